@@ -105,7 +105,8 @@ _READERS: dict[str, Callable[[Any], Any]] = {
 
 def _read(arguments: Mapping[str, Any]) -> dict[str, Any]:
     """Read the arguments that are paths."""
-    found = _scan_and_line(arguments.get("scan"), arguments.get("line"))
+    given = arguments.get("scan"), arguments.get("line")
+    found = _tuning(*given, arguments["knobs"]) if "knobs" in arguments else _scan_and_line(*given)
     for name in arguments.keys() & _READERS.keys():
         value, read = arguments[name], _READERS[name]
         if is_path(value):
@@ -131,3 +132,20 @@ def _scan_and_line(scan: Any, line: Any) -> dict[str, Any]:
     if is_path(scan):
         return {"scan": read_quad_scan(scan)}
     return {"line": load_lattice(line) if scan is None else build_line(lattice_of(scan, line))}
+
+
+def _tuning(scan: Any, line: Any, knobs: Mapping[str, Any]) -> dict[str, Any]:
+    """A table of knobs, and the line that it is checked against without them."""
+    found = {}
+    if is_path(scan):
+        from beamfit.io.tuning import read_tuning_scan
+
+        found["scan"] = scan = read_tuning_scan(scan, knobs)
+    if is_path(line):
+        from beamfit.emittance.scan import QuadScan
+        from beamfit.io.line import build_line, lattice_of, load_lattice
+
+        is_scan = isinstance(scan, QuadScan)
+        own = is_scan and build_line(lattice_of(scan.without_settings(knobs), line))
+        found["line"] = own or load_lattice(line)
+    return found

@@ -12,8 +12,9 @@ import pytest
 import beamfit
 
 NAMES = """
-Anchor Beam BeamMatrix Beamline DecayFit DecayRecord Drift EmittanceFit InputError Job Machine
-Monitor Noise Posterior QuadScan Quadrupole Quantity Run Screen SectorDipole Status Target ThinLens
+Anchor Beam BeamMatrix Beamline DecayFit DecayRecord Drift EmittanceFit EmittanceTable InputError
+Job Machine Monitor Noise Posterior QuadScan Quadrupole Quantity Run Screen SectorDipole Status
+Target ThinLens
 TuningFit check constant_a_test control design find_setpoint fit_decay fit_decays fit_emittance
 fit_lifetimes fit_sizes fit_slices fit_tuning identify load_fit load_lattice loss_coefficients
 moving_lifetime read_decay_record read_formulation read_noise read_operation read_quad_scan

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
@@ -23,8 +24,9 @@ from beamfit.status import Status
 from beamfit.table import cell
 
 if TYPE_CHECKING:
-    from beamfit.emittance.results import PlaneFit
+    from beamfit.emittance.fit import EmittanceFit
     from beamfit.live.scan import Outcome, ScanProgress
+    from beamfit.tuning.fit import TuningFit
 
 EXAMPLE = """\b
 Examples:
@@ -57,7 +59,8 @@ def scan(
     """Scan a machine's quadrupoles and fit the emittance, choosing each setting by what it tells.
 
     MACHINE is a TOML file (docs/live.md) that names the variables of the magnets and the screen,
-    and their limits. The magnets are put back whatever ends the scan. Needs beamfit[live].
+    and their limits. With knobs in it, the setting of the lowest emittance is searched. The magnets
+    are put back whatever ends the scan. Needs beamfit[live].
     """
     if (machine is None) == (recover is None):
         raise InputError("both or neither of MACHINE and --recover", "one of them")
@@ -104,17 +107,23 @@ class _Lines:
         last = now.points[-1]
         at = ", ".join(f"{name} {value:.4g}" for name, value in last.settings.items())
         sizes = ", ".join(f"{p} {1e6 * median(s):.1f} um" for p, s in last.shots.items())
-        planes = fit.planes if fit and count >= FEWEST else ()
-        known = ", ".join(map(_known, planes))
+        known = ", ".join(_known(fit)) if fit and count >= FEWEST else ""
         self(f"{count:3d}  {at:<12}  {sizes:<26}  {known}".rstrip())
 
 
-def _known(plane: PlaneFit) -> str:
-    """Present knowledge of a plane's emittance, in a few words."""
-    if plane.emittance.error is None:
-        return f"{plane.plane}: open"
-    sure = "" if plane.status is Status.converged else f" ({cell(plane.status)})"
-    return f"{plane.plane}: {plane.normalized_emittance}{sure}"
+def _known(fit: EmittanceFit | TuningFit) -> Iterator[str]:
+    """Present knowledge of each plane's emittance, or of the best setting, in a few words."""
+    if not hasattr(fit, "planes"):
+        yield fit.headline
+        return
+    for plane in fit.planes:
+        sure = "" if plane.status is Status.converged else f" ({cell(plane.status)})"
+        known = plane.emittance.error is not None
+        yield (
+            f"{plane.plane}: {plane.normalized_emittance}{sure}"
+            if known
+            else (f"{plane.plane}: open")
+        )
 
 
 async def _planned(machine: ScanMachine, journal: Path, as_json: bool) -> int:
@@ -149,11 +158,16 @@ async def _planned(machine: ScanMachine, journal: Path, as_json: bool) -> int:
             f"{m.name}: {m.set} from {m.low:g} to {m.high:g} {m.unit}, read back by {m.read}, "
             f"within {m.tolerance:g} for {m.settle:g} s; now {value:.6g}"
         )
-    values = ", ".join(f"{value:.4g}" for value in first)
-    click.echo(f"First {machine.magnets[0].name} at {values}; then where it tells most.")
+    values, goal = ", ".join(f"{value:.4g}" for value in first), f"{100 * machine.goal:.3g} %"
+    begin = f"{machine.magnets[0].name} at {values}"
+    until = f"the emittances are known to {goal}"
+    if machine.knobs:
+        begin = f"rows that fill the limits of {', '.join(m.name for m in machine.magnets)}"
+        until = f"the best setting of {', '.join(machine.knobs)} is within {goal} of the minimum"
+    click.echo(f"First {begin}; then where it tells most.")
     click.echo(
         f"{machine.screen.shots} shots on {machine.screen.name} at each, at most {machine.points} "
-        f"settings, or until the emittances are known to {100 * machine.goal:.3g} %."
+        f"settings, or until {until}."
     )
     click.echo(f"At the end back to {named(before)}; until then that stands in {journal}.")
     for line in (*at.notes, *([f"Now: {plan['amiss']}."] if plan["amiss"] else [])):
@@ -167,6 +181,7 @@ def _answered(
 ) -> int:
     """Answer as `beamfit emittance` would for the file, and say how the scan ended."""
     from beamfit.cli.emittance import results_of, show
+    from beamfit.cli.tune import show_tuning
 
     if found.problem is not None:
         if not isinstance(found.problem, InputError):
@@ -186,15 +201,18 @@ def _answered(
         few += f" It is in {out}." if found.points else ""
         answered(as_json, [], inputs, lambda terminal: click.echo(few), scan=said)
     else:
-        measured, described, _ = read_inputs(str(out), machine.lattice)
-        fit = beamfit.fit_emittance(measured, build_line(described))
+        if machine.knobs:
+            results, shown, fit = [found.fit], partial(show_tuning, fit=found.fit), found.fit
+        else:
+            measured, described, _ = read_inputs(str(out), machine.lattice)
+            fit = beamfit.fit_emittance(measured, build_line(described))
+            results, shown = results_of(fit), partial(show, fit=fit)
         reported(report, fit, inputs)
         if not as_json:
             click.echo(
                 f"The scan ended: {found.reason}. It is in {out}. {found.doubt}".rstrip() + "\n"
             )
-        shown = partial(show, fit=fit)
-        answered(as_json, results_of(fit), inputs, shown, report, scan=said)
+        answered(as_json, results, inputs, shown, report, scan=said)
     return 128 + found.signal if found.signal else 0
 
 

@@ -11,7 +11,7 @@ from beamfit.errors import InputError
 from beamfit.io.line import build_line, lattice_of
 from beamfit.io.priors import read_noise
 from beamfit.io.tuning import read_tuning_scan
-from beamfit.tuning.knobs import GOALS, knobs_of, planes_of
+from beamfit.tuning.knobs import GOALS, EmittanceTable, knobs_of, planes_of
 
 if TYPE_CHECKING:
     from beamfit.cli.show import Terminal
@@ -48,26 +48,33 @@ def tune(
     """Find the setting of the knobs at which the emittance is lowest, and the next row to measure.
 
     TABLE is a scan with columns of knobs beside quadrupoles and sizes: Q2_A, SOL_A, phase_deg,
-    size_x_um, ... Rows stand in any order; no setting of the knobs needs a whole scan.
+    size_x_um, ... Rows stand in any order; no setting of the knobs needs a whole scan. Or it has
+    finished emittances, emittance_x_um and emittance_x_error_um: these need no lattice.
     """
     if not limits:
         raise InputError("no --vary", "NAME=LOW:HIGH such as SOL=190:210")
     scan = read_tuning_scan(table, limits, columns=columns, ignore=ignore, skip_bad=skip_bad)
     knobs_of(scan, limits)
     planes_of(scan, goal)
-    described = lattice_of(scan.without_settings(limits), part.pop("lattice"), **part)
-    own = None if noise is None else read_noise(noise)
-    line = build_line(described) if scan.transfer is None else None  # JAX from here on
+    own, line, inputs = None if noise is None else read_noise(noise), None, [scan]
+    if isinstance(scan, EmittanceTable):
+        if given := [name for name, value in part.items() if value]:
+            expected = "none of it: they need no optics"
+            raise scan.unusable(f"--{given[0]} beside finished emittances", expected)
+    else:
+        described = lattice_of(scan.without_settings(limits), part.pop("lattice"), **part)
+        inputs.append(described)
+        line = build_line(described) if scan.transfer is None else None  # JAX from here on
 
     from beamfit.tuning.fit import fit_tuning
 
     fit = fit_tuning(scan, line, limits, goal=goal, within=close, noise=own, seed=seed)
-    inputs = {str(each.path): each.sha256 for each in (scan, described)}
+    inputs = {str(each.path): each.sha256 for each in inputs}
     reported(report, fit, inputs)
-    answered(as_json, [fit], inputs, lambda terminal: _show(terminal, fit), report)
+    answered(as_json, [fit], inputs, lambda terminal: show_tuning(terminal, fit), report)
 
 
-def _show(terminal: Terminal, fit: TuningFit) -> None:
+def show_tuning(terminal: Terminal, fit: TuningFit) -> None:
     """Say the verdict first, then the best setting and the next row."""
     terminal.answer(fit.headline, fit.status, fit.message)
     for note in fit.notes:

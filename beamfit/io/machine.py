@@ -19,6 +19,8 @@ from beamfit.io.toml import LIST, TABLE, TEXT, Key, Section, is_number, read_tom
 from beamfit.lifetime.record import Conditions
 
 FORMAT = "beamfit-machine-1"
+# Most settings of a scan, and rows of a tuning.
+POINTS, ROWS = 15, 60
 APPROACHES = ("either", "below", "above")
 # Units of settings as control systems write them, in capitals or small letters.
 SPELLINGS = {u.lower(): u for u in SETTINGS}
@@ -59,7 +61,7 @@ BEAM = {
 }
 SCAN = {
     "goal_percent": Key("goal", 1e-2, default=0.03, low=0.0, high=100.0, said="0 to 100 %"),
-    "points": Key("points", default=15, low=3.0, high=201.0, said="4 to 200 points"),
+    "points": Key("points", default=None, low=3.0, high=201.0, said="4 to 200 points"),
     "first": Key("first", kind=LIST, default=()),
     "restore_s": Key("restore", default=60.0, **WAIT),
 }
@@ -67,7 +69,7 @@ TOP = {
     "name": Key("name", kind=TEXT, default=""),
     "lattice": Key("lattice", kind=TEXT, default=None),
     "timeout_s": Key("timeout", default=5.0, **WAIT),
-    "magnet": Key(kind=LIST, default=()),
+    **{name: Key(kind=LIST, default=()) for name in ("magnet", "knob")},
     **{name: Key(kind=TABLE, default=None) for name in ("screen", "beam", "scan", "ring", "watch")},
 }
 
@@ -168,7 +170,7 @@ class ScanMachine:
     lattice : LatticeFile
         The line.
     magnets : tuple of Magnet
-        Those to be scanned.
+        Those to be scanned, and behind them the knobs.
     screen : Profiler
     guard : Guard
     goal : float
@@ -180,6 +182,8 @@ class ScanMachine:
     restore, timeout : float
         For how long an IOC that does not answer is asked again to restore, and within which a
         variable has to answer, s.
+    knobs : tuple of str
+        Names of the knobs to be tuned; a scan for the emittance has none.
     """
 
     name: str
@@ -194,6 +198,7 @@ class ScanMachine:
     first: tuple[float, ...]
     restore: float
     timeout: float
+    knobs: tuple[str, ...] = ()
 
 
 def read_scan_machine(path: str | PathLike[str]) -> ScanMachine:
@@ -219,18 +224,21 @@ def read_scan_machine(path: str | PathLike[str]) -> ScanMachine:
     lattice = read_lattice(Path(path).parent / said.pop("lattice"))
     if not top.table.get("magnet"):
         raise top.error("no magnet to scan", "tables [[magnet]]", "magnet")
-    magnets = tuple(_magnet(section, lattice) for section in top.sections("magnet"))
+    scanned = tuple(_magnet(section, lattice) for section in top.sections("magnet"))
+    knobs = tuple(map(_knob, top.sections("knob"))) if "knob" in top.table else ()
+    magnets = scanned + knobs
     for said_once in ({m.name for m in magnets}, {m.set.rpartition("://")[2] for m in magnets}):
         if len(said_once) < len(magnets):
             found = "a magnet or the variable that sets it twice"
-            raise top.error(found, "one [[magnet]] for each", "magnet")
+            raise top.error(found, "one [[magnet]] or [[knob]] for each", "magnet")
     wanted = top.section("scan")
     plan = wanted.values(SCAN)
     first = _numbers(wanted, "first", plan.pop("first"), magnets[0].span)
-    plan["points"] = _whole(wanted, "points", plan["points"])
+    usual = ROWS if knobs else POINTS
+    plan["points"] = _whole(wanted, "points", plan["points"] or usual)
     screen, guard = _screen(top.section("screen"), lattice), _guard(top.section("beam"))
     lattice = _seen_at(lattice, screen.name)
-    for magnet, section in zip(magnets, top.sections("magnet"), strict=True):
+    for magnet, section in zip(scanned, top.sections("magnet"), strict=True):
         if magnet.name not in _before(lattice, screen.name):
             found = f"{magnet.name} behind the screen {screen.name}"
             raise section.error(found, "a magnet that the beam passes before it", "name")
@@ -238,7 +246,10 @@ def read_scan_machine(path: str | PathLike[str]) -> ScanMachine:
         if not name.isprintable():
             raise top.error(f"the name {name!r}", "one of letters that can be shown")
     name, own = said.pop("name"), (magnets, screen, guard)
-    return ScanMachine(name, str(path), top.sha256, lattice, *own, first=first, **plan, **said)
+    tuned = tuple(knob.name for knob in knobs)
+    return ScanMachine(
+        name, str(path), top.sha256, lattice, *own, first=first, knobs=tuned, **plan, **said
+    )
 
 
 def read_machine(path: str | PathLike[str]) -> tuple[Section, dict[str, Any]]:
@@ -267,6 +278,17 @@ def _magnet(section: Section, lattice: LatticeFile) -> Magnet:
     unit, wanted = unit_of(magnet.unit), lattice.calibrations[magnet.name]
     if unit != wanted:
         raise section.error(f"unit '{magnet.unit}'", f"{wanted}, as in the lattice", "unit")
+    return _movable(section, replace(magnet, unit=wanted))
+
+
+def _knob(section: Section) -> Magnet:
+    """A knob of the machine before the lattice, in whatever unit it has."""
+    knob = Magnet(**section.values(MAGNET))
+    return _movable(section, replace(knob, unit=unit_of(knob.unit) or knob.unit))
+
+
+def _movable(section: Section, magnet: Magnet) -> Magnet:
+    """A magnet or a knob whose limits leave room to move it."""
     if not (is_number(magnet.low) and is_number(magnet.high) and magnet.low < magnet.high):
         found = f"limits {magnet.low:g} to {magnet.high:g}"
         raise section.error(found, "low below high, both numbers", "low")
@@ -280,7 +302,7 @@ def _magnet(section: Section, lattice: LatticeFile) -> Magnet:
         found = f"approach by {magnet.approach_by:g} within {magnet.low:g} to {magnet.high:g}"
         raise section.error(found, "room to scan besides", "approach_by")
     degauss = _numbers(section, "degauss", magnet.degauss, (magnet.low, magnet.high))
-    return replace(magnet, unit=wanted, degauss=degauss)
+    return replace(magnet, degauss=degauss)
 
 
 def _numbers(

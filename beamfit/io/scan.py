@@ -106,6 +106,11 @@ def read_quad_scan(
             raise InputError("--columns for a file of emittance_gui", "none: it says them", path)
         return read_emittance_gui(path).scan()
     sheet = read_columns(path, "Q2_A,size_x_um", columns, ignore, skip_bad, MOST_ROWS)
+    return scan_of_sheet(sheet, skip_bad)
+
+
+def scan_of_sheet(sheet: Sheet, skip_bad: bool = False) -> QuadScan:
+    """Understand the columns of a sheet as a scan, as `read_quad_scan` does."""
     columns = scan_columns(sheet)
     if skip_bad:
         sheet = sheet.good(lambda rows: _values(rows, columns))

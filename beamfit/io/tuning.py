@@ -1,24 +1,29 @@
-"""Tables of a machine that is tuned: a scan whose rows also say where its knobs stood."""
+"""Tables of a machine that is tuned: sizes or finished emittances, and where its knobs stood."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import re
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from os import PathLike
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from beamfit.emittance.scan import KNOB, QuadScan
 from beamfit.errors import InputError, nearest
-from beamfit.io.columns import Columns, Layout, layout_of
+from beamfit.io.columns import Columns, Sheet, columns_of, left_out
+from beamfit.io.files import name_of
 from beamfit.io.headers import SETTINGS, spelled
-from beamfit.io.scan import MOST_ROWS, read_quad_scan
+from beamfit.io.scan import MOST_ROWS, scan_of_sheet
 from beamfit.io.table import read_columns
+from beamfit.tuning.knobs import EmittanceTable
 
 if TYPE_CHECKING:
     from pandas import DataFrame
 
 # What a knob's column is called while the table is read: a setting of any unit.
 PLAIN = "tuning_knob_{}"
+EMITTANCE = re.compile(r"(normalized_)?emittance_[xy]")
 
 
 def read_tuning_scan(
@@ -28,8 +33,8 @@ def read_tuning_scan(
     columns: Columns = None,
     ignore: Iterable[str] = (),
     skip_bad: bool = False,
-) -> QuadScan:
-    """Read a table of beam sizes with columns of quadrupoles and of knobs.
+) -> QuadScan | EmittanceTable:
+    """Read a table of beam sizes with columns of quadrupoles and of knobs, or of emittances.
 
     Parameters
     ----------
@@ -43,9 +48,11 @@ def read_tuning_scan(
 
     Returns
     -------
-    QuadScan
-        Knobs stand among its settings under the names given, in the unit "knob" where theirs is
-        none of a magnet. Repeated shots of a row are averaged.
+    QuadScan or EmittanceTable
+        The latter if there are columns such as emittance_x_um or normalized_emittance_x_um, with
+        emittance_x_error_um beside. Knobs stand among the settings under the names given; of a
+        scan in the unit "knob" where theirs is none of a magnet, and repeated shots of a row are
+        averaged.
 
     Raises
     ------
@@ -61,36 +68,66 @@ def read_tuning_scan(
     >>> scan.settings["phase_deg"].tolist(), scan.units["phase_deg"]
     ([5.0, 6.0, 5.0], 'knob')
     """
-    ignore, names = tuple(ignore), {}
-    headers = read_columns(path, "Q2_A,knob,size_x_um", columns, ignore, skip_bad, MOST_ROWS)
-    for knob in dict.fromkeys(knobs):
-        header = _header(knob, headers.names)
-        if header is None:
-            raise headers.header_error(f"no column of the knob '{knob}'", nearest(
-                knob, list(headers.names)))  # fmt: skip
-        names[knob] = headers.called.get(header, header)
+    sheet = read_columns(path, "Q2_A,knob,size_x_um", columns, ignore, skip_bad, MOST_ROWS)
+    names = {knob: _header(knob, sheet) for knob in dict.fromkeys(knobs)}
+    called = {knob: sheet.called.get(name, name) for knob, name in names.items()}
+    if any(EMITTANCE.match(name) for name in sheet.names):
+        return _emittances(sheet, names, called)
     plain = {knob: PLAIN.format(i) for i, knob in enumerate(names)}
-    own = Layout(tuple((names[knob], f"{plain[knob]}_A") for knob in names))
-    scan = read_quad_scan(path, columns=layout_of(columns) + own, ignore=ignore, skip_bad=skip_bad)
+    again = {names[knob]: f"{name}_A" for knob, name in plain.items()}
+    of_file = {again.get(name, name): header for name, header in sheet.called.items()}
+    of_file |= {again[names[knob]]: header for knob, header in called.items()}
+    sheet = replace(sheet, names=tuple(again.get(n, n) for n in sheet.names), called=of_file)
+    scan = scan_of_sheet(replace(sheet, arranged=True), skip_bad)
     back = {name: knob for knob, name in plain.items()}
-    units = {knob: _unit(knob, names[knob]) for knob in names}
+    units = {knob: _unit(knob, name) for knob, name in called.items()}
     return replace(
         scan,
         settings={back.get(n, n): v for n, v in scan.settings.items()},
         units={back.get(n, n): units.get(back.get(n, n), u) for n, u in scan.units.items()},
-        columns=scan.columns | {knob: names[knob] for knob in names},
+        columns=scan.columns | called,
     )
 
 
-def _header(knob: str, names: Sequence[str]) -> str | None:
-    """The header of a knob: its name, or its name with a unit; None if there is none."""
-    if knob in names:
+def _emittances(sheet: Sheet, names: Mapping[str, str], called: dict[str, str]) -> EmittanceTable:
+    """Finished emittances at settings of knobs; other columns are ignored."""
+    known = [n for n in sheet.names if EMITTANCE.match(n)]
+    kinds = {n.startswith("normalized_") for n in known}
+    if len(kinds) > 1:
+        expected = "columns of one of them"
+        raise sheet.header_error("emittances, and normalized emittances", expected, known[-1])
+    word = "normalized_emittance_" if kinds.pop() else "emittance_"
+    quantities = {f"{word}{end}": "length" for end in ("x", "y", "x_error", "y_error")}
+    found = columns_of(sheet.only(known), quantities)
+    values = {k.removeprefix(word): sheet.values(c, blank=True) for k, c in found.items()}
+    for column, each in zip(found.values(), values.values(), strict=True):
+        sheet.refuse(column.header, each <= 0.0, "a positive number")
+    return EmittanceTable(
+        settings={knob: sheet.numbers(name) for knob, name in names.items()},
+        emittance={p: v for p, v in values.items() if p in "xy"},
+        error={k[0]: v for k, v in values.items() if k not in "xy"},
+        normalized=word.startswith("normalized_"),
+        name=Path(name_of(sheet.path)).stem,
+        path=sheet.path,
+        sha256=sheet.sha256,
+        provenance=sheet.comments,
+        notes=left_out(sheet),
+        columns=called | {k.replace(word, "emittance "): c.header for k, c in found.items()},
+    )
+
+
+def _header(knob: str, sheet: Sheet) -> str:
+    """The header of a knob: its name, or its name with a unit."""
+    if knob in sheet.names:
         return knob
-    found = [name for name in names if spelled(name).rpartition("_")[0] == knob]
+    found = [name for name in sheet.names if spelled(name).rpartition("_")[0] == knob]
+    if not found:
+        expected = nearest(knob, list(sheet.names))
+        raise sheet.header_error(f"no column of the knob '{knob}'", expected)
     if len(found) > 1:
         expected = "its header as it stands: " + " or ".join(found)
         raise InputError(f"a knob '{knob}' of several columns", expected)
-    return found[0] if found else None
+    return found[0]
 
 
 def _unit(knob: str, header: str) -> str:

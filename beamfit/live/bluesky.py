@@ -15,6 +15,7 @@ from bluesky.utils import FailedStatus, MsgGenerator
 
 import beamfit
 from beamfit.emittance.fit import EmittanceFit
+from beamfit.errors import InputError
 from beamfit.io.machine import ScanMachine
 from beamfit.live.devices import connect
 from beamfit.live.points import MeasuredPoint
@@ -71,6 +72,7 @@ def emittance_scan(
     --------
     See docs/live_adapters.md, which is run as it stands.
     """
+    _check_no_knobs(machine)
     steps: asyncio.Queue[MsgGenerator[None] | None] = asyncio.Queue()
     turn = asyncio.Semaphore(0)
 
@@ -110,6 +112,11 @@ def emittance_scan(
         return (yield from bpp.contingency_wrapper(plan, except_plan=closed))
     finally:  # after a halt too: the loop restores, with nobody who waits for it
         task.cancel()
+
+
+def _check_no_knobs(machine: ScanMachine) -> None:
+    if machine.knobs:
+        raise InputError("knobs in a plan of bluesky", "beamfit scan for them", machine.path)
 
 
 def _said(machine: ScanMachine, md: Mapping[str, Any]) -> dict[str, Any]:

@@ -439,7 +439,7 @@ async def checked(supply: Supply) -> tuple[Supply, list[str]]:
     setting = await supply.setting.describe()
     readback = await supply.readback.describe()
     for name, unit in ((supply.readback.name, readback.unit), (supply.setting.name, setting.unit)):
-        if unit and unit_of(unit) != magnet.unit:
+        if unit and (unit_of(unit) or unit) != magnet.unit:
             said = f"'{plain(name)}' in '{plain(unit)}'"
             raise InputError(said, f"{magnet.unit}, as the machine file says of {magnet.name}")
     low, high = max(magnet.low, setting.low), min(magnet.high, setting.high)

@@ -15,9 +15,10 @@ import numpy as np
 import beamfit
 from beamfit.emittance.design import best_steps, information_of
 from beamfit.emittance.fit import EmittanceFit, fit_emittance
-from beamfit.emittance.scan import QuadScan
+from beamfit.emittance.scan import KNOB, QuadScan
 from beamfit.errors import InputError, plain
 from beamfit.greybox.problem import padded_length
+from beamfit.io.headers import SETTINGS
 from beamfit.io.machine import Magnet, ScanMachine
 from beamfit.optics.beamline import Beamline
 from beamfit.statistics import POOR_FIT, chi2_probability
@@ -87,7 +88,7 @@ def scan_of(points: Sequence[MeasuredPoint], machine: ScanMachine) -> QuadScan:
     error = {plane: np.array(each) for plane, each in found.items() if each}
     count = np.array([min(map(len, p.shots.values())) for p in points])
     single = {plane: _padded(shots[plane]) for plane in error}
-    units = {m.name: m.unit for m in machine.magnets}
+    units = {m.name: m.unit if m.unit in SETTINGS else KNOB for m in machine.magnets}
     return QuadScan(
         settings, units, size, error, shots=count if error else None, name=machine.name,
         shot_size=single, screen=(machine.screen.name,) * len(points),
@@ -210,25 +211,25 @@ def next_setting(
         some, since a wrong line shows there alone. The middle of the largest gap where nothing can
         be fitted.
     """
-    limits = {m.name: _within(m.name, *m.span, barred, before) for m in machine.magnets}
+    limits = {m.name: limits_within(m.name, *m.span, barred, before) for m in machine.magnets}
     first = machine.magnets[0]
     low, high = limits[first.name]
     begin = first_settings(machine)[len(points) + len(barred) :]
     if begin and low <= begin[0] <= high:
-        return Next(_clipped(dict(before) | {first.name: begin[0]}, limits), "first settings")
+        return Next(clipped(dict(before) | {first.name: begin[0]}, limits), "first settings")
     if fit is not None:
         new = {name: limits[name] for name in fresh(points, machine)}
         aim = "D" if new else "emittance"  # of a new magnet whatever it gains
         steps, stop = best_steps(fit, information_of(fit), new or limits, aim)
         if steps:
             wanted = steps[0].candidate.settings
-            return Next(_clipped(dict(before) | wanted, limits), "where it tells most")
+            return Next(clipped(dict(before) | wanted, limits), "where it tells most")
         if len(points) >= FEWEST:
             return stop.removeprefix("Stop: ").rstrip(".")
     gaps = np.sort([low, high, *(p.settings[first.name] for p in points)])
     place = int(np.argmax(np.diff(gaps)))
     middle = 0.5 * float(gaps[place] + gaps[place + 1])
-    return Next(_clipped(dict(before) | {first.name: middle}, limits), "the largest gap")
+    return Next(clipped(dict(before) | {first.name: middle}, limits), "the largest gap")
 
 
 def fresh(points: Sequence[MeasuredPoint], machine: ScanMachine) -> list[str]:
@@ -250,7 +251,7 @@ def fresh(points: Sequence[MeasuredPoint], machine: ScanMachine) -> list[str]:
     return [m.name for m in machine.magnets[1:] if moved(m) < FEW]
 
 
-def _within(
+def limits_within(
     name: str, low: float, high: float, barred: Sequence[Mapping[str, float]],
     before: Mapping[str, float],
 ) -> tuple[float, float]:  # fmt: skip
@@ -264,7 +265,7 @@ def _within(
     return low, high
 
 
-def _clipped(
+def clipped(
     settings: Mapping[str, float], limits: Mapping[str, tuple[float, float]]
 ) -> dict[str, float]:
     """Settings within the limits, of as many digits as a person would type."""

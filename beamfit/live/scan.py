@@ -38,8 +38,10 @@ from beamfit.live.restore import (
     reach,
     restore,
 )
+from beamfit.live.tuning import next_knobs, tuning_of, warmed_tuning
 from beamfit.live.wrong_line import MOST, WrongLine, suspect, telling_setting, wrong_lines
 from beamfit.optics.beamline import Beamline
+from beamfit.tuning.fit import TuningFit
 
 # Settings in a row at which nothing can be measured, after which a scan ends.
 BARREN = 3
@@ -54,7 +56,7 @@ class ScanProgress(NamedTuple):
     """
 
     points: tuple[MeasuredPoint, ...]
-    fit: EmittanceFit | None
+    fit: EmittanceFit | TuningFit | None
     news: str
     measured: bool = False
 
@@ -66,8 +68,8 @@ class Outcome(NamedTuple):
     ----------
     points : tuple of MeasuredPoint
         What was measured.
-    fit : EmittanceFit or None
-        The fit to them.
+    fit : EmittanceFit, TuningFit or None
+        The fit to them; the latter if the machine has knobs.
     reason : str
         Why it ended.
     problem : Exception or None
@@ -79,7 +81,7 @@ class Outcome(NamedTuple):
     """
 
     points: tuple[MeasuredPoint, ...]
-    fit: EmittanceFit | None
+    fit: EmittanceFit | TuningFit | None
     reason: str
     problem: Exception | None = None
     signal: int = 0
@@ -99,7 +101,7 @@ class Running:
     wrong: Sequence[WrongLine] = ()
     points: list[MeasuredPoint] = field(default_factory=list)
     barred: list[dict[str, float]] = field(default_factory=list)
-    fit: EmittanceFit | None = None
+    fit: EmittanceFit | TuningFit | None = None
     armed: bool = False
     checks: int = 0
 
@@ -118,6 +120,8 @@ async def scan(
     ready: Callable[[], Awaitable[None]] = lambda: asyncio.sleep(0),
 ) -> Outcome:
     """Scan magnets until the emittances are known as well as is wanted, and put them back.
+
+    Of a machine with knobs: tune until the best setting is as near to the minimum as is wanted.
 
     Parameters
     ----------
@@ -152,13 +156,14 @@ async def scan(
     --------
     See docs/live.md, where a simulation takes the place of a control system.
     """
-    warmed(at.machine, line)
+    (warmed_tuning if at.machine.knobs else warmed)(at.machine, line)
     with alone_with(journal, at.machine.magnets):
         check_none_left(journal)
         magnets = at.machine.magnets  # what could not be put back is not moved
         before = {m.name: moved(m, await at.magnets[m.name].get()) for m in magnets}
         log = _journal_for(journal, at.machine, before)
-        run = Running(at, line, before, keep, tell, ready, wrong_lines(line, at.machine))
+        wrong = () if at.machine.knobs else wrong_lines(line, at.machine)
+        run = Running(at, line, before, keep, tell, ready, wrong)
         measuring = asyncio.ensure_future(_begun(run, log))
         reason, problem = "", None
         with ended_by_signals(measuring, run.say) as came:
@@ -172,7 +177,8 @@ async def scan(
             except Exception as error:  # of whatever kind: the magnets are put back first
                 problem, reason = error, str(error)
             await _to_the_end(_back(run, log))
-        number, doubted = came[0] if came else 0, doubt(run.fit, run.points)
+        number, tuned = came[0] if came else 0, bool(at.machine.knobs)
+        doubted = "" if tuned else doubt(run.fit, run.points)
         if not doubted and run.checks:
             doubted = suspect(run.points, run.fit, at.machine, run.wrong)
         return Outcome(tuple(run.points), run.fit, reason, problem, number, doubted)
@@ -234,7 +240,8 @@ async def _measured(run: Running) -> str:
         barren = 0
         run.keep([*run.points, point], run.before)
         run.points.append(point)
-        run.fit = fit_of(run.points, machine, run.line) or run.fit
+        fitted = (tuning_of if machine.knobs else fit_of)(run.points, machine, run.line)
+        run.fit = fitted or run.fit
         run.say(chosen.why, measured=True)
     return chosen
 
@@ -242,6 +249,8 @@ async def _measured(run: Running) -> str:
 def _chosen(run: Running) -> Next | str:
     """The next setting, or why there is none: the goal, and nothing that shows the line wrong."""
     machine, points = run.at.machine, run.points
+    if machine.knobs:
+        return next_knobs(points, run.fit, run.barred, machine, run.before)
     full = len(points) >= machine.points
     if not sharp(run.fit, points, machine.goal) or fresh(points, machine):
         every = f"all {machine.points} points are measured"

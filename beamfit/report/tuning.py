@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
+from dataclasses import replace
 from functools import partial
 from itertools import combinations
 
 import numpy as np
 from matplotlib.figure import FigureBase
 
-from beamfit.quantity import percent
+from beamfit.errors import InputError
+from beamfit.quantity import Quantity, percent
 from beamfit.report.document import BLUE, RED, Picture, ReportPage, Verdict
 from beamfit.report.emittance import about_input, about_scan
 from beamfit.table import Table
-from beamfit.tuning.fit import TuningFit, course_of
+from beamfit.tuning.fit import TuningFit, fit_tuning
 
 # Points along each axis of a map, and most maps that are drawn.
 FINE, MOST_MAPS = 25, 6
+# Parts of a table whose course is shown, and rows of the first.
+POINTS, FIRST = 5, 6
 
 
 def tuning_page(fit: TuningFit) -> ReportPage:
@@ -30,7 +35,8 @@ def tuning_page(fit: TuningFit) -> ReportPage:
     -------
     ReportPage
     """
-    source = f"{fit.scan.name}, {len(fit.scan)} rows on {fit.seen.line.name}"
+    line = f" on line {fit.seen.line.name}, {float(fit.seen.energy):g} MeV" if fit.seen else ""
+    source = f"{fit.scan.name}, {len(fit.scan)} rows{line}"
     names = fit.knobs.names
     pairs = list(combinations(range(len(names)), 2))[:MOST_MAPS] or [(0, 0)]
     pictures = [
@@ -43,8 +49,7 @@ def tuning_page(fit: TuningFit) -> ReportPage:
     tables = [*fit.tables(), *_planes(fit), *about_input(fit.notes)]
     return ReportPage(
         title=f"Tuning by {fit.scan.name}",
-        subtitle=f"{len(fit.scan)} rows of {', '.join(names)} on line {fit.seen.line.name}, "
-        f"{float(fit.seen.energy):g} MeV",
+        subtitle=f"{len(fit.scan)} rows of {', '.join(names)}{line}",
         verdicts=[Verdict(fit.status, fit.headline, f"{fit.message} {fit.next_words}".strip())],
         tables=tables,
         pictures=pictures,
@@ -58,15 +63,16 @@ def _planes(fit: TuningFit) -> list[Table]:
     rows = []
     for plane, found in fit.beam(fit.settings).items():
         for name, band in found.items() if plane != "goal" else ():
-            scale, unit = (1e6, " µm") if name == "normalized_emittance" else (1.0, "")
+            scale, unit = (1e6, " µm") if name == fit.kind else (1.0, "")
             unit = " m" if name == "beta" else unit
             each = [scale * float(part[0]) for part in band]
             label = f"{name.replace('_', ' ')} {plane}"
             ends = f"{each[3]:.3g} to {each[4]:.3g}{unit}"
             rows.append([label, f"{each[0]:.4g}{unit}", ends])
+    what, factor = ("a size", 1.0) if fit.seen else ("an emittance", 2.0)  # its root is fitted
     noise = [
-        [f"relative error of a size {plane}", percent(fit.maps[plane].noise), ""]
-        for plane in fit.maps
+        [f"relative error of {what} in {plane}", percent(factor * m.noise), ""]
+        for plane, m in fit.maps.items()
     ]
     head = ["", "value", "95 % interval"]
     return [Table("The beam at the best setting", head, rows + noise)]
@@ -91,10 +97,10 @@ def draw_map(figure: FigureBase, fit: TuningFit, i: int, j: int) -> None:
         return
     first, second = np.meshgrid(*along, indexing="ij")
     settings = fit.settings | {names[i]: first.ravel(), names[j]: second.ravel()}
-    band = fit.beam(settings)["goal"]["normalized_emittance"]
+    band = fit.beam(settings)["goal"][fit.kind]
     value = 1e6 * band.value.reshape(FINE, FINE)
     error = 50.0 * ((band.high - band.low) / band.value).reshape(FINE, FINE)
-    titles = ("normalised emittance, µm", "its standard error, %")
+    titles = (_axis(fit), "its standard error, %")
     for axes, part, title in zip(figure.subplots(1, 2), (value, error), titles, strict=True):
         drawn = axes.contourf(*along, part.T, levels=12, cmap="viridis")
         figure.colorbar(drawn, ax=axes)
@@ -109,14 +115,14 @@ def draw_map(figure: FigureBase, fit: TuningFit, i: int, j: int) -> None:
 def _draw_curve(figure: FigureBase, fit: TuningFit, at: np.ndarray) -> None:
     """The emittance over a single knob with its 68 and 95 % bands."""
     axes, name = figure.subplots(), fit.knobs.names[0]
-    band = fit.beam({name: at})["goal"]["normalized_emittance"]
+    band = fit.beam({name: at})["goal"][fit.kind]
     axes.fill_between(at, 1e6 * band.low_95, 1e6 * band.high_95, color=BLUE, alpha=0.15, lw=0)
     axes.fill_between(at, 1e6 * band.low, 1e6 * band.high, color=BLUE, alpha=0.3, lw=0)
     axes.plot(at, 1e6 * band.value, color=BLUE)
     bottom = axes.get_ylim()[0]
     axes.plot(fit.scan.settings[name], np.full(len(fit.scan), bottom), "k|", ms=8)
     axes.axvline(fit.settings[name], color=RED, lw=1.2, ls="--")
-    axes.set(xlabel=name, ylabel="normalised emittance, µm", xlim=(at[0], at[-1]))
+    axes.set(xlabel=name, ylabel=_axis(fit), xlim=(at[0], at[-1]))
 
 
 def draw_course(figure: FigureBase, fit: TuningFit) -> None:
@@ -136,4 +142,27 @@ def draw_course(figure: FigureBase, fit: TuningFit) -> None:
     )
     axes.errorbar(rows, value, error, fmt="o-", color=BLUE, ms=4, capsize=3, lw=1.0)
     axes.axhline(1e6 * fit.minimum.value, color="0.5", lw=1.0, ls="--")
-    axes.set(xlabel="rows", ylabel="normalised emittance\nat the best setting, µm")
+    axes.set(xlabel="rows", ylabel="at the best setting:\n" + _axis(fit))
+
+
+def _axis(fit: TuningFit) -> str:
+    return f"{fit.kind.replace('ized_', 'ised ')}, µm"
+
+
+def course_of(fit: TuningFit, points: int = POINTS) -> list[tuple[int, Quantity]]:
+    """Emittance at the best setting, as the first rows of a table said it, and all of them.
+
+    Returns
+    -------
+    list of (int, Quantity)
+        Number of rows, and the normalised emittance at the setting that they say is best. Parts in
+        which too few magnet settings or no row within the limits stand are left out.
+    """
+    scan, found, line = fit.scan, [], fit.seen.line if fit.seen else None
+    for count in np.unique(np.linspace(FIRST, len(scan), points).astype(int))[:-1]:
+        limits = dict(zip(fit.knobs.names, np.stack(fit.knobs[1:3], -1), strict=True))
+        with suppress(InputError):
+            part = replace(scan, **scan.columns_at(range(count)))
+            own = fit_tuning(part, line, limits, goal=fit.goal, noise=fit.noise)
+            found.append((int(count), own.emittance))
+    return [*found, (len(scan), fit.emittance)]

@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
-from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
+from scipy.special import expit
 
 from beamfit.answer import answer
+from beamfit.emittance.comparison import BEAM, MODELS
 from beamfit.emittance.results import in_words
 from beamfit.emittance.scan import KNOB, QuadScan
 from beamfit.emittance.statement import Seen, varied_magnets
 from beamfit.emittance.transport import setting_units
+from beamfit.emittance.verdict import REMEDIES, SURE
 from beamfit.errors import InputError, expect
 from beamfit.noise.model import Noise
 from beamfit.optics.beamline import Beamline
@@ -24,11 +27,16 @@ from beamfit.optics.particle import beta_gamma
 from beamfit.quantity import Quantity, percent
 from beamfit.status import Status
 from beamfit.table import Table, cell, json_of
-from beamfit.tuning.knobs import GOALS, Knobs, knobs_of, planes_of
+from beamfit.tuning.knobs import GOALS, EmittanceTable, Knobs, knobs_of, planes_of
 from beamfit.tuning.minimum import Emittances, Minima, emittances_of, minima_of, values_at
 from beamfit.tuning.next_row import NextRow, PlaneMap, next_row
-from beamfit.tuning.posterior import map_posterior, numbers_at
-from beamfit.tuning.readings import plane_readings, seen_without
+from beamfit.tuning.posterior import map_posterior, mixed, numbers_at
+from beamfit.tuning.readings import (
+    emittance_readings,
+    log_no_beam,
+    plane_readings,
+    seen_without,
+)
 from beamfit.verdict import Finding, judge
 
 # Draws of the map: the ends of a 95 % interval are known to a tenth of its half-width.
@@ -36,8 +44,8 @@ DRAWS = 256
 # Probability below which an emittance is told from one that no knob changes, and a setting is
 # accepted as within the goal of the minimum.
 TOLD = 0.05
-# Parts of a table whose course is shown, and rows of the first.
-POINTS, FIRST = 5, 6
+# Odds, before the sizes are seen, that they are of no beam: as of scans.
+NO_BEAM = (MODELS["sizes at random"] + MODELS["one constant size"]) / MODELS[BEAM]
 # Half ranges within which a minimum is on the limit.
 EDGE = 1e-6
 CENTRAL, WIDE = (0.16, 0.84), (0.025, 0.975)
@@ -59,7 +67,7 @@ class TuningBand(NamedTuple):
 
 
 def fit_tuning(
-    scan: QuadScan,
+    scan: QuadScan | EmittanceTable,
     line: Beamline | None,
     knobs: Mapping[str, tuple[float, float]],
     *,
@@ -73,11 +81,13 @@ def fit_tuning(
 
     Parameters
     ----------
-    scan : QuadScan
+    scan : QuadScan, EmittanceTable or path
         Sizes at settings of quadrupoles and knobs, in any order; no setting of the knobs needs a
-        whole scan. A knob is one of its ``settings``, in the unit "knob" if it is no magnet.
-    line : Beamline or None
-        From where the emittance is wanted to the screens; None for rows with matrices.
+        whole scan. A knob is one of its ``settings``, in the unit "knob" if it is no magnet. Or
+        finished emittances at settings of the knobs.
+    line : Beamline, path or None
+        From where the emittance is wanted to the screens; None for rows with matrices, and for
+        finished emittances.
     knobs : mapping of str to (float, float)
         Name of a knob to its limits.
     goal : {"emittance", "emittance_x", "emittance_y"}
@@ -119,20 +129,34 @@ def fit_tuning(
     >>> fit.status.value, abs(fit.place["SOL"].value) < 0.2
     ('converged', True)
     """
-    expect(scan, QuadScan, "beamfit.read_tuning_scan(path, knobs)")
+    expect(scan, QuadScan | EmittanceTable, "beamfit.read_tuning_scan(path, knobs)")
     expect(knobs, Mapping, '{"SOL": (180.0, 220.0)}')
     if not (within > 0.0 and draws > 1):
         raise InputError(f"{draws} draws, within {within:g}", "2 or more, and a positive share")
-    planes, own = planes_of(scan, goal), knobs_of(scan, knobs)
-    seen, count = seen_without(scan, line, own, noise), len(own.names)
-    maps = {}
-    for i, plane in enumerate(planes):
-        readings = plane_readings(seen, plane, own, scan.settings)
-        given = readings.readings, readings.start, 2 * seed + i
-        maps[plane] = PlaneMap(readings, map_posterior(*given, knobs=count, draws=draws))
-    found = emittances_of([m.posterior for m in maps.values()])
+    planes, own, noise = planes_of(scan, goal), knobs_of(scan, knobs), noise or Noise()
+    seen, none = None, [-math.inf] * len(planes)
+    if isinstance(scan, EmittanceTable):
+        if line is not None:
+            raise scan.unusable("a line beside finished emittances", "none: they need no optics")
+        readings = [emittance_readings(scan, plane, own, noise) for plane in planes]
+    else:
+        seen = seen_without(scan, line, own, noise)
+        readings = [plane_readings(seen, plane, own, scan.settings) for plane in planes]
+        none = [log_no_beam(r.readings) + math.log(NO_BEAM) for r in readings]
+    count, both = len(own.names), []
+    for i, r in enumerate(readings):
+        given = r.readings, r.start, 2 * seed + i
+        both.append(map_posterior(*given, knobs=count, draws=draws))
+    evidence = np.array([p.log_evidence for p in both])
+    of_a_beam = expit(np.logaddexp.reduce(evidence, axis=1) - math.log(2.0) - none).prod()
+    flat = float(expit(np.diff(evidence.sum(axis=0))[0]))
+    still = np.random.default_rng(seed).permutation(draws) < round(flat * draws)
+    posteriors = [mixed(p, still) for p in both]
+    maps = dict(zip(planes, map(PlaneMap, readings, posteriors), strict=True))
+    found = emittances_of(posteriors)
     minima = jax.tree.map(np.asarray, minima_of(found, count))
-    return TuningFit(scan, seen, own, goal, within, maps, found, minima)
+    given = scan, seen, own, goal, within, noise, maps
+    return TuningFit(*given, found, minima, flat, float(of_a_beam))
 
 
 @answer
@@ -142,22 +166,28 @@ class TuningFit:
 
     Attributes
     ----------
-    scan : QuadScan
-        The scan, knobs among its settings.
-    seen : Seen
-        The scan without the knobs, through its line.
+    scan : QuadScan or EmittanceTable
+        The table, knobs among its settings.
+    seen : Seen or None
+        A scan without the knobs, through its line; None of finished emittances.
     knobs : Knobs
         Names, limits and units.
     goal : str
         What is to be low.
     within : float
         Share of the minimum that is good enough.
+    noise : Noise
+        Priors of the noise.
     maps : dict of str to PlaneMap
         Plane to its readings and its map.
     draws : Emittances
         Draws of ln of the goal.
     minima : Minima
         Their lowest values and places, in half ranges.
+    flat : float
+        Probability that no knob changes the emittance, of even odds before.
+    of_a_beam : float
+        Probability that the sizes are those of a beam through this line.
 
     Examples
     --------
@@ -169,33 +199,38 @@ class TuningFit:
     ('converged', 198)
     """
 
-    scan: QuadScan
-    seen: Seen
+    scan: QuadScan | EmittanceTable
+    seen: Seen | None
     knobs: Knobs
     goal: str
     within: float
+    noise: Noise
     maps: dict[str, PlaneMap]
     draws: Emittances
     minima: Minima
+    flat: float
+    of_a_beam: float
 
     @cached_property
     def place(self) -> dict[str, Quantity]:
         """Setting of each knob at which the emittance is lowest, with errors.
 
-        A place that may be anywhere between the limits has no error.
+        A place has no error where no minimum is told from none, or it may be anywhere between the
+        limits.
         """
         every = self.knobs.settings(self.minima.place)
         best = self.knobs.settings(self.minima.best)
+        ends = np.abs(np.quantile(self.minima.place, WIDE, axis=0)).min(axis=0)
         found = {}
         for i, (name, unit) in enumerate(self.units.items()):
             q = self._told(_quantity(every[:, i], best[i], unit or "1"))
-            ends = np.abs(np.quantile(self.minima.place[:, i], WIDE))
-            found[name] = replace(q, error=None) if ends.min() >= 1.0 - EDGE else q
+            known = self.flat <= TOLD and ends[i] < 1.0 - EDGE
+            found[name] = q if known else q.open()
         return found
 
     def _told(self, q: Quantity) -> Quantity:
-        """A quantity of the map; nothing is known of it where a map is not told from one beam."""
-        return q if self.flat <= TOLD else q.open()
+        """A quantity of the map; nothing is known of it if the sizes are of no beam."""
+        return q if self.of_a_beam > SURE else q.open()
 
     @property
     def settings(self) -> dict[str, float]:
@@ -205,7 +240,7 @@ class TuningFit:
     @cached_property
     def minimum(self) -> Quantity:
         """The lowest normalised emittance between the limits, m."""
-        return self._told(_quantity(self.normalized * np.exp(self.minima.value), None, "m"))
+        return self._told(_quantity(self.unit * np.exp(self.minima.value), None, "m"))
 
     @cached_property
     def _at_best(self) -> np.ndarray:
@@ -215,7 +250,7 @@ class TuningFit:
     @cached_property
     def emittance(self) -> Quantity:
         """The normalised emittance at the best setting, m."""
-        return self._told(_quantity(self.normalized * np.exp(self._at_best), None, "m"))
+        return self._told(_quantity(self.unit * np.exp(self._at_best), None, "m"))
 
     @cached_property
     def excess(self) -> np.ndarray:
@@ -223,10 +258,21 @@ class TuningFit:
         return np.expm1(np.maximum(self._at_best - self.minima.value, 0.0))
 
     @property
-    def normalized(self) -> float:
-        """Normalised emittance of which the draws have the logarithm, m."""
+    def boost(self) -> float:
+        """Emittances of the answer over those of the maps: γβ, and 1 of finished emittances."""
+        return beta_gamma(self.seen.energy, self.seen.line.mass) if self.seen else 1.0
+
+    @property
+    def unit(self) -> float:
+        """The emittance of which the draws have the logarithm, m."""
         own = np.prod([m.readings.emittance for m in self.maps.values()]) ** (1 / len(self.maps))
-        return float(own * beta_gamma(self.seen.energy, self.seen.line.mass))
+        return float(own * self.boost)
+
+    @property
+    def kind(self) -> str:
+        """The emittance that is meant: "normalized_emittance", or the "emittance" of a table."""
+        normalized = self.seen is not None or self.scan.normalized
+        return "normalized_emittance" if normalized else "emittance"
 
     @cached_property
     def edge(self) -> dict[str, float]:
@@ -234,18 +280,11 @@ class TuningFit:
         on = (np.abs(self.minima.place) >= 1.0 - EDGE).mean(axis=0)
         return dict(zip(self.knobs.names, map(float, on), strict=True))
 
-    @cached_property
-    def flat(self) -> float:
-        """Probability that no knob changes the emittance, of even odds before."""
-        posts = [m.posterior for m in self.maps.values()]
-        odds = sum(float(p.log_flat - p.log_evidence) for p in posts)
-        return float(1.0 / (1.0 + np.exp(min(-odds, 500.0))))
-
     @property
     def done(self) -> bool:
         """The best setting is within the goal of the minimum with 95 % probability."""
         close = float((self.excess > self.within).mean()) <= TOLD
-        return self.flat <= TOLD and close
+        return self.of_a_beam > SURE and self.flat <= TOLD and close
 
     @cached_property
     def finding(self) -> Finding:
@@ -270,9 +309,10 @@ class TuningFit:
 
     @property
     def _goal(self) -> str:
+        word = self.kind.replace("ized_", "ised ")
         if self.goal != GOALS[0]:
-            return f"normalised emittance {self.goal[-1]}"
-        return "mean normalised emittance" if len(self.maps) > 1 else "normalised emittance"
+            return f"{word} {self.goal[-1]}"
+        return f"mean {word}" if len(self.maps) > 1 else word
 
     @property
     def units(self) -> dict[str, str]:
@@ -287,8 +327,8 @@ class TuningFit:
         said = [f"{outside} of {len(self.scan)} rows are beyond the limits."] if outside else []
         for plane, m in self.maps.items():
             bad = np.flatnonzero(np.asarray(m.posterior.bad) > 0.5)
-            rows = ", ".join(str(self.seen.measured(plane)[i] + 1) for i in bad)
-            said += [f"Bad readings of size {plane}: rows {rows}."] if rows else []
+            rows = ", ".join(str(m.readings.rows[i] + 1) for i in bad)
+            said += [f"Bad readings in {plane}: rows {rows}."] if rows else []
         return (*self.scan.notes, *said)
 
     def beam(self, settings: Mapping[str, Any]) -> dict[str, dict[str, TuningBand]]:
@@ -303,32 +343,34 @@ class TuningFit:
         -------
         dict of str to dict of str to TuningBand
             Plane to ``normalized_emittance`` (m), ``beta`` (m) and ``alpha`` at the start of the
-            line; "goal" to the first of what is tuned.
+            line; "goal" to the first of what is tuned. Of a table of emittances `kind` alone.
         """
         x = self._half_ranges(settings)
-        found = {"goal": {"normalized_emittance": self._goal_band(x)}}
-        boost = beta_gamma(self.seen.energy, self.seen.line.mass)
+        goal = self.unit * np.exp(np.asarray(values_at(self.draws, x)))
+        found = {"goal": {self.kind: TuningBand.of(goal)}}
         for plane, m in self.maps.items():
-            sigma = m.readings.coordinates.sigma(_even(numbers_at(m.posterior, x)))
-            emittance = np.sqrt(sigma[..., 0] * sigma[..., 2] - sigma[..., 1] ** 2)
-            found[plane] = {
-                "normalized_emittance": TuningBand.of(boost * emittance),
-                "beta": TuningBand.of(sigma[..., 0] / emittance),
-                "alpha": TuningBand.of(-sigma[..., 1] / emittance),
-            }
+            numbers = np.asarray(numbers_at(m.posterior, x))
+            emittance = m.readings.emittance * np.exp(numbers[..., 0])
+            found[plane] = {self.kind: TuningBand.of(self.boost * emittance)}
+            if m.readings.coordinates is not None:
+                sigma = m.readings.coordinates.sigma(_even(numbers))
+                found[plane]["beta"] = TuningBand.of(sigma[..., 0] / emittance)
+                found[plane]["alpha"] = TuningBand.of(-sigma[..., 1] / emittance)
         return found
 
     @cached_property
     def next(self) -> NextRow | None:
         """The row that tells most about the minimum; None where no quadrupole was moved."""
-        return next_row(self) if varied_magnets(self.seen.scan) else None
+        return next_row(self) if self.seen is None or varied_magnets(self.seen.scan) else None
 
     @property
     def next_words(self) -> str:
         """The next row in a sentence."""
         if self.next is None:
             return ""
-        units = self.units | setting_units(self.seen.scanned, self.seen.scan.settings)
+        units = self.units
+        if self.seen:
+            units = units | setting_units(self.seen.scanned, self.seen.scan.settings)
         words = in_words(self.next.settings, units, 5)
         return f"Measure next at {words}: this row tells most about the minimum."
 
@@ -339,9 +381,6 @@ class TuningFit:
         values = np.broadcast_arrays(*(np.atleast_1d(settings[n]) for n in self.knobs.names))
         return self.knobs.half_ranges(dict(zip(self.knobs.names, values, strict=True)))
 
-    def _goal_band(self, x: np.ndarray) -> TuningBand:
-        return TuningBand.of(self.normalized * np.exp(np.asarray(values_at(self.draws, x))))
-
     def to_json(self) -> dict[str, Any]:
         """Give the entry of ``results`` of the JSON contract."""
         found = {
@@ -350,13 +389,14 @@ class TuningFit:
             "goal": self.goal,
             "settings": self.place,
             "units": self.units,
-            "normalized_emittance": self.emittance,
+            self.kind: self.emittance,
             "minimum": self.minimum,
             "excess_95": float(np.quantile(self.excess, 1.0 - TOLD)),
             "within": self.within,
             "done": self.done,
             "at_limit": self.edge,
             "flat": self.flat,
+            "of_a_beam": self.of_a_beam,
             "rows": len(self.scan),
             "next": self.next,
         }
@@ -368,36 +408,10 @@ class TuningFit:
             [name, cell(q), cell(q.interval_words), percent(self.edge[name])]
             for name, q in self.place.items()
         ]
-        rows += [
-            [f"{self._goal} there", cell(self.emittance), cell(self.emittance.interval_words), ""],
-            [
-                "lowest between the limits",
-                cell(self.minimum),
-                cell(self.minimum.interval_words),
-                "",
-            ],
-        ]
+        lowest = {f"{self._goal} there": self.emittance, "lowest between the limits": self.minimum}
+        rows += [[name, cell(q), cell(q.interval_words), ""] for name, q in lowest.items()]
         head = ["", "value", "95 % interval", "at a limit"]
         return (Table(f"Best setting, from {len(self.scan)} rows", head, rows),)
-
-
-def course_of(fit: TuningFit, points: int = POINTS) -> list[tuple[int, Quantity]]:
-    """Emittance at the best setting, as the first rows of a table said it, and all of them.
-
-    Returns
-    -------
-    list of (int, Quantity)
-        Number of rows, and the normalised emittance at the setting that they say is best. Parts in
-        which too few magnet settings or no row within the limits stand are left out.
-    """
-    scan, found = fit.scan, []
-    for count in np.unique(np.linspace(FIRST, len(scan), points).astype(int))[:-1]:
-        limits = dict(zip(fit.knobs.names, np.stack(fit.knobs[1:3], -1), strict=True))
-        with suppress(InputError):
-            part = replace(scan, **scan.columns_at(range(count)), profiles=())
-            own = fit_tuning(part, fit.seen.line, limits, goal=fit.goal, noise=fit.seen.noise)
-            found.append((int(count), own.emittance))
-    return [*found, (len(scan), fit.emittance)]
 
 
 def _quantity(draws: np.ndarray, value: float | None, unit: str) -> Quantity:
@@ -414,6 +428,14 @@ def _even(numbers: jax.Array) -> np.ndarray:
     emittance, beta = np.exp(log_emittance), np.exp(log_beta)
     s11, s22 = emittance * beta, emittance * (1.0 + alpha**2) / beta
     return np.stack([s11 + s22, s11 - s22, -2.0 * emittance * alpha], -1)
+
+
+def _no_beam(fit: TuningFit) -> Finding | None:
+    """The sizes may be of no beam."""
+    if fit.of_a_beam > SURE:
+        return None
+    cause = f"The sizes are of no beam through this line ({percent(1.0 - fit.of_a_beam)})."
+    return Finding(Status.unidentified, cause, REMEDIES["sizes at random"])
 
 
 def _flat(fit: TuningFit) -> Finding | None:
@@ -448,4 +470,4 @@ def _found(fit: TuningFit) -> Finding:
 
 
 # In order of gravity.
-RULES = (_flat, _at_limit, _found)
+RULES = (_no_beam, _flat, _at_limit, _found)

@@ -104,7 +104,8 @@ def log_size(numbers: Array, w: Array, known: Array) -> Array:
     numbers : Array
         Shape (3,): ln ε, ln β, α.
     w : Array
-        Shape (2,): R11 and R12 in the coordinates.
+        Shape (3,): R11 and R12 in the coordinates, and 0; of an emittance, whose root stands for a
+        size, 0, 0 and 1.
     known : Array
         Size² that is not due to the beam.
 
@@ -114,9 +115,9 @@ def log_size(numbers: Array, w: Array, known: Array) -> Array:
 
     Examples
     --------
-    >>> float(log_size(jnp.zeros(3), jnp.array([3.0, 4.0]), jnp.array(0.0)) - jnp.log(5.0))
+    >>> float(log_size(jnp.zeros(3), jnp.array([3.0, 4.0, 0.0]), jnp.array(0.0)) - jnp.log(5.0))
     0.0
     """
     emittance, beta, alpha = jnp.exp(numbers[0]), jnp.exp(numbers[1]), numbers[2]
-    along = beta * (w[0] - w[1] * alpha / beta) ** 2 + w[1] ** 2 / beta
+    along = beta * (w[0] - w[1] * alpha / beta) ** 2 + w[1] ** 2 / beta + w[2]
     return 0.5 * jnp.log(emittance * along + known)

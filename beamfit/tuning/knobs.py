@@ -3,16 +3,92 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from typing import NamedTuple
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from os import PathLike
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from beamfit.emittance.scan import QuadScan
+from beamfit.emittance.scan import KNOB, QuadScan, first_unusable
 from beamfit.errors import InputError, nearest
 
 # What is made small: the geometric mean of the planes' emittances, or one of them.
 GOALS = ("emittance", "emittance_x", "emittance_y")
+
+
+@dataclass(frozen=True, eq=False)
+class EmittanceTable:
+    """Finished emittances at settings of knobs, from whole scans or a direct measurement.
+
+    Parameters
+    ----------
+    settings : mapping of str to array
+        Knob to settings, each of shape (n,).
+    emittance : mapping of str to array
+        Plane ("x", "y") to emittances in m; NaN where a row has none.
+    error : mapping of str to array, optional
+        Plane to standard errors in m. A plane left out has none: the fit infers them.
+    normalized : bool
+        Whether they are normalised.
+    name, path, sha256, provenance, notes, columns
+        As of a `beamfit.QuadScan`.
+
+    Raises
+    ------
+    InputError
+        If emittances or errors are not positive, or lengths differ.
+
+    Examples
+    --------
+    >>> table = EmittanceTable({"SOL": [190.0, 200.0]}, {"x": [8e-7, 7e-7]})
+    >>> table.planes, len(table)
+    (('x',), 2)
+    """
+
+    settings: Mapping[str, np.ndarray]
+    emittance: Mapping[str, np.ndarray]
+    error: Mapping[str, np.ndarray] = field(default_factory=dict)
+    normalized: bool = True
+    name: str = "table"
+    path: str | PathLike[str] | None = None
+    sha256: str | None = None
+    provenance: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+    columns: Mapping[str, str] = field(default_factory=dict)
+
+    error_source = "given"
+
+    def __post_init__(self) -> None:
+        for key in ("settings", "emittance", "error"):
+            arrays = {k: np.asarray(v, float) for k, v in getattr(self, key).items()}
+            object.__setattr__(self, key, arrays)
+            for name, values in arrays.items():
+                if values.shape != (len(self),):
+                    expected = f"{len(self)} numbers, one a row"
+                    raise self.unusable(f"shape {values.shape} of {name}", expected, name)
+                if key != "settings" and (wrong := first_unusable(values, blank=True)):
+                    raise self.unusable(wrong[1], f"a positive {key}", f"{key} {name}")
+
+    def __len__(self) -> int:
+        return len(next(iter(self.settings.values())))
+
+    @property
+    def planes(self) -> tuple[str, ...]:
+        """The planes that were measured."""
+        return tuple(p for p in "xy" if p in self.emittance)
+
+    @property
+    def units(self) -> dict[str, str]:
+        """Unit of each knob."""
+        return dict.fromkeys(self.settings, KNOB)
+
+    def columns_at(self, rows: Sequence[int]) -> dict[str, Any]:
+        """Select some rows: arguments of `EmittanceTable` by name."""
+        keys, at = ("settings", "emittance", "error"), list(rows)
+        return {key: {n: v[at] for n, v in getattr(self, key).items()} for key in keys}
+
+    unusable = QuadScan.unusable
 
 
 class Knobs(NamedTuple):
@@ -36,7 +112,7 @@ class Knobs(NamedTuple):
         return 0.5 * (self.low + self.high + x * (self.high - self.low))
 
 
-def knobs_of(scan: QuadScan, limits: Mapping[str, tuple[float, float]]) -> Knobs:
+def knobs_of(scan: QuadScan | EmittanceTable, limits: Mapping[str, tuple[float, float]]) -> Knobs:
     """Check the knobs of a scan and their limits.
 
     Raises
@@ -68,11 +144,12 @@ def knobs_of(scan: QuadScan, limits: Mapping[str, tuple[float, float]]) -> Knobs
     return Knobs(tuple(limits), low, high, tuple(scan.units[n] for n in limits))
 
 
-def planes_of(scan: QuadScan, goal: str) -> tuple[str, ...]:
+def planes_of(scan: QuadScan | EmittanceTable, goal: str) -> tuple[str, ...]:
     """Planes that a goal speaks of."""
     if goal not in GOALS:
         raise InputError(f"goal '{goal}'", nearest(str(goal), list(GOALS)))
     if goal == GOALS[0]:
         return scan.planes
-    scan.rows(goal[-1])  # says so if it was not measured
+    if goal[-1] not in scan.planes:
+        raise scan.unusable(f"nothing measured in plane {goal[-1]}", f"goal {GOALS[0]}")
     return (goal[-1],)

@@ -66,7 +66,7 @@ def _lowered(x: Array, value: object) -> Array:
         held = ((x >= 1.0) & (slope < 0.0)) | ((x <= -1.0) & (slope > 0.0))
         free = jnp.where(held, 0.0, 1.0)
         bend = bend * jnp.outer(free, free) + jnp.diag(1.0 - free)
-        size = jnp.abs(jnp.diag(bend)).max()
+        size = jnp.maximum(jnp.abs(jnp.diag(bend)).max(), 1e-30)  # of a level map 0
         values, vectors = jnp.linalg.eigh(bend)
         along = vectors.T @ (slope * free)
         curved = jnp.abs(values) + (DAMPED[:, None] + 1e-9) * size
@@ -89,6 +89,8 @@ class Minima(NamedTuple):
 def minima_of(draws: Emittances, knobs: int) -> Minima:
     """Search the lowest value of every draw between the limits, and of the mean of all.
 
+    A draw that no knob changes has its minimum at a setting drawn at random.
+
     Parameters
     ----------
     draws : Emittances
@@ -107,11 +109,13 @@ def minima_of(draws: Emittances, knobs: int) -> Minima:
     def mean(x: Array) -> Array:
         return jnp.mean(jax.vmap(lambda draw: _of_draw(x, draw, orders))(draws))
 
-    def lowest(draw: Emittances, first: Array) -> tuple[Array, Array]:
-        x = _lowered(first, lambda x: _of_draw(x, draw, orders))
+    def lowest(draw: Emittances, first: Array, anywhere: Array) -> tuple[Array, Array]:
+        still = sum(s.amplitude[0] for s in draw.scales) == 0.0
+        x = jnp.where(still, anywhere, _lowered(first, lambda x: _of_draw(x, draw, orders)))
         return _of_draw(x, draw, orders), x
 
-    value, place = jax.vmap(lowest)(draws, begin[jnp.argmin(every, axis=1)])
+    anywhere = jax.random.uniform(jax.random.key(0), (len(every), knobs), minval=-1.0)
+    value, place = jax.vmap(lowest)(draws, begin[jnp.argmin(every, axis=1)], anywhere)
     return Minima(value, place, _lowered(begin[jnp.argmin(every.mean(0))], mean))
 
 

@@ -40,7 +40,7 @@ class PlaneMap(NamedTuple):
 class Tuned(Protocol):
     """Parts of a `TuningFit` that advice rests on."""
 
-    seen: Seen
+    seen: Seen | None
     knobs: Knobs
     maps: dict[str, PlaneMap]
     draws: Emittances
@@ -80,10 +80,12 @@ def next_row(fit: Tuned, magnets: Mapping[str, tuple[float, float]] | None = Non
     >>> NextRow({"SOL": 200.0, "Q": 3.0}, 0.5).settings["SOL"]
     200.0
     """
-    scan = fit.seen.scan
-    if not scan.settings:
-        raise InputError("rows without a quadrupole", "settings of one, to choose the next of")
-    tables = candidate_settings(scan.settings, magnets or _scanned(scan.settings))
+    tables = [("", {})]  # an emittance needs no quadrupole
+    if fit.seen is not None:
+        settings = fit.seen.scan.settings
+        if not settings:
+            raise InputError("rows without a quadrupole", "settings of one, to choose the next of")
+        tables = candidate_settings(settings, magnets or _scanned(settings))
     x = np.concatenate(
         [settings_within(len(fit.knobs.names), POWER), fit.minima.place[:PLACES],
          fit.minima.best[None]]
@@ -109,21 +111,35 @@ def _told(
     fit: Tuned, x: np.ndarray, table: Mapping[str, np.ndarray], goal: np.ndarray
 ) -> np.ndarray:
     """Nats that sizes at knobs ``x`` and magnets tell of the goal, shape (settings, magnets)."""
-    seen, count = fit.seen, len(next(iter(table.values())))
-    energy, place = np.full(count, seen.energy), seen.rows.places[-1]
-    every = elements_at(seen, seen.scanned, table, place, energy)
-    told = np.zeros((len(x), count))
-    on_screen = np.ones((len(x), count), bool)
-    for plane, (readings, posterior) in fit.maps.items():
-        c = readings.coordinates
-        r11, r12, known = every["xy".index(plane)]
-        w = np.stack([r11, r12], -1) @ c.back
-        drawn = np.asarray(_log_sizes(posterior, x, w, known / c.unit**2))
+    through = _through(fit, table)
+    told = np.zeros((len(x), len(next(iter(through.values()))[1])))
+    on_screen = np.ones(told.shape, bool)
+    for plane, (w, known) in through.items():
+        readings, posterior = fit.maps[plane]
+        drawn = np.asarray(_log_sizes(posterior, x, w, known))
         there = np.asarray(readings.readings.there) > 0
         error = max(fit.maps[plane].noise, SHARPEST)
         told += _information(drawn.reshape(len(drawn), -1), goal, error).reshape(told.shape)
-        on_screen &= drawn.mean(0) <= np.asarray(readings.readings.y)[there].max()
+        if fit.seen is not None:
+            on_screen &= drawn.mean(0) <= np.asarray(readings.readings.y)[there].max()
     return np.where(on_screen, told, -1.0)
+
+
+def _through(
+    fit: Tuned, table: Mapping[str, np.ndarray]
+) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """R11, R12 and what is known at settings of the magnets, as for `log_size`, by plane."""
+    seen = fit.seen
+    if seen is None:
+        return dict.fromkeys(fit.maps, (np.array([[0.0, 0.0, 1.0]]), np.zeros(1)))
+    energy = np.full(len(next(iter(table.values()))), seen.energy)
+    every = elements_at(seen, seen.scanned, table, seen.rows.places[-1], energy)
+    found = {}
+    for plane, (readings, _) in fit.maps.items():
+        c, (r11, r12, known) = readings.coordinates, every["xy".index(plane)]
+        w = np.stack([r11, r12], -1) @ c.back
+        found[plane] = np.column_stack([w, np.zeros(len(w))]), known / c.unit**2
+    return found
 
 
 @jax.jit

@@ -33,7 +33,7 @@ class KnobReadings(NamedTuple):
     x : Array
         Shape (n, knobs), in half ranges.
     w, known : Array
-        Shape (n, 2) and (n,): as for `log_size`.
+        Shape (n, 3) and (n,): as for `log_size`.
     y : Array
         ln of the size.
     floor, unit : Array
@@ -59,7 +59,7 @@ class KnobReadings(NamedTuple):
 
 
 class MapPosterior(NamedTuple):
-    """Draws of a plane's map, with the logarithms of the evidences of it and of no change.
+    """Draws of a plane's map, with the logarithm of its evidence.
 
     Attributes
     ----------
@@ -67,8 +67,8 @@ class MapPosterior(NamedTuple):
         Of each draw, arrays (d, ...).
     coefficients : Array
         Shape (d, n): in prior standard deviations, as `design` multiplies them.
-    log_evidence, log_flat : Array
-        Of a map, and of one whose emittance is the same at all knobs.
+    log_evidence : Array
+        Of the sizes, all scales averaged over.
     bad, model : Array
         Shape (rows,): probability of a bad reading, fitted ln size.
     error : Array
@@ -78,7 +78,6 @@ class MapPosterior(NamedTuple):
     scales: KnobScales
     coefficients: Array
     log_evidence: Array
-    log_flat: Array
     bad: Array
     model: Array
     error: Array
@@ -213,7 +212,7 @@ def _fitted(
         found = jax.vmap(lambda each: _log_evidence(each, by, orders))(tried)
         return tried[jnp.argmax(jnp.nan_to_num(found, nan=-jnp.inf))]
 
-    def settled(state: _Peak) -> tuple[_Peak, _Linear]:
+    def settled(state: _Peak) -> tuple[_Peak, _Linear, Array]:
         v = _settled(data, state, varies, orders)
         scales = scales_of(state.eta, varies)
         u = _numbers_at(data, scales, orders) @ v
@@ -222,27 +221,30 @@ def _fitted(
         doubt = jnp.exp(jnp.minimum(0.5 * pull * (1.0 - narrower), 500.0))
         doubt = doubt * data.odds / data.wide
         good = jnp.where(data.there > 0, (1.0 + doubt * narrower) / (1.0 + doubt), 1.0)
-        return _Peak(v, state.eta, good), _linear(data, u, good, varies)
+        # ln of good and bad readings together, over the normal density in their place.
+        both = jnp.log1p(doubt) - jnp.log1p(data.odds) - 0.5 * (pull * (1.0 - good) + jnp.log(good))
+        beside = jnp.sum(data.there * both)
+        return _Peak(v, state.eta, good), _linear(data, u, good, varies), beside
 
     def round_of(state: _Peak, _: None) -> tuple[_Peak, None]:
-        state, by = settled(state)
+        state, by, _ = settled(state)
         eta = jax.lax.fori_loop(0, NEWTON, lambda _, e: newton(e, by), state.eta)
         return state._replace(eta=eta), None
 
     state = _Peak(start, mean, jnp.ones(len(data.y)))
-    state, by = settled(jax.lax.scan(round_of, state, length=ROUNDS)[0])
+    state, by, beside = settled(jax.lax.scan(round_of, state, length=ROUNDS)[0])
     root = jnp.linalg.cholesky(jnp.linalg.inv(_scoring(state.eta, by, orders)[1]))
-    whole = _log_evidence(state.eta, by, orders) + 0.5 * len(mean) * LN_2PI
+    whole = _log_evidence(state.eta, by, orders) + beside + 0.5 * len(mean) * LN_2PI
     return state, by, whole + jnp.sum(jnp.log(jnp.diag(root))), root
 
 
-def _draw(key: Array, data: KnobReadings, state: _Peak, orders: np.ndarray) -> Array:
+def _draw(key: Array, data: KnobReadings, state: _Peak, varies: Array, orders: np.ndarray) -> Array:
     """A draw of the map at given scales: a prior draw, corrected by the readings.
 
     J. T. Wilson et al., Pathwise conditioning of Gaussian processes, J. Mach. Learn. Res. 22 (2021)
     105, with the sizes linear about the best map.
     """
-    scales = scales_of(state.eta, jnp.ones(()))
+    scales = scales_of(state.eta, varies)
     every = _numbers_at(data, scales, orders)
     a = jnp.einsum("ij,ijk->ik", _slopes(data, every @ state.v)[1], every)
     variance = _variance(data, scales.noise, state.good)
@@ -257,7 +259,7 @@ def _draw(key: Array, data: KnobReadings, state: _Peak, orders: np.ndarray) -> A
 def map_posterior(
     data: KnobReadings, start: Array, seed: Array, knobs: int, draws: int
 ) -> MapPosterior:
-    """Draw maps of a plane's beam from their posterior.
+    """Draw maps of a plane's beam from their posterior, with an emittance that varies or not.
 
     Parameters
     ----------
@@ -270,6 +272,12 @@ def map_posterior(
     knobs, draws : int
         How many.
 
+    Returns
+    -------
+    MapPosterior
+        Every array with a first axis of two: an emittance that varies with the knobs, and one that
+        none of them changes.
+
     Notes
     -----
     The map is a Gaussian process of each number of the beam, the sizes are linear about the best
@@ -277,28 +285,51 @@ def map_posterior(
     distribution about their best and weighed by the evidence, as D. J. C. MacKay, Information
     Theory, Inference, and Learning Algorithms (2003), sect. 29.2.
     """
-    orders, one = orders_of(knobs), jnp.ones(())
+    orders = orders_of(knobs)
     first = jnp.zeros((NUMBERS, 1 + len(orders))).at[:, 0].set(start / MEAN).ravel()
-    both = jax.lax.map(lambda varies: _fitted(data, first, varies, orders), jnp.array([1.0, 0.0]))
-    (state, by, log_evidence, root), log_flat = jax.tree.map(lambda v: v[0], both), both[2][1]
     of_sets, of_choice, of_draws = jax.random.split(jax.random.key(seed), 3)
-    z = jax.random.normal(of_sets, (SETS, len(state.eta))).at[0].set(0.0)
-    eta = state.eta + z @ root.T
-    log = jax.vmap(lambda e: _log_evidence(e, by, orders))(eta)
-    weight = jax.nn.softmax(jnp.nan_to_num(log, nan=-jnp.inf) + 0.5 * jnp.sum(z**2, axis=1))
-    # Systematic resampling: every set as often as its weight says, up to one.
-    at = (jax.random.uniform(of_choice) + jnp.arange(draws)) / draws
-    chosen = jnp.minimum(jnp.searchsorted(jnp.cumsum(weight), at), SETS - 1)
-    settled = jax.vmap(lambda e: _settled(data, state._replace(eta=e), one, orders))(eta)
-    coefficients = jax.vmap(
-        lambda key, i: _draw(key, data, _Peak(settled[i], eta[i], state.good), orders)
-    )(jax.random.split(of_draws, draws), chosen)
-    error = jnp.sqrt(_variance(data, jnp.exp(state.eta[-1]), 1.0))
-    u = _numbers_at(data, scales_of(state.eta, one), orders) @ state.v
-    model = _slopes(data, u)[0]
-    scales = jax.vmap(lambda e: scales_of(e, one))(eta[chosen])
-    bad = 1.0 - (state.good - data.wide**-2) / (1.0 - data.wide**-2)
-    return MapPosterior(scales, coefficients, log_evidence, log_flat, bad, model, error)
+
+    def drawn(varies: Array) -> MapPosterior:
+        state, by, log_evidence, root = _fitted(data, first, varies, orders)
+        z = jax.random.normal(of_sets, (SETS, len(state.eta))).at[0].set(0.0)
+        eta = state.eta + z @ root.T
+        log = jax.vmap(lambda e: _log_evidence(e, by, orders))(eta)
+        weight = jax.nn.softmax(jnp.nan_to_num(log, nan=-jnp.inf) + 0.5 * jnp.sum(z**2, axis=1))
+        # Systematic resampling: every set as often as its weight says, up to one.
+        at = (jax.random.uniform(of_choice) + jnp.arange(draws)) / draws
+        chosen = jnp.minimum(jnp.searchsorted(jnp.cumsum(weight), at), SETS - 1)
+        settled = jax.vmap(lambda e: _settled(data, state._replace(eta=e), varies, orders))(eta)
+        coefficients = jax.vmap(
+            lambda key, i: _draw(key, data, _Peak(settled[i], eta[i], state.good), varies, orders)
+        )(jax.random.split(of_draws, draws), chosen)
+        error = jnp.sqrt(_variance(data, jnp.exp(state.eta[-1]), 1.0))
+        u = _numbers_at(data, scales_of(state.eta, varies), orders) @ state.v
+        scales = jax.vmap(lambda e: scales_of(e, varies))(eta[chosen])
+        bad = 1.0 - (state.good - data.wide**-2) / (1.0 - data.wide**-2)
+        return MapPosterior(scales, coefficients, log_evidence, bad, _slopes(data, u)[0], error)
+
+    return jax.lax.map(drawn, jnp.array([1.0, 0.0]))
+
+
+def mixed(both: MapPosterior, still: np.ndarray) -> MapPosterior:
+    """Take draws of the map that varies, and where ``still`` of the one that does not.
+
+    Parameters
+    ----------
+    both : MapPosterior
+        From `map_posterior`.
+    still : ndarray of bool
+        Shape (d,). Fitted sizes and errors are of the model that most draws have.
+    """
+    most = int(still.mean() > 0.5)
+
+    def each(v: np.ndarray) -> np.ndarray:
+        v = np.asarray(v)
+        return np.where(still.reshape(-1, *[1] * (v.ndim - 2)), v[1], v[0])
+
+    scales, coefficients = jax.tree.map(each, (both.scales, both.coefficients))
+    rest = (np.asarray(v)[most] for v in both[2:])
+    return MapPosterior(scales, coefficients, *rest)
 
 
 @jax.jit

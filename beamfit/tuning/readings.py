@@ -9,20 +9,22 @@ from typing import NamedTuple
 import numpy as np
 
 from beamfit.emittance.beam_draws import Coordinates, coordinates
-from beamfit.emittance.comparison import PlaneSizes
+from beamfit.emittance.comparison import LEVEL, STEPS
 from beamfit.emittance.known import one_by_one, plane_sizes, prepared, unfitted
 from beamfit.emittance.scan import QuadScan
 from beamfit.emittance.statement import Seen
 from beamfit.emittance.transport import look_through
 from beamfit.greybox.problem import padded_length
-from beamfit.noise.model import Noise
+from beamfit.noise.model import LN_2PI, Noise
 from beamfit.noise.sizes import kinds_of
 from beamfit.optics.beamline import Beamline
-from beamfit.tuning.knobs import Knobs
+from beamfit.tuning.knobs import EmittanceTable, Knobs
 from beamfit.tuning.posterior import KnobReadings
 
 # A beam to begin with where no constant one fits: ln of its emittance in the coordinates.
 BEGIN = np.array([-1.0, 0.0, 0.0])
+# Nodes over ln of the scale of the noise, in standard deviations of its prior.
+NODES = np.linspace(-2.5, 2.5, 11)
 
 
 def seen_without(scan: QuadScan, line: Beamline | None, knobs: Knobs, noise: Noise | None) -> Seen:
@@ -33,16 +35,27 @@ def seen_without(scan: QuadScan, line: Beamline | None, knobs: Knobs, noise: Noi
 
 
 class PlaneReadings(NamedTuple):
-    """Readings of a plane, the coordinates they are in, and a beam to begin with, shape (3,)."""
+    """Readings of a plane, a beam to begin with, and what they are in.
+
+    Attributes
+    ----------
+    readings : KnobReadings
+        Padded.
+    start : ndarray
+        Shape (3,): numbers of a beam.
+    emittance : float
+        The emittance of which a map has the logarithm, m.
+    rows : ndarray
+        Rows of the table in which the plane was measured.
+    coordinates : Coordinates or None
+        Of the beam; None of emittances.
+    """
 
     readings: KnobReadings
-    coordinates: Coordinates
     start: np.ndarray
-
-    @property
-    def emittance(self) -> float:
-        """The emittance of which a map has the logarithm, m."""
-        return float(abs(np.linalg.det(self.coordinates.back)) * self.coordinates.unit**2)
+    emittance: float
+    rows: np.ndarray
+    coordinates: Coordinates | None = None
 
 
 def plane_readings(
@@ -63,28 +76,66 @@ def plane_readings(
             "rows at three or more settings of a quadrupole",
             f"size_{plane}",
         )
-    floor, unit, noise = _relative_noise(sizes, seen.noise)
-    x = knobs.half_ranges(settings)[seen.measured(plane)]
-    n = len(x)
+    noise = _relative_noise(sizes.size, sizes.error, sizes.of_shots, seen.noise)
+    rows = np.asarray(seen.measured(plane))
+    x, w = knobs.half_ranges(settings)[rows], np.column_stack([c.w, np.zeros(len(rows))])
+    readings = _padded(x, w, c.known, np.log(c.size), noise, seen.noise)
+    emittance = float(abs(np.linalg.det(c.back)) * c.unit**2)
+    return PlaneReadings(readings, _constant_beam(c), emittance, rows, c)
+
+
+def emittance_readings(
+    table: EmittanceTable, plane: str, knobs: Knobs, noise: Noise
+) -> PlaneReadings:
+    """The emittances of a plane, whose roots stand for sizes; stated errors are at least as large.
+
+    Examples
+    --------
+    >>> from beamfit.tuning.knobs import knobs_of
+    >>> table = EmittanceTable({"SOL": [0.0, 1.0]}, {"x": [4e-7, 9e-7]}, {"x": [4e-8, 9e-8]})
+    >>> found = emittance_readings(table, "x", knobs_of(table, {"SOL": (0.0, 1.0)}), Noise())
+    >>> float(np.diff(found.readings.y[:2])[0].round(3)), round(1e7 * found.emittance, 3)
+    (0.405, 6.0)
+    """
+    rows = np.flatnonzero(~np.isnan(table.emittance[plane]))
+    value, error = table.emittance[plane][rows], table.error.get(plane)
+    floor, unit, prior = _relative_noise(
+        value, error if error is None else error[rows], False, noise
+    )
+    log, w = 0.5 * np.log(value), np.tile([0.0, 0.0, 1.0], (len(rows), 1))
+    x, own = knobs.half_ranges(table.settings)[rows], (0.5 * floor, 0.5 * unit, prior)
+    readings = _padded(x, w, np.zeros(len(rows)), log - log.mean(), own, noise)
+    return PlaneReadings(readings, np.zeros(3), math.exp(2.0 * log.mean()), rows)
+
+
+def _padded(
+    x: np.ndarray,
+    w: np.ndarray,
+    known: np.ndarray,
+    y: np.ndarray,
+    own: tuple[np.ndarray, np.ndarray, np.ndarray],
+    noise: Noise,
+) -> KnobReadings:
+    """Readings with their own floor, unit and prior of the errors, of a length that others have."""
+    n, bad = len(x), noise.of_points(len(x)).bad
 
     def filled(values: np.ndarray, fill: float = 0.0) -> np.ndarray:
         more = [(0, padded_length(n) - n)] + [(0, 0)] * (values.ndim - 1)
         return np.pad(values, more, constant_values=fill)
 
-    bad = seen.noise.of_points(n).bad
-    readings = KnobReadings(
-        filled(x), filled(c.w), filled(c.known, 1.0), filled(np.log(c.size)), filled(floor, 1.0),
-        filled(unit), filled(np.ones(n)), noise, np.float64(bad / (1.0 - bad)),
-        np.float64(seen.noise.width),
+    return KnobReadings(
+        filled(x), filled(w), filled(known, 1.0), filled(y), filled(own[0], 1.0), filled(own[1]),
+        filled(np.ones(n)), own[2], np.float64(bad / (1.0 - bad)), np.float64(noise.width),
     )  # fmt: skip
-    return PlaneReadings(readings, c, _constant_beam(c))
 
 
-def _relative_noise(sizes: PlaneSizes, noise: Noise) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _relative_noise(
+    size: np.ndarray, error: np.ndarray | None, of_shots: bool, noise: Noise
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Relative floor and unit of the errors, and the prior of ln of the scale of the unit."""
-    floor = sizes.error if sizes.of_shots else None
-    kind = kinds_of(noise, sizes.size, None if sizes.of_shots else sizes.error, floor)[0]
-    share = 1.0 if kind.power else sizes.size
+    floor = error if of_shots else None
+    kind = kinds_of(noise, size, None if of_shots else error, floor)[0]
+    share = 1.0 if kind.power else size
     floor, unit, middle = kind.floor / share, kind.unit / share, kind.prior.middle
     if kind.least:
         # Stated errors are a floor; with the scatter beside them they are larger by the factor.
@@ -102,3 +153,31 @@ def _constant_beam(c: Coordinates) -> np.ndarray:
         return BEGIN
     emittance = math.sqrt(square)
     return np.array([math.log(emittance), math.log(s11 / emittance), -s12 / emittance])
+
+
+def log_no_beam(data: KnobReadings) -> float:
+    """Log evidence of sizes that are of no beam: the same at all settings, or at random.
+
+    Notes
+    -----
+    ln of a size is a level with steps of one size about it, as of scans (docs/verdict_constants.md)
+    or none; steps and noise are averaged over.
+
+    Examples
+    --------
+    >>> one, none = np.ones(2), np.zeros(2)
+    >>> data = KnobReadings(none, none, none, none, none, one, one, np.log([1e-3, 2.0]), 0.0, 1.0)
+    >>> log_no_beam(data) < 0.0
+    True
+    """
+    here = data.there > 0
+    y, floor, unit = data.y[here], data.floor[here], data.unit[here]
+    scale = np.exp(data.noise[0] + data.noise[1] * NODES)[:, None]
+    noise = floor**2 + (scale * unit) ** 2
+    variance = np.append(0.0, STEPS)[:, None, None] ** 2 + noise
+    weight, own = (1.0 / variance).sum(-1) + LEVEL**-2, (y / variance).sum(-1)
+    log = -0.5 * ((y**2 / variance + np.log(variance) + LN_2PI).sum(-1) - own**2 / weight)
+    log -= 0.5 * np.log(weight * LEVEL**2)
+    prior = -0.5 * NODES**2
+    prior -= np.logaddexp.reduce(prior) + math.log(len(variance))
+    return float(np.logaddexp.reduce((log + prior).ravel()))

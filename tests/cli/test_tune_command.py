@@ -40,7 +40,7 @@ def test_the_answer_as_json(run):
         (("--vary", "SOL=1:2"), "limits 1:2 of SOL, which was set from 190"),
         (("--vary", "SOL=210:190", *KNOBS[2:]), "limits 210:190 of SOL; expected two numbers"),
         (KNOBS[2:], f"{TABLE}: column 'SOL_A': no magnet 'SOL' in the lattice"),
-        ((*KNOBS, "--goal", "emittance_y"), "no sizes in plane y"),
+        ((*KNOBS, "--goal", "emittance_y"), "nothing measured in plane y"),
         ((*KNOBS, "--close", "none"), "none"),
     ],
 )
@@ -56,3 +56,45 @@ def test_a_wrong_cell_is_named_by_its_line_and_the_header_of_the_file(run, tmp_p
     status, _, err = run("tune", table, "--lattice", LATTICE, "--vary", "phase_deg=0:3")
     assert status == 2
     assert "table.csv:3: column 'phase_deg': 'x'; expected a number" in err
+
+
+def emittances(folder, word="normalized_emittance", unit="um"):
+    rows = [(190, 1.05), (195, 0.8), (200, 0.72), (205, 0.85), (210, 1.2), (198, 0.74), (193, 0.9)]
+    head = f"SOL_A,{word}_x_{unit},{word}_x_error_{unit},when"
+    table = folder / "emittances.csv"
+    table.write_text("\n".join([head, *(f"{a},{e},0.03,noon" for a, e in rows)]) + "\n")
+    return table
+
+
+def test_a_table_of_emittances_needs_no_lattice(run, tmp_path):
+    table, page = emittances(tmp_path), tmp_path / "tune.html"
+    vary = ("--vary", "SOL=190:210")
+    status, out, err = run("tune", table, *vary, "--report", page)
+    assert (status, err) == (0, "")
+    assert out.strip().startswith("converged: normalised emittance 0.7")
+    assert "course of the best emittance" in page.read_text()
+    status, out, _ = run("tune", emittances(tmp_path, "emittance", "nm"), *vary, "--json")
+    [result] = json.loads(out)["results"]
+    assert result["emittance"]["value"] == pytest.approx(0.72e-9, rel=0.05)
+    assert list(result["next"]["settings"]) == ["SOL"]
+    status, _, err = run("tune", table, *vary, "--lattice", LATTICE)
+    assert status == 2
+    assert "--lattice beside finished emittances" in err
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("0.72", "-1", ":4: column 'normalized_emittance_x_um': '-1'; expected a positive number"),
+        ("0.72", "x", ":4: column 'normalized_emittance_x_um': 'x'; expected a number"),
+        ("200,", "x,", ":4: column 'SOL_A': 'x'; expected a number"),
+        ("x_um", "x_furlong", "unit"),
+        (",when", ",emittance_y_um", "emittances, and normalized emittances"),
+    ],
+)
+def test_a_bad_table_of_emittances_is_named(run, tmp_path, old, new, said):
+    table = emittances(tmp_path)
+    table.write_text(table.read_text().replace(old, new, 1))
+    status, _, err = run("tune", table, "--vary", "SOL=190:210")
+    assert status == 2
+    assert said in err

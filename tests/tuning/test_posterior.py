@@ -5,23 +5,25 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.optimize import differential_evolution
-from scipy.stats import multivariate_normal, norm
+from scipy.stats import kstest, multivariate_normal, norm, uniform
 
+from beamfit.emittance.comparison import STEPS
 from beamfit.tuning import posterior as of
 from beamfit.tuning.knob_map import MEAN, design, features, log_size, orders_of
-from beamfit.tuning.minimum import _of_draw, emittances_of, minima_of
+from beamfit.tuning.minimum import _of_draw, emittances_of, minima_of, values_at
+from beamfit.tuning.readings import log_no_beam
 
 RNG = np.random.default_rng(3)
 COUNT, KNOBS = 24, 2
 X = RNG.uniform(-1, 1, (COUNT, KNOBS))
-W = RNG.normal(size=(COUNT, 2))
+W = np.column_stack([RNG.normal(size=(COUNT, 2)), np.zeros(COUNT)])
 NUMBERS = np.stack([-1.0 + 0.5 * (X**2).sum(1), 0.5 * X[:, 0], 0.3 * X[:, 1]], -1)
 
 
 def size_by_matrix(numbers, w):
     emittance, beta, alpha = np.exp(numbers[0]), np.exp(numbers[1]), numbers[2]
     sigma = emittance * np.array([[beta, -alpha], [-alpha, (1 + alpha**2) / beta]])
-    return np.sqrt(w @ sigma @ w)
+    return np.sqrt(w[:2] @ sigma @ w[:2])
 
 
 @pytest.fixture(scope="module")
@@ -37,7 +39,12 @@ def data():
 
 @pytest.fixture(scope="module")
 def found(data):
-    return of.map_posterior(data, np.array([-1.0, 0.0, 0.0]), 1, KNOBS, 256)
+    return varying(data)
+
+
+def varying(data):
+    both = of.map_posterior(data, np.array([-1.0, 0.0, 0.0]), 1, KNOBS, 256)
+    return of.mixed(both, np.zeros(256, bool))
 
 
 def kernel(a, b, length):
@@ -111,7 +118,7 @@ def test_draws_have_the_mean_and_spread_of_gaussian_regression(data):
     at = np.asarray(design(jnp.array([0.2, -0.4]), scales, orders))
     mean, covariance = at @ gain @ by.off, at @ (np.eye(a.shape[1]) - gain @ a) @ at.T
     keys = jax.random.split(jax.random.key(2), 4000)
-    drawn = np.asarray(jax.vmap(lambda key: of._draw(key, data, state, orders))(keys)) @ at.T
+    drawn = np.asarray(jax.vmap(lambda key: of._draw(key, data, state, one, orders))(keys)) @ at.T
     assert np.allclose(drawn.mean(0), mean, atol=0.02)
     assert np.allclose(np.cov(drawn.T), covariance, rtol=0.15, atol=0.005)
 
@@ -120,7 +127,7 @@ def test_padding_changes_nothing(data, found):
     pad = [np.pad(v, [(0, 8)] + [(0, 0)] * (v.ndim - 1)) for v in data[:7]]
     known, floor = (np.pad(v, (0, 8), constant_values=1.0) for v in (data.known, data.floor))
     longer = of.KnobReadings(*pad, *data[7:])._replace(known=known, floor=floor)
-    other = of.map_posterior(longer, np.array([-1.0, 0.0, 0.0]), 1, KNOBS, 256)
+    other = varying(longer)
     assert float(other.log_evidence) == pytest.approx(float(found.log_evidence), abs=1e-4)
     assert np.allclose(other.model[:COUNT], found.model, atol=1e-4)
 
@@ -128,7 +135,7 @@ def test_padding_changes_nothing(data, found):
 def test_a_bad_reading_is_found_and_moves_little(data, found):
     y = data.y.copy()
     y[5] += 1.5
-    moved = of.map_posterior(data._replace(y=y), np.array([-1.0, 0.0, 0.0]), 1, KNOBS, 256)
+    moved = varying(data._replace(y=y))
     assert moved.bad[5] > 0.95
     assert np.delete(np.asarray(moved.bad), 5).max() < 0.5
     assert np.abs(np.delete(np.asarray(moved.model - found.model), 5)).max() < 0.1
@@ -148,3 +155,30 @@ def test_scales_have_an_amplitude_of_no_emittance_where_nothing_varies():
     eta = jnp.log(jnp.array([1.0, 2.0, 3.0, 4.0]))
     found = of.scales_of(jnp.append(jnp.zeros(2), eta), jnp.zeros(()))
     assert np.allclose(np.concatenate(list(map(np.ravel, found))), [1, 1, 0, 2, 3, 4])
+
+
+def test_draws_of_a_map_that_no_knob_changes_stand_where_they_are_wanted(data):
+    both = of.map_posterior(data, np.array([-1.0, 0.0, 0.0]), 1, KNOBS, 256)
+    still = np.arange(256) % 4 == 0
+    found = emittances_of([of.mixed(both, still)])
+    values = np.asarray(values_at(found, X))
+    assert np.all(np.ptp(values[still], axis=1) < 1e-12)
+    assert np.all(np.ptp(values[~still], axis=1) > 1e-3)
+    place = np.asarray(minima_of(found, KNOBS).place)[still]
+    assert kstest(place.ravel(), uniform(-1, 2).cdf).pvalue > 1e-3
+    level = minima_of(emittances_of([of.mixed(both, np.ones(256, bool))]), KNOBS)
+    assert np.isfinite(np.asarray(level.best)).all()
+
+
+def test_the_evidence_of_no_beam_is_the_integral_of_its_likelihood(data):
+    """By summing over levels, steps and noise: a level of ln size with independent errors."""
+    nodes, levels = np.linspace(-2.5, 2.5, 11), np.linspace(-8.0, 8.0, 4001)
+    scales = np.exp(data.noise[0] + data.noise[1] * nodes)
+    weights = np.exp(-0.5 * nodes**2) / np.exp(-0.5 * nodes**2).sum()
+    whole = 0.0
+    for step in [0.0, *STEPS]:
+        for scale, weight in zip(scales, weights, strict=True):
+            deviation = np.sqrt(step**2 + data.floor**2 + scale**2)
+            log = norm.logpdf(data.y, levels[:, None], deviation).sum(-1)
+            whole += weight * np.exp(log + norm.logpdf(levels)).sum() * (levels[1] - levels[0]) / 7
+    assert log_no_beam(data) == pytest.approx(np.log(whole), abs=1e-6)
