@@ -48,6 +48,9 @@ MOST_CAUSES, SMALLEST = 30, 5e-4
 RESOLUTION, DISPERSION, SPREAD = 10e-6, 0.01, 1e-3
 # What saturation, space charge or a pedestal add to every size², told at the smallest size.
 AT_WAIST = 0.05
+# What moves within a scan unseen: the energy from the first row to the last, and by how much of
+# each step a field is late.
+DRIFT, LATE = 0.01, 0.1
 
 
 class BudgetChange(NamedTuple):
@@ -103,9 +106,10 @@ def systematics(fit: EmittanceFit, plane: str) -> list[BudgetChange]:
         magnet, scanned or not, of the angle of each bend, of the energy and of the screen's scale;
         for +1 cm of each drift; for 10 µm of resolution and 1 cm of dispersion of the incoming beam
         (of the line's momentum spread, or 0.1 % where it has none) that were not thought of; for
-        what saturation, space charge or a pedestal add to size² at the waist. First
-        order: exact derivatives (through transport, and through the minimum by the implicit
-        function theorem) times the step.
+        what saturation, space charge or a pedestal add to size² at the waist; for an energy that
+        rises by 1 % from the first row to the last, and magnets whose fields are late by a tenth
+        of each step from row to row. First order: exact derivatives (through transport, and through
+        the minimum by the implicit function theorem) times the step.
 
     Examples
     --------
@@ -133,7 +137,8 @@ def systematics(fit: EmittanceFit, plane: str) -> list[BudgetChange]:
     sigma = np.array([q.value for q in result.sigma])
     line = fit.seen.scanned.stored_by_kind((*rows.settings, *rows.places))
     upright = np.array(plane == "y")
-    by_parts, by_energy, by_known = _slopes(replace(rows, line=line), upright, sigma, size, noise)
+    slopes = _slopes(replace(rows, line=line), upright, sigma, size, noise)
+    by_parts, by_energy, by_known, *by_row = slopes
     changes = {_magnet_cause(fit, name): 0.0 for name in rows.settings}
     upstream = {e.name for e in fit.seen.scanned.upto(result.screen.name).elements}
     for element, slope in _by_element(fit.seen.scanned, line, by_parts):
@@ -142,6 +147,7 @@ def systematics(fit: EmittanceFit, plane: str) -> list[BudgetChange]:
             changes[cause] = changes.get(cause, 0.0) + step * float(slope)
     energy, mass = fit.seen.energy, fit.line.mass
     changes[of_energy := _energy_cause(energy, mass)] = 0.01 * float(by_energy)
+    changes |= _within_scan(fit.seen.rows, len(fit.scan), *by_row)
     changes |= _of_screen(fit, p, np.asarray(by_known)[keep])
     # ln βγ rises by E²/(E² - m²) for each relative step of the energy.
     stiffer = 0.01 * energy**2 / (energy**2 - mass**2)
@@ -149,6 +155,23 @@ def systematics(fit: EmittanceFit, plane: str) -> list[BudgetChange]:
     whole = {cause: d if abs(d) > ROUNDING else 0.0 for cause, d in changes.items()}
     found = [BudgetChange(c, d, d + stiffer * (c == of_energy)) for c, d in whole.items()]
     return sorted(found, key=lambda change: -abs(change.normalized_emittance))
+
+
+def _within_scan(
+    rows: Rows, count: int, by_energy: Array, by_setting: dict[str, Array]
+) -> dict[str, float]:
+    """Changes by what moves from row to row: a drift of the energy, and magnets that are late."""
+    # Rows beyond the scan's are of no weight.
+    rises = float(np.asarray(by_energy)[:count] @ np.linspace(-0.5, 0.5, count))
+    found = {"energy rises by 1 % within the scan": DRIFT * rises}
+    for name, slope in by_setting.items():
+        setting = np.asarray(rows.settings[name])
+        behind = LATE * np.diff(setting, axis=0, prepend=setting[:1])
+        behind[count:] = 0.0
+        if behind.any():
+            late = -float(np.sum(np.asarray(slope) * behind))
+            found[f"{name} late by 10 % of each step, row by row"] = late
+    return found
 
 
 def _energy_cause(energy: float, mass: float) -> str:
@@ -246,8 +269,9 @@ class _Weighing(NamedTuple):
 @partial(jax.jit, compiler_options=SELDOM)
 def _slopes(
     rows: Rows, upright: Array, sigma: Array, size: Array, noise: _Weighing
-) -> tuple[list[Array], Array, Array]:
-    """Derivatives of ln ε of the fit by the parts of the line, by ln E, and by known size².
+) -> tuple[list[Array], Array, Array, Array, dict[str, Array]]:
+    """Derivatives of ln ε of the fit by the parts of the line and ln E, and by known size², ln E
+    and the settings of every row.
 
     At the answer the weighted residuals F(σ, rows) = Σ w ∂m²/∂σ (m² - size²) vanish, so dσ =
     -(∂F/∂σ)⁻¹ ∂F/∂rows: exact for either residual, without differentiating the solver, weights
@@ -256,10 +280,16 @@ def _slopes(
     """
     unit = jnp.abs(sigma)
 
-    def elements(changes: list[Array], factor: Array, more: Array) -> tuple[Array, ...]:
-        x, y = rows.both(_moved(rows.line, iter(changes)), rows.energy * factor)
+    def elements(
+        changes: list[Array], factor: Array, more: Array, drift: Array, settings: dict[str, Array]
+    ) -> tuple[Array, ...]:
+        own, mass = rows.energy * (1.0 + drift), rows.line.mass
+        # A row of higher energy has a smaller beam: its normalised emittance is the scan's.
+        smaller = ((rows.energy**2 - mass**2) / (own**2 - mass**2)) ** 0.25
+        moved = replace(rows, settings=settings, damping=rows.damping * smaller)
+        x, y = moved.both(_moved(rows.line, iter(changes)), own * factor)
         # Either plane in one program, which is compiled once.
-        r11, r12, known = rows.known(jnp.where(upright, y, x))
+        r11, r12, known = moved.known(jnp.where(upright, y, x))
         return r11, r12, known + more
 
     def slope(relative: Array, seen: tuple[Array, ...]) -> Array:
@@ -278,7 +308,8 @@ def _slopes(
     )
     still = [jnp.zeros(_shape(kind)) for kind in kinds if not isinstance(kind, Marker)]
     here = sigma / unit
-    seen, back = jax.vjp(elements, still, jnp.ones(()), jnp.zeros(len(size)))
+    none = jnp.zeros(len(size))
+    seen, back = jax.vjp(elements, still, jnp.ones(()), none, none, rows.settings)
     by_sigma = jax.grad(lambda s: jnp.log(emittance_parts(s * unit)[0]))(here)
     weights = jnp.linalg.solve(jax.jacfwd(slope)(here, seen), by_sigma)
     return back(jax.grad(lambda seen: -weights @ slope(here, seen))(seen))

@@ -39,6 +39,8 @@ def test_budget_is_the_slope_of_a_refit(gtf, gtf_sizes, method):
         "screen resolution 10 µm larger",
         "dispersion 1 cm larger (spread 0.1 %)",
         "smallest size 5 % too large (saturation, space charge)",
+        "energy rises by 1 % within the scan",
+        "Q2 late by 10 % of each step, row by row",
     }
     sizes_of = [abs(c.normalized_emittance) for c in changes.values()]
     assert sizes_of == sorted(sizes_of, reverse=True)
@@ -67,6 +69,26 @@ def test_budget_is_the_slope_of_a_refit(gtf, gtf_sizes, method):
             ends = [getattr(f, attribute).value for f in (up, down)]
             slope = np.log(ends[0] / ends[1]) / (2 * h)
             assert got == pytest.approx(0.01 * slope, rel=1e-5, abs=1e-9), (cause, attribute)
+
+
+def test_what_moves_within_a_scan_is_the_slope_of_a_refit(gtf, gtf_sizes):
+    """The energy of each row, and fields that lag behind; settings in no order."""
+    currents, _, sizes = gtf_sizes
+    order = np.random.default_rng(0).permutation(len(currents))
+    scan = scan_of("Q2", "A", currents[order], sizes[order], seed=4)
+    fit = beamfit.fit_emittance(scan, gtf)
+    changes = {c.cause: c.emittance for c in systematics(fit, "x")}
+    ramp, h = np.linspace(-0.5, 0.5, len(order)), 1e-3
+    behind = 0.1 * np.diff(currents[order], prepend=currents[order][0])
+    rising = (replace(scan, energy=gtf.energy * (1 + s * ramp)) for s in (h, -h))
+    late = (replace(scan, settings={"Q2": currents[order] - s * behind}) for s in (h, -h))
+    for cause, step, both in (
+        ("energy rises by 1 % within the scan", 0.01, rising),
+        ("Q2 late by 10 % of each step, row by row", 1.0, late),
+    ):
+        up, down = (beamfit.fit_emittance(one, gtf).x.emittance.value for one in both)
+        # The weights of the points move with their residuals, by a little.
+        assert changes[cause] == pytest.approx(step * np.log(up / down) / (2 * h), rel=0.02)
 
 
 def test_budget_of_a_drift_in_parts_is_that_of_the_whole(gtf, gtf_sizes):
