@@ -111,7 +111,7 @@ def fit_tuning(
 
     Notes
     -----
-    ln ε, ln β and α of each plane are Gaussian processes of the knobs; a size is that beam carried
+    ε², ln β and α of each plane are Gaussian processes of the knobs; a size is that beam carried
     through the line (report eq. 37). Lengths, amplitudes and noise are averaged over; see
     docs/tuning.md.
 

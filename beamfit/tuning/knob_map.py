@@ -19,6 +19,8 @@ prepare_jax()
 
 # Numbers of a beam: ln of the emittance, ln of beta, alpha, in coordinates even to the scan.
 NUMBERS = 3
+# How sharply the emittance's square turns away from zero, where its map would lead below.
+SHARP = 3.0
 # Highest total degree of the features by the number of knobs: beyond it their prior variance is
 # below 1 % for lengths of a half range (of 0.7 for four knobs and more), and they are few.
 DEGREE = {1: 10, 2: 8, 3: 6, 4: 5, 5: 4, 6: 4}
@@ -84,16 +86,40 @@ def features(x: Array, length: Array, orders: np.ndarray) -> Array:
 
 
 def design(x: Array, scales: KnobScales, orders: np.ndarray) -> Array:
-    """Derivatives of the three numbers of a beam by the map's coefficients, shape (3, n).
+    """Derivatives of the numbers of the map by its coefficients, shape (4, n).
 
-    The coefficients are of one prior standard deviation: of each number its mean, then features.
+    The numbers are those of `beam_of`: the level of ln ε, which no knob changes, the change of ε²,
+    ln β and α. Coefficients are of one prior standard deviation: a mean, then features.
     """
     row = jnp.append(MEAN, jnp.ones(len(orders)))
     phi = jnp.append(1.0, features(x, scales.length, orders)) * row
     grown = jnp.concatenate(
         [jnp.ones((NUMBERS, 1)), jnp.repeat(scales.amplitude[:, None], len(orders), axis=1)], axis=1
     )
-    return jnp.einsum("ij,ik->ijk", jnp.eye(NUMBERS), grown * phi).reshape(NUMBERS, -1)
+    rows = jnp.einsum("ij,ik->ijk", jnp.eye(NUMBERS), grown * phi).reshape(NUMBERS, -1)
+    level = jnp.arange(rows.shape[1]) == 0
+    return jnp.concatenate([jnp.where(level, rows[:1], 0.0), jnp.where(level, 0.0, rows[:1]),
+                            rows[1:]])  # fmt: skip
+
+
+def log_emittance(level: Array, change: Array) -> Array:
+    """Logarithm of an emittance whose square is exp(2 level) (1 + change), kept above zero.
+
+    What makes an emittance grow adds in squares: D. H. Dowell, Sources of emittance in RF
+    photocathode injectors, arXiv:1610.01242 (2016). So its square is the smooth map.
+
+    Examples
+    --------
+    >>> float(log_emittance(0.0, 0.0))
+    0.0
+    """
+    square = jnp.logaddexp(SHARP * (1.0 + change), 0.0) / jnp.logaddexp(SHARP, 0.0)
+    return level + 0.5 * jnp.log(square)
+
+
+def beam_of(numbers: Array) -> Array:
+    """ln ε, ln β and α of the numbers of the map: level, change of ε², ln β, α."""
+    return jnp.append(log_emittance(numbers[0], numbers[1]), numbers[2:])
 
 
 def log_size(numbers: Array, w: Array, known: Array) -> Array:

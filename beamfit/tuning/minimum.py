@@ -12,7 +12,7 @@ import numpy as np
 from jax import Array
 from scipy.stats.qmc import Sobol
 
-from beamfit.tuning.knob_map import MEAN, KnobScales, features, orders_of
+from beamfit.tuning.knob_map import MEAN, KnobScales, features, log_emittance, orders_of
 from beamfit.tuning.posterior import MapPosterior
 
 # Settings among which the search begins, as a power of two, its steps, and its dampings.
@@ -44,7 +44,7 @@ def emittances_of(planes: Sequence[MapPosterior]) -> Emittances:
 def _of_draw(x: Array, draw: Emittances, orders: np.ndarray) -> Array:
     """Value of a single draw at a setting."""
     each = [
-        MEAN * c[0] + s.amplitude[0] * (features(x, s.length, orders) @ c[1:])
+        log_emittance(MEAN * c[0], s.amplitude[0] * (features(x, s.length, orders) @ c[1:]))
         for s, c in zip(draw.scales, draw.coefficients, strict=True)
     ]
     return sum(each, jnp.zeros(())) / len(each)

@@ -11,13 +11,22 @@ import numpy as np
 from jax import Array
 
 from beamfit.noise.model import LN_2PI
-from beamfit.tuning.knob_map import MEAN, NUMBERS, KnobScales, design, log_size, orders_of
+from beamfit.tuning.knob_map import (
+    MEAN,
+    NUMBERS,
+    KnobScales,
+    beam_of,
+    design,
+    log_size,
+    orders_of,
+)
 
 # Priors of ln of the scales, middle and standard deviation. Lengths of 0.6 to 2.7 half ranges: a
 # range is chosen so that the beam bends once or twice; longer ones would have a weak knob's
-# emittance straight, and its minimum at a limit. Emittances change by a tenth to a factor of
-# three over it, beta and alpha by a third to a factor of five.
-LENGTH, EMITTANCE, TWISS = (0.2, 0.4), (-1.0, 1.0), (-0.4, 0.9)
+# emittance straight, and its minimum at a limit. What a knob adds to the square of the emittance is
+# as large as what is there without, a factor of three to either side; beta and alpha change by a
+# third to a factor of five.
+LENGTH, EMITTANCE, TWISS = (0.2, 0.4), (0.0, 1.0), (-0.4, 0.9)
 # Rounds of scales and map; steps of the map and of the scales in each; steps tried.
 ROUNDS, STEPS, NEWTON = 6, 6, 2
 TRIED = np.array([1.0, 0.5, 0.2, 0.05, 0.0])
@@ -115,9 +124,13 @@ def _numbers_at(data: KnobReadings, scales: KnobScales, orders: np.ndarray) -> A
     return jax.vmap(lambda x: design(x, scales, orders))(data.x)
 
 
+def _log_size(numbers: Array, w: Array, known: Array) -> Array:
+    return log_size(beam_of(numbers), w, known)
+
+
 def _slopes(data: KnobReadings, u: Array) -> tuple[Array, Array]:
     """Predicted ln sizes and their derivatives by the rows' numbers."""
-    both = jax.vmap(jax.value_and_grad(log_size))(u, data.w, data.known)
+    both = jax.vmap(jax.value_and_grad(_log_size))(u, data.w, data.known)
     return both[0], both[1] * data.there[:, None]
 
 
@@ -128,7 +141,7 @@ def _settled(data: KnobReadings, state: _Peak, varies: Array, orders: np.ndarray
     variance = _variance(data, scales.noise, state.good)
 
     def cost(v: Array) -> Array:
-        off = data.y - jax.vmap(log_size)(every @ v, data.w, data.known)
+        off = data.y - jax.vmap(_log_size)(every @ v, data.w, data.known)
         return jnp.sum(v**2) + jnp.sum(data.there * off**2 / variance)
 
     def step(v: Array, _: None) -> tuple[Array, None]:
@@ -338,6 +351,6 @@ def numbers_at(posterior: MapPosterior, x: np.ndarray) -> Array:
     orders = orders_of(x.shape[-1])
 
     def one(scales: KnobScales, v: Array) -> Array:
-        return jax.vmap(lambda at: design(at, scales, orders) @ v)(jnp.asarray(x))
+        return jax.vmap(lambda at: beam_of(design(at, scales, orders) @ v))(jnp.asarray(x))
 
     return jax.vmap(one)(posterior.scales, posterior.coefficients)

@@ -13,7 +13,7 @@ from beamfit.noise.model import Noise
 from beamfit.optics.particle import beta_gamma
 from beamfit.status import Status
 from beamfit.tuning.fit import fit_tuning
-from beamfit.tuning.knob_map import orders_of
+from beamfit.tuning.knob_map import log_emittance, orders_of
 from beamfit.tuning.knobs import EmittanceTable, knobs_of
 from beamfit.tuning.next_row import _information, next_row
 from beamfit.tuning.posterior import _covariance, _linear
@@ -143,11 +143,12 @@ def test_emittances_are_those_of_gaussian_regression():
     table = table_of(MACHINE, 2, count=16)
     readings = emittance_readings(table, "x", knobs_of(table, limits_of(MACHINE)), Noise())
     data, scales = readings.readings, np.log([1.2, 1.2, 0.5, 0.6, 0.6, 1.0])
-    by = _linear(data, np.zeros((len(data.y), 3)), jnp.ones(len(data.y)), jnp.ones(()))
+    by = _linear(data, np.zeros((len(data.y), 4)), jnp.ones(len(data.y)), jnp.ones(()))
     there = data.there > 0
-    assert np.allclose(by.slope[there], [0.5, 0.0, 0.0])
+    bend = (log_emittance(0.0, 1e-5) - log_emittance(0.0, -1e-5)) / 2e-5
+    assert np.allclose(by.slope[there], [0.5, bend / 2, 0.0, 0.0])
     far = ((data.x[there][:, None] - data.x[there][None]) / 1.2) ** 2
-    expected = 0.25 * (9.0 + 0.25 * np.exp(-0.5 * far.sum(-1)))
+    expected = 0.25 * (9.0 + 0.25 * float(bend) ** 2 * np.exp(-0.5 * far.sum(-1)))
     expected += np.diag(data.floor[there] ** 2 + data.unit[there] ** 2)
     found = np.asarray(_covariance(jnp.asarray(scales), by, orders_of(2)))[there][:, there]
     assert np.allclose(found, expected, atol=1e-3)

@@ -9,7 +9,7 @@ from scipy.stats import kstest, multivariate_normal, norm, uniform
 
 from beamfit.emittance.comparison import STEPS
 from beamfit.tuning import posterior as of
-from beamfit.tuning.knob_map import MEAN, design, features, log_size, orders_of
+from beamfit.tuning.knob_map import MEAN, design, features, log_emittance, log_size, orders_of
 from beamfit.tuning.minimum import _of_draw, emittances_of, minima_of, values_at
 from beamfit.tuning.readings import log_no_beam
 
@@ -63,8 +63,19 @@ def test_a_size_is_that_of_the_beam_matrix():
         assert np.exp(log_size(numbers, w, 0.0)) == pytest.approx(size_by_matrix(numbers, w))
 
 
+def test_squares_of_emittances_add():
+    """Two contributions in quadrature are one change of the square; below zero it stays above."""
+    change = np.array([0.5, 2.0, 8.0])
+    found = np.exp(log_emittance(0.4, change))
+    assert np.allclose(found, np.exp(0.4) * np.sqrt(1.0 + change), rtol=0.01)
+    below = np.asarray(log_emittance(0.0, np.linspace(-20.0, 0.0, 50)))
+    assert np.all(np.isfinite(below))
+    assert np.all(np.diff(below) > 0)
+
+
 def linear(data):
-    return of._linear(data, jnp.asarray(NUMBERS), jnp.ones(COUNT), jnp.ones(()))
+    numbers = np.insert(NUMBERS, 1, 0.3, axis=1)  # the emittance's square 1.3 times its level
+    return of._linear(data, jnp.asarray(numbers), jnp.ones(COUNT), jnp.ones(()))
 
 
 def scales_at():
@@ -74,7 +85,9 @@ def scales_at():
 def covariance_by_kernel(eta, slope):
     length, amplitude, noise = np.exp(eta[:2]), np.exp(eta[2:5]), np.exp(eta[5])
     same = kernel(X, X, length)
-    parts = [(MEAN**2 + amplitude[i] ** 2 * same) * np.outer(s, s) for i, s in enumerate(slope.T)]
+    level, *own = slope.T
+    parts = [amplitude[i] ** 2 * same * np.outer(s, s) for i, s in enumerate(own)]
+    parts += [MEAN**2 * np.outer(s, s) for s in (level, *own[1:])]
     return sum(parts) + (0.01**2 + noise**2) * np.eye(COUNT)
 
 
