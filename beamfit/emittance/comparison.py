@@ -203,10 +203,10 @@ def _process(
     return averaged(log, scales.log_weight)
 
 
-# Amplitudes of a smooth departure from a beam's sizes, as shares of the size, and the part of the
-# chance of "a smooth curve" that it has: with it one scan in a thousand departs, and one that
-# the noise would hide refuses no good scan.
-DEPARTURES, NEAR = np.array([0.1, 0.2, 0.4]), 1 / 30
+# Amplitudes of a smooth departure from a beam's sizes, as shares of the size; over which share of
+# the scan it bends; and the part of the chance of "a smooth curve" that it has: with it one scan in
+# a thousand departs, so that a departure which the noise would hide refuses no good scan.
+DEPARTURES, SMOOTH, NEAR = np.array([0.1, 0.2, 0.4]), 0.7, 1 / 30
 
 
 def departure_odds(x: np.ndarray, u: np.ndarray, c: Coordinates, kind: NoiseKind) -> np.ndarray:
@@ -238,17 +238,14 @@ def departure_odds(x: np.ndarray, u: np.ndarray, c: Coordinates, kind: NoiseKind
     known = np.log(root).sum(-1)
     known = known + np.log(np.abs(np.einsum("...ii->...i", triangle[..., :3, :]))).sum(-1)
     alone = averaged(-0.5 * np.sum(q**2, axis=-1) - known, wide.log_weight)
-    found = []
-    for length in LENGTHS:
-        shares = model[..., None, :] / root
-        kernel = _bends(u, length)[..., None, :, :] * shares[..., None] * shares[..., None, :]
-        values, vectors = np.linalg.eigh(left @ kernel @ np.swapaxes(left, -1, -2))
-        turned = (np.swapaxes(vectors, -1, -2) @ q[..., None])[..., None, :, 0]
-        grown = 1.0 + DEPARTURES[:, None] ** 2 * np.maximum(values, 0.0)[..., None, :]
-        log = -0.5 * np.sum(turned**2 / grown + np.log(grown), axis=-1) - known[..., None]
-        log = averaged(log, -math.log(len(DEPARTURES)))
-        found.append(averaged(log, wide.log_weight))
-    return np.logaddexp(*found) - math.log(2.0) - alone
+    shares = model[..., None, :] / root
+    kernel = _bends(u, SMOOTH)[..., None, :, :] * shares[..., None] * shares[..., None, :]
+    values, vectors = np.linalg.eigh(left @ kernel @ np.swapaxes(left, -1, -2))
+    turned = (np.swapaxes(vectors, -1, -2) @ q[..., None])[..., None, :, 0]
+    grown = 1.0 + DEPARTURES[:, None] ** 2 * np.maximum(values, 0.0)[..., None, :]
+    log = -0.5 * np.sum(turned**2 / grown + np.log(grown), axis=-1) - known[..., None]
+    log = averaged(log, -math.log(len(DEPARTURES)))
+    return averaged(log, wide.log_weight) - alone
 
 
 class PlaneSizes(NamedTuple):

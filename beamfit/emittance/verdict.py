@@ -151,7 +151,7 @@ def _determined(e: PlaneEvidence) -> str:
 
 def _sure(probability: float) -> str:
     return "the sizes are those of a beam with " + (
-        "P > 0.9999" if probability > 0.9999 else f"P = {probability:.4f}"
+        "P > 0.999" if probability > 0.999 else f"P = {probability:.3f}"
     )
 
 

@@ -6,9 +6,17 @@ import numpy as np
 import pytest
 
 import beamfit
-from beamfit.emittance.comparison import BENDS, LENGTHS, MODELS, STEPS, weighted_quantiles
+from beamfit.emittance.comparison import (
+    BENDS,
+    LENGTHS,
+    MODELS,
+    NEAR,
+    STEPS,
+    weighted_quantiles,
+)
 from beamfit.noise.model import Noise
 from tests.emittance.conftest import TABLE_2, design
+from tests.emittance.test_departure import dense_odds
 from tests.noise import reference as ref
 
 CURRENTS = {5: np.linspace(0.2, 3.4, 5), 9: np.linspace(0.0, 3.9, 9)}
@@ -126,7 +134,7 @@ def brute_probabilities(fit, kind, noise):
     x, walk = np.log(size / mean), np.minimum.outer(np.arange(n), np.arange(n)) * 1.0
     far = np.abs(np.subtract.outer(*2 * [np.argsort(np.argsort(p.r11 / p.r12))])) / n
     usual = ref.usual_over_own(size, error) if kind in ("stated", "share") else 1.0
-    parts = []
+    parts, near = [], []
     for chance, deviation, weight in noises(kind, size, error, noise):
         found = [ref.log_evidence_of_constant(size, deviation, weight, noise, usual)]
         for kernel in (np.eye(n), walk):
@@ -134,7 +142,16 @@ def brute_probabilities(fit, kind, noise):
         bends = [a**2 * (1 + far / m) * np.exp(-far / m) for m in LENGTHS for a in BENDS]
         curve = ref.log_process(size / mean - 1, bends, deviation * size / mean, weight)
         parts.append(np.array([*found, curve + x.sum()]) + np.log(chance))
+        model = p.model / mean
+        slopes = spread * (p.error / mean)[:, None] * np.abs(post.best)
+        odds = dense_odds(
+            size / mean - model, slopes, model, far, deviation * model, np.log(weight)
+        )
+        near.append(beam + odds + np.log(chance))
     curves = ref.log_sum(np.array(parts), 0)
+    curves[-1] = np.logaddexp(
+        curves[-1] + np.log(1 - NEAR), ref.log_sum(np.array(near)) + np.log(NEAR)
+    )
     log = np.array([beam, flat, *curves]) + np.log(list(MODELS.values()))
     return dict(zip(MODELS, np.exp(log - ref.log_sum(log)), strict=True))
 
