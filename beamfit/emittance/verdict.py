@@ -151,7 +151,7 @@ def _determined(e: PlaneEvidence) -> str:
 
 def _sure(probability: float) -> str:
     return "the sizes are those of a beam with " + (
-        "P > 0.999" if probability > 0.999 else f"P = {probability:.3f}"
+        f"P > {SURE:g}" if probability > SURE else f"P = {probability:.2f}"
     )
 
 

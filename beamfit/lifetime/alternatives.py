@@ -338,7 +338,7 @@ def sudden_loss(record: DecayRecord) -> SuddenLoss | None:
     >>> beam = 100 * np.exp(-time / 36000) * np.where(time > 3000, 0.98, 1.0)
     >>> noise = 0.1 * np.random.default_rng(1).normal(size=400)
     >>> print(sudden_loss(DecayRecord(time, beam + noise)))
-    0.468 ± 0.019 mA were lost at once near t = 2996 s
+    1.848 ± 0.019 mA were lost at once near t = 2997 s
     """
     plain = solved(Pieces.of(record))
     rival = rival_of(plain) if plain.rested and plain.wanders else None

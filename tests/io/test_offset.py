@@ -39,7 +39,7 @@ def test_readings_without_beam_give_the_offset(shifted):
     assert stated.b.value == pytest.approx(off.b.value, rel=1e-4)
     assert stated.readings.monitor is None
     # The error of the offset is part of that of b.
-    doubtful = replace(record, monitor=replace(record.monitor, offset=10.0))
+    doubtful = replace(record, monitor=record.monitor._replace(offset=10.0))
     assert fit_decay(doubtful).b.error > 1.1 * stated.b.error
 
 
