@@ -359,7 +359,9 @@ def _likely(plain: Expansion) -> list[str]:
     Their evidence is that of losses about the law without, averaged over times and noises.
     """
     columns = plain.rows[:, [LEVEL, *PLAIN]]
-    looked = {"step": GRID[::2], "relaxing": np.array(STARTS), "sudden": GRID}
+    # A sudden loss that is looked for beside its interval explains little of it.
+    sudden = np.concatenate([_times(plain, count, "sudden")[0] for count in (1, 2)])
+    looked = {"step": GRID[::2], "relaxing": np.array(STARTS), "sudden": sudden}
     further = [further_columns(plain, kind, times) for kind, times in looked.items()]
     columns = np.column_stack([columns, plain.residuals, *further])
     products = Products.of(columns, plain.pieces.time, bool(plain.given), COARSE)
@@ -384,16 +386,23 @@ def _likely(plain: Expansion) -> list[str]:
 
     ends = np.cumsum([times.size for times in looked.values()])[:-1]
     places = dict(zip(looked, np.split(np.arange(1, left.shape[1])[:, None], ends), strict=True))
-    for twice, once in (("steps", "step"), ("sudden twice", "sudden")):
-        places[twice] = np.array(list(itertools.combinations(places[once][:, 0], 2)))
+    places["steps"] = np.array(list(itertools.combinations(places["step"][:, 0], 2)))
+    places["sudden"], both = np.split(places["sudden"], [1])
+    places["sudden twice"] = both.T
     if plain.pieces.gauge is not None:
         del places["relaxing"]
     least_log = log_evidence(np.empty((1, 0), int)) + math.log(CHANCES[""]) + HOPELESS
     return [
         name
         for name, place in places.items()
-        if log_evidence(place) + math.log(CHANCES[name]) > least_log
+        if log_evidence(place) + _log_chance(name, plain, place.shape[1]) > least_log
     ]
+
+
+def _log_chance(name: str, law: Expansion, count: int) -> float:
+    """Log prior probability; the time of a sudden loss is any interval between readings."""
+    where = count * math.log(law.pieces.time.size - 1) if name.startswith("sudden") else 0.0
+    return math.log(CHANCES[name]) - where
 
 
 def _flat(size: np.ndarray) -> np.ndarray:
@@ -414,9 +423,9 @@ def _smooth(plain: Expansion) -> float:
     return float(logsumexp([_log_evidence(law, name) for law, name in named if law.rested]))
 
 
-def _changed(plain: Expansion, count: int, kind: str = "step") -> Expansion | None:
-    """The law with changes of the loss rate, or a sudden loss, at the times that explain most, in
-    linear approximation about the law without.
+def _times(plain: Expansion, count: int, kind: str) -> tuple[np.ndarray, np.ndarray]:
+    """Times and sizes of further losses that explain most, in linear approximation about the law
+    without.
     """
     basis = np.linalg.qr(plain.left[:, [LEVEL, *PLAIN]])[0]
 
@@ -435,8 +444,13 @@ def _changed(plain: Expansion, count: int, kind: str = "step") -> Expansion | No
         best = int(np.argmax(np.sum(sizes * along[place], axis=1)))
         times, steps = every[place[best]], [window[1] - window[0] for window in windows]
         windows = [np.linspace(t - d, t + d, GRID.size) for t, d in zip(times, steps, strict=True)]
-    further = np.column_stack([-sizes[best] / size[place[best]], times])
-    further = further[np.argsort(times)].ravel()
+    return times, -sizes[best] / size[place[best]]
+
+
+def _changed(plain: Expansion, count: int, kind: str = "step") -> Expansion | None:
+    """The law with changes of the loss rate, or sudden losses, at the times that explain most."""
+    times, sizes = _times(plain, count, kind)
+    further = np.column_stack([sizes, times])[np.argsort(times)].ravel()
     free = (*PLAIN, *range(FURTHER, FURTHER + 2 * count, 2))
     law = solved(plain.pieces, free, kind, start=np.append(plain.numbers, further))
     apart = STEP * float(np.median(np.diff(plain.pieces.time))) / plain.pieces.units[0]
@@ -499,10 +513,7 @@ def _log_evidence(law: Expansion, name: str) -> float:
     log = log - 0.5 * np.linalg.slogdet(scaled)[1] - np.log(scale).sum(1)
     finite = np.isfinite(width)
     log = log - 0.5 * np.sum(((centre + step) / width)[:, finite] ** 2, 1)
-    chance = math.log(CHANCES[name])
-    if name.startswith("sudden"):
-        # The time of each is an interval between readings, all of them as likely.
-        chance -= len(further) / 2 * math.log(law.pieces.time.size - 1)
+    chance = _log_chance(name, law, len(further) // 2)
     return float(logsumexp(log)) - float(np.log(width[finite]).sum()) + chance
 
 
