@@ -1,0 +1,66 @@
+"""Current lost at once, too little for single readings to show, and monitors that walk."""
+
+import numpy as np
+from scipy.integrate import solve_ivp
+
+from beamfit.lifetime.record import DecayRecord
+from beamfit.lifetime.study import study_record
+from beamfit.quantity import HOUR, Status
+from tests.simulations import simulations
+
+A, B, START, SPAN, COUNT = 1.2e-7, 2e-5, 200.0, 5 * HOUR, 500
+TIME = np.linspace(0.0, SPAN, COUNT)
+
+
+def decay(losses=()):
+    """Current after losses of (place in the record, share), integrated by SciPy."""
+    edges = [0.0, *(SPAN * place for place, _ in losses), SPAN * (1 + 1e-9)]
+    shares, begin, current = [*(share for _, share in losses), 0.0], START, np.empty(COUNT)
+    for first, last, share in zip(edges, edges[1:], shares, strict=False):
+        found = solve_ivp(lambda t, i: -(A * i + B) * i, (first, last), [begin], rtol=1e-10,
+                          dense_output=True)  # fmt: skip
+        inside = (first <= TIME) & (last > TIME)
+        current[inside] = found.sol(TIME[inside])[0]
+        begin = found.y[0, -1] * (1.0 - share)
+    return current
+
+
+def holds(fit, true):
+    """Whether the 95 % interval has the lifetime at the mean current of the fitted piece."""
+    low, high = fit.lifetime_mean.interval_95
+    return low <= 1 / (A * true.mean() + B) / HOUR <= high
+
+
+@simulations(4, 40)
+def test_the_record_is_cut_where_current_was_lost(count):
+    """1.5 and 2 % of the current at 10 times the noise of a reading, which no step shows."""
+    rng, losses, held = np.random.default_rng(1), ((0.31, 0.015), (0.72, 0.02)), []
+    true = decay(losses)
+    for _ in range(count):
+        study = study_record(DecayRecord(TIME, true + 0.3 * rng.normal(size=COUNT)))
+        assert [event.kind for event in study.events] == ["loss", "loss"]
+        for event, (place, share) in zip(study.events, losses, strict=True):
+            assert abs(event.time - place * SPAN) < 3 * SPAN / COUNT
+            at = np.searchsorted(TIME, event.time)
+            assert abs(event.change + share * true[at]) < 0.2 * share * true[at]
+        assert len(study.decays) == 3
+        for part in study.decays:
+            inside = (part.offset <= TIME) & (part.offset + part.segment.span >= TIME)
+            held.append(holds(part.fit, true[inside]))
+    assert np.mean(held) >= 0.9
+
+
+@simulations(8, 100)
+def test_a_monitor_that_walks_is_not_cut_and_covers(count):
+    """By .3 of its white noise a reading: 10 times in the record."""
+    rng, true, held, cut = np.random.default_rng(2), decay(), [], 0
+    for _ in range(count):
+        walk = 0.3 * np.cumsum(rng.normal(size=COUNT))
+        study = study_record(DecayRecord(TIME, true + 0.1 * (rng.normal(size=COUNT) + walk)))
+        cut += len(study.decays) > 1
+        fit = study.decays[0].fit
+        if fit.status is Status.converged:
+            held.append(holds(fit, true))
+    assert cut <= 0.1 * count
+    assert len(held) >= 0.8 * count
+    assert np.mean(held) >= 0.85
