@@ -338,7 +338,7 @@ def sudden_loss(record: DecayRecord) -> SuddenLoss | None:
     >>> beam = 100 * np.exp(-time / 36000) * np.where(time > 3000, 0.98, 1.0)
     >>> noise = 0.1 * np.random.default_rng(1).normal(size=400)
     >>> print(sudden_loss(DecayRecord(time, beam + noise)))
-    1.848 ± 0.019 mA were lost at once near t = 2997 s
+    1.847 ± 0.019 mA were lost at once near t = 3005 s
     """
     plain = solved(Pieces.of(record))
     rival = rival_of(plain) if plain.rested and plain.wanders else None
@@ -553,12 +553,16 @@ def _sudden_loss(law: Expansion) -> SuddenLoss:
     (span, _), pairs = law.pieces.units, law.numbers[3:].reshape(-1, 2)
     largest = int(np.argmax(np.abs(pairs[:, 0])))
     size, when = pairs[largest]
-    at = float(np.interp(when * span, law.pieces.time, law.pieces.current))
+    # All times between two readings are one: the middle stands for them.
+    after = int(np.searchsorted(law.pieces.time, when * span))
+    when = float(law.pieces.time[after - 1 : after + 1].mean())
+    model = law.pieces.current + law.residuals * law.pieces.over
+    at = float(model[after - 1])
     slopes = np.zeros((1, law.rows.shape[1]))
     slopes[0, FURTHER + 2 * largest] = at * math.exp(-size)
     columns = [LEVEL, *PLAIN, *range(FURTHER, slopes.shape[1], 2)]
     ((value, error),) = _quantities(law, np.array([-at * math.expm1(-size)]), slopes, columns)
-    return SuddenLoss(float(when * span), Quantity(float(value), float(error), "mA"))
+    return SuddenLoss(when, Quantity(float(value), float(error), "mA"))
 
 
 def _outgassing(law: Expansion) -> Outgassing:

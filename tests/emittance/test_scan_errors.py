@@ -87,7 +87,7 @@ def test_errors_that_are_half_of_the_truth_are_no_trap(otr2, true, points, count
     assert np.sum(far) <= 8 * count / 120  # 3 %, and three standard deviations of a binomial
 
 
-@simulations(20, 60)
+@simulations(60, 60)
 def test_errors_far_too_small_are_said_and_enlarged(otr2, true, count):
     """A fifth of the truth at 12 points: the factor is found, and the answer holds."""
     settings, rng, inside, factors = np.linspace(-4.5, -1.0, 12), np.random.default_rng(12), 0, []

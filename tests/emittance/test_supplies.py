@@ -94,7 +94,8 @@ def test_a_scan_of_the_knob_gives_the_beam_and_its_waist(pair):
 def test_one_per_cent_of_the_supply_is_one_per_cent_of_all_its_magnets(pair):
     """The budget's exact derivative against fits of sizes seen through other magnets."""
     fit = beamfit.fit_emittance(knob_scan(), pair)
-    [change] = [c for c in systematics(fit, "x") if c.cause.startswith("QS")]
+    changes = [c for c in systematics(fit, "x") if c.cause.startswith("QS")]
+    [change] = [c for c in changes if "late" not in c.cause]
     moved = []
     for factor in (1.001, 0.999):
         text = PAIR.replace("slope = 500.0", f"slope = {500.0 * factor}")

@@ -174,7 +174,8 @@ def test_a_perfect_determined_scan_is_believed(gtf, gtf_sizes):
     currents, _, sizes = gtf_sizes
     fit = beamfit.fit_emittance(scan_of("Q2", "A", currents, sizes), gtf).x
     assert fit.identifiability.undetermined == ()
-    assert fit.identifiability.probability["beam"] > 0.9999
+    # One scan in a thousand departs smoothly, before its sizes are seen.
+    assert fit.identifiability.probability["beam"] > 0.999
     assert sum(fit.identifiability.probability.values()) == pytest.approx(1.0, abs=1e-12)
     assert fit.identifiability.next_measurement is None
 
