@@ -245,7 +245,9 @@ def departure_odds(x: np.ndarray, u: np.ndarray, c: Coordinates, kind: NoiseKind
     grown = 1.0 + DEPARTURES[:, None] ** 2 * np.maximum(values, 0.0)[..., None, :]
     log = -0.5 * np.sum(turned**2 / grown + np.log(grown), axis=-1) - known[..., None]
     log = averaged(log, -math.log(len(DEPARTURES)))
-    return averaged(log, wide.log_weight) - alone
+    odds = averaged(log, wide.log_weight) - alone
+    # Settings that do not separate the beam's numbers show no departure from them.
+    return np.where(c.seen & np.isfinite(odds), odds, -np.inf)
 
 
 class PlaneSizes(NamedTuple):

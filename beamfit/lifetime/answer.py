@@ -264,7 +264,7 @@ def _extent(e: Evidence, name: str) -> str | None:
 
 NEGATIVE = (partial(_negative, "b", NOT_GAS), partial(_negative, "a", RISING))
 LOOK = ": look for steps with split_record, or test constant_a_test"
-RULES = (_lost, *NEGATIVE, _within_noise, _stepped, _refuted, _inseparable)
+RULES = (_lost, _stepped, *NEGATIVE, _within_noise, _refuted, _inseparable)
 RULES += (partial(_improbable, remedy=LOOK), _freely, _determined)
 
 
