@@ -249,6 +249,7 @@ class Outgassing(NamedTuple):
         )
 
 
+@shown
 class SuddenLoss(NamedTuple):
     """Current lost, or gained, between two readings: a decay ends there and another begins.
 
@@ -258,6 +259,15 @@ class SuddenLoss(NamedTuple):
         When, s from the first reading.
     current : Quantity
         What was lost, mA; below zero of a refill.
+
+    Examples
+    --------
+    >>> from beamfit.lifetime.fit import fit_decay
+    >>> time = np.linspace(0.0, 7200.0, 400)
+    >>> beam = 100 * np.exp(-time / 36000) * np.where(time > 3000, 0.98, 1.0)
+    >>> noise = 0.1 * np.random.default_rng(1).normal(size=400)
+    >>> print(fit_decay(DecayRecord(time, beam + noise)).loss)
+    1.847 ± 0.019 mA were lost at once near t = 3005 s
     """
 
     time: float
@@ -309,14 +319,16 @@ def rival_of(plain: Expansion) -> Rival | None:
     if pieces.time.size <= WHEN + 2:
         return None
     plain = solved(pieces) if pieces is not plain.pieces else plain
-    likely = _likely(plain)
+    once, twice = (_at_best(plain, count, "sudden") for count in (1, 2))
+    likely = _likely(plain, np.append(once.times, twice.times))
     if not likely:
         return None
     smooth = _smooth(plain)
-    fitted = {"step": lambda: _changed(plain, 1), "steps": lambda: _changed(plain, 2),
+    fitted = {"step": lambda: _changed(plain, _at_best(plain, 1, "step")),
+              "steps": lambda: _changed(plain, _at_best(plain, 2, "step")),
               "relaxing": lambda: _relaxing(plain),
-              "sudden": lambda: _changed(plain, 1, "sudden"),
-              "sudden twice": lambda: _changed(plain, 2, "sudden")}  # fmt: skip
+              "sudden": lambda: _changed(plain, once),
+              "sudden twice": lambda: _changed(plain, twice)}  # fmt: skip
     laws = [(name, fitted[name]()) for name in likely]
     found = [(_log_evidence(law, name), name, law) for name, law in laws if law is not None]
     log, name, best = max(found, key=lambda one: one[0], default=(-math.inf, "", plain))
@@ -328,23 +340,6 @@ def rival_of(plain: Expansion) -> Rival | None:
     return Rival(answer, log - smooth, scatter)
 
 
-def sudden_loss(record: DecayRecord) -> SuddenLoss | None:
-    """Find current that a single decay lost or gained at once, too little for its noise to show
-    between two readings; None if a smooth law or another alternative is likelier.
-
-    Examples
-    --------
-    >>> time = np.linspace(0.0, 7200.0, 400)
-    >>> beam = 100 * np.exp(-time / 36000) * np.where(time > 3000, 0.98, 1.0)
-    >>> noise = 0.1 * np.random.default_rng(1).normal(size=400)
-    >>> print(sudden_loss(DecayRecord(time, beam + noise)))
-    1.847 ± 0.019 mA were lost at once near t = 3005 s
-    """
-    plain = solved(Pieces.of(record))
-    rival = rival_of(plain) if plain.rested and plain.wanders else None
-    return rival.found if rival is not None and isinstance(rival.found, SuddenLoss) else None
-
-
 def _averaged(pieces: Pieces) -> Pieces:
     """A long decay as the means of neighbouring readings: the curve is smooth between them."""
     if pieces.time.size <= ENOUGH or pieces.first.size > 1 or pieces.gauge is not None:
@@ -353,14 +348,13 @@ def _averaged(pieces: Pieces) -> Pieces:
     return Pieces.of(DecayRecord(*record.blocks(ENOUGH), monitor=pieces.monitor))
 
 
-def _likely(plain: Expansion) -> list[str]:
-    """List the alternatives that are not much less likely than constant a and b.
+def _likely(plain: Expansion, sudden: np.ndarray) -> list[str]:
+    """List the alternatives that are not much less likely than constant a and b; `sudden` are the
+    best times of one loss and of two: beside its interval a loss explains little.
 
     Their evidence is that of losses about the law without, averaged over times and noises.
     """
     columns = plain.rows[:, [LEVEL, *PLAIN]]
-    # A sudden loss that is looked for beside its interval explains little of it.
-    sudden = np.concatenate([_times(plain, count, "sudden")[0] for count in (1, 2)])
     looked = {"step": GRID[::2], "relaxing": np.array(STARTS), "sudden": sudden}
     further = [further_columns(plain, kind, times) for kind, times in looked.items()]
     columns = np.column_stack([columns, plain.residuals, *further])
@@ -423,10 +417,16 @@ def _smooth(plain: Expansion) -> float:
     return float(logsumexp([_log_evidence(law, name) for law, name in named if law.rested]))
 
 
-def _times(plain: Expansion, count: int, kind: str) -> tuple[np.ndarray, np.ndarray]:
-    """Times and sizes of further losses that explain most, in linear approximation about the law
-    without.
-    """
+class _Further(NamedTuple):
+    """Further losses of a kind: their times and sizes."""
+
+    kind: str
+    times: np.ndarray
+    sizes: np.ndarray
+
+
+def _at_best(plain: Expansion, count: int, kind: str) -> _Further:
+    """Further losses that explain most, in linear approximation about the law without."""
     basis = np.linalg.qr(plain.left[:, [LEVEL, *PLAIN]])[0]
 
     def beside(columns: np.ndarray) -> np.ndarray:
@@ -444,15 +444,14 @@ def _times(plain: Expansion, count: int, kind: str) -> tuple[np.ndarray, np.ndar
         best = int(np.argmax(np.sum(sizes * along[place], axis=1)))
         times, steps = every[place[best]], [window[1] - window[0] for window in windows]
         windows = [np.linspace(t - d, t + d, GRID.size) for t, d in zip(times, steps, strict=True)]
-    return times, -sizes[best] / size[place[best]]
+    return _Further(kind, times, -sizes[best] / size[place[best]])
 
 
-def _changed(plain: Expansion, count: int, kind: str = "step") -> Expansion | None:
-    """The law with changes of the loss rate, or sudden losses, at the times that explain most."""
-    times, sizes = _times(plain, count, kind)
-    further = np.column_stack([sizes, times])[np.argsort(times)].ravel()
-    free = (*PLAIN, *range(FURTHER, FURTHER + 2 * count, 2))
-    law = solved(plain.pieces, free, kind, start=np.append(plain.numbers, further))
+def _changed(plain: Expansion, more: _Further) -> Expansion | None:
+    """The law with changes of the loss rate, or sudden losses, at their times."""
+    further = np.column_stack([more.sizes, more.times])[np.argsort(more.times)].ravel()
+    free = (*PLAIN, *range(FURTHER, FURTHER + further.size, 2))
+    law = solved(plain.pieces, free, more.kind, start=np.append(plain.numbers, further))
     apart = STEP * float(np.median(np.diff(plain.pieces.time))) / plain.pieces.units[0]
     clear = np.all(np.diff([0.0, *law.numbers[4::2], 1.0]) > apart)
     return law if law.rested and clear else None

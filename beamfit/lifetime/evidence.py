@@ -16,6 +16,7 @@ from beamfit.lifetime.alternatives import (
     LifetimeLaw,
     Outgassing,
     Rival,
+    SuddenLoss,
     constant_a,
     lifetime_law,
     rival_of,
@@ -377,6 +378,12 @@ class Evidence:
         """A gas loss that relaxes, where that explains a refuted law."""
         found = self.explained
         return found.found if found is not None and isinstance(found.found, Outgassing) else None
+
+    @property
+    def loss(self) -> SuddenLoss | None:
+        """Current lost at once, too little for single readings to show, where that explains it."""
+        found = self.explained
+        return found.found if found is not None and isinstance(found.found, SuddenLoss) else None
 
     @cached_property
     def free(self) -> FreeLaw | None:

@@ -11,7 +11,7 @@ import numpy as np
 
 from beamfit.answer import answer, quantity_frame
 from beamfit.errors import InputError, expect
-from beamfit.lifetime.alternatives import Change, ConstantA, LifetimeLaw, Outgassing
+from beamfit.lifetime.alternatives import Change, ConstantA, LifetimeLaw, Outgassing, SuddenLoss
 from beamfit.lifetime.answer import finding_of, finding_of_cycles
 from beamfit.lifetime.cycles import FEWEST_CYCLES, FEWEST_READINGS, averaged, cleaned
 from beamfit.lifetime.evidence import BELIEVED, UNITS, Evidence, RatePart, Separability
@@ -81,6 +81,8 @@ class DecayFit:
         When the loss rate changed, where that explains a refuted law.
     outgassing : Outgassing or None
         A gas loss that relaxes, where that explains a refuted law better.
+    loss : SuddenLoss or None
+        Current lost at once, where that explains it better.
     readings : DecayRecord, optional
         What was fitted.
     shaped : bool
@@ -124,6 +126,7 @@ class DecayFit:
     lifetimes: LifetimeLaw | None = None
     change: Change | None = None
     outgassing: Outgassing | None = None
+    loss: SuddenLoss | None = None
     readings: DecayRecord | None = None
     shaped: bool = False
     first: np.ndarray | None = None
@@ -403,6 +406,7 @@ def _judged(
         rms_residual=float(np.sqrt(np.mean(evidence.residuals**2))),
         change=evidence.change,
         outgassing=evidence.outgassing,
+        loss=evidence.loss,
         readings=record,
     )
 

@@ -12,7 +12,6 @@ import numpy as np
 
 from beamfit.answer import answer
 from beamfit.errors import InputError, expect
-from beamfit.lifetime.alternatives import sudden_loss
 from beamfit.lifetime.bunch import stored_bunch
 from beamfit.lifetime.cycles import (
     FEWEST_CYCLES,
@@ -480,26 +479,48 @@ def _decays(record: DecayRecord) -> tuple[list[DecayRecord], tuple[Event, ...]]:
         expected = f"at least {SHORTEST} readings in a row of a stored beam"
         expected += "; leave out a setting that only scatters with --ignore" if moving else ""
         raise InputError(f"no decay between {kinds}", expected, record.name, column="current")
-    cut = [_cut_at_losses(piece) for piece in pieces]
-    lost = tuple(event for _, events in cut for event in events)
-    return [part for parts, _ in cut for part in parts], split.events + lost
+    return pieces, split.events
 
 
-def _cut_at_losses(piece: DecayRecord) -> tuple[list[DecayRecord], list[Event]]:
-    """Cut a decay where current was lost at once, though single readings do not show it."""
-    looked = thinned(on_edges(piece))
-    loss = sudden_loss(looked)
+class _Fitted(NamedTuple):
+    """A piece of a record, what was fitted of it, and the fit, or why there is none."""
+
+    piece: DecayRecord
+    segment: DecayRecord
+    fit: DecayFit | InputError
+
+    def placed(self, name: str, start: float | None) -> _Fitted:
+        """The same under a name, in a record that begins at a time."""
+        start = None if start is None else start + self.segment.start
+        segment, fit = replace(self.segment, name=name, start=start), self.fit
+        if isinstance(fit, DecayFit):
+            fit = replace(fit, record=name, readings=segment)
+        return _Fitted(self.piece, segment, fit)
+
+
+def _fitted(piece: DecayRecord, law: Law) -> _Fitted:
+    segment = thinned(on_edges(piece))
+    try:
+        return _Fitted(piece, segment, fit_decay(segment, law=law))
+    except InputError as error:
+        return _Fitted(piece, segment, error)
+
+
+def _parts(piece: DecayRecord, law: Law) -> tuple[list[_Fitted], list[Event]]:
+    """Fit a decay, or its parts where current was lost at once, though no reading shows it."""
+    whole = _fitted(piece, law)
+    loss = whole.fit.loss if isinstance(whole.fit, DecayFit) else None
     if loss is None:
-        return [piece], []
-    at, apart = looked.time[0] - piece.time[0] + loss.time, float(np.median(np.diff(looked.time)))
-    within = apart * (len(looked) < len(piece))
-    since = piece.time - piece.time[0]
-    halves = [piece.select(rows) for rows in (since < at - within, since > at + within)]
+        return [whole], []
+    at = whole.segment.start - piece.start + loss.time
+    # Of means of neighbours the loss is anywhere within one.
+    within = float(np.median(np.diff(whole.segment.time))) * (len(whole.segment) < len(piece))
+    halves = [piece.select(rows) for rows in (piece.time < at - within, piece.time > at + within)]
     if min(map(len, halves)) < SHORTEST:
-        return [piece], []
+        return [whole], []
     kind = "loss" if loss.current.value > 0 else "refill"
-    parts, events = zip(*map(_cut_at_losses, halves), strict=True)
     event = Event(kind, piece.start + at, 0.0, -loss.current.value)
+    parts, events = zip(*(_parts(half, law) for half in halves), strict=True)
     return [*parts[0], *parts[1]], [*events[0], event, *events[1]]
 
 
@@ -544,32 +565,30 @@ def study_record(
     placed = replace(record, start=0.0)
     cycles, events = _refilled(placed)
     pooled, pieces = _pooled(cycles, record.name, machine, law)
-    if not pooled:
+    lost: list[Event] = []
+    if pooled:
+        found = [_fitted(piece, law) for piece in pieces]
+    else:
         pieces, events = _decays(placed)
-    if len(pieces) > 1:
-        ordered = sorted(pieces, key=lambda piece: piece.start)
-        pieces = [replace(piece, name=f"{record.name}#{k}") for k, piece in enumerate(ordered, 1)]
+        parts = [_parts(piece, law) for piece in pieces]
+        found = [one for fits, _ in parts for one in fits]
+        lost = [event for _, gone in parts for event in gone]
+    if len(found) == 1 and not pooled and isinstance(found[0].fit, InputError):
+        # A record that does nothing but rise is an error; a slow refill within one is not.
+        raise found[0].fit
     decays, rising = [], []
-    for piece in pieces:
-        offset = piece.start
-        start = None if record.start is None else record.start + offset
-        segment = thinned(on_edges(replace(piece, start=start)))
-        try:
-            fit = fit_decay(segment, law=law)
-        except InputError:
-            # A record that does nothing but rise is an error; a slow refill within one is not.
-            if len(pieces) == 1 and not pooled:
-                raise
+    for k, one in enumerate(sorted(found, key=lambda one: one.piece.start), 1):
+        name = f"{record.name}#{k}" if len(found) > 1 else one.segment.name
+        piece, segment, fit = one.placed(name, record.start)
+        if isinstance(fit, InputError):
             change = float(segment.current[-1] - segment.current[0])
-            rising.append(Event("slow refill", offset, segment.span, change))
-            continue
-        decays.append(Decay.of(segment, offset, fit, machine))
+            rising.append(Event("slow refill", piece.start, segment.span, change))
+        else:
+            decays.append(Decay.of(segment, piece.start, fit, machine))
     if not decays and not pooled:
         expected = "a decay between refills"
         raise InputError("a current that rises", expected, path=record.name, column="current")
     shown = thinned(record)
     shown = replace(shown, notes=record.notes) if pooled else shown
-    return RecordStudy(
-        shown, tuple(decays), tuple(sorted((*events, *rising), key=lambda event: event.time)),
-        tuple(pooled),
-    )  # fmt: skip
+    found_events = sorted((*events, *lost, *rising), key=lambda event: event.time)
+    return RecordStudy(shown, tuple(decays), tuple(found_events), tuple(pooled))
