@@ -1,0 +1,400 @@
+"""The density fit: a scan with profiles in, emittance against charge with its error out."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from beamfit.answer import answer
+from beamfit.density.charge import FINE, charge_parts, finely
+from beamfit.density.profiles import MeanProfile, mean_profiles
+from beamfit.density.tomography import Densities, tomography
+from beamfit.emittance.known import one_by_one, prepared, unfitted
+from beamfit.emittance.scan import QuadScan
+from beamfit.emittance.sigma import fit_sizes
+from beamfit.emittance.transport import look_through
+from beamfit.errors import InputError, expect
+from beamfit.noise.model import Noise
+from beamfit.optics.beamline import Beamline
+from beamfit.optics.particle import beta_gamma
+from beamfit.quantity import Quantity, percent
+from beamfit.status import Status
+from beamfit.table import Table, cell, json_of
+from beamfit.verdict import Finding, judge
+
+# Shares of the charge whose emittance is given, and draws of the density.
+SHARES, DRAWS = (0.5, 0.68, 0.9, 0.95, 1.0), 256
+# Phase advance, degrees, without which no density is given: three phases 30 degrees apart
+# (statement of the project; a density is made of 180).
+LEAST_PHASE = 60.0
+# Odds that profiles depart from every density, before they are seen, and the probability from
+# which they are taken to.
+DEPART, TOLD = 0.01, 0.5
+# A window that ends where the profile still has this share of its peak cuts the beam: a Gaussian
+# has it at 2.8 rms, with 2 % of its second moment beyond.
+CUT = 0.02
+# Shares that a cut window leaves open.
+OPEN_WHEN_CUT = 0.95
+CENTRAL, WIDE = (0.16, 0.84), (0.025, 0.975)
+UNSURE = ("halo", "background")
+
+
+@answer
+@dataclass(frozen=True, eq=False)
+class PlaneDensity:
+    """The density of one plane.
+
+    Attributes
+    ----------
+    plane : str
+        "x" or "y".
+    profiles : tuple of MeanProfile
+        What it is from, one a setting.
+    labels : tuple of str
+        The setting of each.
+    densities : Densities or None
+        Its draws; None where there is no beam.
+    boost : float
+        βγ.
+    phase : float
+        Phase advance over the settings, degrees.
+    notes : tuple of str
+        Shots left out, saturation, windows that cut.
+    """
+
+    plane: str
+    profiles: tuple[MeanProfile, ...]
+    labels: tuple[str, ...]
+    densities: Densities | None
+    boost: float
+    phase: float
+    notes: tuple[str, ...] = ()
+
+    @cached_property
+    def _parts(self) -> Any:
+        parts = charge_parts(self.densities.values, SHARES)
+        unit = self.boost * abs(np.linalg.det(self.densities.frame)) * self.densities.growth
+        return parts._replace(emittance=parts.emittance * unit[:, None], rms=parts.rms * unit)
+
+    @property
+    def cut(self) -> tuple[int, ...]:
+        """Profiles whose window cuts the beam."""
+        return tuple(k for k, p in enumerate(self.profiles) if p.ends > CUT)
+
+    @cached_property
+    def finding(self) -> Finding:
+        """Status with its sentences."""
+        return judge(self, RULES)
+
+    @property
+    def status(self) -> Status:
+        """Status of the density."""
+        return self.finding.status
+
+    @property
+    def message(self) -> str:
+        """Cause of the status, and what to do."""
+        return self.finding.message
+
+    @cached_property
+    def emittance(self) -> dict[str, Quantity]:
+        """Normalised rms emittance of 50, 68, 90, 95 and 100 % of the charge, m.
+
+        A share has no error where the profiles do not tell it: never without a density, and from
+        95 % on not where windows cut the beam.
+        """
+        if self.densities is None:
+            return {percent(share): Quantity(math.nan, None, "m") for share in SHARES}
+        found = {}
+        for k, share in enumerate(SHARES):
+            q = _quantity(self._parts.emittance[:, k], "m")
+            known = self._known and not (self.cut and share >= OPEN_WHEN_CUT)
+            found[percent(share)] = q if known else q.open()
+        return found
+
+    @property
+    def _known(self) -> bool:
+        return self.status is Status.converged
+
+    @cached_property
+    def halo(self) -> Quantity:
+        """Share of the charge beyond 3 rms."""
+        return self._share("halo")
+
+    @cached_property
+    def brightness(self) -> Quantity:
+        """Charge within half an rms over its area in normalised phase space, 1/m."""
+        if self.densities is None:
+            return Quantity(math.nan, None, "1/m")
+        q = _quantity(self._parts.core / (0.25 * math.pi * self._parts.rms), "1/m")
+        return q if self._known else q.open()
+
+    def _share(self, name: str) -> Quantity:
+        if self.densities is None:
+            return Quantity(math.nan, None, "1")
+        q = _quantity(getattr(self._parts, name), "1")
+        return q if self._known and not self.cut else q.open()
+
+    @cached_property
+    def density(self) -> np.ndarray:
+        """The mean density on `charge.FINE_AXIS`, per area of the frame, shape (m, m)."""
+        mean = finely(self.densities.values.mean(axis=0)[None])[0] / FINE**2
+        return mean.reshape(round(math.sqrt(mean.size)), -1)
+
+    def to_json(self) -> dict[str, Any]:
+        """Give the entry of ``results`` of the JSON contract."""
+        d = self.densities
+        found = {
+            "plane": self.plane,
+            "status": self.status,
+            "message": " ".join([self.message, *self.notes]),
+            "normalized_emittance": self.emittance,
+            "halo": self.halo,
+            "core_brightness": self.brightness,
+            "phase_seen_deg": self.phase,
+            "profiles": [p._replace(position=None, charge=None) for p in ()] or len(self.profiles),
+            "contradicted": None if d is None else d.contradicted,
+            "scatter": None if d is None else d.scatter,
+        }
+        return json_of(found)
+
+
+def fit_density(
+    scan: QuadScan,
+    line: Beamline | None = None,
+    *,
+    noise: Noise | None = None,
+    draws: int = DRAWS,
+    seed: int = 1,
+) -> DensityFit:
+    """Find the density of a beam in phase space from the profiles of a scan.
+
+    Parameters
+    ----------
+    scan : QuadScan or path
+        With ``profiles``: of a file of emittance_gui, or `beamfit.read_profiles`.
+    line : Beamline or path, optional
+        From where the density is wanted to the screens; None for rows with matrices.
+    noise : Noise, optional
+        Its scatter of settings stretches profiles; `beamfit.Noise()` if None.
+    draws, seed : int
+        Draws of the density, and the seed of their random numbers.
+
+    Returns
+    -------
+    DensityFit
+        Emittance against charge of each plane, with errors; `print` it.
+
+    Raises
+    ------
+    InputError
+        If the scan has no profiles at three settings of a plane.
+
+    Notes
+    -----
+    The posterior of a Gaussian process in the phase space of the rms beam; see `tomography` and
+    docs/density.md.
+
+    Examples
+    --------
+    >>> from beamfit.emittance.scan import Profile
+    >>> angle = np.radians([0.0, 35, 70, 105, 140])  # a round beam of 0.1 mm and 1e-5
+    >>> rows = np.column_stack([np.cos(angle), 10.0 * np.sin(angle)])
+    >>> x = np.linspace(-6e-4, 6e-4, 81)
+    >>> shots = [Profile("x", i, x, np.exp(-0.5 * (x / 1e-4) ** 2), None) for i in range(5)]
+    >>> scan = QuadScan({}, {}, {"x": 5 * [1e-4]}, energy=135.0, transfer={"x": rows},
+    ...                 profiles=tuple(shots))
+    >>> found = fit_density(scan)["x"]
+    >>> found.status.value, abs(found.emittance["90 %"].value / (264.2 * 0.744e-9) - 1) < 0.03
+    ('converged', True)
+    """
+    expect(scan, QuadScan, "beamfit.read_profiles(path)")
+    if not scan.profiles:
+        expected = "profiles of the beam: an emittance_gui file, or beamfit.read_profiles"
+        raise scan.unusable("no profiles", expected)
+    noise = noise or Noise()
+    scan, line = prepared(scan, line)
+    seen = unfitted(scan, line, noise=noise)
+    seen = seen._replace(look=one_by_one(look_through, [(seen.rows,)])[0])
+    r11, r12, known = (np.asarray(part) for part in seen.look[:3])
+    boost, planes = beta_gamma(seen.energy, seen.line.mass), []
+    for plane in scan.planes:
+        profiles, notes = mean_profiles(scan, plane)
+        if len(profiles) < 3:
+            continue
+        i, at = "xy".index(plane), [p.row for p in profiles]
+        rows = np.column_stack([r11[i, at], r12[i, at]])
+        resolution = np.sqrt(np.maximum(known[i, at], 0.0))
+        densities, phase = _densities(profiles, rows, resolution, noise, draws, seed)
+        labels = tuple(_label(scan, row) for row in at)
+        planes.append(PlaneDensity(plane, tuple(profiles), labels, densities, boost, phase,
+                                   tuple(notes)))  # fmt: skip
+    if not planes:
+        raise scan.unusable("profiles at fewer than three settings", "three, better five or more")
+    return DensityFit(scan, tuple(planes))
+
+
+def _densities(
+    profiles: list[MeanProfile],
+    rows: np.ndarray,
+    resolution: np.ndarray,
+    noise: Noise,
+    draws: int,
+    seed: int,
+) -> tuple[Densities | None, float]:
+    """Draws of the density, and the phase advance that was seen; None where no beam is found."""
+    size = np.sqrt(np.maximum([p.size**2 for p in profiles] - resolution**2, 1e-2 * resolution**2))
+    found = fit_sizes(*rows.T, size, size)
+    if not bool(found.positive):
+        return None, 0.0
+    s11, s12, s22 = np.asarray(found.sigma)
+    frame = np.linalg.cholesky(np.array([[s11, s12], [s12, s22]]))
+    try:
+        densities = tomography(profiles, rows, frame, resolution=resolution, noise=noise,
+                               draws=draws, seed=seed, odds=DEPART)  # fmt: skip
+    except np.linalg.LinAlgError:
+        return None, 0.0
+    c, s = densities.bins.direction.T
+    # Directions are lines: a phase and its opposite are one. What is seen is all but the gap.
+    phase = np.sort(np.degrees(np.arctan2(s, c)) % 180.0)
+    gaps = np.diff([*phase, phase[0] + 180.0])
+    return densities, float(180.0 - gaps.max())
+
+
+def _label(scan: QuadScan, row: int) -> str:
+    named = [f"{name} = {values[row]:.4g} {scan.units[name]}" for name, values in
+             scan.settings.items()]  # fmt: skip
+    return ", ".join(named) or (scan.screen[row] if scan.screen else f"row {row + 1}")
+
+
+def _quantity(draws: np.ndarray, unit: str) -> Quantity:
+    """Median of draws with half of the central 68 %, and the central 95 %."""
+    draws = draws[np.isfinite(draws)]
+    if not len(draws):
+        return Quantity(math.nan, None, unit)
+    low, high = np.quantile(draws, CENTRAL)
+    ends = np.quantile(draws, WIDE)
+    return Quantity(float(np.median(draws)), 0.5 * float(high - low), unit, None,
+                    (float(ends[0]), float(ends[1])))  # fmt: skip
+
+
+def _no_beam(plane: PlaneDensity) -> Finding | None:
+    if plane.densities is not None:
+        return None
+    cause = f"The profiles in {plane.plane} are of no beam through this line."
+    return Finding(Status.unidentified, cause, "Check the line, the magnet and the screen.")
+
+
+def _few_phases(plane: PlaneDensity) -> Finding | None:
+    if plane.phase >= LEAST_PHASE:
+        return None
+    cause = f"Profiles in {plane.plane} see {plane.phase:.0f}° of phase, {LEAST_PHASE:.0f}° are "
+    cause += "needed: what stands between them could hide any shape."
+    return Finding(Status.unidentified, cause, "Scan further on both sides of the waist.")
+
+
+def _contradiction(plane: PlaneDensity) -> Finding | None:
+    d = plane.densities
+    if d.contradicted <= TOLD:
+        return None
+    cause = (
+        f"No density gives these profiles in {plane.plane} (P = {percent(d.contradicted)}): the "
+        f"one at {plane.labels[d.worst]} departs most."
+    )
+    return Finding(Status.poor_fit, cause, "Look at that profile, and measure it again.")
+
+
+def _found(plane: PlaneDensity) -> Finding:
+    missing = 180.0 - plane.phase
+    cause = (
+        f"{plane.phase:.0f}° of phase are seen in {plane.plane}; what {missing:.0f}° could hide "
+        "is in the errors."
+    )
+    if plane.cut:
+        where = plane.labels[plane.cut[0]]
+        cause += f" The window cuts the beam at {where}: what lies beyond it is not known."
+        return Finding(Status.converged, cause, "Widen the window for 95 % of the charge and all.")
+    return Finding(Status.converged, cause)
+
+
+# In order of gravity.
+RULES = (_no_beam, _few_phases, _contradiction, _found)
+
+
+@answer
+@dataclass(frozen=True, eq=False)
+class DensityFit:
+    """Densities of the planes of a scan.
+
+    Attributes
+    ----------
+    scan : QuadScan
+        What was fitted.
+    planes : tuple of PlaneDensity
+        One a plane with profiles at three settings or more.
+    """
+
+    scan: QuadScan
+    planes: tuple[PlaneDensity, ...]
+
+    def __getitem__(self, plane: str) -> PlaneDensity:
+        """Give the density of a plane."""
+        found = {p.plane: p for p in self.planes}
+        if plane not in found:
+            raise InputError(f"no density in '{plane}'", ", ".join(found))
+        return found[plane]
+
+    def __iter__(self) -> Any:
+        return iter(self.planes)
+
+    @property
+    def status(self) -> Status:
+        """The gravest of the planes."""
+        return max((p.status for p in self.planes), key=ORDER.index)
+
+    @property
+    def headline(self) -> str:
+        """Verdict, and the emittances of 90 % of the charge."""
+        said = [f"{p.plane} {p.emittance['90 %']}" for p in self.planes]
+        return f"{cell(self.status)}: normalised emittance of 90 % of the charge {', '.join(said)}"
+
+    @property
+    def message(self) -> str:
+        """What each plane says."""
+        return " ".join(p.message for p in self.planes)
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Sentences on the file and on what was left out."""
+        return (*self.scan.notes, *(note for p in self.planes for note in p.notes))
+
+    def to_json(self) -> dict[str, Any]:
+        """Give the planes as the JSON contract wants them."""
+        return {"status": self.status, "message": self.message,
+                "planes": [p.to_json() for p in self.planes]}  # fmt: skip
+
+    def tables(self) -> tuple[Table, ...]:
+        """Lay out emittance against charge, halo and core of each plane."""
+        return tuple(_table(p) for p in self.planes)
+
+
+ORDER = [Status.converged, Status.poor_fit, Status.unidentified]
+
+
+def _table(plane: PlaneDensity) -> Table:
+    rows: list[list[Any]] = [
+        [f"emittance of {share} of the charge", cell(q), cell(q.interval_words)]
+        for share, q in plane.emittance.items()
+    ]
+    further: Mapping[str, Quantity] = {
+        "share beyond 3 rms": plane.halo,
+        "core brightness": plane.brightness,
+    }
+    rows += [[name, cell(q), cell(q.interval_words)] for name, q in further.items()]
+    title = f"Normalised emittance in {plane.plane}, from {len(plane.profiles)} profiles"
+    return Table(title, ["", "value", "95 % interval"], rows)

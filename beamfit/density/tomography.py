@@ -1,0 +1,430 @@
+"""Phase-space tomography by a Gaussian process, with every error of the profiles averaged over.
+
+The frame is the reference beam: points u = (q, p) in which it is round with unit rms. Profile k
+is the projection of the density on its direction, its position in units of its size there.
+
+The density is the reference Gaussian plus two Gaussian processes under Gaussian envelopes: a core
+and a tail (J. Svensson, EFDA-JET-PR(11)24, 2011; D. Li et al., Rev. Sci. Instrum. 84, 083506
+(2013), eqs. 5 to 9). All profiles are linear in it, so that its posterior is exact for given
+amplitudes; background, charge and centre of each profile are further columns. Settings scatter:
+each profile is stretched by a share of its own, to which the model is linearised anew until it
+stands. Densities may be negative where noise leaves that open: sums over many points are unbiased.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from functools import cache
+from typing import NamedTuple
+
+import numpy as np
+from scipy.linalg import cho_solve
+from scipy.optimize import minimize
+
+from beamfit.density.profiles import MeanProfile
+from beamfit.noise.model import Noise
+
+# The grid, in rms sizes, the rms of what stands at each point, and the least width of a bin.
+STEP, EDGE, BIN = 0.25, 6.0, 0.25
+POINT = 0.8 * STEP
+AXIS = np.arange(-EDGE, EDGE + STEP / 2, STEP)
+GRID = np.stack(np.meshgrid(AXIS, AXIS, indexing="ij"), -1).reshape(-1, 2)
+# Lengths over which the core changes, and envelopes of the core: equally likely, as far as a length
+# is no longer than its envelope. Length and envelope of the tail, in rms sizes.
+LENGTHS, ENVELOPES, TAIL = (0.4, 0.6, 0.9, 1.4), (1.3, 1.9), (2.4, 3.0)
+# Peak of the projected reference Gaussian: shares of the peak are shares of this.
+PEAK = 1.0 / math.sqrt(2.0 * math.pi)
+# Priors, standard deviations: background as a share of the peak, charge, centre in sizes, and sizes
+# of the beam about the reference.
+BACKGROUND, CHARGE, CENTRE, FRAME = 0.1, 0.05, 0.1, 0.3
+# Priors of ln: amplitude of core and tail over the reference's peak, noise of a bin and its part
+# that grows with the root of the charge, as shares of the peak. Scatter of settings: `Noise`.
+PRIORS = ((math.log(0.5), 1.0), (math.log(0.02), 1.2), (math.log(0.005), 1.5),
+          (math.log(0.02), 1.2))  # fmt: skip
+# Departures of a profile of its own: share of the peak, and length, in sizes.
+OWN, OWN_LENGTH = 0.1, 0.5
+# Linearisations, at which of them amplitudes are sought, and the most a step may change a size.
+ROUNDS, SOUGHT, MOST = 6, (2, 4), 0.3
+# Kernels less likely than this share have no draws; draws that share their amplitudes.
+LEAST, SHARED = 0.01, 8
+# Added to the diagonal of correlations of the grid.
+JITTER = 1e-9
+
+
+class Bins(NamedTuple):
+    """Bins of all profiles as the frame sees them.
+
+    Attributes
+    ----------
+    profile : ndarray
+        Shape (n,): number of the profile.
+    position, charge : ndarray
+        Shape (n,): in sizes, and share of the charge per size.
+    look, slope : ndarray
+        Shape (n, g): what each point of the grid adds to each bin, and its derivative.
+    direction : ndarray
+        Shape (k, 2): unit vectors of the profiles.
+    """
+
+    profile: np.ndarray
+    position: np.ndarray
+    charge: np.ndarray
+    look: np.ndarray
+    slope: np.ndarray
+    direction: np.ndarray
+
+    @property
+    def own(self) -> np.ndarray:
+        """1 where a bin is of a profile, shape (n, k)."""
+        return (self.profile[:, None] == np.arange(len(self.direction))).astype(float)
+
+
+class Densities(NamedTuple):
+    """Draws of the density.
+
+    Attributes
+    ----------
+    values : ndarray
+        Shape (d, g): charge at the points of `GRID`, each of rms `POINT`, in the frame.
+    frame : ndarray
+        Shape (2, 2): from the frame to position (m) and angle; its determinant is the emittance.
+    growth : ndarray
+        Shape (d,): emittance of a draw's frame over that.
+    bins : Bins
+        As fitted last.
+    fitted, error : ndarray
+        Shape (n,): charge of each bin by the mean density with what each profile has of its own,
+        and the noise of a bin.
+    stretch : ndarray
+        Shape (k,): sizes over those of the density, less one.
+    contradicted : float
+        Probability that no density fits: profiles have departures of their own.
+    worst : int
+        The profile with the largest.
+    scatter : float
+        What settings scatter, as a share of a size.
+    """
+
+    values: np.ndarray
+    frame: np.ndarray
+    growth: np.ndarray
+    bins: Bins
+    fitted: np.ndarray
+    error: np.ndarray
+    stretch: np.ndarray
+    contradicted: float
+    worst: int
+    scatter: float
+
+
+def tomography(
+    profiles: Sequence[MeanProfile],
+    rows: np.ndarray,
+    frame: np.ndarray,
+    *,
+    resolution: np.ndarray,
+    noise: Noise,
+    draws: int,
+    seed: int,
+    odds: float,
+) -> Densities:
+    """Draw densities that may have given the profiles.
+
+    Parameters
+    ----------
+    profiles : sequence of MeanProfile
+        k of them.
+    rows : ndarray
+        Shape (k, 2): R11 and R12 (m) of each.
+    frame : ndarray
+        Shape (2, 2): lower root of a beam matrix to begin with.
+    resolution : ndarray
+        Shape (k,): rms of what is not the beam's, m.
+    noise : Noise
+        For the scatter of settings.
+    draws, seed : int
+        How many, and the seed of their random numbers.
+    odds : float
+        Of profiles with departures of their own, before they are seen.
+
+    Returns
+    -------
+    Densities
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        If the profiles lead to no beam.
+    """
+    prior = np.array([*PRIORS, (math.log(noise.scatter.middle), noise.scatter.spread)])
+    density, stretch, numbers = _gaussian(), np.zeros(len(profiles)), prior[:, 0]
+    for i in range(ROUNDS):
+        bins = bins_of(profiles, rows, frame, stretch, resolution)
+        near = _Posterior.of(bins, density, stretch, _kernels(bins)[-1], prior)
+        if i in SOUGHT:
+            numbers = near.best(numbers)[1]
+        density, change, stretch = near.mean(numbers)
+        change = np.eye(2) + np.clip(change, -MOST, MOST)
+        frame = np.linalg.cholesky(frame @ change @ change.T @ frame.T)
+        stretch = np.clip(stretch, -MOST, MOST)
+    bins = bins_of(profiles, rows, frame, stretch, resolution)
+    each = [_Posterior.of(bins, density, stretch, k, prior) for k in _kernels(bins)]
+    found = [p.best(numbers) for p in each]
+    logs = np.array([log for log, _ in found])
+    weight = np.exp(logs - logs.max()) / np.exp(logs - logs.max()).sum()
+    random, parts = np.random.default_rng(seed), []
+    for p, (_, at), share in zip(each, found, weight, strict=True):
+        if share > LEAST:
+            parts.append(p.draws(at, max(1, round(share * draws)), random))
+    likeliest = int(np.argmax(weight))
+    best, at = each[likeliest], found[likeliest][1]
+    other = best.with_own_departures()
+    log, there = other.best(at)
+    excess = log - logs[likeliest] + math.log(odds)
+    values, changes = (np.concatenate(part) for part in zip(*parts, strict=True))
+    growth = np.linalg.det(np.eye(2) + changes)
+    return Densities(
+        values, frame, growth, bins, best.fitted(at), best.bin_error(at), stretch,
+        float(1.0 / (1.0 + math.exp(-np.clip(excess, -500.0, 500.0)))), other.worst(there),
+        float(math.exp(at[-1])),
+    )  # fmt: skip
+
+
+def bins_of(
+    profiles: Sequence[MeanProfile],
+    rows: np.ndarray,
+    frame: np.ndarray,
+    stretch: np.ndarray,
+    resolution: np.ndarray,
+) -> Bins:
+    """See the profiles through a frame, neighbouring bins added up to a quarter of a size."""
+    seen = rows @ frame
+    unit = np.hypot(*seen.T)
+    direction, size = seen / unit[:, None], unit * (1.0 + stretch)
+    parts = []
+    for k, p in enumerate(profiles):
+        count = max(1, int(BIN * size[k] / p.step))
+        whole = len(p.position) // count * count
+        x, charge = (v[:whole].reshape(-1, count).mean(1) for v in (p.position, p.charge))
+        inside = np.abs(x) < EDGE * size[k]
+        width = count * p.step / size[k]
+        charge = charge[inside] / (charge[inside].sum() * width)
+        parts.append((np.full(len(charge), k), x[inside] / size[k], charge,
+                      np.full(len(charge), width)))  # fmt: skip
+    profile, position, charge, width = (np.concatenate(v) for v in zip(*parts, strict=True))
+    width = np.sqrt(POINT**2 + width**2 / 12.0 + (resolution / size)[profile] ** 2)[:, None]
+    away = (position[:, None] - direction[profile] @ GRID.T) / width
+    look = PEAK / width * np.exp(-0.5 * away**2)
+    return Bins(profile, position, charge, look, -away / width * look, direction)
+
+
+class _Kernel(NamedTuple):
+    """Process of given length and envelope, with what the bins see of it.
+
+    ``seen`` is the covariance of bins and grid, shape (n, g), and ``of_bins`` that of bins.
+    """
+
+    length: float
+    envelope: float
+    seen: np.ndarray
+    of_bins: np.ndarray
+
+
+def _kernel(bins: Bins, length: float, envelope: float) -> _Kernel:
+    weight, along, n = _envelope(envelope), _correlation(length), len(AXIS)
+    seen = (bins.look * weight).reshape(-1, n, n)
+    seen = weight * (along @ seen @ along).reshape(-1, n * n)
+    return _Kernel(length, envelope, seen, seen @ bins.look.T)
+
+
+def _kernels(bins: Bins) -> list[tuple[_Kernel, _Kernel]]:
+    """Core and tail for every length and envelope."""
+    tail = _kernel(bins, *TAIL)
+    likely = [(length, e) for e in ENVELOPES for length in LENGTHS if length <= e]
+    return [(_kernel(bins, length, e), tail) for length, e in likely]
+
+
+@cache
+def _correlation(length: float) -> np.ndarray:
+    return np.exp(-0.5 * ((AXIS[:, None] - AXIS) / length) ** 2)
+
+
+@cache
+def _root(length: float) -> np.ndarray:
+    return np.linalg.cholesky(_correlation(length) + JITTER * np.eye(len(AXIS)))
+
+
+@cache
+def _envelope(rms: float) -> np.ndarray:
+    """Charge at each point of a Gaussian with the reference's peak."""
+    return STEP**2 / (2.0 * math.pi) * np.exp(-0.5 * np.sum(GRID**2, axis=1) / rms**2)
+
+
+@cache
+def _gaussian() -> np.ndarray:
+    """The reference: with the width of a point its rms is one."""
+    rms = math.sqrt(1.0 - POINT**2)
+    return _envelope(rms) / rms**2
+
+
+class _Posterior(NamedTuple):
+    """Posterior of the density for one kernel, linear about a density and stretches.
+
+    ``free`` are columns with unit priors: backgrounds, charges, centres, and three of the frame;
+    ``stretching`` those of the stretches. ``residual`` is what the reference leaves.
+    """
+
+    bins: Bins
+    kernels: tuple[_Kernel, _Kernel]
+    prior: np.ndarray
+    expected: np.ndarray
+    residual: np.ndarray
+    free: np.ndarray
+    stretching: np.ndarray
+    known: np.ndarray
+
+    @classmethod
+    def of(
+        cls,
+        bins: Bins,
+        density: np.ndarray,
+        stretch: np.ndarray,
+        kernels: tuple[_Kernel, _Kernel],
+        prior: np.ndarray,
+    ) -> _Posterior:
+        expected, slope, own = bins.look @ density, bins.slope @ density, bins.own
+        stretching = -own * (expected + bins.position * slope)[:, None]
+        c, s = bins.direction.T
+        frame = stretching @ (FRAME * np.column_stack([c * c, s * s, math.sqrt(2.0) * c * s]))
+        each = BACKGROUND * PEAK * np.ones_like(slope), CHARGE * expected, CENTRE * slope
+        free = np.hstack([*(own * column[:, None] for column in each), frame])
+        # The bins stand where these stretches put them: what is left of them has a mean.
+        residual = bins.charge - bins.look @ _gaussian() + stretching @ stretch
+        return cls(bins, kernels, prior, np.maximum(expected, 0.0), residual, free, stretching,
+                   free @ free.T)  # fmt: skip
+
+    def with_own_departures(self) -> _Posterior:
+        """The same with profiles that depart from every density."""
+        return self._replace(known=self.known + self._own_departures())
+
+    def _own_departures(self) -> np.ndarray:
+        position, profile = self.bins.position, self.bins.profile
+        apart = (position[:, None] - position) / OWN_LENGTH
+        high = np.exp(-0.5 * (position / ENVELOPES[-1]) ** 2)
+        same = (OWN * PEAK) ** 2 * (profile[:, None] == profile)
+        return same * np.outer(high, high) * np.exp(-0.5 * apart**2)
+
+    def _parts(self) -> tuple[np.ndarray, ...]:
+        """Covariances whose amplitudes are the numbers; those of noise are diagonals."""
+        flat = np.full(len(self.residual), PEAK**2)
+        core, tail = self.kernels
+        scatter = self.stretching @ self.stretching.T
+        return core.of_bins, tail.of_bins, flat, PEAK * self.expected, scatter
+
+    def covariance(self, numbers: np.ndarray) -> np.ndarray:
+        """Of the bins, at ln of the amplitudes."""
+        total = self.known.copy()
+        for square, part in zip(np.exp(2.0 * numbers), self._parts(), strict=True):
+            total += square * (part if part.ndim == 2 else np.diag(part))
+        return total
+
+    def bin_error(self, numbers: np.ndarray) -> np.ndarray:
+        """Noise of each bin."""
+        _, _, flat, grown, _ = self._parts()
+        square = np.exp(2.0 * numbers)
+        return np.sqrt(square[2] * flat + square[3] * grown)
+
+    def _loss(self, numbers: np.ndarray) -> tuple[float, np.ndarray]:
+        """Minus ln of evidence and prior, and its slope (Rasmussen and Williams, 2006, eq. 5.9)."""
+        try:
+            root = np.linalg.cholesky(self.covariance(numbers))
+        except np.linalg.LinAlgError:
+            return 1e10, np.zeros(len(numbers))
+        inverse = cho_solve((root, True), np.eye(len(root)))
+        pull, slope = inverse @ self.residual, []
+        for square, part in zip(np.exp(2.0 * numbers), self._parts(), strict=True):
+            if part.ndim == 2:
+                change = np.sum(inverse * part) - pull @ part @ pull
+            else:
+                change = np.diag(inverse) @ part - pull**2 @ part
+            slope.append(square * change)
+        z = (numbers - self.prior[:, 0]) / self.prior[:, 1]
+        loss = 0.5 * self.residual @ pull + np.log(np.diag(root)).sum() + 0.5 * z @ z
+        return float(loss), np.array(slope) + z / self.prior[:, 1]
+
+    def best(self, start: np.ndarray) -> tuple[float, np.ndarray]:
+        """Ln of the evidence at the likeliest amplitudes, and ln of these."""
+        found = minimize(self._loss, start, jac=True, method="L-BFGS-B", options={"maxiter": 30})
+        return -float(found.fun), found.x
+
+    def _pull(self, numbers: np.ndarray, residual: np.ndarray) -> np.ndarray:
+        return np.linalg.solve(self.covariance(numbers), residual)
+
+    def _answer(self, numbers: np.ndarray, pull: np.ndarray) -> np.ndarray:
+        """What pulls on the bins do to the density."""
+        return sum(
+            square * pull.T @ kernel.seen
+            for square, kernel in zip(np.exp(2.0 * numbers), self.kernels, strict=False)
+        )
+
+    def mean(self, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Mean density, change of the frame, and stretches."""
+        pull = self._pull(numbers, self.residual)
+        density = _gaussian() + self._answer(numbers, pull)
+        stretch = math.exp(2.0 * numbers[-1]) * (self.stretching.T @ pull)
+        return density, _symmetric(self.free.T @ pull), stretch
+
+    def fitted(self, numbers: np.ndarray) -> np.ndarray:
+        """The bins without their noise."""
+        pull, error = self._pull(numbers, self.residual), self.bin_error(numbers)
+        return self.bins.charge - error**2 * pull
+
+    def worst(self, numbers: np.ndarray) -> int:
+        """The profile that departs most from every density."""
+        own = self._own_departures() @ self._pull(numbers, self.residual)
+        return int(np.argmax(self.bins.own.T @ own**2))
+
+    def draws(
+        self, numbers: np.ndarray, count: int, random: np.random.Generator
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Densities and changes of the frame, amplitudes by Laplace's method.
+
+        Each is a draw of the prior moved by what the bins say of it (A. G. Journel and C. J.
+        Huijbregts, Mining Geostatistics, 1978, ch. VII).
+        """
+        step, each = 0.1, np.eye(len(numbers))
+        curved = np.array([(self._loss(numbers + step * u)[1] - self._loss(numbers - step * u)[1])
+                           / (2.0 * step) for u in each])  # fmt: skip
+        values, vectors = np.linalg.eigh(0.5 * (curved + curved.T))
+        # The prior alone curves by 1/1.5²: less is rounding.
+        width = vectors / np.sqrt(np.maximum(values, 1.0 / self.prior[:, 1].max() ** 2))
+        parts = []
+        for some in np.array_split(np.arange(count), max(1, count // SHARED)):
+            at = numbers + width @ random.normal(size=len(numbers))
+            parts.append(self._draws_at(at, len(some), random))
+        densities, changes = zip(*parts, strict=True)
+        return np.concatenate(densities), np.concatenate(changes)
+
+    def _draws_at(
+        self, numbers: np.ndarray, count: int, random: np.random.Generator
+    ) -> tuple[np.ndarray, np.ndarray]:
+        amplitude, n, density = np.exp(numbers), len(AXIS), np.zeros((count, len(GRID)))
+        for size, kernel in zip(amplitude, self.kernels, strict=False):
+            root = _root(kernel.length)
+            wave = root @ random.normal(size=(count, n, n)) @ root.T
+            density += size * _envelope(kernel.envelope) * wave.reshape(count, -1)
+        free = random.normal(size=(count, self.free.shape[1]))
+        stretch = amplitude[-1] * random.normal(size=(count, self.stretching.shape[1]))
+        noise = self.bin_error(numbers) * random.normal(size=(count, len(self.residual)))
+        seen = density @ self.bins.look.T + free @ self.free.T + stretch @ self.stretching.T
+        pull = self._pull(numbers, (self.residual - seen - noise).T)
+        found = _gaussian() + density + self._answer(numbers, pull)
+        moved = free + pull.T @ self.free
+        return found, np.array([_symmetric(row) for row in moved])
+
+
+def _symmetric(free: np.ndarray) -> np.ndarray:
+    """Change of the frame of the last three of the columns."""
+    a, b, c = FRAME * free[-3:]
+    return np.array([[a, c / math.sqrt(2.0)], [c / math.sqrt(2.0), b]])
