@@ -14,6 +14,7 @@ from beamfit import __version__
 from beamfit.cli.batch import batch
 from beamfit.cli.check import check
 from beamfit.cli.control import control
+from beamfit.cli.density import density
 from beamfit.cli.design import design
 from beamfit.cli.emittance import emittance
 from beamfit.cli.example import example
@@ -47,7 +48,7 @@ def cli() -> None:
     """Beam emittance and lifetime from scans and decays, with errors you can defend."""
 
 
-for command in (emittance, lifetime, setpoint, design, tune, example, check):
+for command in (emittance, density, lifetime, setpoint, design, tune, example, check):
     cli.add_command(command)
 for command in (solve, identify, control, batch, watch, scan):
     cli.add_command(command)

@@ -35,9 +35,9 @@ LEAST_PHASE = 60.0
 # Odds that profiles depart from every density, before they are seen, and the probability from
 # which they are taken to.
 DEPART, TOLD = 0.01, 0.5
-# A window that ends where the profile still has this share of its peak cuts the beam: a Gaussian
-# has it at 2.8 rms, with 2 % of its second moment beyond.
-CUT = 0.02
+# A window that ends where the density still has this share of its peak cuts the beam: a Gaussian has
+# it at 3 rms, with 3 % of its second moment beyond.
+CUT = 0.01
 # Shares that a cut window leaves open.
 OPEN_WHEN_CUT = 0.95
 CENTRAL, WIDE = (0.16, 0.84), (0.025, 0.975)
@@ -84,7 +84,17 @@ class PlaneDensity:
     @property
     def cut(self) -> tuple[int, ...]:
         """Profiles whose window cuts the beam."""
-        return tuple(k for k, p in enumerate(self.profiles) if p.ends > CUT)
+        return tuple(int(k) for k in np.flatnonzero(self.ends > CUT))
+
+    @cached_property
+    def ends(self) -> np.ndarray:
+        """What the mean density has at the ends of each window, over its peak there; shape (k,)."""
+        if self.densities is None:
+            return np.zeros(len(self.profiles))
+        bins = self.densities.bins
+        seen = bins.look @ self.densities.values.mean(axis=0)
+        each = [seen[bins.profile == k] for k in range(len(self.profiles))]
+        return np.array([max(one[0], one[-1]) / one.max() for one in each])
 
     @cached_property
     def finding(self) -> Finding:
@@ -157,7 +167,8 @@ class PlaneDensity:
             "halo": self.halo,
             "core_brightness": self.brightness,
             "phase_seen_deg": self.phase,
-            "profiles": [p._replace(position=None, charge=None) for p in ()] or len(self.profiles),
+            "profiles": len(self.profiles),
+            "window_ends": None if d is None else list(map(float, self.ends)),
             "contradicted": None if d is None else d.contradicted,
             "scatter": None if d is None else d.scatter,
         }

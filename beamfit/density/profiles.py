@@ -47,12 +47,6 @@ class MeanProfile(NamedTuple):
         """Width of a bin, m."""
         return float(self.position[1] - self.position[0])
 
-    @property
-    def ends(self) -> float:
-        """The higher of both ends of the window over the peak."""
-        n = max(3, len(self.charge) // 20)
-        return float(max(self.charge[:n].mean(), self.charge[-n:].mean()) / self.charge.max())
-
 
 def mean_profiles(scan: QuadScan, plane: str) -> tuple[list[MeanProfile], list[str]]:
     """Average the shots of each setting, and say what was left out.
@@ -97,6 +91,20 @@ def mean_profiles(scan: QuadScan, plane: str) -> tuple[list[MeanProfile], list[s
     if dark:
         notes.append(f"{dark} profiles in {plane} were left out: no beam, or another charge.")
     return found, list(dict.fromkeys(notes))
+
+
+def profile_size(profile: Profile) -> float:
+    """Find the rms size of a profile, m, its background by the ends; NaN where it shows no beam.
+
+    Examples
+    --------
+    >>> x = np.linspace(-1e-3, 1e-3, 81)
+    >>> beam = Profile("x", 0, x, 5.0 + 100.0 * np.exp(-0.5 * (x / 2e-4) ** 2), None)
+    >>> round(1e6 * profile_size(beam))
+    200
+    """
+    shot = _shot(profile)
+    return np.nan if shot is None else _mean(profile.row, [shot]).size
 
 
 def _shot(profile: Profile) -> tuple[np.ndarray, np.ndarray] | None:

@@ -30,9 +30,10 @@ STEP, EDGE, BIN = 0.25, 6.0, 0.25
 POINT = 0.8 * STEP
 AXIS = np.arange(-EDGE, EDGE + STEP / 2, STEP)
 GRID = np.stack(np.meshgrid(AXIS, AXIS, indexing="ij"), -1).reshape(-1, 2)
-# Lengths over which the core changes, and envelopes of the core: equally likely, as far as a length
-# is no longer than its envelope. Length and envelope of the tail, in rms sizes.
-LENGTHS, ENVELOPES, TAIL = (0.4, 0.6, 0.9, 1.4), (1.3, 1.9), (2.4, 3.0)
+# Lengths over which the core changes with its envelope, equally likely; those of the tail; and
+# those that the frame is found with. In rms sizes; no core is longer than its envelope.
+CORES = ((0.4, 1.3), (0.6, 1.3), (0.9, 1.3), (0.4, 1.9), (0.6, 1.9), (0.9, 1.9), (1.4, 1.9))
+TAIL, ROUGH = (2.4, 3.0), (0.6, 1.9)
 # Peak of the projected reference Gaussian: shares of the peak are shares of this.
 PEAK = 1.0 / math.sqrt(2.0 * math.pi)
 # Priors, standard deviations: background as a share of the peak, charge, centre in sizes, and sizes
@@ -161,7 +162,7 @@ def tomography(
     density, stretch, numbers = _gaussian(), np.zeros(len(profiles)), prior[:, 0]
     for i in range(ROUNDS):
         bins = bins_of(profiles, rows, frame, stretch, resolution)
-        near = _Posterior.of(bins, density, stretch, _kernels(bins)[-1], prior)
+        near = _Posterior.of(bins, density, stretch, _kernels(bins, [ROUGH])[0], prior)
         if i in SOUGHT:
             numbers = near.best(numbers)[1]
         density, change, stretch = near.mean(numbers)
@@ -169,7 +170,7 @@ def tomography(
         frame = np.linalg.cholesky(frame @ change @ change.T @ frame.T)
         stretch = np.clip(stretch, -MOST, MOST)
     bins = bins_of(profiles, rows, frame, stretch, resolution)
-    each = [_Posterior.of(bins, density, stretch, k, prior) for k in _kernels(bins)]
+    each = [_Posterior.of(bins, density, stretch, k, prior) for k in _kernels(bins, CORES)]
     found = [p.best(numbers) for p in each]
     logs = np.array([log for log, _ in found])
     weight = np.exp(logs - logs.max()) / np.exp(logs - logs.max()).sum()
@@ -233,16 +234,16 @@ class _Kernel(NamedTuple):
 
 def _kernel(bins: Bins, length: float, envelope: float) -> _Kernel:
     weight, along, n = _envelope(envelope), _correlation(length), len(AXIS)
-    seen = (bins.look * weight).reshape(-1, n, n)
-    seen = weight * (along @ seen @ along).reshape(-1, n * n)
+    seen = (bins.look * weight).reshape(-1, n) @ along
+    seen = seen.reshape(-1, n, n).swapaxes(1, 2).reshape(-1, n) @ along
+    seen = weight * seen.reshape(-1, n, n).swapaxes(1, 2).reshape(-1, n * n)
     return _Kernel(length, envelope, seen, seen @ bins.look.T)
 
 
-def _kernels(bins: Bins) -> list[tuple[_Kernel, _Kernel]]:
-    """Core and tail for every length and envelope."""
+def _kernels(bins: Bins, likely: Sequence[tuple[float, float]]) -> list[tuple[_Kernel, _Kernel]]:
+    """Core, for each length and envelope, and tail."""
     tail = _kernel(bins, *TAIL)
-    likely = [(length, e) for e in ENVELOPES for length in LENGTHS if length <= e]
-    return [(_kernel(bins, length, e), tail) for length, e in likely]
+    return [(_kernel(bins, *core), tail) for core in likely]
 
 
 @cache
@@ -311,7 +312,7 @@ class _Posterior(NamedTuple):
     def _own_departures(self) -> np.ndarray:
         position, profile = self.bins.position, self.bins.profile
         apart = (position[:, None] - position) / OWN_LENGTH
-        high = np.exp(-0.5 * (position / ENVELOPES[-1]) ** 2)
+        high = np.exp(-0.5 * (position / ROUGH[1]) ** 2)
         same = (OWN * PEAK) ** 2 * (profile[:, None] == profile)
         return same * np.outer(high, high) * np.exp(-0.5 * apart**2)
 

@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from datetime import datetime, timedelta
+from itertools import product
 from os import PathLike
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -194,7 +195,7 @@ def _read(source: _Fields) -> EmittanceGuiFile:
         if (mean := _scan(settings, own, error, called)) is not None:
             means[name] = replace(mean, error_source="the file")
         alone = error if beams.shape[1] == 1 else {}
-        profiles = _profiles(source.get("beam"), used, k)
+        profiles = _profiles(beams, k)
         if (scan := _scan(settings, each, alone, called, profiles)) is None:
             left_out[name] = _counted(each, settings.labels)
             continue
@@ -436,19 +437,17 @@ def _notes(
             yield f"The file's means in {plane} are not those of these shots: {_first(places)}."
 
 
-def _profiles(beam: np.ndarray | None, used: np.ndarray, k: int) -> tuple[Profile, ...]:
-    """Projected profiles of one method, as far as the file has them."""
+def _profiles(beams: np.ndarray, k: int) -> tuple[Profile, ...]:
+    """Projected profiles of the shots of one method, as far as the file has them."""
     found = []
-    if beam is None or beam.dtype.names is None or beam.ndim < 2 or k >= beam.shape[1]:
-        return ()
-    for row, i in enumerate(used):
-        for plane in SIZE:
-            record = beam[(i, k, *(0,) * (beam.ndim - 2))]
-            field = f"prof{plane}"
-            values = np.asarray(record[field]) if field in beam.dtype.names else np.zeros(0)
-            if values.ndim == 2 and values.shape[0] in (2, 3) and values.dtype.kind in "iuf":
-                position, counts, *curve = np.asarray(values, float)
-                found.append(Profile(plane, row, 1e-6 * position, counts, *(curve or [None])))
+    for (row, shot), plane in product(np.ndindex(beams.shape[:2]), SIZE):
+        field = f"prof{plane}"
+        if field not in beams.dtype.names:
+            continue
+        values = np.asarray(beams[field][row, shot, k])
+        if values.ndim == 2 and values.shape[0] in (2, 3) and values.dtype.kind in "iuf":
+            position, counts, *curve = np.asarray(values, float)
+            found.append(Profile(plane, row, 1e-6 * position, counts, *(curve or [None])))
     return tuple(found)
 
 

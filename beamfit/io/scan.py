@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from beamfit.emittance.scan import POSSIBLE, USUAL, QuadScan, first_unusable, middle
+from beamfit.emittance.scan import POSSIBLE, USUAL, Profile, QuadScan, first_unusable, middle
 from beamfit.errors import InputError, located
 from beamfit.io.columns import (
     UNITS,
@@ -23,6 +23,7 @@ from beamfit.io.columns import (
 from beamfit.io.emittance_gui import is_emittance_gui, read_emittance_gui
 from beamfit.io.files import name_of
 from beamfit.io.headers import SETTINGS
+from beamfit.io.profiles import has_profiles, of_profiles
 from beamfit.io.scan_columns import (
     ENERGIES,
     PERCENT,
@@ -111,6 +112,9 @@ def read_quad_scan(
 
 def scan_of_sheet(sheet: Sheet, skip_bad: bool = False) -> QuadScan:
     """Understand the columns of a sheet as a scan, as `read_quad_scan` does."""
+    profiles: tuple[Profile, ...] = ()
+    if has_profiles(sheet):
+        sheet, profiles = of_profiles(sheet)
     columns = scan_columns(sheet)
     if skip_bad:
         sheet = sheet.good(lambda rows: _values(rows, columns))
@@ -124,7 +128,7 @@ def scan_of_sheet(sheet: Sheet, skip_bad: bool = False) -> QuadScan:
         more = "; --skip-bad leaves such rows out" if skip else ""
         raise replace(error, expected=error.expected + more) from None
     with located(sheet.path):
-        scan = _scan(sheet, columns, values)
+        scan = replace(_scan(sheet, columns, values), profiles=profiles)
     return average_shots(scan, marked="shot" in columns)
 
 

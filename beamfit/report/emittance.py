@@ -119,7 +119,8 @@ def _pictures(fit: EmittanceFit) -> list[Picture]:
     width = ALONE if len(fit.planes) == 1 else ABREAST
     listed = [scan_picture(fit, p.plane, width) for p in fit.planes]
     for p in fit.planes:
-        if shown := [f for f in fit.scan.profiles if f.plane == p.plane][:MOST_DRAWN]:
+        first = {f.row: f for f in reversed(fit.scan.profiles) if f.plane == p.plane}
+        if shown := [first[row] for row in sorted(first)][:MOST_DRAWN]:
             height = 0.6 + 1.3 * math.ceil(len(shown) / PROFILES_ABREAST)
             draw = partial(draw_profiles, profiles=shown, fit=fit)
             words, source = f"profiles of the {p.plane} plane", source_of(fit)

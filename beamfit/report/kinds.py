@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+from beamfit.density.fit import DensityFit
 from beamfit.dynamics.fedbatch import FedBatchFit
 from beamfit.dynamics.feed import FeedPlan
 from beamfit.dynamics.fit import ResponseFit
@@ -15,6 +16,7 @@ from beamfit.emittance.slices import SliceFits
 from beamfit.language.computed import Computed
 from beamfit.language.solution import ProblemSolution
 from beamfit.report.control import control_page
+from beamfit.report.density import density_page
 from beamfit.report.document import ReportPage
 from beamfit.report.fedbatch import fedbatch_page, feed_page
 from beamfit.report.formulation import computed_page, formulation_page
@@ -31,6 +33,7 @@ OF_ONE = {
     FeedPlan: feed_page,
     Loop: control_page,
     TuningFit: tuning_page,
+    DensityFit: density_page,
 }
 OF_SEVERAL = dict.fromkeys((ResponseFit, StatesFit), response_page)
 OF_SEVERAL |= dict.fromkeys((FedBatchFit, TitreFit), fedbatch_page)

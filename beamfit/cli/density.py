@@ -1,0 +1,61 @@
+"""`beamfit density`: profiles of a scan in, emittance against charge out."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from beamfit.cli.options import Command, answered, options, reported
+from beamfit.errors import InputError
+from beamfit.io.line import build_line, read_inputs
+from beamfit.io.priors import read_noise
+
+if TYPE_CHECKING:
+    from beamfit.cli.show import Terminal
+    from beamfit.density.fit import DensityFit
+
+EXAMPLE = """\b
+Examples:
+  beamfit density Emittance-scan-OTRS_IN20_571.mat --report density.html
+  beamfit density measurements/profiles_simulated.csv --lattice lattices/lcls_otr2.toml
+  beamfit density profiles.h5 --lattice line.toml --json
+"""
+
+
+@click.command(cls=Command, epilog=EXAMPLE)
+@options(
+    "scan columns ignore skip-bad size-method maybe-lattice use from to screen energy particle"
+)
+@options("noise seed report json")
+def density(
+    scan: str, noise: str | None, seed: int, report: str | None, as_json: bool, **given: Any
+) -> None:
+    """Find the density of a beam in phase space, and its emittance against charge, with errors.
+
+    SCAN is a .mat file of SLAC's emittance_gui, or a CSV or HDF5 table with a line for each bin of
+    each profile: Q2_A, shot, position_um, counts_x, counts_y.
+    """
+    read = read_inputs(scan, **given)
+    if not read.scan.profiles:
+        expected = "columns position_um and counts_x, a line a bin, or a file of emittance_gui"
+        raise InputError("sizes and no profiles", expected, scan)
+    own = None if noise is None else read_noise(noise)
+    line = build_line(read.lattice)  # JAX from here on
+
+    from beamfit.density.fit import fit_density
+
+    fit = fit_density(read.scan, line, noise=own, seed=seed)
+    inputs = {str(each.path): each.sha256 for each in (read.scan, read.lattice)}
+    reported(report, fit, inputs)
+    answered(as_json, [fit], inputs, lambda terminal: show_density(terminal, fit), report)
+
+
+def show_density(terminal: Terminal, fit: DensityFit) -> None:
+    """Say the verdict first, then emittance against charge."""
+    terminal.answer(fit.headline, fit.status, fit.message)
+    for note in fit.notes:
+        terminal.line(note)
+    for table in fit.tables():
+        terminal.line()
+        terminal.table(table)
