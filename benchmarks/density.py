@@ -23,6 +23,7 @@ import numpy as np
 from beamfit.density.charge import _parts
 from beamfit.density.fit import SHARES, PlaneDensity, fit_density
 from beamfit.emittance.scan import Profile, QuadScan
+from beamfit.errors import InputError
 from beamfit.io.emittance_gui import read_emittance_gui
 from beamfit.optics.particle import ELECTRON_MASS, beta_gamma
 
@@ -123,6 +124,14 @@ def fitted(kind: str, seed: int, number: int) -> tuple[PlaneDensity, np.ndarray]
     return fit_density(scan)["x"], whole * truth(beam)
 
 
+def refused(kind: str, seed: int, number: int) -> bool:
+    """True if a simulated scan has no density."""
+    try:
+        return fitted(kind, seed, number)[0].status.value != "converged"
+    except InputError:
+        return True
+
+
 def cover(kind: str, seed: int, scans: int) -> Iterator[str]:
     """A table row for each share of the charge."""
     held = {share: [] for share in SHARES}
@@ -168,8 +177,8 @@ def main() -> None:
             print(row, flush=True)
     print()
     for kind in REFUSED:
-        found = [fitted(kind, told.seed, number)[0].status.value for number in range(told.scans)]
-        print(f"- {kind}: {sum(s != 'converged' for s in found)} of {told.scans} refused")
+        found = [refused(kind, told.seed, number) for number in range(told.scans)]
+        print(f"- {kind}: {sum(found)} of {told.scans} refused")
 
 
 if __name__ == "__main__":

@@ -10,11 +10,11 @@ import numpy as np
 from beamfit.density.tomography import AXIS, EDGE, POINT
 
 # Points of the fine grid, in rms sizes, and the rings into which squares of radii are counted.
-FINE = 0.1
+FINE = 0.15
 FINE_AXIS = np.arange(-EDGE, EDGE + FINE / 2, FINE)
-FAR, RINGS = 40.0, 800
+FAR, RINGS = 100.0, 2000
 # Squared radii, in rms sizes, beyond which charge is halo, and within which it is core.
-HALO, CORE = 9.0, 0.25
+HALO, CORE = 9.0, 1.0
 
 
 class ChargeParts(NamedTuple):
@@ -26,7 +26,7 @@ class ChargeParts(NamedTuple):
         Shape (d, f): rms emittance of the charge within the ellipse, of the shape of the rms beam,
         that holds each share; NaN where a density has no rms.
     halo, core : ndarray
-        Shape (d,): shares of the charge beyond 3 rms, and within half of one.
+        Shape (d,): shares of the charge beyond 3 rms, and within one.
     rms : ndarray
         Shape (d,): emittance of all charge.
     """
@@ -68,6 +68,21 @@ def charge_parts(values: np.ndarray, shares: tuple[float, ...]) -> ChargeParts:
     found = [_parts(density, q, p, powers, shares) for density in finely(values)]
     emittance, halo, core, rms = zip(*found, strict=True)
     return ChargeParts(*map(np.array, (emittance, halo, core, rms)))
+
+
+def negative_charge(values: np.ndarray) -> float:
+    """Find how many standard deviations the charge is below zero where the mean density is.
+
+    Examples
+    --------
+    >>> from beamfit.density.tomography import _gaussian
+    >>> noise = np.random.default_rng(1).normal(size=(64, len(_gaussian())))
+    >>> bool(negative_charge(_gaussian() + 1e-4 * noise) < 2.0)
+    True
+    """
+    fine = finely(values)
+    charge = fine[:, fine.mean(axis=0) < 0.0].sum(axis=1)
+    return float(-charge.mean() / charge.std()) if charge.std() > 0.0 else 0.0
 
 
 def finely(values: np.ndarray) -> np.ndarray:

@@ -9,9 +9,10 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+from scipy.special import ndtr
 
 from beamfit.answer import answer
-from beamfit.density.charge import FINE, charge_parts, finely
+from beamfit.density.charge import FINE, charge_parts, finely, negative_charge
 from beamfit.density.profiles import MeanProfile, mean_profiles
 from beamfit.density.tomography import Densities, tomography
 from beamfit.emittance.known import one_by_one, prepared, unfitted
@@ -32,16 +33,15 @@ SHARES, DRAWS = (0.5, 0.68, 0.9, 0.95, 1.0), 256
 # Phase advance, degrees, without which no density is given: three phases 30 degrees apart
 # (statement of the project; a density is made of 180).
 LEAST_PHASE = 60.0
-# Odds that profiles depart from every density, before they are seen, and the probability from
-# which they are taken to.
-DEPART, TOLD = 0.01, 0.5
-# A window that ends where the density still has this share of its peak cuts the beam: a Gaussian has
-# it at 3 rms, with 3 % of its second moment beyond.
+# No density has negative charge. Places that are told apart within 3 rms, by lengths of .6 rms, in
+# any of which chance may ask for it; and the probability of chance below which it is none.
+PLACES, CHANCE = 25, 0.01
+# A window that ends where the density still has this share of its peak cuts the beam: a Gaussian
+# has it at 3 rms, with 3 % of its second moment beyond.
 CUT = 0.01
 # Shares that a cut window leaves open.
 OPEN_WHEN_CUT = 0.95
 CENTRAL, WIDE = (0.16, 0.84), (0.025, 0.975)
-UNSURE = ("halo", "background")
 
 
 @answer
@@ -97,6 +97,11 @@ class PlaneDensity:
         return np.array([max(one[0], one[-1]) / one.max() for one in each])
 
     @cached_property
+    def by_chance(self) -> float:
+        """Probability that chance has profiles of a density ask for as much negative charge."""
+        return min(1.0, PLACES * float(ndtr(-negative_charge(self.densities.values))))
+
+    @cached_property
     def finding(self) -> Finding:
         """Status with its sentences."""
         return judge(self, RULES)
@@ -138,10 +143,10 @@ class PlaneDensity:
 
     @cached_property
     def brightness(self) -> Quantity:
-        """Charge within half an rms over its area in normalised phase space, 1/m."""
+        """Share of the charge within one rms over its area in normalised phase space, 1/m."""
         if self.densities is None:
             return Quantity(math.nan, None, "1/m")
-        q = _quantity(self._parts.core / (0.25 * math.pi * self._parts.rms), "1/m")
+        q = _quantity(self._parts.core / (math.pi * self._parts.rms), "1/m")
         return q if self._known else q.open()
 
     def _share(self, name: str) -> Quantity:
@@ -169,7 +174,7 @@ class PlaneDensity:
             "phase_seen_deg": self.phase,
             "profiles": len(self.profiles),
             "window_ends": None if d is None else list(map(float, self.ends)),
-            "contradicted": None if d is None else d.contradicted,
+            "by_chance": None if d is None else self.by_chance,
             "scatter": None if d is None else d.scatter,
         }
         return json_of(found)
@@ -188,7 +193,7 @@ def fit_density(
     Parameters
     ----------
     scan : QuadScan or path
-        With ``profiles``: of a file of emittance_gui, or `beamfit.read_profiles`.
+        With ``profiles``: of a file of emittance_gui, or of a table of profiles.
     line : Beamline or path, optional
         From where the density is wanted to the screens; None for rows with matrices.
     noise : Noise, optional
@@ -224,10 +229,10 @@ def fit_density(
     >>> found.status.value, abs(found.emittance["90 %"].value / (264.2 * 0.744e-9) - 1) < 0.03
     ('converged', True)
     """
-    expect(scan, QuadScan, "beamfit.read_profiles(path)")
+    expect(scan, QuadScan, "beamfit.read_quad_scan(path)")
     if not scan.profiles:
-        expected = "profiles of the beam: an emittance_gui file, or beamfit.read_profiles"
-        raise scan.unusable("no profiles", expected)
+        expected = "an emittance_gui file, or columns position_um and counts_x, a line a bin"
+        raise scan.unusable("a scan of sizes, without profiles", expected)
     noise = noise or Noise()
     scan, line = prepared(scan, line)
     seen = unfitted(scan, line, noise=noise)
@@ -246,7 +251,9 @@ def fit_density(
         planes.append(PlaneDensity(plane, tuple(profiles), labels, densities, boost, phase,
                                    tuple(notes)))  # fmt: skip
     if not planes:
-        raise scan.unusable("profiles at fewer than three settings", "three, better five or more")
+        raise scan.unusable(
+            "profiles that show a beam at fewer than three settings", "five or more"
+        )
     return DensityFit(scan, tuple(planes))
 
 
@@ -267,7 +274,7 @@ def _densities(
     frame = np.linalg.cholesky(np.array([[s11, s12], [s12, s22]]))
     try:
         densities = tomography(profiles, rows, frame, resolution=resolution, noise=noise,
-                               draws=draws, seed=seed, odds=DEPART)  # fmt: skip
+                               draws=draws, seed=seed)  # fmt: skip
     except np.linalg.LinAlgError:
         return None, 0.0
     c, s = densities.bins.direction.T
@@ -310,12 +317,12 @@ def _few_phases(plane: PlaneDensity) -> Finding | None:
 
 
 def _contradiction(plane: PlaneDensity) -> Finding | None:
-    d = plane.densities
-    if d.contradicted <= TOLD:
+    if plane.by_chance >= CHANCE:
         return None
     cause = (
-        f"No density gives these profiles in {plane.plane} (P = {percent(d.contradicted)}): the "
-        f"one at {plane.labels[d.worst]} departs most."
+        f"No density gives these profiles in {plane.plane}: they ask for negative charge, which "
+        f"chance does with P = {plane.by_chance:.1g}. The profile at "
+        f"{plane.labels[plane.densities.worst]} departs most."
     )
     return Finding(Status.poor_fit, cause, "Look at that profile, and measure it again.")
 

@@ -14,7 +14,7 @@ FEWEST_BINS, LEAST_LIGHT = 12, 5.0
 USUAL_LIGHT = 0.5
 # Share of the window at each end that is taken for background to begin with, and the reach of a
 # size in sizes: the tails are the density's to tell.
-ENDS, REACH = 0.1, 3.0
+ENDS, REACH = 0.1, 4.0
 # Share of the peak above which a shot's bins tell its centre.
 CENTRE = 0.2
 # Bins at exactly the highest count: more than a rounded peak has.
@@ -89,7 +89,8 @@ def mean_profiles(scan: QuadScan, plane: str) -> tuple[list[MeanProfile], list[s
         dark += int((~usual).sum())
         found.append(_mean(row, [s for s, good in zip(shots, usual, strict=True) if good]))
     if dark:
-        notes.append(f"{dark} profiles in {plane} were left out: no beam, or another charge.")
+        word = "profile was" if dark == 1 else "profiles were"
+        notes.append(f"{dark} {word} left out in {plane}: no beam, or another charge.")
     return found, list(dict.fromkeys(notes))
 
 

@@ -26,7 +26,7 @@ from beamfit.density.profiles import MeanProfile
 from beamfit.noise.model import Noise
 
 # The grid, in rms sizes, the rms of what stands at each point, and the least width of a bin.
-STEP, EDGE, BIN = 0.25, 6.0, 0.25
+STEP, EDGE, BIN = 0.3, 8.1, 0.3
 POINT = 0.8 * STEP
 AXIS = np.arange(-EDGE, EDGE + STEP / 2, STEP)
 GRID = np.stack(np.meshgrid(AXIS, AXIS, indexing="ij"), -1).reshape(-1, 2)
@@ -99,10 +99,8 @@ class Densities(NamedTuple):
         and the noise of a bin.
     stretch : ndarray
         Shape (k,): sizes over those of the density, less one.
-    contradicted : float
-        Probability that no density fits: profiles have departures of their own.
     worst : int
-        The profile with the largest.
+        The profile with the largest departures of its own.
     scatter : float
         What settings scatter, as a share of a size.
     """
@@ -114,7 +112,6 @@ class Densities(NamedTuple):
     fitted: np.ndarray
     error: np.ndarray
     stretch: np.ndarray
-    contradicted: float
     worst: int
     scatter: float
 
@@ -128,7 +125,6 @@ def tomography(
     noise: Noise,
     draws: int,
     seed: int,
-    odds: float,
 ) -> Densities:
     """Draw densities that may have given the profiles.
 
@@ -146,8 +142,6 @@ def tomography(
         For the scatter of settings.
     draws, seed : int
         How many, and the seed of their random numbers.
-    odds : float
-        Of profiles with departures of their own, before they are seen.
 
     Returns
     -------
@@ -180,15 +174,11 @@ def tomography(
             parts.append(p.draws(at, max(1, round(share * draws)), random))
     likeliest = int(np.argmax(weight))
     best, at = each[likeliest], found[likeliest][1]
-    other = best.with_own_departures()
-    log, there = other.best(at)
-    excess = log - logs[likeliest] + math.log(odds)
     values, changes = (np.concatenate(part) for part in zip(*parts, strict=True))
     growth = np.linalg.det(np.eye(2) + changes)
     return Densities(
         values, frame, growth, bins, best.fitted(at), best.bin_error(at), stretch,
-        float(1.0 / (1.0 + math.exp(-np.clip(excess, -500.0, 500.0)))), other.worst(there),
-        float(math.exp(at[-1])),
+        best.worst(at), float(math.exp(at[-1])),
     )  # fmt: skip
 
 
@@ -305,10 +295,6 @@ class _Posterior(NamedTuple):
         return cls(bins, kernels, prior, np.maximum(expected, 0.0), residual, free, stretching,
                    free @ free.T)  # fmt: skip
 
-    def with_own_departures(self) -> _Posterior:
-        """The same with profiles that depart from every density."""
-        return self._replace(known=self.known + self._own_departures())
-
     def _own_departures(self) -> np.ndarray:
         position, profile = self.bins.position, self.bins.profile
         apart = (position[:, None] - position) / OWN_LENGTH
@@ -382,9 +368,10 @@ class _Posterior(NamedTuple):
         return self.bins.charge - error**2 * pull
 
     def worst(self, numbers: np.ndarray) -> int:
-        """The profile that departs most from every density."""
-        own = self._own_departures() @ self._pull(numbers, self.residual)
-        return int(np.argmax(self.bins.own.T @ own**2))
+        """The profile that departs most from every density, if each may have a part of its own."""
+        own = self._own_departures()
+        part = own @ np.linalg.solve(self.covariance(numbers) + own, self.residual)
+        return int(np.argmax(self.bins.own.T @ part**2))
 
     def draws(
         self, numbers: np.ndarray, count: int, random: np.random.Generator

@@ -1,0 +1,53 @@
+"""Tables with a line for each bin of each profile."""
+
+import numpy as np
+import pytest
+
+import beamfit
+
+X = np.arange(-1000.0, 1001.0, 50.0)
+
+
+def table(path, widths=(200.0, 120.0, 210.0), shots=2, bins=X, header="position_um,counts_x"):
+    lines = [f"Q2_A,shot,{header}"]
+    for q, width in enumerate(widths):
+        for shot in range(shots):
+            for x in bins:
+                counts = 1000.0 * np.exp(-0.5 * (x / width) ** 2)
+                lines.append(f"{q},{shot},{x:g},{counts:.2f}")
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def test_shots_become_rows_with_sizes_and_profiles(tmp_path):
+    scan = beamfit.read_quad_scan(table(tmp_path / "p.csv"))
+    assert scan.size["x"] == pytest.approx([200e-6, 120e-6, 210e-6], rel=0.01)
+    assert [p.row for p in scan.profiles] == [0, 0, 1, 1, 2, 2]
+    assert scan.profiles[2].position == pytest.approx(1e-6 * X)
+    assert scan.settings["Q2"].tolist() == [0, 1, 2]
+    assert scan.shots.tolist() == [2, 2, 2]
+
+
+def test_a_background_is_taken_off(tmp_path):
+    path = table(tmp_path / "p.csv")
+    head, *rows = path.read_text().splitlines()
+    raised = [f"{head},background_x"]
+    for row in rows:
+        cells = row.split(",")
+        ramp = 300.0 + 0.2 * float(cells[2])
+        raised.append(",".join([*cells[:3], f"{float(cells[3]) + ramp:.3f}", f"{ramp:.3f}"]))
+    path.write_text("\n".join(raised) + "\n")
+    assert beamfit.read_quad_scan(path).size["x"] == pytest.approx([2e-4, 1.2e-4, 2.1e-4], rel=0.01)
+
+
+def test_a_short_shot_is_named_with_its_line(tmp_path):
+    with pytest.raises(beamfit.InputError) as error:
+        beamfit.read_quad_scan(table(tmp_path / "p.csv", bins=X[:5]))
+    assert error.value.line == 2
+    assert "5 bins" in error.value.found
+
+
+def test_counts_without_positions_are_refused(tmp_path):
+    path = table(tmp_path / "p.csv", header="place,counts_x")
+    with pytest.raises(beamfit.InputError, match="position"):
+        beamfit.read_quad_scan(path)
