@@ -27,7 +27,7 @@ from beamfit.dynamics.search import Settled, seen_of
 from beamfit.greybox import tree
 from beamfit.greybox.memory import Memory, Whitened, noises, range_of
 from beamfit.greybox.problem import with_slope
-from beamfit.noise.correlated import CorrelatedNoise, log_volume, white_beside, whitened
+from beamfit.noise.correlated import CorrelatedNoise, whitened_of_both
 
 # Laws, and half widths of each as shares of an input's range: prior flat in their logarithm. A stop
 # hands on other values as soon as its width passes a move, the others change smoothly with it.
@@ -168,16 +168,9 @@ def _predicted(chosen: Any, model: Any, run: Driven, theta: jax.Array, u: jax.Ar
 
 def _triangles(grid: Sequence[CorrelatedNoise], rows: np.ndarray, interval: np.ndarray):
     """Triangular factors of rows, shape (laws, n, m), and log volumes, whitened by each noise."""
-    triangles, volumes = [], []
-    for noise in grid:
-        apart = interval / noise.time
-        row, volume = whitened(np.swapaxes(rows, 0, 1), apart, np), float(log_volume(apart, np))
-        if noise.white:
-            row, more = white_beside(row, apart, noise.white)
-            volume += more
-        triangles.append(np.linalg.qr(np.swapaxes(row, 0, 1), mode="r"))
-        volumes.append(volume)
-    return np.array(triangles), np.array(volumes)
+    each = [whitened_of_both(np.swapaxes(rows, 0, 1), interval, noise) for noise in grid]
+    triangles = [np.linalg.qr(np.swapaxes(row, 0, 1), mode="r") for row, _ in each]
+    return np.array(triangles), np.array([volume for _, volume in each])
 
 
 def _shape(found: Settled, seen: PreparedOutput) -> list[int]:

@@ -17,19 +17,18 @@ from scipy.special import gammaln, stdtr, stdtrit
 from beamfit.greybox.covariance import CUT
 from beamfit.greybox.problem import padded_length
 from beamfit.noise.correlated import (
+    BESIDE,
     CorrelatedNoise,
     Levels,
     levelled,
     log_volume,
     white_beside,
+    white_shares,
     whitened,
 )
 
 # Grid of correlation times: from this share of the median interval to this many records, and count.
 SHORTEST, LONGEST, TIMES = 0.3, 5.0, 20
-# Grid of the white noise's variance, in units of the variance that the correlated part gains from
-# one reading to the next.
-WHITE = (0.0, 1.0, 10.0, 100.0, 1000.0)
 # Central 68 %, one standard deviation to either side of a normal distribution, and its upper end.
 CENTRAL, HALF = 0.682689492, 0.841344746
 # Most steps to a distance of given probability, and the last step's share of its size.
@@ -270,16 +269,18 @@ def noises(
     >>> [noise.time for noise in noises((1.0, 4.0), 1.0, 3)]
     [1.0, 2.0, 4.0]
     """
+    times = np.geomspace(*ends, count)
+    shares = white_shares(usual / times, ratios)
     return [
-        CorrelatedNoise(float(each), float(ratio / (ratio + 1.0 / -np.expm1(-2.0 * usual / each))))
-        for each in np.geomspace(*ends, count)
-        for ratio in ratios
+        CorrelatedNoise(float(each), float(white))
+        for each, row in zip(times, shares, strict=True)
+        for white in row
     ]
 
 
 def usual_noises(time: np.ndarray) -> list[CorrelatedNoise]:
     """Noises that readings at these times may have, as of `memory_of`."""
-    return noises(range_of(time), float(np.median(np.diff(time))), TIMES, WHITE)
+    return noises(range_of(time), float(np.median(np.diff(time))), TIMES, BESIDE)
 
 
 def memory_of(

@@ -217,6 +217,10 @@ def _check_layers(net: MLP) -> None:
         positions(pair, names, "layer")
         if net.connections.count(pair) > 1:
             raise InputError(f"two connections {connection(*pair)}", "each connection once")
+    led = {target for _, target in net.connections} | {port.layer for port in net.input_ports}
+    for name in names:
+        if name not in led:
+            raise InputError(f"layer '{name}' with nothing before it", "a connection or an input")
     _ = net.order  # which has no loop
 
 

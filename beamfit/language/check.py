@@ -47,6 +47,11 @@ def check_problem(document: d.Document, given: Iterable[str] = ()) -> None:
             if one.model not in known:
                 found = f"no {what} '{one.model}' in the mapping"
                 raise error_at(one.at, found, nearest(one.model, known))
+    sizes = {one.name: one.dimensions for one in m.outputs}
+    for one in p.goals:
+        if sizes[one.model]:
+            found = f"'{one.model}' of {len(sizes[one.model])} dimension(s) as an objective"
+            raise error_at(one.at, found, "an output that is a number, such as a sum(... | ...)")
     _check_variables(p)
     names = [*(v.model for v in p.variables), *given]
     for one in m.inputs:

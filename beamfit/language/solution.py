@@ -239,7 +239,7 @@ def solve_document(
     told |= {name: value for name, value in options.items() if value is not None}
     problem = replace(made.problem, tolerance=told.pop("tolerance", TOLERANCE))
     fit = solve(problem, starts=starts, began=began, **told)
-    notes = (*made.notes, *notes, *_ailments(made), *warnings, *_places(made, fit))
+    notes = (*made.notes, *notes, *_ailments(made, fit), *warnings, *_places(made, fit))
     if fit.status is Status.not_finite:
         cause = _cause(made, fit.model)
         told = cause is None or any(cause in note for note in notes)
@@ -274,10 +274,13 @@ def _cause(made: Formulation, model: Mapping[str, np.ndarray]) -> str | None:
     return found or cause_of(made.program, model, names, slopes=True)
 
 
-def _ailments(made: Formulation) -> list[str]:
+def _ailments(made: Formulation, fit: Fit) -> list[str]:
     """Defects that `diagnose` finds, except those reported elsewhere with their place."""
+    # More data are no remedy for what the verdict may have found to be a freedom of the model.
+    told = set(fit.about) if fit.status is Status.unidentified else set()
     found = (one for one in diagnose(made.problem) if one.kind not in TOLD_ELSEWHERE)
-    return [f"{one.message[:-1]} ({_where(made, one.names)})." for one in found]
+    new = (one for one in found if one.kind != "undetermined" or not told.issuperset(one.names))
+    return [f"{one.message[:-1]} ({_where(made, one.names)})." for one in new]
 
 
 def _where(made: Formulation, names: Iterable[str]) -> str:

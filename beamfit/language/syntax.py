@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
 from difflib import get_close_matches
 from typing import Any
 
@@ -17,7 +18,25 @@ MOST_OPEN, LONGEST = 60, 30
 BRACKET = re.compile(
     r"#[^\n]*|//[^\n]*|/\*.*?\*/|\"(?:\\.|[^\"\\\n])*\"|([(\[{])|([)\]}])|(/\*)", re.DOTALL
 )
-DECIMAL = re.compile(r"\d,\d")
+# Signs of other languages, and this one's.
+SIGNS = {
+    r"(?<=\d),(?=\d)": "a point before decimals",
+    r"\*\*": "'^' for powers",
+    r"==|:=|<-|[-+*/]=": "'=' between a name and its value",
+    r"=>|≥": "'>='",
+    r"=<|≤": "'<='",
+    r"\.\.": "':' between the ends of a set",
+    r"[×·]": "'*' for products",
+    r"[÷\\]": "'/' for quotients",
+}
+# Words of other languages, and what this one begins so.
+WORDS = {
+    "for": "foreach", "while": "foreach", "loop": "foreach", "subject": "constraint",
+    "st": "constraint", "limit": "constraint", "var": "variable", "param": "parameter",
+    "const": "parameter", "def": "function", "min": "minimize", "max": "maximize",
+    "objective": "minimize", "let": "real", "double": "real", "float": "real", "int": "real",
+    "import": "table", "data": "table", "model": "mapping", "range": "set",
+}  # fmt: skip
 STARTS = """minimize maximize variable constraint solver mapping table network input output
 parameter set real function foreach forall layer connection gain in random seed weight"""
 KEYWORDS = STARTS.split()
@@ -65,8 +84,8 @@ def _at(text: str, position: int) -> Place:
 def explained(error: UnexpectedInput, text: str) -> InputError:
     """Say where the text stops making sense, what stands there, and what could."""
     at, odd_at = Place(error.line, error.column), error.pos_in_stream or 0
-    if odd_at and DECIMAL.match(text, odd_at - 1):
-        return error_at(at, f"',' behind '{text[odd_at - 1]}'", "a point before decimals")
+    if known := _sign(text, odd_at):
+        return known
     if isinstance(error, UnexpectedCharacters):
         expected = _choices(error.allowed or ())
         odd = text[error.pos_in_stream]
@@ -88,16 +107,30 @@ def explained(error: UnexpectedInput, text: str) -> InputError:
     return known or error_at(at, f"'{short(word)}'", _choices(accepted))
 
 
+def _sign(text: str, odd_at: int) -> InputError | None:
+    """Error for a sign of another language at a place or from the letter before it; or None."""
+    for start in (odd_at, max(odd_at - 1, 0)):
+        for sign, wanted in SIGNS.items():
+            if found := re.compile(sign).match(text, start):
+                return error_at(_at(text, start), f"'{found[0]}'", wanted)
+    return None
+
+
 def _habit(before: Token, token: Token, accepted: set[str], text: str) -> InputError | None:
-    """Error for a habit of other languages: powers, assignments, products; or None."""
-    at, here = Place(before.line, before.column), Place(token.line, token.column)
-    behind = text[token.end_pos : token.end_pos + 1]
-    if token == "*" and before == "*":
-        return error_at(at, "'**'", "'^' for powers")
-    if token == "=" and before == "=":
-        return error_at(at, "'=='", "'=' between a name and its value")
-    if token == ":" and behind == "=" and "EQUAL" in accepted:
-        return error_at(here, "':='", "'=' between a name and its value")
+    """Error for a habit of other languages: formulas as limits, |x|, products; or None."""
+    here, found = Place(token.line, token.column), f"'{short(token)}'"
+    if before in ("constraint", "minimize", "maximize") or (
+        token == "(" and {"WEIGHT", "COMPARE"} & accepted
+    ):
+        return error_at(here, found, "the name of an output, set by a statement NAME = FORMULA;")
+    if token == "," and "WEIGHT" in accepted:
+        return error_at(here, found, "';', and a statement of its own for each goal")
+    if token.type == "COMPARE" and before.type == "SIGNED":
+        return error_at(here, found, "';', or in [LOW, HIGH] for two bounds")
+    if token == "|" and "NUMBER" in accepted:
+        return error_at(here, found, "a value; an absolute one is abs(...), |...| is a set")
+    if before == "(" and token.type in ("NUMBER", "SIGNED"):
+        return error_at(here, found, "'[' before an index; (...) calls a mapping")
     if "MULTIPLY" in accepted and token.type in ("NAME", "NUMBER"):
         found = f"'{short(token)}' behind '{short(before)}'"
         return error_at(here, found, "an operator between them, such as *, or ';'")
@@ -107,19 +140,28 @@ def _habit(before: Token, token: Token, accepted: set[str], text: str) -> InputE
 def _misspelt(before: Token | None, token: Token, accepted: set[str]) -> InputError | None:
     """A word that is nearly a keyword: the one that surprises, or the one before it."""
     words = {name.lower().lstrip("_") for name in accepted} & set(KEYWORDS)
-    close = get_close_matches(str(token).lower(), sorted(words), n=1, cutoff=0.6)
+    close = _near(token, words)
     if token.type == "NAME" and close:
         return error_at(Place(token.line, token.column), f"'{short(token)}'",
-                        f"{_choices(accepted)} (did you mean {close[0]}?)")  # fmt: skip
+                        f"{_choices(accepted)} (did you mean {close}?)")  # fmt: skip
     if before is None or before.type != "NAME" or str(before) in KEYWORDS:
         return None
     at = Place(before.line, before.column)
     if token.type == "_IN" or (token.type == "NAME" and "_IN" in accepted):
         return None
-    close = get_close_matches(str(before).lower(), KEYWORDS, n=1, cutoff=0.6)
+    close = _near(before, KEYWORDS)
     if token.type in ("NAME", "STRING") and close:
-        return error_at(at, f"'{short(before)}'", f"a statement (did you mean {close[0]}?)")
+        return error_at(at, f"'{short(before)}'", f"a statement (did you mean {close}?)")
     return None
+
+
+def _near(word: str, keywords: Iterable[str]) -> str | None:
+    """The keyword that another language's word or a mistyped one stands for, if there is one."""
+    word = str(word).lower()
+    if WORDS.get(word) in keywords:
+        return WORDS[word]
+    close = get_close_matches(word, sorted(keywords), n=1, cutoff=0.6) if len(word) > 1 else []
+    return close[0] if close else None
 
 
 def _choices(accepted: Any) -> str:

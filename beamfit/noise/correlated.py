@@ -17,6 +17,9 @@ from scipy.linalg.lapack import dtbtrs
 # Correlation of neighbouring residuals, in standard errors of that of independent ones, from which
 # they count as correlated.
 SEEN = 2.0
+# White variances beside a memory that are looked at, over what the part with a memory gains from
+# one reading to the next: a monitor that walks by a third of its noise a reading has 10.
+BESIDE = (0.0, 1.0, 10.0, 100.0, 1000.0)
 # Means of so many neighbours are looked at: a slow drift hides under white noise.
 BLOCKS = (4, 16)
 
@@ -143,6 +146,29 @@ def whitened_of_both(
         return rows, volume
     rows, more = white_beside(rows, apart, noise.white)
     return rows, volume + more
+
+
+def white_shares(apart, ratios=BESIDE) -> np.ndarray:
+    """Shares of variance without memory, from ratios to what the memory's part gains in a time.
+
+    Parameters
+    ----------
+    apart : array, shape (t,)
+        The time over each correlation time.
+    ratios : array, shape (r,)
+        White variances, in units of the gain.
+
+    Returns
+    -------
+    array, shape (t, r)
+
+    Examples
+    --------
+    >>> white_shares([np.log(2.0)], [0.0, 1.0]).round(6).tolist()
+    [[0.0, 0.428571]]
+    """
+    white = np.outer(-np.expm1(-2.0 * np.asarray(apart)), ratios)
+    return white / (1.0 + white)
 
 
 def white_beside(rows: np.ndarray, apart: np.ndarray, white: float) -> tuple[np.ndarray, float]:

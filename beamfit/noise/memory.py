@@ -13,17 +13,15 @@ import numpy as np
 from scipy.fft import irfft, next_fast_len, rfft
 from scipy.special import logsumexp
 
-from beamfit.noise.correlated import log_volume, white_beside, whitened
+from beamfit.noise.correlated import BESIDE, log_volume, white_beside, white_shares, whitened
 
 # Prior probabilities of white noise, of noise with one correlation time, and of a random walk; 1/f
 # noise has the rest. Readings are white unless something slow moves the monitor: amplifiers have
 # 1/f noise, and what a changing temperature adds up in a monitor is a walk.
 WHITE, CORRELATED, WALK = 0.5, 0.25, 0.1
 # Correlation times, from this share of the interval between readings to so many records, flat in
-# the logarithm, and the white noise's variance beside, over what the correlated part gains from one
-# reading to the next: a monitor that walks by a third of its noise a reading has 10.
+# the logarithm.
 SHORTEST, LONGEST, TIMES = 0.5, 3.0, 17
-BESIDE = (0.0, 1.0, 10.0, 100.0, 1000.0)
 # Spectra 1/f^power. P. Dutta and P. M. Horn, Rev. Mod. Phys. 53 (1981) 497: 1/f noise of devices
 # has powers of 0.8 to 1.4; beyond 1 it is as a random walk.
 POWERS = (0.4, 0.7, 1.0)
@@ -55,13 +53,11 @@ def kinds_of(time: np.ndarray, count: int = TIMES) -> list[MemoryKind]:
     """
     usual, span = float(np.median(np.diff(time))), float(time[-1] - time[0])
     times = np.geomspace(SHORTEST * usual, LONGEST * span, count)
-    gain = -np.expm1(-2 * usual / times)
-    shares = np.outer(gain, BESIDE) / (1.0 + np.outer(gain, BESIDE))
     chance = np.full(count, CORRELATED / count)
     chance[-1] += WALK  # the longest memory is as a walk of the record
     memory = [
         MemoryKind(float(each) / len(BESIDE), float(t), float(white))
-        for t, each, row in zip(times, chance, shares, strict=True)
+        for t, each, row in zip(times, chance, white_shares(usual / times), strict=True)
         for white in row
     ]
     flicker = (1.0 - WHITE - CORRELATED - WALK) / len(POWERS)

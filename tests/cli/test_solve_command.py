@@ -172,6 +172,22 @@ def test_findings_of_the_solver_name_lines(run, tmp_path, text, status, places):
     assert all(place in notes for place in places)
 
 
+def test_gains_in_series_are_a_freedom_of_the_model_that_no_data_end(run, tmp_path):
+    (tmp_path / "m.bf").write_text(
+        "minimize miss;\nvariable k1 = 1 in [0, 9];\nvariable k2 = 1.5 in [0, 9];\n"
+        "input k1, k2;\noutput miss;\nset T = |1:5|;\n"
+        "parameter seen[T] = [2.1, 3.9, 6.1, 8, 9.9];\n"
+        "miss = sum(t in T | (k1*k2*t - seen[t])^2);"
+    )
+    _, found = result(run, tmp_path / "m.bf")
+    assert found["status"] == "unidentified"
+    assert "k1, k2 move together (k1 +1 %, k2 -1 %)" in found["message"]
+    assert "whatever the data, a freedom of the model; fix one of them" in found["message"]
+    notes = " ".join(found["notes"])
+    assert "'k1' at line 2, column 10, 'k2' at line 3, column 10" in notes
+    assert "add data" not in notes
+
+
 def test_a_document_solved_again_compiles_nothing(root, tmp_path, caplog):
     """Neither the document read again nor another value of an input is traced again."""
     import jax

@@ -1,4 +1,4 @@
-"""Two hundred mistakes: line, column and culprit are named. The table is mistakes.txt."""
+"""Mistakes of many kinds: line, column and culprit are named. The table is mistakes.txt."""
 
 import re
 from pathlib import Path
