@@ -58,6 +58,7 @@ Ratios are the peer's time over beamfit's: above 1 beamfit is faster. Warm: noth
 Where beamfit gives more than the peer (verdicts, correlated noise, errors) the line above a
 table says so.
 """
+BUSY = "Others were at work: processor times are up to a half too long, ratios are good to that."
 FIRST = """\
 ## First answers
 
@@ -560,6 +561,8 @@ def main() -> None:
     versions = f"Python {platform.python_version()}, JAX {jax.__version__}, numpy {np.__version__}"
     load = os.getloadavg()[0]
     made = f"Measured with {versions}, {os.cpu_count()} processors, load {load:.0f}.\n"
+    if load > 1.5:
+        made += f"{BUSY}\n"
     every: dict[str, Any] = {}
     told, every["first"] = first_answers()
     files, every["many"] = many_files()
