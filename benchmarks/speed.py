@@ -502,8 +502,8 @@ DRAWN = (
     "NumPy"
 )
 NOISES = (
-    "89 noises, 33 exponents and 12 000 draws are averaged over for each record; with constant a "
-    "and b it is told in the table above"
+    "89 noises, 33 exponents and 12 000 draws are averaged over for each record; a and b taken as "
+    "constant cost far less"
 )
 TARGETS = (
     Target("first answer of a command, kept", "× import", 1.5,
@@ -525,13 +525,18 @@ TARGETS = (
            "workers are sent files and send rows", most=False),
     *(Target(f"effective samples of a {what}, over the best emcee", "×", 10.0,
              over_best(f"Effective samples of a {what}", "emcee"),
-             "differential evolution with all walkers in one call is a good peer where the "
-             "likelihood is arithmetic on long arrays", most=False) for what in ("scan", "decay")),
+             "with all walkers in one call, or moves by differential evolution, emcee does little "
+             "work in Python for a draw", most=False) for what in ("scan", "decay")),
     *(Target(f"effective samples of a {what}, over compiled NUTS", "×", 2.0,
              over_best(f"Effective samples of a {what}", "NUTS"),
              "three numbers are few, and NUTS moves far in each step", most=False)
       for what in ("scan", "decay")),
 )  # fmt: skip
+
+
+def plainly(value: float, digits: int) -> str:
+    """So many digits, without a power of ten."""
+    return f"{float(f'{value:.{digits}g}'):g}"
 
 
 def targets(every: dict) -> str:
@@ -541,9 +546,9 @@ def targets(every: dict) -> str:
         value = t.found(every)
         met = value <= t.aim if t.most else value >= t.aim
         far = value / t.aim if t.most else t.aim / value
-        why = "reached" if met else f"missed by a factor {far:.2g}: {t.why}"
+        why = "reached" if met else f"missed by a factor {plainly(far, 2)}: {t.why}"
         sign = "≤" if t.most else "≥"
-        lines.append(f"| {t.name} | {value:.3g} {t.unit} | {sign} {t.aim:g} | {why} |")
+        lines.append(f"| {t.name} | {plainly(value, 3)} {t.unit} | {sign} {t.aim:g} | {why} |")
     return AIMED + "\n" + "\n".join(lines) + "\n"
 
 
