@@ -9,7 +9,6 @@ from __future__ import annotations
 import re
 import secrets
 import sys
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -265,23 +264,6 @@ def same_status(rng, draws: int) -> str:
     return limits(changed, draws)
 
 
-def speed(rng) -> str:
-    """Processor time of a judged plane: many in one call, and one warm."""
-    drawn = [relative(0.05, 1.0)(rng, 8) for _ in range(500)]
-    pairs = [(scan, beamline(t.line)) for t, scan in drawn]
-    fit_many(pairs[:300])
-    begin = time.process_time()
-    fit_many(pairs)
-    many = (time.process_time() - begin) / len(pairs)
-    times = []
-    for pair in pairs[:20]:
-        begin = time.process_time()
-        fit_many([pair])
-        times.append(time.process_time() - begin)
-    one = f"{1e3 * min(times):.1f} ms for one, warm"
-    return f"{1e3 * many:.1f} ms a scan of 8 points in one call of 500, {one}."
-
-
 def main(draws: int = 200, seed: int | None = None, page: str = str(PAGE)) -> None:
     seed = secrets.randbelow(10**6) if seed is None else seed
     rng = np.random.default_rng(seed)
@@ -302,8 +284,6 @@ def main(draws: int = 200, seed: int | None = None, page: str = str(PAGE)) -> No
         "",
         "Scans of 6 to 12 points whose status changes as right stated errors of 1 to 8 % are "
         f"halved and doubled: {same_status(rng, draws)} %.",
-        "",
-        f"Processor time: {speed(rng)}",
         MARKS[1],
     ]
     file = Path(page)

@@ -39,3 +39,20 @@ def test_a_missing_peer_stops_the_run_in_one_line(monkeypatch):
     monkeypatch.setattr(speed, "PEERS", ("a_peer_nobody_has",))
     with pytest.raises(SystemExit, match="a_peer_nobody_has is not installed"):
         speed.refuse_if_missing()
+
+
+def test_targets_say_what_is_missed_and_by_how_much():
+    """Every figure at its target is reached; a command of twice its time is not."""
+    first = {name: 1.3 for name in ("a script with one fit, kept", "beamfit emittance, kept")}
+    first |= {f"beamfit {name}, cold": 3.0 for name in ("emittance", "lifetime")}
+    every = {"first": first, "many": {"files": 150.0, "workers": 1.7}}
+    for name, size, ms in (("Scans, fit alone", 10_000, 0.004), ("Scans, judged", 128, 0.5),
+                           ("Decays at once", 10, 0.5)):  # fmt: skip
+        every[name] = [(size, {"beamfit": size * ms / 1e3 * (1 - 1e-9)})]
+    for name in ("scan", "decay"):
+        told = {"beamfit": 1.0, "emcee": 300.0, "emcee, vectorised": 10.0, "NUTS, compiled": 2.0}
+        every[f"Effective samples of a {name}"] = [(1, told)]
+    rows = speed.targets(every).splitlines()[-len(speed.TARGETS) :]
+    assert all(row.endswith("| reached |") for row in rows)
+    first["beamfit emittance, kept"] = 3.0
+    assert "| 3 × import | ≤ 1.5 | missed by a factor 2: " in speed.targets(every)

@@ -36,7 +36,8 @@ ROUNDS, FURTHEST = 6, 3.0
 PAIRS, SINGLES, WORST, STEPS = 24, 50, 0.25, 12
 # Numbers that one draw of many points may have, with all draws of few: memory and time.
 ROOM, FEWEST = 500_000, 128
-BLOCK = 10_000_000
+# Numbers worked on at once: what a processor has at hand.
+BLOCK = 200_000
 # A direction of the beam is lost below this share of the best seen one.
 RANK = 1e-12
 # Standard deviation of ln of the beam's mean square over the scan: anything near the sizes.
@@ -387,17 +388,18 @@ def _student_density(
     x: np.ndarray, centre: np.ndarray, root: np.ndarray, share: np.ndarray
 ) -> np.ndarray:
     """Log density of a mixture of Student distributions at points, shape (..., d)."""
-    dim = centre.shape[-1]
+    *lead, parts, dim = centre.shape
     inverse = np.linalg.inv(root)
-    # (x - centre) of every part at once: L⁻¹x - L⁻¹centre.
-    far = x[..., None, :, :] @ np.swapaxes(inverse, -1, -2)
-    far = far - (inverse @ centre[..., None])[..., None, :, 0]
-    determinant = np.log(np.abs(np.diagonal(root, axis1=-2, axis2=-1))).sum(-1)
-    log = -0.5 * (TAIL + dim) * np.log1p((far**2).sum(-1) / TAIL) - determinant[..., None]
+    # L⁻¹x of every part in one product, less L⁻¹centre: shape (..., parts, dim, d).
+    rows = inverse.reshape(*lead, parts * dim, dim)
+    far = (rows @ np.swapaxes(x, -1, -2)).reshape(*lead, parts, dim, -1)
+    far -= inverse @ centre[..., None]
+    near = 1.0 / (1.0 + np.square(far, out=far).sum(-2) / TAIL)
+    near **= 0.5 * (TAIL + dim)
     with np.errstate(divide="ignore"):
-        log = log + np.log(share)[..., None]
-    top = log.max(-2, keepdims=True)
-    log = np.log(np.exp(log - top).sum(-2)) + top[..., 0, :]
+        height = np.log(share) - np.log(np.abs(np.diagonal(root, axis1=-2, axis2=-1))).sum(-1)
+    top = height.max(-1, keepdims=True)
+    log = np.log((np.exp(height - top)[..., None, :] @ near)[..., 0, :]) + top
     constant = gammaln(0.5 * (TAIL + dim)) - gammaln(0.5 * TAIL)
     return log + constant - 0.5 * dim * math.log(TAIL * math.pi)
 

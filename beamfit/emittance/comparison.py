@@ -534,7 +534,7 @@ def _expected(
     off, model = (c.size - model)[:, None, :], model[:, None, :]
     scale, share = draws.scales.scale, draws.scale_weight[..., None]
     z2 = squared_pulls(off, model, kind, scale)
-    odds = np.moveaxis(log_odds(z2, kind, noise)[..., 0, :], 0, -1)
+    odds = np.moveaxis(log_odds(z2, kind, noise)[..., 0], 0, -1)
     bad = 1.0 / (1.0 + np.exp(-odds))
     wide = (noise.width * kind.usual[:, None, :]) ** -2
     each = (1.0 - bad * (1.0 - wide)) / variance_of(kind, scale)

@@ -21,9 +21,9 @@ from jax import Array
 from beamfit.compile_cache import SELDOM
 from beamfit.emittance.fit import EmittanceFit
 from beamfit.emittance.known import WEIGHTS
-from beamfit.emittance.model import coefficients, emittance_parts, size_squared
+from beamfit.emittance.model import coefficients
 from beamfit.emittance.results import PlaneFit, Points
-from beamfit.emittance.sigma import error_at, weighed_size
+from beamfit.emittance.sigma import FURTHEST, error_at
 from beamfit.emittance.statement import varied_magnets
 from beamfit.emittance.transport import Rows
 from beamfit.optics.beamline import Beamline
@@ -130,15 +130,13 @@ def systematics(fit: EmittanceFit, plane: str) -> list[BudgetChange]:
         return []
     rows, p = fit.seen.rows, result.points
     keep = fit.seen.measured(plane)
-    size, weighed, sharp = np.ones((3, len(rows.energy))) * [[1.0], [1.0], [0.0]]
-    size[keep], weighed[keep], sharp[keep] = p.size, p.weighed, 1.0 / p.error
-    follows = fit.seen.weights == WEIGHTS[0]
-    noise = _Weighing(weighed, sharp, np.array(p.relative), np.array(float(follows)))
     sigma = np.array([q.value for q in result.sigma])
+    by_rows = np.zeros((3, len(rows.energy)))
+    by_rows[:, keep] = _by_rows(p, sigma, rows.squared, fit.seen.weights == WEIGHTS[0])
     line = fit.seen.scanned.stored_by_kind((*rows.settings, *rows.places))
     upright = np.array(plane == "y")
-    slopes = _slopes(replace(rows, line=line), upright, sigma, size, noise)
-    by_parts, by_energy, by_known, *by_row = slopes
+    slopes = _slopes(replace(rows, line=line), upright, tuple(by_rows))
+    by_parts, by_energy, *by_row = slopes
     changes = {_magnet_cause(fit, name): 0.0 for name in rows.settings}
     upstream = {e.name for e in fit.seen.scanned.upto(result.screen.name).elements}
     for element, slope in _by_element(fit.seen.scanned, line, by_parts):
@@ -148,7 +146,7 @@ def systematics(fit: EmittanceFit, plane: str) -> list[BudgetChange]:
     energy, mass = fit.seen.energy, fit.line.mass
     changes[of_energy := _energy_cause(energy, mass)] = 0.01 * float(by_energy)
     changes |= _within_scan(fit.seen.rows, len(fit.scan), *by_row)
-    changes |= _of_screen(fit, p, np.asarray(by_known)[keep])
+    changes |= _of_screen(fit, p, by_rows[2, keep])
     # ln βγ rises by E²/(E² - m²) for each relative step of the energy.
     stiffer = 0.01 * energy**2 / (energy**2 - mass**2)
     # What is zero but for rounding is zero, and keeps its place.
@@ -257,31 +255,57 @@ def _of_screen(fit: EmittanceFit, p: Points, by_known: np.ndarray) -> dict[str, 
     }
 
 
-class _Weighing(NamedTuple):
-    """Sizes that weights are taken at, 1/error there, and whether each follows the model's size."""
+def _by_rows(p: Points, sigma: np.ndarray, squared: bool, follows: bool) -> np.ndarray:
+    """Derivatives of ln ε of the fit by R11, R12 and known size² of every point, shape (3, n).
 
-    weighed: Array
-    sharp: Array
-    relative: Array
-    follows: Array
+    At the answer the weighted residuals F(σ, rows) = Σ f(m²) ∂m²/∂σ vanish, so dσ =
+    -(∂F/∂σ)⁻¹ ∂F/∂rows: exact for either residual, without differentiating the solver, weights
+    that follow the model included.
+    """
+    design = np.stack(coefficients(p.r11, p.r12), -1)
+    pull, steep = _pulls(p, design @ sigma + p.known, squared, follows)
+    unit = np.abs(sigma)
+    of_sigma = (design * unit).T * steep @ (design * unit)
+    s11, s12, s22 = sigma
+    by_sigma = np.array([s22, -2.0 * s12, s11]) * unit / (2.0 * (s11 * s22 - s12**2))
+    w11, w12, w22 = -unit * np.linalg.solve(of_sigma, by_sigma)
+    by_squared = (design @ np.array([w11, w12, w22])) * steep
+    by_r11 = pull * (p.r11 * w11 + p.r12 * w12) + by_squared * (p.r11 * s11 + p.r12 * s12)
+    by_r12 = pull * (p.r11 * w12 + p.r12 * w22) + by_squared * (p.r11 * s12 + p.r12 * s22)
+    return np.stack([2.0 * by_r11, 2.0 * by_r12, by_squared])
+
+
+def _pulls(
+    p: Points, m2: np.ndarray, squared: bool, follows: bool
+) -> tuple[np.ndarray, np.ndarray]:
+    """f of every point's predicted size², whose products with ∂m²/∂σ add to zero, and f'."""
+    if not squared:
+        size = np.sqrt(m2)
+        return (1.0 - p.size / size) / p.error**2, p.size / (2.0 * size**3 * p.error**2)
+    low, high = p.size / FURTHEST, p.size * FURTHEST
+    size = np.clip(np.sqrt(m2), low, high)
+    moves = follows * ((size > low) & (size < high)) / (2.0 * size)
+    at = size if follows else p.weighed
+    grown = error_at(at, p.weighed, 1.0, p.relative)
+    weight = (at * grown * p.error) ** -2
+    # How ln(at grown), the error of size², goes with m².
+    error = moves * (1.0 / at + p.relative / (p.weighed * grown))
+    off = m2 - p.size**2
+    return off * weight, weight * (1.0 - 2.0 * off * error)
 
 
 @partial(jax.jit, compiler_options=SELDOM)
 def _slopes(
-    rows: Rows, upright: Array, sigma: Array, size: Array, noise: _Weighing
-) -> tuple[list[Array], Array, Array, Array, dict[str, Array]]:
-    """Derivatives of ln ε of the fit by the parts of the line and ln E, and by known size², ln E
-    and the settings of every row.
+    rows: Rows, upright: Array, by_rows: tuple[Array, ...]
+) -> tuple[list[Array], Array, Array, dict[str, Array]]:
+    """Derivatives of ln ε by the parts of the line and ln E, and by ln E and the settings of every
+    row, from those by R11, R12 and known size² of every row.
 
-    At the answer the weighted residuals F(σ, rows) = Σ w ∂m²/∂σ (m² - size²) vanish, so dσ =
-    -(∂F/∂σ)⁻¹ ∂F/∂rows: exact for either residual, without differentiating the solver, weights
-    that follow the model included. One reverse pass carries that back to every number of the line,
-    however long it is.
+    One reverse pass carries them back to every number of the line, however long it is.
     """
-    unit = jnp.abs(sigma)
 
     def elements(
-        changes: list[Array], factor: Array, more: Array, drift: Array, settings: dict[str, Array]
+        changes: list[Array], factor: Array, drift: Array, settings: dict[str, Array]
     ) -> tuple[Array, ...]:
         own, mass = rows.energy * (1.0 + drift), rows.line.mass
         # A row of higher energy has a smaller beam: its normalised emittance is the scan's.
@@ -289,30 +313,15 @@ def _slopes(
         moved = replace(rows, settings=settings, damping=rows.damping * smaller)
         x, y = moved.both(_moved(rows.line, iter(changes)), own * factor)
         # Either plane in one program, which is compiled once.
-        r11, r12, known = moved.known(jnp.where(upright, y, x))
-        return r11, r12, known + more
-
-    def slope(relative: Array, seen: tuple[Array, ...]) -> Array:
-        def squared_of(r: Array) -> Array:
-            return size_squared(r * unit, *seen)
-
-        squared, back = jax.vjp(squared_of, relative)
-        if not rows.squared:
-            return back((jnp.sqrt(squared) - size) * noise.sharp**2 / jnp.sqrt(squared))[0]
-        at = noise.weighed + noise.follows * (weighed_size(size, squared) - noise.weighed)
-        grown = error_at(at, noise.weighed, 1.0, noise.relative)
-        return back((squared - size**2) * (noise.sharp / (at * grown)) ** 2)[0]
+        return moved.known(jnp.where(upright, y, x))
 
     kinds = (
         k for e in rows.line.elements for k in (e.kinds if isinstance(e, ElementSeries) else (e,))
     )
     still = [jnp.zeros(_shape(kind)) for kind in kinds if not isinstance(kind, Marker)]
-    here = sigma / unit
-    none = jnp.zeros(len(size))
-    seen, back = jax.vjp(elements, still, jnp.ones(()), none, none, rows.settings)
-    by_sigma = jax.grad(lambda s: jnp.log(emittance_parts(s * unit)[0]))(here)
-    weights = jnp.linalg.solve(jax.jacfwd(slope)(here, seen), by_sigma)
-    return back(jax.grad(lambda seen: -weights @ slope(here, seen))(seen))
+    none = jnp.zeros(len(rows.energy))
+    _, back = jax.vjp(elements, still, jnp.ones(()), none, rows.settings)
+    return back(by_rows)
 
 
 def _shape(kind: Element) -> tuple[int, ...]:

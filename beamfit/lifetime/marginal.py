@@ -49,6 +49,8 @@ FLAT = 0.2
 NEAR = 0.25
 # Shares of a of losses that are no beam's, and the prior odds of one.
 NO_BEAM, UNPHYSICAL = (-2.0, 3.0), 0.05
+# What rounding leaves of a direction that the readings do not determine.
+LEAST_LEFT = 1e-15
 # Step of the differences that give slopes.
 STEP = 1e-5
 # What lies farther below the largest log probability adds nothing.
@@ -205,13 +207,38 @@ class Peaks(NamedTuple):
 
 
 def _slopes(seen: SeenDecay, numbers: np.ndarray, free: list[int]) -> tuple[np.ndarray, np.ndarray]:
-    """Slopes of the currents at the nodes, (14, m, p), and of the share, (m, p)."""
-    currents, share = [], []
-    for move in STEP * np.eye(5)[free]:
-        more, less = (Numbers.of(numbers + sign * move[:, None]) for sign in (1, -1))
-        currents.append(more.currents(seen.gas) - less.currents(seen.gas))
-        share.append(more.share - less.share)
-    return np.stack(currents, axis=2) / (2 * STEP), np.stack(share, axis=1) / (2 * STEP)
+    """Slopes of the currents at the nodes, (14, p, m), and of the share, (p, m)."""
+    move = STEP * np.eye(5)[:, None, free, None] * np.array([1.0, -1.0])[:, None, None]
+    both = Numbers.of((numbers[:, None, None] + move).reshape(5, -1))
+    shape = (2, len(free), -1)
+    more, less = np.moveaxis(both.currents(seen.gas).reshape(NODES, *shape), 1, 0)
+    share = both.share.reshape(shape)
+    return (more - less) / (2 * STEP), (share[0] - share[1]) / (2 * STEP)
+
+
+def _triangle(matrix: np.ndarray) -> np.ndarray:
+    """Lower triangles L of many small matrices L Lᵀ, numbers of the matrix first: (p, p, ...)."""
+    lower = np.zeros_like(matrix)
+    for j in range(len(matrix)):
+        left = matrix[j:, j] - np.sum(lower[j:, :j] * lower[j, :j], axis=1)
+        lower[j:, j] = left / np.sqrt(np.maximum(left[0], LEAST_LEFT * matrix[j, j]))
+    return lower
+
+
+def _forward(lower: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """L⁻¹ of columns, (p, ...)."""
+    found = np.empty(lower.shape[1:])
+    for j in range(len(lower)):
+        found[j] = (right[j] - np.sum(lower[j, :j] * found[:j], axis=0)) / lower[j, j]
+    return found
+
+
+def _solved(lower: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """(L Lᵀ)⁻¹ of columns, (p, ...)."""
+    found = _forward(lower, right)
+    for j in reversed(range(len(lower))):
+        found[j] = (found[j] - np.sum(lower[j + 1 :, j] * found[j + 1 :], axis=0)) / lower[j, j]
+    return found
 
 
 def _log_within(bounds: tuple[float, float], middle: np.ndarray, sd: np.ndarray) -> np.ndarray:
@@ -227,46 +254,55 @@ def _expanded(seen: SeenDecay, numbers: np.ndarray, free: list[int]) -> Peaks:
     """Expand the posterior about numbers (5, m) for every noise."""
     slopes, of_share = _slopes(seen, numbers, free)
     squares, pulled = seen.left(numbers)
-    gradient = np.einsum("nmp,knm->kmp", slopes, pulled)
-    turned = (seen.products.matrix[:, 1:, 1:] @ slopes.reshape(NODES, -1)).reshape(
-        (-1, *slopes.shape)
-    )
-    normal = np.einsum("nmp,knmq->kmpq", slopes, turned)
+    gradient = np.einsum("npm,knm->pkm", slopes, pulled)
+    turned = seen.products.matrix[:, 1:, 1:] @ slopes.reshape(NODES, -1)
+    normal = np.einsum("npm,knqm->pqkm", slopes, turned.reshape(-1, *slopes.shape))
     width, middle = np.array([np.inf, np.inf, AROUND, np.inf, DRIFT])[free], np.zeros(len(free))
     middle[2] = 0.5
-    known, pull = np.diag(1 / width**2), ((middle - numbers[free].T) / width**2)[None]
+    width, middle = width[:, None], middle[:, None]
+    known = np.diag(1 / width[:, 0] ** 2)[..., None, None]
+    pull = ((middle - numbers[free]) / width**2)[:, None]
     after = squares
     for _ in range(2):
-        unit = seen.products.variance(after, len(free))[..., None]
-        precision = normal / unit[..., None] + known
-        step = np.linalg.solve(precision, (gradient / unit + pull)[..., None])[..., 0]
-        after = squares - 2 * np.sum(step * gradient, 2)
-        after = np.maximum(after + np.einsum("kmp,kmpq,kmq->km", step, normal, step), 1e-30)
-    centre = numbers[free].T + step
+        unit = seen.products.variance(after, len(free))
+        precision = normal / unit + known
+        lower = _triangle(precision)
+        step = _solved(lower, gradient / unit + pull)
+        after = squares - 2 * np.sum(step * gradient, axis=0)
+        after = np.maximum(after + np.einsum("pkm,pqkm,qkm->km", step, normal, step), 1e-30)
+    centre = numbers[free][:, None] + step
     log = seen.products.log_prior[:, None] + seen.products.log_size(after)
-    log = log - 0.5 * np.linalg.slogdet(precision)[1]
-    log = log - 0.5 * np.sum((centre - middle) ** 2 / width**2, axis=2)
-    share = Numbers.of(numbers).share + np.sum(of_share * step, axis=2)
-    spread = np.linalg.solve(precision, np.broadcast_to(of_share, step.shape)[..., None])[..., 0]
-    log = log + _log_within(seen.share, share, np.sqrt(np.sum(of_share * spread, axis=2)))
-    return Peaks(centre, precision, log + log_prior(numbers[3])[0], numbers)
+    log = log - np.sum(np.log(np.einsum("ppkm->pkm", lower)), axis=0)
+    log = log - 0.5 * np.sum(((centre - middle[:, None]) / width[:, None]) ** 2, axis=0)
+    share = Numbers.of(numbers).share + np.einsum("pm,pkm->km", of_share, step)
+    spread = np.sum(_forward(lower, of_share[:, None]) ** 2, axis=0)
+    log = log + _log_within(seen.share, share, np.sqrt(spread))
+    log = log + log_prior(numbers[3])[0]
+    return Peaks(np.moveaxis(centre, 0, 2), np.moveaxis(precision, (0, 1), (2, 3)), log, numbers)
 
 
-def _searched(seen: SeenDecay, numbers: np.ndarray, free: list[int]) -> Peaks:
-    """The most probable of the free numbers at each exponent, by Gauss and Newton."""
+def _searched(seen: SeenDecay, numbers: np.ndarray, free: list[int]) -> tuple[SeenDecay, Peaks]:
+    """The most probable of the free numbers at each exponent, by Gauss and Newton.
+
+    Noises that have no part where the most probable exponent rests are left out from there on.
+    """
     for _ in range(STEPS):
         found = _expanded(seen, numbers, free)
-        weight = np.exp(found.log - logsumexp(found.log, axis=0))
+        whole = logsumexp(found.log, axis=0)
+        weight = np.exp(found.log - whole)
         step = np.einsum("km,kmp->pm", weight, found.centre) - numbers[free]
         numbers = numbers.copy()
         numbers[free] += np.clip(step, -0.5, 0.5)
         numbers[4] = np.clip(numbers[4], -5 * DRIFT, 5 * DRIFT)
         named = Numbers.of(numbers)
         numbers[2] += (np.clip(named.share, -1.0, 2.0) - named.share) / named.unit
-        spread = 1 / np.sqrt(np.einsum("kmpp->pm", weight[..., None, None] * found.precision))
-        if np.all(np.abs(step) < 0.03 * spread + 1e-9):
+        spread = 1 / np.sqrt(np.einsum("km,kmpp->pm", weight, found.precision))
+        rests = np.all(np.abs(step) < 0.03 * spread + 1e-9, axis=0)
+        if rests.all():
             break
-    return _expanded(seen, numbers, free)
+        if rests[np.argmax(whole)]:
+            seen = seen.of_noises(found.log.max(axis=1) > found.log.max() - 2 * FAR)
+    return seen, _expanded(seen, numbers, free)
 
 
 def _by_exponent(seen: SeenDecay, free: list[int]) -> tuple[SeenDecay, Peaks]:
@@ -275,7 +311,7 @@ def _by_exponent(seen: SeenDecay, free: list[int]) -> tuple[SeenDecay, Peaks]:
     for _ in range(RANGES):
         power = np.linspace(low, high, EXPONENTS)
         numbers = np.vstack([numbers[:3], power, numbers[4]])
-        found = _searched(seen, numbers, free)
+        seen, found = _searched(seen, numbers, free)
         seen = seen.of_noises(found.log.max(axis=1) > found.log.max() - FAR)
         whole = logsumexp(found.log, axis=0)
         held = np.flatnonzero(whole > whole.max() - FAR)
@@ -302,7 +338,7 @@ def drawn(seen: SeenDecay, free: list[int]) -> Draws:
     if 3 in free:
         seen, peaks = _by_exponent(seen, free[:3] + free[4:])
     else:
-        peaks = _searched(seen, seen.start, free)
+        seen, peaks = _searched(seen, seen.start, free)
     found = _drawn(seen, peaks, DRAWS[0])
     return found if found.worth >= WORTH else _drawn(seen, peaks, DRAWS[1])
 
@@ -327,9 +363,11 @@ def _drawn(seen: SeenDecay, peaks: Peaks, draws: int) -> Draws:
     products = seen.products
     beside = np.vstack([-np.ones(draws), away])
     squares = np.empty(draws)
-    for one in np.unique(kind):  # draws of one noise together: one product of matrices
-        some = beside[:, kind == one]
-        squares[kind == one] = np.sum(some * (products.matrix[one] @ some), axis=0)
+    # Draws of one noise follow each other: one product of matrices.
+    ends = np.searchsorted(kind, np.arange(len(products.matrix) + 1))
+    for matrix, first, last in zip(products.matrix, ends[:-1], ends[1:], strict=True):
+        some = beside[:, first:last]
+        squares[first:last] = np.sum(some * (matrix @ some), axis=0)
     log = products.log_prior[kind] + products.log_size(np.maximum(squares, 1e-30))
     log = log + np.log(named.level * named.rate * named.unit) + log_prior(named.power)[0]
     if 4 in free:

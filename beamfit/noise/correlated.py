@@ -11,8 +11,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.linalg import cholesky_banded
-from scipy.linalg.lapack import dtbtrs
+from scipy.linalg.lapack import dpttrf, dtbtrs
 
 # Correlation of neighbouring residuals, in standard errors of that of independent ones, from which
 # they count as correlated.
@@ -171,16 +170,21 @@ def white_shares(apart, ratios=BESIDE) -> np.ndarray:
     return white / (1.0 + white)
 
 
-def white_beside(rows: np.ndarray, apart: np.ndarray, white: float) -> tuple[np.ndarray, float]:
-    """Rows that are whitened for a memory alone as whitened for a white share beside it."""
+def beside(apart: np.ndarray, white: float) -> tuple[np.ndarray, np.ndarray]:
+    """Diagonals D and l of T = L D Lᵀ, of `whitened_of_both`: L has ones and l."""
     kept, new = np.exp(-apart), np.sqrt(-np.expm1(-2 * apart))
     own, before = np.append(1.0, 1.0 / new), np.append(0.0, -kept / new)
-    matrix = np.zeros((2, len(rows)))
-    matrix[0] = 1.0 - white + white * (own**2 + before**2)
-    matrix[1, :-1] = white * before[1:] * own[:-1]
-    factor = cholesky_banded(matrix, lower=True, check_finite=False)
-    solved = dtbtrs(factor, rows.reshape(len(rows), -1), uplo="L")[0]
-    return solved.reshape(rows.shape), -float(np.sum(np.log(factor[0])))
+    diagonal = 1.0 - white + white * (own**2 + before**2)
+    return dpttrf(diagonal, white * before[1:] * own[:-1])[:2]
+
+
+def white_beside(rows: np.ndarray, apart: np.ndarray, white: float) -> tuple[np.ndarray, float]:
+    """Rows that are whitened for a memory alone as whitened for a white share beside it."""
+    size, next_ = beside(apart, white)
+    factor = np.stack([np.ones_like(size), np.append(next_, 0.0)])
+    solved = dtbtrs(factor, rows.reshape(len(rows), -1), uplo="L", diag="U")[0]
+    solved /= np.sqrt(size)[:, None]
+    return solved.reshape(rows.shape), -0.5 * float(np.sum(np.log(size)))
 
 
 class Levels(NamedTuple):

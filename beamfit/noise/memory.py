@@ -11,9 +11,10 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.fft import irfft, next_fast_len, rfft
+from scipy.linalg.lapack import dpttrs
 from scipy.special import logsumexp
 
-from beamfit.noise.correlated import BESIDE, log_volume, white_beside, white_shares, whitened
+from beamfit.noise.correlated import BESIDE, beside, log_volume, white_shares, whitened
 
 # Prior probabilities of white noise, of noise with one correlation time, and of a random walk; 1/f
 # noise has the rest. Readings are white unless something slow moves the monitor: amplifiers have
@@ -81,21 +82,25 @@ def without_flicker(rows: np.ndarray, power: float) -> np.ndarray:
     return found[: len(rows)]
 
 
-def _whitened(kinds: list[MemoryKind], rows: np.ndarray, time: np.ndarray):
-    """Yield the rows whitened by each noise, in order, with the log of the volume."""
+def _products(kinds: list[MemoryKind], rows: np.ndarray, time: np.ndarray):
+    """Yield products of the rows whitened by each noise, in order, with the log of the volume."""
     interval = np.diff(time)
     for length, alike in groupby(kinds, key=lambda kind: kind.time):
+        begun, volume = rows, 0.0
         if length:
             apart = interval / length
-            begun, volume = whitened(rows, apart, np), float(log_volume(apart, np))
+            begun = np.asfortranarray(whitened(rows, apart, np))
+            volume = float(log_volume(apart, np))
         for kind in alike:
             if not length:
-                yield (without_flicker(rows, kind.power) if kind.power else rows), 0.0
+                own = without_flicker(rows, kind.power) if kind.power else rows
+                yield own.T @ own, 0.0
             elif not kind.white:
-                yield begun, volume
+                yield begun.T @ begun, volume
             else:
-                both, more = white_beside(begun, apart, kind.white)
-                yield both, volume + more
+                size, next_ = beside(apart, kind.white)
+                solved = dpttrs(size, next_, begun)[0]
+                yield begun.T @ solved, volume - 0.5 * float(np.sum(np.log(size)))
 
 
 class Products(NamedTuple):
@@ -138,10 +143,9 @@ class Products(NamedTuple):
         ((89, 1, 1), 1.0)
         """
         kinds = kinds_of(time, times)
-        parts = list(_whitened(kinds, columns, time))
-        logs = np.array([np.log(k.chance) + v for k, (_, v) in zip(kinds, parts, strict=True)])
-        matrix = np.array([rows.T @ rows for rows, _ in parts])
-        return cls(kinds, logs, matrix, len(columns), STATED if stated else 0.0)
+        matrix, volumes = zip(*_products(kinds, columns, time), strict=True)
+        logs = np.log([kind.chance for kind in kinds]) + volumes
+        return cls(kinds, logs, np.array(matrix), len(columns), STATED if stated else 0.0)
 
     def some(self, kept: np.ndarray) -> Products:
         """Keep some of the noises."""

@@ -16,6 +16,8 @@ from beamfit.noise.model import LN_2PI, Lognormal, Noise
 NODES, DEEP = 12, 12.0
 # Standard deviations of the prior that nodes begin with.
 REACH = 4.5
+# Log odds beyond which a reading is surely bad, to rounding, and how many such are multiplied.
+CLEAR, AT_ONCE = 36.0, 16
 
 
 class NoiseKind(NamedTuple):
@@ -147,11 +149,11 @@ def variance_of(kind: NoiseKind, scale: Any) -> Any:
 
 
 def squared_pulls(off: Any, model: Any, kind: NoiseKind, scale: Any) -> Any:
-    """(size - model)² over the variance, points first: shape (n, ..., d, k), d draws, k scales."""
+    """(size - model)² over the variance, points first: shape (n, ..., k, d), k scales, d draws."""
     xp = off.__array_namespace__()
     z = off / model if kind.power else off
-    squared = _points_first(z**2, xp)[..., None]
-    return squared * _points_first(1.0 / variance_of(kind, scale), xp)[..., None, :]
+    squared = _points_first(z**2, xp)[..., None, :]
+    return squared * _points_first(1.0 / variance_of(kind, scale), xp)[..., None]
 
 
 def _points_first(values: Any, xp: Any) -> Any:
@@ -188,21 +190,27 @@ def log_likelihood(off: Any, model: Any, kind: NoiseKind, scale: Any, noise: Noi
     n = off.shape[-1]
     z2 = squared_pulls(off, model, kind, scale)
     spread = 0.5 * xp.sum(xp.log(variance_of(kind, scale)), axis=-1)
-    found = -0.5 * xp.sum(z2, axis=0) - spread[..., None, :] - 0.5 * n * LN_2PI
+    found = -0.5 * xp.sum(z2, axis=0) - spread[..., None]
+    found += n * (math.log1p(-noise.bad) - 0.5 * LN_2PI)
     if kind.power:
-        found = found - xp.sum(xp.log(model), axis=-1)[..., None]
+        found -= xp.sum(xp.log(model), axis=-1)[..., None, :]
     odds = log_odds(z2, kind, noise)
-    # ln(1 + e^odds) without overflow.
-    doubt = xp.log(1.0 + xp.exp(xp.minimum(odds, 500.0))) + xp.maximum(odds - 500.0, 0.0)
-    return found + n * math.log1p(-noise.bad) + xp.sum(doubt, axis=0)
+    near = xp.minimum(odds, CLEAR)
+    odds -= near
+    found += xp.sum(odds, axis=0)
+    # ln(1 + e^odds) of several points is one logarithm.
+    for first in range(0, n, AT_ONCE):
+        found += xp.log(xp.prod(1.0 + xp.exp(near[first : first + AT_ONCE]), axis=0))
+    return xp.moveaxis(found, -1, -2)
 
 
 def log_odds(squared_pull: Any, kind: NoiseKind, noise: Noise) -> Any:
     """Log odds that a reading is bad, from its squared pull, points first as `squared_pulls`."""
     xp = squared_pull.__array_namespace__()
     width = noise.width * xp.moveaxis(kind.usual, -1, 0)[..., None, None]
-    before = math.log(noise.bad / (1.0 - noise.bad)) - xp.log(width)
-    return before + 0.5 * squared_pull * (1.0 - width**-2)
+    odds = squared_pull * (0.5 * (1.0 - width**-2))
+    odds += math.log(noise.bad / (1.0 - noise.bad)) - xp.log(width)
+    return odds
 
 
 def averaged(log: Any, log_weight: Any) -> Any:
