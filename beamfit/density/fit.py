@@ -14,7 +14,7 @@ from scipy.special import ndtr
 from beamfit.answer import answer
 from beamfit.density.charge import FINE, charge_parts, finely, negative_charge
 from beamfit.density.profiles import MeanProfile, mean_profiles
-from beamfit.density.tomography import Densities, tomography
+from beamfit.density.tomography import GRID, Densities, tomography
 from beamfit.emittance.known import one_by_one, prepared, unfitted
 from beamfit.emittance.scan import QuadScan
 from beamfit.emittance.sigma import fit_sizes
@@ -36,9 +36,9 @@ LEAST_PHASE = 60.0
 # No density has negative charge. Places that are told apart within 3 rms, by lengths of .6 rms, in
 # any of which chance may ask for it; and the probability of chance below which it is none.
 PLACES, CHANCE = 25, 0.01
-# A window that ends where the density still has this share of its peak cuts the beam: a Gaussian
-# has it at 3 rms, with 3 % of its second moment beyond.
-CUT = 0.01
+# A window beyond which more than this of the mean square may lie cuts the beam: 1 % of an emittance.
+# That is so for a Gaussian within 3.2 rms.
+CUT = 0.02
 # Shares that a cut window leaves open.
 OPEN_WHEN_CUT = 0.95
 CENTRAL, WIDE = (0.16, 0.84), (0.025, 0.975)
@@ -84,17 +84,21 @@ class PlaneDensity:
     @property
     def cut(self) -> tuple[int, ...]:
         """Profiles whose window cuts the beam."""
-        return tuple(int(k) for k in np.flatnonzero(self.ends > CUT))
+        return tuple(int(k) for k in np.flatnonzero(self.beyond > CUT))
 
     @cached_property
-    def ends(self) -> np.ndarray:
-        """What the mean density has at the ends of each window, over its peak there; shape (k,)."""
-        if self.densities is None:
+    def beyond(self) -> np.ndarray:
+        """Share of the mean square that may lie beyond each window, at most with 84 %; (k,)."""
+        d = self.densities
+        if d is None:
             return np.zeros(len(self.profiles))
-        bins = self.densities.bins
-        seen = bins.look @ self.densities.values.mean(axis=0)
-        each = [seen[bins.profile == k] for k in range(len(self.profiles))]
-        return np.array([max(one[0], one[-1]) / one.max() for one in each])
+        found = []
+        for k, direction in enumerate(d.bins.direction):
+            position = d.bins.position[d.bins.profile == k]
+            at = GRID @ direction
+            outside = (at < position[0]) | (at > position[-1])
+            found.append((d.values @ (outside * at**2)) / (d.values @ at**2))
+        return np.quantile(found, CENTRAL[1], axis=1)
 
     @cached_property
     def by_chance(self) -> float:
@@ -173,7 +177,7 @@ class PlaneDensity:
             "core_brightness": self.brightness,
             "phase_seen_deg": self.phase,
             "profiles": len(self.profiles),
-            "window_ends": None if d is None else list(map(float, self.ends)),
+            "beyond_window": None if d is None else list(map(float, self.beyond)),
             "by_chance": None if d is None else self.by_chance,
             "scatter": None if d is None else d.scatter,
         }

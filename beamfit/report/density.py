@@ -61,9 +61,9 @@ def _seen(plane: PlaneDensity) -> Table:
     for k, (label, p) in enumerate(zip(plane.labels, plane.profiles, strict=True)):
         told = ["-", "-"]
         if d is not None:
-            told = [f"{100.0 * d.stretch[k]:+.1f} %", f"{100.0 * plane.ends[k]:.1f} %"]
+            told = [f"{100.0 * d.stretch[k]:+.1f} %", f"{100.0 * max(plane.beyond[k], 0.0):.1f} %"]
         rows.append([label, str(p.shots), f"{1e6 * p.size:.4g}", *told])
-    head = ["setting", "shots", "rms, µm", "wider than the density", "density at the window's end"]
+    head = ["setting", "shots", "rms, µm", "wider than the density", "beyond the window"]
     return Table(f"Profiles in {plane.plane}", head, rows)
 
 
