@@ -5,6 +5,7 @@ One-point functions of JAX arrays. Knobs are in half ranges, from -1 to 1 betwee
 
 from __future__ import annotations
 
+import math
 from itertools import product
 from typing import NamedTuple
 
@@ -72,56 +73,33 @@ def features(x: Array, length: Array, orders: np.ndarray) -> Array:
     >>> a, b, one = jnp.array([0.3, -0.5]), jnp.array([0.6, 0.1]), jnp.ones(2)
     >>> orders = orders_of(2)
     >>> kernel = features(a, one, orders) @ features(b, one, orders)
-    >>> round(float(kernel), 6), round(float(np.exp(-0.5 * (0.3**2 + 0.6**2))), 6)
+    >>> round(float(kernel), 6), round(math.exp(-0.5 * (0.3**2 + 0.6**2)), 6)
     (0.798516, 0.798516)
     """
     z = x / length
-    found, at = jnp.exp(-0.5 * jnp.sum(z**2))[None], {tuple(n): i for i, n in enumerate(orders)}
-    for degree in range(1, orders.sum(1).max() + 1):
-        level = orders[orders.sum(1) == degree]
-        # Each is another of the degree before times a knob: its last.
-        knob = level.shape[1] - 1 - np.argmax(level[:, ::-1] > 0, axis=1)
-        before = [at[tuple(n)] for n in level - np.eye(level.shape[1], dtype=int)[knob]]
-        root = np.sqrt(level[np.arange(len(level)), knob])
-        found = jnp.concatenate([found, found[np.array(before)] * z[knob] / root])
-    return found
+    top = int(orders.max())
+    root = np.array([math.sqrt(math.factorial(n)) for n in range(top + 1)])
+    # Products, since the derivative of 0**n is not finite.
+    powers = jnp.cumprod(jnp.concatenate([jnp.ones((1, len(z))), jnp.tile(z, (top, 1))]), axis=0)
+    each = powers / root[:, None] * jnp.exp(-0.5 * z**2)
+    return jnp.prod(each[orders, np.arange(orders.shape[1])], axis=1)
 
 
-def numbers_of(phi: Array, amplitude: Array, v: Array) -> Array:
-    """Numbers of the map from its coefficients, linear in them; shape (4,).
+def design(x: Array, scales: KnobScales, orders: np.ndarray) -> Array:
+    """Derivatives of the numbers of the map by its coefficients, shape (4, n).
 
-    Parameters
-    ----------
-    phi : Array
-        Features of a setting.
-    amplitude : Array
-        As of `KnobScales`.
-    v : Array
-        Shape (3, 1 + features): in prior standard deviations, a mean of ln ε, ln β and α first.
-
-    Returns
-    -------
-    Array
-        Those of `beam_of`: the level of ln ε, which no knob changes, the change of ε², ln β and α.
+    The numbers are those of `beam_of`: the level of ln ε, which no knob changes, the change of ε²,
+    ln β and α. Coefficients are of one prior standard deviation: a mean, then features.
     """
-    mean, own = MEAN * v[:, 0], amplitude * (v[:, 1:] @ phi)
-    return jnp.array([mean[0], own[0], mean[1] + own[1], mean[2] + own[2]])
-
-
-def covariance_of(slope: Array, same: Array, amplitude: Array) -> Array:
-    """Prior covariance of readings with slopes by the numbers of the map, shape (n, n).
-
-    Parameters
-    ----------
-    slope : Array
-        Shape (n, 4).
-    same : Array
-        Products of the readings' features, shape (n, n).
-    amplitude : Array
-        As of `KnobScales`.
-    """
-    level, own = MEAN * slope[:, np.array([0, 2, 3])], amplitude * slope[:, 1:]
-    return level @ level.T + same * (own @ own.T)
+    row = jnp.append(MEAN, jnp.ones(len(orders)))
+    phi = jnp.append(1.0, features(x, scales.length, orders)) * row
+    grown = jnp.concatenate(
+        [jnp.ones((NUMBERS, 1)), jnp.repeat(scales.amplitude[:, None], len(orders), axis=1)], axis=1
+    )
+    rows = jnp.einsum("ij,ik->ijk", jnp.eye(NUMBERS), grown * phi).reshape(NUMBERS, -1)
+    level = jnp.arange(rows.shape[1]) == 0
+    return jnp.concatenate([jnp.where(level, rows[:1], 0.0), jnp.where(level, 0.0, rows[:1]),
+                            rows[1:]])  # fmt: skip
 
 
 def log_emittance(level: Array, change: Array) -> Array:

@@ -37,7 +37,7 @@ class Emittances(NamedTuple):
 
 def emittances_of(planes: Sequence[MapPosterior]) -> Emittances:
     """Draws of ln of the geometric mean of some planes' emittances, in their coordinates."""
-    one = [p.coefficients[:, 0] for p in planes]
+    one = [p.coefficients.reshape(len(p.coefficients), 3, -1)[:, 0] for p in planes]
     return Emittances(tuple(p.scales for p in planes), tuple(one))
 
 

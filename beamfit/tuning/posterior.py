@@ -16,10 +16,8 @@ from beamfit.tuning.knob_map import (
     NUMBERS,
     KnobScales,
     beam_of,
-    covariance_of,
-    features,
+    design,
     log_size,
-    numbers_of,
     orders_of,
 )
 
@@ -77,7 +75,7 @@ class MapPosterior(NamedTuple):
     scales : KnobScales
         Of each draw, arrays (d, ...).
     coefficients : Array
-        Shape (d, 3, 1 + features): in prior standard deviations, as of `numbers_of`.
+        Shape (d, n): in prior standard deviations, as `design` multiplies them.
     log_evidence : Array
         Of the sizes, all scales averaged over.
     bad, model : Array
@@ -121,14 +119,9 @@ def _variance(data: KnobReadings, noise: Array, good: Array) -> Array:
     return jnp.where(data.there > 0, own / good, 1.0)
 
 
-def _features(data: KnobReadings, scales: KnobScales, orders: np.ndarray) -> Array:
-    """Features of every row, shape (n, features)."""
-    return jax.vmap(lambda x: features(x, scales.length, orders))(data.x)
-
-
-def _numbers(phi: Array, scales: KnobScales, v: Array) -> Array:
-    """Numbers of the map in every row, shape (n, 4)."""
-    return jax.vmap(lambda each: numbers_of(each, scales.amplitude, v))(phi)
+def _numbers_at(data: KnobReadings, scales: KnobScales, orders: np.ndarray) -> Array:
+    """Derivatives of every row's numbers by the coefficients, shape (n, 3, coefficients)."""
+    return jax.vmap(lambda x: design(x, scales, orders))(data.x)
 
 
 def _log_size(numbers: Array, w: Array, known: Array) -> Array:
@@ -141,37 +134,23 @@ def _slopes(data: KnobReadings, u: Array) -> tuple[Array, Array]:
     return both[0], both[1] * data.there[:, None]
 
 
-def _told(
-    slope: Array, phi: Array, scales: KnobScales, variance: Array, v: Array, off: Array
-) -> Array:
-    """Coefficients after readings that are linear in them and miss ``v`` by ``off``.
-
-    Rasmussen and Williams, eq. 2.23, for prior coefficients of covariance one.
-    """
-
-    def linear(v: Array) -> Array:
-        return jnp.sum(slope * _numbers(phi, scales, v), axis=1)
-
-    covariance = covariance_of(slope, phi @ phi.T, scales.amplitude) + jnp.diag(variance)
-    root = jax.scipy.linalg.cho_factor(covariance)
-    missed = jax.scipy.linalg.cho_solve(root, off - linear(v))
-    return v + jax.linear_transpose(linear, v)(missed)[0]
-
-
 def _settled(data: KnobReadings, state: _Peak, varies: Array, orders: np.ndarray) -> Array:
     """Coefficients that fit best at given scales: Gauss-Newton with the best of a few steps."""
     scales = scales_of(state.eta, varies)
-    phi = _features(data, scales, orders)
+    every = _numbers_at(data, scales, orders)
     variance = _variance(data, scales.noise, state.good)
 
     def cost(v: Array) -> Array:
-        off = data.y - jax.vmap(_log_size)(_numbers(phi, scales, v), data.w, data.known)
+        off = data.y - jax.vmap(_log_size)(every @ v, data.w, data.known)
         return jnp.sum(v**2) + jnp.sum(data.there * off**2 / variance)
 
     def step(v: Array, _: None) -> tuple[Array, None]:
-        by = _linear(data, _numbers(phi, scales, v), state.good, varies)
-        whole = _told(by.slope, phi, scales, variance, jnp.zeros_like(v), by.off)
-        tried = v + TRIED[:, None, None] * (whole - v)
+        model, slope = _slopes(data, every @ v)
+        a = jnp.einsum("ij,ijk->ik", slope, every)
+        off = data.there * (data.y - model) + a @ v
+        root = jax.scipy.linalg.cho_factor(a @ a.T + jnp.diag(variance))
+        whole = a.T @ jax.scipy.linalg.cho_solve(root, off)
+        tried = v + TRIED[:, None] * (whole - v)
         return tried[jnp.nanargmin(jax.vmap(cost)(tried))], None
 
     return jax.lax.scan(step, state.v, length=STEPS)[0]
@@ -197,9 +176,8 @@ def _linear(data: KnobReadings, u: Array, good: Array, varies: Array) -> _Linear
 def _covariance(eta: Array, by: _Linear, orders: np.ndarray) -> Array:
     """Covariance of the readings under scales, shape (n, n)."""
     scales = scales_of(eta, by.varies)
-    phi = _features(by.data, scales, orders)
-    own = jnp.diag(_variance(by.data, scales.noise, by.good))
-    return covariance_of(by.slope, phi @ phi.T, scales.amplitude) + own
+    a = jnp.einsum("ij,ijk->ik", by.slope, _numbers_at(by.data, scales, orders))
+    return a @ a.T + jnp.diag(_variance(by.data, scales.noise, by.good))
 
 
 def _log_evidence(eta: Array, by: _Linear, orders: np.ndarray) -> Array:
@@ -250,7 +228,7 @@ def _fitted(
     def settled(state: _Peak) -> tuple[_Peak, _Linear, Array]:
         v = _settled(data, state, varies, orders)
         scales = scales_of(state.eta, varies)
-        u = _numbers(_features(data, scales, orders), scales, v)
+        u = _numbers_at(data, scales, orders) @ v
         pull = (data.y - _slopes(data, u)[0]) ** 2 / _variance(data, scales.noise, 1.0)
         narrower = data.wide**-2
         doubt = jnp.exp(jnp.minimum(0.5 * pull * (1.0 - narrower), 500.0))
@@ -280,13 +258,14 @@ def _draw(key: Array, data: KnobReadings, state: _Peak, varies: Array, orders: n
     105, with the sizes linear about the best map.
     """
     scales = scales_of(state.eta, varies)
-    phi = _features(data, scales, orders)
-    by = _linear(data, _numbers(phi, scales, state.v), state.good, varies)
+    every = _numbers_at(data, scales, orders)
+    a = jnp.einsum("ij,ijk->ik", _slopes(data, every @ state.v)[1], every)
     variance = _variance(data, scales.noise, state.good)
     of_map, of_noise = jax.random.split(key)
     free = jax.random.normal(of_map, state.v.shape)
     noise = jnp.sqrt(variance) * jax.random.normal(of_noise, variance.shape)
-    return _told(by.slope, phi, scales, variance, free, by.off - noise)
+    root = jax.scipy.linalg.cho_factor(a @ a.T + jnp.diag(variance))
+    return state.v + free - a.T @ jax.scipy.linalg.cho_solve(root, a @ free + noise)
 
 
 @partial(jax.jit, static_argnames=("knobs", "draws"))
@@ -320,7 +299,7 @@ def map_posterior(
     Theory, Inference, and Learning Algorithms (2003), sect. 29.2.
     """
     orders = orders_of(knobs)
-    first = jnp.zeros((NUMBERS, 1 + len(orders))).at[:, 0].set(start / MEAN)
+    first = jnp.zeros((NUMBERS, 1 + len(orders))).at[:, 0].set(start / MEAN).ravel()
     of_sets, of_choice, of_draws = jax.random.split(jax.random.key(seed), 3)
 
     def drawn(varies: Array) -> MapPosterior:
@@ -337,8 +316,7 @@ def map_posterior(
             lambda key, i: _draw(key, data, _Peak(settled[i], eta[i], state.good), varies, orders)
         )(jax.random.split(of_draws, draws), chosen)
         error = jnp.sqrt(_variance(data, jnp.exp(state.eta[-1]), 1.0))
-        best = scales_of(state.eta, varies)
-        u = _numbers(_features(data, best, orders), best, state.v)
+        u = _numbers_at(data, scales_of(state.eta, varies), orders) @ state.v
         scales = jax.vmap(lambda e: scales_of(e, varies))(eta[chosen])
         bad = 1.0 - (state.good - data.wide**-2) / (1.0 - data.wide**-2)
         return MapPosterior(scales, coefficients, log_evidence, bad, _slopes(data, u)[0], error)
@@ -373,7 +351,6 @@ def numbers_at(posterior: MapPosterior, x: np.ndarray) -> Array:
     orders = orders_of(x.shape[-1])
 
     def one(scales: KnobScales, v: Array) -> Array:
-        phi = jax.vmap(lambda at: features(at, scales.length, orders))(jnp.asarray(x))
-        return jax.vmap(beam_of)(_numbers(phi, scales, v))
+        return jax.vmap(lambda at: beam_of(design(at, scales, orders) @ v))(jnp.asarray(x))
 
     return jax.vmap(one)(posterior.scales, posterior.coefficients)

@@ -9,7 +9,7 @@ from scipy.stats import kstest, multivariate_normal, norm, uniform
 
 from beamfit.emittance.comparison import STEPS
 from beamfit.tuning import posterior as of
-from beamfit.tuning.knob_map import MEAN, features, log_emittance, log_size, orders_of
+from beamfit.tuning.knob_map import MEAN, design, features, log_emittance, log_size, orders_of
 from beamfit.tuning.minimum import _of_draw, emittances_of, minima_of, values_at
 from beamfit.tuning.readings import log_no_beam
 
@@ -117,28 +117,21 @@ def test_slope_and_curvature_of_the_evidence_are_its_differences(data):
     assert np.allclose(each.T @ each / 4000 + np.diag(spread**-2), curvature, rtol=0.15, atol=0.4)
 
 
-def derivatives(phi, scales):
-    """Derivatives of the numbers by all coefficients, shape (n, 4, coefficients)."""
-    none = jnp.zeros((3, 1 + phi.shape[1]))
-    rows = jax.jacobian(lambda v: of._numbers(phi, scales, v))(none)
-    return np.asarray(rows).reshape(len(phi), 4, -1)
-
-
 def test_draws_have_the_mean_and_spread_of_gaussian_regression(data):
     """Rasmussen and Williams, eq. 2.25 and 2.26, the readings linear about the best map."""
     orders, eta, one = orders_of(2), scales_at(), jnp.ones(())
-    state = of._Peak(jnp.zeros((3, 1 + len(orders))), jnp.asarray(eta), jnp.ones(COUNT))
+    state = of._Peak(jnp.zeros(3 * (1 + len(orders))), jnp.asarray(eta), jnp.ones(COUNT))
     for _ in range(4):
         state = state._replace(v=of._settled(data, state, one, orders))
     scales = of.scales_of(jnp.asarray(eta), one)
-    phi = of._features(data, scales, orders)
-    by = of._linear(data, of._numbers(phi, scales, state.v), jnp.ones(COUNT), one)
-    a = np.einsum("ij,ijk->ik", by.slope, derivatives(phi, scales))
+    rows = np.asarray(of._numbers_at(data, scales, orders))
+    by = of._linear(data, rows @ state.v, jnp.ones(COUNT), one)
+    a = np.einsum("ij,ijk->ik", by.slope, rows)
     gain = a.T @ np.linalg.inv(np.asarray(of._covariance(eta, by, orders)))
-    at = derivatives(features(jnp.array([0.2, -0.4]), scales.length, orders)[None], scales)[0]
+    at = np.asarray(design(jnp.array([0.2, -0.4]), scales, orders))
     mean, covariance = at @ gain @ by.off, at @ (np.eye(a.shape[1]) - gain @ a) @ at.T
     keys = jax.random.split(jax.random.key(2), 4000)
-    drawn = jax.vmap(lambda key: of._draw(key, data, state, one, orders).ravel())(keys) @ at.T
+    drawn = np.asarray(jax.vmap(lambda key: of._draw(key, data, state, one, orders))(keys)) @ at.T
     assert np.allclose(drawn.mean(0), mean, atol=0.02)
     assert np.allclose(np.cov(drawn.T), covariance, rtol=0.15, atol=0.005)
 
