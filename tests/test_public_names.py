@@ -13,13 +13,13 @@ import beamfit
 
 NAMES = """
 Anchor Beam BeamMatrix Beamline DecayFit DecayRecord DensityFit Drift EmittanceFit EmittanceTable
-InputError Job Machine Monitor Noise Posterior QuadScan Quadrupole Quantity Run Screen SectorDipole Status
-Target ThinLens
-TuningFit check constant_a_test control design find_setpoint fit_decay fit_decays fit_density
-fit_emittance fit_lifetimes fit_sizes fit_slices fit_tuning identify load_fit load_lattice loss_coefficients
-moving_lifetime read_decay_record read_formulation read_noise read_operation read_quad_scan
-read_ring read_run read_tuning_scan run_batch save_fit scan_machine solve split_record study
-study_shift systematics trend watch write_report
+InputError Job Machine Monitor Noise Posterior QuadScan Quadrupole Quantity Run Screen
+SectorDipole Status Target ThinLens TuningFit check constant_a_test control design find_setpoint
+fit_decay fit_decays fit_density fit_emittance fit_lifetimes fit_sizes fit_slices fit_tuning
+identify load_fit load_lattice loss_coefficients moving_lifetime read_decay_record
+read_formulation read_noise read_operation read_quad_scan read_ring read_run read_tuning_scan
+run_batch save_fit scan_machine solve split_record study study_shift systematics trend watch
+write_report
 """
 PUBLIC = NAMES.split()
 # Every command and the function that answers as it does.

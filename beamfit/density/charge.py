@@ -10,7 +10,7 @@ import numpy as np
 from beamfit.density.tomography import AXIS, EDGE, POINT
 
 # Points of the fine grid, in rms sizes, and the rings into which squares of radii are counted.
-FINE = 0.15
+FINE = 0.18
 FINE_AXIS = np.arange(-EDGE, EDGE + FINE / 2, FINE)
 FAR, RINGS = 100.0, 2000
 # Squared radii, in rms sizes, beyond which charge is halo, and within which it is core.

@@ -36,9 +36,9 @@ LEAST_PHASE = 60.0
 # No density has negative charge. Places that are told apart within 3 rms, by lengths of .6 rms, in
 # any of which chance may ask for it; and the probability of chance below which it is none.
 PLACES, CHANCE = 25, 0.01
-# A window beyond which more than this of the mean square may lie cuts the beam: 1 % of an emittance.
-# That is so for a Gaussian within 3.2 rms.
-CUT = 0.02
+# A window beyond which likely more than this of the mean square lies cuts the beam: 5 % of an
+# emittance. That is so for a Gaussian within 2.5 rms.
+CUT = 0.1
 # Shares that a cut window leaves open.
 OPEN_WHEN_CUT = 0.95
 CENTRAL, WIDE = (0.16, 0.84), (0.025, 0.975)
@@ -88,7 +88,7 @@ class PlaneDensity:
 
     @cached_property
     def beyond(self) -> np.ndarray:
-        """Share of the mean square that may lie beyond each window, at most with 84 %; (k,)."""
+        """Share of the mean square that likely lies beyond each window, shape (k,)."""
         d = self.densities
         if d is None:
             return np.zeros(len(self.profiles))
@@ -98,7 +98,7 @@ class PlaneDensity:
             at = GRID @ direction
             outside = (at < position[0]) | (at > position[-1])
             found.append((d.values @ (outside * at**2)) / (d.values @ at**2))
-        return np.quantile(found, CENTRAL[1], axis=1)
+        return np.median(found, axis=1)
 
     @cached_property
     def by_chance(self) -> float:

@@ -26,14 +26,14 @@ from beamfit.density.profiles import MeanProfile
 from beamfit.noise.model import Noise
 
 # The grid, in rms sizes, the rms of what stands at each point, and the least width of a bin.
-STEP, EDGE, BIN = 0.3, 8.1, 0.3
+STEP, EDGE, BIN = 0.36, 10.8, 0.36
 POINT = 0.8 * STEP
 AXIS = np.arange(-EDGE, EDGE + STEP / 2, STEP)
 GRID = np.stack(np.meshgrid(AXIS, AXIS, indexing="ij"), -1).reshape(-1, 2)
 # Lengths over which the core changes with its envelope, equally likely; those of the tail; and
 # those that the frame is found with. In rms sizes; no core is longer than its envelope.
 CORES = ((0.4, 1.3), (0.6, 1.3), (0.9, 1.3), (0.4, 1.9), (0.6, 1.9), (0.9, 1.9), (1.4, 1.9))
-TAIL, ROUGH = (2.4, 3.0), (0.6, 1.9)
+TAIL, ROUGH = (3.0, 4.0), (0.6, 1.9)
 # Peak of the projected reference Gaussian: shares of the peak are shares of this.
 PEAK = 1.0 / math.sqrt(2.0 * math.pi)
 # Priors, standard deviations: background as a share of the peak, charge, centre in sizes, and sizes
