@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -12,7 +12,7 @@ import numpy as np
 from scipy.special import ndtr
 
 from beamfit.answer import answer
-from beamfit.density.charge import FINE, charge_parts, finely, negative_charge
+from beamfit.density.charge import FINE, ChargeParts, charge_parts, finely, negative_charge
 from beamfit.density.profiles import MeanProfile, mean_profiles
 from beamfit.density.tomography import GRID, Densities, tomography
 from beamfit.emittance.known import one_by_one, prepared, unfitted
@@ -76,7 +76,7 @@ class PlaneDensity:
     notes: tuple[str, ...] = ()
 
     @cached_property
-    def _parts(self) -> Any:
+    def _parts(self) -> ChargeParts:
         parts = charge_parts(self.densities.values, SHARES)
         unit = self.boost * abs(np.linalg.det(self.densities.frame)) * self.densities.growth
         return parts._replace(emittance=parts.emittance * unit[:, None], rms=parts.rms * unit)
@@ -127,37 +127,30 @@ class PlaneDensity:
         A share has no error where the profiles do not tell it: never without a density, and from
         95 % on not where windows cut the beam.
         """
-        if self.densities is None:
-            return {percent(share): Quantity(math.nan, None, "m") for share in SHARES}
-        found = {}
-        for k, share in enumerate(SHARES):
-            q = _quantity(self._parts.emittance[:, k], "m")
-            known = self._known and not (self.cut and share >= OPEN_WHEN_CUT)
-            found[percent(share)] = q if known else q.open()
-        return found
-
-    @property
-    def _known(self) -> bool:
-        return self.status is Status.converged
+        return {
+            percent(share): self._told(
+                lambda parts, k=k: parts.emittance[:, k], "m", share >= OPEN_WHEN_CUT
+            )
+            for k, share in enumerate(SHARES)
+        }
 
     @cached_property
     def halo(self) -> Quantity:
         """Share of the charge beyond 3 rms."""
-        return self._share("halo")
+        return self._told(lambda parts: parts.halo, "1", True)
 
     @cached_property
     def brightness(self) -> Quantity:
         """Share of the charge within one rms over its area in normalised phase space, 1/m."""
-        if self.densities is None:
-            return Quantity(math.nan, None, "1/m")
-        q = _quantity(self._parts.core / (math.pi * self._parts.rms), "1/m")
-        return q if self._known else q.open()
+        return self._told(lambda parts: parts.core / (math.pi * parts.rms), "1/m", False)
 
-    def _share(self, name: str) -> Quantity:
+    def _told(self, of: Callable[[ChargeParts], np.ndarray], unit: str, tail: bool) -> Quantity:
+        """A quantity of the draws, open where the profiles do not tell it."""
         if self.densities is None:
-            return Quantity(math.nan, None, "1")
-        q = _quantity(getattr(self._parts, name), "1")
-        return q if self._known and not self.cut else q.open()
+            return Quantity(math.nan, None, unit)
+        q = _quantity(of(self._parts), unit)
+        known = self.status is Status.converged and not (tail and self.cut)
+        return q if known else q.open()
 
     @cached_property
     def density(self) -> np.ndarray:
@@ -371,7 +364,7 @@ class DensityFit:
             raise InputError(f"no density in '{plane}'", ", ".join(found))
         return found[plane]
 
-    def __iter__(self) -> Any:
+    def __iter__(self) -> Iterator[PlaneDensity]:
         return iter(self.planes)
 
     @property

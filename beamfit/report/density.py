@@ -144,7 +144,7 @@ def draw_profiles(figure: FigureBase, plane: PlaneDensity) -> None:
             axes.tick_params(labelsize=6)
         upper.step(bins.position[at], bins.charge[at], where="mid", color="0.6", lw=0.8)
         upper.plot(bins.position[at], d.fitted[at], color=BLUE, lw=1.0)
-        upper.set_title(label, fontsize=7)
+        upper.set_title(label.split(" = ")[-1] if label.count("=") == 1 else label, fontsize=7)
         upper.set_yticks([])
         pull = (bins.charge[at] - d.fitted[at]) / d.error[at]
         lower.bar(bins.position[at], pull, 0.2, color="0.5")
