@@ -352,6 +352,14 @@ class DensityFit:
         What was fitted.
     planes : tuple of PlaneDensity
         One a plane with profiles at three settings or more.
+
+    Examples
+    --------
+    >>> import beamfit
+    >>> scan = beamfit.read_quad_scan("measurements/profiles_simulated.csv")
+    >>> fit = beamfit.fit_density(scan, beamfit.load_lattice("lattices/lcls_otr2.toml"))
+    >>> fit.status.value, f"{1e6 * fit['x'].emittance['90 %'].value:.1f} µm"
+    ('converged', '0.6 µm')
     """
 
     scan: QuadScan

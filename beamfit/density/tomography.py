@@ -47,8 +47,9 @@ PRIORS = ((math.log(0.5), 1.0), (math.log(0.02), 1.2), (math.log(0.005), 1.5),
 OWN, OWN_LENGTH = 0.1, 0.5
 # Linearisations, at which of them amplitudes are sought, and the most a step may change a size.
 ROUNDS, SOUGHT, MOST = 6, (2, 4), 0.3
-# Kernels less likely than this share have no draws; draws that share their amplitudes.
-LEAST, SHARED = 0.01, 8
+# Kernels less likely than this share have no draws; draws that share their amplitudes. Proposals
+# for each of these, and how much wider than by Laplace's method they are.
+LEAST, SHARED, PROPOSED, WIDER = 0.01, 8, 4, 1.5
 # Standard deviations of their priors within which amplitudes are sought; added to the diagonal of
 # correlations of the grid.
 REACH, JITTER = 6.0, 1e-9
@@ -380,10 +381,11 @@ class _Posterior(NamedTuple):
     def draws(
         self, numbers: np.ndarray, count: int, random: np.random.Generator
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Densities and changes of the frame, amplitudes by Laplace's method.
+        """Densities and changes of the frame, amplitudes drawn by their importance.
 
         Each is a draw of the prior moved by what the bins say of it (A. G. Journel and C. J.
-        Huijbregts, Mining Geostatistics, 1978, ch. VII).
+        Huijbregts, Mining Geostatistics, 1978, ch. VII). Amplitudes are proposed by Laplace's
+        method, wider than it says, and resampled: what settings scatter is skew.
         """
         step, each = 0.1, np.eye(len(numbers))
         curved = np.array([(self._loss(numbers + step * u)[1] - self._loss(numbers - step * u)[1])
@@ -391,10 +393,16 @@ class _Posterior(NamedTuple):
         values, vectors = np.linalg.eigh(0.5 * (curved + curved.T))
         # The prior alone curves by 1/1.5²: less is rounding.
         width = vectors / np.sqrt(np.maximum(values, 1.0 / self.prior[:, 1].max() ** 2))
-        parts = []
-        for some in np.array_split(np.arange(count), max(1, count // SHARED)):
-            at = numbers + width @ random.normal(size=len(numbers))
-            parts.append(self._draws_at(at, len(some), random))
+        wanted = max(1, count // SHARED)
+        z = WIDER * random.normal(size=(PROPOSED * wanted, len(numbers)))
+        proposed = numbers + z @ width.T
+        log = np.array([-self._loss(at)[0] for at in proposed]) + 0.5 * np.sum(z**2, 1) / WIDER**2
+        weight = np.exp(log - log.max())
+        chosen = random.choice(len(proposed), wanted, p=weight / weight.sum())
+        parts = [
+            self._draws_at(proposed[i], len(some), random)
+            for i, some in zip(chosen, np.array_split(np.arange(count), wanted), strict=True)
+        ]
         densities, changes = zip(*parts, strict=True)
         return np.concatenate(densities), np.concatenate(changes)
 

@@ -223,7 +223,7 @@ HELD = {
     f"{DECAY}.record": "DecayRecord Conditions Monitor",
     f"{DECAY}.fit": "DecayFit",
     f"{DECAY}.evidence": "Separability RatePart",
-    f"{DECAY}.alternatives": "ConstantA LifetimeLaw Change Outgassing",
+    f"{DECAY}.alternatives": "ConstantA LifetimeLaw Change Outgassing SuddenLoss",
     f"{DECAY}.marginal": "FreeLaw Span",
     f"{OPTICS}.beamline": "Beamline Design",
     f"{OPTICS}.elements": "Drift Quadrupole ThinLens SectorDipole Marker Screen TransferMatrix",

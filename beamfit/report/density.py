@@ -6,6 +6,7 @@ import math
 from functools import partial
 
 import numpy as np
+from matplotlib import colormaps
 from matplotlib.figure import FigureBase
 
 from beamfit.density.charge import FINE_AXIS
@@ -85,6 +86,7 @@ def draw_density(figure: FigureBase, plane: PlaneDensity) -> None:
     u = np.stack(np.meshgrid(FINE_AXIS, FINE_AXIS, indexing="ij"), -1) @ d.frame.T
     x, angle = 1e3 * u[..., 0], 1e3 * u[..., 1]
     axes.pcolormesh(x, angle, density, cmap="viridis", shading="gouraud", rasterized=True)
+    axes.set_facecolor(colormaps["viridis"](0.0))
     axes.contour(x, angle, density, levels=levels, colors="w", linewidths=0.7)
     wide, high = 1e3 * REACH * np.hypot(*d.frame.T)
     axes.set(xlabel=f"{plane.plane}, mm", ylabel=f"{plane.plane}′, mrad")

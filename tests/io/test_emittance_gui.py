@@ -213,7 +213,8 @@ def test_a_made_file_gives_the_beam_it_was_made_of(save):
     gamma = (1 + 0.1**2) / 1.2
     bmag = 0.5 * (3.4e-9 * gamma + 2 * 2e-10 * -0.1 + 2.1e-9 * 1.2) / true
     assert fit.x.mismatch.value == pytest.approx(bmag, rel=1e-2)
-    assert len(gui.scan().profiles) == 2 * len(KG)
+    # Five shots of each setting in both planes.
+    assert len(gui.scan().profiles) == 2 * 5 * len(KG)
 
 
 @pytest.mark.parametrize("compressed", [True, False])
