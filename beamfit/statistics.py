@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import chdtrc, fdtrc, ndtr, stdtr, stdtrit
 
-from beamfit.quantity import NORMAL_REACH
+from beamfit.quantity import NORMAL_REACH, Quantity
 
 # Probability of the residuals below which a fit is poor: the contract of the JSON output.
 POOR_FIT = 1e-3
@@ -18,6 +18,8 @@ OPEN = 3.0
 BASELINE, FEWEST = 20, 3
 # Degrees of freedom below which the message gives the 95 % interval of Student's distribution.
 MANY = 8
+# Ends of the central 68 and 95 % of draws.
+CENTRAL, WIDE = (0.16, 0.84), (0.025, 0.975)
 # Mean range of two normal numbers in standard deviations; degrees of freedom of a moving range.
 RANGE, RANGE_DOF = 1.128, 0.62
 # Probability below 3 standard deviations; one point in 370 lies beyond them to either side.
@@ -118,6 +120,37 @@ def chi2_probability(chi2: float, dof: float, error_dof: float = math.inf) -> fl
     if math.isinf(error_dof):
         return float(chdtrc(dof, chi2))
     return float(fdtrc(dof, error_dof, chi2 / dof))
+
+
+def quantity_of_draws(draws: np.ndarray, unit: str, value: float | None = None) -> Quantity:
+    """Make the quantity that draws of a posterior say.
+
+    Parameters
+    ----------
+    draws : ndarray
+        Shape (d,); those that are not finite are left out.
+    unit : str
+        Its unit.
+    value : float, optional
+        The median if None.
+
+    Returns
+    -------
+    Quantity
+        Its error is half of the central 68 %, its interval the central 95 %.
+
+    Examples
+    --------
+    >>> quantity_of_draws(np.linspace(0.0, 2.0, 101), "m")
+    <Quantity 1.00 ± 0.68 m>
+    """
+    draws = draws[np.isfinite(draws)]
+    if not len(draws):
+        return Quantity(math.nan, None, unit)
+    low, high = np.quantile(draws, CENTRAL)
+    ends = np.quantile(draws, WIDE)
+    value = float(np.median(draws)) if value is None else float(value)
+    return Quantity(value, 0.5 * float(high - low), unit, None, (float(ends[0]), float(ends[1])))
 
 
 def one_sided_probability(deviations: float, dof: float) -> float:

@@ -57,7 +57,7 @@ def test_one_runs_as_a_notebook(executed):
         ("calibration", ["converged 0.679 ± 0.015 µm", "Q2.slope 167.2 ± 3.3"]),
         ("slices", ["3          converged 0.4954 ± 0.0056 µm"]),
         ("loss_mechanisms", ["longest: 18.4 h at 3.2 MV"]),
-        ("density", ["x by sizes 0.899 ± 0.039 µm by the density 1.028"]),
+        ("density", ["x by sizes 0.899 ± 0.039 µm by the density 1.0"]),
         ("tuning", ["converged: normalised emittance 0.734 ± 0.026 µm at SOL = 197.8 A"]),
         ("posterior", ["converged", "fit:     0.702 ± 0.023 µm"]),
         ("identification", ["poor_fit Past inputs", "converged The free run"]),

@@ -24,6 +24,7 @@ from beamfit.noise.model import Noise
 from beamfit.optics.beamline import Beamline
 from beamfit.optics.particle import beta_gamma
 from beamfit.quantity import Quantity, percent
+from beamfit.statistics import quantity_of_draws
 from beamfit.status import Status
 from beamfit.table import Table, cell, json_of
 from beamfit.verdict import Finding, judge
@@ -41,7 +42,6 @@ PLACES, CHANCE = 25, 0.01
 CUT = 0.1
 # Shares that a cut window leaves open.
 OPEN_WHEN_CUT = 0.95
-CENTRAL, WIDE = (0.16, 0.84), (0.025, 0.975)
 
 
 @answer
@@ -148,7 +148,7 @@ class PlaneDensity:
         """A quantity of the draws, open where the profiles do not tell it."""
         if self.densities is None:
             return Quantity(math.nan, None, unit)
-        q = _quantity(of(self._parts), unit)
+        q = quantity_of_draws(of(self._parts), unit)
         known = self.status is Status.converged and not (tail and self.cut)
         return q if known else q.open()
 
@@ -287,22 +287,12 @@ def _label(scan: QuadScan, row: int) -> str:
     return ", ".join(named) or (scan.screen[row] if scan.screen else f"row {row + 1}")
 
 
-def _quantity(draws: np.ndarray, unit: str) -> Quantity:
-    """Median of draws with half of the central 68 %, and the central 95 %."""
-    draws = draws[np.isfinite(draws)]
-    if not len(draws):
-        return Quantity(math.nan, None, unit)
-    low, high = np.quantile(draws, CENTRAL)
-    ends = np.quantile(draws, WIDE)
-    return Quantity(float(np.median(draws)), 0.5 * float(high - low), unit, None,
-                    (float(ends[0]), float(ends[1])))  # fmt: skip
-
-
 def _no_beam(plane: PlaneDensity) -> Finding | None:
     if plane.densities is not None:
         return None
-    cause = f"The profiles in {plane.plane} are of no beam through this line."
-    return Finding(Status.unidentified, cause, "Check the line, the magnet and the screen.")
+    cause = f"The sizes of the profiles in {plane.plane} give no emittance: the waist is not "
+    cause += "bracketed, or they are of no beam through this line."
+    return Finding(Status.unidentified, cause, "Scan on both sides of the waist; check the line.")
 
 
 def _few_phases(plane: PlaneDensity) -> Finding | None:

@@ -25,6 +25,7 @@ from beamfit.optics.beamline import Beamline
 from beamfit.optics.calibration import SETTING_UNITS
 from beamfit.optics.particle import beta_gamma
 from beamfit.quantity import Quantity, percent
+from beamfit.statistics import CENTRAL, WIDE, quantity_of_draws
 from beamfit.status import Status
 from beamfit.table import Table, cell, json_of
 from beamfit.tuning.knobs import GOALS, EmittanceTable, Knobs, knobs_of, planes_of
@@ -48,7 +49,6 @@ TOLD = 0.05
 NO_BEAM = (MODELS["sizes at random"] + MODELS["one constant size"]) / MODELS[BEAM]
 # Half ranges within which a minimum is on the limit.
 EDGE = 1e-6
-CENTRAL, WIDE = (0.16, 0.84), (0.025, 0.975)
 
 
 class TuningBand(NamedTuple):
@@ -223,7 +223,7 @@ class TuningFit:
         ends = np.abs(np.quantile(self.minima.place, WIDE, axis=0)).min(axis=0)
         found = {}
         for i, (name, unit) in enumerate(self.units.items()):
-            q = self._told(_quantity(every[:, i], best[i], unit or "1"))
+            q = self._told(quantity_of_draws(every[:, i], unit or "1", best[i]))
             known = self.flat <= TOLD and ends[i] < 1.0 - EDGE
             found[name] = q if known else q.open()
         return found
@@ -240,7 +240,7 @@ class TuningFit:
     @cached_property
     def minimum(self) -> Quantity:
         """The lowest normalised emittance between the limits, m."""
-        return self._told(_quantity(self.unit * np.exp(self.minima.value), None, "m"))
+        return self._told(quantity_of_draws(self.unit * np.exp(self.minima.value), "m"))
 
     @cached_property
     def _at_best(self) -> np.ndarray:
@@ -250,7 +250,7 @@ class TuningFit:
     @cached_property
     def emittance(self) -> Quantity:
         """The normalised emittance at the best setting, m."""
-        return self._told(_quantity(self.unit * np.exp(self._at_best), None, "m"))
+        return self._told(quantity_of_draws(self.unit * np.exp(self._at_best), "m"))
 
     @cached_property
     def excess(self) -> np.ndarray:
@@ -412,14 +412,6 @@ class TuningFit:
         rows += [[name, cell(q), cell(q.interval_words), ""] for name, q in lowest.items()]
         head = ["", "value", "95 % interval", "at a limit"]
         return (Table(f"Best setting, from {len(self.scan)} rows", head, rows),)
-
-
-def _quantity(draws: np.ndarray, value: float | None, unit: str) -> Quantity:
-    """Median of draws, or another value, with half of the central 68 %, and the central 95 %."""
-    low, high = np.quantile(draws, CENTRAL)
-    ends = np.quantile(draws, WIDE)
-    value = float(np.median(draws)) if value is None else float(value)
-    return Quantity(value, 0.5 * float(high - low), unit, None, (float(ends[0]), float(ends[1])))
 
 
 def _even(numbers: jax.Array) -> np.ndarray:
