@@ -113,17 +113,17 @@ class _Lines:
 
 def _known(fit: EmittanceFit | TuningFit) -> Iterator[str]:
     """Present knowledge of each plane's emittance, or of the best setting, in a few words."""
-    if not hasattr(fit, "planes"):
+    from beamfit.emittance.fit import EmittanceFit
+
+    if not isinstance(fit, EmittanceFit):
         yield fit.headline
         return
     for plane in fit.planes:
-        sure = "" if plane.status is Status.converged else f" ({cell(plane.status)})"
-        known = plane.emittance.error is not None
-        yield (
-            f"{plane.plane}: {plane.normalized_emittance}{sure}"
-            if known
-            else (f"{plane.plane}: open")
-        )
+        if plane.emittance.error is None:
+            yield f"{plane.plane}: open"
+        else:
+            sure = "" if plane.status is Status.converged else f" ({cell(plane.status)})"
+            yield f"{plane.plane}: {plane.normalized_emittance}{sure}"
 
 
 async def _planned(machine: ScanMachine, journal: Path, as_json: bool) -> int:

@@ -54,6 +54,10 @@ TOGETHER, ROUNDS, REST = 16, 40, 1e-11
 # and over which share of the scan it bends.
 STEPS = np.geomspace(0.05, 1.0, 6)
 BENDS, LENGTHS = np.array([0.2, 0.4, 0.7, 1.2]), (0.25, 0.5)
+# Amplitudes of a smooth departure from a beam's sizes, as shares of the size; over which share of
+# the scan it bends; and the part of the chance of "a smooth curve" that it has: with it one scan in
+# a thousand departs, so that a departure which the noise would hide refuses no good scan.
+DEPARTURES, SMOOTH, NEAR = np.array([0.1, 0.2, 0.4]), 0.7, 1 / 30
 # Standard deviation of ln of a constant size.
 LEVEL = 1.0
 # Draws of a beam of no emittance, of which the evidence alone is wanted.
@@ -201,12 +205,6 @@ def _process(
     log = -0.5 * (qq - qo**2 / (1.0 + oo) + log_det + n * LN_2PI)
     log = averaged(log, -math.log(len(amplitudes)))
     return averaged(log, scales.log_weight)
-
-
-# Amplitudes of a smooth departure from a beam's sizes, as shares of the size; over which share of
-# the scan it bends; and the part of the chance of "a smooth curve" that it has: with it one scan in
-# a thousand departs, so that a departure which the noise would hide refuses no good scan.
-DEPARTURES, SMOOTH, NEAR = np.array([0.1, 0.2, 0.4]), 0.7, 1 / 30
 
 
 def departure_odds(x: np.ndarray, u: np.ndarray, c: Coordinates, kind: NoiseKind) -> np.ndarray:
