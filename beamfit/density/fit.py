@@ -19,6 +19,7 @@ from beamfit.emittance.known import one_by_one, prepared, unfitted
 from beamfit.emittance.scan import QuadScan
 from beamfit.emittance.sigma import fit_sizes
 from beamfit.emittance.transport import look_through
+from beamfit.emittance.verdict import USEFUL
 from beamfit.errors import InputError, expect
 from beamfit.noise.model import Noise
 from beamfit.optics.beamline import Beamline
@@ -76,7 +77,8 @@ class PlaneDensity:
     notes: tuple[str, ...] = ()
 
     @cached_property
-    def _parts(self) -> ChargeParts:
+    def parts(self) -> ChargeParts:
+        """Core and halo of every draw, emittances normalised, m."""
         parts = charge_parts(self.densities.values, SHARES)
         unit = self.boost * abs(np.linalg.det(self.densities.frame)) * self.densities.growth
         return parts._replace(emittance=parts.emittance * unit[:, None], rms=parts.rms * unit)
@@ -148,9 +150,9 @@ class PlaneDensity:
         """A quantity of the draws, open where the profiles do not tell it."""
         if self.densities is None:
             return Quantity(math.nan, None, unit)
-        q = quantity_of_draws(of(self._parts), unit)
+        q = quantity_of_draws(of(self.parts), unit)
         known = self.status is Status.converged and not (tail and self.cut)
-        return q if known else q.open()
+        return q if known and _narrow(q) else q.open()
 
     @cached_property
     def density(self) -> np.ndarray:
@@ -235,10 +237,11 @@ def fit_density(
     seen = unfitted(scan, line, noise=noise)
     seen = seen._replace(look=one_by_one(look_through, [(seen.rows,)])[0])
     r11, r12, known = (np.asarray(part) for part in seen.look[:3])
-    boost, planes = beta_gamma(seen.energy, seen.line.mass), []
+    boost, planes, lost = beta_gamma(seen.energy, seen.line.mass), [], []
     for plane in scan.planes:
         profiles, notes = mean_profiles(scan, plane)
         if len(profiles) < 3:
+            lost += notes
             continue
         i, at = "xy".index(plane), [p.row for p in profiles]
         rows = np.column_stack([r11[i, at], r12[i, at]])
@@ -248,9 +251,8 @@ def fit_density(
         planes.append(PlaneDensity(plane, tuple(profiles), labels, densities, boost, phase,
                                    tuple(notes)))  # fmt: skip
     if not planes:
-        raise scan.unusable(
-            "profiles that show a beam at fewer than three settings", "five or more"
-        )
+        found = " ".join(["profiles that show a beam at fewer than three settings.", *lost])
+        raise scan.unusable(found.rstrip("."), "five settings with such profiles")
     return DensityFit(scan, tuple(planes))
 
 
@@ -303,6 +305,21 @@ def _few_phases(plane: PlaneDensity) -> Finding | None:
     return Finding(Status.unidentified, cause, "Scan further on both sides of the waist.")
 
 
+def _narrow(q: Quantity) -> bool:
+    """True if a quantity is known well enough to be of use."""
+    low, high = q.interval_95 or (0.0, 0.0)
+    return low > 0.0 and high < USEFUL * low
+
+
+def _wide(plane: PlaneDensity) -> Finding | None:
+    whole = quantity_of_draws(plane.parts.emittance[:, SHARES.index(0.9)], "m")
+    if _narrow(whole):
+        return None
+    cause = f"The profiles in {plane.plane} leave the emittance of 90 % of the charge open."
+    where = f" The window cuts the beam at {plane.labels[plane.cut[0]]}." if plane.cut else ""
+    return Finding(Status.unidentified, cause + where, "Widen the window, and scan further.")
+
+
 def _contradiction(plane: PlaneDensity) -> Finding | None:
     if plane.by_chance >= CHANCE:
         return None
@@ -328,7 +345,7 @@ def _found(plane: PlaneDensity) -> Finding:
 
 
 # In order of gravity.
-RULES = (_no_beam, _few_phases, _contradiction, _found)
+RULES = (_no_beam, _few_phases, _contradiction, _wide, _found)
 
 
 @answer

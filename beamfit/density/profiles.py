@@ -17,8 +17,10 @@ USUAL_LIGHT = 0.5
 ENDS, REACH = 0.1, 4.0
 # Share of the peak above which a shot's bins tell its centre.
 CENTRE = 0.2
-# Bins at exactly the highest count: more than a rounded peak has.
+# Neighbouring bins at exactly the highest count, of which a rounded peak has no more.
 FLAT = 3
+# Settings that are taken at most: time grows with the cube of their number.
+MOST = 20
 
 
 class MeanProfile(NamedTuple):
@@ -74,24 +76,34 @@ def mean_profiles(scan: QuadScan, plane: str) -> tuple[list[MeanProfile], list[s
     (2, 200, [])
     """
     rows: dict[int, list[tuple[np.ndarray, np.ndarray]]] = {}
-    notes, dark = [], 0
-    for p in scan.profiles:
-        if p.plane == plane and (shot := _shot(p)) is not None:
-            rows.setdefault(p.row, []).append(shot)
-            if np.sum(p.counts == p.counts.max()) > FLAT:
-                notes.append(f"Row {p.row + 1} in {plane} looks saturated: its top is flat.")
+    own, found, dark, flat = [p for p in scan.profiles if p.plane == plane], [], 0, 0
+    for p in own:
+        if (shot := _shot(p)) is None:
+            dark += 1
+        elif _saturated(p):
+            flat += 1
         else:
-            dark += p.plane == plane
-    found = []
+            rows.setdefault(p.row, []).append(shot)
     for row, shots in sorted(rows.items()):
         light = np.array([charge.sum() for _, charge in shots])
         usual = np.abs(np.log(light / np.median(light))) < -np.log(USUAL_LIGHT)
         dark += int((~usual).sum())
         found.append(_mean(row, [s for s, good in zip(shots, usual, strict=True) if good]))
-    if dark:
-        word = "profile was" if dark == 1 else "profiles were"
-        notes.append(f"{dark} {word} left out in {plane}: no beam, or another charge.")
-    return found, list(dict.fromkeys(notes))
+    lost = {"no beam, or another charge": dark, "saturated, flat at the top": flat}
+    few = found
+    if len(found) > MOST:
+        few = [found[i] for i in np.linspace(0, len(found) - 1, MOST).astype(int)]
+    notes = [f"Left out in {plane}: {count} of {len(own)} profiles ({why})."
+             for why, count in lost.items() if count]  # fmt: skip
+    if few is not found:
+        notes.append(f"Of {len(found)} settings in {plane} {MOST} are taken, evenly among all.")
+    return few, notes
+
+
+def _saturated(profile: Profile) -> bool:
+    """True if more neighbouring bins are at the highest count than a peak has."""
+    top = profile.counts == np.nanmax(profile.counts)
+    return bool(np.convolve(top, np.ones(FLAT + 1), "valid").max(initial=0.0) > FLAT)
 
 
 def profile_size(profile: Profile) -> float:

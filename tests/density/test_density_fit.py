@@ -122,3 +122,30 @@ def test_a_scan_of_sizes_has_no_density():
     scan = beamfit.read_quad_scan(ROOT / "measurements" / "lcls_otr2.csv")
     with pytest.raises(beamfit.InputError, match="without profiles"):
         beamfit.fit_density(scan, beamfit.load_lattice(LINE))
+
+
+def test_saturated_profiles_are_left_out_and_counted():
+    scan = beamfit.read_quad_scan(HALO)
+    flat = [
+        p._replace(counts=np.minimum(p.counts, 0.5 * p.counts.max())) if p.row < 4 else p
+        for p in scan.profiles
+    ]
+    with pytest.raises(beamfit.InputError, match="saturated"):
+        beamfit.fit_density(replace(scan, profiles=tuple(flat)), beamfit.load_lattice(LINE))
+
+
+def test_a_window_of_one_and_a_half_rms_determines_nothing():
+    scan = beamfit.read_quad_scan(HALO)
+    cut = [
+        p._replace(position=p.position[near], counts=p.counts[near])
+        for p in scan.profiles
+        for near in [np.abs(p.position - p.position[np.argmax(p.counts)])
+                     < 1.5 * scan.size[p.plane][p.row]]
+    ]  # fmt: skip
+    fit = beamfit.fit_density(replace(scan, profiles=tuple(cut)), beamfit.load_lattice(LINE))
+    for plane in fit:
+        assert plane.cut
+        if plane.status.value != "converged":
+            assert all(q.error is None for q in plane.emittance.values())
+        for q in plane.emittance.values():
+            assert q.error is None or q.interval_95[1] < 2.5 * q.interval_95[0]
