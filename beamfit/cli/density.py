@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -46,6 +47,7 @@ def density(
     from beamfit.density.fit import fit_density
 
     fit = fit_density(read.scan, line, noise=own, seed=seed)
+    fit = fit if read.gui is None else replace(fit, stored=read.gui.stored)
     inputs = {str(each.path): each.sha256 for each in (read.scan, read.lattice)}
     reported(report, fit, inputs)
     answered(as_json, [fit], inputs, lambda terminal: show_density(terminal, fit), report)

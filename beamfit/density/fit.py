@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
@@ -359,6 +359,8 @@ class DensityFit:
         What was fitted.
     planes : tuple of PlaneDensity
         One a plane with profiles at three settings or more.
+    stored : dict of str to dict of str to Quantity
+        Size method and plane to the normalised emittance that a file says, to be shown beside.
 
     Examples
     --------
@@ -371,6 +373,7 @@ class DensityFit:
 
     scan: QuadScan
     planes: tuple[PlaneDensity, ...]
+    stored: Mapping[str, Mapping[str, Quantity]] = field(default_factory=dict)
 
     def __getitem__(self, plane: str) -> PlaneDensity:
         """Give the density of a plane."""

@@ -22,6 +22,8 @@ from beamfit.io.isolated import LARGEST, isolated
 
 # Filters that are part of every HDF5 library: deflate, shuffle, fletcher32, and h5py's own lzf.
 FILTERS = {1, 2, 3, 32000}
+# A stack of images, and the width of its pixels in µm.
+IMAGES, PIXEL = "images", "pixel_um"
 # Letters of an attribute that is kept as a comment; a whole log may stand in one.
 LONGEST_COMMENT = 1000
 FEWER = "fewer: average what is repeated, or cut the file"
@@ -105,10 +107,42 @@ def hdf5_content(content: bytes, rows: int, texts: int) -> Columns:
         if "openPMD" in store.attrs:
             return _openpmd(store, rows), {}, []
         place = _place(store)
-        columns = {name: _column(place, name, rows, texts) for name in _names(place)}
+        if IMAGES in (names := _names(place)):
+            return _projections(place, names, rows, texts), {}, []
+        columns = {name: _column(place, name, rows, texts) for name in names}
         units = {name: _unit(place[name], name) for name in columns}
         said = [f"{key}: {value}"[:LONGEST_COMMENT] for key, value in store.attrs.items()]
     return columns, units, said
+
+
+def _projections(
+    place: Any, names: Sequence[str], rows: int, texts: int
+) -> dict[str, Sequence[Any]]:
+    """A line a bin of the projections of a stack of images; the shorter one is filled with NaN."""
+    data = place[IMAGES]
+    _check_stored(data, IMAGES)
+    if len(data.shape or ()) != 3 or data.dtype.kind not in "iuf":
+        found = f"a dataset of shape {data.shape}, type {data.dtype}"
+        raise InputError(found, "images of shape (n, rows, columns)", column=IMAGES)
+    if PIXEL not in names:
+        raise InputError(f"images and no dataset {PIXEL}", "the width of a pixel", column=IMAGES)
+    count, bins = data.shape[0], max(data.shape[1:])
+    if count * bins > rows:
+        raise InputError(f"projections of {count * bins} bins", FEWER, column=IMAGES)
+    told = {n: _column(place, n, rows, texts) for n in names if n not in (IMAGES, PIXEL)}
+    for name, values in told.items():
+        if len(values) != count:
+            raise InputError(f"{len(values)} values", f"{count}, one an image", column=name)
+    told = {"shot": np.arange(count, dtype=float)} | told
+    columns = {name: list(np.repeat(values, bins)) for name, values in told.items()}
+    columns["position_um"] = np.tile(np.arange(bins) * float(np.ravel(place[PIXEL][()])[0]), count)
+    for plane, axis in (("x", 0), ("y", 1)):
+        each = np.full((count, bins), np.nan)
+        for i in range(count):
+            seen = np.asarray(data[i], float).sum(axis=axis)
+            each[i, : len(seen)] = seen
+        columns[f"counts_{plane}"] = each.ravel()
+    return columns
 
 
 def _openpmd(store: Any, rows: int) -> dict[str, Sequence[Any]]:
@@ -175,14 +209,8 @@ def _column(store: Any, name: str, rows: int, texts: int) -> list[str] | np.ndar
     import h5py
 
     data = store[name]
-    plan = data.id.get_create_plist()
-    filters = {plan.get_filter(i)[0] for i in range(plan.get_nfilters())}
+    _check_stored(data, name)
     is_text = h5py.check_string_dtype(data.dtype) is not None
-    if data.is_virtual or plan.get_external_count():
-        raise InputError("numbers in another file", ELSEWHERE, column=name)
-    if not filters <= FILTERS:
-        said = "gzip, lzf, shuffle, fletcher32 or none"
-        raise InputError(f"a filter of number {min(filters - FILTERS)}", said, column=name)
     if data.shape is None or data.size != max(data.shape, default=1):
         raise InputError(
             f"a dataset of shape {data.shape}", "a one-dimensional dataset", column=name
@@ -197,6 +225,17 @@ def _column(store: Any, name: str, rows: int, texts: int) -> list[str] | np.ndar
         return [str(value) for value in np.ravel(data.asstr("utf-8")[()])]
     except UnicodeDecodeError:
         raise InputError("bytes that are not text", "UTF-8 text", column=name) from None
+
+
+def _check_stored(data: Any, name: str) -> None:
+    """Refuse numbers in another file, and filters that HDF5 does not bring."""
+    plan = data.id.get_create_plist()
+    filters = {plan.get_filter(i)[0] for i in range(plan.get_nfilters())}
+    if data.is_virtual or plan.get_external_count():
+        raise InputError("numbers in another file", ELSEWHERE, column=name)
+    if not filters <= FILTERS:
+        said = "gzip, lzf, shuffle, fletcher32 or none"
+        raise InputError(f"a filter of number {min(filters - FILTERS)}", said, column=name)
 
 
 def _unit(data: Any, name: str) -> str:

@@ -51,7 +51,9 @@ def of_profiles(sheet: Sheet) -> tuple[Sheet, tuple[Profile, ...]]:
         column = position.get(f"{POSITION}_{plane}") or position.get(POSITION)
         if column is None:
             raise sheet.header_error(f"no position of counts_{plane}", "a column position_um")
-        x, counts = sheet.values(column), sheet.numbers(f"{COUNTS}_{plane}")
+        x, counts = sheet.values(column), sheet[f"{COUNTS}_{plane}"]
+        if not isinstance(counts, np.ndarray):  # of HDF5, NaN beyond the shorter side of an image
+            counts = sheet.numbers(f"{COUNTS}_{plane}")
         if f"{BACKGROUND}_{plane}" in sheet.names:
             counts = counts - sheet.numbers(f"{BACKGROUND}_{plane}")
         shots = [

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from functools import partial
 
 import numpy as np
@@ -11,9 +12,10 @@ from matplotlib.figure import FigureBase
 
 from beamfit.density.charge import FINE_AXIS
 from beamfit.density.fit import SHARES, DensityFit, PlaneDensity
+from beamfit.quantity import Quantity
 from beamfit.report.document import BLUE, RED, Picture, ReportPage, Verdict
 from beamfit.report.emittance import about_input, about_scan
-from beamfit.table import Table
+from beamfit.table import Table, cell
 
 # Profiles in a row of the picture; shares of the charge inside the contours; reach in rms sizes.
 ABREAST, CONTOURS, REACH = 4, (0.95, 0.9, 0.68, 0.5), 4.0
@@ -36,7 +38,11 @@ def density_page(fit: DensityFit) -> ReportPage:
         if p.densities is None:
             continue
         rows = math.ceil(len(p.profiles) / ABREAST)
-        draw, seen = partial(draw_density, plane=p), partial(draw_profiles, plane=p)
+        methods = [said[p.plane] for said in fit.stored.values() if p.plane in said]
+        draw, seen = (
+            partial(draw_density, plane=p, methods=methods),
+            partial(draw_profiles, plane=p),
+        )
         pictures.append(Picture(f"density in {p.plane}, emittance against charge", 3.2, draw,
                                 source))  # fmt: skip
         pictures.append(Picture(f"profiles in {p.plane}", 0.6 + 1.9 * rows, seen, source))
@@ -47,7 +53,7 @@ def density_page(fit: DensityFit) -> ReportPage:
             Verdict(p.status, f"{p.plane}: 90 % of the charge {p.emittance['90 %']}", p.message)
             for p in fit.planes
         ],
-        tables=[*fit.tables(), *map(_seen, fit.planes), *about_input(fit.notes)],
+        tables=[*fit.tables(), *map(_seen, fit.planes), *_methods(fit), *about_input(fit.notes)],
         pictures=pictures,
         pictures_title="Phase space and profiles",
         leading=len(fit.planes),
@@ -68,7 +74,16 @@ def _seen(plane: PlaneDensity) -> Table:
     return Table(f"Profiles in {plane.plane}", head, rows)
 
 
-def draw_density(figure: FigureBase, plane: PlaneDensity) -> None:
+def _methods(fit: DensityFit) -> list[Table]:
+    """What the file says of the emittance, by size method."""
+    rows = [
+        [name, *(cell(said.get(p.plane)) for p in fit.planes)] for name, said in fit.stored.items()
+    ]
+    header = ["size method", *(p.plane for p in fit.planes)]
+    return [Table("Normalised emittances in the file, by size method", header, rows)] * bool(rows)
+
+
+def draw_density(figure: FigureBase, plane: PlaneDensity, methods: Sequence[Quantity] = ()) -> None:
     """Draw the density with its contours, and emittance against charge with bands.
 
     Parameters
@@ -77,6 +92,8 @@ def draw_density(figure: FigureBase, plane: PlaneDensity) -> None:
         The figure to draw on.
     plane : PlaneDensity
         With a density.
+    methods : sequence of Quantity
+        Emittances by size methods, marked at the right edge.
     """
     axes, beside = figure.subplots(1, 2)
     d, density = plane.densities, np.maximum(plane.density, 0.0)
@@ -102,9 +119,11 @@ def draw_density(figure: FigureBase, plane: PlaneDensity) -> None:
     beside.plot(share, value, "o-", color=BLUE, ms=4, lw=1.0)
     open_ = [not k for k in known]
     beside.plot(share[open_], value[open_], "o", color=RED, ms=5, mfc="w")
-    title = "open circles are not determined" if any(open_) else ""
+    said = ["○ not determined"] * any(open_) + ["– size methods"] * bool(methods)
     beside.set(xlabel="share of the charge, %", ylabel="normalised emittance, µm")
-    beside.set_title(title, fontsize=7)
+    beside.set_title("   ".join(said), fontsize=7)
+    for q in methods:
+        beside.plot(101.5, 1e6 * q.value, marker="_", color="0.4", ms=7)
     beside.set_ylim(bottom=0.0)
 
 

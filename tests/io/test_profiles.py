@@ -1,5 +1,6 @@
 """Tables with a line for each bin of each profile."""
 
+import h5py
 import numpy as np
 import pytest
 
@@ -51,3 +52,31 @@ def test_counts_without_positions_are_refused(tmp_path):
     path = table(tmp_path / "p.csv", header="place,counts_x")
     with pytest.raises(beamfit.InputError, match="position"):
         beamfit.read_quad_scan(path)
+
+
+def images(path, widths=((200.0, 90.0), (120.0, 100.0), (210.0, 110.0)), **changed):
+    x, y = np.arange(120) * 25.0 - 1500.0, np.arange(80) * 25.0 - 1000.0
+    stack = [np.exp(-0.5 * (x / a) ** 2) * np.exp(-0.5 * (y[:, None] / b) ** 2) for a, b in widths]
+    found = {"images": 1000.0 * np.array(stack) + 5.0, "pixel_um": 25.0, "Q2_A": [0.0, 1.0, 2.0]}
+    with h5py.File(path, "w") as store:
+        for name, values in (found | changed).items():
+            if values is not None:
+                store[name] = values
+    return path
+
+
+def test_a_stack_of_images_gives_its_projections(tmp_path):
+    scan = beamfit.read_quad_scan(images(tmp_path / "stack.h5"))
+    assert scan.size["x"] == pytest.approx([200e-6, 120e-6, 210e-6], rel=0.02)
+    assert scan.size["y"] == pytest.approx([90e-6, 100e-6, 110e-6], rel=0.02)
+    assert len(scan.profiles) == 6
+
+
+@pytest.mark.parametrize(
+    ("changed", "found"),
+    [({"pixel_um": None}, "no dataset pixel_um"), ({"Q2_A": [0.0, 1.0]}, "2 values"),
+     ({"images": np.zeros((3, 40))}, "shape")],
+)  # fmt: skip
+def test_a_stack_that_lacks_something_is_refused(changed, found, tmp_path):
+    with pytest.raises(beamfit.InputError, match=found):
+        beamfit.read_quad_scan(images(tmp_path / "stack.h5", **changed))
