@@ -19,7 +19,8 @@ from functools import cache
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import cho_solve
+from scipy.linalg import cholesky, solve_triangular
+from scipy.linalg.lapack import dpotri
 from scipy.optimize import minimize
 
 from beamfit.density.profiles import MeanProfile
@@ -324,23 +325,30 @@ class _Posterior(NamedTuple):
         square = np.exp(2.0 * numbers)
         return np.sqrt(square[2] * flat + square[3] * grown)
 
+    def _root(self, numbers: np.ndarray) -> tuple[np.ndarray, float]:
+        """Cholesky root of the covariance, and minus ln of evidence and prior."""
+        root = cholesky(self.covariance(numbers), lower=True, overwrite_a=True, check_finite=False)
+        z = (numbers - self.prior[:, 0]) / self.prior[:, 1]
+        own = solve_triangular(root, self.residual, lower=True, check_finite=False)
+        return root, float(0.5 * own @ own + np.log(np.diag(root)).sum() + 0.5 * z @ z)
+
     def _loss(self, numbers: np.ndarray) -> tuple[float, np.ndarray]:
         """Minus ln of evidence and prior, and its slope (Rasmussen and Williams, 2006, eq. 5.9)."""
         try:
-            root = np.linalg.cholesky(self.covariance(numbers))
+            root, loss = self._root(numbers)
         except np.linalg.LinAlgError:
             return 1e10, np.zeros(len(numbers))
-        inverse = cho_solve((root, True), np.eye(len(root)))
+        lower = np.tril(dpotri(root, lower=1)[0])
+        inverse = lower + np.tril(lower, -1).T
         pull, slope = inverse @ self.residual, []
         for square, part in zip(np.exp(2.0 * numbers), self._parts(), strict=True):
             if part.ndim == 2:
-                change = np.sum(inverse * part) - pull @ part @ pull
+                change = np.vdot(inverse, part) - pull @ part @ pull
             else:
                 change = np.diag(inverse) @ part - pull**2 @ part
             slope.append(square * change)
         z = (numbers - self.prior[:, 0]) / self.prior[:, 1]
-        loss = 0.5 * self.residual @ pull + np.log(np.diag(root)).sum() + 0.5 * z @ z
-        return float(loss), np.array(slope) + z / self.prior[:, 1]
+        return loss, np.array(slope) + z / self.prior[:, 1]
 
     def best(self, start: np.ndarray) -> tuple[float, np.ndarray]:
         """Ln of the evidence at the likeliest amplitudes, and ln of these."""
@@ -396,7 +404,7 @@ class _Posterior(NamedTuple):
         wanted = max(1, count // SHARED)
         z = WIDER * random.normal(size=(PROPOSED * wanted, len(numbers)))
         proposed = numbers + z @ width.T
-        log = np.array([-self._loss(at)[0] for at in proposed]) + 0.5 * np.sum(z**2, 1) / WIDER**2
+        log = 0.5 * np.sum(z**2, axis=1) / WIDER**2 - [self._root(at)[1] for at in proposed]
         weight = np.exp(log - log.max())
         chosen = random.choice(len(proposed), wanted, p=weight / weight.sum())
         parts = [
