@@ -5,8 +5,8 @@
 
 gpsr (R. Roussel et al., Phys. Rev. Lett. 130, 145001 (2023)) fits a neural network's beam of 10 000
 particles to the images, without errors; an ensemble of them would give some. It is trained from
-rays of 1 mm for 500 epochs, after which its emittances still grow. beamfit is given the projections of these images. Emittances are of all
-charge; the true one is 0.5 µm in both planes.
+rays of 1 mm for 500 epochs, after which its emittances still grow. beamfit is given the projections
+of these images. Emittances are of all charge; the true one is 0.5 µm in both planes.
 """
 
 from __future__ import annotations
