@@ -22,6 +22,7 @@ import numpy as np
 
 from beamfit.density.charge import _parts
 from beamfit.density.fit import SHARES, PlaneDensity, fit_density
+from beamfit.density.profiles import profile_size
 from beamfit.emittance.scan import Profile, QuadScan
 from beamfit.errors import InputError
 from beamfit.io.emittance_gui import read_emittance_gui
@@ -111,8 +112,9 @@ def simulated(kind: str, random: np.random.Generator) -> tuple[QuadScan, Mixture
     # Matrices of a line before which β is 5 m.
     along = np.sqrt(EMITTANCE * 5.0), np.sqrt(EMITTANCE / 5.0)
     rows = size[:, None] * direction / along
-    scan = QuadScan({}, {}, {"x": size}, energy=ENERGY, transfer={"x": rows},
-                    profiles=tuple(profiles))  # fmt: skip
+    shown = np.array([profile_size(p) for p in profiles])
+    sizes = {"x": np.where(np.isnan(shown), size, shown)}
+    scan = QuadScan({}, {}, sizes, energy=ENERGY, transfer={"x": rows}, profiles=tuple(profiles))
     return scan, beam
 
 

@@ -15,11 +15,12 @@ from beamfit.answer import answer
 from beamfit.density.charge import FINE, ChargeParts, charge_parts, finely, negative_charge
 from beamfit.density.profiles import MeanProfile, mean_profiles
 from beamfit.density.tomography import GRID, Densities, tomography
-from beamfit.emittance.known import one_by_one, prepared, unfitted
+from beamfit.emittance.answer import plane_evidence
+from beamfit.emittance.known import prepared, see
+from beamfit.emittance.model import phase_coverage
 from beamfit.emittance.scan import QuadScan
 from beamfit.emittance.sigma import fit_sizes
-from beamfit.emittance.transport import look_through
-from beamfit.emittance.verdict import USEFUL
+from beamfit.emittance.verdict import USEFUL, PlaneEvidence, verdict
 from beamfit.errors import InputError, expect
 from beamfit.noise.model import Noise
 from beamfit.optics.beamline import Beamline
@@ -32,8 +33,8 @@ from beamfit.verdict import Finding, judge
 
 # Shares of the charge whose emittance is given, and draws of the density.
 SHARES, DRAWS = (0.5, 0.68, 0.9, 0.95, 1.0), 256
-# Phase advance, degrees, without which no density is given: three phases 30 degrees apart
-# (statement of the project; a density is made of 180).
+# Phase advance, degrees, without which no density is given: three phases 30 degrees apart. The
+# whole is seen from 180.
 LEAST_PHASE = 60.0
 # No density has negative charge. Places that are told apart within 3 rms, by lengths of .6 rms, in
 # any of which chance may ask for it; and the probability of chance below which it is none.
@@ -43,6 +44,8 @@ PLACES, CHANCE = 25, 0.01
 CUT = 0.1
 # Shares that a cut window leaves open.
 OPEN_WHEN_CUT = 0.95
+# Statuses of planes, the gravest last.
+GRAVER = (Status.converged, Status.poor_fit, Status.unidentified)
 
 
 @answer
@@ -58,6 +61,8 @@ class PlaneDensity:
         What it is from, one a setting.
     labels : tuple of str
         The setting of each.
+    sizes : PlaneEvidence
+        What the sizes of the scan say of a beam and its rivals.
     densities : Densities or None
         Its draws; None where there is no beam.
     boost : float
@@ -65,12 +70,13 @@ class PlaneDensity:
     phase : float
         Phase advance over the settings, degrees.
     notes : tuple of str
-        Shots left out, saturation, windows that cut.
+        Profiles that were left out.
     """
 
     plane: str
     profiles: tuple[MeanProfile, ...]
     labels: tuple[str, ...]
+    sizes: PlaneEvidence
     densities: Densities | None
     boost: float
     phase: float
@@ -234,8 +240,7 @@ def fit_density(
         raise scan.unusable("a scan of sizes, without profiles", expected)
     noise = noise or Noise()
     scan, line = prepared(scan, line)
-    seen = unfitted(scan, line, noise=noise)
-    seen = seen._replace(look=one_by_one(look_through, [(seen.rows,)])[0])
+    seen = see(scan, line, noise=noise)
     r11, r12, known = (np.asarray(part) for part in seen.look[:3])
     boost, planes, lost = beta_gamma(seen.energy, seen.line.mass), [], []
     for plane in scan.planes:
@@ -248,7 +253,8 @@ def fit_density(
         resolution = np.sqrt(np.maximum(known[i, at], 0.0))
         densities, phase = _densities(profiles, rows, resolution, noise, draws, seed)
         labels = tuple(_label(scan, row) for row in at)
-        planes.append(PlaneDensity(plane, tuple(profiles), labels, densities, boost, phase,
+        sizes = plane_evidence(seen, plane, math.nan, math.nan)
+        planes.append(PlaneDensity(plane, tuple(profiles), labels, sizes, densities, boost, phase,
                                    tuple(notes)))  # fmt: skip
     if not planes:
         found = " ".join(["profiles that show a beam at fewer than three settings.", *lost])
@@ -276,17 +282,23 @@ def _densities(
                                draws=draws, seed=seed)  # fmt: skip
     except np.linalg.LinAlgError:
         return None, 0.0
-    c, s = densities.bins.direction.T
-    # Directions are lines: a phase and its opposite are one. What is seen is all but the gap.
-    phase = np.sort(np.degrees(np.arctan2(s, c)) % 180.0)
-    gaps = np.diff([*phase, phase[0] + 180.0])
-    return densities, float(180.0 - gaps.max())
+    s11, s12, s22 = (densities.frame @ densities.frame.T)[[0, 0, 1], [0, 1, 1]]
+    emittance = math.sqrt(s11 * s22 - s12**2)
+    return densities, phase_coverage(*rows.T, s11 / emittance, -s12 / emittance)
 
 
 def _label(scan: QuadScan, row: int) -> str:
     named = [f"{name} = {values[row]:.4g} {scan.units[name]}" for name, values in
              scan.settings.items()]  # fmt: skip
     return ", ".join(named) or (scan.screen[row] if scan.screen else f"row {row + 1}")
+
+
+def _sizes(plane: PlaneDensity) -> Finding | None:
+    """Sizes that are not told to be a beam's have no density, whatever their profiles say."""
+    if plane.sizes.of_a_beam:
+        return None
+    found = verdict(plane.sizes)
+    return found._replace(cause=f"{plane.plane}: {found.cause}")
 
 
 def _no_beam(plane: PlaneDensity) -> Finding | None:
@@ -345,7 +357,7 @@ def _found(plane: PlaneDensity) -> Finding:
 
 
 # In order of gravity.
-RULES = (_no_beam, _few_phases, _contradiction, _wide, _found)
+RULES = (_sizes, _no_beam, _few_phases, _contradiction, _wide, _found)
 
 
 @answer
@@ -388,7 +400,7 @@ class DensityFit:
     @property
     def status(self) -> Status:
         """The gravest of the planes."""
-        return max((p.status for p in self.planes), key=ORDER.index)
+        return max((p.status for p in self.planes), key=GRAVER.index)
 
     @property
     def headline(self) -> str:
@@ -414,9 +426,6 @@ class DensityFit:
     def tables(self) -> tuple[Table, ...]:
         """Lay out emittance against charge, halo and core of each plane."""
         return tuple(_table(p) for p in self.planes)
-
-
-ORDER = [Status.converged, Status.poor_fit, Status.unidentified]
 
 
 def _table(plane: PlaneDensity) -> Table:
