@@ -20,7 +20,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from beamfit.density.charge import _parts
+from beamfit.density.charge import parts_of, powers_of
 from beamfit.density.fit import SHARES, PlaneDensity, fit_density
 from beamfit.density.profiles import profile_size
 from beamfit.emittance.scan import Profile, QuadScan
@@ -72,14 +72,13 @@ def mixture(kind: str, random: np.random.Generator) -> Mixture:
 
 def truth(beam: Mixture) -> np.ndarray:
     """Emittance of each share of the charge over that of all."""
-    q, p = (v.ravel() for v in np.meshgrid(FINE, FINE, indexing="ij"))
-    density = np.zeros_like(q)
+    powers = powers_of(FINE)
+    (q, p), density = powers[1:3], np.zeros(len(FINE) ** 2)
     for weight, mean, covariance in zip(*beam, strict=True):
         inverse, (dq, dp) = np.linalg.inv(covariance), (q - mean[0], p - mean[1])
         square = inverse[0, 0] * dq**2 + 2.0 * inverse[0, 1] * dq * dp + inverse[1, 1] * dp**2
         density += weight / np.sqrt(np.linalg.det(covariance)) * np.exp(-0.5 * square)
-    powers = np.stack([np.ones_like(q), q, p, q * q, q * p, p * p])
-    return np.array(_parts(density, q, p, powers, SHARES)[0])
+    return np.array(parts_of(density, powers, SHARES)[0])
 
 
 def simulated(kind: str, random: np.random.Generator) -> tuple[QuadScan, Mixture]:

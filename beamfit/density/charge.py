@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -63,11 +64,15 @@ def charge_parts(values: np.ndarray, shares: tuple[float, ...]) -> ChargeParts:
     >>> parts.emittance.round(3).tolist(), parts.halo.round(3).tolist()
     ([[0.307, 0.744, 1.0]], [0.011])
     """
-    q, p = (v.ravel() for v in np.meshgrid(FINE_AXIS, FINE_AXIS, indexing="ij"))
-    powers = np.stack([np.ones_like(q), q, p, q * q, q * p, p * p])
-    found = [_parts(density, q, p, powers, shares) for density in finely(values)]
-    emittance, halo, core, rms = zip(*found, strict=True)
-    return ChargeParts(*map(np.array, (emittance, halo, core, rms)))
+    powers = powers_of(FINE_AXIS)
+    found = [parts_of(density, powers, shares) for density in finely(values)]
+    return ChargeParts(*map(np.array, zip(*found, strict=True)))
+
+
+def powers_of(axis: np.ndarray) -> np.ndarray:
+    """Give 1, q, p, q², qp, p² at the points of a square grid, shape (6, m²)."""
+    q, p = (v.ravel() for v in np.meshgrid(axis, axis, indexing="ij"))
+    return np.stack([np.ones_like(q), q, p, q * q, q * p, p * p])
 
 
 def negative_charge(values: np.ndarray) -> float:
@@ -81,32 +86,36 @@ def negative_charge(values: np.ndarray) -> float:
     >>> round(negative_charge(draws), 1)
     3.7
     """
-    fine = finely(values)
-    charge = fine[:, fine.mean(axis=0) < 0.0].sum(axis=1)
+    spread, n = _spread(), len(AXIS)
+    negative = finely(values.mean(axis=0)[None])[0] < 0.0
+    below = spread.T @ negative.reshape(len(spread), -1) @ spread  # of the charge at each point
+    charge = values @ below.reshape(n * n)
     return float(-charge.mean() / charge.std()) if charge.std() > 0.0 else 0.0
+
+
+@cache
+def _spread() -> np.ndarray:
+    """Share of the charge at each point of the axis that each of the fine one has."""
+    spread = np.exp(-0.5 * ((FINE_AXIS[:, None] - AXIS) / POINT) ** 2)
+    return spread * FINE / POINT / math.sqrt(2.0 * math.pi)
 
 
 def finely(values: np.ndarray) -> np.ndarray:
     """Densities on the fine grid, shape (d, m²), as charge at each point."""
-    spread = np.exp(-0.5 * ((FINE_AXIS[:, None] - AXIS) / POINT) ** 2)
-    spread *= FINE / POINT / math.sqrt(2.0 * math.pi)
-    n = len(AXIS)
+    spread, n = _spread(), len(AXIS)
     return (spread @ values.reshape(-1, n, n) @ spread.T).reshape(len(values), -1)
 
 
-def _parts(
-    density: np.ndarray,
-    q: np.ndarray,
-    p: np.ndarray,
-    powers: np.ndarray,
-    shares: tuple[float, ...],
+def parts_of(
+    density: np.ndarray, powers: np.ndarray, shares: tuple[float, ...]
 ) -> tuple[list[float], float, float, float]:
+    """Emittances of the shares, halo, core and rms emittance of one density, as `ChargeParts`."""
     total, *moments = powers @ density
     mean_q, mean_p, *_ = np.array(moments) / total
     square, (a, b, c) = _second(np.array([total, *moments]))
     if not (square > 0.0 and a > 0.0):
         return [math.nan] * len(shares), math.nan, math.nan, math.nan
-    dq, dp = q - mean_q, p - mean_p
+    dq, dp = powers[1] - mean_q, powers[2] - mean_p
     radius = (c * dq * dq - 2.0 * b * dq * dp + a * dp * dp) / square
     ring = np.minimum((radius * (RINGS / FAR)).astype(int), RINGS)
     inside = np.cumsum([np.bincount(ring, density * power, RINGS + 1) for power in powers], axis=1)

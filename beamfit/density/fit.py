@@ -111,6 +111,8 @@ class PlaneDensity:
     @cached_property
     def by_chance(self) -> float:
         """Probability that chance has profiles of a density ask for as much negative charge."""
+        if self.densities is None:
+            return 1.0
         return min(1.0, PLACES * float(ndtr(-negative_charge(self.densities.values))))
 
     @cached_property
@@ -224,11 +226,12 @@ def fit_density(
     Examples
     --------
     >>> from beamfit.emittance.scan import Profile
-    >>> angle = np.radians([0.0, 35, 70, 105, 140])  # a round beam of 0.1 mm and 1e-5
-    >>> rows = np.column_stack([np.cos(angle), 10.0 * np.sin(angle)])
-    >>> x = np.linspace(-6e-4, 6e-4, 81)
-    >>> shots = [Profile("x", i, x, np.exp(-0.5 * (x / 1e-4) ** 2), None) for i in range(5)]
-    >>> scan = QuadScan({}, {}, {"x": 5 * [1e-4]}, energy=135.0, transfer={"x": rows},
+    >>> angle = np.radians([0.0, 35, 70, 105, 140])  # of a beam of 0.1 mm and 1e-5
+    >>> size = 1e-4 * np.array([1.0, 2, 1.5, 1, 2.5])
+    >>> rows = 1e4 * size[:, None] * np.column_stack([np.cos(angle), 10.0 * np.sin(angle)])
+    >>> x = np.linspace(-1.5e-3, 1.5e-3, 201)
+    >>> shots = [Profile("x", i, x, np.exp(-0.5 * (x / s) ** 2), None) for i, s in enumerate(size)]
+    >>> scan = QuadScan({}, {}, {"x": size}, energy=135.0, transfer={"x": rows},
     ...                 profiles=tuple(shots))
     >>> found = fit_density(scan)["x"]
     >>> found.status.value, abs(found.emittance["90 %"].value / (264.2 * 0.744e-9) - 1) < 0.03
@@ -357,7 +360,7 @@ def _found(plane: PlaneDensity) -> Finding:
 
 
 # In order of gravity.
-RULES = (_sizes, _no_beam, _few_phases, _contradiction, _wide, _found)
+RULES = (_contradiction, _sizes, _no_beam, _few_phases, _wide, _found)
 
 
 @answer

@@ -192,7 +192,7 @@ def bins_of(
     stretch: np.ndarray,
     resolution: np.ndarray,
 ) -> Bins:
-    """See the profiles through a frame, neighbouring bins added up to a quarter of a size."""
+    """See the profiles through a frame, neighbouring bins taken together up to a width."""
     seen = rows @ frame
     unit = np.hypot(*seen.T)
     direction, size = seen / unit[:, None], unit * (1.0 + stretch)
@@ -266,17 +266,19 @@ class _Posterior(NamedTuple):
     """Posterior of the density for one kernel, linear about a density and stretches.
 
     ``free`` are columns with unit priors: backgrounds, charges, centres, and three of the frame;
-    ``stretching`` those of the stretches. ``residual`` is what the reference leaves.
+    ``stretching`` those of the stretches. ``residual`` is what the reference leaves, ``known`` the
+    covariance of the free columns, and ``parts`` are those whose amplitudes are the numbers; of
+    noise they are diagonals.
     """
 
     bins: Bins
     kernels: tuple[_Kernel, _Kernel]
     prior: np.ndarray
-    expected: np.ndarray
     residual: np.ndarray
     free: np.ndarray
     stretching: np.ndarray
     known: np.ndarray
+    parts: tuple[np.ndarray, ...]
 
     @classmethod
     def of(
@@ -295,8 +297,9 @@ class _Posterior(NamedTuple):
         free = np.hstack([*(own * column[:, None] for column in each), frame])
         # The bins stand where these stretches put them: what is left of them has a mean.
         residual = bins.charge - bins.look @ _gaussian() + stretching @ stretch
-        return cls(bins, kernels, prior, np.maximum(expected, 0.0), residual, free, stretching,
-                   free @ free.T)  # fmt: skip
+        flat, grown = np.full_like(residual, PEAK**2), PEAK * np.maximum(expected, 0.0)
+        parts = (*(k.of_bins for k in kernels), flat, grown, stretching @ stretching.T)
+        return cls(bins, kernels, prior, residual, free, stretching, free @ free.T, parts)
 
     def _own_departures(self) -> np.ndarray:
         position, profile = self.bins.position, self.bins.profile
@@ -305,23 +308,16 @@ class _Posterior(NamedTuple):
         same = (OWN * PEAK) ** 2 * (profile[:, None] == profile)
         return same * np.outer(high, high) * np.exp(-0.5 * apart**2)
 
-    def _parts(self) -> tuple[np.ndarray, ...]:
-        """Covariances whose amplitudes are the numbers; those of noise are diagonals."""
-        flat = np.full(len(self.residual), PEAK**2)
-        core, tail = self.kernels
-        scatter = self.stretching @ self.stretching.T
-        return core.of_bins, tail.of_bins, flat, PEAK * self.expected, scatter
-
     def covariance(self, numbers: np.ndarray) -> np.ndarray:
         """Of the bins, at ln of the amplitudes."""
         total = self.known.copy()
-        for square, part in zip(np.exp(2.0 * numbers), self._parts(), strict=True):
+        for square, part in zip(np.exp(2.0 * numbers), self.parts, strict=True):
             total += square * (part if part.ndim == 2 else np.diag(part))
         return total
 
     def bin_error(self, numbers: np.ndarray) -> np.ndarray:
         """Noise of each bin."""
-        _, _, flat, grown, _ = self._parts()
+        _, _, flat, grown, _ = self.parts
         square = np.exp(2.0 * numbers)
         return np.sqrt(square[2] * flat + square[3] * grown)
 
@@ -341,7 +337,7 @@ class _Posterior(NamedTuple):
         lower = np.tril(dpotri(root, lower=1)[0])
         inverse = lower + np.tril(lower, -1).T
         pull, slope = inverse @ self.residual, []
-        for square, part in zip(np.exp(2.0 * numbers), self._parts(), strict=True):
+        for square, part in zip(np.exp(2.0 * numbers), self.parts, strict=True):
             if part.ndim == 2:
                 change = np.vdot(inverse, part) - pull @ part @ pull
             else:
