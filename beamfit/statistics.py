@@ -14,6 +14,8 @@ from beamfit.quantity import NORMAL_REACH, Quantity
 POOR_FIT = 1e-3
 # A direction is undetermined if its value is below this many standard errors.
 OPEN = 3.0
+# A value is of use where its 95 % interval spans less than this factor.
+USEFUL = 2.5
 # Points of a baseline at most (the first ones; at most half of all), and at least.
 BASELINE, FEWEST = 20, 3
 # Degrees of freedom below which the message gives the 95 % interval of Student's distribution.
@@ -151,6 +153,18 @@ def quantity_of_draws(draws: np.ndarray, unit: str, value: float | None = None) 
     ends = np.quantile(draws, WIDE)
     value = float(np.median(draws)) if value is None else float(value)
     return Quantity(value, 0.5 * float(high - low), unit, None, (float(ends[0]), float(ends[1])))
+
+
+def of_use(interval_95: tuple[float, float] | None) -> bool:
+    """Tell whether a positive value is known well enough to be of use.
+
+    Examples
+    --------
+    >>> of_use((1.0, 2.0)), of_use((1.0, 3.0)), of_use((-0.1, 0.1)), of_use(None)
+    (True, False, False, False)
+    """
+    low, high = interval_95 or (0.0, 0.0)
+    return low > 0.0 and high < USEFUL * low
 
 
 def one_sided_probability(deviations: float, dof: float) -> float:

@@ -20,13 +20,13 @@ from beamfit.emittance.known import prepared, see
 from beamfit.emittance.model import phase_coverage
 from beamfit.emittance.scan import QuadScan
 from beamfit.emittance.sigma import fit_sizes
-from beamfit.emittance.verdict import USEFUL, PlaneEvidence, verdict
+from beamfit.emittance.verdict import PlaneEvidence, verdict
 from beamfit.errors import InputError, expect
 from beamfit.noise.model import Noise
 from beamfit.optics.beamline import Beamline
 from beamfit.optics.particle import beta_gamma
 from beamfit.quantity import Quantity, percent
-from beamfit.statistics import quantity_of_draws
+from beamfit.statistics import of_use, quantity_of_draws
 from beamfit.status import Status
 from beamfit.table import Table, cell, json_of
 from beamfit.verdict import Finding, judge
@@ -160,7 +160,7 @@ class PlaneDensity:
             return Quantity(math.nan, None, unit)
         q = quantity_of_draws(of(self.parts), unit)
         known = self.status is Status.converged and not (tail and self.cut)
-        return q if known and _narrow(q) else q.open()
+        return q if known and of_use(q.interval_95) else q.open()
 
     @cached_property
     def density(self) -> np.ndarray:
@@ -320,15 +320,9 @@ def _few_phases(plane: PlaneDensity) -> Finding | None:
     return Finding(Status.unidentified, cause, "Scan further on both sides of the waist.")
 
 
-def _narrow(q: Quantity) -> bool:
-    """True if a quantity is known well enough to be of use."""
-    low, high = q.interval_95 or (0.0, 0.0)
-    return low > 0.0 and high < USEFUL * low
-
-
 def _wide(plane: PlaneDensity) -> Finding | None:
     whole = quantity_of_draws(plane.parts.emittance[:, SHARES.index(0.9)], "m")
-    if _narrow(whole):
+    if of_use(whole.interval_95):
         return None
     cause = f"The profiles in {plane.plane} leave the emittance of 90 % of the charge open."
     where = f" The window cuts the beam at {plane.labels[plane.cut[0]]}." if plane.cut else ""

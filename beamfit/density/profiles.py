@@ -8,7 +8,7 @@ import numpy as np
 
 from beamfit.emittance.scan import Profile, QuadScan
 
-# Bins and light (in standard deviations of its noise) without which a profile shows no beam.
+# Bins and light (in errors of the sum) without which a profile shows no beam.
 FEWEST_BINS, LEAST_LIGHT = 12, 5.0
 # A shot with less than this of the usual light of its setting, or its inverse, shows another beam.
 USUAL_LIGHT = 0.5
@@ -129,8 +129,11 @@ def _shot(profile: Profile) -> tuple[np.ndarray, np.ndarray] | None:
         return None
     n = max(3, round(ENDS * len(x)))
     charge = counts - 0.5 * (np.median(counts[:n]) + np.median(counts[-n:]))
-    noise = np.median(np.abs(np.diff(charge))) / 0.954  # of a normal difference, sqrt(2) 0.6745
-    if charge.sum() <= LEAST_LIGHT * noise * np.sqrt(len(x)):
+    # Second differences of normal noise have sqrt(6) times its error, and a beam's are small.
+    noise = np.median(np.abs(np.diff(charge, 2))) / (np.sqrt(6.0) * 0.6745)
+    # The sum has the noise of its bins and that of the medians of both ends, off its every bin.
+    error = noise * np.sqrt(len(x) + len(x) ** 2 * np.pi / 2.0 / (2.0 * n))
+    if charge.sum() <= LEAST_LIGHT * error:
         return None
     top = np.where(charge > CENTRE * charge.max(), charge, 0.0)
     return x - np.average(x, weights=top), charge

@@ -35,7 +35,6 @@ from beamfit.emittance.next_point import (
 from beamfit.emittance.results import in_words
 from beamfit.emittance.statement import size_records, varied_magnets
 from beamfit.emittance.transport import NetworkRows, Rows, rows_at, setting_units
-from beamfit.emittance.verdict import USEFUL
 from beamfit.errors import InputError, nearest
 from beamfit.greybox import assess
 from beamfit.greybox.covariance import MOST_SHARE
@@ -43,6 +42,7 @@ from beamfit.greybox.design import Information, greedy
 from beamfit.greybox.fit import value_and_slope
 from beamfit.optics.beamline import Beamline
 from beamfit.optics.elements import Drift, Screen
+from beamfit.statistics import USEFUL
 from beamfit.status import Status
 from beamfit.table import Table, json_of
 

@@ -11,13 +11,12 @@ import numpy as np
 from beamfit.emittance.comparison import BEAM, FLAT
 from beamfit.emittance.results import Points
 from beamfit.quantity import display_unit
+from beamfit.statistics import of_use
 from beamfit.status import Status
 from beamfit.verdict import Finding
 
 # A beam is sure with this probability: one answer in a hundred may be another thing.
 SURE = 0.99
-# An emittance is of use where its 95 % interval spans less than this factor.
-USEFUL = 2.5
 # A point carries the answer if the emittance moves by so many errors without it; the interval
 # reaches to where it goes if that is farther than any noise would move it.
 CARRIES, MOVES = 2.0, 3.0
@@ -101,8 +100,8 @@ class PlaneEvidence(NamedTuple):
     def determined(self) -> bool:
         """True if they are a beam's and say its emittance."""
         sure = self.untested or self.probability[BEAM] > SURE
-        narrow = self.low > 0.0 and self.high < USEFUL * self.low
-        return self.of_a_beam and sure and narrow and not self.opened and self.ending is None
+        free = not self.opened and self.ending is None
+        return self.of_a_beam and sure and of_use((self.low, self.high)) and free
 
 
 def verdict(e: PlaneEvidence, remarks: str = "", advice: str = "") -> Finding:

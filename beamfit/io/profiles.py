@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -12,6 +13,8 @@ from beamfit.io.columns import Sheet, columns_of
 from beamfit.io.headers import spelled
 
 COUNTS, BACKGROUND, POSITION = "counts", "background", "position"
+# Settings without which a plane has no emittance.
+FEWEST_SETTINGS = 3
 
 
 def has_profiles(sheet: Sheet) -> bool:
@@ -32,12 +35,14 @@ def of_profiles(sheet: Sheet) -> tuple[Sheet, tuple[Profile, ...]]:
     Returns
     -------
     Sheet, tuple of Profile
-        A line a shot, with the rms sizes of the profiles; and these.
+        A line a shot, with the rms sizes of the profiles; and these. A plane that shows a beam
+        at fewer than three settings is left out where the other shows more.
 
     Raises
     ------
     InputError
-        If a shot has fewer than twelve bins, or a column of positions is missing.
+        If a shot has fewer than twelve bins, a column of positions is missing, or no profile
+        shows a beam.
     """
     planes = [p for p in PLANES if f"{COUNTS}_{p}" in sheet.names]
     bins = {f"{kind}_{p}" for kind in (COUNTS, BACKGROUND) for p in planes}
@@ -46,7 +51,7 @@ def of_profiles(sheet: Sheet) -> tuple[Sheet, tuple[Profile, ...]]:
     starts, ends = _shots(sheet, rest)
     keys = [POSITION, *(f"{POSITION}_{p}" for p in PLANES)]
     position = columns_of(sheet.only(places), dict.fromkeys(keys, "length"))
-    found, sizes = [], {}
+    found, sizes = {}, {}
     for plane in planes:
         column = position.get(f"{POSITION}_{plane}") or position.get(POSITION)
         if column is None:
@@ -64,11 +69,30 @@ def of_profiles(sheet: Sheet) -> tuple[Sheet, tuple[Profile, ...]]:
         if short is not None:
             said = f"a profile of {len(short.position)} bins"
             raise sheet.error(said, f"{FEWEST_BINS} lines or more a shot", int(starts[short.row]))
-        sizes[f"size_{plane}_m"] = np.array([profile_size(s) for s in shots])
-        found += shots
+        sizes[plane], found[plane] = np.array([profile_size(s) for s in shots]), shots
     kept = sheet.only(rest).rows(list(starts))
+    seen, notes = _settings_with_beam(kept, sizes), list(kept.notes)
+    for plane in [p for p in planes if seen[p] < min(FEWEST_SETTINGS, max(seen.values()))]:
+        notes.append(f"Left out: {plane}, whose profiles show a beam at {seen[plane]} settings.")
+        del sizes[plane], found[plane]
     cells = [*kept.cells, *(list(map(str, v)) for v in sizes.values())]
-    return replace(kept, names=(*kept.names, *sizes), cells=cells), tuple(found)
+    names = (*kept.names, *(f"size_{plane}_m" for plane in sizes))
+    profiles = tuple(shot for shots in found.values() for shot in shots)
+    return replace(kept, names=names, cells=cells, notes=tuple(notes)), profiles
+
+
+def _settings_with_beam(sheet: Sheet, sizes: Mapping[str, np.ndarray]) -> dict[str, int]:
+    """Count the settings at which a plane has a size."""
+    columns = [sheet[name] for name in sheet.names if spelled(name) != "shot"]
+    settings = list(zip(*(map(str, cells) for cells in columns), strict=True))
+    seen = {
+        plane: len({where for where, size in zip(settings, own, strict=True) if np.isfinite(size)})
+        for plane, own in sizes.items()
+    }
+    if not any(seen.values()):
+        expected = "counts that rise above the noise of their bins, with background at both ends"
+        raise sheet.header_error("no profile that shows a beam", expected)
+    return seen
 
 
 def _shots(sheet: Sheet, rest: list[str]) -> tuple[np.ndarray, np.ndarray]:

@@ -15,7 +15,7 @@ from beamfit.lifetime.evidence import BELIEVED, DETERMINED, SEPARABLE, UNITS, Ev
 from beamfit.lifetime.pieces import noise_of
 from beamfit.lifetime.record import Monitor
 from beamfit.quantity import HOUR
-from beamfit.statistics import MANY, POOR_FIT, chi2_probability, few_words
+from beamfit.statistics import MANY, POOR_FIT, chi2_probability, few_words, of_use
 from beamfit.status import Status
 from beamfit.verdict import Finding, judge
 
@@ -29,9 +29,8 @@ STEP = 12.0
 CAUTIOUS = 0.25
 # A share of a so many errors outside 0 to 1 is of no longer record.
 OUTSIDE = 3.0
-# An interval that begins below this share of its end begins at zero; one whose ends differ by more
-# than this factor determines no value.
-LEAST_SHARE, USEFUL = 5e-3, 2.5
+# An interval that begins below this share of its end begins at zero.
+LEAST_SHARE = 5e-3
 # Residuals so many times the scatter of neighbouring readings are not the monitor's noise.
 WANDERS = 10.0
 # Settings that are said to have gone from one value to another, by more than this share.
@@ -257,7 +256,7 @@ def _extent(e: Evidence, name: str) -> str | None:
     low, high = e.free.spans[name].interval
     if low <= LEAST_SHARE * high:
         return f"{name} is compatible with zero: it is below {high:.2g} {UNITS[name]} at 95 %"
-    if high <= USEFUL * low:
+    if of_use((low, high)):
         return None
     return f"{name} lies between {low:.2g} and {high:.2g} {UNITS[name]} at 95 %"
 

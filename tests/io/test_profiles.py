@@ -80,3 +80,30 @@ def test_a_stack_of_images_gives_its_projections(tmp_path):
 def test_a_stack_that_lacks_something_is_refused(changed, found, tmp_path):
     with pytest.raises(beamfit.InputError, match=found):
         beamfit.read_quad_scan(images(tmp_path / "stack.h5", **changed))
+
+
+def noisy(path, planes):
+    """A table of two shots at each of five settings, of which these planes show a beam."""
+    random, lines = np.random.default_rng(3), ["Q2_A,shot,position_um,counts_x,counts_y"]
+    for q, width in enumerate((200.0, 150.0, 120.0, 160.0, 210.0)):
+        for shot in range(2):
+            beam = 1000.0 * np.exp(-0.5 * (X / width) ** 2)
+            noise = 20.0 * random.normal(size=(2, len(X)))
+            counts = [beam + n if p in planes else n for p, n in zip("xy", noise, strict=True)]
+            lines += [
+                f"{q},{shot},{x:g},{a:.1f},{b:.1f}" for x, a, b in zip(X, *counts, strict=True)
+            ]
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def test_a_plane_of_noise_is_left_out_and_said(tmp_path):
+    scan = beamfit.read_quad_scan(noisy(tmp_path / "p.csv", "y"))
+    assert scan.planes == ("y",)
+    assert {p.plane for p in scan.profiles} == {"y"}
+    assert any(note.startswith("Left out: x,") for note in scan.notes)
+
+
+def test_noise_in_all_planes_is_no_beam(tmp_path):
+    with pytest.raises(beamfit.InputError, match="shows a beam"):
+        beamfit.read_quad_scan(noisy(tmp_path / "p.csv", ""))
