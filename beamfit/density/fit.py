@@ -15,12 +15,11 @@ from beamfit.answer import answer
 from beamfit.density.charge import FINE, ChargeParts, charge_parts, finely, negative_charge
 from beamfit.density.profiles import MeanProfile, mean_profiles
 from beamfit.density.tomography import GRID, Densities, tomography
-from beamfit.emittance.answer import plane_evidence
-from beamfit.emittance.known import prepared, see
+from beamfit.emittance.fit import fit_emittance
 from beamfit.emittance.model import phase_coverage
+from beamfit.emittance.results import PlaneFit
 from beamfit.emittance.scan import QuadScan
 from beamfit.emittance.sigma import fit_sizes
-from beamfit.emittance.verdict import PlaneEvidence, verdict
 from beamfit.errors import InputError, expect
 from beamfit.noise.model import Noise
 from beamfit.optics.beamline import Beamline
@@ -61,8 +60,8 @@ class PlaneDensity:
         What it is from, one a setting.
     labels : tuple of str
         The setting of each.
-    sizes : PlaneEvidence
-        What the sizes of the scan say of a beam and its rivals.
+    sizes : PlaneFit
+        What the sizes of the scan say alone.
     densities : Densities or None
         Its draws; None where there is no beam.
     boost : float
@@ -76,7 +75,7 @@ class PlaneDensity:
     plane: str
     profiles: tuple[MeanProfile, ...]
     labels: tuple[str, ...]
-    sizes: PlaneEvidence
+    sizes: PlaneFit
     densities: Densities | None
     boost: float
     phase: float
@@ -242,8 +241,8 @@ def fit_density(
         expected = "an emittance_gui file, or columns position_um and counts_x, a line a bin"
         raise scan.unusable("a scan of sizes, without profiles", expected)
     noise = noise or Noise()
-    scan, line = prepared(scan, line)
-    seen = see(scan, line, noise=noise)
+    fit = fit_emittance(scan, line, noise=noise)
+    scan, seen = fit.scan, fit.seen
     r11, r12, known = (np.asarray(part) for part in seen.look[:3])
     boost, planes, lost = beta_gamma(seen.energy, seen.line.mass), [], []
     for plane in scan.planes:
@@ -256,9 +255,8 @@ def fit_density(
         resolution = np.sqrt(np.maximum(known[i, at], 0.0))
         densities, phase = _densities(profiles, rows, resolution, noise, draws, seed)
         labels = tuple(_label(scan, row) for row in at)
-        sizes = plane_evidence(seen, plane, math.nan, math.nan)
-        planes.append(PlaneDensity(plane, tuple(profiles), labels, sizes, densities, boost, phase,
-                                   tuple(notes)))  # fmt: skip
+        planes.append(PlaneDensity(plane, tuple(profiles), labels, fit[plane], densities, boost,
+                                   phase, tuple(notes)))  # fmt: skip
     if not planes:
         found = " ".join(["profiles that show a beam at fewer than three settings.", *lost])
         raise scan.unusable(found.rstrip("."), "five settings with such profiles")
@@ -297,11 +295,14 @@ def _label(scan: QuadScan, row: int) -> str:
 
 
 def _sizes(plane: PlaneDensity) -> Finding | None:
-    """Sizes that are not told to be a beam's have no density, whatever their profiles say."""
-    if plane.sizes.of_a_beam:
+    """Sizes that determine no emittance have no density, whatever their profiles say.
+
+    Its scale is theirs, and the posterior of scans knows that it is skew; that of the density
+    is linear in it.
+    """
+    if plane.sizes.identifiability.determined:
         return None
-    found = verdict(plane.sizes)
-    return found._replace(cause=f"{plane.plane}: {found.cause}")
+    return Finding(plane.sizes.status, f"{plane.plane}: {plane.sizes.message}")
 
 
 def _no_beam(plane: PlaneDensity) -> Finding | None:

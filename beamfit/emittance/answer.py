@@ -143,7 +143,7 @@ def plane_answer(
     """
     post, p = seen.works[plane].posterior, seen.works[plane].points
     n, carrying = _numbers(post, p, places, b)
-    e = plane_evidence(seen, plane, n.low[1], n.high[1], b)
+    e = _evidence(seen, plane, n.low[1], n.high[1], b)
     j = _judged(seen, plane, e, b, carrying, n.value)
     known = j.determined | (LINEAR & j.of_a_beam & (b is None))
     emittance, normalized, beta, alpha, s11, s12, s22, *screen, mismatch = n.quantities(
@@ -290,10 +290,7 @@ def _reaching(
     return low, high, half
 
 
-def plane_evidence(
-    seen: Seen, plane: str, low: float, high: float, b: Beside | None = None
-) -> PlaneEvidence:
-    """Evidence for the verdict on a plane, with the central 95 % of its normalised emittance, m."""
+def _evidence(seen: Seen, plane: str, low: float, high: float, b: Beside | None) -> PlaneEvidence:
     work = seen.works[plane]
     p, post = work.points, work.posterior
     found = PlaneEvidence(
