@@ -50,7 +50,7 @@ OWN, OWN_LENGTH = 0.1, 0.5
 ROUNDS, SOUGHT, MOST = 6, (2, 4), 0.3
 # Kernels less likely than this share have no draws; draws that share their amplitudes. Proposals
 # for each of these, and how much wider than by Laplace's method they are.
-LEAST, SHARED, PROPOSED, WIDER = 0.01, 8, 4, 1.5
+LEAST, SHARED, PROPOSED, WIDER = 0.01, 8, 8, 1.5
 # Standard deviations of their priors within which amplitudes are sought; added to the diagonal of
 # correlations of the grid.
 REACH, JITTER = 6.0, 1e-9
@@ -389,7 +389,8 @@ class _Posterior(NamedTuple):
 
         Each is a draw of the prior moved by what the bins say of it (A. G. Journel and C. J.
         Huijbregts, Mining Geostatistics, 1978, ch. VII). Amplitudes are proposed by Laplace's
-        method, wider than it says, and resampled: what settings scatter is skew.
+        method, wider than it says, and resampled evenly over what settings scatter, which is skew
+        (G. Kitagawa, J. Comput. Graph. Stat. 5, 1 (1996), sec. 2.3).
         """
         step, each = 0.1, np.eye(len(numbers))
         curved = np.array([(self._loss(numbers + step * u)[1] - self._loss(numbers - step * u)[1])
@@ -399,10 +400,13 @@ class _Posterior(NamedTuple):
         width = vectors / np.sqrt(np.maximum(values, 1.0 / self.prior[:, 1].max() ** 2))
         wanted = max(1, count // SHARED)
         z = WIDER * random.normal(size=(PROPOSED * wanted, len(numbers)))
+        z = z[np.argsort(z @ width[-1])]
         proposed = numbers + z @ width.T
         log = 0.5 * np.sum(z**2, axis=1) / WIDER**2 - [self._root(at)[1] for at in proposed]
         weight = np.exp(log - log.max())
-        chosen = random.choice(len(proposed), wanted, p=weight / weight.sum())
+        up_to = np.cumsum(weight)
+        even = (np.arange(wanted) + random.uniform()) / wanted * up_to[-1]
+        chosen = np.searchsorted(up_to, even)
         parts = [
             self._draws_at(proposed[i], len(some), random)
             for i, some in zip(chosen, np.array_split(np.arange(count), wanted), strict=True)
