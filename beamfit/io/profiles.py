@@ -1,17 +1,24 @@
-"""Tables of profiles: a line a bin of each shot, with the settings beside."""
+"""Tables of profiles, a line a bin of each shot, and of images, a line each."""
 
 from __future__ import annotations
 
+import io
 from collections.abc import Mapping
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
 from beamfit.density.profiles import FEWEST_BINS, profile_size
 from beamfit.emittance.scan import PLANES, Profile
+from beamfit.errors import InputError
 from beamfit.io.columns import Sheet, columns_of
+from beamfit.io.files import read_bytes
 from beamfit.io.headers import spelled
+from beamfit.io.isolated import LARGEST, isolated
 
+# What a table of images names, and what an image should be.
+IMAGE, PIXEL, SHOT, PICTURES = "image", "pixel_um", "shot", "PNG, or TIFF"
 COUNTS, BACKGROUND, POSITION = "counts", "background", "position"
 # Settings without which a plane has no emittance.
 FEWEST_SETTINGS = 3
@@ -20,6 +27,68 @@ FEWEST_SETTINGS = 3
 def has_profiles(sheet: Sheet) -> bool:
     """Tell a table of profiles: it has columns counts_x or counts_y."""
     return any(f"{COUNTS}_{plane}" in sheet.names for plane in PLANES)
+
+
+def of_images(sheet: Sheet) -> Sheet:
+    """Make a table of images a table of profiles, which are their projections.
+
+    Parameters
+    ----------
+    sheet : Sheet
+        With ``image``, the name of a file beside the table (PNG, or what else Pillow reads), and
+        ``pixel_um``; each line is a shot.
+
+    Returns
+    -------
+    Sheet
+        A line a bin; the shorter side of an image is filled with NaN.
+
+    Raises
+    ------
+    InputError
+        If a file is no image, or there is no ``pixel_um``.
+    """
+    if PIXEL not in sheet.names:
+        raise sheet.header_error(f"images and no column {PIXEL}", "the width of a pixel")
+    place = Path(sheet.path).parent if sheet.path else Path()
+    files = [str(place / str(name).strip()) for name in sheet[IMAGE]]
+    content = {}
+    for row, name in enumerate(files):
+        try:
+            content[name] = read_bytes(name, LARGEST // len(files), "a smaller image")
+        except InputError as error:
+            raise sheet.error(f"{name}: {error.found}", error.expected, row, IMAGE) from None
+    found = isolated("an image", sheet.path, PICTURES, image_projections, content)
+    seen, pixel = [found[name] for name in files], sheet.numbers(PIXEL)
+    bins = [max(map(len, planes)) for planes in seen]
+    of = np.repeat(np.arange(len(sheet)), bins)
+    kept = sheet.only([n for n in sheet.names if n not in (IMAGE, PIXEL, SHOT)]).rows(of.tolist())
+    counts = {
+        plane: np.concatenate([
+            np.pad(planes[i], (0, n - len(planes[i])), constant_values=np.nan)
+            for planes, n in zip(seen, bins, strict=True)
+        ])
+        for i, plane in enumerate(PLANES)
+    }  # fmt: skip
+    added = {SHOT: of, f"{POSITION}_um": np.concatenate([np.arange(n) for n in bins]) * pixel[of]}
+    added |= {f"{COUNTS}_{plane}": values for plane, values in counts.items()}
+    return replace(kept, names=(*kept.names, *added), cells=[*kept.cells, *added.values()])
+
+
+def image_projections(content: Mapping[str, bytes]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Project images on x and y, by name; called in a process of its own."""
+    from matplotlib.image import imread
+
+    found = {}
+    for name, image in content.items():
+        try:
+            pixels = np.asarray(imread(io.BytesIO(image)), float)
+        except (OSError, SyntaxError, ValueError) as error:
+            raise InputError("no image, or a damaged one", PICTURES, name) from error
+        if pixels.ndim == 3:  # colours, and perhaps what is transparent
+            pixels = pixels[..., :3].mean(axis=2)
+        found[name] = pixels.sum(axis=0), pixels.sum(axis=1)
+    return found
 
 
 def of_profiles(sheet: Sheet) -> tuple[Sheet, tuple[Profile, ...]]:

@@ -23,7 +23,7 @@ from beamfit.io.columns import (
 from beamfit.io.emittance_gui import is_emittance_gui, read_emittance_gui
 from beamfit.io.files import name_of
 from beamfit.io.headers import SETTINGS
-from beamfit.io.profiles import has_profiles, of_profiles
+from beamfit.io.profiles import IMAGE, has_profiles, of_images, of_profiles
 from beamfit.io.scan_columns import (
     ENERGIES,
     PERCENT,
@@ -113,6 +113,8 @@ def read_quad_scan(
 def scan_of_sheet(sheet: Sheet, skip_bad: bool = False) -> QuadScan:
     """Understand the columns of a sheet as a scan, as `read_quad_scan` does."""
     profiles: tuple[Profile, ...] = ()
+    if IMAGE in sheet.names:
+        sheet = of_images(sheet)
     if has_profiles(sheet):
         sheet, profiles = of_profiles(sheet)
     columns = scan_columns(sheet)

@@ -3,6 +3,7 @@
 import h5py
 import numpy as np
 import pytest
+from PIL import Image
 
 import beamfit
 
@@ -80,6 +81,39 @@ def test_a_stack_of_images_gives_its_projections(tmp_path):
 def test_a_stack_that_lacks_something_is_refused(changed, found, tmp_path):
     with pytest.raises(beamfit.InputError, match=found):
         beamfit.read_quad_scan(images(tmp_path / "stack.h5", **changed))
+
+
+def pictures(folder, name="{}.png", pixel="pixel_um"):
+    """A table of PNG images of 16 bits, beside it."""
+    lines = [f"Q2_A,image,{pixel}"]
+    x, y = np.arange(120) * 25.0 - 1500.0, np.arange(80) * 25.0 - 1000.0
+    for q, (a, b) in enumerate(((200.0, 90.0), (120.0, 100.0), (210.0, 110.0))):
+        seen = np.exp(-0.5 * (x / a) ** 2) * np.exp(-0.5 * (y[:, None] / b) ** 2)
+        Image.fromarray((40000 * seen + 100).astype(np.uint16)).save(folder / f"{q}.png")
+        lines.append(f"{q},{name.format(q)},25")
+    path = folder / "scan.csv"
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def test_a_table_of_images_gives_their_projections(tmp_path):
+    scan = beamfit.read_quad_scan(pictures(tmp_path))
+    assert scan.size["x"] == pytest.approx([200e-6, 120e-6, 210e-6], rel=0.02)
+    assert scan.size["y"] == pytest.approx([90e-6, 100e-6, 110e-6], rel=0.02)
+    assert [p.row for p in scan.profiles if p.plane == "y"] == [0, 1, 2]
+
+
+def test_images_that_are_none_are_refused_in_a_line(tmp_path):
+    with pytest.raises(beamfit.InputError, match="column pixel_um"):
+        beamfit.read_quad_scan(pictures(tmp_path, pixel="width"))
+    with pytest.raises(beamfit.InputError, match=r"7\.png: no such file"):
+        beamfit.read_quad_scan(pictures(tmp_path, name="7.png"))
+    path = pictures(tmp_path)
+    whole = (tmp_path / "1.png").read_bytes()
+    for damaged in (b"text", whole[: len(whole) // 2], whole[:200] + b"?" * 40 + whole[240:]):
+        (tmp_path / "1.png").write_bytes(damaged)
+        with pytest.raises(beamfit.InputError, match=r"1\.png: no image, or a damaged one"):
+            beamfit.read_quad_scan(path)
 
 
 def noisy(path, planes):
