@@ -398,8 +398,10 @@ def growth(rows: list[tuple[int, dict[str, float]]], tool: str) -> str:
 
 
 def command(*words: str, cold: bool = False) -> float:
-    """Processor seconds of a process."""
-    kept = {"JAX_ENABLE_COMPILATION_CACHE": "false"} if cold else {}
+    """Processor seconds of a process, which keeps the bytecode of modules, as Python does."""
+    kept = {"PYTHONDONTWRITEBYTECODE": ""}
+    if cold:
+        kept["JAX_ENABLE_COMPILATION_CACHE"] = "false"
     with subprocess.Popen([sys.executable, *words], stdout=subprocess.DEVNULL,
                           env=os.environ | kept) as process:  # fmt: skip
         _, status, used = os.wait4(process.pid, 0)
