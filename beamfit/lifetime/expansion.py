@@ -20,6 +20,7 @@ import numpy as np
 from jax import Array
 from scipy.integrate import cumulative_simpson
 
+from beamfit.compile_cache import SELDOM
 from beamfit.greybox.memory import Memory, Whitened, usual_noises, whitened_by_each
 from beamfit.greybox.problem import padded_length
 from beamfit.lifetime.decay_law import Moments, beam_current, cumulative
@@ -228,6 +229,8 @@ class _State(NamedTuple):
     level: Array
     residual: Array
     slopes: Array
+    values: Array
+    by: Array
     cost: Array
     step: Array
     down: Array
@@ -329,24 +332,30 @@ class _Question(NamedTuple):
         return jnp.where(self.mask(numbers.size), jnp.clip(numbers, low, high), before)
 
 
-def _begun(rows: _Rows, begin: Array, both: Array, level: Array, question: _Question):
-    """Numbers and levels to begin at: those given, or from integrals, or a plain decay's."""
+def _first(rows: _Rows, begin: Array, both: Array, level: Array, question: _Question) -> _State:
+    """Begin at the numbers given, or a step from a plain decay's, at those from integrals.
+
+    A start taken from noise can lie where the law has no value: the step is halved then. Nothing is
+    known of the law yet, since the search alone holds it, which takes a second to compile.
+    """
     mask, given = question.mask(begin.size), jnp.isfinite(begin[0])
-    own = jnp.zeros(begin.size).at[:2].set(both)
-    plain = jnp.zeros(begin.size).at[:2].set(jnp.array([0.1, 0.05]))
-    start = jnp.where(given, begin, own * mask)
-    # A start taken from noise can lie where the law has no value; a plain decay never does.
-    good = jnp.isfinite(_about(start, level, rows, question.kind, question.shape)[0]).all()
-    return jnp.where(good | given, start, plain * mask), jnp.where(good, level, 1.0)
+    plain = mask * jnp.zeros(begin.size).at[:2].set(jnp.array([0.1, 0.05]))
+    own = mask * jnp.zeros(begin.size).at[:2].set(both)
+    start, at = jnp.where(given, begin, plain), jnp.where(given, level, 1.0)
+    law = jax.eval_shape(partial(_about, kind=question.kind, shape=question.shape), own, at, rows)
+    unknown = (jnp.full(part.shape, jnp.nan) for part in law)
+    step = jnp.where(given, 0.0, own - plain)
+    return _State(start, at, *unknown, jnp.inf, step, at - level, 1.0, False, 0)
 
 
 def _tried(numbers: Array, level: Array, rows: _Rows, prior: Array, question: _Question):
-    """Residuals, slopes and their sum of squares, infinite where the law has no value."""
-    residual, slopes, *_ = _about(numbers, level, rows, question.kind, question.shape)
+    """The law about numbers, and the sum of squares, infinite where the law has no value."""
+    found = _about(numbers, level, rows, question.kind, question.shape)
+    residual, slopes = found[:2]
     known = prior * numbers[jnp.array(question.free) - 1]
     cost = residual @ residual + jnp.sum(known**2)
     fine = jnp.isfinite(slopes).all() & jnp.isfinite(cost)
-    return residual, slopes, jnp.where(fine, cost, jnp.inf)
+    return *found, jnp.where(fine, cost, jnp.inf)
 
 
 def _advanced(s: _State, rows: _Rows, prior: Array, noise: Array, question: _Question) -> _State:
@@ -354,14 +363,15 @@ def _advanced(s: _State, rows: _Rows, prior: Array, noise: Array, question: _Que
     places = jnp.array(question.free)
     tried = question.within(s.numbers + s.share * s.step, s.numbers), s.level - s.share * s.down
     tried += _tried(*tried, rows, prior, question)
-    better = tried[-1] <= s.cost * (1 + 1e-15)
-    numbers, level, residual, slopes, cost = (
-        jnp.where(better, new, old) for new, old in zip(tried, s[:5], strict=True)
+    better = jnp.isfinite(tried[-1]) & (tried[-1] <= s.cost * (1 + 1e-15))
+    numbers, level, residual, slopes, values, by, cost = (
+        jnp.where(better, new, old) for new, old in zip(tried, s[:7], strict=True)
     )
     columns = jnp.column_stack([slopes[:, places], residual])
     left, worth = rows.without_levels(slopes[:, LEVEL], columns)
     known = jnp.column_stack([jnp.diag(prior), prior * numbers[places - 1]])
     step = _least_squares(left, known)
+    down = worth[:, :-1] @ step + worth[:, -1]
     promised = jnp.linalg.norm(left[:, :-1] @ step)
     rounding = 1e-14 * jnp.linalg.norm(slopes[:, LEVEL])
     share = jnp.where(better, 1.0, s.share / 2)
@@ -369,13 +379,13 @@ def _advanced(s: _State, rows: _Rows, prior: Array, noise: Array, question: _Que
     small = s.rested | (better & (promised <= NEAR * noise + rounding))
     stuck = ~better & (s.share <= 0.5**HALVED)
     return _State(
-        numbers, level, residual, slopes, cost, jnp.zeros_like(numbers).at[places - 1].set(step),
-        worth[:, :-1] @ step + worth[:, -1], share, small | stuck, s.count + 1,
+        numbers, level, residual, slopes, values, by, cost,
+        jnp.where(better, jnp.zeros_like(numbers).at[places - 1].set(step), s.step),
+        jnp.where(better, down, s.down), share, small | stuck, s.count + 1,
     )  # fmt: skip
 
 
-@partial(jax.jit, static_argnames=("free", "kind", "shape"))
-def _searched(rows: _Rows, begin: Array, widths: Array, free, kind=None, shape=None):
+def _search(rows: _Rows, begin: Array, widths: Array, free, kind=None, shape=None):
     """Gauss and Newton from numbers, NaN where the start is to be found; and what they leave.
 
     `widths` are those of normal priors about zero.
@@ -384,17 +394,17 @@ def _searched(rows: _Rows, begin: Array, widths: Array, free, kind=None, shape=N
     both, level, noise, width = _start(rows)
     weak = noise / width * (shape is None)
     prior = noise / widths + jnp.where(jnp.array(free) == QUADRATIC, weak, 0.0)
-    start, level = _begun(rows, begin, both, level, question)
-    residual, slopes, _ = _tried(start, level, rows, prior, question)
-    first = _State(start, level, residual, slopes, jnp.inf, jnp.zeros_like(start),
-                   jnp.zeros_like(level), 1.0, False, 0)  # fmt: skip
     last = jax.lax.while_loop(
         lambda s: ~s.rested & (s.count < STEPS),
         lambda s: _advanced(s, rows, prior, noise, question),
-        jax.tree.map(jnp.asarray, first),
+        jax.tree.map(jnp.asarray, _first(rows, begin, both, level, question)),
     )
-    residual, slopes, values, by = _about(last.numbers, last.level, rows, kind, shape)
-    return last.numbers, last.level, residual, slopes, values, by, last.rested, weak
+    return *last[:6], last.rested, weak
+
+
+QUESTION = ("free", "kind", "shape")
+_searched = jax.jit(_search, static_argnames=QUESTION)
+_searched_seldom = jax.jit(_search, static_argnames=QUESTION, compiler_options=SELDOM)
 
 
 @partial(jax.jit, static_argnames=("kind", "shape"))
@@ -597,7 +607,8 @@ def solved(
     """
     begin = np.full(3, np.nan) if start is None else np.asarray(start, float)
     known = np.array([(widths or {}).get(column, np.inf) for column in free])
-    return Expansion.of(pieces, _searched(pieces.scaled(), begin, known, tuple(free), kind, shape))
+    search = _searched if free == PLAIN else _searched_seldom
+    return Expansion.of(pieces, search(pieces.scaled(), begin, known, tuple(free), kind, shape))
 
 
 def solved_together(records: Sequence[DecayRecord]) -> list[Expansion]:
