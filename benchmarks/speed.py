@@ -411,7 +411,7 @@ def command(*words: str, cold: bool = False) -> float:
     return used.ru_utime + used.ru_stime
 
 
-def first_answers(repeats: int = 3) -> tuple[str, dict[str, float]]:
+def first_answers(repeats: int = 5) -> tuple[str, dict[str, float]]:
     """Seconds of whole processes, the least of several, told, and over those of an import alone."""
     scan, lattice = ROOT / "measurements/lcls_otr2.csv", ROOT / "lattices/lcls_otr2.toml"
     main = ["-c", "from beamfit.cli import main; main()"]
