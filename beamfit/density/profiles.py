@@ -128,9 +128,13 @@ def _shot(profile: Profile) -> tuple[np.ndarray, np.ndarray] | None:
     if len(x) < FEWEST_BINS:
         return None
     n = max(3, round(ENDS * len(x)))
-    charge = counts - 0.5 * (np.median(counts[:n]) + np.median(counts[-n:]))
-    # Second differences of normal noise have sqrt(6) times its error, and a beam's are small.
-    noise = np.median(np.abs(np.diff(charge, 2))) / (np.sqrt(6.0) * 0.6745)
+    ends = np.stack([counts[:n], counts[-n:]])
+    level = np.median(ends, axis=1, keepdims=True)
+    charge = counts - level.mean()
+    # Second differences of normal noise have sqrt(6) times its error; so have those of a beam of
+    # few bins, whose background tells the noise then.
+    jagged = np.median(np.abs(np.diff(charge, 2))) / (np.sqrt(6.0) * 0.6745)
+    noise = min(jagged, np.sqrt(np.sum((ends - level) ** 2) / (2 * n - 2)))
     # The sum has the noise of its bins and that of the medians of both ends, off its every bin.
     error = noise * np.sqrt(len(x) + len(x) ** 2 * np.pi / 2.0 / (2.0 * n))
     if charge.sum() <= LEAST_LIGHT * error:

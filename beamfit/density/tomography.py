@@ -204,10 +204,12 @@ def bins_of(
         inside = np.abs(x) < EDGE * size[k]
         width = count * p.step / size[k]
         charge = charge[inside] / (charge[inside].sum() * width)
+        # Bins are points, as of a wire; what a pixel adds is the resolution's.
+        together = width**2 * (1.0 - 1.0 / count**2) / 12.0
         parts.append((np.full(len(charge), k), x[inside] / size[k], charge,
-                      np.full(len(charge), width)))  # fmt: skip
-    profile, position, charge, width = (np.concatenate(v) for v in zip(*parts, strict=True))
-    width = np.sqrt(POINT**2 + width**2 / 12.0 + (resolution / size)[profile] ** 2)[:, None]
+                      np.full(len(charge), together)))  # fmt: skip
+    profile, position, charge, together = (np.concatenate(v) for v in zip(*parts, strict=True))
+    width = np.sqrt(POINT**2 + together + (resolution / size)[profile] ** 2)[:, None]
     away = (position[:, None] - direction[profile] @ GRID.T) / width
     look = PEAK / width * np.exp(-0.5 * away**2)
     return Bins(profile, position, charge, look, -away / width * look, direction)

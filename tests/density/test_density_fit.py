@@ -8,6 +8,7 @@ import pytest
 
 import beamfit
 from beamfit.density.fit import SHARES
+from beamfit.emittance.scan import Profile, QuadScan
 from beamfit.io.emittance_gui import read_emittance_gui
 from benchmarks.density import BEAMS, REFUSED, fitted, simulated
 from tests.simulations import simulations
@@ -149,3 +150,19 @@ def test_a_window_of_one_and_a_half_rms_determines_nothing():
             assert all(q.error is None for q in plane.emittance.values())
         for q in plane.emittance.values():
             assert q.error is None or q.interval_95[1] < 2.5 * q.interval_95[0]
+
+
+def test_a_wire_with_few_positions_has_the_emittance_of_many():
+    angle, size = np.radians([0.0, 30, 60, 90, 120, 150]), 1e-4 * np.array([1.0, 2, 1.5, 1, 2.5, 2])
+    rows = 1e4 * size[:, None] * np.column_stack([np.cos(angle), 10.0 * np.sin(angle)])
+    found = []
+    for count in (15, 101):
+        x = np.linspace(-5.0, 5.0, count)
+        shots = [Profile("x", i, s * x, np.exp(-0.5 * x**2), None)
+                 for i, s in enumerate(size)]  # fmt: skip
+        scan = QuadScan({}, {}, {"x": size}, energy=135.0, transfer={"x": rows},
+                                profiles=tuple(shots))  # fmt: skip
+        found.append(beamfit.fit_density(scan)["x"].emittance["90 %"])
+    few, many = found
+    assert abs(few.value - many.value) < 1.5 * few.error
+    assert abs(few.value / many.value - 1.0) < 0.03

@@ -36,7 +36,7 @@ def test_the_reference_has_unit_rms_and_its_projection_is_a_normal_density():
     moments = GRID.T @ (GRID * reference[:, None]) + POINT**2 * np.eye(2)
     assert moments == pytest.approx(np.eye(2), abs=1e-6)
     width = seen.position[1] - seen.position[0]
-    spread = 1.0 + width**2 / 12.0
+    spread = 1.0 + width**2 / 16.0  # of two readings taken together, half a width apart
     expected = PEAK / np.sqrt(spread) * np.exp(-0.5 * seen.position**2 / spread)
     assert seen.look @ reference == pytest.approx(expected, abs=2e-4)
 
