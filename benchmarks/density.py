@@ -20,7 +20,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from beamfit.density.charge import parts_of, powers_of
+from beamfit.density.charge import parts_of, powers_of, rms_beam
 from beamfit.density.fit import SHARES, PlaneDensity, fit_density
 from beamfit.density.profiles import profile_size
 from beamfit.emittance.scan import Profile, QuadScan
@@ -78,7 +78,7 @@ def truth(beam: Mixture) -> np.ndarray:
         inverse, (dq, dp) = np.linalg.inv(covariance), (q - mean[0], p - mean[1])
         square = inverse[0, 0] * dq**2 + 2.0 * inverse[0, 1] * dq * dp + inverse[1, 1] * dp**2
         density += weight / np.sqrt(np.linalg.det(covariance)) * np.exp(-0.5 * square)
-    return np.array(parts_of(density, powers, SHARES)[0])
+    return np.array(parts_of(density, powers, rms_beam(density, powers)[0], SHARES)[0])
 
 
 def simulated(kind: str, random: np.random.Generator) -> tuple[QuadScan, Mixture]:

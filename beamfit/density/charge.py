@@ -24,18 +24,18 @@ class ChargeParts(NamedTuple):
     Attributes
     ----------
     emittance : ndarray
-        Shape (d, f): rms emittance of the charge within the ellipse, of the shape of the rms beam,
-        that holds each share; NaN where a density has no rms.
+        Shape (d, f): rms emittance of the charge within the ellipse, of the shape of the rms beam
+        of all densities, that holds each share; NaN where the charge inside has no rms.
     halo, core : ndarray
         Shape (d,): shares of the charge beyond 3 rms, and within one.
-    rms : ndarray
-        Shape (d,): emittance of all charge.
+    rms : float
+        Emittance of the rms beam of all densities.
     """
 
     emittance: np.ndarray
     halo: np.ndarray
     core: np.ndarray
-    rms: np.ndarray
+    rms: float
 
 
 def charge_parts(values: np.ndarray, shares: tuple[float, ...]) -> ChargeParts:
@@ -64,9 +64,11 @@ def charge_parts(values: np.ndarray, shares: tuple[float, ...]) -> ChargeParts:
     >>> parts.emittance.round(3).tolist(), parts.halo.round(3).tolist()
     ([[0.307, 0.744, 1.0]], [0.011])
     """
-    powers = powers_of(FINE_AXIS)
-    found = [parts_of(density, powers, shares) for density in finely(values)]
-    return ChargeParts(*map(np.array, zip(*found, strict=True)))
+    powers, fine = powers_of(FINE_AXIS), finely(values)
+    # Where windows cut the beam single densities may have no rms: noise may be negative.
+    radius, rms = rms_beam(fine.mean(axis=0), powers)
+    found = [parts_of(density, powers, radius, shares) for density in fine]
+    return ChargeParts(*map(np.array, zip(*found, strict=True)), rms)
 
 
 def powers_of(axis: np.ndarray) -> np.ndarray:
@@ -106,20 +108,25 @@ def finely(values: np.ndarray) -> np.ndarray:
     return (spread @ values.reshape(-1, n, n) @ spread.T).reshape(len(values), -1)
 
 
-def parts_of(
-    density: np.ndarray, powers: np.ndarray, shares: tuple[float, ...]
-) -> tuple[list[float], float, float, float]:
-    """Emittances of the shares, halo, core and rms emittance of one density, as `ChargeParts`."""
-    total, *moments = powers @ density
-    mean_q, mean_p, *_ = np.array(moments) / total
-    square, (a, b, c) = _second(np.array([total, *moments]))
+def rms_beam(density: np.ndarray, powers: np.ndarray) -> tuple[np.ndarray, float]:
+    """Squares of the distances of points from the centre, in rms sizes, and the rms emittance."""
+    sums = powers @ density
+    square, (a, b, c) = _second(sums)
     if not (square > 0.0 and a > 0.0):
-        return [math.nan] * len(shares), math.nan, math.nan, math.nan
-    dq, dp = powers[1] - mean_q, powers[2] - mean_p
-    radius = (c * dq * dq - 2.0 * b * dq * dp + a * dp * dp) / square
+        return np.full_like(density, math.nan), math.nan
+    dq, dp = powers[1] - sums[1] / sums[0], powers[2] - sums[2] / sums[0]
+    return (c * dq * dq - 2.0 * b * dq * dp + a * dp * dp) / square, math.sqrt(square)
+
+
+def parts_of(
+    density: np.ndarray, powers: np.ndarray, radius: np.ndarray, shares: tuple[float, ...]
+) -> tuple[list[float], float, float]:
+    """Emittances of the shares, halo and core of one density, as `ChargeParts`."""
+    if not np.isfinite(radius).all():
+        return [math.nan] * len(shares), math.nan, math.nan
     ring = np.minimum((radius * (RINGS / FAR)).astype(int), RINGS)
     inside = np.cumsum([np.bincount(ring, density * power, RINGS + 1) for power in powers], axis=1)
-    edges, held = np.linspace(FAR / RINGS, FAR, RINGS), inside[0] / total
+    edges, held = np.linspace(FAR / RINGS, FAR, RINGS), inside[0] / inside[0, -1]
     emittances = []
     for share in shares:
         # The first ellipse that holds it: beyond, noise may be negative.
@@ -128,9 +135,15 @@ def parts_of(
         if 0 < k < RINGS:
             within = (share - held[k - 1]) / (held[k] - held[k - 1])
             part = inside[:, k - 1] + within * (part - inside[:, k - 1])
-        emittances.append(math.sqrt(max(_second(part)[0], 0.0)))
-    halo = 1.0 - float(np.interp(HALO, edges, held[:RINGS]))
-    return emittances, halo, float(np.interp(CORE, edges, held[:RINGS])), math.sqrt(square)
+        emittances.append(_emittance(part))
+    halo, core = (float(np.interp(at, edges, held[:RINGS])) for at in (HALO, CORE))
+    return emittances, 1.0 - halo, core
+
+
+def _emittance(sums: np.ndarray) -> float:
+    """Rms emittance of sums of powers; NaN where there is none."""
+    square, (a, _, _) = _second(sums)
+    return math.sqrt(square) if square > 0.0 and a > 0.0 else math.nan
 
 
 def _second(sums: np.ndarray) -> tuple[float, tuple[float, float, float]]:

@@ -94,8 +94,11 @@ def _unit_change(current: np.ndarray) -> int | None:
         decades = current[1:] / current[:-1]
         np.abs(np.log10(decades, out=decades), out=decades)
     for row in np.flatnonzero((decades > 2.99) & (decades < 3.01)) + 1:
-        before, after = np.median(current[max(row - 3, 0) : row]), np.median(current[row : row + 3])
-        if before > 0 and after > 0 and abs(abs(np.log10(after / before)) - 3) < 0.05:
+        before, after = np.median(current[max(row - 3, 0) : row]), current[row : row + 3]
+        # The noise after a dump is by chance a thousandth once, not again and again.
+        with np.errstate(divide="ignore", invalid="ignore"):
+            stays = np.abs(np.abs(np.log10(after / before)) - 3) < 0.05
+        if stays.size > 1 and stays.all():
             return int(row)
     return None
 

@@ -164,6 +164,12 @@ def test_what_no_beam_can_do(time, current, column, words):
     assert caught.value.column == column
 
 
+@pytest.mark.parametrize("after", [[0.0982], [0.0982, 0.031, 0.12], [0.0982, 0.0, 0.098]])
+def test_what_is_left_after_a_dump_is_no_change_of_unit(after):
+    current = np.array([99.0, 98.5, 98.2, *after])
+    assert DecayRecord(np.arange(current.size), current).current.size == current.size
+
+
 def test_errors_and_conditions_are_checked():
     with pytest.raises(InputError, match="reading 2: an error of 0 mA"):
         DecayRecord([0, 1], [2, 1], [0.1, 0.0])
