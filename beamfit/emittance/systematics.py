@@ -68,15 +68,6 @@ class Effects(NamedTuple):
     total: float
 
     @property
-    def beyond_statistics(self) -> float:
-        """Variance of all over that of statistics: its square multiplies the degrees of freedom.
-
-        As of a sum of variances of which one is known from few residuals: B. L. Welch, Biometrika
-        34, 28 (1947); F. E. Satterthwaite, Biometrics Bull. 2, 110 (1946), eq. 17.
-        """
-        return (self.total / self.statistical) ** 2 if self.statistical > 0 else math.inf
-
-    @property
     def words(self) -> str:
         """The largest one, and how it compares."""
         name, most = max(self.systematic.items(), key=lambda item: item[1])

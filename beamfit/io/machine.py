@@ -28,7 +28,6 @@ SPELLINGS |= {word.lower(): unit for word, unit in ALSO.items() if unit in SETTI
 LENGTHS = {"um": 1e-6, "mm": 1e-3, "m": 1.0}
 # Bounds that several keys share.
 WAIT = {"low": 0.0, "said": "a time above zero"}
-MAYBE = Key(kind=TEXT, default=None)
 POSITIVE = {"low": 0.0, "said": "a positive number"}
 MAGNET = {
     "name": Key("name", kind=TEXT),
