@@ -77,16 +77,18 @@ def of_images(sheet: Sheet) -> Sheet:
 
 def image_projections(content: Mapping[str, bytes]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """Project images on x and y, by name; called in a process of its own."""
-    from matplotlib.image import imread
+    from PIL import Image
 
     found = {}
     for name, image in content.items():
         try:
-            pixels = np.asarray(imread(io.BytesIO(image)), float)
-        except (OSError, SyntaxError, ValueError) as error:
+            with Image.open(io.BytesIO(image)) as picture:
+                coloured = picture.mode == "P" or len(picture.getbands()) > 1
+                pixels = np.asarray(picture.convert("RGB") if coloured else picture, float)
+        except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
             raise InputError("no image, or a damaged one", PICTURES, name) from error
-        if pixels.ndim == 3:  # colours, and perhaps what is transparent
-            pixels = pixels[..., :3].mean(axis=2)
+        if coloured:
+            pixels = pixels.mean(axis=2)
         found[name] = pixels.sum(axis=0), pixels.sum(axis=1)
     return found
 
