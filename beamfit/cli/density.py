@@ -35,11 +35,13 @@ def density(
     """Find the density of a beam in phase space, and its emittance against charge, with errors.
 
     SCAN is a .mat file of SLAC's emittance_gui, or a CSV or HDF5 table with a line for each bin of
-    each profile: Q2_A, shot, position_um, counts_x, counts_y.
+    each profile: Q2_A, shot, position_um, counts_x, counts_y; or with a line for each image: Q2_A,
+    image, pixel_um.
     """
     read = read_inputs(scan, **given)
     if not read.scan.profiles:
-        expected = "columns position_um and counts_x, a line a bin, or a file of emittance_gui"
+        expected = "columns position_um and counts_x, or image and pixel_um, or a file of "
+        expected += "emittance_gui"
         raise InputError("sizes and no profiles", expected, scan)
     own = None if noise is None else read_noise(noise)
     line = build_line(read.lattice)  # JAX from here on

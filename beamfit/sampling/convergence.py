@@ -183,7 +183,8 @@ def _never_settled(e: ChainEvidence) -> Finding | None:
 def _walkers_disagree(e: ChainEvidence) -> Finding | None:
     if e.diagnostics.settled:
         return None
-    worst = e.target.names[int(np.argmax(e.diagnostics.rhat / (1 + 1 / e.diagnostics.effective)))]
+    allowed = 1 + 1 / np.maximum(e.diagnostics.effective, 1.0)
+    worst = e.target.names[int(np.argmax(e.diagnostics.rhat / allowed))]
     cause = f"The budget of {e.budget} steps ended before the walkers agreed"
     said = f"{cause} (slowest: {plain_name(worst)}): raise it, and distrust the intervals."
     return Finding(Status.not_converged, said)
