@@ -26,6 +26,7 @@ from torch.utils.data import DataLoader
 
 import beamfit
 from beamfit.density.fit import fit_density
+from beamfit.density.profiles import profile_size
 from beamfit.emittance.scan import Profile, QuadScan
 from beamfit.optics.elements import Drift, Quadrupole
 from beamfit.optics.elements import Screen as Monitor
@@ -58,8 +59,8 @@ def by_beamfit(stack: np.ndarray, line: beamfit.Beamline) -> tuple[float, str]:
             counts = image.sum(axis=axis)
             counts = counts + 0.005 * counts.max() * random.normal(size=PIXELS)
             profiles.append(Profile(plane, row, x, counts, None))
-    size = np.full(len(K1), 1e-4)
-    scan = QuadScan({"Q": K1}, {"Q": "k1"}, {"x": size, "y": size}, profiles=tuple(profiles))
+    size = {plane: [profile_size(p) for p in profiles if p.plane == plane] for plane in "xy"}
+    scan = QuadScan({"Q": K1}, {"Q": "k1"}, size, profiles=tuple(profiles))
     fit_density(scan, line)
     start = time.process_time()
     fit = fit_density(scan, line)
