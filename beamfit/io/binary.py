@@ -118,7 +118,7 @@ def hdf5_content(content: bytes, rows: int, texts: int) -> Columns:
 def _projections(
     place: Any, names: Sequence[str], rows: int, texts: int
 ) -> dict[str, Sequence[Any]]:
-    """A line a bin of the projections of a stack of images; the shorter one is filled with NaN."""
+    """A line a bin of the projections of a stack of images."""
     data = place[IMAGES]
     _check_stored(data, IMAGES)
     if len(data.shape or ()) != 3 or data.dtype.kind not in "iuf":
@@ -133,15 +133,32 @@ def _projections(
     for name, values in told.items():
         if len(values) != count:
             raise InputError(f"{len(values)} values", f"{count}, one an image", column=name)
-    told = {"shot": np.arange(count, dtype=float)} | told
-    columns = {name: list(np.repeat(values, bins)) for name, values in told.items()}
-    columns["position_um"] = np.tile(np.arange(bins) * float(np.ravel(place[PIXEL][()])[0]), count)
-    for plane, axis in (("x", 0), ("y", 1)):
-        each = np.full((count, bins), np.nan)
-        for i in range(count):
-            seen = np.asarray(data[i], float).sum(axis=axis)
-            each[i, : len(seen)] = seen
-        columns[f"counts_{plane}"] = each.ravel()
+    pixel = np.full(count, float(np.ravel(place[PIXEL][()])[0]))
+    columns = columns_of_images([projections(np.asarray(image, float)) for image in data], pixel)
+    of = columns["shot"]
+    return columns | {name: [values[i] for i in of] for name, values in told.items()}
+
+
+def projections(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Project an image on x and y."""
+    return image.sum(axis=0), image.sum(axis=1)
+
+
+def columns_of_images(
+    seen: Sequence[tuple[np.ndarray, np.ndarray]], pixel_um: np.ndarray
+) -> dict[str, np.ndarray]:
+    """A line a bin of projections on x and y; the shorter one of each is filled with NaN."""
+    bins = [max(map(len, planes)) for planes in seen]
+    shot = np.repeat(np.arange(len(seen)), bins)
+    columns = {
+        "shot": shot,
+        "position_um": np.concatenate([*map(np.arange, bins)]) * pixel_um[shot],
+    }
+    for i, plane in enumerate("xy"):
+        columns[f"counts_{plane}"] = np.concatenate([
+            np.pad(planes[i], (0, n - len(planes[i])), constant_values=np.nan)
+            for planes, n in zip(seen, bins, strict=True)
+        ])  # fmt: skip
     return columns
 
 

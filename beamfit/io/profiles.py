@@ -12,13 +12,14 @@ import numpy as np
 from beamfit.density.profiles import FEWEST_BINS, profile_size
 from beamfit.emittance.scan import PLANES, Profile
 from beamfit.errors import InputError
+from beamfit.io.binary import PIXEL, columns_of_images, projections
 from beamfit.io.columns import Sheet, columns_of
 from beamfit.io.files import read_bytes
 from beamfit.io.headers import spelled
 from beamfit.io.isolated import LARGEST, isolated
 
 # What a table of images names, and what an image should be.
-IMAGE, PIXEL, SHOT, PICTURES = "image", "pixel_um", "shot", "PNG, or TIFF"
+IMAGE, SHOT, PICTURES = "image", "shot", "PNG, or TIFF"
 COUNTS, BACKGROUND, POSITION = "counts", "background", "position"
 # Settings without which a plane has no emittance.
 FEWEST_SETTINGS = 3
@@ -60,18 +61,9 @@ def of_images(sheet: Sheet) -> Sheet:
             raise sheet.error(f"{name}: {error.found}", error.expected, row, IMAGE) from None
     found = isolated("an image", sheet.path, PICTURES, image_projections, content)
     seen, pixel = [found[name] for name in files], sheet.numbers(PIXEL)
-    bins = [max(map(len, planes)) for planes in seen]
-    of = np.repeat(np.arange(len(sheet)), bins)
-    kept = sheet.only([n for n in sheet.names if n not in (IMAGE, PIXEL, SHOT)]).rows(of.tolist())
-    counts = {
-        plane: np.concatenate([
-            np.pad(planes[i], (0, n - len(planes[i])), constant_values=np.nan)
-            for planes, n in zip(seen, bins, strict=True)
-        ])
-        for i, plane in enumerate(PLANES)
-    }  # fmt: skip
-    added = {SHOT: of, f"{POSITION}_um": np.concatenate([np.arange(n) for n in bins]) * pixel[of]}
-    added |= {f"{COUNTS}_{plane}": values for plane, values in counts.items()}
+    added = columns_of_images(seen, pixel)
+    kept = sheet.only([n for n in sheet.names if n not in (IMAGE, PIXEL, SHOT)])
+    kept = kept.rows(added[SHOT].tolist())
     return replace(kept, names=(*kept.names, *added), cells=[*kept.cells, *added.values()])
 
 
@@ -89,7 +81,7 @@ def image_projections(content: Mapping[str, bytes]) -> dict[str, tuple[np.ndarra
             raise InputError("no image, or a damaged one", PICTURES, name) from error
         if coloured:
             pixels = pixels.mean(axis=2)
-        found[name] = pixels.sum(axis=0), pixels.sum(axis=1)
+        found[name] = projections(pixels)
     return found
 
 
@@ -112,8 +104,8 @@ def of_profiles(sheet: Sheet) -> tuple[Sheet, tuple[Profile, ...]]:
     Raises
     ------
     InputError
-        If a shot has fewer than twelve bins, a column of positions is missing, or no profile
-        shows a beam.
+        If a shot has fewer than twelve bins or a position twice, a column of positions is missing,
+        or no profile shows a beam.
     """
     planes = [p for p in PLANES if f"{COUNTS}_{p}" in sheet.names]
     bins = {f"{kind}_{p}" for kind in (COUNTS, BACKGROUND) for p in planes}
@@ -128,7 +120,9 @@ def of_profiles(sheet: Sheet) -> tuple[Sheet, tuple[Profile, ...]]:
         if column is None:
             raise sheet.header_error(f"no position of counts_{plane}", "a column position_um")
         x, counts = sheet.values(column), sheet[f"{COUNTS}_{plane}"]
-        if not isinstance(counts, np.ndarray):  # of HDF5, NaN beyond the shorter side of an image
+        if not isinstance(
+            counts, np.ndarray
+        ):  # of images, NaN beyond the shorter side
             counts = sheet.numbers(f"{COUNTS}_{plane}")
         if f"{BACKGROUND}_{plane}" in sheet.names:
             counts = counts - sheet.numbers(f"{BACKGROUND}_{plane}")
@@ -140,6 +134,10 @@ def of_profiles(sheet: Sheet) -> tuple[Sheet, tuple[Profile, ...]]:
         if short is not None:
             said = f"a profile of {len(short.position)} bins"
             raise sheet.error(said, f"{FEWEST_BINS} lines or more a shot", int(starts[short.row]))
+        twice = next((s for s in shots if len(set(s.position)) < len(s.position)), None)
+        if twice is not None:
+            expected = "bins at positions of their own, a pixel above zero, and a column shot"
+            raise sheet.error("a profile with a position twice", expected, int(starts[twice.row]))
         sizes[plane], found[plane] = np.array([profile_size(s) for s in shots]), shots
     kept = sheet.only(rest).rows(list(starts))
     seen, notes = _settings_with_beam(kept, sizes), list(kept.notes)

@@ -55,6 +55,15 @@ def test_counts_without_positions_are_refused(tmp_path):
         beamfit.read_quad_scan(path)
 
 
+def test_bins_at_one_place_are_named_with_their_line(tmp_path):
+    path = table(tmp_path / "p.csv", shots=1)
+    head, first, _, *rest = path.read_text().splitlines()
+    path.write_text("\n".join([head, first, first, *rest]) + "\n")
+    with pytest.raises(beamfit.InputError, match="a position twice") as error:
+        beamfit.read_quad_scan(path)
+    assert error.value.line == 2
+
+
 def images(path, widths=((200.0, 90.0), (120.0, 100.0), (210.0, 110.0)), **changed):
     x, y = np.arange(120) * 25.0 - 1500.0, np.arange(80) * 25.0 - 1000.0
     stack = [np.exp(-0.5 * (x / a) ** 2) * np.exp(-0.5 * (y[:, None] / b) ** 2) for a, b in widths]
@@ -81,6 +90,11 @@ def test_a_stack_of_images_gives_its_projections(tmp_path):
 def test_a_stack_that_lacks_something_is_refused(changed, found, tmp_path):
     with pytest.raises(beamfit.InputError, match=found):
         beamfit.read_quad_scan(images(tmp_path / "stack.h5", **changed))
+
+
+def test_a_pixel_without_width_is_refused(tmp_path):
+    with pytest.raises(beamfit.InputError, match="a pixel above zero"):
+        beamfit.read_quad_scan(images(tmp_path / "stack.h5", pixel_um=0.0))
 
 
 def pictures(folder, name="{}.png", pixel="pixel_um"):
