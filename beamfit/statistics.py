@@ -139,19 +139,25 @@ def quantity_of_draws(draws: np.ndarray, unit: str, value: float | None = None) 
     Returns
     -------
     Quantity
-        Its error is half of the central 68 %, its interval the central 95 %.
+        Its error is half of the central 68 %, its interval the central 95 %; none where more draws
+        have no value than lie beyond an end of it.
 
     Examples
     --------
     >>> quantity_of_draws(np.linspace(0.0, 2.0, 101), "m")
     <Quantity 1.00 ± 0.68 m>
+    >>> quantity_of_draws(np.append(np.linspace(0.0, 2.0, 101), 9 * [np.nan]), "m").error is None
+    True
     """
-    draws = draws[np.isfinite(draws)]
-    if not len(draws):
+    found = np.isfinite(draws)
+    if not found.any():
         return Quantity(math.nan, None, unit)
+    lost, draws = float(np.mean(~found)), draws[found]
+    value = float(np.median(draws)) if value is None else float(value)
+    if lost >= WIDE[0]:
+        return Quantity(value, None, unit)
     low, high = np.quantile(draws, CENTRAL)
     ends = np.quantile(draws, WIDE)
-    value = float(np.median(draws)) if value is None else float(value)
     return Quantity(value, 0.5 * float(high - low), unit, None, (float(ends[0]), float(ends[1])))
 
 

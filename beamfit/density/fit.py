@@ -41,8 +41,6 @@ PLACES, CHANCE = 25, 0.01
 # A window beyond which likely more than this of the mean square lies cuts the beam: 5 % of an
 # emittance. That is so for a Gaussian within 2.5 rms.
 CUT = 0.1
-# Share of draws without a value from which a 95 % interval has no end.
-LOST = 0.025
 # Shares that a cut window leaves open.
 OPEN_WHEN_CUT = 0.95
 # Statuses of planes, the gravest last.
@@ -159,10 +157,9 @@ class PlaneDensity:
         """A quantity of the draws, open where the profiles do not tell it."""
         if self.densities is None:
             return Quantity(math.nan, None, unit)
-        draws = of(self.parts)
-        q, lost = quantity_of_draws(draws, unit), float(np.mean(~np.isfinite(draws)))
+        q = quantity_of_draws(of(self.parts), unit)
         known = self.status is Status.converged and not (tail and self.cut)
-        return q if known and lost < LOST and of_use(q.interval_95) else q.open()
+        return q if known and of_use(q.interval_95) else q.open()
 
     @cached_property
     def density(self) -> np.ndarray:

@@ -323,7 +323,7 @@ class _Posterior(NamedTuple):
         square = np.exp(2.0 * numbers)
         return np.sqrt(square[2] * flat + square[3] * grown)
 
-    def _root(self, numbers: np.ndarray) -> tuple[np.ndarray, float]:
+    def _factored(self, numbers: np.ndarray) -> tuple[np.ndarray, float]:
         """Cholesky root of the covariance, and minus ln of evidence and prior."""
         root = cholesky(self.covariance(numbers), lower=True, overwrite_a=True, check_finite=False)
         z = (numbers - self.prior[:, 0]) / self.prior[:, 1]
@@ -333,7 +333,7 @@ class _Posterior(NamedTuple):
     def _loss(self, numbers: np.ndarray) -> tuple[float, np.ndarray]:
         """Minus ln of evidence and prior, and its slope (Rasmussen and Williams, 2006, eq. 5.9)."""
         try:
-            root, loss = self._root(numbers)
+            root, loss = self._factored(numbers)
         except np.linalg.LinAlgError:
             return 1e10, np.zeros(len(numbers))
         lower = np.tril(dpotri(root, lower=1)[0])
@@ -404,7 +404,7 @@ class _Posterior(NamedTuple):
         z = WIDER * random.normal(size=(PROPOSED * wanted, len(numbers)))
         z = z[np.argsort(z @ width[-1])]
         proposed = numbers + z @ width.T
-        log = 0.5 * np.sum(z**2, axis=1) / WIDER**2 - [self._root(at)[1] for at in proposed]
+        log = 0.5 * np.sum(z**2, axis=1) / WIDER**2 - [self._factored(at)[1] for at in proposed]
         weight = np.exp(log - log.max())
         up_to = np.cumsum(weight)
         even = (np.arange(wanted) + random.uniform()) / wanted * up_to[-1]

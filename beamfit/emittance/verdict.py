@@ -100,8 +100,8 @@ class PlaneEvidence(NamedTuple):
     def determined(self) -> bool:
         """True if they are a beam's and say its emittance."""
         sure = self.untested or self.probability[BEAM] > SURE
-        free = not self.opened and self.ending is None
-        return self.of_a_beam and sure and of_use((self.low, self.high)) and free
+        known = of_use((self.low, self.high)) and not self.opened and self.ending is None
+        return self.of_a_beam and sure and known
 
 
 def verdict(e: PlaneEvidence, remarks: str = "", advice: str = "") -> Finding:

@@ -402,6 +402,7 @@ def _search(rows: _Rows, begin: Array, widths: Array, free, kind=None, shape=Non
     return *last[:6], last.rested, weak
 
 
+# The plain law is searched again and again; what alternatives ask for runs a few times.
 QUESTION = ("free", "kind", "shape")
 _searched = jax.jit(_search, static_argnames=QUESTION)
 _searched_seldom = jax.jit(_search, static_argnames=QUESTION, compiler_options=SELDOM)
