@@ -150,10 +150,8 @@ def columns_of_images(
     """A line a bin of projections on x and y; the shorter one of each is filled with NaN."""
     bins = [max(map(len, planes)) for planes in seen]
     shot = np.repeat(np.arange(len(seen)), bins)
-    columns = {
-        "shot": shot,
-        "position_um": np.concatenate([*map(np.arange, bins)]) * pixel_um[shot],
-    }
+    place = np.concatenate([np.arange(n) for n in bins])
+    columns = {"shot": shot, "position_um": place * pixel_um[shot]}
     for i, plane in enumerate("xy"):
         columns[f"counts_{plane}"] = np.concatenate([
             np.pad(planes[i], (0, n - len(planes[i])), constant_values=np.nan)

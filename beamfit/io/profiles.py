@@ -120,9 +120,7 @@ def of_profiles(sheet: Sheet) -> tuple[Sheet, tuple[Profile, ...]]:
         if column is None:
             raise sheet.header_error(f"no position of counts_{plane}", "a column position_um")
         x, counts = sheet.values(column), sheet[f"{COUNTS}_{plane}"]
-        if not isinstance(
-            counts, np.ndarray
-        ):  # of images, NaN beyond the shorter side
+        if not isinstance(counts, np.ndarray):  # of images, NaN beyond the shorter side
             counts = sheet.numbers(f"{COUNTS}_{plane}")
         if f"{BACKGROUND}_{plane}" in sheet.names:
             counts = counts - sheet.numbers(f"{BACKGROUND}_{plane}")
