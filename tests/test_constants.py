@@ -10,7 +10,7 @@ MODULES = [
     ROOT / "beamfit" / "noise" / f"{name}.py" for name in ("learn", "model", "shots", "sizes")
 ] + [
     ROOT / "beamfit" / "emittance" / f"{name}.py"
-    for name in ("answer", "beam_draws", "comparison", "known", "next_point", "verdict")
+    for name in ("advice", "answer", "beam_draws", "comparison", "known", "verdict")
 ]
 
 

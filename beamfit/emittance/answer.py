@@ -8,13 +8,13 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import ndtri
 
+from beamfit.emittance.advice import next_measurement
 from beamfit.emittance.comparison import (
     PlanePosterior,
     emittance_quantiles,
     weighted_quantiles,
 )
 from beamfit.emittance.model import QUANTITIES, coefficients, numbers_of, phase_coverage
-from beamfit.emittance.next_point import next_measurement
 from beamfit.emittance.results import Identifiability, PlaneFit, Points, ScreenTwiss
 from beamfit.emittance.statement import Seen
 from beamfit.emittance.transport import setting_units

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from beamfit.emittance.assumptions import Assumptions
 from beamfit.emittance.beam_draws import BRIGHT
 from beamfit.emittance.model import (
     QUANTITIES,
@@ -21,10 +20,9 @@ from beamfit.emittance.model import (
     spoken,
 )
 from beamfit.emittance.results import PlaneFit
-from beamfit.emittance.statement import Scenario, Seen, asked_in, factor_of, size_records
+from beamfit.emittance.statement import Scanned, Seen, asked_in, factor_of, size_records
 from beamfit.errors import InputError
 from beamfit.greybox import tree
-from beamfit.greybox.fit import Fit
 from beamfit.greybox.posterior import predicted, target_of
 from beamfit.greybox.problem import Problem
 from beamfit.greybox.stated import Optimum, Statement
@@ -42,16 +40,6 @@ CHOLESKY, SIGMA = ("l11", "l21", "l22"), ("sigma11", "sigma12", "sigma22")
 TWISS = ("emittance", "normalized_emittance", "beta", "alpha", "mismatch")
 PLACES = np.array([list(QUANTITIES).index(name) for name in TWISS])
 OPEN = "the scan does not determine sigma11, sigma12 and sigma22"
-
-
-class Scanned(Protocol):
-    """A fitted scan, of any scenario."""
-
-    planes: tuple[PlaneFit, ...]
-    statement: Scenario
-    told: Assumptions
-    seen: Seen
-    solved: Fit | None
 
 
 def _quoted(model: Mapping[str, Any]) -> dict[str, Any]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -13,14 +13,12 @@ import numpy as np
 from beamfit.emittance.comparison import PlanePosterior, weighted_quantiles
 from beamfit.emittance.model import coefficients, emittance_parts, predict_sizes, size_squared
 from beamfit.emittance.results import PlaneFit
+from beamfit.emittance.statement import Scanned
 from beamfit.emittance.transport import Rows, padded, rows_at
 from beamfit.errors import InputError, nearest
 from beamfit.optics.rows import seen_line
 from beamfit.sampling.intervals import Correlations
 from beamfit.shown import shown
-
-if TYPE_CHECKING:
-    from beamfit.emittance.posterior import Scanned
 
 NAMES = ("sigma11", "sigma12", "sigma22", "emittance", "beta", "alpha")
 

@@ -7,14 +7,14 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib import import_module
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import numpy as np
 
 from beamfit.emittance.assumptions import SCENARIOS, Assumptions
 from beamfit.emittance.comparison import PlanePosterior, PlaneSizes
 from beamfit.emittance.model import UNIT, Asked, predict_sizes
-from beamfit.emittance.results import Parameter, Points
+from beamfit.emittance.results import Parameter, PlaneFit, Points
 from beamfit.emittance.scan import QuadScan
 from beamfit.emittance.transport import Look, Rows, padded, scan_rows
 from beamfit.greybox.problem import Free, Prior, Problem, Record
@@ -156,6 +156,16 @@ class Scenario:
     closed: bool = False
     network: bool = False
     whole_map: bool = True
+
+
+class Scanned(Protocol):
+    """A fitted scan, of any scenario."""
+
+    planes: tuple[PlaneFit, ...]
+    statement: Scenario
+    told: Assumptions
+    seen: Seen
+    solved: Fit | None
 
 
 def scenario_of(name: str) -> Scenario:

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 import beamfit
-from beamfit.emittance.design import best_steps, information_of
+from beamfit.emittance.advice import adviser_of, best_steps
 from beamfit.emittance.fit import EmittanceFit, fit_emittance
 from beamfit.emittance.scan import KNOB, QuadScan
 from beamfit.errors import InputError, plain
@@ -207,7 +207,7 @@ def next_setting(
     -------
     Next or str
         First settings over the range of the first magnet; then those that tell most, by
-        `beamfit.emittance.design`: of magnets that fewer than three points moved where there are
+        `beamfit.emittance.advice`: of magnets that fewer than three points moved where there are
         some, since a wrong line shows there alone. The middle of the largest gap where nothing can
         be fitted.
     """
@@ -220,7 +220,7 @@ def next_setting(
     if fit is not None:
         new = {name: limits[name] for name in fresh(points, machine)}
         aim = "D" if new else "emittance"  # of a new magnet whatever it gains
-        steps, stop = best_steps(fit, information_of(fit), new or limits, aim)
+        steps, stop = best_steps(fit, adviser_of(fit), new or limits, aim)
         if steps:
             wanted = steps[0].candidate.settings
             return Next(clipped(dict(before) | wanted, limits), "where it tells most")

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from beamfit.emittance.next_point import SHARPEST, candidate_settings, elements_at
+from beamfit.emittance.advice import SHARPEST, candidate_settings, elements_at
 from beamfit.emittance.statement import Seen
 from beamfit.errors import InputError
 from beamfit.tuning.knob_map import log_size
@@ -80,7 +80,7 @@ def next_row(fit: Tuned, magnets: Mapping[str, tuple[float, float]] | None = Non
     >>> NextRow({"SOL": 200.0, "Q": 3.0}, 0.5).settings["SOL"]
     200.0
     """
-    tables = [("", {})]  # an emittance needs no quadrupole
+    tables: dict[str, dict[str, np.ndarray]] = {"": {}}  # an emittance needs no quadrupole
     if fit.seen is not None:
         settings = fit.seen.scan.settings
         if not settings:
@@ -92,7 +92,7 @@ def next_row(fit: Tuned, magnets: Mapping[str, tuple[float, float]] | None = Non
     )  # fmt: skip
     goal = np.asarray(values_at(fit.draws, x[-PLACES - 1 :]))
     best = None
-    for _, table in tables:
+    for table in tables.values():
         told = _told(fit, x, table, goal)
         i, j = np.unravel_index(np.argmax(told), told.shape)
         if best is None or told[i, j] > best.information:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import beamfit
-from beamfit.emittance.design import candidate_rows, plan_measurements
+from beamfit.emittance.advice import candidate_settings, plan_measurements
 from beamfit.errors import InputError
 from beamfit.quantity import Status
 from tests.emittance.conftest import TABLE_2, design
@@ -167,8 +167,8 @@ def test_bad_wishes_are_named(known, options, words):
 def test_zero_is_not_listed_as_its_rounding(known):
     """linspace(-1.7, 1.7, 41) misses zero by 2.2e-16."""
     limits = {"Q2": (-1.7, 1.7)}
-    candidates, _ = candidate_rows(known, limits, ())
-    settings = [c.settings["Q2"] for c in candidates]
+    tables = candidate_settings(known.scan.settings, limits)
+    settings = tables["Q2"]["Q2"].tolist()
     assert 0.0 in settings
     assert min(abs(s) for s in settings if s) > 1e-3
 
