@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import betaincinv
 
-from beamfit.emittance.many import fit_many
+from beamfit.emittance.fit import fit_many
 from beamfit.emittance.scan import QuadScan
 from beamfit.optics.beamline import Beamline
 from beamfit.optics.elements import Drift, Quadrupole, Screen

@@ -148,7 +148,7 @@ class Job:
         InputError
             If there are fewer than five planes of a kind.
         """
-        from beamfit.emittance.many import noise_samples
+        from beamfit.emittance.fit import noise_samples
 
         read = (found for file in files if isinstance(found := _tried(self.read, file), Inputs))
         pairs = [(found.scan, self.line_of(found)) for found in read if len(found.scan.slices) < 2]
@@ -156,7 +156,7 @@ class Job:
         return learn_noise(list(noise_samples(pairs, self._priors)), self._priors, source)
 
     def _emittances(self, files: Iterable[str]) -> Iterator[dict[str, Any]]:
-        from beamfit.emittance.many import fit_many
+        from beamfit.emittance.fit import fit_many
 
         read = [_tried(self.read, file) for file in files]
         parts = []

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.special import ndtri
@@ -14,9 +14,15 @@ from beamfit.emittance.comparison import (
     emittance_quantiles,
     weighted_quantiles,
 )
-from beamfit.emittance.model import QUANTITIES, coefficients, numbers_of, phase_coverage
+from beamfit.emittance.model import (
+    QUANTITIES,
+    asked_places,
+    coefficients,
+    numbers_of,
+    phase_coverage,
+)
 from beamfit.emittance.results import Identifiability, PlaneFit, Points, ScreenTwiss
-from beamfit.emittance.statement import Seen
+from beamfit.emittance.statement import Seen, asked_of
 from beamfit.emittance.transport import setting_units
 from beamfit.emittance.verdict import (
     CARRIES,
@@ -42,15 +48,8 @@ LINEAR = np.isin(list(QUANTITIES), ("sigma11", "sigma12", "sigma22", "screen_siz
 # Numbers of either sign; the others are positive, and spread by a factor.
 SIGNED = np.isin(list(QUANTITIES), ("alpha", "sigma12", "screen_alpha"))
 AT = (0.025, 0.1587, 0.5, 0.8413, 0.975)
-
-
-class Places(NamedTuple):
-    """Places at which the numbers of a beam are asked for: βγ, matrices to screen and design."""
-
-    factor: float
-    to_screen: np.ndarray
-    to_design: np.ndarray
-    design: np.ndarray
+# βγ, matrices to the screen and the design's place, and the design: see `asked_places`.
+Places = tuple[Any, Any, Any, Any]
 
 
 class Beside(NamedTuple):
@@ -118,6 +117,14 @@ class Judged(NamedTuple):
     advice: str | None
 
 
+def judged_beam(seen: Seen) -> tuple[PlaneFit, ...]:
+    """Answer for each plane: nothing but the beam is unknown."""
+    return tuple(
+        plane_answer(seen, seen.line, plane, asked_places({}, asked_of(seen, plane)), None)
+        for plane in seen.planes
+    )
+
+
 def plane_answer(
     seen: Seen, line: Beamline, plane: str, places: Places, b: Beside | None
 ) -> PlaneFit:
@@ -131,8 +138,8 @@ def plane_answer(
         The line as found.
     plane : str
         "x" or "y".
-    places : Places
-        Where the beam is asked for.
+    places : tuple
+        Where the beam is asked for, from `asked_places`.
     b : Beside or None
         What a scenario adds.
 
@@ -182,7 +189,7 @@ def _numbers(
 ) -> tuple[PlaneNumbers, Influence]:
     """The numbers of a plane, and the point that carries them."""
     spread = None if b is None else b.spread
-    quantiles = _quantiles(post, tuple(places), spread)
+    quantiles = _quantiles(post, places, spread)
     value = numbers_of(post.best, *places) if b is None else b.value
     half = 0.5 * (quantiles[3] - quantiles[1])
     low, high = quantiles[0], quantiles[4]
@@ -190,7 +197,7 @@ def _numbers(
     carrying = _influence(p, post.best, half[0]) if alone else Influence()
     if abs(carrying.shift) > MOVES:
         low, high, half = _reaching(low, high, half, value, carrying.without)
-    raw = _raw(post, tuple(places))
+    raw = _raw(post, places)
     raw = raw if b is None else np.hypot(raw, b.spread)
     return PlaneNumbers(value, half, low, high, raw), carrying
 

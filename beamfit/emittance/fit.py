@@ -2,21 +2,33 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from html import escape
 from typing import TYPE_CHECKING, Any
 
 from beamfit.answer import answer, quantity_frame
+from beamfit.emittance.answer import judged_beam
 from beamfit.emittance.assumptions import Anchor, Assumptions
-from beamfit.emittance.known import METHODS, WEIGHTS, judged_beam, prepared, see
+from beamfit.emittance.comparison import BEAM
+from beamfit.emittance.known import (
+    METHODS,
+    WEIGHTS,
+    looked_through,
+    prepared,
+    see,
+    unfitted,
+    with_posteriors,
+)
 from beamfit.emittance.model import line_of
 from beamfit.emittance.predicted import Prediction, correlations_of, predicted_sizes
 from beamfit.emittance.questions import of_emittances, of_priors, questions
 from beamfit.emittance.results import Parameter, PlaneFit, parameter_rows, result_rows
 from beamfit.emittance.scan import QuadScan
 from beamfit.emittance.statement import Scenario, Seen, scenario_of
+from beamfit.emittance.verdict import SURE
 from beamfit.errors import InputError, expect
 from beamfit.greybox.problem import Problem
 from beamfit.noise.model import ROBUST, Noise
@@ -28,6 +40,7 @@ if TYPE_CHECKING:
     from pandas import DataFrame
 
     from beamfit.greybox.fit import Fit
+    from beamfit.noise.learn import Sample
     from beamfit.sampling.intervals import Correlations
     from beamfit.sampling.posterior import Posterior
     from beamfit.sampling.priors import Distribution
@@ -409,3 +422,71 @@ class EmittanceFit:
         said = (f"<p><b>{escape(p.headline)}.</b> {escape(p.message)}</p>" for p in self.planes)
         more = (f"<p>{escape(note)}</p>" for note in self.notes)
         return "".join((*said, html_of(self._table), *more))
+
+
+def fit_many(
+    scans: Iterable[tuple[QuadScan, Beamline]],
+    weights: str = WEIGHTS[0],
+    noise: Noise | None = None,
+) -> list[EmittanceFit | InputError]:
+    """Fit the emittance to each of many scans: what `fit_emittance` gives of each.
+
+    Parameters
+    ----------
+    scans : iterable of (QuadScan, Beamline)
+        The scans with their lines; hundreds at a time.
+    weights, noise
+        As for `beamfit.fit_emittance`.
+
+    Returns
+    -------
+    list of EmittanceFit or InputError
+        One a scan, in their order: its fit, or what is wrong with it.
+
+    Examples
+    --------
+    >>> from beamfit.optics.elements import Drift, Quadrupole, Screen
+    >>> line = Beamline((Quadrupole("Q", 0.1), Drift("D", 2.0), Screen("S")), 135.0)
+    >>> k1, sizes = [-1.0, 1.5, 4.0, 6.5, 9.0], np.array([3.4e-4, 1.9e-4, 0.9e-4, 1.9e-4, 3.4e-4])
+    >>> scans = [QuadScan({"Q": k1}, {"Q": "k1"}, {"x": f * sizes}) for f in (1.0, 2.0)]
+    >>> one, other = fit_many((scan, line) for scan in scans)
+    >>> round(other.x.emittance.value / one.x.emittance.value, 9)
+    4.0
+    """
+    found: list[EmittanceFit | InputError | None] = []
+    begun: dict[int, Seen] = {}
+    for i, given in enumerate(scans):
+        try:
+            begun[i] = unfitted(*prepared(*given), noise=noise, weights=weights)
+            found.append(None)
+        except InputError as error:
+            found.append(error)
+    for i, seen in zip(begun, with_posteriors(looked_through(list(begun.values()))), strict=True):
+        own = (seen.scan, seen.line, scenario_of("known"), Assumptions())
+        found[i] = EmittanceFit(judged_beam(seen), *own, seen)
+    return found
+
+
+def noise_samples(scans: Iterable[tuple[QuadScan, Beamline]], noise: Noise) -> Iterator[Sample]:
+    """Scales of the noise by the planes of many scans that are surely a beam's.
+
+    Parameters
+    ----------
+    scans : iterable of (QuadScan, Beamline)
+        Scans that cannot be used are passed over.
+    noise : Noise
+        The priors to look at them with.
+    """
+    from beamfit.noise.learn import Sample  # loads the minimiser
+
+    begun = []
+    for given in scans:
+        with suppress(InputError):
+            begun.append(unfitted(*prepared(*given), noise=noise))
+    for seen in with_posteriors(looked_through(begun)):
+        for work in seen.works.values():
+            post = work.posterior
+            if len(work.sizes.size) > 3 and post.probability[BEAM] > SURE:
+                word = work.sizes.likeness[1]
+                word = "stated" if word == "share" else word
+                yield Sample(word, post.kinds, post.scales, post.by_scale)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
@@ -10,14 +10,12 @@ import jax
 import numpy as np
 
 from beamfit.compile_cache import SELDOM
-from beamfit.emittance.answer import Places, plane_answer
 from beamfit.emittance.comparison import PlanePosterior, PlaneSizes, compare
 from beamfit.emittance.questions import check_gradients
-from beamfit.emittance.results import PlaneFit, Points
+from beamfit.emittance.results import Points
 from beamfit.emittance.scan import QuadScan, check_names
-from beamfit.emittance.statement import Scenario, Seen, Work, asked_of, beam_problem
+from beamfit.emittance.statement import Scenario, Seen, Work, beam_problem
 from beamfit.emittance.transport import (
-    Look,
     look_through,
     names_of,
     rows_line,
@@ -37,6 +35,9 @@ WEIGHTS = ("model", "measured")
 MOST_NAMED = 4
 # A share of the size from which on the scatter of shots is the beam's more than the screen's.
 UNSTEADY = 0.1
+# Scans that are looked at in one call: one, or at most so many (what spares repeats the last), as
+# far as rows times the longest of their arrays have room.
+FEW, LANES, ROOM = 16, 256, 1 << 20
 
 
 def see(
@@ -63,7 +64,9 @@ def see(
     InputError
         If the line lacks a magnet or screen of the scan, or a plane was not measured.
     """
-    return looked_through([unfitted(scan, line, planes, method, noise, weights)])[0]
+    return with_posteriors(looked_through([unfitted(scan, line, planes, method, noise, weights)]))[
+        0
+    ]
 
 
 def prepared(
@@ -114,22 +117,30 @@ def unfitted(
     return Seen(scan, line, scanned, asked, method, weights, rows, noise or Noise(), None, {})
 
 
-def one_by_one(function: Callable[..., Any], given: Iterable[tuple], *static: str) -> list[Any]:
-    """Results of a function for each, as NumPy arrays."""
-    return [jax.tree.map(np.asarray, _compiled(function, each, static)) for each in given]
+def looked_through(begun: Sequence[Seen]) -> list[Seen]:
+    """Look at scans through their lines; those whose rows have one shape are one call."""
+    found, alike = list(begun), {}
+    for i, seen in enumerate(begun):
+        leaves, kind = jax.tree.flatten(seen.rows)
+        alike.setdefault((kind, *map(np.shape, leaves)), []).append((i, leaves))
+    for (kind, *shapes), members in alike.items():
+        room = max(ROOM // max(map(np.prod, shapes)) ** 2, 1)
+        lanes = min(int(room), 1 if len(members) == 1 else FEW if len(members) <= FEW else LANES)
+        for start in range(0, len(members), lanes):
+            own = members[start : start + lanes]
+            columns = zip(
+                *(leaves for _, leaves in own + own[-1:] * (lanes - len(own))), strict=True
+            )
+            looks = jax.tree.map(np.asarray, _looks([np.stack(c) for c in columns], kind))
+            for lane, (i, _) in enumerate(own):
+                look = jax.tree.map(lambda a, lane=lane: a[lane], looks)
+                found[i] = begun[i]._replace(look=look)
+    return found
 
 
-@partial(jax.jit, static_argnums=(0, 2), compiler_options=SELDOM)
-def _compiled(function: Callable[..., Any], given: tuple, static: tuple[str, ...]) -> Any:
-    return function(*given, *static)
-
-
-def looked_through(begun: Sequence[Seen], together: Callable = one_by_one) -> list[Seen]:
-    """Look at scans through their lines, and at what their sizes say."""
-    looks = together(look_through, [(seen.rows,) for seen in begun])
-    return with_posteriors(
-        [seen._replace(look=look) for seen, look in zip(begun, looks, strict=True)]
-    )
+@partial(jax.jit, static_argnums=1, compiler_options=SELDOM)
+def _looks(columns: list, kind: Any) -> Any:
+    return jax.vmap(lambda leaves: look_through(jax.tree.unflatten(kind, leaves)))(columns)
 
 
 def with_posteriors(begun: Sequence[Seen]) -> list[Seen]:
@@ -218,20 +229,6 @@ def _shot_words(p: Points, shots: ShotMeans | None) -> str:
     are = "are" if len(lost) > 1 else "is"
     said = f"{len(lost)} of {count} shots {are} left out, no beam there: {'; '.join(places)}."
     return f"{said} {unsteady}".strip()
-
-
-def judged_beam(seen: Seen) -> tuple[PlaneFit, ...]:
-    """Answer for each plane: nothing but the beam is unknown."""
-    return tuple(
-        plane_answer(seen, seen.line, plane, places_of(seen, plane), None) for plane in seen.planes
-    )
-
-
-def places_of(seen: Seen, plane: str) -> Places:
-    """Places of a plane's numbers, magnets as the lattice has them."""
-    asked, i = asked_of(seen, plane), "xy".index(plane)
-    look: Look = seen.look
-    return Places(float(asked.factor), look.to_screen[i], look.to_design[i], asked.design)
 
 
 # Nothing but the beam is unknown; as a problem for those who want more than the posterior.

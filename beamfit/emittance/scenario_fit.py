@@ -14,7 +14,7 @@ import numpy as np
 from jax import Array
 
 from beamfit.compile_cache import SELDOM
-from beamfit.emittance.answer import SIGMA, Beside, Places, plane_answer, units_of
+from beamfit.emittance.answer import SIGMA, Beside, plane_answer, units_of
 from beamfit.emittance.assumptions import Anchor, Assumptions
 from beamfit.emittance.known import pulls, with_posteriors
 from beamfit.emittance.model import (
@@ -111,9 +111,9 @@ def _through(seen: Seen, fit: Fit) -> Seen:
     """See the scan through the line as a fit found it: each plane fitted in closed form."""
     records = size_records(fit.problem)
     elements = np.asarray(_elements(fit.model, tuple(records[p].data for p in seen.planes)))
-    look = np.array(seen.look[:3])
+    look = np.array(seen.look)
     look[:, ["xy".index(plane) for plane in seen.planes]] = np.swapaxes(elements, 0, 1)
-    return with_posteriors([seen._replace(look=Look(*look, *seen.look[3:]))])[0]
+    return with_posteriors([seen._replace(look=Look(*look))])[0]
 
 
 def judged_scenario(
@@ -140,7 +140,7 @@ def judged_scenario(
         work = seen.works[plane]
         points = _points_at(work, own.value[SIGMA], seen.rows.squared)
         now = seen._replace(works=seen.works | {plane: work._replace(points=points)})
-        at = Places(*map(np.asarray, places[i]))
+        at = tuple(map(np.asarray, places[i]))
         beams.append(plane_answer(now, line, plane, at, beside))
     return tuple(beams)
 

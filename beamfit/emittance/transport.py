@@ -155,10 +155,7 @@ class Rows:
         """R11, R12 and R16 of both planes, shape (2, n, 3), by a line, unless they are given."""
         if self.given is not None:
             return self.given
-        return self.at_screens(transfer_rows(line, self.settings, energy, self.places).planes)
-
-    def at_screens(self, planes: Array) -> Array:
-        """R11, R12 and R16 of both planes as `given`, from matrices (n, 2, places, 3, 3)."""
+        planes = transfer_rows(line, self.settings, energy, self.places).planes
         return jnp.moveaxis(planes[jnp.arange(len(self.energy)), :, self.which, 0], 1, 0)
 
     def known(
@@ -322,41 +319,23 @@ def damping_of(energy: np.ndarray, mean: float, mass: float) -> np.ndarray:
 
 
 class Look(NamedTuple):
-    """Both planes of a scan's rows through a line, shape (2, rows), and further along it.
+    """Both planes of a scan's rows through a line, each of shape (2, rows).
 
     Attributes
     ----------
     r11, r12, known : Array
         Transfer-matrix elements to the screens (R12 in m), size² not due to the beam, m².
-    to_screen, to_design : Array
-        Shape (2, 3, 3): start to the scan's last screen and to the design's place, magnets as the
-        lattice sets them.
     """
 
     r11: Array
     r12: Array
     known: Array
-    to_screen: Array
-    to_design: Array
 
 
 def look_through(rows: Rows) -> Look:
     """Carry the rows of a scan to their screens, in both planes and one pass."""
-    line = rows.line
-    last = rows.places[-1]
-    places = (*rows.places, line.design.at) if line.design else rows.places
-    places = tuple(dict.fromkeys(places))
-    settings = {n: jnp.append(v, line[n].setting) for n, v in rows.settings.items()}
-    energy = jnp.append(rows.energy, line.energy)
-    every = transfer_rows(line, settings, energy, places).planes
-    given = rows.at_screens(every[:-1]) if rows.given is None else rows.given
-    seen, own = [rows.known(r) for r in given], every[-1]
-    at = places.index(line.design.at) if line.design else 0
-    return Look(
-        *(jnp.stack(part) for part in zip(*seen, strict=True)),
-        own[:, places.index(last)],
-        own[:, at],
-    )
+    seen = [rows.known(r) for r in rows.both(rows.line, rows.energy)]
+    return Look(*(jnp.stack(part) for part in zip(*seen, strict=True)))
 
 
 def setting_units(line: Beamline, magnets: Iterable[str]) -> dict[str, str]:

@@ -10,10 +10,9 @@ import numpy as np
 
 from beamfit.emittance.beam_draws import Coordinates, coordinates
 from beamfit.emittance.comparison import LEVEL, STEPS
-from beamfit.emittance.known import one_by_one, plane_sizes, prepared, unfitted
+from beamfit.emittance.known import looked_through, plane_sizes, prepared, unfitted
 from beamfit.emittance.scan import QuadScan
 from beamfit.emittance.statement import Seen
-from beamfit.emittance.transport import look_through
 from beamfit.greybox.problem import padded_length
 from beamfit.noise.model import LN_2PI, Noise
 from beamfit.noise.sizes import kinds_of
@@ -30,8 +29,7 @@ NODES = np.linspace(-2.5, 2.5, 11)
 def seen_without(scan: QuadScan, line: Beamline | None, knobs: Knobs, noise: Noise | None) -> Seen:
     """The scan through its line; the knobs are no magnets of it."""
     scan, line = prepared(scan.without_settings(knobs.names), line)
-    seen = unfitted(scan, line, noise=noise)
-    return seen._replace(look=one_by_one(look_through, [(seen.rows,)])[0])
+    return looked_through([unfitted(scan, line, noise=noise)])[0]
 
 
 class PlaneReadings(NamedTuple):

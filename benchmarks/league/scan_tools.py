@@ -9,7 +9,7 @@ import numpy as np
 from scipy.optimize import curve_fit, minimize
 
 import beamfit
-from beamfit.emittance.many import fit_many
+from beamfit.emittance.fit import fit_many
 from beamfit.emittance.sensitivity import systematics
 
 from .. import verdict

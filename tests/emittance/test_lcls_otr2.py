@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import beamfit
-from beamfit.emittance.known import places_of
-from beamfit.emittance.model import QUANTITIES, numbers_of
+from beamfit.emittance.model import QUANTITIES, asked_places, numbers_of
+from beamfit.emittance.statement import asked_of
 from beamfit.quantity import Status
 
 
@@ -28,8 +28,7 @@ def least_squares(fit, plane, size, error):
     p = fit[plane].points
     found = beamfit.fit_sizes(p.r11, p.r12, size, error, weights="measured")
     scale = np.sqrt(float(found.chi2) / (len(size) - 3))
-    at = places_of(fit.seen, plane)
-    given = at.factor, at.to_screen, at.to_design, at.design
+    given = asked_places({}, asked_of(fit.seen, plane))
     sigma, covariance = np.asarray(found.sigma), np.asarray(found.covariance)
     unit = np.sqrt(np.diag(covariance))
     steps = np.array(sigma, complex)[:, None] + 1e-20j * np.diag(unit)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import beamfit
-from beamfit.emittance.many import fit_many
+from beamfit.emittance.fit import fit_many
 
 
 def same(one, other, where=""):

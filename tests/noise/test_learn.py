@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import beamfit
-from beamfit.emittance.many import noise_samples
+from beamfit.emittance.fit import noise_samples
 from beamfit.emittance.scan import QuadScan
 from beamfit.emittance.transport import rows_line
 from beamfit.errors import InputError
