@@ -23,7 +23,7 @@ from beamfit.emittance.fit import EmittanceFit
 from beamfit.emittance.known import WEIGHTS
 from beamfit.emittance.model import coefficients
 from beamfit.emittance.results import PlaneFit, Points
-from beamfit.emittance.sigma import FURTHEST, error_at
+from beamfit.emittance.sigma import error_at, weighed_size
 from beamfit.emittance.statement import varied_magnets
 from beamfit.emittance.transport import Rows
 from beamfit.optics.beamline import Beamline
@@ -128,15 +128,15 @@ def systematics(fit: EmittanceFit, plane: str) -> list[BudgetChange]:
     result = fit[plane]
     if result.emittance.error is None:
         return []
-    rows, p = fit.seen.rows, result.points
-    keep = fit.seen.measured(plane)
+    rows, p, keep = fit.seen.rows, result.points, fit.seen.measured(plane)
+    # Used, size, error and weight of each row; those of other rows count for nothing.
+    points = np.vstack([np.zeros(len(rows.energy)), np.ones((3, len(rows.energy)))])
+    points[:, keep] = np.ones(len(keep)), p.size, p.error, p.weighed
     sigma = np.array([q.value for q in result.sigma])
-    by_rows = np.zeros((3, len(rows.energy)))
-    by_rows[:, keep] = _by_rows(p, sigma, rows.squared, fit.seen.weights == WEIGHTS[0])
     line = fit.seen.scanned.stored_by_kind((*rows.settings, *rows.places))
-    upright = np.array(plane == "y")
-    slopes = _slopes(replace(rows, line=line), upright, tuple(by_rows))
-    by_parts, by_energy, *by_row = slopes
+    given = points, sigma, np.array(plane == "y"), np.array(p.relative)
+    slopes = _slopes(replace(rows, line=line), *given, fit.seen.weights == WEIGHTS[0])
+    by_parts, by_energy, *by_row, by_known = slopes
     changes = {_magnet_cause(fit, name): 0.0 for name in rows.settings}
     upstream = {e.name for e in fit.seen.scanned.upto(result.screen.name).elements}
     for element, slope in _by_element(fit.seen.scanned, line, by_parts):
@@ -146,7 +146,7 @@ def systematics(fit: EmittanceFit, plane: str) -> list[BudgetChange]:
     energy, mass = fit.seen.energy, fit.line.mass
     changes[of_energy := _energy_cause(energy, mass)] = 0.01 * float(by_energy)
     changes |= _within_scan(fit.seen.rows, len(fit.scan), *by_row)
-    changes |= _of_screen(fit, p, by_rows[2, keep])
+    changes |= _of_screen(fit, p, np.asarray(by_known)[keep])
     # ln βγ rises by E²/(E² - m²) for each relative step of the energy.
     stiffer = 0.01 * energy**2 / (energy**2 - mass**2)
     # What is zero but for rounding is zero, and keeps its place.
@@ -255,73 +255,51 @@ def _of_screen(fit: EmittanceFit, p: Points, by_known: np.ndarray) -> dict[str, 
     }
 
 
-def _by_rows(p: Points, sigma: np.ndarray, squared: bool, follows: bool) -> np.ndarray:
-    """Derivatives of ln ε of the fit by R11, R12 and known size² of every point, shape (3, n).
-
-    At the answer the weighted residuals F(σ, rows) = Σ f(m²) ∂m²/∂σ vanish, so dσ =
-    -(∂F/∂σ)⁻¹ ∂F/∂rows: exact for either residual, without differentiating the solver, weights
-    that follow the model included.
-    """
-    design = np.stack(coefficients(p.r11, p.r12), -1)
-    pull, steep = _pulls(p, design @ sigma + p.known, squared, follows)
-    unit = np.abs(sigma)
-    of_sigma = (design * unit).T * steep @ (design * unit)
-    s11, s12, s22 = sigma
-    by_sigma = np.array([s22, -2.0 * s12, s11]) * unit / (2.0 * (s11 * s22 - s12**2))
-    w11, w12, w22 = -unit * np.linalg.solve(of_sigma, by_sigma)
-    by_squared = (design @ np.array([w11, w12, w22])) * steep
-    by_r11 = pull * (p.r11 * w11 + p.r12 * w12) + by_squared * (p.r11 * s11 + p.r12 * s12)
-    by_r12 = pull * (p.r11 * w12 + p.r12 * w22) + by_squared * (p.r11 * s12 + p.r12 * s22)
-    return np.stack([2.0 * by_r11, 2.0 * by_r12, by_squared])
-
-
-def _pulls(
-    p: Points, m2: np.ndarray, squared: bool, follows: bool
-) -> tuple[np.ndarray, np.ndarray]:
-    """f of every point's predicted size², whose products with ∂m²/∂σ add to zero, and f'."""
-    if not squared:
-        size = np.sqrt(m2)
-        return (1.0 - p.size / size) / p.error**2, p.size / (2.0 * size**3 * p.error**2)
-    low, high = p.size / FURTHEST, p.size * FURTHEST
-    size = np.clip(np.sqrt(m2), low, high)
-    moves = follows * ((size > low) & (size < high)) / (2.0 * size)
-    at = size if follows else p.weighed
-    grown = error_at(at, p.weighed, 1.0, p.relative)
-    weight = (at * grown * p.error) ** -2
-    # How ln(at grown), the error of size², goes with m².
-    error = moves * (1.0 / at + p.relative / (p.weighed * grown))
-    off = m2 - p.size**2
-    return off * weight, weight * (1.0 - 2.0 * off * error)
-
-
-@partial(jax.jit, compiler_options=SELDOM)
+@partial(jax.jit, static_argnames="follows", compiler_options=SELDOM)
 def _slopes(
-    rows: Rows, upright: Array, by_rows: tuple[Array, ...]
-) -> tuple[list[Array], Array, Array, dict[str, Array]]:
-    """Derivatives of ln ε by the parts of the line and ln E, and by ln E and the settings of every
-    row, from those by R11, R12 and known size² of every row.
+    rows: Rows, points: Array, sigma: Array, upright: Array, relative: Array, follows: bool
+) -> tuple[list[Array], Array, Array, dict[str, Array], Array]:
+    """Derivatives of ln ε of the fit by the parts of the line and ln E, and by ln E, the settings
+    and the known size² of every row.
 
+    At the answer the weighted residuals F = Σ f(m²) ∂m²/∂σ vanish, so dσ = -(∂F/∂σ)⁻¹ dF: exact
+    for either residual, without differentiating the solver, weights that follow the model included.
     One reverse pass carries them back to every number of the line, however long it is.
     """
 
-    def elements(
-        changes: list[Array], factor: Array, drift: Array, settings: dict[str, Array]
-    ) -> tuple[Array, ...]:
+    def residuals(
+        sigma: Array, changes: list[Array], factor: Array, drift: Array,
+        settings: dict[str, Array], further: Array,
+    ) -> Array:  # fmt: skip
         own, mass = rows.energy * (1.0 + drift), rows.line.mass
         # A row of higher energy has a smaller beam: its normalised emittance is the scan's.
         smaller = ((rows.energy**2 - mass**2) / (own**2 - mass**2)) ** 0.25
         moved = replace(rows, settings=settings, damping=rows.damping * smaller)
         x, y = moved.both(_moved(rows.line, iter(changes)), own * factor)
         # Either plane in one program, which is compiled once.
-        return moved.known(jnp.where(upright, y, x))
+        r11, r12, known = moved.known(jnp.where(upright, y, x))
+        design = jnp.stack(coefficients(r11, r12), -1)
+        return pulls(design @ sigma + known + further) @ design
+
+    def pulls(m2: Array) -> Array:
+        """Multiples of ∂m²/∂σ of each point that add to zero at the answer."""
+        used, size, error, weighed = points
+        if not rows.squared:
+            return used * (1.0 - size / jnp.sqrt(m2)) / error**2
+        at = weighed_size(size, m2) if follows else weighed
+        return used * (m2 - size**2) / (at * error_at(at, weighed, error, relative)) ** 2
 
     kinds = (
         k for e in rows.line.elements for k in (e.kinds if isinstance(e, ElementSeries) else (e,))
     )
-    still = [jnp.zeros(_shape(kind)) for kind in kinds if not isinstance(kind, Marker)]
+    changes = [jnp.zeros(_shape(kind)) for kind in kinds if not isinstance(kind, Marker)]
     none = jnp.zeros(len(rows.energy))
-    _, back = jax.vjp(elements, still, jnp.ones(()), none, rows.settings)
-    return back(by_rows)
+    still = changes, jnp.ones(()), none, rows.settings, none
+    unit = jnp.abs(sigma)
+    by_sigma = jax.jacobian(residuals)(sigma, *still) * unit[:, None] * unit
+    slope = unit * jax.grad(lambda s: 0.5 * jnp.log(s[0] * s[2] - s[1] ** 2))(sigma)
+    back = -unit * jnp.linalg.solve(by_sigma.T, slope)
+    return jax.grad(lambda still: back @ residuals(sigma, *still))(still)
 
 
 def _shape(kind: Element) -> tuple[int, ...]:
