@@ -20,7 +20,7 @@ from beamfit.table import text_of
 
 if TYPE_CHECKING:
     from beamfit.cli.show import Terminal
-    from beamfit.emittance.setpoint_result import Setpoint
+    from beamfit.emittance.setpoint import Setpoint
     from beamfit.io.lattice import LatticeFile
 
 EXAMPLE = """\b

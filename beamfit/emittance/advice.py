@@ -30,7 +30,8 @@ from beamfit.emittance.results import PlaneFit, in_words
 from beamfit.emittance.statement import Scanned, Seen, size_records, varied_magnets
 from beamfit.emittance.transport import NetworkRows, Rows, rows_at, setting_units
 from beamfit.emittance.verdict import PlaneEvidence
-from beamfit.errors import InputError, nearest
+from beamfit.emittance.wishes import check_limits
+from beamfit.errors import InputError
 from beamfit.greybox import assess
 from beamfit.greybox.covariance import MOST_SHARE
 from beamfit.greybox.design import Information, greedy, rows_of
@@ -405,27 +406,18 @@ def adviser_of(fit: Scanned) -> Adviser:
     return drawn_adviser(fit.seen, fit.planes) if fit.solved is None else linear_adviser(fit)
 
 
-def check_limits(fit: Scanned, limits: Mapping[str, tuple[float, float]] | None) -> None:
-    """Refuse limits of magnets that cannot be set, and a scan for which none can be told.
-
-    Raises
-    ------
-    InputError
-        If limits name no magnet of the line, or are reversed.
-    """
-    scan, magnets, varied = fit.seen.scan, fit.seen.scanned.magnets, varied_magnets(fit.seen.scan)
+def _check_settable(fit: Scanned, limits: Mapping[str, tuple[float, float]]) -> None:
+    """Refuse a scan for which no settings can be told, and magnets that cannot be set."""
+    scan, varied = fit.seen.scan, varied_magnets(fit.seen.scan)
     if scan.transfer:
         found = "advice on rows with matrices of their own"
         raise scan.unusable(found, "a lattice in which other settings can be tried")
     if not limits and not varied:
         found = "advice on a scan that moved no magnet"
         raise scan.unusable(found, "limits of a magnet, such as --vary Q1=LOW:HIGH")
-    for name, (low, high) in (limits or {}).items():
-        if name not in magnets:
-            raise InputError(f"limits of '{name}'", nearest(name, list(magnets)) + ", a magnet")
-        if not (np.isfinite(low) and np.isfinite(high) and low < high):
-            raise InputError(f"limits {low:g}:{high:g} of {name}", "finite limits, lower first")
-        if not fit.statement.whole_map and name not in varied:
+    check_limits(fit.seen.scanned, limits)
+    for name in () if fit.statement.whole_map else limits:
+        if name not in varied:
             raise InputError(f"limits of '{name}', which was not scanned", "a scanned magnet")
 
 
@@ -746,7 +738,7 @@ def best_steps(
     energies: tuple[float, ...] = (),
 ) -> tuple[tuple[Outcome, ...], str]:
     """The best measurement, the best after that, and why the list ends."""
-    check_limits(fit, limits)
+    _check_settable(fit, limits or {})
     candidates, rows = adviser.candidates(limits, _screens(fit), energies)
     aim = "" if goal is None else f"goal of {100 * goal:.3g} %"
     now, steps = adviser.information, []

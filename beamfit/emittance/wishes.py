@@ -144,8 +144,7 @@ def checked_place(
         raise InputError("no target", "a size, a divergence or a match")
     if not vary:
         raise InputError("no magnet to vary", f"some of {', '.join(line.magnets)}")
-    for name, limits in vary.items():
-        _check_limits(line, name, *limits)
+    check_limits(line, vary)
     if screen is None and not line.screens:
         raise InputError("a line without a screen", "a screen where the beam is wanted")
     place = line.screens[-1] if screen is None else screen
@@ -167,11 +166,13 @@ def checked_place(
     return place
 
 
-def _check_limits(line: Beamline, name: str, low: float, high: float) -> None:
-    if name not in line.magnets:
-        raise InputError(f"no magnet '{name}' in the line", nearest(name, list(line.magnets)))
-    if not (math.isfinite(low) and math.isfinite(high) and low < high):
-        raise InputError(f"limits {low:g}:{high:g} of {name}", "finite limits, lower first")
+def check_limits(line: Beamline, limits: Mapping[str, tuple[float, float]]) -> None:
+    """Refuse limits of what is no magnet of the line, and such as no setting is within."""
+    for name, (low, high) in limits.items():
+        if name not in line.magnets:
+            raise InputError(f"no magnet '{name}' in the line", nearest(name, list(line.magnets)))
+        if not (math.isfinite(low) and math.isfinite(high) and low < high):
+            raise InputError(f"limits {low:g}:{high:g} of {name}", "finite limits, lower first")
 
 
 def _check_target(beams: Mapping[str, Beam], target: Target) -> None:
