@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import lru_cache
 from typing import NamedTuple
 
+import jax
 import numpy as np
 
 from beamfit.emittance.beam_draws import (
@@ -78,7 +80,7 @@ def flat_beam(c: Coordinates, kind: NoiseKind, noise: Noise) -> np.ndarray:
     w = np.take_along_axis(w, order[..., None], -2)
     size, known = (np.take_along_axis(v, order, -1) for v in (c.size, c.known))
     own = (np.take_along_axis(v, order, -1) for v in (kind.floor, kind.unit, kind.usual))
-    kind = kind._replace(**dict(zip(("floor", "unit", "usual"), own, strict=True)))
+    kind = replace(kind, **dict(zip(("floor", "unit", "usual"), own, strict=True)))
     target = np.sqrt(np.maximum(size**2 - known, 0.0))
     scale = kind.special or kind.prior.middle
     deviation = np.hypot(kind.floor, scale * kind.unit) * (size if kind.power else 1.0)
@@ -160,8 +162,10 @@ def curve_evidences(u: np.ndarray, c: Coordinates, kind: NoiseKind, noise: Noise
     n = c.size.shape[-1]
     x = np.log(c.size)
     # In ln size the noise of one size for all is a share of it.
-    own = kind if kind.power else kind._replace(floor=kind.floor / c.size, unit=kind.unit / c.size)
-    flat = own._replace(power=0)
+    own = kind
+    if not kind.power:
+        own = replace(kind, floor=kind.floor / c.size, unit=kind.unit / c.size)
+    flat = replace(own, power=0)
     mean = x.mean(-1)
     levels = np.linspace(-4.0, 4.0, 65)
     spread = np.maximum(x.std(-1, ddof=1), 0.02)[..., None] / math.sqrt(n) * 2.5
@@ -456,7 +460,7 @@ def _evidences(s: _Stack, i: int, draws: BeamDraws, noise: Noise) -> np.ndarray:
     if not kind.power:
         flat = flat_beam(s.c, kind, noise)
     elif len(s.kinds) == 1:
-        flat = flat_beam(s.c, kind._replace(power=0, unit=kind.unit * s.c.size), noise)
+        flat = flat_beam(s.c, replace(kind, power=0, unit=kind.unit * s.c.size), noise)
     jacobian = np.log(s.c.size).sum(-1)
     curves = curve_evidences(s.u, s.c, kind, noise)
     near = beam + jacobian + departure_odds(draws.best, s.u, s.c, kind)
@@ -579,17 +583,12 @@ def _posterior(
         relative=float(sum(w * k.power for w, k in zip(of_kind, s.kinds, strict=True))),
         chi2=chi2,
         seen=bool(c.seen),
-        kinds=tuple(_of_plane(k, i) for k in s.kinds),
+        kinds=jax.tree.map(lambda part: part[i], s.kinds),
         scales=tuple(Scales(*(part[i] for part in d.scales)) for d in draws),
         by_scale=tuple(d.by_scale[i] for d in draws),
         unit=unit,
         trace=np.array([trace[0, 0], 2.0 * trace[0, 1], trace[1, 1]]),
     )
-
-
-def _of_plane(kind: NoiseKind, i: int) -> NoiseKind:
-    """A kind of noise of one plane of many."""
-    return kind._replace(floor=kind.floor[i], unit=kind.unit[i], usual=kind.usual[i])
 
 
 def _covariance(rows: np.ndarray) -> np.ndarray:

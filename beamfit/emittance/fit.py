@@ -24,10 +24,10 @@ from beamfit.emittance.known import (
 )
 from beamfit.emittance.model import line_of
 from beamfit.emittance.predicted import Prediction, correlations_of, predicted_sizes
-from beamfit.emittance.questions import of_emittances, of_priors, questions
 from beamfit.emittance.results import Parameter, PlaneFit, parameter_rows, result_rows
 from beamfit.emittance.scan import QuadScan
 from beamfit.emittance.statement import Scenario, Seen, scenario_of
+from beamfit.emittance.transport import of_emittances, of_priors, questions
 from beamfit.emittance.verdict import SURE
 from beamfit.errors import InputError, expect
 from beamfit.greybox.problem import Problem

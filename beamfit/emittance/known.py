@@ -11,11 +11,11 @@ import numpy as np
 
 from beamfit.compile_cache import SELDOM
 from beamfit.emittance.comparison import PlanePosterior, PlaneSizes, compare
-from beamfit.emittance.questions import check_gradients
 from beamfit.emittance.results import Points
 from beamfit.emittance.scan import QuadScan, check_names
 from beamfit.emittance.statement import Scenario, Seen, Work, beam_problem
 from beamfit.emittance.transport import (
+    check_gradients,
     look_through,
     names_of,
     rows_line,

@@ -26,8 +26,8 @@ from beamfit.greybox import tree
 from beamfit.greybox.posterior import predicted, target_of
 from beamfit.greybox.problem import Problem
 from beamfit.greybox.stated import Optimum, Statement
-from beamfit.noise.model import Lognormal, Noise
-from beamfit.noise.sizes import NoiseKind, averaged, log_likelihood
+from beamfit.noise.model import Noise
+from beamfit.noise.sizes import NoiseKind, Scales, averaged, log_likelihood
 from beamfit.optics.beam import BeamMatrix
 from beamfit.quantity import Status
 from beamfit.sampling.intervals import Expected
@@ -59,29 +59,6 @@ def _own(model: Mapping[str, Any]) -> dict[str, Any]:
     return {**model, "beam": beams}
 
 
-@tree.node("power", "special", "chance", "least", "log_weight", "prior")
-class AveragedNoise:
-    """One kind of noise of a plane with its nodes, in units of the mean size."""
-
-    power: int
-    special: float
-    chance: float
-    least: float
-    log_weight: float
-    prior: tuple[float, float]
-    floor: Any
-    unit: Any
-    usual: Any
-    scale: Any
-    log_scale_weight: Any
-
-    @property
-    def kind(self) -> NoiseKind:
-        """The same as the likelihood takes it."""
-        named = (self.power, self.floor, self.unit, self.usual, Lognormal(*self.prior))
-        return NoiseKind(*named, self.special, self.chance, self.least, self.log_weight)
-
-
 @tree.node("plane", "noise")
 class PlaneLikelihood:
     """The sizes of a plane for its likelihood: where its rows are, what was measured, its noise."""
@@ -93,7 +70,8 @@ class PlaneLikelihood:
     size: Any
     unit: Any
     trace: Any
-    kinds: tuple[AveragedNoise, ...]
+    kinds: tuple[NoiseKind, ...]
+    scales: tuple[Scales, ...]
 
     def log_density(self, model: Mapping[str, Any]) -> Array:
         """Log likelihood of the sizes, the noise averaged over, with the prior of the beam."""
@@ -101,9 +79,9 @@ class PlaneLikelihood:
         squared = size_squared(sigma, *(v[self.used] for v in self.rows.elements(model)))
         found = jnp.sqrt(jnp.maximum(squared, 1e-300))[None] / self.unit
         off, parts = self.size[None] - found, []
-        for each in self.kinds:
-            log = log_likelihood(off, found, each.kind, each.scale, self.noise)[0]
-            parts.append(averaged(log, each.log_scale_weight) + each.log_weight)
+        for kind, nodes in zip(self.kinds, self.scales, strict=True):
+            log = log_likelihood(off, found, kind, nodes.scale, self.noise)[0]
+            parts.append(averaged(log, nodes.log_weight) + kind.log_weight)
         bright = jnp.log(jnp.maximum(self.trace @ sigma, 1e-300))
         determinant = jnp.maximum(sigma[0] * sigma[2] - sigma[1] ** 2, 1e-300)
         prior = -2.0 * bright - 0.5 * (bright / BRIGHT) ** 2 - 0.5 * jnp.log(determinant)
@@ -128,15 +106,8 @@ def _sizes_of(problem: Problem, seen: Seen, planes: Sequence[str]) -> tuple[Plan
     for plane in planes:
         work = seen.works[plane]
         post = work.posterior
-        kinds = [
-            AveragedNoise(
-                k.power, k.special, k.chance, k.least, k.log_weight, tuple(k.prior), k.floor,
-                k.unit, k.usual, nodes.scale, nodes.log_weight,
-            )
-            for k, nodes in zip(post.kinds, post.scales, strict=True)
-        ]  # fmt: skip
         at, size = seen.measured(plane), work.sizes.size / post.unit
-        own = (records[plane].data, at, size, post.unit, post.trace, tuple(kinds))
+        own = (records[plane].data, at, size, post.unit, post.trace, post.kinds, post.scales)
         found.append(PlaneLikelihood(plane, seen.noise.of_points(len(size)), *own))
     return tuple(found)
 

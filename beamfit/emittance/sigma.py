@@ -14,46 +14,13 @@ import jax.numpy as jnp
 from jax import Array
 from jax.typing import ArrayLike
 
-from beamfit.emittance.model import coefficients, size_squared
+from beamfit.emittance.model import coefficients
 from beamfit.shown import shown
 
 # A direction of σ is lost when its diagonal of R is this far below the largest.
 _RANK = 1e-10
 # How often weights are taken anew from the model, and how far its size may be from the measured.
 ROUNDS, FURTHEST = 6, 3.0
-
-
-class SizeData(NamedTuple):
-    """One scan in one plane, as the fit sees it.
-
-    Attributes
-    ----------
-    r11 : Array
-        Shape (n,), start of line to screen.
-    r12 : Array
-        Shape (n,), m.
-    known : Array
-        Shape (n,), m²: size² not due to σ (dispersion and resolution).
-    size : Array
-        Shape (n,), rms sizes in m.
-    error : Array
-        Shape (n,), their standard errors in m; infinite takes a point out.
-    relative : Array
-        Shape () or (n,): 1 where the error is a share of the size, so that it grows with the
-        model's size; 0 where it is as it stands.
-    """
-
-    r11: Array
-    r12: Array
-    known: Array
-    size: Array
-    error: Array
-    relative: ArrayLike = 0.0
-
-    @property
-    def design(self) -> Array:
-        """Coefficients of σ11, σ12, σ22 in size², shape (n, 3)."""
-        return jnp.stack(coefficients(self.r11, self.r12), axis=-1)
 
 
 @shown
@@ -83,58 +50,6 @@ class SigmaFit(NamedTuple):
     determinant_error: Array
     full_rank: Array
     positive: Array
-
-
-def solve_size_squared(data: SizeData, weights: str = "model") -> SigmaFit:
-    """Fit size² by weighted linear least squares: the report's ``error_linear``.
-
-    Parameters
-    ----------
-    data : SizeData
-        One scan in one plane.
-    weights : {"model", "measured"}
-        Whose size the error of size² is taken at.
-
-    Returns
-    -------
-    SigmaFit
-        The best symmetric matrix, which is a beam's where it is positive definite.
-
-    Notes
-    -----
-    Residual (model² - size²)/(2 size error): Appendix A of the report. QR of the scaled
-    design, so that its condition is not squared. With the measured size in the weights a size
-    that noise made small counts for more, which makes σ small by 3 r² to 7 r² for a relative
-    noise r, however many points there are; the model's size has no part in the noise.
-    """
-    size, error = _weighed(data, weights)
-    scale = 0.5 / (size * error)
-    target, design = (data.size**2 - data.known) * scale, data.design * scale[:, None]
-    sigma, covariance, full_rank = _least_squares(design, target)
-    determinant, determinant_error = _determinant(sigma, covariance)
-    positive = full_rank & (determinant > 0.0) & (sigma[0] > 0.0)
-    chi2 = jnp.sum((design @ sigma - target) ** 2)
-    return SigmaFit(sigma, covariance, chi2, determinant, determinant_error, full_rank, positive)
-
-
-def _determinant(sigma: Array, covariance: Array) -> tuple[Array, Array]:
-    """Determinant of the beam matrix, with its error."""
-    gradient = jnp.stack([sigma[2], -2.0 * sigma[1], sigma[0]])
-    return sigma[0] * sigma[2] - sigma[1] ** 2, jnp.sqrt(gradient @ covariance @ gradient)
-
-
-def _weighed(data: SizeData, weights: str) -> tuple[Array, Array]:
-    """Sizes to take the error of size² at, and errors there: of a model fitted with the last."""
-
-    def again(_: int, size: Array) -> Array:
-        scale = 0.5 / (size * error_at(size, data.size, data.error, data.relative))
-        target = (data.size**2 - data.known) * scale
-        sigma = _least_squares(data.design * scale[:, None], target)[0]
-        return weighed_size(data.size, size_squared(sigma, data.r11, data.r12, data.known))
-
-    rounds = ROUNDS if weights == "model" else 0
-    size = jax.lax.fori_loop(0, rounds, again, data.size)
-    return size, error_at(size, data.size, data.error, data.relative)
 
 
 def weighed_size(measured: Array, squared: Array) -> Array:
@@ -223,6 +138,14 @@ def fit_sizes(
     SigmaFit
         Arrays with the leading shape of ``size``.
 
+    Notes
+    -----
+    Weighted linear least squares, the report's ``error_linear``: residual (model² - size²)/(2 size
+    error), Appendix A. QR of the scaled design, so that its condition is not squared. With the
+    measured size in the weights a size that noise made small counts for more, which makes σ small
+    by 3 r² to 7 r² for a relative noise r, however many points there are; the model's size has no
+    part in the noise.
+
     Examples
     --------
     Ten thousand simulated scans of one line:
@@ -238,8 +161,32 @@ def fit_sizes(
     arrays = jnp.broadcast_arrays(*(jnp.asarray(v, float) for v in given))
 
     def one(*columns: Array) -> SigmaFit:
-        return solve_size_squared(SizeData(*columns), weights)
+        return _fit(*columns, weights)
 
     for _ in arrays[0].shape[:-1]:
         one = jax.vmap(one)
     return one(*arrays)
+
+
+def _fit(
+    r11: Array, r12: Array, known: Array, size: Array, error: Array, relative: Array, weights: str
+) -> SigmaFit:
+    """Fit one scan in one plane, all arrays of shape (n,)."""
+    rows = jnp.stack(coefficients(r11, r12), axis=-1)
+
+    def fitted(at: Array) -> tuple[Array, ...]:
+        scale = 0.5 / (at * error_at(at, size, error, relative))
+        target, design = (size**2 - known) * scale, rows * scale[:, None]
+        return *_least_squares(design, target), design, target
+
+    def again(_: int, at: Array) -> Array:
+        return weighed_size(size, rows @ fitted(at)[0] + known)
+
+    at = jax.lax.fori_loop(0, ROUNDS if weights == "model" else 0, again, size)
+    sigma, covariance, full_rank, design, target = fitted(at)
+    determinant = sigma[0] * sigma[2] - sigma[1] ** 2
+    gradient = jnp.stack([sigma[2], -2.0 * sigma[1], sigma[0]])
+    positive = full_rank & (determinant > 0.0) & (sigma[0] > 0.0)
+    chi2 = jnp.sum((design @ sigma - target) ** 2)
+    error = jnp.sqrt(gradient @ covariance @ gradient)
+    return SigmaFit(sigma, covariance, chi2, determinant, error, full_rank, positive)

@@ -124,7 +124,7 @@ def understand(
     content = read(path, **reading)
     facts, notes = told(content), tuple(getattr(content, "notes", ()))
     if kind == "scan":
-        from beamfit.emittance.questions import of_sizes
+        from beamfit.emittance.transport import of_sizes
 
         notes += tuple(of_sizes(content))
         if is_emittance_gui(path):
@@ -170,8 +170,10 @@ def with_lattice(scan: Understood, lattice: Understood) -> Understood:
     except InputError as error:
         said = str(replace(error, path=None))
         return replace(scan, facts=(*scan.facts, Fact(label, said, {"fits": False, "why": said})))
-    from beamfit.emittance.questions import questions  # JAX from here on
-    from beamfit.emittance.transport import scanned_line
+    from beamfit.emittance.transport import (
+        questions,  # JAX from here on
+        scanned_line,
+    )
 
     line = build_line(lattice.content)
     own = scan.content.of_particle(line.mass)

@@ -6,10 +6,12 @@ One-plane functions of NumPy or JAX arrays; leading axes are planes and draws.
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from beamfit.nodes import registered
 from beamfit.noise.model import LN_2PI, Lognormal, Noise
 
 # Nodes over the scale of the noise, and how far below its peak the likelihood still counts.
@@ -20,7 +22,8 @@ REACH = 4.5
 CLEAR, AT_ONCE = 36.0, 16
 
 
-class NoiseKind(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class NoiseKind:
     """One kind of noise: a point's standard deviation is (floor² + (s unit)²)^½ model^power.
 
     Attributes
@@ -52,6 +55,10 @@ class NoiseKind(NamedTuple):
     chance: float
     least: float
     log_weight: float
+
+
+# A tree of arrays for JAX: what is the same at every point is structure.
+registered(NoiseKind, ("power", "prior", "special", "chance", "least", "log_weight"))
 
 
 class Scales(NamedTuple):
