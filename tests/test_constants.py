@@ -6,9 +6,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
-MODULES = [
-    ROOT / "beamfit" / "noise" / f"{name}.py" for name in ("learn", "model", "shots", "sizes")
-] + [
+MODULES = [ROOT / "beamfit" / "noise" / f"{name}.py" for name in ("learn", "model", "sizes")] + [
     ROOT / "beamfit" / "emittance" / f"{name}.py"
     for name in ("advice", "answer", "beam_draws", "comparison", "known", "verdict")
 ]

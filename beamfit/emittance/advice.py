@@ -297,11 +297,11 @@ def simulated(seen: Seen, plane: str, r11: np.ndarray, r12: np.ndarray, known: n
     size = size + off * (-1.0) ** np.arange(n)
     rows = [np.append(v, w) for v, w in zip(old[:4], (r11, r12, known, size), strict=True)]
     error = None if old.error is None else np.append(old.error, off)
-    [found] = compare([PlaneSizes(*rows, error, old.of_shots, old.moved)], seen.noise)
+    sizes = PlaneSizes(*rows, error, old.of_shots, old.moved)
+    [found] = compare([sizes], seen.noise)
     drawn = emittances(found.sigma)
     low, high = emittance_quantiles(drawn, found.weight, found.flat, (0.025, 0.975))
-    given = len(rows[0]), old.moved, error is not None
-    return PlaneEvidence(found.probability, found.seen, *given, low, high, None).determined
+    return PlaneEvidence(found, sizes, low, high).determined
 
 
 def next_measurement(seen: Seen, plane: str) -> str | None:

@@ -22,7 +22,7 @@ from beamfit.emittance.model import (
     phase_coverage,
 )
 from beamfit.emittance.results import Identifiability, PlaneFit, Points, ScreenTwiss
-from beamfit.emittance.statement import Seen, asked_of
+from beamfit.emittance.statement import Seen, Work, asked_of
 from beamfit.emittance.transport import setting_units
 from beamfit.emittance.verdict import (
     CARRIES,
@@ -108,15 +108,6 @@ class PlaneNumbers(NamedTuple):
         return [_quantity(*row, limits) for row in rows]
 
 
-class Judged(NamedTuple):
-    """A finding, whether the emittance is determined, and what to measure next."""
-
-    finding: Finding
-    determined: bool
-    of_a_beam: bool
-    advice: str | None
-
-
 def judged_beam(seen: Seen) -> tuple[PlaneFit, ...]:
     """Answer for each plane: nothing but the beam is unknown."""
     return tuple(
@@ -148,21 +139,24 @@ def plane_answer(
     PlaneFit
         Errors only for what the data determine: half of the central 68 % of the posterior.
     """
-    post, p = seen.works[plane].posterior, seen.works[plane].points
+    work = seen.works[plane]
+    post, p = work.posterior, work.points
     n, carrying = _numbers(post, p, places, b)
-    e = _evidence(seen, plane, n.low[1], n.high[1], b)
-    j = _judged(seen, plane, e, b, carrying, n.value)
-    known = j.determined | (LINEAR & j.of_a_beam & (b is None))
+    e = _evidence(seen, plane, n, b)
+    advice = next_measurement(seen, plane) if _advised(e, b) else None
+    finding = verdict(e, _remarks(work, e, b, carrying, n.value), advice or "")
+    holds = e.of_a_beam and e.ending is None
+    known = e.determined | (LINEAR & holds & (b is None))
     emittance, normalized, beta, alpha, s11, s12, s22, *screen, mismatch = n.quantities(
-        known, j.of_a_beam and not e.opened and e.ending is None
+        known, holds and not e.opened
     )
-    scale = _scale(n) if j.determined else 1.0
+    scale = _scale(n) if e.determined else 1.0
     place = seen.rows.places[-1]
     own = {name: float(line[name].setting) for name in line.upto(place).magnets}
     return PlaneFit(
         plane=plane,
-        status=j.finding.status,
-        message=j.finding.message,
+        status=finding.status,
+        message=finding.message,
         emittance=emittance,
         normalized_emittance=normalized,
         beta=beta,
@@ -175,10 +169,10 @@ def plane_answer(
         rms_residual=Quantity(float(np.sqrt(np.mean((p.size - p.model) ** 2))), None, "m"),
         covariance=_covariance(post, b, scale, bool(known[SIGMA].all())),
         error_scale=scale,
-        noise=noise_words(seen.works[plane].sizes.likeness[1], post.scale, post.relative, p),
+        noise=noise_words(work.sizes.likeness[1], post.scale, post.relative, p),
         method=seen.method,
         weights=seen.weights,
-        identifiability=_identifiability(post, p, n, e, j, b),
+        identifiability=_identifiability(p, n, e, advice, b),
         points=p,
         holds="statistics only" if b is None else b.holds,
     )
@@ -202,21 +196,16 @@ def _numbers(
     return PlaneNumbers(value, half, low, high, raw), carrying
 
 
-def _judged(
-    seen: Seen,
-    plane: str,
-    e: PlaneEvidence,
-    b: Beside | None,
-    carrying: Influence,
-    value: np.ndarray,
-) -> Judged:
-    """The verdict on a plane."""
-    work = seen.works[plane]
-    post, p = work.posterior, work.points
-    column = seen.scan.columns.get(f"size_{plane}", f"size_{plane}")
-    if e.determined and (other := _impossible(float(value[1]), column)):
-        return Judged(other, False, False, None)
-    remarks = [work.shot_words]
+def _advised(e: PlaneEvidence, b: Beside | None) -> bool:
+    """True if a further size is to be named: of a beam whose emittance is open."""
+    return b is None and e.of_a_beam and e.ending is None and not e.determined
+
+
+def _remarks(
+    work: Work, e: PlaneEvidence, b: Beside | None, carrying: Influence, value: np.ndarray
+) -> str:
+    """Further sentences on noise and points."""
+    post, p, remarks = work.posterior, work.points, [work.shot_words]
     if e.of_a_beam:
         likely = chi2_probability(post.chi2, max(len(p.size) - 3, 0))
         remarks.insert(0, noise_remark(work.sizes.likeness[1], post.scale, likely))
@@ -225,10 +214,7 @@ def _judged(
         remarks += point_remarks(p, place, float(without), abs(carrying.shift) > MOVES)
     if b is not None and e.determined:
         remarks.append(b.remark)
-    advised = e.of_a_beam and not e.determined and b is None
-    advice = next_measurement(seen, plane) if advised else None
-    finding = verdict(e, " ".join(filter(None, remarks)), advice or "")
-    return Judged(finding, e.determined, e.of_a_beam, advice)
+    return " ".join(filter(None, remarks))
 
 
 def _scale(n: PlaneNumbers) -> float:
@@ -246,18 +232,18 @@ def _covariance(post: PlanePosterior, b: Beside | None, scale: float, known: boo
 
 
 def _identifiability(
-    post: PlanePosterior, p: Points, n: PlaneNumbers, e: PlaneEvidence, j: Judged, b: Beside | None
+    p: Points, n: PlaneNumbers, e: PlaneEvidence, advice: str | None, b: Beside | None
 ) -> Identifiability:
-    directions = _directions(p, post) if b is None else b.directions
+    directions = _directions(p, e.posterior) if b is None else b.directions
     return Identifiability(
-        determined=j.determined,
-        probability=post.probability,
+        determined=e.determined,
+        probability=e.posterior.probability,
         singular_values=tuple(float(v) for v in directions.singular_values),
         condition=directions.condition if math.isfinite(directions.condition) else None,
         waist_bracketed=e.bracketed,
         phase_coverage=phase_coverage(p.r11, p.r12, float(n.value[2]), float(n.value[3])),
-        undetermined=(*directions.undetermined, *["emittance"] * (not j.determined)),
-        next_measurement=j.advice,
+        undetermined=(*directions.undetermined, *["emittance"] * (not e.determined)),
+        next_measurement=advice,
     )
 
 
@@ -297,37 +283,26 @@ def _reaching(
     return low, high, half
 
 
-def _evidence(seen: Seen, plane: str, low: float, high: float, b: Beside | None) -> PlaneEvidence:
-    work = seen.works[plane]
-    p, post = work.points, work.posterior
-    found = PlaneEvidence(
-        probability=post.probability,
-        seen=post.seen,
-        points=len(p.size),
-        moved=work.sizes.moved,
-        errors=work.sizes.error is not None,
-        low=float(low),
-        high=float(high),
-        bracketed=waist_bracketed(p.settings, p.screen, p.size, p.error),
-    )
-    if b is None:
-        return found
-    return found._replace(ending=b.ending, scenario=b.scenario, opened=b.opened, remedy=b.remedy)
-
-
-def _impossible(emittance: float, sizes: str) -> Finding | None:
-    """The finding on an emittance that only a wrong unit explains; None of a possible one."""
-    if LEAST <= emittance <= MOST:
-        return None
+def _evidence(seen: Seen, plane: str, n: PlaneNumbers, b: Beside | None) -> PlaneEvidence:
+    work, low, high = seen.works[plane], float(n.low[1]), float(n.high[1])
+    p = work.points
+    waist = waist_bracketed(p.settings, p.screen, p.size, p.error)
+    e = PlaneEvidence(work.posterior, work.sizes, low, high, waist)
+    if b is not None:
+        e = e._replace(ending=b.ending, scenario=b.scenario, opened=b.opened, remedy=b.remedy)
+    emittance = float(n.value[1])
+    if not e.determined or LEAST <= emittance <= MOST:
+        return e
     cause = (
         f"Not determined: a normalised emittance of {emittance:.2g} m is "
         f"{'less' if emittance < LEAST else 'more'} than any accelerator has."
     )
     remedy = (
-        f"Check the units of '{sizes}', the settings and the energy: sizes in mm under a header "
-        "that says um make it a million times less."
+        f"Check the units of '{seen.scan.columns.get(f'size_{plane}', f'size_{plane}')}', the "
+        "settings and the energy: sizes in mm under a header that says um make it a million times "
+        "less."
     )
-    return Finding(Status.unidentified, cause, remedy)
+    return e._replace(ending=Finding(Status.unidentified, cause, remedy))
 
 
 def _quantity(

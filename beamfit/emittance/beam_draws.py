@@ -14,14 +14,7 @@ import numpy as np
 from scipy.special import fdtri, gammaln, ndtri
 
 from beamfit.noise.model import LN_2PI, Noise
-from beamfit.noise.sizes import (
-    NoiseKind,
-    Scales,
-    averaged,
-    log_likelihood,
-    narrowed,
-    wide_scales,
-)
+from beamfit.noise.sizes import NoiseKind, Scales, averaged, log_likelihood, scales_of
 
 # Draws of a plane, and degrees of freedom of the Student distributions they are drawn from.
 DRAWS, TAIL = 1536, 4.0
@@ -163,15 +156,12 @@ def draw_beams(c: Coordinates, kind: NoiseKind, noise: Noise) -> BeamDraws:
     sampling; A. B. Owen and Y. Zhou, J. Am. Stat. Assoc. 95, 135 (2000), sect. 4).
     """
     centre, root = fits(c, kind)
-    scales = wide_scales(kind, c.unit.shape)
-    for _ in range(2):
-        at_centres = _log_likelihood(centre, c, kind, scales.scale, noise)
-        scales = narrowed(
-            kind, scales, np.logaddexp.reduce(at_centres + scales.log_weight[..., None, :], axis=-2)
-        )
-    found = averaged(
-        _log_likelihood(centre, c, kind, scales.scale, noise), scales.log_weight[..., None, :]
-    )
+
+    def at_centres(scale: np.ndarray) -> np.ndarray:
+        return _log_likelihood(centre, c, kind, scale, noise)
+
+    scales = scales_of(kind, c.unit.shape, at_centres)
+    found = averaged(at_centres(scales.scale), scales.log_weight[..., None, :])
     found = np.where(np.isfinite(found), found, -np.inf)
     # In their own order: which of two equals is the better, rounding would decide.
     top = np.sort(np.argsort(found, axis=-1)[..., -PARTS:], axis=-1)

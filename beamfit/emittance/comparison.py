@@ -30,7 +30,7 @@ from beamfit.noise.sizes import (
     kinds_of,
     log_likelihood,
     log_odds,
-    narrowed,
+    scales_of,
     squared_pulls,
     variance_of,
     wide_scales,
@@ -99,15 +99,13 @@ def flat_beam(c: Coordinates, kind: NoiseKind, noise: Noise) -> np.ndarray:
     least = np.take_along_axis(chi2, best, -1)
     factor = np.maximum(1.0, least / max(n - 2, 1)) if kind.chance else (2.0 + least) / n
     root = WIDER * np.linalg.cholesky(np.linalg.inv(normal)) * np.sqrt(factor)[..., None, None]
-    scales = wide_scales(kind, c.unit.shape)
 
     def each(v: np.ndarray, scale: np.ndarray) -> np.ndarray:
         seen = np.abs(v @ np.swapaxes(w, -1, -2))
         model = np.sqrt(np.maximum(seen**2 + known[..., None, :], 1e-8))
         return log_likelihood(size[..., None, :] - model, model, kind, scale, noise)
 
-    for _ in range(2):
-        scales = narrowed(kind, scales, each(v, scales.scale)[..., 0, :] + scales.log_weight)
+    scales = scales_of(kind, c.unit.shape, lambda scale: each(v, scale))
     x, log_density = student_mixture(v, root, np.ones((*v.shape[:-2], 1)), FEW)
     t = np.maximum((x**2).sum(-1), 1e-300)
     # v and -v are one beam: twice the density of the whole plane.
@@ -133,17 +131,8 @@ def _bends(w: np.ndarray, length: float) -> np.ndarray:
     return (1.0 + far) * np.exp(-far)
 
 
-class CurveEvidence(NamedTuple):
-    """Log evidences of sizes that are no beam's, each of shape (...,)."""
-
-    constant: np.ndarray
-    random: np.ndarray
-    drift: np.ndarray
-    curve: np.ndarray
-
-
-def curve_evidences(u: np.ndarray, c: Coordinates, kind: NoiseKind, noise: Noise) -> CurveEvidence:
-    """Evidences of one size, sizes at random, a drift in time, a smooth curve of the setting.
+def curve_evidences(u: np.ndarray, c: Coordinates, kind: NoiseKind, noise: Noise) -> np.ndarray:
+    """Log evidences of one size, sizes at random, a drift, a smooth curve; shape (4, ...).
 
     Parameters
     ----------
@@ -171,13 +160,12 @@ def curve_evidences(u: np.ndarray, c: Coordinates, kind: NoiseKind, noise: Noise
     spread = np.maximum(x.std(-1, ddof=1), 0.02)[..., None] / math.sqrt(n) * 2.5
     mu = mean[..., None] + levels * spread
     off = x[..., None, :] - mu[..., None]
-    scales = wide_scales(flat, c.unit.shape)
-    for _ in range(2):
-        here = log_likelihood(off, off, flat, scales.scale, noise)
-        scales = narrowed(flat, scales, np.logaddexp.reduce(here, axis=-2) + scales.log_weight)
-    here = averaged(
-        log_likelihood(off, off, flat, scales.scale, noise), scales.log_weight[..., None, :]
-    )
+
+    def at_levels(scale: np.ndarray) -> np.ndarray:
+        return log_likelihood(off, off, flat, scale, noise)
+
+    scales = scales_of(flat, c.unit.shape, at_levels)
+    here = averaged(at_levels(scales.scale), scales.log_weight[..., None, :])
     prior = -0.5 * (mu / LEVEL) ** 2 - 0.5 * LN_2PI - math.log(LEVEL)
     constant = averaged(here + prior, np.log(8.0 / 64 * spread))
     wide = wide_scales(flat, c.unit.shape)
@@ -188,7 +176,7 @@ def curve_evidences(u: np.ndarray, c: Coordinates, kind: NoiseKind, noise: Noise
     by_size = variance * c.size[..., None, :] ** 2
     curves = [_process(c.size - 1.0, _bends(u, each), BENDS, by_size, wide) for each in LENGTHS]
     curve = np.logaddexp(*curves) - math.log(2.0) + x.sum(-1)
-    return CurveEvidence(*(v + kind.log_weight for v in (constant, random, drift, curve)))
+    return np.stack([constant, random, drift, curve]) + kind.log_weight
 
 
 def _process(
@@ -464,8 +452,7 @@ def _evidences(s: _Stack, i: int, draws: BeamDraws, noise: Noise) -> np.ndarray:
     jacobian = np.log(s.c.size).sum(-1)
     curves = curve_evidences(s.u, s.c, kind, noise)
     near = beam + jacobian + departure_odds(draws.best, s.u, s.c, kind)
-    curve = np.logaddexp(curves.curve + math.log1p(-NEAR), near + math.log(NEAR))
-    curves = curves._replace(curve=curve)
+    curves[-1] = np.logaddexp(curves[-1] + math.log1p(-NEAR), near + math.log(NEAR))
     return np.stack([beam + jacobian, flat + jacobian, *curves], -1)
 
 

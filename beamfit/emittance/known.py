@@ -22,8 +22,9 @@ from beamfit.emittance.transport import (
     scan_rows,
     scanned_line,
 )
+from beamfit.emittance.verdict import MOST_NAMED
 from beamfit.noise.model import Noise
-from beamfit.noise.shots import ShotMeans, evened, means_of
+from beamfit.noise.sizes import ShotMeans, evened, means_of
 from beamfit.optics.beamline import Beamline
 from beamfit.optics.calibration import SETTING_UNITS
 
@@ -31,13 +32,11 @@ from beamfit.optics.calibration import SETTING_UNITS
 METHODS = ("size_squared", "size")
 # Whose size errors are taken at.
 WEIGHTS = ("model", "measured")
-# Shots that a sentence names.
-MOST_NAMED = 4
 # A share of the size from which on the scatter of shots is the beam's more than the screen's.
 UNSTEADY = 0.1
-# Scans that are looked at in one call: one, or at most so many (what spares repeats the last), as
+# Scans that are looked at in one call at most, in powers of two (the last one fills them up), as
 # far as rows times the longest of their arrays have room.
-FEW, LANES, ROOM = 16, 256, 1 << 20
+LANES, ROOM = 256, 1 << 20
 
 
 def see(
@@ -125,7 +124,7 @@ def looked_through(begun: Sequence[Seen]) -> list[Seen]:
         alike.setdefault((kind, *map(np.shape, leaves)), []).append((i, leaves))
     for (kind, *shapes), members in alike.items():
         room = max(ROOM // max(map(np.prod, shapes)) ** 2, 1)
-        lanes = min(int(room), 1 if len(members) == 1 else FEW if len(members) <= FEW else LANES)
+        lanes = min(int(room), LANES, 1 << (len(members) - 1).bit_length())
         for start in range(0, len(members), lanes):
             own = members[start : start + lanes]
             columns = zip(

@@ -18,7 +18,7 @@ from beamfit.answer import frame_of
 from beamfit.errors import InputError, expect, nearest
 from beamfit.particles import ENERGY_KEYS, total_energy
 from beamfit.shown import shown
-from beamfit.table import Table
+from beamfit.table import MOST_ROWS, Table
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -31,8 +31,6 @@ SETTINGS = ("A", "kG", "T_per_m", "k1", "k1l")
 KNOB = "knob"
 # What rows that look at no single slice of the beam say for one.
 PROJECTED = "projected"
-# Rows of a scan that a notebook shows.
-MOST_SHOWN = 20
 # Rms sizes in m that a beam can have, and that most have: outside a unit is wrong, or questioned.
 POSSIBLE, USUAL = (1e-8, 0.3), (1e-6, 2e-2)
 # What a scan has for each of its rows.
@@ -254,7 +252,7 @@ class QuadScan:
         for p in self.planes:
             columns[f"size {p} µm"] = 1e6 * self.size[p]
             columns |= {f"error {p} µm": 1e6 * self.error[p]} if p in self.error else {}
-        few = range(min(len(self), MOST_SHOWN))
+        few = range(min(len(self), MOST_ROWS))
         rows = [[f"{values[i]:.5g}" for values in columns.values()] for i in few]
         more = f"the first {len(few)} of {len(self)} rows" if len(few) < len(self) else ""
         return (Table(self.headline, list(columns), rows, more, numeric=True),)

@@ -14,13 +14,12 @@ import jax.numpy as jnp
 from jax import Array
 from jax.typing import ArrayLike
 
+from beamfit.emittance.beam_draws import FURTHEST, ROUNDS
 from beamfit.emittance.model import coefficients
 from beamfit.shown import shown
 
 # A direction of σ is lost when its diagonal of R is this far below the largest.
 _RANK = 1e-10
-# How often weights are taken anew from the model, and how far its size may be from the measured.
-ROUNDS, FURTHEST = 6, 3.0
 
 
 @shown

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from beamfit.emittance.comparison import BEAM, FLAT
+from beamfit.emittance.comparison import BEAM, FLAT, PlanePosterior, PlaneSizes
 from beamfit.emittance.results import Points
 from beamfit.quantity import display_unit
 from beamfit.statistics import of_use
@@ -44,20 +44,16 @@ class PlaneEvidence(NamedTuple):
 
     Attributes
     ----------
-    probability : dict of str to float
+    posterior : PlanePosterior
         Of a beam and its rivals.
-    seen : bool
-        Whether the settings separate the three numbers of the beam.
-    points : int
-        How many there are.
-    moved, errors : bool
-        Whether a magnet was, and whether errors were stated.
+    sizes : PlaneSizes
+        What it is from.
     low, high : float
         Central 95 % of the normalised emittance, m; infinite where other unknowns leave it open.
     bracketed : bool or None
         Whether the waist is.
     ending : Finding or None
-        How a search ended, where that was no answer.
+        How a search ended, where that was no answer, or what no emittance can be.
     scenario : str
         What is free besides the beam, in words; empty where nothing is.
     opened : str
@@ -66,40 +62,42 @@ class PlaneEvidence(NamedTuple):
         What would close it.
     """
 
-    probability: dict[str, float]
-    seen: bool
-    points: int
-    moved: bool
-    errors: bool
+    posterior: PlanePosterior
+    sizes: PlaneSizes
     low: float
     high: float
-    bracketed: bool | None
+    bracketed: bool | None = None
     ending: Finding | None = None
     scenario: str = ""
     opened: str = ""
     remedy: str = ""
 
     @property
-    def cause(self) -> str:
-        """The likeliest model."""
-        return max(self.probability, key=self.probability.__getitem__)
+    def beam(self) -> float:
+        """Probability of a beam."""
+        return self.posterior.probability[BEAM]
+
+    @property
+    def few(self) -> bool:
+        """True if three points give three numbers, and nothing is left to compare."""
+        return len(self.sizes.size) <= 3
 
     @property
     def untested(self) -> bool:
-        """True if three monitors give three numbers, and nothing is left to compare."""
-        return self.points == 3 and not self.moved and self.errors
+        """True if these are of three monitors with stated errors."""
+        return self.few and not self.sizes.moved and self.sizes.error is not None
 
     @property
     def of_a_beam(self) -> bool:
         """True if the sizes are a beam's, of an emittance or none."""
-        if not self.seen or self.points <= 3:
-            return self.seen and self.untested
-        return self.probability[BEAM] + self.probability[FLAT] > SURE
+        if not self.posterior.seen or self.few:
+            return self.posterior.seen and self.untested
+        return self.beam + self.posterior.probability[FLAT] > SURE
 
     @property
     def determined(self) -> bool:
         """True if they are a beam's and say its emittance."""
-        sure = self.untested or self.probability[BEAM] > SURE
+        sure = self.untested or self.beam > SURE
         known = of_use((self.low, self.high)) and not self.opened and self.ending is None
         return self.of_a_beam and sure and known
 
@@ -115,24 +113,17 @@ def verdict(e: PlaneEvidence, remarks: str = "", advice: str = "") -> Finding:
         Further sentences on noise and points.
     advice : str
         What to measure next.
-
-    Examples
-    --------
-    >>> probability = {"beam": 0.999, "beam of no emittance": 0.001}
-    >>> e = PlaneEvidence(probability, True, 9, True, True, 0.9e-6, 1.1e-6, True)
-    >>> verdict(e).status.value, verdict(e._replace(high=4e-6)).status.value
-    ('converged', 'unidentified')
     """
     if e.ending is not None and (e.of_a_beam or e.ending.status is not Status.not_converged):
         return e.ending
     if e.determined:
         return Finding(Status.converged, f"{_determined(e)} {remarks}".strip())
-    status = Status.unidentified
-    if e.cause.startswith("a smooth curve") and e.probability[e.cause] > SURE:
+    post, status = e.posterior, Status.unidentified
+    if post.cause.startswith("a smooth curve") and post.probability[post.cause] > SURE:
         status = Status.poor_fit
     where = f" in scenario {e.scenario}" if e.scenario else ""
     said = f"Not determined{where}: {_open(e)}."
-    help_ = [advice or (REMEDIES.get(e.cause, "") if not e.of_a_beam and e.seen else "")]
+    help_ = [advice or (REMEDIES.get(post.cause, "") if not e.of_a_beam and post.seen else "")]
     help_ += [f"Needed: {e.remedy}."] if e.remedy and e.of_a_beam else []
     return Finding(status, f"{said} {remarks}".strip(), " ".join(filter(None, help_)))
 
@@ -145,41 +136,36 @@ def _determined(e: PlaneEvidence) -> str:
             "nothing is left to test line and stated errors by."
         )
     waist = {None: "", True: ", the waist is bracketed", False: ", the waist is not bracketed"}
-    return f"Determined{where}: {_sure(e.probability[BEAM])}{waist[e.bracketed]}."
-
-
-def _sure(probability: float) -> str:
-    return "the sizes are those of a beam with " + (
-        f"P > {SURE:g}" if probability > SURE else f"P = {probability:.2f}"
-    )
+    sure = f"P > {SURE:g}" if e.beam > SURE else f"P = {e.beam:.2f}"
+    return f"Determined{where}: the sizes are those of a beam with {sure}{waist[e.bracketed]}."
 
 
 def _open(e: PlaneEvidence) -> str:
     """Why the emittance is not determined."""
-    if not e.seen:
+    probability, rival = e.posterior.probability, e.posterior.cause
+    if not e.posterior.seen:
         return (
             "the settings do not separate the three numbers of the beam matrix, as if the "
             "scanned magnet were downstream of the screen or hardly moved"
         )
-    if e.points == 3 and not e.untested:
+    if e.few and not e.untested:
         return (
             "three points fit any three numbers exactly and leave nothing to judge them by; "
             "measure a fourth setting"
         )
     if not e.of_a_beam:
-        rival = e.cause
         if rival in (BEAM, FLAT):
-            rest = {k: v for k, v in e.probability.items() if k not in (BEAM, FLAT)}
+            rest = {k: v for k, v in probability.items() if k not in (BEAM, FLAT)}
             rival = max(rest, key=rest.__getitem__)
             return (
-                f"these sizes may be a beam's (P = {e.probability[BEAM]:.2g}), or else {rival} "
+                f"these sizes may be a beam's (P = {e.beam:.2g}), or else {rival} "
                 f"(P = {rest[rival]:.2g})"
             )
-        return f"the sizes look like {rival} (P = {e.probability[rival]:.2g}), not like a beam's"
+        return f"the sizes look like {rival} (P = {probability[rival]:.2g}), not like a beam's"
     if e.opened:
         return e.opened
-    if e.probability[BEAM] <= SURE:
-        return f"a beam of no emittance explains the sizes, too (P = {e.probability[FLAT]:.2g})"
+    if e.beam <= SURE:
+        return f"a beam of no emittance explains the sizes, too (P = {probability[FLAT]:.2g})"
     if not e.low > 0.0:
         return "the 95 % interval of the emittance begins at zero"
     factor = e.high / e.low

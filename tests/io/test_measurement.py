@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from beamfit.errors import InputError
 from beamfit.io.scan import read_quad_scan
-from beamfit.noise.shots import evened
+from beamfit.noise.sizes import evened
 from tests.io.forked import in_forks  # noqa: F401
 
 PLAIN = "Q_kG,size_x_um,size_x_error_um\n-4,111.5,1.5\n-3,60,0.5\n-1,104,1\n"

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from beamfit.noise.model import Noise
-from beamfit.noise.shots import evened, means_of
+from beamfit.noise.sizes import evened, means_of
 
 
 def shots_of(n=9, m=5, relative=0.02, seed=0):
