@@ -20,8 +20,8 @@ from rich.table import Table
 
 import beamfit
 from beamfit.emittance.assumptions import Anchor, Assumptions
-from beamfit.emittance.known import see
 from beamfit.emittance.model import predict_sizes
+from beamfit.emittance.statement import see
 from beamfit.emittance.transport_network import SCENARIO
 from beamfit.greybox import problem as greybox
 from beamfit.greybox.descend import descend_all

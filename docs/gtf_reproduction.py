@@ -24,16 +24,15 @@ import beamfit
 from beamfit.emittance.assumptions import Assumptions
 from beamfit.emittance.calibration import with_numbers
 from beamfit.emittance.fit import EmittanceFit, fit_emittance
-from beamfit.emittance.known import see
 from beamfit.emittance.model import UNIT
 from beamfit.emittance.scan import QuadScan
+from beamfit.emittance.statement import see
 from beamfit.emittance.transport_network import SCENARIO
 from beamfit.greybox.fit import Fit
 from beamfit.greybox.solve import solve
 from beamfit.io.files import digest
 from beamfit.optics.beam import BeamMatrix
-from beamfit.optics.beamline import Beamline
-from beamfit.optics.rows import transfer_rows
+from beamfit.optics.beamline import Beamline, transfer_rows
 from beamfit.report.document import (
     BLUE,
     RED,

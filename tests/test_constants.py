@@ -8,7 +8,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 MODULES = [ROOT / "beamfit" / "noise" / f"{name}.py" for name in ("learn", "model", "sizes")] + [
     ROOT / "beamfit" / "emittance" / f"{name}.py"
-    for name in ("advice", "answer", "beam_draws", "comparison", "known", "verdict")
+    for name in ("advice", "answer", "beam_draws", "comparison", "statement", "verdict")
 ]
 
 

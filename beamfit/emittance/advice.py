@@ -36,9 +36,8 @@ from beamfit.greybox import assess
 from beamfit.greybox.covariance import MOST_SHARE
 from beamfit.greybox.design import Information, greedy, rows_of
 from beamfit.greybox.fit import value_and_slope
-from beamfit.optics.beamline import Beamline
+from beamfit.optics.beamline import Beamline, transfer_rows
 from beamfit.optics.elements import Drift, Screen
-from beamfit.optics.rows import transfer_rows
 from beamfit.statistics import USEFUL
 from beamfit.status import Status
 from beamfit.table import Table, json_of

@@ -27,7 +27,7 @@ class Entry(NamedTuple):
 
 # A further scenario is a module with a `SCENARIO` and a line here.
 SCENARIOS = {
-    "known": Entry("known"),
+    "known": Entry("statement"),
     "transport-network": Entry("transport_network", anchor=True, map_free=True),
     "calibration": Entry("calibration", numbers=True),
     "focusing-network": Entry("focusing_network", anchor=True, branches=True),

@@ -13,20 +13,22 @@ from beamfit.answer import answer, quantity_frame
 from beamfit.emittance.answer import judged_beam
 from beamfit.emittance.assumptions import Anchor, Assumptions
 from beamfit.emittance.comparison import BEAM
-from beamfit.emittance.known import (
-    METHODS,
-    WEIGHTS,
-    looked_through,
-    prepared,
-    see,
-    unfitted,
-    with_posteriors,
-)
 from beamfit.emittance.model import line_of
 from beamfit.emittance.predicted import Prediction, correlations_of, predicted_sizes
 from beamfit.emittance.results import Parameter, PlaneFit, parameter_rows, result_rows
 from beamfit.emittance.scan import QuadScan
-from beamfit.emittance.statement import Scenario, Seen, scenario_of
+from beamfit.emittance.statement import (
+    METHODS,
+    WEIGHTS,
+    Scenario,
+    Seen,
+    looked_through,
+    prepared,
+    scenario_of,
+    see,
+    unfitted,
+    with_posteriors,
+)
 from beamfit.emittance.transport import of_emittances, of_priors, questions
 from beamfit.emittance.verdict import SURE
 from beamfit.errors import InputError, expect

@@ -16,7 +16,6 @@ from jax import Array
 from beamfit.compile_cache import SELDOM
 from beamfit.emittance.answer import SIGMA, Beside, plane_answer, units_of
 from beamfit.emittance.assumptions import Anchor, Assumptions
-from beamfit.emittance.known import pulls, with_posteriors
 from beamfit.emittance.model import (
     QUANTITIES,
     Asked,
@@ -26,7 +25,16 @@ from beamfit.emittance.model import (
     spoken,
 )
 from beamfit.emittance.results import Parameter, PlaneFit, Points
-from beamfit.emittance.statement import Scenario, Seen, Work, asked_in, size_record, size_records
+from beamfit.emittance.statement import (
+    Scenario,
+    Seen,
+    Work,
+    asked_in,
+    pulls,
+    size_record,
+    size_records,
+    with_posteriors,
+)
 from beamfit.emittance.systematics import effects_of
 from beamfit.emittance.transport import Look
 from beamfit.greybox.covariance import Group

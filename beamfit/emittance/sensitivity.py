@@ -20,11 +20,10 @@ from jax import Array
 
 from beamfit.compile_cache import SELDOM
 from beamfit.emittance.fit import EmittanceFit
-from beamfit.emittance.known import WEIGHTS
 from beamfit.emittance.model import coefficients
 from beamfit.emittance.results import PlaneFit, Points
 from beamfit.emittance.sigma import error_at, weighed_size
-from beamfit.emittance.statement import varied_magnets
+from beamfit.emittance.statement import WEIGHTS, varied_magnets
 from beamfit.emittance.transport import Rows
 from beamfit.optics.beamline import Beamline
 from beamfit.optics.calibration import SlopeIntercept, scaled

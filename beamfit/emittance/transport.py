@@ -21,11 +21,10 @@ from beamfit.emittance.model import line_of
 from beamfit.emittance.scan import USUAL, QuadScan, middle
 from beamfit.greybox import tree
 from beamfit.greybox.problem import padded_length
-from beamfit.optics.beamline import Beamline
+from beamfit.optics.beamline import Beamline, Same, seen_line, transfer_rows
 from beamfit.optics.calibration import SETTING_UNITS, CurrentTable, plain_meaning
 from beamfit.optics.elements import Element, Marker, Quadrupole, Screen, ThinLens
 from beamfit.optics.particle import ELECTRON_MASS, beta_gamma, rigidity
-from beamfit.optics.rows import Same, seen_line, transfer_rows
 
 # Gradients in T/m beyond which a magnet is a plasma lens at least, and beyond any lens.
 STRONG, IMPOSSIBLE = 500.0, 1e4

@@ -28,7 +28,7 @@ from beamfit.emittance.transport import NetworkRows, padded
 from beamfit.greybox.bounds import over_cells
 from beamfit.greybox.mlp import MLP, Port
 from beamfit.greybox.problem import Free, Problem, Record
-from beamfit.optics.rows import transfer_rows
+from beamfit.optics.beamline import transfer_rows
 
 CELLS = 32
 ELEMENTS = "ABCD"

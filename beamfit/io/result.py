@@ -324,7 +324,7 @@ def _fit(kind: str, content: Any) -> EmittanceFit | DecayFit:
     if kind != "EmittanceFit":
         raise InputError(f"a fit of kind {str(kind)[:40]}", "EmittanceFit or DecayFit")
     from beamfit.emittance.fit import EmittanceFit, scenario_of
-    from beamfit.emittance.known import see
+    from beamfit.emittance.statement import see
 
     own = {name: _value(content[name]) for name in OWN}
     line, statement = _value(content["line"]), scenario_of("known")

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
+from itertools import islice
 from typing import Any
 
 from beamfit.emittance.fit import EmittanceFit
-from beamfit.emittance.results import parameter_rows, result_rows
+from beamfit.emittance.results import PlaneFit, degrees, parameter_rows, result_rows
 from beamfit.emittance.scan import QuadScan
 from beamfit.emittance.sensitivity import budget_rows, range_rows
 from beamfit.emittance.size_methods import SizeMethods
@@ -24,8 +25,7 @@ from beamfit.report.scan_pictures import (
     source_of,
     words_of,
 )
-from beamfit.report.scan_tables import identifiability_rows, point_rows
-from beamfit.table import Table, labelled
+from beamfit.table import Table, cell, labelled
 
 ERRORS = (
     "Errors are half of the central 68 % of the posterior, the noise averaged over. "
@@ -35,6 +35,8 @@ METHODS = (
     "“Measured weights” is emittance_gui's own method, computed here. The error over all methods "
     "has the spread of the methods in it, as a systematic."
 )
+# Most rows in a table of points.
+MOST_ROWS = 500
 
 
 def emittance_page(fit: EmittanceFit, methods: tuple[SizeMethods, ...] = ()) -> ReportPage:
@@ -128,3 +130,54 @@ def _pictures(fit: EmittanceFit) -> list[Picture]:
     if any(has_ellipses(p) for p in fit.planes):
         listed.append(ellipse_picture(fit))
     return listed
+
+
+def identifiability_rows(
+    planes: tuple[PlaneFit, ...],
+) -> list[tuple[str, list[str]]]:
+    """Label and one cell per plane for what the data determine."""
+    rows: list[tuple[str, Callable[[PlaneFit], object]]] = [
+        ("emittance", lambda p: "determined" if p.identifiability.determined else "not determined"),
+        ("not determined", lambda p: ", ".join(p.identifiability.undetermined) or "nothing"),
+        (
+            "singular values",
+            lambda p: ", ".join(f"{v:.3g}" for v in p.identifiability.singular_values),
+        ),
+        ("condition", lambda p: _condition(p.identifiability.condition)),
+        ("probability of a beam", lambda p: f"{p.identifiability.probability['beam']:.4f}"),
+        ("waist bracketed", lambda p: p.identifiability.waist_bracketed),
+        ("phase advance covered", lambda p: degrees(p.identifiability.phase_coverage)),
+    ]
+    return [(label, [cell(value(p)) for p in planes]) for label, value in rows]
+
+
+def _condition(value: float | None) -> str:
+    return "infinite" if value is None else f"{value:.3g}"
+
+
+def point_rows(plane: PlaneFit) -> tuple[list[str], list[list[str]]]:
+    """Header and rows of the point-by-point table of one plane.
+
+    Parameters
+    ----------
+    plane : PlaneFit
+        The plane.
+
+    Returns
+    -------
+    tuple
+        Column names, and one list of cells a point.
+    """
+    p = plane.points
+    columns = {"screen": p.screen} if len(set(p.screen)) > 1 else {}
+    columns |= {f"{n} {p.units[n]}": map("{:.5g}".format, v) for n, v in p.settings.items()}
+    for name, size in (("size", p.size), ("error", p.error), ("fit", p.model)):
+        columns[f"{name} µm"] = map("{:.2f}".format, 1e6 * size)
+    columns["pull"] = map("{:+.2f}".format, p.pull)
+    if (p.outlier_probability > 0.05).any():
+        columns["P(bad)"] = map("{:.2f}".format, p.outlier_probability)
+    rows = [list(row) for row in islice(zip(*columns.values(), strict=True), MOST_ROWS)]
+    left = len(p.size) - len(rows)
+    if left > 0:
+        rows.append([f"{left} more"] + [""] * (len(columns) - 1))
+    return list(columns), rows

@@ -13,9 +13,14 @@ from beamfit.emittance.results import PlaneFit, result_rows
 from beamfit.emittance.scan import PROJECTED
 from beamfit.emittance.slices import SliceFits
 from beamfit.report.document import MOST_DRAWN, Picture, ReportPage, Verdict
-from beamfit.report.emittance import ERRORS, about_input, about_scan
+from beamfit.report.emittance import (
+    ERRORS,
+    about_input,
+    about_scan,
+    identifiability_rows,
+    point_rows,
+)
 from beamfit.report.scan_pictures import COLOUR, scan_picture, source_of, words_of
-from beamfit.report.scan_tables import identifiability_rows, point_rows
 from beamfit.status import Status
 from beamfit.table import Table, labelled
 

@@ -10,9 +10,8 @@ import numpy as np
 
 from beamfit.emittance.beam_draws import Coordinates, coordinates
 from beamfit.emittance.comparison import LEVEL, STEPS
-from beamfit.emittance.known import looked_through, plane_sizes, prepared, unfitted
 from beamfit.emittance.scan import QuadScan
-from beamfit.emittance.statement import Seen
+from beamfit.emittance.statement import Seen, looked_through, plane_sizes, prepared, unfitted
 from beamfit.greybox.problem import padded_length
 from beamfit.noise.model import LN_2PI, Noise
 from beamfit.noise.sizes import kinds_of

@@ -10,7 +10,7 @@ import pytest
 
 import beamfit
 from beamfit.emittance.assumptions import Assumptions
-from beamfit.emittance.known import see
+from beamfit.emittance.statement import see
 from beamfit.emittance.transport_network import SCENARIO, certificate_of
 from beamfit.errors import InputError
 from tests.greybox.appendices import (

@@ -9,7 +9,7 @@ import pytest
 import beamfit
 from beamfit.emittance.assumptions import Anchor, Assumptions
 from beamfit.emittance.fit import scenario_of
-from beamfit.emittance.known import see
+from beamfit.emittance.statement import see
 from tests.emittance.coverage import binomial_limits, coverage, deviations
 
 # Case: scan, scenario, what is told, simulated scans with all tests.

@@ -10,9 +10,8 @@ import pytest
 import beamfit
 from beamfit.emittance.assumptions import Anchor, Assumptions
 from beamfit.emittance.calibration import with_numbers
-from beamfit.emittance.known import see
 from beamfit.emittance.model import UNIT, asked_numbers
-from beamfit.emittance.statement import asked_of
+from beamfit.emittance.statement import asked_of, see
 from beamfit.emittance.transport_network import SCENARIO as TRANSPORT_NETWORK
 from beamfit.emittance.transport_network import certificate_of
 from beamfit.errors import InputError

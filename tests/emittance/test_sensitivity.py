@@ -14,9 +14,9 @@ from beamfit.emittance.sensitivity import (
     range_sensitivity,
     systematics,
 )
+from beamfit.optics.beamline import transfer_rows
 from beamfit.optics.elements import Drift, Quadrupole, Screen, SectorDipole
 from beamfit.optics.particle import PROTON_MASS
-from beamfit.optics.rows import transfer_rows
 from tests.emittance.conftest import scan_of
 
 

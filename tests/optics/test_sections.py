@@ -12,11 +12,10 @@ from hypothesis import strategies as st
 from jax.extend.core import jaxprs_in_params
 
 import beamfit
-from beamfit.optics import rows
-from beamfit.optics.beamline import Beamline
+from beamfit.optics import beamline
+from beamfit.optics.beamline import Beamline, transfer_rows
 from beamfit.optics.calibration import CurrentPolynomial, IntegratedGradient, SlopeIntercept
 from beamfit.optics.elements import Drift, Marker, Quadrupole, Screen, SectorDipole, ThinLens
-from beamfit.optics.rows import transfer_rows
 from beamfit.optics.sections import ElementSeries, LineSection, in_series
 
 ENERGIES = np.array([95.0, 100.0, 104.0])
@@ -117,10 +116,10 @@ def test_rows_of_a_long_line_taken_by_turns_are_the_same(monkeypatch):
     set_to = {"F0": np.linspace(0.5, 1.5, 7)}
     energy = np.linspace(95.0, 105.0, 7)
     at_once = transfer_rows(line, set_to, energy, ("END",)).planes
-    monkeypatch.setattr(rows, "MOST_AT_ONCE", 100)
-    rows._rows.clear_cache()
+    monkeypatch.setattr(beamline, "MOST_AT_ONCE", 100)
+    beamline._rows.clear_cache()
     by_turns = transfer_rows(line, set_to, energy, ("END",)).planes
-    rows._rows.clear_cache()
+    beamline._rows.clear_cache()
     np.testing.assert_allclose(by_turns, at_once, rtol=1e-13)
 
 
@@ -148,8 +147,8 @@ def test_what_is_compiled_does_not_grow_with_the_line(own_energies):
         line = cells(number, IntegratedGradient())
         set_to = {"D3": np.ones(3)}
         energy = ENERGIES if own_energies else np.full(3, 100.0)
-        short = rows.seen_line(line, set_to, energy, ("END",))
-        program = jax.make_jaxpr(rows._rows, static_argnums=3)(short, set_to, energy, ("END",))
+        short = beamline.seen_line(line, set_to, energy, ("END",))
+        program = jax.make_jaxpr(beamline._rows, static_argnums=3)(short, set_to, energy, ("END",))
         sizes.append(equations(program.jaxpr))
     assert sizes[0] == sizes[1]
 
