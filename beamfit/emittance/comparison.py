@@ -29,9 +29,8 @@ from beamfit.noise.sizes import (
     averaged,
     kinds_of,
     log_likelihood,
-    log_odds,
+    odds_of,
     scales_of,
-    squared_pulls,
     variance_of,
     wide_scales,
 )
@@ -520,14 +519,13 @@ def _expected(
     model: np.ndarray, c: Coordinates, kind: NoiseKind, draws: BeamDraws, noise: Noise
 ) -> tuple[np.ndarray, np.ndarray]:
     """Expected precision of each point's size, and probability that it is bad, (planes, n)."""
-    off, model = (c.size - model)[:, None, :], model[:, None, :]
-    scale, share = draws.scales.scale, draws.scale_weight[..., None]
-    z2 = squared_pulls(off, model, kind, scale)
-    odds = np.moveaxis(log_odds(z2, kind, noise)[..., 0], 0, -1)
-    bad = 1.0 / (1.0 + np.exp(-odds))
+    variance = variance_of(kind, draws.scales.scale)
+    steep, least = (part[:, None, :] for part in odds_of(kind, noise))
+    squared = (((c.size - model) / model**kind.power) ** 2)[:, None, :]
+    bad = 1.0 / (1.0 + np.exp(-steep * squared / variance - least))
     wide = (noise.width * kind.usual[:, None, :]) ** -2
-    each = (1.0 - bad * (1.0 - wide)) / variance_of(kind, scale)
-    return (share * each).sum(1) / model[:, 0] ** (2 * kind.power), (share * bad).sum(1)
+    each, share = (1.0 - bad * (1.0 - wide)) / variance, draws.scale_weight[..., None]
+    return (share * each).sum(1) / model ** (2 * kind.power), (share * bad).sum(1)
 
 
 def _posterior(

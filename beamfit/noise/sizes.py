@@ -175,14 +175,6 @@ def variance_of(kind: NoiseKind, scale: Any) -> Any:
     return kind.floor[..., None, :] ** 2 + grown**2
 
 
-def squared_pulls(off: Any, model: Any, kind: NoiseKind, scale: Any) -> Any:
-    """(size - model)² over the variance, points first: shape (n, ..., k, d), k scales, d draws."""
-    xp = off.__array_namespace__()
-    z = off / model if kind.power else off
-    squared = _points_first(z**2, xp)[..., None, :]
-    return squared * _points_first(1.0 / variance_of(kind, scale), xp)[..., None]
-
-
 def _points_first(values: Any, xp: Any) -> Any:
     """The last axis first, laid out anew, so that sums over points run along memory."""
     turned = xp.moveaxis(values, -1, 0)
@@ -215,29 +207,35 @@ def log_likelihood(off: Any, model: Any, kind: NoiseKind, scale: Any, noise: Noi
     """
     xp = off.__array_namespace__()
     n = off.shape[-1]
-    z2 = squared_pulls(off, model, kind, scale)
-    spread = 0.5 * xp.sum(xp.log(variance_of(kind, scale)), axis=-1)
-    found = -0.5 * xp.sum(z2, axis=0) - spread[..., None]
+    squared, variance = (off / model if kind.power else off) ** 2, variance_of(kind, scale)
+    steep, least = odds_of(kind, noise)
+    steep = steep[..., None, :] / variance
+    # Sums over points of all draws at all scales are products of two matrices.
+    by_point = xp.moveaxis(squared, -1, -2)
+    found = (steep - 0.5 / variance) @ by_point
+    found -= (0.5 * xp.sum(xp.log(variance), axis=-1) - xp.sum(least, axis=-1, keepdims=True))[
+        ..., None
+    ]
     found += n * (math.log1p(-noise.bad) - 0.5 * LN_2PI)
     if kind.power:
         found -= xp.sum(xp.log(model), axis=-1)[..., None, :]
-    odds = log_odds(z2, kind, noise)
-    near = xp.minimum(odds, CLEAR)
-    odds -= near
-    found += xp.sum(odds, axis=0)
-    # ln(1 + e^odds) of several points is one logarithm.
+    odds = _points_first(steep, xp)[..., None] * _points_first(squared, xp)[..., None, :]
+    odds += xp.moveaxis(least, -1, 0)[..., None, None]
+    odds = xp.minimum(odds, CLEAR)
+    found -= xp.sum(odds, axis=0)
+    # ln(1 + e^odds) is odds of one that is clear; of several points it is one logarithm.
+    odds = xp.exp(odds)
+    odds += 1.0
     for first in range(0, n, AT_ONCE):
-        found += xp.log(xp.prod(1.0 + xp.exp(near[first : first + AT_ONCE]), axis=0))
+        found += xp.log(xp.prod(odds[first : first + AT_ONCE], axis=0))
     return xp.moveaxis(found, -1, -2)
 
 
-def log_odds(squared_pull: Any, kind: NoiseKind, noise: Noise) -> Any:
-    """Log odds that a reading is bad, from its squared pull, points first as `squared_pulls`."""
-    xp = squared_pull.__array_namespace__()
-    width = noise.width * xp.moveaxis(kind.usual, -1, 0)[..., None, None]
-    odds = squared_pull * (0.5 * (1.0 - width**-2))
-    odds += math.log(noise.bad / (1.0 - noise.bad)) - xp.log(width)
-    return odds
+def odds_of(kind: NoiseKind, noise: Noise) -> tuple[Any, Any]:
+    """Log odds that a reading is bad: slope by its squared pull, and those without; (..., n)."""
+    width = noise.width * kind.usual
+    xp = width.__array_namespace__()
+    return 0.5 * (1.0 - width**-2), math.log(noise.bad / (1.0 - noise.bad)) - xp.log(width)
 
 
 def averaged(log: Any, log_weight: Any) -> Any:
