@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from beamfit.io.emittance_gui import EmittanceGuiFile
     from beamfit.optics.beamline import Beamline
     from beamfit.sampling.posterior import Posterior
-    from beamfit.status import Status
 
 # What `read_inputs` takes besides the scan.
 GIVEN = ["lattice", "use", "first", "last", "screen", "energy", "particle"]
@@ -149,11 +148,7 @@ def emittance(
 def _show_slices(terminal: Terminal, fits: SliceFits) -> None:
     """Show a row a slice, and what is said of each."""
     terminal.line(f"{fits.scan.name} on {fits.fits[0].line.name}", style="bold")
-    alike: dict[tuple[str, Status, str], list[str]] = {}
-    for fit in fits:
-        for p in fit.planes:
-            alike.setdefault((p.plane, p.status, p.message), []).append(fit.scan.slices[0])
-    for (plane, status, message), names in alike.items():
+    for (plane, status, message), names in fits.alike().items():
         which = f"slice{'s' * (len(names) > 1)} {', '.join(names)}"
         terminal.verdict(f"{plane}, {which}", status, message)
     for note in fits.notes:

@@ -11,6 +11,7 @@ from beamfit.emittance.fit import EmittanceFit, fit_emittance
 from beamfit.emittance.results import PlaneFit
 from beamfit.emittance.scan import PROJECTED, QuadScan
 from beamfit.optics.beamline import Beamline
+from beamfit.status import Status
 from beamfit.table import Table, cell, text_of
 
 HEADER = ("slice", "energy", "status", "normalised emittance", "beta at the start")
@@ -66,6 +67,14 @@ class SliceFits:
     def of_plane(self, plane: str) -> list[tuple[EmittanceFit, PlaneFit]]:
         """The slices that were fitted in a plane, each with its fit there."""
         return [(fit, p) for fit in self.fits for p in fit.planes if p.plane == plane]
+
+    def alike(self) -> dict[tuple[str, Status, str], dict[str, PlaneFit]]:
+        """Fits by slice of those that share plane, status and message, which are said once."""
+        found: dict[tuple[str, Status, str], dict[str, PlaneFit]] = {}
+        for plane in self.planes:
+            for fit, p in self.of_plane(plane):
+                found.setdefault((plane, p.status, p.message), {})[fit.scan.slices[0]] = p
+        return found
 
     @property
     def headline(self) -> str:

@@ -9,7 +9,7 @@ from functools import partial
 import numpy as np
 from matplotlib.figure import FigureBase
 
-from beamfit.emittance.results import PlaneFit, result_rows
+from beamfit.emittance.results import result_rows
 from beamfit.emittance.scan import PROJECTED
 from beamfit.emittance.slices import SliceFits
 from beamfit.report.document import MOST_DRAWN, Picture, ReportPage, Verdict
@@ -73,12 +73,8 @@ def slices_page(fits: SliceFits) -> ReportPage:
 
 def _verdicts(fits: SliceFits) -> Iterator[Verdict]:
     """Verdict of each slice, those that say the same together."""
-    alike: dict[tuple[str, Status, str], list[tuple[str, PlaneFit]]] = {}
-    for plane in fits.planes:
-        for fit, p in fits.of_plane(plane):
-            alike.setdefault((plane, p.status, p.message), []).append((fit.scan.slices[0], p))
-    for (plane, status, message), same in alike.items():
-        names, answers = zip(*same, strict=True)
+    for (plane, status, message), same in fits.alike().items():
+        answers = list(same.values())
         words = words_of(answers[0])
         if len(same) > 1:
             words = "normalised emittance not determined"
@@ -87,7 +83,7 @@ def _verdicts(fits: SliceFits) -> Iterator[Verdict]:
                 low, high = (f(values, key=lambda q: q.value) for f in (min, max))
                 words = f"normalised emittance {low} to {high}"
         noun = "slice" if len(same) == 1 else "slices"
-        yield Verdict(status, f"{noun} {', '.join(names)}, {plane}: {words}", message)
+        yield Verdict(status, f"{noun} {', '.join(same)}, {plane}: {words}", message)
 
 
 def draw_slices(figure: FigureBase, fits: SliceFits) -> None:
