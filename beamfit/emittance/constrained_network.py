@@ -17,8 +17,7 @@ from beamfit.emittance.transport import padded
 from beamfit.errors import InputError, nearest
 from beamfit.greybox.gains import certified_gain
 from beamfit.greybox.mlp import MLP, Port, dense
-from beamfit.greybox.problem import Free, Prior, Problem, Record
-from beamfit.greybox.terms import Constraint
+from beamfit.greybox.problem import Constraint, Free, Prior, Problem, Record
 
 # Bounds of the weights: the report's (appendix B).
 MOST = 10.0

@@ -25,9 +25,8 @@ from beamfit.emittance.statement import Scenario, Seen, asked_in, factor_of, siz
 from beamfit.errors import InputError
 from beamfit.greybox import tree
 from beamfit.greybox.fit import Fit
-from beamfit.greybox.posterior import predicted, target_of
+from beamfit.greybox.posterior import Optimum, Statement, predicted, target_of
 from beamfit.greybox.problem import Problem
-from beamfit.greybox.stated import Optimum, Statement
 from beamfit.noise.model import Lognormal, Noise
 from beamfit.noise.sizes import NoiseKind, averaged, log_likelihood
 from beamfit.optics.beam import BeamMatrix

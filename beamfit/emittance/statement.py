@@ -17,8 +17,7 @@ from beamfit.emittance.model import UNIT, Asked, predict_sizes
 from beamfit.emittance.results import Parameter, Points
 from beamfit.emittance.scan import QuadScan
 from beamfit.emittance.transport import Look, Rows, padded, scan_rows
-from beamfit.greybox.problem import Free, Prior, Problem, Record
-from beamfit.greybox.terms import Constraint
+from beamfit.greybox.problem import Constraint, Free, Prior, Problem, Record
 from beamfit.noise.model import Noise
 from beamfit.optics.beamline import Beamline
 

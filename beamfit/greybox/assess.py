@@ -17,8 +17,8 @@ import numpy as np
 from scipy import sparse
 
 from beamfit.greybox import problem
-from beamfit.greybox.covariance import Rows, lengths
 from beamfit.greybox.problem import Problem
+from beamfit.greybox.sparse import Rows, lengths
 
 # A bound also counts as reached if moving onto it changes the cost by less than this share.
 CLOSE = 1e-8

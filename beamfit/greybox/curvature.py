@@ -13,8 +13,9 @@ import jax
 import numpy as np
 
 from beamfit.greybox import assess, problem
-from beamfit.greybox.covariance import FEW, in_units, null_space, triangle, weakest
+from beamfit.greybox.covariance import FEW, null_space, triangle
 from beamfit.greybox.problem import Problem
+from beamfit.greybox.sparse import in_units, weakest
 
 # A search has not ended while the next Newton step exceeds this, in sizes of the numbers.
 STEP = 1e-3
@@ -24,9 +25,6 @@ FLAT = 1e-6
 PLAIN = 2e-3
 # Slopes below this share of the terms that cancel in them are rounding.
 ROUNDING = 1e-13
-# A slope at a bound that predicts more than this many times the cost and its change nearby is
-# rounding: b/(1 - exp(-b t)) has lost its figures at b = 1e-18.
-LOST = 1e3
 # Test points: distance in sizes of the numbers, count along the weakest directions of a sum of
 # squares, and count at random or inward from bounds.
 NEAR, WEAKEST, AROUND = 1e-3, 2, 4
@@ -99,33 +97,34 @@ def lower_beside(p: Problem, s: assess.SearchState, lagrangian: Look) -> np.ndar
     """A lower point beside one where squares end, if the cost bends down there.
 
     The squares' own curvature never does; what their residuals bend shows first where that is
-    weakest. Numbers at a bound are tried inward, whatever the force that holds them.
+    weakest. Numbers at a bound are tried inward, whatever the force that holds them, and where they
+    started: b/(1 - exp(-b t)) has lost its figures at b = 1e-18, so that its slope tells nothing.
     """
     unit, weak = s.scale.unit, _weakest(p, s)
     if not weak.shape[1]:
         return None
     low, high = s.bounds.reached
     inward = np.flatnonzero((low ^ high) & ~p.nuisance & p.moving)[:AROUND]
-    pushes = [
-        np.where(np.arange(len(unit)) == i, unit * (1.0 if low[i] else -1.0), 0) for i in inward
-    ]
-    sides = [(w, -w) for w in weak.T]
-    every = [s.theta, *(np.clip(s.theta + NEAR * d, p.lower, p.upper)
-                        for d in (*(d for pair in sides for d in pair), *pushes))]  # fmt: skip
-    cost = lagrangian(np.array(every))
+    pushes, back = np.zeros((len(inward), len(unit))), np.tile(s.theta, (len(inward), 1))
+    for k, i in enumerate(inward):
+        pushes[k, i] = unit[i] if low[i] else -unit[i]
+        back[k, i] = p.start[i]
+    sides = np.repeat(weak.T, 2, axis=0)
+    sides[1::2] *= -1.0
+    points = [s.theta, *(s.theta + NEAR * d for d in (*sides, *pushes)), *back]
+    cost = lagrangian(np.clip(points, p.lower, p.upper))
     gain = cost[0] - cost[1:]
     gain = np.where(np.isfinite(gain), gain, -np.inf)
     least = 1e-9 * abs(cost[0]) + 1e-12 * p.least_residual**2
-    for i, (w, back) in enumerate(sides):
-        forth, other = gain[2 * i], gain[2 * i + 1]
-        if forth + other > least:
-            return _along(p, s, w if forth > other else back, lagrangian)
-    for i, push in enumerate(pushes):
-        change = gain[2 * len(sides) + i]
+    near, returned = gain[: len(sides) + len(pushes)], gain[len(sides) + len(pushes) :]
+    for i in range(0, len(sides), 2):
+        if near[i] + near[i + 1] > least:
+            return _along(p, s, sides[i + (near[i] <= near[i + 1])], lagrangian)
+    for push, change in zip(pushes, near[len(sides) :], strict=True):
         if change > least:
             return _along(p, s, push, lagrangian)
-        if NEAR * abs(s.at.gradient[inward[i]]) * unit[inward[i]] > LOST * max(cost[0], -change):
-            return every[1 + 2 * len(sides) + i]
+    if len(back) and np.max(returned) > _worth(p, s):
+        return np.clip(back[int(np.argmax(returned))], p.lower, p.upper)
     return None
 
 
@@ -159,10 +158,16 @@ def _along(
     cost = lagrangian(np.array(points))
     cost = np.where(np.isfinite(cost), cost, np.inf)
     best = int(np.argmin(cost))
+    return points[best] if cost[0] - cost[best] > _worth(p, s) else None
+
+
+def _worth(p: Problem, s: assess.SearchState) -> float:
+    """The decrease of the cost from which on a point is lower."""
+    if p.objectives:
+        return 1e-9 * s.scale.cost
     count = max(len(s.at.residual) - len(s.theta), 1)
     noise = 1.0 if p.errors_known or not p.records else 2 * s.at.cost / count
-    counts = 1e-9 * s.scale.cost if p.objectives else max(1e-3 * noise, 1e-6 * s.at.cost)
-    return points[best] if cost[0] - cost[best] > counts else None
+    return max(1e-3 * noise, 1e-6 * s.at.cost)
 
 
 def _restored(p: Problem, s: assess.SearchState, point: np.ndarray) -> np.ndarray | None:

@@ -19,7 +19,7 @@ from beamfit.errors import InputError
 from beamfit.greybox import tree
 from beamfit.greybox.bounds import KINDS, LayeredNetwork, cells, gain_bounds
 from beamfit.greybox.maps import Map, positions
-from beamfit.greybox.terms import Constraint
+from beamfit.greybox.problem import Constraint
 
 
 def _restricted(m: Map, x: jax.Array, variables: tuple[str, ...]):
