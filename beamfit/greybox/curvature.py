@@ -25,6 +25,9 @@ FLAT = 1e-6
 PLAIN = 2e-3
 # Slopes below this share of the terms that cancel in them are rounding.
 ROUNDING = 1e-13
+# A slope at a bound is rounding where it predicts these parts of the cost as a change and less than
+# this share of that happens: b/(1 - exp(-b t)) has lost its figures at b = 1e-18.
+LOST, PARTS = 1e-2, (1.0, 1e-2)
 # Test points: distance in sizes of the numbers, count along the weakest directions of a sum of
 # squares, and count at random or inward from bounds.
 NEAR, WEAKEST, AROUND = 1e-3, 2, 4
@@ -97,34 +100,36 @@ def lower_beside(p: Problem, s: assess.SearchState, lagrangian: Look) -> np.ndar
     """A lower point beside one where squares end, if the cost bends down there.
 
     The squares' own curvature never does; what their residuals bend shows first where that is
-    weakest. Numbers at a bound are tried inward, whatever the force that holds them, and where they
-    started: b/(1 - exp(-b t)) has lost its figures at b = 1e-18, so that its slope tells nothing.
+    weakest. Numbers at a bound are tried inward, whatever the force that holds them.
     """
     unit, weak = s.scale.unit, _weakest(p, s)
     if not weak.shape[1]:
         return None
     low, high = s.bounds.reached
     inward = np.flatnonzero((low ^ high) & ~p.nuisance & p.moving)[:AROUND]
-    pushes, back = np.zeros((len(inward), len(unit))), np.tile(s.theta, (len(inward), 1))
-    for k, i in enumerate(inward):
-        pushes[k, i] = unit[i] if low[i] else -unit[i]
-        back[k, i] = p.start[i]
+    pushes = np.zeros((len(inward), len(unit)))
+    pushes[np.arange(len(inward)), inward] = np.where(low, unit, -unit)[inward]
     sides = np.repeat(weak.T, 2, axis=0)
     sides[1::2] *= -1.0
-    points = [s.theta, *(s.theta + NEAR * d for d in (*sides, *pushes)), *back]
-    cost = lagrangian(np.clip(points, p.lower, p.upper))
-    gain = cost[0] - cost[1:]
+    # Steps inward over which the slope predicts a change as large as the cost, and a part of it.
+    size = max(float(s.at.cost), 0.5 * p.least_residual**2)
+    slope = np.maximum(np.abs(s.at.gradient * unit)[inward], 1e-300)
+    short = pushes * np.minimum(size / slope, NEAR)[:, None]
+    steps = np.vstack([0 * unit, NEAR * sides, NEAR * pushes, *(t * short for t in PARTS)])
+    points = np.clip(s.theta + steps, p.lower, p.upper)
+    cost = lagrangian(points)
+    gain = cost[0] - cost
     gain = np.where(np.isfinite(gain), gain, -np.inf)
     least = 1e-9 * abs(cost[0]) + 1e-12 * p.least_residual**2
-    near, returned = gain[: len(sides) + len(pushes)], gain[len(sides) + len(pushes) :]
-    for i in range(0, len(sides), 2):
-        if near[i] + near[i + 1] > least:
-            return _along(p, s, sides[i + (near[i] <= near[i + 1])], lagrangian)
-    for push, change in zip(pushes, near[len(sides) :], strict=True):
-        if change > least:
-            return _along(p, s, push, lagrangian)
-    if len(back) and np.max(returned) > _worth(p, s):
-        return np.clip(back[int(np.argmax(returned))], p.lower, p.upper)
+    for i in range(1, len(sides), 2):
+        if gain[i] + gain[i + 1] > least:
+            return _along(p, s, sides[i - 1 if gain[i] > gain[i + 1] else i], lagrangian)
+    for k, i in enumerate(range(1 + len(sides), 1 + len(sides) + len(pushes))):
+        if gain[i] > least:
+            return _along(p, s, pushes[k], lagrangian)
+        for at, t in enumerate(PARTS, 1):
+            if NEAR * slope[k] > size and gain[i + at * len(pushes)] > -LOST * t * size:
+                return points[i + at * len(pushes)]
     return None
 
 
