@@ -28,8 +28,7 @@ if TYPE_CHECKING:
     from pandas import DataFrame
 
     from beamfit.greybox.fit import Fit
-    from beamfit.sampling.intervals import Correlations
-    from beamfit.sampling.posterior import Posterior
+    from beamfit.sampling.posterior import Correlations, Posterior
     from beamfit.sampling.priors import Distribution
 
 

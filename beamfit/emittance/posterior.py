@@ -31,8 +31,7 @@ from beamfit.noise.model import Lognormal, Noise
 from beamfit.noise.sizes import NoiseKind, averaged, log_likelihood
 from beamfit.optics.beam import BeamMatrix
 from beamfit.quantity import Status
-from beamfit.sampling.intervals import Expected
-from beamfit.sampling.posterior import Posterior
+from beamfit.sampling.posterior import Expected, Posterior
 from beamfit.sampling.priors import Distribution
 from beamfit.sampling.target import SamplingTarget
 from beamfit.verdict import Finding

@@ -16,7 +16,7 @@ from beamfit.emittance.results import PlaneFit
 from beamfit.emittance.transport import Rows, padded, rows_at
 from beamfit.errors import InputError, nearest
 from beamfit.optics.rows import seen_line
-from beamfit.sampling.intervals import Correlations
+from beamfit.sampling.posterior import Correlations
 from beamfit.shown import shown
 
 if TYPE_CHECKING:

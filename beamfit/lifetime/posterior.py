@@ -27,8 +27,7 @@ from beamfit.noise.correlated import (
     whitened_of_both,
 )
 from beamfit.quantity import HOUR
-from beamfit.sampling.intervals import Expected
-from beamfit.sampling.posterior import Posterior
+from beamfit.sampling.posterior import Expected, Posterior
 from beamfit.sampling.priors import Distribution
 from beamfit.sampling.target import SamplingTarget
 from beamfit.verdict import Finding
