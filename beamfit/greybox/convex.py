@@ -11,6 +11,7 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
@@ -88,10 +89,11 @@ def _hessian(core, theta):
 
 
 def _curve(p: Problem, function) -> Curvature | None:
-    """Curvature of a function of (core, theta) in theta; None if it is not known."""
-    program, given = p.program(function)
+    """Curvature of a compiled function of (core, theta) in theta; None if it is not known."""
+    program = function.trace(p.core, jnp.asarray(p.start)).jaxpr
+    arguments = [*jax.tree.leaves(p.core), Curvature(0, 1.0)]
     try:
-        (found,) = _followed(program.jaxpr, program.consts, [*given, Curvature(0, 1.0)])
+        (found,) = _followed(program.jaxpr, program.consts, arguments)
     except _Unknown:
         return None
     return found if isinstance(found, Curvature) else Curvature(0, 0.0)

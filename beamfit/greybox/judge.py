@@ -19,7 +19,7 @@ from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 
 from beamfit import verdict
-from beamfit.greybox import assess, curvature, problem
+from beamfit.greybox import assess, problem
 from beamfit.greybox.assess import LOOKS, NEAR, SearchState
 from beamfit.greybox.conflict import Conflict, dependence
 from beamfit.greybox.convex import convex
@@ -334,7 +334,7 @@ def _restless(e: FitEvidence) -> Finding | None:
         why = e.residue.strip("()")
     elif bend is not None and bend.direction is not None:
         why = "the cost still bends down there"
-    elif bend is not None and bend.newton > curvature.STEP:
+    elif bend is not None and bend.newton > assess.STEP:
         why = f"the next step is {bend.newton:.1e} of the numbers' sizes"
     if why is None:
         return None

@@ -16,7 +16,6 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import ClosedJaxpr
 
 from beamfit.errors import InputError
 from beamfit.greybox import tree
@@ -262,15 +261,6 @@ def compiled_at(function: Callable, core: Core) -> Callable:
     return partial(_compiled(function, structure), [jnp.asarray(leaf) for leaf in leaves])
 
 
-@lru_cache(maxsize=256)
-def _program(function, structure, kinds, n) -> ClosedJaxpr:
-    """The operations of a function of (core, theta)."""
-    leaves = [jax.ShapeDtypeStruct(*kind) for kind in kinds]
-    return jax.make_jaxpr(lambda *flat: function(structure.unflatten(flat[:-1]), flat[-1]))(
-        *leaves, jax.ShapeDtypeStruct((n,), float)
-    )
-
-
 def _model_at(core: Core, theta: jax.Array) -> Any:
     return tree.replace(core.model, core.chosen, theta)
 
@@ -509,15 +499,6 @@ class Problem:
         """
         leaves, structure = self._flat
         return partial(_compiled(function, structure), leaves)
-
-    def program(self, function: Callable) -> tuple[ClosedJaxpr, list[jax.Array]]:
-        """The program of a function of (core, theta), and its arguments before theta.
-
-        Traced once for each structure of problem, with its data as arguments.
-        """
-        leaves, structure = self._flat
-        kinds = tuple((leaf.shape, leaf.dtype) for leaf in leaves)
-        return _program(function, structure, kinds, len(self.start)), leaves
 
     @cached_property
     def _flat(self) -> tuple[list[jax.Array], jax.tree_util.PyTreeDef]:

@@ -9,7 +9,7 @@ from functools import partial
 import numpy as np
 
 from beamfit.errors import InputError
-from beamfit.greybox import assess, curvature
+from beamfit.greybox import assess
 from beamfit.greybox.assess import SearchState
 from beamfit.greybox.conflict import relaxed
 from beamfit.greybox.descend import Descent, costs, descent_of
@@ -196,7 +196,7 @@ def _drawn(p: Problem, number: int, seed: int) -> np.ndarray:
 
 def _good(s: SearchState) -> bool:
     """True if a point is an optimum to second order."""
-    bent = s.bend is not None and (s.bend.direction is not None or s.bend.newton > curvature.STEP)
+    bent = s.bend is not None and (s.bend.direction is not None or s.bend.newton > assess.STEP)
     return s.optimal and not bent
 
 
@@ -317,7 +317,7 @@ def _moved_off(p: Problem, lanes: Descent, lane: int, budget: SearchLimit) -> Se
     s = _judged(p, lanes, lane)
     for _ in range(MOVES):
         look = partial(costs, p, lanes)
-        point = curvature.lower_beside(p, s, look) if s.at.finite else None
+        point = assess.lower_beside(p, s, look) if s.at.finite else None
         if point is None or budget.left <= 0:
             break
         lanes.move(lane, point)
@@ -371,7 +371,7 @@ def _program(
             steps, said = steps + end.iterations, end.said
             point = None
             if s.optimal:
-                s, point = curvature.second_order(p, s, exact)
+                s, point = assess.second_order(p, s, exact)
             if best is None or _best(p, [best, s]) == 1:
                 best = s
             if point is None or budget.left <= 0:

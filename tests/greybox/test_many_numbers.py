@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import sparse
 
-from beamfit.greybox import covariance, curvature, descend
+from beamfit.greybox import assess, covariance, descend
 from beamfit.greybox import sparse as sparse_parts
 from beamfit.greybox.problem import Free, Prior, Problem, Record
 from beamfit.greybox.solve import solve
@@ -133,7 +133,7 @@ def both_ways(problem, monkeypatch):
     """The answer by sparse factors, and by orthogonal ones and singular values."""
     many = solve(problem)
     assert sparse.issparse(many.jacobian)
-    for module in (descend, covariance, curvature):
+    for module in (descend, covariance, assess):
         monkeypatch.setattr(module, "FEW", 10**9)
     return many, solve(problem)
 
