@@ -29,7 +29,7 @@ from jax.flatten_util import ravel_pytree
 from rich.console import Console
 from rich.table import Table
 
-from beamfit.greybox import assess, curvature, solve
+from beamfit.greybox import assess, solve
 from beamfit.greybox.problem import Constraint, Free, Objective, Problem
 
 PACKAGES = ("_bounded_minimisation", "_constrained_minimisation", "_quadratic_problems")
@@ -203,7 +203,7 @@ def ipopt(p):
         return at.cost, at.constraints
 
     def bend(x, _, sigma, y):
-        hessian = p.compiled(curvature.lagrangian_hessian)
+        hessian = p.compiled(assess.lagrangian_hessian)
         return (np.asarray(hessian(x, float(sigma[0]), -y)),)
 
     f, g, at = (1, 1, False), (m, 1, False), {"x": n, "p": 0}

@@ -180,9 +180,8 @@ def free(n: int) -> dict[str, Callable]:
     import casadi
     import jax.numpy as jnp
 
-    from beamfit.greybox.problem import Problem
+    from beamfit.greybox.problem import Free, Problem, Record
     from beamfit.greybox.solve import solve
-    from beamfit.greybox.terms import Free, Record
 
     h = 1 / (n + 1)
     t = h * np.arange(1, n + 1)

@@ -17,8 +17,8 @@ from beamfit.dynamics.input_laws import LawEvidence
 from beamfit.dynamics.model import PreparedOutput, curves
 from beamfit.dynamics.response import ARX, FIRST_ORDER, SECOND_ORDER, Physics
 from beamfit.greybox.fit import Derived, Fit
+from beamfit.greybox.judge import gauges, together
 from beamfit.greybox.memory import Memory
-from beamfit.greybox.verdict import gauges, together
 from beamfit.quantity import Quantity
 from beamfit.statistics import POOR_FIT
 from beamfit.status import Status

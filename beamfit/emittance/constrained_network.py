@@ -1,14 +1,13 @@
-"""Networks held by signs of their weights, or by limits of gains and a box (Appendix B)."""
+"""Problems of beams and networks: anchors, or limits of gains and a box (Appendix B)."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from jax import Array
-from scipy.optimize import nnls
 
 from beamfit.emittance.assumptions import Assumptions
 from beamfit.emittance.model import UNIT, sigma_of
@@ -17,91 +16,10 @@ from beamfit.emittance.transport import padded
 from beamfit.errors import InputError, nearest
 from beamfit.greybox.gains import certified_gain
 from beamfit.greybox.mlp import MLP, Port, dense
-from beamfit.greybox.problem import Free, Prior, Problem, Record
-from beamfit.greybox.terms import Constraint
+from beamfit.greybox.problem import Constraint, Free, Prior, Problem, Record
 
 # Bounds of the weights: the report's (appendix B).
 MOST = 10.0
-
-
-def signed_network(
-    inputs: list[Port], outputs: list[Port], rising: np.ndarray, hidden: int, seed: int
-) -> tuple[MLP, dict[str, tuple[np.ndarray, np.ndarray]]]:
-    """Make a network that starts as a straight line, with bounds that keep it monotonic.
-
-    Parameters
-    ----------
-    inputs, outputs : list of Port
-        Scaled so that the range of interest is -1 to 1 on both sides.
-    rising : ndarray
-        Shape (outputs, inputs): +1 where an output must rise with an input, -1 where it must
-        fall, 0 where it is free. A row of zeros asks nothing of its output. An input with a
-        zero elsewhere is free for all outputs, and so is one that asks of the outputs another
-        pattern of signs than the first does.
-    hidden, seed : int
-        Hidden tanh nodes, and the seed of their thresholds.
-
-    Returns
-    -------
-    tuple of MLP and dict
-        The network, and lower and upper bounds by connection or layer.
-
-    Notes
-    -----
-    Each hidden node moves one way with an input and each output one way with the node, so each
-    gain is a sum of terms of one sign; no point of the range has to be asked. A rising
-    function of one input can be approximated by such a sum as well as one likes.
-    """
-    node, out = _pattern(rising)
-    net = dense(inputs, outputs, [hidden], seed=seed)
-    first, last = "layer0->layer1", "layer1->layer2"
-    thresholds = np.linspace(-1.5, 1.5, hidden) if hidden > 1 else np.zeros(1)
-    start = {first: np.zeros((len(inputs), hidden)), last: np.zeros((hidden, len(outputs)))}
-    lead = int(np.argmax(node != 0)) if node.any() else 0
-    way = node[lead] or 1.0
-    start[first][lead] = way
-    towards = np.where(out != 0, out, 1.0)
-    start[last] += _straight(thresholds)[:, None] * towards
-    biases = {"layer1": way * thresholds, "layer2": np.zeros(len(outputs))}
-    model = replace(net, weights=start, biases=biases)
-    bounds = {
-        f"weights.{first}": _ends(np.broadcast_to(node[:, None], (len(inputs), hidden))),
-        f"weights.{last}": _ends(np.broadcast_to(out, (hidden, len(outputs)))),
-        "biases.layer1": _ends(np.zeros(hidden)),
-        "biases.layer2": _ends(np.zeros(len(outputs))),
-    }
-    return model, bounds
-
-
-def _straight(thresholds: np.ndarray) -> np.ndarray:
-    """Weights, none negative, that make the nodes add up to a straight line from -1 to 1."""
-    x = np.linspace(-1.0, 1.0, 41)
-    return nnls(np.tanh(x[:, None] + thresholds), x)[0]
-
-
-def _ends(sign: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    return np.where(sign > 0, 0.0, -MOST), np.where(sign < 0, 0.0, MOST)
-
-
-def _pattern(rising: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Signs of input to node and of node to output that give the gains their signs."""
-    node, out = np.zeros(rising.shape[1]), np.zeros(rising.shape[0])
-    asked = rising.any(axis=1)
-    for i in range(rising.shape[1]):
-        column = rising[:, i]
-        if not asked.any() or not column[asked].all():
-            continue
-        if not out.any():
-            out, node[i] = -column, -1.0
-        elif np.array_equal(column, -out) or np.array_equal(column, out):
-            lead = int(np.argmax(asked))
-            node[i] = column[lead] * out[lead]
-    return node, out
-
-
-def weight_free(path: str, bounds: dict[str, tuple[np.ndarray, np.ndarray]]) -> list[Free]:
-    """The weights of a network as free numbers that nobody asks for."""
-    return [Free(f"{path}.{k}", a, b, (-1.5, 1.5), nuisance=True) for k, (a, b) in bounds.items()]
 
 
 def network_problem(

@@ -43,8 +43,7 @@ if TYPE_CHECKING:
 
     from beamfit.greybox.fit import Fit
     from beamfit.noise.learn import Sample
-    from beamfit.sampling.intervals import Correlations
-    from beamfit.sampling.posterior import Posterior
+    from beamfit.sampling.posterior import Correlations, Posterior
     from beamfit.sampling.priors import Distribution
 
 

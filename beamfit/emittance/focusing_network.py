@@ -18,10 +18,9 @@ from jax.typing import ArrayLike
 
 from beamfit.emittance.assumptions import Assumptions
 from beamfit.emittance.constrained_network import (
+    MOST,
     known_record,
     network_problem,
-    signed_network,
-    weight_free,
 )
 from beamfit.emittance.results import Parameter
 from beamfit.emittance.statement import Scenario, Seen, varied_magnets
@@ -30,7 +29,8 @@ from beamfit.errors import InputError
 from beamfit.greybox import tree
 from beamfit.greybox.fit import Derived, Fit
 from beamfit.greybox.mlp import MLP, Port
-from beamfit.greybox.problem import Problem, Record
+from beamfit.greybox.problem import Free, Problem, Record
+from beamfit.greybox.signed_network import signed_network
 from beamfit.quantity import Quantity
 from beamfit.status import Status
 
@@ -142,8 +142,8 @@ def _state(seen: Seen, told: Assumptions) -> Problem:
     for name in varied:
         if not seen.scanned[name].length:
             raise InputError(f"a network of k1 for '{name}', which has no length", "a quadrupole")
-        strengths[name], bounds = _strength(seen, name, told, name in branches)
-        weights += weight_free(f"magnets.{name}.network", bounds)
+        strengths[name], free = _strength(seen, name, told, name in branches)
+        weights += free
         records += _anchors(seen, name, told, name in branches)
     settings = seen.rows.settings | {
         name: np.stack([seen.rows.settings[name], padded(branch)], -1)
@@ -169,7 +169,7 @@ def _branches(seen: Seen, varied: tuple[str, ...]) -> dict[str, np.ndarray]:
 
 def _strength(
     seen: Seen, name: str, told: Assumptions, branches: bool
-) -> tuple[NetworkStrength, dict[str, tuple[np.ndarray, np.ndarray]]]:
+) -> tuple[NetworkStrength, list[Free]]:
     """A network that starts as the straight line between the lattice's own k1 at both ends."""
     settings = seen.scan.settings[name]
     low, high = float(settings.min()), float(settings.max())
@@ -182,8 +182,9 @@ def _strength(
         rising.append(0.0)
     half = abs(float(ends[1] - ends[0])) / 2 or 1.0
     output = Port(f"{name}.k1E", "", 0, half, float(ends.mean()))
-    net, bounds = signed_network(ports, [output], np.array([rising]), told.hidden, told.seed)
-    return NetworkStrength(net, seen.scanned[name].calibration.unit), bounds
+    path, rises = f"magnets.{name}.network", np.array([rising])
+    net, free = signed_network(path, ports, [output], rises, told.hidden, told.seed, MOST)
+    return NetworkStrength(net, seen.scanned[name].calibration.unit), free
 
 
 def _anchors(seen: Seen, name: str, told: Assumptions, branches: bool) -> Iterator[Record]:

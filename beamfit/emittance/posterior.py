@@ -23,15 +23,13 @@ from beamfit.emittance.results import PlaneFit
 from beamfit.emittance.statement import Scanned, Seen, asked_in, factor_of, size_records
 from beamfit.errors import InputError
 from beamfit.greybox import tree
-from beamfit.greybox.posterior import predicted, target_of
+from beamfit.greybox.posterior import Optimum, Statement, predicted, target_of
 from beamfit.greybox.problem import Problem
-from beamfit.greybox.stated import Optimum, Statement
 from beamfit.noise.model import Noise
 from beamfit.noise.sizes import NoiseKind, Scales, averaged, log_likelihood
 from beamfit.optics.beam import BeamMatrix
 from beamfit.quantity import Status
-from beamfit.sampling.intervals import Expected
-from beamfit.sampling.posterior import Posterior
+from beamfit.sampling.posterior import Expected, Posterior
 from beamfit.sampling.priors import Distribution
 from beamfit.sampling.target import SamplingTarget
 from beamfit.verdict import Finding

@@ -17,7 +17,7 @@ from beamfit.emittance.statement import Scanned
 from beamfit.emittance.transport import Rows, padded, rows_at
 from beamfit.errors import InputError, nearest
 from beamfit.optics.beamline import seen_line
-from beamfit.sampling.intervals import Correlations
+from beamfit.sampling.posterior import Correlations
 from beamfit.shown import shown
 
 NAMES = ("sigma11", "sigma12", "sigma22", "emittance", "beta", "alpha")

@@ -31,8 +31,7 @@ from beamfit.emittance.transport import (
     scanned_line,
 )
 from beamfit.emittance.verdict import MOST_NAMED
-from beamfit.greybox.problem import Free, Prior, Problem, Record
-from beamfit.greybox.terms import Constraint
+from beamfit.greybox.problem import Constraint, Free, Prior, Problem, Record
 from beamfit.noise.model import Noise
 from beamfit.noise.sizes import ShotMeans, evened, means_of
 from beamfit.optics.beamline import Beamline

@@ -15,19 +15,19 @@ import numpy as np
 
 from beamfit.emittance.assumptions import Assumptions
 from beamfit.emittance.constrained_network import (
+    MOST,
     beam_box,
     check_box,
     known_record,
     limited_network,
     network_problem,
-    signed_network,
-    weight_free,
 )
 from beamfit.emittance.statement import Scenario, Seen, varied_magnets
 from beamfit.emittance.transport import NetworkRows, padded
 from beamfit.greybox.bounds import over_cells
 from beamfit.greybox.mlp import MLP, Port
 from beamfit.greybox.problem import Free, Problem, Record
+from beamfit.greybox.signed_network import signed_network
 from beamfit.optics.beamline import transfer_rows
 
 CELLS = 32
@@ -183,8 +183,8 @@ def _signed(seen: Seen, lay: _Layout, told: Assumptions) -> tuple[MLP, list[Free
         Port(name, "", 0, np.ptp(v) / 2 or 1.0, (v.max() + v.min()) / 2)
         for name, v in zip(_names(seen, lay), first.T, strict=True)
     ]
-    net, bounds = signed_network(inputs, outputs, _signs(seen, lay, grid), told.hidden, told.seed)
-    return net, weight_free("map", bounds)
+    rising = _signs(seen, lay, grid)
+    return signed_network("map", inputs, outputs, rising, told.hidden, told.seed, MOST)
 
 
 def _names(seen: Seen, lay: _Layout) -> list[str]:

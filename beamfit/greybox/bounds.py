@@ -367,45 +367,6 @@ def _bounds(net: LayeredNetwork, lower: jax.Array, upper: jax.Array) -> Range:
     )
 
 
-def value_bounds(net: LayeredNetwork, lower: jax.Array, upper: jax.Array) -> Range:
-    """Enclose every output of a network over one finite box, by its gains from the centre.
-
-    Parameters
-    ----------
-    net : LayeredNetwork
-        The network; its own gain outputs play no part.
-    lower, upper : array, shape (inputs,)
-        Corners of the box.
-
-    Returns
-    -------
-    Range
-        `lower` and `upper`, each of shape (output ports,), rounding included.
-
-    Notes
-    -----
-    The mean value form, f(c) + f'(box) (box - c): R. E. Moore, Interval Analysis (1966), section
-    6.3. Its excess falls with the square of the box's size.
-
-    Examples
-    --------
-    >>> from beamfit.greybox.mlp import dense
-    >>> found = value_bounds(dense(["u"], ["y"]), jnp.array([0.0]), jnp.array([0.1]))
-    >>> bool(found.lower[0] < found.upper[0])
-    True
-    """
-    centre = 0.5 * (lower + upper)
-    radius = 0.5 * (upper - lower) + 4 * _ROUNDING * (jnp.abs(lower) + jnp.abs(upper))
-    bound = gain_bounds(net, lower, upper)
-    reach = jnp.maximum(jnp.abs(bound.lower), jnp.abs(bound.upper)) @ radius
-    node = _enclose(net, Range(centre, centre)).value
-    scale, bias = (jnp.array([getattr(p, n) for p in net.output_ports]) for n in ("scale", "bias"))
-    ends = node.lower * scale + bias, node.upper * scale + bias
-    size = jnp.maximum(*map(jnp.abs, ends)) + jnp.abs(bias) + reach
-    error = 8 * (len(radius) + 2) * _ROUNDING * size + _TINY
-    return Range(jnp.minimum(*ends) - reach, jnp.maximum(*ends) + reach).widened(error)
-
-
 def cells(lower, upper, number: int) -> tuple[np.ndarray, np.ndarray]:
     """Split a box into a grid of cells that leave no gap.
 

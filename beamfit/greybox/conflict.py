@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
+from scipy.optimize import nnls
 
 from beamfit.greybox import problem
 from beamfit.greybox.assess import NEAR, SearchState, gradient_size, nearby, scale_of
@@ -171,24 +172,25 @@ def _changes(p: Problem, s: SearchState) -> np.ndarray:
 
 
 def _combination(rows: np.ndarray, free: np.ndarray, cut: float) -> np.ndarray | None:
-    """A combination of rows that vanishes, not negative where it is not free to be."""
-    left, sizes, _ = np.linalg.svd(rows, full_matrices=True)
-    none = left[:, int(np.sum(sizes > cut * max(1.0, np.max(sizes)))) :]
-    if not none.shape[1]:
-        return None
-    if free.all():
-        return none[:, 0]
-    if none.shape[1] == 1:
-        v = none[:, 0] * np.sign(none[np.argmax(np.abs(none[:, 0]) * ~free), 0])
-        return v if np.min(v[~free]) >= -PART * np.max(np.abs(v)) else None
-    from scipy.optimize import linprog
+    """A combination of rows that vanishes, not negative where it is not free to be.
 
-    # Prefer combinations of constrained rows; otherwise take a free one.
-    bound = [(-1.0, 1.0)] * none.shape[1]
-    found = linprog(-none[~free].sum(axis=0), -none[~free], np.zeros((~free).sum()), bounds=bound)
-    v = none @ found.x if found.status == 0 else np.zeros(len(rows))
-    if np.max(np.abs(v)) > PART:
-        return v
-    values, turned = np.linalg.svd(none[~free], full_matrices=True)[1:]
-    rest = turned[int(np.sum(values > cut)) :]
-    return none @ rest[0] if len(rest) else None
+    Prefer one with rows that are not free; otherwise take one of the free rows alone.
+    """
+    held, v = ~free, np.zeros(len(rows))
+    if held.any():
+        signed = np.vstack([rows[held], rows[free], -rows[free]])
+        total = np.append(np.ones(held.sum()), np.zeros(2 * free.sum()))
+        one = np.append(np.zeros(rows.shape[1]), 1.0)
+        found, miss = nnls(np.vstack([signed.T, total]), one, maxiter=50 * len(signed))
+        if miss <= cut:
+            v[held], (up, down) = found[: held.sum()], np.split(found[held.sum() :], 2)
+            v[free] = up - down
+            return v
+    if not free.any():
+        return None
+    left, sizes, _ = np.linalg.svd(rows[free], full_matrices=True)
+    rank = int(np.sum(sizes > cut * max(1.0, np.max(sizes))))
+    if rank == free.sum():
+        return None
+    v[free] = left[:, rank]
+    return v

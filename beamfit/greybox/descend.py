@@ -3,9 +3,12 @@
 Levenberg-Marquardt with Moré's column scaling (Moré 1978, Numerical Analysis, LNM 630, 105) and
 Nielsen's damping (IMM-REP-1999-05). A step solves the damped linear problem by QR, not by normal
 equations, and pins the numbers that would leave their bounds, so iterates end exactly on them;
-scipy's bounded methods stay strictly inside, which blurs the verdict "at its bound". Written for
-`jax.vmap`: twenty starts take the time of a few. It proposes points; whether one is an optimum is
-for `beamfit.greybox.assess` to say.
+scipy's bounded methods stay strictly inside, which blurs the verdict "at its bound". All starts
+take their steps together: only residuals and slopes are compiled, the steps are batched NumPy.
+
+Of many free numbers steps solve normal equations, sparse where the problem is, and are corrected by
+the residual that they leave (corrected seminormal equations: Å. Björck, Linear Algebra Appl. 88/89
+(1987) 31). It proposes points; whether one is an optimum is for `beamfit.greybox.assess` to say.
 """
 
 from __future__ import annotations
@@ -16,420 +19,247 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from beamfit.greybox.covariance import FEW, RIDGE, Factor, Rows, in_units, lengths, with_diagonal
-from beamfit.greybox.problem import Problem, sloped, with_slope
-from beamfit.greybox.problem import residual as problem_residual
+from beamfit.greybox.covariance import FEW
+from beamfit.greybox.problem import Problem, residual, sloped, with_slope
+from beamfit.greybox.sparse import (
+    RIDGE,
+    Factor,
+    Pattern,
+    Rows,
+    in_units,
+    lengths,
+    pattern_at,
+    with_diagonal,
+)
 
 # Damping of the first step; the Jacobian's columns have unit length.
 DAMPING = 1e-3
 # A search rests at a step below this share of the numbers, both in units of the Jacobian's columns.
 TOLERANCE = 1e-13
-# Smallest factor on the damping in one step.
-EASED = 1e-4
-# Damping beyond which no step, however short, lowers the cost.
-STUCK = 1e30
+# Damping beyond which no step, however short, lowers the cost; below the least it is rounding.
+STUCK, LEAST = 1e30, 1e-30
 # A promised decrease below this share of the sum of squares is rounding.
 ROUNDING = 1e-16
 # The same for many numbers, whose last steps cost most and move them by 1e-7 of an error.
 FINISHED = 1e-14
 # Rounds in which a step pins numbers to bounds; the rest is clipped.
 PINNED = 3
-# Factor on the damping of many numbers, times the relative miss of a step's promised decrease.
-TRUSTED = 10.0
-# Steps between two looks at the clock under a time limit.
-SEGMENT = 50
-# Starts searched in one compiled call, if their Jacobians have at most this many entries.
+# Factor on the damping of many numbers, times the relative miss of a step's promised decrease; its
+# least value.
+TRUSTED, EASED = 10.0, 1e-4
+# Starts looked at in one compiled call, if their Jacobians have at most this many entries.
 WIDTH, LARGE = 4, 2**15
+
+# Residuals (k, m) and their Jacobians (k, m, n), or k sparse ones, at points (k, n) of some starts.
+Slopes = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 
 class Found(NamedTuple):
-    """End of one start: numbers, half the sum of squares, steps, and if it came to rest."""
+    """Ends of searches: numbers, half the sums of squares, steps, and if they came to rest."""
 
-    theta: Array
-    cost: Array
-    steps: Array
-    rested: Array
-
-
-class Walk(NamedTuple):
-    """A search under way: where it is, the point it tries next, and what that promises.
-
-    `stuck` tells that no step from here lowers the cost; `steps` is -1 before the start is seen.
-    """
-
-    theta: Array
-    residual: Array
-    jacobian: Array
-    scale: Array
-    damping: Array
-    growth: Array
-    steps: Array
-    rested: Array
-    stuck: Array
-    trial: Array
-    promised: Array
-
-    @property
-    def memory(self) -> tuple[Array, Array, Array, Array]:
-        """State that the next segment of a search begins with."""
-        return self.damping, self.growth, self.scale, self.steps
-
-    @property
-    def found(self) -> Found:
-        """The end of the search."""
-        return Found(self.theta, 0.5 * self.residual @ self.residual, self.steps, self.rested)
+    theta: np.ndarray
+    cost: np.ndarray
+    steps: np.ndarray
+    rested: np.ndarray
 
 
-def walk(
-    residual: Callable[[Array], Array],
-    start: Array,
-    lower: Array,
-    upper: Array,
-    iterations: Any,
-    tolerance: float = TOLERANCE,
-    memory: tuple[Any, Any, Any, Any] = (DAMPING, 2.0, 0.0, 0),
-    moves: Any = True,
-) -> Walk:
-    """Search until it rests, is stuck or has taken so many steps, refused ones too.
+class Descent:
+    """Searches side by side; arrays with one row for each start.
 
-    `memory` has damping, growth, column lengths and steps of an earlier walk to go on from. A walk
-    that does not move only looks at its start.
-    """
-    theta = jnp.clip(start, lower, upper)
-    shape = jax.eval_shape(residual, theta)
-    damping, growth, scale, steps = (jnp.asarray(v) for v in memory)
-    first = Walk(
-        theta, jnp.full(shape.shape, jnp.inf), jnp.zeros((*shape.shape, theta.size)),
-        jnp.broadcast_to(scale, theta.shape).astype(float), damping.astype(float),
-        growth.astype(float), jnp.asarray(-1), jnp.asarray(False), jnp.asarray(False), theta,
-        jnp.asarray(0.0),
-    )  # fmt: skip
-    more = jnp.maximum(iterations - steps, 0)
-
-    def go_on(s: Walk) -> Array:
-        return ~s.rested & ~s.stuck & (s.steps < more)
-
-    advance = partial(_advance, residual, lower, upper, tolerance, moves)
-    last = jax.lax.while_loop(go_on, advance, first)
-    return last._replace(steps=last.steps + steps)
-
-
-def descend_one(
-    residual: Callable[[Array], Array],
-    start: Array,
-    lower: Array,
-    upper: Array,
-    iterations: int = 300,
-    tolerance: float = TOLERANCE,
-) -> Found:
-    """Minimise half the sum of squares within bounds; a pure function, to be vectorised.
+    `stuck` tells that no step from there lowers the cost; `steps` counts refused ones too.
 
     Parameters
     ----------
-    residual : callable
-        ``residual(theta)``, shape (m,), in JAX.
-    start : array, shape (n,)
-        Where to start; the residual is finite there.
+    slopes : callable
+        ``slopes(lanes, points)``: residuals and Jacobians at a point of each of some starts.
+    points : array, shape (k, n)
+        Where to start.
     lower, upper : array, shape (n,)
         Bounds; equal ends hold a number fixed.
-    iterations : int
-        Most steps, refused ones too.
     tolerance : float
-        On the length of a step relative to theta, both in units of the Jacobian's columns.
-
-    Returns
-    -------
-    Found
-
-    Examples
-    --------
-    >>> import beamfit.greybox
-    >>> fit = jax.vmap(lambda y: descend_one(lambda t: t - y, jnp.zeros(1), -jnp.ones(1),
-    ...                                      jnp.ones(1)).theta)
-    >>> fit(jnp.array([0.5, 3.0])).ravel().round(9).tolist()
-    [0.5, 1.0]
-    """
-    lower, upper = jnp.asarray(lower, float), jnp.asarray(upper, float)
-    return walk(residual, jnp.asarray(start, float), lower, upper, iterations, tolerance).found
-
-
-@partial(jax.jit, static_argnames=("residual", "iterations", "tolerance"))
-def descend_all(
-    residual: Callable[[Any, Array], Array],
-    data: Any,
-    starts: Array,
-    lower: Array,
-    upper: Array,
-    iterations: int = 300,
-    tolerance: float = TOLERANCE,
-) -> Found:
-    """`descend_one` from every start.
-
-    Parameters
-    ----------
-    residual : callable
-        ``residual(data, theta)``, shape (m,), in JAX; defined at the top of a module, so that it
-        is compiled once.
-    data : pytree
-        What it needs; the same for all starts.
-    starts : array, shape (k, n)
-        Where to start.
-    lower, upper, iterations, tolerance
-        As for `descend_one`.
-
-    Returns
-    -------
-    Found
-        Arrays with the leading axis of ``starts``.
-
-    Examples
-    --------
-    >>> import beamfit.greybox
-    >>> def miss(target, t):
-    ...     return t**2 - target
-    >>> starts, low, high = jnp.array([[1.0], [5.0]]), jnp.array([0.0]), jnp.array([9.0])
-    >>> found = descend_all(miss, 4.0, starts, low, high)
-    >>> found.theta.round(6).ravel().tolist()
-    [2.0, 2.0]
+        On the length of a step relative to the numbers, both in units of the Jacobian's columns.
+    many : bool
+        Whether steps are those of many free numbers.
     """
 
-    def one(start: Array) -> Found:
-        return descend_one(partial(residual, data), start, lower, upper, iterations, tolerance)
-
-    return jax.vmap(one)(jnp.asarray(starts, float))
-
-
-def _advance(residual, lower: Array, upper: Array, tolerance: float, moves, s: Walk) -> Walk:
-    """Look at the point tried, take or refuse it, and find the next one."""
-    first = s.steps < 0
-    r, j = with_slope(residual, s.trial)
-    finite = jnp.all(jnp.isfinite(r)) & jnp.all(jnp.isfinite(j))
-    gained = 0.5 * (s.residual - r) @ (s.residual + r)
-    ratio = jnp.where(finite & (s.promised > 0), gained / s.promised, -1.0)
-    good = first | (ratio > 1e-4)
-    eased = s.damping * jnp.maximum(1 / 3, 1 - (2 * jnp.minimum(ratio, 1.0) - 1) ** 3)
-    kept = partial(jnp.where, good)
-    theta, r, j = kept(s.trial, s.theta), kept(r, s.residual), kept(j, s.jacobian)
-    scale = jnp.maximum(s.scale, jnp.linalg.norm(j, axis=0))
-    damping = jnp.where(first, s.damping, kept(eased, s.damping * s.growth))
-    at = (theta, r, j, scale, damping, lower, upper)
-    trial = _next(*at) if moves is True else jax.lax.cond(moves, _next, lambda *at: at[0], *at)
-    change = trial - theta
-    promised = -(r @ (j @ change)) - 0.5 * jnp.sum((j @ change) ** 2)
-    small = jnp.linalg.norm(scale * change) <= tolerance * jnp.linalg.norm(scale * theta)
-    # The decrease that a refused step promised is below rounding.
-    nothing = ~good & (s.promised >= 0) & (s.promised <= ROUNDING * (r @ r))
-    return Walk(
-        theta, r, j, scale, damping, kept(jnp.where(first, s.growth, 2.0), 2.0 * s.growth),
-        s.steps + 1, small | nothing, (damping > STUCK) | (first & ~finite), trial, promised,
-    )  # fmt: skip
-
-
-def _easing(ratio: float) -> float:
-    """Factor on the damping after a step that gained this share of its promised decrease.
-
-    Nielsen's rule, and faster where a step gains what it promised: then steps become undamped and
-    converge as fast as Gauss-Newton's. Few numbers keep to Nielsen's rule: in the flat valleys of
-    networks every second step would be refused.
-    """
-    nielsen = max(1 / 3, 1 - (2 * min(ratio, 1.0) - 1) ** 3)
-    return min(nielsen, max(TRUSTED * abs(1 - ratio), EASED))
-
-
-def _next(theta, residual, jacobian, scale, damping, lower, upper) -> Array:
-    """Solve the damped linear problem inside the bounds, pinning what would leave.
-
-    In units of the columns' lengths; (R, q) of the QR of (J, r) stand for (J, r).
-    """
-    n = theta.size
-    unit = jnp.where(scale > 0, scale, 1.0)
-    low, high = (lower - theta) * unit, (upper - theta) * unit
-    rows = jnp.column_stack([jacobian / unit, residual])
-    if rows.shape[0] > n + 1:
-        rows = jnp.linalg.qr(rows, mode="r")
-    triangle, reduced = rows[:, :n], rows[:, n]
-    g = triangle.T @ reduced
-    pinned = ((low >= 0) & (g > 0)) | ((high <= 0) & (g < 0)) | (lower >= upper)
-
-    def unfinished(state):
-        pinned, _, before, rounds = state
-        return (rounds == 0) | ((rounds < PINNED) & jnp.any(pinned != before))
-
-    def pin(state):
-        # A pinned number stands alone in its row; the others are solved beside it.
-        pinned, held, _, rounds = state
-        at = jnp.where(pinned, held, 0.0)
-        loose = jnp.where(pinned, 0.0, triangle)
-        left = jnp.vstack([loose, jnp.diag(jnp.where(pinned, 1.0, jnp.sqrt(damping)))])
-        right = jnp.concatenate([-reduced - triangle @ at, at])
-        r = jnp.linalg.qr(jnp.column_stack([left, right]), mode="r")
-        tried = jax.scipy.linalg.solve_triangular(r[:n, :n], r[:n, n])
-        clipped = jnp.clip(tried, low, high)
-        return pinned | (clipped != tried), clipped, pinned, rounds + 1
-
-    begin = (pinned, jnp.zeros_like(g), pinned, jnp.asarray(0))
-    held = jax.lax.while_loop(unfinished, pin, begin)[1]
-    inside = jnp.clip(theta + held / unit, lower, upper)
-    # Exactly on a bound, or the number is not known to be there.
-    found = jnp.where(held <= low, lower, jnp.where(held >= high, upper, inside))
-    return jnp.where(jnp.all(jnp.isfinite(held)), found, theta)
-
-
-class Lanes:
-    """Searches of a problem side by side, or points looked at: a few in a compiled call.
-
-    The call has one width however many searches there are, so that they share its code; one that
-    is polished alone does not wait for all.
-    """
-
-    def __init__(self, p: Problem, points: np.ndarray):
-        self.p, self.call = p, p.compiled(_walks)
-        k, n = points.shape
-        self.width = WIDTH if n * p.size <= LARGE else 1
-        nothing, no = np.zeros(k), np.zeros(k, bool)
-        self.at = Walk(
-            np.array(points), np.full((k, p.residual_count), np.inf),
-            np.zeros((k, p.residual_count, n)), np.zeros((k, n)), nothing + DAMPING, nothing + 2.0,
-            np.zeros(k, int), no, no.copy(), np.array(points), nothing,
-        )  # fmt: skip
+    def __init__(self, slopes: Slopes, points, lower, upper, tolerance=TOLERANCE, many=False):
+        self.slopes, self.lower, self.upper = slopes, np.asarray(lower), np.asarray(upper)
+        self.tolerance, self.many = tolerance, many
+        self.theta = np.clip(np.asarray(points, float), lower, upper)
+        k = len(self.theta)
+        self.residual, self.jacobian = slopes(np.arange(k), self.theta)
+        self.scale = np.zeros_like(self.theta)
+        self.damping, self.growth = np.full(k, DAMPING), np.full(k, 2.0)
+        self.steps, self.rested = np.zeros(k, int), np.zeros(k, bool)
+        self.stuck = ~_finite(self.residual, self.jacobian)
 
     @property
     def done(self) -> np.ndarray:
         """True for each start that has come to rest or cannot move."""
-        return self.at.rested | self.at.stuck
-
-    def go(self, lanes: np.ndarray, limit: int, until: float | None) -> None:
-        """Move some searches on to a number of steps, or until a moment on the clock."""
-        reached = limit if until is None else 0
-        while True:
-            reached = min(max(reached, int(np.min(self.at.steps[lanes])) + SEGMENT), limit)
-            moving = lanes[~self.done[lanes]]
-            for some in np.split(moving, range(self.width, len(moving), self.width)):
-                self._move(some, reached)
-            unfinished = ~self.done[lanes] & (self.at.steps[lanes] < limit)
-            if not unfinished.any() or (until is not None and time.perf_counter() >= until):
-                return
-
-    def _move(self, some: np.ndarray, limit: int) -> None:
-        begin = jax.tree.map(lambda part: part[some], (self.at.theta, self.at.memory))
-        for own, part in zip(self.at, self._called(limit, *begin), strict=True):
-            own[some] = part
-
-    def _called(self, limit: int, theta: np.ndarray, memory: tuple[np.ndarray, ...]) -> Walk:
-        """The call for no more searches than its width, filled up with the first of them."""
-        k, fill = len(theta), self.width - len(theta)
-        every = theta, memory, np.full(k, limit)
-        filled = jax.tree.map(lambda v: np.concatenate([v, np.repeat(v[:1], fill, axis=0)]), every)
-        found = self.call(*filled, self.p.lower, self.p.upper)
-        return Walk(*(np.asarray(part)[:k] for part in found))
+        return self.rested | self.stuck
 
     @property
     def cost(self) -> np.ndarray:
         """Half the sum of squares of each; infinite where something is not finite."""
-        cost = 0.5 * np.sum(self.at.residual**2, axis=1)
+        cost = 0.5 * np.sum(self.residual**2, axis=1)
         return np.where(np.isfinite(cost), cost, np.inf)
 
-    def look(self, points: np.ndarray) -> np.ndarray:
-        """Cost at points, without moving."""
-        parts = np.split(points, range(self.width, len(points), self.width))
-        fresh = (Lanes(self.p, part).at for part in parts)
-        found = [self._called(0, at.theta, at.memory).residual for at in fresh]
-        return np.concatenate([0.5 * np.sum(residual**2, axis=1) for residual in found])
+    @property
+    def found(self) -> Found:
+        """The ends."""
+        return Found(self.theta, self.cost, self.steps, self.rested)
+
+    def go(self, lanes: np.ndarray, limit: int, until: float | None = None) -> None:
+        """Move some searches on to a number of steps, or until a moment on the clock."""
+        while until is None or time.perf_counter() < until:
+            moving = lanes[~self.done[lanes] & (self.steps[lanes] < limit)]
+            if not len(moving):
+                return
+            self._advance(moving)
+
+    def _advance(self, lanes: np.ndarray) -> None:
+        """Try a step of each, take or refuse it."""
+        r, j = self.residual[lanes], self.jacobian[lanes]
+        self.scale[lanes] = scale = np.maximum(self.scale[lanes], _lengths(j))
+        theta, damping = self.theta[lanes], self.damping[lanes]
+        step = _next_of_many if self.many else _next
+        trial = step(theta, r, j, scale, damping, self.lower, self.upper)
+        change = trial - theta
+        moved = _times(j, change)
+        promised = -np.sum(moved * (r + 0.5 * moved), axis=1)
+        small = _length(scale * change) <= self.tolerance * _length(scale * theta)
+        self.rested[lanes] = small
+        go = ~small
+        lanes, r, promised = lanes[go], r[go], promised[go]
+        if not len(lanes):
+            return
+        new, slope = self.slopes(lanes, trial[go])
+        self.steps[lanes] += 1
+        finite = _finite(new, slope)
+        with np.errstate(all="ignore"):
+            ratio = 0.5 * np.sum((r - new) * (r + new), axis=1) / promised
+        ratio = np.where(finite & (promised > 0), ratio, -1.0)
+        squares = np.sum(r * r, axis=1)
+        # A step that promises next to nothing cannot be judged: of many numbers it is the last.
+        last = finite & (promised >= 0) & (promised <= FINISHED * squares) & self.many
+        good = (ratio > 1e-4) | last
+        nothing = ~good & (promised >= 0) & (promised <= ROUNDING * squares)
+        taken, refused = lanes[good], lanes[~good]
+        self.theta[taken], self.residual[taken] = trial[go][good], new[good]
+        self.jacobian[taken] = slope[good]
+        self.damping[taken] *= _easing(ratio[good], self.many)
+        self.growth[taken] = 2.0
+        self.damping[refused] *= self.growth[refused]
+        self.growth[refused] *= 2.0
+        self.rested[lanes] = last | nothing
+        self.stuck[lanes] = self.damping[lanes] > STUCK
 
     def move(self, lane: int, point: np.ndarray) -> None:
         """Begin one search anew."""
-        self.at.theta[lane], self.at.scale[lane] = point, 0.0
-        self.at.damping[lane], self.at.growth[lane] = DAMPING, 2.0
-        self.at.rested[lane] = self.at.stuck[lane] = False
+        at = np.array([lane])
+        self.theta[at] = point
+        self.residual[at], self.jacobian[at] = self.slopes(at, self.theta[at])
+        self.scale[lane], self.damping[lane], self.growth[lane] = 0.0, DAMPING, 2.0
+        self.rested[lane] = self.stuck[lane] = False
 
 
-class ManyLanes(Lanes):
-    """The same for many free numbers, one search after the other outside JAX.
+def _length(rows: np.ndarray) -> np.ndarray:
+    return np.linalg.norm(rows, axis=-1)
 
-    Steps solve normal equations, sparse where the problem is, and are corrected by the residual
-    that they leave (corrected seminormal equations: Å. Björck, Linear Algebra Appl. 88/89 (1987)
-    31).
+
+def _lengths(jacobians: np.ndarray) -> np.ndarray:
+    """Lengths of the columns of each; of many numbers they are an array of matrices."""
+    if jacobians.dtype == object:
+        return np.stack([lengths(one) for one in jacobians])
+    return np.linalg.norm(jacobians, axis=1)
+
+
+def _times(jacobians: np.ndarray, steps: np.ndarray) -> np.ndarray:
+    if jacobians.dtype == object:
+        return np.stack([one @ step for one, step in zip(jacobians, steps, strict=True)])
+    return np.einsum("kmn,kn->km", jacobians, steps)
+
+
+def _finite(residuals: np.ndarray, jacobians: np.ndarray) -> np.ndarray:
+    """True for each start where all is finite."""
+    sums = np.array([one.sum() for one in jacobians], float)
+    return np.isfinite(residuals.sum(axis=1) + sums)
+
+
+def _easing(ratio: np.ndarray, many: bool) -> np.ndarray:
+    """Factor on the damping after a step that gained this share of its promised decrease.
+
+    Nielsen's rule, and faster where a step of many numbers gains what it promised: then steps
+    become undamped and converge as fast as Gauss-Newton's. Few numbers keep to Nielsen's rule: in
+    the flat valleys of networks every second step would be refused.
     """
+    nielsen = np.maximum(1 / 3, 1 - (2 * np.minimum(ratio, 1.0) - 1) ** 3)
+    return np.minimum(nielsen, np.maximum(TRUSTED * np.abs(1 - ratio), EASED)) if many else nielsen
 
-    def __init__(self, p: Problem, points: np.ndarray):
-        self.p, self.width = p, 1
-        k, n = points.shape
-        nothing, no = np.zeros(k), np.zeros(k, bool)
-        self.at = Walk(
-            np.array(points), np.full((k, p.residual_count), np.inf), np.empty(k, object),
-            np.zeros((k, n)), nothing + DAMPING, nothing + 2.0, np.zeros(k, int), no, no.copy(),
-            np.array(points), nothing,
-        )  # fmt: skip
 
-    def look(self, points: np.ndarray) -> np.ndarray:
-        """Cost at points, without moving."""
-        look = self.p.compiled(problem_residual)
-        found = (np.asarray(look(point)) for point in points)
-        return np.array([0.5 * residual @ residual for residual in found])
+def _pinned(g: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """True for each number on a bound towards which the cost falls, and for fixed ones."""
+    return ((low >= 0) & (g > 0)) | ((high <= 0) & (g < 0)) | (low >= high)
 
-    def slopes(self, theta: np.ndarray) -> tuple[np.ndarray, Rows]:
-        """Residuals and their Jacobian, in as few sweeps as its pattern allows."""
-        pattern = self.p.pattern
-        if pattern is not None:
-            r, swept = map(np.asarray, self.p.compiled(_swept)(theta, pattern.seeds))
-            found = pattern.matrix(swept)
-            if pattern.holds(found, swept):
-                return r, found
-        r, found = self.p.compiled(sloped)(theta)
-        return np.asarray(r), np.asarray(found)
 
-    def _move(self, some: np.ndarray, limit: int) -> None:
-        for lane in some:
-            memory = tuple(part[lane] for part in self.at.memory)
-            walked = self._walk(self.at.theta[lane], memory, limit)
-            for own, part in zip(self.at, walked, strict=True):
-                own[lane] = part
+def _placed(theta, held, unit, low, high, lower, upper) -> np.ndarray:
+    """The next point: exactly on a bound, or the number is not known to be there."""
+    inside = np.clip(theta + held / unit, lower, upper)
+    return np.where(held <= low, lower, np.where(held >= high, upper, inside))
 
-    def _walk(self, theta: np.ndarray, memory: tuple[Any, ...], limit: int) -> Walk:
-        """`walk`, looking at one point tried after the other."""
-        p, (damping, growth, scale, steps), rested = self.p, memory, False
-        theta = np.clip(theta, p.lower, p.upper)
-        r, j = self.slopes(theta)
-        while not (stuck := damping > STUCK or not np.isfinite(r.sum() + j.sum())):
-            scale = np.maximum(scale, lengths(j))
-            try:
-                trial = _next_of_many(theta, r, j, scale, damping, p.lower, p.upper)
-            except np.linalg.LinAlgError:
-                damping, growth, steps = max(damping, RIDGE) * growth, 2.0 * growth, steps + 1
-                continue
-            change = trial - theta
-            moved = j @ change
-            promised = -(r @ moved) - 0.5 * moved @ moved
-            rested = np.linalg.norm(scale * change) <= TOLERANCE * np.linalg.norm(scale * theta)
-            if rested or steps >= limit:
-                break
-            new, slope = self.slopes(trial)
-            steps += 1
-            ratio = 0.5 * (r - new) @ (r + new) / promised if promised > 0 else -1.0
-            # A step that promises next to nothing cannot be judged: it is taken, as the last.
-            rested = bool(0 <= promised <= FINISHED * (r @ r)) and np.isfinite(slope.sum())
-            if rested:
-                theta, r, j = trial, new, slope
-                break
-            if ratio > 1e-4 and np.isfinite(slope.sum()):
-                theta, r, j = trial, new, slope
-                damping, growth = damping * _easing(ratio), 2.0
-            else:
-                damping, growth = damping * growth, 2.0 * growth
-        return Walk(theta, r, j, scale, damping, growth, steps, rested, stuck, theta, 0.0)
+
+def _next(theta, residual, jacobian, scale, damping, lower, upper) -> np.ndarray:
+    """Solve the damped linear problems inside the bounds, pinning what would leave.
+
+    In units of the columns' lengths; (R, q) of the QR of (J, r) stand for (J, r).
+    """
+    n = theta.shape[1]
+    unit = np.where(scale > 0, scale, 1.0)
+    low, high = (lower - theta) * unit, (upper - theta) * unit
+    rows = np.concatenate([jacobian / unit[:, None], residual[..., None]], axis=2)
+    if rows.shape[1] > n + 1:
+        rows = np.linalg.qr(rows, mode="r")
+    triangle, reduced = rows[..., :n], rows[..., n]
+    pinned = _pinned(np.einsum("kmn,km->kn", triangle, reduced), low, high)
+    held, root = np.zeros_like(theta), np.sqrt(np.maximum(damping, LEAST))[:, None]
+    for _ in range(PINNED):
+        # A pinned number stands alone in its row; the others are solved beside it.
+        at = np.where(pinned, held, 0.0)
+        loose = np.where(pinned[:, None], 0.0, triangle)
+        alone = np.where(pinned, 1.0, root)[..., None] * np.eye(n)
+        right = np.concatenate([-reduced - np.einsum("kmn,kn->km", triangle, at), at], axis=1)
+        left = np.concatenate([loose, alone], axis=1)
+        r = np.linalg.qr(np.concatenate([left, right[..., None]], axis=2), mode="r")
+        tried = np.linalg.solve(r[:, :n, :n], r[:, :n, n:])[..., 0]
+        held = np.clip(tried, low, high)
+        more = pinned | (held != tried)
+        if np.array_equal(more, pinned):
+            break
+        pinned = more
+    found = _placed(theta, held, unit, low, high, lower, upper)
+    return np.where(np.isfinite(held).all(axis=1, keepdims=True), found, theta)
 
 
 def _next_of_many(theta, residual, jacobian, scale, damping, lower, upper) -> np.ndarray:
-    """`_next`, by normal equations of the numbers that are not pinned."""
+    """`_next` of each start, by normal equations of the numbers that are not pinned."""
+    found = np.full_like(theta, np.nan)
+    for lane, at in enumerate(zip(theta, residual, jacobian, scale, damping, strict=True)):
+        try:
+            found[lane] = _seminormal(*at, lower, upper)
+        except np.linalg.LinAlgError:  # refused, and damped more
+            continue
+    return found
+
+
+def _seminormal(theta, residual, jacobian, scale, damping, lower, upper) -> np.ndarray:
     unit = np.where(scale > 0, scale, 1.0)
     low, high = (lower - theta) * unit, (upper - theta) * unit
     rows = in_units(jacobian, unit)
-    normal, g = rows.T @ rows, rows.T @ residual
-    pinned = ((low >= 0) & (g > 0)) | ((high <= 0) & (g < 0)) | (lower >= upper)
+    normal = rows.T @ rows
+    pinned = _pinned(rows.T @ residual, low, high)
     held, more = np.zeros(len(theta)), max(damping, RIDGE)
     for _ in range(PINNED):
         loose, held = np.flatnonzero(~pinned), np.where(pinned, held, 0.0)
@@ -443,26 +273,138 @@ def _next_of_many(theta, residual, jacobian, scale, damping, lower, upper) -> np
         held, done, pinned = clipped, np.array_equal(pinned, more_pinned), more_pinned
         if done:
             break
-    inside = np.clip(theta + held / unit, lower, upper)
-    return np.where(held <= low, lower, np.where(held >= high, upper, inside))
+    return _placed(theta, held, unit, low, high, lower, upper)
 
 
-def lanes_of(p: Problem, points: np.ndarray) -> Lanes:
-    """Searches from points, by the method for as many free numbers as there are."""
-    return (Lanes if len(p.start) <= FEW else ManyLanes)(p, points)
+def descent_of(p: Problem, points: np.ndarray) -> Descent:
+    """Searches of a problem, by the method for as many free numbers as it has."""
+    many = len(p.start) > FEW
+    slopes = _slopes_of_many(p) if many else _slopes_of_few(p)
+    return Descent(slopes, points, p.lower, p.upper, many=many)
 
 
-def _swept(core, theta, seeds):
+def costs(p: Problem, d: Descent, points: np.ndarray) -> np.ndarray:
+    """Half the sum of squares at points; of few numbers by the call that is compiled already."""
+    look = p.compiled(residual)
+    found = map(look, points) if d.many else d.slopes(np.zeros(len(points), int), points)[0]
+    return np.array([0.5 * float(r @ r) for r in map(np.asarray, found)])
+
+
+def _slopes_of_few(p: Problem) -> Slopes:
+    """A few points in each compiled call, whose width is one however many starts there are."""
+    width = WIDTH if len(p.start) * p.size <= LARGE else 1
+    call = p.compiled(_sloped_each)
+
+    def slopes(_: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        fill = np.repeat(points[:1], -len(points) % width, axis=0)
+        parts = np.split(np.concatenate([points, fill]), (len(points) + len(fill)) // width)
+        found = zip(*(map(np.asarray, call(part)) for part in parts), strict=True)
+        r, j = (np.concatenate(every)[: len(points)] for every in found)
+        return r, j
+
+    return slopes
+
+
+def _sloped_each(core, thetas):
+    return jax.vmap(partial(sloped, core))(thetas)
+
+
+def _slopes_of_many(p: Problem) -> Slopes:
+    """One point after the other, in as few sweeps as the pattern of the Jacobian allows."""
+    shape = p.residual_count, len(p.start)
+    sweep, whole = p.compiled(_swept), p.compiled(sloped)
+    pattern: Pattern | None = None
+    sparse = True
+
+    def one(theta: np.ndarray) -> tuple[np.ndarray, Rows]:
+        nonlocal pattern, sparse
+        there = partial(sweep, theta)
+        # A place that was zero at all points before is found by looking once more.
+        for again in (False, True):
+            if sparse and (again or pattern is None):
+                pattern = pattern_at(there, shape, pattern)
+                sparse = pattern is not None
+            if sparse:
+                r, found = pattern.jacobian(there)
+                if found is not None:
+                    return r, found
+        r, found = whole(theta)
+        return np.asarray(r), np.asarray(found)
+
+    def slopes(_: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        rows, matrices = zip(*map(one, points), strict=True)
+        found = np.empty(len(points), object)
+        found[:] = matrices
+        return np.stack(rows), found
+
+    return slopes
+
+
+def _swept(core, theta, directions):
     """Residuals, and the products of their Jacobian with some directions."""
-    r, along = jax.linearize(partial(problem_residual, core), theta)
-    return r, jax.vmap(along)(seeds)
+    r, along = jax.linearize(partial(residual, core), theta)
+    return r, jax.vmap(along)(directions)
 
 
-def _walks(core, starts, memory, limit, lower, upper) -> Walk:
-    """Searches from starts, each with its own memory and limit of steps."""
-    residual, moves = partial(problem_residual, core), jnp.any(limit > 0)
+@partial(jax.jit, static_argnums=(0, 3))
+def _sloped_all(residual, data, points, own: bool):
+    def one(data, theta):
+        return with_slope(partial(residual, data), theta)
 
-    def one(theta, memory, limit):
-        return walk(residual, theta, lower, upper, limit, memory=memory, moves=moves)
+    return jax.vmap(one, (0 if own else None, 0))(data, points)
 
-    return jax.vmap(one)(starts, memory, limit)
+
+def descend_all(
+    residual: Callable[[Any, Array], Array],
+    data: Any,
+    starts: Array,
+    lower: Array,
+    upper: Array,
+    iterations: int = 300,
+    tolerance: float = TOLERANCE,
+    own: bool = False,
+) -> Found:
+    """Minimise half the sum of squares within bounds, from every start.
+
+    Parameters
+    ----------
+    residual : callable
+        ``residual(data, theta)``, shape (m,), in JAX; defined at the top of a module, so that it
+        is compiled once.
+    data : pytree
+        What it needs.
+    starts : array, shape (k, n)
+        Where to start; the residual is finite there.
+    lower, upper : array, shape (n,)
+        Bounds; equal ends hold a number fixed.
+    iterations : int
+        Most steps, refused ones too.
+    tolerance : float
+        On the length of a step relative to theta, both in units of the Jacobian's columns.
+    own : bool
+        Whether every start has data of its own, along the first axis of each leaf.
+
+    Returns
+    -------
+    Found
+        Arrays with the leading axis of ``starts``.
+
+    Examples
+    --------
+    >>> import beamfit.greybox
+    >>> def miss(target, t):
+    ...     return t**2 - target
+    >>> found = descend_all(miss, 4.0, np.array([[1.0], [5.0]]), np.array([0.0]), np.array([9.0]))
+    >>> found.theta.round(6).ravel().tolist()
+    [2.0, 2.0]
+    """
+    every = np.array(starts, float)
+
+    def slopes(lanes: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        every[lanes] = points
+        r, j = map(np.asarray, _sloped_all(residual, data, every, own))
+        return r[lanes], j[lanes]
+
+    search = Descent(slopes, every, np.asarray(lower), np.asarray(upper), tolerance)
+    search.go(np.arange(len(every)), iterations)
+    return search.found

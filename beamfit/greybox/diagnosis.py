@@ -11,7 +11,7 @@ import numpy as np
 
 from beamfit.greybox import assess, tree
 from beamfit.greybox.covariance import CUT, directions
-from beamfit.greybox.optimum import listed
+from beamfit.greybox.judge import listed
 from beamfit.greybox.problem import Problem, with_slope
 
 # Rows are badly scaled if their sizes differ by more than this: half the digits are lost.
@@ -44,9 +44,8 @@ def diagnose(p: Problem) -> tuple[Ailment, ...]:
         Empty where nothing was found; what stands first is graver. Structure is read off the
         derivatives at the start and a few points beside it, in exact arithmetic of zeros: a number
         on which nothing depends at any of them is unused. Numbers are undetermined where residuals,
-        priors and equations have a lower structural rank (the size of the largest matching of rows
-        and numbers: A. Pothen & C.-J. Fan, ACM Trans. Math. Software 16 (1990) 303) or a lower rank
-        at every point than there are numbers; an objective may determine any.
+        priors and equations have a lower rank at every point than there are numbers, which is their
+        structural rank at points at random; an objective may determine any.
 
     Examples
     --------
@@ -131,85 +130,53 @@ def _looks(p: Problem) -> list[assess.Slopes]:
     return [assess.slopes(p, point) for point in points]
 
 
-def _rows(looks: list[assess.Slopes], which: Callable[[assess.Slopes], np.ndarray]) -> np.ndarray:
+def _depends(looks: list[np.ndarray]) -> np.ndarray:
     """True for each row and number that it depends on, at any of the points."""
-    return np.any([which(at) != 0 for at in looks], axis=0)
+    return np.any([rows != 0 for rows in looks], axis=0)
 
 
 def _unused(p: Problem, looks: list[assess.Slopes]) -> Iterator[Ailment]:
-    used = np.any([_rows(looks, part).any(axis=0) for part in _EVERYTHING], axis=0)
-    names = tuple(np.array(p.names)[p.moving & ~used].tolist())
+    every = [np.vstack([a.residual_jacobian, a.gradient[None], a.jacobian]) for a in looks]
+    names = tuple(np.array(p.names)[p.moving & ~_depends(every).any(axis=0)].tolist())
     if names:
         said = f"nothing depends on {listed(names)}; fix or remove what is not needed."
         yield Ailment("unused", names, said)
-    idle = ~_rows(looks, lambda at: at.jacobian)[:, p.moving].any(axis=1)
+    idle = ~_depends([at.jacobian for at in looks])[:, p.moving].any(axis=1)
     names = tuple(np.array(p.constraint_names)[idle].tolist())
     if names:
         said = f"{listed(names)} depends on no free number; free what it limits, or remove it."
         yield Ailment("constant", names, said)
 
 
-_EVERYTHING = (
-    lambda at: at.residual_jacobian,
-    lambda at: at.gradient[None],
-    lambda at: at.jacobian,
-)
-
-
 def _undetermined(p: Problem, looks: list[assess.Slopes]) -> Iterator[Ailment]:
     """Numbers of which rows, priors and equations see fewer combinations than there are."""
     if p.objectives:
         return
-
-    def rows(at):
-        return np.vstack([at.residual_jacobian, at.jacobian[p.equations]])
-
-    on = _rows(looks, rows)
-    used = np.flatnonzero(on.any(axis=0) & p.moving)
-    loose = _open(_unmatched(on[:, used]), [rows(at)[:, used] for at in looks])
+    every = [np.vstack([at.residual_jacobian, at.jacobian[p.equations]]) for at in looks]
+    used = np.flatnonzero(_depends(every).any(axis=0) & p.moving)
+    loose = _open([rows[:, used] for rows in every])
     names = tuple(np.array(p.names)[used][loose].tolist())
     if names:
         said = (
-            f"{len(on)} rows do not determine {listed(names)} each: only "
+            f"{len(every[0])} rows do not determine {listed(names)} each: only "
             "combinations of them; fix some, or add data or priors."
         )
         yield Ailment("undetermined", names, said)
 
 
-def _unmatched(on: np.ndarray) -> np.ndarray:
-    """Columns of the underdetermined part: what alternating paths reach from unmatched ones."""
-    from scipy.sparse import csr_matrix
-    from scipy.sparse.csgraph import maximum_bipartite_matching
-
-    row_of = maximum_bipartite_matching(csr_matrix(on), perm_type="row")
-    loose = row_of < 0
-    while True:
-        rows = on[:, loose].any(axis=1)
-        more = loose | (np.isin(row_of, np.flatnonzero(rows)) & (row_of >= 0))
-        if (more == loose).all():
-            return loose
-        loose = more
-
-
-def _open(loose: np.ndarray, looks: list[np.ndarray]) -> np.ndarray:
-    """Columns along which the rows see nothing at any point; of those that the structure leaves
-    open, if it leaves any.
-    """
-    every = np.ones_like(loose)
+def _open(looks: list[np.ndarray]) -> np.ndarray:
+    """Columns along which the rows see nothing at any point."""
+    every = np.ones(looks[0].shape[1], bool)
     for rows in looks:
         _, unseen, reach = directions(rows)
         every &= np.max(np.abs(unseen), axis=1, initial=0.0) > CUT**0.5 * reach
-    return loose & every if loose.any() else every
+    return every
 
 
 def _dependent(p: Problem, looks: list[assess.Slopes]) -> Iterator[Ailment]:
     """Equations among which one follows from the others or contradicts them."""
     equal = np.flatnonzero(p.equations)
-
-    def columns(at):
-        return at.jacobian[equal][:, p.moving].T
-
-    loose = _open(_unmatched(_rows(looks, columns)), list(map(columns, looks)))
+    loose = _open([at.jacobian[equal][:, p.moving].T for at in looks])
     names = tuple(np.array(p.constraint_names)[equal][loose].tolist())
     if names:
         said = (

@@ -16,13 +16,14 @@ from beamfit.compile_cache import SELDOM
 from beamfit.errors import InputError, nearest
 from beamfit.greybox import tree
 from beamfit.greybox.assess import KKT
-from beamfit.greybox.covariance import MOST_SHARE, FactoredSpread, Group, Rows, Spread
+from beamfit.greybox.covariance import MOST_SHARE, FactoredSpread, Group, Spread
 from beamfit.greybox.problem import Problem, with_slope
-from beamfit.greybox.stated import Optimum
+from beamfit.greybox.sparse import Rows
 from beamfit.status import Status
 from beamfit.verdict import Finding
 
 if TYPE_CHECKING:
+    from beamfit.greybox.posterior import Optimum
     from beamfit.sampling.posterior import Posterior
     from beamfit.sampling.priors import Distribution
 
@@ -290,6 +291,8 @@ class Fit:
     @property
     def optimum(self) -> Optimum:
         """This fit as a start for the sampler."""
+        from beamfit.greybox.posterior import Optimum
+
         near = [a for a in self.attempts if a.kkt.worst <= self.problem.tolerance]
         return Optimum(
             self.theta,

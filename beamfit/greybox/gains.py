@@ -1,12 +1,12 @@
 """Derivatives of maps and rules on them (report 3.1, eqs 38-39).
 
 Forward sensitivities, adjoints, gains of order 1 to 3; constraints on gains at points or certified
-everywhere in a box; signs of weights that make a network rise or fall by construction.
+everywhere in a box.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -17,9 +17,9 @@ import numpy as np
 
 from beamfit.errors import InputError
 from beamfit.greybox import tree
-from beamfit.greybox.bounds import KINDS, LayeredNetwork, cells, gain_bounds
+from beamfit.greybox.bounds import cells, gain_bounds
 from beamfit.greybox.maps import Map, positions
-from beamfit.greybox.terms import Constraint
+from beamfit.greybox.problem import Constraint
 
 
 def _restricted(m: Map, x: jax.Array, variables: tuple[str, ...]):
@@ -326,58 +326,3 @@ def certified_gain(
     if not found:
         raise InputError(f"no limit on d{output}/d{by}", "lower, upper or both")
     return found
-
-
-def monotone_signs(net: LayeredNetwork, signs: Mapping[str, int]) -> dict[str, np.ndarray]:
-    """Signs of the weights that make every output monotonic in chosen inputs by construction.
-
-    With weights of these signs (0: free) each path from such an input to an output is a product of
-    rising node functions and weights of one overall sign, so the gain has that sign everywhere,
-    not only where it was looked at.
-
-    Parameters
-    ----------
-    net : LayeredNetwork
-        All its node functions between input and output must rise: identity, linear, sigmoid, tanh.
-    signs : mapping of str to int
-        Input name to +1 (outputs rise) or -1 (outputs fall); other inputs stay free.
-
-    Returns
-    -------
-    dict of str to array
-        Connection name to signs, of the shape of its weights.
-
-    Raises
-    ------
-    InputError
-        If a node function falls somewhere, an input is not the only one of its node, or an input
-        layer is fed by another layer.
-
-    Examples
-    --------
-    >>> from beamfit.greybox.mlp import dense
-    >>> from beamfit.greybox.mlp import dense
-    >>> signs = monotone_signs(dense(["u", "v"], ["y"], [2]), {"u": -1})
-    >>> signs["layer0->layer1"].tolist(), signs["layer1->layer2"].tolist()
-    ([[-1.0, -1.0], [0.0, 0.0]], [[1.0], [1.0]])
-    """
-    positions(list(signs), [port.name for port in net.input_ports], "input")
-    entry = {port.layer for port in net.input_ports}
-    places = [(port.layer, port.node) for port in net.input_ports]
-    falling = [layer.name for layer in net.layers if not KINDS[layer.kind].monotonic]
-    if falling:
-        raise InputError(f"layers {', '.join(falling)} that fall somewhere", "rising layers only")
-    if len(set(places)) < len(places) or any(target in entry for _, target in net.connections):
-        raise InputError("shared input nodes or layers that feed the inputs", "plain input layers")
-    rows = {name: np.zeros(layer.size) for layer in net.layers if (name := layer.name) in entry}
-    for port in net.input_ports:
-        rows[port.layer][port.node] = signs.get(port.name, 0) * np.sign(port.scale)
-    flips = {np.sign(port.scale) for port in net.output_ports}
-    if flips != {1.0}:
-        raise InputError("an output with a negative scale", "positive scales for monotonic outputs")
-    return {
-        f"{a}->{b}": np.broadcast_to(
-            rows[a][:, None] if a in rows else 1.0, net.weights[f"{a}->{b}"].shape
-        )
-        for a, b in net.connections
-    }

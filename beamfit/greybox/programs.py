@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from beamfit.greybox import assess, curvature, problem
+from beamfit.greybox import assess, problem
 from beamfit.greybox.problem import Problem
 
 
@@ -253,7 +253,7 @@ def scaled(
         return sigma * flat * rows.T @ rows
 
     def bend(x, sigma, y):
-        exact = p.compiled(curvature.lagrangian_hessian)
+        exact = p.compiled(assess.lagrangian_hessian)
         h = np.asarray(exact(full(x), sigma * flat, y / limit))
         return h[np.ix_(moving, moving)] * np.outer(unit, unit)
 

@@ -4,20 +4,20 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterable
+from functools import partial
 
 import numpy as np
 
 from beamfit.errors import InputError
-from beamfit.greybox import assess, curvature
+from beamfit.greybox import assess
 from beamfit.greybox.assess import SearchState
 from beamfit.greybox.conflict import relaxed
-from beamfit.greybox.descend import Lanes, lanes_of
+from beamfit.greybox.descend import Descent, costs, descent_of
 from beamfit.greybox.diagnosis import contradictory, not_finite
 from beamfit.greybox.fit import Attempt, Fit
-from beamfit.greybox.optimum import Search, outgrown, settled
+from beamfit.greybox.judge import Search, conclude, outgrown, refused, settled
 from beamfit.greybox.problem import Problem
 from beamfit.greybox.programs import SOLVERS, SearchLimit, scaled
-from beamfit.greybox.verdict import conclude, refused
 from beamfit.status import Status
 
 METHOD, SQUARES = "Levenberg-Marquardt", "levenberg-marquardt"
@@ -196,7 +196,7 @@ def _drawn(p: Problem, number: int, seed: int) -> np.ndarray:
 
 def _good(s: SearchState) -> bool:
     """True if a point is an optimum to second order."""
-    bent = s.bend is not None and (s.bend.direction is not None or s.bend.newton > curvature.STEP)
+    bent = s.bend is not None and (s.bend.direction is not None or s.bend.newton > assess.STEP)
     return s.optimal and not bent
 
 
@@ -271,9 +271,9 @@ def _lanes(
     p: Problem, points: np.ndarray, budget: SearchLimit
 ) -> tuple[list[SearchState], list[Attempt]]:
     k = len(points)
-    lanes = lanes_of(p, points)
+    lanes = descent_of(p, points)
     lanes.go(np.arange(k), min(STEPS, budget.iterations), budget.until)
-    cost = lanes.cost[:k]
+    cost = lanes.cost
     found: dict[int, SearchState] = {}
     for lane in np.argsort(cost, kind="stable")[:POLISHED].tolist():
         if not np.isfinite(cost[lane]):
@@ -286,41 +286,42 @@ def _lanes(
     return list(found.values()), accounts
 
 
-def _go_on(p: Problem, lanes: Lanes, lane: int, limit: int, budget: SearchLimit) -> None:
+def _go_on(p: Problem, lanes: Descent, lane: int, limit: int, budget: SearchLimit) -> None:
     """Polish one search until it rests, or has settled in a flat valley where it gains nothing."""
-    while not lanes.done[lane] and lanes.at.steps[lane] < limit and budget.left > 0:
+    while not lanes.done[lane] and lanes.steps[lane] < limit and budget.left > 0:
         before = lanes.cost[lane]
-        lanes.go(np.array([lane]), min(limit, int(lanes.at.steps[lane]) + STRETCH), budget.until)
+        lanes.go(np.array([lane]), min(limit, int(lanes.steps[lane]) + STRETCH), budget.until)
         gained = before - lanes.cost[lane]
         if gained < NOTHING * before and settled(p, _judged(p, lanes, lane)):
             return
 
 
-def _account(p: Problem, lanes: Lanes, lane: int, s: SearchState | None) -> Attempt:
-    theta, steps = lanes.at.theta[lane].copy(), int(lanes.at.steps[lane])
+def _account(p: Problem, lanes: Descent, lane: int, s: SearchState | None) -> Attempt:
+    theta, steps = lanes.theta[lane].copy(), int(lanes.steps[lane])
     if not np.isfinite(lanes.cost[lane]):
         return Attempt(METHOD, theta, np.nan, assess.LOST, steps, "cost not finite")
-    said = "came to rest" if lanes.at.rested[lane] else "ran out of iterations"
+    said = "came to rest" if lanes.rested[lane] else "ran out of iterations"
     s = _judged(p, lanes, lane) if s is None else s
     return Attempt(METHOD, theta, float(s.at.cost), s.kkt, steps, said)
 
 
-def _judged(p: Problem, lanes: Lanes, lane: int) -> SearchState:
+def _judged(p: Problem, lanes: Descent, lane: int) -> SearchState:
     """Judged end of one search."""
-    theta = lanes.at.theta[lane].copy()
-    at = assess.of_squares(lanes.at.residual[lane], lanes.at.jacobian[lane])
+    theta = lanes.theta[lane].copy()
+    at = assess.of_squares(lanes.residual[lane].copy(), lanes.jacobian[lane])
     return assess.state(p, theta, assess.scale_of(p, theta, at), at)
 
 
-def _moved_off(p: Problem, lanes: Lanes, lane: int, budget: SearchLimit) -> SearchState:
+def _moved_off(p: Problem, lanes: Descent, lane: int, budget: SearchLimit) -> SearchState:
     """Judge one end; where the cost bends down there, move off and go on."""
     s = _judged(p, lanes, lane)
     for _ in range(MOVES):
-        point = curvature.lower_beside(p, s, lanes.look) if s.at.finite else None
+        look = partial(costs, p, lanes)
+        point = assess.lower_beside(p, s, look) if s.at.finite else None
         if point is None or budget.left <= 0:
             break
         lanes.move(lane, point)
-        _go_on(p, lanes, lane, int(lanes.at.steps[lane]) + budget.iterations, budget)
+        _go_on(p, lanes, lane, int(lanes.steps[lane]) + budget.iterations, budget)
         s = _judged(p, lanes, lane)
     return s
 
@@ -370,7 +371,7 @@ def _program(
             steps, said = steps + end.iterations, end.said
             point = None
             if s.optimal:
-                s, point = curvature.second_order(p, s, exact)
+                s, point = assess.second_order(p, s, exact)
             if best is None or _best(p, [best, s]) == 1:
                 best = s
             if point is None or budget.left <= 0:

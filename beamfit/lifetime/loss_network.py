@@ -23,7 +23,8 @@ from beamfit.errors import InputError
 from beamfit.greybox.bounds import over_cells
 from beamfit.greybox.fit import Fit
 from beamfit.greybox.mlp import MLP, Layer, Port
-from beamfit.greybox.problem import Free, Prior, Problem, Record
+from beamfit.greybox.problem import Prior, Problem, Record
+from beamfit.greybox.signed_network import signed_weights
 from beamfit.greybox.solve import solve
 from beamfit.lifetime.mechanisms import LossTerms, loss_terms, scaled_losses
 from beamfit.lifetime.ring import Operation
@@ -384,15 +385,9 @@ def _network(inputs: np.ndarray, means: np.ndarray, hidden: int, seed: int) -> M
     return MLP(layers, pairs, ports, outputs, weights, biases)
 
 
-def _free(net: MLP, single_maximum: bool) -> list[Free]:
-    """Weights within the signs that make the network obey."""
-    held = dict.fromkeys(POSITIVE if single_maximum else POSITIVE[:1], 1) | {RISING: DIRECTION}
-    found = []
-    for name, weights in net.weights.items():
-        sign = np.broadcast_to(held.get(name, 0), weights.shape)
-        low, high = np.where(sign > 0, 0.0, -MOST), np.where(sign < 0, 0.0, MOST)
-        found.append(Free(f"map.weights.{name}", low, high, start=(-1.0, 1.0), nuisance=True))
-    return [*found, Free("map.biases", -MOST, MOST, start=(-1.0, 1.0), nuisance=True)]
+def _signs(single_maximum: bool) -> dict[str, np.ndarray | int]:
+    """Signs of weights that make the network obey."""
+    return dict.fromkeys(POSITIVE if single_maximum else POSITIVE[:1], 1) | {RISING: DIRECTION}
 
 
 def _statement(measured: Summaries, floor: float) -> tuple[np.ndarray, np.ndarray]:
@@ -474,7 +469,10 @@ def fit_loss_network(
         raise InputError("a setting that is not finite", "RF voltage, scraper, pressure, bunches")
     scales = None if corrected is None else corrected.vector
     means = np.zeros(2) if corrected is not None else _typical(measured)
-    net = _network(inputs, means, hidden, seed)
+    net, signs = (
+        _network(inputs, means, hidden, seed),
+        _signs(single_maximum or corrected is not None),
+    )
     width = ALONE if corrected is None else CORRECTION
     weight, rows = _statement(measured, floor)
     seen, base = weight @ np.asarray(measured.parts).ravel(), _base(scales, terms)
@@ -484,7 +482,7 @@ def fit_loss_network(
         data = (jnp.asarray(inputs), base, measured.current, jnp.asarray(whiten @ weight))
         problem = Problem(
             model={"map": net},
-            free=_free(net, single_maximum or corrected is not None),
+            free=signed_weights("map", net, signs, MOST, 1.0),
             records=[Record("decays", _predict, data, jnp.asarray(whiten @ seen), error=1.0)],
             priors=[Prior("map", 0.0, width)],
         )

@@ -14,9 +14,8 @@ from jax import Array
 from beamfit.errors import InputError
 from beamfit.greybox import tree
 from beamfit.greybox.memory import range_of
-from beamfit.greybox.posterior import Sampled, target_of
+from beamfit.greybox.posterior import Optimum, Sampled, Statement, target_of
 from beamfit.greybox.problem import Free, Prior, Problem, Record
-from beamfit.greybox.stated import Optimum, Statement
 from beamfit.lifetime.decay_law import Moments, beam_current, current
 from beamfit.lifetime.expansion import Pieces, solved
 from beamfit.lifetime.record import DecayRecord
@@ -28,8 +27,7 @@ from beamfit.noise.correlated import (
     whitened_of_both,
 )
 from beamfit.quantity import HOUR
-from beamfit.sampling.intervals import Expected
-from beamfit.sampling.posterior import Posterior
+from beamfit.sampling.posterior import Expected, Posterior
 from beamfit.sampling.priors import Distribution
 from beamfit.sampling.target import SamplingTarget
 from beamfit.verdict import Finding

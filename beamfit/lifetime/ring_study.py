@@ -38,8 +38,7 @@ from beamfit.lifetime.scales import (
 )
 from beamfit.lifetime.study import Decay, Machine, operation_during, settings_json
 from beamfit.quantity import HOUR, Quantity, Status
-from beamfit.sampling.intervals import Interval
-from beamfit.sampling.posterior import Posterior
+from beamfit.sampling.posterior import Interval, Posterior
 from beamfit.shown import shown
 from beamfit.table import json_of
 

@@ -15,10 +15,9 @@ from jax import Array
 from beamfit.errors import InputError, nearest
 from beamfit.greybox.covariance import Spread, spread_of
 from beamfit.greybox.fit import Fit
-from beamfit.greybox.posterior import target_of
+from beamfit.greybox.posterior import Optimum, Statement, target_of
 from beamfit.greybox.problem import Free, Prior, Problem, Record
 from beamfit.greybox.solve import solve
-from beamfit.greybox.stated import Optimum, Statement
 from beamfit.lifetime.decay_law import current
 from beamfit.lifetime.expansion import padded_size
 from beamfit.lifetime.fit import DecayFit

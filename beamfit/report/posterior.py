@@ -19,9 +19,8 @@ from beamfit.lifetime.fit import DecayFit
 from beamfit.lifetime.posterior import expected_current
 from beamfit.report.document import BLUE, MANY, Picture, ReportPage, Verdict, legend_below
 from beamfit.report.scan_pictures import COLOUR, setting_axis, source_of
-from beamfit.sampling.intervals import Expected, in_unit
 from beamfit.sampling.likelihood import noise_words
-from beamfit.sampling.posterior import Posterior
+from beamfit.sampling.posterior import Expected, Posterior, in_unit
 from beamfit.table import Table, plain_name
 
 # Shares of the draws inside the contours of one and two standard deviations in two dimensions.

@@ -13,7 +13,7 @@ from beamfit.emittance.model import emittance_parts, predict_sizes, sigma_of
 from beamfit.greybox import problem as greybox
 from beamfit.greybox import tree
 from beamfit.greybox.covariance import MOST_SHARE, spread_of
-from beamfit.greybox.descend import descend_one
+from beamfit.greybox.descend import descend_all
 
 
 def drawn(problem, theta, key):
@@ -53,7 +53,6 @@ def _with(record, measured, error):
 
 def deviations(problem, theta, plane="x", number=500, seed=0, iterations=300):
     """(emittance - truth)/error of every simulated scan, and which say it is determined."""
-    lower, upper = jnp.asarray(problem.lower), jnp.asarray(problem.upper)
     theta = jnp.asarray(theta)
 
     def emittance(core, t):
@@ -62,17 +61,16 @@ def deviations(problem, theta, plane="x", number=500, seed=0, iterations=300):
 
     @jax.jit
     @jax.vmap
-    def fitted(key):
-        core = drawn(problem, theta, key)
+    def judged(core, end):
+        value, slope = jax.value_and_grad(emittance, 1)(core, end)
+        return value, slope, jax.jacfwd(greybox.residual, 1)(core, end)
 
-        def residual(t):
-            return greybox.residual(core, t)
-
-        end = descend_one(residual, theta, lower, upper, iterations).theta
-        slope = jax.grad(lambda t: emittance(core, t))(end)
-        return end, emittance(core, end), slope, jax.jacfwd(residual)(end)
-
-    found = [np.asarray(v) for v in fitted(jax.random.split(jax.random.key(seed), number))]
+    keys = jax.random.split(jax.random.key(seed), number)
+    cores = jax.jit(jax.vmap(lambda key: drawn(problem, theta, key)))(keys)
+    starts = np.tile(theta, (number, 1))
+    bounds = problem.lower, problem.upper
+    ends = descend_all(greybox.residual, cores, starts, *bounds, iterations, own=True).theta
+    found = [ends, *map(np.asarray, judged(cores, ends))]
     with_prior = np.isin(np.array(problem.names), [p.name for p in problem.priors])
     true, pulls, known = float(emittance(problem.core, theta)), [], []
     for end, value, slope, jacobian in zip(*found, strict=True):

@@ -8,7 +8,7 @@ import pytest
 from scipy.optimize import minimize_scalar
 
 from beamfit.errors import InputError
-from beamfit.greybox.bounds import KINDS, cells, gain_bounds, over_cells, value_bounds
+from beamfit.greybox.bounds import KINDS, cells, gain_bounds, over_cells
 from beamfit.greybox.mlp import MLP, Layer, NetworkGain, Port, dense
 
 sampled_gains = jax.jit(lambda net, x: jax.vmap(jax.jacfwd(net.values))(x))
@@ -161,16 +161,3 @@ def test_bounds_are_differentiable_by_the_weights():
 def test_cells_need_a_finite_box(box):
     with pytest.raises(InputError, match="finite box"):
         cells(*box, 4)
-
-
-def test_values_of_a_network_lie_within_their_enclosure_of_each_cell():
-    net = dense(["u", "v"], ["y", "z"], [4], seed=3, spread=1.5)
-    low, high = cells([-1.0, 0.0], [2.0, 3.0], 16)
-    bound = jax.vmap(lambda a, b: value_bounds(net, a, b))(jnp.asarray(low), jnp.asarray(high))
-    share = np.random.default_rng(0).uniform(size=(200, 1, 2))
-    share[:4, 0] = [[0, 0], [0, 1], [1, 0], [1, 1]]
-    values = np.asarray(jax.vmap(jax.vmap(net.values))(jnp.asarray(low + share * (high - low))))
-    assert np.all(values >= np.asarray(bound.lower))
-    assert np.all(values <= np.asarray(bound.upper))
-    width, true = np.asarray(bound.upper - bound.lower), np.ptp(values, axis=0)
-    assert np.median(width / true) < 1.6

@@ -6,18 +6,23 @@ import numpy as np
 import pytest
 from scipy import sparse
 
-from beamfit.greybox import covariance, curvature, descend, sparsity
-from beamfit.greybox.covariance import Factor, weakest
+from beamfit.greybox import assess, covariance, descend
+from beamfit.greybox import sparse as sparse_parts
 from beamfit.greybox.problem import Free, Prior, Problem, Record
 from beamfit.greybox.solve import solve
-from beamfit.greybox.sparsity import pattern_of as pattern_of_program
+from beamfit.greybox.sparse import Factor, pattern_at, weakest
 from beamfit.status import Status
 
 N = 12
 
 
-def pattern_of(function, at):
-    return pattern_of_program(jax.make_jaxpr(function)(at), [], len(at))
+def swept(function, x):
+    """Values of a function at a point, and products of its Jacobian with directions."""
+    return lambda seeds: (function(x), jax.vmap(lambda s: jax.jvp(function, (x,), (s,))[1])(seeds))
+
+
+def pattern_of(function, x, known=None):
+    return pattern_at(swept(function, x), (len(function(x)), len(x)), known)
 
 
 DIFFERENCES = np.diff(np.eye(N), axis=0)
@@ -43,33 +48,39 @@ FUNCTIONS = {
 
 @pytest.mark.parametrize("name", FUNCTIONS)
 def test_a_pattern_misses_nothing(name, monkeypatch):
-    """Beside the dense Jacobian at three points; the matrix from its sweeps is that Jacobian."""
-    monkeypatch.setattr(sparsity, "FULL", 2.0)
+    """Beside the dense Jacobian at three points; where it misses a place, that is noticed."""
+    monkeypatch.setattr(sparse_parts, "FULL", 2.0)
 
     def function(x):
         return jnp.ravel(FUNCTIONS[name](x))
 
-    pattern = pattern_of(function, np.zeros(N))
+    pattern = None
     for seed in range(3):
-        x = np.random.default_rng(seed).normal(size=N)
-        dense = np.asarray(jax.jacfwd(function)(x))
-        swept = np.asarray(jax.vmap(lambda s, x=x: jax.jvp(function, (x,), (s,))[1])(pattern.seeds))
-        found = pattern.matrix(swept)
+        x = jnp.asarray(np.random.default_rng(seed).normal(size=N))
+        dense, there = np.asarray(jax.jacfwd(function)(x)), swept(function, x)
+        found = None if pattern is None else pattern.jacobian(there)[1]
+        if found is None:
+            pattern = pattern_of(function, x, pattern)
+            found = pattern.jacobian(there)[1]
         np.testing.assert_allclose(found.toarray(), dense, atol=1e-13)
-        assert pattern.holds(found, swept)
 
 
 def test_few_sweeps_and_a_wrong_pattern():
     def function(x):
         return x[2:] - 2 * x[1:-1] ** 2 + x[:-2]
 
-    pattern = pattern_of(function, np.zeros(300))
-    assert pattern.shape == (298, 300)
-    assert len(pattern.seeds) == 4  # three colours and the probe
-    assert pattern_of(lambda x: jnp.cumsum(x), np.zeros(300)) is None
     x = np.linspace(1, 2, 300)
-    swept = jax.vmap(lambda s: jax.jvp(lambda t: function(t) + t[7], (x,), (s,))[1])(pattern.seeds)
-    assert not pattern.holds(pattern.matrix(np.asarray(swept)), np.asarray(swept))
+    pattern = pattern_of(function, x)
+    assert pattern.places.shape == (298, 300)
+    assert len(pattern.seeds) == 4  # three colours and the probe
+    assert pattern_of(jnp.cumsum, x) is None
+    assert pattern.jacobian(swept(lambda t: function(t) + t[7], x))[1] is None
+    # At zero the middle number of each row acts on nothing; at another point it is added.
+    fewer = pattern_of(function, np.zeros(300))
+    assert fewer.places.nnz < pattern.places.nnz
+    assert fewer.jacobian(swept(function, x))[1] is None
+    again = pattern_of(function, x, fewer)
+    np.testing.assert_array_equal(again.places.toarray(), pattern.places.toarray())
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -122,7 +133,7 @@ def both_ways(problem, monkeypatch):
     """The answer by sparse factors, and by orthogonal ones and singular values."""
     many = solve(problem)
     assert sparse.issparse(many.jacobian)
-    for module in (descend, covariance, curvature):
+    for module in (descend, covariance, assess):
         monkeypatch.setattr(module, "FEW", 10**9)
     return many, solve(problem)
 
@@ -182,7 +193,7 @@ def test_a_dense_problem_of_many_numbers():
     measured = np.tanh(matrix @ truth) + 0.01 * rng.normal(size=500)
     p = Problem({"x": np.zeros(220)}, [Free("x")], [Record("r", product, matrix, measured, 0.01)])
     fit = solve(p)
-    assert p.pattern is None
+    assert not sparse.issparse(fit.jacobian)
     assert fit.status is Status.converged
     rows = (1 - np.tanh(matrix @ fit.theta) ** 2)[:, None] * matrix / 0.01
     assert np.max(np.abs(rows.T @ np.asarray(p.residual(fit.theta)))) < 1e-4

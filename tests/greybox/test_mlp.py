@@ -8,8 +8,8 @@ import pytest
 
 from beamfit.errors import InputError
 from beamfit.greybox.bounds import KINDS, Range, range_of
-from beamfit.greybox.gains import monotone_signs
 from beamfit.greybox.mlp import MLP, Layer, NetworkGain, Port, dense
+from beamfit.greybox.signed_network import monotone_signs
 from beamfit.io.formulation import read_network, write_network
 from beamfit.language.network import format_network, parse_network
 

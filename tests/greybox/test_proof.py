@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from beamfit.greybox.optimum import convex
+from beamfit.greybox.convex import convex
 from beamfit.greybox.problem import Constraint, Free, Objective, Problem, Record
 from beamfit.greybox.solve import solve
 from beamfit.status import Status

@@ -14,10 +14,9 @@ from scipy import stats
 import beamfit
 from beamfit.emittance.posterior import beam_target, expected_sizes
 from beamfit.errors import InputError
-from beamfit.greybox.posterior import target_of
+from beamfit.greybox.posterior import Statement, target_of
 from beamfit.greybox.problem import Constraint, Free, Prior, Problem, Record
 from beamfit.greybox.solve import solve
-from beamfit.greybox.stated import Statement
 from beamfit.lifetime.decay_law import current
 from beamfit.lifetime.fit import fit_decay
 from beamfit.lifetime.posterior import expected_current

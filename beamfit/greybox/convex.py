@@ -1,0 +1,224 @@
+"""Proof that a problem is convex, so that its optimum is the only one.
+
+By the rules of composition of convex functions, followed operation by operation through the program
+of cost and constraints (M. Grant, S. Boyd & Y. Ye, in Global Optimization, L. Liberti & N. Maculan
+eds., Springer 2006, 155), or because a cost is quadratic and its Hessian, which is then the same
+everywhere, has no negative eigenvalue.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
+
+from beamfit.greybox import problem
+from beamfit.greybox.problem import Problem
+
+# Operations that move elements, with the first operand that says where to, 0 if none does.
+MOVES = dict.fromkeys(
+    """broadcast_in_dim concatenate expand_dims pad reshape rev slice split squeeze stack tile
+    transpose unstack""".split(),  # noqa: SIM905
+    0,
+) | {"dynamic_slice": 1, "gather": 1, "dynamic_update_slice": 2}
+# Linear operations on elements.
+SUMS = {"reduce_sum", "cumsum", "convert_element_type", "copy", "add", "add_any",
+        "reduce_precision"}  # fmt: skip
+# Operations that are linear where an operand that says which or where to is known.
+PLACES = {"select_n": 0, "scatter": 1, "scatter-add": 1}
+# Functions of one affine or convex argument that are convex and do not fall, likewise for concave.
+RISING_CONVEX, RISING_CONCAVE = {"exp", "exp2", "expm1"}, {"log", "log1p", "sqrt"}
+# Operations up to which a loop of known length is followed step by step.
+UNROLLED = 5_000
+# Negative eigenvalues of a Hessian below this share of the largest are rounding.
+ROUNDING = 1e-12
+
+
+class _Unknown(Exception):
+    """No rule covers an operation."""
+
+
+class Curvature(NamedTuple):
+    """Curvature and degree of every element of an array as a function of the numbers.
+
+    `sign` is 0 if it is affine, 1 convex, -1 concave, None if it is not known; `degree` is that of
+    a polynomial, infinite if it is none.
+    """
+
+    sign: int | None
+    degree: float
+
+
+def convex(p: Problem) -> bool:
+    """True if the problem is proved convex: a convex cost within a convex set."""
+    cost = _curve(p, problem.cost)
+    if cost is None or not (_upward(cost) or (cost.degree <= 2 and _positive(p))):
+        return False
+    if not p.constraints:
+        return True
+    limits = _curve(p, problem.constraints)
+    if limits is None:
+        return False
+    below, above = np.isfinite(p.constraint_lower).any(), np.isfinite(p.constraint_upper).any()
+    return bool(
+        limits.sign == 0
+        or limits.degree <= 1
+        or (limits.sign == 1 and not below)
+        or (limits.sign == -1 and not above)
+    )
+
+
+def _upward(curve: Curvature) -> bool:
+    return curve.sign in (0, 1)
+
+
+def _positive(p: Problem) -> bool:
+    """True if the Hessian of a quadratic cost has no negative eigenvalue."""
+    h = np.asarray(p.compiled(_hessian)(p.start))
+    if not np.all(np.isfinite(h)):
+        return False
+    values = np.linalg.eigvalsh(h)
+    return bool(values[0] >= -ROUNDING * len(h) * max(values[-1], 0.0))
+
+
+def _hessian(core, theta):
+    return jax.hessian(problem.cost, 1)(core, theta)
+
+
+def _curve(p: Problem, function) -> Curvature | None:
+    """Curvature of a compiled function of (core, theta) in theta; None if it is not known."""
+    program = function.trace(p.core, jnp.asarray(p.start)).jaxpr
+    arguments = [*jax.tree.leaves(p.core), Curvature(0, 1.0)]
+    try:
+        (found,) = _followed(program.jaxpr, program.consts, arguments)
+    except _Unknown:
+        return None
+    return found if isinstance(found, Curvature) else Curvature(0, 0.0)
+
+
+def _followed(program: Jaxpr, constants, arguments: list[Any]) -> list[Any]:
+    """Follow curvatures of some arguments of a program to its results; the others are arrays."""
+    known: dict[Any, Any] = dict(zip(program.constvars, constants, strict=True))
+    known |= dict(zip(program.invars, arguments, strict=True))
+
+    def value(atom):
+        return atom.val if isinstance(atom, Literal) else known[atom]
+
+    for step in program.eqns:
+        operands = [value(atom) for atom in step.invars]
+        known |= dict(zip(step.outvars, _results(step, operands), strict=True))
+    return [value(atom) for atom in program.outvars]
+
+
+def _results(step, operands: list[Any]) -> list[Any]:
+    name = step.primitive.name
+    if not any(isinstance(v, Curvature) for v in operands):
+        found = step.primitive.bind(*operands, **step.params)
+        return list(found) if step.primitive.multiple_results else [found]
+    called = (step.params.get(key) for key in ("jaxpr", "call_jaxpr", "fun_jaxpr"))
+    inner = next((c for c in called if isinstance(c, ClosedJaxpr)), None)
+    if inner is not None and name not in ("scan", "while", "cond"):
+        return _followed(inner.jaxpr, inner.consts, operands)
+    if name == "scan" and step.params["length"] * len(inner.jaxpr.eqns) <= UNROLLED:
+        return _looped(step.params, inner, operands)
+    found = _of_step(step, operands)
+    if found.sign is None and not np.isfinite(found.degree):
+        raise _Unknown
+    return [found] * len(step.outvars)
+
+
+def _looped(params: dict[str, Any], inner: ClosedJaxpr, operands: list[Any]) -> list[Any]:
+    """A loop of known length, step by step; all elements of an array have one curvature."""
+    fixed, kept = params["num_consts"], params["num_carry"]
+    constants, carry, each = operands[:fixed], operands[fixed:][:kept], operands[fixed + kept :]
+    times = range(params["length"])[:: -1 if params["reverse"] else 1]
+    found: dict[int, list[Any]] = {}
+    for t in times:
+        now = [v if isinstance(v, Curvature) else v[t] for v in each]
+        ends = _followed(inner.jaxpr, inner.consts, [*constants, *carry, *now])
+        carry, found[t] = ends[:kept], ends[kept:]
+    rows = [found[t] for t in range(len(times))]
+    return [*carry, *map(_stacked, zip(*rows, strict=True))]
+
+
+def _stacked(parts: tuple[Any, ...]) -> Any:
+    """Results of the steps of a loop as one."""
+    numbers = [v for v in parts if isinstance(v, Curvature)]
+    return _sum(numbers) if numbers else np.stack(parts)
+
+
+def _sum(numbers: list[Curvature]) -> Curvature:
+    return Curvature(_common([v.sign for v in numbers]), max(v.degree for v in numbers))
+
+
+def _of_step(step, operands: list[Any]) -> Curvature:
+    name = step.primitive.name
+    numbers = [v for v in operands if isinstance(v, Curvature)]
+    first, degree = numbers[0], max(v.degree for v in numbers)
+    if name in SUMS or _only_moved(name, operands):
+        return _sum(numbers)
+    if name == "neg":
+        return Curvature(_times(first.sign, -1), degree)
+    if name == "sub":
+        signs = [v.sign if i == 0 else _times(v.sign, -1)
+                 for i, v in enumerate(operands) if isinstance(v, Curvature)]  # fmt: skip
+        return Curvature(_common(signs), degree)
+    if name in ("mul", "dot_general") or (name == "div" and not isinstance(operands[1], Curvature)):
+        return _product(step, operands, numbers)
+    if name in ("square", "integer_pow"):
+        power = 2 if name == "square" else step.params["y"]
+        return _power(first, power)
+    return Curvature(_composed(name, numbers), np.inf)
+
+
+def _only_moved(name: str, operands: list[Any]) -> bool:
+    """True if an operation only moves or picks elements, to and from known positions."""
+    if name in PLACES:
+        return not isinstance(operands[PLACES[name]], Curvature)
+    first = MOVES.get(name, -1)
+    places = operands[first:] if first > 0 else []
+    return first >= 0 and not any(isinstance(v, Curvature) for v in places)
+
+
+def _product(step, operands: list[Any], numbers: list[Curvature]) -> Curvature:
+    if len(numbers) == 2:
+        same = step.invars[0] is step.invars[1]
+        return Curvature(
+            1 if same and numbers[0].sign == 0 else None, sum(v.degree for v in numbers)
+        )
+    factor = np.asarray(next(v for v in operands if not isinstance(v, Curvature)))
+    sign = 1 if np.all(factor >= 0) else -1 if np.all(factor <= 0) else None
+    known = numbers[0].sign
+    return Curvature(0 if known == 0 else _times(known, sign), numbers[0].degree)
+
+
+def _power(v: Curvature, power: int) -> Curvature:
+    if power < 0:
+        return Curvature(None, np.inf)
+    if power <= 1:
+        return Curvature(v.sign if power else 0, v.degree * power)
+    return Curvature(1 if v.sign == 0 and power % 2 == 0 else None, v.degree * power)
+
+
+def _composed(name: str, numbers: list[Curvature]) -> int | None:
+    signs = {v.sign for v in numbers}
+    if name in RISING_CONVEX | {"max", "reduce_max"} and signs <= {0, 1}:
+        return 1
+    if name in RISING_CONCAVE | {"min", "reduce_min"} and signs <= {0, -1}:
+        return -1
+    if name in ("abs", "cosh") and signs == {0}:
+        return 1
+    return None
+
+
+def _common(signs: list[int | None]) -> int | None:
+    """Sign of a sum's curvature: the one of all its terms that are not affine, else None."""
+    bent = {sign for sign in signs if sign != 0}
+    return 0 if not bent else bent.pop() if len(bent) == 1 else None
+
+
+def _times(sign: int | None, factor: int | None) -> int | None:
+    return 0 if sign == 0 else None if sign is None or factor is None else sign * factor

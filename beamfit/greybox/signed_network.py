@@ -1,0 +1,179 @@
+"""Networks that are monotonic by the signs of their weights, at every point and not only at data.
+
+With weights of these signs each path from an input to an output is a product of rising node
+functions and weights of one overall sign, so that the gain has that sign everywhere.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+from scipy.optimize import nnls
+
+from beamfit.errors import InputError
+from beamfit.greybox.bounds import KINDS
+from beamfit.greybox.maps import positions
+from beamfit.greybox.mlp import MLP, Port, dense
+from beamfit.greybox.problem import Free
+
+# Largest threshold of a node and random start of a weight: a network's range is -1 to 1.
+WIDE = 1.5
+
+
+def signed_weights(
+    path: str, net: MLP, signs: Mapping[str, np.ndarray], most: float, start: float
+) -> list[Free]:
+    """The weights of a network as free numbers that nobody asks for, within the signs they have.
+
+    Parameters
+    ----------
+    path : str
+        Where the network is in the model.
+    net : MLP
+        The network.
+    signs : mapping of str to array
+        Connection to signs that spread to its weights; 0 and connections that are missing are free.
+    most, start : float
+        Largest magnitude of a weight or bias, and of random starts.
+
+    Returns
+    -------
+    list of Free
+        One for each connection, and one for all biases.
+    """
+    found = []
+    for name, weights in net.weights.items():
+        sign = np.broadcast_to(signs.get(name, 0), weights.shape)
+        low, high = np.where(sign > 0, 0.0, -most), np.where(sign < 0, 0.0, most)
+        found.append(Free(f"{path}.weights.{name}", low, high, (-start, start), nuisance=True))
+    return [*found, Free(f"{path}.biases", -most, most, (-start, start), nuisance=True)]
+
+
+def monotone_signs(net: MLP, signs: Mapping[str, int]) -> dict[str, np.ndarray]:
+    """Signs of the weights that make every output monotonic in chosen inputs by construction.
+
+    With weights of these signs (0: free) each path from such an input to an output is a product of
+    rising node functions and weights of one overall sign, so the gain has that sign everywhere,
+    not only where it was looked at.
+
+    Parameters
+    ----------
+    net : MLP
+        All its node functions between input and output must rise: identity, linear, sigmoid, tanh.
+    signs : mapping of str to int
+        Input name to +1 (outputs rise) or -1 (outputs fall); other inputs stay free.
+
+    Returns
+    -------
+    dict of str to array
+        Connection name to signs, of the shape of its weights.
+
+    Raises
+    ------
+    InputError
+        If a node function falls somewhere, an input is not the only one of its node, or an input
+        layer is fed by another layer.
+
+    Examples
+    --------
+    >>> signs = monotone_signs(dense(["u", "v"], ["y"], [2]), {"u": -1})
+    >>> signs["layer0->layer1"].tolist(), signs["layer1->layer2"].tolist()
+    ([[-1.0, -1.0], [0.0, 0.0]], [[1.0], [1.0]])
+    """
+    positions(list(signs), [port.name for port in net.input_ports], "input")
+    entry = {port.layer for port in net.input_ports}
+    places = [(port.layer, port.node) for port in net.input_ports]
+    falling = [layer.name for layer in net.layers if not KINDS[layer.kind].monotonic]
+    if falling:
+        raise InputError(f"layers {', '.join(falling)} that fall somewhere", "rising layers only")
+    if len(set(places)) < len(places) or any(target in entry for _, target in net.connections):
+        raise InputError("shared input nodes or layers that feed the inputs", "plain input layers")
+    rows = {name: np.zeros(layer.size) for layer in net.layers if (name := layer.name) in entry}
+    for port in net.input_ports:
+        rows[port.layer][port.node] = signs.get(port.name, 0) * np.sign(port.scale)
+    flips = {np.sign(port.scale) for port in net.output_ports}
+    if flips != {1.0}:
+        raise InputError("an output with a negative scale", "positive scales for monotonic outputs")
+    return {
+        f"{a}->{b}": np.broadcast_to(
+            rows[a][:, None] if a in rows else 1.0, net.weights[f"{a}->{b}"].shape
+        )
+        for a, b in net.connections
+    }
+
+
+def signed_network(
+    path: str,
+    inputs: list[Port],
+    outputs: list[Port],
+    rising: np.ndarray,
+    hidden: int,
+    seed: int,
+    most: float,
+) -> tuple[MLP, list[Free]]:
+    """Make a network that starts as a straight line, with bounds that keep it monotonic.
+
+    Parameters
+    ----------
+    path : str
+        Where the network is in the model.
+    inputs, outputs : list of Port
+        Scaled so that the range of interest is -1 to 1 on both sides.
+    rising : ndarray
+        Shape (outputs, inputs): +1 where an output must rise with an input, -1 where it must
+        fall, 0 where it is free. A row of zeros asks nothing of its output. An input with a
+        zero elsewhere is free for all outputs, and so is one that asks of the outputs another
+        pattern of signs than the first does.
+    hidden, seed : int
+        Hidden tanh nodes, and the seed of their thresholds.
+    most : float
+        Largest magnitude of a weight.
+
+    Returns
+    -------
+    tuple of MLP and list of Free
+        The network, and its weights as free numbers.
+
+    Notes
+    -----
+    Each hidden node moves one way with an input and each output one way with the node, so each
+    gain is a sum of terms of one sign; no point of the range has to be asked. A rising
+    function of one input can be approximated by such a sum as well as one likes.
+    """
+    node, out = _pattern(rising)
+    net = dense(inputs, outputs, [hidden], seed=seed)
+    first, last = "layer0->layer1", "layer1->layer2"
+    thresholds = np.linspace(-WIDE, WIDE, hidden) if hidden > 1 else np.zeros(1)
+    start = {first: np.zeros((len(inputs), hidden)), last: np.zeros((hidden, len(outputs)))}
+    lead = int(np.argmax(node != 0)) if node.any() else 0
+    way = node[lead] or 1.0
+    start[first][lead] = way
+    towards = np.where(out != 0, out, 1.0)
+    start[last] += _straight(thresholds)[:, None] * towards
+    biases = {"layer1": way * thresholds, "layer2": np.zeros(len(outputs))}
+    net = replace(net, weights=start, biases=biases)
+    return net, signed_weights(path, net, {first: node[:, None], last: out}, most, WIDE)
+
+
+def _straight(thresholds: np.ndarray) -> np.ndarray:
+    """Weights, none negative, that make the nodes add up to a straight line from -1 to 1."""
+    x = np.linspace(-1.0, 1.0, 41)
+    return nnls(np.tanh(x[:, None] + thresholds), x)[0]
+
+
+def _pattern(rising: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Signs of input to node and of node to output that give the gains their signs."""
+    node, out = np.zeros(rising.shape[1]), np.zeros(rising.shape[0])
+    asked = rising.any(axis=1)
+    for i in range(rising.shape[1]):
+        column = rising[:, i]
+        if not asked.any() or not column[asked].all():
+            continue
+        if not out.any():
+            out, node[i] = -column, -1.0
+        elif np.array_equal(column, -out) or np.array_equal(column, out):
+            lead = int(np.argmax(asked))
+            node[i] = column[lead] * out[lead]
+    return node, out
