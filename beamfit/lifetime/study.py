@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -24,7 +25,7 @@ from beamfit.lifetime.cycles import (
     usual_cycle,
 )
 from beamfit.lifetime.evidence import SEPARABLE
-from beamfit.lifetime.fit import DecayFit, bare, fit_cycles, fit_decay
+from beamfit.lifetime.fit import DecayFit, bare, fit_cycles, fit_decay, fit_pieces
 from beamfit.lifetime.marginal import DRIFT, Law
 from beamfit.lifetime.mechanisms import MECHANISMS, Losses, loss_coefficients
 from beamfit.lifetime.pieces import (
@@ -56,8 +57,8 @@ BEND = 1 / 12 / math.sqrt(5)
 OWN = 3.0
 # Probability of refills faster than the record is read from which cycles tell no lifetime.
 UNSURE = 0.05
-# Points of a picture.
-POINTS = 60
+# Points of a picture, and cycles that make a point of a course at least.
+POINTS, FEWEST_IN_PART = 60, 10
 
 
 @shown
@@ -356,6 +357,24 @@ class Decay:
     ) -> Decay:
         """Add the losses of a ring, if there is one."""
         return cls(segment, offset, fit, None if machine is None else budget(segment, machine))
+
+    def parts(self, number: int, machine: Machine | None) -> list[Decay]:
+        """The cycles of top-up as so many decays at most, each of some cycles and a fit of its own;
+        a single decay as it is.
+        """
+        fit, first = self.fit, self.fit.first
+        count = 1 if first is None else min(number, first.size // FEWEST_IN_PART)
+        if count < 2:
+            return [self]
+        ends, found = [*first, len(fit.readings)], []
+        every = [fit.readings.select(slice(*pair)) for pair in pairwise(ends)]
+        for k, group in enumerate(np.array_split(np.arange(first.size), count), 1):
+            cycles, name = [every[place] for place in group], f"{fit.record}#{k}"
+            rows = [cycles[0].start, cycles[-1].start + cycles[-1].span] - np.array(self.offset)
+            within = slice(*np.searchsorted(self.segment.time, rows))
+            segment = self.segment.select(within, name)
+            found.append(Decay.of(segment, cycles[0].start, fit_pieces(cycles, name), machine))
+        return found
 
     @cached_property
     def checks(self) -> DecayChecks | None:

@@ -16,9 +16,7 @@ from beamfit.lifetime.expansion import (
     LOSS,
     POWER,
     Expansion,
-    Physical,
     Pieces,
-    expanded,
     further_columns,
     lifetime_of,
     solved,
@@ -133,10 +131,15 @@ def _monitor(record: DecayRecord, share: np.ndarray) -> dict[str, np.ndarray]:
 
 def about_fit(fit: DecayFit) -> Expansion:
     """The law about a fit of a constant a."""
-    i0, a, b = (fit.if_constant(name).value for name in ("i0", "a", "b"))
-    rate, unused = a * fit.mean_current + b, np.nan
-    values = Physical(i0, a, b, unused, unused, rate, unused, unused)
-    return expanded(Pieces.of(fit.readings), values)
+    return about_law(fit.readings, *(fit.if_constant(name).value for name in ("i0", "a", "b")))
+
+
+def about_law(record: DecayRecord, i0: float, a: float, b: float) -> Expansion:
+    """The law with constant a and b about numbers, at the readings of a record."""
+    pieces = Pieces.of(record)
+    span, mean = pieces.units
+    numbers = np.array([(a * mean + b) * span, a * mean * span, 0.0])
+    return Expansion.of(pieces, numbers, np.array([i0 / mean]))
 
 
 FEWEST_IN_WINDOW = 5
