@@ -15,11 +15,11 @@ from jax import Array
 from beamfit.errors import InputError
 from beamfit.greybox.design import Information, scores
 from beamfit.lifetime.decay_law import current
+from beamfit.lifetime.expansion import Expansion
 from beamfit.lifetime.mechanisms import LossTerms, loss_terms, scaled_losses
 from beamfit.lifetime.record import DecayRecord
 from beamfit.lifetime.ring import Operation
 from beamfit.lifetime.scales import ScaleFit, Summaries, information_root, loss_parts
-from beamfit.lifetime.systematics import about_law
 from beamfit.quantity import HOUR, Quantity, Status
 from beamfit.sampling.posterior import Posterior
 
@@ -76,7 +76,7 @@ def _rows(fit: ScaleFit, candidate: DecayCandidate) -> np.ndarray:
     time = np.linspace(0.0, candidate.duration, READINGS)
     beam = np.asarray(current(time, candidate.current, a, b))
     record = DecayRecord(time, beam, np.full(READINGS, candidate.noise))
-    mean, root = beam.mean(), information_root(about_law(record, candidate.current, a, b))
+    mean, root = beam.mean(), information_root(Expansion.at(record, candidate.current, a, b))
     one = Summaries(*(jnp.asarray(part)[None] for part in (mean, loss_parts(a, b, mean), root)))
     stacked = jax.tree.map(lambda part: jnp.asarray(part)[None], terms._replace(current=mean))
     return fit.about(stacked, one)[2].reshape(-1, fit.vector.size)

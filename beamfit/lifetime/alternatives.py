@@ -13,9 +13,10 @@ from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.special import logsumexp
+from scipy.special import logsumexp, ndtri
 
 from beamfit.lifetime.expansion import (
+    DETERMINED,
     FURTHER,
     LEVEL,
     PLAIN,
@@ -28,22 +29,17 @@ from beamfit.lifetime.expansion import (
     lifetime_of,
     solved,
 )
-from beamfit.lifetime.marginal import ABOVE, BELOW, DRIFT
+from beamfit.lifetime.marginal import ABOVE, BELOW, DRIFT, ENOUGH
 from beamfit.lifetime.record import DecayRecord
 from beamfit.noise.memory import Products
 from beamfit.quantity import HOUR, Quantity
 from beamfit.shown import shown
+from beamfit.statistics import POOR_FIT
 from beamfit.status import Status
 from beamfit.table import json_of
 
-# Probability of so large an exponent from which a constant a is rejected.
-REJECTED = 1e-3
-# An exponent known worse than this tells no bunch that lengthens from one that does not.
-TELLING = 1 / 3
-# A departure of so many errors is found with 90 % at a false alarm rate of `REJECTED`.
-FOUND = 4.57
-# Readings from which a search with further numbers learns all that it can.
-ENOUGH = 1024
+# A departure of so many errors is found with 90 % at a false alarm rate of `POOR_FIT`.
+FOUND = float(ndtri(1 - POOR_FIT / 2) + ndtri(0.9))
 # Times, over the span, that are looked at for a change, and from which searches for gas begin.
 GRID, STARTS, LONGEST = np.linspace(0.05, 0.95, 40), (0.05, 0.2, 0.7), 1.0
 # Changes are placed on ever finer grids about the best of the last, so often.
@@ -59,8 +55,8 @@ SIZES = (1e-3, 1.0)
 # An alternative is fitted if in linear approximation its evidence, by noises of so many correlation
 # times, is not below that of constant a and b by more than this: it is good to about 1.
 COARSE, HOPELESS = 7, -1.0
-# Currents at which a lifetime is offered, if the loss rate there is so many errors above zero.
-CURRENTS, CLEAR = 5, 3.0
+# Currents at which a lifetime is offered.
+CURRENTS = 5
 
 
 @shown
@@ -103,12 +99,12 @@ class ConstantA:
 
 def constant_a(exponent: float, error: float, raw: float, chance: float) -> ConstantA:
     """Judge an exponent by its error and the chance of so large a one where a is constant."""
-    if not error < TELLING:
+    if not error < DETERMINED:  # a third: the exponent of a long bunch
         message = "The record cannot tell a constant a from one that depends on the current"
         unknown = Quantity(math.nan, None, "1")
         return ConstantA(Status.unidentified, f"{message}: record longer.", unknown, math.nan)
     found, chance = Quantity(float(exponent), float(error), "1", float(raw)), float(chance)
-    if chance >= REJECTED:
+    if chance >= POOR_FIT:
         message = (
             f"A constant a describes the record (p = {chance:.2g}, exponent {found}; one of "
             f"{FOUND * error:.2g} would be seen)."
@@ -169,7 +165,7 @@ def lifetime_law(about: Expansion, independent: bool, free: bool) -> LifetimeLaw
     columns = about.columns(*[POWER] * free)
     (*found, power), errors = about.quoted(rates, columns, independent)
     exponent = Quantity(float(power), float(errors[-1]) if free else None, "1")
-    lifetimes = (lifetime_of(*pair, CLEAR) for pair in zip(found, errors[:-1], strict=True))
+    lifetimes = (lifetime_of(*pair, clear=True) for pair in zip(found, errors[:-1], strict=True))
     return LifetimeLaw(tuple(map(float, x * mean)), tuple(lifetimes), exponent)
 
 
@@ -550,5 +546,5 @@ def _outgassing(law: Expansion) -> Outgassing:
     units = ("h", "1/(mA s)", "1/s", "1/s", "1/s")
     found = zip(*law.quoted(numbers, [LEVEL, *PLAIN, FURTHER, WHEN]), units, strict=True)
     constant, a, b, *rates = (Quantity(float(v), float(e), u) for v, e, u in found)
-    before, after = (lifetime_of(rate.value, rate.error, CLEAR) for rate in rates)
+    before, after = (lifetime_of(rate.value, rate.error, clear=True) for rate in rates)
     return Outgassing(constant, a, b, before, after, float(law.level[0]) * mean)

@@ -395,9 +395,7 @@ OUTLIER, SHARE = 7.0, 0.2
 # Errors of the mean by which readings at the edges of cycles lie off the law where they are of an
 # injection: what stays below moves the lifetime by no more than its error.
 EDGE, WITHIN = 2.5, "they lie within injections"
-# Cycles whose median tells what a loss rate in their middle should be.
-NEIGHBOURS = 9
-# Readings from the edge inwards that tell whether the edge lies off.
+# Neighbours that tell where a cycle, or a reading at the edge of one, should lie.
 NEXT = 9
 
 
@@ -435,7 +433,7 @@ def _odd_cycles(about: Expansion) -> np.ndarray:
     first, slope, residual = about.pieces.first, about.left[:, LOSS], about.left[:, -1]
     squares = np.add.reduceat(slope**2, first)
     rate = -np.add.reduceat(slope * residual, first) / squares
-    near = median_filter(rate, NEIGHBOURS, mode="nearest")
+    near = median_filter(rate, NEXT, mode="nearest")
     return _far((rate - near) * np.sqrt(squares))
 
 

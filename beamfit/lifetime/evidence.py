@@ -19,7 +19,7 @@ from beamfit.lifetime.alternatives import (
     lifetime_law,
     rival_of,
 )
-from beamfit.lifetime.expansion import LOSS, POWER, Expansion, Physical, lifetime_of
+from beamfit.lifetime.expansion import DETERMINED, LOSS, POWER, Expansion, Physical, lifetime_of
 from beamfit.lifetime.marginal import BELOW, UNITS, FreeLaw, Law, free_law
 from beamfit.lifetime.record import DecayRecord
 from beamfit.noise.memory import CLOSE, Products
@@ -32,8 +32,6 @@ ENDS = ("start", "end", "mean")
 # The share of a in the loss lies between 0 and 1: known to 0.2, the record tells pure Touschek
 # from pure gas at five standard deviations; known worse, a and b are one number.
 SEPARABLE = 0.2
-# A loss rate less than three errors from zero leaves the lifetime without an upper limit.
-DETERMINED = 1 / 3
 # How many errors below zero an unphysical a or b, or a rising current, is believed.
 BELIEVED = 5.0
 # Standard deviations that hold 95 % of a normal distribution.
@@ -445,7 +443,7 @@ class Evidence:
         rates = (self.about.numbers[LOSS - 1] + parts.departure) / span + shift
         since = self.time - self.time[0]
         ends = np.append(since[parts.first[1:]], since[-1])
-        lifetimes = (lifetime_of(*pair, 1 / DETERMINED) for pair in
+        lifetimes = (lifetime_of(*pair, clear=True) for pair in
                      zip(rates, found.error, strict=True))  # fmt: skip
         return tuple(map(RatePart, since[parts.first].tolist(), ends.tolist(), lifetimes))
 

@@ -42,6 +42,8 @@ POWERS, TIMES = (-0.95, 3.0), (1e-3, 10.0)
 # A drift under white noise counts from so many standard errors on: it enlarges errors much. Fewer
 # readings tell nothing of the memory of their noise.
 SLOW, FEWEST = 3.0, 12
+# A loss rate less than three errors from zero leaves the lifetime without an upper limit.
+DETERMINED = 1 / 3
 # Noises of so small a part of the largest probability move no digit.
 NO_WEIGHT = 1e-12
 # Steps by which slopes are taken: imaginary ones lose no digit, but a shape takes real numbers.
@@ -66,9 +68,9 @@ class Physical(NamedTuple):
     exponent: Array
 
 
-def lifetime_of(rate: float, error: float, clear: float | None = None) -> Quantity:
-    """Lifetime, h, of a loss rate, 1/s; unknown of one not so many of its errors above zero."""
-    if clear is not None and not rate > clear * error:
+def lifetime_of(rate: float, error: float, clear: bool = False) -> Quantity:
+    """Lifetime, h, of a loss rate, 1/s; unknown where one that is not clear of zero tells none."""
+    if clear and not error < DETERMINED * rate:
         return Quantity(math.nan, None, "h")
     return Quantity(float(1 / rate / HOUR), float(error / rate**2 / HOUR), "h")
 
@@ -122,7 +124,7 @@ class Pieces:
 
     @cached_property
     def weight(self) -> np.ndarray:
-        """Of a residual over the mean current."""
+        """Weight of a residual over the mean current."""
         return np.broadcast_to(self.units[1] / np.asarray(self.over), self.time.shape)
 
     @cached_property
@@ -322,6 +324,14 @@ class Expansion:
         fine = np.isfinite(slopes).all() and np.isfinite(found).all()
         return cls(pieces, numbers, level, found[:count], slopes[:count], Physical(*values), by,
                    rested=bool(fine))  # fmt: skip
+
+    @classmethod
+    def at(cls, record: DecayRecord, i0: float, a: float, b: float) -> Expansion:
+        """About constant a and b, at the readings of a record."""
+        pieces = Pieces.of(record)
+        span, mean = pieces.units
+        numbers = np.array([(a * mean + b) * span, a * mean * span, 0.0])
+        return cls.of(pieces, numbers, np.array([i0 / mean]))
 
     @cached_property
     def levels(self) -> Levels | None:

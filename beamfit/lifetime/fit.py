@@ -191,6 +191,12 @@ class DecayFit:
         return self.exact.get(name, getattr(self, name))
 
     @property
+    def about(self) -> Expansion:
+        """The law with constant a and b about this fit of a single decay."""
+        numbers = (self.if_constant(name).value for name in ("i0", "a", "b"))
+        return Expansion.at(self.readings, *numbers)
+
+    @property
     def quantities(self) -> dict[str, Quantity]:
         """Quoted quantities, by name."""
         return {name: getattr(self, name) for name in UNITS}

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from contextlib import nullcontext
 from os import PathLike
-from typing import TYPE_CHECKING, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -27,7 +27,6 @@ from beamfit.lifetime.marginal import (
     rates_of,
     weighed,
 )
-from beamfit.lifetime.systematics import about_fit
 from beamfit.noise.memory import WHITE, MemoryKind
 from beamfit.quantity import HOUR
 from beamfit.sampling import store as disk
@@ -41,9 +40,6 @@ from beamfit.sampling.store import FROM_PYTHON, Checkpoint, Provenance
 from beamfit.sampling.target import PosteriorLaw, SamplingTarget
 from beamfit.verdict import Finding, judge
 from beamfit.writing import alone
-
-if TYPE_CHECKING:
-    from beamfit.lifetime.fit import DecayFit
 
 UNITS = {"i0": "mA", "a": "1/(mA s)", "b": "1/s", "exponent": "1", "drift": "1"}
 BOUNDS = {"i0": (0.0, np.inf), "a": (0.0, np.inf), "b": (0.0, np.inf), "exponent": (LEAST, MOST)}
@@ -135,15 +131,15 @@ DENSITY = PosteriorLaw(_no_residual, _log_density, _derived, _built)
 class _Prepared(NamedTuple):
     """A fit made ready: its normal approximations, and shifts of I0, a and b by the monitor."""
 
-    fit: DecayFit
+    fit: Any
     seen: SeenDecay
     peaks: Peaks
     moved: np.ndarray
 
     @classmethod
-    def of(cls, fit: DecayFit) -> _Prepared:
+    def of(cls, fit) -> _Prepared:
         """With the law of the fit, and where a and b are constant its noise."""
-        about, free = about_fit(fit), [0, 1, 2]
+        about, free = fit.about, [0, 1, 2]
         seen = SeenDecay.of(fit.readings, about.values)
         if fit.free_law is not None:
             free = [0, 1, 2, 3, 4] if seen.drifts else [0, 1, 2, 3]
@@ -191,14 +187,14 @@ class _Prepared(NamedTuple):
         )  # fmt: skip
 
 
-def _observed(fit: DecayFit) -> dict[str, np.ndarray]:
+def _observed(fit) -> dict[str, np.ndarray]:
     error = fit.readings.error
     found = {"decay measured": fit.readings.current}
     return found if error is None else found | {"decay error": error}
 
 
 def sampled(
-    fit: DecayFit,
+    fit,
     priors: Mapping[str, Distribution] | None = None,
     *,
     seed: int = 0,
@@ -300,7 +296,7 @@ def _taken(weight: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, fl
     return place, float(np.mean(place[1:] == proposed[1:]))
 
 
-def expected_current(posterior: Posterior, fit: DecayFit) -> Expected:
+def expected_current(posterior: Posterior, fit) -> Expected:
     """Currents that the posterior of a decay expects at its readings, mA.
 
     Parameters

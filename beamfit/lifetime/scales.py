@@ -19,12 +19,11 @@ from beamfit.greybox.posterior import target_of
 from beamfit.greybox.problem import Free, Prior, Problem, Record
 from beamfit.greybox.solve import solve
 from beamfit.greybox.stated import Optimum, Statement
-from beamfit.lifetime.expansion import LEVEL, LOSS, QUADRATIC, Expansion
+from beamfit.lifetime.expansion import DETERMINED, LEVEL, LOSS, QUADRATIC, Expansion
 from beamfit.lifetime.fit import DecayFit
 from beamfit.lifetime.mechanisms import SCALES, LossTerms, loss_terms, scaled_losses
 from beamfit.lifetime.ring import Operation
 from beamfit.lifetime.study import Decay, Machine, operation_during
-from beamfit.lifetime.systematics import about_fit
 from beamfit.quantity import Quantity, Status
 from beamfit.shown import shown
 from beamfit.statistics import POOR_FIT, chi2_probability
@@ -86,7 +85,7 @@ def _root(decay: Decay, parts: np.ndarray) -> np.ndarray:
     if not fit.noise_inferred:
         pulls = fit.residuals / decay.segment.error
         scale = max(1.0, np.sqrt(pulls @ pulls / fit.dof))
-    about = about_fit(fit)
+    about = fit.about
     return _with_monitor(information_root(about, scale * fit.inflation), about)
 
 
@@ -153,8 +152,6 @@ def summarise(decays: tuple[Decay, ...]) -> Summaries:
     return Summaries(*map(jnp.asarray, (current, parts, root)))
 
 
-# A scale known to a third or worse cannot be told from a third more or less of another cause.
-SEPARABLE = 1 / 3
 PRESSURE_ERROR = 0.05
 RECORD = "decays"
 LARGEST = 1e3
@@ -248,7 +245,7 @@ class ScaleFit:
         usual = jnp.ones_like(vector)
         size = np.maximum(np.abs(quantity(vector)), np.abs(quantity(usual)))
         error = spread_of_scales(self.fit).error(np.asarray(jax.jacfwd(quantity)(vector)))
-        return self.error_scale * error < SEPARABLE * size
+        return self.error_scale * error < DETERMINED * size
 
     def about(self, terms: LossTerms, measured: Summaries) -> tuple[np.ndarray, ...]:
         """Expand decays: their weights, their `pulls`, and the slopes of these by the scales."""
@@ -464,7 +461,7 @@ def _scale(
 ) -> Quantity:
     """A scale, without an error where the decays do not tell it."""
     # Against 1 where the value is smaller: a mechanism found absent, 0.0 ± 0.1, is separable.
-    known = scale * raw < SEPARABLE * max(value, 1.0)
+    known = scale * raw < DETERMINED * max(value, 1.0)
     if name == VOLTAGE:
         known = raw < (1 - NARROWED) * priors[name][1]
     found = Quantity(float(value), scale * float(raw), "1", float(raw))

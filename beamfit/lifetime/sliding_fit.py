@@ -17,9 +17,10 @@ from beamfit.lifetime.evidence import UNITS
 from beamfit.lifetime.fit import DecayFit, bare, fit_decay, fit_pieces
 from beamfit.lifetime.marginal import Law
 from beamfit.lifetime.mechanisms import added, loss_coefficients, terms_of
+from beamfit.lifetime.pieces import FEWEST
 from beamfit.lifetime.record import Conditions, DecayRecord
 from beamfit.lifetime.study import (
-    SHORTEST,
+    CHANGED,
     Decay,
     Machine,
     at_settings,
@@ -143,10 +144,10 @@ def fit_window(rows: Sequence[WindowRow], name: str) -> Window:
         for decay in cut_at_refills(section).segments
     ]
     if not decays:
-        return Window(None, None, 0, f"fewer than {SHORTEST} readings in a row of a stored beam")
+        return Window(None, None, 0, f"fewer than {FEWEST} readings in a row of a stored beam")
     group = _at_last(decays)
     one = group[0] if len(group) == 1 else joined(group, name)
-    if len(one) < SHORTEST:
+    if len(one) < FEWEST:
         return Window(None, one, len(group), f"{len(one)} readings since the last change")
     try:
         fit = _fitted(group, name)
@@ -200,7 +201,7 @@ def _pieces(rows: Sequence[WindowRow], name: str) -> list[DecayRecord]:
             time[part], current[part], None, name, time[part[0]],
             Conditions(*(None if column is None else column[part] for column in filled)),
         )
-        for part in parts if part.size >= SHORTEST
+        for part in parts if part.size >= FEWEST
     ]  # fmt: skip
 
 
@@ -217,8 +218,6 @@ def _at_last(decays: list[DecayRecord]) -> list[DecayRecord]:
 
 # a and b so well known are the usual ones; errors half as large replace them before an alarm.
 KNOWN = 0.05
-# Settings, and the current, that moved by more than this share are given to the ring anew.
-MOVED = 0.01
 # What the ring is expected to lose follows its settings over so long, s, and steps at once.
 SMOOTH = 300.0
 
@@ -305,7 +304,7 @@ def _terms(machine: Machine, before: Terms | None, row: WindowRow) -> Terms:
     moment = DecayRecord([0.0, 1.0], row.current * np.array([1.0, 1 - 1e-6]), conditions=at)
     operation = operation_during(moment, machine)
     place = np.array([row.current, *row.settings._replace(pressure=0.0)])
-    if before and np.allclose(place, before.place, rtol=MOVED, atol=0.0, equal_nan=True):
+    if before and np.allclose(place, before.place, rtol=CHANGED, atol=0.0, equal_nan=True):
         place, parts = before.place, before.parts
     else:
         parts = terms_of(machine.ring, operation, row.current)

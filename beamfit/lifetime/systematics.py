@@ -15,7 +15,6 @@ from beamfit.lifetime.expansion import (
     LEVEL,
     LOSS,
     POWER,
-    Expansion,
     Pieces,
     further_columns,
     lifetime_of,
@@ -97,7 +96,7 @@ def systematics(fit: DecayFit) -> tuple[Systematic, ...]:
     record, another = fit.readings, fit.shaped or fit.first is not None
     if record is None or another or fit.status is Status.infeasible or fit.a.error is None:
         return ()
-    about = about_fit(fit)
+    about = fit.about
     over, share = about.pieces.over, record.time / record.span
     grown = further_columns(about, "drift", np.zeros(1))[:, 0] * over * record.span
     rises = f"pressure rises by {100 * PRESSURE:g} % over the record"
@@ -127,19 +126,6 @@ def _monitor(record: DecayRecord, share: np.ndarray) -> dict[str, np.ndarray]:
         }
     stated = record.monitor.changes(record.time)
     return {f"monitor {cause} (in the errors)": moved for cause, moved in stated.items()}
-
-
-def about_fit(fit: DecayFit) -> Expansion:
-    """The law about a fit of a constant a."""
-    return about_law(fit.readings, *(fit.if_constant(name).value for name in ("i0", "a", "b")))
-
-
-def about_law(record: DecayRecord, i0: float, a: float, b: float) -> Expansion:
-    """The law with constant a and b about numbers, at the readings of a record."""
-    pieces = Pieces.of(record)
-    span, mean = pieces.units
-    numbers = np.array([(a * mean + b) * span, a * mean * span, 0.0])
-    return Expansion.of(pieces, numbers, np.array([i0 / mean]))
 
 
 FEWEST_IN_WINDOW = 5
