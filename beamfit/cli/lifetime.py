@@ -216,8 +216,7 @@ def _show(
             _show_record(terminal, each)
     fits = [decay.fit for study in studies for decay in study.answers]
     for fit, posterior in zip(fits, posteriors or (), strict=False):
-        held = "" if fit.free_law is None else ", a and b constant"
-        terminal.posterior(f"Posterior of {fit.record}{held}", posterior)
+        terminal.posterior(f"Posterior of {fit.record}", posterior)
     if shift is not None:
         _show_shift(terminal, shift)
     if trend is not None:

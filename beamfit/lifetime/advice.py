@@ -15,7 +15,9 @@ from jax import Array
 from beamfit.errors import InputError
 from beamfit.greybox.design import Information, scores
 from beamfit.lifetime.decay_law import current
+from beamfit.lifetime.expansion import Expansion
 from beamfit.lifetime.mechanisms import LossTerms, loss_terms, scaled_losses
+from beamfit.lifetime.record import DecayRecord
 from beamfit.lifetime.ring import Operation
 from beamfit.lifetime.scales import ScaleFit, Summaries, information_root, loss_parts
 from beamfit.quantity import HOUR, Quantity, Status
@@ -69,17 +71,15 @@ class Proposal(NamedTuple):
 
 def _rows(fit: ScaleFit, candidate: DecayCandidate) -> np.ndarray:
     """Readings of the candidate predicted by the scales, over its errors, shape (2, scales)."""
-    scales = jnp.asarray(fit.vector)
     terms = fit.terms_at(candidate.operation, candidate.current)
-    a, b = scaled_losses(scales, terms)
-    time = jnp.linspace(0.0, candidate.duration, READINGS)
-    mean = jnp.mean(current(time, candidate.current, a, b))
-    parts = loss_parts(a, b, mean)
-    weight = jnp.full(READINGS, 1 / candidate.noise)
-    root = information_root(time, weight, candidate.current, parts, mean)
-    one = Summaries(mean[None], parts[None], root[None])
+    a, b = map(float, scaled_losses(jnp.asarray(fit.vector), terms))
+    time = np.linspace(0.0, candidate.duration, READINGS)
+    beam = np.asarray(current(time, candidate.current, a, b))
+    record = DecayRecord(time, beam, np.full(READINGS, candidate.noise))
+    mean, root = beam.mean(), information_root(Expansion.at(record, candidate.current, a, b))
+    one = Summaries(*(jnp.asarray(part)[None] for part in (mean, loss_parts(a, b, mean), root)))
     stacked = jax.tree.map(lambda part: jnp.asarray(part)[None], terms._replace(current=mean))
-    return fit.about(stacked, one)[2].reshape(-1, len(scales))
+    return fit.about(stacked, one)[2].reshape(-1, fit.vector.size)
 
 
 def next_decays(fit: ScaleFit, candidates: Sequence[DecayCandidate]) -> tuple[Proposal, ...]:

@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from beamfit.lifetime.pieces import GAP
 from beamfit.quantity import Quantity, relative_change
 
 MINUTE = 60.0
@@ -168,8 +169,8 @@ NAMED = 13.8
 BOTH = 10.8
 # After so long an alarm goes without a name, s.
 PATIENCE = 60 * MINUTE
-# After a step nothing is looked at for so long; after a gap of so many intervals all begins anew.
-SETTLE, GAP = 10.0, 10.0
+# After a step nothing is looked at for so long, s; after a gap all begins anew.
+SETTLE = 10.0
 # A reading off the pace before it by so many of its errors, or by such a share of the loss, begins
 # anew: a refill, a lost bunch, a step of the clock.
 JUMP, SHARE = 6.0, 0.15

@@ -12,18 +12,15 @@ import math
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from scipy.special import logsumexp
+from scipy.special import logsumexp, ndtri
 
 from beamfit.lifetime.expansion import (
+    DETERMINED,
     FURTHER,
     LEVEL,
-    LOSS,
     PLAIN,
     POWER,
-    QUADRATIC,
     TIMES,
     WHEN,
     Expansion,
@@ -32,22 +29,17 @@ from beamfit.lifetime.expansion import (
     lifetime_of,
     solved,
 )
-from beamfit.lifetime.marginal import ABOVE, BELOW, DRIFT
+from beamfit.lifetime.marginal import ABOVE, BELOW, DRIFT, ENOUGH
 from beamfit.lifetime.record import DecayRecord
 from beamfit.noise.memory import Products
 from beamfit.quantity import HOUR, Quantity
 from beamfit.shown import shown
+from beamfit.statistics import POOR_FIT
 from beamfit.status import Status
 from beamfit.table import json_of
 
-# Probability of so large an exponent from which a constant a is rejected.
-REJECTED = 1e-3
-# An exponent known worse than this tells no bunch that lengthens from one that does not.
-TELLING = 1 / 3
-# A departure of so many errors is found with 90 % at a false alarm rate of `REJECTED`.
-FOUND = 4.57
-# Readings from which a search with further numbers learns all that it can.
-ENOUGH = 1024
+# A departure of so many errors is found with 90 % at a false alarm rate of `POOR_FIT`.
+FOUND = float(ndtri(1 - POOR_FIT / 2) + ndtri(0.9))
 # Times, over the span, that are looked at for a change, and from which searches for gas begin.
 GRID, STARTS, LONGEST = np.linspace(0.05, 0.95, 40), (0.05, 0.2, 0.7), 1.0
 # Changes are placed on ever finer grids about the best of the last, so often.
@@ -63,8 +55,8 @@ SIZES = (1e-3, 1.0)
 # An alternative is fitted if in linear approximation its evidence, by noises of so many correlation
 # times, is not below that of constant a and b by more than this: it is good to about 1.
 COARSE, HOPELESS = 7, -1.0
-# Currents at which a lifetime is offered, if the loss rate there is so many errors above zero.
-CURRENTS, CLEAR = 5, 3.0
+# Currents at which a lifetime is offered.
+CURRENTS = 5
 
 
 @shown
@@ -107,12 +99,12 @@ class ConstantA:
 
 def constant_a(exponent: float, error: float, raw: float, chance: float) -> ConstantA:
     """Judge an exponent by its error and the chance of so large a one where a is constant."""
-    if not error < TELLING:
+    if not error < DETERMINED:  # a third: the exponent of a long bunch
         message = "The record cannot tell a constant a from one that depends on the current"
         unknown = Quantity(math.nan, None, "1")
         return ConstantA(Status.unidentified, f"{message}: record longer.", unknown, math.nan)
     found, chance = Quantity(float(exponent), float(error), "1", float(raw)), float(chance)
-    if chance >= REJECTED:
+    if chance >= POOR_FIT:
         message = (
             f"A constant a describes the record (p = {chance:.2g}, exponent {found}; one of "
             f"{FOUND * error:.2g} would be seen)."
@@ -166,23 +158,14 @@ def lifetime_law(about: Expansion, independent: bool, free: bool) -> LifetimeLaw
     (span, mean), current = about.pieces.units, about.pieces.current
     x = np.geomspace(current.min(), current.max(), CURRENTS) / mean
 
-    def rates(numbers: jax.Array) -> jax.Array:
-        loss, quadratic, power = numbers[:3]
+    def rates(level, loss, quadratic, power):
         found = (quadratic * x ** (1 + power) + loss - quadratic) / span
-        return jnp.append(found, power)
+        return np.append(found, power)
 
     columns = about.columns(*[POWER] * free)
-    slopes = np.zeros((CURRENTS + 1, about.rows.shape[1]))
-    slopes[:, 1:4] = np.asarray(jax.jacfwd(rates)(about.numbers[:3]))
-    memory = about.memory(columns, independent)
-    errors = memory.moments(slopes[:, columns], about.given).error
-    over = about.pieces.over
-    for change in about.pieces.monitor_changes:
-        moved = np.linalg.lstsq(about.left[:, columns], change / over, rcond=None)[0]
-        errors = np.hypot(errors, slopes[:, columns] @ moved)
-    *found, power = np.asarray(rates(about.numbers))
+    (*found, power), errors = about.quoted(rates, columns, independent)
     exponent = Quantity(float(power), float(errors[-1]) if free else None, "1")
-    lifetimes = (lifetime_of(*pair, CLEAR) for pair in zip(found, errors[:-1], strict=True))
+    lifetimes = (lifetime_of(*pair, clear=True) for pair in zip(found, errors[:-1], strict=True))
     return LifetimeLaw(tuple(map(float, x * mean)), tuple(lifetimes), exponent)
 
 
@@ -516,72 +499,52 @@ def _log_evidence(law: Expansion, name: str) -> float:
     return float(logsumexp(log)) - float(np.log(width[finite]).sum()) + chance
 
 
-def _quantities(law: Expansion, values: np.ndarray, slopes: np.ndarray, columns: list[int]):
-    """Values with their errors by slopes of all columns."""
-    independent = not law.wanders
-    memory = law.memory(columns, independent)
-    errors = memory.moments(slopes[:, columns], law.given).error
-    return zip(values, errors, strict=True)
-
-
 def _change(law: Expansion) -> Change:
     """The lifetimes before and after each time, from the law with changes there."""
-    (span, mean), (loss, quadratic, _, *further) = law.pieces.units, law.numbers
-    pairs = sorted(zip(further[1::2], further[::2], range(len(further)), strict=False))
-    columns = [LEVEL, *PLAIN, *(FURTHER + 2 * k for *_, k in pairs)]
-    told, here, slopes = None, [], []
-    gone, slope = 0.0, np.zeros(law.rows.shape[1])
-    for at, size, k in pairs:
-        x = float(np.interp(at * span, law.pieces.time, law.pieces.current)) / mean
-        slope[[LOSS, QUADRATIC]] = 1.0, x - 1
-        for more in (0.0, size):
-            slope = slope.copy()
-            slope[FURTHER + 2 * k] = 1.0 * (more != 0.0)
-            here.append(loss + quadratic * (x - 1) + gone + more)
-            slopes.append(slope)
-        gone += size
-    found = _quantities(law, np.array(here) / span, np.array(slopes) / span, columns)
-    lifetimes = [lifetime_of(*one) for one in found]
-    for k in reversed(range(len(pairs))):
-        told = Change(float(pairs[k][0] * span), *lifetimes[2 * k : 2 * k + 2], told)
-    return told
+    (span, mean), count = law.pieces.units, law.numbers.size // 2 - 1
+    times = law.numbers[4::2]
+    x = np.interp(times * span, law.pieces.time, law.pieces.current) / mean
+
+    def rates(level, loss, quadratic, power, *further):
+        before = loss + quadratic * (x - 1) + np.append(0.0, np.cumsum(further[::2])[:-1])
+        return np.concatenate([before, before + further[::2]]) / span
+
+    columns = [LEVEL, *PLAIN, *range(FURTHER, FURTHER + 2 * count, 2)]
+    lifetimes = [lifetime_of(*one) for one in zip(*law.quoted(rates, columns), strict=True)]
+    found = None
+    for k in reversed(range(count)):
+        found = Change(float(times[k] * span), lifetimes[k], lifetimes[count + k], found)
+    return found
 
 
 def _sudden_loss(law: Expansion) -> SuddenLoss:
     """What was lost at once, the larger of two, from the law with it."""
-    (span, _), pairs = law.pieces.units, law.numbers[3:].reshape(-1, 2)
-    largest = int(np.argmax(np.abs(pairs[:, 0])))
-    size, when = pairs[largest]
+    (span, _), sizes, times = law.pieces.units, law.numbers[3::2], law.numbers[4::2]
+    largest = int(np.argmax(np.abs(sizes)))
     # All times between two readings are one: the middle stands for them.
-    after = int(np.searchsorted(law.pieces.time, when * span))
+    after = int(np.searchsorted(law.pieces.time, times[largest] * span))
     when = float(law.pieces.time[after - 1 : after + 1].mean())
     model = law.pieces.current + law.residuals * law.pieces.over
-    at = float(model[after - 1])
-    slopes = np.zeros((1, law.rows.shape[1]))
-    slopes[0, FURTHER + 2 * largest] = at * math.exp(-size)
-    columns = [LEVEL, *PLAIN, *range(FURTHER, slopes.shape[1], 2)]
-    ((value, error),) = _quantities(law, np.array([-at * math.expm1(-size)]), slopes, columns)
+
+    def lost(level, loss, quadratic, power, *further):
+        return np.array([-model[after - 1] * np.expm1(-further[2 * largest])])
+
+    columns = [LEVEL, *PLAIN, *range(FURTHER, law.rows.shape[1], 2)]
+    [value], [error] = law.quoted(lost, columns)
     return SuddenLoss(when, Quantity(float(value), float(error), "mA"))
 
 
 def _outgassing(law: Expansion) -> Outgassing:
-    (span, mean), (_, quadratic, _, further, when) = law.pieces.units, law.numbers
-    start = float(law.level[0])
+    span, mean = law.pieces.units
 
-    def quoted(step: jax.Array) -> jax.Array:
-        x, q = start + step[LEVEL], quadratic + step[QUADRATIC]
-        b, more = law.numbers[0] + step[LOSS] - q, further + step[FURTHER]
-        return jnp.stack([(when + step[WHEN]) * span / HOUR, q / mean / span, b / span,
-                          (q * x + b + more) / span, (q * x + b) / span])  # fmt: skip
+    def numbers(level, loss, quadratic, power, further, when):
+        b = loss - quadratic
+        rate = quadratic * level + b
+        return np.array([when * span / HOUR, quadratic / mean / span, b / span,
+                         (rate + further) / span, rate / span])  # fmt: skip
 
-    zero = jnp.zeros(law.rows.shape[1])
-    columns = [LEVEL, *PLAIN, FURTHER, WHEN]
-    found = _quantities(
-        law, np.asarray(quoted(zero)), np.asarray(jax.jacfwd(quoted)(zero)), columns
-    )
     units = ("h", "1/(mA s)", "1/s", "1/s", "1/s")
-    constant, a, b, *rates = (
-        Quantity(float(v), float(e), u) for (v, e), u in zip(found, units, strict=True)
-    )
-    before, after = (lifetime_of(rate.value, rate.error, CLEAR) for rate in rates)
-    return Outgassing(constant, a, b, before, after, start * mean)
+    found = zip(*law.quoted(numbers, [LEVEL, *PLAIN, FURTHER, WHEN]), units, strict=True)
+    constant, a, b, *rates = (Quantity(float(v), float(e), u) for v, e, u in found)
+    before, after = (lifetime_of(rate.value, rate.error, clear=True) for rate in rates)
+    return Outgassing(constant, a, b, before, after, float(law.level[0]) * mean)

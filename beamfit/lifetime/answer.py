@@ -253,7 +253,7 @@ def _clear(e: Evidence) -> str:
 
 def _extent(e: Evidence, name: str) -> str | None:
     """An interval too wide for a value, or a limit."""
-    low, high = e.free.spans[name].interval
+    low, high = e.free.quantities[name].interval_95
     if low <= LEAST_SHARE * high:
         return f"{name} is compatible with zero: it is below {high:.2g} {UNITS[name]} at 95 %"
     if of_use((low, high)):

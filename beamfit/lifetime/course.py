@@ -13,7 +13,7 @@ from beamfit.answer import answer
 from beamfit.errors import InputError
 from beamfit.lifetime.alarm import Alarm, Reference, alarms_of, when
 from beamfit.lifetime.fit import DecayFit, bare
-from beamfit.lifetime.mechanisms import loss_coefficients
+from beamfit.lifetime.mechanisms import Losses, loss_coefficients
 from beamfit.lifetime.scales import by_losses, summarise
 from beamfit.lifetime.study import Decay, Machine, RecordStudy
 from beamfit.quantity import HOUR, Quantity, Status, percent, relative_change
@@ -23,8 +23,12 @@ from beamfit.table import Table, cell, json_of
 # a and b wander by so much on an ordinary day.
 WANDER = 0.005
 DAY = 24 * HOUR
+# Where readings do not tell a from b, the ring's own shares of them are trusted to this.
+SHARES = 0.3
 # No monitor is better than this share of the current.
 BEST_MONITOR = 1e-7
+# Points of a course that records of top-up are divided into.
+MOST_PARTS = 48
 # More readings are watched every second, third, ... one.
 MOST = 50_000
 
@@ -158,7 +162,7 @@ def trend_of(studies: Sequence[RecordStudy], machine: Machine | None = None) -> 
     Parameters
     ----------
     studies : sequence of RecordStudy
-        Records, each with its decays; of several, all with dates.
+        Records, each with its decays; of several, all with dates. Top-up is divided into parts.
     machine : Machine, optional
         The ring, which scales lifetimes to its usual settings and the reference current, the
         median of all. Otherwise current times lifetime is taken as it is, which is constant where
@@ -195,7 +199,8 @@ def trend_of(studies: Sequence[RecordStudy], machine: Machine | None = None) -> 
     placed = [
         ((study.record.start or 0.0) + decay.offset, decay)
         for study in studies
-        for decay in study.decays or study.pooled
+        for each in study.decays or study.pooled
+        for decay in each.parts(max(MOST_PARTS // len(studies), 1), machine)
         if decay.fit.lifetime_mean.error is not None
     ]
     if not placed:
@@ -206,7 +211,7 @@ def trend_of(studies: Sequence[RecordStudy], machine: Machine | None = None) -> 
     a, b, lifetime = _by_ring(decays, machine, current)
     first = baseline(len(decays))
     watched = len(decays) > first
-    usual = _reference(decays[:first], a[:first], b[:first]) if watched else None
+    usual = reference_of(decays[:first], a[:first], b[:first]) if watched else None
     values = _normalised(decays, lifetime, current if machine else None)
     centre, limit = control_limits(np.array([value.value for value in values[:first]]))
     points = tuple(
@@ -273,16 +278,23 @@ def _drift(time: np.ndarray, values: Sequence[Quantity], centre: float) -> Quant
     return Quantity(float(slope), float(np.sqrt(covariance[0, 0])), "1")
 
 
-def _reference(decays: Sequence[Decay], a: np.ndarray, b: np.ndarray) -> Reference | None:
+def reference_of(
+    decays: Sequence[Decay], a: np.ndarray, b: np.ndarray, ring: Losses | None = None
+) -> Reference | None:
     """Usual a and b of some decays, with their noise; None where they do not give both above zero.
 
-    Least squares on what each decay says of a I and a I + b. How far the decays scatter about it
-    is how far a and b are expected to wander.
+    Least squares on what each decay says of a I and a I + b; with a ring its ratio of a to b is
+    known, to `SHARES`. How far the decays scatter about it is how far a and b are expected to
+    wander.
     """
     current, parts, root = map(np.asarray, summarise(tuple(decays)))
     rows = by_losses(a * current, b)
     weighted = (root @ rows).reshape(-1, 2)
     seen = np.einsum("nij,nj->ni", root, parts).ravel()
+    if ring is not None:
+        by = parts[0, 1] / float(ring.a * current[0] + ring.b)
+        ratio = np.array([1 / float(ring.a), -1 / float(ring.b)]) / by / SHARES
+        weighted, seen = np.vstack([weighted, ratio]), np.append(seen, 0.0)
     size = np.linalg.norm(weighted, axis=0)
     found = np.linalg.lstsq(weighted / size, seen, rcond=None)[0] / size
     if not (np.isfinite(found).all() and found.min() > 0):
@@ -295,7 +307,7 @@ def _reference(decays: Sequence[Decay], a: np.ndarray, b: np.ndarray) -> Referen
     return Reference(*map(float, found), *_noise(decays), covariance)
 
 
-def alike_over(fit: DecayFit) -> float:
+def _alike_over(fit: DecayFit) -> float:
     """Correlation time of noise with a fit's neighbours and no white part, s; 0 for none."""
     alike = fit.identifiability.residual_correlation
     return -float(np.median(np.diff(fit.readings.time))) / math.log(alike) if alike else 0.0
@@ -304,7 +316,7 @@ def alike_over(fit: DecayFit) -> float:
 def _noise(decays: Sequence[Decay]) -> tuple[float, float, float]:
     """Noise of a reading, mA, its correlation time and the interval of readings, s."""
     fits = [decay.fit for decay in decays]
-    memory = np.median([alike_over(fit) for fit in fits])
+    memory = np.median([_alike_over(fit) for fit in fits])
     least = BEST_MONITOR * np.median([fit.mean_current for fit in fits])
     noise = max(np.median([fit.noise for fit in fits]), least)
     interval = np.median([np.median(np.diff(decay.segment.time)) for decay in decays])

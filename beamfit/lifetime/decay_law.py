@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -24,13 +25,15 @@ WEIGHTS = np.array([5.0, 8.0, 5.0]) / 18
 LEAST = 1e-12
 
 
-def mean_exponential(x: Array) -> Array:
+def mean_exponential(x, xp=jnp):
     """(1 - exp(-x))/x, smooth through x = 0 with all derivatives.
 
     Parameters
     ----------
     x : float or array
-        Any real number.
+        Any number.
+    xp : module, optional
+        jax.numpy or numpy.
 
     Returns
     -------
@@ -42,14 +45,13 @@ def mean_exponential(x: Array) -> Array:
     >>> print(mean_exponential(0.0), f"{mean_exponential(1.0):.6f}")
     1.0 0.632121
     """
-    x = jnp.asarray(x, float)
-    small = jnp.abs(x) < SERIES_BELOW
-    inner = jnp.where(small, x, 0.0)
-    series = jnp.ones_like(x)
+    small = xp.abs(x) < SERIES_BELOW
+    inner = xp.where(small, x, 0.0)
+    series = 1.0
     for order in range(11, 1, -1):
         series = 1 - inner / order * series
-    outer = jnp.where(small, 1.0, x)
-    return jnp.where(small, series, -jnp.expm1(-outer) / outer)
+    outer = xp.where(small, 1.0, x)
+    return xp.where(small, series, -xp.expm1(-outer) / outer)
 
 
 def current(time: Array, i0: Array, a: Array, b: Array) -> Array:
@@ -93,13 +95,10 @@ class Moments(NamedTuple):
         Since the first reading of a piece, in a unit of time.
     gas : array, shape (n,), or None
         Integral of the pressure over its mean, in the same unit; None where it is constant.
-    starts : array of int, shape (n,), or None
-        First reading of the piece of each; None of a single piece.
     """
 
-    time: Array
-    gas: Array | None = None
-    starts: Array | None = None
+    time: np.ndarray
+    gas: np.ndarray | None = None
 
 
 def closed_form(level, quadratic, power, lost, whole, xp=jnp):
@@ -114,51 +113,44 @@ def closed_form(level, quadratic, power, lost, whole, xp=jnp):
     0.500
     """
     c = 1.0 + power
-    return level * xp.exp(-lost) * (1.0 + c * quadratic * level**c * whole) ** (-1.0 / c)
+    left = 1.0 + c * quadratic * level**c * whole
+    left = xp.where(xp.real(left) > 0, left, np.nan)  # a negative loss without end
+    return level * xp.exp(-lost) * left ** (-1.0 / c)
 
 
-def cumulative(values: Array) -> Array:
-    """Sum cumulatively by two small triangular products: JAX's own takes seconds to compile."""
-    side = math.isqrt(values.size - 1) + 1
-    square = jnp.pad(values, (0, side**2 - values.size)).reshape(side, side)
-    within = square @ jnp.triu(jnp.ones((side, side)))
-    before = jnp.tril(jnp.ones((side, side)), -1) @ within[:, -1]
-    return (within + before[:, None]).ravel()[: values.size]
-
-
-def course(kind: str, time: Array, when: Array) -> Array:
+def course(kind: str, time: np.ndarray, when: complex) -> np.ndarray:
     """Integral from zero of a further loss of 1.
 
     One that is "relaxing" within a time, a "step" at a time, a "drift" about zero in time 1, or
     "sudden", all of it at a time.
     """
     if kind == "step":
-        return jnp.maximum(time - when, 0.0)
+        return np.where(time > np.real(when), time - when, 0.0)
     if kind == "drift":
         return time * (time - 1.0) / 2
     if kind == "sudden":
-        return jnp.where(time > when, 1.0, 0.0)
-    return -when * jnp.expm1(-time / when)
+        return np.where(time > np.real(when), 1.0, 0.0)
+    return -when * np.expm1(-time / when)
 
 
 def beam_current(
-    level: Array,
-    numbers: Array,
+    level: np.ndarray,
+    numbers: Sequence[np.ndarray],
     at: Moments,
     kind: str | None = None,
     shape: Callable[[Array], Array] | None = None,
-) -> Array:
+) -> np.ndarray:
     """Beam current over its mean, for any power of a and any b(t).
 
     Parameters
     ----------
     level : float or array, shape (n,)
         Current at the first reading, of each reading's piece.
-    numbers : array, shape (3,) or (3 + 2 k,)
+    numbers : sequence, of length 3 or 3 + 2 k
         Loss rate at the mean current, its quadratic part, the power by which a departs from its
-        shape, and k times a further loss and its time.
+        shape, and k times a further loss and its time; complex where slopes are wanted.
     at : Moments
-        When.
+        When; with a gauge or further losses of a single piece.
     kind : {"relaxing", "step", "drift", "sudden"}, optional
         The further losses, as of `course`.
     shape : callable, optional
@@ -180,33 +172,35 @@ def beam_current(
     >>> print(beam_current(1.0, np.array([0.5, 0.5, 0.0]), at).round(6))
     [1.       0.666667]
     """
-    loss, quadratic, power = numbers[:3]
+    loss, quadratic, power, *further = numbers
     linear = loss - quadratic
     if shape is not None:
-
-        def rate(x: Array) -> Array:
-            x = jnp.maximum(x, LEAST)
-            return quadratic * shape(x) / shape(1.0) * x ** (1.0 + power) + linear
-
-        return current_by_rate(at.time, level, rate)
+        return np.asarray(_shaped(at.time, level, quadratic, linear, power, shape))
     if at.gas is None and kind is None:
         lost = linear * at.time
-        whole = at.time * mean_exponential((1.0 + power) * lost)
-        return closed_form(level, quadratic, power, lost, whole)
+        whole = at.time * mean_exponential((1.0 + power) * lost, np)
+        return closed_form(level, quadratic, power, lost, whole, np)
 
-    def gone(time: Array, gas: Array) -> Array:
-        more = [f * course(kind, time, w) for f, w in numbers[3:].reshape(-1, 2)] if kind else []
-        return linear * gas + sum(more)
+    def gone(time: np.ndarray, gas: np.ndarray) -> np.ndarray:
+        pairs = zip(further[::2], further[1::2], strict=True)
+        return linear * gas + sum(f * course(kind, time, w) for f, w in pairs)
 
     gas = at.time if at.gas is None else at.gas
-    starts = jnp.zeros(at.time.size, int) if at.starts is None else at.starts
-    inside = jnp.diff(at.time) * (starts[1:] == starts[:-1])
+    inside = np.diff(at.time)
     node = at.time[:-1, None] + inside[:, None] * NODES
-    node_gas = gas[:-1, None] + (jnp.diff(gas) * (inside > 0))[:, None] * NODES
-    parts = inside * (jnp.exp(-(1.0 + power) * gone(node, node_gas)) @ WEIGHTS)
-    whole = cumulative(jnp.concatenate([jnp.zeros(1), parts]))
-    whole = whole - whole[starts]
-    return closed_form(level, quadratic, power, gone(at.time, gas), whole)
+    node_gas = gas[:-1, None] + np.diff(gas)[:, None] * NODES
+    parts = inside * (np.exp(-(1.0 + power) * gone(node, node_gas)) @ WEIGHTS)
+    whole = np.append(0.0, np.cumsum(parts))
+    return closed_form(level, quadratic, power, gone(at.time, gas), whole, np)
+
+
+@partial(jax.jit, static_argnames="shape")
+def _shaped(time: Array, level: Array, quadratic: Array, linear: Array, power: Array, shape):
+    def rate(x: Array) -> Array:
+        x = jnp.maximum(x, LEAST)
+        return quadratic * shape(x) / shape(1.0) * x ** (1.0 + power) + linear
+
+    return current_by_rate(time, level, rate)
 
 
 def lifetime(beam_current: Array, a: Array, b: Array) -> Array:

@@ -11,18 +11,16 @@ import numpy as np
 
 from beamfit.greybox.memory import AveragedMoments, Memory
 from beamfit.lifetime.alternatives import (
-    Change,
     ConstantA,
     LifetimeLaw,
     Outgassing,
     Rival,
-    SuddenLoss,
     constant_a,
     lifetime_law,
     rival_of,
 )
-from beamfit.lifetime.expansion import LOSS, POWER, Expansion, Physical, lifetime_of
-from beamfit.lifetime.marginal import BELOW, FreeLaw, Law, free_law
+from beamfit.lifetime.expansion import DETERMINED, LOSS, POWER, Expansion, Physical, lifetime_of
+from beamfit.lifetime.marginal import BELOW, UNITS, FreeLaw, Law, free_law
 from beamfit.lifetime.record import DecayRecord
 from beamfit.noise.memory import CLOSE, Products
 from beamfit.quantity import HOUR, Quantity
@@ -30,20 +28,10 @@ from beamfit.shown import shown
 from beamfit.status import Status
 from beamfit.table import json_of
 
-UNITS = {
-    "a": "1/(mA s)",
-    "b": "1/s",
-    "i0": "mA",
-    "lifetime_start": "h",
-    "lifetime_end": "h",
-    "lifetime_mean": "h",
-}
 ENDS = ("start", "end", "mean")
 # The share of a in the loss lies between 0 and 1: known to 0.2, the record tells pure Touschek
 # from pure gas at five standard deviations; known worse, a and b are one number.
 SEPARABLE = 0.2
-# A loss rate less than three errors from zero leaves the lifetime without an upper limit.
-DETERMINED = 1 / 3
 # How many errors below zero an unphysical a or b, or a rising current, is believed.
 BELIEVED = 5.0
 # Standard deviations that hold 95 % of a normal distribution.
@@ -192,12 +180,12 @@ class Evidence:
     @cached_property
     def drifted(self) -> np.ndarray:
         """Shifts of the values by the stated instability of the monitor."""
-        moved = [self.about.moved(c / self.about.pieces.over) for c in self.monitor_changes]
+        moved = [self.about.moved(change) for change in self.monitor_changes]
         return np.linalg.norm(moved, axis=0) if moved else np.zeros(len(Physical._fields))
 
     @property
     def monitor_changes(self) -> list[np.ndarray]:
-        """Stated instabilities of the monitor, mA."""
+        """Stated instabilities of the monitor, over the errors of readings."""
         return self.about.pieces.monitor_changes if self.about.rested else []
 
     @cached_property
@@ -367,24 +355,6 @@ class Evidence:
         """Alternative that explains a refuted law better than a power of the current."""
         return self.rival if self.refuted else None
 
-    @property
-    def change(self) -> Change | None:
-        """A change of the loss rate that explains a refuted law."""
-        found = self.explained
-        return found.found if found is not None and isinstance(found.found, Change) else None
-
-    @property
-    def outgassing(self) -> Outgassing | None:
-        """A gas loss that relaxes, where that explains a refuted law."""
-        found = self.explained
-        return found.found if found is not None and isinstance(found.found, Outgassing) else None
-
-    @property
-    def loss(self) -> SuddenLoss | None:
-        """Current lost at once, too little for single readings to show, where that explains it."""
-        found = self.explained
-        return found.found if found is not None and isinstance(found.found, SuddenLoss) else None
-
     @cached_property
     def free(self) -> FreeLaw | None:
         """Posterior of the free law; None where the law is known, an alternative explains the
@@ -425,20 +395,18 @@ class Evidence:
         rate = name.replace("lifetime", "rate")
         by = HOUR if rate != name else 0.0
         if self.bending is not None and exact.error is not None and not self.refuted:
-            moved = float(getattr(self.bending, rate)) * (by * exact.value**2 or 1.0)
-            low, high = (np.hypot(exact.value - end, NORMAL * moved) for end in exact.interval_95)
-            interval = exact.value - float(low), exact.value + float(high)
-            error = math.hypot(exact.error, moved)
-            return Quantity(exact.value, error, exact.unit, exact.error_raw, interval)
-        if self.free is None:
+            value, error, interval, more = exact.value, exact.error, exact.interval_95, self.bending
+        elif self.free is not None:
+            found, more = self.free.quantities[name], Physical(*self.drifted)
+            error, interval = found.error, found.interval_95
+            value = exact.value if self.free.constant > LIKELIER else found.value
+            value = float(np.clip(value, *interval))
+        else:
             return exact
-        span = self.free.spans[name]
-        value = exact.value if self.free.constant > LIKELIER else span.median
-        value = float(np.clip(value, *span.interval))
-        moved = float(getattr(Physical(*self.drifted), rate)) * (by * value**2 or 1.0)
-        error, interval = span.beside(value, moved)
-        error = None if exact.error is None else error
-        return Quantity(value, error, exact.unit, exact.error_raw, interval)
+        moved = float(getattr(more, rate)) * (by * value**2 or 1.0)
+        low, high = (float(np.hypot(value - end, NORMAL * moved)) for end in interval)
+        error = None if exact.error is None else math.hypot(error, moved)
+        return Quantity(value, error, exact.unit, exact.error_raw, (value - low, value + high))
 
     def quoted(self, known: bool = True) -> dict[str, Any]:
         """Fields of a `DecayFit`, by name."""
@@ -450,6 +418,7 @@ class Evidence:
         found = {name: self.widely(name, quantity) for name, quantity in exact.items()}
         found |= {"exact": exact, "free_law": self.free, "shaped": self.shaped}
         found |= {name: getattr(self, name) for name in (*same, "inflation", "residuals", "course")}
+        found["alternative"] = self.explained and self.explained.found
         return found | {"identifiability": self.separability}
 
     @cached_property
@@ -474,7 +443,7 @@ class Evidence:
         rates = (self.about.numbers[LOSS - 1] + parts.departure) / span + shift
         since = self.time - self.time[0]
         ends = np.append(since[parts.first[1:]], since[-1])
-        lifetimes = (lifetime_of(*pair, 1 / DETERMINED) for pair in
+        lifetimes = (lifetime_of(*pair, clear=True) for pair in
                      zip(rates, found.error, strict=True))  # fmt: skip
         return tuple(map(RatePart, since[parts.first].tolist(), ends.tolist(), lifetimes))
 
@@ -489,7 +458,8 @@ class Evidence:
             known = self.separability.separable and not (refuted and self.course)
         else:
             plain = not self.shaped and self.about.pieces.gauge is None
-            known = plain and refuted and self.outgassing is None
+            gas = self.explained is not None and isinstance(self.explained.found, Outgassing)
+            known = plain and refuted and not gas
         return lifetime_law(self.about, self.independent, refuted) if known else None
 
     @cached_property

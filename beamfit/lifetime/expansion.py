@@ -10,20 +10,16 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property, lru_cache
 from itertools import pairwise
 from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from scipy.integrate import cumulative_simpson
 
-from beamfit.compile_cache import SELDOM
 from beamfit.greybox.memory import Memory, Whitened, usual_noises, whitened_by_each
-from beamfit.greybox.problem import padded_length
-from beamfit.lifetime.decay_law import Moments, beam_current, cumulative
+from beamfit.lifetime.decay_law import LEAST, Moments, beam_current
 from beamfit.lifetime.record import DecayRecord, Monitor
 from beamfit.noise.correlated import CorrelatedNoise, Levels, remembers
 from beamfit.quantity import HOUR, Quantity
@@ -39,15 +35,19 @@ PRIOR_WIDTH = 30.0
 # A search rests where a step moves the curve by less than this share of the noise: the next would
 # be below rounding. It ends after so many steps, and a step is halved so often.
 NEAR, STEPS, HALVED = 1e-4, 100, 30
+# Loss and quadratic part of a decay that has a value wherever a search begins.
+PLAIN_DECAY = np.array([0.1, 0.05])
 # Powers and times of a further loss that are looked at.
 POWERS, TIMES = (-0.95, 3.0), (1e-3, 10.0)
 # A drift under white noise counts from so many standard errors on: it enlarges errors much. Fewer
 # readings tell nothing of the memory of their noise.
 SLOW, FEWEST = 3.0, 12
+# A loss rate less than three errors from zero leaves the lifetime without an upper limit.
+DETERMINED = 1 / 3
 # Noises of so small a part of the largest probability move no digit.
 NO_WEIGHT = 1e-12
-# Records solved in one call; fewer are filled up, so that one number is compiled.
-TOGETHER = 16
+# Steps by which slopes are taken: imaginary ones lose no digit, but a shape takes real numbers.
+IMAGINARY, REAL = 1e-30, 1e-5
 
 Shape = Callable[[Array], Array]
 
@@ -68,17 +68,18 @@ class Physical(NamedTuple):
     exponent: Array
 
 
-def lifetime_of(rate: float, error: float, clear: float | None = None) -> Quantity:
-    """Lifetime, h, of a loss rate, 1/s; unknown of one not so many of its errors above zero."""
-    if clear is not None and not rate > clear * error:
+def lifetime_of(rate: float, error: float, clear: bool = False) -> Quantity:
+    """Lifetime, h, of a loss rate, 1/s; unknown where one that is not clear of zero tells none."""
+    if clear and not error < DETERMINED * rate:
         return Quantity(math.nan, None, "h")
     return Quantity(float(1 / rate / HOUR), float(error / rate**2 / HOUR), "h")
 
 
-class Pieces(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Pieces:
     """Readings of all pieces in a row.
 
-    Attributes
+    Parameters
     ----------
     time, since : array, shape (n,)
         Times, and times since the first reading of the piece, s.
@@ -106,15 +107,47 @@ class Pieces(NamedTuple):
         time, first = record.time, np.zeros(1, int)
         return cls(time, time, record.current, record.error, first, record.gauge, record.monitor)
 
-    @property
+    @cached_property
     def lengths(self) -> np.ndarray:
         """Readings of each piece."""
         return np.diff(self.first, append=self.time.size)
 
-    @property
+    @cached_property
     def units(self) -> tuple[float, float]:
         """The longest piece, s, and the mean current, mA."""
         return float(self.since.max()), float(self.current.mean())
+
+    @cached_property
+    def share(self) -> np.ndarray:
+        """Currents over their mean."""
+        return self.current / self.units[1]
+
+    @cached_property
+    def weight(self) -> np.ndarray:
+        """Weight of a residual over the mean current."""
+        return np.broadcast_to(self.units[1] / np.asarray(self.over), self.time.shape)
+
+    @cached_property
+    def at(self) -> Moments:
+        """Times in units of the longest piece."""
+        gas = None if self.gauge is None else self.gauge / self.units[0]
+        return Moments(self.since / self.units[0], gas)
+
+    @property
+    def pressure(self) -> np.ndarray:
+        """Pressure over its mean at the first and last reading."""
+        if self.gauge is None:
+            return np.ones(2)
+        return (np.diff(self.gauge) / np.diff(self.time))[[0, -1]]
+
+    def each(self, values: np.ndarray) -> np.ndarray:
+        """Values of the pieces for each reading."""
+        return np.repeat(values, self.lengths) if values.size > 1 else values[0]
+
+    def worth(self, own: np.ndarray, values: np.ndarray) -> np.ndarray:
+        """Multiples of a column that explain most of values, piece by piece."""
+        squares = np.maximum(np.add.reduceat(own**2, self.first), 1e-300)
+        return np.add.reduceat(own * values, self.first) / squares
 
     @property
     def over(self) -> np.ndarray | float:
@@ -123,9 +156,10 @@ class Pieces(NamedTuple):
 
     @property
     def monitor_changes(self) -> list[np.ndarray]:
-        """Changes of the readings by a stated instability of the monitor, mA."""
+        """Changes of the readings by a stated instability of the monitor, over their errors."""
         since = self.time - self.time[0]
-        return [] if self.monitor is None else list(self.monitor.changes(since).values())
+        changes = {} if self.monitor is None else self.monitor.changes(since)
+        return [change / self.over for change in changes.values()]
 
     def kept(self, keep: np.ndarray, fewest: int) -> Pieces:
         """Some of the readings; pieces with fewer than so many of them are left out."""
@@ -137,71 +171,6 @@ class Pieces(NamedTuple):
         since = time - np.repeat(time[first], count)
         error = None if self.error is None else self.error[keep]
         return Pieces(time, since, self.current[keep], error, first, None, self.monitor)
-
-    def scaled(self) -> _Rows:
-        """Readings in units of the search, padded to one of a few lengths by some of no weight."""
-        (span, mean), size, many = self.units, self.time.size, self.first.size > 1
-        extra = (0, padded_size(size) - size)
-        weight = np.broadcast_to(mean / np.asarray(self.over), (size,))
-        columns = [self.since / span, self.current / mean]
-        columns += [] if self.gauge is None else [self.gauge / span]
-        time, current, *gas = (np.pad(column, extra, mode="edge") for column in columns)
-        piece, pressure = None, np.ones(2)
-        if many:
-            piece = np.pad(np.repeat(np.arange(self.first.size), self.lengths), extra, mode="edge")
-        if self.gauge is not None:
-            pressure = (np.diff(self.gauge) / np.diff(self.time))[[0, -1]]
-        ends = np.array([current.max(), current.min()])
-        return _Rows(time, current, np.pad(weight, extra), gas[0] if gas else None, piece, ends,
-                     pressure, mean)  # fmt: skip
-
-
-class _Rows(NamedTuple):
-    """As `Pieces`, scaled: `piece` is the place of each reading's, None of a single one; highest
-    and lowest current, the pressure over its mean at both ends, the mean current, mA, and by how
-    much the loss rate of each reading's piece departs from the mean.
-    """
-
-    time: Array
-    current: Array
-    weight: Array
-    gas: Array | None
-    piece: Array | None
-    ends: Array
-    pressure: Array
-    mean: Array
-    departure: Array | None = None
-
-    def shape_of(self, shape: Shape | None) -> Shape | None:
-        """A shape of the current over its mean."""
-        return None if shape is None else lambda x: shape(x * self.mean)
-
-    @property
-    def count(self) -> int:
-        """Pieces at most: of three readings or more each."""
-        return 1 if self.piece is None else self.time.size // 2
-
-    @property
-    def starts(self) -> Array | None:
-        """First reading of the piece of each; None of a single piece."""
-        if self.piece is None:
-            return None
-        return jnp.searchsorted(self.piece, self.piece, side="left")
-
-    def sums(self, values: Array) -> Array:
-        """Sum the values of each piece."""
-        if self.piece is None:
-            return jnp.sum(values, axis=0, keepdims=True)
-        return jax.ops.segment_sum(values, self.piece, self.count, indices_are_sorted=True)
-
-    def each(self, values: Array) -> Array:
-        """Values of the pieces for each reading."""
-        return values[jnp.zeros(self.time.size, int) if self.piece is None else self.piece]
-
-    def without_levels(self, own: Array, columns: Array) -> tuple[Array, Array]:
-        """Columns without what the levels explain, and what they are worth of each level."""
-        worth = self.sums(own[:, None] * columns) / jnp.maximum(self.sums(own**2), 1e-300)[:, None]
-        return columns - own[:, None] * self.each(worth), worth
 
 
 class Parts(NamedTuple):
@@ -222,195 +191,60 @@ class Parts(NamedTuple):
     departure: np.ndarray
 
 
-class _State(NamedTuple):
-    """A search: numbers and levels, the law about them, half the squares, and the next step."""
-
-    numbers: Array
-    level: Array
-    residual: Array
-    slopes: Array
-    values: Array
-    by: Array
-    cost: Array
-    step: Array
-    down: Array
-    share: Array
-    rested: Array
-    count: Array
+@lru_cache(maxsize=16)  # one that is made anew would be compiled anew
+def _of_share(shape: Shape, mean: float) -> Shape:
+    """A shape as one of the current over its mean."""
+    return lambda x: shape(x * mean)
 
 
-def padded_size(rows: int) -> int:
-    """A few lengths from 64: each is compiled once, for a second or two."""
-    return padded_length(max(rows, 64))
+def _least_squares(rows: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """Step of the numbers from columns, the last of them residuals, and rows of priors."""
+    size = np.linalg.norm(rows[:, :-1], axis=0) + 1e-300
+    whole = np.vstack([rows, known]) / np.append(size, 1.0)
+    whole = np.vstack([whole, 1e-15 * np.eye(size.size, size.size + 1)])
+    factor = np.linalg.qr(whole, mode="r")
+    return -np.linalg.solve(factor[:-1, :-1], factor[:-1, -1]) / size
 
 
-def _about(numbers: Array, level: Array, rows: _Rows, kind: str | None, shape: Shape | None):
-    """Residuals over errors and physical values, and their slopes by all columns."""
-    at, shape = Moments(rows.time, rows.gas, rows.starts), rows.shape_of(shape)
+class _Start(NamedTuple):
+    """Loss and quadratic part, levels, noise in units of the weights, width of the prior."""
 
-    def answer(step: Array) -> tuple[Array, Array]:
-        now = numbers + step[1:]
-        begin = level[0] if rows.piece is None else rows.each(level)
-        own = now if rows.departure is None else (now[0] + rows.departure, *now[1:])
-        model = beam_current(begin + step[0], own, at, kind, shape)
-        ends = rows.ends
-        if rows.piece is None:
-            ends = jnp.stack([begin + step[0], model[-1]])
-        return rows.weight * (model - rows.current), _physical(ends, now, rows.pressure, shape)
+    both: np.ndarray
+    level: np.ndarray
+    noise: float
+    width: float
 
-    zero = jnp.zeros(numbers.size + 1)
-    (residual, values), (slopes, by) = jax.vmap(
-        lambda way: jax.jvp(answer, (zero,), (way,)), out_axes=(None, 0)
-    )(jnp.eye(zero.size))
-    return residual, slopes.T, values, by.T
+    @classmethod
+    def of(cls, pieces: Pieces) -> _Start:
+        """From integrals, which average the noise, so that it is good for a decay of any length.
 
+        Integrated once, the law is linear: x(t) = level - loss ∫x dt - quadratic ∫x (x - 1) dt.
+        """
+        x, weight, inside = pieces.share, pieces.weight, np.diff(pieces.at.time)
 
-def _physical(ends: Array, numbers: Array, pressure: Array, shape: Shape | None) -> Array:
-    loss, quadratic, power = numbers[:3]
-    x = jnp.maximum(ends, 1e-12)
-    rates = quadratic * x ** (1 + power) * (1.0 if shape is None else shape(x) / shape(1.0))
-    rates = rates + (loss - quadratic) * pressure
-    return jnp.stack([ends[0], quadratic, loss - quadratic, *rates, loss, quadratic / loss, power])
+        def integral(values: np.ndarray) -> np.ndarray:
+            whole = np.append(0.0, np.cumsum(inside * (values[1:] + values[:-1]) / 2))
+            return whole - pieces.each(whole[pieces.first])
 
-
-def _least_squares(rows: Array, known: Array) -> Array:
-    """Step of the numbers from columns, the last of them residuals, and rows of priors, by QR."""
-    size = jnp.linalg.norm(rows[:, :-1], axis=0) + 1e-300
-    unit = jnp.append(1 / size, 1.0)
-    ridge = 1e-15 * jnp.eye(size.size, size.size + 1)
-    factor = jnp.linalg.qr(jnp.concatenate([rows * unit, known * unit, ridge]), mode="r")
-    return -jax.scipy.linalg.solve_triangular(factor[:-1, :-1], factor[:-1, -1]) / size
+        columns = np.stack([-integral(x), -integral(x * (x - 1)), x], axis=1) * weight[:, None]
+        loss, bend, y = Levels(pieces.first, weight).left(columns).T
+        root = math.sqrt(max(x.size - pieces.first.size - 2, 1))
+        size = np.linalg.norm(loss) + 1e-300
+        straight = (loss @ y) / size**2
+        noise = np.linalg.norm(y - straight * loss) / root
+        width = PRIOR_WIDTH * (abs(straight) + 3 * noise / size) + 1e-300
+        known = np.array([[0.0, noise / width, 0.0]])
+        both = _least_squares(np.stack([loss, bend, -y], axis=1), known)
+        less = np.linalg.norm(y - both @ (loss, bend)) / root
+        least = 1e-15 * np.linalg.norm(weight * x) / root
+        level = pieces.worth(weight, columns[:, 2] - columns[:, :2] @ both)
+        return cls(both, level, max(min(noise, less), least), width)
 
 
-def _start(rows: _Rows) -> tuple[Array, Array, Array, Array]:
-    """Loss and quadratic part, levels, noise in units of the weights, width of the prior.
-
-    Integrated once, the law is linear: x(t) = level - loss ∫x dt - quadratic ∫x (x - 1) dt. The
-    integrals average the noise, so the start is good for a decay of any length.
-    """
-    x, weight, inside = rows.current, rows.weight, jnp.diff(rows.time)
-
-    def integral(values: Array) -> Array:
-        parts = jnp.append(0.0, inside * (values[1:] + values[:-1]) / 2)
-        whole = cumulative(parts)
-        return whole if rows.piece is None else whole - whole[rows.starts]
-
-    columns = jnp.stack([-integral(x), -integral(x * (x - 1)), x], axis=1)
-    left, worth = rows.without_levels(weight, weight[:, None] * columns)
-    loss, bend, y = left.T
-    pieces = 1 if rows.piece is None else rows.piece[-1] + 1
-    count = jnp.maximum(jnp.sum(weight > 0) - pieces - 2, 1)
-    size = jnp.linalg.norm(loss) + 1e-300
-    straight = (loss @ y) / size**2
-    noise = jnp.linalg.norm(y - straight * loss) / jnp.sqrt(count)
-    width = PRIOR_WIDTH * (jnp.abs(straight) + 3 * noise / size) + 1e-300
-    both = _least_squares(
-        jnp.stack([loss, bend, -y], axis=1), jnp.array([[0.0, noise / width, 0.0]])
-    )
-    less = jnp.linalg.norm(y - left[:, :2] @ both) / jnp.sqrt(count)
-    least = 1e-15 * jnp.linalg.norm(weight * x) / jnp.sqrt(count)
-    level = worth[:, 2] - worth[:, :2] @ both
-    return both, level, jnp.maximum(jnp.minimum(noise, less), least), width
-
-
-class _Question(NamedTuple):
-    """Columns whose numbers are free, the kind of further losses, and the shape of a."""
-
-    free: tuple[int, ...]
-    kind: str | None
-    shape: Shape | None
-
-    def mask(self, size: int) -> Array:
-        """Free ones of so many numbers."""
-        return jnp.isin(jnp.arange(1, size + 1), jnp.array(self.free))
-
-    def within(self, numbers: Array, before: Array) -> Array:
-        """Free numbers within their bounds, and the others as before."""
-        more = numbers.size // 2 - 1
-        low = jnp.array([-jnp.inf, -jnp.inf, POWERS[0]] + [-jnp.inf, TIMES[0]] * more)
-        high = jnp.array([jnp.inf, jnp.inf, POWERS[1]] + [jnp.inf, TIMES[1]] * more)
-        return jnp.where(self.mask(numbers.size), jnp.clip(numbers, low, high), before)
-
-
-def _first(rows: _Rows, begin: Array, both: Array, level: Array, question: _Question) -> _State:
-    """Begin at the numbers given, or a step from a plain decay's, at those from integrals.
-
-    A start taken from noise can lie where the law has no value: the step is halved then. Nothing is
-    known of the law yet, since the search alone holds it, which takes a second to compile.
-    """
-    mask, given = question.mask(begin.size), jnp.isfinite(begin[0])
-    plain = mask * jnp.zeros(begin.size).at[:2].set(jnp.array([0.1, 0.05]))
-    own = mask * jnp.zeros(begin.size).at[:2].set(both)
-    start, at = jnp.where(given, begin, plain), jnp.where(given, level, 1.0)
-    law = jax.eval_shape(partial(_about, kind=question.kind, shape=question.shape), own, at, rows)
-    unknown = (jnp.full(part.shape, jnp.nan) for part in law)
-    step = jnp.where(given, 0.0, own - plain)
-    return _State(start, at, *unknown, jnp.inf, step, at - level, 1.0, False, 0)
-
-
-def _tried(numbers: Array, level: Array, rows: _Rows, prior: Array, question: _Question):
-    """The law about numbers, and the sum of squares, infinite where the law has no value."""
-    found = _about(numbers, level, rows, question.kind, question.shape)
-    residual, slopes = found[:2]
-    known = prior * numbers[jnp.array(question.free) - 1]
-    cost = residual @ residual + jnp.sum(known**2)
-    fine = jnp.isfinite(slopes).all() & jnp.isfinite(cost)
-    return *found, jnp.where(fine, cost, jnp.inf)
-
-
-def _advanced(s: _State, rows: _Rows, prior: Array, noise: Array, question: _Question) -> _State:
-    """Take the step, or half of it where it did not help, and find the next."""
-    places = jnp.array(question.free)
-    tried = question.within(s.numbers + s.share * s.step, s.numbers), s.level - s.share * s.down
-    tried += _tried(*tried, rows, prior, question)
-    better = jnp.isfinite(tried[-1]) & (tried[-1] <= s.cost * (1 + 1e-15))
-    numbers, level, residual, slopes, values, by, cost = (
-        jnp.where(better, new, old) for new, old in zip(tried, s[:7], strict=True)
-    )
-    columns = jnp.column_stack([slopes[:, places], residual])
-    left, worth = rows.without_levels(slopes[:, LEVEL], columns)
-    known = jnp.column_stack([jnp.diag(prior), prior * numbers[places - 1]])
-    step = _least_squares(left, known)
-    down = worth[:, :-1] @ step + worth[:, -1]
-    promised = jnp.linalg.norm(left[:, :-1] @ step)
-    rounding = 1e-14 * jnp.linalg.norm(slopes[:, LEVEL])
-    share = jnp.where(better, 1.0, s.share / 2)
-    # Where no step however short is better, what it promised must be below the noise.
-    small = s.rested | (better & (promised <= NEAR * noise + rounding))
-    stuck = ~better & (s.share <= 0.5**HALVED)
-    return _State(
-        numbers, level, residual, slopes, values, by, cost,
-        jnp.where(better, jnp.zeros_like(numbers).at[places - 1].set(step), s.step),
-        jnp.where(better, down, s.down), share, small | stuck, s.count + 1,
-    )  # fmt: skip
-
-
-def _search(rows: _Rows, begin: Array, widths: Array, free, kind=None, shape=None):
-    """Gauss and Newton from numbers, NaN where the start is to be found; and what they leave.
-
-    `widths` are those of normal priors about zero.
-    """
-    question = _Question(free, kind, shape)
-    both, level, noise, width = _start(rows)
-    weak = noise / width * (shape is None)
-    prior = noise / widths + jnp.where(jnp.array(free) == QUADRATIC, weak, 0.0)
-    last = jax.lax.while_loop(
-        lambda s: ~s.rested & (s.count < STEPS),
-        lambda s: _advanced(s, rows, prior, noise, question),
-        jax.tree.map(jnp.asarray, _first(rows, begin, both, level, question)),
-    )
-    return *last[:6], last.rested, weak
-
-
-# The plain law is searched again and again; what alternatives ask for runs a few times.
-QUESTION = ("free", "kind", "shape")
-_searched = jax.jit(_search, static_argnames=QUESTION)
-_searched_seldom = jax.jit(_search, static_argnames=QUESTION, compiler_options=SELDOM)
-
-
-@partial(jax.jit, static_argnames=("kind", "shape"))
-def _looked(rows: _Rows, numbers: Array, level: Array, kind: str | None, shape):
-    return _about(numbers, level, rows, kind, shape)
+def _ends(count: int) -> np.ndarray:
+    """Lowest and highest value of each of so many numbers."""
+    more = count // 2 - 1
+    return np.array([(-np.inf, np.inf)] * 2 + [POWERS] + [(-np.inf, np.inf), TIMES] * more).T
 
 
 @dataclass(frozen=True, eq=False)
@@ -453,19 +287,51 @@ class Expansion:
     parts: Parts | None = None
 
     @classmethod
-    def of(cls, pieces: Pieces, found: Sequence[np.ndarray]) -> Expansion:
-        """From what a search gives, in units of the readings."""
-        (span, mean), size = pieces.units, pieces.time.size
-        numbers, level, residual, rows, values, by, *rest = map(np.asarray, found)
+    def of(
+        cls, pieces: Pieces, numbers: np.ndarray, level: np.ndarray, kind: str | None = None,
+        shape: Shape | None = None, departure: np.ndarray | float = 0.0,
+    ) -> Expansion:  # fmt: skip
+        """About numbers and levels of the pieces; `departure` is by how much the loss of each
+        reading's piece departs from the mean.
+        """
+        (span, mean), many = pieces.units, level.size > 1
+        shape = shape and _of_share(shape, mean)
+        highest = np.array([pieces.share.max(), pieces.share.min()])
+
+        def answer(step: np.ndarray) -> np.ndarray:
+            loss, quadratic, power, *further = numbers + step[1:]
+            begin, own = level + step[0], (loss + departure, quadratic, power, *further)
+            model = beam_current(pieces.each(begin), own, pieces.at, kind, shape)
+            x = highest if many else np.array([begin[0], model[-1]])
+            rates = quadratic * np.where(x.real > LEAST, x, LEAST) ** (1 + power)
+            rates = rates * (1.0 if shape is None else np.asarray(shape(x) / shape(1.0)))
+            b = loss - quadratic
+            values = begin.mean(), quadratic, b, *(rates + b * pieces.pressure), loss
+            values = *values, quadratic / loss, power
+            return np.concatenate([pieces.weight * (model - pieces.share), values])
+
+        ways, count = np.eye(numbers.size + 1), pieces.time.size
+        if shape is None:
+            found = np.array([answer(1j * IMAGINARY * way) for way in ways])
+            found, slopes = found[0].real, found.imag.T / IMAGINARY
+        else:
+            found = answer(0.0 * ways[0])
+            slopes = [(answer(REAL * way) - answer(-REAL * way)) / (2 * REAL) for way in ways]
+            slopes = np.array(slopes).T
         unit = np.array([mean, 1 / mean / span, *[1 / span] * 4, 1.0, 1.0])
-        prior, rested = (float(rest[1]), bool(rest[0])) if rest else (0.0, True)
-        fine = rested and bool(np.isfinite(values).all())
-        level = level[: pieces.first.size]
-        values, by = values * unit, by * unit[:, None]
-        if level.size > 1:
-            values[0], by[0] = mean * level.mean(), 0.0
-        return cls(pieces, numbers, level, residual[:size], rows[:size], Physical(*values), by,
-                   prior, fine)  # fmt: skip
+        values, by = found[count:] * unit, slopes[count:] * unit[:, None]
+        by[0] = 0.0 if many else by[0]
+        fine = np.isfinite(slopes).all() and np.isfinite(found).all()
+        return cls(pieces, numbers, level, found[:count], slopes[:count], Physical(*values), by,
+                   rested=bool(fine))  # fmt: skip
+
+    @classmethod
+    def at(cls, record: DecayRecord, i0: float, a: float, b: float) -> Expansion:
+        """About constant a and b, at the readings of a record."""
+        pieces = Pieces.of(record)
+        span, mean = pieces.units
+        numbers = np.array([(a * mean + b) * span, a * mean * span, 0.0])
+        return cls.of(pieces, numbers, np.array([i0 / mean]))
 
     @cached_property
     def levels(self) -> Levels | None:
@@ -531,6 +397,26 @@ class Expansion:
             CorrelatedNoise(np.zeros(1), np.zeros(1)), triangle, np.zeros(1), count
         ).memory()
 
+    def quoted(
+        self,
+        function: Callable[..., np.ndarray],
+        columns: Sequence[int],
+        independent: bool | None = None,
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Values of ``function(level, *numbers)`` with their errors: the noise averaged over, and
+        the stated instability of the monitor.
+        """
+        at, columns = np.append(self.level[:1], self.numbers), list(columns)
+        ways = 1j * IMAGINARY * np.eye(self.rows.shape[1], at.size)
+        found = np.array([function(*at + way) for way in ways])
+        memory = self.memory(columns, not self.wanders if independent is None else independent)
+        slopes = found.imag.T[:, columns] / IMAGINARY
+        error = memory.moments(slopes, self.given).error
+        for change in self.pieces.monitor_changes:
+            moved = np.linalg.lstsq(self.left[:, columns], self.beside(change[:, None]), rcond=None)
+            error = np.hypot(error, (slopes @ moved[0])[:, 0])
+        return found[0].real, error
+
     def _whitened(self, columns: Sequence[int]) -> Whitened:
         """Slopes by some columns and residuals, whitened by each noise; the cycles of a part, in
         which a departure is one of the loss, by themselves.
@@ -562,6 +448,49 @@ class Expansion:
         step = np.linalg.lstsq(self.left[:, plain], change, rcond=None)[0]
         beside = np.linalg.lstsq(self.left[:, power], change, rcond=None)[0]
         return Physical(*(self.slopes[:, plain] @ step))._replace(exponent=beside[-1])
+
+
+def _search(
+    pieces: Pieces, begin: np.ndarray | None, widths: np.ndarray, free: tuple[int, ...], kind, shape
+) -> Expansion:
+    """Gauss and Newton from numbers, None where the start is to be found.
+
+    `widths` are those of normal priors about zero. A start taken from noise can lie where the law
+    has no value: it is the first step from a plain decay, and halved then.
+    """
+    start, places = _Start.of(pieces), np.array(free) - 1
+    weak = start.noise / start.width * (shape is None)
+    prior = start.noise / widths + np.where(np.array(free) == QUADRATIC, weak, 0.0)
+    numbers, at = np.zeros(3) if begin is None else begin, np.ones(start.level.size)
+    step, down = np.zeros(numbers.size), at - start.level
+    if begin is None:
+        plain = np.isin(PLAIN, free)
+        numbers[:2], step[:2] = PLAIN_DECAY * plain, (start.both - PLAIN_DECAY) * plain
+    cost, share, rested, best = np.inf, 1.0, False, None
+    for _ in range(STEPS):
+        tried = numbers.copy()
+        tried[places] = np.clip(numbers + share * step, *_ends(numbers.size))[places]
+        found = Expansion.of(pieces, tried, at - share * down, kind, shape)
+        now = found.residuals @ found.residuals + np.sum((prior * tried[places]) ** 2)
+        if not (found.rested and now <= cost * (1 + 1e-15)):
+            share /= 2
+            # Where no step however short is better, what it promised must be below the noise.
+            if rested := share < 0.5**HALVED:
+                break
+            continue
+        numbers, at, cost, share, best = tried, found.level, now, 1.0, found
+        own, columns = found.rows[:, LEVEL], found.rows[:, free]
+        left = Levels(pieces.first, own).left(np.column_stack([columns, found.residuals]))
+        known = np.column_stack([np.diag(prior), prior * numbers[places]])
+        moved = _least_squares(left, known)
+        step = np.zeros(numbers.size)
+        step[places] = moved
+        down = pieces.worth(own, found.residuals + columns @ moved)
+        promised = np.linalg.norm(left[:, :-1] @ moved)
+        if rested := bool(promised <= NEAR * start.noise + 1e-14 * np.linalg.norm(own)):
+            break
+    best = best or found
+    return replace(best, prior=weak, rested=rested and best.rested)
 
 
 def solved(
@@ -606,65 +535,10 @@ def solved(
     >>> print(f"{found.a:.6e} {found.b:.6e}")
     2.000000e-08 1.000000e-06
     """
-    begin = np.full(3, np.nan) if start is None else np.asarray(start, float)
     known = np.array([(widths or {}).get(column, np.inf) for column in free])
-    search = _searched if free == PLAIN else _searched_seldom
-    return Expansion.of(pieces, search(pieces.scaled(), begin, known, tuple(free), kind, shape))
-
-
-def solved_together(records: Sequence[DecayRecord]) -> list[Expansion]:
-    """`solved` for the plain law of many decays, those of similar length in one call."""
-    pieces = [Pieces.of(record) for record in records]
-    groups: dict[tuple[int, bool], list[int]] = {}
-    for k, one in enumerate(pieces):
-        groups.setdefault((padded_size(one.time.size), one.gauge is None), []).append(k)
-    found: list[Expansion] = [None] * len(pieces)
-    for members in groups.values():
-        for first in range(0, len(members), TOGETHER):
-            chosen = members[first : first + TOGETHER]
-            rows = [pieces[k].scaled() for k in chosen]
-            rows += rows[:1] * (TOGETHER - len(chosen))
-            answers = _all_searched(jax.tree.map(lambda *parts: np.stack(parts), *rows))
-            answers = [np.asarray(part) for part in answers]
-            for row, k in enumerate(chosen):
-                found[k] = Expansion.of(pieces[k], [part[row] for part in answers])
-    return found
-
-
-@jax.jit
-def _all_searched(rows: _Rows):
-    nothing = jnp.full(3, jnp.nan), jnp.full(len(PLAIN), jnp.inf)
-    return jax.vmap(lambda one: _searched(one, *nothing, PLAIN))(rows)
-
-
-def expanded(
-    pieces: Pieces,
-    values: Physical,
-    shape: Shape | None = None,
-    kind: str | None = None,
-    further: Sequence[float] = (),
-) -> Expansion:
-    """Expand the law of a single decay about values, for what no search does.
-
-    `further` are losses and their times in units of the search.
-    """
-    span, mean = pieces.units
-    loss, quadratic = float(values.rate_mean) * span, float(values.a) * mean * span
-    numbers = np.array([loss, quadratic, float(np.nan_to_num(values.exponent)), *further])
-    level = np.array([float(values.i0) / mean])
-    found = _looked(pieces.scaled(), numbers, level, kind, shape)
-    return Expansion.of(pieces, (numbers, level, *found))
-
-
-def expanded_about(about: Expansion, numbers: np.ndarray, departure: np.ndarray) -> Expansion:
-    """Expand the law of many pieces about other numbers, with a departure of the loss rate for each
-    reading's piece; levels are eliminated.
-    """
-    rows = about.pieces.scaled()
-    departure = np.pad(departure, (0, rows.time.size - departure.size))
-    level = np.pad(about.level, (0, rows.count - about.level.size), constant_values=1.0)
-    found = _looked(rows._replace(departure=departure), numbers, level, None, None)
-    return replace(Expansion.of(about.pieces, (numbers, level, *found)), prior=about.prior)
+    begin = None if start is None else np.array(start, float)
+    with np.errstate(all="ignore"):
+        return _search(pieces, begin, known, tuple(free), kind, shape)
 
 
 def further_columns(about: Expansion, kind: str, times: np.ndarray) -> np.ndarray:

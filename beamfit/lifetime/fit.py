@@ -15,7 +15,7 @@ from beamfit.lifetime.alternatives import Change, ConstantA, LifetimeLaw, Outgas
 from beamfit.lifetime.answer import finding_of, finding_of_cycles
 from beamfit.lifetime.cycles import FEWEST_CYCLES, FEWEST_READINGS, averaged, cleaned
 from beamfit.lifetime.evidence import BELIEVED, UNITS, Evidence, RatePart, Separability
-from beamfit.lifetime.expansion import Expansion, Pieces, Shape, solved, solved_together
+from beamfit.lifetime.expansion import Expansion, Pieces, Shape, solved
 from beamfit.lifetime.marginal import FreeLaw, Law
 from beamfit.lifetime.record import DecayRecord, Monitor
 from beamfit.quantity import Quantity, Status
@@ -77,12 +77,9 @@ class DecayFit:
         By how much the memory of the noise enlarges the error of the loss rate, determined or not.
     lifetimes : LifetimeLaw or None
         The lifetime by current, where a constant a is refuted.
-    change : Change or None
-        When the loss rate changed, where that explains a refuted law.
-    outgassing : Outgassing or None
-        A gas loss that relaxes, where that explains a refuted law better.
-    loss : SuddenLoss or None
-        Current lost at once, where that explains it better.
+    alternative : Change, Outgassing, SuddenLoss or None
+        A change of the loss rate, a gas loss that relaxes, or current lost at once, where that
+        explains a refuted law; also as `change`, `outgassing` or `loss`.
     readings : DecayRecord, optional
         What was fitted.
     shaped : bool
@@ -124,9 +121,7 @@ class DecayFit:
     correlation_time: float | None = None
     inflation: float = 1.0
     lifetimes: LifetimeLaw | None = None
-    change: Change | None = None
-    outgassing: Outgassing | None = None
-    loss: SuddenLoss | None = None
+    alternative: Change | Outgassing | SuddenLoss | None = None
     readings: DecayRecord | None = None
     shaped: bool = False
     first: np.ndarray | None = None
@@ -135,39 +130,27 @@ class DecayFit:
     course: tuple[RatePart, ...] = ()
 
     def sample(
-        self,
-        *,
-        noise: str | None = None,
-        outliers: bool = False,
-        priors: Mapping[str, Distribution] | None = None,
-        **options: Any,
+        self, *, priors: Mapping[str, Distribution] | None = None, **options: Any
     ) -> Posterior:
-        """Draw I0, a and b from their posterior, flat above zero; lifetimes are derived.
-
-        a and b are constant in it, as in `exact`, also where the errors of the fit contain more.
+        """Draw from the posterior that the fit quotes: of the free law or the constant one.
 
         Parameters
         ----------
-        noise : {"known", "inferred"}, optional
-            Whether the errors are right, or right up to a common factor that is inferred. By
-            default they are inferred where the record has none or the fit enlarged them.
-        outliers : bool
-            Let an unknown fraction of the readings be outliers.
         priors : mapping of str to distribution, optional
-            On ``i0``, ``a`` or ``b``: `Normal`, `LogNormal`, `Uniform`, `HalfNormal` of
-            `beamfit.sampling.priors`, or a frozen one of scipy.stats.
+            On ``i0``, ``a``, ``b``, ``exponent`` or ``drift``: `Normal`, `LogNormal`, `Uniform`,
+            `HalfNormal` of `beamfit.sampling.priors`, or a frozen one of scipy.stats.
         **options
-            ``seed, target_ess, budget, walkers, store, provenance, progress`` of
-            `beamfit.sampling.ensemble.draw`.
+            ``seed, target_ess, store, provenance`` of `beamfit.lifetime.posterior.sampled`.
 
         Returns
         -------
         Posterior
+            Lifetimes are derived.
 
         Raises
         ------
         InputError
-            As `beamfit.lifetime.posterior.decay_target` and `draw`.
+            As `beamfit.lifetime.posterior.sampled`, and for many cycles.
 
         Examples
         --------
@@ -178,17 +161,40 @@ class DecayFit:
         >>> posterior.status.value, bool(posterior.values("b").min() >= 0)
         ('converged', True)
         """
-        from beamfit.lifetime.posterior import decay_target
-        from beamfit.sampling.ensemble import draw
+        from beamfit.lifetime.posterior import sampled
 
         if self.first is not None:
             expected = "one decay; the errors of cycles fitted together are those of the fit"
             raise InputError("samples of many cycles", expected, path=self.record)
-        return draw(decay_target(self, noise, outliers, priors), **options)
+        return sampled(self, priors, **options)
+
+    def _alternative(self, kind: type) -> Any:
+        return self.alternative if isinstance(self.alternative, kind) else None
+
+    @property
+    def change(self) -> Change | None:
+        """A change of the loss rate that explains a refuted law."""
+        return self._alternative(Change)
+
+    @property
+    def outgassing(self) -> Outgassing | None:
+        """A gas loss that relaxes, where that explains a refuted law."""
+        return self._alternative(Outgassing)
+
+    @property
+    def loss(self) -> SuddenLoss | None:
+        """Current lost at once, too little for single readings to show, where that explains it."""
+        return self._alternative(SuddenLoss)
 
     def if_constant(self, name: str) -> Quantity:
         """A quantity of the law with constant a and b, as the curve through the readings has it."""
         return self.exact.get(name, getattr(self, name))
+
+    @property
+    def about(self) -> Expansion:
+        """The law with constant a and b about this fit of a single decay."""
+        numbers = (self.if_constant(name).value for name in ("i0", "a", "b"))
+        return Expansion.at(self.readings, *numbers)
 
     @property
     def quantities(self) -> dict[str, Quantity]:
@@ -344,13 +350,7 @@ def fit_decays(records: Sequence[DecayRecord], law: Law | str = Law.free) -> tup
     >>> [f"{fit.a.value:.3e}" for fit in fit_decays(records)]
     ['1.000e-08', '1.000e-08']
     """
-    telling = [k for k, record in enumerate(records) if not _says_nothing(record)]
-    found = solved_together([records[k] for k in telling])
-    fits = dict(zip(telling, found, strict=True))
-    return tuple(
-        _judged(record, fits[k], law=Law(law)) if k in fits else _constant(record)
-        for k, record in enumerate(records)
-    )
+    return tuple(fit_decay(record, law=law) for record in records)
 
 
 def _says_nothing(record: DecayRecord) -> bool:
@@ -404,9 +404,6 @@ def _judged(
         **evidence.quoted(about.rested),
         mean_current=float(record.current.mean()),
         rms_residual=float(np.sqrt(np.mean(evidence.residuals**2))),
-        change=evidence.change,
-        outgassing=evidence.outgassing,
-        loss=evidence.loss,
         readings=record,
     )
 
@@ -446,7 +443,7 @@ def fit_cycles(
     readings alone. Noise with a memory goes on from cycle to cycle (`beamfit.noise.correlated`).
     Readings, cycles and heads of cycles that lie far off are left out and counted. Where the loss
     rate is not the same in all cycles the answer is that of the mean rate, and `course` has the
-    lifetimes of parts (`beamfit.lifetime.rate_course`).
+    lifetimes of parts (`beamfit.lifetime.cycles`).
 
     Examples
     --------

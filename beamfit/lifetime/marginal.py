@@ -56,6 +56,14 @@ STEP = 1e-5
 # What lies farther below the largest log probability adds nothing.
 FAR = 9.0
 
+UNITS = {
+    "a": "1/(mA s)",
+    "b": "1/s",
+    "i0": "mA",
+    "lifetime_start": "h",
+    "lifetime_end": "h",
+    "lifetime_mean": "h",
+}
 ANGLE = -np.cos(np.pi * np.arange(NODES) / (NODES - 1))
 NODE = (1 + ANGLE) / 2
 FROM_NODES = np.linalg.inv(chebvander(ANGLE, NODES - 1))
@@ -102,27 +110,30 @@ class Numbers(NamedTuple):
         return cls(level, rate, (found[2] + drift / rate) / unit, power, drift, 1 / unit)
 
     def currents(self, gas: np.ndarray) -> np.ndarray:
-        """Currents at the nodes over the mean, one column a set; `gas` is ∫ P dt over the mean.
-
-        As of `closed_form`, W = ∫ exp(-c B) ds.
-        """
-        c = 1 + self.power
-        course = gas[:, None] + self.drift * (NODE**2 - NODE)[:, None] / 2
-        lost = (1 - self.share) * self.rate * course
-        whole = INTEGRAL @ np.exp(np.clip(-c * lost, -700, 700))
-        # Where a loss that is no beam's would have ended the record the law has no value.
-        inside = c * self.share * self.rate * self.level**c
-        least = (1e-3 - 1) / np.where(inside == 0, 1.0, inside)
-        whole = np.where(inside * whole < 1e-3 - 1, least, whole)
-        return closed_form(self.level, self.share * self.rate, self.power, lost, whole, np)
+        """Currents at the nodes over the mean, one column a set; `gas` is ∫ P dt over the mean."""
+        parts = self.share * self.rate, (1 - self.share) * self.rate
+        return node_currents(self.level, *parts, self.power, self.drift, gas)
 
 
-def log_prior(power: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def node_currents(level, quadratic, linear, power, drift, gas, xp=np):
+    """Currents at the nodes over the mean, (14, m), as of `closed_form` with W = ∫ exp(-c B) ds."""
+    c = 1 + power
+    course = gas[:, None] + drift * (NODE**2 - NODE)[:, None] / 2
+    lost = linear * course
+    whole = INTEGRAL @ xp.exp(xp.clip(-c * lost, -700, 700))
+    # Where a loss that is no beam's would have ended the record the law has no value.
+    inside = c * quadratic * level**c
+    least = (1e-3 - 1) / xp.where(inside == 0, 1.0, inside)
+    whole = xp.where(inside * whole < 1e-3 - 1, least, whole)
+    return closed_form(level, quadratic, power, lost, whole, xp)
+
+
+def log_prior(power, xp=np):
     """Log density of exponents, and of its flat part alone."""
-    width = np.where(power < 0, BELOW, ABOVE)
-    usual = np.exp(-0.5 * (power / width) ** 2) / (np.sqrt(np.pi / 2) * (BELOW + ABOVE))
-    odd = np.full_like(usual, ODD / (MOST - LEAST))
-    return np.log((1 - ODD) * usual + odd), np.log(odd)
+    width = xp.where(power < 0, BELOW, ABOVE)
+    usual = xp.exp(-0.5 * (power / width) ** 2) / (np.sqrt(np.pi / 2) * (BELOW + ABOVE))
+    odd = ODD / (MOST - LEAST)
+    return xp.log((1 - ODD) * usual + odd), np.log(odd)
 
 
 @dataclass(frozen=True)
@@ -180,6 +191,11 @@ class SeenDecay:
         rows = rows if error is None else rows * (mean / error)[:, None]
         products = Products.of(rows, time, error is not None)
         return cls(products, start, origin, gas, ends, record.gauge is None)
+
+    @property
+    def middle(self) -> float:
+        """When the current is its mean, over the span: the drift has gone so far by then."""
+        return float(np.interp(-1.0, -self.origin[:, 0], NODE))
 
     def of_noises(self, kept: np.ndarray) -> SeenDecay:
         """The same with some of the noises."""
@@ -333,19 +349,23 @@ class Draws(NamedTuple):
     worth: float
 
 
+def peaks_of(seen: SeenDecay, free: list[int]) -> tuple[SeenDecay, Peaks]:
+    """Approximate the posterior of some of the numbers by normal distributions."""
+    if 3 in free:
+        return _by_exponent(seen, free[:3] + free[4:])
+    return _searched(seen, seen.start, free)
+
+
 def drawn(seen: SeenDecay, free: list[int]) -> Draws:
     """Draw the free numbers from their posterior; more of them where they are worth too few."""
-    if 3 in free:
-        seen, peaks = _by_exponent(seen, free[:3] + free[4:])
-    else:
-        seen, peaks = _searched(seen, seen.start, free)
-    found = _drawn(seen, peaks, DRAWS[0])
-    return found if found.worth >= WORTH else _drawn(seen, peaks, DRAWS[1])
+    seen, peaks = peaks_of(seen, free)
+    found = weighed(seen, peaks, DRAWS[0])
+    return found if found.worth >= WORTH else weighed(seen, peaks, DRAWS[1])
 
 
-def _drawn(seen: SeenDecay, peaks: Peaks, draws: int) -> Draws:
+def weighed(seen: SeenDecay, peaks: Peaks, draws: int, seed: int = 0) -> Draws:
     """Draw from normal approximations, Student's tails, each draw weighed by the posterior."""
-    rng, free = np.random.default_rng(0), [0, 1, 2, 4][: peaks.centre.shape[2]]
+    rng, free = np.random.default_rng(seed), [0, 1, 2, 4][: peaks.centre.shape[2]]
     odds = np.exp(peaks.log - peaks.log.max()).ravel()
     ends = np.cumsum(odds) / odds.sum()
     which = np.minimum(np.searchsorted(ends, (np.arange(draws) + 0.5) / draws), odds.size - 1)
@@ -396,29 +416,18 @@ def quantiles(values: np.ndarray, weight: np.ndarray, at: np.ndarray) -> np.ndar
     return np.interp(at, below, values[order])
 
 
-class Span(NamedTuple):
-    """Median, half of the central 68 %, and the interval of 95 % of one quantity."""
-
-    median: float
-    error: float
-    interval: tuple[float, float]
-
-    @classmethod
-    def of(
-        cls, values: np.ndarray, weight: np.ndarray, bounds: tuple[bool, bool] = (False, False)
-    ) -> Span:
-        """From draws; where a bound below or above is not excluded the interval reaches to it."""
-        ends = {(False, False): (0.025, 0.975), (True, False): (0.0, 0.95)}
-        ends |= {(False, True): (0.05, 0.999), (True, True): (0.0, 0.999)}
-        at = np.array([0.5, 0.1587, 0.8413, *ends[bounds]])
-        middle, less, more, low, high = map(float, quantiles(values, weight, at))
-        return cls(middle, (more - less) / 2, (0.0 if bounds[0] else low, high))
-
-    def beside(self, value: float, moved: float) -> tuple[float, tuple[float, float]]:
-        """Error and interval about a value with a further, independent error."""
-        reaches = (np.hypot(value - self.interval[0], 1.96 * moved),
-                   np.hypot(self.interval[1] - value, 1.96 * moved))  # fmt: skip
-        return float(np.hypot(self.error, moved)), (value - reaches[0], value + reaches[1])
+def quantity_of(
+    values: np.ndarray, weight: np.ndarray, unit: str, bounds: tuple[bool, bool] = (False, False)
+) -> Quantity:
+    """Median, half of the central 68 % and the 95 % of weighted draws; where a bound below or above
+    is not excluded the interval reaches to it.
+    """
+    ends = {(False, False): (0.025, 0.975), (True, False): (0.0, 0.95)}
+    ends |= {(False, True): (0.05, 0.999), (True, True): (0.0, 0.999)}
+    at = np.array([0.5, 0.1587, 0.8413, *ends[bounds]])
+    middle, less, more, low, high = map(float, quantiles(values, weight, at))
+    interval = 0.0 if bounds[0] else low, high
+    return Quantity(middle, (more - less) / 2, unit, None, interval)
 
 
 @dataclass(frozen=True)
@@ -427,9 +436,8 @@ class FreeLaw:
 
     Parameters
     ----------
-    spans : mapping of str to Span
-        Of I0, a, b and the lifetimes at the start, the end and the mean current, in mA, 1/(mA s),
-        1/s and h.
+    quantities : mapping of str to Quantity
+        I0, a, b and the lifetimes at the start, the end and the mean current.
     exponent : Quantity
         g in a(I) proportional to I^g, with its prior.
     drift : Quantity or None
@@ -440,7 +448,7 @@ class FreeLaw:
         Probability that the exponent is none of a bunch's length.
     """
 
-    spans: Mapping[str, Span]
+    quantities: Mapping[str, Quantity]
     exponent: Quantity
     drift: Quantity | None
     constant: float
@@ -490,7 +498,8 @@ def free_law(record: DecayRecord, values: Physical) -> FreeLaw | None:
     >>> noise = 1e-2 * np.random.default_rng(1).normal(size=100)
     >>> record = DecayRecord(t, 100.0 / (1.0 + 100.0 * 1e-7 * t) + noise)
     >>> found = free_law(record, solved(Pieces.of(record)).values)
-    >>> found.spans["a"].interval[0] < 1e-7 <= found.spans["a"].interval[1]
+    >>> low, high = found.quantities["a"].interval_95
+    >>> low < 1e-7 <= high
     True
     """
     seen = SeenDecay.of(record, values)
@@ -505,30 +514,33 @@ def free_law(record: DecayRecord, values: Physical) -> FreeLaw | None:
     usual, odd = log_prior(draws.numbers.power)
     bounds = _at_bounds(draws.numbers.share, draws.weight)
     ends = {"a": bounds, "b": bounds[::-1]}
-    spans = {
-        n: Span.of(v, draws.weight, ends.get(n, (False, False)))
-        for n, v in _quoted(record, seen, draws.numbers).items()
+    found = {
+        name: quantity_of(values, draws.weight, UNITS[name], ends.get(name, (False, False)))
+        for name, values in _quoted(record, seen, draws.numbers).items()
     }
-    power, drift = (Span.of(v, draws.weight) for v in (draws.numbers.power, draws.numbers.drift))
+    power, drift = (quantity_of(values, draws.weight, "1") for values in draws.numbers[3:5])
     return FreeLaw(
-        spans, Quantity(power.median, power.error, "1", None, power.interval),
-        Quantity(drift.median, drift.error, "1", None, drift.interval) if seen.drifts else None,
+        found, power, drift if seen.drifts else None,
         float(1 / (1 + np.exp(draws.log - plain.log))), float(draws.weight @ np.exp(odd - usual)),
     )  # fmt: skip
+
+
+def rates_of(a, b, power, drift, x, seen: SeenDecay):
+    """Loss rates at the first and last reading and at the mean current, where x are the currents at
+    the nodes; in the unit of b, and of a at the mean current.
+    """
+    first, last = (
+        a * x[k] ** (1 + power) + b * pressure * (1 + drift * (NODE[k] - 0.5))
+        for k, pressure in zip((0, -1), seen.ends, strict=True)
+    )
+    return first, last, a + b * (1 + drift * (seen.middle - 0.5))
 
 
 def _quoted(record: DecayRecord, seen: SeenDecay, found: Numbers) -> dict[str, np.ndarray]:
     """Quoted quantities, by draw."""
     span, mean = record.span, float(record.current.mean())
-    x = found.currents(seen.gas)
-    # Where the current is its mean: the drift has gone so far by then.
-    middle = float(np.interp(-1.0, -seen.origin[:, 0], NODE)) - 0.5
-    gas = {"start": (-0.5, seen.ends[0]), "end": (0.5, seen.ends[1]), "mean": (middle, 1.0)}
-    beam = {"start": x[0], "end": x[-1], "mean": np.ones_like(found.level)}
     a, b = found.share * found.rate, (1 - found.share) * found.rate
-    rates = {
-        at: a * beam[at] ** (1 + found.power) + b * pressure * (1 + found.drift * s)
-        for at, (s, pressure) in gas.items()
-    }
+    rates = rates_of(a, b, found.power, found.drift, found.currents(seen.gas), seen)
     quoted = {"i0": found.level * mean, "a": a / mean / span, "b": b / span}
-    return quoted | {f"lifetime_{at}": span / rate / HOUR for at, rate in rates.items()}
+    ends = zip(("start", "end", "mean"), rates, strict=True)
+    return quoted | {f"lifetime_{at}": span / rate / HOUR for at, rate in ends}

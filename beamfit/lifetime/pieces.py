@@ -316,12 +316,10 @@ def split_record(record: DecayRecord) -> Split:
 
 # Readings beyond which neighbours are averaged.
 MOST_READINGS = 1 << 16
-# Robust standard deviations off the median of its block that a reading may lie.
-OUTLIER = 10.0
 # Repeats are of a monitor slower than its archive if half of the readings are, and nearly all come
 # by equal numbers, or what changes, changes by more than so many digits. Runs so much longer than
 # usual are of a monitor that stands.
-EQUAL, DIGITS, STANDS, FEWEST_EDGES = 0.95, 3.0, 5, 8
+EQUAL, DIGITS, STANDS = 0.95, 3.0, 5
 # Readings that a step of a staircase lasts at least, and by how much of a digit steps may differ.
 STAIR, ROUNDING = 3, 1e-6
 
@@ -334,7 +332,7 @@ def without_repeats(record: DecayRecord) -> DecayRecord:
     first = np.flatnonzero(fresh)
     runs = np.diff(first, append=fresh.size)
     usual = int(np.median(runs))
-    if not FEWEST_EDGES <= first.size <= len(record) / 2 or usual < 2:
+    if not FEWEST <= first.size <= len(record) / 2 or usual < 2:
         return record
     change = float(np.median(np.abs(np.diff(record.current[first]))))
     kept = fresh | np.repeat(runs > STANDS * usual, runs)
@@ -374,7 +372,7 @@ def on_edges(record: DecayRecord) -> DecayRecord:
     """
     digit, change = record.resolution, np.diff(record.current)
     edge = np.flatnonzero(change)
-    if digit is None or record.error is not None or edge.size < FEWEST_EDGES:
+    if digit is None or record.error is not None or edge.size < FEWEST:
         return record
     single = np.abs(change[edge] + digit) < ROUNDING * digit
     if not single.all() or np.median(np.diff(edge)) < STAIR:
@@ -425,8 +423,8 @@ def thinned(record: DecayRecord) -> DecayRecord:
     off = np.abs(blocks - np.median(blocks, axis=1, keepdims=True))
     spread = 1.4826 * np.median(off, axis=1)
     kept = np.ones(len(record), bool)
-    limit = OUTLIER * max(float(np.median(spread)), record.resolution or 0.0)
-    kept[:whole] = (off <= np.maximum(OUTLIER * spread, limit)[:, None]).ravel()
+    limit = THRESHOLD * max(float(np.median(spread)), record.resolution or 0.0)
+    kept[:whole] = (off <= np.maximum(THRESHOLD * spread, limit)[:, None]).ravel()
     count = np.maximum(np.add.reduceat(kept.astype(int), first), 1)
 
     def mean(values: np.ndarray) -> np.ndarray:

@@ -1,12 +1,13 @@
-"""The posterior of a decay: I0, a and b, none of them negative."""
+"""The posterior of a decay, by the draws of the fit: I0, a, b, exponent and drift of b."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
-from dataclasses import replace
-from typing import NamedTuple
+from contextlib import nullcontext
+from os import PathLike
+from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -25,317 +26,314 @@ from beamfit.noise.correlated import (
     log_volume,
     whitened,
     whitened_of_both,
+from beamfit.lifetime.decay_law import Moments, beam_current
+from beamfit.lifetime.marginal import (
+    DRIFT,
+    LEAST,
+    MOST,
+    Draws,
+    Peaks,
+    SeenDecay,
+    log_prior,
+    node_currents,
+    peaks_of,
+    rates_of,
+    weighed,
 )
+from beamfit.noise.memory import WHITE, MemoryKind
 from beamfit.quantity import HOUR
 from beamfit.sampling.posterior import Expected, Posterior
 from beamfit.sampling.priors import Distribution
 from beamfit.sampling.target import SamplingTarget
 from beamfit.verdict import Finding
+from beamfit.sampling import store as disk
+from beamfit.sampling.convergence import RULES, ChainEvidence, diagnose, held_by_priors
+from beamfit.sampling.ensemble import draw
+from beamfit.sampling.posterior import Expected
+from beamfit.sampling.likelihood import NoiseGroup
+from beamfit.sampling.posterior import Posterior
+from beamfit.sampling.priors import Distribution, checked
+from beamfit.sampling.store import FROM_PYTHON, Checkpoint, Provenance
+from beamfit.sampling.target import PosteriorLaw, SamplingTarget
+from beamfit.verdict import Finding, judge
+from beamfit.writing import alone
 
-RECORD = "decay"
-UNITS = {"i0": "mA", "a": "1/(mA s)", "b": "1/s"}
-SAMPLED = UNITS | {"log_memory": "1", "log_wander": "1", "drift": "mA/s", "offset": "mA"}
-# A share of the noise below which it is rounding.
-ROUNDING = 1e-9
-# Variances that noise with a memory gets anew in a usual interval, over that of the white part,
-# beyond which one of the two would not be seen.
-LEAST_NEW, MOST_NEW = 1e-4, 10.0
-# The monitor is taken to be within so many of its stated errors.
-WIDEST = 8.0
-LIFETIMES = {"lifetime_start": "h", "lifetime_mean": "h", "lifetime_end": "h"}
+UNITS = {"i0": "mA", "a": "1/(mA s)", "b": "1/s", "exponent": "1", "drift": "1"}
+BOUNDS = {"i0": (0.0, np.inf), "a": (0.0, np.inf), "b": (0.0, np.inf), "exponent": (LEAST, MOST)}
+LIFETIMES = {"lifetime_start": "h", "lifetime_end": "h", "lifetime_mean": "h"}
+STATED = {"exponent": "normal about 0, 0.3 below and 0.2 above", "drift": f"normal, 0 ± {DRIFT}"}
+# Chains, and steps of each at first and at most: the fewer chains, the less R-hat has of chance.
+WALKERS, STEPS, BUDGET = 16, 1024, 16384
 
 
 class DecayNumbers(NamedTuple):
-    """Current at the first reading, mA, and a, 1/(mA s), and b, 1/s, of dI/dt = -a I² - b I.
+    """Numbers of dI/dt = -a I² (I/mean)^exponent - b (1 + drift (t/span - 1/2)) I.
 
-    `log_memory` is the logarithm of the correlation time of the readings' errors, s, and
-    `log_wander` that of the variance that they get anew in a usual interval over that of their
-    white part; `drift`, mA/s, and `offset`, mA, are the monitor's.
+    Current at the first reading, mA, a, 1/(mA s), and b, 1/s.
     """
 
     i0: Array
     a: Array
     b: Array
-    log_memory: Array = 0.0
-    log_wander: Array = 0.0
+    exponent: Array = 0.0
     drift: Array = 0.0
-    offset: Array = 0.0
 
 
-class Readings(NamedTuple):
-    """Times, s, the mean current, mA, and the integral of the pressure as of `Moments`."""
-
-    time: Array
-    mean: Array
-    gas: Array | None = None
-
-
-def monitored_current(numbers: DecayNumbers, at: Readings) -> Array:
-    """Current that a monitor with a drift and an offset reads, mA."""
-    quadratic = numbers.a * at.mean
-    law = jnp.stack([quadratic + numbers.b, quadratic, 0.0])
-    beam = beam_current(numbers.i0 / at.mean, law, Moments(at.time, at.gas))
-    return at.mean * beam + numbers.offset + numbers.drift * at.time
-
-
-def apart(model: DecayNumbers, at: Readings) -> Array:
-    """Time between neighbouring readings over the correlation time of their errors."""
-    return jnp.diff(at.time) * jnp.exp(-model.log_memory)
-
-
-def decay_problem(record: DecayRecord, memory: float | None = None) -> Problem:
-    """State the fit of a decay: I0, a and b free, one record.
-
-    Parameters
-    ----------
-    record : DecayRecord
-        The readings.
-    memory : float, optional
-        Correlation time of the errors, s.
-
-    Returns
-    -------
-    Problem
-        Whose solution `fit_decay` finds faster.
-
-    Examples
-    --------
-    >>> from beamfit.greybox.solve import solve
-    >>> t = np.linspace(0, 36000, 50)
-    >>> fit = solve(decay_problem(DecayRecord(t, 500 / (1 + 500 * 2e-8 * t))))
-    >>> print(f"{fit['a'].value:.3e}")
-    2.000e-08
+class _Data(NamedTuple):
+    """Readings as of `SeenDecay`, mean current, mA, and span, s; shifts of I0, a and b by what is
+    stated of the monitor, shape (k, 3).
     """
-    found, mean = solved(Pieces.of(record)).values, float(record.current.mean())
-    numbers = DecayNumbers(*map(float, found[:3]))
-    at = Readings(record.time, mean, record.gauge)
-    readings = Record(RECORD, monitored_current, at, record.current, record.error)
-    if memory is not None:
-        numbers = numbers._replace(log_memory=math.log(memory))
-        readings = replace(readings, apart=apart)
-    return Problem(numbers, [Free("i0"), Free("a"), Free("b")], [readings])
+
+    matrix: Array
+    log_prior: Array
+    count: Array
+    known: Array
+    origin: Array
+    gas: Array
+    ends: Array
+    middle: Array
+    mean: Array
+    span: Array
+    moved: Array
 
 
-def _lifetimes(numbers: DecayNumbers, at: tuple[Array, Array]) -> Array:
-    """Lifetime at the first reading, at the mean current and at the last reading, h."""
-    mean, last, _ = at
-    levels = jnp.stack([numbers.i0, mean, current(last, numbers.i0, numbers.a, numbers.b)])
-    return 1.0 / (numbers.a * levels + numbers.b) / HOUR
+def _numbers(data: _Data, theta: Array) -> DecayNumbers:
+    """Numbers that the monitor shows; theta ends with how far that is off, in stated errors."""
+    more = data.moved.shape[0]
+    own, shifts = theta[: theta.size - more], theta[theta.size - more :]
+    i0, a, b = own[:3]
+    shifted = jnp.stack([i0, a, b]) - shifts @ data.moved
+    exponent, drift = (own[k] if k < own.size else 0.0 for k in (3, 4))
+    return DecayNumbers(*shifted, exponent, drift)
 
 
-def decay_target(
+def _nodes(data: _Data, numbers: DecayNumbers) -> Array:
+    quadratic, linear = numbers.a * data.mean * data.span, numbers.b * data.span
+    given = numbers.i0 / data.mean, quadratic, linear, numbers.exponent, numbers.drift
+    return node_currents(*given, data.gas, jnp)
+
+
+def _log_density(data: _Data, theta: Array) -> Array:
+    """Log posterior, the noise averaged over: flat in I0, loss rate and share of a."""
+    numbers = _numbers(data, theta)
+    away = jnp.append(-1.0, _nodes(data, numbers)[:, 0] - data.origin)
+    squares = jnp.maximum(jnp.einsum("p,kpq,q->k", away, data.matrix, away), 1e-30)
+    noises = data.log_prior - 0.5 * (data.count + data.known) * jnp.log(data.known + squares)
+    rate = numbers.a * data.mean + numbers.b
+    law = log_prior(numbers.exponent, jnp)[0] - 0.5 * (numbers.drift / DRIFT) ** 2
+    shifts = theta[theta.size - data.moved.shape[0] :]
+    inside = (numbers.a >= 0) & (numbers.b >= 0)
+    log = jax.scipy.special.logsumexp(noises) + law - jnp.log(rate) - 0.5 * jnp.sum(shifts**2)
+    return jnp.where(inside, log, -jnp.inf)
+
+
+def _derived(data: _Data, theta: Array) -> Array:
+    """Lifetimes at the first and last reading and at the mean current, h."""
+    i0, a, b, power, drift = DecayNumbers(*theta[:3], *_numbers(data, theta)[3:])
+    x = _nodes(data, DecayNumbers(i0, a, b, power, drift))[:, 0]
+    return 1.0 / HOUR / jnp.stack(rates_of(a * data.mean, b, power, drift, x, data))
+
+
+def _no_residual(data: _Data, theta: Array) -> tuple[Array]:
+    return (jnp.zeros(0),)
+
+
+def _built(data: _Data, theta: Array) -> DecayNumbers:
+    return DecayNumbers(*theta[:3], *_numbers(data, theta)[3:])
+
+
+DENSITY = PosteriorLaw(_no_residual, _log_density, _derived, _built)
+
+
+class _Prepared(NamedTuple):
+    """A fit made ready: its normal approximations, and shifts of I0, a and b by the monitor."""
+
+    fit: Any
+    seen: SeenDecay
+    peaks: Peaks
+    moved: np.ndarray
+
+    @classmethod
+    def of(cls, fit) -> _Prepared:
+        """With the law of the fit, and where a and b are constant its noise."""
+        about, free = fit.about, [0, 1, 2]
+        seen = SeenDecay.of(fit.readings, about.values)
+        if fit.free_law is not None:
+            free = [0, 1, 2, 3, 4] if seen.drifts else [0, 1, 2, 3]
+        elif fit.correlation_time is None:
+            white = [kind == MemoryKind(WHITE) for kind in seen.products.kinds]
+            seen = seen.of_noises(np.array(white))
+        moved = [about.moved(change)[:3] for change in about.pieces.monitor_changes]
+        return cls(fit, *peaks_of(seen, free), np.reshape(moved, (-1, 3)))
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Numbers that are drawn."""
+        law = self.peaks.centre.shape[2] + (self.peaks.log.shape[1] > 1)
+        return *list(UNITS)[:law], *(f"monitor_{k + 1}" for k in range(len(self.moved)))
+
+    def thetas(self, draws: Draws, rng: np.random.Generator) -> np.ndarray:
+        """Draws as numbers of the target."""
+        found, span, mean = draws.numbers, self.fit.readings.span, self.fit.readings.current.mean()
+        a, b = found.share * found.rate / mean / span, (1 - found.share) * found.rate / span
+        own = np.column_stack([found.level * mean, a, b, found.power, found.drift])
+        shifts = rng.normal(size=(len(own), len(self.moved)))
+        own[:, :3] += shifts @ self.moved
+        return np.hstack([own[:, : len(self.names) - len(self.moved)], shifts])
+
+    def target(self, priors: Mapping[str, Distribution]) -> SamplingTarget:
+        """State the posterior."""
+        fit, seen, draws = self.fit, self.seen, weighed(self.seen, self.peaks, STEPS * WALKERS)
+        record, thetas = fit.readings, self.thetas(draws, np.random.default_rng(0))
+        products, count = seen.products, len(self.names)
+        data = _Data(
+            products.matrix, products.log_prior, products.count, products.known,
+            seen.origin[:, 0], seen.gas, np.array(seen.ends), seen.middle,
+            record.current.mean(), record.span, self.moved,
+        )  # fmt: skip
+        lower, upper = np.array([BOUNDS.get(name, (-np.inf, np.inf)) for name in self.names]).T
+        told = fit.identifiability.separable or {"a", "b"} & set(priors)
+        return SamplingTarget(
+            DENSITY, data, self.names, tuple(UNITS.get(name, "1") for name in self.names),
+            lower, upper, thetas[np.argmax(draws.weight)],
+            np.cov(thetas.T, aweights=draws.weight).reshape(count, count),
+            groups=(NoiseGroup("", "averaged"),), priors=checked(priors, self.names),
+            derived=LIFETIMES, observed=_observed(fit), priors_own=() if told else ("a", "b"),
+            verdict=Finding(fit.status, fit.message), hidden=self.names[count - len(self.moved):],
+            stated={name: STATED[name] for name in self.names if name in STATED},
+        )  # fmt: skip
+
+
+def _observed(fit) -> dict[str, np.ndarray]:
+    error = fit.readings.error
+    found = {"decay measured": fit.readings.current}
+    return found if error is None else found | {"decay error": error}
+
+
+def sampled(
     fit,
-    noise: str | None = None,
-    outliers: bool = False,
     priors: Mapping[str, Distribution] | None = None,
-) -> SamplingTarget:
-    """State the posterior of a fitted decay.
+    *,
+    seed: int = 0,
+    target_ess: float = 4000.0,
+    store: str | PathLike[str] | None = None,
+    provenance: Provenance = FROM_PYTHON,
+    progress: bool = False,
+) -> Posterior:
+    """Draw from the posterior that a fit quotes.
 
     Parameters
     ----------
     fit : DecayFit
         The fit, with its readings.
-    noise, outliers, priors
-        As of `beamfit.greybox.posterior.target_of`; priors on i0, a, b.
+    priors : mapping of str to distribution, optional
+        In addition to the fit's own.
+    seed, target_ess, store, provenance, progress
+        As of `beamfit.sampling.ensemble.draw`; a decay takes a second, and shows no progress.
 
     Returns
     -------
-    SamplingTarget
-        Lifetimes are its derived numbers.
+    Posterior
 
     Raises
     ------
     InputError
-        If the fit has no readings or another law than a constant a, or as `target_of`.
+        If the fit has no readings or a shape of a, or as `draw`.
 
     Notes
     -----
-    Errors that are correlated are so in the likelihood, and the correlation time is sampled too,
-    flat in its logarithm as in `beamfit.greybox.memory.memory_of` but only up to the length of
-    the record: in a longer memory i0 loses its hold, and a walk its way, for nothing of a and b.
-    The white part beside, where there is one, is sampled by the variance that the rest gets anew
-    over the white, flat in its logarithm: the record tells that whatever the correlation time.
-
-    Where the record does not tell a from b, the two bounds a ≥ 0 and b ≥ 0 make the posterior a
-    line across all shares of a in the loss. The lifetime at the mean current is then as well
-    determined as ever; a and b are marked as the bounds'.
+    Chains of independent proposals, the weighed draws of `beamfit.lifetime.marginal`, each taken or
+    left by Metropolis and Hastings; they begin with draws by weight, so that no step is left out.
     """
-    record = fit.readings
-    if record is None:
+    if fit.readings is None:
         raise InputError("a fit without its readings", "the result of fit_decay or fit_decays")
     if fit.shaped:
         expected = "a fit of eq. 44 with constant a and b; sample fit_decay(record) without shape"
         raise InputError("a fit with a shape of a(I), which is not sampled", expected)
-    problem, monitor = _with_monitor(decay_problem(record, memory=fit.correlation_time), record)
-    theta, rate = _start(fit, record)
-    theta = np.append(theta, np.zeros(len(monitor)))
-    scale = fit.noise if record.error is None else max(1.0, np.sqrt(fit.chi2 / fit.dof))
-    if fit.correlation_time is not None:
-        inferred = noise == "inferred" or (noise is None and (record.error is None or scale > 1))
-        remembered = _noise_of(fit)
-        problem = _with_memory(problem, fit, remembered, inferred)
-        theta = np.append(theta, np.log(remembered.time))
-        theta = np.append(theta, log_wander(remembered, record)) if remembered.white else theta
-    stated = _statement(fit, problem, monitor, rate, priors or {})
-    verdict, given = Finding(fit.status, fit.message), [record.error is not None]
-    optimum = Optimum(theta, verdict, [max(scale, 1e-12)], given)
-    return target_of(problem, optimum, stated, noise=noise, outliers=outliers, priors=priors)
+    if not 0 <= seed < 2**32 or not target_ess > 0:
+        expected = "a whole number from 0 to 4294967295, and draws above zero"
+        raise InputError(f"seed {seed!r}, {target_ess} draws", expected)
+    if not fit.rms_residual > 0 and fit.readings.error is None:
+        said = f"the readings show neither decay nor noise; {fit.message}".rstrip(".")
+        ends = np.zeros(3), np.full(3, np.inf)
+        names = tuple(UNITS)[:3], tuple(UNITS.values())[:3]
+        given = DENSITY, np.zeros(0), *names, *ends, np.zeros(3), np.eye(3)
+        return draw(SamplingTarget(*given, open_directions=said), seed=seed)
+    ready = _Prepared.of(fit)
+    target = ready.target(priors or {})
+    with nullcontext() if store is None else alone(store):
+        if store is not None:
+            disk.load(store, target, seed, WALKERS)
+        posterior = _chains(ready, target, seed, target_ess)
+        if store is not None and not disk.finished(store):
+            random = np.random.RandomState(seed).get_state()
+            chain = posterior.chain, posterior.log_prob
+            state = Checkpoint(*chain, random, 1.0, 0, True, seed)
+            disk.save(store, target, state, provenance, posterior.to_json())
+    return posterior
 
 
-def _statement(
-    fit, problem: Problem, monitor: dict[str, float], rate: float, priors: Mapping[str, object]
-) -> Statement:
-    """Units, bounds, widths and derived numbers of the posterior."""
-    record, memory = fit.readings, fit.correlation_time is not None
-    nothing = f"the readings show neither decay nor noise; {fit.message}".rstrip(".")
-    seen = fit.rms_residual > 0 or record.error is not None
-    # A prior on one of the two tells them apart, if anything does.
-    told = fit.identifiability.separable or {"a", "b"} & set(priors)
-    widths = {"a": rate / fit.mean_current, "b": rate, "log_memory": 1.0, "log_wander": 1.0}
-    return Statement(
-        derived=LIFETIMES,
-        derive=_lifetimes,
-        data=(fit.mean_current, record.time[-1], problem.records[0].data),
-        units=SAMPLED,
-        lower=dict.fromkeys(UNITS, 0.0),
-        width=widths | monitor,
-        noise_unit="mA",
-        priors_own=() if told else ("a", "b"),
-        nothing="" if seen else nothing,
-        **{"log_volume": _log_volume, "along": "log_memory"} if memory else {},
-    )
+def _chains(ready: _Prepared, target: SamplingTarget, seed: int, target_ess: float) -> Posterior:
+    """Chains that grow until they are worth the draws that are wanted."""
+    steps = STEPS
+    while True:
+        rng = np.random.default_rng(seed)
+        draws = weighed(ready.seen, ready.peaks, steps * WALKERS, seed)
+        thetas, weight = ready.thetas(draws, rng), draws.weight
+        weight = weight * ((thetas >= target.lower) & (thetas <= target.upper)).all(axis=1)
+        for name, prior in target.priors.items():
+            weight = weight * np.exp(prior.logpdf(thetas[:, target.names.index(name)]))
+        if not weight.sum() > 0:
+            raise InputError("priors that leave no draw", "priors nearer to what the record shows")
+        place, acceptance = _taken(weight / weight.sum(), rng)
+        chain = thetas[place]
+        found = diagnose(chain)
+        if (found.settled and min(found.effective) >= target_ess) or 2 * steps > BUDGET:
+            break
+        steps *= 2
+    held = held_by_priors(target, chain.reshape(-1, chain.shape[2]))
+    held = tuple(dict.fromkeys((*target.priors_own, *held)))
+    shown = tuple(name for name in held if name not in target.hidden)
+    verdict = judge(ChainEvidence(found, target, target_ess, steps, shown), RULES)
+    said = f"{min(found.effective):.0f} effective draws (R-hat {max(found.rhat):.3f})."
+    log = target.log_probability(chain.reshape(-1, chain.shape[2])).reshape(place.shape)
+    return Posterior(target, chain, log, verdict.status, f"{verdict.message} {said}", found,
+                     acceptance, 0, seed, held)  # fmt: skip
 
 
-def _with_monitor(problem: Problem, record: DecayRecord) -> tuple[Problem, dict[str, float]]:
-    """The problem with what is stated of the monitor as numbers of a prior, and their sizes."""
-    stated = {} if record.monitor is None else record.monitor._asdict()
-    units = {"drift": HOUR, "offset": 1.0}
-    size = {name: value / units[name] for name, value in stated.items() if value > 0}
-    if not size:
-        return problem, size
-    free = [Free(name, -WIDEST * sd, WIDEST * sd, nuisance=True) for name, sd in size.items()]
-    priors = [Prior(name, 0.0, sd) for name, sd in size.items()]
-    return replace(problem, free=[*problem.free, *free], priors=priors), size
+def _taken(weight: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, float]:
+    """Places of the draws in each chain, (steps, walkers), and the share of those taken."""
+    proposed = rng.permutation(weight.size).reshape(-1, WALKERS)
+    least = rng.uniform(size=proposed.shape)
+    place = proposed.copy()
+    place[0] = rng.choice(weight.size, WALKERS, p=weight)
+    for k in range(1, len(place)):
+        taken = weight[proposed[k]] > least[k] * weight[place[k - 1]]
+        place[k] = np.where(taken, proposed[k], place[k - 1])
+    return place, float(np.mean(place[1:] == proposed[1:]))
 
 
-class Remembered(NamedTuple):
-    """Data of whitened residuals: when, what was read, its error, the usual interval, the
-    logarithm of what was new in it by the fitted noise, or NaN where the errors are known, and the
-    fitted share without a memory, None where there is none.
-    """
-
-    at: Readings
-    measured: Array
-    error: Array
-    usual: Array
-    quoted: Array
-    white: Array | None
-
-
-def _noise_of(fit) -> CorrelatedNoise:
-    """Correlation time of a fit's errors, and the share without, by how neighbours are alike."""
-    usual = np.median(np.diff(fit.readings.time)) / fit.correlation_time
-    white = 1.0 - fit.identifiability.residual_correlation * np.exp(usual)
-    return CorrelatedNoise(fit.correlation_time, float(white) if white > ROUNDING else 0.0)
-
-
-def _with_memory(problem: Problem, fit, noise: CorrelatedNoise, inferred: bool) -> Problem:
-    """The problem with the correlation time free, and residuals of independent errors.
-
-    An unknown noise is sampled by what is new in a usual interval, which a record tells well
-    whatever the memory, and quoted as the whole noise at the fitted memory; beside a white part,
-    where the record does not show how far the rest wanders, as the scatter of the residuals.
-    """
-    readings, record = problem.records[0], fit.readings
-    error = np.ones(1) if record.error is None else record.error
-    usual, white = np.median(np.diff(record.time)), noise.white or None
-    fresh = noise.white - (1.0 - noise.white) * np.expm1(-2 * usual / noise.time)
-    quoted = 0.5 * np.log(fresh) if inferred else np.nan
-    if noise.white:
-        over = fit.residuals / error
-        new, _ = whitened_of_both(over, np.diff(record.time), noise)
-        quoted += 0.5 * np.log((new @ new) / (over @ over))
-    data = Remembered(readings.data, readings.measured, error, usual, quoted, white)
-    own = Record(RECORD, _new, data, np.zeros(len(record)), None if record.error is None else 1.0)
-    lower, upper = np.log([range_of(record.time)[0], record.span])
-    free = [*problem.free, Free("log_memory", lower, upper)]
-    if noise.white:
-        free += [Free("log_wander", np.log(LEAST_NEW), np.log(MOST_NEW))]
-    return replace(problem, free=free, records=[own])
-
-
-def log_wander(noise: CorrelatedNoise, record: DecayRecord) -> float:
-    """Logarithm of the variance that is new in a usual interval over that of the white part."""
-    new = (1.0 - noise.white) * -np.expm1(-2 * np.median(np.diff(record.time)) / noise.time)
-    return float(np.log(np.clip(new / noise.white, LEAST_NEW, MOST_NEW)))
-
-
-def _parts(model: DecayNumbers, data: Remembered) -> tuple[Array, Array]:
-    """Variances of the white part and of the rest, over what the rest gets anew."""
-    white = 0.0 if data.white is None else jnp.exp(-model.log_wander)
-    return white, -1.0 / jnp.expm1(-2 * data.usual * jnp.exp(-model.log_memory))
-
-
-def _log_size(model: DecayNumbers, data: Remembered) -> Array:
-    """Logarithm of what whitened residuals are multiplied by."""
-    white, rest = _parts(model, data)
-    known, new = jnp.isnan(data.quoted), 0.5 * jnp.log((white + 1.0) / (white + rest))
-    return jnp.where(known, 0.0, new - jnp.where(known, new, data.quoted))
-
-
-def _whitened(model: DecayNumbers, data: Remembered) -> tuple[Array, Array]:
-    """Residuals as independent ones of the same size, and what that adds to the log density."""
-    rows = (monitored_current(model, data.at) - data.measured) / data.error
-    if data.white is None:
-        between = apart(model, data.at)
-        return whitened(rows, between), log_volume(between)
-    white, rest = _parts(model, data)
-    noise = CorrelatedNoise(jnp.exp(model.log_memory), white / (white + rest))
-    white, sizes = innovations(rows, jnp.asarray(data.at.time), noise)
-    return white, -sizes
-
-
-def _new(model: DecayNumbers, data: Remembered) -> Array:
-    return _whitened(model, data)[0] * jnp.exp(_log_size(model, data))
-
-
-def _log_volume(model: DecayNumbers, data: tuple[Array, Array, Remembered]) -> Array:
-    remembered = data[2]
-    volume = _whitened(model, remembered)[1]
-    return volume + remembered.measured.size * _log_size(model, remembered)
-
-
-def _start(fit, record: DecayRecord) -> tuple[np.ndarray, float]:
-    """Start values, a and b not negative, and the whole loss rate at the mean current, 1/s."""
-    mean = fit.mean_current
-    a, b = fit.if_constant("a").value, fit.if_constant("b").value
-    rate = a * mean + b
-    if not (np.isfinite(rate) and rate > 0):
-        rate = 1.0 / max(record.span, 1.0)
-    share = np.clip(np.nan_to_num(a * mean / rate, nan=0.5), 0.0, 1.0)
-    return np.array([fit.i0.value, share * rate / mean, (1.0 - share) * rate]), rate
-
-
-def _currents(data: Sampled, theta: Array) -> Array:
-    """Readings that one draw predicts."""
-    core = data.core
-    at = core.records[0].data
-    model = tree.replace(core.model, core.chosen, data.theta.at[data.moving].set(theta))
-    return monitored_current(model, at.at if isinstance(at, Remembered) else at)
-
-
-def expected_current(posterior: Posterior) -> Expected:
+def expected_current(posterior: Posterior, fit) -> Expected:
     """Currents that the posterior of a decay expects at its readings, mA.
 
     Parameters
     ----------
     posterior : Posterior
         Of `DecayFit.sample`.
+    fit : DecayFit
+        The fit.
     """
-    target = posterior.target
-    record = target.data.core.records[0]
-    error = np.ones(1) if record.error is None else np.asarray(record.error)
-    if isinstance(record.data, Remembered):
-        error = np.asarray(record.data.error)
-    draws = target.each(_currents, posterior.thinned())
-    return posterior.expected(draws, np.broadcast_to(error, draws.shape[1:]))
+    record, data = fit.readings, posterior.target.data
+    span, mean = record.span, float(data.mean)
+    at = Moments(record.time / span, None if record.gauge is None else record.gauge / span)
+    shown = posterior.target.each(lambda data, theta: jnp.stack(_numbers(data, theta)),
+                                  posterior.thinned())  # fmt: skip
+    draws = np.empty((len(shown), len(record)))
+    for row, (i0, a, b, power, drift) in zip(draws, shown, strict=True):
+        quadratic, linear = a * mean * span, b * span
+        law = quadratic + linear, quadratic, power, linear * drift, 0.0
+        row[:] = mean * beam_current(i0 / mean, law, at, "drift")
+    error = (
+        fit.noise if record.error is None else record.error * max(1, (fit.chi2 / fit.dof) ** 0.5)
+    )
+    return posterior.expected(draws, np.broadcast_to(error, record.time.shape))

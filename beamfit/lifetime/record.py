@@ -381,13 +381,6 @@ class DecayRecord:
             return None
         return self.integral(pressure / self.integral(pressure)[-1] * self.span)
 
-    @property
-    def monitor_changes(self) -> list[np.ndarray]:
-        """Changes of the readings by a stated instability of the monitor, over their errors."""
-        over = 1.0 if self.error is None else self.error
-        changes = {} if self.monitor is None else self.monitor.changes(self.time)
-        return [change / over for change in changes.values()]
-
     def integral(self, values: np.ndarray) -> np.ndarray:
         """Integral over time from the first reading on, by the trapezoidal rule.
 

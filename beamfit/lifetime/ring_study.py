@@ -22,13 +22,13 @@ from beamfit.lifetime.advice import (
     best_operating_point,
     next_decays,
 )
-from beamfit.lifetime.expansion import lifetime_of
+from beamfit.lifetime.alarm import BOTH
+from beamfit.lifetime.expansion import DETERMINED, lifetime_of
 from beamfit.lifetime.fit import bare
 from beamfit.lifetime.loss_network import Network, NetworkFit, fit_loss_network
 from beamfit.lifetime.mechanisms import MECHANISMS, scaled_losses, scaled_parts
 from beamfit.lifetime.ring import Operation
 from beamfit.lifetime.scales import (
-    SEPARABLE,
     ScaleFit,
     by_losses,
     fit_scales,
@@ -40,10 +40,9 @@ from beamfit.lifetime.study import Decay, Machine, operation_during, settings_js
 from beamfit.quantity import HOUR, Quantity, Status
 from beamfit.sampling.posterior import Interval, Posterior
 from beamfit.shown import shown
+from beamfit.statistics import POOR_FIT
 from beamfit.table import json_of
 
-# Chance of a false alarm in one call.
-FALSE_ALARM = 1e-3
 CAUSES = {
     "a": "the bunch or the momentum acceptance changed, or the beam-induced pressure",
     "b": "a gas loss that the gauge does not see: a leak away from it, heavier gas, aperture",
@@ -142,7 +141,7 @@ def find_anomaly(fit: ScaleFit, decays: Sequence[Decay]) -> Anomaly:
     chance = min(1.0, len(decays) * float(chdtrc(2, fall)))
     error = np.sqrt(np.diag(covariance))
     a, b = (Quantity(float(v), float(e), "1") for v, e in zip(found, error, strict=True))
-    if chance > FALSE_ALARM:
+    if chance > POOR_FIT:
         message = f"{len(decays)} decays follow the model (p = {chance:.2g})."
         return Anomaly(Status.converged, message, None, (), a, b, chance)
     moved, begun = _moved(off, since(best), fall), decays[best].fit.record
@@ -157,10 +156,10 @@ def find_anomaly(fit: ScaleFit, decays: Sequence[Decay]) -> Anomaly:
 
 
 def _moved(off: np.ndarray, change: np.ndarray, fall: float) -> tuple[str, ...]:
-    """Test if one of the two explains as much as both, within 10.8 of chi² (p = 1e-3)."""
+    """Test if one of the two explains as much as both, within `BOTH` of chi²."""
     alone = {name: _fitted(off, change[:, [k]])[0] for k, name in enumerate("ab")}
     best = max(alone, key=alone.get)
-    return (best,) if fall - alone[best] < 10.8 else ("a", "b")
+    return (best,) if fall - alone[best] < BOTH else ("a", "b")
 
 
 def budget_intervals(
@@ -449,7 +448,7 @@ def predict_held_back(fit: ScaleFit) -> tuple[HeldBack, ...]:
         reading = np.linalg.inv(root)[1]
         rate, error = measured.parts[k, 1], fit.error_scale * np.linalg.norm(reading)
         spread = np.sqrt(max(whole[1, 1] - error**2, 0.0))
-        if not spread < SEPARABLE * rate:
+        if not spread < DETERMINED * rate:
             continue
         found.append(
             HeldBack(

@@ -18,13 +18,11 @@ from beamfit.greybox.fit import Fit
 from beamfit.greybox.posterior import Optimum, Statement, target_of
 from beamfit.greybox.problem import Free, Prior, Problem, Record
 from beamfit.greybox.solve import solve
-from beamfit.lifetime.decay_law import current
-from beamfit.lifetime.expansion import padded_size
+from beamfit.lifetime.expansion import DETERMINED, LEVEL, LOSS, QUADRATIC, Expansion
 from beamfit.lifetime.fit import DecayFit
 from beamfit.lifetime.mechanisms import SCALES, LossTerms, loss_terms, scaled_losses
 from beamfit.lifetime.ring import Operation
 from beamfit.lifetime.study import Decay, Machine, operation_during
-from beamfit.lifetime.systematics import about_fit
 from beamfit.quantity import Quantity, Status
 from beamfit.shown import shown
 from beamfit.statistics import POOR_FIT, chi2_probability
@@ -67,47 +65,36 @@ def by_losses(quadratic: np.ndarray, linear: np.ndarray) -> np.ndarray:
     return np.moveaxis(rows, -1, 0)
 
 
-@jax.jit
-def information_root(
-    time: Array, weight: Array, i0: Array, parts: Array, mean_current: Array
-) -> Array:
-    """Root of the information that readings hold on the two parts, I0 eliminated; a triangle, s."""
+def information_root(about: Expansion, scale: float = 1.0) -> np.ndarray:
+    """Root of the information that readings hold on the two parts, I0 eliminated; a triangle, s.
 
-    def weighted(theta: Array) -> Array:
-        quadratic, rate = theta[1], theta[2]
-        law = current(time, theta[0], quadratic / mean_current, rate - quadratic)
-        return weight * law
-
-    jacobian = jax.jacfwd(weighted)(jnp.array([i0, parts[0], parts[1]]))
+    `scale` is the size of the errors of what residuals are divided by.
+    """
     # Columns in order of elimination: the last two rows of R hold what is left beside I0.
-    return jnp.linalg.qr(jacobian, mode="r")[1:, 1:]
+    rows = about.rows[:, [LEVEL, QUADRATIC, LOSS]] * (about.pieces.units[0] / scale)
+    return np.linalg.qr(rows, mode="r")[1:, 1:]
 
 
 def _root(decay: Decay, parts: np.ndarray) -> np.ndarray:
     """The information that a decay holds on its parts, as of `Summaries`."""
-    segment, fit, rows = decay.segment, decay.fit, len(decay.segment)
+    fit = decay.fit
     if fit.first is not None:
         return _together(fit, parts[1])
-    if fit.noise_inferred:
-        error = np.full(rows, fit.noise)
-    else:
-        pulls = fit.residuals / segment.error
-        error = segment.error * max(1.0, np.sqrt(pulls @ pulls / fit.dof))
-    weight = 1 / (error * fit.inflation)
-    extra = (0, padded_size(rows) - rows)
-    time, weight = np.pad(segment.time, extra, mode="edge"), np.pad(weight, extra)
-    root = np.asarray(information_root(time, weight, fit.i0.value, parts, fit.mean_current))
-    return _with_monitor(root, fit)
+    scale = fit.noise
+    if not fit.noise_inferred:
+        pulls = fit.residuals / decay.segment.error
+        scale = max(1.0, np.sqrt(pulls @ pulls / fit.dof))
+    about = fit.about
+    return _with_monitor(information_root(about, scale * fit.inflation), about)
 
 
-def _with_monitor(root: np.ndarray, fit: DecayFit) -> np.ndarray:
+def _with_monitor(root: np.ndarray, about: Expansion) -> np.ndarray:
     """The root with what is stated of the monitor added to the covariance of the parts."""
-    changes = fit.readings.monitor_changes
+    changes = about.pieces.monitor_changes
     if not changes:
         return root
-    about = about_fit(fit)
     moved = [about.moved(change) for change in changes]
-    spread = root @ np.array([[m.a * fit.mean_current, m.rate_mean] for m in moved]).T
+    spread = root @ np.array([[m.a * about.pieces.units[1], m.rate_mean] for m in moved]).T
     whole = np.linalg.cholesky(np.eye(2) + spread @ spread.T)
     return np.linalg.qr(np.linalg.solve(whole, root), mode="r")
 
@@ -140,6 +127,7 @@ def summarise(decays: tuple[Decay, ...]) -> Summaries:
 
     Examples
     --------
+    >>> from beamfit.lifetime.decay_law import current
     >>> from beamfit.lifetime.record import DecayRecord
     >>> from beamfit.lifetime.study import study_record
     >>> t = np.linspace(0, 36000, 100)
@@ -163,8 +151,6 @@ def summarise(decays: tuple[Decay, ...]) -> Summaries:
     return Summaries(*map(jnp.asarray, (current, parts, root)))
 
 
-# A scale known to a third or worse cannot be told from a third more or less of another cause.
-SEPARABLE = 1 / 3
 PRESSURE_ERROR = 0.05
 RECORD = "decays"
 LARGEST = 1e3
@@ -258,7 +244,7 @@ class ScaleFit:
         usual = jnp.ones_like(vector)
         size = np.maximum(np.abs(quantity(vector)), np.abs(quantity(usual)))
         error = spread_of_scales(self.fit).error(np.asarray(jax.jacfwd(quantity)(vector)))
-        return self.error_scale * error < SEPARABLE * size
+        return self.error_scale * error < DETERMINED * size
 
     def about(self, terms: LossTerms, measured: Summaries) -> tuple[np.ndarray, ...]:
         """Expand decays: their weights, their `pulls`, and the slopes of these by the scales."""
@@ -474,7 +460,7 @@ def _scale(
 ) -> Quantity:
     """A scale, without an error where the decays do not tell it."""
     # Against 1 where the value is smaller: a mechanism found absent, 0.0 ± 0.1, is separable.
-    known = scale * raw < SEPARABLE * max(value, 1.0)
+    known = scale * raw < DETERMINED * max(value, 1.0)
     if name == VOLTAGE:
         known = raw < (1 - NARROWED) * priors[name][1]
     found = Quantity(float(value), scale * float(raw), "1", float(raw))

@@ -11,15 +11,17 @@ import numpy as np
 
 from beamfit.errors import InputError
 from beamfit.lifetime import alarm
-from beamfit.lifetime.course import BEST_MONITOR, WANDER, alike_over
+from beamfit.lifetime.course import reference_of
 from beamfit.lifetime.cycles import alike, cut_at_refills, joined, usual_cycle
 from beamfit.lifetime.evidence import UNITS
 from beamfit.lifetime.fit import DecayFit, bare, fit_decay, fit_pieces
 from beamfit.lifetime.marginal import Law
 from beamfit.lifetime.mechanisms import added, loss_coefficients, terms_of
+from beamfit.lifetime.pieces import FEWEST
 from beamfit.lifetime.record import Conditions, DecayRecord
 from beamfit.lifetime.study import (
-    SHORTEST,
+    CHANGED,
+    Decay,
     Machine,
     at_settings,
     budget,
@@ -142,10 +144,10 @@ def fit_window(rows: Sequence[WindowRow], name: str) -> Window:
         for decay in cut_at_refills(section).segments
     ]
     if not decays:
-        return Window(None, None, 0, f"fewer than {SHORTEST} readings in a row of a stored beam")
+        return Window(None, None, 0, f"fewer than {FEWEST} readings in a row of a stored beam")
     group = _at_last(decays)
     one = group[0] if len(group) == 1 else joined(group, name)
-    if len(one) < SHORTEST:
+    if len(one) < FEWEST:
         return Window(None, one, len(group), f"{len(one)} readings since the last change")
     try:
         fit = _fitted(group, name)
@@ -199,7 +201,7 @@ def _pieces(rows: Sequence[WindowRow], name: str) -> list[DecayRecord]:
             time[part], current[part], None, name, time[part[0]],
             Conditions(*(None if column is None else column[part] for column in filled)),
         )
-        for part in parts if part.size >= SHORTEST
+        for part in parts if part.size >= FEWEST
     ]  # fmt: skip
 
 
@@ -216,10 +218,6 @@ def _at_last(decays: list[DecayRecord]) -> list[DecayRecord]:
 
 # a and b so well known are the usual ones; errors half as large replace them before an alarm.
 KNOWN = 0.05
-# Where readings do not tell a from b, the ring's own shares of them are trusted to this.
-SHARES = 0.3
-# Settings, and the current, that moved by more than this share are given to the ring anew.
-MOVED = 0.01
 # What the ring is expected to lose follows its settings over so long, s, and steps at once.
 SMOOTH = 300.0
 
@@ -269,20 +267,11 @@ def learnt(
     # Where the gauge does not follow the current a is without gas, and b of no moment.
     if fit is None or window.readings.gauge is not None or (before and before.raised is not None):
         return None
-    if fit.status is Status.converged:
-        found = _told(window)
-    else:
-        shared = machine is not None and fit.status is Status.unidentified
-        found = _shared(window, machine) if shared else None
-    if found is None:
+    usual = _usual(window, machine)
+    if usual is None:
         return None
-    a, b, covariance = found
-    covariance = covariance + WANDER**2 * np.eye(2)
-    if before and not np.trace(covariance) < np.trace(before.usual.covariance) / 4:
+    if before and not np.trace(usual.covariance) < np.trace(before.usual.covariance) / 4:
         return None
-    noise = max(fit.noise, BEST_MONITOR * fit.mean_current)
-    apart = float(np.median(np.diff([row.time for row in rows])))
-    usual = alarm.Reference(a, b, noise, alike_over(fit), apart, covariance)
     known = Alarmed(usual, alarm.started(usual))
     if machine is None:
         return known
@@ -290,31 +279,23 @@ def learnt(
     return known._replace(ring=ring, losses=ring.losses)
 
 
-def _told(window: Window) -> tuple[float, float, np.ndarray] | None:
-    """a and b of a fit that knows both well, with their relative covariance."""
-    a, b = window.fit.a, window.fit.b
-    if not (a.value > 0 and b.value > 0 and a.error and b.error):
+def _usual(window: Window, machine: Machine | None) -> alarm.Reference | None:
+    """The loss of a fit that knows a and b, or the loss rate and a ring their ratio."""
+    fit, ring = window.fit, None
+    decay = Decay(window.readings, 0.0, fit, None)
+    if fit.status is Status.converged:
+        known = (fit.a, fit.b)
+    elif fit.status is Status.unidentified and machine is not None:
+        known = (fit.lifetime_mean,)
+        try:
+            ring = budget(window.readings, machine).losses
+        except InputError:
+            return None
+    else:
         return None
-    errors = np.array([a.relative, b.relative])
-    correlation = window.fit.identifiability.correlation or 0.0
-    covariance = np.outer(errors, errors) * [[1.0, correlation], [correlation, 1.0]]
-    return (a.value, b.value, covariance) if errors.max() < KNOWN else None
-
-
-def _shared(window: Window, machine: Machine) -> tuple[float, float, np.ndarray] | None:
-    """The loss rate of a fit by the ring's shares of a and b, which may be off together."""
-    lifetime = window.fit.lifetime_mean
-    if lifetime.error is None or not lifetime.relative < KNOWN:
+    if not all(one.error and abs(one.relative) < KNOWN for one in known):
         return None
-    try:
-        expected = budget(window.readings, machine)
-    except InputError:
-        return None
-    by = expected.lifetime / lifetime.value
-    a, b = (by * float(part) for part in (expected.losses.a, expected.losses.b))
-    share = a * expected.current / (a * expected.current + b)
-    apart = SHARES * np.array([1 - share, -share])
-    return a, b, np.outer(apart, apart) + lifetime.relative**2 * np.eye(2)
+    return reference_of((decay,), np.ones(1), np.ones(1), ring)
 
 
 def _terms(machine: Machine, before: Terms | None, row: WindowRow) -> Terms:
@@ -323,7 +304,7 @@ def _terms(machine: Machine, before: Terms | None, row: WindowRow) -> Terms:
     moment = DecayRecord([0.0, 1.0], row.current * np.array([1.0, 1 - 1e-6]), conditions=at)
     operation = operation_during(moment, machine)
     place = np.array([row.current, *row.settings._replace(pressure=0.0)])
-    if before and np.allclose(place, before.place, rtol=MOVED, atol=0.0, equal_nan=True):
+    if before and np.allclose(place, before.place, rtol=CHANGED, atol=0.0, equal_nan=True):
         place, parts = before.place, before.parts
     else:
         parts = terms_of(machine.ring, operation, row.current)

@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -24,10 +25,11 @@ from beamfit.lifetime.cycles import (
     usual_cycle,
 )
 from beamfit.lifetime.evidence import SEPARABLE
-from beamfit.lifetime.fit import DecayFit, bare, fit_cycles, fit_decay
+from beamfit.lifetime.fit import DecayFit, bare, fit_cycles, fit_decay, fit_pieces
 from beamfit.lifetime.marginal import DRIFT, Law
 from beamfit.lifetime.mechanisms import MECHANISMS, Losses, loss_coefficients
 from beamfit.lifetime.pieces import (
+    FEWEST,
     Event,
     Split,
     noise_of,
@@ -46,8 +48,6 @@ from beamfit.table import json_of
 # A setting that moves by more than this share between two readings was changed by somebody.
 CHANGED = 0.01
 SETTINGS = ("rf_voltage", "scraper_y", "bunches")
-# Decays shorter than this are pieces between two events.
-SHORTEST = 8
 # Refills of so many standard deviations of the means beside them are none of them missed.
 SEEN = 6.0
 # Scatter, over the length squared, of the parabola t² beside its line, halved: the bend of a decay.
@@ -56,8 +56,8 @@ BEND = 1 / 12 / math.sqrt(5)
 OWN = 3.0
 # Probability of refills faster than the record is read from which cycles tell no lifetime.
 UNSURE = 0.05
-# Points of a picture.
-POINTS = 60
+# Points of a picture, and cycles that make a point of a course at least.
+POINTS, FEWEST_IN_PART = 60, 10
 
 
 @shown
@@ -357,6 +357,24 @@ class Decay:
         """Add the losses of a ring, if there is one."""
         return cls(segment, offset, fit, None if machine is None else budget(segment, machine))
 
+    def parts(self, number: int, machine: Machine | None) -> list[Decay]:
+        """The cycles of top-up as so many decays at most, each of some cycles and a fit of its own;
+        a single decay as it is.
+        """
+        fit, first = self.fit, self.fit.first
+        count = 1 if first is None else min(number, first.size // FEWEST_IN_PART)
+        if count < 2:
+            return [self]
+        ends, found = [*first, len(fit.readings)], []
+        every = [fit.readings.select(slice(*pair)) for pair in pairwise(ends)]
+        for k, group in enumerate(np.array_split(np.arange(first.size), count), 1):
+            cycles, name = [every[place] for place in group], f"{fit.record}#{k}"
+            rows = [cycles[0].start, cycles[-1].start + cycles[-1].span] - np.array(self.offset)
+            within = slice(*np.searchsorted(self.segment.time, rows))
+            segment = self.segment.select(within, name)
+            found.append(Decay.of(segment, cycles[0].start, fit_pieces(cycles, name), machine))
+        return found
+
     @cached_property
     def checks(self) -> DecayChecks | None:
         """Simpler analyses, and the test of a constant a; None if nothing decays, and
@@ -427,9 +445,9 @@ def at_settings(segment: DecayRecord) -> list[DecayRecord]:
     """Cut where somebody changed a setting."""
     moved = np.any(list(_steps(segment).values()), axis=0)
     if not moved.any():
-        return [segment] if len(segment) >= SHORTEST else []
+        return [segment] if len(segment) >= FEWEST else []
     pieces = np.split(np.arange(len(segment)), np.flatnonzero(moved) + 1)
-    return [segment.select(rows) for rows in pieces if len(rows) >= SHORTEST]
+    return [segment.select(rows) for rows in pieces if len(rows) >= FEWEST]
 
 
 def _pooled(
@@ -440,13 +458,13 @@ def _pooled(
     many = sum(len(group) >= FEWEST_CYCLES for group in groups)
     for group in groups:
         if len(group) < FEWEST_CYCLES:
-            alone += [cycle for cycle in group if len(cycle) >= SHORTEST]
+            alone += [cycle for cycle in group if len(cycle) >= FEWEST]
             continue
         called = name if many == 1 else f"{name}@{len(pooled) + 1}"
         fit = seen_through(fit_cycles(group, called, law), *usual_cycle(group))
         segment = joined(group, called)
         pooled.append(Decay.of(segment, segment.start, fit, machine))
-        alone += [c for c in group if len(c) >= SHORTEST and stands_alone(c, fit)]
+        alone += [c for c in group if len(c) >= FEWEST and stands_alone(c, fit)]
     return pooled, alone
 
 
@@ -468,7 +486,7 @@ def _refilled(record: DecayRecord) -> Split:
 
 def _decays(record: DecayRecord) -> tuple[list[DecayRecord], tuple[Event, ...]]:
     """Clean decays at constant settings, and the events."""
-    if len(record) < SHORTEST:
+    if len(record) < FEWEST:
         return [record], ()
     split = split_record(record)
     pieces = [piece for segment in split.segments for piece in at_settings(segment)]
@@ -476,7 +494,7 @@ def _decays(record: DecayRecord) -> tuple[list[DecayRecord], tuple[Event, ...]]:
         moving = [name for name, steps in _steps(record).items() if steps.any()]
         changes = f"changes of {', '.join(moving)} by more than {100 * CHANGED:g} %"
         kinds = ", ".join(sorted({event.kind for event in split.events})) or changes
-        expected = f"at least {SHORTEST} readings in a row of a stored beam"
+        expected = f"at least {FEWEST} readings in a row of a stored beam"
         expected += "; leave out a setting that only scatters with --ignore" if moving else ""
         raise InputError(f"no decay between {kinds}", expected, record.name, column="current")
     return pieces, split.events
@@ -516,7 +534,7 @@ def _parts(piece: DecayRecord, law: Law) -> tuple[list[_Fitted], list[Event]]:
     # Of means of neighbours the loss is anywhere within one.
     within = float(np.median(np.diff(whole.segment.time))) * (len(whole.segment) < len(piece))
     halves = [piece.select(rows) for rows in (piece.time < at - within, piece.time > at + within)]
-    if min(map(len, halves)) < SHORTEST:
+    if min(map(len, halves)) < FEWEST:
         return [whole], []
     kind = "loss" if loss.current.value > 0 else "refill"
     event = Event(kind, piece.start + at, 0.0, -loss.current.value)

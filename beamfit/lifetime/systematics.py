@@ -15,10 +15,7 @@ from beamfit.lifetime.expansion import (
     LEVEL,
     LOSS,
     POWER,
-    Expansion,
-    Physical,
     Pieces,
-    expanded,
     further_columns,
     lifetime_of,
     solved,
@@ -99,7 +96,7 @@ def systematics(fit: DecayFit) -> tuple[Systematic, ...]:
     record, another = fit.readings, fit.shaped or fit.first is not None
     if record is None or another or fit.status is Status.infeasible or fit.a.error is None:
         return ()
-    about = about_fit(fit)
+    about = fit.about
     over, share = about.pieces.over, record.time / record.span
     grown = further_columns(about, "drift", np.zeros(1))[:, 0] * over * record.span
     rises = f"pressure rises by {100 * PRESSURE:g} % over the record"
@@ -129,14 +126,6 @@ def _monitor(record: DecayRecord, share: np.ndarray) -> dict[str, np.ndarray]:
         }
     stated = record.monitor.changes(record.time)
     return {f"monitor {cause} (in the errors)": moved for cause, moved in stated.items()}
-
-
-def about_fit(fit: DecayFit) -> Expansion:
-    """The law about a fit of a constant a."""
-    i0, a, b = (fit.if_constant(name).value for name in ("i0", "a", "b"))
-    rate, unused = a * fit.mean_current + b, np.nan
-    values = Physical(i0, a, b, unused, unused, rate, unused, unused)
-    return expanded(Pieces.of(fit.readings), values)
 
 
 FEWEST_IN_WINDOW = 5

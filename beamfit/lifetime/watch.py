@@ -11,7 +11,7 @@ from typing import NamedTuple
 from beamfit.errors import InputError
 from beamfit.lifetime import alarm
 from beamfit.lifetime.course import BEST_MONITOR
-from beamfit.lifetime.pieces import DROPOUT
+from beamfit.lifetime.pieces import DROPOUT, GAP
 from beamfit.lifetime.record import PLAUSIBLE, Conditions
 from beamfit.lifetime.sliding_fit import (
     Alarmed,
@@ -33,8 +33,6 @@ DEAD = 5
 ROWS = 4096
 # So many readings in a row, each older than the newest before them, are of a clock set back.
 LATE = 5
-# A reading above the others of its row by so many of its errors begins a new one: a refill.
-JUMP = 6.0
 # Beyond what a ring stores, mA, or a clock shows, s, a reading is none.
 MOST, LATEST = (math.inf, 1e6), 1e11
 # Events and points of the course that are kept.
@@ -214,7 +212,7 @@ def _current(plan: Plan, state: State, time: float, value: float) -> State:
     if own <= last:
         return _behind(plan, state, time, value)
     apart, usual = own - last, state.interval
-    if usual and apart > max(alarm.GAP * usual, alarm.MINUTE):
+    if usual and apart > max(GAP * usual, alarm.MINUTE):
         said = f"no reading for {apart:.0f} s, or the clock was set forward"
         state = _counted(noted(_cut(plan, state), time, said), gaps=1)
     interval = usual * (1.2 if apart > usual else 1 / 1.2) if usual else apart
@@ -251,7 +249,7 @@ def _placed(plan: Plan, state: State, own: float, value: float) -> State:
     if state.highest and DROPOUT * value > state.highest and state.spikes + 1 < DEAD:
         return _counted(state._replace(spikes=state.spikes + 1), bad=1)
     count, begin, times, currents = state.sums
-    refilled = count and value - currents / count > JUMP * state.noise
+    refilled = count and value - currents / count > alarm.JUMP * state.noise
     if count and (refilled or own - begin >= plan.window / ROWS):
         state = _closed(plan, state)
         count, times, currents = 0, 0.0, 0.0

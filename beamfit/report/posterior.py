@@ -294,7 +294,7 @@ def of_decay(fit: DecayFit, posterior: Posterior, label: str = "") -> ReportedPo
         at=fit.readings.time / 3600.0,
         measured=fit.readings.current,
         error=fit.readings.error,
-        expect=partial(expected_current, posterior),
+        expect=partial(expected_current, posterior, fit),
         unit=1.0,
         colour=BLUE,
     )

@@ -2,11 +2,11 @@ import numpy as np
 import pytest
 from scipy.optimize import curve_fit
 
+from beamfit.greybox.problem import Free, Problem, Record
 from beamfit.greybox.solve import solve
-from beamfit.lifetime.decay_law import current_by_rate
+from beamfit.lifetime.decay_law import current, current_by_rate
 from beamfit.lifetime.evidence import Evidence
-from beamfit.lifetime.expansion import PLAIN, POWER, Pieces, solved, solved_together
-from beamfit.lifetime.posterior import decay_problem
+from beamfit.lifetime.expansion import PLAIN, POWER, Pieces, solved
 from beamfit.lifetime.record import DecayRecord
 from tests.simulations import simulations, widened
 
@@ -81,7 +81,7 @@ def test_what_a_record_of_this_length_can_tell(span, error_a, error_b, count):
         DecayRecord(time, noisy(time, 500.0, a, b, 1e-3, seed), np.full(1000, 1e-3))
         for seed in range(count)
     ]
-    fits = [Evidence(about) for about in solved_together(records)]
+    fits = [Evidence(solved(Pieces.of(record))) for record in records]
     assert all(fit.about.rested for fit in fits)
     # 64 records know a standard deviation to 9 %.
     for name in ("a", "b", "rate_mean"):
@@ -90,19 +90,6 @@ def test_what_a_record_of_this_length_can_tell(span, error_a, error_b, count):
         assert np.std(values) == pytest.approx(stated, rel=widened(0.3, 64, count))
     assert np.median([fit.raw.a for fit in fits]) / a == pytest.approx(error_a, rel=0.25)
     assert np.median([fit.raw.b for fit in fits]) / b == pytest.approx(error_b, rel=0.25)
-
-
-def test_records_solved_together_equal_those_solved_alone():
-    records = [
-        DecayRecord(
-            np.linspace(0, 7200, n), noisy(np.linspace(0, 7200, n), i0, 4e-8, 2e-6, 0.01, 3)
-        )
-        for i0, n in ((500.0, 300), (20.0, 300), (1.0, 290), (500.0, 40))
-    ]
-    for record, together in zip(records, solved_together(records), strict=True):
-        alone = solved(Pieces.of(record))
-        assert together.values.a == pytest.approx(float(alone.values.a), rel=1e-6)
-        np.testing.assert_allclose(together.rows, alone.rows, rtol=1e-6, atol=1e-9)
 
 
 def random_decay(rng, span):
@@ -117,7 +104,7 @@ def test_no_random_record_defeats_the_search():
     rng = np.random.default_rng(5)
     spans = np.where(np.arange(512) % 4 == 0, 60.0, 10 ** rng.uniform(1.7, 5.0, 512))
     records = [random_decay(rng, span) for span in spans]
-    fits = solved_together(records)
+    fits = [solved(Pieces.of(record)) for record in records]
     assert all(fit.rested for fit in fits)
     assert all(np.isfinite(fit.values).all() for fit in fits)
     reduced = np.array([fit.residuals @ fit.residuals for fit in fits]) / 61
@@ -158,13 +145,26 @@ def test_the_exponent_of_a_constant_a_is_zero():
     assert error < 0.05
 
 
+def core_problem(record):
+    """The decay as a problem of the grey-box core, begun near its solution."""
+    units = {"i0": 1.0, "a": 1e-8, "b": 1e-6}
+
+    def predict(model, time):
+        return current(time, *(model[name] * unit for name, unit in units.items()))
+
+    readings = Record("decay", predict, record.time, record.current, record.error)
+    begin = {"i0": 500.0, "a": 4.0, "b": 2.0}
+    return Problem(begin, [Free(name) for name in begin], [readings]), units
+
+
 @pytest.mark.parametrize("stated", [None, 0.01])
 def test_the_search_answers_the_problem(stated):
     """Against the core's own search, errors and noise, without the weak prior."""
     time = np.linspace(0, 8 * 3600, 200)
     error = None if stated is None else np.full(200, stated)
     record = DecayRecord(time, noisy(time, 500.0, 4e-8, 2e-6, 0.01, 8), error)
-    fast, core = Evidence(solved(Pieces.of(record))), solve(decay_problem(record))
-    for name in ("i0", "a", "b"):
-        assert core[name].value == pytest.approx(float(getattr(fast.values, name)), rel=1e-9)
-        assert core[name].error_raw == pytest.approx(getattr(fast.raw, name), rel=1e-5)
+    problem, units = core_problem(record)
+    fast, core = Evidence(solved(Pieces.of(record))), solve(problem)
+    for name, unit in units.items():
+        assert core[name].value * unit == pytest.approx(getattr(fast.values, name), rel=1e-9)
+        assert core[name].error_raw * unit == pytest.approx(getattr(fast.raw, name), rel=1e-5)

@@ -72,7 +72,7 @@ def test_the_closed_form_is_the_integrated_law(name, gauged):
 
 def test_pieces_begin_anew():
     time = np.linspace(0, 1, 50)
-    at = Moments(np.tile(time, 2), np.tile(time, 2), np.repeat([0, 50], 50))
+    at = Moments(np.tile(time, 2))
     numbers = np.array([0.7, 0.4, 0.2])
     both = beam_current(np.repeat([1.3, 0.9], 50), numbers, at)
     for k, level in enumerate((1.3, 0.9)):

@@ -113,3 +113,18 @@ def test_the_command_and_its_page(tmp_path, well_shown):
     assert "Alarm: b moved by" in " ".join(done.output.split())
     assert "course of the lifetime" in page.read_text()
     assert well_shown(page, 3) == []
+
+
+def test_top_up_is_a_course_of_many_points():
+    """It was one point, whatever happened in it."""
+    random, time = np.random.default_rng(1), 10.0 * np.arange(8000)
+    loss = np.where(time > 50_000, 1 / 34_000, 1 / 36_000)
+    lost = np.append(0.0, np.cumsum(10 * loss[:-1]))
+    cycle = np.floor(time / 180.0)
+    beam = 300 * np.exp(lost[np.searchsorted(cycle, cycle)] - lost)
+    found = trend_of([study_record(DecayRecord(time, beam + 0.01 * random.normal(size=8000)))])
+    assert found.status == "poor_fit"
+    assert len(found.points) >= 40
+    times, beyond = np.array([(point.time, point.beyond) for point in found.points]).T
+    assert set(beyond[times > 50_000]) == {-1}
+    assert np.sum(beyond[times < 47_000] != 0) <= 1

@@ -53,8 +53,8 @@ def test_pairs_are_drawn_with_every_number(posterior):
     shown = [axes for axes in figure.axes if axes.axison]
     assert len(shown) == 6
     labels = [axes.get_xlabel() for axes in figure.axes if axes.get_xlabel()]
-    assert labels == ["lifetime mean\nh", "a\n1e-8 1/(mA s)", "b\n1e-7 1/s"]
+    assert labels == ["lifetime mean\nh", "a\n1e-8 1/(mA s)", "b\n1e-6 1/s"]
     a, b = (posterior.values(name) for name in "ab")
     dots = next(axes for axes in shown if axes.lines and len(axes.lines[0].get_xdata()) == 2000)
     np.testing.assert_allclose(dots.lines[0].get_xdata(), a[:2000] * 1e8)
-    np.testing.assert_allclose(dots.lines[0].get_ydata(), b[:2000] * 1e7)
+    np.testing.assert_allclose(dots.lines[0].get_ydata(), b[:2000] * 1e6)
