@@ -12,9 +12,9 @@ import numpy as np
 from beamfit.language import document as d
 from beamfit.language import expression as x
 from beamfit.language.evaluate import Setting, Value, check_rank, evaluate, picked, stored
-from beamfit.language.network import with_weights
+from beamfit.language.network_xml import with_weights
+from beamfit.language.plan import callee_of, gains_of
 from beamfit.language.scope import Array, Axes, IndexSet, Net, Scope, located, widened
-from beamfit.language.steps import callee_of, gains_of
 
 Arrays = dict[str, jax.Array]
 

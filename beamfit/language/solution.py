@@ -18,8 +18,8 @@ from beamfit.greybox.fit import Fit, FittedConstraint, FittedVariable
 from beamfit.greybox.problem import TOLERANCE
 from beamfit.greybox.solve import solve
 from beamfit.language import document as d
-from beamfit.language.computed import gain_tables, gains_at, outputs_at
-from beamfit.language.statement import Formulation, at_start, formulate, starts_of
+from beamfit.language.compiled import gain_tables, gains_at, outputs_at
+from beamfit.language.problem import Formulation, at_start, formulate, starts_of
 from beamfit.language.trace import cause_of
 from beamfit.quantity import Quantity
 from beamfit.statistics import reach_of

@@ -8,7 +8,7 @@ from math import ceil
 import numpy as np
 from matplotlib.figure import FigureBase
 
-from beamfit.language.computed import Computed
+from beamfit.language.compiled import Computed
 from beamfit.language.solution import ProblemSolution
 from beamfit.language.text import format_document
 from beamfit.report.document import BLUE, MOST_DRAWN, Picture, ReportPage, Verdict
