@@ -30,9 +30,9 @@ from beamfit.dynamics.search import (
     Settled,
     begun,
     case_of,
+    fitted,
     is_first_order,
     latest,
-    remembering,
     used_by,
 )
 from beamfit.errors import InputError, nearest
@@ -242,7 +242,7 @@ def _with_network(found: Begun, offset: bool, hidden: int, seeds: range) -> Sett
     seen, first = found.seen, found.plain.fit.model
     physics, raw = seen.runs[0].physics, np.asarray(first["map"])
     nets = (network_of(seen, physics, raw, hidden, seed) for seed in seeds)
-    return remembering(case_of(seen, offset, True), [first | {"map": net} for net in nets])
+    return fitted(case_of(seen, offset, True), [first | {"map": net} for net in nets])
 
 
 def _known(
