@@ -128,16 +128,13 @@ class ResponseFit:
     def to_json(self) -> dict[str, Any]:
         """Give one entry of ``results`` in the JSON contract."""
         names = ("output", "status", "message", "model", "map")
-        entry = {name: getattr(self, name) for name in names}
-        return json_of(
-            entry
-            | {"records": [run.path or run.name for run in self.runs]}
-            | {"delay_samples": self.delay, "parameters": self.quantities}
-            | {"curves": [curve.to_json() for curve in self.curves]}
-            | {"noise_rms": list(self.noise), "noise_memory": self.memory}
-            | {"checks": self.checks._asdict(), "held_back": [h._asdict() for h in self.held]}
-            | {"left_out": [each._asdict() for each in self.left_out]}
-        )
+        return json_of({
+            **{name: getattr(self, name) for name in names},
+            "records": [run.path or run.name for run in self.runs],
+            "delay_samples": self.delay, "parameters": self.quantities, "curves": self.curves,
+            "noise_rms": self.noise, "noise_memory": self.memory,
+            "checks": self.checks, "held_back": self.held, "left_out": self.left_out,
+        })  # fmt: skip
 
 
 def identify(

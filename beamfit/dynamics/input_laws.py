@@ -21,9 +21,9 @@ import numpy as np
 from beamfit.dynamics.checks import RunSlopes, slow_paths
 from beamfit.dynamics.model import Driven, PreparedOutput, delayed, predicted
 from beamfit.dynamics.record import Run
-from beamfit.dynamics.search import Settled
+from beamfit.dynamics.search import Settled, noises_of
 from beamfit.greybox import tree
-from beamfit.greybox.memory import Memory, Whitened, noises, range_of
+from beamfit.greybox.memory import Memory, Whitened
 from beamfit.greybox.problem import with_slope
 from beamfit.noise.correlated import CorrelatedNoise, innovations
 
@@ -291,9 +291,7 @@ def laws_of(
     """
     paths = zip(slow_paths(seen), slopes, strict=True)
     more = [np.concatenate([slow, each.changing], axis=1) for slow, each in paths]
-    apart = min(float(np.median(np.diff(t))) for t in seen.time)
-    ends = np.array([range_of(t) for t in seen.time])
-    grid = noises((ends[:, 0].min(), ends[:, 1].max()), apart, CORRELATION_TIMES, WHITE)
+    grid = noises_of(seen.time, CORRELATION_TIMES, WHITE)
     candidates = _candidates(runs, seen, delays, more)
     laws = _LawFits(found, seen, candidates, CorrelatedNoise(*np.array(grid).T))
     at, count = laws.fitted(), len(candidates.prior)

@@ -72,6 +72,16 @@ class PreparedOutput(NamedTuple):
         """The inputs at all readings, shape (readings, inputs)."""
         return np.concatenate([np.asarray(run.u)[np.asarray(run.index)] for run in self.runs])
 
+    @property
+    def apart(self) -> float:
+        """Median time between readings, of the run where it is shortest."""
+        return min(float(np.median(np.diff(t))) for t in self.time)
+
+    @property
+    def span(self) -> float:
+        """Length of the longest run."""
+        return max(float(np.ptp(t)) for t in self.time)
+
     def scaled(self, u: Any) -> np.ndarray:
         """Inputs in units of their scatter."""
         return (np.asarray(u) - self.mean_u) / self.wide

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -30,10 +31,10 @@ from beamfit.dynamics.model import (
 from beamfit.dynamics.record import Run
 from beamfit.dynamics.response import ARX, FIRST_ORDER, Physics, simulate
 from beamfit.greybox.fit import Fit
-from beamfit.greybox.memory import Memory, noises, range_of, whitened_by_each
+from beamfit.greybox.memory import TIMES, Memory, noises, range_of, whitened_by_each
 from beamfit.greybox.problem import Free, Prior, Problem, Record
 from beamfit.greybox.solve import solve
-from beamfit.noise.correlated import CorrelatedNoise, innovations, remembers
+from beamfit.noise.correlated import BESIDE, CorrelatedNoise, innovations, remembers
 from beamfit.status import Status
 
 # Longest delay that is tried, in samples, and as a share of the run.
@@ -42,7 +43,10 @@ LATEST, SHARE = 24, 0.1
 # that are tried besides.
 BETTER, PARTS = 5.0, (-0.75, -0.5, -0.25, 0.25, 0.5, 0.75)
 # Time constants of the grid, and dampings of a second order.
-TIMES, DAMPINGS = 16, (0.2, 0.6, 1.0, 2.0)
+LAGS, DAMPINGS = 16, (0.2, 0.6, 1.0, 2.0)
+# Step of their logarithms in a slope, share of the logarithm of squares whose gain ends a start,
+# and smallest residual of which a logarithm is taken.
+STEP, ENOUGH, TINY = 1e-3, 1e-6, 1e-150
 
 
 class Start(NamedTuple):
@@ -62,28 +66,37 @@ class Start(NamedTuple):
 def best_start(seen: PreparedOutput, offset: bool) -> Start:
     """The best of the grid, of a difference equation that of second orders (eqs 13, 14)."""
     physics = seen.runs[0].physics
-    apart = min(float(np.median(np.diff(t))) for t in seen.time)
-    span = max(float(t[-1] - t[0]) for t in seen.time)
-    times = np.geomspace(0.3 * apart, span, TIMES)
-    grid = np.array([[t] for t in times] if physics is FIRST_ORDER
-                    else [[t, z] for t in times for z in DAMPINGS])  # fmt: skip
+    apart, span = seen.apart, seen.span
+    times = np.geomspace(0.3 * apart, span, LAGS)
+    grid = np.log([[t] for t in times] if physics is FIRST_ORDER
+                  else [[t, z] for t in times for z in DAMPINGS])  # fmt: skip
 
-    def fits(shapes: np.ndarray) -> list[Start]:
-        shapes = shapes if physics is not ARX else _difference(shapes, apart)
-        columns = [np.asarray(unit_outputs(run, shapes)) for run in seen.runs]
-        return [_fitted(seen, s, [c[i] for c in columns], offset) for i, s in enumerate(shapes)]
+    def shapes(logarithms: np.ndarray) -> np.ndarray:
+        found = np.exp(logarithms)
+        return found if physics is not ARX else _difference(found, apart)
 
-    def at(logarithms: np.ndarray) -> Start:
-        return fits(np.exp(np.clip(logarithms, *np.log([1e-3 * apart, 1e3 * span])))[None])[0]
+    def left(logarithms: np.ndarray) -> np.ndarray:
+        triangles = _triangles(seen.runs, seen.measured, shapes(logarithms), offset)
+        return 2.0 * np.log(np.maximum(np.abs(np.asarray(triangles)[:, -1, -1]), TINY))
 
-    found = fits(grid)
-    best = min(range(len(grid)), key=lambda i: found[i].squares)
-    # To a hundredth of a time constant: delays are compared by what remains.
-    begin = np.log(grid[best])
-    simplex = begin + 0.3 * np.vstack([np.zeros(len(begin)), np.eye(len(begin))])
-    options = {"initial_simplex": simplex, "xatol": 0.01, "fatol": 0.0, "maxiter": 40}
-    end = minimize(lambda x: at(x).squares, begin, method="Nelder-Mead", options=options)
-    return min(at(end.x), found[best], key=lambda each: each.squares)
+    def with_slope(x: np.ndarray) -> tuple[float, np.ndarray]:
+        moved = STEP * np.eye(len(x))
+        here, up, down = np.split(left(np.vstack([x, x + moved, x - moved])), [1, 1 + len(x)])
+        return float(here[0]), (up - down) / (2.0 * STEP)
+
+    bounds = [tuple(np.log([1e-3 * apart, 1e3 * span]))] * grid.shape[1]
+    begin = grid[np.argmin(left(grid))]
+    ends = {"ftol": ENOUGH, "maxiter": 20}
+    x = minimize(with_slope, begin, jac=True, bounds=bounds, method="L-BFGS-B", options=ends).x
+    (shape,) = shapes(x[None])
+    (triangle,) = np.asarray(_triangles(seen.runs, seen.measured, shape[None], offset))
+    size = np.linalg.norm(triangle[:, :-1], axis=0)
+    size = np.where(size > 0, size, 1.0)
+    found = np.linalg.lstsq(triangle[:, :-1] / size, triangle[:, -1], rcond=1e-10)[0] / size
+    k = len(seen.runs) * physics.free_states + offset
+    first = found[len(found) - k :][: k - offset].reshape(len(seen.runs), -1)
+    p, level = np.append(shape, found[: len(found) - k]), float(found[-1]) if offset else 0.0
+    return Start(p, first, level, float(triangle[-1, -1] ** 2))
 
 
 def _difference(shapes: np.ndarray, apart: float) -> np.ndarray:
@@ -109,25 +122,23 @@ def unit_outputs(run: Driven, shapes: jax.Array) -> jax.Array:
     return jax.vmap(each, in_axes=(0, None, None))(shapes, gains, firsts)
 
 
-def _fitted(
-    seen: PreparedOutput, shape: np.ndarray, columns: list[np.ndarray], offset: bool
-) -> Start:
-    k, runs = seen.runs[0].physics.free_states, len(columns)
-    m = columns[0].shape[0] - k
+@partial(jax.jit, static_argnums=3)
+def _triangles(runs: tuple[Driven, ...], measured: Any, shapes: jax.Array, offset: bool):
+    """Triangular factors of outputs of unit gains, first states and offset, and of the readings.
+
+    One for each shape; its last number is what least squares leave.
+    """
     parts = []
-    for i, column in enumerate(columns):
-        first = np.zeros((column.shape[1], runs * k))
-        first[:, i * k : (i + 1) * k] = column[m:].T
-        parts.append(np.hstack([column[:m].T, first, np.ones((len(first), 1))]))
-    design, y = np.vstack(parts), np.concatenate(seen.measured)
-    if not offset:
-        design = design[:, :-1]
-    size = np.linalg.norm(design, axis=0)
-    size = np.where(size > 0, size, 1.0)
-    found = np.linalg.lstsq(design / size, y, rcond=1e-10)[0] / size
-    rest = float(np.sum((design @ found - y) ** 2))
-    first = found[m : m + runs * k].reshape(runs, k)
-    return Start(np.append(shape, found[:m]), first, float(found[-1]) if offset else 0.0, rest)
+    for i, (run, y) in enumerate(zip(runs, measured, strict=True)):
+        columns = jnp.swapaxes(unit_outputs(run, shapes), 1, 2)
+        k = run.physics.free_states
+        others = (0, 0), (0, 0), (i * k, (len(runs) - 1 - i) * k)
+        rest = jnp.stack([jnp.ones_like(y)] * offset + [y], axis=1)
+        rest = jnp.broadcast_to(rest, (len(shapes), *rest.shape))
+        parts.append([columns[..., :-k], jnp.pad(columns[..., -k:], others), rest])
+    rows = jnp.concatenate([jnp.concatenate(part, axis=2) for part in parts], axis=1)
+    few = max(0, rows.shape[2] - rows.shape[1])
+    return jnp.linalg.qr(jnp.pad(rows, ((0, 0), (0, few), (0, 0))), mode="r")
 
 
 def driven_by(seen: PreparedOutput, physics: Physics) -> tuple[Driven, ...]:
@@ -179,9 +190,15 @@ def latest(runs: tuple[Run, ...]) -> int:
     return min(LATEST, int(SHARE * min(map(len, runs))))
 
 
-# Correlation times looked at, and variances of the part without memory, in those that the part
-# that wanders gets anew from one sample to the next.
-CORRELATION_TIMES, WHITE = 16, (0.0, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 1000.0)
+def noises_of(
+    time: Sequence[np.ndarray], count: int = TIMES, ratios: Sequence[float] = BESIDE
+) -> list[CorrelatedNoise]:
+    """Noises that readings at these times, by run, may have: so many correlation times, and with
+    each the ratios of white variance to what the part that wanders gets anew in a sample.
+    """
+    apart = min(float(np.median(np.diff(t))) for t in time)
+    ends = np.array([range_of(t) for t in time])
+    return noises((ends[:, 0].min(), ends[:, 1].max()), apart, count, ratios)
 
 
 def noise_of(
@@ -195,10 +212,7 @@ def noise_of(
     `rows` hold the slopes of each run's residuals and, last, the residuals, in units of their
     noise; `known` those of the priors; `noise` is it if it is known.
     """
-    apart = min(float(np.median(np.diff(t))) for t in time)
-    ends = np.array([range_of(t) for t in time])
-    grid = noises((ends[:, 0].min(), ends[:, 1].max()), apart, CORRELATION_TIMES, WHITE)
-    grid = grid if noise is None else [noise]
+    grid = noises_of(time) if noise is None else [noise]
     memory = whitened_by_each(grid, list(zip(rows, time, strict=True)), known).memory()
     best = int(np.argmax(memory.weight))
     return memory, grid[best], float(np.sqrt(memory.squares[best] / memory.dof))

@@ -41,7 +41,7 @@ def formulation_page(found: ProblemSolution) -> ReportPage:
         height = 0.6 + 1.7 * ceil(len(drawn) / 2)
         draw = partial(draw_outputs, found=found)
         pictures = [Picture("outputs by index", height, draw, f"{found.headline}, {found.solver}")]
-    goals = "maximised" if found.factor < 0 else "minimised"
+    goals = "maximised" if found.made.factor < 0 else "minimised"
     called = found.made.document.mapping.name
     sizes = {"variable": len(p.names), "limit": len(p.constraint_names)}
     counts = ", ".join(f"{n} {what}" + "s" * (n != 1) for what, n in sizes.items())
