@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from beamfit.dynamics.state_fit import StatesFit
     from beamfit.dynamics.titre import TitreFit
     from beamfit.io.machine import ScanMachine, WatchMachine
-    from beamfit.language.computed import Computed
+    from beamfit.language.compiled import Computed
     from beamfit.language.document import Document
     from beamfit.language.solution import ProblemSolution
     from beamfit.lifetime.watch import Plan

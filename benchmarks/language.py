@@ -16,7 +16,7 @@ import numpy as np
 
 import beamfit.greybox  # noqa: F401 - double precision
 from beamfit.language.parse import parse_document
-from beamfit.language.statement import formulate
+from beamfit.language.problem import formulate
 
 ROOT = Path(__file__).resolve().parents[1]
 REPEATS = 30

@@ -40,8 +40,8 @@ from beamfit.io.result import load_fit, read_fitted_beams, save_fit
 from beamfit.io.ring import read_ring, read_twiss
 from beamfit.io.run import read_run
 from beamfit.io.scan import read_quad_scan
-from beamfit.language.check import check_document
-from beamfit.language.network import format_network
+from beamfit.language.network_xml import format_network
+from beamfit.language.plan import check_document
 from beamfit.sampling.ensemble import draw
 from beamfit.sampling.store import load
 from tests.conftest import ROOT

@@ -15,7 +15,7 @@ from beamfit.io.files import digest
 
 if TYPE_CHECKING:
     from beamfit.cli.show import Terminal
-    from beamfit.language.computed import Computed
+    from beamfit.language.compiled import Computed
     from beamfit.language.solution import ProblemSolution
 
 EXAMPLE = """\b

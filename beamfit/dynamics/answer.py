@@ -71,39 +71,27 @@ class Curve(NamedTuple):
         return Table(f"{self.parameter} by {self.input}", [self.input, self.parameter, ""], rows)
 
     def to_json(self) -> dict[str, Any]:
-        """Arrays with null where nothing is known."""
-        known = np.where(self.visited, self.error, np.nan)
-        fields = self._asdict() | {"error": known}
-        return json_of({k: _nulls(v) if k in ("value", "error") else v for k, v in fields.items()})
-
-
-def _nulls(values: np.ndarray) -> list[float | None]:
-    return [float(v) if np.isfinite(v) else None for v in values]
+        """Arrays; no error where the runs never were."""
+        return json_of(self._asdict() | {"error": np.where(self.visited, self.error, np.nan)})
 
 
 def _units(physics: Physics, m: int) -> list[str]:
     return [TIME if time else GAIN if gain else PURE for time, gain in physics.units(m)]
 
 
-def _constants(model: Any, seen: Any) -> jax.Array:
+def _quoted(model: Any, of: tuple[Any, float]) -> jax.Array:
+    """Constant parameters, with the gains or lags that they stand for; the offset; the delay, s."""
+    seen, delay = of
     p = curves(model, (seen, seen.u[:1]))[0]
+    parts = [p]
     if seen.physics is ARX:  # settled, y = K u
         m = seen.u.shape[1]
-        return jnp.concatenate([p, (p[2 : 2 + m] + p[2 + m :]) / (1.0 + p[0] + p[1])])
-    if seen.physics is not SECOND_ORDER:
-        return p
-    # Both lags of eq 8 where there are two: T (zeta ± sqrt(zeta² - 1)).
-    root = jnp.sqrt(jnp.maximum(p[1] ** 2 - 1.0, 1e-12))
-    return jnp.concatenate([p, p[0] * (p[1] + jnp.stack([root, -root]))])
-
-
-def _offset(model: Any, seen: Any) -> jax.Array:
-    return model["offset"]
-
-
-def _late(model: Any, of: tuple[Any, float]) -> jax.Array:
-    apart = jnp.median(jnp.diff(of[0].time))
-    return (of[1] + model["late"]) * apart
+        parts.append((p[2 : 2 + m] + p[2 + m :]) / (1.0 + p[0] + p[1]))
+    if seen.physics is SECOND_ORDER:  # both lags of eq 8 where there are two
+        root = jnp.sqrt(jnp.maximum(p[1] ** 2 - 1.0, 1e-12))
+        parts.append(p[0] * (p[1] + jnp.stack([root, -root])))
+    late = (delay + model["late"]) * jnp.median(jnp.diff(seen.time))
+    return jnp.concatenate([*parts, jnp.stack([jnp.asarray(model["offset"]), late])])
 
 
 def quantities_of(
@@ -114,9 +102,11 @@ def quantities_of(
     physics: Physics,
     delay: float,
 ) -> dict[str, Quantity]:
-    """Constant parameters with errors, and the offset if it is free."""
+    """Constant parameters with errors, and the offset and the delay if they are free."""
     m = len(seen.inputs)
-    found = derived(fit, errors, _constants, seen.runs[0], laws)
+    found = alone = derived(fit, errors, _quoted, (seen.runs[0], delay))
+    if laws is not None:
+        found = alone._replace(error=laws.error(alone.slope, alone.error))
     names, units = list(physics.parameters(seen.inputs)), _units(physics, m)
     if physics is SECOND_ORDER and found.value[1] > 1.0:
         names, units = [*names, "tau1", "tau2"], [*units, TIME, TIME]
@@ -127,29 +117,18 @@ def quantities_of(
         for i, (name, unit) in enumerate(zip(names, units, strict=True))
     }
     free = {v.name for v in fit.variables}
-    if "offset" in free:
-        said["offset"] = quantity(derived(fit, errors, _offset, seen.runs[0], laws), (), "output")
-    if "late" in free:
-        said["delay"] = quantity(derived(fit, errors, _late, (seen.runs[0], delay)), (), TIME)
-    return said
+    said |= {"offset": quantity(found, -2, "output")} if "offset" in free else {}
+    return said | ({"delay": quantity(alone, -1, TIME)} if "late" in free else {})
 
 
-def derived(
-    fit: Fit,
-    errors: Memory | None,
-    function: Callable,
-    data: Any,
-    laws: LawEvidence | None = None,
-) -> Derived:
-    """Numbers of a fit, with errors averaged over what is open of the noise and of laws."""
+def derived(fit: Fit, errors: Memory | None, function: Callable, data: Any) -> Derived:
+    """Numbers of a fit, with errors averaged over what is open of the noise."""
     found = fit.derive(function, data)
-    known = found.error
-    if errors is not None:
-        slopes = found.slope.reshape(-1, found.slope.shape[-1])
-        averaged = errors.moments(slopes).error.reshape(found.value.shape)
-        known = np.where(np.isfinite(known), averaged, np.nan)
-    known = known if laws is None else laws.error(found.slope, known)
-    return found._replace(error=known)
+    if errors is None:
+        return found
+    slopes = found.slope.reshape(-1, found.slope.shape[-1])
+    averaged = errors.moments(slopes).error.reshape(found.value.shape)
+    return found._replace(error=np.where(np.isfinite(found.error), averaged, np.nan))
 
 
 def quantity(found: Derived, i: Any, unit: str) -> Quantity:
@@ -176,11 +155,9 @@ def told(
     gains = [name for name, (_, gain) in powers if gain]
     joint = {n for k, n in enumerate(gains) if inputs[k % len(inputs)] in checks.together}
 
-    apart = min(float(np.median(np.diff(t))) for t in seen.time)
-
     def is_open(name: str, q: Quantity) -> bool:
         # Readings see what a sample leaves, exp(-apart/tau): its relative error is larger by this.
-        below = 1.0 if name == "delay" else max(1.0, apart / abs(q.value))
+        below = 1.0 if name == "delay" else max(1.0, seen.apart / abs(q.value))
         wide = q.unit == TIME and q.error is not None and q.error * below > WIDE * abs(q.value)
         # A higher order that is a first one determines only its gains and its longer lag.
         more = checks.first_order and not name.startswith(("K", "offset", "tau1", "delay"))

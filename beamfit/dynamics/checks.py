@@ -255,8 +255,7 @@ def _explained(
 
 def slow_paths(seen: PreparedOutput) -> list[np.ndarray]:
     """Outputs of further paths of first order from each input, shape (readings, paths) by run."""
-    apart = min(float(np.median(np.diff(t))) for t in seen.time)
-    times = np.geomspace(apart, max(float(np.ptp(t)) for t in seen.time) / 4, SLOW)[:, None]
+    times = np.geomspace(seen.apart, seen.span / 4, SLOW)[:, None]
     m, paths = len(seen.inputs), driven_by(seen, FIRST_ORDER)
     found = [np.asarray(unit_outputs(path, times))[:, :m] for path in paths]
     return [each.reshape(-1, each.shape[2]).T for each in found]

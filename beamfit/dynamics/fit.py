@@ -30,9 +30,9 @@ from beamfit.dynamics.search import (
     Settled,
     begun,
     case_of,
+    fitted,
     is_first_order,
     latest,
-    remembering,
     used_by,
 )
 from beamfit.errors import InputError, nearest
@@ -128,16 +128,13 @@ class ResponseFit:
     def to_json(self) -> dict[str, Any]:
         """Give one entry of ``results`` in the JSON contract."""
         names = ("output", "status", "message", "model", "map")
-        entry = {name: getattr(self, name) for name in names}
-        return json_of(
-            entry
-            | {"records": [run.path or run.name for run in self.runs]}
-            | {"delay_samples": self.delay, "parameters": self.quantities}
-            | {"curves": [curve.to_json() for curve in self.curves]}
-            | {"noise_rms": list(self.noise), "noise_memory": self.memory}
-            | {"checks": self.checks._asdict(), "held_back": [h._asdict() for h in self.held]}
-            | {"left_out": [each._asdict() for each in self.left_out]}
-        )
+        return json_of({
+            **{name: getattr(self, name) for name in names},
+            "records": [run.path or run.name for run in self.runs],
+            "delay_samples": self.delay, "parameters": self.quantities, "curves": self.curves,
+            "noise_rms": self.noise, "noise_memory": self.memory,
+            "checks": self.checks, "held_back": self.held, "left_out": self.left_out,
+        })  # fmt: skip
 
 
 def identify(
@@ -242,7 +239,7 @@ def _with_network(found: Begun, offset: bool, hidden: int, seeds: range) -> Sett
     seen, first = found.seen, found.plain.fit.model
     physics, raw = seen.runs[0].physics, np.asarray(first["map"])
     nets = (network_of(seen, physics, raw, hidden, seed) for seed in seeds)
-    return remembering(case_of(seen, offset, True), [first | {"map": net} for net in nets])
+    return fitted(case_of(seen, offset, True), [first | {"map": net} for net in nets])
 
 
 def _known(

@@ -1,37 +1,366 @@
-"""Linear state spaces, and ones with a network, of an order that the runs tell."""
+"""Linear state spaces, and ones with a network, of an order that the runs tell.
+
+States are those directions of past inputs and outputs that foretell the future best. Fits of rising
+order are compared by their information criterion.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from itertools import product
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.linalg import solve_discrete_lyapunov
 
 from beamfit.dynamics.answer import GAIN, PURE, TIME, WIDE, derived, quantity
 from beamfit.dynamics.fit import MAPS
-from beamfit.dynamics.model import WEIGHT
-from beamfit.dynamics.order import (
-    LINEAR,
-    NETWORK,
-    Tried,
-    count_of,
-    criterion,
-    free_of,
-    largest_order,
-    orders,
-    stripped,
-)
+from beamfit.dynamics.model import CLOSE, WEIGHT
 from beamfit.dynamics.record import Run, check_inputs, checked
-from beamfit.dynamics.search import Case, Settled
+from beamfit.dynamics.search import LONGEST, Case, Settled, information, noise_of, used_by
 from beamfit.dynamics.state_fit import Course, StatesFit, answer, case_of, remembering, trained
-from beamfit.dynamics.states import linear_outputs
+from beamfit.dynamics.states import Matrices, contraction, linear_outputs
 from beamfit.errors import InputError, nearest
 from beamfit.greybox import tree
 from beamfit.greybox.problem import Free, Prior
+from beamfit.noise.correlated import CorrelatedNoise, remembers
 from beamfit.quantity import Quantity
+
+# Most samples of past and future, and most rows, of the regression.
+HORIZON, ROWS = 20, 20_000
+# Strides through the samples, for slow responses; fewest rows that must remain.
+STRIDES, FEWEST = (1, 5, 25, 125), 100
+# Newton steps to the rest of a network.
+REST = 20
+
+
+class Linear:
+    """x+ = a x + b u, y = c x + d u in units of the scatter, stable whatever its numbers.
+
+    Of p: ``z`` and ``around`` (`beamfit.dynamics.states.contraction`), ``c``, ``d``, and ``units``,
+    pairs of mean and size of the inputs and the outputs. A last input that is 1 stands for offsets:
+    of the outputs alone they would have no end where the process integrates.
+    """
+
+    def run(self, p: Any, u: Any, dt: Any, x0: Any) -> tuple[jax.Array, jax.Array]:
+        """Outputs at the samples and the state after the last."""
+        y, last = linear_outputs(self.linear(p), self.scaled(p, u), x0)
+        return y * p["units"]["y"][1] + p["units"]["y"][0], last
+
+    def scaled(self, p: Any, u: Any) -> jax.Array:
+        """Inputs in their units, and 1 if there are offsets."""
+        u = (u - p["units"]["u"][0]) / p["units"]["u"][1]
+        return jnp.pad(u, ((0, 0), (0, p["z"].shape[1] - u.shape[1])), constant_values=1.0)
+
+    def linear(self, p: Any) -> Matrices:
+        """Matrices of the linear part."""
+        return Matrices(*contraction(p["z"], p["around"]), p["c"], p["d"], jnp.zeros(len(p["c"])))
+
+    matrices = linear
+
+
+class LinearWithNetwork(Linear):
+    """The same with x+ = a x + b u + steps * out @ tanh(inside @ (x/sizes, u) + bias)."""
+
+    def run(self, p: Any, u: Any, dt: Any, x0: Any) -> tuple[jax.Array, jax.Array]:
+        """Outputs at the samples and the state after the last."""
+        linear, u = self.linear(p), self.scaled(p, u)
+        n, net = len(x0), p["net"]
+        drive, inside = u @ linear.b.T, u @ net["inside"][:, n:].T
+        by_state, out = net["inside"][:, :n] / p["sizes"], p["steps"][:, None] * net["out"]
+
+        def step(x, now):
+            return linear.a @ x + now[0] + out @ jnp.tanh(by_state @ x + now[1]), x
+
+        last, x = jax.lax.scan(step, x0, (drive, inside))
+        y = x @ linear.c.T + u @ linear.d.T
+        return y * p["units"]["y"][1] + p["units"]["y"][0], last
+
+    def matrices(self, p: Any) -> Matrices:
+        """Matrices linearised about the rest at the mean input."""
+        linear, (n, m), net = self.linear(p), p["z"].shape, p["net"]
+
+        def after(x, u):
+            inside = net["inside"] @ jnp.concatenate([x / p["sizes"], u])
+            return linear.a @ x + linear.b @ u + p["steps"] * (net["out"] @ jnp.tanh(inside))
+
+        x, mean = jnp.zeros(n), jnp.zeros(m).at[p["units"]["u"].shape[1] :].set(1.0)
+        for _ in range(REST):
+            slope = jnp.eye(n) - jax.jacfwd(after)(x, mean)
+            x = x + jnp.linalg.solve(slope, after(x, mean) - x)
+        a, b = jax.jacfwd(after, (0, 1))(x, mean)
+        shift = (x - a @ x - b @ mean)[:, None] * mean  # so that it rests there
+        return linear._replace(a=a, b=b + shift)
+
+
+LINEAR, NETWORK = Linear(), LinearWithNetwork()
+
+
+def realisations(
+    u: list[np.ndarray], y: list[np.ndarray], order: int
+) -> Iterator[tuple[np.ndarray, ...]]:
+    """Find linear systems of an order from runs, one for each stride that the runs are long for.
+
+    Parameters
+    ----------
+    u, y : list of array, shape (samples, m) and (samples, k)
+        Inputs and outputs of each run, in units of their scatter, nothing missing.
+    order : int
+        States.
+
+    Yields
+    ------
+    tuple of array
+        a, b, c, d; the poles of a inside the unit circle.
+
+    Notes
+    -----
+    Canonical variates (W. Larimore 1990; L. Ljung, System Identification (1999), section 10.6): the
+    future is regressed on the past and on future inputs, the singular vectors of the past's part
+    are the states, and the matrices a regression of states and outputs on states and inputs.
+    """
+    longest = max(map(len, y))
+    for stride in STRIDES:
+        if stride > 1 and longest < stride * FEWEST:
+            return
+        # An input that changes within a stride counts by its mean.
+        mean = [each[: len(each) // stride * stride].reshape(-1, stride, each.shape[1]).mean(1)
+                for each in u]  # fmt: skip
+        read = [each[::stride][: len(v)] for each, v in zip(y, mean, strict=True)]
+        found = _regressed(mean, read, order)
+        if found is None:
+            continue
+        a, b, c, d = found
+        values, vectors = np.linalg.eig(a)
+        most = np.exp(-stride / (1000.0 * longest))
+        values = values * np.minimum(1.0, most / np.maximum(np.abs(values), 1e-12))
+        if stride > 1:
+            if np.any((np.abs(values.imag) < 1e-9) & (values.real <= 0)):
+                continue  # no root of it is real
+            values = values ** (1.0 / stride)
+        once = (vectors * values) @ np.linalg.pinv(vectors)
+        many = sum(np.linalg.matrix_power(once, i) for i in range(stride))
+        if np.isfinite(many).all():
+            yield once.real, np.linalg.lstsq(many, b, rcond=1e-10)[0].real, c, d
+
+
+def _regressed(
+    u: list[np.ndarray], y: list[np.ndarray], order: int
+) -> tuple[np.ndarray, ...] | None:
+    m, k = u[0].shape[1], y[0].shape[1]
+    count = sum(map(len, y))
+    horizon = int(np.clip(count // (4 * (m + k) + 4 * m), order // k + 2, HORIZON))
+    rows = [_rows(v, w, horizon) for v, w in zip(u, y, strict=True) if len(v) > 2 * horizon + 1]
+    if not rows or sum(len(r[0]) for r in rows) < horizon * (2 * m + k):
+        return None
+    past, later, future, inputs, now_u, now_y = (
+        np.concatenate(parts) for parts in zip(*rows, strict=True)
+    )
+    by = np.linalg.lstsq(np.hstack([past, inputs]), future, rcond=1e-10)[0][: past.shape[1]]
+    triangle = np.linalg.qr(past, mode="r")
+    _, _, right = np.linalg.svd(triangle @ by, full_matrices=False)
+    if len(right) < order:
+        return None
+    to_state = by @ right[:order].T
+    x, after = past @ to_state, later @ to_state
+    size = np.maximum(np.linalg.norm(x, axis=0), 1e-12) / np.sqrt(len(x))
+    x, after = x / size, after / size
+    ab = np.linalg.lstsq(np.hstack([x, now_u]), after, rcond=1e-10)[0].T
+    cd = np.linalg.lstsq(np.hstack([x, now_u]), now_y, rcond=1e-10)[0].T
+    return ab[:, :order], ab[:, order:], cd[:, :order], cd[:, order:]
+
+
+def _rows(u: np.ndarray, y: np.ndarray, horizon: int) -> tuple[np.ndarray, ...]:
+    """Past, past a sample later, future, future inputs, and inputs and outputs now, by row."""
+    both, count = np.hstack([y, u]), len(y) - 2 * horizon
+    at = np.arange(horizon, horizon + count, max(1, count // ROWS))
+
+    def around(of, begin, end):
+        return np.concatenate([of[at + k] for k in range(begin, end)], axis=1)
+
+    return (
+        around(both, -horizon, 0), around(both, 1 - horizon, 1), around(y, 0, horizon),
+        around(u, 0, horizon), u[at], y[at],
+    )  # fmt: skip
+
+
+def normal_form(
+    a: np.ndarray, b: np.ndarray, c: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Write a stable system with a aᵀ + b bᵀ = 1.
+
+    Returns
+    -------
+    tuple of array
+        `around` of `beamfit.dynamics.states.contraction`, shape (n + m, n + m), c, and the matrix
+        that takes states to the new ones.
+    """
+    n = len(a)
+    reach = solve_discrete_lyapunov(a, b @ b.T)
+    reach = 0.5 * (reach + reach.T) + 1e-10 * max(np.trace(reach), 1e-12) * np.eye(n)
+    values, vectors = np.linalg.eigh(reach)
+    size = np.sqrt(np.maximum(values, 1e-14 * values.max()))
+    to, back = (vectors / size) @ vectors.T, (vectors * size) @ vectors.T
+    both = np.hstack([to @ a @ back, to @ b])
+    left, _, right = np.linalg.svd(both)
+    around = right.copy()
+    around[:n] = left @ right[:n]  # the rows that are nearest, orthonormal
+    return around, c @ back, to
+
+
+def padded(model: dict[str, Any], size: int) -> dict[str, Any]:
+    """The model with further states that nothing moves and nobody reads."""
+    p, (n, m) = model["p"], model["p"]["z"].shape
+    more, at = size - n, [*range(n), *range(size, size + m)]
+    around = np.zeros((size + m, size + m))
+    around[np.ix_(at, at)] = p["around"]
+    wide = {"z": np.pad(p["z"], ((0, more), (0, 0))), "c": np.pad(p["c"], ((0, 0), (0, more)))}
+    start = np.pad(model["start"], ((0, 0), (0, more)))
+    nodes = np.zeros((len(start), 0, size))
+    return {"p": p | wide | {"around": around}, "start": start, "nodes": nodes}
+
+
+def stripped(model: dict[str, Any], n: int) -> dict[str, Any]:
+    """The model without the states beyond the first n."""
+    p, (size, m) = model["p"], model["p"]["z"].shape
+    at = np.array([*range(n), *range(size, size + m)])
+    less = {"z": p["z"][:n], "c": p["c"][:, :n], "around": p["around"][at][:, at]}
+    return {"p": p | less, "start": model["start"][:, :n], "nodes": model["nodes"][:, :, :n]}
+
+
+# State counts of the compiled searches (unused states are held at 0), and number of orders without
+# improvement that ends the search.
+SIZES, BEYOND = (4, 10), 2
+# Starts searched for each order, the best predictors; readings needed for each free number.
+BEGINS, EACH = 2, 3
+# Pole, and weight in the output, of a state that is added to an order.
+NEW, FAINT = 0.6, 1e-3
+
+
+class Tried(NamedTuple):
+    """A fit of an order, with a direct path from inputs to outputs or without."""
+
+    order: int
+    direct: bool
+    case: Case
+    found: Settled
+
+
+def count_of(case: Case) -> int:
+    """Number of readings."""
+    return sum(len(m) for s in case.seen for m in s.measured)
+
+
+def largest_order(case: Case) -> int:
+    """The largest order that leaves a few readings to each free number."""
+    k, m = len(case.seen), len(case.seen[0].inputs)
+    return int((count_of(case) / EACH - k * (m + 1)) / (m + k + len(case.courses)))
+
+
+def orders(case: Case, order: int | None, offset: bool) -> tuple[Tried, list[dict[str, Any]]]:
+    """Fit 1, 2, … states, or as many as asked for; give the best, and what was tried."""
+    tried: list[Tried] = []
+    for n in [order] if order else range(1, min(SIZES[-1], largest_order(case)) + 1):
+        tried.append(_tried(case, n, offset, tried[-1] if tried else None))
+        told = criterion(case, [t.found for t in tried])
+        if n - tried[int(np.argmin(told))].order >= BEYOND:
+            break
+    full = tried[int(np.argmin(told))]
+    model = full.found.fit.model
+    p = model["p"] | {"d": model["p"]["d"].at[:, : len(case.seen[0].inputs)].set(0.0)}
+    bounded = case._replace(free=free_of(case, full.order, len(p["z"]), offset, False))
+    plain = Tried(full.order, False, bounded, trained(bounded, [model | {"p": p}]))
+    tried.append(plain)
+    told = criterion(case, [t.found for t in tried], tried[-2].found)
+    best = plain if told[-1] <= min(told[:-1]) else full
+    return best, [{"order": t.order, "direct": t.direct, "bic": v}
+                  for t, v in zip(tried, told, strict=True)]  # fmt: skip
+
+
+def criterion(case: Case, found: Sequence[Settled], last: Settled | None = None) -> list[float]:
+    """The Bayesian information criterion of fits under the noise, with its memory, of the last."""
+    noise = _noise_of(case, last or found[-1])
+    return [information(case, each, noise) for each in found]
+
+
+def _noise_of(case: Case, found: Settled) -> CorrelatedNoise | None:
+    """The noise with a memory of residuals that have one; slopes are left out for speed."""
+    rows = case.rows(found.rest)
+    if not any(remembers(rest, used_by(found.fit)) for rest, _, _ in rows):
+        return None
+    scaled = [rest[:LONGEST, None] / max(float(rest.std()), CLOSE * s.size_y)
+              for rest, _, s in rows]  # fmt: skip
+    return noise_of(scaled, [time[:LONGEST] for _, time, _ in rows], np.zeros((0, 1)))[1]
+
+
+def free_of(case: Case, order: int, size: int, offset: bool, direct: bool) -> tuple[Free, ...]:
+    """Free numbers of a model of `size` states; those beyond the order are held at 0."""
+    k, m, runs = len(case.seen), len(case.seen[0].inputs), len(case.courses)
+    used, straight = np.arange(size) < order, np.full((k, m + offset), direct)
+    straight[:, m:] = True
+    start = np.tile(used, (runs, 1))
+    start[0] &= not offset  # where the first run begins, the offsets of a linear system say
+    parts = {"p.z": np.tile(used[:, None], (1, m + offset)), "p.c": np.tile(used, (k, 1))}
+    parts |= {"p.d": straight, "start": start}
+    return tuple(Free(name, np.where(on, -np.inf, 0.0), np.where(on, np.inf, 0.0), nuisance=True)
+                 for name, on in parts.items())  # fmt: skip
+
+
+def _tried(case: Case, n: int, offset: bool, before: Tried | None) -> Tried:
+    """The fit of an order from its best realisations, and from the order before and one more."""
+    size = next((s for s in SIZES if s >= n), n)
+    bounded = case._replace(free=free_of(case, n, size, offset, True))
+    units, k = _units(case, offset), len(case.seen)
+    u, y = _scaled(case, units, offset)
+    m, rest = u[0].shape[1], np.zeros((len(y), n))
+
+    def model(a, b, c, d, start=rest):
+        around, c, to = normal_form(a, b, c)
+        p = {"z": np.zeros((n, m)), "around": around, "c": c, "d": d, "units": units}
+        return padded({"p": p, "start": start @ to.T}, size)
+
+    models = [model(*found) for found in realisations(u, y, n)]
+    missed = [case.squares(case.rest(each)) for each in models]
+    best = [i for i in np.argsort(missed, kind="stable") if np.isfinite(missed[i])]
+    models = [models[i] for i in best[:BEGINS]]
+    if before is not None:
+        old, last = before.order, before.found.fit.model
+        a, b, c, d, _ = map(np.asarray, LINEAR.matrices(last["p"]))
+        a = np.diag([*np.zeros(old), NEW]) + np.pad(a[:old, :old], ((0, 1), (0, 1)))
+        b, c = np.vstack([b[:old], np.ones(m)]), np.hstack([c[:, :old], np.full((k, 1), FAINT)])
+        start = np.pad(np.asarray(last["start"])[:, :old], ((0, 0), (0, 1)))
+        models.append(model(a, b, c, d, start))
+    if not models:  # runs too short for a regression
+        a = np.diag(NEW ** np.arange(1.0, n + 1))
+        models = [model(a, np.ones((n, m)), np.full((k, n), FAINT), np.zeros((k, m)))]
+    return Tried(n, True, bounded, trained(bounded, models))
+
+
+def _units(case: Case, offset: bool) -> dict[str, np.ndarray]:
+    """Mean and size of inputs and outputs; without an offset all is about 0."""
+    seen = case.seen[0]
+    y = np.array([np.mean(np.concatenate(s.measured)) for s in case.seen])
+    return {
+        "u": np.stack([offset * seen.mean_u, seen.wide]),
+        "y": np.stack([offset * y, [s.size_y for s in case.seen]]),
+    }
+
+
+def _scaled(
+    case: Case, units: dict[str, np.ndarray], offset: bool
+) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """Inputs (with a 1) and outputs of the runs in units, unpadded; missing readings bridged."""
+    u, y = [], []
+    for i, run in enumerate(case.seen[0].runs):
+        count = int(np.count_nonzero(np.asarray(run.dt))) + 1
+        each = (np.asarray(run.u)[:count] - units["u"][0]) / units["u"][1]
+        u.append(np.pad(each, ((0, 0), (0, int(offset))), constant_values=1.0))
+        read = [np.interp(np.arange(count), np.asarray(s.runs[i].index), s.measured[i])
+                for s in case.seen]  # fmt: skip
+        y.append((np.stack(read, axis=1) - units["y"][0]) / units["y"][1])
+    return u, y
 
 
 def identify_states(
@@ -82,7 +411,7 @@ def identify_states(
     Notes
     -----
     Output error in a stable and minimal parametrisation (`beamfit.dynamics.states.contraction`),
-    from the best realisation of an order (`beamfit.dynamics.order`). The criterion
+    from the best realisation of an order (`beamfit.dynamics.linear`). The criterion
     takes the noise, with its memory, of the largest order tried: a drift is no reason for a
     further state. L. Ljung, System Identification (1999), chapters 4 and 16.
 

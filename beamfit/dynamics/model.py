@@ -72,28 +72,43 @@ class PreparedOutput(NamedTuple):
         """The inputs at all readings, shape (readings, inputs)."""
         return np.concatenate([np.asarray(run.u)[np.asarray(run.index)] for run in self.runs])
 
+    @property
+    def apart(self) -> float:
+        """Median time between readings, of the run where it is shortest."""
+        return min(float(np.median(np.diff(t))) for t in self.time)
+
+    @property
+    def span(self) -> float:
+        """Length of the longest run."""
+        return max(float(np.ptp(t)) for t in self.time)
+
     def scaled(self, u: Any) -> np.ndarray:
         """Inputs in units of their scatter."""
         return (np.asarray(u) - self.mean_u) / self.wide
 
 
-def driven(run: Run, number: int, output: str, physics: Physics, delay: float) -> Driven:
-    """A run with its inputs `delay` samples late; earlier inputs equal the first.
+def delayed(u: np.ndarray, delay: float) -> np.ndarray:
+    """Inputs `delay` samples late, shape (rows, inputs), padded; earlier ones equal the first.
 
     A delay of no whole number of samples has two rows a sample, one for each input that it feels.
     """
-    n, u, part = len(run), np.stack(list(run.inputs.values()), axis=1), delay % 1.0
-    whole = [np.concatenate([np.repeat(u[:1], k, axis=0), u])[:n]
-             for k in ((int(delay),) if part == 0.0 else (int(delay) + 1, int(delay)))]  # fmt: skip
+    shifts = (int(delay),) if delay % 1.0 == 0.0 else (int(delay) + 1, int(delay))
+    whole = [np.concatenate([np.repeat(u[:1], k, axis=0), u])[: len(u)] for k in shifts]
     late = np.stack(whole, axis=1).reshape(-1, u.shape[1])
     longer = padded_length(len(late)) - len(late)
-    late = np.concatenate([late, np.repeat(late[-1:], longer, axis=0)])
+    return np.concatenate([late, np.repeat(late[-1:], longer, axis=0)])
+
+
+def driven(run: Run, number: int, output: str, physics: Physics, delay: float) -> Driven:
+    """A run with its inputs late, as of `delayed`."""
+    late, part = delayed(np.stack(list(run.inputs.values()), axis=1), delay), delay % 1.0
     apart = np.append(np.diff(run.time), 0.0)
     shares, held = ([[1.0]], None) if part == 0.0 else ([[part], [1.0 - part]], [[1.0], [-1.0]])
+    longer = len(late) - len(shares) * len(run)
     dt, held = (None if s is None else np.append((s * apart).T.ravel(), np.zeros(longer))
                 for s in (shares, held))  # fmt: skip
     rows = np.flatnonzero(np.isfinite(run.outputs[output]))
-    seen = (late, dt, run.time[rows] - run.time[0], rows * len(whole))
+    seen = (late, dt, run.time[rows] - run.time[0], rows * len(shares))
     arrays = (jnp.asarray(v) for v in seen)
     held = None if held is None else jnp.asarray(held)
     return Driven(physics, *arrays, jnp.asarray(number), None, held)

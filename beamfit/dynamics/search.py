@@ -29,12 +29,12 @@ from beamfit.dynamics.model import (
     weight_priors,
 )
 from beamfit.dynamics.record import Run
-from beamfit.dynamics.response import ARX, FIRST_ORDER, SECOND_ORDER, Physics, simulate
+from beamfit.dynamics.response import ARX, FIRST_ORDER, Physics, simulate
 from beamfit.greybox.fit import Fit
-from beamfit.greybox.memory import Memory, noises, range_of, whitened_by_each
+from beamfit.greybox.memory import TIMES, Memory, noises, range_of, whitened_by_each
 from beamfit.greybox.problem import Free, Prior, Problem, Record
 from beamfit.greybox.solve import solve
-from beamfit.noise.correlated import CorrelatedNoise, innovations, remembers
+from beamfit.noise.correlated import BESIDE, CorrelatedNoise, innovations, remembers
 from beamfit.status import Status
 
 # Longest delay that is tried, in samples, and as a share of the run.
@@ -43,59 +43,74 @@ LATEST, SHARE = 24, 0.1
 # that are tried besides.
 BETTER, PARTS = 5.0, (-0.75, -0.5, -0.25, 0.25, 0.5, 0.75)
 # Time constants of the grid, and dampings of a second order.
-TIMES, DAMPINGS = 16, (0.2, 0.6, 1.0, 2.0)
-# Share of a second lag's transient after one sample below which the lag is ignored.
-FORGOTTEN = 1e-4
+LAGS, DAMPINGS = 16, (0.2, 0.6, 1.0, 2.0)
+# Step of their logarithms in a slope, share of the logarithm of squares whose gain ends a start,
+# and smallest residual of which a logarithm is taken.
+STEP, ENOUGH, TINY = 1e-3, 1e-6, 1e-150
 
 
 class Start(NamedTuple):
-    """Raw numbers, first states (runs, free states), offset, and the sum of squares."""
+    """Parameters, first states (runs, free states), offset, and the sum of squares."""
 
-    raw: np.ndarray
+    p: np.ndarray
     first: np.ndarray
     offset: float
     squares: float
 
-    @property
-    def model(self) -> dict[str, Any]:
+    def model(self, seen: PreparedOutput) -> dict[str, Any]:
         """The model that a search begins with."""
-        raw = jnp.asarray(self.raw)
+        raw = seen.runs[0].physics.raw(jnp.asarray(self.p), len(seen.inputs))
         return {"map": raw, "start": self.first, "offset": self.offset, "late": 0.0}
 
 
 def best_start(seen: PreparedOutput, offset: bool) -> Start:
-    """The best of the grid."""
+    """The best of the grid, of a difference equation that of second orders (eqs 13, 14)."""
     physics = seen.runs[0].physics
-    if physics is ARX:
-        return _as_difference(
-            seen, best_start(seen._replace(runs=driven_by(seen, SECOND_ORDER)), offset)
-        )
-    apart = min(float(np.median(np.diff(t))) for t in seen.time)
-    span = max(float(t[-1] - t[0]) for t in seen.time)
-    times = np.geomspace(0.3 * apart, span, TIMES)
-    shapes = np.array([[t] for t in times] if physics is FIRST_ORDER
-                      else [[t, z] for t in times for z in DAMPINGS])  # fmt: skip
-    columns = [np.asarray(unit_outputs(run, shapes)) for run in seen.runs]
-    found = [_fitted(seen, s, [c[i] for c in columns], offset) for i, s in enumerate(shapes)]
-    best = min(range(len(shapes)), key=lambda i: found[i].squares)
+    apart, span = seen.apart, seen.span
+    times = np.geomspace(0.3 * apart, span, LAGS)
+    grid = np.log([[t] for t in times] if physics is FIRST_ORDER
+                  else [[t, z] for t in times for z in DAMPINGS])  # fmt: skip
 
-    def at(logarithms: np.ndarray) -> Start:
-        shape = np.exp(np.clip(logarithms, *np.log([1e-3 * apart, 1e3 * span])))
-        there = [np.asarray(unit_outputs(run, shape[None]))[0] for run in seen.runs]
-        return _fitted(seen, shape, there, offset)
+    def shapes(logarithms: np.ndarray) -> np.ndarray:
+        found = np.exp(logarithms)
+        return found if physics is not ARX else _difference(found, apart)
 
-    # To a hundredth of a time constant: delays are compared by what remains.
-    begin = np.log(shapes[best])
-    simplex = begin + 0.3 * np.vstack([np.zeros(len(begin)), np.eye(len(begin))])
-    options = {"initial_simplex": simplex, "xatol": 0.01, "fatol": 0.0, "maxiter": 40}
-    end = minimize(lambda x: at(x).squares, begin, method="Nelder-Mead", options=options)
-    return min(at(end.x), found[best], key=lambda each: each.squares)
+    def left(logarithms: np.ndarray) -> np.ndarray:
+        triangles = _triangles(seen.runs, seen.measured, shapes(logarithms), offset)
+        return 2.0 * np.log(np.maximum(np.abs(np.asarray(triangles)[:, -1, -1]), TINY))
+
+    def with_slope(x: np.ndarray) -> tuple[float, np.ndarray]:
+        moved = STEP * np.eye(len(x))
+        here, up, down = np.split(left(np.vstack([x, x + moved, x - moved])), [1, 1 + len(x)])
+        return float(here[0]), (up - down) / (2.0 * STEP)
+
+    bounds = [tuple(np.log([1e-3 * apart, 1e3 * span]))] * grid.shape[1]
+    begin = grid[np.argmin(left(grid))]
+    ends = {"ftol": ENOUGH, "maxiter": 20}
+    x = minimize(with_slope, begin, jac=True, bounds=bounds, method="L-BFGS-B", options=ends).x
+    (shape,) = shapes(x[None])
+    (triangle,) = np.asarray(_triangles(seen.runs, seen.measured, shape[None], offset))
+    size = np.linalg.norm(triangle[:, :-1], axis=0)
+    size = np.where(size > 0, size, 1.0)
+    found = np.linalg.lstsq(triangle[:, :-1] / size, triangle[:, -1], rcond=1e-10)[0] / size
+    k = len(seen.runs) * physics.free_states + offset
+    first = found[len(found) - k :][: k - offset].reshape(len(seen.runs), -1)
+    p, level = np.append(shape, found[: len(found) - k]), float(found[-1]) if offset else 0.0
+    return Start(p, first, level, float(triangle[-1, -1] ** 2))
+
+
+def _difference(shapes: np.ndarray, apart: float) -> np.ndarray:
+    """a1 and a2 of the difference equations that samples of second orders obey."""
+    time, zeta = shapes.T.astype(complex)
+    root = np.sqrt(zeta**2 - 1.0)
+    one, other = (np.exp(-apart / time * (zeta + sign * root)) for sign in (1, -1))
+    return np.stack([-(one + other), one * other], axis=1).real
 
 
 @jax.jit
 def unit_outputs(run: Driven, shapes: jax.Array) -> jax.Array:
     """Outputs for unit gains and unit first states, shape (shapes, columns, readings)."""
-    m, k = run.u.shape[1], run.physics.free_states
+    m, k = len(run.physics.units(run.u.shape[1])) - shapes.shape[1], run.physics.free_states
 
     def one(shape, gains, first):
         p = jnp.broadcast_to(jnp.concatenate([shape, gains]), (len(run.u), len(shape) + m))
@@ -107,54 +122,28 @@ def unit_outputs(run: Driven, shapes: jax.Array) -> jax.Array:
     return jax.vmap(each, in_axes=(0, None, None))(shapes, gains, firsts)
 
 
-def _fitted(
-    seen: PreparedOutput, shape: np.ndarray, columns: list[np.ndarray], offset: bool
-) -> Start:
-    m, k, runs = len(seen.inputs), seen.runs[0].physics.free_states, len(columns)
+@partial(jax.jit, static_argnums=3)
+def _triangles(runs: tuple[Driven, ...], measured: Any, shapes: jax.Array, offset: bool):
+    """Triangular factors of outputs of unit gains, first states and offset, and of the readings.
+
+    One for each shape; its last number is what least squares leave.
+    """
     parts = []
-    for i, column in enumerate(columns):
-        first = np.zeros((column.shape[1], runs * k))
-        first[:, i * k : (i + 1) * k] = column[m:].T
-        parts.append(np.hstack([column[:m].T, first, np.ones((len(first), 1))]))
-    design, y = np.vstack(parts), np.concatenate(seen.measured)
-    if not offset:
-        design = design[:, :-1]
-    size = np.linalg.norm(design, axis=0)
-    size = np.where(size > 0, size, 1.0)
-    found = np.linalg.lstsq(design / size, y, rcond=1e-10)[0] / size
-    rest = float(np.sum((design @ found - y) ** 2))
-    raw = np.concatenate([np.log(shape), found[:m]])
-    first = found[m : m + runs * k].reshape(runs, k)
-    return Start(raw, first, float(found[-1]) if offset else 0.0, rest)
+    for i, (run, y) in enumerate(zip(runs, measured, strict=True)):
+        columns = jnp.swapaxes(unit_outputs(run, shapes), 1, 2)
+        k = run.physics.free_states
+        others = (0, 0), (0, 0), (i * k, (len(runs) - 1 - i) * k)
+        rest = jnp.stack([jnp.ones_like(y)] * offset + [y], axis=1)
+        rest = jnp.broadcast_to(rest, (len(shapes), *rest.shape))
+        parts.append([columns[..., :-k], jnp.pad(columns[..., -k:], others), rest])
+    rows = jnp.concatenate([jnp.concatenate(part, axis=2) for part in parts], axis=1)
+    few = max(0, rows.shape[2] - rows.shape[1])
+    return jnp.linalg.qr(jnp.pad(rows, ((0, 0), (0, few), (0, 0))), mode="r")
 
 
 def driven_by(seen: PreparedOutput, physics: Physics) -> tuple[Driven, ...]:
     """The runs with another physics."""
     return tuple(replace(run, physics=physics) for run in seen.runs)
-
-
-def _as_difference(seen: PreparedOutput, found: Start) -> Start:
-    """The difference equation whose samples are those of a second order (eqs 13-16)."""
-    m = len(seen.inputs)
-    dt = float(np.median(np.asarray(seen.runs[0].dt)[: len(seen.time[0]) - 1]))
-    p = np.asarray(SECOND_ORDER.physical(jnp.asarray(found.raw), m))
-    advance = partial(SECOND_ORDER.advance, jnp.asarray(p), dt=dt)
-    rest = np.column_stack([advance(jnp.asarray(e), jnp.zeros(m)) for e in np.eye(2)])
-    a1, a2 = -np.trace(rest), np.linalg.det(rest)
-    once = np.stack([np.asarray(advance(jnp.zeros(2), jnp.asarray(e))) for e in np.eye(m)])
-    twice = np.stack([np.asarray(advance(jnp.asarray(s), jnp.asarray(e)))
-                      for s, e in zip(once, np.eye(m), strict=True)])  # fmt: skip
-    b1 = once[:, 0]
-    b2 = twice[:, 0] + a1 * b1 - b1
-    raw = ARX.raw(jnp.asarray(np.concatenate([[a1, a2], b1, b2])), m)
-    # The sample before the first, by running the state backwards; a lag far below a sample has
-    # forgotten it.
-    back = np.linalg.inv(rest) if a2 > FORGOTTEN else np.eye(2)
-    states = np.stack([
-        [s[0], (back @ (s - np.stack(once, axis=1) @ np.asarray(r.u[0])))[0]]
-        for s, r in zip(found.first, seen.runs, strict=True)
-    ])  # fmt: skip
-    return Start(np.asarray(raw), states, found.offset, found.squares)
 
 
 def seen_of(runs: tuple[Run, ...], output: str, physics: Physics, delay: float) -> PreparedOutput:
@@ -201,9 +190,15 @@ def latest(runs: tuple[Run, ...]) -> int:
     return min(LATEST, int(SHARE * min(map(len, runs))))
 
 
-# Correlation times looked at, and variances of the part without memory, in those that the part
-# that wanders gets anew from one sample to the next.
-CORRELATION_TIMES, WHITE = 16, (0.0, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 1000.0)
+def noises_of(
+    time: Sequence[np.ndarray], count: int = TIMES, ratios: Sequence[float] = BESIDE
+) -> list[CorrelatedNoise]:
+    """Noises that readings at these times, by run, may have: so many correlation times, and with
+    each the ratios of white variance to what the part that wanders gets anew in a sample.
+    """
+    apart = min(float(np.median(np.diff(t))) for t in time)
+    ends = np.array([range_of(t) for t in time])
+    return noises((ends[:, 0].min(), ends[:, 1].max()), apart, count, ratios)
 
 
 def noise_of(
@@ -217,10 +212,7 @@ def noise_of(
     `rows` hold the slopes of each run's residuals and, last, the residuals, in units of their
     noise; `known` those of the priors; `noise` is it if it is known.
     """
-    apart = min(float(np.median(np.diff(t))) for t in time)
-    ends = np.array([range_of(t) for t in time])
-    grid = noises((ends[:, 0].min(), ends[:, 1].max()), apart, CORRELATION_TIMES, WHITE)
-    grid = grid if noise is None else [noise]
+    grid = noises_of(time) if noise is None else [noise]
     memory = whitened_by_each(grid, list(zip(rows, time, strict=True)), known).memory()
     best = int(np.argmax(memory.weight))
     return memory, grid[best], float(np.sqrt(memory.squares[best] / memory.dof))
@@ -228,6 +220,8 @@ def noise_of(
 
 # Most rounds with a memory of the noise, and the gain in -2 ln L below which they end.
 AGAIN, GAINED = 3, 0.05
+# Most readings of each output that estimate correlated noise.
+LONGEST = 5000
 
 
 class Case(NamedTuple):
@@ -417,15 +411,27 @@ def settled(
 
 
 def with_memory(
-    case: Case, white: Settled, search: Callable[..., Settled], most: int | None = None
+    case: Case, white: Settled, search: Callable[..., Settled], worse: float = np.inf
 ) -> Settled:
-    """The fit again, the noise of its residuals with a memory."""
+    """The fit again, its noise with a memory, where residuals are correlated.
+
+    It may leave squares larger by the factor `worse`.
+    """
+    if not white.correlated(case):
+        return white
 
     def again(found: Settled) -> Settled:
-        _, memory, size = found.remembered(case, most=most)
+        _, memory, size = found.remembered(case, most=LONGEST)
         return search(case, found.fit.model, size * found.noise, memory=memory)
 
-    return rounds(white, again, GAINED, AGAIN)[0]
+    found = rounds(white, again, GAINED, AGAIN)[0]
+    if case.squares(found.rest) > worse * case.squares(white.rest):
+        # The search took a part of the response for noise that wanders.
+        found = white
+    errors = found.remembered(case, most=LONGEST)[0]
+    if found is not white and max(len(r) for row in found.rest for r in row) > LONGEST:
+        errors = found.remembered(case, found.memory)[0]
+    return found._replace(rests=white.rests, errors=errors)
 
 
 # Steps of a round, after which the noise is estimated again, and most rounds.
@@ -448,16 +454,13 @@ def _round(
     return found._replace(likelihood=information(case, found, memory))
 
 
-def remembering(case: Case, models: Sequence[Any]) -> Settled:
+def fitted(case: Case, models: Sequence[Any]) -> Settled:
     """The best fit from some starts, its noise with a memory where residuals are correlated.
 
     The noise weighs against the priors of a network, so it is taken anew in every round.
     """
     found = settled(case, models, _round, lambda f: GAINED + 1e-9 * abs(f.likelihood), ROUNDS)
-    if not found.correlated(case):
-        return found
-    again = with_memory(case, found, _round)
-    return again._replace(rests=found.rests, errors=again.remembered(case)[0])
+    return with_memory(case, found, _round)
 
 
 class Begun(NamedTuple):
@@ -473,7 +476,7 @@ def begun(
 ) -> Begun:
     """Identify with constant parameters; the delay among candidates if None."""
     start, seen, delay = start_of(runs, output, physics, delay, offset)
-    return Begun(seen, delay, remembering(case_of(seen, offset), [start.model]))
+    return Begun(seen, delay, fitted(case_of(seen, offset), [start.model(seen)]))
 
 
 def is_first_order(found: Begun, offset: bool) -> bool:
@@ -482,4 +485,4 @@ def is_first_order(found: Begun, offset: bool) -> bool:
         return False
     lower = found.seen._replace(runs=driven_by(found.seen, FIRST_ORDER))
     start = best_start(lower, offset)
-    return remembering(case_of(lower, offset), [start.model]).likelihood <= found.plain.likelihood
+    return fitted(case_of(lower, offset), [start.model(lower)]).likelihood <= found.plain.likelihood

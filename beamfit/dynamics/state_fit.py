@@ -49,9 +49,8 @@ STEPS, ROUNDS, EACH = 25, 80, 1e-4
 CLOSING = (1.0, 0.1, 1e-2, 1e-3, 1e-4)
 # Distance in time between the series of two outputs, in lengths of the run: no correlation is left.
 APART = 1e6
-# Most readings of each output that estimate correlated noise; factor by which the fit with it may
-# leave larger squares than the fit without.
-LONGEST, WORSE = 5000, 1.5
+# Factor by which a fit with correlated noise may leave larger squares than the fit without.
+WORSE = 1.5
 
 
 class System(Protocol):
@@ -134,16 +133,7 @@ def begun(case: Case, model: Any, noise: np.ndarray) -> Any:
 
 def remembering(case: Case, white: Settled) -> Settled:
     """The fit again, its noise with a memory, where residuals are correlated."""
-    if not white.correlated(case):
-        return white
-    found = with_memory(case, white, _round, LONGEST)
-    if case.squares(found.rest) > WORSE * case.squares(white.rest):
-        # The search took a part of the response for noise that wanders.
-        found = white
-    errors = found.remembered(case, most=LONGEST)[0]
-    if found is not white and max(len(r) for row in found.rest for r in row) > LONGEST:
-        errors = found.remembered(case, found.memory)[0]
-    return found._replace(rests=white.rests, errors=errors)
+    return with_memory(case, white, _round, WORSE)
 
 
 # Percent of an output explained by the free run below which segments are tried.

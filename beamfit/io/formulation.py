@@ -11,19 +11,18 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from beamfit.errors import InputError, located
-from beamfit.greybox.mlp import MLP
 from beamfit.io.cells import check_length
 from beamfit.io.files import read_text, text_lines
-from beamfit.language.check import check_document
 from beamfit.language.document import Document
-from beamfit.language.network import format_network, parse_network
 from beamfit.language.parse import parse_document
+from beamfit.language.plan import check_document
 from beamfit.language.text import format_document
 from beamfit.language.xml import format_xml, parse_xml
 from beamfit.writing import write_atomically
 
 if TYPE_CHECKING:
-    from beamfit.language.computed import Computed
+    from beamfit.greybox.mlp import MLP
+    from beamfit.language.compiled import Computed
     from beamfit.language.solution import ProblemSolution
 
 # 32 MB as numbers; a table that a formulation uses is far smaller.
@@ -210,7 +209,7 @@ def solved_formulation(
     with located(path):
         check_document(document, {n: t.shape for n, t in (tables or {}).items()}, values or ())
         if document.problem is None:
-            from beamfit.language.computed import compute_document  # JAX from here on
+            from beamfit.language.compiled import compute_document  # JAX from here on
 
             return compute_document(document, tables, values, gains)
         from beamfit.language.solution import solve_document
@@ -235,6 +234,8 @@ def read_network(path: str | os.PathLike[str]) -> MLP:
     InputError
         If the file cannot be read or is not a network.
     """
+    from beamfit.language.network_xml import parse_network  # JAX from here on
+
     return parse_network(read_text(path), path)
 
 
@@ -248,4 +249,6 @@ def write_network(path: str | os.PathLike[str], net: MLP) -> None:
     net : MLP
         The network.
     """
+    from beamfit.language.network_xml import format_network
+
     write_atomically(path, format_network(net).encode())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 
 import jax
@@ -11,10 +12,10 @@ import numpy as np
 
 from beamfit.language import document as d
 from beamfit.language import expression as x
-from beamfit.language.evaluate import Setting, Value, check_rank, evaluate, picked, stored
-from beamfit.language.network import with_weights
-from beamfit.language.scope import Array, Axes, IndexSet, Net, Scope, located, widened
-from beamfit.language.steps import callee_of, gains_of
+from beamfit.language.evaluate import Setting, Value, check_rank, evaluate, lifted, picked, stored
+from beamfit.language.network_xml import with_weights
+from beamfit.language.plan import callee_of, gains_of
+from beamfit.language.scope import Array, Axes, Net, Scope, located, widened
 
 Arrays = dict[str, jax.Array]
 
@@ -22,28 +23,29 @@ Arrays = dict[str, jax.Array]
 def called(statement: d.Call, s: Setting, inner: Callable[[str], Callable]) -> Arrays:
     """The arrays that a call changes; `inner` gives a mapping inside by name as it is computed."""
     callee = callee_of(s.scope, statement)
-    axes = s.axes
-    given = given_to(statement, callee, s)
+    given, count = given_to(statement, callee, s), len(s.axes)
     names = [gains_of(w, callee, statement.mapping) for w in statement.outputs]
-    lengths = [len(one) for one in axes.values()]
-    batched = {n: a.shape[: len(axes)] != (1,) * len(axes) for n, a in given.items()}
-    flat = {n: _points(a, lengths, batched[n]) for n, a in given.items()}
     run = partial(_network, callee) if isinstance(callee, Net) else inner(statement.mapping)
     function = _function(s, callee, run, names)
-    many = any(batched.values())
-    if many:
-        function = jax.vmap(function, in_axes=({n: 0 if b else None for n, b in batched.items()},))
-    found = function(flat)
+    # All points at once: along each iterator that an input changes with.
+    lead = [max((a.shape[k] for a in given.values()), default=1) for k in range(count)]
+    many = [k for k, n in enumerate(lead) if n > 1]
+    for k in reversed(many):
+        function = jax.vmap(
+            function, ({n: 0 if a.shape[k] > 1 else None for n, a in given.items()},)
+        )
+    found = function({n: a.reshape([m for m in a.shape[:count] if m > 1] + [*a.shape[count:]])
+                      for n, a in given.items()})  # fmt: skip
     made: Arrays = {}
     for wire, value, (output, _) in zip(statement.outputs, found, names, strict=True):
-        own = value.shape[1:] if many else value.shape
-        head = lengths if many else [1] * len(axes)
-        whole = Value(value.reshape(*head, *own), len(own))
-        own_axes, to = widened(s.scope, axes, wire.each), wire.target
-        part = _output(s, whole, output, callee, own_axes, len(axes))
-        check_rank(s.scope, to, s.scope.arrays[to.name], part, wire.value)
-        array, old = s.scope.arrays[to.name], made.get(to.name, s.arrays[to.name])
-        made[to.name] = stored(old, s.scope, array, to, own_axes, part, wire.value)
+        own = value.shape[len(many) :]
+        whole = Value(value.reshape(*lead, *own), len(own))
+        axes, to = widened(s.scope, s.axes, wire.each), wire.target
+        part = _output(s, whole, output, callee, axes, count)
+        array = s.scope.arrays[to.name]
+        check_rank(s.scope, to, array, part, wire.value)
+        old = made.get(to.name, s.arrays[to.name])
+        made[to.name] = stored(old, s.scope, array, to, axes, part, wire.value)
     return made
 
 
@@ -60,44 +62,30 @@ def given_to(statement: d.Call, callee: Scope | Net, s: Setting) -> Arrays:
 def _wired(s: Setting, array: Array, wires: list[d.Assignment]) -> jax.Array:
     """An input of what is called: one axis for each iterator of the call, then its dimensions."""
     count = len(s.axes)
-    found = None
+    found = jnp.zeros((*[1] * count, *array.shape))
+    if array.values is not None:
+        found = found + jnp.asarray(array.values, float).reshape(array.shape)
     for wire in wires:
-        inner = widened(s.scope, s.axes, wire.each)
-        value = evaluate(wire.value, Setting(s.scope, s.arrays, inner, s.bound, s.known, s.watch))
+        value = evaluate(wire.value, replace(s, axes=widened(s.scope, s.axes, wire.each)))
         check_rank(s.scope, wire.target, array, value, wire.value)
-        if found is None:
-            found = jnp.zeros((*[1] * count, *array.shape))
-            if array.values is not None:
-                found = found + jnp.asarray(array.values, float).reshape(array.shape)
-        head = value.array.shape[:count]
-        shape = tuple(max(a, b) for a, b in zip(head, found.shape, strict=False))
-        found = jnp.broadcast_to(found, (*shape, *array.shape))
-        # Iterators of the call lead, as further dimensions that are taken whole.
-        lead = {f"{i}'": IndexSet("", np.arange(n)) for i, n in enumerate(shape)}
         own = widened(s.scope, {}, wire.each)
-        outer = Array(array.name, "input", (*lead.values(), *array.dims), array.at)
-        rest = wire.target.indices or (x.Whole(),) * len(array.dims)
-        leading = tuple(x.Name(n) for n in lead)
-        target = x.Name(array.name, (*leading, *rest), wire.target.at)
-        found = stored(found, s.scope, outer, target, {**lead, **own}, value, wire.value)
+
+        def put(old, v, wire=wire, own=own, rank=value.rank):
+            return stored(old, s.scope, array, wire.target, own, Value(v, rank), wire.value)
+
+        for _ in range(count):
+            put = jax.vmap(put)
+        lead = np.broadcast_shapes(found.shape[:count], value.array.shape[:count])
+        pair = (jnp.broadcast_to(a, (*lead, *a.shape[count:])) for a in (found, value.array))
+        found = put(*pair)
     return found
-
-
-def _points(a: jax.Array, lengths: list[int], batched: bool) -> jax.Array:
-    """An input with the iterators of the call as one axis, or without them."""
-    own = a.shape[len(lengths) :]
-    if not batched:
-        return a.reshape(own)
-    return jnp.broadcast_to(a, (*lengths, *own)).reshape(-1, *own)
 
 
 def _output(s: Setting, v: Value, output: x.Name, callee, axes: Axes, count: int) -> Value:
     """The elements of an output that a wire takes."""
     array = callee.outputs[output.name]
     if v.rank == 0 or not output.indices:
-        more = len(axes) - count
-        shape = v.array.shape
-        return Value(v.array.reshape(*shape[:count], *[1] * more, *shape[count:]), v.rank)
+        return lifted(v, len(axes))
     indices = located(s.scope, output, array, axes)
     whole = sum(isinstance(i, x.Whole) for i in output.indices)
     lead = []

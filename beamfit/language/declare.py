@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+import math
+from collections.abc import Iterable, Iterator, Mapping
 
 import numpy as np
 
@@ -69,7 +70,7 @@ def scope_of(m: d.Mapping, shapes: Mapping[str, tuple[int, int]] | None = None) 
 
 
 def _net(network: d.NetworkDefinition) -> Net:
-    from beamfit.language.network import network_of, weights_of  # JAX from here on
+    from beamfit.language.network_xml import network_of, weights_of  # JAX from here on
 
     mlp = network_of(network)
     values = tuple(map(float, weights_of(mlp)))
@@ -206,3 +207,44 @@ def _work(scope: Scope, f: d.Function, stack: tuple[str, ...], seen: dict | None
                            "smaller functions")  # fmt: skip
         seen[f.name] = total
     return seen[f.name]
+
+
+# ---- the problem
+
+
+def check_problem(document: d.Document, given: Iterable[str] = ()) -> None:
+    """Refuse names that the mapping has not, bounds that contradict, and inputs without a value."""
+    p, m = document.problem, document.mapping
+    faces = (p.variables, m.inputs, "input"), ((*p.goals, *p.limits), m.outputs, "output")
+    for group, face, what in faces:
+        known = [one.name for one in face]
+        for one in group:
+            if one.model not in known:
+                found = f"no {what} '{one.model}' in the mapping"
+                raise error_at(one.at, found, nearest(one.model, known))
+    sizes = {one.name: one.dimensions for one in m.outputs}
+    for one in p.goals:
+        if sizes[one.model]:
+            found = f"'{one.model}' of {len(sizes[one.model])} dimension(s) as an objective"
+            raise error_at(one.at, found, "an output that is a number, such as a sum(... | ...)")
+    _check_variables(p)
+    names = [*(v.model for v in p.variables), *given]
+    for one in m.inputs:
+        if one.values is None and one.name not in names:
+            expected = f"variable {one.name};, input {one.name} = VALUE;, or --set {one.name}=VALUE"
+            raise error_at(one.at, f"input '{one.name}' without a value", expected)
+
+
+def _check_variables(p: d.ProblemStatement) -> None:
+    for one in (*p.variables, *p.limits):
+        if not one.lower <= one.upper:
+            found = f"bounds of '{one.label}' from {one.lower:g} up to {one.upper:g}"
+            raise error_at(one.at, found, "a lower bound that is not above the upper one")
+    names = [v.model for v in p.variables]
+    for v in p.variables:
+        if names.count(v.model) > 1:
+            raise error_at(v.at, f"variable '{v.model}' twice", "each variable once")
+        low, high = v.random or (0.0, 0.0)
+        if not (low <= high and math.isfinite(high - low)):
+            found = f"a random start of '{v.label}' in [{low:g}, {high:g}]"
+            raise error_at(v.at, found, "a finite range, the lower end first")

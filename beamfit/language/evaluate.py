@@ -76,7 +76,7 @@ def evaluate(e: x.Expression, s: Setting) -> Value:
     """Compute an expression for all combinations of the iterators in force."""
     found = s.known.get(id(e))
     if found is not None:
-        return _lifted(found, len(s.axes))
+        return lifted(found, len(s.axes))
     match e:
         case x.Literal():
             found = Value(jnp.full((1,) * len(s.axes), e.value))
@@ -100,7 +100,7 @@ def evaluate(e: x.Expression, s: Setting) -> Value:
     return found
 
 
-def _lifted(v: Value, axes: int) -> Value:
+def lifted(v: Value, axes: int) -> Value:
     """A value of outer iterators, for as many iterators as are in force further in."""
     outer = v.array.ndim - v.rank
     shape = v.array.shape
@@ -208,7 +208,7 @@ def _named(e: x.Name, s: Setting) -> Value:
     if e.name in s.bound:
         if e.indices:
             raise error_at(e.at, f"'{e}', an index of an argument", "the argument as a whole")
-        return _lifted(s.bound[e.name], len(s.axes))
+        return lifted(s.bound[e.name], len(s.axes))
     array = s.scope.arrays.get(e.name)
     if array is None or (array.role == "parameter" and not array.dims):
         value = s.scope.constant(e.name)

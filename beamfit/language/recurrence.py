@@ -12,9 +12,8 @@ import numpy as np
 from beamfit.language import document as d
 from beamfit.language import expression as x
 from beamfit.language.evaluate import Setting, Value, evaluate, picked
-from beamfit.language.lags import Lagged, RecurrencePlan
+from beamfit.language.plan import Lagged, RecurrencePlan, sources
 from beamfit.language.scope import Array, Axes, IndexSet, MappingStep, Scope, widened
-from beamfit.language.steps import sources
 
 ONE = IndexSet("", np.arange(1))
 Arrays = dict[str, jax.Array]

@@ -18,8 +18,8 @@ from beamfit.greybox.fit import Fit, FittedConstraint, FittedVariable
 from beamfit.greybox.problem import TOLERANCE
 from beamfit.greybox.solve import solve
 from beamfit.language import document as d
-from beamfit.language.computed import gain_tables, gains_at, outputs_at
-from beamfit.language.statement import Formulation, at_start, formulate, starts_of
+from beamfit.language.compiled import gain_tables, gains_at, outputs_at
+from beamfit.language.problem import Formulation, at_start, formulate, starts_of
 from beamfit.language.trace import cause_of
 from beamfit.quantity import Quantity
 from beamfit.statistics import reach_of
@@ -53,10 +53,6 @@ class ProblemSolution:
         What was found.
     outputs, gains : mapping of str to array
         Values at the answer, and the derivatives that were asked for.
-    factor : float
-        Objective over cost: negative where it is maximised.
-    squares : bool
-        Whether the objective is a sum of squares, so that there are errors.
     notes : tuple of str
         What was made of the document, its starts and its solver parameters.
     made : Formulation
@@ -67,8 +63,6 @@ class ProblemSolution:
     fit: Fit
     outputs: Mapping[str, np.ndarray]
     gains: Mapping[str, np.ndarray]
-    factor: float
-    squares: bool
     notes: tuple[str, ...]
     made: Formulation
 
@@ -85,7 +79,7 @@ class ProblemSolution:
     @property
     def objective(self) -> float:
         """The objective in the terms of the document."""
-        return self.factor * self.fit.cost
+        return self.made.factor * self.fit.cost
 
     @property
     def solver(self) -> str:
@@ -96,13 +90,15 @@ class ProblemSolution:
     def variables(self) -> list[FittedVariable]:
         """Free numbers by their labels, with d(objective)/d(bound)."""
         return [
-            v._replace(reduced_gradient=self.factor * v.reduced_gradient)
+            v._replace(reduced_gradient=self.made.factor * v.reduced_gradient)
             for v in self.fit.variables
         ]
 
     def constraints(self) -> list[FittedConstraint]:
         """Limited outputs by their labels, with d(objective)/d(limit)."""
-        return [c._replace(multiplier=self.factor * c.multiplier) for c in self.fit.constraints]
+        return [
+            c._replace(multiplier=self.made.factor * c.multiplier) for c in self.fit.constraints
+        ]
 
     def quantity(self, v: FittedVariable) -> Quantity:
         """A free number with its error; its interval is that of Student's t."""
@@ -118,7 +114,7 @@ class ProblemSolution:
 
     def tables(self) -> list[Table]:
         """Objective, variables, constraints and outputs as tables."""
-        tables = [_table("variable", self.variables(), self._row, self.squares)]
+        tables = [_table("variable", self.variables(), self._row, self.made.squares)]
         if self.fit.constraints:
             rows = self.constraints()
             tables.append(_table("constraint", rows, _limited, False, "multiplier"))
@@ -127,7 +123,7 @@ class ProblemSolution:
         return tables + gain_tables(self.made.program.scope, self.gains)
 
     def _row(self, v: FittedVariable) -> list[str]:
-        error = ["-" if not math.isfinite(v.error) else f"{v.error:.2g}"] * self.squares
+        error = ["-" if not math.isfinite(v.error) else f"{v.error:.2g}"] * self.made.squares
         slope = f"{v.reduced_gradient + 0.0:.3g}"
         return [v.name, f"{v.value:.8g}", *error, *_ends(v), v.state, slope]
 
@@ -142,8 +138,8 @@ class ProblemSolution:
             "status": self.status,
             "message": self.message,
             "objective": self.objective,
-            "direction": "maximize" if self.factor < 0 else "minimize",
-            "least_squares": self.squares,
+            "direction": "maximize" if self.made.factor < 0 else "minimize",
+            "least_squares": self.made.squares,
             "dof": self.fit.dof,
             "solver": self.solver,
             "kkt_residual": self.fit.kkt.worst,
@@ -152,7 +148,7 @@ class ProblemSolution:
             "outputs": self.outputs,
             "gains": self.gains,
             "starts": [
-                {"objective": self.factor * a.cost, "solver": a.solver, "said": a.said}
+                {"objective": self.made.factor * a.cost, "solver": a.solver, "said": a.said}
                 for a in self.fit.attempts
             ],
             "notes": self.notes,
@@ -248,7 +244,7 @@ def solve_document(
         notes = (*notes, NOISE)
     outputs, gained = outputs_at(made.program, fit.model), gains_at(made.program, fit.model, gains)
     name = _goals(made.document)
-    return ProblemSolution(name, fit, outputs, gained, made.factor, made.squares, notes, made)
+    return ProblemSolution(name, fit, outputs, gained, notes, made)
 
 
 def _started(made: Formulation) -> tuple[Formulation, tuple[str, ...]]:

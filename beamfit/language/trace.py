@@ -12,10 +12,8 @@ from beamfit.language import expression as x
 from beamfit.language.calls import Arrays, given_to
 from beamfit.language.compiled import Program, carry_out
 from beamfit.language.evaluate import Setting, Value, evaluate
-from beamfit.language.lags import RecurrencePlan
-from beamfit.language.order import StepGroup
+from beamfit.language.plan import RecurrencePlan, StepGroup, callee_of
 from beamfit.language.scope import Axes, IndexSet, MappingStep, Scope, said_at
-from beamfit.language.steps import callee_of
 
 
 class _FoundError(Exception):
@@ -62,17 +60,13 @@ def cause_of(
         if not np.all(np.isfinite(value)):
             return f"{inside}{name} is not finite"
     for group in program.order.needed(names):
-        try:
-            changed = carry_out(program.order, group, arrays, _Watch(slopes))
-        except _FoundError as found:
-            return f"{inside}{found}"
-        if slopes and isinstance(group.steps[0].what, d.Call) and group.plan is None:
-            step = group.steps[0]
-            found = _of_call(program, step, Setting(program.scope, arrays, step.axes), slopes)
-            if found is not None:
-                return inside + found
-        if not all(np.all(np.isfinite(array)) for array in changed.values()):
-            return inside + _of_group(program, group, arrays, changed)
+        changed = carry_out(program.order, group, arrays)
+        finite = all(np.all(np.isfinite(array)) for array in changed.values())
+        found = (
+            None if finite and not slopes else _of_group(program, group, arrays, changed, slopes)
+        )
+        if found is not None:
+            return inside + found
         arrays |= changed
     return None
 
@@ -118,36 +112,41 @@ def _may_be_steep(e: x.Expression) -> bool:
     return not (isinstance(e.parts[1], x.Literal) and e.parts[1].value >= 1)
 
 
-def _of_group(program: Program, group: StepGroup, arrays: Arrays, changed: Arrays) -> str:
+def _of_group(
+    program: Program, group: StepGroup, arrays: Arrays, changed: Arrays, slopes: bool
+) -> str | None:
     """Description of what is not finite in a group: in a call, or at the first bad time."""
     scope = program.scope
     for step in group.steps if group.plan is None else group.plan.steps:
         axes = step.axes
         if group.plan is not None:
             time = group.plan.time[step.number]
-            upto = 1 + _first_time(group.plan, changed)
-            axes = axes | {time: IndexSet(axes[time].name, axes[time].elements[:upto])}
-        found = _of_step(program, step, Setting(scope, arrays | changed, axes, watch=_Watch()))
+            elements = axes[time].elements[: _bad_time(group.plan, changed) + 1]
+            axes = axes | {time: IndexSet(axes[time].name, elements)}
+        watch = _Watch(slopes)
+        found = _of_step(program, step, Setting(scope, arrays | changed, axes, watch=watch))
         if found is not None:
             return found
-    name, array = next((n, a) for n, a in changed.items() if not np.all(np.isfinite(a)))
-    element = scope.arrays[name].element(int(np.argmax(~np.isfinite(np.ravel(array)))))
-    at = group.steps[0].at
-    return f"{element} is not finite ({at})"
+    for name, array in changed.items():
+        if not np.all(np.isfinite(array)):
+            element = scope.arrays[name].element(int(np.argmax(~np.isfinite(np.ravel(array)))))
+            return f"{element} is not finite ({group.steps[0].at})"
+    return None
 
 
-def _first_time(plan: RecurrencePlan, changed: Arrays) -> int:
-    """The first time at which what advances is not finite."""
-    bad = []
+def _bad_time(plan: RecurrencePlan, changed: Arrays) -> int:
+    """The first time at which what advances is not finite; the last one if all is."""
+    bad = np.zeros(plan.length, bool)
+    bad[-1] = True
     for name, w in plan.written.items():
         rows = np.moveaxis(np.asarray(changed[name]), w.dim, 0)[w.start : w.start + plan.length]
-        bad.append(~np.all(np.isfinite(rows.reshape(plan.length, -1)), axis=1))
-    return int(np.argmax(np.any(bad, axis=0)))
+        bad |= ~np.all(np.isfinite(rows.reshape(plan.length, -1)), axis=1)
+    return int(np.argmax(bad))
 
 
 def _of_step(program: Program, step: MappingStep, s: Setting) -> str | None:
     if isinstance(step.what, d.Call):
-        return _of_call(program, step, s)
+        return _of_call(program, step, s, s.watch.slopes)
     try:
         evaluate(step.what.value, s)
     except _FoundError as found:
@@ -155,7 +154,7 @@ def _of_step(program: Program, step: MappingStep, s: Setting) -> str | None:
     return None
 
 
-def _of_call(program: Program, step: MappingStep, s: Setting, slopes: bool = False) -> str | None:
+def _of_call(program: Program, step: MappingStep, s: Setting, slopes: bool) -> str | None:
     """Description of what is not finite in a called mapping, at its first bad point; or None."""
     callee = callee_of(s.scope, step.what)
     if not isinstance(callee, Scope):

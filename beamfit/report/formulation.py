@@ -8,7 +8,7 @@ from math import ceil
 import numpy as np
 from matplotlib.figure import FigureBase
 
-from beamfit.language.computed import Computed
+from beamfit.language.compiled import Computed
 from beamfit.language.solution import ProblemSolution
 from beamfit.language.text import format_document
 from beamfit.report.document import BLUE, MOST_DRAWN, Picture, ReportPage, Verdict
@@ -41,7 +41,7 @@ def formulation_page(found: ProblemSolution) -> ReportPage:
         height = 0.6 + 1.7 * ceil(len(drawn) / 2)
         draw = partial(draw_outputs, found=found)
         pictures = [Picture("outputs by index", height, draw, f"{found.headline}, {found.solver}")]
-    goals = "maximised" if found.factor < 0 else "minimised"
+    goals = "maximised" if found.made.factor < 0 else "minimised"
     called = found.made.document.mapping.name
     sizes = {"variable": len(p.names), "limit": len(p.constraint_names)}
     counts = ", ".join(f"{n} {what}" + "s" * (n != 1) for what, n in sizes.items())

@@ -13,7 +13,7 @@ from beamfit.dynamics.loop import Loop
 from beamfit.dynamics.state_fit import StatesFit
 from beamfit.dynamics.titre import TitreFit
 from beamfit.emittance.slices import SliceFits
-from beamfit.language.computed import Computed
+from beamfit.language.compiled import Computed
 from beamfit.language.solution import ProblemSolution
 from beamfit.report.control import control_page
 from beamfit.report.density import density_page

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from scipy.signal import cont2discrete, dlsim, lfilter
 
-from beamfit.dynamics.linear import identify_states
-from beamfit.dynamics.order import criterion
+from beamfit.dynamics.linear import criterion, identify_states
 from beamfit.dynamics.record import Run
 from beamfit.dynamics.search import Case
 from beamfit.dynamics.state_fit import fit_states

@@ -11,7 +11,7 @@ from beamfit.greybox.bounds import KINDS, Range, range_of
 from beamfit.greybox.mlp import MLP, Layer, NetworkGain, Port, dense
 from beamfit.greybox.signed_network import monotone_signs
 from beamfit.io.formulation import read_network, write_network
-from beamfit.language.network import format_network, parse_network
+from beamfit.language.network_xml import format_network, parse_network
 
 # The report's own example (3.1.3), put together from its fragments; weights are its numbers
 # divided by 10 so that no node saturates.

@@ -8,9 +8,9 @@ import pytest
 
 from beamfit.errors import InputError
 from beamfit.io.formulation import read_numbers
-from beamfit.language.check import check_document
 from beamfit.language.parse import parse_document
-from beamfit.language.statement import formulate, starts_of
+from beamfit.language.plan import check_document
+from beamfit.language.problem import formulate, starts_of
 from beamfit.language.trace import cause_of
 from tests.language.documents import SHORT
 

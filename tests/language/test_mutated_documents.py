@@ -12,9 +12,9 @@ import jax
 import numpy as np
 
 from beamfit.errors import InputError
-from beamfit.language.check import check_document
 from beamfit.language.parse import parse_document
-from beamfit.language.statement import formulate, starts_of
+from beamfit.language.plan import check_document
+from beamfit.language.problem import formulate, starts_of
 from beamfit.language.text import format_document
 from beamfit.language.trace import cause_of
 from beamfit.language.xml import format_xml, parse_xml

@@ -12,7 +12,7 @@ from beamfit.greybox.solve import solve
 from beamfit.io.formulation import read_formulation, read_numbers
 from beamfit.language.compiled import compile_mapping
 from beamfit.language.parse import parse_document
-from beamfit.language.statement import formulate
+from beamfit.language.problem import formulate
 from tests.greybox import appendices as by_hand
 
 DATA = "formulations/fitdata_simulated.csv"

@@ -7,8 +7,8 @@ import pytest
 from beamfit.errors import InputError
 from beamfit.language import document as d
 from beamfit.language import expression as x
-from beamfit.language.check import check_document
 from beamfit.language.parse import parse_document
+from beamfit.language.plan import check_document
 from beamfit.language.text import format_document
 from beamfit.language.xml import format_xml, parse_xml
 from tests.language.documents import SHORT

@@ -18,10 +18,8 @@ import numpy as np
 from beamfit.errors import InputError
 from beamfit.greybox.mlp import MLP, Layer, NetworkGain, Port, connection
 from beamfit.language import document as d
-from beamfit.language.elements import Node, read_elements
 from beamfit.language.expression import error_at
-
-_CLASS = "com.pav.pdas.model.mlp.MlpMapping"
+from beamfit.language.xml import MLP_CLASS, Node, read_elements
 
 
 def parse_network(text: str, path: str | os.PathLike[str] | None = None) -> MLP:
@@ -124,7 +122,7 @@ def format_network(net: MLP, name: str = "mlp") -> str:
     >>> print(format_network(dense(["u"], ["y"], [1])).splitlines()[0])
     <mapping classname="com.pav.pdas.model.mlp.MlpMapping" name="mlp">
     """
-    root = Plain.Element("mapping", classname=_CLASS, name=name)
+    root = Plain.Element("mapping", classname=MLP_CLASS, name=name)
     for tag, ports in (("input", net.input_ports), ("output", net.output_ports)):
         for port in ports:
             e = Plain.SubElement(root, tag, name=port.name, layer=port.layer, node=str(port.node))

@@ -1,26 +1,31 @@
-"""Order in which the steps of a mapping are computed, from the elements each defines and needs."""
+"""Order in which the steps of a mapping are computed, from the elements each defines and needs.
+
+Statements that need their own earlier values advance together along an index.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
-from graphlib import TopologicalSorter
+from graphlib import CycleError, TopologicalSorter
+from itertools import islice, product
 from typing import NamedTuple
 
 import numpy as np
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
 
-from beamfit.errors import InputError
+from beamfit.errors import InputError, nearest
 from beamfit.language import document as d
 from beamfit.language import expression as x
-from beamfit.language.declare import scope_of
+from beamfit.language.declare import check_problem, scope_of
 from beamfit.language.expression import error_at
-from beamfit.language.lags import RecurrencePlan, plan_of
 from beamfit.language.scope import (
     Array,
+    Axes,
     MappingStep,
+    Net,
     Read,
     Scope,
     located,
@@ -28,15 +33,208 @@ from beamfit.language.scope import (
     whole_of,
     widened,
 )
-from beamfit.language.steps import callee_of, gains_of, sources, targets, written
 
 # Owner of an element that no statement defines.
 NOBODY = -1
 # Most names shown in the message about a loop.
 MOST_NAMED = 8
-# Limits of a mapping: elements of all statements together, statements, and statements from which
-# the cycle of a loop is sought.
-MOST_WORK, MOST_STEPS, MOST_TRIED = 60_000_000, 5_000, 50
+# Limits of a mapping: elements of all statements together, and statements.
+MOST_WORK, MOST_STEPS = 60_000_000, 5_000
+# Most combinations of time indices, one for each statement of a loop, that are tried; and
+# statements from which its cycle is sought.
+MOST_TRIED = 64
+
+
+# ---- what steps write, read and call
+
+
+def callee_of(scope: Scope, call: d.Call) -> Scope | Net:
+    """Find what a call calls, and check the names on both sides."""
+    callee = scope.callees.get(call.mapping)
+    if callee is None:
+        known = nearest(call.mapping, list(scope.callees))
+        raise error_at(call.at, f"unknown mapping '{call.mapping}'", known)
+    for wire in call.inputs:
+        if wire.target.name not in callee.inputs:
+            known = nearest(wire.target.name, list(callee.inputs))
+            found = f"unknown input '{wire.target.name}' of {call.mapping}"
+            raise error_at(wire.target.at, found, known)
+    given = [w.target.name for w in call.inputs if not w.target.indices]
+    for name, wanted in callee.inputs.items():
+        if wanted.values is None and name not in [w.target.name for w in call.inputs]:
+            found = f"input '{name}' of {call.mapping} is not given"
+            raise error_at(call.at, found, f"{name} = ... before '::'")
+        if given.count(name) > 1:
+            raise error_at(call.at, f"input '{name}' of {call.mapping} given twice", "once")
+    if not call.outputs:
+        raise error_at(call.at, f"a call of {call.mapping} without outputs", "outputs behind '::'")
+    for wire in call.outputs:
+        gains_of(wire, callee, call.mapping)
+    return callee
+
+
+def gains_of(
+    wire: d.Assignment, callee: Scope | Net, label: str
+) -> tuple[x.Name, tuple[x.Name, ...]]:
+    """The output behind a wire, and the inputs by which it is differentiated: `gain(y, x)`."""
+    names = (wire.value,)
+    if isinstance(wire.value, x.Application) and wire.value.function == "gain":
+        names = wire.value.arguments
+    wrong = [e for e in names if not isinstance(e, x.Name)]
+    if wrong or not names:
+        at = (wrong or [wire.value])[0].at
+        raise error_at(at, f"'{wire.value}'", f"an output of {label}, or gain(output, input)")
+    faces = [callee.outputs, *[callee.inputs] * (len(names) - 1)]
+    for e, face, what in zip(names, faces, ["output", *["input"] * (len(names) - 1)], strict=True):
+        if e.name not in face:
+            known = nearest(e.name, list(face))
+            raise error_at(e.at, f"unknown {what} '{e.name}' of {label}", known)
+    return names[0], names[1:]
+
+
+def targets(scope: Scope, step: MappingStep) -> list[tuple[x.Name, Axes]]:
+    """Names that a step writes, with the iterators in force there."""
+    if isinstance(step.what, d.Assignment):
+        return [(step.what.target, step.axes)]
+    return [(w.target, widened(scope, step.axes, w.each)) for w in step.what.outputs]
+
+
+def sources(scope: Scope, step: MappingStep) -> list[tuple[x.Expression, Axes]]:
+    """Expressions that a step reads, with the iterators in force there."""
+    if isinstance(step.what, d.Assignment):
+        return [(step.what.value, step.axes)]
+    return [(w.value, widened(scope, step.axes, w.each)) for w in step.what.inputs]
+
+
+def written(scope: Scope, node: x.Name, axes: Axes) -> Read:
+    """The elements a target writes; it must be an output or a local variable."""
+    found = scope.arrays.get(node.name)
+    if found is None or found.role not in ("output", "real"):
+        free = [a.name for a in scope.arrays.values() if a.role in ("output", "real")]
+        known = nearest(node.name, free)
+        if found is None:
+            raise error_at(node.at, f"unknown name '{node.name}'", f"{known}, or real {node.name};")
+        raise error_at(node.at, f"{found.role} '{node.name}' set by a statement", known)
+    return Read(found, node, axes, located(scope, node, found, axes))
+
+
+# ---- statements that need their own earlier values
+
+
+class Written(NamedTuple):
+    """Dimension along which an array advances, and its first index there."""
+
+    dim: int
+    start: int
+
+
+class Lagged(NamedTuple):
+    """A read of what the group itself computes: how many steps back, and which element there."""
+
+    name: str
+    lag: np.ndarray
+    rest: list[np.ndarray]
+    whole: int
+
+
+class RecurrencePlan(NamedTuple):
+    """Steps in their order at one time, their time iterators, and what each reads of the past.
+
+    `reads` are by identity of the node, `depth` is the longest way back.
+    """
+
+    steps: tuple[MappingStep, ...]
+    time: dict[int, str]
+    written: dict[str, Written]
+    length: int
+    reads: dict[int, Lagged]
+    depth: int
+
+
+def plan_of(
+    scope: Scope, steps: tuple[MappingStep, ...], owners: dict[str, np.ndarray]
+) -> RecurrencePlan | None:
+    """Find how steps that need one another advance in time; None if they form a true loop."""
+    choices = [list(_advances(scope, step)) for step in steps]
+    for chosen in islice(product(*choices), MOST_TRIED):
+        plan = _planned(scope, steps, owners, chosen)
+        if plan is not None:
+            return plan
+    return None
+
+
+def _advances(scope: Scope, step: MappingStep) -> Iterator[tuple[str, dict[str, Written], int]]:
+    """The iterators along which all that a step writes advances by one."""
+    for k, (axis, over) in enumerate(step.axes.items()):
+        found: dict[str, Written] = {}
+        for node, axes in targets(scope, step):
+            array = scope.arrays[node.name]
+            indices = located(scope, node, array, axes)
+            moving = [i for i, index in enumerate(indices) if index.shape[k] > 1]
+            if len(moving) != 1 or indices[moving[0]].size != len(over):
+                break
+            values = indices[moving[0]].ravel()
+            if np.any(np.diff(values) != 1):
+                break
+            here = Written(moving[0], int(values[0]))
+            if found.setdefault(node.name, here) != here:
+                break
+        else:
+            yield axis, found, len(over)
+
+
+def _planned(scope, steps, owners, chosen) -> RecurrencePlan | None:
+    """The plan for one choice of time iterators, if every read lies at this time or before."""
+    if len({n for _, _, n in chosen}) > 1:
+        return None
+    written: dict[str, Written] = {}
+    for _, found, _ in chosen:
+        for name, here in found.items():
+            if written.setdefault(name, here) != here:
+                return None
+    numbers = np.array([step.number for step in steps])
+    lagged: dict[int, Lagged] = {}
+    now: dict[int, set[int]] = {step.number: set() for step in steps}
+    for step, (axis, _, length) in zip(steps, chosen, strict=True):
+        k = list(step.axes).index(axis)
+        for read in (r for e, axes in sources(scope, step) for r in reads(scope, e, axes)):
+            owner = owners.get(read.array.name)
+            if owner is None or not np.isin(owner[read.flat], numbers).any():
+                continue
+            found = _lag(read, written.get(read.array.name), k, length)
+            if found is None:
+                return None
+            lagged[id(read.node)] = found
+            shape = np.broadcast_shapes(*(i.shape for i in read.indices))
+            here = np.broadcast_to(found.lag == 0, shape).ravel()
+            now[step.number] |= set(owner[read.flat[here]].tolist()) & set(numbers.tolist())
+    try:
+        order = list(TopologicalSorter(now).static_order())
+    except CycleError:
+        return None
+    by_number = {step.number: step for step in steps}
+    time = {step.number: axis for step, (axis, _, _) in zip(steps, chosen, strict=True)}
+    depth = max((int(np.max(r.lag)) for r in lagged.values()), default=0)
+    ordered = tuple(by_number[n] for n in order)
+    return RecurrencePlan(ordered, time, written, chosen[0][2], lagged, depth)
+
+
+def _lag(read: Read, written: Written | None, k: int, length: int) -> Lagged | None:
+    """Lag of a read along the time axis k; None if it changes or is negative."""
+    if written is None:
+        return None
+    rank = read.indices[0].ndim
+    times = written.start + np.arange(length).reshape([-1 if i == k else 1 for i in range(rank)])
+    lag = times - read.indices[written.dim]
+    rest = [index for i, index in enumerate(read.indices) if i != written.dim]
+    first = np.take(lag, [0], axis=k)
+    if np.any(lag != first) or np.any(first < 0) or any(index.shape[k] > 1 for index in rest):
+        return None
+    whole = sum(isinstance(i, x.Whole) for i in read.node.indices)
+    return Lagged(read.array.name, first, rest, whole)
+
+
+# ---- the order
 
 
 class StepGroup(NamedTuple):
@@ -82,9 +280,6 @@ class Order:
         """Groups that some names hang on, each after what it needs."""
         wanted, _ = self.closure(names)
         return (g for g in self.groups if not wanted.isdisjoint(step.number for step in g.steps))
-
-
-# ---- the order
 
 
 def order_of(scope: Scope) -> Order:
@@ -309,3 +504,29 @@ def checked(mapping: d.Mapping, shapes=None) -> Order:
 @lru_cache(maxsize=64)
 def _ordered(same: _Same, shapes: tuple[tuple[str, tuple[int, ...]], ...]) -> Order:
     return order_of(scope_of(same.mapping, dict(shapes)))
+
+
+def check_document(
+    document: d.Document,
+    shapes: Mapping[str, tuple[int, int]] | None = None,
+    given: Iterable[str] = (),
+) -> None:
+    """Check the names, indices and order of a document, its variables and their bounds.
+
+    Parameters
+    ----------
+    document : Document
+        From a file.
+    shapes : mapping of str to (int, int), optional
+        Rows and columns of its tables, where they have been read.
+    given : iterable of str, optional
+        Inputs whose values come from elsewhere.
+
+    Raises
+    ------
+    InputError
+        With the place in the document.
+    """
+    checked(document.mapping, shapes)
+    if document.problem is not None:
+        check_problem(document, given)
