@@ -15,8 +15,8 @@ import numpy as np
 
 from beamfit.emittance.scan import POSSIBLE, Profile, QuadScan
 from beamfit.errors import InputError, nearest
-from beamfit.io.binary import matlab_variables
 from beamfit.io.files import digest, laid_out, name_of
+from beamfit.io.isolated import matlab_variables
 from beamfit.io.lattice import LatticeFile
 from beamfit.io.shots import average_shots
 from beamfit.quantity import Quantity

@@ -10,11 +10,10 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from beamfit.errors import InputError, nearest, plain
-from beamfit.io.columns import UNITS
-from beamfit.io.headers import ALSO, SETTINGS, known_unit
+from beamfit.io.columns import ALSO, SETTINGS, UNITS, known_unit
+from beamfit.io.decay_record import QUANTITIES
 from beamfit.io.lattice import LatticeFile
 from beamfit.io.line import part_of, read_lattice
-from beamfit.io.record_columns import QUANTITIES
 from beamfit.io.toml import LIST, TABLE, TEXT, Key, Section, is_number, read_toml
 from beamfit.lifetime.record import Conditions
 

@@ -13,13 +13,13 @@ from beamfit.errors import InputError
 from beamfit.io.columns import (
     DATE,
     Column,
-    Columns,
     Sheet,
     columns_of,
     left_aside,
     left_out,
 )
 from beamfit.io.files import name_of
+from beamfit.io.layout import Columns
 from beamfit.io.table import read_columns
 
 if TYPE_CHECKING:

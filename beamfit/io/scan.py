@@ -10,20 +10,19 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from beamfit.emittance.scan import POSSIBLE, USUAL, Profile, QuadScan, first_unusable, middle
+from beamfit.emittance.scan import POSSIBLE, USUAL, Profile, QuadScan, middle, row_keys
 from beamfit.errors import InputError, located
 from beamfit.io.columns import (
+    SETTINGS,
     UNITS,
     Column,
-    Columns,
     Sheet,
     left_aside,
     left_out,
 )
 from beamfit.io.emittance_gui import is_emittance_gui, read_emittance_gui
 from beamfit.io.files import name_of
-from beamfit.io.headers import SETTINGS
-from beamfit.io.profiles import IMAGE, has_profiles, of_images, of_profiles
+from beamfit.io.layout import Columns
 from beamfit.io.scan_columns import (
     ENERGIES,
     PERCENT,
@@ -32,7 +31,7 @@ from beamfit.io.scan_columns import (
     is_scatter,
     scan_columns,
 )
-from beamfit.io.shots import average_shots
+from beamfit.io.shots import IMAGE, average_shots, of_images, of_profiles
 from beamfit.io.table import read_columns
 
 if TYPE_CHECKING:
@@ -102,7 +101,7 @@ def read_quad_scan(
     >>> scan.notes
     ("1 of 4 rows was left out: line 5, column 'size_x_um', 'lost'.",)
     """
-    if isinstance(path, str | PathLike) and is_emittance_gui(path):
+    if str(path).lower().endswith(".mat") and is_emittance_gui(path):
         if columns is not None:
             raise InputError("--columns for a file of emittance_gui", "none: it says them", path)
         return read_emittance_gui(path).scan()
@@ -115,7 +114,7 @@ def scan_of_sheet(sheet: Sheet, skip_bad: bool = False) -> QuadScan:
     profiles: tuple[Profile, ...] = ()
     if IMAGE in sheet.names:
         sheet = of_images(sheet)
-    if has_profiles(sheet):
+    if {"counts_x", "counts_y"} & set(sheet.names):
         sheet, profiles = of_profiles(sheet)
     columns = scan_columns(sheet)
     if skip_bad:
@@ -131,7 +130,8 @@ def scan_of_sheet(sheet: Sheet, skip_bad: bool = False) -> QuadScan:
         raise replace(error, expected=error.expected + more) from None
     with located(sheet.path):
         scan = replace(_scan(sheet, columns, values), profiles=profiles)
-    return average_shots(scan, marked="shot" in columns)
+    rows = row_keys(scan)
+    return average_shots(scan, marked="shot" in columns) if len(set(rows)) < len(rows) else scan
 
 
 def _scan(
@@ -143,6 +143,7 @@ def _scan(
     energy, kind = energies[0] if energies else (None, "total")
     headers = {key: sheet.called.get(c.header, c.header) for key, c in columns.items()}
     planes = [p for p in "xy" if f"size_{p}" in values]
+    error = {p: values[f"size_{p}_error"] for p in planes if f"size_{p}_error" in values}
     own = {
         p: np.stack([values.get(f"r{i}_{p}", np.zeros(len(sheet))) for i in ELEMENTS], axis=-1)
         for p in planes
@@ -152,7 +153,7 @@ def _scan(
         settings={name: values[c.key] for name, c in magnets.items()},
         units={name: c.unit for name, c in magnets.items()},
         size={p: values[f"size_{p}"] for p in planes},
-        error={p: values[f"size_{p}_error"] for p in planes if f"size_{p}_error" in values},
+        error=error,
         energy=energy,
         energy_kind=kind,
         resolution=values.get("resolution"),
@@ -161,7 +162,9 @@ def _scan(
         screen=_screens(sheet, columns.get("screen")),
         slice=tuple(map(str, sheet[columns["slice"].header])) if "slice" in columns else None,
         transfer=own or None,
-        error_source="the file",
+        error_source="the file"
+        if any(f"size_{p}_error" in values for p in planes)
+        else "none given",
         name=Path(name_of(sheet.path)).stem,
         path=sheet.path,
         sha256=sheet.sha256,
@@ -215,14 +218,11 @@ def _check_absent(sheet: Sheet, column: Column, size: np.ndarray, error: np.ndar
 def _positive(sheet: Sheet, column: Column, what: str) -> np.ndarray:
     """Lengths in m; NaN where the cell is blank."""
     values = sheet.values(column, blank=True)
-    if wrong := first_unusable(values, blank=True):
-        cell = sheet[column.header][wrong[0]]
+    if (wrong := values <= 0).any():
         expected = f"a positive {what} in {column.unit}"
         if what == "error" and not np.any(values > 0):
-            expected += (
-                f"; --ignore '{column.header}' leaves them unread, and the noise is inferred"
-            )
-        raise sheet.error(f"'{cell}'", expected, wrong[0], column.header)
+            expected += f"; --ignore '{column.header}' leaves them unread: the noise is inferred"
+        sheet.refuse(column.header, wrong, expected)
     return values
 
 

@@ -8,9 +8,8 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 from beamfit.errors import InputError, nearest, short
-from beamfit.io.columns import UNITS, Column, Sheet, columns_of
+from beamfit.io.columns import SETTINGS, UNITS, Column, Sheet, columns_of, known_unit, spelled
 from beamfit.io.files import text_lines
-from beamfit.io.headers import SETTINGS, bare, known_unit, spelled
 from beamfit.particles import ENERGY_KEYS
 
 # How the energy of a row may be given, without its unit, and what that is.
@@ -397,7 +396,7 @@ def _check(sheet: Sheet, sizes: list[Column], text: str, stated: re.Match[str]) 
     if true:
         return
     lines = enumerate([] if sheet.lines is None else text_lines(sheet.path), start=1)
-    line = next((number for number, one in lines if text in bare(one)), None)
+    line = next((number for number, one in lines if text in one), None)
     raise InputError(
         f"the comment '{short(text, 80)}'",
         f"one that agrees with the header: {mend} if the comment is right, else delete the comment",

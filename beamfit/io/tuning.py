@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING
 
 from beamfit.emittance.scan import KNOB, QuadScan
 from beamfit.errors import InputError, nearest
-from beamfit.io.columns import Columns, Sheet, columns_of, left_out
+from beamfit.io.columns import SETTINGS, Sheet, columns_of, left_out, spelled
 from beamfit.io.files import name_of
-from beamfit.io.headers import SETTINGS, spelled
+from beamfit.io.layout import Columns
 from beamfit.io.scan import MOST_ROWS, scan_of_sheet
 from beamfit.io.table import read_columns
 from beamfit.tuning.knobs import EmittanceTable

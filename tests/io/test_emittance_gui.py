@@ -11,8 +11,8 @@ import scipy.io
 import beamfit
 from beamfit.cli import main
 from beamfit.emittance.size_methods import compare_size_methods
-from beamfit.io.binary import matlab_variables
 from beamfit.io.emittance_gui import read_emittance_gui
+from beamfit.io.isolated import matlab_variables
 from beamfit.io.line import build_line, read_inputs
 from beamfit.optics.elements import Drift, Quadrupole, Screen
 
