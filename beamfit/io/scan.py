@@ -13,7 +13,6 @@ import numpy as np
 from beamfit.emittance.scan import POSSIBLE, USUAL, Profile, QuadScan, middle, row_keys
 from beamfit.errors import InputError, located
 from beamfit.io.columns import (
-    SETTINGS,
     UNITS,
     Column,
     Sheet,
@@ -26,6 +25,7 @@ from beamfit.io.layout import Columns
 from beamfit.io.scan_columns import (
     ENERGIES,
     PERCENT,
+    SETTING,
     column_notes,
     comment_notes,
     is_scatter,
@@ -109,14 +109,16 @@ def read_quad_scan(
     return scan_of_sheet(sheet, skip_bad)
 
 
-def scan_of_sheet(sheet: Sheet, skip_bad: bool = False) -> QuadScan:
-    """Understand the columns of a sheet as a scan, as `read_quad_scan` does."""
+def scan_of_sheet(
+    sheet: Sheet, skip_bad: bool = False, knobs: Mapping[str, Column] | None = None
+) -> QuadScan:
+    """Understand the columns of a sheet as a scan; knobs of the machine are settings, too."""
     profiles: tuple[Profile, ...] = ()
     if IMAGE in sheet.names:
         sheet = of_images(sheet)
     if {"counts_x", "counts_y"} & set(sheet.names):
         sheet, profiles = of_profiles(sheet)
-    columns = scan_columns(sheet)
+    columns = scan_columns(sheet, knobs or {})
     if skip_bad:
         sheet = sheet.good(lambda rows: _values(rows, columns))
         usual = _usual(_values(sheet, columns))
@@ -138,7 +140,7 @@ def _scan(
     sheet: Sheet, columns: Mapping[str, Column], values: Mapping[str, np.ndarray]
 ) -> QuadScan:
     """The scan of these numbers, one row a line of the file."""
-    magnets = {k.removeprefix("setting "): c for k, c in columns.items() if c.unit in SETTINGS}
+    magnets = {k.removeprefix(SETTING): c for k, c in columns.items() if k.startswith(SETTING)}
     energies = [(values[key], kind) for key, kind in ENERGIES.items() if key in values]
     energy, kind = energies[0] if energies else (None, "total")
     headers = {key: sheet.called.get(c.header, c.header) for key, c in columns.items()}
@@ -203,7 +205,7 @@ def _values(sheet: Sheet, columns: Mapping[str, Column]) -> dict[str, np.ndarray
             values[f"size_{plane}_error"] /= np.sqrt(values["shots"])
     _screens(sheet, columns.get("screen"))
     elements = [f"r{i}_{p}" for i in ELEMENTS for p in "xy"]
-    plain = [c for key, c in columns.items() if c.unit in SETTINGS or key in elements]
+    plain = [c for key, c in columns.items() if key.startswith(SETTING) or key in elements]
     return values | {c.key: sheet.values(c) for c in plain}
 
 
