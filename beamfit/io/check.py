@@ -394,16 +394,10 @@ def of_run(run: Run) -> Iterator[Fact]:
 def of_formulation(document: Document) -> Iterator[Fact]:
     """Variables, constraints, objectives, inputs and outputs of a formulation."""
     mapping, problem = document.mapping, document.problem
-    said = {
-        "inputs": [p.name for p in mapping.inputs],
-        "outputs": [p.name for p in mapping.outputs],
-    }
+    lists: dict[str, Any] = {"inputs": mapping.inputs, "outputs": mapping.outputs}
     if problem is not None:
-        for label, these in (
-            ("variables", problem.variables),
-            ("constraints", problem.limits),
-            ("objectives", problem.goals),
-        ):
-            said[label] = [one.label for one in these]
-    for label, names in said.items():
+        lists |= {"variables": problem.variables, "constraints": problem.limits}
+        lists |= {"objectives": problem.goals}
+    for label, these in lists.items():
+        names = [one.name if label in ("inputs", "outputs") else one.label for one in these]
         yield Fact(label, ", ".join(names) or "none", names)
