@@ -239,17 +239,9 @@ def _record(sheet: Sheet, skip_bad: bool, offset: str | None) -> DecayRecord:
         start=float(moment[0]) if absolute else None,
         conditions=conditions,
         comments=sheet.comments,
-        notes=notes + left_out(sheet) + _left_aside(sheet, columns) + found.notes,
+        notes=notes + left_out(sheet) + left_aside(sheet, columns) + found.notes,
         monitor=Monitor(offset=found.error) if found.error else None,
     )
-
-
-def _left_aside(sheet: Sheet, columns: Mapping[str, Column]) -> tuple[str, ...]:
-    """Name the columns of unknown names that were not read, as a note."""
-    if sheet.arranged:
-        return left_aside(sheet, columns)
-    unknown = [name for name in sheet.names if not known(sheet, name)]
-    return left_aside(replace(sheet.only(unknown), arranged=True), columns) if unknown else ()
 
 
 def _values(sheet: Sheet, column: Column) -> np.ndarray:
