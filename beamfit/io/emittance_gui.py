@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from beamfit.emittance.scan import POSSIBLE, Profile, QuadScan
+from beamfit.emittance.scan import PLANES, POSSIBLE, Profile, QuadScan
 from beamfit.errors import InputError, nearest
 from beamfit.io.files import digest, laid_out, name_of
 from beamfit.io.isolated import matlab_variables
@@ -25,8 +25,8 @@ from beamfit.quantity import Quantity
 USUAL_ENERGY = 0.135
 # The size method that answers unless another is asked for.
 USUAL_METHOD = "RMS"
-# Places in `stats`: sizes in µm, and the sum of the counts.
-SIZE, SUM = {"x": 2, "y": 3}, 5
+# Numbers in `stats`: of the planes in µm, and the sum of the counts.
+STATS = ("middle x", "middle y", "x", "y", "correlation", "sum")
 # A shot with less of the usual light than this shows no beam: light follows the charge, and a pulse
 # of a tenth of the charge is not the beam whose emittance is asked for. Missed pulses have 1e-3.
 LEAST_LIGHT = 0.1
@@ -189,7 +189,7 @@ def _read(source: _Fields) -> EmittanceGuiFile:
     scans, means, left_out = {}, {}, {}
     names = [_method(beams[:, :, k], k) for k in range(beams.shape[2])]
     for k, name in enumerate(names):
-        each = {p: np.where(dark, np.nan, _sizes(beams[:, :, k], p)) for p in SIZE}
+        each = {p: np.where(dark, np.nan, _sizes(beams[:, :, k], p)) for p in PLANES}
         own, error = (_own(source, part, used, k) for part in ("beam", "beamStd"))
         called = f"{Path(name_of(source.path)).stem}, {name} sizes"
         if (mean := _scan(settings, own, error, called)) is not None:
@@ -325,9 +325,9 @@ def _method(beams: np.ndarray, k: int) -> str:
     return next((name for name in named if name), f"method {k + 1}")
 
 
-def _stat(beams: np.ndarray, place: int) -> np.ndarray:
+def _stat(beams: np.ndarray, name: str) -> np.ndarray:
     """One of the numbers in `stats` of each record, NaN where it is missing or not finite."""
-    found = np.full(beams.shape, np.nan)
+    found, place = np.full(beams.shape, np.nan), STATS.index(name)
     for at, stats in np.ndenumerate(beams["stats"]):
         values = np.asarray(stats)
         if values.dtype.kind in "iuf" and values.size > place:
@@ -338,7 +338,7 @@ def _stat(beams: np.ndarray, place: int) -> np.ndarray:
 
 def _sizes(beams: np.ndarray, plane: str) -> np.ndarray:
     """Sizes in m; NaN where there is none that a beam can have."""
-    size = 1e-6 * _stat(beams, SIZE[plane])
+    size = 1e-6 * _stat(beams, plane)
     return np.where((size >= POSSIBLE[0]) & (size <= POSSIBLE[1]), size, np.nan)
 
 
@@ -347,7 +347,7 @@ def _without_beam(source: _Fields, beams: np.ndarray) -> np.ndarray:
 
     The light is the median over size methods. Monitors differ, and have a usual light each.
     """
-    light = np.median(np.nan_to_num(_stat(beams, SUM)), axis=2)
+    light = np.median(np.nan_to_num(_stat(beams, "sum")), axis=2)
     usual = np.median(light, axis=1, keepdims=True) if _of_several(source) else np.median(light)
     return light < LEAST_LIGHT * usual
 
@@ -360,8 +360,8 @@ def _own(source: _Fields, field: str, used: np.ndarray, k: int) -> dict[str, np.
     if len(beams) <= used.max() or k >= beams.shape[1]:
         return {}
     if field == "beam":
-        return {p: _sizes(beams[used, k, None], p) for p in SIZE}
-    return {p: 1e-6 * _stat(beams[used, k, None], SIZE[p]) for p in SIZE}
+        return {p: _sizes(beams[used, k, None], p) for p in PLANES}
+    return {p: 1e-6 * _stat(beams[used, k, None], p) for p in PLANES}
 
 
 def _scan(
@@ -440,7 +440,7 @@ def _notes(
 def _profiles(beams: np.ndarray, k: int) -> tuple[Profile, ...]:
     """Projected profiles of the shots of one method, as far as the file has them."""
     found = []
-    for (row, shot), plane in product(np.ndindex(beams.shape[:2]), SIZE):
+    for (row, shot), plane in product(np.ndindex(beams.shape[:2]), PLANES):
         field = f"prof{plane}"
         if field not in beams.dtype.names:
             continue
@@ -465,7 +465,7 @@ def _stored(source: _Fields, methods: list[str]) -> dict[str, dict[str, Quantity
     return {
         name: {
             plane: Quantity(float(values[0, p, k]), float(errors[0, p, k]), "m")
-            for p, plane in enumerate(SIZE)
+            for p, plane in enumerate(PLANES)
             if np.isfinite([values[0, p, k], errors[0, p, k]]).all() and values[0, p, k] > 0.0
         }
         for k, name in enumerate(methods)
@@ -485,7 +485,8 @@ def _lattice(source: _Fields, n: int) -> LatticeFile:
         beta, alpha = np.asarray(twiss[1:], float)
         if np.isfinite([beta, alpha]).all() and beta.min() > 0.0:
             design = {"at": places[-1]} | {
-                p: {"beta_m": float(beta[i]), "alpha": float(alpha[i])} for i, p in enumerate(SIZE)
+                p: {"beta_m": float(beta[i]), "alpha": float(alpha[i])}
+                for i, p in enumerate(PLANES)
             }
     return LatticeFile(
         path=source.path,

@@ -29,8 +29,8 @@ from beamfit.errors import InputError, plain
 from beamfit.io.columns import SETTINGS, known_unit, named, plain_unit, spelled, unit_at_end
 from beamfit.io.files import digest_now, read_bytes
 
-# Bytes of a file; seconds and bytes of memory that reading it may take.
-LARGEST, PATIENCE, ROOM = 256_000_000, 10, 1_000_000_000
+# Seconds and bytes of memory that reading a file may take.
+PATIENCE, ROOM = 10, 1_000_000_000
 # Bytes for which a busy machine may have another second.
 MUCH = 10_000_000
 CHILD = "from beamfit.io.isolated import answer; answer(0, 1)"
@@ -176,7 +176,7 @@ def hdf5_columns(
         If the file is damaged or too large, or a dataset is no column, has its numbers in another
         file or is packed by a filter that HDF5 does not bring.
     """
-    content = read_bytes(path, LARGEST, "an HDF5 file of readings; fewer of them")
+    content = read_bytes(path, "an HDF5 file of readings; fewer of them")
     found = isolated("HDF5", path, "an HDF5 file; text is .csv", hdf5_content, content, rows, texts)
     return _with_units(path, *found)
 
@@ -402,7 +402,7 @@ def matlab_variables(path: str | PathLike[str], name: str = "") -> dict[str, np.
 
 @lru_cache(maxsize=1)  # a file of emittance_gui is asked several times what it is
 def _matlab(path: str, name: str, sha256: str) -> dict[str, np.ndarray]:
-    content = read_bytes(path, LARGEST, MATLAB)
+    content = read_bytes(path, MATLAB)
     if HDF5_SIGNATURE in (content[:8], content[512:520]):
         raise InputError("a MATLAB file of version 7.3", MATLAB, path)
     if content[126:128] not in (b"IM", b"MI"):
@@ -449,7 +449,7 @@ def sdds_columns(
     if find_spec("sdds") is None:
         expected = "pip install 'beamfit[sdds]', or a table: sdds2spreadsheet writes one"
         raise InputError("an SDDS file, which needs soliday-sdds to read", expected, path)
-    content = read_bytes(path, LARGEST, "an SDDS file of readings; fewer of them")
+    content = read_bytes(path, "an SDDS file of readings; fewer of them")
     expected = "an SDDS file, or a table that sdds2spreadsheet writes"
     found = isolated("SDDS", path, expected, sdds_content, content, rows, texts)
     return _with_units(path, *found)

@@ -381,8 +381,6 @@ GRADIENTS = {
     "integrated_gradient_T": lambda length: 1.0 / length,
     "integrated_gradient_kG": lambda length: 0.1 / length,
 }
-# More points than any measurement of a magnet.
-MOST_ROWS = 10_000
 
 
 def gradient_table(section: Section, key: str, length: float) -> list[tuple[float, float]]:
@@ -414,7 +412,7 @@ def gradient_table(section: Section, key: str, length: float) -> list[tuple[floa
             raise section.error(f"{wrong!r}"[:80], "pairs [current in A, gradient in T/m]", key)
         points = [(float(current), float(gradient)) for current, gradient in pairs]
     else:
-        points = _points(read_sheet(Path(section.path).parent / said, EXAMPLE, MOST_ROWS), length)
+        points = _points(read_sheet(Path(section.path).parent / said, EXAMPLE), length)
     currents = sorted(current for current, _ in points)
     twice = next((a for a, b in pairwise(currents) if a == b), None)
     if len(points) < 2 or twice is not None:

@@ -25,8 +25,6 @@ from beamfit.io.table import read_columns
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-# A month of readings a second.
-MOST_ROWS = 2_000_000
 ASIDE, TIME = "aside", "time"
 EXAMPLE = "time_s,u_valve,y_level"
 
@@ -79,7 +77,7 @@ def read_run(
     >>> print(read_run(file))
     run.csv: 10 rows over 9 s, inputs valve, outputs level
     """
-    sheet = read_columns(path, EXAMPLE, columns, ignore, skip_bad, MOST_ROWS)
+    sheet = read_columns(path, EXAMPLE, columns, ignore, skip_bad)
     named = {"u": tuple(inputs), "y": tuple(outputs)}
     columns = _columns(sheet, named)
     if TIME not in columns and step is None:

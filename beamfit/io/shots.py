@@ -13,8 +13,8 @@ from beamfit.density.profiles import FEWEST_BINS, profile_size
 from beamfit.emittance.scan import PLANES, Profile, QuadScan, row_keys
 from beamfit.errors import InputError
 from beamfit.io.columns import Sheet, columns_of, spelled
-from beamfit.io.files import read_bytes
-from beamfit.io.isolated import LARGEST, PIXEL, columns_of_images, isolated, projections
+from beamfit.io.files import LARGEST, read_bytes
+from beamfit.io.isolated import PIXEL, columns_of_images, isolated, projections
 
 # With fewer repeats in all (two or three accidental ones) the scatter says nothing.
 ENOUGH_DEGREES = 3
@@ -51,7 +51,7 @@ def of_images(sheet: Sheet) -> Sheet:
     content = {}
     for row, name in enumerate(files):
         try:
-            content[name] = read_bytes(name, LARGEST // len(files), "a smaller image")
+            content[name] = read_bytes(name, "a smaller image", LARGEST // len(files))
         except InputError as error:
             raise sheet.error(f"{name}: {error.found}", error.expected, row, IMAGE) from None
     found = isolated("an image", sheet.path, PICTURES, image_projections, content)
