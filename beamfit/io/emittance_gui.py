@@ -128,30 +128,23 @@ def read_emittance_gui(path: str | PathLike[str]) -> EmittanceGuiFile:
         return _read(source)
 
 
-class _Fields:
-    """The fields of the struct, each as the array it is."""
+class _Fields(dict[str, np.ndarray]):
+    """The fields of the struct that are not empty, each as the array it is."""
 
     def __init__(self, path: str | PathLike[str], data: Any) -> None:
-        self.path = path
         if data.dtype.names is None or data.size != 1:
             raise InputError("a variable 'data' that is no struct", EXPECTED, path)
-        self.record = data.ravel()[0]
-        self.names = data.dtype.names
+        record, self.path = data.ravel()[0], path
+        values = ((name, np.asarray(record[name])) for name in data.dtype.names)
+        super().__init__((name, value) for name, value in values if value.size)
 
     def error(self, found: str, field: str) -> InputError:
         return InputError(found, EXPECTED, self.path, column=field)
 
-    def get(self, field: str) -> np.ndarray | None:
-        """A field as an array; None if the file has none, or an empty one."""
-        if field not in self.names:
-            return None
-        value = np.asarray(self.record[field])
-        return value if value.size else None
-
     def need(self, field: str) -> np.ndarray:
-        if (value := self.get(field)) is None:
+        if field not in self:
             raise self.error("a field that is missing or empty", field)
-        return value
+        return self[field]
 
     def numbers(self, field: str, n: int | None = None) -> np.ndarray:
         """A field of finite numbers, flat; of n of them if that is said."""
@@ -163,7 +156,13 @@ class _Fields:
         return value.ravel().astype(float)
 
     def number(self, field: str, usual: float) -> float:
-        return usual if self.get(field) is None else float(self.numbers(field, 1)[0])
+        return float(self.numbers(field, 1)[0]) if field in self else usual
+
+    def texts(self, field: str) -> list[str]:
+        return [_text(value) for value in self[field].ravel()] if field in self else []
+
+    def text(self, field: str, usual: str = "") -> str:
+        return _text(self.get(field)) or usual
 
 
 def _text(value: Any) -> str:
@@ -171,10 +170,6 @@ def _text(value: Any) -> str:
     while isinstance(value, np.ndarray) and value.size == 1:
         value = value.ravel()[0]
     return str(value).strip() if isinstance(value, str) else ""
-
-
-def _texts(value: np.ndarray | None) -> list[str]:
-    return [] if value is None else [_text(v) for v in value.ravel()]
 
 
 def _read(source: _Fields) -> EmittanceGuiFile:
@@ -210,7 +205,7 @@ def _read(source: _Fields) -> EmittanceGuiFile:
 
 def _beams(source: _Fields) -> np.ndarray:
     """Records of the beam by setting, shot and method."""
-    field, usual = ("beamList", 3) if source.get("beamList") is not None else ("beam", 2)
+    field, usual = ("beamList", 3) if "beamList" in source else ("beam", 2)
     beams = source.need(field)
     if beams.dtype.names is None or "stats" not in beams.dtype.names:
         raise source.error("no sizes", field)
@@ -224,8 +219,8 @@ def _beams(source: _Fields) -> np.ndarray:
 def _used(source: _Fields, taken: int) -> tuple[np.ndarray, int]:
     """Numbers of the settings that were taken and count, and how many there were to be."""
     word = "monitors" if _of_several(source) else "settings"
-    marks = [f for f in ("status", "use") if source.get(f) is not None]
-    n = max(taken, *(source.get(f).size for f in marks), 0)
+    marks = [field for field in ("status", "use") if field in source]
+    n = max(taken, *(source[field].size for field in marks), 0)
     used = np.arange(n) < taken
     for mark in marks:
         used &= source.numbers(mark, n) > 0
@@ -275,12 +270,12 @@ def _settings(source: _Fields, used: np.ndarray, n: int, lattice: LatticeFile) -
         names = _monitors(source, n)
         labels = columns["screen"] = [names[i] for i in used]
     else:
-        magnet = _text(source.get("quadName")) or "quadrupole"
+        magnet = source.text("quadName", "quadrupole")
         columns["settings"] = {magnet: source.numbers("quadVal", n)[used]}
         labels = [f"{kg:.5g} kG" for kg in columns["settings"][magnet]]
     left = n - len(used)
     notes = [f"{left} of {n} settings failed or were not taken or used (status, use)."] * (left > 0)
-    if source.get("energy") is None:
+    if "energy" not in source:
         notes.append(f"The file has no energy; {1e3 * USUAL_ENERGY:g} MeV is taken, as there.")
     about = {
         "units": dict.fromkeys(columns["settings"], "kG"),
@@ -293,28 +288,25 @@ def _settings(source: _Fields, used: np.ndarray, n: int, lattice: LatticeFile) -
 
 def _of_several(source: _Fields) -> bool:
     """Tell a file of several monitors at one setting from a scan."""
-    return _text(source.get("type")) == "multi"
+    return source.text("type") == "multi"
 
 
 def _monitors(source: _Fields, n: int) -> list[str]:
     """The monitor of each of n sizes, or the one of all."""
-    named = _texts(source.get("name")) or [""]
+    named = source.texts("name") or [""]
     if _of_several(source) and len(named) != n:
         return [f"monitor {i + 1}" for i in range(n)]
     return [name or "screen" for name in (named if _of_several(source) else named[:1])]
 
 
 def _provenance(source: _Fields) -> list[str]:
-    said = [f"emittance_gui, {_text(source.get('type')) or 'scan'}"]
+    said = [f"emittance_gui, {source.text('type', 'scan')}"]
     for word, name in (("monitor", "name"), ("quadrupole", "quadName")):
-        if named := ", ".join(_texts(source.get(name))):
+        if named := ", ".join(source.texts(name)):
             said.append(f"{word} {named}")
-    if source.get("ts") is not None:
-        days = source.number("ts", 0.0)
-        if 366 < days < 1e6:  # MATLAB counts days from the year 0
-            moment = datetime(1, 1, 1) + timedelta(days=days - 367)
-            said.append(f"{moment:%Y-%m-%d %H:%M:%S}")
-    if source.get("charge") is not None:
+    if 366 < (days := source.number("ts", 0.0)) < 1e6:  # MATLAB counts days from the year 0
+        said.append(f"{datetime(1, 1, 1) + timedelta(days=days - 367):%Y-%m-%d %H:%M:%S}")
+    if "charge" in source:
         said.append(f"charge {source.number('charge', 0.0):.3g} nC")
     return said
 
@@ -359,9 +351,8 @@ def _own(source: _Fields, field: str, used: np.ndarray, k: int) -> dict[str, np.
         return {}
     if len(beams) <= used.max() or k >= beams.shape[1]:
         return {}
-    if field == "beam":
-        return {p: _sizes(beams[used, k, None], p) for p in PLANES}
-    return {p: 1e-6 * _stat(beams[used, k, None], p) for p in PLANES}
+    own = beams[used, k, None]
+    return {p: _sizes(own, p) if field == "beam" else 1e-6 * _stat(own, p) for p in PLANES}
 
 
 def _scan(
@@ -460,8 +451,7 @@ def _stored(source: _Fields, methods: list[str]) -> dict[str, dict[str, Quantity
     values, errors = (np.asarray(v, float) for v in (values, errors))
     if values.ndim < 3 or values.shape[:3] != shape or errors.shape != values.shape:
         return {}
-    first = (slice(None),) * 3 + (0,) * (values.ndim - 3)
-    values, errors = values[first], errors[first]
+    values, errors = (v.reshape(*shape, -1)[..., 0] for v in (values, errors))
     return {
         name: {
             plane: Quantity(float(values[0, p, k]), float(errors[0, p, k]), "m")
