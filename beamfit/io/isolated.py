@@ -153,32 +153,39 @@ def answered(read: Callable[..., Any], given: tuple[Any, ...], said: BinaryIO) -
     pickle.dump(found, said, protocol=pickle.HIGHEST_PROTOCOL)
 
 
-def hdf5_columns(
-    path: str | PathLike[str], rows: int, texts: int
+def library_columns(
+    path: str | PathLike[str], library: str, rows: int, texts: int
 ) -> tuple[dict[str, Sequence[Any]], tuple[str, ...]]:
-    """Read the datasets at the top of an HDF5 file.
+    """Read the columns of an HDF5 or SDDS file.
 
     Parameters
     ----------
     path : str or path
         The file.
+    library : {"HDF5", "SDDS"}
+        What reads it. Columns are the datasets at the top of an HDF5 file; of an SDDS file of
+        parameters alone there is a row for each page.
     rows, texts : int
-        Most values of a dataset, and of one of texts.
+        Most values of a column, and of one of texts.
 
     Returns
     -------
     dict of str to array or list of str, tuple of str
-        Values by name, and attributes of the file.
+        Values by name, and attributes or parameters of the file.
 
     Raises
     ------
     InputError
-        If the file is damaged or too large, or a dataset is no column, has its numbers in another
-        file or is packed by a filter that HDF5 does not bring.
+        If soliday-sdds is not installed, the file is damaged or too large, has several pages of
+        columns, or a dataset is no column, has its numbers in another file or is packed by a
+        filter that HDF5 does not bring.
     """
-    content = read_bytes(path, "an HDF5 file of readings; fewer of them")
-    found = isolated("HDF5", path, "an HDF5 file; text is .csv", hdf5_content, content, rows, texts)
-    return _with_units(path, *found)
+    if library == "SDDS" and find_spec("sdds") is None:
+        expected = "pip install 'beamfit[sdds]', or a table: sdds2spreadsheet writes one"
+        raise InputError("an SDDS file, which needs soliday-sdds to read", expected, path)
+    read, expected = LIBRARIES[library]
+    content = read_bytes(path, f"{expected.partition(';')[0]} of readings; fewer of them")
+    return _with_units(path, *isolated(library, path, expected, read, content, rows, texts))
 
 
 def _with_units(
@@ -425,36 +432,6 @@ def matlab_content(content: bytes, name: str) -> dict[str, np.ndarray]:
     return {n: found[n].ravel().astype(float) for n in wanted if found[n].dtype.kind in "biuf"}
 
 
-def sdds_columns(
-    path: str | PathLike[str], rows: int, texts: int
-) -> tuple[dict[str, Sequence[Any]], tuple[str, ...]]:
-    """Read an SDDS file, of ASCII or binary data.
-
-    Parameters
-    ----------
-    path, rows, texts
-        As of `hdf5_columns`.
-
-    Returns
-    -------
-    dict of str to array or list of str, tuple of str
-        Columns by name, and parameters. A file of parameters alone has a row for each page.
-
-    Raises
-    ------
-    InputError
-        If soliday-sdds is not installed, the file is damaged or too large, or has several pages
-        of columns.
-    """
-    if find_spec("sdds") is None:
-        expected = "pip install 'beamfit[sdds]', or a table: sdds2spreadsheet writes one"
-        raise InputError("an SDDS file, which needs soliday-sdds to read", expected, path)
-    content = read_bytes(path, "an SDDS file of readings; fewer of them")
-    expected = "an SDDS file, or a table that sdds2spreadsheet writes"
-    found = isolated("SDDS", path, expected, sdds_content, content, rows, texts)
-    return _with_units(path, *found)
-
-
 def sdds_content(content: bytes, rows: int, texts: int) -> Columns:
     """Read an SDDS file; called in a process of its own."""
     if b"&include" in content:
@@ -508,3 +485,9 @@ def _sdds_unit(unit: str) -> str:
     for mark, meant in SHIFTS.items():
         unit = unit.replace(mark, meant)
     return unit
+
+
+LIBRARIES = {
+    "HDF5": (hdf5_content, "an HDF5 file; text is .csv"),
+    "SDDS": (sdds_content, "an SDDS file; sdds2spreadsheet writes a table"),
+}

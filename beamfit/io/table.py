@@ -23,7 +23,7 @@ from beamfit.io.columns import (
     with_units,
 )
 from beamfit.io.files import Numbered, digest, first_bytes, laid_out, read_json, text_lines
-from beamfit.io.isolated import hdf5_columns, matlab_variables, sdds_columns
+from beamfit.io.isolated import library_columns, matlab_variables
 from beamfit.io.layout import Columns, arranged, layout_of
 
 if TYPE_CHECKING:
@@ -323,8 +323,8 @@ def _binary(path: str | PathLike[str], most: int) -> Sheet:
     if suffix == MATLAB:
         columns = matlab_variables(path)
     else:
-        read = hdf5_columns if suffix in HDF5 else sdds_columns
-        columns, comments = read(path, most, min(most, MOST_WORDS))
+        library = "HDF5" if suffix in HDF5 else "SDDS"
+        columns, comments = library_columns(path, library, most, min(most, MOST_WORDS))
     if not columns:
         expected = "one dataset a column, at the top of the file"
         raise InputError("no datasets", expected, path=path)
