@@ -166,7 +166,7 @@ def read_decay_record(
         Lines that begin with `#` and HDF5 attributes are kept as comments.
     columns : str, path, mapping or Layout, optional
         What columns are whose headers do not say it: ``{"PV 12": "beam_current_mA"}``, or as
-        `beamfit.io.columns.layout_of` reads it. Other columns of unknown names are ignored.
+        `beamfit.io.layout.layout_of` reads it. Other columns of unknown names are ignored.
     ignore : iterable of str, optional
         Columns to leave unread; * and ? stand for any letters.
     skip_bad : bool, optional

@@ -74,7 +74,7 @@ def read_quad_scan(
         `beamfit.io.emittance_gui.read_emittance_gui`).
     columns : str, path, mapping or Layout, optional
         What columns are whose headers do not say it: ``{"xrms": "size_x_um"}``, or as
-        `beamfit.io.columns.layout_of` reads it. Other columns of unknown names are ignored.
+        `beamfit.io.layout.layout_of` reads it. Other columns of unknown names are ignored.
     ignore : iterable of str
         Columns to leave unread; * and ? stand for any letters.
     skip_bad : bool
