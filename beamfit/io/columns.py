@@ -392,7 +392,7 @@ class Sheet:
         if isinstance(cells, np.ndarray) and read is number and np.isfinite(cells).all():
             return cells.astype(float)
         values, row = numbers_of(cells, read, blank)
-        if row is not None and unit:
+        if row is not None and unit and number_and_unit(str(cells[row])):
             apart = ((cell, number_and_unit(str(cell))) for cell in cells)
             cells = [own[0] if own and own[1] == plain_unit(unit) else cell for cell, own in apart]
             values, row = numbers_of(cells, read, blank)

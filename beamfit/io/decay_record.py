@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from beamfit.errors import InputError
-from beamfit.io.cells import DAY, DAY_FIRST, dates_in_order, is_number
+from beamfit.io.cells import DAY, DAY_FIRST, dates_in_order, is_number, number
 from beamfit.io.columns import (
     DATE,
     UNITS,
@@ -20,6 +20,7 @@ from beamfit.io.columns import (
     columns_of,
     left_aside,
     left_out,
+    number_and_unit,
     spelled,
     unit_at_end,
 )
@@ -426,12 +427,17 @@ def offset_of(
             f"{error:.2g} mA, which is taken off."
         )
         return Offset(value, error, beam, (note,))
-    units = "|".join(UNITS["current"])
-    found = re.fullmatch(rf"\s*([-+]?\d*\.?\d+(?:[eE][-+]?\d+)?)\s*:?\s*({units})\s*", said)
-    if found is None:
+    if (value := _amount(said.replace(":", " ", 1))) is None:
         raise InputError(f"--offset {said}", f"{ZERO_BEAM}, or a current such as 0.12mA")
-    value = float(found[1]) * UNITS["current"][found[2]]
     return Offset(value, 0.0, beam, (f"The monitor's offset of {value:.4g} mA is taken off.",))
+
+
+def _amount(text: str) -> float | None:
+    """A current in mA, from a number and its unit; None if it is none."""
+    found = number_and_unit(text.strip())
+    if found is None or found[1] not in UNITS["current"] or not is_number(found[0]):
+        return None
+    return number(found[0]) * UNITS["current"][found[1]]
 
 
 def _without_beam(dark: np.ndarray, top: float, path) -> tuple[float, float, int]:
@@ -472,18 +478,19 @@ def monitor_of(drift: str | None, offset: str | None) -> Monitor | None:
     >>> print(monitor_of("0.24 mA/d", None))
     drifts by 10 µA/h
     """
-    current = "|".join(UNITS["current"])
-    found = []
-    for name, text, per, example in (
-        ("drift", drift, rf"\s*/\s*({'|'.join(UNITS['time'])})", "10uA/h"),
-        ("offset", offset, "()", "50uA"),
-    ):
-        said = re.fullmatch(rf"\s*(\d+\.?\d*(?:[eE][-+]?\d+)?)\s*({current}){per}\s*", text or "")
-        if text is not None and said is None:
-            raise InputError(f"--monitor-{name} {text}", f"a stability such as {example}")
-        value = 0.0 if said is None else float(said[1]) * UNITS["current"][said[2]]
-        found.append(value * (3600 / UNITS["time"][said[3]] if said and said[3] else 1.0))
+    found = _stability("drift", drift, "10uA/h"), _stability("offset", offset, "50uA")
     return Monitor(*found) if any(found) else None
+
+
+def _stability(name: str, text: str | None, example: str) -> float:
+    """A current in mA, or a current for each hour where the example has a time."""
+    if text is None:
+        return 0.0
+    size, slash, per = text.partition("/")
+    value, seconds = _amount(size), UNITS["time"].get(per.strip()) if slash else 3600.0
+    if value is None or value < 0 or seconds is None or bool(slash) != ("/" in example):
+        raise InputError(f"--monitor-{name} {text}", f"a stability such as {example}")
+    return value * 3600 / seconds
 
 
 def record_columns(sheet: Sheet) -> dict[str, Column]:
