@@ -15,6 +15,7 @@ from beamfit.io.emittance_gui import read_emittance_gui
 from beamfit.io.isolated import matlab_variables
 from beamfit.io.line import build_line, read_inputs
 from beamfit.optics.elements import Drift, Quadrupole, Screen
+from tests.io.forked import in_forks  # noqa: F401
 
 METHODS = ["Gaussian", "RMS", "RMS floor"]
 WIDER = {"Gaussian": 1.0, "RMS": 1.1, "RMS floor": 1.05}
