@@ -194,19 +194,21 @@ def average_shots(scan: QuadScan, *, marked: bool) -> QuadScan:
     rows: dict[tuple, int] = {}
     keys = row_keys(scan)
     group = np.array([rows.setdefault(key, len(rows)) for key in keys])
+    shots = {plane: _by_setting(values, group) for plane, values in scan.size.items()}
     alone = len(rows) == len(group) or (scan.error and not marked)
-    if alone or not (marked or all(_alike(values, group) for values in scan.size.values())):
+    if alone or not (marked or all(map(_alike, shots.values()))):
         return scan if scan.error else replace(scan, error_source="none given")
     size, scatter, given = {}, {}, {}
-    for plane, values in scan.size.items():
-        size[plane], error = _shot_means(values, group)
+    for plane, values in shots.items():
+        size[plane], error = _shot_means(values)
         if error is not None:
             scatter[plane] = error
         elif plane in scan.error:  # too few repeats: what the file says of its shots is kept
-            shots, mean_square = _means(scan.error[plane] ** 2, group)
-            given[plane] = np.sqrt(mean_square / shots)
+            square = _by_setting(scan.error[plane] ** 2, group)
+            number = np.where(np.isnan(size[plane]), np.nan, np.sum(~np.isnan(square), axis=1))
+            given[plane] = np.sqrt(np.nansum(square, axis=1)) / number
     first = np.unique(group, return_index=True)[1]
-    single = {p: _table_of(values, group) for p, values in scan.size.items() if p in scatter}
+    single = {plane: shots[plane] for plane in scatter}
     said = "the scatter of the shots (standard error of the mean)" if scatter else "the file"
     # Errors that the file gives are not taken from these shots.
     means = {"size": size, "error": scatter | given, "shots": None if given else np.bincount(group)}
@@ -217,7 +219,7 @@ def average_shots(scan: QuadScan, *, marked: bool) -> QuadScan:
     return replace(scan, **scan.columns_at(first) | means)
 
 
-def _table_of(values: np.ndarray, group: np.ndarray) -> np.ndarray:
+def _by_setting(values: np.ndarray, group: np.ndarray) -> np.ndarray:
     """The shots of each setting in a row, NaN where it has fewer."""
     order = np.argsort(group, kind="stable")
     counts = np.bincount(group)
@@ -227,27 +229,20 @@ def _table_of(values: np.ndarray, group: np.ndarray) -> np.ndarray:
     return table
 
 
-def _means(values: np.ndarray, group: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Count and mean of the numbers of each group; NaN, a shot not measured, is none."""
-    measured = ~np.isnan(values)
-    number = np.bincount(group, measured)
-    with np.errstate(invalid="ignore"):
-        return number, np.bincount(group, np.where(measured, values, 0.0)) / number
-
-
-def scatter_of(size: np.ndarray, group: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _scatter(shots: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Mean of each setting's shots, their degrees of freedom, and their sum of squares."""
-    number, mean = _means(size, group)
+    number = np.sum(~np.isnan(shots), axis=1)
     with np.errstate(invalid="ignore"):
-        square = number * _means((size - mean[group]) ** 2, group)[1]
-    return mean, np.maximum(number - 1, 0), np.nan_to_num(square)
+        mean = np.nansum(shots, axis=1) / number
+    square = np.nansum((shots - mean[:, None]) ** 2, axis=1)
+    return mean, np.maximum(number - 1, 0), square
 
 
-def _alike(size: np.ndarray, group: np.ndarray) -> bool:
+def _alike(shots: np.ndarray) -> bool:
     """Tell repeats that scatter by one relative noise: the largest against all others by F."""
     from beamfit.statistics import POOR_FIT  # scipy, which most scans are read without
 
-    mean, degrees, square = scatter_of(size, group)
+    mean, degrees, square = _scatter(shots)
     return bool(_outstanding(square / mean**2, degrees).min() > POOR_FIT)
 
 
@@ -269,13 +264,13 @@ def _outstanding(square: np.ndarray, degrees: np.ndarray) -> np.ndarray:
     return np.minimum(chance * max(int(tested.sum()), 1), 1.0)
 
 
-def _shot_means(size: np.ndarray, group: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
+def _shot_means(shots: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
     """Mean of the shots of each setting, m, and its standard error.
 
     The error is None where too few repeat or all agree; of a setting that has one shot, or whose
     shots agree to the last digit, it is that of all settings together.
     """
-    mean, degrees, square = scatter_of(size, group)
+    mean, degrees, square = _scatter(shots)
     pooled = np.sqrt(np.nansum(square / mean**2) / max(degrees.sum(), 1))
     if degrees.sum() < ENOUGH_DEGREES or pooled == 0.0:
         return mean, None
