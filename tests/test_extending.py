@@ -67,7 +67,7 @@ def test_the_element_stands_in_a_lattice_file(page, tmp_path):
     keys, settings, case = re.findall(r"\n\n```\n(.*?)```\n", page, re.DOTALL)[:3]
     lattice = tmp_path / "beamfit/io/lattice.py"
     text = lattice.read_text().replace('    "marker": {', f'{keys}    "marker": {{', 1)
-    text = re.sub(r"^    magnet = kind in .*\n", settings, text, flags=re.MULTILINE)
+    text = re.sub(r"^    for kind in \(\"quad.*\n", settings, text, flags=re.MULTILINE)
     text = text.replace('        case "marker":', f'{case}        case "marker":', 1)
     lattice.write_text(text)
     (tmp_path / "line.toml").write_text(LATTICE)

@@ -11,7 +11,7 @@ import beamfit
 from beamfit.cli.options import Command, command_line, options
 from beamfit.errors import InputError
 from beamfit.io.check import Understood, proposed_layout, with_lattice
-from beamfit.io.columns import Layout
+from beamfit.io.layout import Layout
 from beamfit.io.result import results_text
 from beamfit.table import text_of
 

@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import shlex
+from importlib.resources import files
+from os import PathLike
+from pathlib import Path
 
 import click
 
-from beamfit.io.example import write_example
+from beamfit.errors import InputError
+from beamfit.writing import write_atomically
 
+EXAMPLE_FILES = ("scan.csv", "lattice.toml", "decay.csv")
 EXAMPLE = """\b
 Examples:
   beamfit example first
@@ -26,3 +31,44 @@ def example(folder: str) -> None:
     click.echo(f"  beamfit check {scan} {lattice} {decay}")
     click.echo(f"  beamfit emittance {scan} --lattice {lattice}")
     click.echo(f"  beamfit lifetime {decay}")
+
+
+def write_example(folder: str | PathLike[str]) -> tuple[Path, ...]:
+    """Write the example files into a folder, which is made if it is not there.
+
+    Parameters
+    ----------
+    folder : str or path
+        Where to.
+
+    Returns
+    -------
+    tuple of Path
+        The scan, its lattice, and a decay record; all SIMULATED.
+
+    Raises
+    ------
+    InputError
+        If one of the files is there already (nothing is written then), or the folder cannot be
+        written.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> [path.name for path in write_example(tempfile.mkdtemp())]
+    ['scan.csv', 'lattice.toml', 'decay.csv']
+    """
+    targets = tuple(Path(folder) / name for name in EXAMPLE_FILES)
+    try:
+        Path(folder).mkdir(parents=True, exist_ok=True)
+        there = [path for path in targets if path.exists() or path.is_symlink()]
+    except (OSError, ValueError) as error:  # a name with a zero byte is a ValueError
+        cause = getattr(error, "strerror", None) or error
+        found = f"a place where no folder can be ({cause})"
+        raise InputError(found, "a folder to write into", path=folder) from None
+    if there:
+        found = "a file that is there already and is not overwritten"
+        raise InputError(found, "a folder without it, such as a new one", path=there[0])
+    for path in targets:
+        write_atomically(path, (files("beamfit") / "example" / path.name).read_bytes())
+    return targets

@@ -14,7 +14,7 @@ from beamfit.cli.option_text import anchor_of, bounds_of, gains_of, goal_of, lim
 from beamfit.cli.waiting import Waiting, ended
 from beamfit.emittance.assumptions import SCENARIOS
 from beamfit.errors import InputError
-from beamfit.io.columns import layout_of
+from beamfit.io.layout import layout_of
 from beamfit.io.result import results_text
 from beamfit.particles import REST_ENERGY
 from beamfit.report import kind_of

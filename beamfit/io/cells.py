@@ -1,4 +1,4 @@
-"""Cells of tables: numbers with decimal commas or units, dates, and a fast way through many."""
+"""Cells of tables: numbers and dates as people write them, and a fast way through many."""
 
 from __future__ import annotations
 
@@ -6,24 +6,80 @@ import hashlib
 import math
 import os
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from datetime import UTC, datetime, timedelta, timezone
 from os import PathLike
+from typing import Any
 from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
 import numpy as np
 
 from beamfit.errors import InputError
 from beamfit.io.files import remember
-from beamfit.io.headers import (
-    NUMBER,
-    is_number,
-    named,
-    plain_unit,
-    spelled,
-    unit_at_end,
-    unit_behind,
-)
+
+# What programs write where there is no number.
+BLANK = {"", "nan", "-nan", "na", "n/a", "n.a.", "#n/a", "<na>", "null", "none", "-", "--", "---"}
+BLANK |= {"nan(ind)", "-nan(ind)", "1.#qnan", "-1.#ind", "1.#ind", "#num!", "#value!"}
+# Thousands with something between them that can be nothing else, and an exponent of Fortran.
+GROUPED = re.compile(r"[-+]?\d{1,3}(?:(?:,\d{3})+\.\d*|(?:['’\xa0\u202f]\d{3})+(?:\.\d*)?)")
+BETWEEN = dict.fromkeys(map(ord, ",'’\xa0\u202f"))
+FORTRAN = re.compile(r"([\d.])[dD]([-+]?\d+)$")
+
+
+def number(cell: object) -> float:
+    """The number of a cell, also as Fortran and spreadsheets write it where that means one thing.
+
+    Raises
+    ------
+    ValueError
+        If it is none: 5,125 could be 5125.
+
+    Examples
+    --------
+    >>> [number(cell) for cell in ("5.125D-04", "−5", "5,125.0", "5'125")]
+    [0.0005125, -5.0, 5125.0, 5125.0]
+    """
+    if isinstance(cell, str) and "_" in cell:  # which Python takes for nothing between digits
+        raise ValueError("an underscore")
+    try:
+        return float(cell)
+    except ValueError:
+        text = cell.replace("−", "-")
+        text = text.translate(BETWEEN) if GROUPED.fullmatch(text) else text
+        return float(FORTRAN.sub(r"\1e\2", text))
+
+
+def is_number(text: object) -> bool:
+    """Tell a cell that is a number."""
+    try:
+        number(text)
+    except ValueError:
+        return False
+    return True
+
+
+def numbers_of(
+    cells: Sequence[object], read: Callable[[Any], float] = number, blank: bool = False
+) -> tuple[np.ndarray, int | None]:
+    """Read cells up to the first that is no finite number, and say which that is.
+
+    Examples
+    --------
+    >>> numbers_of(["1", "-", "2"], blank=True)[0].tolist(), numbers_of(["1", "-", "2"])[1]
+    ([1.0, nan, 2.0], 1)
+    """
+    values = np.full(len(cells), np.nan)
+    for row, cell in enumerate(cells):
+        if blank and isinstance(cell, str) and cell.lower() in BLANK:
+            continue
+        try:
+            values[row] = read(cell)
+        except (ValueError, TypeError, OverflowError):
+            return values, row
+        if not math.isfinite(values[row]):
+            return values, row
+    return values, None
+
 
 # Seconds.
 DAY = 86400.0
@@ -162,11 +218,9 @@ def _moment(text: str) -> datetime:
         raise
 
 
-# Bytes from which a file is worth it, and how many are read at a time.
-LARGE, BLOCK = 1_000_000, 1 << 23
-# What numbers and what stands between them are written with.
-USUAL = np.zeros(256, bool)
-USUAL[list(b"0123456789+-.eE,;\t \r\n")] = True
+# Bytes from which a file is worth it, how many are read at a time, and what numbers and what stands
+# between them are written with.
+LARGE, BLOCK, USUAL = 1_000_000, 1 << 23, b"0123456789+-.eE,;\t \r\n"
 
 
 def numeric_rows(
@@ -212,13 +266,21 @@ def numeric_rows(
     with open(path, "rb") as stream:
         for _ in range(first - 1):
             seen.update(stream.readline())
-        for block in _blocks(stream):
+        while lines := stream.readlines(BLOCK):
+            block = b"".join(lines)
             seen.update(block)
-            rows = _rows(block, None if separator == " " else separator, columns)
-            if rows is None:
+            if block.translate(None, USUAL) or block.count(b"\r") != block.count(b"\r\n"):
                 return None
-            parts.append(rows)
-            count += rows.shape[1]
+            text = block.decode("ascii").splitlines()
+            between = None if separator == " " else separator
+            try:
+                rows = np.loadtxt(text, delimiter=between, comments=None, ndmin=2)
+            except ValueError:
+                return None
+            if rows.shape != (len(lines), columns) or not np.isfinite(rows).all():
+                return None
+            parts.append(rows.T)
+            count += len(lines)
             check_length(count, most, path, first + most)
     remember(path, seen)
     return np.concatenate(parts, axis=1)
@@ -229,31 +291,6 @@ def check_length(rows: int, most: int, path: str | PathLike[str], line: int | No
     if rows > most:
         expected = "fewer: average what is repeated, or cut the file"
         raise InputError(f"more than {most} rows", expected, path=path, line=line)
-
-
-def _blocks(stream) -> Iterator[bytes]:
-    """Whole lines, some megabytes at a time."""
-    left = b""
-    while block := stream.read(BLOCK):
-        whole, end, left = (left + block).rpartition(b"\n")
-        if end:
-            yield whole + end
-    if left:
-        yield left
-
-
-def _rows(block: bytes, separator: str | None, columns: int) -> np.ndarray | None:
-    usual = USUAL[np.frombuffer(block, np.uint8)].all()
-    if not usual or block.count(b"\r") != block.count(b"\r\n"):
-        return None
-    lines = block.decode("ascii").removesuffix("\n").replace("\r", "").split("\n")
-    try:
-        found = np.loadtxt(lines, delimiter=separator, comments=None, ndmin=2)
-    except ValueError:
-        return None
-    if found.shape != (len(lines), columns) or not np.isfinite(found).all():
-        return None
-    return found.T.copy()
 
 
 COMMA = re.compile(r"[-+]?(\d+|\d{1,3}(?:[.'’\xa0\u202f]\d{3})+),\d+([eEdD][-+]?\d+)?")
@@ -299,54 +336,3 @@ def with_points(
     return changed, (
         f"Numbers have a decimal comma: '{commas[0]}' is {commas[0].translate(POINTS)}.",
     )
-
-
-# Columns of words, of which one may look so: a screen 2A.
-WORDS = re.compile(r"(screen|slice|note|comment|remark).*", re.IGNORECASE)
-
-
-def without_units(
-    names: Sequence[str], rows: Sequence[Sequence[str]], path: str | PathLike[str], lines: list[int]
-) -> tuple[list[str], Sequence[Sequence[str]]]:
-    """Take units off cells, where they are those of the header or all cells have one.
-
-    Parameters
-    ----------
-    names : sequence of str
-        Headers; one without a unit gets that of its cells.
-    rows : sequence of sequences of str
-        The cells. Of a unit other than its column's a cell stays as it is, and is no number.
-    path, lines
-        Where they are from.
-
-    Returns
-    -------
-    tuple
-        Names and rows.
-
-    Raises
-    ------
-    InputError
-        If a number has no unit where the cells above it have one and the header none.
-
-    Examples
-    --------
-    >>> without_units(["Q2_A", "size_x"], [["1", "627 um"], ["2 A", "580um"]], "a.csv", [2, 3])
-    (['Q2_A', 'size_x_um'], [['1', '627'], ['2', '580']])
-    """
-    names, changed = list(names), None
-    for i, name in enumerate(names):
-        own = unit_at_end(plain_unit(spelled(name)))
-        unit = own or unit_behind(next((row[i] for row in rows if row[i]), ""))
-        said = [unit_behind(row[i]) for row in rows] if unit and not WORDS.match(name) else ()
-        if unit is None or unit not in said:
-            continue
-        changed = changed or [list(row) for row in rows]
-        names[i] = name if own else named(name, unit)
-        for row, its, line in zip(changed, said, lines, strict=True):
-            if its == unit:
-                row[i] = NUMBER.fullmatch(row[i])[1]
-            elif own is None and is_number(row[i].replace(",", ".")):
-                expected = f"{unit} behind it, as above, or one unit in the header: {names[i]}"
-                raise InputError(f"'{row[i]}' without a unit", expected, path, line, name)
-    return names, changed or rows

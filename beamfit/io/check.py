@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from os import PathLike
@@ -16,13 +16,12 @@ import numpy as np
 from beamfit.dynamics.record import Run
 from beamfit.emittance.scan import QuadScan
 from beamfit.errors import InputError
-from beamfit.io.columns import Columns, Layout, layout_of, proposal
-from beamfit.io.decay_record import read_lifetime_input
+from beamfit.io.decay_record import is_current, known, likely_record_name, read_lifetime_input
 from beamfit.io.emittance_gui import is_emittance_gui, read_emittance_gui
 from beamfit.io.files import digest
 from beamfit.io.lattice import CALIBRATIONS, STRENGTHS, LatticeFile
+from beamfit.io.layout import Columns, Layout, layout_of, proposal
 from beamfit.io.line import FOREIGN, build_line, read_lattice
-from beamfit.io.record_columns import is_current, known, likely_record_name
 from beamfit.io.ring import read_operation, read_ring
 from beamfit.io.run import read_run
 from beamfit.io.scan import read_quad_scan
@@ -112,17 +111,21 @@ def understand(
     layout = layout_of(columns)
     kind = _kind(path, layout)
     reading = {"columns": layout or None, "ignore": ignore, "skip_bad": skip_bad}
-    parts = {"use": use, "energy": energy} if Path(path).suffix.lower() in FOREIGN else {}
+    reading = reading if kind in ("scan", "record", "run") else {}
+    if Path(path).suffix.lower() in FOREIGN:
+        reading = {"use": use, "energy": energy}
     read, told = {
-        "scan": (_scan_of, of_scan),
-        "lattice": (lambda path, **_: read_lattice(path, **parts), of_lattice),
+        "scan": (read_quad_scan, of_scan),
+        "lattice": (read_lattice, of_lattice),
         "record": (read_lifetime_input, of_record),
         "run": (read_run, of_run),
-        "ring": (lambda path, **_: read_ring(path), lambda ring: of_ring(path, ring)),
-        "formulation": (_formulation_of, of_formulation),
+        "ring": (read_ring, of_ring),
+        "formulation": (_formulation, of_formulation),
     }[kind]
     content = read(path, **reading)
-    facts, notes = told(content), tuple(getattr(content, "notes", ()))
+    facts, notes = list(told(content)), tuple(getattr(content, "notes", ()))
+    if kind == "ring" and "operation" in read_toml(path, "a ring").table:
+        facts += of_operation(read_operation(path))
     if kind == "scan":
         from beamfit.emittance.transport import of_sizes
 
@@ -133,15 +136,7 @@ def understand(
     return Understood(str(path), kind, digest(path), tuple(facts), notes, content)
 
 
-def _scan_of(path: str | PathLike[str], **reading: Any) -> QuadScan:
-    return (
-        read_emittance_gui(path).scan()
-        if is_emittance_gui(path)
-        else read_quad_scan(path, **reading)
-    )
-
-
-def _formulation_of(path: str | PathLike[str], **_: Any) -> Document:
+def _formulation(path: str | PathLike[str]) -> Document:
     from beamfit.io.formulation import read_formulation  # scipy
 
     return read_formulation(path)
@@ -225,11 +220,6 @@ class Fact(NamedTuple):
     value: Any
 
 
-def _ranges(columns: Iterable[tuple[str, np.ndarray | None, str]]) -> list[Fact]:
-    """From the smallest to the largest of each column that there is."""
-    return [_range(label, values, unit) for label, values, unit in columns if values is not None]
-
-
 def _range(label: str, values: np.ndarray, unit: str = "", after: str = "", **more: Any) -> Fact:
     """From the smallest to the largest, lengths in a unit of their size, and what is said more."""
     low, high = float(np.nanmin(values)), float(np.nanmax(values))
@@ -239,65 +229,69 @@ def _range(label: str, values: np.ndarray, unit: str = "", after: str = "", **mo
     return Fact(label, f"{words} {SAID.get(said, said)}".strip() + after, value)
 
 
+def _ranges(columns: Iterable[tuple[str, np.ndarray | None, str]]) -> list[Fact]:
+    """From the smallest to the largest of each column that there is."""
+    return [
+        _range(name.replace("_", " "), values, unit)
+        for name, values, unit in columns
+        if values is not None
+    ]
+
+
 def _counted(label: str, rows: Mapping[str, int], form: str = "{0} ({1} rows)") -> Fact:
     """Count of each."""
     return Fact(label, ", ".join(form.format(name, n) for name, n in rows.items()), dict(rows))
 
 
-def of_scan(scan: QuadScan) -> list[Fact]:
+def of_scan(scan: QuadScan) -> Iterator[Fact]:
     """Rows, planes, magnets, sizes, energies of a scan."""
-    facts = [Fact("rows", str(len(scan)), len(scan))]
-    facts.append(_counted("planes", {p: int(np.isfinite(scan.size[p]).sum()) for p in scan.planes}))
+    yield Fact("rows", str(len(scan)), len(scan))
+    yield _counted("planes", {p: int(np.isfinite(scan.size[p]).sum()) for p in scan.planes})
     for name, values in scan.settings.items():
         distinct = len(np.unique(values))
         after = f", {distinct} setting" + "s" * (distinct > 1)
-        facts.append(_range(f"magnet {name}", values, scan.units[name], after, settings=distinct))
+        yield _range(f"magnet {name}", values, scan.units[name], after, settings=distinct)
     for plane in scan.planes:
-        column = scan.columns.get(key := f"size_{plane}", key)
-        sizes = scan.size[plane]
-        facts.append(_range(f"size {plane}", sizes, "m", f", column {column}", column=column))
+        column, sizes = scan.columns.get(key := f"size_{plane}", key), scan.size[plane]
+        yield _range(f"size {plane}", sizes, "m", f", column {column}", column=column)
         words, value = INFERRED, None
         if plane in scan.error:
             share = float(np.nanmedian(scan.error[plane] / sizes))
             words = f"{100 * share:.2g} % of the size in the middle, from {scan.error_source}"
             value = {"median_relative": share, "source": scan.error_source}
-        facts.append(Fact(f"errors {plane}", words, value))
+        yield Fact(f"errors {plane}", words, value)
     if scan.transfer is not None:
-        facts.append(Fact("matrices", "R11 and R12 of each row: no lattice is needed", True))
+        yield Fact("matrices", "R11 and R12 of each row: no lattice is needed", True)
     if (kind := scan.energy_kind) and scan.energy is not None:
         after = ", momentum p c" if kind == "momentum" else f", {kind} energy"
-        facts.append(_range("energy", scan.energy, "MeV", after, kind=kind))
+        yield _range("energy", scan.energy, "MeV", after, kind=kind)
     for label, names in (("screens", scan.screen), ("slices", scan.slice)):
-        facts += [] if names is None else [_counted(label, Counter(names))]
+        yield from [] if names is None else [_counted(label, Counter(names))]
     further = ("resolution", "m"), ("energy_spread", ""), ("shots", "")
-    return facts + _ranges((n.replace("_", " "), getattr(scan, n), unit) for n, unit in further)
+    yield from _ranges((name, getattr(scan, name), unit) for name, unit in further)
 
 
-def of_lattice(file: LatticeFile) -> list[Fact]:
+def of_lattice(file: LatticeFile) -> Iterator[Fact]:
     """Energy, elements, magnets and screens of a lattice."""
-    length = sum(map(_length, file.elements))
     energy = {"value": file.energy, "unit": "MeV", "particle": file.particle}
     plural = "" if file.particle.endswith("-") else "s"
-    kinds = Counter(element["type"] for element in file.elements)
-    listed = ", ".join(f"{n} {kind.replace('_', ' ')}" for kind, n in kinds.items())
-    facts = [
-        Fact("name", file.name, file.name),
-        Fact("energy", f"{file.energy:.6g} MeV total, {file.particle}{plural}", energy),
-        Fact("elements", listed, dict(kinds)),
-        Fact("length", f"{length:.6g} m", length),
-    ]
+    length = sum(map(_length, file.elements))
+    yield Fact("name", file.name, file.name)
+    yield Fact("energy", f"{file.energy:.6g} MeV total, {file.particle}{plural}", energy)
+    kinds = _counted("elements", Counter(e["type"] for e in file.elements), "{1} {0}")
+    yield kinds._replace(words=kinds.words.replace("_", " "))
+    yield Fact("length", f"{length:.6g} m", length)
     units = [(e, file.calibrations.get(e.get("supply", e["name"]))) for e in file.elements]
     magnets = [(e, unit) for e, unit in units if unit is not None]
-    facts += [_magnet(e, unit) for e, unit in magnets[:MOST_MAGNETS]]
+    yield from (_magnet(e, unit) for e, unit in magnets[:MOST_MAGNETS])
     if (more := len(magnets) - MOST_MAGNETS) > 0:
-        facts.append(Fact("further magnets", f"{more}, set as these", more))
+        yield Fact("further magnets", f"{more}, set as these", more)
     screens = [e["name"] for e in file.elements if e["type"] == "screen"]
-    facts.append(Fact("screens", ", ".join(screens) or "none: sizes need one", screens))
+    yield Fact("screens", ", ".join(screens) or "none: sizes need one", screens)
     if file.energy_spread:
-        facts.append(Fact("energy spread", f"{file.energy_spread:.3g}", file.energy_spread))
+        yield Fact("energy spread", f"{file.energy_spread:.3g}", file.energy_spread)
     if file.design is not None:
-        facts.append(Fact("design Twiss", f"at {file.design['at']}", dict(file.design)))
-    return facts
+        yield Fact("design Twiss", f"at {file.design['at']}", dict(file.design))
 
 
 def _magnet(element: Mapping[str, Any], unit: str) -> Fact:
@@ -328,79 +322,84 @@ def _length(element: Mapping[str, Any]) -> float:
     return float(element.get("length_m", 0.0))
 
 
-def of_record(record: DecayRecord | LifetimeTable) -> list[Fact]:
+def of_record(record: DecayRecord | LifetimeTable) -> Iterator[Fact]:
     """Readings, currents and conditions of a record, and the decays in it."""
     if isinstance(record, LifetimeTable):
         errors = "none: the scatter of the points" if record.error is None else "given"
-        columns = ("lifetime", record.lifetime, "h"), ("beam current", record.current, "mA")
-        facts = [Fact("lifetimes", str(len(record)), len(record)), *_ranges(columns)]
-        return [*facts, Fact("errors", errors, record.error is not None)]
+        yield Fact("lifetimes", str(len(record)), len(record))
+        yield _range("lifetime", record.lifetime, "h")
+        yield _range("beam current", record.current, "mA")
+        yield Fact("errors", errors, record.error is not None)
+        return
     from beamfit.lifetime.pieces import split_record  # scipy, for records alone
 
     hours = record.span / 3600
     value = {"count": len(record), "span_h": hours}
-    facts = [Fact("readings", f"{len(record)} over {hours:.3g} h", value)]
-    facts += _ranges([("beam current", record.current, "mA"), ("errors", record.error, "mA")])
-    if record.error is None:
-        facts.append(Fact("errors", INFERRED, None))
+    yield Fact("readings", f"{len(record)} over {hours:.3g} h", value)
+    yield _range("beam current", record.current, "mA")
+    none = record.error is None
+    yield Fact("errors", INFERRED, None) if none else _range("errors", record.error, "mA")
     if record.start is not None:
         began = datetime.fromtimestamp(record.start, UTC).isoformat(timespec="seconds")
-        facts.append(Fact("began", began, began))
-    units = dict(zip(record.conditions._fields, ("V", "m", "Pa", "", "m"), strict=True))
-    columns = record.conditions._asdict().items()
-    facts += _ranges((name.replace("_", " "), values, units[name]) for name, values in columns)
+        yield Fact("began", began, began)
+    conditions, units = record.conditions._asdict(), ("V", "m", "Pa", "", "m")
+    yield from _ranges(zip(conditions, conditions.values(), units, strict=True))
     split = split_record(record)
     kinds, count = Counter(event.kind for event in split.events), len(split.segments)
     cut = _counted("", kinds, "{1} × {0}").words or "nothing cut away"
-    return [*facts, Fact("decays", f"{count} ({cut})", {"count": count, "events": dict(kinds)})]
+    yield Fact("decays", f"{count} ({cut})", {"count": count, "events": dict(kinds)})
 
 
-def of_ring(path: str | PathLike[str], ring: Any) -> list[Fact]:
-    """Energy, size and beam of a ring, and how it runs."""
-    said = [
+def _numbers(*said: tuple[str, float, str]) -> list[Fact]:
+    """One number each, with its unit."""
+    return [
+        Fact(label, f"{value:.6g} {unit}".strip(), {"value": float(value), "unit": unit or "1"})
+        for label, value, unit in said
+    ]
+
+
+def of_ring(ring: Any) -> list[Fact]:
+    """Energy, size and beam of a ring."""
+    return _numbers(
         ("energy", ring.energy / 1e9, "GeV"),
         ("circumference", ring.circumference, "m"),
         ("energy loss a turn", ring.energy_loss / 1e3, "keV"),
         ("emittance x", 1e9 * ring.emittance_x, "nm"),
         ("emittance y", 1e9 * ring.emittance_y, "nm"),
         ("points of the optics", len(ring.optics.weight), ""),
-    ]
-    if "operation" in read_toml(path, "a ring").table:
-        operation = read_operation(path)
-        said += [
-            ("RF voltage", operation.rf_voltage / 1e3, "kV"),
-            ("bunches", operation.bunches, ""),
-            ("pressure without beam", operation.pressure_base, "Pa"),
-        ]
-    return [
-        Fact(label, f"{float(v):.6g} {unit}".strip(), {"value": float(v), "unit": unit or "1"})
-        for label, v, unit in said
-    ]
+    )
 
 
-def of_run(run: Run) -> list[Fact]:
+def of_operation(operation: Any) -> list[Fact]:
+    """The way a ring runs."""
+    return _numbers(
+        ("RF voltage", operation.rf_voltage / 1e3, "kV"),
+        ("bunches", operation.bunches, ""),
+        ("pressure without beam", operation.pressure_base, "Pa"),
+    )
+
+
+def of_run(run: Run) -> Iterator[Fact]:
     """Rows, steps, and the range of every input and output."""
     span = float(run.time[-1] - run.time[0])
     step = "at unequal distances" if run.step is None else f"every {run.step:.4g} s"
     value = {"count": len(run), "span_s": span, "step_s": run.step}
-    facts = [Fact("rows", f"{len(run)} over {span:.4g} s, {step}", value)]
-    facts += [_range(f"input {name}", values) for name, values in run.inputs.items()]
+    yield Fact("rows", f"{len(run)} over {span:.4g} s, {step}", value)
+    for name, values in run.inputs.items():
+        yield _range(f"input {name}", values)
     for name, values in run.outputs.items():
         missing = int(np.isnan(values).sum())
         after = f", {missing} not read" if missing else ""
-        facts.append(_range(f"output {name}", values, after=after, missing=missing))
-    return facts
+        yield _range(f"output {name}", values, after=after, missing=missing)
 
 
-def of_formulation(document: Document) -> list[Fact]:
+def of_formulation(document: Document) -> Iterator[Fact]:
     """Variables, constraints, objectives, inputs and outputs of a formulation."""
     mapping, problem = document.mapping, document.problem
-    said = {
-        "inputs": [part.name for part in mapping.inputs],
-        "outputs": [part.name for part in mapping.outputs],
-    }
+    lists: dict[str, Any] = {"inputs": mapping.inputs, "outputs": mapping.outputs}
     if problem is not None:
-        lists = {"variables": problem.variables, "constraints": problem.limits}
-        lists["objectives"] = problem.goals
-        said |= {label: [one.label for one in these] for label, these in lists.items()}
-    return [Fact(label, ", ".join(names) or "none", names) for label, names in said.items()]
+        lists |= {"variables": problem.variables, "constraints": problem.limits}
+        lists |= {"objectives": problem.goals}
+    for label, these in lists.items():
+        names = [one.name if label in ("inputs", "outputs") else one.label for one in these]
+        yield Fact(label, ", ".join(names) or "none", names)

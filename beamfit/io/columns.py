@@ -1,28 +1,186 @@
-"""Named columns with the place of every value, what their headers mean, and --columns."""
+"""Named columns: what their headers mean, and the place of every value."""
 
 from __future__ import annotations
 
-import csv
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
+from functools import lru_cache
 from os import PathLike
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from beamfit.emittance.scan import SETTINGS
 from beamfit.errors import InputError, nearest
-from beamfit.io.cells import DAY_FIRST, HOUR_OR_MINUTE, MONTH_FIRST, NUMBERS, dates_in_order
-from beamfit.io.headers import UNITS, is_number, number, spelled, unit_at_end, unit_behind
-from beamfit.io.toml import LIST, TABLE, TEXT, Key, read_toml
+from beamfit.io.cells import (
+    HOUR_OR_MINUTE,
+    NUMBERS,
+    dates_in_order,
+    is_number,
+    number,
+    numbers_of,
+)
+
+UNITS: dict[str, dict[str, float]] = {
+    # quantity: unit at the end of a name -> factor to SI (a stored current: to mA)
+    "length": {"um": 1e-6, "mm": 1e-3, "m": 1.0, "µm": 1e-6, "μm": 1e-6, "nm": 1e-9, "cm": 1e-2},
+    "length or duration": {"mm": 1e-3, "m": 1.0, "ps": 299792458e-12},
+    "time": {"s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9},
+    "current": {"mA": 1.0, "A": 1e3, "uA": 1e-3, "µA": 1e-3, "μA": 1e-3, "nA": 1e-6},
+    "voltage": {"kV": 1e3, "V": 1.0, "MV": 1e6},
+    "pressure": {"Pa": 1.0, "mbar": 100.0, "Torr": 101325 / 760},
+    "energy in MeV": {"MeV": 1.0},
+}
+UNITS["length or share"] = UNITS["length"] | {"%": 0.01}
+# Units at the end of a header, as the columns' names have them.
+KNOWN = {*SETTINGS, "µs", *(unit for units in UNITS.values() for unit in units)}
+ENDS = tuple(f"_{unit}" for unit in KNOWN)
+# Other ways to write one; in capitals or small letters no other unit is meant by these.
+ALSO = {
+    word: unit
+    for unit, words in {
+        "T_per_m": ("T m^-1", "T.m-1", "tesla/m", "T/m", "T_PER_M"),
+        "k1": ("1/m**2", "1/m^2", "1/m2", "1/m²", "m^-2", "m-2", "m⁻²", "K1"),
+        "k1l": ("m-1", "1/m", "m^-1", "K1L"),
+        "A": ("ampere", "amperes", "Amp", "Amps", "amp"),
+        "kG": ("KG", "kg"),
+        "um": ("um rms", "micron", "microns", "UM", "Um"),
+        "mm": ("mm rms", "MM", "Mm"),
+        "m": ("M",),
+        "s": ("sec",),
+        "h": ("hours",),
+        "MeV": ("MEV", "mev"),
+        "mA": ("ma",),
+        "Pa": ("pa", "PA"),
+        "Torr": ("torr", "TORR"),
+        "%": ("percent",),
+    }.items()
+    for word in words
+}
+# A header that ends with one of them, the longest.
+WRITTEN = re.compile(f"(.*?)[\\s_]({'|'.join(map(re.escape, ALSO))})")
+# A number and what stands behind it.
+NUMBER = re.compile(r"([-+]?(?:\d+[.,]?\d*|[.,]\d+)(?:[eE][-+]?\d+)?)\s*([^\W\d_].*|[%\[(].*)")
+# A name, and its unit in brackets or behind a stroke between blanks.
+BRACKETS = re.compile(r"(.*?)[\s_]*(?:\[(.*?)\]|\((.*?)\)|\s/\s+(\S+))\s*")
+APART = re.compile(r"([^/,]+?)(?:/|, ?| in )([^/,\s]+)")  # I/A, "I, A", I in A
+
+
+def known_unit(text: str) -> str | None:
+    """A unit as the names of columns have it; None if the text is none."""
+    text = text.strip().strip("[]()").strip()
+    return text if text in KNOWN else ALSO.get(text)
+
+
+def plain_unit(text: str) -> str:
+    """A unit, or a name that ends with one, with u for either letter µ."""
+    return re.sub("[µμ]", "u", text)
+
+
+def named(name: str, unit: str) -> str:
+    """The name of a column with its unit behind it, without blanks."""
+    return re.sub(r"\s+", "_", f"{name}_{unit}")
+
+
+@lru_cache(maxsize=4096)  # a year's files have the headers of the first
+def spelled(header: str) -> str:
+    """A header as ``name_unit``; as it stands where it has no unit.
+
+    Examples
+    --------
+    >>> [spelled(h) for h in ("Q525 [T/m]", "size x (µm)", "Time / h", "SIZE_X_MM", "Q5 T m^-1")]
+    ['Q525_T_per_m', 'size_x_µm', 'Time_h', 'SIZE_X_mm', 'Q5_T_per_m']
+    >>> [spelled(h) for h in ("I/A", "size x, um", "size x in um", "Q1_T/m", "sr/dcct/A")]
+    ['I_A', 'size_x_um', 'size_x_um', 'Q1_T_per_m', 'sr/dcct/A']
+    """
+    if (found := BRACKETS.fullmatch(header)) and found[1]:
+        name, unit = found[1], next(part for part in found.groups()[1:] if part is not None)
+        if (known := known_unit(unit)) is not None:
+            return named(name.strip().removesuffix(f"_{known}"), known)
+    if header.endswith(ENDS):
+        return header
+    if found := WRITTEN.fullmatch(header):
+        return named(found[1], ALSO[found[2]])
+    if (found := APART.fullmatch(header)) and (known := known_unit(found[2])):
+        return named(found[1], known)
+    words = header.split()
+    return "_".join(words) if len(words) > 1 and words[-1] in KNOWN else header
+
+
+def unit_at_end(name: str) -> str | None:
+    """The unit that a name as `spelled` ends with; None if it has none."""
+    return max((u for u in KNOWN if name.endswith(f"_{u}")), key=len, default=None)
+
+
+def number_and_unit(cell: str) -> tuple[str, str] | None:
+    """A number, and the unit behind it as the names of columns have it; None if it has none.
+
+    Examples
+    --------
+    >>> [number_and_unit(cell) for cell in ("627 µm", "1.5A", "1e-3", "OTR2")]
+    [('627', 'um'), ('1.5', 'A'), None, None]
+    """
+    found = None if cell[-1:].isdigit() else NUMBER.fullmatch(cell)
+    unit = known_unit(plain_unit(found[2])) if found else None
+    return (found[1], unit) if unit else None
+
+
+def is_header(cells: Sequence[str]) -> bool:
+    """Tell a header from other rows: two or more names with units, and no number among them."""
+    if sum(map(has_unit, cells)) < 2:
+        return False
+    return not any(map(is_number, cells)) and not any(map(number_and_unit, cells))
+
+
+def has_unit(header: str) -> bool:
+    """Tell a header that says its unit."""
+    return unit_at_end(spelled(header)) is not None
+
+
+def units_below(cells: Sequence[str]) -> list[str | None] | None:
+    """The units of a row of nothing else; None if it is no such row.
+
+    Examples
+    --------
+    >>> units_below(["A", "[um]", ""]), units_below(["A", "5"])
+    (['A', 'um', None], None)
+    """
+    units = [known_unit(cell) for cell in cells]
+    plain = all(u or cell in ("", "-", "1") for u, cell in zip(units, cells, strict=True))
+    return units if plain and any(units) else None
+
+
+def with_units(
+    names: Sequence[str], cells: Sequence[str], path: str | PathLike[str], line: int
+) -> list[str] | None:
+    """Names with the units of a row of units below them; None if the row is none.
+
+    Raises
+    ------
+    InputError
+        If a name has another unit already.
+
+    Examples
+    --------
+    >>> with_units(["Q2", "size_x", "shot"], ["A", "[um]", ""], "a.csv", 2)
+    ['Q2_A', 'size_x_um', 'shot']
+    """
+    if (units := units_below(cells)) is None:
+        return None
+    found = []
+    for name, unit in zip(names, units, strict=True):
+        own = unit_at_end(spelled(name))
+        if own and unit and plain_unit(own) != plain_unit(unit):
+            expected = "one unit, in the header or below it"
+            raise InputError(f"'{unit}' below a header in {own}", expected, path, line, name)
+        found.append(name if own or unit is None else named(name, unit))
+    return found
+
 
 # The unit of a column of dates.
 DATE = "a date"
-# What programs write where there is no number.
-BLANK = {"", "nan", "-nan", "na", "n/a", "n.a.", "#n/a", "<na>", "null", "none", "-", "--", "---"}
-BLANK |= {"nan(ind)", "-nan(ind)", "1.#qnan", "-1.#ind", "1.#ind", "#num!", "#value!"}
 # Most rows left out, or columns ignored, that a note names one by one.
 MOST_NAMED, MOST_ASIDE = 5, 8
 
@@ -206,6 +364,7 @@ class Sheet:
         name: str,
         *,
         blank: bool = False,
+        unit: str = "",
         read: Callable[[Any], float] = number,
         expected: str = "a number",
     ) -> np.ndarray:
@@ -217,6 +376,8 @@ class Sheet:
             Its header.
         blank : bool
             Whether a cell may be blank, or say NaN in a text; it is NaN then.
+        unit : str
+            What may stand behind a number.
         read : callable
             From a cell to a number, or ValueError.
         expected : str
@@ -227,42 +388,47 @@ class Sheet:
         InputError
             Naming line and column of the first cell that is no number.
         """
-        if isinstance(self[name], np.ndarray) and read is number and np.isfinite(self[name]).all():
-            return self[name].astype(float)
-        values = np.empty(len(self))
-        for row, cell in enumerate(self[name]):
-            if blank and isinstance(cell, str) and cell.lower() in BLANK:
-                values[row] = np.nan
-                continue
-            try:
-                values[row] = read(cell)
-            except (ValueError, TypeError, OverflowError):
-                comma = " with a decimal point" if "," in str(cell) else ""
-                more = " in the unit of the column" if unit_behind(str(cell)) else comma
-                if re.search(r"\d\s*(±|\+/?-)", str(cell)):
-                    more = ", and its error in a column of its own"
-                found = "an empty cell" if cell == "" else f"'{cell}'"
-                raise self.error(found, expected + more, row, name) from None
-            if not np.isfinite(values[row]):
-                raise self.error(f"'{cell}'", "a finite number", row, name)
-        return values
+        cells = self[name]
+        if isinstance(cells, np.ndarray) and read is number and np.isfinite(cells).all():
+            return cells.astype(float)
+        values, row = numbers_of(cells, read, blank)
+        if row is not None and unit and number_and_unit(str(cells[row])):
+            apart = ((cell, number_and_unit(str(cell))) for cell in cells)
+            cells = [own[0] if own and own[1] == plain_unit(unit) else cell for cell, own in apart]
+            values, row = numbers_of(cells, read, blank)
+        if row is None:
+            return values
+        cell = self[name][row]
+        if read is number and is_number(cell):
+            raise self.error(f"'{cell}'", "a finite number", row, name)
+        more = " with a decimal point" if "," in str(cell) else ""
+        more = " in the unit of the column" if number_and_unit(str(cell)) else more
+        if re.search(r"\d\s*(±|\+/?-)", str(cell)):
+            more = ", and its error in a column of its own"
+        found = "an empty cell" if cell == "" else f"'{cell}'"
+        raise self.error(found, expected + more, row, name)
 
     def values(self, column: Column, *, blank: bool = False) -> np.ndarray:
         """A column of finite numbers in SI, or of dates in s since 1970; as `numbers`."""
+        cells = self[column.header]
         if column.unit == DATE:
-            expected = "an ISO 8601 time, such as 2024-03-01T12:00:00+01:00"
-            first = str(next(iter(self[column.header]), ""))
-            if HOUR_OR_MINUTE.fullmatch(first):
-                expected = "00:00:00: are these hours and minutes, or minutes and seconds?"
-            if NUMBERS.match(first):
-                expected = "a date whose day and month cannot be exchanged, such as 2024-03-01, "
-                expected += "or --columns day-month-year (or month-day-year)"
-            elif is_number(first):
-                units = ", ".join(f"{column.header}_{unit}" for unit in ("s", "ms", "d"))
-                expected = f"a date, or the unit of the number in the header: {units}"
-            read = dates_in_order(self.order)
+            read, expected = dates_in_order(self.order), _expected_date(cells, column.header)
             return self.numbers(column.header, read=read, expected=expected)
-        return self.numbers(column.header, blank=blank) * column.factor
+        return self.numbers(column.header, blank=blank, unit=column.unit) * column.factor
+
+
+def _expected_date(cells: Sequence[Any], header: str) -> str:
+    """What a column of dates should have, by its first cell."""
+    first = str(next(iter(cells), ""))
+    if NUMBERS.match(first):
+        expected = "a date whose day and month cannot be exchanged, such as 2024-03-01, "
+        return expected + "or --columns day-month-year (or month-day-year)"
+    if HOUR_OR_MINUTE.fullmatch(first):
+        return "00:00:00: are these hours and minutes, or minutes and seconds?"
+    if is_number(first):
+        units = ", ".join(f"{header}_{unit}" for unit in ("s", "ms", "d"))
+        return f"a date, or the unit of the number in the header: {units}"
+    return "an ISO 8601 time, such as 2024-03-01T12:00:00+01:00"
 
 
 def columns_of(
@@ -365,218 +531,3 @@ def left_out(sheet: Sheet) -> tuple[str, ...]:
     were = "was" if len(sheet.bad) == 1 else "were"
     total = len(sheet) + len(sheet.bad)
     return (*sheet.notes, f"{len(sheet.bad)} of {total} rows {were} left out: {'; '.join(named)}.")
-
-
-FORMAT = "beamfit-layout-1"
-# Layouts that come with the package, by name.
-SHIPPED = Path(__file__).with_name("layouts")
-ORDERS = (DAY_FIRST, MONTH_FIRST)
-NAMES = "a list of names in quotes"
-EXAMPLE = "'xrms=size_x_um, QUAD:BACT=Q525_kG', or a layout (.toml)"
-KEYS = {
-    "columns": Key("columns", kind=TABLE, default={}),
-    "ignore": Key("ignore", kind=LIST, default=[], said=NAMES, each=str),
-    "dates": Key("dates", kind=TEXT, default="", among=ORDERS),
-    "header": Key("header", kind=LIST, default=[], said=NAMES, each=str),
-}
-
-
-@dataclass(frozen=True)
-class Layout:
-    """The meaning of a file's columns: believed as it stands, and nothing is guessed against it.
-
-    Attributes
-    ----------
-    names : tuple of (str, str)
-        Header of the file, or a pattern with * and ?, and the name that beamfit has for it, with
-        its unit: ``("xrms", "size_x_um")``.
-    needed : tuple of str
-        Headers that must be there: those said for one file; a laboratory's layout may have more.
-    ignore : tuple of str
-        Columns to leave unread, where they are there.
-    dates : str
-        "day-month-year" or "month-day-year", for dates that may be read both ways.
-    header : tuple of str
-        Names of the columns of a file that has no header; "*" for further cells.
-    """
-
-    names: tuple[tuple[str, str], ...] = ()
-    needed: tuple[str, ...] = ()
-    ignore: tuple[str, ...] = ()
-    dates: str = ""
-    header: tuple[str, ...] = ()
-
-    def __bool__(self) -> bool:
-        return self != Layout()
-
-    def __add__(self, other: Layout) -> Layout:
-        """Both; where they disagree, what the other says."""
-        names = dict(self.names) | dict(other.names)
-        return Layout(
-            tuple(names.items()),
-            self.needed + other.needed,
-            self.ignore + other.ignore,
-            other.dates or self.dates,
-            other.header or self.header,
-        )
-
-    def called(self, headers: Sequence[str], path: str | PathLike[str]) -> dict[str, str]:
-        """The name of each of a file's headers for which the layout has one.
-
-        Raises
-        ------
-        InputError
-            If a header that was said is missing, or two would have one name.
-
-        Examples
-        --------
-        >>> layout_of("xrms=size_x_um, QUAD:BACT=Q525_kG").called(["QUAD:BACT", "xrms"], "a.csv")
-        {'xrms': 'size_x_um', 'QUAD:BACT': 'Q525_kG'}
-        """
-        found: dict[str, str] = {}
-        for said, name in self.names:
-            matching = [h for h in headers if said in _spellings(h)]
-            matching = matching or [h for h in headers if fnmatchcase(h, said)]
-            if not matching and said in self.needed:
-                raise InputError(f"no column '{said}'", nearest(said, list(headers)), path)
-            if len(matching) > 1 or (matching and name in found.values()):
-                expected = "one column for each name"
-                both = " and ".join(matching or [said])
-                raise InputError(f"{both} for {name}", expected, path, column=said)
-            found |= dict.fromkeys(matching, name)
-        return found
-
-
-Columns = str | PathLike[str] | Mapping[str, str] | Layout | None
-"""Layout of columns as a reader takes it; see `layout_of`."""
-
-
-def _spellings(header: str) -> set[str]:
-    """A header as it stands, and without the unit that stands below or beside it."""
-    said = spelled(header)
-    unit = unit_at_end(said)
-    return {header, said, said.removesuffix(f"_{unit}") if unit else header}
-
-
-def layout_of(columns: str | PathLike[str] | Mapping[str, str] | Layout | None) -> Layout:
-    """Read what is said of columns.
-
-    Parameters
-    ----------
-    columns : str, path, mapping or Layout
-        ``"xrms=size_x_um, QUAD:BACT=Q525_kG"``, with quotes around an item that holds a comma; a
-        layout file (``.toml``) or the name of one that comes with beamfit; ``day-month-year``; or
-        several of these, separated by commas. A mapping of header to name says the same.
-
-    Raises
-    ------
-    InputError
-        If a layout cannot be read, or there is none of that name.
-
-    Examples
-    --------
-    >>> layout_of({"xrms": "size_x_um"}) == layout_of("xrms = size_x_um")
-    True
-    """
-    if columns is None or isinstance(columns, Layout):
-        return columns or Layout()
-    if isinstance(columns, Mapping):
-        items = tuple((str(said), str(name)) for said, name in columns.items())
-        return Layout(items, tuple(said for said, _ in items))
-    if isinstance(columns, PathLike):
-        return _read(columns)
-    found = Layout()
-    for item in filter(
-        None, map(str.strip, next(csv.reader([columns], skipinitialspace=True), []))
-    ):
-        found += _item(item)
-    return found
-
-
-def _item(item: str) -> Layout:
-    said, equals, name = (part.strip() for part in item.rpartition("="))
-    if equals:
-        if not said or not name:
-            raise InputError(f"--columns '{item}'", f"HEADER=NAME such as {EXAMPLE}")
-        return Layout(((said, name),), (said,))
-    if item in ORDERS:
-        return Layout(dates=item)
-    shipped = {path.stem: path for path in SHIPPED.glob("*.toml")}
-    if item in shipped:
-        return _read(shipped[item])
-    if not item.endswith(".toml"):
-        known = nearest(item, sorted([*shipped, *ORDERS]))
-        raise InputError(f"--columns {item}", f"HEADER=NAME such as {EXAMPLE}; or {known}")
-    return _read(item)
-
-
-def _read(path: str | PathLike[str]) -> Layout:
-    section = read_toml(path, "a layout", FORMAT)
-    said = section.values(KEYS)
-    for header, name in said["columns"].items():
-        if not (isinstance(name, str) and name.strip()):
-            expected = 'the name that beamfit has for it, such as "size_x_um"'
-            raise section.error(f"'{header}' = {name!r}", expected, "columns")
-    names = tuple(said["columns"].items())
-    return Layout(names, (), tuple(said["ignore"]), said["dates"], tuple(said["header"]))
-
-
-def arranged(sheet: Sheet, layout: Layout) -> Sheet:
-    """Give the columns of a sheet the names that a layout says.
-
-    Parameters
-    ----------
-    sheet : Sheet
-        The file.
-    layout : Layout
-        What its columns are; other columns of unknown names are then ignored.
-
-    Returns
-    -------
-    Sheet
-        Its messages name the columns as the file does.
-
-    Examples
-    --------
-    >>> sheet = Sheet("a.csv", ("xrms", "n"), [["0.1"], ["7"]], [2], 1, ())
-    >>> arranged(sheet, layout_of("xrms=size_x_mm")).names
-    ('size_x_mm', 'n')
-    """
-    if not layout:
-        return sheet
-    present = [p for p in layout.ignore if any(fnmatchcase(name, p) for name in sheet.names)]
-    sheet = sheet.without(present) if present else sheet
-    called = layout.called(sheet.names, sheet.path)
-    # A column that has such a name already is not the one that was meant.
-    kept = [n for n in sheet.names if n in called or n not in called.values()]
-    sheet = sheet.only(kept)
-    names = tuple(called.get(name, name) for name in kept)
-    said = {name: header for header, name in called.items()}
-    return replace(sheet, names=names, called=said, order=layout.dates, arranged=True)
-
-
-def proposal(unknown: Mapping[str, tuple[str | None, Any]]) -> str:
-    """Write a layout for columns that nobody knows, for a person to complete.
-
-    Parameters
-    ----------
-    unknown : mapping of str to (str or None, object)
-        Header to the name that it may mean, and a cell.
-
-    Examples
-    --------
-    >>> print(proposal({"xrms": ("size_x_um", 0.1), "n": (None, 7)}))
-    format = "beamfit-layout-1"
-    ignore = []  # headers to leave unread
-    <BLANKLINE>
-    [columns]  # "header" = "its name and unit in beamfit": docs/files.md has them
-    "xrms" = "size_x_um"  # 0.1: is it that, and in this unit?
-    # "n" = ""  # 7
-    """
-    lines = [f'format = "{FORMAT}"', "ignore = []  # headers to leave unread", ""]
-    lines.append('[columns]  # "header" = "its name and unit in beamfit": docs/files.md has them')
-    for header, (guess, cell) in unknown.items():
-        quoted = header.replace("\\", "\\\\").replace('"', '\\"')
-        asked = f"{cell}: is it that, and in this unit?" if guess else f"{cell}"
-        lines.append(f'{"" if guess else "# "}"{quoted}" = "{guess or ""}"  # {asked}')
-    return "\n".join(lines)

@@ -13,10 +13,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from beamfit.emittance.scan import POSSIBLE, Profile, QuadScan
+from beamfit.emittance.scan import PLANES, POSSIBLE, Profile, QuadScan
 from beamfit.errors import InputError, nearest
-from beamfit.io.binary import matlab_variables
 from beamfit.io.files import digest, laid_out, name_of
+from beamfit.io.isolated import matlab_variables
 from beamfit.io.lattice import LatticeFile
 from beamfit.io.shots import average_shots
 from beamfit.quantity import Quantity
@@ -25,8 +25,8 @@ from beamfit.quantity import Quantity
 USUAL_ENERGY = 0.135
 # The size method that answers unless another is asked for.
 USUAL_METHOD = "RMS"
-# Places in `stats`: sizes in µm, and the sum of the counts.
-SIZE, SUM = {"x": 2, "y": 3}, 5
+# Numbers in `stats`: of the planes in µm, and the sum of the counts.
+STATS = ("middle x", "middle y", "x", "y", "correlation", "sum")
 # A shot with less of the usual light than this shows no beam: light follows the charge, and a pulse
 # of a tenth of the charge is not the beam whose emittance is asked for. Missed pulses have 1e-3.
 LEAST_LIGHT = 0.1
@@ -128,30 +128,23 @@ def read_emittance_gui(path: str | PathLike[str]) -> EmittanceGuiFile:
         return _read(source)
 
 
-class _Fields:
-    """The fields of the struct, each as the array it is."""
+class _Fields(dict[str, np.ndarray]):
+    """The fields of the struct that are not empty, each as the array it is."""
 
     def __init__(self, path: str | PathLike[str], data: Any) -> None:
-        self.path = path
         if data.dtype.names is None or data.size != 1:
             raise InputError("a variable 'data' that is no struct", EXPECTED, path)
-        self.record = data.ravel()[0]
-        self.names = data.dtype.names
+        record, self.path = data.ravel()[0], path
+        values = ((name, np.asarray(record[name])) for name in data.dtype.names)
+        super().__init__((name, value) for name, value in values if value.size)
 
     def error(self, found: str, field: str) -> InputError:
         return InputError(found, EXPECTED, self.path, column=field)
 
-    def get(self, field: str) -> np.ndarray | None:
-        """A field as an array; None if the file has none, or an empty one."""
-        if field not in self.names:
-            return None
-        value = np.asarray(self.record[field])
-        return value if value.size else None
-
     def need(self, field: str) -> np.ndarray:
-        if (value := self.get(field)) is None:
+        if field not in self:
             raise self.error("a field that is missing or empty", field)
-        return value
+        return self[field]
 
     def numbers(self, field: str, n: int | None = None) -> np.ndarray:
         """A field of finite numbers, flat; of n of them if that is said."""
@@ -163,7 +156,13 @@ class _Fields:
         return value.ravel().astype(float)
 
     def number(self, field: str, usual: float) -> float:
-        return usual if self.get(field) is None else float(self.numbers(field, 1)[0])
+        return float(self.numbers(field, 1)[0]) if field in self else usual
+
+    def texts(self, field: str) -> list[str]:
+        return [_text(value) for value in self[field].ravel()] if field in self else []
+
+    def text(self, field: str, usual: str = "") -> str:
+        return _text(self.get(field)) or usual
 
 
 def _text(value: Any) -> str:
@@ -171,10 +170,6 @@ def _text(value: Any) -> str:
     while isinstance(value, np.ndarray) and value.size == 1:
         value = value.ravel()[0]
     return str(value).strip() if isinstance(value, str) else ""
-
-
-def _texts(value: np.ndarray | None) -> list[str]:
-    return [] if value is None else [_text(v) for v in value.ravel()]
 
 
 def _read(source: _Fields) -> EmittanceGuiFile:
@@ -189,7 +184,7 @@ def _read(source: _Fields) -> EmittanceGuiFile:
     scans, means, left_out = {}, {}, {}
     names = [_method(beams[:, :, k], k) for k in range(beams.shape[2])]
     for k, name in enumerate(names):
-        each = {p: np.where(dark, np.nan, _sizes(beams[:, :, k], p)) for p in SIZE}
+        each = {p: np.where(dark, np.nan, _sizes(beams[:, :, k], p)) for p in PLANES}
         own, error = (_own(source, part, used, k) for part in ("beam", "beamStd"))
         called = f"{Path(name_of(source.path)).stem}, {name} sizes"
         if (mean := _scan(settings, own, error, called)) is not None:
@@ -210,7 +205,7 @@ def _read(source: _Fields) -> EmittanceGuiFile:
 
 def _beams(source: _Fields) -> np.ndarray:
     """Records of the beam by setting, shot and method."""
-    field, usual = ("beamList", 3) if source.get("beamList") is not None else ("beam", 2)
+    field, usual = ("beamList", 3) if "beamList" in source else ("beam", 2)
     beams = source.need(field)
     if beams.dtype.names is None or "stats" not in beams.dtype.names:
         raise source.error("no sizes", field)
@@ -224,8 +219,8 @@ def _beams(source: _Fields) -> np.ndarray:
 def _used(source: _Fields, taken: int) -> tuple[np.ndarray, int]:
     """Numbers of the settings that were taken and count, and how many there were to be."""
     word = "monitors" if _of_several(source) else "settings"
-    marks = [f for f in ("status", "use") if source.get(f) is not None]
-    n = max(taken, *(source.get(f).size for f in marks), 0)
+    marks = [field for field in ("status", "use") if field in source]
+    n = max(taken, *(source[field].size for field in marks), 0)
     used = np.arange(n) < taken
     for mark in marks:
         used &= source.numbers(mark, n) > 0
@@ -275,12 +270,12 @@ def _settings(source: _Fields, used: np.ndarray, n: int, lattice: LatticeFile) -
         names = _monitors(source, n)
         labels = columns["screen"] = [names[i] for i in used]
     else:
-        magnet = _text(source.get("quadName")) or "quadrupole"
+        magnet = source.text("quadName", "quadrupole")
         columns["settings"] = {magnet: source.numbers("quadVal", n)[used]}
         labels = [f"{kg:.5g} kG" for kg in columns["settings"][magnet]]
     left = n - len(used)
     notes = [f"{left} of {n} settings failed or were not taken or used (status, use)."] * (left > 0)
-    if source.get("energy") is None:
+    if "energy" not in source:
         notes.append(f"The file has no energy; {1e3 * USUAL_ENERGY:g} MeV is taken, as there.")
     about = {
         "units": dict.fromkeys(columns["settings"], "kG"),
@@ -293,28 +288,25 @@ def _settings(source: _Fields, used: np.ndarray, n: int, lattice: LatticeFile) -
 
 def _of_several(source: _Fields) -> bool:
     """Tell a file of several monitors at one setting from a scan."""
-    return _text(source.get("type")) == "multi"
+    return source.text("type") == "multi"
 
 
 def _monitors(source: _Fields, n: int) -> list[str]:
     """The monitor of each of n sizes, or the one of all."""
-    named = _texts(source.get("name")) or [""]
+    named = source.texts("name") or [""]
     if _of_several(source) and len(named) != n:
         return [f"monitor {i + 1}" for i in range(n)]
     return [name or "screen" for name in (named if _of_several(source) else named[:1])]
 
 
 def _provenance(source: _Fields) -> list[str]:
-    said = [f"emittance_gui, {_text(source.get('type')) or 'scan'}"]
+    said = [f"emittance_gui, {source.text('type', 'scan')}"]
     for word, name in (("monitor", "name"), ("quadrupole", "quadName")):
-        if named := ", ".join(_texts(source.get(name))):
+        if named := ", ".join(source.texts(name)):
             said.append(f"{word} {named}")
-    if source.get("ts") is not None:
-        days = source.number("ts", 0.0)
-        if 366 < days < 1e6:  # MATLAB counts days from the year 0
-            moment = datetime(1, 1, 1) + timedelta(days=days - 367)
-            said.append(f"{moment:%Y-%m-%d %H:%M:%S}")
-    if source.get("charge") is not None:
+    if 366 < (days := source.number("ts", 0.0)) < 1e6:  # MATLAB counts days from the year 0
+        said.append(f"{datetime(1, 1, 1) + timedelta(days=days - 367):%Y-%m-%d %H:%M:%S}")
+    if "charge" in source:
         said.append(f"charge {source.number('charge', 0.0):.3g} nC")
     return said
 
@@ -325,9 +317,9 @@ def _method(beams: np.ndarray, k: int) -> str:
     return next((name for name in named if name), f"method {k + 1}")
 
 
-def _stat(beams: np.ndarray, place: int) -> np.ndarray:
+def _stat(beams: np.ndarray, name: str) -> np.ndarray:
     """One of the numbers in `stats` of each record, NaN where it is missing or not finite."""
-    found = np.full(beams.shape, np.nan)
+    found, place = np.full(beams.shape, np.nan), STATS.index(name)
     for at, stats in np.ndenumerate(beams["stats"]):
         values = np.asarray(stats)
         if values.dtype.kind in "iuf" and values.size > place:
@@ -338,7 +330,7 @@ def _stat(beams: np.ndarray, place: int) -> np.ndarray:
 
 def _sizes(beams: np.ndarray, plane: str) -> np.ndarray:
     """Sizes in m; NaN where there is none that a beam can have."""
-    size = 1e-6 * _stat(beams, SIZE[plane])
+    size = 1e-6 * _stat(beams, plane)
     return np.where((size >= POSSIBLE[0]) & (size <= POSSIBLE[1]), size, np.nan)
 
 
@@ -347,7 +339,7 @@ def _without_beam(source: _Fields, beams: np.ndarray) -> np.ndarray:
 
     The light is the median over size methods. Monitors differ, and have a usual light each.
     """
-    light = np.median(np.nan_to_num(_stat(beams, SUM)), axis=2)
+    light = np.median(np.nan_to_num(_stat(beams, "sum")), axis=2)
     usual = np.median(light, axis=1, keepdims=True) if _of_several(source) else np.median(light)
     return light < LEAST_LIGHT * usual
 
@@ -359,9 +351,8 @@ def _own(source: _Fields, field: str, used: np.ndarray, k: int) -> dict[str, np.
         return {}
     if len(beams) <= used.max() or k >= beams.shape[1]:
         return {}
-    if field == "beam":
-        return {p: _sizes(beams[used, k, None], p) for p in SIZE}
-    return {p: 1e-6 * _stat(beams[used, k, None], SIZE[p]) for p in SIZE}
+    own = beams[used, k, None]
+    return {p: _sizes(own, p) if field == "beam" else 1e-6 * _stat(own, p) for p in PLANES}
 
 
 def _scan(
@@ -440,7 +431,7 @@ def _notes(
 def _profiles(beams: np.ndarray, k: int) -> tuple[Profile, ...]:
     """Projected profiles of the shots of one method, as far as the file has them."""
     found = []
-    for (row, shot), plane in product(np.ndindex(beams.shape[:2]), SIZE):
+    for (row, shot), plane in product(np.ndindex(beams.shape[:2]), PLANES):
         field = f"prof{plane}"
         if field not in beams.dtype.names:
             continue
@@ -460,12 +451,11 @@ def _stored(source: _Fields, methods: list[str]) -> dict[str, dict[str, Quantity
     values, errors = (np.asarray(v, float) for v in (values, errors))
     if values.ndim < 3 or values.shape[:3] != shape or errors.shape != values.shape:
         return {}
-    first = (slice(None),) * 3 + (0,) * (values.ndim - 3)
-    values, errors = values[first], errors[first]
+    values, errors = (v.reshape(*shape, -1)[..., 0] for v in (values, errors))
     return {
         name: {
             plane: Quantity(float(values[0, p, k]), float(errors[0, p, k]), "m")
-            for p, plane in enumerate(SIZE)
+            for p, plane in enumerate(PLANES)
             if np.isfinite([values[0, p, k], errors[0, p, k]]).all() and values[0, p, k] > 0.0
         }
         for k, name in enumerate(methods)
@@ -485,7 +475,8 @@ def _lattice(source: _Fields, n: int) -> LatticeFile:
         beta, alpha = np.asarray(twiss[1:], float)
         if np.isfinite([beta, alpha]).all() and beta.min() > 0.0:
             design = {"at": places[-1]} | {
-                p: {"beta_m": float(beta[i]), "alpha": float(alpha[i])} for i, p in enumerate(SIZE)
+                p: {"beta_m": float(beta[i]), "alpha": float(alpha[i])}
+                for i, p in enumerate(PLANES)
             }
     return LatticeFile(
         path=source.path,

@@ -35,10 +35,8 @@ SIGNATURES = {
 UTF16 = codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE
 # ° ± ² ³ µ in the code pages of Windows, and what needs none.
 MARKS, ASCII = bytes([0xB0, 0xB1, 0xB2, 0xB3, 0xB5]), bytes(range(128))
-# Bytes of a lattice of 50 000 elements, of an archive's day, and of a pipe kept in memory.
-LARGEST_TEXT = 4_000_000
-LARGEST_JSON = 64_000_000
-LARGEST_PIPE = 256_000_000
+# Bytes of a lattice of 50 000 elements, and of what is kept in memory at all.
+LARGEST_TEXT, LARGEST = 4_000_000, 256_000_000
 # Seconds after which a pipe that gives nothing is given up.
 SILENCE = 30.0
 # What values of other kinds than a document has may raise.
@@ -61,8 +59,8 @@ def _piped(path: str, inode: int) -> bytes:
                 return b"".join(parts)
             parts.append(part)
             size += len(part)
-            if size > LARGEST_PIPE:
-                found = f"more than {LARGEST_PIPE // 1_000_000} MB from a pipe"
+            if size > LARGEST:
+                found = f"more than {LARGEST // 1_000_000} MB from a pipe"
                 raise InputError(found, "a file, for so much", path=path)
     expected = "a program that writes into it, or a file"
     raise InputError(f"a pipe that gives nothing for {SILENCE:.0f} s", expected, path=path)
@@ -185,7 +183,7 @@ def read_text(path: str | PathLike[str]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def read_bytes(path: str | PathLike[str], most: int, expected: str) -> bytes:
+def read_bytes(path: str | PathLike[str], expected: str, most: int = LARGEST) -> bytes:
     """Read a whole file of up to ``most`` bytes.
 
     Raises
@@ -218,7 +216,7 @@ def read_json(path: str | PathLike[str], found: str, expected: str) -> Any:
         If it cannot be read; with ``found`` and ``expected`` if it does not parse or lies deeper
         in itself than can be followed. An integer of hundreds of digits is infinite.
     """
-    content = read_bytes(path, LARGEST_JSON, expected)
+    content = read_bytes(path, expected)
     try:
         return json.loads(content, parse_int=lambda t: int(t) if len(t) < 300 else float(t))
     except (ValueError, RecursionError):

@@ -46,6 +46,7 @@ POWERS = "at least two numbers c0, c1, ... in T/m, T/(m A), ..."
 NAME, OPTIONAL = Key(kind=TEXT), Key(default=None)
 LENGTH = Key(low=0.0, said="a positive number")
 EDGE = Key(default=0.0, low=-90.0, high=90.0, said="an angle below 90 degrees")
+SUPPLY = {"supply": Key(kind=TEXT, default=None)}
 ELEMENTS: dict[str, dict[str, Key]] = {
     "drift": {"name": Key(kind=TEXT, default=None), "length_m": LENGTH},
     "quadrupole": {
@@ -58,11 +59,11 @@ ELEMENTS: dict[str, dict[str, Key]] = {
         "signed_intercept": Key(kind=FLAG, default=False),
         "gradient_table": Key(kind=LIST, default=None),
         "gradient_table_file": Key(kind=TEXT, default=None),
-        "supply": Key(kind=TEXT, default=None),
+        **SUPPLY,
     },
     "thin_lens": {
         "name": NAME,
-        "supply": Key(kind=TEXT, default=None),
+        **SUPPLY,
         "integrated_gradient_kG": OPTIONAL,
         "k1l_per_m": OPTIONAL,
     },
@@ -102,6 +103,11 @@ TOP = {
     "design": Key(kind=TABLE, default=None),
 }
 TWISS = Key(kind=TABLE, default=None)
+# Keys and units by which a magnet of some type is set.
+SETTINGS_OF = {
+    kind: {k: unit for k, unit in STRENGTHS.items() if k in ELEMENTS[kind]}
+    for kind in ("quadrupole", "thin_lens")
+}
 
 
 @dataclass(frozen=True)
@@ -129,7 +135,7 @@ class LatticeFile:
         return {
             e.get("supply", e["name"]): unit
             for e in self.elements
-            for key, unit in _settings(e["type"])
+            for key, unit in SETTINGS_OF.get(e["type"], {}).items()
             if key in e
         }
 
@@ -194,8 +200,7 @@ def read_toml_lattice(path: str | PathLike[str]) -> LatticeFile:
         raise top.error(f"more than {MOST} elements", "a line that a machine has", "element")
     sections = top.sections("element")
     elements = tuple(_element(section, i) for i, section in enumerate(sections, 1))
-    _check_unique(elements, sections)
-    _check_supplies(elements, sections)
+    _check_names(elements, sections)
     for element, section in zip(elements, sections, strict=True):
         _check_slice(element, section, energy, REST_ENERGY[said["particle"]])
     return LatticeFile(
@@ -221,12 +226,6 @@ def _energy(top: Section, particle: str) -> float:
     return total
 
 
-def _settings(kind: str) -> list[tuple[str, str]]:
-    """Keys and units by which a magnet of some type is set; none for what no scan sets."""
-    magnet = kind in ("quadrupole", "thin_lens")
-    return [(k, unit) for k, unit in STRENGTHS.items() if magnet and k in ELEMENTS[kind]]
-
-
 def _element(section: Section, number: int) -> Mapping[str, Any]:
     """Check one element table and return it with a name."""
     kind = section.table.get("type")
@@ -234,8 +233,8 @@ def _element(section: Section, number: int) -> Mapping[str, Any]:
         word = f"element {number} of " + (f"type {kind!r}"[:80] if kind else "no type")
         raise section.error(word, nearest(str(kind), list(ELEMENTS)), "type")
     section.values(ELEMENTS[kind] | {"type": NAME})
-    if settings := _settings(kind):
-        _check_strength(section, section.one_of(key for key, _ in settings))
+    if kind in SETTINGS_OF:
+        _check_strength(section, section.one_of(SETTINGS_OF[kind]))
     if section.table.get("angle_deg") == 0:
         raise section.error("a dipole that does not bend", "a drift", "angle_deg")
     table = {"name": f"{kind}{number}"} | section.table
@@ -263,28 +262,23 @@ def _check_strength(section: Section, setting: str) -> None:
             raise section.error(f"{numbers!r}"[:80], POWERS, key)
 
 
-def _check_unique(elements: tuple[Mapping[str, Any], ...], sections: list[Section]) -> None:
+def _check_names(elements: tuple[Mapping[str, Any], ...], sections: list[Section]) -> None:
+    """Check names, and that magnets on one supply, which no element is called, are set alike."""
     seen: dict[str, int] = {}
     for number, (element, section) in enumerate(zip(elements, sections, strict=True), 1):
-        if element["name"] in seen:
-            expected = f"another name: element {seen[element['name']]} has it"
+        if (first := seen.setdefault(element["name"], number)) < number:
+            expected = f"another name: element {first} has it"
             raise section.error(f"the name '{element['name']}' used again", expected, "name")
-        seen[element["name"]] = number
-
-
-def _check_supplies(elements: tuple[Mapping[str, Any], ...], sections: list[Section]) -> None:
-    """Check that magnets on one supply are set by one number, and no element has its name."""
-    names, first = {e["name"] for e in elements}, {}
+    settings: dict[str, dict[str, float]] = {}
     for element, section in zip(elements, sections, strict=True):
         if (supply := element.get("supply")) is None:
             continue
-        if supply in names:
+        if supply in seen:
             raise section.error(f"supply '{supply}'", "another name: an element has it", "supply")
-        setting = {key: element[key] for key in STRENGTHS if key in element}
-        if first.setdefault(supply, setting) != setting:
+        own = {key: element[key] for key in STRENGTHS if key in element}
+        if (first := settings.setdefault(supply, own)) != own:
             found, expected = (
-                ", ".join(f"{key} = {v:g}" for key, v in said.items())
-                for said in (setting, first[supply])
+                ", ".join(f"{key} = {v:g}" for key, v in said.items()) for said in (own, first)
             )
             raise section.error(f"{found} on supply '{supply}'", f"{expected}, as above", "supply")
 
@@ -335,31 +329,30 @@ def element_of(table: Mapping[str, Any], mass: float) -> Element:
     """
     from beamfit.optics import elements
 
-    name = table["name"]
+    name, length = table["name"], float(table.get("length_m", 0.0))
     match table["type"]:
         case "drift":
-            return elements.Drift(name, float(table["length_m"]))
+            return elements.Drift(name, length)
         case "marker":
             return elements.Marker(name)
         case "screen":
             return elements.Screen(name, 1e-6 * table.get("resolution_um", 0.0))
-        case "sector_dipole":
-            edges = [np.radians(table.get(f"{end}_edge_deg", 0.0)) for end in ("entrance", "exit")]
-            return elements.SectorDipole(
-                name,
-                float(np.copysign(table["radius_m"], table["angle_deg"])),
-                float(np.radians(table["angle_deg"])),
-                *map(float, edges),
-                table["bend_plane"],
-                float(table.get("energy_offset", 0.0)),
-                float(table.get("k1_per_m2", 0.0)),
-                mass=mass,
-            )
         case "thin_lens":
             return elements.ThinLens(name, *_strength(table, mass))
-        case _:
-            length = float(table["length_m"])
+        case "quadrupole":
             return elements.Quadrupole(name, length, *_strength(table, mass))
+    keys = ("angle_deg", "entrance_edge_deg", "exit_edge_deg")
+    angle, *edges = (float(np.radians(table.get(key, 0.0))) for key in keys)
+    return elements.SectorDipole(
+        name,
+        float(np.copysign(table["radius_m"], angle)),
+        angle,
+        *edges,
+        table["bend_plane"],
+        float(table.get("energy_offset", 0.0)),
+        float(table.get("k1_per_m2", 0.0)),
+        mass=mass,
+    )
 
 
 def _strength(table: Mapping[str, Any], mass: float) -> tuple[float, Calibration]:
@@ -388,8 +381,6 @@ GRADIENTS = {
     "integrated_gradient_T": lambda length: 1.0 / length,
     "integrated_gradient_kG": lambda length: 0.1 / length,
 }
-# More points than any measurement of a magnet.
-MOST_ROWS = 10_000
 
 
 def gradient_table(section: Section, key: str, length: float) -> list[tuple[float, float]]:
@@ -421,7 +412,7 @@ def gradient_table(section: Section, key: str, length: float) -> list[tuple[floa
             raise section.error(f"{wrong!r}"[:80], "pairs [current in A, gradient in T/m]", key)
         points = [(float(current), float(gradient)) for current, gradient in pairs]
     else:
-        points = _points(read_sheet(Path(section.path).parent / said, EXAMPLE, MOST_ROWS), length)
+        points = _points(read_sheet(Path(section.path).parent / said, EXAMPLE), length)
     currents = sorted(current for current, _ in points)
     twice = next((a for a, b in pairwise(currents) if a == b), None)
     if len(points) < 2 or twice is not None:

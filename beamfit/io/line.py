@@ -4,16 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
+from itertools import repeat
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from beamfit.emittance.scan import QuadScan
 from beamfit.errors import InputError, expect, nearest
-from beamfit.io.columns import Columns
 from beamfit.io.dialects import DIALECTS
 from beamfit.io.emittance_gui import EmittanceGuiFile, is_emittance_gui, read_emittance_gui
 from beamfit.io.lattice import LatticeFile, element_of, read_toml_lattice
+from beamfit.io.layout import Columns
 from beamfit.io.scan import read_quad_scan
 from beamfit.particles import REST_ENERGY, expected_energy
 
@@ -259,11 +260,10 @@ def build_line(file: LatticeFile) -> Beamline:
         twiss = {p: (t["beta_m"], t["alpha"]) for p, t in file.design.items() if p != "at"}
         design = Design(at=file.design["at"], **twiss)
     supplies: dict[str, tuple[str, ...]] = {}
-    for table in file.elements:
-        if "supply" in table:
-            supplies[table["supply"]] = (*supplies.get(table["supply"], ()), table["name"])
+    for table in (e for e in file.elements if "supply" in e):
+        supplies[table["supply"]] = (*supplies.get(table["supply"], ()), table["name"])
     return Beamline(
-        tuple(element_of(table, mass) for table in file.elements),
+        tuple(map(element_of, file.elements, repeat(mass))),
         energy=file.energy,
         name=file.name,
         mass=mass,

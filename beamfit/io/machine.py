@@ -10,12 +10,11 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from beamfit.errors import InputError, nearest, plain
-from beamfit.io.columns import UNITS
-from beamfit.io.headers import ALSO, SETTINGS, known_unit
+from beamfit.io.columns import ALSO, SETTINGS, UNITS, known_unit
+from beamfit.io.decay_record import QUANTITIES
 from beamfit.io.lattice import LatticeFile
 from beamfit.io.line import part_of, read_lattice
-from beamfit.io.record_columns import QUANTITIES
-from beamfit.io.toml import LIST, TABLE, TEXT, Key, Section, is_number, read_toml
+from beamfit.io.toml import LIST, TABLE, TEXT, WHOLE, Key, Section, is_number, read_toml
 from beamfit.lifetime.record import Conditions
 
 FORMAT = "beamfit-machine-1"
@@ -48,7 +47,7 @@ SCREEN = {
     **{name: Key(name, kind=TEXT, default=None) for name in ("x", "y", "profile_x", "profile_y")},
     "unit": Key("unit", kind=TEXT, default="um", among=tuple(LENGTHS)),
     "pixel_um": Key("pixel", 1e-6, default=None, **POSITIVE),
-    "shots": Key("shots", default=5, low=1.0, high=1001.0, said="2 to 1000 shots"),
+    "shots": Key("shots", kind=WHOLE, default=5, low=1, high=1001, said="2 to 1000 shots"),
     "timeout_s": Key("timeout", default=10.0, **WAIT),
 }
 BEAM = {
@@ -60,7 +59,7 @@ BEAM = {
 }
 SCAN = {
     "goal_percent": Key("goal", 1e-2, default=0.03, low=0.0, high=100.0, said="0 to 100 %"),
-    "points": Key("points", default=None, low=3.0, high=201.0, said="4 to 200 points"),
+    "points": Key("points", kind=WHOLE, default=None, low=3, high=201, said="4 to 200 points"),
     "first": Key("first", kind=LIST, default=()),
     "restore_s": Key("restore", default=60.0, **WAIT),
 }
@@ -224,7 +223,7 @@ def read_scan_machine(path: str | PathLike[str]) -> ScanMachine:
     if not top.table.get("magnet"):
         raise top.error("no magnet to scan", "tables [[magnet]]", "magnet")
     scanned = tuple(_magnet(section, lattice) for section in top.sections("magnet"))
-    knobs = tuple(map(_knob, top.sections("knob"))) if "knob" in top.table else ()
+    knobs = tuple(map(_magnet, top.sections("knob"))) if "knob" in top.table else ()
     magnets = scanned + knobs
     for said_once in ({m.name for m in magnets}, {m.set.rpartition("://")[2] for m in magnets}):
         if len(said_once) < len(magnets):
@@ -233,12 +232,11 @@ def read_scan_machine(path: str | PathLike[str]) -> ScanMachine:
     wanted = top.section("scan")
     plan = wanted.values(SCAN)
     first = _numbers(wanted, "first", plan.pop("first"), magnets[0].span)
-    usual = ROWS if knobs else POINTS
-    plan["points"] = _whole(wanted, "points", plan["points"] or usual)
+    plan["points"] = plan["points"] or (ROWS if knobs else POINTS)
     screen, guard = _screen(top.section("screen"), lattice), _guard(top.section("beam"))
-    lattice = _seen_at(lattice, screen.name)
+    lattice, before = _seen_at(lattice, screen.name)
     for magnet, section in zip(scanned, top.sections("magnet"), strict=True):
-        if magnet.name not in _before(lattice, screen.name):
+        if magnet.name not in before:
             found = f"{magnet.name} behind the screen {screen.name}"
             raise section.error(found, "a magnet that the beam passes before it", "name")
     for name in (screen.name, *(m.name for m in magnets)):
@@ -269,25 +267,22 @@ def unit_of(word: str) -> str | None:
     return SPELLINGS.get(word.strip().lower())
 
 
-def _magnet(section: Section, lattice: LatticeFile) -> Magnet:
+def _magnet(section: Section, lattice: LatticeFile | None = None) -> Magnet:
+    """A magnet of the lattice; or without one a knob of the machine, in whatever unit it has."""
     magnet = Magnet(**section.values(MAGNET))
-    if magnet.name not in lattice.calibrations:
+    unit = unit_of(magnet.unit)
+    if lattice is not None and magnet.name not in lattice.calibrations:
         expected = nearest(magnet.name, list(lattice.calibrations)) + f", of {lattice.path}"
         raise section.error(f"no magnet '{magnet.name}'", expected, "name")
-    unit, wanted = unit_of(magnet.unit), lattice.calibrations[magnet.name]
-    if unit != wanted:
+    if lattice is not None and unit != (wanted := lattice.calibrations[magnet.name]):
         raise section.error(f"unit '{magnet.unit}'", f"{wanted}, as in the lattice", "unit")
-    return _movable(section, replace(magnet, unit=wanted))
+    _check_movable(section, magnet)
+    degauss = _numbers(section, "degauss", magnet.degauss, (magnet.low, magnet.high))
+    return replace(magnet, unit=unit or magnet.unit, degauss=degauss)
 
 
-def _knob(section: Section) -> Magnet:
-    """A knob of the machine before the lattice, in whatever unit it has."""
-    knob = Magnet(**section.values(MAGNET))
-    return _movable(section, replace(knob, unit=unit_of(knob.unit) or knob.unit))
-
-
-def _movable(section: Section, magnet: Magnet) -> Magnet:
-    """A magnet or a knob whose limits leave room to move it."""
+def _check_movable(section: Section, magnet: Magnet) -> None:
+    """Check that the limits leave room to move a magnet or a knob."""
     if not (is_number(magnet.low) and is_number(magnet.high) and magnet.low < magnet.high):
         found = f"limits {magnet.low:g} to {magnet.high:g}"
         raise section.error(found, "low below high, both numbers", "low")
@@ -300,8 +295,6 @@ def _movable(section: Section, magnet: Magnet) -> Magnet:
     if not magnet.span[1] - magnet.span[0] > 10 * magnet.tolerance:
         found = f"approach by {magnet.approach_by:g} within {magnet.low:g} to {magnet.high:g}"
         raise section.error(found, "room to scan besides", "approach_by")
-    degauss = _numbers(section, "degauss", magnet.degauss, (magnet.low, magnet.high))
-    return replace(magnet, degauss=degauss)
 
 
 def _numbers(
@@ -313,12 +306,6 @@ def _numbers(
             expected = f"numbers within {span[0]:g} and {span[1]:g}"
             raise section.error(f"{value!r}"[:80], expected, key)
     return tuple(map(float, values))
-
-
-def _whole(section: Section, key: str, value: float) -> int:
-    if value != int(value):
-        raise section.error(f"{value!r}", "a whole number", key)
-    return int(value)
 
 
 def _screen(section: Section, lattice: LatticeFile) -> Profiler:
@@ -336,26 +323,20 @@ def _screen(section: Section, lattice: LatticeFile) -> Profiler:
     if name not in lattice.places:
         expected = nearest(str(name), lattice.places) + f", of {lattice.path}"
         raise section.error(f"no screen '{name}'", expected, "name")
-    shots = _whole(section, "shots", said["shots"])
-    return Profiler(name, sizes, profiles, said["unit"], said["pixel"], shots, said["timeout"])
+    rest = {key: said[key] for key in ("unit", "pixel", "shots", "timeout")}
+    return Profiler(name, sizes, profiles, **rest)
 
 
-def _seen_at(lattice: LatticeFile, screen: str) -> LatticeFile:
-    """A lattice with one screen: at the others nothing can be measured."""
-    cut = part_of(lattice, screen=screen)
-    elements = tuple(
-        {"type": "marker", "name": e["name"]}
-        if e["type"] == "screen" and e["name"] != screen
-        else e
-        for e in cut.elements
-    )
-    return replace(cut, elements=elements)
-
-
-def _before(lattice: LatticeFile, screen: str) -> set[str]:
-    """Elements and supplies before a screen."""
-    place = [e["name"] for e in lattice.elements].index(screen)
-    return {name for e in lattice.elements[:place] for name in (e["name"], e.get("supply"))}
+def _seen_at(lattice: LatticeFile, screen: str) -> tuple[LatticeFile, set[str]]:
+    """A lattice with one screen, since nothing is measured at others, and what stands before it."""
+    cut, found, before = part_of(lattice, screen=screen), [], set()
+    for e in cut.elements:
+        if e["name"] == screen:
+            before = {name for each in found for name in (each["name"], each.get("supply"))}
+        elif e["type"] == "screen":
+            e = {"type": "marker", "name": e["name"]}
+        found.append(e)
+    return replace(cut, elements=tuple(found)), before
 
 
 def _guard(section: Section) -> Guard:

@@ -60,17 +60,13 @@ def read_noise(path: str | PathLike[str]) -> Noise:
     0.03
     """
     top = read_toml(path, "priors of noise", NOISE, needed=False)
-    schema = {name: Key(default=None, kind=NUMBER) for name in SINGLE}
-    schema |= {name: Key(default=None, kind=LIST) for name in PAIRS}
-    top.values(schema | {"source": Key(default=str(path), kind=TEXT)})
-    told: dict[str, Any] = {"source": top.table.get("source", str(path))}
-    for name in (*SINGLE, *PAIRS):
-        if name not in top.table:
-            continue
-        value = top.table[name]
-        if name in PAIRS and not (len(value) == 2 and all(map(is_number, value))):
+    schema = {name: Key(name, default=None) for name in SINGLE}
+    schema |= {name: Key(name, kind=LIST, default=None, said=PAIR, each=NUMBER) for name in PAIRS}
+    said = top.values(schema | {"source": Key("source", kind=TEXT, default=str(path))})
+    told: dict[str, Any] = {name: value for name, value in said.items() if value is not None}
+    for name, value in told.items():
+        if name in PAIRS and len(value) != 2:
             raise top.error(f"{name} = {value}", PAIR, name)
-        told[name] = value
         try:
             Noise(**{name: value})
         except InputError as error:

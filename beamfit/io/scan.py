@@ -2,37 +2,36 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from beamfit.emittance.scan import POSSIBLE, USUAL, Profile, QuadScan, first_unusable, middle
+from beamfit.emittance.scan import POSSIBLE, USUAL, Profile, QuadScan, middle, row_keys
 from beamfit.errors import InputError, located
 from beamfit.io.columns import (
     UNITS,
     Column,
-    Columns,
     Sheet,
     left_aside,
     left_out,
 )
 from beamfit.io.emittance_gui import is_emittance_gui, read_emittance_gui
 from beamfit.io.files import name_of
-from beamfit.io.headers import SETTINGS
-from beamfit.io.profiles import IMAGE, has_profiles, of_images, of_profiles
+from beamfit.io.layout import Columns
 from beamfit.io.scan_columns import (
     ENERGIES,
     PERCENT,
+    SETTING,
     column_notes,
     comment_notes,
     is_scatter,
     scan_columns,
 )
-from beamfit.io.shots import average_shots
+from beamfit.io.shots import IMAGE, average_shots, of_images, of_profiles
 from beamfit.io.table import read_columns
 
 if TYPE_CHECKING:
@@ -75,7 +74,7 @@ def read_quad_scan(
         `beamfit.io.emittance_gui.read_emittance_gui`).
     columns : str, path, mapping or Layout, optional
         What columns are whose headers do not say it: ``{"xrms": "size_x_um"}``, or as
-        `beamfit.io.columns.layout_of` reads it. Other columns of unknown names are ignored.
+        `beamfit.io.layout.layout_of` reads it. Other columns of unknown names are ignored.
     ignore : iterable of str
         Columns to leave unread; * and ? stand for any letters.
     skip_bad : bool
@@ -102,7 +101,7 @@ def read_quad_scan(
     >>> scan.notes
     ("1 of 4 rows was left out: line 5, column 'size_x_um', 'lost'.",)
     """
-    if isinstance(path, str | PathLike) and is_emittance_gui(path):
+    if str(path).lower().endswith(".mat") and is_emittance_gui(path):
         if columns is not None:
             raise InputError("--columns for a file of emittance_gui", "none: it says them", path)
         return read_emittance_gui(path).scan()
@@ -110,39 +109,52 @@ def read_quad_scan(
     return scan_of_sheet(sheet, skip_bad)
 
 
-def scan_of_sheet(sheet: Sheet, skip_bad: bool = False) -> QuadScan:
-    """Understand the columns of a sheet as a scan, as `read_quad_scan` does."""
+def scan_of_sheet(
+    sheet: Sheet, skip_bad: bool = False, knobs: Mapping[str, Column] | None = None
+) -> QuadScan:
+    """Understand the columns of a sheet as a scan; knobs of the machine are settings, too."""
     profiles: tuple[Profile, ...] = ()
     if IMAGE in sheet.names:
         sheet = of_images(sheet)
-    if has_profiles(sheet):
+    if {"counts_x", "counts_y"} & set(sheet.names):
         sheet, profiles = of_profiles(sheet)
-    columns = scan_columns(sheet)
+    columns = scan_columns(sheet, knobs or {})
     if skip_bad:
         sheet = sheet.good(lambda rows: _values(rows, columns))
         usual = _usual(_values(sheet, columns))
-        sheet = sheet.good(lambda rows: _check_slipped(rows, columns, usual))
+        sheet = sheet.good(
+            lambda rows: _check_slipped(rows, columns, _values(rows, columns), usual)
+        )
     try:
         values = _values(sheet, columns)
-        _check_sizes(sheet, columns, values)
+        odd = _check_sizes(sheet, columns, values)
     except InputError as error:
         skip = error.line is not None and not skip_bad and "--ignore" not in error.expected
         more = "; --skip-bad leaves such rows out" if skip else ""
         raise replace(error, expected=error.expected + more) from None
+    notes = [*column_notes(columns), *comment_notes(sheet, columns), *odd]
+    notes += [*left_aside(sheet, columns), *left_out(sheet)]
     with located(sheet.path):
-        scan = replace(_scan(sheet, columns, values), profiles=profiles)
-    return average_shots(scan, marked="shot" in columns)
+        scan = _scan(sheet, columns, values, notes=tuple(notes), profiles=profiles)
+    rows = row_keys(scan)
+    return average_shots(scan, marked="shot" in columns) if len(set(rows)) < len(rows) else scan
 
 
 def _scan(
-    sheet: Sheet, columns: Mapping[str, Column], values: Mapping[str, np.ndarray]
+    sheet: Sheet, columns: Mapping[str, Column], values: Mapping[str, np.ndarray], **further: Any
 ) -> QuadScan:
     """The scan of these numbers, one row a line of the file."""
-    magnets = {k.removeprefix("setting "): c for k, c in columns.items() if c.unit in SETTINGS}
+    magnets = {k.removeprefix(SETTING): c for k, c in columns.items() if k.startswith(SETTING)}
     energies = [(values[key], kind) for key, kind in ENERGIES.items() if key in values]
     energy, kind = energies[0] if energies else (None, "total")
     headers = {key: sheet.called.get(c.header, c.header) for key, c in columns.items()}
+    words = {
+        key: tuple(map(str, sheet[columns[key].header]))
+        for key in ("screen", "slice")
+        if key in columns
+    }
     planes = [p for p in "xy" if f"size_{p}" in values]
+    error = {p: values[f"size_{p}_error"] for p in planes if f"size_{p}_error" in values}
     own = {
         p: np.stack([values.get(f"r{i}_{p}", np.zeros(len(sheet))) for i in ELEMENTS], axis=-1)
         for p in planes
@@ -152,77 +164,62 @@ def _scan(
         settings={name: values[c.key] for name, c in magnets.items()},
         units={name: c.unit for name, c in magnets.items()},
         size={p: values[f"size_{p}"] for p in planes},
-        error={p: values[f"size_{p}_error"] for p in planes if f"size_{p}_error" in values},
+        error=error,
         energy=energy,
         energy_kind=kind,
-        resolution=values.get("resolution"),
-        energy_spread=values.get("energy_spread"),
-        shots=values.get("shots"),
-        screen=_screens(sheet, columns.get("screen")),
-        slice=tuple(map(str, sheet[columns["slice"].header])) if "slice" in columns else None,
+        **{key: values.get(key) for key in ("resolution", "energy_spread", "shots")},
+        **words,
         transfer=own or None,
-        error_source="the file",
+        error_source="the file" if error else "none given",
         name=Path(name_of(sheet.path)).stem,
         path=sheet.path,
         sha256=sheet.sha256,
         provenance=sheet.comments,
-        notes=(
-            *column_notes(columns),
-            *comment_notes(sheet, columns),
-            *_tiny_errors(values),
-            *left_aside(sheet, columns),
-            *left_out(sheet),
-        ),
         columns={name: headers[c.key] for name, c in magnets.items()}
         | headers
         | {header: header for header in headers.values()},
+        **further,
     )
 
 
 def _values(sheet: Sheet, columns: Mapping[str, Column]) -> dict[str, np.ndarray]:
     """The numbers of a scan in SI by quantity; what is wrong with a row by itself is refused."""
-    values: dict[str, np.ndarray] = {}
+    sizes = [key for p in "xy" for key in (f"size_{p}", f"size_{p}_error") if key in columns]
+    others = [key for key in columns if key in RANGES or key.startswith((SETTING, "r1"))]
+    values = {key: _checked(sheet, columns[key], key in sizes) for key in sizes + others}
     for plane in "xy":
         size, error = f"size_{plane}", f"size_{plane}_error"
-        if size in columns:
-            values[size] = _positive(sheet, columns[size], "beam size")
-        if error in columns:
-            values[error] = _positive(sheet, columns[error], "error")
-            if columns[error].unit == PERCENT:
-                values[error] = values[error] * values[size]
-            missing = np.isnan(values[error]) & ~np.isnan(values[size])
+        if error not in columns:
+            continue
+        if columns[error].unit == PERCENT:
+            values[error] = values[error] * values[size]
+        if is_scatter(columns, plane):
+            values[error] = values[error] / np.sqrt(values["shots"])
+        if (missing := np.isnan(values[error]) & ~np.isnan(values[size])).any():
             expected = "an error for each size, or none at all"
             sheet.refuse(columns[error].header, missing, expected, "an empty cell")
-            _check_absent(sheet, columns[size], values[size], values[error])
-    values |= {key: _within(sheet, columns[key]) for key in RANGES if key in columns}
-    for plane in "xy":
-        if is_scatter(columns, plane):
-            values[f"size_{plane}_error"] /= np.sqrt(values["shots"])
-    _screens(sheet, columns.get("screen"))
-    elements = [f"r{i}_{p}" for i in ELEMENTS for p in "xy"]
-    plain = [c for key, c in columns.items() if c.unit in SETTINGS or key in elements]
-    return values | {c.key: sheet.values(c) for c in plain}
+        # It was measured, or it was not: a size that says NaN has no error.
+        absent = np.isnan(values[size]) & ~np.isnan(values[error])
+        for row in [int(row) for row in np.flatnonzero(absent)]:
+            if (cell := sheet[columns[size].header][row]) != "":
+                expected = "a finite number, or no error beside it"
+                raise sheet.error(f"'{cell}'", expected, row, columns[size].header)
+    if "screen" in columns and "" in (names := list(sheet[columns["screen"].header])):
+        expected = "the name of a screen of the lattice"
+        raise sheet.error("an empty cell", expected, names.index(""), columns["screen"].header)
+    return values
 
 
-def _check_absent(sheet: Sheet, column: Column, size: np.ndarray, error: np.ndarray) -> None:
-    """Refuse a size that says NaN and has an error: it was measured, or it was not."""
-    for row in np.flatnonzero(np.isnan(size) & ~np.isnan(error)):
-        if (cell := sheet[column.header][row]) != "":
-            expected = "a finite number, or no error beside it"
-            raise sheet.error(f"'{cell}'", expected, int(row), column.header)
-
-
-def _positive(sheet: Sheet, column: Column, what: str) -> np.ndarray:
-    """Lengths in m; NaN where the cell is blank."""
-    values = sheet.values(column, blank=True)
-    if wrong := first_unusable(values, blank=True):
-        cell = sheet[column.header][wrong[0]]
-        expected = f"a positive {what} in {column.unit}"
-        if what == "error" and not np.any(values > 0):
-            expected += (
-                f"; --ignore '{column.header}' leaves them unread, and the noise is inferred"
-            )
-        raise sheet.error(f"'{cell}'", expected, wrong[0], column.header)
+def _checked(sheet: Sheet, column: Column, length: bool) -> np.ndarray:
+    """A quantity within what it can be; lengths in m, NaN where the cell is blank."""
+    values = sheet.values(column, blank=length)
+    what = f"a positive {'error' if column.key.endswith('error') else 'beam size'} in {column.unit}"
+    usual = (0.0, np.inf, what) if length else (-np.inf, np.inf, "")
+    low, high, expected = RANGES.get(column.key, usual)
+    if (wrong := (values <= low) | (values > high)).any():
+        if column.key.endswith("error") and not np.any(values > 0):
+            expected += f"; --ignore '{column.header}' leaves them unread: the noise is inferred"
+        sheet.refuse(column.header, wrong, expected)
     return values
 
 
@@ -232,22 +229,27 @@ def _usual(values: Mapping[str, np.ndarray]) -> dict[str, float]:
     return {p: middle(v) for p, v in sizes.items() if not np.isnan(v).all()}
 
 
-def _check_slipped(sheet: Sheet, columns: Mapping[str, Column], usual: Mapping[str, float]) -> None:
+def _check_slipped(
+    sheet: Sheet,
+    columns: Mapping[str, Column],
+    values: Mapping[str, np.ndarray],
+    usual: Mapping[str, float],
+) -> None:
     """Refuse a size that is far larger than the others of its column and than most beams."""
     for plane, usually in usual.items():
-        column = columns[f"size_{plane}"]
-        size = _positive(sheet, column, "beam size")
-        slipped = np.nan_to_num(size) > max(USUAL[1], SLIPPED * usually)
-        found = f"{{:g}} {column.unit}, where the others are around {usually / column.factor:.3g}"
-        written = size / column.factor
-        sheet.refuse(column.header, slipped, "sizes in one unit", found, written)
+        column, size = columns[f"size_{plane}"], values[f"size_{plane}"]
+        if (slipped := np.nan_to_num(size) > max(USUAL[1], SLIPPED * usually)).any():
+            around = f"{usually / column.factor:.3g}"
+            found = f"{{:g}} {column.unit}, where the others are around {around}"
+            written = size / column.factor
+            sheet.refuse(column.header, slipped, "sizes in one unit", found, written)
 
 
 def _check_sizes(
     sheet: Sheet, columns: Mapping[str, Column], values: Mapping[str, np.ndarray]
-) -> None:
-    """Check that sizes and errors are in a unit that can be meant: no beam is metres wide."""
-    usual = _usual(values)
+) -> list[str]:
+    """Check that sizes and errors are in a unit that can be meant; ask about tiny errors."""
+    usual, notes = _usual(values), []
     for plane in (p for p in "xy" if f"size_{p}" in columns):
         column, error = columns[f"size_{plane}"], columns.get(f"size_{plane}_error")
         if plane not in usual:
@@ -255,25 +257,18 @@ def _check_sizes(
             raise sheet.error("no number at all", expected, None, column.header)
         if not POSSIBLE[0] <= usual[plane] <= POSSIBLE[1]:
             raise _implausible(sheet, column, usual[plane] / column.factor)
-        if error is not None:
-            with np.errstate(over="ignore"):
-                ratio = middle(values[f"size_{plane}_error"] / values[f"size_{plane}"])
-            if not 1e-6 < ratio < 1.0:
-                found = f"errors that are {ratio:g} of the sizes"
-                raise sheet.error(found, "errors in the unit of the header", None, error.header)
-    _check_slipped(sheet, columns, usual)
-
-
-def _tiny_errors(values: Mapping[str, np.ndarray]) -> Iterator[str]:
-    """Ask about errors that are smaller than any measurement's, as of sizes in another unit."""
-    for plane in "xy":
-        if f"size_{plane}_error" in values:
+        if error is None:
+            continue
+        with np.errstate(over="ignore"):
             ratio = middle(values[f"size_{plane}_error"] / values[f"size_{plane}"])
-            if ratio < SMALLEST:
-                yield (
-                    f"Errors in {plane} are {ratio:.1g} of the sizes: are both in the units of "
-                    "their headers?"
-                )
+        if not 1e-6 < ratio < 1.0:
+            found = f"errors that are {ratio:g} of the sizes"
+            raise sheet.error(found, "errors in the unit of the header", None, error.header)
+        if ratio < SMALLEST:
+            said = f"Errors in {plane} are {ratio:.1g} of the sizes"
+            notes.append(f"{said}: are both in the units of their headers?")
+    _check_slipped(sheet, columns, values, usual)
+    return notes
 
 
 def _implausible(sheet: Sheet, column: Column, written: float) -> InputError:
@@ -284,21 +279,3 @@ def _implausible(sheet: Sheet, column: Column, written: float) -> InputError:
     expected = f"sizes between {1e9 * POSSIBLE[0]:g} nm and {1e3 * POSSIBLE[1]:g} mm; if these are "
     expected += f"{likely}, rename the column {column.key}_{likely}"
     return sheet.error(found, expected, None, column.header)
-
-
-def _within(sheet: Sheet, column: Column) -> np.ndarray:
-    """A further quantity, within what it can be."""
-    low, high, expected = RANGES[column.key]
-    values = sheet.values(column)
-    sheet.refuse(column.header, (values <= low) | (values > high), expected)
-    return values
-
-
-def _screens(sheet: Sheet, column: Column | None) -> tuple[str, ...] | None:
-    if column is None:
-        return None
-    names = tuple(str(name) for name in sheet[column.header])
-    if "" in names:
-        expected = "the name of a screen of the lattice"
-        raise sheet.error("an empty cell", expected, names.index(""), column.header)
-    return names

@@ -6,11 +6,11 @@ import math
 import re
 from collections.abc import Mapping
 from dataclasses import replace
+from types import MappingProxyType
 
 from beamfit.errors import InputError, nearest, short
-from beamfit.io.columns import UNITS, Column, Sheet, columns_of
+from beamfit.io.columns import SETTINGS, UNITS, Column, Sheet, columns_of, known_unit, spelled
 from beamfit.io.files import text_lines
-from beamfit.io.headers import SETTINGS, bare, known_unit, spelled
 from beamfit.particles import ENERGY_KEYS
 
 # How the energy of a row may be given, without its unit, and what that is.
@@ -26,7 +26,8 @@ QUANTITIES = {
     "screen": "",
     "slice": "",
 }
-# What tells rows apart besides settings of magnets.
+# How the keys of settings begin, and what tells rows apart besides.
+SETTING = "setting "
 SEEN = {"screen", "r11_x", "r11_y"}
 CARRIED = re.compile(
     r"note_.*|comments?|charge[ _]?[\[(]?[np]C[\])]?|index|n[or]\.?|point|row|seq"
@@ -68,13 +69,17 @@ ONE_WORD = re.compile(
 )
 
 
-def scan_columns(sheet: Sheet) -> dict[str, Column]:
+def scan_columns(
+    sheet: Sheet, knobs: Mapping[str, Column] = MappingProxyType({})
+) -> dict[str, Column]:
     """Understand every header of a scan.
 
     Parameters
     ----------
     sheet : Sheet
         The file.
+    knobs : mapping of str to Column, optional
+        Settings that are no magnets of a line, as they are returned.
 
     Returns
     -------
@@ -98,10 +103,12 @@ def scan_columns(sheet: Sheet) -> dict[str, Column]:
     if any(spelled(name).lower().startswith("beam_current") for name in sheet.names):
         expected = "a quadrupole scan; `beamfit lifetime` reads it"
         raise sheet.header_error("a record of beam current", expected)
-    columns = _understood(sheet)
+    taken = {column.header for column in knobs.values()}
+    rest = [name for name in sheet.names if name not in taken]
+    columns = dict(knobs) | _understood(sheet.only(rest) if knobs else sheet)
     if not {"size_x", "size_y"} & set(columns):
         missing = "a beam size column, such as size_x_um"
-    elif not (any(c.unit in SETTINGS for c in columns.values()) or SEEN & set(columns)):
+    elif not (any(key.startswith(SETTING) for key in columns) or SEEN & set(columns)):
         missing = "a magnet setting column, such as Q2_A, Q2_kG or Q2_k1, or a column screen"
     else:
         missing = ""
@@ -193,7 +200,7 @@ def _other(header: str, sheet: Sheet) -> Column:
     while (bare := ATTRIBUTE.sub("", name)) != name:
         name = bare
     if name and not re.match(r"(size|sigma|rms|fwhm)_[xy](_|$)", name):
-        return Column(header, f"setting {name}", unit)
+        return Column(header, f"{SETTING}{name}", unit)
     usual = [f"{q}_um" for q in QUANTITIES if q.startswith("size")]
     usual += ["resolution_um", *ENERGY_KEYS, "energy_spread"]
     usual += ["shot", "shots", "screen", "slice"]
@@ -397,7 +404,7 @@ def _check(sheet: Sheet, sizes: list[Column], text: str, stated: re.Match[str]) 
     if true:
         return
     lines = enumerate([] if sheet.lines is None else text_lines(sheet.path), start=1)
-    line = next((number for number, one in lines if text in bare(one)), None)
+    line = next((number for number, one in lines if text in one), None)
     raise InputError(
         f"the comment '{short(text, 80)}'",
         f"one that agrees with the header: {mend} if the comment is right, else delete the comment",

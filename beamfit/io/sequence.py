@@ -1,15 +1,18 @@
-"""Sequences and lines of MAD-X, MAD-8 and elegant files as the elements of a beamfit lattice."""
+"""Sequences and lines of MAD-X, MAD-8 and elegant files as the elements of a beamfit lattice.
+
+What a first-order, uncoupled line of one energy cannot hold is refused, never dropped.
+"""
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from collections import Counter
+from collections.abc import Iterable, Iterator
 from itertools import count
 from os import PathLike
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from beamfit.errors import InputError, nearest
 from beamfit.io.dialects import DIALECTS, ELEGANT, MADX, coded
@@ -17,7 +20,6 @@ from beamfit.io.files import digest, read_text
 from beamfit.io.lattice import MOST, LatticeFile
 from beamfit.io.madx import NO_MATTER, Attribute, Definition, Interpreter, word_of
 from beamfit.io.madx_values import NAME, words
-from beamfit.io.sequence_elements import NOTHING_AT_ZERO, Element, element_tables
 from beamfit.particles import REST_ENERGY, expected_energy
 
 # Gaps and overlaps in m that MAD-X takes for none.
@@ -38,6 +40,44 @@ MEMBER = re.compile(rf"\s*([-+]?)\s*(?:(\d+)\s*\*)?\s*(?:({NAME})|(\())", re.I)
 KNOWN = {"positron": 1.0, "electron": -1.0, "proton": 1.0, "antiproton": -1.0}
 # Relative: masses that differ by less are one particle's.
 SAME_MASS = 2e-4
+# Parameters that bend, focus, couple or accelerate in a way beamfit does not model.
+UNMODELLED = {
+    "ks": "a solenoid field",
+    "ksi": "a solenoid field",
+    "b": "a field given as B",
+    "k1s": "a skew gradient",
+    "k0s": "a skew bend",
+    "ktap": "a tapered field",
+    "fse": "a field error",
+    "etilt": "a tilt error",
+    "t0": "a tilted component",
+    "t1": "a tilted component",
+    "bore": "a field given by its bore",
+    "use_bn": "a field given by B1, B2, ...",
+    "volt": "an accelerating voltage",
+    "ex": "an electric field",
+    "ey": "an electric field",
+    "kill_ent_fringe": "an edge switched off",
+    "kill_exi_fringe": "an edge switched off",
+}
+# Elements that are nothing where some parameter is zero.
+NOTHING_AT_ZERO = {
+    "srotation": ("angle",),
+    "xrotation": ("angle",),
+    "yrotation": ("angle",),
+    "translation": ("dx", "dy", "ds"),
+    "dipedge": ("h",),
+    "nllens": ("knll",),
+    "twcavity": ("volt",),
+    "hacdipole": ("volt",),
+    "vacdipole": ("volt",),
+    "beambeam": ("charge",),
+}
+EDGES = ("edge1_effects", "edge2_effects")
+# What each class of element is to a line.
+KINDS = dict.fromkeys(SCREENS, "screen") | dict.fromkeys((*SPACES, *NOTHING_AT_ZERO), "space")
+KINDS |= {"marker": "marker", "quadrupole": "quadrupole", "multipole": "thin"}
+KINDS |= {"sbend": "dipole", "rbend": "dipole", "nothing": "nothing"}
 
 
 def read_sequence(
@@ -81,7 +121,7 @@ def read_sequence(
     program.finish(path)
     chosen = _chosen(program, path, use)
     particle, total = _beam(program, path, chosen.name.lower(), energy)
-    elements = element_tables(_Expansion(program, chosen).elements())
+    elements = numbered(_Line(program, chosen).tables())
     if not elements:
         raise chosen.error(f"'{chosen.name}' without elements", "a line with magnets and a screen")
     return LatticeFile(path, digest(path), chosen.name, total, particle, tuple(elements))
@@ -114,21 +154,18 @@ class _Placed(NamedTuple):
     place: tuple[str | PathLike[str], int]
 
 
-class _Expansion:
-    """The elements of one line, in order."""
+class _Line:
+    """The elements of one line or sequence, in order."""
 
     def __init__(self, program: Interpreter, line: Definition) -> None:
         self.program, self.line, self.made = program, line, 0
-        self.elegant = program.dialect is ELEGANT
-        self.meant = {*MEANT, *program.dialect.meant}
 
-    def elements(self) -> Iterator[Element]:
-        """Each element of the line, with drifts where nothing stands."""
+    def tables(self) -> Iterator[dict[str, Any]]:
+        """The table of each element of the line, with drifts where nothing stands."""
         if self.line.kind == "line":
             for name, reflected in self._members(self.line, ()):
-                for one in self._whole(self.program.elements[name]):
-                    turned = reflected and self.program.dialect is not MADX  # which does not
-                    yield replace(one, edges=one.edges[::-1]) if turned else one
+                turned = reflected and self.program.dialect is not MADX  # which does not
+                yield from self._whole(self.program.elements[name], turned)
             return
         end, number = 0.0, count()
         last = _Placed(None, self._length(self.line), 0.0, (self.line.path, self.line.line))
@@ -139,7 +176,7 @@ class _Expansion:
                 expected = "elements in the order of their places that do not overlap"
                 raise InputError(f"{what} by {-gap:g} m", expected, *one.place)
             if gap > TINY:
-                yield Element(f"drift_{next(number)}", "DRIFT", "space", gap)
+                yield {"type": "drift", "name": f"drift_{next(number)}", "length_m": gap}
             if one.own is not None:
                 yield from self._whole(one.own)
                 end = one.start + one.length
@@ -153,7 +190,7 @@ class _Expansion:
         length = self._number(own, "l")
         if own.kind == "sequence" and length <= 0.0:
             raise own.error(f"sequence '{own.name}' of length {length:g} m", "L above zero")
-        if own.kind == "multipole" and not self.elegant:
+        if own.kind == "multipole" and self.program.dialect is not ELEGANT:
             return 0.0
         if length < 0.0 or (own.kind == "marker" and length):
             raise own.error(f"'{own.name}' of length {length:g} m", "a length that MAD-X takes")
@@ -169,7 +206,7 @@ class _Expansion:
         for i, (name, _) in enumerate(sequence.placed):
             self._count(sequence)
             own = self._part(sequence, name)
-            first = start + self._start(sequence, i)
+            first = start + self._centre(sequence, i, ()) - 0.5 * self._length(own)
             if own.kind == "sequence":
                 yield from self._placed(own, first, (*within, sequence.name))
             else:
@@ -182,10 +219,6 @@ class _Expansion:
             found = f"line '{own.name}' within a sequence"
             raise sequence.error(found, "elements and sequences")
         return own
-
-    def _start(self, sequence: Definition, i: int) -> float:
-        own = self._part(sequence, sequence.placed[i][0])
-        return self._centre(sequence, i, ()) - 0.5 * self._length(own)
 
     def _centre(self, sequence: Definition, i: int, behind: tuple[int, ...]) -> float:
         """Place of the centre of one part of a sequence, from the sequence's start."""
@@ -276,9 +309,9 @@ class _Expansion:
         if self.made > MOST:
             raise own.error(f"more than {MOST} elements", "a line that a machine has")
 
-    def _whole(self, own: Definition) -> list[Element]:
-        """An element, and the halves before and behind the centre of one that is a screen."""
-        kind = KINDS.get(own.kind)
+    def _whole(self, own: Definition, turned: bool = False) -> list[dict[str, Any]]:
+        """The table of an element, with the halves of one that is a screen around its centre."""
+        kind, length = KINDS.get(own.kind), self._length(own) if own.kind in KINDS else 0.0
         if kind is None:
             raise own.error(
                 f"element '{own.name}' of type '{own.type}', which cannot be read",
@@ -286,54 +319,176 @@ class _Expansion:
             )
         if kind == "nothing":
             return []
-        odd = [k for k in own.parameters if k not in self.meant and k not in NO_MATTER]
+        table = _Element(self.program, own, kind, length).table(turned)
+        if kind != "screen" or not length:
+            return [table]
+        half = {"type": "drift", "name": own.name, "length_m": 0.5 * length}
+        return [half, table, half.copy()]
+
+
+class _Element:
+    """An element of a file, which gives its table unless it does what beamfit does not model."""
+
+    def __init__(self, program: Interpreter, own: Definition, kind: str, length: float) -> None:
+        self.own, self.kind, self.length = own, kind, length
+        self.elegant = program.dialect is ELEGANT
+        meant = {*MEANT, *program.dialect.meant}
+        odd = [k for k in own.parameters if k not in meant and k not in NO_MATTER]
         if odd and not self.elegant:  # which has many that change no matrix
             found = f"'{odd[0]}' of element '{own.name}', which MAD-X or beamfit does not know"
             raise own.error(found, nearest(odd[0], ["l", "k1", "angle", "e1", "e2", "tilt", "knl"]))
         if "tilt" in own.parameters and not own.parameters["tilt"].text:
             raise own.error("'tilt' without a value", "tilt = ...")
-        length = self._length(own)
-        if kind == "screen" and length:
-            half = Element(own.name, "DRIFT", "space", 0.5 * length)
-            return [half, Element(own.name, own.type, kind, 0.0), half]
-        return [self._magnet(own, "space" if kind == "thin" and length else kind, length)]
+        meant |= {"e1", "e2"} if kind == "dipole" else set()
+        self.said = {k: program.number(p) for k, p in own.parameters.items() if k in meant}
 
-    def _magnet(self, own: Definition, kind: str, length: float) -> Element:
-        said = {
-            key: self.program.number(parameter)
-            for key, parameter in own.parameters.items()
-            if key in self.meant or (key in ("e1", "e2") and kind == "dipole")
+    def table(self, turned: bool) -> dict[str, Any]:
+        """The table of a TOML lattice; of a turned dipole the faces change places."""
+        named = {"name": self.own.name}
+        if self.kind in ("screen", "marker"):
+            return {"type": self.kind} | named
+        self._check_unmodelled()
+        if self.kind == "thin" and not self.length:
+            return named | self._lens()
+        if self.kind in ("quadrupole", "dipole"):
+            self._check_length()
+            return named | (
+                self._quadrupole() if self.kind == "quadrupole" else self._dipole(turned)
+            )
+        if self.elegant and self._number("k1"):
+            raise self._refuse("with a dipole or quadrupole component of its own")
+        return named | self._drift()
+
+    def _refuse(self, what: str, expected: str = "") -> InputError:
+        found = f"element '{self.own.name}' of type '{self.own.type}' {what}"
+        expected = expected or "a line without it: cut the line after it, or set it to zero"
+        return self.own.error(f"{found}, which beamfit does not model", expected)
+
+    def _number(self, key: str) -> float:
+        """A parameter as the file has it; 0 where it has none."""
+        if isinstance(value := self.said.get(key, 0.0), tuple):
+            raise self._refuse(f"with several numbers as {key.upper()}", "one number")
+        return float(value)
+
+    def _several(self, key: str) -> tuple[float, float]:
+        """The dipole and the quadrupole component of a list."""
+        value = self.said.get(key, ())
+        return (*(value if isinstance(value, tuple) else (value,)), 0.0, 0.0)[:2]
+
+    def _check_unmodelled(self) -> None:
+        for key, meaning in UNMODELLED.items():
+            if self._number(key) != 0.0:
+                raise self._refuse(f"with {meaning} ({key.upper()} = {self._number(key):g})")
+        for key in NOTHING_AT_ZERO.get(self.own.type.lower(), ()):
+            if self._number(key) != 0.0:
+                raise self._refuse(f"with {key.upper()} = {self._number(key):g}")
+        for key in EDGES:
+            if key in self.said and self._number(key) == 0.0:
+                raise self._refuse(f"with an edge switched off ({key.upper()} = 0)")
+        thin = self.kind == "thin" and not self.length
+        for key in () if thin else ("knl", "ksl"):
+            if any(self._several(key)):
+                raise self._refuse(f"with multipole components of its own ({key.upper()})")
+
+    def _check_length(self) -> None:
+        if self.kind == "dipole" and (gone := [k for k in ("angle", "l") if k not in self.said]):
+            found = f"'{self.own.name}' without '{gone[0]}'"
+            raise self.own.error(found, f"{gone[0].upper()} = ...")
+        if self.length <= 0.0:
+            raise self._refuse(f"of length {self.length:g} m", "a length above zero")
+
+    def _drift(self) -> dict[str, Any]:
+        """A length without focusing: drifts, collimators, correctors, sextupoles, ..."""
+        return {"type": "drift", "length_m": self.length} if self.length else {"type": "marker"}
+
+    def _quarter_turns(self) -> int:
+        """Tilt of the element in units of 90°."""
+        turns = self._number("tilt") / (math.pi / 2)
+        # Four digits: files write pi/2 as 1.5708.
+        if abs(turns - round(turns)) > 1e-4:
+            raise self._refuse(
+                f"tilted by {math.degrees(self._number('tilt')):g} degrees",
+                "upright elements, or bends tilted by a multiple of 90 degrees",
+            )
+        return round(turns) % 4
+
+    def _upright(self, gradient: float) -> float:
+        """A gradient; that of an element turned by 90° is the other one."""
+        return (-gradient if self._quarter_turns() % 2 else gradient) + 0.0
+
+    def _quadrupole(self) -> dict[str, Any]:
+        k1 = self._upright(self._number("k1"))
+        return {"type": "quadrupole", "length_m": self.length, "k1_per_m2": k1}
+
+    def _lens(self) -> dict[str, Any]:
+        if self.elegant:
+            at = self.said.get("order", 1)
+            normal = tuple(self._number("knl") * (at == n) for n in range(2))
+        elif "knl" in self.said:
+            normal = self._several("knl")
+        else:
+            normal = self._number("k0l"), self._number("k1l")
+        if self._number("angle"):
+            raise self.own.error(f"'{self.own.name}' with a bend in a thin element", "ANGLE = 0")
+        if normal[0] or any(self._several("ksl")):
+            raise self._refuse("with a dipole or skew component of its own")
+        if not normal[1]:
+            return {"type": "marker"}
+        return {"type": "thin_lens", "k1l_per_m": self._upright(normal[1])}
+
+    def _dipole(self, turned: bool) -> dict[str, Any]:
+        angle, turns = self._number("angle"), self._quarter_turns()
+        self._check_dipole(angle)
+        edge = 0.5 * angle if self.own.kind == "rbend" else 0.0
+        edges = [self._number(key) + edge for key in ("e1", "e2")]
+        k1 = self._upright(self._number("k1"))
+        if angle == 0.0:
+            return self._quadrupole() if k1 else self._drift()
+        if turns in (2, 3):  # bends the other way; the edges are counted with the bend
+            angle, edges = -angle, [-edge for edge in edges]
+        entrance, leaving = map(math.degrees, edges[::-1] if turned else edges)
+        return {
+            "type": "sector_dipole",
+            "radius_m": self.length / abs(angle),
+            "angle_deg": math.degrees(angle),
+            "entrance_edge_deg": entrance,
+            "exit_edge_deg": leaving,
+            "bend_plane": "y" if turns % 2 else "x",
+            "k1_per_m2": k1,
         }
-        if required := [k for k in ("angle", "l") if kind == "dipole" and k not in said]:
-            raise own.error(f"'{own.name}' without '{required[0]}'", f"{required[0].upper()} = ...")
-        normal = skew = (0.0, 0.0)
-        if kind == "thin" and self.elegant:
-            normal = tuple(said.get("knl", 0.0) * (said.get("order", 1) == n) for n in range(2))
-        elif kind == "thin":
-            lists = {"knl": [said.get(f"k{n}l", 0.0) for n in range(2)]} | said
-            normal, skew = ((*_several(lists.get(k, ())), 0.0, 0.0)[:2] for k in ("knl", "ksl"))
-        elif kind in ("quadrupole", "dipole") or self.elegant:
-            normal, skew = (0.0, float(said.get("k1", 0.0))), (0.0, float(said.get("k1s", 0.0)))
-        angle = float(said.get("angle", 0.0)) if kind == "dipole" else 0.0
-        edge = 0.5 * angle if own.kind == "rbend" else 0.0
-        edges = tuple(float(said.get(k, 0.0)) + edge for k in ("e1", "e2"))
-        if kind == "thin" and said.get("angle", 0.0) != 0.0:
-            raise own.error(f"'{own.name}' with a bend in a thin element", "ANGLE = 0")
-        place = (own.path, own.line)
-        return Element(
-            own.name, own.type, kind, length, normal, skew, angle, edges, said, place, self.elegant
-        )
+
+    def _check_dipole(self, angle: float) -> None:
+        if self.elegant and "RB" in self.own.type:
+            raise self._refuse(
+                "(rectangular, whose length programs read differently)",
+                "CSBEND or SBEN with the arc length and E1 = E2 = ANGLE/2",
+            )
+        k0 = self._number("k0")
+        if k0 and abs(k0 * self.length - angle) > 1e-9:
+            raise self._refuse(f"with a field (K0 = {k0:g}) that is not ANGLE/L")
+        # elegant takes FINT = 0.5 where the file has none, MAD takes 0.
+        integrals = [self._number(k) for k in ("fint", "fintx", "fint1", "fint2")]
+        integrals.append(0.5 if self.elegant and "fint" not in self.said else 0.0)
+        if (self._number("hgap") or self._number("hgapx")) and any(integrals):
+            raise self._refuse(
+                "with a fringe field (HGAP and FINT)",
+                "HGAP = 0, or a TOML lattice with effective edge angles",
+            )
 
 
-KINDS = {name: "screen" for name in SCREENS} | {
-    name: "space" for name in (*SPACES, *NOTHING_AT_ZERO)
-}
-KINDS |= {"marker": "marker", "quadrupole": "quadrupole", "multipole": "thin"}
-KINDS |= {"sbend": "dipole", "rbend": "dipole", "nothing": "nothing"}
-
-
-def _several(value: float | Sequence[float]) -> Sequence[float]:
-    return value if isinstance(value, tuple | list) else (value,)
+def numbered(elements: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Number markers and screens that occur several times as elegant does, NAME#1, NAME#2."""
+    tables = list(elements)
+    places = Counter(t["name"] for t in tables if t["type"] in ("marker", "screen"))
+    seen: Counter[str] = Counter()
+    for table in tables:
+        name = table["name"]
+        if table["type"] == "drift" and name in places:
+            table["name"] = f"{name}.drift"  # half of a monitor with a length
+        elif places[name] > 1:
+            seen[name] += 1
+            table["name"] = f"{name}#{seen[name]}"
+    return tables
 
 
 def _single(program: Interpreter, parameter: Attribute) -> float:

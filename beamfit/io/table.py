@@ -11,24 +11,20 @@ from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from beamfit.errors import InputError, expect, located
-from beamfit.io.binary import hdf5_columns, is_sdds, matlab_variables, sdds_columns
-from beamfit.io.cells import check_length, numeric_rows, with_points, without_units
-from beamfit.io.columns import UNITS, Columns, Sheet, arranged, layout_of
-from beamfit.io.files import Numbered, digest, laid_out, read_json, text_lines
-from beamfit.io.headers import (
-    HEAD,
-    MARKS,
-    bare,
-    header_at,
+from beamfit.errors import InputError, expect
+from beamfit.io.cells import check_length, is_number, numeric_rows, with_points
+from beamfit.io.columns import (
+    UNITS,
+    Sheet,
+    has_unit,
     is_header,
-    is_number,
-    is_value,
-    separator_of,
     spelled,
-    uncommented,
+    units_below,
     with_units,
 )
+from beamfit.io.files import Numbered, digest, first_bytes, laid_out, read_json, text_lines
+from beamfit.io.isolated import library_columns, matlab_variables
+from beamfit.io.layout import Columns, arranged, layout_of
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -52,6 +48,12 @@ EXPECTED = (
     'of the EPICS Archiver Appliance, [{"meta": …, "data": [{"secs": …}]}]'
 )
 WORD = re.compile(r'"[^"]*"|\S+')
+# Lines that are looked through for the header below a title.
+HEAD = 50
+# How a line begins that is a comment: of Python, MATLAB, C, SDDS.
+MARKS = ("#", "%", "//", "!")
+# Of a TFS file.
+TFS = ("@", "*", "$")
 
 
 def read_columns(
@@ -69,7 +71,7 @@ def read_columns(
     path, example, most
         As for `read_sheet`.
     columns : str, path, mapping or Layout, optional
-        As `beamfit.io.columns.layout_of` reads it.
+        As `beamfit.io.layout.layout_of` reads it.
     ignore : iterable of str
         Columns to leave unread; * and ? stand for any letters.
     skip_bad : bool
@@ -80,6 +82,8 @@ def read_columns(
     InputError
         As `read_sheet`, and of what is said of columns.
     """
+    if columns is None:
+        return read_sheet(path, example, most, ragged=skip_bad).without(ignore)
     layout = layout_of(columns)
     sheet = read_sheet(path, example, most, ragged=skip_bad, names=layout.header or None)
     return arranged(sheet.without(ignore), layout)
@@ -150,22 +154,15 @@ def _read_text(
     names: Sequence[str] | None,
 ) -> Sheet:
     comments, rows, lines, bad, columns, notes = [], [], [], [], None, ()
-    header, separator = None, ","
-    numbered = enumerate(text_lines(path), start=1)
-    if names is None:
-        names, header, separator, numbered = _head(path, example, comments)
-    else:
-        head = list(itertools.islice(numbered, 1))
-        separator = separator_of(next((text for _, text in head), ","))
-        numbered = itertools.chain(head, numbered)
+    names, header, separator, numbered = _head(path, example, comments, names)
     names, rest = [name for name in names if name != REST], REST in names
-    title = list(names)
+    title, least = list(names), min(most, MOST_WORDS // max(1, len(names)))
     for line, text in numbered:
         if text.lstrip().startswith(MARKS + TFS_LINES * (separator == " ")):
             comments.append(bare(text))
         elif text.strip().strip(",;\t "):
             cells, wrong = _row(text, separator, path, line, len(names), rest)
-            units = None if rows or wrong else _units_below(names, cells, path, line)
+            units = None if rows or wrong else with_units(names, cells, path, line)
             names = units or names
             if units or (rows and _is_again(cells, title, path, line)):
                 continue
@@ -176,15 +173,14 @@ def _read_text(
                 break
             (bad if wrong else rows).append(wrong or cells)
             lines += [] if wrong else [line]
-            least = min(most, MOST_WORDS // max(1, len(names)))
-            check_length(len(rows) + len(bad), least, path, line)
+            if len(rows) + len(bad) > least:
+                check_length(len(rows) + len(bad), least, path, line)
             if bad and not ragged:
                 break
     if bad and not (ragged and rows):
         more = "; --skip-bad leaves such rows out" if ragged is False else ""
         raise replace(bad[0], expected=bad[0].expected + more)
     if columns is None:
-        names, rows = without_units(names, rows, path, lines)
         rows, notes = with_points(rows, separator)
         columns = zip(*rows, strict=True) if rows else [()] * len(names)
     said = (tuple(comments), digest(path), tuple(bad), notes)
@@ -192,15 +188,21 @@ def _read_text(
 
 
 def _head(
-    path: str | PathLike[str], example: str, comments: list[str]
-) -> tuple[list[str], int | None, str, Numbered]:
+    path: str | PathLike[str],
+    example: str,
+    comments: list[str],
+    names: Sequence[str] | None = None,
+) -> tuple[Sequence[str], int | None, str, Numbered]:
     """Names of the columns, their line, what separates them, and the lines below, numbered."""
     whole = text_lines(path)
-    head = uncommented(list(itertools.islice(whole, HEAD)))
-    title, numbered = header_at(head), enumerate(itertools.chain(head, whole), start=1)
+    head = list(itertools.islice(whole, HEAD))
     first = next((text for text in head if text.strip()), "")
-    if ARCHIVER.fullmatch(first):
-        return ARCHIVED, None, ",", numbered
+    if names is None and ARCHIVER.fullmatch(first):
+        names = ARCHIVED
+    if names is not None:
+        return names, None, separator_of(first), enumerate(itertools.chain(head, whole), start=1)
+    head = uncommented(head)
+    title, numbered = header_at(head), enumerate(itertools.chain(head, whole), start=1)
     for line, text in numbered:
         if text.lstrip().startswith(MARKS + TFS_LINES):
             comments.append(bare(text))
@@ -212,9 +214,10 @@ def _head(
         elif line <= title:
             comments.append(text.strip(",;\t "))
         else:
-            names = _cells(path, text, line)
+            separator = separator_of(text)
+            names = _without_blanks(_split(text, separator, path, line), 0)
             _check_header(names, example, path, line)
-            return names, line, separator_of(text), numbered
+            return names, line, separator, numbered
     raise InputError("no header and no rows", f"a header line such as {example}", path=path)
 
 
@@ -245,16 +248,8 @@ def header_of(path: str | PathLike[str]) -> list[str]:
     names, _, separator, numbered = _head(path, "Q2_A,size_x_um", [])
     line, text = next((one for one in numbered if one[1].strip()), (0, ""))
     cells, wrong = _row(text, separator, path, line, len(names))
-    if wrong is None:
-        names = (
-            _units_below(names, cells, path, line) or without_units(names, [cells], path, [line])[0]
-        )
+    names = names if wrong else with_units(names, cells, path, line) or names
     return [spelled(name) for name in names]
-
-
-def _cells(path: str | PathLike[str], text: str, line: int = 1) -> list[str]:
-    """The cells of a line by its own separator."""
-    return _without_blanks(_split(text, separator_of(text), path, line), 0)
 
 
 def _row(
@@ -278,13 +273,6 @@ def _row(
     apart = {",": "commas", ";": "semicolons", "\t": "tabs", " ": "blanks"}[separator]
     expected += f", with {apart} between them" if len(cells) == 1 < count else ""
     return cells, InputError(f"{len(cells)} cells", expected, path=path, line=line)
-
-
-def _units_below(
-    names: list[str], cells: list[str], path: str | PathLike[str], line: int
-) -> list[str] | None:
-    with located(path, line):
-        return with_units(names, cells)
 
 
 def _is_again(cells: list[str], title: list[str], path: str | PathLike[str], line: int) -> bool:
@@ -326,7 +314,7 @@ def _check_header(names: list[str], example: str, path: str | PathLike[str], lin
 
 def is_binary(path: str | PathLike[str]) -> bool:
     """Tell a file that a library reads: HDF5 and MATLAB by the name, SDDS by how it begins."""
-    return Path(path).suffix.lower() in BINARY or is_sdds(path)
+    return Path(path).suffix.lower() in BINARY or first_bytes(path, 4) == b"SDDS"
 
 
 def _binary(path: str | PathLike[str], most: int) -> Sheet:
@@ -335,8 +323,8 @@ def _binary(path: str | PathLike[str], most: int) -> Sheet:
     if suffix == MATLAB:
         columns = matlab_variables(path)
     else:
-        read = hdf5_columns if suffix in HDF5 else sdds_columns
-        columns, comments = read(path, most, min(most, MOST_WORDS))
+        library = "HDF5" if suffix in HDF5 else "SDDS"
+        columns, comments = library_columns(path, library, most, min(most, MOST_WORDS))
     if not columns:
         expected = "one dataset a column, at the top of the file"
         raise InputError("no datasets", expected, path=path)
@@ -416,3 +404,94 @@ def _planes(content: dict[str, Any]) -> dict[str, list[Any]] | None:
 def _part(values: Any, i: int) -> Any:
     """One plane's part of a list, or of an object by number."""
     return values.get(str(i)) if isinstance(values, dict) else values[i]
+
+
+def separator_of(header: str) -> str:
+    """Separator of the columns below a header."""
+    return next((s for s in ",;\t" if s in header), " ")
+
+
+def _words(text: str) -> list[str]:
+    separator = separator_of(text)
+    return [word.strip(' "') for word in text.split(None if separator == " " else separator)]
+
+
+def header_at(lines: Sequence[str]) -> int:
+    """Which of some lines is the header: the first with two units, if only words stand above it.
+
+    Where none has units it is the first line, or the first that rows of as many cells follow.
+
+    Examples
+    --------
+    >>> header_at(["Scan", "by me, at noon", "Q2_A,size_x_um", "1,2"])
+    2
+    >>> header_at(["time,current", "1,2", "Q2_A,size_x_um"])
+    0
+    """
+    first: int | None = None
+    for i, text in enumerate(lines):
+        if _is_aside(text):
+            continue
+        cells = _words(text)
+        if is_header(cells):
+            return i
+        if first is None:
+            first = i
+        elif (
+            any(map(is_number, cells))
+            and is_value(cells[0])
+            and len(cells) == len(_words(lines[first]))
+        ):
+            break
+    if first is None or _has_rows(lines, first):
+        return first or 0
+    return next((i for i in range(first, len(lines)) if _has_rows(lines, i)), first)
+
+
+def _is_aside(text: str) -> bool:
+    """Tell a line that is blank, a comment, or of the head of a TFS file."""
+    return not text.strip(",;\t ") or text.lstrip().startswith(MARKS + TFS)
+
+
+def is_value(cell: str) -> bool:
+    """Tell a cell that may be a number or a date."""
+    return cell.lstrip("+-.")[:1].isdigit()
+
+
+def _has_rows(lines: Sequence[str], i: int) -> bool:
+    """Tell a line of words that rows of as many cells follow, below its units perhaps."""
+    cells = _words(lines[i])
+    rows = [_words(text) for text in lines[i + 1 :] if not _is_aside(text)][:3]
+    if rows and units_below(rows[0]):
+        del rows[0]
+    alike = rows and all(len(row) == len(cells) and is_value(row[0]) for row in rows[:2])
+    words = not _is_aside(lines[i]) and not any(map(is_value, cells))
+    return bool(alike) and len(cells) > 1 and words
+
+
+def uncommented(lines: Sequence[str]) -> list[str]:
+    """Some lines, with the header that a mark of comments hides above the first values.
+
+    Examples
+    --------
+    >>> uncommented(["# noon", "# time_s,beam_current_mA", "0,1"])
+    ['# noon', 'time_s,beam_current_mA', '0,1']
+    """
+    found = list(lines)
+    rows = (i for i, t in enumerate(found) if t.strip(" ,;\t") and not t.lstrip().startswith(MARKS))
+    first = next(rows, 0)
+    above = found[first - 1].strip() if first else ""
+    if above.startswith(MARKS):
+        said = bare(above)
+        cells, words = _words(found[first]), _words(said)
+        values = len(words) == len(cells) and all(map(is_value, cells))
+        # Words between blanks may be a sentence.
+        named = any(map(has_unit, words)) or separator_of(said) != " "
+        if values and named and not any(map(is_value, words)):
+            found[first - 1] = said
+    return found
+
+
+def bare(comment: str) -> str:
+    """A comment without its mark."""
+    return comment.strip().lstrip("".join(MARKS) + " ").rstrip()

@@ -21,11 +21,12 @@ LONG = re.compile(r"\b0[xob][0-9A-Fa-f_]{250,}")
 # Words of which all are named, and not the nearest.
 MOST_LISTED = 3
 REQUIRED: Any = object()
-TEXT, LIST, FLAG, TABLE, NUMBER = str, list, bool, dict, (int, float)
-NUMBERS = (int, float, list)
+TEXT, LIST, FLAG, TABLE = str, list, bool, dict
+NUMBER, WHOLE, NUMBERS = (int, float), (float, int), (int, float, list)
 # How each kind of value is called in a message.
 KINDS = {
     NUMBER: "a number",
+    WHOLE: "a whole number",
     TEXT: "text in quotes",
     LIST: "a list",
     FLAG: "true or false",
@@ -83,10 +84,11 @@ class Key(NamedTuple):
             return None if known and value.strip() else self._words(value)
         if self.kind is LIST and not all(map(self._fits, value)):
             return self.said
-        if self.kind not in (NUMBER, NUMBERS) or value == self.default:
+        if self.kind not in (WHOLE, NUMBER, NUMBERS) or value == self.default:
             return None
         numbers = value if isinstance(value, list) else [value]
-        if not numbers or not all(map(is_number, numbers)):
+        whole = self.kind is not WHOLE or value % 1 == 0
+        if not (numbers and whole and all(map(is_number, numbers))):
             return usual
         return None if all(self.low < number < self.high for number in numbers) else self.said
 
@@ -101,6 +103,8 @@ class Key(NamedTuple):
         """A good value in SI; what is neither number nor list of numbers as it is."""
         if self.kind is NUMBERS and isinstance(value, list):
             return [number * self.factor for number in value]
+        if self.kind is WHOLE:
+            return int(value)
         return value * self.factor if self.kind in (NUMBER, NUMBERS) else value
 
 

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING
 
 from beamfit.emittance.scan import KNOB, QuadScan
 from beamfit.errors import InputError, nearest
-from beamfit.io.columns import Columns, Sheet, columns_of, left_out
+from beamfit.io.columns import SETTINGS, Column, Sheet, columns_of, left_out, spelled
 from beamfit.io.files import name_of
-from beamfit.io.headers import SETTINGS, spelled
+from beamfit.io.layout import Columns
 from beamfit.io.scan import MOST_ROWS, scan_of_sheet
 from beamfit.io.table import read_columns
 from beamfit.tuning.knobs import EmittanceTable
@@ -21,8 +21,6 @@ from beamfit.tuning.knobs import EmittanceTable
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-# What a knob's column is called while the table is read: a setting of any unit.
-PLAIN = "tuning_knob_{}"
 EMITTANCE = re.compile(r"(normalized_)?emittance_[xy]")
 
 
@@ -73,20 +71,10 @@ def read_tuning_scan(
     called = {knob: sheet.called.get(name, name) for knob, name in names.items()}
     if any(EMITTANCE.match(name) for name in sheet.names):
         return _emittances(sheet, names, called)
-    plain = {knob: PLAIN.format(i) for i, knob in enumerate(names)}
-    again = {names[knob]: f"{name}_A" for knob, name in plain.items()}
-    of_file = {again.get(name, name): header for name, header in sheet.called.items()}
-    of_file |= {again[names[knob]]: header for knob, header in called.items()}
-    sheet = replace(sheet, names=tuple(again.get(n, n) for n in sheet.names), called=of_file)
-    scan = scan_of_sheet(replace(sheet, arranged=True), skip_bad)
-    back = {name: knob for knob, name in plain.items()}
-    units = {knob: _unit(knob, name) for knob, name in called.items()}
-    return replace(
-        scan,
-        settings={back.get(n, n): v for n, v in scan.settings.items()},
-        units={back.get(n, n): units.get(back.get(n, n), u) for n, u in scan.units.items()},
-        columns=scan.columns | called,
-    )
+    units = {knob: _unit(knob, header) for knob, header in called.items()}
+    knobs = {f"setting {k}": Column(n, f"setting {k}", units[k]) for k, n in names.items()}
+    scan = scan_of_sheet(replace(sheet, arranged=True), skip_bad, knobs)
+    return replace(scan, columns=scan.columns | called)
 
 
 def _emittances(sheet: Sheet, names: Mapping[str, str], called: dict[str, str]) -> EmittanceTable:

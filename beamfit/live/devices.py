@@ -19,7 +19,7 @@ import numpy as np
 from scipy.optimize import curve_fit
 
 from beamfit.errors import InputError, plain
-from beamfit.io.headers import UNITS
+from beamfit.io.columns import UNITS
 from beamfit.io.machine import (
     LENGTHS,
     Guard,

@@ -18,7 +18,7 @@ from beamfit.emittance.fit import EmittanceFit, fit_emittance
 from beamfit.emittance.scan import KNOB, QuadScan
 from beamfit.errors import InputError, plain
 from beamfit.greybox.problem import padded_length
-from beamfit.io.headers import SETTINGS
+from beamfit.io.columns import SETTINGS
 from beamfit.io.machine import Magnet, ScanMachine
 from beamfit.optics.beamline import Beamline
 from beamfit.statistics import POOR_FIT, chi2_probability

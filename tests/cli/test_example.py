@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from beamfit import read_decay_record, read_quad_scan
-from beamfit.io.example import EXAMPLE_FILES
+from beamfit.cli.example import EXAMPLE_FILES
 
 GROUP = re.compile(r"```\w*\n(.*?)```", re.DOTALL)
 

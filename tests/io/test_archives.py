@@ -12,6 +12,7 @@ from beamfit.io.check import understand
 from beamfit.io.decay_record import read_decay_record, read_lifetime_input, read_lifetimes
 from beamfit.io.scan import read_quad_scan
 from beamfit.lifetime.record import LifetimeTable
+from tests.io.forked import in_forks  # noqa: F401
 
 START = 1709290800.25  # 2024-03-01T11:00:00.25 UTC
 CURRENT = [200.0, 199.5, 199.1, 198.6]

@@ -11,10 +11,11 @@ import scipy.io
 import beamfit
 from beamfit.cli import main
 from beamfit.emittance.size_methods import compare_size_methods
-from beamfit.io.binary import matlab_variables
 from beamfit.io.emittance_gui import read_emittance_gui
+from beamfit.io.isolated import matlab_variables
 from beamfit.io.line import build_line, read_inputs
 from beamfit.optics.elements import Drift, Quadrupole, Screen
+from tests.io.forked import in_forks  # noqa: F401
 
 METHODS = ["Gaussian", "RMS", "RMS floor"]
 WIDER = {"Gaussian": 1.0, "RMS": 1.1, "RMS floor": 1.05}

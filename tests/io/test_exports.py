@@ -3,8 +3,8 @@
 import pytest
 
 from beamfit.errors import InputError
+from beamfit.io.cells import BLANK
 from beamfit.io.check import understand
-from beamfit.io.columns import BLANK
 from beamfit.io.decay_record import read_decay_record
 from beamfit.io.scan import read_quad_scan
 
@@ -101,7 +101,7 @@ RECORDS = {
     "a zone": ("Time (UTC),I [mA]", [f"2024-03-01 12:0{k}Z,{200.5 - k}" for k in range(3)]),
     "an index": ("No,time_s,beam_current_mA", [f"{k},{60 * k},{200.5 - k}" for k in range(3)]),
     "units below": ("Time\tCurrent", ["[s]\t[mA]", *[f"{60 * k}\t{200.5 - k}" for k in range(3)]]),
-    "units behind": ("time;current", [f"{60 * k} s;{200 - k},5 mA" for k in range(3)]),
+    "units behind": ("time_s;current_mA", [f"{60 * k} s;{200.5 - k} mA" for k in range(3)]),
 }
 
 

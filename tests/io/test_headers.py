@@ -5,8 +5,8 @@ import pytest
 
 from beamfit.errors import InputError
 from beamfit.io.check import understand
+from beamfit.io.columns import spelled
 from beamfit.io.decay_record import read_decay_record
-from beamfit.io.headers import spelled
 from beamfit.io.scan import read_quad_scan
 
 ROWS = "-4.2,111.4,1.1\n-3.2,63.4,0.3\n-2.6,53.6,0.3\n-2.1,56.7,0.5\n"

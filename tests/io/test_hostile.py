@@ -12,8 +12,8 @@ import pytest
 import beamfit
 from beamfit.errors import InputError
 from beamfit.io import files, isolated
-from beamfit.io.binary import hdf5_content
 from beamfit.io.files import digest, read_json
+from beamfit.io.isolated import hdf5_content
 from beamfit.io.result import load_fit, read_fitted_beams
 from beamfit.io.table import read_sheet
 from beamfit.io.toml import read_toml

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from beamfit.errors import InputError
 from beamfit.io.columns import UNITS, Sheet, columns_of
 from beamfit.io.table import read_sheet
+from tests.io.forked import in_forks  # noqa: F401
 
 EXAMPLE = "s_m,beta_x_m"
 NUMBERS = st.floats(allow_nan=False, allow_infinity=False)
