@@ -163,11 +163,20 @@ def doubt(fit: EmittanceFit | None, points: Sequence[MeasuredPoint]) -> str:
     """Sizes that miss the line by far more than their shots scatter, in words; "" if none do.
 
     The errors of the fit hold it as a scatter of the settings, which real magnets have; a line that
-    is wrong shows in the same way, and there no error holds.
+    is wrong shows in the same way, and there no error holds. The scatter is that of all shots as a
+    share of their size: a fit may take one of every three shots for a bad one, and find the others
+    sharper than they are.
     """
     planes = [p for p in (fit.planes if fit else ()) if p.chi2 is not None]
-    chi2, dof = sum(p.chi2 for p in planes), sum(p.dof for p in planes)
-    freedom = sum(point.shots[p.plane].size - 1 for p in planes for point in points)
+    off = within = 0.0
+    dof, freedom = sum(p.dof for p in planes), 0
+    for plane in planes:
+        for point, model in zip(points, plane.points.model, strict=True):
+            shots = point.shots[plane.plane] / model
+            off += shots.size * (shots.mean() - 1.0) ** 2
+            within += shots.size * shots.var()
+            freedom += shots.size - 1
+    chi2 = off * freedom / within if within > 0.0 else 0.0
     chance = chi2_probability(chi2, dof, max(freedom, 1))
     if chance is None or chance >= POOR_FIT:
         return ""

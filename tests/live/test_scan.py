@@ -500,9 +500,9 @@ def test_the_first_settings_are_those_of_the_file(tmp_path):
     assert gap.settings["Q1"] == pytest.approx(-2.5)  # between -5.5 and 0.5
 
 
-def points_of(line, settings, shots=5):
+def points_of(line, settings, shots=5, seed=4):
     """What scans of a line would measure with 2 % of noise, SIMULATED by its own matrices."""
-    rng, found = np.random.default_rng(4), []
+    rng, found = np.random.default_rng(seed), []
     for setting in settings:
         matrix = line.matrix(setting)
         r11, r12 = np.asarray(matrix.x)[0, :2]
@@ -546,6 +546,14 @@ def test_each_magnet_is_moved_and_a_line_that_is_wrong_is_doubted(tmp_path):
         r"The sizes miss this line .* \(χ² \d+ with 4 degrees .*: is it right\?", said
     )
     assert doubt(None, []) == ""
+
+
+def test_three_shots_of_a_setting_that_happen_to_agree_are_no_doubt_of_the_line(tmp_path):
+    machine = read_scan_machine(written(tmp_path, y=('y = "SIM:SCREEN:Y"\n', "")))
+    line, settings = build_line(machine.lattice), [{"Q1": v} for v in np.linspace(-4.7, 1.7, 7)]
+    for seed in (10, 29, 2168):  # χ² 97 to 137 with 4 degrees of freedom by the errors of the fit
+        points = points_of(line, settings, shots=3, seed=seed)
+        assert doubt(fit_of(points, machine, line), points) == ""
 
 
 class TwoMagnets(Simulated):
