@@ -361,14 +361,15 @@ def answered(
     as_json: bool,
     results: Iterable[Any],
     inputs: Mapping[str, str | None],
-    show: Callable[[Terminal], None],
+    show: Callable[[Terminal], None] | None = None,
     report: str | None = None,
     full: bool = True,
     **further: Any,
 ) -> None:
     """Print the one JSON object of a command, or have the answer shown, and where its report is.
 
-    Results are asked for if they are printed; what there is ``further`` is named beside them.
+    Without ``show`` each result shows itself. Results are asked for if they are printed; what there
+    is ``further`` is named beside them.
     """
     ended()
     if as_json:
@@ -378,7 +379,11 @@ def answered(
     from beamfit.cli.show import Terminal  # rich
 
     terminal = Terminal(full)
-    show(terminal)
+    if show is None:
+        for each in results:
+            terminal.result(each)
+    else:
+        show(terminal)
     terminal.report(report)
 
 

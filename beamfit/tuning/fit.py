@@ -38,7 +38,7 @@ from beamfit.tuning.readings import (
     plane_readings,
     seen_without,
 )
-from beamfit.verdict import Finding, judge
+from beamfit.verdict import Finding, Judged, judge
 
 # Draws of the map: the ends of a 95 % interval are known to a tenth of its half-width.
 DRAWS = 256
@@ -161,7 +161,7 @@ def fit_tuning(
 
 @answer
 @dataclass(frozen=True, eq=False)
-class TuningFit:
+class TuningFit(Judged):
     """A map of the emittance over the knobs of a machine, and its minimum.
 
     Attributes
@@ -290,16 +290,6 @@ class TuningFit:
     def finding(self) -> Finding:
         """Status with its sentences."""
         return judge(self, RULES)
-
-    @property
-    def status(self) -> Status:
-        """Status of the minimum: converged, at_limit or unidentified."""
-        return self.finding.status
-
-    @property
-    def message(self) -> str:
-        """Cause of the status, and what to do."""
-        return self.finding.message
 
     @property
     def headline(self) -> str:
