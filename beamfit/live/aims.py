@@ -21,8 +21,7 @@ from beamfit.optics.elements import Drift
 from beamfit.statistics import POOR_FIT, chi2_probability
 from beamfit.status import Status
 from beamfit.tuning.fit import TuningFit, fit_tuning
-from beamfit.tuning.minimum import settings_within
-from beamfit.tuning.next_row import next_row
+from beamfit.tuning.minimum import next_row, settings_within
 
 # Where a scan begins, in parts of the range of its first magnet.
 BEGIN = (0.1, 0.37, 0.63, 0.9)

@@ -28,10 +28,18 @@ from beamfit.quantity import Quantity, percent
 from beamfit.statistics import CENTRAL, WIDE, quantity_of_draws
 from beamfit.status import Status
 from beamfit.table import Table, cell, json_of
+from beamfit.tuning.knob_map import map_posterior, mixed, numbers_at
 from beamfit.tuning.knobs import GOALS, EmittanceTable, Knobs, knobs_of, planes_of
-from beamfit.tuning.minimum import Emittances, Minima, emittances_of, minima_of, values_at
-from beamfit.tuning.next_row import NextRow, PlaneMap, next_row
-from beamfit.tuning.posterior import map_posterior, mixed, numbers_at
+from beamfit.tuning.minimum import (
+    Emittances,
+    Minima,
+    NextRow,
+    PlaneMap,
+    emittances_of,
+    minima_of,
+    next_row,
+    values_at,
+)
 from beamfit.tuning.readings import (
     emittance_readings,
     log_no_beam,
