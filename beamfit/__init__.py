@@ -7,7 +7,7 @@
 """
 
 from functools import cache
-from importlib import import_module
+from pkgutil import resolve_name
 
 __version__ = "0.1.0"
 
@@ -112,9 +112,9 @@ def __getattr__(name: str) -> object:
 
 @cache  # one object a name, or the functions could not be pickled
 def _found(name: str) -> object:
-    home, _, other = _HOME[name].partition(":")
-    found = getattr(import_module(home), other or name)
-    return import_module("beamfit.paths").opening(found, name) if name in _OPENING else found
+    home = _HOME[name]
+    found = resolve_name(home if ":" in home else f"{home}:{name}")
+    return resolve_name("beamfit.commands:opening")(found, name) if name in _OPENING else found
 
 
 def __dir__() -> list[str]:

@@ -1,15 +1,17 @@
-"""Commands that need more than one step, as functions: `beamfit COMMAND` calls these."""
+"""Public functions that take files: paths in calls, and commands of more than one step."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
+from functools import wraps
+from inspect import signature
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from pkgutil import resolve_name
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from beamfit.errors import InputError, nearest
-from beamfit.paths import is_path, machine_of
 
 if TYPE_CHECKING:
     import numpy as np
@@ -28,10 +30,120 @@ if TYPE_CHECKING:
     from beamfit.live.scan import Outcome, ScanProgress
     from beamfit.live.watch import WatchView
 
+F = TypeVar("F", bound=Callable[..., Any])
 Limits = Mapping[str, tuple[float, float]]
 Steps = Sequence[tuple[str, float, float]]
 # Models of all outputs together; the others are of one output at a time.
 STATES, FED_BATCH = "state-space", "fed-batch"
+# Arguments that may be files, and what reads them.
+READERS = {
+    "record": "beamfit.io.decay_record:read_decay_record",
+    "records": "beamfit.io.decay_record:read_decay_record",
+    "runs": "beamfit.io.run:read_run",
+    "held": "beamfit.io.run:read_run",
+    "table": "beamfit.io.decay_record:read_lifetime_input",
+    "ring": "beamfit.io.ring:read_ring",
+    "operation": "beamfit.io.ring:read_operation",
+    "machine": "beamfit.commands:machine_of",
+}
+
+
+def is_path(value: object) -> bool:
+    """Tell a path from what is read from it."""
+    return isinstance(value, str | PathLike)
+
+
+def opening(function: F, name: str) -> F:
+    """Have a function take paths in the place of a scan, a line, a record, runs or a ring.
+
+    Parameters
+    ----------
+    function : callable
+        With arguments ``scan``, ``line``, ``record``, ``records``, ``runs``, ``held``, ``table``,
+        ``ring``, ``operation`` or ``machine``.
+    name : str
+        Its public name in `beamfit`.
+
+    Returns
+    -------
+    callable
+        The same function; what is no path it takes as before.
+
+    Examples
+    --------
+    >>> def rows(record): return len(record.time)
+    >>> opening(rows, "rows")("measurements/aps_1999_decay.csv")
+    27
+    """
+    given = signature(function)
+
+    @wraps(function)
+    def opened(*args: Any, **named: Any) -> Any:
+        bound = given.bind(*args, **named)
+        bound.arguments |= _read(bound.arguments)
+        return function(*bound.args, **bound.kwargs)
+
+    opened.__module__, opened.__name__, opened.__qualname__ = "beamfit", name, name
+    return opened
+
+
+def machine_of(path: str | PathLike[str]) -> Any:
+    """Read a ring and its usual operation from one file."""
+    from beamfit.io.ring import read_operation, read_ring
+
+    ring, operation = read_ring(path), read_operation(path)
+
+    from beamfit.lifetime.study import Machine  # JAX from here on
+
+    return Machine(ring, operation)
+
+
+def _read(arguments: Mapping[str, Any]) -> dict[str, Any]:
+    """Read the arguments that are paths."""
+    given = arguments.get("scan"), arguments.get("line")
+    found = _tuning(*given, arguments["knobs"]) if "knobs" in arguments else _scan_and_line(*given)
+    for name in arguments.keys() & READERS.keys():
+        value, read = arguments[name], resolve_name(READERS[name])
+        if is_path(value):
+            found[name] = read(value)
+        elif isinstance(value, list | tuple) and any(map(is_path, value)):
+            found[name] = [read(one) if is_path(one) else one for one in value]
+    return found
+
+
+def _scan_and_line(scan: Any, line: Any) -> dict[str, Any]:
+    """A scan and its line, read together where both are files: each is checked against the other.
+
+    A file of emittance_gui, or rows with matrices of their own, need no lattice beside them.
+    """
+    if not (is_path(scan) or is_path(line)):
+        return {}
+    from beamfit.io.line import build_line, lattice_of, load_lattice, read_inputs
+    from beamfit.io.scan import read_quad_scan
+
+    if is_path(scan) and (line is None or is_path(line)):
+        read = read_inputs(str(scan), line)
+        return {"scan": read.scan, "line": build_line(read.lattice)}
+    if is_path(scan):
+        return {"scan": read_quad_scan(scan)}
+    return {"line": load_lattice(line) if scan is None else build_line(lattice_of(scan, line))}
+
+
+def _tuning(scan: Any, line: Any, knobs: Mapping[str, Any]) -> dict[str, Any]:
+    """A table of knobs, and the line that it is checked against without them."""
+    found = {}
+    if is_path(scan):
+        from beamfit.io.tuning import read_tuning_scan
+
+        found["scan"] = scan = read_tuning_scan(scan, knobs)
+    if is_path(line):
+        from beamfit.emittance.scan import QuadScan
+        from beamfit.io.line import build_line, lattice_of, load_lattice
+
+        is_scan = isinstance(scan, QuadScan)
+        own = is_scan and build_line(lattice_of(scan.without_settings(knobs), line))
+        found["line"] = own or load_lattice(line)
+    return found
 
 
 def identify(

@@ -27,6 +27,22 @@ class Finding(NamedTuple):
         return f"{self.cause} {self.remedy}".strip()
 
 
+class Judged:
+    """A result with a ``finding``: its status, and its message of cause and remedy."""
+
+    finding: Finding
+
+    @property
+    def status(self) -> Status:
+        """Status of the finding."""
+        return self.finding.status
+
+    @property
+    def message(self) -> str:
+        """Cause of the status, and what to do."""
+        return self.finding.message
+
+
 Rule = Callable[[Evidence], Finding | None]
 
 

@@ -27,7 +27,7 @@ from beamfit.emittance.scan import KNOB, QuadScan
 from beamfit.optics.beamline import Beamline
 from beamfit.optics.elements import Drift, Screen, ThinLens
 from beamfit.tuning.fit import TuningFit, fit_tuning
-from beamfit.tuning.next_row import next_row
+from beamfit.tuning.minimum import next_row
 
 MC2, ALFVEN = 0.51099895, 17045.0  # MeV, A
 WAVE = 2 * np.pi * 2.856e9 / 299792458.0  # 1/m: an S-band gun

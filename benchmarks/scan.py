@@ -21,8 +21,9 @@ import numpy as np
 import beamfit
 from beamfit.io.line import build_line
 from beamfit.io.machine import ScanMachine, read_scan_machine
+from beamfit.live.aims import FEWEST, fit_of, sharp
 from beamfit.live.devices import Connected, Left, Shots
-from beamfit.live.points import FEWEST, MeasuredPoint, fit_of, sharp
+from beamfit.live.points import MeasuredPoint
 from beamfit.live.scan import scan
 
 NOISE, SHOTS, MOST = 0.03, 5, 60

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import sys
-import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -81,7 +81,7 @@ def batch(
     if learned is not None:
         check_place(learned)
     job = beamfit.Job(kind, lattice, part, reading, weights, noise=noise)
-    with _Progress(not as_json and sys.stderr.isatty()) as progress:
+    with _progress(shown=not as_json) as progress:
         found = beamfit.run_batch(
             path, out, job, workers=workers, scheduler=scheduler, progress=progress
         )
@@ -109,25 +109,17 @@ def _check_kind(kind: str, of_scans: dict[str, Any]) -> None:
             raise InputError(f"--{said} with --kind {kind}", "none: it is of the other kind")
 
 
-class _Progress:
-    """Progress on one line of a terminal: files, files a second, time left."""
+@contextmanager
+def _progress(shown: bool) -> Iterator[Callable[[int, int], None]]:
+    """Files done, and the time left, on one line of a terminal."""
+    from rich.console import Console
+    from rich.progress import MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-    def __init__(self, shown: bool) -> None:
-        self.shown, self.began, self.first = shown, time.monotonic(), None
-
-    def __enter__(self) -> _Progress:
-        return self
-
-    def __call__(self, done: int, of: int) -> None:
-        self.first = done if self.first is None else self.first
-        rate = (done - self.first) / max(time.monotonic() - self.began, 1e-3)
-        left = f", {(of - done) / rate:.0f} s left" if rate else ""
-        if self.shown:
-            click.echo(f"\r{done} of {of} files, {rate:.0f}/s{left}\033[K", err=True, nl=False)
-
-    def __exit__(self, *_: object) -> None:
-        if self.shown:
-            click.echo("", err=True)
+    screen = Console(stderr=True)
+    columns = MofNCompleteColumn(" of "), TextColumn("files, left"), TimeRemainingColumn()
+    with Progress(*columns, console=screen, disable=not (shown and screen.is_terminal)) as bar:
+        task = bar.add_task("files", total=None)
+        yield lambda done, of: bar.update(task, completed=done, total=of)
 
 
 def _show(terminal: Terminal, found: Batch, out: str, summary: Table | None) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
@@ -11,10 +11,6 @@ from beamfit.cli.options import Command, answered, options, reported
 from beamfit.errors import InputError
 from beamfit.io.line import build_line, read_inputs
 from beamfit.io.priors import read_noise
-
-if TYPE_CHECKING:
-    from beamfit.cli.show import Terminal
-    from beamfit.density.fit import DensityFit
 
 EXAMPLE = """\b
 Examples:
@@ -50,16 +46,5 @@ def density(
 
     fit = fit_density(read.scan, line, noise=own, seed=seed)
     fit = fit if read.gui is None else replace(fit, stored=read.gui.stored)
-    inputs = {str(each.path): each.sha256 for each in (read.scan, read.lattice)}
-    reported(report, fit, inputs)
-    answered(as_json, [fit], inputs, lambda terminal: show_density(terminal, fit), report)
-
-
-def show_density(terminal: Terminal, fit: DensityFit) -> None:
-    """Say the verdict first, then emittance against charge."""
-    terminal.answer(fit.headline, fit.status, fit.message)
-    for note in fit.notes:
-        terminal.line(note)
-    for table in fit.tables():
-        terminal.line()
-        terminal.table(table)
+    reported(report, fit, read.digests)
+    answered(as_json, [fit], read.digests, report=report)

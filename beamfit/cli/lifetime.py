@@ -9,11 +9,11 @@ import click
 
 import beamfit
 from beamfit.cli.options import Command, Sampling, answered, option, options, reported
+from beamfit.commands import machine_of
 from beamfit.errors import InputError
 from beamfit.io.decay_record import monitor_of, read_lifetime_input
 from beamfit.io.files import digest
 from beamfit.lifetime.record import LifetimeTable
-from beamfit.paths import machine_of
 
 if TYPE_CHECKING:
     from beamfit.cli.show import Terminal

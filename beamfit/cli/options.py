@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import shlex
 import sys
+import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from threading import Event, Thread
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 
 import beamfit
 from beamfit.cli.option_text import anchor_of, bounds_of, gains_of, goal_of, limits_of, priors_of
-from beamfit.cli.waiting import Waiting, ended
 from beamfit.emittance.assumptions import SCENARIOS
 from beamfit.errors import InputError
 from beamfit.io.layout import layout_of
@@ -27,6 +28,43 @@ if TYPE_CHECKING:
 
 # Commands that say themselves how they stand, or answer at once.
 TALKING = ("batch", "check", "scan", "watch")
+# Seconds after which a reader wonders if anything goes on, and between two looks at the clock.
+QUIET, EVERY = 3.0, 0.5
+
+
+class Waiting:
+    """A line on standard error that counts seconds, until `end`; none where nobody looks.
+
+    A step of JAX or a search tells no share of its work: what can be told honestly is the time.
+    """
+
+    def __init__(self, name: str) -> None:
+        self.name, self.over, self.thread = name, Event(), None
+        if sys.stderr is not None and sys.stderr.isatty():
+            self.thread = Thread(target=self._count, daemon=True)
+            self.thread.start()
+
+    def _count(self) -> None:
+        began, shown = time.monotonic(), False
+        while not self.over.wait(EVERY):
+            if (seconds := time.monotonic() - began) > QUIET:
+                click.echo(f"\r{self.name}: {seconds:.0f} s ...\033[K", err=True, nl=False)
+                shown = True
+        if shown:
+            click.echo("\r\033[K", err=True, nl=False)
+
+    def end(self) -> None:
+        """Take the line away: an answer, an error or another progress bar comes."""
+        self.over.set()
+        if self.thread is not None:
+            self.thread.join()
+
+
+def ended() -> None:
+    """End the wait of the running command, if it has one."""
+    context = click.get_current_context(silent=True)
+    if context is not None and isinstance(context.obj, Waiting):
+        context.obj.end()
 
 
 class _Option(click.Option):
@@ -323,14 +361,15 @@ def answered(
     as_json: bool,
     results: Iterable[Any],
     inputs: Mapping[str, str | None],
-    show: Callable[[Terminal], None],
+    show: Callable[[Terminal], None] | None = None,
     report: str | None = None,
     full: bool = True,
     **further: Any,
 ) -> None:
     """Print the one JSON object of a command, or have the answer shown, and where its report is.
 
-    Results are asked for if they are printed; what there is ``further`` is named beside them.
+    Without ``show`` each result shows itself. Results are asked for if they are printed; what there
+    is ``further`` is named beside them.
     """
     ended()
     if as_json:
@@ -340,7 +379,11 @@ def answered(
     from beamfit.cli.show import Terminal  # rich
 
     terminal = Terminal(full)
-    show(terminal)
+    if show is None:
+        for each in results:
+            terminal.result(each)
+    else:
+        show(terminal)
     terminal.report(report)
 
 

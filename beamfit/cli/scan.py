@@ -98,7 +98,7 @@ class _Lines:
 
     def told(self, now: ScanProgress) -> None:
         """A new point with what is known after it, or what else is new."""
-        from beamfit.live.points import FEWEST
+        from beamfit.live.aims import FEWEST
 
         if not now.measured:
             self(now.news)
@@ -128,8 +128,8 @@ def _known(fit: EmittanceFit | TuningFit) -> Iterator[str]:
 
 async def _planned(machine: ScanMachine, journal: Path, as_json: bool) -> int:
     """Check that the machine answers, and say what a scan would do."""
+    from beamfit.live.aims import first_settings
     from beamfit.live.devices import connect
-    from beamfit.live.points import first_settings
     from beamfit.live.restore import named
 
     at = await connect(machine)

@@ -80,6 +80,15 @@ class Terminal:
         text = Text(f"\n{headline}. ", style=_style(status))
         self.console.print(text.append(message, style="default not bold"))
 
+    def result(self, found: Any) -> None:
+        """Say a result: its verdict, what is odd about its input, and every table."""
+        self.answer(found.headline, found.status, found.message)
+        for note in found.notes:
+            self.line(note)
+        for table in found.tables():
+            self.line()
+            self.table(table)
+
     def posterior(self, title: str, posterior: Posterior) -> None:
         """Show intervals, verdict and diagnostics."""
         self.table(posterior.table()._replace(title=f"\n{title}"), wrap=False)

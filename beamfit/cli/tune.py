@@ -76,11 +76,6 @@ def tune(
 
 def show_tuning(terminal: Terminal, fit: TuningFit) -> None:
     """Say the verdict first, then the best setting and the next row."""
-    terminal.answer(fit.headline, fit.status, fit.message)
-    for note in fit.notes:
-        terminal.line(note)
-    terminal.line()
-    for table in fit.tables():
-        terminal.table(table)
+    terminal.result(fit)
     terminal.line()
     terminal.line(fit.next_words)

@@ -28,7 +28,7 @@ from beamfit.quantity import Quantity, percent
 from beamfit.statistics import of_use, quantity_of_draws
 from beamfit.status import Status
 from beamfit.table import Table, cell, json_of
-from beamfit.verdict import Finding, judge
+from beamfit.verdict import Finding, Judged, judge
 
 # Shares of the charge whose emittance is given, and draws of the density.
 SHARES, DRAWS = (0.5, 0.68, 0.9, 0.95, 1.0), 256
@@ -49,7 +49,7 @@ GRAVER = (Status.converged, Status.poor_fit, Status.unidentified)
 
 @answer
 @dataclass(frozen=True, eq=False)
-class PlaneDensity:
+class PlaneDensity(Judged):
     """The density of one plane.
 
     Attributes
@@ -118,16 +118,6 @@ class PlaneDensity:
     def finding(self) -> Finding:
         """Status with its sentences."""
         return judge(self, RULES)
-
-    @property
-    def status(self) -> Status:
-        """Status of the density."""
-        return self.finding.status
-
-    @property
-    def message(self) -> str:
-        """Cause of the status, and what to do."""
-        return self.finding.message
 
     @cached_property
     def emittance(self) -> dict[str, Quantity]:

@@ -13,19 +13,6 @@ import numpy as np
 from jax import Array
 
 from beamfit.errors import InputError
-from beamfit.greybox import tree
-from beamfit.greybox.memory import range_of
-from beamfit.greybox.posterior import Optimum, Sampled, Statement, target_of
-from beamfit.greybox.problem import Free, Prior, Problem, Record
-from beamfit.lifetime.decay_law import Moments, beam_current, current
-from beamfit.lifetime.expansion import Pieces, solved
-from beamfit.lifetime.record import DecayRecord
-from beamfit.noise.correlated import (
-    CorrelatedNoise,
-    innovations,
-    log_volume,
-    whitened,
-    whitened_of_both,
 from beamfit.lifetime.decay_law import Moments, beam_current
 from beamfit.lifetime.marginal import (
     DRIFT,
@@ -42,16 +29,11 @@ from beamfit.lifetime.marginal import (
 )
 from beamfit.noise.memory import WHITE, MemoryKind
 from beamfit.quantity import HOUR
-from beamfit.sampling.posterior import Expected, Posterior
-from beamfit.sampling.priors import Distribution
-from beamfit.sampling.target import SamplingTarget
-from beamfit.verdict import Finding
 from beamfit.sampling import store as disk
 from beamfit.sampling.convergence import RULES, ChainEvidence, diagnose, held_by_priors
 from beamfit.sampling.ensemble import draw
-from beamfit.sampling.posterior import Expected
 from beamfit.sampling.likelihood import NoiseGroup
-from beamfit.sampling.posterior import Posterior
+from beamfit.sampling.posterior import Expected, Posterior
 from beamfit.sampling.priors import Distribution, checked
 from beamfit.sampling.store import FROM_PYTHON, Checkpoint, Provenance
 from beamfit.sampling.target import PosteriorLaw, SamplingTarget

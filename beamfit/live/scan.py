@@ -18,17 +18,9 @@ import numpy as np
 from beamfit.emittance.fit import EmittanceFit
 from beamfit.errors import InputError
 from beamfit.io.machine import ScanMachine, moved
+from beamfit.live.aims import Aim, Next, aim_of
 from beamfit.live.devices import Connected, NoSizesError, Shots
-from beamfit.live.points import (
-    MeasuredPoint,
-    Next,
-    doubt,
-    fit_of,
-    fresh,
-    next_setting,
-    sharp,
-    warmed,
-)
+from beamfit.live.points import MeasuredPoint
 from beamfit.live.restore import (
     Journal,
     alone_with,
@@ -38,8 +30,6 @@ from beamfit.live.restore import (
     reach,
     restore,
 )
-from beamfit.live.tuning import next_knobs, tuning_of, warmed_tuning
-from beamfit.live.wrong_line import MOST, WrongLine, suspect, telling_setting, wrong_lines
 from beamfit.optics.beamline import Beamline
 from beamfit.tuning.fit import TuningFit
 
@@ -93,17 +83,15 @@ class Running:
     """State of a scan; the one thing that changes as it goes on."""
 
     at: Connected
-    line: Beamline
+    aim: Aim
     before: Mapping[str, float]
     keep: Callable[[Sequence[MeasuredPoint], Mapping[str, float]], None]
     tell: Callable[[ScanProgress], None]
     ready: Callable[[], Awaitable[None]]
-    wrong: Sequence[WrongLine] = ()
     points: list[MeasuredPoint] = field(default_factory=list)
     barred: list[dict[str, float]] = field(default_factory=list)
     fit: EmittanceFit | TuningFit | None = None
     armed: bool = False
-    checks: int = 0
 
     def say(self, news: str, measured: bool = False) -> None:
         """Tell how it stands."""
@@ -156,14 +144,14 @@ async def scan(
     --------
     See docs/live.md, where a simulation takes the place of a control system.
     """
-    (warmed_tuning if at.machine.knobs else warmed)(at.machine, line)
+    aim = aim_of(at.machine, line)
+    aim.warm()
     with alone_with(journal, at.machine.magnets):
         check_none_left(journal)
         magnets = at.machine.magnets  # what could not be put back is not moved
         before = {m.name: moved(m, await at.magnets[m.name].get()) for m in magnets}
         log = _journal_for(journal, at.machine, before)
-        wrong = () if at.machine.knobs else wrong_lines(line, at.machine)
-        run = Running(at, line, before, keep, tell, ready, wrong)
+        run = Running(at, aim, before, keep, tell, ready)
         measuring = asyncio.ensure_future(_begun(run, log))
         reason, problem = "", None
         with ended_by_signals(measuring, run.say) as came:
@@ -177,11 +165,8 @@ async def scan(
             except Exception as error:  # of whatever kind: the magnets are put back first
                 problem, reason = error, str(error)
             await _to_the_end(_back(run, log))
-        number, tuned = came[0] if came else 0, bool(at.machine.knobs)
-        doubted = "" if tuned else doubt(run.fit, run.points)
-        if not doubted and run.checks:
-            doubted = suspect(run.points, run.fit, at.machine, run.wrong)
-        return Outcome(tuple(run.points), run.fit, reason, problem, number, doubted)
+        number, doubt = came[0] if came else 0, aim.doubt(run.points, run.fit)
+        return Outcome(tuple(run.points), run.fit, reason, problem, number, doubt)
 
 
 def _journal_for(path: Path, machine: ScanMachine, before: Mapping[str, float]) -> Journal:
@@ -225,7 +210,7 @@ async def _measured(run: Running) -> str:
     for magnet in machine.magnets:
         for value in magnet.degauss:
             await reach(magnet, run.at.magnets[magnet.name], value)
-    while isinstance(chosen := _chosen(run), Next):
+    while isinstance(chosen := run.aim.next(run.points, run.fit, run.barred, run.before), Next):
         await run.ready()
         point, why = await _point(run, chosen.settings)
         if point is None:
@@ -240,26 +225,9 @@ async def _measured(run: Running) -> str:
         barren = 0
         run.keep([*run.points, point], run.before)
         run.points.append(point)
-        fitted = (tuning_of if machine.knobs else fit_of)(run.points, machine, run.line)
-        run.fit = fitted or run.fit
+        run.fit = run.aim.fit(run.points) or run.fit
         run.say(chosen.why, measured=True)
     return chosen
-
-
-def _chosen(run: Running) -> Next | str:
-    """The next setting, or why there is none: the goal, and nothing that shows the line wrong."""
-    machine, points = run.at.machine, run.points
-    if machine.knobs:
-        return next_knobs(points, run.fit, run.barred, machine, run.before)
-    full = len(points) >= machine.points
-    if not sharp(run.fit, points, machine.goal) or fresh(points, machine):
-        every = f"all {machine.points} points are measured"
-        return every if full else next_setting(points, run.fit, run.barred, machine, run.before)
-    left = () if full or run.checks == MOST else run.wrong
-    if one := telling_setting(points, run.fit, machine, left, run.before):
-        run.checks += 1
-        return one
-    return f"the goal of {100 * machine.goal:.3g} % is reached"
 
 
 async def _point(run: Running, settings: Mapping[str, float]) -> tuple[MeasuredPoint | None, str]:

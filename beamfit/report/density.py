@@ -13,7 +13,7 @@ from matplotlib.figure import FigureBase
 from beamfit.density.charge import FINE_AXIS
 from beamfit.density.fit import SHARES, DensityFit, PlaneDensity
 from beamfit.quantity import Quantity
-from beamfit.report.document import BLUE, RED, Picture, ReportPage, Verdict
+from beamfit.report.document import BLUE, RED, Picture, ReportPage, Verdict, contour_levels
 from beamfit.report.emittance import about_input, about_scan
 from beamfit.table import Table, cell
 
@@ -97,9 +97,7 @@ def draw_density(figure: FigureBase, plane: PlaneDensity, methods: Sequence[Quan
     """
     axes, beside = figure.subplots(1, 2)
     d, density = plane.densities, np.maximum(plane.density, 0.0)
-    ordered = np.sort(density.ravel())[::-1]
-    held = np.cumsum(ordered) / ordered.sum()
-    levels = [float(ordered[np.searchsorted(held, share)]) for share in CONTOURS]
+    levels = contour_levels(density, CONTOURS)
     u = np.stack(np.meshgrid(FINE_AXIS, FINE_AXIS, indexing="ij"), -1) @ d.frame.T
     x, angle = 1e3 * u[..., 0], 1e3 * u[..., 1]
     axes.pcolormesh(x, angle, density, cmap="viridis", shading="gouraud", rasterized=True)

@@ -199,6 +199,19 @@ def control_chart(
         axes.axhspan(*ends, color="0.92", zorder=0, label="control limits")
 
 
+def contour_levels(density: np.ndarray, shares: Sequence[float]) -> list[float]:
+    """Values of a density above which these shares of it lie, the largest share first.
+
+    Examples
+    --------
+    >>> contour_levels(np.array([[4.0, 3.0], [2.0, 1.0]]), (0.4, 0.9))
+    [2.0, 4.0]
+    """
+    ordered = np.sort(density.ravel())[::-1]
+    held = np.cumsum(ordered) / ordered.sum()
+    return sorted({float(ordered[np.searchsorted(held, share)]) for share in shares})
+
+
 def date_axis(axes: Axes) -> None:
     """Label the horizontal axis with dates."""
     locator = AutoDateLocator()

@@ -12,12 +12,21 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import FigureBase
 from matplotlib.ticker import MaxNLocator, NullLocator
+from scipy.ndimage import gaussian_filter
 
 from beamfit.emittance.fit import EmittanceFit
 from beamfit.emittance.posterior import expected_sizes
 from beamfit.lifetime.fit import DecayFit
 from beamfit.lifetime.posterior import expected_current
-from beamfit.report.document import BLUE, MANY, Picture, ReportPage, Verdict, legend_below
+from beamfit.report.document import (
+    BLUE,
+    MANY,
+    Picture,
+    ReportPage,
+    Verdict,
+    contour_levels,
+    legend_below,
+)
 from beamfit.report.scan_pictures import COLOUR, setting_axis, source_of
 from beamfit.sampling.likelihood import noise_words
 from beamfit.sampling.posterior import Expected, Posterior, in_unit
@@ -194,26 +203,17 @@ def _pair(axes: Axes, x: np.ndarray, y: np.ndarray, colour: str) -> None:
     (low, high), (bottom, top) = _ends(x), _ends(y)
     edges = np.linspace(low, high, 36), np.linspace(bottom, top, 36)
     count, _, _ = np.histogram2d(x, y, edges)
-    smooth = _smoothed(count)
-    ordered = np.sort(smooth.ravel())[::-1]
-    share = np.cumsum(ordered) / ordered.sum()
-    levels = sorted({float(ordered[np.searchsorted(share, inside)]) for inside in INSIDE})
+    # Contours follow the shape and not the counting noise of the bins.
+    smooth = gaussian_filter(count, 1.0, mode="constant")
+    levels = contour_levels(smooth, INSIDE)
     middles = [0.5 * (edge[1:] + edge[:-1]) for edge in edges]
     if len(levels) == 2 and levels[0] > 0:
-        filled = [*levels, 1.01 * ordered[0]]
+        filled = [*levels, 1.01 * smooth.max()]
         axes.contourf(*middles, smooth.T, filled, colors=[colour, colour], alpha=0.3)
         axes.contour(*middles, smooth.T, levels, colors=colour, linewidths=0.9)
     else:
         axes.plot(x[:2000], y[:2000], ",", color=colour, rasterized=True)
     axes.set_ylim(bottom, top)
-
-
-def _smoothed(count: np.ndarray) -> np.ndarray:
-    """Each bin shared with its neighbours: contours follow the shape and not the counting noise."""
-    kernel = np.array([1.0, 4.0, 6.0, 4.0, 1.0]) / 16.0
-    for axis in (0, 1):
-        count = np.apply_along_axis(np.convolve, axis, count, kernel, mode="same")
-    return count
 
 
 def _expectations(

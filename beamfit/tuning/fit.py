@@ -28,17 +28,25 @@ from beamfit.quantity import Quantity, percent
 from beamfit.statistics import CENTRAL, WIDE, quantity_of_draws
 from beamfit.status import Status
 from beamfit.table import Table, cell, json_of
+from beamfit.tuning.knob_map import map_posterior, mixed, numbers_at
 from beamfit.tuning.knobs import GOALS, EmittanceTable, Knobs, knobs_of, planes_of
-from beamfit.tuning.minimum import Emittances, Minima, emittances_of, minima_of, values_at
-from beamfit.tuning.next_row import NextRow, PlaneMap, next_row
-from beamfit.tuning.posterior import map_posterior, mixed, numbers_at
+from beamfit.tuning.minimum import (
+    Emittances,
+    Minima,
+    NextRow,
+    PlaneMap,
+    emittances_of,
+    minima_of,
+    next_row,
+    values_at,
+)
 from beamfit.tuning.readings import (
     emittance_readings,
     log_no_beam,
     plane_readings,
     seen_without,
 )
-from beamfit.verdict import Finding, judge
+from beamfit.verdict import Finding, Judged, judge
 
 # Draws of the map: the ends of a 95 % interval are known to a tenth of its half-width.
 DRAWS = 256
@@ -161,7 +169,7 @@ def fit_tuning(
 
 @answer
 @dataclass(frozen=True, eq=False)
-class TuningFit:
+class TuningFit(Judged):
     """A map of the emittance over the knobs of a machine, and its minimum.
 
     Attributes
@@ -290,16 +298,6 @@ class TuningFit:
     def finding(self) -> Finding:
         """Status with its sentences."""
         return judge(self, RULES)
-
-    @property
-    def status(self) -> Status:
-        """Status of the minimum: converged, at_limit or unidentified."""
-        return self.finding.status
-
-    @property
-    def message(self) -> str:
-        """Cause of the status, and what to do."""
-        return self.finding.message
 
     @property
     def headline(self) -> str:

@@ -1,19 +1,23 @@
-"""The beam as a smooth map of the knobs, and the sizes that it predicts.
+"""The beam as a smooth map of the knobs, the sizes it predicts, and the posterior of the map.
 
-One-point functions of JAX arrays. Knobs are in half ranges, from -1 to 1 between their limits.
+Knobs are in half ranges, from -1 to 1 between their limits. The map is functions of one point; its
+posterior is by Laplace's method, the scales averaged over.
 """
 
 from __future__ import annotations
 
 import math
+from functools import partial
 from itertools import product
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
 from beamfit.compile_cache import prepare_jax
+from beamfit.noise.model import LN_2PI
 
 prepare_jax()
 
@@ -26,6 +30,17 @@ SHARP = 3.0
 DEGREE = {1: 10, 2: 8, 3: 6, 4: 5, 5: 4, 6: 4}
 # Standard deviation of a number's mean over the knobs: any eccentricity of the ellipse.
 MEAN = 3.0
+# Priors of ln of the scales, middle and standard deviation. Lengths of 0.6 to 2.7 half ranges: a
+# range is chosen so that the beam bends once or twice; longer ones would have a weak knob's
+# emittance straight, and its minimum at a limit. What a knob adds to the square of the emittance is
+# as large as what is there without, a factor of three to either side; beta and alpha change by a
+# third to a factor of five.
+LENGTH, EMITTANCE, TWISS = (0.2, 0.4), (0.0, 1.0), (-0.4, 0.9)
+# Rounds of scales and map; steps of the map and of the scales in each; steps tried.
+ROUNDS, STEPS, NEWTON = 6, 6, 2
+TRIED = np.array([1.0, 0.5, 0.2, 0.05, 0.0])
+# Draws of the scales, and the farthest step of them in standard deviations of the prior.
+SETS, FAR = 64, 1.5
 
 
 class KnobScales(NamedTuple):
@@ -147,3 +162,325 @@ def log_size(numbers: Array, w: Array, known: Array) -> Array:
     emittance, beta, alpha = jnp.exp(numbers[0]), jnp.exp(numbers[1]), numbers[2]
     along = beta * (w[0] - w[1] * alpha / beta) ** 2 + w[1] ** 2 / beta + w[2]
     return 0.5 * jnp.log(emittance * along + known)
+
+
+class KnobReadings(NamedTuple):
+    """Sizes of one plane at knob settings, padded; arrays begin with the n rows.
+
+    Attributes
+    ----------
+    x : Array
+        Shape (n, knobs), in half ranges.
+    w, known : Array
+        Shape (n, 3) and (n,): as for `log_size`.
+    y : Array
+        ln of the size.
+    floor, unit : Array
+        Relative standard deviation in any case, and what the scale of the noise multiplies.
+    there : Array
+        1 of a row, 0 of padding.
+    noise : Array
+        Shape (2,): prior mean and deviation of ln of the noise's scale.
+    odds, wide : Array
+        Prior odds of a bad reading, and how much wider it scatters.
+    """
+
+    x: Array
+    w: Array
+    known: Array
+    y: Array
+    floor: Array
+    unit: Array
+    there: Array
+    noise: Array
+    odds: Array
+    wide: Array
+
+
+class MapPosterior(NamedTuple):
+    """Draws of a plane's map, with the logarithm of its evidence.
+
+    Attributes
+    ----------
+    scales : KnobScales
+        Of each draw, arrays (d, ...).
+    coefficients : Array
+        Shape (d, n): in prior standard deviations, as `design` multiplies them.
+    log_evidence : Array
+        Of the sizes, all scales averaged over.
+    bad, model : Array
+        Shape (rows,): probability of a bad reading, fitted ln size.
+    error : Array
+        Shape (rows,): relative error of the sizes that was found.
+    """
+
+    scales: KnobScales
+    coefficients: Array
+    log_evidence: Array
+    bad: Array
+    model: Array
+    error: Array
+
+
+def prior_of(data: KnobReadings) -> tuple[Array, Array]:
+    """Prior means and deviations of ln of all scales: lengths, amplitudes, noise."""
+    own = [LENGTH] * data.x.shape[1] + [EMITTANCE] + [TWISS] * (NUMBERS - 1)
+    mean, spread = jnp.array(own).T
+    return jnp.append(mean, data.noise[0]), jnp.append(spread, data.noise[1])
+
+
+def scales_of(eta: Array, varies: Array) -> KnobScales:
+    """Scales from their logarithms; ``varies`` is 1, or 0 for an emittance that is constant."""
+    each = jnp.exp(eta)
+    return KnobScales(each[:-4], each[-4:-1].at[0].multiply(varies), each[-1])
+
+
+class _Peak(NamedTuple):
+    """Coefficients of the map, ln of its scales, and how good each reading is, from 0 to 1."""
+
+    v: Array
+    eta: Array
+    good: Array
+
+
+def _variance(data: KnobReadings, noise: Array, good: Array) -> Array:
+    """Variance of ln of the sizes; of padding 1."""
+    own = data.floor**2 + (noise * data.unit) ** 2
+    return jnp.where(data.there > 0, own / good, 1.0)
+
+
+def _numbers_at(data: KnobReadings, scales: KnobScales, orders: np.ndarray) -> Array:
+    """Derivatives of every row's numbers by the coefficients, shape (n, 3, coefficients)."""
+    return jax.vmap(lambda x: design(x, scales, orders))(data.x)
+
+
+def _log_size(numbers: Array, w: Array, known: Array) -> Array:
+    return log_size(beam_of(numbers), w, known)
+
+
+def _slopes(data: KnobReadings, u: Array) -> tuple[Array, Array]:
+    """Predicted ln sizes and their derivatives by the rows' numbers."""
+    both = jax.vmap(jax.value_and_grad(_log_size))(u, data.w, data.known)
+    return both[0], both[1] * data.there[:, None]
+
+
+def _settled(data: KnobReadings, state: _Peak, varies: Array, orders: np.ndarray) -> Array:
+    """Coefficients that fit best at given scales: Gauss-Newton with the best of a few steps."""
+    scales = scales_of(state.eta, varies)
+    every = _numbers_at(data, scales, orders)
+    variance = _variance(data, scales.noise, state.good)
+
+    def cost(v: Array) -> Array:
+        off = data.y - jax.vmap(_log_size)(every @ v, data.w, data.known)
+        return jnp.sum(v**2) + jnp.sum(data.there * off**2 / variance)
+
+    def step(v: Array, _: None) -> tuple[Array, None]:
+        model, slope = _slopes(data, every @ v)
+        a = jnp.einsum("ij,ijk->ik", slope, every)
+        off = data.there * (data.y - model) + a @ v
+        root = jax.scipy.linalg.cho_factor(a @ a.T + jnp.diag(variance))
+        whole = a.T @ jax.scipy.linalg.cho_solve(root, off)
+        tried = v + TRIED[:, None] * (whole - v)
+        return tried[jnp.nanargmin(jax.vmap(cost)(tried))], None
+
+    return jax.lax.scan(step, state.v, length=STEPS)[0]
+
+
+class _Linear(NamedTuple):
+    """Readings that are linear about the numbers of the rows: how good each is, and a constant."""
+
+    data: KnobReadings
+    off: Array
+    slope: Array
+    good: Array
+    varies: Array
+
+
+def _linear(data: KnobReadings, u: Array, good: Array, varies: Array) -> _Linear:
+    """The readings, linear about the numbers ``u`` of the rows, shape (n, 3)."""
+    model, slope = _slopes(data, u)
+    off = data.there * (data.y - model) + jnp.sum(slope * u, axis=1)
+    return _Linear(data, off, slope, good, varies)
+
+
+def _covariance(eta: Array, by: _Linear, orders: np.ndarray) -> Array:
+    """Covariance of the readings under scales, shape (n, n)."""
+    scales = scales_of(eta, by.varies)
+    a = jnp.einsum("ij,ijk->ik", by.slope, _numbers_at(by.data, scales, orders))
+    return a @ a.T + jnp.diag(_variance(by.data, scales.noise, by.good))
+
+
+def _log_evidence(eta: Array, by: _Linear, orders: np.ndarray) -> Array:
+    """Log evidence of the scales times their prior.
+
+    C. E. Rasmussen and C. K. I. Williams, Gaussian Processes for Machine Learning (2006), eq. 2.30.
+    """
+    root = jnp.linalg.cholesky(_covariance(eta, by, orders))
+    z = jax.scipy.linalg.solve_triangular(root, by.off, lower=True)
+    mean, spread = prior_of(by.data)
+    own = -0.5 * jnp.sum(((eta - mean) / spread) ** 2 + 2.0 * jnp.log(spread) + LN_2PI)
+    count = jnp.sum(by.data.there)
+    return own - 0.5 * jnp.sum(z**2) - jnp.sum(jnp.log(jnp.diag(root))) - 0.5 * count * LN_2PI
+
+
+def _scoring(eta: Array, by: _Linear, orders: np.ndarray) -> tuple[Array, Array]:
+    """Slope of the log evidence, and its expected curvature with the prior's, both by ln scales.
+
+    Rasmussen and Williams, eq. 5.9; Fisher's information of a normal distribution, ½ tr(S⁻¹ S_i
+    S⁻¹ S_j), of S. M. Kay, Fundamentals of Statistical Signal Processing (1993), eq. 3.31.
+    """
+    covariance = _covariance(eta, by, orders)
+    changes = jnp.moveaxis(jax.jacfwd(_covariance)(eta, by, orders), -1, 0)
+    inverse = jax.scipy.linalg.cho_solve(
+        jax.scipy.linalg.cho_factor(covariance), jnp.eye(len(covariance))
+    )
+    each, z = inverse @ changes, inverse @ by.off
+    mean, spread = prior_of(by.data)
+    slope = 0.5 * (jnp.einsum("i,kij,j->k", z, changes, z) - jnp.trace(each, axis1=1, axis2=2))
+    fisher = 0.5 * jnp.einsum("aij,bji->ab", each, each)
+    return slope - (eta - mean) / spread**2, fisher + jnp.diag(spread**-2)
+
+
+def _fitted(
+    data: KnobReadings, start: Array, varies: Array, orders: np.ndarray
+) -> tuple[_Peak, _Linear, Array, Array]:
+    """The best map and scales, readings about it, log evidence, root of the scales' covariance."""
+    mean, spread = prior_of(data)
+
+    def newton(eta: Array, by: _Linear) -> Array:
+        slope, curvature = _scoring(eta, by, orders)
+        step = jnp.linalg.solve(curvature, slope)
+        step = step * jnp.minimum(1.0, FAR / jnp.linalg.norm(step / spread))
+        tried = eta + TRIED[:, None] * step
+        found = jax.vmap(lambda each: _log_evidence(each, by, orders))(tried)
+        return tried[jnp.argmax(jnp.nan_to_num(found, nan=-jnp.inf))]
+
+    def settled(state: _Peak) -> tuple[_Peak, _Linear, Array]:
+        v = _settled(data, state, varies, orders)
+        scales = scales_of(state.eta, varies)
+        u = _numbers_at(data, scales, orders) @ v
+        pull = (data.y - _slopes(data, u)[0]) ** 2 / _variance(data, scales.noise, 1.0)
+        narrower = data.wide**-2
+        doubt = jnp.exp(jnp.minimum(0.5 * pull * (1.0 - narrower), 500.0))
+        doubt = doubt * data.odds / data.wide
+        good = jnp.where(data.there > 0, (1.0 + doubt * narrower) / (1.0 + doubt), 1.0)
+        # ln of good and bad readings together, over the normal density in their place.
+        both = jnp.log1p(doubt) - jnp.log1p(data.odds) - 0.5 * (pull * (1.0 - good) + jnp.log(good))
+        beside = jnp.sum(data.there * both)
+        return _Peak(v, state.eta, good), _linear(data, u, good, varies), beside
+
+    def round_of(state: _Peak, _: None) -> tuple[_Peak, None]:
+        state, by, _ = settled(state)
+        eta = jax.lax.fori_loop(0, NEWTON, lambda _, e: newton(e, by), state.eta)
+        return state._replace(eta=eta), None
+
+    state = _Peak(start, mean, jnp.ones(len(data.y)))
+    state, by, beside = settled(jax.lax.scan(round_of, state, length=ROUNDS)[0])
+    root = jnp.linalg.cholesky(jnp.linalg.inv(_scoring(state.eta, by, orders)[1]))
+    whole = _log_evidence(state.eta, by, orders) + beside + 0.5 * len(mean) * LN_2PI
+    return state, by, whole + jnp.sum(jnp.log(jnp.diag(root))), root
+
+
+def _draw(key: Array, data: KnobReadings, state: _Peak, varies: Array, orders: np.ndarray) -> Array:
+    """A draw of the map at given scales: a prior draw, corrected by the readings.
+
+    J. T. Wilson et al., Pathwise conditioning of Gaussian processes, J. Mach. Learn. Res. 22 (2021)
+    105, with the sizes linear about the best map.
+    """
+    scales = scales_of(state.eta, varies)
+    every = _numbers_at(data, scales, orders)
+    a = jnp.einsum("ij,ijk->ik", _slopes(data, every @ state.v)[1], every)
+    variance = _variance(data, scales.noise, state.good)
+    of_map, of_noise = jax.random.split(key)
+    free = jax.random.normal(of_map, state.v.shape)
+    noise = jnp.sqrt(variance) * jax.random.normal(of_noise, variance.shape)
+    root = jax.scipy.linalg.cho_factor(a @ a.T + jnp.diag(variance))
+    return state.v + free - a.T @ jax.scipy.linalg.cho_solve(root, a @ free + noise)
+
+
+@partial(jax.jit, static_argnames=("knobs", "draws"))
+def map_posterior(
+    data: KnobReadings, start: Array, seed: Array, knobs: int, draws: int
+) -> MapPosterior:
+    """Draw maps of a plane's beam from their posterior, with an emittance that varies or not.
+
+    Parameters
+    ----------
+    data : KnobReadings
+        The sizes.
+    start : Array
+        Shape (3,): numbers of a beam to begin with, the same at all knobs.
+    seed : Array
+        Of the random numbers.
+    knobs, draws : int
+        How many.
+
+    Returns
+    -------
+    MapPosterior
+        Every array with a first axis of two: an emittance that varies with the knobs, and one that
+        none of them changes.
+
+    Notes
+    -----
+    The map is a Gaussian process of each number of the beam, the sizes are linear about the best
+    map (Laplace's method: Rasmussen and Williams, sect. 3.4). Its scales are drawn from the normal
+    distribution about their best and weighed by the evidence, as D. J. C. MacKay, Information
+    Theory, Inference, and Learning Algorithms (2003), sect. 29.2.
+    """
+    orders = orders_of(knobs)
+    first = jnp.zeros((NUMBERS, 1 + len(orders))).at[:, 0].set(start / MEAN).ravel()
+    of_sets, of_choice, of_draws = jax.random.split(jax.random.key(seed), 3)
+
+    def drawn(varies: Array) -> MapPosterior:
+        state, by, log_evidence, root = _fitted(data, first, varies, orders)
+        z = jax.random.normal(of_sets, (SETS, len(state.eta))).at[0].set(0.0)
+        eta = state.eta + z @ root.T
+        log = jax.vmap(lambda e: _log_evidence(e, by, orders))(eta)
+        weight = jax.nn.softmax(jnp.nan_to_num(log, nan=-jnp.inf) + 0.5 * jnp.sum(z**2, axis=1))
+        # Systematic resampling: every set as often as its weight says, up to one.
+        at = (jax.random.uniform(of_choice) + jnp.arange(draws)) / draws
+        chosen = jnp.minimum(jnp.searchsorted(jnp.cumsum(weight), at), SETS - 1)
+        settled = jax.vmap(lambda e: _settled(data, state._replace(eta=e), varies, orders))(eta)
+        coefficients = jax.vmap(
+            lambda key, i: _draw(key, data, _Peak(settled[i], eta[i], state.good), varies, orders)
+        )(jax.random.split(of_draws, draws), chosen)
+        error = jnp.sqrt(_variance(data, jnp.exp(state.eta[-1]), 1.0))
+        u = _numbers_at(data, scales_of(state.eta, varies), orders) @ state.v
+        scales = jax.vmap(lambda e: scales_of(e, varies))(eta[chosen])
+        bad = 1.0 - (state.good - data.wide**-2) / (1.0 - data.wide**-2)
+        return MapPosterior(scales, coefficients, log_evidence, bad, _slopes(data, u)[0], error)
+
+    return jax.lax.map(drawn, jnp.array([1.0, 0.0]))
+
+
+def mixed(both: MapPosterior, still: np.ndarray) -> MapPosterior:
+    """Take draws of the map that varies, and where ``still`` of the one that does not.
+
+    Parameters
+    ----------
+    both : MapPosterior
+        From `map_posterior`.
+    still : ndarray of bool
+        Shape (d,). Fitted sizes and errors are of the model that most draws have.
+    """
+    most = int(still.mean() > 0.5)
+
+    def each(v: np.ndarray) -> np.ndarray:
+        v = np.asarray(v)
+        return np.where(still.reshape(-1, *[1] * (v.ndim - 2)), v[1], v[0])
+
+    scales, coefficients = jax.tree.map(each, (both.scales, both.coefficients))
+    rest = (np.asarray(v)[most] for v in both[2:])
+    return MapPosterior(scales, coefficients, *rest)
+
+
+@jax.jit
+def numbers_at(posterior: MapPosterior, x: np.ndarray) -> Array:
+    """ln ε, ln β, α of every draw at settings, shape (m, knobs) to (d, m, 3), in coordinates."""
+    orders = orders_of(x.shape[-1])
+
+    def one(scales: KnobScales, v: Array) -> Array:
+        return jax.vmap(lambda at: beam_of(design(at, scales, orders) @ v))(jnp.asarray(x))
+
+    return jax.vmap(one)(posterior.scales, posterior.coefficients)

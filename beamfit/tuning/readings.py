@@ -16,8 +16,8 @@ from beamfit.greybox.problem import padded_length
 from beamfit.noise.model import LN_2PI, Noise
 from beamfit.noise.sizes import kinds_of
 from beamfit.optics.beamline import Beamline
+from beamfit.tuning.knob_map import KnobReadings
 from beamfit.tuning.knobs import EmittanceTable, Knobs
-from beamfit.tuning.posterior import KnobReadings
 
 # A beam to begin with where no constant one fits: ln of its emittance in the coordinates.
 BEGIN = np.array([-1.0, 0.0, 0.0])

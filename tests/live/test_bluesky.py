@@ -86,7 +86,8 @@ def bench(ioc, engine, tmp_path, request):
     value("SIM:Q1:SET", -1.5)
     kept = {name: [] for name in ("start", "descriptor", "event", "stop")}
     engine.subscribe(lambda name, document: kept[name].append(document))
-    return Bench(engine, replace(machine, goal=0.04), value, kept)
+    # Seven points of three shots do not always reach 4 %.
+    return Bench(engine, replace(machine, goal=0.04, points=30), value, kept)
 
 
 @pytest.mark.parametrize("bench", [("", ""), ("pva://", "")], indirect=True)
@@ -97,7 +98,8 @@ def test_a_scan_reaches_its_goal_through_a_pause_and_its_events_are_its_points(i
     time.sleep(1.0)
     assert measured() <= before + 1  # the setting that was begun is the last
     found = bench.engine.resume().plan_result
-    assert found.reason == bench.kept["stop"][0]["reason"] == "the goal of 4 % is reached"
+    assert found.reason == "the goal of 4 % is reached"
+    assert bench.kept["stop"][0]["reason"] == f"{found.reason}. {found.doubt}".removesuffix(". ")
     assert bench.is_back()
     primary, fitted = (d["uid"] for d in bench.kept["descriptor"])
     events = [e for e in bench.kept["event"] if e["descriptor"] == primary]

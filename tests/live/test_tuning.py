@@ -10,10 +10,10 @@ from beamfit.errors import InputError
 from beamfit.io.line import build_line
 from beamfit.io.machine import read_scan_machine
 from beamfit.io.tuning import read_tuning_scan
+from beamfit.live.aims import TuningAim
 from beamfit.live.devices import Connected, Shots
 from beamfit.live.points import scan_text
 from beamfit.live.scan import scan
-from beamfit.live.tuning import next_knobs
 from tests.live.faulty import LINE, MACHINE
 
 KNOB = """[[knob]]
@@ -77,7 +77,7 @@ class Knob:
 def machine_in(folder, **changed):
     (folder / "line.toml").write_text(LINE)
     text = MACHINE.format(scheme="", more="").replace('y = "SIM:SCREEN:Y"\n', "")
-    text = text.replace("goal_percent = 0.5\npoints = 7", "goal_percent = 5\npoints = 40")
+    text = text.replace("goal_percent = 0.5\npoints = 7", "goal_percent = 5\npoints = 24")
     text = text.replace("[screen]", KNOB + "[screen]", 1)
     for old, new in changed.items():
         text = text.replace(old, new)
@@ -107,7 +107,7 @@ def test_a_tuning_finds_the_minimum_within_limits_and_restores_every_knob(done):
     found, gun, _, machine, folder = done
     assert found.problem is None
     assert found.reason == "the best setting is within 5 % of the minimum"
-    assert len(found.points) < 40
+    assert len(found.points) < 24
     assert 1.0 + ((found.fit.settings["phase"] - BEST) / 8.0) ** 2 < 1.05
     spans = {m.name: m.span for m in machine.magnets}
     assert all(spans[name][0] <= value <= spans[name][1] for name, value in gun.puts)
@@ -132,16 +132,17 @@ def test_a_fault_puts_every_knob_back(tmp_path):
 def test_nothing_is_chosen_beyond_what_could_not_be_measured(done):
     found, _, _, machine, _ = done
     barred, before = [{"Q1": -2.0, "phase": 8.0}], {"Q1": -2.0, "phase": 0.0}
+    aim = TuningAim(machine, build_line(machine.lattice))
     for count in (0, 1, 3):
-        chosen = next_knobs(found.points[:count], None, barred, machine, before)
+        chosen = aim.next(found.points[:count], None, barred, before)
         assert chosen.settings["phase"] <= 4.0
-    full = next_knobs(found.points * 9, None, (), machine, before)
-    assert full == "all 40 points are measured"
+    full = aim.next(found.points * 9, None, (), before)
+    assert full == "all 24 points are measured"
 
 
 def test_a_machine_without_knobs_scans_and_has_fewer_points(tmp_path):
-    usual = machine_in(tmp_path, **{"points = 40": ""})
-    plain = machine_in(tmp_path, **{"points = 40": "", KNOB: ""})
+    usual = machine_in(tmp_path, **{"points = 24": ""})
+    plain = machine_in(tmp_path, **{"points = 24": "", KNOB: ""})
     assert (usual.knobs, usual.points) == (("phase",), 60)
     assert (plain.knobs, plain.points) == ((), 15)
 

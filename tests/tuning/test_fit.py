@@ -13,10 +13,9 @@ from beamfit.noise.model import Noise
 from beamfit.optics.particle import beta_gamma
 from beamfit.status import Status
 from beamfit.tuning.fit import fit_tuning
-from beamfit.tuning.knob_map import log_emittance, orders_of
+from beamfit.tuning.knob_map import _covariance, _linear, log_emittance, orders_of
 from beamfit.tuning.knobs import EmittanceTable, knobs_of
-from beamfit.tuning.next_row import _information, next_row
-from beamfit.tuning.posterior import _covariance, _linear
+from beamfit.tuning.minimum import _information, next_row
 from beamfit.tuning.readings import emittance_readings
 from tests.tuning.machines import (
     EMITTANCE,

@@ -8,7 +8,7 @@ from scipy.optimize import differential_evolution
 from scipy.stats import kstest, multivariate_normal, norm, uniform
 
 from beamfit.emittance.comparison import STEPS
-from beamfit.tuning import posterior as of
+from beamfit.tuning import knob_map as of
 from beamfit.tuning.knob_map import MEAN, design, features, log_emittance, log_size, orders_of
 from beamfit.tuning.minimum import _of_draw, emittances_of, minima_of, values_at
 from beamfit.tuning.readings import log_no_beam
