@@ -26,7 +26,14 @@ from beamfit.dynamics.order import (
 )
 from beamfit.dynamics.record import Run, check_inputs, checked
 from beamfit.dynamics.search import Case, Settled
-from beamfit.dynamics.state_fit import Course, StatesFit, answer, case_of, remembering, trained
+from beamfit.dynamics.state_fit import (
+    Course,
+    StatesFit,
+    case_of,
+    remembering,
+    states_answer,
+    trained,
+)
 from beamfit.dynamics.states import linear_outputs
 from beamfit.errors import InputError, nearest
 from beamfit.greybox import tree
@@ -117,7 +124,7 @@ def identify_states(
     said, gains = _quantities(case, found, n, runs, offset)
     more = {"delay_samples": delay, "tried": tried, "matrices": _matrices(case, found, n)}
     judged = {"held": held, "map": map, "gain": gain, "delay": delay, "order": n}
-    return answer(case, found, runs, said, by_input=gains, more=more, **judged)
+    return states_answer(case, found, runs, said, by_input=gains, more=more, **judged)
 
 
 def _check_order(case: Case, runs: Sequence[Run], order: int) -> None:
