@@ -16,12 +16,11 @@ from beamfit.errors import InputError, nearest
 if TYPE_CHECKING:
     import numpy as np
 
+    from beamfit.dynamics.control import Loop
     from beamfit.dynamics.fedbatch import FedBatchFit
     from beamfit.dynamics.fit import ResponseFit
-    from beamfit.dynamics.loop import Loop
     from beamfit.dynamics.record import Run
     from beamfit.dynamics.state_fit import StatesFit
-    from beamfit.dynamics.titre import TitreFit
     from beamfit.io.machine import ScanMachine, WatchMachine
     from beamfit.language.compiled import Computed
     from beamfit.language.document import Document
@@ -157,7 +156,7 @@ def identify(
     hidden: int = 5,
     seed: int = 1,
     held: Sequence[Run] = (),
-) -> tuple[ResponseFit | StatesFit | FedBatchFit | TitreFit, ...]:
+) -> tuple[ResponseFit | StatesFit | FedBatchFit, ...]:
     """Identify how the outputs of a process respond to its inputs.
 
     Parameters
@@ -182,8 +181,7 @@ def identify(
     Returns
     -------
     tuple
-        A fit for each output; one of all outputs for a state space; rates, and the titre where it
-        was read, of a fed-batch process.
+        A fit for each output; one of all outputs for a state space or a fed-batch process.
 
     Raises
     ------
@@ -202,11 +200,8 @@ def identify(
     options: dict[str, Any] = {"hidden": hidden, "seed": seed, "held": tuple(held)}
     if model == FED_BATCH:
         from beamfit.dynamics.fedbatch import identify_batches
-        from beamfit.dynamics.titre import fit_titre
 
-        rates = identify_batches(runs, **options)
-        titred = all("titre" in run.outputs for run in runs)
-        return (rates, fit_titre(rates, seed=seed)) if titred else (rates,)
+        return (identify_batches(runs, **options),)
     if model == STATES:
         from beamfit.dynamics.linear import identify_states
 
@@ -302,9 +297,8 @@ def control(
     _check("set", [t[0] for t in targets], outputs)
     _check("disturb", [t[0] for t in disturbances], outputs)
 
-    from beamfit.dynamics.control import controller
+    from beamfit.dynamics.control import controller, simulate_loop
     from beamfit.dynamics.fit import identify as respond
-    from beamfit.dynamics.loop import simulate_loop
 
     options = {"delay": delay, "offset": offset, "hidden": hidden, "seed": seed}
     wished = [name for name in outputs if name in {t[0] for t in targets} | set(limits)]

@@ -16,9 +16,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import beamfit
-from beamfit.dynamics.fedbatch import identify_batches
+from beamfit.dynamics.fedbatch import identify_batches, rank_inputs
 from beamfit.dynamics.feed import best_feed, predict
-from beamfit.dynamics.titre import fit_titre, rank_inputs
 from beamfit.io.run import read_run
 from beamfit.report.fedbatch import draw_ranking
 
@@ -47,20 +46,20 @@ def main() -> None:
     made, began = runpy.run_path(str(PLACE / "make_fedbatch.py")), time.process_time()
     runs = [read_run(path) for path in sorted(PLACE.glob("fedbatch_simulated_*.csv"))]
     fit = identify_batches(runs[:4], held=runs[4:])
-    print(fit.headline, fit.message, fit.held, f"{time.process_time() - began:.0f} s", sep="\n")
+    print(fit.headline, fit.message, fit.tables()[0], f"{time.process_time() - began:.0f} s",
+          sep="\n")  # fmt: skip
     against_truth(fit, made["rates"])
-    titre = fit_titre(fit)
     ranked = rank_inputs(fit)
-    print(titre.headline, *ranked, sep="\n")
+    print(*ranked, sep="\n")
     hours = 0.5 * np.arange(81)
     pulsed = np.resize(runs[3].inputs["feed"], 81)
     steady = np.clip(0.015 * np.exp(0.09 * hours), 0.0, 0.2)
     for name, feed in (("pulsed", pulsed), ("steady", steady)):
-        found = predict(titre, hours, REST | {"feed": feed}, START).length(TITRE)
+        found = predict(fit, hours, REST | {"feed": feed}, START).length(TITRE)
         true = made["plant"](START, feed, np.ones(81))
         print(f"{name}: {TITRE} g/L after {found}, plant {np.interp(TITRE, true[:, 3], hours):.2f}")
     plan = best_feed(
-        titre, START, REST, product=PRODUCT, feed=(0.0, 0.3), volume=7.0, substrate=9.0,
+        fit, START, REST, product=PRODUCT, feed=(0.0, 0.3), volume=7.0, substrate=9.0,
         hours=(10.0, 45.0),
     )  # fmt: skip
     course = plan.course
@@ -68,7 +67,7 @@ def main() -> None:
     print(plan.headline, plan.tables()[0], sep="\n")
     print(f"plant: {true[-1, 2] * true[-1, 3]:.1f} g, substrate at most {true[:, 1].max():.2f} g/L")
     print(f"{time.process_time() - began:.0f} s")
-    for name, result in (("titre", titre), ("plan", plan)) if sys.argv[1:] else ():
+    for name, result in (("batches", fit), ("plan", plan)) if sys.argv[1:] else ():
         beamfit.write_report(Path(sys.argv[1]) / f"{name}.html", result)
     if sys.argv[1:]:
         figure = Figure(figsize=(6, 4), layout="constrained")

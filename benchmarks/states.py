@@ -5,6 +5,10 @@ noise of 0.02): Torricelli's law with unknown coefficients and a network for wha
 a network state space of as many nodes, on a run that was held back. Then 30 000 samples of a linear
 system: time and the most memory; and the same by jax-sysid (L-BFGS as its page has it) where the
 python of its own environment is named: python benchmarks/states.py /tmp/venv-sysid/bin/python.
+
+python benchmarks/states.py eqs: report eqs 1 and 2 on a plant of two states, an input and a known
+parameter rho, identified anew with several noises: how many coefficients of A and B lie within one
+error of the truth, and within 1.96.
 """
 
 from __future__ import annotations
@@ -126,6 +130,31 @@ def long(python: str | None, samples: int = 30_000) -> None:
         subprocess.run([python, "-c", SYSID.format(path=file.name)], check=True)
 
 
+def coefficients(noises: int = 12, samples: int = 300) -> None:
+    """Pulls of A and B where the states are the outputs."""
+    a, b = np.array([[0.85, 0.1], [-0.15, 0.75]]), np.array([[0.4, 0.1], [0.1, -0.3]])
+    pulls = []
+    for seed in range(noises):
+        random, x, y = np.random.default_rng(seed), np.zeros(2), []
+        u = np.repeat(random.normal(size=(samples // 8 + 1, 2)), 8, axis=0)[:samples]
+        for now in u:
+            y.append(x)
+            x = a @ x + b @ now
+        y = np.array(y) + 0.05 * random.normal(size=(samples, 2))
+        run = Run(np.arange(1.0 * samples), dict(zip(("u", "rho"), u.T, strict=True)),
+                  dict(zip("xz", y.T, strict=True)))  # fmt: skip
+        found = identify_states(run, 2).to_json()["matrices"]["outputs_as_states"]
+        for name, true in (("A", a), ("B", b)):
+            off = np.array(found[name]) - true
+            pulls.append(np.abs(off / np.array(found[f"{name}_error"])))
+    pulls = np.concatenate([p.ravel() for p in pulls])
+    print(f"{len(pulls)} coefficients: {np.mean(pulls < 1):.0%} within one error, "
+          f"{np.mean(pulls < 1.96):.0%} within 1.96")  # fmt: skip
+
+
 if __name__ == "__main__":
+    if sys.argv[1:] == ["eqs"]:
+        coefficients()
+        sys.exit()
     long(sys.argv[1] if len(sys.argv) > 1 else None)
     compare()

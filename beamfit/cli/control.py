@@ -16,7 +16,7 @@ from beamfit.io.run import read_run
 
 if TYPE_CHECKING:
     from beamfit.cli.show import Terminal
-    from beamfit.dynamics.loop import Loop
+    from beamfit.dynamics.control import Loop
 
 
 EXAMPLE = """\b

@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from beamfit.dynamics.fedbatch import FedBatchFit
     from beamfit.dynamics.fit import ResponseFit
     from beamfit.dynamics.state_fit import StatesFit
-    from beamfit.dynamics.titre import TitreFit
     from beamfit.table import Table
 
 
@@ -76,9 +75,7 @@ def identify(
     answered(as_json, fits, digests, lambda terminal: _show(terminal, fits), report, full)
 
 
-def _show(
-    terminal: Terminal, fits: tuple[ResponseFit | StatesFit | FedBatchFit | TitreFit, ...]
-) -> None:
+def _show(terminal: Terminal, fits: tuple[ResponseFit | StatesFit | FedBatchFit, ...]) -> None:
     for run in fits[0].runs:
         terminal.line(run.headline, style="bold")
         for note in run.notes:

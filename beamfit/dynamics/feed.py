@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from beamfit.answer import answer
-from beamfit.dynamics.balances import STATES, Batches, batches_of
-from beamfit.dynamics.titre import TITRE, TitreFit, predicted
+from beamfit.dynamics.balances import STATES, TITRE, Batches, batches_of
+from beamfit.dynamics.fedbatch import FedBatchFit, ahead, forecast
 from beamfit.errors import InputError
 from beamfit.greybox.fit import Fit
 from beamfit.greybox.problem import Constraint, Free, Objective, Problem
@@ -35,8 +35,8 @@ class FeedCourse(NamedTuple):
     feed : array, shape (n,)
         L/h, each until the next time.
     value, error : dict of str to array
-        Biomass, substrate, volume and titre; errors are of the model, without the noise of
-        readings.
+        Biomass, substrate, volume and titre; errors are of the model and of how batches differ,
+        without the noise of readings.
     """
 
     time: np.ndarray
@@ -56,26 +56,24 @@ class FeedCourse(NamedTuple):
         return Quantity(float(at), float(error / slope), "h")
 
 
-def _ahead(model: Any, asked: tuple[Batches, Any]) -> Any:
-    """Outputs of one batch from a start that is known, shape (rows, 4)."""
-    b, start = asked
-    begun = {"start": jnp.log(start[None, :3]), "begin": start[3:]}
-    return predicted(model | begun, b)[0]
+def _begun(start: Any) -> dict[str, Any]:
+    """Numbers at the start of one batch, as the model has them."""
+    return {"start": jnp.log(start[None, :3]), "begin": start[3:], "own": jnp.zeros((1, 3))}
 
 
 def predict(
-    fit: TitreFit, time: np.ndarray, inputs: Mapping[str, Any], start: tuple[float, ...]
+    fit: FedBatchFit, time: np.ndarray, inputs: Mapping[str, Any], start: tuple[float, ...]
 ) -> FeedCourse:
     """Predict a batch.
 
     Parameters
     ----------
-    fit : TitreFit
-        Both stages.
+    fit : FedBatchFit
+        With a titre.
     time : array, shape (n,)
         h, increasing.
     inputs : mapping of str to array or float
-        All inputs that the batches had.
+        All that the rates and the titre hang on, and the flows.
     start : (float, float, float, float)
         Biomass, substrate (g/L), volume (L) and titre at the first time.
 
@@ -86,23 +84,27 @@ def predict(
     Raises
     ------
     InputError
-        If an input is missing, or the start is not positive.
+        If the fit has no titre, an input is missing, or the start is not positive.
     """
     time = np.asarray(time, float)
     b = _one(fit, time, inputs, start)
-    n, found = len(time), fit.fit.derive(_ahead, (b, jnp.asarray(start, float)))
-    value, error = (dict(zip(OUTPUTS, part[:n].T, strict=True))
-                    for part in (found.value, found.error))  # fmt: skip
+    found = forecast(fit.fit, b, _begun(jnp.asarray(start, float)), [*fit.spread.values()])
+    n = len(time)
+    value, error = (dict(zip(OUTPUTS, part[0, :n].T, strict=True)) for part in found)
     return FeedCourse(time, np.asarray(b.flow.feed)[0, :n], value, error)
 
 
 def _one(
-    fit: TitreFit, time: np.ndarray, inputs: Mapping[str, Any], start: tuple[float, ...]
+    fit: FedBatchFit, time: np.ndarray, inputs: Mapping[str, Any], start: tuple[float, ...]
 ) -> Batches:
-    like = fit.seen.batches
-    missing = [name for name in like.inputs if name not in inputs]
+    like, model = fit.seen.batches, fit.fit.model
+    if "product" not in model:
+        raise InputError("a fit without titre", "batches with y_titre")
+    needed = {"feed", "feed_substrate", *model["rates"].inputs, *model["product"].inputs}
+    needed = [name for name in like.inputs if name in needed]
+    missing = [name for name in needed if name not in inputs]
     if missing:
-        raise InputError(f"no input {missing[0]}", f"all of {', '.join(like.inputs)}")
+        raise InputError(f"no input {missing[0]}", f"all of {', '.join(needed)}")
     if len(start) != len(OUTPUTS) or not min(start[0], start[2]) > 0 or min(start) < 0:
         raise InputError(f"a start of {start}", f"{', '.join(OUTPUTS)}, biomass and volume above 0")
     held = {n: np.broadcast_to(np.asarray(v, float), time.shape) for n, v in inputs.items()}
@@ -151,7 +153,7 @@ class FeedPlan:
 
 
 def best_feed(
-    fit: TitreFit,
+    fit: FedBatchFit,
     start: tuple[float, ...],
     inputs: Mapping[str, float],
     *,
@@ -167,8 +169,8 @@ def best_feed(
 
     Parameters
     ----------
-    fit : TitreFit
-        Both stages.
+    fit : FedBatchFit
+        With a titre.
     start : (float, float, float, float)
         Biomass, substrate (g/L), volume (L) and titre to begin with.
     inputs : mapping of str to float
@@ -239,7 +241,7 @@ def _planned(model: Any, data: Any) -> Any:
     dt = jnp.where(b.dt > 0, model["hours"] / len(rows), 0.0)
     u = b.u.at[..., b.inputs.index("feed")].set(feed)
     b = replace(b, u=u, flow=b.flow._replace(feed=feed), dt=dt)
-    return _ahead(model, (b, start))[rows]
+    return ahead(model, (b, _begun(start)))[0, rows]
 
 
 def _planned_by(model: Any, asked: Any) -> Any:

@@ -20,7 +20,14 @@ from beamfit.dynamics.fit import MAPS
 from beamfit.dynamics.model import CLOSE, WEIGHT
 from beamfit.dynamics.record import Run, check_inputs, checked
 from beamfit.dynamics.search import LONGEST, Case, Settled, information, noise_of, used_by
-from beamfit.dynamics.state_fit import Course, StatesFit, answer, case_of, remembering, trained
+from beamfit.dynamics.state_fit import (
+    Course,
+    StatesFit,
+    case_of,
+    remembering,
+    states_answer,
+    trained,
+)
 from beamfit.dynamics.states import Matrices, contraction, linear_outputs
 from beamfit.errors import InputError, nearest
 from beamfit.greybox import tree
@@ -446,7 +453,7 @@ def identify_states(
     said, gains = _quantities(case, found, n, runs, offset)
     more = {"delay_samples": delay, "tried": tried, "matrices": _matrices(case, found, n)}
     judged = {"held": held, "map": map, "gain": gain, "delay": delay, "order": n}
-    return answer(case, found, runs, said, by_input=gains, more=more, **judged)
+    return states_answer(case, found, runs, said, by_input=gains, more=more, **judged)
 
 
 def _check_order(case: Case, runs: Sequence[Run], order: int) -> None:
@@ -531,8 +538,30 @@ def _quantities(
     return said, gains
 
 
+def _taylor(model: Any, asked: UsedStates) -> jax.Array:
+    """A and B of states that are the outputs without noise, in the units of the record."""
+    p, n = model["p"], asked.order
+    a, b, c, _, _ = asked.course.system.matrices(p)
+    (_, size_u), (_, size_y) = (p["units"][kind] for kind in "uy")
+    to = size_y[:, None] * c[:, :n]
+    return jnp.column_stack([to @ a[:n, :n] @ jnp.linalg.inv(to),
+                             to @ b[:n, : len(size_u)] / size_u])  # fmt: skip
+
+
 def _matrices(case: Case, found: Settled, n: int) -> dict[str, Any]:
-    """A, B, C, D in the units of the record, for inputs less their mean."""
+    """A, B, C, D in the units of the record, for inputs less their mean.
+
+    Of as many states as outputs, all of which are read, also the first terms of report eq 2 with
+    errors: the states are the outputs, so that no change of basis is open.
+    """
+    more = {}
+    if n == len(case.seen):
+        read = derived(found.fit, found.errors, _taylor, UsedStates(n, case.courses[0]))
+        ends = {"A": slice(n), "B": slice(n, None)}
+        more["outputs_as_states"] = {
+            name + said: part[:, ends[name]] for name in ends
+            for said, part in (("", read.value), ("_error", read.error))
+        }  # fmt: skip
     p = found.fit.model["p"]
     a, b, c, d, _ = map(np.asarray, case.courses[0].system.matrices(p))
     (mean_u, size_u), (mean_y, size_y) = (np.asarray(p["units"][kind]) for kind in "uy")
@@ -541,4 +570,4 @@ def _matrices(case: Case, found: Settled, n: int) -> dict[str, Any]:
         "step_s": float(case.courses[0].dt[0]), "input_mean": mean_u, "A": a[:n, :n],
         "B": b[:n, :m] / size_u, "C": by * c[:, :n], "D": by * d[:, :m] / size_u,
         "state_offset": b[:n, m:].sum(1), "output_offset": mean_y + size_y * d[:, m:].sum(1),
-    }  # fmt: skip
+    } | more  # fmt: skip

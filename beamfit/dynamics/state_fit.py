@@ -334,7 +334,7 @@ def fit_states(
     said = {name.removeprefix("p."): quantity(numbers, i, "")
             for i, name in enumerate(found.fit.problem.names)
             if name.startswith("p.") and not found.fit.problem.nuisance[i]}  # fmt: skip
-    return answer(case, found, runs, said, held=held, map="network" if nets else "constant")
+    return states_answer(case, found, runs, said, held=held, map="network" if nets else "constant")
 
 
 def case_of(
@@ -402,7 +402,7 @@ def _nodes(case: Case, model: Any, segments: int) -> tuple[np.ndarray, np.ndarra
     return found, np.where(scatter > 0, scatter, rest)
 
 
-def answer(
+def states_answer(
     case: Case,
     found: Settled,
     runs: tuple[Run, ...],

@@ -7,7 +7,7 @@ from functools import partial
 import numpy as np
 from matplotlib.figure import FigureBase
 
-from beamfit.dynamics.loop import Loop
+from beamfit.dynamics.control import Loop
 from beamfit.report.document import BLUE, RED, Picture, ReportPage, Verdict
 from beamfit.report.response import about_runs, unitless
 

@@ -8,9 +8,8 @@ from functools import partial
 import numpy as np
 from matplotlib.figure import FigureBase
 
-from beamfit.dynamics.fedbatch import FedBatchFit
+from beamfit.dynamics.fedbatch import FedBatchFit, Ranked
 from beamfit.dynamics.feed import FeedCourse, FeedPlan
-from beamfit.dynamics.titre import Ranked, TitreFit
 from beamfit.report.document import BLUE, RED, Picture, ReportPage, Verdict
 from beamfit.report.response import about_runs, draw_curve
 
@@ -21,12 +20,11 @@ NOTES = (
 UNITS = {"biomass": "g/L", "substrate": "g/L", "volume": "L", "titre": "g/L"}
 
 
-def fedbatch_page(fits: Sequence[FedBatchFit | TitreFit]) -> ReportPage:
-    """Lay out the rates, and the titre if it was fitted."""
-    rates = fits[0].rates if isinstance(fits[0], TitreFit) else fits[0]
+def fedbatch_page(rates: FedBatchFit) -> ReportPage:
+    """Lay out batches and rates."""
     pictures = [
         Picture(
-            f"Measured and predicted in {run.name}", 6.8, partial(draw_batch, fits[-1], i), run.name
+            f"Measured and predicted in {run.name}", 6.8, partial(draw_batch, rates, i), run.name
         )
         for i, run in enumerate(rates.runs)
     ]
@@ -42,8 +40,8 @@ def fedbatch_page(fits: Sequence[FedBatchFit | TitreFit]) -> ReportPage:
     return ReportPage(
         title="Fed-batch process",
         subtitle=f"identified from {', '.join(run.name for run in rates.runs)}",
-        verdicts=[Verdict.of(fit) for fit in fits],
-        tables=[table for fit in fits for table in fit.tables()],
+        verdicts=[Verdict.of(rates)],
+        tables=list(rates.tables()),
         pictures=pictures,
         pictures_title="Batches and rates",
         notes=NOTES,
@@ -64,10 +62,9 @@ def feed_page(plan: FeedPlan) -> ReportPage:
     )
 
 
-def draw_batch(fit: FedBatchFit | TitreFit, i: int, figure: FigureBase) -> None:
+def draw_batch(fit: FedBatchFit, i: int, figure: FigureBase) -> None:
     """Measured and predicted outputs of a batch, and its inputs below."""
-    run = (fit.rates if isinstance(fit, TitreFit) else fit).runs[i]
-    names = list(UNITS)[: fit.courses[i].shape[1]]
+    run, names = fit.runs[i], list(fit.noise)
     hours = (run.time - run.time[0]) / 3600.0
     axes = figure.subplots(len(names) + 1, 1, sharex=True)
     for axis, name, predicted in zip(axes, names, fit.courses[i].T, strict=False):

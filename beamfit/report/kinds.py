@@ -6,12 +6,11 @@ from collections.abc import Sequence
 from typing import Any
 
 from beamfit.density.fit import DensityFit
+from beamfit.dynamics.control import Loop
 from beamfit.dynamics.fedbatch import FedBatchFit
 from beamfit.dynamics.feed import FeedPlan
 from beamfit.dynamics.fit import ResponseFit
-from beamfit.dynamics.loop import Loop
 from beamfit.dynamics.state_fit import StatesFit
-from beamfit.dynamics.titre import TitreFit
 from beamfit.emittance.slices import SliceFits
 from beamfit.language.compiled import Computed
 from beamfit.language.solution import ProblemSolution
@@ -30,13 +29,13 @@ OF_ONE = {
     ProblemSolution: formulation_page,
     Computed: computed_page,
     SliceFits: slices_page,
+    FedBatchFit: fedbatch_page,
     FeedPlan: feed_page,
     Loop: control_page,
     TuningFit: tuning_page,
     DensityFit: density_page,
 }
 OF_SEVERAL = dict.fromkeys((ResponseFit, StatesFit), response_page)
-OF_SEVERAL |= dict.fromkeys((FedBatchFit, TitreFit), fedbatch_page)
 
 
 def page_of(several: Sequence[Any]) -> ReportPage:

@@ -22,11 +22,10 @@ from beamfit.sampling.posterior import Posterior
 from beamfit.writing import write_atomically
 
 if TYPE_CHECKING:
+    from beamfit.dynamics.control import Loop
     from beamfit.dynamics.fedbatch import FedBatchFit
     from beamfit.dynamics.feed import FeedPlan
     from beamfit.dynamics.fit import ResponseFit
-    from beamfit.dynamics.loop import Loop
-    from beamfit.dynamics.titre import TitreFit
     from beamfit.emittance.size_methods import SizeMethods
     from beamfit.emittance.slices import SliceFits
     from beamfit.language.solution import ProblemSolution
@@ -35,7 +34,7 @@ if TYPE_CHECKING:
 
     Reported = (
         EmittanceFit | SliceFits | DecayFit | ProblemSolution | ResponseFit | Loop
-        | FedBatchFit | TitreFit | FeedPlan
+        | FedBatchFit | FeedPlan
     )  # fmt: skip
 
 
@@ -60,8 +59,8 @@ def write_report(
     result : EmittanceFit, SliceFits, DecayFit, ProblemSolution, ResponseFit, Loop, or sequence
         The emittance of a scan or of the slices of a beam, the lifetime of a decay, a formulation
         solved, the response of a process, a simulated loop; or a sequence of RecordStudy (the
-        lifetimes of whole records) or of ResponseFit (several outputs); the rates and the titre
-        of a fed-batch process, or its planned feed.
+        lifetimes of whole records) or of ResponseFit (several outputs); a fed-batch process,
+        or its planned feed.
     posterior : Posterior or sequence of Posterior, optional
         What `sample` of the fit gave; of records one for each decay.
     command : str, optional

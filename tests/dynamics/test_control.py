@@ -9,9 +9,16 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from beamfit.dynamics.control import Controller, ControlLimits, Response, controller, start
+from beamfit.dynamics.control import (
+    Controller,
+    ControlLimits,
+    Response,
+    closed_loop,
+    controller,
+    simulate_loop,
+    start,
+)
 from beamfit.dynamics.fit import identify
-from beamfit.dynamics.loop import closed_loop, simulate_loop
 from beamfit.dynamics.record import Run
 from beamfit.dynamics.response import ARX, FIRST_ORDER, SECOND_ORDER, simulate
 from beamfit.errors import InputError

@@ -89,6 +89,11 @@ def test_poles_gains_and_the_order_of_two_inputs_and_outputs_are_found():
     fit = identify_states(run)
     assert (fit.status, fit.order) == (Status.converged, 2), fit.message
     gains = c @ np.linalg.solve(np.eye(2) - a, b) * [[1.0], [100.0]]
+    read = fit.to_json()["matrices"]["outputs_as_states"]  # report eq 2 of these states
+    to = np.diag([1.0, 100.0]) @ c
+    for name, true in (("A", to @ a @ np.linalg.inv(to)), ("B", to @ b)):
+        off = (np.array(read[name]) - true) / np.array(read[f"{name}_error"])
+        assert np.abs(off).max() < 4.0, (name, off)
     near(fit, T1=1 / np.hypot(0.1, 1.0), zeta1=0.1 / np.hypot(0.1, 1.0))
     near(fit, K_l_a=gains[0, 0], K_l_b=gains[0, 1], K_m_a=gains[1, 0], K_m_b=gains[1, 1])
     found = fit.to_json()["matrices"]  # which stand for themselves
@@ -123,6 +128,10 @@ def test_a_network_follows_what_no_linear_state_space_does():
     assert fit.parts[0].checks.against_constant > 100.0
     assert np.std(fit.fitted["level"][0] - x) < 0.015
     mean = u.mean()
+    read = fit.to_json()["matrices"]["outputs_as_states"]
+    slope = 1.0 / np.cosh(mean + rest(mean) / 2) ** 2
+    for name, true in (("A", 0.8 + 0.2 * slope), ("B", 0.4 * slope)):
+        assert abs(read[name][0][0] - true) < 4 * read[f"{name}_error"][0][0], name
     near(fit, level=rest(mean), K=(rest(mean + 1e-4) - rest(mean - 1e-4)) / 2e-4)
 
 
