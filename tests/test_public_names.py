@@ -43,7 +43,7 @@ READ = {"Document", "Decay", "LifetimeTable", "Operation", "RecordStudy", "Ring"
 READ |= {"ScanMachine", "ScanProgress", "WatchView", "WatchMachine", "Layout"}
 # Words for what may be given in their place, or what a report is written of.
 WORDS = {"Any", "Array", "ArrayLike", "Callable", "Columns", "DataFrame", "Iterable", "Law"}
-WORDS |= {"Limits", "Mapping", "None", "PathLike", "Reported", "Sequence", "Steps"}
+WORDS |= {"Limits", "Mapping", "None", "PathLike", "Reported", "Scanned", "Sequence", "Steps"}
 WORDS |= {"Network", "ResponseFit", "SizeMethods", "Shift", "Trend"}
 
 
