@@ -249,8 +249,8 @@ def _next_stage(
     density = [target.log_probability(part) for part in np.split(drawn, 8)]
     points = recent.reshape(-1, recent.shape[2])
     share = share_of(proposal, points, log_prob.ravel(), drawn, np.concatenate(density))
-    agreed = bool(np.max(diagnose(recent).rhat) < WARM)
-    return state._replace(share=share, producing=agreed or state.began == ROUNDS[-1])
+    agreed = state.began > ROUNDS[0] and np.max(diagnose(recent).rhat) < WARM
+    return state._replace(share=share, producing=bool(agreed) or state.began == ROUNDS[-1])
 
 
 def _refused(target: SamplingTarget, seed: int, status: Status, said: str) -> Posterior:
