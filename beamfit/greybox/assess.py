@@ -43,7 +43,7 @@ PLAIN = 2e-3
 ROUNDING = 1e-13
 # A slope at a bound is rounding where it predicts these parts of the cost as a change and less than
 # this share of that happens: b/(1 - exp(-b t)) has lost its figures at b = 1e-18.
-LOST, PARTS = 1e-2, (1.0, 1e-2)
+SHARE, PARTS = 1e-2, (1.0, 1e-2)
 # Test points: distance in sizes of the numbers, count along the weakest directions of a sum of
 # squares, and count at random or inward from bounds.
 BESIDE, WEAKEST, AROUND = 1e-3, 2, 4
@@ -460,7 +460,7 @@ def lower_beside(p: Problem, s: SearchState, lagrangian: Look) -> np.ndarray | N
         if gain[i] > least:
             return _along(p, s, pushes[k], lagrangian)
         for at, t in enumerate(PARTS, 1):
-            if BESIDE * slope[k] > size and gain[i + at * len(pushes)] > -LOST * t * size:
+            if BESIDE * slope[k] > size and gain[i + at * len(pushes)] > -SHARE * t * size:
                 return points[i + at * len(pushes)]
     return None
 

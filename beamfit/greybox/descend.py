@@ -47,9 +47,6 @@ ROUNDING = 1e-16
 FINISHED = 1e-14
 # Rounds in which a step pins numbers to bounds; the rest is clipped.
 PINNED = 3
-# Factor on the damping of many numbers, times the relative miss of a step's promised decrease; its
-# least value.
-TRUSTED, EASED = 10.0, 1e-4
 # Starts looked at in one compiled call, if their Jacobians have at most this many entries.
 WIDTH, LARGE = 4, 2**15
 
@@ -150,7 +147,7 @@ class Descent:
         taken, refused = lanes[good], lanes[~good]
         self.theta[taken], self.residual[taken] = trial[go][good], new[good]
         self.jacobian[taken] = slope[good]
-        self.damping[taken] *= _easing(ratio[good], self.many)
+        self.damping[taken] *= np.maximum(1 / 3, 1 - (2 * np.minimum(ratio[good], 1.0) - 1) ** 3)
         self.growth[taken] = 2.0
         self.damping[refused] *= self.growth[refused]
         self.growth[refused] *= 2.0
@@ -187,17 +184,6 @@ def _finite(residuals: np.ndarray, jacobians: np.ndarray) -> np.ndarray:
     """True for each start where all is finite."""
     sums = np.array([one.sum() for one in jacobians], float)
     return np.isfinite(residuals.sum(axis=1) + sums)
-
-
-def _easing(ratio: np.ndarray, many: bool) -> np.ndarray:
-    """Factor on the damping after a step that gained this share of its promised decrease.
-
-    Nielsen's rule, and faster where a step of many numbers gains what it promised: then steps
-    become undamped and converge as fast as Gauss-Newton's. Few numbers keep to Nielsen's rule: in
-    the flat valleys of networks every second step would be refused.
-    """
-    nielsen = np.maximum(1 / 3, 1 - (2 * np.minimum(ratio, 1.0) - 1) ** 3)
-    return np.minimum(nielsen, np.maximum(TRUSTED * np.abs(1 - ratio), EASED)) if many else nielsen
 
 
 def _pinned(g: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:

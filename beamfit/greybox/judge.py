@@ -109,7 +109,7 @@ class FitEvidence(NamedTuple):
 
     @property
     def optima(self) -> tuple[int, list[tuple[float, int]]]:
-        """How many starts ended on the answer; costs of other optima, and how many on each."""
+        """Number of starts on the answer; costs of other optima, and the number on each."""
         least = ALIKE * max(self.state.scale.cost, abs(self.state.at.cost))
         ends = [a.cost for a in self.search.attempts if a.kkt.worst <= self.problem.tolerance]
         agreed = sum(abs(cost - self.state.at.cost) <= least for cost in ends)
