@@ -218,9 +218,10 @@ def _moment(text: str) -> datetime:
         raise
 
 
-# Bytes from which a file is worth it, how many are read at a time, and what numbers and what stands
-# between them are written with.
-LARGE, BLOCK, USUAL = 1_000_000, 1 << 23, b"0123456789+-.eE,;\t \r\n"
+# Bytes from which a file is worth it, and how many are read at a time.
+LARGE, BLOCK = 1_000_000, 1 << 23
+# What numbers and what stands between them are written with.
+USUAL = b"0123456789+-.eE,;\t \r\n"
 
 
 def numeric_rows(

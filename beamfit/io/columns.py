@@ -418,7 +418,7 @@ class Sheet:
 
 
 def _expected_date(cells: Sequence[Any], header: str) -> str:
-    """What a column of dates should have, by its first cell."""
+    """Say what a column of dates should have, by its first cell."""
     first = str(next(iter(cells), ""))
     if NUMBERS.match(first):
         expected = "a date whose day and month cannot be exchanged, such as 2024-03-01, "

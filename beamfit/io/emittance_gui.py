@@ -18,7 +18,7 @@ from beamfit.errors import InputError, nearest
 from beamfit.io.files import digest, laid_out, name_of
 from beamfit.io.isolated import matlab_variables
 from beamfit.io.lattice import LatticeFile
-from beamfit.io.shots import average_shots
+from beamfit.io.shots import FEWEST_SETTINGS, average_shots
 from beamfit.quantity import Quantity
 
 # GeV, of files that have none; the electron's is the only particle there.
@@ -32,8 +32,8 @@ STATS = ("middle x", "middle y", "x", "y", "correlation", "sum")
 LEAST_LIGHT = 0.1
 # Relative: a mean that differs by more is another one, and not rounded otherwise.
 ROUNDED = 1e-6
-# A beam matrix has three numbers; of shots and sizes that are odd so many are named.
-FEWEST, MOST_NAMED = 3, 4
+# Shots and sizes that are odd, of which so many are named.
+MOST_NAMED = 4
 MATLAB, VARIABLE = ".mat", "data"
 EXPECTED = "a file saved by emittance_gui"
 
@@ -224,7 +224,7 @@ def _used(source: _Fields, taken: int) -> tuple[np.ndarray, int]:
     used = np.arange(n) < taken
     for mark in marks:
         used &= source.numbers(mark, n) > 0
-    if used.sum() < FEWEST:
+    if used.sum() < FEWEST_SETTINGS:
         found = f"{used.sum()} of {n} {word} taken and in use"
         raise InputError(found, "at least three: the beam matrix has three numbers", source.path)
     return np.flatnonzero(used), n
@@ -366,7 +366,7 @@ def _scan(
 
     A plane has errors where each of its sizes has one.
     """
-    kept = {p: v for p, v in sizes.items() if _distinct(v, settings.labels) >= FEWEST}
+    kept = {p: v for p, v in sizes.items() if _distinct(v, settings.labels) >= FEWEST_SETTINGS}
     if not kept:
         return None
     at = np.flatnonzero(~np.isnan(list(kept.values())).all(axis=0))
@@ -416,7 +416,7 @@ def _notes(
     for named, planes in lost.items():
         yield f"Left out in {' and '.join(planes)}, without a size a beam can have: {named}."
     for plane, each in sizes.items():
-        if (n := _distinct(each, labels)) < FEWEST:
+        if (n := _distinct(each, labels)) < FEWEST_SETTINGS:
             yield f"Left out: plane {plane}, with sizes at {n} of {len(labels)} settings."
             continue
         number = np.maximum((~np.isnan(each)).sum(axis=1), 1)

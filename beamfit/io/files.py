@@ -34,7 +34,7 @@ SIGNATURES = {
 # How text of two bytes a letter begins, such as Excel's "Unicode text".
 UTF16 = codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE
 # ° ± ² ³ µ in the code pages of Windows, and what needs none.
-MARKS, ASCII = bytes([0xB0, 0xB1, 0xB2, 0xB3, 0xB5]), bytes(range(128))
+MARKS, ASCII = "°±²³µ".encode("latin-1"), bytes(range(128))
 # Bytes of a lattice of 50 000 elements, and of what is kept in memory at all.
 LARGEST_TEXT, LARGEST = 4_000_000, 256_000_000
 # Seconds after which a pipe that gives nothing is given up.

@@ -56,8 +56,8 @@ NUMBERS = {
     *(f"{u}int{n}" for u in ("", "u") for n in (8, 16, 32, 64)),
 }
 SDDS_HEAD = re.compile(rb"&data\b.*?&end[^\n]*\n", re.DOTALL)
-# How the name of a magnet's setting ends; m/s.
-SETTING_ENDS, LIGHT = tuple(f"_{unit}" for unit in SETTINGS), 299792458.0
+# How the name of a magnet's setting ends.
+SETTING_ENDS = tuple(f"_{unit}" for unit in SETTINGS)
 # What ends an exponent or an index in a unit, and what begins one: 1/m$a2$n.
 SHIFTS = {"$a": "^", "$b": "", "$n": "", "$e": ""}
 # Values by name, the unit that the file says of each, and its comments.
@@ -295,7 +295,7 @@ def _beam_row(beam: Any, rows: int) -> dict[str, Any]:
         middle = np.average(values, weights=shares)
         row[f"size_{plane}_m"] = math.sqrt(np.average((values - middle) ** 2, weights=shares))
     row["momentum_MeV"] = float(np.mean(np.linalg.norm(np.broadcast_arrays(*momentum), axis=0)))
-    row["momentum_MeV"] *= LIGHT / 1.602176634e-13
+    row["momentum_MeV"] *= 299792458.0 / 1.602176634e-13  # from kg m/s
     return row
 
 

@@ -42,9 +42,8 @@ RANGES = {
     "beta": (1e-6, 1e6, "a positive beta function"),
     "alpha": (-1e4, 1e4, "a Twiss alpha"),
     "dispersion": (-1e3, 1e3, "a dispersion of metres"),
+    "s": (-1e6, 1e6, "a position in m"),
 }
-# Beyond the circumference of any ring.
-ANYWHERE = (-1e6, 1e6, "a position in m")
 INFINITE = math.inf
 SHARE = "a positive number that is a share: up to 1, 0.03 for 3 %"
 FILL = "the number of equal bunches, or a list with the charge of each, in any unit"
@@ -468,7 +467,7 @@ def _column(sheet: Sheet, name: str) -> np.ndarray:
         values = np.abs(values)
         wrong, expected = (values == 0) | (values >= 1), "a share between 0 and 1, 0.03 for 3 %"
     else:
-        low, high, expected = RANGES.get(name.split("_")[0], ANYWHERE)
+        low, high, expected = RANGES[name.split("_")[0]]
         wrong = ~((low < values) & (values < high))
     sheet.refuse(header, wrong, expected, "{:g}", values)
     return values

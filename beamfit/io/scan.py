@@ -44,7 +44,7 @@ SLIPPED = 100.0
 # Relative: nobody has measured a beam's size better, while mm and µm are 1e-3 apart.
 SMALLEST = 1e-4
 # Of the matrix of a plane, where rows have their own.
-ELEMENTS = (11, 12, 16)
+ELEMENTS = ("r11", "r12", "r16")
 # Further quantities: from (open), to, and how to say it.
 RANGES = {
     "energy": (0.511, 1e7, "a total energy between 0.511 MeV and 10 TeV; is it in GeV or eV?"),
@@ -156,7 +156,7 @@ def _scan(
     planes = [p for p in "xy" if f"size_{p}" in values]
     error = {p: values[f"size_{p}_error"] for p in planes if f"size_{p}_error" in values}
     own = {
-        p: np.stack([values.get(f"r{i}_{p}", np.zeros(len(sheet))) for i in ELEMENTS], axis=-1)
+        p: np.stack([values.get(f"{name}_{p}", np.zeros(len(sheet))) for name in ELEMENTS], axis=-1)
         for p in planes
         if f"r11_{p}" in values
     }
