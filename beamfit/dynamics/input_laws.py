@@ -240,22 +240,13 @@ class _LawFits(NamedTuple):
         The first step is by the noise that is likeliest with each law, further ones by the `FEW`
         that are so with the likeliest laws.
         """
-        count = len(self.candidates.inputs[0])
-        best, noises, each = (
-            np.tile(self.begin, (count, 1)),
-            range(len(self.grid.time)),
-            np.arange(count),
-        )
+        count, noises = len(self.candidates.inputs[0]), range(len(self.grid.time))
+        best, each = np.tile(self.begin, (count, 1)), np.arange(count)
         step, least = np.zeros_like(best), np.full(count, np.inf)
         for _ in range(ROUNDS):
             white = self.whitened(best + step, noises)
-            squares, memory = np.sum(white.triangle[..., -1] ** 2, axis=(1)), white.memory()
-            now, after = (
-                (
-                    white.count * np.log(np.maximum(s, np.finfo(float).tiny)) - 2 * white.volume
-                ).reshape(-1, count)
-                for s in (squares, memory.squares)
-            )
+            memory, squares = white.memory(), np.sum(white.triangle[..., -1] ** 2, axis=1)
+            now, after = (_minus(white, s).reshape(-1, count) for s in (squares, memory.squares))
             likeliest = after.argmin(axis=0)
             further = memory.step.reshape(-1, count, best.shape[1])[likeliest, each]
             better = now.min(axis=0) < least
@@ -264,6 +255,11 @@ class _LawFits(NamedTuple):
             step = np.where(better[:, None], further, 0.25 * step)
             noises = list(dict.fromkeys(likeliest[np.argsort(after.min(axis=0))]))[:FEW]
         return best
+
+
+def _minus(white: Whitened, squares: np.ndarray) -> np.ndarray:
+    """-2 ln L by each noise, up to a constant, of so large sums of squares."""
+    return white.count * np.log(np.maximum(squares, np.finfo(float).tiny)) - 2.0 * white.volume
 
 
 def _moments(memory: Memory, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
