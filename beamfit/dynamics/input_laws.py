@@ -37,8 +37,8 @@ PLAYS = (0.0, 0.4, 0.8, 1.2, 1.6, 2.0)
 CORRELATION_TIMES, WHITE, MOST = 6, (0.0, 1.0, 10.0, 100.0), 2048
 # Share of what a law hands on that no gain and level give, below which it is none.
 SAME = 1e-6
-# Smallest weight and sum of squares; largest residual, of a step that went astray.
-TINY, VAST = 1e-300, 1e100
+# Largest residual, of a step that went astray.
+VAST = 1e100
 # Gauss-Newton rounds of each, noises in those after the first, and shorter delays that a law may
 # stand for.
 ROUNDS, FEW, LATE = 4, 4, 3
@@ -240,20 +240,13 @@ class _LawFits(NamedTuple):
         The first step is by the noise that is likeliest with each law, further ones by the `FEW`
         that are so with the likeliest laws.
         """
-        count = len(self.candidates.inputs[0])
-        best, noises, each = (
-            np.tile(self.begin, (count, 1)),
-            range(len(self.grid.time)),
-            np.arange(count),
-        )
+        count, noises = len(self.candidates.inputs[0]), range(len(self.grid.time))
+        best, each = np.tile(self.begin, (count, 1)), np.arange(count)
         step, least = np.zeros_like(best), np.full(count, np.inf)
         for _ in range(ROUNDS):
             white = self.whitened(best + step, noises)
-            squares, memory = np.sum(white.triangle[..., -1] ** 2, axis=(1)), white.memory()
-            now, after = (
-                (white.count * np.log(np.maximum(s, TINY)) - 2 * white.volume).reshape(-1, count)
-                for s in (squares, memory.squares)
-            )
+            memory, squares = white.memory(), np.sum(white.triangle[..., -1] ** 2, axis=1)
+            now, after = (_minus(white, s).reshape(-1, count) for s in (squares, memory.squares))
             likeliest = after.argmin(axis=0)
             further = memory.step.reshape(-1, count, best.shape[1])[likeliest, each]
             better = now.min(axis=0) < least
@@ -264,9 +257,14 @@ class _LawFits(NamedTuple):
         return best
 
 
+def _minus(white: Whitened, squares: np.ndarray) -> np.ndarray:
+    """-2 ln L by each noise, up to a constant, of so large sums of squares."""
+    return white.count * np.log(np.maximum(squares, np.finfo(float).tiny)) - 2.0 * white.volume
+
+
 def _moments(memory: Memory, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Likelihood of each law, the mean of its steps over noises, and the covariance."""
-    weight = np.maximum(memory.weight, TINY).reshape(-1, count)
+    weight = np.maximum(memory.weight, np.finfo(float).tiny).reshape(-1, count)
     share, step = weight / weight.sum(axis=0), memory.step.reshape(*weight.shape, -1)
     half = memory.half.reshape(*weight.shape, *memory.half.shape[1:])
     size = (memory.squares / memory.dof).reshape(weight.shape)

@@ -44,9 +44,8 @@ LATEST, SHARE = 24, 0.1
 BETTER, PARTS = 5.0, (-0.75, -0.5, -0.25, 0.25, 0.5, 0.75)
 # Time constants of the grid, and dampings of a second order.
 LAGS, DAMPINGS = 16, (0.2, 0.6, 1.0, 2.0)
-# Step of their logarithms in a slope, share of the logarithm of squares whose gain ends a start,
-# and smallest residual of which a logarithm is taken.
-STEP, ENOUGH, TINY = 1e-3, 1e-6, 1e-150
+# Step of their logarithms in a slope.
+STEP = 1e-3
 
 
 class Start(NamedTuple):
@@ -77,7 +76,8 @@ def best_start(seen: PreparedOutput, offset: bool) -> Start:
 
     def left(logarithms: np.ndarray) -> np.ndarray:
         triangles = _triangles(seen.runs, seen.measured, shapes(logarithms), offset)
-        return 2.0 * np.log(np.maximum(np.abs(np.asarray(triangles)[:, -1, -1]), TINY))
+        missed = np.abs(np.asarray(triangles)[:, -1, -1])
+        return 2.0 * np.log(np.maximum(missed, np.finfo(float).tiny))
 
     def with_slope(x: np.ndarray) -> tuple[float, np.ndarray]:
         moved = STEP * np.eye(len(x))
@@ -86,8 +86,7 @@ def best_start(seen: PreparedOutput, offset: bool) -> Start:
 
     bounds = [tuple(np.log([1e-3 * apart, 1e3 * span]))] * grid.shape[1]
     begin = grid[np.argmin(left(grid))]
-    ends = {"ftol": ENOUGH, "maxiter": 20}
-    x = minimize(with_slope, begin, jac=True, bounds=bounds, method="L-BFGS-B", options=ends).x
+    x = minimize(with_slope, begin, jac=True, bounds=bounds, method="L-BFGS-B").x
     (shape,) = shapes(x[None])
     (triangle,) = np.asarray(_triangles(seen.runs, seen.measured, shape[None], offset))
     size = np.linalg.norm(triangle[:, :-1], axis=0)

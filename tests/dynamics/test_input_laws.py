@@ -82,6 +82,19 @@ def test_no_gain_behind_a_law_is_sure_and_wrong(family, count):
         assert fit.status is not Status.converged or abs(gain.value - 2) < 3 * gain.error, seed
 
 
+def test_a_play_is_found_where_the_delay_is_no_whole_number_of_samples():
+    """Half a sample: searches that made steps between samples negative passed for perfect fits."""
+    random = np.random.default_rng(1)
+    u = np.repeat(random.uniform(0, 3, 30), 10)
+    moves = np.repeat(plays(u, 0.1), 2)
+    fine = response(moves, np.append(moves[0], moves[:-1]), 0.0, random, tau=6.0)
+    level = fine.outputs["level"][::2]
+    level = level + 0.01 * level.std() * random.normal(size=300)
+    fit = identify(Run(0.5 * np.arange(300), {"valve": u}, {"level": level}))
+    assert fit.status is Status.poor_fit
+    assert fit.checks.law.startswith("a play of valve"), fit.message
+
+
 def test_two_values_of_an_input_do_not_tell_a_dead_zone():
     """The gain between them is what is measured: no law makes its error larger."""
     random = np.random.default_rng(2)
