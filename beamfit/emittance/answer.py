@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import partial
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 from scipy.special import ndtri
 
+from beamfit.compile_cache import SELDOM
 from beamfit.emittance.advice import next_measurement
 from beamfit.emittance.comparison import (
     PlanePosterior,
@@ -16,6 +21,7 @@ from beamfit.emittance.comparison import (
 )
 from beamfit.emittance.model import (
     QUANTITIES,
+    Asked,
     asked_places,
     coefficients,
     numbers_of,
@@ -110,10 +116,21 @@ class PlaneNumbers(NamedTuple):
 
 def judged_beam(seen: Seen) -> tuple[PlaneFit, ...]:
     """Answer for each plane: nothing but the beam is unknown."""
+    places = places_of({}, tuple(asked_of(seen, plane) for plane in seen.planes))
     return tuple(
-        plane_answer(seen, seen.line, plane, asked_places({}, asked_of(seen, plane)), None)
-        for plane in seen.planes
+        plane_answer(seen, seen.line, plane, at, None)
+        for plane, at in zip(seen.planes, places, strict=True)
     )
+
+
+def places_of(model: Mapping[str, Any], asked: tuple[Asked, ...]) -> list[Places]:
+    """βγ, matrices and design of each plane, through the line as a model has it."""
+    return jax.tree.map(np.asarray, _places(model, asked))
+
+
+@partial(jax.jit, compiler_options=SELDOM)
+def _places(model: Mapping[str, Any], asked: tuple[Asked, ...]) -> list[Places]:
+    return [asked_places(model, each) for each in asked]
 
 
 def plane_answer(
@@ -289,7 +306,7 @@ def _evidence(seen: Seen, plane: str, n: PlaneNumbers, b: Beside | None) -> Plan
     waist = waist_bracketed(p.settings, p.screen, p.size, p.error)
     e = PlaneEvidence(work.posterior, work.sizes, low, high, waist)
     if b is not None:
-        e = e._replace(ending=b.ending, scenario=b.scenario, opened=b.opened, remedy=b.remedy)
+        e = replace(e, ending=b.ending, scenario=b.scenario, opened=b.opened, remedy=b.remedy)
     emittance = float(n.value[1])
     if not e.determined or LEAST <= emittance <= MOST:
         return e
@@ -302,7 +319,7 @@ def _evidence(seen: Seen, plane: str, n: PlaneNumbers, b: Beside | None) -> Plan
         "settings and the energy: sizes in mm under a header that says um make it a million times "
         "less."
     )
-    return e._replace(ending=Finding(Status.unidentified, cause, remedy))
+    return replace(e, ending=Finding(Status.unidentified, cause, remedy))
 
 
 def _quantity(
