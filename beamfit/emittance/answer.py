@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import replace
-from functools import partial
 from typing import Any, NamedTuple
 
-import jax
 import numpy as np
 from scipy.special import ndtri
 
-from beamfit.compile_cache import SELDOM
 from beamfit.emittance.advice import next_measurement
 from beamfit.emittance.comparison import (
     PlanePosterior,
@@ -21,7 +17,6 @@ from beamfit.emittance.comparison import (
 )
 from beamfit.emittance.model import (
     QUANTITIES,
-    Asked,
     asked_places,
     coefficients,
     numbers_of,
@@ -115,22 +110,11 @@ class PlaneNumbers(NamedTuple):
 
 
 def judged_beam(seen: Seen) -> tuple[PlaneFit, ...]:
-    """Answer for each plane: nothing but the beam is unknown."""
-    places = places_of({}, tuple(asked_of(seen, plane) for plane in seen.planes))
+    """Answer for each plane where nothing but the beam is unknown; no program is compiled."""
     return tuple(
-        plane_answer(seen, seen.line, plane, at, None)
-        for plane, at in zip(seen.planes, places, strict=True)
+        plane_answer(seen, seen.line, plane, asked_places({}, asked_of(seen, plane)), None)
+        for plane in seen.planes
     )
-
-
-def places_of(model: Mapping[str, Any], asked: tuple[Asked, ...]) -> list[Places]:
-    """βγ, matrices and design of each plane, through the line as a model has it."""
-    return jax.tree.map(np.asarray, _places(model, asked))
-
-
-@partial(jax.jit, compiler_options=SELDOM)
-def _places(model: Mapping[str, Any], asked: tuple[Asked, ...]) -> list[Places]:
-    return [asked_places(model, each) for each in asked]
 
 
 def plane_answer(

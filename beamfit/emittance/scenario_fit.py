@@ -14,12 +14,13 @@ import numpy as np
 from jax import Array
 
 from beamfit.compile_cache import SELDOM
-from beamfit.emittance.answer import SIGMA, Beside, places_of, plane_answer, units_of
+from beamfit.emittance.answer import SIGMA, Beside, plane_answer, units_of
 from beamfit.emittance.assumptions import Anchor, Assumptions
 from beamfit.emittance.model import (
     QUANTITIES,
     Asked,
     asked_numbers,
+    asked_places,
     size_squared,
     spoken,
 )
@@ -139,7 +140,7 @@ def judged_scenario(
     records = size_records(fit.problem)
     asked = asked_in(fit.problem, seen, seen.planes, scenario.whole_map)
     derived, jacobian = fit.derive(_numbers, asked), _loose_jacobian(fit)
-    places, beams = places_of(fit.model, asked), []
+    places, beams = jax.tree.map(np.asarray, _places(fit.model, asked)), []
     for i, plane in enumerate(seen.planes):
         own = Derived(*(part[i] for part in derived))
         group = next((g for g in fit.groups if g.name == records[plane].name), NOTHING)
@@ -149,6 +150,12 @@ def judged_scenario(
         now = seen._replace(works=seen.works | {plane: work._replace(points=points)})
         beams.append(plane_answer(now, line, plane, places[i], beside))
     return tuple(beams)
+
+
+@partial(jax.jit, compiler_options=SELDOM)
+def _places(model: Mapping[str, Any], asked: tuple[Asked, ...]) -> list[tuple[Any, ...]]:
+    """βγ, matrices and design of each plane, through the line as the model has it."""
+    return [asked_places(model, each) for each in asked]
 
 
 def _points_at(work: Work, sigma: np.ndarray, squared: bool) -> Points:
