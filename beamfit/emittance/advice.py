@@ -85,7 +85,7 @@ Judge = Callable[[Information, Sequence[Candidate]], dict[str, bool]]
 
 
 class Adviser(NamedTuple):
-    """What is known of the emittances of some planes, and what further sizes would add.
+    """Information on the emittances of a scan, to which further sizes add.
 
     Attributes
     ----------
@@ -439,7 +439,7 @@ def _along(seen: Seen) -> tuple[list[str], list[int]]:
 
 def further_options(
     fit: Scanned, adviser: Adviser, energies: tuple[float, ...]
-) -> Iterator[Outcome]:
+) -> Iterator[Prospect]:
     """Kinds of measurement that might identify a scenario.
 
     A single size at every other screen, the same scan at it; the same scan at other energies;
@@ -457,13 +457,13 @@ def further_options(
 
     Yields
     ------
-    Outcome
+    Prospect
     """
 
-    def outcome(words: str, rows: np.ndarray) -> Outcome:
+    def prospect(words: str, rows: np.ndarray) -> Prospect:
         after = adviser.information.with_rows(rows.reshape(-1, rows.shape[-1]))
         known = adviser.errors(after), determined_by(fit.seen, after)
-        return Outcome(words, *known, float(after.share.max()))
+        return Prospect(words, *known, float(after.share.max()))
 
     seen, base = fit.seen, adviser.information
     table = {n: np.asarray(v) for n, v in seen.scan.settings.items()}
@@ -474,12 +474,12 @@ def further_options(
             rows = adviser.predict(line, table, screen, energy).rows
             best = min(range(count), key=lambda i: _worst(base.with_rows(rows[:, i])))
             at = _in_words(seen, {n: float(v[best]) for n, v in table.items()})
-            yield outcome(f"one size on {words} ({at})", rows[:, best])
-            yield outcome(f"the same scan on {words}", rows)
+            yield prospect(f"one size on {words} ({at})", rows[:, best])
+            yield prospect(f"the same scan on {words}", rows)
         screen = (seen.scan.screen or seen.rows.places)[-1]
         for each in energies or tuple(seen.energy * f for f in USUAL_ENERGIES):
             rows = adviser.predict(seen.scanned, table, screen, np.full(count, each)).rows
-            yield outcome(f"the same scan at {each:.4g} MeV", rows)
+            yield prospect(f"the same scan at {each:.4g} MeV", rows)
     slopes = {
         name: abs(number.value)
         for name, number in numbers_of_magnets(seen.scanned).items()
@@ -489,7 +489,7 @@ def further_options(
         if (name := spoken(path)) in slopes:
             row = np.zeros(len(base.lower))
             row[i] = 1.0 / (0.02 * slopes[name])
-            yield outcome(f"a prior of 2 % on {name}", row)
+            yield prospect(f"a prior of 2 % on {name}", row)
 
 
 def _worst(after: Information) -> float:
@@ -514,7 +514,7 @@ def _other_screens(fit: Scanned) -> list[tuple[Beamline, str, str]]:
     return found
 
 
-class Outcome(NamedTuple):
+class Prospect(NamedTuple):
     """A measurement, single or of some kind, and what it would make of the emittance.
 
     ``candidate`` is that of a single one.
@@ -553,11 +553,11 @@ class Advice:
         Whether the data so far determine the emittance of each plane.
     now : dict of str to float
         Relative emittance error of each plane so far; what bounds decide is not counted.
-    steps : tuple of Outcome
+    steps : tuple of Prospect
         The best further measurement, then the best after that, ...
     stop : str
         Why the list ends there.
-    options : tuple of Outcome
+    options : tuple of Prospect
         For a scenario that is not identified: which kind of measurement would identify it.
     tie : str
         What else could, in words.
@@ -567,9 +567,9 @@ class Advice:
     criterion: str
     determined: dict[str, bool]
     now: dict[str, float]
-    steps: tuple[Outcome, ...]
+    steps: tuple[Prospect, ...]
     stop: str
-    options: tuple[Outcome, ...]
+    options: tuple[Prospect, ...]
     tie: str = ""
 
     @property
@@ -735,7 +735,7 @@ def best_steps(
     goal: float | None = None,
     count: int = 1,
     energies: tuple[float, ...] = (),
-) -> tuple[tuple[Outcome, ...], str]:
+) -> tuple[tuple[Prospect, ...], str]:
     """The best measurement, the best after that, and why the list ends."""
     _check_settable(fit, limits or {})
     candidates, rows = adviser.candidates(limits, _screens(fit), energies)
@@ -759,7 +759,7 @@ def best_steps(
             )
         now, candidate = choice.known, candidates[choice.index]
         sure = adviser.determined(now, [*(s.candidate for s in steps), candidate])
-        steps.append(Outcome(candidate.words, adviser.errors(now), sure, candidate=candidate))
+        steps.append(Prospect(candidate.words, adviser.errors(now), sure, candidate=candidate))
     if sharp():
         return tuple(steps), f"Stop after these: the {aim} is reached."
     if goal is not None and all(sure.values()):

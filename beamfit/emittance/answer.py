@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -109,7 +110,7 @@ class PlaneNumbers(NamedTuple):
 
 
 def judged_beam(seen: Seen) -> tuple[PlaneFit, ...]:
-    """Answer for each plane: nothing but the beam is unknown."""
+    """Answer for each plane where nothing but the beam is unknown; no program is compiled."""
     return tuple(
         plane_answer(seen, seen.line, plane, asked_places({}, asked_of(seen, plane)), None)
         for plane in seen.planes
@@ -289,7 +290,7 @@ def _evidence(seen: Seen, plane: str, n: PlaneNumbers, b: Beside | None) -> Plan
     waist = waist_bracketed(p.settings, p.screen, p.size, p.error)
     e = PlaneEvidence(work.posterior, work.sizes, low, high, waist)
     if b is not None:
-        e = e._replace(ending=b.ending, scenario=b.scenario, opened=b.opened, remedy=b.remedy)
+        e = replace(e, ending=b.ending, scenario=b.scenario, opened=b.opened, remedy=b.remedy)
     emittance = float(n.value[1])
     if not e.determined or LEAST <= emittance <= MOST:
         return e
@@ -302,7 +303,7 @@ def _evidence(seen: Seen, plane: str, n: PlaneNumbers, b: Beside | None) -> Plan
         "settings and the energy: sizes in mm under a header that says um make it a million times "
         "less."
     )
-    return e._replace(ending=Finding(Status.unidentified, cause, remedy))
+    return replace(e, ending=Finding(Status.unidentified, cause, remedy))
 
 
 def _quantity(

@@ -140,7 +140,7 @@ def judged_scenario(
     records = size_records(fit.problem)
     asked = asked_in(fit.problem, seen, seen.planes, scenario.whole_map)
     derived, jacobian = fit.derive(_numbers, asked), _loose_jacobian(fit)
-    places, beams = _places(fit.model, asked), []
+    places, beams = jax.tree.map(np.asarray, _places(fit.model, asked)), []
     for i, plane in enumerate(seen.planes):
         own = Derived(*(part[i] for part in derived))
         group = next((g for g in fit.groups if g.name == records[plane].name), NOTHING)
@@ -148,8 +148,7 @@ def judged_scenario(
         work = seen.works[plane]
         points = _points_at(work, own.value[SIGMA], seen.rows.squared)
         now = seen._replace(works=seen.works | {plane: work._replace(points=points)})
-        at = tuple(map(np.asarray, places[i]))
-        beams.append(plane_answer(now, line, plane, at, beside))
+        beams.append(plane_answer(now, line, plane, places[i], beside))
     return tuple(beams)
 
 

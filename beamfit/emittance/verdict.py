@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from typing import NamedTuple
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -39,7 +40,8 @@ REMEDIES = {
 }
 
 
-class PlaneEvidence(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class PlaneEvidence:
     """Evidence for the verdict on one plane.
 
     Attributes
@@ -87,14 +89,14 @@ class PlaneEvidence(NamedTuple):
         """True if these are of three monitors with stated errors."""
         return self.few and not self.sizes.moved and self.sizes.error is not None
 
-    @property
+    @cached_property
     def of_a_beam(self) -> bool:
         """True if the sizes are a beam's, of an emittance or none."""
         if not self.posterior.seen or self.few:
             return self.posterior.seen and self.untested
         return self.beam + self.posterior.probability[FLAT] > SURE
 
-    @property
+    @cached_property
     def determined(self) -> bool:
         """True if they are a beam's and say its emittance."""
         sure = self.untested or self.beam > SURE
