@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -40,8 +41,8 @@ from beamfit.table import json_of
 
 # A departure of so many errors is found with 90 % at a false alarm rate of `POOR_FIT`.
 FOUND = float(ndtri(1 - POOR_FIT / 2) + ndtri(0.9))
-# Times, over the span, that are looked at for a change, and from which searches for gas begin.
-GRID, STARTS, LONGEST = np.linspace(0.05, 0.95, 40), (0.05, 0.2, 0.7), 1.0
+# Times, over the span, that are looked at first, and the longest of gas that relaxes.
+GRID, LONGEST = np.linspace(0.05, 0.95, 40), 1.0
 # Changes are placed on ever finer grids about the best of the last, so often.
 FINER = 3
 # Two changes within so many readings are a step.
@@ -52,9 +53,14 @@ STEP = 3.0
 CHANCES = {"": 0.34, "power": 0.2, "drift": 0.2, "step": 0.08, "steps": 0.04, "relaxing": 0.08,
            "sudden": 0.04, "sudden twice": 0.02}  # fmt: skip
 SIZES = (1e-3, 1.0)
+# Further losses of each alternative: how many, of which kind.
+KINDS = {"step": (1, "step"), "steps": (2, "step"), "relaxing": (1, "relaxing"),
+         "sudden": (1, "sudden"), "sudden twice": (2, "sudden")}  # fmt: skip
 # An alternative is fitted if in linear approximation its evidence, by noises of so many correlation
 # times, is not below that of constant a and b by more than this: it is good to about 1.
 COARSE, HOPELESS = 7, -1.0
+# Step of a time for the slope by it, over the span.
+MOVED = 1e-3
 # Currents at which a lifetime is offered.
 CURRENTS = 5
 
@@ -302,17 +308,14 @@ def rival_of(plain: Expansion) -> Rival | None:
     if pieces.time.size <= WHEN + 2:
         return None
     plain = solved(pieces) if pieces is not plain.pieces else plain
-    once, twice = (_at_best(plain, count, "sudden") for count in (1, 2))
-    likely = _likely(plain, np.append(once.times, twice.times))
+    best = {name: _at_best(plain, *further) for name, further in KINDS.items()}
+    if plain.pieces.gauge is not None:
+        del best["relaxing"]
+    likely = _likely(plain, best)
     if not likely:
         return None
     smooth = _smooth(plain)
-    fitted = {"step": lambda: _changed(plain, _at_best(plain, 1, "step")),
-              "steps": lambda: _changed(plain, _at_best(plain, 2, "step")),
-              "relaxing": lambda: _relaxing(plain),
-              "sudden": lambda: _changed(plain, once),
-              "sudden twice": lambda: _changed(plain, twice)}  # fmt: skip
-    laws = [(name, fitted[name]()) for name in likely]
+    laws = [(name, _with_further(plain, best[name])) for name in likely]
     found = [(_log_evidence(law, name), name, law) for name, law in laws if law is not None]
     log, name, best = max(found, key=lambda one: one[0], default=(-math.inf, "", plain))
     if not log > smooth:
@@ -331,49 +334,34 @@ def _averaged(pieces: Pieces) -> Pieces:
     return Pieces.of(DecayRecord(*record.blocks(ENOUGH), monitor=pieces.monitor))
 
 
-def _likely(plain: Expansion, sudden: np.ndarray) -> list[str]:
-    """List the alternatives that are not much less likely than constant a and b; `sudden` are the
-    best times of one loss and of two: beside its interval a loss explains little.
-
-    Their evidence is that of losses about the law without, averaged over times and noises.
+def _likely(plain: Expansion, best: Mapping[str, _Further]) -> list[str]:
+    """List the alternatives that are not much less likely than constant a and b: by their evidence
+    in linear approximation about the law without, at their best times.
     """
-    columns = plain.rows[:, [LEVEL, *PLAIN]]
-    looked = {"step": GRID[::2], "relaxing": np.array(STARTS), "sudden": sudden}
-    further = [further_columns(plain, kind, times) for kind, times in looked.items()]
-    columns = np.column_stack([columns, plain.residuals, *further])
-    products = Products.of(columns, plain.pieces.time, bool(plain.given), COARSE)
-    base, across = products.matrix[:, :3, :3], products.matrix[:, :3, 3:]
-    left = products.matrix[:, 3:, 3:] - np.swapaxes(across, 1, 2) @ np.linalg.solve(base, across)
-    known = products.log_prior - 0.5 * np.linalg.slogdet(base)[1]
-    least = SIZES[0] * abs(plain.numbers[0])
+    columns, places, widths = (
+        [plain.residuals, *plain.rows[:, [LEVEL, *PLAIN]].T],
+        {"": []},
+        {"": []},
+    )
+    for name, more in best.items():
+        own = list(further_columns(plain, more.kind, more.times).T)
+        size, time = _widths(name, more.sizes, more.times, plain.numbers[0])
+        if more.kind != "sudden":
+            ends = (further_columns(plain, more.kind, more.times + d) for d in (MOVED, -MOVED))
+            own += list(more.sizes[:, None] * np.subtract(*ends).T / (2 * MOVED))
+            size = np.append(size, time)
+        places[name], widths[name] = range(len(columns), len(columns) + len(own)), size
+        columns += own
+    products = Products.of(np.column_stack(columns), plain.pieces.time, bool(plain.given), COARSE)
 
-    def log_evidence(place: np.ndarray) -> float:
-        """Further losses in the columns of each row of places."""
-        count = place.shape[1]
-        pull, pairs = left[:, 0, place], left[:, place[:, :, None], place[:, None, :]]
-        pairs = pairs * (1 + 1e-6 * np.eye(count))
-        sizes = np.linalg.solve(pairs, pull[..., None])[..., 0]
-        after = np.maximum(left[:, 0, 0, None] - np.sum(sizes * pull, axis=2), 1e-30)
-        unit = products.variance(after, 3 + count)
-        width = _flat(np.maximum(np.abs(sizes), least))
-        pairs = pairs / unit[..., None, None] + np.eye(count) / width[..., None] ** 2
-        log = products.log_size(after) + 1.5 * np.log(unit) - np.log(width).sum(axis=2)
-        log = known[:, None] + log - 0.5 * np.linalg.slogdet(pairs)[1]
-        return float(logsumexp(log)) - math.log(len(place))
+    def log_evidence(name: str) -> float:
+        own, width = [0, 1, 2, 3, *places[name]], np.append([np.inf] * 3, widths[name])
+        some = products._replace(matrix=products.matrix[:, own][:, :, own])
+        chance = _log_chance(name, plain, KINDS.get(name, (0, ""))[0])
+        return _laplace(some, width, np.zeros(width.size)) + chance
 
-    ends = np.cumsum([times.size for times in looked.values()])[:-1]
-    places = dict(zip(looked, np.split(np.arange(1, left.shape[1])[:, None], ends), strict=True))
-    places["steps"] = np.array(list(itertools.combinations(places["step"][:, 0], 2)))
-    places["sudden"], both = np.split(places["sudden"], [1])
-    places["sudden twice"] = both.T
-    if plain.pieces.gauge is not None:
-        del places["relaxing"]
-    least_log = log_evidence(np.empty((1, 0), int)) + math.log(CHANCES[""]) + HOPELESS
-    return [
-        name
-        for name, place in places.items()
-        if log_evidence(place) + _log_chance(name, plain, place.shape[1]) > least_log
-    ]
+    constant = log_evidence("") + HOPELESS
+    return [name for name in best if log_evidence(name) > constant]
 
 
 def _log_chance(name: str, law: Expansion, count: int) -> float:
@@ -382,9 +370,14 @@ def _log_chance(name: str, law: Expansion, count: int) -> float:
     return math.log(CHANCES[name]) - where
 
 
-def _flat(size: np.ndarray) -> np.ndarray:
-    """Width of a normal prior with the density, at a size, of one flat in its logarithm."""
-    return 2 * size * math.log(SIZES[1] / SIZES[0]) / math.sqrt(2 * math.pi)
+def _widths(name: str, sizes: np.ndarray, times: np.ndarray, loss: float) -> np.ndarray:
+    """Widths of normal priors on sizes and times of further losses that have the density of flat
+    ones there: what is not determined costs nothing.
+    """
+    sizes = np.maximum(np.abs(sizes), SIZES[0] * abs(loss))
+    gas = name == "relaxing"
+    times = times * math.log(LONGEST / TIMES[0]) if gas else np.ones(times.size)
+    return np.array([2 * sizes * math.log(SIZES[1] / SIZES[0]), times]) / math.sqrt(2 * math.pi)
 
 
 def _smooth(plain: Expansion) -> float:
@@ -430,30 +423,20 @@ def _at_best(plain: Expansion, count: int, kind: str) -> _Further:
     return _Further(kind, times, -sizes[best] / size[place[best]])
 
 
-def _changed(plain: Expansion, more: _Further) -> Expansion | None:
-    """The law with changes of the loss rate, or sudden losses, at their times."""
+def _with_further(plain: Expansion, more: _Further) -> Expansion | None:
+    """The law with changes of the loss rate, or sudden losses, at their times, or with gas that
+    relaxes, whose time is found.
+    """
     further = np.column_stack([more.sizes, more.times])[np.argsort(more.times)].ravel()
-    free = (*PLAIN, *range(FURTHER, FURTHER + further.size, 2))
+    gas = more.kind == "relaxing"
+    free = (*PLAIN, *range(FURTHER, FURTHER + further.size, 1 if gas else 2))
     law = solved(plain.pieces, free, more.kind, start=np.append(plain.numbers, further))
-    apart = STEP * float(np.median(np.diff(plain.pieces.time))) / plain.pieces.units[0]
-    clear = np.all(np.diff([0.0, *law.numbers[4::2], 1.0]) > apart)
-    return law if law.rested and clear else None
-
-
-def _relaxing(plain: Expansion) -> Expansion | None:
-    """The law with gas that relaxes."""
-    free = (*PLAIN, FURTHER, WHEN)
-    laws = [
-        solved(plain.pieces, free, "relaxing",
-               start=np.append(plain.numbers, [0.1 * abs(plain.numbers[0]), at]))
-        for at in STARTS
-    ]  # fmt: skip
     shortest = float(np.median(np.diff(plain.pieces.time))) / plain.pieces.units[0]
-    laws = [
-        law for law in laws
-        if law.rested and law.numbers[3] > 0 and shortest < law.numbers[4] < LONGEST
-    ]  # fmt: skip
-    return min(laws, key=lambda law: float(law.residuals @ law.residuals), default=None)
+    if gas:
+        known = law.numbers[3] > 0 and shortest < law.numbers[4] < LONGEST
+    else:
+        known = np.all(np.diff([0.0, *law.numbers[4::2], 1.0]) > STEP * shortest)
+    return law if law.rested and known else None
 
 
 def _log_evidence(law: Expansion, name: str) -> float:
@@ -464,29 +447,34 @@ def _log_evidence(law: Expansion, name: str) -> float:
         extra[POWER] = BELOW if power < 0 else ABOVE
     if name == "drift":
         extra[FURTHER] = DRIFT * max(abs(loss - quadratic), 1e-300)
-    flat = []
-    for k in range(0, len(further) * (name != "drift"), 2):
-        # A flat prior as a normal one of that density: what is not determined costs nothing.
-        extra[FURTHER + k] = _flat(max(abs(further[k]), SIZES[0] * abs(loss)))
-        flat.append(FURTHER + k)
-        if name.startswith("sudden"):
-            continue
-        time = 1.0 if name != "relaxing" else further[1] * math.log(LONGEST / TIMES[0])
-        extra[WHEN + k] = time / math.sqrt(2 * math.pi)
-        flat.append(WHEN + k)
+    flat: dict[int, float] = {}
+    if further and name != "drift":
+        sizes, times = _widths(name, np.array(further[::2]), np.array(further[1::2]), loss)
+        flat = {FURTHER + 2 * k: size for k, size in enumerate(sizes)}
+        if not name.startswith("sudden"):
+            flat |= {WHEN + 2 * k: time for k, time in enumerate(times)}
+    extra |= flat
     columns = [LEVEL, *PLAIN, *extra]
     width = np.array([np.inf] * 3 + list(extra.values()))
     known = [0.0 if column in flat else law.numbers[column - 1] for column in extra]
     centre = np.array([0.0] * 3 + known)
     rows = np.column_stack([law.residuals, law.rows[:, columns]])
     products = Products.of(rows, law.pieces.time, law.pieces.error is not None)
+    return _laplace(products, width, centre) + _log_chance(name, law, len(further) // 2)
+
+
+def _laplace(products: Products, width: np.ndarray, centre: np.ndarray) -> float:
+    """Log evidence of the first column by Laplace's approximation, the noise averaged over.
+
+    Numbers of the other columns begin `centre` away from the middle of normal priors.
+    """
     along, matrix = products.matrix[:, 1:, 0], products.matrix[:, 1:, 1:]
     after, first = products.matrix[:, 0, 0], products.matrix[:, 0, 0]
     for _ in range(3):
-        unit = products.variance(after, len(columns))[:, None]
+        unit = products.variance(after, width.size)[:, None]
         precision = matrix / unit[..., None] + np.diag(1 / width**2)
         scale = np.sqrt(np.einsum("kpp->kp", precision)) + 1e-300
-        scaled = precision / scale[:, :, None] / scale[:, None, :] + 1e-12 * np.eye(len(columns))
+        scaled = precision / scale[:, :, None] / scale[:, None, :] + 1e-12 * np.eye(width.size)
         pull = (along / unit + centre / width**2) / scale
         step = -np.linalg.solve(scaled, pull[..., None])[..., 0] / scale
         after = first + 2 * np.sum(along * step, 1) + np.einsum("kp,kpq,kq->k", step, matrix, step)
@@ -495,8 +483,7 @@ def _log_evidence(law: Expansion, name: str) -> float:
     log = log - 0.5 * np.linalg.slogdet(scaled)[1] - np.log(scale).sum(1)
     finite = np.isfinite(width)
     log = log - 0.5 * np.sum(((centre + step) / width)[:, finite] ** 2, 1)
-    chance = _log_chance(name, law, len(further) // 2)
-    return float(logsumexp(log)) - float(np.log(width[finite]).sum()) + chance
+    return float(logsumexp(log)) - float(np.log(width[finite]).sum())
 
 
 def _change(law: Expansion) -> Change:

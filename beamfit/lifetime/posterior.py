@@ -18,6 +18,7 @@ from beamfit.lifetime.marginal import (
     DRIFT,
     LEAST,
     MOST,
+    WORTH,
     Draws,
     Peaks,
     SeenDecay,
@@ -44,7 +45,7 @@ UNITS = {"i0": "mA", "a": "1/(mA s)", "b": "1/s", "exponent": "1", "drift": "1"}
 BOUNDS = {"i0": (0.0, np.inf), "a": (0.0, np.inf), "b": (0.0, np.inf), "exponent": (LEAST, MOST)}
 LIFETIMES = {"lifetime_start": "h", "lifetime_end": "h", "lifetime_mean": "h"}
 STATED = {"exponent": "normal about 0, 0.3 below and 0.2 above", "drift": f"normal, 0 ± {DRIFT}"}
-# Chains, and steps of each at first and at most: the fewer chains, the less R-hat has of chance.
+# Draws are laid out as so many chains of so many steps; at most so many steps of proposals.
 WALKERS, STEPS, BUDGET = 16, 1024, 16384
 
 
@@ -175,12 +176,14 @@ class _Prepared(NamedTuple):
         )  # fmt: skip
         lower, upper = np.array([BOUNDS.get(name, (-np.inf, np.inf)) for name in self.names]).T
         told = fit.identifiability.separable or {"a", "b"} & set(priors)
+        held = () if told else ("a", "b")
+        held = held if fit.lifetime_mean.error is not None else (*self.names, *LIFETIMES)
         return SamplingTarget(
             DENSITY, data, self.names, tuple(UNITS.get(name, "1") for name in self.names),
             lower, upper, thetas[np.argmax(draws.weight)],
             np.cov(thetas.T, aweights=draws.weight).reshape(count, count),
             groups=(NoiseGroup("", "averaged"),), priors=checked(priors, self.names),
-            derived=LIFETIMES, observed=_observed(fit), priors_own=() if told else ("a", "b"),
+            derived=LIFETIMES, observed=_observed(fit), priors_own=held,
             verdict=Finding(fit.status, fit.message), hidden=self.names[count - len(self.moved):],
             stated={name: STATED[name] for name in self.names if name in STATED},
         )  # fmt: skip
@@ -224,8 +227,8 @@ def sampled(
 
     Notes
     -----
-    Chains of independent proposals, the weighed draws of `beamfit.lifetime.marginal`, each taken or
-    left by Metropolis and Hastings; they begin with draws by weight, so that no step is left out.
+    The weighed draws of `beamfit.lifetime.marginal`, drawn again by their weight (importance
+    resampling): no chain has to settle, and no step is left out.
     """
     if fit.readings is None:
         raise InputError("a fit without its readings", "the result of fit_decay or fit_decays")
@@ -237,13 +240,15 @@ def sampled(
         raise InputError(f"seed {seed!r}, {target_ess} draws", expected)
     if not fit.rms_residual > 0 and fit.readings.error is None:
         said = f"the readings show neither decay nor noise; {fit.message}".rstrip(".")
-        ends = np.zeros(3), np.full(3, np.inf)
-        names = tuple(UNITS)[:3], tuple(UNITS.values())[:3]
-        given = DENSITY, np.zeros(0), *names, *ends, np.zeros(3), np.eye(3)
-        return draw(SamplingTarget(*given, open_directions=said), seed=seed)
-    ready = _Prepared.of(fit)
-    target = ready.target(priors or {})
-    with nullcontext() if store is None else alone(store):
+        return _refused(said, seed)
+    with np.errstate(all="ignore"):
+        ready = _Prepared.of(fit)
+        if not weighed(ready.seen, ready.peaks, STEPS).worth > 0:
+            return _refused(
+                f"no a and b that are not negative fit; {fit.message}".rstrip("."), seed
+            )
+        target = ready.target(priors or {})
+    with nullcontext() if store is None else alone(store), np.errstate(all="ignore"):
         if store is not None:
             disk.load(store, target, seed, WALKERS)
         posterior = _chains(ready, target, seed, target_ess)
@@ -255,8 +260,16 @@ def sampled(
     return posterior
 
 
+def _refused(said: str, seed: int) -> Posterior:
+    """A posterior that is not sampled, and why."""
+    names = list(UNITS)[:3]
+    ends, units = (np.zeros(3), np.full(3, np.inf)), tuple(UNITS[name] for name in names)
+    given = DENSITY, np.zeros(0), tuple(names), units, *ends, np.zeros(3), np.eye(3)
+    return draw(SamplingTarget(*given, open_directions=said), seed=seed)
+
+
 def _chains(ready: _Prepared, target: SamplingTarget, seed: int, target_ess: float) -> Posterior:
-    """Chains that grow until they are worth the draws that are wanted."""
+    """Draws by weight, from more and more proposals until these are worth as many as are wanted."""
     steps = STEPS
     while True:
         rng = np.random.default_rng(seed)
@@ -267,32 +280,23 @@ def _chains(ready: _Prepared, target: SamplingTarget, seed: int, target_ess: flo
             weight = weight * np.exp(prior.logpdf(thetas[:, target.names.index(name)]))
         if not weight.sum() > 0:
             raise InputError("priors that leave no draw", "priors nearer to what the record shows")
-        place, acceptance = _taken(weight / weight.sum(), rng)
-        chain = thetas[place]
-        found = diagnose(chain)
-        if (found.settled and min(found.effective) >= target_ess) or 2 * steps > BUDGET:
+        weight = weight / weight.sum()
+        worth = 1 / np.sum(weight**2)
+        if worth >= target_ess or 2 * steps > BUDGET:
             break
         steps *= 2
+    chain = thetas[rng.choice(weight.size, (STEPS, WALKERS), p=weight)]
+    found = diagnose(chain)
+    found = found._replace(effective=np.minimum(found.effective, worth))
     held = held_by_priors(target, chain.reshape(-1, chain.shape[2]))
     held = tuple(dict.fromkeys((*target.priors_own, *held)))
     shown = tuple(name for name in held if name not in target.hidden)
-    verdict = judge(ChainEvidence(found, target, target_ess, steps, shown), RULES)
-    said = f"{min(found.effective):.0f} effective draws (R-hat {max(found.rhat):.3f})."
-    log = target.log_probability(chain.reshape(-1, chain.shape[2])).reshape(place.shape)
+    enough = min(target_ess, WORTH)  # as the fit needs
+    verdict = judge(ChainEvidence(found, target, enough, steps, shown), RULES)
+    said = f"{min(found.effective):.0f} effective draws."
+    log = target.log_probability(chain.reshape(-1, chain.shape[2])).reshape(chain.shape[:2])
     return Posterior(target, chain, log, verdict.status, f"{verdict.message} {said}", found,
-                     acceptance, 0, seed, held)  # fmt: skip
-
-
-def _taken(weight: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, float]:
-    """Places of the draws in each chain, (steps, walkers), and the share of those taken."""
-    proposed = rng.permutation(weight.size).reshape(-1, WALKERS)
-    least = rng.uniform(size=proposed.shape)
-    place = proposed.copy()
-    place[0] = rng.choice(weight.size, WALKERS, p=weight)
-    for k in range(1, len(place)):
-        taken = weight[proposed[k]] > least[k] * weight[place[k - 1]]
-        place[k] = np.where(taken, proposed[k], place[k - 1])
-    return place, float(np.mean(place[1:] == proposed[1:]))
+                     worth / weight.size, 0, seed, held)  # fmt: skip
 
 
 def expected_current(posterior: Posterior, fit) -> Expected:
