@@ -124,8 +124,8 @@ def network_of(
 class HeldBatch(NamedTuple):
     """A batch that is only predicted, from a start that fits it.
 
-    `rms` is by output, in its units; `rest` that of all in units of their errors, which are of
-    noise, model, and how batches differ; `inside` the share of readings within the 95 % band.
+    `rms` is by output, in its units; `rest` that of all in units of their errors, of noise, model,
+    and how batches differ; `inside` the share of readings within the 95 % band, by output.
     """
 
     name: str
@@ -159,13 +159,24 @@ def forecast(
 def held_back(
     run: Run, like: Batches, fit: Fit, noise: Mapping[str, ReadingNoise], spread: np.ndarray
 ) -> HeldBatch:
-    """Predict a batch of which only the numbers at the start are fitted."""
+    """Predict a batch of which only the numbers at the start are fitted.
+
+    Substrate that ends falls by decades at once, and an hour too early or late is no noise of the
+    smaller value: the larger of what is read and predicted has the error.
+    """
     seen = seen_of([run], like, tuple(noise))
-    error, model = errors_of(noise.values(), seen.measured), dict(fit.model) | begun(seen)
-    end = solve(problem_of(seen, model, error, BEGINS)).model
-    value, band = forecast(fit, seen.batches, {n: end[n] for n in BEGINS if n in end}, spread)
+
+    def judged(first):
+        value, band = forecast(fit, seen.batches, first, spread)
+        error = errors_of(noise.values(), np.maximum(value, seen.measured))
+        return value, np.hypot(error, np.nan_to_num(band))
+
+    first = begun(seen)
+    problem = problem_of(seen, dict(fit.model) | first, judged(first)[1], BEGINS)
+    end = solve(problem).model
+    value, error = judged({name: end[name] for name in first})
     rest, rms, inside = value - seen.measured, {}, {}
-    off = np.abs(rest) / np.hypot(errors_of(noise.values(), value), np.nan_to_num(band))
+    off = np.abs(rest) / error
     for k, name in enumerate(noise):
         read = seen.read[..., k]
         rms[name] = float(np.sqrt(np.mean(rest[..., k][read] ** 2)))
@@ -369,7 +380,7 @@ def identify_batches(
     product : sequence of str
         What the formation of product hangs on: mu_b, mu_s, and what the rates may hang on.
     held : sequence of Run
-        Batches that are only predicted, from states at the start that fit them.
+        Batches that are only predicted, from numbers at the start that fit them.
     hidden : int
         Nodes of the network.
     most : (float, float), optional
@@ -567,7 +578,8 @@ def settled(
     first = errors_of([ReadingNoise(FIRST, FIRST * each) for each in low], seen.measured)
     found, rests = rounds(
         search(model, first, np.full(len(names) - 1, DIFFER)),
-        lambda f: search(f.fit.model, f.error, f.spread), GAINED, ROUNDS - 1,
+        lambda f: search(f.fit.model, f.error, f.spread),
+        GAINED, ROUNDS - 1,
     )  # fmt: skip
     rests |= found.fit.status is Status.converged
     return found.fit, dict(zip(names, found.noise, strict=True)), found.spread, rests

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import beamfit
 from beamfit.dynamics import fedbatch
 from beamfit.dynamics import feed as feeding
 from beamfit.dynamics.balances import STATES, bounded, predicted, rates_at, stretches_of
@@ -203,3 +204,10 @@ def test_batches_that_cannot_be_used_are_refused(runs):
     dead = Run(run.time, run.inputs, run.outputs | {"biomass": np.linspace(2, 1, len(run))})
     with pytest.raises(InputError, match="never grows"):
         identify_batches(dead)
+
+
+def test_the_report_has_batches_rates_and_titre(fit, tmp_path):
+    beamfit.write_report(tmp_path / "batches.html", fit)
+    page = (tmp_path / "batches.html").read_text()
+    for words in ("predicted in three", "mu_s by air", "decay of titre", "batches differ in mu_b"):
+        assert words in page, words
