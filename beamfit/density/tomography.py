@@ -52,8 +52,8 @@ ROUNDS, SOUGHT, MOST = 6, (2, 4), 0.3
 # for each of these, and how much wider than by Laplace's method they are.
 LEAST, SHARED, PROPOSED, WIDER = 0.01, 8, 8, 1.5
 # Standard deviations of their priors within which amplitudes are sought; added to the diagonal of
-# correlations of the grid.
-REACH, JITTER = 6.0, 1e-9
+# correlations of the grid; share of the largest mode below which one is rounding.
+REACH, JITTER, ROUNDING = 6.0, 1e-9, 1e-12
 
 
 class Bins(NamedTuple):
@@ -228,11 +228,23 @@ class _Kernel(NamedTuple):
 
 
 def _kernel(bins: Bins, length: float, envelope: float) -> _Kernel:
-    weight, along, n = _envelope(envelope), _correlation(length), len(AXIS)
-    seen = (bins.look * weight).reshape(-1, n) @ along
-    seen = seen.reshape(-1, n, n).swapaxes(1, 2).reshape(-1, n) @ along
-    seen = weight * seen.reshape(-1, n, n).swapaxes(1, 2).reshape(-1, n * n)
-    return _Kernel(length, envelope, seen, seen @ bins.look.T)
+    modes, n = STEP / math.sqrt(2.0 * math.pi) * _modes(length, envelope), len(AXIS)
+    part = modes.T @ (bins.look.reshape(-1, n) @ modes).reshape(len(bins.look), n, -1)
+    seen = (modes @ part @ modes.T).reshape(-1, n * n)
+    part = part.reshape(len(part), -1)
+    return _Kernel(length, envelope, seen, part @ part.T)
+
+
+@cache
+def _modes(length: float, envelope: float) -> np.ndarray:
+    """Root of the covariance along an axis, shape (m, modes), without modes that are rounding.
+
+    The covariance of the grid is a product of the two axes', so that bins see it through these.
+    """
+    fall = np.exp(-0.5 * (AXIS / envelope) ** 2)
+    values, vectors = np.linalg.eigh(fall[:, None] * _correlation(length) * fall)
+    kept = values > ROUNDING * values[-1]
+    return vectors[:, kept] * np.sqrt(values[kept])
 
 
 def _kernels(bins: Bins, likely: Sequence[tuple[float, float]]) -> list[tuple[_Kernel, _Kernel]]:
@@ -313,8 +325,9 @@ class _Posterior(NamedTuple):
     def covariance(self, numbers: np.ndarray) -> np.ndarray:
         """Of the bins, at ln of the amplitudes."""
         total = self.known.copy()
+        diagonal = np.einsum("ii->i", total)
         for square, part in zip(np.exp(2.0 * numbers), self.parts, strict=True):
-            total += square * (part if part.ndim == 2 else np.diag(part))
+            (total if part.ndim == 2 else diagonal)[:] += square * part
         return total
 
     def bin_error(self, numbers: np.ndarray) -> np.ndarray:

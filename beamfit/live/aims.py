@@ -350,7 +350,10 @@ class TuningAim:
         if len(points) < ROWS * len(limits):
             return None
         try:
-            return fit_tuning(scan_of(points, machine), self.line, limits, within=machine.goal)
+            return fit_tuning(
+                scan_of(points, machine), self.line, limits,
+                within=machine.goal, room=machine.points,
+            )  # fmt: skip
         except InputError:
             return None
 
@@ -383,5 +386,5 @@ class TuningAim:
 
     def warm(self) -> None:
         """As `Aim.warm`."""
-        for points in rehearsed(self.machine, ROWS * len(self.machine.knobs)):
+        for points in rehearsed(self.machine, self.machine.points):  # of one length, as its fits
             self.next(points[:-1], self.fit(points), (), _middle(self.machine))

@@ -163,6 +163,6 @@ def course_of(fit: TuningFit, points: int = POINTS) -> list[tuple[int, Quantity]
         limits = dict(zip(fit.knobs.names, np.stack(fit.knobs[1:3], -1), strict=True))
         with suppress(InputError):
             part = replace(scan, **scan.columns_at(range(count)))
-            own = fit_tuning(part, line, limits, goal=fit.goal, noise=fit.noise)
+            own = fit_tuning(part, line, limits, goal=fit.goal, noise=fit.noise, room=len(scan))
             found.append((int(count), own.emittance))
     return [*found, (len(scan), fit.emittance)]

@@ -84,6 +84,7 @@ def fit_tuning(
     noise: Noise | None = None,
     draws: int = DRAWS,
     seed: int = 1,
+    room: int = 0,
 ) -> TuningFit:
     """Find the setting of a machine's knobs at which the emittance is lowest, with its error.
 
@@ -106,6 +107,8 @@ def fit_tuning(
         Priors of the noise of sizes; `beamfit.Noise()` if None.
     draws, seed : int
         Draws of the map, and the seed of their random numbers.
+    room : int
+        Rows that a table will have as it grows: one compiled program then serves all its lengths.
 
     Returns
     -------
@@ -146,10 +149,10 @@ def fit_tuning(
     if isinstance(scan, EmittanceTable):
         if line is not None:
             raise scan.unusable("a line beside finished emittances", "none: they need no optics")
-        readings = [emittance_readings(scan, plane, own, noise) for plane in planes]
+        readings = [emittance_readings(scan, plane, own, noise, room) for plane in planes]
     else:
         seen = seen_without(scan, line, own, noise)
-        readings = [plane_readings(seen, plane, own, scan.settings) for plane in planes]
+        readings = [plane_readings(seen, plane, own, scan.settings, room) for plane in planes]
         none = [log_no_beam(r.readings) + math.log(NO_BEAM) for r in readings]
     count, both = len(own.names), []
     for i, r in enumerate(readings):

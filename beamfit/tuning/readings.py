@@ -56,7 +56,7 @@ class PlaneReadings(NamedTuple):
 
 
 def plane_readings(
-    seen: Seen, plane: str, knobs: Knobs, settings: Mapping[str, np.ndarray]
+    seen: Seen, plane: str, knobs: Knobs, settings: Mapping[str, np.ndarray], room: int = 0
 ) -> PlaneReadings:
     """The sizes of a plane at the settings of the knobs, with the noise of scans.
 
@@ -76,13 +76,13 @@ def plane_readings(
     noise = _relative_noise(sizes.size, sizes.error, sizes.of_shots, seen.noise)
     rows = np.asarray(seen.measured(plane))
     x, w = knobs.half_ranges(settings)[rows], np.column_stack([c.w, np.zeros(len(rows))])
-    readings = _padded(x, w, c.known, np.log(c.size), noise, seen.noise)
+    readings = _padded(x, w, c.known, np.log(c.size), noise, seen.noise, room)
     emittance = float(abs(np.linalg.det(c.back)) * c.unit**2)
     return PlaneReadings(readings, _constant_beam(c), emittance, rows, c)
 
 
 def emittance_readings(
-    table: EmittanceTable, plane: str, knobs: Knobs, noise: Noise
+    table: EmittanceTable, plane: str, knobs: Knobs, noise: Noise, room: int = 0
 ) -> PlaneReadings:
     """The emittances of a plane, whose roots stand for sizes; stated errors are at least as large.
 
@@ -101,7 +101,7 @@ def emittance_readings(
     )
     log, w = 0.5 * np.log(value), np.tile([0.0, 0.0, 1.0], (len(rows), 1))
     x, own = knobs.half_ranges(table.settings)[rows], (0.5 * floor, 0.5 * unit, prior)
-    readings = _padded(x, w, np.zeros(len(rows)), log - log.mean(), own, noise)
+    readings = _padded(x, w, np.zeros(len(rows)), log - log.mean(), own, noise, room)
     return PlaneReadings(readings, np.zeros(3), math.exp(2.0 * log.mean()), rows)
 
 
@@ -112,12 +112,13 @@ def _padded(
     y: np.ndarray,
     own: tuple[np.ndarray, np.ndarray, np.ndarray],
     noise: Noise,
+    room: int,
 ) -> KnobReadings:
     """Readings with their own floor, unit and prior of the errors, of a length that others have."""
     n, bad = len(x), noise.of_points(len(x)).bad
 
     def filled(values: np.ndarray, fill: float = 0.0) -> np.ndarray:
-        more = [(0, padded_length(n) - n)] + [(0, 0)] * (values.ndim - 1)
+        more = [(0, padded_length(max(n, room)) - n)] + [(0, 0)] * (values.ndim - 1)
         return np.pad(values, more, constant_values=fill)
 
     return KnobReadings(

@@ -94,8 +94,15 @@ def test_a_window_that_cuts_leaves_the_tails_open():
 
 
 @needs_data
-@pytest.mark.parametrize("name", ["lcls_otr2/test_scan2", "lcls_gui/"
-                                  "Emittance-scan-OTRS_IN20_571-2021-02-11-193249"])  # fmt: skip
+@pytest.mark.parametrize(
+    "name",
+    [
+        "lcls_otr2/test_scan2",
+        pytest.param(
+            "lcls_gui/Emittance-scan-OTRS_IN20_571-2021-02-11-193249", marks=pytest.mark.calibrate
+        ),
+    ],
+)
 def test_halves_of_the_shots_agree(name):
     scan = read_emittance_gui(DATA / f"{name}.mat").scan()
     seen, halves = {}, ([], [])
