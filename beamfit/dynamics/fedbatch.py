@@ -45,7 +45,7 @@ from beamfit.greybox.fit import Fit
 from beamfit.greybox.mlp import MLP, Port, dense
 from beamfit.greybox.problem import Free, Prior, Problem, Record
 from beamfit.greybox.solve import solve
-from beamfit.noise.correlated import is_correlated
+from beamfit.noise.memory import is_correlated
 from beamfit.statistics import POOR_FIT
 from beamfit.status import Status
 from beamfit.table import Table, json_of

@@ -37,7 +37,7 @@ from beamfit.dynamics.search import (
 )
 from beamfit.errors import InputError, nearest
 from beamfit.greybox.fit import Fit
-from beamfit.noise.correlated import CorrelatedNoise
+from beamfit.noise.memory import CorrelatedNoise
 from beamfit.quantity import Quantity
 from beamfit.status import Status
 from beamfit.table import Table, json_of

@@ -25,7 +25,7 @@ from beamfit.dynamics.search import Settled, noises_of
 from beamfit.greybox import tree
 from beamfit.greybox.memory import Memory, Whitened
 from beamfit.greybox.problem import with_slope
-from beamfit.noise.correlated import CorrelatedNoise, innovations
+from beamfit.noise.memory import CorrelatedNoise, innovations
 
 # Laws, and half widths of each as shares of an input's range: prior flat in their logarithm. A stop
 # hands on other values as soon as its width passes a move, the others change smoothly with it.

@@ -32,7 +32,7 @@ from beamfit.dynamics.states import Matrices, contraction, linear_outputs
 from beamfit.errors import InputError, nearest
 from beamfit.greybox import tree
 from beamfit.greybox.problem import Free, Prior
-from beamfit.noise.correlated import CorrelatedNoise, remembers
+from beamfit.noise.memory import CorrelatedNoise, remembers
 from beamfit.quantity import Quantity
 
 # Most samples of past and future, and most rows, of the regression.

@@ -13,7 +13,7 @@ from beamfit.dynamics.response import Physics, simulate
 from beamfit.greybox import tree
 from beamfit.greybox.mlp import MLP, Port, dense
 from beamfit.greybox.problem import Prior, padded_length
-from beamfit.noise.correlated import CorrelatedNoise
+from beamfit.noise.memory import CorrelatedNoise
 
 # Residual, as a share of the output's scatter, below which a fit counts as exact.
 CLOSE = 2e-4

@@ -34,7 +34,7 @@ from beamfit.greybox.fit import Fit
 from beamfit.greybox.memory import TIMES, Memory, noises, range_of, whitened_by_each
 from beamfit.greybox.problem import Free, Prior, Problem, Record
 from beamfit.greybox.solve import solve
-from beamfit.noise.correlated import BESIDE, CorrelatedNoise, innovations, remembers
+from beamfit.noise.memory import BESIDE, CorrelatedNoise, innovations, remembers
 from beamfit.status import Status
 
 # Longest delay that is tried, in samples, and as a share of the run.

@@ -36,7 +36,7 @@ from beamfit.greybox.fit import Derived, Fit
 from beamfit.greybox.mlp import MLP
 from beamfit.greybox.problem import Free, Prior
 from beamfit.greybox.solve import solve
-from beamfit.noise.correlated import CorrelatedNoise
+from beamfit.noise.memory import CorrelatedNoise
 from beamfit.quantity import Quantity
 from beamfit.statistics import POOR_FIT
 from beamfit.status import Status

@@ -16,7 +16,7 @@ from scipy.special import gammaln, stdtr, stdtrit
 
 from beamfit.greybox.covariance import CUT
 from beamfit.greybox.problem import padded_length
-from beamfit.noise.correlated import (
+from beamfit.noise.memory import (
     BESIDE,
     CorrelatedNoise,
     Levels,

@@ -19,7 +19,7 @@ import numpy as np
 
 from beamfit.errors import InputError
 from beamfit.greybox import tree
-from beamfit.noise.correlated import log_volume, whitened
+from beamfit.noise.memory import log_volume, whitened
 
 # Default tolerance on limits and on the conditions of an optimum, in sizes.
 TOLERANCE = 1e-6
@@ -95,7 +95,7 @@ class Record:
     apart : callable, optional
         ``apart(model, data)``, shape (values - 1,), for errors with a memory: the time between
         neighbouring values over the correlation time of their errors. Residuals are then those of
-        independent errors (`beamfit.noise.correlated.whitened`). A sampler may vary the
+        independent errors (`beamfit.noise.memory.whitened`). A sampler may vary the
         correlation time; a search takes it as fixed. Such a record has no padding.
 
     Raises

@@ -21,7 +21,7 @@ from scipy.integrate import cumulative_simpson
 from beamfit.greybox.memory import Memory, Whitened, usual_noises, whitened_by_each
 from beamfit.lifetime.decay_law import LEAST, Moments, beam_current
 from beamfit.lifetime.record import DecayRecord, Monitor
-from beamfit.noise.correlated import CorrelatedNoise, Levels, remembers
+from beamfit.noise.memory import CorrelatedNoise, Levels, remembers
 from beamfit.quantity import HOUR, Quantity
 
 # Columns of the slopes: the current of the piece, loss at the mean current and its quadratic part,

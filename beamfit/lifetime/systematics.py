@@ -335,7 +335,7 @@ def constant_a_test(record: DecayRecord) -> ConstantA:
     constant a then leaves a remainder that the fit takes for a gas term: repeat the fit with
     the bunch's own law, `fit_decay(record, shape=...)`. The exponent is estimated beside I0, a and
     b in linear approximation about a constant a, and its error contains the noise's memory
-    (`beamfit.noise.correlated`): the score test.
+    (`beamfit.noise.memory`): the score test.
 
     Examples
     --------

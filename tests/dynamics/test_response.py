@@ -11,7 +11,7 @@ from beamfit.dynamics.fit import identify
 from beamfit.dynamics.record import Run
 from beamfit.dynamics.response import FIRST_ORDER, SECOND_ORDER, simulate
 from beamfit.errors import InputError
-from beamfit.noise.correlated import CorrelatedNoise, innovations
+from beamfit.noise.memory import CorrelatedNoise, innovations
 from beamfit.status import Status
 from tests.simulations import simulations, widened
 

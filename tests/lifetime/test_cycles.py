@@ -12,7 +12,7 @@ from beamfit.lifetime.fit import fit_cycles
 from beamfit.lifetime.pieces import thinned
 from beamfit.lifetime.record import Conditions, DecayRecord
 from beamfit.lifetime.study import study_record
-from beamfit.noise.correlated import CorrelatedNoise, Levels
+from beamfit.noise.memory import CorrelatedNoise, Levels
 from tests.simulations import simulations, widened
 
 LIFETIME = 10.01 * 3600

@@ -8,7 +8,7 @@ from scipy.stats import multivariate_normal
 from beamfit.greybox.memory import memory_of
 from beamfit.greybox.problem import Free, Problem, Record
 from beamfit.greybox.solve import solve
-from beamfit.noise.correlated import (
+from beamfit.noise.memory import (
     CorrelatedNoise,
     is_correlated,
     log_volume,
