@@ -398,7 +398,7 @@ class DensityFit:
 
     @property
     def message(self) -> str:
-        """What each plane says."""
+        """Messages of the planes."""
         return " ".join(p.message for p in self.planes)
 
     @property

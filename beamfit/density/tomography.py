@@ -323,7 +323,7 @@ class _Posterior(NamedTuple):
         return same * np.outer(high, high) * np.exp(-0.5 * apart**2)
 
     def covariance(self, numbers: np.ndarray) -> np.ndarray:
-        """Of the bins, at ln of the amplitudes."""
+        """Covariance of the bins, at ln of the amplitudes."""
         total = self.known.copy()
         diagonal = np.einsum("ii->i", total)
         for square, part in zip(np.exp(2.0 * numbers), self.parts, strict=True):
@@ -373,7 +373,7 @@ class _Posterior(NamedTuple):
         return np.linalg.solve(self.covariance(numbers), residual)
 
     def _answer(self, numbers: np.ndarray, pull: np.ndarray) -> np.ndarray:
-        """What pulls on the bins do to the density."""
+        """Answer of the density to pulls on the bins."""
         return sum(
             square * pull.T @ kernel.seen
             for square, kernel in zip(np.exp(2.0 * numbers), self.kernels, strict=False)

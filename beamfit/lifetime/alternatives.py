@@ -269,7 +269,7 @@ class SuddenLoss(NamedTuple):
 
 
 class Rival(NamedTuple):
-    """What explains a record better than a smooth law, and by how much.
+    """The explanation that is better than a smooth law, and by how much.
 
     `odds` is the logarithm of its probability over that of a power of a with a drift of b, and
     `scatter` what it leaves of the readings, mA rms.
@@ -505,7 +505,7 @@ def _change(law: Expansion) -> Change:
 
 
 def _sudden_loss(law: Expansion) -> SuddenLoss:
-    """What was lost at once, the larger of two, from the law with it."""
+    """The larger of two sudden losses, from the law with them."""
     (span, _), sizes, times = law.pieces.units, law.numbers[3::2], law.numbers[4::2]
     largest = int(np.argmax(np.abs(sizes)))
     # All times between two readings are one: the middle stands for them.

@@ -53,7 +53,7 @@ class Next(NamedTuple):
 
 
 class Aim(Protocol):
-    """What a scan is for."""
+    """The purpose of a live scan: what it fits, measures next and stops at."""
 
     def fit(self, points: Sequence[MeasuredPoint]) -> Any:
         """Fit the points; None as long as they are too few."""

@@ -62,7 +62,7 @@ def density_page(fit: DensityFit) -> ReportPage:
 
 
 def _seen(plane: PlaneDensity) -> Table:
-    """What each profile is beside the density."""
+    """Profiles beside the density."""
     d = plane.densities
     rows = []
     for k, (label, p) in enumerate(zip(plane.labels, plane.profiles, strict=True)):
@@ -75,7 +75,7 @@ def _seen(plane: PlaneDensity) -> Table:
 
 
 def _methods(fit: DensityFit) -> list[Table]:
-    """What the file says of the emittance, by size method."""
+    """Emittances that the file states, by size method."""
     rows = [
         [name, *(cell(said.get(p.plane)) for p in fit.planes)] for name, said in fit.stored.items()
     ]
