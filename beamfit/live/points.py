@@ -13,7 +13,8 @@ from typing import NamedTuple
 import numpy as np
 
 import beamfit
-from beamfit.emittance.advice import adviser_of, best_steps
+from beamfit.emittance.advice import adviser_of
+from beamfit.emittance.design import best_steps
 from beamfit.emittance.fit import EmittanceFit, fit_emittance
 from beamfit.emittance.scan import KNOB, QuadScan
 from beamfit.errors import InputError, plain
@@ -207,7 +208,7 @@ def next_setting(
     -------
     Next or str
         First settings over the range of the first magnet; then those that tell most, by
-        `beamfit.emittance.advice`: of magnets that fewer than three points moved where there are
+        `beamfit.emittance.design`: of magnets that fewer than three points moved where there are
         some, since a wrong line shows there alone. The middle of the largest gap where nothing can
         be fitted.
     """
