@@ -43,7 +43,7 @@ _HOME = {
     "check": "beamfit.io.check:understand",
     "constant_a_test": "beamfit.lifetime.systematics",
     "control": "beamfit.commands",
-    "design": "beamfit.emittance.advice:plan_measurements",
+    "design": "beamfit.emittance.design:plan_measurements",
     "find_setpoint": "beamfit.emittance.setpoint",
     "fit_decay": "beamfit.lifetime.fit",
     "fit_decays": "beamfit.lifetime.fit",

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import beamfit
-from beamfit.emittance.advice import plan_measurements
+from beamfit.emittance.design import plan_measurements
 from beamfit.emittance.wishes import Beam, Target
 from beamfit.quantity import Quantity
 from beamfit.shown import brief

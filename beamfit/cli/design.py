@@ -16,7 +16,7 @@ from beamfit.table import text_of
 
 if TYPE_CHECKING:
     from beamfit.cli.show import Terminal
-    from beamfit.emittance.advice import Advice
+    from beamfit.emittance.design import Advice
 
 # What `read_inputs` takes besides the scan.
 GIVEN = ["lattice", "use", "first", "last", "screen", "energy", "columns", "ignore", "skip_bad"]

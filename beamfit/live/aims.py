@@ -10,7 +10,8 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from beamfit.emittance.advice import adviser_of, best_steps
+from beamfit.emittance.advice import adviser_of
+from beamfit.emittance.design import best_steps
 from beamfit.emittance.fit import EmittanceFit, fit_emittance
 from beamfit.errors import InputError
 from beamfit.greybox.problem import padded_length
@@ -132,7 +133,7 @@ class EmittanceAim:
         """As `Aim.next`: the goal, with every magnet moved, and nothing that shows the line wrong.
 
         First settings over the range of the first magnet; then those that tell most, by
-        `beamfit.emittance.advice`: of magnets that fewer than three points moved where there are
+        `beamfit.emittance.design`: of magnets that fewer than three points moved where there are
         some, since a wrong line shows there alone. The middle of the largest gap where nothing can
         be fitted.
         """

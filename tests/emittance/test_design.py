@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 import beamfit
-from beamfit.emittance.advice import candidate_settings, plan_measurements
+from beamfit.emittance.advice import candidate_settings
+from beamfit.emittance.design import plan_measurements
 from beamfit.errors import InputError
 from beamfit.quantity import Status
 from tests.emittance.conftest import TABLE_2, design

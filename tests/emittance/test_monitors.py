@@ -7,7 +7,7 @@ import pytest
 
 import beamfit
 from beamfit.cli import main
-from beamfit.emittance.advice import plan_measurements
+from beamfit.emittance.design import plan_measurements
 from beamfit.errors import InputError
 from beamfit.optics.beam import BeamMatrix
 from beamfit.optics.beamline import Beamline

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import beamfit
-from beamfit.emittance.advice import plan_measurements
+from beamfit.emittance.design import plan_measurements
 from beamfit.errors import InputError
 from beamfit.optics.elements import Drift
 from tests.simulations import simulations, widened

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import beamfit
-from beamfit.emittance.advice import plan_measurements
+from beamfit.emittance.design import plan_measurements
 from beamfit.emittance.sensitivity import systematics
 from beamfit.emittance.wishes import Target
 from beamfit.errors import InputError
