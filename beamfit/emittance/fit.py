@@ -446,6 +446,7 @@ def fit_many(
 
     Examples
     --------
+    >>> import numpy as np
     >>> from beamfit.optics.elements import Drift, Quadrupole, Screen
     >>> line = Beamline((Quadrupole("Q", 0.1), Drift("D", 2.0), Screen("S")), 135.0)
     >>> k1, sizes = [-1.0, 1.5, 4.0, 6.5, 9.0], np.array([3.4e-4, 1.9e-4, 0.9e-4, 1.9e-4, 3.4e-4])
