@@ -36,7 +36,7 @@ _HOME = {
     "Run": "beamfit.dynamics.record",
     "Screen": "beamfit.optics.elements",
     "SectorDipole": "beamfit.optics.elements",
-    "Status": "beamfit.status",
+    "Status": "beamfit.verdict",
     "Target": "beamfit.emittance.wishes",
     "ThinLens": "beamfit.optics.elements",
     "TuningFit": "beamfit.tuning.fit",

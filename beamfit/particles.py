@@ -1,4 +1,6 @@
-"""Particles a lattice may carry: plain numbers, for files and optics alike."""
+"""Particles a lattice may carry: rest energies, momentum and rigidity, for files and optics."""
+
+from __future__ import annotations
 
 from typing import Any
 
@@ -7,6 +9,11 @@ REST_ENERGY |= {"antiproton": REST_ENERGY["proton"], "H-": 939.294073, "deuteron
 """MeV, CODATA 2022 (NIST), all of one charge; H- is a proton and two electrons, less 14.35 eV."""
 ENERGY_KEYS = {"energy_MeV": "total", "kinetic_energy_MeV": "kinetic", "momentum_MeV": "momentum"}
 """Energy of a beam as files give it; a momentum is p c."""
+# MeV
+ELECTRON_MASS = REST_ENERGY["electron"]
+PROTON_MASS = REST_ENERGY["proton"]
+# Speed of light in the unit MeV/(T m) that turns p c into B rho: exact by definition.
+_LIGHT = 299.792458
 # MeV, above the energy of every machine: a larger number is in another unit.
 _HIGHEST = 1e7
 
@@ -53,3 +60,49 @@ def total_energy(number: Any, kind: str, rest: float) -> Any:
     if kind == "momentum":
         return (number**2 + rest**2) ** 0.5
     return number + rest if kind == "kinetic" else number
+
+
+def beta_gamma(energy: Any, mass: float = ELECTRON_MASS) -> Any:
+    """Momentum over rest mass, p/(m c) = βγ, which turns geometric emittance into normalised.
+
+    Parameters
+    ----------
+    energy : float or array
+        Total energy in MeV.
+    mass : float
+        Rest energy in MeV.
+
+    Returns
+    -------
+    float or array
+        βγ, of the shape of ``energy``.
+
+    Examples
+    --------
+    >>> round(beta_gamma(135.0), 4)
+    264.1865
+    """
+    return ((energy - mass) * (energy + mass)) ** 0.5 / mass
+
+
+def rigidity(energy: Any, mass: float = ELECTRON_MASS) -> Any:
+    """Magnetic rigidity Bρ = p/e in T m, for a particle of unit charge.
+
+    Parameters
+    ----------
+    energy : float or array
+        Total energy in MeV.
+    mass : float
+        Rest energy in MeV.
+
+    Returns
+    -------
+    float or array
+        Bρ in T m.
+
+    Examples
+    --------
+    >>> round(rigidity(135.0), 6)
+    0.450308
+    """
+    return beta_gamma(energy, mass) * mass / _LIGHT

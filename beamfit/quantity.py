@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 
 from beamfit.errors import InputError
-from beamfit.status import Status
+from beamfit.verdict import Status
 
 __all__ = ["Quantity", "Status", "display_unit", "percent", "relative_change"]
 

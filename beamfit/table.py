@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 from beamfit.errors import plain
 from beamfit.quantity import Quantity
-from beamfit.status import Status
+from beamfit.verdict import Status
 
 # Rows shown of a long table; JSON has all.
 MOST_ROWS = 40

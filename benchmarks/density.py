@@ -26,7 +26,7 @@ from beamfit.density.profiles import profile_size
 from beamfit.emittance.scan import Profile, QuadScan
 from beamfit.errors import InputError
 from beamfit.io.emittance_gui import read_emittance_gui
-from beamfit.optics.particle import ELECTRON_MASS, beta_gamma
+from beamfit.particles import ELECTRON_MASS, beta_gamma
 
 BEAMS = ("gaussian", "core and halo", "banana", "hollow")
 REFUSED = ("noise alone", "less than 60 degrees", "one profile of another beam")

@@ -20,8 +20,8 @@ from beamfit.io.files import digest
 from beamfit.io.line import build_line, read_inputs
 from beamfit.io.machine import ScanMachine, read_scan_machine
 from beamfit.io.result import results_text
-from beamfit.status import Status
 from beamfit.table import cell
+from beamfit.verdict import Status
 
 if TYPE_CHECKING:
     from beamfit.emittance.fit import EmittanceFit

@@ -23,12 +23,11 @@ from beamfit.emittance.sigma import fit_sizes
 from beamfit.errors import InputError, expect
 from beamfit.noise.model import Noise
 from beamfit.optics.beamline import Beamline
-from beamfit.optics.particle import beta_gamma
+from beamfit.particles import beta_gamma
 from beamfit.quantity import Quantity, percent
 from beamfit.statistics import of_use, quantity_of_draws
-from beamfit.status import Status
 from beamfit.table import Table, cell, json_of
-from beamfit.verdict import Finding, Judged, judge
+from beamfit.verdict import Finding, Judged, Status, judge
 
 # Shares of the charge whose emittance is given, and draws of the density.
 SHARES, DRAWS = (0.5, 0.68, 0.9, 0.95, 1.0), 256

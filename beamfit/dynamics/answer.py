@@ -21,9 +21,8 @@ from beamfit.greybox.judge import gauges, together
 from beamfit.greybox.memory import Memory
 from beamfit.quantity import Quantity
 from beamfit.statistics import POOR_FIT
-from beamfit.status import Status
 from beamfit.table import Table, cell, json_of
-from beamfit.verdict import Finding
+from beamfit.verdict import Finding, Status
 
 # Points of a curve; samples within a share of its range that make a point visited.
 POINTS, VISITS, NEAR = 41, 5, 0.05

@@ -23,9 +23,8 @@ from beamfit.dynamics.model import parameters_at, predicted
 from beamfit.dynamics.response import ARX, PHYSICS, Physics, run_from
 from beamfit.errors import InputError, nearest
 from beamfit.greybox.quadratic import Quadratic, minimum
-from beamfit.status import Status
 from beamfit.table import Table, json_of
-from beamfit.verdict import Finding, judge
+from beamfit.verdict import Finding, Status, judge
 
 # Penalty on an output beyond its limit, per unit of its scatter: larger than any multiplier of a
 # limit that can be kept, so that such a limit is kept exactly.

@@ -47,9 +47,8 @@ from beamfit.greybox.problem import Free, Prior, Problem, Record
 from beamfit.greybox.solve import solve
 from beamfit.noise.memory import is_correlated
 from beamfit.statistics import POOR_FIT
-from beamfit.status import Status
 from beamfit.table import Table, json_of
-from beamfit.verdict import Finding, judge
+from beamfit.verdict import Finding, Status, judge
 
 # Values, in units of the largest, below which a noise that is a share of them stays the same.
 FLOORS = np.geomspace(1e-4, 1.0, 13)

@@ -17,8 +17,8 @@ from beamfit.greybox.fit import Fit
 from beamfit.greybox.problem import Constraint, Free, Objective, Problem
 from beamfit.greybox.solve import solve
 from beamfit.quantity import Quantity
-from beamfit.status import Status
 from beamfit.table import Table
+from beamfit.verdict import Status
 
 OUTPUTS = (*STATES, TITRE)
 # Rows of a plan, and rounds in which its safety margins follow the errors of the plan.

@@ -39,8 +39,8 @@ from beamfit.errors import InputError, nearest
 from beamfit.greybox.fit import Fit
 from beamfit.noise.memory import CorrelatedNoise
 from beamfit.quantity import Quantity
-from beamfit.status import Status
 from beamfit.table import Table, json_of
+from beamfit.verdict import Status
 
 MAPS = ("constant", "network")
 LATEST = "The delay is the longest that was tried: say a longer one by --delay."

@@ -35,7 +35,7 @@ from beamfit.greybox.memory import TIMES, Memory, noises, range_of, whitened_by_
 from beamfit.greybox.problem import Free, Prior, Problem, Record
 from beamfit.greybox.solve import solve
 from beamfit.noise.memory import BESIDE, CorrelatedNoise, innovations, remembers
-from beamfit.status import Status
+from beamfit.verdict import Status
 
 # Longest delay that is tried, in samples, and as a share of the run.
 LATEST, SHARE = 24, 0.1

@@ -39,8 +39,8 @@ from beamfit.greybox.solve import solve
 from beamfit.noise.memory import CorrelatedNoise
 from beamfit.quantity import Quantity
 from beamfit.statistics import POOR_FIT
-from beamfit.status import Status
 from beamfit.table import Table, json_of
+from beamfit.verdict import Status
 
 # Steps of a round, after which the noise is estimated again; most rounds; gain in -2 ln L per
 # reading below which they end.

@@ -37,8 +37,7 @@ from beamfit.emittance.verdict import (
 from beamfit.optics.beamline import Beamline
 from beamfit.quantity import Quantity
 from beamfit.statistics import Directions, chi2_probability, scaled_directions
-from beamfit.status import Status
-from beamfit.verdict import Finding
+from beamfit.verdict import Finding, Status
 
 SIGMA = slice(4, 7)
 # Normalised emittances in m beyond which only a wrong unit leads: rings and linacs have 1e-9 and

@@ -18,7 +18,7 @@ from beamfit.greybox.problem import Free, Prior, Problem
 from beamfit.greybox.tree import leaves
 from beamfit.optics.beamline import Beamline
 from beamfit.optics.calibration import CurrentPolynomial, SlopeIntercept
-from beamfit.status import Status
+from beamfit.verdict import Status
 
 # The report's bounds are 167.23 ± 20 for the slope and 43.17 ± 20 for the intercept (appendix C).
 WIDTH = 20.0 / 167.23

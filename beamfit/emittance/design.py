@@ -27,8 +27,8 @@ from beamfit.errors import InputError
 from beamfit.greybox.design import Information, greedy
 from beamfit.optics.beamline import Beamline
 from beamfit.optics.elements import Drift, Screen
-from beamfit.status import Status
 from beamfit.table import Table, json_of
+from beamfit.verdict import Status
 
 # Other energies to consider where none is named: what a linac can usually do.
 USUAL_ENERGIES = (0.8, 1.25)

@@ -32,7 +32,7 @@ from beamfit.greybox.mlp import MLP, Port
 from beamfit.greybox.problem import Free, Problem, Record
 from beamfit.greybox.signed_network import signed_network
 from beamfit.quantity import Quantity
-from beamfit.status import Status
+from beamfit.verdict import Status
 
 
 @tree.node("unit")

@@ -27,7 +27,7 @@ import beamfit.optics  # noqa: F401 - switches JAX to double precision
 from beamfit.greybox import tree
 from beamfit.optics.beamline import Beamline
 from beamfit.optics.calibration import scaled
-from beamfit.optics.particle import beta_gamma
+from beamfit.particles import beta_gamma
 
 UNIT = 1e-4  # m and rad of a beam's numbers
 # What people quote of a plane, in this order everywhere, with units.

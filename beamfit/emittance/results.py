@@ -13,8 +13,8 @@ from beamfit.answer import answer
 from beamfit.optics.beam import BeamMatrix
 from beamfit.quantity import Quantity, display_unit
 from beamfit.shown import shown
-from beamfit.status import Status
 from beamfit.table import Row, Table, cell, json_of, labelled
+from beamfit.verdict import Status
 
 if TYPE_CHECKING:
     from beamfit.greybox.fit import FittedVariable

@@ -43,8 +43,7 @@ from beamfit.greybox.problem import Problem
 from beamfit.greybox.solve import solve
 from beamfit.optics.beamline import Beamline
 from beamfit.statistics import Directions, scaled_directions
-from beamfit.status import Status
-from beamfit.verdict import Finding
+from beamfit.verdict import Finding, Status
 
 # Ends of a search that are no answer.
 NO_ANSWER = (Status.not_finite, Status.infeasible, Status.not_converged)

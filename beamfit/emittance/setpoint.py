@@ -44,9 +44,8 @@ from beamfit.greybox.problem import (
 from beamfit.greybox.solve import search, solve
 from beamfit.optics.beamline import Beamline
 from beamfit.quantity import Quantity
-from beamfit.status import Status
 from beamfit.table import Table, cell, json_of
-from beamfit.verdict import Finding
+from beamfit.verdict import Finding, Status
 
 # Starts of the search: enough for the minima that a few magnets have; no number fills the box of
 # many magnets, whose wishes can usually be met in many ways.

@@ -14,11 +14,11 @@ from beamfit.emittance.model import emittance_parts
 from beamfit.emittance.scan import QuadScan
 from beamfit.emittance.sigma import fit_sizes
 from beamfit.optics.beamline import Beamline
-from beamfit.optics.particle import ELECTRON_MASS, beta_gamma
+from beamfit.particles import ELECTRON_MASS, beta_gamma
 from beamfit.quantity import Quantity
 from beamfit.statistics import reach_of
-from beamfit.status import Status
 from beamfit.table import Table, cell
+from beamfit.verdict import Status
 
 
 class MethodRow(NamedTuple):

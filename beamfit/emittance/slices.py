@@ -11,8 +11,8 @@ from beamfit.emittance.fit import EmittanceFit, fit_emittance
 from beamfit.emittance.results import PlaneFit
 from beamfit.emittance.scan import PROJECTED, QuadScan
 from beamfit.optics.beamline import Beamline
-from beamfit.status import Status
 from beamfit.table import Table, cell, text_of
+from beamfit.verdict import Status
 
 HEADER = ("slice", "energy", "status", "normalised emittance", "beta at the start")
 HEADER += ("alpha at the start", "chi2/dof")

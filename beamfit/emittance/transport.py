@@ -24,7 +24,7 @@ from beamfit.greybox.problem import padded_length
 from beamfit.optics.beamline import Beamline, Same, seen_line, transfer_rows
 from beamfit.optics.calibration import SETTING_UNITS, CurrentTable, plain_meaning
 from beamfit.optics.elements import Element, Marker, Quadrupole, Screen, ThinLens
-from beamfit.optics.particle import ELECTRON_MASS, beta_gamma, rigidity
+from beamfit.particles import ELECTRON_MASS, beta_gamma, rigidity
 
 # Gradients in T/m beyond which a magnet is a plasma lens at least, and beyond any lens.
 STRONG, IMPOSSIBLE = 500.0, 1e4

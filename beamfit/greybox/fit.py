@@ -19,8 +19,7 @@ from beamfit.greybox.assess import KKT
 from beamfit.greybox.covariance import MOST_SHARE, FactoredSpread, Group, Spread
 from beamfit.greybox.problem import Problem, with_slope
 from beamfit.greybox.sparse import Rows
-from beamfit.status import Status
-from beamfit.verdict import Finding
+from beamfit.verdict import Finding, Status
 
 if TYPE_CHECKING:
     from beamfit.greybox.posterior import Optimum

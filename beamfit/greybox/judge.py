@@ -37,8 +37,7 @@ from beamfit.greybox.fit import Attempt, Fit, FittedConstraint, FittedVariable
 from beamfit.greybox.problem import Problem, compiled_at, sloped
 from beamfit.greybox.sparse import Rows
 from beamfit.statistics import POOR_FIT, chi2_probability
-from beamfit.status import Status
-from beamfit.verdict import Finding
+from beamfit.verdict import Finding, Status
 
 # A search is settled if a further step lowers chi-square by less: a tenth of a standard error.
 SETTLED = 0.01

@@ -18,7 +18,7 @@ from beamfit.greybox.fit import Attempt, Fit
 from beamfit.greybox.judge import Search, conclude, outgrown, refused, settled
 from beamfit.greybox.problem import Problem
 from beamfit.greybox.programs import SOLVERS, SearchLimit, scaled
-from beamfit.status import Status
+from beamfit.verdict import Status
 
 METHOD, SQUARES = "Levenberg-Marquardt", "levenberg-marquardt"
 # Steps from each of many starts, and number of cheapest ends that are polished.

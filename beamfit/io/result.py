@@ -214,7 +214,7 @@ KEPT = "a file that beamfit.save_fit wrote"
 SCAN, DECAY, OPTICS = "beamfit.emittance", "beamfit.lifetime", "beamfit.optics"
 HELD = {
     "beamfit.quantity": "Quantity",
-    "beamfit.status": "Status",
+    "beamfit.verdict": "Status",
     "beamfit.noise.model": "Noise Lognormal",
     f"{SCAN}.scan": "QuadScan Profile",
     f"{SCAN}.results": "PlaneFit Points Parameter ScreenTwiss Identifiability",

@@ -23,8 +23,8 @@ from beamfit.language.problem import Formulation, at_start, formulate, starts_of
 from beamfit.language.trace import cause_of
 from beamfit.quantity import Quantity
 from beamfit.statistics import reach_of
-from beamfit.status import Status
 from beamfit.table import MOST_ROWS, Table, cell
+from beamfit.verdict import Status
 
 # Most draws of a random start until it is finite.
 MOST_DRAWS = 100

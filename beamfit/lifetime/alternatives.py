@@ -36,8 +36,8 @@ from beamfit.noise.memory import Products
 from beamfit.quantity import HOUR, Quantity
 from beamfit.shown import shown
 from beamfit.statistics import POOR_FIT
-from beamfit.status import Status
 from beamfit.table import json_of
+from beamfit.verdict import Status
 
 # A departure of so many errors is found with 90 % at a false alarm rate of `POOR_FIT`.
 FOUND = float(ndtri(1 - POOR_FIT / 2) + ndtri(0.9))

@@ -16,8 +16,7 @@ from beamfit.lifetime.pieces import noise_of
 from beamfit.lifetime.record import Monitor
 from beamfit.quantity import HOUR
 from beamfit.statistics import MANY, POOR_FIT, chi2_probability, few_words, of_use
-from beamfit.status import Status
-from beamfit.verdict import Finding, judge
+from beamfit.verdict import Finding, Status, judge
 
 # Lifetimes, s, that stored beams seldom have, but times in a wrong unit often give.
 SHORTEST, LONGEST = 20.0, 3000 * HOUR

@@ -25,8 +25,8 @@ from beamfit.lifetime.record import DecayRecord
 from beamfit.noise.memory import CLOSE, Products
 from beamfit.quantity import HOUR, Quantity
 from beamfit.shown import shown
-from beamfit.status import Status
 from beamfit.table import json_of
+from beamfit.verdict import Status
 
 ENDS = ("start", "end", "mean")
 # The share of a in the loss lies between 0 and 1: known to 0.2, the record tells pure Touschek

@@ -20,9 +20,9 @@ from beamfit.live.points import MeasuredPoint, clipped, limits_within, scan_of
 from beamfit.optics.beamline import Beamline
 from beamfit.optics.elements import Drift
 from beamfit.statistics import POOR_FIT, chi2_probability
-from beamfit.status import Status
 from beamfit.tuning.fit import TuningFit, fit_tuning
 from beamfit.tuning.minimum import next_row, settings_within
+from beamfit.verdict import Status
 
 # Where a scan begins, in parts of the range of its first magnet.
 BEGIN = (0.1, 0.37, 0.63, 0.9)

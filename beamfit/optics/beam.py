@@ -13,7 +13,7 @@ from jax.typing import ArrayLike
 
 from beamfit.errors import InputError
 from beamfit.optics.arrays import value
-from beamfit.optics.particle import ELECTRON_MASS, beta_gamma
+from beamfit.particles import ELECTRON_MASS, beta_gamma
 from beamfit.shown import shown
 
 

@@ -19,8 +19,8 @@ from beamfit.errors import InputError, nearest
 from beamfit.optics.arrays import value
 from beamfit.optics.calibration import FocusingStrength, IntegratedStrength
 from beamfit.optics.elements import IDENTITY, Element, Screen, SectorDipole, TransferMatrix
-from beamfit.optics.particle import ELECTRON_MASS
 from beamfit.optics.sections import ElementSeries, LineSection, in_series
+from beamfit.particles import ELECTRON_MASS
 from beamfit.shown import brief, shown
 from beamfit.table import MOST_ROWS, Table
 

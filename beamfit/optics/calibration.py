@@ -13,7 +13,7 @@ from jax import Array
 from jax.typing import ArrayLike
 
 from beamfit.optics.arrays import array_module, value
-from beamfit.optics.particle import ELECTRON_MASS, rigidity
+from beamfit.particles import ELECTRON_MASS, rigidity
 
 SETTING_UNITS = {"A": "A", "kG": "kG", "T_per_m": "T/m", "k1": "1/m²", "k1l": "1/m"}
 """Units of settings as people write them."""

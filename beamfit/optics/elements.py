@@ -16,7 +16,7 @@ from jax.typing import ArrayLike
 from beamfit.optics.arrays import array_module, floats, value
 from beamfit.optics.calibration import Calibration, FocusingStrength, IntegratedStrength
 from beamfit.optics.focusing import focusing
-from beamfit.optics.particle import ELECTRON_MASS, beta_gamma
+from beamfit.particles import ELECTRON_MASS, beta_gamma
 
 _BY_K1, _BY_K1L = FocusingStrength(), IntegratedStrength()
 

@@ -30,8 +30,8 @@ from beamfit.report.document import (
 )
 from beamfit.report.page import write_page, write_report
 from beamfit.statistics import BEYOND
-from beamfit.status import Status
 from beamfit.table import MOST_ROWS, Table, plain_name
+from beamfit.verdict import Status
 
 NOTHING = Verdict(
     Status.unidentified,

@@ -35,8 +35,8 @@ from beamfit.report.document import (
 )
 from beamfit.report.network import network_pictures
 from beamfit.report.trend import trend_picture
-from beamfit.status import Status
 from beamfit.table import Table, labelled
+from beamfit.verdict import Status
 
 COLOURS = (BLUE, "#c98a00", "#2c7a3f", "#7b4fa3", RED, "#4f9aa3", "0.5")
 

@@ -22,8 +22,8 @@ from matplotlib.figure import Figure, FigureBase
 
 import beamfit
 from beamfit.errors import plain
-from beamfit.status import Status
 from beamfit.table import Table
+from beamfit.verdict import Status
 
 STYLE = {
     "font.size": 10,

@@ -21,8 +21,8 @@ from beamfit.report.emittance import (
     point_rows,
 )
 from beamfit.report.scan_pictures import COLOUR, scan_picture, source_of, words_of
-from beamfit.status import Status
 from beamfit.table import Table, labelled
+from beamfit.verdict import Status
 
 FIXED = (
     "Each slice is fitted by its own rows and has a beam matrix of its own; magnets stay as they "

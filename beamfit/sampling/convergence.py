@@ -8,9 +8,8 @@ import numpy as np
 
 from beamfit.sampling.likelihood import FRACTION, noise_words
 from beamfit.sampling.target import SamplingTarget
-from beamfit.status import Status
 from beamfit.table import plain_name
-from beamfit.verdict import Finding
+from beamfit.verdict import Finding, Status
 
 # R-hat below which chains agree: Vehtari et al., Bayesian Analysis 16, 667 (2021).
 AGREED = 1.01

@@ -18,8 +18,7 @@ from beamfit.sampling.moves import IndependenceProposal, about, fitted, moves_of
 from beamfit.sampling.posterior import Posterior
 from beamfit.sampling.store import FROM_PYTHON, Checkpoint, Provenance
 from beamfit.sampling.target import SamplingTarget
-from beamfit.status import Status
-from beamfit.verdict import judge
+from beamfit.verdict import Status, judge
 from beamfit.writing import alone
 
 # Steps between two looks at the chain; every decision falls at a multiple, so that a run that was

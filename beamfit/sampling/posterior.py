@@ -18,8 +18,8 @@ from beamfit.sampling.likelihood import LOG_NOISE
 from beamfit.sampling.priors import in_words
 from beamfit.sampling.target import SamplingTarget
 from beamfit.shown import brief, shown
-from beamfit.status import Status
 from beamfit.table import MOST_ROWS, Table, html_of, json_of, plain_name, text_of
+from beamfit.verdict import Status
 
 if TYPE_CHECKING:
     from arviz import InferenceData

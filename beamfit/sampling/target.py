@@ -18,8 +18,7 @@ from beamfit.compile_cache import prepare_jax
 from beamfit.sampling.likelihood import LOG_NOISE, NoiseGroup, log_likelihood
 from beamfit.sampling.moves import Widening
 from beamfit.sampling.priors import Distribution, in_words
-from beamfit.status import Status
-from beamfit.verdict import Finding
+from beamfit.verdict import Finding, Status
 
 # Not in the package: priors and the place of a store are looked at before JAX is loaded.
 prepare_jax()

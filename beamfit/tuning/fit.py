@@ -23,10 +23,9 @@ from beamfit.errors import InputError, expect
 from beamfit.noise.model import Noise
 from beamfit.optics.beamline import Beamline
 from beamfit.optics.calibration import SETTING_UNITS
-from beamfit.optics.particle import beta_gamma
+from beamfit.particles import beta_gamma
 from beamfit.quantity import Quantity, percent
 from beamfit.statistics import CENTRAL, WIDE, quantity_of_draws
-from beamfit.status import Status
 from beamfit.table import Table, cell, json_of
 from beamfit.tuning.knob_map import map_posterior, mixed, numbers_at
 from beamfit.tuning.knobs import GOALS, EmittanceTable, Knobs, knobs_of, planes_of
@@ -46,7 +45,7 @@ from beamfit.tuning.readings import (
     plane_readings,
     seen_without,
 )
-from beamfit.verdict import Finding, Judged, judge
+from beamfit.verdict import Finding, Judged, Status, judge
 
 # Draws of the map: the ends of a 95 % interval are known to a tenth of its half-width.
 DRAWS = 256

@@ -22,7 +22,7 @@ from beamfit.dynamics.fit import identify
 from beamfit.dynamics.record import Run
 from beamfit.dynamics.response import ARX, FIRST_ORDER, SECOND_ORDER, simulate
 from beamfit.errors import InputError
-from beamfit.status import Status
+from beamfit.verdict import Status
 from tests.simulations import simulations
 
 INF = np.inf

@@ -24,8 +24,7 @@ from beamfit.dynamics.fedbatch import (
 from beamfit.dynamics.feed import best_feed, predict
 from beamfit.dynamics.record import Run
 from beamfit.errors import InputError
-from beamfit.status import Status
-from beamfit.verdict import judge
+from beamfit.verdict import Status, judge
 
 FED = {"feed_substrate": 200.0}
 

@@ -12,7 +12,7 @@ from beamfit.dynamics.record import Run
 from beamfit.dynamics.response import FIRST_ORDER, SECOND_ORDER, simulate
 from beamfit.errors import InputError
 from beamfit.noise.memory import CorrelatedNoise, innovations
-from beamfit.status import Status
+from beamfit.verdict import Status
 from tests.simulations import simulations, widened
 
 

@@ -14,7 +14,7 @@ from beamfit.dynamics.search import Case
 from beamfit.dynamics.state_fit import fit_states
 from beamfit.dynamics.states import StateSpace
 from beamfit.errors import InputError
-from beamfit.status import Status
+from beamfit.verdict import Status
 
 
 def steps(n, rng, every):

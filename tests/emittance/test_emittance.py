@@ -11,7 +11,7 @@ from beamfit.errors import InputError
 from beamfit.optics.beam import BeamMatrix
 from beamfit.optics.beamline import Beamline
 from beamfit.optics.elements import Drift, Quadrupole, Screen, SectorDipole, ThinLens
-from beamfit.optics.particle import beta_gamma
+from beamfit.particles import beta_gamma
 from beamfit.quantity import Status
 from tests.emittance.conftest import TABLE_2, design, scan_of
 from tests.noise.reference import log_stated

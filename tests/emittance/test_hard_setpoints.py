@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from beamfit.emittance.setpoint import Beam, Target, find_setpoint
-from beamfit.optics.particle import rigidity
+from beamfit.particles import rigidity
 
 WIDE = {"QA": (-40.0, 40.0), "QB": (-15.0, 15.0), "QC": (-12.0, 12.0)}
 MIDDLE = {"QA": (-10.0, 10.0), "QB": (-5.0, 5.0), "QC": (-6.0, 6.0)}

@@ -9,7 +9,7 @@ import pytest
 
 import beamfit
 from beamfit.optics.beam import BeamMatrix
-from beamfit.optics.particle import beta_gamma
+from beamfit.particles import beta_gamma
 from beamfit.quantity import Status
 from tests.emittance.conftest import TABLE_2, design, scan_of
 from tests.simulations import simulations

@@ -19,7 +19,7 @@ from beamfit.greybox.bounds import over_cells
 from beamfit.greybox.solve import solve
 from beamfit.optics.calibration import IntegratedGradient, SlopeIntercept
 from beamfit.optics.elements import Quadrupole, Screen
-from beamfit.optics.particle import beta_gamma
+from beamfit.particles import beta_gamma
 from tests.emittance.conftest import TABLE_2
 
 TRUE_EMITTANCE = np.sqrt(TABLE_2[0] * TABLE_2[2] - TABLE_2[1] ** 2)

@@ -16,7 +16,7 @@ from beamfit.emittance.sensitivity import (
 )
 from beamfit.optics.beamline import transfer_rows
 from beamfit.optics.elements import Drift, Quadrupole, Screen, SectorDipole
-from beamfit.optics.particle import PROTON_MASS
+from beamfit.particles import PROTON_MASS
 from tests.emittance.conftest import scan_of
 
 

@@ -12,7 +12,7 @@ from beamfit.errors import InputError
 from beamfit.optics.beam import BeamMatrix
 from beamfit.optics.beamline import Beamline
 from beamfit.optics.elements import Drift, Quadrupole, Screen
-from beamfit.optics.particle import PROTON_MASS
+from beamfit.particles import PROTON_MASS
 
 # Appendix D, in SI.
 SIGMA = np.array([2.6367971055566173, 1.5738242270790272, 1.435441121463094]) * 1e-8

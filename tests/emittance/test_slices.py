@@ -16,7 +16,7 @@ from beamfit.emittance.transport import scanned_line
 from beamfit.errors import InputError
 from beamfit.io.result import read_fitted_beams, results_text
 from beamfit.optics.elements import Drift, Quadrupole, Screen
-from beamfit.optics.particle import rigidity
+from beamfit.particles import rigidity
 from beamfit.report.page import write_report
 
 

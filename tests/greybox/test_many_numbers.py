@@ -11,7 +11,7 @@ from beamfit.greybox import sparse as sparse_parts
 from beamfit.greybox.problem import Free, Prior, Problem, Record
 from beamfit.greybox.solve import solve
 from beamfit.greybox.sparse import Factor, pattern_at, weakest
-from beamfit.status import Status
+from beamfit.verdict import Status
 
 N = 12
 

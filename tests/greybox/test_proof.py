@@ -8,7 +8,7 @@ import pytest
 from beamfit.greybox.convex import convex
 from beamfit.greybox.problem import Constraint, Free, Objective, Problem, Record
 from beamfit.greybox.solve import solve
-from beamfit.status import Status
+from beamfit.verdict import Status
 
 CONVEX = {
     "squares": lambda x: (x[0] - 1) ** 2 + 3 * (x[1] - 2) ** 2,

@@ -11,8 +11,7 @@ from beamfit.errors import InputError
 from beamfit.io.line import build_line, load_lattice, read_lattice
 from beamfit.optics.calibration import CurrentPolynomial, IntegratedGradient, SlopeIntercept
 from beamfit.optics.elements import Drift, Marker, Quadrupole, Screen, SectorDipole, ThinLens
-from beamfit.optics.particle import PROTON_MASS
-from beamfit.particles import REST_ENERGY
+from beamfit.particles import PROTON_MASS, REST_ENERGY
 
 # Every element and every key once; the line numbers below count on it.
 WHOLE = """format = "beamfit-lattice-1"

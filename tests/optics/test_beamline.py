@@ -20,7 +20,7 @@ from beamfit.optics.calibration import (
     plain_meaning,
 )
 from beamfit.optics.elements import Drift, Marker, Quadrupole, Screen, SectorDipole, ThinLens
-from beamfit.optics.particle import beta_gamma, rigidity
+from beamfit.particles import beta_gamma, rigidity
 
 # One case per element class: a new class without a case fails test_every_element_has_a_case.
 CASES = {

@@ -11,7 +11,7 @@ from scipy.integrate import solve_ivp
 
 from beamfit.optics.beamline import Beamline
 from beamfit.optics.elements import Drift, Screen, SectorDipole, hard_edge_slice
-from beamfit.optics.particle import ELECTRON_MASS, PROTON_MASS
+from beamfit.particles import ELECTRON_MASS, PROTON_MASS
 
 RADIUS, ANGLE = 0.4, np.pi / 3
 EDGES = np.radians(2.53), np.radians(13.49)

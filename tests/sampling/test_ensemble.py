@@ -10,7 +10,7 @@ from scipy import stats
 from beamfit.errors import InputError
 from beamfit.sampling.ensemble import draw, first_walkers
 from beamfit.sampling.priors import HalfNormal, LogNormal, Normal, Uniform
-from beamfit.status import Status
+from beamfit.verdict import Status
 from tests.sampling.targets import (
     BANANA,
     PEAKS,

@@ -22,7 +22,7 @@ from beamfit.lifetime.fit import fit_decay
 from beamfit.lifetime.posterior import expected_current
 from beamfit.lifetime.record import DecayRecord
 from beamfit.sampling.priors import Normal, Uniform
-from beamfit.status import Status
+from beamfit.verdict import Status
 
 X = np.linspace(0.0, 1.0, 12)
 Y = 1.0 + 2.0 * X + 0.1 * np.random.default_rng(1).normal(size=12)

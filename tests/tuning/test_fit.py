@@ -10,13 +10,13 @@ from scipy.stats import binom
 from beamfit.emittance.scan import QuadScan
 from beamfit.errors import InputError
 from beamfit.noise.model import Noise
-from beamfit.optics.particle import beta_gamma
-from beamfit.status import Status
+from beamfit.particles import beta_gamma
 from beamfit.tuning.fit import fit_tuning
 from beamfit.tuning.knob_map import _covariance, _linear, log_emittance, orders_of
 from beamfit.tuning.knobs import EmittanceTable, knobs_of
 from beamfit.tuning.minimum import _information, next_row
 from beamfit.tuning.readings import emittance_readings
+from beamfit.verdict import Status
 from tests.tuning.machines import (
     EMITTANCE,
     LINE,
