@@ -741,12 +741,12 @@ def simulate_loop(
     begin = np.clip(fits[0].seen.mean_u, control.limits.low, control.limits.high)
     rest = [r.offset + float(settled(r, jnp.asarray(begin), control.step)[0])
             for r in control.responses]  # fmt: skip
+    wanted = _series(control, time, targets, np.array(rest), add=False)
+    load = _series(control, time, disturbances, np.zeros(len(rest)), add=True)
     for name, value, _ in targets:
         low, high = (ends[_output(control, name)] for ends in control.limits[3:])
         if not low <= value <= high:
             raise InputError(f"{name} wanted at {value:g}", f"{_range(low, high)}, its limits")
-    wanted = _series(control, time, targets, np.array(rest), add=False)
-    load = _series(control, time, disturbances, np.zeros(len(rest)), add=True)
     noise = np.stack([_noise(fit, time, seed + i) for i, fit in enumerate(fits)], axis=1)
     run = jax.jit(partial(closed_loop, control))
     trace = Trace(*map(np.asarray, run(begin, wanted, noise, load)))
