@@ -29,7 +29,7 @@ from beamfit.dynamics.model import (
     weight_priors,
 )
 from beamfit.dynamics.record import Run
-from beamfit.dynamics.response import ARX, FIRST_ORDER, Physics, simulate
+from beamfit.dynamics.response import ARX, FIRST_ORDER, SECOND_ORDER, Physics, simulate
 from beamfit.greybox.fit import Fit
 from beamfit.greybox.memory import TIMES, Memory, noises, range_of, whitened_by_each
 from beamfit.greybox.problem import Free, Prior, Problem, Record
@@ -164,21 +164,24 @@ def start_of(
     """The best start, and the delay: the shortest of those that fit about as well as any.
 
     A part of a sample must do as much better: only an input that moves within a sample tells it.
+    The delay of a difference equation is that of a second order: its own gains of two samples let
+    a shorter one pass.
     """
 
-    def at(late: float) -> tuple[Start, PreparedOutput, float]:
-        seen = seen_of(runs, output, physics, late)
+    def at(late: float, law: Physics = physics) -> tuple[Start, PreparedOutput, float]:
+        seen = seen_of(runs, output, law, late)
         return best_start(seen, offset), seen, late
 
     if delay is not None:
         return at(delay)
-    found = [at(late) for late in range(latest(runs) + 1)]
+    law = SECOND_ORDER if physics is ARX else physics
+    found = [at(late, law) for late in range(latest(runs) + 1)]
     count = sum(map(len, found[0][1].measured))
     worth = np.exp(2.0 * BETTER / count)
     near = worth * min(start.squares for start, _, _ in found)
     whole = next(each for each in found if each[0].squares <= near)
     if physics.even:
-        return whole
+        return at(whole[2])
     parts = [whole[2] + part for part in PARTS if 0 < whole[2] + part < max(latest(runs), 1)]
     best = min((at(part) for part in parts), key=lambda each: each[0].squares)
     return best if worth * best[0].squares < whole[0].squares else whole

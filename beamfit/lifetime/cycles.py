@@ -222,6 +222,8 @@ def _changes_between(record: DecayRecord, pieces: Sequence[np.ndarray]) -> list[
     """Changes of the current from each piece to the next, mA, the loss put back; by one
     law for some pieces together.
     """
+    if not pieces:
+        return []
     ends, found = np.cumsum([piece.size for piece in pieces]) // STRETCH, []
     for batch in np.split(np.arange(len(pieces)), np.flatnonzero(np.diff(ends)) + 1):
         some = [pieces[k] for k in batch] + list(pieces[batch[-1] + 1 : batch[-1] + 2])

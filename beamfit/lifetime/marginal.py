@@ -183,13 +183,15 @@ class SeenDecay:
             slope = np.diff(record.gauge) / np.diff(record.time)
             ends = float(slope[0]), float(slope[-1])
             current = current * np.exp((1 - share) * rate * bumps)
-        if len(record) > ENOUGH:
-            time, current, error = DecayRecord(time, current, error).blocks(ENOUGH)
+        stated = error is not None
+        if len(record) > ENOUGH:  # readings whose errors nobody states have all the same
+            alike = error if stated else np.full(len(record), mean)
+            time, current, error = DecayRecord(time, current, alike).blocks(ENOUGH)
         origin = Numbers.of(start).currents(gas)
         sees = chebvander(2 * time / span - 1, NODES - 1) @ FROM_NODES
         rows = np.column_stack([current / mean - sees @ origin[:, 0], sees])
         rows = rows if error is None else rows * (mean / error)[:, None]
-        products = Products.of(rows, time, error is not None)
+        products = Products.of(rows, time, stated)
         return cls(products, start, origin, gas, ends, record.gauge is None)
 
     @property
@@ -328,8 +330,10 @@ def _by_exponent(seen: SeenDecay, free: list[int]) -> tuple[SeenDecay, Peaks]:
         power = np.linspace(low, high, EXPONENTS)
         numbers = np.vstack([numbers[:3], power, numbers[4]])
         seen, found = _searched(seen, numbers, free)
-        seen = seen.of_noises(found.log.max(axis=1) > found.log.max() - FAR)
         whole = logsumexp(found.log, axis=0)
+        if not np.isfinite(whole).all():
+            return seen, found  # a beam that died: no law of this kind has finite slopes
+        seen = seen.of_noises(found.log.max(axis=1) > found.log.max() - FAR)
         held = np.flatnonzero(whole > whole.max() - FAR)
         ends = max(held[0] - 1, 0), min(held[-1] + 1, EXPONENTS - 1)
         if ends[1] - ends[0] > 0.6 * EXPONENTS:
@@ -359,6 +363,8 @@ def peaks_of(seen: SeenDecay, free: list[int]) -> tuple[SeenDecay, Peaks]:
 def drawn(seen: SeenDecay, free: list[int]) -> Draws:
     """Draw the free numbers from their posterior; more of them where they are worth too few."""
     seen, peaks = peaks_of(seen, free)
+    if not np.isfinite(peaks.log).all():
+        return Draws(Numbers.of(seen.start), np.ones(1), -np.inf, 0.0)
     found = weighed(seen, peaks, DRAWS[0])
     return found if found.worth >= WORTH else weighed(seen, peaks, DRAWS[1])
 
