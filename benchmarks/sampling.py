@@ -161,8 +161,7 @@ def decay() -> Case:
     scale = np.array([1.0, 1e8, 1e6])
     start = np.array([fit.i0.value, fit.a.value, fit.b.value]) * scale
     errors = np.array([fit.i0.error_raw, fit.a.error_raw, fit.b.error_raw]) * scale
-    sample = partial(fit.sample, noise="known")
-    return Case("1000-point decay", log_prob, start, np.diag(errors**2), scale, sample)
+    return Case("1000-point decay", log_prob, start, np.diag(errors**2), scale, fit.sample)
 
 
 def alone(log_prob: Callable[[np.ndarray], np.ndarray], theta: np.ndarray) -> float:
