@@ -101,8 +101,6 @@ class Statement(NamedTuple):
     lower, width : mapping of str to float
         Lower bounds of sampled numbers instead of the problem's own, and how far from the optimum
         each may be at most where the data do not say.
-    along : str
-        A number with which the spread of others changes, as the correlation time of a noise.
     labels : mapping of str to str
         What stands for a record before the names of its noise; by default nothing if there is one
         record, else its name.
@@ -132,7 +130,6 @@ class Statement(NamedTuple):
     units: Mapping[str, str] = {}
     lower: Mapping[str, float] = {}
     width: Mapping[str, float] = {}
-    along: str = ""
     labels: Mapping[str, str] = {}
     averaged: Sequence[str] = ()
     trusted: Sequence[str] = ()
@@ -277,7 +274,6 @@ def target_of(
         hidden=(*(names[i] for i in np.flatnonzero(p.nuisance[moving])), *stated.hidden),
         group_of=group_of,
         block_of=block_of,
-        along=stated.along,
     )
 
 

@@ -363,14 +363,14 @@ def peaks_of(seen: SeenDecay, free: list[int]) -> tuple[SeenDecay, Peaks]:
 def drawn(seen: SeenDecay, free: list[int]) -> Draws:
     """Draw the free numbers from their posterior; more of them where they are worth too few."""
     seen, peaks = peaks_of(seen, free)
-    if not np.isfinite(peaks.log).all():
-        return Draws(Numbers.of(seen.start), np.ones(1), -np.inf, 0.0)
     found = weighed(seen, peaks, DRAWS[0])
     return found if found.worth >= WORTH else weighed(seen, peaks, DRAWS[1])
 
 
 def weighed(seen: SeenDecay, peaks: Peaks, draws: int, seed: int = 0) -> Draws:
     """Draw from normal approximations, Student's tails, each draw weighed by the posterior."""
+    if not np.isfinite(peaks.log).all():
+        return Draws(Numbers.of(peaks.numbers), np.zeros(peaks.numbers.shape[1]), -np.inf, 0.0)
     rng, free = np.random.default_rng(seed), [0, 1, 2, 4][: peaks.centre.shape[2]]
     odds = np.exp(peaks.log - peaks.log.max()).ravel()
     ends = np.cumsum(odds) / odds.sum()

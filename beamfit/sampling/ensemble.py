@@ -231,8 +231,7 @@ def _half_round(state: Checkpoint) -> slice:
 
 def _proposal(target: SamplingTarget, state: Checkpoint) -> IndependenceProposal:
     """Proposal of long moves: about the fit at first, then fitted to the last half round."""
-    along = target.names.index(target.along) if target.along else -1
-    first = about(target.covariance, target.widening, target.blocks, 5.0, along)
+    first = about(target.covariance, target.widening, target.blocks)
     recent = state.chain[_half_round(state)]
     return fitted(recent.reshape(-1, recent.shape[2]), first) if state.began else first
 

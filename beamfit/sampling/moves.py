@@ -8,13 +8,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.linalg import solve_triangular
-from scipy.special import gammaln, logsumexp
+from scipy.special import gammaln
 
 # Degrees of freedom that are tried, from heavy tails to nearly normal.
 DEGREES = (4.0, 6.0, 10.0, 30.0)
-# Pieces of equal length along a number that changes the spread of others; draws that a piece needs
-# for each number; least share of long moves into a piece, since walkers stick in a tail.
-PIECES, EACH, RARE = 6, 20, 0.05
 
 
 class Widening(NamedTuple):
@@ -94,23 +91,6 @@ class Student:
         return self._norm - power * np.log1p(squares / self.degrees)
 
 
-class Mixture(NamedTuple):
-    """Student distributions, and how likely each is."""
-
-    parts: tuple[Student, ...]
-    weights: np.ndarray
-
-    def draw(self, random: np.random.RandomState, number: int) -> np.ndarray:
-        """Draw points, shape (number, n)."""
-        chosen = random.choice(len(self.parts), number, p=self.weights)
-        return np.stack([p.draw(random, number) for p in self.parts])[chosen, np.arange(number)]
-
-    def log_density(self, points: np.ndarray) -> np.ndarray:
-        """Log density at points of shape (m, n)."""
-        each = [part.log_density(points) for part in self.parts]
-        return logsumexp(each, axis=0, b=self.weights[:, None])
-
-
 @dataclass(frozen=True, eq=False)
 class IndependenceProposal:
     """Proposal of long moves, independent of the walker's present place.
@@ -125,10 +105,8 @@ class IndependenceProposal:
         In which distances the parts are Student distributions.
     blocks : tuple of array of int
         Which numbers each part is for; together all of them, each once.
-    parts : tuple of Student or Mixture
+    parts : tuple of Student
         Independent of each other: one heavy tail should not make all of them heavy.
-    along : int
-        Place of a number with which the spread of those beside it changes; -1 for none.
 
     Examples
     --------
@@ -141,8 +119,7 @@ class IndependenceProposal:
 
     widening: Widening
     blocks: tuple[np.ndarray, ...]
-    parts: tuple[Student | Mixture, ...]
-    along: int = -1
+    parts: tuple[Student, ...]
 
     def draw(self, random: np.random.RandomState, number: int) -> np.ndarray:
         """Draw points, shape (number, n)."""
@@ -186,7 +163,6 @@ def about(
     widening: Widening,
     blocks: tuple[np.ndarray, ...],
     degrees: float = 5.0,
-    along: int = -1,
 ) -> IndependenceProposal:
     """Leap about a centre with the covariance of a fit.
 
@@ -194,7 +170,7 @@ def about(
     ----------
     covariance : array, shape (n, n)
         Of which each block is used.
-    widening, blocks, along
+    widening, blocks
         As of `IndependenceProposal`.
     degrees : float
         Of freedom.
@@ -207,7 +183,7 @@ def about(
         Student(np.zeros(len(block)), _root(covariance[np.ix_(block, block)]), degrees)
         for block in blocks
     )
-    return IndependenceProposal(widening, blocks, tuple(parts), along)
+    return IndependenceProposal(widening, blocks, tuple(parts))
 
 
 def fitted(points: np.ndarray, before: IndependenceProposal) -> IndependenceProposal:
@@ -224,7 +200,7 @@ def fitted(points: np.ndarray, before: IndependenceProposal) -> IndependenceProp
     -------
     IndependenceProposal
         Each part with the draws' mean and covariance and, of a few degrees of freedom, those of
-        the highest likelihood; along a number with which the spread changes, piece by piece.
+        the highest likelihood.
 
     Examples
     --------
@@ -234,14 +210,8 @@ def fitted(points: np.ndarray, before: IndependenceProposal) -> IndependenceProp
     30.0
     """
     evened = before.widening.evened(points)
-
-    def part(block: np.ndarray) -> Student | Mixture:
-        if before.along not in block:
-            return _student(evened[:, block])
-        return _piecewise(evened[:, block], evened[:, before.along])
-
-    parts = tuple(map(part, before.blocks))
-    return IndependenceProposal(before.widening, before.blocks, parts, before.along)
+    parts = tuple(_student(evened[:, block]) for block in before.blocks)
+    return IndependenceProposal(before.widening, before.blocks, parts)
 
 
 def _student(points: np.ndarray) -> Student:
@@ -249,19 +219,6 @@ def _student(points: np.ndarray) -> Student:
     # A Student distribution is wider than its scale matrix by dof/(dof - 2).
     tried = [Student(location, _root(covariance * (dof - 2) / dof), dof) for dof in DEGREES]
     return max(tried, key=lambda part: float(np.mean(part.log_density(points))))
-
-
-def _piecewise(points: np.ndarray, along: np.ndarray) -> Mixture:
-    """Pieces of the draws from the tail down; a piece with few draws joins the next."""
-    ends = np.linspace(along.min(), along.max(), PIECES + 1)[1:-1]
-    piece, pieces, few = np.searchsorted(ends, along), [], np.zeros(0, int)
-    for k in reversed(range(PIECES)):
-        few = np.append(few, np.flatnonzero(piece == k))
-        if len(few) >= EACH * points.shape[1]:
-            pieces, few = [*pieces, few], few[:0]
-    pieces = [*pieces[:-1], np.concatenate([*pieces[-1:], few])]
-    weights = np.maximum([len(part) / len(points) for part in pieces], RARE)
-    return Mixture(tuple(_student(points[part]) for part in pieces), weights / weights.sum())
 
 
 def share_of(

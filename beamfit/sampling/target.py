@@ -121,8 +121,6 @@ class SamplingTarget:
         Which group's noise widens each of the law's numbers; the first if empty.
     block_of : tuple of int
         Which of the law's numbers are proposed together; all if empty.
-    along : str
-        A number with which the spread of others changes, as the correlation time of a noise.
 
     Examples
     --------
@@ -160,7 +158,6 @@ class SamplingTarget:
     stated: Mapping[str, str] = field(default_factory=dict)
     group_of: tuple[int, ...] = ()
     block_of: tuple[int, ...] = ()
-    along: str = ""
 
     def __post_init__(self) -> None:
         pairs = zip(self.groups, self.noise, strict=True)
