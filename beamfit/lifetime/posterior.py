@@ -38,7 +38,7 @@ from beamfit.sampling.posterior import Expected, Posterior
 from beamfit.sampling.priors import Distribution, checked
 from beamfit.sampling.store import FROM_PYTHON, Checkpoint, Provenance
 from beamfit.sampling.target import PosteriorLaw, SamplingTarget
-from beamfit.verdict import Finding, judge
+from beamfit.verdict import Finding, Status, judge
 from beamfit.writing import alone
 
 UNITS = {"i0": "mA", "a": "1/(mA s)", "b": "1/s", "exponent": "1", "drift": "1"}
@@ -292,11 +292,19 @@ def _chains(ready: _Prepared, target: SamplingTarget, seed: int, target_ess: flo
     held = tuple(dict.fromkeys((*target.priors_own, *held)))
     shown = tuple(name for name in held if name not in target.hidden)
     enough = min(target_ess, WORTH)  # as the fit needs
-    verdict = judge(ChainEvidence(found, target, enough, steps, shown), RULES)
+    verdict = judge(ChainEvidence(found, target, enough, steps, shown), (_worth_little, *RULES))
     said = f"{min(found.effective):.0f} effective draws."
     log = target.log_probability(chain.reshape(-1, chain.shape[2])).reshape(chain.shape[:2])
     return Posterior(target, chain, log, verdict.status, f"{verdict.message} {said}", found,
                      worth / weight.size, 0, seed, held)  # fmt: skip
+
+
+def _worth_little(e: ChainEvidence) -> Finding | None:
+    if np.min(e.diagnostics.effective) >= e.target_ess:
+        return None
+    cause = f"The draws are worth less than the {e.target_ess:.0f} that intervals need:"
+    remedy = "the posterior is far from normal, distrust the intervals."
+    return Finding(Status.not_converged, cause, remedy)
 
 
 def expected_current(posterior: Posterior, fit) -> Expected:
