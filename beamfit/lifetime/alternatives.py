@@ -22,7 +22,6 @@ from beamfit.lifetime.expansion import (
     LEVEL,
     PLAIN,
     POWER,
-    TIMES,
     WHEN,
     Expansion,
     Pieces,
@@ -30,7 +29,16 @@ from beamfit.lifetime.expansion import (
     lifetime_of,
     solved,
 )
-from beamfit.lifetime.marginal import ABOVE, BELOW, DRIFT, ENOUGH
+from beamfit.lifetime.marginal import (
+    ABOVE,
+    BELOW,
+    DRIFT,
+    ENOUGH,
+    OUTGASSING,
+    SIZES,
+    SMOOTH,
+    TIMES,
+)
 from beamfit.lifetime.record import DecayRecord
 from beamfit.noise.memory import Products
 from beamfit.quantity import HOUR, Quantity
@@ -41,18 +49,16 @@ from beamfit.verdict import Status
 
 # A departure of so many errors is found with 90 % at a false alarm rate of `POOR_FIT`.
 FOUND = float(ndtri(1 - POOR_FIT / 2) + ndtri(0.9))
-# Times, over the span, that are looked at first, and the longest of gas that relaxes.
-GRID, LONGEST = np.linspace(0.05, 0.95, 40), 1.0
+# Times, over the span, that are looked at first.
+GRID = np.linspace(0.05, 0.95, 40)
 # Changes are placed on ever finer grids about the best of the last, so often.
 FINER = 3
 # Two changes within so many readings are a step.
 STEP = 3.0
 # Prior probabilities: constant a and b, a power of a, a drift of b beside, one change, two, gas
-# that relaxes, current lost at once between two readings, each as likely, once or twice; and
-# between which shares of the loss a further one lies, flat in its logarithm.
-CHANCES = {"": 0.34, "power": 0.2, "drift": 0.2, "step": 0.08, "steps": 0.04, "relaxing": 0.08,
-           "sudden": 0.04, "sudden twice": 0.02}  # fmt: skip
-SIZES = (1e-3, 1.0)
+# that relaxes, current lost at once between two readings, each as likely, once or twice.
+CHANCES = {"": SMOOTH - 0.4, "power": 0.2, "drift": 0.2, "step": 0.08, "steps": 0.04,
+           "relaxing": OUTGASSING, "sudden": 0.04, "sudden twice": 0.02}  # fmt: skip
 # Further losses of each alternative: how many, of which kind.
 KINDS = {"step": (1, "step"), "steps": (2, "step"), "relaxing": (1, "relaxing"),
          "sudden": (1, "sudden"), "sudden twice": (2, "sudden")}  # fmt: skip
@@ -376,7 +382,7 @@ def _widths(name: str, sizes: np.ndarray, times: np.ndarray, loss: float) -> np.
     """
     sizes = np.maximum(np.abs(sizes), SIZES[0] * abs(loss))
     gas = name == "relaxing"
-    times = times * math.log(LONGEST / TIMES[0]) if gas else np.ones(times.size)
+    times = times * math.log(TIMES[1] / TIMES[0]) if gas else np.ones(times.size)
     return np.array([2 * sizes * math.log(SIZES[1] / SIZES[0]), times]) / math.sqrt(2 * math.pi)
 
 
@@ -433,7 +439,7 @@ def _with_further(plain: Expansion, more: _Further) -> Expansion | None:
     law = solved(plain.pieces, free, more.kind, start=np.append(plain.numbers, further))
     shortest = float(np.median(np.diff(plain.pieces.time))) / plain.pieces.units[0]
     if gas:
-        known = law.numbers[3] > 0 and shortest < law.numbers[4] < LONGEST
+        known = law.numbers[3] > 0 and shortest < law.numbers[4] < TIMES[1]
     else:
         known = np.all(np.diff([0.0, *law.numbers[4::2], 1.0]) > STEP * shortest)
     return law if law.rested and known else None

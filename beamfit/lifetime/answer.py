@@ -11,10 +11,17 @@ import numpy as np
 
 from beamfit.lifetime.alternatives import ConstantA, LifetimeLaw, Outgassing
 from beamfit.lifetime.cycles import is_sawtooth
-from beamfit.lifetime.evidence import BELIEVED, DETERMINED, SEPARABLE, UNITS, Evidence
+from beamfit.lifetime.evidence import (
+    BELIEVED,
+    DETERMINED,
+    LIKELIER,
+    SEPARABLE,
+    UNITS,
+    Evidence,
+)
 from beamfit.lifetime.pieces import noise_of
 from beamfit.lifetime.record import Monitor
-from beamfit.quantity import HOUR
+from beamfit.quantity import HOUR, percent
 from beamfit.statistics import MANY, POOR_FIT, chi2_probability, few_words, of_use
 from beamfit.verdict import Finding, Status, judge
 
@@ -231,16 +238,19 @@ def _freely(e: Evidence) -> Finding | None:
     if e.free is None:
         return None
     told = "; ".join(filter(None, (_clear(e), *(_extent(e, name) for name in "ab"))))
+    if e.free.pumped > LIKELIER:
+        found = f"Gas that is pumped away after a fill is likely ({percent(e.free.pumped)}), which "
+        return Finding(Status.converged, f"{told}. {found}the errors contain")
     if e.constant_a.status is Status.poor_fit:
         drift = "" if e.free.drift is None else f" and b drifts by {e.free.drift} of itself"
         found = f"A constant a is rejected (p = {max(e.constant_a.p_value, 1e-300):.2g}): it goes "
         found += f"as I^({e.free.exponent}){drift}, which the errors contain"
         return Finding(Status.converged, f"{told}. {found}")
-    open_ = "an exponent of a" if e.free.drift is None else "an exponent of a and a drift of b"
+    gas = "" if e.free.drift is None else ", a drift of b and gas that is pumped away"
     exact = {name: e.quantity(name, True) for name in "ab"}
     return Finding(
         Status.converged,
-        f"{told}, with {open_} left open. If a and b are constant, a is "
+        f"{told}, with an exponent of a{gas} left open. If a and b are constant, a is "
         f"{exact['a']} and b is {exact['b']}",
     )
 

@@ -1,16 +1,18 @@
 """Posterior of a decay whose law and noise are not certain: a(I), b(t) and noise averaged over.
 
 With x the current over its mean and s the time over the span, the loss rate is
-share R x^(1 + g) + (1 - share) R (1 + h (s - 1/2)) with the share of a from 0 to 1. The exponent g
-and the drift h have priors, the first current, R and the share are flat. The law has a closed form
-with one integral, taken to rounding on Chebyshev nodes; readings see the nodes through one matrix,
-so that whitened products of its columns are all that the readings say.
+share R x^(1 + g) + (1 - share) R (1 + h f(s)) with the share of a from 0 to 1. The gas changes by h
+of itself: in a straight line, f = s - 1/2, or as what is pumped away after a fill, f = 1/k -
+exp(-k s)/(1 - exp(-k)), where a is then constant. The exponent g, the change h and the pace k have
+priors, the first current, R and the share are flat. The law has a closed form with one integral,
+taken to rounding on Chebyshev nodes; readings see the nodes through one matrix, so that whitened
+products of its columns are all that the readings say.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import NamedTuple
@@ -32,10 +34,18 @@ BELOW, ABOVE, ODD = 0.3, 0.2, 0.05
 LEAST, MOST = -0.9, 2.0
 # Standard deviation of the change of b in one record: pressures of stored beams are read to 10 %.
 DRIFT = 0.1
+# Prior probabilities of these and of gas that is pumped away after a fill. The time that takes is
+# flat in its logarithm from a thousandth of the span to all of it, its loss at first from a
+# thousandth of the mean loss to ten times that.
+SMOOTH, OUTGASSING, TIMES, SIZES = 0.74, 0.08, (1e-3, 1.0), (1e-3, 10.0)
+# Width of that change in what draws come from.
+PUMPED = 0.5
 # Nodes of the integral: exact to rounding up to four lifetimes in a record.
 NODES = 14
-# Exponents looked at, in ever narrower ranges, and steps of the search with each.
-EXPONENTS, RANGES, STEPS = 33, 5, 6
+# Exponents, or paces, looked at, in ever narrower ranges, and steps of the search with each.
+PLACES, RANGES, STEPS = 33, 5, 6
+# Spans over the time of gas that is pumped away: shorter times are seen by themselves.
+PACES = (1.0, 10.0)
 # Readings beyond which neighbours are averaged: the curve is smooth between them.
 ENOUGH = 1024
 # Draws at first and again where they are worth too few, the degrees of freedom of what they come
@@ -43,7 +53,7 @@ ENOUGH = 1024
 DRAWS, TAIL, WORTH = (6000, 60000), 8.0, 200.0
 # Width of the share in what draws come from, which its bounds cut off otherwise.
 AROUND = 0.6
-# Where the record's bend would not depend on the share its coordinate takes this slope instead.
+# Where the record's bend would not depend on the share its coordinate goes over to this slope.
 FLAT = 0.2
 # Standard deviations of the share beside a bound in which draws tell the density there.
 NEAR = 0.25
@@ -56,6 +66,7 @@ STEP = 1e-5
 # What lies farther below the largest log probability adds nothing.
 FAR = 9.0
 
+ENDS = ("start", "end", "mean")
 UNITS = {
     "a": "1/(mA s)",
     "b": "1/s",
@@ -85,41 +96,74 @@ class Law(StrEnum):
     constant = "constant"
 
 
+# Rows of the search's numbers: ln level, ln rate, bend, exponent, change of b, its pace.
+BEND, POWER, CHANGE, PACE = range(2, 6)
+CONSTANT = (0, 1, BEND)
+
+
+def gas_change(s, pace, xp=np):
+    """Change of the gas at a time over the span, of 1 from the first to the last reading and 0 in
+    the mean: a straight line at a pace of 0.
+
+    Examples
+    --------
+    >>> gas_change(0.0, 0.0).item(), (gas_change(1.0, 3.0) - gas_change(0.0, 3.0)).round(9).item()
+    (-0.5, 1.0)
+    """
+    k = xp.where(pace > 0, pace, 1.0)
+    return xp.where(pace > 0, 1 / k + xp.exp(-k * s) / xp.expm1(-k), s - 0.5)
+
+
+def gas_changed(pace, xp=np):
+    """Integral of that up to the nodes, one column a pace."""
+    s, k = NODE[:, None], xp.where(pace > 0, pace, 1.0)
+    return xp.where(pace > 0, (s - xp.expm1(-k * s) / xp.expm1(-k)) / k, (s**2 - s) / 2)
+
+
 class Numbers(NamedTuple):
     """First current over the mean, loss in the span at the mean current, share of a, exponent,
-    drift, and by how much the share changes with the third of the search's numbers.
+    change of the gas over that loss and its pace, and by how much the share changes with the bend.
     """
 
     level: np.ndarray
     rate: np.ndarray
     share: np.ndarray
     power: np.ndarray
-    drift: np.ndarray
+    gas: np.ndarray
+    pace: np.ndarray
     unit: np.ndarray
 
     @classmethod
     def of(cls, found: np.ndarray) -> Numbers:
-        """From columns of ln level, ln rate, bend, exponent, drift.
+        """From columns of ln level, ln rate, bend, exponent, change, pace.
 
-        The bend, share (1 + g) - (1 - share) h / R, is how the loss rate falls with the current,
-        which the record shows: with it the posterior is nearly normal.
+        A straight change of the gas is one of b, that of gas which is pumped away one of the whole
+        loss. The bend, share (1 + g) - (1 - share) h / R, is how the loss rate falls with the
+        current, which the record shows: with it the posterior is nearly normal.
         """
         level, rate = np.exp(np.clip(found[:2], -30.0, 8.0))
-        power, drift = found[3], found[4]
-        unit = np.maximum(1 + power + drift / rate, FLAT)
-        return cls(level, rate, (found[2] + drift / rate) / unit, power, drift, 1 / unit)
+        power, change, pace = found[POWER:]
+        unit = np.where(pace > 0, 1.0, np.maximum(1 + power + change / rate, FLAT))
+        share = (found[BEND] + change / rate) / unit
+        gas = np.where(pace > 0, change, (1 - share) * change)
+        return cls(level, rate, share, power, gas, pace, 1 / unit)
+
+    @property
+    def drift(self) -> np.ndarray:
+        """Change of b over b."""
+        return self.gas / (1 - self.share)
 
     def currents(self, gas: np.ndarray) -> np.ndarray:
         """Currents at the nodes over the mean, one column a set; `gas` is ∫ P dt over the mean."""
-        parts = self.share * self.rate, (1 - self.share) * self.rate
-        return node_currents(self.level, *parts, self.power, self.drift, gas)
+        lost = (1 - self.share) * gas[:, None] + self.gas * gas_changed(self.pace)
+        return node_currents(self.level, self.share * self.rate, self.power, self.rate * lost)
 
 
-def node_currents(level, quadratic, linear, power, drift, gas, xp=np):
-    """Currents at the nodes over the mean, (14, m), as of `closed_form` with W = ∫ exp(-c B) ds."""
+def node_currents(level, quadratic, power, lost, xp=np):
+    """Currents at the nodes over the mean, (14, m), as of `closed_form` with W = ∫ exp(-c B) ds,
+    where B is what is lost to gas up to each node.
+    """
     c = 1 + power
-    course = gas[:, None] + drift * (NODE**2 - NODE)[:, None] / 2
-    lost = linear * course
     whole = INTEGRAL @ xp.exp(xp.clip(-c * lost, -700, 700))
     # Where a loss that is no beam's would have ended the record the law has no value.
     inside = c * quadratic * level**c
@@ -136,6 +180,20 @@ def log_prior(power, xp=np):
     return xp.log((1 - ODD) * usual + odd), np.log(odd)
 
 
+def log_straight(change):
+    """Log density of straight changes of the gas."""
+    return -0.5 * (change / DRIFT) ** 2 - math.log(DRIFT * math.sqrt(2 * math.pi))
+
+
+def log_pumped(share, gas, pace, xp=np):
+    """Log density of gas that is pumped away, and of its pace, with the odds of there being any."""
+    size = gas / xp.expm1(-pace)  # of its loss at first
+    inside = (size > SIZES[0]) & (size < SIZES[1]) & (-gas < pace * (1 - share))  # some is left
+    width = math.log(SIZES[1] / SIZES[0]) * math.log(TIMES[1] / TIMES[0])
+    density = math.log(OUTGASSING / SMOOTH / width) - xp.log(xp.where(inside, -gas, 1.0) * pace)
+    return xp.where(inside, density, -np.inf)
+
+
 @dataclass(frozen=True)
 class SeenDecay:
     """A record as products of the columns that its readings see the nodes through.
@@ -144,7 +202,7 @@ class SeenDecay:
     ----------
     products : Products
         Of what is left of the readings at `start`, and of the columns of the nodes.
-    start : array, shape (5, 1)
+    start : array, shape (6, 1)
         Numbers of a law near the most probable one.
     origin : array, shape (14, 1)
         Its currents at the nodes.
@@ -172,7 +230,7 @@ class SeenDecay:
         span, mean = record.span, float(record.current.mean())
         rate = max(float(values.rate_mean) * span, 1e-9)
         share = float(np.clip(values.share, -0.2, 1.2))
-        start = np.array([[np.log(values.i0 / mean)], [np.log(rate)], [share], [0.0], [0.0]])
+        start = np.array([[np.log(values.i0 / mean), np.log(rate), share, 0.0, 0.0, 0.0]]).T
         gas, bumps, ends = NODE, 0.0, (1.0, 1.0)
         time, current, error = record.time, record.current, record.error
         if record.gauge is not None:
@@ -194,14 +252,19 @@ class SeenDecay:
         products = Products.of(rows, time, stated)
         return cls(products, start, origin, gas, ends, record.gauge is None)
 
-    @property
-    def middle(self) -> float:
-        """When the current is its mean, over the span: the drift has gone so far by then."""
-        return float(np.interp(-1.0, -self.origin[:, 0], NODE))
-
     def of_noises(self, kept: np.ndarray) -> SeenDecay:
         """The same with some of the noises."""
         return replace(self, products=self.products.some(kept))
+
+    def log_size(self, numbers: Numbers, kind: np.ndarray) -> np.ndarray:
+        """Log likelihood of draws in the noises of these places, which are in order."""
+        away = np.vstack([-np.ones(kind.size), numbers.currents(self.gas) - self.origin])
+        squares, products = np.empty(kind.size), self.products
+        ends = np.searchsorted(kind, np.arange(len(products.matrix) + 1))
+        for matrix, *part in zip(products.matrix, ends[:-1], ends[1:], strict=True):
+            some = away[:, slice(*part)]  # of one noise: one product of matrices
+            squares[slice(*part)] = np.sum(some * (matrix @ some), axis=0)
+        return products.log_size(np.maximum(squares, 1e-30))
 
     def left(self, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Sums of squares (k, m) by noise and set of numbers, and products with node columns."""
@@ -214,20 +277,22 @@ class SeenDecay:
 
 
 class Peaks(NamedTuple):
-    """Normal approximations by noise (k) and exponent (m): centre, scaled triangle of the inverse
-    covariance, log of the integral; and numbers (5, m) about which the last step was taken.
+    """Normal approximations by noise (k) and place (m): centre, scaled triangle of the inverse
+    covariance, log of the integral; numbers (6, m) about which the last step was taken, and those
+    of them that are free.
     """
 
     centre: np.ndarray
     precision: np.ndarray
     log: np.ndarray
     numbers: np.ndarray
+    free: list[int]
 
 
 def _slopes(seen: SeenDecay, numbers: np.ndarray, free: list[int]) -> tuple[np.ndarray, np.ndarray]:
     """Slopes of the currents at the nodes, (14, p, m), and of the share, (p, m)."""
-    move = STEP * np.eye(5)[:, None, free, None] * np.array([1.0, -1.0])[:, None, None]
-    both = Numbers.of((numbers[:, None, None] + move).reshape(5, -1))
+    move = STEP * np.eye(6)[:, None, free, None] * np.array([1.0, -1.0])[:, None, None]
+    both = Numbers.of((numbers[:, None, None] + move).reshape(6, -1))
     shape = (2, len(free), -1)
     more, less = np.moveaxis(both.currents(seen.gas).reshape(NODES, *shape), 1, 0)
     share = both.share.reshape(shape)
@@ -259,6 +324,11 @@ def _solved(lower: np.ndarray, right: np.ndarray) -> np.ndarray:
     return found
 
 
+def _spread(lower: np.ndarray, slopes: np.ndarray) -> np.ndarray:
+    """Standard deviations of something with these slopes, (p, k or 1, m)."""
+    return np.sqrt(np.sum(_forward(lower, slopes) ** 2, axis=0))
+
+
 def _log_within(bounds: tuple[float, float], middle: np.ndarray, sd: np.ndarray) -> np.ndarray:
     """Logarithm of the part of normal distributions between two bounds."""
     low, high = ((bound - middle) / np.maximum(sd, 1e-300) for bound in bounds)
@@ -269,14 +339,15 @@ def _log_within(bounds: tuple[float, float], middle: np.ndarray, sd: np.ndarray)
 
 
 def _expanded(seen: SeenDecay, numbers: np.ndarray, free: list[int]) -> Peaks:
-    """Expand the posterior about numbers (5, m) for every noise."""
+    """Expand the posterior about numbers (6, m) for every noise."""
     slopes, of_share = _slopes(seen, numbers, free)
     squares, pulled = seen.left(numbers)
     gradient = np.einsum("npm,knm->pkm", slopes, pulled)
     turned = seen.products.matrix[:, 1:, 1:] @ slopes.reshape(NODES, -1)
     normal = np.einsum("npm,knqm->pqkm", slopes, turned.reshape(-1, *slopes.shape))
-    width, middle = np.array([np.inf, np.inf, AROUND, np.inf, DRIFT])[free], np.zeros(len(free))
-    middle[2] = 0.5
+    change = np.where(numbers[PACE, 0] > 0, PUMPED, DRIFT)
+    width, middle = np.array([np.inf, np.inf, AROUND, np.inf, change])[free], np.zeros(len(free))
+    middle[BEND] = 0.5
     width, middle = width[:, None], middle[:, None]
     known = np.diag(1 / width[:, 0] ** 2)[..., None, None]
     pull = ((middle - numbers[free]) / width**2)[:, None]
@@ -293,10 +364,13 @@ def _expanded(seen: SeenDecay, numbers: np.ndarray, free: list[int]) -> Peaks:
     log = log - np.sum(np.log(np.einsum("ppkm->pkm", lower)), axis=0)
     log = log - 0.5 * np.sum(((centre - middle[:, None]) / width[:, None]) ** 2, axis=0)
     share = Numbers.of(numbers).share + np.einsum("pm,pkm->km", of_share, step)
-    spread = np.sum(_forward(lower, of_share[:, None]) ** 2, axis=0)
-    log = log + _log_within(seen.share, share, np.sqrt(spread))
-    log = log + log_prior(numbers[3])[0]
-    return Peaks(np.moveaxis(centre, 0, 2), np.moveaxis(precision, (0, 1), (2, 3)), log, numbers)
+    log = log + _log_within(seen.share, share, _spread(lower, of_share[:, None]))
+    log = log + log_prior(numbers[POWER])[0] - np.log(np.maximum(numbers[PACE], 1.0))
+    if np.any(numbers[PACE]):  # gas that is pumped away gets less
+        own = np.broadcast_to(np.eye(len(free))[-1][:, None, None], of_share[:, None].shape)
+        log = log + _log_within((-np.inf, 0.0), centre[-1], _spread(lower, own))
+    centre, precision = np.moveaxis(centre, 0, 2), np.moveaxis(precision, (0, 1), (2, 3))
+    return Peaks(centre, precision, log, numbers, free)
 
 
 def _searched(seen: SeenDecay, numbers: np.ndarray, free: list[int]) -> tuple[SeenDecay, Peaks]:
@@ -311,9 +385,11 @@ def _searched(seen: SeenDecay, numbers: np.ndarray, free: list[int]) -> tuple[Se
         step = np.einsum("km,kmp->pm", weight, found.centre) - numbers[free]
         numbers = numbers.copy()
         numbers[free] += np.clip(step, -0.5, 0.5)
-        numbers[4] = np.clip(numbers[4], -5 * DRIFT, 5 * DRIFT)
+        pumped = numbers[PACE] > 0
+        ends = np.where(pumped, -SIZES[1], -5 * DRIFT), np.where(pumped, 0.0, 5 * DRIFT)
+        numbers[CHANGE] = np.clip(numbers[CHANGE], *ends)
         named = Numbers.of(numbers)
-        numbers[2] += (np.clip(named.share, -1.0, 2.0) - named.share) / named.unit
+        numbers[BEND] += (np.clip(named.share, -1.0, 2.0) - named.share) / named.unit
         spread = 1 / np.sqrt(np.einsum("km,kmpp->pm", weight, found.precision))
         rests = np.all(np.abs(step) < 0.03 * spread + 1e-9, axis=0)
         if rests.all():
@@ -323,24 +399,26 @@ def _searched(seen: SeenDecay, numbers: np.ndarray, free: list[int]) -> tuple[Se
     return seen, _expanded(seen, numbers, free)
 
 
-def _by_exponent(seen: SeenDecay, free: list[int]) -> tuple[SeenDecay, Peaks]:
-    """Expansions at exponents and by noises that hold the posterior, in ever narrower ranges."""
-    low, high, numbers = LEAST, MOST, np.tile(seen.start, (1, EXPONENTS))
+def _along(
+    seen: SeenDecay, row: int, low: float, high: float, free: list[int]
+) -> tuple[SeenDecay, Peaks]:
+    """Expansions at places of one number and by noises that hold the posterior, in ever narrower
+    ranges.
+    """
+    place, numbers = np.linspace(low, high, PLACES), np.tile(seen.start, (1, PLACES))
     for _ in range(RANGES):
-        power = np.linspace(low, high, EXPONENTS)
-        numbers = np.vstack([numbers[:3], power, numbers[4]])
+        numbers[row] = place
         seen, found = _searched(seen, numbers, free)
         whole = logsumexp(found.log, axis=0)
         if not np.isfinite(whole).all():
             return seen, found  # a beam that died: no law of this kind has finite slopes
         seen = seen.of_noises(found.log.max(axis=1) > found.log.max() - FAR)
         held = np.flatnonzero(whole > whole.max() - FAR)
-        ends = max(held[0] - 1, 0), min(held[-1] + 1, EXPONENTS - 1)
-        if ends[1] - ends[0] > 0.6 * EXPONENTS:
+        ends = [max(held[0] - 1, 0), min(held[-1] + 1, PLACES - 1)]
+        if ends[1] - ends[0] > 0.6 * PLACES:
             break
-        low, high = power[ends[0]], power[ends[1]]
-        at = np.linspace(low, high, EXPONENTS)
-        numbers = np.array([np.interp(at, power, row) for row in found.numbers])
+        before, place = place, np.linspace(*place[ends], PLACES)
+        numbers = np.array([np.interp(place, before, one) for one in found.numbers])
     return seen, _expanded(seen, found.numbers, free)
 
 
@@ -353,60 +431,82 @@ class Draws(NamedTuple):
     worth: float
 
 
-def peaks_of(seen: SeenDecay, free: list[int]) -> tuple[SeenDecay, Peaks]:
-    """Approximate the posterior of some of the numbers by normal distributions."""
-    if 3 in free:
-        return _by_exponent(seen, free[:3] + free[4:])
-    return _searched(seen, seen.start, free)
+class Proposal(NamedTuple):
+    """A law that is drawn from: the record with the noises that are left, and its peaks."""
+
+    seen: SeenDecay
+    peaks: Peaks
+
+    @classmethod
+    def of(cls, seen: SeenDecay, free: Sequence[int]) -> Proposal:
+        """Approximate the posterior of some of the numbers by normal distributions; an exponent and
+        a pace at places.
+        """
+        normal = [row for row in free if row not in (POWER, PACE)]
+        if PACE in free:
+            found = _along(seen, PACE, *PACES, normal)
+        elif POWER in free:
+            found = _along(seen, POWER, LEAST, MOST, normal)
+        else:
+            found = _searched(seen, seen.start, normal)
+        return cls(found[0], found[1]._replace(free=list(free)))
+
+    def _log_prior(self, numbers: Numbers) -> np.ndarray:
+        free, (low, high) = self.peaks.free, self.seen.share
+        inside = (numbers.share >= low) & (numbers.share <= high)
+        log = np.where(inside, -math.log(high - low), -np.inf)
+        if PACE in free:
+            return log + log_pumped(numbers.share, numbers.gas, numbers.pace)
+        log = log + log_prior(numbers.power)[0] if POWER in free else log
+        return log + log_straight(numbers.drift) if CHANGE in free else log
+
+    def drawn(self, least: float = WORTH) -> Draws:
+        """Draws of the posterior; more of them where they are worth too few."""
+        found = self.weighed(DRAWS[0])
+        return found if found.worth >= least else self.weighed(DRAWS[1])
+
+    def weighed(self, draws: int, seed: int = 0) -> Draws:
+        """Draw from the normal approximations, Student's tails, each weighed by the posterior."""
+        seen, peaks = self
+        if not np.isfinite(peaks.log).all():
+            return Draws(Numbers.of(peaks.numbers), np.zeros(peaks.log.shape[1]), -np.inf, 0.0)
+        rng, odds = np.random.default_rng(seed), np.exp(peaks.log - peaks.log.max()).ravel()
+        ends = np.cumsum(odds) / odds.sum()
+        which = np.minimum(np.searchsorted(ends, (np.arange(draws) + 0.5) / draws), odds.size - 1)
+        kind, at = np.unravel_index(which, peaks.log.shape)
+        count = peaks.centre.shape[2]
+        normal = (
+            rng.normal(size=(draws, count)) * np.sqrt(TAIL / rng.chisquare(TAIL, draws))[:, None]
+        )
+        root = np.linalg.cholesky(np.linalg.inv(peaks.precision))[kind, at]
+        numbers = peaks.numbers[:, at]
+        rows = [row for row in peaks.free if row not in (POWER, PACE)]
+        numbers[rows] = (peaks.centre[kind, at] + np.einsum("dpq,dq->dp", root, normal)).T
+        given = gammaln((TAIL + count) / 2) - gammaln(TAIL / 2) - 0.5 * count * np.log(np.pi * TAIL)
+        given = given - np.log(np.einsum("dpp->dp", root)).sum(1)
+        given = given - 0.5 * (TAIL + count) * np.log1p(np.sum(normal**2, 1) / TAIL)
+        given = given + np.log(odds[which] / odds.sum())
+        named = Numbers.of(numbers)
+        log = seen.products.log_prior[kind] + seen.log_size(named, kind)
+        log = log + np.log(named.level * named.rate * named.unit)
+        log = log + self._log_prior(named)
+        if not np.isfinite(log).any():
+            return Draws(named, np.zeros(draws), -np.inf, 0.0)
+        weight = np.exp(log - given - logsumexp(log - given))
+        grid = [row for row in peaks.free if row in (POWER, PACE)]
+        spacing = float(np.prod([np.diff(peaks.numbers[row])[0] for row in grid]))
+        whole = float(logsumexp(log - given)) - np.log(draws) + np.log(spacing)
+        return Draws(named, weight, whole, float(1 / np.sum(weight**2)))
 
 
-def drawn(seen: SeenDecay, free: list[int]) -> Draws:
-    """Draw the free numbers from their posterior; more of them where they are worth too few."""
-    seen, peaks = peaks_of(seen, free)
-    found = weighed(seen, peaks, DRAWS[0])
-    return found if found.worth >= WORTH else weighed(seen, peaks, DRAWS[1])
-
-
-def weighed(seen: SeenDecay, peaks: Peaks, draws: int, seed: int = 0) -> Draws:
-    """Draw from normal approximations, Student's tails, each draw weighed by the posterior."""
-    if not np.isfinite(peaks.log).all():
-        return Draws(Numbers.of(peaks.numbers), np.zeros(peaks.numbers.shape[1]), -np.inf, 0.0)
-    rng, free = np.random.default_rng(seed), [0, 1, 2, 4][: peaks.centre.shape[2]]
-    odds = np.exp(peaks.log - peaks.log.max()).ravel()
-    ends = np.cumsum(odds) / odds.sum()
-    which = np.minimum(np.searchsorted(ends, (np.arange(draws) + 0.5) / draws), odds.size - 1)
-    kind, at = np.unravel_index(which, peaks.log.shape)
-    size, count = np.sqrt(TAIL / rng.chisquare(TAIL, draws)), len(free)
-    normal = rng.normal(size=(draws, count)) * size[:, None]
-    root = np.linalg.cholesky(np.linalg.inv(peaks.precision))[kind, at]
-    numbers = peaks.numbers[:, at]
-    numbers[free] = (peaks.centre[kind, at] + np.einsum("dpq,dq->dp", root, normal)).T
-    given = gammaln((TAIL + count) / 2) - gammaln(TAIL / 2) - 0.5 * count * np.log(np.pi * TAIL)
-    given = given - np.log(np.einsum("dpp->dp", root)).sum(1)
-    given = given - 0.5 * (TAIL + count) * np.log1p(np.sum(normal**2, 1) / TAIL)
-    named = Numbers.of(numbers)
-    away = named.currents(seen.gas) - seen.origin
-    products = seen.products
-    beside = np.vstack([-np.ones(draws), away])
-    squares = np.empty(draws)
-    # Draws of one noise follow each other: one product of matrices.
-    ends = np.searchsorted(kind, np.arange(len(products.matrix) + 1))
-    for matrix, first, last in zip(products.matrix, ends[:-1], ends[1:], strict=True):
-        some = beside[:, first:last]
-        squares[first:last] = np.sum(some * (matrix @ some), axis=0)
-    log = products.log_prior[kind] + products.log_size(np.maximum(squares, 1e-30))
-    log = log + np.log(named.level * named.rate * named.unit) + log_prior(named.power)[0]
-    if 4 in free:
-        log = log - 0.5 * (named.drift / DRIFT) ** 2 - np.log(DRIFT * np.sqrt(2 * np.pi))
-    inside = (named.share >= seen.share[0]) & (named.share <= seen.share[1])
-    log = log - np.log(seen.share[1] - seen.share[0])
-    log = np.where(inside, log - given - np.log(odds[which] / odds.sum()), -np.inf)
-    if not inside.any():
-        return Draws(named, np.zeros(draws), -np.inf, 0.0)
-    weight = np.exp(log - logsumexp(log))
-    spacing = float(np.diff(peaks.numbers[3])[0]) if peaks.log.shape[1] > 1 else 1.0
-    whole = float(logsumexp(log)) - np.log(draws) + np.log(spacing)
-    return Draws(named, weight, whole, float(1 / np.sum(weight**2)))
+def mixed(laws: Sequence[Draws]) -> Draws:
+    """Draws of several laws, each with its probability."""
+    whole = float(logsumexp([law.log for law in laws]))
+    if not np.isfinite(whole):
+        return laws[0]
+    weight = np.concatenate([law.weight * math.exp(law.log - whole) for law in laws])
+    numbers = Numbers(*map(np.concatenate, zip(*(law.numbers for law in laws), strict=True)))
+    return Draws(numbers, weight, whole, float(1 / np.sum(weight**2)))
 
 
 def quantiles(values: np.ndarray, weight: np.ndarray, at: np.ndarray) -> np.ndarray:
@@ -422,18 +522,23 @@ def quantiles(values: np.ndarray, weight: np.ndarray, at: np.ndarray) -> np.ndar
     return np.interp(at, below, values[order])
 
 
-def quantity_of(
-    values: np.ndarray, weight: np.ndarray, unit: str, bounds: tuple[bool, bool] = (False, False)
+def quantity_of(values: np.ndarray, weight: np.ndarray, unit: str) -> Quantity:
+    """Median, half of the central 68 % and the central 95 % of weighted draws."""
+    found = quantiles(values, weight, np.array([0.5, 0.1587, 0.8413, 0.025, 0.975]))
+    middle, less, more, *interval = map(float, found)
+    return Quantity(middle, (more - less) / 2, unit, None, tuple(interval))
+
+
+def _share_of(
+    values: np.ndarray, weight: np.ndarray, unit: str, none: bool, all_: bool, whole: np.ndarray
 ) -> Quantity:
-    """Median, half of the central 68 % and the 95 % of weighted draws; where a bound below or above
-    is not excluded the interval reaches to it.
+    """A loss that is a share of a whole; the interval reaches to a bound that is not excluded: from
+    0 to the limit of 95 %, or up to the whole.
     """
-    ends = {(False, False): (0.025, 0.975), (True, False): (0.0, 0.95)}
-    ends |= {(False, True): (0.05, 0.999), (True, True): (0.0, 0.999)}
-    at = np.array([0.5, 0.1587, 0.8413, *ends[bounds]])
-    middle, less, more, low, high = map(float, quantiles(values, weight, at))
-    interval = 0.0 if bounds[0] else low, high
-    return Quantity(middle, (more - less) / 2, unit, None, interval)
+    found = quantity_of(values, weight, unit)
+    low, high = quantiles(values, weight, np.array([0.025 + 0.025 * all_, 0.975 - 0.025 * none]))
+    high = quantiles(whole, weight, np.array([0.975]))[0] if all_ else high
+    return replace(found, interval_95=(0.0 if none else float(low), float(high)))
 
 
 @dataclass(frozen=True)
@@ -452,6 +557,8 @@ class FreeLaw:
         Probability of constant a and b, at even odds with the free law.
     odd : float
         Probability that the exponent is none of a bunch's length.
+    pumped : float
+        Probability of gas that is pumped away after a fill, in the place of exponent and drift.
     """
 
     quantities: Mapping[str, Quantity]
@@ -459,14 +566,16 @@ class FreeLaw:
     drift: Quantity | None
     constant: float
     odd: float
+    pumped: float = 0.0
 
     def to_json(self) -> dict[str, object]:
         """Return the exponent, the drift and the probability of constant a and b."""
         told = {"exponent": self.exponent, "drift": self.drift}
-        return told | {"probability_of_constant_a_and_b": self.constant}
+        told |= {"probability_of_constant_a_and_b": self.constant}
+        return told | {"probability_of_outgassing": self.pumped}
 
 
-def _at_bounds(share: np.ndarray, weight: np.ndarray) -> tuple[bool, bool]:
+def at_bounds(share: np.ndarray, weight: np.ndarray) -> tuple[bool, bool]:
     """Tell if shares of 0 and of 1 are not excluded at 95 %: by the density of draws beside them
     in that of a normal distribution, two standard deviations off.
     """
@@ -509,44 +618,67 @@ def free_law(record: DecayRecord, values: Physical) -> FreeLaw | None:
     True
     """
     seen = SeenDecay.of(record, values)
-    draws = drawn(seen, [0, 1, 2, 3, 4] if seen.drifts else [0, 1, 2, 3])
+    laws = [law.drawn() for law in proposals(seen)]
+    draws, smooth = mixed(laws), laws[0]
     if draws.worth < WORTH / 4:
         return None
-    plain = drawn(seen, [0, 1, 2])
+    plain = Proposal.of(seen, CONSTANT).drawn()
     if not 0 <= values.share <= 1:
-        rival = drawn(replace(seen, share=NO_BEAM), [0, 1, 2])
+        rival = Proposal.of(replace(seen, share=NO_BEAM), CONSTANT).drawn()
         if rival.log + np.log(UNPHYSICAL) > draws.log:
             return None
-    usual, odd = log_prior(draws.numbers.power)
-    bounds = _at_bounds(draws.numbers.share, draws.weight)
-    ends = {"a": bounds, "b": bounds[::-1]}
-    found = {
-        name: quantity_of(values, draws.weight, UNITS[name], ends.get(name, (False, False)))
-        for name, values in _quoted(record, seen, draws.numbers).items()
-    }
-    power, drift = (quantity_of(values, draws.weight, "1") for values in draws.numbers[3:5])
-    return FreeLaw(
-        found, power, drift if seen.drifts else None,
-        float(1 / (1 + np.exp(draws.log - plain.log))), float(draws.weight @ np.exp(odd - usual)),
-    )  # fmt: skip
+    usual, odd = log_prior(smooth.numbers.power)
+    odd = math.exp(smooth.log - draws.log) * float(smooth.weight @ np.exp(odd - usual))
+    found = _quantities(record, seen, draws)
+    power, drift = smooth.numbers.power, smooth.numbers.drift if seen.drifts else None
+    power, drift = (v if v is None else quantity_of(v, smooth.weight, "1") for v in (power, drift))
+    constant = float(1 / (1 + np.exp(draws.log - plain.log)))
+    pumped = 1.0 - math.exp(smooth.log - draws.log)
+    return FreeLaw(found, power, drift, constant, odd, pumped)
 
 
-def rates_of(a, b, power, drift, x, seen: SeenDecay):
+def proposals(seen: SeenDecay) -> list[Proposal]:
+    """The free law, and gas that is pumped away where no gauge tells the gas."""
+    if not seen.drifts:
+        return [Proposal.of(seen, [*CONSTANT, POWER])]
+    return [
+        Proposal.of(seen, [*CONSTANT, POWER, CHANGE]),
+        Proposal.of(seen, [*CONSTANT, CHANGE, PACE]),
+    ]
+
+
+def rates_of(a, b, power, changed, x, seen: SeenDecay):
     """Loss rates at the first and last reading and at the mean current, where x are the currents at
-    the nodes; in the unit of b, and of a at the mean current.
+    the nodes; in the unit of b, and of a at the mean current. `changed` is by how much the loss to
+    gas has changed at the first reading, at the mean current and at the last one.
     """
     first, last = (
-        a * x[k] ** (1 + power) + b * pressure * (1 + drift * (NODE[k] - 0.5))
+        a * x[k] ** (1 + power) + b * pressure + changed[k]
         for k, pressure in zip((0, -1), seen.ends, strict=True)
     )
-    return first, last, a + b * (1 + drift * (seen.middle - 0.5))
+    return first, last, a + b + changed[1]
 
 
-def _quoted(record: DecayRecord, seen: SeenDecay, found: Numbers) -> dict[str, np.ndarray]:
-    """Quoted quantities, by draw."""
+def middle_of(draws: Draws, gas: np.ndarray) -> float:
+    """When the current is its mean, over the span, by the mean of draws."""
+    time = np.linspace(0.0, 1.0, 1001)
+    nodes = draws.numbers.currents(gas) @ draws.weight
+    return float(np.interp(-1.0, -(chebvander(2 * time - 1, NODES - 1) @ FROM_NODES @ nodes), time))
+
+
+def _quantities(record: DecayRecord, seen: SeenDecay, draws: Draws) -> dict[str, Quantity]:
+    """What is quoted, from draws."""
+    found, weight = draws.numbers, draws.weight
     span, mean = record.span, float(record.current.mean())
-    a, b = found.share * found.rate, (1 - found.share) * found.rate
-    rates = rates_of(a, b, found.power, found.drift, found.currents(seen.gas), seen)
-    quoted = {"i0": found.level * mean, "a": a / mean / span, "b": b / span}
-    ends = zip(("start", "end", "mean"), rates, strict=True)
-    return quoted | {f"lifetime_{at}": span / rate / HOUR for at, rate in ends}
+    whole = found.rate / mean / span, found.rate / span
+    a, b = found.share * whole[0], (1 - found.share) * whole[1]
+    moments = (0.0, middle_of(draws, seen.gas), 1.0)
+    changed = [found.gas * whole[1] * gas_change(s, found.pace) for s in moments]
+    rates = rates_of(a * mean, b, found.power, changed, found.currents(seen.gas), seen)
+    quoted = {"i0": found.level * mean}
+    quoted |= {f"lifetime_{at}": 1 / rate / HOUR for at, rate in zip(ENDS, rates, strict=True)}
+    bounds = at_bounds(found.share, weight)
+    own = {"a": (a, *bounds, whole[0]), "b": (b, *bounds[::-1], whole[1])}
+    told = {name: quantity_of(values, weight, UNITS[name]) for name, values in quoted.items()}
+    told |= {n: _share_of(v, weight, UNITS[n], *more) for n, (v, *more) in own.items()}
+    return {name: told[name] for name in UNITS}

@@ -15,18 +15,25 @@ from jax import Array
 from beamfit.errors import InputError
 from beamfit.lifetime.decay_law import Moments, beam_current
 from beamfit.lifetime.marginal import (
+    CONSTANT,
     DRIFT,
     LEAST,
     MOST,
     WORTH,
     Draws,
-    Peaks,
+    Proposal,
     SeenDecay,
+    at_bounds,
+    gas_change,
+    gas_changed,
     log_prior,
+    log_pumped,
+    log_straight,
+    middle_of,
+    mixed,
     node_currents,
-    peaks_of,
+    proposals,
     rates_of,
-    weighed,
 )
 from beamfit.noise.memory import WHITE, MemoryKind
 from beamfit.quantity import HOUR
@@ -41,18 +48,21 @@ from beamfit.sampling.target import PosteriorLaw, SamplingTarget
 from beamfit.verdict import Finding, Status, judge
 from beamfit.writing import alone
 
-UNITS = {"i0": "mA", "a": "1/(mA s)", "b": "1/s", "exponent": "1", "drift": "1"}
+UNITS = {"i0": "mA", "a": "1/(mA s)", "b": "1/s", "exponent": "1", "drift": "1", "pace": "1"}
 BOUNDS = {"i0": (0.0, np.inf), "a": (0.0, np.inf), "b": (0.0, np.inf), "exponent": (LEAST, MOST)}
+SHOWN = ("i0", "a", "b", "exponent", "drift")
 LIFETIMES = {"lifetime_start": "h", "lifetime_end": "h", "lifetime_mean": "h"}
-STATED = {"exponent": "normal about 0, 0.3 below and 0.2 above", "drift": f"normal, 0 ± {DRIFT}"}
+STATED = {"exponent": "normal about 0, 0.3 below and 0.2 above",
+          "drift": f"normal, 0 ± {DRIFT}, or that of gas that is pumped away"}  # fmt: skip
 # Draws are laid out as so many chains of so many steps; at most so many steps of proposals.
 WALKERS, STEPS, BUDGET = 16, 1024, 16384
 
 
 class DecayNumbers(NamedTuple):
-    """Numbers of dI/dt = -a I² (I/mean)^exponent - b (1 + drift (t/span - 1/2)) I.
+    """Numbers of dI/dt = -a I² (I/mean)^exponent - b (1 + drift f(t)) I.
 
-    Current at the first reading, mA, a, 1/(mA s), and b, 1/s.
+    Current at the first reading, mA, a, 1/(mA s), and b, 1/s; f is as of
+    `beamfit.lifetime.marginal.gas_change`, whose pace is 0 where the drift is a straight line.
     """
 
     i0: Array
@@ -60,6 +70,7 @@ class DecayNumbers(NamedTuple):
     b: Array
     exponent: Array = 0.0
     drift: Array = 0.0
+    pace: Array = 0.0
 
 
 class _Data(NamedTuple):
@@ -84,16 +95,13 @@ def _numbers(data: _Data, theta: Array) -> DecayNumbers:
     """Numbers that the monitor shows; theta ends with how far that is off, in stated errors."""
     more = data.moved.shape[0]
     own, shifts = theta[: theta.size - more], theta[theta.size - more :]
-    i0, a, b = own[:3]
-    shifted = jnp.stack([i0, a, b]) - shifts @ data.moved
-    exponent, drift = (own[k] if k < own.size else 0.0 for k in (3, 4))
-    return DecayNumbers(*shifted, exponent, drift)
+    return DecayNumbers(*(own[:3] - shifts @ data.moved), *own[3:])
 
 
 def _nodes(data: _Data, numbers: DecayNumbers) -> Array:
     quadratic, linear = numbers.a * data.mean * data.span, numbers.b * data.span
-    given = numbers.i0 / data.mean, quadratic, linear, numbers.exponent, numbers.drift
-    return node_currents(*given, data.gas, jnp)
+    lost = linear * (data.gas[:, None] + numbers.drift * gas_changed(numbers.pace, jnp))
+    return node_currents(numbers.i0 / data.mean, quadratic, numbers.exponent, lost, jnp)
 
 
 def _log_density(data: _Data, theta: Array) -> Array:
@@ -103,7 +111,11 @@ def _log_density(data: _Data, theta: Array) -> Array:
     squares = jnp.maximum(jnp.einsum("p,kpq,q->k", away, data.matrix, away), 1e-30)
     noises = data.log_prior - 0.5 * (data.count + data.known) * jnp.log(data.known + squares)
     rate = numbers.a * data.mean + numbers.b
-    law = log_prior(numbers.exponent, jnp)[0] - 0.5 * (numbers.drift / DRIFT) ** 2
+    share = numbers.a * data.mean / rate
+    gas, pace = (1 - share) * numbers.drift, jnp.maximum(numbers.pace, 1.0)
+    pumped = log_pumped(share, gas, pace, jnp) + jnp.log1p(-share)
+    smooth = log_prior(numbers.exponent, jnp)[0] + log_straight(numbers.drift)
+    law = jnp.where(numbers.pace > 0, pumped, smooth)
     shifts = theta[theta.size - data.moved.shape[0] :]
     inside = (numbers.a >= 0) & (numbers.b >= 0)
     log = jax.scipy.special.logsumexp(noises) + law - jnp.log(rate) - 0.5 * jnp.sum(shifts**2)
@@ -112,9 +124,11 @@ def _log_density(data: _Data, theta: Array) -> Array:
 
 def _derived(data: _Data, theta: Array) -> Array:
     """Lifetimes at the first and last reading and at the mean current, h."""
-    i0, a, b, power, drift = DecayNumbers(*theta[:3], *_numbers(data, theta)[3:])
-    x = _nodes(data, DecayNumbers(i0, a, b, power, drift))[:, 0]
-    return 1.0 / HOUR / jnp.stack(rates_of(a * data.mean, b, power, drift, x, data))
+    n = _built(data, theta)
+    moments = (0.0, data.middle, 1.0)
+    changed = [n.b * n.drift * gas_change(s, n.pace, jnp) for s in moments]
+    rates = rates_of(n.a * data.mean, n.b, n.exponent, changed, _nodes(data, n)[:, 0], data)
+    return 1.0 / HOUR / jnp.stack(rates)
 
 
 def _no_residual(data: _Data, theta: Array) -> tuple[Array]:
@@ -129,49 +143,52 @@ DENSITY = PosteriorLaw(_no_residual, _log_density, _derived, _built)
 
 
 class _Prepared(NamedTuple):
-    """A fit made ready: its normal approximations, and shifts of I0, a and b by the monitor."""
+    """A fit made ready: its laws, and shifts of I0, a and b by the monitor."""
 
     fit: Any
     seen: SeenDecay
-    peaks: Peaks
+    laws: list[Proposal]
     moved: np.ndarray
 
     @classmethod
     def of(cls, fit) -> _Prepared:
         """With the law of the fit, and where a and b are constant its noise."""
-        about, free = fit.about, [0, 1, 2]
+        about = fit.about
         seen = SeenDecay.of(fit.readings, about.values)
-        if fit.free_law is not None:
-            free = [0, 1, 2, 3, 4] if seen.drifts else [0, 1, 2, 3]
-        elif fit.correlation_time is None:
+        if fit.free_law is None and fit.correlation_time is None:
             white = [kind == MemoryKind(WHITE) for kind in seen.products.kinds]
             seen = seen.of_noises(np.array(white))
+        laws = [Proposal.of(seen, CONSTANT)] if fit.free_law is None else proposals(seen)
         moved = [about.moved(change)[:3] for change in about.pieces.monitor_changes]
-        return cls(fit, *peaks_of(seen, free), np.reshape(moved, (-1, 3)))
+        return cls(fit, seen, laws, np.reshape(moved, (-1, 3)))
 
     @property
     def names(self) -> tuple[str, ...]:
         """Numbers that are drawn."""
-        law = self.peaks.centre.shape[2] + (self.peaks.log.shape[1] > 1)
+        law = max(max(one.peaks.free) for one in self.laws) + 1
         return *list(UNITS)[:law], *(f"monitor_{k + 1}" for k in range(len(self.moved)))
+
+    def draws(self, number: int, seed: int = 0) -> Draws:
+        """Draw so many numbers from each law."""
+        return mixed([law.weighed(number, seed) for law in self.laws])
 
     def thetas(self, draws: Draws, rng: np.random.Generator) -> np.ndarray:
         """Draws as numbers of the target."""
         found, span, mean = draws.numbers, self.fit.readings.span, self.fit.readings.current.mean()
         a, b = found.share * found.rate / mean / span, (1 - found.share) * found.rate / span
-        own = np.column_stack([found.level * mean, a, b, found.power, found.drift])
+        own = np.column_stack([found.level * mean, a, b, found.power, found.drift, found.pace])
         shifts = rng.normal(size=(len(own), len(self.moved)))
         own[:, :3] += shifts @ self.moved
         return np.hstack([own[:, : len(self.names) - len(self.moved)], shifts])
 
     def target(self, priors: Mapping[str, Distribution]) -> SamplingTarget:
         """State the posterior."""
-        fit, seen, draws = self.fit, self.seen, weighed(self.seen, self.peaks, STEPS * WALKERS)
+        fit, seen, draws = self.fit, self.seen, self.draws(STEPS * WALKERS)
         record, thetas = fit.readings, self.thetas(draws, np.random.default_rng(0))
         products, count = seen.products, len(self.names)
         data = _Data(
             products.matrix, products.log_prior, products.count, products.known,
-            seen.origin[:, 0], seen.gas, np.array(seen.ends), seen.middle,
+            seen.origin[:, 0], seen.gas, np.array(seen.ends), middle_of(draws, seen.gas),
             record.current.mean(), record.span, self.moved,
         )  # fmt: skip
         lower, upper = np.array([BOUNDS.get(name, (-np.inf, np.inf)) for name in self.names]).T
@@ -184,9 +201,18 @@ class _Prepared(NamedTuple):
             np.cov(thetas.T, aweights=draws.weight).reshape(count, count),
             groups=(NoiseGroup("", "averaged"),), priors=checked(priors, self.names),
             derived=LIFETIMES, observed=_observed(fit), priors_own=held,
-            verdict=Finding(fit.status, fit.message), hidden=self.names[count - len(self.moved):],
+            verdict=Finding(fit.status, fit.message), reaching=_reaching(draws),
+            hidden=tuple(name for name in self.names if name not in SHOWN),
             stated={name: STATED[name] for name in self.names if name in STATED},
         )  # fmt: skip
+
+
+def _reaching(draws: Draws) -> dict[str, tuple[float, float]]:
+    """Ends of the 95 % of a and b that reach to a bound, as the fit quotes them."""
+    none, all_ = at_bounds(draws.numbers.share, draws.weight)
+    ends = {"a": (none, all_), "b": (all_, none)}
+    return {name: (0.0 if low else 0.025 + 0.025 * high, 0.999 if high else 0.975 - 0.025 * low)
+            for name, (low, high) in ends.items() if low or high}  # fmt: skip
 
 
 def _observed(fit) -> dict[str, np.ndarray]:
@@ -243,7 +269,7 @@ def sampled(
         return _refused(said, seed)
     with np.errstate(all="ignore"):
         ready = _Prepared.of(fit)
-        if not weighed(ready.seen, ready.peaks, STEPS).worth > 0:
+        if not ready.draws(STEPS).worth > 0:
             return _refused(
                 f"no a and b that are not negative fit; {fit.message}".rstrip("."), seed
             )
@@ -273,7 +299,7 @@ def _chains(ready: _Prepared, target: SamplingTarget, seed: int, target_ess: flo
     steps = STEPS
     while True:
         rng = np.random.default_rng(seed)
-        draws = weighed(ready.seen, ready.peaks, steps * WALKERS, seed)
+        draws = ready.draws(steps * WALKERS, seed)
         thetas, weight = ready.thetas(draws, rng), draws.weight
         weight = weight * ((thetas >= target.lower) & (thetas <= target.upper)).all(axis=1)
         for name, prior in target.priors.items():
@@ -323,10 +349,18 @@ def expected_current(posterior: Posterior, fit) -> Expected:
     shown = posterior.target.each(lambda data, theta: jnp.stack(_numbers(data, theta)),
                                   posterior.thinned())  # fmt: skip
     draws = np.empty((len(shown), len(record)))
-    for row, (i0, a, b, power, drift) in zip(draws, shown, strict=True):
-        quadratic, linear = a * mean * span, b * span
-        law = quadratic + linear, quadratic, power, linear * drift, 0.0
-        row[:] = mean * beam_current(i0 / mean, law, at, "drift")
+    for row, (i0, a, b, power, drift, pace) in zip(draws, shown, strict=True):
+        quadratic, linear, kind, further = (
+            a * mean * span,
+            b * span,
+            "drift",
+            (b * span * drift, 0.0),
+        )
+        if pace > 0:
+            kind, further = "relaxing", (linear * drift / np.expm1(-pace), 1 / pace)
+            linear = linear * (1 + drift / pace)
+        law = quadratic + linear, quadratic, power, *further
+        row[:] = mean * beam_current(i0 / mean, law, at, kind)
     error = (
         fit.noise if record.error is None else record.error * max(1, (fit.chi2 / fit.dof) ** 0.5)
     )

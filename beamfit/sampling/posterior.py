@@ -69,7 +69,7 @@ class Interval(NamedTuple):
 
 
 class Summary(NamedTuple):
-    """A number with its quantiles at 2.5, 16, 50, 84 and 97.5 %.
+    """A number with the ends of its 95 and 68 % and its median, in order.
 
     `doubt` says in a word or two why no interval may be quoted; empty where one may.
     """
@@ -285,12 +285,20 @@ class Posterior:
             return Quantity(mean, None, unit)
         return Quantity(mean, 0.5 * (other - one), unit, interval_95=(low, high))
 
-    def quantiles(self, name: str, probabilities: Sequence[float] = QUANTILES) -> np.ndarray:
-        """Quantiles of a number; NaN where nothing was sampled."""
-        values = self.values(name)
+    def quantiles(self, name: str, probabilities: Sequence[float] | None = None) -> np.ndarray:
+        """Quantiles of a number; NaN where nothing was sampled. By default the median and the ends
+        of 68 and 95 %, which reach to a bound that is not excluded.
+        """
+        values, ends = self.values(name), (QUANTILES[0], QUANTILES[-1])
+        if probabilities is None:
+            ends = self.target.reaching.get(name, ends)
+            probabilities = (ends[0], *QUANTILES[1:-1], ends[1])
         if not values.size:
             return np.full(len(probabilities), np.nan)
-        return np.quantile(values, probabilities)
+        found = np.quantile(values, probabilities)
+        if name in self.target.reaching and not ends[0]:
+            found[0] = self.target.lower[self.names.index(name)]
+        return found
 
     def interval(self, name: str, probability: float = ONE_SIGMA) -> Interval:
         """Median and central credible interval of a number."""

@@ -121,6 +121,9 @@ class SamplingTarget:
         Which group's noise widens each of the law's numbers; the first if empty.
     block_of : tuple of int
         Which of the law's numbers are proposed together; all if empty.
+    reaching : mapping of str to (float, float)
+        Probabilities at the ends of the 95 % interval of numbers whose bounds are not excluded; a
+        probability of 0 stands for the lower bound.
 
     Examples
     --------
@@ -158,6 +161,7 @@ class SamplingTarget:
     stated: Mapping[str, str] = field(default_factory=dict)
     group_of: tuple[int, ...] = ()
     block_of: tuple[int, ...] = ()
+    reaching: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         pairs = zip(self.groups, self.noise, strict=True)

@@ -12,7 +12,7 @@ from beamfit.lifetime.cycles import find_cycles
 from beamfit.lifetime.expansion import Pieces, solved
 from beamfit.lifetime.fit import fit_cycles, fit_decay, fit_decays
 from beamfit.lifetime.lifetime_table import fit_lifetimes
-from beamfit.lifetime.marginal import NODE, Numbers, SeenDecay, drawn, quantiles
+from beamfit.lifetime.marginal import CONSTANT, NODE, Numbers, Proposal, SeenDecay, quantiles
 from beamfit.lifetime.record import Conditions, DecayRecord, LifetimeTable
 from beamfit.lifetime.study import study_record
 from tests.simulations import simulations
@@ -36,18 +36,23 @@ def record(seed, noise=0.3, stated=None, **given):
 
 
 @pytest.mark.parametrize(
-    ("share", "power", "drift"), [(0.4, 0.0, 0.0), (0.7, -1 / 3, 0.1), (0.2, 0.3, -0.2)]
+    ("power", "change", "pace"),
+    [(0.0, 0.0, 0.0), (-1 / 3, 0.1, 0.0), (0.3, -0.2, 0.0), (0.0, -0.8, 1.0), (0.0, -1.5, 10.0)],
 )
-def test_the_closed_form_is_the_integrated_law(share, power, drift):
+def test_the_closed_form_is_the_integrated_law(power, change, pace):
+    """Gas that is pumped away falls as exp(-pace s), by `change` of the whole loss."""
     rate, level = 1.3, 1.4
-    bend = share * (1 + power) - (1 - share) * drift / rate
-    found = np.array([[np.log(level)], [np.log(rate)], [bend], [power], [drift]])
+    found = np.array([[np.log(level)], [np.log(rate)], [0.4], [power], [change], [pace]])
+    share = Numbers.of(found).share[0]
+    change *= 1.0 if pace else 1 - share
 
     def slope(s, x):
-        return -(share * rate * x**power * x + (1 - share) * rate * (1 + drift * (s - 0.5))) * x
+        course = 1 / pace - np.exp(-pace * s) / (1 - np.exp(-pace)) if pace else s - 0.5
+        return -rate * (share * x**power * x + 1 - share + change * course) * x
 
     true = solve_ivp(slope, (0, 1), [level], t_eval=NODE, rtol=1e-12, atol=1e-12).y[0]
-    np.testing.assert_allclose(Numbers.of(found).currents(NODE)[:, 0], true, rtol=1e-9)
+    rtol = 1e-9 if pace < 5 else 1e-6  # 14 nodes of a fast course
+    np.testing.assert_allclose(Numbers.of(found).currents(NODE)[:, 0], true, rtol=rtol)
 
 
 @simulations(4, 12)
@@ -69,11 +74,33 @@ def test_intervals_hold_the_truth_whatever_the_law(given, count):
     assert held["constant"] >= count - 2 if not given else held["constant"] <= max(1, count / 6)
 
 
+@simulations(4, 12)
+def test_gas_that_is_pumped_away_is_left_open(count):
+    """It looks like a larger a: with an exponent and a drift alone a is up to 20 errors off."""
+    held = 0
+    for seed in range(count):
+        time = np.linspace(0.0, 10 * HOUR, 300)
+
+        def slope(t, i, fill=0.35 * 10 * HOUR):
+            return -(A * i + B * (1 + 1.2 * np.exp(-t / fill))) * i
+
+        beam = solve_ivp(slope, (0, time[-1]), [I0], t_eval=time, rtol=1e-11, atol=1e-10).y[0]
+        off = np.random.default_rng(seed).normal(size=time.size)
+        fit = fit_decay(DecayRecord(time, beam + 0.1 * off))
+        if fit.outgassing is None:
+            low, high = fit.a.interval_95
+            held += low <= A <= high
+            assert fit.free_law.pumped > 0.025
+        else:
+            held += abs(fit.outgassing.a.value - A) < 3 * fit.outgassing.a.error
+    assert held >= count - 1
+
+
 def test_the_draws_are_those_of_the_posterior():
     """With constant a and b against a grid of the exact law in white noise."""
     one = record(3, noise=3.0)
     values = solved(Pieces.of(one)).values
-    draws = drawn(SeenDecay.of(one, values), [0, 1, 2])
+    draws = Proposal.of(SeenDecay.of(one, values), CONSTANT).drawn()
     time, rates, shares = one.time, np.linspace(0.97, 1.03, 61), np.linspace(0.0, 1.0, 81)
     unit, mean, log = float(values.rate_mean), float(one.current.mean()), np.zeros((61, 81))
     for j, rate in enumerate(rates * unit):
