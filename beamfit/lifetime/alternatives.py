@@ -337,7 +337,8 @@ def _averaged(pieces: Pieces) -> Pieces:
     if pieces.time.size <= ENOUGH or pieces.first.size > 1 or pieces.gauge is not None:
         return pieces
     record = DecayRecord(pieces.time, pieces.current, pieces.error, monitor=pieces.monitor)
-    return Pieces.of(DecayRecord(*record.blocks(ENOUGH), monitor=pieces.monitor))
+    means = record.means(-(-len(record) // ENOUGH))
+    return Pieces.of(DecayRecord(*means, monitor=pieces.monitor))
 
 
 def _likely(plain: Expansion, best: Mapping[str, _Further]) -> list[str]:

@@ -403,16 +403,14 @@ NEXT = 9
 
 def averaged(cycles: Sequence[DecayRecord]) -> Pieces:
     """All readings, in time; of very many the means of neighbours within a cycle."""
-    total = sum(map(len, cycles))
-    fewer = max(1.0, total / MOST)
+    size = -(-sum(map(len, cycles)) // MOST)
     begin, place, parts = 0.0, 0, []
     known = all(cycle.start is not None for cycle in cycles)
     for cycle in cycles:
         begin = cycle.start if known else begin
-        blocks = min(len(cycle), max(FEWEST_READINGS, round(len(cycle) / fewer)))
-        time, current, error = cycle.blocks(blocks)
+        time, current, error = cycle.means(min(size, len(cycle) // FEWEST_READINGS))
         parts.append((begin + time, time - time[0], current, error, place))
-        place += blocks
+        place += time.size
         begin += 2 * cycle.span  # nobody said when: as if a cycle were missing in between
     time, since, current, errors, first = zip(*parts, strict=True)
     given = all(error is not None for error in errors)

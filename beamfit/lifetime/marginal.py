@@ -241,15 +241,14 @@ class SeenDecay:
             slope = np.diff(record.gauge) / np.diff(record.time)
             ends = float(slope[0]), float(slope[-1])
             current = current * np.exp((1 - share) * rate * bumps)
-        stated = error is not None
-        if len(record) > ENOUGH:  # readings whose errors nobody states have all the same
-            alike = error if stated else np.full(len(record), mean)
-            time, current, error = DecayRecord(time, current, alike).blocks(ENOUGH)
+        if len(record) > ENOUGH:
+            size = -(-len(record) // ENOUGH)
+            time, current, error = DecayRecord(time, current, error).means(size)
         origin = Numbers.of(start).currents(gas)
         sees = chebvander(2 * time / span - 1, NODES - 1) @ FROM_NODES
         rows = np.column_stack([current / mean - sees @ origin[:, 0], sees])
         rows = rows if error is None else rows * (mean / error)[:, None]
-        products = Products.of(rows, time, stated)
+        products = Products.of(rows, time, error is not None)
         return cls(products, start, origin, gas, ends, record.gauge is None)
 
     def of_noises(self, kept: np.ndarray) -> SeenDecay:

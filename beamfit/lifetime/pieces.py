@@ -137,7 +137,7 @@ def _saturated(current: np.ndarray) -> np.ndarray:
 def _flattened(time: np.ndarray, current: np.ndarray) -> np.ndarray:
     """The readings without their decay: level, but for noise, steps and spikes."""
     interval = np.diff(time)
-    slope = median_filter(np.diff(current) / interval, WINDOW, mode="nearest")
+    slope = median_filter(np.diff(current) / interval, WINDOW, mode="mirror")
     return current - np.concatenate([[0.0], np.cumsum(slope * interval)])
 
 

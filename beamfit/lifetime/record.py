@@ -393,14 +393,24 @@ class DecayRecord:
         parts = np.diff(self.time) * (values[1:] + values[:-1]) / 2
         return np.concatenate([[0.0], np.cumsum(parts)])
 
-    def blocks(self, number: int) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-        """Time, current and its error as means of neighbouring readings, in so many blocks."""
-        first = np.linspace(0, len(self), number, endpoint=False).astype(int)
-        count = np.diff(first, append=len(self))
-        time, current = (np.add.reduceat(v, first) / count for v in (self.time, self.current))
+    def means(self, size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+        """Time, current and its error as means of so many neighbours; readings that do not fill a
+        last block are left out.
+
+        Examples
+        --------
+        >>> DecayRecord(np.arange(7.0), np.full(7, 100.0)).means(3)[0].tolist()
+        [1.0, 4.0]
+        """
+        whole = len(self) // size * size
+
+        def mean(values: np.ndarray) -> np.ndarray:
+            return values[:whole].reshape(-1, size).mean(axis=1)
+
+        time, current = mean(self.time), mean(self.current)
         if self.error is None:
             return time, current, None
-        return time, current, np.sqrt(np.add.reduceat(self.error**2, first)) / count
+        return time, current, np.sqrt(mean(self.error**2) / size)
 
     def select(self, rows: np.ndarray | slice, name: str | None = None) -> DecayRecord:
         """Take some of the readings.
