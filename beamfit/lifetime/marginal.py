@@ -276,13 +276,13 @@ class SeenDecay:
 
 
 class Peaks(NamedTuple):
-    """Normal approximations by noise (k) and place (m): centre, scaled triangle of the inverse
+    """Normal approximations by noise (k) and place (m): centre, lower triangle of the inverse
     covariance, log of the integral; numbers (6, m) about which the last step was taken, and those
     of them that are free.
     """
 
     centre: np.ndarray
-    precision: np.ndarray
+    lower: np.ndarray
     log: np.ndarray
     numbers: np.ndarray
     free: list[int]
@@ -368,8 +368,8 @@ def _expanded(seen: SeenDecay, numbers: np.ndarray, free: list[int]) -> Peaks:
     if np.any(numbers[PACE]):  # gas that is pumped away gets less
         own = np.broadcast_to(np.eye(len(free))[-1][:, None, None], of_share[:, None].shape)
         log = log + _log_within((-np.inf, 0.0), centre[-1], _spread(lower, own))
-    centre, precision = np.moveaxis(centre, 0, 2), np.moveaxis(precision, (0, 1), (2, 3))
-    return Peaks(centre, precision, log, numbers, free)
+    centre, lower = np.moveaxis(centre, 0, 2), np.moveaxis(lower, (0, 1), (2, 3))
+    return Peaks(centre, lower, log, numbers, free)
 
 
 def _searched(seen: SeenDecay, numbers: np.ndarray, free: list[int]) -> tuple[SeenDecay, Peaks]:
@@ -389,7 +389,7 @@ def _searched(seen: SeenDecay, numbers: np.ndarray, free: list[int]) -> tuple[Se
         numbers[CHANGE] = np.clip(numbers[CHANGE], *ends)
         named = Numbers.of(numbers)
         numbers[BEND] += (np.clip(named.share, -1.0, 2.0) - named.share) / named.unit
-        spread = 1 / np.sqrt(np.einsum("km,kmpp->pm", weight, found.precision))
+        spread = 1 / np.sqrt(np.einsum("km,kmpq->pm", weight, found.lower**2))
         rests = np.all(np.abs(step) < 0.03 * spread + 1e-9, axis=0)
         if rests.all():
             break
@@ -477,7 +477,7 @@ class Proposal(NamedTuple):
         normal = (
             rng.normal(size=(draws, count)) * np.sqrt(TAIL / rng.chisquare(TAIL, draws))[:, None]
         )
-        root = np.linalg.cholesky(np.linalg.inv(peaks.precision))[kind, at]
+        root = np.swapaxes(np.linalg.inv(peaks.lower), 2, 3)[kind, at]
         numbers = peaks.numbers[:, at]
         rows = [row for row in peaks.free if row not in (POWER, PACE)]
         numbers[rows] = (peaks.centre[kind, at] + np.einsum("dpq,dq->dp", root, normal)).T
