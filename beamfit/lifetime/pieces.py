@@ -136,9 +136,13 @@ def _saturated(current: np.ndarray) -> np.ndarray:
 
 def _flattened(time: np.ndarray, current: np.ndarray) -> np.ndarray:
     """The readings without their decay: level, but for noise, steps and spikes."""
-    interval = np.diff(time)
-    slope = median_filter(np.diff(current) / interval, WINDOW, mode="mirror")
-    return current - np.concatenate([[0.0], np.cumsum(slope * interval)])
+    interval, level = np.diff(time), current.copy()
+    lost = np.diff(current)
+    lost /= interval
+    lost = median_filter(lost, WINDOW, mode="mirror")
+    lost *= interval
+    level[1:] -= np.cumsum(lost, out=lost)  # in place: of 1e7 readings each copy is 80 MB
+    return level
 
 
 def _spikes(time: np.ndarray, current: np.ndarray, noise: float) -> np.ndarray:
@@ -192,11 +196,13 @@ def beam_readings(record: DecayRecord, spikes: bool = True) -> tuple[np.ndarray,
 
 def _steps(time: np.ndarray, current: np.ndarray, noise: float) -> np.ndarray:
     """Change from each reading to the next beyond what the decay around it explains, or zero."""
-    change = np.diff(current)
-    excess = np.diff(_flattened(time, current))
-    usual = 1.4826 * np.median(np.abs(excess))
-    allowed = THRESHOLD * max(usual, np.sqrt(2) * noise) + 0.5 * np.abs(change - excess)
-    return np.where(np.abs(excess) > allowed, change, 0.0)
+    excess, change = np.diff(_flattened(time, current)), np.diff(current)
+    allowed = np.abs(change - excess)
+    allowed *= 0.5
+    np.abs(excess, out=excess)
+    allowed += THRESHOLD * max(1.4826 * np.median(excess), np.sqrt(2) * noise)
+    change[excess <= allowed] = 0.0
+    return change
 
 
 def _highest(smooth: np.ndarray, low: float, noise: float) -> int:
