@@ -48,9 +48,10 @@ PLACES, RANGES, STEPS = 33, 5, 6
 PACES = (1.0, 10.0)
 # Readings beyond which neighbours are averaged: the curve is smooth between them.
 ENOUGH = 1024
-# Draws at first and again where they are worth too few, the degrees of freedom of what they come
-# from, and how many independent ones an answer needs.
-DRAWS, TAIL, WORTH = (6000, 60000), 8.0, 200.0
+# Draws of the law that is quoted and of its rivals, and how many times as many where they are worth
+# too few; the degrees of freedom of what they come from, and how many independent ones an answer
+# needs.
+DRAWS, FEW, AGAIN, TAIL, WORTH = 6000, 1500, 10, 8.0, 200.0
 # Width of the share in what draws come from, which its bounds cut off otherwise.
 AROUND = 0.6
 # Where the record's bend would not depend on the share its coordinate goes over to this slope.
@@ -155,7 +156,8 @@ class Numbers(NamedTuple):
 
     def currents(self, gas: np.ndarray) -> np.ndarray:
         """Currents at the nodes over the mean, one column a set; `gas` is ∫ P dt over the mean."""
-        lost = (1 - self.share) * gas[:, None] + self.gas * gas_changed(self.pace)
+        changed = gas_changed(self.pace if np.any(self.pace) else np.zeros(1))
+        lost = (1 - self.share) * gas[:, None] + self.gas * changed
         return node_currents(self.level, self.share * self.rate, self.power, self.rate * lost)
 
 
@@ -249,7 +251,16 @@ class SeenDecay:
         rows = np.column_stack([current / mean - sees @ origin[:, 0], sees])
         rows = rows if error is None else rows * (mean / error)[:, None]
         products = Products.of(rows, time, error is not None)
-        return cls(products, start, origin, gas, ends, record.gauge is None)
+        return cls(products, start, origin, gas, ends, record.gauge is None).without_hopeless()
+
+    def without_hopeless(self) -> SeenDecay:
+        """Leave out noises in which no smooth curve is as likely as this one in another."""
+        along, matrix = self.products.matrix[:, 1:, :1], self.products.matrix[:, 1:, 1:]
+        known = LEAST_LEFT * np.trace(matrix, axis1=1, axis2=2)[:, None, None] * np.eye(NODES)
+        explained = np.sum(along * np.linalg.solve(matrix + known, along), axis=(1, 2))
+        least = np.maximum(self.products.matrix[:, 0, 0] - explained, 1e-30)
+        best = self.products.log_prior + self.products.log_size(least)
+        return self.of_noises(best > self.products.log_likelihood().max() - 2 * FAR)
 
     def of_noises(self, kept: np.ndarray) -> SeenDecay:
         """The same with some of the noises."""
@@ -459,10 +470,10 @@ class Proposal(NamedTuple):
         log = log + log_prior(numbers.power)[0] if POWER in free else log
         return log + log_straight(numbers.drift) if CHANGE in free else log
 
-    def drawn(self, least: float = WORTH) -> Draws:
+    def drawn(self, draws: int = DRAWS) -> Draws:
         """Draws of the posterior; more of them where they are worth too few."""
-        found = self.weighed(DRAWS[0])
-        return found if found.worth >= least else self.weighed(DRAWS[1])
+        found = self.weighed(draws)
+        return found if found.worth >= WORTH else self.weighed(AGAIN * draws)
 
     def weighed(self, draws: int, seed: int = 0) -> Draws:
         """Draw from the normal approximations, Student's tails, each weighed by the posterior."""
@@ -617,13 +628,14 @@ def free_law(record: DecayRecord, values: Physical) -> FreeLaw | None:
     True
     """
     seen = SeenDecay.of(record, values)
-    laws = [law.drawn() for law in proposals(seen)]
+    quoted, *others = proposals(seen)
+    laws = [quoted.drawn(), *(law.drawn(FEW) for law in others)]
     draws, smooth = mixed(laws), laws[0]
     if draws.worth < WORTH / 4:
         return None
-    plain = Proposal.of(seen, CONSTANT).drawn()
+    plain = Proposal.of(seen, CONSTANT).drawn(FEW)
     if not 0 <= values.share <= 1:
-        rival = Proposal.of(replace(seen, share=NO_BEAM), CONSTANT).drawn()
+        rival = Proposal.of(replace(seen, share=NO_BEAM), CONSTANT).drawn(FEW)
         if rival.log + np.log(UNPHYSICAL) > draws.log:
             return None
     usual, odd = log_prior(smooth.numbers.power)
@@ -658,10 +670,9 @@ def rates_of(a, b, power, changed, x, seen: SeenDecay):
     return first, last, a + b + changed[1]
 
 
-def middle_of(draws: Draws, gas: np.ndarray) -> float:
-    """When the current is its mean, over the span, by the mean of draws."""
-    time = np.linspace(0.0, 1.0, 1001)
-    nodes = draws.numbers.currents(gas) @ draws.weight
+def middle_of(currents: np.ndarray, weight: np.ndarray) -> float:
+    """When the current is its mean, over the span, by the mean of draws at the nodes."""
+    time, nodes = np.linspace(0.0, 1.0, 1001), currents @ weight
     return float(np.interp(-1.0, -(chebvander(2 * time - 1, NODES - 1) @ FROM_NODES @ nodes), time))
 
 
@@ -671,9 +682,10 @@ def _quantities(record: DecayRecord, seen: SeenDecay, draws: Draws) -> dict[str,
     span, mean = record.span, float(record.current.mean())
     whole = found.rate / mean / span, found.rate / span
     a, b = found.share * whole[0], (1 - found.share) * whole[1]
-    moments = (0.0, middle_of(draws, seen.gas), 1.0)
+    currents = found.currents(seen.gas)
+    moments = (0.0, middle_of(currents, weight), 1.0)
     changed = [found.gas * whole[1] * gas_change(s, found.pace) for s in moments]
-    rates = rates_of(a * mean, b, found.power, changed, found.currents(seen.gas), seen)
+    rates = rates_of(a * mean, b, found.power, changed, currents, seen)
     quoted = {"i0": found.level * mean}
     quoted |= {f"lifetime_{at}": 1 / rate / HOUR for at, rate in zip(ENDS, rates, strict=True)}
     bounds = at_bounds(found.share, weight)

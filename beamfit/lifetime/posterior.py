@@ -188,7 +188,8 @@ class _Prepared(NamedTuple):
         products, count = seen.products, len(self.names)
         data = _Data(
             products.matrix, products.log_prior, products.count, products.known,
-            seen.origin[:, 0], seen.gas, np.array(seen.ends), middle_of(draws, seen.gas),
+            seen.origin[:, 0], seen.gas, np.array(seen.ends),
+            middle_of(draws.numbers.currents(seen.gas), draws.weight),
             record.current.mean(), record.span, self.moved,
         )  # fmt: skip
         lower, upper = np.array([BOUNDS.get(name, (-np.inf, np.inf)) for name in self.names]).T
