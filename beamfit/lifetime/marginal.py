@@ -51,7 +51,7 @@ ENOUGH = 1024
 # Draws of the law that is quoted and of its rivals, and how many times as many where they are worth
 # too few; the degrees of freedom of what they come from, and how many independent ones an answer
 # needs.
-DRAWS, FEW, AGAIN, TAIL, WORTH = 6000, 1500, 10, 8.0, 200.0
+DRAWS, FEW, AGAIN, TAIL, WORTH = 6000, 3000, 10, 8.0, 200.0
 # Width of the share in what draws come from, which its bounds cut off otherwise.
 AROUND = 0.6
 # Where the record's bend would not depend on the share its coordinate goes over to this slope.
