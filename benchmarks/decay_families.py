@@ -75,6 +75,12 @@ def drift(change: float) -> Course:
     return lambda random: lambda s: 1 + change * (s - 0.5)
 
 
+def pumped(random: np.random.Generator) -> Callable[[np.ndarray], np.ndarray]:
+    """The vacuum after a fill gets better: b falls to between a third and a half."""
+    fast = random.uniform(2.0, 6.0)
+    return lambda s: (1 + np.exp(-fast * s)) / 1.5
+
+
 def noise_of(kind: str, count: int, random: np.random.Generator) -> np.ndarray:
     """Noise of variance 1."""
     if kind == "white":
@@ -177,6 +183,7 @@ FAMILIES: dict[str, Callable[[np.random.Generator], Case]] = {
     "a as I^0.3": lambda r: decay(Decay(exponent=0.3), r),
     "b rises by 10 %": lambda r: decay(Decay(of_b=drift(0.1)), r),
     "b falls by 10 %": lambda r: decay(Decay(of_b=drift(-0.1)), r),
+    "gas is pumped away": lambda r: decay(Decay(of_b=pumped), r),
     "correlated, 0.6-0.98": lambda r: decay(Decay(noise="correlated"), r),
     "correlated, errors stated": lambda r: decay(Decay(noise="correlated", stated=1.0), r),
     "1/f": lambda r: decay(Decay(noise="1/f"), r),

@@ -11,7 +11,7 @@ from collections.abc import Callable
 import numpy as np
 from scipy.signal import lfilter
 
-from ..decay_families import FAMILIES, START, Case, Decay, decay, noise_of, top_up
+from ..decay_families import FAMILIES, START, Case, Decay, decay, noise_of, pumped, top_up
 
 Draw = Callable[[np.random.Generator], Case]
 TOO_SHORT = (2e-4, 2e-3)  # lifetimes in a minute or so
@@ -33,12 +33,6 @@ def nothing(noise: str) -> Draw:
         return case._replace(law=lambda current: (np.nan, math.inf))
 
     return drawn
-
-
-def pumped(random):
-    """The vacuum after a fill gets better: b falls to between a third and a half."""
-    fast = random.uniform(2.0, 6.0)
-    return lambda s: (1 + np.exp(-fast * s)) / 1.5
 
 
 def bursts(random):
