@@ -16,6 +16,15 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.special import logsumexp, ndtri
 
+from beamfit.lifetime.departures import (
+    ABOVE,
+    BELOW,
+    DRIFT,
+    OUTGASSING,
+    SIZES,
+    SMOOTH,
+    TIMES,
+)
 from beamfit.lifetime.expansion import (
     DETERMINED,
     FURTHER,
@@ -29,16 +38,7 @@ from beamfit.lifetime.expansion import (
     lifetime_of,
     solved,
 )
-from beamfit.lifetime.marginal import (
-    ABOVE,
-    BELOW,
-    DRIFT,
-    ENOUGH,
-    OUTGASSING,
-    SIZES,
-    SMOOTH,
-    TIMES,
-)
+from beamfit.lifetime.marginal import ENOUGH
 from beamfit.lifetime.record import DecayRecord
 from beamfit.noise.memory import Products
 from beamfit.quantity import HOUR, Quantity

@@ -13,6 +13,7 @@ import numpy as np
 from scipy.ndimage import maximum_filter1d, median_filter
 from scipy.special import logsumexp, ndtr
 
+from beamfit.lifetime.departures import BELOW
 from beamfit.lifetime.expansion import (
     LOSS,
     POWER,
@@ -22,7 +23,6 @@ from beamfit.lifetime.expansion import (
     Pieces,
     solved,
 )
-from beamfit.lifetime.marginal import BELOW
 from beamfit.lifetime.pieces import Event, Split, beam_readings, event_of, split_record
 from beamfit.lifetime.record import Conditions, DecayRecord
 

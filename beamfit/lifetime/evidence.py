@@ -19,8 +19,9 @@ from beamfit.lifetime.alternatives import (
     lifetime_law,
     rival_of,
 )
+from beamfit.lifetime.departures import BELOW, Law
 from beamfit.lifetime.expansion import DETERMINED, LOSS, POWER, Expansion, Physical, lifetime_of
-from beamfit.lifetime.marginal import BELOW, UNITS, FreeLaw, Law, free_law
+from beamfit.lifetime.marginal import ENDS, UNITS, FreeLaw, free_law
 from beamfit.lifetime.record import DecayRecord
 from beamfit.noise.memory import CLOSE, Products
 from beamfit.quantity import HOUR, Quantity
@@ -28,7 +29,6 @@ from beamfit.shown import shown
 from beamfit.table import json_of
 from beamfit.verdict import Status
 
-ENDS = ("start", "end", "mean")
 # The share of a in the loss lies between 0 and 1: known to 0.2, the record tells pure Touschek
 # from pure gas at five standard deviations; known worse, a and b are one number.
 SEPARABLE = 0.2

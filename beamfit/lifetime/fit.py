@@ -14,9 +14,10 @@ from beamfit.errors import InputError, expect
 from beamfit.lifetime.alternatives import Change, ConstantA, LifetimeLaw, Outgassing, SuddenLoss
 from beamfit.lifetime.answer import finding_of, finding_of_cycles
 from beamfit.lifetime.cycles import FEWEST_CYCLES, FEWEST_READINGS, averaged, cleaned
+from beamfit.lifetime.departures import Law
 from beamfit.lifetime.evidence import BELIEVED, UNITS, Evidence, RatePart, Separability
 from beamfit.lifetime.expansion import Expansion, Pieces, Shape, solved
-from beamfit.lifetime.marginal import FreeLaw, Law
+from beamfit.lifetime.marginal import FreeLaw
 from beamfit.lifetime.record import DecayRecord, Monitor
 from beamfit.quantity import Quantity, Status
 from beamfit.table import Table, cell, json_of, labelled, plain_name
@@ -284,7 +285,7 @@ def fit_decay(
         it.
     law : {"free", "constant"}
         Whether a may depend on the current by a power and b drift in the record, with the priors
-        of `beamfit.lifetime.marginal`, which the errors then contain; or both are constant.
+        of `beamfit.lifetime.departures`, which the errors then contain; or both are constant.
         With a `shape` the law is known.
 
     Returns

@@ -14,24 +14,26 @@ from jax import Array
 
 from beamfit.errors import InputError
 from beamfit.lifetime.decay_law import Moments, beam_current
-from beamfit.lifetime.marginal import (
+from beamfit.lifetime.departures import (
     CONSTANT,
     DRIFT,
     LEAST,
     MOST,
-    WORTH,
-    Draws,
-    Proposal,
-    SeenDecay,
-    at_bounds,
     gas_change,
     gas_changed,
     log_prior,
     log_pumped,
     log_straight,
+    node_currents,
+)
+from beamfit.lifetime.marginal import (
+    WORTH,
+    Draws,
+    Proposal,
+    SeenDecay,
+    at_bounds,
     middle_of,
     mixed,
-    node_currents,
     proposals,
     rates_of,
 )
@@ -62,7 +64,7 @@ class DecayNumbers(NamedTuple):
     """Numbers of dI/dt = -a I² (I/mean)^exponent - b (1 + drift f(t)) I.
 
     Current at the first reading, mA, a, 1/(mA s), and b, 1/s; f is as of
-    `beamfit.lifetime.marginal.gas_change`, whose pace is 0 where the drift is a straight line.
+    `beamfit.lifetime.departures.gas_change`, whose pace is 0 where the drift is a straight line.
     """
 
     i0: Array

@@ -13,9 +13,9 @@ from beamfit.errors import InputError
 from beamfit.lifetime import alarm
 from beamfit.lifetime.course import reference_of
 from beamfit.lifetime.cycles import alike, cut_at_refills, joined, usual_cycle
+from beamfit.lifetime.departures import Law
 from beamfit.lifetime.evidence import UNITS
 from beamfit.lifetime.fit import DecayFit, bare, fit_decay, fit_pieces
-from beamfit.lifetime.marginal import Law
 from beamfit.lifetime.mechanisms import added, loss_coefficients, terms_of
 from beamfit.lifetime.pieces import FEWEST
 from beamfit.lifetime.record import Conditions, DecayRecord

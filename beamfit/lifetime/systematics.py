@@ -10,6 +10,7 @@ import numpy as np
 
 from beamfit.errors import InputError
 from beamfit.lifetime.alternatives import ConstantA
+from beamfit.lifetime.departures import Law
 from beamfit.lifetime.evidence import UNITS
 from beamfit.lifetime.expansion import (
     LEVEL,
@@ -21,7 +22,6 @@ from beamfit.lifetime.expansion import (
     solved,
 )
 from beamfit.lifetime.fit import DecayFit, bare, fit_decay
-from beamfit.lifetime.marginal import Law
 from beamfit.lifetime.record import DecayRecord
 from beamfit.quantity import HOUR, Quantity, Status
 from beamfit.shown import shown

@@ -9,10 +9,11 @@ from scipy.integrate import solve_ivp
 
 from beamfit.errors import InputError
 from beamfit.lifetime.cycles import find_cycles
+from beamfit.lifetime.departures import CONSTANT, NODE, Numbers
 from beamfit.lifetime.expansion import Pieces, solved
 from beamfit.lifetime.fit import fit_cycles, fit_decay, fit_decays
 from beamfit.lifetime.lifetime_table import fit_lifetimes
-from beamfit.lifetime.marginal import CONSTANT, NODE, Numbers, Proposal, SeenDecay, quantiles
+from beamfit.lifetime.marginal import Proposal, SeenDecay, quantiles
 from beamfit.lifetime.record import Conditions, DecayRecord, LifetimeTable
 from beamfit.lifetime.study import study_record
 from tests.simulations import simulations
