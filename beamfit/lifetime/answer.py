@@ -14,7 +14,6 @@ from beamfit.lifetime.cycles import is_sawtooth
 from beamfit.lifetime.evidence import (
     BELIEVED,
     DETERMINED,
-    LIKELIER,
     SEPARABLE,
     UNITS,
     Evidence,
@@ -238,9 +237,10 @@ def _freely(e: Evidence) -> Finding | None:
     if e.free is None:
         return None
     told = "; ".join(filter(None, (_clear(e), *(_extent(e, name) for name in "ab"))))
-    if e.free.pumped > LIKELIER:
-        found = f"Gas that is pumped away after a fill is likely ({percent(e.free.pumped)}), which "
-        return Finding(Status.converged, f"{told}. {found}the errors contain")
+    if e.pumped:
+        likely = f"Gas that is pumped away after a fill is likely ({percent(e.free.pumped)})"
+        said = f": {e.explained}" if e.by_gas else ""
+        return Finding(Status.converged, f"{told}. {likely}, which the errors contain{said}")
     if e.constant_a.status is Status.poor_fit:
         drift = "" if e.free.drift is None else f" and b drifts by {e.free.drift} of itself"
         found = f"A constant a is rejected (p = {max(e.constant_a.p_value, 1e-300):.2g}): it goes "

@@ -30,7 +30,7 @@ DRIFT = 0.1
 # thousandth of the mean loss to ten times that.
 SMOOTH, OUTGASSING, TIMES, SIZES = 0.74, 0.08, (1e-3, 1.0), (1e-3, 10.0)
 # Spans over the time of gas that is pumped away: shorter times are seen by themselves.
-PACES = (1.0, 10.0)
+PACES = (1.0, 20.0)
 # Nodes of the integral: exact to rounding up to four lifetimes in a record.
 NODES = 14
 # Where the record's bend would not depend on the share its coordinate goes over to this slope.

@@ -19,8 +19,16 @@ from beamfit.lifetime.alternatives import (
     lifetime_law,
     rival_of,
 )
-from beamfit.lifetime.departures import BELOW, Law
-from beamfit.lifetime.expansion import DETERMINED, LOSS, POWER, Expansion, Physical, lifetime_of
+from beamfit.lifetime.departures import BELOW, PACES, Law
+from beamfit.lifetime.expansion import (
+    DETERMINED,
+    LOSS,
+    POWER,
+    Expansion,
+    Physical,
+    further_columns,
+    lifetime_of,
+)
 from beamfit.lifetime.marginal import ENDS, UNITS, FreeLaw, free_law
 from beamfit.lifetime.record import DecayRecord
 from beamfit.noise.memory import CLOSE, Products
@@ -228,7 +236,9 @@ class Evidence:
 
     @cached_property
     def residuals(self) -> np.ndarray:
-        """Model less reading, mA."""
+        """Model less reading, mA; of the law whose values are quoted."""
+        if self.freed:
+            return self.free.curve(self.time) - self.about.pieces.current
         after = self.about.residuals
         if self.cycles == 1 and not self.independent:
             after = after + self.about.rows[:, self.about.columns()] @ self.memory.mean_step
@@ -241,7 +251,7 @@ class Evidence:
         How far a drift under white noise gets in the end says nothing of the errors.
         """
         likely = self.memory.likely
-        if self.memory.white[likely]:
+        if self.freed or self.memory.white[likely]:
             return float(np.sum((self.residuals / self.about.pieces.over) ** 2))
         return float(self.memory.squares[likely])
 
@@ -357,14 +367,40 @@ class Evidence:
 
     @cached_property
     def free(self) -> FreeLaw | None:
-        """Posterior of the free law; None where the law is known, an alternative explains the
-        record better, or the decay is within its noise.
+        """Posterior of the free law; None where the law is known, an alternative that is no part of
+        it explains the record better, or the decay is within its noise.
         """
         known = self.law is Law.constant or self.shaped or self.cycles > 1
-        if known or not self.is_clear("rate_mean") or self.explained is not None:
+        if known or not self.is_clear("rate_mean") or not (self.explained is None or self.by_gas):
             return None
         found = free_law(self.record, self.values)
-        return None if found is None or found.odd > LIKELIER else found
+        if found is None or found.odd > LIKELIER or (self.by_gas and found.pumped < LIKELIER):
+            return None
+        return found
+
+    @property
+    def freed(self) -> bool:
+        """True if departures of a and b are likelier than none: their values are quoted then."""
+        return self.free is not None and self.free.constant <= LIKELIER
+
+    @property
+    def by_gas(self) -> bool:
+        """True if gas explains a refuted law that is pumped away in a time of the free law."""
+        if self.outgassing is None:
+            return False
+        spans = self.record.span / (self.outgassing.time_constant.value * HOUR)
+        return PACES[0] <= spans <= PACES[1]
+
+    @property
+    def outgassing(self) -> Outgassing | None:
+        """Gas that explains a refuted law."""
+        found = self.explained and self.explained.found
+        return found if isinstance(found, Outgassing) else None
+
+    @property
+    def pumped(self) -> bool:
+        """True if gas that is pumped away is likelier than not, by the posterior."""
+        return self.free is not None and self.free.pumped > LIKELIER
 
     @cached_property
     def bending(self) -> Physical | None:
@@ -399,7 +435,7 @@ class Evidence:
         elif self.free is not None:
             found, more = self.free.quantities[name], Physical(*self.drifted)
             error, interval = found.error, found.interval_95
-            value = exact.value if self.free.constant > LIKELIER else found.value
+            value = found.value if self.freed else exact.value
             value = float(np.clip(value, *interval))
         else:
             return exact
@@ -425,6 +461,9 @@ class Evidence:
     def stated_odds(self) -> float:
         """Log odds that the stated errors are right, whatever memory the noise has."""
         columns = np.column_stack([self.about.residuals, self.about.rows[:, : POWER + 1]])
+        if self.pumped:
+            gas = further_columns(self.about, "relaxing", 1 / np.array(PACES))
+            columns = np.column_stack([columns, gas])
         products = Products.of(columns, self.time, stated=True, times=CLOSE)
         rest, rows = products.matrix[:, :1, 1:], products.matrix[:, 1:, 1:]
         step = np.linalg.solve(rows, np.swapaxes(rest, 1, 2))
@@ -458,8 +497,7 @@ class Evidence:
             known = self.separability.separable and not (refuted and self.course)
         else:
             plain = not self.shaped and self.about.pieces.gauge is None
-            gas = self.explained is not None and isinstance(self.explained.found, Outgassing)
-            known = plain and refuted and not gas
+            known = plain and refuted and self.outgassing is None and not self.pumped
         return lifetime_law(self.about, self.independent, refuted) if known else None
 
     @cached_property

@@ -263,11 +263,8 @@ def _expanded(seen: SeenDecay, numbers: np.ndarray, free: list[int]) -> Peaks:
     return Peaks(centre, lower, log, numbers, free)
 
 
-def _searched(seen: SeenDecay, numbers: np.ndarray, free: list[int]) -> tuple[SeenDecay, Peaks]:
-    """The most probable of the free numbers at each exponent, by Gauss and Newton.
-
-    Noises that have no part where the most probable exponent rests are left out from there on.
-    """
+def _searched(seen: SeenDecay, numbers: np.ndarray, free: list[int]) -> Peaks:
+    """The most probable of the free numbers at each place, by Gauss and Newton."""
     for _ in range(STEPS):
         found = _expanded(seen, numbers, free)
         whole = logsumexp(found.log, axis=0)
@@ -281,35 +278,32 @@ def _searched(seen: SeenDecay, numbers: np.ndarray, free: list[int]) -> tuple[Se
         named = Numbers.of(numbers)
         numbers[BEND] += (np.clip(named.share, -1.0, 2.0) - named.share) / named.unit
         spread = 1 / np.sqrt(np.einsum("km,kmpq->pm", weight, found.lower**2))
-        rests = np.all(np.abs(step) < 0.03 * spread + 1e-9, axis=0)
-        if rests.all():
+        rests = (np.abs(step) < 0.03 * spread + 1e-9).all(axis=0)
+        if rests[whole > whole.max() - FAR].all():
             break
-        if rests[np.argmax(whole)]:
-            seen = seen.of_noises(found.log.max(axis=1) > found.log.max() - 2 * FAR)
-    return seen, _expanded(seen, numbers, free)
+    return _expanded(seen, numbers, free)
 
 
-def _along(
-    seen: SeenDecay, row: int, low: float, high: float, free: list[int]
-) -> tuple[SeenDecay, Peaks]:
-    """Expansions at places of one number and by noises that hold the posterior, in ever narrower
-    ranges.
+def _along(seen: SeenDecay, row: int, low: float, high: float, free: list[int]) -> Peaks:
+    """Expansions at places of one number, in ever narrower ranges that hold the posterior.
+
+    No noise is left out before the last range: between places far apart something smooth is left
+    over, and looks like noise with a memory.
     """
     place, numbers = np.linspace(low, high, PLACES), np.tile(seen.start, (1, PLACES))
     for _ in range(RANGES):
         numbers[row] = place
-        seen, found = _searched(seen, numbers, free)
+        found = _searched(seen, numbers, free)
         whole = logsumexp(found.log, axis=0)
         if not np.isfinite(whole).all():
-            return seen, found  # a beam that died: no law of this kind has finite slopes
-        seen = seen.of_noises(found.log.max(axis=1) > found.log.max() - FAR)
+            break  # a beam that died: no law of this kind has finite slopes
         held = np.flatnonzero(whole > whole.max() - FAR)
         ends = [max(held[0] - 1, 0), min(held[-1] + 1, PLACES - 1)]
         if ends[1] - ends[0] > 0.6 * PLACES:
             break
         before, place = place, np.linspace(*place[ends], PLACES)
         numbers = np.array([np.interp(place, before, one) for one in found.numbers])
-    return seen, _expanded(seen, found.numbers, free)
+    return found
 
 
 class Draws(NamedTuple):
@@ -339,7 +333,11 @@ class Proposal(NamedTuple):
             found = _along(seen, POWER, LEAST, MOST, normal)
         else:
             found = _searched(seen, seen.start, normal)
-        return cls(found[0], found[1]._replace(free=list(free)))
+        kept = found.log.max(axis=1) > found.log.max() - FAR
+        if not kept.any():  # not finite
+            return cls(seen, found._replace(free=list(free)))
+        parts = (part[kept] for part in found[:3])
+        return cls(seen.of_noises(kept), Peaks(*parts, found.numbers, list(free)))
 
     def _log_prior(self, numbers: Numbers) -> np.ndarray:
         free, (low, high) = self.peaks.free, self.seen.share
@@ -449,6 +447,10 @@ class FreeLaw:
         Probability that the exponent is none of a bunch's length.
     pumped : float
         Probability of gas that is pumped away after a fill, in the place of exponent and drift.
+    nodes : array, shape (14,)
+        Mean current at the nodes, mA.
+    span : float
+        Length of the record, s.
     """
 
     quantities: Mapping[str, Quantity]
@@ -456,7 +458,13 @@ class FreeLaw:
     drift: Quantity | None
     constant: float
     odd: float
-    pumped: float = 0.0
+    pumped: float
+    nodes: np.ndarray
+    span: float
+
+    def curve(self, time: np.ndarray) -> np.ndarray:
+        """Mean current at times in s, mA."""
+        return chebvander(2 * time / self.span - 1, NODES - 1) @ FROM_NODES @ self.nodes
 
     def to_json(self) -> dict[str, object]:
         """Return the exponent, the drift and the probability of constant a and b."""
@@ -520,12 +528,14 @@ def free_law(record: DecayRecord, values: Physical) -> FreeLaw | None:
             return None
     usual, odd = log_prior(smooth.numbers.power)
     odd = math.exp(smooth.log - draws.log) * float(smooth.weight @ np.exp(odd - usual))
-    found = _quantities(record, seen, draws)
+    currents = draws.numbers.currents(seen.gas)
+    found = _quantities(record, seen, draws, currents)
     power, drift = smooth.numbers.power, smooth.numbers.drift if seen.drifts else None
     power, drift = (v if v is None else quantity_of(v, smooth.weight, "1") for v in (power, drift))
     constant = float(1 / (1 + np.exp(draws.log - plain.log)))
     pumped = 1.0 - math.exp(smooth.log - draws.log)
-    return FreeLaw(found, power, drift, constant, odd, pumped)
+    nodes = record.current.mean() * currents @ draws.weight
+    return FreeLaw(found, power, drift, constant, odd, pumped, nodes, record.span)
 
 
 def proposals(seen: SeenDecay) -> list[Proposal]:
@@ -556,13 +566,14 @@ def middle_of(currents: np.ndarray, weight: np.ndarray) -> float:
     return float(np.interp(-1.0, -(chebvander(2 * time - 1, NODES - 1) @ FROM_NODES @ nodes), time))
 
 
-def _quantities(record: DecayRecord, seen: SeenDecay, draws: Draws) -> dict[str, Quantity]:
-    """What is quoted, from draws."""
+def _quantities(
+    record: DecayRecord, seen: SeenDecay, draws: Draws, currents: np.ndarray
+) -> dict[str, Quantity]:
+    """What is quoted, from draws with their currents at the nodes."""
     found, weight = draws.numbers, draws.weight
     span, mean = record.span, float(record.current.mean())
     whole = found.rate / mean / span, found.rate / span
     a, b = found.share * whole[0], (1 - found.share) * whole[1]
-    currents = found.currents(seen.gas)
     moments = (0.0, middle_of(currents, weight), 1.0)
     changed = [found.gas * whole[1] * gas_change(s, found.pace) for s in moments]
     rates = rates_of(a * mean, b, found.power, changed, currents, seen)

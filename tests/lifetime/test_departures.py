@@ -112,8 +112,10 @@ def test_a_lengthening_bunch_is_refuted_and_its_lifetime_offered():
 def test_a_vacuum_that_recovers_is_no_bunch_length():
     time, beam = integrated(lambda t, i: 1e-8 * i + 4e-6 * (1 + np.exp(-t / 7200)))
     fit = fit_decay(noisy(time, beam))
-    assert fit.status in ("poor_fit", "infeasible")
-    assert "vacuum" in fit.message or "loss rate changed" in fit.message
+    assert fit.status == "converged"
+    assert "Gas that is pumped away after a fill is likely" in fit.message
+    assert abs(fit.a.value - 1e-8) < 4 * fit.a.error < 4e-10
+    assert fit.rms_residual == pytest.approx(2e-3, rel=0.1)  # that of the noise
 
 
 @pytest.mark.parametrize(
@@ -122,7 +124,7 @@ def test_a_vacuum_that_recovers_is_no_bunch_length():
 def test_outgassing_is_named_with_its_time_constant_and_lifetimes(a, b, further, hours):
     time, beam = integrated(lambda t, i: a * i + b + further * np.exp(-t / hours / HOUR))
     fit = fit_decay(noisy(time, beam))
-    assert fit.status in ("poor_fit", "infeasible")
+    assert fit.status == ("converged" if hours > 0.05 * SPAN / HOUR else "poor_fit")
     found = fit.outgassing
     truth = {
         "time_constant": hours,
@@ -240,7 +242,8 @@ def test_a_gauge_that_falls_by_itself_enters_as_it_is():
     gas = 20.0  # 1/(s Pa)
     time, beam = integrated(lambda t, i: 2e-8 * i + gas * pressure(t))
     blind = fit_decay(noisy(time, beam))
-    assert blind.status != "converged"
+    assert blind.free_law.pumped > 0.99
+    assert abs(blind.a.value - 2e-8) < 4 * blind.a.error
     fit = fit_decay(noisy(time, beam, pressure=pressure(time)))
     assert fit.status == "converged"
     assert abs(fit.a.value - 2e-8) < 4 * fit.a.error

@@ -38,7 +38,7 @@ def record(seed, noise=0.3, stated=None, **given):
 
 @pytest.mark.parametrize(
     ("power", "change", "pace"),
-    [(0.0, 0.0, 0.0), (-1 / 3, 0.1, 0.0), (0.3, -0.2, 0.0), (0.0, -0.8, 1.0), (0.0, -1.5, 10.0)],
+    [(0.0, 0.0, 0.0), (-1 / 3, 0.1, 0.0), (0.3, -0.2, 0.0), (0.0, -0.8, 1.0), (0.0, -1.5, 20.0)],
 )
 def test_the_closed_form_is_the_integrated_law(power, change, pace):
     """Gas that is pumped away falls as exp(-pace s), by `change` of the whole loss."""
@@ -52,7 +52,7 @@ def test_the_closed_form_is_the_integrated_law(power, change, pace):
         return -rate * (share * x**power * x + 1 - share + change * course) * x
 
     true = solve_ivp(slope, (0, 1), [level], t_eval=NODE, rtol=1e-12, atol=1e-12).y[0]
-    rtol = 1e-9 if pace < 5 else 1e-6  # 14 nodes of a fast course
+    rtol = 1e-9 if pace < 5 else 5e-6  # 14 nodes of a fast course
     np.testing.assert_allclose(Numbers.of(found).currents(NODE)[:, 0], true, rtol=rtol)
 
 
