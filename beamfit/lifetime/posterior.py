@@ -40,7 +40,7 @@ from beamfit.lifetime.marginal import (
 from beamfit.noise.memory import WHITE, MemoryKind
 from beamfit.quantity import HOUR
 from beamfit.sampling import store as disk
-from beamfit.sampling.convergence import RULES, ChainEvidence, diagnose, held_by_priors
+from beamfit.sampling.convergence import RULES, ChainEvidence, Diagnostics, held_by_priors
 from beamfit.sampling.ensemble import draw
 from beamfit.sampling.likelihood import NoiseGroup
 from beamfit.sampling.posterior import Expected, Posterior
@@ -315,8 +315,9 @@ def _chains(ready: _Prepared, target: SamplingTarget, seed: int, target_ess: flo
             break
         steps *= 2
     chain = thetas[rng.choice(weight.size, (STEPS, WALKERS), p=weight)]
-    found = diagnose(chain)
-    found = found._replace(effective=np.minimum(found.effective, worth))
+    # Drawn one by one they are independent, and worth no more than what they were drawn from.
+    worth, size = min(worth, STEPS * WALKERS), np.ones(chain.shape[2])
+    found = Diagnostics(STEPS * WALKERS / worth * size, worth * size, size, STEPS, WALKERS)
     held = held_by_priors(target, chain.reshape(-1, chain.shape[2]))
     held = tuple(dict.fromkeys((*target.priors_own, *held)))
     shown = tuple(name for name in held if name not in target.hidden)
