@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
-from beamfit.errors import InputError, nearest
+from beamfit.errors import InputError, expect, nearest
 from beamfit.shown import shown
 
 
@@ -161,6 +161,12 @@ class Assumptions:
     seed: int = 0
 
     def __post_init__(self) -> None:
+        expect(self.anchor, Anchor, "beamfit.Anchor(determinant=True)")
+        for kind in ("priors", "bounds", "gains"):
+            expect(getattr(self, kind), Mapping, f"{kind}={{'Q2.slope': (160.0, 170.0)}}")
+            for name, pair in getattr(self, kind).items():
+                if not (isinstance(pair, Sequence) and len(pair) == 2):
+                    raise InputError(f"{kind} {name} = {pair!r}", "a pair of numbers")
         for name, (mean, sd) in self.priors.items():
             if not (math.isfinite(mean or 0.0) and math.isfinite(sd) and sd > 0):
                 expected = "a finite mean and a positive deviation"

@@ -142,6 +142,8 @@ def fit_emittance(
     expect(scan, QuadScan, "beamfit.read_quad_scan(path)")
     if line is not None:
         expect(line, Beamline, "beamfit.load_lattice(path)")
+    if noise is not None:
+        expect(noise, Noise, "beamfit.Noise(bad=0.1)")
     for name, given, known in (("method", method, METHODS), ("weights", weights, WEIGHTS)):
         if given not in known:
             raise InputError(f"{name} '{given}'", " or ".join(known))

@@ -145,11 +145,14 @@ def _formulation(path: str | PathLike[str]) -> Document:
 def proposed_layout(path: str | PathLike[str], columns: Columns = None) -> str | None:
     """Write a layout for the columns of a table that nobody knows; None where there are none."""
     layout = layout_of(columns)
-    if _kind(path, layout) not in ("scan", "record") or is_emittance_gui(path):
+    kind = _kind(path, layout)
+    if kind not in ("scan", "record") or is_emittance_gui(path):
         return None
+    likely = [likely_scan_name, likely_record_name]
+    likely = likely if kind == "scan" else likely[::-1]
     sheet = read_columns(path, "", layout, skip_bad=True)
     unknown = {
-        name: (likely_scan_name(name) or likely_record_name(name, cell), cell)
+        name: (likely[0](name, cell) or likely[1](name, cell), cell)
         for name, cells in zip(sheet.names, sheet.cells, strict=True)
         if not (is_known(name, sheet) or known(sheet, name))
         for cell in [next(iter(cells), "")]

@@ -552,14 +552,16 @@ def likely_record_name(header: str, cell: object) -> str | None:
 
     Examples
     --------
-    >>> likely_record_name("When", "2024-03-01 12:00:00"), likely_record_name("Current", "200.1")
-    ('time', 'beam_current_mA')
+    >>> likely_record_name("When", "2024-03-01 12:00:00"), likely_record_name("Current", "0.2 A")
+    ('time', 'beam_current_A')
     """
     try:
         dates_in_order(DAY_FIRST)(str(cell))
     except ValueError:
         words = set(re.findall(r"[a-z]+", header.lower()))
-        return "beam_current_mA" if words & (CURRENTS | {"beam"}) and not words & OTHERS else None
+        _, unit = number_and_unit(str(cell)) or ("", "mA")
+        named = words & (CURRENTS | {"beam"}) and not words & OTHERS
+        return f"beam_current_{unit}" if named and unit in UNITS["current"] else None
     return "time"
 
 

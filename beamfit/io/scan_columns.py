@@ -9,7 +9,16 @@ from dataclasses import replace
 from types import MappingProxyType
 
 from beamfit.errors import InputError, nearest, short
-from beamfit.io.columns import SETTINGS, UNITS, Column, Sheet, columns_of, known_unit, spelled
+from beamfit.io.columns import (
+    SETTINGS,
+    UNITS,
+    Column,
+    Sheet,
+    columns_of,
+    known_unit,
+    number_and_unit,
+    spelled,
+)
 from beamfit.io.files import text_lines
 from beamfit.particles import ENERGY_KEYS
 
@@ -213,18 +222,23 @@ def _other(header: str, sheet: Sheet) -> Column:
     )
 
 
-def likely_scan_name(header: str) -> str | None:
-    """The name that a header without a unit may mean, in a usual unit.
+def likely_scan_name(header: str, cell: object = "") -> str | None:
+    """The name that a header without a unit may mean, in the unit of a cell or a usual one.
 
     Examples
     --------
     >>> [likely_scan_name(header) for header in ("xrms", "QUAD:525:BACT", "foo")]
     ['size_x_um', 'QUAD_525_kG', None]
+    >>> likely_scan_name("xrms", "0.11 mm"), likely_scan_name("Q5 current", "1.5 A")
+    ('size_x_mm', 'Q5_A')
     """
+    _, own = number_and_unit(str(cell)) or ("", None)
     if (size := _size(f"{header}_um")) is not None:
-        return f"{size.key}_um"
-    bare = ATTRIBUTE.sub("", header)
-    return f"{re.sub(r'[^A-Za-z0-9.]+', '_', bare)}_kG" if bare != header else None
+        return f"{size.key}_{own if own in UNITS['length'] else 'um'}"
+    bare, unit = ATTRIBUTE.sub("", header), own or "kG"
+    if bare == header or unit not in SETTINGS:
+        return None
+    return f"{re.sub(r'[^A-Za-z0-9.]+', '_', bare)}_{unit}"
 
 
 def _not_understood(header: str) -> str:

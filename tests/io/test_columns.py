@@ -223,6 +223,14 @@ def test_check_proposes_a_layout_that_then_reads_the_file(file, monkeypatch, cap
     assert document["notes"] == ["Left aside: foo."]
 
 
+def test_check_proposes_the_unit_that_the_cells_say(file, monkeypatch, capsys):
+    path = file("when,beam_current\n" + "".join(f"{t},{200 - t} mA\n" for t in range(9)))
+    _, out, _ = run(monkeypatch, capsys, "check", path)
+    assert '"beam_current" = "beam_current_mA"  # 200 mA' in out
+    layout = file(out.replace('# "when" = ""', '"when" = "time_s"'), "l.toml")
+    assert beamfit.read_decay_record(path, columns=layout).current[0] == 200
+
+
 def test_every_command_takes_it(file, root, monkeypatch, capsys):
     source = (root / "measurements/lcls_otr2.csv").read_text()
     header = next(line for line in source.splitlines() if line.startswith("Q525_kG"))
