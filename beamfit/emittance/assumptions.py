@@ -161,12 +161,7 @@ class Assumptions:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        expect(self.anchor, Anchor, "beamfit.Anchor(determinant=True)")
-        for kind in ("priors", "bounds", "gains"):
-            expect(getattr(self, kind), Mapping, f"{kind}={{'Q2.slope': (160.0, 170.0)}}")
-            for name, pair in getattr(self, kind).items():
-                if not (isinstance(pair, Sequence) and len(pair) == 2):
-                    raise InputError(f"{kind} {name} = {pair!r}", "a pair of numbers")
+        self._check_types()
         for name, (mean, sd) in self.priors.items():
             if not (math.isfinite(mean or 0.0) and math.isfinite(sd) and sd > 0):
                 expected = "a finite mean and a positive deviation"
@@ -187,6 +182,14 @@ class Assumptions:
         for name in ("hidden", "starts"):
             if getattr(self, name) < 1:
                 raise InputError(f"{getattr(self, name)} {name}", "at least one")
+
+    def _check_types(self) -> None:
+        expect(self.anchor, Anchor, "beamfit.Anchor(determinant=True)")
+        for kind in ("priors", "bounds", "gains"):
+            expect(getattr(self, kind), Mapping, f"{kind}={{'Q2.slope': (160.0, 170.0)}}")
+            for name, pair in getattr(self, kind).items():
+                if not (isinstance(pair, Sequence) and len(pair) == 2):
+                    raise InputError(f"{kind} {name} = {pair!r}", "a pair of numbers")
 
     @property
     def systematics(self) -> dict[str, tuple[float | None, float]]:
