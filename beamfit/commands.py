@@ -301,8 +301,8 @@ def control(
     from beamfit.dynamics.fit import identify as respond
 
     options = {"delay": delay, "offset": offset, "hidden": hidden, "seed": seed}
-    wished = [name for name in outputs if name in {t[0] for t in targets} | set(limits)]
-    fits = [respond(runs, model, map, output=name, **options) for name in wished or outputs]
+    wanted = [name for name in outputs if name in {t[0] for t in targets} | set(limits)]
+    fits = [respond(runs, model, map, output=name, **options) for name in wanted or outputs]
     made = controller(
         fits,
         inputs={n: v for n, v in limits.items() if n in inputs},

@@ -21,6 +21,7 @@ from matplotlib import rc_context
 from matplotlib.figure import FigureBase
 
 import beamfit
+from beamfit.answer import Table
 from beamfit.emittance.assumptions import Assumptions
 from beamfit.emittance.calibration import with_numbers
 from beamfit.emittance.fit import EmittanceFit, fit_emittance
@@ -44,7 +45,6 @@ from beamfit.report.document import (
     provenance,
     written,
 )
-from beamfit.table import Table
 from beamfit.writing import write_atomically
 
 ROOT = Path(__file__).resolve().parents[1]

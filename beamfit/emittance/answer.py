@@ -34,10 +34,10 @@ from beamfit.emittance.verdict import (
     verdict,
     waist_bracketed,
 )
+from beamfit.errors import Finding, Status
 from beamfit.optics.beamline import Beamline
 from beamfit.quantity import Quantity
 from beamfit.statistics import Directions, chi2_probability, scaled_directions
-from beamfit.verdict import Finding, Status
 
 SIGMA = slice(4, 7)
 # Normalised emittances in m beyond which only a wrong unit leads: rings and linacs have 1e-9 and

@@ -7,8 +7,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
+from beamfit.answer import shown
 from beamfit.errors import InputError, expect, nearest
-from beamfit.shown import shown
 
 
 class Entry(NamedTuple):

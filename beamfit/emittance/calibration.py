@@ -12,13 +12,12 @@ import jax
 from beamfit.emittance.assumptions import Assumptions
 from beamfit.emittance.results import Parameter
 from beamfit.emittance.statement import Scenario, Seen, beam_problem, varied_magnets
-from beamfit.errors import InputError, nearest
+from beamfit.errors import InputError, Status, nearest
 from beamfit.greybox.fit import Fit
 from beamfit.greybox.problem import Free, Prior, Problem
 from beamfit.greybox.tree import leaves
 from beamfit.optics.beamline import Beamline
 from beamfit.optics.calibration import CurrentPolynomial, SlopeIntercept
-from beamfit.verdict import Status
 
 # The report's bounds are 167.23 ± 20 for the slope and 43.17 ± 20 for the intercept (appendix C).
 WIDTH = 20.0 / 167.23

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from beamfit.answer import answer
+from beamfit.answer import Table, answer, json_of
 from beamfit.emittance.advice import (
     Adviser,
     Candidate,
@@ -22,13 +22,11 @@ from beamfit.emittance.model import (
     spoken,
 )
 from beamfit.emittance.statement import Seen, varied_magnets
-from beamfit.emittance.wishes import check_limits
-from beamfit.errors import InputError
+from beamfit.emittance.targets import check_limits
+from beamfit.errors import InputError, Status
 from beamfit.greybox.design import Information, greedy
 from beamfit.optics.beamline import Beamline
 from beamfit.optics.elements import Drift, Screen
-from beamfit.table import Table, json_of
-from beamfit.verdict import Status
 
 # Other energies to consider where none is named: what a linac can usually do.
 USUAL_ENERGIES = (0.8, 1.25)

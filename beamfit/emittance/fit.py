@@ -9,7 +9,16 @@ from functools import cached_property
 from html import escape
 from typing import TYPE_CHECKING, Any
 
-from beamfit.answer import answer, quantity_frame
+from beamfit.answer import (
+    Table,
+    answer,
+    determined,
+    html_of,
+    json_of,
+    labelled,
+    quantity_frame,
+    text_of,
+)
 from beamfit.emittance.answer import judged_beam
 from beamfit.emittance.assumptions import Anchor, Assumptions
 from beamfit.emittance.comparison import BEAM
@@ -36,7 +45,6 @@ from beamfit.greybox.problem import Problem
 from beamfit.noise.model import ROBUST, Noise
 from beamfit.optics.beamline import Beamline
 from beamfit.quantity import Quantity
-from beamfit.table import Table, determined, html_of, json_of, labelled, text_of
 
 if TYPE_CHECKING:
     from pandas import DataFrame

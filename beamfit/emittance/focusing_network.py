@@ -25,14 +25,13 @@ from beamfit.emittance.constrained_network import (
 from beamfit.emittance.results import Parameter
 from beamfit.emittance.statement import Scenario, Seen, varied_magnets
 from beamfit.emittance.transport import padded
-from beamfit.errors import InputError
+from beamfit.errors import InputError, Status
 from beamfit.greybox import tree
 from beamfit.greybox.fit import Derived, Fit
 from beamfit.greybox.mlp import MLP, Port
 from beamfit.greybox.problem import Free, Problem, Record
 from beamfit.greybox.signed_network import signed_network
 from beamfit.quantity import Quantity
-from beamfit.verdict import Status
 
 
 @tree.node("unit")

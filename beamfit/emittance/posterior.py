@@ -21,7 +21,7 @@ from beamfit.emittance.model import (
 )
 from beamfit.emittance.results import PlaneFit
 from beamfit.emittance.statement import Scanned, Seen, asked_in, factor_of, size_records
-from beamfit.errors import InputError
+from beamfit.errors import Finding, InputError
 from beamfit.greybox import tree
 from beamfit.greybox.posterior import Optimum, Statement, predicted, target_of
 from beamfit.greybox.problem import Problem
@@ -32,7 +32,6 @@ from beamfit.quantity import Status
 from beamfit.sampling.posterior import Expected, Posterior
 from beamfit.sampling.priors import Distribution
 from beamfit.sampling.target import SamplingTarget
-from beamfit.verdict import Finding
 
 CHOLESKY, SIGMA = ("l11", "l21", "l22"), ("sigma11", "sigma12", "sigma22")
 TWISS = ("emittance", "normalized_emittance", "beta", "alpha", "mismatch")

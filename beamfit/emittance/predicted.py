@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from beamfit.answer import shown
 from beamfit.emittance.comparison import PlanePosterior, weighted_quantiles
 from beamfit.emittance.model import coefficients, emittance_parts, predict_sizes, size_squared
 from beamfit.emittance.results import PlaneFit
@@ -18,7 +19,6 @@ from beamfit.emittance.transport import Rows, padded, rows_at
 from beamfit.errors import InputError, nearest
 from beamfit.optics.beamline import seen_line
 from beamfit.sampling.posterior import Correlations
-from beamfit.shown import shown
 
 NAMES = ("sigma11", "sigma12", "sigma22", "emittance", "beta", "alpha")
 

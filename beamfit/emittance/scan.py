@@ -14,11 +14,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from beamfit.answer import frame_of
+from beamfit.answer import MOST_ROWS, Table, frame_of, shown
 from beamfit.errors import InputError, expect, nearest
 from beamfit.particles import ENERGY_KEYS, total_energy
-from beamfit.shown import shown
-from beamfit.table import MOST_ROWS, Table
 
 if TYPE_CHECKING:
     from pandas import DataFrame

@@ -37,13 +37,13 @@ from beamfit.emittance.statement import (
 )
 from beamfit.emittance.systematics import effects_of
 from beamfit.emittance.transport import Look
+from beamfit.errors import Finding, Status
 from beamfit.greybox.covariance import Group
 from beamfit.greybox.fit import Derived, Fit
 from beamfit.greybox.problem import Problem
 from beamfit.greybox.solve import solve
 from beamfit.optics.beamline import Beamline
 from beamfit.statistics import Directions, scaled_directions
-from beamfit.verdict import Finding, Status
 
 # Ends of a search that are no answer.
 NO_ANSWER = (Status.not_finite, Status.infeasible, Status.not_converged)

@@ -11,9 +11,9 @@ import numpy as np
 
 from beamfit.emittance.comparison import BEAM, FLAT, PlanePosterior, PlaneSizes
 from beamfit.emittance.results import Points
+from beamfit.errors import Finding, Status
 from beamfit.quantity import display_unit
 from beamfit.statistics import of_use
-from beamfit.verdict import Finding, Status
 
 # A beam is sure with this probability: one answer in a hundred may be another thing.
 SURE = 0.99

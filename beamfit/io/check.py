@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from beamfit.answer import Table
 from beamfit.dynamics.record import Run
 from beamfit.emittance.scan import QuadScan
 from beamfit.errors import InputError
@@ -24,14 +25,12 @@ from beamfit.io.layout import Columns, Layout, layout_of, proposal
 from beamfit.io.line import FOREIGN, build_line, read_lattice
 from beamfit.io.ring import read_operation, read_ring
 from beamfit.io.run import read_run
-from beamfit.io.scan import read_quad_scan
-from beamfit.io.scan_columns import is_known, is_size, likely_scan_name
+from beamfit.io.scan import is_known, is_size, likely_scan_name, read_quad_scan
 from beamfit.io.table import header_of, is_binary, read_columns, read_sheet
 from beamfit.io.toml import read_toml
 from beamfit.language.document import Document
 from beamfit.lifetime.record import DecayRecord, LifetimeTable
 from beamfit.quantity import display_unit
-from beamfit.table import Table
 
 
 @dataclass(frozen=True)

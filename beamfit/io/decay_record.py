@@ -26,7 +26,7 @@ from beamfit.io.columns import (
 )
 from beamfit.io.files import name_of
 from beamfit.io.layout import Columns
-from beamfit.io.scan_columns import is_size
+from beamfit.io.scan import is_size
 from beamfit.io.table import read_columns
 from beamfit.lifetime.record import (
     Conditions,

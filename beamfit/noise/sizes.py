@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.special import expit, gammaln
 
-from beamfit.nodes import registered
+from beamfit.arrays import registered
 from beamfit.noise.model import LN_2PI, Lognormal, Noise
 
 # Nodes over the scale of the noise, and how far below its peak the likelihood still counts.

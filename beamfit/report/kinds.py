@@ -14,13 +14,11 @@ from beamfit.dynamics.state_fit import StatesFit
 from beamfit.emittance.slices import SliceFits
 from beamfit.language.compiled import Computed
 from beamfit.language.solution import ProblemSolution
-from beamfit.report.control import control_page
 from beamfit.report.density import density_page
 from beamfit.report.document import ReportPage
-from beamfit.report.fedbatch import fedbatch_page, feed_page
+from beamfit.report.dynamics import control_page, fedbatch_page, feed_page, response_page
+from beamfit.report.emittance import slices_page
 from beamfit.report.formulation import computed_page, formulation_page
-from beamfit.report.response import response_page
-from beamfit.report.slices import slices_page
 from beamfit.report.tuning import tuning_page
 from beamfit.tuning.fit import TuningFit
 

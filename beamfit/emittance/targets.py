@@ -20,7 +20,7 @@ SAME_ENERGY = 1e-3
 
 
 class Target(NamedTuple):
-    """A wish for the beam at the screen in one plane.
+    """A target for the beam at the screen in one plane.
 
     Attributes
     ----------
