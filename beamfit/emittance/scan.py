@@ -440,13 +440,13 @@ class QuadScan:
                 )
 
     def _check_three_settings(self, plane: str) -> None:
-        distinct = "settings" if self.settings or self.transfer else "screens"
+        distinct = "setting" if self.settings or self.transfer else "screen"
         keys = dict.fromkeys(compress(row_keys(self), ~np.isnan(self.size[plane])))
         for name, number in (Counter(key[0] for key in keys) or {"": 0}).items():
             if number < 3:
                 of = f" of slice {name}" if name else ""
                 raise self.unusable(
-                    f"{number} distinct {distinct}{of} in plane {plane}",
+                    f"{number} distinct {distinct}{'s' * (number != 1)}{of} in plane {plane}",
                     "at least three: the beam matrix has three numbers",
                 )
 

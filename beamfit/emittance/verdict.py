@@ -159,8 +159,8 @@ def _open(e: PlaneEvidence) -> str:
             rest = {k: v for k, v in probability.items() if k not in (BEAM, FLAT)}
             rival = max(rest, key=rest.__getitem__)
             return (
-                f"these sizes may be a beam's (P = {e.beam:.2g}), or else {rival} "
-                f"(P = {rest[rival]:.2g})"
+                f"these sizes may be a beam's (P = {e.beam:.3g}, and {SURE:g} is needed), or else "
+                f"{rival} (P = {rest[rival]:.2g})"
             )
         return f"the sizes look like {rival} (P = {probability[rival]:.2g}), not like a beam's"
     if e.opened:

@@ -503,8 +503,10 @@ def _known(header: str, quantities: Mapping[str, str], sheet: Sheet) -> Column |
     units = UNITS[kind]
     if unit not in units:
         listed = ", ".join(u for u in units if u.isascii())
-        expected = f"one of {listed} at the end, such as {name}_{next(iter(units))}"
-        raise sheet.header_error(f"unknown unit '{unit}'", expected, header)
+        whole = header.lower() in quantities  # such as size_x_error
+        named, found = (header, "no unit") if whole else (name, f"unknown unit '{unit}'")
+        expected = f"one of {listed} at the end, such as {named}_{next(iter(units))}"
+        raise sheet.header_error(found, expected, header)
     return Column(header, name, unit, units[unit])
 
 

@@ -124,7 +124,8 @@ def scan_columns(
     >>> list(columns), round(2.3548 * columns["size_x"].factor, 7)
     (['setting Q', 'size_x'], 0.001)
     """
-    if any(spelled(name).lower().startswith("beam_current") for name in sheet.names):
+    current = any(spelled(name).lower().startswith("beam_current") for name in sheet.names)
+    if current and not any(map(is_size, sheet.names)):
         expected = "a quadrupole scan; `beamfit lifetime` reads it"
         raise sheet.header_error("a record of beam current", expected)
     taken = {column.header for column in knobs.values()}
@@ -262,6 +263,8 @@ def _not_understood(header: str) -> str:
     before, _, last = header.rpartition("_")
     if _size(f"{header}_um") is not None:
         return "a size without a unit"
+    if header.lower().startswith("beam_current"):
+        return "a beam current, on which no size depends"
     if bracket is not None:
         return f"unknown unit '{bracket[1]}'"
     if before and last in UNITS["length or share"]:
@@ -445,7 +448,8 @@ def _check(sheet: Sheet, sizes: list[Column], text: str, stated: re.Match[str]) 
 
 # More rows than any scan: such a file is a log, and is refused before it fills the memory.
 MOST_ROWS = 100_000
-# A size this many times the usual one of its column, and larger than most beams, has slipped.
+# A size this many times the usual one of its column, or less than it by this factor, and larger or
+# smaller than most beams, has slipped.
 SLIPPED = 100.0
 # Relative: nobody has measured a beam's size better, while mm and µm are 1e-3 apart.
 SMALLEST = 1e-4
@@ -641,10 +645,11 @@ def _check_slipped(
     values: Mapping[str, np.ndarray],
     usual: Mapping[str, float],
 ) -> None:
-    """Refuse a size that is far larger than the others of its column and than most beams."""
+    """Refuse a size far from the others of its column, and larger or smaller than most beams."""
     for plane, usually in usual.items():
         column, size = columns[f"size_{plane}"], values[f"size_{plane}"]
-        if (slipped := np.nan_to_num(size) > max(USUAL[1], SLIPPED * usually)).any():
+        most, least = max(USUAL[1], SLIPPED * usually), min(USUAL[0], usually / SLIPPED)
+        if (slipped := (size > most) | (size < least)).any():
             around = f"{usually / column.factor:.3g}"
             found = f"{{:g}} {column.unit}, where the others are around {around}"
             written = size / column.factor
