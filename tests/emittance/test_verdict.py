@@ -225,7 +225,7 @@ def test_an_emittance_that_only_a_wrong_unit_explains_is_not_given(gtf, factor, 
 
 
 @pytest.mark.parametrize(
-    ("factor", "words"), [(0.006, "is less than most"), (100.0, "is more than most")]
+    ("factor", "words"), [(0.02, "is less than most"), (130.0, "is more than most")]
 )
 def test_an_emittance_of_few_accelerators_is_asked_about(gtf, factor, words, root):
     scan = beamfit.read_quad_scan(root / "measurements/gtf_simulated.csv")
