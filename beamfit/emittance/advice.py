@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.linalg import block_diag
 
-from beamfit.emittance.comparison import PlaneSizes, compare, emittance_quantiles
+from beamfit.emittance.comparison import AT, PlaneSizes, compare, emittance_quantiles
 from beamfit.emittance.model import (
     emittance_parts,
     predict_sizes,
@@ -31,6 +31,7 @@ from beamfit.greybox.covariance import MOST_SHARE
 from beamfit.greybox.design import Information, greedy, rows_of
 from beamfit.greybox.fit import value_and_slope
 from beamfit.optics.beamline import Beamline, transfer_rows
+from beamfit.quantity import NORMAL_REACH
 from beamfit.statistics import USEFUL
 
 # Candidates reach half the scanned range beyond either end.
@@ -40,7 +41,7 @@ ROUNDING = 1e-9
 # A further size is known no better than this share of itself.
 SHARPEST = 1e-4
 # The error of ln ε whose 95 % interval spans the factor within which an emittance is of use.
-NARROW = float(np.log(USEFUL)) / 3.92
+NARROW = float(np.log(USEFUL)) / (2.0 * NORMAL_REACH)
 
 
 class Candidate(NamedTuple):
@@ -283,7 +284,7 @@ def simulated(seen: Seen, plane: str, r11: np.ndarray, r12: np.ndarray, known: n
     sizes = PlaneSizes(*rows, error, old.of_shots, old.moved)
     [found] = compare([sizes], seen.noise)
     drawn = emittances(found.sigma)
-    low, high = emittance_quantiles(drawn, found.weight, found.flat, (0.025, 0.975))
+    low, high = emittance_quantiles(drawn, found.weight, found.flat, (AT[0], AT[-1]))
     return PlaneEvidence(found, sizes, low, high).determined
 
 

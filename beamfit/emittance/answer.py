@@ -11,6 +11,7 @@ from scipy.special import ndtri
 
 from beamfit.emittance.advice import next_measurement
 from beamfit.emittance.comparison import (
+    AT,
     PlanePosterior,
     emittance_quantiles,
     weighted_quantiles,
@@ -47,7 +48,6 @@ LEAST, MOST = 1e-10, 0.1
 LINEAR = np.isin(list(QUANTITIES), ("sigma11", "sigma12", "sigma22", "screen_size"))
 # Numbers of either sign; the others are positive, and spread by a factor.
 SIGNED = np.isin(list(QUANTITIES), ("alpha", "sigma12", "screen_alpha"))
-AT = (0.025, 0.1587, 0.5, 0.8413, 0.975)
 # βγ, matrices to the screen and the design's place, and the design: see `asked_places`.
 Places = tuple[Any, Any, Any, Any]
 

@@ -61,6 +61,8 @@ BENDS, LENGTHS = np.array([0.2, 0.4, 0.7, 1.2]), (0.25, 0.5)
 DEPARTURES, SMOOTH, NEAR = np.array([0.1, 0.2, 0.4]), 0.7, 1 / 30
 # Standard deviation of ln of a constant size.
 LEVEL = 1.0
+# Quantiles of a posterior: an error is half of the central 68 %, an interval the central 95 %.
+AT = (0.025, 0.1587, 0.5, 0.8413, 0.975)
 # Draws of a beam of no emittance, of which the evidence alone is wanted.
 FEW = 256
 
@@ -590,7 +592,7 @@ def _covariance(rows: np.ndarray) -> np.ndarray:
 def _scale_of(i: int, draws: Sequence[BeamDraws], of_kind: np.ndarray) -> np.ndarray:
     """Median and central 68 % of the scale of the likelier kind of noise."""
     own = draws[int(np.argmax(of_kind))]
-    return weighted_quantiles(own.scales.scale[i], own.scale_weight[i], (0.5, 0.1587, 0.8413))
+    return weighted_quantiles(own.scales.scale[i], own.scale_weight[i], (AT[2], AT[1], AT[3]))
 
 
 def weighted_quantiles(values: np.ndarray, weight: np.ndarray, at: Sequence[float]) -> np.ndarray:

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from beamfit.answer import shown
-from beamfit.emittance.comparison import PlanePosterior, weighted_quantiles
+from beamfit.emittance.comparison import AT, PlanePosterior, weighted_quantiles
 from beamfit.emittance.model import coefficients, emittance_parts, predict_sizes, size_squared
 from beamfit.emittance.results import PlaneFit
 from beamfit.emittance.statement import Scanned
@@ -95,7 +95,7 @@ def _spread(
     kept = post.weight > 0.0
     sigma, weight = post.sigma[kept].T, post.weight[kept]
     sizes = np.sqrt(size_squared(sigma, r11[:, None], r12[:, None], known[:, None]))
-    ends = [weighted_quantiles(row, weight, (0.1587, 0.8413)) for row in sizes]
+    ends = [weighted_quantiles(row, weight, (AT[1], AT[3])) for row in sizes]
     return 0.5 * np.diff(ends, axis=1)[:, 0]
 
 

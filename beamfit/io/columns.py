@@ -22,11 +22,12 @@ from beamfit.io.cells import (
     number,
     numbers_of,
 )
+from beamfit.particles import LIGHT
 
 UNITS: dict[str, dict[str, float]] = {
     # quantity: unit at the end of a name -> factor to SI (a stored current: to mA)
     "length": {"um": 1e-6, "mm": 1e-3, "m": 1.0, "µm": 1e-6, "μm": 1e-6, "nm": 1e-9, "cm": 1e-2},
-    "length or duration": {"mm": 1e-3, "m": 1.0, "ps": 299792458e-12},
+    "length or duration": {"mm": 1e-3, "m": 1.0, "ps": LIGHT / 1e12},
     "time": {"s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9},
     "current": {"mA": 1.0, "A": 1e3, "uA": 1e-3, "µA": 1e-3, "μA": 1e-3, "nA": 1e-6},
     "voltage": {"kV": 1e3, "V": 1.0, "MV": 1e6},

@@ -16,6 +16,7 @@ from beamfit.dynamics.feed import FeedCourse, FeedPlan
 from beamfit.dynamics.fit import ResponseFit
 from beamfit.dynamics.record import Run
 from beamfit.dynamics.state_fit import StatesFit, StateSpaceOutput
+from beamfit.quantity import HOUR
 from beamfit.report.document import BLUE, RED, Picture, ReportPage, Verdict, day_of
 
 RESPONSE = (
@@ -202,7 +203,7 @@ def feed_page(plan: FeedPlan) -> ReportPage:
 def draw_batch(fit: FedBatchFit, i: int, figure: FigureBase) -> None:
     """Measured and predicted outputs of a batch, and its inputs below."""
     run, names = fit.runs[i], list(fit.noise)
-    hours = (run.time - run.time[0]) / 3600.0
+    hours = (run.time - run.time[0]) / HOUR
     axes = figure.subplots(len(names) + 1, 1, sharex=True)
     for axis, name, predicted in zip(axes, names, fit.courses[i].T, strict=False):
         axis.plot(hours, run.outputs[name], ".", color="0.6", markersize=4, label="measured")

@@ -97,7 +97,7 @@ def decay_page(
     ]
     names = [study.record.name for study in studies]
     title = names[0] if len(names) == 1 else f"{len(names)} records"
-    hours = sum(study.record.span for study in studies) / 3600
+    hours = sum(study.record.span for study in studies) / HOUR
     counts = {"cycle": sum(d.fit.first.size for d in pooled), "decay": len(decays)}
     count = ", ".join(f"{n} {what}" + "s" * (n > 1) for what, n in counts.items() if n)
     return ReportPage(
@@ -429,7 +429,7 @@ def draw_trend(figure: FigureBase, trend: Trend) -> None:
 
 def _at(trend: Trend, time: float) -> np.datetime64 | float:
     """Time on the axis: a date, or hours."""
-    return np.datetime64(round(1000 * time), "ms") if trend.dated else time / 3600
+    return np.datetime64(round(1000 * time), "ms") if trend.dated else time / HOUR
 
 
 def _lifetimes(axes: Axes, trend: Trend, at: np.ndarray) -> None:

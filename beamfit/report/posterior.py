@@ -19,6 +19,7 @@ from beamfit.emittance.fit import EmittanceFit
 from beamfit.emittance.posterior import expected_sizes
 from beamfit.lifetime.fit import DecayFit
 from beamfit.lifetime.posterior import expected_current
+from beamfit.quantity import HOUR
 from beamfit.report.document import (
     BLUE,
     MANY,
@@ -291,7 +292,7 @@ def of_decay(fit: DecayFit, posterior: Posterior, label: str = "") -> ReportedPo
         _expectations,
         title=fit.readings.name,
         labels=("time, h", "current - median model, mA"),
-        at=fit.readings.time / 3600.0,
+        at=fit.readings.time / HOUR,
         measured=fit.readings.current,
         error=fit.readings.error,
         expect=partial(expected_current, posterior, fit),
