@@ -15,6 +15,7 @@ import numpy as np
 
 from beamfit.emittance.scan import POSSIBLE, USUAL, Profile, QuadScan, middle, row_keys
 from beamfit.errors import InputError, located, nearest, short
+from beamfit.io.cells import number, numbers_of
 from beamfit.io.columns import (
     SETTINGS,
     UNITS,
@@ -529,6 +530,7 @@ def scan_of_sheet(
     if {"counts_x", "counts_y"} & set(sheet.names):
         sheet, profiles = of_profiles(sheet)
     columns = scan_columns(sheet, knobs or {})
+    sheet = _without_dark(sheet, columns) if "shot" in columns else sheet
     if skip_bad:
         sheet = sheet.good(lambda rows: _values(rows, columns))
         usual = _usual(_values(sheet, columns))
@@ -548,6 +550,28 @@ def scan_of_sheet(
         scan = _scan(sheet, columns, values, notes=tuple(notes), profiles=profiles)
     rows = row_keys(scan)
     return average_shots(scan, marked="shot" in columns) if len(set(rows)) < len(rows) else scan
+
+
+def _without_dark(sheet: Sheet, columns: Mapping[str, Column]) -> Sheet:
+    """Blank the sizes of shots that show no beam, for which programs write 0."""
+    cells, count = dict(zip(sheet.names, sheet.cells, strict=True)), 0
+    for plane in (p for p in "xy" if f"size_{p}" in columns):
+        size, wrong = numbers_of(cells[columns[f"size_{plane}"].header], number, True)
+        if wrong is not None:
+            continue
+        dark, count = size == 0.0, count + int(np.sum(size == 0.0))
+        for key in {f"size_{plane}", f"size_{plane}_error"} & set(columns):
+            header = columns[key].header
+            cells[header] = ["" if d else c for d, c in zip(dark, cells[header], strict=True)]
+    if not count:
+        return sheet
+    show = (
+        "shot of size 0 shows no beam and is"
+        if count == 1
+        else "shots of size 0 show no beam and are"
+    )
+    note = f"{count} {show} left out."
+    return replace(sheet, cells=list(cells.values()), notes=(*sheet.notes, note))
 
 
 def _scan(
