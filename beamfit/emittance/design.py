@@ -23,7 +23,7 @@ from beamfit.emittance.model import (
 )
 from beamfit.emittance.statement import Seen, varied_magnets
 from beamfit.emittance.targets import check_limits
-from beamfit.errors import InputError, Status
+from beamfit.errors import InputError, Status, expect
 from beamfit.greybox.design import Information, greedy
 from beamfit.optics.beamline import Beamline
 from beamfit.optics.elements import Drift, Screen
@@ -345,6 +345,7 @@ def plan_measurements(
     >>> len(advice.steps), advice.steps[1].relative_error["x"] < advice.now["x"]
     (2, True)
     """
+    expect(fit, EmittanceFit, "beamfit.fit_emittance(scan, line)")
     if criterion not in CRITERIA:
         raise InputError(f"criterion '{criterion}'", "emittance or D")
     if count < 1 or (goal is not None and not goal > 0):

@@ -59,13 +59,14 @@ def predicted_sizes(
     fitted = {p.plane: p for p in fit.planes}
     if plane not in fitted:
         raise InputError(f"no fit of plane '{plane}'", " or ".join(fitted))
-    p, given = fitted[plane], {n: np.atleast_1d(np.asarray(v, float)) for n, v in settings.items()}
-    n = max((len(v) for v in given.values()), default=1)
+    p = fitted[plane]
     try:
+        given = {name: np.atleast_1d(np.asarray(v, float)) for name, v in settings.items()}
+        n = max((len(v) for v in given.values()), default=1)
         given = {name: np.array(np.broadcast_to(v, n)) for name, v in given.items()}
     except ValueError:
-        lengths = {name: len(v) for name, v in given.items()}
-        raise InputError(f"settings of lengths {lengths}", "one length, or one number") from None
+        expected = "a number for each magnet, or arrays of one length"
+        raise InputError(f"settings {dict(settings)}", expected) from None
     rows = _rows(fit, given, n, plane, screen)
     if fit.statement.closed:
         r11, r12, known = (np.asarray(part)[:n] for part in rows.elements({}))

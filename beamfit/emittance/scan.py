@@ -380,12 +380,17 @@ class QuadScan:
         lengths |= {f"size_{p}": len(v) for p, v in self.size.items()}
         lengths |= {f"size_{p}_error": len(v) for p, v in self.error.items()}
         lengths |= {f"shots of {p}": len(v) for p, v in self.shot_size.items()}
-        lengths |= {"slice": len(self.slice)} if self.slice is not None else {}
+        words = {"slice": self.slice, "screen": self.screen}
+        lengths |= {name: len(v) for name, v in words.items() if v is not None}
         lengths |= {f"R in {p}": len(v) for p, v in (self.transfer or {}).items()}
+        if apart := [p for p in self.error if p not in self.size]:
+            raise self.unusable(f"errors in {apart[0]} without sizes", f"size_{apart[0]}, too")
         if len(set(lengths.values())) != 1:
             raise self.unusable(f"lengths {lengths}", "one length for all columns")
 
     def _numbers(self, values: object, key: str) -> np.ndarray:
+        if isinstance(values, np.ma.MaskedArray):  # what is masked was not measured
+            values = values.astype(float).filled(np.nan)
         try:
             found = np.asarray(values, float)
         except (TypeError, ValueError):

@@ -12,6 +12,7 @@ from beamfit.dynamics.feed import FeedPlan
 from beamfit.dynamics.fit import ResponseFit
 from beamfit.dynamics.state_fit import StatesFit
 from beamfit.emittance.slices import SliceFits
+from beamfit.errors import InputError
 from beamfit.language.compiled import Computed
 from beamfit.language.solution import ProblemSolution
 from beamfit.report.density import density_page
@@ -39,4 +40,6 @@ OF_SEVERAL = dict.fromkeys((ResponseFit, StatesFit), response_page)
 def page_of(several: Sequence[Any]) -> ReportPage:
     """The page of such a result, or of several."""
     kind = type(several[0])
+    if kind not in OF_ONE and kind not in OF_SEVERAL:
+        raise InputError(f"a report of a {kind.__name__}", "a fit, or another result that has one")
     return OF_ONE[kind](several[0]) if kind in OF_ONE else OF_SEVERAL[kind](several)
