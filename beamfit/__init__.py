@@ -65,7 +65,7 @@ _HOME = {
     "read_quad_scan": "beamfit.io.scan",
     "read_ring": "beamfit.io.ring",
     "read_run": "beamfit.io.run",
-    "read_tuning_scan": "beamfit.io.tuning",
+    "read_tuning_scan": "beamfit.io.scan",
     "run_batch": "beamfit.batch.run",
     "save_fit": "beamfit.io.result",
     "scan_machine": "beamfit.commands",

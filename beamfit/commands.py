@@ -132,7 +132,7 @@ def _tuning(scan: Any, line: Any, knobs: Mapping[str, Any]) -> dict[str, Any]:
     """A table of knobs, and the line that it is checked against without them."""
     found = {}
     if is_path(scan):
-        from beamfit.io.tuning import read_tuning_scan
+        from beamfit.io.scan import read_tuning_scan
 
         found["scan"] = scan = read_tuning_scan(scan, knobs)
     if is_path(line):

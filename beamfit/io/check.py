@@ -17,11 +17,11 @@ from beamfit.answer import Table
 from beamfit.dynamics.record import Run
 from beamfit.emittance.scan import QuadScan
 from beamfit.errors import InputError
+from beamfit.io.columns import Columns, Layout, layout_of, proposal
 from beamfit.io.decay_record import is_current, known, likely_record_name, read_lifetime_input
 from beamfit.io.emittance_gui import is_emittance_gui, read_emittance_gui
 from beamfit.io.files import digest
 from beamfit.io.lattice import CALIBRATIONS, STRENGTHS, LatticeFile
-from beamfit.io.layout import Columns, Layout, layout_of, proposal
 from beamfit.io.line import FOREIGN, build_line, read_lattice
 from beamfit.io.ring import read_operation, read_ring
 from beamfit.io.run import read_run

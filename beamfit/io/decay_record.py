@@ -16,6 +16,7 @@ from beamfit.io.columns import (
     DATE,
     UNITS,
     Column,
+    Columns,
     Sheet,
     columns_of,
     left_aside,
@@ -25,7 +26,6 @@ from beamfit.io.columns import (
     unit_at_end,
 )
 from beamfit.io.files import name_of
-from beamfit.io.layout import Columns
 from beamfit.io.scan import is_size
 from beamfit.io.table import read_columns
 from beamfit.lifetime.record import (
@@ -167,7 +167,7 @@ def read_decay_record(
         Lines that begin with `#` and HDF5 attributes are kept as comments.
     columns : str, path, mapping or Layout, optional
         What columns are whose headers do not say it: ``{"PV 12": "beam_current_mA"}``, or as
-        `beamfit.io.layout.layout_of` reads it. Other columns of unknown names are ignored.
+        `beamfit.io.columns.layout_of` reads it. Other columns of unknown names are ignored.
     ignore : iterable of str, optional
         Columns to leave unread; * and ? stand for any letters.
     skip_bad : bool, optional

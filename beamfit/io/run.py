@@ -13,13 +13,13 @@ from beamfit.errors import InputError
 from beamfit.io.columns import (
     DATE,
     Column,
+    Columns,
     Sheet,
     columns_of,
     left_aside,
     left_out,
 )
 from beamfit.io.files import name_of
-from beamfit.io.layout import Columns
 from beamfit.io.table import read_columns
 
 if TYPE_CHECKING:
@@ -47,7 +47,7 @@ def read_run(
         A frame, CSV or HDF5 with ``time_s`` (_min, _h, _ms; or ``time`` with dates), inputs ``u_…``
         and outputs ``y_…``. A blank output was not read.
     columns : str, path, mapping or Layout, optional
-        What columns are: ``{"valve position": "u_valve"}``, or as `beamfit.io.layout.layout_of`
+        What columns are: ``{"valve position": "u_valve"}``, or as `beamfit.io.columns.layout_of`
         reads it. Other columns of unknown names are ignored.
     inputs, outputs : iterable of str
         Columns of other names that are inputs or outputs; the others are then ignored.

@@ -9,8 +9,8 @@ import pytest
 import beamfit
 from beamfit.cli import main
 from beamfit.errors import InputError
+from beamfit.io.columns import layout_of
 from beamfit.io.decay_record import read_lifetimes
-from beamfit.io.layout import layout_of
 from beamfit.io.run import read_run
 
 SCAN = "QUAD:BACT,xrms,err,foo\n0,200,2,9\n1,120,1,9\n2,180,2,9\n3,230,2,9\n"
