@@ -21,7 +21,7 @@ from beamfit.emittance.fit import EmittanceFit
 from beamfit.emittance.model import (
     spoken,
 )
-from beamfit.emittance.statement import Seen, varied_magnets
+from beamfit.emittance.statement import PreparedScan, varied_magnets
 from beamfit.emittance.targets import check_limits
 from beamfit.errors import InputError, Status, expect
 from beamfit.greybox.design import Information, greedy
@@ -62,7 +62,7 @@ def _screens(fit: EmittanceFit) -> tuple[str, ...]:
     return tuple(dict.fromkeys((*measured, *later)))
 
 
-def _along(seen: Seen) -> tuple[list[str], list[int]]:
+def _along(seen: PreparedScan) -> tuple[list[str], list[int]]:
     """Names along the line, and where in them the scanned magnets stand."""
     names = [e.name for e in seen.scanned.elements]
     magnets = [m for name in varied_magnets(seen.scan) for m in seen.scanned.members(name)]

@@ -72,13 +72,13 @@ def predicted_sizes(
         r11, r12, known = (np.asarray(part)[:n] for part in rows.elements({}))
         sigma = np.array([q.value for q in p.sigma])
         size = np.sqrt(np.maximum(size_squared(sigma, r11, r12, known), 0.0))
-        error = _spread(fit.seen.works[plane].posterior, r11, r12, known)
+        error = _spread(fit.seen.solutions[plane].posterior, r11, r12, known)
         error = np.where(np.isfinite(p.covariance).all(), error, np.nan)
     else:
         found = fit.solved.derive(predict_sizes, rows)
         size, whole = 1e-6 * found.value[:n], 1e-6 * found.error[:n]
         r11, r12, known = (np.asarray(part)[:n] for part in rows.elements(fit.solved.model))
-        post = fit.seen.works[plane].posterior
+        post = fit.seen.solutions[plane].posterior
         slope = np.stack(coefficients(r11, r12), -1) / (2.0 * size[:, None])
         held = np.einsum("ij,jk,ik->i", slope, post.covariance, slope)
         # What the other unknowns add in linear theory, beside the posterior of the beam.

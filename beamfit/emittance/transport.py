@@ -399,7 +399,7 @@ def check_gradients(scan: QuadScan, scanned: Beamline) -> None:
             )
 
 
-def questions(scan: QuadScan, scanned: Beamline) -> tuple[str, ...]:
+def unit_warnings(scan: QuadScan, scanned: Beamline) -> tuple[str, ...]:
     """Ask about sizes and settings that are possible, and yet more likely in a wrong unit.
 
     Parameters

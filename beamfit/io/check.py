@@ -168,13 +168,13 @@ def with_lattice(scan: Understood, lattice: Understood) -> Understood:
         said = str(replace(error, path=None))
         return replace(scan, facts=(*scan.facts, Fact(label, said, {"fits": False, "why": said})))
     from beamfit.emittance.transport import (
-        questions,  # JAX from here on
         scanned_line,
+        unit_warnings,  # JAX from here on
     )
 
     line = build_line(lattice.content)
     own = scan.content.of_particle(line.mass)
-    asked = questions(own, scanned_line(own, line))
+    asked = unit_warnings(own, scanned_line(own, line))
     notes = (*scan.notes, *(note for note in asked if note not in scan.notes))
     fact = Fact(label, "has all its magnets and screens", {"fits": True})
     return replace(scan, facts=(*scan.facts, fact), notes=notes)

@@ -516,12 +516,12 @@ def _known(header: str, quantities: Mapping[str, str], sheet: Sheet) -> Column |
     return Column(header, name, unit, units[unit])
 
 
-def left_aside(sheet: Sheet, columns: Mapping[str, Column]) -> tuple[str, ...]:
+def ignored(sheet: Sheet, columns: Mapping[str, Column]) -> tuple[str, ...]:
     """Name the columns that a layout and beamfit do not know, and that were not read, as a note."""
     used = {column.header for column in columns.values()}
     aside = [name for name in sheet.names if name not in used] if sheet.arranged else []
     more = [f"{len(aside) - MOST_ASIDE} more"] if len(aside) > MOST_ASIDE else []
-    return (f"Left aside: {', '.join(aside[:MOST_ASIDE] + more)}.",) if aside else ()
+    return (f"Ignored: {', '.join(aside[:MOST_ASIDE] + more)}.",) if aside else ()
 
 
 def left_out(sheet: Sheet) -> tuple[str, ...]:

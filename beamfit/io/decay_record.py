@@ -19,7 +19,7 @@ from beamfit.io.columns import (
     Columns,
     Sheet,
     columns_of,
-    left_aside,
+    ignored,
     left_out,
     number_and_unit,
     spelled,
@@ -240,7 +240,7 @@ def _record(sheet: Sheet, skip_bad: bool, offset: str | None) -> DecayRecord:
         start=float(moment[0]) if absolute else None,
         conditions=conditions,
         comments=sheet.comments,
-        notes=notes + left_out(sheet) + left_aside(sheet, columns) + found.notes,
+        notes=notes + left_out(sheet) + ignored(sheet, columns) + found.notes,
         monitor=Monitor(offset=found.error) if found.error else None,
     )
 

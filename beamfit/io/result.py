@@ -324,12 +324,12 @@ def _fit(kind: str, content: Any) -> EmittanceFit | DecayFit:
     if kind != "EmittanceFit":
         raise InputError(f"a fit of kind {str(kind)[:40]}", "EmittanceFit or DecayFit")
     from beamfit.emittance.fit import EmittanceFit, scenario_of
-    from beamfit.emittance.statement import see
+    from beamfit.emittance.statement import prepare
 
     own = {name: _value(content[name]) for name in OWN}
     line, statement = _value(content["line"]), scenario_of("known")
     planes = tuple(p.plane for p in own["planes"])
-    seen = see(own["scan"], line, planes, *(_value(content[name]) for name in HOW_SEEN))
+    seen = prepare(own["scan"], line, planes, *(_value(content[name]) for name in HOW_SEEN))
     return EmittanceFit(
         own.pop("planes"), own.pop("scan"), line, statement, own.pop("told"), seen, **own
     )

@@ -16,7 +16,7 @@ from beamfit.io.columns import (
     Columns,
     Sheet,
     columns_of,
-    left_aside,
+    ignored,
     left_out,
 )
 from beamfit.io.files import name_of
@@ -99,7 +99,7 @@ def read_run(
         row = int(late[0]) + 1
         found = f"time {time[row]:.10g} s after {time[row - 1]:.10g} s"
         raise sheet.error(found, "times that increase", row, columns[TIME].header)
-    name, aside = name_of(sheet.path), left_aside(sheet, columns)
+    name, aside = name_of(sheet.path), ignored(sheet, columns)
     said = {
         "provenance": sheet.comments,
         "notes": (*aside, *left_out(sheet)),

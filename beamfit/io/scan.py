@@ -23,8 +23,8 @@ from beamfit.io.columns import (
     Columns,
     Sheet,
     columns_of,
+    ignored,
     known_unit,
-    left_aside,
     left_out,
     number_and_unit,
     spelled,
@@ -546,7 +546,7 @@ def scan_of_sheet(
         more = "; --skip-bad leaves such rows out" if skip else ""
         raise replace(error, expected=error.expected + more) from None
     notes = [*column_notes(columns), *comment_notes(sheet, columns), *odd]
-    notes += [*left_aside(sheet, columns), *left_out(sheet)]
+    notes += [*ignored(sheet, columns), *left_out(sheet)]
     with located(sheet.path):
         scan = _scan(sheet, columns, values, notes=tuple(notes), profiles=profiles)
     rows = row_keys(scan)

@@ -16,7 +16,7 @@ from beamfit.answer import Table, answer, cell, json_of
 from beamfit.emittance.comparison import BEAM, MODELS
 from beamfit.emittance.results import in_words
 from beamfit.emittance.scan import KNOB, QuadScan
-from beamfit.emittance.statement import Seen, varied_magnets
+from beamfit.emittance.statement import PreparedScan, varied_magnets
 from beamfit.emittance.transport import setting_units
 from beamfit.emittance.verdict import REMEDIES, SURE
 from beamfit.errors import Finding, InputError, Judged, Status, expect, judge
@@ -176,7 +176,7 @@ class TuningFit(Judged):
     ----------
     scan : QuadScan or EmittanceTable
         The table, knobs among its settings.
-    seen : Seen or None
+    seen : PreparedScan or None
         A scan without the knobs, through its line; None of finished emittances.
     knobs : Knobs
         Names, limits and units.
@@ -208,7 +208,7 @@ class TuningFit(Judged):
     """
 
     scan: QuadScan | EmittanceTable
-    seen: Seen | None
+    seen: PreparedScan | None
     knobs: Knobs
     goal: str
     within: float
