@@ -15,7 +15,7 @@ __version__ = "0.1.0"
 # `beamfit --help` and a bad file are answered before JAX has been imported.
 _HOME = {
     "Anchor": "beamfit.emittance.assumptions",
-    "Beam": "beamfit.emittance.wishes",
+    "Beam": "beamfit.emittance.targets",
     "BeamMatrix": "beamfit.optics.beam",
     "Beamline": "beamfit.optics.beamline",
     "DecayFit": "beamfit.lifetime.fit",
@@ -36,8 +36,8 @@ _HOME = {
     "Run": "beamfit.dynamics.record",
     "Screen": "beamfit.optics.elements",
     "SectorDipole": "beamfit.optics.elements",
-    "Status": "beamfit.verdict",
-    "Target": "beamfit.emittance.wishes",
+    "Status": "beamfit.errors",
+    "Target": "beamfit.emittance.targets",
     "ThinLens": "beamfit.optics.elements",
     "TuningFit": "beamfit.tuning.fit",
     "check": "beamfit.io.check:understand",
@@ -65,7 +65,7 @@ _HOME = {
     "read_quad_scan": "beamfit.io.scan",
     "read_ring": "beamfit.io.ring",
     "read_run": "beamfit.io.run",
-    "read_tuning_scan": "beamfit.io.tuning",
+    "read_tuning_scan": "beamfit.io.scan",
     "run_batch": "beamfit.batch.run",
     "save_fit": "beamfit.io.result",
     "scan_machine": "beamfit.commands",

@@ -132,7 +132,7 @@ def _tuning(scan: Any, line: Any, knobs: Mapping[str, Any]) -> dict[str, Any]:
     """A table of knobs, and the line that it is checked against without them."""
     found = {}
     if is_path(scan):
-        from beamfit.io.tuning import read_tuning_scan
+        from beamfit.io.scan import read_tuning_scan
 
         found["scan"] = scan = read_tuning_scan(scan, knobs)
     if is_path(line):
@@ -301,8 +301,8 @@ def control(
     from beamfit.dynamics.fit import identify as respond
 
     options = {"delay": delay, "offset": offset, "hidden": hidden, "seed": seed}
-    wished = [name for name in outputs if name in {t[0] for t in targets} | set(limits)]
-    fits = [respond(runs, model, map, output=name, **options) for name in wished or outputs]
+    wanted = [name for name in outputs if name in {t[0] for t in targets} | set(limits)]
+    fits = [respond(runs, model, map, output=name, **options) for name in wanted or outputs]
     made = controller(
         fits,
         inputs={n: v for n, v in limits.items() if n in inputs},

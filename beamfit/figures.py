@@ -141,14 +141,14 @@ def decay(result: DecayFit | RecordStudy) -> Figure:
     -------
     matplotlib.figure.Figure
     """
-    from beamfit.report.decays import record_picture, study_of
+    from beamfit.report.lifetime import record_picture, study_of
 
     return _drawn(record_picture(study_of(result)))
 
 
 def lifetime(result: DecayFit | RecordStudy) -> Figure:
     """Draw the momentary lifetime along a record beside that of the fit; argument as of `decay`."""
-    from beamfit.report.decays import lifetime_picture, study_of
+    from beamfit.report.lifetime import lifetime_picture, study_of
 
     return _drawn(lifetime_picture(study_of(result)))
 
@@ -192,7 +192,7 @@ def trend(result: Trend) -> Figure:
     -------
     matplotlib.figure.Figure
     """
-    from beamfit.report.trend import trend_picture
+    from beamfit.report.lifetime import trend_picture
 
     return _drawn(trend_picture(result))
 

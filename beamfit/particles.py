@@ -12,8 +12,9 @@ ENERGY_KEYS = {"energy_MeV": "total", "kinetic_energy_MeV": "kinetic", "momentum
 # MeV
 ELECTRON_MASS = REST_ENERGY["electron"]
 PROTON_MASS = REST_ENERGY["proton"]
-# Speed of light in the unit MeV/(T m) that turns p c into B rho: exact by definition.
-_LIGHT = 299.792458
+# Speed of light in m/s, exact by definition; in MeV/(T m) it turns p c into B rho.
+LIGHT = 299792458.0
+_LIGHT = LIGHT / 1e6
 # MeV, above the energy of every machine: a larger number is in another unit.
 _HIGHEST = 1e7
 

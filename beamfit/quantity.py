@@ -5,8 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from beamfit.errors import InputError
-from beamfit.verdict import Status
+from beamfit.errors import InputError, Status
 
 __all__ = ["Quantity", "Status", "display_unit", "percent", "relative_change"]
 

@@ -19,7 +19,7 @@ import beamfit
 from beamfit.dynamics.fedbatch import identify_batches, rank_inputs
 from beamfit.dynamics.feed import best_feed, predict
 from beamfit.io.run import read_run
-from beamfit.report.fedbatch import draw_ranking
+from beamfit.report.dynamics import draw_ranking
 
 PLACE = Path(__file__).resolve().parents[1] / "measurements"
 START, REST = (1.0, 8.0, 4.0, 0.0), {"feed_substrate": 200.0, "air": 1.0}

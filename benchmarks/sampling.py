@@ -114,7 +114,7 @@ def scan() -> Case:
     noise = beamfit.Noise()
     measured = beamfit.read_quad_scan("measurements/gtf_simulated.csv")
     fit = beamfit.fit_emittance(measured, beamfit.load_lattice("lattices/gtf.toml"))
-    p, post = fit.x.points, fit.seen.works["x"].posterior
+    p, post = fit.x.points, fit.seen.solutions["x"].posterior
     size = p.size / post.unit
     kinds = tuple(zip(post.kinds, post.scales, strict=True))
 

@@ -21,7 +21,7 @@ from rich.table import Table
 import beamfit
 from beamfit.emittance.assumptions import Anchor, Assumptions
 from beamfit.emittance.model import predict_sizes
-from beamfit.emittance.statement import see
+from beamfit.emittance.statement import prepare
 from beamfit.emittance.transport_network import SCENARIO
 from beamfit.greybox import problem as greybox
 from beamfit.greybox.descend import descend_all
@@ -129,7 +129,7 @@ def compare(name, problem, count, table):
 def main(count=20):
     scan = beamfit.read_quad_scan(ROOT / "measurements/gtf_simulated.csv")
     line = beamfit.load_lattice(ROOT / "lattices/gtf.toml")
-    seen = see(scan, line)
+    seen = prepare(scan, line)
     table = Table(title=f"Transport network, SIMULATED scan of 14 points, {count} starts")
     for column in ("problem", "tool", "χ² best", "χ² median", "s warm", "ratio", "s first"):
         table.add_column(column)

@@ -49,7 +49,7 @@ def main():
         lowest = dense(request)
         between = time.perf_counter()
         beams = {plane: Beam(sigma) for plane, sigma in request.beams.items()}
-        found = find_setpoint(line, beams, request.limits, request.wishes)
+        found = find_setpoint(line, beams, request.limits, request.targets)
         ended = time.perf_counter()
         print(
             f"{name:30s} {lowest:12.6g} in {between - began:5.1f} s, here "

@@ -18,9 +18,9 @@ from scipy.special import betaincinv
 
 from beamfit.emittance.fit import fit_many
 from beamfit.emittance.scan import QuadScan
+from beamfit.errors import Status
 from beamfit.optics.beamline import Beamline
 from beamfit.optics.elements import Drift, Quadrupole, Screen
-from beamfit.verdict import Status
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "verdict_measured.md"
 MARKS = "<!-- measured: benchmarks/verdict.py -->", "<!-- end of measured -->"

@@ -21,12 +21,13 @@ from matplotlib import rc_context
 from matplotlib.figure import FigureBase
 
 import beamfit
+from beamfit.answer import Table
 from beamfit.emittance.assumptions import Assumptions
 from beamfit.emittance.calibration import with_numbers
 from beamfit.emittance.fit import EmittanceFit, fit_emittance
 from beamfit.emittance.model import UNIT
 from beamfit.emittance.scan import QuadScan
-from beamfit.emittance.statement import see
+from beamfit.emittance.statement import prepare
 from beamfit.emittance.transport_network import SCENARIO
 from beamfit.greybox.fit import Fit
 from beamfit.greybox.solve import solve
@@ -44,7 +45,6 @@ from beamfit.report.document import (
     provenance,
     written,
 )
-from beamfit.table import Table
 from beamfit.writing import write_atomically
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -143,7 +143,7 @@ def reproduce(scan: QuadScan, line: Beamline, starts: int = 20) -> Reproduction:
 def _held(scan: QuadScan, line: Beamline, words: str, sigma, starts: int) -> Held:
     """Train the network of A and B for a beam that is held."""
     told = Assumptions(starts=starts)
-    problem = SCENARIO.state(see(scan, line, ("x",)), told)
+    problem = SCENARIO.state(prepare(scan, line, ("x",)), told)
     beam = BeamMatrix.from_sigma(*(1e-8 / UNIT**2 * s for s in sigma))
     numbers = {k: float(getattr(beam, k)) for k in ("l11", "l21", "l22")}
     model = problem.model | {"beam": {"x": numbers}}

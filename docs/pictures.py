@@ -70,8 +70,8 @@ def mechanisms() -> Figure:
     """Computed losses of simulated decays by mechanism, and what was measured."""
     import beamfit
     from beamfit.lifetime.study import Machine, study_record
-    from beamfit.report.decays import draw_budget
     from beamfit.report.document import Picture, figure_of
+    from beamfit.report.lifetime import draw_budget
 
     ring = ROOT / "lattices/spear3_2003.toml"
     machine = Machine(beamfit.read_ring(ring), beamfit.read_operation(ring))

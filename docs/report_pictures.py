@@ -124,7 +124,7 @@ def _batches():
 def figs_31_33() -> Figure:
     """Measured and predicted outputs of a batch."""
     from beamfit.report.document import Picture, figure_of
-    from beamfit.report.fedbatch import draw_batch
+    from beamfit.report.dynamics import draw_batch
 
     fit = _batches()
     return figure_of(Picture("", 5.6, lambda figure: draw_batch(fit, 0, figure), fit.runs[0].name))

@@ -31,9 +31,9 @@ import beamfit.io.decay_record
 from beamfit.errors import InputError
 from beamfit.greybox.mlp import dense
 from beamfit.io import isolated
+from beamfit.io.columns import SHIPPED, layout_of
 from beamfit.io.emittance_gui import read_emittance_gui
 from beamfit.io.formulation import read_formulation, read_network, read_numbers
-from beamfit.io.layout import SHIPPED, layout_of
 from beamfit.io.line import read_lattice
 from beamfit.io.machine import read_scan_machine
 from beamfit.io.result import load_fit, read_fitted_beams, save_fit

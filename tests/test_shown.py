@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 import beamfit
+from beamfit.answer import brief
 from beamfit.emittance.design import plan_measurements
-from beamfit.emittance.wishes import Beam, Target
+from beamfit.emittance.targets import Beam, Target
 from beamfit.quantity import Quantity
-from beamfit.shown import brief
 
 HOSTILE = "<i>&Q\n1"
 

@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from beamfit.answer import Table, labelled, plain_name
 from beamfit.batch.columns import COLUMNS, named
 from beamfit.batch.run import Batch
 from beamfit.emittance.model import QUANTITIES
@@ -16,7 +17,6 @@ from beamfit.errors import InputError, nearest
 from beamfit.lifetime.evidence import UNITS
 from beamfit.quantity import display_unit
 from beamfit.statistics import baseline, control_limits
-from beamfit.table import Table, labelled, plain_name
 
 # Standard deviations of all points; limits that are wider rest on fewer than five points, whose
 # Student's quantile they show.

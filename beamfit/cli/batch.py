@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 import click
 
 import beamfit
+from beamfit.answer import Table
 from beamfit.cli.options import Command, answered, command_line, option, options
 from beamfit.errors import InputError
-from beamfit.table import Table
 from beamfit.writing import check_place
 
 if TYPE_CHECKING:

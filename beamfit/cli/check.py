@@ -8,12 +8,12 @@ from typing import Any
 import click
 
 import beamfit
+from beamfit.answer import text_of
 from beamfit.cli.options import Command, command_line, options
 from beamfit.errors import InputError
 from beamfit.io.check import Understood, proposed_layout, with_lattice
-from beamfit.io.layout import Layout
+from beamfit.io.columns import Layout
 from beamfit.io.result import results_text
-from beamfit.table import text_of
 
 EXAMPLE = """\b
 Examples:

@@ -1,4 +1,4 @@
-"""`beamfit control`: records of runs and wishes in, a controller in a simulated loop out."""
+"""`beamfit control`: records of runs and targets in, a controller in a simulated loop out."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ Examples:
     --disturb level=-1@90 --report loop.html
 """
 READING = ("columns", "inputs", "outputs", "step", "ignore", "skip_bad")
-WISH = "OUTPUT=VALUE or OUTPUT=VALUE@SECONDS such as level=2.5@60"
+TARGET = "OUTPUT=VALUE or OUTPUT=VALUE@SECONDS such as level=2.5@60"
 LIMIT = "NAME=LOW:HIGH, one of them may be left out, such as level=:3"
 
 
@@ -36,7 +36,7 @@ LIMIT = "NAME=LOW:HIGH, one of them may be left out, such as level=:3"
 @option(
     "--set OUTPUT=VALUE[@SECONDS]",
     "Target of an output, from a time on.",
-    name="wishes",
+    name="targets",
     multiple=True,
     required=True,
 )
@@ -59,7 +59,7 @@ LIMIT = "NAME=LOW:HIGH, one of them may be left out, such as level=:3"
 def control(
     record: tuple[str, ...],
     no_offset: bool,
-    wishes: tuple[str, ...],
+    targets: tuple[str, ...],
     limit: tuple[str, ...],
     rate: tuple[str, ...],
     disturb: tuple[str, ...],
@@ -73,7 +73,7 @@ def control(
     of its residuals. Inputs and their rates keep their limits always, outputs wherever any inputs
     can keep them; what cannot be kept is named.
     """
-    targets, loads = _steps(wishes, "set"), _steps(disturb, "disturb")
+    targets, loads = _steps(targets, "set"), _steps(disturb, "disturb")
     told |= {"limits": gains_of(limit, "limit", LIMIT), "rates": _rates(rate)}
     reading = {n: told.pop(n) for n in READING}
     runs = [read_run(path, **reading) for path in record]
@@ -93,7 +93,7 @@ def _steps(texts: tuple[str, ...], option: str) -> list[tuple[str, float, float]
         try:
             found.append((name.strip(), float(value), float(at or 0.0)))
         except ValueError:
-            raise InputError(f"--{option} '{text}'", WISH) from None
+            raise InputError(f"--{option} '{text}'", TARGET) from None
     return found
 
 

@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING, Any
 import click
 
 import beamfit
+from beamfit.answer import text_of
 from beamfit.cli.option_text import energies_of
 from beamfit.cli.options import Command, answered, option, options
 from beamfit.emittance.assumptions import Assumptions
 from beamfit.io.line import build_line, read_inputs
 from beamfit.io.priors import read_noise
-from beamfit.table import text_of
 
 if TYPE_CHECKING:
     from beamfit.cli.show import Terminal

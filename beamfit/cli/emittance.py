@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING, Any
 import click
 
 import beamfit
+from beamfit.answer import Table, determined, labelled
 from beamfit.cli.options import Command, Sampling, answered, option, options, reported
 from beamfit.emittance.assumptions import Assumptions
 from beamfit.errors import InputError
 from beamfit.io.line import build_line, read_inputs
 from beamfit.io.priors import read_noise, read_systematics
 from beamfit.quantity import percent
-from beamfit.table import Table, determined, labelled
 
 if TYPE_CHECKING:
     from beamfit.cli.show import Terminal

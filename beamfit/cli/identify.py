@@ -14,11 +14,11 @@ from beamfit.io.files import digest
 from beamfit.io.run import read_run
 
 if TYPE_CHECKING:
+    from beamfit.answer import Table
     from beamfit.cli.show import Terminal
     from beamfit.dynamics.fedbatch import FedBatchFit
     from beamfit.dynamics.fit import ResponseFit
     from beamfit.dynamics.state_fit import StatesFit
-    from beamfit.table import Table
 
 
 # A table of more rows is shown by three of them; --full has all.

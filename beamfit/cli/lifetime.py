@@ -228,8 +228,8 @@ def _show(
 
 def _show_record(terminal: Terminal, study: RecordStudy) -> None:
     """Lay out a record: what was cut away, and every decay with its verdict and budget."""
+    from beamfit.answer import Table, determined, labelled
     from beamfit.lifetime import tables
-    from beamfit.table import Table, determined, labelled
 
     terminal.line(str(study.record), style="bold")
     for note in study.record.notes:
@@ -265,8 +265,8 @@ def _show_record(terminal: Terminal, study: RecordStudy) -> None:
 
 def _show_many(terminal: Terminal, study: RecordStudy) -> None:
     """Say each verdict once, then print a table with a row for each decay."""
+    from beamfit.answer import Table, cell
     from beamfit.lifetime import tables
-    from beamfit.table import Table, cell
 
     verdicts = tables.alike(study.decays)
     told = verdicts if terminal.full else verdicts[:MOST_VERDICTS]
@@ -299,8 +299,8 @@ def _say_shift(terminal: Terminal, shift: Shift) -> None:
 
 def _show_shift(terminal: Terminal, shift: Shift) -> None:
     """Lay out a study of many decays."""
+    from beamfit.answer import labelled
     from beamfit.lifetime import tables
-    from beamfit.table import labelled
 
     fit, count = shift.fit, len(shift.fit.names)
     names = ["1 decay" if count == 1 else f"{count} decays"]

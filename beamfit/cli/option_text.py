@@ -9,7 +9,7 @@ import re
 from collections.abc import Callable, Iterable
 
 from beamfit.emittance.assumptions import Anchor
-from beamfit.emittance.wishes import Target
+from beamfit.emittance.targets import Target
 from beamfit.errors import InputError
 
 PRIOR = "NAME=MEAN+-SD such as Q2.slope=167.23+-3.3446"

@@ -15,7 +15,7 @@ import beamfit
 from beamfit.cli.option_text import anchor_of, bounds_of, gains_of, goal_of, limits_of, priors_of
 from beamfit.emittance.assumptions import SCENARIOS
 from beamfit.errors import InputError
-from beamfit.io.layout import layout_of
+from beamfit.io.columns import layout_of
 from beamfit.io.result import results_text
 from beamfit.particles import REST_ENERGY
 from beamfit.report import kind_of

@@ -14,14 +14,13 @@ from typing import TYPE_CHECKING
 import click
 
 import beamfit
+from beamfit.answer import cell
 from beamfit.cli.options import Command, answered, command_line, option, options, reported
-from beamfit.errors import InputError, plain
+from beamfit.errors import InputError, Status, plain
 from beamfit.io.files import digest
 from beamfit.io.line import build_line, read_inputs
 from beamfit.io.machine import ScanMachine, read_scan_machine
 from beamfit.io.result import results_text
-from beamfit.table import cell
-from beamfit.verdict import Status
 
 if TYPE_CHECKING:
     from beamfit.emittance.fit import EmittanceFit

@@ -1,4 +1,4 @@
-"""`beamfit setpoint`: a beam, a lattice and a wish in, the best magnet settings out."""
+"""`beamfit setpoint`: a beam, a lattice and targets in, the best magnet settings out."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ import click
 import numpy as np
 
 import beamfit
+from beamfit.answer import text_of
 from beamfit.cli.option_text import target_of
 from beamfit.cli.options import Command, answered, option, options
-from beamfit.emittance.wishes import Beam, Target, common_energy
+from beamfit.emittance.targets import Beam, Target, common_energy
 from beamfit.errors import InputError, located
 from beamfit.io.files import digest
 from beamfit.io.line import build_line, read_lattice
 from beamfit.io.result import read_fitted_beams
-from beamfit.table import text_of
 
 if TYPE_CHECKING:
     from beamfit.cli.show import Terminal
@@ -43,7 +43,7 @@ Examples:
 )
 @options("vary")
 @option(
-    "--target WISH",
+    "--target TARGET",
     "size=200um, divergence=140urad, match (to the lattice's design Twiss) or "
     "match=BETA_M:ALPHA; size_y and so on for a plane by name.",
     multiple=True,

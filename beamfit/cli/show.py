@@ -11,11 +11,11 @@ from rich.segment import Segment
 from rich.table import Table as RichTable
 from rich.text import Text
 
+from beamfit.answer import Table
 from beamfit.errors import plain
 from beamfit.quantity import Status
 from beamfit.report import PAGES, kind_of
 from beamfit.sampling.posterior import Posterior
-from beamfit.table import Table
 
 
 def _style(status: Status) -> str:

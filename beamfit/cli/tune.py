@@ -10,7 +10,7 @@ from beamfit.cli.options import Command, answered, option, options, reported
 from beamfit.errors import InputError
 from beamfit.io.line import build_line, lattice_of
 from beamfit.io.priors import read_noise
-from beamfit.io.tuning import read_tuning_scan
+from beamfit.io.scan import read_tuning_scan
 from beamfit.tuning.knobs import GOALS, EmittanceTable, knobs_of, planes_of
 
 if TYPE_CHECKING:

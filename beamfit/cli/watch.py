@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from beamfit.answer import Table, cell
 from beamfit.cli.options import Command, answered, option, options
 from beamfit.commands import watch_plan
 from beamfit.errors import plain
 from beamfit.io.files import digest
 from beamfit.io.machine import WatchMachine, read_watch_machine
-from beamfit.table import Table, cell
 
 if TYPE_CHECKING:
     from beamfit.live.watch import WatchView

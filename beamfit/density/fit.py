@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from scipy.special import ndtr
 
-from beamfit.answer import answer
+from beamfit.answer import Table, answer, cell, json_of
 from beamfit.density.charge import FINE, ChargeParts, charge_parts, finely, negative_charge
 from beamfit.density.profiles import MeanProfile, mean_profiles
 from beamfit.density.tomography import GRID, Densities, tomography
@@ -20,14 +20,12 @@ from beamfit.emittance.model import phase_coverage
 from beamfit.emittance.results import PlaneFit
 from beamfit.emittance.scan import QuadScan
 from beamfit.emittance.sigma import fit_sizes
-from beamfit.errors import InputError, expect
+from beamfit.errors import Finding, InputError, Judged, Status, expect, judge
 from beamfit.noise.model import Noise
 from beamfit.optics.beamline import Beamline
 from beamfit.particles import beta_gamma
 from beamfit.quantity import Quantity, percent
 from beamfit.statistics import of_use, quantity_of_draws
-from beamfit.table import Table, cell, json_of
-from beamfit.verdict import Finding, Judged, Status, judge
 
 # Shares of the charge whose emittance is given, and draws of the density.
 SHARES, DRAWS = (0.5, 0.68, 0.9, 0.95, 1.0), 256

@@ -12,17 +12,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from beamfit.answer import Table, cell, json_of
 from beamfit.dynamics.checks import Checks, HeldOutRun
 from beamfit.dynamics.input_laws import LawEvidence
 from beamfit.dynamics.model import PreparedOutput, curves
 from beamfit.dynamics.response import ARX, FIRST_ORDER, SECOND_ORDER, Physics
+from beamfit.errors import Finding, Status
 from beamfit.greybox.fit import Derived, Fit
 from beamfit.greybox.judge import gauges, together
 from beamfit.greybox.memory import Memory
 from beamfit.quantity import Quantity
 from beamfit.statistics import POOR_FIT
-from beamfit.table import Table, cell, json_of
-from beamfit.verdict import Finding, Status
 
 # Points of a curve; samples within a share of its range that make a point visited.
 POINTS, VISITS, NEAR = 41, 5, 0.05

@@ -17,14 +17,12 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.signal import lfilter
 
-from beamfit.answer import answer
+from beamfit.answer import Table, answer, json_of
 from beamfit.dynamics.fit import ResponseFit
 from beamfit.dynamics.model import parameters_at, predicted
 from beamfit.dynamics.response import ARX, PHYSICS, Physics, run_from
-from beamfit.errors import InputError, nearest
+from beamfit.errors import Finding, InputError, Status, judge, nearest
 from beamfit.greybox.quadratic import Quadratic, minimum
-from beamfit.table import Table, json_of
-from beamfit.verdict import Finding, Status, judge
 
 # Penalty on an output beyond its limit, per unit of its scatter: larger than any multiplier of a
 # limit that can be kept, so that such a limit is kept exactly.

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.special import logit, ndtri
 
-from beamfit.answer import answer
+from beamfit.answer import Table, answer, json_of
 from beamfit.dynamics.answer import NEAR, POINTS, WORSE, Curve
 from beamfit.dynamics.balances import (
     BEYOND,
@@ -40,15 +40,13 @@ from beamfit.dynamics.balances import (
 from beamfit.dynamics.model import weight_priors
 from beamfit.dynamics.record import Run, ordered
 from beamfit.dynamics.search import rounds
-from beamfit.errors import InputError, nearest
+from beamfit.errors import Finding, InputError, Status, judge, nearest
 from beamfit.greybox.fit import Fit
 from beamfit.greybox.mlp import MLP, Port, dense
 from beamfit.greybox.problem import Free, Prior, Problem, Record
 from beamfit.greybox.solve import solve
 from beamfit.noise.memory import is_correlated
 from beamfit.statistics import POOR_FIT
-from beamfit.table import Table, json_of
-from beamfit.verdict import Finding, Status, judge
 
 # Values, in units of the largest, below which a noise that is a share of them stays the same.
 FLOORS = np.geomspace(1e-4, 1.0, 13)

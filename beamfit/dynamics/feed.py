@@ -9,16 +9,14 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from beamfit.answer import answer
+from beamfit.answer import Table, answer
 from beamfit.dynamics.balances import STATES, TITRE, Batches, batches_of
 from beamfit.dynamics.fedbatch import FedBatchFit, ahead, forecast
-from beamfit.errors import InputError
+from beamfit.errors import InputError, Status
 from beamfit.greybox.fit import Fit
 from beamfit.greybox.problem import Constraint, Free, Objective, Problem
 from beamfit.greybox.solve import solve
 from beamfit.quantity import Quantity
-from beamfit.table import Table
-from beamfit.verdict import Status
 
 OUTPUTS = (*STATES, TITRE)
 # Rows of a plan, and rounds in which its safety margins follow the errors of the plan.

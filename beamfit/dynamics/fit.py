@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from beamfit.answer import answer
+from beamfit.answer import Table, answer, json_of
 from beamfit.dynamics.answer import (
     Curve,
     ResponseEvidence,
@@ -35,12 +35,10 @@ from beamfit.dynamics.search import (
     latest,
     used_by,
 )
-from beamfit.errors import InputError, nearest
+from beamfit.errors import InputError, Status, nearest
 from beamfit.greybox.fit import Fit
 from beamfit.noise.memory import CorrelatedNoise
 from beamfit.quantity import Quantity
-from beamfit.table import Table, json_of
-from beamfit.verdict import Status
 
 MAPS = ("constant", "network")
 LATEST = "The delay is the longest that was tried: say a longer one by --delay."

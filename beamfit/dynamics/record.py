@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from beamfit.answer import shown
 from beamfit.errors import InputError
-from beamfit.shown import shown
 
 # Fewest readings of an output; with fewer its response and its start are not separable.
 LEAST = 8

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from beamfit.answer import answer
+from beamfit.answer import Table, answer, json_of
 from beamfit.dynamics.answer import ResponseEvidence, judged, quantity
 from beamfit.dynamics.checks import Checks, HeldOutRun, RunSlopes, checks_of, percent
 from beamfit.dynamics.model import PreparedOutput, weight_priors
@@ -30,7 +30,7 @@ from beamfit.dynamics.search import (
     with_memory,
 )
 from beamfit.dynamics.states import StateSpace
-from beamfit.errors import InputError
+from beamfit.errors import InputError, Status
 from beamfit.greybox import tree
 from beamfit.greybox.fit import Derived, Fit
 from beamfit.greybox.mlp import MLP
@@ -39,8 +39,6 @@ from beamfit.greybox.solve import solve
 from beamfit.noise.memory import CorrelatedNoise
 from beamfit.quantity import Quantity
 from beamfit.statistics import POOR_FIT
-from beamfit.table import Table, json_of
-from beamfit.verdict import Status
 
 # Steps of a round, after which the noise is estimated again; most rounds; gain in -2 ln L per
 # reading below which they end.

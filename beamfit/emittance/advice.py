@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.linalg import block_diag
 
-from beamfit.emittance.comparison import PlaneSizes, compare, emittance_quantiles
+from beamfit.emittance.comparison import AT, PlaneSizes, compare, emittance_quantiles
 from beamfit.emittance.model import (
     emittance_parts,
     predict_sizes,
@@ -23,7 +23,7 @@ from beamfit.emittance.model import (
     size_squared,
 )
 from beamfit.emittance.results import PlaneFit, in_words
-from beamfit.emittance.statement import Scanned, Seen, size_records, varied_magnets
+from beamfit.emittance.statement import PreparedScan, Scanned, size_records, varied_magnets
 from beamfit.emittance.transport import NetworkRows, Rows, rows_at, setting_units
 from beamfit.emittance.verdict import PlaneEvidence
 from beamfit.greybox import assess
@@ -31,6 +31,7 @@ from beamfit.greybox.covariance import MOST_SHARE
 from beamfit.greybox.design import Information, greedy, rows_of
 from beamfit.greybox.fit import value_and_slope
 from beamfit.optics.beamline import Beamline, transfer_rows
+from beamfit.quantity import NORMAL_REACH
 from beamfit.statistics import USEFUL
 
 # Candidates reach half the scanned range beyond either end.
@@ -40,7 +41,7 @@ ROUNDING = 1e-9
 # A further size is known no better than this share of itself.
 SHARPEST = 1e-4
 # The error of ln ε whose 95 % interval spans the factor within which an emittance is of use.
-NARROW = float(np.log(USEFUL)) / 3.92
+NARROW = float(np.log(USEFUL)) / (2.0 * NORMAL_REACH)
 
 
 class Candidate(NamedTuple):
@@ -73,7 +74,7 @@ class Adviser(NamedTuple):
 
     Attributes
     ----------
-    seen : Seen
+    seen : PreparedScan
         The scan through its line.
     information : Information
         Of their emittances.
@@ -83,7 +84,7 @@ class Adviser(NamedTuple):
         Which planes are determined, by what is known and what is measured further.
     """
 
-    seen: Seen
+    seen: PreparedScan
     information: Information
     predict: Predict
     determined: Judge
@@ -121,7 +122,7 @@ class Adviser(NamedTuple):
         return found, np.array(rows)
 
 
-def settings_in_words(seen: Seen, settings: Mapping[str, float], digits: int = 4) -> str:
+def settings_in_words(seen: PreparedScan, settings: Mapping[str, float], digits: int = 4) -> str:
     """Settings with the units of the scan."""
     return in_words(settings, setting_units(seen.scanned, settings), digits)
 
@@ -177,9 +178,9 @@ class BeamSpread(NamedTuple):
         return np.linalg.solve(self.covariance, across.T).T
 
 
-def spread_of(seen: Seen, plane: str) -> BeamSpread:
+def spread_of(seen: PreparedScan, plane: str) -> BeamSpread:
     """Draws of a plane's beam about their mean."""
-    post = seen.works[plane].posterior
+    post = seen.solutions[plane].posterior
     kept = post.weight > 0.0
     sigma, weight = post.sigma[kept], post.weight[kept]
     # In units of each number, so that a covariance can be solved with.
@@ -189,12 +190,12 @@ def spread_of(seen: Seen, plane: str) -> BeamSpread:
     return BeamSpread(sigma, off, weight, covariance + 1e-12 * np.trace(covariance) * np.eye(3))
 
 
-def drawn_adviser(seen: Seen, fitted: Sequence[PlaneFit] = ()) -> Adviser:
+def drawn_adviser(seen: PreparedScan, fitted: Sequence[PlaneFit] = ()) -> Adviser:
     """Advise by the draws of the beams, where nothing else is unknown.
 
     Parameters
     ----------
-    seen : Seen
+    seen : PreparedScan
         The scan through its line.
     fitted : sequence of PlaneFit
         Its planes with the errors that are quoted; those of the draws count if none are given.
@@ -252,14 +253,18 @@ def emittances(sigma: np.ndarray) -> np.ndarray:
     return np.sqrt(np.maximum(sigma[:, 0] * sigma[:, 2] - sigma[:, 1] ** 2, 0.0))
 
 
-def relative_error(seen: Seen, plane: str) -> float:
+def relative_error(seen: PreparedScan, plane: str) -> float:
     """The relative error that a further size of a plane is expected to have: the scan's."""
-    p = seen.works[plane].points
+    p = seen.solutions[plane].points
     return max(float(np.median(p.error / p.size)), SHARPEST)
 
 
 def elements_at(
-    seen: Seen, line: Beamline, table: Mapping[str, np.ndarray], screen: str, energy: np.ndarray
+    seen: PreparedScan,
+    line: Beamline,
+    table: Mapping[str, np.ndarray],
+    screen: str,
+    energy: np.ndarray,
 ) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """R11, R12 and known size² of both planes at settings nobody need have measured."""
     settings = {n: jnp.asarray(v) for n, v in table.items()}
@@ -268,12 +273,14 @@ def elements_at(
     return [rows.known(r) for r in np.moveaxis(planes[:, :, 0, 0], 1, 0)]
 
 
-def simulated(seen: Seen, plane: str, r11: np.ndarray, r12: np.ndarray, known: np.ndarray) -> bool:
+def simulated(
+    seen: PreparedScan, plane: str, r11: np.ndarray, r12: np.ndarray, known: np.ndarray
+) -> bool:
     """Simulate further sizes, and tell if they determine the emittance of a plane.
 
     They are those that the draws predict in the mean, off by one error up and down in turn.
     """
-    work = seen.works[plane]
+    work = seen.solutions[plane]
     old, post, n = work.sizes, work.posterior, len(r11)
     size = np.sqrt(size_squared(post.weight @ post.sigma, r11, r12, known))
     off = relative_error(seen, plane) * size
@@ -283,14 +290,14 @@ def simulated(seen: Seen, plane: str, r11: np.ndarray, r12: np.ndarray, known: n
     sizes = PlaneSizes(*rows, error, old.of_shots, old.moved)
     [found] = compare([sizes], seen.noise)
     drawn = emittances(found.sigma)
-    low, high = emittance_quantiles(drawn, found.weight, found.flat, (0.025, 0.975))
+    low, high = emittance_quantiles(drawn, found.weight, found.flat, (AT[0], AT[-1]))
     return PlaneEvidence(found, sizes, low, high).determined
 
 
-def next_measurement(seen: Seen, plane: str) -> str | None:
+def next_measurement(seen: PreparedScan, plane: str) -> str | None:
     """Say which further setting would help the emittance of a plane most, if one can be named."""
     varied, screen = varied_magnets(seen.scan), seen.rows.places[-1]
-    if not varied or not seen.works[plane].posterior.seen:
+    if not varied or not seen.solutions[plane].posterior.seen:
         return None
     adviser, i = drawn_adviser(seen), seen.planes.index(plane)
     candidates, rows = adviser.candidates(None, (screen,))
@@ -347,7 +354,7 @@ def linear_adviser(fit: Scanned) -> Adviser:
     return Adviser(seen, information, predict, lambda known, _: determined_by(seen, known))
 
 
-def determined_by(seen: Seen, known: Information) -> dict[str, bool]:
+def determined_by(seen: PreparedScan, known: Information) -> dict[str, bool]:
     """Tell of each plane if its emittance rests on data and priors, within a factor of use."""
     clear = (known.relative_error <= NARROW) & (known.share < MOST_SHARE)
     return dict(zip(seen.planes, map(bool, clear), strict=True))

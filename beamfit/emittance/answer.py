@@ -11,6 +11,7 @@ from scipy.special import ndtri
 
 from beamfit.emittance.advice import next_measurement
 from beamfit.emittance.comparison import (
+    AT,
     PlanePosterior,
     emittance_quantiles,
     weighted_quantiles,
@@ -23,7 +24,7 @@ from beamfit.emittance.model import (
     phase_coverage,
 )
 from beamfit.emittance.results import Identifiability, PlaneFit, Points, ScreenTwiss
-from beamfit.emittance.statement import Seen, Work, asked_of
+from beamfit.emittance.statement import PlaneSolution, PreparedScan, asked_of
 from beamfit.emittance.transport import setting_units
 from beamfit.emittance.verdict import (
     CARRIES,
@@ -34,10 +35,10 @@ from beamfit.emittance.verdict import (
     verdict,
     waist_bracketed,
 )
+from beamfit.errors import Finding, Status
 from beamfit.optics.beamline import Beamline
 from beamfit.quantity import Quantity
 from beamfit.statistics import Directions, chi2_probability, scaled_directions
-from beamfit.verdict import Finding, Status
 
 SIGMA = slice(4, 7)
 # Normalised emittances in m beyond which only a wrong unit leads: rings and linacs have 1e-9 and
@@ -47,7 +48,6 @@ LEAST, MOST = 1e-10, 0.1
 LINEAR = np.isin(list(QUANTITIES), ("sigma11", "sigma12", "sigma22", "screen_size"))
 # Numbers of either sign; the others are positive, and spread by a factor.
 SIGNED = np.isin(list(QUANTITIES), ("alpha", "sigma12", "screen_alpha"))
-AT = (0.025, 0.1587, 0.5, 0.8413, 0.975)
 # βγ, matrices to the screen and the design's place, and the design: see `asked_places`.
 Places = tuple[Any, Any, Any, Any]
 
@@ -108,7 +108,7 @@ class PlaneNumbers(NamedTuple):
         return [_quantity(*row, limits) for row in rows]
 
 
-def judged_beam(seen: Seen) -> tuple[PlaneFit, ...]:
+def judged_beam(seen: PreparedScan) -> tuple[PlaneFit, ...]:
     """Answer for each plane where nothing but the beam is unknown; no program is compiled."""
     return tuple(
         plane_answer(seen, seen.line, plane, asked_places({}, asked_of(seen, plane)), None)
@@ -117,13 +117,13 @@ def judged_beam(seen: Seen) -> tuple[PlaneFit, ...]:
 
 
 def plane_answer(
-    seen: Seen, line: Beamline, plane: str, places: Places, b: Beside | None
+    seen: PreparedScan, line: Beamline, plane: str, places: Places, b: Beside | None
 ) -> PlaneFit:
     """Answer for one plane.
 
     Parameters
     ----------
-    seen : Seen
+    seen : PreparedScan
         The scan through its line, as found.
     line : Beamline
         The line as found.
@@ -139,7 +139,7 @@ def plane_answer(
     PlaneFit
         Errors only for what the data determine: half of the central 68 % of the posterior.
     """
-    work = seen.works[plane]
+    work = seen.solutions[plane]
     post, p = work.posterior, work.points
     n, carrying = _numbers(post, p, places, b)
     e = _evidence(seen, plane, n, b)
@@ -202,7 +202,7 @@ def _advised(e: PlaneEvidence, b: Beside | None) -> bool:
 
 
 def _remarks(
-    work: Work, e: PlaneEvidence, b: Beside | None, carrying: Influence, value: np.ndarray
+    work: PlaneSolution, e: PlaneEvidence, b: Beside | None, carrying: Influence, value: np.ndarray
 ) -> str:
     """Further sentences on noise and points."""
     post, p, remarks = work.posterior, work.points, [work.shot_words]
@@ -283,8 +283,8 @@ def _reaching(
     return low, high, half
 
 
-def _evidence(seen: Seen, plane: str, n: PlaneNumbers, b: Beside | None) -> PlaneEvidence:
-    work, low, high = seen.works[plane], float(n.low[1]), float(n.high[1])
+def _evidence(seen: PreparedScan, plane: str, n: PlaneNumbers, b: Beside | None) -> PlaneEvidence:
+    work, low, high = seen.solutions[plane], float(n.low[1]), float(n.high[1])
     p = work.points
     waist = waist_bracketed(p.settings, p.screen, p.size, p.error)
     e = PlaneEvidence(work.posterior, work.sizes, low, high, waist)

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from numbers import Integral, Real
 from typing import NamedTuple
 
-from beamfit.errors import InputError, nearest
-from beamfit.shown import shown
+from beamfit.answer import shown
+from beamfit.errors import InputError, expect, nearest
 
 
 class Entry(NamedTuple):
@@ -94,9 +95,11 @@ class Anchor:
     determinant: bool = False
 
     def __post_init__(self) -> None:
+        if isinstance(self.at, Mapping):
+            raise InputError("an anchor at one mapping", "a tuple of them: at=({'Q2': 0.0},)")
         for name in ("deviation", "sd"):
             value = getattr(self, name)
-            if value is not None and not (math.isfinite(value) and value > 0):
+            if value is not None and not (isinstance(value, Real) and math.inf > value > 0):
                 raise InputError(f"anchor {name} {value}", "a positive relative deviation")
 
     @property
@@ -161,6 +164,7 @@ class Assumptions:
     seed: int = 0
 
     def __post_init__(self) -> None:
+        self._check_types()
         for name, (mean, sd) in self.priors.items():
             if not (math.isfinite(mean or 0.0) and math.isfinite(sd) and sd > 0):
                 expected = "a finite mean and a positive deviation"
@@ -178,9 +182,19 @@ class Assumptions:
             if not low < high or (math.isinf(low) and math.isinf(high)):
                 expected = "a finite limit at least, lower first"
                 raise InputError(f"gain {name} = {low:g}:{high:g}", expected)
-        for name in ("hidden", "starts"):
-            if getattr(self, name) < 1:
-                raise InputError(f"{getattr(self, name)} {name}", "at least one")
+        for name, least in (("hidden", 1), ("starts", 1), ("seed", 0)):
+            value = getattr(self, name)
+            if not (isinstance(value, Integral) and value >= least):
+                raise InputError(f"{name} {value!r}", f"an integer of at least {least}")
+
+    def _check_types(self) -> None:
+        expect(self.anchor, Anchor, "beamfit.Anchor(determinant=True)")
+        for kind in ("priors", "bounds", "gains"):
+            expect(getattr(self, kind), Mapping, f"{kind}={{'Q2.slope': (160.0, 170.0)}}")
+            for name, pair in getattr(self, kind).items():
+                numbers = isinstance(pair, Sequence) and len(pair) == 2
+                if not (numbers and all(v is None or isinstance(v, Real) for v in pair)):
+                    raise InputError(f"{kind} {name} = {pair!r}", "a pair of numbers")
 
     @property
     def systematics(self) -> dict[str, tuple[float | None, float]]:
@@ -201,7 +215,7 @@ class Assumptions:
             If the scenario is unknown, or priors, bounds, an anchor or branches do not apply.
         """
         if scenario not in SCENARIOS:
-            raise InputError(f"scenario '{scenario}'", nearest(scenario, list(SCENARIOS)))
+            raise InputError(f"scenario '{scenario}'", nearest(str(scenario), list(SCENARIOS)))
         entry = SCENARIOS[scenario]
         named = [*self.calibrations, *self.bounds]
         beyond = [name for name in self.systematics if name not in ON_SCREEN]

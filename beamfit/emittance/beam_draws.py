@@ -44,6 +44,8 @@ class Coordinates(NamedTuple):
     ----------
     w : ndarray
         Shape (..., n, 2): rows of R11 and R12 in them.
+    rows : ndarray
+        Shape (..., n, 3): derivatives of size² by T, T p_1 and T p_2.
     back : ndarray
         Shape (..., 2, 2): σ = back σ_w backᵀ, in m and rad.
     size, known : ndarray
@@ -55,17 +57,12 @@ class Coordinates(NamedTuple):
     """
 
     w: np.ndarray
+    rows: np.ndarray
     back: np.ndarray
     size: np.ndarray
     known: np.ndarray
     unit: np.ndarray
     seen: np.ndarray
-
-    @property
-    def rows(self) -> np.ndarray:
-        """Derivatives of size² by T, T p_1 and T p_2, shape (..., n, 3)."""
-        a, b = self.w[..., 0], self.w[..., 1]
-        return 0.5 * np.stack([a**2 + b**2, a**2 - b**2, 2.0 * a * b], -1)
 
     def sigma(self, x: np.ndarray) -> np.ndarray:
         """σ11, σ12, σ22 in SI of T, T p_1, T p_2, shape (..., d, 3)."""
@@ -95,8 +92,10 @@ def coordinates(
     seen = values[..., 0] > RANK * values[..., 1]
     values = np.where(seen[..., None], values, np.maximum(values, 1.0))
     turn = vectors / np.sqrt(values)[..., None, :]
-    back = turn / np.swapaxes(norm, -1, -2)
-    return Coordinates((u / norm) @ turn, back, size, known, unit, seen)
+    back, w = turn / np.swapaxes(norm, -1, -2), (u / norm) @ turn
+    a, b = w[..., 0], w[..., 1]
+    rows = 0.5 * np.stack([a**2 + b**2, a**2 - b**2, 2.0 * a * b], -1)
+    return Coordinates(w, rows, back, size, known, unit, seen)
 
 
 class BeamDraws(NamedTuple):

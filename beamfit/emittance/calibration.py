@@ -11,14 +11,13 @@ import jax
 
 from beamfit.emittance.assumptions import Assumptions
 from beamfit.emittance.results import Parameter
-from beamfit.emittance.statement import Scenario, Seen, beam_problem, varied_magnets
-from beamfit.errors import InputError, nearest
+from beamfit.emittance.statement import PreparedScan, Scenario, beam_problem, varied_magnets
+from beamfit.errors import InputError, Status, nearest
 from beamfit.greybox.fit import Fit
 from beamfit.greybox.problem import Free, Prior, Problem
 from beamfit.greybox.tree import leaves
 from beamfit.optics.beamline import Beamline
 from beamfit.optics.calibration import CurrentPolynomial, SlopeIntercept
-from beamfit.verdict import Status
 
 # The report's bounds are 167.23 ± 20 for the slope and 43.17 ± 20 for the intercept (appendix C).
 WIDTH = 20.0 / 167.23
@@ -156,7 +155,7 @@ def with_numbers(line: Beamline, numbers: Mapping[str, float]) -> Beamline:
     return line
 
 
-def _free_numbers(seen: Seen, told: Assumptions) -> dict[str, Number]:
+def _free_numbers(seen: PreparedScan, told: Assumptions) -> dict[str, Number]:
     """Slope and offset of the scanned magnets, and whatever is named."""
     known, varied = numbers_of_magnets(seen.scanned), varied_magnets(seen.scan)
     named = [*told.calibrations, *told.bounds]
@@ -170,7 +169,7 @@ def _free_numbers(seen: Seen, told: Assumptions) -> dict[str, Number]:
     }
 
 
-def _state(seen: Seen, told: Assumptions) -> Problem:
+def _state(seen: PreparedScan, told: Assumptions) -> Problem:
     """Beams and calibrations free, all planes together."""
     numbers = _free_numbers(seen, told)
     magnets = {n.magnet: seen.scanned[n.magnet].calibration for n in numbers.values()}
@@ -186,7 +185,7 @@ def _state(seen: Seen, told: Assumptions) -> Problem:
     return beam_problem(seen, model={"magnets": magnets}, free=free, priors=priors)
 
 
-def _parameters(seen: Seen, told: Assumptions, fit: Fit) -> Iterator[Parameter]:
+def _parameters(seen: PreparedScan, told: Assumptions, fit: Fit) -> Iterator[Parameter]:
     settled = fit.status is not Status.not_converged
     for name, number in _free_numbers(seen, told).items():
         v, prior = fit[f"magnets.{name}"], told.priors.get(name)
@@ -194,7 +193,7 @@ def _parameters(seen: Seen, told: Assumptions, fit: Fit) -> Iterator[Parameter]:
 
 
 def _null_directions(
-    seen: Seen, parameters: tuple[Parameter, ...], identified: bool
+    seen: PreparedScan, parameters: tuple[Parameter, ...], identified: bool
 ) -> tuple[str, ...]:
     known, said = numbers_of_magnets(seen.scanned), []
     for parameter in parameters:
@@ -215,7 +214,7 @@ def _null_directions(
     return tuple(said)
 
 
-def _remedy(seen: Seen, told: Assumptions) -> str:
+def _remedy(seen: PreparedScan, told: Assumptions) -> str:
     known = numbers_of_magnets(seen.scanned, varied_magnets(seen.scan))
     slopes = [name for name, number in known.items() if number.kind is NumberKind.slope]
     without = [name for name in slopes if name not in told.priors]

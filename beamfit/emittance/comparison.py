@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from typing import NamedTuple
@@ -61,6 +61,8 @@ BENDS, LENGTHS = np.array([0.2, 0.4, 0.7, 1.2]), (0.25, 0.5)
 DEPARTURES, SMOOTH, NEAR = np.array([0.1, 0.2, 0.4]), 0.7, 1 / 30
 # Standard deviation of ln of a constant size.
 LEVEL = 1.0
+# Quantiles of a posterior: an error is half of the central 68 %, an interval the central 95 %.
+AT = (0.025, 0.1587, 0.5, 0.8413, 0.975)
 # Draws of a beam of no emittance, of which the evidence alone is wanted.
 FEW = 256
 
@@ -484,11 +486,10 @@ def _best(
     first = np.argmax(top, axis=0)
     x = np.array([d.best for d in draws])[first, np.arange(len(first))]
     rests = np.zeros(len(x), bool)
+    expecting = [_expecting(c, kind, d, noise) for kind, d in zip(s.kinds, draws, strict=True)]
     for _ in range(ROUNDS):
         model = _model(x, c)
-        parts = [
-            _expected(model, c, kind, d, noise) for kind, d in zip(s.kinds, draws, strict=True)
-        ]
+        parts = [expected(model) for expected in expecting]
         precision = sum(w[:, None] * p for w, (p, _) in zip(of_kind, parts, strict=True))
         if method == "size_squared":
             target, at = c.size**2, model if weights == "model" else c.size
@@ -515,17 +516,21 @@ def _model(x: np.ndarray, c: Coordinates) -> np.ndarray:
     return np.sqrt(np.clip(squared, (c.size / FURTHEST) ** 2, (c.size * FURTHEST) ** 2))
 
 
-def _expected(
-    model: np.ndarray, c: Coordinates, kind: NoiseKind, draws: BeamDraws, noise: Noise
-) -> tuple[np.ndarray, np.ndarray]:
-    """Expected precision of each point's size, and probability that it is bad, (planes, n)."""
-    variance = variance_of(kind, draws.scales.scale)
+def _expecting(
+    c: Coordinates, kind: NoiseKind, draws: BeamDraws, noise: Noise
+) -> Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]:
+    """Expected precision of each point's size, and probability that it is bad, by the model."""
+    variance, share = variance_of(kind, draws.scales.scale), draws.scale_weight[..., None]
     steep, least = (part[:, None, :] for part in odds_of(kind, noise))
-    squared = (((c.size - model) / model**kind.power) ** 2)[:, None, :]
-    bad = 1.0 / (1.0 + np.exp(-steep * squared / variance - least))
     wide = (noise.width * kind.usual[:, None, :]) ** -2
-    each, share = (1.0 - bad * (1.0 - wide)) / variance, draws.scale_weight[..., None]
-    return (share * each).sum(1) / model ** (2 * kind.power), (share * bad).sum(1)
+
+    def expected(model: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        squared = (((c.size - model) / model**kind.power) ** 2)[:, None, :]
+        bad = 1.0 / (1.0 + np.exp(-steep * squared / variance - least))
+        each = (1.0 - bad * (1.0 - wide)) / variance
+        return (share * each).sum(1) / model ** (2 * kind.power), (share * bad).sum(1)
+
+    return expected
 
 
 def _posterior(
@@ -587,7 +592,7 @@ def _covariance(rows: np.ndarray) -> np.ndarray:
 def _scale_of(i: int, draws: Sequence[BeamDraws], of_kind: np.ndarray) -> np.ndarray:
     """Median and central 68 % of the scale of the likelier kind of noise."""
     own = draws[int(np.argmax(of_kind))]
-    return weighted_quantiles(own.scales.scale[i], own.scale_weight[i], (0.5, 0.1587, 0.8413))
+    return weighted_quantiles(own.scales.scale[i], own.scale_weight[i], (AT[2], AT[1], AT[3]))
 
 
 def weighted_quantiles(values: np.ndarray, weight: np.ndarray, at: Sequence[float]) -> np.ndarray:

@@ -11,7 +11,7 @@ from jax import Array
 
 from beamfit.emittance.assumptions import Assumptions
 from beamfit.emittance.model import UNIT, sigma_of
-from beamfit.emittance.statement import Seen, beam_problem
+from beamfit.emittance.statement import PreparedScan, beam_problem
 from beamfit.emittance.transport import padded
 from beamfit.errors import InputError, nearest
 from beamfit.greybox.gains import certified_gain
@@ -23,7 +23,7 @@ MOST = 10.0
 
 
 def network_problem(
-    seen: Seen,
+    seen: PreparedScan,
     told: Assumptions,
     inputs: Sequence[str],
     common: Iterable[str],

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from beamfit.answer import answer
+from beamfit.answer import Table, answer, json_of
 from beamfit.emittance.advice import (
     Adviser,
     Candidate,
@@ -21,14 +21,12 @@ from beamfit.emittance.fit import EmittanceFit
 from beamfit.emittance.model import (
     spoken,
 )
-from beamfit.emittance.statement import Seen, varied_magnets
-from beamfit.emittance.wishes import check_limits
-from beamfit.errors import InputError
+from beamfit.emittance.statement import PreparedScan, varied_magnets
+from beamfit.emittance.targets import check_limits
+from beamfit.errors import InputError, Status, expect
 from beamfit.greybox.design import Information, greedy
 from beamfit.optics.beamline import Beamline
 from beamfit.optics.elements import Drift, Screen
-from beamfit.table import Table, json_of
-from beamfit.verdict import Status
 
 # Other energies to consider where none is named: what a linac can usually do.
 USUAL_ENERGIES = (0.8, 1.25)
@@ -64,7 +62,7 @@ def _screens(fit: EmittanceFit) -> tuple[str, ...]:
     return tuple(dict.fromkeys((*measured, *later)))
 
 
-def _along(seen: Seen) -> tuple[list[str], list[int]]:
+def _along(seen: PreparedScan) -> tuple[list[str], list[int]]:
     """Names along the line, and where in them the scanned magnets stand."""
     names = [e.name for e in seen.scanned.elements]
     magnets = [m for name in varied_magnets(seen.scan) for m in seen.scanned.members(name)]
@@ -347,6 +345,7 @@ def plan_measurements(
     >>> len(advice.steps), advice.steps[1].relative_error["x"] < advice.now["x"]
     (2, True)
     """
+    expect(fit, EmittanceFit, "beamfit.fit_emittance(scan, line)")
     if criterion not in CRITERIA:
         raise InputError(f"criterion '{criterion}'", "emittance or D")
     if count < 1 or (goal is not None and not goal > 0):

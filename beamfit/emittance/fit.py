@@ -9,7 +9,16 @@ from functools import cached_property
 from html import escape
 from typing import TYPE_CHECKING, Any
 
-from beamfit.answer import answer, quantity_frame
+from beamfit.answer import (
+    Table,
+    answer,
+    determined,
+    html_of,
+    json_of,
+    labelled,
+    quantity_frame,
+    text_of,
+)
 from beamfit.emittance.answer import judged_beam
 from beamfit.emittance.assumptions import Anchor, Assumptions
 from beamfit.emittance.comparison import BEAM
@@ -20,23 +29,22 @@ from beamfit.emittance.scan import QuadScan
 from beamfit.emittance.statement import (
     METHODS,
     WEIGHTS,
+    PreparedScan,
     Scenario,
-    Seen,
     looked_through,
-    prepared,
+    of_one_beam,
+    prepare,
     scenario_of,
-    see,
     unfitted,
     with_posteriors,
 )
-from beamfit.emittance.transport import of_emittances, of_priors, questions
+from beamfit.emittance.transport import of_emittances, of_priors, unit_warnings
 from beamfit.emittance.verdict import SURE
 from beamfit.errors import InputError, expect
 from beamfit.greybox.problem import Problem
 from beamfit.noise.model import ROBUST, Noise
 from beamfit.optics.beamline import Beamline
 from beamfit.quantity import Quantity
-from beamfit.table import Table, determined, html_of, json_of, labelled, text_of
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -142,6 +150,8 @@ def fit_emittance(
     expect(scan, QuadScan, "beamfit.read_quad_scan(path)")
     if line is not None:
         expect(line, Beamline, "beamfit.load_lattice(path)")
+    if noise is not None:
+        expect(noise, Noise, "beamfit.Noise(bad=0.1)")
     for name, given, known in (("method", method, METHODS), ("weights", weights, WEIGHTS)):
         if given not in known:
             raise InputError(f"{name} '{given}'", " or ".join(known))
@@ -149,13 +159,13 @@ def fit_emittance(
     told = Assumptions(priors or {}, bounds or {}, *ties, hidden, starts, seed)
     told.check_scenario(scenario)
     noise = replace(noise or Noise(), bad=ROBUST) if robust else noise
-    scan, line = prepared(scan, line, scenario)
+    scan, line = of_one_beam(scan, line, scenario)
     statement = scenario_of(scenario)
     if told.systematics:
         from beamfit.emittance.systematics import with_systematics
 
         statement = with_systematics(statement, told)
-    seen = see(scan, line, planes, method, noise, weights)
+    seen = prepare(scan, line, planes, method, noise, weights)
     if statement.closed:
         return EmittanceFit(judged_beam(seen), scan, line, statement, told, seen)
 
@@ -187,7 +197,7 @@ class EmittanceFit:
         What was unknown besides the beam.
     told : Assumptions
         What was known besides the data.
-    seen : Seen
+    seen : PreparedScan
         The scan through the line as it was given.
     parameters : tuple of Parameter
         Numbers fitted besides the beam.
@@ -213,7 +223,7 @@ class EmittanceFit:
     line: Beamline
     statement: Scenario
     told: Assumptions
-    seen: Seen
+    seen: PreparedScan
     parameters: tuple[Parameter, ...] = ()
     null_directions: tuple[str, ...] = ()
     solved: Fit | None = None
@@ -235,7 +245,7 @@ class EmittanceFit:
         measured = self.seen.weights == "measured"
         own = ("Errors of size squared are taken at the measured sizes, on request.",) * measured
         asked = (
-            *questions(self.scan, self.seen.scanned),
+            *unit_warnings(self.scan, self.seen.scanned),
             *of_priors(self.told.priors, self.seen.scanned),
             *of_emittances(self.planes),
         )
@@ -456,10 +466,10 @@ def fit_many(
     4.0
     """
     found: list[EmittanceFit | InputError | None] = []
-    begun: dict[int, Seen] = {}
+    begun: dict[int, PreparedScan] = {}
     for i, given in enumerate(scans):
         try:
-            begun[i] = unfitted(*prepared(*given), noise=noise, weights=weights)
+            begun[i] = unfitted(*of_one_beam(*given), noise=noise, weights=weights)
             found.append(None)
         except InputError as error:
             found.append(error)
@@ -484,9 +494,9 @@ def noise_samples(scans: Iterable[tuple[QuadScan, Beamline]], noise: Noise) -> I
     begun = []
     for given in scans:
         with suppress(InputError):
-            begun.append(unfitted(*prepared(*given), noise=noise))
+            begun.append(unfitted(*of_one_beam(*given), noise=noise))
     for seen in with_posteriors(looked_through(begun)):
-        for work in seen.works.values():
+        for work in seen.solutions.values():
             post = work.posterior
             if len(work.sizes.size) > 3 and post.probability[BEAM] > SURE:
                 word = work.sizes.likeness[1]

@@ -23,16 +23,15 @@ from beamfit.emittance.constrained_network import (
     network_problem,
 )
 from beamfit.emittance.results import Parameter
-from beamfit.emittance.statement import Scenario, Seen, varied_magnets
+from beamfit.emittance.statement import PreparedScan, Scenario, varied_magnets
 from beamfit.emittance.transport import padded
-from beamfit.errors import InputError
+from beamfit.errors import InputError, Status
 from beamfit.greybox import tree
 from beamfit.greybox.fit import Derived, Fit
 from beamfit.greybox.mlp import MLP, Port
 from beamfit.greybox.problem import Free, Problem, Record
 from beamfit.greybox.signed_network import signed_network
 from beamfit.quantity import Quantity
-from beamfit.verdict import Status
 
 
 @tree.node("unit")
@@ -89,7 +88,7 @@ def branch_of(settings: np.ndarray) -> np.ndarray:
     return np.where(found == 0.0, first, found)
 
 
-def _first_strength(seen: Seen, magnet: str, current: np.ndarray) -> np.ndarray:
+def _first_strength(seen: PreparedScan, magnet: str, current: np.ndarray) -> np.ndarray:
     """k1 · E in MeV/m² as the lattice has it, at settings of a magnet."""
     element, energy = seen.scanned[magnet], float(seen.scanned.energy)
     return np.asarray(_strengths(element.calibration, current, element.length, energy)) * energy
@@ -131,7 +130,7 @@ def _less_common(model: Any, asked: _Asked) -> Array:
     return _predicted(model, asked) / (1.0 + model["anchor"][asked.magnet])
 
 
-def _state(seen: Seen, told: Assumptions) -> Problem:
+def _state(seen: PreparedScan, told: Assumptions) -> Problem:
     """Beams and one network of k1 for each scanned magnet."""
     varied = varied_magnets(seen.scan)
     if several := [name for name in varied if len(seen.scanned.members(name)) > 1]:
@@ -154,7 +153,7 @@ def _state(seen: Seen, told: Assumptions) -> Problem:
     return network_problem(seen, told, varied, varied, rows, part, weights, records)
 
 
-def _branches(seen: Seen, varied: tuple[str, ...]) -> dict[str, np.ndarray]:
+def _branches(seen: PreparedScan, varied: tuple[str, ...]) -> dict[str, np.ndarray]:
     """Branch of every row, where settings both rise and fall."""
     branches = {name: branch_of(seen.scan.settings[name]) for name in varied}
     single = [name for name, branch in branches.items() if np.ptp(branch) == 0]
@@ -168,7 +167,7 @@ def _branches(seen: Seen, varied: tuple[str, ...]) -> dict[str, np.ndarray]:
 
 
 def _strength(
-    seen: Seen, name: str, told: Assumptions, branches: bool
+    seen: PreparedScan, name: str, told: Assumptions, branches: bool
 ) -> tuple[NetworkStrength, list[Free]]:
     """A network that starts as the straight line between the lattice's own k1 at both ends."""
     settings = seen.scan.settings[name]
@@ -187,7 +186,7 @@ def _strength(
     return NetworkStrength(net, seen.scanned[name].calibration.unit), free
 
 
-def _anchors(seen: Seen, name: str, told: Assumptions, branches: bool) -> Iterator[Record]:
+def _anchors(seen: PreparedScan, name: str, told: Assumptions, branches: bool) -> Iterator[Record]:
     """Prior knowledge of k1, midway between the branches where there are two."""
     settings, anchor = seen.scan.settings[name], told.anchor
     largest = float(np.abs(_first_strength(seen, name, settings)).max())
@@ -206,7 +205,7 @@ def _anchors(seen: Seen, name: str, told: Assumptions, branches: bool) -> Iterat
         yield known_record(f"anchor {name}", predict, data, values, sd * largest)
 
 
-def _parameters(seen: Seen, told: Assumptions, fit: Fit) -> Iterator[Parameter]:
+def _parameters(seen: PreparedScan, told: Assumptions, fit: Fit) -> Iterator[Parameter]:
     """k1 at both ends and the middle of the scanned range, and the width of the loop."""
     energy, settled = float(seen.scanned.energy), fit.status is not Status.not_converged
     for name in varied_magnets(seen.scan):

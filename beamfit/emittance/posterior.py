@@ -20,8 +20,8 @@ from beamfit.emittance.model import (
     spoken,
 )
 from beamfit.emittance.results import PlaneFit
-from beamfit.emittance.statement import Scanned, Seen, asked_in, factor_of, size_records
-from beamfit.errors import InputError
+from beamfit.emittance.statement import PreparedScan, Scanned, asked_in, factor_of, size_records
+from beamfit.errors import Finding, InputError
 from beamfit.greybox import tree
 from beamfit.greybox.posterior import Optimum, Statement, predicted, target_of
 from beamfit.greybox.problem import Problem
@@ -32,7 +32,6 @@ from beamfit.quantity import Status
 from beamfit.sampling.posterior import Expected, Posterior
 from beamfit.sampling.priors import Distribution
 from beamfit.sampling.target import SamplingTarget
-from beamfit.verdict import Finding
 
 CHOLESKY, SIGMA = ("l11", "l21", "l22"), ("sigma11", "sigma12", "sigma22")
 TWISS = ("emittance", "normalized_emittance", "beta", "alpha", "mismatch")
@@ -98,11 +97,13 @@ def _log_volume(model: Mapping[str, Any], told: DensityData) -> Array:
     return sum((each.log_density(model) for each in told.sizes), jnp.zeros(()))
 
 
-def _sizes_of(problem: Problem, seen: Seen, planes: Sequence[str]) -> tuple[PlaneLikelihood, ...]:
+def _sizes_of(
+    problem: Problem, seen: PreparedScan, planes: Sequence[str]
+) -> tuple[PlaneLikelihood, ...]:
     """Data of each plane for the likelihood."""
     records, found = size_records(problem), []
     for plane in planes:
-        work = seen.works[plane]
+        work = seen.solutions[plane]
         post = work.posterior
         at, size = seen.measured(plane), work.sizes.size / post.unit
         own = (records[plane].data, at, size, post.unit, post.trace, post.kinds, post.scales)

@@ -10,7 +10,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from beamfit.emittance.comparison import PlanePosterior, weighted_quantiles
+from beamfit.answer import shown
+from beamfit.emittance.comparison import AT, PlanePosterior, weighted_quantiles
 from beamfit.emittance.model import coefficients, emittance_parts, predict_sizes, size_squared
 from beamfit.emittance.results import PlaneFit
 from beamfit.emittance.statement import Scanned
@@ -18,7 +19,6 @@ from beamfit.emittance.transport import Rows, padded, rows_at
 from beamfit.errors import InputError, nearest
 from beamfit.optics.beamline import seen_line
 from beamfit.sampling.posterior import Correlations
-from beamfit.shown import shown
 
 NAMES = ("sigma11", "sigma12", "sigma22", "emittance", "beta", "alpha")
 
@@ -59,25 +59,26 @@ def predicted_sizes(
     fitted = {p.plane: p for p in fit.planes}
     if plane not in fitted:
         raise InputError(f"no fit of plane '{plane}'", " or ".join(fitted))
-    p, given = fitted[plane], {n: np.atleast_1d(np.asarray(v, float)) for n, v in settings.items()}
-    n = max((len(v) for v in given.values()), default=1)
+    p = fitted[plane]
     try:
+        given = {name: np.atleast_1d(np.asarray(v, float)) for name, v in settings.items()}
+        n = max((len(v) for v in given.values()), default=1)
         given = {name: np.array(np.broadcast_to(v, n)) for name, v in given.items()}
     except ValueError:
-        lengths = {name: len(v) for name, v in given.items()}
-        raise InputError(f"settings of lengths {lengths}", "one length, or one number") from None
+        expected = "a number for each magnet, or arrays of one length"
+        raise InputError(f"settings {dict(settings)}", expected) from None
     rows = _rows(fit, given, n, plane, screen)
     if fit.statement.closed:
         r11, r12, known = (np.asarray(part)[:n] for part in rows.elements({}))
         sigma = np.array([q.value for q in p.sigma])
         size = np.sqrt(np.maximum(size_squared(sigma, r11, r12, known), 0.0))
-        error = _spread(fit.seen.works[plane].posterior, r11, r12, known)
+        error = _spread(fit.seen.solutions[plane].posterior, r11, r12, known)
         error = np.where(np.isfinite(p.covariance).all(), error, np.nan)
     else:
         found = fit.solved.derive(predict_sizes, rows)
         size, whole = 1e-6 * found.value[:n], 1e-6 * found.error[:n]
         r11, r12, known = (np.asarray(part)[:n] for part in rows.elements(fit.solved.model))
-        post = fit.seen.works[plane].posterior
+        post = fit.seen.solutions[plane].posterior
         slope = np.stack(coefficients(r11, r12), -1) / (2.0 * size[:, None])
         held = np.einsum("ij,jk,ik->i", slope, post.covariance, slope)
         # What the other unknowns add in linear theory, beside the posterior of the beam.
@@ -95,7 +96,7 @@ def _spread(
     kept = post.weight > 0.0
     sigma, weight = post.sigma[kept].T, post.weight[kept]
     sizes = np.sqrt(size_squared(sigma, r11[:, None], r12[:, None], known[:, None]))
-    ends = [weighted_quantiles(row, weight, (0.1587, 0.8413)) for row in sizes]
+    ends = [weighted_quantiles(row, weight, (AT[1], AT[3])) for row in sizes]
     return 0.5 * np.diff(ends, axis=1)[:, 0]
 
 

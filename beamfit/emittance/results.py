@@ -9,12 +9,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from beamfit.answer import answer
+from beamfit.answer import Row, Table, answer, cell, json_of, labelled, shown
+from beamfit.errors import Status
 from beamfit.optics.beam import BeamMatrix
 from beamfit.quantity import Quantity, display_unit
-from beamfit.shown import shown
-from beamfit.table import Row, Table, cell, json_of, labelled
-from beamfit.verdict import Status
 
 if TYPE_CHECKING:
     from beamfit.greybox.fit import FittedVariable

@@ -14,11 +14,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from beamfit.answer import frame_of
+from beamfit.answer import MOST_ROWS, Table, frame_of, shown
 from beamfit.errors import InputError, expect, nearest
 from beamfit.particles import ENERGY_KEYS, total_energy
-from beamfit.shown import shown
-from beamfit.table import MOST_ROWS, Table
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -382,12 +380,17 @@ class QuadScan:
         lengths |= {f"size_{p}": len(v) for p, v in self.size.items()}
         lengths |= {f"size_{p}_error": len(v) for p, v in self.error.items()}
         lengths |= {f"shots of {p}": len(v) for p, v in self.shot_size.items()}
-        lengths |= {"slice": len(self.slice)} if self.slice is not None else {}
+        words = {"slice": self.slice, "screen": self.screen}
+        lengths |= {name: len(v) for name, v in words.items() if v is not None}
         lengths |= {f"R in {p}": len(v) for p, v in (self.transfer or {}).items()}
+        if apart := [p for p in self.error if p not in self.size]:
+            raise self.unusable(f"errors in {apart[0]} without sizes", f"size_{apart[0]}, too")
         if len(set(lengths.values())) != 1:
             raise self.unusable(f"lengths {lengths}", "one length for all columns")
 
     def _numbers(self, values: object, key: str) -> np.ndarray:
+        if isinstance(values, np.ma.MaskedArray):  # what is masked was not measured
+            values = values.astype(float).filled(np.nan)
         try:
             found = np.asarray(values, float)
         except (TypeError, ValueError):
@@ -442,13 +445,13 @@ class QuadScan:
                 )
 
     def _check_three_settings(self, plane: str) -> None:
-        distinct = "settings" if self.settings or self.transfer else "screens"
+        distinct = "setting" if self.settings or self.transfer else "screen"
         keys = dict.fromkeys(compress(row_keys(self), ~np.isnan(self.size[plane])))
         for name, number in (Counter(key[0] for key in keys) or {"": 0}).items():
             if number < 3:
                 of = f" of slice {name}" if name else ""
                 raise self.unusable(
-                    f"{number} distinct {distinct}{of} in plane {plane}",
+                    f"{number} distinct {distinct}{'s' * (number != 1)}{of} in plane {plane}",
                     "at least three: the beam matrix has three numbers",
                 )
 

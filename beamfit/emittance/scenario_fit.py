@@ -26,9 +26,9 @@ from beamfit.emittance.model import (
 )
 from beamfit.emittance.results import Parameter, PlaneFit, Points
 from beamfit.emittance.statement import (
+    PlaneSolution,
+    PreparedScan,
     Scenario,
-    Seen,
-    Work,
     asked_in,
     pulls,
     size_record,
@@ -37,13 +37,13 @@ from beamfit.emittance.statement import (
 )
 from beamfit.emittance.systematics import effects_of
 from beamfit.emittance.transport import Look
+from beamfit.errors import Finding, Status
 from beamfit.greybox.covariance import Group
 from beamfit.greybox.fit import Derived, Fit
 from beamfit.greybox.problem import Problem
 from beamfit.greybox.solve import solve
 from beamfit.optics.beamline import Beamline
 from beamfit.statistics import Directions, scaled_directions
-from beamfit.verdict import Finding, Status
 
 # Ends of a search that are no answer.
 NO_ANSWER = (Status.not_finite, Status.infeasible, Status.not_converged)
@@ -65,7 +65,9 @@ def _elements(model: Mapping[str, Any], rows: tuple[Any, ...]) -> Array:
     return jnp.stack([jnp.stack(each.elements(model)) for each in rows])
 
 
-def settled_fit(seen: Seen, scenario: Scenario, told: Assumptions) -> tuple[Fit, Seen]:
+def settled_fit(
+    seen: PreparedScan, scenario: Scenario, told: Assumptions
+) -> tuple[Fit, PreparedScan]:
     """Solve, and again with errors taken at the fitted sizes, until these change no more.
 
     Where the line was wrong, so were the sizes that known transport weighed by, the noise it saw in
@@ -88,16 +90,16 @@ def settled_fit(seen: Seen, scenario: Scenario, told: Assumptions) -> tuple[Fit,
     return fit, found
 
 
-def _as_stated(seen: Seen) -> Seen:
+def _as_stated(seen: PreparedScan) -> PreparedScan:
     """The scan with the errors that were stated, where they were.
 
     What a line misses as it is, a scenario is to explain: it is no noise yet.
     """
-    works = {}
-    for plane, work in seen.works.items():
+    solutions = {}
+    for plane, work in seen.solutions.items():
         error = work.points.error if work.sizes.error is None else work.sizes.error
-        works[plane] = work._replace(points=work.points._replace(error=error))
-    return seen._replace(works=works)
+        solutions[plane] = work._replace(points=work.points._replace(error=error))
+    return seen._replace(solutions=solutions)
 
 
 def _solved(problem: Problem, scenario: Scenario, told: Assumptions) -> Fit:
@@ -114,7 +116,7 @@ def _solved(problem: Problem, scenario: Scenario, told: Assumptions) -> Fit:
     return fit
 
 
-def _through(seen: Seen, fit: Fit) -> Seen:
+def _through(seen: PreparedScan, fit: Fit) -> PreparedScan:
     """See the scan through the line as a fit found it: each plane fitted in closed form."""
     records = size_records(fit.problem)
     elements = np.asarray(_elements(fit.model, tuple(records[p].data for p in seen.planes)))
@@ -125,7 +127,7 @@ def _through(seen: Seen, fit: Fit) -> Seen:
 
 def judged_scenario(
     fit: Fit,
-    seen: Seen,
+    seen: PreparedScan,
     line: Beamline,
     scenario: Scenario,
     told: Assumptions,
@@ -144,9 +146,9 @@ def judged_scenario(
         own = Derived(*(part[i] for part in derived))
         group = next((g for g in fit.groups if g.name == records[plane].name), NOTHING)
         beside = _beside(fit, seen, plane, scenario, told, parameters, own, group.dof, jacobian)
-        work = seen.works[plane]
+        work = seen.solutions[plane]
         points = _points_at(work, own.value[SIGMA], seen.rows.squared)
-        now = seen._replace(works=seen.works | {plane: work._replace(points=points)})
+        now = seen._replace(solutions=seen.solutions | {plane: work._replace(points=points)})
         beams.append(plane_answer(now, line, plane, places[i], beside))
     return tuple(beams)
 
@@ -157,7 +159,7 @@ def _places(model: Mapping[str, Any], asked: tuple[Asked, ...]) -> list[tuple[An
     return [asked_places(model, each) for each in asked]
 
 
-def _points_at(work: Work, sigma: np.ndarray, squared: bool) -> Points:
+def _points_at(work: PlaneSolution, sigma: np.ndarray, squared: bool) -> Points:
     """The points as seen, with this fit's model."""
     p = work.points
     p = p._replace(model=np.sqrt(np.maximum(size_squared(sigma, p.r11, p.r12, p.known), 0.0)))
@@ -166,7 +168,7 @@ def _points_at(work: Work, sigma: np.ndarray, squared: bool) -> Points:
 
 def _beside(
     fit: Fit,
-    seen: Seen,
+    seen: PreparedScan,
     plane: str,
     scenario: Scenario,
     told: Assumptions,

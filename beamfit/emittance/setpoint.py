@@ -15,12 +15,11 @@ from jax import Array
 from scipy.linalg import block_diag
 from scipy.stats import qmc
 
-from beamfit.answer import answer
+from beamfit.answer import Table, answer, cell, json_of
 from beamfit.compile_cache import SELDOM
 from beamfit.emittance.calibration import with_numbers
 from beamfit.emittance.results import in_words
-from beamfit.emittance.transport import setting_units
-from beamfit.emittance.wishes import (
+from beamfit.emittance.targets import (
     KINDS,
     SAME_ENERGY,
     Beam,
@@ -29,7 +28,8 @@ from beamfit.emittance.wishes import (
     common_energy,
     resolved,
 )
-from beamfit.errors import InputError
+from beamfit.emittance.transport import setting_units
+from beamfit.errors import Finding, InputError, Status
 from beamfit.greybox import tree
 from beamfit.greybox.descend import Found, descend_all
 from beamfit.greybox.fit import Fit, FittedVariable
@@ -44,11 +44,9 @@ from beamfit.greybox.problem import (
 from beamfit.greybox.solve import search, solve
 from beamfit.optics.beamline import Beamline
 from beamfit.quantity import Quantity
-from beamfit.table import Table, cell, json_of
-from beamfit.verdict import Finding, Status
 
 # Starts of the search: enough for the minima that a few magnets have; no number fills the box of
-# many magnets, whose wishes can usually be met in many ways.
+# many magnets, whose targets can usually be met in many ways.
 STARTS, FEW, MANY = 256, 64, 8
 # Of each of them, and how sharp; the lowest goes on to the end.
 STEPS, SHARP = 300, 1e-10
@@ -56,7 +54,7 @@ STEPS, SHARP = 300, 1e-10
 SAME = 1e-3
 MOST_MINIMA = 10
 PLANES = ("x", "y")
-# A wish is met within the usual error of a measured size, or of the emittance growth of a mismatch.
+# A target is met within the usual error of a measured size, or of the growth of a mismatch.
 MET = 0.02
 # What squares of a micrometre or a microradian, or BMAG - 1, come to by rounding.
 EXACT = 1e-9
@@ -98,7 +96,7 @@ class Setpoint:
     Attributes
     ----------
     status : Status
-        ``converged`` where the wish is met; ``at_limit`` where a limit keeps it from being met
+        ``converged`` where the target is met; ``at_limit`` where a limit keeps it from being met
         better; ``infeasible`` where no setting near by comes nearer; ``not_converged`` where the
         search came to no optimum.
     message : str
@@ -190,15 +188,15 @@ class Setpoint:
 
 
 def _written(objective: float) -> str:
-    """Write an objective; below the rounding of the search all wishes are met."""
+    """Write an objective; below the rounding of the search all targets are met."""
     return f"{objective:.6g}" if objective >= EXACT else "0"
 
 
 @tree.node("names")
 class _Wanted:
-    """The data of a search: magnets (by name), their line, the wishes, the beams.
+    """The data of a search: magnets (by name), their line, the targets, the beams.
 
-    Of the wishes `kinds` and `planes`, shape (wishes,), `values` (wishes, 2) and `weight` (wishes,
+    Of the targets `kinds`, `planes`, shape (targets,), `values` (targets, 2), `weight` (targets,
     1), padded to a length that searches share; `middle` and `reach` (magnets,), `sigma` (2, 3).
     """
 
@@ -245,7 +243,7 @@ def find_setpoint(
     -------
     Setpoint
         The lowest of the minima found from 256 starts, of many magnets from 64. Its status says
-        whether the wish is met, and if not what keeps it from being met.
+        whether the target is met, and if not what keeps it from being met.
 
     Raises
     ------
@@ -332,7 +330,7 @@ def _stated(wanted: _Wanted) -> Problem:
     """The search as a problem: settings from -1 to 1 between their limits, no miss "measured"."""
     none = np.zeros(wanted.values.shape)
     weight = np.broadcast_to(wanted.weight, none.shape)
-    record = Record("wishes", _misses, wanted, none, error=1.0, weight=weight)
+    record = Record("targets", _misses, wanted, none, error=1.0, weight=weight)
     start = jnp.zeros(len(wanted.names))
     return Problem({"settings": start}, [Free("settings", -1.0, 1.0)], [record])
 
@@ -370,7 +368,7 @@ def _at_place(wanted: _Wanted, theta: Array) -> Array:
 
 
 def _misses(model: Any, wanted: _Wanted) -> Array:
-    """Miss of every wish, shape (wishes, 2); the objective is the sum of their squares.
+    """Miss of every target, shape (targets, 2); the objective is the sum of their squares.
 
     Of sizes in µm and divergences in µrad, along the vector; of matches two numbers whose squares
     add to BMAG - 1, linear in R. In the order of KINDS.
@@ -471,7 +469,7 @@ def _predicted(
 
 
 def _relative_misses(wanted: _Wanted, targets, theta: np.ndarray) -> tuple[float, ...]:
-    """Distance of each wish over what is wanted; BMAG - 1 of a match."""
+    """Distance of each target over what is wanted; BMAG - 1 of a match."""
     lengths = np.linalg.norm(_misses({"settings": jnp.asarray(theta)}, wanted), axis=1)
     pairs = zip(targets, lengths, strict=False)  # the rest is padding
     return tuple(float(m / (1e6 * t.value) if np.ndim(t.value) == 0 else m**2) for t, m in pairs)
@@ -519,7 +517,7 @@ def _verdict(
         return Finding(Status.at_limit, said, "a wider one would do better.")
     if max(misses) <= MET:
         return Finding(Status.converged, reached)
-    why = "the wishes contradict one another" if len(misses) > 1 else "the beam does not allow it"
+    why = "the targets contradict one another" if len(misses) > 1 else "the beam does not allow it"
     return Finding(
         Status.infeasible,
         f"{reached} That is the nearest found, and no limit holds it: {why}.",

@@ -14,9 +14,9 @@ import jax.numpy as jnp
 from jax import Array
 from jax.typing import ArrayLike
 
+from beamfit.answer import shown
 from beamfit.emittance.beam_draws import FURTHEST, ROUNDS
 from beamfit.emittance.model import coefficients
-from beamfit.shown import shown
 
 # A direction of σ is lost when its diagonal of R is this far below the largest.
 _RANK = 1e-10

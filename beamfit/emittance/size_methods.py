@@ -9,16 +9,16 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from beamfit.answer import Table, cell
 from beamfit.emittance.fit import fit_emittance
 from beamfit.emittance.model import emittance_parts
 from beamfit.emittance.scan import QuadScan
 from beamfit.emittance.sigma import fit_sizes
+from beamfit.errors import Status
 from beamfit.optics.beamline import Beamline
 from beamfit.particles import ELECTRON_MASS, beta_gamma
 from beamfit.quantity import Quantity
 from beamfit.statistics import reach_of
-from beamfit.table import Table, cell
-from beamfit.verdict import Status
 
 
 class MethodRow(NamedTuple):

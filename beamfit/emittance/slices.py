@@ -6,13 +6,12 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
-from beamfit.answer import answer
+from beamfit.answer import Table, answer, cell, text_of
 from beamfit.emittance.fit import EmittanceFit, fit_emittance
 from beamfit.emittance.results import PlaneFit
 from beamfit.emittance.scan import PROJECTED, QuadScan
+from beamfit.errors import Status
 from beamfit.optics.beamline import Beamline
-from beamfit.table import Table, cell, text_of
-from beamfit.verdict import Status
 
 HEADER = ("slice", "energy", "status", "normalised emittance", "beta at the start")
 HEADER += ("alpha at the start", "chi2/dof")

@@ -51,7 +51,7 @@ UNSTEADY = 0.1
 LANES, ROOM = 256, 1 << 20
 
 
-class Work(NamedTuple):
+class PlaneSolution(NamedTuple):
     """One plane seen through a line: its sizes, their posterior, and the points as fitted.
 
     Attributes
@@ -72,7 +72,7 @@ class Work(NamedTuple):
     shot_words: str = ""
 
 
-class Seen(NamedTuple):
+class PreparedScan(NamedTuple):
     """A scan through its line, with the fit of known transport of each plane to start from.
 
     Attributes
@@ -93,7 +93,7 @@ class Seen(NamedTuple):
         Priors of the noise of sizes.
     look : Look
         The same, with every magnet as the lattice has it; NumPy arrays.
-    works : dict of str to Work
+    solutions : dict of str to PlaneSolution
         Plane to its fit; of every plane that was measured.
     kept, any_energy : tuple of str and bool
         Elements that may change besides the scanned magnets, and whether the energy may.
@@ -108,7 +108,7 @@ class Seen(NamedTuple):
     rows: Rows
     noise: Noise
     look: Look
-    works: dict[str, Work]
+    solutions: dict[str, PlaneSolution]
     kept: tuple[str, ...] = ()
     any_energy: bool = False
 
@@ -116,7 +116,7 @@ class Seen(NamedTuple):
         """The rows of one plane, with other settings if any are given."""
         return replace(self.rows, plane=plane, settings=settings or self.rows.settings)
 
-    def keeping(self, names: Iterable[str], any_energy: bool = False) -> Seen:
+    def keeping(self, names: Iterable[str], any_energy: bool = False) -> PreparedScan:
         """The same with rows in which further elements, or the energy, may change."""
         kept, free = (*self.kept, *names), self.any_energy or any_energy
         rows = scan_rows(self.scan, self.scanned, self.rows.squared, kept, free)
@@ -173,10 +173,14 @@ class Scenario:
     """
 
     name: str
-    state: Callable[[Seen, Assumptions], Problem]
-    parameters: Callable[[Seen, Assumptions, Fit], Iterator[Parameter]] = lambda *_: iter(())
-    null_directions: Callable[[Seen, tuple[Parameter, ...], bool], tuple[str, ...]] = lambda *_: ()
-    remedy: Callable[[Seen, Assumptions], str] = lambda *_: ""
+    state: Callable[[PreparedScan, Assumptions], Problem]
+    parameters: Callable[[PreparedScan, Assumptions, Fit], Iterator[Parameter]] = lambda *_: iter(
+        ()
+    )
+    null_directions: Callable[[PreparedScan, tuple[Parameter, ...], bool], tuple[str, ...]] = (
+        lambda *_: ()
+    )
+    remedy: Callable[[PreparedScan, Assumptions], str] = lambda *_: ""
     aside: str = ""
     closed: bool = False
     network: bool = False
@@ -189,7 +193,7 @@ class Scanned(Protocol):
     planes: tuple[PlaneFit, ...]
     statement: Scenario
     told: Assumptions
-    seen: Seen
+    seen: PreparedScan
     solved: Fit | None
 
 
@@ -211,7 +215,9 @@ def varied_magnets(scan: QuadScan) -> tuple[str, ...]:
     return tuple(n for n, v in scan.settings.items() if np.ptp(v) > 0)
 
 
-def asked_of(seen: Seen, plane: str, whole_map: bool = True, line: Beamline | None = None) -> Asked:
+def asked_of(
+    seen: PreparedScan, plane: str, whole_map: bool = True, line: Beamline | None = None
+) -> Asked:
     """Places of a plane's numbers through a line: the rows' own, if none is given."""
     design = seen.scanned.design
     twiss = getattr(design, plane, None)
@@ -225,12 +231,12 @@ def asked_of(seen: Seen, plane: str, whole_map: bool = True, line: Beamline | No
     )
 
 
-def size_record(seen: Seen, plane: str, rows: Any) -> Record:
+def size_record(seen: PreparedScan, plane: str, rows: Any) -> Record:
     """The measured sizes of a plane, in µm² or µm, with the errors that the posterior found.
 
     Rows without a size have weight 0, and so has padding.
     """
-    points, at = seen.works[plane].points, seen.measured(plane)
+    points, at = seen.solutions[plane].points, seen.measured(plane)
     columns = 1e6 * np.stack([points.size, points.error, points.weighed])
     weight = np.zeros(len(padded(seen.scan.size[plane])))
     every = np.repeat(columns[:, :1], len(weight), axis=1)
@@ -247,7 +253,7 @@ def size_records(problem: Problem) -> dict[str, Record]:
 
 
 def asked_in(
-    problem: Problem, seen: Seen, planes: Iterable[str], whole_map: bool
+    problem: Problem, seen: PreparedScan, planes: Iterable[str], whole_map: bool
 ) -> tuple[Asked, ...]:
     """Places of the planes' numbers, through the lines that a problem has."""
     records = size_records(problem)
@@ -255,9 +261,9 @@ def asked_in(
     return tuple(asked_of(seen, plane, whole_map, line) for plane, line in lines.items())
 
 
-def beam_numbers(seen: Seen) -> dict[str, dict[str, float]]:
+def beam_numbers(seen: PreparedScan) -> dict[str, dict[str, float]]:
     """Cholesky factors to start from: the known-transport fit, kept off zero emittance."""
-    return {plane: factor_of(seen.works[plane].posterior.best, 0.0025) for plane in seen.planes}
+    return {plane: factor_of(seen.solutions[plane].posterior.best, 0.0025) for plane in seen.planes}
 
 
 def factor_of(sigma: Sequence[float], least: float) -> dict[str, float]:
@@ -285,7 +291,7 @@ def beam_free(beams: Mapping[str, Mapping[str, float]]) -> list[Free]:
 
 
 def beam_problem(
-    seen: Seen,
+    seen: PreparedScan,
     rows: Mapping[str, Any] | None = None,
     model: Mapping[str, Any] = MappingProxyType({}),
     free: Iterable[Free] = (),
@@ -300,14 +306,14 @@ def beam_problem(
     return Problem({"beam": beams, **model}, free, records, [*priors], [*constraints])
 
 
-def see(
+def prepare(
     scan: QuadScan,
     line: Beamline,
     planes: tuple[str, ...] | None = None,
     method: str = METHODS[0],
     noise: Noise | None = None,
     weights: str = WEIGHTS[0],
-) -> Seen:
+) -> PreparedScan:
     """Look at a scan through its line, and at what its sizes say of a beam.
 
     Parameters
@@ -317,7 +323,7 @@ def see(
 
     Returns
     -------
-    Seen
+    PreparedScan
 
     Raises
     ------
@@ -329,7 +335,7 @@ def see(
     ]
 
 
-def prepared(
+def of_one_beam(
     scan: QuadScan, line: Beamline | None, scenario: str = "known"
 ) -> tuple[QuadScan, Beamline]:
     """A scan of one beam with total energies, and its line.
@@ -365,8 +371,8 @@ def unfitted(
     method: str = METHODS[0],
     noise: Noise | None = None,
     weights: str = WEIGHTS[0],
-) -> Seen:
-    """The scan and its line as `see` takes them, checked, without the look and the posterior."""
+) -> PreparedScan:
+    """The scan and its line as `prepare` has them, without the look and the posterior."""
     check_names(scan, *names_of(line))
     asked = planes or scan.planes
     for plane in asked:
@@ -374,10 +380,12 @@ def unfitted(
     scanned = scanned_line(scan, line)
     check_gradients(scan, scanned)
     rows = scan_rows(scan, scanned, method == METHODS[0])
-    return Seen(scan, line, scanned, asked, method, weights, rows, noise or Noise(), None, {})
+    return PreparedScan(
+        scan, line, scanned, asked, method, weights, rows, noise or Noise(), None, {}
+    )
 
 
-def looked_through(begun: Sequence[Seen]) -> list[Seen]:
+def looked_through(begun: Sequence[PreparedScan]) -> list[PreparedScan]:
     """Look at scans through their lines; those whose rows have one shape are one call."""
     found, alike = list(begun), {}
     for i, seen in enumerate(begun):
@@ -403,7 +411,7 @@ def _looks(columns: list, kind: Any) -> Any:
     return jax.vmap(lambda leaves: look_through(jax.tree.unflatten(kind, leaves)))(columns)
 
 
-def with_posteriors(begun: Sequence[Seen]) -> list[Seen]:
+def with_posteriors(begun: Sequence[PreparedScan]) -> list[PreparedScan]:
     """The same scans with the posterior of every plane; all with one noise and one method."""
     if not begun:
         return []
@@ -412,15 +420,15 @@ def with_posteriors(begun: Sequence[Seen]) -> list[Seen]:
     found = iter(compare(sizes, begun[0].noise, begun[0].method, begun[0].weights))
     every = []
     for seen, planes in zip(begun, own, strict=True):
-        works = {
+        solutions = {
             plane: _work(seen, plane, each, next(found), shots)
             for plane, (each, shots) in planes.items()
         }
-        every.append(seen._replace(works=works))
+        every.append(seen._replace(solutions=solutions))
     return every
 
 
-def plane_sizes(seen: Seen, plane: str) -> tuple[PlaneSizes, ShotMeans | None]:
+def plane_sizes(seen: PreparedScan, plane: str) -> tuple[PlaneSizes, ShotMeans | None]:
     """The sizes of a plane with their errors, and what its shots say."""
     scan, at, i = seen.scan, seen.measured(plane), "xy".index(plane)
     r11, r12, known = (part[i, at] for part in seen.look[:3])
@@ -441,8 +449,8 @@ def plane_sizes(seen: Seen, plane: str) -> tuple[PlaneSizes, ShotMeans | None]:
 
 
 def _work(
-    seen: Seen, plane: str, sizes: PlaneSizes, post: PlanePosterior, shots: ShotMeans | None
-) -> Work:
+    seen: PreparedScan, plane: str, sizes: PlaneSizes, post: PlanePosterior, shots: ShotMeans | None
+) -> PlaneSolution:
     scan, at, follows = seen.scan, seen.measured(plane), seen.weights == WEIGHTS[0]
     points = Points(
         settings={name: v[at] for name, v in scan.settings.items()},
@@ -460,7 +468,7 @@ def _work(
         known=sizes.known,
     )
     points = points._replace(pull=pulls(points, seen.rows.squared))
-    return Work(sizes, post, points, _shot_words(points, shots))
+    return PlaneSolution(sizes, post, points, _shot_words(points, shots))
 
 
 def pulls(p: Points, squared: bool) -> np.ndarray:

@@ -16,7 +16,7 @@ import numpy as np
 from beamfit.emittance.assumptions import Assumptions
 from beamfit.emittance.model import spoken
 from beamfit.emittance.results import Parameter
-from beamfit.emittance.statement import Scenario, Seen
+from beamfit.emittance.statement import PreparedScan, Scenario
 from beamfit.errors import InputError, nearest
 from beamfit.greybox.fit import Fit
 from beamfit.greybox.problem import Free, Prior, Problem
@@ -98,7 +98,7 @@ def with_systematics(scenario: Scenario, told: Assumptions) -> Scenario:
     if not told.systematics:
         return scenario
 
-    def state(seen: Seen, told: Assumptions) -> Problem:
+    def state(seen: PreparedScan, told: Assumptions) -> Problem:
         terms = _terms(seen, told)
         magnets = [t.name.rpartition(".")[0] for t in terms if "." in t.name]
         seen = seen.keeping(magnets, any_energy="energy" in told.systematics)
@@ -110,7 +110,7 @@ def with_systematics(scenario: Scenario, told: Assumptions) -> Scenario:
             priors=[*problem.priors, *(Prior(t.path, t.mean, t.sd) for t in terms)],
         )
 
-    def parameters(seen: Seen, told: Assumptions, fit: Fit) -> Iterator[Parameter]:
+    def parameters(seen: PreparedScan, told: Assumptions, fit: Fit) -> Iterator[Parameter]:
         yield from scenario.parameters(seen, told, fit)
         for term in _terms(seen, told):
             prior = term.mean, term.sd
@@ -129,12 +129,12 @@ def _numbers(terms: list[Term]) -> dict[str, Any]:
     return model
 
 
-def _terms(seen: Seen, told: Assumptions) -> list[Term]:
+def _terms(seen: PreparedScan, told: Assumptions) -> list[Term]:
     """The numbers of a scan and its line that priors were given for."""
     return [_term(seen, name, *prior) for name, prior in told.systematics.items()]
 
 
-def _term(seen: Seen, name: str, mean: float | None, sd: float) -> Term:
+def _term(seen: PreparedScan, name: str, mean: float | None, sd: float) -> Term:
     element, _, what = name.rpartition(".")
     if element:
         own, unit = _of_element(seen, element, what)
@@ -159,7 +159,7 @@ def _term(seen: Seen, name: str, mean: float | None, sd: float) -> Term:
     return Term(name, path, mean, sd, max(low, 0.0) if positive else low, mean + REACH * sd, unit)
 
 
-def _of_element(seen: Seen, name: str, what: str) -> tuple[float, str]:
+def _of_element(seen: PreparedScan, name: str, what: str) -> tuple[float, str]:
     kinds = {"gradient": (Quadrupole, ThinLens), "length": (Drift,)}[what]
     known = [e.name for e in seen.scanned.elements if isinstance(e, kinds)]
     if name not in known:

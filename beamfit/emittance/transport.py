@@ -28,8 +28,9 @@ from beamfit.particles import ELECTRON_MASS, beta_gamma, rigidity
 
 # Gradients in T/m beyond which a magnet is a plasma lens at least, and beyond any lens.
 STRONG, IMPOSSIBLE = 500.0, 1e4
-# Normalised emittances in m below those of accelerators: sizes in mm that are called µm give 1e-12.
-TINY = 1e-9
+# Normalised emittances in m of most beams: electrons from the best guns, positrons from a target.
+# Sizes in mm that are called µm give 1e-12; an energy in GeV that is called MeV 1e-2 and more.
+LIKELY = (1e-9, 1e-2)
 # A prior further than this from what the line says is asked about.
 FAR = 0.2
 
@@ -398,7 +399,7 @@ def check_gradients(scan: QuadScan, scanned: Beamline) -> None:
             )
 
 
-def questions(scan: QuadScan, scanned: Beamline) -> tuple[str, ...]:
+def unit_warnings(scan: QuadScan, scanned: Beamline) -> tuple[str, ...]:
     """Ask about sizes and settings that are possible, and yet more likely in a wrong unit.
 
     Parameters
@@ -427,13 +428,15 @@ def of_sizes(scan: QuadScan) -> Iterator[str]:
 
 
 def of_emittances(planes: Iterable[Any]) -> Iterator[str]:
-    """Ask about planes whose emittance is determined and smaller than an accelerator's."""
+    """Ask about planes whose emittance is determined and no usual accelerator's."""
     for plane in planes:
         found = plane.normalized_emittance
-        if found.error is not None and 0.0 < found.value < TINY:
+        likely = LIKELY[0] <= found.value <= LIKELY[1]
+        if found.error is not None and found.value > 0.0 and not likely:
             yield (
-                f"A normalised emittance of {found.value:.2g} m in {plane.plane} is less "
-                "than accelerators have: are sizes, settings and energy in their units?"
+                f"A normalised emittance of {found.value:.2g} m in {plane.plane} is "
+                f"{'less' if found.value < LIKELY[0] else 'more'} than most accelerators have: are "
+                "sizes, settings and energy in their units?"
             )
 
 

@@ -22,7 +22,7 @@ from beamfit.emittance.constrained_network import (
     limited_network,
     network_problem,
 )
-from beamfit.emittance.statement import Scenario, Seen, varied_magnets
+from beamfit.emittance.statement import PreparedScan, Scenario, varied_magnets
 from beamfit.emittance.transport import NetworkRows, padded
 from beamfit.greybox.bounds import over_cells
 from beamfit.greybox.mlp import MLP, Port
@@ -80,7 +80,7 @@ class _Layout(NamedTuple):
         return CELLS if len(self.names) == 1 else 8
 
 
-def _layout(seen: Seen, told: Assumptions) -> _Layout:
+def _layout(seen: PreparedScan, told: Assumptions) -> _Layout:
     scan = seen.scan
     columns = {name: scan.settings[name] for name in varied_magnets(scan)}
     with_energy = scan.energy is not None and np.ptp(scan.energy) > 0
@@ -92,7 +92,7 @@ def _layout(seen: Seen, told: Assumptions) -> _Layout:
     return _Layout(tuple(columns), values, with_energy, elements, _box(seen, told, columns))
 
 
-def _box(seen: Seen, told: Assumptions, columns: dict[str, np.ndarray]) -> np.ndarray:
+def _box(seen: PreparedScan, told: Assumptions, columns: dict[str, np.ndarray]) -> np.ndarray:
     """Ends of the inputs' box: those that were given, or else of the scan; shape (2, inputs)."""
     ends = []
     for name, values in columns.items():
@@ -105,7 +105,7 @@ def _box(seen: Seen, told: Assumptions, columns: dict[str, np.ndarray]) -> np.nd
     return np.array(ends, float).T
 
 
-def _first_principles(seen: Seen, lay: _Layout, points: np.ndarray) -> np.ndarray:
+def _first_principles(seen: PreparedScan, lay: _Layout, points: np.ndarray) -> np.ndarray:
     """A, B, C, D of the line, shape (points, planes, places, 4)."""
     full = padded(points)
     columns = dict(zip(lay.names, full.T, strict=True))
@@ -123,7 +123,7 @@ def _grid(lay: _Layout) -> np.ndarray:
     return np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, len(axes))
 
 
-def _signs(seen: Seen, lay: _Layout, grid: np.ndarray) -> np.ndarray:
+def _signs(seen: PreparedScan, lay: _Layout, grid: np.ndarray) -> np.ndarray:
     """Signs of the gains of A and B by first principles, shape (outputs, inputs); 0 if mixed."""
     half = 0.5 * (lay.box[1] - lay.box[0])
     found = np.zeros((len(seen.planes) * len(seen.rows.places) * lay.elements, len(half)))
@@ -138,7 +138,7 @@ def _signs(seen: Seen, lay: _Layout, grid: np.ndarray) -> np.ndarray:
     return found
 
 
-def network_rows(seen: Seen, lay: _Layout, plane: str) -> NetworkRows:
+def network_rows(seen: PreparedScan, lay: _Layout, plane: str) -> NetworkRows:
     """Inputs of the network and the place of A and B among its outputs, for one plane's rows."""
     return NetworkRows(
         plane,
@@ -150,12 +150,12 @@ def network_rows(seen: Seen, lay: _Layout, plane: str) -> NetworkRows:
     )
 
 
-def _columns(seen: Seen, lay: _Layout, plane: str, which: np.ndarray) -> np.ndarray:
+def _columns(seen: PreparedScan, lay: _Layout, plane: str, which: np.ndarray) -> np.ndarray:
     first = (seen.planes.index(plane) * len(seen.rows.places) + which) * lay.elements
     return first[:, None] + np.arange(lay.elements)
 
 
-def _state(seen: Seen, told: Assumptions) -> Problem:
+def _state(seen: PreparedScan, told: Assumptions) -> Problem:
     """Beams, and one network for A and B of every plane and screen."""
     lay = _layout(seen, told)
     outputs = _names(seen, lay)
@@ -171,7 +171,7 @@ def _state(seen: Seen, told: Assumptions) -> Problem:
     return network_problem(seen, told, lay.names, seen.planes, rows, part, weights, anchors, limits)
 
 
-def _signed(seen: Seen, lay: _Layout, told: Assumptions) -> tuple[MLP, list[Free]]:
+def _signed(seen: PreparedScan, lay: _Layout, told: Assumptions) -> tuple[MLP, list[Free]]:
     """A network scaled to its box, whose gains have the signs of first principles."""
     grid = _grid(lay)
     first = _first_principles(seen, lay, grid)[..., : lay.elements].reshape(len(grid), -1)
@@ -187,7 +187,7 @@ def _signed(seen: Seen, lay: _Layout, told: Assumptions) -> tuple[MLP, list[Free
     return signed_network("map", inputs, outputs, rising, told.hidden, told.seed, MOST)
 
 
-def _names(seen: Seen, lay: _Layout) -> list[str]:
+def _names(seen: PreparedScan, lay: _Layout) -> list[str]:
     places = seen.rows.places
     return [
         f"{e}_{plane}" + (f"@{place}" if len(places) > 1 else "")
@@ -197,7 +197,9 @@ def _names(seen: Seen, lay: _Layout) -> list[str]:
     ]
 
 
-def _anchors(seen: Seen, lay: _Layout, told: Assumptions, rows: NetworkRows) -> Iterator[Record]:
+def _anchors(
+    seen: PreparedScan, lay: _Layout, told: Assumptions, rows: NetworkRows
+) -> Iterator[Record]:
     """Tie of the network to first principles, as records."""
     anchor, plane, at = told.anchor, rows.plane, seen.measured(rows.plane)
     i, places = seen.planes.index(plane), len(seen.rows.places)

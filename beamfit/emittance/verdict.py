@@ -11,9 +11,9 @@ import numpy as np
 
 from beamfit.emittance.comparison import BEAM, FLAT, PlanePosterior, PlaneSizes
 from beamfit.emittance.results import Points
+from beamfit.errors import Finding, Status
 from beamfit.quantity import display_unit
 from beamfit.statistics import of_use
-from beamfit.verdict import Finding, Status
 
 # A beam is sure with this probability: one answer in a hundred may be another thing.
 SURE = 0.99
@@ -159,8 +159,8 @@ def _open(e: PlaneEvidence) -> str:
             rest = {k: v for k, v in probability.items() if k not in (BEAM, FLAT)}
             rival = max(rest, key=rest.__getitem__)
             return (
-                f"these sizes may be a beam's (P = {e.beam:.2g}), or else {rival} "
-                f"(P = {rest[rival]:.2g})"
+                f"these sizes may be a beam's (P = {e.beam:.3g}, and {SURE:g} is needed), or else "
+                f"{rival} (P = {rest[rival]:.2g})"
             )
         return f"the sizes look like {rival} (P = {probability[rival]:.2g}), not like a beam's"
     if e.opened:

@@ -13,13 +13,12 @@ import numpy as np
 from scipy.sparse import issparse
 
 from beamfit.compile_cache import SELDOM
-from beamfit.errors import InputError, nearest
+from beamfit.errors import Finding, InputError, Status, nearest
 from beamfit.greybox import tree
 from beamfit.greybox.assess import KKT
 from beamfit.greybox.covariance import MOST_SHARE, FactoredSpread, Group, Spread
 from beamfit.greybox.problem import Problem, with_slope
 from beamfit.greybox.sparse import Rows
-from beamfit.verdict import Finding, Status
 
 if TYPE_CHECKING:
     from beamfit.greybox.posterior import Optimum

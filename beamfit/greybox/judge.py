@@ -18,7 +18,8 @@ from jax.experimental import checkify
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 
-from beamfit import verdict
+from beamfit import errors
+from beamfit.errors import Finding, Status
 from beamfit.greybox import assess, problem
 from beamfit.greybox.assess import LOOKS, NEAR, SearchState
 from beamfit.greybox.conflict import Conflict, dependence
@@ -37,7 +38,6 @@ from beamfit.greybox.fit import Attempt, Fit, FittedConstraint, FittedVariable
 from beamfit.greybox.problem import Problem, compiled_at, sloped
 from beamfit.greybox.sparse import Rows
 from beamfit.statistics import POOR_FIT, chi2_probability
-from beamfit.verdict import Finding, Status
 
 # A search is settled if a further step lowers chi-square by less: a tenth of a standard error.
 SETTLED = 0.01
@@ -215,7 +215,7 @@ def conclude(p: Problem, s: SearchState, search: Search, seconds: float) -> Fit:
     scale = (np.sqrt(max(1.0, ratio)) if dof > 0 else 1.0) if judged else np.sqrt(ratio)
     rest = not s.optimal and settled(p, s)
     evidence = FitEvidence(p, s, search, found, rest, variables, constraints)
-    finding = verdict.judge(evidence, RULES if p.has_data else WITHOUT_DATA)
+    finding = errors.judge(evidence, RULES if p.has_data else WITHOUT_DATA)
     message = " ".join([finding.message, *_remarks(evidence)])
     return Fit(
         p, s.theta, finding.status, message, float(s.at.cost), chi2, dof, found.groups, s.kkt,

@@ -13,14 +13,13 @@ import numpy as np
 from scipy.linalg import null_space
 from scipy.sparse.csgraph import connected_components
 
-from beamfit.errors import InputError
+from beamfit.errors import Finding, InputError
 from beamfit.greybox import tree
 from beamfit.greybox.problem import Core, Prior, Problem, with_slope
 from beamfit.sampling.likelihood import NoiseGroup
 from beamfit.sampling.posterior import Posterior
 from beamfit.sampling.priors import Distribution, checked
 from beamfit.sampling.target import PosteriorLaw, SamplingTarget, covariance_of, slopes_of
-from beamfit.verdict import Finding
 
 # Smallest share of an undetermined direction at which a number belongs to it.
 PART = 0.05

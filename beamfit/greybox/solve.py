@@ -8,7 +8,7 @@ from functools import partial
 
 import numpy as np
 
-from beamfit.errors import InputError
+from beamfit.errors import InputError, Status
 from beamfit.greybox import assess
 from beamfit.greybox.assess import SearchState
 from beamfit.greybox.conflict import relaxed
@@ -18,7 +18,6 @@ from beamfit.greybox.fit import Attempt, Fit
 from beamfit.greybox.judge import Search, conclude, outgrown, refused, settled
 from beamfit.greybox.problem import Problem
 from beamfit.greybox.programs import SOLVERS, SearchLimit, scaled
-from beamfit.verdict import Status
 
 METHOD, SQUARES = "Levenberg-Marquardt", "levenberg-marquardt"
 # Steps from each of many starts, and number of cheapest ends that are polished.

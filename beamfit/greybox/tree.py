@@ -10,8 +10,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from beamfit.arrays import registered
 from beamfit.errors import InputError, nearest
-from beamfit.nodes import registered
 
 C = TypeVar("C", bound=type)
 

@@ -13,25 +13,24 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from beamfit.answer import Table
 from beamfit.dynamics.record import Run
 from beamfit.emittance.scan import QuadScan
 from beamfit.errors import InputError
+from beamfit.io.columns import Columns, Layout, layout_of, proposal
 from beamfit.io.decay_record import is_current, known, likely_record_name, read_lifetime_input
 from beamfit.io.emittance_gui import is_emittance_gui, read_emittance_gui
 from beamfit.io.files import digest
 from beamfit.io.lattice import CALIBRATIONS, STRENGTHS, LatticeFile
-from beamfit.io.layout import Columns, Layout, layout_of, proposal
 from beamfit.io.line import FOREIGN, build_line, read_lattice
 from beamfit.io.ring import read_operation, read_ring
 from beamfit.io.run import read_run
-from beamfit.io.scan import read_quad_scan
-from beamfit.io.scan_columns import is_known, is_size, likely_scan_name
+from beamfit.io.scan import is_known, is_size, likely_scan_name, read_quad_scan
 from beamfit.io.table import header_of, is_binary, read_columns, read_sheet
 from beamfit.io.toml import read_toml
 from beamfit.language.document import Document
 from beamfit.lifetime.record import DecayRecord, LifetimeTable
 from beamfit.quantity import display_unit
-from beamfit.table import Table
 
 
 @dataclass(frozen=True)
@@ -145,11 +144,14 @@ def _formulation(path: str | PathLike[str]) -> Document:
 def proposed_layout(path: str | PathLike[str], columns: Columns = None) -> str | None:
     """Write a layout for the columns of a table that nobody knows; None where there are none."""
     layout = layout_of(columns)
-    if _kind(path, layout) not in ("scan", "record") or is_emittance_gui(path):
+    kind = _kind(path, layout)
+    if kind not in ("scan", "record") or is_emittance_gui(path):
         return None
+    likely = [likely_scan_name, likely_record_name]
+    likely = likely if kind == "scan" else likely[::-1]
     sheet = read_columns(path, "", layout, skip_bad=True)
     unknown = {
-        name: (likely_scan_name(name) or likely_record_name(name, cell), cell)
+        name: (likely[0](name, cell) or likely[1](name, cell), cell)
         for name, cells in zip(sheet.names, sheet.cells, strict=True)
         if not (is_known(name, sheet) or known(sheet, name))
         for cell in [next(iter(cells), "")]
@@ -166,13 +168,13 @@ def with_lattice(scan: Understood, lattice: Understood) -> Understood:
         said = str(replace(error, path=None))
         return replace(scan, facts=(*scan.facts, Fact(label, said, {"fits": False, "why": said})))
     from beamfit.emittance.transport import (
-        questions,  # JAX from here on
         scanned_line,
+        unit_warnings,  # JAX from here on
     )
 
     line = build_line(lattice.content)
     own = scan.content.of_particle(line.mass)
-    asked = questions(own, scanned_line(own, line))
+    asked = unit_warnings(own, scanned_line(own, line))
     notes = (*scan.notes, *(note for note in asked if note not in scan.notes))
     fact = Fact(label, "has all its magnets and screens", {"fits": True})
     return replace(scan, facts=(*scan.facts, fact), notes=notes)

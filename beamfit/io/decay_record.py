@@ -16,17 +16,17 @@ from beamfit.io.columns import (
     DATE,
     UNITS,
     Column,
+    Columns,
     Sheet,
     columns_of,
-    left_aside,
+    ignored,
     left_out,
     number_and_unit,
     spelled,
     unit_at_end,
 )
 from beamfit.io.files import name_of
-from beamfit.io.layout import Columns
-from beamfit.io.scan_columns import is_size
+from beamfit.io.scan import is_size
 from beamfit.io.table import read_columns
 from beamfit.lifetime.record import (
     Conditions,
@@ -167,7 +167,7 @@ def read_decay_record(
         Lines that begin with `#` and HDF5 attributes are kept as comments.
     columns : str, path, mapping or Layout, optional
         What columns are whose headers do not say it: ``{"PV 12": "beam_current_mA"}``, or as
-        `beamfit.io.layout.layout_of` reads it. Other columns of unknown names are ignored.
+        `beamfit.io.columns.layout_of` reads it. Other columns of unknown names are ignored.
     ignore : iterable of str, optional
         Columns to leave unread; * and ? stand for any letters.
     skip_bad : bool, optional
@@ -240,7 +240,7 @@ def _record(sheet: Sheet, skip_bad: bool, offset: str | None) -> DecayRecord:
         start=float(moment[0]) if absolute else None,
         conditions=conditions,
         comments=sheet.comments,
-        notes=notes + left_out(sheet) + left_aside(sheet, columns) + found.notes,
+        notes=notes + left_out(sheet) + ignored(sheet, columns) + found.notes,
         monitor=Monitor(offset=found.error) if found.error else None,
     )
 
@@ -552,14 +552,16 @@ def likely_record_name(header: str, cell: object) -> str | None:
 
     Examples
     --------
-    >>> likely_record_name("When", "2024-03-01 12:00:00"), likely_record_name("Current", "200.1")
-    ('time', 'beam_current_mA')
+    >>> likely_record_name("When", "2024-03-01 12:00:00"), likely_record_name("Current", "0.2 A")
+    ('time', 'beam_current_A')
     """
     try:
         dates_in_order(DAY_FIRST)(str(cell))
     except ValueError:
         words = set(re.findall(r"[a-z]+", header.lower()))
-        return "beam_current_mA" if words & (CURRENTS | {"beam"}) and not words & OTHERS else None
+        _, unit = number_and_unit(str(cell)) or ("", "mA")
+        named = words & (CURRENTS | {"beam"}) and not words & OTHERS
+        return f"beam_current_{unit}" if named and unit in UNITS["current"] else None
     return "time"
 
 

@@ -28,6 +28,7 @@ import numpy as np
 from beamfit.errors import InputError, plain
 from beamfit.io.columns import SETTINGS, known_unit, named, plain_unit, spelled, unit_at_end
 from beamfit.io.files import digest_now, read_bytes
+from beamfit.particles import LIGHT
 
 # Seconds and bytes of memory that reading a file may take.
 PATIENCE, ROOM = 10, 1_000_000_000
@@ -295,7 +296,7 @@ def _beam_row(beam: Any, rows: int) -> dict[str, Any]:
         middle = np.average(values, weights=shares)
         row[f"size_{plane}_m"] = math.sqrt(np.average((values - middle) ** 2, weights=shares))
     row["momentum_MeV"] = float(np.mean(np.linalg.norm(np.broadcast_arrays(*momentum), axis=0)))
-    row["momentum_MeV"] *= 299792458.0 / 1.602176634e-13  # from kg m/s
+    row["momentum_MeV"] *= LIGHT / 1.602176634e-13  # from kg m/s
     return row
 
 

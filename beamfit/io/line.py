@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from beamfit.emittance.scan import QuadScan
 from beamfit.errors import InputError, expect, nearest
+from beamfit.io.columns import Columns
 from beamfit.io.dialects import DIALECTS
 from beamfit.io.emittance_gui import EmittanceGuiFile, is_emittance_gui, read_emittance_gui
 from beamfit.io.lattice import LatticeFile, element_of, read_toml_lattice
-from beamfit.io.layout import Columns
 from beamfit.io.scan import read_quad_scan
 from beamfit.particles import REST_ENERGY, expected_energy
 

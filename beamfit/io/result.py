@@ -14,11 +14,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from beamfit import __version__
+from beamfit.answer import json_of
 from beamfit.emittance.scan import PROJECTED
-from beamfit.emittance.wishes import Beam
+from beamfit.emittance.targets import Beam
 from beamfit.errors import InputError
 from beamfit.io.files import laid_out, read_json
-from beamfit.table import json_of
 from beamfit.writing import write_atomically
 
 if TYPE_CHECKING:
@@ -214,7 +214,7 @@ KEPT = "a file that beamfit.save_fit wrote"
 SCAN, DECAY, OPTICS = "beamfit.emittance", "beamfit.lifetime", "beamfit.optics"
 HELD = {
     "beamfit.quantity": "Quantity",
-    "beamfit.verdict": "Status",
+    "beamfit.errors": "Status",
     "beamfit.noise.model": "Noise Lognormal",
     f"{SCAN}.scan": "QuadScan Profile",
     f"{SCAN}.results": "PlaneFit Points Parameter ScreenTwiss Identifiability",
@@ -324,12 +324,12 @@ def _fit(kind: str, content: Any) -> EmittanceFit | DecayFit:
     if kind != "EmittanceFit":
         raise InputError(f"a fit of kind {str(kind)[:40]}", "EmittanceFit or DecayFit")
     from beamfit.emittance.fit import EmittanceFit, scenario_of
-    from beamfit.emittance.statement import see
+    from beamfit.emittance.statement import prepare
 
     own = {name: _value(content[name]) for name in OWN}
     line, statement = _value(content["line"]), scenario_of("known")
     planes = tuple(p.plane for p in own["planes"])
-    seen = see(own["scan"], line, planes, *(_value(content[name]) for name in HOW_SEEN))
+    seen = prepare(own["scan"], line, planes, *(_value(content[name]) for name in HOW_SEEN))
     return EmittanceFit(
         own.pop("planes"), own.pop("scan"), line, statement, own.pop("told"), seen, **own
     )

@@ -13,13 +13,13 @@ from beamfit.errors import InputError
 from beamfit.io.columns import (
     DATE,
     Column,
+    Columns,
     Sheet,
     columns_of,
-    left_aside,
+    ignored,
     left_out,
 )
 from beamfit.io.files import name_of
-from beamfit.io.layout import Columns
 from beamfit.io.table import read_columns
 
 if TYPE_CHECKING:
@@ -47,7 +47,7 @@ def read_run(
         A frame, CSV or HDF5 with ``time_s`` (_min, _h, _ms; or ``time`` with dates), inputs ``u_…``
         and outputs ``y_…``. A blank output was not read.
     columns : str, path, mapping or Layout, optional
-        What columns are: ``{"valve position": "u_valve"}``, or as `beamfit.io.layout.layout_of`
+        What columns are: ``{"valve position": "u_valve"}``, or as `beamfit.io.columns.layout_of`
         reads it. Other columns of unknown names are ignored.
     inputs, outputs : iterable of str
         Columns of other names that are inputs or outputs; the others are then ignored.
@@ -99,7 +99,7 @@ def read_run(
         row = int(late[0]) + 1
         found = f"time {time[row]:.10g} s after {time[row - 1]:.10g} s"
         raise sheet.error(found, "times that increase", row, columns[TIME].header)
-    name, aside = name_of(sheet.path), left_aside(sheet, columns)
+    name, aside = name_of(sheet.path), ignored(sheet, columns)
     said = {
         "provenance": sheet.comments,
         "notes": (*aside, *left_out(sheet)),

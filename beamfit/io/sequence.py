@@ -20,7 +20,7 @@ from beamfit.io.files import digest, read_text
 from beamfit.io.lattice import MOST, LatticeFile
 from beamfit.io.madx import NO_MATTER, Attribute, Definition, Interpreter, word_of
 from beamfit.io.madx_values import NAME, words
-from beamfit.particles import REST_ENERGY, expected_energy
+from beamfit.particles import LIGHT, REST_ENERGY, expected_energy
 
 # Gaps and overlaps in m that MAD-X takes for none.
 TINY = 1e-6
@@ -514,7 +514,7 @@ def _beam(
         value, rest = _of_beam(program, beam[key]), 1e-3 * REST_ENERGY[particle]
         if key == "beta" and not 0.0 < value < 1.0:
             raise InputError(f"BEAM with BETA = {value:g}", "one between 0 and 1", path)
-        momentum = value if key == "pc" else 0.299792458 * value
+        momentum = value if key == "pc" else LIGHT / 1e9 * value
         total = 1e3 * {
             "energy": value,
             "gamma": value * rest,

@@ -15,16 +15,18 @@ from beamfit.errors import InputError, expect
 from beamfit.io.cells import check_length, is_number, numeric_rows, with_points
 from beamfit.io.columns import (
     UNITS,
+    Columns,
     Sheet,
+    arranged,
     has_unit,
     is_header,
+    layout_of,
     spelled,
     units_below,
     with_units,
 )
 from beamfit.io.files import Numbered, digest, first_bytes, laid_out, read_json, text_lines
 from beamfit.io.isolated import library_columns, matlab_variables
-from beamfit.io.layout import Columns, arranged, layout_of
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -71,7 +73,7 @@ def read_columns(
     path, example, most
         As for `read_sheet`.
     columns : str, path, mapping or Layout, optional
-        As `beamfit.io.layout.layout_of` reads it.
+        As `beamfit.io.columns.layout_of` reads it.
     ignore : iterable of str
         Columns to leave unread; * and ? stand for any letters.
     skip_bad : bool

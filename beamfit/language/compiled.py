@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from beamfit.answer import answer
+from beamfit.answer import MOST_ROWS, Table, answer
 from beamfit.compile_cache import SELDOM
 from beamfit.errors import InputError, nearest
 from beamfit.greybox.maps import Formula
@@ -24,7 +24,6 @@ from beamfit.language.expression import error_at
 from beamfit.language.plan import Order, StepGroup, checked
 from beamfit.language.recurrence import scanned
 from beamfit.language.scope import MappingStep, Scope, reads, widened
-from beamfit.table import MOST_ROWS, Table
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,7 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from beamfit.answer import answer
+from beamfit.answer import MOST_ROWS, Table, answer, cell
+from beamfit.errors import Status
 from beamfit.greybox.assess import slopes
 from beamfit.greybox.diagnosis import diagnose
 from beamfit.greybox.fit import Fit, FittedConstraint, FittedVariable
@@ -23,8 +24,6 @@ from beamfit.language.problem import Formulation, at_start, formulate, starts_of
 from beamfit.language.trace import cause_of
 from beamfit.quantity import Quantity
 from beamfit.statistics import reach_of
-from beamfit.table import MOST_ROWS, Table, cell
-from beamfit.verdict import Status
 
 # Most draws of a random start until it is finite.
 MOST_DRAWS = 100

@@ -16,6 +16,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.special import logsumexp, ndtri
 
+from beamfit.answer import json_of, shown
+from beamfit.errors import Status
 from beamfit.lifetime.departures import (
     ABOVE,
     BELOW,
@@ -42,10 +44,7 @@ from beamfit.lifetime.marginal import ENOUGH
 from beamfit.lifetime.record import DecayRecord
 from beamfit.noise.memory import Products
 from beamfit.quantity import HOUR, Quantity
-from beamfit.shown import shown
 from beamfit.statistics import POOR_FIT
-from beamfit.table import json_of
-from beamfit.verdict import Status
 
 # A departure of so many errors is found with 90 % at a false alarm rate of `POOR_FIT`.
 FOUND = float(ndtri(1 - POOR_FIT / 2) + ndtri(0.9))

@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from beamfit.errors import Finding, Status, judge
 from beamfit.lifetime.alternatives import ConstantA, LifetimeLaw, Outgassing
 from beamfit.lifetime.cycles import is_sawtooth
 from beamfit.lifetime.evidence import (
@@ -22,7 +23,6 @@ from beamfit.lifetime.pieces import noise_of
 from beamfit.lifetime.record import Monitor
 from beamfit.quantity import HOUR, percent
 from beamfit.statistics import MANY, POOR_FIT, chi2_probability, few_words, of_use
-from beamfit.verdict import Finding, Status, judge
 
 # Lifetimes, s, that stored beams seldom have, but times in a wrong unit often give.
 SHORTEST, LONGEST = 20.0, 3000 * HOUR

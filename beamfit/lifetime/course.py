@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from beamfit.answer import answer
+from beamfit.answer import Table, answer, cell, json_of
 from beamfit.errors import InputError
 from beamfit.lifetime.alarm import Alarm, Reference, alarms_of, when
 from beamfit.lifetime.fit import DecayFit, bare
@@ -18,7 +18,6 @@ from beamfit.lifetime.scales import by_losses, summarise
 from beamfit.lifetime.study import Decay, Machine, RecordStudy
 from beamfit.quantity import HOUR, Quantity, Status, percent, relative_change
 from beamfit.statistics import FEWEST, baseline, control_limits
-from beamfit.table import Table, cell, json_of
 
 # a and b wander by so much on an ordinary day.
 WANDER = 0.005

@@ -9,6 +9,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from beamfit.answer import json_of, shown
+from beamfit.errors import Status
 from beamfit.greybox.memory import AveragedMoments, Memory
 from beamfit.lifetime.alternatives import (
     ConstantA,
@@ -33,9 +35,6 @@ from beamfit.lifetime.marginal import ENDS, UNITS, FreeLaw, free_law
 from beamfit.lifetime.record import DecayRecord
 from beamfit.noise.memory import CLOSE, Products
 from beamfit.quantity import HOUR, Quantity
-from beamfit.shown import shown
-from beamfit.table import json_of
-from beamfit.verdict import Status
 
 # The share of a in the loss lies between 0 and 1: known to 0.2, the record tells pure Touschek
 # from pure gas at five standard deviations; known worse, a and b are one number.

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from beamfit.answer import answer, quantity_frame
+from beamfit.answer import Table, answer, cell, json_of, labelled, plain_name, quantity_frame
 from beamfit.errors import InputError, expect
 from beamfit.lifetime.alternatives import Change, ConstantA, LifetimeLaw, Outgassing, SuddenLoss
 from beamfit.lifetime.answer import finding_of, finding_of_cycles
@@ -20,7 +20,6 @@ from beamfit.lifetime.expansion import Expansion, Pieces, Shape, solved
 from beamfit.lifetime.marginal import FreeLaw
 from beamfit.lifetime.record import DecayRecord, Monitor
 from beamfit.quantity import Quantity, Status
-from beamfit.table import Table, cell, json_of, labelled, plain_name
 
 if TYPE_CHECKING:
     from pandas import DataFrame

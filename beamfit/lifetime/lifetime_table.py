@@ -11,7 +11,7 @@ import numpy as np
 from jax import Array
 from scipy.special import chdtrc, fdtrc
 
-from beamfit.answer import answer
+from beamfit.answer import Table, answer, json_of, labelled, plain_name
 from beamfit.errors import expect
 from beamfit.greybox.fit import Derived, Fit
 from beamfit.greybox.problem import Free, Problem, Record, padded_length
@@ -23,7 +23,6 @@ from beamfit.lifetime.fit import bare
 from beamfit.lifetime.record import FEWEST_LIFETIMES, LifetimeTable
 from beamfit.quantity import HOUR, Quantity, Status
 from beamfit.statistics import reach_of
-from beamfit.table import Table, json_of, labelled, plain_name
 
 # Points so many robust standard deviations off the law with a free exponent are outliers; no more
 # than a fifth of them.

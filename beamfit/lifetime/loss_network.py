@@ -19,6 +19,7 @@ from jax import Array
 from scipy.linalg import block_diag, cho_solve, cholesky, solve_triangular
 from scipy.optimize import nnls
 
+from beamfit.answer import json_of, shown
 from beamfit.errors import InputError
 from beamfit.greybox.bounds import over_cells
 from beamfit.greybox.fit import Fit
@@ -39,8 +40,6 @@ from beamfit.lifetime.scales import (
 )
 from beamfit.lifetime.study import Decay, Machine, operation_during
 from beamfit.quantity import HOUR, Quantity
-from beamfit.shown import shown
-from beamfit.table import json_of
 
 INPUTS = ("rf_voltage", "scraper_y", "pressure", "bunches")
 # How the loss moves with each input; nothing is known of the sign for the RF voltage.

@@ -11,12 +11,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from beamfit.answer import shown
 from beamfit.errors import InputError
 from beamfit.lifetime.bunch import quantum_loss
 from beamfit.lifetime.gas import bremsstrahlung_loss, elastic_loss
 from beamfit.lifetime.ring import Operation, Ring, unstored
 from beamfit.lifetime.touschek import touschek_loss
-from beamfit.shown import shown
 
 # Pa, base pressure of the relative rise with current if the pressure is zero.
 NO_PRESSURE = 1e-30

@@ -8,9 +8,9 @@ from typing import NamedTuple
 import numpy as np
 from scipy.ndimage import median_filter
 
+from beamfit.answer import shown
 from beamfit.errors import expect
 from beamfit.lifetime.record import Conditions, DecayRecord
-from beamfit.shown import shown
 
 # Robust z-score at which a step or spike is an event: one false alarm in 1e20 Gaussian readings.
 THRESHOLD = 10.0

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from beamfit.errors import InputError
+from beamfit.errors import Finding, InputError, Status, judge
 from beamfit.lifetime.decay_law import Moments, beam_current
 from beamfit.lifetime.departures import (
     CONSTANT,
@@ -47,7 +47,6 @@ from beamfit.sampling.posterior import Expected, Posterior
 from beamfit.sampling.priors import Distribution, checked
 from beamfit.sampling.store import FROM_PYTHON, Checkpoint, Provenance
 from beamfit.sampling.target import PosteriorLaw, SamplingTarget
-from beamfit.verdict import Finding, Status, judge
 from beamfit.writing import alone
 
 UNITS = {"i0": "mA", "a": "1/(mA s)", "b": "1/s", "exponent": "1", "drift": "1", "pace": "1"}

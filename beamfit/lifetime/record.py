@@ -9,11 +9,9 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from beamfit.answer import frame_of
+from beamfit.answer import Table, frame_of, shown
 from beamfit.errors import InputError
 from beamfit.quantity import HOUR
-from beamfit.shown import shown
-from beamfit.table import Table
 
 if TYPE_CHECKING:
     from pandas import DataFrame

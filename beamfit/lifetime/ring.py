@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 from scipy import constants
 
+from beamfit.answer import shown
 from beamfit.compile_cache import prepare_jax
 from beamfit.particles import REST_ENERGY
-from beamfit.shown import shown
 
 prepare_jax()
 

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.special import chdtrc
 
+from beamfit.answer import json_of, shown
 from beamfit.errors import InputError
 from beamfit.lifetime.advice import (
     BestPoint,
@@ -39,9 +40,7 @@ from beamfit.lifetime.scales import (
 from beamfit.lifetime.study import Decay, Machine, operation_during, settings_json
 from beamfit.quantity import HOUR, Quantity, Status
 from beamfit.sampling.posterior import Interval, Posterior
-from beamfit.shown import shown
 from beamfit.statistics import POOR_FIT
-from beamfit.table import json_of
 
 CAUSES = {
     "a": "the bunch or the momentum acceptance changed, or the beam-induced pressure",

@@ -12,7 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from beamfit.errors import InputError, nearest
+from beamfit.answer import json_of, shown
+from beamfit.errors import Finding, InputError, judge, nearest
 from beamfit.greybox.covariance import Spread, spread_of
 from beamfit.greybox.fit import Fit
 from beamfit.greybox.posterior import Optimum, Statement, target_of
@@ -24,10 +25,7 @@ from beamfit.lifetime.mechanisms import SCALES, LossTerms, loss_terms, scaled_lo
 from beamfit.lifetime.ring import Operation
 from beamfit.lifetime.study import Decay, Machine, operation_during
 from beamfit.quantity import Quantity, Status
-from beamfit.shown import shown
 from beamfit.statistics import POOR_FIT, chi2_probability
-from beamfit.table import json_of
-from beamfit.verdict import Finding, judge
 
 if TYPE_CHECKING:
     from beamfit.sampling.posterior import Posterior

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from beamfit.answer import json_of
 from beamfit.errors import InputError
 from beamfit.lifetime import alarm
 from beamfit.lifetime.course import reference_of
@@ -29,7 +30,6 @@ from beamfit.lifetime.study import (
     seen_through,
 )
 from beamfit.quantity import HOUR, Quantity, Status
-from beamfit.table import json_of
 
 
 class WindowRow(NamedTuple):

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from beamfit.answer import answer
+from beamfit.answer import answer, json_of, shown
 from beamfit.errors import InputError, expect
 from beamfit.lifetime.bunch import stored_bunch
 from beamfit.lifetime.cycles import (
@@ -42,8 +42,6 @@ from beamfit.lifetime.record import DecayRecord
 from beamfit.lifetime.ring import MeasuredLength, Operation, Ring, unstored
 from beamfit.lifetime.systematics import DecayChecks, Systematic, check_decay, systematics
 from beamfit.quantity import HOUR, Quantity, Status
-from beamfit.shown import shown
-from beamfit.table import json_of
 
 # A setting that moves by more than this share between two readings was changed by somebody.
 CHANGED = 0.01

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from beamfit.answer import json_of, shown
 from beamfit.errors import InputError
 from beamfit.lifetime.alternatives import ConstantA
 from beamfit.lifetime.departures import Law
@@ -24,8 +25,6 @@ from beamfit.lifetime.expansion import (
 from beamfit.lifetime.fit import DecayFit, bare, fit_decay
 from beamfit.lifetime.record import DecayRecord
 from beamfit.quantity import HOUR, Quantity, Status
-from beamfit.shown import shown
-from beamfit.table import json_of
 
 # The size of each cause that the table assumes; those of the monitor in mA, and in proportion
 # below so many: a monitor of small currents is as good as that.

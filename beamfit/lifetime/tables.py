@@ -7,6 +7,7 @@ import re
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
+from beamfit.answer import Row, Table, cell
 from beamfit.lifetime.fit import DecayFit
 from beamfit.lifetime.mechanisms import LINEAR, QUADRATIC, SCALES, Mechanism
 from beamfit.lifetime.pieces import Event
@@ -15,7 +16,6 @@ from beamfit.lifetime.ring_study import Shift
 from beamfit.lifetime.scales import VOLTAGE
 from beamfit.lifetime.study import Decay, RecordStudy
 from beamfit.quantity import HOUR, Quantity, Status
-from beamfit.table import Row, Table, cell
 
 
 class DecayRow(NamedTuple):

@@ -13,7 +13,7 @@ import numpy as np
 from beamfit.emittance.advice import adviser_of
 from beamfit.emittance.design import best_steps
 from beamfit.emittance.fit import EmittanceFit, fit_emittance
-from beamfit.errors import InputError
+from beamfit.errors import InputError, Status
 from beamfit.greybox.problem import padded_length
 from beamfit.io.machine import Magnet, ScanMachine
 from beamfit.live.points import MeasuredPoint, clipped, limits_within, scan_of
@@ -22,7 +22,6 @@ from beamfit.optics.elements import Drift
 from beamfit.statistics import POOR_FIT, chi2_probability
 from beamfit.tuning.fit import TuningFit, fit_tuning
 from beamfit.tuning.minimum import next_row, settings_within
-from beamfit.verdict import Status
 
 # Where a scan begins, in parts of the range of its first magnet.
 BEGIN = (0.1, 0.37, 0.63, 0.9)

@@ -9,10 +9,10 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from typing import Any
 
+from beamfit.answer import cell
 from beamfit.errors import InputError, plain
 from beamfit.live.channel import LostError, open_channel
 from beamfit.live.watch import WatchView
-from beamfit.table import cell
 
 # Severities of EPICS.
 NONE, MINOR, MAJOR, INVALID = range(4)

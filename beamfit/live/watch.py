@@ -11,12 +11,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from beamfit.answer import cell, json_of
+from beamfit.errors import Status
 from beamfit.io.machine import Watched, WatchMachine
 from beamfit.lifetime.watch import CURRENT, RULE, Plan, State, noted, stepped
 from beamfit.live.channel import Channel, LostError, PvReading, kept, open_channel
 from beamfit.live.restore import ended_by_signals
-from beamfit.table import cell, json_of
-from beamfit.verdict import Status
 
 # Without a reading for so long, or so many usual intervals, what is shown is old, s.
 STALE, INTERVALS = 10.0, 5.0

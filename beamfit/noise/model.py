@@ -104,9 +104,14 @@ class Noise:
                 found = f"noise prior {name} = {getattr(self, name):g}"
                 raise InputError(found, "a probability between 0 and 1")
         for name in ("factor", "unstated", "scatter"):
-            values = Lognormal(*map(float, getattr(self, name)))
-            if not all(math.isfinite(v) and v > 0 for v in values):
-                raise InputError(f"noise prior {name} = {tuple(values)}", "two positive numbers")
+            given = getattr(self, name)
+            try:
+                values = Lognormal(*map(float, given))
+                positive = all(math.isfinite(v) and v > 0 for v in values)
+            except (TypeError, ValueError):
+                positive = False
+            if not positive:
+                raise InputError(f"noise prior {name} = {given}", "two positive numbers")
             object.__setattr__(self, name, values)
         if not self.width > 1:
             raise InputError(f"noise prior width = {self.width:g}", "a width above 1")

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.special import expit
+from scipy.special import expit, gammaln
 
-from beamfit.nodes import registered
+from beamfit.arrays import registered
 from beamfit.noise.model import LN_2PI, Lognormal, Noise
 
 # Nodes over the scale of the noise, and how far below its peak the likelihood still counts.
@@ -284,7 +284,8 @@ def means_of(shots: np.ndarray, noise: Noise = Noise()) -> ShotMeans | None:  # 
     Notes
     -----
     A mixture of the beam's normal scatter and of anything up to twice the largest size, by
-    expectation and maximisation (D. W. Hogg, J. Bovy and D. Lang, arXiv:1008.4686 (2010), sect. 3).
+    expectation and maximisation (D. W. Hogg, J. Bovy and D. Lang, arXiv:1008.4686 (2010), sect. 3);
+    how large that scatter is is averaged over, or plain shots of an unlucky setting seem far off.
     The error of a mean includes what the doubtful shots would move it by. The variance of m shots
     is s² = (20 s_pool² + (m - 1) s_i²)/(20 + m - 1): a scaled inverse χ² prior around the scatter
     of all settings (A. Gelman et al., Bayesian Data Analysis, 3rd ed. (2013), sect. 2.6), a share
@@ -299,21 +300,23 @@ def means_of(shots: np.ndarray, noise: Noise = Noise()) -> ShotMeans | None:  # 
     """
     there = ~np.isnan(shots)
     value = np.where(there, shots, 0.0)
-    middle = np.nanmedian(shots, axis=1)
+    middle = np.nanmedian(np.where(shots > 0.0, shots, np.nan), axis=1)
     if (there.sum(1) - 1.0).clip(0).sum() < 3 or not np.any(np.nan_to_num(shots - middle[:, None])):
         return None
     far = LARGEST * float(np.max(middle))
     good, mean = there.astype(float), middle
     deviation = np.maximum(_first_scatter(shots, middle), 1e-6 * middle)
     for _ in range(ROUNDS):
-        z2 = ((value - mean[:, None]) / deviation[:, None]) ** 2
-        density = -0.5 * (z2 + LN_2PI) - np.log(deviation / far)[:, None]
+        freedom = _freedom(good)
+        z = (value - mean[:, None]) / deviation[:, None]
+        density = _student(z, freedom) - np.log(deviation / far)[:, None]
         odds = math.log(noise.bad_shot / (1.0 - noise.bad_shot)) - density
         last, good = good, np.where(there, expit(-odds), 0.0)
         mean = _means(value, good, middle)
-        deviation = _scatter(value, good, mean)
+        deviation = _scatter(value, good, mean, (freedom + 1.0) / (freedom + z**2))
         if np.max(np.abs(good - last)) < 1e-6:
             break
+    deviation = _scatter(value, good, mean)
     count = np.maximum(good.sum(1), 0.5)
     doubtful = (good * (there - good) * (value - mean[:, None]) ** 2).sum(1) / count**2
     error = np.sqrt(deviation**2 / count + doubtful)
@@ -328,6 +331,23 @@ def means_of(shots: np.ndarray, noise: Noise = Noise()) -> ShotMeans | None:  # 
     return ShotMeans(mean, error, bad, float(np.median(deviation / mean)))
 
 
+def _freedom(good: np.ndarray) -> np.ndarray:
+    """Degrees of freedom that a setting's deviation is known by, shape (n, 1).
+
+    Those of a setting about all settings together, and of all together about the truth.
+    """
+    own = np.maximum(good.sum(1, keepdims=True) - 1.0, 0.0)
+    of_all = (POOLED / (POOLED + own)) ** 2 / max(own.sum(), 1.0)
+    return 1.0 / (1.0 / (POOLED + own) + of_all)
+
+
+def _student(z: np.ndarray, freedom: np.ndarray) -> np.ndarray:
+    """Log density of Student's t."""
+    constant = gammaln(0.5 * (freedom + 1.0)) - gammaln(0.5 * freedom)
+    constant -= 0.5 * np.log(freedom * math.pi)
+    return constant - 0.5 * (freedom + 1.0) * np.log1p(z**2 / freedom)
+
+
 def _first_scatter(shots: np.ndarray, middle: np.ndarray) -> np.ndarray:
     """A robust deviation of each setting's shots to begin with: the same share for all."""
     share = np.abs(shots - middle[:, None]) / middle[:, None]
@@ -340,9 +360,11 @@ def _means(value: np.ndarray, good: np.ndarray, middle: np.ndarray) -> np.ndarra
     return np.where(total > 0.5, (good * value).sum(1) / np.maximum(total, 0.5), middle)
 
 
-def _scatter(value: np.ndarray, good: np.ndarray, mean: np.ndarray) -> np.ndarray:
+def _scatter(
+    value: np.ndarray, good: np.ndarray, mean: np.ndarray, weight: np.ndarray | float = 1.0
+) -> np.ndarray:
     """Standard deviation of the shots of each setting, evened out over the settings."""
-    square = (good * (value - mean[:, None]) ** 2).sum(1)
+    square = (good * weight * (value - mean[:, None]) ** 2).sum(1)
     freedom = np.maximum(good.sum(1) - 1.0, 0.0)
     return np.sqrt(evened(square, freedom, mean))
 

@@ -11,10 +11,10 @@ import numpy as np
 from jax import Array
 from jax.typing import ArrayLike
 
+from beamfit.answer import shown
+from beamfit.arrays import value
 from beamfit.errors import InputError
-from beamfit.optics.arrays import value
 from beamfit.particles import ELECTRON_MASS, beta_gamma
-from beamfit.shown import shown
 
 
 @shown

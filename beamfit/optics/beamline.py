@@ -15,14 +15,13 @@ import numpy as np
 from jax import Array
 from jax.typing import ArrayLike
 
+from beamfit.answer import MOST_ROWS, Table, brief, shown
+from beamfit.arrays import value
 from beamfit.errors import InputError, nearest
-from beamfit.optics.arrays import value
 from beamfit.optics.calibration import FocusingStrength, IntegratedStrength
 from beamfit.optics.elements import IDENTITY, Element, Screen, SectorDipole, TransferMatrix
 from beamfit.optics.sections import ElementSeries, LineSection, in_series
 from beamfit.particles import ELECTRON_MASS
-from beamfit.shown import brief, shown
-from beamfit.table import MOST_ROWS, Table
 
 # Most matrices in memory, elements times rows, if each row has its own energy.
 MOST_AT_ONCE = 100_000

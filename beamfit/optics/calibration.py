@@ -12,7 +12,7 @@ from typing import ClassVar
 from jax import Array
 from jax.typing import ArrayLike
 
-from beamfit.optics.arrays import array_module, value
+from beamfit.arrays import array_module, value
 from beamfit.particles import ELECTRON_MASS, rigidity
 
 SETTING_UNITS = {"A": "A", "kG": "kG", "T_per_m": "T/m", "k1": "1/m²", "k1l": "1/m"}

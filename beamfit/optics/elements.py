@@ -13,7 +13,7 @@ import numpy as np
 from jax import Array
 from jax.typing import ArrayLike
 
-from beamfit.optics.arrays import array_module, floats, value
+from beamfit.arrays import array_module, floats, value
 from beamfit.optics.calibration import Calibration, FocusingStrength, IntegratedStrength
 from beamfit.optics.focusing import focusing
 from beamfit.particles import ELECTRON_MASS, beta_gamma

@@ -13,7 +13,7 @@ import numpy as np
 from jax import Array
 from jax.typing import ArrayLike
 
-from beamfit.optics.arrays import array_module, floats
+from beamfit.arrays import array_module, floats
 
 # |k L²| below which the series is used; nine terms leave out less than 1e-18.
 _NEAR, _TERMS = 0.5, 9

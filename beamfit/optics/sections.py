@@ -15,7 +15,7 @@ import numpy as np
 from jax import Array
 from jax.typing import ArrayLike
 
-from beamfit.optics.arrays import array_module, value
+from beamfit.arrays import array_module, value
 from beamfit.optics.elements import IDENTITY, Marker, TransferMatrix
 
 

@@ -14,8 +14,10 @@ import numpy as np
 from matplotlib import rc_context
 from matplotlib.figure import FigureBase
 
+from beamfit.answer import MOST_ROWS, Table, plain_name
 from beamfit.batch.course import ControlChart, summary_of
 from beamfit.batch.run import Batch
+from beamfit.errors import Status
 from beamfit.quantity import Quantity, display_unit
 from beamfit.report.document import (
     MANY,
@@ -30,8 +32,6 @@ from beamfit.report.document import (
 )
 from beamfit.report.page import write_page, write_report
 from beamfit.statistics import BEYOND
-from beamfit.table import MOST_ROWS, Table, plain_name
-from beamfit.verdict import Status
 
 NOTHING = Verdict(
     Status.unidentified,

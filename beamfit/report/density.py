@@ -10,12 +10,12 @@ import numpy as np
 from matplotlib import colormaps
 from matplotlib.figure import FigureBase
 
+from beamfit.answer import Table, cell
 from beamfit.density.charge import FINE_AXIS
 from beamfit.density.fit import SHARES, DensityFit, PlaneDensity
 from beamfit.quantity import Quantity
 from beamfit.report.document import BLUE, RED, Picture, ReportPage, Verdict, contour_levels
 from beamfit.report.emittance import about_input, about_scan
-from beamfit.table import Table, cell
 
 # Profiles in a row of the picture; shares of the charge inside the contours; reach in rms sizes.
 ABREAST, CONTOURS, REACH = 4, (0.95, 0.9, 0.68, 0.5), 4.0

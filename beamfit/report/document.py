@@ -21,9 +21,8 @@ from matplotlib.dates import AutoDateLocator, ConciseDateFormatter
 from matplotlib.figure import Figure, FigureBase
 
 import beamfit
-from beamfit.errors import plain
-from beamfit.table import Table
-from beamfit.verdict import Status
+from beamfit.answer import Table
+from beamfit.errors import Status, plain
 
 STYLE = {
     "font.size": 10,

@@ -8,11 +8,11 @@ from math import ceil
 import numpy as np
 from matplotlib.figure import FigureBase
 
+from beamfit.answer import Table
 from beamfit.language.compiled import Computed
 from beamfit.language.solution import ProblemSolution
 from beamfit.language.text import format_document
 from beamfit.report.document import BLUE, MOST_DRAWN, Picture, ReportPage, Verdict
-from beamfit.table import Table
 
 
 def formulation_page(found: ProblemSolution) -> ReportPage:

@@ -12,15 +12,14 @@ from beamfit.dynamics.feed import FeedPlan
 from beamfit.dynamics.fit import ResponseFit
 from beamfit.dynamics.state_fit import StatesFit
 from beamfit.emittance.slices import SliceFits
+from beamfit.errors import InputError
 from beamfit.language.compiled import Computed
 from beamfit.language.solution import ProblemSolution
-from beamfit.report.control import control_page
 from beamfit.report.density import density_page
 from beamfit.report.document import ReportPage
-from beamfit.report.fedbatch import fedbatch_page, feed_page
+from beamfit.report.dynamics import control_page, fedbatch_page, feed_page, response_page
+from beamfit.report.emittance import slices_page
 from beamfit.report.formulation import computed_page, formulation_page
-from beamfit.report.response import response_page
-from beamfit.report.slices import slices_page
 from beamfit.report.tuning import tuning_page
 from beamfit.tuning.fit import TuningFit
 
@@ -41,4 +40,6 @@ OF_SEVERAL = dict.fromkeys((ResponseFit, StatesFit), response_page)
 def page_of(several: Sequence[Any]) -> ReportPage:
     """The page of such a result, or of several."""
     kind = type(several[0])
+    if kind not in OF_ONE and kind not in OF_SEVERAL:
+        raise InputError(f"a report of a {kind.__name__}", "a fit, or another result that has one")
     return OF_ONE[kind](several[0]) if kind in OF_ONE else OF_SEVERAL[kind](several)

@@ -101,7 +101,7 @@ def write_report(
             page = emittance_page(first, methods)
             sampled = [] if posterior is None else [of_scan(first, posterior)]
         elif isinstance(first, DecayFit | RecordStudy):
-            from beamfit.report.decays import decay_page, study_of
+            from beamfit.report.lifetime import decay_page, study_of
 
             studies = (study_of(first),) if isinstance(first, DecayFit) else several
             page = decay_page(studies, shift, trend)

@@ -13,9 +13,9 @@ from matplotlib.figure import Figure
 from matplotlib.font_manager import FontProperties
 from matplotlib.textpath import text_to_path
 
+from beamfit.answer import Table
 from beamfit.errors import plain
 from beamfit.report.document import Picture, ReportPage
-from beamfit.table import Table
 
 WIDTH, HEIGHT, MARGIN = 8.27, 11.69, 0.75  # A4, inches
 # Height of a line of text, inches.

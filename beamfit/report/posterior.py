@@ -14,10 +14,12 @@ from matplotlib.figure import FigureBase
 from matplotlib.ticker import MaxNLocator, NullLocator
 from scipy.ndimage import gaussian_filter
 
+from beamfit.answer import Table, plain_name
 from beamfit.emittance.fit import EmittanceFit
 from beamfit.emittance.posterior import expected_sizes
 from beamfit.lifetime.fit import DecayFit
 from beamfit.lifetime.posterior import expected_current
+from beamfit.quantity import HOUR
 from beamfit.report.document import (
     BLUE,
     MANY,
@@ -30,7 +32,6 @@ from beamfit.report.document import (
 from beamfit.report.scan_pictures import COLOUR, setting_axis, source_of
 from beamfit.sampling.likelihood import noise_words
 from beamfit.sampling.posterior import Expected, Posterior, in_unit
-from beamfit.table import Table, plain_name
 
 # Shares of the draws inside the contours of one and two standard deviations in two dimensions.
 INSIDE = tuple(1 - math.exp(-0.5 * r**2) for r in (1, 2))
@@ -291,7 +292,7 @@ def of_decay(fit: DecayFit, posterior: Posterior, label: str = "") -> ReportedPo
         _expectations,
         title=fit.readings.name,
         labels=("time, h", "current - median model, mA"),
-        at=fit.readings.time / 3600.0,
+        at=fit.readings.time / HOUR,
         measured=fit.readings.current,
         error=fit.readings.error,
         expect=partial(expected_current, posterior, fit),

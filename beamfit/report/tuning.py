@@ -10,11 +10,11 @@ from itertools import combinations
 import numpy as np
 from matplotlib.figure import FigureBase
 
+from beamfit.answer import Table
 from beamfit.errors import InputError
 from beamfit.quantity import Quantity, percent
 from beamfit.report.document import BLUE, RED, Picture, ReportPage, Verdict
 from beamfit.report.emittance import about_input, about_scan
-from beamfit.table import Table
 from beamfit.tuning.fit import TuningFit, fit_tuning
 
 # Points along each axis of a map, and most maps that are drawn.

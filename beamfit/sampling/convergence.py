@@ -6,10 +6,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from beamfit.answer import plain_name
+from beamfit.errors import Finding, Status
 from beamfit.sampling.likelihood import FRACTION, noise_words
 from beamfit.sampling.target import SamplingTarget
-from beamfit.table import plain_name
-from beamfit.verdict import Finding, Status
 
 # R-hat below which chains agree: Vehtari et al., Bayesian Analysis 16, 667 (2021).
 AGREED = 1.01

@@ -11,14 +11,13 @@ import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-from beamfit.errors import InputError
+from beamfit.errors import InputError, Status, judge
 from beamfit.sampling import store as disk
 from beamfit.sampling.convergence import RULES, ChainEvidence, Diagnostics, diagnose, held_by_priors
 from beamfit.sampling.moves import IndependenceProposal, about, fitted, moves_of, share_of
 from beamfit.sampling.posterior import Posterior
 from beamfit.sampling.store import FROM_PYTHON, Checkpoint, Provenance
 from beamfit.sampling.target import SamplingTarget
-from beamfit.verdict import Status, judge
 from beamfit.writing import alone
 
 # Steps between two looks at the chain; every decision falls at a multiple, so that a run that was

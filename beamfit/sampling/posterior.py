@@ -10,16 +10,24 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from beamfit.answer import answer, frame_of
-from beamfit.errors import InputError, nearest
+from beamfit.answer import (
+    MOST_ROWS,
+    Table,
+    answer,
+    brief,
+    frame_of,
+    html_of,
+    json_of,
+    plain_name,
+    shown,
+    text_of,
+)
+from beamfit.errors import InputError, Status, nearest
 from beamfit.quantity import Quantity, display_unit
 from beamfit.sampling.convergence import Diagnostics
 from beamfit.sampling.likelihood import LOG_NOISE
 from beamfit.sampling.priors import in_words
 from beamfit.sampling.target import SamplingTarget
-from beamfit.shown import brief, shown
-from beamfit.table import MOST_ROWS, Table, html_of, json_of, plain_name, text_of
-from beamfit.verdict import Status
 
 if TYPE_CHECKING:
     from arviz import InferenceData

@@ -15,10 +15,10 @@ from jax import Array
 from scipy.linalg import block_diag
 
 from beamfit.compile_cache import prepare_jax
+from beamfit.errors import Finding, Status
 from beamfit.sampling.likelihood import LOG_NOISE, NoiseGroup, log_likelihood
 from beamfit.sampling.moves import Widening
 from beamfit.sampling.priors import Distribution, in_words
-from beamfit.verdict import Finding, Status
 
 # Not in the package: priors and the place of a store are looked at before JAX is loaded.
 prepare_jax()

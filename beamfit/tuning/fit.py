@@ -12,21 +12,20 @@ import jax
 import numpy as np
 from scipy.special import expit
 
-from beamfit.answer import answer
+from beamfit.answer import Table, answer, cell, json_of
 from beamfit.emittance.comparison import BEAM, MODELS
 from beamfit.emittance.results import in_words
 from beamfit.emittance.scan import KNOB, QuadScan
-from beamfit.emittance.statement import Seen, varied_magnets
+from beamfit.emittance.statement import PreparedScan, varied_magnets
 from beamfit.emittance.transport import setting_units
 from beamfit.emittance.verdict import REMEDIES, SURE
-from beamfit.errors import InputError, expect
+from beamfit.errors import Finding, InputError, Judged, Status, expect, judge
 from beamfit.noise.model import Noise
 from beamfit.optics.beamline import Beamline
 from beamfit.optics.calibration import SETTING_UNITS
 from beamfit.particles import beta_gamma
 from beamfit.quantity import Quantity, percent
 from beamfit.statistics import CENTRAL, WIDE, quantity_of_draws
-from beamfit.table import Table, cell, json_of
 from beamfit.tuning.knob_map import map_posterior, mixed, numbers_at
 from beamfit.tuning.knobs import GOALS, EmittanceTable, Knobs, knobs_of, planes_of
 from beamfit.tuning.minimum import (
@@ -45,7 +44,6 @@ from beamfit.tuning.readings import (
     plane_readings,
     seen_without,
 )
-from beamfit.verdict import Finding, Judged, Status, judge
 
 # Draws of the map: the ends of a 95 % interval are known to a tenth of its half-width.
 DRAWS = 256
@@ -178,7 +176,7 @@ class TuningFit(Judged):
     ----------
     scan : QuadScan or EmittanceTable
         The table, knobs among its settings.
-    seen : Seen or None
+    seen : PreparedScan or None
         A scan without the knobs, through its line; None of finished emittances.
     knobs : Knobs
         Names, limits and units.
@@ -210,7 +208,7 @@ class TuningFit(Judged):
     """
 
     scan: QuadScan | EmittanceTable
-    seen: Seen | None
+    seen: PreparedScan | None
     knobs: Knobs
     goal: str
     within: float

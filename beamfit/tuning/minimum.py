@@ -13,7 +13,7 @@ from jax import Array
 from scipy.stats.qmc import Sobol
 
 from beamfit.emittance.advice import SHARPEST, candidate_settings, elements_at
-from beamfit.emittance.statement import Seen
+from beamfit.emittance.statement import PreparedScan
 from beamfit.errors import InputError
 from beamfit.tuning.knob_map import (
     MEAN,
@@ -165,7 +165,7 @@ class PlaneMap(NamedTuple):
 class Tuned(Protocol):
     """Parts of a `TuningFit` that advice rests on."""
 
-    seen: Seen | None
+    seen: PreparedScan | None
     knobs: Knobs
     maps: dict[str, PlaneMap]
     draws: Emittances

@@ -11,7 +11,13 @@ import numpy as np
 from beamfit.emittance.beam_draws import Coordinates, coordinates
 from beamfit.emittance.comparison import LEVEL, STEPS
 from beamfit.emittance.scan import QuadScan
-from beamfit.emittance.statement import Seen, looked_through, plane_sizes, prepared, unfitted
+from beamfit.emittance.statement import (
+    PreparedScan,
+    looked_through,
+    of_one_beam,
+    plane_sizes,
+    unfitted,
+)
 from beamfit.greybox.problem import padded_length
 from beamfit.noise.model import LN_2PI, Noise
 from beamfit.noise.sizes import kinds_of
@@ -25,9 +31,11 @@ BEGIN = np.array([-1.0, 0.0, 0.0])
 NODES = np.linspace(-2.5, 2.5, 11)
 
 
-def seen_without(scan: QuadScan, line: Beamline | None, knobs: Knobs, noise: Noise | None) -> Seen:
+def seen_without(
+    scan: QuadScan, line: Beamline | None, knobs: Knobs, noise: Noise | None
+) -> PreparedScan:
     """The scan through its line; the knobs are no magnets of it."""
-    scan, line = prepared(scan.without_settings(knobs.names), line)
+    scan, line = of_one_beam(scan.without_settings(knobs.names), line)
     return looked_through([unfitted(scan, line, noise=noise)])[0]
 
 
@@ -56,7 +64,7 @@ class PlaneReadings(NamedTuple):
 
 
 def plane_readings(
-    seen: Seen, plane: str, knobs: Knobs, settings: Mapping[str, np.ndarray], room: int = 0
+    seen: PreparedScan, plane: str, knobs: Knobs, settings: Mapping[str, np.ndarray], room: int = 0
 ) -> PlaneReadings:
     """The sizes of a plane at the settings of the knobs, with the noise of scans.
 

@@ -98,6 +98,15 @@ SCANS = {
         ["implausible", "size_x_um", "size_x_m"],
     ),
     "one slipped row": (changed("53.6", "53600"), [":4:", "size_x_um"]),
+    "one row in mm": (changed("53.6,0.3", "0.0536,0.0003"), [":4:", "size_x_um", "one unit"]),
+    "an error without a unit": (
+        GOOD.replace("size_x_error_um", "size_x_error"),
+        [":1:", "size_x_error", "no unit", "size_x_error_um"],
+    ),
+    "a beam current beside sizes": (
+        column("beam_current_mA", *["2"] * 5),
+        ["beam_current_mA", "no size depends", "--ignore"],
+    ),
     "errors larger than sizes": (
         changed(",0.3,74", ",300,74").replace(",0.5,96", ",500,96").replace(",0.3,57", ",300,57"),
         ["size_x_error_um", "errors"],

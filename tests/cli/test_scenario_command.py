@@ -61,7 +61,7 @@ def test_the_terminal_says_what_is_left_open(run):
         (("--anchor", "first-principles=2%", "--anchor", "first-principles=3%"), "once"),
         (("--bounds", "Q2.slope=147%:187"), "NAME=LOWER:UPPER"),
         (("--prior", "Q2.slope=167%+-3"), "NAME=MEAN+-SD"),
-        (("--hidden", "0"), "at least one"),
+        (("--hidden", "0"), "at least 1"),
         (("--hysteresis",), "focusing-network"),
     ],
 )

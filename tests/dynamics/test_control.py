@@ -21,8 +21,7 @@ from beamfit.dynamics.control import (
 from beamfit.dynamics.fit import identify
 from beamfit.dynamics.record import Run
 from beamfit.dynamics.response import ARX, FIRST_ORDER, SECOND_ORDER, simulate
-from beamfit.errors import InputError
-from beamfit.verdict import Status
+from beamfit.errors import InputError, Status
 from tests.simulations import simulations
 
 INF = np.inf

@@ -23,8 +23,7 @@ from beamfit.dynamics.fedbatch import (
 )
 from beamfit.dynamics.feed import best_feed, predict
 from beamfit.dynamics.record import Run
-from beamfit.errors import InputError
-from beamfit.verdict import Status, judge
+from beamfit.errors import InputError, Status, judge
 
 FED = {"feed_substrate": 200.0}
 

@@ -6,7 +6,7 @@ import pytest
 from beamfit.dynamics.fit import identify
 from beamfit.dynamics.input_laws import LawEvidence, moved
 from beamfit.dynamics.record import Run
-from beamfit.verdict import Status
+from beamfit.errors import Status
 
 UP_AND_DOWN = np.array([0.0, 1.0, 2.0, 2.0, 1.5, 1.0, 0.0, -1.0])
 

@@ -10,9 +10,8 @@ from scipy.signal import lfilter
 from beamfit.dynamics.fit import identify
 from beamfit.dynamics.record import Run
 from beamfit.dynamics.response import FIRST_ORDER, SECOND_ORDER, simulate
-from beamfit.errors import InputError
+from beamfit.errors import InputError, Status
 from beamfit.noise.memory import CorrelatedNoise, innovations
-from beamfit.verdict import Status
 from tests.simulations import simulations, widened
 
 

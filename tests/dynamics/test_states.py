@@ -13,8 +13,7 @@ from beamfit.dynamics.record import Run
 from beamfit.dynamics.search import Case
 from beamfit.dynamics.state_fit import fit_states
 from beamfit.dynamics.states import StateSpace
-from beamfit.errors import InputError
-from beamfit.verdict import Status
+from beamfit.errors import InputError, Status
 
 
 def steps(n, rng, every):

@@ -10,7 +10,7 @@ import pytest
 
 import beamfit
 from beamfit.emittance.assumptions import Assumptions
-from beamfit.emittance.statement import see
+from beamfit.emittance.statement import prepare
 from beamfit.emittance.transport_network import SCENARIO, certificate_of
 from beamfit.errors import InputError
 from tests.greybox.appendices import (
@@ -43,9 +43,9 @@ def ours(scan, line):
 
     The errors are those of the appendix, which takes them as right.
     """
-    seen = see(scan, line, ("x",), weights="measured")
-    points = seen.works["x"].points._replace(error=scan.error["x"])
-    seen = seen._replace(works={"x": seen.works["x"]._replace(points=points)})
+    seen = prepare(scan, line, ("x",), weights="measured")
+    points = seen.solutions["x"].points._replace(error=scan.error["x"])
+    seen = seen._replace(solutions={"x": seen.solutions["x"]._replace(points=points)})
     return SCENARIO.state(seen, Assumptions(bounds=BOX, gains=GAINS))
 
 

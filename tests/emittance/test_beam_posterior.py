@@ -58,7 +58,7 @@ def likelihood(kind, size, error, noise):
 
 def brute(fit, kind, noise=Noise()):  # noqa: B008
     """Beams and weights of the x plane of a fit, from its sizes alone."""
-    p, sizes = fit.x.points, fit.seen.works["x"].sizes
+    p, sizes = fit.x.points, fit.seen.solutions["x"].sizes
     rows = np.stack([p.r11**2, 2 * p.r11 * p.r12, p.r12**2], -1)
     spread = rows / (2 * p.model * p.error)[:, None]
     covariance = 6.0 * np.linalg.inv(spread.T @ spread)
@@ -68,7 +68,7 @@ def brute(fit, kind, noise=Noise()):  # noqa: B008
 
 
 def median(fit):
-    post = fit.seen.works["x"].posterior
+    post = fit.seen.solutions["x"].posterior
     s11, s12, s22 = post.sigma[post.weight > 0].T
     own = np.sqrt(np.maximum(s11 * s22 - s12**2, 0.0))
     return weighted_quantiles(own, post.weight[post.weight > 0], (0.5,))[0]
@@ -115,14 +115,14 @@ def noises(kind, size, error, noise):
 
 def brute_probabilities(fit, kind, noise):
     """Of a beam and its rivals, by their evidences written out."""
-    p, sizes = fit.x.points, fit.seen.works["x"].sizes
+    p, sizes = fit.x.points, fit.seen.solutions["x"].sizes
     size, error, n = sizes.size, sizes.error, len(sizes.size)
     rows2 = np.stack([p.r11, p.r12], -1)
     rows = np.stack([p.r11**2, 2 * p.r11 * p.r12, p.r12**2], -1)
     turn = ref.coordinates_of(rows2, size)
     spread = rows / (2 * p.model * p.error)[:, None]
     covariance = 8.0 * np.linalg.inv(spread.T @ spread)
-    post = fit.seen.works["x"].posterior
+    post = fit.seen.solutions["x"].posterior
     log = likelihood(kind, size, error, noise)
     drawn = rows, size, p.known, log, post.best, covariance, turn
     beam = ref.log_evidence_of_beam(*drawn, number=5000)

@@ -9,7 +9,7 @@ import pytest
 import beamfit
 from beamfit.emittance.assumptions import Anchor, Assumptions
 from beamfit.emittance.fit import scenario_of
-from beamfit.emittance.statement import see
+from beamfit.emittance.statement import prepare
 from tests.emittance.coverage import binomial_limits, coverage, deviations
 
 # Case: scan, scenario, what is told, simulated scans with all tests.
@@ -37,7 +37,7 @@ def seen(root):
     for key, (scan, lattice) in pairs.items():
         scan = beamfit.read_quad_scan(root / f"measurements/{scan}.csv")
         line = beamfit.load_lattice(root / f"lattices/{lattice}.toml")
-        found[key] = see(scan, line)
+        found[key] = prepare(scan, line)
     return found
 
 

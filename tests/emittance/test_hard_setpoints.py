@@ -24,7 +24,7 @@ ROUND = dict.fromkeys("xy", np.array([4e-8, -1e-8, 3e-9]))
 class Request(NamedTuple):
     limits: dict
     beams: dict
-    wishes: tuple
+    targets: tuple
     lowest: float
     status: str
 
@@ -49,7 +49,7 @@ REQUESTS = {
     "small and parallel": Request(
         MIDDLE, FLAT, (*sizes(5e-6), *angles(5e-5)), 5814.97, "infeasible"
     ),
-    "four wishes": Request(
+    "four targets": Request(
         WIDE, FLAT, (*sizes(5e-5, 5e-5), *angles(1e-4, 1e-4)), 2386.98, "infeasible"
     ),
     "20 mm by 1 µm": Request(MIDDLE, FLAT, sizes(2e-2, 1e-6), 2.00805e8, "at_limit"),
@@ -67,7 +67,7 @@ REQUESTS = {
         70.8539,
         "at_limit",
     ),
-    "three wishes that can be met": Request(
+    "three targets that can be met": Request(
         WIDE, ROUND, (*sizes(3e-5, 2e-4), *angles(4e-4)), 0.0, "converged"
     ),
     "between two minima": Request(ASIDE, ROUND, sizes(1e-6, 1e-6), 107665.0, "at_limit"),
@@ -87,7 +87,7 @@ def objective(settings, request):
     stiff = float(rigidity(250.0))
     gradient = 0.02 * np.sign(b) + 1.6 * b - 0.004 * b**2
     total = 0.0
-    for kind, plane, value in request.wishes:
+    for kind, plane, value in request.targets:
         r = np.eye(2)
         sign = 1.0 if plane == "x" else -1.0
         for k, drift in ((a / 2.0 / stiff, 0.6), (gradient / stiff, 0.6), (c, 2.5)):
@@ -109,7 +109,7 @@ def objective(settings, request):
 def test_the_best_point_is_found_and_called_what_it_is(three_quads, name):
     request = REQUESTS[name]
     beams = {plane: Beam(sigma) for plane, sigma in request.beams.items()}
-    found = find_setpoint(three_quads, beams, request.limits, request.wishes)
+    found = find_setpoint(three_quads, beams, request.limits, request.targets)
     assert found.best.objective == pytest.approx(request.lowest, rel=1e-5, abs=1e-6)
     settings = np.array([*found.best.settings.values()])
     assert float(objective(settings, request)) == pytest.approx(
@@ -127,9 +127,9 @@ def test_what_holds_an_unreachable_wish_is_said(three_quads):
     def found(name):
         request = REQUESTS[name]
         beams = {plane: Beam(sigma) for plane, sigma in request.beams.items()}
-        return find_setpoint(three_quads, beams, request.limits, request.wishes).message
+        return find_setpoint(three_quads, beams, request.limits, request.targets).message
 
     assert "QA, QB at a limit: a wider one would do better." in found("1 µm")
-    assert "the wishes contradict one another" in found("four wishes")
+    assert "the targets contradict one another" in found("four targets")
     assert "jumps as a magnet changes sign" in found("match at a jump")
     assert "BMAG - 1 = " in found("match and size")

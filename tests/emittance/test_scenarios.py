@@ -11,7 +11,7 @@ import beamfit
 from beamfit.emittance.assumptions import Anchor, Assumptions
 from beamfit.emittance.calibration import with_numbers
 from beamfit.emittance.model import UNIT, asked_numbers
-from beamfit.emittance.statement import asked_of, see
+from beamfit.emittance.statement import asked_of, prepare
 from beamfit.emittance.transport_network import SCENARIO as TRANSPORT_NETWORK
 from beamfit.emittance.transport_network import certificate_of
 from beamfit.errors import InputError
@@ -319,6 +319,10 @@ def test_hysteresis_of_a_scan_that_only_rises(scan, gtf):
         ({"scenario": "calibration", "priors": {"Q2.slop": (1, 1)}}, "did you mean Q2.slope"),
         ({"scenario": "calibration", "priors": {"Q2.slope": (1, 0)}}, "positive deviation"),
         ({"scenario": "calibration", "bounds": {"Q2.slope": (2, 1)}}, "lower first"),
+        ({"scenario": "transport-network", "anchor": "determinant"}, r"beamfit.Anchor\("),
+        ({"scenario": "calibration", "priors": "Q2.slope=167+-3"}, r"a str, .*such as priors="),
+        ({"scenario": "calibration", "priors": {"Q2.slope": 167.0}}, "a pair of numbers"),
+        ({"noise": "shots.toml"}, r"beamfit.Noise\("),
         ({"scenario": "calibration", "anchor": ANCHOR}, "transport-network or focusing-network"),
         ({"scenario": "transport-network", "anchor": Anchor(at=({"Q1": 0.0},))}, "scanned magnet"),
         ({"scenario": "calibration", "hysteresis": True}, "focusing-network"),
@@ -377,7 +381,7 @@ def test_three_quads_two_screens_two_energies(three_quads):
 
 
 def test_training_from_many_starts_is_no_worse_than_from_one(scan, gtf):
-    problem = TRANSPORT_NETWORK.state(see(scan, gtf), Assumptions(anchor=ANCHOR))
+    problem = TRANSPORT_NETWORK.state(prepare(scan, gtf), Assumptions(anchor=ANCHOR))
     assert solve(problem, 20).cost <= solve(problem, 1).cost + 1e-9
 
 

@@ -16,7 +16,7 @@ from beamfit.particles import PROTON_MASS
 
 # Appendix D, in SI.
 SIGMA = np.array([2.6367971055566173, 1.5738242270790272, 1.435441121463094]) * 1e-8
-WISH = [Target("size", "x", 200e-6), Target("divergence", "x", 140e-6)]
+TARGETS = [Target("size", "x", 200e-6), Target("divergence", "x", 140e-6)]
 
 
 def objective(line, current, sigma=SIGMA):
@@ -30,7 +30,7 @@ def objective(line, current, sigma=SIGMA):
 
 def test_appendix_d_finds_the_global_minimum(gtf, shared):
     expected = json.loads((shared / "reference/gtf.json").read_text())["appendix_D"]
-    found = find_setpoint(gtf, {"x": Beam(SIGMA)}, {"Q2": (0.0, 10.0)}, WISH)
+    found = find_setpoint(gtf, {"x": Beam(SIGMA)}, {"Q2": (0.0, 10.0)}, TARGETS)
     assert found.best.settings["Q2"] == pytest.approx(expected["global_minimum_I2_A"], abs=1e-8)
     assert found.best.objective == pytest.approx(expected["objective"], abs=1e-8)
     [x] = found.predicted
@@ -42,7 +42,7 @@ def test_appendix_d_finds_the_global_minimum(gtf, shared):
 
 
 def test_no_point_of_a_dense_search_is_better(gtf):
-    found = find_setpoint(gtf, {"x": Beam(SIGMA)}, {"Q2": (0.0, 10.0)}, WISH)
+    found = find_setpoint(gtf, {"x": Beam(SIGMA)}, {"Q2": (0.0, 10.0)}, TARGETS)
     lowest = min(objective(gtf, c) for c in np.linspace(0.0, 10.0, 501))
     assert found.best.objective <= lowest
     assert found.best.objective == pytest.approx(
@@ -51,7 +51,7 @@ def test_no_point_of_a_dense_search_is_better(gtf):
 
 
 def test_a_limit_is_kept_and_said(gtf):
-    found = find_setpoint(gtf, {"x": Beam(SIGMA)}, {"Q2": (0.0, 0.9)}, WISH)
+    found = find_setpoint(gtf, {"x": Beam(SIGMA)}, {"Q2": (0.0, 0.9)}, TARGETS)
     assert found.best.settings["Q2"] == 0.9
     assert (found.status.value, found.limits) == ("at_limit", ("Q2",))
     assert "Q2 at a limit" in found.message
@@ -74,14 +74,14 @@ def test_a_minimum_on_a_limit_is_listed_once():
 def test_the_errors_are_those_of_moved_beams(gtf):
     """Each beam of the error ellipsoid's axes, searched again, moves by what the error says."""
     sd = np.array([0.02, 0.01, 0.015]) * SIGMA
-    found = find_setpoint(gtf, {"x": Beam(SIGMA, np.diag(sd**2))}, {"Q2": (0.0, 10.0)}, WISH)
+    found = find_setpoint(gtf, {"x": Beam(SIGMA, np.diag(sd**2))}, {"Q2": (0.0, 10.0)}, TARGETS)
     moves = []
     for i in range(3):
         ends = []
         for sign in (-0.1, 0.1):
             moved = SIGMA.copy()
             moved[i] += sign * sd[i]
-            best = find_setpoint(gtf, {"x": Beam(moved)}, {"Q2": (0.0, 10.0)}, WISH)
+            best = find_setpoint(gtf, {"x": Beam(moved)}, {"Q2": (0.0, 10.0)}, TARGETS)
             ends.append(best.best.settings["Q2"])
         moves.append((ends[1] - ends[0]) / 0.2)
     assert found.setting_error["Q2"] == pytest.approx(np.linalg.norm(moves), rel=1e-3)
@@ -122,12 +122,12 @@ def test_a_match_reaches_the_design_and_its_objective_is_bmag_less_one(three_qua
     ],
 )
 def test_bad_input_is_named(gtf, change, words):
-    given = {"beams": {"x": Beam(SIGMA)}, "vary": {"Q2": (0.0, 10.0)}, "targets": WISH} | change
+    given = {"beams": {"x": Beam(SIGMA)}, "vary": {"Q2": (0.0, 10.0)}, "targets": TARGETS} | change
     with pytest.raises(InputError, match=words):
         find_setpoint(gtf, given["beams"], given["vary"], given["targets"])
 
 
 def test_the_json_has_units_and_the_energy_of_the_line(gtf):
-    found = find_setpoint(gtf, {"x": Beam(SIGMA)}, {"Q2": (0.0, 10.0)}, WISH).to_json()
+    found = find_setpoint(gtf, {"x": Beam(SIGMA)}, {"Q2": (0.0, 10.0)}, TARGETS).to_json()
     assert found["units"] == {"Q2": "A"}
     assert (found["energy"]["value"], found["energy"]["unit"]) == (float(gtf.energy), "MeV")

@@ -6,7 +6,7 @@ import pytest
 import beamfit
 from beamfit.emittance.design import plan_measurements
 from beamfit.emittance.sensitivity import systematics
-from beamfit.emittance.wishes import Target
+from beamfit.emittance.targets import Target
 from beamfit.errors import InputError
 from beamfit.io.line import build_line, read_lattice
 from beamfit.optics.beam import BeamMatrix
@@ -119,7 +119,7 @@ def test_advice_and_set_points_move_the_knob(pair):
     advice = plan_measurements(fit, limits={"QS": (0.0, 5.0)}, count=2)
     assert advice.steps
     assert all(0.0 <= step.candidate.settings["QS"] <= 5.0 for step in advice.steps)
-    beam = {"x": beamfit.emittance.wishes.Beam(np.array([1.6e-8, -1e-9, 3.1e-10]))}
+    beam = {"x": beamfit.emittance.targets.Beam(np.array([1.6e-8, -1e-9, 3.1e-10]))}
     found = beamfit.find_setpoint(pair, beam, {"QS": (0.0, 8.0)}, [Target("size", "x", 1e-4)])
     assert set(found.to_json()["settings"]) == {"QS"}
 

@@ -222,3 +222,14 @@ def test_an_emittance_that_only_a_wrong_unit_explains_is_not_given(gtf, factor, 
     assert "the units of 'size_x_um'" in fit.message
     assert {q.error for q in fit.quantities.values()} == {None}
     assert np.isnan(fit.covariance).all()
+
+
+@pytest.mark.parametrize(
+    ("factor", "words"), [(0.02, "is less than most"), (130.0, "is more than most")]
+)
+def test_an_emittance_of_few_accelerators_is_asked_about(gtf, factor, words, root):
+    scan = beamfit.read_quad_scan(root / "measurements/gtf_simulated.csv")
+    size, error = ({p: factor * v for p, v in of.items()} for of in (scan.size, scan.error))
+    fit = beamfit.fit_emittance(replace(scan, size=size, error=error), gtf)
+    assert fit.x.status is Status.converged
+    assert any(words in note for note in fit.notes)

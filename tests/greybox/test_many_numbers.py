@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from scipy import sparse
 
+from beamfit.errors import Status
 from beamfit.greybox import assess, covariance, descend
 from beamfit.greybox import sparse as sparse_parts
 from beamfit.greybox.problem import Free, Prior, Problem, Record
 from beamfit.greybox.solve import solve
 from beamfit.greybox.sparse import Factor, pattern_at, weakest
-from beamfit.verdict import Status
 
 N = 12
 

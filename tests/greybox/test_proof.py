@@ -5,10 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from beamfit.errors import Status
 from beamfit.greybox.convex import convex
 from beamfit.greybox.problem import Constraint, Free, Objective, Problem, Record
 from beamfit.greybox.solve import solve
-from beamfit.verdict import Status
 
 CONVEX = {
     "squares": lambda x: (x[0] - 1) ** 2 + 3 * (x[1] - 2) ** 2,

@@ -9,8 +9,8 @@ import pytest
 import beamfit
 from beamfit.cli import main
 from beamfit.errors import InputError
+from beamfit.io.columns import layout_of
 from beamfit.io.decay_record import read_lifetimes
-from beamfit.io.layout import layout_of
 from beamfit.io.run import read_run
 
 SCAN = "QUAD:BACT,xrms,err,foo\n0,200,2,9\n1,120,1,9\n2,180,2,9\n3,230,2,9\n"
@@ -58,7 +58,7 @@ def test_any_header_becomes_a_quantity_with_a_unit(file):
     path = file(SCAN)
     said = beamfit.read_quad_scan(path, columns=SAID)
     assert told(said) == ([0, 1, 2, 3], [200, 120, 180, 230], [2, 1, 2, 2])
-    assert said.notes == ("Left aside: foo.",)
+    assert said.notes == ("Ignored: foo.",)
     mapping = dict(part.strip().split("=") for part in SAID.split(","))
     layout = file(LAYOUT, "lcls.toml")
     for columns in (mapping, layout, str(layout), layout_of(layout)):
@@ -70,7 +70,7 @@ def test_what_is_said_is_believed_and_nothing_guessed_against_it(file):
     text = "Q_A,size_x_mm,best\n" + "".join(f"{i},9,{100 + i}\n" for i in range(4))
     scan = beamfit.read_quad_scan(file(text), columns="best=size_x_um")
     np.testing.assert_allclose(scan.size["x"], [1e-4, 1.01e-4, 1.02e-4, 1.03e-4])
-    assert scan.notes == ("Left aside: size_x_mm.",)
+    assert scan.notes == ("Ignored: size_x_mm.",)
     other = beamfit.read_quad_scan(file(text.replace("mm", "um")), columns="best=size_x_um")
     np.testing.assert_allclose(other.size["x"], scan.size["x"])
     wide = beamfit.read_quad_scan(file(SCAN), columns=SAID.replace("size_x_um", "fwhm_x_um")
@@ -220,7 +220,15 @@ def test_check_proposes_a_layout_that_then_reads_the_file(file, monkeypatch, cap
     assert (code, err) == (0, "")
     document = json.loads(out)["results"][0]
     assert document["kind"] == "scan"
-    assert document["notes"] == ["Left aside: foo."]
+    assert document["notes"] == ["Ignored: foo."]
+
+
+def test_check_proposes_the_unit_that_the_cells_say(file, monkeypatch, capsys):
+    path = file("when,beam_current\n" + "".join(f"{t},{200 - t} mA\n" for t in range(9)))
+    _, out, _ = run(monkeypatch, capsys, "check", path)
+    assert '"beam_current" = "beam_current_mA"  # 200 mA' in out
+    layout = file(out.replace('# "when" = ""', '"when" = "time_s"'), "l.toml")
+    assert beamfit.read_decay_record(path, columns=layout).current[0] == 200
 
 
 def test_every_command_takes_it(file, root, monkeypatch, capsys):

@@ -81,7 +81,7 @@ def test_units_that_could_mean_another_are_left_as_they_stand():
     assert [spelled(header) for header in same] == list(same)
 
 
-def test_an_index_without_a_name_is_left_aside(tmp_path):
+def test_an_index_without_a_name_is_ignored(tmp_path):
     text = ",Q525_kG,size_x_um\n0,-4.2,111.4\n1,-3,63\n2,2,98\n"
     (tmp_path / "a.csv").write_text(text)
     scan = read_quad_scan(tmp_path / "a.csv")

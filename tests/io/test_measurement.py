@@ -326,3 +326,14 @@ def test_damaged_hdf5_is_read_or_refused(tmp_path_factory, position, damage):
 def test_a_name_the_system_cannot_have():
     with pytest.raises(InputError):
         read_quad_scan("a\0b.csv")
+
+
+def test_shots_of_size_zero_show_no_beam(tmp_path):
+    sizes = {-1: (100, 102, 0), 0: (60, 0, 0), 1: (60, 61, 62), 2: (150, 153, 149), 3: (0, 0, 0)}
+    rows = [f"{k},{j},{size}" for k, three in sizes.items() for j, size in enumerate(three)]
+    path = tmp_path / "shots.csv"
+    path.write_text("\n".join(["Q_k1,shot,size_x_um", *rows]) + "\n")
+    scan = read_quad_scan(path)
+    assert scan.notes == ("6 shots of size 0 show no beam and are left out.",)
+    assert np.isfinite(scan.shot_size["x"]).sum(axis=1).tolist() == [2, 1, 3, 3, 0]
+    assert scan.rows("x").size.round(9).tolist() == [1.01e-4, 6e-5, 6.1e-5, 1.50667e-4]

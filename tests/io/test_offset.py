@@ -68,8 +68,8 @@ def test_what_gives_no_offset_is_refused(said, current, words):
         offset_of(said, current)
 
 
-def test_columns_left_aside_are_named(tmp_path):
+def test_ignored_columns_are_named(tmp_path):
     path = tmp_path / "a.csv"
     path.write_text("t,SR:I,BPM1,Ring temp\n0,100,1,20\n1,99,1,20\n")
     record = read_decay_record(path, columns="t=time_s, SR:I=beam_current_mA")
-    assert record.notes == ("Left aside: BPM1, Ring temp.",)
+    assert record.notes == ("Ignored: BPM1, Ring temp.",)

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 import beamfit
+from beamfit.answer import json_of
 from beamfit.emittance.results import PlaneFit
 from beamfit.errors import InputError
 from beamfit.io.result import HOMES
 from beamfit.lifetime.fit import DecayFit
-from beamfit.table import json_of
 
 
 def of(root, scan, lattice, **options):

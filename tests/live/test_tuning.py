@@ -9,7 +9,7 @@ import pytest
 from beamfit.errors import InputError
 from beamfit.io.line import build_line
 from beamfit.io.machine import read_scan_machine
-from beamfit.io.tuning import read_tuning_scan
+from beamfit.io.scan import read_tuning_scan
 from beamfit.live.aims import TuningAim
 from beamfit.live.devices import Connected, Shots
 from beamfit.live.points import scan_text

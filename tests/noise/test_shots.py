@@ -66,3 +66,22 @@ def test_scatter_is_evened_out_towards_that_of_all_settings():
     square = np.array([4.0, 4.0, 4.0, 4.0, 16.0])
     pooled = square.sum() / freedom.sum()
     np.testing.assert_allclose(evened(square, freedom, size), (20 * pooled + square) / 24.0)
+
+
+@pytest.mark.parametrize("power", [0, 1])
+def test_plain_shots_are_good_ones(power):
+    """SIMULATED normal shots, a share of the size or the same at each: none is surely bad."""
+    rng, lost = np.random.default_rng(7), 0
+    for _ in range(400):
+        n, m = rng.integers(4, 16), rng.integers(3, 11)
+        size = np.hypot(rng.uniform(0.05, 0.6), np.linspace(-2, 2, n) - rng.uniform(-1, 1))
+        scatter = 10 ** rng.uniform(-3, -0.7) * np.median(size) ** (1 - power)
+        shots = size[:, None] + scatter * (size**power)[:, None] * rng.normal(size=(n, m))
+        lost += bool((means_of(np.abs(shots)).bad > 0.99).any())
+    assert lost <= 2
+
+
+def test_two_of_three_shots_without_beam_leave_the_third():
+    found = means_of(np.array([[1.0, 1.02, 0.98], [2.0, 0.0, 0.0], [3.0, 2.94, 3.06]]))
+    assert found.size[1] == pytest.approx(2.0, rel=0.01)
+    assert found.bad[1, 1:].min() > 0.99

@@ -14,9 +14,9 @@ from matplotlib.figure import Figure
 import beamfit
 import beamfit.figures
 from beamfit.errors import InputError
-from beamfit.report.decays import decay_page, study_of
 from beamfit.report.document import day_of, written_now
 from beamfit.report.emittance import emittance_page
+from beamfit.report.lifetime import decay_page, study_of
 from beamfit.report.pdf import HEIGHT, pages_of
 
 

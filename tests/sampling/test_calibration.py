@@ -49,7 +49,7 @@ def test_known_transport_by_quadrature(gtf, kind):
     root = np.linalg.cholesky(np.linalg.inv(spread.T @ spread))
     side = np.linspace(-7.0, 7.0, 33)
     steps = np.stack(np.meshgrid(side, side, side, indexing="ij"), -1).reshape(-1, 3)
-    grid = fit.seen.works["x"].posterior.best + steps @ root.T
+    grid = fit.seen.solutions["x"].posterior.best + steps @ root.T
     s11, s12, s22 = grid.T
     model = np.sqrt(np.maximum(grid @ rows.T + p.known, 1e-30))
     if kind == "none":
@@ -168,7 +168,7 @@ def test_the_posterior_begins_at_the_fit(gtf):
     scan, line = gtf
     fit = beamfit.fit_emittance(scan, line)
     stated = beam_target(fit)
-    p, post = fit.x.points, fit.seen.works["x"].posterior
+    p, post = fit.x.points, fit.seen.solutions["x"].posterior
     sigma = np.array([q.value for q in fit.x.sigma])
     np.testing.assert_allclose(stated.mode, sigma, rtol=1e-3)
     rows = np.stack([p.r11**2, 2 * p.r11 * p.r12, p.r12**2], -1)

@@ -7,10 +7,9 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from beamfit.errors import InputError
+from beamfit.errors import InputError, Status
 from beamfit.sampling.ensemble import draw, first_walkers
 from beamfit.sampling.priors import HalfNormal, LogNormal, Normal, Uniform
-from beamfit.verdict import Status
 from tests.sampling.targets import (
     BANANA,
     PEAKS,

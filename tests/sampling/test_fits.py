@@ -13,7 +13,7 @@ from scipy import stats
 
 import beamfit
 from beamfit.emittance.posterior import beam_target, expected_sizes
-from beamfit.errors import InputError
+from beamfit.errors import InputError, Status
 from beamfit.greybox.posterior import Statement, target_of
 from beamfit.greybox.problem import Constraint, Free, Prior, Problem, Record
 from beamfit.greybox.solve import solve
@@ -22,7 +22,6 @@ from beamfit.lifetime.fit import fit_decay
 from beamfit.lifetime.posterior import expected_current
 from beamfit.lifetime.record import DecayRecord
 from beamfit.sampling.priors import Normal, Uniform
-from beamfit.verdict import Status
 
 X = np.linspace(0.0, 1.0, 12)
 Y = 1.0 + 2.0 * X + 0.1 * np.random.default_rng(1).normal(size=12)

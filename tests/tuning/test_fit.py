@@ -8,7 +8,7 @@ from jax import numpy as jnp
 from scipy.stats import binom
 
 from beamfit.emittance.scan import QuadScan
-from beamfit.errors import InputError
+from beamfit.errors import InputError, Status
 from beamfit.noise.model import Noise
 from beamfit.particles import beta_gamma
 from beamfit.tuning.fit import fit_tuning
@@ -16,7 +16,6 @@ from beamfit.tuning.knob_map import _covariance, _linear, log_emittance, orders_
 from beamfit.tuning.knobs import EmittanceTable, knobs_of
 from beamfit.tuning.minimum import _information, next_row
 from beamfit.tuning.readings import emittance_readings
-from beamfit.verdict import Status
 from tests.tuning.machines import (
     EMITTANCE,
     LINE,

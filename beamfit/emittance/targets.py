@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from beamfit.errors import InputError, nearest
+from beamfit.errors import InputError, expect, nearest
 
 if TYPE_CHECKING:
     from beamfit.optics.beamline import Beamline
@@ -20,7 +20,7 @@ SAME_ENERGY = 1e-3
 
 
 class Target(NamedTuple):
-    """A wish for the beam at the screen in one plane.
+    """A target for the beam at the screen in one plane.
 
     Attributes
     ----------
@@ -107,6 +107,8 @@ def resolved(
     InputError
         If the line has no design Twiss for such a match.
     """
+    for target in targets:
+        expect(target, Target, 'beamfit.Target("size", "x", 1e-4)')
     if screen is None and line.design and targets and all(t.value is None for t in targets):
         screen = line.design.at
     found = tuple(
@@ -140,6 +142,9 @@ def checked_place(
     InputError
         If something cannot be used.
     """
+    expect(beams, Mapping, '{"x": beamfit.Beam(sigma)}')
+    for beam in beams.values():
+        expect(beam, Beam, "beamfit.Beam(sigma)")
     if not targets:
         raise InputError("no target", "a size, a divergence or a match")
     if not vary:
