@@ -569,7 +569,7 @@ def middle_of(currents: np.ndarray, weight: np.ndarray) -> float:
 def _quantities(
     record: DecayRecord, seen: SeenDecay, draws: Draws, currents: np.ndarray
 ) -> dict[str, Quantity]:
-    """What is quoted, from draws with their currents at the nodes."""
+    """Quantities that are quoted, from draws with their currents at the nodes."""
     found, weight = draws.numbers, draws.weight
     span, mean = record.span, float(record.current.mean())
     whole = found.rate / mean / span, found.rate / span
