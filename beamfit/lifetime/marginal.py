@@ -41,6 +41,7 @@ from beamfit.lifetime.expansion import Physical
 from beamfit.lifetime.record import DecayRecord
 from beamfit.noise.memory import Products
 from beamfit.quantity import HOUR, Quantity
+from beamfit.statistics import CENTRAL, WIDE
 
 # Width of the change of gas that is pumped away in what draws come from.
 PUMPED = 0.5
@@ -315,14 +316,14 @@ class Draws(NamedTuple):
     worth: float
 
 
-class Proposal(NamedTuple):
+class DrawnLaw(NamedTuple):
     """A law that is drawn from: the record with the noises that are left, and its peaks."""
 
     seen: SeenDecay
     peaks: Peaks
 
     @classmethod
-    def of(cls, seen: SeenDecay, free: Sequence[int]) -> Proposal:
+    def of(cls, seen: SeenDecay, free: Sequence[int]) -> DrawnLaw:
         """Approximate the posterior of some of the numbers by normal distributions; an exponent and
         a pace at places.
         """
@@ -412,7 +413,7 @@ def quantiles(values: np.ndarray, weight: np.ndarray, at: np.ndarray) -> np.ndar
 
 def quantity_of(values: np.ndarray, weight: np.ndarray, unit: str) -> Quantity:
     """Median, half of the central 68 % and the central 95 % of weighted draws."""
-    found = quantiles(values, weight, np.array([0.5, 0.1587, 0.8413, 0.025, 0.975]))
+    found = quantiles(values, weight, np.array([0.5, *CENTRAL, *WIDE]))
     middle, less, more, *interval = map(float, found)
     return Quantity(middle, (more - less) / 2, unit, None, tuple(interval))
 
@@ -424,8 +425,10 @@ def _share_of(
     0 to the limit of 95 %, or up to the whole.
     """
     found = quantity_of(values, weight, unit)
-    low, high = quantiles(values, weight, np.array([0.025 + 0.025 * all_, 0.975 - 0.025 * none]))
-    high = quantiles(whole, weight, np.array([0.975]))[0] if all_ else high
+    low, high = quantiles(
+        values, weight, np.array([WIDE[0] * (1 + all_), WIDE[1] - WIDE[0] * none])
+    )
+    high = quantiles(whole, weight, np.array([WIDE[1]]))[0] if all_ else high
     return replace(found, interval_95=(0.0 if none else float(low), float(high)))
 
 
@@ -521,9 +524,9 @@ def free_law(record: DecayRecord, values: Physical) -> FreeLaw | None:
     draws, smooth = mixed(laws), laws[0]
     if draws.worth < WORTH / 4:
         return None
-    plain = Proposal.of(seen, CONSTANT).drawn(FEW)
+    plain = DrawnLaw.of(seen, CONSTANT).drawn(FEW)
     if not 0 <= values.share <= 1:
-        rival = Proposal.of(replace(seen, share=NO_BEAM), CONSTANT).drawn(FEW)
+        rival = DrawnLaw.of(replace(seen, share=NO_BEAM), CONSTANT).drawn(FEW)
         if rival.log + np.log(UNPHYSICAL) > draws.log:
             return None
     usual, odd = log_prior(smooth.numbers.power)
@@ -538,13 +541,13 @@ def free_law(record: DecayRecord, values: Physical) -> FreeLaw | None:
     return FreeLaw(found, power, drift, constant, odd, pumped, nodes, record.span)
 
 
-def proposals(seen: SeenDecay) -> list[Proposal]:
+def proposals(seen: SeenDecay) -> list[DrawnLaw]:
     """The free law, and gas that is pumped away where no gauge tells the gas."""
     if not seen.drifts:
-        return [Proposal.of(seen, [*CONSTANT, POWER])]
+        return [DrawnLaw.of(seen, [*CONSTANT, POWER])]
     return [
-        Proposal.of(seen, [*CONSTANT, POWER, CHANGE]),
-        Proposal.of(seen, [*CONSTANT, CHANGE, PACE]),
+        DrawnLaw.of(seen, [*CONSTANT, POWER, CHANGE]),
+        DrawnLaw.of(seen, [*CONSTANT, CHANGE, PACE]),
     ]
 
 

@@ -28,8 +28,8 @@ from beamfit.lifetime.departures import (
 )
 from beamfit.lifetime.marginal import (
     WORTH,
+    DrawnLaw,
     Draws,
-    Proposal,
     SeenDecay,
     at_bounds,
     middle_of,
@@ -47,6 +47,7 @@ from beamfit.sampling.posterior import Expected, Posterior
 from beamfit.sampling.priors import Distribution, checked
 from beamfit.sampling.store import FROM_PYTHON, Checkpoint, Provenance
 from beamfit.sampling.target import PosteriorLaw, SamplingTarget
+from beamfit.statistics import WIDE
 from beamfit.writing import alone
 
 UNITS = {"i0": "mA", "a": "1/(mA s)", "b": "1/s", "exponent": "1", "drift": "1", "pace": "1"}
@@ -148,7 +149,7 @@ class _Prepared(NamedTuple):
 
     fit: Any
     seen: SeenDecay
-    laws: list[Proposal]
+    laws: list[DrawnLaw]
     moved: np.ndarray
 
     @classmethod
@@ -159,7 +160,7 @@ class _Prepared(NamedTuple):
         if fit.free_law is None and fit.correlation_time is None:
             white = [kind == MemoryKind(WHITE) for kind in seen.products.kinds]
             seen = seen.of_noises(np.array(white))
-        laws = [Proposal.of(seen, CONSTANT)] if fit.free_law is None else proposals(seen)
+        laws = [DrawnLaw.of(seen, CONSTANT)] if fit.free_law is None else proposals(seen)
         moved = [about.moved(change)[:3] for change in about.pieces.monitor_changes]
         return cls(fit, seen, laws, np.reshape(moved, (-1, 3)))
 
@@ -213,7 +214,8 @@ def _reaching(draws: Draws) -> dict[str, tuple[float, float]]:
     """Ends of the 95 % of a and b that reach to a bound, as the fit quotes them."""
     none, all_ = at_bounds(draws.numbers.share, draws.weight)
     ends = {"a": (none, all_), "b": (all_, none)}
-    return {name: (0.0 if low else 0.025 + 0.025 * high, 0.999 if high else 0.975 - 0.025 * low)
+    least, most = WIDE
+    return {name: (0.0 if low else least * (1 + high), 0.999 if high else most - least * low)
             for name, (low, high) in ends.items() if low or high}  # fmt: skip
 
 

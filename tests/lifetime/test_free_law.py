@@ -13,7 +13,7 @@ from beamfit.lifetime.departures import CONSTANT, NODE, Numbers
 from beamfit.lifetime.expansion import Pieces, solved
 from beamfit.lifetime.fit import fit_cycles, fit_decay, fit_decays
 from beamfit.lifetime.lifetime_table import fit_lifetimes
-from beamfit.lifetime.marginal import Proposal, SeenDecay, quantiles
+from beamfit.lifetime.marginal import DrawnLaw, SeenDecay, quantiles
 from beamfit.lifetime.record import Conditions, DecayRecord, LifetimeTable
 from beamfit.lifetime.study import study_record
 from tests.simulations import simulations
@@ -101,7 +101,7 @@ def test_the_draws_are_those_of_the_posterior():
     """With constant a and b against a grid of the exact law in white noise."""
     one = record(3, noise=3.0)
     values = solved(Pieces.of(one)).values
-    draws = Proposal.of(SeenDecay.of(one, values), CONSTANT).drawn()
+    draws = DrawnLaw.of(SeenDecay.of(one, values), CONSTANT).drawn()
     time, rates, shares = one.time, np.linspace(0.97, 1.03, 61), np.linspace(0.0, 1.0, 81)
     unit, mean, log = float(values.rate_mean), float(one.current.mean()), np.zeros((61, 81))
     for j, rate in enumerate(rates * unit):
