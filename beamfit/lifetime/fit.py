@@ -318,7 +318,7 @@ def fit_decay(
     expect(record, DecayRecord, "beamfit.read_decay_record(path)")
     record = record if monitor is None else replace(record, monitor=monitor)
     if _says_nothing(record):
-        return _constant(record)
+        return _constant(record, f"All {len(record)} readings are {record.current[0]:.6g} mA")
     return _judged(record, solved(Pieces.of(record), shape=shape), shape, Law(law))
 
 
@@ -361,13 +361,13 @@ def _says_nothing(record: DecayRecord) -> bool:
     return bool(np.ptp(record.current) == 0)
 
 
-def _constant(record: DecayRecord) -> DecayFit:
+def _constant(record: DecayRecord, found: str) -> DecayFit:
     """The result for readings that are all equal: no decay is seen, and no noise either."""
-    level = float(record.current[0])
+    level = float(record.current.mean())
     unknown = {name: Quantity(math.nan, None, unit) for name, unit in UNITS.items()}
     message = (
-        f"All {len(record)} readings are {level:.6g} mA, so neither decay nor noise is seen: "
-        "record longer, or read the monitor with more digits."
+        f"{found}, so neither decay nor noise is seen: record longer, or read the monitor with "
+        "more digits."
     )
     return DecayFit(
         record=record.name,
@@ -467,6 +467,9 @@ def fit_pieces(cycles: Sequence[DecayRecord], name: str, law: Law = Law.constant
     gathered = averaged(cycles)
     if np.any(np.diff(gathered.time) <= 0):
         raise InputError("a cycle before the end of the one before", "an order in time", path=name)
+    if not any(np.ptp(cycle.current) for cycle in cycles):
+        said = f"The readings of each of {len(cycles)} cycles are equal"
+        return replace(_constant(_readings(gathered, name), said), first=gathered.first)
     about, left_out = cleaned(gathered)
     evidence, pieces = Evidence(about, law), about.pieces
     finding = finding_of_cycles(evidence, pieces.monitor, left_out)
@@ -477,8 +480,12 @@ def fit_pieces(cycles: Sequence[DecayRecord], name: str, law: Law = Law.constant
         **evidence.quoted(),
         mean_current=pieces.units[1],
         rms_residual=float(np.sqrt(np.mean((about.left[:, -1] * pieces.over) ** 2))),
-        readings=DecayRecord(
-            pieces.time, pieces.current, pieces.error, name, float(pieces.time[0])
-        ),
+        readings=_readings(pieces, name),
         first=pieces.first,
     )
+
+
+def _readings(pieces: Pieces, name: str) -> DecayRecord:
+    """What was fitted of many pieces, as one record."""
+    start = float(pieces.time[0])
+    return DecayRecord(pieces.time, pieces.current, pieces.error, name, start)

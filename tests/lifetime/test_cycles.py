@@ -299,3 +299,12 @@ def test_long_fills_whose_losses_differ_follow_one_by_one():
         truth = 1 / (2.5e-8 * together.mean_current + b) / 3600
         assert abs(part.lifetime.value - truth) < 3 * part.lifetime.error
     assert [decay.fit.status for decay in study.decays] == ["converged"] * 6
+
+
+@pytest.mark.parametrize("step", [0.0, 1e-4])
+def test_cycles_of_equal_readings_show_no_decay(step):
+    time = np.arange(0.0, 180.0, 10.0)
+    fit = fit_cycles([DecayRecord(time, np.full(18, 500.0 + step * k)) for k in range(20)])
+    assert fit.status == "unidentified"
+    assert "The readings of each of 20 cycles are equal" in fit.message
+    assert fit.lifetime_mean.error is None
