@@ -125,8 +125,8 @@ def node_currents(level, quadratic, power, lost, xp=np):
     """Currents at the nodes over the mean, (14, m), as of `closed_form` with W = ∫ exp(-c B) ds,
     where B is what is lost to gas up to each node.
     """
-    c = 1 + power
-    whole = INTEGRAL @ xp.exp(xp.clip(-c * lost, -700, 700))
+    c, lost = 1 + power, xp.clip(lost, -200, 200)  # a factor that no beam has, and no overflow
+    whole = INTEGRAL @ xp.exp(-c * lost)
     # Where a loss that is no beam's would have ended the record the law has no value.
     inside = c * quadratic * level**c
     least = (1e-3 - 1) / xp.where(inside == 0, 1.0, inside)

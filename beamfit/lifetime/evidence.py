@@ -445,7 +445,9 @@ class Evidence:
 
     def quoted(self, known: bool = True) -> dict[str, Any]:
         """Fields of a `DecayFit`, by name."""
-        apart = known and self.separability.separable
+        # Of a law that the readings refute, and nobody stated, a and b have no errors.
+        doubted = self.refuted and self.free is None and self.law is Law.free
+        apart = known and self.separability.separable and not doubted
         same = ("chi2", "dof", "noise_inferred", "constant_a", "correlation_time", "lifetimes")
         exact = {"i0": self.quantity("i0", known and self.cycles == 1)}
         exact |= {name: self.quantity(name, apart) for name in "ab"}
