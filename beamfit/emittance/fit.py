@@ -6,18 +6,15 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
-from html import escape
 from typing import TYPE_CHECKING, Any
 
 from beamfit.answer import (
     Table,
     answer,
     determined,
-    html_of,
     json_of,
     labelled,
     quantity_frame,
-    text_of,
 )
 from beamfit.emittance.answer import judged_beam
 from beamfit.emittance.assumptions import Anchor, Assumptions
@@ -235,6 +232,11 @@ class EmittanceFit:
         return f"{self.scan.name} on {self.line.name}: {found}"
 
     @property
+    def message(self) -> str:
+        """Sentences on each plane, a line each."""
+        return "\n".join(f"{p.plane}: {p.message}" for p in self.planes)
+
+    @property
     def scenario(self) -> str:
         """The name of the scenario."""
         return self.statement.name
@@ -412,27 +414,15 @@ class EmittanceFit:
         }
         return entries if self.statement.closed else [entry | own for entry in entries]
 
-    @property
-    def _table(self) -> Table:
-        return labelled("", [p.plane for p in self.planes], determined(result_rows(self.planes)))
-
-    def __str__(self) -> str:
-        heading = f"{self.scan.name} on {self.line.name}, fit of {self.planes[0].method}"
-        lines = [heading.replace("_", " "), ""]
-        lines += [f"{p.headline}. {p.message}" for p in self.planes]
-        lines += ["", text_of(self._table)]
-        lines += ["", *self.notes] if self.notes else []
+    def tables(self) -> tuple[Table, ...]:
+        """Lay out all numbers, and what a scenario fitted besides and left open."""
+        names = [p.plane for p in self.planes]
+        found = [labelled("", names, determined(result_rows(self.planes)))]
         if not self.statement.closed:
-            rows = parameter_rows(self.parameters)
-            lines += ["", f"scenario {self.scenario}, anchor: {self.anchor}"]
-            lines += [text_of(Table("", [], rows))] if rows else []
-            lines += [f"Not determined: {words}." for words in self.null_directions]
-        return "\n".join(lines)
-
-    def _repr_html_(self) -> str:
-        said = (f"<p><b>{escape(p.headline)}.</b> {escape(p.message)}</p>" for p in self.planes)
-        more = (f"<p>{escape(note)}</p>" for note in self.notes)
-        return "".join((*said, html_of(self._table), *more))
+            title, rows = f"Scenario {self.scenario}, anchor: {self.anchor}", self.parameters
+            left = " ".join(f"Not determined: {words}." for words in self.null_directions)
+            found.append(Table(title, [], parameter_rows(rows), left))
+        return tuple(found)
 
 
 def fit_many(
