@@ -21,7 +21,7 @@ from beamfit.emittance.assumptions import Anchor, Assumptions
 from beamfit.emittance.comparison import BEAM
 from beamfit.emittance.model import line_of
 from beamfit.emittance.predicted import Prediction, correlations_of, predicted_sizes
-from beamfit.emittance.results import Parameter, PlaneFit, parameter_rows, result_rows
+from beamfit.emittance.results import Parameter, PlaneFit, parameter_table, result_rows
 from beamfit.emittance.scan import QuadScan
 from beamfit.emittance.statement import (
     METHODS,
@@ -415,13 +415,15 @@ class EmittanceFit:
         return entries if self.statement.closed else [entry | own for entry in entries]
 
     def tables(self) -> tuple[Table, ...]:
-        """Lay out all numbers, and what a scenario fitted besides and left open."""
+        """Lay out all numbers, what a scenario fitted besides, and what the data leave open."""
         names = [p.plane for p in self.planes]
         found = [labelled("", names, determined(result_rows(self.planes)))]
-        if not self.statement.closed:
-            title, rows = f"Scenario {self.scenario}, anchor: {self.anchor}", self.parameters
-            left = " ".join(f"Not determined: {words}." for words in self.null_directions)
-            found.append(Table(title, [], parameter_rows(rows), left))
+        if self.parameters:
+            tie = f", anchor: {self.anchor}" * self.statement.network
+            found.append(parameter_table(self.parameters, f"Scenario {self.scenario}{tie}."))
+        if self.null_directions:
+            listed = [[f"{words}."] for words in self.null_directions]
+            found.append(Table("Not determined by the data", [], listed))
         return tuple(found)
 
 
