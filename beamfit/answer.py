@@ -411,15 +411,29 @@ def _names(self: Any) -> Iterator[str]:
     return iter(quantities_of(self))
 
 
+def _spoken(self: Any) -> tuple[list[str], Sequence[Table]]:
+    """The verdict and what is odd, line by line, and every table."""
+    headline, message = self.headline, getattr(self, "message", "")
+    begin = f"{headline}.\n" if "\n" in message else f"{headline}. "
+    said = headline if message in ("", headline) else begin + message
+    remarks = [*getattr(self, "notes", ()), *dict(getattr(self, "doubts", {})).values()]
+    return [*said.split("\n"), *remarks], self.tables() if hasattr(self, "tables") else ()
+
+
 def _text(self: Any) -> str:
     """Write the verdict, what is odd, and every table."""
-    headline, message = getattr(self, "headline", None), getattr(self, "message", "")
-    if headline is None:
+    if not hasattr(self, "headline"):
         return repr(self)
-    said = headline if message in ("", headline) else f"{headline}. {message}"
-    tables = self.tables() if hasattr(self, "tables") else ()
-    remarks = [*getattr(self, "notes", ()), *dict(getattr(self, "doubts", {})).values()]
-    return "\n\n".join(["\n".join([said, *remarks]), *map(text_of, tables)])
+    lines, tables = _spoken(self)
+    return "\n\n".join(["\n".join(lines), *map(text_of, tables)])
+
+
+def _page(self: Any) -> str:
+    """Lay out the same for a notebook."""
+    if not hasattr(self, "headline"):
+        return _html(self)
+    lines, tables = _spoken(self)
+    return "".join(f"<p>{escape(line)}</p>" for line in lines) + "".join(map(html_of, tables))
 
 
 def _plot(self: Any, **options: Any) -> Figure:
@@ -431,6 +445,7 @@ FORMS = {
     "__getitem__": _item,
     "__iter__": _names,
     "__str__": _text,
+    "_repr_html_": _page,
     "plot": _plot,
     "to_dict": _dict,
     "to_frame": _frame,

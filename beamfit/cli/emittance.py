@@ -216,7 +216,7 @@ def show(
 
 def _show_fully(terminal: Terminal, fit: EmittanceFit, methods: tuple[SizeMethods, ...]) -> None:
     """Show every number, the systematics budget and the range of the scan."""
-    from beamfit.emittance.results import parameter_rows, result_rows
+    from beamfit.emittance.results import result_rows
     from beamfit.emittance.sensitivity import budget_rows, range_rows
 
     names, statuses = [p.plane for p in fit.planes], [p.status for p in fit.planes]
@@ -231,8 +231,7 @@ def _show_fully(terminal: Terminal, fit: EmittanceFit, methods: tuple[SizeMethod
                 terminal.table(Table("", [head, *names], cells), wrap=False)
                 terminal.line()
     elif fit.parameters:
-        head = ["", "value", "bounds", "prior", "state"]
-        terminal.table(Table("Other fitted parameters", head, parameter_rows(fit.parameters)))
+        terminal.table(fit.tables()[1])
     for words in fit.null_directions:
         terminal.line(f"Not determined: {words}.")
     if fit.statement.network:

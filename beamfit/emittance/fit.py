@@ -6,25 +6,22 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
-from html import escape
 from typing import TYPE_CHECKING, Any
 
 from beamfit.answer import (
     Table,
     answer,
     determined,
-    html_of,
     json_of,
     labelled,
     quantity_frame,
-    text_of,
 )
 from beamfit.emittance.answer import judged_beam
 from beamfit.emittance.assumptions import Anchor, Assumptions
 from beamfit.emittance.comparison import BEAM
 from beamfit.emittance.model import line_of
 from beamfit.emittance.predicted import Prediction, correlations_of, predicted_sizes
-from beamfit.emittance.results import Parameter, PlaneFit, parameter_rows, result_rows
+from beamfit.emittance.results import Parameter, PlaneFit, parameter_table, result_rows
 from beamfit.emittance.scan import QuadScan
 from beamfit.emittance.statement import (
     METHODS,
@@ -235,6 +232,11 @@ class EmittanceFit:
         return f"{self.scan.name} on {self.line.name}: {found}"
 
     @property
+    def message(self) -> str:
+        """Sentences on each plane, a line each."""
+        return "\n".join(f"{p.plane}: {p.message}" for p in self.planes)
+
+    @property
     def scenario(self) -> str:
         """The name of the scenario."""
         return self.statement.name
@@ -412,27 +414,17 @@ class EmittanceFit:
         }
         return entries if self.statement.closed else [entry | own for entry in entries]
 
-    @property
-    def _table(self) -> Table:
-        return labelled("", [p.plane for p in self.planes], determined(result_rows(self.planes)))
-
-    def __str__(self) -> str:
-        heading = f"{self.scan.name} on {self.line.name}, fit of {self.planes[0].method}"
-        lines = [heading.replace("_", " "), ""]
-        lines += [f"{p.headline}. {p.message}" for p in self.planes]
-        lines += ["", text_of(self._table)]
-        lines += ["", *self.notes] if self.notes else []
-        if not self.statement.closed:
-            rows = parameter_rows(self.parameters)
-            lines += ["", f"scenario {self.scenario}, anchor: {self.anchor}"]
-            lines += [text_of(Table("", [], rows))] if rows else []
-            lines += [f"Not determined: {words}." for words in self.null_directions]
-        return "\n".join(lines)
-
-    def _repr_html_(self) -> str:
-        said = (f"<p><b>{escape(p.headline)}.</b> {escape(p.message)}</p>" for p in self.planes)
-        more = (f"<p>{escape(note)}</p>" for note in self.notes)
-        return "".join((*said, html_of(self._table), *more))
+    def tables(self) -> tuple[Table, ...]:
+        """Lay out all numbers, what a scenario fitted besides, and what the data leave open."""
+        names = [p.plane for p in self.planes]
+        found = [labelled("", names, determined(result_rows(self.planes)))]
+        if self.parameters:
+            tie = f", anchor: {self.anchor}" * self.statement.network
+            found.append(parameter_table(self.parameters, f"Scenario {self.scenario}{tie}."))
+        if self.null_directions:
+            listed = [[f"{words}."] for words in self.null_directions]
+            found.append(Table("Not determined by the data", [], listed))
+        return tuple(found)
 
 
 def fit_many(

@@ -375,8 +375,8 @@ def degrees(value: float | None) -> str:
     return "-" if value is None else f"{value:.0f}° of 180°"
 
 
-def parameter_rows(parameters: tuple[Parameter, ...]) -> list[list[str]]:
-    """Name, value, bounds, prior and state of every number fitted besides the beam."""
+def parameter_table(parameters: tuple[Parameter, ...], note: str = "") -> Table:
+    """Value, bounds, prior and state of every number fitted besides the beam."""
     rows = []
     for p in parameters:
         bounded = abs(p.lower) < 1e300 or abs(p.upper) < 1e300
@@ -385,4 +385,5 @@ def parameter_rows(parameters: tuple[Parameter, ...]) -> list[list[str]]:
         prior = f"{p.prior[0]:.6g} ± {p.prior[1]:.3g}" if p.prior else "-"
         limits = f"{p.lower:.6g} to {p.upper:.6g}" if bounded else "-"
         rows.append([p.name, value, limits, prior, said])
-    return rows
+    header = ["", "value", "bounds", "prior", "state"]
+    return Table("Other fitted parameters", header, rows, note)

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
-from beamfit.answer import Table, answer, cell, text_of
+from beamfit.answer import Table, answer, cell
 from beamfit.emittance.fit import EmittanceFit, fit_emittance
 from beamfit.emittance.results import PlaneFit
 from beamfit.emittance.scan import PROJECTED, QuadScan
@@ -80,6 +80,14 @@ class SliceFits:
         """The scan in a line."""
         return f"{self.scan.name}: {', '.join(self.slices)}, planes {', '.join(self.planes)}"
 
+    @property
+    def message(self) -> str:
+        """Sentences on the slices, each said once, a line each."""
+        alike = self.alike().items()
+        return "\n".join(
+            f"{', '.join(names)}, {plane}: {said}" for (plane, _, said), names in alike
+        )
+
     def tables(self) -> tuple[Table, ...]:
         """One table a plane, one row a slice."""
         found = []
@@ -91,15 +99,6 @@ class SliceFits:
     def to_json(self) -> list[dict[str, Any]]:
         """Give the ``results`` list of the JSON contract, each entry with its ``slice``."""
         return [entry for fit in self.fits for entry in fit.to_json()]
-
-    def __str__(self) -> str:
-        said = [
-            f"{fit.scan.slices[0]}, {p.plane}: {p.message}" for fit in self.fits for p in fit.planes
-        ]
-        tables = [
-            f"{table.title}\n\n{text_of(table._replace(title=''))}" for table in self.tables()
-        ]
-        return "\n\n".join([*tables, "\n".join((*said, *self.notes))])
 
 
 def _row(fit: EmittanceFit, p: PlaneFit) -> list[str]:

@@ -25,6 +25,7 @@ from beamfit.optics.beamline import Beamline, Same, seen_line, transfer_rows
 from beamfit.optics.calibration import SETTING_UNITS, CurrentTable, plain_meaning
 from beamfit.optics.elements import Element, Marker, Quadrupole, Screen, ThinLens
 from beamfit.particles import ELECTRON_MASS, beta_gamma, rigidity
+from beamfit.quantity import display_unit
 
 # Gradients in T/m beyond which a magnet is a plasma lens at least, and beyond any lens.
 STRONG, IMPOSSIBLE = 500.0, 1e4
@@ -421,9 +422,10 @@ def of_sizes(scan: QuadScan) -> Iterator[str]:
         usual = middle(size)
         if not USUAL[0] <= usual <= USUAL[1]:
             unusual = "large" if usual > USUAL[1] else "small"
+            factor, unit = display_unit(usual, "m")
             yield (
-                f"Sizes in {plane} around {1e3 * usual:.3g} mm are taken as they stand, but are "
-                f"unusually {unusual}: is that the unit they are in?"
+                f"Sizes in {plane} around {usual / factor:.3g} {unit} are taken as they stand, but "
+                f"are unusually {unusual}: is that the unit they are in?"
             )
 
 

@@ -14,7 +14,7 @@ from matplotlib.figure import FigureBase
 
 from beamfit.answer import Table, cell, labelled
 from beamfit.emittance.fit import EmittanceFit
-from beamfit.emittance.results import PlaneFit, degrees, parameter_rows, result_rows
+from beamfit.emittance.results import PlaneFit, degrees, result_rows
 from beamfit.emittance.scan import PROJECTED, QuadScan
 from beamfit.emittance.sensitivity import budget_rows, range_rows
 from beamfit.emittance.size_methods import SizeMethods
@@ -66,7 +66,7 @@ def emittance_page(fit: EmittanceFit, methods: tuple[SizeMethods, ...] = ()) -> 
         labelled("Result", names, result_rows(fit.planes)).quoted(),
         labelled("All numbers", names, result_rows(fit.planes), ERRORS),
         labelled("What the data determine", names, identifiability_rows(fit.planes)),
-        *(_budgets(fit, names) if fit.statement.closed else _fitted_too(fit)),
+        *(_budgets(fit, names) if fit.statement.closed else fit.tables()[1:]),
         *(Table(f"Points, {p.plane} plane", *point_rows(p), numeric=True) for p in fit.planes),
     ]
     tables += [way.table()._replace(note=METHODS) for way in methods]
@@ -109,19 +109,6 @@ def _budgets(fit: EmittanceFit, names: list[str]) -> list[Table]:
         labelled(title, names, budget_rows(fit), changed, numeric=True),
         labelled(other, names, range_rows(fit), shifted),
     ]
-
-
-def _fitted_too(fit: EmittanceFit) -> list[Table]:
-    """Tables of parameters fitted besides the beam, and of undetermined combinations."""
-    header, parts = ["parameter", "value", "bounds", "prior", "state"], []
-    if rows := parameter_rows(fit.parameters):
-        # What ties a network to the lattice; a calibration has priors instead.
-        anchor = f"Anchor: {fit.anchor}." if fit.statement.network else ""
-        parts.append(Table(f"Scenario {fit.scenario}", header, rows, anchor))
-    if fit.null_directions:
-        listed = [[words + "."] for words in fit.null_directions]
-        parts.append(Table("Not determined by the data", [], listed))
-    return parts
 
 
 def _pictures(fit: EmittanceFit) -> list[Picture]:

@@ -198,7 +198,7 @@ def test_what_does_not_fit_is_refused(knobs, goal, said):
 
 
 def test_rows_at_one_quadrupole_setting_are_refused():
-    with pytest.raises(InputError, match="distinct settings"):
+    with pytest.raises(InputError, match="1 distinct setting "):
         fit_tuning(scan_with(settings=scan_with().settings | {"Q": np.ones(8)}), LINE, {
             "K0": (-1, 1), "K1": (-1, 1)})  # fmt: skip
 
