@@ -32,9 +32,7 @@ sys.stderr.write(",".join(sorted(heavy)))
 
 def test_help_shows_an_example_and_loads_nothing_heavy():
     commands = sorted(cli.commands)
-    done = subprocess.run(
-        [sys.executable, "-c", LIGHT, *commands], capture_output=True, text=True
-    )
+    done = subprocess.run([sys.executable, "-c", LIGHT, *commands], capture_output=True, text=True)
     assert (done.returncode, done.stderr) == (0, "")
     for command, said in zip(commands, done.stdout.split("\f")[1:], strict=True):
         assert f"beamfit {command} " in said.split("Examples:")[1]
