@@ -20,7 +20,7 @@ LINE = ROOT / "lattices" / "lcls_otr2.toml"
 needs_data = pytest.mark.skipif(not DATA.exists(), reason="needs ../shared/data")
 
 
-@simulations(1, 40)
+@simulations(2, 40)
 @pytest.mark.parametrize("kind", BEAMS)
 def test_intervals_of_answers_hold_the_truth(kind, count):
     held = []
