@@ -24,7 +24,8 @@ COMMAND = re.compile(r"^(?:    |\$ )\$? ?(beamfit (?:.*\\\n)*.*)$", re.MULTILINE
 ELSEWHERE = {"README", "tutorial", "language", "live", "watch"}
 PYTHON_ELSEWHERE = {"README", "tutorial", "python", "extending", "control", "fedbatch"}
 PYTHON_ELSEWHERE |= {"live_adapters", "batch"}  # the batch's wants a cluster's queue
-PYTHON_SLOW = {"lifetime_study", "response"}
+# What the last two show, their notebooks run.
+PYTHON_SLOW = {"lifetime_study", "response", "density", "tuning"}
 # Networks, studies of a shift, posteriors, workers and tuning, whose very command
 # cli/test_tune_command runs, take 10 s and more: `make calibrate`.
 SLOW = {"network", "--study", "--sample", "--workers", "state-space", "--hold-back", "--trend"}
@@ -151,7 +152,7 @@ def test_an_option_that_is_none_is_found():
 
 
 def python_pages():
-    """Pages with Python that no other test runs; a network's take 10 s and more."""
+    """Pages with Python that no other test runs; networks and knobs take 10 s and more."""
     for page in PAGES:
         if page.stem not in PYTHON_ELSEWHERE and "```python\n" in page.read_text():
             marks = [pytest.mark.calibrate] if page.stem in PYTHON_SLOW else []

@@ -230,7 +230,9 @@ def test_t_at_one_current_leaves_the_emittance_open():
 @pytest.mark.parametrize("determinant", [False, True])
 def test_and_the_fit_says_so(scan, gtf, determinant):
     anchor = Anchor(at=({"Q2": 0.0},), determinant=determinant)
-    fit = beamfit.fit_emittance(scan, gtf, scenario="transport-network", anchor=anchor, starts=1)
+    fit = beamfit.fit_emittance(
+        scan, gtf, scenario="transport-network", anchor=anchor, hidden=2, starts=1
+    )
     assert fit.x.emittance.error is None
     assert fit.x.status.value == "unidentified"
     assert fit.null_directions
