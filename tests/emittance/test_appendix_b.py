@@ -142,6 +142,9 @@ def test_the_fit_keeps_to_box_and_gains_and_determines_nothing(scan, line):
     assert found.box == {"Q2": (0.0, 3.9)}
     for gain, top in zip(found.gains, LIMITS.values(), strict=True):
         assert gain.upper < top + 1e-6
+    net, between = fit.fit.model["map"], jnp.linspace(0.0, 3.9, 20001)[:, None]
+    slopes = jax.jit(jax.vmap(jax.jacfwd(net.values)))(between)[..., 0]
+    assert np.all(np.max(slopes, axis=0) <= np.array([*LIMITS.values()]) + 1e-8)
     assert fit.fit.chi2 < 14.0
 
 
