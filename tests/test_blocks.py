@@ -24,7 +24,7 @@ COMMAND = re.compile(r"^(?:    |\$ )\$? ?(beamfit (?:.*\\\n)*.*)$", re.MULTILINE
 ELSEWHERE = {"README", "tutorial", "language", "live", "watch"}
 PYTHON_ELSEWHERE = {"README", "tutorial", "python", "extending", "control", "fedbatch"}
 PYTHON_ELSEWHERE |= {"live_adapters", "batch"}  # the batch's wants a cluster's queue
-# What the last two show, their notebooks run.
+# What the last two show, their commands run.
 PYTHON_SLOW = {"lifetime_study", "response", "density", "tuning"}
 # Networks, studies of a shift, posteriors, workers and tuning, whose very command
 # cli/test_tune_command runs, take 10 s and more: `make calibrate`.

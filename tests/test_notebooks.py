@@ -37,7 +37,8 @@ def test_one_runs_as_a_notebook(executed):
     assert "0.786 µm (+2.0 errors)" in text
 
 
-# Words of each; those that take 10 s and more are executed by `make docs` and `make calibrate`.
+# Words of each. Those that take 10 s and more are executed by `make docs` and `make calibrate`;
+# the same fits of the same files are run by commands and examples of functions.
 SAID = {
     "lifetime_study": [
         "If a and b are constant, a is (7.01 ± 0.11)e-08",
@@ -58,7 +59,7 @@ SAID = {
     "posterior": ["converged", "fit:     0.702 ± 0.023 µm"],
     "identification": ["poor_fit Past inputs", "converged The free run"],
 }
-SLOW = {"lifetime_study", "identification"}
+SLOW = {"lifetime_study", "identification", "density", "tuning"}
 
 
 def cells_of(root, name):
