@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -14,6 +15,8 @@ from beamfit.errors import InputError
 from beamfit.noise.memory import CorrelatedNoise, innovations
 from beamfit.verdict import Status
 from tests.simulations import simulations, widened
+
+simulate = jax.jit(simulate, static_argnums=0)  # a program a shape, not one an operation
 
 
 def steps(n, rng, low=0.1, high=2.9, every=8):

@@ -9,6 +9,8 @@ from scipy.signal import lfilter
 
 from beamfit.dynamics.response import ARX, FIRST_ORDER, PHYSICS, SECOND_ORDER, simulate
 
+simulate = jax.jit(simulate, static_argnums=0)  # a program a shape, not one an operation
+
 
 def held(matrix, drive, x, u, dt):
     """The state of x' = A x + B u after dt, by the exponential of both together (Van Loan)."""
