@@ -16,7 +16,7 @@ def results(root):
     beam = beamfit.Beam(np.array([q.value for q in fit.x.sigma]))
     wish = [beamfit.Target("size", "x", 2e-4)]
     study = beamfit.study(root / "measurements/aps_1999_decay.csv")
-    (response,) = beamfit.identify(root / "measurements/valve_level_simulated.csv")
+    (response,) = beamfit.identify(root / "measurements/valve_level_simulated.csv", delay=2)
     return {
         "emittance": fit,
         "plane": fit.x,

@@ -24,10 +24,12 @@ COMMAND = re.compile(r"^(?:    |\$ )\$? ?(beamfit (?:.*\\\n)*.*)$", re.MULTILINE
 ELSEWHERE = {"README", "tutorial", "language", "live", "watch"}
 PYTHON_ELSEWHERE = {"README", "tutorial", "python", "extending", "control", "fedbatch"}
 PYTHON_ELSEWHERE |= {"live_adapters", "batch"}  # the batch's wants a cluster's queue
-PYTHON_SLOW = {"lifetime_study", "response"}
-# Networks, studies of a shift, posteriors and workers take 10 s and more: `make calibrate`.
+# What the last two show, their commands run.
+PYTHON_SLOW = {"lifetime_study", "response", "density", "tuning"}
+# Networks, studies of a shift, posteriors, workers and tuning, whose very command
+# cli/test_tune_command runs, take 10 s and more: `make calibrate`.
 SLOW = {"network", "--study", "--sample", "--workers", "state-space", "--hold-back", "--trend"}
-SLOW |= {"transport-network"}
+SLOW |= {"transport-network", "tune"}
 DECAY, VALVE = "beamfit/example/decay.csv", "measurements/valve_level_simulated.csv"
 # Files of a reader's own that pages name, and what stands in for them.
 OWN = {
@@ -51,16 +53,22 @@ def commands():
                 yield page, words[1:]
 
 
-def rows_of(chosen):
-    """Rows of a test, a command each; those that take long are marked."""
-    for page, words in commands():
-        if chosen(page.stem):
-            marks = [pytest.mark.calibrate] if SLOW & set(words) else []
-            name = f"{page.stem}: {' '.join(words)[:60]}"
-            yield pytest.param(page, words, id=name, marks=marks)
+def slow(words):
+    return bool(SLOW & set(words))
 
 
-@pytest.mark.parametrize(("page", "words"), list(rows_of(lambda stem: stem not in ELSEWHERE)))
+def row(page, words, marks=()):
+    return pytest.param(page, words, id=f"{page.stem}: {' '.join(words)[:60]}", marks=marks)
+
+
+@pytest.mark.parametrize(
+    ("page", "words"),
+    [
+        row(page, words, [pytest.mark.calibrate] * slow(words))
+        for page, words in commands()
+        if page.stem not in ELSEWHERE
+    ],
+)
 def test_every_command_of_every_page_runs(page, words, tmp_path, monkeypatch, capsys):
     lay_out(page, words, tmp_path)
     monkeypatch.chdir(tmp_path)
@@ -123,8 +131,10 @@ def expanded(words, folder):
         yield from (str(path.relative_to(folder)) for path in found) if found else [word]
 
 
-@pytest.mark.parametrize(("page", "words"), list(rows_of(ELSEWHERE.__contains__)))
-def test_commands_that_run_elsewhere_have_the_options_that_they_name(page, words):
+@pytest.mark.parametrize(
+    ("page", "words"), [row(p, w) for p, w in commands() if p.stem in ELSEWHERE or slow(w)]
+)
+def test_commands_that_run_elsewhere_or_seldom_have_the_options_that_they_name(page, words):
     parsed(words)
 
 
@@ -142,7 +152,7 @@ def test_an_option_that_is_none_is_found():
 
 
 def python_pages():
-    """Pages with Python that no other test runs; a network's take 10 s and more."""
+    """Pages with Python that no other test runs; networks and knobs take 10 s and more."""
     for page in PAGES:
         if page.stem not in PYTHON_ELSEWHERE and "```python\n" in page.read_text():
             marks = [pytest.mark.calibrate] if page.stem in PYTHON_SLOW else []

@@ -42,31 +42,26 @@ def run(before="", warned="", **environment):
     return json.loads(done.stdout)
 
 
-def test_the_second_script_compiles_nothing(tmp_path):
-    folder, hits, misses, dtype, _ = run(XDG_CACHE_HOME=str(tmp_path))
+# Said where a private part of JAX was replaced.
+WHOLE = """
+from jax._src import compilation_cache as own; had = dict(vars(own)); import atexit
+same = lambda: all(vars(own)[k] is v for k, v in had.items() if callable(v))
+atexit.register(lambda: same() or sys.stderr.write('replaced'))
+"""
+
+
+def test_the_second_script_compiles_nothing_and_damaged_code_is_compiled_anew(tmp_path):
+    folder, hits, misses, dtype, _ = run(WHOLE, XDG_CACHE_HOME=str(tmp_path))
     assert folder == str(tmp_path / "beamfit" / "jax")
     assert (hits, dtype) == (0, "float64")
     assert misses > 0
     assert run(XDG_CACHE_HOME=str(tmp_path))[1:3] == [misses, 0]
-
-
-def test_damaged_code_is_compiled_anew_with_a_warning(tmp_path):
-    misses = run(XDG_CACHE_HOME=str(tmp_path))[2]
     for path in (tmp_path / "beamfit" / "jax").iterdir():
         content = path.read_bytes()
         # Half of a file: a single bit may stand where nothing is read, and the times in it vary.
         path.write_bytes(content[: len(content) // 2])
     said = "Error reading persistent compilation cache entry"
     assert run(warned=said, XDG_CACHE_HOME=str(tmp_path))[1:3] == [0, misses]
-
-
-def test_no_private_part_of_jax_is_replaced(tmp_path):
-    before = (
-        "from jax._src import compilation_cache as own; had = dict(vars(own)); import atexit\n"
-        "same = lambda: all(vars(own)[k] is v for k, v in had.items() if callable(v))\n"
-        "atexit.register(lambda: same() or sys.stderr.write('replaced'))"
-    )
-    run(before, XDG_CACHE_HOME=str(tmp_path))
 
 
 def test_a_folder_that_others_can_write_to_is_not_used(tmp_path, monkeypatch):
@@ -83,9 +78,11 @@ def test_a_folder_that_others_can_write_to_is_not_used(tmp_path, monkeypatch):
         assert compile_cache.own_folder() is None
 
 
-@pytest.mark.parametrize("home", ["/dev/null", "/proc/none"])
-def test_a_home_where_nobody_can_write_is_no_obstacle(home):
-    folder, hits, *_ = run(XDG_CACHE_HOME=home)
+def test_a_home_where_nobody_can_write_is_no_obstacle(monkeypatch):
+    for home in ("/dev/null", "/proc/none"):
+        monkeypatch.setenv("XDG_CACHE_HOME", home)
+        assert compile_cache.own_folder() is None
+    folder, hits, *_ = run(XDG_CACHE_HOME="/proc/none")
     assert (folder, hits) == (None, 0)
 
 
@@ -97,10 +94,10 @@ def test_what_the_user_has_set_stands(tmp_path):
     }
     folder, *_, least = run(XDG_CACHE_HOME=str(tmp_path), **environment)
     assert (folder, least) == (mine, 7.0)
-    before = f"jax.config.update('jax_compilation_cache_dir', {mine!r})"
-    assert run(before, XDG_CACHE_HOME=str(tmp_path))[0] == mine
-    off = "jax.config.update('jax_enable_compilation_cache', False)"
-    assert run(off, XDG_CACHE_HOME=str(tmp_path))[1:3] == [0, 0]
+    before = f"jax.config.update('jax_compilation_cache_dir', {mine!r})\n"
+    before += "jax.config.update('jax_enable_compilation_cache', False)"
+    folder, *counts, _, _ = run(before, XDG_CACHE_HOME=str(tmp_path))
+    assert (folder, counts) == (mine, [0, 0])
     assert not list(tmp_path.glob("beamfit/jax/*"))
 
 

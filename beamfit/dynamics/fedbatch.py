@@ -136,6 +136,10 @@ class HeldBatch(NamedTuple):
         return [f"{self.name} held back", f"{self.rest:.2f} times its error: {each}"]
 
 
+_fitted = jax.jit(predicted)
+
+
+@jax.jit  # op by op, hundreds of small programs are compiled
 def ahead(model: Any, asked: tuple[Batches, Mapping[str, Any]]) -> jax.Array:
     """Predict a batch from numbers at its start, shape (1, rows, outputs)."""
     b, begun = asked
@@ -314,7 +318,7 @@ class FedBatchFit:
     @cached_property
     def courses(self) -> tuple[np.ndarray, ...]:
         """Biomass, substrate, volume and titre at the rows of each batch, shape (rows, outputs)."""
-        found = np.asarray(predicted(self.fit.model, self.seen.batches))
+        found = np.asarray(_fitted(self.fit.model, self.seen.batches))
         return tuple(x[: len(t)] for x, t in zip(found, self.seen.time, strict=True))
 
     @property
@@ -430,7 +434,7 @@ def identify_batches(
     if titred:
         first |= _product(first, seen, product, hidden, seed)
     fit, noise, spread, rests = settled(seen, first)
-    curves, y = curves_of(fit, seen), np.asarray(predicted(fit.model, seen.batches))
+    curves, y = curves_of(fit, seen), np.asarray(_fitted(fit.model, seen.batches))
     told = {run.name: held_back(run, like, fit, noise, spread) for run in held}
     found = judge(BatchEvidence(fit, rests, seen, y, noise, curves, told), RULES)
     spread = dict(zip((*RATES, TITRE), map(float, spread), strict=False))
@@ -561,7 +565,7 @@ def settled(
     def search(model, error, spread):
         free = (*NETWORKS, *BEGINS, "own", "decay")
         fit = solve(problem_of(seen, model, error, free, spread), iterations=STEPS)
-        y, own = np.asarray(predicted(fit.model, seen.batches)), fit.derive(_own)
+        y, own = np.asarray(_fitted(fit.model, seen.batches)), fit.derive(_own)
         rest, known = seen.measured - y, np.where(np.isfinite(own.error), own.error, spread)
         noise = [noise_of(rest[..., k], y[..., k], seen.read[..., k]) for k in range(len(names))]
         error = errors_of(noise, y)

@@ -180,9 +180,9 @@ def write(path, content):
     path.write_bytes(content if isinstance(content, bytes) else content.encode())
 
 
-def answer(capfd, monkeypatch, *arguments):
+def answer(capfd, monkeypatch, *arguments, command="emittance"):
     """Run the command in this process."""
-    monkeypatch.setattr(sys, "argv", ["beamfit", "emittance", *map(str, arguments)])
+    monkeypatch.setattr(sys, "argv", ["beamfit", command, *map(str, arguments)])
     with pytest.raises(SystemExit) as stopped:
         main()
     said = capfd.readouterr()
@@ -347,18 +347,18 @@ def test_ten_million_rows_are_refused_in_bounded_memory(place):
 
 
 @pytest.mark.parametrize("command", ["emittance", "lifetime", "check"])
-def test_a_pipe_is_read_once_and_its_digest_is_that_of_what_it_gave(command, root):
+def test_a_pipe_is_read_once_and_its_digest_is_that_of_what_it_gave(
+    command, root, capfd, monkeypatch
+):
     """As `beamfit lifetime <(zcat decay.csv.gz)` has it."""
     name = "lcls_otr2.csv" if command == "emittance" else "aps_1999_decay.csv"
     content = (root / "measurements" / name).read_bytes()
     more = ["--lattice", root / "lattices" / "lcls_otr2.toml"] if command == "emittance" else []
     read, write = os.pipe()
     threading.Thread(target=lambda: (os.write(write, content), os.close(write))).start()
-    found = subprocess.run(
-        [sys.executable, "-m", "beamfit", command, f"/dev/fd/{read}", *map(str, more), "--json"],
-        pass_fds=[read], capture_output=True, text=True, cwd=root, check=False,
-    )  # fmt: skip
+    arguments = (f"/dev/fd/{read}", *more, "--json")
+    status, out, err = answer(capfd, monkeypatch, *arguments, command=command)
     os.close(read)
-    assert found.returncode == 0, found.stderr
-    digests = json.loads(found.stdout)["inputs"]
+    assert status == 0, err
+    digests = json.loads(out)["inputs"]
     assert digests[f"/dev/fd/{read}"] == hashlib.sha256(content).hexdigest()

@@ -209,9 +209,13 @@ def test_bad_files_are_answered_without_jax(root, tmp_path):
         assert done.stderr.count("\n") == 1
 
 
-def test_a_study_of_a_shift(run):
+def test_a_study_of_a_shift_and_a_network_of_the_losses(run, monkeypatch):
+    """Where first principles describe the shift, a correction of them changes little and obeys."""
+    one = functools.partial(ring_study.fit_loss_network, starts=1)
+    monkeypatch.setattr(ring_study, "fit_loss_network", one)
     path = "measurements/spear3_shift_simulated.csv"
-    status, out, err = run("lifetime", path, "--ring", RING, "--study", "--json")
+    options = ("--ring", RING, "--study", "--network", "correction")
+    status, out, err = run("lifetime", path, *options, "--json")
     assert (status, err) == (0, "")
     document = json.loads(out)
     assert len(document["results"]) == 30
@@ -224,17 +228,6 @@ def test_a_study_of_a_shift(run):
     assert study["anomaly"]["moved"] == []
     assert study["best"]["lifetime"]["value"] >= study["best"]["usual"]["value"]
     assert study["next"][0]["information"] >= study["next"][-1]["information"] > 0
-
-
-def test_a_network_of_the_losses(run, monkeypatch):
-    """Where first principles describe the shift, a correction of them changes little and obeys."""
-    one = functools.partial(ring_study.fit_loss_network, starts=1)
-    monkeypatch.setattr(ring_study, "fit_loss_network", one)
-    path = "measurements/spear3_shift_simulated.csv"
-    options = ("--ring", RING, "--study", "--network", "correction")
-    status, out, err = run("lifetime", path, *options, "--json")
-    assert (status, err) == (0, "")
-    study = json.loads(out)["study"]
     network = study["network"]
     assert network["certificate"]["holds"] is True
     assert network["certificate"]["single_maximum"] == "seen"

@@ -17,11 +17,16 @@ SAME = {
         ("solve", "formulations/appendix_d.bf", "--start", 2),
         lambda: [beamfit.solve("formulations/appendix_d.bf", starts=2)],
     ),
-    "identify": (("identify", RUN, "--seed", 3), lambda: beamfit.identify(RUN, seed=3)),
+    "identify": (
+        ("identify", RUN, "--delay", 2, "--seed", 3),
+        lambda: beamfit.identify(RUN, delay=2, seed=3),
+    ),
     "control": (
-        ("control", RUN, "--set", "level=5@10", "--limit", "level=:9"),
+        ("control", RUN, "--delay", 2, "--set", "level=5@10", "--limit", "level=:9"),
         lambda: [
-            beamfit.control(RUN, [("level", 5.0, 10.0)], limits={"level": (float("-inf"), 9.0)})
+            beamfit.control(
+                RUN, [("level", 5.0, 10.0)], limits={"level": (float("-inf"), 9.0)}, delay=2
+            )
         ],
     ),
     "lifetime": (

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 
 import emcee
 import pytest
@@ -92,16 +90,3 @@ def test_one_store_holds_one_decay(run, tmp_path):
     status, _, err = run("lifetime", record, "--sample", "--store", tmp_path / "two.h5")
     assert status == 2
     assert "--store for 2 decays" in err
-
-
-def test_without_sampling_nothing_of_it_is_loaded():
-    code = (
-        "import sys\n"
-        f"sys.argv = ['beamfit', *{SCAN!r}]\n"
-        "from beamfit.cli import main\n"
-        "try:\n    main()\nexcept SystemExit:\n    pass\n"
-        "heavy = {'emcee', 'scipy.stats', 'matplotlib', 'beamfit.sampling.ensemble'}\n"
-        "print(heavy & set(sys.modules), file=sys.stderr)\n"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert done.stderr.strip() == "set()"

@@ -88,11 +88,12 @@ def test_rates_are_bounded_and_nothing_without_substrate(runs):
     model = {"rates": jax.tree_util.tree_map(lambda v: 30.0 * v, net), "half": 0.1}
     draw = np.random.default_rng(0).uniform(0, 2, (200, 3 + len(b.inputs)))
     x, u = draw[:, :3], draw[:, 3:]
-    rates = jax.vmap(lambda x, u: rates_at(b, model, x, u))(jnp.asarray(x), jnp.asarray(u))
+    rates_of = jax.jit(jax.vmap(lambda x, u: rates_at(b, model, x, u)))
+    rates = rates_of(x, u)
     assert jnp.all(rates >= b.ends[0])
     assert jnp.all(rates <= b.ends[1])
     assert jnp.any(rates > 0.9 * b.ends[1])
-    starved = rates_at(b, model, jnp.array([9.0, 0.0, 4.0]), u[0])
+    starved = rates_of(np.tile([9.0, 0.0, 4.0], (200, 1)), u)[0]
     assert starved[0] <= 0.0
     assert starved[1] == 0.0
 

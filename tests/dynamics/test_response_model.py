@@ -9,6 +9,8 @@ from scipy.signal import lfilter
 
 from beamfit.dynamics.response import ARX, FIRST_ORDER, PHYSICS, SECOND_ORDER, simulate
 
+simulate = jax.jit(simulate, static_argnums=0)  # a program a shape, not one an operation
+
 
 def held(matrix, drive, x, u, dt):
     """The state of x' = A x + B u after dt, by the exponential of both together (Van Loan)."""
@@ -36,7 +38,7 @@ def test_slopes_are_finite_where_both_lags_are_equal():
     p = jnp.array([1.3, 1.0, 2.0])
     step = 1e-5 * jnp.array([0.0, 1.0, 0.0])
     expected = (after(p + step) - after(p - step)) / 2e-5
-    np.testing.assert_allclose(jax.jacfwd(after)(p)[:, 1], expected, rtol=1e-6)
+    np.testing.assert_allclose(jax.jit(jax.jacfwd(after))(p)[:, 1], expected, rtol=1e-6)
 
 
 def test_a_first_order_moves_as_its_exponential_does():

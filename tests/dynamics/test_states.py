@@ -79,11 +79,11 @@ def test_poles_gains_and_the_order_of_two_inputs_and_outputs_are_found():
     rng = np.random.default_rng(0)
     b, c, d = rng.normal(size=(2, 2)), rng.normal(size=(2, 2)), np.zeros((2, 2))
     a, b, c, d, _ = cont2discrete((np.array([[-0.1, 1.0], [-1.0, -0.1]]), b, c, d), 0.5)
-    u = np.stack([3.0 * steps(400, rng, 10) + 5.0, steps(400, rng, 7)], axis=1)
+    u = np.stack([3.0 * steps(240, rng, 10) + 5.0, steps(240, rng, 7)], axis=1)
     y = dlsim((a, b, c, d, 1.0), u)[1] * [1.0, 100.0] + [10.0, -300.0]
     y += 0.05 * y.std(0) * rng.normal(size=y.shape)
-    y[rng.random(400) < 0.2, 1] = np.nan
-    run = Run(0.5 * np.arange(400), dict(zip("ab", u.T, strict=True)),
+    y[rng.random(240) < 0.2, 1] = np.nan
+    run = Run(0.5 * np.arange(240), dict(zip("ab", u.T, strict=True)),
               dict(zip("lm", y.T, strict=True)))  # fmt: skip
     fit = identify_states(run)
     assert (fit.status, fit.order) == (Status.converged, 2), fit.message
@@ -97,7 +97,7 @@ def test_poles_gains_and_the_order_of_two_inputs_and_outputs_are_found():
     near(fit, K_l_a=gains[0, 0], K_l_b=gains[0, 1], K_m_a=gains[1, 0], K_m_b=gains[1, 1])
     found = fit.to_json()["matrices"]  # which stand for themselves
     a, b, c, d = (np.array(found[k]) for k in "ABCD")
-    drive = np.column_stack([u - found["input_mean"], np.ones(400)])
+    drive = np.column_stack([u - found["input_mean"], np.ones(240)])
     b, d = np.column_stack([b, found["state_offset"]]), np.column_stack([d, found["output_offset"]])
     again = dlsim((a, b, c, d, 1.0), drive)[1]
     assert np.all(np.nanstd(y - again, 0) < 0.06 * np.nanstd(y, 0))

@@ -16,14 +16,14 @@ from tests.emittance.coverage import binomial_limits, coverage, deviations
 CASES = {
     "known": ("one", "known", Assumptions(), 500),
     "calibration with a prior": (
-        "one", "calibration", Assumptions(priors={"Q2.slope": (167.23, 3.3446)}), 500,
+        "one", "calibration", Assumptions(priors={"Q2.slope": (167.23, 3.3446)}), 200,
     ),
-    "calibration from two screens": ("two", "calibration", Assumptions(), 500),
+    "calibration from two screens": ("two", "calibration", Assumptions(), 120),
     "transport network with an anchor": (
-        "one", "transport-network", Assumptions(anchor=Anchor(deviation=0.02)), 100,
+        "one", "transport-network", Assumptions(anchor=Anchor(deviation=0.02)), 60,
     ),
     "focusing network with an anchor": (
-        "one", "focusing-network", Assumptions(anchor=Anchor(deviation=0.02)), 60,
+        "one", "focusing-network", Assumptions(anchor=Anchor(deviation=0.02)), 40,
     ),
     "focusing network from two screens": ("two", "focusing-network", Assumptions(), 40),
 }  # fmt: skip

@@ -94,7 +94,7 @@ def test_dispersion_of_the_incoming_beam(gtf, gtf_sizes):
         beamfit.fit_emittance(scan, gtf, priors={"dispersion": (0.05, 1e-3)})
 
 
-@simulations(40, 500)
+@simulations(24, 500)
 def test_total_errors_cover(gtf, count):
     """Line, energy and screen wrong by what is known of them: the truth is in interval_95."""
     currents, random = np.linspace(0.0, 3.9, 14), np.random.default_rng(3)
@@ -120,7 +120,7 @@ def test_total_errors_cover(gtf, count):
 
 
 def test_the_posterior_has_them_too(fit):
-    found = fit.sample(seed=1, target_ess=1500)
+    found = fit.sample(seed=1, target_ess=600)
     assert "size_scale" in found.names
     q, linear = found["x.normalized_emittance"], fit.x.normalized_emittance
     assert q.error == pytest.approx(linear.error, rel=0.1)

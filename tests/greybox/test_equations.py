@@ -56,7 +56,7 @@ def test_second_degree_is_the_taylor_series_of_a_process():
         return jnp.exp(0.4 * past[0]) * jnp.sin(1.0 + past[1]) - jnp.sin(1.0)
 
     zero = jnp.zeros(2)
-    slope, bend = jax.grad(process)(zero), jax.hessian(process)(zero)
+    slope, bend = jax.jit(lambda past: (jax.grad(process)(past), jax.hessian(process)(past)))(zero)
     p = [process(zero), *slope, 0.5 * bend[0, 0], bend[0, 1], 0.5 * bend[1, 1]]
     series = TaylorDifference(("u",), ("y",), y_past=1, u_past=0, degree=2)
 

@@ -153,7 +153,7 @@ def written(tmp_path, name, number, text):
     return path
 
 
-@simulations(100, 300)
+@simulations(50, 300)
 def test_no_file_is_read_otherwise_than_madx_reads_it(tmp_path, count):
     cpymad = pytest.importorskip("cpymad.madx", reason="cpymad is not installed")
     with cpymad.Madx(stdout=False) as madx:

@@ -110,7 +110,7 @@ def fit(scan, line):
     return str(beamfit.fit_emittance(scan, line))
 
 
-@simulations(100, 300)
+@simulations(60, 300)
 def test_csv(tmp_path, root, count):
     line = beamfit.load_lattice(root / "lattices/lcls_otr2.toml")
     path = tmp_path / "scan.csv"
@@ -123,7 +123,7 @@ def test_csv(tmp_path, root, count):
     assert kept < count
 
 
-@simulations(30, 100)
+@simulations(16, 100)
 @pytest.mark.parametrize("compressed", [True, False])
 def test_mat(compressed, tmp_path, count):
     path = tmp_path / "scan.mat"
@@ -139,7 +139,7 @@ def test_mat(compressed, tmp_path, count):
     assert grown < GROWTH
 
 
-@simulations(30, 100)
+@simulations(16, 100)
 def test_mat_packed_after_the_damage(tmp_path, count):
     """So that the damage lies in what is unpacked, and not in the packing."""
     path = tmp_path / "scan.mat"
@@ -160,7 +160,7 @@ def test_mat_packed_after_the_damage(tmp_path, count):
     assert grown < GROWTH
 
 
-@simulations(100, 300)
+@simulations(60, 300)
 def test_madx(tmp_path, count):
     pytest.importorskip("at", reason="accelerator-toolbox is not installed")
     path = tmp_path / "line.madx"

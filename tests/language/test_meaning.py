@@ -68,7 +68,7 @@ def test_earlier_times_become_one_scan():
     run = lambda u: program({"a": np.array([0.5, 0.25]), "u": u}, ["y"])["y"]  # noqa: E731
     assert "scan" in str(jax.make_jaxpr(run)(u))
     step = 1e-6 * np.eye(7)[1]
-    slope = jax.jacfwd(run)(u)[:, 1]
+    slope = jax.jit(jax.jacfwd(run))(u)[:, 1]
     np.testing.assert_allclose(slope, (run(u + step) - run(u - step)) / 2e-6, atol=1e-8)
 
 

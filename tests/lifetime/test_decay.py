@@ -277,7 +277,7 @@ def test_the_moving_lifetime_follows_the_law():
         moving_lifetime(record, 20.0)
 
 
-@simulations(60, 1000)
+@simulations(40, 1000)
 def test_random_records_leave_no_failure(count):
     rng = np.random.default_rng(8)
     records = []

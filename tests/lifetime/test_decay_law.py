@@ -50,6 +50,7 @@ def test_all_derivatives_are_smooth_through_zero(order):
     function = mean_exponential
     for _ in range(order):
         function = jax.grad(function)
+    function = jax.jit(function)
     # The n-th derivative at zero of the mean of exp(-u) over [0, x] is (-1)^n/(n + 1).
     assert float(function(0.0)) == pytest.approx((-1) ** order / (order + 1), rel=1e-13)
     for seam in (SERIES_BELOW, -SERIES_BELOW):
@@ -64,7 +65,7 @@ def test_the_mean_exponential_against_extended_precision():
 
 
 def test_the_lifetime_is_the_logarithmic_slope():
-    slope = jax.grad(lambda t: jnp.log(current(t, 500.0, 2e-8, 1e-6)))
+    slope = jax.jit(jax.grad(lambda t: jnp.log(current(t, 500.0, 2e-8, 1e-6))))
     beam = current(7200.0, 500.0, 2e-8, 1e-6)
     assert float(lifetime(beam, 2e-8, 1e-6)) == pytest.approx(-1 / float(slope(7200.0)), rel=1e-12)
 
@@ -84,5 +85,5 @@ def test_the_integrated_rate_can_be_differentiated():
     def end(b):
         return current_by_rate(np.array([0.0, 3e4]), 500.0, lambda i: 2e-8 * i + b, 64)[-1]
 
-    exact = jax.grad(lambda b: current(3e4, 500.0, 2e-8, b))(1e-6)
-    assert float(jax.grad(end)(1e-6)) == pytest.approx(float(exact), rel=1e-7)
+    exact = jax.jit(jax.grad(lambda b: current(3e4, 500.0, 2e-8, b)))(1e-6)
+    assert float(jax.jit(jax.grad(end))(1e-6)) == pytest.approx(float(exact), rel=1e-7)

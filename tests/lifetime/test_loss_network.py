@@ -32,7 +32,7 @@ def test_the_certificate_encloses_every_slope_and_has_the_signs(alone):
     random = np.random.default_rng(3)
     points = random.uniform(certificate.lower, certificate.upper, (500, 4))
     net = alone.fit.model["map"]
-    slopes = np.asarray(jax.vmap(jax.jacfwd(net.values))(points))
+    slopes = np.asarray(jax.jit(jax.vmap(jax.jacfwd(net.values)))(points))
     lower, upper = np.moveaxis(certificate.gains, -1, 0)
     assert (slopes >= lower - 1e-12).all()
     assert (slopes <= upper + 1e-12).all()
@@ -52,12 +52,12 @@ def test_a_broken_sign_is_seen(alone):
 def test_the_lifetime_has_a_single_maximum_in_the_voltage(alone):
     assert alone.certificate.single_maximum == "certified"
     net, certificate = alone.fit.model["map"], alone.certificate
-    random = np.random.default_rng(4)
+    random, values = np.random.default_rng(4), jax.jit(jax.vmap(net.values))
     voltages = np.linspace(certificate.lower[0], certificate.upper[0], 200)
     for point in random.uniform(certificate.lower, certificate.upper, (50, 4)):
         line = np.tile(point, (200, 1))
         line[:, 0] = voltages
-        logs = np.asarray(jax.vmap(net.values)(line))
+        logs = np.asarray(values(line))
         rate = np.exp(logs[:, 0]) * 300 + np.exp(logs[:, 1])
         turns = np.diff(np.sign(np.diff(rate)))
         assert (turns >= 0).all()

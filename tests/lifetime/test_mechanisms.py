@@ -109,9 +109,9 @@ def test_a_lengthening_bunch_lives_longer(ring, operation, current, hours):
 
 def test_lengthening_solves_its_cubic_and_its_slope_is_exact():
     strengths = jnp.array([0.0, 1e-12, 1e-3, 0.385, 1.0, 50.0, 1e6])
-    ratio = jax.vmap(lengthening)(strengths)
+    ratio = jax.jit(jax.vmap(lengthening))(strengths)
     np.testing.assert_allclose(ratio**3 - ratio, strengths, rtol=1e-12, atol=1e-14)
-    slope = jax.vmap(jax.grad(lengthening))(strengths)
+    slope = jax.jit(jax.vmap(jax.grad(lengthening)))(strengths)
     np.testing.assert_allclose(slope, 1 / (3 * ratio**2 - 1), rtol=1e-10)
 
 

@@ -72,9 +72,14 @@ def _locks_of_this_process(tmp_path_factory, monkeypatch):
 
 
 @pytest.fixture(scope="session")
-def _ioc(tmp_path_factory):
+def _ports():
     # Clients read the environment when they first connect, so that it stays for the session.
     os.environ.update(private_ports())
+
+
+@pytest.fixture(scope="package")
+def _ioc(_ports, tmp_path_factory):
+    # For a package's tests alone: its shots take a tenth of a processor for as long as it runs.
     one = Ioc(tmp_path_factory.mktemp("ioc")).start()
     yield one
     one.kill()

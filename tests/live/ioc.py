@@ -16,33 +16,16 @@ import time
 import numpy as np
 from softioc import asyncio_dispatcher, builder, softioc
 
-from tests.live.truth import BEAM
+from tests.live.truth import BEAM, LIMIT, NOISE, A, B, size
 
 PREFIX, TICK = "SIM", 0.01
-# Quadrupole m, drift m, total energy MeV, limits T/m, T/m a second, start T/m.
-LENGTH, DRIFT, ENERGY, LIMIT, RATE, START = 0.108, 2.2094, 135.0, 8.0, 200.0, -2.5
-RIGIDITY = ENERGY / 299.792458
-NOISE, SHOT = 0.02, 0.03  # of a size, and s between shots
+RATE, START = 200.0, -2.5  # T/m a second, T/m
+SHOT = 0.03  # s between shots
 PIXEL, PIXELS = 12.0, 200  # um
 MAGNETS = ("Q1", "Q2")
 FAULTS = ("STUCK", "DRIFT", "SIGN", "NAN", "STALE", "DEAF", "DARK", "LOSSY", "SLOW")
 FAULTS += ("TRIP", "DIM")  # a supply off by so much; a screen that shows sizes of no beam
-# Of the ring: a 1/(mA s), b 1/s at a pressure of 1e-7 Pa, monitor noise mA, s between readings.
-A, B, MONITOR, READ = 2.5e-7, 8.0e-6, 0.002, 0.05
-
-
-def size(plane: str, gradient: float) -> float:
-    """Rms size, m, behind a thick quadrupole and a drift (H. Wiedemann, Particle Accelerator
-    Physics, 4th ed., eq. 7.30 to 7.32).
-    """
-    k = gradient / RIGIDITY * (1 if plane == "x" else -1)
-    root = np.sqrt(complex(k))
-    c, s = np.cos(root * LENGTH).real, (np.sin(root * LENGTH) / root).real if k else LENGTH
-    c_, s_ = -k * s, c
-    r11, r12 = c + DRIFT * c_, s + DRIFT * s_
-    emittance, beta, alpha = BEAM[plane]
-    gamma = (1 + alpha**2) / beta
-    return float(np.sqrt(emittance * (r11**2 * beta - 2 * r11 * r12 * alpha + r12**2 * gamma)))
+MONITOR, READ = 0.002, 0.05  # of the ring: noise of the monitor mA, s between readings
 
 
 class Magnet:

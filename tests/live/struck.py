@@ -19,7 +19,7 @@ import numpy as np
 
 from tests.live.conftest import Ioc, private_ports
 from tests.live.faulty import MACHINE, Injector
-from tests.live.ioc import NOISE, size
+from tests.live.truth import NOISE, size
 
 STRIKES = ("TRIP", "MOVED", "LOSSY", "DIM", "DARK")
 SHOTS = 10

@@ -45,7 +45,7 @@ class Gun:
         emittance = LEAST / GAMMA * (1.0 + ((self.at["phase"] - BEST) / 8.0) ** 2)
         r = np.asarray(self.line.matrix({"Q1": self.at["Q1"]}).x)
         sigma = emittance * np.array([[5.0, 1.0], [1.0, 0.4]])
-        size = np.sqrt((r[:2, :2] @ sigma @ r[:2, :2].T)[0, 0]) * (1 + 0.02 * self.rng.normal())
+        size = np.sqrt((r[:2, :2] @ sigma @ r[:2, :2].T)[0, 0]) * (1 + 0.01 * self.rng.normal())
         return Shots({"x": size * (1 + 0.01 * self.rng.standard_normal(5))}, 1.7e9)
 
     async def amiss(self):

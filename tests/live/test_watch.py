@@ -26,7 +26,7 @@ from beamfit.live.channel import Described, PvReading, open_channel, run
 from beamfit.live.served import values_of
 from beamfit.live.watch import Arrived, _Course
 from tests.live.conftest import ROOT
-from tests.live.ioc import A, B
+from tests.live.truth import A, B
 from tests.report.browser import NAME
 
 MACHINE = """format = "beamfit-machine-1"

@@ -73,7 +73,7 @@ def test_gtf_reproduces_the_reference_at_14_currents(gtf, shared):
     reference = json.loads((shared / "reference/gtf.json").read_text())
     rows = reference["rows"]
     currents = jnp.array([row["I2_A"] for row in rows])
-    r = jax.vmap(lambda i: gtf.matrix({"Q2": i}).x)(currents)
+    r = jax.jit(jax.vmap(lambda i: gtf.matrix({"Q2": i}).x))(currents)
     for (i, j), key in {(0, 0): "A_T", (0, 1): "B_T_m", (1, 0): "C_T_per_m", (1, 1): "D_T"}.items():
         np.testing.assert_allclose(r[:, i, j], [row[key] for row in rows], rtol=0, atol=1e-9)
 
@@ -140,7 +140,7 @@ def test_two_halves_of_a_combined_dipole_make_the_whole():
 def test_a_quadrupole_at_zero_is_a_drift_and_stays_differentiable():
     quadrupole = Quadrupole("Q", 0.4)
     np.testing.assert_array_equal(quadrupole.matrix(0.0).x, Drift("D", 0.4).matrix().x)
-    slope = jax.jacfwd(lambda k: quadrupole.matrix(k).x)(0.0)
+    slope = jax.jit(jax.jacfwd(lambda k: quadrupole.matrix(k).x))(0.0)
     # d/dk of the thin lens limit and the series: R21 = -k L, R11 = 1 - k L²/2, R12 = L - k L³/6
     np.testing.assert_allclose(slope[1, 0], -0.4, rtol=1e-14)
     np.testing.assert_allclose(slope[0, 0], -0.08, rtol=1e-14)
@@ -166,14 +166,14 @@ def test_parts_compose(gtf):
 
 
 def test_derivative_by_the_current_agrees_with_a_finite_difference(gtf):
-    exact = jax.jacfwd(lambda i: gtf.matrix({"Q2": i}).x)(1.3)
+    exact = jax.jit(jax.jacfwd(lambda i: gtf.matrix({"Q2": i}).x))(1.3)
     h = 1e-5
     plus, minus = gtf.matrix({"Q2": 1.3 + h}).x, gtf.matrix({"Q2": 1.3 - h}).x
     np.testing.assert_allclose(exact, (plus - minus) / (2 * h), rtol=1e-8, atol=1e-9)
 
 
 def test_derivative_by_every_number_of_the_line_exists(gtf):
-    slopes = jax.grad(lambda line: line.matrix({"Q2": 1.3}).x[0, 1])(gtf)
+    slopes = jax.jit(jax.grad(lambda line: line.matrix({"Q2": 1.3}).x[0, 1]))(gtf)
     h = 1e-6
     longer = gtf.with_element(Drift("D2", 1.834615 + h))
     change = (longer.matrix({"Q2": 1.3}).x[0, 1] - gtf.matrix({"Q2": 1.3}).x[0, 1]) / h

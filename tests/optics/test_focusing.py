@@ -41,11 +41,12 @@ def test_series_and_closed_form_meet_with_their_derivatives(edge, order):
     derivative = both
     for _ in range(order):
         derivative = jax.jacfwd(derivative)
+    derivative = jax.jit(derivative)
     inside, outside = derivative(edge * (1 - 1e-12)), derivative(edge * (1 + 1e-12))
     np.testing.assert_allclose(inside, outside, rtol=1e-9)
 
 
 def test_gradient_is_finite_over_the_whole_range_of_strengths():
     strengths = jnp.linspace(-500.0, 500.0, 2001)
-    slopes = jax.vmap(jax.jacfwd(lambda k: jnp.stack(focusing(k, 1.5))))(strengths)
+    slopes = jax.jit(jax.vmap(jax.jacfwd(lambda k: jnp.stack(focusing(k, 1.5)))))(strengths)
     assert bool(jnp.all(jnp.isfinite(slopes)))

@@ -181,9 +181,10 @@ def test_derivatives_are_those_of_the_products_one_by_one():
         return reduce(lambda total, part: part @ total, parts)
 
     at = (1.3, 101.0, 0.9)
+    expected_slopes = jax.jit(jax.jacfwd(theirs, (0, 1, 2)))(*at)
     for mode in (jax.jacfwd, jax.jacrev):
         for slope, expected in zip(
-            jax.jit(mode(ours, (0, 1, 2)))(*at), jax.jacfwd(theirs, (0, 1, 2))(*at), strict=True
+            jax.jit(mode(ours, (0, 1, 2)))(*at), expected_slopes, strict=True
         ):
             np.testing.assert_allclose(slope, expected, rtol=1e-12, atol=1e-13)
 

@@ -4,6 +4,7 @@ import re
 import subprocess
 import sys
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -126,34 +127,43 @@ def test_matplotlib_is_loaded_when_something_is_drawn():
     assert done.stdout.strip() == "False"
 
 
-def pages(request, name):
-    if name == "decay":
-        return pages_of(written_now(decay_page((study_of(request.getfixturevalue("decay")),))))
-    fit = request.getfixturevalue(name)
-    if name == "otr":  # names as long as people make them
-        scan = replace(fit.scan, name="a_scan_with_a_name_" * 9, provenance=("W" * 300,))
-        fit = replace(fit, scan=scan)
-    return pages_of(written_now(emittance_page(fit), "beamfit emittance " + "/a/long/path" * 30))
+@pytest.fixture(scope="module")
+def pages(otr, two, noise, decay):
+    """Drawn pages of a PDF, once for each fit."""
+
+    @cache
+    def of(name):
+        if name == "decay":
+            found = pages_of(written_now(decay_page((study_of(decay),))))
+        else:
+            fit = {"otr": otr, "two": two, "noise": noise}[name]
+            if name == "otr":  # names as long as people make them
+                scan = replace(fit.scan, name="a_scan_with_a_name_" * 9, provenance=("W" * 300,))
+                fit = replace(fit, scan=scan)
+            said = "beamfit emittance " + "/a/long/path" * 30
+            found = pages_of(written_now(emittance_page(fit), said))
+        for page in found:
+            FigureCanvasAgg(page).draw()
+        return found
+
+    return of
 
 
 @pytest.mark.parametrize("name", ["otr", "two", "noise", "decay"])
-def test_pages_have_numbers_and_nothing_is_cut_off(request, name):
-    found = pages(request, name)
+def test_pages_have_numbers_and_nothing_is_cut_off(pages, name):
+    found = pages(name)
     for number, page in enumerate(found, 1):
-        canvas = FigureCanvasAgg(page)
-        canvas.draw()
         texts = [text for text in page.texts if text.get_text()]
         assert f"page {number} of {len(found)}" in [text.get_text() for text in texts]
         for drawn in [*texts, *(axes for part in page.subfigs for axes in part.axes)]:
-            box = drawn.get_tightbbox(canvas.get_renderer())
+            box = drawn.get_tightbbox(page.canvas.get_renderer())
             assert page.bbox.x0 <= box.x0 < box.x1 <= page.bbox.x1
             assert page.bbox.y0 <= box.y0 < box.y1 <= page.bbox.y1
 
 
 @pytest.mark.parametrize("name", ["otr", "two", "decay"])
-def test_no_page_but_the_last_is_half_empty(request, name):
-    for page in pages(request, name)[:-1]:
-        FigureCanvasAgg(page).draw()
+def test_no_page_but_the_last_is_half_empty(pages, name):
+    for page in pages(name)[:-1]:
         feet = [text.get_position()[1] for text in page.texts if text.get_position()[1] > 0.05]
         feet += [part.bbox.y0 / page.bbox.height for part in page.subfigs]
         assert min(feet) < 0.45, HEIGHT

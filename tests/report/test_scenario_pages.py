@@ -27,7 +27,7 @@ def inputs(root):
 
 @pytest.fixture(scope="module")
 def found(script, inputs):
-    return script.reproduce(*inputs, starts=6)
+    return script.reproduce(*inputs, starts=3)
 
 
 def test_the_first_beam_matrix_is_found_again(script, found):

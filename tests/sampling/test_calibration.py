@@ -41,7 +41,7 @@ def test_known_transport_by_quadrature(gtf, kind):
     if kind == "none":
         scan = replace(scan, error={})
     fit = beamfit.fit_emittance(scan, line)
-    found = fit.sample(("x",), seed=2, target_ess=40_000)
+    found = fit.sample(("x",), seed=2, target_ess=16_000)
     assert found.status.value == "converged"
     p = fit.x.points
     rows = np.stack([p.r11**2, 2 * p.r11 * p.r12, p.r12**2], -1)

@@ -257,7 +257,7 @@ def test_a_scan_that_determines_nothing_is_not_sampled():
         "x.sigma12": Uniform(-2e-8, 3e-8),
         "x.sigma22": Uniform(0.3e-8, 2e-8),
     }
-    boxed = fit.sample(priors=box, seed=1, target_ess=300)
+    boxed = fit.sample(priors=box, seed=1, target_ess=100)
     assert boxed.chain.size
     assert boxed.status is Status.unidentified
     assert "x.emittance" in boxed.held

@@ -126,7 +126,7 @@ def test_killed_at_any_moment_the_finished_chain_is_the_uninterrupted_one(tmp_pa
         assert process.stdout.readline() == b"begun\n"
         # Before the first checkpoint, between and within later ones; in the end it may finish.
         until = time.monotonic() + random.uniform(0.0, 0.3)
-        until += 0.1 * attempt + 0.02 * attempt**2
+        until += 0.15 * attempt + 0.04 * attempt**2
         while time.monotonic() < until and process.poll() is None:
             time.sleep(0.005)
         if process.poll() is None:

@@ -54,7 +54,8 @@ def kernel(a, b, length):
 @pytest.mark.parametrize("knobs", [1, 2, 4, 6])
 def test_features_make_the_gaussian_kernel(knobs):
     x, length = np.random.default_rng(knobs).uniform(-1, 1, (30, knobs)), 1.5
-    rows = jax.vmap(lambda at: features(at, jnp.full(knobs, length), orders_of(knobs)))(x)
+    at_each = jax.vmap(lambda at: features(at, jnp.full(knobs, length), orders_of(knobs)))
+    rows = jax.jit(at_each)(x)
     assert np.allclose(rows @ rows.T, kernel(x, x, length), atol=0.03)
 
 
@@ -97,12 +98,13 @@ def test_the_evidence_is_that_of_a_gaussian_process(data):
     covariance = covariance_by_kernel(eta, np.asarray(by.slope))
     expected = multivariate_normal.logpdf(by.off, np.zeros(COUNT), covariance)
     expected += norm.logpdf(eta, mean, spread).sum()
-    assert float(of._log_evidence(eta, by, orders_of(2))) == pytest.approx(expected, abs=0.02)
+    evidence = jax.jit(lambda eta: of._log_evidence(eta, by, orders_of(2)))
+    assert float(evidence(eta)) == pytest.approx(expected, abs=0.02)
 
 
 def test_slope_and_curvature_of_the_evidence_are_its_differences(data):
     by, eta, orders, h = linear(data), scales_at(), orders_of(2), 1e-5
-    slope, curvature = map(np.asarray, of._scoring(eta, by, orders))
+    slope, curvature = map(np.asarray, jax.jit(lambda e: of._scoring(e, by, orders))(eta))
     value = jax.jit(lambda e: of._log_evidence(e, by, orders))
     for i, step in enumerate(h * np.eye(len(eta))):
         assert (value(eta + step) - value(eta - step)) / (2 * h) == pytest.approx(
@@ -112,7 +114,8 @@ def test_slope_and_curvature_of_the_evidence_are_its_differences(data):
     covariance = np.asarray(of._covariance(eta, by, orders))
     drawn = np.random.default_rng(0).multivariate_normal(np.zeros(COUNT), covariance, 4000)
     mean, spread = map(np.asarray, of.prior_of(data))
-    each = jax.vmap(lambda off: of._scoring(eta, by._replace(off=off), orders)[0])(drawn)
+    scores = jax.vmap(lambda off: of._scoring(eta, by._replace(off=off), orders)[0])
+    each = jax.jit(scores)(drawn)
     each = np.asarray(each) + (eta - mean) / spread**2
     assert np.allclose(each.T @ each / 4000 + np.diag(spread**-2), curvature, rtol=0.15, atol=0.4)
 
@@ -131,7 +134,8 @@ def test_draws_have_the_mean_and_spread_of_gaussian_regression(data):
     at = np.asarray(design(jnp.array([0.2, -0.4]), scales, orders))
     mean, covariance = at @ gain @ by.off, at @ (np.eye(a.shape[1]) - gain @ a) @ at.T
     keys = jax.random.split(jax.random.key(2), 4000)
-    drawn = np.asarray(jax.vmap(lambda key: of._draw(key, data, state, one, orders))(keys)) @ at.T
+    draw = jax.vmap(lambda key: of._draw(key, data, state, one, orders))
+    drawn = np.asarray(jax.jit(draw)(keys)) @ at.T
     assert np.allclose(drawn.mean(0), mean, atol=0.02)
     assert np.allclose(np.cov(drawn.T), covariance, rtol=0.15, atol=0.005)
 
