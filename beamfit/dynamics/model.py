@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from beamfit.dynamics.record import Run
-from beamfit.dynamics.response import Physics, simulate
+from beamfit.dynamics.response import Physics, simulate, simulate_evenly
 from beamfit.greybox import tree
 from beamfit.greybox.mlp import MLP, Port, dense
 from beamfit.greybox.problem import Prior, padded_length
@@ -17,17 +17,20 @@ from beamfit.noise.memory import CorrelatedNoise
 
 # Residual, as a share of the output's scatter, below which a fit counts as exact.
 CLOSE = 2e-4
+# Distances of samples that differ by less than this share are equal.
+EQUAL = 1e-9
 # Standard deviation of the prior on a network's weights; inputs and outputs are of size 1.
 WEIGHT = 3.0
 
 
-@tree.node("physics")
+@tree.node("physics", "turn")
 class Driven:
     """A run as the model sees it: inputs, its operating points, and steps, padded; what was read.
 
     Shapes (samples, inputs), (samples,), (readings,), (readings,); `run` is its number,
     `noise` that of its readings, if it has a memory; `held` by how much each step grows, s, for a
-    delay that is longer by a sample, where the delay is no whole number of them.
+    delay that is longer by a sample, where the delay is no whole number of them. `turn` is the
+    number of steps after which they repeat, 0 where they do not.
     """
 
     physics: Physics
@@ -38,12 +41,25 @@ class Driven:
     run: Any
     noise: CorrelatedNoise | None
     held: Any
+    turn: int = 0
 
     def predicted(self, model: Any) -> jax.Array:
         """The output where it was read, running free from the start of the run."""
-        p = parameters_at(self.physics, model["map"], self.u)
-        y = simulate(self.physics, p, self.u, steps_of(model, self), model["start"][self.run])
-        return model["offset"] + y[self.index]
+        of, start, dt = model["map"], model["start"][self.run], steps_of(model, self)
+        if callable(of):
+            p = parameters_at(self.physics, of, self.u)
+            return model["offset"] + simulate(self.physics, p, self.u, dt, start)[self.index]
+        return model["offset"] + self.constant(
+            self.physics.physical(of, self.u.shape[1]), dt, start
+        )
+
+    def constant(self, p: jax.Array, dt: jax.Array, start: jax.Array) -> jax.Array:
+        """The response of constant parameters where it was read, without an offset."""
+        if self.turn:
+            y = simulate_evenly(self.physics, p, self.u, dt[: self.turn], start)
+            return y[self.index // self.turn]
+        p = jnp.broadcast_to(p, (len(self.u), len(p)))
+        return simulate(self.physics, p, self.u, dt, start)[self.index]
 
 
 class PreparedOutput(NamedTuple):
@@ -111,7 +127,8 @@ def driven(run: Run, number: int, output: str, physics: Physics, delay: float) -
     seen = (late, dt, run.time[rows] - run.time[0], rows * len(shares))
     arrays = (jnp.asarray(v) for v in seen)
     held = None if held is None else jnp.asarray(held)
-    return Driven(physics, *arrays, jnp.asarray(number), None, held)
+    turn = len(shares) if np.ptp(apart[:-1]) <= EQUAL * apart[0] else 0
+    return Driven(physics, *arrays, jnp.asarray(number), None, held, turn)
 
 
 def steps_of(model: Any, seen: Driven) -> jax.Array:

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from beamfit.dynamics.states import affine_course
+from beamfit.dynamics.states import Matrices, affine_course, linear_outputs
 
 
 class Physics(NamedTuple):
@@ -191,6 +191,45 @@ def simulate(
     [0.0, 1.8964, 2.594, 2.8506]
     """
     return run_from(physics, p, u, dt, physics.begin(free, u[0]))
+
+
+def simulate_evenly(
+    physics: Physics, p: jax.Array, u: jax.Array, dt: jax.Array, free: jax.Array
+) -> jax.Array:
+    """Run a response of constant parameters at steps that repeat, many at once.
+
+    Parameters
+    ----------
+    physics, u, free
+        As for `simulate`; as many samples as a multiple of the steps.
+    p : array, shape (parameters,)
+        Its parameters.
+    dt : array, shape (steps,)
+        Time from each sample to the next, again and again.
+
+    Returns
+    -------
+    jax.Array
+        The output at the first sample of every turn.
+
+    Examples
+    --------
+    >>> p, dt = jnp.array([2.0, 3.0]), jnp.array([2.0])
+    >>> y = simulate_evenly(FIRST_ORDER, p, jnp.ones((4, 1)), dt, jnp.zeros(1))
+    >>> [round(float(v), 4) for v in y]
+    [0.0, 1.8964, 2.594, 2.8506]
+    """
+    x0, turn = physics.begin(free, u[0]), (len(dt), u.shape[1])
+
+    def after(x, now):
+        for step, felt in zip(dt, now.reshape(turn), strict=True):
+            x = physics.advance(p, x, felt, step)
+        return x
+
+    rest, none = jnp.zeros_like(x0), jnp.zeros(turn[0] * turn[1])
+    a, b = jax.jacfwd(after, (0, 1))(rest, none)
+    read = Matrices(a, b, jnp.eye(1, len(x0)), jnp.zeros((1, len(none))), jnp.zeros(1))
+    return linear_outputs(read, u.reshape(-1, len(none)), x0)[0][:, 0]
 
 
 def run_from(

@@ -29,7 +29,7 @@ from beamfit.dynamics.model import (
     weight_priors,
 )
 from beamfit.dynamics.record import Run
-from beamfit.dynamics.response import ARX, FIRST_ORDER, SECOND_ORDER, Physics, simulate
+from beamfit.dynamics.response import ARX, FIRST_ORDER, SECOND_ORDER, Physics
 from beamfit.errors import Status
 from beamfit.greybox.fit import Fit
 from beamfit.greybox.memory import TIMES, Memory, noises, range_of, whitened_by_each
@@ -112,8 +112,7 @@ def unit_outputs(run: Driven, shapes: jax.Array) -> jax.Array:
     m, k = len(run.physics.units(run.u.shape[1])) - shapes.shape[1], run.physics.free_states
 
     def one(shape, gains, first):
-        p = jnp.broadcast_to(jnp.concatenate([shape, gains]), (len(run.u), len(shape) + m))
-        return simulate(run.physics, p, run.u, run.dt, first)[run.index]
+        return run.constant(jnp.concatenate([shape, gains]), run.dt, first)
 
     gains = jnp.concatenate([jnp.eye(m), jnp.zeros((k, m))])
     firsts = jnp.concatenate([jnp.zeros((m, k)), jnp.eye(k)])

@@ -190,9 +190,9 @@ class FactoredSpread:
     def trace(self, rows: Rows) -> float:
         """Trace of these rows' part of the hat matrix."""
         part = in_units(rows[:, self.loose], self.unit)
-        if sparse.issparse(part):
-            return float((part.T @ part).multiply(self.factor.inverse).sum())
-        return float(np.sum((part @ self.factor.inverse) * part))
+        squares, inverse = part.T @ part, self.factor.inverse
+        both = inverse.multiply(squares) if sparse.issparse(inverse) else inverse * squares
+        return float(both.sum())
 
     def _along(self, gradient: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         flat = np.reshape(gradient, (-1, len(self.loose)))[:, self.loose] / self.unit

@@ -4,7 +4,10 @@ Levenberg-Marquardt with Moré's column scaling (Moré 1978, Numerical Analysis,
 Nielsen's damping (IMM-REP-1999-05). A step solves the damped linear problem by QR, not by normal
 equations, and pins the numbers that would leave their bounds, so iterates end exactly on them;
 scipy's bounded methods stay strictly inside, which blurs the verdict "at its bound". All starts
-take their steps together: only residuals and slopes are compiled, the steps are batched NumPy.
+take their steps together: only residuals and slopes are compiled, the steps are batched NumPy. A
+point's triangle of (J, r) serves every damping tried there, by LAPACK's QR of two triangles. Where
+residuals bend along a step, a second one follows their curve, as the end of the first tells it
+(M. K. Transtrum & J. P. Sethna, arXiv:1201.5885, without a further derivative).
 
 Of many free numbers steps solve normal equations, sparse where the problem is, and are corrected by
 the residual that they leave (corrected seminormal equations: Å. Björck, Linear Algebra Appl. 88/89
@@ -21,6 +24,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 from jax import Array
+from scipy.linalg import lapack
 
 from beamfit.greybox.covariance import FEW
 from beamfit.greybox.problem import Problem, residual, sloped, with_slope
@@ -43,10 +47,16 @@ TOLERANCE = 1e-13
 STUCK, LEAST = 1e30, 1e-30
 # A promised decrease below this share of the sum of squares is rounding.
 ROUNDING = 1e-16
-# The same for many numbers, whose last steps cost most and move them by 1e-7 of an error.
+# A step that promises less than this share, and is hardly damped, is the last: it moves the numbers
+# by 1e-7 of their errors, and what it brings cannot be told from rounding.
 FINISHED = 1e-14
+# A step that lowers the cost by less than this share of its promise is followed along the curve of
+# the residuals, if that should bring this share of what was missed within this part of its length.
+BENT, MISSED, NEAR = 0.75, 0.5, 0.375
 # Rounds in which a step pins numbers to bounds; the rest is clipped.
 PINNED = 3
+# Columns that LAPACK's QR of two triangles takes at once: of 3 to 400 numbers the quickest.
+BLOCK = 8
 # Starts looked at in one compiled call, if their Jacobians have at most this many entries.
 WIDTH, LARGE = 4, 2**15
 
@@ -61,6 +71,15 @@ class Found(NamedTuple):
     cost: np.ndarray
     steps: np.ndarray
     rested: np.ndarray
+
+
+class Tried(NamedTuple):
+    """Ends of steps: points, residuals and Jacobians there, decrease of the cost over promised."""
+
+    theta: np.ndarray
+    residual: np.ndarray
+    jacobian: np.ndarray
+    ratio: np.ndarray
 
 
 class Descent:
@@ -88,6 +107,7 @@ class Descent:
         self.theta = np.clip(np.asarray(points, float), lower, upper)
         k = len(self.theta)
         self.residual, self.jacobian = slopes(np.arange(k), self.theta)
+        self.right, self.rows = self._reduced(self.residual, self.jacobian)
         self.scale = np.zeros_like(self.theta)
         self.damping, self.growth = np.full(k, DAMPING), np.full(k, 2.0)
         self.steps, self.rested = np.zeros(k, int), np.zeros(k, bool)
@@ -117,41 +137,96 @@ class Descent:
                 return
             self._advance(moving)
 
+    def _reduced(self, residuals: np.ndarray, jacobians: np.ndarray):
+        """Right sides and rows with the same squares: of few numbers the triangles of (J, r)."""
+        if self.many:
+            return residuals, jacobians
+        n = jacobians.shape[2]
+        rows = np.concatenate([jacobians, residuals[..., None]], axis=2)
+        if rows.shape[1] > n + 1:
+            wide, rows = rows, np.empty((len(rows), n + 1, n + 1))
+            for lane, one in enumerate(wide):
+                rows[lane] = lapack.dgeqrf(one)[0][: n + 1]
+            rows *= np.tri(n + 1).T
+        return rows[..., n], rows[..., :n]
+
     def _advance(self, lanes: np.ndarray) -> None:
         """Try a step of each, take or refuse it."""
-        r, j = self.residual[lanes], self.jacobian[lanes]
-        self.scale[lanes] = scale = np.maximum(self.scale[lanes], _lengths(j))
-        theta, damping = self.theta[lanes], self.damping[lanes]
-        step = _next_of_many if self.many else _next
-        trial = step(theta, r, j, scale, damping, self.lower, self.upper)
-        change = trial - theta
-        moved = _times(j, change)
-        promised = -np.sum(moved * (r + 0.5 * moved), axis=1)
-        small = _length(scale * change) <= self.tolerance * _length(scale * theta)
+        rows = self.rows[lanes]
+        self.scale[lanes] = scale = np.maximum(self.scale[lanes], _lengths(rows))
+        points = self._proposed(lanes, self.right[lanes], rows)
+        theta = self.theta[lanes]
+        small = _length(scale * (points - theta)) <= self.tolerance * _length(scale * theta)
         self.rested[lanes] = small
-        go = ~small
-        lanes, r, promised = lanes[go], r[go], promised[go]
+        lanes, points, rows = lanes[~small], points[~small], rows[~small]
         if not len(lanes):
             return
-        new, slope = self.slopes(lanes, trial[go])
+        moved = _times(rows, points - theta[~small])
+        promised = -np.sum(moved * (self.right[lanes] + 0.5 * moved), axis=1)
+        tried = self._tried(lanes, points, promised)
+        bent, points = self._bent(lanes, tried, promised)
+        if len(bent):
+            second = self._tried(lanes[bent], points, promised[bent])
+            better = second.ratio > tried.ratio[bent]
+            for first, other in zip(tried, second, strict=True):
+                first[bent[better]] = other[better]
+        self._take(lanes, tried, promised)
+
+    def _proposed(self, lanes: np.ndarray, right: np.ndarray, rows: np.ndarray) -> np.ndarray:
+        step = _next_of_many if self.many else _next
+        at = (self.scale[lanes], self.damping[lanes], self.lower, self.upper)
+        return step(self.theta[lanes], right, rows, *at)
+
+    def _tried(self, lanes: np.ndarray, points: np.ndarray, promised: np.ndarray) -> Tried:
+        old = self.residual[lanes]
+        new, slope = self.slopes(lanes, points)
         self.steps[lanes] += 1
-        finite = _finite(new, slope)
         with np.errstate(all="ignore"):
-            ratio = 0.5 * np.sum((r - new) * (r + new), axis=1) / promised
-        ratio = np.where(finite & (promised > 0), ratio, -1.0)
-        squares = np.sum(r * r, axis=1)
-        # A step that promises next to nothing cannot be judged: of many numbers it is the last.
-        last = finite & (promised >= 0) & (promised <= FINISHED * squares) & self.many
+            ratio = 0.5 * np.sum((old - new) * (old + new), axis=1) / promised
+        usable = _finite(new, slope) & (promised > 0)
+        return Tried(points, new, slope, np.where(usable, ratio, -np.inf))
+
+    def _bent(self, lanes: np.ndarray, tried: Tried, promised: np.ndarray):
+        """Find the searches whose residuals bend along their step, and the steps that follow.
+
+        What the residuals at the end of a step have beyond its straight line is added to those that
+        the step was solved for: a little further step along their curve, where it is expected to
+        bring most of what the straight one missed.
+        """
+        squares = np.sum(self.residual[lanes] ** 2, axis=1)
+        poor = (tried.ratio < BENT) & np.isfinite(tried.ratio) & (promised > FINISHED * squares)
+        at = np.flatnonzero(poor)
+        if not len(at):
+            return at, tried.theta[at]
+        jacobian, new, ends = self.jacobian[lanes[at]], tried.residual[at], tried.theta[at]
+        change = ends - self.theta[lanes[at]]
+        curved = self._reduced(new - _times(jacobian, change), jacobian)
+        points = self._proposed(lanes[at], *curved)
+        more, scale = points - ends, self.scale[lanes[at]]
+        left = new + _times(jacobian, more)
+        gain = 0.5 * np.sum((new - left) * (new + left), axis=1)
+        worth = gain > MISSED * (1.0 - tried.ratio[at]) * promised[at]
+        worth &= _length(scale * more) <= NEAR * _length(scale * change)
+        return at[worth], points[worth]
+
+    def _take(self, lanes: np.ndarray, tried: Tried, promised: np.ndarray) -> None:
+        """Take the steps that lower the cost; damp less after those, more after the others."""
+        squares = np.sum(self.residual[lanes] ** 2, axis=1)
+        ratio, plain = tried.ratio, promised >= 0
+        finite = _finite(tried.residual, tried.jacobian) & (self.damping[lanes] <= DAMPING)
+        last = finite & plain & (promised <= FINISHED * squares)
         good = (ratio > 1e-4) | last
-        nothing = ~good & (promised >= 0) & (promised <= ROUNDING * squares)
         taken, refused = lanes[good], lanes[~good]
-        self.theta[taken], self.residual[taken] = trial[go][good], new[good]
-        self.jacobian[taken] = slope[good]
-        self.damping[taken] *= np.maximum(1 / 3, 1 - (2 * np.minimum(ratio[good], 1.0) - 1) ** 3)
+        self.theta[taken], self.residual[taken] = tried.theta[good], tried.residual[good]
+        self.jacobian[taken] = tried.jacobian[good]
+        reduced = self._reduced(tried.residual[good], tried.jacobian[good])
+        self.right[taken], self.rows[taken] = reduced
+        ratio = np.clip(ratio[good], -1.0, 1.0)
+        self.damping[taken] *= np.maximum(1 / 3, 1 - (2 * ratio - 1) ** 3)
         self.growth[taken] = 2.0
         self.damping[refused] *= self.growth[refused]
         self.growth[refused] *= 2.0
-        self.rested[lanes] = last | nothing
+        self.rested[lanes] = last | (~good & plain & (promised <= ROUNDING * squares))
         self.stuck[lanes] = self.damping[lanes] > STUCK
 
     def move(self, lane: int, point: np.ndarray) -> None:
@@ -159,6 +234,7 @@ class Descent:
         at = np.array([lane])
         self.theta[at] = point
         self.residual[at], self.jacobian[at] = self.slopes(at, self.theta[at])
+        self.right[at], self.rows[at] = self._reduced(self.residual[at], self.jacobian[at])
         self.scale[lane], self.damping[lane], self.growth[lane] = 0.0, DAMPING, 2.0
         self.rested[lane] = self.stuck[lane] = False
 
@@ -171,7 +247,7 @@ def _lengths(jacobians: np.ndarray) -> np.ndarray:
     """Lengths of the columns of each; of many numbers they are an array of matrices."""
     if jacobians.dtype == object:
         return np.stack([lengths(one) for one in jacobians])
-    return np.linalg.norm(jacobians, axis=1)
+    return np.sqrt(np.einsum("kmn,kmn->kn", jacobians, jacobians))
 
 
 def _times(jacobians: np.ndarray, steps: np.ndarray) -> np.ndarray:
@@ -182,7 +258,8 @@ def _times(jacobians: np.ndarray, steps: np.ndarray) -> np.ndarray:
 
 def _finite(residuals: np.ndarray, jacobians: np.ndarray) -> np.ndarray:
     """True for each start where all is finite."""
-    sums = np.array([one.sum() for one in jacobians], float)
+    many = jacobians.dtype == object
+    sums = np.array([one.sum() for one in jacobians]) if many else jacobians.sum(axis=(1, 2))
     return np.isfinite(residuals.sum(axis=1) + sums)
 
 
@@ -197,29 +274,21 @@ def _placed(theta, held, unit, low, high, lower, upper) -> np.ndarray:
     return np.where(held <= low, lower, np.where(held >= high, upper, inside))
 
 
-def _next(theta, residual, jacobian, scale, damping, lower, upper) -> np.ndarray:
+def _next(theta, right, rows, scale, damping, lower, upper) -> np.ndarray:
     """Solve the damped linear problems inside the bounds, pinning what would leave.
 
-    In units of the columns' lengths; (R, q) of the QR of (J, r) stand for (J, r).
+    In units of the columns' lengths.
     """
-    n = theta.shape[1]
     unit = np.where(scale > 0, scale, 1.0)
     low, high = (lower - theta) * unit, (upper - theta) * unit
-    rows = np.concatenate([jacobian / unit[:, None], residual[..., None]], axis=2)
-    if rows.shape[1] > n + 1:
-        rows = np.linalg.qr(rows, mode="r")
-    triangle, reduced = rows[..., :n], rows[..., n]
-    pinned = _pinned(np.einsum("kmn,km->kn", triangle, reduced), low, high)
+    rows = rows / unit[:, None]
+    pinned = _pinned(np.einsum("kmn,km->kn", rows, right), low, high)
     held, root = np.zeros_like(theta), np.sqrt(np.maximum(damping, LEAST))[:, None]
     for _ in range(PINNED):
         # A pinned number stands alone in its row; the others are solved beside it.
         at = np.where(pinned, held, 0.0)
-        loose = np.where(pinned[:, None], 0.0, triangle)
-        alone = np.where(pinned, 1.0, root)[..., None] * np.eye(n)
-        right = np.concatenate([-reduced - np.einsum("kmn,kn->km", triangle, at), at], axis=1)
-        left = np.concatenate([loose, alone], axis=1)
-        r = np.linalg.qr(np.concatenate([left, right[..., None]], axis=2), mode="r")
-        tried = np.linalg.solve(r[:, :n, :n], r[:, :n, n:])[..., 0]
+        loose = np.where(pinned[:, None], 0.0, rows)
+        tried = _damped(loose, -right - _times(rows, at), np.where(pinned, 1.0, root), at)
         held = np.clip(tried, low, high)
         more = pinned | (held != tried)
         if np.array_equal(more, pinned):
@@ -227,6 +296,20 @@ def _next(theta, residual, jacobian, scale, damping, lower, upper) -> np.ndarray
         pinned = more
     found = _placed(theta, held, unit, low, high, lower, upper)
     return np.where(np.isfinite(held).all(axis=1, keepdims=True), found, theta)
+
+
+def _damped(rows: np.ndarray, right: np.ndarray, alone: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """Least squares x of rows x = right, of at most n + 1 rows, and of alone x = at, one by one."""
+    k, n = at.shape
+    # Transposed, as LAPACK has them.
+    upper, below = np.zeros((k, n + 1, n + 1)), np.zeros((k, n + 1, n))
+    upper[:, :n, : rows.shape[1]], upper[:, n, : rows.shape[1]] = rows.swapaxes(1, 2), right
+    below[:, range(n), range(n)], below[:, n] = alone, at
+    found, block = np.empty((k, n)), min(BLOCK, n)
+    for r, other, x in zip(upper, below, found, strict=True):
+        lapack.dtpqrt(n, block, r.T, other.T, overwrite_a=1, overwrite_b=1)
+        x[:] = lapack.dtrtrs(r[:n, :n], r[n, :n], lower=1, trans=1)[0]
+    return found
 
 
 def _next_of_many(theta, residual, jacobian, scale, damping, lower, upper) -> np.ndarray:

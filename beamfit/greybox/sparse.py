@@ -33,7 +33,7 @@ def lengths(rows: Rows) -> np.ndarray:
     """Lengths of the columns of a matrix."""
     if sparse.issparse(rows):
         return np.sqrt(np.bincount(rows.indices, rows.data**2, minlength=rows.shape[1]))
-    return np.linalg.norm(rows, axis=0)
+    return np.sqrt(np.einsum("mn,mn->n", rows, rows))
 
 
 def in_units(rows: Rows, unit: np.ndarray) -> Rows:
@@ -244,11 +244,12 @@ def pattern_at(sweep: Sweep, shape: tuple[int, int], known: Pattern | None = Non
     ([0, 1, 1, 2, 2, 3], [0, 1, 0, 1])
     """
     (m, n), width = shape, 1
-    while width * SWEEPS < n:
+    while width * SWEEPS * SPLIT < n:
         width *= SPLIT
     places = sparse.csr_array(np.ones((m, -(-n // width)), bool))
     while True:
-        colours = _colours(places)
+        full = places.nnz == np.prod(places.shape)
+        colours = np.arange(places.shape[1]) if full else _colours(places)
         if colours.max() >= max(FULL * n, SPLIT * SWEEPS):
             return None
         seeds = np.zeros((colours.max() + 1, n))
