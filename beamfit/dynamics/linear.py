@@ -246,7 +246,7 @@ BEGINS, EACH = 2, 3
 NEW, FAINT = 0.6, 1e-3
 
 
-class Tried(NamedTuple):
+class TriedOrder(NamedTuple):
     """A fit of an order, with a direct path from inputs to outputs or without."""
 
     order: int
@@ -266,9 +266,9 @@ def largest_order(case: Case) -> int:
     return int((count_of(case) / EACH - k * (m + 1)) / (m + k + len(case.courses)))
 
 
-def orders(case: Case, order: int | None, offset: bool) -> tuple[Tried, list[dict[str, Any]]]:
+def orders(case: Case, order: int | None, offset: bool) -> tuple[TriedOrder, list[dict[str, Any]]]:
     """Fit 1, 2, … states, or as many as asked for; give the best, and what was tried."""
-    tried: list[Tried] = []
+    tried: list[TriedOrder] = []
     for n in [order] if order else range(1, min(SIZES[-1], largest_order(case)) + 1):
         tried.append(_tried(case, n, offset, tried[-1] if tried else None))
         told = criterion(case, [t.found for t in tried])
@@ -278,7 +278,7 @@ def orders(case: Case, order: int | None, offset: bool) -> tuple[Tried, list[dic
     model = full.found.fit.model
     p = model["p"] | {"d": model["p"]["d"].at[:, : len(case.seen[0].inputs)].set(0.0)}
     bounded = case._replace(free=free_of(case, full.order, len(p["z"]), offset, False))
-    plain = Tried(full.order, False, bounded, trained(bounded, [model | {"p": p}]))
+    plain = TriedOrder(full.order, False, bounded, trained(bounded, [model | {"p": p}]))
     tried.append(plain)
     told = criterion(case, [t.found for t in tried], tried[-2].found)
     best = plain if told[-1] <= min(told[:-1]) else full
@@ -315,7 +315,7 @@ def free_of(case: Case, order: int, size: int, offset: bool, direct: bool) -> tu
                  for name, on in parts.items())  # fmt: skip
 
 
-def _tried(case: Case, n: int, offset: bool, before: Tried | None) -> Tried:
+def _tried(case: Case, n: int, offset: bool, before: TriedOrder | None) -> TriedOrder:
     """The fit of an order from its best realisations, and from the order before and one more."""
     size = next((s for s in SIZES if s >= n), n)
     bounded = case._replace(free=free_of(case, n, size, offset, True))
@@ -342,7 +342,7 @@ def _tried(case: Case, n: int, offset: bool, before: Tried | None) -> Tried:
     if not models:  # runs too short for a regression
         a = np.diag(NEW ** np.arange(1.0, n + 1))
         models = [model(a, np.ones((n, m)), np.full((k, n), FAINT), np.zeros((k, m)))]
-    return Tried(n, True, bounded, trained(bounded, models))
+    return TriedOrder(n, True, bounded, trained(bounded, models))
 
 
 def _units(case: Case, offset: bool) -> dict[str, np.ndarray]:
@@ -464,7 +464,7 @@ def _check_order(case: Case, runs: Sequence[Run], order: int) -> None:
         raise runs[0].unusable(f"order {order} with {count_of(case)} readings", expected)
 
 
-def _networks(best: Tried, hidden: int, seeds: range) -> list[dict[str, Any]]:
+def _networks(best: TriedOrder, hidden: int, seeds: range) -> list[dict[str, Any]]:
     """Models with networks of small random weights beside the linear part."""
     model = stripped(best.found.fit.model, best.order)
     p, (n, m) = model["p"], model["p"]["z"].shape

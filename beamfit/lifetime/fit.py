@@ -486,6 +486,6 @@ def fit_pieces(cycles: Sequence[DecayRecord], name: str, law: Law = Law.constant
 
 
 def _readings(pieces: Pieces, name: str) -> DecayRecord:
-    """What was fitted of many pieces, as one record."""
+    """Readings of many pieces as one record."""
     start = float(pieces.time[0])
     return DecayRecord(pieces.time, pieces.current, pieces.error, name, start)
