@@ -84,7 +84,7 @@ LAWS = {
 
 def run_of(law: str, seed: int) -> tuple[Run, float, float]:
     """A record behind a law, its gain between the values visited, and its time constant."""
-    rng = np.random.default_rng([seed, 13])
+    rng = np.random.default_rng([seed, 13, list(LAWS).index(law)])
     kind, half = rng.choice(list(INPUTS)), 10 ** rng.uniform(-1.8, -0.1)
     u, tau = INPUTS[kind](rng), rng.choice([0.3, 1.5, 3.0, 8.0])
     moves, kept = LAWS[law](u, half), np.exp(-APART / tau)

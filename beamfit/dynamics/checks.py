@@ -14,12 +14,11 @@ from beamfit.dynamics.model import (
     PreparedOutput,
     changed_by,
     driven,
-    parameters_at,
+    output_of,
     predicted,
-    steps_of,
 )
 from beamfit.dynamics.record import Run
-from beamfit.dynamics.response import FIRST_ORDER, Physics, simulate
+from beamfit.dynamics.response import FIRST_ORDER, Physics
 from beamfit.dynamics.search import driven_by, unit_outputs
 from beamfit.greybox.fit import Fit
 
@@ -299,16 +298,15 @@ def slopes_of(seen: PreparedOutput, fit: Fit) -> list[RunSlopes]:
 def predict_held(run: Run, output: str, fit: Fit, physics: Physics, delay: float) -> HeldOutRun:
     """Predict a run that was held back; only the state at its start is estimated."""
     seen = driven(run, 0, output, physics, delay)
-    p = parameters_at(physics, fit.model["map"], seen.u)
     y = run.outputs[output][np.asarray(seen.index)]
 
     def from_start(free: Any) -> np.ndarray:
-        return np.asarray(simulate(physics, p, seen.u, steps_of(fit.model, seen), free)[seen.index])
+        return np.asarray(output_of(fit.model | {"start": free[None]}, seen))
 
     zero = jnp.zeros(physics.free_states)
     base = from_start(zero)
     moved = np.stack([from_start(e) - base for e in jnp.eye(physics.free_states)], axis=1)
-    target = y - base - float(fit.model["offset"])
+    target = y - base
     first = np.linalg.lstsq(moved, target, rcond=1e-10)[0]
     rest = target - moved @ first
     return HeldOutRun(run.name, percent(rest, y), float(np.sqrt(np.mean(rest**2))))

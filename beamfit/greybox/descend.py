@@ -142,12 +142,11 @@ class Descent:
         if self.many:
             return residuals, jacobians
         n = jacobians.shape[2]
-        rows = np.concatenate([jacobians, residuals[..., None]], axis=2)
-        if rows.shape[1] > n + 1:
-            wide, rows = rows, np.empty((len(rows), n + 1, n + 1))
-            for lane, one in enumerate(wide):
-                rows[lane] = lapack.dgeqrf(one)[0][: n + 1]
-            rows *= np.tri(n + 1).T
+        wide = np.concatenate([jacobians, residuals[..., None]], axis=2)
+        rows = np.empty((len(wide), min(wide.shape[1], n + 1), n + 1))
+        for lane, one in enumerate(wide):
+            rows[lane] = lapack.dgeqrf(one)[0][: n + 1]
+        rows *= np.tri(n + 1, rows.shape[1]).T
         return rows[..., n], rows[..., :n]
 
     def _advance(self, lanes: np.ndarray) -> None:

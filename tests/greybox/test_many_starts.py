@@ -41,3 +41,14 @@ def test_a_bound_is_met_exactly_and_a_fixed_number_stays():
     expected = (matrix[:, 1] @ rest) / (matrix[:, 1] @ matrix[:, 1])
     np.testing.assert_allclose(found.theta[0], [lower[0], expected, 0.25], atol=1e-8)
     assert bool(found.rested[0])
+
+
+def test_fewer_residuals_than_numbers_are_met_in_a_few_steps():
+    """Of a linear problem: a step that is no least-squares step would take many, or rest short."""
+    random = np.random.default_rng(4)
+    data = random.normal(size=(3, 7)), random.normal(size=3)
+    wide = np.full(7, np.inf)
+    found = descend_all(quadratic, data, random.normal(size=(5, 7)), -wide, wide)
+    assert np.max(found.cost) < 1e-20
+    assert np.max(found.steps) < 15
+    assert np.all(found.rested)
