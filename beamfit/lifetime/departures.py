@@ -31,10 +31,10 @@ DRIFT = 0.1
 SMOOTH, OUTGASSING, TIMES, SIZES = 0.74, 0.08, (1e-3, 1.0), (1e-3, 10.0)
 # Spans over the time of gas that is pumped away: shorter times are seen by themselves.
 PACES = (1.0, 20.0)
+# Where the record's bend does not depend on the share its coordinate has this slope.
+FLAT = 1e-3
 # Nodes of the integral: exact to rounding up to four lifetimes in a record.
 NODES = 14
-# Where the record's bend would not depend on the share its coordinate goes over to this slope.
-FLAT = 0.2
 
 ANGLE = -np.cos(np.pi * np.arange(NODES) / (NODES - 1))
 NODE = (1 + ANGLE) / 2
@@ -104,10 +104,11 @@ class Numbers(NamedTuple):
         """
         level, rate = np.exp(np.clip(found[:2], -30.0, 8.0))
         power, change, pace = found[POWER:]
-        unit = np.where(pace > 0, 1.0, np.maximum(1 + power + change / rate, FLAT))
+        unit = np.where(pace > 0, 1.0, 1 + power + change / rate)
+        unit = np.where(np.abs(unit) < FLAT, FLAT, unit)
         share = (found[BEND] + change / rate) / unit
         gas = np.where(pace > 0, change, (1 - share) * change)
-        return cls(level, rate, share, power, gas, pace, 1 / unit)
+        return cls(level, rate, share, power, gas, pace, np.abs(1 / unit))
 
     @property
     def drift(self) -> np.ndarray:

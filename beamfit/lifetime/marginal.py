@@ -49,10 +49,10 @@ PUMPED = 0.5
 PLACES, RANGES, STEPS = 33, 5, 6
 # Readings beyond which neighbours are averaged: the curve is smooth between them.
 ENOUGH = 1024
-# Draws of the law that is quoted and of its rivals, and how many times as many where they are worth
-# too few; the degrees of freedom of what they come from, and how many independent ones an answer
-# needs.
-DRAWS, FEW, AGAIN, TAIL, WORTH = 6000, 3000, 10, 8.0, 200.0
+# Draws of laws that are quoted and of their rivals, and how many times as many where they are worth
+# too few; the degrees of freedom of what they come from; how many independent ones an answer needs,
+# and the ends of its interval: a fortieth lies beyond each.
+DRAWS, FEW, AGAIN, TAIL, WORTH, ENDS_WORTH = 6000, 3000, 10, 8.0, 200.0, 2000.0
 # Width of the share in what draws come from, which its bounds cut off otherwise.
 AROUND = 0.6
 # Standard deviations of the share beside a bound in which draws tell the density there.
@@ -351,8 +351,8 @@ class DrawnLaw(NamedTuple):
 
     def drawn(self, draws: int = DRAWS) -> Draws:
         """Draws of the posterior; more of them where they are worth too few."""
-        found = self.weighed(draws)
-        return found if found.worth >= WORTH else self.weighed(AGAIN * draws)
+        found, least = self.weighed(draws), ENDS_WORTH if draws == DRAWS else WORTH
+        return found if found.worth >= least else self.weighed(AGAIN * draws)
 
     def weighed(self, draws: int, seed: int = 0) -> Draws:
         """Draw from the normal approximations, Student's tails, each weighed by the posterior."""
