@@ -195,7 +195,9 @@ def _triangle(matrix: np.ndarray) -> np.ndarray:
     lower = np.zeros_like(matrix)
     for j in range(len(matrix)):
         left = matrix[j:, j] - np.sum(lower[j:, :j] * lower[j, :j], axis=1)
-        lower[j:, j] = left / np.sqrt(np.maximum(left[0], LEAST_LEFT * matrix[j, j]))
+        root = np.sqrt(np.maximum(left[0], LEAST_LEFT * matrix[j, j] + 1e-300))
+        lower[j:, j] = left / root
+        lower[j, j] = root
     return lower
 
 
@@ -389,7 +391,8 @@ class DrawnLaw(NamedTuple):
 
 
 def mixed(laws: Sequence[Draws]) -> Draws:
-    """Draws of several laws, each with its probability."""
+    """Draws of several laws, each with its probability; one that has none may have no numbers."""
+    laws = [law for law in laws if np.isfinite(law.log)] or laws[:1]
     whole = float(logsumexp([law.log for law in laws]))
     if not np.isfinite(whole):
         return laws[0]
