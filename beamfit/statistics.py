@@ -6,7 +6,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import chdtrc, fdtrc, ndtr, stdtr, stdtrit
+from scipy.special import chdtrc, fdtrc, gammaln, ndtr, stdtr, stdtrit
 
 from beamfit.quantity import NORMAL_REACH, Quantity
 
@@ -122,6 +122,18 @@ def chi2_probability(chi2: float, dof: float, error_dof: float = math.inf) -> fl
     if math.isinf(error_dof):
         return float(chdtrc(dof, chi2))
     return float(fdtrc(dof, error_dof, chi2 / dof))
+
+
+def log_student(t: np.ndarray, dof: np.ndarray | float) -> np.ndarray:
+    """Log density of Student's t.
+
+    Examples
+    --------
+    >>> f"{np.exp(log_student(0.0, 1.0)) * math.pi:.6f}"
+    '1.000000'
+    """
+    top = gammaln(0.5 * (dof + 1)) - gammaln(0.5 * dof) - 0.5 * np.log(math.pi * dof)
+    return top - 0.5 * (dof + 1) * np.log1p(t * t / dof)
 
 
 def quantity_of_draws(draws: np.ndarray, unit: str, value: float | None = None) -> Quantity:

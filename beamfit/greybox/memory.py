@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
-from scipy.special import gammaln, stdtr, stdtrit
+from scipy.special import stdtr, stdtrit
 
 from beamfit.greybox.covariance import CUT
 from beamfit.greybox.problem import padded_length
@@ -26,6 +26,7 @@ from beamfit.noise.memory import (
     white_shares,
     whitened,
 )
+from beamfit.statistics import log_student
 
 # Grid of correlation times: from this share of the median interval to this many records, and count.
 SHORTEST, LONGEST, TIMES = 0.3, 5.0, 20
@@ -110,21 +111,15 @@ class Memory(NamedTuple):
 
         def within(reach: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             above, below = ((shift + sign * reach - centre) / spread for sign in (1, -1))
-            slope = (_density(self.dof, above) + _density(self.dof, below)) / spread
+            slope = np.exp(log_student(above, self.dof)) + np.exp(log_student(below, self.dof))
             return self.weight @ (stdtr(self.dof, above) - stdtr(self.dof, below)), (
-                self.weight @ slope
+                self.weight @ (slope / spread)
             )
 
         reaches = [_inverted(within, np.max(np.abs(centre - shift) + spread, 0), p)
                    for p in (CENTRAL, 0.95)]  # fmt: skip
         chance = self.weight @ (2 * stdtr(self.dof, -np.abs(centre) / spread))
         return AveragedMoments(shift, *reaches, chance)
-
-
-def _density(dof: int, t: np.ndarray) -> np.ndarray:
-    """Density of Student's t."""
-    top = gammaln(0.5 * (dof + 1)) - gammaln(0.5 * dof) - 0.5 * np.log(np.pi * dof)
-    return np.exp(top - 0.5 * (dof + 1) * np.log1p(t * t / dof))
 
 
 def _inverted(within, scale: np.ndarray, probability: float) -> np.ndarray:

@@ -257,7 +257,8 @@ def _point(
     beyond = int(np.sign(off)) if abs(off) > max(limit, 3 * value.error) else 0
     fit = decay.fit
     relative: list[Quantity | None] = [None, None]
-    if usual is not None and fit.status is not Status.poor_fit:
+    pumped = fit.free_law is not None and fit.free_law.is_pumped
+    if usual is not None and fit.status is not Status.poor_fit and not pumped:
         relative = [
             None if q.error is None else Quantity(q.value / by, q.error / by, "1")
             for q, by in ((fit.if_constant("a"), usual.a * a), (fit.if_constant("b"), usual.b * b))

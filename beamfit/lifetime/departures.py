@@ -42,6 +42,17 @@ FROM_NODES = np.linalg.inv(chebvander(ANGLE, NODES - 1))
 INTEGRAL = chebvander(ANGLE, NODES) @ chebint(FROM_NODES, lbnd=-1) / 2
 
 
+def from_nodes(s: np.ndarray) -> np.ndarray:
+    """Matrix that takes values at the nodes to those at times over the span, shape (n, 14).
+
+    Examples
+    --------
+    >>> (from_nodes(np.array([0.25])) @ NODE**2).round(9).tolist()
+    [0.0625]
+    """
+    return chebvander(2 * s - 1, NODES - 1) @ FROM_NODES
+
+
 class Law(StrEnum):
     """Knowledge of the law of a decay.
 

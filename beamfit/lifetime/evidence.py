@@ -31,7 +31,7 @@ from beamfit.lifetime.expansion import (
     further_columns,
     lifetime_of,
 )
-from beamfit.lifetime.marginal import ENDS, UNITS, FreeLaw, free_law
+from beamfit.lifetime.marginal import ENDS, LIKELIER, UNITS, FreeLaw, free_law
 from beamfit.lifetime.record import DecayRecord
 from beamfit.noise.memory import CLOSE, Products
 from beamfit.quantity import HOUR, Quantity
@@ -45,8 +45,6 @@ BELIEVED = 5.0
 NORMAL = 1.96
 # Below this share of the current differences are those of the arithmetic, not of the beam.
 EXACT = 1e-12
-# A smooth law is believed where it is likelier than not.
-LIKELIER = 0.5
 
 
 @shown
@@ -373,14 +371,14 @@ class Evidence:
         if known or not self.is_clear("rate_mean") or not (self.explained is None or self.by_gas):
             return None
         found = free_law(self.record, self.values)
-        if found is None or found.odd > LIKELIER or (self.by_gas and found.pumped < LIKELIER):
+        if found is None or found.odd > LIKELIER or (self.by_gas and not found.is_pumped):
             return None
         return found
 
     @property
     def freed(self) -> bool:
         """True if departures of a and b are likelier than none: their values are quoted then."""
-        return self.free is not None and self.free.constant <= LIKELIER
+        return self.free is not None and self.free.likelier
 
     @property
     def by_gas(self) -> bool:
@@ -398,8 +396,8 @@ class Evidence:
 
     @property
     def pumped(self) -> bool:
-        """True if gas that is pumped away is likelier than not, by the posterior."""
-        return self.free is not None and self.free.pumped > LIKELIER
+        """True if what is quoted is gas that is pumped away."""
+        return self.free is not None and self.free.is_pumped
 
     @cached_property
     def bending(self) -> Physical | None:

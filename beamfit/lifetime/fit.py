@@ -14,6 +14,7 @@ from beamfit.errors import InputError, expect
 from beamfit.lifetime.alternatives import Change, ConstantA, LifetimeLaw, Outgassing, SuddenLoss
 from beamfit.lifetime.answer import finding_of, finding_of_cycles
 from beamfit.lifetime.cycles import FEWEST_CYCLES, FEWEST_READINGS, averaged, cleaned
+from beamfit.lifetime.decay_law import current
 from beamfit.lifetime.departures import Law
 from beamfit.lifetime.evidence import BELIEVED, UNITS, Evidence, RatePart, Separability
 from beamfit.lifetime.expansion import Expansion, Pieces, Shape, solved
@@ -189,6 +190,13 @@ class DecayFit:
     def if_constant(self, name: str) -> Quantity:
         """A quantity of the law with constant a and b, as the curve through the readings has it."""
         return self.exact.get(name, getattr(self, name))
+
+    def curve(self, time: np.ndarray) -> np.ndarray:
+        """Current of the law that is quoted, mA, at times since the first reading, s."""
+        if self.free_law is not None and self.free_law.likelier:
+            return self.free_law.curve(time)
+        numbers = (self.if_constant(name).value for name in ("i0", "a", "b"))
+        return np.asarray(current(time, *numbers))
 
     @property
     def about(self) -> Expansion:

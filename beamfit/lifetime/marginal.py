@@ -22,7 +22,6 @@ from beamfit.lifetime.departures import (
     CHANGE,
     CONSTANT,
     DRIFT,
-    FROM_NODES,
     LEAST,
     MOST,
     NODE,
@@ -32,6 +31,7 @@ from beamfit.lifetime.departures import (
     POWER,
     SIZES,
     Numbers,
+    from_nodes,
     gas_change,
     log_prior,
     log_pumped,
@@ -65,6 +65,9 @@ LEAST_LEFT = 1e-15
 STEP = 1e-5
 # What lies farther below the largest log probability adds nothing.
 FAR = 9.0
+
+# A law is taken for the record's where it is likelier than not.
+LIKELIER = 0.5
 
 ENDS = ("start", "end", "mean")
 UNITS = {
@@ -128,7 +131,7 @@ class SeenDecay:
             size = -(-len(record) // ENOUGH)
             time, current, error = DecayRecord(time, current, error).means(size)
         origin = Numbers.of(start).currents(gas)
-        sees = chebvander(2 * time / span - 1, NODES - 1) @ FROM_NODES
+        sees = from_nodes(time / span)
         rows = np.column_stack([current / mean - sees @ origin[:, 0], sees])
         rows = rows if error is None else rows * (mean / error)[:, None]
         products = Products.of(rows, time, error is not None)
@@ -169,15 +172,13 @@ class SeenDecay:
 
 class Peaks(NamedTuple):
     """Normal approximations by noise (k) and place (m): centre, lower triangle of the inverse
-    covariance, log of the integral; numbers (6, m) about which the last step was taken, and those
-    of them that are free.
+    covariance, log of the integral; and numbers (6, m) about which the last step was taken.
     """
 
     centre: np.ndarray
     lower: np.ndarray
     log: np.ndarray
     numbers: np.ndarray
-    free: list[int]
 
 
 def _slopes(seen: SeenDecay, numbers: np.ndarray, free: list[int]) -> tuple[np.ndarray, np.ndarray]:
@@ -263,7 +264,7 @@ def _expanded(seen: SeenDecay, numbers: np.ndarray, free: list[int]) -> Peaks:
         own = np.broadcast_to(np.eye(len(free))[-1][:, None, None], of_share[:, None].shape)
         log = log + _log_within((-np.inf, 0.0), centre[-1], _spread(lower, own))
     centre, lower = np.moveaxis(centre, 0, 2), np.moveaxis(lower, (0, 1), (2, 3))
-    return Peaks(centre, lower, log, numbers, free)
+    return Peaks(centre, lower, log, numbers)
 
 
 def _searched(seen: SeenDecay, numbers: np.ndarray, free: list[int]) -> Peaks:
@@ -319,10 +320,13 @@ class Draws(NamedTuple):
 
 
 class DrawnLaw(NamedTuple):
-    """A law that is drawn from: the record with the noises that are left, and its peaks."""
+    """A law that is drawn from: the record with the noises that are left, its peaks, and rows of
+    the numbers that are free.
+    """
 
     seen: SeenDecay
     peaks: Peaks
+    free: tuple[int, ...]
 
     @classmethod
     def of(cls, seen: SeenDecay, free: Sequence[int]) -> DrawnLaw:
@@ -338,12 +342,12 @@ class DrawnLaw(NamedTuple):
             found = _searched(seen, seen.start, normal)
         kept = found.log.max(axis=1) > found.log.max() - FAR
         if not kept.any():  # not finite
-            return cls(seen, found._replace(free=list(free)))
-        parts = (part[kept] for part in found[:3])
-        return cls(seen.of_noises(kept), Peaks(*parts, found.numbers, list(free)))
+            return cls(seen, found, tuple(free))
+        peaks = Peaks(*(part[kept] for part in found[:3]), found.numbers)
+        return cls(seen.of_noises(kept), peaks, tuple(free))
 
     def _log_prior(self, numbers: Numbers) -> np.ndarray:
-        free, (low, high) = self.peaks.free, self.seen.share
+        free, (low, high) = self.free, self.seen.share
         inside = (numbers.share >= low) & (numbers.share <= high)
         log = np.where(inside, -math.log(high - low), -np.inf)
         if PACE in free:
@@ -351,14 +355,14 @@ class DrawnLaw(NamedTuple):
         log = log + log_prior(numbers.power)[0] if POWER in free else log
         return log + log_straight(numbers.drift) if CHANGE in free else log
 
-    def drawn(self, draws: int = DRAWS) -> Draws:
-        """Draws of the posterior; more of them where they are worth too few."""
-        found, least = self.weighed(draws), ENDS_WORTH if draws == DRAWS else WORTH
+    def drawn(self, draws: int, least: float) -> Draws:
+        """Draws of the posterior; more of them where they are worth less than `least`."""
+        found = self.weighed(draws)
         return found if found.worth >= least else self.weighed(AGAIN * draws)
 
     def weighed(self, draws: int, seed: int = 0) -> Draws:
         """Draw from the normal approximations, Student's tails, each weighed by the posterior."""
-        seen, peaks = self
+        seen, peaks, free = self
         if not np.isfinite(peaks.log).all():
             return Draws(Numbers.of(peaks.numbers), np.zeros(peaks.log.shape[1]), -np.inf, 0.0)
         rng, odds = np.random.default_rng(seed), np.exp(peaks.log - peaks.log.max()).ravel()
@@ -371,7 +375,8 @@ class DrawnLaw(NamedTuple):
         )
         root = np.swapaxes(np.linalg.inv(peaks.lower), 2, 3)[kind, at]
         numbers = peaks.numbers[:, at]
-        rows = [row for row in peaks.free if row not in (POWER, PACE)]
+        rows, places = ([row for row in free if (row in (POWER, PACE)) == placed]
+                        for placed in (False, True))  # fmt: skip
         numbers[rows] = (peaks.centre[kind, at] + np.einsum("dpq,dq->dp", root, normal)).T
         given = gammaln((TAIL + count) / 2) - gammaln(TAIL / 2) - 0.5 * count * np.log(np.pi * TAIL)
         given = given - np.log(np.einsum("dpp->dp", root)).sum(1)
@@ -379,13 +384,12 @@ class DrawnLaw(NamedTuple):
         given = given + np.log(odds[which] / odds.sum())
         named = Numbers.of(numbers)
         log = seen.products.log_prior[kind] + seen.log_size(named, kind)
-        log = log + np.log(named.level * named.rate * named.unit)
+        log = log + np.log(named.level * named.rate * np.abs(named.unit))
         log = log + self._log_prior(named)
         if not np.isfinite(log).any():
             return Draws(named, np.zeros(draws), -np.inf, 0.0)
         weight = np.exp(log - given - logsumexp(log - given))
-        grid = [row for row in peaks.free if row in (POWER, PACE)]
-        spacing = float(np.prod([np.diff(peaks.numbers[row])[0] for row in grid]))
+        spacing = float(np.prod([np.diff(peaks.numbers[row])[0] for row in places]))
         whole = float(logsumexp(log - given)) - np.log(draws) + np.log(spacing)
         return Draws(named, weight, whole, float(1 / np.sum(weight**2)))
 
@@ -421,6 +425,14 @@ def quantity_of(values: np.ndarray, weight: np.ndarray, unit: str) -> Quantity:
     return Quantity(middle, (more - less) / 2, unit, None, tuple(interval))
 
 
+def ends_of(none: bool, all_: bool) -> tuple[float, float]:
+    """Probabilities at the ends of the 95 % interval of a share of which none or all is not
+    excluded; the end at that bound is the bound.
+    """
+    least, most = WIDE
+    return least * (1 + all_), most - least * none
+
+
 def _share_of(
     values: np.ndarray, weight: np.ndarray, unit: str, none: bool, all_: bool, whole: np.ndarray
 ) -> Quantity:
@@ -428,9 +440,7 @@ def _share_of(
     0 to the limit of 95 %, or up to the whole.
     """
     found = quantity_of(values, weight, unit)
-    low, high = quantiles(
-        values, weight, np.array([WIDE[0] * (1 + all_), WIDE[1] - WIDE[0] * none])
-    )
+    low, high = quantiles(values, weight, np.array(ends_of(none, all_)))
     high = quantiles(whole, weight, np.array([WIDE[1]]))[0] if all_ else high
     return replace(found, interval_95=(0.0 if none else float(low), float(high)))
 
@@ -468,9 +478,19 @@ class FreeLaw:
     nodes: np.ndarray
     span: float
 
+    @property
+    def likelier(self) -> bool:
+        """True if departures of a and b are likelier than none: their values are quoted then."""
+        return self.constant <= LIKELIER
+
+    @property
+    def is_pumped(self) -> bool:
+        """True if what is quoted is gas that is pumped away."""
+        return self.likelier and self.pumped > LIKELIER
+
     def curve(self, time: np.ndarray) -> np.ndarray:
         """Mean current at times in s, mA."""
-        return chebvander(2 * time / self.span - 1, NODES - 1) @ FROM_NODES @ self.nodes
+        return from_nodes(time / self.span) @ self.nodes
 
     def to_json(self) -> dict[str, object]:
         """Return the exponent, the drift and the probability of constant a and b."""
@@ -523,13 +543,13 @@ def free_law(record: DecayRecord, values: Physical) -> FreeLaw | None:
     """
     seen = SeenDecay.of(record, values)
     quoted, *others = proposals(seen)
-    laws = [quoted.drawn(), *(law.drawn(FEW) for law in others)]
+    laws = [quoted.drawn(DRAWS, ENDS_WORTH), *(law.drawn(FEW, WORTH) for law in others)]
     draws, smooth = mixed(laws), laws[0]
-    if draws.worth < WORTH / 4:
+    if not np.isfinite(smooth.log) or draws.worth < WORTH / 4:
         return None
-    plain = DrawnLaw.of(seen, CONSTANT).drawn(FEW)
+    plain = DrawnLaw.of(seen, CONSTANT).drawn(FEW, WORTH)
     if not 0 <= values.share <= 1:
-        rival = DrawnLaw.of(replace(seen, share=NO_BEAM), CONSTANT).drawn(FEW)
+        rival = DrawnLaw.of(replace(seen, share=NO_BEAM), CONSTANT).drawn(FEW, WORTH)
         if rival.log + np.log(UNPHYSICAL) > draws.log:
             return None
     usual, odd = log_prior(smooth.numbers.power)
@@ -569,7 +589,7 @@ def rates_of(a, b, power, changed, x, seen: SeenDecay):
 def middle_of(currents: np.ndarray, weight: np.ndarray) -> float:
     """When the current is its mean, over the span, by the mean of draws at the nodes."""
     time, nodes = np.linspace(0.0, 1.0, 1001), currents @ weight
-    return float(np.interp(-1.0, -(chebvander(2 * time - 1, NODES - 1) @ FROM_NODES @ nodes), time))
+    return float(np.interp(-1.0, -(from_nodes(time) @ nodes), time))
 
 
 def _quantities(

@@ -15,6 +15,8 @@ from jax import Array
 from beamfit.errors import Finding, InputError, Status, judge
 from beamfit.lifetime.decay_law import Moments, beam_current
 from beamfit.lifetime.departures import (
+    ABOVE,
+    BELOW,
     CONSTANT,
     DRIFT,
     LEAST,
@@ -32,6 +34,7 @@ from beamfit.lifetime.marginal import (
     Draws,
     SeenDecay,
     at_bounds,
+    ends_of,
     middle_of,
     mixed,
     proposals,
@@ -47,15 +50,16 @@ from beamfit.sampling.posterior import Expected, Posterior
 from beamfit.sampling.priors import Distribution, checked
 from beamfit.sampling.store import FROM_PYTHON, Checkpoint, Provenance
 from beamfit.sampling.target import PosteriorLaw, SamplingTarget
-from beamfit.statistics import WIDE
 from beamfit.writing import alone
 
 UNITS = {"i0": "mA", "a": "1/(mA s)", "b": "1/s", "exponent": "1", "drift": "1", "pace": "1"}
 BOUNDS = {"i0": (0.0, np.inf), "a": (0.0, np.inf), "b": (0.0, np.inf), "exponent": (LEAST, MOST)}
 SHOWN = ("i0", "a", "b", "exponent", "drift")
 LIFETIMES = {"lifetime_start": "h", "lifetime_end": "h", "lifetime_mean": "h"}
-STATED = {"exponent": "normal about 0, 0.3 below and 0.2 above",
+STATED = {"exponent": f"normal about 0, {BELOW} below and {ABOVE} above",
           "drift": f"normal, 0 ± {DRIFT}, or that of gas that is pumped away"}  # fmt: skip
+# Where all of the loss may be of one kind its interval ends, as the last of a thousand draws does.
+UTMOST = 0.999
 # Draws are laid out as so many chains of so many steps; at most so many steps of proposals.
 WALKERS, STEPS, BUDGET = 16, 1024, 16384
 
@@ -167,7 +171,7 @@ class _Prepared(NamedTuple):
     @property
     def names(self) -> tuple[str, ...]:
         """Numbers that are drawn."""
-        law = max(max(one.peaks.free) for one in self.laws) + 1
+        law = max(max(one.free) for one in self.laws) + 1
         return *list(UNITS)[:law], *(f"monitor_{k + 1}" for k in range(len(self.moved)))
 
     def draws(self, number: int, seed: int = 0) -> Draws:
@@ -213,10 +217,12 @@ class _Prepared(NamedTuple):
 def _reaching(draws: Draws) -> dict[str, tuple[float, float]]:
     """Ends of the 95 % of a and b that reach to a bound, as the fit quotes them."""
     none, all_ = at_bounds(draws.numbers.share, draws.weight)
-    ends = {"a": (none, all_), "b": (all_, none)}
-    least, most = WIDE
-    return {name: (0.0 if low else least * (1 + high), 0.999 if high else most - least * low)
-            for name, (low, high) in ends.items() if low or high}  # fmt: skip
+    found = {}
+    for name, (low, high) in (("a", (none, all_)), ("b", (all_, none))):
+        if low or high:
+            least, most = ends_of(low, high)
+            found[name] = (0.0 if low else least, UTMOST if high else most)
+    return found
 
 
 def _observed(fit) -> dict[str, np.ndarray]:
@@ -355,12 +361,8 @@ def expected_current(posterior: Posterior, fit) -> Expected:
                                   posterior.thinned())  # fmt: skip
     draws = np.empty((len(shown), len(record)))
     for row, (i0, a, b, power, drift, pace) in zip(draws, shown, strict=True):
-        quadratic, linear, kind, further = (
-            a * mean * span,
-            b * span,
-            "drift",
-            (b * span * drift, 0.0),
-        )
+        quadratic, linear = a * mean * span, b * span
+        kind, further = "drift", (linear * drift, 0.0)
         if pace > 0:
             kind, further = "relaxing", (linear * drift / np.expm1(-pace), 1 / pace)
             linear = linear * (1 + drift / pace)

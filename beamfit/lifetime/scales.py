@@ -78,11 +78,8 @@ def _root(decay: Decay, parts: np.ndarray) -> np.ndarray:
     fit = decay.fit
     if fit.first is not None:
         return _together(fit, parts[1])
-    scale = fit.noise
-    if not fit.noise_inferred:
-        pulls = fit.residuals / decay.segment.error
-        scale = max(1.0, np.sqrt(pulls @ pulls / fit.dof))
     about = fit.about
+    scale = max(np.sqrt(about.residuals @ about.residuals / fit.dof), about.given)
     return _with_monitor(information_root(about, scale * fit.inflation), about)
 
 

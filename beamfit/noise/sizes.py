@@ -11,10 +11,11 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.special import expit, gammaln
+from scipy.special import expit
 
 from beamfit.arrays import registered
 from beamfit.noise.model import LN_2PI, Lognormal, Noise
+from beamfit.statistics import log_student
 
 # Nodes over the scale of the noise, and how far below its peak the likelihood still counts.
 NODES, DEEP = 12, 12.0
@@ -309,7 +310,7 @@ def means_of(shots: np.ndarray, noise: Noise = Noise()) -> ShotMeans | None:  # 
     for _ in range(ROUNDS):
         freedom = _freedom(good)
         z = (value - mean[:, None]) / deviation[:, None]
-        density = _student(z, freedom) - np.log(deviation / far)[:, None]
+        density = log_student(z, freedom) - np.log(deviation / far)[:, None]
         odds = math.log(noise.bad_shot / (1.0 - noise.bad_shot)) - density
         last, good = good, np.where(there, expit(-odds), 0.0)
         mean = _means(value, good, middle)
@@ -339,13 +340,6 @@ def _freedom(good: np.ndarray) -> np.ndarray:
     own = np.maximum(good.sum(1, keepdims=True) - 1.0, 0.0)
     of_all = (POOLED / (POOLED + own)) ** 2 / max(own.sum(), 1.0)
     return 1.0 / (1.0 / (POOLED + own) + of_all)
-
-
-def _student(z: np.ndarray, freedom: np.ndarray) -> np.ndarray:
-    """Log density of Student's t."""
-    constant = gammaln(0.5 * (freedom + 1.0)) - gammaln(0.5 * freedom)
-    constant -= 0.5 * np.log(freedom * math.pi)
-    return constant - 0.5 * (freedom + 1.0) * np.log1p(z**2 / freedom)
 
 
 def _first_scatter(shots: np.ndarray, middle: np.ndarray) -> np.ndarray:

@@ -16,7 +16,6 @@ from beamfit.errors import InputError, Status
 from beamfit.lifetime import tables
 from beamfit.lifetime.alarm import when
 from beamfit.lifetime.course import Trend
-from beamfit.lifetime.decay_law import current
 from beamfit.lifetime.fit import DecayFit
 from beamfit.lifetime.ring_study import Shift
 from beamfit.lifetime.study import Decay, RecordStudy, cycle_lifetimes
@@ -235,12 +234,9 @@ def draw_record(figure: FigureBase, study: RecordStudy) -> None:
         at = (decay.offset + decay.segment.time) / scale
         above.plot(at, decay.segment.current, **dots(color=BLUE, zorder=2))
         grid = np.linspace(0, decay.segment.span, 200)
-        fit = decay.fit
-        i0, a, b = (fit.if_constant(name).value for name in ("i0", "a", "b"))
-        if np.isfinite(a):
-            law = np.asarray(current(grid, i0, a, b))
-            above.plot((decay.offset + grid) / scale, law, color=RED, lw=1.3, zorder=3)
-        below.plot(at, fit.residuals, **dots(color=BLUE))
+        law = decay.fit.curve(grid)
+        above.plot((decay.offset + grid) / scale, law, color=RED, lw=1.3, zorder=3)
+        below.plot(at, decay.fit.residuals, **dots(color=BLUE))
     above.plot([], [], "o", color=BLUE, ms=5, label="readings")
     above.plot([], [], color=RED, label="fit")
     if sum(len(d.segment) for d in study.pooled or study.decays) < len(record):
@@ -290,20 +286,16 @@ def draw_lifetime(figure: FigureBase, study: RecordStudy) -> None:
             axes.plot(ends, 2 * [mean.value], color=RED, lw=1.5, zorder=3)
     for decay in study.decays:
         tops.append(_momentary(axes, decay, scale))
-        fit = decay.fit
-        i0, a, b = (fit.if_constant(name).value for name in ("i0", "a", "b"))
-        if np.isfinite(a):
-            grid = np.linspace(0, decay.segment.span, 100)
-            level = current(grid, i0, a, b)
-            rate = np.asarray(a * level + b) * HOUR
-            # A rate of zero or less is no lifetime: leave a hole in the curve.
-            inverse = 1 / np.where(rate > 0, rate, np.nan)
-            axes.plot((decay.offset + grid) / scale, inverse, color=RED, lw=1.5, zorder=3)
+        grid = np.linspace(0, decay.segment.span, 100)
+        rate = -np.gradient(np.log(decay.fit.curve(grid)), grid, edge_order=2) * HOUR
+        # A rate of zero or less is no lifetime: leave a hole in the curve.
+        inverse = 1 / np.where(rate > 0, rate, np.nan)
+        axes.plot((decay.offset + grid) / scale, inverse, color=RED, lw=1.5, zorder=3)
     seen = (
         "single cycles, or some together" if study.pooled else "straight lines over 1/8 of a decay"
     )
     axes.errorbar([], [], [], fmt="o", ms=3, color=BLUE, label=seen)
-    axes.plot([], [], color=RED, label="fit, 1/(a I + b)")
+    axes.plot([], [], color=RED, label="fit")
     known = [top for top in tops if np.isfinite(top)]
     if known:
         axes.set_ylim(0.6 * min(known), 1.4 * max(known))

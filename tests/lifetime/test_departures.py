@@ -9,9 +9,12 @@ from scipy.signal import lfilter
 
 from beamfit.lifetime import alternatives
 from beamfit.lifetime.decay_law import Moments, beam_current
+from beamfit.lifetime.departures import Law
 from beamfit.lifetime.expansion import Pieces, further_columns, solved
 from beamfit.lifetime.fit import fit_decay
 from beamfit.lifetime.record import Conditions, DecayRecord
+from beamfit.lifetime.scales import summarise
+from beamfit.lifetime.study import study_record
 from beamfit.lifetime.systematics import systematics
 from beamfit.quantity import Status
 from tests.simulations import simulations, widened
@@ -142,6 +145,22 @@ def test_outgassing_is_named_with_its_time_constant_and_lifetimes(a, b, further,
     assert f"falls with a time constant of {found.time_constant}" in fit.message
     assert str(found.before) in fit.message
     assert fit.to_json()["outgassing"]["after"]["unit"] == "h"
+
+
+@pytest.mark.parametrize("further", [0.0, 4e-6])
+def test_the_curve_that_is_drawn_is_that_of_the_residuals(further):
+    time, beam = integrated(lambda t, i: 1e-8 * i + 4e-6 + further * np.exp(-t / 7200))
+    fit = fit_decay(noisy(time, beam))
+    assert bool(further) == fit.free_law.is_pumped
+    np.testing.assert_allclose(fit.curve(time), fit.readings.current + fit.residuals, rtol=1e-9)
+    assert np.std(fit.curve(time) - beam) < 1e-3  # half of the noise of a reading
+
+
+def test_a_study_knows_a_decay_with_gas_no_better_than_its_constant_law_does():
+    time, beam = integrated(lambda t, i: 1e-8 * i + 4e-6 * (1 + np.exp(-t / 7200)))
+    record = noisy(time, beam)
+    free, constant = (summarise(study_record(record, law=law).decays) for law in Law)
+    np.testing.assert_allclose(free.root, constant.root, rtol=1e-6)
 
 
 @simulations(1, 2)
