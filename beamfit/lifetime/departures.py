@@ -119,7 +119,7 @@ class Numbers(NamedTuple):
         unit = np.where(np.abs(unit) < FLAT, FLAT, unit)
         share = (found[BEND] + change / rate) / unit
         gas = np.where(pace > 0, change, (1 - share) * change)
-        return cls(level, rate, share, power, gas, pace, np.abs(1 / unit))
+        return cls(level, rate, share, power, gas, pace, 1 / unit)
 
     @property
     def drift(self) -> np.ndarray:
