@@ -171,7 +171,7 @@ def _inseparable(e: Evidence) -> Finding | None:
         f"a and b are not separable on this record (correlation {found.correlation:.6f}; share "
         f"of a in the loss {found.share:.2g} ± {found.share_error:.2g}), the lifetime at the mean "
         f"current is determined. A record {max(longer, 1.1):.2g} times longer, or at several "
-        "currents, would separate them",
+        f"currents, would separate them{f'. {_if_constant(e)}' if e.apart else ''}",
     )
 
 
@@ -247,12 +247,13 @@ def _freely(e: Evidence) -> Finding | None:
         found += f"as I^({e.free.exponent}){drift}, which the errors contain"
         return Finding(Status.converged, f"{told}. {found}")
     gas = "" if e.free.drift is None else ", a drift of b and gas that is pumped away"
-    exact = {name: e.quantity(name, True) for name in "ab"}
-    return Finding(
-        Status.converged,
-        f"{told}, with an exponent of a{gas} left open. If a and b are constant, a is "
-        f"{exact['a']} and b is {exact['b']}",
-    )
+    open_ = f"with an exponent of a{gas} left open"
+    return Finding(Status.converged, f"{told}, {open_}. {_if_constant(e)}")
+
+
+def _if_constant(e: Evidence) -> str:
+    a, b = (e.quantity(name, True) for name in "ab")
+    return f"If a and b are constant, a is {a} and b is {b}"
 
 
 def _clear(e: Evidence) -> str:

@@ -325,15 +325,25 @@ class Evidence:
         return Quantity(1 / rate / HOUR, error, "h", raw, interval)
 
     @cached_property
+    def apart(self) -> bool:
+        """True if the law with constant a and b tells them apart."""
+        share, error = self.scaled("share")
+        return math.isfinite(share) and math.isfinite(error) and self.sure("share")[1] < SEPARABLE
+
+    @cached_property
     def separability(self) -> Separability:
-        """Separability of a and b."""
+        """Separability of a and b, by the law that knows less of their share: by its bounds alone
+        the free one may know more.
+        """
         share, error = self.scaled("share")
         finite = math.isfinite(share) and math.isfinite(error)
+        if finite and self.free is not None and self.free.share.error > error:
+            share, error = self.free.share.value, self.free.share.error
         length, usual = self.correlation_time, float(np.median(np.diff(self.time)))
         told = length is None or self.is_clear("rate_mean")
         alike = 0.0 if length is None else (1.0 - self.white) * math.exp(-usual / length)
         return Separability(
-            separable=finite and self.sure("share")[1] < SEPARABLE,
+            separable=self.apart and (self.free is None or self.free.tells_share),
             share=share if finite else None,
             share_error=error if finite else None,
             correlation=self.correlation if math.isfinite(self.correlation) else None,
@@ -438,17 +448,17 @@ class Evidence:
             return exact
         moved = float(getattr(more, rate)) * (by * value**2 or 1.0)
         low, high = (float(np.hypot(value - end, NORMAL * moved)) for end in interval)
-        error = None if exact.error is None else math.hypot(error, moved)
+        known = exact.error is not None and (name not in ("a", "b") or self.separability.separable)
+        error = math.hypot(error, moved) if known else None
         return Quantity(value, error, exact.unit, exact.error_raw, (value - low, value + high))
 
     def quoted(self, known: bool = True) -> dict[str, Any]:
         """Fields of a `DecayFit`, by name."""
         # Of a law that the readings refute, and nobody stated, a and b have no errors.
         doubted = self.refuted and self.free is None and self.law is Law.free
-        apart = known and self.separability.separable and not doubted
         same = ("chi2", "dof", "noise_inferred", "constant_a", "correlation_time", "lifetimes")
         exact = {"i0": self.quantity("i0", known and self.cycles == 1)}
-        exact |= {name: self.quantity(name, apart) for name in "ab"}
+        exact |= {name: self.quantity(name, known and self.apart and not doubted) for name in "ab"}
         exact |= {f"lifetime_{at}": self.lifetime(f"rate_{at}", known) for at in ENDS}
         found = {name: self.widely(name, quantity) for name, quantity in exact.items()}
         found |= {"exact": exact, "free_law": self.free, "shaped": self.shaped}

@@ -91,6 +91,8 @@ class Pieces:
         As of `DecayRecord`, of a single piece.
     monitor : Monitor or None
         What is stated of its stability.
+    mean : float or None
+        Mean current, mA, where it is not that of the readings.
     """
 
     time: np.ndarray
@@ -100,12 +102,14 @@ class Pieces:
     first: np.ndarray
     gauge: np.ndarray | None = None
     monitor: Monitor | None = None
+    mean: float | None = None
 
     @classmethod
     def of(cls, record: DecayRecord) -> Pieces:
         """A single decay."""
-        time, first = record.time, np.zeros(1, int)
-        return cls(time, time, record.current, record.error, first, record.gauge, record.monitor)
+        time, current, first = record.time, record.current, np.zeros(1, int)
+        more = record.gauge, record.monitor, record.mean
+        return cls(time, time, current, record.error, first, *more)
 
     @cached_property
     def lengths(self) -> np.ndarray:
@@ -115,7 +119,8 @@ class Pieces:
     @cached_property
     def units(self) -> tuple[float, float]:
         """The longest piece, s, and the mean current, mA."""
-        return float(self.since.max()), float(self.current.mean())
+        mean = float(self.current.mean()) if self.mean is None else self.mean
+        return float(self.since.max()), mean
 
     @cached_property
     def share(self) -> np.ndarray:

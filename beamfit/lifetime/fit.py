@@ -371,7 +371,7 @@ def _says_nothing(record: DecayRecord) -> bool:
 
 def _constant(record: DecayRecord, found: str) -> DecayFit:
     """The result for readings that are all equal: no decay is seen, and no noise either."""
-    level = float(record.current.mean())
+    level = record.mean_current
     unknown = {name: Quantity(math.nan, None, unit) for name, unit in UNITS.items()}
     message = (
         f"{found}, so neither decay nor noise is seen: record longer, or read the monitor with "
@@ -410,7 +410,7 @@ def _judged(
         status=finding.status,
         message=finding.message,
         **evidence.quoted(about.rested),
-        mean_current=float(record.current.mean()),
+        mean_current=record.mean_current,
         rms_residual=float(np.sqrt(np.mean(evidence.residuals**2))),
         readings=record,
     )

@@ -41,7 +41,7 @@ from beamfit.lifetime.expansion import Physical
 from beamfit.lifetime.record import DecayRecord
 from beamfit.noise.memory import Products
 from beamfit.quantity import HOUR, Quantity
-from beamfit.statistics import CENTRAL, WIDE
+from beamfit.statistics import CENTRAL, NARROWED, WIDE
 
 # Width of the change of gas that is pumped away in what draws come from.
 PUMPED = 0.5
@@ -113,7 +113,7 @@ class SeenDecay:
     @classmethod
     def of(cls, record: DecayRecord, values: Physical) -> SeenDecay:
         """Whiten the readings of a record about the law with constant a and b."""
-        span, mean = record.span, float(record.current.mean())
+        span, mean = record.span, record.mean_current
         rate = max(float(values.rate_mean) * span, 1e-9)
         share = float(np.clip(values.share, -0.2, 1.2))
         start = np.array([[np.log(values.i0 / mean), np.log(rate), share, 0.0, 0.0, 0.0]]).T
@@ -453,6 +453,8 @@ class FreeLaw:
     ----------
     quantities : mapping of str to Quantity
         I0, a, b and the lifetimes at the start, the end and the mean current.
+    share : Quantity
+        Share of a in the loss at the mean current.
     exponent : Quantity
         g in a(I) proportional to I^g, with its prior.
     drift : Quantity or None
@@ -470,6 +472,7 @@ class FreeLaw:
     """
 
     quantities: Mapping[str, Quantity]
+    share: Quantity
     exponent: Quantity
     drift: Quantity | None
     constant: float
@@ -482,6 +485,12 @@ class FreeLaw:
     def likelier(self) -> bool:
         """True if departures of a and b are likelier than none: their values are quoted then."""
         return self.constant <= LIKELIER
+
+    @property
+    def tells_share(self) -> bool:
+        """True if the readings, and not the flat prior alone, tell the share of a."""
+        flat = (CENTRAL[1] - CENTRAL[0]) / 2
+        return self.share.error < (1 - NARROWED) * flat
 
     @property
     def is_pumped(self) -> bool:
@@ -560,8 +569,9 @@ def free_law(record: DecayRecord, values: Physical) -> FreeLaw | None:
     power, drift = (v if v is None else quantity_of(v, smooth.weight, "1") for v in (power, drift))
     constant = float(1 / (1 + np.exp(draws.log - plain.log)))
     pumped = 1.0 - math.exp(smooth.log - draws.log)
-    nodes = record.current.mean() * currents @ draws.weight
-    return FreeLaw(found, power, drift, constant, odd, pumped, nodes, record.span)
+    nodes = record.mean_current * currents @ draws.weight
+    share = quantity_of(draws.numbers.share, draws.weight, "1")
+    return FreeLaw(found, share, power, drift, constant, odd, pumped, nodes, record.span)
 
 
 def proposals(seen: SeenDecay) -> list[DrawnLaw]:
@@ -597,7 +607,7 @@ def _quantities(
 ) -> dict[str, Quantity]:
     """Quantities that are quoted, from draws with their currents at the nodes."""
     found, weight = draws.numbers, draws.weight
-    span, mean = record.span, float(record.current.mean())
+    span, mean = record.span, record.mean_current
     whole = found.rate / mean / span, found.rate / span
     a, b = found.share * whole[0], (1 - found.share) * whole[1]
     moments = (0.0, middle_of(currents, weight), 1.0)

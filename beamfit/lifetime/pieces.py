@@ -389,7 +389,7 @@ def on_edges(record: DecayRecord) -> DecayRecord:
     return replace(
         at, time=middle, current=(record.current[edge] + record.current[edge + 1]) / 2,
         start=None if record.start is None else record.start + float(middle[0]),
-        notes=(*record.notes, note),
+        notes=(*record.notes, note), mean=record.mean_current,
     )  # fmt: skip
 
 

@@ -180,7 +180,7 @@ class _Prepared(NamedTuple):
 
     def thetas(self, draws: Draws, rng: np.random.Generator) -> np.ndarray:
         """Draws as numbers of the target."""
-        found, span, mean = draws.numbers, self.fit.readings.span, self.fit.readings.current.mean()
+        found, span, mean = draws.numbers, self.fit.readings.span, self.fit.readings.mean_current
         a, b = found.share * found.rate / mean / span, (1 - found.share) * found.rate / span
         own = np.column_stack([found.level * mean, a, b, found.power, found.drift, found.pace])
         shifts = rng.normal(size=(len(own), len(self.moved)))
@@ -196,7 +196,7 @@ class _Prepared(NamedTuple):
             products.matrix, products.log_prior, products.count, products.known,
             seen.origin[:, 0], seen.gas, np.array(seen.ends),
             middle_of(draws.numbers.currents(seen.gas), draws.weight),
-            record.current.mean(), record.span, self.moved,
+            record.mean_current, record.span, self.moved,
         )  # fmt: skip
         lower, upper = np.array([BOUNDS.get(name, (-np.inf, np.inf)) for name in self.names]).T
         told = fit.identifiability.separable or {"a", "b"} & set(priors)

@@ -269,6 +269,8 @@ class DecayRecord:
         What was done to its numbers, such as rows left out.
     monitor : Monitor, optional
         Stability of the current monitor, which errors of results then contain.
+    mean : float, optional
+        Mean current, mA, where these readings stand for others; their own if not given.
 
     Raises
     ------
@@ -292,6 +294,7 @@ class DecayRecord:
     comments: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
     monitor: Monitor | None = None
+    mean: float | None = None
 
     def __post_init__(self) -> None:
         rows = np.size(self.time)
@@ -356,6 +359,11 @@ class DecayRecord:
         return float(self.time[-1])
 
     @property
+    def mean_current(self) -> float:
+        """The current that a mean lifetime is quoted at, mA."""
+        return float(self.current.mean()) if self.mean is None else self.mean
+
+    @cached_property
     def resolution(self) -> float | None:
         """Step of a coarsely quantised reading, mA; None where readings seldom repeat, or lie at
         no multiples of a step.
@@ -439,6 +447,7 @@ class DecayRecord:
         moved = None if self.start is None or not time.size else self.start + float(time[0])
         return replace(
             self,
+            mean=None,
             time=time,
             current=self.current[rows],
             error=None if self.error is None else self.error[rows],

@@ -206,7 +206,7 @@ def operation_during(record: DecayRecord, machine: Machine) -> Operation:
             # The fit has the gauge's own course: b is the gas at its mean, and a is without gas.
             mean = record.integral(record.conditions.pressure)[-1] / record.span
             return usual._replace(**said, pressure_base=mean, pressure_slope=0.0)
-        mean = usual.pressure_base + usual.pressure_slope * float(record.current.mean())
+        mean = usual.pressure_base + usual.pressure_slope * record.mean_current
         if not mean > 0:
             usual, mean = usual._replace(pressure_base=1.0, pressure_slope=0.0), 1.0
         said["pressure_base"] = usual.pressure_base * read / mean
@@ -244,7 +244,7 @@ def budget(record: DecayRecord, machine: Machine) -> Budget:
     18.4 h, Touschek alone 30.4 h
     """
     operation = operation_during(record, machine)
-    current = float(record.current.mean())
+    current = record.mean_current
     losses = loss_coefficients(machine.ring, operation, current)
     ring, parts = machine.ring, Losses(*(float(part) for part in losses))
     length = float(stored_bunch(ring, operation, current).length)
