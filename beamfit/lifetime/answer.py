@@ -86,7 +86,8 @@ def _within_noise(e: Evidence) -> Finding | None:
     rate, error = e.sure("rate_mean")
     if e.separability.separable or error <= DETERMINED * abs(rate):
         return None
-    if e.record is not None and e.record.resolution is None and is_sawtooth(e.residuals):
+    digit = math.inf if e.record is None else e.record.resolution or 0.0
+    if digit < np.std(e.residuals) and is_sawtooth(e.residuals):
         return Finding(
             Status.unidentified,
             "The beam is held by refills that the record does not resolve: its readings lie evenly "

@@ -96,7 +96,7 @@ def find_cycles(record: DecayRecord) -> Split:
     (20, 'refill at 180 s (+0.9698 mA)')
     """
     kept, events = beam_readings(record, spikes=False)
-    grain = _grain(record.current)
+    grain = record.resolution or 0.0
     for _ in range(2):
         pieces = np.split(kept, _steps(record.time[kept], record.current[kept], grain))
         lengths = [piece.size for piece in pieces]
@@ -195,13 +195,6 @@ def _prior(value: np.ndarray, middle: float, width: float, wide: float) -> np.nd
     """Density in the logarithm: normal about the middle, a fifth of it flat over a wide range."""
     normal = np.exp(-0.5 * (np.log(value / middle) / width) ** 2) / math.sqrt(2 * math.pi) / width
     return 0.8 * normal + 0.2 / wide
-
-
-def _grain(current: np.ndarray) -> float:
-    """The last digit of the readings, mA."""
-    levels = np.unique(current)
-    apart = np.diff(levels)
-    return float(apart[apart > 1e-12 * levels[-1]].min(initial=levels[-1]))
 
 
 def _levelled(time: np.ndarray, current: np.ndarray, first: np.ndarray) -> np.ndarray:

@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from scipy.ndimage import median_filter
+from scipy.ndimage import maximum_filter1d, median_filter, minimum_filter1d
 
 from beamfit.answer import shown
 from beamfit.errors import expect
@@ -18,6 +18,10 @@ THRESHOLD = 10.0
 DROPOUT = 0.02
 WINDOW = 9
 FEWEST = 8
+# Readings that tell the noise near one, and the error of the median of `WINDOW` over theirs.
+NEIGHBOURS, OF_MEDIAN = 21, 0.42
+# Readings of a spike at most.
+LONE = 3
 # Readings whose means are looked at for a ramp at the head, the share of its rise by which a fall
 # ends it, and by how much it exceeds any later rise.
 SMOOTH, FALL, RISE = 5, 0.1, 3.0
@@ -134,21 +138,38 @@ def _saturated(current: np.ndarray) -> np.ndarray:
     return np.repeat(top & (lengths >= 5) & (lengths > 5 * usual), lengths)
 
 
-def _flattened(time: np.ndarray, current: np.ndarray) -> np.ndarray:
-    """The readings without their decay: level, but for noise, steps and spikes."""
-    interval, level = np.diff(time), current.copy()
-    lost = np.diff(current)
-    lost /= interval
-    lost = median_filter(lost, WINDOW, mode="mirror")
+def _noise_near(off: np.ndarray) -> np.ndarray:
+    """Noise about each of some departures; where it changes the greater one counts."""
+    usual = median_filter(off, NEIGHBOURS, mode="nearest")
+    usual *= 1.4826
+    return maximum_filter1d(usual, NEIGHBOURS)
+
+
+def _lost(time: np.ndarray, current: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """What decays from each reading to the next, by the usual rate near it, and its error."""
+    interval, rate = np.diff(time), np.diff(current)
+    rate /= interval
+    lost = median_filter(rate, WINDOW, mode="mirror")
+    rate -= lost
+    error = _noise_near(np.abs(rate, out=rate))
+    error *= OF_MEDIAN
+    error *= interval
     lost *= interval
-    level[1:] -= np.cumsum(lost, out=lost)  # in place: of 1e7 readings each copy is 80 MB
-    return level
+    return lost, error
 
 
 def _spikes(time: np.ndarray, current: np.ndarray, noise: float) -> np.ndarray:
-    """Up to three readings off the running median, which follows steps exactly."""
-    level = _flattened(time, current)
-    return np.abs(level - median_filter(level, 7, mode="nearest")) > THRESHOLD * noise
+    """Up to three readings off the running median of what is level but for noise and steps; more
+    than a decay whose rate changes there, as at a refill.
+    """
+    lost, _ = _lost(time, current)
+    changes = maximum_filter1d(lost, WINDOW) - minimum_filter1d(lost, WINDOW)
+    level = current.copy()
+    level[1:] -= np.cumsum(lost, out=lost)  # in place: of 1e7 readings each copy is 80 MB
+    level -= median_filter(level, 2 * LONE + 1, mode="nearest")
+    off = np.abs(level, out=level)
+    off[1:] -= LONE * changes
+    return off > THRESHOLD * np.maximum(noise, _noise_near(off))
 
 
 def _runs(flags: np.ndarray) -> list[tuple[int, int]]:
@@ -196,11 +217,11 @@ def beam_readings(record: DecayRecord, spikes: bool = True) -> tuple[np.ndarray,
 
 def _steps(time: np.ndarray, current: np.ndarray, noise: float) -> np.ndarray:
     """Change from each reading to the next beyond what the decay around it explains, or zero."""
-    excess, change = np.diff(_flattened(time, current)), np.diff(current)
-    allowed = np.abs(change - excess)
-    allowed *= 0.5
-    np.abs(excess, out=excess)
-    allowed += THRESHOLD * max(1.4826 * np.median(excess), np.sqrt(2) * noise)
+    (lost, error), change = _lost(time, current), np.diff(current)
+    excess = np.abs(change - lost)
+    allowed = 0.5 * np.abs(lost, out=lost)
+    usual = max(1.4826 * np.median(excess), np.sqrt(2) * noise)
+    allowed += THRESHOLD * np.hypot(np.maximum(usual, _noise_near(excess)), error)
     change[excess <= allowed] = 0.0
     return change
 

@@ -214,22 +214,27 @@ class Monitor(NamedTuple):
 FEWEST_LIFETIMES = 4
 # Readings of a record that a notebook shows.
 MOST_SHOWN = 20
+# Multiples of a digit are exact to this part of it where readings seldom repeat.
+EXACT = 1e-3
 # A pressure that departs from P0 + P1 I by less than this share of the record's mean, on average
 # up to any time, follows the current.
 FOLLOWS = 2e-3
 
 
 def _digit(values: np.ndarray) -> float | None:
-    """The step between readings that often repeat; None where they seldom do, or the levels lie at
-    no multiples of it, as of values that are held until the next.
+    """The step of which all differences are multiples; None where there is none, as of values that
+    are held until the next. Where readings seldom repeat, those of an exact line are none either.
     """
     levels = np.unique(values)
-    if levels.size < 2 or levels.size > values.size / 2:
+    if levels.size < 2:
         return None
     steps = np.diff(levels)
     step = float(steps.min())
-    off = np.abs(steps / step - np.round(steps / step))
-    return step if float(np.median(off)) < 0.1 else None
+    multiples = np.round(steps / step)
+    off = np.abs(steps / step - multiples)
+    if levels.size <= values.size / 2:
+        return step if float(np.median(off)) < 0.1 else None
+    return step if off.max() < EXACT and multiples.max() > 1 else None
 
 
 def _frozen(values: object, rows: int, quantity: str) -> np.ndarray:
