@@ -430,7 +430,7 @@ def predict_held_back(fit: ScaleFit) -> tuple[HeldBack, ...]:
     >>> record = beamfit.read_decay_record("measurements/spear3_shift_simulated.csv")
     >>> found = predict_held_back(fit_scales(study_record(record).decays, machine))
     >>> print(found[3].predicted, "predicted,", found[3].measured, "measured")
-    9.83 ± 0.14 h predicted, 9.739034 ± 0.000099 h measured
+    9.82 ± 0.14 h predicted, 9.730669 ± 0.000098 h measured
     """
     measured = fit.measured
     weight, left, rows = fit.about(fit.terms, measured)

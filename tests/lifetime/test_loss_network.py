@@ -197,7 +197,8 @@ def test_the_design_questions_of_the_docs_are_answered_and_true(root, machine, m
     for mine, theirs in zip(told, said, strict=True):
         assert re.sub(r"[\d.]+", "", mine) == re.sub(r"[\d.]+", "", theirs)
         numbers = [[float(n) for n in re.findall(r"\d+\.?\d*", line)] for line in (mine, theirs)]
-        np.testing.assert_allclose(*numbers, rtol=0.03)
+        # An error of 0.165 is rounded to either side.
+        np.testing.assert_allclose(*numbers, rtol=0.03, atol=0.0101)
     assert [line.count("not determined") for line in told] == [0, 0, 0, 1, 0, 0, 0, 1]
     network, vacuum = names["network"], {"pressure_base": 2e-8, "pressure_slope": 2e-10}
     for setting in ({"rf_voltage": 2.4e6}, {"rf_voltage": 1.8e6}, {"scraper_y": 2.83e-3}):
