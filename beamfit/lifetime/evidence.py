@@ -146,8 +146,15 @@ class Evidence:
 
     @cached_property
     def independent(self) -> bool:
-        """True if errors of neighbouring readings are independent."""
-        return not self.about.wanders or self.changed
+        """True if errors of neighbouring readings are taken for independent; those of many cycles
+        are averaged over what the readings leave open.
+        """
+        return self.cycles == 1 and (not self.about.wanders or self.changed)
+
+    @property
+    def remembers(self) -> bool:
+        """True if residuals are seen to have a memory."""
+        return self.about.wanders and not self.independent
 
     def _memory(self, independent: bool, *more: int) -> Memory:
         return self.about.memory(self.about.columns(*more), independent)
@@ -271,17 +278,17 @@ class Evidence:
     @property
     def correlation_time(self) -> float | None:
         """Correlation time of the noise, s; None where errors are independent."""
-        return None if self.independent else self.memory.noise.time
+        return self.memory.noise.time if self.remembers else None
 
     @property
     def white(self) -> float:
         """The share of their variance that has none."""
-        return 0.0 if self.independent else self.memory.noise.white
+        return self.memory.noise.white if self.remembers else 0.0
 
     @property
     def inflation(self) -> float:
         """Factor by which the memory of the noise enlarges errors."""
-        if self.independent:
+        if not self.remembers:
             return 1.0
         # Of a loss rate that is not clear of zero the share of a says nothing.
         names = ("rate_mean", "share")[: 1 + (self.cycles == 1 and self.is_clear("rate_mean"))]

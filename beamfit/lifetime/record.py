@@ -234,7 +234,8 @@ def _digit(values: np.ndarray) -> float | None:
     off = np.abs(steps / step - multiples)
     if levels.size <= values.size / 2:
         return step if float(np.median(off)) < 0.1 else None
-    return step if off.max() < EXACT and multiples.max() > 1 else None
+    a_line = levels.size == values.size and multiples.max() == 1
+    return step if off.max() < EXACT and not a_line else None
 
 
 def _frozen(values: object, rows: int, quantity: str) -> np.ndarray:

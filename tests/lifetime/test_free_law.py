@@ -262,3 +262,21 @@ def test_a_point_far_off_at_the_end_of_a_table_is_named(place):
     if place:  # at the lowest current an exponent of a explains it as well
         assert fit.outliers == (place,)
         assert abs(fit.a.value * HOUR - 1e-4) < 4 * fit.a.error * HOUR
+
+
+def test_a_share_that_is_known_no_better_than_before_is_not_told():
+    """a and b are told apart by the law that is quoted: in an hour the exponent leaves
+    their share open, which constant a and b would tell to 0.01.
+    """
+    given = record(3, noise=1e-2, span=HOUR, count=400)
+    free, constant = fit_decay(given), fit_decay(given, law="constant")
+    assert constant.identifiability.separable
+    assert constant.identifiability.share_error < 0.2
+    assert free.status == "unidentified"
+    assert not free.identifiability.separable
+    assert free.identifiability.share_error > 0.2
+    assert free.a.error is None
+    assert free.a.interval_95 is not None
+    assert free.a.interval_95[0] < A < free.a.interval_95[1]
+    assert "If a and b are constant" in free.message
+    assert free.lifetime_mean.error is not None

@@ -259,3 +259,54 @@ def test_refills_of_many_readings_are_cut_and_drifts_are_not():
             )
     drift = decay(TIME) * (1 + 0.02 * np.sin(TIME / 500))
     assert kinds(split_record(DecayRecord(TIME, drift))) == []
+
+
+def test_a_gap_between_uneven_readings_is_no_step():
+    """What is lost in a long gap has the error of the loss rate near it."""
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        time = np.sort(rng.uniform(0.0, 36000.0, 400))
+        time = time[(time < 12000) | (time > 18000)] - time[0]
+        noisy = 300 * np.exp(-time / 36000) + 0.3 * rng.normal(size=time.size)
+        assert len(split_record(DecayRecord(time, noisy)).segments) == 1
+
+
+def test_noise_that_grows_for_a_while_is_neither_steps_nor_spikes():
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        noise = np.where((TIME > 2000) & (TIME < 3000), 0.5, 0.05) * rng.normal(size=TIME.size)
+        split = split_record(DecayRecord(TIME, decay(TIME) + noise))
+        assert [len(part) >= TIME.size - 10 for part in split.segments] == [True]
+
+
+def test_the_first_reading_of_a_fill_is_no_spike():
+    """The loss rate is another after each refill, and readings have little noise."""
+    time = np.arange(0.0, 6000.0, 60.0)
+    fills = [500 * np.exp(-time / (3600 * hours)) for hours in (16, 10, 6, 3, 12)]
+    noise = 1e-3 * np.random.default_rng(1).normal(size=(5, time.size))
+    record = DecayRecord(60.0 * np.arange(5 * time.size), np.ravel(fills + noise))
+    split = split_record(record)
+    assert kinds(split) == ["refill"] * 4
+    assert [len(part) for part in split.segments] == [time.size] * 5
+
+
+@pytest.mark.parametrize("readings", [300, 1000])
+def test_the_digit_of_readings_that_seldom_repeat(readings):
+    time = np.linspace(0.0, 36000.0, readings)
+    shown = np.round(300 * np.exp(-time / 30000) / 0.4) * 0.4
+    record = DecayRecord(time, shown)
+    assert record.resolution == pytest.approx(0.4)
+    assert DecayRecord(time, 300 * np.exp(-time / 30000)).resolution is None
+    [decay] = study_record(record).decays
+    assert abs(decay.fit.lifetime_mean.value - 30000 / 3600) < 2 * decay.fit.lifetime_mean.error
+
+
+def test_a_staircase_quotes_its_lifetime_at_the_mean_of_its_readings():
+    """Edges lie evenly in the current, readings in time."""
+    time = np.linspace(0.0, 72000.0, 4000)
+    record = DecayRecord(time, np.round(300 / (1 + time / 20000)))
+    [decay] = study_record(record).decays
+    mean = record.current.mean()
+    assert decay.fit.mean_current == pytest.approx(mean)
+    found = decay.fit.lifetime_mean
+    assert abs(found.value - 20000 * 300 / mean / 3600) < 2 * found.error
