@@ -43,6 +43,9 @@ from beamfit.greybox.sparse import (
 DAMPING = 1e-3
 # A search rests at a step below this share of the numbers, both in units of the Jacobian's columns.
 TOLERANCE = 1e-13
+# Factors by which damping falls after a step along which residuals were straight (D. W. Marquardt,
+# J. SIAM 11 (1963) 431), and after one along which they bent but which kept its promise (Nielsen).
+STRAIGHT, CURVED = 1 / 10, 1 / 3
 # Damping beyond which no step, however short, lowers the cost; below the least it is rounding.
 STUCK, LEAST = 1e30, 1e-30
 # A promised decrease below this share of the sum of squares is rounding.
@@ -104,6 +107,7 @@ class Descent:
     def __init__(self, slopes: Slopes, points, lower, upper, tolerance=TOLERANCE, many=False):
         self.slopes, self.lower, self.upper = slopes, np.asarray(lower), np.asarray(upper)
         self.tolerance, self.many = tolerance, many
+        self.above = np.tri(self.lower.size + 1).T
         self.theta = np.clip(np.asarray(points, float), lower, upper)
         k = len(self.theta)
         self.residual, self.jacobian = slopes(np.arange(k), self.theta)
@@ -118,10 +122,14 @@ class Descent:
         """True for each start that has come to rest or cannot move."""
         return self.rested | self.stuck
 
+    def _squares(self, lanes: np.ndarray) -> np.ndarray:
+        rows = self.residual[lanes]
+        return _dot(rows, rows)
+
     @property
     def cost(self) -> np.ndarray:
         """Half the sum of squares of each; infinite where something is not finite."""
-        cost = 0.5 * np.sum(self.residual**2, axis=1)
+        cost = 0.5 * _dot(self.residual, self.residual)
         return np.where(np.isfinite(cost), cost, np.inf)
 
     @property
@@ -131,22 +139,23 @@ class Descent:
 
     def go(self, lanes: np.ndarray, limit: int, until: float | None = None) -> None:
         """Move some searches on to a number of steps, or until a moment on the clock."""
-        while until is None or time.perf_counter() < until:
-            moving = lanes[~self.done[lanes] & (self.steps[lanes] < limit)]
-            if not len(moving):
-                return
-            self._advance(moving)
+        with np.errstate(all="ignore"):
+            while until is None or time.perf_counter() < until:
+                moving = lanes[~self.done[lanes] & (self.steps[lanes] < limit)]
+                if not len(moving):
+                    return
+                self._advance(moving)
 
     def _reduced(self, residuals: np.ndarray, jacobians: np.ndarray):
         """Right sides and rows with the same squares: of few numbers the triangles of (J, r)."""
         if self.many:
             return residuals, jacobians
-        n = jacobians.shape[2]
+        k, m, n = jacobians.shape
         wide = np.concatenate([jacobians, residuals[..., None]], axis=2)
-        rows = np.empty((len(wide), min(wide.shape[1], n + 1), n + 1))
+        rows = np.empty((k, min(m, n + 1), n + 1))
         for lane, one in enumerate(wide):
             rows[lane] = lapack.dgeqrf(one)[0][: n + 1]
-        rows *= np.tri(n + 1, rows.shape[1]).T
+        rows *= self.above[:m]
         return rows[..., n], rows[..., :n]
 
     def _advance(self, lanes: np.ndarray) -> None:
@@ -155,13 +164,15 @@ class Descent:
         self.scale[lanes] = scale = np.maximum(self.scale[lanes], _lengths(rows))
         points = self._proposed(lanes, self.right[lanes], rows)
         theta = self.theta[lanes]
-        small = _length(scale * (points - theta)) <= self.tolerance * _length(scale * theta)
+        step = points - theta
+        moved = _times(rows, step)
+        promised = -_dot(moved, self.right[lanes] + 0.5 * moved)
+        small = _length(scale * step) <= self.tolerance * _length(scale * theta)
         self.rested[lanes] = small
-        lanes, points, rows = lanes[~small], points[~small], rows[~small]
+        if small.any():
+            lanes, points, promised = lanes[~small], points[~small], promised[~small]
         if not len(lanes):
             return
-        moved = _times(rows, points - theta[~small])
-        promised = -np.sum(moved * (self.right[lanes] + 0.5 * moved), axis=1)
         tried = self._tried(lanes, points, promised)
         bent, points = self._bent(lanes, tried, promised)
         if len(bent):
@@ -180,8 +191,7 @@ class Descent:
         old = self.residual[lanes]
         new, slope = self.slopes(lanes, points)
         self.steps[lanes] += 1
-        with np.errstate(all="ignore"):
-            ratio = 0.5 * np.sum((old - new) * (old + new), axis=1) / promised
+        ratio = 0.5 * _dot(old - new, old + new) / promised
         usable = _finite(new, slope) & (promised > 0)
         return Tried(points, new, slope, np.where(usable, ratio, -np.inf))
 
@@ -192,9 +202,8 @@ class Descent:
         the step was solved for: a little further step along their curve, where it is expected to
         bring most of what the straight one missed.
         """
-        squares = np.sum(self.residual[lanes] ** 2, axis=1)
-        poor = (tried.ratio < BENT) & np.isfinite(tried.ratio) & (promised > FINISHED * squares)
-        at = np.flatnonzero(poor)
+        poor = (tried.ratio < BENT) & np.isfinite(tried.ratio)
+        at = np.flatnonzero(poor & (promised > FINISHED * self._squares(lanes)))
         if not len(at):
             return at, tried.theta[at]
         jacobian, new, ends = self.jacobian[lanes[at]], tried.residual[at], tried.theta[at]
@@ -203,25 +212,29 @@ class Descent:
         points = self._proposed(lanes[at], *curved)
         more, scale = points - ends, self.scale[lanes[at]]
         left = new + _times(jacobian, more)
-        gain = 0.5 * np.sum((new - left) * (new + left), axis=1)
+        gain = 0.5 * _dot(new - left, new + left)
         worth = gain > MISSED * (1.0 - tried.ratio[at]) * promised[at]
         worth &= _length(scale * more) <= NEAR * _length(scale * change)
         return at[worth], points[worth]
 
     def _take(self, lanes: np.ndarray, tried: Tried, promised: np.ndarray) -> None:
-        """Take the steps that lower the cost; damp less after those, more after the others."""
-        squares = np.sum(self.residual[lanes] ** 2, axis=1)
-        ratio, plain = tried.ratio, promised >= 0
+        """Take the steps that lower the cost; damp less after those, more after the others.
+
+        Damping is for residuals that bend: it falls with the share of their change that did.
+        """
+        squares, ratio, plain = self._squares(lanes), tried.ratio, promised >= 0
         finite = _finite(tried.residual, tried.jacobian) & (self.damping[lanes] <= DAMPING)
         last = finite & plain & (promised <= FINISHED * squares)
         good = (ratio > 1e-4) | last
         taken, refused = lanes[good], lanes[~good]
+        line = _times(self.jacobian[taken], tried.theta[good] - self.theta[taken])
+        bend = _length(tried.residual[good] - self.residual[taken] - line) / _length(line)
         self.theta[taken], self.residual[taken] = tried.theta[good], tried.residual[good]
         self.jacobian[taken] = tried.jacobian[good]
         reduced = self._reduced(tried.residual[good], tried.jacobian[good])
         self.right[taken], self.rows[taken] = reduced
-        ratio = np.clip(ratio[good], -1.0, 1.0)
-        self.damping[taken] *= np.maximum(1 / 3, 1 - (2 * ratio - 1) ** 3)
+        ratio = ratio[good].clip(-1.0, 1.0)
+        self.damping[taken] *= np.maximum(np.clip(bend, STRAIGHT, CURVED), 1 - (2 * ratio - 1) ** 3)
         self.growth[taken] = 2.0
         self.damping[refused] *= self.growth[refused]
         self.growth[refused] *= 2.0
@@ -238,8 +251,12 @@ class Descent:
         self.rested[lane] = self.stuck[lane] = False
 
 
+def _dot(rows: np.ndarray, others: np.ndarray) -> np.ndarray:
+    return np.einsum("km,km->k", rows, others)
+
+
 def _length(rows: np.ndarray) -> np.ndarray:
-    return np.linalg.norm(rows, axis=-1)
+    return np.sqrt(_dot(rows, rows))
 
 
 def _lengths(jacobians: np.ndarray) -> np.ndarray:
@@ -269,7 +286,7 @@ def _pinned(g: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
 
 def _placed(theta, held, unit, low, high, lower, upper) -> np.ndarray:
     """The next point: exactly on a bound, or the number is not known to be there."""
-    inside = np.clip(theta + held / unit, lower, upper)
+    inside = (theta + held / unit).clip(lower, upper)
     return np.where(held <= low, lower, np.where(held >= high, upper, inside))
 
 
@@ -288,11 +305,11 @@ def _next(theta, right, rows, scale, damping, lower, upper) -> np.ndarray:
         at = np.where(pinned, held, 0.0)
         loose = np.where(pinned[:, None], 0.0, rows)
         tried = _damped(loose, -right - _times(rows, at), np.where(pinned, 1.0, root), at)
-        held = np.clip(tried, low, high)
-        more = pinned | (held != tried)
-        if np.array_equal(more, pinned):
+        held = tried.clip(low, high)
+        left = held != tried
+        if not (left & ~pinned).any():
             break
-        pinned = more
+        pinned |= left
     found = _placed(theta, held, unit, low, high, lower, upper)
     return np.where(np.isfinite(held).all(axis=1, keepdims=True), found, theta)
 
@@ -347,7 +364,8 @@ def _seminormal(theta, residual, jacobian, scale, damping, lower, upper) -> np.n
 def descent_of(p: Problem, points: np.ndarray) -> Descent:
     """Searches of a problem, by the method for as many free numbers as it has."""
     many = len(p.start) > FEW
-    slopes = _slopes_of_many(p) if many else _slopes_of_few(p)
+    few = slopes_of_few(p)
+    slopes = _slopes_of_many(p) if many else lambda _, points: few(points)
     return Descent(slopes, points, p.lower, p.upper, many=many)
 
 
@@ -358,16 +376,16 @@ def costs(p: Problem, d: Descent, points: np.ndarray) -> np.ndarray:
     return np.array([0.5 * float(r @ r) for r in map(np.asarray, found)])
 
 
-def _slopes_of_few(p: Problem) -> Slopes:
-    """A few points in each compiled call, whose width is one however many starts there are."""
+def slopes_of_few(p: Problem) -> Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]:
+    """Residuals and Jacobians, a few points in each compiled call: one width for all counts."""
     width = WIDTH if len(p.start) * p.size <= LARGE else 1
     call = p.compiled(_sloped_each)
 
-    def slopes(_: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        fill = np.repeat(points[:1], -len(points) % width, axis=0)
-        parts = np.split(np.concatenate([points, fill]), (len(points) + len(fill)) // width)
-        found = zip(*(map(np.asarray, call(part)) for part in parts), strict=True)
-        r, j = (np.concatenate(every)[: len(points)] for every in found)
+    def slopes(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        firsts = range(0, len(points), width)
+        # The last part is filled with its last point.
+        found = [call(points.take(range(i, i + width), 0, mode="clip")) for i in firsts]
+        r, j = (np.concatenate(every)[: len(points)] for every in zip(*found, strict=True))
         return r, j
 
     return slopes

@@ -362,7 +362,7 @@ class Problem:
     core: Core = field(init=False, repr=False)
 
     def __post_init__(self):
-        model = jax.tree_util.tree_map(lambda v: jnp.asarray(v, float), self.model)
+        model = jax.tree_util.tree_map(_number, self.model)
         spread = [(leaf, f) for f in self.free for leaf in tree.find_leaves(model, f.path)]
         paths = [leaf.path for leaf, _ in spread]
         twice = sorted({path for path in paths if paths.count(path) > 1})
@@ -503,7 +503,7 @@ class Problem:
     @cached_property
     def _flat(self) -> tuple[list[jax.Array], jax.tree_util.PyTreeDef]:
         leaves, structure = jax.tree_util.tree_flatten(self.core)
-        return [jnp.asarray(leaf) for leaf in leaves], structure
+        return [_array(leaf) for leaf in leaves], structure
 
     def model_at(self, theta) -> Any:
         """The model with the free numbers set to theta."""
@@ -564,6 +564,17 @@ class Problem:
                     f"a number or an array that spreads to shape {shape}",
                 ) from None
         return np.concatenate(parts)
+
+
+def _array(value: Any) -> jax.Array:
+    return value if isinstance(value, jax.Array) else jnp.asarray(value)
+
+
+def _number(value: Any) -> jax.Array:
+    """An array of floats; NumPy converts twenty times as fast as JAX."""
+    if isinstance(value, jax.Array):
+        return jnp.asarray(value, float)
+    return jnp.asarray(np.asarray(value, float))
 
 
 _GROUPS = ("records", "priors", "constraints", "objectives")
