@@ -149,7 +149,9 @@ class Descent:
     def _reduced(self, residuals: np.ndarray, jacobians: np.ndarray):
         """Right sides and rows with the same squares: of few numbers the triangles of (J, r)."""
         if self.many:
-            return residuals, jacobians
+            rows = np.empty(len(residuals), object)
+            rows[:] = [NormalEquations(one) for one in jacobians]
+            return residuals, rows
         k, m, n = jacobians.shape
         wide = np.concatenate([jacobians, residuals[..., None]], axis=2)
         rows = np.empty((k, min(m, n + 1), n + 1))
@@ -208,7 +210,8 @@ class Descent:
             return at, tried.theta[at]
         jacobian, new, ends = self.jacobian[lanes[at]], tried.residual[at], tried.theta[at]
         change = ends - self.theta[lanes[at]]
-        curved = self._reduced(new - _times(jacobian, change), jacobian)
+        right = new - _times(jacobian, change)
+        curved = (right, self.rows[lanes[at]]) if self.many else self._reduced(right, jacobian)
         points = self._proposed(lanes[at], *curved)
         more, scale = points - ends, self.scale[lanes[at]]
         left = new + _times(jacobian, more)
@@ -260,9 +263,9 @@ def _length(rows: np.ndarray) -> np.ndarray:
 
 
 def _lengths(jacobians: np.ndarray) -> np.ndarray:
-    """Lengths of the columns of each; of many numbers they are an array of matrices."""
+    """Lengths of the columns of each; of many numbers they are an array of normal equations."""
     if jacobians.dtype == object:
-        return np.stack([lengths(one) for one in jacobians])
+        return np.stack([one.lengths for one in jacobians])
     return np.sqrt(np.einsum("kmn,kmn->kn", jacobians, jacobians))
 
 
@@ -328,10 +331,10 @@ def _damped(rows: np.ndarray, right: np.ndarray, alone: np.ndarray, at: np.ndarr
     return found
 
 
-def _next_of_many(theta, residual, jacobian, scale, damping, lower, upper) -> np.ndarray:
+def _next_of_many(theta, residual, rows, scale, damping, lower, upper) -> np.ndarray:
     """`_next` of each start, by normal equations of the numbers that are not pinned."""
     found = np.full_like(theta, np.nan)
-    for lane, at in enumerate(zip(theta, residual, jacobian, scale, damping, strict=True)):
+    for lane, at in enumerate(zip(theta, residual, rows, scale, damping, strict=True)):
         try:
             found[lane] = _seminormal(*at, lower, upper)
         except np.linalg.LinAlgError:  # refused, and damped more
@@ -339,17 +342,15 @@ def _next_of_many(theta, residual, jacobian, scale, damping, lower, upper) -> np
     return found
 
 
-def _seminormal(theta, residual, jacobian, scale, damping, lower, upper) -> np.ndarray:
+def _seminormal(theta, residual, normal, scale, damping, lower, upper) -> np.ndarray:
     unit = np.where(scale > 0, scale, 1.0)
     low, high = (lower - theta) * unit, (upper - theta) * unit
-    rows = in_units(jacobian, unit)
-    normal = rows.T @ rows
+    rows = normal.in_units(unit)
     pinned = _pinned(rows.T @ residual, low, high)
     held, more = np.zeros(len(theta)), max(damping, RIDGE)
     for _ in range(PINNED):
-        loose, held = np.flatnonzero(~pinned), np.where(pinned, held, 0.0)
-        part = normal if len(loose) == len(theta) else normal[loose][:, loose]
-        factor = Factor(with_diagonal(part, more))
+        loose, held = ~pinned, np.where(pinned, held, 0.0)
+        factor = normal.factor(more, loose)
         for _ in range(2):  # the second corrects the rounding of the first
             left = rows.T @ (residual + rows @ held) + damping * held
             held[loose] -= factor.solve(left[loose])
@@ -359,6 +360,32 @@ def _seminormal(theta, residual, jacobian, scale, damping, lower, upper) -> np.n
         if done:
             break
     return _placed(theta, held, unit, low, high, lower, upper)
+
+
+class NormalEquations:
+    """Normal equations of a Jacobian, its columns in units that stay; the last factor is kept."""
+
+    def __init__(self, jacobian: Rows):
+        self.jacobian, self.lengths = jacobian, lengths(jacobian)
+        self.rows: Rows | None = None
+        self.kept: tuple[float, np.ndarray, Factor] | None = None
+
+    def __matmul__(self, step: np.ndarray) -> np.ndarray:
+        return self.jacobian @ step
+
+    def in_units(self, unit: np.ndarray) -> Rows:
+        """The Jacobian with its columns in units, those of the first call."""
+        if self.rows is None:
+            self.rows = in_units(self.jacobian, unit)
+            self.matrix = self.rows.T @ self.rows
+        return self.rows
+
+    def factor(self, damping: float, loose: np.ndarray) -> Factor:
+        """Factor of the damped equations of the numbers that are loose."""
+        if self.kept is None or self.kept[0] != damping or not np.array_equal(self.kept[1], loose):
+            part = self.matrix if loose.all() else self.matrix[loose][:, loose]
+            self.kept = damping, loose, Factor(with_diagonal(part, damping))
+        return self.kept[2]
 
 
 def descent_of(p: Problem, points: np.ndarray) -> Descent:

@@ -135,7 +135,7 @@ def known(p: Problem, s: SearchState) -> Known:
     blocks = [triangle(s.at.residual_jacobian[first:last]) for first, last in parts]
     nowhere = np.full(len(held), np.inf)
     seen = spread_of(_stacked(blocks), -nowhere, nowhere, held, None, equations)
-    groups = groups_of(p.records, np.split(s.at.residual, ends)[:-1], blocks[:-1], seen)
+    groups = groups_of(p.records, np.split(s.at.residual, ends)[:-1], blocks, seen)
     still = (np.isin(s.bounds.states(s.found.bounds), EDGES) & p.nuisance) | ~p.moving
 
     limited = np.isfinite(p.upper - p.lower) & p.moving & ~p.with_prior
