@@ -503,7 +503,7 @@ class Problem:
     @cached_property
     def _flat(self) -> tuple[list[jax.Array], jax.tree_util.PyTreeDef]:
         leaves, structure = jax.tree_util.tree_flatten(self.core)
-        return [_array(leaf) for leaf in leaves], structure
+        return [jnp.asarray(leaf) for leaf in leaves], structure
 
     def model_at(self, theta) -> Any:
         """The model with the free numbers set to theta."""
@@ -564,10 +564,6 @@ class Problem:
                     f"a number or an array that spreads to shape {shape}",
                 ) from None
         return np.concatenate(parts)
-
-
-def _array(value: Any) -> jax.Array:
-    return value if isinstance(value, jax.Array) else jnp.asarray(value)
 
 
 def _number(value: Any) -> jax.Array:
