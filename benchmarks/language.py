@@ -61,10 +61,8 @@ def main(points):
     began = time.perf_counter()
     made = formulate(parse_document(text), {"d": data})
     parsed = time.perf_counter() - began
-    program, constants = (
-        made.program,
-        {n: jnp.asarray(v) for n, v in made.program.constants.items()},
-    )
+    program = made.program
+    constants = {n: jnp.asarray(v) for n, v in program.constants.items()}
 
     def mapping(t, constants):
         given = dict(zip(("s11", "s12", "s22"), t, strict=True))

@@ -23,6 +23,7 @@ from scipy import sparse
 
 from beamfit.greybox import problem
 from beamfit.greybox.covariance import FEW, null_space, triangle
+from beamfit.greybox.descend import slopes_of_few
 from beamfit.greybox.problem import Problem
 from beamfit.greybox.sparse import Rows, in_units, lengths, weakest
 
@@ -188,8 +189,15 @@ def first_order(core, theta):
 
 def slopes(p: Problem, theta: np.ndarray) -> Slopes:
     """Evaluate values and first derivatives at a point."""
-    parts = p.compiled(first_order)(np.asarray(theta, float))
-    return Slopes(*(np.asarray(part) for part in parts))
+    return slopes_at(p, np.asarray(theta, float)[None])[0]
+
+
+def slopes_at(p: Problem, points: np.ndarray) -> list[Slopes]:
+    """The same at points, shape (k, n); of few squares alone by what their search compiles."""
+    if not (p.constraints or p.objectives) and len(p.start) <= FEW:
+        return [of_squares(*each) for each in zip(*slopes_of_few(p)(points), strict=True)]
+    call = p.compiled(first_order)
+    return [Slopes(*map(np.asarray, call(point))) for point in points]
 
 
 def nearby(p: Problem, theta: np.ndarray, unit: np.ndarray) -> np.ndarray:

@@ -365,7 +365,7 @@ def groups_of(
     residuals : sequence of ndarray
         In units of their errors, zero where the weight is.
     blocks : sequence of ndarray
-        `triangle` of each record's rows of the Jacobian.
+        `triangle` of each record's rows of the Jacobian, and of those of the priors.
     seen : Spread
         Of the directions that all rows together see.
 
@@ -378,10 +378,12 @@ def groups_of(
     A guess s0 worth ν0 degrees of freedom makes the variance (ν0 s0² + χ²)/(ν0 + dof): a scaled
     inverse χ² prior, A. Gelman et al., Bayesian Data Analysis (3rd ed., 2013), section 2.6.
     """
-    found, first = [], 0
-    for record, r, block in zip(records, residuals, blocks, strict=True):
+    found, first, whole = [], 0, sum(block.shape[0] for block in blocks)
+    for record, r, block in zip(records, residuals, blocks, strict=False):
         chi2, count = float(r @ r), int(record.used.sum())
-        dof = round(count - seen.trace(block), 9)
+        # The trace over all rows is their rank.
+        hat = seen.rank if block.shape[0] == whole else seen.trace(block)
+        dof = round(count - hat, 9)
         freedom, squares = record.prior_noise
         scale = math.sqrt((squares + chi2) / (freedom + dof)) if dof > 0 else math.nan
         scale = max(1.0, scale) if record.errors_given else scale

@@ -104,6 +104,7 @@ class Descent:
     def __init__(self, slopes: Slopes, points, lower, upper, tolerance=TOLERANCE, many=False):
         self.slopes, self.lower, self.upper = slopes, np.asarray(lower), np.asarray(upper)
         self.tolerance, self.many = tolerance, many
+        self.above = np.tri(self.lower.size + 1).T
         self.theta = np.clip(np.asarray(points, float), lower, upper)
         k = len(self.theta)
         self.residual, self.jacobian = slopes(np.arange(k), self.theta)
@@ -118,10 +119,14 @@ class Descent:
         """True for each start that has come to rest or cannot move."""
         return self.rested | self.stuck
 
+    def _squares(self, lanes: np.ndarray) -> np.ndarray:
+        rows = self.residual[lanes]
+        return _dot(rows, rows)
+
     @property
     def cost(self) -> np.ndarray:
         """Half the sum of squares of each; infinite where something is not finite."""
-        cost = 0.5 * np.sum(self.residual**2, axis=1)
+        cost = 0.5 * _dot(self.residual, self.residual)
         return np.where(np.isfinite(cost), cost, np.inf)
 
     @property
@@ -131,22 +136,25 @@ class Descent:
 
     def go(self, lanes: np.ndarray, limit: int, until: float | None = None) -> None:
         """Move some searches on to a number of steps, or until a moment on the clock."""
-        while until is None or time.perf_counter() < until:
-            moving = lanes[~self.done[lanes] & (self.steps[lanes] < limit)]
-            if not len(moving):
-                return
-            self._advance(moving)
+        with np.errstate(all="ignore"):
+            while until is None or time.perf_counter() < until:
+                moving = lanes[~self.done[lanes] & (self.steps[lanes] < limit)]
+                if not len(moving):
+                    return
+                self._advance(moving)
 
     def _reduced(self, residuals: np.ndarray, jacobians: np.ndarray):
         """Right sides and rows with the same squares: of few numbers the triangles of (J, r)."""
         if self.many:
-            return residuals, jacobians
-        n = jacobians.shape[2]
+            rows = np.empty(len(residuals), object)
+            rows[:] = [NormalEquations(one) for one in jacobians]
+            return residuals, rows
+        k, m, n = jacobians.shape
         wide = np.concatenate([jacobians, residuals[..., None]], axis=2)
-        rows = np.empty((len(wide), min(wide.shape[1], n + 1), n + 1))
+        rows = np.empty((k, min(m, n + 1), n + 1))
         for lane, one in enumerate(wide):
             rows[lane] = lapack.dgeqrf(one)[0][: n + 1]
-        rows *= np.tri(n + 1, rows.shape[1]).T
+        rows *= self.above[:m]
         return rows[..., n], rows[..., :n]
 
     def _advance(self, lanes: np.ndarray) -> None:
@@ -155,13 +163,15 @@ class Descent:
         self.scale[lanes] = scale = np.maximum(self.scale[lanes], _lengths(rows))
         points = self._proposed(lanes, self.right[lanes], rows)
         theta = self.theta[lanes]
-        small = _length(scale * (points - theta)) <= self.tolerance * _length(scale * theta)
+        step = points - theta
+        moved = _times(rows, step)
+        promised = -_dot(moved, self.right[lanes] + 0.5 * moved)
+        small = _length(scale * step) <= self.tolerance * _length(scale * theta)
         self.rested[lanes] = small
-        lanes, points, rows = lanes[~small], points[~small], rows[~small]
+        if small.any():
+            lanes, points, promised = lanes[~small], points[~small], promised[~small]
         if not len(lanes):
             return
-        moved = _times(rows, points - theta[~small])
-        promised = -np.sum(moved * (self.right[lanes] + 0.5 * moved), axis=1)
         tried = self._tried(lanes, points, promised)
         bent, points = self._bent(lanes, tried, promised)
         if len(bent):
@@ -180,8 +190,7 @@ class Descent:
         old = self.residual[lanes]
         new, slope = self.slopes(lanes, points)
         self.steps[lanes] += 1
-        with np.errstate(all="ignore"):
-            ratio = 0.5 * np.sum((old - new) * (old + new), axis=1) / promised
+        ratio = 0.5 * _dot(old - new, old + new) / promised
         usable = _finite(new, slope) & (promised > 0)
         return Tried(points, new, slope, np.where(usable, ratio, -np.inf))
 
@@ -192,26 +201,25 @@ class Descent:
         the step was solved for: a little further step along their curve, where it is expected to
         bring most of what the straight one missed.
         """
-        squares = np.sum(self.residual[lanes] ** 2, axis=1)
-        poor = (tried.ratio < BENT) & np.isfinite(tried.ratio) & (promised > FINISHED * squares)
-        at = np.flatnonzero(poor)
+        poor = (tried.ratio < BENT) & np.isfinite(tried.ratio)
+        at = np.flatnonzero(poor & (promised > FINISHED * self._squares(lanes)))
         if not len(at):
             return at, tried.theta[at]
         jacobian, new, ends = self.jacobian[lanes[at]], tried.residual[at], tried.theta[at]
         change = ends - self.theta[lanes[at]]
-        curved = self._reduced(new - _times(jacobian, change), jacobian)
+        right = new - _times(jacobian, change)
+        curved = (right, self.rows[lanes[at]]) if self.many else self._reduced(right, jacobian)
         points = self._proposed(lanes[at], *curved)
         more, scale = points - ends, self.scale[lanes[at]]
         left = new + _times(jacobian, more)
-        gain = 0.5 * np.sum((new - left) * (new + left), axis=1)
+        gain = 0.5 * _dot(new - left, new + left)
         worth = gain > MISSED * (1.0 - tried.ratio[at]) * promised[at]
         worth &= _length(scale * more) <= NEAR * _length(scale * change)
         return at[worth], points[worth]
 
     def _take(self, lanes: np.ndarray, tried: Tried, promised: np.ndarray) -> None:
         """Take the steps that lower the cost; damp less after those, more after the others."""
-        squares = np.sum(self.residual[lanes] ** 2, axis=1)
-        ratio, plain = tried.ratio, promised >= 0
+        squares, ratio, plain = self._squares(lanes), tried.ratio, promised >= 0
         finite = _finite(tried.residual, tried.jacobian) & (self.damping[lanes] <= DAMPING)
         last = finite & plain & (promised <= FINISHED * squares)
         good = (ratio > 1e-4) | last
@@ -220,7 +228,7 @@ class Descent:
         self.jacobian[taken] = tried.jacobian[good]
         reduced = self._reduced(tried.residual[good], tried.jacobian[good])
         self.right[taken], self.rows[taken] = reduced
-        ratio = np.clip(ratio[good], -1.0, 1.0)
+        ratio = ratio[good].clip(-1.0, 1.0)
         self.damping[taken] *= np.maximum(1 / 3, 1 - (2 * ratio - 1) ** 3)
         self.growth[taken] = 2.0
         self.damping[refused] *= self.growth[refused]
@@ -238,14 +246,18 @@ class Descent:
         self.rested[lane] = self.stuck[lane] = False
 
 
+def _dot(rows: np.ndarray, others: np.ndarray) -> np.ndarray:
+    return np.einsum("km,km->k", rows, others)
+
+
 def _length(rows: np.ndarray) -> np.ndarray:
-    return np.linalg.norm(rows, axis=-1)
+    return np.sqrt(_dot(rows, rows))
 
 
 def _lengths(jacobians: np.ndarray) -> np.ndarray:
-    """Lengths of the columns of each; of many numbers they are an array of matrices."""
+    """Lengths of the columns of each; of many numbers they are an array of normal equations."""
     if jacobians.dtype == object:
-        return np.stack([lengths(one) for one in jacobians])
+        return np.stack([one.lengths for one in jacobians])
     return np.sqrt(np.einsum("kmn,kmn->kn", jacobians, jacobians))
 
 
@@ -269,7 +281,7 @@ def _pinned(g: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
 
 def _placed(theta, held, unit, low, high, lower, upper) -> np.ndarray:
     """The next point: exactly on a bound, or the number is not known to be there."""
-    inside = np.clip(theta + held / unit, lower, upper)
+    inside = (theta + held / unit).clip(lower, upper)
     return np.where(held <= low, lower, np.where(held >= high, upper, inside))
 
 
@@ -288,11 +300,11 @@ def _next(theta, right, rows, scale, damping, lower, upper) -> np.ndarray:
         at = np.where(pinned, held, 0.0)
         loose = np.where(pinned[:, None], 0.0, rows)
         tried = _damped(loose, -right - _times(rows, at), np.where(pinned, 1.0, root), at)
-        held = np.clip(tried, low, high)
-        more = pinned | (held != tried)
-        if np.array_equal(more, pinned):
+        held = tried.clip(low, high)
+        left = held != tried
+        if not (left & ~pinned).any():
             break
-        pinned = more
+        pinned |= left
     found = _placed(theta, held, unit, low, high, lower, upper)
     return np.where(np.isfinite(held).all(axis=1, keepdims=True), found, theta)
 
@@ -311,10 +323,10 @@ def _damped(rows: np.ndarray, right: np.ndarray, alone: np.ndarray, at: np.ndarr
     return found
 
 
-def _next_of_many(theta, residual, jacobian, scale, damping, lower, upper) -> np.ndarray:
+def _next_of_many(theta, residual, rows, scale, damping, lower, upper) -> np.ndarray:
     """`_next` of each start, by normal equations of the numbers that are not pinned."""
     found = np.full_like(theta, np.nan)
-    for lane, at in enumerate(zip(theta, residual, jacobian, scale, damping, strict=True)):
+    for lane, at in enumerate(zip(theta, residual, rows, scale, damping, strict=True)):
         try:
             found[lane] = _seminormal(*at, lower, upper)
         except np.linalg.LinAlgError:  # refused, and damped more
@@ -322,17 +334,15 @@ def _next_of_many(theta, residual, jacobian, scale, damping, lower, upper) -> np
     return found
 
 
-def _seminormal(theta, residual, jacobian, scale, damping, lower, upper) -> np.ndarray:
+def _seminormal(theta, residual, normal, scale, damping, lower, upper) -> np.ndarray:
     unit = np.where(scale > 0, scale, 1.0)
     low, high = (lower - theta) * unit, (upper - theta) * unit
-    rows = in_units(jacobian, unit)
-    normal = rows.T @ rows
+    rows = normal.in_units(unit)
     pinned = _pinned(rows.T @ residual, low, high)
     held, more = np.zeros(len(theta)), max(damping, RIDGE)
     for _ in range(PINNED):
-        loose, held = np.flatnonzero(~pinned), np.where(pinned, held, 0.0)
-        part = normal if len(loose) == len(theta) else normal[loose][:, loose]
-        factor = Factor(with_diagonal(part, more))
+        loose, held = ~pinned, np.where(pinned, held, 0.0)
+        factor = normal.factor(more, loose)
         for _ in range(2):  # the second corrects the rounding of the first
             left = rows.T @ (residual + rows @ held) + damping * held
             held[loose] -= factor.solve(left[loose])
@@ -344,10 +354,37 @@ def _seminormal(theta, residual, jacobian, scale, damping, lower, upper) -> np.n
     return _placed(theta, held, unit, low, high, lower, upper)
 
 
+class NormalEquations:
+    """Normal equations of a Jacobian, its columns in units that stay; the last factor is kept."""
+
+    def __init__(self, jacobian: Rows):
+        self.jacobian, self.lengths = jacobian, lengths(jacobian)
+        self.rows: Rows | None = None
+        self.kept: tuple[float, np.ndarray, Factor] | None = None
+
+    def __matmul__(self, step: np.ndarray) -> np.ndarray:
+        return self.jacobian @ step
+
+    def in_units(self, unit: np.ndarray) -> Rows:
+        """The Jacobian with its columns in units, those of the first call."""
+        if self.rows is None:
+            self.rows = in_units(self.jacobian, unit)
+            self.matrix = self.rows.T @ self.rows
+        return self.rows
+
+    def factor(self, damping: float, loose: np.ndarray) -> Factor:
+        """Factor of the damped equations of the numbers that are loose."""
+        if self.kept is None or self.kept[0] != damping or not np.array_equal(self.kept[1], loose):
+            part = self.matrix if loose.all() else self.matrix[loose][:, loose]
+            self.kept = damping, loose, Factor(with_diagonal(part, damping))
+        return self.kept[2]
+
+
 def descent_of(p: Problem, points: np.ndarray) -> Descent:
     """Searches of a problem, by the method for as many free numbers as it has."""
     many = len(p.start) > FEW
-    slopes = _slopes_of_many(p) if many else _slopes_of_few(p)
+    few = slopes_of_few(p)
+    slopes = _slopes_of_many(p) if many else lambda _, points: few(points)
     return Descent(slopes, points, p.lower, p.upper, many=many)
 
 
@@ -358,16 +395,16 @@ def costs(p: Problem, d: Descent, points: np.ndarray) -> np.ndarray:
     return np.array([0.5 * float(r @ r) for r in map(np.asarray, found)])
 
 
-def _slopes_of_few(p: Problem) -> Slopes:
-    """A few points in each compiled call, whose width is one however many starts there are."""
+def slopes_of_few(p: Problem) -> Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]:
+    """Residuals and Jacobians, a few points in each compiled call: one width for all counts."""
     width = WIDTH if len(p.start) * p.size <= LARGE else 1
     call = p.compiled(_sloped_each)
 
-    def slopes(_: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        fill = np.repeat(points[:1], -len(points) % width, axis=0)
-        parts = np.split(np.concatenate([points, fill]), (len(points) + len(fill)) // width)
-        found = zip(*(map(np.asarray, call(part)) for part in parts), strict=True)
-        r, j = (np.concatenate(every)[: len(points)] for every in found)
+    def slopes(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        firsts = range(0, len(points), width)
+        # The last part is filled with its last point.
+        found = [call(points.take(range(i, i + width), 0, mode="clip")) for i in firsts]
+        r, j = (np.concatenate(every)[: len(points)] for every in zip(*found, strict=True))
         return r, j
 
     return slopes

@@ -62,10 +62,12 @@ def diagnose(p: Problem) -> tuple[Ailment, ...]:
     start = np.clip(p.start, p.lower, p.upper)
     if wrong := contradictory(p):
         return tuple(wrong)
+    points = [start, *assess.nearby(p, p.start, np.maximum(np.abs(p.start), 1.0))]
+    first, *others = assess.slopes_at(p, np.array(points))
     # Part by part only what is known to be wrong: that is traced anew each time.
-    if not assess.slopes(p, start).finite and (wrong := not_finite(p, start)):
+    if not first.finite and (wrong := not_finite(p, start)):
         return tuple(wrong)
-    looks = [at for at in _looks(p) if at.finite]
+    looks = [at for at in (first, *others) if at.finite]
     if not looks:  # a slope is not finite anywhere near: nothing to read off
         return ()
     return (*_unused(p, looks), *_undetermined(p, looks), *_dependent(p, looks), *_scaled(p, looks))
@@ -124,12 +126,6 @@ def _parts(p: Problem) -> Iterator[tuple[str, str, Callable[[Any], jax.Array]]]:
             yield what, part.name, lambda model, part=part: part.function(model, part.data)
 
 
-def _looks(p: Problem) -> list[assess.Slopes]:
-    start = np.clip(p.start, p.lower, p.upper)
-    points = [start, *assess.nearby(p, p.start, np.maximum(np.abs(p.start), 1.0))]
-    return [assess.slopes(p, point) for point in points]
-
-
 def _depends(looks: list[np.ndarray]) -> np.ndarray:
     """True for each row and number that it depends on, at any of the points."""
     return np.any([rows != 0 for rows in looks], axis=0)
@@ -170,12 +166,16 @@ def _open(looks: list[np.ndarray]) -> np.ndarray:
     for rows in looks:
         _, unseen, reach = directions(rows)
         every &= np.max(np.abs(unseen), axis=1, initial=0.0) > CUT**0.5 * reach
+        if not every.any():
+            break
     return every
 
 
 def _dependent(p: Problem, looks: list[assess.Slopes]) -> Iterator[Ailment]:
     """Equations among which one follows from the others or contradicts them."""
     equal = np.flatnonzero(p.equations)
+    if not len(equal):
+        return
     loose = _open([at.jacobian[equal][:, p.moving].T for at in looks])
     names = tuple(np.array(p.constraint_names)[equal][loose].tolist())
     if names:

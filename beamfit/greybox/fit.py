@@ -160,7 +160,7 @@ class Fit:
     seconds: float
     about: tuple[str, ...] = ()
 
-    @property
+    @cached_property
     def model(self) -> Any:
         """The model with the fitted numbers."""
         return self.problem.model_at(self.theta)

@@ -135,7 +135,7 @@ def known(p: Problem, s: SearchState) -> Known:
     blocks = [triangle(s.at.residual_jacobian[first:last]) for first, last in parts]
     nowhere = np.full(len(held), np.inf)
     seen = spread_of(_stacked(blocks), -nowhere, nowhere, held, None, equations)
-    groups = groups_of(p.records, np.split(s.at.residual, ends)[:-1], blocks[:-1], seen)
+    groups = groups_of(p.records, np.split(s.at.residual, ends)[:-1], blocks, seen)
     still = (np.isin(s.bounds.states(s.found.bounds), EDGES) & p.nuisance) | ~p.moving
 
     limited = np.isfinite(p.upper - p.lower) & p.moving & ~p.with_prior
@@ -453,7 +453,7 @@ def gauges(p: Problem, theta: np.ndarray, unseen: np.ndarray) -> tuple[Gauge, ..
     if not open_ones.shape[1]:
         return ()
     basis = np.linalg.qr(open_ones)[0]
-    size = np.where(theta != 0, np.abs(theta), 1.0)
+    size = _size(theta)
     part = np.linalg.norm(basis, axis=1)
     moved = np.flatnonzero(part > TIED**2)
     tied = np.abs(basis[moved] @ basis[moved].T) > TIED * np.outer(part[moved], part[moved]) + 1e-12
@@ -463,7 +463,7 @@ def gauges(p: Problem, theta: np.ndarray, unseen: np.ndarray) -> tuple[Gauge, ..
         _, sizes, turned = np.linalg.svd(basis[at].T)
         free = int(np.sum(sizes > TIED * sizes[0]))
         change = turned[0] / size[at]
-        if len(at) > 1 and free < len(at):
+        if len(at) > 1 and free < len(at) and _everywhere(p, theta, at, free):
             shares = change / np.max(np.abs(change)) * np.sign(change[0])
             names = tuple(p.names[i] for i in at)
             found.append(Gauge(names, tuple(shares.tolist()), free))
@@ -474,21 +474,39 @@ def _still(p: Problem, theta: np.ndarray, unseen: np.ndarray) -> np.ndarray:
     """Combinations of directions along which rows change at no made-up settings."""
     if not unseen.shape[1]:
         return unseen
-    random, size = np.random.default_rng(0), np.where(theta != 0, np.abs(theta), 1.0)
-    rows = []
-    for _ in range(LOOKS):
-        records = tuple(
-            dataclasses.replace(r, data=jax.tree.map(lambda v: _moved(v, random), r.data))
-            for r in p.core.records
-        )
-        core = dataclasses.replace(p.core, records=records)
-        jacobian = np.asarray(compiled_at(sloped, core)(theta)[1])
-        usable = np.all(np.isfinite(jacobian), axis=1)
-        terms = np.linalg.norm(jacobian[usable] * size, axis=1, keepdims=True)
-        rows.append(jacobian[usable] / np.where(terms > 0, terms, 1.0))
+    random, size = np.random.default_rng(0), _size(theta)
+    rows = np.vstack([_made_up(p, theta, random) for _ in range(LOOKS)])
     along = unseen / np.linalg.norm(unseen / size[:, None], axis=0)
-    _, sizes, turned = np.linalg.svd(np.vstack(rows) @ along, full_matrices=True)
+    _, sizes, turned = np.linalg.svd(rows / size @ along, full_matrices=True)
     return along @ turned[int(np.sum(sizes > STILL)) :].T
+
+
+def _everywhere(p: Problem, theta: np.ndarray, at: np.ndarray, free: int) -> bool:
+    """True if numbers are tied at smaller values, too: those run along a ridge are not."""
+    random = np.random.default_rng(0)
+    for _ in range(LOOKS):
+        point = np.clip(theta * random.uniform(size=len(theta)), p.lower, p.upper)
+        sizes = np.linalg.svd(_made_up(p, point, random)[:, at], compute_uv=False)
+        if np.sum(sizes > STILL * np.max(sizes, initial=0.0)) > len(at) - free:
+            return False
+    return True
+
+
+def _size(theta: np.ndarray) -> np.ndarray:
+    return np.where(theta != 0, np.abs(theta), 1.0)
+
+
+def _made_up(p: Problem, theta: np.ndarray, random: np.random.Generator) -> np.ndarray:
+    """Rows at made-up settings, of unit length in the sizes of the numbers."""
+    records = tuple(
+        dataclasses.replace(r, data=jax.tree.map(lambda v: _moved(v, random), r.data))
+        for r in p.core.records
+    )
+    core = dataclasses.replace(p.core, records=records)
+    rows = np.asarray(compiled_at(sloped, core)(theta)[1]) * _size(theta)
+    rows = rows[np.all(np.isfinite(rows), axis=1)]
+    terms = np.linalg.norm(rows, axis=1, keepdims=True)
+    return rows / np.where(terms > 0, terms, 1.0)
 
 
 def _moved(value: Any, random: np.random.Generator) -> Any:

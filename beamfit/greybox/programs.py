@@ -64,8 +64,8 @@ class SolverEnd(NamedTuple):
     said: str
 
 
-def _uno(preset: str) -> Callable[[NonlinearProgram, np.ndarray, int], SolverEnd]:
-    """A solver by Uno with one of its presets."""
+def _uno(preset: str, **more: float) -> Callable[[NonlinearProgram, np.ndarray, int], SolverEnd]:
+    """A solver by Uno with one of its presets, and options of its own."""
 
     def solve(
         program: NonlinearProgram, x: np.ndarray, iterations: int, budget: SearchLimit
@@ -79,6 +79,8 @@ def _uno(preset: str) -> Callable[[NonlinearProgram, np.ndarray, int], SolverEnd
         solver.set_option("primal_tolerance", min(1e-9, 1e-3 * budget.tolerance))
         solver.set_option("dual_tolerance", min(1e-8, 1e-2 * budget.tolerance))
         solver.set_option("time_limit", float(min(120.0, max(budget.left, 0.01))))
+        for name, value in more.items():
+            solver.set_option(name, value)
         found = solver.optimize(_uno_model(unopy, program, x))
         # Uno reports an infeasible problem as an optimisation status of success.
         said = f"{found.solution_status.name}, {found.optimization_status.name}"
@@ -185,6 +187,10 @@ class Stage(NamedTuple):
     solve: Callable[[NonlinearProgram, np.ndarray, int, SearchLimit], SolverEnd]
 
 
+# Squares of fewer residuals than numbers vanish in many places, and a method of active sets ends in
+# a corner of the limits before it finds one: a barrier, at first as strong as one standard
+# deviation of the residuals, keeps it away from these.
+INSIDE = Stage("Uno ipopt", "ipopt", "exact", 250, _uno("ipopt", barrier_initial_parameter=1.0))
 _SHARP = Stage("Uno filtersqp", "filtersqp", "exact", 300, _uno("filtersqp"))
 # Solvers in the order they are tried.
 SOLVERS: tuple[Stage, ...] = (

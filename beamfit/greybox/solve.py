@@ -17,7 +17,7 @@ from beamfit.greybox.diagnosis import contradictory, not_finite
 from beamfit.greybox.fit import Attempt, Fit
 from beamfit.greybox.judge import Search, conclude, outgrown, refused, settled
 from beamfit.greybox.problem import Problem
-from beamfit.greybox.programs import SOLVERS, SearchLimit, scaled
+from beamfit.greybox.programs import INSIDE, SOLVERS, SearchLimit, scaled
 
 METHOD, SQUARES = "Levenberg-Marquardt", "levenberg-marquardt"
 # Steps from each of many starts, and number of cheapest ends that are polished.
@@ -49,6 +49,7 @@ def solve(
     Problems with constraints or further objectives go to Uno's sequential quadratic programming,
     with the Gauss-Newton Hessian first (networks fitted to few data have flat valleys in which the
     exact one crawls), then with the exact Hessian, then to scipy where Uno ends without an optimum.
+    Squares of fewer residuals than free numbers begin with its interior point.
     Whether a point is an optimum is decided by our own KKT residual and second-order test, in the
     problem's own sizes; where the cost bends down, the search moves off and goes on. The best
     feasible point is the answer, whatever its status.
@@ -354,7 +355,9 @@ def _program(
     scale = assess.scale_of(p, start, at)
     # Squares say nothing of further objectives; foreign code may have first derivatives only.
     usable = {"none", hessian} if p.objectives else {"none", "gauss_newton", hessian}
-    stages = [s for s in SOLVERS if s.hessian in usable and budget.solver in (None, s.preset)]
+    loose = p.residual_count + int(np.sum(p.equations)) < int(np.sum(p.moving))
+    order = (INSIDE, *SOLVERS) if loose and not p.objectives else SOLVERS
+    stages = [s for s in order if s.hessian in usable and budget.solver in (None, s.preset)]
     exact = hessian == "exact"
     best, tried, steps, said = None, [], 0, ""
     for stage in stages:

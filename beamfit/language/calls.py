@@ -117,7 +117,7 @@ def _function(s: Setting, callee: Scope | Net, run: Callable, wanted) -> Callabl
 def defaults(callee: Scope | Net) -> Arrays:
     """Inputs that the document gives values to."""
     given = {n: a for n, a in callee.inputs.items() if a.values is not None}
-    return {n: jnp.asarray(a.values, float).reshape(a.shape) for n, a in given.items()}
+    return {n: jnp.asarray(np.reshape(a.values, a.shape), float) for n, a in given.items()}
 
 
 def _network(callee: Net, given: Arrays, names: list[str]) -> Arrays:

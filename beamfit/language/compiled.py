@@ -319,7 +319,7 @@ def _gain(program: Program, output: str, by: str, given, constants) -> jax.Array
 def outputs_at(program: Program, given: Mapping[str, Any]) -> dict[str, np.ndarray]:
     """All outputs at values of the inputs, compiled once for each document."""
     names = tuple(program.scope.outputs)
-    found = _outputs(program, names, dict(given), _constants(program))
+    found = _outputs(program, names, dict(given), program.constants)
     return dict(zip(names, map(np.asarray, found), strict=True))
 
 
@@ -334,7 +334,6 @@ def gains_at(
         If one is not written so, or asks for what the mapping has not.
     """
     found, scope = {}, program.scope
-    given = defaults(scope) | {n: jnp.asarray(v, float) for n, v in given.items()}
     for gain in gains:
         output, by = parts_of(gain)
         for name, face, what in ((output, scope.outputs, "output"), (by, scope.inputs, "input")):
@@ -342,12 +341,9 @@ def gains_at(
                 expected = f"an {what} of the document: {nearest(name, list(face))}"
                 raise InputError(f"'{name}' in --derivative {gain}", expected)
         key = f"d{output}/d{by}"
-        found[key] = np.asarray(_gain(program, output, by, given, _constants(program)))
+        at = defaults(scope) | dict(given)
+        found[key] = np.asarray(_gain(program, output, by, at, program.constants))
     return found
-
-
-def _constants(program: Program) -> dict[str, jax.Array]:
-    return {n: jnp.asarray(v) for n, v in program.constants.items()}
 
 
 def compute_document(

@@ -100,6 +100,7 @@ def formulate(
     document: d.Document,
     tables: Mapping[str, np.ndarray] | None = None,
     values: Mapping[str, Sequence[float]] | None = None,
+    tolerance: float = core.TOLERANCE,
 ) -> Formulation:
     """State the problem of a document.
 
@@ -115,6 +116,8 @@ def formulate(
     values : mapping of str to sequence of float, optional
         Values of inputs in the place of the document's: one number, or all in C order. Of a
         variable it is where the search starts.
+    tolerance : float
+        Of the problem.
 
     Returns
     -------
@@ -168,7 +171,7 @@ def formulate(
         )
         for c in p.limits
     ]
-    problem = core.Problem(model, free, records, (), limits, objectives)
+    problem = core.Problem(model, free, records, (), limits, objectives, tolerance)
     sign = -1.0 if p.maximize else 1.0
     notes += tuple(_unqualified(document))
     return Formulation(document, program, problem, least, 2.0 if least else sign, notes)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import islice
 from typing import Any
 
@@ -229,11 +229,11 @@ def solve_document(
     y = 1, optimal upper
     """
     began = time.perf_counter()
-    made, notes = _started(formulate(document, tables, values))
     told, warnings = _told(document.solver)
     told |= {name: value for name, value in options.items() if value is not None}
-    problem = replace(made.problem, tolerance=told.pop("tolerance", TOLERANCE))
-    fit = solve(problem, starts=starts, began=began, **told)
+    tolerance = told.pop("tolerance", TOLERANCE)
+    made, notes = _started(formulate(document, tables, values, tolerance))
+    fit = solve(made.problem, starts=starts, began=began, **told)
     notes = (*made.notes, *notes, *_ailments(made, fit), *warnings, *_places(made, fit))
     if fit.status is Status.not_finite:
         cause = _cause(made, fit.model)
