@@ -214,8 +214,8 @@ class Monitor(NamedTuple):
 FEWEST_LIFETIMES = 4
 # Readings of a record that a notebook shows.
 MOST_SHOWN = 20
-# Multiples of a digit are exact to this part of it where readings seldom repeat.
-EXACT = 1e-3
+# Multiples of a digit are exact to this part of it where readings seldom repeat; so many tell.
+EXACT, ENOUGH = 1e-3, 4096
 # A pressure that departs from P0 + P1 I by less than this share of the record's mean, on average
 # up to any time, follows the current.
 FOLLOWS = 2e-3
@@ -229,7 +229,7 @@ def _digit(values: np.ndarray) -> float | None:
     if levels.size < 2:
         return None
     steps = np.diff(levels)
-    step = float(steps.min())
+    step, steps = float(steps.min()), steps[:ENOUGH]
     multiples = np.round(steps / step)
     off = np.abs(steps / step - multiples)
     if levels.size <= values.size / 2:
