@@ -366,4 +366,4 @@ def _good(e: ResponseEvidence) -> Finding:
     return Finding(Status.converged, cause)
 
 
-RULES = (_lost, _nothing, _joint, _lawful, _fed_back, _lower, _open, _refuted, _worse, _good)
+RULES = (_lost, _nothing, _joint, _lawful, _fed_back, _lower, _refuted, _open, _worse, _good)
