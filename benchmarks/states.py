@@ -6,9 +6,9 @@ a network state space of as many nodes, on a run that was held back. Then 30 000
 system: time and the most memory; and the same by jax-sysid (L-BFGS as its page has it) where the
 python of its own environment is named: python benchmarks/states.py /tmp/venv-sysid/bin/python.
 
-python benchmarks/states.py eqs: report eqs 1 and 2 on plants of two states, an input and a known
-parameter rho, linear or bent, identified anew with several noises: how many coefficients of A and B
-about the rest lie within one error of the truth, and within 1.96.
+python benchmarks/states.py eqs [first seed, seeds]: report eqs 1 and 2 on plants of two states, an
+input and a known parameter rho, linear or bent, identified anew with several noises: how many
+coefficients of A and B about the rest lie within one error of the truth, and within 1.96.
 """
 
 from __future__ import annotations
@@ -163,7 +163,7 @@ def slopes(after, u, step=1e-6):
                           [((x, u + d), (x, u - d)) for d in moves])]  # fmt: skip
 
 
-def coefficients(plant: str, noises: int = 12, samples: int = 300) -> None:
+def coefficients(plant: str, first: int = 0, noises: int = 12, samples: int = 300) -> None:
     """Pulls of A and B where the states are the outputs."""
     form, more = PLANTS[plant]
     pulls = []
@@ -171,7 +171,7 @@ def coefficients(plant: str, noises: int = 12, samples: int = 300) -> None:
     def after(x, u):
         return A @ x + B @ u + more(x, u)
 
-    for seed in range(noises):
+    for seed in range(first, first + noises):
         random, x, y = np.random.default_rng(seed), np.zeros(2), []
         u = np.repeat(random.normal(size=(samples // 8 + 1, 2)), 8, axis=0)[:samples]
         for now in u:
@@ -190,9 +190,9 @@ def coefficients(plant: str, noises: int = 12, samples: int = 300) -> None:
 
 
 if __name__ == "__main__":
-    if sys.argv[1:] == ["eqs"]:
+    if sys.argv[1:2] == ["eqs"]:
         for plant in PLANTS:
-            coefficients(plant)
+            coefficients(plant, *map(int, sys.argv[2:]))
         sys.exit()
     long(sys.argv[1] if len(sys.argv) > 1 else None)
     compare()

@@ -156,7 +156,7 @@ def told(
 
     def is_open(name: str, q: Quantity) -> bool:
         # Readings see what a sample leaves, exp(-apart/tau): its relative error is larger by this.
-        below = 1.0 if name == "delay" else max(1.0, seen.apart / abs(q.value))
+        below = 1.0 if name == "delay" else max(1.0, seen.apart / (abs(q.value) or 1e-99))
         wide = q.unit == TIME and q.error is not None and q.error * below > WIDE * abs(q.value)
         # A higher order that is a first one determines only its gains and its longer lag.
         more = checks.first_order and not name.startswith(("K", "offset", "tau1", "delay"))
@@ -366,4 +366,4 @@ def _good(e: ResponseEvidence) -> Finding:
     return Finding(Status.converged, cause)
 
 
-RULES = (_lost, _nothing, _joint, _lawful, _fed_back, _lower, _open, _refuted, _worse, _good)
+RULES = (_lost, _nothing, _joint, _lawful, _fed_back, _lower, _refuted, _open, _worse, _good)

@@ -1,4 +1,4 @@
-"""Laws between an input and what it moves: play, hysteresis, stop and dead zone, by evidence.
+"""Laws between an input and what it moves, such as a play or a dead zone, by evidence.
 
 A response behind a law leaves residuals that a noise that wanders takes for its own, and gains far
 off. So every law is fitted beside no law and beside one more term of a fuller response, each under
@@ -28,9 +28,11 @@ from beamfit.greybox.problem import with_slope
 from beamfit.noise.memory import CorrelatedNoise, innovations
 
 # Laws, and half widths of each as shares of an input's range: prior flat in their logarithm. A stop
-# hands on other values as soon as its width passes a move, the others change smoothly with it.
+# hands on other values as soon as its width passes a move. The others change smoothly with it, so
+# that it is a number to be fitted, with a prior about each of these as wide as half their distance.
 LAWS = {law: np.geomspace(0.005, 0.4, count) for law, count in
-        (("play", 8), ("hysteresis", 8), ("stop", 24), ("dead zone", 8))}  # fmt: skip
+        (("play", 8), ("hysteresis", 8), ("stop", 24), ("shift", 8), ("dead zone", 8))}  # fmt: skip
+BETWEEN = 0.5 * np.log(80.0) / 7
 # Plays of a hysteresis, as shares of the widest, which is twice its half width.
 PLAYS = (0.0, 0.4, 0.8, 1.2, 1.6, 2.0)
 # Correlation times and white variances of the noises that each is fitted with, and most readings.
@@ -84,14 +86,18 @@ def moved(u: np.ndarray, law: str, width: float | np.ndarray) -> np.ndarray:
     """One input as a law hands it on, shape (rows,), for each of several widths if given.
 
     A play follows when its clearance is used up; a hysteresis is the mean of plays of several
-    widths (Prandtl, Ishlinskii); a stop (Coulomb friction) goes all the way once it moves at all. A
-    dead zone lies about 0, or about the middle of a range without it.
+    widths (Prandtl, Ishlinskii); a stop (Coulomb friction) goes all the way once it moves at all; a
+    shift (friction against a spring) is to the side that the input last came from. A dead zone lies
+    about 0, or about the middle of a range without it.
     """
-    low, high = float(u.min()), float(u.max())
+    half, low, high = np.asarray(width)[..., None], float(u.min()), float(u.max())
     if law == "dead zone":
         away = u - (0.0 if low < 0 < high else 0.5 * (low + high))
-        half = np.asarray(width)[..., None]
         return u - np.clip(away, -half, half)
+    if law == "shift":
+        sign = np.sign(np.diff(u, prepend=u[0]))
+        last = np.maximum.accumulate(np.where(sign != 0, np.arange(len(u)), 0))
+        return u - half * sign[last]
     changes = np.diff(u, prepend=np.nan) != 0
     widths = np.multiply.outer(width, PLAYS if law == "hysteresis" else (1.0,))
     at, found = u[0] + 0 * widths, []
@@ -100,6 +106,15 @@ def moved(u: np.ndarray, law: str, width: float | np.ndarray) -> np.ndarray:
               else np.clip(at, now - widths, now + widths))  # fmt: skip
         found.append(at)
     return np.moveaxis(np.mean(found, axis=-1), 0, -1)[..., np.cumsum(changes) - 1]
+
+
+def _with_width(u: np.ndarray, law: str, widths: np.ndarray) -> np.ndarray:
+    """What a law hands on at each width, and its change with it, shape (widths, rows, 2)."""
+    at = moved(u, law, widths)
+    if law == "stop":
+        return np.stack([at, 0.0 * at], axis=2)
+    wider, closer = (moved(u, law, widths * np.exp(s)) for s in (BETWEEN, -BETWEEN))
+    return np.stack([at, 0.5 * (wider - closer)], axis=2)
 
 
 class _Candidates(NamedTuple):
@@ -112,8 +127,8 @@ class _Candidates(NamedTuple):
     prior : array, shape (a,)
         Prior of each law at each delay, at even odds of a law: even over its kinds, the widths of
         one, the delays. Laws that a gain and a level stand for have none.
-    inputs : list of array, shape (a + terms, samples, inputs)
-        Inputs of each run behind each.
+    inputs : list of array, shape (a + terms, samples, inputs, 2)
+        Inputs of each run behind each, and how they change with its width.
     terms : list of array, shape (a + terms, readings)
         What is added to the output of each run, zero for laws.
     """
@@ -134,18 +149,22 @@ def _candidates(
     runs: Sequence[Run], seen: PreparedOutput, delays: Sequence[float], more: Sequence[np.ndarray]
 ) -> _Candidates:
     plain = [np.stack(list(run.inputs.values()), axis=1) for run in runs]
-    names, kinds, behind = [""], [""], [[u] for u in plain]
+    names, kinds = [""], [""]
+    behind = [[np.stack([u, 0.0 * u], axis=2)] for u in plain]
     for i, (name, wide) in enumerate(zip(seen.inputs, np.ptp(seen.points, axis=0), strict=True)):
         design = np.concatenate([np.stack([u[:, i], np.ones(len(u))], axis=1) for u in plain])
         for law, shares in LAWS.items():
-            turned = [moved(u[:, i], law, shares * wide) for u in plain]
-            whole = np.concatenate(turned, axis=1).T
+            widths = shares * wide
+            turned = [_with_width(u[:, i], law, widths) for u in plain]
+            whole = np.concatenate([v[..., 0] for v in turned], axis=1).T
             rest = whole - design @ np.linalg.lstsq(design, whole, rcond=1e-10)[0]
             size = np.linalg.norm(whole - whole.mean(axis=0), axis=0)
             kinds += np.where(np.linalg.norm(rest, axis=0) > SAME * size, law, "same").tolist()
-            names += [f"a {law} of {name} by ±{w:.2g}" for w in shares * wide]
-            for each, u, t in zip(behind, plain, turned, strict=True):
-                each += [np.column_stack([u[:, :i], v, u[:, i + 1 :]]) for v in t]
+            names += [f"a {law} of {name} by ±{w:.2g}" for w in widths]
+            for each, t in zip(behind, turned, strict=True):
+                every = np.repeat(each[:1], len(t), axis=0)
+                every[:, :, i] = t
+                each += list(every)
     alike = Counter(kinds)
     some = max(len(alike.keys() - {"", "same"}), 1)
     odds = {kind: 1.0 / (some if kind else 1) / count for kind, count in alike.items()}
@@ -154,9 +173,11 @@ def _candidates(
     unit, terms = np.where(unit > 0, unit, 1.0), more[0].shape[1]
     inputs, added = [], []
     for run, each, x in zip(seen.runs, behind, more, strict=True):
-        late = [np.stack([delayed(u, delay) for u in each]) for delay in delays]
+        flat = np.array(each).reshape(len(each), len(each[0]), -1)
+        late = [np.stack([delayed(u, delay) for u in flat]) for delay in delays]
         late = [np.repeat(u, len(run.u) // u.shape[1], axis=1) for u in late]
-        inputs.append(np.concatenate([*late, np.repeat(late[0][:1], terms, axis=0)]))
+        late = np.concatenate([*late, np.repeat(late[0][:1], terms, axis=0)])
+        inputs.append(late.reshape(*late.shape[:2], *each[0].shape[1:]))
         added.append(np.concatenate([np.zeros((len(each) * len(delays), len(x))), (x / unit).T]))
     return _Candidates(names, np.tile(prior, len(delays)) / len(delays), inputs, added)
 
@@ -166,18 +187,21 @@ def _triangles(chosen: Any, model: Any, run: Driven, data: Any, theta: Any, u: A
     """Triangular factors of slopes and residuals of each law, and log volumes, by each noise.
 
     `data` are readings, their times, the size of their noise, and what is added; `noise` all that
-    are looked at, which of them first, and how many. The last number is the share of what is added.
+    are looked at, which of them first, and how many. The last number is the share of what is added,
+    or by how much the width of a law is another.
     """
     y, time, size, term = data
     every, order, count = noise
 
-    def one(theta, u):
-        own = replace(run, u=u)
-        return with_slope(lambda t: predicted(tree.replace(model, chosen, t), own), theta)
+    def one(theta, u, term):
+        def output(t):
+            own = replace(run, u=u[..., 0] + t[-1] * u[..., 1])
+            return predicted(tree.replace(model, chosen, t[:-1]), own) + t[-1] * term
 
-    value, slope = jax.vmap(one)(theta[:, :-1], u)
-    rest = value + theta[:, -1:] * term - y
-    rows = jnp.concatenate([slope, term[..., None], rest[..., None]], axis=2)[:, :MOST] / size
+        return with_slope(output, theta)
+
+    value, slope = jax.vmap(one)(theta, u, term)
+    rows = jnp.concatenate([slope, (value - y)[..., None]], axis=2)[:, :MOST] / size
     rows = jnp.swapaxes(jnp.clip(jnp.nan_to_num(rows, nan=VAST), -VAST, VAST), 0, 1)
 
     def whiten(k, found):
@@ -206,7 +230,8 @@ class _LawFits(NamedTuple):
     @property
     def near(self) -> list[int]:
         """Raw numbers with a prior of width 1: the logarithm of a time constant, what a damping is
-        made of, and the share of a term. A law may take them to where nothing tells them.
+        made of, the share of a term or the change of a width. A law may take them to where nothing
+        tells them.
         """
         powers = self.seen.runs[0].physics.units(len(self.seen.inputs))
         names = [v.name for v in self.found.fit.variables]

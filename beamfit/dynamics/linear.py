@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from scipy.linalg import solve_discrete_lyapunov
+from scipy.special import ndtr
 
 from beamfit.dynamics.answer import GAIN, PURE, TIME, WIDE, derived, quantity
 from beamfit.dynamics.fit import MAPS
@@ -31,6 +32,8 @@ from beamfit.dynamics.state_fit import (
 from beamfit.dynamics.states import Matrices, contraction, linear_outputs
 from beamfit.errors import InputError, nearest
 from beamfit.greybox import tree
+from beamfit.greybox.fit import Derived
+from beamfit.greybox.memory import CENTRAL
 from beamfit.greybox.problem import Free, Prior
 from beamfit.noise.memory import CorrelatedNoise, remembers
 from beamfit.quantity import Quantity
@@ -39,8 +42,8 @@ from beamfit.quantity import Quantity
 HORIZON, ROWS = 20, 20_000
 # Strides through the samples, for slow responses; fewest rows that must remain.
 STRIDES, FEWEST = (1, 5, 25, 125), 100
-# Newton steps to the rest of a network.
-REST = 20
+# Newton steps to the rest of a network, and halvings of a bracket of an error.
+REST, HALVES = 20, 60
 
 
 class Linear:
@@ -378,7 +381,7 @@ def identify_states(
     delay: int = 0,
     offset: bool = True,
     hidden: int = 5,
-    starts: int = 2,
+    starts: int = 5,
     seed: int = 0,
     held: Sequence[Run] = (),
 ) -> StatesFit:
@@ -398,7 +401,8 @@ def identify_states(
     offset : bool
         Whether the outputs at rest are free numbers; else they are 0 where the inputs are.
     hidden, starts, seed : int
-        Hidden nodes of the network, starts of its training, seed of their weights.
+        Hidden nodes of the network, starts of its training, seed of their weights. Errors contain
+        how far apart the starts end.
     held : sequence of Run
         Runs that are only predicted.
 
@@ -440,20 +444,76 @@ def identify_states(
     case = case_of(runs, LINEAR, (), (), delay)
     _check_order(case, runs, order or 1)
     best, tried = orders(case, order, offset)
-    n, found, gain = best.order, best.found, None
+    n, found, gain = best.order, [best.found], None
     if map == "network":
         nets = _networks(best, hidden, range(seed, seed + starts))
         free = [f for f in free_of(case, n, n, offset, best.direct) if f.path != "start"]
         free += [Free("start", nuisance=True), Free("p.net", nuisance=True)]
         case = case_of(runs, NETWORK, free, [Prior("p.net", 0.0, WEIGHT)], delay)
-        found = trained(case, nets)
-        gain = criterion(best.case, [best.found])[0] - criterion(case, [found])[0]
+        found = likely(case, [trained(case, [net]) for net in nets])
+        gain = criterion(best.case, [best.found])[0] - criterion(case, found[:1])[0]
     case = best.case if map == "constant" else case
-    found = remembering(case, found)
+    found = [remembering(case, each) for each in found]
     said, gains = _quantities(case, found, n, runs, offset)
     more = {"delay_samples": delay, "tried": tried, "matrices": _matrices(case, found, n)}
     judged = {"held": held, "map": map, "gain": gain, "delay": delay, "order": n}
-    return states_answer(case, found, runs, said, by_input=gains, more=more, **judged)
+    return states_answer(case, found[0], runs, said, by_input=gains, more=more, **judged)
+
+
+def likely(case: Case, found: Sequence[Settled]) -> list[Settled]:
+    """The best of several ends of a search, and those that are as likely as draws about it.
+
+    Draws from the posterior about an optimum of p numbers lie above its -2 ln L by chi-square of p
+    degrees of freedom, by p in the mean: an end that is nearer is another part of the posterior.
+    """
+    told = np.array(criterion(case, found, min(found, key=lambda each: each.likelihood)))
+    best, *others = np.argsort(np.where(np.isfinite(told), told, np.inf))
+    most = told[best] + used_by(found[best].fit)
+    return [found[best], *(found[i] for i in others if told[i] <= most)]
+
+
+def _derived(found: Sequence[Settled], function: Any, asked: UsedStates) -> Derived:
+    """Numbers of the best fit; within their errors 68 % of all fits' posterior lies, each of which
+    counts as much: the posterior of a network is bent, and each tells a part of it.
+    """
+    each = [derived(f.fit, f.errors, function, asked) for f in found]
+    if len(each) == 1:
+        return each[0]
+    values, errors = (np.stack([getattr(one, name) for one in each]) for name in ("value", "error"))
+    return each[0]._replace(error=joint_error(values, errors))
+
+
+def joint_error(values: np.ndarray, errors: np.ndarray) -> np.ndarray:
+    """Distance from the first of some values within which 68 % of all lie, each normal.
+
+    Parameters
+    ----------
+    values, errors : array, shape (fits, ...)
+        Of one quantity each along the first axis; an error is NaN where nothing is known.
+
+    Returns
+    -------
+    array, shape (...)
+        NaN where the first is, or where more than 32 % are.
+
+    Examples
+    --------
+    >>> joint_error(np.array([3.0, 3.0]), np.array([0.5, 0.5])).round(6).item()
+    0.5
+    >>> joint_error(np.array([0.0, 1.0]), np.array([0.1, 0.1])).round(2).item()
+    0.97
+    """
+    seen, away = np.isfinite(errors), values - values[0]
+    spread = np.where(seen, np.maximum(errors, np.finfo(float).tiny), np.inf)
+    low = np.zeros_like(values[0])
+    high = np.max(np.where(seen, np.abs(away) + 10.0 * errors, 0.0), axis=0)
+    for _ in range(HALVES):
+        reach = 0.5 * (low + high)
+        with np.errstate(over="ignore"):
+            inside = ndtr((reach - away) / spread) - ndtr((-reach - away) / spread)
+        less = inside.mean(axis=0) < CENTRAL
+        low, high = np.where(less, reach, low), np.where(less, high, reach)
+    return np.where(seen[0] & (seen.mean(axis=0) > CENTRAL), high, np.nan)
 
 
 def _check_order(case: Case, runs: Sequence[Run], order: int) -> None:
@@ -500,6 +560,7 @@ def _quoted(model: Any, asked: UsedStates) -> jax.Array:
     a, b, c, units = a[:n, :n], b[:n], c[:, :n], p["units"]
     m, size = units["u"].shape[1], units["y"][1]
     poles = jnp.linalg.eigvals(a)
+    poles = poles[jnp.lexsort((poles.imag, -jnp.abs(poles)))]  # the same of several fits
     s = jnp.log(poles) / course.dt[0]
     gains = size[:, None] * (d + c @ jnp.linalg.solve(jnp.eye(n) - a, b))
     parts = [-1.0 / s.real, 1.0 / jnp.abs(s), -s.real / jnp.abs(s), poles.real, s.imag]
@@ -508,10 +569,10 @@ def _quoted(model: Any, asked: UsedStates) -> jax.Array:
 
 
 def _quantities(
-    case: Case, found: Settled, n: int, runs: Sequence[Run], offset: bool
+    case: Case, found: Sequence[Settled], n: int, runs: Sequence[Run], offset: bool
 ) -> tuple[dict[str, Quantity], dict[str, list[str]]]:
     """Time constants from the slowest, gains and levels; and the names of each input's gains."""
-    numbers = derived(found.fit, found.errors, _quoted, UsedStates(n, case.courses[0]))
+    numbers = _derived(found, _quoted, UsedStates(n, case.courses[0]))
     step, said = float(case.courses[0].dt[0]), {}
     inputs, outputs = list(runs[0].inputs), list(runs[0].outputs)
     tau, time, zeta, pole, turn = np.arange(5 * n).reshape(5, n)
@@ -548,7 +609,7 @@ def _taylor(model: Any, asked: UsedStates) -> jax.Array:
                              to @ b[:n, : len(size_u)] / size_u])  # fmt: skip
 
 
-def _matrices(case: Case, found: Settled, n: int) -> dict[str, Any]:
+def _matrices(case: Case, found: Sequence[Settled], n: int) -> dict[str, Any]:
     """A, B, C, D in the units of the record, for inputs less their mean.
 
     Of as many states as outputs, all of which are read, also the first terms of report eq 2 with
@@ -556,13 +617,13 @@ def _matrices(case: Case, found: Settled, n: int) -> dict[str, Any]:
     """
     more = {}
     if n == len(case.seen):
-        read = derived(found.fit, found.errors, _taylor, UsedStates(n, case.courses[0]))
+        read = _derived(found, _taylor, UsedStates(n, case.courses[0]))
         ends = {"A": slice(n), "B": slice(n, None)}
         more["outputs_as_states"] = {
             name + said: part[:, ends[name]] for name in ends
             for said, part in (("", read.value), ("_error", read.error))
         }  # fmt: skip
-    p = found.fit.model["p"]
+    p = found[0].fit.model["p"]
     a, b, c, d, _ = map(np.asarray, case.courses[0].system.matrices(p))
     (mean_u, size_u), (mean_y, size_y) = (np.asarray(p["units"][kind]) for kind in "uy")
     by, m = size_y[:, None], len(mean_u)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.signal import cont2discrete, dlsim, lfilter
 
-from beamfit.dynamics.linear import criterion, identify_states
+from beamfit.dynamics.linear import criterion, identify_states, joint_error
 from beamfit.dynamics.record import Run
 from beamfit.dynamics.search import Case
 from beamfit.dynamics.state_fit import fit_states
@@ -166,3 +166,15 @@ def test_the_scale_of_a_state_is_told_as_a_freedom_of_the_model():
     assert "fix one of them" in fit.message
     assert fit.quantities["b"].error is None
     assert fit.quantities["k"].value == pytest.approx(0.8, abs=4 * fit.quantities["k"].error)
+
+
+def test_an_error_of_several_fits_holds_68_percent_of_what_all_of_them_allow():
+    """Beside draws; where a third of the fits know nothing, or the first, there is no error."""
+    random = np.random.default_rng(0)
+    values, errors = np.array([0.0, 1.0, -0.3, 2.0]), np.array([0.2, 0.5, 0.1, 0.7])
+    drawn = random.normal(values, errors, (200_000, 4))
+    wanted = np.quantile(np.abs(drawn - values[0]), 0.6827)
+    assert joint_error(values, errors) == pytest.approx(wanted, rel=0.01)
+    holes = np.array([[0.2, np.nan, 0.2], [0.2, 0.2, 0.2], [0.2, 0.2, np.nan]])
+    found = joint_error(np.zeros((3, 3)), holes)
+    np.testing.assert_allclose(found, [0.2, np.nan, np.nan], rtol=1e-6)
