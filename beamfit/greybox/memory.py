@@ -238,13 +238,18 @@ _levelled_by_each = jax.jit(jax.vmap(levelled, in_axes=(None, None, None, None, 
 def _levelled(
     grid: Sequence[CorrelatedNoise], rows: np.ndarray, time: np.ndarray, levels: Levels
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The same without levels, the rows padded to one of a few lengths."""
+    """The same without levels, the rows padded to one of a few lengths; noises of one time after
+    the other, since all rows together take gigabytes.
+    """
     extra = (0, padded_length(max(time.size, 64)) - time.size)
     begins = np.isin(np.arange(time.size + extra[1]), levels.first)
     padded = np.pad(rows, (extra, (0, 0))), np.pad(time, extra, mode="edge"), begins
-    slope, each = np.pad(levels.slope, extra, mode="edge"), CorrelatedNoise(*np.array(grid).T)
-    found, volume = _levelled_by_each(*padded, slope, each)
-    return np.linalg.qr(np.asarray(found), mode="r"), -np.asarray(volume)
+    slope, triangles, volumes = np.pad(levels.slope, extra, mode="edge"), [], []
+    for _, alike in groupby(grid, key=lambda noise: noise.time):
+        found, volume = _levelled_by_each(*padded, slope, CorrelatedNoise(*np.array([*alike]).T))
+        triangles.append(np.linalg.qr(np.asarray(found), mode="r"))
+        volumes.append(-np.asarray(volume))
+    return np.concatenate(triangles), np.concatenate(volumes)
 
 
 def range_of(time: np.ndarray) -> tuple[float, float]:

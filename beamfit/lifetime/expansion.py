@@ -391,7 +391,9 @@ class Expansion:
         memory the noise may have otherwise. Noises of no weight are left out.
         """
         if not independent:
-            found = self._whitened(columns).memory()
+            least = list(columns) in (self.columns(), self.columns(POWER))
+            found = self._with_power if least else self._whitened(columns)
+            found = found.memory(len(columns))
             kept = found.weight > NO_WEIGHT * found.weight.max()
             return Memory(*(part[kept] for part in found[:-1]), found.dof)
         known = np.append(np.equal(columns, QUADRATIC), self.numbers[QUADRATIC - 1])
@@ -421,6 +423,11 @@ class Expansion:
             moved = np.linalg.lstsq(self.left[:, columns], self.beside(change[:, None]), rcond=None)
             error = np.hypot(error, (slopes @ moved[0])[:, 0])
         return found[0].real, error
+
+    @cached_property
+    def _with_power(self) -> Whitened:
+        """Whitened columns of the plain law and, last, of a power of the current."""
+        return self._whitened(self.columns(POWER))
 
     def _whitened(self, columns: Sequence[int]) -> Whitened:
         """Slopes by some columns and residuals, whitened by each noise; the cycles of a part, in
