@@ -160,7 +160,9 @@ def told(
         wide = q.unit == TIME and q.error is not None and q.error * below > WIDE * abs(q.value)
         # A higher order that is a first one determines only its gains and its longer lag.
         more = checks.first_order and not name.startswith(("K", "offset", "tau1", "delay"))
-        return nothing or wide or more or name in joint
+        # A number that ran to the end of its range has no slope there.
+        ended = name != "delay" and q.error == 0
+        return nothing or wide or more or ended or name in joint
 
     known = {n: q.open() if is_open(n, q) else q for n, q in quantities.items()}
     blank = (nothing or c.parameter in joint for c in curves)

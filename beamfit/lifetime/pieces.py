@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -22,6 +23,8 @@ FEWEST = 8
 NEIGHBOURS, OF_MEDIAN = 21, 0.42
 # Readings of a spike at most.
 LONE = 3
+# Readings that are looked through at once, and how many of their neighbours.
+STRETCH, OVERLAP = 1 << 18, 64
 # Readings whose means are looked at for a ramp at the head, the share of its rise by which a fall
 # ends it, and by how much it exceeds any later rise.
 SMOOTH, FALL, RISE = 5, 0.1, 3.0
@@ -140,22 +143,27 @@ def _saturated(current: np.ndarray) -> np.ndarray:
 
 def _noise_near(off: np.ndarray) -> np.ndarray:
     """Noise about each of some departures; where it changes the greater one counts."""
-    usual = median_filter(off, NEIGHBOURS, mode="nearest")
-    usual *= 1.4826
-    return maximum_filter1d(usual, NEIGHBOURS)
+    return maximum_filter1d(1.4826 * median_filter(off, NEIGHBOURS, mode="nearest"), NEIGHBOURS)
+
+
+def _by_stretches(function: Callable[..., np.ndarray], *columns: np.ndarray) -> np.ndarray:
+    """What a function of near neighbours gives for each reading: of a long record by stretches,
+    since all at once takes gigabytes.
+    """
+    found, size = [], columns[0].size
+    for start in range(0, size, STRETCH):
+        low, stop = max(start - OVERLAP, 0), min(start + STRETCH, size)
+        some = function(*(column[low : stop + OVERLAP] for column in columns))
+        found.append(some[start - low : stop - low])
+    return np.concatenate(found)
 
 
 def _lost(time: np.ndarray, current: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """What decays from each reading to the next, by the usual rate near it, and its error."""
-    interval, rate = np.diff(time), np.diff(current)
-    rate /= interval
-    lost = median_filter(rate, WINDOW, mode="mirror")
-    rate -= lost
-    error = _noise_near(np.abs(rate, out=rate))
-    error *= OF_MEDIAN
-    error *= interval
-    lost *= interval
-    return lost, error
+    interval = np.diff(time)
+    rate = np.diff(current) / interval
+    usual = median_filter(rate, WINDOW, mode="mirror")
+    return usual * interval, OF_MEDIAN * interval * _noise_near(np.abs(rate - usual))
 
 
 def _spikes(time: np.ndarray, current: np.ndarray, noise: float) -> np.ndarray:
@@ -164,10 +172,8 @@ def _spikes(time: np.ndarray, current: np.ndarray, noise: float) -> np.ndarray:
     """
     lost, _ = _lost(time, current)
     changes = maximum_filter1d(lost, WINDOW) - minimum_filter1d(lost, WINDOW)
-    level = current.copy()
-    level[1:] -= np.cumsum(lost, out=lost)  # in place: of 1e7 readings each copy is 80 MB
-    level -= median_filter(level, 2 * LONE + 1, mode="nearest")
-    off = np.abs(level, out=level)
+    level = current - np.append(0.0, np.cumsum(lost))
+    off = np.abs(level - median_filter(level, 2 * LONE + 1, mode="nearest"))
     off[1:] -= LONE * changes
     return off > THRESHOLD * np.maximum(noise, _noise_near(off))
 
@@ -202,7 +208,8 @@ def beam_readings(record: DecayRecord, spikes: bool = True) -> tuple[np.ndarray,
     if spikes and kept.size >= FEWEST:
         found["spike"] = np.zeros(len(record), bool)
         time, current = record.time[kept], record.current[kept]
-        lone = _spikes(time, current, _noise(record, time, current))
+        noise = _noise(record, time, current)
+        lone = _by_stretches(lambda t, i: _spikes(t, i, noise), time, current)
         found["spike"][kept[lone]] = True
         kept = kept[~lone]
     events = [
@@ -217,13 +224,15 @@ def beam_readings(record: DecayRecord, spikes: bool = True) -> tuple[np.ndarray,
 
 def _steps(time: np.ndarray, current: np.ndarray, noise: float) -> np.ndarray:
     """Change from each reading to the next beyond what the decay around it explains, or zero."""
-    (lost, error), change = _lost(time, current), np.diff(current)
-    excess = np.abs(change - lost)
-    allowed = 0.5 * np.abs(lost, out=lost)
-    usual = max(1.4826 * np.median(excess), np.sqrt(2) * noise)
-    allowed += THRESHOLD * np.hypot(np.maximum(usual, _noise_near(excess)), error)
-    change[excess <= allowed] = 0.0
-    return change
+
+    def beyond(time: np.ndarray, current: np.ndarray) -> np.ndarray:
+        (lost, error), change = _lost(time, current), np.diff(current)
+        excess = np.abs(change - lost)
+        near = np.maximum(np.sqrt(2) * noise, _noise_near(excess))
+        allowed = 0.5 * np.abs(lost) + THRESHOLD * np.hypot(near, error)
+        return np.append(0.0, np.where(excess > allowed, change, 0.0))
+
+    return _by_stretches(beyond, time, current)[1:]
 
 
 def _highest(smooth: np.ndarray, low: float, noise: float) -> int:

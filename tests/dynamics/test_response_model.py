@@ -7,6 +7,8 @@ import pytest
 from scipy.linalg import expm
 from scipy.signal import lfilter
 
+from beamfit.dynamics.fit import identify
+from beamfit.dynamics.record import Run
 from beamfit.dynamics.response import ARX, FIRST_ORDER, PHYSICS, SECOND_ORDER, simulate
 
 simulate = jax.jit(simulate, static_argnums=0)  # a program a shape, not one an operation
@@ -92,3 +94,15 @@ def test_samples_at_unequal_distances_are_those_of_the_same_process():
     fine = simulate(SECOND_ORDER, jnp.tile(p, (8, 1)), u, dt, free)
     coarse = simulate(SECOND_ORDER, jnp.tile(p, (4, 1)), u[::2], jnp.ones(4), free)
     np.testing.assert_allclose(fine[::2], coarse, rtol=1e-12)
+
+
+def test_a_number_that_ran_to_the_end_of_its_range_is_not_known():
+    """The damping of 20 readings ended at 0.000 ± 0.000, and was converged; simulated."""
+    u = [99.4, 101.0, 100.45, 99.87, 98.73, 99.67, 100.35, 100.8, 100.21, 99.79]
+    u += [100.37, 100.11, 101.41, 100.79, 98.97, 100.45, 100.23, 99.37, 99.27, 101.83]
+    y = [215.15, 215.15, 215.14, 215.15, 215.15, 215.38, 215.77, 216.04, 216.01, 215.87]
+    y += [215.89, 216.11, 216.37, 216.47, 216.55, 216.62, 216.85, 217.17, 217.16, 217.03]
+    fit = identify(Run(0.1 * np.arange(20), {"u": np.array(u)}, {"y": np.array(y)}), "second-order")
+    assert fit.status == "unidentified"
+    assert fit.quantities["zeta"].error is None
+    assert "zeta" in fit.message
