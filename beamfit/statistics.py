@@ -22,8 +22,6 @@ BASELINE, FEWEST = 20, 3
 MANY = 8
 # Ends of the central 68 and 95 % of draws.
 CENTRAL, WIDE = (0.16, 0.84), (0.025, 0.975)
-# A prior that data narrow by less than this share decides by itself.
-NARROWED = 0.2
 # Mean range of two normal numbers in standard deviations; degrees of freedom of a moving range.
 RANGE, RANGE_DOF = 1.128, 0.62
 # Probability below 3 standard deviations; one point in 370 lies beyond them to either side.

@@ -12,6 +12,7 @@ import numpy as np
 from beamfit.errors import Finding, Status, judge
 from beamfit.lifetime.alternatives import ConstantA, LifetimeLaw, Outgassing
 from beamfit.lifetime.cycles import is_sawtooth
+from beamfit.lifetime.departures import Law
 from beamfit.lifetime.evidence import (
     BELIEVED,
     DETERMINED,
@@ -165,15 +166,20 @@ def _inseparable(e: Evidence) -> Finding | None:
         return Finding(Status.unidentified, cause)
     if (beyond := max(-found.share, found.share - 1.0) / found.share_error) > OUTSIDE:
         return _beyond(e, beyond)
-    # The bend of the decay grows with the square of the span.
-    longer = (found.share_error / SEPARABLE) ** 0.5
-    return Finding(
-        Status.unidentified,
+    told = (
         f"a and b are not separable on this record (correlation {found.correlation:.6f}; share "
         f"of a in the loss {found.share:.2g} ± {found.share_error:.2g}), the lifetime at the mean "
-        f"current is determined. A record {max(longer, 1.1):.2g} times longer, or at several "
-        f"currents, would separate them{f'. {_if_constant(e)}' if e.apart else ''}",
+        "current is determined. "
     )
+    if e.apart:
+        open_ = "An exponent of a and a drift of b leave them open: record farther, or give the "
+        told += f"{open_}ring, the pressure, or --law constant. {_if_constant(e)}"
+        return Finding(Status.unidentified, told)
+    # The bend of the decay grows with the square of the span.
+    longer = max((found.share_error / SEPARABLE) ** 0.5, 1.1)
+    constant = "" if e.law is Law.constant else " if they are constant"
+    told += f"A record {longer:.2g} times longer, or at several currents, would separate them"
+    return Finding(Status.unidentified, told + constant)
 
 
 def _beyond(e: Evidence, errors: float) -> Finding:

@@ -41,7 +41,7 @@ from beamfit.lifetime.expansion import Physical
 from beamfit.lifetime.record import DecayRecord
 from beamfit.noise.memory import Products
 from beamfit.quantity import HOUR, Quantity
-from beamfit.statistics import CENTRAL, NARROWED, WIDE
+from beamfit.statistics import CENTRAL, WIDE
 
 # Width of the change of gas that is pumped away in what draws come from.
 PUMPED = 0.5
@@ -53,6 +53,8 @@ ENOUGH = 1024
 # too few; the degrees of freedom of what they come from; how many independent ones an answer needs,
 # and the ends of its interval: a fortieth lies beyond each.
 DRAWS, FEW, AGAIN, TAIL, WORTH, ENDS_WORTH = 6000, 3000, 10, 8.0, 200.0, 2000.0
+# Draws worth less tell no error. More is enough: constant a and b in their place would be too sure.
+LEAST_WORTH = 10.0
 # Width of the share in what draws come from, which its bounds cut off otherwise.
 AROUND = 0.6
 # Standard deviations of the share beside a bound in which draws tell the density there.
@@ -488,9 +490,8 @@ class FreeLaw:
 
     @property
     def tells_share(self) -> bool:
-        """True if the readings, and not the flat prior alone, tell the share of a."""
-        flat = (CENTRAL[1] - CENTRAL[0]) / 2
-        return self.share.error < (1 - NARROWED) * flat
+        """True unless the loss may as well be all of a as none of it."""
+        return any(self.quantities[name].interval_95[0] > 0 for name in "ab")
 
     @property
     def is_pumped(self) -> bool:
@@ -554,7 +555,7 @@ def free_law(record: DecayRecord, values: Physical) -> FreeLaw | None:
     quoted, *others = proposals(seen)
     laws = [quoted.drawn(DRAWS, ENDS_WORTH), *(law.drawn(FEW, WORTH) for law in others)]
     draws, smooth = mixed(laws), laws[0]
-    if not np.isfinite(smooth.log) or draws.worth < WORTH / 4:
+    if not np.isfinite(smooth.log) or draws.worth < LEAST_WORTH:
         return None
     plain = DrawnLaw.of(seen, CONSTANT).drawn(FEW, WORTH)
     if not 0 <= values.share <= 1:

@@ -25,7 +25,7 @@ from beamfit.lifetime.mechanisms import SCALES, LossTerms, loss_terms, scaled_lo
 from beamfit.lifetime.ring import Operation
 from beamfit.lifetime.study import Decay, Machine, operation_during
 from beamfit.quantity import Quantity, Status
-from beamfit.statistics import NARROWED, POOR_FIT, chi2_probability
+from beamfit.statistics import POOR_FIT, chi2_probability
 
 if TYPE_CHECKING:
     from beamfit.sampling.posterior import Posterior
@@ -152,6 +152,8 @@ LARGEST = 1e3
 # The scale of the RF voltage is sought within so many errors of its prior, and losses computed at
 # each of them.
 WIDEST = 3
+# A prior that data narrow by less than this share decides by itself.
+NARROWED = 0.2
 # How far walkers begin from scales that the decays do not tell.
 WIDTH = 0.3
 
