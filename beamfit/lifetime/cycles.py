@@ -21,6 +21,7 @@ from beamfit.lifetime.expansion import (
     Parts,
     Physical,
     Pieces,
+    least_squares_step,
     solved,
 )
 from beamfit.lifetime.pieces import Event, Split, beam_readings, event_of, split_record
@@ -605,8 +606,10 @@ def _with_parts(about: Expansion, begins: np.ndarray) -> Expansion:
         slopes = np.pad(found.slopes, ((0, 0), (0, begins.size - 1)))
         parts = Parts(first, shares, departure)
         found = replace(found, rows=rows, slopes=slopes, parts=parts, prior=about.prior)
+        if not found.rested:  # a course with which the law has no value
+            return about
         columns = found.columns()
-        step = np.linalg.lstsq(found.left[:, columns], -found.left[:, -1], rcond=None)[0]
+        step = least_squares_step(found.left[:, [*columns, -1]], np.zeros((0, len(columns) + 1)))
         numbers, departure = numbers + np.append(step[:2], 0.0), departure + shares @ step[2:]
     return replace(
         found, numbers=numbers, residuals=found.left[:, -1] + found.left[:, columns] @ step,

@@ -202,8 +202,15 @@ def _of_share(shape: Shape, mean: float) -> Shape:
     return lambda x: shape(x * mean)
 
 
-def _least_squares(rows: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """Step of the numbers from columns, the last of them residuals, and rows of priors."""
+def least_squares_step(rows: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """Step of the numbers from columns, the last of them residuals, and rows of priors.
+
+    Examples
+    --------
+    >>> rows = np.array([[1.0, -1.0], [1.0, -3.0]])
+    >>> least_squares_step(rows, np.zeros((0, 2))).round(9).tolist()
+    [2.0]
+    """
     size = np.linalg.norm(rows[:, :-1], axis=0) + 1e-300
     whole = np.vstack([rows, known]) / np.append(size, 1.0)
     whole = np.vstack([whole, 1e-15 * np.eye(size.size, size.size + 1)])
@@ -239,7 +246,7 @@ class _Start(NamedTuple):
         noise = np.linalg.norm(y - straight * loss) / root
         width = PRIOR_WIDTH * (abs(straight) + 3 * noise / size) + 1e-300
         known = np.array([[0.0, noise / width, 0.0]])
-        both = _least_squares(np.stack([loss, bend, -y], axis=1), known)
+        both = least_squares_step(np.stack([loss, bend, -y], axis=1), known)
         less = np.linalg.norm(y - both @ (loss, bend)) / root
         least = 1e-15 * np.linalg.norm(weight * x) / root
         level = pieces.worth(weight, columns[:, 2] - columns[:, :2] @ both)
@@ -494,7 +501,7 @@ def _search(
         own, columns = found.rows[:, LEVEL], found.rows[:, free]
         left = Levels(pieces.first, own).left(np.column_stack([columns, found.residuals]))
         known = np.column_stack([np.diag(prior), prior * numbers[places]])
-        moved = _least_squares(left, known)
+        moved = least_squares_step(left, known)
         step = np.zeros(numbers.size)
         step[places] = moved
         down = pieces.worth(own, found.residuals + columns @ moved)
