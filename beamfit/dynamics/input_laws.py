@@ -109,7 +109,7 @@ def moved(u: np.ndarray, law: str, width: float | np.ndarray) -> np.ndarray:
 
 
 def _with_width(u: np.ndarray, law: str, widths: np.ndarray) -> np.ndarray:
-    """What a law hands on at each width, and its change with it, shape (widths, rows, 2)."""
+    """Inputs as a law hands them on at each width, and changes with it, shape (widths, rows, 2)."""
     at = moved(u, law, widths)
     if law == "stop":
         return np.stack([at, 0.0 * at], axis=2)

@@ -147,7 +147,7 @@ def _noise_near(off: np.ndarray) -> np.ndarray:
 
 
 def _by_stretches(function: Callable[..., np.ndarray], *columns: np.ndarray) -> np.ndarray:
-    """What a function of near neighbours gives for each reading: of a long record by stretches,
+    """Values of a function of near neighbours for each reading: of a long record by stretches,
     since all at once takes gigabytes.
     """
     found, size = [], columns[0].size
@@ -159,7 +159,7 @@ def _by_stretches(function: Callable[..., np.ndarray], *columns: np.ndarray) -> 
 
 
 def _lost(time: np.ndarray, current: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """What decays from each reading to the next, by the usual rate near it, and its error."""
+    """Loss from each reading to the next, by the usual rate near it, and its error."""
     interval = np.diff(time)
     rate = np.diff(current) / interval
     usual = median_filter(rate, WINDOW, mode="mirror")
