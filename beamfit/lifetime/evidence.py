@@ -55,7 +55,8 @@ class Separability:
     Parameters
     ----------
     separable : bool
-        Whether the share of a in the loss is known to better than 0.2.
+        Whether the share of a in the loss is known to better than 0.2 by constant a and b, and may
+        not as well be all as none by the free law.
     share, share_error : float or None
         Share of a in the loss at the mean current (0: all gas-like, 1: all Touschek-like), and
         its standard deviation.

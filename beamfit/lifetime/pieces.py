@@ -158,19 +158,16 @@ def _by_stretches(function: Callable[..., np.ndarray], *columns: np.ndarray) -> 
     return np.concatenate(found)
 
 
-def _lost(time: np.ndarray, current: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Loss from each reading to the next, by the usual rate near it, and its error."""
-    interval = np.diff(time)
-    rate = np.diff(current) / interval
-    usual = median_filter(rate, WINDOW, mode="mirror")
-    return usual * interval, OF_MEDIAN * interval * _noise_near(np.abs(rate - usual))
+def _usual_rate(time: np.ndarray, current: np.ndarray) -> np.ndarray:
+    """Rate of change near each reading, which a step does not move."""
+    return median_filter(np.diff(current) / np.diff(time), WINDOW, mode="mirror")
 
 
 def _spikes(time: np.ndarray, current: np.ndarray, noise: float) -> np.ndarray:
     """Up to three readings off the running median of what is level but for noise and steps; more
     than a decay whose rate changes there, as at a refill.
     """
-    lost, _ = _lost(time, current)
+    lost = _usual_rate(time, current) * np.diff(time)
     changes = maximum_filter1d(lost, WINDOW) - minimum_filter1d(lost, WINDOW)
     level = current - np.append(0.0, np.cumsum(lost))
     off = np.abs(level - median_filter(level, 2 * LONE + 1, mode="nearest"))
@@ -226,7 +223,9 @@ def _steps(time: np.ndarray, current: np.ndarray, noise: float) -> np.ndarray:
     """Change from each reading to the next beyond what the decay around it explains, or zero."""
 
     def beyond(time: np.ndarray, current: np.ndarray) -> np.ndarray:
-        (lost, error), change = _lost(time, current), np.diff(current)
+        interval, change, usual = np.diff(time), np.diff(current), _usual_rate(time, current)
+        error = OF_MEDIAN * interval * _noise_near(np.abs(change / interval - usual))
+        lost = usual * interval
         excess = np.abs(change - lost)
         near = np.maximum(np.sqrt(2) * noise, _noise_near(excess))
         allowed = 0.5 * np.abs(lost) + THRESHOLD * np.hypot(near, error)
@@ -303,9 +302,9 @@ def split_record(record: DecayRecord) -> Split:
 
     Notes
     -----
-    A step must exceed ten robust standard deviations of the changes between readings; a refill of
-    many readings must rise by 30 and by 1 %, four times faster than the record falls: other slow
-    or noisy changes stay in. A gap alone does not end a decay; a step across it does.
+    A step must exceed ten robust standard deviations of the changes near it, and of what is lost
+    meanwhile, as in a gap; a refill of many readings must rise by 30 and by 1 %, four times faster
+    than the record falls: other slow or noisy changes stay in. A gap alone does not end a decay; a step across it does.
 
     Examples
     --------

@@ -371,9 +371,7 @@ class DecayRecord:
 
     @cached_property
     def resolution(self) -> float | None:
-        """Step of a coarsely quantised reading, mA; None where readings seldom repeat, or lie at
-        no multiples of a step.
-        """
+        """Step of a quantised reading, mA; None where readings lie at no multiples of one."""
         return _digit(self.current)
 
     @cached_property
