@@ -304,7 +304,8 @@ def split_record(record: DecayRecord) -> Split:
     -----
     A step must exceed ten robust standard deviations of the changes near it, and of what is lost
     meanwhile, as in a gap; a refill of many readings must rise by 30 and by 1 %, four times faster
-    than the record falls: other slow or noisy changes stay in. A gap alone does not end a decay; a step across it does.
+    than the record falls: other slow or noisy changes stay in. A gap alone does not end a decay; a
+    step across it does.
 
     Examples
     --------
