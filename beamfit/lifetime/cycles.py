@@ -132,7 +132,7 @@ def is_refilled(split: Split) -> bool:
     if len(cycles) < FEWEST_CYCLES:
         return False
     lost = sum(float(cycle.current[0] - cycle.current[-1]) for cycle in cycles)
-    refills = [event.change for event in split.events if event.kind == "refill"]
+    refills = [event.change for event in split.events if event.kind in ("refill", "ramp")]
     return len(refills) + 1 >= FEWEST_CYCLES and sum(refills) > RETURNED * max(lost, 0.0)
 
 
