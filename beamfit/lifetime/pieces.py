@@ -147,14 +147,24 @@ def _noise_near(off: np.ndarray) -> np.ndarray:
     return maximum_filter1d(1.4826 * median_filter(off, NEIGHBOURS, mode="mirror"), NEIGHBOURS)
 
 
-def _by_stretches(function: Callable[..., np.ndarray], *columns: np.ndarray) -> np.ndarray:
+def by_stretches(
+    function: Callable[..., np.ndarray],
+    *columns: np.ndarray,
+    stretch: int = STRETCH,
+    overlap: int = OVERLAP,
+) -> np.ndarray:
     """Values of a function of near neighbours for each reading: of a long record by stretches,
     since all at once takes gigabytes.
+
+    Examples
+    --------
+    >>> by_stretches(lambda x: np.gradient(x), np.arange(6.0) ** 2, stretch=3, overlap=1).tolist()
+    [1.0, 2.0, 4.0, 6.0, 8.0, 9.0]
     """
     found, size = [], columns[0].size
-    for start in range(0, size, STRETCH):
-        low, stop = max(start - OVERLAP, 0), min(start + STRETCH, size)
-        some = function(*(column[low : stop + OVERLAP] for column in columns))
+    for start in range(0, size, stretch):
+        low, stop = max(start - overlap, 0), min(start + stretch, size)
+        some = function(*(column[low : stop + overlap] for column in columns))
         found.append(some[start - low : stop - low])
     return np.concatenate(found)
 
@@ -207,7 +217,7 @@ def beam_readings(record: DecayRecord, spikes: bool = True) -> tuple[np.ndarray,
         found["spike"] = np.zeros(len(record), bool)
         time, current = record.time[kept], record.current[kept]
         noise = _noise(record, time, current)
-        lone = _by_stretches(lambda t, i: _spikes(t, i, noise), time, current)
+        lone = by_stretches(lambda t, i: _spikes(t, i, noise), time, current)
         found["spike"][kept[lone]] = True
         kept = kept[~lone]
     events = [
@@ -234,7 +244,7 @@ def _steps(time: np.ndarray, current: np.ndarray, noise: float) -> np.ndarray:
         allowed = 0.5 * np.abs(lost) + THRESHOLD * np.hypot(near, error)
         return np.append(0.0, np.where(np.abs(excess) > allowed, excess, 0.0))
 
-    return _by_stretches(beyond, time, current)[1:]
+    return by_stretches(beyond, time, current)[1:]
 
 
 def _highest(smooth: np.ndarray, low: float, noise: float) -> int:

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.special import chdtrc
+from scipy.special import chdtrc, chdtri
 
 from beamfit.answer import json_of, shown
 from beamfit.errors import InputError
@@ -23,7 +23,6 @@ from beamfit.lifetime.advice import (
     best_operating_point,
     next_decays,
 )
-from beamfit.lifetime.alarm import BOTH
 from beamfit.lifetime.expansion import DETERMINED, lifetime_of
 from beamfit.lifetime.fit import bare
 from beamfit.lifetime.loss_network import Network, NetworkFit, fit_loss_network
@@ -155,10 +154,10 @@ def find_anomaly(fit: ScaleFit, decays: Sequence[Decay]) -> Anomaly:
 
 
 def _moved(off: np.ndarray, change: np.ndarray, fall: float) -> tuple[str, ...]:
-    """Test if one of the two explains as much as both, within `BOTH` of chi²."""
+    """Test if one of the two explains as much as both."""
     alone = {name: _fitted(off, change[:, [k]])[0] for k, name in enumerate("ab")}
     best = max(alone, key=alone.get)
-    return (best,) if fall - alone[best] < BOTH else ("a", "b")
+    return (best,) if fall - alone[best] < chdtri(1.0, POOR_FIT) else ("a", "b")
 
 
 def budget_intervals(

@@ -488,13 +488,14 @@ def _decays(record: DecayRecord) -> tuple[list[DecayRecord], tuple[Event, ...]]:
         return [record], ()
     split = split_record(record)
     pieces = [piece for segment in split.segments for piece in at_settings(segment)]
-    if not pieces:
-        moving = [name for name, steps in _steps(record).items() if steps.any()]
+    moving = [name for name, steps in _steps(record).items() if steps.any()]
+    kinds = {event.kind for event in split.events}
+    if not pieces and (moving or "short" not in kinds):
         changes = f"changes of {', '.join(moving)} by more than {100 * CHANGED:g} %"
-        kinds = ", ".join(sorted({event.kind for event in split.events})) or changes
+        found = ", ".join(sorted(kinds)) or changes
         expected = f"at least {FEWEST} readings in a row of a stored beam"
         expected += "; leave out a setting that only scatters with --ignore" if moving else ""
-        raise InputError(f"no decay between {kinds}", expected, record.name, column="current")
+        raise InputError(f"no decay between {found}", expected, record.name, column="current")
     return pieces, split.events
 
 
@@ -601,9 +602,11 @@ def study_record(
             rising.append(Event("slow refill", piece.start, segment.span, change))
         else:
             decays.append(Decay.of(segment, piece.start, fit, machine))
-    if not decays and not pooled:
-        expected = "a decay between refills"
-        raise InputError("a current that rises", expected, path=record.name, column="current")
+    if not decays and not pooled:  # of refills that are not resolved pieces rise, or are short
+        whole = _fitted(placed, law).placed(record.name, record.start)
+        if isinstance(whole.fit, InputError):
+            raise whole.fit
+        decays, events, lost, rising = [Decay.of(whole.segment, 0.0, whole.fit, machine)], (), [], []
     shown = thinned(record)
     shown = replace(shown, notes=record.notes) if pooled else shown
     found_events = sorted((*events, *lost, *rising), key=lambda event: event.time)
