@@ -279,6 +279,7 @@ def _slow_steps(
     at first may be the law, and what rises there is a ramp.
     """
     level, known, size = current - np.append(0.0, np.cumsum(steps)), np.append(False, steps != 0), 1
+    cuts = np.array([-current.size, *np.flatnonzero(known), 2 * current.size])
     found, half = [], -(WINDOW // 2)
     while (count := current.size // (2 * size)) >= COARSE:
         size *= 2
@@ -292,8 +293,11 @@ def _slow_steps(
         for first, last in _runs(seen & ~old[1:] & ~old[:-1]):
             # Half as many readings again: what ends smoothly still counts there.
             begin, end = first * size, (last + 1) * size + (last + 1 - first) * size // 2
+            before, after = cuts[np.searchsorted(cuts, begin, "right") + [-1, 0]]
+            begin = before if begin - before < 2 * size else begin  # nothing was looked for there
+            end = after if after - end < 2 * size else min(end, current.size)
             known[begin:end] = True
-            found.append((begin, min(end, current.size), bool(beyond[first] > 0)))
+            found.append((int(begin), int(end), bool(beyond[first] > 0)))
     return sorted(found)
 
 

@@ -606,7 +606,12 @@ def study_record(
         whole = _fitted(placed, law).placed(record.name, record.start)
         if isinstance(whole.fit, InputError):
             raise whole.fit
-        decays, events, lost, rising = [Decay.of(whole.segment, 0.0, whole.fit, machine)], (), [], []
+        decays, events, lost, rising = (
+            [Decay.of(whole.segment, 0.0, whole.fit, machine)],
+            (),
+            [],
+            [],
+        )
     shown = thinned(record)
     shown = replace(shown, notes=record.notes) if pooled else shown
     found_events = sorted((*events, *lost, *rising), key=lambda event: event.time)
