@@ -582,6 +582,7 @@ def study_record(
     placed = replace(record, start=0.0)
     cycles, events = _refilled(placed)
     pooled, pieces = _pooled(cycles, record.name, machine, law)
+    del cycles  # of 1e7 readings 160 MB
     lost: list[Event] = []
     if pooled:
         found = [_fitted(piece, law) for piece in pieces]
