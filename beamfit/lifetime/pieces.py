@@ -271,34 +271,39 @@ def _ramp(current: np.ndarray, noise: float) -> int:
     return cut if current.size - cut >= FEWEST else 0
 
 
+def _is_slow_step(beyond: np.ndarray, change: np.ndarray) -> np.ndarray:
+    """Which changes from mean to mean are more than the law: not at the head, where what falls fast
+    may be the law and what rises is a ramp; at the end, where nothing comes after, much more.
+    """
+    seen, ends = (beyond < 0) | (beyond > 0) & (change > 0), WINDOW // 2
+    seen[:ends] = False
+    seen[-ends:] &= np.abs(change[-ends:]) > FASTER * np.median(np.abs(change))
+    return seen
+
+
 def _slow_steps(
     time: np.ndarray, level: np.ndarray, steps: np.ndarray, noise: float
 ) -> list[tuple[int, int, bool]]:
     """First and past-the-last readings of falls and rises of many readings, and if it is a rise:
-    steps of the means of 2, 4, 8, ... neighbours, besides those of single readings. What falls fast
-    at first may be the law, and what rises there is a ramp.
+    steps of the means of 2, 4, 8, ... neighbours, besides those of single readings.
     """
-    known, size, cuts = np.zeros(level.size, bool), 1, [-level.size, *steps, 2 * level.size]
-    known[steps], cuts = True, np.array(cuts)
-    found, half = [], -(WINDOW // 2)
-    while (count := level.size // (2 * size)) >= COARSE:
-        size *= 2
-        t, x = (v[: count * size].reshape(count, size).mean(axis=1) for v in (time, level))
-        old = known[: count * size].reshape(count, size).any(axis=1)
+    cuts, found = np.array([-level.size, *steps, 2 * level.size]), []
+    known, size = np.zeros(level.size, bool), 2
+    known[steps] = True
+    while (count := level.size // size) >= COARSE:
+        t, x, old = (v[: count * size].reshape(count, size).mean(1) for v in (time, level, known))
         beyond = _steps(t, x, noise)
-        change = np.diff(x)
-        seen = (beyond < 0) | (beyond > 0) & (change > 0)
-        seen[:-half] = False
-        seen[half:] &= np.abs(change[half:]) > FASTER * np.median(np.abs(change))
-        for first, last in _runs(seen & ~old[1:] & ~old[:-1]):
+        apart = (old[1:] == 0) & (old[:-1] == 0)
+        for first, last in _runs(_is_slow_step(beyond, np.diff(x)) & apart):
             # Half as many readings again: what ends smoothly still counts there.
             begin, end = first * size, (last + 1) * size + (last + 1 - first) * size // 2
             place = np.searchsorted(cuts, begin, "right")
             before, after = cuts[place - 1], cuts[place]
-            begin = before if begin - before < 2 * size else begin  # nothing was looked for there
+            begin = before if begin - before < 2 * size else begin  # beside a step none was sought
             end = after if after - end < 2 * size else min(end, level.size)
             known[begin:end] = True
             found.append((int(begin), int(end), bool(beyond[first] > 0)))
+        size *= 2
     return sorted(found)
 
 
