@@ -7,6 +7,7 @@ order are compared by their information criterion.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from itertools import product
 from typing import Any, NamedTuple
 
@@ -14,10 +15,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from scipy.linalg import solve_discrete_lyapunov
-from scipy.special import ndtr
+from scipy.special import ndtr, ndtri
 
-from beamfit.dynamics.answer import GAIN, PURE, TIME, WIDE, derived, quantity
+from beamfit.dynamics.answer import GAIN, PURE, TIME, derived, quantity
 from beamfit.dynamics.fit import MAPS
+from beamfit.dynamics.limits import SINGLE_END, LagLimits
 from beamfit.dynamics.model import CLOSE, WEIGHT
 from beamfit.dynamics.record import Run, check_inputs, checked
 from beamfit.dynamics.search import LONGEST, Case, Settled, information, noise_of, used_by
@@ -36,7 +38,7 @@ from beamfit.greybox.fit import Derived
 from beamfit.greybox.memory import CENTRAL
 from beamfit.greybox.problem import Free, Prior
 from beamfit.noise.memory import CorrelatedNoise, remembers
-from beamfit.quantity import Quantity
+from beamfit.quantity import NORMAL_REACH, Quantity
 
 # Most samples of past and future, and most rows, of the regression.
 HORIZON, ROWS = 20, 20_000
@@ -577,17 +579,19 @@ def _quantities(
     inputs, outputs = list(runs[0].inputs), list(runs[0].outputs)
     tau, time, zeta, pole, turn = np.arange(5 * n).reshape(5, n)
     slow = [i for i in np.argsort(-numbers.value[time]) if numbers.value[turn[i]] >= 0.0]
+    endless = False  # a pole is compatible with 1, so that gains are with infinity
     for number, i in enumerate(slow, start=1):
         around = numbers.value[turn[i]] * step
         if around < 1e-9:
-            said[f"tau{number}"] = quantity(numbers, tau[i], TIME)
+            said[f"tau{number}"] = lag = _lag(numbers, tau[i], pole[i], step)
+            endless |= lag.interval_95 is not None and np.isinf(lag.interval_95[1])
         elif around > np.pi - 1e-9:  # on the negative axis: a sign from sample to sample
             said[f"pole{number}"] = quantity(numbers, pole[i], PURE)
         else:
-            said[f"T{number}"] = quantity(numbers, time[i], TIME)
+            period = quantity(numbers, time[i], TIME)
+            known = period.determined and period.interval_95[0] > 0
+            said[f"T{number}"] = period if known else period.open()
             said[f"zeta{number}"] = quantity(numbers, zeta[i], PURE)
-    said = {name: q.open() if q.unit == TIME and q.error is not None
-            and q.error > WIDE * abs(q.value) else q for name, q in said.items()}  # fmt: skip
     gains: dict[str, list[str]] = {name: [] for name in inputs}
     for i, (output, name) in enumerate(product(outputs, inputs), start=5 * n):
         words = [output] * (len(outputs) > 1) + [name] * (len(inputs) > 1)
@@ -596,7 +600,29 @@ def _quantities(
     for i, output in enumerate(outputs if offset else (), start=5 * n + len(inputs) * len(outputs)):
         label = "level" if len(outputs) == 1 else f"level_{output}"
         said[label] = quantity(numbers, i, "output")
+    if endless:
+        said = {n: q.open() if q.unit in (GAIN, "output") else q for n, q in said.items()}
     return said, gains
+
+
+def _lag(numbers: Derived, i: int, pole: int, step: float) -> Quantity:
+    """A time constant; a limit where its pole is compatible with 1 or with 0, by 95 %.
+
+    What readings see hangs on the pole, which tells both limits from a lag; on the lag itself it
+    bends.
+    """
+    found, at, error = quantity(numbers, i, TIME), numbers.value[pole], numbers.error[pole]
+    low, high = at + NORMAL_REACH * error * np.array([-1.0, 1.0])
+    if low > 0.0 and high < 1.0:
+        return found
+    below, above = ((-step / np.log(end) if 0.0 < end < 1.0 else None)
+                    for end in at + ndtri(SINGLE_END) * error * np.array([1.0, -1.0]))  # fmt: skip
+    return replace(
+        found.open(),
+        interval_95=LagLimits(
+            above if high >= 1.0 else None, below if low <= 0.0 else None
+        ).interval,
+    )
 
 
 def _taylor(model: Any, asked: UsedStates) -> jax.Array:

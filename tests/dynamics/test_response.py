@@ -96,6 +96,46 @@ def test_a_drift_that_is_as_slow_as_the_response_is_said_and_leaves_no_small_err
     assert fit.quantities["K"].error is None or fit.quantities["K"].error > 0.5
 
 
+def lagging(tau, seed, n=200, noise=0.03):
+    """A first order of gain 2 and offset 1, samples of 1 s, moved every 15 s."""
+    rng = np.random.default_rng(seed)
+    u, keep = steps(n, rng, -1.0, 1.0, 15), np.exp(-1.0 / tau)
+    y = 1.0 + lfilter([0.0, 2.0 * (1.0 - keep)], [1.0, -keep], u)
+    return Run(
+        np.arange(n) * 1.0, {"valve": u}, {"level": y + noise * y.std() * rng.normal(size=n)}
+    )
+
+
+@simulations(4, 20)
+def test_a_lag_beyond_the_record_has_a_lower_limit_and_its_slope(count):
+    """The gain over the lag is all that a record of a 200th of it tells."""
+    held = []
+    for seed in range(count):
+        q = identify(lagging(4e4, seed), delay=0).quantities
+        assert all(q[name].error is None for name in ("tau", "K", "offset")), q
+        low, high = q["tau"].interval_95
+        assert np.isinf(high)
+        assert q["tau"].to_json()["interval_95"] == [low, None]
+        held.append(low < 4e4 and abs(q["K/tau"].value - 5e-5) < 3 * q["K/tau"].error)
+    assert np.mean(held) >= 0.75, held
+
+
+def test_a_lag_below_a_sample_has_an_upper_limit_and_a_gain():
+    fit = identify(lagging(0.1, 0), delay=0)
+    q = fit.quantities
+    assert q["tau"].error is None
+    assert 0.1 < q["tau"].interval_95[1] < 0.5
+    assert "tau is below" in fit.message
+    assert abs(q["K"].value - 2.0) < 4 * q["K"].error
+
+
+@pytest.mark.parametrize("tau", [0.4, 60.0, 200.0])
+def test_a_lag_that_a_record_tells_has_an_error(tau):
+    q = identify(lagging(tau, 1, noise=0.01), delay=0).quantities
+    assert "K/tau" not in q
+    assert abs(q["tau"].value - tau) < 4 * q["tau"].error < tau
+
+
 def test_innovations_of_a_noise_are_those_of_its_covariance():
     rng, noise = np.random.default_rng(0), CorrelatedNoise(3.0, 0.4)
     time = np.cumsum(rng.uniform(0.1, 2.0, 30))
