@@ -379,7 +379,8 @@ def _good(e: ResponseEvidence) -> Finding:
     if e.checks.white_probability < POOR_FIT:
         cause += " The noise has a memory, which the errors contain."
     if e.checks.law is not None:
-        cause += f" {e.checks.law.capitalize()} is likelier than none, which the errors contain."
+        odds = f"P = {e.checks.law_probability:.2f}"
+        cause += f" {e.checks.law.capitalize()} is likelier than none ({odds}): errors contain it."
     gains = [q for name, q in e.quantities.items() if name.startswith("K")]
     if gains and all(q.error is not None and abs(q.value) < 2 * q.error for q in gains):
         cause += " All gains are compatible with 0: only the return of the output to rest is seen."
