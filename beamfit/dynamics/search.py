@@ -417,10 +417,13 @@ def with_memory(
 ) -> Settled:
     """The fit again, its noise with a memory, where residuals are correlated.
 
-    It may leave squares larger by the factor `worse`.
+    It may leave squares larger by the factor `worse`. Errors average over what the residuals leave
+    open of the noise also where they look white: a drift may be in the numbers instead.
     """
-    if not white.correlated(case):
+    if white.exact(case):
         return white
+    if not white.correlated(case):
+        return white._replace(errors=white.remembered(case, most=LONGEST)[0])
 
     def again(found: Settled) -> Settled:
         _, memory, size = found.remembered(case, most=LONGEST)

@@ -96,6 +96,23 @@ def test_a_drift_that_is_as_slow_as_the_response_is_said_and_leaves_no_small_err
     assert fit.quantities["K"].error is None or fit.quantities["K"].error > 0.5
 
 
+def test_a_drift_that_the_numbers_may_have_taken_is_in_their_errors():
+    """Residuals of 60 readings that look white leave it open; of 300 that are, they do not."""
+    wider = []
+    for n, drift in ((60, 3.0), (300, 0.0)):
+        ratios, rng = [], np.random.default_rng(11)
+        for _ in range(6):
+            u, keep = steps(n, rng, -1.0, 1.0, 4), np.exp(-1.0 / 6.0)
+            y = lfilter([0.0, 2.0 * (1.0 - keep)], [1.0, -keep], u)
+            noise = 0.003 * y.std() * (rng.normal(size=n) + drift * np.arange(n) / n)
+            fit = identify(Run(np.arange(n), {"valve": u}, {"level": y + noise}), delay=0)
+            by_white = fit.fit["map[1]"].error  # the gain, as white noise has it
+            ratios += [fit.quantities["K"].error / by_white] if fit.memory is None else []
+        wider.append(np.median(ratios))
+    assert wider[0] > 1.2, wider
+    assert wider[1] < 1.15, wider
+
+
 def lagging(tau, seed, n=200, noise=0.03):
     """A first order of gain 2 and offset 1, samples of 1 s, moved every 15 s."""
     rng = np.random.default_rng(seed)
