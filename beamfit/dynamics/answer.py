@@ -283,7 +283,9 @@ def _lower(e: ResponseEvidence) -> Finding | None:
         return None
     cause = "A first order explains the runs as well: "
     if "a1" in e.quantities:
-        cause += "a pole and a zero cancel, so that a1, a2, b1 and b2 are not determined; K is."
+        gains = [q for name, q in e.quantities.items() if name.startswith("K")]
+        gain = "; K is." if all(q.determined for q in gains) else "."
+        cause += f"a pole and a zero cancel, so that a1, a2, b1 and b2 are not determined{gain}"
     else:
         cause += "the shorter lag is compatible with 0, so that T and zeta are not determined."
     return Finding(Status.unidentified, cause, "Use --model first-order.")

@@ -16,7 +16,14 @@ from scipy.stats import t as student
 from beamfit.dynamics.input_laws import CORRELATION_TIMES, WHITE
 from beamfit.dynamics.model import PreparedOutput, steps_of
 from beamfit.dynamics.response import ARX, FIRST_ORDER
-from beamfit.dynamics.search import LONGEST, RANGE, Settled, noises_of, unit_outputs
+from beamfit.dynamics.search import (
+    LONGEST,
+    RANGE,
+    Settled,
+    difference,
+    noises_of,
+    unit_outputs,
+)
 from beamfit.greybox.memory import Whitened, whitened_by_each
 
 # Other lags that are tried beside one that is given, and rounds of them, each about the best.
@@ -25,8 +32,6 @@ OTHERS, ROUNDS = 8, 3
 HALVES = 8
 # Quantiles at the upper end of a central and of a one-sided 95 %.
 CENTRAL_END, SINGLE_END = 0.975, 0.95
-# Poles of a difference equation lie within this on either side.
-POLES = 0.99
 
 
 class LagLimits(NamedTuple):
@@ -82,27 +87,24 @@ class _Lags(NamedTuple):
         grid = noises_of(self.seen.time, CORRELATION_TIMES, WHITE)
         return whitened_by_each(grid, list(zip(rows, time, strict=True)))
 
-    def with_lag(self, lag: float, other: float) -> np.ndarray:
-        """Lags, or poles, of `lag` and another one."""
-        physics = self.seen.runs[0].physics
+    def evidence(self, lag: float, other: float) -> float:
+        """-2 ln of the evidence of two lags; a first order has the one."""
+        physics, time = self.seen.runs[0].physics, np.sqrt(lag * other)
+        shape = np.array([time, 0.5 * (lag + other) / time])
         if physics is FIRST_ORDER:
-            return np.array([lag])
-        if physics is ARX:
-            one, other = np.exp(-self.seen.apart / lag), other
-            return np.array([-one - other, one * other])
-        time = np.sqrt(lag * other)
-        return np.array([time, 0.5 * (lag + other) / time])
+            shape = np.array([lag])
+        elif physics is ARX:
+            (shape,) = difference(shape[None], self.seen.apart)
+        return self.whitened(shape).evidence()
 
     def least(self, lag: float) -> float:
-        """-2 ln of the evidence with this longest lag."""
-        physics, apart = self.seen.runs[0].physics, self.seen.apart
-        if physics is FIRST_ORDER:
-            return self.whitened(self.with_lag(lag, 0.0)).evidence()
-        ends = np.array([-POLES, POLES]) if physics is ARX else np.log([RANGE[0] * apart, lag])
+        """The same of the longest lag, the other one at its best."""
+        if self.seen.runs[0].physics is FIRST_ORDER:
+            return self.evidence(lag, lag)
+        ends = np.log([RANGE[0] * self.seen.apart, lag])
         for _ in range(ROUNDS):
             tried = np.linspace(*ends, OTHERS)
-            others = tried if physics is ARX else np.exp(tried)
-            told = [self.whitened(self.with_lag(lag, other)).evidence() for other in others]
+            told = [self.evidence(lag, other) for other in np.exp(tried)]
             around = tried[np.argmin(told)] + np.array([-1, 1]) * (tried[1] - tried[0])
             ends = np.clip(around, *ends)
         return float(min(told))

@@ -35,7 +35,7 @@ from beamfit.dynamics.states import Matrices, contraction, linear_outputs
 from beamfit.errors import InputError, nearest
 from beamfit.greybox import tree
 from beamfit.greybox.fit import Derived
-from beamfit.greybox.memory import CENTRAL
+from beamfit.greybox.memory import CENTRAL, reach_of_probability
 from beamfit.greybox.problem import Free, Prior
 from beamfit.noise.memory import CorrelatedNoise, remembers
 from beamfit.quantity import NORMAL_REACH, Quantity
@@ -44,8 +44,8 @@ from beamfit.quantity import NORMAL_REACH, Quantity
 HORIZON, ROWS = 20, 20_000
 # Strides through the samples, for slow responses; fewest rows that must remain.
 STRIDES, FEWEST = (1, 5, 25, 125), 100
-# Newton steps to the rest of a network, and halvings of a bracket of an error.
-REST, HALVES = 20, 60
+# Newton steps to the rest of a network.
+REST = 20
 
 
 class Linear:
@@ -507,15 +507,15 @@ def joint_error(values: np.ndarray, errors: np.ndarray) -> np.ndarray:
     """
     seen, away = np.isfinite(errors), values - values[0]
     spread = np.where(seen, np.maximum(errors, np.finfo(float).tiny), np.inf)
-    low = np.zeros_like(values[0])
-    high = np.max(np.where(seen, np.abs(away) + 10.0 * errors, 0.0), axis=0)
-    for _ in range(HALVES):
-        reach = 0.5 * (low + high)
-        with np.errstate(over="ignore"):
-            inside = ndtr((reach - away) / spread) - ndtr((-reach - away) / spread)
-        less = inside.mean(axis=0) < CENTRAL
-        low, high = np.where(less, reach, low), np.where(less, high, reach)
-    return np.where(seen[0] & (seen.mean(axis=0) > CENTRAL), high, np.nan)
+
+    def within(reach: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        above, below = (reach - away) / spread, (-reach - away) / spread
+        slope = (np.exp(-0.5 * above**2) + np.exp(-0.5 * below**2)) / (np.sqrt(2 * np.pi) * spread)
+        return np.mean(ndtr(above) - ndtr(below), axis=0), np.mean(slope, axis=0)
+
+    widest = np.max(np.where(seen, np.abs(away) + errors, 0.0), axis=0)
+    reach = reach_of_probability(within, widest, CENTRAL)
+    return np.where(seen[0] & (seen.mean(axis=0) > CENTRAL), reach, np.nan)
 
 
 def _check_order(case: Case, runs: Sequence[Run], order: int) -> None:

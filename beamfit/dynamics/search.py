@@ -73,7 +73,7 @@ def best_start(seen: PreparedOutput, offset: bool) -> Start:
 
     def shapes(logarithms: np.ndarray) -> np.ndarray:
         found = np.exp(logarithms)
-        return found if physics is not ARX else _difference(found, apart)
+        return found if physics is not ARX else difference(found, apart)
 
     def left(logarithms: np.ndarray) -> np.ndarray:
         triangles = _triangles(seen.runs, seen.measured, shapes(logarithms), offset)
@@ -99,7 +99,7 @@ def best_start(seen: PreparedOutput, offset: bool) -> Start:
     return Start(p, first, level, float(triangle[-1, -1] ** 2))
 
 
-def _difference(shapes: np.ndarray, apart: float) -> np.ndarray:
+def difference(shapes: np.ndarray, apart: float) -> np.ndarray:
     """a1 and a2 of the difference equations that samples of second orders obey."""
     time, zeta = shapes.T.astype(complex)
     root = np.sqrt(zeta**2 - 1.0)

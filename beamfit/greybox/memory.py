@@ -116,13 +116,13 @@ class Memory(NamedTuple):
                 self.weight @ (slope / spread)
             )
 
-        reaches = [_inverted(within, np.max(np.abs(centre - shift) + spread, 0), p)
+        reaches = [reach_of_probability(within, np.max(np.abs(centre - shift) + spread, 0), p)
                    for p in (CENTRAL, 0.95)]  # fmt: skip
         chance = self.weight @ (2 * stdtr(self.dof, -np.abs(centre) / spread))
         return AveragedMoments(shift, *reaches, chance)
 
 
-def _inverted(within, scale: np.ndarray, probability: float) -> np.ndarray:
+def reach_of_probability(within, scale: np.ndarray, probability: float) -> np.ndarray:
     """Distance within which this probability lies.
 
     By Newton steps, and halves of the bracket where one leaves it or is no shorter by half.
