@@ -110,7 +110,7 @@ def moved(u: np.ndarray, law: str, width: float | np.ndarray, place: float = 0.0
 
 
 def _with_width(u: np.ndarray, law: str, widths: np.ndarray, place: float) -> np.ndarray:
-    """What a law hands on at each width, and its change with it, shape (widths, rows, 2)."""
+    """Inputs that a law hands on at each width, and changes with it, shape (widths, rows, 2)."""
     at = moved(u, law, widths, place)
     if law == "stop":
         return np.stack([at, 0.0 * at], axis=2)

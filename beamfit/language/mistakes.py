@@ -1,4 +1,4 @@
-"""What is wrong with the text of a document, in words: place, culprit, remedy."""
+"""Mistakes in the text of a document, in words: place, culprit, remedy."""
 
 from __future__ import annotations
 
