@@ -588,9 +588,8 @@ def _quantities(
         elif around > np.pi - 1e-9:  # on the negative axis: a sign from sample to sample
             said[f"pole{number}"] = quantity(numbers, pole[i], PURE)
         else:
-            period = quantity(numbers, time[i], TIME)
-            known = period.determined and period.interval_95[0] > 0
-            said[f"T{number}"] = period if known else period.open()
+            said[f"T{number}"] = period = _period(quantity(numbers, time[i], TIME))
+            endless |= not period.determined
             said[f"zeta{number}"] = quantity(numbers, zeta[i], PURE)
     gains: dict[str, list[str]] = {name: [] for name in inputs}
     for i, (output, name) in enumerate(product(outputs, inputs), start=5 * n):
@@ -603,6 +602,14 @@ def _quantities(
     if endless:
         said = {n: q.open() if q.unit in (GAIN, "output") else q for n, q in said.items()}
     return said, gains
+
+
+def _period(found: Quantity) -> Quantity:
+    """T of a pair of poles; a limit where 1/T², by which gains at rest divide, may be 0 by 95 %."""
+    if not found.determined or found.value > 2.0 * NORMAL_REACH * found.error:
+        return found
+    most = 1.0 + 2.0 * ndtri(SINGLE_END) * found.error / found.value  # of 1/T²
+    return replace(found.open(), interval_95=(found.value / np.sqrt(most), np.inf))
 
 
 def _lag(numbers: Derived, i: int, pole: int, step: float) -> Quantity:
