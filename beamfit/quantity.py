@@ -161,13 +161,12 @@ class Quantity:
         low, high = (end / factor for end in self.interval_95)
         return f"{low:.4g} to {high:.4g} {unit}".rstrip()
 
-    def to_json(self) -> dict[str, float | str | list[float] | None]:
+    def to_json(self) -> dict[str, float | str | list[float | None] | None]:
         """Give the object of the JSON contract; numbers that are not finite are null."""
         fields = {"value": self.value, "error": self.error, "error_raw": self.error_raw}
         finite = {k: v if v is not None and math.isfinite(v) else None for k, v in fields.items()}
-        interval = None
-        if self.interval_95 is not None and all(map(math.isfinite, self.interval_95)):
-            interval = list(self.interval_95)
+        ends = [end if math.isfinite(end) else None for end in self.interval_95 or ()]
+        interval = ends if any(end is not None for end in ends) else None
         return {**finite, "unit": self.unit, "interval_95": interval}
 
     def __str__(self) -> str:

@@ -6,6 +6,7 @@ Constants have errors, curves bands.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import jax
@@ -15,6 +16,7 @@ import numpy as np
 from beamfit.answer import Table, cell, json_of
 from beamfit.dynamics.checks import Checks, HeldOutRun
 from beamfit.dynamics.input_laws import LawEvidence
+from beamfit.dynamics.limits import LagLimits
 from beamfit.dynamics.model import PreparedOutput, curves
 from beamfit.dynamics.response import ARX, FIRST_ORDER, SECOND_ORDER, Physics
 from beamfit.errors import Finding, Status
@@ -28,8 +30,6 @@ from beamfit.statistics import POOR_FIT
 POINTS, VISITS, NEAR = 41, 5, 0.05
 # Points of a curve in JSON and tables.
 SHOWN = 9
-# A time constant with a relative error above this is compatible with 0 and with infinity.
-WIDE = 0.5
 TIME, GAIN, PURE = "s", "output/input", "1"
 
 
@@ -79,10 +79,12 @@ def _units(physics: Physics, m: int) -> list[str]:
 
 
 def _quoted(model: Any, of: tuple[Any, float]) -> jax.Array:
-    """Constant parameters, with the gains or lags that they stand for; the offset; the delay, s."""
+    """Constant parameters, with the ratios, gains or lags that they stand for; offset; delay, s."""
     seen, delay = of
     p = curves(model, (seen, seen.u[:1]))[0]
     parts = [p]
+    if seen.physics is FIRST_ORDER:
+        parts.append(p[1:] / p[0])
     if seen.physics is ARX:  # settled, y = K u
         m = seen.u.shape[1]
         parts.append((p[2 : 2 + m] + p[2 + m :]) / (1.0 + p[0] + p[1]))
@@ -107,6 +109,8 @@ def quantities_of(
     if laws is not None:
         found = alone._replace(error=laws.error(alone.slope, alone.error))
     names, units = list(physics.parameters(seen.inputs)), _units(physics, m)
+    if physics is FIRST_ORDER:
+        names, units = [*names, *(f"{k}/tau" for k in names[1:])], [*units, *[f"{GAIN}/s"] * m]
     if physics is SECOND_ORDER and found.value[1] > 1.0:
         names, units = [*names, "tau1", "tau2"], [*units, TIME, TIME]
     if physics is ARX:
@@ -142,11 +146,12 @@ def told(
     curves: Sequence[Curve],
     seen: PreparedOutput,
     checks: Checks,
+    limits: LagLimits,
 ) -> tuple[dict[str, Quantity], tuple[Curve, ...]]:
     """Quantities and curves with errors only where the runs determine them.
 
     No errors: of anything where the inputs explain no more than chance, of the gains of inputs that
-    move together, of time constants compatible with 0 or of which a sample leaves nothing.
+    move together, of lags that runs do not tell from 0 or infinity, and of what grows with them.
     """
     nothing = checks.nothing_probability >= POOR_FIT
     physics, inputs = seen.runs[0].physics, seen.inputs
@@ -154,22 +159,39 @@ def told(
     gains = [name for name, (_, gain) in powers if gain]
     joint = {n for k, n in enumerate(gains) if inputs[k % len(inputs)] in checks.together}
 
+    def wide(name: str) -> bool:
+        q = quantities.get(name)
+        return q is not None and q.unit == TIME and q.determined and q.interval_95[0] <= 0.0
+
     def is_open(name: str, q: Quantity) -> bool:
-        # Readings see what a sample leaves, exp(-apart/tau): its relative error is larger by this.
-        below = 1.0 if name == "delay" else max(1.0, seen.apart / (abs(q.value) or 1e-99))
-        wide = q.unit == TIME and q.error is not None and q.error * below > WIDE * abs(q.value)
+        # The gain that goes with an infinite lag is infinite.
+        grows = name.startswith(("tau", "T", "zeta", "K", "offset")) and not name.endswith("/tau")
+        endless = (wide("tau") or limits.above is not None) and grows
+        none = limits.below is not None and name.startswith(("tau", "T", "zeta"))
+        none |= name != "delay" and wide(name)
         # A higher order that is a first one determines only its gains and its longer lag.
         more = checks.first_order and not name.startswith(("K", "offset", "tau1", "delay"))
         # A number that ran to the end of its range has no slope there.
         ended = name != "delay" and q.error == 0
-        return nothing or wide or more or ended or name in joint
+        return nothing or endless or none or more or ended or name in joint
 
-    known = {n: q.open() if is_open(n, q) else q for n, q in quantities.items()}
+    known = {n: q.open() if is_open(n, q) else q for n, q in quantities.items()
+             if limits.above is not None or not n.endswith("/tau")}  # fmt: skip
+    known |= {n: replace(known[n], interval_95=limits.interval) for n in ("tau", "tau1")
+              if n in known and limits.interval and not nothing}  # fmt: skip
     blank = (nothing or c.parameter in joint for c in curves)
     return known, tuple(
         c._replace(error=np.full_like(c.error, np.nan)) if b else c
         for c, b in zip(curves, blank, strict=True)
     )
+
+
+def limit_words(q: Quantity) -> str:
+    """The limit of a quantity without an error; nothing if it has none."""
+    if q.error is not None or q.interval_95 is None:
+        return ""
+    low, high = q.interval_95
+    return f"above {low:.3g} {q.unit}" if np.isinf(high) else f"below {high:.3g} {q.unit}"
 
 
 def curves_of(fit: Fit, errors: Memory | None, seen: PreparedOutput) -> tuple[Curve, ...]:
@@ -261,7 +283,9 @@ def _lower(e: ResponseEvidence) -> Finding | None:
         return None
     cause = "A first order explains the runs as well: "
     if "a1" in e.quantities:
-        cause += "a pole and a zero cancel, so that a1, a2, b1 and b2 are not determined; K is."
+        gains = [q for name, q in e.quantities.items() if name.startswith("K")]
+        gain = "; K is." if all(q.determined for q in gains) else "."
+        cause += f"a pole and a zero cancel, so that a1, a2, b1 and b2 are not determined{gain}"
     else:
         cause += "the shorter lag is compatible with 0, so that T and zeta are not determined."
     return Finding(Status.unidentified, cause, "Use --model first-order.")
@@ -282,6 +306,8 @@ def _open(e: ResponseEvidence) -> Finding | None:
             return together(tied)
     cause = f"The runs do not determine {', '.join(left)}."
     remedy = "Move the inputs over more of their range."
+    limits = {n: words for n, q in e.quantities.items() if (words := limit_words(q))}
+    cause += "".join(f" {n} is {words} (95 %)." for n, words in limits.items())
     if TIME in left.values():
         remedy = "Sample faster around steps, and wait until the output settles."
         if e.checks.white_probability < POOR_FIT:
@@ -355,7 +381,8 @@ def _good(e: ResponseEvidence) -> Finding:
     if e.checks.white_probability < POOR_FIT:
         cause += " The noise has a memory, which the errors contain."
     if e.checks.law is not None:
-        cause += f" {e.checks.law.capitalize()} is likelier than none, which the errors contain."
+        odds = f"P = {e.checks.law_probability:.2f}"
+        cause += f" {e.checks.law.capitalize()} is likelier than none ({odds}): errors contain it."
     gains = [q for name, q in e.quantities.items() if name.startswith("K")]
     if gains and all(q.error is not None and abs(q.value) < 2 * q.error for q in gains):
         cause += " All gains are compatible with 0: only the return of the output to rest is seen."

@@ -15,6 +15,7 @@ from beamfit.dynamics.answer import (
     ResponseEvidence,
     curves_of,
     judged,
+    limit_words,
     quantities_of,
     rms_of,
     told,
@@ -22,6 +23,7 @@ from beamfit.dynamics.answer import (
 from beamfit.dynamics.bad_readings import BadReadings, sound
 from beamfit.dynamics.checks import Checks, HeldOutRun, checks_of, predict_held, slopes_of
 from beamfit.dynamics.input_laws import laws_of, shorter
+from beamfit.dynamics.limits import LagLimits, lag_limits
 from beamfit.dynamics.model import PreparedOutput, network_of, output_of
 from beamfit.dynamics.record import Run, check_inputs, checked
 from beamfit.dynamics.response import PHYSICS
@@ -117,7 +119,7 @@ class ResponseFit:
 
     def tables(self) -> tuple[Table, ...]:
         """All numbers, to be shown."""
-        rows = [[name, str(q)] for name, q in self.quantities.items()]
+        rows = [[name, f"{q} {limit_words(q)}".rstrip()] for name, q in self.quantities.items()]
         rows += [["delay", f"{self.delay:.4g} samples"]]
         rows += self.checks.rows() + [each.row() for each in self.held]
         found = [Table(f"{self.output} ({self.model}, {self.map} parameters)", [], rows)]
@@ -265,7 +267,9 @@ def _known(
     parts = answer.fit, answer.errors
     physics = seen.runs[0].physics
     quantities = quantities_of(*parts, laws, seen, physics, found.delay) if constant else {}
-    return checks, *told(quantities, () if constant else curves_of(*parts, seen), seen, checks)
+    limits = lag_limits(seen, answer, offset) if constant else LagLimits(None, None)
+    curves = () if constant else curves_of(*parts, seen)
+    return checks, *told(quantities, curves, seen, checks, limits)
 
 
 def _output(run: Run, output: str | None) -> str:

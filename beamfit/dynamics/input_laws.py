@@ -33,6 +33,8 @@ from beamfit.noise.memory import CorrelatedNoise, innovations
 LAWS = {law: np.geomspace(0.005, 0.4, count) for law, count in
         (("play", 8), ("hysteresis", 8), ("stop", 24), ("shift", 8), ("dead zone", 8))}  # fmt: skip
 BETWEEN = 0.5 * np.log(80.0) / 7
+# Places of a dead zone in a range without 0: prior flat.
+PLACES = np.linspace(0.1, 0.9, 5)
 # Plays of a hysteresis, as shares of the widest, which is twice its half width.
 PLAYS = (0.0, 0.4, 0.8, 1.2, 1.6, 2.0)
 # Correlation times and white variances of the noises that each is fitted with, and most readings.
@@ -82,18 +84,17 @@ class LawEvidence(NamedTuple):
         return np.sqrt(self.none * alone**2 + with_law)
 
 
-def moved(u: np.ndarray, law: str, width: float | np.ndarray) -> np.ndarray:
+def moved(u: np.ndarray, law: str, width: float | np.ndarray, place: float = 0.0) -> np.ndarray:
     """One input as a law hands it on, shape (rows,), for each of several widths if given.
 
     A play follows when its clearance is used up; a hysteresis is the mean of plays of several
     widths (Prandtl, Ishlinskii); a stop (Coulomb friction) goes all the way once it moves at all; a
     shift (friction against a spring) is to the side that the input last came from. A dead zone lies
-    about 0, or about the middle of a range without it.
+    about a place.
     """
-    half, low, high = np.asarray(width)[..., None], float(u.min()), float(u.max())
+    half = np.asarray(width)[..., None]
     if law == "dead zone":
-        away = u - (0.0 if low < 0 < high else 0.5 * (low + high))
-        return u - np.clip(away, -half, half)
+        return u - np.clip(u - place, -half, half)
     if law == "shift":
         sign = np.sign(np.diff(u, prepend=u[0]))
         last = np.maximum.accumulate(np.where(sign != 0, np.arange(len(u)), 0))
@@ -108,12 +109,12 @@ def moved(u: np.ndarray, law: str, width: float | np.ndarray) -> np.ndarray:
     return np.moveaxis(np.mean(found, axis=-1), 0, -1)[..., np.cumsum(changes) - 1]
 
 
-def _with_width(u: np.ndarray, law: str, widths: np.ndarray) -> np.ndarray:
-    """Inputs as a law hands them on at each width, and changes with it, shape (widths, rows, 2)."""
-    at = moved(u, law, widths)
+def _with_width(u: np.ndarray, law: str, widths: np.ndarray, place: float) -> np.ndarray:
+    """Inputs that a law hands on at each width, and changes with it, shape (widths, rows, 2)."""
+    at = moved(u, law, widths, place)
     if law == "stop":
         return np.stack([at, 0.0 * at], axis=2)
-    wider, closer = (moved(u, law, widths * np.exp(s)) for s in (BETWEEN, -BETWEEN))
+    wider, closer = (moved(u, law, widths * np.exp(s), place) for s in (BETWEEN, -BETWEEN))
     return np.stack([at, 0.5 * (wider - closer)], axis=2)
 
 
@@ -151,11 +152,14 @@ def _candidates(
     plain = [np.stack(list(run.inputs.values()), axis=1) for run in runs]
     names, kinds = [""], [""]
     behind = [[np.stack([u, 0.0 * u], axis=2)] for u in plain]
-    for i, (name, wide) in enumerate(zip(seen.inputs, np.ptp(seen.points, axis=0), strict=True)):
+    ends = zip(seen.inputs, seen.points.min(axis=0), seen.points.max(axis=0), strict=True)
+    for i, (name, low, high) in enumerate(ends):
         design = np.concatenate([np.stack([u[:, i], np.ones(len(u))], axis=1) for u in plain])
-        for law, shares in LAWS.items():
-            widths = shares * wide
-            turned = [_with_width(u[:, i], law, widths) for u in plain]
+        places = [0.0] if low < 0 < high else low + PLACES * (high - low)
+        shapes = [(law, at) for law in LAWS for at in (places if law == "dead zone" else [0.0])]
+        for law, at in shapes:
+            widths = LAWS[law] * (high - low)
+            turned = [_with_width(u[:, i], law, widths, at) for u in plain]
             whole = np.concatenate([v[..., 0] for v in turned], axis=1).T
             rest = whole - design @ np.linalg.lstsq(design, whole, rcond=1e-10)[0]
             size = np.linalg.norm(whole - whole.mean(axis=0), axis=0)

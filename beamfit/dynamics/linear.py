@@ -7,6 +7,7 @@ order are compared by their information criterion.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from itertools import product
 from typing import Any, NamedTuple
 
@@ -14,10 +15,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from scipy.linalg import solve_discrete_lyapunov
-from scipy.special import ndtr
+from scipy.special import ndtr, ndtri
 
-from beamfit.dynamics.answer import GAIN, PURE, TIME, WIDE, derived, quantity
+from beamfit.dynamics.answer import GAIN, PURE, TIME, derived, quantity
 from beamfit.dynamics.fit import MAPS
+from beamfit.dynamics.limits import SINGLE_END, LagLimits
 from beamfit.dynamics.model import CLOSE, WEIGHT
 from beamfit.dynamics.record import Run, check_inputs, checked
 from beamfit.dynamics.search import LONGEST, Case, Settled, information, noise_of, used_by
@@ -33,17 +35,17 @@ from beamfit.dynamics.states import Matrices, contraction, linear_outputs
 from beamfit.errors import InputError, nearest
 from beamfit.greybox import tree
 from beamfit.greybox.fit import Derived
-from beamfit.greybox.memory import CENTRAL
+from beamfit.greybox.memory import CENTRAL, reach_of_probability
 from beamfit.greybox.problem import Free, Prior
 from beamfit.noise.memory import CorrelatedNoise, remembers
-from beamfit.quantity import Quantity
+from beamfit.quantity import NORMAL_REACH, Quantity
 
 # Most samples of past and future, and most rows, of the regression.
 HORIZON, ROWS = 20, 20_000
 # Strides through the samples, for slow responses; fewest rows that must remain.
 STRIDES, FEWEST = (1, 5, 25, 125), 100
-# Newton steps to the rest of a network, and halvings of a bracket of an error.
-REST, HALVES = 20, 60
+# Newton steps to the rest of a network.
+REST = 20
 
 
 class Linear:
@@ -505,15 +507,15 @@ def joint_error(values: np.ndarray, errors: np.ndarray) -> np.ndarray:
     """
     seen, away = np.isfinite(errors), values - values[0]
     spread = np.where(seen, np.maximum(errors, np.finfo(float).tiny), np.inf)
-    low = np.zeros_like(values[0])
-    high = np.max(np.where(seen, np.abs(away) + 10.0 * errors, 0.0), axis=0)
-    for _ in range(HALVES):
-        reach = 0.5 * (low + high)
-        with np.errstate(over="ignore"):
-            inside = ndtr((reach - away) / spread) - ndtr((-reach - away) / spread)
-        less = inside.mean(axis=0) < CENTRAL
-        low, high = np.where(less, reach, low), np.where(less, high, reach)
-    return np.where(seen[0] & (seen.mean(axis=0) > CENTRAL), high, np.nan)
+
+    def within(reach: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        above, below = (reach - away) / spread, (-reach - away) / spread
+        slope = (np.exp(-0.5 * above**2) + np.exp(-0.5 * below**2)) / (np.sqrt(2 * np.pi) * spread)
+        return np.mean(ndtr(above) - ndtr(below), axis=0), np.mean(slope, axis=0)
+
+    widest = np.max(np.where(seen, np.abs(away) + errors, 0.0), axis=0)
+    reach = reach_of_probability(within, widest, CENTRAL)
+    return np.where(seen[0] & (seen.mean(axis=0) > CENTRAL), reach, np.nan)
 
 
 def _check_order(case: Case, runs: Sequence[Run], order: int) -> None:
@@ -577,17 +579,18 @@ def _quantities(
     inputs, outputs = list(runs[0].inputs), list(runs[0].outputs)
     tau, time, zeta, pole, turn = np.arange(5 * n).reshape(5, n)
     slow = [i for i in np.argsort(-numbers.value[time]) if numbers.value[turn[i]] >= 0.0]
+    endless = False  # a pole is compatible with 1, so that gains are with infinity
     for number, i in enumerate(slow, start=1):
         around = numbers.value[turn[i]] * step
         if around < 1e-9:
-            said[f"tau{number}"] = quantity(numbers, tau[i], TIME)
+            said[f"tau{number}"] = lag = _lag(numbers, tau[i], pole[i], step)
+            endless |= lag.interval_95 is not None and np.isinf(lag.interval_95[1])
         elif around > np.pi - 1e-9:  # on the negative axis: a sign from sample to sample
             said[f"pole{number}"] = quantity(numbers, pole[i], PURE)
         else:
-            said[f"T{number}"] = quantity(numbers, time[i], TIME)
+            said[f"T{number}"] = period = _period(quantity(numbers, time[i], TIME))
+            endless |= not period.determined
             said[f"zeta{number}"] = quantity(numbers, zeta[i], PURE)
-    said = {name: q.open() if q.unit == TIME and q.error is not None
-            and q.error > WIDE * abs(q.value) else q for name, q in said.items()}  # fmt: skip
     gains: dict[str, list[str]] = {name: [] for name in inputs}
     for i, (output, name) in enumerate(product(outputs, inputs), start=5 * n):
         words = [output] * (len(outputs) > 1) + [name] * (len(inputs) > 1)
@@ -596,7 +599,37 @@ def _quantities(
     for i, output in enumerate(outputs if offset else (), start=5 * n + len(inputs) * len(outputs)):
         label = "level" if len(outputs) == 1 else f"level_{output}"
         said[label] = quantity(numbers, i, "output")
+    if endless:
+        said = {n: q.open() if q.unit in (GAIN, "output") else q for n, q in said.items()}
     return said, gains
+
+
+def _period(found: Quantity) -> Quantity:
+    """T of a pair of poles; a limit where 1/T², by which gains at rest divide, may be 0 by 95 %."""
+    if not found.determined or found.value > 2.0 * NORMAL_REACH * found.error:
+        return found
+    most = 1.0 + 2.0 * ndtri(SINGLE_END) * found.error / found.value  # of 1/T²
+    return replace(found.open(), interval_95=(found.value / np.sqrt(most), np.inf))
+
+
+def _lag(numbers: Derived, i: int, pole: int, step: float) -> Quantity:
+    """A time constant; a limit where its pole is compatible with 1 or with 0, by 95 %.
+
+    What readings see hangs on the pole, which tells both limits from a lag; on the lag itself it
+    bends.
+    """
+    found, at, error = quantity(numbers, i, TIME), numbers.value[pole], numbers.error[pole]
+    low, high = at + NORMAL_REACH * error * np.array([-1.0, 1.0])
+    if low > 0.0 and high < 1.0:
+        return found
+    below, above = ((-step / np.log(end) if 0.0 < end < 1.0 else None)
+                    for end in at + ndtri(SINGLE_END) * error * np.array([1.0, -1.0]))  # fmt: skip
+    return replace(
+        found.open(),
+        interval_95=LagLimits(
+            above if high >= 1.0 else None, below if low <= 0.0 else None
+        ).interval,
+    )
 
 
 def _taylor(model: Any, asked: UsedStates) -> jax.Array:

@@ -44,8 +44,9 @@ LATEST, SHARE = 24, 0.1
 BETTER, PARTS = 5.0, (-0.75, -0.5, -0.25, 0.25, 0.5, 0.75)
 # Time constants of the grid, and dampings of a second order.
 LAGS, DAMPINGS = 16, (0.2, 0.6, 1.0, 2.0)
-# Step of their logarithms in a slope.
-STEP = 1e-3
+# Step of their logarithms in a slope; their range, in intervals and in runs, beyond which nothing
+# tells them from zero and from infinity.
+STEP, RANGE = 1e-3, (1e-3, 1e3)
 
 
 class Start(NamedTuple):
@@ -66,13 +67,13 @@ def best_start(seen: PreparedOutput, offset: bool) -> Start:
     """The best of the grid, of a difference equation that of second orders (eqs 13, 14)."""
     physics = seen.runs[0].physics
     apart, span = seen.apart, seen.span
-    times = np.geomspace(0.3 * apart, span, LAGS)
+    times = np.geomspace(0.1 * apart, span, LAGS)
     grid = np.log([[t] for t in times] if physics is FIRST_ORDER
                   else [[t, z] for t in times for z in DAMPINGS])  # fmt: skip
 
     def shapes(logarithms: np.ndarray) -> np.ndarray:
         found = np.exp(logarithms)
-        return found if physics is not ARX else _difference(found, apart)
+        return found if physics is not ARX else difference(found, apart)
 
     def left(logarithms: np.ndarray) -> np.ndarray:
         triangles = _triangles(seen.runs, seen.measured, shapes(logarithms), offset)
@@ -84,7 +85,7 @@ def best_start(seen: PreparedOutput, offset: bool) -> Start:
         here, up, down = np.split(left(np.vstack([x, x + moved, x - moved])), [1, 1 + len(x)])
         return float(here[0]), (up - down) / (2.0 * STEP)
 
-    bounds = [tuple(np.log([1e-3 * apart, 1e3 * span]))] * grid.shape[1]
+    bounds = [tuple(np.log(np.multiply(RANGE, (apart, span))))] * grid.shape[1]
     begin = grid[np.argmin(left(grid))]
     x = minimize(with_slope, begin, jac=True, bounds=bounds, method="L-BFGS-B").x
     (shape,) = shapes(x[None])
@@ -98,7 +99,7 @@ def best_start(seen: PreparedOutput, offset: bool) -> Start:
     return Start(p, first, level, float(triangle[-1, -1] ** 2))
 
 
-def _difference(shapes: np.ndarray, apart: float) -> np.ndarray:
+def difference(shapes: np.ndarray, apart: float) -> np.ndarray:
     """a1 and a2 of the difference equations that samples of second orders obey."""
     time, zeta = shapes.T.astype(complex)
     root = np.sqrt(zeta**2 - 1.0)
@@ -416,10 +417,13 @@ def with_memory(
 ) -> Settled:
     """The fit again, its noise with a memory, where residuals are correlated.
 
-    It may leave squares larger by the factor `worse`.
+    It may leave squares larger by the factor `worse`. Errors average over what the residuals leave
+    open of the noise also where they look white: a drift may be in the numbers instead.
     """
-    if not white.correlated(case):
+    if white.exact(case):
         return white
+    if not white.correlated(case):
+        return white._replace(errors=white.remembered(case, most=LONGEST)[0])
 
     def again(found: Settled) -> Settled:
         _, memory, size = found.remembered(case, most=LONGEST)

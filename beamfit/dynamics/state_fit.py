@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from beamfit.answer import Table, answer, json_of
-from beamfit.dynamics.answer import ResponseEvidence, judged, quantity
+from beamfit.dynamics.answer import ResponseEvidence, judged, limit_words, quantity
 from beamfit.dynamics.checks import Checks, HeldOutRun, RunSlopes, checks_of, percent
 from beamfit.dynamics.model import PreparedOutput, weight_priors
 from beamfit.dynamics.record import Run, checked
@@ -214,7 +214,7 @@ class StatesFit:
 
     def tables(self) -> tuple[Table, ...]:
         """All numbers, to be shown."""
-        rows = [[name, str(q)] for name, q in self.quantities.items()]
+        rows = [[name, f"{q} {limit_words(q)}".rstrip()] for name, q in self.quantities.items()]
         found = [Table(f"State space of order {self.order} ({self.map} parameters)", [], rows)]
         if tried := self.more.get("tried"):
             head = ["order", "direct", "BIC"]

@@ -43,6 +43,9 @@ from beamfit.greybox.sparse import (
 DAMPING = 1e-3
 # A search rests at a step below this share of the numbers, both in units of the Jacobian's columns.
 TOLERANCE = 1e-13
+# Damping falls to these shares after a step along which residuals were straight (D. W. Marquardt,
+# J. SIAM 11 (1963) 431), and after one along which they bent but which kept its promise (Nielsen).
+STRAIGHT, CURVED = 1 / 10, 1 / 3
 # Damping beyond which no step, however short, lowers the cost; below the least it is rounding.
 STUCK, LEAST = 1e30, 1e-30
 # A promised decrease below this share of the sum of squares is rounding.
@@ -218,18 +221,23 @@ class Descent:
         return at[worth], points[worth]
 
     def _take(self, lanes: np.ndarray, tried: Tried, promised: np.ndarray) -> None:
-        """Take the steps that lower the cost; damp less after those, more after the others."""
+        """Take the steps that lower the cost; damp less after those, more after the others.
+
+        Damping is for residuals that bend: it falls with the share of their change that did.
+        """
         squares, ratio, plain = self._squares(lanes), tried.ratio, promised >= 0
         finite = _finite(tried.residual, tried.jacobian) & (self.damping[lanes] <= DAMPING)
         last = finite & plain & (promised <= FINISHED * squares)
         good = (ratio > 1e-4) | last
         taken, refused = lanes[good], lanes[~good]
+        line = _times(self.jacobian[taken], tried.theta[good] - self.theta[taken])
+        bend = _length(tried.residual[good] - self.residual[taken] - line) / _length(line)
         self.theta[taken], self.residual[taken] = tried.theta[good], tried.residual[good]
         self.jacobian[taken] = tried.jacobian[good]
         reduced = self._reduced(tried.residual[good], tried.jacobian[good])
         self.right[taken], self.rows[taken] = reduced
         ratio = ratio[good].clip(-1.0, 1.0)
-        self.damping[taken] *= np.maximum(1 / 3, 1 - (2 * ratio - 1) ** 3)
+        self.damping[taken] *= np.maximum(np.clip(bend, STRAIGHT, CURVED), 1 - (2 * ratio - 1) ** 3)
         self.growth[taken] = 2.0
         self.damping[refused] *= self.growth[refused]
         self.growth[refused] *= 2.0

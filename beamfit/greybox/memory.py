@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
-from scipy.special import stdtr, stdtrit
+from scipy.special import logsumexp, stdtr, stdtrit
 
 from beamfit.greybox.covariance import CUT
 from beamfit.greybox.problem import padded_length
@@ -116,13 +116,13 @@ class Memory(NamedTuple):
                 self.weight @ (slope / spread)
             )
 
-        reaches = [_inverted(within, np.max(np.abs(centre - shift) + spread, 0), p)
+        reaches = [reach_of_probability(within, np.max(np.abs(centre - shift) + spread, 0), p)
                    for p in (CENTRAL, 0.95)]  # fmt: skip
         chance = self.weight @ (2 * stdtr(self.dof, -np.abs(centre) / spread))
         return AveragedMoments(shift, *reaches, chance)
 
 
-def _inverted(within, scale: np.ndarray, probability: float) -> np.ndarray:
+def reach_of_probability(within, scale: np.ndarray, probability: float) -> np.ndarray:
     """Distance within which this probability lies.
 
     By Newton steps, and halves of the bracket where one leaves it or is no shorter by half.
@@ -168,10 +168,26 @@ class Whitened(NamedTuple):
         squares = self.memory(numbers).squares
         return float(np.min(self.count * np.log(squares / self.count) - 2.0 * self.volume))
 
+    def evidence(self) -> float:
+        """-2 ln of the probability of the values, numbers and noise integrated out: up to a
+        constant, flat in the numbers, in the logarithm of the errors' size and over the noises.
+        """
+        return -2.0 * float(logsumexp(self._solved(None)[3]))
+
     def memory(self, numbers: int | None = None) -> Memory:
         """Posterior over noise models with the first `numbers` free and the others held.
 
         Directions that the rows do not see, by a share of `CUT`, are left where they are.
+        """
+        half, along, squares, logs = self._solved(numbers)
+        weight = np.exp(logs - logs.max())
+        step = -(half @ along)[..., 0]
+        dof = self.count - step.shape[1]
+        return Memory(weight / weight.sum(), *self.noise, step, half, squares, dof)
+
+    def _solved(self, numbers: int | None) -> tuple[np.ndarray, ...]:
+        """Root of the covariance, components of the residuals, what is left of their squares, and
+        the logarithm of each noise's probability.
         """
         slopes, rest = self.triangle[..., :-1][..., :numbers], self.triangle[..., -1:]
         length = np.linalg.norm(slopes, axis=1)
@@ -184,13 +200,10 @@ class Whitened(NamedTuple):
         squares = np.maximum(np.sum((rest - left @ along) ** 2, axis=(1, 2)), 1e-300)
         logs = self.volume + np.sum(np.log(np.where(seen, unit * inverse, 1.0)), axis=1)
         logs -= 0.5 * (self.count - seen.sum(axis=1)) * np.log(squares)
-        weight = np.exp(logs - logs.max())
         alone = self.noise.white == 0
         if not alone.all():  # even odds for a white part
-            weight *= np.where(alone, alone.size / alone.sum() - 1.0, 1.0)
-        dof = self.count - slopes.shape[2]
-        step = -(half @ along)[..., 0]
-        return Memory(weight / weight.sum(), *self.noise, step, half, squares, dof)
+            logs += np.where(alone, np.log(alone.size / alone.sum() - 1.0), 0.0)
+        return half, along, squares, logs
 
 
 def whitened_by_each(

@@ -16,7 +16,7 @@ from beamfit.errors import nearest
 from beamfit.language import document as d
 from beamfit.language import expression as x
 from beamfit.language.expression import Place, error_at
-from beamfit.language.text import check_brackets, explained, short
+from beamfit.language.mistakes import check_brackets, explained, short
 
 
 @lru_cache(maxsize=64)

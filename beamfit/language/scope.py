@@ -250,7 +250,8 @@ def index_of(scope: Scope, e: x.Expression, axes: Axes) -> np.ndarray:
 
 
 def _iterators(name: str, known: list[str]) -> str:
-    return nearest(name, known) if known else "a whole number, or foreach behind the statement"
+    behind = f"'foreach {name} in SET' behind the statement, or sum({name} in SET | ...)"
+    return f"{behind}, or {nearest(name, known)}" if known else behind
 
 
 def located(scope: Scope, node: x.Name, array: Array, axes: Axes) -> list[np.ndarray]:
@@ -337,6 +338,8 @@ def _unknown(scope: Scope, e: x.Name, axes: Axes) -> InputError:
     if e.name in FUNCTIONS or e.name in scope.functions:
         return error_at(e.at, f"the function '{e.name}' without arguments", f"{e.name}(...)")
     known = [*scope.arrays, *axes, *CONSTANTS]
+    if e.name == "e":
+        return error_at(e.at, "unknown name 'e'", "exp(...) for powers of e")
     return error_at(e.at, f"unknown name '{e.name}'", nearest(e.name, known))
 
 

@@ -39,6 +39,19 @@ KNOWN = {
     "set": "elements",
 }  # fmt: skip
 
+# Attributes of each element; a misspelt one would be lost without a word.
+GIVEN = {
+    "formulation": "", "problem": "classname direction",
+    "objective": "label modelVariable coefficient",
+    "variable": "label modelVariable lower upper value useRandomInitial randomLower randomUpper "
+                "randomSeed",
+    "constraint": "label modelVariable lower upper", "solver": "classname",
+    "mapping": "classname name", "data": "name file rowCount columnCount", "set": "name",
+    "elements": "type start stop step", "input": "name value isScalar", "output": "name isScalar",
+    "parameter": "name value isScalar", "dimension": "type set size", "values": "",
+    "expressions": "",
+}  # fmt: skip
+
 
 class Node(NamedTuple):
     """An element: its text begins where it stands in the file, so that places in it are right."""
@@ -217,6 +230,7 @@ def parse_xml(text: str) -> d.Document:
     ('y', '2')
     """
     root = read_elements(text)
+    _check_attributes(root)
     if root.tag == "mapping":
         return d.Document(_mapping(root))
     if root.tag != "formulation":
@@ -239,6 +253,18 @@ def _check(node: Node, kind: str) -> None:
             raise child.error(f"<{child.tag}> in <{node.tag}>", nearest(child.tag, known))
     if kind != "expressions" and "".join(node.text).strip() and kind not in ("input", "parameter"):
         raise node.error(f"text in <{node.tag}>", "elements only")
+
+
+def _check_attributes(node: Node) -> None:
+    """Refuse attributes that mean nothing; a network has its own."""
+    known = GIVEN.get(node.tag, "").split()
+    for key in node.given if node.tag in GIVEN else ():
+        if key not in known:
+            raise node.error(f"{key}='{node.given[key]}' in <{node.tag}>", nearest(key, known), key)
+    for child in node.children if node.given.get("classname") != MLP_CLASS else ():
+        if node.tag == "expressions":
+            raise child.error(f"<{child.tag}> in <expressions>", "statements only")
+        _check_attributes(child)
 
 
 def _one(node: Node, tag: str) -> Node | None:

@@ -105,6 +105,20 @@ def test_poles_gains_and_the_order_of_two_inputs_and_outputs_are_found():
         identify_states(run, 60)
 
 
+def test_a_pole_that_is_as_good_as_one_leaves_a_limit_and_no_gain():
+    """A lag of 4000 samples in a record of 200."""
+    rng = np.random.default_rng(0)
+    u, y = np.repeat(rng.uniform(-1, 1, 14), 15)[:200], np.zeros(200)
+    for k in range(199):
+        y[k + 1] = 2 * u[k] + (y[k] - 2 * u[k]) * np.exp(-1 / 4000)
+    run = Run(np.arange(200.0), {"u": u}, {"y": y + 0.1 * y.std() * rng.normal(size=200)})
+    q = identify_states(run, 1).quantities
+    assert [q[name].error for name in ("tau1", "K", "level")] == [None] * 3
+    low, high = q["tau1"].interval_95
+    assert 10 < low < 4000
+    assert np.isinf(high)
+
+
 def test_a_network_follows_what_no_linear_state_space_does():
     """A state that saturates; the rest at the mean input and its slope there are iterated here."""
 

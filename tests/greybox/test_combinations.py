@@ -30,28 +30,29 @@ def predict(model, x):
 
 
 def test_in_series_a_network_finds_a_parameter_nobody_measured():
-    """The compressibility z(T, P) from temperature, pressure and volume alone."""
-    random = np.random.default_rng(3)
-    x = np.column_stack([random.uniform(250, 400, 60), random.uniform(1e6, 2e7, 60)])
-    volume = np.array([van_der_waals_volume(*row) for row in x])
+    """The compressibility z(T, P) from temperature, pressure and volume alone, of five records."""
     ports = [Port("T", "", scale=50.0, bias=325.0), Port("P", "", scale=6e6, bias=1e7)]
     z = dense(ports, [Port("z", "", bias=1.0)], hidden=[6], spread=0.1)
     law = Formula(["z", "T", "P"], ["V"], lambda _, v: 1e6 * v[:1] * GAS * v[1:2] / v[2:])
-    error = 3e-3 * volume
-    measured = 1e6 * (volume + error * random.normal(size=60))  # cm3
-    record = Record("gas", predict, x, measured, 1e6 * error)
-    model = {"gas": Series(z, law)}
-    weak = Prior("gas.first", 0.0, 10.0)
-    fit = solve(
-        Problem(model, [Free("gas", -50, 50, nuisance=True)], [record], priors=[weak]), starts=3
-    )
-    assert fit.chi2 < 1.5 * 60
-    new = np.column_stack([random.uniform(260, 390, 40), random.uniform(2e6, 1.9e7, 40)])
-    truth = [p * van_der_waals_volume(t, p) / (GAS * t) for t, p in new]
-    found = fit.derive(lambda m, x: jax.vmap(m["gas"].first)(x)[:, 0], new)
-    off = np.abs(found.value - truth)
-    assert np.max(off) < 6e-3
-    assert np.mean(off < 2 * found.error) > 0.8
+    model, weak = {"gas": Series(z, law)}, Prior("gas.first", 0.0, 10.0)
+    most, inside = [], []
+    for seed in range(3, 8):
+        random = np.random.default_rng(seed)
+        x = np.column_stack([random.uniform(250, 400, 60), random.uniform(1e6, 2e7, 60)])
+        volume = np.array([van_der_waals_volume(*row) for row in x])
+        error = 3e-3 * volume
+        measured = 1e6 * (volume + error * random.normal(size=60))  # cm3
+        record = Record("gas", predict, x, measured, 1e6 * error)
+        free = [Free("gas", -50, 50, nuisance=True)]
+        fit = solve(Problem(model, free, [record], priors=[weak]), starts=3)
+        assert fit.chi2 < 1.5 * 60
+        new = np.column_stack([random.uniform(260, 390, 40), random.uniform(2e6, 1.9e7, 40)])
+        truth = [p * van_der_waals_volume(t, p) / (GAS * t) for t, p in new]
+        found = fit.derive(lambda m, x: jax.vmap(m["gas"].first)(x)[:, 0], new)
+        most.append(np.max(np.abs(found.value - truth)))
+        inside.append(np.mean(np.abs(found.value - truth) < 2 * found.error))
+    assert np.median(most) < 6e-3
+    assert min(inside) > 0.8
 
 
 def decay_with_ripple(t):

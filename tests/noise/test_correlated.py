@@ -5,7 +5,7 @@ from scipy.linalg import cholesky, solve_triangular
 from scipy.signal import lfilter
 from scipy.stats import multivariate_normal
 
-from beamfit.greybox.memory import memory_of
+from beamfit.greybox.memory import memory_of, whitened_by_each
 from beamfit.greybox.problem import Free, Problem, Record
 from beamfit.greybox.solve import solve
 from beamfit.noise.memory import (
@@ -127,3 +127,20 @@ def test_the_core_fits_and_judges_whitened_rows(uneven):
     np.testing.assert_allclose(fit.theta, covariance @ slopes.T @ weight @ measured, rtol=1e-6)
     np.testing.assert_allclose(fit.covariance_raw, covariance, rtol=1e-6)
     assert 0.5 < fit.chi2 / fit.dof < 1.6
+
+
+def test_the_evidence_is_the_integral_over_numbers_and_the_size_of_the_noise():
+    """One number, white noise: by a sum over a grid, of two sets of readings."""
+    rng, x = np.random.default_rng(0), np.linspace(0.5, 1.5, 9)
+    number, size = (
+        np.linspace(-3, 5, 801)[:, None, None],
+        np.geomspace(0.05, 20, 600)[None, :, None],
+    )
+    found = []
+    for y in (x + 0.3 * rng.normal(size=9), 2 * x + rng.normal(size=9)):
+        density = np.exp(-0.5 * np.sum(((y - number * x) / size) ** 2, axis=2)) / size[..., 0] ** 9
+        rows = [(np.column_stack([x, -y]), np.arange(9.0))]
+        white = whitened_by_each([CorrelatedNoise(1e-9)], rows)
+        found.append([white.evidence(), -2 * np.log(np.sum(density))])
+    (one, by_sum), (other, by_sum_too) = found
+    assert other - one == pytest.approx(by_sum_too - by_sum, rel=1e-6)
