@@ -232,12 +232,14 @@ def loss_terms(
     1.0e-07 Pa, P1/P0 = 0.008 /mA
     """
     base, slope = operation.pressure_base, operation.pressure_slope
+
+    def parts_at(voltage: Array) -> tuple[Array, ...]:
+        return terms_of(ring, operation._replace(rf_voltage=voltage), current)
+
     if voltages is None:
-        parts = terms_of(ring, operation, current)
+        parts = parts_at(operation.rf_voltage)
     else:
-        settings = [operation._replace(rf_voltage=operation.rf_voltage * v) for v in voltages]
-        each = [terms_of(ring, setting, current) for setting in settings]
-        parts = tuple(jnp.stack(part, axis=-1) for part in zip(*each, strict=True))
+        parts = jax.lax.map(parts_at, operation.rf_voltage * jnp.asarray(voltages, float))
     return LossTerms(
         parts,
         pressure=jnp.asarray(base + slope * current, float),

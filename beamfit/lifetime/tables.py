@@ -9,11 +9,8 @@ from typing import NamedTuple
 
 from beamfit.answer import Row, Table, cell
 from beamfit.lifetime.fit import DecayFit
-from beamfit.lifetime.mechanisms import LINEAR, QUADRATIC, SCALES, Mechanism
+from beamfit.lifetime.mechanisms import LINEAR, QUADRATIC, Mechanism
 from beamfit.lifetime.pieces import Event
-from beamfit.lifetime.ring import Operation
-from beamfit.lifetime.ring_study import Shift
-from beamfit.lifetime.scales import VOLTAGE
 from beamfit.lifetime.study import Decay, RecordStudy
 from beamfit.quantity import HOUR, Quantity, Status
 
@@ -29,8 +26,6 @@ class DecayRow(NamedTuple):
 MOST_EVENTS = 100
 # How many decays have every number shown; of more only the main ones, a row each.
 FEW = 4
-# Rows of a study of many decays that stand on the first screen, by the beginnings of their labels.
-QUOTED = (*(f"{name}, " for name in SCALES), "chi2/dof", "lifetime", "best", "next decay, choice 1")
 # Percent of the loss below which a mechanism's digits say nothing.
 NEGLIGIBLE = 1e-6
 
@@ -356,59 +351,3 @@ def event_rows(study: RecordStudy) -> list[list[str]]:
     ]
     left = len(study.events) - len(rows)
     return rows + ([[f"{left} more", "", "", ""]] if left else [])
-
-
-def _setting(operation: Operation) -> str:
-    voltage, scraper = float(operation.rf_voltage) / 1e3, 1e3 * float(operation.scraper_y)
-    return f"{voltage:.6g} kV, {scraper:.4g} mm, {float(operation.bunches):.6g} bunches"
-
-
-def shift_rows(shift: Shift) -> list[Row]:
-    """Label and one cell for each answer of a study of many decays."""
-    fit, best, at = shift.fit, shift.best, f"at {shift.current:.4g} mA"
-    rows: list[tuple[str, object]] = [("status", fit.status)]
-    for name, scale in fit.scales.items():
-        of, told = "scale on the ring file", "not separable"
-        if name == VOLTAGE:
-            of, told = "true over read", "not told: its prior's"
-        rows.append((f"{name}, {of}", told if scale.error is None else scale))
-    rows.append(("chi2/dof", f"{fit.chi2:.4g}/{fit.dof}" if fit.dof > 0 else "not testable"))
-    for row in shift.budget:
-        shown = f"{row.median:.4g} ({row.lower:.4g} to {row.upper:.4g}) {row.unit}"
-        rows.append((f"{row.name} {at}", shown if row.separable else "not determined"))
-    volts, error = best.rf_voltage.value / 1e3, best.rf_voltage.error
-    limit = f"{volts:.6g} kV, at its limit"
-    rows += [
-        ("best RF voltage", limit if error is None else Quantity(volts, error / 1e3, "kV")),
-        ("best scraper and bunches", f"{1e3 * best.scraper_y:.4g} mm, {best.bunches:.6g}"),
-        ("lifetime there", best.lifetime),
-        ("lifetime at the usual settings", best.usual),
-    ]
-    if shift.held_back:
-        off = [abs(one.pull) for one in shift.held_back]
-        within = [sum(pull < most for pull in off) for most in (1, 2)]
-        said = f"{within[0]} of {len(off)} within 1, {within[1]} within 2 errors"
-        rows.append(("each decay predicted by the others", said))
-    for number, proposal in enumerate(shift.proposals, 1):
-        asked = proposal.candidate
-        said = f"{asked.current:.4g} mA (information {proposal.information:.3g})"
-        rows.append((f"next decay, choice {number}", f"{_setting(asked.operation)}, {said}"))
-    return [Row(label, [value], label.startswith(QUOTED)) for label, value in rows]
-
-
-def network_rows(shift: Shift) -> list[Row]:
-    """Label and one cell for what a network of the losses says, and what it obeys."""
-    network, at = shift.network, f"at the usual settings, {shift.current:.4g} mA"
-    a, b, lifetime = network.predict(network.usual, shift.current)
-    held, wrong = network.certificate, network.discrepancy.size
-    rows = [
-        ("status", network.fit.status),
-        ("chi2/dof", f"{network.fit.chi2:.4g}/{network.fit.dof}"),
-        ("what it may be wrong by, a and b", " and ".join(f"{100 * size:.2g} %" for size in wrong)),
-        (f"a {at}", a),
-        (f"b {at}", b),
-        (f"lifetime {at}", lifetime),
-        ("falls with scraper and bunches, rises with pressure", held.holds),
-        ("single maximum of the lifetime in the RF voltage", held.single_maximum),
-    ]
-    return [Row(label, [value]) for label, value in rows]

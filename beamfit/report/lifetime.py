@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import FigureBase
 
 from beamfit.answer import Table, labelled
-from beamfit.errors import InputError, Status
+from beamfit.errors import InputError
 from beamfit.lifetime import tables
 from beamfit.lifetime.alarm import when
 from beamfit.lifetime.course import Trend
@@ -52,10 +52,6 @@ BUDGET = (
     "Computed for the ring file and the record's own settings, nothing fitted. The percentages are "
     "shares of the computed loss at the mean current."
 )
-SHIFT = (
-    "Scales multiply the ring file's first principles. Brackets are 68 % credible intervals. The "
-    "best point is sought within the range of settings seen."
-)
 # Columns of a table of decays that fit the page.
 ABREAST = 2
 
@@ -81,10 +77,8 @@ def decay_page(
     decays = [decay for study in studies for decay in study.decays]
     listed = []
     if shift is not None:
-        found = labelled("All decays", ["value"], tables.shift_rows(shift), SHIFT)
-        listed += [found.quoted()._replace(title="Result", note="", header=[]), found]
-    if shift is not None and shift.network is not None:
-        listed.append(labelled("A network of the losses", ["value"], tables.network_rows(shift)))
+        found = shift.tables()
+        listed += [found[0].quoted()._replace(title="Result", note="", header=[]), *found]
     listed += [] if trend is None else trend.tables()
     pooled = [decay for study in studies for decay in study.pooled]
     listed += _side_by_side(pooled) + tables.course_tables(pooled) + _single(decays)
@@ -160,13 +154,7 @@ def _verdict(decay: Decay) -> Verdict:
 def _together(shift: Shift | None, trend: Trend | None) -> Iterator[Verdict]:
     """Verdicts on all decays together."""
     if shift is not None:
-        fit, best, change = shift.fit, shift.best, shift.anomaly
-        yield Verdict(fit.status, f"{len(fit.names)} decays together", fit.message)
-        yield Verdict(best.status, f"best lifetime {best.lifetime}", best.message)
-        if shift.untold:
-            yield Verdict(Status.unidentified, "loss budget", shift.untold)
-        if change is not None:
-            yield Verdict(change.status, "second half against the first", change.message)
+        yield from (Verdict(status, name, said) for name, status, said in shift.verdicts)
     if trend is not None:
         yield Verdict(trend.status, "course of the lifetime", trend.message)
 

@@ -9,12 +9,18 @@ from scipy.optimize import brentq
 
 import beamfit
 from beamfit.errors import InputError
-from beamfit.lifetime.advice import DecayCandidate, Limits, best_operating_point, next_decays
 from beamfit.lifetime.bunch import rf_acceptance
 from beamfit.lifetime.decay_law import current
 from beamfit.lifetime.mechanisms import SCALES, loss_coefficients, loss_terms, scaled_losses
 from beamfit.lifetime.record import Conditions, DecayRecord
-from beamfit.lifetime.ring_study import budget_intervals, find_anomaly
+from beamfit.lifetime.ring_study import (
+    DecayCandidate,
+    Limits,
+    best_operating_point,
+    budget_intervals,
+    find_anomaly,
+    next_decays,
+)
 from beamfit.lifetime.scales import fit_scales, summarise
 from beamfit.lifetime.study import study_record
 from beamfit.quantity import Status
