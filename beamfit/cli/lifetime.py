@@ -228,7 +228,7 @@ def _show(
 
 def _show_record(terminal: Terminal, study: RecordStudy) -> None:
     """Lay out a record: what was cut away, and every decay with its verdict and budget."""
-    from beamfit.answer import Table, determined, labelled
+    from beamfit.answer import determined, labelled
     from beamfit.lifetime import tables
 
     terminal.line(str(study.record), style="bold")
@@ -252,8 +252,7 @@ def _show_record(terminal: Terminal, study: RecordStudy) -> None:
         rows += tables.check_rows([decay])
         terminal.table(labelled("", [name], determined(rows)), [status])
         if decay.systematics:
-            unseen = tables.systematic_rows(decay)
-            terminal.table(Table("\nSystematics", tables.SYSTEMATIC, unseen))
+            terminal.table(tables.systematic_table(decay, "\nSystematics"))
         if losses := tables.budget_rows([decay]):
             terminal.table(labelled("\nLosses from first principles", [name], losses))
         for course in tables.course_tables([decay]):

@@ -568,12 +568,12 @@ class Shift:
 
     @property
     def status(self) -> Status:
-        """Of the scales."""
+        """Status of the scales."""
         return self.fit.status
 
     @property
     def message(self) -> str:
-        """Of the scales."""
+        """Status of the scales."""
         return self.fit.message
 
     @property
@@ -588,7 +588,7 @@ class Shift:
 
     @property
     def verdicts(self) -> list[tuple[str, Status, str]]:
-        """What is judged, with status and sentence."""
+        """Name, status and sentence of each verdict."""
         found = [(f"{self._count} together", self.status, self.message)]
         if self.untold:
             found.append(("loss budget", Status.unidentified, self.untold))
