@@ -13,9 +13,8 @@ from jax import Array
 
 from beamfit.answer import shown
 from beamfit.errors import InputError
-from beamfit.lifetime.bunch import quantum_loss
 from beamfit.lifetime.gas import bremsstrahlung_loss, elastic_loss
-from beamfit.lifetime.ring import Operation, Ring, unstored
+from beamfit.lifetime.ring import Operation, Ring, quantum_loss, unstored
 from beamfit.lifetime.touschek import touschek_loss
 
 # Pa, base pressure of the relative rise with current if the pressure is zero.

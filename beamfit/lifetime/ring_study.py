@@ -427,8 +427,8 @@ def best_operating_point(
         found = at[np.argmin(jax.vmap(_rate, (0, None))(draws, terms), axis=1)]
         step = at[1] - at[0]
         ends = max(low, found.min() - step), min(at[-1], found.max() + step)
-    error = float(np.hypot(found.std(), step / np.sqrt(12)))
-    best = float(np.median(found))
+    spread = quantity_of_draws(found, "V")
+    best, error = spread.value, math.hypot(spread.error, step / math.sqrt(12))
     inside = low + step < best < high - step
     reached = _lifetime(fit, sample, wide._replace(rf_voltage=best), current)
     message = (

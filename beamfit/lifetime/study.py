@@ -13,7 +13,6 @@ import numpy as np
 
 from beamfit.answer import answer, json_of, shown
 from beamfit.errors import InputError, expect
-from beamfit.lifetime.bunch import stored_bunch
 from beamfit.lifetime.cycles import (
     FEWEST_CYCLES,
     MOST,
@@ -39,7 +38,7 @@ from beamfit.lifetime.pieces import (
     without_repeats,
 )
 from beamfit.lifetime.record import DecayRecord
-from beamfit.lifetime.ring import MeasuredLength, Operation, Ring, unstored
+from beamfit.lifetime.ring import MeasuredLength, Operation, Ring, stored_bunch, unstored
 from beamfit.lifetime.systematics import DecayChecks, Systematic, check_decay, systematics
 from beamfit.quantity import HOUR, Quantity, Status
 

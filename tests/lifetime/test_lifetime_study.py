@@ -9,10 +9,10 @@ from scipy.optimize import brentq
 
 import beamfit
 from beamfit.errors import InputError
-from beamfit.lifetime.bunch import rf_acceptance
 from beamfit.lifetime.decay_law import current
 from beamfit.lifetime.mechanisms import SCALES, loss_coefficients, loss_terms, scaled_losses
 from beamfit.lifetime.record import Conditions, DecayRecord
+from beamfit.lifetime.ring import rf_acceptance
 from beamfit.lifetime.ring_study import (
     DecayCandidate,
     Limits,
