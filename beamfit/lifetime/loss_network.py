@@ -35,6 +35,7 @@ from beamfit.lifetime.scales import (
     by_losses,
     loss_parts,
     summarise,
+    widened,
 )
 from beamfit.lifetime.study import Decay, Machine, operation_during
 from beamfit.quantity import HOUR, Quantity, percent
@@ -409,9 +410,7 @@ def _statement(measured: Summaries, floor: float) -> tuple[np.ndarray, np.ndarra
     quadratic, rate = np.abs(np.asarray(measured.parts)).T
     linear = np.maximum(np.abs(rate - quadratic), SMALLEST * rate)
     by = by_losses(quadratic, linear)
-    own = np.asarray(measured.root) @ by * np.array([floor, PRESSURE_ERROR])
-    root = np.linalg.cholesky(np.eye(2) + own @ np.swapaxes(own, 1, 2))
-    weight = np.linalg.solve(root, np.asarray(measured.root))
+    weight = np.asarray(widened(measured.root, by * np.array([floor, PRESSURE_ERROR])))
     return block_diag(*weight), block_diag(*(weight @ by))
 
 

@@ -84,15 +84,33 @@ def _root(decay: Decay, parts: np.ndarray) -> np.ndarray:
     return _with_monitor(information_root(about, scale * fit.inflation), about)
 
 
+def widened(root: Array, changes: Array) -> Array:
+    """Root of the information where the parts also err by independent changes.
+
+    Parameters
+    ----------
+    root : array, shape (..., 2, 2)
+        As of `Summaries`.
+    changes : array, shape (..., 2, k)
+        By how much each of k errors moves the parts, one standard deviation.
+
+    Returns
+    -------
+    array, shape (..., 2, 2)
+        W with WᵀW = Rᵀ (1 + G Gᵀ)⁻¹ R, G = R times the changes: the errors integrated out.
+    """
+    own = root @ changes
+    whole = jnp.linalg.cholesky(jnp.eye(2) + own @ jnp.swapaxes(own, -1, -2))
+    return jnp.linalg.solve(whole, root)
+
+
 def _with_monitor(root: np.ndarray, about: Expansion) -> np.ndarray:
     """The root with what is stated of the monitor added to the covariance of the parts."""
-    changes = about.pieces.monitor_changes
-    if not changes:
+    moved = [about.moved(change) for change in about.pieces.monitor_changes]
+    if not moved:
         return root
-    moved = [about.moved(change) for change in changes]
-    spread = root @ np.array([[m.a * about.pieces.units[1], m.rate_mean] for m in moved]).T
-    whole = np.linalg.cholesky(np.eye(2) + spread @ spread.T)
-    return np.linalg.qr(np.linalg.solve(whole, root), mode="r")
+    changes = np.array([[m.a * about.pieces.units[1], m.rate_mean] for m in moved]).T
+    return np.linalg.qr(widened(root, changes), mode="r")
 
 
 def _together(fit: DecayFit, rate: float) -> np.ndarray:
@@ -195,15 +213,10 @@ class DecaySet(NamedTuple):
 
 @jax.jit
 def whitener(scales: Array, decays: DecaySet) -> Array:
-    """W of shape (n, 2, 2) with WᵀW = Rᵀ (1 + g gᵀ)⁻¹ R, g = R ∂(parts)/∂(factor) times the
-    relative pressure error: each decay's pressure factor integrated out (Sherman and Morrison).
-    """
-    ones, root = jnp.ones_like(decays.terms.current), decays.measured.root
+    """Roots of the information, each decay's pressure factor integrated out; shape (n, 2, 2)."""
+    ones = jnp.ones_like(decays.terms.current)
     _, slope = jax.jvp(lambda factor: decays.parts(scales, factor), (ones,), (ones,))
-    g = jnp.einsum("nij,nj->ni", root, slope * decays.pressure_error)
-    # (1 + g gᵀ)^(-1/2) = 1 - g gᵀ (1 - 1/sqrt(1 + g²))/g², which is 1/(s (1 + s)) of s² = 1 + g².
-    s = jnp.sqrt(1 + jnp.sum(g**2, -1))
-    return (jnp.eye(2) - g[:, :, None] * g[:, None, :] / (s * (1 + s))[:, None, None]) @ root
+    return widened(decays.measured.root, decays.pressure_error * slope[..., None])
 
 
 @jax.jit
