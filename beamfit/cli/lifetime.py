@@ -168,9 +168,10 @@ def _lifetimes(tables: list[LifetimeTable], inputs: dict[str, str], as_json: boo
 def _show_lifetimes(terminal: Terminal, fits: list[LifetimeFit]) -> None:
     for fit in fits:
         terminal.line(str(fit.readings), style="bold")
-        terminal.verdict(fit.record, fit.status, fit.message)
+        terminal.answer(fit.headline, fit.status, fit.message)
         terminal.line()
-        terminal.table(fit.table(), [fit.status])
+        for table in fit.tables():
+            terminal.table(table, [fit.status])
         for note in fit.readings.notes:
             terminal.line(f"Note: {note}")
         terminal.line()

@@ -28,7 +28,6 @@ from beamfit.statistics import (
 
 # a and b wander by so much on an ordinary day.
 WANDER = 0.005
-DAY = 24 * HOUR
 # Where readings do not tell a from b, the ring's own shares of them are trusted to this.
 SHARES = 0.3
 # No monitor is better than this share of the current.
@@ -277,10 +276,10 @@ def _point(
 
 def _drift(time: np.ndarray, values: Sequence[Quantity], centre: float) -> Quantity:
     """Relative slope by least squares, its error from the residuals."""
-    if len(values) < FEWEST + 1 or np.ptp(time) < DAY:
+    if len(values) < FEWEST + 1 or np.ptp(time) < 24 * HOUR:
         return Quantity(math.nan, None, "1")
     level = np.array([value.value for value in values]) / centre
-    weeks = (time - time.mean()) / (7 * DAY)
+    weeks = (time - time.mean()) / (7 * 24 * HOUR)
     [slope, _], covariance = np.polyfit(weeks, level, 1, cov=True)
     error = float(np.sqrt(covariance[0, 0]))
     return Quantity.reaching(float(slope), error, "1", None, reach_of(level.size - 2) * error)

@@ -173,7 +173,7 @@ class Discrepancy(NamedTuple):
         reach = cho_solve((root, True), self.rows @ self.kernel(at).T)
         jacobian = root @ fit.dense_jacobian[: left.size]
         total = slopes - reach.T @ jacobian
-        own = Discrepancy(self.size, at, self.length, self.rows).kernel(at)
+        own = self._replace(inputs=at).kernel(at)
         rest = own - reach.T @ self.rows @ self.kernel(at).T
         return reach.T @ left, rest + total @ fit.covariance_raw @ total.T
 
@@ -212,12 +212,12 @@ DIRECTION = np.array([SIGNS[name] for name in INPUTS[1:]])[:, None]
 ALONE, CORRECTION = 3.0, 0.3
 # Widths of the prior that no weight exceeds.
 MOST = 10.0
-# Relative error of the model that a first fit is made with, and its correlation length: of half the
-# range of each input, or of that where less was seen. Chosen on simulated shifts.
-TRIAL, LENGTH, SHORTEST = 0.05, 0.8, 0.1
+# Correlation length of the model's error: of half the range of each input, or of that where less
+# was seen. Chosen on simulated shifts.
+LENGTH, SHORTEST = 0.8, 0.1
 # Below this share of the loss b is compatible with zero.
 SMALLEST = 1e-3
-# Voltages at which a correction is looked at.
+# Voltages that are looked at, of a correction or for the longest lifetime.
 VOLTAGES = 65
 
 
@@ -500,7 +500,8 @@ def fit_loss_network(
     pressure = 1e-9 * np.exp(inputs[:, INPUTS.index("pressure")])
     vacuum = _line(np.array(currents), pressure)
     length = np.maximum(LENGTH * np.ptp(inputs, axis=0) / 2, SHORTEST)
-    trial = Discrepancy((TRIAL, TRIAL), inputs, length, rows)
+    middle = SIZES[len(SIZES) // 2]
+    trial = Discrepancy((middle, middle), inputs, length, rows)
     wrong = sized(trial, *fitted(trial))
     fit, left = fitted(wrong)
     low, high = (inputs.min(0), inputs.max(0)) if box is None else box.corners()

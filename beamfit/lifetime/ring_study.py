@@ -22,7 +22,7 @@ from beamfit.lifetime.alarm import BOTH
 from beamfit.lifetime.decay_law import current as beam_at
 from beamfit.lifetime.expansion import DETERMINED, Expansion, lifetime_of
 from beamfit.lifetime.fit import bare
-from beamfit.lifetime.loss_network import Network, NetworkFit, fit_loss_network
+from beamfit.lifetime.loss_network import VOLTAGES, Network, NetworkFit, fit_loss_network
 from beamfit.lifetime.mechanisms import MECHANISMS, LossTerms, scaled_losses, scaled_parts
 from beamfit.lifetime.record import DecayRecord
 from beamfit.lifetime.ring import Operation
@@ -312,10 +312,6 @@ def next_decays(fit: ScaleFit, candidates: Sequence[DecayCandidate]) -> tuple[Pr
     return tuple(sorted(proposals, key=lambda proposal: -proposal.information))
 
 
-# Voltages that are looked at, twice.
-GRID = 33
-
-
 class Limits(NamedTuple):
     """Lowest and highest value allowed of each setting.
 
@@ -420,7 +416,7 @@ def best_operating_point(
     draws = jnp.asarray(sample.thinned())
     ends = low, max(high, low)
     for _ in range(2):
-        at = np.linspace(*ends, GRID)
+        at = np.linspace(*ends, VOLTAGES)
         terms = jax.lax.map(
             lambda v: fit.terms_at(wide._replace(rf_voltage=v), current), jnp.asarray(at)
         )

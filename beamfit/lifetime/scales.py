@@ -168,9 +168,10 @@ def summarise(decays: tuple[Decay, ...]) -> Summaries:
 PRESSURE_ERROR = 0.05
 RECORD = "decays"
 LARGEST = 1e3
-# The scale of the RF voltage, fitted where a prior says how well its reading is calibrated: sought
-# within so many errors of that prior, with losses computed at each of them.
-VOLTAGE, WIDEST = "rf_voltage", 3
+# The scale of the RF voltage, fitted where a prior says how well its reading is calibrated.
+VOLTAGE = "rf_voltage"
+# It is sought within so many errors of that prior, and losses computed at each of them.
+WIDEST = 3
 # How far walkers begin from scales that the decays do not tell.
 WIDTH = 0.3
 

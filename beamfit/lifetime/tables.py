@@ -6,14 +6,13 @@ import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 
-from beamfit.answer import Row, Table, cell
+from beamfit.answer import MOST_ROWS, Row, Table, cell
 from beamfit.lifetime.fit import DecayFit
 from beamfit.lifetime.mechanisms import LINEAR, QUADRATIC, Mechanism
 from beamfit.lifetime.pieces import Event
 from beamfit.lifetime.study import Budget, Decay, RecordStudy
 from beamfit.quantity import HOUR, Quantity, Status
 
-MOST_EVENTS = 100
 # How many decays have every number shown; of more only the main ones, a row each.
 FEW = 4
 # Percent of the loss below which a mechanism's digits say nothing.
@@ -312,7 +311,7 @@ def event_rows(study: RecordStudy) -> list[list[str]]:
     """Kind, time, duration and change of what was cut away; a long list is cut, and says so."""
     rows = [
         [event.kind, f"{event.time:.0f} s", f"{event.duration:.0f} s", f"{event.change:+.4g} mA"]
-        for event in study.events[:MOST_EVENTS]
+        for event in study.events[:MOST_ROWS]
     ]
     left = len(study.events) - len(rows)
     return rows + ([[f"{left} more", "", "", ""]] if left else [])
