@@ -37,7 +37,7 @@ from beamfit.lifetime.scales import (
     summarise,
     widened,
 )
-from beamfit.lifetime.study import Decay, Machine, operation_during
+from beamfit.lifetime.study import Decay, Machine, settings_of
 from beamfit.quantity import HOUR, Quantity, percent
 
 INPUTS = ("rf_voltage", "scraper_y", "pressure", "bunches")
@@ -471,10 +471,8 @@ def fit_loss_network(
     if len(decays) < 4:
         raise InputError(f"{len(decays)} decays", "4 or more at different settings")
     measured = summarise(tuple(decays))
-    settings = [operation_during(d.segment, machine) for d in decays]
-    currents = [d.fit.mean_current for d in decays]
-    pairs = list(zip(settings, currents, strict=True))
-    inputs = np.stack([_inputs(*pair) for pair in pairs])
+    settings = settings_of(decays, machine)
+    inputs = np.stack([_inputs(*setting) for setting in settings])
     if not np.isfinite(inputs).all():
         raise InputError("a setting that is not finite", "RF voltage, scraper, pressure, bunches")
     means = np.zeros(2) if corrected is not None else _typical(measured)
@@ -483,7 +481,7 @@ def fit_loss_network(
     width = ALONE if corrected is None else CORRECTION
     weight, rows = _statement(measured, floor)
     seen = weight @ np.asarray(measured.parts).ravel()
-    base = jnp.stack([_base(corrected, *pair) for pair in pairs])
+    base = jnp.stack([_base(corrected, *setting) for setting in settings])
 
     def fitted(wrong: Discrepancy) -> tuple[Fit, np.ndarray]:
         whiten = np.linalg.inv(wrong.root)
@@ -498,7 +496,7 @@ def fit_loss_network(
         return fit, seen - np.asarray(_predict(fit.model, (*data[:3], jnp.asarray(weight))))
 
     pressure = 1e-9 * np.exp(inputs[:, INPUTS.index("pressure")])
-    vacuum = _line(np.array(currents), pressure)
+    vacuum = _line(np.asarray(measured.current), pressure)
     length = np.maximum(LENGTH * np.ptp(inputs, axis=0) / 2, SHORTEST)
     middle = SIZES[len(SIZES) // 2]
     trial = Discrepancy((middle, middle), inputs, length, rows)
@@ -510,7 +508,7 @@ def fit_loss_network(
     if corrected is None:
         maximum = "certified" if single_maximum else "not asked"
     else:
-        maximum = _maximum_seen(fit, corrected, low, high, max(currents))
+        maximum = _maximum_seen(fit, corrected, low, high, float(measured.current.max()))
     certificate = Certificate(low, high, gains, maximum)
     return NetworkFit(fit, certificate, machine, corrected, wrong, vacuum, left)
 

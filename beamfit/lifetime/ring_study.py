@@ -36,7 +36,7 @@ from beamfit.lifetime.scales import (
     information_root,
     loss_parts,
 )
-from beamfit.lifetime.study import Decay, Machine, operation_during, settings_json
+from beamfit.lifetime.study import Decay, Machine, settings_json, settings_of
 from beamfit.quantity import HOUR, Quantity, Status
 from beamfit.sampling.posterior import Interval, Posterior
 from beamfit.statistics import POOR_FIT, quantity_of_draws
@@ -719,10 +719,9 @@ def study_shift(
     """
     fit = fit_scales(decays, machine, priors=priors)
     sample = fit.sample(seed=seed)
-    current = max(decay.fit.mean_current for decay in decays)
-    settings = [operation_during(decay.segment, machine) for decay in decays]
+    settings, currents = zip(*settings_of(decays, machine), strict=True)
     seen = [[float(getattr(setting, name)) for setting in settings] for name in Limits._fields]
-    limits = Limits(*((min(values), max(values)) for values in seen))
+    limits, current = Limits(*((min(values), max(values)) for values in seen)), max(currents)
     corrected = fit if network is Network.correction else None
     return Shift(
         fit=fit,

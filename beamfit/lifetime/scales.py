@@ -24,7 +24,7 @@ from beamfit.lifetime.expansion import DETERMINED, LEVEL, LOSS, QUADRATIC, Expan
 from beamfit.lifetime.fit import DecayFit
 from beamfit.lifetime.mechanisms import SCALES, LossTerms, loss_terms, scaled_losses
 from beamfit.lifetime.ring import Operation
-from beamfit.lifetime.study import Decay, Machine, operation_during
+from beamfit.lifetime.study import Decay, Machine, settings_of
 from beamfit.quantity import Quantity, Status
 from beamfit.statistics import POOR_FIT, chi2_probability
 
@@ -202,7 +202,7 @@ class DecaySet(NamedTuple):
         voltages: np.ndarray | None = None,
     ) -> DecaySet:
         """Reduce decays; `voltages` as of `LossTerms`."""
-        settings = [(operation_during(d.segment, machine), d.fit.mean_current) for d in decays]
+        settings = settings_of(decays, machine)
         rows = [loss_terms(machine.ring, *setting, voltages) for setting in settings]
         terms = jax.tree.map(lambda *parts: jnp.stack(parts), *rows)
         return cls(terms, summarise(tuple(decays)), pressure_error)
@@ -430,7 +430,7 @@ def _voltages(
         return None
     mean, error = prior
     found = mean + error * np.arange(-WIDEST, WIDEST + 1)
-    lowest = min(float(operation_during(d.segment, machine).rf_voltage) for d in decays)
+    lowest = min(float(setting.rf_voltage) for setting, _ in settings_of(decays, machine))
     if not found[0] * lowest > float(machine.ring.energy_loss):
         expected = "an error at three times of which every decay is still stored"
         raise InputError(f"rf_voltage = {mean:g} ± {error:g}", expected)

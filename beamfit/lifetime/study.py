@@ -376,6 +376,11 @@ class Decay:
         return self.fit.to_json() | json_of(more)
 
 
+def settings_of(decays: Sequence[Decay], machine: Machine) -> list[tuple[Operation, float]]:
+    """Settings and vacuum of each decay, and its mean current, mA."""
+    return [(operation_during(d.segment, machine), d.fit.mean_current) for d in decays]
+
+
 @answer
 @dataclass(frozen=True, eq=False)
 class RecordStudy:
@@ -491,7 +496,8 @@ def _fitted(
         except InputError:
             change = float(piece.current[-1] - piece.current[0])
             found, lost = [], [Event("slow refill", piece.start, piece.span, change)]
-        decays, events = decays + found, events + lost
+        decays += found
+        events += lost
     return decays, events
 
 

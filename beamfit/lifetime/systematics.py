@@ -159,8 +159,11 @@ class OneLifetime:
         )
 
 
-def _one_lifetime(rate: float, error: float, residuals: np.ndarray, fit: DecayFit) -> OneLifetime:
-    found = lifetime_of(rate, error)
+def _one_lifetime(
+    rate: float, error: float, residuals: np.ndarray, record: DecayRecord, fit: DecayFit | None
+) -> OneLifetime:
+    """A constant loss rate beside the fit of a record, which is made where there is none."""
+    found, fit = lifetime_of(rate, error), fit or fit_decay(record, law=Law.constant)
     known = fit.lifetime_start.value, fit.lifetime_mean.value
     bias = [found.value / value - 1 for value in known]
     rms = float(np.sqrt(np.mean(residuals**2)))
@@ -192,8 +195,7 @@ def single_exponential(record: DecayRecord, fit: DecayFit | None = None) -> OneL
     moments = found.memory((LEVEL, LOSS), True).moments(np.eye(2)[1:], found.given)
     error = float(moments.error[0]) / record.span
     left = found.residuals * found.pieces.over
-    fit = fit or fit_decay(record, law=Law.constant)
-    return _one_lifetime(float(found.values.b), error, left, fit)
+    return _one_lifetime(float(found.values.b), error, left, record, fit)
 
 
 def log_linear(record: DecayRecord, fit: DecayFit | None = None) -> OneLifetime:
@@ -227,8 +229,7 @@ def log_linear(record: DecayRecord, fit: DecayFit | None = None) -> OneLifetime:
     logs = np.log(record.current)
     (slope, level), covariance = np.polyfit(record.time, logs, 1, cov=True)
     residuals = np.exp(level + slope * record.time) - record.current
-    fit = fit or fit_decay(record, law=Law.constant)
-    return _one_lifetime(-slope, math.sqrt(covariance[0, 0]), residuals, fit)
+    return _one_lifetime(-slope, math.sqrt(covariance[0, 0]), residuals, record, fit)
 
 
 @shown
