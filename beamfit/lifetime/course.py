@@ -294,7 +294,7 @@ def reference_of(
     known, to `SHARES`. How far the decays scatter about it is how far a and b are expected to
     wander.
     """
-    current, parts, root = map(np.asarray, summarise(tuple(decays)))
+    current, parts, root = map(np.asarray, summarise(decays))
     rows = by_losses(a * current, b)
     weighted = (root @ rows).reshape(-1, 2)
     seen = np.einsum("nij,nj->ni", root, parts).ravel()

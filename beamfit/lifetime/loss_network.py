@@ -470,7 +470,7 @@ def fit_loss_network(
     """
     if len(decays) < 4:
         raise InputError(f"{len(decays)} decays", "4 or more at different settings")
-    measured = summarise(tuple(decays))
+    measured = summarise(decays)
     settings = settings_of(decays, machine)
     inputs = np.stack([_inputs(*setting) for setting in settings])
     if not np.isfinite(inputs).all():

@@ -119,12 +119,12 @@ def _together(fit: DecayFit, rate: float) -> np.ndarray:
     return np.diag(1 / (rate * np.array([np.inf if share is None else share, error])))
 
 
-def summarise(decays: tuple[Decay, ...]) -> Summaries:
+def summarise(decays: Sequence[Decay]) -> Summaries:
     """Reduce decays to what they say of the loss.
 
     Parameters
     ----------
-    decays : tuple of Decay
+    decays : sequence of Decay
         Fitted decays. One without a finite fit or without noise says nothing: it gets no
         information.
 
@@ -172,8 +172,6 @@ LARGEST = 1e3
 VOLTAGE = "rf_voltage"
 # It is sought within so many errors of that prior, and losses computed at each of them.
 WIDEST = 3
-# How far walkers begin from scales that the decays do not tell.
-WIDTH = 0.3
 
 
 class DecaySet(NamedTuple):
@@ -205,7 +203,7 @@ class DecaySet(NamedTuple):
         settings = settings_of(decays, machine)
         rows = [loss_terms(machine.ring, *setting, voltages) for setting in settings]
         terms = jax.tree.map(lambda *parts: jnp.stack(parts), *rows)
-        return cls(terms, summarise(tuple(decays)), pressure_error)
+        return cls(terms, summarise(decays), pressure_error)
 
     def parts(self, scales: Array, factor: Array) -> Array:
         """a I and a I + b of scaled first principles, where the pressure is so many times read."""
@@ -399,7 +397,6 @@ class ScaleFit:
             data=data,
             log_volume=_log_volume,
             units=dict.fromkeys(self.scales, "1"),
-            width=dict.fromkeys(SCALES, WIDTH),
             priors_own=[name for name, scale in self.scales.items() if scale.error is None],
         )
         optimum = Optimum(self.vector, self.finding, [1.0], [True])

@@ -21,7 +21,7 @@ from beamfit.lifetime.ring_study import (
     find_anomaly,
     next_decays,
 )
-from beamfit.lifetime.scales import fit_scales, summarise
+from beamfit.lifetime.scales import fit_scales, summarise, widened
 from beamfit.lifetime.study import study_record
 from beamfit.quantity import Status
 from tests.simulations import simulations
@@ -80,6 +80,16 @@ def test_the_summary_is_the_information_of_the_readings(decays):
         assert np.sqrt(covariance[0, 0]) / mean == pytest.approx(a.error, rel=0.01)
         slope = np.array([-1.0, 1.0])  # b = (a I + b) - a I
         assert np.sqrt(slope @ covariance @ slope) == pytest.approx(b.error, rel=0.01)
+
+
+def test_an_error_of_the_model_adds_to_the_covariance():
+    random = np.random.default_rng(4)
+    root, changes = np.triu(random.normal(size=(2, 2))), random.normal(size=(2, 3))
+    found = np.asarray(widened(root, changes))
+    expected = np.linalg.inv(root.T @ root) + changes @ changes.T
+    np.testing.assert_allclose(np.linalg.inv(found.T @ found), expected, rtol=1e-10)
+    nothing = np.array([[0.0, 0.0], [0.0, 2.0]])  # a decay that does not tell a
+    assert np.isfinite(widened(nothing, changes)).all()
 
 
 def test_the_scales_of_the_shift_are_found(fit):
