@@ -6,7 +6,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import chdtrc, fdtrc, gammaln, ndtr, stdtr, stdtrit
+from scipy.special import chdtrc, fdtrc, gammaln, logsumexp, ndtr, stdtr, stdtrit
 
 from beamfit.quantity import NORMAL_REACH, Quantity
 
@@ -22,6 +22,8 @@ BASELINE, FEWEST = 20, 3
 MANY = 8
 # Ends of the central 68 and 95 % of draws.
 CENTRAL, WIDE = (0.16, 0.84), (0.025, 0.975)
+# Widths of a change as a share of what changes: smaller ones are not seen, larger ones seldom.
+CHANGED = np.geomspace(1e-4, 0.5, 16)
 # Mean range of two normal numbers in standard deviations; degrees of freedom of a moving range.
 RANGE, RANGE_DOF = 1.128, 0.62
 # Probability below 3 standard deviations; one point in 370 lies beyond them to either side.
@@ -134,6 +136,46 @@ def log_student(t: np.ndarray, dof: np.ndarray | float) -> np.ndarray:
     """
     top = gammaln(0.5 * (dof + 1)) - gammaln(0.5 * dof) - 0.5 * np.log(math.pi * dof)
     return top - 0.5 * (dof + 1) * np.log1p(t * t / dof)
+
+
+def log_evidence_of_change(
+    squares: np.ndarray, information: np.ndarray, dof: float = math.inf
+) -> np.ndarray:
+    """Logarithm of how many times likelier a change is than none.
+
+    Parameters
+    ----------
+    squares : array
+        Squares of changes over their errors.
+    information : array
+        One over the squares of the errors of relative changes.
+    dof : float, optional
+        Readings that tell the size of the noise, less numbers; by default it is known.
+
+    Returns
+    -------
+    array
+
+    Notes
+    -----
+    The ratio of two normal densities of what is seen, of variance V + W and V, the size of the
+    noise integrated over where readings tell it. The change is normal about none, its width flat in
+    the logarithm (`CHANGED`). In time the ratio is a martingale while nothing changes, so that it
+    ever exceeds c with a probability of 1/c at most (G. Shafer et al., Statist. Sci. 26 (2011) 84).
+
+    Examples
+    --------
+    >>> log_evidence_of_change(np.array([0.0, 36.0]), np.array([1e4, 1e4])).round(1).tolist()
+    [-0.5, 14.2]
+    """
+    sizes = CHANGED.reshape(-1, *(1,) * np.ndim(squares))
+    worth = information * sizes**2
+    if math.isinf(dof):
+        log = 0.5 * squares * (worth / (1 + worth))
+    else:
+        log = np.log1p(squares / dof) - np.log1p(squares / (1 + worth) / dof)
+        log = 0.5 * (dof + 1) * log
+    return logsumexp(log - 0.5 * np.log1p(worth), axis=0) - math.log(CHANGED.size)
 
 
 def quantity_of_draws(draws: np.ndarray, unit: str, value: float | None = None) -> Quantity:

@@ -7,6 +7,7 @@ that a, or that b, is what moved.
 
 from __future__ import annotations
 
+import math
 from datetime import UTC, datetime
 from typing import NamedTuple
 
@@ -14,6 +15,7 @@ import numpy as np
 
 from beamfit.lifetime.pieces import GAP
 from beamfit.quantity import Quantity, relative_change
+from beamfit.statistics import log_evidence_of_change
 
 MINUTE = 60.0
 # Windows, s: four begin in turn in each length, so that one of nearly any age is at hand.
@@ -100,9 +102,24 @@ def with_reading(
     return {"age": age, "weight": total, "mean": mean, "product": product}
 
 
-def falls_of(state: AlarmState) -> tuple[np.ndarray, ...]:
-    """Fall of chi² if a, if b, if both moved, in each window."""
-    uu, uv, vv, uy, vy = np.moveaxis(state.product, -1, 0)
+class Seen(NamedTuple):
+    """Squares of changes over their errors, and one over the squares of these, in each window: of
+    a alone, of b alone, and of b beside a.
+    """
+
+    squares: tuple[np.ndarray, np.ndarray, np.ndarray]
+    information: tuple[np.ndarray, np.ndarray, np.ndarray]
+
+    @property
+    def evidence(self) -> np.ndarray:
+        """Logarithms of how many times likelier a change of a, of b, of both is than none."""
+        a, b, beside = map(log_evidence_of_change, *self)
+        return np.stack([a, b, a + beside])
+
+
+def seen_in(state: AlarmState, windows: slice = slice(None)) -> Seen:
+    """Changes that some of the windows show."""
+    uu, uv, vv, uy, vy = np.moveaxis(state.product[..., windows, :], -1, 0)
     covariance = state.covariance[..., None, :, :]
     caa, cab, cbb = covariance[..., 0, 0], covariance[..., 0, 1], covariance[..., 1, 1]
     # 1 + J C and its inverse times (J, s), written out: 2 by 2.
@@ -111,13 +128,12 @@ def falls_of(state: AlarmState) -> tuple[np.ndarray, ...]:
     det = p * t - q * r
     maa, mab, mbb = (t * uu - q * uv) / det, (t * uv - q * vv) / det, (p * vv - r * uv) / det
     sa, sb = (t * uy - q * vy) / det, (p * vy - r * uy) / det
-    by_a = sa**2 / np.where(maa > 0, maa, np.inf)
-    by_b = sb**2 / np.where(mbb > 0, mbb, np.inf)
-    left = mbb - mab**2 / np.where(maa > 0, maa, np.inf)
-    rest = sb - sa * mab / np.where(maa > 0, maa, np.inf)
-    # Where the two are not told apart by rounding, both explain no more than one.
-    both = by_a + np.where(left > 1e-9 * mbb, rest**2 / np.where(left > 0, left, np.inf), 0.0)
-    return by_a, by_b, np.maximum(both, np.maximum(by_a, by_b))
+    slope = mab / np.where(maa > 0, maa, np.inf)
+    beside, left = sb - sa * slope, mbb - mab * slope
+    left = np.where(left > 1e-9 * mbb, left, 0.0)  # else rounding: the two are not told apart
+    scores, information = (sa, sb, beside), (maa, mbb, left)
+    pairs = zip(scores, information, strict=True)
+    return Seen(tuple(s**2 / np.where(i > 0, i, np.inf) for s, i in pairs), information)
 
 
 def change_since(state: AlarmState, moved: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -161,12 +177,11 @@ def set_off(state: AlarmState, raised: np.ndarray, best: np.ndarray) -> AlarmSta
     )
 
 
-# Fall of chi² that raises an alarm: 5.5 standard errors, for all windows of 1e6 readings.
-RAISED = 30.0
-# Twice the logarithm of 1000, by Wald's rule: one in a thousand is named wrongly.
-NAMED = 13.8
-# That both moved must explain so much more than the better of the two (p = 1e-3), as in `shift`.
-BOTH = 10.8
+# Readings in which one false alarm is raised at most.
+QUIET = 1e6
+# What moved is named where it is a thousand times likelier than the rest (A. Wald, Sequential
+# Analysis, 1947: one in a thousand is named wrongly).
+NAMED = math.log(1000.0)
 # After so long an alarm goes without a name, s.
 PATIENCE = 60 * MINUTE
 # After a step nothing is looked at for so long, s; after a gap all begins anew.
@@ -317,7 +332,7 @@ def watched(
     ...     if told.raised or told.moved:
     ...         print(second, NAMES[told.moved] or "raised", f"{100 * told.change[0]:.0f} % in a")
     620 raised 0 % in a
-    1055 a 10 % in a
+    1054 a 10 % in a
     """
     usable = np.isfinite(reading.current) & (np.nan_to_num(reading.current) > 0)
     reading = reading._replace(current=np.where(usable, reading.current, 1.0))
@@ -390,18 +405,16 @@ def _moved_on(usual: Reference, state: AlarmState, reading: Reading) -> AlarmSta
 def _judged(
     usual: Reference, state: AlarmState, usable: np.ndarray
 ) -> tuple[AlarmState, AlarmStep]:
-    by_a, by_b, both = falls_of(state)
     quiet = np.isnan(state.raised)
-    old = state.age[..., :-1] >= MINUTE
-    seen = np.where(old, np.maximum(by_a, by_b)[..., :-1], 0.0)
-    raised = quiet & usable & (seen.max(-1) > RAISED)
+    raised, best = _shown(usual, state)
+    raised &= quiet & usable
     if raised.any():
-        state = set_off(state, raised, np.argmax(seen, axis=-1))
-    gain_a, gain_b, gain = by_a[..., -1], by_b[..., -1], both[..., -1]
-    most = np.maximum(gain_a, gain_b)
-    apart = np.select(
-        [gain - most > BOTH, gain_a - gain_b > NAMED, gain_b - gain_a > NAMED], [3, 1, 2], 0
-    )
+        state = set_off(state, raised, best)
+    apart = np.zeros(quiet.shape, int)
+    if not quiet.all():
+        a, b, both = seen_in(state, slice(-1, None)).evidence[..., 0]
+        found = [both - np.logaddexp(a, b) > NAMED, a - b > NAMED, b - a > NAMED]
+        apart = np.select(found, [3, 1, 2], 0)
     late = 4 * (state.raised > PATIENCE)
     settled = ~quiet & usable & (state.age[..., -1] >= MINUTE)
     moved = np.where(settled, np.where(apart > 0, apart, late), 0)
@@ -411,6 +424,22 @@ def _judged(
     change, error, covariance = change_since(state, moved)
     told = AlarmStep(raised, moved, change, error, _since(usual, state, change))
     return _adopted(state, moved > 0, change, covariance), told
+
+
+def _shown(usual: Reference, state: AlarmState) -> tuple[np.ndarray, np.ndarray]:
+    """If a window shows a change of a or b, and which shows it best.
+
+    Each one that begins ever shows so much with one over that as probability, at most.
+    """
+    least = math.log(QUIET * usual.interval * np.sum(1 / LENGTHS))
+    seen = seen_in(state, slice(None, -1))
+    old = state.age[..., :-1] >= MINUTE
+    most = np.where(old, np.maximum(*seen.squares[:2]), 0.0)
+    best = np.argmax(most, axis=-1)
+    if most.max(initial=0.0) <= 2 * least:  # no evidence is above half of that
+        return np.zeros(best.shape, bool), best
+    evidence = np.where(old, np.logaddexp(*seen.evidence[:2]) - math.log(2.0), -np.inf)
+    return evidence.max(-1) > least, np.argmax(evidence, axis=-1)
 
 
 def _since(usual: Reference, state: AlarmState, change: np.ndarray) -> np.ndarray:

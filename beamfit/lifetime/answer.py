@@ -83,18 +83,25 @@ def _lost(e: Evidence) -> Finding | None:
     return Finding(Status.not_finite, cause)
 
 
+def _held(e: Evidence) -> Finding | None:
+    """Refills that an archive is too slow to resolve: readings even between two currents."""
+    rate, error = e.sure("rate_mean")
+    digit = math.inf if e.record is None else e.record.resolution or 0.0
+    told = e.separability.separable or error <= DETERMINED * abs(rate)
+    if told or digit >= np.std(e.residuals) or not is_sawtooth(e.residuals):
+        return None
+    return Finding(
+        Status.unidentified,
+        "The beam is held by refills that the record does not resolve: its readings lie evenly "
+        "between two currents, and tell nothing of the lifetime; record several readings "
+        "between refills",
+    )
+
+
 def _within_noise(e: Evidence) -> Finding | None:
     rate, error = e.sure("rate_mean")
     if e.separability.separable or error <= DETERMINED * abs(rate):
         return None
-    digit = math.inf if e.record is None else e.record.resolution or 0.0
-    if digit < np.std(e.residuals) and is_sawtooth(e.residuals):
-        return Finding(
-            Status.unidentified,
-            "The beam is held by refills that the record does not resolve: its readings lie evenly "
-            "between two currents, and tell nothing of the lifetime; record several readings "
-            "between refills",
-        )
     # A rate below zero by chance is no reason for a longer lifetime than that of a rate of zero.
     limit = 1 / (max(rate, 0.0) + LIMIT * error) / HOUR
     return Finding(
@@ -280,7 +287,7 @@ def _extent(e: Evidence, name: str) -> str | None:
 
 NEGATIVE = (partial(_negative, "b", NOT_GAS), partial(_negative, "a", RISING))
 LOOK = ": look for steps with split_record, or test constant_a_test"
-RULES = (_lost, _stepped, *NEGATIVE, _within_noise, _refuted, _inseparable)
+RULES = (_lost, _held, _stepped, *NEGATIVE, _within_noise, _refuted, _inseparable)
 RULES += (partial(_improbable, remedy=LOOK), _freely, _determined)
 
 
@@ -343,7 +350,7 @@ def _rises(e: Evidence) -> Finding | None:
     return Finding(Status.infeasible, cause)
 
 
-CYCLE_RULES = (_rises, *NEGATIVE, _within_noise, _refuted)
+CYCLE_RULES = (_rises, *NEGATIVE, _held, _within_noise, _refuted)
 CYCLE_RULES += (_one_current, _improbable, _bending, _determined)
 
 

@@ -24,16 +24,24 @@ from beamfit.lifetime.expansion import (
     least_squares_step,
     solved,
 )
-from beamfit.lifetime.pieces import Event, Split, beam_readings, event_of, split_record
+from beamfit.lifetime.pieces import (
+    Event,
+    Split,
+    beam_readings,
+    by_stretches,
+    event_of,
+    split_record,
+)
 from beamfit.lifetime.record import Conditions, DecayRecord
+from beamfit.statistics import log_evidence_of_change
 
 # Standard deviations by which two levels must differ to be two: a false step costs no more than an
 # own current for the rest.
 THRESHOLD = 5.0
 # Least step in units of the last digit of the readings.
 DIGITS = 1.5
-# Readings in which steps are sought at once, and of them those that the next stretch has, too.
-STRETCH, OVERLAP = 1 << 16, 1 << 12
+# Readings in which steps are sought at once, and how many beside them are looked at.
+STRETCH, OVERLAP = 1 << 16, 1 << 11
 # Readings on either side whose means are compared, and the fewest places that tell their scatter.
 WINDOWS, PLACES = (1, 2, 4, 8, 16, 32, 64), 20
 # In so many windows the usual difference, which the decay makes, is taken off.
@@ -132,7 +140,7 @@ def is_refilled(split: Split) -> bool:
     if len(cycles) < FEWEST_CYCLES:
         return False
     lost = sum(float(cycle.current[0] - cycle.current[-1]) for cycle in cycles)
-    refills = [event.change for event in split.events if event.kind == "refill"]
+    refills = [event.change for event in split.events if event.kind in ("refill", "ramp")]
     return len(refills) + 1 >= FEWEST_CYCLES and sum(refills) > RETURNED * max(lost, 0.0)
 
 
@@ -231,17 +239,15 @@ def _changes_between(record: DecayRecord, pieces: Sequence[np.ndarray]) -> list[
 
 
 def _steps(time: np.ndarray, current: np.ndarray, grain: float) -> np.ndarray:
-    """Indices of the first readings after a step, in order; of a long record by stretches of it,
-    each of which tells the steps that are not near its ends.
-    """
-    found = []
-    for start in range(0, max(current.size - OVERLAP, 1), STRETCH - OVERLAP):
-        stop = min(start + STRETCH, current.size)
-        steps = start + _steps_of(time[start:stop], current[start:stop], grain)
-        low = start + OVERLAP // 2 if start else 0
-        high = stop - OVERLAP // 2 if stop < current.size else stop
-        found.append(steps[(steps >= low) & (steps < high)])
-    return np.concatenate(found)
+    """Indices of the first readings after a step, in order."""
+
+    def begins(time: np.ndarray, current: np.ndarray) -> np.ndarray:
+        found = np.zeros(time.size, bool)
+        found[_steps_of(time, current, grain)] = True
+        return found
+
+    found = by_stretches(begins, time, current, stretch=STRETCH, overlap=OVERLAP)
+    return np.flatnonzero(found)
 
 
 def _steps_of(time: np.ndarray, current: np.ndarray, grain: float) -> np.ndarray:
@@ -494,9 +500,6 @@ def cleaned(cycles: Pieces) -> tuple[Expansion, tuple[str, ...]]:
 
 # Prior probability that the loss rate changes within a part, as of a machine that is left alone.
 CHANGES = 0.05
-# A change is normal, its size a share of the loss rate flat in its logarithm: none smaller is seen,
-# larger ones are of other beams.
-CHANGED = np.geomspace(1e-4, 0.5, 16)
 # Cycles of a part at least, and parts at most: so many draw any course.
 PART, MOST_PARTS = 2, 64
 # Steps of Gauss and Newton for them: each leaves the square of what the last one left.
@@ -580,10 +583,8 @@ def _change(rate: np.ndarray, error: np.ndarray, mean: float) -> tuple[float, in
     variance = 1 / before + 1 / after
     place = slice(PART - 1, rate.size - PART)
     change, variance = change[place], variance[place]
-    worth = (mean * CHANGED[:, None]) ** 2 / variance
-    few, squares = rate.size - 1, change**2 / variance  # neighbours tell the noise: Student's
-    log = np.log1p(squares / few) - np.log1p(squares / (1 + worth) / few)
-    log = logsumexp(0.5 * (few + 1) * log - 0.5 * np.log1p(worth), axis=0) - np.log(CHANGED.size)
+    few = rate.size - 1  # neighbours tell the noise
+    log = log_evidence_of_change(change**2 / variance, mean**2 / variance, few)
     odds = logsumexp(log) - np.log(log.size) + np.log(CHANGES / (1 - CHANGES))
     return float(odds), int(np.argmax(log)) + PART
 

@@ -331,7 +331,7 @@ def fit_decay(
 
 
 def fit_decays(records: Sequence[DecayRecord], law: Law | str = Law.free) -> tuple[DecayFit, ...]:
-    """Fit many decays; records of similar length are solved together.
+    """Fit many decays, each by itself.
 
     Parameters
     ----------

@@ -28,11 +28,11 @@ STRETCH, OVERLAP = 1 << 18, 64
 # Readings whose means are looked at for a ramp at the head, the share of its rise by which a fall
 # ends it, and by how much it exceeds any later rise.
 SMOOTH, FALL, RISE = 5, 0.1, 3.0
-# A refill of many readings rises by so many standard deviations, this share of the current, and so
-# many times faster than the record usually falls: a drift of the monitor does none of these.
-REFILL, SHARE, FASTER = 30.0, 0.01, 4.0
 # Readings that are looked through for one at first.
 BLOCK = 4096
+# Means of neighbours in which steps of many readings are sought, at least; at the end of a record,
+# where what comes after is not known, they change so many times as much as usual.
+COARSE, FASTER = 24, 4.0
 # A gap is this many usual sampling intervals.
 GAP = 10.0
 
@@ -43,8 +43,8 @@ class Event(NamedTuple):
     Attributes
     ----------
     kind : str
-        `refill`, `loss`, `dropout`, `spike`, `saturated`, `gap`, `ramp` (the end of injection at
-        the head of a decay) or `short` (a piece too short to keep).
+        `refill`, `loss`, `dropout`, `spike`, `saturated`, `gap`, `ramp` (a refill of many readings,
+        or the end of one at the head of a decay) or `short` (a piece too short to keep).
     time : float
         When it begins, s from the record's start.
     duration : float
@@ -114,7 +114,8 @@ def _dropouts(current: np.ndarray) -> tuple[np.ndarray, int]:
     for start in np.flatnonzero(current[1:] < DROPOUT * current[:-1]) + 1:
         if flagged[start]:
             continue
-        back = _first_above(current, start, DROPOUT * current[start - 1])
+        before = current[max(start - WINDOW, 0) : start].max()  # a beam may be dumped over some
+        back = _first_above(current, start, DROPOUT * before)
         if back == current.size:
             return flagged, int(start)
         flagged[start:back] = True
@@ -143,17 +144,27 @@ def _saturated(current: np.ndarray) -> np.ndarray:
 
 def _noise_near(off: np.ndarray) -> np.ndarray:
     """Noise about each of some departures; where it changes the greater one counts."""
-    return maximum_filter1d(1.4826 * median_filter(off, NEIGHBOURS, mode="nearest"), NEIGHBOURS)
+    return maximum_filter1d(1.4826 * median_filter(off, NEIGHBOURS, mode="mirror"), NEIGHBOURS)
 
 
-def _by_stretches(function: Callable[..., np.ndarray], *columns: np.ndarray) -> np.ndarray:
+def by_stretches(
+    function: Callable[..., np.ndarray],
+    *columns: np.ndarray,
+    stretch: int = STRETCH,
+    overlap: int = OVERLAP,
+) -> np.ndarray:
     """Values of a function of near neighbours for each reading: of a long record by stretches,
     since all at once takes gigabytes.
+
+    Examples
+    --------
+    >>> by_stretches(lambda x: np.gradient(x), np.arange(6.0) ** 2, stretch=3, overlap=1).tolist()
+    [1.0, 2.0, 4.0, 6.0, 8.0, 9.0]
     """
     found, size = [], columns[0].size
-    for start in range(0, size, STRETCH):
-        low, stop = max(start - OVERLAP, 0), min(start + STRETCH, size)
-        some = function(*(column[low : stop + OVERLAP] for column in columns))
+    for start in range(0, size, stretch):
+        low, stop = max(start - overlap, 0), min(start + stretch, size)
+        some = function(*(column[low : stop + overlap] for column in columns))
         found.append(some[start - low : stop - low])
     return np.concatenate(found)
 
@@ -206,7 +217,7 @@ def beam_readings(record: DecayRecord, spikes: bool = True) -> tuple[np.ndarray,
         found["spike"] = np.zeros(len(record), bool)
         time, current = record.time[kept], record.current[kept]
         noise = _noise(record, time, current)
-        lone = _by_stretches(lambda t, i: _spikes(t, i, noise), time, current)
+        lone = by_stretches(lambda t, i: _spikes(t, i, noise), time, current)
         found["spike"][kept[lone]] = True
         kept = kept[~lone]
     events = [
@@ -220,18 +231,20 @@ def beam_readings(record: DecayRecord, spikes: bool = True) -> tuple[np.ndarray,
 
 
 def _steps(time: np.ndarray, current: np.ndarray, noise: float) -> np.ndarray:
-    """Change from each reading to the next beyond what the decay around it explains, or zero."""
+    """Change from each reading to the next, less what the decay around it explains, where that is
+    more than noise; or zero.
+    """
 
     def beyond(time: np.ndarray, current: np.ndarray) -> np.ndarray:
         interval, change, usual = np.diff(time), np.diff(current), _usual_rate(time, current)
         error = OF_MEDIAN * interval * _noise_near(np.abs(change / interval - usual))
         lost = usual * interval
-        excess = np.abs(change - lost)
-        near = np.maximum(np.sqrt(2) * noise, _noise_near(excess))
+        excess = change - lost
+        near = np.maximum(np.sqrt(2) * noise, _noise_near(np.abs(excess)))
         allowed = 0.5 * np.abs(lost) + THRESHOLD * np.hypot(near, error)
-        return np.append(0.0, np.where(excess > allowed, change, 0.0))
+        return np.append(0.0, np.where(np.abs(excess) > allowed, excess, 0.0))
 
-    return _by_stretches(beyond, time, current)[1:]
+    return by_stretches(beyond, time, current)[1:]
 
 
 def _highest(smooth: np.ndarray, low: float, noise: float) -> int:
@@ -258,33 +271,34 @@ def _ramp(current: np.ndarray, noise: float) -> int:
     return cut if current.size - cut >= FEWEST else 0
 
 
-def _refills(time: np.ndarray, current: np.ndarray, noise: float) -> list[int]:
-    """Find where refills of many readings begin: their ramps are then at the heads of pieces."""
-    if current.size < 3 * FEWEST:
-        return []
-    smooth = np.convolve(current, np.full(SMOOTH, 1 / SMOOTH), "valid")
-    usual = np.median(np.abs(np.diff(smooth) / np.diff(time[: smooth.size])))
-    found, start, width = [], 0, BLOCK
-    while start < smooth.size:
-        block = smooth[start : start + width]
-        lowest = np.minimum.accumulate(block)
-        rises = np.flatnonzero(block - lowest > np.maximum(REFILL * noise, SHARE * np.abs(lowest)))
-        if not rises.size and start + width >= smooth.size:
-            break
-        if not rises.size:
-            width *= 2
-            continue
-        top = rises[0]
-        begin = np.flatnonzero(block[:top] == lowest[top])[-1]
-        lasted = time[start + top] - time[start + begin]
-        if block[top] - block[begin] <= FASTER * usual * lasted:
-            break  # a drift of the monitor, which has no end to be seen
-        highest = _highest(block[top:], block[begin], noise)
-        at = start + int(begin) + SMOOTH // 2 + 1
-        if at - (found[-1] if found else 0) >= FEWEST:  # else the ramp is at the head already
-            found.append(at)
-        start, width = start + int(top) + max(highest, 1), BLOCK
-    return found
+def _slow_steps(
+    time: np.ndarray, current: np.ndarray, steps: np.ndarray, noise: float
+) -> list[tuple[int, int, bool]]:
+    """First and past-the-last readings of falls and rises of many readings, and if it is a rise:
+    steps of the means of 2, 4, 8, ... neighbours, besides those of single readings. What falls fast
+    at first may be the law, and what rises there is a ramp.
+    """
+    level, known, size = current - np.append(0.0, np.cumsum(steps)), np.append(False, steps != 0), 1
+    cuts = np.array([-current.size, *np.flatnonzero(known), 2 * current.size])
+    found, half = [], -(WINDOW // 2)
+    while (count := current.size // (2 * size)) >= COARSE:
+        size *= 2
+        t, x = (v[: count * size].reshape(count, size).mean(axis=1) for v in (time, level))
+        old = known[: count * size].reshape(count, size).any(axis=1)
+        beyond = _steps(t, x, noise)
+        change = np.diff(x)
+        seen = (beyond < 0) | (beyond > 0) & (change > 0)
+        seen[:-half] = False
+        seen[half:] &= np.abs(change[half:]) > FASTER * np.median(np.abs(change))
+        for first, last in _runs(seen & ~old[1:] & ~old[:-1]):
+            # Half as many readings again: what ends smoothly still counts there.
+            begin, end = first * size, (last + 1) * size + (last + 1 - first) * size // 2
+            before, after = cuts[np.searchsorted(cuts, begin, "right") + [-1, 0]]
+            begin = before if begin - before < 2 * size else begin  # nothing was looked for there
+            end = after if after - end < 2 * size else min(end, current.size)
+            known[begin:end] = True
+            found.append((int(begin), int(end), bool(beyond[first] > 0)))
+    return sorted(found)
 
 
 def split_record(record: DecayRecord) -> Split:
@@ -303,9 +317,9 @@ def split_record(record: DecayRecord) -> Split:
     Notes
     -----
     A step must exceed ten robust standard deviations of the changes near it, and of what is lost
-    meanwhile, as in a gap; a refill of many readings must rise by 30 and by 1 %, four times faster
-    than the record falls: other slow or noisy changes stay in. A gap alone does not end a decay; a
-    step across it does.
+    meanwhile, as in a gap. Losses and refills of many readings, up to a twentieth of the record,
+    are steps of the means of 2, 4, 8, ... neighbours; slower changes stay in. A gap alone does not
+    end a decay; a step across it does.
 
     Examples
     --------
@@ -323,22 +337,25 @@ def split_record(record: DecayRecord) -> Split:
     time, current = record.time[kept], record.current[kept]
     noise = _noise(record, time, current)
     steps = _steps(time, current, noise)
+    slow = _slow_steps(time, current, steps, noise)
     del time, current  # of 1e7 readings 160 MB
     for before in np.flatnonzero(steps):
         kind = "refill" if steps[before] > 0 else "loss"
-        at = float(record.time[kept[before + 1]])
-        events.append(Event(kind, at, 0.0, float(steps[before])))
+        change = float(record.current[kept[before + 1]] - record.current[kept[before]])
+        events.append(Event(kind, float(record.time[kept[before + 1]]), 0.0, change))
     interval = np.diff(record.time)
     for before in np.flatnonzero(interval > GAP * np.median(interval)):
         events.append(event_of(record, "gap", before, before + 1))
-    long = []
-    between = np.split(kept, np.flatnonzero(steps) + 1)
-    parts = [
-        part
-        for piece in between
-        for part in np.split(piece, _refills(record.time[piece], record.current[piece], noise))
-    ]
-    for piece in parts:
+    ends = [*(np.flatnonzero(steps) + 1)]
+    for first, last, rises in slow:
+        kind = "ramp" if rises else "loss"
+        events.append(event_of(record, kind, kept[first], kept[last - 1]))
+        ends += [first, last]
+    between, long = np.split(kept, np.sort(ends)), []
+    within = {kept[first] for first, *_ in slow}
+    for piece in between:
+        if not piece.size or piece[0] in within:
+            continue
         if cut := _ramp(record.current[piece], noise):
             events.append(event_of(record, "ramp", piece[0], piece[cut - 1]))
         if piece.size < FEWEST:

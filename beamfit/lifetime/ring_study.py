@@ -13,12 +13,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from scipy.special import chdtrc
+from scipy.special import chdtrc, chdtri
 
 from beamfit.answer import Row, Table, answer, cell, json_of, labelled
 from beamfit.errors import InputError
 from beamfit.greybox.design import Information, scores
-from beamfit.lifetime.alarm import BOTH
 from beamfit.lifetime.decay_law import current as beam_at
 from beamfit.lifetime.expansion import DETERMINED, Expansion, lifetime_of
 from beamfit.lifetime.fit import bare
@@ -153,10 +152,10 @@ def find_anomaly(fit: ScaleFit, decays: Sequence[Decay]) -> Anomaly:
 
 
 def _moved(off: np.ndarray, change: np.ndarray, fall: float) -> tuple[str, ...]:
-    """Test if one of the two explains as much as both, within `BOTH` of chi²."""
+    """Test if one of the two explains as much as both."""
     alone = {name: _fitted(off, change[:, [k]])[0] for k, name in enumerate("ab")}
     best = max(alone, key=alone.get)
-    return (best,) if fall - alone[best] < BOTH else ("a", "b")
+    return (best,) if fall - alone[best] < chdtri(1.0, POOR_FIT) else ("a", "b")
 
 
 def budget_intervals(

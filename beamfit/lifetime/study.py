@@ -475,13 +475,14 @@ def _decays(record: DecayRecord) -> tuple[list[DecayRecord], tuple[Event, ...]]:
         return [record], ()
     split = split_record(record)
     pieces = [piece for segment in split.segments for piece in at_settings(segment)]
-    if not pieces:
-        moving = [name for name, steps in _steps(record).items() if steps.any()]
+    moving = [name for name, steps in _steps(record).items() if steps.any()]
+    kinds = {event.kind for event in split.events}
+    if not pieces and (moving or "short" not in kinds):
         changes = f"changes of {', '.join(moving)} by more than {100 * CHANGED:g} %"
-        kinds = ", ".join(sorted({event.kind for event in split.events})) or changes
+        found = ", ".join(sorted(kinds)) or changes
         expected = f"at least {FEWEST} readings in a row of a stored beam"
         expected += "; leave out a setting that only scatters with --ignore" if moving else ""
-        raise InputError(f"no decay between {kinds}", expected, record.name, column="current")
+        raise InputError(f"no decay between {found}", expected, record.name, column="current")
     return pieces, split.events
 
 
@@ -567,9 +568,8 @@ def study_record(
     # A record that does nothing but rise is an error; a slow refill within one is not.
     only = len(pieces) == 1 and not pooled
     found, more = _parts(pieces[0], law, False) if only else _fitted(pieces, law, bool(pooled))
-    if not found and not pooled:
-        expected = "a decay between refills"
-        raise InputError("a current that rises", expected, path=record.name, column="current")
+    if not found and not pooled:  # of refills that are not resolved pieces rise, or are short
+        events, (found, more) = (), _parts(placed, law, True)
     decays = [
         decay.placed(f"{record.name}#{k}" if len(found) > 1 else record.name, record.start, machine)
         for k, decay in enumerate(sorted(found, key=lambda decay: decay.offset), 1)

@@ -38,8 +38,8 @@ MOST, LATEST = (math.inf, 1e6), 1e11
 # Events and points of the course that are kept.
 EVENTS, POINTS = 20, 360
 RULE = (
-    "raised where a change of a or b alone lowers chi² by 30: none false in 9e6 simulated readings "
-    "(benchmarks/alarm.py)"
+    "raised where a change of a or b is so much likelier than none that one in 1e6 readings "
+    "at most is false (none in 9e6 simulated, benchmarks/alarm.py)"
 )
 
 

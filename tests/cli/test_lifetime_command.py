@@ -98,7 +98,7 @@ def test_a_slow_refill_is_an_event_and_not_an_error(run, tmp_path):
     path = write_record(tmp_path / "slow.csv", time, current)
     status, out, _ = run("lifetime", path, "--full")
     assert status == 0
-    assert "slow refill at 3600 s" in out
+    assert "ramp at 3600 s (+278 mA)" in out
     assert sum(line.split() == ["status", "converged"] for line in out.splitlines()) == 2
 
 

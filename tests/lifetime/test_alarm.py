@@ -1,17 +1,21 @@
 """The alarm on a loss: silent while nothing moves, quick, right about what moved, and exact."""
 
+import math
+
 import numpy as np
 import pytest
+from scipy.stats import norm
 
 from beamfit.lifetime.alarm import (
     NAMES,
     Reading,
     Reference,
     alarms_of,
-    falls_of,
+    seen_in,
     started,
     watched,
 )
+from beamfit.statistics import CHANGED, log_evidence_of_change
 
 # Ten hours at 500 mA, two thirds of the loss from a; 1 µA a second.
 USUAL = Reference(a=3.7e-8, b=9.26e-6, noise=1e-3)
@@ -55,7 +59,7 @@ def test_it_is_silent_while_nothing_moves(memory):
     assert raised == []
     # And it did look: the largest windows have seen what they should.
     assert state.age.max() == 699
-    assert max(part.max() for part in falls_of(state)) > 3
+    assert max(part.max() for part in seen_in(state).squares) > 3
 
 
 @pytest.mark.parametrize(("which", "worse"), [("a", (1.1, 1.0)), ("b", (1.0, 1.1))])
@@ -167,7 +171,8 @@ def test_the_tests_are_those_of_generalised_least_squares():
         state, told = watched(usual, state, Reading(*row))
         assert not told.raised
     [begun] = np.flatnonzero(state.age[:-1] == state.age[:-1].max())[-1:]
-    for name, part, wanted in zip("ab2", falls_of(state), expected, strict=True):
+    a, b, beside = seen_in(state).squares
+    for name, part, wanted in zip("ab2", (a, b, a + beside), expected, strict=True):
         assert part[begun] == pytest.approx(wanted, rel=5e-3), name
     assert expected[2] > 3
 
@@ -178,3 +183,30 @@ def test_many_beams_at_once_are_each_as_alone():
     alone, *_ = watch(zip(rows[:, 0, 1], rows[:, 1, 1], strict=True))
     for many, one in zip(together, alone, strict=True):
         np.testing.assert_array_equal(many[1], one)
+
+
+@pytest.mark.parametrize(("squares", "information"), [(0.0, 1e4), (9.0, 400.0), (40.0, 2e5)])
+def test_the_evidence_of_a_change_is_an_integral_over_its_sizes(squares, information):
+    error = information**-0.5
+    seen, parts = math.sqrt(squares) * error, []
+    for width in CHANGED:
+        spread = np.linspace(-12, 12, 20001) / math.hypot(1 / width, 1 / error)
+        middle = seen * width**2 / (width**2 + error**2)
+        sizes = middle + spread
+        density = norm.pdf(sizes, scale=width) * norm.pdf(seen, sizes, error)
+        parts.append(np.trapezoid(density, sizes) / norm.pdf(seen, scale=error))
+    found = log_evidence_of_change(np.array(squares), np.array(information))
+    assert found == pytest.approx(math.log(np.mean(parts)), abs=1e-6)
+    # With many readings that tell the noise it is as good as known.
+    many = log_evidence_of_change(np.array(squares), np.array(information), 1e7)
+    assert many == pytest.approx(float(found), abs=1e-3)
+
+
+def test_where_nothing_changes_the_evidence_seldom_grows():
+    """Of 2000 records of 500 readings one in twenty may ever show twenty to one."""
+    noise = np.random.default_rng(9).normal(size=(2000, 500))
+    count = np.arange(1, 501)
+    squares = np.cumsum(noise, axis=1) ** 2 / count
+    evidence = log_evidence_of_change(squares, np.broadcast_to(25.0 * count, squares.shape))
+    assert np.mean(evidence.max(axis=1) > math.log(20.0)) < 1 / 20
+    assert np.mean(evidence.max(axis=1) > math.log(2.0)) > 0.01

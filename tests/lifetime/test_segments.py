@@ -261,6 +261,42 @@ def test_refills_of_many_readings_are_cut_and_drifts_are_not():
     assert kinds(split_record(DecayRecord(TIME, drift))) == []
 
 
+@pytest.mark.parametrize("lasts", [5, 10, 20])
+@pytest.mark.parametrize("change", [-0.3, -0.03, 0.05, 0.3])
+def test_losses_and_refills_of_many_readings_are_cut(lasts, change):
+    share = np.clip((np.arange(TIME.size) - 250) / lasts, 0, 1)
+    beam = 100 * np.exp(-TIME / 36000) * (1 + change * share)
+    noise = 1e-2 * np.random.default_rng(lasts).normal(size=TIME.size)
+    study = study_record(DecayRecord(TIME, beam + noise))
+    assert [event.kind for event in study.events] == ["ramp" if change > 0 else "loss"]
+    assert sum(len(decay.segment) for decay in study.decays) > TIME.size - 6 * lasts
+    for decay in study.decays:
+        found = decay.fit.lifetime_mean
+        assert abs(found.value - 10) < 3.5 * found.error < 0.2
+
+
+@pytest.mark.parametrize("lasts", [3, 10])
+@pytest.mark.parametrize("dead", [0, 100])
+def test_a_beam_that_is_dumped_over_some_readings_is_answered(lasts, dead):
+    """What the monitor shows of no beam afterwards is none that comes back."""
+    time = np.arange(0.0, 10.0 * (600 + lasts + dead), 10.0)
+    left = np.clip(1 - (np.arange(time.size) - 599) / lasts, 0, 1)
+    noise = 0.1 * np.random.default_rng(dead + lasts).normal(size=time.size)
+    beam = np.maximum(100 * np.exp(-time / 36000) * left + noise, 0)
+    study = study_record(DecayRecord(time, beam))
+    assert {event.kind for event in study.events} <= {"loss", "short"}
+    [decay] = study.decays
+    assert 570 < len(decay.segment) <= 600
+    assert abs(decay.fit.lifetime_mean.value - 10) < 3.5 * decay.fit.lifetime_mean.error
+
+
+def test_a_law_that_bends_fast_has_no_steps():
+    time = np.linspace(0.0, 1.0, 800)
+    for beam in (np.exp(-8 * time), 1 / (1 + 30 * time), np.exp(-2 * time) + np.exp(-30 * time)):
+        noise = 1e-4 * np.random.default_rng(1).normal(size=time.size)
+        assert kinds(split_record(DecayRecord(3600 * time, 100 * np.abs(beam + noise)))) == []
+
+
 def test_a_gap_between_uneven_readings_is_no_step():
     """What is lost in a long gap has the error of the loss rate near it."""
     for seed in range(20):
