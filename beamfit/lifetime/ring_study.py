@@ -22,7 +22,14 @@ from beamfit.lifetime.decay_law import current as beam_at
 from beamfit.lifetime.expansion import DETERMINED, Expansion, lifetime_of
 from beamfit.lifetime.fit import bare
 from beamfit.lifetime.loss_network import VOLTAGES, Network, NetworkFit, fit_loss_network
-from beamfit.lifetime.mechanisms import MECHANISMS, LossTerms, scaled_losses, scaled_parts
+from beamfit.lifetime.mechanisms import (
+    MECHANISMS,
+    SCALES,
+    LossTerms,
+    loss_terms,
+    scaled_losses,
+    scaled_parts,
+)
 from beamfit.lifetime.record import DecayRecord
 from beamfit.lifetime.ring import Operation
 from beamfit.lifetime.scales import (
@@ -410,18 +417,20 @@ def best_operating_point(
         raise InputError(f"at most {high:.6g} V", expected, column="rf_voltage")
     usual = fit.machine.operation
     wide = usual._replace(scraper_y=limits.scraper_y[1], bunches=float(limits.bunches[1]))
-    # A scale of the voltage that is fitted may be lower than one.
-    low = max(low, 1.01 * loss / (1.0 if fit.voltages is None else fit.voltages[0]))
-    draws = jnp.asarray(sample.thinned())
-    ends = low, max(high, low)
+    low, draws = max(low, 1.01 * loss), sample.thinned()
+    # True voltages are looked at; what is set is a reading.
+    by = np.ones(len(draws)) if fit.voltages is None else draws[:, len(SCALES)]
+    ends = max(low * by.min(), 1.01 * loss), max(high, low) * by.max()
     for _ in range(2):
         at = np.linspace(*ends, VOLTAGES)
         terms = jax.lax.map(
-            lambda v: fit.terms_at(wide._replace(rf_voltage=v), current), jnp.asarray(at)
+            lambda v: loss_terms(fit.machine.ring, wide._replace(rf_voltage=v), current),
+            jnp.asarray(at),
         )
-        found = at[np.argmin(jax.vmap(_rate, (0, None))(draws, terms), axis=1)]
+        true = at[np.argmin(jax.vmap(_rate, (0, None))(jnp.asarray(draws), terms), axis=1)]
         step = at[1] - at[0]
-        ends = max(low, found.min() - step), min(at[-1], found.max() + step)
+        ends = max(at[0], true.min() - step), min(at[-1], true.max() + step)
+    found = np.clip(true / by, low, max(high, low))
     spread = quantity_of_draws(found, "V")
     best, error = spread.value, math.hypot(spread.error, step / math.sqrt(12))
     inside = low + step < best < high - step

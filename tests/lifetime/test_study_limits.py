@@ -1,16 +1,24 @@
 """What a study of decays does not know, a calibration it may have to find, and what it predicts."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.optimize import brentq
 
 from beamfit.errors import InputError
 from beamfit.lifetime.decay_law import current
 from beamfit.lifetime.loss_network import fit_loss_network
 from beamfit.lifetime.mechanisms import loss_coefficients, loss_terms, scaled_losses
 from beamfit.lifetime.record import Conditions, DecayRecord
-from beamfit.lifetime.ring_study import predict_held_back, study_shift
+from beamfit.lifetime.ring import rf_acceptance
+from beamfit.lifetime.ring_study import (
+    Limits,
+    best_operating_point,
+    predict_held_back,
+    study_shift,
+)
 from beamfit.lifetime.scales import fit_scales
 from beamfit.lifetime.study import operation_during, study_record
 from beamfit.lifetime.tables import budget_rows
@@ -155,3 +163,18 @@ def test_a_study_with_a_voltage_of_its_own_is_whole(machine):
     losses = loss_coefficients(machine.ring, at, shift.current)
     truth = 1 / float(losses.a * shift.current + losses.b) / HOUR
     assert abs(shift.best.lifetime.value - truth) < 3 * shift.best.lifetime.error
+
+
+def test_the_best_voltage_is_a_reading_and_as_uncertain_as_its_scale(machine):
+    """Bucket and lattice meet at a true voltage; what is read there is 1.2 % less."""
+    ring = machine.ring._replace(momentum_acceptance=0.025)
+    free = fit_scales(read_low(machine), machine, priors={"rf_voltage": PRIOR})
+    narrow = replace(free, machine=machine._replace(ring=ring))
+    sample = free.sample(seed=1, target_ess=300)
+    best = best_operating_point(
+        narrow, sample, Limits((1.5e6, 3.2e6), (2e-3, 6e-3), (70, 280)), 500
+    )
+    bucket = (ring.energy, ring.energy_loss, ring.momentum_compaction, ring.harmonic)
+    meets = brentq(lambda v: float(rf_acceptance(v, *bucket)) - 0.025, 1.5e6, 3.2e6)
+    assert abs(best.rf_voltage.value - meets / TRUE) < 3 * best.rf_voltage.error
+    assert 0.8 < best.rf_voltage.relative / free.rf_voltage.error < 2.0
