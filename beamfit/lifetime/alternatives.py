@@ -18,15 +18,6 @@ from scipy.special import logsumexp, ndtri
 
 from beamfit.answer import json_of, shown
 from beamfit.errors import Status
-from beamfit.lifetime.departures import (
-    ABOVE,
-    BELOW,
-    DRIFT,
-    OUTGASSING,
-    SIZES,
-    SMOOTH,
-    TIMES,
-)
 from beamfit.lifetime.expansion import (
     DETERMINED,
     FURTHER,
@@ -40,7 +31,16 @@ from beamfit.lifetime.expansion import (
     lifetime_of,
     solved,
 )
-from beamfit.lifetime.marginal import ENOUGH
+from beamfit.lifetime.free_law import (
+    ABOVE,
+    BELOW,
+    DRIFT,
+    ENOUGH,
+    OUTGASSING,
+    SIZES,
+    SMOOTH,
+    TIMES,
+)
 from beamfit.lifetime.record import DecayRecord
 from beamfit.noise.memory import Products
 from beamfit.quantity import HOUR, Quantity
@@ -306,7 +306,7 @@ def rival_of(plain: Expansion) -> Rival | None:
     Notes
     -----
     Probabilities by Laplace's approximation about the best numbers of each, the size and the memory
-    of the noise averaged over as in `beamfit.lifetime.marginal`. Further losses are flat in
+    of the noise averaged over as in `beamfit.lifetime.free_law`. Further losses are flat in
     their logarithm, times in the record, those of gas in their logarithm up to its length.
     """
     pieces = _averaged(plain.pieces)

@@ -12,7 +12,6 @@ import numpy as np
 from beamfit.errors import Finding, Status, judge
 from beamfit.lifetime.alternatives import ConstantA, LifetimeLaw, Outgassing
 from beamfit.lifetime.cycles import is_sawtooth
-from beamfit.lifetime.departures import Law
 from beamfit.lifetime.evidence import (
     BELIEVED,
     DETERMINED,
@@ -20,6 +19,7 @@ from beamfit.lifetime.evidence import (
     UNITS,
     Evidence,
 )
+from beamfit.lifetime.free_law import Law
 from beamfit.lifetime.pieces import noise_of
 from beamfit.lifetime.record import Monitor
 from beamfit.quantity import HOUR, percent

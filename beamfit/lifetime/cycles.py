@@ -13,7 +13,6 @@ import numpy as np
 from scipy.ndimage import maximum_filter1d, median_filter
 from scipy.special import logsumexp, ndtr
 
-from beamfit.lifetime.departures import BELOW
 from beamfit.lifetime.expansion import (
     LOSS,
     POWER,
@@ -24,6 +23,7 @@ from beamfit.lifetime.expansion import (
     least_squares_step,
     solved,
 )
+from beamfit.lifetime.free_law import BELOW
 from beamfit.lifetime.pieces import (
     Event,
     Split,

@@ -21,7 +21,6 @@ from beamfit.lifetime.alternatives import (
     lifetime_law,
     rival_of,
 )
-from beamfit.lifetime.departures import BELOW, PACES, Law
 from beamfit.lifetime.expansion import (
     DETERMINED,
     LOSS,
@@ -31,7 +30,7 @@ from beamfit.lifetime.expansion import (
     further_columns,
     lifetime_of,
 )
-from beamfit.lifetime.marginal import ENDS, LIKELIER, UNITS, FreeLaw, free_law
+from beamfit.lifetime.free_law import BELOW, ENDS, LIKELIER, PACES, UNITS, FreeLaw, Law, free_law
 from beamfit.lifetime.record import DecayRecord
 from beamfit.noise.memory import CLOSE, Products
 from beamfit.quantity import HOUR, Quantity

@@ -15,10 +15,9 @@ from beamfit.lifetime.alternatives import Change, ConstantA, LifetimeLaw, Outgas
 from beamfit.lifetime.answer import finding_of, finding_of_cycles
 from beamfit.lifetime.cycles import FEWEST_CYCLES, FEWEST_READINGS, averaged, cleaned
 from beamfit.lifetime.decay_law import current
-from beamfit.lifetime.departures import Law
 from beamfit.lifetime.evidence import BELIEVED, UNITS, Evidence, RatePart, Separability
 from beamfit.lifetime.expansion import Expansion, Pieces, Shape, solved
-from beamfit.lifetime.marginal import FreeLaw
+from beamfit.lifetime.free_law import FreeLaw, Law
 from beamfit.lifetime.record import DecayRecord, Monitor
 from beamfit.quantity import Quantity, Status
 
@@ -292,7 +291,7 @@ def fit_decay(
         it.
     law : {"free", "constant"}
         Whether a may depend on the current by a power and b drift in the record, with the priors
-        of `beamfit.lifetime.departures`, which the errors then contain; or both are constant.
+        of `beamfit.lifetime.free_law`, which the errors then contain; or both are constant.
         With a `shape` the law is known.
 
     Returns
@@ -310,7 +309,7 @@ def fit_decay(
     -----
     Least squares with report equation 44, or with equation 42 if `shape` is given. With constant
     a and b errors are those of the linearised problem, else those of the posterior of
-    `beamfit.lifetime.marginal.free_law`.
+    `beamfit.lifetime.free_law.free_law`.
 
     Examples
     --------

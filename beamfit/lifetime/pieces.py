@@ -293,7 +293,8 @@ def _slow_steps(
         for first, last in _runs(seen & ~old[1:] & ~old[:-1]):
             # Half as many readings again: what ends smoothly still counts there.
             begin, end = first * size, (last + 1) * size + (last + 1 - first) * size // 2
-            before, after = cuts[np.searchsorted(cuts, begin, "right") + [-1, 0]]
+            place = np.searchsorted(cuts, begin, "right")
+            before, after = cuts[place - 1], cuts[place]
             begin = before if begin - before < 2 * size else begin  # nothing was looked for there
             end = after if after - end < 2 * size else min(end, current.size)
             known[begin:end] = True

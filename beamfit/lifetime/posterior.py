@@ -14,29 +14,27 @@ from jax import Array
 
 from beamfit.errors import Finding, InputError, Status, judge
 from beamfit.lifetime.decay_law import Moments, beam_current
-from beamfit.lifetime.departures import (
+from beamfit.lifetime.free_law import (
     ABOVE,
     BELOW,
     CONSTANT,
     DRIFT,
     LEAST,
     MOST,
-    gas_change,
-    gas_changed,
-    log_prior,
-    log_pumped,
-    log_straight,
-    node_currents,
-)
-from beamfit.lifetime.marginal import (
     WORTH,
     DrawnLaw,
     Draws,
     SeenDecay,
     at_bounds,
     ends_of,
+    gas_change,
+    gas_changed,
+    log_prior,
+    log_pumped,
+    log_straight,
     middle_of,
     mixed,
+    node_currents,
     proposals,
     rates_of,
 )
@@ -68,7 +66,7 @@ class DecayNumbers(NamedTuple):
     """Numbers of dI/dt = -a I² (I/mean)^exponent - b (1 + drift f(t)) I.
 
     Current at the first reading, mA, a, 1/(mA s), and b, 1/s; f is as of
-    `beamfit.lifetime.departures.gas_change`, whose pace is 0 where the drift is a straight line.
+    `beamfit.lifetime.free_law.gas_change`, whose pace is 0 where the drift is a straight line.
     """
 
     i0: Array
@@ -263,7 +261,7 @@ def sampled(
 
     Notes
     -----
-    The weighed draws of `beamfit.lifetime.marginal`, drawn again by their weight (importance
+    The weighed draws of `beamfit.lifetime.free_law`, drawn again by their weight (importance
     resampling): no chain has to settle, and no step is left out.
     """
     if fit.readings is None:

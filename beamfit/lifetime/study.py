@@ -23,9 +23,9 @@ from beamfit.lifetime.cycles import (
     unresolved,
     usual_cycle,
 )
-from beamfit.lifetime.departures import DRIFT, Law
 from beamfit.lifetime.evidence import SEPARABLE
 from beamfit.lifetime.fit import DecayFit, bare, fit_cycles, fit_decay, fit_pieces
+from beamfit.lifetime.free_law import DRIFT, Law
 from beamfit.lifetime.mechanisms import MECHANISMS, Losses, loss_coefficients
 from beamfit.lifetime.pieces import (
     FEWEST,

@@ -11,7 +11,6 @@ import numpy as np
 from beamfit.answer import json_of, shown
 from beamfit.errors import InputError
 from beamfit.lifetime.alternatives import ConstantA
-from beamfit.lifetime.departures import Law
 from beamfit.lifetime.evidence import UNITS
 from beamfit.lifetime.expansion import (
     LEVEL,
@@ -23,6 +22,7 @@ from beamfit.lifetime.expansion import (
     solved,
 )
 from beamfit.lifetime.fit import FEWEST, DecayFit, bare, fit_decay
+from beamfit.lifetime.free_law import Law
 from beamfit.lifetime.record import DecayRecord
 from beamfit.quantity import HOUR, Quantity, Status
 

@@ -9,9 +9,9 @@ from scipy.signal import lfilter
 
 from beamfit.lifetime import alternatives
 from beamfit.lifetime.decay_law import Moments, beam_current
-from beamfit.lifetime.departures import Law
 from beamfit.lifetime.expansion import Pieces, further_columns, solved
 from beamfit.lifetime.fit import fit_decay
+from beamfit.lifetime.free_law import Law
 from beamfit.lifetime.record import Conditions, DecayRecord
 from beamfit.lifetime.scales import summarise
 from beamfit.lifetime.study import study_record

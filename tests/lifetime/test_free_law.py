@@ -9,11 +9,10 @@ from scipy.integrate import solve_ivp
 
 from beamfit.errors import InputError
 from beamfit.lifetime.cycles import find_cycles
-from beamfit.lifetime.departures import CONSTANT, NODE, Numbers
 from beamfit.lifetime.expansion import Pieces, solved
 from beamfit.lifetime.fit import fit_cycles, fit_decay, fit_decays
+from beamfit.lifetime.free_law import CONSTANT, NODE, DrawnLaw, Numbers, SeenDecay, quantiles
 from beamfit.lifetime.lifetime_table import fit_lifetimes
-from beamfit.lifetime.marginal import DrawnLaw, SeenDecay, quantiles
 from beamfit.lifetime.record import Conditions, DecayRecord, LifetimeTable
 from beamfit.lifetime.study import study_record
 from tests.simulations import simulations

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from beamfit.lifetime.mechanisms import loss_coefficients
-from beamfit.lifetime.sliding_fit import WindowRow, fit_window, learnt
-from beamfit.lifetime.watch import CURRENT, Plan, State, stepped
+from beamfit.lifetime.watch import CURRENT, Plan, State, WindowRow, fit_window, learnt, stepped
 from tests.lifetime.test_alarm import beam_after
 
 A, B, NOISE, START = 3.7e-8, 9.26e-6, 5e-4, 1.7e9
