@@ -377,12 +377,19 @@ def joined(cycles: Sequence[DecayRecord], name: str) -> DecayRecord:
     """The readings of many cycles as one record."""
 
     def all_of(parts: Sequence[np.ndarray | None]) -> np.ndarray | None:
-        return None if parts[0] is None else np.concatenate(parts)
+        if parts[0] is None:
+            return None
+        whole = np.concatenate(parts)
+        whole.flags.writeable = False  # so that the record need not copy it
+        return whole
 
-    begin = cycles[0].start
+    begin, time = cycles[0].start, np.concatenate([cycle.time for cycle in cycles])
+    ends = np.cumsum([len(cycle) for cycle in cycles[:-1]])
+    for part, cycle in zip(np.split(time, ends), cycles, strict=True):
+        part += cycle.start - begin
+    time.flags.writeable = False
     return DecayRecord(
-        np.concatenate([cycle.start - begin + cycle.time for cycle in cycles]),
-        np.concatenate([cycle.current for cycle in cycles]),
+        time, all_of([cycle.current for cycle in cycles]),
         all_of([cycle.error for cycle in cycles]), name, begin,
         Conditions(*map(all_of, zip(*(c.conditions for c in cycles), strict=True))),
         notes=cycles[0].notes,

@@ -271,34 +271,39 @@ def _ramp(current: np.ndarray, noise: float) -> int:
     return cut if current.size - cut >= FEWEST else 0
 
 
+def _is_slow_step(beyond: np.ndarray, change: np.ndarray) -> np.ndarray:
+    """Which changes from mean to mean are more than the law: not at the head, where what falls fast
+    may be the law and what rises is a ramp; at the end, where nothing comes after, much more.
+    """
+    seen, ends = (beyond < 0) | (beyond > 0) & (change > 0), WINDOW // 2
+    seen[:ends] = False
+    seen[-ends:] &= np.abs(change[-ends:]) > FASTER * np.median(np.abs(change))
+    return seen
+
+
 def _slow_steps(
-    time: np.ndarray, current: np.ndarray, steps: np.ndarray, noise: float
+    time: np.ndarray, level: np.ndarray, steps: np.ndarray, noise: float
 ) -> list[tuple[int, int, bool]]:
     """First and past-the-last readings of falls and rises of many readings, and if it is a rise:
-    steps of the means of 2, 4, 8, ... neighbours, besides those of single readings. What falls fast
-    at first may be the law, and what rises there is a ramp.
+    steps of the means of 2, 4, 8, ... neighbours, besides those of single readings.
     """
-    level, known, size = current - np.append(0.0, np.cumsum(steps)), np.append(False, steps != 0), 1
-    cuts = np.array([-current.size, *np.flatnonzero(known), 2 * current.size])
-    found, half = [], -(WINDOW // 2)
-    while (count := current.size // (2 * size)) >= COARSE:
-        size *= 2
-        t, x = (v[: count * size].reshape(count, size).mean(axis=1) for v in (time, level))
-        old = known[: count * size].reshape(count, size).any(axis=1)
+    cuts, found = np.array([-level.size, *steps, 2 * level.size]), []
+    known, size = np.zeros(level.size, bool), 2
+    known[steps] = True
+    while (count := level.size // size) >= COARSE:
+        t, x, old = (v[: count * size].reshape(count, size).mean(1) for v in (time, level, known))
         beyond = _steps(t, x, noise)
-        change = np.diff(x)
-        seen = (beyond < 0) | (beyond > 0) & (change > 0)
-        seen[:-half] = False
-        seen[half:] &= np.abs(change[half:]) > FASTER * np.median(np.abs(change))
-        for first, last in _runs(seen & ~old[1:] & ~old[:-1]):
+        apart = (old[1:] == 0) & (old[:-1] == 0)
+        for first, last in _runs(_is_slow_step(beyond, np.diff(x)) & apart):
             # Half as many readings again: what ends smoothly still counts there.
             begin, end = first * size, (last + 1) * size + (last + 1 - first) * size // 2
             place = np.searchsorted(cuts, begin, "right")
             before, after = cuts[place - 1], cuts[place]
-            begin = before if begin - before < 2 * size else begin  # nothing was looked for there
-            end = after if after - end < 2 * size else min(end, current.size)
+            begin = before if begin - before < 2 * size else begin  # beside a step none was sought
+            end = after if after - end < 2 * size else min(end, level.size)
             known[begin:end] = True
             found.append((int(begin), int(end), bool(beyond[first] > 0)))
+        size *= 2
     return sorted(found)
 
 
@@ -337,17 +342,20 @@ def split_record(record: DecayRecord) -> Split:
         return Split((), tuple(events))
     time, current = record.time[kept], record.current[kept]
     noise = _noise(record, time, current)
-    steps = _steps(time, current, noise)
+    beyond = _steps(time, current, noise)
+    steps = np.flatnonzero(beyond) + 1
+    for first in steps:
+        kind = "refill" if beyond[first - 1] > 0 else "loss"
+        change = float(current[first] - current[first - 1])
+        events.append(Event(kind, float(time[first]), 0.0, change))
+    current[1:] -= np.cumsum(beyond)
+    del beyond  # of 1e7 readings 80 MB
     slow = _slow_steps(time, current, steps, noise)
-    del time, current  # of 1e7 readings 160 MB
-    for before in np.flatnonzero(steps):
-        kind = "refill" if steps[before] > 0 else "loss"
-        change = float(record.current[kept[before + 1]] - record.current[kept[before]])
-        events.append(Event(kind, float(record.time[kept[before + 1]]), 0.0, change))
+    del time, current
     interval = np.diff(record.time)
     for before in np.flatnonzero(interval > GAP * np.median(interval)):
         events.append(event_of(record, "gap", before, before + 1))
-    ends = [*(np.flatnonzero(steps) + 1)]
+    ends = [*steps]
     for first, last, rises in slow:
         kind = "ramp" if rises else "loss"
         events.append(event_of(record, kind, kept[first], kept[last - 1]))
@@ -473,12 +481,15 @@ def thinned(record: DecayRecord) -> DecayRecord:
     first = np.arange(0, len(record), size)
     count = np.diff(first, append=len(record))
     whole = len(record) // size * size
-    blocks = record.current[:whole].reshape(-1, size)
-    off = np.abs(blocks - np.median(blocks, axis=1, keepdims=True))
-    spread = 1.4826 * np.median(off, axis=1)
+    # In parts: all at once takes gigabytes.
+    blocks = np.array_split(record.current[:whole].reshape(-1, size), -(-whole // STRETCH))
+    off = [np.abs(part - np.median(part, axis=1, keepdims=True)) for part in blocks]
+    spread = [1.4826 * np.median(part, axis=1) for part in off]
     kept = np.ones(len(record), bool)
-    limit = THRESHOLD * max(float(np.median(spread)), record.resolution or 0.0)
-    kept[:whole] = (off <= np.maximum(THRESHOLD * spread, limit)[:, None]).ravel()
+    limit = THRESHOLD * max(float(np.median(np.concatenate(spread))), record.resolution or 0.0)
+    pairs = zip(off, spread, strict=True)
+    within = [part <= np.maximum(THRESHOLD * own, limit)[:, None] for part, own in pairs]
+    kept[:whole] = np.concatenate(within).ravel()
     count = np.maximum(np.add.reduceat(kept.astype(int), first), 1)
 
     def mean(values: np.ndarray) -> np.ndarray:

@@ -563,6 +563,7 @@ def study_record(
     placed = replace(record, start=0.0)
     cycles, events = _refilled(placed)
     pooled, pieces = _pooled(cycles, record.name, machine, law)
+    del cycles  # of 1e7 readings 160 MB
     if not pooled:
         pieces, events = _decays(placed)
     # A record that does nothing but rise is an error; a slow refill within one is not.
