@@ -168,9 +168,10 @@ def _lifetimes(tables: list[LifetimeTable], inputs: dict[str, str], as_json: boo
 def _show_lifetimes(terminal: Terminal, fits: list[LifetimeFit]) -> None:
     for fit in fits:
         terminal.line(str(fit.readings), style="bold")
-        terminal.verdict(fit.record, fit.status, fit.message)
+        terminal.answer(fit.headline, fit.status, fit.message)
         terminal.line()
-        terminal.table(fit.table(), [fit.status])
+        for table in fit.tables():
+            terminal.table(table, [fit.status])
         for note in fit.readings.notes:
             terminal.line(f"Note: {note}")
         terminal.line()
@@ -204,10 +205,11 @@ def _show(
     trend: Trend | None,
 ) -> None:
     """Show every record, and what was drawn and found of all together."""
-    if shift is not None:
-        _say_shift(terminal, shift)
-    if trend is not None:
-        terminal.verdict("trend", trend.status, trend.message)
+    verdicts = [] if shift is None else shift.verdicts
+    verdicts += [] if trend is None else [("trend", trend.status, trend.message)]
+    for verdict in verdicts:
+        terminal.verdict(*verdict)
+    if verdicts:
         terminal.line()
     for each in studies:
         if shift is not None and not terminal.full:
@@ -217,18 +219,17 @@ def _show(
     fits = [decay.fit for study in studies for decay in study.answers]
     for fit, posterior in zip(fits, posteriors or (), strict=False):
         terminal.posterior(f"Posterior of {fit.record}", posterior)
-    if shift is not None:
-        _show_shift(terminal, shift)
-    if trend is not None:
-        for table in trend.tables():
-            terminal.table(table, wrap=False)
+    for table in () if shift is None else shift.tables():
+        terminal.table(table if terminal.full else table.quoted())
+    for table in () if trend is None else trend.tables():
+        terminal.table(table, wrap=False)
     if not terminal.full:
         terminal.line("All tables: --full. A page with pictures: --report FILE.html.", style="dim")
 
 
 def _show_record(terminal: Terminal, study: RecordStudy) -> None:
     """Lay out a record: what was cut away, and every decay with its verdict and budget."""
-    from beamfit.answer import Table, determined, labelled
+    from beamfit.answer import determined, labelled
     from beamfit.lifetime import tables
 
     terminal.line(str(study.record), style="bold")
@@ -252,8 +253,7 @@ def _show_record(terminal: Terminal, study: RecordStudy) -> None:
         rows += tables.check_rows([decay])
         terminal.table(labelled("", [name], determined(rows)), [status])
         if decay.systematics:
-            unseen = tables.systematic_rows(decay)
-            terminal.table(Table("\nSystematics", tables.SYSTEMATIC, unseen))
+            terminal.table(tables.systematic_table(decay, "\nSystematics"))
         if losses := tables.budget_rows([decay]):
             terminal.table(labelled("\nLosses from first principles", [name], losses))
         for course in tables.course_tables([decay]):
@@ -280,32 +280,3 @@ def _show_many(terminal: Terminal, study: RecordStudy) -> None:
             rows = [*rows[:MOST_SHOWN], [f"{left} more", *[""] * (len(header) - 1)]]
         terminal.table(Table(f"\n{title}", header, rows))
     terminal.line()
-
-
-def _say_shift(terminal: Terminal, shift: Shift) -> None:
-    """Say the verdicts of a study of many decays."""
-    from beamfit.quantity import Status
-
-    terminal.verdict("all decays", shift.fit.status, shift.fit.message)
-    if shift.untold:
-        terminal.verdict("loss budget", Status.unidentified, shift.untold)
-    terminal.verdict("operating point", shift.best.status, shift.best.message)
-    if shift.anomaly is not None:
-        terminal.verdict("second half", shift.anomaly.status, shift.anomaly.message)
-    if shift.network is not None:
-        terminal.verdict("network", shift.network.fit.status, shift.network.fit.message)
-    terminal.line()
-
-
-def _show_shift(terminal: Terminal, shift: Shift) -> None:
-    """Lay out a study of many decays."""
-    from beamfit.answer import labelled
-    from beamfit.lifetime import tables
-
-    fit, count = shift.fit, len(shift.fit.names)
-    names = ["1 decay" if count == 1 else f"{count} decays"]
-    table = labelled("First principles fitted to", names, tables.shift_rows(shift))
-    terminal.table(table if terminal.full else table.quoted(), [fit.status])
-    if shift.network is not None:
-        table = labelled("A network of the losses", names, tables.network_rows(shift))
-        terminal.table(table, [shift.network.fit.status])

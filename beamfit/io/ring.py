@@ -242,7 +242,7 @@ def _bunches(section: Section, given: float | list[float], buckets: float) -> di
         raise section.error(found, expected, "bunches")
     if not isinstance(given, list):
         return {"bunches": given}
-    from beamfit.lifetime.bunch import equal_bunches
+    from beamfit.lifetime.ring import equal_bunches
 
     equal = float(equal_bunches(charge))
     return {"bunches": equal, "fill": charge / charge.sum() * equal}

@@ -17,11 +17,17 @@ from beamfit.lifetime.mechanisms import Losses, loss_coefficients
 from beamfit.lifetime.scales import by_losses, summarise
 from beamfit.lifetime.study import Decay, Machine, RecordStudy
 from beamfit.quantity import HOUR, Quantity, Status, percent, relative_change
-from beamfit.statistics import FEWEST, baseline, control_limits
+from beamfit.statistics import (
+    BEYOND,
+    FEWEST,
+    baseline,
+    control_limits,
+    one_sided_probability,
+    reach_of,
+)
 
 # a and b wander by so much on an ordinary day.
 WANDER = 0.005
-DAY = 24 * HOUR
 # Where readings do not tell a from b, the ring's own shares of them are trusted to this.
 SHARES = 0.3
 # No monitor is better than this share of the current.
@@ -270,12 +276,13 @@ def _point(
 
 def _drift(time: np.ndarray, values: Sequence[Quantity], centre: float) -> Quantity:
     """Relative slope by least squares, its error from the residuals."""
-    if len(values) < FEWEST + 1 or np.ptp(time) < DAY:
+    if len(values) < FEWEST + 1 or np.ptp(time) < 24 * HOUR:
         return Quantity(math.nan, None, "1")
     level = np.array([value.value for value in values]) / centre
-    weeks = (time - time.mean()) / (7 * DAY)
+    weeks = (time - time.mean()) / (7 * 24 * HOUR)
     [slope, _], covariance = np.polyfit(weeks, level, 1, cov=True)
-    return Quantity(float(slope), float(np.sqrt(covariance[0, 0])), "1")
+    error = float(np.sqrt(covariance[0, 0]))
+    return Quantity.reaching(float(slope), error, "1", None, reach_of(level.size - 2) * error)
 
 
 def reference_of(
@@ -287,7 +294,7 @@ def reference_of(
     known, to `SHARES`. How far the decays scatter about it is how far a and b are expected to
     wander.
     """
-    current, parts, root = map(np.asarray, summarise(tuple(decays)))
+    current, parts, root = map(np.asarray, summarise(decays))
     rows = by_losses(a * current, b)
     weighted = (root @ rows).reshape(-1, 2)
     seen = np.einsum("nij,nj->ni", root, parts).ravel()
@@ -352,7 +359,7 @@ def _verdict(trend: Trend) -> tuple[Status, str]:
     beyond = sum(point.beyond != 0 for point in trend.points)
     said = f"{usual} ± {percent(trend.limit / centre)}, {beyond} beyond that."
     drift = trend.drift
-    if drift.error is not None and abs(drift.value) > 3 * drift.error:
+    if drift.error is not None and _is_sure(abs(drift.value) / drift.error, count - 2):
         said += f" It changes by {relative_change(drift)} a week."
     if trend.reference is None:
         said += " Readings are not watched: the first decays give no a and b above zero."
@@ -360,3 +367,8 @@ def _verdict(trend: Trend) -> tuple[Status, str]:
         first = "Alarm" if len(trend.alarms) == 1 else f"{len(trend.alarms)} alarms, the first"
         said += f" {first}: {trend.alarms[0].said(trend.dated)}."
     return (Status.poor_fit if beyond or trend.alarms else Status.converged), said
+
+
+def _is_sure(errors: float, dof: int) -> bool:
+    """Tell if a change is as rare by chance as a point beyond the control limits."""
+    return one_sided_probability(errors, dof) < 1 - BEYOND

@@ -30,7 +30,7 @@ from beamfit.quantity import HOUR, Quantity
 from beamfit.statistics import CENTRAL, WIDE
 
 # Standard deviations of the exponent below and above zero. Bunches lengthen with the current, in
-# the potential well by x³ - x ∝ I (`beamfit.lifetime.bunch`), so that a goes as I^0 to I^-1/3; that
+# the potential well by x³ - x ∝ I (`beamfit.lifetime.ring`), so that a goes as I^0 to I^-1/3; that
 # they shorten, or the vacuum follows the current, is seldom. A twentieth of the prior is flat.
 BELOW, ABOVE, ODD = 0.3, 0.2, 0.05
 LEAST, MOST = -0.9, 2.0

@@ -7,8 +7,15 @@ import jax.numpy as jnp
 from jax import Array
 from scipy import constants
 
-from beamfit.lifetime.bunch import stored_bunch, up_and_down, vertical_acceptance
-from beamfit.lifetime.ring import ELECTRON_RADIUS, Gas, Operation, Ring
+from beamfit.lifetime.ring import (
+    ELECTRON_RADIUS,
+    Gas,
+    Operation,
+    Ring,
+    stored_bunch,
+    up_and_down,
+    vertical_acceptance,
+)
 
 
 def elastic_cross_section(

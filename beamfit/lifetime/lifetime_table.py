@@ -11,7 +11,7 @@ import numpy as np
 from jax import Array
 from scipy.special import chdtrc, fdtrc
 
-from beamfit.answer import Table, answer, json_of, labelled, plain_name
+from beamfit.answer import Table, answer, cell, json_of, labelled, plain_name
 from beamfit.errors import expect
 from beamfit.greybox.fit import Derived, Fit
 from beamfit.greybox.problem import Free, Problem, Record, padded_length
@@ -79,18 +79,19 @@ class LifetimeFit:
         """Quoted quantities, by name."""
         return {name: getattr(self, name) for name in UNITS if hasattr(self, name)}
 
-    def __str__(self) -> str:
-        rows = [f"{self.record}: {self.status}. {self.message}"]
-        rows += [f"  {name:15s} {value}" for name, value in self.quantities.items()]
-        return "\n".join([*rows, f"  chi²/dof {self.chi2:.4g}/{self.dof}"])
+    @property
+    def headline(self) -> str:
+        """The table, its status and its lifetime in a line."""
+        return f"{self.record} {cell(self.status)}: mean lifetime {self.lifetime_mean}"
 
-    def table(self) -> Table:
+    def tables(self) -> tuple[Table, ...]:
         """Quoted quantities, to be shown."""
         rows = [(plain_name(name), [value]) for name, value in self.quantities.items()]
         rows.append(("share of a in the loss", [self.share]))
         tested = self.readings.error is not None
         chi2 = f"{self.chi2:.4g}/{self.dof}" if tested else f"not testable ({self.dof} dof)"
-        return labelled("", [self.record], [("status", [self.status]), *rows, ("chi2/dof", [chi2])])
+        rows = [("status", [self.status]), *rows, ("chi2/dof", [chi2])]
+        return (labelled("", [self.record], rows),)
 
     def to_json(self) -> dict[str, Any]:
         """Return the result as `beamfit lifetime --json` prints it."""

@@ -19,7 +19,7 @@ from jax import Array
 from scipy.linalg import block_diag, cho_solve, cholesky, solve_triangular
 from scipy.optimize import nnls
 
-from beamfit.answer import json_of, shown
+from beamfit.answer import Row, json_of, shown
 from beamfit.errors import InputError
 from beamfit.greybox.bounds import over_cells
 from beamfit.greybox.fit import Fit
@@ -27,7 +27,6 @@ from beamfit.greybox.mlp import MLP, Layer, Port
 from beamfit.greybox.problem import Prior, Problem, Record
 from beamfit.greybox.signed_network import signed_weights
 from beamfit.greybox.solve import solve
-from beamfit.lifetime.mechanisms import LossTerms, loss_terms, scaled_losses
 from beamfit.lifetime.ring import Operation
 from beamfit.lifetime.scales import (
     PRESSURE_ERROR,
@@ -35,11 +34,11 @@ from beamfit.lifetime.scales import (
     Summaries,
     by_losses,
     loss_parts,
-    stacked_terms,
     summarise,
+    widened,
 )
-from beamfit.lifetime.study import Decay, Machine, operation_during
-from beamfit.quantity import HOUR, Quantity
+from beamfit.lifetime.study import Decay, Machine, settings_of
+from beamfit.quantity import HOUR, Quantity, percent
 
 INPUTS = ("rf_voltage", "scraper_y", "pressure", "bunches")
 # How the loss moves with each input; nothing is known of the sign for the RF voltage.
@@ -174,7 +173,7 @@ class Discrepancy(NamedTuple):
         reach = cho_solve((root, True), self.rows @ self.kernel(at).T)
         jacobian = root @ fit.dense_jacobian[: left.size]
         total = slopes - reach.T @ jacobian
-        own = Discrepancy(self.size, at, self.length, self.rows).kernel(at)
+        own = self._replace(inputs=at).kernel(at)
         rest = own - reach.T @ self.rows @ self.kernel(at).T
         return reach.T @ left, rest + total @ fit.covariance_raw @ total.T
 
@@ -211,13 +210,14 @@ RISING, POSITIVE = "rest->rising", ("rising->out", "convex->out")
 DIRECTION = np.array([SIGNS[name] for name in INPUTS[1:]])[:, None]
 # Widths of the priors on weights: alone the network covers decades, a correction is near zero.
 ALONE, CORRECTION = 3.0, 0.3
-MOST = 30.0
-# Relative error of the model that a first fit is made with, and its correlation length: of half the
-# range of each input, or of that where less was seen. Chosen on simulated shifts.
-TRIAL, LENGTH, SHORTEST = 0.05, 0.8, 0.1
+# Widths of the prior that no weight exceeds.
+MOST = 10.0
+# Correlation length of the model's error: of half the range of each input, or of that where less
+# was seen. Chosen on simulated shifts.
+LENGTH, SHORTEST = 0.8, 0.1
 # Below this share of the loss b is compatible with zero.
 SMALLEST = 1e-3
-# Voltages at which a correction is looked at.
+# Voltages that are looked at, of a correction or for the longest lifetime.
 VOLTAGES = 65
 
 
@@ -241,8 +241,8 @@ class NetworkFit:
         Signs that hold everywhere in the box.
     machine : Machine
         The ring and its usual operation.
-    scales : array, or None
-        Scales of the first principles that the network corrects; None if it stands alone.
+    corrected : ScaleFit or None
+        The first principles that the network corrects; None if it stands alone.
     discrepancy : Discrepancy
         What it may be wrong by.
     vacuum : array, shape (2,)
@@ -254,7 +254,7 @@ class NetworkFit:
     fit: Fit
     certificate: Certificate
     machine: Machine
-    scales: np.ndarray | None
+    corrected: ScaleFit | None
     discrepancy: Discrepancy
     vacuum: np.ndarray
     left: np.ndarray
@@ -262,7 +262,7 @@ class NetworkFit:
     @property
     def usual(self) -> Operation:
         """The machine's usual settings, of a network alone in the vacuum of the decays."""
-        if self.scales is not None:
+        if self.corrected is not None:
             return self.machine.operation
         base, slope = self.vacuum
         return self.machine.operation._replace(pressure_base=base, pressure_slope=slope)
@@ -287,17 +287,15 @@ class NetworkFit:
 
     def predict(self, operation: Operation, current: float) -> tuple[Quantity, ...]:
         """a, 1/(mA s), b, 1/s, and the lifetime, h, as `losses`."""
-        terms = loss_terms(self.machine.ring, operation, current)
-        at = _inputs(operation, current)[None]
-        base = _base(self.scales, jax.tree.map(lambda part: part[None], terms))
-        logs = self.fit.derive(_logs, (at, base))
+        at, base = _inputs(operation, current)[None], _base(self.corrected, operation, current)
+        logs = self.fit.derive(_logs, (at, base[None]))
         mean, covariance = self.discrepancy.spread(at, logs.slope[0], self.left, self.fit)
         a, b = np.exp(logs.value[0])
         rate = a * current + b
         # By ln a and ln b: of themselves, and of the logarithm of the lifetime.
         rows = np.array([[1, 0], [0, 1], [-a * current / rate, -b / rate]])
         spread = np.sum(rows @ covariance * rows, axis=1) + (rows @ mean) ** 2
-        if self.scales is None:
+        if self.corrected is None:
             spread = spread + self._pressed(at[0], current)
         inside = self.certificate.holds_at(at[0])
         named = zip((a, b, 1 / rate / HOUR), np.sqrt(spread), LOSSES, strict=True)
@@ -312,6 +310,22 @@ class NetworkFit:
         base, slope = self.vacuum
         off = at[INPUTS.index("pressure")] - np.log(1e9 * (base + slope * current))
         return off**2 / 3
+
+    def rows(self, current: float) -> list[Row]:
+        """Label and value of what it says at a current, and of what it obeys."""
+        held, wrong = self.certificate, self.discrepancy.size
+        at = f"at the usual settings, {current:.4g} mA"
+        names = (f"a {at}", f"b {at}", f"lifetime {at}")
+        numbers = zip(names, self.predict(self.usual, current), strict=True)
+        rows = [
+            ("status", self.fit.status),
+            ("chi2/dof", f"{self.fit.chi2:.4g}/{self.fit.dof}"),
+            ("what it may be wrong by, a and b", " and ".join(map(percent, wrong))),
+            *numbers,
+            ("falls with scraper and bunches, rises with pressure", held.holds),
+            ("single maximum of the lifetime in the RF voltage", held.single_maximum),
+        ]
+        return [Row(label, [value], quoted=True) for label, value in rows]
 
     def to_json(self, current: float) -> dict[str, Any]:
         """Return the verdict, and a, b and lifetime at the usual settings, as JSON's types."""
@@ -344,12 +358,11 @@ def _predict(model: Mapping[str, MLP], data: Data) -> Array:
     return weight @ loss_parts(a, b, current).ravel()
 
 
-def _base(scales: np.ndarray | None, terms: LossTerms) -> Array:
+def _base(corrected: ScaleFit | None, operation: Operation, current: float) -> Array:
     """ln a and ln b of first principles, which the network corrects; zero if it stands alone."""
-    if scales is None:
-        return jnp.zeros((terms.current.size, 2))
-    losses = jax.vmap(scaled_losses, (None, 0))(jnp.asarray(scales), terms)
-    return jnp.log(jnp.stack(losses, axis=-1))
+    if corrected is None:
+        return jnp.zeros(2)
+    return jnp.log(jnp.stack(corrected.losses_at(operation, current)))
 
 
 def _network(inputs: np.ndarray, means: np.ndarray, hidden: int, seed: int) -> MLP:
@@ -397,9 +410,7 @@ def _statement(measured: Summaries, floor: float) -> tuple[np.ndarray, np.ndarra
     quadratic, rate = np.abs(np.asarray(measured.parts)).T
     linear = np.maximum(np.abs(rate - quadratic), SMALLEST * rate)
     by = by_losses(quadratic, linear)
-    own = np.asarray(measured.root) @ by * np.array([floor, PRESSURE_ERROR])
-    root = np.linalg.cholesky(np.eye(2) + own @ np.swapaxes(own, 1, 2))
-    weight = np.linalg.solve(root, np.asarray(measured.root))
+    weight = np.asarray(widened(measured.root, by * np.array([floor, PRESSURE_ERROR])))
     return block_diag(*weight), block_diag(*(weight @ by))
 
 
@@ -459,29 +470,25 @@ def fit_loss_network(
     """
     if len(decays) < 4:
         raise InputError(f"{len(decays)} decays", "4 or more at different settings")
-    terms, measured = stacked_terms(decays, machine), summarise(tuple(decays))
-    settings = [operation_during(d.segment, machine) for d in decays]
-    inputs = np.stack(
-        [_inputs(o, d.fit.mean_current) for o, d in zip(settings, decays, strict=True)]
-    )
+    measured = summarise(decays)
+    settings = settings_of(decays, machine)
+    inputs = np.stack([_inputs(*setting) for setting in settings])
     if not np.isfinite(inputs).all():
         raise InputError("a setting that is not finite", "RF voltage, scraper, pressure, bunches")
-    scales = None if corrected is None else corrected.vector
     means = np.zeros(2) if corrected is not None else _typical(measured)
-    net, signs = (
-        _network(inputs, means, hidden, seed),
-        _signs(single_maximum or corrected is not None),
-    )
+    net = _network(inputs, means, hidden, seed)
+    signs = _signs(single_maximum or corrected is not None)
     width = ALONE if corrected is None else CORRECTION
     weight, rows = _statement(measured, floor)
-    seen, base = weight @ np.asarray(measured.parts).ravel(), _base(scales, terms)
+    seen = weight @ np.asarray(measured.parts).ravel()
+    base = jnp.stack([_base(corrected, *setting) for setting in settings])
 
     def fitted(wrong: Discrepancy) -> tuple[Fit, np.ndarray]:
         whiten = np.linalg.inv(wrong.root)
         data = (jnp.asarray(inputs), base, measured.current, jnp.asarray(whiten @ weight))
         problem = Problem(
             model={"map": net},
-            free=signed_weights("map", net, signs, MOST, 1.0),
+            free=signed_weights("map", net, signs, MOST * width, 1.0),
             records=[Record("decays", _predict, data, jnp.asarray(whiten @ seen), error=1.0)],
             priors=[Prior("map", 0.0, width)],
         )
@@ -491,7 +498,8 @@ def fit_loss_network(
     pressure = 1e-9 * np.exp(inputs[:, INPUTS.index("pressure")])
     vacuum = _line(np.asarray(measured.current), pressure)
     length = np.maximum(LENGTH * np.ptp(inputs, axis=0) / 2, SHORTEST)
-    trial = Discrepancy((TRIAL, TRIAL), inputs, length, rows)
+    middle = SIZES[len(SIZES) // 2]
+    trial = Discrepancy((middle, middle), inputs, length, rows)
     wrong = sized(trial, *fitted(trial))
     fit, left = fitted(wrong)
     low, high = (inputs.min(0), inputs.max(0)) if box is None else box.corners()
@@ -500,31 +508,31 @@ def fit_loss_network(
     if corrected is None:
         maximum = "certified" if single_maximum else "not asked"
     else:
-        maximum = _maximum_seen(fit, scales, machine, low, high, float(np.max(terms.current)))
+        maximum = _maximum_seen(fit, corrected, low, high, float(measured.current.max()))
     certificate = Certificate(low, high, gains, maximum)
-    return NetworkFit(fit, certificate, machine, scales, wrong, vacuum, left)
+    return NetworkFit(fit, certificate, machine, corrected, wrong, vacuum, left)
 
 
 def _maximum_seen(
-    fit: Fit, scales: np.ndarray, machine: Machine, low: np.ndarray, high: np.ndarray, current
+    fit: Fit, corrected: ScaleFit, low: np.ndarray, high: np.ndarray, current: float
 ) -> str:
     """Look along the voltage at every corner of the other settings."""
     corners = itertools.product(*zip(low[1:], high[1:], strict=True))
     voltages = np.linspace(low[0], high[0], VOLTAGES)
     for scraper, pressure, bunches in corners:
-        operation = machine.operation._replace(
+        operation = corrected.machine.operation._replace(
             scraper_y=1e-3 * np.exp(scraper),
             pressure_base=1e-9 * np.exp(pressure),
             pressure_slope=0.0,
             bunches=np.exp(bunches),
         )
-        terms = jax.lax.map(
-            lambda v, o=operation: loss_terms(machine.ring, o._replace(rf_voltage=v), current),
+        base = jax.lax.map(
+            lambda v, o=operation: _base(corrected, o._replace(rf_voltage=v), current),
             jnp.asarray(1e6 * voltages),
         )
         rest = np.tile([scraper, pressure, bunches], (VOLTAGES, 1))
         inputs = jnp.asarray(np.column_stack([voltages, rest]))
-        a, b = np.exp(np.asarray(_logs(fit.model, (inputs, _base(scales, terms))))).T
+        a, b = np.exp(np.asarray(_logs(fit.model, (inputs, base)))).T
         turns = np.diff(np.sign(np.diff(a * current + b)))
         if np.count_nonzero(turns) > 1 or turns.min(initial=0) < 0:
             return "broken"

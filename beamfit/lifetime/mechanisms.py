@@ -13,13 +13,9 @@ from jax import Array
 
 from beamfit.answer import shown
 from beamfit.errors import InputError
-from beamfit.lifetime.bunch import quantum_loss
 from beamfit.lifetime.gas import bremsstrahlung_loss, elastic_loss
-from beamfit.lifetime.ring import Operation, Ring, unstored
+from beamfit.lifetime.ring import Operation, Ring, quantum_loss, unstored
 from beamfit.lifetime.touschek import touschek_loss
-
-# Pa, base pressure of the relative rise with current if the pressure is zero.
-NO_PRESSURE = 1e-30
 
 
 class Mechanism(NamedTuple):
@@ -173,10 +169,8 @@ class LossTerms(NamedTuple):
     ----------
     parts : tuple of float
         The term of each of `MECHANISMS`.
-    pressure : float
-        Pressure at the mean current, Pa.
-    rise : float
-        P1/P0, the rise of the pressure with current over the base pressure, 1/mA.
+    base, slope : float
+        Pressure without beam, Pa, and its rise with current, Pa/mA.
     current : float
         Mean current, mA.
     voltages : array, shape (k,), or None
@@ -185,8 +179,8 @@ class LossTerms(NamedTuple):
     """
 
     parts: tuple[Array, ...]
-    pressure: Array
-    rise: Array
+    base: Array
+    slope: Array
     current: Array
     voltages: Array | None = None
 
@@ -228,20 +222,21 @@ def loss_terms(
     >>> from beamfit.io.ring import read_operation, read_ring
     >>> path = "lattices/spear3_2003.toml"
     >>> terms = loss_terms(read_ring(path), read_operation(path), 500.0)
-    >>> print(f"{terms.pressure:.1e} Pa, P1/P0 = {terms.rise:.3f} /mA")
-    1.0e-07 Pa, P1/P0 = 0.008 /mA
+    >>> print(f"{terms.base:.1e} Pa, P1/P0 = {terms.slope / terms.base:.3f} /mA")
+    2.0e-08 Pa, P1/P0 = 0.008 /mA
     """
-    base, slope = operation.pressure_base, operation.pressure_slope
+
+    def parts_at(voltage: Array) -> tuple[Array, ...]:
+        return terms_of(ring, operation._replace(rf_voltage=voltage), current)
+
     if voltages is None:
-        parts = terms_of(ring, operation, current)
+        parts = parts_at(operation.rf_voltage)
     else:
-        settings = [operation._replace(rf_voltage=operation.rf_voltage * v) for v in voltages]
-        each = [terms_of(ring, setting, current) for setting in settings]
-        parts = tuple(jnp.stack(part, axis=-1) for part in zip(*each, strict=True))
+        parts = jax.lax.map(parts_at, operation.rf_voltage * jnp.asarray(voltages, float))
     return LossTerms(
         parts,
-        pressure=jnp.asarray(base + slope * current, float),
-        rise=jnp.asarray(slope / jnp.maximum(base, NO_PRESSURE), float),
+        base=jnp.asarray(operation.pressure_base, float),
+        slope=jnp.asarray(operation.pressure_slope, float),
         current=jnp.asarray(current, float),
         voltages=None if voltages is None else jnp.asarray(voltages, float),
     )
@@ -295,6 +290,7 @@ def scaled_parts(scales: Array, terms: LossTerms, pressure_factor: Array = 1.0) 
     parts = tuple(
         term * next(factors) if m.vary else term for m, term in zip(MECHANISMS, parts, strict=True)
     )
-    rise = desorption * terms.rise
-    base = terms.pressure * pressure_factor / (1 + rise * terms.current)
-    return added(parts, base, base * rise)
+    base, slope = terms.base, desorption * terms.slope
+    made, read = (base + rise * terms.current for rise in (slope, terms.slope))
+    factor = pressure_factor * read / jnp.where(made > 0, made, 1.0)
+    return added(parts, factor * base, factor * slope)

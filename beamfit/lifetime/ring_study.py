@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -11,35 +12,40 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 from scipy.special import chdtrc, chdtri
 
-from beamfit.answer import json_of, shown
+from beamfit.answer import Row, Table, answer, cell, json_of, labelled
 from beamfit.errors import InputError
-from beamfit.lifetime.advice import (
-    BestPoint,
-    DecayCandidate,
-    Limits,
-    Proposal,
-    best_operating_point,
-    next_decays,
-)
-from beamfit.lifetime.expansion import DETERMINED, lifetime_of
+from beamfit.greybox.design import Information, scores
+from beamfit.lifetime.decay_law import current as beam_at
+from beamfit.lifetime.expansion import DETERMINED, Expansion, lifetime_of
 from beamfit.lifetime.fit import bare
-from beamfit.lifetime.loss_network import Network, NetworkFit, fit_loss_network
-from beamfit.lifetime.mechanisms import MECHANISMS, scaled_losses, scaled_parts
+from beamfit.lifetime.loss_network import VOLTAGES, Network, NetworkFit, fit_loss_network
+from beamfit.lifetime.mechanisms import (
+    MECHANISMS,
+    SCALES,
+    LossTerms,
+    loss_terms,
+    scaled_losses,
+    scaled_parts,
+)
+from beamfit.lifetime.record import DecayRecord
 from beamfit.lifetime.ring import Operation
 from beamfit.lifetime.scales import (
+    VOLTAGE,
+    DecaySet,
     ScaleFit,
+    Summaries,
     by_losses,
     fit_scales,
-    spread_of_scales,
-    stacked_terms,
-    summarise,
+    information_root,
+    loss_parts,
 )
-from beamfit.lifetime.study import Decay, Machine, operation_during, settings_json
+from beamfit.lifetime.study import Decay, Machine, settings_json, settings_of
 from beamfit.quantity import HOUR, Quantity, Status
 from beamfit.sampling.posterior import Interval, Posterior
-from beamfit.statistics import POOR_FIT
+from beamfit.statistics import POOR_FIT, quantity_of_draws
 
 CAUSES = {
     "a": "the bunch or the momentum acceptance changed, or the beam-induced pressure",
@@ -82,14 +88,13 @@ def _linearised(
     """Readings minus model (2n,), and their slopes (2n, 2) by relative changes of a and b from a
     decay on; whitened, with the errors of scales and pressures.
     """
-    terms = stacked_terms(decays, fit.machine, fit.voltages)
-    measured = summarise(tuple(decays))
-    weight, off, by_scale = fit.about(terms, measured)
+    together = DecaySet.of(decays, fit.machine, fit.decays.pressure_error, fit.voltages)
+    weight, off, by_scale = fit.about(together)
     off, by_scale = off.ravel(), by_scale.reshape(off.size, -1)
-    a, b = (np.asarray(part) for part in scaled_losses(jnp.asarray(fit.vector), terms))
-    change = (weight @ by_losses(a * np.asarray(terms.current), b)).reshape(-1, 2)
-    known = np.where(np.isfinite(fit.covariance), fit.covariance, 0.0)
-    covariance = fit.error_scale**2 * (np.eye(off.size) + by_scale @ known @ by_scale.T)
+    a, b = map(np.asarray, scaled_losses(jnp.asarray(fit.vector), together.terms))
+    change = (weight @ by_losses(a * np.asarray(together.terms.current), b)).reshape(-1, 2)
+    from_scales = by_scale @ fit.spread.half
+    covariance = fit.error_scale**2 * (np.eye(off.size) + from_scales @ from_scales.T)
     whiten = np.linalg.inv(np.linalg.cholesky(covariance))
     return -whiten @ off, lambda first: whiten[:, 2 * first :] @ change[2 * first :]
 
@@ -188,16 +193,15 @@ def budget_intervals(
         Loss rates 1/h by mechanism, a, b, and the lifetime h; NaN where only the limits of the
         scales decide.
     """
-    terms = fit.terms_at(operation, current)
     units = {m.name: "1/h" for m in MECHANISMS if m.vary}
     units |= {"a": "1/(mA s)", "b": "1/s", "lifetime": "h"}
+    terms = fit.terms_at(operation, current)
 
-    def rows(scales):
+    def rows(scales: Array) -> Array:
         losses = scaled_parts(scales, terms)
         rates = losses.rates(current)
-        a, b = losses.a, losses.b
         parts = [HOUR * rates[name] for name in units if name in rates]
-        return jnp.stack([*parts, a, b, 1 / (a * current + b) / HOUR])
+        return jnp.stack([*parts, losses.a, losses.b, 1 / _rate(scales, terms) / HOUR])
 
     values = np.asarray(jax.vmap(rows)(jnp.asarray(sample.draws)))
     ends = np.percentile(values, [50, 50 - 50 * probability, 50 + 50 * probability], axis=0)
@@ -209,7 +213,329 @@ def budget_intervals(
     )
 
 
-@shown
+def _rate(scales: Array, terms: LossTerms) -> Array:
+    """Loss rate at the mean current, 1/s."""
+    a, b = scaled_losses(scales, terms)
+    return a * terms.current + b
+
+
+# Means of neighbouring readings that stand for a decay that could be recorded.
+READINGS = 64
+
+
+class DecayCandidate(NamedTuple):
+    """A decay that could be recorded.
+
+    Attributes
+    ----------
+    operation : Operation
+        Settings and vacuum.
+    current : float
+        Current at the start, mA.
+    duration : float
+        s.
+    noise : float
+        Standard deviation of the mean of what is read in 1/64 of the duration, mA.
+    """
+
+    operation: Operation
+    current: float
+    duration: float
+    noise: float
+
+
+class Proposal(NamedTuple):
+    """A candidate and what it would bring.
+
+    Attributes
+    ----------
+    candidate : DecayCandidate
+        The decay.
+    information : float
+        Logarithm of the factor by which the volume of the scales' error ellipsoid shrinks.
+    errors : array, shape (4,)
+        Expected standard deviations of Touschek, bremsstrahlung, elastic, desorption afterwards.
+    """
+
+    candidate: DecayCandidate
+    information: float
+    errors: np.ndarray
+
+
+def _rows(fit: ScaleFit, candidate: DecayCandidate) -> np.ndarray:
+    """Readings of the candidate predicted by the scales, over its errors, shape (2, scales)."""
+    terms = fit.terms_at(candidate.operation, candidate.current)
+    a, b = map(float, scaled_losses(jnp.asarray(fit.vector), terms))
+    time = np.linspace(0.0, candidate.duration, READINGS)
+    beam = np.asarray(beam_at(time, candidate.current, a, b))
+    record = DecayRecord(time, beam, np.full(READINGS, candidate.noise))
+    mean, root = beam.mean(), information_root(Expansion.at(record, candidate.current, a, b))
+    summary = Summaries(mean, loss_parts(a, b, mean), root)
+    one = terms._replace(current=mean), summary
+    alone = jax.tree.map(lambda part: jnp.asarray(part)[None], one)
+    return fit.about(DecaySet(*alone, fit.decays.pressure_error))[2][0]
+
+
+def next_decays(fit: ScaleFit, candidates: Sequence[DecayCandidate]) -> tuple[Proposal, ...]:
+    """Rank decays by what they would tell about the scales.
+
+    Parameters
+    ----------
+    fit : ScaleFit
+        What is known so far.
+    candidates : sequence of DecayCandidate
+        What could be recorded.
+
+    Returns
+    -------
+    tuple of Proposal
+        The most informative first (D-optimality, in linear approximation).
+
+    Raises
+    ------
+    InputError
+        If there is no candidate, or one has no duration, current or noise.
+    """
+    if not candidates:
+        raise InputError("no candidate", "one decay or more to choose from")
+    for candidate in candidates:
+        if not min(candidate.current, candidate.duration, candidate.noise) > 0:
+            raise InputError(f"{candidate[1:]}", "current, duration and noise above zero")
+    # Of what is known of the scales so far their limits are a part, as a wide prior.
+    problem, one = fit.fit.problem, np.eye(fit.vector.size)
+    with_prior = np.isin(problem.names, [prior.name for prior in problem.priors])
+    known = Information(
+        fit.fit.dense_jacobian, np.ones(1), one, np.ones(len(one), bool), problem.lower,
+        problem.upper, with_prior=with_prior,
+    )  # fmt: skip
+    rows = np.array([_rows(fit, candidate) for candidate in candidates])
+    [before] = scores(known, np.zeros((1, *rows.shape[1:])), volume=True)
+    gains = 0.5 * (before - scores(known, rows, volume=True))
+    proposals = [
+        Proposal(candidate, float(gain), known.with_rows(own).error * fit.error_scale)
+        for candidate, own, gain in zip(candidates, rows, gains, strict=True)
+    ]
+    return tuple(sorted(proposals, key=lambda proposal: -proposal.information))
+
+
+class Limits(NamedTuple):
+    """Lowest and highest value allowed of each setting.
+
+    Attributes
+    ----------
+    rf_voltage : (float, float)
+        V.
+    scraper_y : (float, float)
+        Distance from the beam, m.
+    bunches : (float, float)
+        Number of bunches.
+    """
+
+    rf_voltage: tuple[float, float]
+    scraper_y: tuple[float, float]
+    bunches: tuple[float, float]
+
+
+class BestPoint(NamedTuple):
+    """The settings of the longest lifetime.
+
+    Attributes
+    ----------
+    rf_voltage : Quantity
+        V; its error is the spread of the best voltage over the posterior, at least the search's.
+    scraper_y, bunches : float
+        m, and number: always the upper limits.
+    lifetime : Quantity
+        Lifetime there, h; NaN where the decays do not tell it.
+    usual : Quantity
+        Lifetime at the machine's usual settings, h; NaN where the decays do not tell it.
+    message : str
+        What limits it.
+    """
+
+    rf_voltage: Quantity
+    scraper_y: float
+    bunches: float
+    lifetime: Quantity
+    usual: Quantity
+    message: str
+
+    @property
+    def status(self) -> Status:
+        """`unidentified` where the decays do not tell the lifetime there."""
+        return Status.unidentified if self.lifetime.error is None else Status.converged
+
+
+def _lifetime(fit: ScaleFit, sample: Posterior, operation: Operation, current: float) -> Quantity:
+    terms = fit.terms_at(operation, current)
+    if not fit.determines(lambda scales: _rate(scales, terms)):
+        return Quantity(math.nan, None, "h")
+    rates = jax.vmap(_rate, (0, None))(jnp.asarray(sample.draws), terms)
+    return quantity_of_draws(1 / np.asarray(rates) / HOUR, "h")
+
+
+def best_operating_point(
+    fit: ScaleFit, sample: Posterior, limits: Limits, current: float
+) -> BestPoint:
+    """Find the settings of the longest lifetime within limits.
+
+    Parameters
+    ----------
+    fit : ScaleFit
+        Fitted scales.
+    sample : Posterior
+        Their draws.
+    limits : Limits
+        What may be set.
+    current : float
+        Beam current to run at, mA.
+
+    Returns
+    -------
+    BestPoint
+        With the spread over the posterior.
+
+    Raises
+    ------
+    InputError
+        If a limit is empty, or no voltage within the limits stores a beam.
+
+    Notes
+    -----
+    More bunches and a wider scraper never shorten the lifetime (a_T falls with both bunch
+    population and length, the elastic cross section with the acceptance), so both sit at their
+    upper limits. The voltage has an inner optimum where the bucket outgrows the lattice's
+    acceptance: a grid, refined once around the best points of all draws.
+    """
+    for name, (low, high) in limits._asdict().items():
+        if not 0 < low <= high:
+            raise InputError(f"limits {low:g} to {high:g}", "0 < lower <= upper", column=name)
+    low, high = limits.rf_voltage
+    loss = float(fit.machine.ring.energy_loss)
+    if high <= loss:
+        expected = f"more than the loss of {loss:.6g} V a turn, or no beam is stored"
+        raise InputError(f"at most {high:.6g} V", expected, column="rf_voltage")
+    usual = fit.machine.operation
+    wide = usual._replace(scraper_y=limits.scraper_y[1], bunches=float(limits.bunches[1]))
+    low, draws = max(low, 1.01 * loss), sample.thinned()
+    # True voltages are looked at; what is set is a reading.
+    by = np.ones(len(draws)) if fit.voltages is None else draws[:, len(SCALES)]
+    ends = max(low * by.min(), 1.01 * loss), max(high, low) * by.max()
+    for _ in range(2):
+        at = np.linspace(*ends, VOLTAGES)
+        terms = jax.lax.map(
+            lambda v: loss_terms(fit.machine.ring, wide._replace(rf_voltage=v), current),
+            jnp.asarray(at),
+        )
+        true = at[np.argmin(jax.vmap(_rate, (0, None))(jnp.asarray(draws), terms), axis=1)]
+        step = at[1] - at[0]
+        ends = max(at[0], true.min() - step), min(at[-1], true.max() + step)
+    found = np.clip(true / by, low, max(high, low))
+    spread = quantity_of_draws(found, "V")
+    best, error = spread.value, math.hypot(spread.error, step / math.sqrt(12))
+    inside = low + step < best < high - step
+    reached = _lifetime(fit, sample, wide._replace(rf_voltage=best), current)
+    message = (
+        "The best RF voltage lies within its limits, where bucket and lattice acceptance meet."
+        if inside
+        else "The best RF voltage is at its limit: more range would help."
+    )
+    if reached.error is None:
+        message, inside = "The decays do not tell the lifetime at other settings: vary them.", False
+    return BestPoint(
+        rf_voltage=Quantity(best, error if inside else None, "V"),
+        scraper_y=limits.scraper_y[1],
+        bunches=limits.bunches[1],
+        lifetime=reached,
+        usual=_lifetime(fit, sample, usual, current),
+        message=message,
+    )
+
+
+class HeldBack(NamedTuple):
+    """A decay as the others predict it.
+
+    Attributes
+    ----------
+    name : str
+        Of the decay.
+    predicted : Quantity
+        Lifetime at its mean current, h, from a fit to the other decays; the error is that of the
+        scales and of this decay's pressure reading.
+    measured : Quantity
+        What the decay itself says, h.
+    pull : float
+        Predicted less measured loss rate, in standard errors of both.
+    """
+
+    name: str
+    predicted: Quantity
+    measured: Quantity
+    pull: float
+
+
+def predict_held_back(fit: ScaleFit) -> tuple[HeldBack, ...]:
+    """Predict the lifetime of each decay by a fit to all the others.
+
+    Parameters
+    ----------
+    fit : ScaleFit
+        Of all decays.
+
+    Returns
+    -------
+    tuple of HeldBack
+        In the order of the decays. Those that say nothing of the loss, and those without which the
+        scales do not predict them, are left out.
+
+    Notes
+    -----
+    Least squares linear about the fit: with H = J (JᵀJ)⁻¹ Jᵀ of one decay's whitened rows J and its
+    residuals r, those of the fit without it are (1 - H)⁻¹ r, with the covariance (1 - H)⁻¹: R. D.
+    Cook and S. Weisberg, Residuals and Influence in Regression (1982), section 2.2.
+
+    Examples
+    --------
+    >>> import beamfit
+    >>> from beamfit.lifetime.scales import fit_scales
+    >>> from beamfit.lifetime.study import Machine, study_record
+    >>> path = "lattices/spear3_2003.toml"
+    >>> machine = Machine(beamfit.read_ring(path), beamfit.read_operation(path))
+    >>> record = beamfit.read_decay_record("measurements/spear3_shift_simulated.csv")
+    >>> found = predict_held_back(fit_scales(study_record(record).decays, machine))
+    >>> print(found[3].predicted, "predicted,", found[3].measured, "measured")
+    9.82 ± 0.14 h predicted, 9.730669 ± 0.000098 h measured
+    """
+    measured = fit.decays.measured
+    weight, left, rows = fit.about(fit.decays)
+    found = []
+    for k, name in enumerate(fit.names):
+        own = rows[k] @ fit.spread.half
+        shares, turned = np.linalg.eigh(own @ own.T)
+        # A decay that alone tells of something is predicted by nothing else: infinitely badly.
+        rest = turned / np.maximum(1 - shares, np.finfo(float).eps) @ turned.T
+        root = np.asarray(measured.root[k])
+        if not np.any(root):
+            continue
+        back = np.linalg.inv(weight[k])
+        spread = back @ rest @ back.T * fit.error_scale**2
+        off = (back @ rest @ left[k])[1]
+        reading = np.linalg.inv(root)[1]
+        rate, error = measured.parts[k, 1], fit.error_scale * np.linalg.norm(reading)
+        by_others = np.sqrt(max(spread[1, 1] - error**2, 0.0))
+        if by_others < DETERMINED * rate:
+            both = lifetime_of(rate + off, by_others), lifetime_of(rate, error)
+            found.append(HeldBack(name, *both, float(off / np.sqrt(spread[1, 1]))))
+    return tuple(found)
+
+
+NOTE = (
+    "Scales multiply the ring file's first principles. Brackets are 68 % credible intervals. The "
+    "best point is sought within the range of settings seen."
+)
+
+
+@answer
 @dataclass(frozen=True, eq=False)
 class Shift:
     """Joint answer of many decays.
@@ -245,6 +571,39 @@ class Shift:
     network: NetworkFit | None = None
 
     @property
+    def status(self) -> Status:
+        """Status of the scales."""
+        return self.fit.status
+
+    @property
+    def message(self) -> str:
+        """Status of the scales."""
+        return self.fit.message
+
+    @property
+    def headline(self) -> str:
+        """Number of decays and the status, in a line."""
+        return f"{self._count} together: {cell(self.status)}"
+
+    @property
+    def _count(self) -> str:
+        count = len(self.fit.names)
+        return "1 decay" if count == 1 else f"{count} decays"
+
+    @property
+    def verdicts(self) -> list[tuple[str, Status, str]]:
+        """Name, status and sentence of each verdict."""
+        found = [(f"{self._count} together", self.status, self.message)]
+        if self.untold:
+            found.append(("loss budget", Status.unidentified, self.untold))
+        found.append((f"best lifetime {self.best.lifetime}", self.best.status, self.best.message))
+        if (moved := self.anomaly) is not None:
+            found.append(("second half against the first", moved.status, moved.message))
+        if self.network is not None:
+            found.append(("network", self.network.fit.status, self.network.fit.message))
+        return found
+
+    @property
     def untold(self) -> str:
         """The sentence on what the decays do not tell of the budget; empty if nothing."""
         names = [row.name for row in self.budget if not row.separable]
@@ -259,6 +618,50 @@ class Shift:
     def held_back(self) -> tuple[HeldBack, ...]:
         """Each decay as the others predict it."""
         return predict_held_back(self.fit)
+
+    def tables(self) -> tuple[Table, ...]:
+        """The scales and what follows from them, and the network."""
+        rows = [Row("status", [self.status]), *self._scale_rows(), *self._advice_rows()]
+        tables = [labelled("First principles fitted to", [self._count], rows, NOTE)]
+        if self.network is not None:
+            rows = self.network.rows(self.current)
+            tables.append(labelled("A network of the losses", [self._count], rows))
+        return tuple(tables)
+
+    def _scale_rows(self) -> list[Row]:
+        fit, rows = self.fit, []
+        for name, scale in fit.scales.items():
+            of, untold = "scale on the ring file", "not separable"
+            if name == VOLTAGE:
+                of, untold = "true over read", "not told: its prior's"
+            rows.append(Row(f"{name}, {of}", [untold if scale.error is None else scale], True))
+        worth = f"{fit.chi2:.4g}/{fit.dof}" if fit.dof > 0 else "not testable"
+        rows.append(Row("chi2/dof", [worth], True))
+        for row in self.budget:
+            said = str(row).removeprefix(f"{row.name}: ") if row.separable else "not determined"
+            rows.append(Row(f"{row.name} at {self.current:.4g} mA", [said], row.name == "lifetime"))
+        return rows
+
+    def _advice_rows(self) -> list[Row]:
+        best, rows = self.best, []
+        volts, error = best.rf_voltage.value / 1e3, best.rf_voltage.error
+        limit = f"{volts:.6g} kV, at its limit"
+        told = limit if error is None else Quantity(volts, error / 1e3, "kV")
+        rows.append(Row("best RF voltage", [told], True))
+        others = f"{1e3 * best.scraper_y:.4g} mm, {best.bunches:.6g}"
+        rows.append(Row("best scraper and bunches", [others], True))
+        rows.append(Row("lifetime there", [best.lifetime], True))
+        if self.held_back:
+            off = np.abs([one.pull for one in self.held_back])
+            said = f"{sum(off < 1)} of {off.size} within 1, {sum(off < 2)} within 2 errors"
+            rows.append(Row("each decay predicted by the others", [said]))
+        for number, proposal in enumerate(self.proposals, 1):
+            asked = proposal.candidate
+            at, scraper, bunches = map(float, asked.operation[:3])
+            said = f"{at / 1e3:.6g} kV, {1e3 * scraper:.4g} mm, {bunches:.6g} bunches, "
+            said += f"{asked.current:.4g} mA (information {proposal.information:.3g})"
+            rows.append(Row(f"next decay, choice {number}", [said], number == 1))
+        return rows
 
     def to_json(self) -> dict[str, Any]:
         """Return the answer as JSON's types, in SI, mA and h."""
@@ -324,10 +727,9 @@ def study_shift(
     """
     fit = fit_scales(decays, machine, priors=priors)
     sample = fit.sample(seed=seed)
-    current = max(decay.fit.mean_current for decay in decays)
-    settings = [operation_during(decay.segment, machine) for decay in decays]
+    settings, currents = zip(*settings_of(decays, machine), strict=True)
     seen = [[float(getattr(setting, name)) for setting in settings] for name in Limits._fields]
-    limits = Limits(*((min(values), max(values)) for values in seen))
+    limits, current = Limits(*((min(values), max(values)) for values in seen)), max(currents)
     corrected = fit if network is Network.correction else None
     return Shift(
         fit=fit,
@@ -346,7 +748,9 @@ def _candidates(
 ) -> list[DecayCandidate]:
     """The corners of what was seen, as long and as noisy as the decays were."""
     duration = float(np.median([d.segment.span for d in decays]))
-    noise = float(np.median([d.fit.rms_residual / np.sqrt(len(d.segment) / 64) for d in decays]))
+    noise = float(
+        np.median([d.fit.rms_residual / np.sqrt(len(d.segment) / READINGS) for d in decays])
+    )
     lowest = min(decay.fit.mean_current for decay in decays)
     corners = itertools.product(*(sorted(set(pair)) for pair in (*limits, (lowest, current))))
     return [
@@ -371,89 +775,3 @@ def _anomaly(
     if not np.isfinite(reference.covariance).all():
         return None
     return find_anomaly(reference, decays[half:])
-
-
-class HeldBack(NamedTuple):
-    """A decay as the others predict it.
-
-    Attributes
-    ----------
-    name : str
-        Of the decay.
-    predicted : Quantity
-        Lifetime at its mean current, h, from a fit to the other decays; the error is that of the
-        scales and of this decay's pressure reading.
-    measured : Quantity
-        What the decay itself says, h.
-    pull : float
-        Predicted less measured loss rate, in standard errors of both.
-    """
-
-    name: str
-    predicted: Quantity
-    measured: Quantity
-    pull: float
-
-
-# A decay that leaves less than this of one to the others is known by nothing else.
-LEAST = 1e-6
-
-
-def predict_held_back(fit: ScaleFit) -> tuple[HeldBack, ...]:
-    """Predict the lifetime of each decay by a fit to all the others.
-
-    Parameters
-    ----------
-    fit : ScaleFit
-        Of all decays.
-
-    Returns
-    -------
-    tuple of HeldBack
-        In the order of the decays. Those that say nothing of the loss, and those without which the
-        scales do not predict them, are left out.
-
-    Notes
-    -----
-    Least squares linear about the fit: with H = J (JᵀJ)⁻¹ Jᵀ of one decay's whitened rows J and its
-    residuals r, those of the fit without it are (1 - H)⁻¹ r, with the covariance (1 - H)⁻¹: R. D.
-    Cook and S. Weisberg, Residuals and Influence in Regression (1982), section 2.2.
-
-    Examples
-    --------
-    >>> import beamfit
-    >>> from beamfit.lifetime.scales import fit_scales
-    >>> from beamfit.lifetime.study import Machine, study_record
-    >>> path = "lattices/spear3_2003.toml"
-    >>> machine = Machine(beamfit.read_ring(path), beamfit.read_operation(path))
-    >>> record = beamfit.read_decay_record("measurements/spear3_shift_simulated.csv")
-    >>> found = predict_held_back(fit_scales(study_record(record).decays, machine))
-    >>> print(found[3].predicted, "predicted,", found[3].measured, "measured")
-    9.82 ± 0.14 h predicted, 9.730669 ± 0.000098 h measured
-    """
-    measured = fit.measured
-    weight, left, rows = fit.about(fit.terms, measured)
-    half = spread_of_scales(fit.fit).half
-    found = []
-    for k, name in enumerate(fit.names):
-        root, own = np.asarray(measured.root[k]), rows[k] @ half
-        rest = np.eye(2) - own @ own.T
-        if not np.any(root) or np.linalg.eigvalsh(rest)[0] < LEAST:
-            continue
-        back = np.linalg.inv(weight[k])
-        whole = back @ np.linalg.inv(rest) @ back.T * fit.error_scale**2
-        off = (back @ np.linalg.solve(rest, left[k]))[1]
-        reading = np.linalg.inv(root)[1]
-        rate, error = measured.parts[k, 1], fit.error_scale * np.linalg.norm(reading)
-        spread = np.sqrt(max(whole[1, 1] - error**2, 0.0))
-        if not spread < DETERMINED * rate:
-            continue
-        found.append(
-            HeldBack(
-                name,
-                lifetime_of(rate + off, spread),
-                lifetime_of(rate, error),
-                float(off / np.sqrt(whole[1, 1])),
-            )
-        )
-    return tuple(found)

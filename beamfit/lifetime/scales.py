@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
@@ -23,7 +24,7 @@ from beamfit.lifetime.expansion import DETERMINED, LEVEL, LOSS, QUADRATIC, Expan
 from beamfit.lifetime.fit import DecayFit
 from beamfit.lifetime.mechanisms import SCALES, LossTerms, loss_terms, scaled_losses
 from beamfit.lifetime.ring import Operation
-from beamfit.lifetime.study import Decay, Machine, operation_during
+from beamfit.lifetime.study import Decay, Machine, settings_of
 from beamfit.quantity import Quantity, Status
 from beamfit.statistics import POOR_FIT, chi2_probability
 
@@ -83,15 +84,33 @@ def _root(decay: Decay, parts: np.ndarray) -> np.ndarray:
     return _with_monitor(information_root(about, scale * fit.inflation), about)
 
 
+def widened(root: Array, changes: Array) -> Array:
+    """Root of the information where the parts also err by independent changes.
+
+    Parameters
+    ----------
+    root : array, shape (..., 2, 2)
+        As of `Summaries`.
+    changes : array, shape (..., 2, k)
+        By how much each of k errors moves the parts, one standard deviation.
+
+    Returns
+    -------
+    array, shape (..., 2, 2)
+        W with WᵀW = Rᵀ (1 + G Gᵀ)⁻¹ R, G = R times the changes: the errors integrated out.
+    """
+    own = root @ changes
+    whole = jnp.linalg.cholesky(jnp.eye(2) + own @ jnp.swapaxes(own, -1, -2))
+    return jnp.linalg.solve(whole, root)
+
+
 def _with_monitor(root: np.ndarray, about: Expansion) -> np.ndarray:
     """The root with what is stated of the monitor added to the covariance of the parts."""
-    changes = about.pieces.monitor_changes
-    if not changes:
+    moved = [about.moved(change) for change in about.pieces.monitor_changes]
+    if not moved:
         return root
-    moved = [about.moved(change) for change in changes]
-    spread = root @ np.array([[m.a * about.pieces.units[1], m.rate_mean] for m in moved]).T
-    whole = np.linalg.cholesky(np.eye(2) + spread @ spread.T)
-    return np.linalg.qr(np.linalg.solve(whole, root), mode="r")
+    changes = np.array([[m.a * about.pieces.units[1], m.rate_mean] for m in moved]).T
+    return np.linalg.qr(widened(root, changes), mode="r")
 
 
 def _together(fit: DecayFit, rate: float) -> np.ndarray:
@@ -100,12 +119,12 @@ def _together(fit: DecayFit, rate: float) -> np.ndarray:
     return np.diag(1 / (rate * np.array([np.inf if share is None else share, error])))
 
 
-def summarise(decays: tuple[Decay, ...]) -> Summaries:
+def summarise(decays: Sequence[Decay]) -> Summaries:
     """Reduce decays to what they say of the loss.
 
     Parameters
     ----------
-    decays : tuple of Decay
+    decays : sequence of Decay
         Fitted decays. One without a finite fit or without noise says nothing: it gets no
         information.
 
@@ -149,13 +168,64 @@ def summarise(decays: tuple[Decay, ...]) -> Summaries:
 PRESSURE_ERROR = 0.05
 RECORD = "decays"
 LARGEST = 1e3
-# The scale of the RF voltage is sought within so many errors of its prior, and losses computed at
-# each of them.
+# The scale of the RF voltage, fitted where a prior says how well its reading is calibrated.
+VOLTAGE = "rf_voltage"
+# It is sought within so many errors of that prior, and losses computed at each of them.
 WIDEST = 3
-# A prior that data narrow by less than this share decides by itself.
-NARROWED = 0.2
-# How far walkers begin from scales that the decays do not tell.
-WIDTH = 0.3
+
+
+class DecaySet(NamedTuple):
+    """Many decays beside first principles.
+
+    Attributes
+    ----------
+    terms : LossTerms
+        First principles at the settings of each decay, each part of shape (n,).
+    measured : Summaries
+        What each decay says.
+    pressure_error : float
+        Relative error of the pressure readings, of each record independently.
+    """
+
+    terms: LossTerms
+    measured: Summaries
+    pressure_error: Array
+
+    @classmethod
+    def of(
+        cls,
+        decays: Sequence[Decay],
+        machine: Machine,
+        pressure_error: float = PRESSURE_ERROR,
+        voltages: np.ndarray | None = None,
+    ) -> DecaySet:
+        """Reduce decays; `voltages` as of `LossTerms`."""
+        settings = settings_of(decays, machine)
+        rows = [loss_terms(machine.ring, *setting, voltages) for setting in settings]
+        terms = jax.tree.map(lambda *parts: jnp.stack(parts), *rows)
+        return cls(terms, summarise(decays), pressure_error)
+
+    def parts(self, scales: Array, factor: Array) -> Array:
+        """a I and a I + b of scaled first principles, where the pressure is so many times read."""
+        return loss_parts(*scaled_losses(scales, self.terms, factor), self.terms.current)
+
+
+@jax.jit
+def whitener(scales: Array, decays: DecaySet) -> Array:
+    """Roots of the information, each decay's pressure factor integrated out; shape (n, 2, 2)."""
+    ones = jnp.ones_like(decays.terms.current)
+    _, slope = jax.jvp(lambda factor: decays.parts(scales, factor), (ones,), (ones,))
+    return widened(decays.measured.root, decays.pressure_error * slope[..., None])
+
+
+@jax.jit
+def pulls(scales: Array, decays: DecaySet, weight: Array) -> Array:
+    """Model minus measurement in standard errors, shape (n, 2); `weight` is that of `whitener`."""
+    off = decays.parts(scales, jnp.ones_like(decays.terms.current)) - decays.measured.parts
+    return jnp.einsum("nij,nj->ni", weight, off)
+
+
+_by_scales = jax.jit(jax.jacfwd(pulls))
 
 
 @shown
@@ -165,44 +235,19 @@ class ScaleFit:
 
     Parameters
     ----------
-    status : Status
-        `converged`; `poor_fit` if chi² is improbable; `unidentified` if a mechanism is not
-        separable from the others; `not_converged` if the search failed.
-    message : str
-        Cause and remedy.
-    scales : mapping of str to Quantity
-        Factors on the ring file's values: touschek, bremsstrahlung, elastic, desorption, also as
-        attributes; without an error where the decays do not separate the mechanism. rf_voltage,
-        true over stated, where it has a prior.
     fit : Fit
         Of the core, with the priors among its parts.
-    dof : int
-        Two numbers a decay, less the scales.
-    covariance : array, shape (n, n)
-        Linearised, not enlarged, of all scales whether separable or not; its entries are infinite
-        along directions that nothing determines.
-    pressure_error : float
-        Relative error of the pressure readings, of each record independently.
     machine : Machine
         The ring and its usual operation.
-    terms : LossTerms
-        First principles at the settings of each decay.
-    measured : Summaries
-        What each decay says.
+    decays : DecaySet
+        What it was fitted to.
     names : tuple of str
         Names of the decays.
     """
 
-    status: Status
-    message: str
-    scales: Mapping[str, Quantity]
     fit: Fit
-    dof: int
-    covariance: np.ndarray
-    pressure_error: float
     machine: Machine
-    terms: LossTerms
-    measured: Summaries
+    decays: DecaySet
     names: tuple[str, ...]
 
     @property
@@ -216,18 +261,88 @@ class ScaleFit:
         return self.fit.group(RECORD).chi2
 
     @property
+    def dof(self) -> int:
+        """Two numbers a decay, less the scales."""
+        told = np.any(np.asarray(self.decays.measured.root) != 0, axis=-1)
+        return int(np.sum(told)) - len(SCALES)
+
+    @property
     def error_scale(self) -> float:
         """sqrt(chi²/dof) where above 1."""
-        return error_scale(self.chi2, self.dof)
+        return math.sqrt(max(1.0, self.chi2 / self.dof)) if self.dof > 0 else 1.0
+
+    @property
+    def improbable(self) -> bool:
+        """True if chi² is improbable."""
+        return self.dof > 0 and chi2_probability(self.chi2, self.dof) < POOR_FIT
+
+    @cached_property
+    def spread(self) -> Spread:
+        """Spread of the scales without their bounds, which stand for nothing known."""
+        unbounded = np.full(self.vector.shape, np.inf)
+        return spread_of(self.fit.jacobian, -unbounded, unbounded)
+
+    @property
+    def covariance(self) -> np.ndarray:
+        """Linearised, not enlarged, of all scales whether separable or not, shape (n, n); infinite
+        along directions that nothing determines.
+        """
+        blind = ~np.isfinite(self.spread.errors)
+        return np.where(np.outer(blind, blind), np.inf, self.spread.seen)
+
+    @cached_property
+    def scales(self) -> dict[str, Quantity]:
+        """Factors on the ring file's values: touschek, bremsstrahlung, elastic, desorption, also as
+        attributes; without an error where the decays do not separate the mechanism. rf_voltage,
+        true over stated, where it has a prior.
+        """
+        priors = {prior.name: prior.sd for prior in self.fit.problem.priors}
+        found = {}
+        numbers = zip(self.fit.problem.names, self.vector, self.spread.errors, strict=True)
+        for name, value, raw in numbers:
+            quantity = Quantity(float(value), self.error_scale * float(raw), "1", float(raw))
+            # Against 1 where the value is smaller: a mechanism found absent, 0.0 ± 0.1, is
+            # separable. A voltage that its prior tells better than the decays is the prior's.
+            known = quantity.error < DETERMINED * max(value, 1.0)
+            if name == VOLTAGE:
+                known = 2 * raw**2 < priors[name] ** 2
+            found[name] = quantity if known else quantity.open()
+        return found
+
+    @cached_property
+    def finding(self) -> Finding:
+        """Status and sentences on the scales."""
+        found, voltage = judge(self, RULES), self.scales.get(VOLTAGE)
+        if voltage is None or voltage.error is not None:
+            return found
+        said = f"{found.cause} The decays do not tell the scale of the RF voltage: its prior does."
+        return Finding(found.status, said)
+
+    @property
+    def status(self) -> Status:
+        """`converged`; `poor_fit` if chi² is improbable; `unidentified` if a mechanism is not
+        separable from the others; `not_converged` if the search failed.
+        """
+        return self.finding.status
+
+    @property
+    def message(self) -> str:
+        """Cause and remedy."""
+        return self.finding.cause
+
+    @property
+    def voltages(self) -> np.ndarray | None:
+        """True over stated RF voltages at which losses are computed, if its scale is free."""
+        known = self.decays.terms.voltages
+        return None if known is None else np.asarray(known)[0]
 
     def terms_at(self, operation: Operation, current: float) -> LossTerms:
         """First principles at a setting, for these scales."""
         return loss_terms(self.machine.ring, operation, current, self.voltages)
 
-    @property
-    def voltages(self) -> np.ndarray | None:
-        """True over stated RF voltages at which losses are computed, if its scale is free."""
-        return None if self.terms.voltages is None else np.asarray(self.terms.voltages[0])
+    def losses_at(self, operation: Operation, current: float) -> tuple[Array, Array]:
+        """a, 1/(mA s), and b, 1/s, of scaled first principles at a setting."""
+        return scaled_losses(jnp.asarray(self.vector), self.terms_at(operation, current))
 
     def determines(self, quantity: Callable[[Array], Array]) -> np.ndarray:
         """Tell if decays and priors, and not the limits of the scales alone, determine quantities.
@@ -238,14 +353,14 @@ class ScaleFit:
         vector = jnp.asarray(self.vector)
         usual = jnp.ones_like(vector)
         size = np.maximum(np.abs(quantity(vector)), np.abs(quantity(usual)))
-        error = spread_of_scales(self.fit).error(np.asarray(jax.jacfwd(quantity)(vector)))
+        error = self.spread.error(np.asarray(jax.jacfwd(quantity)(vector)))
         return self.error_scale * error < DETERMINED * size
 
-    def about(self, terms: LossTerms, measured: Summaries) -> tuple[np.ndarray, ...]:
+    def about(self, decays: DecaySet) -> tuple[np.ndarray, ...]:
         """Expand decays: their weights, their `pulls`, and the slopes of these by the scales."""
         vector = jnp.asarray(self.vector)
-        weight = whitener(vector, terms, measured, self.pressure_error)
-        given = vector, terms, measured, weight
+        weight = whitener(vector, decays)
+        given = vector, decays, weight
         return tuple(map(np.asarray, (weight, pulls(*given), _by_scales(*given))))
 
     def __str__(self) -> str:
@@ -254,7 +369,7 @@ class ScaleFit:
         return "\n".join([*rows, f"  chi²/dof {self.chi2:.4g}/{self.dof}"])
 
     def __getattr__(self, name: str) -> Quantity:
-        if name in (*SCALES, VOLTAGE) and name in vars(self).get("scales", {}):
+        if name in (*SCALES, VOLTAGE) and name in self.scales:
             return self.scales[name]
         raise AttributeError(f"a ScaleFit has no '{name}'")
 
@@ -276,16 +391,15 @@ class ScaleFit:
         """
         from beamfit.sampling.ensemble import draw
 
-        study = (self.terms, self.measured, self.pressure_error, self.error_scale)
-        record = Record(RECORD, _pulls, study, np.zeros(self.measured.parts.shape), 1.0)
+        data = (self.decays, self.error_scale)
+        record = Record(RECORD, _pulls, data, np.zeros(self.decays.measured.parts.shape), 1.0)
         stated = Statement(
-            data=study,
+            data=data,
             log_volume=_log_volume,
             units=dict.fromkeys(self.scales, "1"),
-            width=dict.fromkeys(SCALES, WIDTH),
             priors_own=[name for name, scale in self.scales.items() if scale.error is None],
         )
-        optimum = Optimum(self.vector, Finding(self.status, self.message), [1.0], [True])
+        optimum = Optimum(self.vector, self.finding, [1.0], [True])
         problem = replace(self.fit.problem, records=[record])
         return draw(target_of(problem, optimum, stated), seed=seed, **options)
 
@@ -294,46 +408,6 @@ class ScaleFit:
         verdict = {"status": self.status, "message": self.message}
         rest = {"chi2": self.chi2, "dof": self.dof, "decays": self.names}
         return json_of({**verdict, **self.scales, **rest})
-
-
-def stacked_terms(
-    decays: Sequence[Decay], machine: Machine, voltages: np.ndarray | None = None
-) -> LossTerms:
-    """First principles at the settings of each decay, each of shape (n,); `voltages` as of
-    `LossTerms`.
-    """
-    settings = [(operation_during(d.segment, machine), d.fit.mean_current) for d in decays]
-    rows = [loss_terms(machine.ring, *setting, voltages) for setting in settings]
-    return jax.tree.map(lambda *parts: jnp.stack(parts), *rows)
-
-
-def _parts(scales: Array, terms: LossTerms, factor: Array) -> Array:
-    return loss_parts(*scaled_losses(scales, terms, factor), terms.current)
-
-
-@jax.jit
-def whitener(scales: Array, terms: LossTerms, measured: Summaries, pressure_error: Array) -> Array:
-    """W of shape (n, 2, 2) with WᵀW = Rᵀ (1 + g gᵀ)⁻¹ R, g = R ∂(parts)/∂(factor) times the
-    relative pressure error: each decay's pressure factor integrated out (Sherman and Morrison).
-    """
-    ones = jnp.ones_like(terms.current)
-    _, slope = jax.jvp(lambda factor: _parts(scales, terms, factor), (ones,), (ones,))
-    g = jnp.einsum("nij,nj->ni", measured.root, slope * pressure_error)
-    square = jnp.sum(g**2, -1)
-    # (1 + g gᵀ)^(-1/2) = 1 - g gᵀ (1 - 1/sqrt(1 + g²))/g², which is 1/(s (1 + s)) of s² = 1 + g².
-    root = jnp.sqrt(1 + square)
-    shrink = jnp.eye(2) - g[:, :, None] * g[:, None, :] / (root * (1 + root))[:, None, None]
-    return shrink @ measured.root
-
-
-@jax.jit
-def pulls(scales: Array, terms: LossTerms, measured: Summaries, weight: Array) -> Array:
-    """Model minus measurement in standard errors, shape (n, 2); `weight` is that of `whitener`."""
-    off = _parts(scales, terms, jnp.ones_like(terms.current)) - measured.parts
-    return jnp.einsum("nij,nj->ni", weight, off)
-
-
-_by_scales = jax.jit(jax.jacfwd(pulls))
 
 
 def _checked(priors: Mapping[str, tuple[float, float]]) -> list[Prior]:
@@ -353,7 +427,7 @@ def _voltages(
         return None
     mean, error = prior
     found = mean + error * np.arange(-WIDEST, WIDEST + 1)
-    lowest = min(float(operation_during(d.segment, machine).rf_voltage) for d in decays)
+    lowest = min(float(setting.rf_voltage) for setting, _ in settings_of(decays, machine))
     if not found[0] * lowest > float(machine.ring.energy_loss):
         expected = "an error at three times of which every decay is still stored"
         raise InputError(f"rf_voltage = {mean:g} ± {error:g}", expected)
@@ -403,148 +477,82 @@ def fit_scales(
         raise InputError("no decay", "one or more; several settings separate the mechanisms")
     priors = priors or {}
     known, voltages = _checked(priors), _voltages(decays, machine, priors.get(VOLTAGE))
-    terms, measured = stacked_terms(decays, machine, voltages), summarise(tuple(decays))
-    nothing = np.zeros(measured.parts.shape)
+    together = DecaySet.of(decays, machine, pressure_error, voltages)
+    nothing = np.zeros(together.measured.parts.shape)
     free = [Free(name, 0.0, LARGEST) for name in SCALES]
     free += [] if voltages is None else [Free(VOLTAGE, voltages[0], voltages[-1])]
     names = (*SCALES, VOLTAGE)[: len(free)]
     vector = np.array([priors.get(name, (1.0, 0.0))[0] for name in names])
     for _ in range(5):  # the weight moves little with the scales: it settles in two or three
-        weight = whitener(vector, terms, measured, pressure_error)
-        record = Record(RECORD, _weighted, (terms, measured, weight), nothing, 1.0)
+        weight = whitener(vector, together)
+        record = Record(RECORD, _weighted, (together, weight), nothing, 1.0)
         found = solve(Problem(dict(zip(names, vector, strict=True)), free, [record], known))
         vector = found.theta
-    seen = int(np.sum(np.any(np.asarray(measured.root) != 0, axis=-1)))
-    spread, dof = spread_of_scales(found), seen - len(SCALES)
-    blind = ~np.isfinite(spread.error(np.eye(vector.size)))
-    covariance = np.where(np.outer(blind, blind), np.inf, spread.seen)
-    chi2 = found.group(RECORD).chi2
-    values = zip(names, vector, np.sqrt(np.diag(covariance)), strict=True)
-    scale = error_scale(chi2, dof)
-    scales = {name: _scale(name, *told, scale, priors) for name, *told in values}
-    ended = found.status not in (Status.not_converged, Status.not_finite)
-    verdict = finding_of_scales(ScaleEvidence(scales, chi2, dof, ended, len(decays)))
-    return ScaleFit(
-        verdict.status, verdict.cause, scales, found, dof, covariance, pressure_error, machine,
-        terms, measured, tuple(d.fit.record for d in decays),
-    )  # fmt: skip
-
-
-def error_scale(chi2: float, dof: int) -> float:
-    """sqrt(chi²/dof) where above 1."""
-    return math.sqrt(max(1.0, chi2 / dof)) if dof > 0 else 1.0
-
-
-def spread_of_scales(found: Fit) -> Spread:
-    """Spread of the scales without their bounds, which stand for nothing known."""
-    unbounded = np.full(found.theta.shape, np.inf)
-    return spread_of(found.jacobian, -unbounded, unbounded)
+    return ScaleFit(found, machine, together, tuple(d.fit.record for d in decays))
 
 
 def _vector(model: Mapping[str, Array]) -> Array:
     return jnp.stack([model[name] for name in (*SCALES, VOLTAGE) if name in model])
 
 
-def _weighted(model: Mapping[str, Array], data: tuple[LossTerms, Summaries, Array]) -> Array:
+def _weighted(model: Mapping[str, Array], data: tuple[DecaySet, Array]) -> Array:
     """Model minus measurement, in standard errors taken at the last scales."""
     return pulls(_vector(model), *data)
 
 
-def _scale(
-    name: str, value: float, raw: float, scale: float, priors: Mapping[str, tuple[float, float]]
-) -> Quantity:
-    """A scale, without an error where the decays do not tell it."""
-    # Against 1 where the value is smaller: a mechanism found absent, 0.0 ± 0.1, is separable.
-    known = scale * raw < DETERMINED * max(value, 1.0)
-    if name == VOLTAGE:
-        known = raw < (1 - NARROWED) * priors[name][1]
-    found = Quantity(float(value), scale * float(raw), "1", float(raw))
-    return found if known else found.open()
+def _pulls(scales: Mapping[str, Array], data: tuple[DecaySet, Array]) -> Array:
+    """Model minus measurement in standard errors, which move with the scales; the second of the
+    data is a factor on all errors.
+    """
+    decays, factor = data
+    vector = _vector(scales)
+    return pulls(vector, decays, whitener(vector, decays)) / factor
 
 
-# First principles, the decays, the relative error of pressure readings, the factor on errors.
-Study = tuple[LossTerms, Summaries, Array, Array]
-
-
-def _whitened(scales: Mapping[str, Array], study: Study) -> tuple[Array, Array]:
-    terms, measured, pressure_error, _ = study
-    weight = whitener(_vector(scales), terms, measured, pressure_error)
-    return weight, pulls(_vector(scales), terms, measured, weight)
-
-
-def _pulls(scales: Mapping[str, Array], study: Study) -> Array:
-    """Model minus measurement in standard errors, which move with the scales."""
-    return _whitened(scales, study)[1] / study[3]
-
-
-def _log_volume(scales: Mapping[str, Array], study: Study) -> Array:
+def _log_volume(scales: Mapping[str, Array], data: tuple[DecaySet, Array]) -> Array:
     """det(W)/det(R): the normalisation, which changes with the scales as the errors do."""
-    volume = jnp.abs(jnp.linalg.det(_whitened(scales, study)[0]))
-    known = jnp.abs(jnp.linalg.det(study[1].root)) > 0
+    decays, _ = data
+    volume = jnp.abs(jnp.linalg.det(whitener(_vector(scales), decays)))
+    known = jnp.abs(jnp.linalg.det(decays.measured.root)) > 0
     return jnp.sum(jnp.where(known, jnp.log(jnp.where(known, volume, 1.0)), 0.0))
 
 
-# The scale of the RF voltage, fitted where a prior says how well its reading is calibrated.
-VOLTAGE = "rf_voltage"
-
-
-class ScaleEvidence(NamedTuple):
-    """A fit of scales as the rules see it."""
-
-    scales: Mapping[str, Quantity]
-    chi2: float
-    dof: int
-    ended: bool
-    decays: int
-
-    @property
-    def improbable(self) -> bool:
-        """True if chi² is improbable."""
-        return self.dof > 0 and chi2_probability(self.chi2, self.dof) < POOR_FIT
-
-
-def _lost(e: ScaleEvidence) -> Finding | None:
+def _search_failed(found: ScaleFit) -> Finding | None:
+    if found.fit.status not in (Status.not_converged, Status.not_finite):
+        return None
     said = "The search for the scales did not end: look at the records."
-    return None if e.ended else Finding(Status.not_converged, said)
+    return Finding(Status.not_converged, said)
 
 
-def _blind(e: ScaleEvidence) -> Finding | None:
-    names = [name for name, scale in e.scales.items() if scale.error is None and name in SCALES]
+def _not_separable(found: ScaleFit) -> Finding | None:
+    names = [name for name in SCALES if found.scales[name].error is None]
     if not names:
         return None
-    many = "one decay" if e.decays == 1 else f"{e.decays} decays"
+    count = len(found.names)
+    many = "one decay" if count == 1 else f"{count} decays"
     advice = ", ".join(dict.fromkeys(SCALES[name] for name in names))
     more = ""
-    if e.improbable:
-        more = f" First principles miss something besides: chi²/dof is {e.chi2 / e.dof:.3g}."
+    if found.improbable:
+        worth = f"chi²/dof is {found.chi2 / found.dof:.3g}"
+        more = f" First principles miss something besides: {worth}."
     return Finding(
         Status.unidentified,
         f"{' and '.join(names)} not separable by {many}: vary {advice}, or give a prior.{more}",
     )
 
 
-def _improbable(e: ScaleEvidence) -> Finding | None:
-    if not e.improbable:
+def _improbable(found: ScaleFit) -> Finding | None:
+    if not found.improbable:
         return None
     return Finding(
         Status.poor_fit,
-        f"chi²/dof is {e.chi2 / e.dof:.3g}, improbable for first principles with these scales; "
-        "the errors are enlarged to match: look for an anomaly, or correct by a network.",
+        f"chi²/dof is {found.chi2 / found.dof:.3g}, improbable for first principles with these "
+        "scales; the errors are enlarged to match: look for an anomaly, or correct by a network.",
     )
 
 
-def _separable(e: ScaleEvidence) -> Finding:
+def _separable(found: ScaleFit) -> Finding:
     return Finding(Status.converged, "Every mechanism is separable.")
 
 
-RULES = (_lost, _blind, _improbable, _separable)
-
-
-def finding_of_scales(evidence: ScaleEvidence) -> Finding:
-    """Status and sentences on the scales."""
-    found = judge(evidence, RULES)
-    voltage = evidence.scales.get(VOLTAGE)
-    if voltage is None or voltage.error is not None:
-        return found
-    said = f"{found.cause} The decays do not tell the scale of the RF voltage: its prior does."
-    return Finding(found.status, said)
+RULES = (_search_failed, _not_separable, _improbable, _separable)

@@ -13,7 +13,6 @@ import numpy as np
 
 from beamfit.answer import answer, json_of, shown
 from beamfit.errors import InputError, expect
-from beamfit.lifetime.bunch import stored_bunch
 from beamfit.lifetime.cycles import (
     FEWEST_CYCLES,
     MOST,
@@ -39,7 +38,7 @@ from beamfit.lifetime.pieces import (
     without_repeats,
 )
 from beamfit.lifetime.record import DecayRecord
-from beamfit.lifetime.ring import MeasuredLength, Operation, Ring, unstored
+from beamfit.lifetime.ring import MeasuredLength, Operation, Ring, stored_bunch, unstored
 from beamfit.lifetime.systematics import DecayChecks, Systematic, check_decay, systematics
 from beamfit.quantity import HOUR, Quantity, Status
 
@@ -48,14 +47,12 @@ CHANGED = 0.01
 SETTINGS = ("rf_voltage", "scraper_y", "bunches")
 # Refills of so many standard deviations of the means beside them are none of them missed.
 SEEN = 6.0
-# Scatter, over the length squared, of the parabola t² beside its line, halved: the bend of a decay.
-BEND = 1 / 12 / math.sqrt(5)
 # Noise with a memory is taken for so many times what neighbouring readings scatter by.
 OWN = 3.0
 # Probability of refills faster than the record is read from which cycles tell no lifetime.
 UNSURE = 0.05
-# Points of a picture, and cycles that make a point of a course at least.
-POINTS, FEWEST_IN_PART = 60, 10
+# Cycles that make a point of a course at least.
+FEWEST_IN_PART = 10
 
 
 @shown
@@ -262,7 +259,8 @@ def stands_alone(cycle: DecayRecord, fit: DecayFit) -> bool:
     if fit.status is Status.poor_fit:
         noise = min(noise, OWN * noise_of(cycle.time, cycle.current))
     loss = cycle.span / HOUR / fit.lifetime_mean.value
-    bend = float(cycle.current.mean()) * loss**2 * BEND / 2 * math.sqrt(len(cycle))
+    # The parabola t²/2 scatters about its line by its length squared over 24 sqrt(5).
+    bend = float(cycle.current.mean()) * loss**2 / 24 * math.sqrt(len(cycle) / 5)
     return noise * math.sqrt(max(len(cycle) / MOST, 1.0)) < SEPARABLE * bend
 
 
@@ -304,29 +302,6 @@ def _opened(fit: DecayFit, cause: str) -> DecayFit:
     return replace(fit, status=Status.unidentified, message=cause + fit.message, exact=bare, **bare)
 
 
-def cycle_lifetimes(fit: DecayFit) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Time, s, lifetime and its error, h, of up to 60 parts of a pooled fit; for a picture.
-
-    The slope of the residuals of its cycles is what the loss rate of a part departs by.
-    """
-    record, first = fit.readings, fit.first
-    lengths = np.diff(first, append=len(record))
-    columns = np.column_stack([record.time, fit.residuals])
-    mean = np.add.reduceat(columns, first) / lengths[:, None]
-    since, residual = (columns - np.repeat(mean, lengths, axis=0)).T
-    part = first[np.linspace(0, first.size, min(first.size, POINTS), endpoint=False).astype(int)]
-    count = np.diff(part, append=len(record))
-    at, level = (np.add.reduceat(v, part) / count for v in (record.time, record.current))
-    squares = np.add.reduceat(since**2, part)
-    rate = np.add.reduceat(since * residual, part) / squares / level
-    usual = np.array([of.lifetime.value for of in fit.course] or [fit.lifetime_mean.value])
-    which = np.searchsorted([of.start for of in fit.course][1:], at - record.time[0])
-    rate += fit.a.value * (level - fit.mean_current) + 1 / usual[which] / HOUR
-    error = fit.rms_residual / np.sqrt(squares) / level
-    seen = rate > 0
-    return at[seen], 1 / rate[seen] / HOUR, (error / rate**2)[seen] / HOUR
-
-
 @dataclass(frozen=True, eq=False)
 class Decay:
     """One decay of a record, or many cycles of it together.
@@ -354,6 +329,13 @@ class Decay:
     ) -> Decay:
         """Add the losses of a ring, if there is one."""
         return cls(segment, offset, fit, None if machine is None else budget(segment, machine))
+
+    def placed(self, name: str, start: float | None, machine: Machine | None) -> Decay:
+        """The same under a name, in a record that begins at a time, with the losses of a ring."""
+        start = None if start is None else start + self.segment.start
+        segment = replace(self.segment, name=name, start=start)
+        fit = replace(self.fit, record=name, readings=segment)
+        return Decay.of(segment, self.offset, fit, machine)
 
     def parts(self, number: int, machine: Machine | None) -> list[Decay]:
         """The cycles of top-up as so many decays at most, each of some cycles and a fit of its own;
@@ -392,6 +374,11 @@ class Decay:
         more |= {"notes": self.segment.notes} if self.segment.notes else {}
         more |= {} if self.budget is None else {"budget": self.budget}
         return self.fit.to_json() | json_of(more)
+
+
+def settings_of(decays: Sequence[Decay], machine: Machine) -> list[tuple[Operation, float]]:
+    """Settings and vacuum of each decay, and its mean current, mA."""
+    return [(operation_during(d.segment, machine), d.fit.mean_current) for d in decays]
 
 
 @answer
@@ -499,46 +486,40 @@ def _decays(record: DecayRecord) -> tuple[list[DecayRecord], tuple[Event, ...]]:
     return pieces, split.events
 
 
-class _Fitted(NamedTuple):
-    """A piece of a record, what was fitted of it, and the fit, or why there is none."""
+def _fitted(
+    pieces: Sequence[DecayRecord], law: Law, whole: bool
+) -> tuple[list[Decay], list[Event]]:
+    """Fit every piece; one that cannot be is a slow refill between others."""
+    decays, events = [], []
+    for piece in pieces:
+        try:
+            found, lost = _parts(piece, law, whole)
+        except InputError:
+            change = float(piece.current[-1] - piece.current[0])
+            found, lost = [], [Event("slow refill", piece.start, piece.span, change)]
+        decays += found
+        events += lost
+    return decays, events
 
-    piece: DecayRecord
-    segment: DecayRecord
-    fit: DecayFit | InputError
 
-    def placed(self, name: str, start: float | None) -> _Fitted:
-        """The same under a name, in a record that begins at a time."""
-        start = None if start is None else start + self.segment.start
-        segment, fit = replace(self.segment, name=name, start=start), self.fit
-        if isinstance(fit, DecayFit):
-            fit = replace(fit, record=name, readings=segment)
-        return _Fitted(self.piece, segment, fit)
-
-
-def _fitted(piece: DecayRecord, law: Law) -> _Fitted:
+def _parts(piece: DecayRecord, law: Law, whole: bool) -> tuple[list[Decay], list[Event]]:
+    """Fit a decay or, unless as a whole, its parts where current was lost at once, though no
+    reading shows it.
+    """
     segment = thinned(on_edges(piece))
-    try:
-        return _Fitted(piece, segment, fit_decay(segment, law=law))
-    except InputError as error:
-        return _Fitted(piece, segment, error)
-
-
-def _parts(piece: DecayRecord, law: Law) -> tuple[list[_Fitted], list[Event]]:
-    """Fit a decay, or its parts where current was lost at once, though no reading shows it."""
-    whole = _fitted(piece, law)
-    loss = whole.fit.loss if isinstance(whole.fit, DecayFit) else None
-    if loss is None:
-        return [whole], []
-    at = whole.segment.start - piece.start + loss.time
-    # Of means of neighbours the loss is anywhere within one.
-    within = float(np.median(np.diff(whole.segment.time))) * (len(whole.segment) < len(piece))
-    halves = [piece.select(rows) for rows in (piece.time < at - within, piece.time > at + within)]
-    if min(map(len, halves)) < FEWEST:
-        return [whole], []
-    kind = "loss" if loss.current.value > 0 else "refill"
-    event = Event(kind, piece.start + at, 0.0, -loss.current.value)
-    parts, events = zip(*(_parts(half, law) for half in halves), strict=True)
-    return [*parts[0], *parts[1]], [*events[0], event, *events[1]]
+    fit = fit_decay(segment, law=law)
+    if (loss := fit.loss) is not None and not whole:
+        at = segment.start - piece.start + loss.time
+        # Of means of neighbours the loss is anywhere within one.
+        within = float(np.median(np.diff(segment.time))) * (len(segment) < len(piece))
+        sides = piece.time < at - within, piece.time > at + within
+        halves = [piece.select(rows) for rows in sides]
+        if min(map(len, halves)) >= FEWEST:
+            kind = "loss" if loss.current.value > 0 else "refill"
+            event = Event(kind, piece.start + at, 0.0, -loss.current.value)
+            decays, events = _fitted(halves, law, whole)
+            return decays, [*events, event]
+    return [Decay(segment, piece.start, fit, None)], []
 
 
 def study_record(
@@ -583,37 +564,18 @@ def study_record(
     cycles, events = _refilled(placed)
     pooled, pieces = _pooled(cycles, record.name, machine, law)
     del cycles  # of 1e7 readings 160 MB
-    lost: list[Event] = []
-    if pooled:
-        found = [_fitted(piece, law) for piece in pieces]
-    else:
+    if not pooled:
         pieces, events = _decays(placed)
-        parts = [_parts(piece, law) for piece in pieces]
-        found = [one for fits, _ in parts for one in fits]
-        lost = [event for _, gone in parts for event in gone]
-    if len(found) == 1 and not pooled and isinstance(found[0].fit, InputError):
-        # A record that does nothing but rise is an error; a slow refill within one is not.
-        raise found[0].fit
-    decays, rising = [], []
-    for k, one in enumerate(sorted(found, key=lambda one: one.piece.start), 1):
-        name = f"{record.name}#{k}" if len(found) > 1 else one.segment.name
-        piece, segment, fit = one.placed(name, record.start)
-        if isinstance(fit, InputError):
-            change = float(segment.current[-1] - segment.current[0])
-            rising.append(Event("slow refill", piece.start, segment.span, change))
-        else:
-            decays.append(Decay.of(segment, piece.start, fit, machine))
-    if not decays and not pooled:  # of refills that are not resolved pieces rise, or are short
-        whole = _fitted(placed, law).placed(record.name, record.start)
-        if isinstance(whole.fit, InputError):
-            raise whole.fit
-        decays, events, lost, rising = (
-            [Decay.of(whole.segment, 0.0, whole.fit, machine)],
-            (),
-            [],
-            [],
-        )
+    # A record that does nothing but rise is an error; a slow refill within one is not.
+    only = len(pieces) == 1 and not pooled
+    found, more = _parts(pieces[0], law, False) if only else _fitted(pieces, law, bool(pooled))
+    if not found and not pooled:  # of refills that are not resolved pieces rise, or are short
+        events, (found, more) = (), _parts(placed, law, True)
+    decays = [
+        decay.placed(f"{record.name}#{k}" if len(found) > 1 else record.name, record.start, machine)
+        for k, decay in enumerate(sorted(found, key=lambda decay: decay.offset), 1)
+    ]
     shown = thinned(record)
     shown = replace(shown, notes=record.notes) if pooled else shown
-    found_events = sorted((*events, *lost, *rising), key=lambda event: event.time)
-    return RecordStudy(shown, tuple(decays), tuple(found_events), tuple(pooled))
+    in_order = sorted((*events, *more), key=lambda event: event.time)
+    return RecordStudy(shown, tuple(decays), tuple(in_order), tuple(pooled))

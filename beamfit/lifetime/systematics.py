@@ -21,7 +21,7 @@ from beamfit.lifetime.expansion import (
     lifetime_of,
     solved,
 )
-from beamfit.lifetime.fit import DecayFit, bare, fit_decay
+from beamfit.lifetime.fit import FEWEST, DecayFit, bare, fit_decay
 from beamfit.lifetime.free_law import Law
 from beamfit.lifetime.record import DecayRecord
 from beamfit.quantity import HOUR, Quantity, Status
@@ -127,11 +127,6 @@ def _monitor(record: DecayRecord, share: np.ndarray) -> dict[str, np.ndarray]:
     return {f"monitor {cause} (in the errors)": moved for cause, moved in stated.items()}
 
 
-FEWEST_IN_WINDOW = 5
-# Below 1e-12 a bias is rounding.
-BIAS_DIGITS = 12
-
-
 @shown
 @dataclass(frozen=True)
 class OneLifetime:
@@ -164,10 +159,13 @@ class OneLifetime:
         )
 
 
-def _one_lifetime(rate: float, error: float, residuals: np.ndarray, fit: DecayFit) -> OneLifetime:
-    found = lifetime_of(rate, error)
+def _one_lifetime(
+    rate: float, error: float, residuals: np.ndarray, record: DecayRecord, fit: DecayFit | None
+) -> OneLifetime:
+    """A constant loss rate beside the fit of a record, which is made where there is none."""
+    found, fit = lifetime_of(rate, error), fit or fit_decay(record, law=Law.constant)
     known = fit.lifetime_start.value, fit.lifetime_mean.value
-    bias = [round(found.value / value - 1, BIAS_DIGITS) for value in known]
+    bias = [found.value / value - 1 for value in known]
     rms = float(np.sqrt(np.mean(residuals**2)))
     return OneLifetime(replace(found, error_raw=found.error), rms, *bias)
 
@@ -197,8 +195,7 @@ def single_exponential(record: DecayRecord, fit: DecayFit | None = None) -> OneL
     moments = found.memory((LEVEL, LOSS), True).moments(np.eye(2)[1:], found.given)
     error = float(moments.error[0]) / record.span
     left = found.residuals * found.pieces.over
-    fit = fit or fit_decay(record, law=Law.constant)
-    return _one_lifetime(float(found.values.b), error, left, fit)
+    return _one_lifetime(float(found.values.b), error, left, record, fit)
 
 
 def log_linear(record: DecayRecord, fit: DecayFit | None = None) -> OneLifetime:
@@ -232,8 +229,7 @@ def log_linear(record: DecayRecord, fit: DecayFit | None = None) -> OneLifetime:
     logs = np.log(record.current)
     (slope, level), covariance = np.polyfit(record.time, logs, 1, cov=True)
     residuals = np.exp(level + slope * record.time) - record.current
-    fit = fit or fit_decay(record, law=Law.constant)
-    return _one_lifetime(-slope, math.sqrt(covariance[0, 0]), residuals, fit)
+    return _one_lifetime(-slope, math.sqrt(covariance[0, 0]), residuals, record, fit)
 
 
 @shown
@@ -292,9 +288,9 @@ def moving_lifetime(record: DecayRecord, window: float) -> LifetimeTrace:
     centres = np.flatnonzero((time >= window / 2) & (time <= record.span - window / 2))
     first = np.searchsorted(time, time[centres] - window / 2, side="left")
     last = np.searchsorted(time, time[centres] + window / 2, side="right")
-    full = last - first >= FEWEST_IN_WINDOW
+    full = last - first >= FEWEST
     if not full.any():
-        expected = f"one that holds {FEWEST_IN_WINDOW} readings and fits into {record.span:.6g} s"
+        expected = f"one that holds {FEWEST} readings and fits into {record.span:.6g} s"
         raise InputError(f"a window of {window:.6g} s", expected, path=record.name)
     rows = []
     for start, end in zip(first[full], last[full], strict=True):

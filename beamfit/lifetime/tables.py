@@ -4,117 +4,84 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Mapping, Sequence
 
-from beamfit.answer import Row, Table, cell
+from beamfit.answer import MOST_ROWS, Row, Table, cell
 from beamfit.lifetime.fit import DecayFit
-from beamfit.lifetime.mechanisms import LINEAR, QUADRATIC, SCALES, Mechanism
+from beamfit.lifetime.mechanisms import LINEAR, QUADRATIC, Mechanism
 from beamfit.lifetime.pieces import Event
-from beamfit.lifetime.ring import Operation
-from beamfit.lifetime.ring_study import Shift
-from beamfit.lifetime.scales import VOLTAGE
-from beamfit.lifetime.study import Decay, RecordStudy
+from beamfit.lifetime.study import Budget, Decay, RecordStudy
 from beamfit.quantity import HOUR, Quantity, Status
 
-
-class DecayRow(NamedTuple):
-    """A label, what stands beside it for a decay, and whether people quote it."""
-
-    label: str
-    value: Callable[[Decay], object]
-    quoted: bool = False
-
-
-MOST_EVENTS = 100
 # How many decays have every number shown; of more only the main ones, a row each.
 FEW = 4
-# Rows of a study of many decays that stand on the first screen, by the beginnings of their labels.
-QUOTED = (*(f"{name}, " for name in SCALES), "chi2/dof", "lifetime", "best", "next decay, choice 1")
 # Percent of the loss below which a mechanism's digits say nothing.
 NEGLIGIBLE = 1e-6
+# Labels and values of one decay.
+Cells = Mapping[str, object]
 
 
-def _laid_out(decays: Sequence[Decay], rows: Sequence[DecayRow]) -> list[Row]:
-    return [Row(row.label, [row.value(each) for each in decays], row.quoted) for row in rows]
-
-
-def _span(seconds: float) -> str:
-    if seconds >= 3600:
-        return f"{seconds / 3600:.3g} h"
-    return f"{seconds / 60:.3g} min" if seconds >= 60 else f"{seconds:.3g} s"
-
-
-def _chi2(decay: Decay) -> str:
-    fit = decay.fit
-    if fit.noise_inferred:
-        return f"not testable ({fit.dof} dof)"
-    return f"{fit.chi2:.4g}/{fit.dof} = {fit.chi2 / fit.dof:.3g}"
-
-
-def _reduced_chi2(decay: Decay) -> str:
-    fit = decay.fit
-    return "not testable" if fit.noise_inferred else f"{fit.chi2 / fit.dof:.3g}"
-
-
-def _noise(decay: Decay) -> str:
-    return "inferred from the residuals" if decay.fit.noise_inferred else "as given"
-
-
-STATUS = DecayRow("status", lambda d: d.fit.status)
-READINGS = DecayRow("readings", lambda d: f"{len(d.segment)} over {_span(d.segment.span)}")
-START = DecayRow("current at the start", lambda d: d.fit.i0, quoted=True)
-MEAN = DecayRow("lifetime at the mean current", lambda d: d.fit.lifetime_mean, quoted=True)
-A, B = (DecayRow(name, lambda d, name=name: getattr(d.fit, name), quoted=True) for name in "ab")
-INTERVALS = tuple(
-    DecayRow(
-        f"95 % interval of {row.label}", lambda d, row=row: row.value(d).interval_words, quoted=True
-    )
-    for row in (A, B)
-)
-QUALITY: tuple[DecayRow, ...] = (
-    DecayRow("chi2/dof", _chi2, quoted=True),
-    DecayRow("rms residual", lambda d: f"{d.fit.rms_residual:.3g} mA"),
-    DecayRow("errors", _noise),
-)
-RESULT: tuple[DecayRow, ...] = (
-    STATUS,
-    READINGS,
-    START,
-    DecayRow("lifetime at the start", lambda d: d.fit.lifetime_start, quoted=True),
-    MEAN,
-    DecayRow("lifetime at the end", lambda d: d.fit.lifetime_end, quoted=True),
-    A,
-    B,
-    *INTERVALS,
-)
-EXACT: tuple[DecayRow, ...] = (
-    DecayRow("a if a and b are constant", lambda d: d.fit.if_constant("a"), quoted=True),
-    DecayRow("b if a and b are constant", lambda d: d.fit.if_constant("b"), quoted=True),
-)
-CYCLES: tuple[DecayRow, ...] = (
-    STATUS,
-    DecayRow("cycles", lambda d: f"{d.fit.first.size} at {d.fit.mean_current:.5g} mA", quoted=True),
-    READINGS,
-    MEAN,
-    DecayRow("lifetime at the highest current", lambda d: d.fit.lifetime_start, quoted=True),
-    DecayRow("lifetime at the lowest current", lambda d: d.fit.lifetime_end, quoted=True),
-    A,
-    B,
-    *INTERVALS,
-)
-
-
-def _rows_of(decays: Sequence[Decay]) -> tuple[DecayRow, ...]:
-    if all(decay.fit.first is not None for decay in decays):
-        return *CYCLES, *QUALITY
-    free = any(decay.fit.free_law for decay in decays)
-    return *RESULT, *EXACT * free, *QUALITY
+def _beside(
+    decays: Sequence[Decay], cells_of: Callable[[Decay], Cells], quoted: bool = False
+) -> list[Row]:
+    """Rows with one cell a decay, by the labels that any of them has."""
+    found = [cells_of(decay) for decay in decays]
+    labels = dict.fromkeys(label for cells in found for label in cells)
+    return [Row(label, [cells.get(label) for cells in found], quoted) for label in labels]
 
 
 def decay_rows(decays: Sequence[Decay]) -> list[Row]:
     """Label and one cell per decay, for every number a fit has."""
-    return _laid_out(decays, _rows_of(decays))
+    return [
+        *_beside(decays, _head),
+        *_beside(decays, _numbers, quoted=True),
+        *_beside(decays, _residuals),
+    ]
+
+
+def _head(decay: Decay) -> Cells:
+    readings = f"{len(decay.segment)} over {_span(decay.segment.span)}"
+    return {"status": decay.fit.status, "readings": readings}
+
+
+def _span(seconds: float) -> str:
+    if seconds >= HOUR:
+        return f"{seconds / HOUR:.3g} h"
+    return f"{seconds / 60:.3g} min" if seconds >= 60 else f"{seconds:.3g} s"
+
+
+def _numbers(decay: Decay) -> Cells:
+    fit = decay.fit
+    if fit.first is None:
+        first, last = "start", "end"
+        begin = {"current at the start": fit.i0}
+    else:
+        first, last = "highest current", "lowest current"
+        begin = {"cycles": f"{fit.first.size} at {fit.mean_current:.5g} mA"}
+    numbers = {
+        f"lifetime at the {first}": fit.lifetime_start,
+        "lifetime at the mean current": fit.lifetime_mean,
+        f"lifetime at the {last}": fit.lifetime_end,
+        "a": fit.a,
+        "b": fit.b,
+        "95 % interval of a": fit.a.interval_words,
+        "95 % interval of b": fit.b.interval_words,
+    }
+    if fit.first is None and fit.free_law is not None:
+        numbers |= {f"{name} if a and b are constant": fit.if_constant(name) for name in "ab"}
+    worth = f"{fit.chi2:.4g}/{fit.dof} = {_reduced_chi2(fit)}"
+    if fit.noise_inferred:
+        worth = f"not testable ({fit.dof} dof)"
+    return begin | numbers | {"chi2/dof": worth}
+
+
+def _reduced_chi2(fit: DecayFit) -> str:
+    return "not testable" if fit.noise_inferred else f"{fit.chi2 / fit.dof:.3g}"
+
+
+def _residuals(decay: Decay) -> Cells:
+    errors = "inferred from the residuals" if decay.fit.noise_inferred else "as given"
+    return {"rms residual": f"{decay.fit.rms_residual:.3g} mA", "errors": errors}
 
 
 def course_tables(decays: Sequence[Decay]) -> list[Table]:
@@ -129,35 +96,49 @@ def course_tables(decays: Sequence[Decay]) -> list[Table]:
     ]  # fmt: skip
 
 
+def separability_rows(decays: Sequence[Decay]) -> list[Row]:
+    """Label and one cell per decay for what the record tells of a and b apart."""
+    return _beside(decays, _apart)
+
+
+def _apart(decay: Decay) -> Cells:
+    found = decay.fit.identifiability
+    share = None if found.share is None else Quantity(found.share, found.share_error, "1")
+    return {
+        "a and b": "separable" if found.separable else "not separable",
+        "share of a in the loss": share,
+        "correlation of a and b": _number(found.correlation, ".6f"),
+        "neighbouring residuals": _number(found.residual_correlation, ".2f"),
+        "errors enlarged for that": _number(found.error_inflation, ".1f", " times"),
+    }
+
+
 def _number(value: float | None, form: str, unit: str = "") -> str:
     return "-" if value is None else f"{value:{form}}{unit}"
 
 
-def _share(decay: Decay) -> Quantity | None:
-    found = decay.fit.identifiability
-    return None if found.share is None else Quantity(found.share, found.share_error, "1")
+def check_rows(decays: Sequence[Decay]) -> list[Row]:
+    """Label and one cell per decay for what simpler analyses say, and whether a is constant."""
+    return _beside(decays, _checks)
 
 
-APART: tuple[DecayRow, ...] = (
-    DecayRow(
-        "a and b", lambda d: "separable" if d.fit.identifiability.separable else "not separable"
-    ),
-    DecayRow("share of a in the loss", _share),
-    DecayRow("correlation of a and b", lambda d: _number(d.fit.identifiability.correlation, ".6f")),
-    DecayRow(
-        "neighbouring residuals",
-        lambda d: _number(d.fit.identifiability.residual_correlation, ".2f"),
-    ),
-    DecayRow(
-        "errors enlarged for that",
-        lambda d: _number(d.fit.identifiability.error_inflation, ".1f", " times"),
-    ),
-)
-
-
-def separability_rows(decays: Sequence[Decay]) -> list[Row]:
-    """Label and one cell per decay for what the record tells of a and b apart."""
-    return _laid_out(decays, APART)
+def _checks(decay: Decay) -> Cells:
+    fit, gas = decay.fit, decay.fit.outgassing
+    cells = {
+        "single exponential": _one_lifetime(decay, "single_exponential"),
+        "line through ln I": _one_lifetime(decay, "log_linear"),
+        "constant a": _constant_a(fit),
+        "lifetime by current": fit.lifetimes and str(fit.lifetimes),
+    }
+    if gas is not None:
+        cells |= {
+            "gas loss relaxes within": gas.time_constant,
+            "lifetime at first": gas.before,
+            "without that gas": gas.after,
+            "a beside it": gas.a,
+            "b in the end": gas.b,
+        }
+    return {label: value for label, value in cells.items() if value is not None}
 
 
 def _one_lifetime(decay: Decay, name: str) -> str | None:
@@ -169,8 +150,8 @@ def _one_lifetime(decay: Decay, name: str) -> str | None:
     return f"{found.lifetime} ({bias}{found.rms_residual:.3g} mA rms)"
 
 
-def _constant_a(decay: Decay) -> str | None:
-    found = decay.fit.constant_a
+def _constant_a(fit: DecayFit) -> str | None:
+    found = fit.constant_a
     if found is None:
         return None
     said = {Status.converged: "not contradicted", Status.poor_fit: "rejected"}
@@ -178,113 +159,70 @@ def _constant_a(decay: Decay) -> str | None:
     return said[found.status] + chance if found.status in said else "not testable with this record"
 
 
-CHECKS: tuple[DecayRow, ...] = (
-    DecayRow("single exponential", lambda d: _one_lifetime(d, "single_exponential")),
-    DecayRow("line through ln I", lambda d: _one_lifetime(d, "log_linear")),
-    DecayRow("constant a", _constant_a),
-)
-LIFETIMES: tuple[DecayRow, ...] = (
-    DecayRow("lifetime by current", lambda d: d.fit.lifetimes and str(d.fit.lifetimes)),
-)
-OUTGASSING: tuple[DecayRow, ...] = (
-    DecayRow("gas loss relaxes within", lambda d: d.fit.outgassing.time_constant),
-    DecayRow("lifetime at first", lambda d: d.fit.outgassing.before),
-    DecayRow("without that gas", lambda d: d.fit.outgassing.after),
-    DecayRow("a beside it", lambda d: d.fit.outgassing.a),
-    DecayRow("b in the end", lambda d: d.fit.outgassing.b),
-)
-SYSTEMATIC = ["if the", "a", "b", "lifetime at the mean"]
-
-
-def check_rows(decays: Sequence[Decay]) -> list[Row]:
-    """Label and one cell per decay for what simpler analyses say, and whether a is constant."""
-    rows = CHECKS if any(decay.checks for decay in decays) else CHECKS[-1:]
-    rows += LIFETIMES if any(decay.fit.lifetimes for decay in decays) else ()
-    rows += OUTGASSING if all(decay.fit.outgassing for decay in decays) else ()
-    return _laid_out(decays, rows)
-
-
-def systematic_rows(decay: Decay) -> list[list[str]]:
+def systematic_table(decay: Decay, title: str) -> Table:
     """A cause in each row, and by how much it moves a, b and the lifetime at the mean current."""
     fit = decay.fit
     values = fit.a.value, fit.b.value, fit.lifetime_mean.value
-    return [
+    rows = [
         [cause, *(_percent(moved / value) for moved, value in zip(by, values, strict=True))]
         for cause, *by in decay.systematics
     ]
+    return Table(title, ["if the", "a", "b", "lifetime at the mean"], rows)
 
 
 def _percent(share: float) -> str:
     return f"{100 * share:+.0f} %" if abs(share) > 1 - 1e-9 else f"{100 * share:+.2g} %"
 
 
-def _part(kind: str, mechanism: Mechanism) -> DecayRow:
-    """A mechanism's part of a or b, with its share of the loss at the mean current."""
-    name, unit = f"{kind}_{mechanism.name}", {"a": "1/(mA s)", "b": "1/s"}[kind]
-
-    def shown(decay: Decay) -> str:
-        budget = decay.budget
-        value = float(getattr(budget.losses, name))
-        rate = value * {"a": budget.current, "b": 1.0}[kind]
-        share = 100 * rate * 3600 * budget.lifetime
-        if share < NEGLIGIBLE:
-            return "negligible"
-        return f"{value:.4g} {unit} ({share:.3g} % of the loss)"
-
-    return DecayRow(f"{kind}, {mechanism.label}", shown)
-
-
-def _emittances(decay: Decay) -> str:
-    x, y = (f"{1e9 * value:.4g}" for value in decay.budget.emittances)
-    return f"{x} and {y} nm"
-
-
-def _pressure(decay: Decay) -> str:
-    budget = decay.budget
-    filed = budget.filed_pressure
-    return f"{budget.pressure:.3g} Pa" + (
-        "" if filed is None else f", as the gauge reads; {filed:.3g} Pa by the ring file"
-    )
-
-
-SETTINGS: tuple[DecayRow, ...] = (
-    DecayRow("RF voltage", lambda d: f"{float(d.budget.operation.rf_voltage) / 1e3:.6g} kV"),
-    DecayRow("scraper", lambda d: f"{float(d.budget.operation.scraper_y) * 1e3:.4g} mm"),
-    DecayRow("bunches", lambda d: f"{float(d.budget.operation.bunches):.6g}"),
-)
-BUDGET: tuple[DecayRow, ...] = (
-    *SETTINGS,
-    DecayRow("emittances, as given: no intrabeam scattering", _emittances),
-    DecayRow("rms bunch length", lambda d: f"{1e3 * d.budget.bunch_length:.4g} mm"),
-    DecayRow("pressure at the mean current", _pressure),
-    *(_part("a", mechanism) for mechanism in QUADRATIC),
-    DecayRow("a, sum", lambda d: f"{d.budget.losses.a:.4g} 1/(mA s)"),
-    DecayRow("a, measured", lambda d: d.fit.a),
-    *(_part("b", mechanism) for mechanism in LINEAR),
-    DecayRow("b, sum", lambda d: f"{d.budget.losses.b:.4g} 1/s"),
-    DecayRow("b, measured", lambda d: d.fit.b),
-    DecayRow("lifetime at the mean, computed", lambda d: f"{d.budget.lifetime:.4g} h"),
-    DecayRow("lifetime at the mean, measured", lambda d: d.fit.lifetime_mean),
-)
-# Of many decays only the main numbers are shown, a row each.
-MAIN: dict[str, tuple[DecayRow, ...]] = {
-    "Result": (STATUS, START, MEAN),
-    "a and b": (A, B, DecayRow("chi2/dof", _reduced_chi2)),
-}
-LOSSES: tuple[DecayRow, ...] = (
-    *SETTINGS,
-    DecayRow("computed", lambda d: f"{d.budget.lifetime:.4g} h"),
-    DecayRow("measured", MEAN.value),
-)
+def budget_rows(decays: Sequence[Decay]) -> list[Row]:
+    """Label and one cell per decay: first principles beside the measured; empty without a ring."""
+    return _beside(decays, _budget) if _budgets_known(decays) else []
 
 
 def _budgets_known(decays: Sequence[Decay]) -> bool:
     return all(decay.budget is not None for decay in decays) and len(decays) > 0
 
 
-def budget_rows(decays: Sequence[Decay]) -> list[Row]:
-    """Label and one cell per decay: first principles beside the measured; empty without a ring."""
-    return _laid_out(decays, BUDGET) if _budgets_known(decays) else []
+def _settings(budget: Budget) -> dict[str, object]:
+    voltage, scraper, bunches = map(float, budget.operation[:3])
+    return {
+        "RF voltage": f"{voltage / 1e3:.6g} kV",
+        "scraper": f"{scraper * 1e3:.4g} mm",
+        "bunches": f"{bunches:.6g}",
+    }
+
+
+def _budget(decay: Decay) -> Cells:
+    budget, fit = decay.budget, decay.fit
+    x, y = (f"{1e9 * value:.4g}" for value in budget.emittances)
+    pressure = f"{budget.pressure:.3g} Pa"
+    if budget.filed_pressure is not None:
+        pressure += f", as the gauge reads; {budget.filed_pressure:.3g} Pa by the ring file"
+    losses = budget.losses
+    return {
+        **_settings(budget),
+        "emittances, as given: no intrabeam scattering": f"{x} and {y} nm",
+        "rms bunch length": f"{1e3 * budget.bunch_length:.4g} mm",
+        "pressure at the mean current": pressure,
+        **{f"a, {m.label}": _part(budget, "a", m) for m in QUADRATIC},
+        "a, sum": f"{losses.a:.4g} 1/(mA s)",
+        "a, measured": fit.a,
+        **{f"b, {m.label}": _part(budget, "b", m) for m in LINEAR},
+        "b, sum": f"{losses.b:.4g} 1/s",
+        "b, measured": fit.b,
+        "lifetime at the mean, computed": f"{budget.lifetime:.4g} h",
+        "lifetime at the mean, measured": fit.lifetime_mean,
+    }
+
+
+def _part(budget: Budget, kind: str, mechanism: Mechanism) -> str:
+    """A mechanism's part of a or b, with its share of the loss at the mean current."""
+    value = float(getattr(budget.losses, f"{kind}_{mechanism.name}"))
+    rate, unit = (value * budget.current, "1/(mA s)") if kind == "a" else (value, "1/s")
+    share = 100 * rate * HOUR * budget.lifetime
+    if share < NEGLIGIBLE:
+        return "negligible"
+    return f"{value:.4g} {unit} ({share:.3g} % of the loss)"
 
 
 def overview(decays: Sequence[Decay]) -> list[tuple[str, list[str], list[list[str]]]]:
@@ -300,12 +238,33 @@ def overview(decays: Sequence[Decay]) -> list[tuple[str, list[str], list[list[st
     list of (str, list of str, list of list of str)
         Title, header and rows of each table.
     """
-    known = {"Losses from first principles": LOSSES} if _budgets_known(decays) else {}
+    main = {"Result": _main, "a and b": _a_and_b}
+    main |= {"Losses from first principles": _computed} if _budgets_known(decays) else {}
     tables, names = [], numbered(decays)
-    for title, wanted in (MAIN | known).items():
-        rows = [[names[d.fit.record], *(cell(row.value(d)) for row in wanted)] for d in decays]
-        tables.append((title, ["decay", *(row.label for row in wanted)], rows))
+    for title, cells_of in main.items():
+        found = [cells_of(decay) for decay in decays]
+        rows = [
+            [names[decay.fit.record], *map(cell, cells.values())]
+            for decay, cells in zip(decays, found, strict=True)
+        ]
+        tables.append((title, ["decay", *found[0]], rows))
     return tables
+
+
+def _main(decay: Decay) -> Cells:
+    fit = decay.fit
+    numbers = {"current at the start": fit.i0, "lifetime at the mean current": fit.lifetime_mean}
+    return {"status": fit.status} | numbers
+
+
+def _a_and_b(decay: Decay) -> Cells:
+    fit = decay.fit
+    return {"a": fit.a, "b": fit.b, "chi2/dof": _reduced_chi2(fit)}
+
+
+def _computed(decay: Decay) -> Cells:
+    computed = {"computed": f"{decay.budget.lifetime:.4g} h"}
+    return _settings(decay.budget) | computed | {"measured": decay.fit.lifetime_mean}
 
 
 def numbered(decays: Sequence[Decay]) -> dict[str, str]:
@@ -352,63 +311,7 @@ def event_rows(study: RecordStudy) -> list[list[str]]:
     """Kind, time, duration and change of what was cut away; a long list is cut, and says so."""
     rows = [
         [event.kind, f"{event.time:.0f} s", f"{event.duration:.0f} s", f"{event.change:+.4g} mA"]
-        for event in study.events[:MOST_EVENTS]
+        for event in study.events[:MOST_ROWS]
     ]
     left = len(study.events) - len(rows)
     return rows + ([[f"{left} more", "", "", ""]] if left else [])
-
-
-def _setting(operation: Operation) -> str:
-    voltage, scraper = float(operation.rf_voltage) / 1e3, 1e3 * float(operation.scraper_y)
-    return f"{voltage:.6g} kV, {scraper:.4g} mm, {float(operation.bunches):.6g} bunches"
-
-
-def shift_rows(shift: Shift) -> list[Row]:
-    """Label and one cell for each answer of a study of many decays."""
-    fit, best, at = shift.fit, shift.best, f"at {shift.current:.4g} mA"
-    rows: list[tuple[str, object]] = [("status", fit.status)]
-    for name, scale in fit.scales.items():
-        of, told = "scale on the ring file", "not separable"
-        if name == VOLTAGE:
-            of, told = "true over read", "not told: its prior's"
-        rows.append((f"{name}, {of}", told if scale.error is None else scale))
-    rows.append(("chi2/dof", f"{fit.chi2:.4g}/{fit.dof}" if fit.dof > 0 else "not testable"))
-    for row in shift.budget:
-        shown = f"{row.median:.4g} ({row.lower:.4g} to {row.upper:.4g}) {row.unit}"
-        rows.append((f"{row.name} {at}", shown if row.separable else "not determined"))
-    volts, error = best.rf_voltage.value / 1e3, best.rf_voltage.error
-    limit = f"{volts:.6g} kV, at its limit"
-    rows += [
-        ("best RF voltage", limit if error is None else Quantity(volts, error / 1e3, "kV")),
-        ("best scraper and bunches", f"{1e3 * best.scraper_y:.4g} mm, {best.bunches:.6g}"),
-        ("lifetime there", best.lifetime),
-        ("lifetime at the usual settings", best.usual),
-    ]
-    if shift.held_back:
-        off = [abs(one.pull) for one in shift.held_back]
-        within = [sum(pull < most for pull in off) for most in (1, 2)]
-        said = f"{within[0]} of {len(off)} within 1, {within[1]} within 2 errors"
-        rows.append(("each decay predicted by the others", said))
-    for number, proposal in enumerate(shift.proposals, 1):
-        asked = proposal.candidate
-        said = f"{asked.current:.4g} mA (information {proposal.information:.3g})"
-        rows.append((f"next decay, choice {number}", f"{_setting(asked.operation)}, {said}"))
-    return [Row(label, [value], label.startswith(QUOTED)) for label, value in rows]
-
-
-def network_rows(shift: Shift) -> list[Row]:
-    """Label and one cell for what a network of the losses says, and what it obeys."""
-    network, at = shift.network, f"at the usual settings, {shift.current:.4g} mA"
-    a, b, lifetime = network.predict(network.usual, shift.current)
-    held, wrong = network.certificate, network.discrepancy.size
-    rows = [
-        ("status", network.fit.status),
-        ("chi2/dof", f"{network.fit.chi2:.4g}/{network.fit.dof}"),
-        ("what it may be wrong by, a and b", " and ".join(f"{100 * size:.2g} %" for size in wrong)),
-        (f"a {at}", a),
-        (f"b {at}", b),
-        (f"lifetime {at}", lifetime),
-        ("falls with scraper and bunches, rises with pressure", held.holds),
-        ("single maximum of the lifetime in the RF voltage", held.single_maximum),
-    ]
-    return [Row(label, [value]) for label, value in rows]

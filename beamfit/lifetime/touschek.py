@@ -12,8 +12,7 @@ from jax import Array
 from jax.scipy.special import i0e
 from scipy import constants
 
-from beamfit.lifetime.bunch import population, stored_bunch
-from beamfit.lifetime.ring import ELECTRON_RADIUS, Operation, Optics, Ring
+from beamfit.lifetime.ring import ELECTRON_RADIUS, Operation, Optics, Ring, population, stored_bunch
 
 
 def _spectrum(log_kappa: Array, floor: Array) -> Array:

@@ -12,13 +12,13 @@ from matplotlib.axes import Axes
 from matplotlib.figure import FigureBase
 
 from beamfit.answer import Table, labelled
-from beamfit.errors import InputError, Status
+from beamfit.errors import InputError
 from beamfit.lifetime import tables
 from beamfit.lifetime.alarm import when
-from beamfit.lifetime.course import Trend
+from beamfit.lifetime.course import MOST_PARTS, Trend
 from beamfit.lifetime.fit import DecayFit
 from beamfit.lifetime.ring_study import Shift
-from beamfit.lifetime.study import Decay, RecordStudy, cycle_lifetimes
+from beamfit.lifetime.study import Decay, RecordStudy
 from beamfit.lifetime.systematics import moving_lifetime
 from beamfit.quantity import HOUR
 from beamfit.report.document import (
@@ -52,10 +52,6 @@ BUDGET = (
     "Computed for the ring file and the record's own settings, nothing fitted. The percentages are "
     "shares of the computed loss at the mean current."
 )
-SHIFT = (
-    "Scales multiply the ring file's first principles. Brackets are 68 % credible intervals. The "
-    "best point is sought within the range of settings seen."
-)
 # Columns of a table of decays that fit the page.
 ABREAST = 2
 
@@ -81,10 +77,8 @@ def decay_page(
     decays = [decay for study in studies for decay in study.decays]
     listed = []
     if shift is not None:
-        found = labelled("All decays", ["value"], tables.shift_rows(shift), SHIFT)
-        listed += [found.quoted()._replace(title="Result", note="", header=[]), found]
-    if shift is not None and shift.network is not None:
-        listed.append(labelled("A network of the losses", ["value"], tables.network_rows(shift)))
+        found = shift.tables()
+        listed += [found[0].quoted()._replace(title="Result", note="", header=[]), *found]
     listed += [] if trend is None else trend.tables()
     pooled = [decay for study in studies for decay in study.pooled]
     listed += _side_by_side(pooled) + tables.course_tables(pooled) + _single(decays)
@@ -138,8 +132,7 @@ def _single(decays: Sequence[Decay]) -> list[Table]:
         return [Table(*each, note=ERRORS if each[0] == "Result" else "") for each in many]
     listed = _side_by_side(decays)
     for d in (d for d in decays if d.systematics):
-        title = f"Systematics of {d.fit.record}"
-        listed.append(Table(title, tables.SYSTEMATIC, tables.systematic_rows(d)))
+        listed.append(tables.systematic_table(d, f"Systematics of {d.fit.record}"))
     return listed
 
 
@@ -160,13 +153,7 @@ def _verdict(decay: Decay) -> Verdict:
 def _together(shift: Shift | None, trend: Trend | None) -> Iterator[Verdict]:
     """Verdicts on all decays together."""
     if shift is not None:
-        fit, best, change = shift.fit, shift.best, shift.anomaly
-        yield Verdict(fit.status, f"{len(fit.names)} decays together", fit.message)
-        yield Verdict(best.status, f"best lifetime {best.lifetime}", best.message)
-        if shift.untold:
-            yield Verdict(Status.unidentified, "loss budget", shift.untold)
-        if change is not None:
-            yield Verdict(change.status, "second half against the first", change.message)
+        yield from (Verdict(status, name, said) for name, status, said in shift.verdicts)
     if trend is not None:
         yield Verdict(trend.status, "course of the lifetime", trend.message)
 
@@ -276,7 +263,7 @@ def draw_lifetime(figure: FigureBase, study: RecordStudy) -> None:
     scale, unit = _time_unit(study.record.span)
     tops = []
     for decay in () if study.decays else study.pooled:
-        time, lifetime, error = cycle_lifetimes(decay.fit)
+        time, lifetime, error = _cycle_lifetimes(decay.fit)
         at = (decay.fit.readings.start + time) / scale
         axes.errorbar(at, lifetime, error, fmt="o", ms=3, lw=0.8, color=BLUE, zorder=2)
         fit, begin = decay.fit, decay.fit.readings.start
@@ -301,6 +288,31 @@ def draw_lifetime(figure: FigureBase, study: RecordStudy) -> None:
         axes.set_ylim(0.6 * min(known), 1.4 * max(known))
     axes.set(title="momentary lifetime", xlabel=f"time, {unit}", ylabel="lifetime, h")
     legend_below(figure, axes, 2)
+
+
+def _cycle_lifetimes(fit: DecayFit) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Time, s, lifetime and its error, h, of up to 48 parts of a pooled fit.
+
+    The slope of the residuals of its cycles is what the loss rate of a part departs by.
+    """
+    record, first = fit.readings, fit.first
+    lengths = np.diff(first, append=len(record))
+    columns = np.column_stack([record.time, fit.residuals])
+    mean = np.add.reduceat(columns, first) / lengths[:, None]
+    since, residual = (columns - np.repeat(mean, lengths, axis=0)).T
+    part = first[
+        np.linspace(0, first.size, min(first.size, MOST_PARTS), endpoint=False).astype(int)
+    ]
+    count = np.diff(part, append=len(record))
+    at, level = (np.add.reduceat(v, part) / count for v in (record.time, record.current))
+    squares = np.add.reduceat(since**2, part)
+    rate = np.add.reduceat(since * residual, part) / squares / level
+    usual = np.array([of.lifetime.value for of in fit.course] or [fit.lifetime_mean.value])
+    which = np.searchsorted([of.start for of in fit.course][1:], at - record.time[0])
+    rate += fit.a.value * (level - fit.mean_current) + 1 / usual[which] / HOUR
+    error = fit.rms_residual / np.sqrt(squares) / level
+    seen = rate > 0
+    return at[seen], 1 / rate[seen] / HOUR, (error / rate**2)[seen] / HOUR
 
 
 def _momentary(axes: Axes, decay: Decay, scale: float) -> float:

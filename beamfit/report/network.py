@@ -10,7 +10,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import FigureBase
 
 from beamfit.lifetime.decay_law import current
-from beamfit.lifetime.mechanisms import loss_terms, scaled_losses
 from beamfit.lifetime.ring import Operation
 from beamfit.lifetime.ring_study import Shift
 from beamfit.lifetime.study import Decay, operation_during
@@ -141,7 +140,7 @@ def _first_principles(shift: Shift, operation: Operation) -> tuple[float, float,
     operation = operation._replace(
         pressure_base=share * usual.pressure_base, pressure_slope=share * usual.pressure_slope
     )
-    a, b = scaled_losses(shift.fit.vector, loss_terms(machine.ring, operation, at))
+    a, b = shift.fit.losses_at(operation, at)
     return float(a), float(b), float(1 / (a * at + b) / HOUR)
 
 

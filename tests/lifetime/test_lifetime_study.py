@@ -9,13 +9,19 @@ from scipy.optimize import brentq
 
 import beamfit
 from beamfit.errors import InputError
-from beamfit.lifetime.advice import DecayCandidate, Limits, best_operating_point, next_decays
-from beamfit.lifetime.bunch import rf_acceptance
 from beamfit.lifetime.decay_law import current
 from beamfit.lifetime.mechanisms import SCALES, loss_coefficients, loss_terms, scaled_losses
 from beamfit.lifetime.record import Conditions, DecayRecord
-from beamfit.lifetime.ring_study import budget_intervals, find_anomaly
-from beamfit.lifetime.scales import fit_scales, summarise
+from beamfit.lifetime.ring import rf_acceptance
+from beamfit.lifetime.ring_study import (
+    DecayCandidate,
+    Limits,
+    best_operating_point,
+    budget_intervals,
+    find_anomaly,
+    next_decays,
+)
+from beamfit.lifetime.scales import fit_scales, summarise, widened
 from beamfit.lifetime.study import study_record
 from beamfit.quantity import Status
 from tests.simulations import simulations
@@ -74,6 +80,16 @@ def test_the_summary_is_the_information_of_the_readings(decays):
         assert np.sqrt(covariance[0, 0]) / mean == pytest.approx(a.error, rel=0.01)
         slope = np.array([-1.0, 1.0])  # b = (a I + b) - a I
         assert np.sqrt(slope @ covariance @ slope) == pytest.approx(b.error, rel=0.01)
+
+
+def test_an_error_of_the_model_adds_to_the_covariance():
+    random = np.random.default_rng(4)
+    root, changes = np.triu(random.normal(size=(2, 2))), random.normal(size=(2, 3))
+    found = np.asarray(widened(root, changes))
+    expected = np.linalg.inv(root.T @ root) + changes @ changes.T
+    np.testing.assert_allclose(np.linalg.inv(found.T @ found), expected, rtol=1e-10)
+    nothing = np.array([[0.0, 0.0], [0.0, 2.0]])  # a decay that does not tell a
+    assert np.isfinite(widened(nothing, changes)).all()
 
 
 def test_the_scales_of_the_shift_are_found(fit):

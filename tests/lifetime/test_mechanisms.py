@@ -12,21 +12,21 @@ import pytest
 
 from beamfit.errors import InputError
 from beamfit.io.ring import read_operation, read_ring, ring_from_pyat
-from beamfit.lifetime.bunch import (
-    bunch_in_bucket,
-    equal_bunches,
-    lengthening,
-    population,
-    quantum_rate,
-    vertical_acceptance,
-)
 from beamfit.lifetime.gas import (
     bremsstrahlung_cross_section,
     elastic_cross_section,
     gas_rate_coefficient,
 )
 from beamfit.lifetime.mechanisms import loss_coefficients
-from beamfit.lifetime.ring import gas_mixture
+from beamfit.lifetime.ring import (
+    bunch_in_bucket,
+    equal_bunches,
+    gas_mixture,
+    lengthening,
+    population,
+    quantum_rate,
+    vertical_acceptance,
+)
 from beamfit.lifetime.touschek import (
     piwinski_rate,
     piwinski_shape,

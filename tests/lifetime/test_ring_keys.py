@@ -15,10 +15,15 @@ from scipy.special import gamma
 from beamfit.errors import InputError
 from beamfit.io.decay_record import read_decay_record
 from beamfit.io.ring import read_operation, read_ring
-from beamfit.lifetime.bunch import bunch_in_bucket, length_and_height, population, stored_bunch
 from beamfit.lifetime.gas import elastic_cross_section
 from beamfit.lifetime.mechanisms import loss_coefficients
-from beamfit.lifetime.ring import HarmonicCavity
+from beamfit.lifetime.ring import (
+    HarmonicCavity,
+    bunch_in_bucket,
+    length_and_height,
+    population,
+    stored_bunch,
+)
 from beamfit.lifetime.study import Machine, budget, operation_during
 from beamfit.lifetime.touschek import piwinski_rate
 from tests.lifetime.test_mechanisms import spear3_cells

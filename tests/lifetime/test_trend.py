@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from beamfit.errors import InputError
-from beamfit.lifetime.course import trend_of
+from beamfit.lifetime.course import _drift, _is_sure, trend_of
 from beamfit.lifetime.mechanisms import loss_coefficients
 from beamfit.lifetime.record import Conditions, DecayRecord
 from beamfit.lifetime.study import study_record
+from beamfit.quantity import Quantity
 from beamfit.statistics import control_limits
 from tests.lifetime.test_alarm import beam_after
 
@@ -71,6 +72,18 @@ def test_limits_are_those_of_an_individuals_chart():
     assert 2 <= outside <= 24
     # By hand: mean range 1, 1/1.128; a drift does not widen it, a step hardly.
     assert control_limits(np.arange(200.0))[1] == pytest.approx(3 / 1.128, rel=0.06)
+
+
+def test_four_lifetimes_drift_no_oftener_than_chance_says():
+    """Two degrees of freedom: three errors happen once in ten courses, 4.3 once in twenty."""
+    random, time, inside, sure = np.random.default_rng(1), 86400.0 * np.arange(4), 0, 0
+    for _ in range(3000):
+        values = [Quantity(v, 0.1, "mA h") for v in 10 + 0.1 * random.normal(size=4)]
+        found = _drift(time, values, 10.0)
+        inside += found.interval_95[0] < 0 < found.interval_95[1]
+        sure += _is_sure(abs(found.value) / found.error, 2)
+    assert abs(inside / 3000 - 0.95) < 0.015
+    assert sure / 3000 < 0.006
 
 
 def test_the_ring_takes_settings_and_current_out(machine):
