@@ -364,6 +364,7 @@ def _step(usual: Reference, state: AlarmState, reading: Reading) -> tuple[np.nda
         spread = noise * np.sqrt(2 * (1 - memory) * (1 + ratio + ratio**2))
         off = np.abs(excess - state.pace * alike)
         level = off <= JUMP * spread + SHARE * (a_part + b_part)
+        level &= excess - a_part - b_part <= JUMP * spread  # what rises is a refill
         expected = np.stack(np.broadcast_arrays(reading.a_factor, reading.b_factor, noise)[:2], -1)
         level &= (np.abs(expected / state.expected - 1) <= SET).all(-1)
     moved = np.stack([excess, -a_part, -b_part], axis=-1)
@@ -413,7 +414,9 @@ def _judged(
     apart = np.zeros(quiet.shape, int)
     if not quiet.all():
         a, b, both = seen_in(state, slice(-1, None)).evidence[..., 0]
-        found = [both - np.logaddexp(a, b) > NAMED, a - b > NAMED, b - a > NAMED]
+        either_one = np.logaddexp(a, b)
+        found = [both - either_one, a - np.logaddexp(b, 0.0), b - np.logaddexp(a, 0.0)]
+        found = [odds > NAMED for odds in found]
         apart = np.select(found, [3, 1, 2], 0)
     late = 4 * (state.raised > PATIENCE)
     settled = ~quiet & usable & (state.age[..., -1] >= MINUTE)

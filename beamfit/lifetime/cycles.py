@@ -125,10 +125,22 @@ def find_cycles(record: DecayRecord) -> Split:
 def cut_at_refills(record: DecayRecord) -> Split:
     """As `split_record`, but as `find_cycles` where that finds more cycles: the former cuts
     nothing but clear steps between pieces of eight readings, whatever the law of the decay.
+
+    Refills that are there give back what is lost: between clear steps alone less is lost by as many
+    times as there are more cycles, or by half of that at least.
     """
     clear, fine = split_record(record), find_cycles(record)
-    more = len(fine.segments) > MORE * len(clear.segments) + FEW
-    return fine if more and is_refilled(fine) else clear
+    count, more = len(clear.segments), len(fine.segments)
+    if more <= MORE * count + FEW or not is_refilled(fine):
+        return clear
+    given_back = 1 - lost_in(clear.segments) / max(lost_in(fine.segments), 1e-300)
+    return fine if given_back > RETURNED * (1 - count / more) else clear
+
+
+def lost_in(cycles: Sequence[DecayRecord]) -> float:
+    """Current that cycles lose, mA; zero where they gain some."""
+    lost = sum(float(cycle.current[0] - cycle.current[-1]) for cycle in cycles)
+    return max(lost, 0.0)
 
 
 def is_refilled(split: Split) -> bool:
@@ -139,9 +151,8 @@ def is_refilled(split: Split) -> bool:
     cycles = split.segments
     if len(cycles) < FEWEST_CYCLES:
         return False
-    lost = sum(float(cycle.current[0] - cycle.current[-1]) for cycle in cycles)
     refills = [event.change for event in split.events if event.kind in ("refill", "ramp")]
-    return len(refills) + 1 >= FEWEST_CYCLES and sum(refills) > RETURNED * max(lost, 0.0)
+    return len(refills) + 1 >= FEWEST_CYCLES and sum(refills) > RETURNED * lost_in(cycles)
 
 
 def is_sawtooth(residuals: np.ndarray) -> bool:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -18,6 +18,8 @@ THRESHOLD = 10.0
 # Readings below this share of the largest one near them are dropouts of the monitor.
 DROPOUT = 0.02
 WINDOW = 9
+# A record shows the beam in a hundredth of its readings at least.
+SEEN = 0.99
 FEWEST = 8
 # Readings that tell the noise near one, and the error of the median of `WINDOW` over theirs.
 NEIGHBOURS, OF_MEDIAN = 21, 0.42
@@ -109,13 +111,14 @@ def _dropouts(current: np.ndarray) -> tuple[np.ndarray, int]:
     """Readings near zero although the beam comes back, and where it is gone for good."""
     flagged = np.zeros(current.size, bool)
     # Readings before the beam is seen have no reading before them to compare with.
-    beam = np.median(current[current > 0]) if np.any(current > 0) else 0.0
+    beam = np.quantile(current[current > 0], SEEN) if np.any(current > 0) else 0.0
     flagged[: int(np.argmax(current > DROPOUT * beam))] = True
-    for start in np.flatnonzero(current[1:] < DROPOUT * current[:-1]) + 1:
+    # A beam may be dumped over some readings.
+    before = maximum_filter1d(current, WINDOW, origin=WINDOW // 2)[:-1]
+    for start in np.flatnonzero(current[1:] < DROPOUT * before) + 1:
         if flagged[start]:
             continue
-        before = current[max(start - WINDOW, 0) : start].max()  # a beam may be dumped over some
-        back = _first_above(current, start, DROPOUT * before)
+        back = _first_above(current, start, DROPOUT * before[start - 1])
         if back == current.size:
             return flagged, int(start)
         flagged[start:back] = True
@@ -272,8 +275,8 @@ def _ramp(current: np.ndarray, noise: float) -> int:
 
 
 def _is_slow_step(beyond: np.ndarray, change: np.ndarray) -> np.ndarray:
-    """Which changes from mean to mean are more than the law: not at the head, where what falls fast
-    may be the law and what rises is a ramp; at the end, where nothing comes after, much more.
+    """Which changes from mean to mean are more than the law: not at the head, where what rises is a
+    ramp; at the end, where nothing comes after, much more.
     """
     seen, ends = (beyond < 0) | (beyond > 0) & (change > 0), WINDOW // 2
     seen[:ends] = False
@@ -282,21 +285,27 @@ def _is_slow_step(beyond: np.ndarray, change: np.ndarray) -> np.ndarray:
 
 
 def _slow_steps(
-    time: np.ndarray, level: np.ndarray, steps: np.ndarray, noise: float
+    time: np.ndarray, level: np.ndarray, steps: Mapping[int, float], noise: float
 ) -> list[tuple[int, int, bool]]:
     """First and past-the-last readings of falls and rises of many readings, and if it is a rise:
-    steps of the means of 2, 4, 8, ... neighbours, besides those of single readings.
+    steps of the means of 2, 4, 8, ... neighbours, besides those of single readings. Fresh beam, as
+    after a rise, may fall fast by itself.
     """
     cuts, found = np.array([-level.size, *steps, 2 * level.size]), []
     known, size = np.zeros(level.size, bool), 2
-    known[steps] = True
+    known[list(steps)] = True
     while (count := level.size // size) >= COARSE:
         t, x, old = (v[: count * size].reshape(count, size).mean(1) for v in (time, level, known))
         beyond = _steps(t, x, noise)
         apart = (old[1:] == 0) & (old[:-1] == 0)
+        refills = [k for k, change in steps.items() if change > 0]
+        fresh = np.sort([0, *refills, *(end for _, end, rises in found if rises)])
         for first, last in _runs(_is_slow_step(beyond, np.diff(x)) & apart):
             # Half as many readings again: what ends smoothly still counts there.
             begin, end = first * size, (last + 1) * size + (last + 1 - first) * size // 2
+            since = begin - fresh[np.searchsorted(fresh, begin, "right") - 1]
+            if beyond[first] < 0 and since < WINDOW // 2 * size:
+                continue
             place = np.searchsorted(cuts, begin, "right")
             before, after = cuts[place - 1], cuts[place]
             begin = before if begin - before < 2 * size else begin  # beside a step none was sought
@@ -343,11 +352,10 @@ def split_record(record: DecayRecord) -> Split:
     time, current = record.time[kept], record.current[kept]
     noise = _noise(record, time, current)
     beyond = _steps(time, current, noise)
-    steps = np.flatnonzero(beyond) + 1
-    for first in steps:
-        kind = "refill" if beyond[first - 1] > 0 else "loss"
+    steps = {int(k) + 1: float(beyond[k]) for k in np.flatnonzero(beyond)}
+    for first, size in steps.items():
         change = float(current[first] - current[first - 1])
-        events.append(Event(kind, float(time[first]), 0.0, change))
+        events.append(Event("refill" if size > 0 else "loss", float(time[first]), 0.0, change))
     current[1:] -= np.cumsum(beyond)
     del beyond  # of 1e7 readings 80 MB
     slow = _slow_steps(time, current, steps, noise)

@@ -49,6 +49,8 @@ SETTINGS = ("rf_voltage", "scraper_y", "bunches")
 SEEN = 6.0
 # Noise with a memory is taken for so many times what neighbouring readings scatter by.
 OWN = 3.0
+# Answers of cycles for which one law does not hold.
+REFUTED = (Status.poor_fit, Status.infeasible)
 # Probability of refills faster than the record is read from which cycles tell no lifetime.
 UNSURE = 0.05
 # Cycles that make a point of a course at least.
@@ -253,12 +255,10 @@ def budget(record: DecayRecord, machine: Machine) -> Budget:
 
 def stands_alone(cycle: DecayRecord, fit: DecayFit) -> bool:
     """Tell if a cycle by itself would separate a and b, by the bend of its decay and the noise that
-    all cycles show; where one law does not hold for all, that of its neighbouring readings.
+    all cycles show, or its neighbouring readings, where one law does not hold for all.
     """
-    noise = fit.rms_residual * fit.inflation
-    if fit.status is Status.poor_fit:
-        noise = min(noise, OWN * noise_of(cycle.time, cycle.current))
-    loss = cycle.span / HOUR / fit.lifetime_mean.value
+    noise = min(fit.rms_residual * fit.inflation, OWN * noise_of(cycle.time, cycle.current))
+    loss = math.log(cycle.current[0] / cycle.current[-1])
     # The parabola t²/2 scatters about its line by its length squared over 24 sqrt(5).
     bend = float(cycle.current.mean()) * loss**2 / 24 * math.sqrt(len(cycle) / 5)
     return noise * math.sqrt(max(len(cycle) / MOST, 1.0)) < SEPARABLE * bend
@@ -447,9 +447,13 @@ def _pooled(
             continue
         called = name if many == 1 else f"{name}@{len(pooled) + 1}"
         fit = seen_through(fit_cycles(group, called, law), *usual_cycle(group))
+        own = [c for c in group if len(c) >= FEWEST and stands_alone(c, fit)]
+        alone += own
+        known = fit.status not in REFUTED and fit.lifetime_mean.error is not None
+        if not known and len(own) == len(group):  # fills of no one law
+            continue
         segment = joined(group, called)
         pooled.append(Decay.of(segment, segment.start, fit, machine))
-        alone += [c for c in group if len(c) >= FEWEST and stands_alone(c, fit)]
     return pooled, alone
 
 

@@ -125,6 +125,18 @@ def test_what_befalls_a_record_is_no_change_of_the_loss():
     assert (state.age.max(-1) > 1100).all()
 
 
+@pytest.mark.parametrize("lasts", [10, 60])
+def test_refills_of_many_readings_are_no_change_of_the_loss(lasts):
+    beams, beam, random = [], 500.0, np.random.default_rng(0)
+    for second in range(3000):
+        left = lasts - second % 180
+        rises = second >= 180 and left > 0
+        beam = beam + (500 - beam) / left if rises else beam_after(beam, 1.0)
+        beams.append(float(beam))
+    read = np.array(beams) + 1e-3 * random.normal(size=3000)
+    assert alarms_of(USUAL, np.arange(3000.0), read) == ()
+
+
 def test_a_pressure_that_the_gauge_shows_is_no_alarm():
     time = np.arange(0.0, 900.0)
     beam = np.concatenate(

@@ -290,6 +290,53 @@ def test_a_beam_that_is_dumped_over_some_readings_is_answered(lasts, dead):
     assert abs(decay.fit.lifetime_mean.value - 10) < 3.5 * decay.fit.lifetime_mean.error
 
 
+def test_a_dump_to_what_the_monitor_shows_without_beam_ends_the_decay():
+    time = 30.0 * np.arange(1000)
+    beam = 100 * np.exp(-time / 36000)
+    beam[800:805], beam[805:] = beam[799] * np.array([0.5, 0.2, 0.07, 0.02, 0.004]), 0.2
+    noise = 1e-3 * np.random.default_rng(1).normal(size=time.size)
+    [decay] = study_record(DecayRecord(time, beam + noise)).decays
+    assert len(decay.segment) == 800
+    assert abs(decay.fit.lifetime_mean.value - 10) < 3 * decay.fit.lifetime_mean.error
+
+
+def test_noise_before_the_beam_is_no_decay():
+    time = 30.0 * np.arange(4000)
+    beam = np.where(time < 90000, 0.0, 100 * np.exp(-(time - 90000) / 36000))
+    noise = 0.01 * np.random.default_rng(1).normal(size=time.size)
+    study = study_record(DecayRecord(time, np.maximum(beam + noise, 0)))
+    assert [len(decay.segment) for decay in study.decays] == [1000]
+    assert kinds(study) == ["dropout"]
+
+
+@pytest.mark.parametrize("ramp", [0, 12])
+@pytest.mark.parametrize("hours", [(30, 4, 30), (5, 2.5, 5), (2, 8, 30, 5)])
+def test_fills_of_other_lifetimes_are_answered_each(hours, ramp):
+    """Fresh beam that decays faster is no loss, and fills of no one law have no common answer."""
+    parts, since = [], 10.0 * np.arange(800)
+    for life in hours:
+        rise = np.linspace(parts[-1][-1], 100, ramp + 2)[1:-1] if parts else []
+        parts += [rise, 100 * np.exp(-since / 3600 / life)]
+    beam = np.concatenate(parts)
+    noise = 1e-3 * np.random.default_rng(1).normal(size=beam.size)
+    study = study_record(DecayRecord(10.0 * np.arange(beam.size), beam + noise))
+    assert not study.pooled
+    for decay, life in zip(study.decays, hours, strict=True):
+        assert len(decay.segment) > 770
+        found = decay.fit.lifetime_mean
+        assert abs(found.value - life) < 4 * found.error < 1e-3 * life
+
+
+def test_fills_of_very_different_lifetimes_are_not_cut_finer():
+    """One law does not hold for all of them: what it leaves is no refill."""
+    time, parts = 10.0 * np.arange(2000), []
+    for life in (1.3, 30.0, 4.0, 11.0):
+        parts.append(100 * np.exp(-time / 3600 / life))
+    noise = 0.01 * np.random.default_rng(4).normal(size=8000)
+    study = study_record(DecayRecord(10.0 * np.arange(8000), np.concatenate(parts) + noise))
+    assert [len(decay.segment) for decay in study.decays] == [2000] * 4
+
+
 def test_a_law_that_bends_fast_has_no_steps():
     time = np.linspace(0.0, 1.0, 800)
     for beam in (np.exp(-8 * time), 1 / (1 + 30 * time), np.exp(-2 * time) + np.exp(-30 * time)):
