@@ -224,7 +224,7 @@ HELD = {
     f"{DECAY}.fit": "DecayFit",
     f"{DECAY}.evidence": "Separability RatePart",
     f"{DECAY}.alternatives": "ConstantA LifetimeLaw Change Outgassing SuddenLoss",
-    f"{DECAY}.marginal": "FreeLaw",
+    f"{DECAY}.free_law": "FreeLaw",
     f"{OPTICS}.beamline": "Beamline Design",
     f"{OPTICS}.elements": "Drift Quadrupole ThinLens SectorDipole Marker Screen TransferMatrix",
     f"{OPTICS}.sections": "LineSection ElementSeries",

@@ -412,9 +412,10 @@ FEWEST_CYCLES, FEWEST_READINGS = 3, 3
 MOST = 16384
 # Robust standard deviations off which a reading or a cycle is left out; at most this share of them.
 OUTLIER, SHARE = 7.0, 0.2
-# Errors of the mean by which readings at the edges of cycles lie off the law where they are of an
-# injection: what stays below moves the lifetime by no more than its error.
-EDGE, WITHIN = 2.5, "they lie within injections"
+# Errors of the mean by which readings at the edges of cycles lie off the law where they are left
+# out: as one number more, what they lie off by would foretell better (H. Akaike, IEEE Trans. Autom.
+# Control 19 (1974) 716).
+EDGE, WITHIN = math.sqrt(2.0), "they lie within injections"
 # Neighbours that tell where a cycle, or a reading at the edge of one, should lie.
 NEXT = 9
 
