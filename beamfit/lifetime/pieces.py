@@ -284,36 +284,60 @@ def _is_slow_step(beyond: np.ndarray, change: np.ndarray) -> np.ndarray:
     return seen
 
 
+class SlowStep(NamedTuple):
+    """A fall or a rise of many readings: the first, the one past the last, and if it is a rise."""
+
+    first: int
+    end: int
+    rises: bool
+
+
+def _bounds(first: int, last: int, size: int, cuts: np.ndarray) -> tuple[int, int]:
+    """Readings of a step from one mean of so many to another, up to one that was found before if
+    that is near: beside it none was sought. Half as many again are left out, where a step that ends
+    smoothly still counts.
+    """
+    begin, end = first * size, (last + 1) * size + (last + 1 - first) * size // 2
+    place = np.searchsorted(cuts, begin, "right")
+    before, after = int(cuts[place - 1]), int(cuts[place])
+    return before if begin - before < 2 * size else begin, after if after - end < 2 * size else end
+
+
 def _slow_steps(
     time: np.ndarray, level: np.ndarray, steps: Mapping[int, float], noise: float
-) -> list[tuple[int, int, bool]]:
-    """First and past-the-last readings of falls and rises of many readings, and if it is a rise:
-    steps of the means of 2, 4, 8, ... neighbours, besides those of single readings. Fresh beam, as
-    after a rise, may fall fast by itself.
+) -> list[SlowStep]:
+    """Falls and rises of many readings: steps of means of 2, 4, 8, ... neighbours, besides those
+    of single readings. Fresh beam, as after a rise, may fall fast by itself.
     """
-    cuts, found = np.array([-level.size, *steps, 2 * level.size]), []
-    known, size = np.zeros(level.size, bool), 2
+    known, size, found = np.zeros(level.size, bool), 2, []
     known[list(steps)] = True
+    refills = [first for first, change in steps.items() if change > 0]
     while (count := level.size // size) >= COARSE:
         t, x, old = (v[: count * size].reshape(count, size).mean(1) for v in (time, level, known))
         beyond = _steps(t, x, noise)
         apart = (old[1:] == 0) & (old[:-1] == 0)
-        refills = [k for k, change in steps.items() if change > 0]
-        fresh = np.sort([0, *refills, *(end for _, end, rises in found if rises)])
+        fresh = np.sort([0, *refills, *(step.end for step in found if step.rises)])
+        ends = [end for step in found for end in (step.first, step.end)]
+        cuts = np.sort([-level.size, *steps, *ends, 2 * level.size])
         for first, last in _runs(_is_slow_step(beyond, np.diff(x)) & apart):
-            # Half as many readings again: what ends smoothly still counts there.
-            begin, end = first * size, (last + 1) * size + (last + 1 - first) * size // 2
-            since = begin - fresh[np.searchsorted(fresh, begin, "right") - 1]
-            if beyond[first] < 0 and since < WINDOW // 2 * size:
-                continue
-            place = np.searchsorted(cuts, begin, "right")
-            before, after = cuts[place - 1], cuts[place]
-            begin = before if begin - before < 2 * size else begin  # beside a step none was sought
-            end = after if after - end < 2 * size else min(end, level.size)
-            known[begin:end] = True
-            found.append((int(begin), int(end), bool(beyond[first] > 0)))
+            since = first * size - fresh[np.searchsorted(fresh, first * size, "right") - 1]
+            if beyond[first] > 0 or since >= WINDOW // 2 * size:
+                begin, end = _bounds(first, last, size, cuts)
+                found.append(SlowStep(begin, min(end, level.size), bool(beyond[first] > 0)))
+                known[begin:end] = True
         size *= 2
-    return sorted(found)
+    return _joined(found)
+
+
+def _joined(steps: list[SlowStep]) -> list[SlowStep]:
+    """Steps in order, those that overlap as one."""
+    apart: list[SlowStep] = []
+    for step in sorted(steps):
+        if apart and step.first < apart[-1].end:
+            before = apart.pop()
+            step = before._replace(end=max(step.end, before.end))
+        apart.append(step)
+    return apart
 
 
 def split_record(record: DecayRecord) -> Split:

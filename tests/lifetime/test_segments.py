@@ -393,3 +393,20 @@ def test_a_staircase_quotes_its_lifetime_at_the_mean_of_its_readings():
     assert decay.fit.mean_current == pytest.approx(mean)
     found = decay.fit.lifetime_mean
     assert abs(found.value - 20000 * 300 / mean / 3600) < 2 * found.error
+
+
+def test_readings_between_overlapping_steps_are_of_neither_side():
+    """A loss in two strokes, one beside the other."""
+    time = 10.0 * np.arange(3000)
+    share = np.clip((np.arange(3000) - 1500) / 12, 0, 1) + np.clip(
+        (np.arange(3000) - 1520) / 100, 0, 1
+    )
+    beam = 100 * np.exp(-time / 36000) * (1 - 0.2 * share)
+    noise = 1e-3 * np.random.default_rng(1).normal(size=3000)
+    split = split_record(DecayRecord(time, beam + noise))
+    ends = [event.time + event.duration for event in split.events]
+    assert all(e.time >= before for e, before in zip(split.events[1:], ends, strict=False))
+    assert len(split.segments) == 2
+    for part in split.segments:
+        slope = np.polyfit(part.time, np.log(part.current), 1)[0]
+        assert slope == pytest.approx(-1 / 36000, rel=1e-3)
