@@ -438,9 +438,8 @@ def _shown(usual: Reference, state: AlarmState) -> tuple[np.ndarray, np.ndarray]
     seen = seen_in(state, slice(None, -1))
     old = state.age[..., :-1] >= MINUTE
     most = np.where(old, np.maximum(*seen.squares[:2]), 0.0)
-    best = np.argmax(most, axis=-1)
     if most.max(initial=0.0) <= 2 * least:  # no evidence is above half of that
-        return np.zeros(best.shape, bool), best
+        return np.zeros(state.time.shape, bool), np.zeros(state.time.shape, int)
     evidence = np.where(old, np.logaddexp(*seen.evidence[:2]) - math.log(2.0), -np.inf)
     return evidence.max(-1) > least, np.argmax(evidence, axis=-1)
 

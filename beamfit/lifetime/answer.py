@@ -83,12 +83,16 @@ def _lost(e: Evidence) -> Finding | None:
     return Finding(Status.not_finite, cause)
 
 
+def _is_level(e: Evidence) -> bool:
+    """True if the readings tell no loss, of either sign."""
+    rate, error = e.sure("rate_mean")
+    return not e.separability.separable and error > DETERMINED * abs(rate)
+
+
 def _held(e: Evidence) -> Finding | None:
     """Refills that an archive is too slow to resolve: readings even between two currents."""
-    rate, error = e.sure("rate_mean")
     digit = math.inf if e.record is None else e.record.resolution or 0.0
-    told = e.separability.separable or error <= DETERMINED * abs(rate)
-    if told or digit >= np.std(e.residuals) or not is_sawtooth(e.residuals):
+    if not _is_level(e) or digit >= np.std(e.residuals) or not is_sawtooth(e.residuals):
         return None
     return Finding(
         Status.unidentified,
@@ -99,9 +103,9 @@ def _held(e: Evidence) -> Finding | None:
 
 
 def _within_noise(e: Evidence) -> Finding | None:
-    rate, error = e.sure("rate_mean")
-    if e.separability.separable or error <= DETERMINED * abs(rate):
+    if not _is_level(e):
         return None
+    rate, error = e.sure("rate_mean")
     # A rate below zero by chance is no reason for a longer lifetime than that of a rate of zero.
     limit = 1 / (max(rate, 0.0) + LIMIT * error) / HOUR
     return Finding(

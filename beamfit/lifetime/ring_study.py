@@ -577,7 +577,7 @@ class Shift:
 
     @property
     def message(self) -> str:
-        """Status of the scales."""
+        """Sentence on the scales."""
         return self.fit.message
 
     @property

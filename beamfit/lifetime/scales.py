@@ -14,7 +14,7 @@ import numpy as np
 from jax import Array
 
 from beamfit.answer import json_of, shown
-from beamfit.errors import Finding, InputError, judge, nearest
+from beamfit.errors import Finding, InputError, Judged, judge, nearest
 from beamfit.greybox.covariance import Spread, spread_of
 from beamfit.greybox.fit import Fit
 from beamfit.greybox.posterior import Optimum, Statement, target_of
@@ -230,7 +230,7 @@ _by_scales = jax.jit(jax.jacfwd(pulls))
 
 @shown
 @dataclass(frozen=True, eq=False)
-class ScaleFit:
+class ScaleFit(Judged):
     """Scales on the mechanisms of first principles, from many decays.
 
     Parameters
@@ -311,24 +311,15 @@ class ScaleFit:
 
     @cached_property
     def finding(self) -> Finding:
-        """Status and sentences on the scales."""
+        """Status and sentences on the scales: `converged`; `poor_fit` if chi² is improbable;
+        `unidentified` if a mechanism is not separable from the others; `not_converged` if the
+        search failed.
+        """
         found, voltage = judge(self, RULES), self.scales.get(VOLTAGE)
         if voltage is None or voltage.error is not None:
             return found
         said = f"{found.cause} The decays do not tell the scale of the RF voltage: its prior does."
         return Finding(found.status, said)
-
-    @property
-    def status(self) -> Status:
-        """`converged`; `poor_fit` if chi² is improbable; `unidentified` if a mechanism is not
-        separable from the others; `not_converged` if the search failed.
-        """
-        return self.finding.status
-
-    @property
-    def message(self) -> str:
-        """Cause and remedy."""
-        return self.finding.cause
 
     @property
     def voltages(self) -> np.ndarray | None:

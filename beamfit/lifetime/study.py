@@ -479,15 +479,17 @@ def _decays(record: DecayRecord) -> tuple[list[DecayRecord], tuple[Event, ...]]:
         return [record], ()
     split = split_record(record)
     pieces = [piece for segment in split.segments for piece in at_settings(segment)]
+    if pieces:
+        return pieces, split.events
     moving = [name for name, steps in _steps(record).items() if steps.any()]
     kinds = {event.kind for event in split.events}
-    if not pieces and (moving or "short" not in kinds):
+    if moving or "short" not in kinds:
         changes = f"changes of {', '.join(moving)} by more than {100 * CHANGED:g} %"
         found = ", ".join(sorted(kinds)) or changes
         expected = f"at least {FEWEST} readings in a row of a stored beam"
         expected += "; leave out a setting that only scatters with --ignore" if moving else ""
         raise InputError(f"no decay between {found}", expected, record.name, column="current")
-    return pieces, split.events
+    return [], split.events
 
 
 def _fitted(
