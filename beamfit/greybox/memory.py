@@ -86,6 +86,10 @@ class Memory(NamedTuple):
         """That."""
         return CorrelatedNoise(float(self.time[self.likely]), float(self.white[self.likely]))
 
+    def of_last(self, numbers: int) -> Memory:
+        """The same of the last numbers, whatever the others are."""
+        return self._replace(step=self.step[:, -numbers:], half=self.half[:, -numbers:])
+
     @property
     def mean_step(self) -> np.ndarray:
         """The step, averaged over noises."""
@@ -167,6 +171,21 @@ class Whitened(NamedTuple):
         """-2 ln L by the likeliest noise, up to a constant."""
         squares = self.memory(numbers).squares
         return float(np.min(self.count * np.log(squares / self.count) - 2.0 * self.volume))
+
+    def with_widths(self, widths: Sequence[tuple[float, float]], numbers: int) -> Whitened:
+        """With normal priors about zero on the first `numbers`: each of some widths, over the
+        noise, with a probability.
+        """
+        width, chance = np.array(widths).T
+        known = np.eye(numbers, self.triangle.shape[2]) / width[:, None, None]
+        logs = np.log(chance) - numbers * np.log(width)
+        every = np.repeat(self.triangle, len(widths), axis=0)
+        known = np.tile(known, (len(self.triangle), 1, 1))
+        return Whitened(
+            CorrelatedNoise(*np.repeat(self.noise, len(widths), axis=1)),
+            np.concatenate([every, known], axis=1),
+            (self.volume[:, None] + logs).ravel(), self.count + numbers,
+        )  # fmt: skip
 
     def evidence(self) -> float:
         """-2 ln of the probability of the values, numbers and noise integrated out: up to a

@@ -11,7 +11,7 @@ import numpy as np
 
 from beamfit.errors import Finding, Status, judge
 from beamfit.lifetime.alternatives import ConstantA, LifetimeLaw, Outgassing
-from beamfit.lifetime.cycles import is_sawtooth
+from beamfit.lifetime.cycles import HELD, is_sawtooth, lives_longer
 from beamfit.lifetime.evidence import (
     BELIEVED,
     DETERMINED,
@@ -108,6 +108,13 @@ def _within_noise(e: Evidence) -> Finding | None:
     rate, error = e.sure("rate_mean")
     # A rate below zero by chance is no reason for a longer lifetime than that of a rate of zero.
     limit = 1 / (max(rate, 0.0) + LIMIT * error) / HOUR
+    if lives_longer(limit * HOUR) < HELD:
+        return Finding(
+            Status.unidentified,
+            "The current does not fall: that refills hold the beam, which the noise hides, is "
+            "likelier than so long a lifetime. No limit is given; record more readings "
+            "from refill to refill, or with less noise",
+        )
     return Finding(
         Status.unidentified,
         f"The decay is within its noise: the lifetime is above {limit:.3g} h at 95 %, unless "

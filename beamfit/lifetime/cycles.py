@@ -50,8 +50,6 @@ BLOCK = 16
 NEAR = 8
 # How often steps are sought with the law that those found leave.
 ROUNDS = 20
-# From so many times the cycles and some more on the finer search is taken.
-MORE, FEW = 1.1, 1
 # Share of the usual length below which a piece is the head of a cycle, as of fresh beam.
 SHORT = 0.25
 # Least step as a share of what is lost in the piece that it divides.
@@ -67,8 +65,10 @@ NARROW = 0.02
 NOISES, EVEN = (0.01, 0.03, 0.1, 0.2), math.log(1000.0)
 # Refills of top-up come every 3 min, within a factor 3, those of fills hours apart; lifetimes are
 # 15 h within a factor 3, the rest within seconds to years:
-# middle, s, width of the logarithm, and its whole range.
+# middle, s, width of the logarithm, and its whole range about that.
 PERIOD, LIFETIME = (180.0, 1.2, 12.0), (15 * 3600.0, 1.2, 17.0)
+# Of these so many are usual; and records without a decay so often have refills that none shows.
+USUAL, HELD = 0.8, 0.1
 # Readings beyond which the scatter of their mean is followed no farther.
 LONG = 4096
 
@@ -131,7 +131,7 @@ def cut_at_refills(record: DecayRecord) -> Split:
     """
     clear, fine = split_record(record), find_cycles(record)
     count, more = len(clear.segments), len(fine.segments)
-    if more <= MORE * count + FEW or not is_refilled(fine):
+    if more <= count or not is_refilled(fine):
         return clear
     given_back = 1 - lost_in(clear.segments) / max(lost_in(fine.segments), 1e-300)
     return fine if given_back > RETURNED * (1 - count / more) else clear
@@ -211,10 +211,23 @@ def unresolved(usual: float, interval: float, lifetime: float) -> float:
     return others / max(others + same, 1e-300)
 
 
+def lives_longer(lifetime: float) -> float:
+    """Prior probability of lifetimes beyond one, s.
+
+    Examples
+    --------
+    >>> f"{lives_longer(15 * 3600.0):.2f}, {lives_longer(1000 * 3600.0):.2f}"
+    '0.50, 0.05'
+    """
+    middle, width, wide = LIFETIME
+    far = math.log(lifetime / middle)
+    return USUAL * float(ndtr(-far / width)) + (1 - USUAL) * max(0.5 - far / wide, 0.0)
+
+
 def _prior(value: np.ndarray, middle: float, width: float, wide: float) -> np.ndarray:
-    """Density in the logarithm: normal about the middle, a fifth of it flat over a wide range."""
+    """Density in the logarithm: normal about the middle, a part of it flat over a wide range."""
     normal = np.exp(-0.5 * (np.log(value / middle) / width) ** 2) / math.sqrt(2 * math.pi) / width
-    return 0.8 * normal + 0.2 / wide
+    return USUAL * normal + (1 - USUAL) / wide
 
 
 def _levelled(time: np.ndarray, current: np.ndarray, first: np.ndarray) -> np.ndarray:
@@ -413,8 +426,7 @@ MOST = 16384
 # Robust standard deviations off which a reading or a cycle is left out; at most this share of them.
 OUTLIER, SHARE = 7.0, 0.2
 # Errors of the mean by which readings at the edges of cycles lie off the law where they are of an
-# injection: what stays below moves the lifetime of short cycles by an error or two. With less, good
-# readings go one after the other.
+# injection: what stays below is in the errors (`beamfit.lifetime.expansion.SHIFTS`).
 EDGE, WITHIN = 2.5, "they lie within injections"
 # Neighbours that tell where a cycle, or a reading at the edge of one, should lie.
 NEXT = 9

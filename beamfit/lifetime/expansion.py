@@ -46,6 +46,11 @@ SLOW, FEWEST = 3.0, 12
 DETERMINED = 1 / 3
 # Noises of so small a part of the largest probability move no digit.
 NO_WEIGHT = 1e-12
+# Readings at the edges of cycles may lie within refills, or beside them: standard deviations of
+# what these have in common, over the noise, and their prior probabilities.
+SHIFTS = ((0.01, 0.5), *((width, 0.1) for width in (0.1, 0.3, 1.0, 3.0, 10.0)))
+# Readings of a cycle whose inner ones tell a rate.
+LONG = 5
 # Steps by which slopes are taken: imaginary ones lose no digit, but a shape takes real numbers.
 IMAGINARY, REAL = 1e-30, 1e-5
 
@@ -400,7 +405,7 @@ class Expansion:
         if not independent:
             least = list(columns) in (self.columns(), self.columns(POWER))
             found = self._with_power if least else self._whitened(columns)
-            found = found.memory(len(columns))
+            found = found.memory(self.shifted.shape[1] + len(columns)).of_last(len(columns))
             kept = found.weight > NO_WEIGHT * found.weight.max()
             return Memory(*(part[kept] for part in found[:-1]), found.dof)
         known = np.append(np.equal(columns, QUADRATIC), self.numbers[QUADRATIC - 1])
@@ -437,12 +442,12 @@ class Expansion:
         return self._whitened(self.columns(POWER))
 
     def _whitened(self, columns: Sequence[int]) -> Whitened:
-        """Slopes by some columns and residuals, whitened by each noise; the cycles of a part, in
-        which a departure is one of the loss, by themselves.
+        """Slopes by shifts of edges, by some columns and residuals, whitened by each noise; the
+        cycles of a part, in which a departure is one of the loss, by themselves.
         """
         time, own = self.pieces.time, self.parts or Parts(np.zeros(1, int), np.zeros((1, 0)), None)
         plain = [column for column in columns if column < self.rows.shape[1] - own.shares.shape[1]]
-        rows = np.column_stack([self.rows[:, plain], self.residuals])
+        rows = np.column_stack([self.shifted, self.rows[:, plain], self.residuals])
         if self.levels is None:
             return whitened_by_each(usual_noises(time), [(rows, time)])
         first, slope = self.levels
@@ -454,9 +459,23 @@ class Expansion:
         ]
         found = whitened_by_each(grid, [(rows[part], time[part]) for part in ends], levels=levels)
         triangle, count = found.triangle, found.triangle.shape[1] // len(ends)
-        more = triangle[..., :1] * np.repeat(own.shares, count, axis=0)
-        parts = (triangle[..., : len(PLAIN)], more, triangle[..., len(PLAIN) :])
-        return found._replace(triangle=np.concatenate(parts, axis=2))
+        begin = self.shifted.shape[1]
+        more = triangle[..., [begin]] * np.repeat(own.shares, count, axis=0)
+        parts = np.split(triangle, [begin + len(PLAIN)], axis=2)
+        found = found._replace(triangle=np.concatenate([parts[0], more, parts[1]], axis=2))
+        return found.with_widths(SHIFTS, begin)
+
+    @cached_property
+    def shifted(self) -> np.ndarray:
+        """Slopes of the residuals by a shift of the first and of the last readings of all cycles,
+        which may lie within refills; no column of a single decay.
+        """
+        if self.levels is None:
+            return np.zeros((self.residuals.size, 0))
+        first, lengths = self.pieces.first, self.pieces.lengths
+        long, found = lengths >= LONG, np.zeros((self.residuals.size, 2))
+        found[first[long], 0] = found[(first + lengths - 1)[long], 1] = 1.0
+        return found
 
     def moved(self, change: np.ndarray) -> Physical:
         """Shift the values by a change of the readings, over their errors, by least squares;

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 from scipy.signal import lfilter
+from scipy.stats import binom
 
 from beamfit.errors import InputError
 from beamfit.greybox.memory import whitened_by_each
@@ -171,6 +172,40 @@ def test_ramps_are_cut_and_fresh_beam_that_decays_fast_is_no_spike():
         off = fit.lifetime_mean.value - true_lifetime(fit.mean_current)
         assert abs(off) < 3 * fit.lifetime_mean.error
         assert fit.lifetime_mean.error < 0.02
+
+
+@simulations(20, 60)
+def test_readings_within_short_refills_are_in_the_errors(count):
+    """Refills take 10 s every 183 s and are read every 20 s: every other has a reading within."""
+    held = 0
+    for seed in range(count):
+        time, current, number = top_up(0.1, seed, cycle=183.0, step=20.0, hours=3.0)
+        rest = 183 * (number + 1) - time
+        within = np.where(rest < 10, 500 * 183 / LIFETIME * (1 - rest / 10), 0.0)
+        [decay] = study_record(DecayRecord(time, current + within)).answers
+        low, high = decay.fit.lifetime_mean.interval_95
+        assert decay.fit.lifetime_mean.error < 0.02 * LIFETIME / 3600
+        held += low <= true_lifetime(decay.fit.mean_current) <= high
+    assert held >= binom.ppf(0.01, count, 0.95)
+
+
+def test_a_few_refills_that_the_clear_search_misses_are_cut():
+    """A reading halfway up divides a refill in two, of which neither stands out there."""
+    time, current, number = top_up(0.3, 2, cycle=430.0, step=13.4, hours=20.0)
+    rest = 430 * (number + 1) - time
+    current = current + np.where(rest < 4, 500 * 430 / LIFETIME * (1 - rest / 4), 0.0)
+    [pooled] = study_record(DecayRecord(time, current)).pooled
+    assert abs(pooled.fit.first.size - number[-1] - 1) <= 1
+
+
+def test_a_current_that_does_not_fall_has_no_limit():
+    """Of 500 mA with 0.02 mA of noise: no beam lives 1e5 h, refills hold many."""
+    rng = np.random.default_rng(1)
+    time = np.arange(0.0, 8 * 3600.0, 60.0)
+    [decay] = study_record(DecayRecord(time, 500 + 0.02 * rng.normal(size=time.size))).answers
+    assert decay.fit.lifetime_mean.error is None
+    assert "refills hold the beam" in decay.fit.message
+    assert "above" not in decay.fit.message
 
 
 def test_readings_and_cycles_far_off_are_left_out_and_counted():

@@ -174,12 +174,12 @@ def test_a_drift_under_white_noise_is_seldom_a_change_of_the_loss_rate(count):
 @simulations(5, 20)
 def test_no_record_of_noise_says_more_than_that_its_loss_rate_is_zero(count):
     """Error of a slope: noise sqrt(12/n)/T. Rates below zero by chance made 1e5 h and more."""
-    rng, rows = np.random.default_rng(3), 200
+    rng, rows, span = np.random.default_rng(3), 200, 2.0
     records = [
-        DecayRecord(np.linspace(0, SPAN, rows), 500 + 0.02 * rng.normal(size=rows))
+        DecayRecord(np.linspace(0, span, rows), 500 + 0.02 * rng.normal(size=rows))
         for _ in range(count)
     ]
-    limit = SPAN * 500 / (1.645 * 0.02 * np.sqrt(12 / rows)) / HOUR
+    limit = span * 500 / (1.645 * 0.02 * np.sqrt(12 / rows)) / HOUR
     said = [re.search(r"above ([\d.e+]+) h at 95 %", f.message) for f in fit_decays(records)]
     assert len(said) == count
     assert max(float(found[1]) for found in said) < 1.3 * limit
