@@ -278,7 +278,7 @@ class Beamline:
         Raises
         ------
         InputError
-            If a setting names no magnet of the line.
+            If a setting names no magnet of the line, or is no single number.
 
         Notes
         -----
@@ -310,7 +310,7 @@ class Beamline:
         Raises
         ------
         InputError
-            If a setting names no magnet of the line, or a place no element.
+            If a setting names no magnet of the line or is no single number, or a place no element.
 
         Examples
         --------
@@ -325,6 +325,10 @@ class Beamline:
             raise InputError(
                 f"a setting for '{unknown[0]}'", nearest(unknown[0], list(self.magnets))
             )
+        for name, setting in settings.items():
+            if jnp.ndim(setting):
+                many = "one number; jax.vmap takes a function of it to many"
+                raise InputError(f"{jnp.size(setting)} settings of '{name}' at once", many)
         settings = {member: v for name, v in settings.items() for member in self.members(name)}
         for place in places:
             self._index(place)

@@ -195,6 +195,12 @@ def test_unknown_magnet_offers_the_nearest(gtf):
         gtf.matrix({"QZ2": 1.0})
 
 
+def test_several_settings_at_once_are_refused(gtf):
+    """An array would be taken for as many magnets in a row."""
+    with pytest.raises(InputError, match=r"2 settings of 'Q2' at once.*vmap"):
+        gtf.matrix({"Q2": np.array([1.0, 2.0])})
+
+
 def test_magnets_of_one_name_share_a_setting():
     line = Beamline((Quadrupole("Q", 0.1), Drift("D", 1.0), Quadrupole("Q", 0.1)), energy=100.0)
     single = Quadrupole("Q", 0.1).matrix(3.0)
