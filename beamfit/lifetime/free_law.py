@@ -16,11 +16,12 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
 from numpy.polynomial.chebyshev import chebint, chebvander
-from scipy.special import gammaln, log_ndtr, logsumexp
+from scipy.special import gammaincinv, gammaln, log_ndtr, logsumexp, ndtri
 
 from beamfit.lifetime.decay_law import closed_form
 from beamfit.lifetime.expansion import Physical
@@ -183,12 +184,12 @@ def log_pumped(share, gas, pace, xp=np):
 PUMPED = 0.5
 # Exponents, or paces, looked at, in ever narrower ranges, and steps of the search with each.
 PLACES, RANGES, STEPS = 33, 5, 6
+RESTS = 0.2
 # Readings beyond which neighbours are averaged: the curve is smooth between them.
 ENOUGH = 1024
-# Draws of laws that are quoted and of their rivals, and how many times as many where they are worth
-# too few; the degrees of freedom of what they come from; how many independent ones an answer needs,
-# and the ends of its interval: a fortieth lies beyond each.
-DRAWS, FEW, AGAIN, TAIL, WORTH, ENDS_WORTH = 6000, 3000, 10, 8.0, 200.0, 2000.0
+# Draws of each law at first, of how many independent ones all together are to be worth, and most of
+# them; the degrees of freedom of what they come from.
+FEW, WORTH, MANY, TAIL = 512, 2000.0, 60000, 8.0
 # Draws worth less tell no error. More is enough: constant a and b in their place would be too sure.
 LEAST_WORTH = 10.0
 # Width of the share in what draws come from, which its bounds cut off otherwise.
@@ -288,9 +289,11 @@ class SeenDecay:
         """The same with some of the noises."""
         return replace(self, products=self.products.some(kept))
 
-    def log_size(self, numbers: Numbers, kind: np.ndarray) -> np.ndarray:
-        """Log likelihood of draws in the noises of these places, which are in order."""
-        away = np.vstack([-np.ones(kind.size), numbers.currents(self.gas) - self.origin])
+    def log_size(self, currents: np.ndarray, kind: np.ndarray) -> np.ndarray:
+        """Log likelihood of currents at the nodes, (14, d), in the noises of these places, which
+        are in order.
+        """
+        away = np.vstack([-np.ones(kind.size), currents - self.origin])
         squares, products = np.empty(kind.size), self.products
         ends = np.searchsorted(kind, np.arange(len(products.matrix) + 1))
         for matrix, *part in zip(products.matrix, ends[:-1], ends[1:], strict=True):
@@ -298,19 +301,11 @@ class SeenDecay:
             squares[slice(*part)] = np.sum(some * (matrix @ some), axis=0)
         return products.log_size(np.maximum(squares, 1e-30))
 
-    def left(self, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Sums of squares (k, m) by noise and set of numbers, and products with node columns."""
-        away = Numbers.of(numbers).currents(self.gas) - self.origin
-        matrix, along = self.products.matrix[:, 1:, 1:], self.products.matrix[:, 0, 1:]
-        pulled = matrix @ away
-        first = self.products.matrix[:, 0, 0][:, None]
-        squares = first - 2 * along @ away + np.sum(away * pulled, axis=1)
-        return np.maximum(squares, 1e-30), along[:, :, None] - pulled
-
 
 class Peaks(NamedTuple):
-    """Normal approximations by noise (k) and place (m): centre, lower triangle of the inverse
-    covariance, log of the integral; and numbers (6, m) about which the last step was taken.
+    """Normal approximations by noise (k) and place (m): centre (p, k, m), lower triangle of the
+    inverse covariance (p, p, k, m), log of the integral; and numbers (6, m) about which the last
+    step was taken.
     """
 
     centre: np.ndarray
@@ -319,14 +314,20 @@ class Peaks(NamedTuple):
     numbers: np.ndarray
 
 
-def _slopes(seen: SeenDecay, numbers: np.ndarray, free: list[int]) -> tuple[np.ndarray, np.ndarray]:
-    """Slopes of the currents at the nodes, (14, p, m), and of the share, (p, m)."""
-    move = STEP * np.eye(6)[:, None, free, None] * np.array([1.0, -1.0])[:, None, None]
-    both = Numbers.of((numbers[:, None, None] + move).reshape(6, -1))
-    shape = (2, len(free), -1)
-    more, less = np.moveaxis(both.currents(seen.gas).reshape(NODES, *shape), 1, 0)
-    share = both.share.reshape(shape)
-    return (more - less) / (2 * STEP), (share[0] - share[1]) / (2 * STEP)
+def _seen_slopes(
+    seen: SeenDecay, numbers: np.ndarray, free: list[int]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Slopes by the free numbers and, last, values at numbers (6, m): of what the products have
+    columns of, (15, p + 1, m), and of the share of a, (p + 1, m).
+    """
+    moved = STEP * np.append(np.eye(6)[:, free], np.zeros((6, 1)), axis=1)
+    every = Numbers.of((numbers[:, None] + moved[..., None]).reshape(6, -1))
+    rows = np.empty((NODES + 1, len(free) + 1, numbers.shape[1]))
+    rows[0], share = -1.0, every.share.reshape(rows.shape[1:])
+    rows[1:] = (every.currents(seen.gas) - seen.origin).reshape(NODES, *rows.shape[1:])
+    for one in (rows, share[None]):
+        one[:, :-1] = (one[:, :-1] - one[:, -1:]) / STEP
+    return rows, share
 
 
 def _triangle(matrix: np.ndarray) -> np.ndarray:
@@ -348,11 +349,11 @@ def _forward(lower: np.ndarray, right: np.ndarray) -> np.ndarray:
     return found
 
 
-def _solved(lower: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """(L Lᵀ)⁻¹ of columns, (p, ...)."""
-    found = _forward(lower, right)
+def _backward(lower: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """L⁻ᵀ of columns, (p, ...)."""
+    found = np.empty(lower.shape[1:])
     for j in reversed(range(len(lower))):
-        found[j] = (found[j] - np.sum(lower[j + 1 :, j] * found[j + 1 :], axis=0)) / lower[j, j]
+        found[j] = (right[j] - np.sum(lower[j + 1 :, j] * found[j + 1 :], axis=0)) / lower[j, j]
     return found
 
 
@@ -372,58 +373,57 @@ def _log_within(bounds: tuple[float, float], middle: np.ndarray, sd: np.ndarray)
 
 def _expanded(seen: SeenDecay, numbers: np.ndarray, free: list[int]) -> Peaks:
     """Expand the posterior about numbers (6, m) for every noise."""
-    slopes, of_share = _slopes(seen, numbers, free)
-    squares, pulled = seen.left(numbers)
-    gradient = np.einsum("npm,knm->pkm", slopes, pulled)
-    turned = seen.products.matrix[:, 1:, 1:] @ slopes.reshape(NODES, -1)
-    normal = np.einsum("npm,knqm->pqkm", slopes, turned.reshape(-1, *slopes.shape))
+    rows, share = _seen_slopes(seen, numbers, free)
+    turned = (seen.products.matrix @ rows.reshape(len(rows), -1)).reshape(-1, *rows.shape)
+    products = np.einsum("npm,knqm->pqkm", rows, turned)
+    normal, gradient, squares = products[:-1, :-1], -products[:-1, -1], products[-1, -1]
     change = np.where(numbers[PACE, 0] > 0, PUMPED, DRIFT)
     width, middle = np.array([np.inf, np.inf, AROUND, np.inf, change])[free], np.zeros(len(free))
     middle[BEND] = 0.5
     width, middle = width[:, None], middle[:, None]
     known = np.diag(1 / width[:, 0] ** 2)[..., None, None]
     pull = ((middle - numbers[free]) / width**2)[:, None]
-    after = squares
+    after = np.maximum(squares, 1e-30)
     for _ in range(2):
         unit = seen.products.variance(after, len(free))
-        precision = normal / unit + known
-        lower = _triangle(precision)
-        step = _solved(lower, gradient / unit + pull)
+        lower = _triangle(normal / unit + known)
+        step = _backward(lower, _forward(lower, gradient / unit + pull))
         after = squares - 2 * np.sum(step * gradient, axis=0)
         after = np.maximum(after + np.einsum("pkm,pqkm,qkm->km", step, normal, step), 1e-30)
     centre = numbers[free][:, None] + step
     log = seen.products.log_prior[:, None] + seen.products.log_size(after)
     log = log - np.sum(np.log(np.einsum("ppkm->pkm", lower)), axis=0)
     log = log - 0.5 * np.sum(((centre - middle[:, None]) / width[:, None]) ** 2, axis=0)
-    share = Numbers.of(numbers).share + np.einsum("pm,pkm->km", of_share, step)
-    log = log + _log_within(seen.share, share, _spread(lower, of_share[:, None]))
+    by_share = share[:-1, None]
+    moved = share[-1] + np.sum(by_share * step, axis=0)
+    log = log + _log_within(seen.share, moved, _spread(lower, by_share))
     log = log + log_prior(numbers[POWER])[0] - np.log(np.maximum(numbers[PACE], 1.0))
     if np.any(numbers[PACE]):  # gas that is pumped away gets less
-        own = np.broadcast_to(np.eye(len(free))[-1][:, None, None], of_share[:, None].shape)
+        own = np.broadcast_to(np.eye(len(free))[-1][:, None, None], by_share.shape)
         log = log + _log_within((-np.inf, 0.0), centre[-1], _spread(lower, own))
-    centre, lower = np.moveaxis(centre, 0, 2), np.moveaxis(lower, (0, 1), (2, 3))
     return Peaks(centre, lower, log, numbers)
 
 
 def _searched(seen: SeenDecay, numbers: np.ndarray, free: list[int]) -> Peaks:
-    """The most probable of the free numbers at each place, by Gauss and Newton."""
+    """The most probable of the free numbers at each place, by Gauss and Newton: normal
+    approximations about where the last step began.
+    """
     for _ in range(STEPS):
         found = _expanded(seen, numbers, free)
-        whole = logsumexp(found.log, axis=0)
-        weight = np.exp(found.log - whole)
-        step = np.einsum("km,kmp->pm", weight, found.centre) - numbers[free]
+        whole = np.logaddexp.reduce(found.log)
+        weight, before = np.exp(found.log - whole), numbers[free]
         numbers = numbers.copy()
-        numbers[free] += np.clip(step, -0.5, 0.5)
+        numbers[free] += np.clip(np.sum(weight * found.centre, axis=1) - before, -0.5, 0.5)
         pumped = numbers[PACE] > 0
         ends = np.where(pumped, -SIZES[1], -5 * DRIFT), np.where(pumped, 0.0, 5 * DRIFT)
         numbers[CHANGE] = np.clip(numbers[CHANGE], *ends)
         named = Numbers.of(numbers)
         numbers[BEND] += (np.clip(named.share, -1.0, 2.0) - named.share) / named.unit
-        spread = 1 / np.sqrt(np.einsum("km,kmpq->pm", weight, found.lower**2))
-        rests = (np.abs(step) < 0.03 * spread + 1e-9).all(axis=0)
+        spread = 1 / np.sqrt(np.sum(weight * np.sum(found.lower**2, axis=1), axis=1))
+        rests = (np.abs(numbers[free] - before) < RESTS * spread + 1e-9).all(axis=0)
         if rests[whole > whole.max() - FAR].all():
             break
-    return _expanded(seen, numbers, free)
+    return found
 
 
 def _along(seen: SeenDecay, row: int, low: float, high: float, free: list[int]) -> Peaks:
@@ -436,7 +436,7 @@ def _along(seen: SeenDecay, row: int, low: float, high: float, free: list[int]) 
     for _ in range(RANGES):
         numbers[row] = place
         found = _searched(seen, numbers, free)
-        whole = logsumexp(found.log, axis=0)
+        whole = np.logaddexp.reduce(found.log)
         if not np.isfinite(whole).all():
             break  # a beam that died: no law of this kind has finite slopes
         held = np.flatnonzero(whole > whole.max() - FAR)
@@ -449,12 +449,33 @@ def _along(seen: SeenDecay, row: int, low: float, high: float, free: list[int]) 
 
 
 class Draws(NamedTuple):
-    """Numbers with their weights, their log evidence, and how many draws they are worth."""
+    """Numbers with their currents at the nodes, (14, d), their weights, their log evidence, and how
+    many draws they are worth.
+    """
 
     numbers: Numbers
+    currents: np.ndarray
     weight: np.ndarray
     log: float
     worth: float
+
+
+@lru_cache(maxsize=16)
+def _student(draws: int, count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Draws of so many numbers by Student's distribution, (p, d), and their log density.
+
+    Spread evenly: steps by powers of the root of x^(d + 1) = 1 + x, from a place at random, fill a
+    cube of d dimensions with an error that falls faster than that of random draws.
+    """
+    root = 2.0
+    for _ in range(60):
+        root = (1 + root) ** (1 / (count + 2))
+    steps = root ** -np.arange(1.0, count + 2)
+    start = np.random.default_rng(seed).random((count + 1, 1))
+    even = (start + steps[:, None] * np.arange(draws)) % 1
+    found = ndtri(even[1:]) * np.sqrt(TAIL / (2 * gammaincinv(TAIL / 2, even[0])))
+    log = gammaln((TAIL + count) / 2) - gammaln(TAIL / 2) - 0.5 * count * math.log(math.pi * TAIL)
+    return found, log - 0.5 * (TAIL + count) * np.log1p(np.sum(found**2, axis=0) / TAIL)
 
 
 class DrawnLaw(NamedTuple):
@@ -481,7 +502,7 @@ class DrawnLaw(NamedTuple):
         kept = found.log.max(axis=1) > found.log.max() - FAR
         if not kept.any():  # not finite
             return cls(seen, found, tuple(free))
-        peaks = Peaks(*(part[kept] for part in found[:3]), found.numbers)
+        peaks = Peaks(*(part[..., kept, :] for part in found[:3]), found.numbers)
         return cls(seen.of_noises(kept), peaks, tuple(free))
 
     def _log_prior(self, numbers: Numbers) -> np.ndarray:
@@ -493,43 +514,57 @@ class DrawnLaw(NamedTuple):
         log = log + log_prior(numbers.power)[0] if POWER in free else log
         return log + log_straight(numbers.drift) if CHANGE in free else log
 
-    def drawn(self, draws: int, least: float) -> Draws:
-        """Draws of the posterior; more of them where they are worth less than `least`."""
-        found = self.weighed(draws)
-        return found if found.worth >= least else self.weighed(AGAIN * draws)
-
     def weighed(self, draws: int, seed: int = 0) -> Draws:
         """Draw from the normal approximations, Student's tails, each weighed by the posterior."""
         seen, peaks, free = self
         if not np.isfinite(peaks.log).all():
-            return Draws(Numbers.of(peaks.numbers), np.zeros(peaks.log.shape[1]), -np.inf, 0.0)
-        rng, odds = np.random.default_rng(seed), np.exp(peaks.log - peaks.log.max()).ravel()
+            return _none(Numbers.of(peaks.numbers))
+        odds = np.exp(peaks.log - peaks.log.max()).ravel()
         ends = np.cumsum(odds) / odds.sum()
         which = np.minimum(np.searchsorted(ends, (np.arange(draws) + 0.5) / draws), odds.size - 1)
         kind, at = np.unravel_index(which, peaks.log.shape)
-        count = peaks.centre.shape[2]
-        normal = (
-            rng.normal(size=(draws, count)) * np.sqrt(TAIL / rng.chisquare(TAIL, draws))[:, None]
-        )
-        root = np.swapaxes(np.linalg.inv(peaks.lower), 2, 3)[kind, at]
-        numbers = peaks.numbers[:, at]
+        normal, given = _student(draws, len(peaks.centre), seed)
+        lower, numbers = peaks.lower[..., kind, at], peaks.numbers[:, at]
         rows, places = ([row for row in free if (row in (POWER, PACE)) == placed]
                         for placed in (False, True))  # fmt: skip
-        numbers[rows] = (peaks.centre[kind, at] + np.einsum("dpq,dq->dp", root, normal)).T
-        given = gammaln((TAIL + count) / 2) - gammaln(TAIL / 2) - 0.5 * count * np.log(np.pi * TAIL)
-        given = given - np.log(np.einsum("dpp->dp", root)).sum(1)
-        given = given - 0.5 * (TAIL + count) * np.log1p(np.sum(normal**2, 1) / TAIL)
+        numbers[rows] = peaks.centre[:, kind, at] + _backward(lower, normal)
+        given = given + np.log(np.einsum("ppd->pd", lower)).sum(0)
         given = given + np.log(odds[which] / odds.sum())
         named = Numbers.of(numbers)
-        log = seen.products.log_prior[kind] + seen.log_size(named, kind)
+        currents = named.currents(seen.gas)
+        log = seen.products.log_prior[kind] + seen.log_size(currents, kind)
         log = log + np.log(named.level * named.rate * np.abs(named.unit))
-        log = log + self._log_prior(named)
+        log = log + self._log_prior(named) - given
         if not np.isfinite(log).any():
-            return Draws(named, np.zeros(draws), -np.inf, 0.0)
-        weight = np.exp(log - given - logsumexp(log - given))
+            return _none(named)
+        whole = float(logsumexp(log))
+        weight = np.exp(log - whole)
         spacing = float(np.prod([np.diff(peaks.numbers[row])[0] for row in places]))
-        whole = float(logsumexp(log - given)) - np.log(draws) + np.log(spacing)
-        return Draws(named, weight, whole, float(1 / np.sum(weight**2)))
+        whole += math.log(spacing / draws)
+        return Draws(named, currents, weight, whole, float(1 / np.sum(weight**2)))
+
+
+def _none(numbers: Numbers) -> Draws:
+    """Draws of a law that has no probability."""
+    count = numbers.level.size
+    return Draws(numbers, np.full((NODES, count), np.nan), np.zeros(count), -np.inf, 0.0)
+
+
+def drawn(laws: Sequence[DrawnLaw]) -> list[Draws]:
+    """Draws of several laws: a few, and more of those that the answer rests on, until all together
+    are worth enough, with the fewest draws.
+    """
+    found, count = [law.weighed(FEW) for law in laws], np.full(len(laws), FEW)
+    while True:
+        log, worth = np.array([(one.log, max(one.worth, 1.0)) for one in found]).T
+        errors = np.exp(log - logsumexp(log)) * np.sqrt(count / worth)  # of one draw of each
+        needed = np.minimum(WORTH * errors * errors.sum(), MANY)
+        short = np.flatnonzero(count < 0.8 * needed)
+        if not short.size:
+            return found
+        for k in short:
+            count[k] = needed[k]
+            found[k] = laws[k].weighed(count[k])
 
 
 def mixed(laws: Sequence[Draws]) -> Draws:
@@ -540,7 +575,8 @@ def mixed(laws: Sequence[Draws]) -> Draws:
         return laws[0]
     weight = np.concatenate([law.weight * math.exp(law.log - whole) for law in laws])
     numbers = Numbers(*map(np.concatenate, zip(*(law.numbers for law in laws), strict=True)))
-    return Draws(numbers, weight, whole, float(1 / np.sum(weight**2)))
+    currents = np.hstack([law.currents for law in laws])
+    return Draws(numbers, currents, weight, whole, float(1 / np.sum(weight**2)))
 
 
 def quantiles(values: np.ndarray, weight: np.ndarray, at: np.ndarray) -> np.ndarray:
@@ -688,25 +724,23 @@ def free_law(record: DecayRecord, values: Physical) -> FreeLaw | None:
     True
     """
     seen = SeenDecay.of(record, values)
-    quoted, *others = proposals(seen)
-    laws = [quoted.drawn(DRAWS, ENDS_WORTH), *(law.drawn(FEW, WORTH) for law in others)]
+    laws = drawn(proposals(seen))
     draws, smooth = mixed(laws), laws[0]
     if not np.isfinite(smooth.log) or draws.worth < LEAST_WORTH:
         return None
-    plain = DrawnLaw.of(seen, CONSTANT).drawn(FEW, WORTH)
+    plain = DrawnLaw.of(seen, CONSTANT).weighed(FEW)
     if not 0 <= values.share <= 1:
-        rival = DrawnLaw.of(replace(seen, share=NO_BEAM), CONSTANT).drawn(FEW, WORTH)
+        rival = DrawnLaw.of(replace(seen, share=NO_BEAM), CONSTANT).weighed(FEW)
         if rival.log + np.log(UNPHYSICAL) > draws.log:
             return None
     usual, odd = log_prior(smooth.numbers.power)
     odd = math.exp(smooth.log - draws.log) * float(smooth.weight @ np.exp(odd - usual))
-    currents = draws.numbers.currents(seen.gas)
-    found = _quantities(record, seen, draws, currents)
+    found = _quantities(record, seen, draws)
     power, drift = smooth.numbers.power, smooth.numbers.drift if seen.drifts else None
     power, drift = (v if v is None else quantity_of(v, smooth.weight, "1") for v in (power, drift))
     constant = float(1 / (1 + np.exp(draws.log - plain.log)))
     pumped = 1.0 - math.exp(smooth.log - draws.log)
-    nodes = record.mean_current * currents @ draws.weight
+    nodes = record.mean_current * draws.currents @ draws.weight
     share = quantity_of(draws.numbers.share, draws.weight, "1")
     return FreeLaw(found, share, power, drift, constant, odd, pumped, nodes, record.span)
 
@@ -739,11 +773,9 @@ def middle_of(currents: np.ndarray, weight: np.ndarray) -> float:
     return float(np.interp(-1.0, -(from_nodes(time) @ nodes), time))
 
 
-def _quantities(
-    record: DecayRecord, seen: SeenDecay, draws: Draws, currents: np.ndarray
-) -> dict[str, Quantity]:
-    """Quantities that are quoted, from draws with their currents at the nodes."""
-    found, weight = draws.numbers, draws.weight
+def _quantities(record: DecayRecord, seen: SeenDecay, draws: Draws) -> dict[str, Quantity]:
+    """Quantities that are quoted, from draws."""
+    found, currents, weight = draws.numbers, draws.currents, draws.weight
     span, mean = record.span, record.mean_current
     whole = found.rate / mean / span, found.rate / span
     a, b = found.share * whole[0], (1 - found.share) * whole[1]

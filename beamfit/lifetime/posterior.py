@@ -193,7 +193,7 @@ class _Prepared(NamedTuple):
         data = _Data(
             products.matrix, products.log_prior, products.count, products.known,
             seen.origin[:, 0], seen.gas, np.array(seen.ends),
-            middle_of(draws.numbers.currents(seen.gas), draws.weight),
+            middle_of(draws.currents, draws.weight),
             record.mean_current, record.span, self.moved,
         )  # fmt: skip
         lower, upper = np.array([BOUNDS.get(name, (-np.inf, np.inf)) for name in self.names]).T

@@ -8,13 +8,14 @@ columns once; their products are all that a fit needs later, however many readin
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import groupby
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.fft import irfft, next_fast_len, rfft
+from scipy.fft import dct, irfft, next_fast_len, rfft
 from scipy.linalg.lapack import dpttrf, dpttrs, dtbtrs
 from scipy.special import logsumexp
 
@@ -30,6 +31,8 @@ BLOCKS = (4, 16)
 # noise has the rest. Readings are white unless something slow moves the monitor: amplifiers have
 # 1/f noise, and what a changing temperature adds up in a monitor is a walk.
 WHITE, CORRELATED, WALK = 0.5, 0.25, 0.1
+# Intervals between readings that differ by less than this share are even.
+EVEN = 1e-6
 # Correlation times, from this share of the interval between readings to so many records, flat in
 # the logarithm.
 SHORTEST, LONGEST, TIMES = 0.5, 3.0, 17
@@ -327,6 +330,8 @@ def without_flicker(rows: np.ndarray, power: float) -> np.ndarray:
     >>> without_flicker(np.array([[1.0], [2.0], [4.0]]), 2.0).ravel().round(9).tolist()
     [1.0, 1.0, 2.0]
     """
+    if not power:
+        return rows
     j = np.arange(1, len(rows))
     weights = np.append(1.0, np.cumprod((j - 1 - power / 2) / j))
     size = next_fast_len(2 * len(rows), real=True)
@@ -334,25 +339,51 @@ def without_flicker(rows: np.ndarray, power: float) -> np.ndarray:
     return found[: len(rows)]
 
 
-def _products(kinds: list[MemoryKind], rows: np.ndarray, time: np.ndarray):
-    """Yield products of the rows whitened by each noise, in order, with the log of the volume."""
+def _products(
+    kinds: Sequence[MemoryKind], rows: np.ndarray, time: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Products of the rows whitened by each noise with a memory, and logs of the volume."""
     interval = np.diff(time)
+    if np.ptp(interval) < EVEN * interval[0]:
+        return _even_products(kinds, rows, float(interval.mean()))
+    matrix, volumes = [], []
     for length, alike in groupby(kinds, key=lambda kind: kind.time):
-        begun, volume = rows, 0.0
-        if length:
-            apart = interval / length
-            begun = np.asfortranarray(whitened(rows, apart, np))
-            volume = float(log_volume(apart, np))
+        apart = interval / length
+        begun = np.asfortranarray(whitened(rows, apart, np))
+        volume = float(log_volume(apart, np))
         for kind in alike:
-            if not length:
-                own = without_flicker(rows, kind.power) if kind.power else rows
-                yield own.T @ own, 0.0
-            elif not kind.white:
-                yield begun.T @ begun, volume
-            else:
-                size, next_ = beside(apart, kind.white)
-                solved = dpttrs(size, next_, begun)[0]
-                yield begun.T @ solved, volume - 0.5 * float(np.sum(np.log(size)))
+            size, next_ = beside(apart, kind.white)
+            matrix.append(begun.T @ dpttrs(size, next_, begun)[0])
+            volumes.append(volume - 0.5 * float(np.sum(np.log(size))))
+    return np.array(matrix), np.array(volumes)
+
+
+def _even_products(
+    kinds: Sequence[MemoryKind], rows: np.ndarray, interval: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """The same of evenly spaced readings, by the waves of the cosine transform.
+
+    In them the inverse of the covariance R without a white part is a diagonal D and g E Eᵀ with
+    the sum and the difference E of the first and the last reading. With A = 1/(1 - w + w D) that of
+    (1 - w) R + w is D A + (1 - w) A E S Eᵀ A, where S = 1/(1/g + w Eᵀ A E) is diagonal, too.
+    """
+    count, (_, times, white, _) = len(rows), np.array(kinds).T[..., None]
+    apart, angle = interval / times, np.pi * np.arange(count) / (2 * count)
+    kept, new = np.exp(-apart), -np.expm1(-2 * apart)
+    wave = (np.expm1(-apart) ** 2 + 4 * kept * np.sin(angle) ** 2) / new
+    inverse = 1 / (1 - white + white * wave)
+    ends = 2 / np.sqrt(count) * np.cos(angle) / np.where(angle > 0, 1.0, np.sqrt(2.0))
+    rows = dct(rows, axis=0, norm="ortho")
+    matrix = wave * inverse @ (rows[:, :, None] * rows[:, None]).reshape(count, -1)
+    matrix = matrix.reshape(-1, *2 * rows.shape[1:])
+    volume = (1 - count) * np.log(new[:, 0]) + np.sum(np.log(inverse), axis=1)
+    for parity in (slice(None, None, 2), slice(1, None, 2)):
+        along, end = inverse[:, parity], ends[parity]
+        size = (1 + kept) / kept + white * (along @ end**2)[:, None]
+        seen = np.sqrt((1 - white) / size) * (along @ (end[:, None] * rows[parity]))
+        matrix += seen[:, :, None] * seen[:, None]
+        volume -= np.log(size * kept / (1 + kept))[:, 0]
+    return matrix, 0.5 * volume
 
 
 class Products(NamedTuple):
@@ -395,9 +426,11 @@ class Products(NamedTuple):
         ((89, 1, 1), 1.0)
         """
         kinds = kinds_of(time, times)
-        matrix, volumes = zip(*_products(kinds, columns, time), strict=True)
-        logs = np.log([kind.chance for kind in kinds]) + volumes
-        return cls(kinds, logs, np.array(matrix), len(columns), STATED if stated else 0.0)
+        short = [without_flicker(columns, kind.power) for kind in kinds if not kind.time]
+        matrix, volumes = _products(kinds[len(short) :], columns, time)
+        logs = np.log([kind.chance for kind in kinds]) + np.append(np.zeros(len(short)), volumes)
+        matrix = np.concatenate([[own.T @ own for own in short], matrix])
+        return cls(kinds, logs, matrix, len(columns), STATED if stated else 0.0)
 
     def some(self, kept: np.ndarray) -> Products:
         """Keep some of the noises."""

@@ -100,7 +100,7 @@ def test_the_draws_are_those_of_the_posterior():
     """With constant a and b against a grid of the exact law in white noise."""
     one = record(3, noise=3.0)
     values = solved(Pieces.of(one)).values
-    draws = DrawnLaw.of(SeenDecay.of(one, values), CONSTANT).drawn(6000, 2000.0)
+    draws = DrawnLaw.of(SeenDecay.of(one, values), CONSTANT).weighed(6000)
     time, rates, shares = one.time, np.linspace(0.97, 1.03, 61), np.linspace(0.0, 1.0, 81)
     unit, mean, log = float(values.rate_mean), float(one.current.mean()), np.zeros((61, 81))
     for j, rate in enumerate(rates * unit):
