@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from scipy.fft import dct, irfft, next_fast_len, rfft
-from scipy.linalg.lapack import dpttrf, dpttrs, dtbtrs
+from scipy.linalg.lapack import dpttrf, dpttrs
 from scipy.special import logsumexp
 
 # Correlation of neighbouring residuals, in standard errors of that of independent ones, from which
@@ -148,29 +148,6 @@ def innovations(
     return white, jnp.sum(sizes)
 
 
-def whitened_of_both(
-    rows: np.ndarray, interval: np.ndarray, noise: CorrelatedNoise
-) -> tuple[np.ndarray, float]:
-    """Rows as those with independent errors of the same size, and the log of the volume.
-
-    With W of `whitened`, the covariance of both parts of the noise is that of W⁻¹ T W⁻ᵀ with
-    T = (1 - white) 1 + white W Wᵀ, of three diagonals: its Cholesky factor ends the work, in O(n).
-
-    Examples
-    --------
-    >>> noise = CorrelatedNoise(1.0, 1.0)
-    >>> both, volume = whitened_of_both(np.array([1.0, 2.0]), np.array([1.0]), noise)
-    >>> both.round(9).tolist(), round(volume, 9) + 0.0
-    ([1.0, 2.0], 0.0)
-    """
-    apart = interval / noise.time
-    rows, volume = whitened(rows, apart, np), float(log_volume(apart, np))
-    if not noise.white:
-        return rows, volume
-    rows, more = white_beside(rows, apart, noise.white)
-    return rows, volume + more
-
-
 def white_shares(apart, ratios=BESIDE) -> np.ndarray:
     """Shares of variance without memory, from ratios to what the memory's part gains in a time.
 
@@ -194,21 +171,82 @@ def white_shares(apart, ratios=BESIDE) -> np.ndarray:
     return white / (1.0 + white)
 
 
-def beside(apart: np.ndarray, white: float) -> tuple[np.ndarray, np.ndarray]:
-    """Diagonals D and l of T = L D Lᵀ, of `whitened_of_both`: L has ones and l."""
-    kept, new = np.exp(-apart), np.sqrt(-np.expm1(-2 * apart))
-    own, before = np.append(1.0, 1.0 / new), np.append(0.0, -kept / new)
-    diagonal = 1.0 - white + white * (own**2 + before**2)
-    return dpttrf(diagonal, white * before[1:] * own[:-1])[:2]
+def products_by_each(
+    noises: Sequence[CorrelatedNoise], rows: np.ndarray, interval: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Products of rows whitened by each noise, and logs of the volume.
+
+    Parameters
+    ----------
+    noises : sequence of CorrelatedNoise or MemoryKind, length k
+        Those of one correlation time in a row.
+    rows : array, shape (n, m)
+        One row for each reading.
+    interval : array, shape (n - 1,)
+        Times between readings, s.
+
+    Returns
+    -------
+    matrix : array, shape (k, m, m)
+    volume : array, shape (k,)
+
+    Notes
+    -----
+    With W of `whitened`, the covariance of both parts of the noise is that of W⁻¹ T W⁻ᵀ with
+    T = (1 - white) 1 + white W Wᵀ, of three diagonals: all is done in O(n).
+
+    Examples
+    --------
+    >>> rows, noises = np.array([[1.0], [2.0]]), [CorrelatedNoise(1.0, 1.0)]
+    >>> matrix, volume = products_by_each(noises, rows, np.array([1.0]))
+    >>> matrix.ravel().round(9).tolist(), (volume.round(9) + 0.0).tolist()
+    ([5.0], [0.0])
+    """
+    if interval.size and np.ptp(interval) < EVEN * interval[0]:
+        return _products_of_even(noises, rows, float(interval.mean()))
+    matrix, volumes = [], []
+    for time, alike in groupby(noises, key=lambda noise: noise.time):
+        with np.errstate(divide="ignore"):
+            apart = interval / time
+        kept, new = np.exp(-apart), np.sqrt(-np.expm1(-2 * apart))
+        own, before = np.append(1.0, 1.0 / new), np.append(0.0, -kept / new)
+        begun = np.asfortranarray(whitened(rows, apart, np))
+        volume = float(log_volume(apart, np))
+        for noise in alike:
+            diagonal = 1.0 - noise.white + noise.white * (own**2 + before**2)
+            size, next_, _ = dpttrf(diagonal, noise.white * before[1:] * own[:-1])
+            matrix.append(begun.T @ dpttrs(size, next_, begun)[0])
+            volumes.append(volume - 0.5 * float(np.sum(np.log(size))))
+    return np.array(matrix), np.array(volumes)
 
 
-def white_beside(rows: np.ndarray, apart: np.ndarray, white: float) -> tuple[np.ndarray, float]:
-    """Rows that are whitened for a memory alone as whitened for a white share beside it."""
-    size, next_ = beside(apart, white)
-    factor = np.stack([np.ones_like(size), np.append(next_, 0.0)])
-    solved = dtbtrs(factor, rows.reshape(len(rows), -1), uplo="L", diag="U")[0]
-    solved /= np.sqrt(size)[:, None]
-    return solved.reshape(rows.shape), -0.5 * float(np.sum(np.log(size)))
+def _products_of_even(
+    noises: Sequence[CorrelatedNoise], rows: np.ndarray, interval: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """The same of evenly spaced readings, by the waves of the cosine transform.
+
+    In them the inverse of the covariance R without a white part is a diagonal D and g E Eᵀ with
+    the sum and the difference E of the first and the last reading. With A = 1/(1 - w + w D) that of
+    (1 - w) R + w is D A + (1 - w) A E S Eᵀ A, where S = 1/(1/g + w Eᵀ A E) is diagonal, too.
+    """
+    count, (times, white) = len(rows), np.array([(n.time, n.white) for n in noises]).T[..., None]
+    apart, angle = interval / times, np.pi * np.arange(count) / (2 * count)
+    kept, new = np.exp(-apart), -np.expm1(-2 * apart)
+    wave = (np.expm1(-apart) ** 2 + 4 * kept * np.sin(angle) ** 2) / new
+    inverse = 1 / (1 - white + white * wave)
+    ends = 2 / np.sqrt(count) * np.cos(angle) / np.where(angle > 0, 1.0, np.sqrt(2.0))
+    rows = dct(rows, axis=0, norm="ortho")
+    matrix = wave * inverse @ (rows[:, :, None] * rows[:, None]).reshape(count, -1)
+    matrix = matrix.reshape(-1, *2 * rows.shape[1:])
+    volume = (1 - count) * np.log(new[:, 0]) + np.sum(np.log(inverse), axis=1)
+    for parity in (slice(None, None, 2), slice(1, None, 2)):
+        along, end = inverse[:, parity], ends[parity]
+        more = kept / (1 + kept)
+        size = 1 + more * white * (along @ end**2)[:, None]
+        seen = np.sqrt((1 - white) * more / size) * (along @ (end[:, None] * rows[parity]))
+        matrix += seen[:, :, None] * seen[:, None]
+        volume -= np.log(size)[:, 0]
+    return matrix, 0.5 * volume
 
 
 class Levels(NamedTuple):
@@ -339,53 +377,6 @@ def without_flicker(rows: np.ndarray, power: float) -> np.ndarray:
     return found[: len(rows)]
 
 
-def _products(
-    kinds: Sequence[MemoryKind], rows: np.ndarray, time: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Products of the rows whitened by each noise with a memory, and logs of the volume."""
-    interval = np.diff(time)
-    if np.ptp(interval) < EVEN * interval[0]:
-        return _even_products(kinds, rows, float(interval.mean()))
-    matrix, volumes = [], []
-    for length, alike in groupby(kinds, key=lambda kind: kind.time):
-        apart = interval / length
-        begun = np.asfortranarray(whitened(rows, apart, np))
-        volume = float(log_volume(apart, np))
-        for kind in alike:
-            size, next_ = beside(apart, kind.white)
-            matrix.append(begun.T @ dpttrs(size, next_, begun)[0])
-            volumes.append(volume - 0.5 * float(np.sum(np.log(size))))
-    return np.array(matrix), np.array(volumes)
-
-
-def _even_products(
-    kinds: Sequence[MemoryKind], rows: np.ndarray, interval: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """The same of evenly spaced readings, by the waves of the cosine transform.
-
-    In them the inverse of the covariance R without a white part is a diagonal D and g E Eᵀ with
-    the sum and the difference E of the first and the last reading. With A = 1/(1 - w + w D) that of
-    (1 - w) R + w is D A + (1 - w) A E S Eᵀ A, where S = 1/(1/g + w Eᵀ A E) is diagonal, too.
-    """
-    count, (_, times, white, _) = len(rows), np.array(kinds).T[..., None]
-    apart, angle = interval / times, np.pi * np.arange(count) / (2 * count)
-    kept, new = np.exp(-apart), -np.expm1(-2 * apart)
-    wave = (np.expm1(-apart) ** 2 + 4 * kept * np.sin(angle) ** 2) / new
-    inverse = 1 / (1 - white + white * wave)
-    ends = 2 / np.sqrt(count) * np.cos(angle) / np.where(angle > 0, 1.0, np.sqrt(2.0))
-    rows = dct(rows, axis=0, norm="ortho")
-    matrix = wave * inverse @ (rows[:, :, None] * rows[:, None]).reshape(count, -1)
-    matrix = matrix.reshape(-1, *2 * rows.shape[1:])
-    volume = (1 - count) * np.log(new[:, 0]) + np.sum(np.log(inverse), axis=1)
-    for parity in (slice(None, None, 2), slice(1, None, 2)):
-        along, end = inverse[:, parity], ends[parity]
-        size = (1 + kept) / kept + white * (along @ end**2)[:, None]
-        seen = np.sqrt((1 - white) / size) * (along @ (end[:, None] * rows[parity]))
-        matrix += seen[:, :, None] * seen[:, None]
-        volume -= np.log(size * kept / (1 + kept))[:, 0]
-    return matrix, 0.5 * volume
-
-
 class Products(NamedTuple):
     """Sums of products of columns, whitened by each of k noises.
 
@@ -427,7 +418,7 @@ class Products(NamedTuple):
         """
         kinds = kinds_of(time, times)
         short = [without_flicker(columns, kind.power) for kind in kinds if not kind.time]
-        matrix, volumes = _products(kinds[len(short) :], columns, time)
+        matrix, volumes = products_by_each(kinds[len(short) :], columns, np.diff(time))
         logs = np.log([kind.chance for kind in kinds]) + np.append(np.zeros(len(short)), volumes)
         matrix = np.concatenate([[own.T @ own for own in short], matrix])
         return cls(kinds, logs, matrix, len(columns), STATED if stated else 0.0)

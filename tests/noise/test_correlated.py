@@ -12,8 +12,8 @@ from beamfit.noise.memory import (
     CorrelatedNoise,
     is_correlated,
     log_volume,
+    products_by_each,
     whitened,
-    whitened_of_both,
 )
 from tests.simulations import simulations, widened
 
@@ -54,9 +54,11 @@ def test_the_density_is_scipys(uneven):
 )
 def test_both_parts_of_the_noise_have_scipys_density(uneven, noise):
     row = np.random.default_rng(5).normal(size=40)
-    white, volume = whitened_of_both(row, np.diff(uneven), noise)
-    theirs = multivariate_normal(cov=both(uneven, noise)).logpdf(row)
-    assert volume - 0.5 * white @ white - 20 * np.log(2 * np.pi) == pytest.approx(theirs, rel=1e-7)
+    for time in (uneven, np.arange(40.0)):
+        (square,), (volume,) = products_by_each([noise], row[:, None], np.diff(time))
+        theirs = multivariate_normal(cov=both(time, noise)).logpdf(row)
+        ours = volume - 0.5 * square.item() - 20 * np.log(2 * np.pi)
+        assert ours == pytest.approx(theirs, rel=1e-7)
 
 
 def both(time, noise):

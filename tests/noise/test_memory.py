@@ -14,9 +14,10 @@ def covariance(kind, time):
     return (1 - kind.white) * np.exp(-apart) + kind.white * np.eye(time.size)
 
 
-def test_products_are_those_of_the_dense_covariance():
+@pytest.mark.parametrize("uneven", [0.0, 1.0])
+def test_products_are_those_of_the_dense_covariance(uneven):
     random = np.random.default_rng(1)
-    time = np.cumsum(random.uniform(0.5, 2.0, 60))
+    time = np.cumsum(1.0 + uneven * random.uniform(-0.5, 1.0, 60))
     columns = random.normal(size=(60, 3))
     found = Products.of(columns, time, stated=False)
     assert np.exp(found.log_prior[0]) == pytest.approx(0.5)
