@@ -16,7 +16,6 @@ from typing import NamedTuple
 
 import numpy as np
 from jax import Array
-from scipy.integrate import cumulative_simpson
 
 from beamfit.greybox.memory import Memory, Whitened, usual_noises, whitened_by_each
 from beamfit.lifetime.decay_law import LEAST, Moments, beam_current
@@ -591,6 +590,8 @@ def further_columns(about: Expansion, kind: str, times: np.ndarray) -> np.ndarra
     >>> print(f"{column[-1] / found.pieces.current[-1]:.3f}")
     -0.500
     """
+    from scipy.integrate import cumulative_simpson  # a tenth of a second that few records need
+
     (span, _), level = about.pieces.units, about.rows[:, [LEVEL]]
     time, model = about.pieces.time / span, about.pieces.current / about.pieces.over
     fading = (model + about.residuals)[:, None] / level

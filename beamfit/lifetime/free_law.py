@@ -182,9 +182,9 @@ def log_pumped(share, gas, pace, xp=np):
 
 # Width of the change of gas that is pumped away in what draws come from.
 PUMPED = 0.5
-# Exponents, or paces, looked at, in ever narrower ranges, and steps of the search with each.
-PLACES, RANGES, STEPS = 33, 5, 6
-RESTS = 0.2
+# Exponents, or paces, looked at, in ever narrower ranges, and steps of the search with each: it
+# rests where a step is below this part of a standard deviation, which draws do not miss.
+PLACES, RANGES, STEPS, RESTS = 33, 5, 6, 0.2
 # Readings beyond which neighbours are averaged: the curve is smooth between them.
 ENOUGH = 1024
 # Draws of each law at first, of how many independent ones all together are to be worth, and most of
@@ -374,8 +374,7 @@ def _log_within(bounds: tuple[float, float], middle: np.ndarray, sd: np.ndarray)
 def _expanded(seen: SeenDecay, numbers: np.ndarray, free: list[int]) -> Peaks:
     """Expand the posterior about numbers (6, m) for every noise."""
     rows, share = _seen_slopes(seen, numbers, free)
-    turned = (seen.products.matrix @ rows.reshape(len(rows), -1)).reshape(-1, *rows.shape)
-    products = np.einsum("npm,knqm->pqkm", rows, turned)
+    products = seen.products.between(rows)
     normal, gradient, squares = products[:-1, :-1], -products[:-1, -1], products[-1, -1]
     change = np.where(numbers[PACE, 0] > 0, PUMPED, DRIFT)
     width, middle = np.array([np.inf, np.inf, AROUND, np.inf, change])[free], np.zeros(len(free))
@@ -551,13 +550,13 @@ def _none(numbers: Numbers) -> Draws:
 
 
 def drawn(laws: Sequence[DrawnLaw]) -> list[Draws]:
-    """Draws of several laws: a few, and more of those that the answer rests on, until all together
-    are worth enough, with the fewest draws.
+    """Draws of several laws: a few, and then as few more as tell the end of an interval, whichever
+    law it is of.
     """
     found, count = [law.weighed(FEW) for law in laws], np.full(len(laws), FEW)
     while True:
         log, worth = np.array([(one.log, max(one.worth, 1.0)) for one in found]).T
-        errors = np.exp(log - logsumexp(log)) * np.sqrt(count / worth)  # of one draw of each
+        errors = np.sqrt(np.exp(log - logsumexp(log)) * count / worth)  # of one draw of each
         needed = np.minimum(WORTH * errors * errors.sum(), MANY)
         short = np.flatnonzero(count < 0.8 * needed)
         if not short.size:

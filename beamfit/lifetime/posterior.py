@@ -21,7 +21,6 @@ from beamfit.lifetime.free_law import (
     DRIFT,
     LEAST,
     MOST,
-    WORTH,
     DrawnLaw,
     Draws,
     SeenDecay,
@@ -58,6 +57,8 @@ STATED = {"exponent": f"normal about 0, {BELOW} below and {ABOVE} above",
           "drift": f"normal, 0 ± {DRIFT}, or that of gas that is pumped away"}  # fmt: skip
 # Where all of the loss may be of one kind its interval ends, as the last of a thousand draws does.
 UTMOST = 0.999
+# Independent draws that intervals need at least.
+ENOUGH = 200.0
 # Draws are laid out as so many chains of so many steps; at most so many steps of proposals.
 WALKERS, STEPS, BUDGET = 16, 1024, 16384
 
@@ -326,7 +327,7 @@ def _chains(ready: _Prepared, target: SamplingTarget, seed: int, target_ess: flo
     held = held_by_priors(target, chain.reshape(-1, chain.shape[2]))
     held = tuple(dict.fromkeys((*target.priors_own, *held)))
     shown = tuple(name for name in held if name not in target.hidden)
-    enough = min(target_ess, WORTH)  # as the fit needs
+    enough = min(target_ess, ENOUGH)
     verdict = judge(ChainEvidence(found, target, enough, steps, shown), (_worth_little, *RULES))
     said = f"{min(found.effective):.0f} effective draws."
     log = target.log_probability(chain.reshape(-1, chain.shape[2])).reshape(chain.shape[:2])

@@ -33,6 +33,8 @@ BLOCKS = (4, 16)
 WHITE, CORRELATED, WALK = 0.5, 0.25, 0.1
 # Intervals between readings that differ by less than this share are even.
 EVEN = 1e-6
+# Waves of such readings that are looked at together: what all noises make of them fits the cache.
+BLOCK = 256
 # Correlation times, from this share of the interval between readings to so many records, flat in
 # the logarithm.
 SHORTEST, LONGEST, TIMES = 0.5, 3.0, 17
@@ -230,23 +232,26 @@ def _products_of_even(
     (1 - w) R + w is D A + (1 - w) A E S Eᵀ A, where S = 1/(1/g + w Eᵀ A E) is diagonal, too.
     """
     count, (times, white) = len(rows), np.array([(n.time, n.white) for n in noises]).T[..., None]
-    apart, angle = interval / times, np.pi * np.arange(count) / (2 * count)
-    kept, new = np.exp(-apart), -np.expm1(-2 * apart)
-    wave = (np.expm1(-apart) ** 2 + 4 * kept * np.sin(angle) ** 2) / new
-    inverse = 1 / (1 - white + white * wave)
-    ends = 2 / np.sqrt(count) * np.cos(angle) / np.where(angle > 0, 1.0, np.sqrt(2.0))
-    rows = dct(rows, axis=0, norm="ortho")
-    matrix = wave * inverse @ (rows[:, :, None] * rows[:, None]).reshape(count, -1)
-    matrix = matrix.reshape(-1, *2 * rows.shape[1:])
-    volume = (1 - count) * np.log(new[:, 0]) + np.sum(np.log(inverse), axis=1)
-    for parity in (slice(None, None, 2), slice(1, None, 2)):
-        along, end = inverse[:, parity], ends[parity]
-        more = kept / (1 + kept)
-        size = 1 + more * white * (along @ end**2)[:, None]
-        seen = np.sqrt((1 - white) * more / size) * (along @ (end[:, None] * rows[parity]))
-        matrix += seen[:, :, None] * seen[:, None]
-        volume -= np.log(size)[:, 0]
-    return matrix, 0.5 * volume
+    kept, new = np.exp(-interval / times), -np.expm1(-2 * interval / times)
+    rows, m, matrix, ends = dct(rows, axis=0, norm="ortho"), rows.shape[1], 0.0, 0.0
+    volume = (1 - count) * np.log(new[:, 0])
+    for first in range(0, count, BLOCK):
+        own = rows[first : first + BLOCK]
+        wave = np.arange(first, first + len(own))
+        angle = np.pi * wave / (2 * count)
+        known = ((1 - kept) ** 2 + 4 * kept * np.sin(angle) ** 2) / new
+        inverse = 1 / (1 - white + white * known)
+        end = 2 / np.sqrt(count) * np.cos(angle) / np.where(wave > 0, 1.0, np.sqrt(2.0))
+        both = np.where(wave % 2 == [[0], [1]], end, 0.0).T[:, :, None]
+        beside = both * np.column_stack([end, own])[:, None]
+        matrix += known * inverse @ (own[:, :, None] * own[:, None]).reshape(-1, m * m)
+        ends += inverse @ beside.reshape(-1, 2 * (1 + m))
+        volume += np.sum(np.log(inverse), axis=1)
+    ends, more = ends.reshape(-1, 2, 1 + m), kept / (1 + kept)
+    size = 1 + more * white * ends[..., 0]
+    ends = np.sqrt((1 - white) * more / size)[..., None] * ends[..., 1:]
+    volume -= np.sum(np.log(size), axis=1)
+    return matrix.reshape(-1, m, m) + np.swapaxes(ends, 1, 2) @ ends, 0.5 * volume
 
 
 class Levels(NamedTuple):
@@ -427,6 +432,17 @@ class Products(NamedTuple):
         """Keep some of the noises."""
         kinds = [kind for kind, keep in zip(self.kinds, kept, strict=True) if keep]
         return self._replace(kinds=kinds, log_prior=self.log_prior[kept], matrix=self.matrix[kept])
+
+    def between(self, sets: np.ndarray) -> np.ndarray:
+        """Products (p, p, k, s) of p combinations of the columns by noise, of sets (m, p, s)."""
+        sets = np.ascontiguousarray(np.moveaxis(sets, 2, 0))
+        count, columns, some = sets.shape
+        half = np.swapaxes(sets, 1, 2).reshape(-1, columns) @ np.swapaxes(
+            self.matrix, 0, 1
+        ).reshape(columns, -1)
+        found = half.reshape(count, -1, columns) @ sets
+        found = found.reshape(count, some, -1, some).transpose(1, 3, 2, 0)
+        return np.ascontiguousarray(found)
 
     def log_size(self, squares: np.ndarray) -> np.ndarray:
         """Log likelihood of sums of squares, the size of the noise integrated over.
