@@ -21,7 +21,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.polynomial.chebyshev import chebint, chebvander
-from scipy.special import gammaincinv, gammaln, log_ndtr, logsumexp, ndtri
+from scipy.special import expit, log_expit, log_ndtr, logsumexp
 
 from beamfit.lifetime.decay_law import closed_form
 from beamfit.lifetime.expansion import Physical
@@ -187,9 +187,9 @@ PUMPED = 0.5
 PLACES, RANGES, STEPS, RESTS = 33, 5, 6, 0.2
 # Readings beyond which neighbours are averaged: the curve is smooth between them.
 ENOUGH = 1024
-# Draws of each law at first, of how many independent ones all together are to be worth, and most of
-# them; the degrees of freedom of what they come from.
-FEW, WORTH, MANY, TAIL = 512, 2000.0, 60000, 8.0
+# Draws of each law at first, how many independent ones all together are to be worth, and most of
+# them; the scale of the logistic distribution that they have in standard deviations.
+FEW, WORTH, MANY, TAIL = 512, 2000.0, 60000, 0.6
 # Draws worth less tell no error. More is enough: constant a and b in their place would be too sure.
 LEAST_WORTH = 10.0
 # Width of the share in what draws come from, which its bounds cut off otherwise.
@@ -377,9 +377,8 @@ def _expanded(seen: SeenDecay, numbers: np.ndarray, free: list[int]) -> Peaks:
     products = seen.products.between(rows)
     normal, gradient, squares = products[:-1, :-1], -products[:-1, -1], products[-1, -1]
     change = np.where(numbers[PACE, 0] > 0, PUMPED, DRIFT)
-    width, middle = np.array([np.inf, np.inf, AROUND, np.inf, change])[free], np.zeros(len(free))
-    middle[BEND] = 0.5
-    width, middle = width[:, None], middle[:, None]
+    width = np.array([np.inf, np.inf, AROUND, np.inf, change])[free, None]
+    middle = np.where(np.equal(free, BEND), 0.5, 0.0)[:, None]
     known = np.diag(1 / width[:, 0] ** 2)[..., None, None]
     pull = ((middle - numbers[free]) / width**2)[:, None]
     after = np.maximum(squares, 1e-30)
@@ -396,6 +395,7 @@ def _expanded(seen: SeenDecay, numbers: np.ndarray, free: list[int]) -> Peaks:
     by_share = share[:-1, None]
     moved = share[-1] + np.sum(by_share * step, axis=0)
     log = log + _log_within(seen.share, moved, _spread(lower, by_share))
+    log = log + np.log(np.abs(by_share[1]))  # the share is flat, not the bend
     log = log + log_prior(numbers[POWER])[0] - np.log(np.maximum(numbers[PACE], 1.0))
     if np.any(numbers[PACE]):  # gas that is pumped away gets less
         own = np.broadcast_to(np.eye(len(free))[-1][:, None, None], by_share.shape)
@@ -460,21 +460,33 @@ class Draws(NamedTuple):
 
 
 @lru_cache(maxsize=16)
-def _student(draws: int, count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Draws of so many numbers by Student's distribution, (p, d), and their log density.
-
-    Spread evenly: steps by powers of the root of x^(d + 1) = 1 + x, from a place at random, fill a
-    cube of d dimensions with an error that falls faster than that of random draws.
+def _even(draws: int, count: int, seed: int) -> np.ndarray:
+    """Points that fill a cube evenly, (p, d), so that their means err less than those of random
+    ones: steps by powers of the root of x^(p + 1) = 1 + x, from a place at random.
     """
     root = 2.0
     for _ in range(60):
-        root = (1 + root) ** (1 / (count + 2))
-    steps = root ** -np.arange(1.0, count + 2)
-    start = np.random.default_rng(seed).random((count + 1, 1))
-    even = (start + steps[:, None] * np.arange(draws)) % 1
-    found = ndtri(even[1:]) * np.sqrt(TAIL / (2 * gammaincinv(TAIL / 2, even[0])))
-    log = gammaln((TAIL + count) / 2) - gammaln(TAIL / 2) - 0.5 * count * math.log(math.pi * TAIL)
-    return found, log - 0.5 * (TAIL + count) * np.log1p(np.sum(found**2, axis=0) / TAIL)
+        root = (1 + root) ** (1 / (count + 1))
+    steps = root ** -np.arange(1.0, count + 1)
+    start = np.random.default_rng(seed).random((count, 1))
+    return (start + steps[:, None] * np.arange(draws)) % 1
+
+
+def _between(even: np.ndarray, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Even points as draws by the logistic distribution between bounds, and their log density."""
+    sign = np.where(low > 0, -1.0, 1.0)  # the tail that is not near 1
+    start, end = np.sort(log_expit(np.array([sign * low, sign * high]) / TAIL), axis=0)
+    below = np.logaddexp(start + np.log1p(-even), end + np.log(even))
+    found = below - np.log1p(-np.exp(below))
+    part = end + np.log(-np.expm1(start - end))
+    return sign * TAIL * found, log_expit(found) + log_expit(-found) - part - math.log(TAIL)
+
+
+def _rows(free: Sequence[int]) -> tuple[list[int], list[int]]:
+    """Rows of numbers that are nearly normal, in the order that they are eliminated in, and of
+    those at places.
+    """
+    return [r for r in (0, BEND, 1, CHANGE) if r in free], [r for r in (POWER, PACE) if r in free]
 
 
 class DrawnLaw(NamedTuple):
@@ -491,7 +503,7 @@ class DrawnLaw(NamedTuple):
         """Approximate the posterior of some of the numbers by normal distributions; an exponent and
         a pace at places.
         """
-        normal = [row for row in free if row not in (POWER, PACE)]
+        normal, _ = _rows(free)
         if PACE in free:
             found = _along(seen, PACE, *PACES, normal)
         elif POWER in free:
@@ -513,34 +525,46 @@ class DrawnLaw(NamedTuple):
         log = log + log_prior(numbers.power)[0] if POWER in free else log
         return log + log_straight(numbers.drift) if CHANGE in free else log
 
-    def weighed(self, draws: int, seed: int = 0) -> Draws:
-        """Draw from the normal approximations, Student's tails, each weighed by the posterior."""
+    def _proposed(self, draws: int, seed: int) -> tuple[np.ndarray, Numbers, np.ndarray]:
+        """Noises, in order, numbers and their log density of draws from the normal approximations,
+        with wider tails: of shares and changes of the gas between their bounds.
+        """
         seen, peaks, free = self
-        if not np.isfinite(peaks.log).all():
-            return _none(Numbers.of(peaks.numbers))
         odds = np.exp(peaks.log - peaks.log.max()).ravel()
         ends = np.cumsum(odds) / odds.sum()
         which = np.minimum(np.searchsorted(ends, (np.arange(draws) + 0.5) / draws), odds.size - 1)
         kind, at = np.unravel_index(which, peaks.log.shape)
-        normal, given = _student(draws, len(peaks.centre), seed)
-        lower, numbers = peaks.lower[..., kind, at], peaks.numbers[:, at]
-        rows, places = ([row for row in free if (row in (POWER, PACE)) == placed]
-                        for placed in (False, True))  # fmt: skip
-        numbers[rows] = peaks.centre[:, kind, at] + _backward(lower, normal)
-        given = given + np.log(np.einsum("ppd->pd", lower)).sum(0)
-        given = given + np.log(odds[which] / odds.sum())
-        named = Numbers.of(numbers)
-        currents = named.currents(seen.gas)
+        lower, centre = peaks.lower[..., kind, at], peaks.centre[:, kind, at]
+        (rows, places), numbers = _rows(free), peaks.numbers[:, at]
+        even, far = _even(draws, len(rows), seed), np.full(draws, np.inf)
+        own, log = _between(even, -far, far)
+        if PACE in free:  # gas that is pumped away gets less
+            own[-1], log[-1] = _between(even[-1], -far, -centre[-1] * lower[-1, -1])
+        numbers[rows] = centre + _backward(lower, own)
+        named = Numbers.of(numbers)  # the bend is found after the rate and the change
+        low, high = (own[1] + lower[1, 1] * (s - named.share) / named.unit for s in seen.share)
+        own[1], log[1] = _between(even[1], np.minimum(low, high), np.maximum(low, high))
+        numbers[rows] = centre + _backward(lower, own)
+        log = np.sum(log + np.log(np.einsum("ppd->pd", lower)), axis=0)
+        spacing = math.prod(np.diff(peaks.numbers[row])[0] for row in places)
+        return kind, Numbers.of(numbers), log + np.log(odds[which] / odds.sum() / spacing)
+
+    def weighed(self, draws: int, seed: int = 0) -> Draws:
+        """Draw from the normal approximations, each draw weighed by the posterior."""
+        seen, peaks, _ = self
+        if not np.isfinite(peaks.log).all():
+            return _none(Numbers.of(peaks.numbers))
+        kind, numbers, given = self._proposed(draws, seed)
+        currents = numbers.currents(seen.gas)
         log = seen.products.log_prior[kind] + seen.log_size(currents, kind)
-        log = log + np.log(named.level * named.rate * np.abs(named.unit))
-        log = log + self._log_prior(named) - given
+        log = log + np.log(numbers.level * numbers.rate * np.abs(numbers.unit))
+        log = log + self._log_prior(numbers) - given
         if not np.isfinite(log).any():
-            return _none(named)
+            return _none(numbers)
         whole = float(logsumexp(log))
         weight = np.exp(log - whole)
-        spacing = float(np.prod([np.diff(peaks.numbers[row])[0] for row in places]))
-        whole += math.log(spacing / draws)
-        return Draws(named, currents, weight, whole, float(1 / np.sum(weight**2)))
+        whole, worth = whole - math.log(draws), float(1 / np.sum(weight**2))
+        return Draws(numbers, currents, weight, whole, worth)
 
 
 def _none(numbers: Numbers) -> Draws:
@@ -556,7 +580,8 @@ def drawn(laws: Sequence[DrawnLaw]) -> list[Draws]:
     found, count = [law.weighed(FEW) for law in laws], np.full(len(laws), FEW)
     while True:
         log, worth = np.array([(one.log, max(one.worth, 1.0)) for one in found]).T
-        errors = np.sqrt(np.exp(log - logsumexp(log)) * count / worth)  # of one draw of each
+        part = np.exp(log - max(log.max(), -1e300))
+        errors = np.sqrt(part / max(part.sum(), 1e-300) * count / worth)  # of one draw of each
         needed = np.minimum(WORTH * errors * errors.sum(), MANY)
         short = np.flatnonzero(count < 0.8 * needed)
         if not short.size:
@@ -737,7 +762,7 @@ def free_law(record: DecayRecord, values: Physical) -> FreeLaw | None:
     found = _quantities(record, seen, draws)
     power, drift = smooth.numbers.power, smooth.numbers.drift if seen.drifts else None
     power, drift = (v if v is None else quantity_of(v, smooth.weight, "1") for v in (power, drift))
-    constant = float(1 / (1 + np.exp(draws.log - plain.log)))
+    constant = float(expit(plain.log - draws.log))
     pumped = 1.0 - math.exp(smooth.log - draws.log)
     nodes = record.mean_current * draws.currents @ draws.weight
     share = quantity_of(draws.numbers.share, draws.weight, "1")
