@@ -503,8 +503,8 @@ DRAWN = (
     "NumPy"
 )
 NOISES = (
-    "89 noises, 33 exponents and 12 000 draws are averaged over for each record; a and b taken as "
-    "constant cost far less"
+    "89 noises, 33 exponents and some 6 000 draws are averaged over for each record; a and b taken "
+    "as constant cost far less"
 )
 TARGETS = (
     Target("first answer of a command, kept", "× import", 1.5,

@@ -49,7 +49,7 @@ def mean_exponential(x, xp=jnp):
     inner = xp.where(small, x, 0.0)
     series = 1.0
     for order in range(11, 1, -1):
-        series = 1 - inner / order * series
+        series = 1 - inner * (1.0 / order) * series  # complex numbers are slow to divide
     outer = xp.where(small, 1.0, x)
     return xp.where(small, series, -xp.expm1(-outer) / outer)
 
