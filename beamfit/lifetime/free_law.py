@@ -474,12 +474,11 @@ def _even(draws: int, count: int, seed: int) -> np.ndarray:
 
 def _between(even: np.ndarray, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Even points as draws by the logistic distribution between bounds, and their log density."""
-    sign = np.where(low > 0, -1.0, 1.0)  # the tail that is not near 1
-    start, end = np.sort(log_expit(np.array([sign * low, sign * high]) / TAIL), axis=0)
+    above = low > 0  # both ends on one side: the tail that is not near 1
+    start, end = log_expit(np.where(above, [-high, -low], [low, high]) / TAIL)
     below = np.logaddexp(start + np.log1p(-even), end + np.log(even))
-    found = below - np.log1p(-np.exp(below))
-    part = end + np.log(-np.expm1(start - end))
-    return sign * TAIL * found, log_expit(found) + log_expit(-found) - part - math.log(TAIL)
+    rest, part = np.log1p(-np.exp(below)), end + np.log(-np.expm1(start - end))
+    return np.where(above, -TAIL, TAIL) * (below - rest), below + rest - part - math.log(TAIL)
 
 
 def _rows(free: Sequence[int]) -> tuple[list[int], list[int]]:
