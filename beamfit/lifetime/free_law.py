@@ -189,7 +189,7 @@ PLACES, RANGES, STEPS, RESTS = 33, 5, 6, 0.2
 ENOUGH = 1024
 # Draws of each law at first, how many independent ones all together are to be worth, and most of
 # them; the scale of the logistic distribution that they have in standard deviations.
-FEW, WORTH, MANY, TAIL = 512, 2000.0, 60000, 0.6
+FEW, WORTH, MANY, TAIL = 512, 2500.0, 60000, 0.6
 # Draws worth less tell no error. More is enough: constant a and b in their place would be too sure.
 LEAST_WORTH = 10.0
 # Width of the share in what draws come from, which its bounds cut off otherwise.
