@@ -461,12 +461,11 @@ class Draws(NamedTuple):
 
 @lru_cache(maxsize=16)
 def _even(draws: int, count: int, seed: int) -> np.ndarray:
-    """Points that fill a cube evenly, (p, d), so that their means err less than those of random
-    ones: steps by powers of the root of x^(p + 1) = 1 + x, from a place at random.
+    """Points that fill a cube evenly, (p, d): their means err less than those of random ones.
+
+    Steps are powers of the root of x^(p + 1) = x + 1, from a place at random.
     """
-    root = 2.0
-    for _ in range(60):
-        root = (1 + root) ** (1 / (count + 1))
+    root = np.roots([1.0, *[0.0] * (count - 1), -1.0, -1.0]).real.max()
     steps = root ** -np.arange(1.0, count + 1)
     start = np.random.default_rng(seed).random((count, 1))
     return (start + steps[:, None] * np.arange(draws)) % 1
@@ -552,24 +551,17 @@ class DrawnLaw(NamedTuple):
         """Draw from the normal approximations, each draw weighed by the posterior."""
         seen, peaks, _ = self
         if not np.isfinite(peaks.log).all():
-            return _none(Numbers.of(peaks.numbers))
+            numbers, none = Numbers.of(peaks.numbers), np.zeros(peaks.log.shape[1])
+            return Draws(numbers, numbers.currents(seen.gas), none, -np.inf, 0.0)
         kind, numbers, given = self._proposed(draws, seed)
         currents = numbers.currents(seen.gas)
         log = seen.products.log_prior[kind] + seen.log_size(currents, kind)
         log = log + np.log(numbers.level * numbers.rate * np.abs(numbers.unit))
         log = log + self._log_prior(numbers) - given
-        if not np.isfinite(log).any():
-            return _none(numbers)
         whole = float(logsumexp(log))
-        weight = np.exp(log - whole)
-        whole, worth = whole - math.log(draws), float(1 / np.sum(weight**2))
-        return Draws(numbers, currents, weight, whole, worth)
-
-
-def _none(numbers: Numbers) -> Draws:
-    """Draws of a law that has no probability."""
-    count = numbers.level.size
-    return Draws(numbers, np.full((NODES, count), np.nan), np.zeros(count), -np.inf, 0.0)
+        weight = np.exp(log - max(whole, -1e300))
+        worth = float(weight.sum() / max(np.sum(weight**2), 1e-300))
+        return Draws(numbers, currents, weight, whole - math.log(draws), worth)
 
 
 def drawn(laws: Sequence[DrawnLaw]) -> list[Draws]:
