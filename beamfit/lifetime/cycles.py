@@ -52,10 +52,14 @@ NEAR = 8
 ROUNDS = 20
 # Share of the usual length below which a piece is the head of a cycle, as of fresh beam.
 SHORT = 0.25
+# Refills by the clock are so far apart to this share of it.
+REGULAR = 0.1
 # Least step as a share of what is lost in the piece that it divides.
 LEAST = 0.2
 # Share of what the cycles lose that refills give back at least.
 RETURNED = 0.5
+# A step that both searches find is seen within so many readings.
+BESIDE = 2.0
 # Cycles whose settings and pressure agree to this share have one a and one b.
 SAME = 0.02
 # Currents so alike that a and b do as one number.
@@ -115,6 +119,7 @@ def find_cycles(record: DecayRecord) -> Split:
         short = [piece for piece in pieces if 0 < piece.size < fewest]
         events += [event_of(record, "short", piece[0], piece[-1]) for piece in short]
         kept = np.concatenate(long or [kept[:0]])
+    long = _by_the_clock(long)
     for after, change in zip(long[1:], _changes_between(record, long), strict=True):
         kind, at = "refill" if change > 0 else "loss", float(record.time[after[0]])
         events.append(Event(kind, at, 0.0, change))
@@ -122,19 +127,40 @@ def find_cycles(record: DecayRecord) -> Split:
     return Split(tuple(cycles), tuple(sorted(events, key=lambda event: event.time)))
 
 
+def _by_the_clock(pieces: list[np.ndarray]) -> list[np.ndarray]:
+    """Divide pieces of several usual lengths, where most readings are in those of one: a refill may
+    be too small to be found. One that is missed bends a long piece, which tells most.
+    """
+    lengths = np.array([piece.size for piece in pieces])
+    usual = np.median(np.repeat(lengths, lengths)) if pieces else 1.0
+    regular = np.abs(lengths - usual) <= max(REGULAR * usual, 1.0)
+    if lengths @ regular < 0.5 * lengths.sum():
+        return pieces
+    return [
+        part
+        for piece in pieces
+        for part in np.array_split(piece, max(round(piece.size / usual), 1))
+    ]
+
+
 def cut_at_refills(record: DecayRecord) -> Split:
     """As `split_record`, but as `find_cycles` where that finds more cycles: the former cuts
     nothing but clear steps between pieces of eight readings, whatever the law of the decay.
 
-    Refills that are there give back what is lost: between clear steps alone less is lost by as many
-    times as there are more cycles, or by half of that at least.
+    The finer one is right where it finds what is clear, and all refills raise the current: what a
+    wrong law or the noise makes of a decay goes both ways, and its sum is more than twice the root
+    of its squares once in forty times.
     """
     clear, fine = split_record(record), find_cycles(record)
-    count, more = len(clear.segments), len(fine.segments)
-    if more <= count or not is_refilled(fine):
+    if len(fine.segments) <= len(clear.segments) or not is_refilled(fine):
         return clear
-    given_back = 1 - lost_in(clear.segments) / max(lost_in(fine.segments), 1e-300)
-    return fine if given_back > RETURNED * (1 - count / more) else clear
+    usual, kinds = float(np.median(np.diff(record.time))), ("refill", "loss")
+    seen, found = ([e for e in split.events if e.kind in kinds] for split in (clear, fine))
+    apart = np.abs(np.subtract.outer([e.time for e in seen], [e.time for e in found]))
+    same = apart < BESIDE * usual
+    new = [step.change for step, old in zip(found, same.any(axis=0), strict=True) if not old]
+    agree = same.any(axis=1).sum() >= RETURNED * len(seen)
+    return fine if agree and (not new or sum(new) > 2 * np.linalg.norm(new)) else clear
 
 
 def lost_in(cycles: Sequence[DecayRecord]) -> float:
@@ -152,7 +178,7 @@ def is_refilled(split: Split) -> bool:
     if len(cycles) < FEWEST_CYCLES:
         return False
     refills = [event.change for event in split.events if event.kind in ("refill", "ramp")]
-    return len(refills) + 1 >= FEWEST_CYCLES and sum(refills) > RETURNED * lost_in(cycles)
+    return len(refills) + 1 >= FEWEST_CYCLES and sum(refills) > RETURNED * lost_in(cycles) > 0
 
 
 def is_sawtooth(residuals: np.ndarray) -> bool:

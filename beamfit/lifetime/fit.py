@@ -458,7 +458,7 @@ def fit_cycles(
     >>> noise = 1e-3 * np.random.default_rng(1).normal(size=(50, 18))
     >>> cycles = [DecayRecord(t, 500 * np.exp(-t / 36000) + row) for row in noise]
     >>> print(fit_cycles(cycles).lifetime_mean)
-    9.99998 ± 0.00047 h
+    10.00002 ± 0.00049 h
     """
     if len(cycles) < FEWEST_CYCLES:
         raise InputError(f"{len(cycles)} cycles", f"{FEWEST_CYCLES} or more", path=name)

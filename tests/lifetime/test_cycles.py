@@ -189,6 +189,32 @@ def test_readings_within_short_refills_are_in_the_errors(count):
     assert held >= binom.ppf(0.01, count, 0.95)
 
 
+def uneven(seed, scatter=0.5):
+    """A minute's cycles in which each refill gives back what is missing, more or less; in some
+    nothing.
+    """
+    rng = np.random.default_rng(seed)
+    time = np.arange(0.0, 12000.0, 5.0)
+    starts = [200.0]
+    for _ in range(200):
+        low = law(60.0, starts[-1], 3e-8, 9e-6)
+        starts.append(low + max(0.0, (200 - low) * (1 + scatter * rng.normal())))
+    current = law(time % 60, np.array(starts)[(time // 60).astype(int)], 3e-8, 9e-6)
+    return DecayRecord(time, current + 0.01 * rng.normal(size=time.size))
+
+
+@simulations(15, 60)
+def test_refills_of_uneven_size_do_not_make_the_lifetime_longer(count):
+    """Missed small ones did, by up to ten errors."""
+    pulls = []
+    for seed in range(count):
+        [decay] = study_record(uneven(seed)).pooled
+        true = 1 / (3e-8 * decay.fit.mean_current + 9e-6) / 3600
+        pulls.append((decay.fit.lifetime_mean.value - true) / decay.fit.lifetime_mean.error)
+    assert np.max(np.abs(pulls)) < 4
+    assert np.mean(pulls) < 3 / np.sqrt(count)
+
+
 def test_a_few_refills_that_the_clear_search_misses_are_cut():
     """A reading halfway up divides a refill in two, of which neither stands out there."""
     time, current, number = top_up(0.3, 2, cycle=430.0, step=13.4, hours=20.0)
