@@ -15,7 +15,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.fft import dct, irfft, next_fast_len, rfft
+from scipy.fft import irfft, next_fast_len, rfft
 from scipy.linalg.lapack import dpttrf, dpttrs
 from scipy.special import logsumexp
 
@@ -31,10 +31,6 @@ BLOCKS = (4, 16)
 # noise has the rest. Readings are white unless something slow moves the monitor: amplifiers have
 # 1/f noise, and what a changing temperature adds up in a monitor is a walk.
 WHITE, CORRELATED, WALK = 0.5, 0.25, 0.1
-# Intervals between readings that differ by less than this share are even.
-EVEN = 1e-6
-# Waves of such readings that are looked at together: what all noises make of them fits the cache.
-BLOCK = 256
 # Correlation times, from this share of the interval between readings to so many records, flat in
 # the logarithm.
 SHORTEST, LONGEST, TIMES = 0.5, 3.0, 17
@@ -204,8 +200,6 @@ def products_by_each(
     >>> matrix.ravel().round(9).tolist(), (volume.round(9) + 0.0).tolist()
     ([5.0], [0.0])
     """
-    if interval.size and np.ptp(interval) < EVEN * interval[0]:
-        return _products_of_even(noises, rows, float(interval.mean()))
     matrix, volumes = [], []
     for time, alike in groupby(noises, key=lambda noise: noise.time):
         with np.errstate(divide="ignore"):
@@ -220,38 +214,6 @@ def products_by_each(
             matrix.append(begun.T @ dpttrs(size, next_, begun)[0])
             volumes.append(volume - 0.5 * float(np.sum(np.log(size))))
     return np.array(matrix), np.array(volumes)
-
-
-def _products_of_even(
-    noises: Sequence[CorrelatedNoise], rows: np.ndarray, interval: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """The same of evenly spaced readings, by the waves of the cosine transform.
-
-    In them the inverse of the covariance R without a white part is a diagonal D and g E Eᵀ with
-    the sum and the difference E of the first and the last reading. With A = 1/(1 - w + w D) that of
-    (1 - w) R + w is D A + (1 - w) A E S Eᵀ A, where S = 1/(1/g + w Eᵀ A E) is diagonal, too.
-    """
-    count, (times, white) = len(rows), np.array([(n.time, n.white) for n in noises]).T[..., None]
-    kept, new = np.exp(-interval / times), -np.expm1(-2 * interval / times)
-    rows, m, matrix, ends = dct(rows, axis=0, norm="ortho"), rows.shape[1], 0.0, 0.0
-    volume = (1 - count) * np.log(new[:, 0])
-    for first in range(0, count, BLOCK):
-        own = rows[first : first + BLOCK]
-        wave = np.arange(first, first + len(own))
-        angle = np.pi * wave / (2 * count)
-        known = ((1 - kept) ** 2 + 4 * kept * np.sin(angle) ** 2) / new
-        inverse = 1 / (1 - white + white * known)
-        end = 2 / np.sqrt(count) * np.cos(angle) / np.where(wave > 0, 1.0, np.sqrt(2.0))
-        both = np.where(wave % 2 == [[0], [1]], end, 0.0).T[:, :, None]
-        beside = both * np.column_stack([end, own])[:, None]
-        matrix += known * inverse @ (own[:, :, None] * own[:, None]).reshape(-1, m * m)
-        ends += inverse @ beside.reshape(-1, 2 * (1 + m))
-        volume += np.sum(np.log(inverse), axis=1)
-    ends, more = ends.reshape(-1, 2, 1 + m), kept / (1 + kept)
-    size = 1 + more * white * ends[..., 0]
-    ends = np.sqrt((1 - white) * more / size)[..., None] * ends[..., 1:]
-    volume -= np.sum(np.log(size), axis=1)
-    return matrix.reshape(-1, m, m) + np.swapaxes(ends, 1, 2) @ ends, 0.5 * volume
 
 
 class Levels(NamedTuple):

@@ -41,7 +41,10 @@ def main():
         "negative_size.csv", "a size with the wrong sign", [[0, 300, 6], [1, -200, 4], [2, 90, 2]]
     )
     short = "# invented: too short to tell a from b\ntime_s,beam_current_mA\n"
-    decay = [f"{t},{100.0 - t / 3600:.6f}" for t in range(0, 600, 60)]
+    time = np.arange(0, 600, 60)
+    # Exact readings would leave the verdict to rounding.
+    current = 100.0 * np.exp(-time / 360000) + 1e-4 * np.random.default_rng(5).normal(size=10)
+    decay = [f"{t},{i:.6f}" for t, i in zip(time, current, strict=True)]
     (HERE / "short_decay.csv").write_text(short + "\n".join(decay) + "\n")
 
 

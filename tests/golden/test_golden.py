@@ -42,7 +42,7 @@ COMMANDS = {
     "transport_network": f"emittance measurements/gtf_simulated.csv {GTF} "
     "--scenario transport-network --anchor first-principles=2%",
     "aps": "lifetime measurements/aps_1999_decay.csv",
-    "short_decay": f"lifetime {DATA}/short_decay.csv",
+    "short_decay": f"lifetime {DATA}/short_decay.csv --law constant",
     "spear3": "lifetime measurements/spear3_shift_simulated.csv --ring lattices/spear3_2003.toml",
     "design": f"design measurements/gtf_simulated.csv {GTF}",
     "setpoint": f"setpoint {GTF} --sigma 2.6367971e-8,1.5738242e-8,1.4354411e-8 --vary Q2=0:10 "
