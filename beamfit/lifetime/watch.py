@@ -115,7 +115,7 @@ class Answer(NamedTuple):
         return fit | json_of(named | more)
 
 
-def fit_window(rows: Sequence[WindowRow], name: str) -> Window:
+def fit_window(rows: Sequence[WindowRow], name: str, law: Law = Law.free) -> Window:
     """Cut a window at refills and changes of setting, and fit what is as it is now.
 
     Parameters
@@ -124,6 +124,8 @@ def fit_window(rows: Sequence[WindowRow], name: str) -> Window:
         In order of time.
     name : str
         What to call the result.
+    law : Law
+        As of `fit_decay`.
 
     Returns
     -------
@@ -153,7 +155,7 @@ def fit_window(rows: Sequence[WindowRow], name: str) -> Window:
     if len(one) < FEWEST:
         return Window(None, one, len(group), f"{len(one)} readings since the last change")
     try:
-        fit = _fitted(group, name)
+        fit = _fitted(group, name, law)
     except InputError as error:  # a current that rises
         return Window(None, one, len(group), error.found)
     return Window(fit, one, len(group))
@@ -180,10 +182,10 @@ def normalised(window: Window, machine: Machine | None, current: float | None) -
     return Quantity(by * lifetime.value, by * lifetime.error, "mA h")
 
 
-def _fitted(group: list[DecayRecord], name: str) -> DecayFit:
+def _fitted(group: list[DecayRecord], name: str, law: Law) -> DecayFit:
     if len(group) == 1:
-        return fit_decay(replace(group[0], name=name), law=Law.constant)
-    fit = fit_pieces(group, name)
+        return fit_decay(replace(group[0], name=name), law=law)
+    fit = fit_pieces(group, name, law)
     return seen_through(fit, *usual_cycle(group)) if len(group) > 2 else fit
 
 
@@ -283,19 +285,23 @@ def learnt(
 
 
 def _usual(window: Window, machine: Machine | None) -> alarm.Reference | None:
-    """The loss of a fit that knows a and b, or the loss rate and a ring their ratio."""
+    """The loss of a fit that knows a and b if they are constant, which the readings do not refute,
+    or the loss rate and a ring their ratio.
+    """
     fit, ring = window.fit, None
     decay = Decay(window.readings, 0.0, fit, None)
-    if fit.status is Status.converged:
-        known = (fit.a, fit.b)
-    elif fit.status is Status.unidentified and machine is not None:
+    refuted = fit.constant_a is not None and fit.constant_a.status is Status.poor_fit
+    if refuted or fit.status not in (Status.converged, Status.unidentified):
+        return None
+    known = tuple(fit.if_constant(name) for name in "ab")
+    if not all(one.determined for one in known):
+        if machine is None:
+            return None
         known = (fit.lifetime_mean,)
         try:
             ring = budget(window.readings, machine).losses
         except InputError:
             return None
-    else:
-        return None
     if not all(one.error and abs(one.relative) < KNOWN for one in known):
         return None
     return reference_of((decay,), np.ones(1), np.ones(1), ring)
@@ -596,7 +602,8 @@ def _answered(plan: Plan, state: State) -> State:
     begin, shift = state.last - plan.window, state.shift
     state = _kept(state, begin)
     none = Window(None, None, 0, "no beam")
-    window = fit_window(state.rows, plan.name) if state.dead < DEAD else none
+    law = Law.free if plan.machine is None else Law.constant  # a ring knows more of its law
+    window = fit_window(state.rows, plan.name, law) if state.dead < DEAD else none
     answer = _answer(plan, state, window)
     found = answer.lifetime
     known = (found.value, found.error) if found else (math.nan, math.nan)

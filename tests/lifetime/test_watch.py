@@ -34,9 +34,12 @@ def watch(readings, plan=PLAN, state=State(), start=START):  # noqa: B008
 def test_a_hidden_rise_is_named_and_the_lifetime_is_that_of_the_new_loss(which, worse):
     readings = list(decay(7600, worse=worse, moved=5000.0))
     before = watch(readings[:625])
-    for found, truth in ((before.answer.a, A), (before.answer.b, B)):
-        assert found.value == pytest.approx(truth, abs=4 * found.error)
-        assert found.error < 0.01 * truth
+    for name, truth in (("a", A), ("b", B)):
+        exact = before.answer.window.fit.if_constant(name)
+        assert exact.value == pytest.approx(truth, abs=4 * exact.error)
+        assert exact.error < 0.01 * truth
+        found = getattr(before.answer, name)
+        assert found.value == pytest.approx(truth, abs=2 * found.error)
     assert (before.alarmed, before.answer.status) == ("", "converged")
     after = watch(readings[625:], state=before)
     [alarm] = after.alarms
@@ -50,6 +53,20 @@ def test_a_hidden_rise_is_named_and_the_lifetime_is_that_of_the_new_loss(which, 
     found = after.answer.lifetime
     assert found.value == pytest.approx(1 / rate / 3600, abs=4 * found.error)
     assert after.answer.status == "converged"
+
+
+def test_a_vacuum_that_drifts_is_in_the_errors_of_a_and_b():
+    """Constant a and b would have a off by 90 of their errors."""
+    time, beam, readings = np.arange(0.0, 7200.0, 10.0), 500.0, []
+    random = np.random.default_rng(3)
+    for second in time:
+        beam = beam_after(beam, 10.0, A, B * (1 - 0.05 * second / time[-1]))
+        readings.append((second, beam + 0.01 * random.normal()))
+    fit = watch(readings, Plan(window=8000.0, every=7000.0)).answer.window.fit
+    low, high = fit.a.interval_95
+    assert low < A < high
+    exact = fit.if_constant("a")
+    assert abs(exact.value - A) > 10 * exact.error
 
 
 def test_a_day_of_nothing_but_trouble_is_no_alarm():
