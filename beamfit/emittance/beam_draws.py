@@ -81,13 +81,15 @@ def coordinates(
     r11: np.ndarray, r12: np.ndarray, size: np.ndarray, known: np.ndarray
 ) -> Coordinates:
     """Turn to coordinates in which the scan looks evenly; all arrays of shape (..., n)."""
-    unit = np.exp(np.log(size).mean(-1))
-    size, known = size / unit[..., None], known / unit[..., None] ** 2
     # R12 is a length: the columns are scaled to one size before they are turned.
     u = np.stack([r11, r12], -1)
     norm = np.sqrt((u**2).mean(-2, keepdims=True))
     norm = np.where(norm > 0, norm, 1.0)
-    v = u / norm / size[..., None]
+    likely = _likely(u / norm, size)
+    unit = np.exp(np.log(likely).mean(-1))
+    size, likely = size / unit[..., None], likely / unit[..., None]
+    known = known / unit[..., None] ** 2
+    v = u / norm / likely[..., None]
     values, vectors = np.linalg.eigh(np.swapaxes(v, -1, -2) @ v / size.shape[-1])
     seen = values[..., 0] > RANK * values[..., 1]
     values = np.where(seen[..., None], values, np.maximum(values, 1.0))
@@ -96,6 +98,20 @@ def coordinates(
     a, b = w[..., 0], w[..., 1]
     rows = 0.5 * np.stack([a**2 + b**2, a**2 - b**2, 2.0 * a * b], -1)
     return Coordinates(w, rows, back, size, known, unit, seen)
+
+
+def _likely(v: np.ndarray, size: np.ndarray) -> np.ndarray:
+    """Sizes within a factor of what rows (..., n, 2) of neighbouring phases make likely.
+
+    One bad reading would decide what the prior takes for near the sizes.
+    """
+    length = np.maximum(np.linalg.norm(v, axis=-1), 1e-300)
+    turn = np.argsort(np.arctan2(v[..., 1], v[..., 0]) % math.pi, axis=-1)
+    seen = np.take_along_axis(size / length, turn, -1)
+    first = np.clip(np.arange(size.shape[-1]) - 1, 0, max(size.shape[-1] - 3, 0))
+    middle = np.median([seen[..., np.minimum(first + i, size.shape[-1] - 1)] for i in range(3)], 0)
+    near = np.take_along_axis(middle, np.argsort(turn, axis=-1), -1) * length
+    return np.clip(size, near / FURTHEST, near * FURTHEST)
 
 
 class BeamDraws(NamedTuple):

@@ -27,9 +27,9 @@ from beamfit.noise.sizes import (
     NoiseKind,
     Scales,
     averaged,
+    bad_of,
     kinds_of,
     log_likelihood,
-    odds_of,
     scales_of,
     variance_of,
     wide_scales,
@@ -80,8 +80,8 @@ def flat_beam(c: Coordinates, kind: NoiseKind, noise: Noise) -> np.ndarray:
     order = np.argsort(np.arctan2(w[..., 1], w[..., 0]), axis=-1)
     w = np.take_along_axis(w, order[..., None], -2)
     size, known = (np.take_along_axis(v, order, -1) for v in (c.size, c.known))
-    own = (np.take_along_axis(v, order, -1) for v in (kind.floor, kind.unit, kind.usual))
-    kind = replace(kind, **dict(zip(("floor", "unit", "usual"), own, strict=True)))
+    own = (np.take_along_axis(v, order, -1) for v in (kind.floor, kind.unit))
+    kind = replace(kind, **dict(zip(("floor", "unit"), own, strict=True)))
     target = np.sqrt(np.maximum(size**2 - known, 0.0))
     scale = kind.special or kind.prior.middle
     deviation = np.hypot(kind.floor, scale * kind.unit) * (size if kind.power else 1.0)
@@ -172,17 +172,19 @@ def curve_evidences(u: np.ndarray, c: Coordinates, kind: NoiseKind, noise: Noise
     wide = wide_scales(flat, c.unit.shape)
     variance = variance_of(flat, wide.scale)
     same = np.broadcast_to(np.eye(n), (*c.unit.shape, n, n))
-    random = _process(x, same, STEPS, variance, wide)
-    drift = _process(x, np.broadcast_to(_walk(n), same.shape), STEPS, variance, wide)
-    by_size = variance * c.size[..., None, :] ** 2
-    curves = [_process(c.size - 1.0, _bends(u, each), BENDS, by_size, wide) for each in LENGTHS]
+    random = _process(x, same, STEPS, variance, wide, noise)
+    walk = np.broadcast_to(_walk(n), same.shape)
+    drift = _process(x, walk, STEPS, variance, wide, noise)
+    by_size, own = variance * c.size[..., None, :] ** 2, c.size - 1.0
+    curves = [_process(own, _bends(u, each), BENDS, by_size, wide, noise) for each in LENGTHS]
     curve = np.logaddexp(*curves) - math.log(2.0) + x.sum(-1)
     return np.stack([constant, random, drift, curve]) + kind.log_weight
 
 
 def _process(
-    x: np.ndarray, kernel: np.ndarray, amplitudes: np.ndarray, variance: np.ndarray, scales: Scales
-) -> np.ndarray:
+    x: np.ndarray, kernel: np.ndarray, amplitudes: np.ndarray, variance: np.ndarray,
+    scales: Scales, noise: Noise,
+) -> np.ndarray:  # fmt: skip
     """Log evidence of a Gaussian process about a constant, amplitudes and noise averaged over."""
     n = x.shape[-1]
     root = np.sqrt(variance)
@@ -196,18 +198,47 @@ def _process(
     qq, qo, oo = (np.sum(v / grown, axis=-1) for v in (q * q, q * one, one * one))
     log_det = np.log(grown).sum(-1) + np.log1p(oo) + np.log(variance).sum(-1)[..., None]
     log = -0.5 * (qq - qo**2 / (1.0 + oo) + log_det + n * LN_2PI)
-    log = averaged(log, -math.log(len(amplitudes)))
+    q, one = q / grown @ turned, one / grown @ turned
+    off = q - one * (qo / (1.0 + oo))[..., None]
+    precision = 1.0 / grown @ turned**2 - one**2 / (1.0 + oo)[..., None]
+    log = averaged(log + one_bad(off, precision, noise), -math.log(len(amplitudes)))
     return averaged(log, scales.log_weight)
 
 
-def departure_odds(x: np.ndarray, u: np.ndarray, c: Coordinates, kind: NoiseKind) -> np.ndarray:
+def one_bad(off: np.ndarray, precision: np.ndarray, noise: Noise) -> np.ndarray:
+    """Log of how much likelier readings are if one of them may be bad, shape (..., n) to (...).
+
+    Parameters
+    ----------
+    off, precision : ndarray
+        Shape (..., n): K⁻¹y and the diagonal of K⁻¹, for readings y of covariance K in units of
+        their noise.
+    noise : Noise
+        Of bad readings.
+
+    Notes
+    -----
+    What the others say of a reading is normal, with the variance 1/(K⁻¹)ᵢᵢ about
+    yᵢ - (K⁻¹y)ᵢ/(K⁻¹)ᵢᵢ (Rasmussen and Williams, eq. 5.12); a bad one has its width beside that.
+    """
+    precision = np.maximum(precision, 1e-12)
+    wide = noise.width**2 + 1.0 / precision - 1.0
+    bad = math.log(noise.bad / (1.0 - noise.bad)) + 0.5 * math.log(2.0 / math.pi)
+    bad = bad - 0.5 * np.log(wide * precision) - np.log1p((off / precision) ** 2 / wide)
+    bad = np.logaddexp.reduce(bad + 0.5 * off**2 / precision, axis=-1)
+    return np.logaddexp(0.0, bad) + off.shape[-1] * math.log1p(-noise.bad)
+
+
+def departure_odds(
+    x: np.ndarray, u: np.ndarray, c: Coordinates, kind: NoiseKind, noise: Noise
+) -> np.ndarray:
     """Log odds of a smooth departure beside a beam against a beam alone, shape (...,).
 
     Parameters
     ----------
     x : ndarray
         Shape (..., 3): T, T p_1, T p_2 of a beam near the best.
-    u, c, kind
+    u, c, kind, noise
         As for `curve_evidences`.
 
     Notes
@@ -226,17 +257,20 @@ def departure_odds(x: np.ndarray, u: np.ndarray, c: Coordinates, kind: NoiseKind
     basis, triangle = np.linalg.qr(rows, mode="complete")
     left = np.swapaxes(basis[..., 3:], -1, -2)
     q = (left @ ((c.size - model)[..., None, :] / root)[..., None])[..., 0]
-    known = np.log(root).sum(-1)
-    known = known + np.log(np.abs(np.einsum("...ii->...i", triangle[..., :3, :]))).sum(-1)
-    alone = averaged(-0.5 * np.sum(q**2, axis=-1) - known, wide.log_weight)
     shares = model[..., None, :] / root
     kernel = _bends(u, SMOOTH)[..., None, :, :] * shares[..., None] * shares[..., None, :]
     values, vectors = np.linalg.eigh(left @ kernel @ np.swapaxes(left, -1, -2))
-    turned = (np.swapaxes(vectors, -1, -2) @ q[..., None])[..., None, :, 0]
-    grown = 1.0 + DEPARTURES[:, None] ** 2 * np.maximum(values, 0.0)[..., None, :]
-    log = -0.5 * np.sum(turned**2 / grown + np.log(grown), axis=-1) - known[..., None]
-    log = averaged(log, -math.log(len(DEPARTURES)))
-    odds = averaged(log, wide.log_weight) - alone
+    turned = np.swapaxes(vectors, -1, -2)
+    q, seen = (turned @ q[..., None])[..., None, :, 0], turned @ left
+    # The first is a beam alone.
+    amplitudes = np.append(0.0, DEPARTURES)
+    grown = 1.0 + amplitudes[:, None] ** 2 * np.maximum(values, 0.0)[..., None, :]
+    log = -0.5 * np.sum(q**2 / grown + np.log(grown), axis=-1)
+    log = log + one_bad(q / grown @ seen, 1.0 / grown @ seen**2, noise)
+    spans = np.log(np.abs(np.einsum("...ii->...i", triangle[..., :3, :]))).sum(-1)
+    log = np.swapaxes(log - (np.log(root).sum(-1) + spans)[..., None], -1, -2)
+    log = averaged(log, wide.log_weight[..., None, :])
+    odds = averaged(log[..., 1:], -math.log(len(DEPARTURES))) - log[..., 0]
     # Settings that do not separate the beam's numbers show no departure from them.
     return np.where(c.seen & np.isfinite(odds), odds, -np.inf)
 
@@ -452,7 +486,7 @@ def _evidences(s: _Stack, i: int, draws: BeamDraws, noise: Noise) -> np.ndarray:
         flat = flat_beam(s.c, replace(kind, power=0, unit=kind.unit * s.c.size), noise)
     jacobian = np.log(s.c.size).sum(-1)
     curves = curve_evidences(s.u, s.c, kind, noise)
-    near = beam + jacobian + departure_odds(draws.best, s.u, s.c, kind)
+    near = beam + jacobian + departure_odds(draws.best, s.u, s.c, kind, noise)
     curves[-1] = np.logaddexp(curves[-1] + math.log1p(-NEAR), near + math.log(NEAR))
     return np.stack([beam + jacobian, flat + jacobian, *curves], -1)
 
@@ -513,7 +547,8 @@ def _best(
 
 def _model(x: np.ndarray, c: Coordinates) -> np.ndarray:
     squared = (c.rows @ x[..., None])[..., 0] + c.known
-    return np.sqrt(np.clip(squared, (c.size / FURTHEST) ** 2, (c.size * FURTHEST) ** 2))
+    least, most = (of(c.size, axis=-1, keepdims=True) for of in (np.min, np.max))
+    return np.sqrt(np.clip(squared, (least / FURTHEST) ** 2, (most * FURTHEST) ** 2))
 
 
 def _expecting(
@@ -521,13 +556,12 @@ def _expecting(
 ) -> Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]:
     """Expected precision of each point's size, and probability that it is bad, by the model."""
     variance, share = variance_of(kind, draws.scales.scale), draws.scale_weight[..., None]
-    steep, least = (part[:, None, :] for part in odds_of(kind, noise))
-    wide = (noise.width * kind.usual[:, None, :]) ** -2
 
     def expected(model: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        squared = (((c.size - model) / model**kind.power) ** 2)[:, None, :]
-        bad = 1.0 / (1.0 + np.exp(-steep * squared / variance - least))
-        each = (1.0 - bad * (1.0 - wide)) / variance
+        pull = (((c.size - model) / model**kind.power) ** 2)[:, None, :] / variance
+        bad = 1.0 / (1.0 + np.exp(-0.5 * pull) / bad_of(pull, noise))
+        # A Cauchy distribution is a normal one of this mean precision.
+        each = (1.0 - bad + bad * 2.0 / (noise.width**2 + pull)) / variance
         return (share * each).sum(1) / model ** (2 * kind.power), (share * bad).sum(1)
 
     return expected

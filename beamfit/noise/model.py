@@ -69,8 +69,8 @@ class Noise:
     bad : float
         Probability that a reading is bad: a shot that missed, a wrong cell.
     width : float
-        How many times wider bad readings scatter than good ones, or than most points do where a
-        point's own stated error is less.
+        How many times wider bad readings scatter than good ones, as a Cauchy distribution: a slip
+        of the decimal point is any number of errors off.
     bad_shot : float
         Probability that a single shot shows something else than the beam.
     source : str

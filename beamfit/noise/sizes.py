@@ -21,8 +21,8 @@ from beamfit.statistics import log_student
 NODES, DEEP = 12, 12.0
 # Standard deviations of the prior that nodes begin with.
 REACH = 4.5
-# Log odds beyond which a reading is surely bad, to rounding, and how many such are multiplied.
-CLEAR, AT_ONCE = 36.0, 16
+# Densities that are multiplied before a logarithm is taken.
+AT_ONCE = 8
 # Degrees of freedom that the scatter of all settings counts beside a setting's own: the scatter
 # of a setting differs from the others' by a third of itself at most (Gelman et al., sect. 2.6).
 POOLED = 20.0
@@ -42,9 +42,6 @@ class NoiseKind:
         1 where the noise is a share of the size, 0 where it is the same at every size.
     floor, unit : array
         Shape (..., n): what is there in any case, and what the scale s multiplies.
-    usual : array
-        Shape (..., n): deviations of most points over a point's own, at least 1: a wrong cell may
-        have a wrong error, too.
     prior : Lognormal
         Of s.
     special, chance : float
@@ -59,7 +56,6 @@ class NoiseKind:
     power: int
     floor: Any
     unit: Any
-    usual: Any
     prior: Lognormal
     special: float
     chance: float
@@ -104,23 +100,18 @@ def kinds_of(
     """
     zero, one = np.zeros_like(size), np.ones_like(size)
     if floor is not None:
-        return (NoiseKind(0, floor, size, one, noise.scatter, 0.0, noise.even, 0.0, 0.0),)
+        return (NoiseKind(0, floor, size, noise.scatter, 0.0, noise.even, 0.0, 0.0),)
     if error is None:
         middle = np.median(size, axis=-1, keepdims=True) * np.ones_like(size)
         share, same = math.log(noise.share), math.log1p(-noise.share)
         return (
-            NoiseKind(1, zero, one, one, noise.unstated, 1.0, 0.0, 0.0, share),
-            NoiseKind(0, zero, middle, one, noise.unstated, 1.0, 0.0, 0.0, same),
+            NoiseKind(1, zero, one, noise.unstated, 1.0, 0.0, 0.0, share),
+            NoiseKind(0, zero, middle, noise.unstated, 1.0, 0.0, 0.0, same),
         )
     share = error / size
     alike = bool(np.all(np.ptp(share, axis=-1) <= 0.01 * share.mean(-1)))
     unit = share if alike else error
-    usual = np.maximum(
-        np.median(share, axis=-1, keepdims=True) / share,
-        np.median(error, axis=-1, keepdims=True) / error,
-    )
-    usual = np.maximum(usual, 1.0)
-    return (NoiseKind(int(alike), zero, unit, usual, noise.factor, 1.0, noise.right, 1.0, 0.0),)
+    return (NoiseKind(int(alike), zero, unit, noise.factor, 1.0, noise.right, 1.0, 0.0),)
 
 
 def scales_between(kind: NoiseKind, low: np.ndarray, high: np.ndarray) -> Scales:
@@ -204,39 +195,28 @@ def log_likelihood(off: Any, model: Any, kind: NoiseKind, scale: Any, noise: Noi
     -----
     A reading is good with probability 1 - f or else scatters W times as wide (the good-and-bad-data
     model of D. W. Hogg, J. Bovy and D. Lang, arXiv:1008.4686 (2010), eq. 17, with a width that
-    goes with the noise).
+    goes with the noise), and as a Cauchy distribution: a slip of the decimal point is as far off
+    as it is, whatever the noise.
     """
     xp = off.__array_namespace__()
     n = off.shape[-1]
     squared, variance = (off / model if kind.power else off) ** 2, variance_of(kind, scale)
-    steep, least = odds_of(kind, noise)
-    steep = steep[..., None, :] / variance
-    # Sums over points of all draws at all scales are products of two matrices.
-    by_point = xp.moveaxis(squared, -1, -2)
-    found = (steep - 0.5 / variance) @ by_point
-    found -= (0.5 * xp.sum(xp.log(variance), axis=-1) - xp.sum(least, axis=-1, keepdims=True))[
-        ..., None
-    ]
-    found += n * (math.log1p(-noise.bad) - 0.5 * LN_2PI)
+    found = -0.5 * xp.sum(xp.log(variance), axis=-1)[..., None]
+    found = found + n * (math.log1p(-noise.bad) - 0.5 * LN_2PI)
     if kind.power:
-        found -= xp.sum(xp.log(model), axis=-1)[..., None, :]
-    odds = _points_first(steep, xp)[..., None] * _points_first(squared, xp)[..., None, :]
-    odds += xp.moveaxis(least, -1, 0)[..., None, None]
-    odds = xp.minimum(odds, CLEAR)
-    found -= xp.sum(odds, axis=0)
-    # ln(1 + e^odds) is odds of one that is clear; of several points it is one logarithm.
-    odds = xp.exp(odds)
-    odds += 1.0
+        found = found - xp.sum(xp.log(model), axis=-1)[..., None, :]
+    # Points first, so that sums over them run along memory.
+    pull = _points_first(1.0 / variance, xp)[..., None] * _points_first(squared, xp)[..., None, :]
+    either = xp.exp(-0.5 * pull) + bad_of(pull, noise)
     for first in range(0, n, AT_ONCE):
-        found += xp.log(xp.prod(odds[first : first + AT_ONCE], axis=0))
+        found = found + xp.log(xp.prod(either[first : first + AT_ONCE], axis=0))
     return xp.moveaxis(found, -1, -2)
 
 
-def odds_of(kind: NoiseKind, noise: Noise) -> tuple[Any, Any]:
-    """Log odds that a reading is bad: slope by its squared pull, and those without; (..., n)."""
-    width = noise.width * kind.usual
-    xp = width.__array_namespace__()
-    return 0.5 * (1.0 - width**-2), math.log(noise.bad / (1.0 - noise.bad)) - xp.log(width)
+def bad_of(pull: Any, noise: Noise) -> Any:
+    """Density of bad readings by their squared pulls, where that of good ones is e^(-pull/2)."""
+    peak = noise.bad / (1.0 - noise.bad) * math.sqrt(2.0 / math.pi) / noise.width
+    return peak / (1.0 + pull / noise.width**2)
 
 
 def averaged(log: Any, log_weight: Any) -> Any:

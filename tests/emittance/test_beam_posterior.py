@@ -133,14 +133,14 @@ def brute_probabilities(fit, kind, noise):
     mean = np.exp(np.log(size).mean())
     x, walk = np.log(size / mean), np.minimum.outer(np.arange(n), np.arange(n)) * 1.0
     far = np.abs(np.subtract.outer(*2 * [np.argsort(np.argsort(p.r11 / p.r12))])) / n
-    usual = ref.usual_over_own(size, error) if kind in ("stated", "share") else 1.0
     parts, near = [], []
     for chance, deviation, weight in noises(kind, size, error, noise):
-        found = [ref.log_evidence_of_constant(size, deviation, weight, noise, usual)]
+        found = [ref.log_evidence_of_constant(size, deviation, weight, noise)]
         for kernel in (np.eye(n), walk):
-            found.append(ref.log_process(x, [a**2 * kernel for a in STEPS], deviation, weight))
+            steps = [a**2 * kernel for a in STEPS]
+            found.append(ref.log_process(x, steps, deviation, weight, noise))
         bends = [a**2 * (1 + far / m) * np.exp(-far / m) for m in LENGTHS for a in BENDS]
-        curve = ref.log_process(size / mean - 1, bends, deviation * size / mean, weight)
+        curve = ref.log_process(size / mean - 1, bends, deviation * size / mean, weight, noise)
         parts.append(np.array([*found, curve + x.sum()]) + np.log(chance))
         model = p.model / mean
         slopes = spread * (p.error / mean)[:, None] * np.abs(post.best)

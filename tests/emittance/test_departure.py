@@ -1,6 +1,7 @@
 """A smooth departure from a beam's sizes, as of a screen that lifts the small ones."""
 
 import numpy as np
+import pytest
 from scipy.special import logsumexp
 
 from beamfit.emittance.beam_draws import coordinates
@@ -14,6 +15,7 @@ from beamfit.emittance.comparison import (
 from beamfit.emittance.verdict import SURE
 from beamfit.noise.model import Noise
 from beamfit.noise.sizes import kinds_of, wide_scales
+from tests.noise.reference import log_of_one_bad
 from tests.simulations import simulations
 
 
@@ -26,8 +28,8 @@ def dense_odds(off, slopes, model, far, deviation, log_weight):
         bend = (1 + far / SMOOTH) * np.exp(-far / SMOOTH)
         wide = amplitude**2 * bend * np.outer(model, model) + 1e4 * slopes @ slopes.T
         each = [np.diag(sd**2) + wide for sd in deviation]
-        log = [-0.5 * (off @ np.linalg.solve(c, off) + np.linalg.slogdet(c)[1]) for c in each]
-        return logsumexp(log + log_weight)
+        both = zip(each, deviation, strict=True)
+        return logsumexp([log_of_one_bad(off, c, sd, Noise()) for c, sd in both] + log_weight)
 
     both = [log_of(amplitude) for amplitude in DEPARTURES]
     return logsumexp(both) - np.log(len(both)) - log_of(0.0)
@@ -47,7 +49,7 @@ def test_odds_are_those_of_dense_covariances():
     far = np.abs(np.subtract.outer(rank, rank)) / 9
     deviation = scales.scale[0][:, None] * kind.unit[0] * model
     expected = dense_odds(c.size[0] - model, slopes, model, far, deviation, scales.log_weight[0])
-    assert np.isclose(departure_odds(x[None], u[None], c, kind)[0], expected, atol=1e-3)
+    assert np.isclose(departure_odds(x[None], u[None], c, kind, Noise())[0], expected, atol=1e-3)
 
 
 def probability(size, share, seed):
@@ -67,6 +69,15 @@ def test_lifted_small_sizes_are_no_beam(count):
     """A screen that shows no size below 1.7 times the waist."""
     lifted = np.maximum(WAIST, 1.7 * WAIST.min())
     assert max(probability(lifted, 0.02, seed) for seed in range(count)) < SURE
+
+
+@simulations(8, 100)
+@pytest.mark.parametrize("slip", [10.0, 0.1])
+def test_a_slip_buys_lifted_sizes_no_answer(slip, count):
+    """Rivals have bad readings as a beam has: a curve with one is still a curve."""
+    lifted = np.maximum(WAIST, 1.7 * WAIST.min())
+    lifted[0] *= slip
+    assert np.median([probability(lifted, 0.02, seed) for seed in range(count)]) < SURE
 
 
 @simulations(8, 100)

@@ -129,7 +129,7 @@ def test_asking_for_one_plane_changes_nothing_in_it(fit, scan, otr2):
 def test_the_table_a_person_reads(fit):
     text = str(fit)
     quoted = [str(p.normalized_emittance) for p in fit.planes]
-    for words in (*quoted, "converged", "17.99/2 = 8.99", "beta at OTR2", "P(beam)"):
+    for words in (*quoted, "converged", "17.99/2 = 9.00", "beta at OTR2", "P(beam)"):
         assert words in text
     html = fit._repr_html_()
     assert "<table>" in html

@@ -159,6 +159,21 @@ def test_what_is_called_determined_is_right(gtf, first, relative, count):
             assert fit.emittance.relative < 0.25
 
 
+@pytest.mark.parametrize("errors", [True, False], ids=["errors", "no errors"])
+@pytest.mark.parametrize("factor", [100.0, 10.0, 5.0, 0.1, 0.01])
+def test_a_slip_of_the_decimal_point_is_named_and_left_out(gtf, factor, errors):
+    """However far off: what is bad has no width that a beam's other sizes would have to explain."""
+    currents = np.linspace(0.0, 3.9, 10)
+    sizes = np.sqrt(design(gtf, {"Q2": currents}) @ TABLE_2)
+    scan = scan_of("Q2", "A", currents, sizes, 0.02, 1, errors)
+    scan.size["x"][2] *= factor
+    fit = beamfit.fit_emittance(scan, gtf).x
+    assert fit.status is Status.converged
+    assert f"1 of 10 readings is probably bad: Q2 = {currents[2]:.4g} A" in fit.message
+    low, high = fit.emittance.interval_95
+    assert low < TRUE_EMITTANCE < high
+
+
 def test_a_magnet_that_does_nothing_is_named(three_quads):
     """QC scanned, sizes from the screen before it would be blind: here R does not change."""
     line = three_quads.upto("YAG1")

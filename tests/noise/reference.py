@@ -7,7 +7,7 @@ likelihoods are products over readings. Nothing here is taken from the package b
 import math
 
 import numpy as np
-from scipy.stats import multivariate_t, norm
+from scipy.stats import cauchy, multivariate_t, norm
 
 GRID = 80
 
@@ -49,26 +49,18 @@ def unstated_scales(noise):
     return lognormal_grid(noise.unstated)
 
 
-def usual_over_own(size, error):
-    """How much larger most points' errors are than a point's own: what a wrong cell may be off."""
-    share = error / size
-    by_share, by_error = np.median(share) / share, np.median(error) / error
-    return np.maximum(np.maximum(by_share, by_error), 1.0)
-
-
-def log_readings(off, deviation, noise, usual=1.0):
+def log_readings(off, deviation, noise):
     """Log density of readings of shape (..., n), each good or bad."""
     good = log_normal(off, deviation)
-    wide = log_normal(off, noise.width * usual * deviation)
+    wide = cauchy.logpdf(off, scale=noise.width * deviation)
     either = np.logaddexp(math.log(1.0 - noise.bad) + good, math.log(noise.bad) + wide)
     return either.sum(-1)
 
 
 def log_stated(size, model, error, noise):
     """Sizes with stated errors, that are right or all too small by one factor."""
-    usual = usual_over_own(size, error)
     parts = [
-        math.log(w) + log_readings(size - model, s * error, noise, usual)
+        math.log(w) + log_readings(size - model, s * error, noise)
         for s, w in zip(*stated_scales(noise), strict=True)
         if w > 0.0
     ]
@@ -77,9 +69,8 @@ def log_stated(size, model, error, noise):
 
 def log_share(size, model, share, noise):
     """The same of errors that are one share of the size, and so of the beam's own."""
-    usual = usual_over_own(size, share * size)
     parts = [
-        math.log(w) + log_readings(size - model, s * share * model, noise, usual)
+        math.log(w) + log_readings(size - model, s * share * model, noise)
         for s, w in zip(*stated_scales(noise), strict=True)
         if w > 0.0
     ]
@@ -112,20 +103,42 @@ def log_unstated(size, model, noise):
     return np.logaddexp(log_same(size, model, noise), log_same(size, model, noise, share=True))
 
 
-def log_process(x, kernels, deviation, weight):
+def log_of_all(off, covariance):
+    """Log density of a multivariate normal distribution."""
+    _, log_determinant = np.linalg.slogdet(covariance)
+    pull = off @ np.linalg.solve(covariance, off)
+    return -0.5 * (pull + log_determinant + len(off) * math.log(2.0 * math.pi))
+
+
+def log_of_one_bad(off, covariance, deviation, noise):
+    """The same where one of the readings may be bad: about what the others say of it.
+
+    That is uncertain itself, by what their covariance leaves beside the reading's own noise.
+    """
+    n, good = len(off), math.log(1.0 - noise.bad)
+    found = [n * good + log_of_all(off, covariance)]
+    for i, sd in enumerate(deviation):
+        rest = np.arange(n) != i
+        pull = np.linalg.solve(covariance[np.ix_(rest, rest)], covariance[rest, i])
+        left = covariance[i, i] - pull @ covariance[rest, i] - sd**2
+        bad = cauchy.logpdf(
+            off[i] - pull @ off[rest], scale=math.hypot(noise.width * sd, math.sqrt(max(left, 0)))
+        )
+        others = log_of_all(off[rest], covariance[np.ix_(rest, rest)])
+        found.append((n - 1) * good + math.log(noise.bad) + others + bad)
+    return log_sum(np.array(found))
+
+
+def log_process(x, kernels, deviation, weight, noise):
     """Evidence of a Gaussian process about a constant known to a factor e, by dense matrices.
 
     Kernels are averaged with equal weights; ``deviation`` (k, n) and ``weight`` (k) are those of
     the noise.
     """
-    n, found = len(x), []
-    noise = np.einsum("kn,nm->knm", deviation**2, np.eye(n))
+    found = []
     for kernel in kernels:
-        covariance = kernel + noise + 1.0
-        _, log_determinant = np.linalg.slogdet(covariance)
-        pull = np.linalg.solve(covariance, np.broadcast_to(x[:, None], (len(noise), n, 1)))[..., 0]
-        log = -0.5 * (pull @ x + log_determinant + n * math.log(2.0 * math.pi))
-        found.append(log + np.log(np.maximum(weight, 1e-300) / len(kernels)))
+        each = [log_of_one_bad(x, kernel + np.diag(sd**2) + 1.0, sd, noise) for sd in deviation]
+        found.append(each + np.log(np.maximum(weight, 1e-300) / len(kernels)))
     return log_sum(np.concatenate(found))
 
 
@@ -199,12 +212,12 @@ def log_evidence_of_flat_beam(rows2, size, known, log_likelihood, turn, side=100
     return log_sum(log.ravel()) - math.log(side) + np.log(size).sum()
 
 
-def log_evidence_of_constant(size, deviation, weight, noise, usual):
+def log_evidence_of_constant(size, deviation, weight, noise):
     """One size for all, known to a factor e: sums over it and over the noise, in ln size."""
     x = np.log(size / np.exp(np.log(size).mean()))
     level, step = np.linspace(-1.5, 1.5, 601, retstep=True)
     parts = [
-        math.log(w) + log_readings(x - level[:, None], sd, noise, usual)
+        math.log(w) + log_readings(x - level[:, None], sd, noise)
         for sd, w in zip(deviation, weight, strict=True)
         if w > 1e-12
     ]
