@@ -154,18 +154,21 @@ def _open(e: PlaneEvidence) -> str:
             "three points fit any three numbers exactly and leave nothing to judge them by; "
             "measure a fourth setting"
         )
+    rest = {k: v for k, v in probability.items() if k not in (BEAM, FLAT)}
+    other = max(rest, key=rest.__getitem__)
+    maybe = (
+        f"these sizes may be a beam's (P = {e.beam:.4g}, and {SURE:g} is needed), or else {other} "
+        f"(P = {rest[other]:.2g})"
+    )
     if not e.of_a_beam:
         if rival in (BEAM, FLAT):
-            rest = {k: v for k, v in probability.items() if k not in (BEAM, FLAT)}
-            rival = max(rest, key=rest.__getitem__)
-            return (
-                f"these sizes may be a beam's (P = {e.beam:.3g}, and {SURE:g} is needed), or else "
-                f"{rival} (P = {rest[rival]:.2g})"
-            )
+            return maybe
         return f"the sizes look like {rival} (P = {probability[rival]:.2g}), not like a beam's"
     if e.opened:
         return e.opened
     if e.beam <= SURE:
+        if rest[other] > probability[FLAT]:
+            return maybe
         return f"a beam of no emittance explains the sizes, too (P = {probability[FLAT]:.2g})"
     if not e.low > 0.0:
         return "the 95 % interval of the emittance begins at zero"
