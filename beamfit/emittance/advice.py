@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.linalg import block_diag
 
-from beamfit.emittance.comparison import AT, PlaneSizes, compare, emittance_quantiles
+from beamfit.emittance.comparison import AT, BEAM, FLAT, PlaneSizes, compare, emittance_quantiles
 from beamfit.emittance.model import (
     emittance_parts,
     predict_sizes,
@@ -102,10 +102,10 @@ class Adviser(NamedTuple):
         """List single further measurements with their rows, of shape (candidates, planes, n).
 
         Where no limits are given, those in which no plane's size exceeds the measured ones, if
-        there are any: screens have edges.
+        there are any: screens have edges. Bad readings, and sizes that are no beam's, are none.
         """
         found, rows, screens = [], [], tuple(screens)
-        largest = np.array([[np.nanmax(self.seen.scan.size[plane])] for plane in self.seen.planes])
+        largest = np.array([[_largest(self.seen, plane)] for plane in self.seen.planes])
         for table in candidate_settings(self.seen.scan.settings, limits).values():
             rows_of_table = zip(*table.values(), strict=True)
             points = [dict(zip(table, map(float, row), strict=True)) for row in rows_of_table]
@@ -120,6 +120,14 @@ class Adviser(NamedTuple):
                     words = settings_in_words(self.seen, points[i]) + where
                     found.append(Candidate(points[i], screen, float(energy), words))
         return found, np.array(rows)
+
+
+def _largest(seen: PreparedScan, plane: str) -> float:
+    """The largest size of a plane's beam that its screens have shown, m."""
+    p, likely = seen.solutions[plane].points, seen.solutions[plane].posterior.probability
+    beams = likely[BEAM] + likely[FLAT] > 0.5
+    good = p.size[p.outlier_probability <= 0.5]
+    return float(np.max(good, initial=0.0)) if beams else np.inf
 
 
 def settings_in_words(seen: PreparedScan, settings: Mapping[str, float], digits: int = 4) -> str:

@@ -24,7 +24,7 @@ from beamfit.emittance.model import (
     phase_coverage,
 )
 from beamfit.emittance.results import Identifiability, PlaneFit, Points, ScreenTwiss
-from beamfit.emittance.statement import PlaneSolution, PreparedScan, asked_of
+from beamfit.emittance.statement import PreparedScan, asked_of
 from beamfit.emittance.transport import setting_units
 from beamfit.emittance.verdict import (
     CARRIES,
@@ -86,8 +86,9 @@ class Beside(NamedTuple):
 
 
 class Influence(NamedTuple):
-    """The point without which the emittance moves most: where it lies, by how many errors."""
+    """The point without which the emittance moves most: which, where, by how many errors."""
 
+    point: int = 0
     place: str = ""
     shift: float = 0.0
     without: float = math.nan
@@ -144,7 +145,7 @@ def plane_answer(
     n, carrying = _numbers(post, p, places, b)
     e = _evidence(seen, plane, n, b)
     advice = next_measurement(seen, plane) if _advised(e, b) else None
-    finding = verdict(e, _remarks(work, e, b, carrying, n.value), advice or "")
+    finding = verdict(e, _remarks(seen, plane, e, b, carrying, n.value), advice or "")
     holds = e.of_a_beam and e.ending is None
     known = e.determined | (LINEAR & holds & (b is None))
     emittance, normalized, beta, alpha, s11, s12, s22, *screen, mismatch = n.quantities(
@@ -202,15 +203,19 @@ def _advised(e: PlaneEvidence, b: Beside | None) -> bool:
 
 
 def _remarks(
-    work: PlaneSolution, e: PlaneEvidence, b: Beside | None, carrying: Influence, value: np.ndarray
-) -> str:
+    seen: PreparedScan, plane: str, e: PlaneEvidence, b: Beside | None, carrying: Influence,
+    value: np.ndarray,
+) -> str:  # fmt: skip
     """Further sentences on noise and points."""
+    work = seen.solutions[plane]
     post, p, remarks = work.posterior, work.points, [work.shot_words]
     if e.of_a_beam:
         likely = chi2_probability(post.chi2, max(len(p.size) - 3, 0))
         remarks.insert(0, noise_remark(work.sizes.likeness[1], post.scale, likely))
         without = carrying.without * value[1] / value[0]
         place = "" if e.opened else carrying.place
+        if place:
+            place += _bad_elsewhere(seen, plane, carrying.point)
         remarks += point_remarks(p, place, float(without), abs(carrying.shift) > MOVES)
     if b is not None and e.determined:
         remarks.append(b.remark)
@@ -283,6 +288,15 @@ def _reaching(
     return low, high, half
 
 
+def _bad_elsewhere(seen: PreparedScan, plane: str, point: int) -> str:
+    """Say in which other plane the row of a point is probably bad: both have its setting."""
+    row = seen.measured(plane)[point]
+    for other, work in seen.solutions.items():
+        if np.any(work.posterior.bad[seen.measured(other) == row] > 0.5):
+            return f", which is probably bad in {other}"
+    return ""
+
+
 def _evidence(seen: PreparedScan, plane: str, n: PlaneNumbers, b: Beside | None) -> PlaneEvidence:
     work, low, high = seen.solutions[plane], float(n.low[1]), float(n.high[1])
     p = work.points
@@ -293,14 +307,16 @@ def _evidence(seen: PreparedScan, plane: str, n: PlaneNumbers, b: Beside | None)
     emittance = float(n.value[1])
     if not e.determined or LEAST <= emittance <= MOST:
         return e
+    little = emittance < LEAST
     cause = (
         f"Not determined: a normalised emittance of {emittance:.2g} m is "
-        f"{'less' if emittance < LEAST else 'more'} than any accelerator has."
+        f"{'less' if little else 'more'} than any accelerator has."
     )
+    own, said = ("mm", "um") if little else ("um", "mm")
     remedy = (
         f"Check the units of '{seen.scan.columns.get(f'size_{plane}', f'size_{plane}')}', the "
-        "settings and the energy: sizes in mm under a header that says um make it a million times "
-        "less."
+        f"settings and the energy: sizes in {own} under a header that says {said} make it a "
+        f"million times {'less' if little else 'more'}."
     )
     return replace(e, ending=Finding(Status.unidentified, cause, remedy))
 
@@ -368,7 +384,7 @@ def _influence(p: Points, sigma: np.ndarray, error: float) -> Influence:
     most = int(np.argmax(np.where(np.isnan(shifts), np.inf, np.abs(shifts))))
     if abs(shifts[most]) <= CARRIES:
         return Influence()
-    return Influence(p.where(most), float(shifts[most]), float(without[most]))
+    return Influence(most, p.where(most), float(shifts[most]), float(without[most]))
 
 
 def noise_words(noise: str, scale: np.ndarray, relative: float, p: Points) -> str:

@@ -234,7 +234,9 @@ def _element(section: Section, number: int) -> Mapping[str, Any]:
         raise section.error(word, nearest(str(kind), list(ELEMENTS)), "type")
     section.values(ELEMENTS[kind] | {"type": NAME})
     if kind in SETTINGS_OF:
-        _check_strength(section, section.one_of(SETTINGS_OF[kind]))
+        *_, last = SETTINGS_OF[kind]
+        hint = f"; {last} = 0 where every row of a scan sets it"
+        _check_strength(section, section.one_of(SETTINGS_OF[kind], hint))
     if section.table.get("angle_deg") == 0:
         raise section.error("a dipole that does not bend", "a drift", "angle_deg")
     table = {"name": f"{kind}{number}"} | section.table

@@ -217,8 +217,8 @@ class Section:
             if key.field
         }
 
-    def one_of(self, names: Iterable[str]) -> str:
-        """The one of some keys that is given.
+    def one_of(self, names: Iterable[str], hint: str = "") -> str:
+        """The one of some keys that is given; a hint says what may stand for none.
 
         Raises
         ------
@@ -228,8 +228,9 @@ class Section:
         names = list(names)
         given = [name for name in names if name in self.table]
         if len(given) != 1:
-            found = f"{'both' if given else 'neither'} of {' and '.join(given or names)}"
-            expected = "one of " + ", ".join(names)
+            none = "neither" if len(names) == 2 else "none"
+            found = f"{'both' if given else none} of {' and '.join(given or names)}"
+            expected = "one of " + ", ".join(names) + hint * (not given)
             raise self.error(f"{found} {self.words}", expected, (given or names)[-1])
         return given[0]
 

@@ -118,7 +118,10 @@ def _residuals(axes: Axes, p: PlaneFit) -> None:
     axes.axhline(0, color="0.6", lw=0.8)
     for rows, colour, marker, _ in _screens(p):
         many = len(at) > MANY
-        axes.plot(at[rows], p.points.pull[rows], marker, color=colour, ms=5, rasterized=many)
+        for keep, face in ((rows & ~_doubted(p), colour), (rows & _doubted(p), "white")):
+            style = {"color": colour, "mfc": face, "ms": 5, "rasterized": many}
+            if keep.any():
+                axes.plot(at[keep], p.points.pull[keep], marker, **style)
     finite = np.abs(p.points.pull[np.isfinite(p.points.pull)])
     reach = max(3.0, 1.15 * float(finite.max(initial=0.0)))
     axes.set(xlabel=words, ylabel="residual,\nstd. errors", ylim=(-reach, reach))
@@ -169,10 +172,9 @@ def _curves(axes: Axes, fit: EmittanceFit, p: PlaneFit, magnet: str) -> None:
 
 
 def _points(axes: Axes, p: PlaneFit, at: np.ndarray) -> None:
-    """Measured points; those that are probably bad are drawn hollow."""
+    """Measured points; those that are probably bad are hollow, and their errors nobody knows."""
     error, size = np.nan_to_num(1e6 * p.points.error), 1e6 * p.points.size
-    doubt = p.points.outlier_probability
-    doubted = doubt >= 0.5
+    doubted = _doubted(p)
     screens = _screens(p)
     for rows, colour, marker, screen in screens:
         name = "measured" if len(screens) == 1 else f"measured at {screen}"
@@ -183,7 +185,13 @@ def _points(axes: Axes, p: PlaneFit, at: np.ndarray) -> None:
             if keep.any():
                 style = {"fmt": marker, "ms": 5, "capsize": 3, "color": colour, "mfc": face}
                 style |= {"rasterized": len(at) > MANY, "label": label}
-                axes.errorbar(at[keep], size[keep], error[keep], **style)
+                bar = error[keep] if face == colour else None
+                axes.errorbar(at[keep], size[keep], bar, **style)
+
+
+def _doubted(p: PlaneFit) -> np.ndarray:
+    """Which points are probably bad."""
+    return p.points.outlier_probability >= 0.5
 
 
 def draw_profiles(figure: FigureBase, profiles: list[Profile], fit: EmittanceFit) -> None:

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 import beamfit
 from beamfit.emittance.model import phase_coverage
 from beamfit.emittance.verdict import waist_bracketed
+from beamfit.optics.elements import Drift, Quadrupole, Screen
 from beamfit.quantity import Status
 from tests.emittance.conftest import TABLE_2, design, scan_of
 from tests.simulations import simulations
@@ -212,6 +213,36 @@ def test_no_positive_matrix_is_better_than_the_answer(seed):
         assert (((model - size**2) * scale) ** 2).sum() >= float(fit.chi2) * (1 - 1e-9)
 
 
+def scan_of_two_planes(x_of, y_of):
+    """Of a quadrupole whose y plane is seen from one side, and a line of it; SIMULATED."""
+    line = beamfit.Beamline((Quadrupole("Q", 0.25), Drift("D", 2.2), Screen("S")), 647.0)
+    k1 = np.linspace(1.0, 3.1, 9)
+    x = np.array([97.6, 75.6, 51.7, 32.8, 22.3, 34.0, 52.9, 78.5, 100.9]) * 1e-6
+    y = np.array([156.4, 167.7, 177.5, 181.7, 189.6, 204.1, 206.6, 223.3, 231.2]) * 1e-6
+    size = {"x": x_of(x), "y": y_of(y)}
+    error = {"x": 0.02 * x, "y": 0.02 * y}
+    return beamfit.QuadScan({"Q": k1}, {"Q": "k1"}, size, error), line
+
+
+def test_a_bad_size_of_one_plane_changes_no_advice_on_the_other():
+    """Settings at which a plane gets larger than measured are none; a bad size is not measured."""
+    slipped = np.array([1, 1, 1, 10, 1, 1, 1, 1, 1])
+    said = [
+        beamfit.fit_emittance(*scan_of_two_planes(x_of, lambda y: y)).y.message
+        for x_of in (lambda x: x, lambda x: slipped * x)
+    ]
+    assert "Measure next near" in said[0]
+    assert said[0] == said[1]
+
+
+def test_a_point_that_carries_one_plane_and_is_bad_in_the_other_is_called_so():
+    scan, line = scan_of_two_planes(lambda x: x, lambda y: y)
+    k1 = scan.settings["Q"] * np.array([1, -1, 1, 1, 1, 1, 1, 1, 1])
+    fit = beamfit.fit_emittance(replace(scan, settings={"Q": k1}), line)
+    assert f"1 of 9 readings is probably bad: Q = {k1[1]:.4g}" in fit.x.message
+    assert f"the point at Q = {k1[1]:.4g} 1/m², which is probably bad in x:" in fit.y.message
+
+
 def test_waist_needs_a_rise_on_both_sides():
     settings, screens = {"Q": np.arange(5.0)}, ("S",) * 5
     error = np.full(5, 0.1)
@@ -227,14 +258,21 @@ def test_phase_of_a_drift_from_a_waist():
     assert phase_coverage(r11, r12, 2.0, 0.0) == pytest.approx(45.0)
 
 
-@pytest.mark.parametrize(("factor", "words"), [(1e-3, "less than any"), (600.0, "more than any")])
-def test_an_emittance_that_only_a_wrong_unit_explains_is_not_given(gtf, factor, words, root):
+@pytest.mark.parametrize(
+    ("factor", "words", "units"),
+    [
+        (1e-3, "less than any", "in mm under a header that says um make it a million times less"),
+        (600.0, "more than any", "in um under a header that says mm make it a million times more"),
+    ],
+)
+def test_an_emittance_that_only_a_wrong_unit_explains_is_not_given(gtf, factor, words, units, root):
     scan = beamfit.read_quad_scan(root / "measurements/gtf_simulated.csv")
     size, error = ({p: factor * v for p, v in of.items()} for of in (scan.size, scan.error))
     fit = beamfit.fit_emittance(replace(scan, size=size, error=error), gtf).x
     assert fit.status is Status.unidentified
     assert f"{words} accelerator has" in fit.message
     assert "the units of 'size_x_um'" in fit.message
+    assert units in fit.message
     assert {q.error for q in fit.quantities.values()} == {None}
     assert np.isnan(fit.covariance).all()
 

@@ -185,7 +185,12 @@ ERRORS = {
         "energy_offset",
         "through the exit face",
     ),
-    "no setting": (("k1l_per_m = 0.5\n", ""), 32, None, "k1l_per_m"),
+    "no setting": (
+        ("k1l_per_m = 0.5\n", ""),
+        32,
+        None,
+        "k1l_per_m; k1l_per_m = 0 where every row of a scan sets it",
+    ),
     "two settings": (
         ("k1l_per_m = 0.5", "k1l_per_m = 0.5\nintegrated_gradient_kG = 1"),
         35,

@@ -90,6 +90,17 @@ def test_a_curve_goes_through_what_was_fitted(otr):
     np.testing.assert_allclose(drawn, 1e6 * otr.x.points.model, rtol=2e-3)
 
 
+def test_a_bad_reading_is_hollow_and_has_no_bar(root):
+    scan = beamfit.read_quad_scan(root / "tests/golden/data/outlier.csv")
+    fit = beamfit.fit_emittance(scan, beamfit.load_lattice(root / "lattices/gtf.toml"))
+    above, below = beamfit.figures.scan(fit, "x").axes
+    bars = {c.get_label(): c for c in above.containers}
+    assert bars["measured"].has_yerr
+    assert not bars["probably bad"].has_yerr
+    hollow = [line for line in below.lines if line.get_mfc() == "white"]
+    assert sum(len(line.get_xdata()) for line in hollow) == 1
+
+
 def test_two_screens_are_told_apart(two):
     above, below = beamfit.figures.scan(two, "x").axes
     labels = [text.get_text() for text in above.get_legend().get_texts()]
