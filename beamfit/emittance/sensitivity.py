@@ -20,12 +20,12 @@ from jax import Array
 
 from beamfit.compile_cache import SELDOM
 from beamfit.emittance.fit import EmittanceFit
-from beamfit.emittance.model import coefficients
+from beamfit.emittance.model import coefficients, size_squared
 from beamfit.emittance.results import PlaneFit, Points
 from beamfit.emittance.sigma import error_at, weighed_size
 from beamfit.emittance.statement import WEIGHTS, varied_magnets
 from beamfit.emittance.transport import Rows
-from beamfit.optics.beamline import Beamline
+from beamfit.optics.beamline import Beamline, transfer_rows
 from beamfit.optics.calibration import SlopeIntercept, scaled
 from beamfit.optics.elements import (
     Drift,
@@ -47,6 +47,8 @@ MOST_CAUSES, SMALLEST = 30, 5e-4
 RESOLUTION, DISPERSION, SPREAD = 10e-6, 0.01, 1e-3
 # What saturation, space charge or a pedestal add to every size², told at the smallest size.
 AT_WAIST = 0.05
+# Roll of a scanned magnet about the beam.
+ROLL = math.radians(1.0)
 # What moves within a scan unseen: the energy from the first row to the last, and by how much of
 # each step a field is late.
 DRIFT, LATE = 0.01, 0.1
@@ -107,7 +109,8 @@ def systematics(fit: EmittanceFit, plane: str) -> list[BudgetChange]:
         (of the line's momentum spread, or 0.1 % where it has none) that were not thought of; for
         what saturation, space charge or a pedestal add to size² at the waist; for an energy that
         rises by 1 % from the first row to the last, and magnets whose fields are late by a tenth
-        of each step from row to row. First order: exact derivatives (through transport, and through
+        of each step from row to row; and for each scanned magnet rolled by a degree, where both
+        planes have a beam, exactly. First order: exact derivatives (through transport, and through
         the minimum by the implicit function theorem) times the step.
 
     Examples
@@ -146,6 +149,7 @@ def systematics(fit: EmittanceFit, plane: str) -> list[BudgetChange]:
     changes[of_energy := _energy_cause(energy, mass)] = 0.01 * float(by_energy)
     changes |= _within_scan(fit.seen.rows, len(fit.scan), *by_row)
     changes |= _of_screen(fit, p, np.asarray(by_known)[keep])
+    changes |= _of_rolls(fit, plane, np.asarray(by_known))
     # ln βγ rises by E²/(E² - m²) for each relative step of the energy.
     stiffer = 0.01 * energy**2 / (energy**2 - mass**2)
     # What is zero but for rounding is zero, and keeps its place.
@@ -252,6 +256,38 @@ def _of_screen(fit: EmittanceFit, p: Points, by_known: np.ndarray) -> dict[str, 
         "screen resolution 10 µm larger": float(by_known.sum()) * RESOLUTION**2,
         f"dispersion 1 cm larger (spread {100 * spread:.2g} %)": dispersed,
     }
+
+
+def _of_rolls(fit: EmittanceFit, plane: str, by_known: np.ndarray) -> dict[str, float]:
+    """Changes by a roll of each scanned magnet, which shows a plane's screen the other's beam.
+
+    Where both planes have one. A magnet M rolled by φ is T(-φ) M T(φ), where T turns (x, y) and
+    their slopes alike (K. L. Brown et al., TRANSPORT, SLAC-91 (1977), type code 20): of blocks A
+    and B it has A + sin²φ (B - A) in the plane, and sin φ cos φ (A - B) from the other one.
+    """
+    rows, line, found = fit.seen.rows, fit.seen.scanned, {}
+    beams = [[q.value for q in p.sigma] for p in fit.planes if p.sigma[0].error is not None]
+    names = [m for name in varied_magnets(fit.scan) for m in line.members(name)]
+    order = [e.name for e in line.elements]
+    for name in names if len(beams) == 2 else ():
+        at = order.index(name)
+        places = (*order[max(at - 1, 0) : at], name, *rows.places)
+        reached = np.array([order.index(place) > at for place in rows.places])[rows.which]
+        planes = np.asarray(transfer_rows(line, rows.settings, rows.energy, places).planes)
+        r = np.moveaxis(planes[..., :2, :2], 1, 0)[:: -1 if plane == "y" else 1]
+        before = r[:, :, 0] if at else np.broadcast_to(np.eye(2), r[:, :, 0].shape)
+        exit_ = r[:, :, min(at, 1)]
+        seen = r[0, np.arange(len(rows.which)), rows.which + len(places) - len(rows.places)][:, :1]
+        own, other = exit_ @ np.linalg.inv(before)
+        after = seen @ np.linalg.inv(exit_[0])
+        sin, cos = math.sin(ROLL), math.cos(ROLL)
+        turned = after @ (own + sin**2 * (other - own)) @ before[0]
+        across = sin * cos * after @ (own - other) @ before[1]
+        ways = zip((1, 1, -1), (turned, across, seen), (0, 1, 0), strict=True)
+        both = beams[:: -1 if plane == "y" else 1]
+        added = sum(k * size_squared(both[i], *v[:, 0].T, 0.0) for k, v, i in ways)
+        found[f"{name} rolled by 1 degree"] = float(by_known @ (reached * rows.damping**2 * added))
+    return found
 
 
 @partial(jax.jit, static_argnames="follows", compiler_options=SELDOM)
