@@ -85,7 +85,7 @@ def coordinates(
     u = np.stack([r11, r12], -1)
     norm = np.sqrt((u**2).mean(-2, keepdims=True))
     norm = np.where(norm > 0, norm, 1.0)
-    likely = _likely(u / norm, size)
+    likely = _plausible(u / norm, size)
     unit = np.exp(np.log(likely).mean(-1))
     size, likely = size / unit[..., None], likely / unit[..., None]
     known = known / unit[..., None] ** 2
@@ -100,7 +100,7 @@ def coordinates(
     return Coordinates(w, rows, back, size, known, unit, seen)
 
 
-def _likely(v: np.ndarray, size: np.ndarray) -> np.ndarray:
+def _plausible(v: np.ndarray, size: np.ndarray) -> np.ndarray:
     """Sizes within a factor of what rows (..., n, 2) of neighbouring phases make likely.
 
     One bad reading would decide what the prior takes for near the sizes.

@@ -27,7 +27,7 @@ from beamfit.noise.sizes import (
     NoiseKind,
     Scales,
     averaged,
-    bad_of,
+    bad_density,
     kinds_of,
     log_likelihood,
     scales_of,
@@ -201,11 +201,11 @@ def _process(
     q, one = q / grown @ turned, one / grown @ turned
     off = q - one * (qo / (1.0 + oo))[..., None]
     precision = 1.0 / grown @ turned**2 - one**2 / (1.0 + oo)[..., None]
-    log = averaged(log + one_bad(off, precision, noise), -math.log(len(amplitudes)))
+    log = averaged(log + log_gain_of_one_bad(off, precision, noise), -math.log(len(amplitudes)))
     return averaged(log, scales.log_weight)
 
 
-def one_bad(off: np.ndarray, precision: np.ndarray, noise: Noise) -> np.ndarray:
+def log_gain_of_one_bad(off: np.ndarray, precision: np.ndarray, noise: Noise) -> np.ndarray:
     """Log of how much likelier readings are if one of them may be bad, shape (..., n) to (...).
 
     Parameters
@@ -266,7 +266,7 @@ def departure_odds(
     amplitudes = np.append(0.0, DEPARTURES)
     grown = 1.0 + amplitudes[:, None] ** 2 * np.maximum(values, 0.0)[..., None, :]
     log = -0.5 * np.sum(q**2 / grown + np.log(grown), axis=-1)
-    log = log + one_bad(q / grown @ seen, 1.0 / grown @ seen**2, noise)
+    log = log + log_gain_of_one_bad(q / grown @ seen, 1.0 / grown @ seen**2, noise)
     spans = np.log(np.abs(np.einsum("...ii->...i", triangle[..., :3, :]))).sum(-1)
     log = np.swapaxes(log - (np.log(root).sum(-1) + spans)[..., None], -1, -2)
     log = averaged(log, wide.log_weight[..., None, :])
@@ -559,7 +559,7 @@ def _expecting(
 
     def expected(model: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         pull = (((c.size - model) / model**kind.power) ** 2)[:, None, :] / variance
-        bad = 1.0 / (1.0 + np.exp(-0.5 * pull) / bad_of(pull, noise))
+        bad = 1.0 / (1.0 + np.exp(-0.5 * pull) / bad_density(pull, noise))
         # A Cauchy distribution is a normal one of this mean precision.
         each = (1.0 - bad + bad * 2.0 / (noise.width**2 + pull)) / variance
         return (share * each).sum(1) / model ** (2 * kind.power), (share * bad).sum(1)

@@ -207,13 +207,13 @@ def log_likelihood(off: Any, model: Any, kind: NoiseKind, scale: Any, noise: Noi
         found = found - xp.sum(xp.log(model), axis=-1)[..., None, :]
     # Points first, so that sums over them run along memory.
     pull = _points_first(1.0 / variance, xp)[..., None] * _points_first(squared, xp)[..., None, :]
-    either = xp.exp(-0.5 * pull) + bad_of(pull, noise)
+    either = xp.exp(-0.5 * pull) + bad_density(pull, noise)
     for first in range(0, n, AT_ONCE):
         found = found + xp.log(xp.prod(either[first : first + AT_ONCE], axis=0))
     return xp.moveaxis(found, -1, -2)
 
 
-def bad_of(pull: Any, noise: Noise) -> Any:
+def bad_density(pull: Any, noise: Noise) -> Any:
     """Density of bad readings by their squared pulls, where that of good ones is e^(-pull/2)."""
     peak = noise.bad / (1.0 - noise.bad) * math.sqrt(2.0 / math.pi) / noise.width
     return peak / (1.0 + pull / noise.width**2)
