@@ -206,14 +206,27 @@ class Evidence:
         return Physical(*(np.array(self.about.values) + self.moments.shift))
 
     @cached_property
+    def displaced(self) -> np.ndarray:
+        """Errors of the values by changes of the loss rate somewhere within a cycle."""
+        about = self.about
+        if about.parts is None:
+            return np.zeros(len(Physical._fields))
+        first, lengths = about.pieces.first, about.pieces.lengths
+        share = lengths[np.isin(first, about.parts.first[1:])] / lengths.sum()
+        # Evenly anywhere in it.
+        moved = np.linalg.norm(np.diff(about.parts.departure) * share) / math.sqrt(12)
+        return np.abs(about.slopes[:, LOSS]) * moved
+
+    @cached_property
     def errors(self) -> Physical:
         """Half of the central 68 %."""
-        return Physical(*np.hypot(self.moments.error, self.drifted))
+        return Physical(*np.hypot(np.hypot(self.moments.error, self.drifted), self.displaced))
 
     @cached_property
     def reach(self) -> Physical:
         """Reach of 95 % about the values."""
-        return Physical(*np.hypot(self.moments.reach, NORMAL * self.drifted))
+        more = NORMAL * np.hypot(self.drifted, self.displaced)
+        return Physical(*np.hypot(self.moments.reach, more))
 
     @cached_property
     def raw(self) -> Physical:

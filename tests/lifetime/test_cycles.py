@@ -254,6 +254,22 @@ def test_a_loss_rate_that_changes_has_a_course():
     assert fit_cycles(cut(*top_up(0.01, 1))).course == ()
 
 
+def test_a_change_within_a_cycle_is_somewhere_in_it():
+    """Its parts are known far better than when one turns to the other."""
+    time, current, number = top_up(0.002, 1, hours=6.0)
+    late = time > 3 * 3600 + 130.0  # most of a cycle is before
+    lost = np.where(late, 0.3 * 500 / LIFETIME * np.minimum(time - 180 * number, 180.0), 0.0)
+    lost = np.where(
+        (number == number[late][0]) & late, 0.3 * 500 / LIFETIME * (time % 180 - 130), lost
+    )
+    fit = fit_cycles(cut(time, current - lost, number))
+    true = 1 / (1 / true_lifetime(fit.mean_current) + 0.3 * late.mean() * 3600 / LIFETIME)
+    assert len(fit.course) == 2
+    assert abs(fit.lifetime_mean.value - true) < 3 * fit.lifetime_mean.error
+    parts = [part.lifetime.error for part in fit.course]
+    assert fit.lifetime_mean.error > max(parts)
+
+
 def test_a_lifetime_that_wanders_is_followed_and_its_mean_is_right():
     time = np.arange(0.0, 30 * 3600.0, 10.0)
     lives = LIFETIME * (1 + 0.05 * np.sin(2 * np.pi * time / time[-1]))
