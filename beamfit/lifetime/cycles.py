@@ -56,7 +56,7 @@ SHORT = 0.25
 REGULAR = 0.1
 # Least step as a share of what is lost in the piece that it divides.
 LEAST = 0.2
-# Share of what the cycles lose that refills give back at least.
+# Share of what cycles lose that refills give back at least, and of steps that are to be refills.
 RETURNED = 0.5
 # A step that both searches find is seen within so many readings.
 BESIDE = 2.0
@@ -147,9 +147,8 @@ def cut_at_refills(record: DecayRecord) -> Split:
     """As `split_record`, but as `find_cycles` where that finds more cycles: the former cuts
     nothing but clear steps between pieces of eight readings, whatever the law of the decay.
 
-    The finer one is right where it finds what is clear, and all refills raise the current: what a
-    wrong law or the noise makes of a decay goes both ways, and its sum is more than twice the root
-    of its squares once in forty times.
+    The finer one is right where it finds what is clear, and most of what it finds besides raises
+    the current, as refills do: what a wrong law or the noise makes of a decay goes both ways.
     """
     clear, fine = split_record(record), find_cycles(record)
     if len(fine.segments) <= len(clear.segments) or not is_refilled(fine):
@@ -160,7 +159,7 @@ def cut_at_refills(record: DecayRecord) -> Split:
     same = apart < BESIDE * usual
     new = [step.change for step, old in zip(found, same.any(axis=0), strict=True) if not old]
     agree = same.any(axis=1).sum() >= RETURNED * len(seen)
-    return fine if agree and (not new or sum(new) > 2 * np.linalg.norm(new)) else clear
+    return fine if agree and sum(new) >= RETURNED * sum(map(abs, new)) else clear
 
 
 def lost_in(cycles: Sequence[DecayRecord]) -> float:
