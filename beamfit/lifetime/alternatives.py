@@ -66,6 +66,11 @@ KINDS = {"step": (1, "step"), "steps": (2, "step"), "relaxing": (1, "relaxing"),
 COARSE, HOPELESS = 7, -1.0
 # Step of a time for the slope by it, over the span.
 MOVED = 1e-3
+# A loss rate that wanders takes so many steps in a record, of a random walk: by which shares of the
+# loss it has gone at the end.
+WALK, WALKS = 16, (0.003, 0.015, 0.07, 0.3)
+# A sharp change of the loss rate is one where it is so much likelier than a wandering loss rate.
+SHARP = math.log(1000.0)
 # Currents at which a lifetime is offered.
 CURRENTS = 5
 
@@ -329,6 +334,120 @@ def rival_of(plain: Expansion) -> Rival | None:
     answer = told.get(name, _change)(best)
     scatter = float(np.sqrt(np.mean((best.residuals * pieces.over) ** 2)))
     return Rival(answer, log - smooth, scatter)
+
+
+class SharpChange(NamedTuple):
+    """A change of the loss rate at one moment, which no wandering loss rate explains.
+
+    Attributes
+    ----------
+    time, error : float
+        When, s from the first reading.
+    odds : float
+        Logarithm of the probability with it over that without it, both with a loss rate that
+        wanders besides.
+    """
+
+    time: float
+    error: float
+    odds: float
+
+
+def sharp_change(plain: Expansion) -> SharpChange | None:
+    """The likeliest sharp change of the loss rate, where it is `SHARP`.
+
+    Parameters
+    ----------
+    plain : Expansion
+        Of a single decay, with constant a and b.
+
+    Returns
+    -------
+    SharpChange or None
+
+    Notes
+    -----
+    Besides a power of a the loss rate goes by a random walk of `WALK` steps, each of `WALKS` as
+    likely, with and without one step of any size more. A pressure that wanders is a walk, and a
+    change that the walk alone explains is none. The further step is taken in linear approximation
+    about the walk, which has most of it.
+
+    Examples
+    --------
+    >>> time = np.linspace(0.0, 7200.0, 400)
+    >>> noise = 0.01 * np.random.default_rng(1).normal(size=400)
+    >>> loss = np.where(time > 3000, 1.5 * time - 1500, time) / 36000
+    >>> found = sharp_change(solved(Pieces.of(DecayRecord(time, 100 * np.exp(-loss) + noise))))
+    >>> print(f"{found.time:.0f} s")
+    3000 s
+    """
+    pieces = _averaged(plain.pieces)
+    plain = solved(pieces) if pieces is not plain.pieces else plain
+    walks = [walk for share in WALKS if (walk := _walk(plain, share))[0].rested]
+    if not walks:
+        return None
+    without, stepped, *steps = np.array([_beside(*walk) for walk in walks]).T
+    odds, best = float(logsumexp(stepped) - logsumexp(without)), int(np.argmax(stepped))
+    if odds <= SHARP:
+        return None
+    time, error = _dated(*walks[best], *(values[best] for values in steps))
+    return SharpChange(pieces.units[0] * time, pieces.units[0] * error, odds)
+
+
+def _walk(plain: Expansion, share: float) -> tuple[Expansion, dict[int, float]]:
+    """The law with a power of a and a random walk of the loss rate, and the widths of its numbers;
+    the loss has gone by such a share of itself at the end.
+    """
+    walk = np.array([np.zeros(WALK), (np.arange(WALK) + 0.5) / WALK]).T.ravel()
+    step = share * abs(plain.numbers[0]) / math.sqrt(WALK)
+    widths = {POWER: (BELOW + ABOVE) / 2} | {FURTHER + 2 * k: step for k in range(WALK)}
+    start = np.append(plain.numbers, walk)
+    return solved(plain.pieces, (*PLAIN, *widths), "step", start=start, widths=widths), widths
+
+
+def _dated(
+    law: Expansion, widths: Mapping[int, float], loss: float, time: float
+) -> tuple[float, float]:
+    """The time of one more step of the loss rate and its error, over the span; both begin at what
+    they are in linear approximation.
+    """
+    size, when = law.numbers.size + 1, law.numbers.size + 2
+    free, start = (*PLAIN, *widths, size, when), np.append(law.numbers, [loss, time])
+    best = solved(law.pieces, free, "step", start=start, widths=widths)
+    noise = math.sqrt(best.residuals @ best.residuals / best.residuals.size)
+    known = np.zeros((len(widths), len(free) + 1))
+    known[:, 3:-2] = np.diag(noise / np.array(list(widths.values())))
+    triangle = np.linalg.qr(np.vstack([best.rows[:, [LEVEL, *free]], known]), mode="r")
+    # The last number beside all others.
+    return float(best.numbers[-1]), float(noise / abs(triangle[-1, -1]))
+
+
+def _beside(law: Expansion, widths: Mapping[int, float]) -> tuple[float, float, float, float]:
+    """Log evidence without and with one more step of the loss rate, its size and its time."""
+    columns, width = [LEVEL, *PLAIN, *widths], np.append([np.inf] * 3, list(widths.values()))
+    centre = np.append(np.zeros(3), [law.numbers[column - 1] for column in widths])
+    noise = math.sqrt(law.residuals @ law.residuals / law.residuals.size)
+    known = np.vstack([law.rows[:, columns], np.diag(noise / width)])
+    basis = np.linalg.qr(known)[0][: law.residuals.size]
+
+    def left(values: np.ndarray) -> np.ndarray:
+        return np.sqrt(np.sum(values**2, axis=0) - np.sum((basis.T @ values) ** 2, axis=0))
+
+    times = GRID
+    for _ in range(FINER):
+        kinks = further_columns(law, "step", times)
+        along, size = kinks.T @ law.residuals, left(kinks) + 1e-300
+        best = int(np.argmax(np.abs(along) / size))
+        time, loss, near = times[best], -along[best] / size[best] ** 2, times[1] - times[0]
+        times = np.linspace(max(time - near, MOVED), min(time + near, 1 - MOVED), GRID.size)
+    ends = (further_columns(law, "step", np.array([time + d])) for d in (MOVED, -MOVED))
+    more = np.hstack([kinks[:, [best]], loss * np.subtract(*ends) / (2 * MOVED)])
+    rows = np.column_stack([law.residuals, law.rows[:, columns], more])
+    products = Products.of(rows, law.pieces.time, bool(law.given), COARSE)
+    some = products._replace(matrix=products.matrix[:, :-2, :-2])
+    both = np.append(width, _widths("step", np.array([loss]), np.array([time]), law.numbers[0]))
+    stepped = _laplace(products, both, np.append(centre, [0.0, 0.0])) + math.log(CHANCES["step"])
+    return _laplace(some, width, centre), stepped, loss, time
 
 
 def _averaged(pieces: Pieces) -> Pieces:

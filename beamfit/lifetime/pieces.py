@@ -46,7 +46,8 @@ class Event(NamedTuple):
     ----------
     kind : str
         `refill`, `loss`, `dropout`, `spike`, `saturated`, `gap`, `ramp` (a refill of many readings,
-        or the end of one at the head of a decay) or `short` (a piece too short to keep).
+        or the end of one at the head of a decay), `short` (a piece too short to keep) or `loss rate
+        changes`.
     time : float
         When it begins, s from the record's start.
     duration : float
@@ -61,7 +62,8 @@ class Event(NamedTuple):
     change: float
 
     def __str__(self) -> str:
-        return f"{self.kind} at {self.time:.0f} s ({self.change:+.4g} mA)"
+        change = f" ({self.change:+.4g} mA)" if self.change else ""
+        return f"{self.kind} at {self.time:.0f} s{change}"
 
 
 @shown

@@ -13,6 +13,7 @@ import numpy as np
 
 from beamfit.answer import answer, json_of, shown
 from beamfit.errors import InputError, expect
+from beamfit.lifetime.alternatives import sharp_change
 from beamfit.lifetime.cycles import (
     FEWEST_CYCLES,
     MOST,
@@ -53,6 +54,8 @@ OWN = 3.0
 REFUTED = (Status.poor_fit, Status.infeasible)
 # Probability of refills faster than the record is read from which cycles tell no lifetime.
 UNSURE = 0.05
+# Errors of the time of a change within which readings are of neither side.
+TWICE = 2.0
 # Cycles that make a point of a course at least.
 FEWEST_IN_PART = 10
 
@@ -509,23 +512,32 @@ def _fitted(
 
 
 def _parts(piece: DecayRecord, law: Law, whole: bool) -> tuple[list[Decay], list[Event]]:
-    """Fit a decay or, unless as a whole, its parts where current was lost at once, though no
-    reading shows it.
+    """Fit a decay or, unless as a whole, its parts where current was lost at once, or the loss rate
+    changed sharply, though no reading shows it.
     """
     segment = thinned(on_edges(piece))
     fit = fit_decay(segment, law=law)
-    if (loss := fit.loss) is not None and not whole:
-        at = segment.start - piece.start + loss.time
-        # Of means of neighbours the loss is anywhere within one.
-        within = float(np.median(np.diff(segment.time))) * (len(segment) < len(piece))
+    if not whole and (cut := _cut(segment, fit)) is not None:
+        event, within = cut
+        at = segment.start - piece.start + event.time
+        # Of means of neighbours the time is anywhere within one.
+        within += float(np.median(np.diff(segment.time))) * (len(segment) < len(piece))
         sides = piece.time < at - within, piece.time > at + within
         halves = [piece.select(rows) for rows in sides]
         if min(map(len, halves)) >= FEWEST:
-            kind = "loss" if loss.current.value > 0 else "refill"
-            event = Event(kind, piece.start + at, 0.0, -loss.current.value)
             decays, events = _fitted(halves, law, whole)
-            return decays, [*events, event]
+            return decays, [*events, event._replace(time=piece.start + at)]
     return [Decay(segment, piece.start, fit, None)], []
+
+
+def _cut(segment: DecayRecord, fit: DecayFit) -> tuple[Event, float] | None:
+    """The event at which a decay ends within a segment, and the error of its time, s."""
+    if (loss := fit.loss) is not None:
+        change = -loss.current.value
+        return Event("refill" if change > 0 else "loss", loss.time, 0.0, change), 0.0
+    if fit.change is not None and (sharp := sharp_change(fit.about)) is not None:
+        return Event("loss rate changes", sharp.time, 0.0, 0.0), TWICE * sharp.error
+    return None
 
 
 def study_record(

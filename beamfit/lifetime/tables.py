@@ -303,15 +303,15 @@ def counted(events: Sequence[Event]) -> str:
         changes = [event.change for event in events if event.kind == kind]
         low, high = min(changes), max(changes)
         size = f"{low:+.3g} mA" if len(changes) == 1 else f"{low:+.3g} to {high:+.3g} mA"
-        said.append(f"{kind} {len(changes)} times ({size})")
+        said.append(f"{kind} {len(changes)} times" + f" ({size})" * any(changes))
     return "; ".join(said)
 
 
 def event_rows(study: RecordStudy) -> list[list[str]]:
     """Kind, time, duration and change of what was cut away; a long list is cut, and says so."""
     rows = [
-        [event.kind, f"{event.time:.0f} s", f"{event.duration:.0f} s", f"{event.change:+.4g} mA"]
-        for event in study.events[:MOST_ROWS]
+        [kind, f"{time:.0f} s", f"{lasts:.0f} s", f"{change:+.4g} mA" if change else ""]
+        for kind, time, lasts, change in study.events[:MOST_ROWS]
     ]
     left = len(study.events) - len(rows)
     return rows + ([[f"{left} more", "", "", ""]] if left else [])

@@ -3,6 +3,7 @@
 import numpy as np
 from scipy.integrate import solve_ivp
 
+from beamfit.lifetime.fit import fit_decay
 from beamfit.lifetime.record import DecayRecord
 from beamfit.lifetime.study import study_record
 from beamfit.quantity import HOUR, Status
@@ -64,3 +65,39 @@ def test_a_monitor_that_walks_is_not_cut_and_covers(count):
     assert cut <= 0.1 * count
     assert len(held) >= 0.8 * count
     assert np.mean(held) >= 0.85
+
+
+def rate_change(factor, wander, rng, noise=0.02):
+    """Readings of a decay whose a goes up by a factor at 0.4 of the record, in a vacuum that goes
+    by a share up and down, and the lifetime at a current before and after.
+    """
+    vacuum = B * (1 + wander * np.sin(2 * np.pi * 1.3 * TIME / SPAN + 1.0))
+    a, current = np.where(TIME < 0.4 * SPAN, A, factor * A), np.full(COUNT, START)
+    for k, step in enumerate(np.diff(TIME)):
+        found = solve_ivp(lambda t, i, k=k: -(a[k] * i + vacuum[k]) * i, (0.0, step),
+                          current[k : k + 1], rtol=1e-9)  # fmt: skip
+        current[k + 1] = found.y[0, -1]
+    return DecayRecord(TIME, current + noise * rng.normal(size=COUNT)), current
+
+
+def test_the_record_is_cut_where_the_loss_rate_changes_sharply():
+    """An RF trip without a loss: a is 1.3 times as large from a moment on."""
+    record, true = rate_change(1.3, 0.0, np.random.default_rng(3))
+    study = study_record(record)
+    [event] = study.events
+    assert str(event) == f"loss rate changes at {event.time:.0f} s"
+    assert abs(event.time - 0.4 * SPAN) < 0.01 * SPAN
+    before, after = study.decays
+    assert holds(before.fit, true[: np.searchsorted(TIME, event.time)])
+    low, high = after.fit.lifetime_mean.interval_95
+    assert low <= 1 / (1.3 * A * after.fit.mean_current + B) / HOUR <= high
+    assert {decay.fit.status for decay in study.decays} <= {Status.converged, Status.unidentified}
+
+
+def test_a_vacuum_that_wanders_is_not_cut():
+    """A change that is likelier than a drift is no sharp one for that."""
+    record, _ = rate_change(1.0, 0.05, np.random.default_rng(3))
+    assert fit_decay(record).change is not None
+    study = study_record(record)
+    assert not study.events
+    assert len(study.decays) == 1
