@@ -390,7 +390,9 @@ def sharp_change(plain: Expansion) -> SharpChange | None:
     odds, best = float(logsumexp(stepped) - logsumexp(without)), int(np.argmax(stepped))
     if odds <= SHARP:
         return None
-    time, error = _dated(*walks[best], *(values[best] for values in steps))
+    # A change of a falls with the current: a wider walk leaves room for that.
+    wider = walks[min(best + 1, len(walks) - 1)]
+    time, error = _dated(*wider, *(values[best] for values in steps))
     return SharpChange(pieces.units[0] * time, pieces.units[0] * error, odds)
 
 

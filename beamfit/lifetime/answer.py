@@ -20,7 +20,7 @@ from beamfit.lifetime.evidence import (
     Evidence,
 )
 from beamfit.lifetime.free_law import Law
-from beamfit.lifetime.pieces import noise_of
+from beamfit.lifetime.pieces import noise_of, split_record
 from beamfit.lifetime.record import Monitor
 from beamfit.quantity import HOUR, percent
 from beamfit.statistics import MANY, POOR_FIT, chi2_probability, few_words, of_use
@@ -31,10 +31,14 @@ SHORTEST, LONGEST = 20.0, 3000 * HOUR
 LIMIT = 1.645
 # A change between neighbouring residuals of so many times their usual one is a step, not noise.
 STEP = 12.0
+# A change of which the next takes back such a share is of one reading.
+BACK = 0.5
 # Below this chi²/dof stated errors are said to be too large.
 CAUTIOUS = 0.25
 # A share of a so many errors outside 0 to 1 is of no longer record.
 OUTSIDE = 3.0
+# An exponent or a drift so many errors off zero is told from none.
+CLEAR = 2.0
 # An interval that begins below this share of its end begins at zero.
 LEAST_SHARE = 5e-3
 # Residuals so many times the scatter of neighbouring readings are not the monitor's noise.
@@ -134,11 +138,17 @@ def _stepped(e: Evidence) -> Finding | None:
     if abs(change[largest]) <= STEP * max(usual, floor):
         return None
     # Residuals are model minus reading, so a refill lowers them.
-    return Finding(
-        Status.poor_fit,
-        f"The record has a step of {-change[largest]:+.4g} mA at "
-        f"{record.time[largest + 1]:.6g} s: cut it with split_record and fit the pieces",
-    )
+    size, time = f"{-change[largest]:+.4g} mA", f"{record.time[largest + 1]:.6g} s"
+    if len(split_record(record).segments) > 1:
+        remedy = "cut it with split_record and fit the pieces"
+        return Finding(Status.poor_fit, f"The record has a step of {size} at {time}: {remedy}")
+    beside = np.clip([largest - 1, largest + 1], 0, change.size - 1)
+    if np.min(change[beside] / change[largest]) < -BACK:
+        far = f"A reading near {time} lies {size.lstrip('+-')} off those beside it"
+        remedy = "leave it out, or state errors that contain it"
+        return Finding(Status.poor_fit, f"{far}: {remedy}")
+    remedy = "too small there to cut at: fit the readings before and after it by themselves"
+    return Finding(Status.poor_fit, f"The record has a step of {size} at {time}, {remedy}")
 
 
 def _negative(name: str, cause: str, e: Evidence | TableEvidence) -> Finding | None:
@@ -264,16 +274,32 @@ def _freely(e: Evidence) -> Finding | None:
     told = "; ".join(filter(None, (_clear(e), *(_extent(e, name) for name in "ab"))))
     if e.pumped:
         likely = f"Gas that is pumped away after a fill is likely ({percent(e.free.pumped)})"
-        said = f": {e.explained}" if e.by_gas else ""
+        gas = e.outgassing if e.by_gas else None
+        # A lifetime afterwards that is not determined, or a below zero, is no explanation.
+        known = gas and math.isfinite(gas.after.value) and min(gas.a.value, gas.b.value) > 0
+        said = f": {e.explained}" if known else ""
         return Finding(Status.converged, f"{told}. {likely}, which the errors contain{said}")
     if e.constant_a.status is Status.poor_fit:
-        drift = "" if e.free.drift is None else f" and b drifts by {e.free.drift} of itself"
-        found = f"A constant a is rejected (p = {max(e.constant_a.p_value, 1e-300):.2g}): it goes "
-        found += f"as I^({e.free.exponent}){drift}, which the errors contain"
-        return Finding(Status.converged, f"{told}. {found}")
+        return Finding(Status.converged, f"{told}. {_departs(e)}, which the errors contain")
     gas = "" if e.free.drift is None else ", a drift of b and gas that is pumped away"
     open_ = f"with an exponent of a{gas} left open"
     return Finding(Status.converged, f"{told}, {open_}. {_if_constant(e)}")
+
+
+def _departs(e: Evidence) -> str:
+    """What departs of a and b where constant ones are rejected."""
+    chance = f"(p = {max(e.constant_a.p_value, 1e-300):.2g})"
+    drift, power = e.free.drift, f"a goes as I^({e.free.exponent})"
+    drifts = f"b drifts by {drift} of itself"
+    bends, moves = (
+        q is not None and abs(q.value) > CLEAR * q.error for q in (e.free.exponent, drift)
+    )
+    if bends or drift is None:
+        found = power if drift is None else f"{power} and {drifts}"
+        return f"A constant a is rejected {chance}: {found}"
+    beside = f"{drifts}, with a as I^({e.free.exponent})"
+    open_ = f"{power} or {drifts}, and the record does not tell which"
+    return f"Constant a and b are rejected {chance}: {beside if moves else open_}"
 
 
 def _if_constant(e: Evidence) -> str:
@@ -296,6 +322,8 @@ def _extent(e: Evidence, name: str) -> str | None:
     return f"{name} lies between {low:.2g} and {high:.2g} {UNITS[name]} at 95 %"
 
 
+# What cycles at one current tell.
+LIFETIME_ALONE = "The lifetime at the mean current is the answer; "
 NEGATIVE = (partial(_negative, "b", NOT_GAS), partial(_negative, "a", RISING))
 LOOK = ": look for steps with split_record, or test constant_a_test"
 RULES = (_lost, _held, _stepped, *NEGATIVE, _within_noise, _refuted, _inseparable)
@@ -341,13 +369,28 @@ def _course(e: Evidence) -> str | None:
     )
 
 
+def _bent(e: Evidence) -> Finding | None:
+    """Cycles within which the current bends as no loss does: no lifetime is quoted."""
+    if not e.outside > OUTSIDE:
+        return None
+    share, error = e.scaled("share")
+    return Finding(
+        Status.unidentified,
+        f"The current bends within the cycles as no loss does: the share of a in it would be "
+        f"{share:.2g} ± {error:.2g}, {e.outside:.1f} errors outside 0 to 1. Refills that the noise "
+        "hides, fresh beam or vacuum after a refill, or a slow monitor do that, and the lifetime "
+        "may be far off then: no error is given. Look at the mean of all cycles for steps, and "
+        "leave out what follows a refill",
+    )
+
+
 def _one_current(e: Evidence) -> Finding | None:
     share, error = e.scaled("share")
     if error < SEPARABLE:
         return None
     return Finding(
         Status.unidentified,
-        f"The lifetime at the mean current is the answer; a and b are not separable at these "
+        f"{LIFETIME_ALONE}a and b are not separable at these "
         f"currents (share of a in the loss {share:.2g} ± {error:.2g}): let the beam decay "
         "farther once, or measure at another current",
     )
@@ -361,7 +404,7 @@ def _rises(e: Evidence) -> Finding | None:
     return Finding(Status.infeasible, cause)
 
 
-CYCLE_RULES = (_rises, *NEGATIVE, _held, _within_noise, _refuted)
+CYCLE_RULES = (_rises, *NEGATIVE, _bent, _held, _within_noise, _refuted)
 CYCLE_RULES += (_one_current, _improbable, _bending, _determined)
 
 

@@ -372,6 +372,12 @@ class Evidence:
         )
 
     @property
+    def outside(self) -> float:
+        """By how many errors the share of a in the loss lies outside 0 to 1; nan if unknown."""
+        share, error = self.sure("share")
+        return max(-share, share - 1.0) / error if error > 0 else math.nan
+
+    @property
     def refuted(self) -> bool:
         """True if the readings contradict constant a and b, or show values that no beam has."""
         if self.changed or self.constant_a.status is Status.poor_fit:

@@ -12,7 +12,7 @@ import numpy as np
 from beamfit.answer import Table, answer, cell, json_of, labelled, plain_name, quantity_frame
 from beamfit.errors import InputError, expect
 from beamfit.lifetime.alternatives import Change, ConstantA, LifetimeLaw, Outgassing, SuddenLoss
-from beamfit.lifetime.answer import finding_of, finding_of_cycles
+from beamfit.lifetime.answer import OUTSIDE, finding_of, finding_of_cycles
 from beamfit.lifetime.cycles import FEWEST_CYCLES, FEWEST_READINGS, averaged, cleaned
 from beamfit.lifetime.decay_law import current
 from beamfit.lifetime.evidence import BELIEVED, UNITS, Evidence, RatePart, Separability
@@ -372,10 +372,11 @@ def _constant(record: DecayRecord, found: str) -> DecayFit:
     """The result for readings that are all equal: no decay is seen, and no noise either."""
     level = record.mean_current
     unknown = {name: Quantity(math.nan, None, unit) for name, unit in UNITS.items()}
-    message = (
-        f"{found}, so neither decay nor noise is seen: record longer, or read the monitor with "
-        "more digits."
-    )
+    if level:
+        remedy = "record longer, or read the monitor with more digits."
+        message = f"{found}, so neither decay nor noise is seen: {remedy}"
+    else:
+        message = f"{found}: no beam is stored, or this is not the column of the current."
     return DecayFit(
         record=record.name,
         status=Status.unidentified,
@@ -480,11 +481,12 @@ def fit_pieces(cycles: Sequence[DecayRecord], name: str, law: Law = Law.constant
     about, left_out = cleaned(gathered)
     evidence, pieces = Evidence(about, law), about.pieces
     finding = finding_of_cycles(evidence, pieces.monitor, left_out)
+    bent = finding.status is Status.unidentified and evidence.outside > OUTSIDE
     return DecayFit(
         record=name,
         status=finding.status,
         message=finding.message,
-        **evidence.quoted(),
+        **evidence.quoted(not bent),
         mean_current=pieces.units[1],
         rms_residual=float(np.sqrt(np.mean((about.left[:, -1] * pieces.over) ** 2))),
         readings=_readings(pieces, name),

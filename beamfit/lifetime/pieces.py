@@ -12,6 +12,7 @@ from scipy.ndimage import maximum_filter1d, median_filter, minimum_filter1d
 from beamfit.answer import shown
 from beamfit.errors import expect
 from beamfit.lifetime.record import Conditions, DecayRecord
+from beamfit.quantity import HOUR
 
 # Robust z-score at which a step or spike is an event: one false alarm in 1e20 Gaussian readings.
 THRESHOLD = 10.0
@@ -410,6 +411,8 @@ def split_record(record: DecayRecord) -> Split:
     return Split(segments, tuple(sorted(events, key=lambda event: event.time)))
 
 
+# An hour is skipped to such a share of the usual interval.
+SAME = 0.1
 # Readings beyond which neighbours are averaged.
 MOST_READINGS = 1 << 16
 # Repeats are of a monitor slower than its archive if half of the readings are, and nearly all come
@@ -443,6 +446,36 @@ def without_repeats(record: DecayRecord) -> DecayRecord:
         "a monitor slower than its archive: left out."
     )
     return replace(record.select(kept), notes=(*record.notes, note))
+
+
+def without_summer_time(record: DecayRecord) -> DecayRecord:
+    """Take out the hour that a local clock skips in spring: between two readings an hour passes
+    besides the usual interval, and the current goes on as if it had not.
+
+    Examples
+    --------
+    >>> t = np.arange(0.0, 7200.0, 60.0)
+    >>> beam = 100 * np.exp(-t / 36000)
+    >>> print(without_summer_time(DecayRecord(t + np.where(t > 3600, 3600.0, 0.0), beam)))
+    record: 120 readings over 1.98 h, 100 to 82.0096 mA
+    """
+    interval = np.diff(record.time)
+    usual = float(np.median(interval))
+    found = np.flatnonzero(np.abs(interval - usual - HOUR) < SAME * usual) + 1
+    if found.size != 1 or not WINDOW <= found[0] <= len(record) - WINDOW:
+        return record
+    after, at = int(found[0]), float(record.time[found[0] - 1])
+    since = np.where(record.time > at, record.time - HOUR, record.time)
+    sides = slice(after - WINDOW, after), slice(after, after + WINDOW)
+    lines = [np.polyfit(since[side] - at, record.current[side], 1) for side in sides]
+    step, noise = abs(lines[1][1] - lines[0][1]), _noise(record, record.time, record.current)
+    if min(-slope * HOUR for slope, _ in lines) < THRESHOLD * max(step, noise):
+        return record
+    note = (
+        f"The clock skips an hour after {at:.0f} s while the current goes on as before, as local "
+        "times do in spring: the hour was taken out. Give times with their zone."
+    )
+    return replace(record, time=since, notes=(*record.notes, note))
 
 
 def on_edges(record: DecayRecord) -> DecayRecord:

@@ -14,6 +14,7 @@ import numpy as np
 from beamfit.answer import answer, json_of, shown
 from beamfit.errors import InputError, expect
 from beamfit.lifetime.alternatives import sharp_change
+from beamfit.lifetime.answer import LIFETIME_ALONE
 from beamfit.lifetime.cycles import (
     FEWEST_CYCLES,
     MOST,
@@ -37,6 +38,7 @@ from beamfit.lifetime.pieces import (
     split_record,
     thinned,
     without_repeats,
+    without_summer_time,
 )
 from beamfit.lifetime.record import DecayRecord
 from beamfit.lifetime.ring import MeasuredLength, Operation, Ring, stored_bunch, unstored
@@ -302,7 +304,8 @@ def seen_through(fit: DecayFit, usual: float, interval: float) -> DecayFit:
 
 def _opened(fit: DecayFit, cause: str) -> DecayFit:
     bare = {name: quantity.open() for name, quantity in fit.quantities.items()}
-    return replace(fit, status=Status.unidentified, message=cause + fit.message, exact=bare, **bare)
+    message = cause + fit.message.replace(LIFETIME_ALONE, "")
+    return replace(fit, status=Status.unidentified, message=message, exact=bare, **bare)
 
 
 @dataclass(frozen=True, eq=False)
@@ -576,7 +579,8 @@ def study_record(
     ['10.000 h', '10.000 h']
     """
     expect(record, DecayRecord, "beamfit.read_decay_record(path)")
-    record, law = without_repeats(record), Law(law) if machine is None else Law.constant
+    record = without_repeats(without_summer_time(record))
+    law = Law(law) if machine is None else Law.constant
     # Segments move `start` with them: counted from zero it is their place in the record.
     placed = replace(record, start=0.0)
     cycles, events = _refilled(placed)
