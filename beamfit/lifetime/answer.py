@@ -15,6 +15,7 @@ from beamfit.lifetime.cycles import HELD, is_sawtooth, lives_longer
 from beamfit.lifetime.evidence import (
     BELIEVED,
     DETERMINED,
+    OUTSIDE,
     SEPARABLE,
     UNITS,
     Evidence,
@@ -35,8 +36,6 @@ STEP = 12.0
 BACK = 0.5
 # Below this chi²/dof stated errors are said to be too large.
 CAUTIOUS = 0.25
-# A share of a so many errors outside 0 to 1 is of no longer record.
-OUTSIDE = 3.0
 # An exponent or a drift so many errors off zero is told from none.
 CLEAR = 2.0
 # An interval that begins below this share of its end begins at zero.
@@ -371,7 +370,7 @@ def _course(e: Evidence) -> str | None:
 
 def _bent(e: Evidence) -> Finding | None:
     """Cycles within which the current bends as no loss does: no lifetime is quoted."""
-    if not e.outside > OUTSIDE:
+    if not e.bends:
         return None
     share, error = e.scaled("share")
     return Finding(
@@ -404,7 +403,7 @@ def _rises(e: Evidence) -> Finding | None:
     return Finding(Status.infeasible, cause)
 
 
-CYCLE_RULES = (_rises, *NEGATIVE, _bent, _held, _within_noise, _refuted)
+CYCLE_RULES = (_rises, _bent, *NEGATIVE, _held, _within_noise, _refuted)
 CYCLE_RULES += (_one_current, _improbable, _bending, _determined)
 
 

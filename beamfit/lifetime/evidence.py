@@ -40,6 +40,8 @@ from beamfit.quantity import HOUR, Quantity
 SEPARABLE = 0.2
 # How many errors below zero an unphysical a or b, or a rising current, is believed.
 BELIEVED = 5.0
+# A share of a so many errors outside 0 to 1 is of no longer record.
+OUTSIDE = 3.0
 # Standard deviations that hold 95 % of a normal distribution.
 NORMAL = 1.96
 # Below this share of the current differences are those of the arithmetic, not of the beam.
@@ -376,6 +378,11 @@ class Evidence:
         """By how many errors the share of a in the loss lies outside 0 to 1; nan if unknown."""
         share, error = self.sure("share")
         return max(-share, share - 1.0) / error if error > 0 else math.nan
+
+    @property
+    def bends(self) -> bool:
+        """True if cycles bend as no loss does, and the monitor is not stated to drift so."""
+        return self.cycles > 1 and not self.monitor_changes and self.outside > OUTSIDE
 
     @property
     def refuted(self) -> bool:

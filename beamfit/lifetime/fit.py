@@ -12,7 +12,7 @@ import numpy as np
 from beamfit.answer import Table, answer, cell, json_of, labelled, plain_name, quantity_frame
 from beamfit.errors import InputError, expect
 from beamfit.lifetime.alternatives import Change, ConstantA, LifetimeLaw, Outgassing, SuddenLoss
-from beamfit.lifetime.answer import OUTSIDE, finding_of, finding_of_cycles
+from beamfit.lifetime.answer import finding_of, finding_of_cycles
 from beamfit.lifetime.cycles import FEWEST_CYCLES, FEWEST_READINGS, averaged, cleaned
 from beamfit.lifetime.decay_law import current
 from beamfit.lifetime.evidence import BELIEVED, UNITS, Evidence, RatePart, Separability
@@ -481,12 +481,11 @@ def fit_pieces(cycles: Sequence[DecayRecord], name: str, law: Law = Law.constant
     about, left_out = cleaned(gathered)
     evidence, pieces = Evidence(about, law), about.pieces
     finding = finding_of_cycles(evidence, pieces.monitor, left_out)
-    bent = finding.status is Status.unidentified and evidence.outside > OUTSIDE
     return DecayFit(
         record=name,
         status=finding.status,
         message=finding.message,
-        **evidence.quoted(not bent),
+        **evidence.quoted(not evidence.bends),
         mean_current=pieces.units[1],
         rms_residual=float(np.sqrt(np.mean((about.left[:, -1] * pieces.over) ** 2))),
         readings=_readings(pieces, name),
