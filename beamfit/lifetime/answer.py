@@ -286,7 +286,7 @@ def _freely(e: Evidence) -> Finding | None:
 
 
 def _departs(e: Evidence) -> str:
-    """What departs of a and b where constant ones are rejected."""
+    """Name what departs of a and b where constant ones are rejected."""
     chance = f"(p = {max(e.constant_a.p_value, 1e-300):.2g})"
     drift, power = e.free.drift, f"a goes as I^({e.free.exponent})"
     drifts = f"b drifts by {drift} of itself"

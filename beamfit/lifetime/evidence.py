@@ -375,7 +375,7 @@ class Evidence:
 
     @property
     def outside(self) -> float:
-        """By how many errors the share of a in the loss lies outside 0 to 1; nan if unknown."""
+        """Errors by which the share of a in the loss lies outside 0 to 1; nan if unknown."""
         share, error = self.sure("share")
         return max(-share, share - 1.0) / error if error > 0 else math.nan
 
