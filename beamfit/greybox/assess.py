@@ -290,7 +290,9 @@ def state(p: Problem, theta: np.ndarray, scale: Scale, at: Slopes | None = None)
         near = np.where(pushed, np.maximum(near, CLOSE * cost / np.abs(at.gradient)), near)
     near = np.where(np.isfinite(near), near, 0.0)
     bounds = LimitedValues(theta, p.lower, p.upper, scale.unit, near)
-    here = scale_of(p, theta, at) if p.constraints else scale
+    # A number that ends at zero does not make what it limits small.
+    largest = np.maximum(np.abs(theta), scale.unit)
+    here = scale_of(p, largest, at) if p.constraints else scale
     size_here = np.fmin(scale.limit, GROWN * here.limit)
     limits = LimitedValues(
         at.constraints, p.constraint_lower, p.constraint_upper, size_here, p.tolerance * size_here

@@ -110,6 +110,15 @@ def test_a_ridge_of_a_curved_limit_is_no_saddle(start):
     rule = ("above", lambda x: x[2] - (x[0] ** 2 + x[1] ** 2 - 1) ** 2, 0.0)
     fit = minimise(lambda x: x[2], list(start), rules=[rule])
     assert fit.status in ("local_optimum", "degenerate"), fit
+
+
+def test_rounding_at_zero_breaks_no_limit():
+    """All that the limit holds ends at zero: half of such starts were called infeasible."""
+    rule = ("above", lambda x: x[2] - (x[0] ** 2 + x[1] ** 2 - 1) ** 2, 0.0)
+    for k in range(8):
+        start = np.array([-1.5, 0.3, 2.0]) * (1 + 1e-15 * k)
+        fit = minimise(lambda x: x[2], list(start), rules=[rule])
+        assert fit.status in ("local_optimum", "degenerate"), fit
     assert fit.cost == pytest.approx(0.0, abs=1e-6)
 
 
