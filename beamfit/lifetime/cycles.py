@@ -155,11 +155,18 @@ def cut_at_refills(record: DecayRecord) -> Split:
         return clear
     usual, kinds = float(np.median(np.diff(record.time))), ("refill", "loss")
     seen, found = ([e for e in split.events if e.kind in kinds] for split in (clear, fine))
-    apart = np.abs(np.subtract.outer([e.time for e in seen], [e.time for e in found]))
-    same = apart < BESIDE * usual
-    new = [step.change for step, old in zip(found, same.any(axis=0), strict=True) if not old]
-    agree = same.any(axis=1).sum() >= RETURNED * len(seen)
-    return fine if agree and sum(new) >= RETURNED * sum(map(abs, new)) else clear
+    both = [np.array([event.time for event in events]) for events in (seen, found)]
+    agreed, old = (_nearest(*pair) < BESIDE * usual for pair in (both, both[::-1]))
+    new = np.array([event.change for event in found])[~old]
+    agree = agreed.sum() >= RETURNED * agreed.size
+    return fine if agree and new.sum() >= RETURNED * np.abs(new).sum() else clear
+
+
+def _nearest(times: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Distance of each time from the nearest of others, both in order."""
+    ends = np.concatenate([[-np.inf], others, [np.inf]])
+    after = np.searchsorted(ends, times)
+    return np.minimum(times - ends[after - 1], ends[after] - times)
 
 
 def lost_in(cycles: Sequence[DecayRecord]) -> float:
