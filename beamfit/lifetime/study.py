@@ -17,7 +17,6 @@ from beamfit.lifetime.alternatives import sharp_change
 from beamfit.lifetime.answer import LIFETIME_ALONE
 from beamfit.lifetime.cycles import (
     FEWEST_CYCLES,
-    MOST,
     alike,
     cut_at_refills,
     is_refilled,
@@ -262,11 +261,14 @@ def stands_alone(cycle: DecayRecord, fit: DecayFit) -> bool:
     """Tell if a cycle by itself would separate a and b, by the bend of its decay and the noise that
     all cycles show, or its neighbouring readings, where one law does not hold for all.
     """
-    noise = min(fit.rms_residual * fit.inflation, OWN * noise_of(cycle.time, cycle.current))
+    # Of very many readings the fit has means of neighbours.
+    mean, one = (np.median(np.diff(times)) for times in (fit.readings.time, cycle.time))
+    of_reading = fit.rms_residual * math.sqrt(max(mean / one, 1.0))
+    noise = min(of_reading * fit.inflation, OWN * noise_of(cycle.time, cycle.current))
     loss = math.log(cycle.current[0] / cycle.current[-1])
     # The parabola t²/2 scatters about its line by its length squared over 24 sqrt(5).
     bend = float(cycle.current.mean()) * loss**2 / 24 * math.sqrt(len(cycle) / 5)
-    return noise * math.sqrt(max(len(cycle) / MOST, 1.0)) < SEPARABLE * bend
+    return noise < SEPARABLE * bend
 
 
 def seen_through(fit: DecayFit, usual: float, interval: float) -> DecayFit:
