@@ -12,6 +12,9 @@ from beamfit.quantity import NORMAL_REACH, Quantity
 
 # Probability of the residuals below which a fit is poor: the contract of the JSON output.
 POOR_FIT = 1e-3
+# Logarithm of the odds from which something is taken for so: one in a thousand is wrong then
+# (A. Wald, Sequential Analysis, 1947).
+CLEAR_ODDS = -math.log(POOR_FIT)
 # A direction is undetermined if its value is below this many standard errors.
 OPEN = 3.0
 # A value is of use where its 95 % interval spans less than this factor.

@@ -15,7 +15,7 @@ import numpy as np
 
 from beamfit.lifetime.pieces import GAP
 from beamfit.quantity import Quantity, relative_change
-from beamfit.statistics import log_evidence_of_change
+from beamfit.statistics import CLEAR_ODDS, log_evidence_of_change
 
 MINUTE = 60.0
 # Windows, s: four begin in turn in each length, so that one of nearly any age is at hand.
@@ -179,9 +179,6 @@ def set_off(state: AlarmState, raised: np.ndarray, best: np.ndarray) -> AlarmSta
 
 # Readings in which one false alarm is raised at most.
 QUIET = 1e6
-# What moved is named where it is a thousand times likelier than the rest (A. Wald, Sequential
-# Analysis, 1947: one in a thousand is named wrongly).
-NAMED = math.log(1000.0)
 # After so long an alarm goes without a name, s.
 PATIENCE = 60 * MINUTE
 # After a step nothing is looked at for so long, s; after a gap all begins anew.
@@ -416,7 +413,7 @@ def _judged(
         a, b, both = seen_in(state, slice(-1, None)).evidence[..., 0]
         either_one = np.logaddexp(a, b)
         found = [both - either_one, a - np.logaddexp(b, 0.0), b - np.logaddexp(a, 0.0)]
-        found = [odds > NAMED for odds in found]
+        found = [odds > CLEAR_ODDS for odds in found]
         apart = np.select(found, [3, 1, 2], 0)
     late = 4 * (state.raised > PATIENCE)
     settled = ~quiet & usable & (state.age[..., -1] >= MINUTE)

@@ -44,7 +44,7 @@ from beamfit.lifetime.free_law import (
 from beamfit.lifetime.record import DecayRecord
 from beamfit.noise.memory import Products
 from beamfit.quantity import HOUR, Quantity
-from beamfit.statistics import POOR_FIT
+from beamfit.statistics import CLEAR_ODDS, POOR_FIT
 
 # A departure of so many errors is found with 90 % at a false alarm rate of `POOR_FIT`.
 FOUND = float(ndtri(1 - POOR_FIT / 2) + ndtri(0.9))
@@ -69,8 +69,6 @@ MOVED = 1e-3
 # A loss rate that wanders takes so many steps in a record, of a random walk: by which shares of the
 # loss it has gone at the end.
 WALK, WALKS = 16, (0.003, 0.015, 0.07, 0.3)
-# A sharp change of the loss rate is one where it is so much likelier than a wandering loss rate.
-SHARP = math.log(1000.0)
 # Currents at which a lifetime is offered.
 CURRENTS = 5
 
@@ -354,7 +352,7 @@ class SharpChange(NamedTuple):
 
 
 def sharp_change(plain: Expansion) -> SharpChange | None:
-    """The likeliest sharp change of the loss rate, where it is `SHARP`.
+    """The likeliest sharp change of the loss rate, where it is far likelier than a wandering one.
 
     Parameters
     ----------
@@ -388,7 +386,7 @@ def sharp_change(plain: Expansion) -> SharpChange | None:
         return None
     without, stepped, *steps = np.array([_beside(*walk) for walk in walks]).T
     odds, best = float(logsumexp(stepped) - logsumexp(without)), int(np.argmax(stepped))
-    if odds <= SHARP:
+    if odds <= CLEAR_ODDS:
         return None
     # A change of a falls with the current: a wider walk leaves room for that.
     wider = walks[min(best + 1, len(walks) - 1)]

@@ -33,7 +33,7 @@ from beamfit.lifetime.pieces import (
     split_record,
 )
 from beamfit.lifetime.record import Conditions, DecayRecord
-from beamfit.statistics import log_evidence_of_change
+from beamfit.statistics import CLEAR_ODDS, log_evidence_of_change
 
 # Standard deviations by which two levels must differ to be two: a false step costs no more than an
 # own current for the rest.
@@ -64,9 +64,8 @@ BESIDE = 2.0
 SAME = 0.02
 # Currents so alike that a and b do as one number.
 NARROW = 0.02
-# Noise over the height of a sawtooth that is looked at, and the logarithm of the likelihood ratio
-# from which readings are of one: 1 in 1000 at even odds.
-NOISES, EVEN = (0.01, 0.03, 0.1, 0.2), math.log(1000.0)
+# Noise over the height of a sawtooth that is looked at.
+NOISES = (0.01, 0.03, 0.1, 0.2)
 # Refills of top-up come every 3 min, within a factor 3, those of fills hours apart; lifetimes are
 # 15 h within a factor 3, the rest within seconds to years:
 # middle, s, width of the logarithm, and its whole range about that.
@@ -169,12 +168,6 @@ def _nearest(times: np.ndarray, others: np.ndarray) -> np.ndarray:
     return np.minimum(times - ends[after - 1], ends[after] - times)
 
 
-def lost_in(cycles: Sequence[DecayRecord]) -> float:
-    """Current that cycles lose, mA; zero where they gain some."""
-    lost = sum(float(cycle.current[0] - cycle.current[-1]) for cycle in cycles)
-    return max(lost, 0.0)
-
-
 def is_refilled(split: Split) -> bool:
     """Tell three or more cycles held by refills from a decay with odd steps.
 
@@ -184,7 +177,8 @@ def is_refilled(split: Split) -> bool:
     if len(cycles) < FEWEST_CYCLES:
         return False
     refills = [event.change for event in split.events if event.kind in ("refill", "ramp")]
-    return len(refills) + 1 >= FEWEST_CYCLES and sum(refills) > RETURNED * lost_in(cycles) > 0
+    lost = sum(float(cycle.current[0] - cycle.current[-1]) for cycle in cycles)
+    return len(refills) + 1 >= FEWEST_CYCLES and sum(refills) > RETURNED * lost > 0
 
 
 def is_sawtooth(residuals: np.ndarray) -> bool:
@@ -205,7 +199,7 @@ def is_sawtooth(residuals: np.ndarray) -> bool:
         ends = ((off + sign * width / 2) / (share * width) for sign in (1, -1))
         inside = np.subtract(*map(ndtr, ends)) / width
         best = max(best, float(np.sum(np.log(np.maximum(inside, 1e-300)))))
-    return best - normal > EVEN
+    return best - normal > CLEAR_ODDS
 
 
 def unresolved(usual: float, interval: float, lifetime: float) -> float:

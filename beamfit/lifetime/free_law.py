@@ -463,7 +463,8 @@ class Draws(NamedTuple):
 def _even(draws: int, count: int, seed: int) -> np.ndarray:
     """Points that fill a cube evenly, (p, d): their means err less than those of random ones.
 
-    Steps are powers of the root of x^(p + 1) = x + 1, from a place at random.
+    Steps are powers of the root of x^(p + 1) = x + 1, from a place at random (M. Roberts, The
+    unreasonable effectiveness of quasirandom sequences, 2018).
     """
     root = np.roots([1.0, *[0.0] * (count - 1), -1.0, -1.0]).real.max()
     steps = root ** -np.arange(1.0, count + 1)

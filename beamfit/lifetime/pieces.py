@@ -450,7 +450,8 @@ def without_repeats(record: DecayRecord) -> DecayRecord:
 
 def without_summer_time(record: DecayRecord) -> DecayRecord:
     """Take out the hour that a local clock skips in spring: between two readings an hour passes
-    besides the usual interval, and the current goes on as if it had not.
+    besides the usual interval, and the current goes on as if it had not. Refills may hold a beam
+    over an hour that was not recorded: with them nothing is taken out.
 
     Examples
     --------
@@ -469,7 +470,8 @@ def without_summer_time(record: DecayRecord) -> DecayRecord:
     sides = slice(after - WINDOW, after), slice(after, after + WINDOW)
     lines = [np.polyfit(since[side] - at, record.current[side], 1) for side in sides]
     step, noise = abs(lines[1][1] - lines[0][1]), _noise(record, record.time, record.current)
-    if min(-slope * HOUR for slope, _ in lines) < THRESHOLD * max(step, noise):
+    refilled = np.max(record.current - np.minimum.accumulate(record.current)) > THRESHOLD * noise
+    if refilled or min(-slope * HOUR for slope, _ in lines) < THRESHOLD * max(step, noise):
         return record
     note = (
         f"The clock skips an hour after {at:.0f} s while the current goes on as before, as local "

@@ -56,7 +56,7 @@ REFUTED = (Status.poor_fit, Status.infeasible)
 # Probability of refills faster than the record is read from which cycles tell no lifetime.
 UNSURE = 0.05
 # Errors of the time of a change within which readings are of neither side.
-TWICE = 2.0
+NEITHER = 2.0
 # Cycles that make a point of a course at least.
 FEWEST_IN_PART = 10
 
@@ -541,7 +541,7 @@ def _cut(segment: DecayRecord, fit: DecayFit) -> tuple[Event, float] | None:
         change = -loss.current.value
         return Event("refill" if change > 0 else "loss", loss.time, 0.0, change), 0.0
     if fit.change is not None and (sharp := sharp_change(fit.about)) is not None:
-        return Event("loss rate changes", sharp.time, 0.0, 0.0), TWICE * sharp.error
+        return Event("loss rate changes", sharp.time, 0.0, 0.0), NEITHER * sharp.error
     return None
 
 

@@ -80,3 +80,12 @@ def test_an_hour_that_the_clock_skips_is_taken_out_and_one_of_beam_is_not(lost):
     assert abs(lifetime.value - 10) < 4 * lifetime.error
     assert any("skips an hour" in note for note in study.record.notes) is not lost
     assert study.record.span == pytest.approx(later[-1] if lost else time[-1])
+
+
+def test_an_hour_of_top_up_that_is_missing_is_no_clock():
+    """Refills hold the current over an hour that was not recorded."""
+    time = np.arange(0.0, 6 * HOUR, 10.0)
+    later = np.where(time >= 9000.0, time + HOUR, time)
+    noise = 0.01 * np.random.default_rng(0).normal(size=time.size)
+    record = DecayRecord(later, 500 * np.exp(-(time % 180) / 36000) + noise)
+    assert study_record(record).record.notes == ()
