@@ -35,11 +35,18 @@ from beamfit.lifetime.free_law import (
     ABOVE,
     BELOW,
     DRIFT,
+    ENDS,
     ENOUGH,
+    INTEGRAL,
+    NODES,
     OUTGASSING,
     SIZES,
     SMOOTH,
     TIMES,
+    WALK,
+    WALKS,
+    WANDERS,
+    from_nodes,
 )
 from beamfit.lifetime.record import DecayRecord
 from beamfit.noise.memory import Products
@@ -54,10 +61,11 @@ GRID = np.linspace(0.05, 0.95, 40)
 FINER = 3
 # Two changes within so many readings are a step.
 STEP = 3.0
-# Prior probabilities: constant a and b, a power of a, a drift of b beside, one change, two, gas
-# that relaxes, current lost at once between two readings, each as likely, once or twice.
-CHANCES = {"": SMOOTH - 0.4, "power": 0.2, "drift": 0.2, "step": 0.08, "steps": 0.04,
-           "relaxing": OUTGASSING, "sudden": 0.04, "sudden twice": 0.02}  # fmt: skip
+# Prior probabilities: constant a and b, a power of a, a drift of b beside, a walk beside both, one
+# change, two, gas that relaxes, current lost at once between two readings, each as likely, once or
+# twice.
+CHANCES = {"": SMOOTH - 0.4, "power": 0.2, "drift": 0.2, "walk": WANDERS, "step": 0.08,
+           "steps": 0.04, "relaxing": OUTGASSING, "sudden": 0.04, "sudden twice": 0.02}  # fmt: skip
 # Further losses of each alternative: how many, of which kind.
 KINDS = {"step": (1, "step"), "steps": (2, "step"), "relaxing": (1, "relaxing"),
          "sudden": (1, "sudden"), "sudden twice": (2, "sudden")}  # fmt: skip
@@ -66,9 +74,8 @@ KINDS = {"step": (1, "step"), "steps": (2, "step"), "relaxing": (1, "relaxing"),
 COARSE, HOPELESS = 7, -1.0
 # Step of a time for the slope by it, over the span.
 MOVED = 1e-3
-# A loss rate that wanders takes so many steps in a record, of a random walk: by which shares of the
-# loss it has gone at the end.
-WALK, WALKS = 16, (0.003, 0.015, 0.07, 0.3)
+# Steps of a loss rate that wanders beside a sharp change of it.
+STEPS = 16
 # Currents at which a lifetime is offered.
 CURRENTS = 5
 
@@ -279,13 +286,14 @@ class SuddenLoss(NamedTuple):
 class Rival(NamedTuple):
     """The explanation that is better than a smooth law, and by how much.
 
-    `odds` is the logarithm of its probability over that of a power of a with a drift of b, and
-    `scatter` what it leaves of the readings, mA rms.
+    `odds` is the logarithm of its probability over that of a power of a with a drift of b,
+    `scatter` what it leaves of the readings, mA rms, and `quantities` has its I0 and lifetimes.
     """
 
     found: Change | Outgassing | SuddenLoss
     odds: float
     scatter: float
+    quantities: dict[str, Quantity]
 
     def __str__(self) -> str:
         size = self.odds / math.log(10.0)
@@ -331,7 +339,28 @@ def rival_of(plain: Expansion) -> Rival | None:
     told = {"relaxing": _outgassing, "sudden": _sudden_loss, "sudden twice": _sudden_loss}
     answer = told.get(name, _change)(best)
     scatter = float(np.sqrt(np.mean((best.residuals * pieces.over) ** 2)))
-    return Rival(answer, log - smooth, scatter)
+    return Rival(answer, log - smooth, scatter, _quantities(best, KINDS[name][1]))
+
+
+def _quantities(law: Expansion, kind: str) -> dict[str, Quantity]:
+    """I0 and lifetimes at the first and last reading and the mean current, with further losses."""
+    (span, mean), x = law.pieces.units, law.pieces.share + law.residuals / law.pieces.weight
+    when = np.array([0.0, 1.0, np.interp(-1.0, -x, law.pieces.time / span)])
+
+    def numbers(level, loss, quadratic, power, *further):
+        rates = loss + quadratic * (np.array([level, x[-1], 1.0]) - 1)
+        for size, time in zip(further[::2], further[1::2], strict=True):
+            if kind == "relaxing":
+                rates = rates + size * np.exp(-when / time)
+            elif kind == "step":
+                rates = rates + size * (when > np.real(time))
+        return np.append(rates / span, level * mean)
+
+    columns = [LEVEL, *PLAIN, *range(FURTHER, law.rows.shape[1])]
+    *rates, first = zip(*law.quoted(numbers, columns), strict=True)
+    lifetimes = (lifetime_of(*rate, clear=True) for rate in rates)
+    found = {f"lifetime_{at}": one for at, one in zip(ENDS, lifetimes, strict=True)}
+    return {"i0": Quantity(*map(float, first), "mA")} | found
 
 
 class SharpChange(NamedTuple):
@@ -365,7 +394,7 @@ def sharp_change(plain: Expansion) -> SharpChange | None:
 
     Notes
     -----
-    Besides a power of a the loss rate goes by a random walk of `WALK` steps, each of `WALKS` as
+    Besides a power of a the loss rate goes by a random walk of `STEPS` steps, each of `WALKS` as
     likely, with and without one step of any size more. A pressure that wanders is a walk, and a
     change that the walk alone explains is none. The further step is taken in linear approximation
     about the walk, which has most of it.
@@ -398,9 +427,9 @@ def _walk(plain: Expansion, share: float) -> tuple[Expansion, dict[int, float]]:
     """The law with a power of a and a random walk of the loss rate, and the widths of its numbers;
     the loss has gone by such a share of itself at the end.
     """
-    walk = np.array([np.zeros(WALK), (np.arange(WALK) + 0.5) / WALK]).T.ravel()
-    step = share * abs(plain.numbers[0]) / math.sqrt(WALK)
-    widths = {POWER: (BELOW + ABOVE) / 2} | {FURTHER + 2 * k: step for k in range(WALK)}
+    walk = np.array([np.zeros(STEPS), (np.arange(STEPS) + 0.5) / STEPS]).T.ravel()
+    step = share * abs(plain.numbers[0]) / math.sqrt(STEPS)
+    widths = {POWER: (BELOW + ABOVE) / 2} | {FURTHER + 2 * k: step for k in range(STEPS)}
     start = np.append(plain.numbers, walk)
     return solved(plain.pieces, (*PLAIN, *widths), "step", start=start, widths=widths), widths
 
@@ -506,7 +535,7 @@ def _widths(name: str, sizes: np.ndarray, times: np.ndarray, loss: float) -> np.
 
 
 def _smooth(plain: Expansion) -> float:
-    """Log evidence of a power of the current with a drift of b, or of neither."""
+    """Log evidence of a power of the current with a drift of b, and a walk, or of neither."""
     start = np.append(plain.numbers, [0.0, 0.0])
     laws = [plain, solved(plain.pieces, (*PLAIN, POWER))]
     if plain.pieces.gauge is None:
@@ -515,7 +544,10 @@ def _smooth(plain: Expansion) -> float:
         laws.append(solved(plain.pieces, (*PLAIN, POWER, FURTHER), "drift", start=start,
                            widths={POWER: width, FURTHER: DRIFT * gas}))  # fmt: skip
     named = zip(laws, ("", "power", "drift"), strict=False)
-    return float(logsumexp([_log_evidence(law, name) for law, name in named if law.rested]))
+    found = [_log_evidence(law, name) for law, name in named if law.rested]
+    if plain.pieces.gauge is None and laws[-1].rested:
+        found.append(_log_evidence_of_walk(laws[-1]))
+    return float(logsumexp(found))
 
 
 class _Further(NamedTuple):
@@ -566,6 +598,17 @@ def _with_further(plain: Expansion, more: _Further) -> Expansion | None:
 
 def _log_evidence(law: Expansion, name: str) -> float:
     """Logarithm of the probability of the readings, the noise averaged over, up to a constant."""
+    columns, width, centre = _given(law, name)
+    rows = np.column_stack([law.residuals, law.rows[:, columns]])
+    products = Products.of(rows, law.pieces.time, law.pieces.error is not None)
+    count = (law.numbers.size - len(PLAIN) - 1) // 2
+    return _laplace(products, width, centre) + _log_chance(name, law, count)
+
+
+def _given(law: Expansion, name: str) -> tuple[list[int], np.ndarray, np.ndarray]:
+    """Columns of the numbers of an alternative, widths of their priors, and how far the numbers
+    are from the middle of these.
+    """
     loss, quadratic, power, *further = law.numbers
     extra: dict[int, float] = {}
     if name in ("power", "drift"):
@@ -579,13 +622,23 @@ def _log_evidence(law: Expansion, name: str) -> float:
         if not name.startswith("sudden"):
             flat |= {WHEN + 2 * k: time for k, time in enumerate(times)}
     extra |= flat
-    columns = [LEVEL, *PLAIN, *extra]
-    width = np.array([np.inf] * 3 + list(extra.values()))
     known = [0.0 if column in flat else law.numbers[column - 1] for column in extra]
-    centre = np.array([0.0] * 3 + known)
-    rows = np.column_stack([law.residuals, law.rows[:, columns]])
-    products = Products.of(rows, law.pieces.time, law.pieces.error is not None)
-    return _laplace(products, width, centre) + _log_chance(name, law, len(further) // 2)
+    width = np.array([np.inf] * 3 + list(extra.values()))
+    return [LEVEL, *PLAIN, *extra], width, np.array([0.0] * 3 + known)
+
+
+def _log_evidence_of_walk(law: Expansion) -> float:
+    """The same if the loss rate goes by a random walk besides a drift of b, in linear
+    approximation.
+    """
+    columns, width, centre = _given(law, "drift")
+    walked = from_nodes(law.pieces.time / law.pieces.units[0]) @ INTEGRAL @ WALK
+    model = (law.pieces.current / law.pieces.over + law.residuals)[:, None]
+    rows = np.column_stack([law.residuals, law.rows[:, columns], -law.numbers[0] * model * walked])
+    products = Products.of(rows, law.pieces.time, bool(law.given), COARSE)
+    centre, every = np.append(centre, np.zeros(NODES)), np.ones(NODES)
+    walks = [_laplace(products, np.append(width, share * every), centre) for share in WALKS]
+    return float(logsumexp(walks)) + math.log(CHANCES["walk"] / len(WALKS))
 
 
 def _laplace(products: Products, width: np.ndarray, centre: np.ndarray) -> float:

@@ -198,6 +198,8 @@ def _inseparable(e: Evidence) -> Finding | None:
         f"of a in the loss {found.share:.2g} ± {found.share_error:.2g}), the lifetime at the mean "
         "current is determined. "
     )
+    if e.free is not None and e.free.is_odd:
+        return Finding(Status.unidentified, f"{told}{_departs(e)}. Give the pressure in a column")
     if e.apart:
         open_ = "An exponent of a and a drift of b leave them open: record farther, or give the "
         told += f"{open_}ring, the pressure, or --law constant. {_if_constant(e)}"

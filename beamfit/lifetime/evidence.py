@@ -30,7 +30,7 @@ from beamfit.lifetime.expansion import (
     further_columns,
     lifetime_of,
 )
-from beamfit.lifetime.free_law import BELOW, ENDS, LIKELIER, PACES, UNITS, FreeLaw, Law, free_law
+from beamfit.lifetime.free_law import BELOW, ENDS, EXACT, PACES, UNITS, FreeLaw, Law, free_law
 from beamfit.lifetime.record import DecayRecord
 from beamfit.noise.memory import CLOSE, Products
 from beamfit.quantity import HOUR, Quantity
@@ -44,8 +44,6 @@ BELIEVED = 5.0
 OUTSIDE = 3.0
 # Standard deviations that hold 95 % of a normal distribution.
 NORMAL = 1.96
-# Below this share of the current differences are those of the arithmetic, not of the beam.
-EXACT = 1e-12
 
 
 @shown
@@ -413,10 +411,7 @@ class Evidence:
         known = self.law is Law.constant or self.shaped or self.cycles > 1
         if known or not self.is_clear("rate_mean") or not (self.explained is None or self.by_gas):
             return None
-        found = free_law(self.record, self.values)
-        if found is None or found.odd > LIKELIER or (self.by_gas and not found.is_pumped):
-            return None
-        return found
+        return free_law(self.record, self.values)
 
     @property
     def freed(self) -> bool:
@@ -428,8 +423,7 @@ class Evidence:
         """True if gas explains a refuted law that is pumped away in a time of the free law."""
         if self.outgassing is None:
             return False
-        spans = self.record.span / (self.outgassing.time_constant.value * HOUR)
-        return PACES[0] <= spans <= PACES[1]
+        return self.record.span <= PACES[1] * self.outgassing.time_constant.value * HOUR
 
     @property
     def outgassing(self) -> Outgassing | None:
@@ -487,12 +481,15 @@ class Evidence:
 
     def quoted(self, known: bool = True) -> dict[str, Any]:
         """Fields of a `DecayFit`, by name."""
-        # Of a law that the readings refute, and nobody stated, a and b have no errors.
+        # Of a law that the readings refute, and nobody stated, nothing has an error; I0 and lifetimes
+        # are those of what explains the readings. The mean lifetime of many cycles is of no law.
         doubted = self.refuted and self.free is None and self.law is Law.free
         same = ("chi2", "dof", "noise_inferred", "constant_a", "correlation_time", "lifetimes")
-        exact = {"i0": self.quantity("i0", known and self.cycles == 1)}
+        exact = {"i0": self.quantity("i0", known and not doubted and self.cycles == 1)}
         exact |= {name: self.quantity(name, known and self.apart and not doubted) for name in "ab"}
-        exact |= {f"lifetime_{at}": self.lifetime(f"rate_{at}", known) for at in ENDS}
+        alone = known and not (doubted and self.cycles == 1)
+        exact |= {f"lifetime_{at}": self.lifetime(f"rate_{at}", alone) for at in ENDS}
+        exact |= self.explained.quantities if doubted and self.explained is not None else {}
         found = {name: self.widely(name, quantity) for name, quantity in exact.items()}
         found |= {"exact": exact, "free_law": self.free, "shaped": self.shaped}
         found |= {name: getattr(self, name) for name in (*same, "inflation", "residuals", "course")}

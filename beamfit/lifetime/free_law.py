@@ -5,9 +5,10 @@ With x the current over its mean and s the time over the span, the loss rate is
 share R x^(1 + g) + (1 - share) R (1 + h f(s)) with the share of a from 0 to 1. The gas changes by h
 of itself: in a straight line, f = s - 1/2, or as what is pumped away after a fill, f = 1/k -
 exp(-k s)/(1 - exp(-k)), where a is then constant. The exponent g, the change h and the pace k have
-priors, the first current, the loss rate and the share of a are flat. The law has a closed form with
-one integral, taken to rounding on Chebyshev nodes, which readings see through one matrix: whitened
-products of its columns are all that they say.
+priors, the first current, the loss rate and the share of a are flat. Beside g and h the whole loss
+may go by a random walk. The law has a closed form with one integral, taken to rounding on Chebyshev
+nodes, which readings see through one matrix: whitened products of its columns are all that they
+say.
 """
 
 from __future__ import annotations
@@ -17,11 +18,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from functools import lru_cache
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 from numpy.polynomial.chebyshev import chebint, chebvander
-from scipy.special import expit, log_expit, log_ndtr, logsumexp
+from scipy.special import expit, log_expit, log_ndtr, logsumexp, ndtri
 
 from beamfit.lifetime.decay_law import closed_form
 from beamfit.lifetime.expansion import Physical
@@ -40,7 +42,10 @@ DRIFT = 0.1
 # Prior probabilities of these and of gas that is pumped away after a fill. The time that takes is
 # flat in its logarithm from a thousandth of the span to all of it, its loss at first from a
 # thousandth of the mean loss to ten times that.
-SMOOTH, OUTGASSING, TIMES, SIZES = 0.74, 0.08, (1e-3, 1.0), (1e-3, 10.0)
+SMOOTH, OUTGASSING, TIMES, SIZES = 0.6, 0.08, (1e-3, 1.0), (1e-3, 10.0)
+# Prior probability that the loss rate wanders, as a pressure does, by a random walk: by which
+# shares of the loss it has gone at the end, each as likely.
+WANDERS, WALKS = 0.14, (0.003, 0.015, 0.07, 0.3)
 # Spans over the time of gas that is pumped away: shorter times are seen by themselves.
 PACES = (1.0, 20.0)
 # Where the record's bend does not depend on the share its coordinate has this slope.
@@ -52,6 +57,13 @@ ANGLE = -np.cos(np.pi * np.arange(NODES) / (NODES - 1))
 NODE = (1 + ANGLE) / 2
 FROM_NODES = np.linalg.inv(chebvander(ANGLE, NODES - 1))
 INTEGRAL = chebvander(ANGLE, NODES) @ chebint(FROM_NODES, lbnd=-1) / 2
+
+
+# A random walk about its mean at the nodes: a half of its covariance, min(s, t) less the means over
+# s, over t and over both.
+_PART = NODE - NODE**2 / 2
+WALK = np.minimum.outer(NODE, NODE) - np.add.outer(_PART, _PART) + 1 / 3
+WALK = np.linalg.cholesky(WALK + 1e-12 * np.eye(NODES))
 
 
 def from_nodes(s: np.ndarray) -> np.ndarray:
@@ -180,6 +192,12 @@ def log_pumped(share, gas, pace, xp=np):
     return xp.where(inside, density, -np.inf)
 
 
+LOG_WANDERS = math.log(WANDERS / SMOOTH)
+# A walk is looked at beside noises that are not less likely than the likeliest by more than this;
+# fewer readings tell no noise beside a curve as free.
+BESIDE, FEWEST = 3.0, 2 * NODES
+# Below this share of the current differences are those of the arithmetic, not of the beam.
+EXACT = 1e-12
 # Width of the change of gas that is pumped away in what draws come from.
 PUMPED = 0.5
 # Exponents, or paces, looked at, in ever narrower ranges, and steps of the search with each: it
@@ -219,6 +237,15 @@ UNITS = {
 }
 
 
+class Walk(NamedTuple):
+    """A loss rate that wanders, by noise: its mean at the nodes from what the readings leave,
+    (k, 14, 15), and a half of its covariance over the noise, (k, 14, 14), as shares of the loss.
+    """
+
+    mean: np.ndarray
+    half: np.ndarray
+
+
 @dataclass(frozen=True)
 class SeenDecay:
     """A record as products of the columns that its readings see the nodes through.
@@ -239,6 +266,8 @@ class SeenDecay:
         Whether b may drift.
     share : tuple of float
         Between which the share of a lies.
+    walk : Walk or None
+        What the readings say of a loss rate that wanders, by noise; None where it does not.
     """
 
     products: Products
@@ -248,6 +277,7 @@ class SeenDecay:
     ends: tuple[float, float]
     drifts: bool
     share: tuple[float, float] = (0.0, 1.0)
+    walk: Walk | None = None
 
     @classmethod
     def of(cls, record: DecayRecord, values: Physical) -> SeenDecay:
@@ -276,30 +306,77 @@ class SeenDecay:
         products = Products.of(rows, time, error is not None)
         return cls(products, start, origin, gas, ends, record.gauge is None).without_hopeless()
 
-    def without_hopeless(self) -> SeenDecay:
-        """Leave out noises in which no smooth curve is as likely as this one in another."""
+    def likely(self) -> tuple[np.ndarray, np.ndarray]:
+        """Squares that the likeliest smooth curve leaves in each noise, and its log likelihood."""
         along, matrix = self.products.matrix[:, 1:, :1], self.products.matrix[:, 1:, 1:]
         known = LEAST_LEFT * np.trace(matrix, axis1=1, axis2=2)[:, None, None] * np.eye(NODES)
         explained = np.sum(along * np.linalg.solve(matrix + known, along), axis=(1, 2))
         least = np.maximum(self.products.matrix[:, 0, 0] - explained, 1e-30)
-        best = self.products.log_prior + self.products.log_size(least)
+        return least, self.products.log_prior + self.products.log_size(least)
+
+    def without_hopeless(self) -> SeenDecay:
+        """Leave out noises in which no smooth curve is as likely as this one in another."""
+        _, best = self.likely()
         return self.of_noises(best > self.products.log_likelihood().max() - 2 * FAR)
 
     def of_noises(self, kept: np.ndarray) -> SeenDecay:
         """The same with some of the noises."""
-        return replace(self, products=self.products.some(kept))
+        walk = self.walk and Walk(*(part[kept] for part in self.walk))
+        return replace(self, products=self.products.some(kept), walk=walk)
 
-    def log_size(self, currents: np.ndarray, kind: np.ndarray) -> np.ndarray:
-        """Log likelihood of currents at the nodes, (14, d), in the noises of these places, which
-        are in order.
+    def wandering(self) -> SeenDecay:
+        """The same with a loss rate that wanders, averaged over, beside the likeliest noises."""
+        least, best = self.likely()
+        near = best > best.max() - BESIDE
+        some, unit = self.of_noises(near), np.sqrt(self.products.variance(least[near], NODES))
+        size, rate = (
+            np.outer(WALKS, 1 / np.maximum(unit, EXACT)).ravel(),
+            float(np.exp(self.start[1, 0])),
+        )
+        columns = -size[:, None, None] * rate * self.origin * (INTEGRAL @ WALK)
+        matrix, chance = np.tile(some.products.matrix, (len(WALKS), 1, 1)), -math.log(len(WALKS))
+        seen = matrix[:, :, 1:] @ columns
+        known = np.swapaxes(columns, 1, 2) @ seen[:, 1:]
+        least = LEAST_LEFT * np.trace(known, axis1=1, axis2=2)[:, None, None]
+        half = np.linalg.inv(np.linalg.cholesky(known + (1 + least) * np.eye(NODES)))
+        half, volume = np.swapaxes(half, 1, 2), np.linalg.slogdet(half)[1]
+        gain = half @ np.swapaxes(seen @ half, 1, 2)
+        products = some.products._replace(
+            kinds=some.products.kinds * len(WALKS),
+            log_prior=np.tile(some.products.log_prior, len(WALKS)) + volume + chance,
+            matrix=matrix - seen @ gain,
+        )
+        size = size[:, None, None] * WALK
+        return replace(self, products=products, walk=Walk(-size @ gain, size @ half))
+
+    def away(self, currents: np.ndarray) -> np.ndarray:
+        """Currents at the nodes, (14, d), as multiples of the columns that they leave."""
+        return np.vstack([-np.ones(currents.shape[1]), currents - self.origin])
+
+    def squares(self, currents: np.ndarray, kind: np.ndarray) -> np.ndarray:
+        """Whitened squares of what currents leave, in the noises of these places, in order."""
+        away, squares = self.away(currents), np.empty(kind.size)
+        for matrix, part in zip(self.products.matrix, self._parts(kind), strict=True):
+            squares[part] = np.sum(away[:, part] * (matrix @ away[:, part]), axis=0)
+        return np.maximum(squares, 1e-30)
+
+    def _parts(self, kind: np.ndarray) -> list[slice]:
+        """Draws of each noise: of one noise they are one product of matrices."""
+        ends = np.searchsorted(kind, np.arange(len(self.products.matrix) + 1))
+        return [slice(*part) for part in pairwise(ends)]
+
+    def walked(self, currents: np.ndarray, kind: np.ndarray, even: np.ndarray) -> np.ndarray:
+        """Draw how far the loss rate has walked at the nodes, as shares of the loss, (14, d), by
+        even points of a cube, beside these currents.
         """
-        away = np.vstack([-np.ones(kind.size), currents - self.origin])
-        squares, products = np.empty(kind.size), self.products
-        ends = np.searchsorted(kind, np.arange(len(products.matrix) + 1))
-        for matrix, *part in zip(products.matrix, ends[:-1], ends[1:], strict=True):
-            some = away[:, slice(*part)]  # of one noise: one product of matrices
-            squares[slice(*part)] = np.sum(some * (matrix @ some), axis=0)
-        return products.log_size(np.maximum(squares, 1e-30))
+        walked = np.zeros_like(currents)
+        if self.walk is None:
+            return walked
+        away, normal = self.away(currents), ndtri(even)
+        noise = np.sqrt(self.products.variance(self.squares(currents, kind), 0))
+        for mean, half, part in zip(*self.walk, self._parts(kind), strict=True):
+            walked[:, part] = mean @ away[:, part] + half @ (normal[:, part] * noise[part])
+        return walked
 
 
 class Peaks(NamedTuple):
@@ -448,11 +525,12 @@ def _along(seen: SeenDecay, row: int, low: float, high: float, free: list[int]) 
 
 
 class Draws(NamedTuple):
-    """Numbers with their currents at the nodes, (14, d), their weights, their log evidence, and how
-    many draws they are worth.
+    """Numbers with walks of the loss rate and currents at the nodes, (14, d), their weights, their
+    log evidence, and how many draws they are worth.
     """
 
     numbers: Numbers
+    walk: np.ndarray
     currents: np.ndarray
     weight: np.ndarray
     log: float
@@ -521,6 +599,7 @@ class DrawnLaw(NamedTuple):
         log = np.where(inside, -math.log(high - low), -np.inf)
         if PACE in free:
             return log + log_pumped(numbers.share, numbers.gas, numbers.pace)
+        log = log if self.seen.walk is None else log + LOG_WANDERS
         log = log + log_prior(numbers.power)[0] if POWER in free else log
         return log + log_straight(numbers.drift) if CHANGE in free else log
 
@@ -553,16 +632,20 @@ class DrawnLaw(NamedTuple):
         seen, peaks, _ = self
         if not np.isfinite(peaks.log).all():
             numbers, none = Numbers.of(peaks.numbers), np.zeros(peaks.log.shape[1])
-            return Draws(numbers, numbers.currents(seen.gas), none, -np.inf, 0.0)
+            currents = numbers.currents(seen.gas)
+            return Draws(numbers, np.zeros_like(currents), currents, none, -np.inf, 0.0)
         kind, numbers, given = self._proposed(draws, seed)
         currents = numbers.currents(seen.gas)
-        log = seen.products.log_prior[kind] + seen.log_size(currents, kind)
+        log = seen.products.log_prior[kind]
+        log = log + seen.products.log_size(seen.squares(currents, kind))
         log = log + np.log(numbers.level * numbers.rate * np.abs(numbers.unit))
         log = log + self._log_prior(numbers) - given
         whole = float(logsumexp(log))
         weight = np.exp(log - max(whole, -1e300))
         worth = float(weight.sum() / max(np.sum(weight**2), 1e-300))
-        return Draws(numbers, currents, weight, whole - math.log(draws), worth)
+        walk = seen.walked(currents, kind, _even(draws, NODES, seed + 1))
+        currents = currents * np.exp(-numbers.rate * (INTEGRAL @ walk))
+        return Draws(numbers, walk, currents, weight, whole - math.log(draws), worth)
 
 
 def drawn(laws: Sequence[DrawnLaw]) -> list[Draws]:
@@ -591,8 +674,8 @@ def mixed(laws: Sequence[Draws]) -> Draws:
         return laws[0]
     weight = np.concatenate([law.weight * math.exp(law.log - whole) for law in laws])
     numbers = Numbers(*map(np.concatenate, zip(*(law.numbers for law in laws), strict=True)))
-    currents = np.hstack([law.currents for law in laws])
-    return Draws(numbers, currents, weight, whole, float(1 / np.sum(weight**2)))
+    walk, currents = (np.hstack([law[row] for law in laws]) for row in (1, 2))
+    return Draws(numbers, walk, currents, weight, whole, float(1 / np.sum(weight**2)))
 
 
 def quantiles(values: np.ndarray, weight: np.ndarray, at: np.ndarray) -> np.ndarray:
@@ -678,8 +761,13 @@ class FreeLaw:
 
     @property
     def tells_share(self) -> bool:
-        """True unless the loss may as well be all of a as none of it."""
-        return any(self.quantities[name].interval_95[0] > 0 for name in "ab")
+        """True unless the loss may as well be all of a as none of it, or bends as no known law."""
+        return not self.is_odd and any(self.quantities[name].interval_95[0] > 0 for name in "ab")
+
+    @property
+    def is_odd(self) -> bool:
+        """True if the exponent is likely none of a bunch's length."""
+        return self.odd > LIKELIER
 
     @property
     def is_pumped(self) -> bool:
@@ -741,7 +829,7 @@ def free_law(record: DecayRecord, values: Physical) -> FreeLaw | None:
     """
     seen = SeenDecay.of(record, values)
     laws = drawn(proposals(seen))
-    draws, smooth = mixed(laws), laws[0]
+    draws, smooth = mixed(laws), mixed(laws[::2])  # the second is gas that is pumped away
     if not np.isfinite(smooth.log) or draws.worth < LEAST_WORTH:
         return None
     plain = DrawnLaw.of(seen, CONSTANT).weighed(FEW)
@@ -762,13 +850,14 @@ def free_law(record: DecayRecord, values: Physical) -> FreeLaw | None:
 
 
 def proposals(seen: SeenDecay) -> list[DrawnLaw]:
-    """The free law, and gas that is pumped away where no gauge tells the gas."""
+    """The free law, and where no gauge tells the gas, gas that is pumped away and a walk."""
     if not seen.drifts:
         return [DrawnLaw.of(seen, [*CONSTANT, POWER])]
-    return [
-        DrawnLaw.of(seen, [*CONSTANT, POWER, CHANGE]),
-        DrawnLaw.of(seen, [*CONSTANT, CHANGE, PACE]),
-    ]
+    smooth = [*CONSTANT, POWER, CHANGE]
+    laws = [DrawnLaw.of(seen, smooth), DrawnLaw.of(seen, [*CONSTANT, CHANGE, PACE])]
+    if seen.products.count < FEWEST:
+        return laws
+    return [*laws, DrawnLaw.of(seen.wandering(), smooth)]
 
 
 def rates_of(a, b, power, changed, x, seen: SeenDecay):
@@ -796,7 +885,10 @@ def _quantities(record: DecayRecord, seen: SeenDecay, draws: Draws) -> dict[str,
     whole = found.rate / mean / span, found.rate / span
     a, b = found.share * whole[0], (1 - found.share) * whole[1]
     moments = (0.0, middle_of(currents, weight), 1.0)
-    changed = [found.gas * whole[1] * gas_change(s, found.pace) for s in moments]
+    changed = [
+        whole[1] * (found.gas * gas_change(s, found.pace) + walked)
+        for s, walked in zip(moments, from_nodes(np.array(moments)) @ draws.walk, strict=True)
+    ]
     rates = rates_of(a * mean, b, found.power, changed, currents, seen)
     quoted = {"i0": found.level * mean}
     quoted |= {f"lifetime_{at}": 1 / rate / HOUR for at, rate in zip(ENDS, rates, strict=True)}
