@@ -20,7 +20,7 @@ from beamfit.lifetime.evidence import (
     UNITS,
     Evidence,
 )
-from beamfit.lifetime.free_law import Law
+from beamfit.lifetime.free_law import LIKELIER, Law
 from beamfit.lifetime.pieces import noise_of, split_record
 from beamfit.lifetime.record import Monitor
 from beamfit.quantity import HOUR, percent
@@ -280,6 +280,9 @@ def _freely(e: Evidence) -> Finding | None:
         known = gas and math.isfinite(gas.after.value) and min(gas.a.value, gas.b.value) > 0
         said = f": {e.explained}" if known else ""
         return Finding(Status.converged, f"{told}. {likely}, which the errors contain{said}")
+    if e.free.wanders > LIKELIER:
+        likely = f"The loss rate wanders within the record ({percent(e.free.wanders)})"
+        return Finding(Status.converged, f"{told}. {likely}, which the errors contain")
     if e.constant_a.status is Status.poor_fit:
         return Finding(Status.converged, f"{told}. {_departs(e)}, which the errors contain")
     gas = "" if e.free.drift is None else ", a drift of b and gas that is pumped away"

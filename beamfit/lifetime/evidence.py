@@ -30,7 +30,7 @@ from beamfit.lifetime.expansion import (
     further_columns,
     lifetime_of,
 )
-from beamfit.lifetime.free_law import BELOW, ENDS, EXACT, PACES, UNITS, FreeLaw, Law, free_law
+from beamfit.lifetime.free_law import BELOW, ENDS, PACES, UNITS, FreeLaw, Law, free_law
 from beamfit.lifetime.record import DecayRecord
 from beamfit.noise.memory import CLOSE, Products
 from beamfit.quantity import HOUR, Quantity
@@ -44,6 +44,8 @@ BELIEVED = 5.0
 OUTSIDE = 3.0
 # Standard deviations that hold 95 % of a normal distribution.
 NORMAL = 1.96
+# Below this share of the current differences are those of the arithmetic, not of the beam.
+EXACT = 1e-12
 
 
 @shown
@@ -481,8 +483,8 @@ class Evidence:
 
     def quoted(self, known: bool = True) -> dict[str, Any]:
         """Fields of a `DecayFit`, by name."""
-        # Of a law that the readings refute, and nobody stated, nothing has an error; I0 and lifetimes
-        # are those of what explains the readings. The mean lifetime of many cycles is of no law.
+        # Of a law that the readings refute, and nobody stated, nothing has an error; I0 and
+        # lifetimes are those of what explains them. The mean lifetime of many cycles is of no law.
         doubted = self.refuted and self.free is None and self.law is Law.free
         same = ("chi2", "dof", "noise_inferred", "constant_a", "correlation_time", "lifetimes")
         exact = {"i0": self.quantity("i0", known and not doubted and self.cycles == 1)}

@@ -183,6 +183,16 @@ def log_straight(change):
     return -0.5 * (change / DRIFT) ** 2 - math.log(DRIFT * math.sqrt(2 * math.pi))
 
 
+def log_walk(walk, xp=np):
+    """Log density of a walk at the nodes, with the odds of there being any."""
+    squares = xp.sum((np.linalg.inv(WALK) @ walk) ** 2)
+    widths = np.log(WALKS)
+    log = -0.5 * squares * xp.exp(-2 * widths) - NODES * widths
+    log = xp.log(xp.mean(xp.exp(log - xp.max(log)))) + xp.max(log)
+    log = log - 0.5 * NODES * math.log(2 * math.pi) - np.log(np.diag(WALK)).sum()
+    return xp.where(squares > 0, log + LOG_WANDERS, 0.0)
+
+
 def log_pumped(share, gas, pace, xp=np):
     """Log density of gas that is pumped away, and of its pace, with the odds of there being any."""
     size = gas / xp.expm1(-pace)  # of its loss at first
@@ -196,8 +206,8 @@ LOG_WANDERS = math.log(WANDERS / SMOOTH)
 # A walk is looked at beside noises that are not less likely than the likeliest by more than this;
 # fewer readings tell no noise beside a curve as free.
 BESIDE, FEWEST = 3.0, 2 * NODES
-# Below this share of the current differences are those of the arithmetic, not of the beam.
-EXACT = 1e-12
+# No monitor reads a current to less of itself: transformers of direct current to 1e-6.
+QUIET = 1e-7
 # Width of the change of gas that is pumped away in what draws come from.
 PUMPED = 0.5
 # Exponents, or paces, looked at, in ever narrower ranges, and steps of the search with each: it
@@ -235,6 +245,10 @@ UNITS = {
     "lifetime_end": "h",
     "lifetime_mean": "h",
 }
+
+
+def _turned(matrices: np.ndarray) -> np.ndarray:
+    return np.swapaxes(matrices, 1, 2)
 
 
 class Walk(NamedTuple):
@@ -330,24 +344,27 @@ class SeenDecay:
         near = best > best.max() - BESIDE
         some, unit = self.of_noises(near), np.sqrt(self.products.variance(least[near], NODES))
         size, rate = (
-            np.outer(WALKS, 1 / np.maximum(unit, EXACT)).ravel(),
+            np.outer(WALKS, 1 / np.maximum(unit, QUIET)).ravel(),
             float(np.exp(self.start[1, 0])),
         )
         columns = -size[:, None, None] * rate * self.origin * (INTEGRAL @ WALK)
-        matrix, chance = np.tile(some.products.matrix, (len(WALKS), 1, 1)), -math.log(len(WALKS))
-        seen = matrix[:, :, 1:] @ columns
-        known = np.swapaxes(columns, 1, 2) @ seen[:, 1:]
-        least = LEAST_LEFT * np.trace(known, axis1=1, axis2=2)[:, None, None]
-        half = np.linalg.inv(np.linalg.cholesky(known + (1 + least) * np.eye(NODES)))
-        half, volume = np.swapaxes(half, 1, 2), np.linalg.slogdet(half)[1]
-        gain = half @ np.swapaxes(seen @ half, 1, 2)
+        matrix = np.tile(some.products.matrix, (len(WALKS), 1, 1))
+        known = LEAST_LEFT * np.einsum("kpp->kp", matrix)[..., None] * np.eye(NODES + 1)
+        root = _turned(np.linalg.cholesky(matrix + known))
+        seen = root[:, :, 1:] @ columns
+        # What readings say beside a walk: square roots lose no digit where there is little noise.
+        lower = np.linalg.cholesky(np.eye(NODES + 1) + seen @ _turned(seen))
+        left = np.linalg.solve(lower, root)
+        half = np.linalg.inv(np.linalg.cholesky(np.eye(NODES) + _turned(seen) @ seen))
+        volume = np.sum(np.log(np.einsum("kpp->kp", lower)), axis=1) + math.log(len(WALKS))
         products = some.products._replace(
             kinds=some.products.kinds * len(WALKS),
-            log_prior=np.tile(some.products.log_prior, len(WALKS)) + volume + chance,
-            matrix=matrix - seen @ gain,
+            log_prior=np.tile(some.products.log_prior, len(WALKS)) - volume,
+            matrix=_turned(left) @ left,
         )
         size = size[:, None, None] * WALK
-        return replace(self, products=products, walk=Walk(-size @ gain, size @ half))
+        mean = -size @ _turned(np.linalg.solve(lower, seen)) @ left
+        return replace(self, products=products, walk=Walk(mean, size @ _turned(half)))
 
     def away(self, currents: np.ndarray) -> np.ndarray:
         """Currents at the nodes, (14, d), as multiples of the columns that they leave."""
@@ -738,6 +755,8 @@ class FreeLaw:
         Probability that the exponent is none of a bunch's length.
     pumped : float
         Probability of gas that is pumped away after a fill, in the place of exponent and drift.
+    wanders : float
+        Probability that the loss rate wanders besides.
     nodes : array, shape (14,)
         Mean current at the nodes, mA.
     span : float
@@ -751,6 +770,7 @@ class FreeLaw:
     constant: float
     odd: float
     pumped: float
+    wanders: float
     nodes: np.ndarray
     span: float
 
@@ -779,10 +799,11 @@ class FreeLaw:
         return from_nodes(time / self.span) @ self.nodes
 
     def to_json(self) -> dict[str, object]:
-        """Return the exponent, the drift and the probability of constant a and b."""
+        """Return the exponent, the drift and the probabilities of the laws."""
         told = {"exponent": self.exponent, "drift": self.drift}
         told |= {"probability_of_constant_a_and_b": self.constant}
-        return told | {"probability_of_outgassing": self.pumped}
+        told |= {"probability_of_outgassing": self.pumped}
+        return told | {"probability_of_wandering": self.wanders}
 
 
 def at_bounds(share: np.ndarray, weight: np.ndarray) -> tuple[bool, bool]:
@@ -843,10 +864,11 @@ def free_law(record: DecayRecord, values: Physical) -> FreeLaw | None:
     power, drift = smooth.numbers.power, smooth.numbers.drift if seen.drifts else None
     power, drift = (v if v is None else quantity_of(v, smooth.weight, "1") for v in (power, drift))
     constant = float(expit(plain.log - draws.log))
-    pumped = 1.0 - math.exp(smooth.log - draws.log)
+    chances = [math.exp(law.log - draws.log) for law in laws[1:]]
+    pumped, wanders = [*chances, 0.0, 0.0][:2]
     nodes = record.mean_current * draws.currents @ draws.weight
     share = quantity_of(draws.numbers.share, draws.weight, "1")
-    return FreeLaw(found, share, power, drift, constant, odd, pumped, nodes, record.span)
+    return FreeLaw(found, share, power, drift, constant, odd, pumped, wanders, nodes, record.span)
 
 
 def proposals(seen: SeenDecay) -> list[DrawnLaw]:

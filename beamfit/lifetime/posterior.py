@@ -19,18 +19,22 @@ from beamfit.lifetime.free_law import (
     BELOW,
     CONSTANT,
     DRIFT,
+    INTEGRAL,
     LEAST,
     MOST,
+    NODES,
     DrawnLaw,
     Draws,
     SeenDecay,
     at_bounds,
     ends_of,
+    from_nodes,
     gas_change,
     gas_changed,
     log_prior,
     log_pumped,
     log_straight,
+    log_walk,
     middle_of,
     mixed,
     node_currents,
@@ -64,10 +68,11 @@ WALKERS, STEPS, BUDGET = 16, 1024, 16384
 
 
 class DecayNumbers(NamedTuple):
-    """Numbers of dI/dt = -a I² (I/mean)^exponent - b (1 + drift f(t)) I.
+    """Numbers of dI/dt = -a I² (I/mean)^exponent - b (1 + drift f(t)) I - (a mean + b) walk(t) I.
 
     Current at the first reading, mA, a, 1/(mA s), and b, 1/s; f is as of
-    `beamfit.lifetime.free_law.gas_change`, whose pace is 0 where the drift is a straight line.
+    `beamfit.lifetime.free_law.gas_change`, whose pace is 0 where the drift is a straight line. The
+    walk is at the nodes of `beamfit.lifetime.free_law`, zero where the loss rate does not wander.
     """
 
     i0: Array
@@ -76,11 +81,13 @@ class DecayNumbers(NamedTuple):
     exponent: Array = 0.0
     drift: Array = 0.0
     pace: Array = 0.0
+    walk: Array = 0.0
 
 
 class _Data(NamedTuple):
-    """Readings as of `SeenDecay`, mean current, mA, and span, s; shifts of I0, a and b by what is
-    stated of the monitor, shape (k, 3).
+    """Readings as of `SeenDecay`, the matrix that takes nodes to the first reading, the middle and
+    the last one, mean current, mA, and span, s; shifts of I0, a and b by what is stated of the
+    monitor, shape (k, 3).
     """
 
     matrix: Array
@@ -91,6 +98,7 @@ class _Data(NamedTuple):
     gas: Array
     ends: Array
     middle: Array
+    moments: Array
     mean: Array
     span: Array
     moved: Array
@@ -100,13 +108,17 @@ def _numbers(data: _Data, theta: Array) -> DecayNumbers:
     """Numbers that the monitor shows; theta ends with how far that is off, in stated errors."""
     more = data.moved.shape[0]
     own, shifts = theta[: theta.size - more], theta[theta.size - more :]
-    return DecayNumbers(*(own[:3] - shifts @ data.moved), *own[3:])
+    last = len(UNITS)
+    walk = own[last:] if own.size > last else jnp.zeros(NODES)
+    law = jnp.append(own[3:last], jnp.zeros(last - own[:last].size))
+    return DecayNumbers(*(own[:3] - shifts @ data.moved), *law, walk)
 
 
 def _nodes(data: _Data, numbers: DecayNumbers) -> Array:
     quadratic, linear = numbers.a * data.mean * data.span, numbers.b * data.span
     lost = linear * (data.gas[:, None] + numbers.drift * gas_changed(numbers.pace, jnp))
-    return node_currents(numbers.i0 / data.mean, quadratic, numbers.exponent, lost, jnp)
+    found = node_currents(numbers.i0 / data.mean, quadratic, numbers.exponent, lost, jnp)
+    return found * jnp.exp(-(quadratic + linear) * (INTEGRAL @ numbers.walk))[:, None]
 
 
 def _log_density(data: _Data, theta: Array) -> Array:
@@ -120,6 +132,7 @@ def _log_density(data: _Data, theta: Array) -> Array:
     gas, pace = (1 - share) * numbers.drift, jnp.maximum(numbers.pace, 1.0)
     pumped = log_pumped(share, gas, pace, jnp) + jnp.log1p(-share)
     smooth = log_prior(numbers.exponent, jnp)[0] + log_straight(numbers.drift)
+    smooth = smooth + log_walk(numbers.walk, jnp)
     law = jnp.where(numbers.pace > 0, pumped, smooth)
     shifts = theta[theta.size - data.moved.shape[0] :]
     inside = (numbers.a >= 0) & (numbers.b >= 0)
@@ -130,8 +143,9 @@ def _log_density(data: _Data, theta: Array) -> Array:
 def _derived(data: _Data, theta: Array) -> Array:
     """Lifetimes at the first and last reading and at the mean current, h."""
     n = _built(data, theta)
-    moments = (0.0, data.middle, 1.0)
-    changed = [n.b * n.drift * gas_change(s, n.pace, jnp) for s in moments]
+    moments, whole = jnp.stack([0.0, data.middle, 1.0]), n.a * data.mean + n.b
+    walked = whole * (data.moments @ n.walk)
+    changed = n.b * n.drift * gas_change(moments, n.pace, jnp) + walked
     rates = rates_of(n.a * data.mean, n.b, n.exponent, changed, _nodes(data, n)[:, 0], data)
     return 1.0 / HOUR / jnp.stack(rates)
 
@@ -171,7 +185,9 @@ class _Prepared(NamedTuple):
     def names(self) -> tuple[str, ...]:
         """Numbers that are drawn."""
         law = max(max(one.free) for one in self.laws) + 1
-        return *list(UNITS)[:law], *(f"monitor_{k + 1}" for k in range(len(self.moved)))
+        walk = NODES * any(one.seen.walk is not None for one in self.laws)
+        hidden = [("walk", walk), ("monitor", len(self.moved))]
+        return *list(UNITS)[:law], *(f"{n}_{k + 1}" for n, count in hidden for k in range(count))
 
     def draws(self, number: int, seed: int = 0) -> Draws:
         """Draw so many numbers from each law."""
@@ -181,7 +197,8 @@ class _Prepared(NamedTuple):
         """Draws as numbers of the target."""
         found, span, mean = draws.numbers, self.fit.readings.span, self.fit.readings.mean_current
         a, b = found.share * found.rate / mean / span, (1 - found.share) * found.rate / span
-        own = np.column_stack([found.level * mean, a, b, found.power, found.drift, found.pace])
+        law = [found.level * mean, a, b, found.power, found.drift, found.pace]
+        own = np.column_stack([*law, draws.walk.T])
         shifts = rng.normal(size=(len(own), len(self.moved)))
         own[:, :3] += shifts @ self.moved
         return np.hstack([own[:, : len(self.names) - len(self.moved)], shifts])
@@ -190,11 +207,12 @@ class _Prepared(NamedTuple):
         """State the posterior."""
         fit, seen, draws = self.fit, self.seen, self.draws(STEPS * WALKERS)
         record, thetas = fit.readings, self.thetas(draws, np.random.default_rng(0))
+        middle = middle_of(draws.currents, draws.weight)
         products, count = seen.products, len(self.names)
         data = _Data(
             products.matrix, products.log_prior, products.count, products.known,
             seen.origin[:, 0], seen.gas, np.array(seen.ends),
-            middle_of(draws.currents, draws.weight),
+            middle, from_nodes(np.array([0.0, middle, 1.0])),
             record.mean_current, record.span, self.moved,
         )  # fmt: skip
         lower, upper = np.array([BOUNDS.get(name, (-np.inf, np.inf)) for name in self.names]).T
@@ -356,10 +374,11 @@ def expected_current(posterior: Posterior, fit) -> Expected:
     record, data = fit.readings, posterior.target.data
     span, mean = record.span, float(data.mean)
     at = Moments(record.time / span, None if record.gauge is None else record.gauge / span)
-    shown = posterior.target.each(lambda data, theta: jnp.stack(_numbers(data, theta)),
+    shown = posterior.target.each(lambda data, theta: jnp.hstack(_numbers(data, theta)),
                                   posterior.thinned())  # fmt: skip
+    taken = from_nodes(record.time / span) @ INTEGRAL
     draws = np.empty((len(shown), len(record)))
-    for row, (i0, a, b, power, drift, pace) in zip(draws, shown, strict=True):
+    for row, (i0, a, b, power, drift, pace, *walk) in zip(draws, shown, strict=True):
         quadratic, linear = a * mean * span, b * span
         kind, further = "drift", (linear * drift, 0.0)
         if pace > 0:
@@ -367,6 +386,7 @@ def expected_current(posterior: Posterior, fit) -> Expected:
             linear = linear * (1 + drift / pace)
         law = quadratic + linear, quadratic, power, *further
         row[:] = mean * beam_current(i0 / mean, law, at, kind)
+        row *= np.exp(-(quadratic + b * span) * (taken @ walk))
     error = (
         fit.noise if record.error is None else record.error * max(1, (fit.chi2 / fit.dof) ** 0.5)
     )
