@@ -38,7 +38,6 @@ from beamfit.lifetime.free_law import (
     ENDS,
     ENOUGH,
     INTEGRAL,
-    NODES,
     OUTGASSING,
     SIZES,
     SMOOTH,
@@ -51,7 +50,7 @@ from beamfit.lifetime.free_law import (
 from beamfit.lifetime.record import DecayRecord
 from beamfit.noise.memory import Products
 from beamfit.quantity import HOUR, Quantity
-from beamfit.statistics import CLEAR_ODDS, POOR_FIT
+from beamfit.statistics import POOR_FIT
 
 # A departure of so many errors is found with 90 % at a false alarm rate of `POOR_FIT`.
 FOUND = float(ndtri(1 - POOR_FIT / 2) + ndtri(0.9))
@@ -61,10 +60,10 @@ GRID = np.linspace(0.05, 0.95, 40)
 FINER = 3
 # Two changes within so many readings are a step.
 STEP = 3.0
-# Prior probabilities: constant a and b, a power of a, a drift of b beside, a walk beside both, one
-# change, two, gas that relaxes, current lost at once between two readings, each as likely, once or
+# Prior probabilities: constant a and b, a power of a, a drift of b beside, one change, two, gas
+# that relaxes, current lost at once between two readings, each as likely, once or
 # twice.
-CHANCES = {"": SMOOTH - 0.4, "power": 0.2, "drift": 0.2, "walk": WANDERS, "step": 0.08,
+CHANCES = {"": SMOOTH - 0.4, "power": 0.2, "drift": 0.2, "step": 0.08,
            "steps": 0.04, "relaxing": OUTGASSING, "sudden": 0.04, "sudden twice": 0.02}  # fmt: skip
 # Further losses of each alternative: how many, of which kind.
 KINDS = {"step": (1, "step"), "steps": (2, "step"), "relaxing": (1, "relaxing"),
@@ -74,8 +73,6 @@ KINDS = {"step": (1, "step"), "steps": (2, "step"), "relaxing": (1, "relaxing"),
 COARSE, HOPELESS = 7, -1.0
 # Step of a time for the slope by it, over the span.
 MOVED = 1e-3
-# Steps of a loss rate that wanders beside a sharp change of it.
-STEPS = 16
 # Currents at which a lifetime is offered.
 CURRENTS = 5
 
@@ -196,8 +193,8 @@ class Change(NamedTuple):
 
     Attributes
     ----------
-    time : float
-        When, s from the first reading.
+    time, error : float
+        When, s from the first reading, and the error of that.
     before, after : Quantity
         Lifetime at that moment's current before and after it, h.
     then : Change or None
@@ -205,9 +202,15 @@ class Change(NamedTuple):
     """
 
     time: float
+    error: float
     before: Quantity
     after: Quantity
     then: Change | None = None
+
+    @property
+    def size(self) -> float:
+        """By how much the loss rate changed, 1/h."""
+        return abs(1 / self.after.value - 1 / self.before.value)
 
     def to_json(self) -> dict[str, Any]:
         """Return the time and the two lifetimes as JSON's types, and of a second change too."""
@@ -363,122 +366,6 @@ def _quantities(law: Expansion, kind: str) -> dict[str, Quantity]:
     return {"i0": Quantity(*map(float, first), "mA")} | found
 
 
-class SharpChange(NamedTuple):
-    """A change of the loss rate at one moment, which no wandering loss rate explains.
-
-    Attributes
-    ----------
-    time, error : float
-        When, s from the first reading.
-    odds : float
-        Logarithm of the probability with it over that without it, both with a loss rate that
-        wanders besides.
-    """
-
-    time: float
-    error: float
-    odds: float
-
-
-def sharp_change(plain: Expansion) -> SharpChange | None:
-    """The likeliest sharp change of the loss rate, where it is far likelier than a wandering one.
-
-    Parameters
-    ----------
-    plain : Expansion
-        Of a single decay, with constant a and b.
-
-    Returns
-    -------
-    SharpChange or None
-
-    Notes
-    -----
-    Besides a power of a the loss rate goes by a random walk of `STEPS` steps, each of `WALKS` as
-    likely, with and without one step of any size more. A pressure that wanders is a walk, and a
-    change that the walk alone explains is none. The further step is taken in linear approximation
-    about the walk, which has most of it.
-
-    Examples
-    --------
-    >>> time = np.linspace(0.0, 7200.0, 400)
-    >>> noise = 0.01 * np.random.default_rng(1).normal(size=400)
-    >>> loss = np.where(time > 3000, 1.5 * time - 1500, time) / 36000
-    >>> found = sharp_change(solved(Pieces.of(DecayRecord(time, 100 * np.exp(-loss) + noise))))
-    >>> print(f"{found.time:.0f} s")
-    3000 s
-    """
-    pieces = _averaged(plain.pieces)
-    plain = solved(pieces) if pieces is not plain.pieces else plain
-    walks = [walk for share in WALKS if (walk := _walk(plain, share))[0].rested]
-    if not walks:
-        return None
-    without, stepped, *steps = np.array([_beside(*walk) for walk in walks]).T
-    odds, best = float(logsumexp(stepped) - logsumexp(without)), int(np.argmax(stepped))
-    if odds <= CLEAR_ODDS:
-        return None
-    # A change of a falls with the current: a wider walk leaves room for that.
-    wider = walks[min(best + 1, len(walks) - 1)]
-    time, error = _dated(*wider, *(values[best] for values in steps))
-    return SharpChange(pieces.units[0] * time, pieces.units[0] * error, odds)
-
-
-def _walk(plain: Expansion, share: float) -> tuple[Expansion, dict[int, float]]:
-    """The law with a power of a and a random walk of the loss rate, and the widths of its numbers;
-    the loss has gone by such a share of itself at the end.
-    """
-    walk = np.array([np.zeros(STEPS), (np.arange(STEPS) + 0.5) / STEPS]).T.ravel()
-    step = share * abs(plain.numbers[0]) / math.sqrt(STEPS)
-    widths = {POWER: (BELOW + ABOVE) / 2} | {FURTHER + 2 * k: step for k in range(STEPS)}
-    start = np.append(plain.numbers, walk)
-    return solved(plain.pieces, (*PLAIN, *widths), "step", start=start, widths=widths), widths
-
-
-def _dated(
-    law: Expansion, widths: Mapping[int, float], loss: float, time: float
-) -> tuple[float, float]:
-    """The time of one more step of the loss rate and its error, over the span; both begin at what
-    they are in linear approximation.
-    """
-    size, when = law.numbers.size + 1, law.numbers.size + 2
-    free, start = (*PLAIN, *widths, size, when), np.append(law.numbers, [loss, time])
-    best = solved(law.pieces, free, "step", start=start, widths=widths)
-    noise = math.sqrt(best.residuals @ best.residuals / best.residuals.size)
-    known = np.zeros((len(widths), len(free) + 1))
-    known[:, 3:-2] = np.diag(noise / np.array(list(widths.values())))
-    triangle = np.linalg.qr(np.vstack([best.rows[:, [LEVEL, *free]], known]), mode="r")
-    # The last number beside all others.
-    return float(best.numbers[-1]), float(noise / abs(triangle[-1, -1]))
-
-
-def _beside(law: Expansion, widths: Mapping[int, float]) -> tuple[float, float, float, float]:
-    """Log evidence without and with one more step of the loss rate, its size and its time."""
-    columns, width = [LEVEL, *PLAIN, *widths], np.append([np.inf] * 3, list(widths.values()))
-    centre = np.append(np.zeros(3), [law.numbers[column - 1] for column in widths])
-    noise = math.sqrt(law.residuals @ law.residuals / law.residuals.size)
-    known = np.vstack([law.rows[:, columns], np.diag(noise / width)])
-    basis = np.linalg.qr(known)[0][: law.residuals.size]
-
-    def left(values: np.ndarray) -> np.ndarray:
-        return np.sqrt(np.sum(values**2, axis=0) - np.sum((basis.T @ values) ** 2, axis=0))
-
-    times = GRID
-    for _ in range(FINER):
-        kinks = further_columns(law, "step", times)
-        along, size = kinks.T @ law.residuals, left(kinks) + 1e-300
-        best = int(np.argmax(np.abs(along) / size))
-        time, loss, near = times[best], -along[best] / size[best] ** 2, times[1] - times[0]
-        times = np.linspace(max(time - near, MOVED), min(time + near, 1 - MOVED), GRID.size)
-    ends = (further_columns(law, "step", np.array([time + d])) for d in (MOVED, -MOVED))
-    more = np.hstack([kinks[:, [best]], loss * np.subtract(*ends) / (2 * MOVED)])
-    rows = np.column_stack([law.residuals, law.rows[:, columns], more])
-    products = Products.of(rows, law.pieces.time, bool(law.given), COARSE)
-    some = products._replace(matrix=products.matrix[:, :-2, :-2])
-    both = np.append(width, _widths("step", np.array([loss]), np.array([time]), law.numbers[0]))
-    stepped = _laplace(products, both, np.append(centre, [0.0, 0.0])) + math.log(CHANCES["step"])
-    return _laplace(some, width, centre), stepped, loss, time
-
-
 def _averaged(pieces: Pieces) -> Pieces:
     """A long decay as the means of neighbouring readings: the curve is smooth between them."""
     if pieces.time.size <= ENOUGH or pieces.first.size > 1 or pieces.gauge is not None:
@@ -535,7 +422,7 @@ def _widths(name: str, sizes: np.ndarray, times: np.ndarray, loss: float) -> np.
 
 
 def _smooth(plain: Expansion) -> float:
-    """Log evidence of a power of the current with a drift of b, and a walk, or of neither."""
+    """Log evidence of a power of the current with a drift of b, or of neither."""
     start = np.append(plain.numbers, [0.0, 0.0])
     laws = [plain, solved(plain.pieces, (*PLAIN, POWER))]
     if plain.pieces.gauge is None:
@@ -544,10 +431,7 @@ def _smooth(plain: Expansion) -> float:
         laws.append(solved(plain.pieces, (*PLAIN, POWER, FURTHER), "drift", start=start,
                            widths={POWER: width, FURTHER: DRIFT * gas}))  # fmt: skip
     named = zip(laws, ("", "power", "drift"), strict=False)
-    found = [_log_evidence(law, name) for law, name in named if law.rested]
-    if plain.pieces.gauge is None and laws[-1].rested:
-        found.append(_log_evidence_of_walk(laws[-1]))
-    return float(logsumexp(found))
+    return float(logsumexp([_log_evidence(law, name) for law, name in named if law.rested]))
 
 
 class _Further(NamedTuple):
@@ -597,12 +481,30 @@ def _with_further(plain: Expansion, more: _Further) -> Expansion | None:
 
 
 def _log_evidence(law: Expansion, name: str) -> float:
-    """Logarithm of the probability of the readings, the noise averaged over, up to a constant."""
+    """Logarithm of the probability of the readings, the noise averaged over, up to a constant: also
+    if the loss rate goes by a random walk besides, in linear approximation.
+    """
     columns, width, centre = _given(law, name)
-    rows = np.column_stack([law.residuals, law.rows[:, columns]])
+    slopes = law.rows[:, columns]
+    if law.pieces.gauge is None:
+        slopes = np.column_stack([slopes, _walked(law)])
+    rows = np.column_stack([law.residuals, slopes])
     products = Products.of(rows, law.pieces.time, law.pieces.error is not None)
+    own = products._replace(matrix=products.matrix[:, : len(width) + 1, : len(width) + 1])
+    found, every = [_laplace(own, width, centre)], np.ones(slopes.shape[1] - width.size)
+    if every.size:
+        chance, centre = math.log(WANDERS / SMOOTH / len(WALKS)), np.append(centre, 0.0 * every)
+        widths = [np.append(width, share * every) for share in WALKS]
+        found += [_laplace(products, one, centre) + chance for one in widths]
     count = (law.numbers.size - len(PLAIN) - 1) // 2
-    return _laplace(products, width, centre) + _log_chance(name, law, count)
+    return float(logsumexp(found)) + _log_chance(name, law, count)
+
+
+def _walked(law: Expansion) -> np.ndarray:
+    """Slopes of the residuals by a random walk of the loss rate, shape (n, 14)."""
+    walk = from_nodes(law.pieces.time / law.pieces.units[0]) @ INTEGRAL @ WALK
+    model = law.pieces.current / law.pieces.over + law.residuals
+    return -law.numbers[0] * model[:, None] * walk
 
 
 def _given(law: Expansion, name: str) -> tuple[list[int], np.ndarray, np.ndarray]:
@@ -625,20 +527,6 @@ def _given(law: Expansion, name: str) -> tuple[list[int], np.ndarray, np.ndarray
     known = [0.0 if column in flat else law.numbers[column - 1] for column in extra]
     width = np.array([np.inf] * 3 + list(extra.values()))
     return [LEVEL, *PLAIN, *extra], width, np.array([0.0] * 3 + known)
-
-
-def _log_evidence_of_walk(law: Expansion) -> float:
-    """The same if the loss rate goes by a random walk besides a drift of b, in linear
-    approximation.
-    """
-    columns, width, centre = _given(law, "drift")
-    walked = from_nodes(law.pieces.time / law.pieces.units[0]) @ INTEGRAL @ WALK
-    model = (law.pieces.current / law.pieces.over + law.residuals)[:, None]
-    rows = np.column_stack([law.residuals, law.rows[:, columns], -law.numbers[0] * model * walked])
-    products = Products.of(rows, law.pieces.time, bool(law.given), COARSE)
-    centre, every = np.append(centre, np.zeros(NODES)), np.ones(NODES)
-    walks = [_laplace(products, np.append(width, share * every), centre) for share in WALKS]
-    return float(logsumexp(walks)) + math.log(CHANCES["walk"] / len(WALKS))
 
 
 def _laplace(products: Products, width: np.ndarray, centre: np.ndarray) -> float:
@@ -672,13 +560,14 @@ def _change(law: Expansion) -> Change:
 
     def rates(level, loss, quadratic, power, *further):
         before = loss + quadratic * (x - 1) + np.append(0.0, np.cumsum(further[::2])[:-1])
-        return np.concatenate([before, before + further[::2]]) / span
+        return np.concatenate([before, before + further[::2], further[1::2]]) / span
 
-    columns = [LEVEL, *PLAIN, *range(FURTHER, FURTHER + 2 * count, 2)]
-    lifetimes = [lifetime_of(*one) for one in zip(*law.quoted(rates, columns), strict=True)]
+    values, errors = law.quoted(rates, [LEVEL, *PLAIN, *range(FURTHER, law.rows.shape[1])])
+    lifetimes = [lifetime_of(*one) for one in zip(values, errors, strict=True)]
     found = None
     for k in reversed(range(count)):
-        found = Change(float(times[k] * span), lifetimes[k], lifetimes[count + k], found)
+        time, error = (float(span**2 * part[2 * count + k]) for part in (values, errors))
+        found = Change(time, error, lifetimes[k], lifetimes[count + k], found)
     return found
 
 

@@ -13,7 +13,6 @@ import numpy as np
 
 from beamfit.answer import answer, json_of, shown
 from beamfit.errors import InputError, expect
-from beamfit.lifetime.alternatives import sharp_change
 from beamfit.lifetime.answer import LIFETIME_ALONE
 from beamfit.lifetime.cycles import (
     FEWEST_CYCLES,
@@ -540,8 +539,9 @@ def _cut(segment: DecayRecord, fit: DecayFit) -> tuple[Event, float] | None:
     if (loss := fit.loss) is not None:
         change = -loss.current.value
         return Event("refill" if change > 0 else "loss", loss.time, 0.0, change), 0.0
-    if fit.change is not None and (sharp := sharp_change(fit.about)) is not None:
-        return Event("loss rate changes", sharp.time, 0.0, 0.0), NEITHER * sharp.error
+    if fit.change is not None:  # of two the larger: its parts tell if there was another
+        change = max(filter(None, (fit.change, fit.change.then)), key=lambda one: one.size)
+        return Event("loss rate changes", change.time, 0.0, 0.0), NEITHER * change.error
     return None
 
 
