@@ -81,6 +81,15 @@ def pumped(random: np.random.Generator) -> Callable[[np.ndarray], np.ndarray]:
     return lambda s: (1 + np.exp(-fast * s)) / 1.5
 
 
+def walks(random: np.random.Generator) -> Callable[[np.ndarray], np.ndarray]:
+    """A vacuum that goes by a random walk of 2 to 10 % over the record, in waves down to a sixth of
+    it.
+    """
+    turns = np.pi * np.arange(1, 7)
+    waves = random.normal(size=6) * random.uniform(0.02, 0.1) * np.sqrt(2) / turns
+    return lambda s: 1 + np.cos(np.multiply.outer(s, turns)) @ waves
+
+
 def noise_of(kind: str, count: int, random: np.random.Generator) -> np.ndarray:
     """Noise of variance 1."""
     if kind == "white":
@@ -183,6 +192,7 @@ FAMILIES: dict[str, Callable[[np.random.Generator], Case]] = {
     "a as I^0.3": lambda r: decay(Decay(exponent=0.3), r),
     "b rises by 10 %": lambda r: decay(Decay(of_b=drift(0.1)), r),
     "b falls by 10 %": lambda r: decay(Decay(of_b=drift(-0.1)), r),
+    "b walks": lambda r: decay(Decay(of_b=walks), r),
     "gas is pumped away": lambda r: decay(Decay(of_b=pumped), r),
     "correlated, 0.6-0.98": lambda r: decay(Decay(noise="correlated"), r),
     "correlated, errors stated": lambda r: decay(Decay(noise="correlated", stated=1.0), r),

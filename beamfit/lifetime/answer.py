@@ -199,7 +199,12 @@ def _inseparable(e: Evidence) -> Finding | None:
         "current is determined. "
     )
     if e.free is not None and e.free.is_odd:
-        return Finding(Status.unidentified, f"{told}{_departs(e)}. Give the pressure in a column")
+        return Finding(
+            Status.unidentified,
+            "a and b are open, the lifetime is determined: the loss goes with the current as no "
+            f"bunch length makes it, a as I^({e.free.exponent}). A vacuum that changes does, as "
+            "after a fill: give the pressure in a column",
+        )
     if e.apart:
         open_ = "An exponent of a and a drift of b leave them open: record farther, or give the "
         told += f"{open_}ring, the pressure, or --law constant. {_if_constant(e)}"

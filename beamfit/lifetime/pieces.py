@@ -47,8 +47,8 @@ class Event(NamedTuple):
     ----------
     kind : str
         `refill`, `loss`, `dropout`, `spike`, `saturated`, `gap`, `ramp` (a refill of many readings,
-        or the end of one at the head of a decay), `short` (a piece too short to keep) or `loss rate
-        changes`.
+        or the end of one at the head of a decay), `short` (a piece too short to keep), `loss rate
+        changes` or `gas is pumped away` (until then).
     time : float
         When it begins, s from the record's start.
     duration : float

@@ -56,6 +56,8 @@ REFUTED = (Status.poor_fit, Status.infeasible)
 UNSURE = 0.05
 # Errors of the time of a change within which readings are of neither side.
 NEITHER = 2.0
+# Times in which gas is pumped away to less than a hundredth.
+SETTLED = 5.0
 # Cycles that make a point of a course at least.
 FEWEST_IN_PART = 10
 
@@ -516,8 +518,8 @@ def _fitted(
 
 
 def _parts(piece: DecayRecord, law: Law, whole: bool) -> tuple[list[Decay], list[Event]]:
-    """Fit a decay or, unless as a whole, its parts where current was lost at once, or the loss rate
-    changed sharply, though no reading shows it.
+    """Fit a decay or, unless as a whole, its parts where current was lost at once, the loss rate
+    changed, though no reading shows it, or the gas of a fill was gone.
     """
     segment = thinned(on_edges(piece))
     fit = fit_decay(segment, law=law)
@@ -542,6 +544,9 @@ def _cut(segment: DecayRecord, fit: DecayFit) -> tuple[Event, float] | None:
     if fit.change is not None:  # of two the larger: its parts tell if there was another
         change = max(filter(None, (fit.change, fit.change.then)), key=lambda one: one.size)
         return Event("loss rate changes", change.time, 0.0, 0.0), NEITHER * change.error
+    if fit.outgassing is not None and fit.status is Status.poor_fit:
+        settled = SETTLED * fit.outgassing.time_constant.value * HOUR
+        return Event("gas is pumped away", settled, 0.0, 0.0), 0.0
     return None
 
 
