@@ -483,16 +483,17 @@ class Evidence:
 
     def quoted(self, known: bool = True) -> dict[str, Any]:
         """Fields of a `DecayFit`, by name."""
-        # Of a law that the readings refute, and nobody stated, nothing has an error; I0 and
-        # lifetimes are those of what explains them. The mean lifetime of many cycles is of no law.
-        doubted = self.refuted and self.free is None and self.law is Law.free
+        # A law that the readings refute has no errors, but for a and b of one that is stated; I0
+        # and lifetimes are those of what explains them. The mean of many cycles is of no law.
         same = ("chi2", "dof", "noise_inferred", "constant_a", "correlation_time", "lifetimes")
-        exact = {"i0": self.quantity("i0", known and not doubted and self.cycles == 1)}
-        exact |= {name: self.quantity(name, known and self.apart and not doubted) for name in "ab"}
-        alone = known and not (doubted and self.cycles == 1)
-        exact |= {f"lifetime_{at}": self.lifetime(f"rate_{at}", alone) for at in ENDS}
-        exact |= self.explained.quantities if doubted and self.explained is not None else {}
+        refuted = self.refuted and self.free is None
+        one, told = self.cycles == 1, not (refuted and self.law is Law.free)
+        exact = {"i0": self.quantity("i0", known and one and not refuted)}
+        exact |= {name: self.quantity(name, known and self.apart and told) for name in "ab"}
+        sure = known and not (refuted and one)
+        exact |= {f"lifetime_{at}": self.lifetime(f"rate_{at}", sure) for at in ENDS}
         found = {name: self.widely(name, quantity) for name, quantity in exact.items()}
+        found |= self.explained.quantities if refuted and self.explained is not None else {}
         found |= {"exact": exact, "free_law": self.free, "shaped": self.shaped}
         found |= {name: getattr(self, name) for name in (*same, "inflation", "residuals", "course")}
         found["alternative"] = self.explained and self.explained.found
