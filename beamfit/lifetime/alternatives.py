@@ -209,7 +209,7 @@ class Change(NamedTuple):
 
     @property
     def size(self) -> float:
-        """By how much the loss rate changed, 1/h."""
+        """Change of the loss rate, 1/h, of either sign."""
         return abs(1 / self.after.value - 1 / self.before.value)
 
     def to_json(self) -> dict[str, Any]:

@@ -339,15 +339,15 @@ class SeenDecay:
         return replace(self, products=self.products.some(kept), walk=walk)
 
     def wandering(self) -> SeenDecay:
-        """The same with a loss rate that wanders, averaged over, beside the likeliest noises."""
+        """The same with a loss rate that wanders, averaged over, beside the likeliest noises.
+
+        A walk of normal numbers z makes the currents `columns` z more, in units of the noise.
+        """
         least, best = self.likely()
         near = best > best.max() - BESIDE
         some, unit = self.of_noises(near), np.sqrt(self.products.variance(least[near], NODES))
-        size, rate = (
-            np.outer(WALKS, 1 / np.maximum(unit, QUIET)).ravel(),
-            float(np.exp(self.start[1, 0])),
-        )
-        columns = -size[:, None, None] * rate * self.origin * (INTEGRAL @ WALK)
+        size = np.outer(WALKS, 1 / np.maximum(unit, QUIET)).ravel()[:, None, None] * WALK
+        columns = -np.exp(self.start[1, 0]) * self.origin * (INTEGRAL @ size)
         matrix = np.tile(some.products.matrix, (len(WALKS), 1, 1))
         known = LEAST_LEFT * np.einsum("kpp->kp", matrix)[..., None] * np.eye(NODES + 1)
         root = _turned(np.linalg.cholesky(matrix + known))
@@ -362,7 +362,6 @@ class SeenDecay:
             log_prior=np.tile(some.products.log_prior, len(WALKS)) - volume,
             matrix=_turned(left) @ left,
         )
-        size = size[:, None, None] * WALK
         mean = -size @ _turned(np.linalg.solve(lower, seen)) @ left
         return replace(self, products=products, walk=Walk(mean, size @ _turned(half)))
 

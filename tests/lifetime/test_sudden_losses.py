@@ -1,6 +1,7 @@
 """Current lost at once, too little for single readings to show, and monitors that walk."""
 
 import numpy as np
+import pytest
 from scipy.integrate import solve_ivp
 
 from beamfit.lifetime.fit import fit_decay
@@ -104,3 +105,29 @@ def test_a_vacuum_that_wanders_is_not_cut():
     study = study_record(record)
     assert not study.events
     assert len(study.decays) == 1
+
+
+def test_the_record_is_cut_where_the_gas_of_a_fill_is_gone():
+    """What explains a refuted law is quoted, and both parts of a record are answered."""
+    gas = 1.5 * B
+
+    def slope(t, i):
+        return -(A * i + B + gas * np.exp(-t / 600.0)) * i
+
+    beam = solve_ivp(slope, (0, TIME[-1]), [START], t_eval=TIME, rtol=1e-11, atol=1e-10).y[0]
+    record = DecayRecord(TIME, beam + 0.02 * np.random.default_rng(1).normal(size=COUNT))
+    fit = fit_decay(record)
+    assert fit.status is Status.poor_fit
+    assert fit.a.error is None
+    ends = {"lifetime_start": (START, gas), "lifetime_mean": (fit.mean_current, 0.0)}
+    for name, (current, more) in ends.items():
+        low, high = getattr(fit, name).interval_95
+        assert low <= 1 / (A * current + B + more) / HOUR <= high
+    assert fit.i0.value == pytest.approx(START, abs=3 * fit.i0.error)
+    study = study_record(record)
+    assert [str(event) for event in study.events] == [
+        f"gas is pumped away at {study.events[0].time:.0f} s"
+    ]
+    assert study.events[0].time == pytest.approx(3000.0, rel=0.3)
+    low, high = study.decays[-1].fit.a.interval_95
+    assert low <= A <= high
