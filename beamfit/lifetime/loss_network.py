@@ -22,7 +22,7 @@ from beamfit.errors import InputError
 from beamfit.greybox.bounds import over_cells
 from beamfit.greybox.fit import Fit
 from beamfit.greybox.mlp import MLP, Port
-from beamfit.greybox.problem import Free, Prior, Problem, Record
+from beamfit.greybox.problem import Prior, Problem, Record
 from beamfit.greybox.signed_network import signed_network
 from beamfit.greybox.solve import solve
 from beamfit.lifetime.mechanisms import scaled_losses
