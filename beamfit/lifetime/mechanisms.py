@@ -1,4 +1,4 @@
-"""The loss mechanisms of a ring: Touschek's, the gas's, and the a and b of the decay that they make."""
+"""The loss mechanisms of a ring: Touschek, the gas, and the a and b of the decay they make."""
 
 from __future__ import annotations
 

@@ -15,7 +15,7 @@ import numpy as np
 from beamfit.answer import json_of
 from beamfit.errors import InputError
 from beamfit.lifetime import alarm
-from beamfit.lifetime.course import BEST_MONITOR, reference_of
+from beamfit.lifetime.course import BEST_MONITOR, normalised, reference_of
 from beamfit.lifetime.cycles import alike, cut_at_refills, joined, usual_cycle
 from beamfit.lifetime.evidence import UNITS
 from beamfit.lifetime.fit import DecayFit, bare, fit_decay, fit_pieces
@@ -28,11 +28,10 @@ from beamfit.lifetime.study import (
     Decay,
     Machine,
     at_settings,
-    budget,
     operation_during,
     seen_through,
 )
-from beamfit.quantity import HOUR, Quantity, Status
+from beamfit.quantity import Quantity, Status
 
 
 class WindowRow(NamedTuple):
@@ -74,6 +73,10 @@ class Window(NamedTuple):
     pieces: int
     why: str = ""
 
+    def decay(self, machine: Machine | None) -> Decay:
+        """The decays as one, with the losses of a ring; `InputError` if it stores no beam there."""
+        return Decay.of(self.readings, 0.0, self.fit, machine)
+
 
 class Answer(NamedTuple):
     """Answer of the window.
@@ -86,9 +89,9 @@ class Answer(NamedTuple):
         The fit.
     status, message : Status, str
         Of the fit, or why there is none.
-    lifetime, a, b, normalised : Quantity or None
-        At the mean current, h; 1/(mA s); 1/s; current times lifetime, mA h, by the ring at the
-        reference current and its usual settings. None where the readings do not determine it.
+    normalised : Quantity or None
+        Current times lifetime, mA h, by the ring at the reference current and its usual settings.
+        None where the readings do not determine it.
     """
 
     time: float
@@ -96,10 +99,26 @@ class Answer(NamedTuple):
     window: Window
     status: Status
     message: str
-    lifetime: Quantity | None = None
-    a: Quantity | None = None
-    b: Quantity | None = None
     normalised: Quantity | None = None
+
+    @property
+    def lifetime(self) -> Quantity | None:
+        """At the mean current, h; None where the readings do not determine it."""
+        return self._told("lifetime_mean")
+
+    @property
+    def a(self) -> Quantity | None:
+        """1/(mA s), likewise."""
+        return self._told("a")
+
+    @property
+    def b(self) -> Quantity | None:
+        """1/s, likewise."""
+        return self._told("b")
+
+    def _told(self, name: str) -> Quantity | None:
+        found = self.window.fit and getattr(self.window.fit, name)
+        return found if found and found.error is not None else None
 
     def to_json(self) -> dict[str, Any]:
         """Return it as `beamfit lifetime --json` does a decay, with what is normalised."""
@@ -159,27 +178,6 @@ def fit_window(rows: Sequence[WindowRow], name: str, law: Law = Law.free) -> Win
     except InputError as error:  # a current that rises
         return Window(None, one, len(group), error.found)
     return Window(fit, one, len(group))
-
-
-def normalised(window: Window, machine: Machine | None, current: float | None) -> Quantity | None:
-    """Current times lifetime, mA h, as of `trend`; None where the readings do not tell it.
-
-    Raises
-    ------
-    InputError
-        If the ring stores no beam at the settings of the window.
-    """
-    lifetime, mean = window.fit.lifetime_mean, window.fit.mean_current
-    if lifetime.error is None:
-        return None
-    if machine is None:
-        by = mean
-    else:
-        current = current or mean
-        usual = loss_coefficients(machine.ring, machine.operation, current)
-        expected = budget(window.readings, machine).lifetime * HOUR
-        by = current / expected / float(usual.a * current + usual.b)
-    return Quantity(by * lifetime.value, by * lifetime.error, "mA h")
 
 
 def _fitted(group: list[DecayRecord], name: str, law: Law) -> DecayFit:
@@ -289,7 +287,6 @@ def _usual(window: Window, machine: Machine | None) -> alarm.Reference | None:
     or the loss rate and a ring their ratio.
     """
     fit, ring = window.fit, None
-    decay = Decay(window.readings, 0.0, fit, None)
     refuted = fit.constant_a is not None and fit.constant_a.status is Status.poor_fit
     if refuted or fit.status not in (Status.converged, Status.unidentified):
         return None
@@ -299,12 +296,12 @@ def _usual(window: Window, machine: Machine | None) -> alarm.Reference | None:
             return None
         known = (fit.lifetime_mean,)
         try:
-            ring = budget(window.readings, machine).losses
+            ring = window.decay(machine).budget.losses
         except InputError:
             return None
     if not all(one.error and abs(one.relative) < KNOWN for one in known):
         return None
-    return reference_of((decay,), np.ones(1), np.ones(1), ring)
+    return reference_of((window.decay(None),), np.ones(1), np.ones(1), ring)
 
 
 def _terms(machine: Machine, before: Terms | None, row: WindowRow) -> Terms:
@@ -635,13 +632,15 @@ def _answer(plan: Plan, state: State, window: Window) -> Answer:
     time, fit = state.last - state.shift, window.fit
     if fit is None:
         return Answer(time, current, window, Status.unidentified, f"No lifetime: {window.why}.")
-    known = [None if q.error is None else q for q in (fit.lifetime_mean, fit.a, fit.b)]
-    scaled, message = None, fit.message
+    answer = Answer(time, current, window, fit.status, fit.message)
+    if answer.lifetime is None:
+        return answer
+    machine, at = plan.machine, plan.current or fit.mean_current
     try:
-        scaled = normalised(window, plan.machine, plan.current)
+        ring = None if machine is None else loss_coefficients(*machine, at)
+        return answer._replace(normalised=normalised(window.decay(machine), ring, at))
     except InputError as error:
-        message += f" Not normalised: {error}."
-    return Answer(time, current, window, fit.status, message, *known, scaled)
+        return answer._replace(message=f"{fit.message} Not normalised: {error}.")
 
 
 def nothing_yet(state: State) -> Answer:
