@@ -11,7 +11,7 @@ import numpy as np
 
 from beamfit.answer import Table, answer, cell, json_of
 from beamfit.errors import InputError
-from beamfit.lifetime.alarm import Alarm, Reference, alarms_of, when
+from beamfit.lifetime.alarm import WANDER, Alarm, Reference, alarms_of, when
 from beamfit.lifetime.fit import DecayFit, bare
 from beamfit.lifetime.mechanisms import Losses, loss_coefficients
 from beamfit.lifetime.scales import by_losses, summarise
@@ -26,8 +26,6 @@ from beamfit.statistics import (
     reach_of,
 )
 
-# a and b wander by so much on an ordinary day.
-WANDER = 0.005
 # Where readings do not tell a from b, the ring's own shares of them are trusted to this.
 SHARES = 0.3
 # No monitor is better than this share of the current.

@@ -195,9 +195,9 @@ def sized(trial: Discrepancy, fit: Fit, left: np.ndarray) -> Discrepancy:
 
 # Units of a, b and the lifetime.
 LOSSES = ("1/(mA s)", "1/s", "h")
-# Size of a correction of ln a and ln b by weights of order one, the standard deviation of the prior
-# on them; none exceeds ten.
-CORRECTION, WEIGHT, MOST = 0.3, 1.0, 10.0
+# Size of a correction of ln a and ln b by weights of one, the standard deviation of the prior on
+# them, which is the usual for inputs and outputs of size one; none exceeds ten.
+CORRECTION, MOST = 0.3, 10.0
 # An input counts by half its range, 0.1 MV or 10 % at least: what hardly moved tells nothing. The
 # model's error is correlated over so much of that, chosen on simulated shifts.
 SHORTEST, LENGTH = 0.1, 0.8
@@ -377,7 +377,7 @@ def fit_loss_network(
             model={"map": net},
             free=free,
             records=[Record("decays", _predict, data, jnp.asarray(whiten @ seen), error=1.0)],
-            priors=[Prior("map", 0.0, WEIGHT)],
+            priors=[Prior("map", 0.0, 1.0)],
         )
         fit = solve(problem, starts=starts, seed=seed, iterations=300)
         return fit, seen - np.asarray(_predict(fit.model, (*data[:3], jnp.asarray(whole))))

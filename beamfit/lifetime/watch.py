@@ -21,7 +21,7 @@ from beamfit.lifetime.evidence import UNITS
 from beamfit.lifetime.fit import DecayFit, bare, fit_decay, fit_pieces
 from beamfit.lifetime.free_law import Law
 from beamfit.lifetime.mechanisms import added, loss_coefficients, terms_of
-from beamfit.lifetime.pieces import DROPOUT, FEWEST, GAP
+from beamfit.lifetime.pieces import DROPOUT, FEWEST
 from beamfit.lifetime.record import PLAUSIBLE, Conditions, DecayRecord
 from beamfit.lifetime.study import (
     CHANGED,
@@ -348,12 +348,11 @@ def followed(known: Alarmed, row: WindowRow, apart: float, machine: Machine | No
 
 
 CURRENT = "beam_current"
-# Dead readings in a row from which the beam is gone.
-DEAD = 5
+# Readings in a row that are believed against all before: of no beam, of a far higher one, and of
+# a clock that was set back.
+IN_A_ROW = 5
 # A window is kept as the means of readings over so many parts of it.
 ROWS = 4096
-# So many readings in a row, each older than the newest before them, are of a clock set back.
-LATE = 5
 # Beyond what a ring stores, mA, or a clock shows, s, a reading is none.
 MOST, LATEST = (math.inf, 1e6), 1e11
 # Events and points of the course that are kept.
@@ -533,7 +532,7 @@ def _current(plan: Plan, state: State, time: float, value: float) -> State:
     if own <= last:
         return _behind(plan, state, time, value)
     apart, usual = own - last, state.interval
-    if usual and apart > max(GAP * usual, alarm.MINUTE):
+    if usual and alarm.is_gap(apart, usual):
         said = f"no reading for {apart:.0f} s, or the clock was set forward"
         state = _counted(noted(_cut(plan, state), time, said), gaps=1)
     interval = usual * (1.2 if apart > usual else 1 / 1.2) if usual else apart
@@ -544,7 +543,7 @@ def _behind(plan: Plan, state: State, time: float, value: float) -> State:
     """A reading no newer than the last."""
     count, latest = state.late
     count = count + 1 if time > latest else 1
-    if count < LATE:
+    if count < IN_A_ROW:
         return _counted(state._replace(late=(count, time)), late=1)
     said = f"the clock was set back by {state.last - state.shift - time:.0f} s"
     state = _counted(noted(_cut(plan, state), time, said), clock=1)
@@ -562,12 +561,12 @@ def _placed(plan: Plan, state: State, own: float, value: float) -> State:
     """A reading into its row, if there is a beam."""
     state, time = state._replace(last=own), own - state.shift
     if not value > DROPOUT * state.highest:
-        if state.dead + 1 == DEAD:
+        if state.dead + 1 == IN_A_ROW:
             state = noted(_cut(plan, state), time, "the beam was lost")
         return state._replace(dead=state.dead + 1)
-    if state.dead >= DEAD:
+    if state.dead >= IN_A_ROW:
         state = noted(state, time, "beam again")
-    if state.highest and DROPOUT * value > state.highest and state.spikes + 1 < DEAD:
+    if state.highest and DROPOUT * value > state.highest and state.spikes + 1 < IN_A_ROW:
         return _counted(state._replace(spikes=state.spikes + 1), bad=1)
     count, begin, times, currents = state.sums
     refilled = count and value - currents / count > alarm.JUMP * state.noise
@@ -600,7 +599,7 @@ def _answered(plan: Plan, state: State) -> State:
     state = _kept(state, begin)
     none = Window(None, None, 0, "no beam")
     law = Law.free if plan.machine is None else Law.constant  # a ring knows more of its law
-    window = fit_window(state.rows, plan.name, law) if state.dead < DEAD else none
+    window = fit_window(state.rows, plan.name, law) if state.dead < IN_A_ROW else none
     answer = _answer(plan, state, window)
     found = answer.lifetime
     known = (found.value, found.error) if found else (math.nan, math.nan)
@@ -628,7 +627,7 @@ def _noise_of_one(plan: Plan, state: State, noise: float) -> float:
 
 
 def _answer(plan: Plan, state: State, window: Window) -> Answer:
-    current = state.rows[-1].current if state.rows and state.dead < DEAD else 0.0
+    current = state.rows[-1].current if state.rows and state.dead < IN_A_ROW else 0.0
     time, fit = state.last - state.shift, window.fit
     if fit is None:
         return Answer(time, current, window, Status.unidentified, f"No lifetime: {window.why}.")
