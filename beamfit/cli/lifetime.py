@@ -254,7 +254,7 @@ def _show_record(terminal: Terminal, study: RecordStudy) -> None:
 
 def _show_many(terminal: Terminal, study: RecordStudy) -> None:
     """Say each verdict once, then print a table with a row for each decay."""
-    from beamfit.answer import Table, cell
+    from beamfit.answer import cell
     from beamfit.lifetime import tables
 
     verdicts = tables.alike(study.decays)
@@ -264,8 +264,9 @@ def _show_many(terminal: Terminal, study: RecordStudy) -> None:
     if left := verdicts[len(told) :]:
         others = ", ".join(dict.fromkeys(cell(status) for status, *_ in left))
         terminal.line(f"\n{len(left)} more kinds of verdict ({others}): --full.")
-    for title, header, rows in tables.overview(study.decays)[: None if terminal.full else 1]:
+    for table in tables.overview(study.decays)[: None if terminal.full else 1]:
+        rows = table.rows
         if not terminal.full and (left := len(rows) - MOST_SHOWN) > 0:
-            rows = [*rows[:MOST_SHOWN], [f"{left} more", *[""] * (len(header) - 1)]]
-        terminal.table(Table(f"\n{title}", header, rows))
+            rows = [*rows[:MOST_SHOWN], [f"{left} more", *[""] * (len(table.header) - 1)]]
+        terminal.table(table._replace(title=f"\n{table.title}", rows=rows))
     terminal.line()
