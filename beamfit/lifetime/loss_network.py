@@ -19,11 +19,10 @@ from scipy.linalg import block_diag, cho_solve, cholesky, solve_triangular
 
 from beamfit.answer import Row, json_of, shown
 from beamfit.errors import InputError
-from beamfit.greybox.bounds import over_cells
 from beamfit.greybox.fit import Fit
 from beamfit.greybox.mlp import MLP, Port
 from beamfit.greybox.problem import Prior, Problem, Record
-from beamfit.greybox.signed_network import signed_network
+from beamfit.greybox.signed_network import GainCertificate, certificate_of, signed_network
 from beamfit.greybox.solve import solve
 from beamfit.lifetime.mechanisms import scaled_losses
 from beamfit.lifetime.ring import Operation
@@ -36,7 +35,6 @@ INPUTS = ("rf_voltage", "scraper_y", "pressure", "bunches")
 SIGNS = {"scraper_y": -1, "pressure": 1, "bunches": -1}
 OUTPUTS = ("log_a", "log_b")
 RISING = np.array([[SIGNS.get(name, 0) for name in INPUTS]] * len(OUTPUTS))
-ROUNDING = 1e-9
 
 
 def scaled(rf_voltage: float, scraper_y: float, pressure: float, bunches: float) -> np.ndarray:
@@ -78,44 +76,6 @@ class Box(NamedTuple):
                 raise InputError(f"range {low:g} to {high:g}", expected, column=name)
         low, high = np.array(self, float).T
         return scaled(*low), scaled(*high)
-
-
-class Certificate(NamedTuple):
-    """Bounds that hold for all inputs in the operating box.
-
-    Attributes
-    ----------
-    lower, upper : array, shape (4,)
-        Corners of the box: RF voltage MV, logarithms of scraper mm, pressure nPa, bunches.
-    gains : array, shape (2, 4, 2)
-        Enclosures of the slopes of the network's ln a and ln b by the four inputs over the box,
-        rounded outward.
-    single_maximum : bool
-        Whether the lifetime has a single maximum in the RF voltage at points along the edges of
-        the box: first principles have no enclosure.
-    """
-
-    lower: np.ndarray
-    upper: np.ndarray
-    gains: np.ndarray
-    single_maximum: bool
-
-    @property
-    def holds(self) -> bool:
-        """True if every slope of known sign has it, within rounding."""
-        known = [INPUTS.index(name) for name in SIGNS]
-        sign = np.array(list(SIGNS.values()))
-        worst = np.where(sign > 0, -self.gains[:, known, 0], self.gains[:, known, 1])
-        return bool(np.all(worst <= ROUNDING))
-
-    def holds_at(self, inputs: np.ndarray) -> bool:
-        """Test if a point is in the box, within rounding."""
-        inside = (inputs >= self.lower - ROUNDING) & (inputs <= self.upper + ROUNDING)
-        return bool(np.all(inside))
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the range and the slopes as JSON's types."""
-        return json_of({"holds": self.holds, **self._asdict()})
 
 
 # Sizes that are weighed, as relative errors of a and of b.
@@ -214,8 +174,12 @@ class NetworkFit:
     ----------
     fit : Fit
         Of the grey-box core, with its status, message and covariance.
-    certificate : Certificate
-        Signs that hold everywhere in the box.
+    certificate : GainCertificate
+        Enclosures of the slopes of the network's ln a and ln b by the four inputs, which are RF
+        voltage MV, logarithms of scraper mm, pressure nPa and bunches; and the operating box.
+    single_maximum : bool
+        Whether the lifetime has a single maximum in the RF voltage at points along the edges of
+        the box: first principles have no enclosure.
     corrected : ScaleFit
         The first principles that the network corrects.
     discrepancy : Discrepancy
@@ -225,7 +189,8 @@ class NetworkFit:
     """
 
     fit: Fit
-    certificate: Certificate
+    certificate: GainCertificate
+    single_maximum: bool
     corrected: ScaleFit
     discrepancy: Discrepancy
     left: np.ndarray
@@ -276,7 +241,7 @@ class NetworkFit:
             ("what it may be wrong by, a and b", " and ".join(map(percent, wrong))),
             *numbers,
             ("falls with scraper and bunches, rises with pressure", held.holds),
-            ("single maximum of the lifetime in the RF voltage", held.single_maximum),
+            ("single maximum of the lifetime in the RF voltage", self.single_maximum),
         ]
         return [Row(label, [value], quoted=True) for label, value in rows]
 
@@ -285,6 +250,7 @@ class NetworkFit:
         found = {name: getattr(self.fit, name) for name in ("status", "message", "chi2", "dof")}
         a, b, lifetime = self.predict(self.usual, current)
         told = {"a": a, "b": b, "lifetime": lifetime, "certificate": self.certificate}
+        told["single_maximum"] = self.single_maximum
         told["model_error"] = dict(zip("ab", self.discrepancy.size, strict=True))
         return json_of(found | told)
 
@@ -360,7 +326,8 @@ def fit_loss_network(
     if not np.isfinite(inputs).all():
         raise InputError("a setting that is not finite", "RF voltage, scraper, pressure, bunches")
     half = np.maximum(np.ptp(inputs, axis=0) / 2, SHORTEST)
-    entries = zip(INPUTS, half, inputs.mean(0), strict=True)
+    low, high = (inputs.min(0), inputs.max(0)) if box is None else box.corners()
+    entries = zip(INPUTS, half, inputs.mean(0), low, high, strict=True)
     ports = [Port(name, "", 0, *scale) for name, *scale in entries]
     outputs = [Port(name, "", scale=CORRECTION) for name in OUTPUTS]
     net, free = signed_network("map", ports, outputs, RISING, hidden, seed, MOST)
@@ -387,11 +354,9 @@ def fit_loss_network(
     trial = Discrepancy((middle, middle), inputs, LENGTH * half, rows)
     wrong = sized(trial, *fitted(trial))
     fit, left = fitted(wrong)
-    low, high = (inputs.min(0), inputs.max(0)) if box is None else box.corners()
-    enclosed = over_cells(fit.model["map"], low, high, 2)
-    gains = np.stack([np.min(enclosed.lower, axis=0), np.max(enclosed.upper, axis=0)], axis=-1)
+    held = certificate_of(fit.problem, fit.model["map"])
     single = _single_maximum(fit, corrected, low, high, float(measured.current.max()))
-    return NetworkFit(fit, Certificate(low, high, gains, single), corrected, wrong, left)
+    return NetworkFit(fit, held, single, corrected, wrong, left)
 
 
 def _single_maximum(

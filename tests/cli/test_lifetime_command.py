@@ -230,7 +230,7 @@ def test_a_study_of_a_shift_and_a_network_of_the_losses(run, monkeypatch):
     assert study["next"][0]["information"] >= study["next"][-1]["information"] > 0
     network = study["network"]
     assert network["certificate"]["holds"] is True
-    assert network["certificate"]["single_maximum"] is True
+    assert network["single_maximum"] is True
     assert network["lifetime"]["value"] == pytest.approx(study["best"]["usual"]["value"], rel=0.03)
     status, out, err = run("lifetime", path, "--network")
     assert (status, out) == (2, "")

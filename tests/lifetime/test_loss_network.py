@@ -10,7 +10,7 @@ import pytest
 
 from beamfit.errors import InputError
 from beamfit.lifetime.decay_law import current
-from beamfit.lifetime.loss_network import INPUTS, SIGNS, Box, fit_loss_network
+from beamfit.lifetime.loss_network import INPUTS, RISING, SIGNS, Box, fit_loss_network
 from beamfit.lifetime.mechanisms import loss_coefficients, loss_terms, scaled_losses
 from beamfit.lifetime.record import Conditions, DecayRecord
 from beamfit.lifetime.scales import fit_scales
@@ -60,19 +60,20 @@ def test_the_certificate_encloses_every_slope_and_has_the_signs(decays, scales):
     network = fit_loss_network(decays, scales, starts=1)
     certificate = network.certificate
     assert certificate.holds
-    assert certificate.single_maximum
+    assert network.single_maximum
     random = np.random.default_rng(3)
-    points = random.uniform(certificate.lower, certificate.upper, (500, 4))
+    points = random.uniform(*np.transpose([*certificate.box.values()]), (500, 4))
     net = network.fit.model["map"]
     slopes = np.asarray(jax.jit(jax.vmap(jax.jacfwd(net.values)))(points))
-    lower, upper = np.moveaxis(certificate.gains, -1, 0)
+    lower, upper, signs = np.array([gain[1:] for gain in certificate.gains]).T.reshape(3, 2, 4)
     assert (slopes >= lower - 1e-12).all()
     assert (slopes <= upper + 1e-12).all()
+    assert signs.tolist() == RISING.tolist()
     for name, sign in SIGNS.items():
         assert (sign * slopes[:, :, INPUTS.index(name)] >= -1e-12).all()
-    gains = certificate.gains.copy()
-    gains[0, 3, 1] = 0.1  # a might rise with the bunches
-    assert not certificate._replace(gains=gains).holds
+    *others, last = certificate.gains
+    assert last.name == "dlog_b/dbunches"
+    assert not certificate._replace(gains=(*others, last._replace(upper=0.1))).holds
 
 
 def test_a_correction_finds_what_first_principles_miss(wrong_ring, correction, machine):
@@ -90,10 +91,11 @@ def test_a_correction_finds_what_first_principles_miss(wrong_ring, correction, m
     assert before > 0.03
     assert after < 0.015
     assert correction.certificate.holds
-    assert correction.certificate.single_maximum
+    assert correction.single_maximum
     # The network bends with the voltage, and not by chance of a flat one.
-    net, certificate = correction.fit.model["map"], correction.certificate
-    slopes = [np.asarray(jax.jacfwd(net.values)(end))[0, 0] for end in certificate[:2]]
+    net, box = correction.fit.model["map"], correction.certificate.box
+    ends = np.transpose([*box.values()])
+    slopes = [np.asarray(jax.jacfwd(net.values)(end))[0, 0] for end in ends]
     assert slopes[0] < -0.2
     assert slopes[1] > 0.2
 
@@ -104,7 +106,8 @@ def test_outside_the_box_nothing_is_claimed(correction, machine):
 
 
 def test_over_a_box_of_ones_own_errors_grow_with_the_way_from_the_decays(correction):
-    np.testing.assert_allclose(correction.certificate.upper, [3.6, *np.log([10, 1000, 372])])
+    upper = [high for _, high in correction.certificate.box.values()]
+    np.testing.assert_allclose(upper, [3.6, *np.log([10, 1000, 372])])
     inside, *ends = (
         correction.predict(correction.usual._replace(rf_voltage=voltage), 470.0)[0].relative
         for voltage in (2.8e6, 1.25e6, 3.6e6)
