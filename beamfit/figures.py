@@ -198,7 +198,7 @@ def trend(result: Trend) -> Figure:
 
 
 def network(shift: Shift, decays: Sequence[Decay], setting: str | None = None) -> Figure:
-    """Draw what a network of the losses says beside decays, or by one setting.
+    """Draw what corrected first principles say beside decays, or by one setting.
 
     Parameters
     ----------
@@ -221,7 +221,7 @@ def network(shift: Shift, decays: Sequence[Decay], setting: str | None = None) -
     from beamfit.report.network import SETTINGS, decays_picture, setting_picture
 
     if shift.network is None:
-        raise InputError("a study without a network", "study_shift(..., network=Network.alone)")
+        raise InputError("a study without a network", "study_shift(..., network=True)")
     if setting is None:
         return _drawn(decays_picture(shift, decays))
     if setting not in SETTINGS:

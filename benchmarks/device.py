@@ -23,7 +23,7 @@ from beamfit import fit_sizes
 from beamfit.greybox.bounds import over_cells
 from beamfit.greybox.mlp import dense
 from beamfit.io.ring import read_ring
-from beamfit.lifetime.touschek import piwinski_rate
+from beamfit.lifetime.mechanisms import piwinski_rate
 from beamfit.sampling.posterior import Posterior
 
 REPEATS = 5

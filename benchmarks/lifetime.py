@@ -28,9 +28,9 @@ from scipy.optimize import curve_fit
 from beamfit.io.ring import ring_from_pyat
 from beamfit.lifetime.expansion import Pieces, solved
 from beamfit.lifetime.fit import fit_decay, fit_decays
+from beamfit.lifetime.mechanisms import piwinski_rate
 from beamfit.lifetime.record import DecayRecord
 from beamfit.lifetime.ring import population
-from beamfit.lifetime.touschek import piwinski_rate
 
 sys.path.insert(0, str(Path(__file__).parent))
 import spear3_lattice

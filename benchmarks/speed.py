@@ -244,8 +244,8 @@ def slices(n: int) -> dict[str, Callable]:
     import at
 
     from beamfit.io.ring import ring_from_pyat
+    from beamfit.lifetime.mechanisms import piwinski_rate
     from beamfit.lifetime.ring import population
-    from beamfit.lifetime.touschek import piwinski_rate
 
     from . import spear3_lattice
 

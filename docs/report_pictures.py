@@ -151,10 +151,9 @@ def figs_34_36() -> Figure:
 
 
 def figs_27_30() -> Figure:
-    """Decays of a simulated shift with what a network that knows the signs alone says of them."""
+    """Decays of a simulated shift with what first principles corrected by a network say of them."""
     import beamfit
     import beamfit.figures
-    from beamfit.lifetime.loss_network import Network
     from beamfit.lifetime.ring_study import study_shift
     from beamfit.lifetime.study import Machine, study_record
 
@@ -162,7 +161,7 @@ def figs_27_30() -> Figure:
     machine = Machine(beamfit.read_ring(ring), beamfit.read_operation(ring))
     record = beamfit.read_decay_record(MEASUREMENTS / "spear3_shift_simulated.csv")
     decays = study_record(record, machine).decays
-    return beamfit.figures.network(study_shift(decays, machine, network=Network.alone), decays)
+    return beamfit.figures.network(study_shift(decays, machine, network=True), decays)
 
 
 FIGURES = (figs_7_8, figs_9_10, figs_11_13, fig_14, figs_27_30, figs_31_33, figs_34_36)

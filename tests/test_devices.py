@@ -22,7 +22,7 @@ here, found = (fit_sizes(*given).covariance for given in (rows, there(rows)))
 """
 TOUSCHEK = """
 from beamfit.io.ring import read_ring
-from beamfit.lifetime.touschek import piwinski_rate
+from beamfit.lifetime.mechanisms import piwinski_rate
 ring = read_ring("lattices/spear3_2003.toml")
 here, found = (piwinski_rate(r, 1e10, 5e-3, 0.03) for r in (ring, there(ring)))
 """

@@ -95,8 +95,8 @@ def test_each_is_a_table_in_a_notebook(values):
 def test_a_long_line_or_record_shows_its_first_rows():
     time = np.arange(1000.0)
     shown = beamfit.DecayRecord(time, 100 - 1e-3 * time)._repr_html_()
-    assert shown.count("<tr>") == 21
-    assert "first 20 of 1000" in shown
+    assert shown.count("<tr>") == 41
+    assert "first 40 of 1000" in shown
 
 
 def test_names_are_never_markup():

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from beamfit.lifetime.course import Trend
     from beamfit.lifetime.lifetime_table import LifetimeFit
     from beamfit.lifetime.ring_study import Shift
-    from beamfit.lifetime.study import Decay, Machine, RecordStudy
+    from beamfit.lifetime.study import RecordStudy
     from beamfit.sampling.posterior import Posterior
 
 # Decays, and kinds of verdict on many of them, that the first screen lists; --full has every one.
@@ -35,7 +35,7 @@ Examples:
   beamfit lifetime fill1.csv --ring ring.toml --report fill1.html --json
   beamfit lifetime measurements/spear3_shift_simulated.csv --ring lattices/spear3_2003.toml --study
   beamfit lifetime shift.csv --ring ring.toml --study --prior rf_voltage=1+-1%
-  beamfit lifetime shift.csv --ring ring.toml --study --network correction
+  beamfit lifetime shift.csv --ring ring.toml --study --network
   beamfit lifetime week*.csv --trend --report weeks.html
   beamfit lifetime export.csv --columns 'SR:DCCT:CURRENT=beam_current_mA' --skip-bad
 """
@@ -55,9 +55,9 @@ Examples:
 )
 @option(
     "--network",
-    "With --study: also fit a and b by a network that falls with bunches and scraper and "
-    "rises with pressure; alone, or as a factor on the fitted first principles.",
-    choices=["alone", "correction"],
+    "With --study: also fit a network that corrects the fitted first principles, by a factor on a "
+    "and on b that falls with bunches and scraper and rises with pressure.",
+    is_flag=True,
 )
 @option(
     "--trend",
@@ -91,7 +91,7 @@ def lifetime(
     record: tuple[str, ...],
     ring: str | None,
     study: bool,
-    network: str | None,
+    network: bool,
     trend: bool,
     law: str,
     monitor_drift: str | None,
@@ -139,7 +139,7 @@ def lifetime(
     studies = tuple(beamfit.study(each, machine, law) for each in records)  # JAX from here on
     decays = [decay for each in studies for decay in each.answers]
     single = [decay for each in studies for decay in each.decays or each.pooled]
-    shift = _shift(single, machine, network, priors) if study else None
+    shift = beamfit.study_shift(single, machine, 0, network, priors) if study else None
     course = beamfit.trend(studies, machine) if trend else None
     drawn = sampling.drawn([decay.fit for decay in decays], inputs, quiet=as_json)
     posteriors = drawn if sample else None
@@ -177,24 +177,13 @@ def _show_lifetimes(terminal: Terminal, fits: list[LifetimeFit]) -> None:
         terminal.line()
 
 
-def _check_study(study: bool, ring: str | None, network: str | None, priors: dict | None) -> None:
+def _check_study(study: bool, ring: str | None, network: bool, priors: dict | None) -> None:
     if study and ring is None:
         raise InputError("--study without a ring", "--ring FILE.toml")
-    if network is not None and not study:
+    if network and not study:
         raise InputError("--network without a study", "--study --ring FILE.toml")
     if priors and not study:
         raise InputError("--prior without a study", "--study --ring FILE.toml")
-
-
-def _shift(
-    decays: list[Decay],
-    machine: Machine,
-    network: str | None,
-    priors: dict[str, tuple[float, float]] | None,
-) -> Shift:
-    from beamfit.lifetime.loss_network import Network
-
-    return beamfit.study_shift(decays, machine, network=network and Network(network), priors=priors)
 
 
 def _show(
@@ -265,7 +254,7 @@ def _show_record(terminal: Terminal, study: RecordStudy) -> None:
 
 def _show_many(terminal: Terminal, study: RecordStudy) -> None:
     """Say each verdict once, then print a table with a row for each decay."""
-    from beamfit.answer import Table, cell
+    from beamfit.answer import cell
     from beamfit.lifetime import tables
 
     verdicts = tables.alike(study.decays)
@@ -275,8 +264,9 @@ def _show_many(terminal: Terminal, study: RecordStudy) -> None:
     if left := verdicts[len(told) :]:
         others = ", ".join(dict.fromkeys(cell(status) for status, *_ in left))
         terminal.line(f"\n{len(left)} more kinds of verdict ({others}): --full.")
-    for title, header, rows in tables.overview(study.decays)[: None if terminal.full else 1]:
+    for table in tables.overview(study.decays)[: None if terminal.full else 1]:
+        rows = table.rows
         if not terminal.full and (left := len(rows) - MOST_SHOWN) > 0:
-            rows = [*rows[:MOST_SHOWN], [f"{left} more", *[""] * (len(header) - 1)]]
-        terminal.table(Table(f"\n{title}", header, rows))
+            rows = [*rows[:MOST_SHOWN], [f"{left} more", *[""] * (len(table.header) - 1)]]
+        terminal.table(table._replace(title=f"\n{table.title}", rows=rows))
     terminal.line()

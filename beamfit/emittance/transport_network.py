@@ -24,45 +24,14 @@ from beamfit.emittance.constrained_network import (
 )
 from beamfit.emittance.statement import PreparedScan, Scenario, varied_magnets
 from beamfit.emittance.transport import NetworkRows, padded
-from beamfit.greybox.bounds import over_cells
 from beamfit.greybox.mlp import MLP, Port
 from beamfit.greybox.problem import Free, Problem, Record
-from beamfit.greybox.signed_network import signed_network
+from beamfit.greybox.signed_network import cells_along, signed_network
 from beamfit.optics.beamline import transfer_rows
 
-CELLS = 32
 ELEMENTS = "ABCD"
 # The sharpness of det T = 1.
 DETERMINANT = 1e-3
-
-
-class Gain(NamedTuple):
-    """A gain of the network over the box of the scan: its enclosure, and the sign it must have."""
-
-    name: str
-    lower: float
-    upper: float
-    sign: int
-
-    @property
-    def holds(self) -> bool:
-        """True if the enclosure keeps to the sign; rounding is part of the enclosure."""
-        reach = 1e-12 * max(abs(self.lower), abs(self.upper))
-        if self.sign == 0:
-            return True
-        return self.upper <= reach if self.sign < 0 else self.lower >= -reach
-
-
-class GainCertificate(NamedTuple):
-    """Certified gains of a fitted network, and the box they hold over."""
-
-    gains: tuple[Gain, ...]
-    box: dict[str, tuple[float, float]]
-
-    @property
-    def holds(self) -> bool:
-        """True if every gain keeps to its sign everywhere in the box."""
-        return all(gain.holds for gain in self.gains)
 
 
 class _Layout(NamedTuple):
@@ -77,7 +46,7 @@ class _Layout(NamedTuple):
     @property
     def cells(self) -> int:
         """Along each input, in which gains are enclosed."""
-        return CELLS if len(self.names) == 1 else 8
+        return cells_along(len(self.names))
 
 
 def _layout(seen: PreparedScan, told: Assumptions) -> _Layout:
@@ -258,49 +227,3 @@ SCENARIO = Scenario(
     network=True,
     whole_map=False,
 )
-
-
-def certificate_of(problem: Problem, net: MLP) -> GainCertificate:
-    """Enclose the gains of a fitted network over the box of the scan.
-
-    Parameters
-    ----------
-    problem : Problem
-        From `transport_problem`; its bounds tell which sign each gain must have. A limit that was
-        given for a gain is a constraint of the problem, and asks for no sign here.
-    net : MLP
-        The fitted network.
-
-    Returns
-    -------
-    GainCertificate
-        For every current in the box, not only the measured ones, outward rounding included.
-    """
-    ports = net.input_ports
-    # A network that is scaled to its box has it in the scales.
-    scaled = [(p.bias - p.scale, p.bias + p.scale) for p in ports]
-    given = [(p.lower, p.upper) for p in ports]
-    low, high = np.where(np.isfinite(given), given, scaled).T
-    bound = over_cells(net, low, high, CELLS if len(ports) == 1 else 8)
-    lower, upper = np.asarray(bound.lower).min(axis=0), np.asarray(bound.upper).max(axis=0)
-    sign = _asked(problem, net)
-    gains = tuple(
-        Gain(f"d{out.name}/d{port.name}", float(lower[o, i]), float(upper[o, i]), int(sign[o, i]))
-        for o, out in enumerate(net.output_ports)
-        for i, port in enumerate(ports)
-    )
-    box = {p.name: (float(a), float(b)) for p, a, b in zip(ports, low, high, strict=True)}
-    return GainCertificate(gains, box)
-
-
-def _asked(problem: Problem, net: MLP) -> np.ndarray:
-    """Signs the bounds of the weights ask of the gains, shape (outputs, inputs)."""
-    ends = {
-        f.path.rsplit(".", 1)[-1]: np.sign(np.asarray(f.lower) + np.asarray(f.upper))
-        for f in problem.free
-        if ".weights." in f.path
-    }
-    if not ends:  # limits, and no signs
-        return np.zeros((len(net.output_ports), len(net.input_ports)))
-    first, last = (ends[f"layer{i}->layer{i + 1}"][...] for i in (0, 1))
-    return last[0][:, None] * first[:, 0][None, :]

@@ -8,18 +8,22 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.optimize import nnls
 
+from beamfit.answer import json_of
 from beamfit.errors import InputError
-from beamfit.greybox.bounds import KINDS
+from beamfit.greybox.bounds import KINDS, over_cells
 from beamfit.greybox.maps import positions
 from beamfit.greybox.mlp import MLP, Port, dense
-from beamfit.greybox.problem import Free
+from beamfit.greybox.problem import Free, Problem
 
 # Largest threshold of a node and random start of a weight: a network's range is -1 to 1.
 WIDE = 1.5
+# A point is in a box within so much.
+ROUNDING = 1e-9
 
 
 def signed_weights(
@@ -177,3 +181,93 @@ def _pattern(rising: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             lead = int(np.argmax(asked))
             node[i] = column[lead] * out[lead]
     return node, out
+
+
+class Gain(NamedTuple):
+    """A gain of a network over a box: its enclosure, and the sign that it must have."""
+
+    name: str
+    lower: float
+    upper: float
+    sign: int
+
+    @property
+    def holds(self) -> bool:
+        """True if the enclosure keeps to the sign; rounding is part of the enclosure."""
+        # Rounded outward, a gain of zero is one of 1e-300 to either side.
+        reach = max(1e-12 * max(abs(self.lower), abs(self.upper)), 1e-200)
+        if self.sign == 0:
+            return True
+        return self.upper <= reach if self.sign < 0 else self.lower >= -reach
+
+
+class GainCertificate(NamedTuple):
+    """Certified gains of a fitted network, and the box they hold over."""
+
+    gains: tuple[Gain, ...]
+    box: dict[str, tuple[float, float]]
+
+    @property
+    def holds(self) -> bool:
+        """True if every gain keeps to its sign everywhere in the box."""
+        return all(gain.holds for gain in self.gains)
+
+    def holds_at(self, inputs: np.ndarray) -> bool:
+        """Test if a point is in the box, within rounding."""
+        low, high = np.array([*self.box.values()]).T
+        return bool(np.all((inputs >= low - ROUNDING) & (inputs <= high + ROUNDING)))
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the verdict, the enclosures and the box as JSON's types."""
+        return json_of({"holds": self.holds, **self._asdict()})
+
+
+def cells_along(inputs: int) -> int:
+    """Cells along each of some inputs in which gains are enclosed."""
+    return 32 if inputs == 1 else 8
+
+
+def certificate_of(problem: Problem, net: MLP) -> GainCertificate:
+    """Enclose the gains of a fitted network over the box of its inputs.
+
+    Parameters
+    ----------
+    problem : Problem
+        With `signed_network`; its bounds tell which sign each gain must have. A limit that was
+        given for a gain is a constraint of the problem, and asks for no sign here.
+    net : MLP
+        The fitted network.
+
+    Returns
+    -------
+    GainCertificate
+        For every input in the box, not only the measured ones, outward rounding included.
+    """
+    ports = net.input_ports
+    # A network that is scaled to its box has it in the scales.
+    scaled = [(p.bias - p.scale, p.bias + p.scale) for p in ports]
+    given = [(p.lower, p.upper) for p in ports]
+    low, high = np.where(np.isfinite(given), given, scaled).T
+    bound = over_cells(net, low, high, cells_along(len(ports)))
+    lower, upper = np.asarray(bound.lower).min(axis=0), np.asarray(bound.upper).max(axis=0)
+    sign = _asked(problem, net)
+    gains = tuple(
+        Gain(f"d{out.name}/d{port.name}", float(lower[o, i]), float(upper[o, i]), int(sign[o, i]))
+        for o, out in enumerate(net.output_ports)
+        for i, port in enumerate(ports)
+    )
+    box = {p.name: (float(a), float(b)) for p, a, b in zip(ports, low, high, strict=True)}
+    return GainCertificate(gains, box)
+
+
+def _asked(problem: Problem, net: MLP) -> np.ndarray:
+    """Signs the bounds of the weights ask of the gains, shape (outputs, inputs)."""
+    ends = {
+        f.path.rsplit(".", 1)[-1]: np.sign(np.asarray(f.lower) + np.asarray(f.upper))
+        for f in problem.free
+        if ".weights." in f.path
+    }
+    if not ends:  # limits, and no signs
+        return np.zeros((len(net.output_ports), len(net.input_ports)))
+    first, last = (ends[f"layer{i}->layer{i + 1}"][...] for i in (0, 1))
+    return last[0][:, None] * first[:, 0][None, :]

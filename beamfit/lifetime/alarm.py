@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from beamfit.lifetime.pieces import GAP
-from beamfit.quantity import Quantity, relative_change
+from beamfit.quantity import HOUR, Quantity, relative_change
 from beamfit.statistics import CLEAR_ODDS, log_evidence_of_change
 
 MINUTE = 60.0
@@ -23,6 +23,8 @@ LENGTHS = np.repeat([4.0, 8.0, 16.0, 32.0, 64.0, 128.0], 4) * MINUTE
 PHASES = LENGTHS * np.tile([0.0, 0.25, 0.5, 0.75], 6)
 # Before an alarm a and b may be off by this much.
 WIDE = 0.3
+# a and b wander by so much on an ordinary day.
+WANDER = 0.005
 
 
 class AlarmState(NamedTuple):
@@ -179,8 +181,6 @@ def set_off(state: AlarmState, raised: np.ndarray, best: np.ndarray) -> AlarmSta
 
 # Readings in which one false alarm is raised at most.
 QUIET = 1e6
-# After so long an alarm goes without a name, s.
-PATIENCE = 60 * MINUTE
 # After a step nothing is looked at for so long, s; after a gap all begins anew.
 SETTLE = 10.0
 # A reading off the pace before it by so many of its errors, or by such a share of the loss, begins
@@ -217,7 +217,7 @@ class Reference(NamedTuple):
     noise: float
     correlation_time: float = 0.0
     interval: float = 1.0
-    covariance: np.ndarray = 0.005**2 * np.eye(2)
+    covariance: np.ndarray = WANDER**2 * np.eye(2)
 
 
 class Reading(NamedTuple):
@@ -338,6 +338,11 @@ def watched(
     return _judged(reference, after, usable)
 
 
+def is_gap(seconds: np.ndarray | float, interval: float) -> np.ndarray | bool:
+    """True between readings so far apart that a piece begins anew."""
+    return seconds > max(GAP * interval, MINUTE)
+
+
 def _step(usual: Reference, state: AlarmState, reading: Reading) -> tuple[np.ndarray, ...]:
     """From one reading to the next: seconds, whether the path goes on, and whether it was cut by
     a step; how far ln I moved against the expected, with derivatives; what is expected of a and b;
@@ -345,7 +350,7 @@ def _step(usual: Reference, state: AlarmState, reading: Reading) -> tuple[np.nda
     """
     with np.errstate(invalid="ignore", divide="ignore"):
         seconds = np.asarray(reading.time - state.time)
-        going = (seconds > 0) & (seconds <= max(GAP * usual.interval, MINUTE))
+        going = (seconds > 0) & ~is_gap(seconds, usual.interval)
         seconds = np.where(going, seconds, 1.0)
         middle = (reading.current + state.current) / 2
         a_part = usual.a * state.factor[..., 0] * reading.a_factor * middle * seconds
@@ -415,7 +420,7 @@ def _judged(
         found = [both - either_one, a - np.logaddexp(b, 0.0), b - np.logaddexp(a, 0.0)]
         found = [odds > CLEAR_ODDS for odds in found]
         apart = np.select(found, [3, 1, 2], 0)
-    late = 4 * (state.raised > PATIENCE)
+    late = 4 * (state.raised > HOUR)  # it goes without a name
     settled = ~quiet & usable & (state.age[..., -1] >= MINUTE)
     moved = np.where(settled, np.where(apart > 0, apart, late), 0)
     if not moved.any():
@@ -546,5 +551,5 @@ def alarm_of(raised: float, told: AlarmStep, at: float | None) -> Alarm:
 def when(time: float, dated: bool) -> str:
     """A time as a date, or in hours of the record."""
     if not dated:
-        return f"{time / 3600:.2f} h"
+        return f"{time / HOUR:.2f} h"
     return datetime.fromtimestamp(60 * round(time / 60), UTC).strftime("%Y-%m-%d %H:%M")

@@ -8,6 +8,7 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
+from scipy.special import ndtri
 
 from beamfit.errors import Finding, Status, judge
 from beamfit.lifetime.alternatives import ConstantA, LifetimeLaw, Outgassing
@@ -28,18 +29,14 @@ from beamfit.statistics import MANY, POOR_FIT, chi2_probability, few_words, of_u
 
 # Lifetimes, s, that stored beams seldom have, but times in a wrong unit often give.
 SHORTEST, LONGEST = 20.0, 3000 * HOUR
-# One-sided 95 %.
-LIMIT = 1.645
+# Errors above a value that are not exceeded with 95 %.
+LIMIT = float(ndtri(0.95))
 # A change between neighbouring residuals of so many times their usual one is a step, not noise.
 STEP = 12.0
 # A change of which the next takes back such a share is of one reading.
 BACK = 0.5
 # Below this chi²/dof stated errors are said to be too large.
 CAUTIOUS = 0.25
-# An exponent or a drift so many errors off zero is told from none.
-CLEAR = 2.0
-# An interval that begins below this share of its end begins at zero.
-LEAST_SHARE = 5e-3
 # Residuals so many times the scatter of neighbouring readings are not the monitor's noise.
 WANDERS = 10.0
 # Settings that are said to have gone from one value to another, by more than this share.
@@ -301,7 +298,8 @@ def _departs(e: Evidence) -> str:
     drift, power = e.free.drift, f"a goes as I^({e.free.exponent})"
     drifts = f"b drifts by {drift} of itself"
     bends, moves = (
-        q is not None and abs(q.value) > CLEAR * q.error for q in (e.free.exponent, drift)
+        q is not None and not q.interval_95[0] < 0 < q.interval_95[1]
+        for q in (e.free.exponent, drift)
     )
     if bends or drift is None:
         found = power if drift is None else f"{power} and {drifts}"
@@ -324,7 +322,7 @@ def _clear(e: Evidence) -> str:
 def _extent(e: Evidence, name: str) -> str | None:
     """An interval too wide for a value, or a limit."""
     low, high = e.free.quantities[name].interval_95
-    if low <= LEAST_SHARE * high:
+    if low <= 0:
         return f"{name} is compatible with zero: it is below {high:.2g} {UNITS[name]} at 95 %"
     if of_use((low, high)):
         return None

@@ -11,7 +11,7 @@ import numpy as np
 
 from beamfit.answer import Table, answer, cell, json_of
 from beamfit.errors import InputError
-from beamfit.lifetime.alarm import Alarm, Reference, alarms_of, when
+from beamfit.lifetime.alarm import WANDER, Alarm, Reference, alarms_of, when
 from beamfit.lifetime.fit import DecayFit, bare
 from beamfit.lifetime.mechanisms import Losses, loss_coefficients
 from beamfit.lifetime.scales import by_losses, summarise
@@ -26,8 +26,6 @@ from beamfit.statistics import (
     reach_of,
 )
 
-# a and b wander by so much on an ordinary day.
-WANDER = 0.005
 # Where readings do not tell a from b, the ring's own shares of them are trusted to this.
 SHARES = 0.3
 # No monitor is better than this share of the current.
@@ -212,12 +210,16 @@ def trend_of(studies: Sequence[RecordStudy], machine: Machine | None = None) -> 
         expected = "one decay at least whose lifetime is determined"
         raise InputError("no lifetime", expected, path=studies[0].record.name)
     times, decays = zip(*placed, strict=True)
-    current = float(np.median([decay.fit.mean_current for decay in decays]))
-    a, b, lifetime = _by_ring(decays, machine, current)
+    current, ring = float(np.median([decay.fit.mean_current for decay in decays])), None
+    a = b = np.ones(len(decays))
+    if machine is not None:
+        ring = loss_coefficients(*machine, current)
+        losses = [decay.budget.losses for decay in decays]
+        a, b = np.array([(own.a / ring.a, own.b / ring.b) for own in losses], float).T
     first = baseline(len(decays))
     watched = len(decays) > first
     usual = reference_of(decays[:first], a[:first], b[:first]) if watched else None
-    values = _normalised(decays, lifetime, current if machine else None)
+    values = [normalised(decay, ring, current) for decay in decays]
     centre, limit = control_limits(np.array([value.value for value in values[:first]]))
     points = tuple(
         _point(*of_decay, usual, (centre, limit))
@@ -230,29 +232,13 @@ def trend_of(studies: Sequence[RecordStudy], machine: Machine | None = None) -> 
     return replace(trend, **dict(zip(("status", "message"), _verdict(trend), strict=True)))
 
 
-def _by_ring(decays: Sequence[Decay], machine: Machine | None, current: float) -> np.ndarray:
-    """a, b and lifetime of the ring at each decay over those of the reference, (3, n)."""
-    if machine is None:
-        return np.ones((3, len(decays)))
-    usual = loss_coefficients(machine.ring, machine.operation, current)
-    rate = usual.a * current + usual.b
-    rows = [
-        (d.budget.losses.a / usual.a, d.budget.losses.b / usual.b, d.budget.lifetime * HOUR * rate)
-        for d in decays
-    ]
-    return np.array(rows, float).T
-
-
-def _normalised(
-    decays: Sequence[Decay], factors: np.ndarray, current: float | None
-) -> list[Quantity]:
-    """Current times lifetime, mA h."""
-    values = []
-    for decay, factor in zip(decays, factors, strict=True):
-        found = decay.fit.lifetime_mean
-        by = (current or decay.fit.mean_current) / factor
-        values.append(Quantity(by * found.value, by * found.error, "mA h"))
-    return values
+def normalised(decay: Decay, ring: Losses | None, current: float) -> Quantity:
+    """Current times lifetime, mA h: by a ring's usual losses at a current, or as measured."""
+    found, by = decay.fit.lifetime_mean, decay.fit.mean_current
+    if ring is not None:
+        rate = float(ring.a * current + ring.b)
+        by = current / (decay.budget.lifetime * HOUR * rate)
+    return Quantity(by * found.value, by * found.error, "mA h")
 
 
 def _point(

@@ -284,7 +284,7 @@ def fit_decay(
         One decay, without refills or steps: cut others with `split_record` first.
     shape : callable, optional
         How a depends on the current in mA, up to a factor, where it is not constant; for
-        example `beamfit.lifetime.touschek.touschek_shape(ring, operation)`. The rate equation is
+        example `beamfit.lifetime.mechanisms.touschek_shape(ring, operation)`. The rate equation is
         then integrated, and `a` is the value at the mean current.
     monitor : Monitor, optional
         Stability of the current monitor, instead of what the record says of it; the errors contain

@@ -1,7 +1,7 @@
-"""a and b by a network that obeys physics everywhere: alone, or as a correction (report 3.4.2).
+"""A network that corrects first principles: ln a and ln b at any setting (report 3.4.2).
 
-The network's outputs are logarithms, so a and b are positive. Signs of its weights make both fall
-with bunches and scraper opening and rise with pressure, at every point and not only at data.
+Signs of its weights make a and b fall with bunches and scraper opening and rise with pressure, at
+every point and not only at data; first principles do so themselves, and so does the product.
 """
 
 from __future__ import annotations
@@ -9,7 +9,6 @@ from __future__ import annotations
 import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from enum import StrEnum
 from typing import Any, NamedTuple
 
 import jax
@@ -17,33 +16,25 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from scipy.linalg import block_diag, cho_solve, cholesky, solve_triangular
-from scipy.optimize import nnls
 
 from beamfit.answer import Row, json_of, shown
 from beamfit.errors import InputError
-from beamfit.greybox.bounds import over_cells
 from beamfit.greybox.fit import Fit
-from beamfit.greybox.mlp import MLP, Layer, Port
+from beamfit.greybox.mlp import MLP, Port
 from beamfit.greybox.problem import Prior, Problem, Record
-from beamfit.greybox.signed_network import signed_weights
+from beamfit.greybox.signed_network import GainCertificate, certificate_of, signed_network
 from beamfit.greybox.solve import solve
+from beamfit.lifetime.mechanisms import scaled_losses
 from beamfit.lifetime.ring import Operation
-from beamfit.lifetime.scales import (
-    PRESSURE_ERROR,
-    ScaleFit,
-    Summaries,
-    by_losses,
-    loss_parts,
-    summarise,
-    widened,
-)
-from beamfit.lifetime.study import Decay, Machine, settings_of
+from beamfit.lifetime.scales import ScaleFit, by_losses, loss_parts
+from beamfit.lifetime.study import Decay, settings_of
 from beamfit.quantity import HOUR, Quantity, percent
 
 INPUTS = ("rf_voltage", "scraper_y", "pressure", "bunches")
 # How the loss moves with each input; nothing is known of the sign for the RF voltage.
 SIGNS = {"scraper_y": -1, "pressure": 1, "bunches": -1}
-ROUNDING = 1e-9
+OUTPUTS = ("log_a", "log_b")
+RISING = np.array([[SIGNS.get(name, 0) for name in INPUTS]] * len(OUTPUTS))
 
 
 def scaled(rf_voltage: float, scraper_y: float, pressure: float, bunches: float) -> np.ndarray:
@@ -85,45 +76,6 @@ class Box(NamedTuple):
                 raise InputError(f"range {low:g} to {high:g}", expected, column=name)
         low, high = np.array(self, float).T
         return scaled(*low), scaled(*high)
-
-
-class Certificate(NamedTuple):
-    """Bounds that hold for all inputs in the operating box.
-
-    Attributes
-    ----------
-    lower, upper : array, shape (4,)
-        Corners of the box: RF voltage MV, logarithms of scraper mm, pressure nPa, bunches.
-    gains : array, shape (2, 4, 2)
-        Enclosures of the slopes of the network's ln a and ln b by the four inputs over the box,
-        rounded outward; of a correction, those of its factor.
-    single_maximum : str
-        Whether the lifetime has a single maximum in the RF voltage: "certified" by convex nodes of
-        a network alone; of a correction "seen" or "broken" at points of the box, since first
-        principles have no enclosure; "not asked".
-    """
-
-    lower: np.ndarray
-    upper: np.ndarray
-    gains: np.ndarray
-    single_maximum: str
-
-    @property
-    def holds(self) -> bool:
-        """True if every slope of known sign has it, within rounding."""
-        known = [INPUTS.index(name) for name in SIGNS]
-        sign = np.array(list(SIGNS.values()))
-        worst = np.where(sign > 0, -self.gains[:, known, 0], self.gains[:, known, 1])
-        return bool(np.all(worst <= ROUNDING))
-
-    def holds_at(self, inputs: np.ndarray) -> bool:
-        """Test if a point is in the box, within rounding."""
-        inside = (inputs >= self.lower - ROUNDING) & (inputs <= self.upper + ROUNDING)
-        return bool(np.all(inside))
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the range and the slopes as JSON's types."""
-        return json_of({"holds": self.holds, **self._asdict()})
 
 
 # Sizes that are weighed, as relative errors of a and of b.
@@ -201,31 +153,16 @@ def sized(trial: Discrepancy, fit: Fit, left: np.ndarray) -> Discrepancy:
     return trial._replace(size=max(itertools.product(SIZES, SIZES), key=likelihood))
 
 
-OUTPUTS = ("log_a", "log_b")
 # Units of a, b and the lifetime.
 LOSSES = ("1/(mA s)", "1/s", "h")
-# Weights with a sign: from the inputs that the loss rises or falls with, and, as sums of rising
-# and of convex nodes are such, to the outputs; the last makes the lifetime have one maximum.
-RISING, POSITIVE = "rest->rising", ("rising->out", "convex->out")
-DIRECTION = np.array([SIGNS[name] for name in INPUTS[1:]])[:, None]
-# Widths of the priors on weights: alone the network covers decades, a correction is near zero.
-ALONE, CORRECTION = 3.0, 0.3
-# Widths of the prior that no weight exceeds.
-MOST = 10.0
-# Correlation length of the model's error: of half the range of each input, or of that where less
-# was seen. Chosen on simulated shifts.
-LENGTH, SHORTEST = 0.8, 0.1
-# Below this share of the loss b is compatible with zero.
-SMALLEST = 1e-3
-# Voltages that are looked at, of a correction or for the longest lifetime.
+# Size of a correction of ln a and ln b by weights of one, the standard deviation of the prior on
+# them, which is the usual for inputs and outputs of size one; none exceeds ten.
+CORRECTION, MOST = 0.3, 10.0
+# An input counts by half its range, 0.1 MV or 10 % at least: what hardly moved tells nothing. The
+# model's error is correlated over so much of that, chosen on simulated shifts.
+SHORTEST, LENGTH = 0.1, 0.8
+# Voltages that are looked at, for a maximum or for the longest lifetime.
 VOLTAGES = 65
-
-
-class Network(StrEnum):
-    """Kinds of loss network: all of a and b, or a factor on first principles."""
-
-    alone = "alone"
-    correction = "correction"
 
 
 @shown
@@ -237,57 +174,50 @@ class NetworkFit:
     ----------
     fit : Fit
         Of the grey-box core, with its status, message and covariance.
-    certificate : Certificate
-        Signs that hold everywhere in the box.
-    machine : Machine
-        The ring and its usual operation.
-    corrected : ScaleFit or None
-        The first principles that the network corrects; None if it stands alone.
+    certificate : GainCertificate
+        Enclosures of the slopes of the network's ln a and ln b by the four inputs, which are RF
+        voltage MV, logarithms of scraper mm, pressure nPa and bunches; and the operating box.
+    single_maximum : bool
+        Whether the lifetime has a single maximum in the RF voltage at points along the edges of
+        the box: first principles have no enclosure.
+    corrected : ScaleFit
+        The first principles that the network corrects.
     discrepancy : Discrepancy
         What it may be wrong by.
-    vacuum : array, shape (2,)
-        Pressure of the decays, Pa, without beam and for each mA of it, by a straight line.
     left : array, shape (2n,)
         What it leaves of the decays, in their errors.
     """
 
     fit: Fit
-    certificate: Certificate
-    machine: Machine
-    corrected: ScaleFit | None
+    certificate: GainCertificate
+    single_maximum: bool
+    corrected: ScaleFit
     discrepancy: Discrepancy
-    vacuum: np.ndarray
     left: np.ndarray
 
     @property
     def usual(self) -> Operation:
-        """The machine's usual settings, of a network alone in the vacuum of the decays."""
-        if self.corrected is not None:
-            return self.machine.operation
-        base, slope = self.vacuum
-        return self.machine.operation._replace(pressure_base=base, pressure_slope=slope)
+        """The machine's usual settings and vacuum."""
+        return self.corrected.machine.operation
 
-    def losses(self, operation: Operation, current: float) -> tuple[Quantity, Quantity]:
-        """Predict a and b at a setting.
+    def predict(self, operation: Operation, current: float) -> tuple[Quantity, ...]:
+        """Predict a, b and the lifetime at a setting.
 
         Parameters
         ----------
         operation : Operation
-            Settings and vacuum.
+            Settings and vacuum, with the P1/P0 of the ring file, which a scale is on.
         current : float
             Mean current, mA.
 
         Returns
         -------
         tuple of Quantity
-            a, 1/(mA s), and b, 1/s. Outside the operating box the network is not to be believed,
-            and the errors are None.
+            a, 1/(mA s), b, 1/s, and the lifetime, h. Outside the operating box the network is not
+            to be believed, and the errors are None.
         """
-        return self.predict(operation, current)[:2]
-
-    def predict(self, operation: Operation, current: float) -> tuple[Quantity, ...]:
-        """a, 1/(mA s), b, 1/s, and the lifetime, h, as `losses`."""
-        at, base = _inputs(operation, current)[None], _base(self.corrected, operation, current)
+        at = _inputs(operation, current)[None]
+        base = np.log(np.array(self.corrected.losses_at(operation, current), float))
         logs = self.fit.derive(_logs, (at, base[None]))
         mean, covariance = self.discrepancy.spread(at, logs.slope[0], self.left, self.fit)
         a, b = np.exp(logs.value[0])
@@ -295,21 +225,9 @@ class NetworkFit:
         # By ln a and ln b: of themselves, and of the logarithm of the lifetime.
         rows = np.array([[1, 0], [0, 1], [-a * current / rate, -b / rate]])
         spread = np.sum(rows @ covariance * rows, axis=1) + (rows @ mean) ** 2
-        if self.corrected is None:
-            spread = spread + self._pressed(at[0], current)
         inside = self.certificate.holds_at(at[0])
         named = zip((a, b, 1 / rate / HOUR), np.sqrt(spread), LOSSES, strict=True)
         return tuple(Quantity(float(v), float(e * v) if inside else None, u) for v, e, u in named)
-
-    def _pressed(self, at: np.ndarray, current: float) -> float:
-        """Variance of ln a and ln b at another pressure than the decays had at that current.
-
-        The pressure went with the current, so that what is of one and what of the other is not
-        told: losses go with a power of the pressure of which only 0 to 1 is known (gas part).
-        """
-        base, slope = self.vacuum
-        off = at[INPUTS.index("pressure")] - np.log(1e9 * (base + slope * current))
-        return off**2 / 3
 
     def rows(self, current: float) -> list[Row]:
         """Label and value of what it says at a current, and of what it obeys."""
@@ -323,7 +241,7 @@ class NetworkFit:
             ("what it may be wrong by, a and b", " and ".join(map(percent, wrong))),
             *numbers,
             ("falls with scraper and bunches, rises with pressure", held.holds),
-            ("single maximum of the lifetime in the RF voltage", held.single_maximum),
+            ("single maximum of the lifetime in the RF voltage", self.single_maximum),
         ]
         return [Row(label, [value], quoted=True) for label, value in rows]
 
@@ -332,11 +250,12 @@ class NetworkFit:
         found = {name: getattr(self.fit, name) for name in ("status", "message", "chi2", "dof")}
         a, b, lifetime = self.predict(self.usual, current)
         told = {"a": a, "b": b, "lifetime": lifetime, "certificate": self.certificate}
+        told["single_maximum"] = self.single_maximum
         told["model_error"] = dict(zip("ab", self.discrepancy.size, strict=True))
         return json_of(found | told)
 
 
-# The network's inputs, what it is added to, mean currents, weights of the two loss rates.
+# The network's inputs, ln a and ln b of first principles, mean currents, weights of the two rates.
 Data = tuple[Array, Array, Array, Array]
 
 
@@ -347,7 +266,7 @@ def _inputs(operation: Operation, current: float) -> np.ndarray:
 
 
 def _logs(model: Mapping[str, MLP], data: tuple[Array, Array]) -> Array:
-    """ln a and ln b at settings and what is added to, shape (n, 2)."""
+    """ln a and ln b at settings, shape (n, 2)."""
     inputs, base = data
     return base + jax.vmap(model["map"].values)(inputs)
 
@@ -358,95 +277,28 @@ def _predict(model: Mapping[str, MLP], data: Data) -> Array:
     return weight @ loss_parts(a, b, current).ravel()
 
 
-def _base(corrected: ScaleFit | None, operation: Operation, current: float) -> Array:
-    """ln a and ln b of first principles, which the network corrects; zero if it stands alone."""
-    if corrected is None:
-        return jnp.zeros(2)
-    return jnp.log(jnp.stack(corrected.losses_at(operation, current)))
-
-
-def _network(inputs: np.ndarray, means: np.ndarray, hidden: int, seed: int) -> MLP:
-    """Additive in the voltage and the rest: convex nodes for one, rising ones for the other.
-
-    ln a = convex(V) + monotonic(Y, P, M). The rate a I + b is then log-convex in V, as a sum of
-    log-convex functions, so the lifetime has a single maximum.
-    """
-    middle, half = inputs.mean(0), np.maximum(np.ptp(inputs, axis=0) / 2, 1e-3)
-    ports = [
-        Port(name, "voltage" if k == 0 else "rest", max(k - 1, 0), half[k], middle[k])
-        for k, name in enumerate(INPUTS)
-    ]
-    layers = [
-        Layer("voltage", "identity", 1),
-        Layer("rest", "identity", 3),
-        Layer("convex", "logcosh", 2, bias=True),
-        Layer("rising", "tanh", hidden, bias=True),
-        Layer("out", "linear", 2, bias=True),
-    ]
-    random = np.random.default_rng(seed)
-    weights = {
-        "voltage->convex": random.normal(0, 1, (1, 2)),
-        "voltage->out": random.normal(0, 0.1, (1, 2)),
-        "convex->out": np.abs(random.normal(0, 0.3, (2, 2))),
-        RISING: DIRECTION * np.abs(random.normal(0, 0.5, (3, hidden))),
-        "rising->out": np.abs(random.normal(0, 0.3, (hidden, 2))),
-    }
-    biases = {"out": np.zeros(2), "rising": random.normal(0, 0.5, hidden)}
-    outputs = [Port(name, "out", k, 1.0, means[k]) for k, name in enumerate(OUTPUTS)]
-    pairs = [tuple(name.split("->")) for name in weights]
-    return MLP(layers, pairs, ports, outputs, weights, biases)
-
-
-def _signs(single_maximum: bool) -> dict[str, np.ndarray | int]:
-    """Signs of weights that make the network obey."""
-    return dict.fromkeys(POSITIVE if single_maximum else POSITIVE[:1], 1) | {RISING: DIRECTION}
-
-
-def _statement(measured: Summaries, floor: float) -> tuple[np.ndarray, np.ndarray]:
-    """Weights of what the decays say, and slopes of that by ln a and ln b, (2n, 2n) each.
-
-    With independent relative errors of a, and of b, whose pressure is as good as its reading.
-    """
-    quadratic, rate = np.abs(np.asarray(measured.parts)).T
-    linear = np.maximum(np.abs(rate - quadratic), SMALLEST * rate)
-    by = by_losses(quadratic, linear)
-    weight = np.asarray(widened(measured.root, by * np.array([floor, PRESSURE_ERROR])))
-    return block_diag(*weight), block_diag(*(weight @ by))
-
-
 def fit_loss_network(
     decays: Sequence[Decay],
-    machine: Machine,
-    corrected: ScaleFit | None = None,
+    corrected: ScaleFit,
     *,
     hidden: int = 4,
-    floor: float = 0.01,
     box: Box | None = None,
-    single_maximum: bool = True,
     starts: int = 3,
     seed: int = 0,
 ) -> NetworkFit:
-    """Fit a network of a and b to decays at different settings.
+    """Fit a network that multiplies a and b of first principles, to decays at different settings.
 
     Parameters
     ----------
     decays : sequence of Decay
         Fitted decays whose records carry their settings.
-    machine : Machine
-        The ring, and what the records do not say.
-    corrected : ScaleFit, optional
-        First principles that the network multiplies: a = a_fp exp(network). Without it the
-        network stands alone.
+    corrected : ScaleFit
+        First principles fitted to them: a = a_fp exp(network), and b alike.
     hidden : int, optional
-        Nodes for scraper, pressure and bunches together; two more serve the voltage.
-    floor : float, optional
-        Independent relative error of a in each decay, for what no input shows; b has that of a
-        pressure reading, 5 %.
+        Nodes of the network.
     box : Box, optional
         The operating box of the certificate, outside which nothing is predicted; what the decays
         span by default. Where it is wider than that, errors are those of an extrapolation.
-    single_maximum : bool, optional
-        Whether a network alone must give the lifetime a single maximum in the RF voltage.
     starts, seed : int, optional
         Of the search.
 
@@ -462,60 +314,54 @@ def fit_loss_network(
 
     Notes
     -----
-    Weights are regularised by a normal prior of width 3 alone and 0.3 as a correction, so that a
-    correction the data do not ask for stays zero. First principles themselves fall with bunches
-    and scraper and rise with pressure, so the signs hold for the product. What the network cannot
-    follow is a smooth random error in its likelihood, whose size the decays themselves tell
-    (`discrepancy`); errors of predictions contain it, and grow away from the decays.
+    Weights are regularised by a normal prior of width 0.3, so that a correction the data do not ask
+    for stays zero. What the network cannot follow is a smooth random error in its likelihood, whose
+    size the decays themselves tell (`discrepancy`); errors of predictions contain it, and grow away
+    from the decays.
     """
     if len(decays) < 4:
         raise InputError(f"{len(decays)} decays", "4 or more at different settings")
-    measured = summarise(decays)
-    settings = settings_of(decays, machine)
+    settings = settings_of(decays, corrected.machine)
     inputs = np.stack([_inputs(*setting) for setting in settings])
     if not np.isfinite(inputs).all():
         raise InputError("a setting that is not finite", "RF voltage, scraper, pressure, bunches")
-    means = np.zeros(2) if corrected is not None else _typical(measured)
-    net = _network(inputs, means, hidden, seed)
-    signs = _signs(single_maximum or corrected is not None)
-    width = ALONE if corrected is None else CORRECTION
-    weight, rows = _statement(measured, floor)
-    seen = weight @ np.asarray(measured.parts).ravel()
-    base = jnp.stack([_base(corrected, *setting) for setting in settings])
+    half = np.maximum(np.ptp(inputs, axis=0) / 2, SHORTEST)
+    low, high = (inputs.min(0), inputs.max(0)) if box is None else box.corners()
+    entries = zip(INPUTS, half, inputs.mean(0), low, high, strict=True)
+    ports = [Port(name, "", 0, *scale) for name, *scale in entries]
+    outputs = [Port(name, "", scale=CORRECTION) for name in OUTPUTS]
+    net, free = signed_network("map", ports, outputs, RISING, hidden, seed, MOST)
+    terms, measured = corrected.decays.terms, corrected.decays.measured
+    weight, *_ = corrected.about(corrected.decays)
+    losses = np.array(scaled_losses(jnp.asarray(corrected.vector), terms), float)
+    base, whole = jnp.log(losses.T), block_diag(*weight)
+    seen = whole @ np.asarray(measured.parts).ravel()
 
     def fitted(wrong: Discrepancy) -> tuple[Fit, np.ndarray]:
         whiten = np.linalg.inv(wrong.root)
-        data = (jnp.asarray(inputs), base, measured.current, jnp.asarray(whiten @ weight))
+        data = (jnp.asarray(inputs), base, measured.current, jnp.asarray(whiten @ whole))
         problem = Problem(
             model={"map": net},
-            free=signed_weights("map", net, signs, MOST * width, 1.0),
+            free=free,
             records=[Record("decays", _predict, data, jnp.asarray(whiten @ seen), error=1.0)],
-            priors=[Prior("map", 0.0, width)],
+            priors=[Prior("map", 0.0, 1.0)],
         )
         fit = solve(problem, starts=starts, seed=seed, iterations=300)
-        return fit, seen - np.asarray(_predict(fit.model, (*data[:3], jnp.asarray(weight))))
+        return fit, seen - np.asarray(_predict(fit.model, (*data[:3], jnp.asarray(whole))))
 
-    pressure = 1e-9 * np.exp(inputs[:, INPUTS.index("pressure")])
-    vacuum = _line(np.asarray(measured.current), pressure)
-    length = np.maximum(LENGTH * np.ptp(inputs, axis=0) / 2, SHORTEST)
+    rows = block_diag(*(weight @ by_losses(losses[0] * np.asarray(measured.current), losses[1])))
     middle = SIZES[len(SIZES) // 2]
-    trial = Discrepancy((middle, middle), inputs, length, rows)
+    trial = Discrepancy((middle, middle), inputs, LENGTH * half, rows)
     wrong = sized(trial, *fitted(trial))
     fit, left = fitted(wrong)
-    low, high = (inputs.min(0), inputs.max(0)) if box is None else box.corners()
-    enclosed = over_cells(fit.model["map"], low, high, 2)
-    gains = np.stack([np.min(enclosed.lower, axis=0), np.max(enclosed.upper, axis=0)], axis=-1)
-    if corrected is None:
-        maximum = "certified" if single_maximum else "not asked"
-    else:
-        maximum = _maximum_seen(fit, corrected, low, high, float(measured.current.max()))
-    certificate = Certificate(low, high, gains, maximum)
-    return NetworkFit(fit, certificate, machine, corrected, wrong, vacuum, left)
+    held = certificate_of(fit.problem, fit.model["map"])
+    single = _single_maximum(fit, corrected, low, high, float(measured.current.max()))
+    return NetworkFit(fit, held, single, corrected, wrong, left)
 
 
-def _maximum_seen(
+def _single_maximum(
     fit: Fit, corrected: ScaleFit, low: np.ndarray, high: np.ndarray, current: float
-) -> str:
+) -> bool:
     """Look along the voltage at every corner of the other settings."""
     corners = itertools.product(*zip(low[1:], high[1:], strict=True))
     voltages = np.linspace(low[0], high[0], VOLTAGES)
@@ -527,7 +373,9 @@ def _maximum_seen(
             bunches=np.exp(bunches),
         )
         base = jax.lax.map(
-            lambda v, o=operation: _base(corrected, o._replace(rf_voltage=v), current),
+            lambda v, o=operation: jnp.log(
+                jnp.stack(corrected.losses_at(o._replace(rf_voltage=v), current))
+            ),
             jnp.asarray(1e6 * voltages),
         )
         rest = np.tile([scraper, pressure, bunches], (VOLTAGES, 1))
@@ -535,22 +383,5 @@ def _maximum_seen(
         a, b = np.exp(np.asarray(_logs(fit.model, (inputs, base)))).T
         turns = np.diff(np.sign(np.diff(a * current + b)))
         if np.count_nonzero(turns) > 1 or turns.min(initial=0) < 0:
-            return "broken"
-    return "seen"
-
-
-def _line(current: np.ndarray, pressure: np.ndarray) -> np.ndarray:
-    """P0 and P1 of P = P0 + P1 I, neither negative; relative errors are alike."""
-    rows = np.stack([np.ones_like(current), current], axis=1) / pressure[:, None]
-    size = np.linalg.norm(rows, axis=0)
-    return nnls(rows / size, np.ones_like(current))[0] / size
-
-
-def _typical(measured: Summaries) -> np.ndarray:
-    """Means of ln a and ln b, from the decays where both are positive."""
-    quadratic, rate = np.asarray(measured.parts).T
-    good = (quadratic > 0) & (rate > quadratic)
-    if not good.any():
-        raise InputError("no decay with positive a and b", "one at least, for a start")
-    a, b = quadratic[good] / np.asarray(measured.current)[good], (rate - quadratic)[good]
-    return np.array([np.log(a).mean(), np.log(b).mean()])
+            return False
+    return True

@@ -13,7 +13,6 @@ import numpy as np
 from jax import Array
 
 from beamfit.errors import Finding, InputError, Status, judge
-from beamfit.lifetime.decay_law import Moments, beam_current
 from beamfit.lifetime.free_law import (
     ABOVE,
     BELOW,
@@ -175,8 +174,8 @@ class _Prepared(NamedTuple):
         about = fit.about
         seen = SeenDecay.of(fit.readings, about.values)
         if fit.free_law is None and fit.correlation_time is None:
-            white = [kind == MemoryKind(WHITE) for kind in seen.products.kinds]
-            seen = seen.of_noises(np.array(white))
+            white = np.array([kind == MemoryKind(WHITE) for kind in seen.products.kinds])
+            seen = seen.of_noises(white) if white.any() else seen  # hopeless where nothing fits
         laws = [DrawnLaw.of(seen, CONSTANT)] if fit.free_law is None else proposals(seen)
         moved = [about.moved(change)[:3] for change in about.pieces.monitor_changes]
         return cls(fit, seen, laws, np.reshape(moved, (-1, 3)))
@@ -361,6 +360,12 @@ def _worth_little(e: ChainEvidence) -> Finding | None:
     return Finding(Status.not_converged, cause, remedy)
 
 
+def _expected(data: _Data, theta: Array) -> tuple[Array, Array]:
+    """Currents at the nodes over the mean, and the loss to gas in the span, that readings show."""
+    numbers = _numbers(data, theta)
+    return _nodes(data, numbers)[:, 0], numbers.b * data.span
+
+
 def expected_current(posterior: Posterior, fit) -> Expected:
     """Currents that the posterior of a decay expects at its readings, mA.
 
@@ -372,21 +377,11 @@ def expected_current(posterior: Posterior, fit) -> Expected:
         The fit.
     """
     record, data = fit.readings, posterior.target.data
-    span, mean = record.span, float(data.mean)
-    at = Moments(record.time / span, None if record.gauge is None else record.gauge / span)
-    shown = posterior.target.each(lambda data, theta: jnp.hstack(_numbers(data, theta)),
-                                  posterior.thinned())  # fmt: skip
-    taken = from_nodes(record.time / span) @ INTEGRAL
-    draws = np.empty((len(shown), len(record)))
-    for row, (i0, a, b, power, drift, pace, *walk) in zip(draws, shown, strict=True):
-        quadratic, linear = a * mean * span, b * span
-        kind, further = "drift", (linear * drift, 0.0)
-        if pace > 0:
-            kind, further = "relaxing", (linear * drift / np.expm1(-pace), 1 / pace)
-            linear = linear * (1 + drift / pace)
-        law = quadratic + linear, quadratic, power, *further
-        row[:] = mean * beam_current(i0 / mean, law, at, kind)
-        row *= np.exp(-(quadratic + b * span) * (taken @ walk))
+    at = from_nodes(record.time / record.span)
+    nodes, lost = posterior.target.each(_expected, posterior.thinned())
+    draws = record.mean_current * nodes @ at.T
+    if record.gauge is not None:  # what of it no smooth curve follows
+        draws *= np.exp(-np.outer(lost, record.gauge / record.span - at @ np.asarray(data.gas)))
     error = (
         fit.noise if record.error is None else record.error * max(1, (fit.chi2 / fit.dof) ** 0.5)
     )

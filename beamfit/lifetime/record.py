@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from beamfit.answer import Table, frame_of, shown
+from beamfit.answer import MOST_ROWS, Table, frame_of, shown
 from beamfit.errors import InputError
 from beamfit.quantity import HOUR
 
@@ -212,8 +212,6 @@ class Monitor(NamedTuple):
 
 
 FEWEST_LIFETIMES = 4
-# Readings of a record that a notebook shows.
-MOST_SHOWN = 20
 # Multiples of a digit are exact to this part of it where readings seldom repeat; so many tell.
 EXACT, ENOUGH = 1e-3, 4096
 # A pressure that departs from P0 + P1 I by less than this share of the record's mean, on average
@@ -354,7 +352,7 @@ class DecayRecord:
 
     def tables(self) -> tuple[Table, ...]:
         """The first readings, to be shown."""
-        few = range(min(len(self), MOST_SHOWN))
+        few = range(min(len(self), MOST_ROWS))
         rows = [[f"{self.time[i]:.6g}", f"{self.current[i]:.6g}"] for i in few]
         more = f"the first {len(few)} of {len(self)} readings" if len(few) < len(self) else ""
         return (Table(str(self), ["time s", "beam current mA"], rows, more, numeric=True),)

@@ -21,7 +21,7 @@ from beamfit.greybox.design import Information, scores
 from beamfit.lifetime.decay_law import current as beam_at
 from beamfit.lifetime.expansion import DETERMINED, Expansion, lifetime_of
 from beamfit.lifetime.fit import bare
-from beamfit.lifetime.loss_network import VOLTAGES, Network, NetworkFit, fit_loss_network
+from beamfit.lifetime.loss_network import VOLTAGES, NetworkFit, fit_loss_network
 from beamfit.lifetime.mechanisms import (
     MECHANISMS,
     SCALES,
@@ -558,7 +558,7 @@ class Shift:
         Whether the second half departs from a model fitted to the first; None if the first half
         does not separate the mechanisms.
     network : NetworkFit or None
-        A network of the losses, where one was asked for.
+        A network that corrects first principles, where one was asked for.
     """
 
     fit: ScaleFit
@@ -625,7 +625,7 @@ class Shift:
         tables = [labelled("First principles fitted to", [self._count], rows, NOTE)]
         if self.network is not None:
             rows = self.network.rows(self.current)
-            tables.append(labelled("A network of the losses", [self._count], rows))
+            tables.append(labelled("First principles corrected by a network", [self._count], rows))
         return tuple(tables)
 
     def _scale_rows(self) -> list[Row]:
@@ -689,7 +689,7 @@ def study_shift(
     decays: Sequence[Decay],
     machine: Machine,
     seed: int = 0,
-    network: Network | None = None,
+    network: bool = False,
     priors: Mapping[str, tuple[float, float]] | None = None,
 ) -> Shift:
     """Study the decays of a shift together.
@@ -702,8 +702,8 @@ def study_shift(
         The ring, and what the records do not say.
     seed : int, optional
         Of the random numbers.
-    network : Network, optional
-        Also fit a network of the losses: alone, or as a correction of first principles.
+    network : bool, optional
+        Also fit a network that corrects first principles.
     priors : mapping of str to (mean, standard deviation), optional
         As of `fit_scales`.
 
@@ -730,7 +730,6 @@ def study_shift(
     settings, currents = zip(*settings_of(decays, machine), strict=True)
     seen = [[float(getattr(setting, name)) for setting in settings] for name in Limits._fields]
     limits, current = Limits(*((min(values), max(values)) for values in seen)), max(currents)
-    corrected = fit if network is Network.correction else None
     return Shift(
         fit=fit,
         budget=budget_intervals(fit, sample, machine.operation, current),
@@ -739,7 +738,7 @@ def study_shift(
         best=best_operating_point(fit, sample, limits, current),
         proposals=next_decays(fit, _candidates(decays, machine, limits, current))[:3],
         anomaly=_anomaly(decays, machine, priors),
-        network=network and fit_loss_network(decays, machine, corrected, seed=seed),
+        network=fit_loss_network(decays, fit, seed=seed) if network else None,
     )
 
 

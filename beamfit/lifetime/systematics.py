@@ -294,13 +294,9 @@ def moving_lifetime(record: DecayRecord, window: float) -> LifetimeTrace:
         raise InputError(f"a window of {window:.6g} s", expected, path=record.name)
     rows = []
     for start, end in zip(first[full], last[full], strict=True):
-        at, level = time[start:end].mean(), current[start:end].mean()
-        apart, off = time[start:end] - at, current[start:end] - level
-        spread = apart @ apart
-        slope = apart @ off / spread
-        left = off - slope * apart
-        error = math.sqrt(left @ left / (apart.size - 2) / spread)
-        rows.append((at, level, slope, error))
+        at = time[start:end].mean()
+        (slope, level), spread = np.polyfit(time[start:end] - at, current[start:end], 1, cov=True)
+        rows.append((at, level, slope, math.sqrt(max(spread[0, 0], 0.0))))
     at, level, slope, error = np.transpose(rows)
     with np.errstate(divide="ignore", invalid="ignore"):
         return LifetimeTrace(at, level, -level / slope / HOUR, level * error / slope**2 / HOUR)

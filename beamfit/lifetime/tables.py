@@ -225,7 +225,7 @@ def _part(budget: Budget, kind: str, mechanism: Mechanism) -> str:
     return f"{value:.4g} {unit} ({share:.3g} % of the loss)"
 
 
-def overview(decays: Sequence[Decay]) -> list[tuple[str, list[str], list[list[str]]]]:
+def overview(decays: Sequence[Decay]) -> list[Table]:
     """The main numbers of many decays, one row each.
 
     Parameters
@@ -235,8 +235,7 @@ def overview(decays: Sequence[Decay]) -> list[tuple[str, list[str], list[list[st
 
     Returns
     -------
-    list of (str, list of str, list of list of str)
-        Title, header and rows of each table.
+    list of Table
     """
     main = {"Result": _main, "a and b": _a_and_b}
     main |= {"Losses from first principles": _computed} if _budgets_known(decays) else {}
@@ -247,7 +246,7 @@ def overview(decays: Sequence[Decay]) -> list[tuple[str, list[str], list[list[st
             [names[decay.fit.record], *map(cell, cells.values())]
             for decay, cells in zip(decays, found, strict=True)
         ]
-        tables.append((title, ["decay", *found[0]], rows))
+        tables.append(Table(title, ["decay", *found[0]], rows))
     return tables
 
 

@@ -15,24 +15,23 @@ import numpy as np
 from beamfit.answer import json_of
 from beamfit.errors import InputError
 from beamfit.lifetime import alarm
-from beamfit.lifetime.course import BEST_MONITOR, reference_of
+from beamfit.lifetime.course import BEST_MONITOR, normalised, reference_of
 from beamfit.lifetime.cycles import alike, cut_at_refills, joined, usual_cycle
 from beamfit.lifetime.evidence import UNITS
 from beamfit.lifetime.fit import DecayFit, bare, fit_decay, fit_pieces
 from beamfit.lifetime.free_law import Law
 from beamfit.lifetime.mechanisms import added, loss_coefficients, terms_of
-from beamfit.lifetime.pieces import DROPOUT, FEWEST, GAP
+from beamfit.lifetime.pieces import DROPOUT, FEWEST
 from beamfit.lifetime.record import PLAUSIBLE, Conditions, DecayRecord
 from beamfit.lifetime.study import (
     CHANGED,
     Decay,
     Machine,
     at_settings,
-    budget,
     operation_during,
     seen_through,
 )
-from beamfit.quantity import HOUR, Quantity, Status
+from beamfit.quantity import Quantity, Status
 
 
 class WindowRow(NamedTuple):
@@ -74,6 +73,10 @@ class Window(NamedTuple):
     pieces: int
     why: str = ""
 
+    def decay(self, machine: Machine | None) -> Decay:
+        """The decays as one, with the losses of a ring; `InputError` if it stores no beam there."""
+        return Decay.of(self.readings, 0.0, self.fit, machine)
+
 
 class Answer(NamedTuple):
     """Answer of the window.
@@ -86,9 +89,9 @@ class Answer(NamedTuple):
         The fit.
     status, message : Status, str
         Of the fit, or why there is none.
-    lifetime, a, b, normalised : Quantity or None
-        At the mean current, h; 1/(mA s); 1/s; current times lifetime, mA h, by the ring at the
-        reference current and its usual settings. None where the readings do not determine it.
+    normalised : Quantity or None
+        Current times lifetime, mA h, by the ring at the reference current and its usual settings.
+        None where the readings do not determine it.
     """
 
     time: float
@@ -96,10 +99,26 @@ class Answer(NamedTuple):
     window: Window
     status: Status
     message: str
-    lifetime: Quantity | None = None
-    a: Quantity | None = None
-    b: Quantity | None = None
     normalised: Quantity | None = None
+
+    @property
+    def lifetime(self) -> Quantity | None:
+        """At the mean current, h; None where the readings do not determine it."""
+        return self._told("lifetime_mean")
+
+    @property
+    def a(self) -> Quantity | None:
+        """1/(mA s), likewise."""
+        return self._told("a")
+
+    @property
+    def b(self) -> Quantity | None:
+        """1/s, likewise."""
+        return self._told("b")
+
+    def _told(self, name: str) -> Quantity | None:
+        found = self.window.fit and getattr(self.window.fit, name)
+        return found if found and found.error is not None else None
 
     def to_json(self) -> dict[str, Any]:
         """Return it as `beamfit lifetime --json` does a decay, with what is normalised."""
@@ -159,27 +178,6 @@ def fit_window(rows: Sequence[WindowRow], name: str, law: Law = Law.free) -> Win
     except InputError as error:  # a current that rises
         return Window(None, one, len(group), error.found)
     return Window(fit, one, len(group))
-
-
-def normalised(window: Window, machine: Machine | None, current: float | None) -> Quantity | None:
-    """Current times lifetime, mA h, as of `trend`; None where the readings do not tell it.
-
-    Raises
-    ------
-    InputError
-        If the ring stores no beam at the settings of the window.
-    """
-    lifetime, mean = window.fit.lifetime_mean, window.fit.mean_current
-    if lifetime.error is None:
-        return None
-    if machine is None:
-        by = mean
-    else:
-        current = current or mean
-        usual = loss_coefficients(machine.ring, machine.operation, current)
-        expected = budget(window.readings, machine).lifetime * HOUR
-        by = current / expected / float(usual.a * current + usual.b)
-    return Quantity(by * lifetime.value, by * lifetime.error, "mA h")
 
 
 def _fitted(group: list[DecayRecord], name: str, law: Law) -> DecayFit:
@@ -289,7 +287,6 @@ def _usual(window: Window, machine: Machine | None) -> alarm.Reference | None:
     or the loss rate and a ring their ratio.
     """
     fit, ring = window.fit, None
-    decay = Decay(window.readings, 0.0, fit, None)
     refuted = fit.constant_a is not None and fit.constant_a.status is Status.poor_fit
     if refuted or fit.status not in (Status.converged, Status.unidentified):
         return None
@@ -299,12 +296,12 @@ def _usual(window: Window, machine: Machine | None) -> alarm.Reference | None:
             return None
         known = (fit.lifetime_mean,)
         try:
-            ring = budget(window.readings, machine).losses
+            ring = window.decay(machine).budget.losses
         except InputError:
             return None
     if not all(one.error and abs(one.relative) < KNOWN for one in known):
         return None
-    return reference_of((decay,), np.ones(1), np.ones(1), ring)
+    return reference_of((window.decay(None),), np.ones(1), np.ones(1), ring)
 
 
 def _terms(machine: Machine, before: Terms | None, row: WindowRow) -> Terms:
@@ -351,12 +348,11 @@ def followed(known: Alarmed, row: WindowRow, apart: float, machine: Machine | No
 
 
 CURRENT = "beam_current"
-# Dead readings in a row from which the beam is gone.
-DEAD = 5
+# Readings in a row that are believed against all before: of no beam, of a far higher one, and of
+# a clock that was set back.
+IN_A_ROW = 5
 # A window is kept as the means of readings over so many parts of it.
 ROWS = 4096
-# So many readings in a row, each older than the newest before them, are of a clock set back.
-LATE = 5
 # Beyond what a ring stores, mA, or a clock shows, s, a reading is none.
 MOST, LATEST = (math.inf, 1e6), 1e11
 # Events and points of the course that are kept.
@@ -536,7 +532,7 @@ def _current(plan: Plan, state: State, time: float, value: float) -> State:
     if own <= last:
         return _behind(plan, state, time, value)
     apart, usual = own - last, state.interval
-    if usual and apart > max(GAP * usual, alarm.MINUTE):
+    if usual and alarm.is_gap(apart, usual):
         said = f"no reading for {apart:.0f} s, or the clock was set forward"
         state = _counted(noted(_cut(plan, state), time, said), gaps=1)
     interval = usual * (1.2 if apart > usual else 1 / 1.2) if usual else apart
@@ -547,7 +543,7 @@ def _behind(plan: Plan, state: State, time: float, value: float) -> State:
     """A reading no newer than the last."""
     count, latest = state.late
     count = count + 1 if time > latest else 1
-    if count < LATE:
+    if count < IN_A_ROW:
         return _counted(state._replace(late=(count, time)), late=1)
     said = f"the clock was set back by {state.last - state.shift - time:.0f} s"
     state = _counted(noted(_cut(plan, state), time, said), clock=1)
@@ -565,12 +561,12 @@ def _placed(plan: Plan, state: State, own: float, value: float) -> State:
     """A reading into its row, if there is a beam."""
     state, time = state._replace(last=own), own - state.shift
     if not value > DROPOUT * state.highest:
-        if state.dead + 1 == DEAD:
+        if state.dead + 1 == IN_A_ROW:
             state = noted(_cut(plan, state), time, "the beam was lost")
         return state._replace(dead=state.dead + 1)
-    if state.dead >= DEAD:
+    if state.dead >= IN_A_ROW:
         state = noted(state, time, "beam again")
-    if state.highest and DROPOUT * value > state.highest and state.spikes + 1 < DEAD:
+    if state.highest and DROPOUT * value > state.highest and state.spikes + 1 < IN_A_ROW:
         return _counted(state._replace(spikes=state.spikes + 1), bad=1)
     count, begin, times, currents = state.sums
     refilled = count and value - currents / count > alarm.JUMP * state.noise
@@ -603,7 +599,7 @@ def _answered(plan: Plan, state: State) -> State:
     state = _kept(state, begin)
     none = Window(None, None, 0, "no beam")
     law = Law.free if plan.machine is None else Law.constant  # a ring knows more of its law
-    window = fit_window(state.rows, plan.name, law) if state.dead < DEAD else none
+    window = fit_window(state.rows, plan.name, law) if state.dead < IN_A_ROW else none
     answer = _answer(plan, state, window)
     found = answer.lifetime
     known = (found.value, found.error) if found else (math.nan, math.nan)
@@ -631,17 +627,19 @@ def _noise_of_one(plan: Plan, state: State, noise: float) -> float:
 
 
 def _answer(plan: Plan, state: State, window: Window) -> Answer:
-    current = state.rows[-1].current if state.rows and state.dead < DEAD else 0.0
+    current = state.rows[-1].current if state.rows and state.dead < IN_A_ROW else 0.0
     time, fit = state.last - state.shift, window.fit
     if fit is None:
         return Answer(time, current, window, Status.unidentified, f"No lifetime: {window.why}.")
-    known = [None if q.error is None else q for q in (fit.lifetime_mean, fit.a, fit.b)]
-    scaled, message = None, fit.message
+    answer = Answer(time, current, window, fit.status, fit.message)
+    if answer.lifetime is None:
+        return answer
+    machine, at = plan.machine, plan.current or fit.mean_current
     try:
-        scaled = normalised(window, plan.machine, plan.current)
+        ring = None if machine is None else loss_coefficients(*machine, at)
+        return answer._replace(normalised=normalised(window.decay(machine), ring, at))
     except InputError as error:
-        message += f" Not normalised: {error}."
-    return Answer(time, current, window, fit.status, message, *known, scaled)
+        return answer._replace(message=f"{fit.message} Not normalised: {error}.")
 
 
 def nothing_yet(state: State) -> Answer:

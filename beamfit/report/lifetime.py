@@ -128,8 +128,8 @@ def _side_by_side(decays: Sequence[Decay]) -> list[Table]:
 def _single(decays: Sequence[Decay]) -> list[Table]:
     """Every number of a few decays; the main numbers of many, one row each."""
     if len(decays) > tables.FEW:
-        many = tables.overview(decays)
-        return [Table(*each, note=ERRORS if each[0] == "Result" else "") for each in many]
+        result, *more = tables.overview(decays)
+        return [result._replace(note=ERRORS), *more]
     listed = _side_by_side(decays)
     for d in (d for d in decays if d.systematics):
         listed.append(tables.systematic_table(d, f"Systematics of {d.fit.record}"))

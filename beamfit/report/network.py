@@ -1,4 +1,4 @@
-"""Pictures of a network of the losses: the report's figures 27 to 30, and a, b by the settings."""
+"""Pictures of a network on first principles: the report's figures 27 to 30, a, b by settings."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from matplotlib.figure import FigureBase
 from beamfit.lifetime.decay_law import current
 from beamfit.lifetime.ring import Operation
 from beamfit.lifetime.ring_study import Shift
-from beamfit.lifetime.study import Decay, operation_during
+from beamfit.lifetime.study import Decay, operation_during, pressure_at
 from beamfit.quantity import HOUR
 from beamfit.report.document import BLUE, RED, Picture, legend_below
 
@@ -20,6 +20,8 @@ from beamfit.report.document import BLUE, RED, Picture, legend_below
 POINTS = 33
 # Decays drawn, as many as in the report's figure.
 SHOWN = 4
+# Decays whose mean current is within this share of the highest one are drawn beside curves of it.
+NEAR = 0.25
 SETTINGS = {
     "rf_voltage": (1e6, "RF voltage, MV"),
     "scraper_y": (1e-3, "scraper, mm"),
@@ -67,7 +69,7 @@ def draw_decays(figure: FigureBase, shift: Shift, decays: Sequence[Decay]) -> No
     for axes, row in zip(panels, rows, strict=False):
         decay = decays[row]
         segment, fit = decay.segment, decay.fit
-        operation = operation_during(segment, network.machine)
+        operation = operation_during(segment, shift.fit.machine)
         a, b, _ = network.predict(operation, fit.mean_current)
         hours = segment.time / HOUR
         law = np.asarray(current(segment.time, fit.i0.value, a.value, b.value))
@@ -101,9 +103,11 @@ def draw_by_setting(figure: FigureBase, shift: Shift, decays: Sequence[Decay], n
     network = shift.network
     scale, label = SETTINGS[name]
     at = np.linspace(*getattr(shift.limits, name), POINTS)
-    settings = [network.usual._replace(**{name: float(value)}) for value in at]
+    usual = _in_their_vacuum(shift, decays)
+    settings = [usual._replace(**{name: float(value)}) for value in at]
     told = [network.predict(one, shift.current) for one in settings]
-    first = [_first_principles(shift, one) for one in settings]
+    first = np.array([shift.fit.losses_at(one, shift.current) for one in settings])
+    first = np.column_stack([first, 1 / (first @ [shift.current, 1.0]) / HOUR])
     points = _measured(shift, decays, name)
     units = ("a, 1/(mA s)", "b, 1/s", f"lifetime at {shift.current:.3g} mA, h")
     panels = figure.subplots(1, 3)
@@ -112,13 +116,29 @@ def draw_by_setting(figure: FigureBase, shift: Shift, decays: Sequence[Decay], n
         error = np.array([np.nan if one[k].error is None else one[k].error for one in told])
         axes.fill_between(at / scale, value - error, value + error, color=RED, alpha=0.2, lw=0)
         axes.plot(at / scale, value, color=RED, label="network, one error")
-        axes.plot(
-            at / scale, [one[k] for one in first], color="0.5", ls="--", label="first principles"
-        )
+        axes.plot(at / scale, first[:, k], color="0.5", ls="--", label="first principles")
         _points(axes, points, k, scale)
         axes.set(xlabel=label)
         axes.set_title(unit, fontsize="small")
     legend_below(figure, panels[0], 3)
+
+
+def _in_their_vacuum(shift: Shift, decays: Sequence[Decay]) -> Operation:
+    """The usual settings, at the pressure that decays near the current have."""
+    machine, current = shift.fit.machine, shift.current
+    usual = machine.operation
+    read = [
+        pressure_at(operation_during(decay.segment, machine), current)
+        for decay in decays
+        if _is_near(decay, current)
+    ]
+    share = float(np.median(read)) / pressure_at(usual, current)
+    base, slope = share * usual.pressure_base, share * usual.pressure_slope
+    return usual._replace(pressure_base=base, pressure_slope=slope)
+
+
+def _is_near(decay: Decay, current: float) -> bool:
+    return abs(decay.fit.mean_current / current - 1) < NEAR
 
 
 def _points(axes: Axes, points: list[tuple[float, list]], k: int, scale: float) -> None:
@@ -128,29 +148,14 @@ def _points(axes: Axes, points: list[tuple[float, list]], k: int, scale: float) 
         axes.errorbar(at, value, error, fmt="o", ms=4, color=BLUE, label="decays")
 
 
-def _first_principles(shift: Shift, operation: Operation) -> tuple[float, float, float]:
-    """a, b and lifetime with the scales of the study, at the same pressure.
-
-    A scale is on the ring file's own P1/P0.
-    """
-    machine, at = shift.fit.machine, shift.current
-    usual = machine.operation
-    pressure = operation.pressure_base + operation.pressure_slope * at
-    share = pressure / (usual.pressure_base + usual.pressure_slope * at)
-    operation = operation._replace(
-        pressure_base=share * usual.pressure_base, pressure_slope=share * usual.pressure_slope
-    )
-    a, b = shift.fit.losses_at(operation, at)
-    return float(a), float(b), float(1 / (a * at + b) / HOUR)
-
-
 def _measured(shift: Shift, decays: Sequence[Decay], name: str) -> list[tuple[float, list]]:
     """Decays near the current and the usual settings but for one: its value, and what they say."""
-    usual, found = shift.network.machine.operation, []
+    machine, found = shift.fit.machine, []
+    usual = machine.operation
     others = [setting for setting in SETTINGS if setting != name]
     for decay in decays:
-        at = operation_during(decay.segment, shift.network.machine)
-        near = abs(decay.fit.mean_current / shift.current - 1) < 0.25
+        at = operation_during(decay.segment, machine)
+        near = _is_near(decay, shift.current)
         if near and all(np.isclose(getattr(at, o), getattr(usual, o), rtol=0.01) for o in others):
             fit = decay.fit
             found.append((float(getattr(at, name)), [fit.a, fit.b, fit.lifetime_mean]))

@@ -11,8 +11,9 @@ import pytest
 import beamfit
 from beamfit.emittance.assumptions import Assumptions
 from beamfit.emittance.statement import prepare
-from beamfit.emittance.transport_network import SCENARIO, certificate_of
+from beamfit.emittance.transport_network import SCENARIO
 from beamfit.errors import InputError
+from beamfit.greybox.signed_network import certificate_of
 from tests.greybox.appendices import (
     CURRENTS,
     LIMITS,

@@ -13,9 +13,9 @@ from beamfit.emittance.calibration import with_numbers
 from beamfit.emittance.model import UNIT, asked_numbers
 from beamfit.emittance.statement import asked_of, prepare
 from beamfit.emittance.transport_network import SCENARIO as TRANSPORT_NETWORK
-from beamfit.emittance.transport_network import certificate_of
 from beamfit.errors import InputError
 from beamfit.greybox.bounds import over_cells
+from beamfit.greybox.signed_network import certificate_of
 from beamfit.greybox.solve import solve
 from beamfit.optics.calibration import IntegratedGradient, SlopeIntercept
 from beamfit.optics.elements import Quadrupole, Screen

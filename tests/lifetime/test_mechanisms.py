@@ -12,12 +12,15 @@ import pytest
 
 from beamfit.errors import InputError
 from beamfit.io.ring import read_operation, read_ring, ring_from_pyat
-from beamfit.lifetime.gas import (
+from beamfit.lifetime.mechanisms import (
     bremsstrahlung_cross_section,
     elastic_cross_section,
     gas_rate_coefficient,
+    loss_coefficients,
+    piwinski_rate,
+    piwinski_shape,
+    touschek_shape,
 )
-from beamfit.lifetime.mechanisms import loss_coefficients
 from beamfit.lifetime.ring import (
     bunch_in_bucket,
     equal_bunches,
@@ -26,11 +29,6 @@ from beamfit.lifetime.ring import (
     population,
     quantum_rate,
     vertical_acceptance,
-)
-from beamfit.lifetime.touschek import (
-    piwinski_rate,
-    piwinski_shape,
-    touschek_shape,
 )
 from tests.lifetime.bruck import bruck_rate, bruck_shape
 

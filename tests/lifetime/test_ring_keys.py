@@ -15,8 +15,7 @@ from scipy.special import gamma
 from beamfit.errors import InputError
 from beamfit.io.decay_record import read_decay_record
 from beamfit.io.ring import read_operation, read_ring
-from beamfit.lifetime.gas import elastic_cross_section
-from beamfit.lifetime.mechanisms import loss_coefficients
+from beamfit.lifetime.mechanisms import elastic_cross_section, loss_coefficients, piwinski_rate
 from beamfit.lifetime.ring import (
     HarmonicCavity,
     bunch_in_bucket,
@@ -25,7 +24,6 @@ from beamfit.lifetime.ring import (
     stored_bunch,
 )
 from beamfit.lifetime.study import Machine, budget, operation_during
-from beamfit.lifetime.touschek import piwinski_rate
 from tests.lifetime.test_mechanisms import spear3_cells
 
 SPEAR3 = Path("lattices/spear3_2003.toml")

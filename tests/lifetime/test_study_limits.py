@@ -147,9 +147,8 @@ def test_a_correction_begins_at_the_voltage_that_was_found(machine):
     """The network of decays that follow first principles is zero: it had to mend 1 % of voltage."""
     decays = read_low(machine)
     free = fit_scales(decays, machine, priors={"rf_voltage": PRIOR})
-    network = fit_loss_network(decays, machine, free, starts=1)
-    held = network.certificate
-    points = np.linspace(held.lower, held.upper, 9)
+    network = fit_loss_network(decays, free, starts=1)
+    points = np.linspace(*np.transpose([*network.certificate.box.values()]), 9)
     added = np.array([network.fit.model["map"].values(point)[0] for point in points])
     assert np.abs(added).max() < 4e-3  # of ln a; it was up to 2.8 %
 
