@@ -67,7 +67,8 @@ def _numbers(decay: Decay) -> Cells:
         "95 % interval of a": fit.a.interval_words,
         "95 % interval of b": fit.b.interval_words,
     }
-    if fit.first is None and fit.free_law is not None:
+    refuted = fit.constant_a is not None and fit.constant_a.status is Status.poor_fit
+    if fit.first is None and fit.free_law is not None and not refuted:
         numbers |= {f"{name} if a and b are constant": fit.if_constant(name) for name in "ab"}
     worth = f"{fit.chi2:.4g}/{fit.dof} = {_reduced_chi2(fit)}"
     if fit.noise_inferred:
