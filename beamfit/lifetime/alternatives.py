@@ -289,7 +289,7 @@ class SuddenLoss(NamedTuple):
 class Rival(NamedTuple):
     """The explanation that is better than a smooth law, and by how much.
 
-    `odds` is the logarithm of its probability over that of a power of a with a drift of b,
+    `odds` is the logarithm of its probability over that of a loss rate that drifts or wanders,
     `scatter` what it leaves of the readings, mA rms, and `quantities` has its I0 and lifetimes.
     """
 
@@ -301,7 +301,7 @@ class Rival(NamedTuple):
     def __str__(self) -> str:
         size = self.odds / math.log(10.0)
         times = f"{10**size:.2g}" if size < 6 else f"1e{size:.0f}"
-        return f"{self.found} ({times} times likelier than a power of a with a drift of b)"
+        return f"{self.found} ({times} times likelier than a loss rate that drifts or wanders)"
 
 
 def rival_of(plain: Expansion) -> Rival | None:
