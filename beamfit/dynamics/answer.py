@@ -245,13 +245,6 @@ def judged(found: Mapping[str, ResponseEvidence]) -> tuple[Status, str]:
     raise AssertionError("the last rule always finds something")
 
 
-def rms_of(fit: Fit) -> float:
-    """The noise of all runs, as the fit weighs them."""
-    found = [float(group.scale * np.mean(np.asarray(record.error)))
-             for group, record in zip(fit.groups, fit.problem.records, strict=True)]  # fmt: skip
-    return float(np.sqrt(np.mean(np.square(found))))
-
-
 def _lost(e: ResponseEvidence) -> Finding | None:
     if e.rests:
         return None

@@ -19,11 +19,18 @@ from beamfit.dynamics.model import (
 )
 from beamfit.dynamics.record import Run
 from beamfit.dynamics.response import FIRST_ORDER, Physics
-from beamfit.dynamics.search import driven_by, unit_outputs
+from beamfit.dynamics.search import (
+    DRIFT,
+    drift_columns,
+    driven_by,
+    unit_outputs,
+    whitened_rows,
+)
 from beamfit.greybox.fit import Fit
+from beamfit.noise.memory import CorrelatedNoise
 
-# Most lags of residuals, of earlier inputs, of later inputs, and of the whitening autoregression.
-LAGS, PAST, LATER, ORDER = 20, 10, 5, 8
+# Most lags of residuals, of earlier inputs, and of later inputs.
+LAGS, PAST, LATER = 20, 10, 5
 # Time constants of the additional paths in the test for a fuller model.
 SLOW = 5
 # An input is band-limited if its changes have less than the share `FAINT` of their power above the
@@ -119,6 +126,7 @@ def percent(rest: np.ndarray, y: np.ndarray) -> float:
 def checks_of(
     seen: PreparedOutput,
     residuals: tuple[np.ndarray, ...],
+    noise: RunNoises,
     slopes: Sequence[RunSlopes],
     used: int,
     gain: float | None,
@@ -128,17 +136,16 @@ def checks_of(
 
     `slopes` has those of the output by the model's own numbers, and what fuller models would add.
     """
-    y = np.concatenate([m - m.mean() for m in seen.measured])
+    y = [m - m.mean() for m in seen.measured]
     rest = np.concatenate(residuals)
-    ahead = np.concatenate([_whitened(r, [_share(residuals)]) for r in residuals])
-    (explained, chance), (later, fed) = _explained(seen, residuals, slopes, delay)
-    white = _white(residuals)
+    (explained, chance), (later, fed) = _explained(seen, residuals, noise, slopes, delay)
+    white = _white([r / error for r, error in zip(residuals, noise.errors, strict=True)])
     if rest.std() <= CLOSE * seen.size_y:  # what is left is rounding, or the network's own detail
         explained, chance, later, fed, white = 0.0, 1.0, 0.0, 1.0, 1.0
     return Checks(
-        percent(rest, y),
-        percent(ahead, y),
-        _chance(y, rest, used),
+        percent(rest, np.concatenate(y)),
+        percent(noise.ahead(residuals), np.concatenate(y)),
+        _chance(noise.white(y), noise.white(residuals), used),
         white,
         chance,
         explained,
@@ -182,30 +189,45 @@ def _chance(y: np.ndarray, rest: np.ndarray, used: int) -> float:
     return float(f.sf((whole - left) / used / max(left / free, 1e-300), used, free))
 
 
-def _share(residuals: tuple[np.ndarray, ...]) -> float:
-    """Correlation of neighbours."""
-    both = sum(float(r[1:] @ r[:-1]) for r in residuals)
-    return float(np.clip(both / max(sum(float(r @ r) for r in residuals), 1e-300), 0.0, 0.999))
+class RunNoises(NamedTuple):
+    """Noise of an output: times and errors of the readings of each run, and the memory."""
+
+    times: Sequence[np.ndarray]
+    errors: Sequence[np.ndarray]
+    memory: CorrelatedNoise | None
+
+    def white(self, parts: Sequence[np.ndarray]) -> np.ndarray:
+        """Columns of readings, by run, in noise without a memory and of size 1."""
+        each = zip(parts, self.errors, self.times, strict=True)
+        return np.concatenate([
+            np.asarray(whitened_rows(part / np.expand_dims(error, tuple(range(1, part.ndim))),
+                                     time, self.memory)[0])
+            for part, error, time in each
+        ])  # fmt: skip
+
+    def drift(self, own: np.ndarray, rest: np.ndarray) -> np.ndarray:
+        """Cosines of a drift that whitened residuals show beside a model's own slopes, as many as
+        the Bayesian information criterion wants.
+        """
+        count, runs = len(rest), len(self.times)
+        waves = self.white([np.asarray(drift_columns(self.times, i)).reshape(len(t), -1)
+                            for i, t in enumerate(self.times)])  # fmt: skip
+        triangle = np.linalg.qr(np.column_stack([_basis(own), waves, rest]), mode="r")
+        least = np.cumsum(triangle[::-1, -1] ** 2)[::-1]
+        used = len(triangle) - 1 - runs * np.arange(DRIFT, -1, -1)
+        cost = count * np.log(np.maximum(least[used], np.finfo(float).tiny)) + np.log(count) * used
+        return waves[:, : runs * int(cost.argmin())]
+
+    def ahead(self, residuals: Sequence[np.ndarray]) -> np.ndarray:
+        """Residuals of predictions from the readings before."""
+        found = []
+        for r, error, time in zip(residuals, self.errors, self.times, strict=True):
+            white, volume = whitened_rows(r / error, time, self.memory)
+            found.append(np.asarray(white) * error * np.exp(float(volume) / len(r)))
+        return np.concatenate(found)
 
 
-def _whitened(r: np.ndarray, memory: Sequence[float] | np.ndarray) -> np.ndarray:
-    """Residuals less their prediction from earlier ones; the first ones are dropped."""
-    order = len(memory)
-    return r[order:] - sum(m * r[order - k : -k] for k, m in enumerate(memory, start=1))
-
-
-def _memory(residuals: tuple[np.ndarray, ...]) -> np.ndarray:
-    """Autoregression of the residuals, by least squares.
-
-    With a first order alone, white noise on top of a drift would stay coloured.
-    """
-    order = max(1, min(ORDER, min(map(len, residuals)) // 20))
-    before = [np.stack([r[order - k : -k] for k in range(1, order + 1)], axis=1) for r in residuals]
-    after = np.concatenate([r[order:] for r in residuals])
-    return np.linalg.lstsq(np.vstack(before), after, rcond=1e-10)[0]
-
-
-def _white(residuals: tuple[np.ndarray, ...]) -> float:
+def _white(residuals: Sequence[np.ndarray]) -> float:
     count = sum(map(len, residuals))
     lags = min(LAGS, count // 5)
     squares = max(sum(float(r @ r) for r in residuals), 1e-300)
@@ -217,6 +239,7 @@ def _white(residuals: tuple[np.ndarray, ...]) -> float:
 def _explained(
     seen: PreparedOutput,
     residuals: tuple[np.ndarray, ...],
+    noise: RunNoises,
     slopes: Sequence[RunSlopes],
     delay: int,
 ) -> tuple[tuple[float, float], tuple[float, float]]:
@@ -227,29 +250,24 @@ def _explained(
     further paths of first order, and the slopes of the output by parameters that change with the
     operating point, less what the model's own numbers can do.
     """
-    memory = _memory(residuals)
-    own, quick, later, targets = [], [], [], []
-    for run, r, each in zip(seen.runs, residuals, slopes, strict=True):
+    own, quick, later = [each.own for each in slopes], [], []
+    for run, each in zip(seen.runs, slopes, strict=True):
         u = seen.scaled(run.u)
         index = np.asarray(run.index)
         past = [u[np.clip(index + k, 0, len(u) - 1)] for k in range(-PAST, delay)]
         after = [u[np.clip(index + delay + k, 0, len(u) - 1)] for k in range(LATER)]
         later.append(np.concatenate(after, axis=1))
         quick.append(np.concatenate([*past, each.changing], axis=1))
-        own.append(each.own)
-        targets.append(r)
-
-    def white(parts: list[np.ndarray]) -> np.ndarray:
-        return np.concatenate([_whitened(part, memory) for part in parts])
-
-    slow, basis = slow_paths(seen), _basis(white(own))
-    rest = white(targets)
+    own, slow, quick, later = (noise.white(part) for part in (own, slow_paths(seen), quick, later))
+    rest = noise.white(residuals)
+    own = np.hstack([own, noise.drift(own, rest)])
+    basis = _basis(own)
     rest = rest - basis @ (basis.T @ rest)
-    few, more = (_tested(rest, basis, white(columns)) for columns in (slow, quick))
+    few, more = (_tested(rest, basis, columns) for columns in (slow, quick))
     share, chance = min(few, more, key=lambda each: each[1])
-    basis = _basis(np.hstack([white(columns) for columns in (own, slow, quick)]))
+    basis = _basis(np.hstack([own, slow, quick]))
     rest = rest - basis @ (basis.T @ rest)
-    return (share, min(2.0 * chance, 1.0)), _tested(rest, basis, white(later))
+    return (share, min(2.0 * chance, 1.0)), _tested(rest, basis, later)
 
 
 def slow_paths(seen: PreparedOutput) -> list[np.ndarray]:

@@ -17,11 +17,17 @@ from beamfit.dynamics.answer import (
     judged,
     limit_words,
     quantities_of,
-    rms_of,
     told,
 )
 from beamfit.dynamics.bad_readings import BadReadings, sound
-from beamfit.dynamics.checks import Checks, HeldOutRun, checks_of, predict_held, slopes_of
+from beamfit.dynamics.checks import (
+    Checks,
+    HeldOutRun,
+    RunNoises,
+    checks_of,
+    predict_held,
+    slopes_of,
+)
 from beamfit.dynamics.input_laws import laws_of, shorter
 from beamfit.dynamics.limits import LagLimits, lag_limits
 from beamfit.dynamics.model import PreparedOutput, network_of, output_of
@@ -225,11 +231,13 @@ def identify(
     fit, late = answer.fit, found.delay
     ahead = tuple(predict_held(each, output, fit, physics, late) for each in held)
     evidence = (fit, answer.rests, checks, quantities, curves, ahead, map)
-    status, message = judged({output: ResponseEvidence(*evidence, rms_of(fit))})
+    status, message = judged(
+        {output: ResponseEvidence(*evidence, float(np.sqrt(np.mean(answer.rms**2))))}
+    )
     longest = [LATEST] if delay is None and late == latest(runs) > 0 else []
     message = " ".join([message, *longest, *(f"Left out: {each}." for each in left_out)])
     late = late if late % 1 == 0 else late + float(fit.model["late"])
-    noise = tuple(answer.noise[:, 0].tolist())
+    noise = tuple(answer.rms[:, 0].tolist())
     parts = (quantities, curves, noise, answer.memory, checks, ahead, left_out)
     return ResponseFit(output, status, message, model, map, late, runs, found.seen, fit, *parts)
 
@@ -251,6 +259,7 @@ def _known(
     checks = checks_of(
         seen,
         tuple(rest for (rest,) in answer.rest),
+        RunNoises(seen.time, [noise.each for (noise,) in answer.noise], answer.likely),
         slopes,
         used_by(answer.fit),
         None if constant else found.plain.likelihood - answer.likelihood,

@@ -190,11 +190,11 @@ def _candidates(
 def _triangles(chosen: Any, model: Any, run: Driven, data: Any, theta: Any, u: Any, noise: Any):
     """Triangular factors of slopes and residuals of each law, and log volumes, by each noise.
 
-    `data` are readings, their times, the size of their noise, and what is added; `noise` all that
+    `data` are readings, their times, their errors, and what is added; `noise` all that
     are looked at, which of them first, and how many. The last number is the share of what is added,
     or by how much the width of a law is another.
     """
-    y, time, size, term = data
+    y, time, error, term = data
     every, order, count = noise
 
     def one(theta, u, term):
@@ -205,7 +205,8 @@ def _triangles(chosen: Any, model: Any, run: Driven, data: Any, theta: Any, u: A
         return with_slope(output, theta)
 
     value, slope = jax.vmap(one)(theta, u, term)
-    rows = jnp.concatenate([slope, (value - y)[..., None]], axis=2)[:, :MOST] / size
+    rows = jnp.concatenate([slope, (value - y)[..., None]], axis=2)[:, :MOST]
+    rows = rows / error[:MOST, None]
     rows = jnp.swapaxes(jnp.clip(jnp.nan_to_num(rows, nan=VAST), -VAST, VAST), 0, 1)
 
     def whiten(k, found):
@@ -248,8 +249,8 @@ class _LawFits(NamedTuple):
         order = np.array([*noises, *range(g - len(noises))])
         triangles, volume, count = [], 0.0, 0
         for run, *data, term, u in zip(
-            seen.runs, seen.measured, seen.time, self.found.noise[:, 0],
-            self.candidates.terms, self.candidates.inputs, strict=True,
+            seen.runs, seen.measured, seen.time,
+            [noise.each for (noise,) in self.found.noise], self.candidates.terms, self.candidates.inputs, strict=True,
         ):  # fmt: skip
             noise = self.grid, order, len(noises)
             each = _triangles(core.chosen, core.model, run, (*data, term), theta, u, noise)

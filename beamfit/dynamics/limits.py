@@ -79,7 +79,8 @@ class _Lags(NamedTuple):
             first = np.zeros((len(y), len(runs) * k))
             first[:, i * k : (i + 1) * k] = columns[:, -k:]
             level = np.ones((len(y), int(self.offset)))
-            parts.append(np.hstack([columns[:, :-k], first, level, y[:, None]])[:LONGEST])
+            part = np.hstack([columns[:, :-k], first, level, y[:, None]])
+            parts.append((part / self.found.noise[i][0].each[:, None])[:LONGEST])
         time = [each[:LONGEST] for each in self.seen.time]
         both = np.concatenate(parts)
         both[:, :-1] = np.linalg.qr(both[:, :-1])[0]
