@@ -67,11 +67,19 @@ class Checks(NamedTuple):
     first_order : bool
         Whether a first order does as well.
     law : str or None
-        The law of an input that is likelier than none: its name, input and half width.
+        The law of an input that is likelier than none, or the laws between which the runs do not
+        tell, in words.
     law_probability : float
         Its probability, where no law and laws of inputs are all that can be.
+    static_law : bool
+        Whether it is one of the value alone, whatever came before.
     band_limited : tuple of str
         Inputs without high frequencies, which move between samples; that goes with later inputs.
+    delay_growth : float
+        Samples by which the delay grows along the record, if this is what explains the residuals
+        best: clocks of input and output then run at different rates. Else 0.
+    jitter : float
+        Standard deviation of the times of readings about those of the record, s.
     """
 
     free_run_percent: float
@@ -87,7 +95,10 @@ class Checks(NamedTuple):
     first_order: bool = False
     law: str | None = None
     law_probability: float = 0.0
+    static_law: bool = False
     band_limited: tuple[str, ...] = ()
+    delay_growth: float = 0.0
+    jitter: float = 0.0
 
     def rows(self) -> list[list[str]]:
         """Label and value."""
@@ -138,10 +149,10 @@ def checks_of(
     """
     y = [m - m.mean() for m in seen.measured]
     rest = np.concatenate(residuals)
-    (explained, chance), (later, fed) = _explained(seen, residuals, noise, slopes, delay)
+    (explained, chance), (later, fed), grown = _explained(seen, residuals, noise, slopes, delay)
     white = _white([r / error for r, error in zip(residuals, noise.errors, strict=True)])
     if rest.std() <= CLOSE * seen.size_y:  # what is left is rounding, or the network's own detail
-        explained, chance, later, fed, white = 0.0, 1.0, 0.0, 1.0, 1.0
+        explained, chance, later, fed, white, grown = 0.0, 1.0, 0.0, 1.0, 1.0, 0.0
     return Checks(
         percent(rest, np.concatenate(y)),
         percent(noise.ahead(residuals), np.concatenate(y)),
@@ -154,6 +165,7 @@ def checks_of(
         gain,
         _together(seen),
         band_limited=_band_limited(seen),
+        delay_growth=grown,
     )
 
 
@@ -242,13 +254,13 @@ def _explained(
     noise: RunNoises,
     slopes: Sequence[RunSlopes],
     delay: int,
-) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Share of the whitened residuals that a fuller model explains, with its chance, and the share
-    of the rest that later inputs explain.
+) -> tuple[tuple[float, float], tuple[float, float], float]:
+    """Share of the whitened residuals that a fuller model explains, with its chance, the share of
+    the rest that later inputs explain, and the growth of the delay if it explains most.
 
     A score test (Lagrange multipliers): columns are inputs before, those within the delay too,
-    further paths of first order, and the slopes of the output by parameters that change with the
-    operating point, less what the model's own numbers can do.
+    further paths of first order, the slopes of the output by parameters that change with the
+    operating point, and by a delay that grows, less what the model's own numbers can do.
     """
     own, quick, later = [each.own for each in slopes], [], []
     for run, each in zip(seen.runs, slopes, strict=True):
@@ -263,11 +275,22 @@ def _explained(
     own = np.hstack([own, noise.drift(own, rest)])
     basis = _basis(own)
     rest = rest - basis @ (basis.T @ rest)
-    few, more = (_tested(rest, basis, columns) for columns in (slow, quick))
-    share, chance = min(few, more, key=lambda each: each[1])
+    pairs = zip(seen.measured, residuals, noise.times, strict=True)
+    clock = noise.white([_late(y - r, t) for y, r, t in pairs])
+    clock = clock - basis @ (basis.T @ clock)
+    tests = [_tested(rest, basis, columns) for columns in (slow, quick, clock)]
+    share, chance = found = min(tests, key=lambda each: each[1])
+    grown = float(clock[:, 0] @ rest / (clock[:, 0] @ clock[:, 0])) if found is tests[2] else 0.0
     basis = _basis(np.hstack([own, slow, quick]))
     rest = rest - basis @ (basis.T @ rest)
-    return (share, min(2.0 * chance, 1.0)), _tested(rest, basis, later)
+    chance = min(len(tests) * chance, 1.0)
+    return (share, chance), _tested(rest, basis, later), grown
+
+
+def _late(fitted: np.ndarray, time: np.ndarray) -> np.ndarray:
+    """Change of an output whose delay grows by a sample along the record, as a column."""
+    through = (time - time[0]) / (time[-1] - time[0]) - 0.5
+    return (-through * np.diff(fitted, prepend=fitted[0]))[:, None]
 
 
 def slow_paths(seen: PreparedOutput) -> list[np.ndarray]:

@@ -172,7 +172,8 @@ def identify(
         Which output, if the runs have several.
     delay : float, optional
         Samples by which the output follows late; found among candidates if None. What is no whole
-        number is estimated besides, with an error.
+        number is estimated besides, with an error. Below zero where the clocks of input and output
+        differ.
     offset : bool
         Whether the output at rest is a free number; else it is 0.
     hidden, starts, seed : int
@@ -218,8 +219,8 @@ def identify(
     check_inputs(runs)
     output = _output(runs[0], output)
     shortest = min(len(run) for run in runs)
-    if delay is not None and not 0 <= delay < shortest - 1:
-        raise InputError(f"a delay of {delay} samples", f"less than the {shortest} rows of a run")
+    if delay is not None and not abs(delay) < shortest - 1:
+        raise InputError(f"a delay of {delay:g} samples", f"less than the {shortest} rows of a run")
     runs, left_out, found = sound(
         runs, output, lambda these: begun(these, output, physics, delay, offset)
     )
@@ -231,15 +232,15 @@ def identify(
     fit, late = answer.fit, found.delay
     ahead = tuple(predict_held(each, output, fit, physics, late) for each in held)
     evidence = (fit, answer.rests, checks, quantities, curves, ahead, map)
-    status, message = judged(
-        {output: ResponseEvidence(*evidence, float(np.sqrt(np.mean(answer.rms**2))))}
-    )
+    exact = late if late % 1 == 0 else late + float(fit.model["late"])
+    early = max(-exact, 0.0) if delay is None else 0.0
+    rms = float(np.sqrt(np.mean(answer.rms**2)))
+    status, message = judged({output: ResponseEvidence(*evidence, rms, early)})
     longest = [LATEST] if delay is None and late == latest(runs) > 0 else []
     message = " ".join([message, *longest, *(f"Left out: {each}." for each in left_out)])
-    late = late if late % 1 == 0 else late + float(fit.model["late"])
     noise = tuple(answer.rms[:, 0].tolist())
     parts = (quantities, curves, noise, answer.memory, checks, ahead, left_out)
-    return ResponseFit(output, status, message, model, map, late, runs, found.seen, fit, *parts)
+    return ResponseFit(output, status, message, model, map, exact, runs, found.seen, fit, *parts)
 
 
 def _with_network(found: Begun, offset: bool, hidden: int, seeds: range) -> Settled:
@@ -265,14 +266,18 @@ def _known(
         None if constant else found.plain.likelihood - answer.likelihood,
         int(np.ceil(found.delay)) * (1 if found.delay % 1 == 0 else 2),  # in rows
     )
-    checks = checks._replace(first_order=constant and is_first_order(found, offset))
+    checks = checks._replace(
+        first_order=constant and is_first_order(found, offset), jitter=float(answer.jitter.max())
+    )
     laws = (
         laws_of(runs, seen, answer, delays, slopes)
         if constant and not answer.exact(case_of(seen, offset))
         else None
     )
     if laws is not None and laws.none < 0.5 and laws.fuller < 0.5:
-        checks = checks._replace(law=laws.likeliest, law_probability=1.0 - laws.none)
+        checks = checks._replace(
+            law=laws.likeliest, law_probability=1.0 - laws.none, static_law=laws.static
+        )
     parts = answer.fit, answer.errors
     physics = seen.runs[0].physics
     quantities = quantities_of(*parts, laws, seen, physics, found.delay) if constant else {}

@@ -41,7 +41,7 @@ from beamfit.noise.memory import BESIDE, CorrelatedNoise, innovations, remembers
 LATEST, SHARE = 24, 0.1
 # Gain in log likelihood that a longer delay needs over a shorter one; fractions of a sample
 # that are tried besides.
-BETTER, PARTS = 5.0, (-0.75, -0.5, -0.25, 0.25, 0.5, 0.75)
+BETTER, PARTS = 5.0, (-0.9, -0.75, -0.5, -0.25, -0.1, 0.1, 0.25, 0.5, 0.75, 0.9)
 # Time constants of the grid, and dampings of a second order.
 LAGS, DAMPINGS = 16, (0.2, 0.6, 1.0, 2.0)
 # Step of their logarithms in a slope; their range, in intervals and in runs, beyond which nothing
@@ -256,8 +256,8 @@ def noise_of(
     return memory, grid[best], float(np.sqrt(memory.squares[best] / memory.dof))
 
 
-# Ratios of the noise by a clock's jitter, rms, to the rest; the prior is as much for none as for all
-# of them. Longest jitter: by more than half a sample readings would not stand in their order.
+# Ratios of the noise by a clock's jitter, rms, to the rest; the prior is as much for none as for
+# all of them. Longest jitter: by more than half a sample readings would not be in their order.
 RATIOS, LONGEST_JITTER = np.append(0.0, np.geomspace(0.2, 50.0, 24)), 0.5
 
 

@@ -430,6 +430,7 @@ def states_answer(
         noise = RunNoises(s.time, [row[k].each for row in found.noise], found.likely)
         used_each = max(1, used // len(case.seen))
         checks = checks_of(s, rest, noise, list(pairs), used_each, gain, delay)
+        checks = checks._replace(jitter=float(found.jitter[:, k].max()))
         parts.append(StateSpaceOutput(list(runs[0].outputs)[k], runs, s, fitted, checks))
     ahead = _ahead(case, found, held, delay)
     nothing = all(part.checks.nothing_probability >= POOR_FIT for part in parts)
