@@ -255,10 +255,16 @@ def _lost(e: ResponseEvidence) -> Finding | None:
     return Finding(Status.not_finite if lost else Status.not_converged, e.fit.message)
 
 
+WANDERS = "The noise wanders about as slowly as the output responds."
+REPEAT = "Repeat the steps, up and down, so that a drift does not look like a response."
+
+
 def _nothing(e: ResponseEvidence) -> Finding | None:
     if e.checks.nothing_probability < POOR_FIT:
         return None
     cause = "The inputs explain no more of the output than chance would."
+    if e.checks.white_probability < POOR_FIT:
+        return Finding(Status.unidentified, f"{cause} {WANDERS}", REPEAT)
     remedy = (
         "Move the inputs further, record longer, try a longer delay (--delay), or look for what "
         "else drives the output."
@@ -307,8 +313,7 @@ def _open(e: ResponseEvidence) -> Finding | None:
     if TIME in left.values():
         remedy = "Sample faster around steps, and wait until the output settles."
         if e.checks.white_probability < POOR_FIT:
-            cause += " The noise wanders about as slowly as the output responds."
-            remedy = "Repeat the steps, up and down, so that a drift does not look like a response."
+            cause, remedy = f"{cause} {WANDERS}", REPEAT
     return Finding(Status.unidentified, cause, remedy)
 
 

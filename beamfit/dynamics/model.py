@@ -86,6 +86,14 @@ class PreparedOutput(NamedTuple):
         return np.concatenate([np.asarray(run.u)[np.asarray(run.index)] for run in self.runs])
 
     @property
+    def part(self) -> float:
+        """The part of a sample in the delay."""
+        if self.runs[0].held is None:
+            return 0.0
+        first, second = np.asarray(self.runs[0].dt[:2])
+        return float(first / (first + second))
+
+    @property
     def apart(self) -> float:
         """Median time between readings, of the run where it is shortest."""
         return min(float(np.median(np.diff(t))) for t in self.time)

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.optimize import minimize
+from scipy.optimize import minimize, minimize_scalar
 
 from beamfit.dynamics.model import (
     CLOSE,
@@ -41,7 +41,9 @@ from beamfit.noise.memory import BESIDE, CorrelatedNoise, innovations, remembers
 LATEST, SHARE = 24, 0.1
 # Gain in log likelihood that a longer delay needs over a shorter one; fractions of a sample
 # that are tried besides.
-BETTER, PARTS = 5.0, (-0.9, -0.75, -0.5, -0.25, -0.1, 0.1, 0.25, 0.5, 0.75, 0.9)
+BETTER, PARTS = 5.0, (-0.75, -0.5, -0.25, 0.25, 0.5, 0.75)
+# Where the search for a fraction ends, in samples; the fit goes on from there.
+CLOSE_DELAY = 0.02
 # Time constants of the grid, and dampings of a second order.
 LAGS, DAMPINGS = 16, (0.2, 0.6, 1.0, 2.0)
 # Step of their logarithms in a slope; their range, in intervals and in runs, beyond which nothing
@@ -218,9 +220,13 @@ def start_of(
         whole = earlier
     if physics.even:
         return at(whole[2])
-    parts = [whole[2] + part for part in PARTS if whole[2] + part < max(latest(runs), 1)]
-    best = min((at(part) for part in parts), key=lambda each: each[0].cost)
-    return best if best[0].cost + 2.0 * BETTER < whole[0].cost else whole
+    parts = [at(whole[2] + part) for part in PARTS if whole[2] + part < max(latest(runs), 1)]
+    middle = min([whole, *parts], key=lambda each: each[0].cost)[2]
+    ends = middle - 0.25, min(middle + 0.25, max(latest(runs), 1))
+    found = minimize_scalar(
+        lambda late: at(late)[0].cost, bounds=ends, options={"xatol": CLOSE_DELAY}
+    )
+    return at(found.x) if found.fun + 2.0 * BETTER < whole[0].cost else whole
 
 
 def latest(runs: tuple[Run, ...]) -> int:
@@ -581,7 +587,7 @@ def case_of(seen: PreparedOutput, offset: bool, network: bool = False) -> Case:
     """The case of one output: constant raw numbers or a network of them."""
     free = [Free("start", nuisance=True), Free("map", nuisance=network)]
     free += [Free("offset")] if offset else []
-    free += [] if seen.runs[0].held is None else [Free("late")]
+    free += [Free("late", -seen.part, 1.0 - seen.part)] if seen.part else []
     return Case((seen,), seen.runs, tuple(free), weight_priors("map") if network else ())
 
 

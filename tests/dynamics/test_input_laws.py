@@ -34,7 +34,7 @@ def test_an_error_is_that_of_the_mixture_about_the_value_without_a_law():
     """Beside draws from the mixture."""
     random = np.random.default_rng(0)
     shift, covariance = np.array([[2.0, 1.0], [0.0, -3.0]]), np.stack([np.diag([1.0, 0.5])] * 2)
-    found = LawEvidence(0.5, 0.0, "", np.array([0.3, 0.2]), shift, covariance)
+    found = LawEvidence(0.5, 0.0, "", False, np.array([0.3, 0.2]), shift, covariance)
     slope = np.array([1.0, 0.5])
     which = random.choice(3, 200_000, p=[0.5, 0.3, 0.2])
     laws = [random.multivariate_normal(s, c, 200_000) @ slope
