@@ -91,7 +91,7 @@ def _quoted(model: Any, of: tuple[Any, float]) -> jax.Array:
     if seen.physics is SECOND_ORDER:  # both lags of eq 8 where there are two
         root = jnp.sqrt(jnp.maximum(p[1] ** 2 - 1.0, 1e-12))
         parts.append(p[0] * (p[1] + jnp.stack([root, -root])))
-    late = (delay + model["late"]) * jnp.median(jnp.diff(seen.time))
+    late = (delay + model["late"]) * jnp.sum(seen.dt[: 1 if seen.held is None else 2])
     return jnp.concatenate([*parts, jnp.stack([jnp.asarray(model["offset"]), late])])
 
 
@@ -404,6 +404,9 @@ def _good(e: ResponseEvidence) -> Finding:
     cause = f"The free run explains {e.checks.free_run_percent:.2f} % of the output."
     if e.checks.white_probability < POOR_FIT:
         cause += " The noise has a memory, which the errors contain."
+    if e.checks.between:
+        names = ", ".join(e.checks.between)
+        cause += f" Without high frequencies, {names} is taken to move between samples."
     if e.checks.jitter:
         cause += f" Times of readings are uncertain by {e.checks.jitter:.2g} s: errors contain it."
     if e.checks.law is not None:

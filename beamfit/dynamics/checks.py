@@ -33,9 +33,6 @@ from beamfit.noise.memory import CorrelatedNoise
 LAGS, PAST, LATER = 20, 10, 5
 # Time constants of the additional paths in the test for a fuller model.
 SLOW = 5
-# An input is band-limited if its changes have less than the share `FAINT` of their power above the
-# share `HIGH` of the highest frequency; white ones have a tenth there, noise that is fed back too.
-HIGH, FAINT = 0.9, 2e-3
 # Share of an input's variance, independent of other inputs, below which its gain is not separable.
 ALONE = 1e-3
 
@@ -74,7 +71,10 @@ class Checks(NamedTuple):
     static_law : bool
         Whether it is one of the value alone, whatever came before.
     band_limited : tuple of str
-        Inputs without high frequencies, which move between samples; that goes with later inputs.
+        Inputs without high frequencies that the model holds from sample to sample; if they move
+        between, that goes with later inputs.
+    between : tuple of str
+        Inputs without high frequencies that the model follows between samples.
     delay_growth : float
         Samples by which the delay grows along the record, if this is what explains the residuals
         best: clocks of input and output then run at different rates. Else 0.
@@ -97,6 +97,7 @@ class Checks(NamedTuple):
     law_probability: float = 0.0
     static_law: bool = False
     band_limited: tuple[str, ...] = ()
+    between: tuple[str, ...] = ()
     delay_growth: float = 0.0
     jitter: float = 0.0
 
@@ -164,22 +165,8 @@ def checks_of(
         later,
         gain,
         _together(seen),
-        band_limited=_band_limited(seen),
         delay_growth=grown,
     )
-
-
-def _band_limited(seen: PreparedOutput) -> tuple[str, ...]:
-    """Inputs of runs at equal steps that have no high frequencies."""
-    high, whole = np.zeros(len(seen.inputs)), np.zeros(len(seen.inputs))
-    for run in seen.runs:
-        count = int(np.count_nonzero(np.asarray(run.dt)))
-        rows = slice(0, count + 1, 1 if run.held is None else 2)
-        changes = np.diff(np.asarray(run.u)[rows], axis=0)
-        power = np.abs(np.fft.rfft(changes * np.hanning(len(changes))[:, None], axis=0)) ** 2
-        high += power[int(HIGH * len(power)) :].sum(axis=0)
-        whole += power.sum(axis=0)
-    return tuple(np.array(seen.inputs)[(high < FAINT * whole) & (whole > 0)].tolist())
 
 
 def _together(seen: PreparedOutput) -> tuple[str, ...]:

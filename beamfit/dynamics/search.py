@@ -210,19 +210,21 @@ def start_of(
     if delay is not None:
         return at(delay)
     law = SECOND_ORDER if physics is ARX else physics
-    found = [at(late, law) for late in range(latest(runs) + 1)]
+    step = runs[0].parts
+    found = [at(late, law) for late in range(0, latest(runs) + 1, step)]
     near = 2.0 * BETTER + min(start.cost for start, _, _ in found)
     whole = next(each for each in found if each[0].cost <= near)
     while whole[2] <= 0 and whole[2] > -latest(runs):
-        earlier = at(whole[2] - 1, law)
+        earlier = at(whole[2] - step, law)
         if earlier[0].cost + 2.0 * BETTER >= whole[0].cost:
             break
         whole = earlier
     if physics.even:
         return at(whole[2])
-    parts = [at(whole[2] + part) for part in PARTS if whole[2] + part < max(latest(runs), 1)]
+    longest = max(latest(runs), step)
+    parts = [at(whole[2] + step * part) for part in PARTS if whole[2] + step * part < longest]
     middle = min([whole, *parts], key=lambda each: each[0].cost)[2]
-    ends = middle - 0.25, min(middle + 0.25, max(latest(runs), 1))
+    ends = middle - 0.25 * step, min(middle + 0.25 * step, longest)
     found = minimize_scalar(
         lambda late: at(late)[0].cost, bounds=ends, options={"xatol": CLOSE_DELAY}
     )
@@ -230,8 +232,9 @@ def start_of(
 
 
 def latest(runs: tuple[Run, ...]) -> int:
-    """The longest delay that is tried."""
-    return min(LATEST, int(SHARE * min(map(len, runs))))
+    """The longest delay that is tried, in rows."""
+    step = runs[0].parts
+    return step * min(LATEST, int(SHARE * min(map(len, runs)) / step))
 
 
 def noises_of(
