@@ -189,11 +189,15 @@ def _chance(y: np.ndarray, rest: np.ndarray, used: int) -> float:
 
 
 class RunNoises(NamedTuple):
-    """Noise of an output: times and errors of the readings of each run, and the memory."""
+    """Noise of an output: times and errors of the readings of each run, and the memory.
+
+    `jitter` is how many rows earlier or later readings may have been taken.
+    """
 
     times: Sequence[np.ndarray]
     errors: Sequence[np.ndarray]
     memory: CorrelatedNoise | None
+    jitter: int = 0
 
     def white(self, parts: Sequence[np.ndarray]) -> np.ndarray:
         """Columns of readings, by run, in noise without a memory and of size 1."""
@@ -254,7 +258,8 @@ def _explained(
         u = seen.scaled(run.u)
         index = np.asarray(run.index)
         past = [u[np.clip(index + k, 0, len(u) - 1)] for k in range(-PAST, delay)]
-        after = [u[np.clip(index + delay + k, 0, len(u) - 1)] for k in range(LATER)]
+        first = delay + noise.jitter  # a late reading has seen the input of its row
+        after = [u[np.clip(index + first + k, 0, len(u) - 1)] for k in range(LATER)]
         later.append(np.concatenate(after, axis=1))
         quick.append(np.concatenate([*past, each.changing], axis=1))
     own, slow, quick, later = (noise.white(part) for part in (own, slow_paths(seen), quick, later))

@@ -50,7 +50,7 @@ from beamfit.dynamics.search import (
     fitted,
     is_first_order,
     latest,
-    start_of,
+    starts_of,
     used_by,
 )
 from beamfit.errors import InputError, Status, nearest
@@ -263,8 +263,8 @@ class _Asked(NamedTuple):
 
     def cost(self, runs: tuple[Run, ...]) -> float:
         """-2 ln L of the start of a search, with the price of a part of a sample in the delay."""
-        start, _, late = start_of(runs, self.output, self.physics, self.delay, self.offset)
-        return start.cost + 2.0 * BETTER * (late % 1.0 > 0.0)
+        starts = starts_of(runs, self.output, self.physics, self.delay, self.offset)
+        return starts[-1][0].cost + 2.0 * BETTER * (len(starts) - 1)
 
     def begun(self, runs: tuple[Run, ...]) -> Begun:
         """The fit of runs with constant parameters."""
@@ -309,11 +309,13 @@ def _known(
     """Tests of the residuals, and what the runs determine of constants or curves."""
     seen, constant, offset = found.seen, asked.map == "constant", asked.offset
     delays = shorter(found.delay) if asked.delay is None else [asked.delay]
-    slopes = slopes_of(seen, answer.fit)
+    slopes, jitter = slopes_of(seen, answer.fit), float(answer.jitter.max())
+    sample = runs[0].parts * (1 if seen.part == 0.0 else 2)  # in rows
+    errors = [noise.each for (noise,) in answer.noise]
     checks = checks_of(
         seen,
         tuple(rest for (rest,) in answer.rest),
-        RunNoises(seen.time, [noise.each for (noise,) in answer.noise], answer.likely),
+        RunNoises(seen.time, errors, answer.likely, sample if jitter else 0),
         slopes,
         used_by(answer.fit),
         None if constant else found.plain.likelihood - answer.likelihood,
@@ -321,7 +323,7 @@ def _known(
     )
     checks = checks._replace(
         first_order=constant and is_first_order(found, offset),
-        jitter=float(answer.jitter.max()),
+        jitter=jitter,
         **{"band_limited" if runs[0].parts == 1 else "between": asked.moving},
     )
     laws = (

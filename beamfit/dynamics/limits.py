@@ -25,17 +25,18 @@ from beamfit.dynamics.search import (
     unit_outputs,
 )
 from beamfit.greybox.memory import Whitened, whitened_by_each
+from beamfit.statistics import POOR_FIT
 
 # Other lags that are tried beside one that is given, and rounds of them, each about the best.
 OTHERS, ROUNDS = 8, 3
 # Halvings of the logarithm of a lag on the way to its limit.
 HALVES = 8
-# Quantiles at the upper end of a central and of a one-sided 95 %.
-CENTRAL_END, SINGLE_END = 0.975, 0.95
+# Quantile at the upper end of a one-sided 95 %.
+SINGLE_END = 0.95
 
 
 class LagLimits(NamedTuple):
-    """Limits that the longest lag is compatible with, by the central 95 % of its likelihood.
+    """Limits that the longest lag is compatible with.
 
     Attributes
     ----------
@@ -122,14 +123,15 @@ def lag_limits(seen: PreparedOutput, found: Settled, offset: bool) -> LagLimits:
 
     The gain that goes with a lag far beyond the runs is as large, K/tau being the same, and of a
     lag far below a sample nothing is left. A limit is possible unless its evidence, the noise and
-    all that is linear integrated out, is lower than the best by more than a central 95 % allows.
+    all that is linear integrated out, is so much lower than the best that it is refuted: where a
+    limit is as little as likely, the error of a lag says nothing.
     """
     lags = _Lags(seen, found, offset)
     least = lags.whitened(lags.own).evidence()
     ends = np.multiply(RANGE, (seen.apart, seen.span))
 
     def reached(limit: float, other: float) -> float | None:
-        if lags.least(limit) - least > lags.rise(CENTRAL_END):
+        if lags.least(limit) - least > lags.rise(1.0 - 0.5 * POOR_FIT):
             return None
         near, far, most = np.log(limit), np.log(other), lags.rise(SINGLE_END)
         for _ in range(HALVES):

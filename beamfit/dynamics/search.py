@@ -192,15 +192,15 @@ def seen_of(runs: tuple[Run, ...], output: str, physics: Physics, delay: float) 
     )
 
 
-def start_of(
+def starts_of(
     runs: tuple[Run, ...], output: str, physics: Physics, delay: float | None, offset: bool
-) -> tuple[Start, PreparedOutput, float]:
-    """The best start, and the delay: the shortest of those that fit about as well as any.
+) -> list[tuple[Start, PreparedOutput, float]]:
+    """The best start, and the delay: the shortest of those that fit about as well as any. After it
+    one with a part of a sample in the delay, if that does as much better.
 
-    A part of a sample must do as much better: only an input that moves within a sample tells it. So
-    must one below zero, which stands for clocks of input and output that differ. The delay of a
-    difference equation is that of a second order: its own gains of two samples let a shorter one
-    pass.
+    A delay below zero must do so, too: it stands for clocks of input and output that differ. The
+    delay of a difference equation is that of a second order: its own gains of two samples let a
+    shorter one pass.
     """
 
     def at(late: float, law: Physics = physics) -> tuple[Start, PreparedOutput, float]:
@@ -208,7 +208,7 @@ def start_of(
         return best_start(seen, offset), seen, late
 
     if delay is not None:
-        return at(delay)
+        return [at(delay)]
     law = SECOND_ORDER if physics is ARX else physics
     step = runs[0].parts
     found = [at(late, law) for late in range(0, latest(runs) + 1, step)]
@@ -220,7 +220,7 @@ def start_of(
             break
         whole = earlier
     if physics.even:
-        return at(whole[2])
+        return [at(whole[2])]
     longest = max(latest(runs), step)
     parts = [at(whole[2] + step * part) for part in PARTS if whole[2] + step * part < longest]
     middle = min([whole, *parts], key=lambda each: each[0].cost)[2]
@@ -228,7 +228,7 @@ def start_of(
     found = minimize_scalar(
         lambda late: at(late)[0].cost, bounds=ends, options={"xatol": CLOSE_DELAY}
     )
-    return at(found.x) if found.fun + 2.0 * BETTER < whole[0].cost else whole
+    return [whole, at(found.x)] if found.fun + 2.0 * BETTER < whole[0].cost else [whole]
 
 
 def latest(runs: tuple[Run, ...]) -> int:
@@ -620,9 +620,18 @@ class Begun(NamedTuple):
 def begun(
     runs: tuple[Run, ...], output: str, physics: Physics, delay: float | None, offset: bool
 ) -> Begun:
-    """Identify with constant parameters; the delay among candidates if None."""
-    start, seen, delay = start_of(runs, output, physics, delay, offset)
-    return Begun(seen, delay, fitted(case_of(seen, offset), [start.model(seen)]))
+    """Identify with constant parameters; the delay among candidates if None.
+
+    A part of a sample in the delay must do better also under the noise that the fits have: times
+    that jitter look like one.
+    """
+    starts = starts_of(runs, output, physics, delay, offset)
+    whole, *part = (
+        Begun(seen, late, fitted(case_of(seen, offset), [start.model(seen)]))
+        for start, seen, late in starts
+    )
+    better = part and part[0].plain.likelihood + 2.0 * BETTER < whole.plain.likelihood
+    return part[0] if better else whole
 
 
 def is_first_order(found: Begun, offset: bool) -> bool:
