@@ -42,7 +42,6 @@ from beamfit.dynamics.record import (
 )
 from beamfit.dynamics.response import PHYSICS, Physics
 from beamfit.dynamics.search import (
-    BETTER,
     Begun,
     Settled,
     begun,
@@ -262,9 +261,10 @@ class _Asked(NamedTuple):
     held: tuple[Run, ...]
 
     def cost(self, runs: tuple[Run, ...]) -> float:
-        """-2 ln L of the start of a search, with the price of a part of a sample in the delay."""
+        """-2 ln L of the start of a search, with the cost of a part of a sample in the delay."""
         starts = starts_of(runs, self.output, self.physics, self.delay, self.offset)
-        return starts[-1][0].cost + 2.0 * BETTER * (len(starts) - 1)
+        part = np.log(sum(len(run) // run.parts for run in runs))
+        return min(start.cost + part * (late % 1.0 > 0.0) for start, _, late in starts)
 
     def begun(self, runs: tuple[Run, ...]) -> Begun:
         """The fit of runs with constant parameters."""

@@ -259,8 +259,12 @@ def _behind(runs: Sequence[Run], laws: Sequence[InputLaw]) -> Behind:
 
 
 def _is_none(behind: Behind, law: InputLaw, k: int) -> bool:
-    """True if a gain and a level stand for a law of input k."""
-    u, at = (np.concatenate([each[:, k, 0] for each in behind[of]]) for of in (None, law))
+    """True if a gain and a level stand for a law of input k, from its first change on: what was
+    before is a number at the start.
+    """
+    since = [np.argmax(u[:, k, 0] != u[0, k, 0]) for u in behind[None]]
+    u, at = (np.concatenate([each[first:, k, 0] for each, first in zip(behind[of], since, strict=True)])
+             for of in (None, law))  # fmt: skip
     design = np.stack([u, np.ones(len(u))], axis=1)
     rest = at - design @ np.linalg.lstsq(design, at, rcond=1e-10)[0]
     return bool(np.linalg.norm(rest) <= SAME * np.linalg.norm(at - at.mean()))

@@ -196,10 +196,10 @@ def starts_of(
     runs: tuple[Run, ...], output: str, physics: Physics, delay: float | None, offset: bool
 ) -> list[tuple[Start, PreparedOutput, float]]:
     """The best start, and the delay: the shortest of those that fit about as well as any. After it
-    one with a part of a sample in the delay, if that does as much better.
+    the best with a part of a sample in the delay.
 
-    A delay below zero must do so, too: it stands for clocks of input and output that differ. The
-    delay of a difference equation is that of a second order: its own gains of two samples let a
+    A delay below zero must do as much better: it stands for clocks of input and output that differ.
+    The delay of a difference equation is that of a second order: its own gains of two samples let a
     shorter one pass.
     """
 
@@ -228,7 +228,7 @@ def starts_of(
     found = minimize_scalar(
         lambda late: at(late)[0].cost, bounds=ends, options={"xatol": CLOSE_DELAY}
     )
-    return [whole, at(found.x)] if found.fun + 2.0 * BETTER < whole[0].cost else [whole]
+    return [whole, at(found.x)] if found.fun < whole[0].cost else [whole]
 
 
 def latest(runs: tuple[Run, ...]) -> int:
@@ -622,16 +622,20 @@ def begun(
 ) -> Begun:
     """Identify with constant parameters; the delay among candidates if None.
 
-    A part of a sample in the delay must do better also under the noise that the fits have: times
-    that jitter look like one.
+    A part of a sample in the delay must do better by the Bayesian information criterion, under the
+    noise that the fits have: times that jitter look like one. If it makes the delay negative it
+    must do as much better as another whole number.
     """
     starts = starts_of(runs, output, physics, delay, offset)
     whole, *part = (
         Begun(seen, late, fitted(case_of(seen, offset), [start.model(seen)]))
         for start, seen, late in starts
     )
-    better = part and part[0].plain.likelihood + 2.0 * BETTER < whole.plain.likelihood
-    return part[0] if better else whole
+    for other in part:
+        margin = 2.0 * BETTER if other.delay < 0 <= whole.delay else 0.0
+        if other.plain.likelihood + margin < whole.plain.likelihood:
+            return other
+    return whole
 
 
 def is_first_order(found: Begun, offset: bool) -> bool:
