@@ -231,7 +231,7 @@ def identify(
     if delay is not None and not abs(delay) < shortest - 1:
         raise InputError(f"a delay of {delay:g} samples", f"less than the {shortest} rows of a run")
     seeds, moving = range(seed, seed + starts), () if physics.even else band_limited(runs)
-    asked = _Asked(output, physics, map, delay, offset, hidden, seeds, moving, held)
+    asked = _Identification(output, physics, map, delay, offset, hidden, seeds, moving, held)
     if moving:
         finer = tuple(between(run, moving) for run in runs)
         rows = asked._replace(delay=None if delay is None else delay * PARTS)
@@ -247,7 +247,7 @@ def identify(
     return whole if whole.status is Status.poor_fit else fit
 
 
-class _Asked(NamedTuple):
+class _Identification(NamedTuple):
     """Settings of an identification."""
 
     output: str
@@ -272,7 +272,7 @@ class _Asked(NamedTuple):
 
 
 def _answered(
-    asked: _Asked, runs: tuple[Run, ...], found: Begun, left_out: tuple[BadReadings, ...]
+    asked: _Identification, runs: tuple[Run, ...], found: Begun, left_out: tuple[BadReadings, ...]
 ) -> ResponseFit:
     """Judge runs whose fit with constant parameters was found."""
     output, physics, map, delay = asked[:4]
@@ -295,7 +295,7 @@ def _answered(
     return ResponseFit(*named, runs, found.seen, fit, *parts)
 
 
-def _with_network(asked: _Asked, found: Begun) -> Settled:
+def _with_network(asked: _Identification, found: Begun) -> Settled:
     """The best fit with a network of parameters, from the constant ones."""
     seen, first = found.seen, found.plain.fit.model
     raw = np.asarray(first["map"])
@@ -304,7 +304,7 @@ def _with_network(asked: _Asked, found: Begun) -> Settled:
 
 
 def _known(
-    asked: _Asked, runs: tuple[Run, ...], found: Begun, answer: Settled
+    asked: _Identification, runs: tuple[Run, ...], found: Begun, answer: Settled
 ) -> tuple[Checks, dict[str, Quantity], tuple[Curve, ...]]:
     """Tests of the residuals, and what the runs determine of constants or curves."""
     seen, constant, offset = found.seen, asked.map == "constant", asked.offset

@@ -195,21 +195,6 @@ class _Trial(NamedTuple):
     prior: float
 
 
-class _Candidates(NamedTuple):
-    """Laws of the inputs, and terms of a fuller response without one.
-
-    Attributes
-    ----------
-    inputs : list of array, shape (trials + terms, samples, inputs, 2)
-        Inputs of each run behind each, and how they change with its width.
-    terms : list of array, shape (trials + terms, readings)
-        What is added to the output of each run, zero for laws.
-    """
-
-    inputs: list[np.ndarray]
-    terms: list[np.ndarray]
-
-
 def shorter(delay: float) -> list[float]:
     """A delay that was found, and the shorter ones that a law may stand for."""
     whole = int(np.ceil(delay))
@@ -263,8 +248,10 @@ def _is_none(behind: Behind, law: InputLaw, k: int) -> bool:
     before is a number at the start.
     """
     since = [np.argmax(u[:, k, 0] != u[0, k, 0]) for u in behind[None]]
-    u, at = (np.concatenate([each[first:, k, 0] for each, first in zip(behind[of], since, strict=True)])
-             for of in (None, law))  # fmt: skip
+    u, at = (
+        np.concatenate([each[row:, k, 0] for each, row in zip(behind[of], since, strict=True)])
+        for of in (None, law)
+    )
     design = np.stack([u, np.ones(len(u))], axis=1)
     rest = at - design @ np.linalg.lstsq(design, at, rcond=1e-10)[0]
     return bool(np.linalg.norm(rest) <= SAME * np.linalg.norm(at - at.mean()))
@@ -288,8 +275,11 @@ def _candidates(
     trials: Sequence[_Trial],
     more: Sequence[np.ndarray],
     count: int,
-) -> _Candidates:
-    """Inputs behind each trial, the first repeated until they are `count`, and terms without."""
+) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """Inputs of each run behind each trial and their changes with its width, the first repeated
+    until they are `count`, shape (count + terms, samples, inputs, 2); and what is added to the
+    output, zero for laws, shape (count + terms, readings).
+    """
     unit = np.sqrt(np.mean(np.concatenate(more) ** 2, axis=0)) / seen.size_y
     unit, inputs, terms = np.where(unit > 0, unit, 1.0), [], []
     for i, (run, x) in enumerate(zip(seen.runs, more, strict=True)):
@@ -301,7 +291,7 @@ def _candidates(
             each.append(late.reshape(len(late), *u.shape[1:]))
         inputs.append(np.stack(each + [each[0]] * (count - len(each) + x.shape[1])))
         terms.append(np.concatenate([np.zeros((count, len(x))), (x / unit).T]))
-    return _Candidates(inputs, terms)
+    return inputs, terms
 
 
 @partial(jax.jit, static_argnums=0)
@@ -338,12 +328,13 @@ def _triangles(chosen: Any, model: Any, run: Driven, data: Any, theta: Any, u: A
 
 
 class _LawFits(NamedTuple):
-    """Laws to be fitted beside the fit without one, each under every noise of a grid."""
+    """Laws, and terms, to be fitted beside the fit without one, each under every noise of a grid."""
 
     found: Settled
     seen: PreparedOutput
-    candidates: _Candidates
     grid: CorrelatedNoise
+    inputs: list[np.ndarray]
+    terms: list[np.ndarray]
 
     @property
     def begin(self) -> np.ndarray:
@@ -369,7 +360,7 @@ class _LawFits(NamedTuple):
         errors = [noise.each for (noise,) in self.found.noise]
         for run, *data, term, u in zip(
             seen.runs, seen.measured, seen.time, errors,
-            self.candidates.terms, self.candidates.inputs, strict=True,
+            self.terms, self.inputs, strict=True,
         ):  # fmt: skip
             noise = self.grid, order, len(noises)
             each = _triangles(core.chosen, core.model, run, (*data, term), theta, u, noise)
@@ -389,7 +380,7 @@ class _LawFits(NamedTuple):
         The first step is by the noise that is likeliest with each law, further ones by the `FEW`
         that are so with the likeliest laws.
         """
-        count, noises = len(self.candidates.inputs[0]), range(len(self.grid.time))
+        count, noises = len(self.inputs[0]), range(len(self.grid.time))
         best, each = np.tile(self.begin, (count, 1)), np.arange(count)
         step, least = np.zeros_like(best), np.full(count, np.inf)
         for _ in range(ROUNDS):
@@ -485,7 +476,7 @@ def laws_of(
 
     def weighed(behind: Behind, trials: list[_Trial], terms: Any, count: int) -> _Weighed:
         candidates = _candidates(seen, behind, trials, terms, count)
-        return _weighed(_LawFits(found, seen, candidates, grid), trials)
+        return _weighed(_LawFits(found, seen, grid, *candidates), trials)
 
     ends = zip(seen.inputs, seen.points.min(axis=0), seen.points.max(axis=0), strict=True)
     behind = _behind(runs, [law for each in ends for law in _laws(*each)])
