@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 from scipy.stats import chi2, f
 
@@ -13,12 +12,9 @@ from beamfit.dynamics.model import (
     CLOSE,
     PreparedOutput,
     changed_by,
-    driven,
-    output_of,
     predicted,
 )
-from beamfit.dynamics.record import Run
-from beamfit.dynamics.response import FIRST_ORDER, Physics
+from beamfit.dynamics.response import FIRST_ORDER
 from beamfit.dynamics.search import (
     DRIFT,
     drift_columns,
@@ -123,6 +119,11 @@ class HeldOutRun(NamedTuple):
     name: str
     free_run_percent: float
     rms: float
+
+    @classmethod
+    def of(cls, name: str, rest: np.ndarray, y: np.ndarray) -> HeldOutRun:
+        """The run by its residuals and readings."""
+        return cls(name, percent(rest, y), float(np.sqrt(np.mean(rest**2))))
 
     def row(self) -> list[str]:
         """Label and value."""
@@ -326,20 +327,3 @@ def slopes_of(seen: PreparedOutput, fit: Fit) -> list[RunSlopes]:
         added = changed_by(fit.model, run, np.concatenate([u, u**2], axis=1))
         found.append(RunSlopes(fit.derive(predicted, run).slope, np.asarray(added)))
     return found
-
-
-def predict_held(run: Run, output: str, fit: Fit, physics: Physics, delay: float) -> HeldOutRun:
-    """Predict a run that was held back; only the state at its start is estimated."""
-    seen = driven(run, 0, output, physics, delay)
-    y = run.outputs[output][np.asarray(seen.index)]
-
-    def from_start(free: Any) -> np.ndarray:
-        return np.asarray(output_of(fit.model | {"start": free[None]}, seen))
-
-    zero = jnp.zeros(physics.free_states)
-    base = from_start(zero)
-    moved = np.stack([from_start(e) - base for e in jnp.eye(physics.free_states)], axis=1)
-    target = y - base
-    first = np.linalg.lstsq(moved, target, rcond=1e-10)[0]
-    rest = target - moved @ first
-    return HeldOutRun(run.name, percent(rest, y), float(np.sqrt(np.mean(rest**2))))

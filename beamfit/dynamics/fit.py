@@ -25,7 +25,6 @@ from beamfit.dynamics.checks import (
     HeldOutRun,
     RunNoises,
     checks_of,
-    predict_held,
     slopes_of,
 )
 from beamfit.dynamics.input_laws import laws_of, shorter
@@ -43,12 +42,14 @@ from beamfit.dynamics.record import (
 from beamfit.dynamics.response import PHYSICS, Physics
 from beamfit.dynamics.search import (
     Begun,
+    Case,
     Settled,
     begun,
     case_of,
     fitted,
     is_first_order,
     latest,
+    seen_of,
     starts_of,
     used_by,
 )
@@ -279,7 +280,7 @@ def _answered(
     answer = found.plain if map == "constant" else _with_network(asked, found)
     checks, quantities, curves = _known(asked, runs, found, answer)
     fit, late = answer.fit, found.delay
-    ahead = tuple(predict_held(each, output, fit, physics, late) for each in asked.held)
+    ahead = tuple(_ahead(run, output, answer, physics, late) for run in asked.held)
     evidence = (fit, answer.rests, checks, quantities, curves, ahead, map)
     exact = late if late % 1 == 0 else late + float(fit.model["late"])
     exact /= runs[0].parts
@@ -293,6 +294,14 @@ def _answered(
     named = output, status, message, physics.name, map, exact
     runs = tuple(recorded(run) for run in runs)
     return ResponseFit(*named, runs, found.seen, fit, *parts)
+
+
+def _ahead(run: Run, output: str, answer: Settled, physics: Physics, late: float) -> HeldOutRun:
+    """Predict a run that was held back."""
+    seen = seen_of((run,), output, physics, late)
+    start = {"start": np.zeros((1, physics.free_states))}
+    (rest,) = Case((seen,), seen.runs, (), ()).ahead(answer, start)
+    return HeldOutRun.of(run.name, rest, seen.measured[0])
 
 
 def _with_network(asked: _Identification, found: Begun) -> Settled:

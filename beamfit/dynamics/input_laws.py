@@ -328,7 +328,7 @@ def _triangles(chosen: Any, model: Any, run: Driven, data: Any, theta: Any, u: A
 
 
 class _LawFits(NamedTuple):
-    """Laws, and terms, to be fitted beside the fit without one, each under every noise of a grid."""
+    """Laws and terms to be fitted beside the fit without one, each under every noise of a grid."""
 
     found: Settled
     seen: PreparedOutput

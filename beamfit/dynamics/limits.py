@@ -21,8 +21,8 @@ from beamfit.dynamics.search import (
     RANGE,
     Settled,
     difference,
+    linear_columns,
     noises_of,
-    unit_outputs,
 )
 from beamfit.greybox.memory import Whitened, whitened_by_each
 from beamfit.statistics import POOR_FIT
@@ -73,14 +73,11 @@ class _Lags(NamedTuple):
 
     def whitened(self, shape: np.ndarray) -> Whitened:
         """A basis of what gains, first states and offset do, and the readings, by each noise."""
-        runs, parts = self.seen.runs, []
-        for i, (run, y) in enumerate(zip(runs, self.seen.measured, strict=True)):
-            run, k = replace(run, dt=steps_of(self.found.fit.model, run)), run.physics.free_states
-            columns = np.asarray(unit_outputs(run, jnp.asarray(shape[None])))[0].T
-            first = np.zeros((len(y), len(runs) * k))
-            first[:, i * k : (i + 1) * k] = columns[:, -k:]
-            level = np.ones((len(y), int(self.offset)))
-            part = np.hstack([columns[:, :-k], first, level, y[:, None]])
+        model, parts = self.found.fit.model, []
+        runs = [replace(run, dt=steps_of(model, run)) for run in self.seen.runs]
+        for i, y in enumerate(self.seen.measured):
+            columns = linear_columns(runs, i, jnp.asarray(shape[None]), self.offset)[0]
+            part = np.column_stack([columns, y])
             parts.append((part / self.found.noise[i][0].each[:, None])[:LONGEST])
         time = [each[:LONGEST] for each in self.seen.time]
         both = np.concatenate(parts)

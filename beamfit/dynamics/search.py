@@ -154,22 +154,27 @@ def unit_outputs(run: Driven, shapes: jax.Array) -> jax.Array:
     return jax.vmap(each, in_axes=(0, None, None))(shapes, gains, firsts)
 
 
+def linear_columns(runs: Sequence[Driven], i: int, shapes: jax.Array, offset: bool) -> jax.Array:
+    """Outputs of run i for unit gains, unit first states of each run and the offset, by shape."""
+    columns = jnp.swapaxes(unit_outputs(runs[i], shapes), 1, 2)
+    k = runs[i].physics.free_states
+    others = (0, 0), (0, 0), (i * k, (len(runs) - 1 - i) * k)
+    level = jnp.ones((*columns.shape[:2], int(offset)))
+    return jnp.concatenate([columns[..., :-k], jnp.pad(columns[..., -k:], others), level], axis=2)
+
+
 @partial(jax.jit, static_argnums=3)
 def _triangles(runs: tuple[Driven, ...], measured: Any, shapes: jax.Array, offset: bool):
     """Triangular factors of outputs of unit gains, first states and offset, cosines of a drift of
     each run, from the slowest, and of the readings: one for each shape.
     """
     parts = []
-    for i, (run, y) in enumerate(zip(runs, measured, strict=True)):
+    for i, y in enumerate(measured):
         waves = drift_columns([run.time for run in runs], i)
-        columns = jnp.swapaxes(unit_outputs(run, shapes), 1, 2)
-        k = run.physics.free_states
-        others = (0, 0), (0, 0), (i * k, (len(runs) - 1 - i) * k)
-        level = jnp.ones((len(y), int(offset)))
-        rest = jnp.concatenate([level, waves.reshape(len(y), -1), y[:, None]], axis=1)
+        rest = jnp.concatenate([waves.reshape(len(y), -1), y[:, None]], axis=1)
         rest = jnp.broadcast_to(rest, (len(shapes), *rest.shape))
-        parts.append([columns[..., :-k], jnp.pad(columns[..., -k:], others), rest])
-    rows = jnp.concatenate([jnp.concatenate(part, axis=2) for part in parts], axis=1)
+        parts.append(jnp.concatenate([linear_columns(runs, i, shapes, offset), rest], axis=2))
+    rows = jnp.concatenate(parts, axis=1)
     few = max(0, rows.shape[2] - rows.shape[1])
     return jnp.linalg.qr(jnp.pad(rows, ((0, 0), (0, few), (0, 0))), mode="r")
 
@@ -381,6 +386,14 @@ class Case(NamedTuple):
         """Sum of squared residuals, in units of each output's scatter."""
         return sum(float(np.sum((r / s.size_y) ** 2))
                    for row in rest for r, s in zip(row, self.seen, strict=True))  # fmt: skip
+
+    def ahead(self, found: Settled, start: dict[str, Any]) -> tuple[np.ndarray, ...]:
+        """Residuals of a run that was held back, by output: only its `start` is fitted."""
+        sizes = np.sqrt(np.mean(found.rms**2, axis=0))
+        noise = tuple(ReadingErrors(np.full(len(s.measured[0]), size))
+                      for s, size in zip(self.seen, sizes, strict=True))  # fmt: skip
+        case = self._replace(free=(Free("start", nuisance=True),), priors=())
+        return case.rest(solve(case.problem(found.fit.model | start, (noise,))).model)[0]
 
     def problem(
         self, model: Any, noise: Noises, memory: CorrelatedNoise | None = None, gap: Any = ()
@@ -623,8 +636,8 @@ def begun(
     """Identify with constant parameters; the delay among candidates if None.
 
     A part of a sample in the delay must do better by the Bayesian information criterion, under the
-    noise that the fits have: times that jitter look like one. If it makes the delay negative it
-    must do as much better as another whole number.
+    noise that the fits have. If it makes the delay negative it must do as much better as another
+    whole number; also if times jitter, of which late ones see a new input in its own row.
     """
     starts = starts_of(runs, output, physics, delay, offset)
     whole, *part = (
@@ -632,7 +645,8 @@ def begun(
         for start, seen, late in starts
     )
     for other in part:
-        margin = 2.0 * BETTER if other.delay < 0 <= whole.delay else 0.0
+        doubtful = other.delay < 0 <= whole.delay or whole.plain.jitter.any()
+        margin = 2.0 * BETTER if doubtful else 0.0
         if other.plain.likelihood + margin < whole.plain.likelihood:
             return other
     return whole

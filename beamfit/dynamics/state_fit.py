@@ -23,8 +23,6 @@ from beamfit.dynamics.response import FIRST_ORDER
 from beamfit.dynamics.search import (
     GAINED,
     Case,
-    Noises,
-    ReadingErrors,
     Settled,
     seen_of,
     settled,
@@ -37,7 +35,6 @@ from beamfit.greybox import tree
 from beamfit.greybox.fit import Derived, Fit
 from beamfit.greybox.mlp import MLP
 from beamfit.greybox.problem import Free, Prior
-from beamfit.greybox.solve import solve
 from beamfit.noise.memory import CorrelatedNoise
 from beamfit.quantity import Quantity
 from beamfit.statistics import POOR_FIT
@@ -122,11 +119,6 @@ def trained(case: Case, models: Sequence[Any]) -> Settled:
     """Fit from each start for a round, then from the best until nothing is gained."""
     enough = GAINED + EACH * sum(len(each) for s in case.seen for each in s.measured)
     return settled(case, models, _round, lambda found: enough, ROUNDS)
-
-
-def begun(case: Case, model: Any, noise: Noises) -> Any:
-    """The model with what is free fitted once: the first states of runs that were held back."""
-    return solve(case.problem(model, noise)).model
 
 
 def remembering(case: Case, white: Settled) -> Settled:
@@ -465,18 +457,10 @@ def _ahead(
     """Predict runs that were held back; only the state at their start is estimated."""
     ahead: dict[str, list[HeldOutRun]] = {name: [] for name in held[0].outputs} if held else {}
     for run in held:
-        one = case_of((run,), case.courses[0].system, [Free("start")], (), delay)
-        model = found.fit.model
-        start = np.mean(np.asarray(model["start"]), axis=0)[None]
-        model = model | {"start": start, "nodes": np.zeros((1, 0, start.shape[1]))}
-        sizes = np.sqrt(np.mean(found.rms**2, axis=0))
-        noise = (ReadingErrors(np.full(len(s.measured[0]), size))
-                 for s, size in zip(one.seen, sizes, strict=True))  # fmt: skip
-        (rest,) = one.rest(begun(one, model, (tuple(noise),)))
-        for s, r in zip(one.seen, rest, strict=True):
-            y = s.measured[0] - s.measured[0].mean()
-            ahead[s.output].append(
-                HeldOutRun(run.name, percent(r, y), float(np.sqrt(np.mean(r**2))))
-            )
+        one = case_of((run,), case.courses[0].system, (), (), delay)
+        start = np.mean(np.asarray(found.fit.model["start"]), axis=0)[None]
+        start = {"start": start, "nodes": np.zeros((1, 0, start.shape[1]))}
+        for s, r in zip(one.seen, one.ahead(found, start), strict=True):
+            ahead[s.output].append(HeldOutRun.of(run.name, r, s.measured[0]))
     names = [s.output for s in case.seen]
     return {name: tuple(ahead.get(name, ())) for name in names}
