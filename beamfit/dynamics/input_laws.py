@@ -50,7 +50,7 @@ PLACES = {
 # Laws of the value alone, whatever came before.
 STATIC = tuple(PLACES)
 # Probability of the laws that are named, where several are possible.
-NAMED = 0.95
+NAMED = 0.99
 # Parts of a law's width and of its place that are looked at between neighbours, how many times, and
 # how many that makes at most.
 FINER, ZOOMS = 5, 2
@@ -78,7 +78,7 @@ class LawEvidence(NamedTuple):
     fuller : float
         Probability that one more term of a fuller response explains more than a law does.
     likeliest : str
-        The likeliest kind of law in words, or those that make 95 % with their probabilities.
+        The likeliest kind of law in words, or those that make 99 % with their probabilities.
     static : bool
         Whether the likeliest law is one of the value alone.
     weight : array, shape (a,)
@@ -510,7 +510,7 @@ def laws_of(
 
 
 def _named(posterior: _Weighed) -> tuple[str, bool]:
-    """The likeliest law of each kind and input in words, as many as make 95 % of all laws, and if
+    """The likeliest law of each kind and input in words, as many as make 99 % of all laws, and if
     the first is one of the value alone.
     """
     best: dict[tuple[str, str], tuple[float, InputLaw]] = {}
