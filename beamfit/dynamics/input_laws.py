@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.special import logsumexp
+from scipy.special import expit, logsumexp
 
 from beamfit.dynamics.checks import RunSlopes, slow_paths
 from beamfit.dynamics.model import Driven, PreparedOutput, delayed, predicted
@@ -484,7 +484,7 @@ def laws_of(
     whole = weighed(behind, trials, more, len(trials))
     posterior, terms = whole.first(len(trials)), whole.log[len(trials) :]
     law = logsumexp((posterior.log + [t.prior for t in trials])[~posterior.none])
-    fuller = 1.0 / (1.0 + np.exp(law - logsumexp(terms) + np.log(len(terms))))
+    fuller = expit(logsumexp(terms) - np.log(len(terms)) - law)
     if posterior.chance[posterior.none].sum() < 0.5:
         nothing = [term[:, :0] for term in more]
         for _ in range(ZOOMS):
