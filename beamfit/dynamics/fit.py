@@ -283,7 +283,7 @@ def _answered(
     ahead = tuple(_ahead(run, output, answer, physics, late) for run in asked.held)
     evidence = (fit, answer.rests, checks, quantities, curves, ahead, map)
     exact = late if late % 1 == 0 else late + float(fit.model["late"])
-    exact /= runs[0].parts
+    exact = exact / runs[0].parts if runs[0].parts > 1 else exact
     early = max(-exact, 0.0) if delay is None else 0.0
     rms = float(np.sqrt(np.mean(answer.rms**2)))
     status, message = judged({output: ResponseEvidence(*evidence, rms, early)})
