@@ -151,7 +151,7 @@ def identify(
     map: str = "constant",
     *,
     order: int | None = None,
-    delay: int | None = None,
+    delay: float | None = None,
     offset: bool = True,
     hidden: int = 5,
     seed: int = 1,
@@ -169,8 +169,9 @@ def identify(
         Parameters are numbers, or change with the inputs by a network.
     order : int, optional
         States of a state space; chosen by an information criterion if None.
-    delay : int, optional
-        Samples by which outputs follow late; fitted if None.
+    delay : float, optional
+        Samples by which outputs follow late, whole ones for a state space; fitted if None. Below 0
+        where the clocks of inputs and outputs differ.
     offset : bool
         The output at rest is estimated; else it is 0.
     hidden, seed : int
@@ -205,7 +206,7 @@ def identify(
     if model == STATES:
         from beamfit.dynamics.linear import identify_states
 
-        return (identify_states(runs, order, map, delay=delay or 0, offset=offset, **options),)
+        return (identify_states(runs, order, map, delay=int(delay or 0), offset=offset, **options),)
     from beamfit.dynamics.fit import identify as respond
 
     options |= {"delay": delay, "offset": offset}
@@ -217,7 +218,7 @@ def check_model(
     map: str,
     *,
     order: int | None = None,
-    delay: int | None = None,
+    delay: float | None = None,
     offset: bool = True,
 ) -> None:
     """Refuse options that do not belong to a model, in the words of the command line.
@@ -229,6 +230,8 @@ def check_model(
     """
     if order is not None and model != STATES:
         raise InputError(f"--order {order} with --model {model}", f"--model {STATES}")
+    if model == STATES and delay and not (delay > 0 and float(delay).is_integer()):
+        raise InputError(f"--delay {delay:g} with --model {STATES}", "a whole number of samples")
     if model == FED_BATCH and (map != "network" or delay or not offset):
         expected = "--map network, without --delay or --no-offset: its rates are a network's"
         raise InputError(f"--model {FED_BATCH}", expected)
@@ -243,7 +246,7 @@ def control(
     disturbances: Steps = (),
     model: str = "first-order",
     map: str = "constant",
-    delay: int | None = None,
+    delay: float | None = None,
     offset: bool = True,
     hidden: int = 5,
     horizon: int | None = None,

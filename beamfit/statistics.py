@@ -138,7 +138,7 @@ def log_student(t: np.ndarray, dof: np.ndarray | float) -> np.ndarray:
     '1.000000'
     """
     top = gammaln(0.5 * (dof + 1)) - gammaln(0.5 * dof) - 0.5 * np.log(math.pi * dof)
-    return top - 0.5 * (dof + 1) * np.log1p(t * t / dof)
+    return top - (dof + 1) * np.log(np.hypot(1.0, t / np.sqrt(dof)))  # t² may overflow
 
 
 def log_evidence_of_change(

@@ -43,7 +43,7 @@ def identify(
     model: str,
     order: int | None,
     map: str,
-    delay: int | None,
+    delay: float | None,
     no_offset: bool,
     hidden: int,
     hold_back: tuple[str, ...],

@@ -270,7 +270,7 @@ SHARED: dict[str, Callable[..., Any]] = {
     "input": option("--input COLUMN", "An input of any name.", name="inputs", multiple=True),
     "output": option("--output COLUMN", "An output of any name.", name="outputs", multiple=True),
     "step": option("--step SECONDS", "Distance of rows without a time.", type=float),
-    "delay": option("--delay SAMPLES", "Known delay; default: fitted.", type=click.IntRange(0)),
+    "delay": option("--delay SAMPLES", "Known delay; default: fitted.", type=float),
     "no-offset": option("--no-offset", "The output at rest is 0, and not estimated.", is_flag=True),
     "goal": option("--goal PERCENT", "Emittance error to stop at.", callback=_parsed(goal_of)),
     "close": option(

@@ -91,7 +91,7 @@ def _quoted(model: Any, of: tuple[Any, float]) -> jax.Array:
     if seen.physics is SECOND_ORDER:  # both lags of eq 8 where there are two
         root = jnp.sqrt(jnp.maximum(p[1] ** 2 - 1.0, 1e-12))
         parts.append(p[0] * (p[1] + jnp.stack([root, -root])))
-    late = (delay + model["late"]) * jnp.median(jnp.diff(seen.time))
+    late = (delay + model["late"]) * jnp.sum(seen.dt[: 1 if seen.held is None else 2])
     return jnp.concatenate([*parts, jnp.stack([jnp.asarray(model["offset"]), late])])
 
 
@@ -220,7 +220,9 @@ WORSE = 2.0
 
 
 class ResponseEvidence(NamedTuple):
-    """Input of the rules."""
+    """Input of the rules; `early` is by how many samples the output moves before its inputs, if
+    that was found and not given.
+    """
 
     fit: Fit
     rests: bool
@@ -230,6 +232,7 @@ class ResponseEvidence(NamedTuple):
     held: tuple[HeldOutRun, ...]
     map: str
     rms: float
+    early: float = 0.0
 
 
 def judged(found: Mapping[str, ResponseEvidence]) -> tuple[Status, str]:
@@ -245,13 +248,6 @@ def judged(found: Mapping[str, ResponseEvidence]) -> tuple[Status, str]:
     raise AssertionError("the last rule always finds something")
 
 
-def rms_of(fit: Fit) -> float:
-    """The noise of all runs, as the fit weighs them."""
-    found = [float(group.scale * np.mean(np.asarray(record.error)))
-             for group, record in zip(fit.groups, fit.problem.records, strict=True)]  # fmt: skip
-    return float(np.sqrt(np.mean(np.square(found))))
-
-
 def _lost(e: ResponseEvidence) -> Finding | None:
     if e.rests:
         return None
@@ -259,10 +255,16 @@ def _lost(e: ResponseEvidence) -> Finding | None:
     return Finding(Status.not_finite if lost else Status.not_converged, e.fit.message)
 
 
+WANDERS = "The noise wanders about as slowly as the output responds."
+REPEAT = "Repeat the steps, up and down, so that a drift does not look like a response."
+
+
 def _nothing(e: ResponseEvidence) -> Finding | None:
     if e.checks.nothing_probability < POOR_FIT:
         return None
     cause = "The inputs explain no more of the output than chance would."
+    if e.checks.white_probability < POOR_FIT:
+        return Finding(Status.unidentified, f"{cause} {WANDERS}", REPEAT)
     remedy = (
         "Move the inputs further, record longer, try a longer delay (--delay), or look for what "
         "else drives the output."
@@ -311,9 +313,19 @@ def _open(e: ResponseEvidence) -> Finding | None:
     if TIME in left.values():
         remedy = "Sample faster around steps, and wait until the output settles."
         if e.checks.white_probability < POOR_FIT:
-            cause += " The noise wanders about as slowly as the output responds."
-            remedy = "Repeat the steps, up and down, so that a drift does not look like a response."
+            cause, remedy = f"{cause} {WANDERS}", REPEAT
     return Finding(Status.unidentified, cause, remedy)
+
+
+def _ahead(e: ResponseEvidence) -> Finding | None:
+    if not e.early:
+        return None
+    cause = (
+        f"The output moves {e.early:.3g} samples before its inputs: their clocks differ by so "
+        "much, or the inputs were set from the output (feedback)."
+    )
+    remedy = f"If it is the clock, say so (--delay {-e.early:.3g}): the answer then stands."
+    return Finding(Status.poor_fit, cause, remedy)
 
 
 def _fed_back(e: ResponseEvidence) -> Finding | None:
@@ -342,11 +354,14 @@ def _lawful(e: ResponseEvidence) -> Finding | None:
     c = e.checks
     if c.law is None or 1.0 - c.law_probability >= POOR_FIT:
         return None
-    cause = (
-        f"The output follows {c.law} (p = {1.0 - c.law_probability:.1g} without): what moves up "
-        f"and down then differs. The free run explains {c.free_run_percent:.1f} % of the output."
-    )
-    remedy = "Go to each value from the same side, or move by much more than the width."
+    cause = f"The output follows {c.law} (p = {1.0 - c.law_probability:.1g} without): "
+    if c.static_law:
+        cause += "the gain then changes with the input."
+        remedy = "Stay where the gain is the same, or let it change: --map network."
+    else:
+        cause += "what moves up and down then differs."
+        remedy = "Go to each value from the same side, or move by much more than the width."
+    cause += f" The free run explains {c.free_run_percent:.1f} % of the output."
     return Finding(Status.poor_fit, cause, remedy)
 
 
@@ -354,6 +369,15 @@ def _refuted(e: ResponseEvidence) -> Finding | None:
     c = e.checks
     if c.input_probability >= POOR_FIT:
         return None
+    if abs(c.delay_growth) > 0:
+        way = "grows" if c.delay_growth > 0 else "falls"
+        cause = (
+            f"The delay {way} by about {abs(c.delay_growth):.2g} samples along the record "
+            f"(p = {c.input_probability:.1g}): clocks of inputs and output run at different rates."
+        )
+        return Finding(
+            Status.poor_fit, cause, "Cut the record into shorter ones, or correct times."
+        )
     cause = (
         f"Past inputs, or parameters that change with them, explain {100 * c.input_share:.0f} % of "
         f"the residuals (p = {c.input_probability:.1g}): the model lacks a part of the response. "
@@ -380,9 +404,15 @@ def _good(e: ResponseEvidence) -> Finding:
     cause = f"The free run explains {e.checks.free_run_percent:.2f} % of the output."
     if e.checks.white_probability < POOR_FIT:
         cause += " The noise has a memory, which the errors contain."
+    if e.checks.between:
+        names = ", ".join(e.checks.between)
+        cause += f" Without high frequencies, {names} is taken to move between samples."
+    if e.checks.jitter:
+        cause += f" Times of readings are uncertain by {e.checks.jitter:.2g} s: errors contain it."
     if e.checks.law is not None:
         odds = f"P = {e.checks.law_probability:.2f}"
-        cause += f" {e.checks.law.capitalize()} is likelier than none ({odds}): errors contain it."
+        law = e.checks.law[0].upper() + e.checks.law[1:]
+        cause += f" {law} is likelier than none ({odds}): errors contain it."
     gains = [q for name, q in e.quantities.items() if name.startswith("K")]
     if gains and all(q.error is not None and abs(q.value) < 2 * q.error for q in gains):
         cause += " All gains are compatible with 0: only the return of the output to rest is seen."
@@ -395,4 +425,16 @@ def _good(e: ResponseEvidence) -> Finding:
     return Finding(Status.converged, cause)
 
 
-RULES = (_lost, _nothing, _joint, _lawful, _fed_back, _lower, _refuted, _open, _worse, _good)
+RULES = (
+    _lost,
+    _nothing,
+    _joint,
+    _ahead,
+    _lawful,
+    _fed_back,
+    _lower,
+    _refuted,
+    _open,
+    _worse,
+    _good,
+)

@@ -9,7 +9,6 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.ndimage import median_filter
-from scipy.stats import binom
 
 from beamfit.dynamics.model import CLOSE, output_of
 from beamfit.dynamics.record import LEAST, Run
@@ -19,9 +18,6 @@ from beamfit.dynamics.search import Begun, seen_of
 # readings, plus MOVES times the model's step there. More than the share MOST are the
 # process's own. The search is repeated ROUNDS times, each beside a fit without those found.
 FAR, MOST, AROUND, MOVES, ROUNDS = 10.0, 0.05, 7, 3.0, 3
-# A wrong model may miss readings from a change of the inputs to AFTER samples beyond its delay.
-# If more bad ones lie there than chance leads to (p < CHANCE), it is at fault, and they are kept.
-AFTER, CHANCE = 3, 0.05
 # Number of equal readings that count as stuck, if the model moves away by AWAY times the noise.
 HELD, AWAY = 8, 3.0
 
@@ -45,7 +41,6 @@ def sound(
     found, left_out = begin(runs), []
     for _ in range(ROUNDS):
         masks = [_lone(y, f, found.seen.size_y) for y, f in _beside(runs, output, found)]
-        masks = _without_missed(masks, [_at_changes(run, output, found.delay) for run in runs])
         trial, which = _without(runs, output, masks, "readings far off their neighbours")
         if trial is None:
             break
@@ -98,25 +93,6 @@ def _lone(y: np.ndarray, fitted: np.ndarray, size: float) -> np.ndarray:
     steps = np.abs(np.diff(fitted, prepend=fitted[0], append=fitted[-1]))
     far = off > FAR * noise + MOVES * (steps[1:] + steps[:-1])
     return far & (far.mean() <= MOST)
-
-
-def _at_changes(run: Run, output: str, delay: float) -> np.ndarray:
-    """True for readings from a change of the inputs until a little after its delay."""
-    u = np.stack(list(run.inputs.values()), axis=1)
-    rows = np.flatnonzero(np.any(np.diff(u, axis=0) != 0, axis=1)) + 1
-    found = np.zeros(len(u), bool)
-    for shift in range(int(np.ceil(delay)) + AFTER + 1):
-        found[np.minimum(rows + shift, len(u) - 1)] = True
-    return found[np.isfinite(run.outputs[output])]
-
-
-def _without_missed(masks: list[np.ndarray], near: list[np.ndarray]) -> list[np.ndarray]:
-    """Bad readings but those about changes of the inputs, where too many lie there."""
-    bad, inside = np.concatenate(masks), np.concatenate(near)
-    chance = binom.sf(np.sum(bad & inside) - 1, np.sum(bad), inside.mean())
-    return (
-        [mask & ~part for mask, part in zip(masks, near, strict=True)] if chance < CHANCE else masks
-    )
 
 
 def _still(y: np.ndarray, fitted: np.ndarray | None = None, noise: float = 0.0) -> np.ndarray:

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 from scipy.stats import chi2, f
 
@@ -13,22 +12,23 @@ from beamfit.dynamics.model import (
     CLOSE,
     PreparedOutput,
     changed_by,
-    driven,
-    output_of,
     predicted,
 )
-from beamfit.dynamics.record import Run
-from beamfit.dynamics.response import FIRST_ORDER, Physics
-from beamfit.dynamics.search import driven_by, unit_outputs
+from beamfit.dynamics.response import FIRST_ORDER
+from beamfit.dynamics.search import (
+    DRIFT,
+    drift_columns,
+    driven_by,
+    unit_outputs,
+    whitened_rows,
+)
 from beamfit.greybox.fit import Fit
+from beamfit.noise.memory import CorrelatedNoise
 
-# Most lags of residuals, of earlier inputs, of later inputs, and of the whitening autoregression.
-LAGS, PAST, LATER, ORDER = 20, 10, 5, 8
+# Most lags of residuals, of earlier inputs, and of later inputs.
+LAGS, PAST, LATER = 20, 10, 5
 # Time constants of the additional paths in the test for a fuller model.
 SLOW = 5
-# An input is band-limited if its changes have less than the share `FAINT` of their power above the
-# share `HIGH` of the highest frequency; white ones have a tenth there, noise that is fed back too.
-HIGH, FAINT = 0.9, 2e-3
 # Share of an input's variance, independent of other inputs, below which its gain is not separable.
 ALONE = 1e-3
 
@@ -60,11 +60,22 @@ class Checks(NamedTuple):
     first_order : bool
         Whether a first order does as well.
     law : str or None
-        The law of an input that is likelier than none: its name, input and half width.
+        The law of an input that is likelier than none, or the laws between which the runs do not
+        tell, in words.
     law_probability : float
         Its probability, where no law and laws of inputs are all that can be.
+    static_law : bool
+        Whether it is one of the value alone, whatever came before.
     band_limited : tuple of str
-        Inputs without high frequencies, which move between samples; that goes with later inputs.
+        Inputs without high frequencies that the model holds from sample to sample; if they move
+        between, that goes with later inputs.
+    between : tuple of str
+        Inputs without high frequencies that the model follows between samples.
+    delay_growth : float
+        Samples by which the delay grows along the record, if this is what explains the residuals
+        best: clocks of input and output then run at different rates. Else 0.
+    jitter : float
+        Standard deviation of the times of readings about those of the record, s.
     """
 
     free_run_percent: float
@@ -80,7 +91,11 @@ class Checks(NamedTuple):
     first_order: bool = False
     law: str | None = None
     law_probability: float = 0.0
+    static_law: bool = False
     band_limited: tuple[str, ...] = ()
+    between: tuple[str, ...] = ()
+    delay_growth: float = 0.0
+    jitter: float = 0.0
 
     def rows(self) -> list[list[str]]:
         """Label and value."""
@@ -105,6 +120,11 @@ class HeldOutRun(NamedTuple):
     free_run_percent: float
     rms: float
 
+    @classmethod
+    def of(cls, name: str, rest: np.ndarray, y: np.ndarray) -> HeldOutRun:
+        """The run by its residuals and readings."""
+        return cls(name, percent(rest, y), float(np.sqrt(np.mean(rest**2))))
+
     def row(self) -> list[str]:
         """Label and value."""
         return [f"held back {self.name}", f"{self.free_run_percent:.2f} %, rms {self.rms:.3g}"]
@@ -119,6 +139,7 @@ def percent(rest: np.ndarray, y: np.ndarray) -> float:
 def checks_of(
     seen: PreparedOutput,
     residuals: tuple[np.ndarray, ...],
+    noise: RunNoises,
     slopes: Sequence[RunSlopes],
     used: int,
     gain: float | None,
@@ -128,17 +149,16 @@ def checks_of(
 
     `slopes` has those of the output by the model's own numbers, and what fuller models would add.
     """
-    y = np.concatenate([m - m.mean() for m in seen.measured])
+    y = [m - m.mean() for m in seen.measured]
     rest = np.concatenate(residuals)
-    ahead = np.concatenate([_whitened(r, [_share(residuals)]) for r in residuals])
-    (explained, chance), (later, fed) = _explained(seen, residuals, slopes, delay)
-    white = _white(residuals)
+    (explained, chance), (later, fed), grown = _explained(seen, residuals, noise, slopes, delay)
+    white = _white([r / error for r, error in zip(residuals, noise.errors, strict=True)])
     if rest.std() <= CLOSE * seen.size_y:  # what is left is rounding, or the network's own detail
-        explained, chance, later, fed, white = 0.0, 1.0, 0.0, 1.0, 1.0
+        explained, chance, later, fed, white, grown = 0.0, 1.0, 0.0, 1.0, 1.0, 0.0
     return Checks(
-        percent(rest, y),
-        percent(ahead, y),
-        _chance(y, rest, used),
+        percent(rest, np.concatenate(y)),
+        percent(noise.ahead(residuals), np.concatenate(y)),
+        _chance(noise.white(y), noise.white(residuals), used),
         white,
         chance,
         explained,
@@ -146,21 +166,8 @@ def checks_of(
         later,
         gain,
         _together(seen),
-        band_limited=_band_limited(seen),
+        delay_growth=grown,
     )
-
-
-def _band_limited(seen: PreparedOutput) -> tuple[str, ...]:
-    """Inputs of runs at equal steps that have no high frequencies."""
-    high, whole = np.zeros(len(seen.inputs)), np.zeros(len(seen.inputs))
-    for run in seen.runs:
-        count = int(np.count_nonzero(np.asarray(run.dt)))
-        rows = slice(0, count + 1, 1 if run.held is None else 2)
-        changes = np.diff(np.asarray(run.u)[rows], axis=0)
-        power = np.abs(np.fft.rfft(changes * np.hanning(len(changes))[:, None], axis=0)) ** 2
-        high += power[int(HIGH * len(power)) :].sum(axis=0)
-        whole += power.sum(axis=0)
-    return tuple(np.array(seen.inputs)[(high < FAINT * whole) & (whole > 0)].tolist())
 
 
 def _together(seen: PreparedOutput) -> tuple[str, ...]:
@@ -182,30 +189,49 @@ def _chance(y: np.ndarray, rest: np.ndarray, used: int) -> float:
     return float(f.sf((whole - left) / used / max(left / free, 1e-300), used, free))
 
 
-def _share(residuals: tuple[np.ndarray, ...]) -> float:
-    """Correlation of neighbours."""
-    both = sum(float(r[1:] @ r[:-1]) for r in residuals)
-    return float(np.clip(both / max(sum(float(r @ r) for r in residuals), 1e-300), 0.0, 0.999))
+class RunNoises(NamedTuple):
+    """Noise of an output: times and errors of the readings of each run, and the memory.
 
-
-def _whitened(r: np.ndarray, memory: Sequence[float] | np.ndarray) -> np.ndarray:
-    """Residuals less their prediction from earlier ones; the first ones are dropped."""
-    order = len(memory)
-    return r[order:] - sum(m * r[order - k : -k] for k, m in enumerate(memory, start=1))
-
-
-def _memory(residuals: tuple[np.ndarray, ...]) -> np.ndarray:
-    """Autoregression of the residuals, by least squares.
-
-    With a first order alone, white noise on top of a drift would stay coloured.
+    `jitter` is how many rows earlier or later readings may have been taken.
     """
-    order = max(1, min(ORDER, min(map(len, residuals)) // 20))
-    before = [np.stack([r[order - k : -k] for k in range(1, order + 1)], axis=1) for r in residuals]
-    after = np.concatenate([r[order:] for r in residuals])
-    return np.linalg.lstsq(np.vstack(before), after, rcond=1e-10)[0]
+
+    times: Sequence[np.ndarray]
+    errors: Sequence[np.ndarray]
+    memory: CorrelatedNoise | None
+    jitter: int = 0
+
+    def white(self, parts: Sequence[np.ndarray]) -> np.ndarray:
+        """Columns of readings, by run, in noise without a memory and of size 1."""
+        each = zip(parts, self.errors, self.times, strict=True)
+        return np.concatenate([
+            np.asarray(whitened_rows(part / np.expand_dims(error, tuple(range(1, part.ndim))),
+                                     time, self.memory)[0])
+            for part, error, time in each
+        ])  # fmt: skip
+
+    def drift(self, own: np.ndarray, rest: np.ndarray) -> np.ndarray:
+        """Cosines of a drift that whitened residuals show beside a model's own slopes, as many as
+        the Bayesian information criterion wants.
+        """
+        count, runs = len(rest), len(self.times)
+        waves = self.white([np.asarray(drift_columns(self.times, i)).reshape(len(t), -1)
+                            for i, t in enumerate(self.times)])  # fmt: skip
+        triangle = np.linalg.qr(np.column_stack([_basis(own), waves, rest]), mode="r")
+        least = np.cumsum(triangle[::-1, -1] ** 2)[::-1]
+        used = len(triangle) - 1 - runs * np.arange(DRIFT, -1, -1)
+        cost = count * np.log(np.maximum(least[used], np.finfo(float).tiny)) + np.log(count) * used
+        return waves[:, : runs * int(cost.argmin())]
+
+    def ahead(self, residuals: Sequence[np.ndarray]) -> np.ndarray:
+        """Residuals of predictions from the readings before."""
+        found = []
+        for r, error, time in zip(residuals, self.errors, self.times, strict=True):
+            white, volume = whitened_rows(r / error, time, self.memory)
+            found.append(np.asarray(white) * error * np.exp(float(volume) / len(r)))
+        return np.concatenate(found)
 
 
-def _white(residuals: tuple[np.ndarray, ...]) -> float:
+def _white(residuals: Sequence[np.ndarray]) -> float:
     count = sum(map(len, residuals))
     lags = min(LAGS, count // 5)
     squares = max(sum(float(r @ r) for r in residuals), 1e-300)
@@ -217,39 +243,47 @@ def _white(residuals: tuple[np.ndarray, ...]) -> float:
 def _explained(
     seen: PreparedOutput,
     residuals: tuple[np.ndarray, ...],
+    noise: RunNoises,
     slopes: Sequence[RunSlopes],
     delay: int,
-) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Share of the whitened residuals that a fuller model explains, with its chance, and the share
-    of the rest that later inputs explain.
+) -> tuple[tuple[float, float], tuple[float, float], float]:
+    """Share of the whitened residuals that a fuller model explains, with its chance, the share of
+    the rest that later inputs explain, and the growth of the delay if it explains most.
 
     A score test (Lagrange multipliers): columns are inputs before, those within the delay too,
-    further paths of first order, and the slopes of the output by parameters that change with the
-    operating point, less what the model's own numbers can do.
+    further paths of first order, the slopes of the output by parameters that change with the
+    operating point, and by a delay that grows, less what the model's own numbers can do.
     """
-    memory = _memory(residuals)
-    own, quick, later, targets = [], [], [], []
-    for run, r, each in zip(seen.runs, residuals, slopes, strict=True):
+    own, quick, later = [each.own for each in slopes], [], []
+    for run, each in zip(seen.runs, slopes, strict=True):
         u = seen.scaled(run.u)
         index = np.asarray(run.index)
         past = [u[np.clip(index + k, 0, len(u) - 1)] for k in range(-PAST, delay)]
-        after = [u[np.clip(index + delay + k, 0, len(u) - 1)] for k in range(LATER)]
+        first = delay + noise.jitter  # a late reading has seen the input of its row
+        after = [u[np.clip(index + first + k, 0, len(u) - 1)] for k in range(LATER)]
         later.append(np.concatenate(after, axis=1))
         quick.append(np.concatenate([*past, each.changing], axis=1))
-        own.append(each.own)
-        targets.append(r)
-
-    def white(parts: list[np.ndarray]) -> np.ndarray:
-        return np.concatenate([_whitened(part, memory) for part in parts])
-
-    slow, basis = slow_paths(seen), _basis(white(own))
-    rest = white(targets)
+    own, slow, quick, later = (noise.white(part) for part in (own, slow_paths(seen), quick, later))
+    rest = noise.white(residuals)
+    own = np.hstack([own, noise.drift(own, rest)])
+    basis = _basis(own)
     rest = rest - basis @ (basis.T @ rest)
-    few, more = (_tested(rest, basis, white(columns)) for columns in (slow, quick))
-    share, chance = min(few, more, key=lambda each: each[1])
-    basis = _basis(np.hstack([white(columns) for columns in (own, slow, quick)]))
+    pairs = zip(seen.measured, residuals, noise.times, strict=True)
+    clock = noise.white([_late(y - r, t) for y, r, t in pairs])
+    clock = clock - basis @ (basis.T @ clock)
+    tests = [_tested(rest, basis, columns) for columns in (slow, quick, clock)]
+    share, chance = found = min(tests, key=lambda each: each[1])
+    grown = float(clock[:, 0] @ rest / (clock[:, 0] @ clock[:, 0])) if found is tests[2] else 0.0
+    basis = _basis(np.hstack([own, slow, quick]))
     rest = rest - basis @ (basis.T @ rest)
-    return (share, min(2.0 * chance, 1.0)), _tested(rest, basis, white(later))
+    chance = min(len(tests) * chance, 1.0)
+    return (share, chance), _tested(rest, basis, later), grown
+
+
+def _late(fitted: np.ndarray, time: np.ndarray) -> np.ndarray:
+    """Change of an output whose delay grows by a sample along the record, as a column."""
+    through = (time - time[0]) / (time[-1] - time[0]) - 0.5
+    return (-through * np.diff(fitted, prepend=fitted[0]))[:, None]
 
 
 def slow_paths(seen: PreparedOutput) -> list[np.ndarray]:
@@ -293,20 +327,3 @@ def slopes_of(seen: PreparedOutput, fit: Fit) -> list[RunSlopes]:
         added = changed_by(fit.model, run, np.concatenate([u, u**2], axis=1))
         found.append(RunSlopes(fit.derive(predicted, run).slope, np.asarray(added)))
     return found
-
-
-def predict_held(run: Run, output: str, fit: Fit, physics: Physics, delay: float) -> HeldOutRun:
-    """Predict a run that was held back; only the state at its start is estimated."""
-    seen = driven(run, 0, output, physics, delay)
-    y = run.outputs[output][np.asarray(seen.index)]
-
-    def from_start(free: Any) -> np.ndarray:
-        return np.asarray(output_of(fit.model | {"start": free[None]}, seen))
-
-    zero = jnp.zeros(physics.free_states)
-    base = from_start(zero)
-    moved = np.stack([from_start(e) - base for e in jnp.eye(physics.free_states)], axis=1)
-    target = y - base
-    first = np.linalg.lstsq(moved, target, rcond=1e-10)[0]
-    rest = target - moved @ first
-    return HeldOutRun(run.name, percent(rest, y), float(np.sqrt(np.mean(rest**2))))

@@ -480,7 +480,7 @@ def _response(fit: ResponseFit, every: int, step: float) -> Response:
         PHYSICS[fit.model],
         model["map"],
         float(model["offset"]),
-        int(np.ceil(fit.delay / every)),
+        max(int(np.ceil(fit.delay / every)), 0),
         fit.seen.size_y,
         ahead / (ahead + 1.0),
         MARGIN * float(np.hypot(noise, band)),

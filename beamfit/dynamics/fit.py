@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -17,24 +17,40 @@ from beamfit.dynamics.answer import (
     judged,
     limit_words,
     quantities_of,
-    rms_of,
     told,
 )
 from beamfit.dynamics.bad_readings import BadReadings, sound
-from beamfit.dynamics.checks import Checks, HeldOutRun, checks_of, predict_held, slopes_of
+from beamfit.dynamics.checks import (
+    Checks,
+    HeldOutRun,
+    RunNoises,
+    checks_of,
+    slopes_of,
+)
 from beamfit.dynamics.input_laws import laws_of, shorter
 from beamfit.dynamics.limits import LagLimits, lag_limits
 from beamfit.dynamics.model import PreparedOutput, network_of, output_of
-from beamfit.dynamics.record import Run, check_inputs, checked
-from beamfit.dynamics.response import PHYSICS
+from beamfit.dynamics.record import (
+    PARTS,
+    Run,
+    band_limited,
+    between,
+    check_inputs,
+    checked,
+    recorded,
+)
+from beamfit.dynamics.response import PHYSICS, Physics
 from beamfit.dynamics.search import (
     Begun,
+    Case,
     Settled,
     begun,
     case_of,
     fitted,
     is_first_order,
     latest,
+    seen_of,
+    starts_of,
     used_by,
 )
 from beamfit.errors import InputError, Status, nearest
@@ -166,7 +182,8 @@ def identify(
         Which output, if the runs have several.
     delay : float, optional
         Samples by which the output follows late; found among candidates if None. What is no whole
-        number is estimated besides, with an error.
+        number is estimated besides, with an error. Below zero where the clocks of input and output
+        differ.
     offset : bool
         Whether the output at rest is a free number; else it is 0.
     hidden, starts, seed : int
@@ -212,61 +229,123 @@ def identify(
     check_inputs(runs)
     output = _output(runs[0], output)
     shortest = min(len(run) for run in runs)
-    if delay is not None and not 0 <= delay < shortest - 1:
-        raise InputError(f"a delay of {delay} samples", f"less than the {shortest} rows of a run")
-    runs, left_out, found = sound(
-        runs, output, lambda these: begun(these, output, physics, delay, offset)
-    )
-    answer = found.plain
-    if map == "network":
-        answer = _with_network(found, offset, hidden, range(seed, seed + starts))
-    delays = shorter(found.delay) if delay is None else [delay]
-    checks, quantities, curves = _known(runs, found, answer, offset, map, delays)
+    if delay is not None and not abs(delay) < shortest - 1:
+        raise InputError(f"a delay of {delay:g} samples", f"less than the {shortest} rows of a run")
+    seeds, moving = range(seed, seed + starts), () if physics.even else band_limited(runs)
+    asked = _Identification(output, physics, map, delay, offset, hidden, seeds, moving, held)
+    if moving:
+        finer = tuple(between(run, moving) for run in runs)
+        rows = asked._replace(delay=None if delay is None else delay * PARTS)
+        if rows.cost(finer) < asked.cost(runs):
+            held = tuple(between(run, moving) for run in held)
+            runs, asked = finer, rows._replace(held=held)
+    sound_runs, left_out, found = sound(runs, output, asked.begun)
+    fit = _answered(asked, sound_runs, found, left_out)
+    if not left_out or fit.status is not Status.poor_fit:
+        return fit
+    # A model that is refuted misses good readings.
+    whole = _answered(asked, runs, asked.begun(runs), ())
+    return whole if whole.status is Status.poor_fit else fit
+
+
+class _Identification(NamedTuple):
+    """Settings of an identification."""
+
+    output: str
+    physics: Physics
+    map: str
+    delay: float | None
+    offset: bool
+    hidden: int
+    seeds: range
+    moving: tuple[str, ...]
+    held: tuple[Run, ...]
+
+    def cost(self, runs: tuple[Run, ...]) -> float:
+        """-2 ln L of the start of a search, with the cost of a part of a sample in the delay."""
+        starts = starts_of(runs, self.output, self.physics, self.delay, self.offset)
+        part = np.log(sum(len(run) // run.parts for run in runs))
+        return min(start.cost + part * (late % 1.0 > 0.0) for start, _, late in starts)
+
+    def begun(self, runs: tuple[Run, ...]) -> Begun:
+        """The fit of runs with constant parameters."""
+        return begun(runs, self.output, self.physics, self.delay, self.offset)
+
+
+def _answered(
+    asked: _Identification, runs: tuple[Run, ...], found: Begun, left_out: tuple[BadReadings, ...]
+) -> ResponseFit:
+    """Judge runs whose fit with constant parameters was found."""
+    output, physics, map, delay = asked[:4]
+    answer = found.plain if map == "constant" else _with_network(asked, found)
+    checks, quantities, curves = _known(asked, runs, found, answer)
     fit, late = answer.fit, found.delay
-    ahead = tuple(predict_held(each, output, fit, physics, late) for each in held)
+    ahead = tuple(_ahead(run, output, answer, physics, late) for run in asked.held)
     evidence = (fit, answer.rests, checks, quantities, curves, ahead, map)
-    status, message = judged({output: ResponseEvidence(*evidence, rms_of(fit))})
+    exact = late if late % 1 == 0 else late + float(fit.model["late"])
+    exact = exact / runs[0].parts if runs[0].parts > 1 else exact
+    early = max(-exact, 0.0) if delay is None else 0.0
+    rms = float(np.sqrt(np.mean(answer.rms**2)))
+    status, message = judged({output: ResponseEvidence(*evidence, rms, early)})
     longest = [LATEST] if delay is None and late == latest(runs) > 0 else []
     message = " ".join([message, *longest, *(f"Left out: {each}." for each in left_out)])
-    late = late if late % 1 == 0 else late + float(fit.model["late"])
-    noise = tuple(answer.noise[:, 0].tolist())
+    noise = tuple(answer.rms[:, 0].tolist())
     parts = (quantities, curves, noise, answer.memory, checks, ahead, left_out)
-    return ResponseFit(output, status, message, model, map, late, runs, found.seen, fit, *parts)
+    named = output, status, message, physics.name, map, exact
+    runs = tuple(recorded(run) for run in runs)
+    return ResponseFit(*named, runs, found.seen, fit, *parts)
 
 
-def _with_network(found: Begun, offset: bool, hidden: int, seeds: range) -> Settled:
+def _ahead(run: Run, output: str, answer: Settled, physics: Physics, late: float) -> HeldOutRun:
+    """Predict a run that was held back."""
+    seen = seen_of((run,), output, physics, late)
+    start = {"start": np.zeros((1, physics.free_states))}
+    (rest,) = Case((seen,), seen.runs, (), ()).ahead(answer, start)
+    return HeldOutRun.of(run.name, rest, seen.measured[0])
+
+
+def _with_network(asked: _Identification, found: Begun) -> Settled:
     """The best fit with a network of parameters, from the constant ones."""
     seen, first = found.seen, found.plain.fit.model
-    physics, raw = seen.runs[0].physics, np.asarray(first["map"])
-    nets = (network_of(seen, physics, raw, hidden, seed) for seed in seeds)
-    return fitted(case_of(seen, offset, True), [first | {"map": net} for net in nets])
+    raw = np.asarray(first["map"])
+    nets = (network_of(seen, asked.physics, raw, asked.hidden, seed) for seed in asked.seeds)
+    return fitted(case_of(seen, asked.offset, True), [first | {"map": net} for net in nets])
 
 
 def _known(
-    runs: tuple[Run, ...], found: Begun, answer: Settled, offset: bool, map: str, delays: Sequence
+    asked: _Identification, runs: tuple[Run, ...], found: Begun, answer: Settled
 ) -> tuple[Checks, dict[str, Quantity], tuple[Curve, ...]]:
     """Tests of the residuals, and what the runs determine of constants or curves."""
-    seen, constant = found.seen, map == "constant"
-    slopes = slopes_of(seen, answer.fit)
+    seen, constant, offset = found.seen, asked.map == "constant", asked.offset
+    delays = shorter(found.delay) if asked.delay is None else [asked.delay]
+    slopes, jitter = slopes_of(seen, answer.fit), float(answer.jitter.max())
+    sample = runs[0].parts * (1 if seen.part == 0.0 else 2)  # in rows
+    errors = [noise.each for (noise,) in answer.noise]
     checks = checks_of(
         seen,
         tuple(rest for (rest,) in answer.rest),
+        RunNoises(seen.time, errors, answer.likely, sample if jitter else 0),
         slopes,
         used_by(answer.fit),
         None if constant else found.plain.likelihood - answer.likelihood,
         int(np.ceil(found.delay)) * (1 if found.delay % 1 == 0 else 2),  # in rows
     )
-    checks = checks._replace(first_order=constant and is_first_order(found, offset))
+    checks = checks._replace(
+        first_order=constant and is_first_order(found, offset),
+        jitter=jitter,
+        **{"band_limited" if runs[0].parts == 1 else "between": asked.moving},
+    )
     laws = (
         laws_of(runs, seen, answer, delays, slopes)
         if constant and not answer.exact(case_of(seen, offset))
         else None
     )
     if laws is not None and laws.none < 0.5 and laws.fuller < 0.5:
-        checks = checks._replace(law=laws.likeliest, law_probability=1.0 - laws.none)
+        checks = checks._replace(
+            law=laws.likeliest, law_probability=1.0 - laws.none, static_law=laws.static
+        )
     parts = answer.fit, answer.errors
-    physics = seen.runs[0].physics
-    quantities = quantities_of(*parts, laws, seen, physics, found.delay) if constant else {}
+    quantities = quantities_of(*parts, laws, seen, asked.physics, found.delay) if constant else {}
     limits = lag_limits(seen, answer, offset) if constant else LagLimits(None, None)
     curves = () if constant else curves_of(*parts, seen)
     return checks, *told(quantities, curves, seen, checks, limits)

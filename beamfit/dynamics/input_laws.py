@@ -12,29 +12,49 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
+from itertools import groupby
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.special import expit, logsumexp
 
 from beamfit.dynamics.checks import RunSlopes, slow_paths
 from beamfit.dynamics.model import Driven, PreparedOutput, delayed, predicted
 from beamfit.dynamics.record import Run
 from beamfit.dynamics.search import Settled, noises_of
 from beamfit.greybox import tree
-from beamfit.greybox.memory import Memory, Whitened
+from beamfit.greybox.memory import Whitened
 from beamfit.greybox.problem import with_slope
 from beamfit.noise.memory import CorrelatedNoise, innovations
 
 # Laws, and half widths of each as shares of an input's range: prior flat in their logarithm. A stop
 # hands on other values as soon as its width passes a move. The others change smoothly with it, so
 # that it is a number to be fitted, with a prior about each of these as wide as half their distance.
+# A saturation leaves this share of the range on one side of its place, flat in the logarithm of
+# what is cut off. A square law bends up or down; as wide as the range it is a square from one end.
 LAWS = {law: np.geomspace(0.005, 0.4, count) for law, count in
         (("play", 8), ("hysteresis", 8), ("stop", 24), ("shift", 8), ("dead zone", 8))}  # fmt: skip
-BETWEEN = 0.5 * np.log(80.0) / 7
-# Places of a dead zone in a range without 0: prior flat.
-PLACES = np.linspace(0.1, 0.9, 5)
+LAWS |= {
+    "saturation": 1.0 - np.geomspace(0.02, 0.9, 8),
+    "square law": np.outer((1.0, -1.0), np.geomspace(0.1, 50.0, 8)).ravel(),
+}
+# Places in the range about which a law lies, as shares of it: prior flat. A dead zone of a range
+# with 0 lies there; a saturation about an end of the range is one of the other end.
+PLACES = {
+    "dead zone": (0.1, 0.3, 0.5, 0.7, 0.9),
+    "saturation": (0.0, 0.5, 1.0),
+    "square law": (0.5,),
+}
+# Laws of the value alone, whatever came before.
+STATIC = tuple(PLACES)
+# Probability of the laws that are named, where several are possible.
+NAMED = 0.99
+# Parts of a law's width and of its place that are looked at between neighbours, how many times, and
+# how many that makes at most.
+FINER, ZOOMS = 5, 2
+MOST_FINER = FINER**2
 # Plays of a hysteresis, as shares of the widest, which is twice its half width.
 PLAYS = (0.0, 0.4, 0.8, 1.2, 1.6, 2.0)
 # Correlation times and white variances of the noises that each is fitted with, and most readings.
@@ -58,7 +78,9 @@ class LawEvidence(NamedTuple):
     fuller : float
         Probability that one more term of a fuller response explains more than a law does.
     likeliest : str
-        The likeliest law: its name, input and half width.
+        The likeliest kind of law in words, or those that make 99 % with their probabilities.
+    static : bool
+        Whether the likeliest law is one of the value alone.
     weight : array, shape (a,)
         Probability of each law; with `none` they make 1.
     shift : array, shape (a, p)
@@ -70,6 +92,7 @@ class LawEvidence(NamedTuple):
     none: float
     fuller: float
     likeliest: str
+    static: bool
     weight: np.ndarray
     shift: np.ndarray
     covariance: np.ndarray
@@ -90,11 +113,15 @@ def moved(u: np.ndarray, law: str, width: float | np.ndarray, place: float = 0.0
     A play follows when its clearance is used up; a hysteresis is the mean of plays of several
     widths (Prandtl, Ishlinskii); a stop (Coulomb friction) goes all the way once it moves at all; a
     shift (friction against a spring) is to the side that the input last came from. A dead zone lies
-    about a place.
+    about a place, a saturation leaves what is about one, and a square law bends about one.
     """
     half = np.asarray(width)[..., None]
     if law == "dead zone":
         return u - np.clip(u - place, -half, half)
+    if law == "saturation":
+        return place + np.clip(u - place, -half, half)
+    if law == "square law":
+        return u + (u - place) ** 2 / half
     if law == "shift":
         sign = np.sign(np.diff(u, prepend=u[0]))
         last = np.maximum.accumulate(np.where(sign != 0, np.arange(len(u)), 0))
@@ -109,35 +136,63 @@ def moved(u: np.ndarray, law: str, width: float | np.ndarray, place: float = 0.0
     return np.moveaxis(np.mean(found, axis=-1), 0, -1)[..., np.cumsum(changes) - 1]
 
 
-def _with_width(u: np.ndarray, law: str, widths: np.ndarray, place: float) -> np.ndarray:
-    """Inputs that a law hands on at each width, and changes with it, shape (widths, rows, 2)."""
-    at = moved(u, law, widths, place)
-    if law == "stop":
-        return np.stack([at, 0.0 * at], axis=2)
-    wider, closer = (moved(u, law, widths * np.exp(s), place) for s in (BETWEEN, -BETWEEN))
-    return np.stack([at, 0.5 * (wider - closer)], axis=2)
+class InputLaw(NamedTuple):
+    """A law of an input that goes from `low` to `high`, as wide as `width` about `place`.
 
-
-class _Candidates(NamedTuple):
-    """Laws of the inputs at each delay, no law first; and terms of a fuller response, without one.
-
-    Attributes
-    ----------
-    names : list of str
-        Kind, input and half width of each law at one delay; empty of none.
-    prior : array, shape (a,)
-        Prior of each law at each delay, at even odds of a law: even over its kinds, the widths of
-        one, the delays. Laws that a gain and a level stand for have none.
-    inputs : list of array, shape (a + terms, samples, inputs, 2)
-        Inputs of each run behind each, and how they change with its width.
-    terms : list of array, shape (a + terms, readings)
-        What is added to the output of each run, zero for laws.
+    `step` is half the distance to the next width, in the logarithm, and the width of a prior about
+    this one; `stride` half the distance to the next place.
     """
 
-    names: list[str]
-    prior: np.ndarray
-    inputs: list[np.ndarray]
-    terms: list[np.ndarray]
+    kind: str
+    input: str
+    width: float
+    step: float
+    place: float
+    stride: float
+    low: float
+    high: float
+
+    def changed(self, change: float) -> InputLaw:
+        """The law `change` steps wider; a dead zone to an end of the range is a saturation."""
+        law = self._replace(width=self.width * float(np.exp(change * self.step)))
+        ends = law.place - law.width, law.place + law.width
+        if law.kind == "dead zone" and ends[1] >= law.high > ends[0] > law.low:
+            return law._replace(kind="saturation", place=law.low, width=ends[0] - law.low)
+        if law.kind == "dead zone" and ends[0] <= law.low < ends[1] < law.high:
+            return law._replace(kind="saturation", place=law.high, width=law.high - ends[1])
+        return law
+
+    def finer(self, change: float) -> list[InputLaw]:
+        """Laws between this one, `change` steps wider, and those next to it."""
+        at = np.linspace(-1.0, 1.0, FINER + 1)
+        at = 0.5 * (at[1:] + at[:-1])
+        widths = self.width * np.exp(self.step * (change + at))
+        places = self.place + self.stride * at if self.stride else [self.place]
+        less = {"step": self.step / FINER, "stride": self.stride / FINER}
+        return [self._replace(width=float(w), place=float(p), **less)
+                for p in places for w in widths]  # fmt: skip
+
+    def words(self) -> str:
+        """The law in words."""
+        width, name = self.width, self.input
+        if self.kind == "saturation":
+            ends = self.place - width, self.place + width
+            below = [f"below {ends[0]:.3g}"] if ends[0] > self.low else []
+            above = [f"above {ends[1]:.3g}"] if ends[1] < self.high else []
+            return f"a saturation of {name} {' and '.join(below + above)}"
+        if self.kind == "square law":
+            ends = 1.0 + np.array([-1.0, 1.0]) * (self.high - self.low) / width
+            return f"a square law of {name} (gain {ends[0]:.2g} to {ends[1]:.2g} of its mean)"
+        about = f" about {self.place:.3g}" if self.kind in STATIC else ""
+        return f"a {self.kind} of {name} by ±{width:.2g}{about}"
+
+
+class _Trial(NamedTuple):
+    """A law, or none, at a delay, with the logarithm of its prior."""
+
+    law: InputLaw | None
+    delay: float
+    prior: float
 
 
 def shorter(delay: float) -> list[float]:
@@ -146,55 +201,108 @@ def shorter(delay: float) -> list[float]:
     return [delay, *range(max(0, whole - LATE), whole)]
 
 
-def _candidates(
-    runs: Sequence[Run], seen: PreparedOutput, delays: Sequence[float], more: Sequence[np.ndarray]
-) -> _Candidates:
+def _laws(name: str, low: float, high: float) -> list[InputLaw]:
+    """The laws that are looked at of an input with this range."""
+    found = []
+    for kind, shares in LAWS.items():
+        at_zero = kind not in PLACES or (kind == "dead zone" and low < 0 < high)
+        places = [0.0] if at_zero else low + np.array(PLACES[kind]) * (high - low)
+        stride = 0.5 * (places[1] - places[0]) if len(places) > 1 else 0.0
+        apart = np.abs(np.diff(np.log(np.abs(shares))))
+        near = 0.5 * np.minimum(np.append(apart, np.inf), np.append(np.inf, apart))
+        for place in places:
+            ended = kind == "saturation" and place in (low, high)
+            reach = max(place - low, high - place) if kind == "saturation" else high - low
+            found += [
+                InputLaw(kind, name, w * reach, 0.0 if kind == "stop" else float(step),
+                         float(place), 0.0 if ended else float(stride), low, high)
+                for w, step in zip(shares, near, strict=True)
+            ]  # fmt: skip
+    return found
+
+
+# Inputs of each run behind a law and their changes by a step of its width, (rows, inputs, 2).
+Behind = dict[InputLaw | None, list[np.ndarray]]
+
+
+def _behind(runs: Sequence[Run], laws: Sequence[InputLaw]) -> Behind:
+    """Inputs behind no law and each of some."""
+    inputs = list(runs[0].inputs)
     plain = [np.stack(list(run.inputs.values()), axis=1) for run in runs]
-    names, kinds = [""], [""]
-    behind = [[np.stack([u, 0.0 * u], axis=2)] for u in plain]
-    ends = zip(seen.inputs, seen.points.min(axis=0), seen.points.max(axis=0), strict=True)
-    for i, (name, low, high) in enumerate(ends):
-        design = np.concatenate([np.stack([u[:, i], np.ones(len(u))], axis=1) for u in plain])
-        places = [0.0] if low < 0 < high else low + PLACES * (high - low)
-        shapes = [(law, at) for law in LAWS for at in (places if law == "dead zone" else [0.0])]
-        for law, at in shapes:
-            widths = LAWS[law] * (high - low)
-            turned = [_with_width(u[:, i], law, widths, at) for u in plain]
-            whole = np.concatenate([v[..., 0] for v in turned], axis=1).T
-            rest = whole - design @ np.linalg.lstsq(design, whole, rcond=1e-10)[0]
-            size = np.linalg.norm(whole - whole.mean(axis=0), axis=0)
-            kinds += np.where(np.linalg.norm(rest, axis=0) > SAME * size, law, "same").tolist()
-            names += [f"a {law} of {name} by ±{w:.2g}" for w in widths]
-            for each, t in zip(behind, turned, strict=True):
-                every = np.repeat(each[:1], len(t), axis=0)
-                every[:, :, i] = t
-                each += list(every)
-    alike = Counter(kinds)
-    some = max(len(alike.keys() - {"", "same"}), 1)
-    odds = {kind: 1.0 / (some if kind else 1) / count for kind, count in alike.items()}
-    prior = [(odds | {"same": 0.0})[kind] for kind in kinds]
+    found: Behind = {None: [np.stack([u, 0.0 * u], axis=2) for u in plain]}
+    for (kind, place, name), group in groupby(laws, lambda law: (law.kind, law.place, law.input)):
+        alike, k = list(group), inputs.index(name)
+        width, step = np.array([(law.width, law.step) for law in alike]).T
+        widths = width * np.exp(np.multiply.outer([0.0, 1.0, -1.0], step))
+        for law in alike:
+            found[law] = [u.copy() for u in found[None]]
+        for i, u in enumerate(plain):
+            at, wider, closer = moved(u[:, k], kind, widths, place)
+            for law, *turned in zip(alike, at, 0.5 * (wider - closer), strict=True):
+                found[law][i][:, k] = np.stack(turned, axis=1)
+    return found
+
+
+def _is_none(behind: Behind, law: InputLaw, k: int) -> bool:
+    """True if a gain and a level stand for a law of input k, from its first change on: what was
+    before is a number at the start.
+    """
+    since = [np.argmax(u[:, k, 0] != u[0, k, 0]) for u in behind[None]]
+    u, at = (
+        np.concatenate([each[row:, k, 0] for each, row in zip(behind[of], since, strict=True)])
+        for of in (None, law)
+    )
+    design = np.stack([u, np.ones(len(u))], axis=1)
+    rest = at - design @ np.linalg.lstsq(design, at, rcond=1e-10)[0]
+    return bool(np.linalg.norm(rest) <= SAME * np.linalg.norm(at - at.mean()))
+
+
+def _trials(behind: Behind, inputs: Sequence[str], delays: Sequence[float]) -> list[_Trial]:
+    """No law and every law at each delay, at even odds of a law: even over its kinds, the widths
+    of one, the delays. Laws that a gain and a level stand for are none.
+    """
+    laws = [law for law in behind
+            if law is not None and not _is_none(behind, law, inputs.index(law.input))]  # fmt: skip
+    alike, each = Counter(law.kind for law in laws), -np.log(len(delays))
+    priors = [each - np.log(len(alike) * alike[law.kind]) for law in laws]
+    pairs = [(None, each), *zip(laws, priors, strict=True)]
+    return [_Trial(law, delay, prior) for law, prior in pairs for delay in delays]
+
+
+def _candidates(
+    seen: PreparedOutput,
+    behind: Behind,
+    trials: Sequence[_Trial],
+    more: Sequence[np.ndarray],
+    count: int,
+) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """Inputs of each run behind each trial and their changes with its width, the first repeated
+    until they are `count`, shape (count + terms, samples, inputs, 2); and what is added to the
+    output, zero for laws, shape (count + terms, readings).
+    """
     unit = np.sqrt(np.mean(np.concatenate(more) ** 2, axis=0)) / seen.size_y
-    unit, terms = np.where(unit > 0, unit, 1.0), more[0].shape[1]
-    inputs, added = [], []
-    for run, each, x in zip(seen.runs, behind, more, strict=True):
-        flat = np.array(each).reshape(len(each), len(each[0]), -1)
-        late = [np.stack([delayed(u, delay) for u in flat]) for delay in delays]
-        late = [np.repeat(u, len(run.u) // u.shape[1], axis=1) for u in late]
-        late = np.concatenate([*late, np.repeat(late[0][:1], terms, axis=0)])
-        inputs.append(late.reshape(*late.shape[:2], *each[0].shape[1:]))
-        added.append(np.concatenate([np.zeros((len(each) * len(delays), len(x))), (x / unit).T]))
-    return _Candidates(names, np.tile(prior, len(delays)) / len(delays), inputs, added)
+    unit, inputs, terms = np.where(unit > 0, unit, 1.0), [], []
+    for i, (run, x) in enumerate(zip(seen.runs, more, strict=True)):
+        each = []
+        for law, delay, _ in trials:
+            u = behind[law][i]
+            late = delayed(u.reshape(len(u), -1), delay)
+            late = np.repeat(late, len(run.u) // len(late), axis=0)
+            each.append(late.reshape(len(late), *u.shape[1:]))
+        inputs.append(np.stack(each + [each[0]] * (count - len(each) + x.shape[1])))
+        terms.append(np.concatenate([np.zeros((count, len(x))), (x / unit).T]))
+    return inputs, terms
 
 
 @partial(jax.jit, static_argnums=0)
 def _triangles(chosen: Any, model: Any, run: Driven, data: Any, theta: Any, u: Any, noise: Any):
     """Triangular factors of slopes and residuals of each law, and log volumes, by each noise.
 
-    `data` are readings, their times, the size of their noise, and what is added; `noise` all that
+    `data` are readings, their times, their errors, and what is added; `noise` all that
     are looked at, which of them first, and how many. The last number is the share of what is added,
     or by how much the width of a law is another.
     """
-    y, time, size, term = data
+    y, time, error, term = data
     every, order, count = noise
 
     def one(theta, u, term):
@@ -205,7 +313,8 @@ def _triangles(chosen: Any, model: Any, run: Driven, data: Any, theta: Any, u: A
         return with_slope(output, theta)
 
     value, slope = jax.vmap(one)(theta, u, term)
-    rows = jnp.concatenate([slope, (value - y)[..., None]], axis=2)[:, :MOST] / size
+    rows = jnp.concatenate([slope, (value - y)[..., None]], axis=2)[:, :MOST]
+    rows = rows / error[:MOST, None]
     rows = jnp.swapaxes(jnp.clip(jnp.nan_to_num(rows, nan=VAST), -VAST, VAST), 0, 1)
 
     def whiten(k, found):
@@ -219,12 +328,13 @@ def _triangles(chosen: Any, model: Any, run: Driven, data: Any, theta: Any, u: A
 
 
 class _LawFits(NamedTuple):
-    """Laws to be fitted beside the fit without one, each under every noise of a grid."""
+    """Laws and terms to be fitted beside the fit without one, each under every noise of a grid."""
 
     found: Settled
     seen: PreparedOutput
-    candidates: _Candidates
     grid: CorrelatedNoise
+    inputs: list[np.ndarray]
+    terms: list[np.ndarray]
 
     @property
     def begin(self) -> np.ndarray:
@@ -247,9 +357,10 @@ class _LawFits(NamedTuple):
         seen, core, g = self.seen, self.found.fit.problem.core, len(self.grid.time)
         order = np.array([*noises, *range(g - len(noises))])
         triangles, volume, count = [], 0.0, 0
+        errors = [noise.each for (noise,) in self.found.noise]
         for run, *data, term, u in zip(
-            seen.runs, seen.measured, seen.time, self.found.noise[:, 0],
-            self.candidates.terms, self.candidates.inputs, strict=True,
+            seen.runs, seen.measured, seen.time, errors,
+            self.terms, self.inputs, strict=True,
         ):  # fmt: skip
             noise = self.grid, order, len(noises)
             each = _triangles(core.chosen, core.model, run, (*data, term), theta, u, noise)
@@ -269,7 +380,7 @@ class _LawFits(NamedTuple):
         The first step is by the noise that is likeliest with each law, further ones by the `FEW`
         that are so with the likeliest laws.
         """
-        count, noises = len(self.candidates.inputs[0]), range(len(self.grid.time))
+        count, noises = len(self.inputs[0]), range(len(self.grid.time))
         best, each = np.tile(self.begin, (count, 1)), np.arange(count)
         step, least = np.zeros_like(best), np.full(count, np.inf)
         for _ in range(ROUNDS):
@@ -291,17 +402,60 @@ def _minus(white: Whitened, squares: np.ndarray) -> np.ndarray:
     return white.count * np.log(np.maximum(squares, np.finfo(float).tiny)) - 2.0 * white.volume
 
 
-def _moments(memory: Memory, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Likelihood of each law, the mean of its steps over noises, and the covariance."""
-    weight = np.maximum(memory.weight, np.finfo(float).tiny).reshape(-1, count)
-    share, step = weight / weight.sum(axis=0), memory.step.reshape(*weight.shape, -1)
-    half = memory.half.reshape(*weight.shape, *memory.half.shape[1:])
-    size = (memory.squares / memory.dof).reshape(weight.shape)
+class _Weighed(NamedTuple):
+    """Trials with the logarithms of their likelihoods, their numbers, and the covariances."""
+
+    trials: list[_Trial]
+    log: np.ndarray
+    numbers: np.ndarray
+    spread: np.ndarray
+
+    def first(self, count: int) -> _Weighed:
+        """The first of them."""
+        return _Weighed(self.trials[:count], *(each[:count] for each in self[1:]))
+
+    @property
+    def chance(self) -> np.ndarray:
+        """Probability of each."""
+        logs = self.log + np.array([trial.prior for trial in self.trials])
+        return np.exp(logs - logsumexp(logs))
+
+    @property
+    def none(self) -> np.ndarray:
+        """True for those without a law."""
+        return np.array([trial.law is None for trial in self.trials])
+
+    def best(self) -> dict[tuple[str, str], int]:
+        """The likeliest law of the value alone, by kind and input."""
+        logs = self.log + np.array([trial.prior for trial in self.trials])
+        found: dict[tuple[str, str], int] = {}
+        for k, (law, *_) in enumerate(self.trials):
+            if law is not None and law.kind in STATIC:
+                key = law.kind, law.input
+                found[key] = k if logs[k] > logs[found.get(key, k)] else found.get(key, k)
+        return found
+
+    def with_finer(self, at: int, other: _Weighed) -> _Weighed:
+        """These with others in the place of one."""
+        parts = zip(self[1:], other[1:], strict=True)
+        trials = self.trials[:at] + self.trials[at + 1 :] + other.trials
+        return _Weighed(trials, *(np.concatenate([np.delete(a, at, 0), b]) for a, b in parts))
+
+
+def _weighed(laws: _LawFits, trials: list[_Trial]) -> _Weighed:
+    """Fit trials, and terms if there are more candidates, with numbers and noise integrated out."""
+    at, grid = laws.fitted(), len(laws.grid.time)
+    white = laws.whitened(at, range(grid))
+    memory, logs = white.memory(), -0.5 * white.evidences().reshape(grid, -1)
+    likelihood = logsumexp(logs, axis=0)
+    share, step = np.exp(logs - likelihood), memory.step.reshape(*logs.shape, -1)
+    half = memory.half.reshape(*logs.shape, *memory.half.shape[1:])
+    size = (memory.squares / memory.dof).reshape(logs.shape)
     mean = np.einsum("ga,gap->ap", share, step)
     spread = np.einsum("ga,gapr,gaqr->apq", share * size, half, half, optimize=True)
     away = step - mean
     spread += np.einsum("ga,gap,gaq->apq", share, away, away, optimize=True)
-    return weight.sum(axis=0), mean, spread
+    return _Weighed(trials, likelihood, at + mean, spread)
 
 
 def laws_of(
@@ -316,24 +470,75 @@ def laws_of(
     `delays` are those that a law is looked for with. Terms of a fuller response are a further path
     of first order or a parameter that changes with an input, as large as the output's scatter.
     """
-    paths = zip(slow_paths(seen), slopes, strict=True)
-    more = [np.concatenate([slow, each.changing], axis=1) for slow, each in paths]
-    grid = noises_of(seen.time, CORRELATION_TIMES, WHITE)
-    candidates = _candidates(runs, seen, delays, more)
-    laws = _LawFits(found, seen, candidates, CorrelatedNoise(*np.array(grid).T))
-    at, count = laws.fitted(), len(candidates.prior)
-    memory = laws.whitened(at, range(len(grid))).memory()
-    likelihood, mean, spread = _moments(memory, len(at))
-    fuller, chance = likelihood[count:].mean(), likelihood[:count] * candidates.prior
-    none = np.arange(count) % len(candidates.names) == 0
-    law = float(chance[~none].sum())
-    best = candidates.names[int(np.argmax(np.where(none, -1.0, chance))) % len(candidates.names)]
-    chance /= chance.sum()
+    paths, bent = zip(slow_paths(seen), slopes, strict=True), _bent(seen)
+    more = [np.concatenate([slow, each.changing[:, ~bent]], axis=1) for slow, each in paths]
+    grid = CorrelatedNoise(*np.array(noises_of(seen.time, CORRELATION_TIMES, WHITE)).T)
+
+    def weighed(behind: Behind, trials: list[_Trial], terms: Any, count: int) -> _Weighed:
+        candidates = _candidates(seen, behind, trials, terms, count)
+        return _weighed(_LawFits(found, seen, grid, *candidates), trials)
+
+    ends = zip(seen.inputs, seen.points.min(axis=0), seen.points.max(axis=0), strict=True)
+    behind = _behind(runs, [law for each in ends for law in _laws(*each)])
+    trials = _trials(behind, seen.inputs, delays)
+    whole = weighed(behind, trials, more, len(trials))
+    posterior, terms = whole.first(len(trials)), whole.log[len(trials) :]
+    law = logsumexp((posterior.log + [t.prior for t in trials])[~posterior.none])
+    fuller = expit(logsumexp(terms) - np.log(len(terms)) - law)
+    if posterior.chance[posterior.none].sum() < 0.5:
+        nothing = [term[:, :0] for term in more]
+        for _ in range(ZOOMS):
+            for kind in posterior.best():
+                at = posterior.best()[kind]
+                law, delay, prior = posterior.trials[at]
+                laws = law.finer(posterior.numbers[at, -1])
+                finer = [_Trial(each, delay, prior - np.log(len(laws))) for each in laws]
+                other = weighed(_behind(runs, laws), finer, nothing, MOST_FINER)
+                posterior = posterior.with_finer(at, other.first(len(finer)))
+    chance, none = posterior.chance, posterior.none
+    words, static = _named(posterior)
+    begin = np.append(found.fit.theta, 0.0)
     return LawEvidence(
         float(chance[none].sum()),
-        float(fuller / (fuller + law)),
-        best,
+        float(fuller),
+        words,
+        static,
         chance[~none],
-        (at + mean - laws.begin)[:count, :-1][~none],
-        spread[:count, :-1, :-1][~none],
+        (posterior.numbers - begin)[~none, :-1],
+        posterior.spread[~none, :-1, :-1],
     )
+
+
+def _named(posterior: _Weighed) -> tuple[str, bool]:
+    """The likeliest law of each kind and input in words, as many as make 99 % of all laws, and if
+    the first is one of the value alone.
+    """
+    best: dict[tuple[str, str], tuple[float, InputLaw]] = {}
+    whole: Counter[tuple[str, str]] = Counter()
+    for (begun, *_), p, numbers in zip(
+        posterior.trials, posterior.chance, posterior.numbers, strict=True
+    ):
+        if begun is not None:
+            law = begun.changed(numbers[-1])
+            kind = law.kind, law.input
+            whole[kind] += float(p)
+            best[kind] = max(best.get(kind, (0.0, law)), (float(p), law), key=lambda each: each[0])
+    if not whole:
+        return "", False
+    total = max(sum(whole.values()), np.finfo(float).tiny)
+    ranked = [(kind, p / total) for kind, p in whole.most_common()]
+    above = np.cumsum([0.0, *(p for _, p in ranked)])[:-1]
+    ranked = [each for each, before in zip(ranked, above, strict=True) if before < NAMED]
+    words = [best[kind][1].words() for kind, _ in ranked]
+    if len(words) > 1:
+        words = [f"{w} (P = {p:.2f})" for w, (_, p) in zip(words, ranked, strict=True)]
+    return " or ".join(words), ranked[0][0][0] in STATIC
+
+
+def _bent(seen: PreparedOutput) -> np.ndarray:
+    """True for the terms of a fuller response that are static laws: gains by their own input."""
+    m = len(seen.inputs)
+    gains = [power for _, power in seen.runs[0].physics.units(m)]
+    number = np.cumsum(gains) - 1
+    own = [gain and k % m == number[i] % m for i, gain in enumerate(gains) for k in range(2 * m)]
+    return np.array(own, bool)

@@ -21,21 +21,22 @@ from beamfit.dynamics.search import (
     RANGE,
     Settled,
     difference,
+    linear_columns,
     noises_of,
-    unit_outputs,
 )
 from beamfit.greybox.memory import Whitened, whitened_by_each
+from beamfit.statistics import POOR_FIT
 
 # Other lags that are tried beside one that is given, and rounds of them, each about the best.
 OTHERS, ROUNDS = 8, 3
 # Halvings of the logarithm of a lag on the way to its limit.
 HALVES = 8
-# Quantiles at the upper end of a central and of a one-sided 95 %.
-CENTRAL_END, SINGLE_END = 0.975, 0.95
+# Quantile at the upper end of a one-sided 95 %.
+SINGLE_END = 0.95
 
 
 class LagLimits(NamedTuple):
-    """Limits that the longest lag is compatible with, by the central 95 % of its likelihood.
+    """Limits that the longest lag is compatible with.
 
     Attributes
     ----------
@@ -72,14 +73,12 @@ class _Lags(NamedTuple):
 
     def whitened(self, shape: np.ndarray) -> Whitened:
         """A basis of what gains, first states and offset do, and the readings, by each noise."""
-        runs, parts = self.seen.runs, []
-        for i, (run, y) in enumerate(zip(runs, self.seen.measured, strict=True)):
-            run, k = replace(run, dt=steps_of(self.found.fit.model, run)), run.physics.free_states
-            columns = np.asarray(unit_outputs(run, jnp.asarray(shape[None])))[0].T
-            first = np.zeros((len(y), len(runs) * k))
-            first[:, i * k : (i + 1) * k] = columns[:, -k:]
-            level = np.ones((len(y), int(self.offset)))
-            parts.append(np.hstack([columns[:, :-k], first, level, y[:, None]])[:LONGEST])
+        model, parts = self.found.fit.model, []
+        runs = [replace(run, dt=steps_of(model, run)) for run in self.seen.runs]
+        for i, y in enumerate(self.seen.measured):
+            columns = linear_columns(runs, i, jnp.asarray(shape[None]), self.offset)[0]
+            part = np.column_stack([columns, y])
+            parts.append((part / self.found.noise[i][0].each[:, None])[:LONGEST])
         time = [each[:LONGEST] for each in self.seen.time]
         both = np.concatenate(parts)
         both[:, :-1] = np.linalg.qr(both[:, :-1])[0]
@@ -121,14 +120,15 @@ def lag_limits(seen: PreparedOutput, found: Settled, offset: bool) -> LagLimits:
 
     The gain that goes with a lag far beyond the runs is as large, K/tau being the same, and of a
     lag far below a sample nothing is left. A limit is possible unless its evidence, the noise and
-    all that is linear integrated out, is lower than the best by more than a central 95 % allows.
+    all that is linear integrated out, is so much lower than the best that it is refuted: where a
+    limit is as little as likely, the error of a lag says nothing.
     """
     lags = _Lags(seen, found, offset)
     least = lags.whitened(lags.own).evidence()
     ends = np.multiply(RANGE, (seen.apart, seen.span))
 
     def reached(limit: float, other: float) -> float | None:
-        if lags.least(limit) - least > lags.rise(CENTRAL_END):
+        if lags.least(limit) - least > lags.rise(1.0 - 0.5 * POOR_FIT):
             return None
         near, far, most = np.log(limit), np.log(other), lags.rise(SINGLE_END)
         for _ in range(HALVES):

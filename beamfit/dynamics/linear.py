@@ -20,7 +20,7 @@ from scipy.special import ndtr, ndtri
 from beamfit.dynamics.answer import GAIN, PURE, TIME, derived, quantity
 from beamfit.dynamics.fit import MAPS
 from beamfit.dynamics.limits import SINGLE_END, LagLimits
-from beamfit.dynamics.model import CLOSE, WEIGHT
+from beamfit.dynamics.model import WEIGHT
 from beamfit.dynamics.record import Run, check_inputs, checked
 from beamfit.dynamics.search import LONGEST, Case, Settled, information, noise_of, used_by
 from beamfit.dynamics.state_fit import (
@@ -299,12 +299,11 @@ def criterion(case: Case, found: Sequence[Settled], last: Settled | None = None)
 
 def _noise_of(case: Case, found: Settled) -> CorrelatedNoise | None:
     """The noise with a memory of residuals that have one; slopes are left out for speed."""
-    rows = case.rows(found.rest)
-    if not any(remembers(rest, used_by(found.fit)) for rest, _, _ in rows):
+    rows = case.rows(found.rest, found.noise)
+    if not any(remembers(rest / error, used_by(found.fit)) for rest, error, *_ in rows):
         return None
-    scaled = [rest[:LONGEST, None] / max(float(rest.std()), CLOSE * s.size_y)
-              for rest, _, s in rows]  # fmt: skip
-    return noise_of(scaled, [time[:LONGEST] for _, time, _ in rows], np.zeros((0, 1)))[1]
+    scaled = [(rest / error)[:LONGEST, None] for rest, error, *_ in rows]
+    return noise_of(scaled, [time[:LONGEST] for _, _, time, _ in rows], np.zeros((0, 1)))[1]
 
 
 def free_of(case: Case, order: int, size: int, offset: bool, direct: bool) -> tuple[Free, ...]:

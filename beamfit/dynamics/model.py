@@ -13,7 +13,6 @@ from beamfit.dynamics.response import Physics, simulate, simulate_evenly
 from beamfit.greybox import tree
 from beamfit.greybox.mlp import MLP, Port, dense
 from beamfit.greybox.problem import Prior, padded_length
-from beamfit.noise.memory import CorrelatedNoise
 
 # Residual, as a share of the output's scatter, below which a fit counts as exact.
 CLOSE = 2e-4
@@ -27,10 +26,9 @@ WEIGHT = 3.0
 class Driven:
     """A run as the model sees it: inputs, its operating points, and steps, padded; what was read.
 
-    Shapes (samples, inputs), (samples,), (readings,), (readings,); `run` is its number,
-    `noise` that of its readings, if it has a memory; `held` by how much each step grows, s, for a
-    delay that is longer by a sample, where the delay is no whole number of them. `turn` is the
-    number of steps after which they repeat, 0 where they do not.
+    Shapes (samples, inputs), (samples,), (readings,), (readings,); `run` is its number, `held` by
+    how much each step grows, s, for a delay that is longer by a sample, where the delay is no whole
+    number of them. `turn` is the number of steps after which they repeat, 0 where they do not.
     """
 
     physics: Physics
@@ -39,7 +37,6 @@ class Driven:
     time: Any
     index: Any
     run: Any
-    noise: CorrelatedNoise | None
     held: Any
     turn: int = 0
 
@@ -89,6 +86,14 @@ class PreparedOutput(NamedTuple):
         return np.concatenate([np.asarray(run.u)[np.asarray(run.index)] for run in self.runs])
 
     @property
+    def part(self) -> float:
+        """The part of a sample in the delay."""
+        if self.runs[0].held is None:
+            return 0.0
+        first, second = np.asarray(self.runs[0].dt[:2])
+        return float(first / (first + second))
+
+    @property
     def apart(self) -> float:
         """Median time between readings, of the run where it is shortest."""
         return min(float(np.median(np.diff(t))) for t in self.time)
@@ -108,9 +113,10 @@ def delayed(u: np.ndarray, delay: float) -> np.ndarray:
 
     A delay of no whole number of samples has two rows a sample, one for each input that it feels.
     """
-    shifts = (int(delay),) if delay % 1.0 == 0.0 else (int(delay) + 1, int(delay))
-    whole = [np.concatenate([np.repeat(u[:1], k, axis=0), u])[: len(u)] for k in shifts]
-    late = np.stack(whole, axis=1).reshape(-1, u.shape[1])
+    whole = int(np.floor(delay))
+    shifts = (whole,) if delay == whole else (whole + 1, whole)
+    each = [u[np.clip(np.arange(len(u)) - k, 0, len(u) - 1)] for k in shifts]
+    late = np.stack(each, axis=1).reshape(-1, u.shape[1])
     longer = padded_length(len(late)) - len(late)
     return np.concatenate([late, np.repeat(late[-1:], longer, axis=0)])
 
@@ -128,7 +134,7 @@ def driven(run: Run, number: int, output: str, physics: Physics, delay: float) -
     arrays = (jnp.asarray(v) for v in seen)
     held = None if held is None else jnp.asarray(held)
     turn = len(shares) if np.ptp(apart[:-1]) <= EQUAL * apart[0] else 0
-    return Driven(physics, *arrays, jnp.asarray(number), None, held, turn)
+    return Driven(physics, *arrays, jnp.asarray(number), held, turn)
 
 
 def steps_of(model: Any, seen: Driven) -> jax.Array:

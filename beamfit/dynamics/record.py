@@ -12,6 +12,12 @@ from beamfit.errors import InputError
 
 # Fewest readings of an output; with fewer its response and its start are not separable.
 LEAST = 8
+# An input is band-limited if its changes have less than the share `FAINT` of their power above the
+# share `HIGH` of the highest frequency; white ones have a tenth there, noise that is fed back too.
+HIGH, FAINT = 0.9, 2e-3
+# Rows a sample by which an input that moves between samples is followed: what is left of a sine of
+# half the highest frequency is right to 1e-3.
+PARTS = 8
 
 
 @shown
@@ -33,6 +39,8 @@ class Run:
         The file, if there is one.
     provenance, notes : tuple of str
         Comments of the file, and what was done to its numbers.
+    parts : int
+        Rows a sample, of which the first was recorded (`between`).
 
     Raises
     ------
@@ -55,6 +63,7 @@ class Run:
     sha256: str = ""
     provenance: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
+    parts: int = 1
 
     def __post_init__(self):
         object.__setattr__(self, "time", np.asarray(self.time, float))
@@ -135,6 +144,49 @@ def check_inputs(runs: tuple[Run, ...]) -> None:
         if all(np.ptp(run.inputs[name]) == 0 for run in runs):
             said = f"input {name} at {runs[0].inputs[name][0]:g} all the time"
             raise first.unusable(said, "an input that changes: a step at least")
+
+
+def band_limited(runs: Sequence[Run]) -> tuple[str, ...]:
+    """Inputs of runs at equal steps that have no high frequencies."""
+    if any(run.step is None for run in runs):
+        return ()
+    found = []
+    for name in runs[0].inputs:
+        high = whole = 0.0
+        for run in runs:
+            changes = np.diff(run.inputs[name])
+            power = np.abs(np.fft.rfft(changes * np.hanning(len(changes)))) ** 2
+            high, whole = high + power[int(HIGH * len(power)) :].sum(), whole + power.sum()
+        found += [name] if high < FAINT * whole else []
+    return tuple(found)
+
+
+def between(run: Run, names: Sequence[str]) -> Run:
+    """The run with rows between its own, where some inputs move without high frequencies.
+
+    They go on by the sines that they are made of (C. E. Shannon 1949), mirrored at both ends.
+    """
+    n, inputs = len(run), {}
+    rows = np.arange((n - 1) * PARTS + 1)
+    for name, u in run.inputs.items():
+        waves = np.fft.rfft(np.concatenate([u, u[::-1]]))
+        turn = 2j * np.pi * np.fft.rfftfreq(2 * n)
+        late = (np.arange(PARTS) + 0.5) / PARTS  # each part holds its middle
+        moved = [np.fft.irfft(waves * np.exp(turn * s), 2 * n)[:n] for s in late]
+        fine = np.stack(moved if name in names else [u] * PARTS, axis=1)
+        inputs[name] = fine.ravel()[: len(rows)]
+    outputs = {name: np.full(len(rows), np.nan) for name in run.outputs}
+    for name, y in run.outputs.items():
+        outputs[name][::PARTS] = y
+    time = np.interp(rows / PARTS, np.arange(n), run.time)
+    return replace(run, time=time, inputs=inputs, outputs=outputs, parts=PARTS)
+
+
+def recorded(run: Run) -> Run:
+    """The run without rows between those of its record."""
+    parts = slice(None, None, run.parts)
+    inputs, outputs = ({n: v[parts] for n, v in each.items()} for each in (run.inputs, run.outputs))
+    return replace(run, time=run.time[parts], inputs=inputs, outputs=outputs, parts=1)
 
 
 def ordered(run: Run, first: Run) -> Run:

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.optimize import minimize
+from scipy.optimize import minimize, minimize_scalar
 
 from beamfit.dynamics.model import (
     CLOSE,
@@ -42,6 +42,8 @@ LATEST, SHARE = 24, 0.1
 # Gain in log likelihood that a longer delay needs over a shorter one; fractions of a sample
 # that are tried besides.
 BETTER, PARTS = 5.0, (-0.75, -0.5, -0.25, 0.25, 0.5, 0.75)
+# Where the search for a fraction ends, in samples; the fit goes on from there.
+CLOSE_DELAY = 0.02
 # Time constants of the grid, and dampings of a second order.
 LAGS, DAMPINGS = 16, (0.2, 0.6, 1.0, 2.0)
 # Step of their logarithms in a slope; their range, in intervals and in runs, beyond which nothing
@@ -49,13 +51,27 @@ LAGS, DAMPINGS = 16, (0.2, 0.6, 1.0, 2.0)
 STEP, RANGE = 1e-3, (1e-3, 1e3)
 
 
+# Most half periods in a run of a drift of the output.
+DRIFT = 8
+
+
+def drift_columns(times: Sequence[Any], i: int) -> jax.Array:
+    """Cosines of a slow drift of each run, from the slowest, at the readings of run i.
+
+    Shape (readings, DRIFT, runs), zero but for run i.
+    """
+    through = jnp.pi * times[i] / times[i][-1]
+    waves = jnp.zeros((len(times[i]), DRIFT, len(times)))
+    return waves.at[:, :, i].set(jnp.cos(through[:, None] * jnp.arange(1, DRIFT + 1)))
+
+
 class Start(NamedTuple):
-    """Parameters, first states (runs, free states), offset, and the sum of squares."""
+    """Parameters, first states (runs, free states), offset, and -2 ln L with the drift's cost."""
 
     p: np.ndarray
     first: np.ndarray
     offset: float
-    squares: float
+    cost: float
 
     def model(self, seen: PreparedOutput) -> dict[str, Any]:
         """The model that a search begins with."""
@@ -75,10 +91,11 @@ def best_start(seen: PreparedOutput, offset: bool) -> Start:
         found = np.exp(logarithms)
         return found if physics is not ARX else difference(found, apart)
 
+    def triangles(shapes: np.ndarray) -> np.ndarray:
+        return np.asarray(_triangles(seen.runs, seen.measured, shapes, offset))
+
     def left(logarithms: np.ndarray) -> np.ndarray:
-        triangles = _triangles(seen.runs, seen.measured, shapes(logarithms), offset)
-        missed = np.abs(np.asarray(triangles)[:, -1, -1])
-        return 2.0 * np.log(np.maximum(missed, np.finfo(float).tiny))
+        return _costs(triangles(shapes(logarithms)), seen).min(axis=1)
 
     def with_slope(x: np.ndarray) -> tuple[float, np.ndarray]:
         moved = STEP * np.eye(len(x))
@@ -89,14 +106,30 @@ def best_start(seen: PreparedOutput, offset: bool) -> Start:
     begin = grid[np.argmin(left(grid))]
     x = minimize(with_slope, begin, jac=True, bounds=bounds, method="L-BFGS-B").x
     (shape,) = shapes(x[None])
-    (triangle,) = np.asarray(_triangles(seen.runs, seen.measured, shape[None], offset))
-    size = np.linalg.norm(triangle[:, :-1], axis=0)
+    triangle = triangles(shape[None])
+    (costs,), triangle = _costs(triangle, seen), triangle[0]
+    waves = DRIFT * len(seen.runs)
+    design = triangle[:, : triangle.shape[1] - 1 - waves + len(seen.runs) * int(costs.argmin())]
+    size = np.linalg.norm(design, axis=0)
     size = np.where(size > 0, size, 1.0)
-    found = np.linalg.lstsq(triangle[:, :-1] / size, triangle[:, -1], rcond=1e-10)[0] / size
+    found = np.linalg.lstsq(design / size, triangle[:, -1], rcond=1e-10)[0] / size
+    found = found[: triangle.shape[1] - 1 - waves]
     k = len(seen.runs) * physics.free_states + offset
     first = found[len(found) - k :][: k - offset].reshape(len(seen.runs), -1)
     p, level = np.append(shape, found[: len(found) - k]), float(found[-1]) if offset else 0.0
-    return Start(p, first, level, float(triangle[-1, -1] ** 2))
+    return Start(p, first, level, float(costs.min()))
+
+
+def _costs(triangles: np.ndarray, seen: PreparedOutput) -> np.ndarray:
+    """-2 ln L of each shape with a drift of 0, 1, … cosines a run, and the cost of these numbers.
+
+    The Bayesian information criterion, with the noise's size at its likeliest.
+    """
+    runs, count = len(seen.runs), sum(map(len, seen.measured))
+    used = triangles.shape[2] - 1 - runs * DRIFT + runs * np.arange(DRIFT + 1)
+    missed = np.stack([np.sum(triangles[:, k:, -1] ** 2, axis=1) for k in used], axis=1)
+    least = count * (CLOSE * seen.size_y) ** 2
+    return count * np.log(np.maximum(missed, least)) + np.log(count) * used
 
 
 def difference(shapes: np.ndarray, apart: float) -> np.ndarray:
@@ -121,21 +154,27 @@ def unit_outputs(run: Driven, shapes: jax.Array) -> jax.Array:
     return jax.vmap(each, in_axes=(0, None, None))(shapes, gains, firsts)
 
 
+def linear_columns(runs: Sequence[Driven], i: int, shapes: jax.Array, offset: bool) -> jax.Array:
+    """Outputs of run i for unit gains, unit first states of each run and the offset, by shape."""
+    columns = jnp.swapaxes(unit_outputs(runs[i], shapes), 1, 2)
+    k = runs[i].physics.free_states
+    others = (0, 0), (0, 0), (i * k, (len(runs) - 1 - i) * k)
+    level = jnp.ones((*columns.shape[:2], int(offset)))
+    return jnp.concatenate([columns[..., :-k], jnp.pad(columns[..., -k:], others), level], axis=2)
+
+
 @partial(jax.jit, static_argnums=3)
 def _triangles(runs: tuple[Driven, ...], measured: Any, shapes: jax.Array, offset: bool):
-    """Triangular factors of outputs of unit gains, first states and offset, and of the readings.
-
-    One for each shape; its last number is what least squares leave.
+    """Triangular factors of outputs of unit gains, first states and offset, cosines of a drift of
+    each run, from the slowest, and of the readings: one for each shape.
     """
     parts = []
-    for i, (run, y) in enumerate(zip(runs, measured, strict=True)):
-        columns = jnp.swapaxes(unit_outputs(run, shapes), 1, 2)
-        k = run.physics.free_states
-        others = (0, 0), (0, 0), (i * k, (len(runs) - 1 - i) * k)
-        rest = jnp.stack([jnp.ones_like(y)] * offset + [y], axis=1)
+    for i, y in enumerate(measured):
+        waves = drift_columns([run.time for run in runs], i)
+        rest = jnp.concatenate([waves.reshape(len(y), -1), y[:, None]], axis=1)
         rest = jnp.broadcast_to(rest, (len(shapes), *rest.shape))
-        parts.append([columns[..., :-k], jnp.pad(columns[..., -k:], others), rest])
-    rows = jnp.concatenate([jnp.concatenate(part, axis=2) for part in parts], axis=1)
+        parts.append(jnp.concatenate([linear_columns(runs, i, shapes, offset), rest], axis=2))
+    rows = jnp.concatenate(parts, axis=1)
     few = max(0, rows.shape[2] - rows.shape[1])
     return jnp.linalg.qr(jnp.pad(rows, ((0, 0), (0, few), (0, 0))), mode="r")
 
@@ -158,14 +197,15 @@ def seen_of(runs: tuple[Run, ...], output: str, physics: Physics, delay: float) 
     )
 
 
-def start_of(
+def starts_of(
     runs: tuple[Run, ...], output: str, physics: Physics, delay: float | None, offset: bool
-) -> tuple[Start, PreparedOutput, float]:
-    """The best start, and the delay: the shortest of those that fit about as well as any.
+) -> list[tuple[Start, PreparedOutput, float]]:
+    """The best start, and the delay: the shortest of those that fit about as well as any. After it
+    the best with a part of a sample in the delay.
 
-    A part of a sample must do as much better: only an input that moves within a sample tells it.
-    The delay of a difference equation is that of a second order: its own gains of two samples let
-    a shorter one pass.
+    A delay below zero must do as much better: it stands for clocks of input and output that differ.
+    The delay of a difference equation is that of a second order: its own gains of two samples let a
+    shorter one pass.
     """
 
     def at(late: float, law: Physics = physics) -> tuple[Start, PreparedOutput, float]:
@@ -173,23 +213,33 @@ def start_of(
         return best_start(seen, offset), seen, late
 
     if delay is not None:
-        return at(delay)
+        return [at(delay)]
     law = SECOND_ORDER if physics is ARX else physics
-    found = [at(late, law) for late in range(latest(runs) + 1)]
-    count = sum(map(len, found[0][1].measured))
-    worth = np.exp(2.0 * BETTER / count)
-    near = worth * min(start.squares for start, _, _ in found)
-    whole = next(each for each in found if each[0].squares <= near)
+    step = runs[0].parts
+    found = [at(late, law) for late in range(0, latest(runs) + 1, step)]
+    near = 2.0 * BETTER + min(start.cost for start, _, _ in found)
+    whole = next(each for each in found if each[0].cost <= near)
+    while whole[2] <= 0 and whole[2] > -latest(runs):
+        earlier = at(whole[2] - step, law)
+        if earlier[0].cost + 2.0 * BETTER >= whole[0].cost:
+            break
+        whole = earlier
     if physics.even:
-        return at(whole[2])
-    parts = [whole[2] + part for part in PARTS if 0 < whole[2] + part < max(latest(runs), 1)]
-    best = min((at(part) for part in parts), key=lambda each: each[0].squares)
-    return best if worth * best[0].squares < whole[0].squares else whole
+        return [at(whole[2])]
+    longest = max(latest(runs), step)
+    parts = [at(whole[2] + step * part) for part in PARTS if whole[2] + step * part < longest]
+    middle = min([whole, *parts], key=lambda each: each[0].cost)[2]
+    ends = middle - 0.25 * step, min(middle + 0.25 * step, longest)
+    found = minimize_scalar(
+        lambda late: at(late)[0].cost, bounds=ends, options={"xatol": CLOSE_DELAY}
+    )
+    return [whole, at(found.x)] if found.fun < whole[0].cost else [whole]
 
 
 def latest(runs: tuple[Run, ...]) -> int:
-    """The longest delay that is tried."""
-    return min(LATEST, int(SHARE * min(map(len, runs))))
+    """The longest delay that is tried, in rows."""
+    step = runs[0].parts
+    return step * min(LATEST, int(SHARE * min(map(len, runs)) / step))
 
 
 def noises_of(
@@ -220,10 +270,62 @@ def noise_of(
     return memory, grid[best], float(np.sqrt(memory.squares[best] / memory.dof))
 
 
+# Ratios of the noise by a clock's jitter, rms, to the rest; the prior is as much for none as for
+# all of them. Longest jitter: by more than half a sample readings would not be in their order.
+RATIOS, LONGEST_JITTER = np.append(0.0, np.geomspace(0.2, 50.0, 24)), 0.5
+
+
+class ReadingErrors(NamedTuple):
+    """Standard deviation of each reading of an output in a run, and the jitter of its clock, s.
+
+    Readings that are taken by an uncertain time earlier or later are off by as much as the output
+    moves meanwhile: sqrt(at_rest² + (jitter slope)²).
+    """
+
+    each: np.ndarray
+    jitter: float = 0.0
+
+
+def reading_errors(
+    rest: np.ndarray,
+    fitted: np.ndarray,
+    time: np.ndarray,
+    least: float,
+    memory: CorrelatedNoise | None,
+) -> ReadingErrors:
+    """The likeliest errors of readings, by their residuals."""
+    slope = np.diff(fitted) / np.diff(time)
+    moves = np.sqrt(0.5 * (np.append(slope, 0.0) ** 2 + np.append(0.0, slope) ** 2))
+    usual = float(np.sqrt(np.mean(moves**2)))
+    if not (np.isfinite(usual) and usual > 0):
+        return ReadingErrors(np.full(len(rest), max(float(rest.std()), least)))
+    scale = np.hypot(1.0, np.outer(RATIOS, moves / usual))
+    white = np.asarray(whitened_rows((rest / scale).T, time, memory)[0])
+    size = np.maximum(np.sqrt(np.mean(white**2, axis=0)), least)
+    minus = 2.0 * (len(rest) * np.log(size) + np.log(scale).sum(axis=1))
+    minus[1:] += 2.0 * np.log(len(RATIOS) - 1)
+    jitter = RATIOS * size / usual
+    minus[jitter > LONGEST_JITTER * np.median(np.diff(time))] = np.inf
+    at = int(minus.argmin())
+    each = np.maximum(scale[at] * float(np.std(rest / scale[at])), least)
+    return ReadingErrors(each, float(jitter[at]))
+
+
+def whitened_rows(
+    rows: np.ndarray, time: np.ndarray, memory: CorrelatedNoise | None
+) -> tuple[Any, Any]:
+    """Rows whitened, and the log sum of the errors; as they are without a memory."""
+    return (rows, 0.0) if memory is None else innovations(rows, time, memory)
+
+
 # Most rounds with a memory of the noise, and the gain in -2 ln L below which they end.
 AGAIN, GAINED = 3, 0.05
 # Most readings of each output that estimate correlated noise.
 LONGEST = 5000
+
+
+# Errors of the readings, by run and output.
+Noises = tuple[tuple[ReadingErrors, ...], ...]
 
 
 class Case(NamedTuple):
@@ -238,14 +340,12 @@ class Case(NamedTuple):
     priors: tuple[Prior, ...]
 
     @property
-    def guess(self) -> np.ndarray:
-        """The noise by run and output, before anything is known of it."""
-        return np.array([[0.1 * s.size_y for s in self.seen]] * len(self.courses))
-
-    @property
-    def floor(self) -> np.ndarray:
-        """Residual of each output below which the model explains it completely."""
-        return np.array([CLOSE * s.size_y for s in self.seen])
+    def guess(self) -> Noises:
+        """Errors of the readings before anything is known of them."""
+        return tuple(
+            tuple(ReadingErrors(np.full(len(s.measured[i]), 0.1 * s.size_y)) for s in self.seen)
+            for i in range(len(self.courses))
+        )
 
     def measured(self, i: int) -> np.ndarray:
         """Readings of a run, one output after the other."""
@@ -262,35 +362,60 @@ class Case(NamedTuple):
             for i, course in enumerate(self.courses)
         )
 
-    def rows(self, rest: Any) -> list[tuple[np.ndarray, np.ndarray, PreparedOutput]]:
-        """Residuals, their times and the output, for each run and output."""
-        pairs = ((i, zip(row, self.seen, strict=True)) for i, row in enumerate(rest))
-        return [(r, s.time[i], s) for i, row in pairs for r, s in row]
+    def errors(self, rest: Any, memory: CorrelatedNoise | None) -> Noises:
+        """Errors of the readings by their residuals."""
+        return tuple(
+            tuple(
+                reading_errors(r, s.measured[i] - r, s.time[i], CLOSE * s.size_y, memory)
+                for r, s in zip(row, self.seen, strict=True)
+            )
+            for i, row in enumerate(rest)
+        )
+
+    def rows(
+        self, rest: Any, noise: Noises
+    ) -> list[tuple[np.ndarray, np.ndarray, np.ndarray, float]]:
+        """Residuals, errors, times and the floor of the errors, for each run and output."""
+        return [
+            (r, n.each, s.time[i], CLOSE * s.size_y)
+            for i, row in enumerate(rest)
+            for r, n, s in zip(row, noise[i], self.seen, strict=True)
+        ]
 
     def squares(self, rest: Any) -> float:
         """Sum of squared residuals, in units of each output's scatter."""
-        return sum(float(np.sum((r / s.size_y) ** 2)) for r, _, s in self.rows(rest))
+        return sum(float(np.sum((r / s.size_y) ** 2))
+                   for row in rest for r, s in zip(row, self.seen, strict=True))  # fmt: skip
+
+    def ahead(self, found: Settled, start: dict[str, Any]) -> tuple[np.ndarray, ...]:
+        """Residuals of a run that was held back, by output: only its `start` is fitted."""
+        sizes = np.sqrt(np.mean(found.rms**2, axis=0))
+        noise = tuple(ReadingErrors(np.full(len(s.measured[0]), size))
+                      for s, size in zip(self.seen, sizes, strict=True))  # fmt: skip
+        case = self._replace(free=(Free("start", nuisance=True),), priors=())
+        return case.rest(solve(case.problem(found.fit.model | start, (noise,))).model)[0]
 
     def problem(
-        self, model: Any, noise: np.ndarray, memory: CorrelatedNoise | None = None, gap: Any = ()
+        self, model: Any, noise: Noises, memory: CorrelatedNoise | None = None, gap: Any = ()
     ) -> Problem:
         """State it; `gap` is how far ends of segments may lie apart, shape (states,).
 
-        `noise` by run and output is a guess that the residuals correct, `memory` how it wanders.
+        `noise` is a guess that the residuals correct, `memory` how it wanders.
         """
         records = []
         cuts = model["nodes"].shape[1] if len(gap) else 0
         for i, course in enumerate(self.courses):
             y, predict = self.measured(i), _with_gaps if cuts else predicted
-            error = np.repeat(noise[i], [len(s.measured[i]) for s in self.seen])
-            worth = np.inf if np.all(noise[i] <= 1.001 * self.floor) else 1.0
+            error = np.concatenate([each.each for each in noise[i]])
+            exact = all(_exact(n, s.size_y) for n, s in zip(noise[i], self.seen, strict=True))
             if cuts:
                 y = np.concatenate([y, np.zeros(cuts * len(gap))])
                 error = np.concatenate([error, np.tile(gap, cuts)])
             if memory is not None:
-                course = replace(course, noise=CorrelatedNoise(*map(jnp.asarray, memory)))
-                y = np.asarray(innovations(jnp.asarray(y), course.time, course.noise)[0])
-                predict = _surprising
+                course = (course, jnp.asarray(error), CorrelatedNoise(*map(jnp.asarray, memory)))
+                y, predict = np.asarray(_surprises(y, *course)), _surprising
+                error = np.ones_like(y)
+            worth = np.inf if exact else 1.0
             records.append(Record(f"run {i + 1}", predict, course, y, error, worth=worth))
         free = [*self.free, *([Free("nodes", nuisance=True)] if cuts else [])]
         return Problem(model, free, records, self.priors)
@@ -298,7 +423,7 @@ class Case(NamedTuple):
     def search(
         self,
         model: Any,
-        noise: np.ndarray,
+        noise: Noises,
         steps: int,
         memory: CorrelatedNoise | None = None,
         gap: Any = (),
@@ -306,9 +431,9 @@ class Case(NamedTuple):
         """Fit with the noise that the residuals of the round before had."""
         fit = solve(self.problem(model, noise, memory, gap), iterations=steps)
         rest = self.rest(fit.model)
-        found = np.maximum([[float(r.std()) for r in row] for row in rest], self.floor)
-        minus = sum(_minus(r, t, s.size_y, None) for r, t, s in self.rows(rest))
-        minus = minus if np.isfinite(found).all() else np.inf
+        found = self.errors(rest, memory)
+        minus = sum(_minus(*row, None) for row in self.rows(rest, found))
+        minus = minus if np.isfinite(minus) else np.inf
         rests = fit.status not in (Status.not_finite, Status.not_converged)
         return Settled(fit, rest, found, memory, None, minus, rests)
 
@@ -323,7 +448,7 @@ class Settled(NamedTuple):
 
     fit: Fit
     rest: tuple[tuple[np.ndarray, ...], ...]
-    noise: np.ndarray
+    noise: Noises
     memory: CorrelatedNoise | None
     errors: Memory | None
     likelihood: float
@@ -338,23 +463,44 @@ class Settled(NamedTuple):
         self, case: Case, noise: CorrelatedNoise | None = None, most: int | None = None
     ) -> tuple[Memory, CorrelatedNoise, float]:
         """The noise with a memory that the residuals have, of so many of them at most."""
-        problem, size, rest = self.fit.problem, self.fit.problem.size, case.rows(self.rest)
+        problem, size = self.fit.problem, self.fit.problem.size
+        rest = case.rows(self.rest, self.noise)
         own = [part for i, s in enumerate(self.slopes(case)) for part in case.split(i, s)]
-        parts = zip(own, rest, self.noise.ravel(), strict=True)
-        rows = [np.column_stack([slope, -r])[:most] / s for slope, (r, _, _), s in parts]
+        rows = [np.column_stack([slope, -r])[:most] / error[:most, None]
+                for slope, (r, error, *_) in zip(own, rest, strict=True)]  # fmt: skip
         prior = np.asarray(problem.residual(self.fit.theta))[size:]
         known = np.column_stack([self.fit.dense_jacobian[size:], prior])
-        return noise_of(rows, [time[:most] for _, time, _ in rest], known, noise)
+        return noise_of(rows, [time[:most] for _, _, time, _ in rest], known, noise)
 
     def exact(self, case: Case) -> bool:
         """True if the model explains all outputs but for rounding."""
-        return bool(np.all(self.noise <= case.floor))
+        return all(_exact(n, s.size_y) for row in self.noise
+                   for n, s in zip(row, case.seen, strict=True))  # fmt: skip
 
     def correlated(self, case: Case) -> bool:
         """True if the noise of any output has a memory and exceeds rounding."""
         used = used_by(self.fit)
-        return any(remembers(r, used) and r.std() > CLOSE * s.size_y
-                   for r, _, s in case.rows(self.rest))  # fmt: skip
+        return any(remembers(r / error, used) and r.std() > least
+                   for r, error, _, least in case.rows(self.rest, self.noise))  # fmt: skip
+
+    @property
+    def likely(self) -> CorrelatedNoise | None:
+        """The noise that the residuals make likely, also where they look white; None if exact."""
+        return None if self.errors is None else self.errors.noise
+
+    @property
+    def rms(self) -> np.ndarray:
+        """Root mean square of the residuals, by run and output."""
+        return np.array([[float(np.sqrt(np.mean(r**2))) for r in row] for row in self.rest])
+
+    @property
+    def jitter(self) -> np.ndarray:
+        """Jitter of the clock, s, by run and output."""
+        return np.array([[n.jitter for n in row] for row in self.noise])
+
+
+def _exact(noise: ReadingErrors, size_y: float) -> bool:
+    return bool(noise.each.max() <= 1.001 * CLOSE * size_y)
 
 
 def used_by(fit: Fit) -> int:
@@ -364,27 +510,36 @@ def used_by(fit: Fit) -> int:
 
 def information(case: Case, found: Settled, noise: CorrelatedNoise | None) -> float:
     """The Bayesian information criterion of a fit under a noise with a memory, or without."""
-    rows = case.rows(found.rest)
-    cost = used_by(found.fit) * np.log(sum(len(rest) for rest, _, _ in rows))
-    return float(cost + sum(_minus(r, t, s.size_y, noise) for r, t, s in rows))
+    rows = case.rows(found.rest, found.noise)
+    cost = used_by(found.fit) * np.log(sum(len(rest) for rest, *_ in rows))
+    return float(cost + sum(_minus(*row, noise) for row in rows))
 
 
 def _minus(
-    rest: np.ndarray, time: np.ndarray, size_y: float, noise: CorrelatedNoise | None
+    rest: np.ndarray,
+    error: np.ndarray,
+    time: np.ndarray,
+    least: float,
+    memory: CorrelatedNoise | None,
 ) -> float:
-    """-2 ln L of residuals, their size being their own."""
-    white, volume = (rest, 0.0) if noise is None else innovations(rest, time, noise)
-    size = max(float(np.std(white)), CLOSE * size_y)
-    return 2.0 * (len(rest) * np.log(size) + float(volume))
+    """-2 ln L of residuals whose errors have these ratios, their size being their own."""
+    scale = error / error.min()
+    white, volume = whitened_rows(rest / scale, time, memory)
+    size = max(float(np.std(white)), least)
+    return 2.0 * (len(rest) * np.log(size) + float(np.log(scale).sum()) + float(volume))
 
 
 def _with_gaps(model: Any, course: Any) -> jax.Array:
     return jnp.concatenate(course.shot(model))
 
 
-def _surprising(model: Any, course: Any) -> jax.Array:
-    """Innovations of a run: readings less their prediction from earlier ones."""
-    return innovations(predicted(model, course), course.time, course.noise)[0]
+def _surprising(model: Any, asked: tuple[Any, jax.Array, CorrelatedNoise]) -> jax.Array:
+    return _surprises(predicted(model, asked[0]), *asked)
+
+
+def _surprises(y: Any, course: Any, error: jax.Array, memory: CorrelatedNoise) -> jax.Array:
+    """Innovations of a run: readings less their prediction from earlier ones, over their errors."""
+    return innovations(y / error, course.time, memory)[0]
 
 
 def rounds(found: Any, again: Callable[[Any], Any], gained: float, most: int) -> tuple[Any, bool]:
@@ -427,7 +582,8 @@ def with_memory(
 
     def again(found: Settled) -> Settled:
         _, memory, size = found.remembered(case, most=LONGEST)
-        return search(case, found.fit.model, size * found.noise, memory=memory)
+        noise = tuple(tuple(n._replace(each=size * n.each) for n in row) for row in found.noise)
+        return search(case, found.fit.model, noise, memory=memory)
 
     found = rounds(white, again, GAINED, AGAIN)[0]
     if case.squares(found.rest) > worse * case.squares(white.rest):
@@ -447,13 +603,11 @@ def case_of(seen: PreparedOutput, offset: bool, network: bool = False) -> Case:
     """The case of one output: constant raw numbers or a network of them."""
     free = [Free("start", nuisance=True), Free("map", nuisance=network)]
     free += [Free("offset")] if offset else []
-    free += [] if seen.runs[0].held is None else [Free("late")]
+    free += [Free("late", -seen.part, 1.0 - seen.part)] if seen.part else []
     return Case((seen,), seen.runs, tuple(free), weight_priors("map") if network else ())
 
 
-def _round(
-    case: Case, model: Any, noise: np.ndarray, memory: CorrelatedNoise | None = None
-) -> Settled:
+def _round(case: Case, model: Any, noise: Noises, memory: CorrelatedNoise | None = None) -> Settled:
     """A search that pays for what it uses; the part of a sample in a delay begins anew."""
     found = case.search(model | {"late": 0.0}, noise, STEPS, memory)
     return found._replace(likelihood=information(case, found, memory))
@@ -479,9 +633,23 @@ class Begun(NamedTuple):
 def begun(
     runs: tuple[Run, ...], output: str, physics: Physics, delay: float | None, offset: bool
 ) -> Begun:
-    """Identify with constant parameters; the delay among candidates if None."""
-    start, seen, delay = start_of(runs, output, physics, delay, offset)
-    return Begun(seen, delay, fitted(case_of(seen, offset), [start.model(seen)]))
+    """Identify with constant parameters; the delay among candidates if None.
+
+    A part of a sample in the delay must do better by the Bayesian information criterion, under the
+    noise that the fits have. If it makes the delay negative it must do as much better as another
+    whole number; also if times jitter, of which late ones see a new input in its own row.
+    """
+    starts = starts_of(runs, output, physics, delay, offset)
+    whole, *part = (
+        Begun(seen, late, fitted(case_of(seen, offset), [start.model(seen)]))
+        for start, seen, late in starts
+    )
+    for other in part:
+        doubtful = other.delay < 0 <= whole.delay or whole.plain.jitter.any()
+        margin = 2.0 * BETTER if doubtful else 0.0
+        if other.plain.likelihood + margin < whole.plain.likelihood:
+            return other
+    return whole
 
 
 def is_first_order(found: Begun, offset: bool) -> bool:

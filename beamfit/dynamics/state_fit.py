@@ -16,7 +16,7 @@ import numpy as np
 
 from beamfit.answer import Table, answer, json_of
 from beamfit.dynamics.answer import ResponseEvidence, judged, limit_words, quantity
-from beamfit.dynamics.checks import Checks, HeldOutRun, RunSlopes, checks_of, percent
+from beamfit.dynamics.checks import Checks, HeldOutRun, RunNoises, RunSlopes, checks_of, percent
 from beamfit.dynamics.model import PreparedOutput, weight_priors
 from beamfit.dynamics.record import Run, checked
 from beamfit.dynamics.response import FIRST_ORDER
@@ -35,7 +35,6 @@ from beamfit.greybox import tree
 from beamfit.greybox.fit import Derived, Fit
 from beamfit.greybox.mlp import MLP
 from beamfit.greybox.problem import Free, Prior
-from beamfit.greybox.solve import solve
 from beamfit.noise.memory import CorrelatedNoise
 from beamfit.quantity import Quantity
 from beamfit.statistics import POOR_FIT
@@ -65,8 +64,7 @@ class Course:
     """A run as the model sees it: inputs and steps, padded, and which outputs were read.
 
     Shapes (samples, m), (samples,); `index` (readings,) points into all outputs one after the
-    other, `time` is theirs, s, far apart from output to output; `run` is its number, `noise` that
-    of its readings, if it has a memory.
+    other, `time` is theirs, s, far apart from output to output; `run` is its number.
     """
 
     system: System
@@ -75,7 +73,6 @@ class Course:
     index: Any
     time: Any
     run: Any
-    noise: CorrelatedNoise | None
 
     def shot(self, model: Any) -> tuple[jax.Array, jax.Array]:
         """Outputs from every segment's own start, and the gaps where segments meet."""
@@ -98,7 +95,7 @@ def course_of(system: System, seen: Sequence[PreparedOutput], i: int) -> Course:
     far = APART * float(np.sum(np.asarray(run.dt)))
     time = [far * k + np.asarray(s.runs[i].time) for k, s in enumerate(seen)]
     index, time = (jnp.asarray(np.concatenate(part)) for part in (index, time))
-    return Course(system, run.u, run.dt, index, time, run.run, None)
+    return Course(system, run.u, run.dt, index, time, run.run)
 
 
 _round = partial(Case.search, steps=STEPS)
@@ -122,11 +119,6 @@ def trained(case: Case, models: Sequence[Any]) -> Settled:
     """Fit from each start for a round, then from the best until nothing is gained."""
     enough = GAINED + EACH * sum(len(each) for s in case.seen for each in s.measured)
     return settled(case, models, _round, lambda found: enough, ROUNDS)
-
-
-def begun(case: Case, model: Any, noise: np.ndarray) -> Any:
-    """The model with what is free fitted once: the first states of runs that were held back."""
-    return solve(case.problem(model, noise)).model
 
 
 def remembering(case: Case, white: Settled) -> Settled:
@@ -427,7 +419,10 @@ def states_answer(
         fitted = tuple(y - r for y, r in zip(s.measured, rest, strict=True))
         added = [_added(s, i, y) for i, y in enumerate(fitted)]
         pairs = (RunSlopes(o, a) for o, a in zip(own, added, strict=True))
-        checks = checks_of(s, rest, list(pairs), max(1, used // len(case.seen)), gain, delay)
+        noise = RunNoises(s.time, [row[k].each for row in found.noise], found.likely)
+        used_each = max(1, used // len(case.seen))
+        checks = checks_of(s, rest, noise, list(pairs), used_each, gain, delay)
+        checks = checks._replace(jitter=float(found.jitter[:, k].max()))
         parts.append(StateSpaceOutput(list(runs[0].outputs)[k], runs, s, fitted, checks))
     ahead = _ahead(case, found, held, delay)
     nothing = all(part.checks.nothing_probability >= POOR_FIT for part in parts)
@@ -436,7 +431,7 @@ def states_answer(
     evidence = {
         part.output: ResponseEvidence(
             found.fit, found.rests, part.checks, told, (), ahead[part.output], map,
-            float(np.sqrt(np.mean(found.noise[:, k] ** 2))),
+            float(np.sqrt(np.mean(found.rms[:, k] ** 2))),
         )
         for k, part in enumerate(parts)
     }  # fmt: skip
@@ -444,7 +439,7 @@ def states_answer(
     order = order or found.fit.model["start"].shape[1]
     held_back = ahead if held else {}
     return StatesFit(
-        status, message, map, order, runs, tuple(parts), found.fit, told, found.noise,
+        status, message, map, order, runs, tuple(parts), found.fit, told, found.rms,
         found.memory, held_back, dict(more or {}),
     )  # fmt: skip
 
@@ -462,16 +457,10 @@ def _ahead(
     """Predict runs that were held back; only the state at their start is estimated."""
     ahead: dict[str, list[HeldOutRun]] = {name: [] for name in held[0].outputs} if held else {}
     for run in held:
-        one = case_of((run,), case.courses[0].system, [Free("start")], (), delay)
-        model = found.fit.model
-        start = np.mean(np.asarray(model["start"]), axis=0)[None]
-        model = model | {"start": start, "nodes": np.zeros((1, 0, start.shape[1]))}
-        sizes = np.array([[np.sqrt(np.mean(found.noise[:, k] ** 2)) for k in range(len(one.seen))]])
-        (rest,) = one.rest(begun(one, model, sizes))
-        for s, r in zip(one.seen, rest, strict=True):
-            y = s.measured[0] - s.measured[0].mean()
-            ahead[s.output].append(
-                HeldOutRun(run.name, percent(r, y), float(np.sqrt(np.mean(r**2))))
-            )
+        one = case_of((run,), case.courses[0].system, (), (), delay)
+        start = np.mean(np.asarray(found.fit.model["start"]), axis=0)[None]
+        start = {"start": start, "nodes": np.zeros((1, 0, start.shape[1]))}
+        for s, r in zip(one.seen, one.ahead(found, start), strict=True):
+            ahead[s.output].append(HeldOutRun.of(run.name, r, s.measured[0]))
     names = [s.output for s in case.seen]
     return {name: tuple(ahead.get(name, ())) for name in names}

@@ -189,7 +189,11 @@ class Whitened(NamedTuple):
         """-2 ln of the probability of the values, numbers and noise integrated out: up to a
         constant, flat in the numbers, in the logarithm of the errors' size and over the noises.
         """
-        return -2.0 * float(logsumexp(self._solved(None)[3]))
+        return -2.0 * float(logsumexp(-0.5 * self.evidences()))
+
+    def evidences(self) -> np.ndarray:
+        """The same by each noise, shape (g,)."""
+        return -2.0 * self._solved(None)[3]
 
     def memory(self, numbers: int | None = None) -> Memory:
         """Posterior over noise models with the first `numbers` free and the others held.

@@ -19,6 +19,8 @@ UP_AND_DOWN = np.array([0.0, 1.0, 2.0, 2.0, 1.5, 1.0, 0.0, -1.0])
         ("stop", 0.8, [0.0, 1.0, 2.0, 2.0, 2.0, 1.0, 0.0, -1.0]),
         ("dead zone", 0.5, [0.0, 0.5, 1.5, 1.5, 1.0, 0.5, 0.0, -0.5]),
         ("shift", 0.5, [0.0, 0.5, 1.5, 1.5, 2.0, 1.5, 0.5, -0.5]),
+        ("saturation", 0.8, [0.0, 0.8, 0.8, 0.8, 0.8, 0.8, 0.0, -0.8]),
+        ("square law", 2.0, [0.0, 1.5, 4.0, 4.0, 2.625, 1.5, 0.0, -0.5]),
     ],
 )
 def test_what_a_law_hands_on(law, width, wanted):
@@ -34,7 +36,7 @@ def test_an_error_is_that_of_the_mixture_about_the_value_without_a_law():
     """Beside draws from the mixture."""
     random = np.random.default_rng(0)
     shift, covariance = np.array([[2.0, 1.0], [0.0, -3.0]]), np.stack([np.diag([1.0, 0.5])] * 2)
-    found = LawEvidence(0.5, 0.0, "", np.array([0.3, 0.2]), shift, covariance)
+    found = LawEvidence(0.5, 0.0, "", False, np.array([0.3, 0.2]), shift, covariance)
     slope = np.array([1.0, 0.5])
     which = random.choice(3, 200_000, p=[0.5, 0.3, 0.2])
     laws = [random.multivariate_normal(s, c, 200_000) @ slope
@@ -94,6 +96,34 @@ def test_a_play_is_found_where_the_delay_is_no_whole_number_of_samples():
     fit = identify(Run(0.5 * np.arange(300), {"valve": u}, {"level": level}))
     assert fit.status is Status.poor_fit
     assert fit.checks.law.startswith("a play of valve"), fit.message
+
+
+BENDS = {
+    "a dead zone of valve by ±": lambda u: u - np.clip(u - 1.4, -0.35, 0.35),
+    "a saturation of valve above 2.": lambda u: np.minimum(u, 2.2),
+    "a square law of valve (gain 0.": lambda u: u**2 / 3.0 + 0.3 * u,
+}
+
+
+@pytest.mark.parametrize("words", BENDS)
+def test_a_bend_of_the_gain_is_named_for_what_it_is(words):
+    """All of them were called a dead zone, a square law what the model lacks."""
+    for seed in (3, 4):
+        random = np.random.default_rng(seed)
+        u = np.repeat(random.uniform(0, 3, 25), 12)
+        fit = identify(response(u, BENDS[words](u), 0.03, random), delay=0)
+        assert fit.status is Status.poor_fit
+        assert fit.checks.law.startswith(words), fit.checks.law
+        assert "--map network" in fit.message
+
+
+def test_a_few_values_of_an_input_leave_several_bends_possible():
+    """What only the highest of four values feels is a saturation or a dead zone below it."""
+    random = np.random.default_rng(5)
+    u = np.repeat(random.integers(0, 4, 40) * 1.0, 8)
+    fit = identify(response(u, np.minimum(u, 2.5), 0.03, random), delay=0)
+    assert "a saturation of valve above 2." in fit.checks.law
+    assert " or a dead zone of valve by ±" in fit.checks.law
 
 
 def test_two_values_of_an_input_do_not_tell_a_dead_zone():

@@ -105,4 +105,4 @@ def test_a_number_that_ran_to_the_end_of_its_range_is_not_known():
     fit = identify(Run(0.1 * np.arange(20), {"u": np.array(u)}, {"y": np.array(y)}), "second-order")
     assert fit.status == "unidentified"
     assert fit.quantities["zeta"].error is None
-    assert "zeta" in fit.message
+    assert "no more of the output than chance" in fit.message

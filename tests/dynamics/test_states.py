@@ -10,7 +10,7 @@ from scipy.signal import cont2discrete, dlsim, lfilter
 
 from beamfit.dynamics.linear import criterion, identify_states, joint_error
 from beamfit.dynamics.record import Run
-from beamfit.dynamics.search import Case
+from beamfit.dynamics.search import Case, ReadingErrors
 from beamfit.dynamics.state_fit import fit_states
 from beamfit.dynamics.states import StateSpace
 from beamfit.errors import InputError, Status
@@ -157,7 +157,8 @@ def test_an_order_is_worth_what_it_adds_to_what_readings_before_foretell():
     def missed(share, used):
         rest = lfilter([1.0], [1.0, -share], np.random.default_rng(1).normal(size=n))
         fit = SimpleNamespace(groups=[SimpleNamespace(count=n, dof=n - used)])
-        return SimpleNamespace(rest=((0.3 * rest / rest.std(),),), fit=fit)
+        noise = ((ReadingErrors(np.full(n, 0.3)),),)
+        return SimpleNamespace(rest=((0.3 * rest / rest.std(),),), noise=noise, fit=fit)
 
     rough, smooth, more = criterion(case, [missed(0.9, 3), missed(0.99, 6), missed(0.99, 7)])
     assert smooth < rough - 100.0
