@@ -247,7 +247,7 @@ def main() -> None:
         random = np.random.default_rng([number, chosen.trials])
         cases = [FAMILIES[name](random) for _ in range(chosen.trials)]
         pairs = [(case, fit) for case in cases if (fit := fitted(case, chosen.law))]
-        true = [(f, *c.truth()) for c, f in pairs]
+        true = [(f, *c.truth(f.mean_current)) for c, f in pairs]
         told = [(f.a, a) for f, a, _ in true if f.a.error is not None and np.isfinite(a)]
         far = sum(abs(q.value - a) > 4 * q.error for q, a in told)
         error = np.median([q.error / a for q, a in told]) if told else np.nan

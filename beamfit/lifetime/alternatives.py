@@ -61,10 +61,9 @@ FINER = 3
 # Two changes within so many readings are a step.
 STEP = 3.0
 # Prior probabilities: constant a and b, a power of a, a drift of b beside, one change, two, gas
-# that relaxes, current lost at once between two readings, each as likely, once or
-# twice.
-CHANCES = {"": SMOOTH - 0.4, "power": 0.2, "drift": 0.2, "step": 0.08,
-           "steps": 0.04, "relaxing": OUTGASSING, "sudden": 0.04, "sudden twice": 0.02}  # fmt: skip
+# that relaxes, current lost at once between two readings, each as likely, once or twice.
+CHANCES = {"": SMOOTH - 0.4, "power": 0.2, "drift": 0.2, "step": 0.08, "steps": 0.04,
+           "relaxing": OUTGASSING, "sudden": 0.04, "sudden twice": 0.02}  # fmt: skip
 # Further losses of each alternative: how many, of which kind.
 KINDS = {"step": (1, "step"), "steps": (2, "step"), "relaxing": (1, "relaxing"),
          "sudden": (1, "sudden"), "sudden twice": (2, "sudden")}  # fmt: skip
@@ -290,13 +289,36 @@ class Rival(NamedTuple):
     """The explanation that is better than a smooth law, and by how much.
 
     `odds` is the logarithm of its probability over that of a loss rate that drifts or wanders,
-    `scatter` what it leaves of the readings, mA rms, and `quantities` has its I0 and lifetimes.
+    `scatter` what it leaves of the readings, mA rms, and `law` its law, of a kind of `KINDS`.
     """
 
     found: Change | Outgassing | SuddenLoss
     odds: float
     scatter: float
-    quantities: dict[str, Quantity]
+    law: Expansion
+    kind: str
+
+    @property
+    def quantities(self) -> dict[str, Quantity]:
+        """I0 and lifetimes at the first and last reading and the mean current."""
+        (span, mean), pieces = self.law.pieces.units, self.law.pieces
+        x = pieces.share + self.law.residuals / pieces.weight
+        when = np.array([0.0, 1.0, np.interp(-1.0, -x, pieces.time / span)])
+
+        def numbers(level, loss, quadratic, power, *further):
+            rates = loss + quadratic * (np.array([level, x[-1], 1.0]) - 1)
+            for size, time in zip(further[::2], further[1::2], strict=True):
+                if self.kind == "relaxing":
+                    rates = rates + size * np.exp(-when / time)
+                elif self.kind == "step":
+                    rates = rates + size * (when > np.real(time))
+            return np.append(rates / span, level * mean)
+
+        columns = [LEVEL, *PLAIN, *range(FURTHER, self.law.rows.shape[1])]
+        *rates, first = zip(*self.law.quoted(numbers, columns), strict=True)
+        lifetimes = (lifetime_of(*rate, clear=True) for rate in rates)
+        found = {f"lifetime_{at}": one for at, one in zip(ENDS, lifetimes, strict=True)}
+        return {"i0": Quantity(*map(float, first), "mA")} | found
 
     def __str__(self) -> str:
         size = self.odds / math.log(10.0)
@@ -342,28 +364,7 @@ def rival_of(plain: Expansion) -> Rival | None:
     told = {"relaxing": _outgassing, "sudden": _sudden_loss, "sudden twice": _sudden_loss}
     answer = told.get(name, _change)(best)
     scatter = float(np.sqrt(np.mean((best.residuals * pieces.over) ** 2)))
-    return Rival(answer, log - smooth, scatter, _quantities(best, KINDS[name][1]))
-
-
-def _quantities(law: Expansion, kind: str) -> dict[str, Quantity]:
-    """I0 and lifetimes at the first and last reading and the mean current, with further losses."""
-    (span, mean), x = law.pieces.units, law.pieces.share + law.residuals / law.pieces.weight
-    when = np.array([0.0, 1.0, np.interp(-1.0, -x, law.pieces.time / span)])
-
-    def numbers(level, loss, quadratic, power, *further):
-        rates = loss + quadratic * (np.array([level, x[-1], 1.0]) - 1)
-        for size, time in zip(further[::2], further[1::2], strict=True):
-            if kind == "relaxing":
-                rates = rates + size * np.exp(-when / time)
-            elif kind == "step":
-                rates = rates + size * (when > np.real(time))
-        return np.append(rates / span, level * mean)
-
-    columns = [LEVEL, *PLAIN, *range(FURTHER, law.rows.shape[1])]
-    *rates, first = zip(*law.quoted(numbers, columns), strict=True)
-    lifetimes = (lifetime_of(*rate, clear=True) for rate in rates)
-    found = {f"lifetime_{at}": one for at, one in zip(ENDS, lifetimes, strict=True)}
-    return {"i0": Quantity(*map(float, first), "mA")} | found
+    return Rival(answer, log - smooth, scatter, best, KINDS[name][1])
 
 
 def _averaged(pieces: Pieces) -> Pieces:
@@ -485,17 +486,14 @@ def _log_evidence(law: Expansion, name: str) -> float:
     if the loss rate goes by a random walk besides, in linear approximation.
     """
     columns, width, centre = _given(law, name)
-    slopes = law.rows[:, columns]
-    if law.pieces.gauge is None:
-        slopes = np.column_stack([slopes, _walked(law)])
-    rows = np.column_stack([law.residuals, slopes])
+    walk = _walked(law) if law.pieces.gauge is None else np.zeros((law.residuals.size, 0))
+    rows = np.column_stack([law.residuals, law.rows[:, columns], walk])
     products = Products.of(rows, law.pieces.time, law.pieces.error is not None)
     own = products._replace(matrix=products.matrix[:, : len(width) + 1, : len(width) + 1])
-    found, every = [_laplace(own, width, centre)], np.ones(slopes.shape[1] - width.size)
-    if every.size:
-        chance, centre = math.log(WANDERS / SMOOTH / len(WALKS)), np.append(centre, 0.0 * every)
-        widths = [np.append(width, share * every) for share in WALKS]
-        found += [_laplace(products, one, centre) + chance for one in widths]
+    found, every = [_laplace(own, width, centre)], np.ones(walk.shape[1])
+    for share in WALKS if every.size else ():
+        wanders = _laplace(products, np.append(width, share * every), np.append(centre, 0 * every))
+        found.append(wanders + math.log(WANDERS / SMOOTH / len(WALKS)))
     count = (law.numbers.size - len(PLAIN) - 1) // 2
     return float(logsumexp(found)) + _log_chance(name, law, count)
 

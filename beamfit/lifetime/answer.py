@@ -190,11 +190,6 @@ def _inseparable(e: Evidence) -> Finding | None:
         return Finding(Status.unidentified, cause)
     if (beyond := max(-found.share, found.share - 1.0) / found.share_error) > OUTSIDE:
         return _beyond(e, beyond)
-    told = (
-        f"a and b are not separable on this record (correlation {found.correlation:.6f}; share "
-        f"of a in the loss {found.share:.2g} ± {found.share_error:.2g}), the lifetime at the mean "
-        "current is determined. "
-    )
     if e.free is not None and e.free.is_odd:
         return Finding(
             Status.unidentified,
@@ -202,6 +197,11 @@ def _inseparable(e: Evidence) -> Finding | None:
             f"bunch length makes it, a as I^({e.free.exponent}). A vacuum that changes does, as "
             "after a fill: give the pressure in a column",
         )
+    told = (
+        f"a and b are not separable on this record (correlation {found.correlation:.6f}; share "
+        f"of a in the loss {found.share:.2g} ± {found.share_error:.2g}), the lifetime at the mean "
+        "current is determined. "
+    )
     if e.apart:
         open_ = "An exponent of a and a drift of b leave them open: record farther, or give the "
         told += f"{open_}ring, the pressure, or --law constant. {_if_constant(e)}"

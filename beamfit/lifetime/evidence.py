@@ -422,7 +422,7 @@ class Evidence:
 
     @property
     def by_gas(self) -> bool:
-        """True if gas explains a refuted law that is pumped away in a time of the free law."""
+        """True if gas explains a refuted law that is not gone before the free law can follow it."""
         if self.outgassing is None:
             return False
         return self.record.span <= PACES[1] * self.outgassing.time_constant.value * HOUR

@@ -46,6 +46,7 @@ SMOOTH, OUTGASSING, TIMES, SIZES = 0.6, 0.08, (1e-3, 1.0), (1e-3, 10.0)
 # Prior probability that the loss rate wanders, as a pressure does, by a random walk: by which
 # shares of the loss it has gone at the end, each as likely.
 WANDERS, WALKS = 0.14, (0.003, 0.015, 0.07, 0.3)
+LOG_WANDERS = math.log(WANDERS / SMOOTH)
 # Spans over the time of gas that is pumped away: shorter times are seen by themselves.
 PACES = (1.0, 20.0)
 # Where the record's bend does not depend on the share its coordinate has this slope.
@@ -202,7 +203,6 @@ def log_pumped(share, gas, pace, xp=np):
     return xp.where(inside, density, -np.inf)
 
 
-LOG_WANDERS = math.log(WANDERS / SMOOTH)
 # A walk is looked at beside noises that are not less likely than the likeliest by more than this;
 # fewer readings tell no noise beside a curve as free.
 BESIDE, FEWEST = 3.0, 2 * NODES
@@ -381,15 +381,17 @@ class SeenDecay:
         ends = np.searchsorted(kind, np.arange(len(self.products.matrix) + 1))
         return [slice(*part) for part in pairwise(ends)]
 
-    def walked(self, currents: np.ndarray, kind: np.ndarray, even: np.ndarray) -> np.ndarray:
+    def walked(
+        self, currents: np.ndarray, kind: np.ndarray, squares: np.ndarray, even: np.ndarray
+    ) -> np.ndarray:
         """Draw how far the loss rate has walked at the nodes, as shares of the loss, (14, d), by
-        even points of a cube, beside these currents.
+        even points of a cube, beside these currents and the squares that they leave.
         """
         walked = np.zeros_like(currents)
         if self.walk is None:
             return walked
         away, normal = self.away(currents), ndtri(even)
-        noise = np.sqrt(self.products.variance(self.squares(currents, kind), 0))
+        noise = np.sqrt(self.products.variance(squares, 0))
         for mean, half, part in zip(*self.walk, self._parts(kind), strict=True):
             walked[:, part] = mean @ away[:, part] + half @ (normal[:, part] * noise[part])
         return walked
@@ -652,14 +654,14 @@ class DrawnLaw(NamedTuple):
             return Draws(numbers, np.zeros_like(currents), currents, none, -np.inf, 0.0)
         kind, numbers, given = self._proposed(draws, seed)
         currents = numbers.currents(seen.gas)
-        log = seen.products.log_prior[kind]
-        log = log + seen.products.log_size(seen.squares(currents, kind))
+        squares = seen.squares(currents, kind)
+        log = seen.products.log_prior[kind] + seen.products.log_size(squares)
         log = log + np.log(numbers.level * numbers.rate * np.abs(numbers.unit))
         log = log + self._log_prior(numbers) - given
         whole = float(logsumexp(log))
         weight = np.exp(log - max(whole, -1e300))
         worth = float(weight.sum() / max(np.sum(weight**2), 1e-300))
-        walk = seen.walked(currents, kind, _even(draws, NODES, seed + 1))
+        walk = seen.walked(currents, kind, squares, _even(draws, NODES, seed + 1))
         currents = currents * np.exp(-numbers.rate * (INTEGRAL @ walk))
         return Draws(numbers, walk, currents, weight, whole - math.log(draws), worth)
 
