@@ -329,8 +329,6 @@ def _extent(e: Evidence, name: str) -> str | None:
     return f"{name} lies between {low:.2g} and {high:.2g} {UNITS[name]} at 95 %"
 
 
-# What cycles at one current tell.
-LIFETIME_ALONE = "The lifetime at the mean current is the answer; "
 NEGATIVE = (partial(_negative, "b", NOT_GAS), partial(_negative, "a", RISING))
 LOOK = ": look for steps with split_record, or test constant_a_test"
 RULES = (_lost, _held, _stepped, *NEGATIVE, _within_noise, _refuted, _inseparable)
@@ -397,7 +395,7 @@ def _one_current(e: Evidence) -> Finding | None:
         return None
     return Finding(
         Status.unidentified,
-        f"{LIFETIME_ALONE}a and b are not separable at these "
+        "The lifetime at the mean current is the answer; a and b are not separable at these "
         f"currents (share of a in the loss {share:.2g} ± {error:.2g}): let the beam decay "
         "farther once, or measure at another current",
     )
@@ -411,7 +409,28 @@ def _rises(e: Evidence) -> Finding | None:
     return Finding(Status.infeasible, cause)
 
 
-CYCLE_RULES = (_rises, _bent, *NEGATIVE, _held, _within_noise, _refuted)
+def _missed(e: Evidence) -> Finding | None:
+    """Refills that may have been missed: the beam then seems to live longer than it does."""
+    if e.aliased:
+        usual, interval = e.usual
+        return Finding(
+            Status.unidentified,
+            "The beam is held by refills that the record may not resolve: of those that were found "
+            f"the next comes after {usual:.3g} readings, but faster ones look the same when read "
+            f"every {interval:.3g} s. Record more readings from refill to refill",
+        )
+    if e.hidden is None:
+        return None
+    lost, least = e.hidden
+    return Finding(
+        Status.unidentified,
+        f"A cycle of the {e.cycles} that were found loses {lost:.2g} mA, and refills below "
+        f"{least:.2g} mA can be missed in this noise: the beam then seems to live longer than it "
+        "does. Average readings, or give the times of the refills by cutting the record there",
+    )
+
+
+CYCLE_RULES = (_rises, _missed, _bent, *NEGATIVE, _held, _within_noise, _refuted)
 CYCLE_RULES += (_one_current, _improbable, _bending, _determined)
 
 

@@ -21,6 +21,7 @@ from beamfit.lifetime.alternatives import (
     lifetime_law,
     rival_of,
 )
+from beamfit.lifetime.cycles import unresolved
 from beamfit.lifetime.expansion import (
     DETERMINED,
     LOSS,
@@ -42,6 +43,10 @@ SEPARABLE = 0.2
 BELIEVED = 5.0
 # A share of a so many errors outside 0 to 1 is of no longer record.
 OUTSIDE = 3.0
+# Probability of refills faster than the record is read from which cycles tell no lifetime.
+UNSURE = 0.05
+# Refills of so many standard deviations of the means beside them are none of them missed.
+SEEN = 6.0
 # Standard deviations that hold 95 % of a normal distribution.
 NORMAL = 1.96
 # Below this share of the current differences are those of the arithmetic, not of the beam.
@@ -114,12 +119,15 @@ class Evidence:
         Whether the dependence of a was given.
     record : DecayRecord or None
         The readings of a single decay.
+    usual : tuple of float or None
+        Readings of a cycle, and the time between them, s, of cycles that were found in a record.
     """
 
     about: Expansion
     law: Law = Law.constant
     shaped: bool = False
     record: DecayRecord | None = None
+    usual: tuple[float, float] | None = None
 
     @property
     def cycles(self) -> int:
@@ -263,6 +271,14 @@ class Evidence:
             after = after + self.about.rows[:, self.about.columns()] @ self.memory.mean_step
         return after * self.about.pieces.over
 
+    @property
+    def rms(self) -> float:
+        """Root mean square of the residuals, mA, beside a current for each cycle."""
+        after = (
+            self.about.left[:, -1] * self.about.pieces.over if self.cycles > 1 else self.residuals
+        )
+        return float(np.sqrt(np.mean(after**2)))
+
     @cached_property
     def squares(self) -> float:
         """Sum of squares of the residuals over their errors, whitened.
@@ -383,6 +399,36 @@ class Evidence:
     def bends(self) -> bool:
         """True if cycles bend as no loss does, and the monitor is not stated to drift so."""
         return self.cycles > 1 and not self.monitor_changes and self.outside > OUTSIDE
+
+    @cached_property
+    def aliased(self) -> bool:
+        """True if refills faster than the record is read may look like those that were found."""
+        rate = float(self.values.rate_mean)
+        return self.usual is not None and rate > 0 and unresolved(*self.usual, 1 / rate) > UNSURE
+
+    @cached_property
+    def hidden(self) -> tuple[float, float] | None:
+        """What a cycle loses, and the least refill that the noise does not hide, mA, where that is
+        more, of cycles that were found.
+
+        The refill that holds the current gives back what a cycle loses. It is told from the noise
+        by the means of half a cycle before and after.
+        """
+        rate = float(self.values.rate_mean)
+        if self.usual is None or not rate > 0:
+            return None
+        memory = self.separability.residual_correlation
+        half = max(self.time.size / self.cycles / 2, 1.0)
+        mean = (1 + memory) / (1 - memory) / half
+        least = SEEN * self.rms * math.sqrt(2 * min(mean, 1.0))
+        lasts = 2 * half * float(np.median(np.diff(self.time)))
+        lost = self.about.pieces.units[1] * rate * lasts
+        return None if lost >= least else (lost, least)
+
+    @property
+    def tells_lifetime(self) -> bool:
+        """True if cycles are of a decay, and none of their refills may have been missed."""
+        return not self.bends and not self.aliased and self.hidden is None
 
     @property
     def refuted(self) -> bool:

@@ -13,7 +13,7 @@ from beamfit.answer import Table, answer, cell, json_of, labelled, plain_name, q
 from beamfit.errors import InputError, expect
 from beamfit.lifetime.alternatives import Change, ConstantA, LifetimeLaw, Outgassing, SuddenLoss
 from beamfit.lifetime.answer import finding_of, finding_of_cycles
-from beamfit.lifetime.cycles import FEWEST_CYCLES, FEWEST_READINGS, averaged, cleaned
+from beamfit.lifetime.cycles import FEWEST_CYCLES, FEWEST_READINGS, averaged, cleaned, usual_cycle
 from beamfit.lifetime.decay_law import current
 from beamfit.lifetime.evidence import BELIEVED, UNITS, Evidence, RatePart, Separability
 from beamfit.lifetime.expansion import Expansion, Pieces, Shape, solved
@@ -411,13 +411,17 @@ def _judged(
         message=finding.message,
         **evidence.quoted(about.rested),
         mean_current=record.mean_current,
-        rms_residual=float(np.sqrt(np.mean(evidence.residuals**2))),
+        rms_residual=evidence.rms,
         readings=record,
     )
 
 
 def fit_cycles(
-    cycles: Sequence[DecayRecord], name: str = "cycles", law: Law | str = Law.free
+    cycles: Sequence[DecayRecord],
+    name: str = "cycles",
+    law: Law | str = Law.free,
+    *,
+    found: bool = True,
 ) -> DecayFit:
     """Fit one a and one b to many cycles, as of top-up, each with an own current at its start.
 
@@ -430,6 +434,10 @@ def fit_cycles(
         What to call them together.
     law : {"free", "constant"}
         Whether a may go as a power of the current, which errors of a and b then contain.
+    found : bool, optional
+        Whether the cycles were found in the readings. Where the noise may have hidden refills, or
+        they come faster than the readings, there is no lifetime then. False where the times of the
+        refills are known.
 
     Returns
     -------
@@ -467,10 +475,12 @@ def fit_cycles(
         if len(cycle) < FEWEST_READINGS:
             found, expected = f"{len(cycle)} readings", f"{FEWEST_READINGS} or more in a cycle"
             raise InputError(found, expected, path=cycle.name)
-    return fit_pieces(cycles, name, Law(law))
+    return fit_pieces(cycles, name, Law(law), found=found)
 
 
-def fit_pieces(cycles: Sequence[DecayRecord], name: str, law: Law = Law.constant) -> DecayFit:
+def fit_pieces(
+    cycles: Sequence[DecayRecord], name: str, law: Law = Law.constant, *, found: bool = False
+) -> DecayFit:
     """As `fit_cycles`, also of two, such as before and after a refill or a gap."""
     gathered = averaged(cycles)
     if np.any(np.diff(gathered.time) <= 0):
@@ -479,15 +489,16 @@ def fit_pieces(cycles: Sequence[DecayRecord], name: str, law: Law = Law.constant
         said = f"The readings of each of {len(cycles)} cycles are equal"
         return replace(_constant(_readings(gathered, name), said), first=gathered.first)
     about, left_out = cleaned(gathered)
-    evidence, pieces = Evidence(about, law), about.pieces
+    usual = usual_cycle(cycles) if found else None
+    evidence, pieces = Evidence(about, law, usual=usual), about.pieces
     finding = finding_of_cycles(evidence, pieces.monitor, left_out)
     return DecayFit(
         record=name,
         status=finding.status,
         message=finding.message,
-        **evidence.quoted(not evidence.bends),
+        **evidence.quoted(evidence.tells_lifetime),
         mean_current=pieces.units[1],
-        rms_residual=float(np.sqrt(np.mean((about.left[:, -1] * pieces.over) ** 2))),
+        rms_residual=evidence.rms,
         readings=_readings(pieces, name),
         first=pieces.first,
     )

@@ -13,15 +13,12 @@ import numpy as np
 
 from beamfit.answer import answer, json_of, shown
 from beamfit.errors import InputError, expect
-from beamfit.lifetime.answer import LIFETIME_ALONE
 from beamfit.lifetime.cycles import (
     FEWEST_CYCLES,
     alike,
     cut_at_refills,
     is_refilled,
     joined,
-    unresolved,
-    usual_cycle,
 )
 from beamfit.lifetime.evidence import SEPARABLE
 from beamfit.lifetime.fit import DecayFit, bare, fit_cycles, fit_decay, fit_pieces
@@ -46,14 +43,10 @@ from beamfit.quantity import HOUR, Quantity, Status
 # A setting that moves by more than this share between two readings was changed by somebody.
 CHANGED = 0.01
 SETTINGS = ("rf_voltage", "scraper_y", "bunches")
-# Refills of so many standard deviations of the means beside them are none of them missed.
-SEEN = 6.0
 # Noise with a memory is taken for so many times what neighbouring readings scatter by.
 OWN = 3.0
 # Answers of cycles for which one law does not hold.
 REFUTED = (Status.poor_fit, Status.infeasible)
-# Probability of refills faster than the record is read from which cycles tell no lifetime.
-UNSURE = 0.05
 # Errors of the time of a change within which readings are of neither side.
 NEITHER = 2.0
 # Times in which gas is pumped away to less than a hundredth.
@@ -272,45 +265,6 @@ def stands_alone(cycle: DecayRecord, fit: DecayFit) -> bool:
     return noise < SEPARABLE * bend
 
 
-def seen_through(fit: DecayFit, usual: float, interval: float) -> DecayFit:
-    """A fit to cycles that were found, without errors where refills may have been missed: then the
-    beam seems to live longer than it does. `usual` is how many readings
-    a cycle has, one each `interval`.
-
-    The refill that holds the current gives back what a cycle loses. It is told from the noise by
-    the means of half a cycle before and after.
-    """
-    lifetime = fit.lifetime_mean.value * HOUR
-    if lifetime > 0 and unresolved(usual, interval, lifetime) > UNSURE:
-        cause = (
-            "The beam is held by refills that the record may not resolve: of those that were found "
-            f"the next comes after {usual:.3g} readings, but faster ones look the same when read "
-            f"every {interval:.3g} s. Record more readings from refill to refill. "
-        )
-        return _opened(fit, cause)
-    record, memory = fit.readings, fit.identifiability.residual_correlation
-    half = max(len(record) / fit.first.size / 2, 1.0)
-    mean = (1 + memory) / (1 - memory) / half if memory else 1 / half
-    least = SEEN * fit.rms_residual * math.sqrt(2 * min(mean, 1.0))
-    lasts = 2 * half * float(np.median(np.diff(record.time)))
-    lifetime = fit.lifetime_mean.value
-    lost = fit.mean_current * lasts / (lifetime * HOUR)
-    if lost >= least or not lifetime > 0:  # that of a current that rises is nan
-        return fit
-    cause = (
-        f"A cycle of the {fit.first.size} that were found loses {lost:.2g} mA, and refills below "
-        f"{least:.2g} mA can be missed in this noise: the beam then seems to live longer than it "
-        f"does. Average readings, or give the times of the refills by cutting the record there. "
-    )
-    return _opened(fit, cause)
-
-
-def _opened(fit: DecayFit, cause: str) -> DecayFit:
-    bare = {name: quantity.open() for name, quantity in fit.quantities.items()}
-    message = cause + fit.message.replace(LIFETIME_ALONE, "")
-    return replace(fit, status=Status.unidentified, message=message, exact=bare, **bare)
-
-
 @dataclass(frozen=True, eq=False)
 class Decay:
     """One decay of a record, or many cycles of it together.
@@ -455,7 +409,7 @@ def _pooled(
             alone += [cycle for cycle in group if len(cycle) >= FEWEST]
             continue
         called = name if many == 1 else f"{name}@{len(pooled) + 1}"
-        fit = seen_through(fit_cycles(group, called, law), *usual_cycle(group))
+        fit = fit_cycles(group, called, law)
         own = [c for c in group if len(c) >= FEWEST and stands_alone(c, fit)]
         alone += own
         known = fit.status not in REFUTED and fit.lifetime_mean.error is not None

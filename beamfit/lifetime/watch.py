@@ -16,7 +16,7 @@ from beamfit.answer import json_of
 from beamfit.errors import InputError
 from beamfit.lifetime import alarm
 from beamfit.lifetime.course import BEST_MONITOR, normalised, reference_of
-from beamfit.lifetime.cycles import alike, cut_at_refills, joined, usual_cycle
+from beamfit.lifetime.cycles import alike, cut_at_refills, joined
 from beamfit.lifetime.evidence import UNITS
 from beamfit.lifetime.fit import DecayFit, bare, fit_decay, fit_pieces
 from beamfit.lifetime.free_law import Law
@@ -29,7 +29,6 @@ from beamfit.lifetime.study import (
     Machine,
     at_settings,
     operation_during,
-    seen_through,
 )
 from beamfit.quantity import Quantity, Status
 
@@ -183,8 +182,7 @@ def fit_window(rows: Sequence[WindowRow], name: str, law: Law = Law.free) -> Win
 def _fitted(group: list[DecayRecord], name: str, law: Law) -> DecayFit:
     if len(group) == 1:
         return fit_decay(replace(group[0], name=name), law=law)
-    fit = fit_pieces(group, name, law)
-    return seen_through(fit, *usual_cycle(group)) if len(group) > 2 else fit
+    return fit_pieces(group, name, law, found=len(group) > 2)
 
 
 def _pieces(rows: Sequence[WindowRow], name: str) -> list[DecayRecord]:

@@ -66,7 +66,7 @@ def test_top_up_of_ten_hours_has_one_answer(noise):
 def test_errors_cover(step, memory, count):
     pulls, held = [], []
     for seed in range(count):
-        fit = fit_cycles(cut(*top_up(0.01, seed, step=step, memory=memory)))
+        fit = fit_cycles(cut(*top_up(0.01, seed, step=step, memory=memory)), found=False)
         truth = true_lifetime(fit.mean_current)
         pulls.append(abs(fit.lifetime_mean.value - truth) / fit.lifetime_mean.error)
         low, high = fit.lifetime_mean.interval_95
@@ -79,7 +79,7 @@ def test_errors_cover(step, memory, count):
 def test_the_fit_is_that_of_all_numbers_at_once():
     """By one noise; averaged over noises the answer moves by a small part of its error."""
     time, current, number = top_up(0.01, 3, hours=1.0, cycle=600.0)
-    fit = fit_cycles(cut(time, current, number))
+    fit = fit_cycles(cut(time, current, number), found=False)
     alone = solved(averaged(cut(time, current, number))).values
     since = time - 600 * number
 
@@ -155,7 +155,7 @@ def test_steps_of_a_few_standard_deviations_are_found(noise, step):
     refills = [event for event in split.events if event.kind == "refill"]
     assert len(refills) == number[-1]
     assert len(split.events) == len(refills)
-    fit = fit_cycles(split.segments)
+    fit = fit_cycles(split.segments, found=False)
     off = fit.lifetime_mean.value - true_lifetime(fit.mean_current)
     assert abs(off) < 3 * fit.lifetime_mean.error
 
@@ -238,7 +238,7 @@ def test_readings_and_cycles_far_off_are_left_out_and_counted():
     time, current, number = top_up(0.01, 4, hours=3.0)
     current[[100, 501]] += 0.2
     current[number == 20] -= 4e-3 * (time[number == 20] - time[number == 20][0])
-    fit = fit_cycles(cut(time, current, number))
+    fit = fit_cycles(cut(time, current, number), found=False)
     assert "1 cycle was left out" in fit.message
     assert "2 readings were left out" in fit.message
     off = fit.lifetime_mean.value - true_lifetime(fit.mean_current)
@@ -247,11 +247,11 @@ def test_readings_and_cycles_far_off_are_left_out_and_counted():
 
 def test_a_loss_rate_that_changes_has_a_course():
     time, current, number = top_up(0.01, 1, change=0.2)
-    fit = fit_cycles(cut(time, current, number))
+    fit = fit_cycles(cut(time, current, number), found=False)
     assert fit.status.value == "unidentified"
     assert "not the same in all cycles" in fit.message
     assert fit.to_json()["course"][0]["start"]["value"] == 0.0
-    assert fit_cycles(cut(*top_up(0.01, 1))).course == ()
+    assert fit_cycles(cut(*top_up(0.01, 1)), found=False).course == ()
 
 
 def test_a_change_within_a_cycle_is_somewhere_in_it():
@@ -262,7 +262,7 @@ def test_a_change_within_a_cycle_is_somewhere_in_it():
     lost = np.where(
         (number == number[late][0]) & late, 0.3 * 500 / LIFETIME * (time % 180 - 130), lost
     )
-    fit = fit_cycles(cut(time, current - lost, number))
+    fit = fit_cycles(cut(time, current - lost, number), found=False)
     true = 1 / (1 / true_lifetime(fit.mean_current) + 0.3 * late.mean() * 3600 / LIFETIME)
     assert len(fit.course) == 2
     assert abs(fit.lifetime_mean.value - true) < 3 * fit.lifetime_mean.error
@@ -277,7 +277,7 @@ def test_a_lifetime_that_wanders_is_followed_and_its_mean_is_right():
     number = (time // 300).astype(int)
     beam = 300 * np.exp(lost[np.searchsorted(number, number)] - lost)
     noise = 0.01 * np.random.default_rng(2).normal(size=time.size)
-    fit = fit_cycles(cut(time, beam + noise, number))
+    fit = fit_cycles(cut(time, beam + noise, number), found=False)
 
     def off(found, some):
         return (found.value - 1 / np.mean(1 / lives[some]) / 3600) / found.error
@@ -349,7 +349,7 @@ def test_too_few_are_refused():
     with pytest.raises(InputError, match="before the end"):
         fit_cycles([*cycles, cycles[0]])
     with pytest.raises(InputError, match="samples of many cycles"):
-        fit_cycles(cut(*top_up(0.01, 1, hours=0.5))).sample(seed=1)
+        fit_cycles(cut(*top_up(0.01, 1, hours=0.5)), found=False).sample(seed=1)
 
 
 @pytest.mark.parametrize(("memory", "ratio"), [(0.8, 3.0), (0.9, 3.0), (0.8, 5.0), (0.0, 3.0)])
