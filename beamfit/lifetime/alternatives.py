@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -60,13 +59,6 @@ GRID = np.linspace(0.05, 0.95, 40)
 FINER = 3
 # Two changes within so many readings are a step.
 STEP = 3.0
-# Prior probabilities: constant a and b, a power of a, a drift of b beside, one change, two, gas
-# that relaxes, current lost at once between two readings, each as likely, once or twice.
-CHANCES = {"": SMOOTH - 0.4, "power": 0.2, "drift": 0.2, "step": 0.08, "steps": 0.04,
-           "relaxing": OUTGASSING, "sudden": 0.04, "sudden twice": 0.02}  # fmt: skip
-# Further losses of each alternative: how many, of which kind.
-KINDS = {"step": (1, "step"), "steps": (2, "step"), "relaxing": (1, "relaxing"),
-         "sudden": (1, "sudden"), "sudden twice": (2, "sudden")}  # fmt: skip
 # An alternative is fitted if in linear approximation its evidence, by noises of so many correlation
 # times, is not below that of constant a and b by more than this: it is good to about 1.
 COARSE, HOPELESS = 7, -1.0
@@ -74,6 +66,27 @@ COARSE, HOPELESS = 7, -1.0
 MOVED = 1e-3
 # Currents at which a lifetime is offered.
 CURRENTS = 5
+
+
+class Alternative(NamedTuple):
+    """A law of a decay by its prior probability, what is lost besides, and how often.
+
+    `power` is whether a goes as a power of the current.
+    """
+
+    chance: float
+    kind: str | None = None
+    count: int = 0
+    power: bool = False
+
+
+# Constant a and b, a power of a, and a drift of b beside; one change of the loss rate, two, gas
+# that relaxes, current lost at once between two readings, each as likely, once or twice.
+CONSTANT, POWERED = Alternative(SMOOTH - 0.4), Alternative(0.2, power=True)
+DRIFTING = Alternative(0.2, "drift", power=True)
+OTHERS = (Alternative(0.08, "step", 1), Alternative(0.04, "step", 2),
+          Alternative(OUTGASSING, "relaxing", 1),
+          Alternative(0.04, "sudden", 1), Alternative(0.02, "sudden", 2))  # fmt: skip
 
 
 @shown
@@ -217,11 +230,12 @@ class Change(NamedTuple):
         return json_of(told if self.then is None else told | {"then": self.then})
 
     def __str__(self) -> str:
-        again = "" if self.then is None else f", and {str(self.then).partition('changed ')[2]}"
-        return (
-            f"the loss rate changed near t = {self.time:.4g} s, where the lifetime went from "
-            f"{self.before} to {self.after}{again}"
+        changes = [self] if self.then is None else [self, self.then]
+        told = (
+            f"near t = {one.time:.4g} s, where the lifetime went from {one.before} to {one.after}"
+            for one in changes
         )
+        return f"the loss rate changed {', and '.join(told)}"
 
 
 @shown
@@ -289,7 +303,8 @@ class Rival(NamedTuple):
     """The explanation that is better than a smooth law, and by how much.
 
     `odds` is the logarithm of its probability over that of a loss rate that drifts or wanders,
-    `scatter` what it leaves of the readings, mA rms, and `law` its law, of a kind of `KINDS`.
+    `scatter` what it leaves of the readings, mA rms, and `law` its law, with further losses of a
+    kind.
     """
 
     found: Change | Outgassing | SuddenLoss
@@ -349,22 +364,18 @@ def rival_of(plain: Expansion) -> Rival | None:
     if pieces.time.size <= WHEN + 2:
         return None
     plain = solved(pieces) if pieces is not plain.pieces else plain
-    best = {name: _at_best(plain, *further) for name, further in KINDS.items()}
-    if plain.pieces.gauge is not None:
-        del best["relaxing"]
-    likely = _likely(plain, best)
+    likely = _likely(plain)
     if not likely:
         return None
     smooth = _smooth(plain)
-    laws = [(name, _with_further(plain, best[name])) for name in likely]
-    found = [(_log_evidence(law, name), name, law) for name, law in laws if law is not None]
-    log, name, best = max(found, key=lambda one: one[0], default=(-math.inf, "", plain))
+    laws = [(one, _with_further(plain, further)) for one, further in likely.items()]
+    found = [(_log_evidence(law, one), one, law) for one, law in laws if law is not None]
+    log, one, best = max(found, key=lambda each: each[0], default=(-math.inf, CONSTANT, plain))
     if not log > smooth:
         return None
-    told = {"relaxing": _outgassing, "sudden": _sudden_loss, "sudden twice": _sudden_loss}
-    answer = told.get(name, _change)(best)
+    told = {"step": _change, "relaxing": _outgassing, "sudden": _sudden_loss}
     scatter = float(np.sqrt(np.mean((best.residuals * pieces.over) ** 2)))
-    return Rival(answer, log - smooth, scatter, best, KINDS[name][1])
+    return Rival(told[one.kind](best), log - smooth, scatter, best, one.kind)
 
 
 def _averaged(pieces: Pieces) -> Pieces:
@@ -376,48 +387,47 @@ def _averaged(pieces: Pieces) -> Pieces:
     return Pieces.of(DecayRecord(*means, monitor=pieces.monitor))
 
 
-def _likely(plain: Expansion, best: Mapping[str, _Further]) -> list[str]:
-    """List the alternatives that are not much less likely than constant a and b: by their evidence
-    in linear approximation about the law without, at their best times.
+def _likely(plain: Expansion) -> dict[Alternative, _Further]:
+    """Further losses of the alternatives that are not much less likely than constant a and b: by
+    their evidence in linear approximation about the law without, at their best times.
     """
-    columns, places, widths = (
-        [plain.residuals, *plain.rows[:, [LEVEL, *PLAIN]].T],
-        {"": []},
-        {"": []},
-    )
-    for name, more in best.items():
+    gauged = plain.pieces.gauge is not None
+    others = [one for one in OTHERS if not (gauged and one.kind == "relaxing")]
+    best = {one: _at_best(plain, one.count, one.kind) for one in others}
+    columns = [plain.residuals, *plain.rows[:, [LEVEL, *PLAIN]].T]
+    places, widths = {CONSTANT: range(0)}, {CONSTANT: np.zeros(0)}
+    for one, more in best.items():
         own = list(further_columns(plain, more.kind, more.times).T)
-        size, time = _widths(name, more.sizes, more.times, plain.numbers[0])
+        size, time = _widths(more.kind, more.sizes, more.times, plain.numbers[0])
         if more.kind != "sudden":
             ends = (further_columns(plain, more.kind, more.times + d) for d in (MOVED, -MOVED))
             own += list(more.sizes[:, None] * np.subtract(*ends).T / (2 * MOVED))
             size = np.append(size, time)
-        places[name], widths[name] = range(len(columns), len(columns) + len(own)), size
+        places[one], widths[one] = range(len(columns), len(columns) + len(own)), size
         columns += own
     products = Products.of(np.column_stack(columns), plain.pieces.time, bool(plain.given), COARSE)
 
-    def log_evidence(name: str) -> float:
-        own, width = [0, 1, 2, 3, *places[name]], np.append([np.inf] * 3, widths[name])
+    def log_evidence(one: Alternative) -> float:
+        own, width = [0, 1, 2, 3, *places[one]], np.append([np.inf] * 3, widths[one])
         some = products._replace(matrix=products.matrix[:, own][:, :, own])
-        chance = _log_chance(name, plain, KINDS.get(name, (0, ""))[0])
-        return _laplace(some, width, np.zeros(width.size)) + chance
+        return _laplace(some, width, np.zeros(width.size)) + _log_chance(one, plain)
 
-    constant = log_evidence("") + HOPELESS
-    return [name for name in best if log_evidence(name) > constant]
+    constant = log_evidence(CONSTANT) + HOPELESS
+    return {one: more for one, more in best.items() if log_evidence(one) > constant}
 
 
-def _log_chance(name: str, law: Expansion, count: int) -> float:
+def _log_chance(one: Alternative, law: Expansion) -> float:
     """Log prior probability; the time of a sudden loss is any interval between readings."""
-    where = count * math.log(law.pieces.time.size - 1) if name.startswith("sudden") else 0.0
-    return math.log(CHANCES[name]) - where
+    intervals = law.pieces.time.size - 1 if one.kind == "sudden" else 1
+    return math.log(one.chance) - one.count * math.log(intervals)
 
 
-def _widths(name: str, sizes: np.ndarray, times: np.ndarray, loss: float) -> np.ndarray:
+def _widths(kind: str, sizes: np.ndarray, times: np.ndarray, loss: float) -> np.ndarray:
     """Widths of normal priors on sizes and times of further losses that have the density of flat
     ones there: what is not determined costs nothing.
     """
     sizes = np.maximum(np.abs(sizes), SIZES[0] * abs(loss))
-    gas = name == "relaxing"
+    gas = kind == "relaxing"
     times = times * math.log(TIMES[1] / TIMES[0]) if gas else np.ones(times.size)
     return np.array([2 * sizes * math.log(SIZES[1] / SIZES[0]), times]) / math.sqrt(2 * math.pi)
 
@@ -431,8 +441,8 @@ def _smooth(plain: Expansion) -> float:
         width = (BELOW + ABOVE) / 2
         laws.append(solved(plain.pieces, (*PLAIN, POWER, FURTHER), "drift", start=start,
                            widths={POWER: width, FURTHER: DRIFT * gas}))  # fmt: skip
-    named = zip(laws, ("", "power", "drift"), strict=False)
-    return float(logsumexp([_log_evidence(law, name) for law, name in named if law.rested]))
+    each = zip(laws, (CONSTANT, POWERED, DRIFTING), strict=False)
+    return float(logsumexp([_log_evidence(law, one) for law, one in each if law.rested]))
 
 
 class _Further(NamedTuple):
@@ -481,11 +491,11 @@ def _with_further(plain: Expansion, more: _Further) -> Expansion | None:
     return law if law.rested and known else None
 
 
-def _log_evidence(law: Expansion, name: str) -> float:
+def _log_evidence(law: Expansion, one: Alternative) -> float:
     """Logarithm of the probability of the readings, the noise averaged over, up to a constant: also
     if the loss rate goes by a random walk besides, in linear approximation.
     """
-    columns, width, centre = _given(law, name)
+    columns, width, centre = _given(law, one)
     walk = _walked(law) if law.pieces.gauge is None else np.zeros((law.residuals.size, 0))
     rows = np.column_stack([law.residuals, law.rows[:, columns], walk])
     products = Products.of(rows, law.pieces.time, law.pieces.error is not None)
@@ -494,8 +504,7 @@ def _log_evidence(law: Expansion, name: str) -> float:
     for share in WALKS if every.size else ():
         wanders = _laplace(products, np.append(width, share * every), np.append(centre, 0 * every))
         found.append(wanders + math.log(WANDERS / SMOOTH / len(WALKS)))
-    count = (law.numbers.size - len(PLAIN) - 1) // 2
-    return float(logsumexp(found)) + _log_chance(name, law, count)
+    return float(logsumexp(found)) + _log_chance(one, law)
 
 
 def _walked(law: Expansion) -> np.ndarray:
@@ -505,21 +514,21 @@ def _walked(law: Expansion) -> np.ndarray:
     return -law.numbers[0] * model[:, None] * walk
 
 
-def _given(law: Expansion, name: str) -> tuple[list[int], np.ndarray, np.ndarray]:
+def _given(law: Expansion, one: Alternative) -> tuple[list[int], np.ndarray, np.ndarray]:
     """Columns of the numbers of an alternative, widths of their priors, and how far the numbers
     are from the middle of these.
     """
     loss, quadratic, power, *further = law.numbers
     extra: dict[int, float] = {}
-    if name in ("power", "drift"):
+    if one.power:
         extra[POWER] = BELOW if power < 0 else ABOVE
-    if name == "drift":
+    if one.kind == "drift":
         extra[FURTHER] = DRIFT * max(abs(loss - quadratic), 1e-300)
     flat: dict[int, float] = {}
-    if further and name != "drift":
-        sizes, times = _widths(name, np.array(further[::2]), np.array(further[1::2]), loss)
+    if one.count:
+        sizes, times = _widths(one.kind, np.array(further[::2]), np.array(further[1::2]), loss)
         flat = {FURTHER + 2 * k: size for k, size in enumerate(sizes)}
-        if not name.startswith("sudden"):
+        if one.kind != "sudden":
             flat |= {WHEN + 2 * k: time for k, time in enumerate(times)}
     extra |= flat
     known = [0.0 if column in flat else law.numbers[column - 1] for column in extra]
