@@ -611,11 +611,16 @@ class DrawnLaw(NamedTuple):
         peaks = Peaks(*(part[..., kept, :] for part in found[:3]), found.numbers)
         return cls(seen.of_noises(kept), peaks, tuple(free))
 
+    @property
+    def is_pumped(self) -> bool:
+        """True if the gas is pumped away after a fill."""
+        return PACE in self.free
+
     def _log_prior(self, numbers: Numbers) -> np.ndarray:
         free, (low, high) = self.free, self.seen.share
         inside = (numbers.share >= low) & (numbers.share <= high)
         log = np.where(inside, -math.log(high - low), -np.inf)
-        if PACE in free:
+        if self.is_pumped:
             return log + log_pumped(numbers.share, numbers.gas, numbers.pace)
         log = log if self.seen.walk is None else log + LOG_WANDERS
         log = log + log_prior(numbers.power)[0] if POWER in free else log
@@ -634,7 +639,7 @@ class DrawnLaw(NamedTuple):
         (rows, places), numbers = _rows(free), peaks.numbers[:, at]
         even, far = _even(draws, len(rows), seed), np.full(draws, np.inf)
         own, log = _between(even, -far, far)
-        if PACE in free:  # gas that is pumped away gets less
+        if self.is_pumped:  # gas gets less
             own[-1], log[-1] = _between(even[-1], -far, -centre[-1] * lower[-1, -1])
         numbers[rows] = centre + _backward(lower, own)
         named = Numbers.of(numbers)  # the bend is found after the rate and the change
@@ -850,8 +855,10 @@ def free_law(record: DecayRecord, values: Physical) -> FreeLaw | None:
     True
     """
     seen = SeenDecay.of(record, values)
-    laws = drawn(proposals(seen))
-    draws, smooth = mixed(laws), mixed(laws[::2])  # the second is gas that is pumped away
+    proposed = proposals(seen)
+    laws = list(zip(proposed, drawn(proposed), strict=True))
+    draws = mixed([own for _, own in laws])
+    smooth = mixed([own for law, own in laws if not law.is_pumped])
     if not np.isfinite(smooth.log) or draws.worth < LEAST_WORTH:
         return None
     plain = DrawnLaw.of(seen, CONSTANT).weighed(FEW)
@@ -865,8 +872,9 @@ def free_law(record: DecayRecord, values: Physical) -> FreeLaw | None:
     power, drift = smooth.numbers.power, smooth.numbers.drift if seen.drifts else None
     power, drift = (v if v is None else quantity_of(v, smooth.weight, "1") for v in (power, drift))
     constant = float(expit(plain.log - draws.log))
-    chances = [math.exp(law.log - draws.log) for law in laws[1:]]
-    pumped, wanders = [*chances, 0.0, 0.0][:2]
+    chances = [(law, math.exp(own.log - draws.log)) for law, own in laws]
+    pumped = sum((chance for law, chance in chances if law.is_pumped), 0.0)
+    wanders = sum((chance for law, chance in chances if law.seen.walk is not None), 0.0)
     nodes = record.mean_current * draws.currents @ draws.weight
     share = quantity_of(draws.numbers.share, draws.weight, "1")
     return FreeLaw(found, share, power, drift, constant, odd, pumped, wanders, nodes, record.span)
