@@ -36,17 +36,12 @@ from beamfit.noise.sizes import (
 )
 
 # What scans turn out to be, before their sizes are seen: most are scans of a beam.
-MODELS = {
-    "beam": 0.85,
-    "beam of no emittance": 0.03,
-    "one constant size": 0.03,
-    "sizes at random": 0.04,
-    "sizes that drift": 0.02,
-    "a smooth curve that is no beam's": 0.03,
-}
 BEAM, FLAT = "beam", "beam of no emittance"
+CONSTANT, RANDOM, DRIFTING = "one constant size", "sizes at random", "sizes that drift"
+CURVE = "a smooth curve that is no beam's"
+MODELS = {BEAM: 0.85, FLAT: 0.03, CONSTANT: 0.03, RANDOM: 0.04, DRIFTING: 0.02, CURVE: 0.03}
 # Of rows that moved no magnet only a beam and sizes at random are possible.
-UNMOVED = {BEAM: 0.9, FLAT: 0.05, "sizes at random": 0.05}
+UNMOVED = {BEAM: 0.9, FLAT: 0.05, RANDOM: 0.05}
 # Models are told apart by at most so many points, evenly among all: the beam by every one.
 COMPARED = 100
 # Planes that are looked at in one call, and rounds of the best fit and when it rests.

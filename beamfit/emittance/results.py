@@ -275,15 +275,19 @@ class PlaneFit:
         return found | at_screen | {"rms_residual": self.rms_residual}
 
     @property
+    def words(self) -> str:
+        """The normalised emittance, or its interval where only that is known, in words."""
+        if self.status is not Status.unidentified:
+            return f"normalised emittance {self.normalized_emittance}"
+        known = self.normalized_emittance.interval_95 is not None
+        return f"normalised emittance {_interval(self)} (95 %)" if known else ""
+
+    @property
     def headline(self) -> str:
         """The plane, its status and its emittance in a line."""
-        status = cell(self.status)
-        if self.status is Status.unidentified:
-            limit = self.normalized_emittance.interval_95
-            known = f": normalised emittance {_interval(self)} (95 %)" if limit else ""
-            return f"{self.plane} {status}{known}"
-        holds = "" if self.emittance.error is None else f" ({self.holds})"
-        return f"{self.plane} {status}: normalised emittance {self.normalized_emittance}{holds}"
+        words = f": {self.words}" if self.words else ""
+        said = self.status is not Status.unidentified and self.emittance.error is not None
+        return f"{self.plane} {cell(self.status)}{words}{f' ({self.holds})' if said else ''}"
 
     def tables(self) -> tuple[Table, ...]:
         """All numbers, to be shown."""

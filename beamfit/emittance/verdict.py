@@ -9,7 +9,16 @@ from functools import cached_property
 
 import numpy as np
 
-from beamfit.emittance.comparison import BEAM, FLAT, PlanePosterior, PlaneSizes
+from beamfit.emittance.comparison import (
+    BEAM,
+    CONSTANT,
+    CURVE,
+    DRIFTING,
+    FLAT,
+    RANDOM,
+    PlanePosterior,
+    PlaneSizes,
+)
 from beamfit.emittance.results import Points
 from beamfit.errors import Finding, Status
 from beamfit.quantity import display_unit
@@ -27,12 +36,10 @@ MOST_NAMED = 5
 # What to check where a rival explains the sizes.
 REMEDIES = {
     FLAT: "The smallest sizes decide: measure over the waist, and check resolution_um.",
-    "one constant size": (
-        "Check that the magnet moved and that the screen shows the beam, and scan further."
-    ),
-    "sizes at random": "Check settings, units, energy and screen, or measure more settings.",
-    "sizes that drift": "Check that the beam was stable while the scan was taken.",
-    "a smooth curve that is no beam's": (
+    CONSTANT: ("Check that the magnet moved and that the screen shows the beam, and scan further."),
+    RANDOM: "Check settings, units, energy and screen, or measure more settings.",
+    DRIFTING: "Check that the beam was stable while the scan was taken.",
+    CURVE: (
         "Check the line, the settings' units, and how sizes are taken from the profile "
         "(saturation, background, cut edges)."
     ),
@@ -120,7 +127,7 @@ def verdict(e: PlaneEvidence, remarks: str = "", advice: str = "") -> Finding:
     if e.determined:
         return Finding(Status.converged, f"{_determined(e)} {remarks}".strip())
     post, status = e.posterior, Status.unidentified
-    if post.cause.startswith("a smooth curve") and post.probability[post.cause] > SURE:
+    if post.cause == CURVE and post.probability[CURVE] > SURE:
         status = Status.poor_fit
     where = f" in scenario {e.scenario}" if e.scenario else ""
     said = f"Not determined{where}: {_open(e)}."

@@ -31,7 +31,6 @@ from beamfit.report.scan_pictures import (
     has_ellipses,
     scan_picture,
     source_of,
-    words_of,
 )
 
 ERRORS = (
@@ -76,7 +75,7 @@ def emittance_page(fit: EmittanceFit, methods: tuple[SizeMethods, ...] = ()) -> 
     return ReportPage(
         title=f"Emittance of {scan.name}",
         subtitle=f"{len(scan)} settings on line {line.name}, {energy}",
-        verdicts=[Verdict(p.status, f"{p.plane}: {words_of(p)}", p.message) for p in fit.planes],
+        verdicts=[Verdict(p.status, f"{p.plane}: {p.words}", p.message) for p in fit.planes],
         tables=tables + about_input(fit.notes),
         pictures=_pictures(fit),
         pictures_title="Phase space" if not fit.scan.profiles else "Profiles and phase space",
@@ -228,7 +227,7 @@ def _verdicts(fits: SliceFits) -> Iterator[Verdict]:
     """Verdict of each slice, those that say the same together."""
     for (plane, status, message), same in fits.alike().items():
         answers = list(same.values())
-        words = words_of(answers[0])
+        words = answers[0].words
         if len(same) > 1:
             words = "normalised emittance not determined"
             values = [p.normalized_emittance for p in answers]

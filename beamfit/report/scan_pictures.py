@@ -89,7 +89,7 @@ def draw_scan(figure: FigureBase, fit: EmittanceFit, plane: str, letters: int = 
         style = {"ms": 14, "mew": 2, "color": COLOUR[plane], "alpha": 0.6}
         above.plot(at, 1e6 * p.points.model, "_", label="fit", **style)
     above.legend(frameon=False, loc="best", fontsize=8)
-    title = f"{plane} plane: {words_of(p).removesuffix(' (statistics only)')}"
+    title = f"{plane} plane: {p.words}"
     above.set_title(fill(title, letters), fontsize=9.5)
     above.set(ylabel="rms size, µm", ylim=(0.0, None))
     _residuals(below, p)
@@ -125,11 +125,6 @@ def _residuals(axes: Axes, p: PlaneFit) -> None:
     finite = np.abs(p.points.pull[np.isfinite(p.points.pull)])
     reach = max(3.0, 1.15 * float(finite.max(initial=0.0)))
     axes.set(xlabel=words, ylabel="residual,\nstd. errors", ylim=(-reach, reach))
-
-
-def words_of(p: PlaneFit) -> str:
-    """The answer of a plane, as a heading."""
-    return p.headline.partition(": ")[2]
 
 
 def _varied(p: PlaneFit) -> list[str]:

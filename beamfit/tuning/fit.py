@@ -13,7 +13,7 @@ import numpy as np
 from scipy.special import expit
 
 from beamfit.answer import Table, answer, cell, json_of
-from beamfit.emittance.comparison import BEAM, MODELS
+from beamfit.emittance.comparison import BEAM, CONSTANT, MODELS, RANDOM
 from beamfit.emittance.results import in_words
 from beamfit.emittance.scan import KNOB, QuadScan
 from beamfit.emittance.statement import PreparedScan, varied_magnets
@@ -51,7 +51,7 @@ DRAWS = 256
 # accepted as within the goal of the minimum.
 TOLD = 0.05
 # Odds, before the sizes are seen, that they are of no beam: as of scans.
-NO_BEAM = (MODELS["sizes at random"] + MODELS["one constant size"]) / MODELS[BEAM]
+NO_BEAM = (MODELS[RANDOM] + MODELS[CONSTANT]) / MODELS[BEAM]
 # Half ranges within which a minimum is on the limit.
 EDGE = 1e-6
 
@@ -425,7 +425,7 @@ def _no_beam(fit: TuningFit) -> Finding | None:
     if fit.of_a_beam > SURE:
         return None
     cause = f"The sizes are of no beam through this line ({percent(1.0 - fit.of_a_beam)})."
-    return Finding(Status.unidentified, cause, REMEDIES["sizes at random"])
+    return Finding(Status.unidentified, cause, REMEDIES[RANDOM])
 
 
 def _flat(fit: TuningFit) -> Finding | None:
