@@ -315,7 +315,8 @@ class Decay:
             rows = [cycles[0].start, cycles[-1].start + cycles[-1].span] - np.array(self.offset)
             within = slice(*np.searchsorted(self.segment.time, rows))
             segment = self.segment.select(within, name)
-            found.append(Decay.of(segment, cycles[0].start, fit_pieces(cycles, name), machine))
+            own = fit_pieces(cycles, name, found=True)
+            found.append(Decay.of(segment, cycles[0].start, own, machine))
         return found
 
     @cached_property
