@@ -36,12 +36,12 @@ from beamfit.lifetime.free_law import (
     DRIFT,
     ENDS,
     ENOUGH,
+    HALF_WALK,
     INTEGRAL,
     OUTGASSING,
     SIZES,
     SMOOTH,
     TIMES,
-    WALK,
     WALKS,
     WANDERS,
     from_nodes,
@@ -509,7 +509,7 @@ def _log_evidence(law: Expansion, one: Alternative) -> float:
 
 def _walked(law: Expansion) -> np.ndarray:
     """Slopes of the residuals by a random walk of the loss rate, shape (n, 14)."""
-    walk = from_nodes(law.pieces.time / law.pieces.units[0]) @ INTEGRAL @ WALK
+    walk = from_nodes(law.pieces.time / law.pieces.units[0]) @ INTEGRAL @ HALF_WALK
     model = law.pieces.current / law.pieces.over + law.residuals
     return -law.numbers[0] * model[:, None] * walk
 

@@ -63,8 +63,8 @@ INTEGRAL = chebvander(ANGLE, NODES) @ chebint(FROM_NODES, lbnd=-1) / 2
 # A random walk about its mean at the nodes: a half of its covariance, min(s, t) less the means over
 # s, over t and over both.
 _PART = NODE - NODE**2 / 2
-WALK = np.minimum.outer(NODE, NODE) - np.add.outer(_PART, _PART) + 1 / 3
-WALK = np.linalg.cholesky(WALK + 1e-12 * np.eye(NODES))
+_COVARIANCE = np.minimum.outer(NODE, NODE) - np.add.outer(_PART, _PART) + 1 / 3
+HALF_WALK = np.linalg.cholesky(_COVARIANCE + 1e-12 * np.eye(NODES))
 
 
 def from_nodes(s: np.ndarray) -> np.ndarray:
@@ -186,11 +186,11 @@ def log_straight(change):
 
 def log_walk(walk, xp=np):
     """Log density of a walk at the nodes, with the odds of there being any."""
-    squares = xp.sum((np.linalg.inv(WALK) @ walk) ** 2)
+    squares = xp.sum((np.linalg.inv(HALF_WALK) @ walk) ** 2)
     widths = np.log(WALKS)
     log = -0.5 * squares * xp.exp(-2 * widths) - NODES * widths
     log = xp.log(xp.mean(xp.exp(log - xp.max(log)))) + xp.max(log)
-    log = log - 0.5 * NODES * math.log(2 * math.pi) - np.log(np.diag(WALK)).sum()
+    log = log - 0.5 * NODES * math.log(2 * math.pi) - np.log(np.diag(HALF_WALK)).sum()
     return xp.where(squares > 0, log + LOG_WANDERS, 0.0)
 
 
@@ -346,7 +346,7 @@ class SeenDecay:
         least, best = self.likely()
         near = best > best.max() - BESIDE
         some, unit = self.of_noises(near), np.sqrt(self.products.variance(least[near], NODES))
-        size = np.outer(WALKS, 1 / np.maximum(unit, QUIET)).ravel()[:, None, None] * WALK
+        size = np.outer(WALKS, 1 / np.maximum(unit, QUIET)).ravel()[:, None, None] * HALF_WALK
         columns = -np.exp(self.start[1, 0]) * self.origin * (INTEGRAL @ size)
         matrix = np.tile(some.products.matrix, (len(WALKS), 1, 1))
         known = LEAST_LEFT * np.einsum("kpp->kp", matrix)[..., None] * np.eye(NODES + 1)

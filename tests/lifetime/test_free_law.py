@@ -13,9 +13,9 @@ from beamfit.lifetime.expansion import Pieces, solved
 from beamfit.lifetime.fit import fit_cycles, fit_decay, fit_decays
 from beamfit.lifetime.free_law import (
     CONSTANT,
+    HALF_WALK,
     INTEGRAL,
     NODE,
-    WALK,
     DrawnLaw,
     Numbers,
     SeenDecay,
@@ -110,7 +110,7 @@ def test_a_walk_at_the_nodes_is_a_random_walk_about_its_mean():
     steps = np.random.default_rng(0).normal(size=(40_000, 1000)) / np.sqrt(1000)
     walks = np.cumsum(steps, axis=1)
     walks = (walks - walks.mean(axis=1, keepdims=True))[:, (NODE * 999).round().astype(int)]
-    np.testing.assert_allclose(WALK @ WALK.T, walks.T @ walks / len(walks), atol=0.01)
+    np.testing.assert_allclose(HALF_WALK @ HALF_WALK.T, walks.T @ walks / len(walks), atol=0.01)
 
 
 def test_a_walk_is_averaged_over_in_closed_form():
@@ -123,7 +123,7 @@ def test_a_walk_is_averaged_over_in_closed_form():
     sees = np.polynomial.chebyshev.chebvander(2 * one.time / one.span - 1, 13)
     sees = sees @ np.linalg.inv(np.polynomial.chebyshev.chebvander(2 * NODE - 1, 13))
     rows = one.current / one.mean_current - sees @ white.origin[:, 0]
-    taken = -np.exp(white.start[1, 0]) * sees @ (white.origin * (INTEGRAL @ WALK))
+    taken = -np.exp(white.start[1, 0]) * sees @ (white.origin * (INTEGRAL @ HALF_WALK))
     for place, share in enumerate((0.003, 0.015, 0.07, 0.3)):
         covariance = np.eye(40) + (share / noise) ** 2 * taken @ taken.T
         squares = rows @ np.linalg.solve(covariance, rows)
