@@ -375,8 +375,9 @@ def groups_of(
 
     Notes
     -----
-    A guess s0 worth ν0 degrees of freedom makes the variance (ν0 s0² + χ²)/(ν0 + dof): a scaled
-    inverse χ² prior, A. Gelman et al., Bayesian Data Analysis (3rd ed., 2013), section 2.6.
+    Errors that are guessed, worth ν0 degrees of freedom, make the variance (ν0 + χ²)/(ν0 + dof) in
+    their units: a scaled inverse χ² prior, A. Gelman et al., Bayesian Data Analysis (3rd ed.,
+    2013), section 2.6.
     """
     found, first, whole = [], 0, sum(block.shape[0] for block in blocks)
     for record, r, block in zip(records, residuals, blocks, strict=False):
@@ -384,8 +385,8 @@ def groups_of(
         # The trace over all rows is their rank.
         hat = seen.rank if block.shape[0] == whole else seen.trace(block)
         dof = round(count - hat, 9)
-        freedom, squares = record.prior_noise
-        scale = math.sqrt((squares + chi2) / (freedom + dof)) if dof > 0 else math.nan
+        guess = record.prior_freedom
+        scale = math.sqrt((guess + chi2) / (guess + dof)) if dof > 0 else math.nan
         scale = max(1.0, scale) if record.errors_given else scale
         rows = slice(first, first := first + len(r))
         found.append(Group(record.name, rows, record.errors_given, chi2, count, dof, scale))

@@ -108,8 +108,6 @@ class Statement(NamedTuple):
         first shape of the proposals.
     trusted : sequence of str
         Records whose errors are right, whatever the residuals show: anchors of a model.
-    noise_unit : str
-        Of the errors of records that came without.
     priors_own, hidden : sequence of str
         Numbers that the prior decides, and those nobody asks for.
     remark : str
@@ -132,7 +130,6 @@ class Statement(NamedTuple):
     labels: Mapping[str, str] = {}
     averaged: Sequence[str] = ()
     trusted: Sequence[str] = ()
-    noise_unit: str = "1"
     priors_own: Sequence[str] = ()
     hidden: Sequence[str] = ()
     remark: str = ""
@@ -172,8 +169,6 @@ def _law(own, log_volume, derive, build) -> tuple[PosteriorLaw, Callable]:
         """Priors and further objectives, and -inf where a bound or constraint is broken."""
         model, core = model_of(data, moved), data.core
         value = log_volume(model, data.more)
-        for record in core.records:
-            value += record.log_volume(model)
         for prior in core.priors:
             value -= 0.5 * jnp.sum(prior.residual(model) ** 2)
         for objective in core.objectives:
@@ -261,7 +256,6 @@ def target_of(
         groups=_groups(p, optimum, stated, noise, outliers),
         noise=noise_found,
         counts=tuple(record.used for record in p.records),
-        noise_unit="1" if any(optimum.given) else stated.noise_unit,
         priors=priors,
         derived=stated.derived,
         observed=_observed(p),
@@ -381,7 +375,7 @@ def _groups(
         if record.name in stated.averaged:
             kind = "averaged"
         doubted = outliers and not trusted and kind != "averaged"
-        groups.append(NoiseGroup(label, kind, doubted, record.prior_noise))
+        groups.append(NoiseGroup(label, kind, doubted, record.prior_freedom))
     return tuple(groups) or (NoiseGroup("", noise or "known", outliers),)
 
 

@@ -19,7 +19,6 @@ import numpy as np
 
 from beamfit.errors import InputError
 from beamfit.greybox import tree
-from beamfit.noise.memory import log_volume, whitened
 
 # Default tolerance on limits and on the conditions of an optimum, in sizes.
 TOLERANCE = 1e-6
@@ -65,7 +64,7 @@ class Free(NamedTuple):
     labels: tuple[str, ...] | None = None
 
 
-@tree.node("name", "predict", "worth", "apart")
+@tree.node("name", "predict", "worth")
 class Record:
     """Measured data and the function that predicts them.
 
@@ -90,13 +89,6 @@ class Record:
     worth : float
         Degrees of freedom that `error` is worth: infinite where it is known; a few where it rests
         on a guess, which the residuals correct.
-    guess : float
-        That guess in units of `error`.
-    apart : callable, optional
-        ``apart(model, data)``, shape (values - 1,), for errors with a memory: the time between
-        neighbouring values over the correlation time of their errors. Residuals are then those of
-        independent errors (`beamfit.noise.memory.whitened`). A sampler may vary the
-        correlation time; a search takes it as fixed. Such a record has no padding.
 
     Raises
     ------
@@ -111,8 +103,6 @@ class Record:
     error: Any = None
     weight: Any = 1.0
     worth: float = np.inf
-    guess: Any = 1.0
-    apart: Callable[[Any, Any], jax.Array] | None = None
 
     def __post_init__(self):
         measured = np.asarray(self.measured, float)
@@ -136,15 +126,10 @@ class Record:
         object.__setattr__(self, "error", None if error is None else jnp.asarray(error))
 
     def residual(self, model: Any) -> jax.Array:
-        """Weighted residuals (predicted - measured)/error as a flat vector, whitened."""
+        """Weighted residuals (predicted - measured)/error as a flat vector."""
         scale = 1.0 if self.error is None else self.error
         difference = (self.predict(model, self.data) - self.measured) / scale
-        rows = jnp.ravel(jnp.where(self.weight > 0, jnp.sqrt(self.weight) * difference, 0.0))
-        return rows if self.apart is None else whitened(rows, self.apart(model, self.data))
-
-    def log_volume(self, model: Any) -> jax.Array:
-        """Logarithm of the density's factor from whitening."""
-        return jnp.zeros(()) if self.apart is None else log_volume(self.apart(model, self.data))
+        return jnp.ravel(jnp.where(self.weight > 0, jnp.sqrt(self.weight) * difference, 0.0))
 
     @property
     def errors_given(self) -> bool:
@@ -152,11 +137,9 @@ class Record:
         return self.error is not None and np.isinf(self.worth)
 
     @property
-    def prior_noise(self) -> tuple[float, float]:
-        """The guess at errors that are not known: degrees of freedom and its sum of squares."""
-        if self.error is None or self.errors_given:
-            return 0.0, 0.0
-        return self.worth, self.worth * float(self.guess) ** 2
+    def prior_freedom(self) -> float:
+        """Degrees of freedom that a guess at the errors is worth; 0 where they are known."""
+        return 0.0 if self.error is None or self.errors_given else self.worth
 
     @property
     def used(self) -> np.ndarray:
