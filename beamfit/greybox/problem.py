@@ -456,7 +456,7 @@ class Problem:
     @cached_property
     def residual_count(self) -> int:
         """Number of residuals, those of priors included."""
-        return self.size + sum(shape_of(p.residual, self.core.model)[0] for p in self.priors)
+        return self.size + sum(shape_of(Prior.residual, p, self.core.model)[0] for p in self.priors)
 
     @cached_property
     def least_residual(self) -> float:
@@ -588,5 +588,5 @@ def _check_shapes(problem: Problem) -> None:
                     f"a number or the shape of the measured values, {record.measured.shape}",
                 )
     for prior in problem.priors:
-        jax.eval_shape(prior.residual, problem.core.model)
+        shape_of(Prior.residual, prior, problem.core.model)
     _ = (problem.lower, problem.upper, problem.constraint_lower, problem.constraint_upper)
