@@ -486,7 +486,7 @@ class Problem:
     @cached_property
     def _flat(self) -> tuple[list[jax.Array], jax.tree_util.PyTreeDef]:
         leaves, structure = jax.tree_util.tree_flatten(self.core)
-        return [jnp.asarray(leaf) for leaf in leaves], structure
+        return [x if isinstance(x, jax.Array) else jnp.asarray(x) for x in leaves], structure
 
     def model_at(self, theta) -> Any:
         """The model with the free numbers set to theta."""

@@ -249,15 +249,15 @@ def solve_document(
 def _started(made: Formulation) -> tuple[Formulation, tuple[str, ...]]:
     """The problem at its first start that is finite, drawn again from the same seeds if need be."""
     p, variables = made.problem, made.document.problem.variables
+    if slopes(p, p.start).finite:
+        return made, ()
+    cause = _cause(made, p.core.model)
     drawn = any(v.random for v in variables)
-    for draws, model in enumerate(islice(starts_of(made), MOST_DRAWS if drawn else 1)):
+    for draws, model in enumerate(islice(starts_of(made), 1, MOST_DRAWS if drawn else 1), 1):
         if slopes(p, np.concatenate([np.ravel(model[v.model]) for v in variables])).finite:
-            if draws == 0:
-                return made, ()
             times = "once" if draws == 1 else f"{draws} times"
-            said = f"At the start of the seeds {_cause(made, next(starts_of(made)))}"
+            said = f"At the start of the seeds {cause}"
             return at_start(made, model), (f"{said}; drawn again from the same seeds, {times}.",)
-    cause = _cause(made, next(starts_of(made)))
     return made, (f"At the start {cause}.",) if cause else ()
 
 
