@@ -22,6 +22,8 @@ from beamfit.greybox import tree
 
 # Default tolerance on limits and on the conditions of an optimum, in sizes.
 TOLERANCE = 1e-6
+# Numbers up to which an array is handed over with every call: JAX takes longer to make it its own.
+SMALL = 1000
 # Shortest padded record; lengths are powers of two, so that records share compiled code.
 SHORTEST = 8
 
@@ -121,9 +123,9 @@ class Record:
         weight = np.asarray(self.weight, float)
         if not (np.all(np.isfinite(weight)) and np.all(weight >= 0) and np.any(weight > 0)):
             raise InputError(f"weight {weight} of '{self.name}'", "positive weights, 0 for padding")
-        object.__setattr__(self, "weight", jnp.asarray(weight))
-        object.__setattr__(self, "measured", jnp.asarray(measured))
-        object.__setattr__(self, "error", None if error is None else jnp.asarray(error))
+        object.__setattr__(self, "weight", weight)
+        object.__setattr__(self, "measured", measured)
+        object.__setattr__(self, "error", error)
 
     def residual(self, model: Any) -> jax.Array:
         """Weighted residuals (predicted - measured)/error as a flat vector."""
@@ -241,7 +243,7 @@ def _compiled(function: Callable, structure: jax.tree_util.PyTreeDef) -> Callabl
 def compiled_at(function: Callable, core: Core) -> Callable:
     """A function of (core, theta, ...) as a compiled function of (theta, ...) at any core."""
     leaves, structure = jax.tree_util.tree_flatten(core)
-    return partial(_compiled(function, structure), [jnp.asarray(leaf) for leaf in leaves])
+    return partial(_compiled(function, structure), leaves)
 
 
 def _model_at(core: Core, theta: jax.Array) -> Any:
@@ -486,7 +488,8 @@ class Problem:
     @cached_property
     def _flat(self) -> tuple[list[jax.Array], jax.tree_util.PyTreeDef]:
         leaves, structure = jax.tree_util.tree_flatten(self.core)
-        return [x if isinstance(x, jax.Array) else jnp.asarray(x) for x in leaves], structure
+        found = [jnp.asarray(x) if np.size(x) > SMALL else np.asarray(x) for x in leaves]
+        return found, structure
 
     def model_at(self, theta) -> Any:
         """The model with the free numbers set to theta."""
@@ -549,11 +552,11 @@ class Problem:
         return np.concatenate(parts)
 
 
-def _number(value: Any) -> jax.Array:
-    """An array of floats; NumPy converts twenty times as fast as JAX."""
-    if isinstance(value, jax.Array):
-        return jnp.asarray(value, float)
-    return jnp.asarray(np.asarray(value, float))
+def _number(value: Any) -> np.ndarray:
+    """An array of floats; a small one is handed to a compiled call in less time than JAX takes to
+    make it its own.
+    """
+    return np.asarray(value, float)
 
 
 _GROUPS = ("records", "priors", "constraints", "objectives")
