@@ -234,16 +234,37 @@ class Core:
     objectives: tuple[Objective, ...]
 
 
+class FlatCore(NamedTuple):
+    """The arrays of a core, each once, and where they stand among the leaves of its structure.
+
+    What two parts compute of the same arrays, a compiled function computes once.
+    """
+
+    arrays: list[Any]
+    places: tuple[int, ...]
+    structure: jax.tree_util.PyTreeDef
+
+    @classmethod
+    def of(cls, core: Core) -> FlatCore:
+        """Flatten a core."""
+        leaves, structure = jax.tree_util.tree_flatten(core)
+        keys = [id(x) if np.ndim(x) else -i for i, x in enumerate(leaves)]
+        once = dict(zip(keys, leaves, strict=True))
+        order = {key: i for i, key in enumerate(once)}
+        arrays = [jnp.asarray(x) if np.size(x) > SMALL else np.asarray(x) for x in once.values()]
+        return cls(arrays, tuple(order[key] for key in keys), structure)
+
+    def compiled(self, function: Callable) -> Callable:
+        """A function of (core, theta, ...) as a compiled function of (theta, ...)."""
+        return partial(_compiled(function, self.places, self.structure), self.arrays)
+
+
 @lru_cache(maxsize=256)
-def _compiled(function: Callable, structure: jax.tree_util.PyTreeDef) -> Callable:
-    """A function of (core, theta, ...), compiled to take the leaves of the core instead."""
-    return jax.jit(lambda leaves, *rest: function(structure.unflatten(leaves), *rest))
+def _compiled(function: Callable, places: tuple[int, ...], structure) -> Callable:
+    def at(arrays, *rest):
+        return function(structure.unflatten([arrays[i] for i in places]), *rest)
 
-
-def compiled_at(function: Callable, core: Core) -> Callable:
-    """A function of (core, theta, ...) as a compiled function of (theta, ...) at any core."""
-    leaves, structure = jax.tree_util.tree_flatten(core)
-    return partial(_compiled(function, structure), leaves)
+    return jax.jit(at)
 
 
 def _model_at(core: Core, theta: jax.Array) -> Any:
@@ -482,14 +503,11 @@ class Problem:
         Compiled once for each structure of problem. A search calls it a thousand times, and walking
         the tree of the core for every call takes longer than the numbers of a small network.
         """
-        leaves, structure = self._flat
-        return partial(_compiled(function, structure), leaves)
+        return self._flat.compiled(function)
 
     @cached_property
-    def _flat(self) -> tuple[list[jax.Array], jax.tree_util.PyTreeDef]:
-        leaves, structure = jax.tree_util.tree_flatten(self.core)
-        found = [jnp.asarray(x) if np.size(x) > SMALL else np.asarray(x) for x in leaves]
-        return found, structure
+    def _flat(self) -> FlatCore:
+        return FlatCore.of(self.core)
 
     def model_at(self, theta) -> Any:
         """The model with the free numbers set to theta."""
