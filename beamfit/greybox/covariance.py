@@ -18,13 +18,12 @@ from scipy import sparse
 
 from beamfit.greybox.problem import Record
 from beamfit.greybox.sparse import Factor, Rows, in_units, lengths, with_diagonal
+from beamfit.noise.correlated import CUT
 
 # Free numbers up to which all is dense, by orthogonal factors and singular values.
 FEW = 200
 # A quantity counts as determined while bounds carry less than this share of its variance.
 MOST_SHARE = 0.5
-# A direction is determined if its singular value exceeds this share of the largest: 1e6 roundings.
-CUT = 1e-10
 # A quantity moves along an open direction if more than this share of its terms remains.
 PART = 1e-6
 # Standard deviation of an undetermined direction, in units of the best determined one.

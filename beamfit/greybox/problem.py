@@ -24,19 +24,6 @@ from beamfit.greybox import tree
 TOLERANCE = 1e-6
 # Numbers up to which an array is handed over with every call: JAX takes longer to make it its own.
 SMALL = 1000
-# Shortest padded record; lengths are powers of two, so that records share compiled code.
-SHORTEST = 8
-
-
-def padded_length(n: int) -> int:
-    """The length to pad a record of n values to, so that a growing one is not compiled anew.
-
-    Examples
-    --------
-    >>> [padded_length(n) for n in (3, 8, 9, 100)]
-    [8, 8, 16, 128]
-    """
-    return max(SHORTEST, 1 << max(n - 1, 0).bit_length())
 
 
 class Free(NamedTuple):
@@ -87,7 +74,7 @@ class Record:
     weight : float or array
         Weight of the record's chi-square among several objectives, or of each value. Values of
         weight 0 are padding and count nowhere, so that records of a few lengths
-        (`beamfit.greybox.problem.padded_length`) share compiled code.
+        (`beamfit.arrays.padded_length`) share compiled code.
     worth : float
         Degrees of freedom that `error` is worth: infinite where it is known; a few where it rests
         on a guess, which the residuals correct.

@@ -4,7 +4,7 @@ from scipy.linalg import cholesky, solve_triangular
 from scipy.signal import lfilter
 from scipy.stats import multivariate_normal
 
-from beamfit.greybox.memory import usual_noises, whitened_by_each
+from beamfit.noise.correlated import usual_noises, whitened_by_each
 from beamfit.noise.memory import (
     CorrelatedNoise,
     is_correlated,

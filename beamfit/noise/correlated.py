@@ -14,8 +14,7 @@ import jax
 import numpy as np
 from scipy.special import logsumexp, stdtr, stdtrit
 
-from beamfit.greybox.covariance import CUT
-from beamfit.greybox.problem import padded_length
+from beamfit.arrays import padded_length
 from beamfit.noise.memory import (
     BESIDE,
     CorrelatedNoise,
@@ -26,6 +25,8 @@ from beamfit.noise.memory import (
 )
 from beamfit.statistics import log_student
 
+# A direction is determined if its singular value exceeds this share of the largest: 1e6 roundings.
+CUT = 1e-10
 # Grid of correlation times: from this share of the median interval to this many records, and count.
 SHORTEST, LONGEST, TIMES = 0.3, 5.0, 20
 # Central 68 %, one standard deviation to either side of a normal distribution, and its upper end.
