@@ -97,9 +97,8 @@ class Statement(NamedTuple):
         else than the sampled numbers.
     units : mapping of str to str
         Of sampled numbers.
-    lower, width : mapping of str to float
-        Lower bounds of sampled numbers instead of the problem's own, and how far from the optimum
-        each may be at most where the data do not say.
+    lower : mapping of str to float
+        Lower bounds of sampled numbers instead of the problem's own.
     labels : mapping of str to str
         What stands for a record before the names of its noise; by default nothing if there is one
         record, else its name.
@@ -126,7 +125,6 @@ class Statement(NamedTuple):
     log_volume: Callable[[Any, Any], jax.Array] = _no_volume
     units: Mapping[str, str] = {}
     lower: Mapping[str, float] = {}
-    width: Mapping[str, float] = {}
     labels: Mapping[str, str] = {}
     averaged: Sequence[str] = ()
     trusted: Sequence[str] = ()
@@ -238,7 +236,7 @@ def target_of(
     data = _data(p, theta, moving, stated)
     slopes = slopes_of(law._replace(residual=with_priors), data, theta[moving])
     noise_found = tuple(scale if scale > 0 else 1.0 for scale in optimum.scales) or (1.0,)
-    width = _widths(upper - lower, names, stated.width, priors)
+    width = _widths(upper - lower, names, priors)
     covariance = covariance_of(slopes, (*noise_found, 1.0), width)
     unseen = np.zeros((len(theta), 0)) if optimum.undetermined is None else optimum.undetermined
     with_prior = np.array([name in priors for name in names])
@@ -349,14 +347,10 @@ def _data(p: Problem, theta: np.ndarray, moving: np.ndarray, stated: Statement) 
 
 
 def _widths(
-    box: np.ndarray,
-    names: Sequence[str],
-    told: Mapping[str, float],
-    priors: Mapping[str, Distribution],
+    box: np.ndarray, names: Sequence[str], priors: Mapping[str, Distribution]
 ) -> np.ndarray:
     """Largest distance of each number from the optimum where the data do not determine it."""
     width = np.where(np.isfinite(box), 0.5 * box, np.inf)
-    width = np.minimum(width, [told.get(name, np.inf) for name in names])
     spread = [float(priors[name].std()) if name in priors else np.inf for name in names]
     return np.minimum(width, spread)
 

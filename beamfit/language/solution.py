@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from beamfit.answer import MOST_ROWS, Table, answer, cell
+from beamfit.answer import Table, answer, cell
 from beamfit.errors import Status
 from beamfit.greybox.assess import slopes
 from beamfit.greybox.diagnosis import diagnose
@@ -19,7 +19,7 @@ from beamfit.greybox.fit import Fit, FittedConstraint, FittedVariable
 from beamfit.greybox.problem import TOLERANCE
 from beamfit.greybox.solve import solve
 from beamfit.language import document as d
-from beamfit.language.compiled import gain_tables, gains_at, outputs_at
+from beamfit.language.compiled import gain_tables, gains_at, limited, outputs_at
 from beamfit.language.problem import Formulation, at_start, formulate, starts_of
 from beamfit.language.trace import cause_of
 from beamfit.quantity import Quantity
@@ -173,10 +173,7 @@ def _limited(c: FittedConstraint) -> list[str]:
 
 def _table(name: str, rows: Sequence, row_of, errors: bool, last="reduced gradient") -> Table:
     header = [name, "value", *["error"] * errors, "lower", "upper", "state", last]
-    more = len(rows) - MOST_ROWS
-    cells = [row_of(row) for row in rows[:MOST_ROWS]]
-    cells += [[f"... and {more} more", *[""] * (len(header) - 1)]] if more > 0 else []
-    return Table("", header, cells, numeric=True)
+    return limited(header, [row_of(row) for row in rows])
 
 
 # ---- solving
