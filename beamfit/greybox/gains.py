@@ -17,7 +17,7 @@ import numpy as np
 
 from beamfit.errors import InputError
 from beamfit.greybox import tree
-from beamfit.greybox.bounds import cells, gain_bounds
+from beamfit.greybox.bounds import cells, over_cells
 from beamfit.greybox.maps import Map, positions
 from beamfit.greybox.problem import Constraint
 
@@ -226,7 +226,7 @@ class _CertifiedGain:
 
     def __call__(self, model: Any, corners: tuple[jax.Array, jax.Array]) -> jax.Array:
         net = part(model, self.path)
-        bound = jax.vmap(lambda a, b: gain_bounds(net, a, b))(*corners)
+        bound = over_cells(net, *corners)
         row = positions([self.output], [port.name for port in net.output_ports], "output")[0]
         column = positions([self.by], net.inputs, "input")[0]
         return getattr(bound, self.end)[:, row, column]
