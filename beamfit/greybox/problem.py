@@ -94,8 +94,8 @@ class Record:
     worth: float = np.inf
 
     def __post_init__(self):
-        measured = np.asarray(self.measured, float)
-        error = None if self.error is None else np.asarray(self.error, float)
+        measured = np.array(self.measured, float)
+        error = None if self.error is None else np.array(self.error, float)
         bad = np.flatnonzero(~np.isfinite(measured))
         if bad.size:
             raise InputError(
@@ -107,7 +107,7 @@ class Record:
                 f"an error of '{self.name}' that is not positive and finite",
                 "one standard deviation of each value",
             )
-        weight = np.asarray(self.weight, float)
+        weight = np.array(self.weight, float)
         if not (np.all(np.isfinite(weight)) and np.all(weight >= 0) and np.any(weight > 0)):
             raise InputError(f"weight {weight} of '{self.name}'", "positive weights, 0 for padding")
         object.__setattr__(self, "weight", weight)
@@ -558,10 +558,8 @@ class Problem:
 
 
 def _number(value: Any) -> np.ndarray:
-    """An array of floats; a small one is handed to a compiled call in less time than JAX takes to
-    make it its own.
-    """
-    return np.asarray(value, float)
+    """An array of floats, its own: JAX takes longer to make a small one its own than to take it."""
+    return np.array(value, float)
 
 
 _GROUPS = ("records", "priors", "constraints", "objectives")
