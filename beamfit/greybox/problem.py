@@ -497,8 +497,8 @@ class Problem:
         return FlatCore.of(self.core)
 
     def model_at(self, theta) -> Any:
-        """The model with the free numbers set to theta."""
-        return _model_at(self.core, np.asarray(theta, float))
+        """The model with the free numbers set to theta, all of them JAX's arrays."""
+        return jax.tree.map(jnp.asarray, _model_at(self.core, np.asarray(theta, float)))
 
     def residual(self, theta) -> jax.Array:
         """Residuals in units of their errors, priors last, shape (values,)."""
