@@ -205,6 +205,7 @@ def replace(tree: Any, chosen: Sequence[Leaf], vector: jax.Array) -> Any:
     values, structure = jax.tree_util.tree_flatten(tree)
     start = 0
     for leaf in chosen:
-        values[leaf.index] = vector[start : start + leaf.size].reshape(leaf.shape)
+        # Untraced numbers are taken by numpy, so that nothing is compiled.
+        values[leaf.index] = jnp.asarray(vector[start : start + leaf.size].reshape(leaf.shape))
         start += leaf.size
     return jax.tree_util.tree_unflatten(structure, values)
