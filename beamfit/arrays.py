@@ -16,6 +16,8 @@ from jax.typing import ArrayLike
 from beamfit.answer import shown
 
 C = TypeVar("C", bound=type)
+# Shortest padded record; lengths are powers of two, so that records share compiled code.
+SHORTEST = 8
 
 
 def registered(cls: C, static: Sequence[str]) -> C:
@@ -99,3 +101,14 @@ def floats(number: ArrayLike) -> Array:
     array(2.)
     """
     return array_module(number).asarray(number, float)
+
+
+def padded_length(n: int) -> int:
+    """The length to pad a record of n values to, so that a growing one is not compiled anew.
+
+    Examples
+    --------
+    >>> [padded_length(n) for n in (3, 8, 9, 100)]
+    [8, 8, 16, 128]
+    """
+    return max(SHORTEST, 1 << max(n - 1, 0).bit_length())

@@ -22,7 +22,7 @@ from beamfit.dynamics.response import ARX, FIRST_ORDER, SECOND_ORDER, Physics
 from beamfit.errors import Finding, Status
 from beamfit.greybox.fit import Derived, Fit
 from beamfit.greybox.judge import gauges, together
-from beamfit.greybox.memory import Memory
+from beamfit.noise.correlated import Memory
 from beamfit.quantity import Quantity
 from beamfit.statistics import POOR_FIT
 

@@ -25,8 +25,8 @@ from beamfit.dynamics.model import Driven, PreparedOutput, delayed, predicted
 from beamfit.dynamics.record import Run
 from beamfit.dynamics.search import Settled, noises_of
 from beamfit.greybox import tree
-from beamfit.greybox.memory import Whitened
 from beamfit.greybox.problem import with_slope
+from beamfit.noise.correlated import Whitened
 from beamfit.noise.memory import CorrelatedNoise, innovations
 
 # Laws, and half widths of each as shares of an input's range: prior flat in their logarithm. A stop

@@ -24,7 +24,7 @@ from beamfit.dynamics.search import (
     linear_columns,
     noises_of,
 )
-from beamfit.greybox.memory import Whitened, whitened_by_each
+from beamfit.noise.correlated import Whitened, whitened_by_each
 from beamfit.statistics import POOR_FIT
 
 # Other lags that are tried beside one that is given, and rounds of them, each about the best.

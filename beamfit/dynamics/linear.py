@@ -35,8 +35,8 @@ from beamfit.dynamics.states import Matrices, contraction, linear_outputs
 from beamfit.errors import InputError, nearest
 from beamfit.greybox import tree
 from beamfit.greybox.fit import Derived
-from beamfit.greybox.memory import CENTRAL, reach_of_probability
 from beamfit.greybox.problem import Free, Prior
+from beamfit.noise.correlated import CENTRAL, reach_of_probability
 from beamfit.noise.memory import CorrelatedNoise, remembers
 from beamfit.quantity import NORMAL_REACH, Quantity
 

@@ -8,11 +8,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from beamfit.arrays import padded_length
 from beamfit.dynamics.record import Run
 from beamfit.dynamics.response import Physics, simulate, simulate_evenly
 from beamfit.greybox import tree
 from beamfit.greybox.mlp import MLP, Port, dense
-from beamfit.greybox.problem import Prior, padded_length
+from beamfit.greybox.problem import Prior
 
 # Residual, as a share of the output's scatter, below which a fit counts as exact.
 CLOSE = 2e-4

@@ -32,9 +32,9 @@ from beamfit.dynamics.record import Run
 from beamfit.dynamics.response import ARX, FIRST_ORDER, SECOND_ORDER, Physics
 from beamfit.errors import Status
 from beamfit.greybox.fit import Fit
-from beamfit.greybox.memory import TIMES, Memory, noises, range_of, whitened_by_each
 from beamfit.greybox.problem import Free, Prior, Problem, Record
 from beamfit.greybox.solve import solve
+from beamfit.noise.correlated import TIMES, Memory, noises, range_of, whitened_by_each
 from beamfit.noise.memory import BESIDE, CorrelatedNoise, innovations, remembers
 
 # Longest delay that is tried, in samples, and as a share of the run.

@@ -16,6 +16,7 @@ from scipy.linalg import block_diag
 from scipy.stats import qmc
 
 from beamfit.answer import Table, answer, cell, json_of
+from beamfit.arrays import padded_length
 from beamfit.compile_cache import SELDOM
 from beamfit.emittance.calibration import with_numbers
 from beamfit.emittance.results import in_words
@@ -33,14 +34,7 @@ from beamfit.errors import Finding, InputError, Status
 from beamfit.greybox import tree
 from beamfit.greybox.descend import Found, descend_all
 from beamfit.greybox.fit import Fit, FittedVariable
-from beamfit.greybox.problem import (
-    TOLERANCE,
-    Free,
-    Problem,
-    Record,
-    padded_length,
-    residual,
-)
+from beamfit.greybox.problem import TOLERANCE, Free, Problem, Record, residual
 from beamfit.greybox.solve import search, solve
 from beamfit.optics.beamline import Beamline
 from beamfit.quantity import Quantity

@@ -17,10 +17,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from beamfit.arrays import padded_length
 from beamfit.emittance.model import line_of
 from beamfit.emittance.scan import USUAL, QuadScan, middle
 from beamfit.greybox import tree
-from beamfit.greybox.problem import padded_length
 from beamfit.optics.beamline import Beamline, Same, seen_line, transfer_rows
 from beamfit.optics.calibration import SETTING_UNITS, CurrentTable, plain_meaning
 from beamfit.optics.elements import Element, Marker, Quadrupole, Screen, ThinLens

@@ -405,34 +405,26 @@ def cells(lower, upper, number: int) -> tuple[np.ndarray, np.ndarray]:
     return low.reshape(-1, lower.size), high.reshape(-1, lower.size)
 
 
-def over_cells(net: LayeredNetwork, lower, upper, number: int) -> Range:
-    """Enclose every first-order gain over each cell of a box.
+def over_cells(net: LayeredNetwork, lower: jax.Array, upper: jax.Array) -> Range:
+    """Enclose every first-order gain over each of some boxes.
 
     Parameters
     ----------
     net : LayeredNetwork
         The network.
-    lower, upper : array, shape (inputs,)
-        Corners of the box, finite.
-    number : int
-        Cells along each input.
+    lower, upper : array, shape (cells, inputs)
+        Corners of the boxes, such as those of `cells`.
 
     Returns
     -------
     Range
         `lower` and `upper`, each of shape (cells, output ports, inputs). A constraint on all of
-        them holds everywhere in the box.
-
-    Raises
-    ------
-    InputError
-        As for `cells`.
+        them holds everywhere in the boxes.
 
     Examples
     --------
     >>> from beamfit.greybox.mlp import dense
-    >>> over_cells(dense(["u"], ["y", "z"]), [0.0], [1.0], 4).lower.shape
+    >>> over_cells(dense(["u"], ["y", "z"]), *cells([0.0], [1.0], 4)).lower.shape
     (4, 2, 1)
     """
-    low, high = cells(lower, upper, number)
-    return jax.vmap(lambda a, b: gain_bounds(net, a, b))(low, high)
+    return jax.vmap(lambda a, b: gain_bounds(net, a, b))(lower, upper)

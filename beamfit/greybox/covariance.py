@@ -18,13 +18,12 @@ from scipy import sparse
 
 from beamfit.greybox.problem import Record
 from beamfit.greybox.sparse import Factor, Rows, in_units, lengths, with_diagonal
+from beamfit.noise.correlated import CUT
 
 # Free numbers up to which all is dense, by orthogonal factors and singular values.
 FEW = 200
 # A quantity counts as determined while bounds carry less than this share of its variance.
 MOST_SHARE = 0.5
-# A direction is determined if its singular value exceeds this share of the largest: 1e6 roundings.
-CUT = 1e-10
 # A quantity moves along an open direction if more than this share of its terms remains.
 PART = 1e-6
 # Standard deviation of an undetermined direction, in units of the best determined one.
@@ -375,8 +374,9 @@ def groups_of(
 
     Notes
     -----
-    A guess s0 worth ν0 degrees of freedom makes the variance (ν0 s0² + χ²)/(ν0 + dof): a scaled
-    inverse χ² prior, A. Gelman et al., Bayesian Data Analysis (3rd ed., 2013), section 2.6.
+    Errors that are guessed, worth ν0 degrees of freedom, make the variance (ν0 + χ²)/(ν0 + dof) in
+    their units: a scaled inverse χ² prior, A. Gelman et al., Bayesian Data Analysis (3rd ed.,
+    2013), section 2.6.
     """
     found, first, whole = [], 0, sum(block.shape[0] for block in blocks)
     for record, r, block in zip(records, residuals, blocks, strict=False):
@@ -384,8 +384,8 @@ def groups_of(
         # The trace over all rows is their rank.
         hat = seen.rank if block.shape[0] == whole else seen.trace(block)
         dof = round(count - hat, 9)
-        freedom, squares = record.prior_noise
-        scale = math.sqrt((squares + chi2) / (freedom + dof)) if dof > 0 else math.nan
+        guess = record.prior_freedom
+        scale = math.sqrt((guess + chi2) / (guess + dof)) if dof > 0 else math.nan
         scale = max(1.0, scale) if record.errors_given else scale
         rows = slice(first, first := first + len(r))
         found.append(Group(record.name, rows, record.errors_given, chi2, count, dof, scale))

@@ -77,12 +77,16 @@ class Found(NamedTuple):
 
 
 class Tried(NamedTuple):
-    """Ends of steps: points, residuals and Jacobians there, decrease of the cost over promised."""
+    """Ends of steps: points, residuals and Jacobians there, decrease of the cost over promised.
+
+    `finite` tells of each end if all is.
+    """
 
     theta: np.ndarray
     residual: np.ndarray
     jacobian: np.ndarray
     ratio: np.ndarray
+    finite: np.ndarray
 
 
 class Descent:
@@ -194,8 +198,9 @@ class Descent:
         new, slope = self.slopes(lanes, points)
         self.steps[lanes] += 1
         ratio = 0.5 * _dot(old - new, old + new) / promised
-        usable = _finite(new, slope) & (promised > 0)
-        return Tried(points, new, slope, np.where(usable, ratio, -np.inf))
+        finite = _finite(new, slope)
+        ratio = np.where(finite & (promised > 0), ratio, -np.inf)
+        return Tried(points, new, slope, ratio, finite)
 
     def _bent(self, lanes: np.ndarray, tried: Tried, promised: np.ndarray):
         """Find the searches whose residuals bend along their step, and the steps that follow.
@@ -226,8 +231,8 @@ class Descent:
         Damping is for residuals that bend: it falls with the share of their change that did.
         """
         squares, ratio, plain = self._squares(lanes), tried.ratio, promised >= 0
-        finite = _finite(tried.residual, tried.jacobian) & (self.damping[lanes] <= DAMPING)
-        last = finite & plain & (promised <= FINISHED * squares)
+        last = tried.finite & (self.damping[lanes] <= DAMPING) & plain
+        last &= promised <= FINISHED * squares
         good = (ratio > 1e-4) | last
         taken, refused = lanes[good], lanes[~good]
         line = _times(self.jacobian[taken], tried.theta[good] - self.theta[taken])
@@ -323,7 +328,7 @@ def _damped(rows: np.ndarray, right: np.ndarray, alone: np.ndarray, at: np.ndarr
     # Transposed, as LAPACK has them.
     upper, below = np.zeros((k, n + 1, n + 1)), np.zeros((k, n + 1, n))
     upper[:, :n, : rows.shape[1]], upper[:, n, : rows.shape[1]] = rows.swapaxes(1, 2), right
-    below[:, range(n), range(n)], below[:, n] = alone, at
+    below.reshape(k, -1)[:, : n * n : n + 1], below[:, n] = alone, at
     found, block = np.empty((k, n)), min(BLOCK, n)
     for r, other, x in zip(upper, below, found, strict=True):
         lapack.dtpqrt(n, block, r.T, other.T, overwrite_a=1, overwrite_b=1)

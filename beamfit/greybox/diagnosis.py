@@ -10,9 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from beamfit.greybox import assess, tree
-from beamfit.greybox.covariance import CUT, directions
+from beamfit.greybox.covariance import directions
 from beamfit.greybox.judge import listed
 from beamfit.greybox.problem import Problem, with_slope
+from beamfit.noise.correlated import CUT
 
 # Rows are badly scaled if their sizes differ by more than this: half the digits are lost.
 APART = 1e8

@@ -237,30 +237,6 @@ class TaylorDifference:
         monomials = jnp.stack([jnp.prod(past[np.array(t, int)]) for t in self.terms])
         return jnp.reshape(p, (len(self.process_outputs), -1)) @ monomials
 
-    def one_step(self, p: jax.Array, u: jax.Array, y: jax.Array) -> jax.Array:
-        """Predict each sample from the measured past (equation error).
-
-        Parameters
-        ----------
-        p : array, shape (coefficients,) or (samples, coefficients)
-            Constant parameters, or those of each sample.
-        u : array, shape (samples, process inputs)
-            Input deviations.
-        y : array, shape (samples, process outputs)
-            Measured output deviations.
-
-        Returns
-        -------
-        jax.Array, shape (samples - start, process outputs)
-            Predictions from sample max(y_past, u_past) on.
-        """
-        start = max(self.y_past, self.u_past)
-        k = np.arange(start, len(u))
-        lags = [y[k - i] for i in range(1, 1 + self.y_past)]
-        lags += [u[k - i] for i in range(1 + self.u_past)]
-        p = jnp.broadcast_to(p, (len(u), len(self.coefficients)))
-        return jax.vmap(self.step)(p[start:], jnp.concatenate(lags, axis=1))
-
     def simulate(self, p: jax.Array, u: jax.Array, y0: jax.Array) -> jax.Array:
         """Run the equation on its own outputs (output error).
 

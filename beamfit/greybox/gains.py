@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import lru_cache, partial
 from typing import Any
 
 import jax
@@ -17,7 +17,7 @@ import numpy as np
 
 from beamfit.errors import InputError
 from beamfit.greybox import tree
-from beamfit.greybox.bounds import cells, gain_bounds
+from beamfit.greybox.bounds import cells, over_cells
 from beamfit.greybox.maps import Map, positions
 from beamfit.greybox.problem import Constraint
 
@@ -226,7 +226,7 @@ class _CertifiedGain:
 
     def __call__(self, model: Any, corners: tuple[jax.Array, jax.Array]) -> jax.Array:
         net = part(model, self.path)
-        bound = jax.vmap(lambda a, b: gain_bounds(net, a, b))(*corners)
+        bound = over_cells(net, *corners)
         row = positions([self.output], [port.name for port in net.output_ports], "output")[0]
         column = positions([self.by], net.inputs, "input")[0]
         return getattr(bound, self.end)[:, row, column]
@@ -275,6 +275,12 @@ def gain_at(
     )
 
 
+@lru_cache(maxsize=64)
+def _corners(low: tuple[float, ...], high: tuple[float, ...], number: int):
+    """Corners of cells; the same arrays for all limits over a box, whose enclosures are shared."""
+    return tuple(map(jnp.asarray, cells(low, high, number)))
+
+
 def certified_gain(
     path: str,
     output: str,
@@ -314,7 +320,7 @@ def certified_gain(
     >>> [c.name for c in certified_gain("map", "A", "c", ([0.0], [3.9]), upper=0.0)]
     ['max dA/dc']
     """
-    corners = tuple(jnp.asarray(c) for c in cells(*box, number))
+    corners = _corners(*(tuple(map(float, corner)) for corner in box), number)
     wanted = [("upper", "max", -np.inf, upper), ("lower", "min", lower, np.inf)]
     found = [
         Constraint(

@@ -35,7 +35,7 @@ from beamfit.greybox.covariance import (
 )
 from beamfit.greybox.equations import Implicit
 from beamfit.greybox.fit import Attempt, Fit, FittedConstraint, FittedVariable
-from beamfit.greybox.problem import Problem, compiled_at, sloped
+from beamfit.greybox.problem import FlatCore, Problem, sloped
 from beamfit.greybox.sparse import Rows
 from beamfit.statistics import POOR_FIT, chi2_probability
 
@@ -503,7 +503,7 @@ def _made_up(p: Problem, theta: np.ndarray, random: np.random.Generator) -> np.n
         for r in p.core.records
     )
     core = dataclasses.replace(p.core, records=records)
-    rows = np.asarray(compiled_at(sloped, core)(theta)[1]) * _size(theta)
+    rows = np.asarray(FlatCore.of(core).compiled(sloped)(theta)[1]) * _size(theta)
     rows = rows[np.all(np.isfinite(rows), axis=1)]
     terms = np.linalg.norm(rows, axis=1, keepdims=True)
     return rows / np.where(terms > 0, terms, 1.0)

@@ -14,7 +14,7 @@ import numpy as np
 
 from beamfit.errors import InputError, nearest
 from beamfit.greybox import tree
-from beamfit.greybox.bounds import KINDS, gain_bounds, over_cells
+from beamfit.greybox.bounds import KINDS, cells, over_cells
 from beamfit.greybox.gains import gain
 from beamfit.greybox.maps import positions
 
@@ -192,10 +192,9 @@ def _certified(net: MLP, asked: NetworkGain) -> jax.Array:
     (column,) = positions(asked.by, net.inputs)
     low = np.array([port.lower for port in net.input_ports])
     high = np.array([port.upper for port in net.input_ports])
-    if not np.all(np.isfinite(high - low)):
-        bound = gain_bounds(net, low, high)
-        return (bound.lower if asked.kind == "lower" else bound.upper)[row, column]
-    bound = over_cells(net, low, high, asked.cells)
+    finite = np.all(np.isfinite(high - low))
+    corners = cells(low, high, asked.cells) if finite else (low[None], high[None])
+    bound = over_cells(net, *corners)
     if asked.kind == "lower":
         return jnp.min(bound.lower[:, row, column])
     return jnp.max(bound.upper[:, row, column])

@@ -97,9 +97,8 @@ class Statement(NamedTuple):
         else than the sampled numbers.
     units : mapping of str to str
         Of sampled numbers.
-    lower, width : mapping of str to float
-        Lower bounds of sampled numbers instead of the problem's own, and how far from the optimum
-        each may be at most where the data do not say.
+    lower : mapping of str to float
+        Lower bounds of sampled numbers instead of the problem's own.
     labels : mapping of str to str
         What stands for a record before the names of its noise; by default nothing if there is one
         record, else its name.
@@ -108,8 +107,6 @@ class Statement(NamedTuple):
         first shape of the proposals.
     trusted : sequence of str
         Records whose errors are right, whatever the residuals show: anchors of a model.
-    noise_unit : str
-        Of the errors of records that came without.
     priors_own, hidden : sequence of str
         Numbers that the prior decides, and those nobody asks for.
     remark : str
@@ -128,11 +125,9 @@ class Statement(NamedTuple):
     log_volume: Callable[[Any, Any], jax.Array] = _no_volume
     units: Mapping[str, str] = {}
     lower: Mapping[str, float] = {}
-    width: Mapping[str, float] = {}
     labels: Mapping[str, str] = {}
     averaged: Sequence[str] = ()
     trusted: Sequence[str] = ()
-    noise_unit: str = "1"
     priors_own: Sequence[str] = ()
     hidden: Sequence[str] = ()
     remark: str = ""
@@ -172,8 +167,6 @@ def _law(own, log_volume, derive, build) -> tuple[PosteriorLaw, Callable]:
         """Priors and further objectives, and -inf where a bound or constraint is broken."""
         model, core = model_of(data, moved), data.core
         value = log_volume(model, data.more)
-        for record in core.records:
-            value += record.log_volume(model)
         for prior in core.priors:
             value -= 0.5 * jnp.sum(prior.residual(model) ** 2)
         for objective in core.objectives:
@@ -243,7 +236,7 @@ def target_of(
     data = _data(p, theta, moving, stated)
     slopes = slopes_of(law._replace(residual=with_priors), data, theta[moving])
     noise_found = tuple(scale if scale > 0 else 1.0 for scale in optimum.scales) or (1.0,)
-    width = _widths(upper - lower, names, stated.width, priors)
+    width = _widths(upper - lower, names, priors)
     covariance = covariance_of(slopes, (*noise_found, 1.0), width)
     unseen = np.zeros((len(theta), 0)) if optimum.undetermined is None else optimum.undetermined
     with_prior = np.array([name in priors for name in names])
@@ -261,7 +254,6 @@ def target_of(
         groups=_groups(p, optimum, stated, noise, outliers),
         noise=noise_found,
         counts=tuple(record.used for record in p.records),
-        noise_unit="1" if any(optimum.given) else stated.noise_unit,
         priors=priors,
         derived=stated.derived,
         observed=_observed(p),
@@ -355,14 +347,10 @@ def _data(p: Problem, theta: np.ndarray, moving: np.ndarray, stated: Statement) 
 
 
 def _widths(
-    box: np.ndarray,
-    names: Sequence[str],
-    told: Mapping[str, float],
-    priors: Mapping[str, Distribution],
+    box: np.ndarray, names: Sequence[str], priors: Mapping[str, Distribution]
 ) -> np.ndarray:
     """Largest distance of each number from the optimum where the data do not determine it."""
     width = np.where(np.isfinite(box), 0.5 * box, np.inf)
-    width = np.minimum(width, [told.get(name, np.inf) for name in names])
     spread = [float(priors[name].std()) if name in priors else np.inf for name in names]
     return np.minimum(width, spread)
 
@@ -381,7 +369,7 @@ def _groups(
         if record.name in stated.averaged:
             kind = "averaged"
         doubted = outliers and not trusted and kind != "averaged"
-        groups.append(NoiseGroup(label, kind, doubted, record.prior_noise))
+        groups.append(NoiseGroup(label, kind, doubted, record.prior_freedom))
     return tuple(groups) or (NoiseGroup("", noise or "known", outliers),)
 
 

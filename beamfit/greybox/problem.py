@@ -19,23 +19,11 @@ import numpy as np
 
 from beamfit.errors import InputError
 from beamfit.greybox import tree
-from beamfit.noise.memory import log_volume, whitened
 
 # Default tolerance on limits and on the conditions of an optimum, in sizes.
 TOLERANCE = 1e-6
-# Shortest padded record; lengths are powers of two, so that records share compiled code.
-SHORTEST = 8
-
-
-def padded_length(n: int) -> int:
-    """The length to pad a record of n values to, so that a growing one is not compiled anew.
-
-    Examples
-    --------
-    >>> [padded_length(n) for n in (3, 8, 9, 100)]
-    [8, 8, 16, 128]
-    """
-    return max(SHORTEST, 1 << max(n - 1, 0).bit_length())
+# Numbers up to which an array is handed over with every call: JAX takes longer to make it its own.
+SMALL = 1000
 
 
 class Free(NamedTuple):
@@ -65,7 +53,7 @@ class Free(NamedTuple):
     labels: tuple[str, ...] | None = None
 
 
-@tree.node("name", "predict", "worth", "apart")
+@tree.node("name", "predict", "worth")
 class Record:
     """Measured data and the function that predicts them.
 
@@ -86,17 +74,10 @@ class Record:
     weight : float or array
         Weight of the record's chi-square among several objectives, or of each value. Values of
         weight 0 are padding and count nowhere, so that records of a few lengths
-        (`beamfit.greybox.problem.padded_length`) share compiled code.
+        (`beamfit.arrays.padded_length`) share compiled code.
     worth : float
         Degrees of freedom that `error` is worth: infinite where it is known; a few where it rests
         on a guess, which the residuals correct.
-    guess : float
-        That guess in units of `error`.
-    apart : callable, optional
-        ``apart(model, data)``, shape (values - 1,), for errors with a memory: the time between
-        neighbouring values over the correlation time of their errors. Residuals are then those of
-        independent errors (`beamfit.noise.memory.whitened`). A sampler may vary the
-        correlation time; a search takes it as fixed. Such a record has no padding.
 
     Raises
     ------
@@ -111,12 +92,10 @@ class Record:
     error: Any = None
     weight: Any = 1.0
     worth: float = np.inf
-    guess: Any = 1.0
-    apart: Callable[[Any, Any], jax.Array] | None = None
 
     def __post_init__(self):
-        measured = np.asarray(self.measured, float)
-        error = None if self.error is None else np.asarray(self.error, float)
+        measured = np.array(self.measured, float)
+        error = None if self.error is None else np.array(self.error, float)
         bad = np.flatnonzero(~np.isfinite(measured))
         if bad.size:
             raise InputError(
@@ -128,23 +107,18 @@ class Record:
                 f"an error of '{self.name}' that is not positive and finite",
                 "one standard deviation of each value",
             )
-        weight = np.asarray(self.weight, float)
+        weight = np.array(self.weight, float)
         if not (np.all(np.isfinite(weight)) and np.all(weight >= 0) and np.any(weight > 0)):
             raise InputError(f"weight {weight} of '{self.name}'", "positive weights, 0 for padding")
-        object.__setattr__(self, "weight", jnp.asarray(weight))
-        object.__setattr__(self, "measured", jnp.asarray(measured))
-        object.__setattr__(self, "error", None if error is None else jnp.asarray(error))
+        object.__setattr__(self, "weight", weight)
+        object.__setattr__(self, "measured", measured)
+        object.__setattr__(self, "error", error)
 
     def residual(self, model: Any) -> jax.Array:
-        """Weighted residuals (predicted - measured)/error as a flat vector, whitened."""
+        """Weighted residuals (predicted - measured)/error as a flat vector."""
         scale = 1.0 if self.error is None else self.error
         difference = (self.predict(model, self.data) - self.measured) / scale
-        rows = jnp.ravel(jnp.where(self.weight > 0, jnp.sqrt(self.weight) * difference, 0.0))
-        return rows if self.apart is None else whitened(rows, self.apart(model, self.data))
-
-    def log_volume(self, model: Any) -> jax.Array:
-        """Logarithm of the density's factor from whitening."""
-        return jnp.zeros(()) if self.apart is None else log_volume(self.apart(model, self.data))
+        return jnp.ravel(jnp.where(self.weight > 0, jnp.sqrt(self.weight) * difference, 0.0))
 
     @property
     def errors_given(self) -> bool:
@@ -152,11 +126,9 @@ class Record:
         return self.error is not None and np.isinf(self.worth)
 
     @property
-    def prior_noise(self) -> tuple[float, float]:
-        """The guess at errors that are not known: degrees of freedom and its sum of squares."""
-        if self.error is None or self.errors_given:
-            return 0.0, 0.0
-        return self.worth, self.worth * float(self.guess) ** 2
+    def prior_freedom(self) -> float:
+        """Degrees of freedom that a guess at the errors is worth; 0 where they are known."""
+        return 0.0 if self.error is None or self.errors_given else self.worth
 
     @property
     def used(self) -> np.ndarray:
@@ -249,16 +221,37 @@ class Core:
     objectives: tuple[Objective, ...]
 
 
+class FlatCore(NamedTuple):
+    """The arrays of a core, each once, and where they stand among the leaves of its structure.
+
+    What two parts compute of the same arrays, a compiled function computes once.
+    """
+
+    arrays: list[Any]
+    places: tuple[int, ...]
+    structure: jax.tree_util.PyTreeDef
+
+    @classmethod
+    def of(cls, core: Core) -> FlatCore:
+        """Flatten a core."""
+        leaves, structure = jax.tree_util.tree_flatten(core)
+        keys = [id(x) if np.ndim(x) else -i for i, x in enumerate(leaves)]
+        once = dict(zip(keys, leaves, strict=True))
+        order = {key: i for i, key in enumerate(once)}
+        arrays = [jnp.asarray(x) if np.size(x) > SMALL else np.asarray(x) for x in once.values()]
+        return cls(arrays, tuple(order[key] for key in keys), structure)
+
+    def compiled(self, function: Callable) -> Callable:
+        """A function of (core, theta, ...) as a compiled function of (theta, ...)."""
+        return partial(_compiled(function, self.places, self.structure), self.arrays)
+
+
 @lru_cache(maxsize=256)
-def _compiled(function: Callable, structure: jax.tree_util.PyTreeDef) -> Callable:
-    """A function of (core, theta, ...), compiled to take the leaves of the core instead."""
-    return jax.jit(lambda leaves, *rest: function(structure.unflatten(leaves), *rest))
+def _compiled(function: Callable, places: tuple[int, ...], structure) -> Callable:
+    def at(arrays, *rest):
+        return function(structure.unflatten([arrays[i] for i in places]), *rest)
 
-
-def compiled_at(function: Callable, core: Core) -> Callable:
-    """A function of (core, theta, ...) as a compiled function of (theta, ...) at any core."""
-    leaves, structure = jax.tree_util.tree_flatten(core)
-    return partial(_compiled(function, structure), [jnp.asarray(leaf) for leaf in leaves])
+    return jax.jit(at)
 
 
 def _model_at(core: Core, theta: jax.Array) -> Any:
@@ -473,7 +466,7 @@ class Problem:
     @cached_property
     def residual_count(self) -> int:
         """Number of residuals, those of priors included."""
-        return self.size + sum(shape_of(p.residual, self.core.model)[0] for p in self.priors)
+        return self.size + sum(shape_of(Prior.residual, p, self.core.model)[0] for p in self.priors)
 
     @cached_property
     def least_residual(self) -> float:
@@ -497,17 +490,15 @@ class Problem:
         Compiled once for each structure of problem. A search calls it a thousand times, and walking
         the tree of the core for every call takes longer than the numbers of a small network.
         """
-        leaves, structure = self._flat
-        return partial(_compiled(function, structure), leaves)
+        return self._flat.compiled(function)
 
     @cached_property
-    def _flat(self) -> tuple[list[jax.Array], jax.tree_util.PyTreeDef]:
-        leaves, structure = jax.tree_util.tree_flatten(self.core)
-        return [jnp.asarray(leaf) for leaf in leaves], structure
+    def _flat(self) -> FlatCore:
+        return FlatCore.of(self.core)
 
     def model_at(self, theta) -> Any:
-        """The model with the free numbers set to theta."""
-        return _model_at(self.core, np.asarray(theta, float))
+        """The model with the free numbers set to theta, all of them JAX's arrays."""
+        return jax.tree.map(jnp.asarray, _model_at(self.core, np.asarray(theta, float)))
 
     def residual(self, theta) -> jax.Array:
         """Residuals in units of their errors, priors last, shape (values,)."""
@@ -566,11 +557,9 @@ class Problem:
         return np.concatenate(parts)
 
 
-def _number(value: Any) -> jax.Array:
-    """An array of floats; NumPy converts twenty times as fast as JAX."""
-    if isinstance(value, jax.Array):
-        return jnp.asarray(value, float)
-    return jnp.asarray(np.asarray(value, float))
+def _number(value: Any) -> np.ndarray:
+    """An array of floats, its own: JAX takes longer to make a small one its own than to take it."""
+    return np.array(value, float)
 
 
 _GROUPS = ("records", "priors", "constraints", "objectives")
@@ -605,5 +594,5 @@ def _check_shapes(problem: Problem) -> None:
                     f"a number or the shape of the measured values, {record.measured.shape}",
                 )
     for prior in problem.priors:
-        jax.eval_shape(prior.residual, problem.core.model)
+        shape_of(Prior.residual, prior, problem.core.model)
     _ = (problem.lower, problem.upper, problem.constraint_lower, problem.constraint_upper)

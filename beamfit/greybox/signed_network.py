@@ -15,7 +15,7 @@ from scipy.optimize import nnls
 
 from beamfit.answer import json_of
 from beamfit.errors import InputError
-from beamfit.greybox.bounds import KINDS, over_cells
+from beamfit.greybox.bounds import KINDS, cells, over_cells
 from beamfit.greybox.maps import positions
 from beamfit.greybox.mlp import MLP, Port, dense
 from beamfit.greybox.problem import Free, Problem
@@ -248,7 +248,7 @@ def certificate_of(problem: Problem, net: MLP) -> GainCertificate:
     scaled = [(p.bias - p.scale, p.bias + p.scale) for p in ports]
     given = [(p.lower, p.upper) for p in ports]
     low, high = np.where(np.isfinite(given), given, scaled).T
-    bound = over_cells(net, low, high, cells_along(len(ports)))
+    bound = over_cells(net, *cells(low, high, cells_along(len(ports))))
     lower, upper = np.asarray(bound.lower).min(axis=0), np.asarray(bound.upper).max(axis=0)
     sign = _asked(problem, net)
     gains = tuple(

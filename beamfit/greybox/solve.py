@@ -38,7 +38,6 @@ def solve(
     seed: int = 0,
     iterations: int = 3000,
     hessian: str = "exact",
-    progress: bool = False,
     seconds: float | None = None,
     solver: str | None = None,
     began: float | None = None,
@@ -67,8 +66,6 @@ def solve(
     hessian : str
         ``"exact"``, or ``"gauss_newton"`` to keep to first derivatives, for models that bring no
         second ones (foreign code).
-    progress : bool
-        Show a progress bar over the starts on standard error.
     seconds : float, optional
         For all starts and stages together, compilation included: looked at between them, so that
         what is being compiled is finished first.
@@ -112,9 +109,9 @@ def solve(
     until = None if seconds is None else began + seconds
     budget = SearchLimit(iterations, until, solver, p.tolerance)
     if not squares or solver not in (None, SQUARES):
-        found, attempts = _one_by_one(p, _bar(points, progress), budget, hessian)
+        found, attempts = _one_by_one(p, points, budget, hessian)
     else:
-        found, attempts = _together(p, points, budget, progress)
+        found, attempts = _together(p, points, budget)
     spent = time.perf_counter() - began
     if not found:
         said = (
@@ -149,15 +146,6 @@ def _check_solver(solver: str | None, squares: bool) -> None:
     known = [SQUARES] * squares + list(dict.fromkeys(stage.preset for stage in SOLVERS))
     if solver is not None and solver not in known:
         raise InputError(f"solver '{solver}' for this problem", f"one of {', '.join(known)}")
-
-
-def _bar(points: np.ndarray, progress: bool) -> Iterable:
-    if not progress:
-        return points
-    from rich.console import Console  # a tenth of a second that only a bar should cost
-    from rich.progress import track
-
-    return track(points, "fitting", console=Console(stderr=True), transient=True)
 
 
 def starting_points(p: Problem, number: int, seed: int) -> list[np.ndarray]:
@@ -247,7 +235,7 @@ def search(
     start, budget = np.asarray(start, float), SearchLimit(iterations, None, None, p.tolerance)
     if p.constraints or p.objectives:
         return _program(p, start, assess.slopes(p, start), budget, hessian)
-    found, attempts = _together(p, start[None], budget, False)
+    found, attempts = _together(p, start[None], budget)
     return found[0], attempts[0]
 
 
@@ -255,13 +243,13 @@ def search(
 
 
 def _together(
-    p: Problem, points: np.ndarray, budget: SearchLimit, progress: bool
+    p: Problem, points: np.ndarray, budget: SearchLimit
 ) -> tuple[list[SearchState], tuple[Attempt, ...]]:
     """Search from all starts, in parts that fit the memory, and polish the cheapest ends."""
     part = max(1, MEMORY // (8 * (p.size + 1) * len(p.names)))
     found: list[SearchState] = []
     attempts: list[Attempt] = []
-    for some in _bar(np.split(points, range(part, len(points), part)), progress):
+    for some in np.split(points, range(part, len(points), part)):
         states, accounts = _lanes(p, some, budget)
         found, attempts = found + states, attempts + accounts
     return found, tuple(attempts)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import Any, NamedTuple, TypeVar, dataclass_transform
 
 import jax
@@ -77,10 +78,17 @@ def leaves(tree: Any) -> tuple[Leaf, ...]:
     >>> [leaf.path for leaf in leaves({"a": 1.0, "b": (2.0, 3.0)})]
     ['a', 'b.0', 'b.1']
     """
-    found = jax.tree_util.tree_leaves_with_path(tree)
+    values, structure = jax.tree_util.tree_flatten(tree)
+    return _leaves(structure, tuple(map(np.shape, values)))
+
+
+@lru_cache(maxsize=256)
+def _leaves(structure: jax.tree_util.PyTreeDef, shapes: tuple[tuple[int, ...], ...]):
+    """Leaves of all trees of a structure: a problem finds each of its numbers among them."""
+    found = jax.tree_util.tree_leaves_with_path(structure.unflatten(range(len(shapes))))
     return tuple(
-        Leaf(i, jax.tree_util.keystr(path, simple=True, separator="."), jnp.shape(value))
-        for i, (path, value) in enumerate(found)
+        Leaf(i, jax.tree_util.keystr(path, simple=True, separator="."), shapes[i])
+        for path, i in found
     )
 
 

@@ -10,10 +10,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from beamfit.greybox import tree
 from beamfit.language import document as d
 from beamfit.language import expression as x
 from beamfit.language.evaluate import Setting, Value, check_rank, evaluate, lifted, picked, stored
-from beamfit.language.network_xml import with_weights
+from beamfit.language.network_xml import weight_leaves
 from beamfit.language.plan import callee_of, gains_of
 from beamfit.language.scope import Array, Axes, Net, Scope, located, widened
 
@@ -123,7 +124,7 @@ def defaults(callee: Scope | Net) -> Arrays:
 def _network(callee: Net, given: Arrays, names: list[str]) -> Arrays:
     net = callee.mlp
     if "weights" in given:
-        net = with_weights(net, given["weights"])
+        net = tree.replace(net, weight_leaves(net), given["weights"])
     found = net(jnp.stack([given[name] for name in net.inputs]))
     every = dict(zip(net.outputs, found, strict=True))
     return {name: every[name] for name in names}

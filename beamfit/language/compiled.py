@@ -232,7 +232,7 @@ class Computed:
         """Every element of outputs and gains, as far as a terminal shows them."""
         arrays = [(self.scope.outputs[n], v) for n, v in self.outputs.items()]
         rows = [[a.element(i), f"{v:.8g}"] for a, values in arrays for i, v in _each(values)]
-        return [limited("output", rows), *gain_tables(self.scope, self.gains)]
+        return [limited(["output", "value"], rows), *gain_tables(self.scope, self.gains)]
 
     def to_json(self) -> dict[str, Any]:
         """The result of the JSON contract."""
@@ -243,11 +243,11 @@ def _each(values: np.ndarray) -> Iterable[tuple[int, float]]:
     return enumerate(np.ravel(values).tolist())
 
 
-def limited(name: str, rows: list[list[str]]) -> Table:
-    """A table of names and values with no more rows than a terminal shows."""
-    more = len(rows) - MOST_ROWS
-    rows = rows[:MOST_ROWS] + [[f"... and {more} more", ""]] * (more > 0)
-    return Table("", [name, "value"], rows, numeric=True)
+def limited(header: Sequence[str], rows: list[list[str]]) -> Table:
+    """A table with no more rows than a terminal shows."""
+    more, rest = len(rows) - MOST_ROWS, [""] * (len(header) - 1)
+    rows = rows[:MOST_ROWS] + [[f"... and {more} more", *rest]] * (more > 0)
+    return Table("", header, rows, numeric=True)
 
 
 def gain_tables(scope: Scope, gains: Mapping[str, np.ndarray]) -> list[Table]:
@@ -259,7 +259,7 @@ def gain_tables(scope: Scope, gains: Mapping[str, np.ndarray]) -> list[Table]:
         for i, v in _each(values):
             at = divmod(i, x.size)
             rows.append([f"d{y.element(at[0])}/d{x.element(at[1])}", f"{v:.8g}"])
-    return [limited("gain", rows)] if rows else []
+    return [limited(["gain", "value"], rows)] if rows else []
 
 
 def parts_of(gain: str) -> tuple[str, str]:

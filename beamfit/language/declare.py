@@ -70,10 +70,11 @@ def scope_of(m: d.Mapping, shapes: Mapping[str, tuple[int, int]] | None = None) 
 
 
 def _net(network: d.NetworkDefinition) -> Net:
-    from beamfit.language.network_xml import network_of, weights_of  # JAX from here on
+    from beamfit.greybox import tree  # JAX from here on
+    from beamfit.language.network_xml import network_of, weight_leaves
 
     mlp = network_of(network)
-    values = tuple(map(float, weights_of(mlp)))
+    values = tuple(tree.read(mlp, weight_leaves(mlp)).tolist())
     known = any(part.values is not None for part in network.parts)
     count = IndexSet("", np.arange(len(values)))
     ports = {name: Array(name, "input", (), network.at) for name in mlp.inputs}

@@ -8,14 +8,12 @@ from __future__ import annotations
 
 import os
 from collections import Counter
-from dataclasses import replace
 from xml.etree import ElementTree as Plain
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from beamfit.errors import InputError
+from beamfit.greybox import tree
 from beamfit.greybox.mlp import MLP, Layer, NetworkGain, Port, connection
 from beamfit.language import document as d
 from beamfit.language.expression import error_at
@@ -168,28 +166,14 @@ def network_of(n: d.NetworkDefinition) -> MLP:
         raise error_at(n.at, f"{error.found} (network '{n.name}')", error.expected) from None
 
 
-def weights_of(net: MLP) -> jax.Array:
-    """The numbers of a network as one vector: weights of each connection, row by row, then biases.
+def weight_leaves(net: MLP) -> tuple[tree.Leaf, ...]:
+    """The numbers of a network: weights of each connection, row by row, then biases.
 
     Connections and layers stand in the order of the document.
     """
-    return jnp.concatenate([jnp.ravel(a) for group in _numbers_of(net) for a in group.values()])
-
-
-def with_weights(net: MLP, vector: jax.Array) -> MLP:
-    """The network with its numbers taken from such a vector."""
-    groups, start = [], 0
-    for group in _numbers_of(net):
-        groups.append({})
-        for name, old in group.items():
-            groups[-1][name] = vector[start : start + old.size].reshape(old.shape)
-            start += old.size
-    return replace(net, weights=groups[0], biases=groups[1])
-
-
-def _numbers_of(net: MLP) -> tuple[dict[str, jax.Array], dict[str, jax.Array]]:
-    weights = {(name := connection(*pair)): net.weights[name] for pair in net.connections}
-    return weights, {la.name: net.biases[la.name] for la in net.layers if la.bias}
+    paths = [f"weights.{connection(*pair)}" for pair in net.connections]
+    paths += [f"biases.{layer.name}" for layer in net.layers if layer.bias]
+    return tuple(leaf for path in paths for leaf in tree.find_leaves(net, path))
 
 
 def _layer(e: Node) -> Layer:

@@ -151,7 +151,7 @@ def formulate(
     program = compile_mapping(document.mapping, tables)
     free, model, notes = _free(document, program)
     model |= values_of(program.scope, values)
-    constants = {n: jnp.asarray(v) for n, v in program.constants.items()}
+    constants = program.constants
     records, objectives = [], []
     for name, weight in weights.items():
         if least:

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from beamfit.answer import MOST_ROWS, Table, answer, cell
+from beamfit.answer import Table, answer, cell
 from beamfit.errors import Status
 from beamfit.greybox.assess import slopes
 from beamfit.greybox.diagnosis import diagnose
@@ -19,7 +19,7 @@ from beamfit.greybox.fit import Fit, FittedConstraint, FittedVariable
 from beamfit.greybox.problem import TOLERANCE
 from beamfit.greybox.solve import solve
 from beamfit.language import document as d
-from beamfit.language.compiled import gain_tables, gains_at, outputs_at
+from beamfit.language.compiled import gain_tables, gains_at, limited, outputs_at
 from beamfit.language.problem import Formulation, at_start, formulate, starts_of
 from beamfit.language.trace import cause_of
 from beamfit.quantity import Quantity
@@ -173,10 +173,7 @@ def _limited(c: FittedConstraint) -> list[str]:
 
 def _table(name: str, rows: Sequence, row_of, errors: bool, last="reduced gradient") -> Table:
     header = [name, "value", *["error"] * errors, "lower", "upper", "state", last]
-    more = len(rows) - MOST_ROWS
-    cells = [row_of(row) for row in rows[:MOST_ROWS]]
-    cells += [[f"... and {more} more", *[""] * (len(header) - 1)]] if more > 0 else []
-    return Table("", header, cells, numeric=True)
+    return limited(header, [row_of(row) for row in rows])
 
 
 # ---- solving
@@ -249,15 +246,15 @@ def solve_document(
 def _started(made: Formulation) -> tuple[Formulation, tuple[str, ...]]:
     """The problem at its first start that is finite, drawn again from the same seeds if need be."""
     p, variables = made.problem, made.document.problem.variables
+    if slopes(p, p.start).finite:
+        return made, ()
+    cause = _cause(made, p.core.model)
     drawn = any(v.random for v in variables)
-    for draws, model in enumerate(islice(starts_of(made), MOST_DRAWS if drawn else 1)):
+    for draws, model in enumerate(islice(starts_of(made), 1, MOST_DRAWS if drawn else 1), 1):
         if slopes(p, np.concatenate([np.ravel(model[v.model]) for v in variables])).finite:
-            if draws == 0:
-                return made, ()
             times = "once" if draws == 1 else f"{draws} times"
-            said = f"At the start of the seeds {_cause(made, next(starts_of(made)))}"
+            said = f"At the start of the seeds {cause}"
             return at_start(made, model), (f"{said}; drawn again from the same seeds, {times}.",)
-    cause = _cause(made, next(starts_of(made)))
     return made, (f"At the start {cause}.",) if cause else ()
 
 

@@ -11,7 +11,6 @@ import numpy as np
 
 from beamfit.answer import json_of, shown
 from beamfit.errors import Status
-from beamfit.greybox.memory import AveragedMoments, Memory
 from beamfit.lifetime.alternatives import (
     ConstantA,
     LifetimeLaw,
@@ -33,6 +32,7 @@ from beamfit.lifetime.expansion import (
 )
 from beamfit.lifetime.free_law import BELOW, ENDS, PACES, UNITS, FreeLaw, Law, free_law
 from beamfit.lifetime.record import DecayRecord
+from beamfit.noise.correlated import AveragedMoments, Memory
 from beamfit.noise.memory import CLOSE, Products
 from beamfit.quantity import HOUR, Quantity
 

@@ -17,9 +17,9 @@ from typing import NamedTuple
 import numpy as np
 from jax import Array
 
-from beamfit.greybox.memory import Memory, Whitened, usual_noises, whitened_by_each
 from beamfit.lifetime.decay_law import LEAST, Moments, beam_current
 from beamfit.lifetime.record import DecayRecord, Monitor
+from beamfit.noise.correlated import Memory, Whitened, usual_noises, whitened_by_each
 from beamfit.noise.memory import CorrelatedNoise, Levels, remembers
 from beamfit.quantity import HOUR, Quantity
 

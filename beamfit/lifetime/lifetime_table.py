@@ -12,9 +12,10 @@ from jax import Array
 from scipy.special import chdtrc, fdtrc
 
 from beamfit.answer import Table, answer, cell, json_of, labelled, plain_name
+from beamfit.arrays import padded_length
 from beamfit.errors import expect
 from beamfit.greybox.fit import Derived, Fit
-from beamfit.greybox.problem import Free, Problem, Record, padded_length
+from beamfit.greybox.problem import Free, Problem, Record
 from beamfit.greybox.solve import solve
 from beamfit.lifetime.alternatives import CURRENTS, ConstantA, LifetimeLaw, constant_a
 from beamfit.lifetime.answer import TableEvidence, finding_of_table

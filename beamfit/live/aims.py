@@ -10,11 +10,11 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
+from beamfit.arrays import padded_length
 from beamfit.emittance.advice import adviser_of
 from beamfit.emittance.design import best_steps
 from beamfit.emittance.fit import EmittanceFit, fit_emittance
 from beamfit.errors import InputError, Status
-from beamfit.greybox.problem import padded_length
 from beamfit.io.machine import Magnet, ScanMachine
 from beamfit.live.points import MeasuredPoint, clipped, limits_within, scan_of
 from beamfit.optics.beamline import Beamline

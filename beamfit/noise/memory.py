@@ -45,7 +45,7 @@ STATED = 8.0
 WRONG, SIZES = np.log(30.0), 121
 
 
-def whitened(rows, apart, xp=jnp):
+def whitened(rows, apart):
     """Rows of values with correlated errors as rows with independent errors of the same size.
 
     Parameters
@@ -67,18 +67,18 @@ def whitened(rows, apart, xp=jnp):
 
     Examples
     --------
-    >>> whitened(np.array([1.0, 2.0, 2.0]), np.log([2.0, 2.0]), np).round(4).tolist()
+    >>> whitened(np.array([1.0, 2.0, 2.0]), np.log([2.0, 2.0])).round(4).tolist()
     [1.0, 1.7321, 1.1547]
     """
     shape = (-1,) + (1,) * (rows.ndim - 1)
-    kept = xp.exp(-apart).reshape(shape)
-    new = xp.sqrt(-xp.expm1(-2 * apart)).reshape(shape)
-    return xp.concatenate([rows[:1], (rows[1:] - kept * rows[:-1]) / new])
+    kept = np.exp(-apart).reshape(shape)
+    new = np.sqrt(-np.expm1(-2 * apart)).reshape(shape)
+    return np.concatenate([rows[:1], (rows[1:] - kept * rows[:-1]) / new])
 
 
-def log_volume(apart, xp=jnp):
+def log_volume(apart):
     """Logarithm of the density's normalisation, whitened over not: -sum ln sqrt(1 - c²)."""
-    return -0.5 * xp.sum(xp.log(-xp.expm1(-2 * apart)))
+    return -0.5 * np.sum(np.log(-np.expm1(-2 * apart)))
 
 
 def is_correlated(residuals: np.ndarray, parameters: int, seen: float = SEEN) -> bool:
@@ -206,8 +206,8 @@ def products_by_each(
             apart = interval / time
         kept, new = np.exp(-apart), np.sqrt(-np.expm1(-2 * apart))
         own, before = np.append(1.0, 1.0 / new), np.append(0.0, -kept / new)
-        begun = np.asfortranarray(whitened(rows, apart, np))
-        volume = float(log_volume(apart, np))
+        begun = np.asfortranarray(whitened(rows, apart))
+        volume = float(log_volume(apart))
         for noise in alike:
             diagonal = 1.0 - noise.white + noise.white * (own**2 + before**2)
             size, next_, _ = dpttrf(diagonal, noise.white * before[1:] * own[:-1])

@@ -47,15 +47,15 @@ class NoiseGroup(NamedTuple):
         averaged over the noise, and the residuals count nowhere.
     outliers : bool
         Whether an unknown fraction of the points, flat from 0 to 1/2, are outliers.
-    guess : (float, float)
-        Of noise that is inferred: degrees of freedom and sum of squares of a scaled inverse χ²
-        prior on the square of the factor.
+    freedom : float
+        Degrees of freedom that stated errors are worth where the noise is inferred: a scaled
+        inverse χ² prior about 1 on the square of the factor.
     """
 
     label: str = ""
     noise: str = "known"
     outliers: bool = False
-    guess: tuple[float, float] = (0.0, 0.0)
+    freedom: float = 0.0
 
     @property
     def prefix(self) -> str:
@@ -142,8 +142,7 @@ def _of_group(residual: Array, counts: Array, group: NoiseGroup, extra: list[Arr
         tiny = jnp.finfo(float).tiny
         wild = jnp.log(jnp.maximum(safe, tiny)) + jnp.log(outlier_density(scaled) + tiny)
         each = jnp.logaddexp(good, wild)
-    freedom, squares = group.guess
-    before = -freedom * log_scale - 0.5 * squares * jnp.exp(-2.0 * log_scale)
+    before = -group.freedom * (log_scale + 0.5 * jnp.exp(-2.0 * log_scale))
     value = before + jnp.sum(jnp.where(counts, each - log_scale, 0.0))
     return jnp.where(inside, value, -jnp.inf)
 

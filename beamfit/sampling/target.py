@@ -97,8 +97,6 @@ class SamplingTarget:
         Factor on the stated errors that the fit's residuals show, one a group.
     counts : tuple of array of bool
         Which residuals of each group count; all if empty.
-    noise_unit : str
-        Unit of a stated error of 1; "1" where errors were stated.
     priors : mapping of str to distribution
         In addition to the law's own.
     derived : mapping of str to str
@@ -149,7 +147,6 @@ class SamplingTarget:
     groups: tuple[NoiseGroup, ...] = (NoiseGroup(),)
     noise: tuple[float, ...] = (1.0,)
     counts: tuple[np.ndarray, ...] = ()
-    noise_unit: str = "1"
     priors: Mapping[str, Distribution] = field(default_factory=dict)
     derived: Mapping[str, str] = field(default_factory=dict)
     observed: Mapping[str, np.ndarray] = field(default_factory=dict)
@@ -237,13 +234,12 @@ class SamplingTarget:
     @cached_property
     def derived_names(self) -> tuple[str, ...]:
         """Names of the derived numbers, the noise included where it is inferred."""
-        word = "error_factor" if self.noise_unit == "1" else "noise"
-        return (*self.derived, *(g.prefix + word for g in self.groups if g.inferred))
+        return (*self.derived, *(g.prefix + "error_factor" for g in self.groups if g.inferred))
 
     @cached_property
     def derived_units(self) -> tuple[str, ...]:
         """Units of the derived numbers."""
-        return (*self.derived.values(), *(self.noise_unit for g in self.groups if g.inferred))
+        return (*self.derived.values(), *("1" for g in self.groups if g.inferred))
 
     def derive(self, thetas: np.ndarray) -> np.ndarray:
         """The derived numbers at many points, shape (m, k)."""

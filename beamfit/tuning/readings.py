@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from beamfit.arrays import padded_length
 from beamfit.emittance.beam_draws import Coordinates, coordinates
 from beamfit.emittance.comparison import LEVEL, STEPS
 from beamfit.emittance.scan import QuadScan
@@ -18,7 +19,6 @@ from beamfit.emittance.statement import (
     plane_sizes,
     unfitted,
 )
-from beamfit.greybox.problem import padded_length
 from beamfit.noise.model import LN_2PI, Noise
 from beamfit.noise.sizes import kinds_of
 from beamfit.optics.beamline import Beamline

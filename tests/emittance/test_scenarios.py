@@ -14,7 +14,7 @@ from beamfit.emittance.model import UNIT, asked_numbers
 from beamfit.emittance.statement import asked_of, prepare
 from beamfit.emittance.transport_network import SCENARIO as TRANSPORT_NETWORK
 from beamfit.errors import InputError
-from beamfit.greybox.bounds import over_cells
+from beamfit.greybox.bounds import cells, over_cells
 from beamfit.greybox.signed_network import certificate_of
 from beamfit.greybox.solve import solve
 from beamfit.optics.calibration import IntegratedGradient, SlopeIntercept
@@ -257,7 +257,7 @@ def test_gains_fall_everywhere(which, request):
     assert [g.sign for g in found.gains] == [-1, -1]
     slopes = jax.jit(jax.vmap(jax.jacfwd(net.values)))(jnp.linspace(0.0, 3.9, 5001)[:, None])
     assert float(slopes.max()) <= 0.0
-    bound = over_cells(net, [0.0], [3.9], 32)
+    bound = over_cells(net, *cells([0.0], [3.9], 32))
     assert float(bound.upper.max()) <= 1e-12
     for i, gain in enumerate(found.gains):
         inside = np.asarray(slopes)[:, i, 0]

@@ -12,7 +12,7 @@ from beamfit.greybox.bounds import KINDS, cells, gain_bounds, over_cells
 from beamfit.greybox.mlp import MLP, Layer, NetworkGain, Port, dense
 
 sampled_gains = jax.jit(lambda net, x: jax.vmap(jax.jacfwd(net.values))(x))
-cell_bounds = jax.jit(over_cells, static_argnums=(1, 2, 3))
+cell_bounds = jax.jit(over_cells)
 
 
 def tower(kind, seed):
@@ -38,7 +38,7 @@ def test_no_sampled_gain_leaves_its_cell(kind):
     low, high = cells([-1.0, 0.2], [1.5, 2.0], 6)
     for seed in range(3):
         net = tower(kind, seed)
-        bound = cell_bounds(net, (-1.0, 0.2), (1.5, 2.0), 6)
+        bound = cell_bounds(net, *cells((-1.0, 0.2), (1.5, 2.0), 6))
         for _ in range(10):
             inside = low + random.uniform(size=low.shape) * (high - low)
             inside = np.where(random.uniform(size=low.shape) < 0.3, low, inside)
@@ -52,7 +52,7 @@ def test_search_for_a_crossing_finds_none():
     """A local maximiser in every cell, for nets whose gain turns inside."""
     for seed in range(4):
         net = dense(["c"], ["A", "B"], [5], seed=seed, spread=2.0)
-        bound = cell_bounds(net, (0.0,), (3.9,), 16)
+        bound = cell_bounds(net, *cells((0.0,), (3.9,), 16))
         low, high = cells([0.0], [3.9], 16)
         for row in range(2):
             slope = jax.jit(jax.grad(lambda c, net=net, row=row: net.values(c[None])[row]))
@@ -89,7 +89,7 @@ def test_64_cells_are_within_two_percent_of_the_true_range():
     ratios = []
     for seed in range(40):
         net = dense(["c"], ["A", "B"], [5], seed=seed)
-        bound = cell_bounds(net, (0.0,), (3.9,), 64)
+        bound = cell_bounds(net, *cells((0.0,), (3.9,), 64))
         gains = sampled_gains(net, fine)[..., 0]
         width = bound.upper.max(0)[:, 0] - bound.lower.min(0)[:, 0]
         ratios += list(np.asarray(width / np.ptp(gains, axis=0)))
@@ -127,7 +127,7 @@ def test_bounds_as_outputs_of_the_network():
     ]
     net = dense([Port("u", "", lower=-1.0, upper=2.0)], ["y"], gains=gains, seed=2)
     _, low, high = (float(v) for v in jax.jit(net.__call__)(jnp.array([0.0])))
-    bound = cell_bounds(net, (-1.0,), (2.0,), 8)
+    bound = cell_bounds(net, *cells((-1.0,), (2.0,), 8))
     assert low == pytest.approx(float(bound.lower.min()), abs=1e-14)
     assert high == pytest.approx(float(bound.upper.max()), abs=1e-14)
     slopes = sampled_gains(net, np.linspace(-1, 2, 500)[:, None])
@@ -146,7 +146,7 @@ def test_bounds_are_differentiable_by_the_weights():
             {**net.weights, "layer0->layer1": w},
             net.biases,
         )
-        return over_cells(changed, (0.0,), (1.0,), 4).upper.max()
+        return over_cells(changed, *cells((0.0,), (1.0,), 4)).upper.max()
 
     w = net.weights["layer0->layer1"]
     slope = jax.jit(jax.grad(worst))(w)

@@ -33,13 +33,6 @@ def test_simulation_follows_the_recursion():
     np.testing.assert_allclose(found, by_loop(), rtol=0, atol=1e-13)
 
 
-def test_one_step_predictions_are_exact_on_exact_data_and_differ_otherwise():
-    y = by_loop()
-    np.testing.assert_allclose(SECOND.one_step(P, U[:, None], y[:, None])[:, 0], y[2:], atol=1e-13)
-    wrong = SECOND.one_step(P, U[:, None], y[:, None] + 1.0)[:, 0]
-    np.testing.assert_allclose(wrong - y[2:], 1.2 - 0.4, atol=1e-13)
-
-
 def test_second_degree_has_every_product_once():
     both = TaylorDifference(("u",), ("y", "z"), y_past=1, u_past=0, degree=2)
     y, z, u = 0.3, -0.5, 0.7

@@ -4,10 +4,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from beamfit.arrays import padded_length
 from beamfit.errors import InputError
 from beamfit.greybox import fit as fits
 from beamfit.greybox.posterior import target_of
-from beamfit.greybox.problem import Free, Prior, Problem, Record, padded_length
+from beamfit.greybox.problem import Free, Prior, Problem, Record
 from beamfit.greybox.solve import solve
 
 X = np.linspace(-1.0, 1.0, 21)

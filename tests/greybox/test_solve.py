@@ -251,18 +251,6 @@ def test_several_starts_find_the_better_valley_and_repeat_exactly():
     assert not np.array_equal(starting_points(p, 3, 1)[1], starting_points(p, 3, 2)[1])
 
 
-def test_the_progress_bar_goes_to_standard_error_and_only_when_asked(capsys, monkeypatch):
-    monkeypatch.setenv("FORCE_COLOR", "1")  # a terminal, as far as rich can tell
-    record = Record("r", line, X, 2.0 * X, 0.1)
-    p = Problem({"slope": 0.0, "offset": 0.0}, [Free("")], [record])
-    solve(p, starts=3)
-    assert capsys.readouterr() == ("", "")
-    solve(p, starts=3, progress=True)
-    said = capsys.readouterr()
-    assert said.out == ""
-    assert "fitting" in said.err
-
-
 def test_foreign_code_fits_with_first_derivatives():
     square = Foreign(["x"], ["y"], lambda x: x**2, lambda x: np.diag(2 * x))
     record = Record("r", lambda m, _: square(m["x"][None]), None, [4.0], 0.1)

@@ -7,13 +7,13 @@ from scipy.signal import lfilter
 from scipy.stats import binom
 
 from beamfit.errors import InputError
-from beamfit.greybox.memory import whitened_by_each
 from beamfit.lifetime.cycles import averaged, find_cycles, is_refilled
 from beamfit.lifetime.expansion import solved
 from beamfit.lifetime.fit import fit_cycles
 from beamfit.lifetime.pieces import thinned
 from beamfit.lifetime.record import Conditions, DecayRecord
 from beamfit.lifetime.study import study_record
+from beamfit.noise.correlated import whitened_by_each
 from beamfit.noise.memory import CorrelatedNoise, Levels
 from tests.simulations import simulations, widened
 

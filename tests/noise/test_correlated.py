@@ -1,13 +1,10 @@
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.linalg import cholesky, solve_triangular
 from scipy.signal import lfilter
 from scipy.stats import multivariate_normal
 
-from beamfit.greybox.memory import memory_of, whitened_by_each
-from beamfit.greybox.problem import Free, Problem, Record
-from beamfit.greybox.solve import solve
+from beamfit.noise.correlated import usual_noises, whitened_by_each
 from beamfit.noise.memory import (
     CorrelatedNoise,
     is_correlated,
@@ -31,14 +28,13 @@ def correlation(time, length):
 def test_whitening_is_the_inverse_of_the_dense_cholesky_factor(uneven, length):
     rows = np.random.default_rng(4).normal(size=(40, 3))
     dense = cholesky(correlation(uneven, length), lower=True)
-    ours = whitened(rows, np.diff(uneven) / length, np)
+    ours = whitened(rows, np.diff(uneven) / length)
     np.testing.assert_allclose(ours, solve_triangular(dense, rows, lower=True), rtol=1e-7)
-    np.testing.assert_allclose(whitened(jnp.asarray(rows), np.diff(uneven) / length), ours)
 
 
 def test_the_density_is_scipys(uneven):
     row, apart = np.random.default_rng(5).normal(size=40), np.diff(uneven) / 2.0
-    ours = log_volume(apart, np) - 0.5 * np.sum(whitened(row, apart, np) ** 2)
+    ours = log_volume(apart) - 0.5 * np.sum(whitened(row, apart) ** 2)
     theirs = multivariate_normal(cov=correlation(uneven, 2.0)).logpdf(row)
     assert ours - 20 * np.log(2 * np.pi) == pytest.approx(theirs, rel=1e-9)
 
@@ -65,11 +61,16 @@ def both(time, noise):
     return (1 - noise.white) * correlation(time, noise.time) + noise.white * np.eye(len(time))
 
 
+def averaged(slopes, residuals, time):
+    rows = np.column_stack([slopes, residuals])
+    return whitened_by_each(usual_noises(time), [(rows, time)]).memory()
+
+
 def test_each_noise_is_generalised_least_squares_by_dense_matrices(uneven):
     rng = np.random.default_rng(6)
     slopes = np.column_stack([np.ones(40), uneven])
     residuals = rng.normal(size=40)
-    found = memory_of(slopes, residuals, uneven)
+    found = averaged(slopes, residuals, uneven)
     for k in (0, 17, 40, 63, 99):
         weight = np.linalg.inv(both(uneven, CorrelatedNoise(found.time[k], found.white[k])))
         information = slopes.T @ weight @ slopes
@@ -87,7 +88,7 @@ def test_a_slow_drift_under_white_noise_is_in_the_errors(count):
     held = []
     for _ in range(count):
         drift = lfilter([np.sqrt(1 - 0.98**2)], [1, -0.98], rng.normal(size=1300))[1000:]
-        said = memory_of(slopes, drift + rng.normal(size=300), time).moments(np.eye(3))
+        said = averaged(slopes, drift + rng.normal(size=300), time).moments(np.eye(3))
         held.append(np.abs(said.shift) < said.reach)
     assert (np.mean(held, axis=0) > 0.95 - widened(0.1, 60, count)).all()
 
@@ -102,33 +103,11 @@ def test_a_number_that_is_known_keeps_its_error_when_the_level_is_lost():
     """A random walk: its level is unknown after the first reading, its slope is not."""
     walk = np.cumsum(np.random.default_rng(8).normal(size=500))
     time = np.arange(500.0)
-    found = memory_of(np.column_stack([np.ones(500), time - 250]), walk - 0.3 * time, time)
+    found = averaged(np.column_stack([np.ones(500), time - 250]), walk - 0.3 * time, time)
     slope = found.moments(np.array([[0.0, 1.0]]))
     # The mean of 499 independent steps.
     assert slope.error[0] == pytest.approx(1 / np.sqrt(499), rel=0.5)
     assert slope.reach[0] > 1.7 * slope.error[0]
-
-
-def line(model, time):
-    return model["level"] + model["slope"] * time
-
-
-def apart(model, time):
-    return jnp.diff(time) / 5.0
-
-
-def test_the_core_fits_and_judges_whitened_rows(uneven):
-    rng = np.random.default_rng(9)
-    noise = cholesky(correlation(uneven, 5.0), lower=True) @ rng.normal(size=40)
-    measured = 2.0 + 0.5 * uneven + 0.1 * noise
-    record = Record("drift", line, uneven, measured, 0.1, apart=apart)
-    fit = solve(Problem({"level": 0.0, "slope": 0.0}, [Free("level"), Free("slope")], [record]))
-    weight = np.linalg.inv(correlation(uneven, 5.0)) / 0.01
-    slopes = np.column_stack([np.ones(40), uneven])
-    covariance = np.linalg.inv(slopes.T @ weight @ slopes)
-    np.testing.assert_allclose(fit.theta, covariance @ slopes.T @ weight @ measured, rtol=1e-6)
-    np.testing.assert_allclose(fit.covariance_raw, covariance, rtol=1e-6)
-    assert 0.5 < fit.chi2 / fit.dof < 1.6
 
 
 def test_the_evidence_is_the_integral_over_numbers_and_the_size_of_the_noise():

@@ -14,8 +14,7 @@ import jax
 import numpy as np
 from scipy.special import logsumexp, stdtr, stdtrit
 
-from beamfit.greybox.covariance import CUT
-from beamfit.greybox.problem import padded_length
+from beamfit.arrays import padded_length
 from beamfit.noise.memory import (
     BESIDE,
     CorrelatedNoise,
@@ -26,6 +25,8 @@ from beamfit.noise.memory import (
 )
 from beamfit.statistics import log_student
 
+# A direction is determined if its singular value exceeds this share of the largest: 1e6 roundings.
+CUT = 1e-10
 # Grid of correlation times: from this share of the median interval to this many records, and count.
 SHORTEST, LONGEST, TIMES = 0.3, 5.0, 20
 # Central 68 %, one standard deviation to either side of a normal distribution, and its upper end.
@@ -199,6 +200,24 @@ class Whitened(NamedTuple):
         """Posterior over noise models with the first `numbers` free and the others held.
 
         Directions that the rows do not see, by a share of `CUT`, are left where they are.
+
+        Notes
+        -----
+        By each noise generalised least squares; its probability is the density of the residuals
+        integrated over the numbers (flat) and over the size of the errors (flat in its logarithm):
+        the restricted likelihood of D. A. Harville, Biometrika 61 (1974) 383, which the fitted
+        numbers do not bias, at even odds that a part of the noise is white where that is looked at.
+
+        Examples
+        --------
+        >>> noise = np.random.default_rng(3).normal(size=300)
+        >>> walk, time = np.zeros(300), np.arange(300.0)
+        >>> for k in range(1, 300):
+        ...     walk[k] = 0.8 * walk[k - 1] + 0.6 * noise[k]
+        >>> rows = np.column_stack([np.ones(300), walk - 5.0])
+        >>> found = whitened_by_each(usual_noises(time), [(rows, time)]).memory()
+        >>> print(f"{found.mean_step[0]:.1f}, {np.exp(-1 / found.time[found.likely]):.1f}")
+        4.9, 0.8
         """
         half, along, squares, logs = self._solved(numbers)
         weight = np.exp(logs - logs.max())
@@ -308,54 +327,12 @@ def noises(
 
 
 def usual_noises(time: np.ndarray) -> list[CorrelatedNoise]:
-    """Noises that readings at these times may have, as of `memory_of`."""
-    return noises(range_of(time), float(np.median(np.diff(time))), TIMES, BESIDE)
+    """Noises that readings at these times may have.
 
-
-def memory_of(
-    slopes: np.ndarray,
-    residuals: np.ndarray,
-    time: np.ndarray,
-    known: float | None = None,
-) -> Memory:
-    """Least squares with correlated errors, averaged over what the residuals leave open of them.
-
-    Parameters
-    ----------
-    slopes : array, shape (n, p)
-        Derivatives of the residuals by the numbers, in units of the errors.
-    residuals : array, shape (n,)
-        Model less reading, in the same units.
-    time : array, shape (n,)
-        When each was taken, increasing.
-    known : float, optional
-        The correlation time; 0 for independent errors. Otherwise it is averaged over.
-
-    Returns
-    -------
-    Memory
-
-    Notes
-    -----
-    At each correlation time generalised least squares; its probability is the density of the
-    residuals integrated over the numbers (flat) and over the size of the errors (flat in its
-    logarithm): the restricted likelihood of D. A. Harville, Biometrika 61 (1974) 383, which the
-    fitted numbers do not bias, times a prior flat in the logarithm of the correlation time, from
-    0.3 usual intervals to five times the record. Without levels a part of the noise may be white: a
-    monitor that drifts, read by a noisy converter, would pass for a short memory otherwise, and its
-    errors come out several times too small; the ratio of both is averaged over, too, at even odds
-    that there is one. Near the upper end the errors are a random walk: nothing tells its level, but
-    slope and bend the rows do tell.
-
-    Examples
-    --------
-    >>> noise = np.random.default_rng(3).normal(size=300)
-    >>> walk = np.zeros(300)
-    >>> for k in range(1, 300):
-    ...     walk[k] = 0.8 * walk[k - 1] + 0.6 * noise[k]
-    >>> found = memory_of(np.ones((300, 1)), walk - 5.0, np.arange(300.0))
-    >>> print(f"{found.mean_step[0]:.1f}, {np.exp(-1 / found.time[found.likely]):.1f}")
-    4.9, 0.8
+    From 0.3 usual intervals to five times the record, flat in the logarithm. A part of the noise
+    may be white: a monitor that drifts, read by a noisy converter, would pass for a short memory
+    otherwise, and its errors come out several times too small; the ratio of both is averaged over,
+    too. Near the upper end the errors are a random walk: nothing tells its level, but slope and
+    bend the rows do tell.
     """
-    grid = usual_noises(time) if known is None else [CorrelatedNoise(known)]
-    return whitened_by_each(grid, [(np.column_stack([slopes, residuals]), time)]).memory()
+    return noises(range_of(time), float(np.median(np.diff(time))), TIMES, BESIDE)
