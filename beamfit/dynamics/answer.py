@@ -14,8 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from beamfit.answer import Table, cell, json_of
+from beamfit.dynamics.alternatives import Alternatives
 from beamfit.dynamics.checks import Checks, HeldOutRun
-from beamfit.dynamics.input_laws import LawEvidence
 from beamfit.dynamics.limits import LagLimits
 from beamfit.dynamics.model import PreparedOutput, curves
 from beamfit.dynamics.response import ARX, FIRST_ORDER, SECOND_ORDER, Physics
@@ -98,7 +98,7 @@ def _quoted(model: Any, of: tuple[Any, float]) -> jax.Array:
 def quantities_of(
     fit: Fit,
     errors: Memory | None,
-    laws: LawEvidence | None,
+    others: Alternatives | None,
     seen: PreparedOutput,
     physics: Physics,
     delay: float,
@@ -106,8 +106,8 @@ def quantities_of(
     """Constant parameters with errors, and the offset and the delay if they are free."""
     m = len(seen.inputs)
     found = alone = derived(fit, errors, _quoted, (seen.runs[0], delay))
-    if laws is not None:
-        found = alone._replace(error=laws.error(alone.slope, alone.error))
+    if others is not None:
+        found = alone._replace(error=others.error(alone.slope, alone.error))
     names, units = list(physics.parameters(seen.inputs)), _units(physics, m)
     if physics is FIRST_ORDER:
         names, units = [*names, *(f"{k}/tau" for k in names[1:])], [*units, *[f"{GAIN}/s"] * m]

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.stats import t as student
 
-from beamfit.dynamics.input_laws import CORRELATION_TIMES, WHITE
+from beamfit.dynamics.alternatives import CORRELATION_TIMES, WHITE
 from beamfit.dynamics.model import PreparedOutput, steps_of
 from beamfit.dynamics.response import ARX, FIRST_ORDER
 from beamfit.dynamics.search import (

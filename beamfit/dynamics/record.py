@@ -161,32 +161,30 @@ def band_limited(runs: Sequence[Run]) -> tuple[str, ...]:
     return tuple(found)
 
 
-def between(run: Run, names: Sequence[str]) -> Run:
-    """The run with rows between its own, where some inputs move without high frequencies.
+def between_rows(u: np.ndarray, late: np.ndarray) -> np.ndarray:
+    """An input at parts of a sample after each of its samples, shape (samples, parts).
 
-    They go on by the sines that they are made of (C. E. Shannon 1949), mirrored at both ends.
+    It goes on by the sines that it is made of (C. E. Shannon 1949), mirrored at both ends.
     """
+    n = len(u)
+    waves = np.fft.rfft(np.concatenate([u, u[::-1]]))
+    turn = 2j * np.pi * np.fft.rfftfreq(2 * n)
+    return np.stack([np.fft.irfft(waves * np.exp(turn * s), 2 * n)[:n] for s in late], axis=1)
+
+
+def between(run: Run, names: Sequence[str]) -> Run:
+    """The run with rows between its own, where some inputs move without high frequencies."""
     n, inputs = len(run), {}
     rows = np.arange((n - 1) * PARTS + 1)
+    middle = (np.arange(PARTS) + 0.5) / PARTS
     for name, u in run.inputs.items():
-        waves = np.fft.rfft(np.concatenate([u, u[::-1]]))
-        turn = 2j * np.pi * np.fft.rfftfreq(2 * n)
-        late = (np.arange(PARTS) + 0.5) / PARTS  # each part holds its middle
-        moved = [np.fft.irfft(waves * np.exp(turn * s), 2 * n)[:n] for s in late]
-        fine = np.stack(moved if name in names else [u] * PARTS, axis=1)
+        fine = between_rows(u, middle) if name in names else np.repeat(u[:, None], PARTS, axis=1)
         inputs[name] = fine.ravel()[: len(rows)]
     outputs = {name: np.full(len(rows), np.nan) for name in run.outputs}
     for name, y in run.outputs.items():
         outputs[name][::PARTS] = y
     time = np.interp(rows / PARTS, np.arange(n), run.time)
     return replace(run, time=time, inputs=inputs, outputs=outputs, parts=PARTS)
-
-
-def recorded(run: Run) -> Run:
-    """The run without rows between those of its record."""
-    parts = slice(None, None, run.parts)
-    inputs, outputs = ({n: v[parts] for n, v in each.items()} for each in (run.inputs, run.outputs))
-    return replace(run, time=run.time[parts], inputs=inputs, outputs=outputs, parts=1)
 
 
 def ordered(run: Run, first: Run) -> Run:

@@ -219,17 +219,22 @@ def simulate_evenly(
     >>> [round(float(v), 4) for v in y]
     [0.0, 1.8964, 2.594, 2.8506]
     """
-    x0, turn = physics.begin(free, u[0]), (len(dt), u.shape[1])
+    x0 = physics.begin(free, u[0])
+    rest, none = jnp.zeros_like(x0), jnp.zeros(u.shape[1])
 
-    def after(x, now):
-        for step, felt in zip(dt, now.reshape(turn), strict=True):
-            x = physics.advance(p, x, felt, step)
-        return x
+    def moved(step):
+        return jax.jacfwd(lambda x, felt: physics.advance(p, x, felt, step), (0, 1))(rest, none)
 
-    rest, none = jnp.zeros_like(x0), jnp.zeros(turn[0] * turn[1])
-    a, b = jax.jacfwd(after, (0, 1))(rest, none)
-    read = Matrices(a, b, jnp.eye(1, len(x0)), jnp.zeros((1, len(none))), jnp.zeros(1))
-    return linear_outputs(read, u.reshape(-1, len(none)), x0)[0][:, 0]
+    def earlier(after, step):
+        return after @ step[0], after @ step[1]
+
+    a, into = jax.lax.scan(earlier, jnp.eye(len(x0)), jax.vmap(moved)(dt), reverse=True)
+    pushed = u.reshape(-1, into.shape[0] * into.shape[2]) @ jnp.swapaxes(into, 1, 2).reshape(
+        -1, len(x0)
+    )
+    n = len(x0)
+    read = Matrices(a, jnp.eye(n), jnp.eye(1, n), jnp.zeros((1, n)), jnp.zeros(1))
+    return linear_outputs(read, pushed, x0)[0][:, 0]
 
 
 def run_from(

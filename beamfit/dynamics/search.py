@@ -17,7 +17,6 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.optimize import minimize, minimize_scalar
 
 from beamfit.dynamics.model import (
     CLOSE,
@@ -28,7 +27,8 @@ from beamfit.dynamics.model import (
     predicted,
     weight_priors,
 )
-from beamfit.dynamics.record import Run
+from beamfit.dynamics.paths import Path, Paths, handed_on, with_rows
+from beamfit.dynamics.record import PARTS, Run, between
 from beamfit.dynamics.response import ARX, FIRST_ORDER, SECOND_ORDER, Physics
 from beamfit.errors import Status
 from beamfit.greybox.fit import Fit
@@ -37,18 +37,13 @@ from beamfit.greybox.problem import Free, Prior, Problem, Record
 from beamfit.greybox.solve import solve
 from beamfit.noise.memory import BESIDE, CorrelatedNoise, innovations, remembers
 
-# Longest delay that is tried, in samples, and as a share of the run.
-LATEST, SHARE = 24, 0.1
-# Gain in log likelihood that a longer delay needs over a shorter one; fractions of a sample
-# that are tried besides.
-BETTER, PARTS = 5.0, (-0.75, -0.5, -0.25, 0.25, 0.5, 0.75)
-# Where the search for a fraction ends, in samples; the fit goes on from there.
-CLOSE_DELAY = 0.02
 # Time constants of the grid, and dampings of a second order.
 LAGS, DAMPINGS = 16, (0.2, 0.6, 1.0, 2.0)
-# Step of their logarithms in a slope; their range, in intervals and in runs, beyond which nothing
-# tells them from zero and from infinity.
-STEP, RANGE = 1e-3, (1e-3, 1e3)
+# How many times the grid is laid anew about its best, and the paths that are looked at together.
+ZOOMS, BATCH = 2, 16
+# Range of time constants, in intervals and in runs, beyond which nothing tells them from zero and
+# from infinity.
+RANGE = (1e-3, 1e3)
 
 
 # Most half periods in a run of a drift of the output.
@@ -66,58 +61,81 @@ def drift_columns(times: Sequence[Any], i: int) -> jax.Array:
 
 
 class Start(NamedTuple):
-    """Parameters, first states (runs, free states), offset, and -2 ln L with the drift's cost."""
+    """A path, parameters, first states (runs, free states), offset, and -2 ln of the probability
+    of all, with the cost of a drift.
+    """
 
+    path: Path
     p: np.ndarray
     first: np.ndarray
     offset: float
     cost: float
 
-    def model(self, seen: PreparedOutput) -> dict[str, Any]:
+    def model(self, physics: Physics, inputs: int) -> dict[str, Any]:
         """The model that a search begins with."""
-        raw = seen.runs[0].physics.raw(jnp.asarray(self.p), len(seen.inputs))
+        raw = physics.raw(jnp.asarray(self.p), inputs)
         return {"map": raw, "start": self.first, "offset": self.offset, "late": 0.0}
 
 
-def best_start(seen: PreparedOutput, offset: bool) -> Start:
-    """The best of the grid, of a difference equation that of second orders (eqs 13, 14)."""
-    physics = seen.runs[0].physics
-    apart, span = seen.apart, seen.span
-    times = np.geomspace(0.1 * apart, span, LAGS)
-    grid = np.log([[t] for t in times] if physics is FIRST_ORDER
-                  else [[t, z] for t in times for z in DAMPINGS])  # fmt: skip
+class _Grid(NamedTuple):
+    """Least squares of runs for time constants of a grid, the inputs having taken some path."""
 
-    def shapes(logarithms: np.ndarray) -> np.ndarray:
+    seen: PreparedOutput
+    physics: Physics
+    offset: bool
+    runs: tuple[Run, ...]
+    starts: np.ndarray
+
+    def shapes(self, logarithms: np.ndarray) -> np.ndarray:
+        """Shapes of the response by logarithms of a time constant and a damping."""
         found = np.exp(logarithms)
-        return found if physics is not ARX else difference(found, apart)
+        return found if self.physics is not ARX else difference(found, self.seen.apart)
 
-    def triangles(shapes: np.ndarray) -> np.ndarray:
-        return np.asarray(_triangles(seen.runs, seen.measured, shapes, offset))
+    def best(self, paths: Sequence[Path]) -> list[Start]:
+        """The best start by each path."""
+        found = []
+        for k in range(0, len(paths), BATCH):
+            some = [*paths[k : k + BATCH]]
+            found += self._best([*some, *some[:1] * (BATCH - len(some))])[: len(some)]
+        return found
 
-    def left(logarithms: np.ndarray) -> np.ndarray:
-        return _costs(triangles(shapes(logarithms)), seen).min(axis=1)
+    def _best(self, paths: Sequence[Path]) -> list[Start]:
+        seen, every = self.seen, np.arange(len(paths))
+        drives, measured = with_rows(self.runs, seen, self.physics, self.starts)
+        counts = [len(drive.dt) // len(self.starts) for drive in drives]
+        inputs = [u[..., 0] for u in handed_on(self.runs, counts, paths, self.starts)]
+        times = np.log(np.geomspace(0.1 * seen.apart, seen.span, LAGS))
+        damped = self.physics is not FIRST_ORDER
+        axes = [times, np.log(DAMPINGS)] if damped else [times]
+        grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(axes))
+        grid, reach = np.tile(grid, (len(paths), 1, 1)), np.array([a[1] - a[0] for a in axes])
+        around = np.stack(np.meshgrid(*[np.linspace(-1, 1, len(a)) for a in axes], indexing="ij"),
+                          axis=-1).reshape(-1, len(axes))  # fmt: skip
+        for zoom in range(ZOOMS + 1):
+            triangles = np.asarray(
+                _triangles(drives, tuple(measured), inputs, self.shapes(grid), self.offset)
+            )
+            costs = _costs(triangles, seen)
+            at = costs.min(axis=2).argmin(axis=1)
+            if zoom < ZOOMS:
+                grid = grid[every, at][:, None] + reach * around
+                reach = reach * 2.0 / (np.array([len(a) for a in axes]) - 1.0)
+        best = paths, self.shapes(grid[every, at]), triangles[every, at], costs[every, at]
+        return [self._start(*each) for each in zip(*best, strict=True)]
 
-    def with_slope(x: np.ndarray) -> tuple[float, np.ndarray]:
-        moved = STEP * np.eye(len(x))
-        here, up, down = np.split(left(np.vstack([x, x + moved, x - moved])), [1, 1 + len(x)])
-        return float(here[0]), (up - down) / (2.0 * STEP)
-
-    bounds = [tuple(np.log(np.multiply(RANGE, (apart, span))))] * grid.shape[1]
-    begin = grid[np.argmin(left(grid))]
-    x = minimize(with_slope, begin, jac=True, bounds=bounds, method="L-BFGS-B").x
-    (shape,) = shapes(x[None])
-    triangle = triangles(shape[None])
-    (costs,), triangle = _costs(triangle, seen), triangle[0]
-    waves = DRIFT * len(seen.runs)
-    design = triangle[:, : triangle.shape[1] - 1 - waves + len(seen.runs) * int(costs.argmin())]
-    size = np.linalg.norm(design, axis=0)
-    size = np.where(size > 0, size, 1.0)
-    found = np.linalg.lstsq(design / size, triangle[:, -1], rcond=1e-10)[0] / size
-    found = found[: triangle.shape[1] - 1 - waves]
-    k = len(seen.runs) * physics.free_states + offset
-    first = found[len(found) - k :][: k - offset].reshape(len(seen.runs), -1)
-    p, level = np.append(shape, found[: len(found) - k]), float(found[-1]) if offset else 0.0
-    return Start(p, first, level, float(costs.min()))
+    def _start(
+        self, path: Path, shape: np.ndarray, triangle: np.ndarray, costs: np.ndarray
+    ) -> Start:
+        """The start of a path by a triangular factor and costs of drifts."""
+        runs, own = len(self.runs), triangle.shape[1] - 1 - DRIFT * len(self.runs)
+        design = triangle[:, : own + runs * int(costs.argmin())]
+        size = np.linalg.norm(design, axis=0)
+        size = np.where(size > 0, size, 1.0)
+        found = (np.linalg.lstsq(design / size, triangle[:, -1], rcond=1e-10)[0] / size)[:own]
+        k = runs * self.physics.free_states + self.offset
+        first = found[own - k :][: k - self.offset].reshape(runs, -1)
+        level = float(found[-1]) if self.offset else 0.0
+        return Start(path, np.append(shape, found[: own - k]), first, level, float(costs.min()))
 
 
 def _costs(triangles: np.ndarray, seen: PreparedOutput) -> np.ndarray:
@@ -126,8 +144,8 @@ def _costs(triangles: np.ndarray, seen: PreparedOutput) -> np.ndarray:
     The Bayesian information criterion, with the noise's size at its likeliest.
     """
     runs, count = len(seen.runs), sum(map(len, seen.measured))
-    used = triangles.shape[2] - 1 - runs * DRIFT + runs * np.arange(DRIFT + 1)
-    missed = np.stack([np.sum(triangles[:, k:, -1] ** 2, axis=1) for k in used], axis=1)
+    used = triangles.shape[-1] - 1 - runs * DRIFT + runs * np.arange(DRIFT + 1)
+    missed = np.stack([np.sum(triangles[..., k:, -1] ** 2, axis=-1) for k in used], axis=-1)
     least = count * (CLOSE * seen.size_y) ** 2
     return count * np.log(np.maximum(missed, least)) + np.log(count) * used
 
@@ -163,20 +181,26 @@ def linear_columns(runs: Sequence[Driven], i: int, shapes: jax.Array, offset: bo
     return jnp.concatenate([columns[..., :-k], jnp.pad(columns[..., -k:], others), level], axis=2)
 
 
-@partial(jax.jit, static_argnums=3)
-def _triangles(runs: tuple[Driven, ...], measured: Any, shapes: jax.Array, offset: bool):
+@partial(jax.jit, static_argnums=4)
+def _triangles(runs: tuple[Driven, ...], measured: Any, inputs: Any, shapes: Any, offset: bool):
     """Triangular factors of outputs of unit gains, first states and offset, cosines of a drift of
-    each run, from the slowest, and of the readings: one for each shape.
+    each run, from the slowest, and of the readings: for each path one for each of its shapes.
     """
-    parts = []
-    for i, y in enumerate(measured):
-        waves = drift_columns([run.time for run in runs], i)
-        rest = jnp.concatenate([waves.reshape(len(y), -1), y[:, None]], axis=1)
-        rest = jnp.broadcast_to(rest, (len(shapes), *rest.shape))
-        parts.append(jnp.concatenate([linear_columns(runs, i, shapes, offset), rest], axis=2))
-    rows = jnp.concatenate(parts, axis=1)
-    few = max(0, rows.shape[2] - rows.shape[1])
-    return jnp.linalg.qr(jnp.pad(rows, ((0, 0), (0, few), (0, 0))), mode="r")
+
+    def one(asked):
+        inputs, shapes = asked
+        felt = [replace(run, u=u) for run, u in zip(runs, inputs, strict=True)]
+        parts = []
+        for i, y in enumerate(measured):
+            waves = drift_columns([run.time for run in runs], i)
+            rest = jnp.concatenate([waves.reshape(len(y), -1), y[:, None]], axis=1)
+            rest = jnp.broadcast_to(rest, (len(shapes), *rest.shape))
+            parts.append(jnp.concatenate([linear_columns(felt, i, shapes, offset), rest], axis=2))
+        rows = jnp.concatenate(parts, axis=1)
+        few = max(0, rows.shape[2] - rows.shape[1])
+        return jnp.linalg.qr(jnp.pad(rows, ((0, 0), (0, few), (0, 0))), mode="r")
+
+    return jax.lax.map(one, (inputs, shapes))
 
 
 def driven_by(seen: PreparedOutput, physics: Physics) -> tuple[Driven, ...]:
@@ -184,9 +208,14 @@ def driven_by(seen: PreparedOutput, physics: Physics) -> tuple[Driven, ...]:
     return tuple(replace(run, physics=physics) for run in seen.runs)
 
 
-def seen_of(runs: tuple[Run, ...], output: str, physics: Physics, delay: float) -> PreparedOutput:
-    """The runs as the model sees them."""
-    drives = tuple(driven(run, i, output, physics, delay) for i, run in enumerate(runs))
+def prepared(
+    runs: Sequence[Run], output: str, physics: Physics, path: Path, more: float = 0.0
+) -> PreparedOutput:
+    """Runs as the model sees them behind a path without a law, `more` rows later."""
+    late = path.delay
+    if path.moving:
+        runs, late = [between(run, path.moving) for run in runs], PARTS * path.delay + more
+    drives = tuple(driven(run, i, output, physics, late) for i, run in enumerate(runs))
     read = [np.isfinite(run.outputs[output]) for run in runs]
     measured = tuple(run.outputs[output][k] for run, k in zip(runs, read, strict=True))
     time = tuple(run.time[k] for run, k in zip(runs, read, strict=True))
@@ -195,51 +224,6 @@ def seen_of(runs: tuple[Run, ...], output: str, physics: Physics, delay: float) 
     return PreparedOutput(
         tuple(runs[0].inputs), output, drives, measured, time, u.mean(0), u.std(0), spread
     )
-
-
-def starts_of(
-    runs: tuple[Run, ...], output: str, physics: Physics, delay: float | None, offset: bool
-) -> list[tuple[Start, PreparedOutput, float]]:
-    """The best start, and the delay: the shortest of those that fit about as well as any. After it
-    the best with a part of a sample in the delay.
-
-    A delay below zero must do as much better: it stands for clocks of input and output that differ.
-    The delay of a difference equation is that of a second order: its own gains of two samples let a
-    shorter one pass.
-    """
-
-    def at(late: float, law: Physics = physics) -> tuple[Start, PreparedOutput, float]:
-        seen = seen_of(runs, output, law, late)
-        return best_start(seen, offset), seen, late
-
-    if delay is not None:
-        return [at(delay)]
-    law = SECOND_ORDER if physics is ARX else physics
-    step = runs[0].parts
-    found = [at(late, law) for late in range(0, latest(runs) + 1, step)]
-    near = 2.0 * BETTER + min(start.cost for start, _, _ in found)
-    whole = next(each for each in found if each[0].cost <= near)
-    while whole[2] <= 0 and whole[2] > -latest(runs):
-        earlier = at(whole[2] - step, law)
-        if earlier[0].cost + 2.0 * BETTER >= whole[0].cost:
-            break
-        whole = earlier
-    if physics.even:
-        return [at(whole[2])]
-    longest = max(latest(runs), step)
-    parts = [at(whole[2] + step * part) for part in PARTS if whole[2] + step * part < longest]
-    middle = min([whole, *parts], key=lambda each: each[0].cost)[2]
-    ends = middle - 0.25 * step, min(middle + 0.25 * step, longest)
-    found = minimize_scalar(
-        lambda late: at(late)[0].cost, bounds=ends, options={"xatol": CLOSE_DELAY}
-    )
-    return [whole, at(found.x)] if found.fun < whole[0].cost else [whole]
-
-
-def latest(runs: tuple[Run, ...]) -> int:
-    """The longest delay that is tried, in rows."""
-    step = runs[0].parts
-    return step * min(LATEST, int(SHARE * min(map(len, runs)) / step))
 
 
 def noises_of(
@@ -623,39 +607,88 @@ def fitted(case: Case, models: Sequence[Any]) -> Settled:
 
 
 class Begun(NamedTuple):
-    """Runs as the model sees them, the delay, and the fit with constant parameters."""
+    """Runs as the model sees them behind a path, the delay in its rows, and the fit."""
 
     seen: PreparedOutput
+    path: Path
     delay: float
     plain: Settled
 
+    @property
+    def parts(self) -> int:
+        """Rows a sample."""
+        return PARTS if self.path.moving else 1
 
-def begun(
-    runs: tuple[Run, ...], output: str, physics: Physics, delay: float | None, offset: bool
-) -> Begun:
-    """Identify with constant parameters; the delay among candidates if None.
+    @property
+    def exact(self) -> float:
+        """The delay in samples, by the fit where it is no whole number of rows."""
+        late = float(self.plain.fit.model["late"]) if self.delay % 1.0 else 0.0
+        return (self.delay + late) / self.parts
 
-    A part of a sample in the delay must do better by the Bayesian information criterion, under the
-    noise that the fits have. If it makes the delay negative it must do as much better as another
-    whole number; also if times jitter, of which late ones see a new input in its own row.
-    """
-    starts = starts_of(runs, output, physics, delay, offset)
-    whole, *part = (
-        Begun(seen, late, fitted(case_of(seen, offset), [start.model(seen)]))
-        for start, seen, late in starts
-    )
-    for other in part:
-        doubtful = other.delay < 0 <= whole.delay or whole.plain.jitter.any()
-        margin = 2.0 * BETTER if doubtful else 0.0
-        if other.plain.likelihood + margin < whole.plain.likelihood:
-            return other
-    return whole
+    def contains(self, path: Path) -> bool:
+        """True if the fit is by that path, or estimates its delay."""
+        if path.law is not None or path.moving != self.path.moving:
+            return False
+        apart = abs(path.delay - self.exact)
+        return apart < (1.0 / self.parts if self.delay % 1.0 else 1e-9)
 
 
-def is_first_order(found: Begun, offset: bool) -> bool:
-    """True if a first order does as well as a higher one by the Bayesian information criterion."""
-    if found.seen.runs[0].physics is FIRST_ORDER:
-        return False
-    lower = found.seen._replace(runs=driven_by(found.seen, FIRST_ORDER))
-    start = best_start(lower, offset)
-    return fitted(case_of(lower, offset), [start.model(lower)]).likelihood <= found.plain.likelihood
+class Asked(NamedTuple):
+    """Output, physics and paths of a search, and whether the output at rest is a free number."""
+
+    output: str
+    physics: Physics
+    paths: Paths
+    offset: bool
+
+    def starts(self, runs: tuple[Run, ...], physics: Physics, paths: Sequence[Path]) -> list[Start]:
+        """The best start of a physics by each path."""
+        seen = prepared(runs, self.output, physics, Path(None, (), 0.0))
+        rows = self.paths.starts(paths[0].delay)
+        return _Grid(seen, physics, self.offset, runs, rows).best(paths)
+
+    def start(self, runs: tuple[Run, ...]) -> Start:
+        """The likeliest start, noise being white: by a whole delay, or a part of a sample about it.
+
+        The delay of a difference equation is that of a second order: its own gains of two samples
+        let a shorter one pass.
+        """
+        law = SECOND_ORDER if self.physics is ARX and len(self.paths.delays) > 1 else self.physics
+
+        def cost(start: Start) -> float:
+            return start.cost - 2.0 * self.paths.log_prior(start.path)
+
+        found = min(self.starts(runs, law, self.paths.plain()), key=cost)
+        if parts := self.paths.around(found.path, self.paths.starts(0.0)):
+            found = min([found, *self.starts(runs, law, parts)], key=cost)
+        return found if law is self.physics else self.starts(runs, self.physics, [found.path])[0]
+
+    def begun(self, runs: tuple[Run, ...]) -> Begun:
+        """Identify with constant parameters."""
+        start = self.start(runs)
+        return self.along(runs, start.path, start.model(self.physics, len(runs[0].inputs)))
+
+    def along(self, runs: tuple[Run, ...], path: Path, model: dict[str, Any]) -> Begun:
+        """Identify with constant parameters by a path, from a model.
+
+        A part of a sample is a number of the fit; of an input that moves between samples it lies
+        within a row to either side.
+        """
+        aside = (-0.5, 0.5) if path.moving and path.part and len(self.paths.delays) > 1 else (0.0,)
+        found = []
+        for more in aside:
+            seen = prepared(runs, self.output, self.physics, path, more)
+            late = path.delay * (PARTS if path.moving else 1) + more
+            fit = fitted(case_of(seen, self.offset), [model | {"late": 0.0}])
+            found.append(Begun(seen, path, late, fit))
+        return min(found, key=lambda each: each.plain.likelihood)
+
+    def is_first_order(self, runs: tuple[Run, ...], found: Begun) -> bool:
+        """True if a first order does as well as a higher one by the information criterion."""
+        if self.physics is FIRST_ORDER:
+            return False
+        lower = found.seen._replace(runs=driven_by(found.seen, FIRST_ORDER))
+        (start,) = self.starts(runs, FIRST_ORDER, [found.path])
+        model = start.model(FIRST_ORDER, len(found.seen.inputs))
+        fit = fitted(case_of(lower, self.offset), [model])
+        return fit.likelihood <= found.plain.likelihood
