@@ -10,7 +10,7 @@ off. The likeliest is named, and what stays open goes into errors.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
@@ -21,9 +21,9 @@ import numpy as np
 from scipy.special import expit, logsumexp
 
 from beamfit.dynamics.checks import RunSlopes, slow_paths
-from beamfit.dynamics.input_laws import STATIC, InputLaw, laws_between
+from beamfit.dynamics.input_laws import STATIC, InputLaw, laws_between, moved
 from beamfit.dynamics.model import Driven, PreparedOutput, predicted
-from beamfit.dynamics.paths import Path, Paths, handed_on, with_rows
+from beamfit.dynamics.paths import Path, Paths, handed_on, undriven
 from beamfit.dynamics.record import Run
 from beamfit.dynamics.search import Begun, noises_of
 from beamfit.greybox import tree
@@ -41,9 +41,11 @@ ZOOMS = 2
 SAME = 1e-6
 # Largest residual, of a step that went astray.
 VAST = 1e100
-# Gauss-Newton rounds of each, noises in those after the first, and shorter delays that a law may
-# stand for.
-ROUNDS, FEW, LATE = 4, 4, 3
+# Gauss-Newton rounds of all, and of the `MANY` that are likeliest then; every how many-th noise of
+# the grid the first one looks at, and how many the others.
+FIRST, MANY, ROUNDS, SPREAD, FEW = 2, 128, 3, 3, 4
+# Shorter delays that a law may stand for.
+LATE = 3
 # Alternatives that are fitted at once: one program is compiled for all.
 BATCH = 64
 
@@ -54,6 +56,11 @@ class Trial(NamedTuple):
     path: Path
     prior: float
     term: int | None = None
+
+    @property
+    def lawful(self) -> bool:
+        """True for a law or a further term."""
+        return self.path.law is not None or self.term is not None
 
 
 class Alternatives(NamedTuple):
@@ -103,21 +110,21 @@ class Alternatives(NamedTuple):
 def _triangles(chosen: Any, model: Any, run: Driven, data: Any, theta: Any, u: Any, noise: Any):
     """Triangular factors of slopes and residuals of each trial, and log volumes, by each noise.
 
-    `data` are readings, their times, their errors, and what is added; `noise` all that
-    are looked at, which of them first, and how many. The last number is the share of what is added,
-    or by how much the width of a law is another.
+    `data` are readings, their times, their errors, what is added, and the parts of a row in delays;
+    `noise` all that are looked at, which of them first, and how many. The last number is the share
+    of what is added, or by how much the width of a law is another.
     """
-    y, time, error, term = data
+    y, time, error, term, part = data
     every, order, count = noise
 
-    def one(theta, u, term):
+    def one(theta, u, term, part):
         def output(t):
-            own = replace(run, u=u[..., 0] + t[-1] * u[..., 1])
+            own = replace(run, u=u[..., 0] + t[-1] * u[..., 1], part=part)
             return predicted(tree.replace(model, chosen, t[:-1]), own) + t[-1] * term
 
         return with_slope(output, theta)
 
-    value, slope = jax.vmap(one)(theta, u, term)
+    value, slope = jax.vmap(one)(theta, u, term, part)
     rows = jnp.concatenate([slope, (value - y)[..., None]], axis=2) / error[:, None]
     rows = jnp.swapaxes(jnp.clip(jnp.nan_to_num(rows, nan=VAST), -VAST, VAST), 0, 1)
 
@@ -137,6 +144,7 @@ class _Batch(NamedTuple):
 
     comparison: Comparison
     inputs: list[np.ndarray]
+    part: np.ndarray
     terms: list[np.ndarray]
 
     def whitened(self, theta: np.ndarray, noises: Sequence[int]) -> Whitened:
@@ -147,7 +155,7 @@ class _Batch(NamedTuple):
         triangles, volume, count = [], 0.0, 0
         for run, data, term, u in zip(c.drives, c.data, self.terms, self.inputs, strict=True):
             noise = grid, order, len(some)
-            each = _triangles(c.chosen, c.model, run, (*data, term), theta, u, noise)
+            each = _triangles(c.chosen, c.model, run, (*data, term, self.part), theta, u, noise)
             triangles.append(np.asarray(each[0])[some])
             volume, count = volume + np.asarray(each[1])[some], count + len(data[0])
         prior = np.eye(len(c.begin))[c.near]
@@ -158,16 +166,16 @@ class _Batch(NamedTuple):
         both, volume = both.reshape(-1, *both.shape[2:]), np.repeat(volume, len(theta))
         return Whitened(noise, both, volume, count + len(prior))
 
-    def fitted(self, begin: np.ndarray) -> np.ndarray:
-        """The numbers of each trial, by Gauss-Newton steps that lower -2 ln L.
+    def fitted(self, begin: np.ndarray, rounds: int) -> tuple[np.ndarray, np.ndarray]:
+        """The numbers of each trial, by Gauss-Newton steps that lower -2 ln L, and its least.
 
-        The first step is by the noise that is likeliest with each trial, further ones by the `FEW`
-        that are so with the likeliest trials.
+        The first step is by the noise of a few that is likeliest with each trial, further ones by
+        the `FEW` that are so with the likeliest trials.
         """
-        count, noises = len(begin), np.arange(len(self.comparison.grid.time))
+        count, noises = len(begin), np.arange(len(self.comparison.grid.time))[::SPREAD]
         best, each = begin, np.arange(count)
         step, least = np.zeros_like(best), np.full(count, np.inf)
-        for _ in range(ROUNDS):
+        for _ in range(rounds):
             white = self.whitened(best + step, noises)
             memory, squares = white.memory(), np.sum(white.triangle[..., -1] ** 2, axis=1)
             now, after = (_minus(white, s).reshape(-1, count) for s in (squares, memory.squares))
@@ -179,11 +187,11 @@ class _Batch(NamedTuple):
             step = np.where(better[:, None], further, 0.25 * step)
             ranked = noises[likeliest[np.argsort(after.min(axis=0))]]
             noises = np.array(list(dict.fromkeys(ranked))[:FEW])
-        return best
+        return best, np.minimum(least, after.min(axis=0))
 
     def weighed(self, begin: np.ndarray) -> tuple[np.ndarray, ...]:
         """Log evidence, numbers and covariances of each trial, numbers and noise integrated out."""
-        at, grid = self.fitted(begin), len(self.comparison.grid.time)
+        (at, _), grid = self.fitted(begin, ROUNDS), len(self.comparison.grid.time)
         white = self.whitened(at, range(grid))
         memory, logs = white.weighed()
         logs = logs.reshape(grid, -1)
@@ -264,7 +272,7 @@ class Comparison(NamedTuple):
     runs: tuple[Run, ...]
     drives: tuple[Driven, ...]
     data: list[tuple[np.ndarray, ...]]
-    starts: np.ndarray
+    parts: int
     chosen: tuple[Any, ...]
     model: Any
     begin: np.ndarray
@@ -278,8 +286,7 @@ class Comparison(NamedTuple):
     ) -> Comparison:
         """That of the fit of runs; `slopes` has terms of a fuller response."""
         seen, fit = found.seen, found.plain.fit
-        starts = paths.starts(found.exact)
-        drives, measured = with_rows(runs, seen, seen.runs[0].physics, starts, MOST)
+        drives, measured = undriven(runs, seen.output, seen.runs[0].physics, paths.parts, MOST)
         errors = [noise.each[:MOST] for (noise,) in found.plain.noise]
         data = list(zip(measured, [time[:MOST] for time in seen.time], errors, strict=True))
         more, bent = [], _bent(seen)
@@ -296,26 +303,36 @@ class Comparison(NamedTuple):
         grid = CorrelatedNoise(*np.array(noises_of(seen.time, CORRELATION_TIMES, WHITE)).T)
         begin = np.append(fit.theta[: len(numbers)], 0.0)
         model = core.model | {"late": jnp.zeros(())}
-        return cls(runs, drives, data, starts, chosen, model, begin, near, grid, terms)
+        return cls(runs, drives, data, paths.parts, chosen, model, begin, near, grid, terms)
 
     def weighed(self, trials: list[Trial]) -> _Weighed:
-        """Fit and weigh trials from the numbers of the fit, `BATCH` at once."""
+        """Weigh trials: those of no law, and the likeliest after a step or two from the fit."""
         begin = np.tile(self.begin, (len(trials), 1))
-        counts = [len(drive.dt) // len(self.starts) for drive in self.drives]
-        found = []
+        if len(trials) > MANY:
+            steps = [batch.fitted(each, FIRST) for batch, each in self._batches(trials, begin)]
+            parts = zip(*steps, strict=True)
+            begin, cost = (np.concatenate(part)[: len(trials)] for part in parts)
+            cost -= [2.0 * t.prior if t.lawful else np.inf for t in trials]
+            kept = np.argsort(cost)[:MANY]
+            trials, begin = [trials[k] for k in kept], begin[kept]
+        found = [batch.weighed(each) for batch, each in self._batches(trials, begin)]
+        parts = (np.concatenate(part)[: len(trials)] for part in zip(*found, strict=True))
+        return _Weighed(trials, *parts)
+
+    def _batches(
+        self, trials: list[Trial], begin: np.ndarray
+    ) -> Iterator[tuple[_Batch, np.ndarray]]:
+        """`BATCH` trials at once, the last ones repeated, and where they begin."""
+        more = -len(trials) % BATCH
+        trials, begin = trials + trials[-1:] * more, np.pad(begin, ((0, more), (0, 0)), mode="edge")
         for k in range(0, len(trials), BATCH):
-            some, first = trials[k : k + BATCH], begin[k : k + BATCH]
-            more = BATCH - len(some)
-            first = np.concatenate([first, np.repeat(first[:1], more, axis=0)])
-            paths = [trial.path for trial in [*some, *some[:1] * more]]
-            inputs = handed_on(self.runs, counts, paths, self.starts)
-            terms = []
-            for each in self.terms:
-                own = [each[t.term] if t.term is not None else 0.0 * each[0] for t in some]
-                terms.append(np.stack([*own, *[0.0 * each[0]] * more]))
-            batch = _Batch(self, inputs, terms).weighed(first)
-            found.append([part[: len(some)] for part in batch])
-        return _Weighed(trials, *map(np.concatenate, zip(*found, strict=True)))
+            some = trials[k : k + BATCH]
+            inputs, part = handed_on(
+                self.runs, self.drives, self.parts, [trial.path for trial in some]
+            )
+            terms = [np.stack([0.0 * each[0] if t.term is None else each[t.term] for t in some])
+                     for each in self.terms]  # fmt: skip
+            yield _Batch(self, inputs, part, terms), begin[k : k + BATCH]
 
 
 def alternatives_of(
@@ -332,7 +349,7 @@ def alternatives_of(
     """
     comparison = Comparison.of(runs, found, paths, slopes)
     own = found.path._replace(delay=found.exact)
-    plain = [own, *paths.plain(), *paths.around(own, comparison.starts)]
+    plain = [own, *paths.plain(), *paths.around(own.delay)]
     trials = [Trial(path, paths.log_prior(path)) for path in dict.fromkeys(plain)]
     if lawful:
         terms = len(comparison.terms[0])
@@ -369,7 +386,7 @@ def _lawful(comparison: Comparison, own: Path, paths: Paths) -> list[Trial]:
     """
     runs = comparison.runs
     delays, whole = [own.delay], int(np.ceil(own.delay))
-    if len(paths.delays) > 1:
+    if not paths.given:
         delays += range(max(0, whole - LATE), whole)
     ways = [Path(None, kind, float(delay)) for delay in delays for kind in paths.kinds]
     laws = [law for name in runs[0].inputs for law in _laws_of(runs, name)]
@@ -385,12 +402,14 @@ def _laws_of(runs: Sequence[Run], name: str) -> list[InputLaw]:
     before is a number at the start.
     """
     inputs = [run.inputs[name] for run in runs]
-    since = [int(np.argmax(u != u[0])) for u in inputs]
-    plain = np.concatenate([u[row:] for u, row in zip(inputs, since, strict=True)])
+    since = [u[int(np.argmax(u != u[0])) :] for u in inputs]
+    plain = np.concatenate(since)
     laws = laws_between(name, *map(float, (min(map(np.min, inputs)), max(map(np.max, inputs)))))
-    paths, k = [Path(law, (), 0.0) for law in laws], list(runs[0].inputs).index(name)
-    behind = handed_on(runs, [len(run) for run in runs], paths, np.zeros(1))
-    at = np.concatenate([u[:, row:, k, 0] for u, row in zip(behind, since, strict=True)], axis=1).T
+    at = np.stack([
+        np.concatenate([moved(u, law.kind, law.width, law.place)[-len(some) :]
+                        for u, some in zip(inputs, since, strict=True)])
+        for law in laws
+    ], axis=1)  # fmt: skip
     basis = np.linalg.qr(np.stack([np.ones(len(plain)), plain], axis=1))[0]
     at = at - at.mean(axis=0)
     left = np.linalg.norm(at - basis @ (basis.T @ at), axis=0)

@@ -30,10 +30,10 @@ from beamfit.dynamics.checks import (
 )
 from beamfit.dynamics.limits import LagLimits, lag_limits
 from beamfit.dynamics.model import PreparedOutput, network_of, output_of
-from beamfit.dynamics.paths import Paths, latest
+from beamfit.dynamics.paths import Paths, latest, prepared
 from beamfit.dynamics.record import Run, band_limited, check_inputs, checked
 from beamfit.dynamics.response import PHYSICS, Physics
-from beamfit.dynamics.search import Asked, Begun, Case, Settled, case_of, fitted, prepared, used_by
+from beamfit.dynamics.search import Asked, Begun, Case, Settled, case_of, fitted, used_by
 from beamfit.errors import InputError, Status, nearest
 from beamfit.greybox.fit import Fit
 from beamfit.noise.memory import CorrelatedNoise
@@ -249,11 +249,10 @@ def _answered(
     evidence = (fit, answer.rests, checks, quantities, curves, ahead, map)
     exact = found._replace(plain=answer).exact
     exact = int(exact) if exact == int(exact) else exact
-    given = len(paths.delays) == 1
     rms = float(np.sqrt(np.mean(answer.rms**2)))
-    early = 0.0 if given else max(-exact, 0.0)
+    early = 0.0 if paths.given else max(-exact, 0.0)
     status, message = judged({output: ResponseEvidence(*evidence, rms, early)})
-    longest = [LATEST] if not given and exact == latest(runs) > 0 else []
+    longest = [LATEST] if not paths.given and exact == latest(runs) > 0 else []
     message = " ".join([message, *longest, *(f"Left out: {each}." for each in left_out)])
     noise = tuple(answer.rms[:, 0].tolist())
     parts = (quantities, curves, noise, answer.memory, checks, ahead, left_out)
@@ -284,8 +283,7 @@ def _likeliest(
 
 def _ahead(run: Run, output: str, answer: Settled, physics: Physics, found: Begun) -> HeldOutRun:
     """Predict a run that was held back."""
-    path = found.path._replace(delay=found.delay / found.parts)
-    seen = prepared((run,), output, physics, path)
+    seen = prepared((run,), output, physics, found.path)
     start = {"start": np.zeros((1, physics.free_states))}
     (rest,) = Case((seen,), seen.runs, (), ()).ahead(answer, start)
     return HeldOutRun.of(run.name, rest, seen.measured[0])
@@ -309,16 +307,15 @@ def _known(
     """Tests of the residuals, and what the runs determine of constants or curves."""
     seen, constant, (_, physics, paths, offset) = found.seen, asked.map == "constant", asked.search
     jitter = float(answer.jitter.max())
-    sample = found.parts * (1 if seen.part == 0.0 else 2)  # in rows
     errors = [noise.each for (noise,) in answer.noise]
     checks = checks_of(
         seen,
         tuple(rest for (rest,) in answer.rest),
-        RunNoises(seen.time, errors, answer.likely, sample if jitter else 0),
+        RunNoises(seen.time, errors, answer.likely, seen.parts if jitter else 0),
         slopes_of(seen, answer.fit),
         used_by(answer.fit),
         None if constant else found.plain.likelihood - answer.likelihood,
-        int(np.ceil(found.delay)) * (1 if found.delay % 1 == 0 else 2),  # in rows
+        int(np.floor(seen.delay)),
     )
     checks = checks._replace(
         first_order=constant and asked.search.is_first_order(runs, found),
@@ -332,7 +329,7 @@ def _known(
             law=others.likeliest, law_probability=1.0 - others.none, static_law=others.static
         )
     parts = answer.fit, answer.errors
-    quantities = quantities_of(*parts, others, seen, physics, found.delay) if constant else {}
+    quantities = quantities_of(*parts, others, seen, physics) if constant else {}
     limits = lag_limits(seen, answer, offset) if constant else LagLimits(None, None)
     curves = () if constant else curves_of(*parts, seen)
     return checks, *told(quantities, curves, seen, checks, limits)

@@ -6,20 +6,22 @@ Every path hands on rows of its own, as many a sample for all paths of a compari
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import groupby
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 
 from beamfit.dynamics.input_laws import InputLaw, moved
 from beamfit.dynamics.model import EQUAL, Driven, PreparedOutput
-from beamfit.dynamics.record import PARTS, Run, between_rows
+from beamfit.dynamics.record import PARTS, Run, rows_of
 from beamfit.dynamics.response import Physics
 from beamfit.greybox.problem import padded_length
 
-# Longest delay that is tried, in samples, and as a share of the run.
-LATEST, SHARE = 24, 0.1
+# Longest delay that is tried, in samples, and as a share of the run; most samples that clocks are
+# taken to be apart.
+LATEST, SHARE, EARLIEST = 24, 0.1, 3
 # Logarithm of the odds of clocks of input and output that differ: 1 in 150, a guess.
 AHEAD = 5.0
 
@@ -31,16 +33,6 @@ class Path(NamedTuple):
     moving: tuple[str, ...]
     delay: float
 
-    @property
-    def whole(self) -> int:
-        """The whole samples of the delay."""
-        return int(np.floor(self.delay))
-
-    @property
-    def part(self) -> float:
-        """The part of a sample of the delay."""
-        return self.delay - self.whole
-
 
 class Paths(NamedTuple):
     """The paths without a law that a record may have.
@@ -49,15 +41,15 @@ class Paths(NamedTuple):
     ----------
     moving : tuple of str
         Inputs without high frequencies, which may move between samples.
-    delays : tuple of int
-        Whole samples.
-    parts : bool
+    delays : tuple of float
+        Whole samples, or the one delay that is given.
+    some : bool
         Whether parts of a sample are possible besides.
     """
 
     moving: tuple[str, ...]
     delays: tuple[float, ...]
-    parts: bool
+    some: bool
 
     @classmethod
     def of(
@@ -67,42 +59,40 @@ class Paths(NamedTuple):
         if delay is not None:
             return cls(moving, (delay,), False)
         most = latest(runs)
-        return cls(moving, tuple(range(-most, most + 1)), parts)
+        return cls(moving, tuple(map(float, range(-min(EARLIEST, most), most + 1))), parts)
+
+    @property
+    def given(self) -> bool:
+        """True if the delay is."""
+        return len(self.delays) == 1
 
     @property
     def kinds(self) -> tuple[tuple[str, ...], ...]:
         """Inputs that move between samples, of each kind of path."""
         return ((), self.moving) if self.moving else ((),)
 
-    def starts(self, delay: float) -> np.ndarray:
-        """Where rows of a sample begin, so that this delay ends at one of them."""
-        if not (self.parts or self.moving or delay % 1.0):
-            return np.zeros(1)
-        rows, part = np.arange(PARTS) / PARTS, delay % 1.0
-        if part:
-            rows[1 + np.argmin(np.abs(rows[1:] - part))] = part
-        return rows
+    @property
+    def parts(self) -> int:
+        """Rows a sample that all paths have in common."""
+        return PARTS if self.moving else 1
 
     def plain(self) -> list[Path]:
         """Paths of whole delays."""
-        return [Path(None, kind, float(delay)) for delay in self.delays for kind in self.kinds]
+        return [Path(None, kind, delay) for delay in self.delays for kind in self.kinds]
 
-    def around(self, path: Path, starts: np.ndarray) -> list[Path]:
-        """Paths of parts of a sample less than one from a path."""
-        if not self.parts:
-            return []
-        whole = [path.whole - 1, path.whole] if path.delay == path.whole else [path.whole]
-        return [Path(None, kind, k + float(part))
-                for k in whole for part in starts[1:] for kind in self.kinds
-                if k + part < max(self.delays[-1], 1)]  # fmt: skip
+    def around(self, delay: float) -> list[Path]:
+        """Paths of parts of a sample less than one from a delay."""
+        ends = (np.ceil(delay) - 1, np.floor(delay) + 1) if self.some else (0, 0)
+        near = np.arange(PARTS * ends[0], PARTS * min(ends[1], max(self.delays[-1], 1))) / PARTS
+        return [Path(None, kind, float(each)) for each in near if each % 1.0 for kind in self.kinds]
 
     def log_prior(self, path: Path) -> float:
         """Even over delays, over whole ones and parts, and over the ways between samples."""
         log = -np.log(len(self.kinds))
-        if len(self.delays) == 1:
+        if self.given:
             return float(log)
         log -= np.log(self.delays[-1] + 1.0) + (AHEAD if path.delay < 0 else 0.0)
-        if self.parts:
+        if self.some:
             log -= np.log(2.0) + (np.log(PARTS - 1.0) if path.delay % 1.0 else 0.0)
         return float(log)
 
@@ -112,79 +102,86 @@ def latest(runs: Sequence[Run]) -> int:
     return min(LATEST, int(SHARE * min(map(len, runs))))
 
 
-def with_rows(
-    runs: Sequence[Run],
-    seen: PreparedOutput,
-    physics: Physics,
-    starts: np.ndarray,
-    most: int | None = None,
-) -> tuple[tuple[Driven, ...], list[np.ndarray]]:
-    """Runs without inputs at rows of a sample that begin there, and readings, `most` of each."""
+def undriven(
+    runs: Sequence[Run], output: str, physics: Physics, parts: int, most: int | None = None
+) -> tuple[tuple[Driven, ...], tuple[np.ndarray, ...]]:
+    """Runs without inputs, of so many rows a sample, and their readings, `most` of each run."""
     found, measured = [], []
-    shares = np.diff(starts, append=1.0)
-    for i, (run, y) in enumerate(zip(runs, seen.measured, strict=True)):
-        rows = np.flatnonzero(np.isfinite(run.outputs[seen.output]))[:most]
-        time = run.time[: rows[-1] + 1]
-        apart = np.append(np.diff(time), 0.0)
-        dt = np.outer(np.pad(apart, (0, padded_length(len(time)) - len(time))), shares).ravel()
-        turn = len(starts) if np.ptp(apart[:-1]) <= EQUAL * apart[0] else 0
-        each = (jnp.asarray(v) for v in (dt, time[rows] - time[0], rows * len(starts), i))
-        found.append(Driven(physics, None, *each, None, turn))
-        measured.append(y[:most])
-    return tuple(found), measured
+    for i, run in enumerate(runs):
+        read = np.flatnonzero(np.isfinite(run.outputs[output]))[:most]
+        time = run.time[: read[-1] + 1]
+        apart = np.diff(time, append=time[-1:])
+        dt = np.repeat(np.pad(apart, (0, padded_length(len(time)) - len(time))) / parts, parts)
+        turn = parts if np.ptp(apart[:-1]) <= EQUAL * apart[0] else 0
+        each = (jnp.asarray(v) for v in (dt, run.time[read] - run.time[0], read * parts, i))
+        found.append(Driven(physics, None, *each, 0.0, turn))
+        measured.append(run.outputs[output][read])
+    return tuple(found), tuple(measured)
 
 
 def handed_on(
-    runs: Sequence[Run], counts: Sequence[int], paths: Sequence[Path], starts: np.ndarray
-) -> list[np.ndarray]:
-    """Inputs of each run behind each path and their changes by a step of a law's width.
+    runs: Sequence[Run], drives: Sequence[Driven], parts: int, paths: Sequence[Path]
+) -> tuple[list[np.ndarray], np.ndarray]:
+    """Inputs of each run behind each path and their changes by a step of a law's width, and the
+    part of a row by which each path is later still.
 
-    Shape (paths, rows, inputs, 2), rows of so many samples of each run. Inputs before the first
-    sample equal it.
+    Shape (paths, rows, inputs, 2). Inputs before the first sample equal it.
     """
+    whole = [int(np.floor(path.delay * parts)) for path in paths]
     found = []
-    for run, samples in zip(runs, counts, strict=True):
-        plain = {(path.moving, path.part): _late(run, starts, path) for path in paths}
+    for run, drive in zip(runs, drives, strict=True):
+        plain = {moving: rows_of(run, moving, parts) for moving in {p.moving for p in paths}}
         behind = _behind(run, plain, paths)
-        more, each = (0, max(samples - len(run), 0)), []
-        for path in paths:
-            u = plain[path.moving, path.part]
-            rows = np.stack([u, np.zeros_like(u)], axis=3)
+        each, rows = [], np.arange(len(drive.dt))
+        for path, late in zip(paths, whole, strict=True):
+            u = plain[path.moving]
+            u = np.stack([u, np.zeros_like(u)], axis=2)
             if path.law is not None:
-                k = list(run.inputs).index(path.law.input)
-                rows[:, :, k] = behind[path._replace(delay=path.part)]
-            rows = rows[np.clip(np.arange(len(rows)) - path.whole, 0, len(rows) - 1)]
-            each.append(np.pad(rows, (more, *[(0, 0)] * 3), mode="edge")[:samples])
-        found.append(np.stack(each).reshape(len(paths), -1, *each[0].shape[2:]))
-    return found
+                u[:, list(run.inputs).index(path.law.input)] = behind[path.law, path.moving]
+            each.append(u[np.clip(rows - late, 0, len(u) - 1)])
+        found.append(np.stack(each))
+    return found, np.array([parts * path.delay for path in paths]) - whole
 
 
-def _late(run: Run, starts: np.ndarray, path: Path) -> np.ndarray:
-    """Inputs a part of a sample late, shape (samples, rows, inputs)."""
-    middle = 0.5 * (starts + np.append(starts[1:], 1.0)) - path.part
-    columns = []
-    for name, u in run.inputs.items():
-        before = np.append(u[0], u[:-1])
-        held = np.where(starts < path.part, before[:, None], u[:, None])
-        columns.append(between_rows(u, middle) if name in path.moving else held)
-    return np.stack(columns, axis=2)
+def _behind(run: Run, plain: dict, paths: Sequence[Path]) -> dict[Any, np.ndarray]:
+    """An input behind laws and its changes, shape (rows, 2): alike laws at once."""
 
+    def alike(each: tuple[InputLaw, tuple[str, ...]]) -> tuple:
+        return each[0].kind, each[0].place, each[0].input, each[1]
 
-def _behind(run: Run, plain: dict, paths: Sequence[Path]) -> dict[Path, np.ndarray]:
-    """An input behind laws and its changes, (samples, rows, 2): alike laws at once."""
-
-    def alike(path: Path) -> tuple:
-        return path.law.kind, path.law.place, path.law.input, path.moving, path.part
-
-    lawful = {path._replace(delay=path.part) for path in paths if path.law is not None}
+    lawful = {(path.law, path.moving) for path in paths if path.law is not None}
     found = {}
-    for (kind, place, name, *way), group in groupby(sorted(lawful, key=alike), alike):
+    for (kind, place, name, moving), group in groupby(sorted(lawful, key=alike), alike):
         group = list(group)
-        u = plain[tuple(way)][:, :, list(run.inputs).index(name)]
-        width, step = np.array([path.law[2:4] for path in group]).T
+        u = plain[moving][:, list(run.inputs).index(name)]
+        width, step = np.array([(law.width, law.step) for law, _ in group]).T
         widths = width * np.exp(np.multiply.outer([0.0, 1.0, -1.0], step))
-        behind = moved(u.ravel(), kind, widths, place)
-        for path, at, wider, closer in zip(group, *behind, strict=True):
-            turned = np.stack([at, 0.5 * (wider - closer)], axis=1)
-            found[path] = turned.reshape(*u.shape, 2)
+        for key, at, wider, closer in zip(group, *moved(u, kind, widths, place), strict=True):
+            found[key] = np.stack([at, 0.5 * (wider - closer)], axis=1)
     return found
+
+
+def prepared(
+    runs: Sequence[Run], output: str, physics: Physics, path: Path, given: bool = False
+) -> PreparedOutput:
+    """Runs as the model sees them behind a path without a law.
+
+    A part of a sample in the delay is a number of the fit, by up to a sample; of an input that
+    moves between samples by half a row to either side.
+    """
+    parts = PARTS if path.moving else 1
+    drives, measured = undriven(runs, output, physics, parts)
+    inputs, (part,) = handed_on(runs, drives, parts, [path])
+    drives = tuple(replace(drive, u=jnp.asarray(u[0, ..., 0]), part=part)
+                   for drive, u in zip(drives, inputs, strict=True))  # fmt: skip
+    ends = (-part, 1.0 - part) if part else None
+    if path.moving and path.delay % 1.0 and not given:
+        ends = (-0.5, 0.5)
+    time = tuple(np.asarray(drive.time) for drive in drives)
+    u = np.concatenate([np.stack(list(run.inputs.values()), axis=1) for run in runs])
+    spread = float(np.concatenate(measured).std()) or 1.0
+    delay = parts * path.delay
+    names = tuple(runs[0].inputs)
+    return PreparedOutput(
+        names, output, drives, measured, time, u.mean(0), u.std(0), spread, delay, parts, ends
+    )

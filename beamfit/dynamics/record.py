@@ -39,8 +39,6 @@ class Run:
         The file, if there is one.
     provenance, notes : tuple of str
         Comments of the file, and what was done to its numbers.
-    parts : int
-        Rows a sample, of which the first was recorded (`between`).
 
     Raises
     ------
@@ -63,7 +61,6 @@ class Run:
     sha256: str = ""
     provenance: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
-    parts: int = 1
 
     def __post_init__(self):
         object.__setattr__(self, "time", np.asarray(self.time, float))
@@ -161,30 +158,22 @@ def band_limited(runs: Sequence[Run]) -> tuple[str, ...]:
     return tuple(found)
 
 
-def between_rows(u: np.ndarray, late: np.ndarray) -> np.ndarray:
-    """An input at parts of a sample after each of its samples, shape (samples, parts).
+def rows_of(run: Run, moving: Sequence[str], parts: int) -> np.ndarray:
+    """Inputs at so many rows a sample, shape (samples * parts, inputs), some moving between them.
 
-    It goes on by the sines that it is made of (C. E. Shannon 1949), mirrored at both ends.
+    Those go on by the sines that they are made of (C. E. Shannon 1949), mirrored at both ends.
     """
-    n = len(u)
-    waves = np.fft.rfft(np.concatenate([u, u[::-1]]))
-    turn = 2j * np.pi * np.fft.rfftfreq(2 * n)
-    return np.stack([np.fft.irfft(waves * np.exp(turn * s), 2 * n)[:n] for s in late], axis=1)
-
-
-def between(run: Run, names: Sequence[str]) -> Run:
-    """The run with rows between its own, where some inputs move without high frequencies."""
-    n, inputs = len(run), {}
-    rows = np.arange((n - 1) * PARTS + 1)
-    middle = (np.arange(PARTS) + 0.5) / PARTS
+    columns = []
     for name, u in run.inputs.items():
-        fine = between_rows(u, middle) if name in names else np.repeat(u[:, None], PARTS, axis=1)
-        inputs[name] = fine.ravel()[: len(rows)]
-    outputs = {name: np.full(len(rows), np.nan) for name in run.outputs}
-    for name, y in run.outputs.items():
-        outputs[name][::PARTS] = y
-    time = np.interp(rows / PARTS, np.arange(n), run.time)
-    return replace(run, time=time, inputs=inputs, outputs=outputs, parts=PARTS)
+        if name in moving:
+            waves = np.fft.rfft(np.concatenate([u, u[::-1]]))
+            turn = 2j * np.pi * np.fft.rfftfreq(2 * len(u))
+            late = (np.arange(parts) + 0.5) / parts  # each part holds its middle
+            fine = [np.fft.irfft(waves * np.exp(turn * s), 2 * len(u))[: len(u)] for s in late]
+            columns.append(np.stack(fine, axis=1).ravel())
+        else:
+            columns.append(np.repeat(u, parts))
+    return np.stack(columns, axis=1)
 
 
 def ordered(run: Run, first: Run) -> Run:

@@ -22,13 +22,12 @@ from beamfit.dynamics.model import (
     CLOSE,
     Driven,
     PreparedOutput,
-    driven,
     output_of,
     predicted,
     weight_priors,
 )
-from beamfit.dynamics.paths import Path, Paths, handed_on, with_rows
-from beamfit.dynamics.record import PARTS, Run, between
+from beamfit.dynamics.paths import Path, Paths, handed_on, prepared, undriven
+from beamfit.dynamics.record import Run
 from beamfit.dynamics.response import ARX, FIRST_ORDER, SECOND_ORDER, Physics
 from beamfit.errors import Status
 from beamfit.greybox.fit import Fit
@@ -40,7 +39,7 @@ from beamfit.noise.memory import BESIDE, CorrelatedNoise, innovations, remembers
 # Time constants of the grid, and dampings of a second order.
 LAGS, DAMPINGS = 16, (0.2, 0.6, 1.0, 2.0)
 # How many times the grid is laid anew about its best, and the paths that are looked at together.
-ZOOMS, BATCH = 2, 16
+ZOOMS, BATCH = 1, 16
 # Range of time constants, in intervals and in runs, beyond which nothing tells them from zero and
 # from infinity.
 RANGE = (1e-3, 1e3)
@@ -84,7 +83,7 @@ class _Grid(NamedTuple):
     physics: Physics
     offset: bool
     runs: tuple[Run, ...]
-    starts: np.ndarray
+    parts: int
 
     def shapes(self, logarithms: np.ndarray) -> np.ndarray:
         """Shapes of the response by logarithms of a time constant and a damping."""
@@ -101,9 +100,9 @@ class _Grid(NamedTuple):
 
     def _best(self, paths: Sequence[Path]) -> list[Start]:
         seen, every = self.seen, np.arange(len(paths))
-        drives, measured = with_rows(self.runs, seen, self.physics, self.starts)
-        counts = [len(drive.dt) // len(self.starts) for drive in drives]
-        inputs = [u[..., 0] for u in handed_on(self.runs, counts, paths, self.starts)]
+        drives, measured = undriven(self.runs, seen.output, self.physics, self.parts)
+        inputs, part = handed_on(self.runs, drives, self.parts, paths)
+        inputs = [u[..., 0] for u in inputs], part
         times = np.log(np.geomspace(0.1 * seen.apart, seen.span, LAGS))
         damped = self.physics is not FIRST_ORDER
         axes = [times, np.log(DAMPINGS)] if damped else [times]
@@ -113,7 +112,7 @@ class _Grid(NamedTuple):
                           axis=-1).reshape(-1, len(axes))  # fmt: skip
         for zoom in range(ZOOMS + 1):
             triangles = np.asarray(
-                _triangles(drives, tuple(measured), inputs, self.shapes(grid), self.offset)
+                _triangles(drives, measured, inputs, self.shapes(grid), self.offset)
             )
             costs = _costs(triangles, seen)
             at = costs.min(axis=2).argmin(axis=1)
@@ -164,7 +163,7 @@ def unit_outputs(run: Driven, shapes: jax.Array) -> jax.Array:
     m, k = len(run.physics.units(run.u.shape[1])) - shapes.shape[1], run.physics.free_states
 
     def one(shape, gains, first):
-        return run.constant(jnp.concatenate([shape, gains]), run.dt, first)
+        return run.constant(jnp.concatenate([shape, gains]), first, run.part)
 
     gains = jnp.concatenate([jnp.eye(m), jnp.zeros((k, m))])
     firsts = jnp.concatenate([jnp.zeros((m, k)), jnp.eye(k)])
@@ -188,8 +187,8 @@ def _triangles(runs: tuple[Driven, ...], measured: Any, inputs: Any, shapes: Any
     """
 
     def one(asked):
-        inputs, shapes = asked
-        felt = [replace(run, u=u) for run, u in zip(runs, inputs, strict=True)]
+        (inputs, part), shapes = asked
+        felt = [replace(run, u=u, part=part) for run, u in zip(runs, inputs, strict=True)]
         parts = []
         for i, y in enumerate(measured):
             waves = drift_columns([run.time for run in runs], i)
@@ -206,24 +205,6 @@ def _triangles(runs: tuple[Driven, ...], measured: Any, inputs: Any, shapes: Any
 def driven_by(seen: PreparedOutput, physics: Physics) -> tuple[Driven, ...]:
     """The runs with another physics."""
     return tuple(replace(run, physics=physics) for run in seen.runs)
-
-
-def prepared(
-    runs: Sequence[Run], output: str, physics: Physics, path: Path, more: float = 0.0
-) -> PreparedOutput:
-    """Runs as the model sees them behind a path without a law, `more` rows later."""
-    late = path.delay
-    if path.moving:
-        runs, late = [between(run, path.moving) for run in runs], PARTS * path.delay + more
-    drives = tuple(driven(run, i, output, physics, late) for i, run in enumerate(runs))
-    read = [np.isfinite(run.outputs[output]) for run in runs]
-    measured = tuple(run.outputs[output][k] for run, k in zip(runs, read, strict=True))
-    time = tuple(run.time[k] for run, k in zip(runs, read, strict=True))
-    u = np.concatenate([np.stack(list(run.inputs.values()), axis=1) for run in runs])
-    spread = float(np.concatenate(measured).std()) or 1.0
-    return PreparedOutput(
-        tuple(runs[0].inputs), output, drives, measured, time, u.mean(0), u.std(0), spread
-    )
 
 
 def noises_of(
@@ -587,7 +568,7 @@ def case_of(seen: PreparedOutput, offset: bool, network: bool = False) -> Case:
     """The case of one output: constant raw numbers or a network of them."""
     free = [Free("start", nuisance=True), Free("map", nuisance=network)]
     free += [Free("offset")] if offset else []
-    free += [Free("late", -seen.part, 1.0 - seen.part)] if seen.part else []
+    free += [Free("late", *seen.ends)] if seen.ends else []
     return Case((seen,), seen.runs, tuple(free), weight_priors("map") if network else ())
 
 
@@ -607,30 +588,23 @@ def fitted(case: Case, models: Sequence[Any]) -> Settled:
 
 
 class Begun(NamedTuple):
-    """Runs as the model sees them behind a path, the delay in its rows, and the fit."""
+    """Runs as the model sees them behind a path, and the fit."""
 
     seen: PreparedOutput
     path: Path
-    delay: float
     plain: Settled
 
     @property
-    def parts(self) -> int:
-        """Rows a sample."""
-        return PARTS if self.path.moving else 1
-
-    @property
     def exact(self) -> float:
-        """The delay in samples, by the fit where it is no whole number of rows."""
-        late = float(self.plain.fit.model["late"]) if self.delay % 1.0 else 0.0
-        return (self.delay + late) / self.parts
+        """The delay in samples, by the fit where it is a number of it."""
+        late = float(self.plain.fit.model["late"]) if self.seen.ends else 0.0
+        return (self.seen.delay + late) / self.seen.parts
 
     def contains(self, path: Path) -> bool:
         """True if the fit is by that path, or estimates its delay."""
-        if path.law is not None or path.moving != self.path.moving:
-            return False
         apart = abs(path.delay - self.exact)
-        return apart < (1.0 / self.parts if self.delay % 1.0 else 1e-9)
+        near = 1.0 / self.seen.parts if self.seen.ends else 1e-9
+        return path.law is None and path.moving == self.path.moving and apart < near
 
 
 class Asked(NamedTuple):
@@ -644,8 +618,7 @@ class Asked(NamedTuple):
     def starts(self, runs: tuple[Run, ...], physics: Physics, paths: Sequence[Path]) -> list[Start]:
         """The best start of a physics by each path."""
         seen = prepared(runs, self.output, physics, Path(None, (), 0.0))
-        rows = self.paths.starts(paths[0].delay)
-        return _Grid(seen, physics, self.offset, runs, rows).best(paths)
+        return _Grid(seen, physics, self.offset, runs, self.paths.parts).best(paths)
 
     def start(self, runs: tuple[Run, ...]) -> Start:
         """The likeliest start, noise being white: by a whole delay, or a part of a sample about it.
@@ -653,13 +626,13 @@ class Asked(NamedTuple):
         The delay of a difference equation is that of a second order: its own gains of two samples
         let a shorter one pass.
         """
-        law = SECOND_ORDER if self.physics is ARX and len(self.paths.delays) > 1 else self.physics
+        law = SECOND_ORDER if self.physics is ARX and not self.paths.given else self.physics
 
         def cost(start: Start) -> float:
             return start.cost - 2.0 * self.paths.log_prior(start.path)
 
         found = min(self.starts(runs, law, self.paths.plain()), key=cost)
-        if parts := self.paths.around(found.path, self.paths.starts(0.0)):
+        if parts := self.paths.around(found.path.delay):
             found = min([found, *self.starts(runs, law, parts)], key=cost)
         return found if law is self.physics else self.starts(runs, self.physics, [found.path])[0]
 
@@ -669,19 +642,9 @@ class Asked(NamedTuple):
         return self.along(runs, start.path, start.model(self.physics, len(runs[0].inputs)))
 
     def along(self, runs: tuple[Run, ...], path: Path, model: dict[str, Any]) -> Begun:
-        """Identify with constant parameters by a path, from a model.
-
-        A part of a sample is a number of the fit; of an input that moves between samples it lies
-        within a row to either side.
-        """
-        aside = (-0.5, 0.5) if path.moving and path.part and len(self.paths.delays) > 1 else (0.0,)
-        found = []
-        for more in aside:
-            seen = prepared(runs, self.output, self.physics, path, more)
-            late = path.delay * (PARTS if path.moving else 1) + more
-            fit = fitted(case_of(seen, self.offset), [model | {"late": 0.0}])
-            found.append(Begun(seen, path, late, fit))
-        return min(found, key=lambda each: each.plain.likelihood)
+        """Identify with constant parameters by a path, from a model."""
+        seen = prepared(runs, self.output, self.physics, path, self.paths.given)
+        return Begun(seen, path, fitted(case_of(seen, self.offset), [model | {"late": 0.0}]))
 
     def is_first_order(self, runs: tuple[Run, ...], found: Begun) -> bool:
         """True if a first order does as well as a higher one by the information criterion."""
