@@ -25,7 +25,7 @@ from beamfit.dynamics.input_laws import STATIC, InputLaw, laws_between, moved
 from beamfit.dynamics.model import Driven, PreparedOutput, predicted
 from beamfit.dynamics.paths import Path, Paths, handed_on, undriven
 from beamfit.dynamics.record import Run
-from beamfit.dynamics.search import Begun, noises_of
+from beamfit.dynamics.search import BETTER, Begun, noises_of
 from beamfit.greybox import tree
 from beamfit.greybox.memory import Whitened
 from beamfit.greybox.problem import with_slope
@@ -69,7 +69,7 @@ class Alternatives(NamedTuple):
     Attributes
     ----------
     path : Path
-        The likeliest one without a law.
+        The likeliest one without a law, if it is clearly likelier than that of the fit.
     none : float
         Probability of no law, where a law is the only other possibility.
     fuller : float
@@ -364,10 +364,11 @@ def alternatives_of(
         posterior = _finer(comparison, posterior)
     chance, none = posterior.chance, posterior.none
     others = np.array([not found.contains(trial.path) for trial in posterior.trials])
-    likeliest = max(np.flatnonzero(none), key=lambda k: chance[k])
+    logs = np.where(none, posterior.logs, -np.inf)
+    clear = logs.max() > logs[~others].max() + BETTER
     words, static = _named(posterior)
     return Alternatives(
-        posterior.trials[likeliest].path,
+        posterior.trials[logs.argmax()].path if clear else found.path,
         float(chance[none].sum()),
         float(fuller),
         words,

@@ -275,7 +275,7 @@ def _likeliest(
             return found, None
         slopes = slopes_of(found.seen, found.plain.fit)
         others = alternatives_of(runs, found, asked.search.paths, slopes, lawful)
-        if found.contains(others.path):
+        if others.path == found.path:
             break
         found = asked.search.along(runs, others.path, found.plain.fit.model)
     return found, others
@@ -313,7 +313,7 @@ def _known(
         tuple(rest for (rest,) in answer.rest),
         RunNoises(seen.time, errors, answer.likely, seen.parts if jitter else 0),
         slopes_of(seen, answer.fit),
-        used_by(answer.fit),
+        used_by(answer.fit) + (not paths.given and not seen.ends),  # a delay found is a number, too
         None if constant else found.plain.likelihood - answer.likelihood,
         int(np.floor(seen.delay)),
     )

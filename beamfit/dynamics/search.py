@@ -38,6 +38,8 @@ from beamfit.noise.memory import BESIDE, CorrelatedNoise, innovations, remembers
 
 # Time constants of the grid, and dampings of a second order.
 LAGS, DAMPINGS = 16, (0.2, 0.6, 1.0, 2.0)
+# Gain in log likelihood that a longer delay needs over a shorter one, a path over that of a fit.
+BETTER = 5.0
 # How many times the grid is laid anew about its best, and the paths that are looked at together.
 ZOOMS, BATCH = 1, 16
 # Range of time constants, in intervals and in runs, beyond which nothing tells them from zero and
@@ -151,10 +153,10 @@ def _costs(triangles: np.ndarray, seen: PreparedOutput) -> np.ndarray:
 
 def difference(shapes: np.ndarray, apart: float) -> np.ndarray:
     """a1 and a2 of the difference equations that samples of second orders obey."""
-    time, zeta = shapes.T.astype(complex)
+    time, zeta = np.moveaxis(shapes, -1, 0).astype(complex)
     root = np.sqrt(zeta**2 - 1.0)
     one, other = (np.exp(-apart / time * (zeta + sign * root)) for sign in (1, -1))
-    return np.stack([-(one + other), one * other], axis=1).real
+    return np.stack([-(one + other), one * other], axis=-1).real
 
 
 @jax.jit
@@ -621,7 +623,8 @@ class Asked(NamedTuple):
         return _Grid(seen, physics, self.offset, runs, self.paths.parts).best(paths)
 
     def start(self, runs: tuple[Run, ...]) -> Start:
-        """The likeliest start, noise being white: by a whole delay, or a part of a sample about it.
+        """The start of the shortest whole delay about as likely as any, noise being white, or of a
+        likelier part of a sample about it.
 
         The delay of a difference equation is that of a second order: its own gains of two samples
         let a shorter one pass.
@@ -631,7 +634,10 @@ class Asked(NamedTuple):
         def cost(start: Start) -> float:
             return start.cost - 2.0 * self.paths.log_prior(start.path)
 
-        found = min(self.starts(runs, law, self.paths.plain()), key=cost)
+        tried = self.starts(runs, law, self.paths.plain())
+        near = min(map(cost, tried)) + 2.0 * BETTER
+        near = min(abs(each.path.delay) for each in tried if cost(each) <= near)
+        found = min((each for each in tried if abs(each.path.delay) == near), key=cost)
         if parts := self.paths.around(found.path.delay):
             found = min([found, *self.starts(runs, law, parts)], key=cost)
         return found if law is self.physics else self.starts(runs, self.physics, [found.path])[0]
