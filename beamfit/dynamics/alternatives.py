@@ -261,7 +261,7 @@ class _Weighed(NamedTuple):
 
 
 class Comparison(NamedTuple):
-    """What alternatives to a fit are compared with: its runs, readings, numbers and noises.
+    """A fit that alternatives are compared with: its runs, readings, numbers and noises.
 
     `data` are readings, their times and errors, by run; `begin` the numbers of the fit without its
     delay and, last, a share of nothing; `near` those that have a prior of width 1: the logarithm of
@@ -284,7 +284,7 @@ class Comparison(NamedTuple):
     def of(
         cls, runs: tuple[Run, ...], found: Begun, paths: Paths, slopes: Sequence[RunSlopes]
     ) -> Comparison:
-        """That of the fit of runs; `slopes` has terms of a fuller response."""
+        """Prepare the fit of runs; `slopes` has terms of a fuller response."""
         seen, fit = found.seen, found.plain.fit
         drives, measured = undriven(runs, seen.output, seen.runs[0].physics, paths.parts, MOST)
         errors = [noise.each[:MOST] for (noise,) in found.plain.noise]

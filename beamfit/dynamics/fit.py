@@ -33,7 +33,7 @@ from beamfit.dynamics.model import PreparedOutput, network_of, output_of
 from beamfit.dynamics.paths import Paths, latest, prepared
 from beamfit.dynamics.record import Run, band_limited, check_inputs, checked
 from beamfit.dynamics.response import PHYSICS, Physics
-from beamfit.dynamics.search import Asked, Begun, Case, Settled, case_of, fitted, used_by
+from beamfit.dynamics.search import Begun, Case, ResponseSearch, Settled, case_of, fitted, used_by
 from beamfit.errors import InputError, Status, nearest
 from beamfit.greybox.fit import Fit
 from beamfit.noise.memory import CorrelatedNoise
@@ -214,9 +214,8 @@ def identify(
         raise InputError(f"a delay of {delay:g} samples", f"less than the {shortest} rows of a run")
     moving = () if physics.even else band_limited(runs)
     paths = Paths.of(runs, moving, delay, not physics.even)
-    asked = _Identification(
-        Asked(output, physics, paths, offset), map, hidden, range(seed, seed + starts), held
-    )
+    search = ResponseSearch(output, physics, paths, offset)
+    asked = _Identification(search, map, hidden, range(seed, seed + starts), held)
     sound_runs, left_out, found = sound(runs, output, asked.search.begun)
     fit = _answered(asked, sound_runs, found, left_out)
     if not left_out or fit.status is not Status.poor_fit:
@@ -229,7 +228,7 @@ def identify(
 class _Identification(NamedTuple):
     """Settings of an identification."""
 
-    search: Asked
+    search: ResponseSearch
     map: str
     hidden: int
     seeds: range

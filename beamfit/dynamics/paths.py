@@ -55,7 +55,7 @@ class Paths(NamedTuple):
     def of(
         cls, runs: Sequence[Run], moving: tuple[str, ...], delay: float | None, parts: bool
     ) -> Paths:
-        """Those of runs; one delay if it is given."""
+        """List those of runs; one delay if it is given."""
         if delay is not None:
             return cls(moving, (delay,), False)
         most = latest(runs)
@@ -109,7 +109,7 @@ def undriven(
     found, measured = [], []
     for i, run in enumerate(runs):
         read = np.flatnonzero(np.isfinite(run.outputs[output]))[:most]
-        time = run.time[: read[-1] + 1]
+        time = run.time[: None if most is None else read[-1] + 1]
         apart = np.diff(time, append=time[-1:])
         dt = np.repeat(np.pad(apart, (0, padded_length(len(time)) - len(time))) / parts, parts)
         turn = parts if np.ptp(apart[:-1]) <= EQUAL * apart[0] else 0

@@ -40,8 +40,8 @@ from beamfit.noise.memory import BESIDE, CorrelatedNoise, innovations, remembers
 LAGS, DAMPINGS = 16, (0.2, 0.6, 1.0, 2.0)
 # Gain in log likelihood that a longer delay needs over a shorter one, a path over that of a fit.
 BETTER = 5.0
-# How many times the grid is laid anew about its best, and the paths that are looked at together.
-ZOOMS, BATCH = 1, 16
+# Paths that are looked at together: one program is compiled for all.
+BATCH = 16
 # Range of time constants, in intervals and in runs, beyond which nothing tells them from zero and
 # from infinity.
 RANGE = (1e-3, 1e3)
@@ -62,81 +62,122 @@ def drift_columns(times: Sequence[Any], i: int) -> jax.Array:
 
 
 class Start(NamedTuple):
-    """A path, parameters, first states (runs, free states), offset, and -2 ln of the probability
-    of all, with the cost of a drift.
-    """
+    """A path, the model that a search begins with, and -2 ln L with the cost of a drift."""
 
     path: Path
-    p: np.ndarray
-    first: np.ndarray
-    offset: float
+    model: dict[str, Any]
     cost: float
 
-    def model(self, physics: Physics, inputs: int) -> dict[str, Any]:
-        """The model that a search begins with."""
-        raw = physics.raw(jnp.asarray(self.p), inputs)
-        return {"map": raw, "start": self.first, "offset": self.offset, "late": 0.0}
+
+def _grid(ends: Sequence[np.ndarray]) -> np.ndarray:
+    """All pairs of values of two axes, or the values of one, shape (points, axes)."""
+    return np.stack(np.meshgrid(*ends, indexing="ij"), axis=-1).reshape(-1, len(ends))
 
 
-class _Grid(NamedTuple):
-    """Least squares of runs for time constants of a grid, the inputs having taken some path."""
+class ResponseSearch(NamedTuple):
+    """Output, physics and paths of a search, and whether the output at rest is a free number."""
 
-    seen: PreparedOutput
+    output: str
     physics: Physics
+    paths: Paths
     offset: bool
-    runs: tuple[Run, ...]
-    parts: int
 
-    def shapes(self, logarithms: np.ndarray) -> np.ndarray:
-        """Shapes of the response by logarithms of a time constant and a damping."""
-        found = np.exp(logarithms)
-        return found if self.physics is not ARX else difference(found, self.seen.apart)
-
-    def best(self, paths: Sequence[Path]) -> list[Start]:
-        """The best start by each path."""
+    def starts(self, runs: tuple[Run, ...], physics: Physics, paths: Sequence[Path]) -> list[Start]:
+        """The best start of a physics by each path, `BATCH` at once."""
         found = []
         for k in range(0, len(paths), BATCH):
             some = [*paths[k : k + BATCH]]
-            found += self._best([*some, *some[:1] * (BATCH - len(some))])[: len(some)]
+            more = some[:1] * (BATCH - len(some))
+            found += self._starts(runs, physics, [*some, *more])[: len(some)]
         return found
 
-    def _best(self, paths: Sequence[Path]) -> list[Start]:
-        seen, every = self.seen, np.arange(len(paths))
-        drives, measured = undriven(self.runs, seen.output, self.physics, self.parts)
-        inputs, part = handed_on(self.runs, drives, self.parts, paths)
-        inputs = [u[..., 0] for u in inputs], part
-        times = np.log(np.geomspace(0.1 * seen.apart, seen.span, LAGS))
-        damped = self.physics is not FIRST_ORDER
-        axes = [times, np.log(DAMPINGS)] if damped else [times]
-        grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(axes))
-        grid, reach = np.tile(grid, (len(paths), 1, 1)), np.array([a[1] - a[0] for a in axes])
-        around = np.stack(np.meshgrid(*[np.linspace(-1, 1, len(a)) for a in axes], indexing="ij"),
-                          axis=-1).reshape(-1, len(axes))  # fmt: skip
-        for zoom in range(ZOOMS + 1):
-            triangles = np.asarray(
-                _triangles(drives, measured, inputs, self.shapes(grid), self.offset)
-            )
-            costs = _costs(triangles, seen)
-            at = costs.min(axis=2).argmin(axis=1)
-            if zoom < ZOOMS:
-                grid = grid[every, at][:, None] + reach * around
-                reach = reach * 2.0 / (np.array([len(a) for a in axes]) - 1.0)
-        best = paths, self.shapes(grid[every, at]), triangles[every, at], costs[every, at]
-        return [self._start(*each) for each in zip(*best, strict=True)]
+    def _starts(
+        self, runs: tuple[Run, ...], physics: Physics, paths: Sequence[Path]
+    ) -> list[Start]:
+        """The best of a grid of time constants and dampings, and of a finer one about it."""
+        seen, every = prepared(runs, self.output, physics, paths[0]), np.arange(len(paths))
+        drives, measured = undriven(runs, self.output, physics, self.paths.parts)
+        inputs, part = handed_on(runs, drives, self.paths.parts, paths)
+        axes = [np.log(np.geomspace(0.1 * seen.apart, seen.span, LAGS))]
+        axes += [np.log(DAMPINGS)] if physics is not FIRST_ORDER else []
+        reach = np.array([axis[1] - axis[0] for axis in axes])
+        around = _grid([np.linspace(-1.0, 1.0, len(axis)) for axis in axes])
+        grid = np.tile(_grid(axes), (len(paths), 1, 1))
 
-    def _start(
-        self, path: Path, shape: np.ndarray, triangle: np.ndarray, costs: np.ndarray
-    ) -> Start:
-        """The start of a path by a triangular factor and costs of drifts."""
-        runs, own = len(self.runs), triangle.shape[1] - 1 - DRIFT * len(self.runs)
+        def least(logarithms):
+            found = np.exp(logarithms)
+            found = found if physics is not ARX else difference(found, seen.apart)
+            asked = ([u[..., 0] for u in inputs], part), found
+            triangles = np.asarray(_triangles(drives, measured, *asked, self.offset))
+            costs = _costs(triangles, seen)
+            return costs.min(axis=2).argmin(axis=1), found, triangles, costs
+
+        near = grid[every, least(grid)[0]]
+        at, shapes, triangles, costs = least(near[:, None] + reach * around)
+        best = paths, shapes[every, at], triangles[every, at], costs[every, at]
+        return [
+            Start(path, self._model(physics, seen, *each, cost), float(cost.min()))
+            for path, *each, cost in zip(*best, strict=True)
+        ]
+
+    def _model(
+        self,
+        physics: Physics,
+        seen: PreparedOutput,
+        shape: np.ndarray,
+        triangle: np.ndarray,
+        costs: np.ndarray,
+    ) -> dict[str, Any]:
+        """The model of a shape by its triangular factor and the costs of drifts."""
+        runs, own = len(seen.runs), triangle.shape[1] - 1 - DRIFT * len(seen.runs)
         design = triangle[:, : own + runs * int(costs.argmin())]
         size = np.linalg.norm(design, axis=0)
         size = np.where(size > 0, size, 1.0)
         found = (np.linalg.lstsq(design / size, triangle[:, -1], rcond=1e-10)[0] / size)[:own]
-        k = runs * self.physics.free_states + self.offset
-        first = found[own - k :][: k - self.offset].reshape(runs, -1)
+        k = own - self.offset - runs * physics.free_states
+        gains, first = np.split(found[: own - self.offset], [k])
+        raw = physics.raw(jnp.asarray(np.append(shape, gains)), len(seen.inputs))
         level = float(found[-1]) if self.offset else 0.0
-        return Start(path, np.append(shape, found[: own - k]), first, level, float(costs.min()))
+        return {"map": raw, "start": first.reshape(runs, -1), "offset": level, "late": 0.0}
+
+    def start(self, runs: tuple[Run, ...]) -> Start:
+        """The start of the shortest whole delay about as likely as any, noise being white, or of a
+        likelier part of a sample about it.
+
+        The delay of a difference equation is that of a second order: its own gains of two samples
+        let a shorter one pass.
+        """
+        law = SECOND_ORDER if self.physics is ARX and not self.paths.given else self.physics
+
+        def cost(start: Start) -> float:
+            return start.cost - 2.0 * self.paths.log_prior(start.path)
+
+        tried = self.starts(runs, law, self.paths.plain())
+        near = min(map(cost, tried)) + 2.0 * BETTER
+        near = min(abs(each.path.delay) for each in tried if cost(each) <= near)
+        found = min((each for each in tried if abs(each.path.delay) == near), key=cost)
+        if parts := self.paths.around(found.path.delay):
+            found = min([found, *self.starts(runs, law, parts)], key=cost)
+        return found if law is self.physics else self.starts(runs, self.physics, [found.path])[0]
+
+    def begun(self, runs: tuple[Run, ...]) -> Begun:
+        """Identify with constant parameters."""
+        start = self.start(runs)
+        return self.along(runs, start.path, start.model)
+
+    def along(self, runs: tuple[Run, ...], path: Path, model: dict[str, Any]) -> Begun:
+        """Identify with constant parameters by a path, from a model."""
+        seen = prepared(runs, self.output, self.physics, path, self.paths.given)
+        return Begun(seen, path, fitted(case_of(seen, self.offset), [model | {"late": 0.0}]))
+
+    def is_first_order(self, runs: tuple[Run, ...], found: Begun) -> bool:
+        """True if a first order does as well as a higher one by the information criterion."""
+        if self.physics is FIRST_ORDER:
+            return False
+        lower = found.seen._replace(runs=driven_by(found.seen, FIRST_ORDER))
+        (start,) = self.starts(runs, FIRST_ORDER, [found.path])
+        fit = fitted(case_of(lower, self.offset), [start.model])
+        return fit.likelihood <= found.plain.likelihood
 
 
 def _costs(triangles: np.ndarray, seen: PreparedOutput) -> np.ndarray:
@@ -607,57 +648,3 @@ class Begun(NamedTuple):
         apart = abs(path.delay - self.exact)
         near = 1.0 / self.seen.parts if self.seen.ends else 1e-9
         return path.law is None and path.moving == self.path.moving and apart < near
-
-
-class Asked(NamedTuple):
-    """Output, physics and paths of a search, and whether the output at rest is a free number."""
-
-    output: str
-    physics: Physics
-    paths: Paths
-    offset: bool
-
-    def starts(self, runs: tuple[Run, ...], physics: Physics, paths: Sequence[Path]) -> list[Start]:
-        """The best start of a physics by each path."""
-        seen = prepared(runs, self.output, physics, Path(None, (), 0.0))
-        return _Grid(seen, physics, self.offset, runs, self.paths.parts).best(paths)
-
-    def start(self, runs: tuple[Run, ...]) -> Start:
-        """The start of the shortest whole delay about as likely as any, noise being white, or of a
-        likelier part of a sample about it.
-
-        The delay of a difference equation is that of a second order: its own gains of two samples
-        let a shorter one pass.
-        """
-        law = SECOND_ORDER if self.physics is ARX and not self.paths.given else self.physics
-
-        def cost(start: Start) -> float:
-            return start.cost - 2.0 * self.paths.log_prior(start.path)
-
-        tried = self.starts(runs, law, self.paths.plain())
-        near = min(map(cost, tried)) + 2.0 * BETTER
-        near = min(abs(each.path.delay) for each in tried if cost(each) <= near)
-        found = min((each for each in tried if abs(each.path.delay) == near), key=cost)
-        if parts := self.paths.around(found.path.delay):
-            found = min([found, *self.starts(runs, law, parts)], key=cost)
-        return found if law is self.physics else self.starts(runs, self.physics, [found.path])[0]
-
-    def begun(self, runs: tuple[Run, ...]) -> Begun:
-        """Identify with constant parameters."""
-        start = self.start(runs)
-        return self.along(runs, start.path, start.model(self.physics, len(runs[0].inputs)))
-
-    def along(self, runs: tuple[Run, ...], path: Path, model: dict[str, Any]) -> Begun:
-        """Identify with constant parameters by a path, from a model."""
-        seen = prepared(runs, self.output, self.physics, path, self.paths.given)
-        return Begun(seen, path, fitted(case_of(seen, self.offset), [model | {"late": 0.0}]))
-
-    def is_first_order(self, runs: tuple[Run, ...], found: Begun) -> bool:
-        """True if a first order does as well as a higher one by the information criterion."""
-        if self.physics is FIRST_ORDER:
-            return False
-        lower = found.seen._replace(runs=driven_by(found.seen, FIRST_ORDER))
-        (start,) = self.starts(runs, FIRST_ORDER, [found.path])
-        model = start.model(FIRST_ORDER, len(found.seen.inputs))
-        fit = fitted(case_of(lower, self.offset), [model])
-        return fit.likelihood <= found.plain.likelihood
