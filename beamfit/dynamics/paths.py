@@ -161,13 +161,10 @@ def _behind(run: Run, plain: dict, paths: Sequence[Path]) -> dict[Any, np.ndarra
     return found
 
 
-def prepared(
-    runs: Sequence[Run], output: str, physics: Physics, path: Path, given: bool = False
-) -> PreparedOutput:
+def prepared(runs: Sequence[Run], output: str, physics: Physics, path: Path) -> PreparedOutput:
     """Runs as the model sees them behind a path without a law.
 
-    A part of a sample in the delay is a number of the fit, by up to a sample; of an input that
-    moves between samples by half a row to either side.
+    A part of a row in the delay is a number of the fit.
     """
     parts = PARTS if path.moving else 1
     drives, measured = undriven(runs, output, physics, parts)
@@ -175,8 +172,6 @@ def prepared(
     drives = tuple(replace(drive, u=jnp.asarray(u[0, ..., 0]), part=part)
                    for drive, u in zip(drives, inputs, strict=True))  # fmt: skip
     ends = (-part, 1.0 - part) if part else None
-    if path.moving and path.delay % 1.0 and not given:
-        ends = (-0.5, 0.5)
     time = tuple(np.asarray(drive.time) for drive in drives)
     u = np.concatenate([np.stack(list(run.inputs.values()), axis=1) for run in runs])
     spread = float(np.concatenate(measured).std()) or 1.0

@@ -27,7 +27,7 @@ from beamfit.dynamics.model import (
     weight_priors,
 )
 from beamfit.dynamics.paths import Path, Paths, handed_on, prepared, undriven
-from beamfit.dynamics.record import Run
+from beamfit.dynamics.record import PARTS, Run
 from beamfit.dynamics.response import ARX, FIRST_ORDER, SECOND_ORDER, Physics
 from beamfit.errors import Status
 from beamfit.greybox.fit import Fit
@@ -84,10 +84,10 @@ class ResponseSearch(NamedTuple):
 
     def starts(self, runs: tuple[Run, ...], physics: Physics, paths: Sequence[Path]) -> list[Start]:
         """The best start of a physics by each path, `BATCH` at once."""
-        found = []
-        for k in range(0, len(paths), BATCH):
-            some = [*paths[k : k + BATCH]]
-            more = some[:1] * (BATCH - len(some))
+        size, found = BATCH if len(paths) > 2 else len(paths), []
+        for k in range(0, len(paths), size):
+            some = [*paths[k : k + size]]
+            more = some[:1] * (size - len(some))
             found += self._starts(runs, physics, [*some, *more])[: len(some)]
         return found
 
@@ -166,9 +166,20 @@ class ResponseSearch(NamedTuple):
         return self.along(runs, start.path, start.model)
 
     def along(self, runs: tuple[Run, ...], path: Path, model: dict[str, Any]) -> Begun:
-        """Identify with constant parameters by a path, from a model."""
-        seen = prepared(runs, self.output, self.physics, path, self.paths.given)
-        return Begun(seen, path, fitted(case_of(seen, self.offset), [model | {"late": 0.0}]))
+        """Identify with constant parameters by a path, from a model.
+
+        A part of a sample that is a whole number of rows lies in the one before or after.
+        """
+        aside = (0.0,)
+        if path.moving and path.delay % 1.0 and not self.paths.given:
+            aside = (-0.5 / PARTS, 0.5 / PARTS)
+        found = []
+        for more in aside:
+            near = path._replace(delay=path.delay + more)
+            seen = prepared(runs, self.output, self.physics, near)
+            fit = fitted(case_of(seen, self.offset), [model | {"late": 0.0}])
+            found.append(Begun(seen, near, fit))
+        return min(found, key=lambda each: each.plain.likelihood)
 
     def is_first_order(self, runs: tuple[Run, ...], found: Begun) -> bool:
         """True if a first order does as well as a higher one by the information criterion."""
