@@ -40,6 +40,8 @@ from beamfit.noise.memory import BESIDE, CorrelatedNoise, innovations, remembers
 LAGS, DAMPINGS = 16, (0.2, 0.6, 1.0, 2.0)
 # Gain in log likelihood that a longer delay needs over a shorter one, a path over that of a fit.
 BETTER = 5.0
+# Part of a row from its ends within which a delay has left it.
+INSIDE = 1e-3
 # Paths that are looked at together: one program is compiled for all.
 BATCH = 16
 # Range of time constants, in intervals and in runs, beyond which nothing tells them from zero and
@@ -168,17 +170,20 @@ class ResponseSearch(NamedTuple):
     def along(self, runs: tuple[Run, ...], path: Path, model: dict[str, Any]) -> Begun:
         """Identify with constant parameters by a path, from a model.
 
-        A part of a sample that is a whole number of rows lies in the one before or after.
+        A part of a sample that is a whole number of rows may lie in the row before or after, where
+        a fit ends within it; where none does the other rows are alternatives.
         """
         aside = (0.0,)
         if path.moving and path.delay % 1.0 and not self.paths.given:
-            aside = (-0.5 / PARTS, 0.5 / PARTS)
+            aside = (0.0, -0.5 / PARTS, 0.5 / PARTS)
         found = []
         for more in aside:
             near = path._replace(delay=path.delay + more)
             seen = prepared(runs, self.output, self.physics, near)
             fit = fitted(case_of(seen, self.offset), [model | {"late": 0.0}])
-            found.append(Begun(seen, near, fit))
+            late = float(fit.fit.model["late"])
+            if not more or min(np.abs(late - np.array(seen.ends))) > INSIDE:
+                found.append(Begun(seen, near, fit))
         return min(found, key=lambda each: each.plain.likelihood)
 
     def is_first_order(self, runs: tuple[Run, ...], found: Begun) -> bool:
