@@ -14,8 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from beamfit.answer import Table, cell, json_of
+from beamfit.dynamics.alternatives import Alternatives
 from beamfit.dynamics.checks import Checks, HeldOutRun
-from beamfit.dynamics.input_laws import LawEvidence
 from beamfit.dynamics.limits import LagLimits
 from beamfit.dynamics.model import PreparedOutput, curves
 from beamfit.dynamics.response import ARX, FIRST_ORDER, SECOND_ORDER, Physics
@@ -91,23 +91,22 @@ def _quoted(model: Any, of: tuple[Any, float]) -> jax.Array:
     if seen.physics is SECOND_ORDER:  # both lags of eq 8 where there are two
         root = jnp.sqrt(jnp.maximum(p[1] ** 2 - 1.0, 1e-12))
         parts.append(p[0] * (p[1] + jnp.stack([root, -root])))
-    late = (delay + model["late"]) * jnp.sum(seen.dt[: 1 if seen.held is None else 2])
+    late = (delay + model["late"]) * seen.dt[0]
     return jnp.concatenate([*parts, jnp.stack([jnp.asarray(model["offset"]), late])])
 
 
 def quantities_of(
     fit: Fit,
     errors: Memory | None,
-    laws: LawEvidence | None,
+    others: Alternatives | None,
     seen: PreparedOutput,
     physics: Physics,
-    delay: float,
 ) -> dict[str, Quantity]:
     """Constant parameters with errors, and the offset and the delay if they are free."""
     m = len(seen.inputs)
-    found = alone = derived(fit, errors, _quoted, (seen.runs[0], delay))
-    if laws is not None:
-        found = alone._replace(error=laws.error(alone.slope, alone.error))
+    found = alone = derived(fit, errors, _quoted, (seen.runs[0], seen.delay))
+    if others is not None:
+        found = alone._replace(error=others.error(alone.slope, alone.error))
     names, units = list(physics.parameters(seen.inputs)), _units(physics, m)
     if physics is FIRST_ORDER:
         names, units = [*names, *(f"{k}/tau" for k in names[1:])], [*units, *[f"{GAIN}/s"] * m]

@@ -11,8 +11,9 @@ import numpy as np
 from scipy.ndimage import median_filter
 
 from beamfit.dynamics.model import CLOSE, output_of
+from beamfit.dynamics.paths import prepared
 from beamfit.dynamics.record import LEAST, Run
-from beamfit.dynamics.search import Begun, seen_of
+from beamfit.dynamics.search import Begun
 
 # A single reading is bad beyond FAR times the noise, the residual about a running median of AROUND
 # readings, plus MOVES times the model's step there. More than the share MOST are the
@@ -63,7 +64,7 @@ def _beside(
     runs: tuple[Run, ...], output: str, found: Begun
 ) -> list[tuple[np.ndarray, np.ndarray]]:
     """Readings of each run, and the free-running output there."""
-    seen = seen_of(runs, output, found.seen.runs[0].physics, found.delay)
+    seen = prepared(runs, output, found.seen.runs[0].physics, found.path)
     pairs = zip(seen.measured, seen.runs, strict=True)
     return [(y, np.asarray(output_of(found.plain.fit.model, run))) for y, run in pairs]
 

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from beamfit.answer import Table, answer, json_of
+from beamfit.dynamics.alternatives import Alternatives, alternatives_of
 from beamfit.dynamics.answer import (
     Curve,
     ResponseEvidence,
@@ -27,32 +28,12 @@ from beamfit.dynamics.checks import (
     checks_of,
     slopes_of,
 )
-from beamfit.dynamics.input_laws import laws_of, shorter
 from beamfit.dynamics.limits import LagLimits, lag_limits
 from beamfit.dynamics.model import PreparedOutput, network_of, output_of
-from beamfit.dynamics.record import (
-    PARTS,
-    Run,
-    band_limited,
-    between,
-    check_inputs,
-    checked,
-    recorded,
-)
+from beamfit.dynamics.paths import Paths, latest, prepared
+from beamfit.dynamics.record import Run, band_limited, check_inputs, checked
 from beamfit.dynamics.response import PHYSICS, Physics
-from beamfit.dynamics.search import (
-    Begun,
-    Case,
-    Settled,
-    begun,
-    case_of,
-    fitted,
-    is_first_order,
-    latest,
-    seen_of,
-    starts_of,
-    used_by,
-)
+from beamfit.dynamics.search import Begun, Case, ResponseSearch, Settled, case_of, fitted, used_by
 from beamfit.errors import InputError, Status, nearest
 from beamfit.greybox.fit import Fit
 from beamfit.noise.memory import CorrelatedNoise
@@ -231,74 +212,77 @@ def identify(
     shortest = min(len(run) for run in runs)
     if delay is not None and not abs(delay) < shortest - 1:
         raise InputError(f"a delay of {delay:g} samples", f"less than the {shortest} rows of a run")
-    seeds, moving = range(seed, seed + starts), () if physics.even else band_limited(runs)
-    asked = _Identification(output, physics, map, delay, offset, hidden, seeds, moving, held)
-    if moving:
-        finer = tuple(between(run, moving) for run in runs)
-        rows = asked._replace(delay=None if delay is None else delay * PARTS)
-        if rows.cost(finer) < asked.cost(runs):
-            held = tuple(between(run, moving) for run in held)
-            runs, asked = finer, rows._replace(held=held)
-    sound_runs, left_out, found = sound(runs, output, asked.begun)
+    moving = () if physics.even else band_limited(runs)
+    paths = Paths.of(runs, moving, delay, not physics.even)
+    search = ResponseSearch(output, physics, paths, offset)
+    asked = _Identification(search, map, hidden, range(seed, seed + starts), held)
+    sound_runs, left_out, found = sound(runs, output, asked.search.begun)
     fit = _answered(asked, sound_runs, found, left_out)
     if not left_out or fit.status is not Status.poor_fit:
         return fit
     # A model that is refuted misses good readings.
-    whole = _answered(asked, runs, asked.begun(runs), ())
+    whole = _answered(asked, runs, asked.search.begun(runs), ())
     return whole if whole.status is Status.poor_fit else fit
 
 
 class _Identification(NamedTuple):
     """Settings of an identification."""
 
-    output: str
-    physics: Physics
+    search: ResponseSearch
     map: str
-    delay: float | None
-    offset: bool
     hidden: int
     seeds: range
-    moving: tuple[str, ...]
     held: tuple[Run, ...]
-
-    def cost(self, runs: tuple[Run, ...]) -> float:
-        """-2 ln L of the start of a search, with the cost of a part of a sample in the delay."""
-        starts = starts_of(runs, self.output, self.physics, self.delay, self.offset)
-        part = np.log(sum(len(run) // run.parts for run in runs))
-        return min(start.cost + part * (late % 1.0 > 0.0) for start, _, late in starts)
-
-    def begun(self, runs: tuple[Run, ...]) -> Begun:
-        """The fit of runs with constant parameters."""
-        return begun(runs, self.output, self.physics, self.delay, self.offset)
 
 
 def _answered(
     asked: _Identification, runs: tuple[Run, ...], found: Begun, left_out: tuple[BadReadings, ...]
 ) -> ResponseFit:
     """Judge runs whose fit with constant parameters was found."""
-    output, physics, map, delay = asked[:4]
+    (output, physics, paths, _), map = asked.search, asked.map
+    found, others = _likeliest(asked, runs, found)
     answer = found.plain if map == "constant" else _with_network(asked, found)
-    checks, quantities, curves = _known(asked, runs, found, answer)
-    fit, late = answer.fit, found.delay
-    ahead = tuple(_ahead(run, output, answer, physics, late) for run in asked.held)
+    checks, quantities, curves = _known(asked, runs, found, answer, others)
+    fit = answer.fit
+    ahead = tuple(_ahead(run, output, answer, physics, found) for run in asked.held)
     evidence = (fit, answer.rests, checks, quantities, curves, ahead, map)
-    exact = late if late % 1 == 0 else late + float(fit.model["late"])
-    exact = exact / runs[0].parts if runs[0].parts > 1 else exact
-    early = max(-exact, 0.0) if delay is None else 0.0
+    exact = found._replace(plain=answer).exact
+    exact = int(exact) if exact == int(exact) else exact
     rms = float(np.sqrt(np.mean(answer.rms**2)))
+    early = 0.0 if paths.given else max(-exact, 0.0)
     status, message = judged({output: ResponseEvidence(*evidence, rms, early)})
-    longest = [LATEST] if delay is None and late == latest(runs) > 0 else []
+    longest = [LATEST] if not paths.given and exact == latest(runs) > 0 else []
     message = " ".join([message, *longest, *(f"Left out: {each}." for each in left_out)])
     noise = tuple(answer.rms[:, 0].tolist())
     parts = (quantities, curves, noise, answer.memory, checks, ahead, left_out)
-    named = output, status, message, physics.name, map, exact
-    runs = tuple(recorded(run) for run in runs)
-    return ResponseFit(*named, runs, found.seen, fit, *parts)
+    return ResponseFit(
+        output, status, message, physics.name, map, exact, runs, found.seen, fit, *parts
+    )
 
 
-def _ahead(run: Run, output: str, answer: Settled, physics: Physics, late: float) -> HeldOutRun:
+# Most searches by a path that was likelier than that of the search before.
+AGAIN = 2
+
+
+def _likeliest(
+    asked: _Identification, runs: tuple[Run, ...], found: Begun
+) -> tuple[Begun, Alternatives | None]:
+    """The fit by the likeliest path without a law, and the alternatives to it."""
+    lawful = asked.map == "constant"
+    for _ in range(AGAIN):
+        if found.plain.exact(case_of(found.seen, asked.search.offset)):
+            return found, None
+        slopes = slopes_of(found.seen, found.plain.fit)
+        others = alternatives_of(runs, found, asked.search.paths, slopes, lawful)
+        if others.path == found.path:
+            break
+        found = asked.search.along(runs, others.path, found.plain.fit.model)
+    return found, others
+
+
+def _ahead(run: Run, output: str, answer: Settled, physics: Physics, found: Begun) -> HeldOutRun:
     """Predict a run that was held back."""
-    seen = seen_of((run,), output, physics, late)
+    seen = prepared((run,), output, physics, found.path)
     start = {"start": np.zeros((1, physics.free_states))}
     (rest,) = Case((seen,), seen.runs, (), ()).ahead(answer, start)
     return HeldOutRun.of(run.name, rest, seen.measured[0])
@@ -306,46 +290,45 @@ def _ahead(run: Run, output: str, answer: Settled, physics: Physics, late: float
 
 def _with_network(asked: _Identification, found: Begun) -> Settled:
     """The best fit with a network of parameters, from the constant ones."""
-    seen, first = found.seen, found.plain.fit.model
+    seen, first, (_, physics, _, offset) = found.seen, found.plain.fit.model, asked.search
     raw = np.asarray(first["map"])
-    nets = (network_of(seen, asked.physics, raw, asked.hidden, seed) for seed in asked.seeds)
-    return fitted(case_of(seen, asked.offset, True), [first | {"map": net} for net in nets])
+    nets = (network_of(seen, physics, raw, asked.hidden, seed) for seed in asked.seeds)
+    return fitted(case_of(seen, offset, True), [first | {"map": net} for net in nets])
 
 
 def _known(
-    asked: _Identification, runs: tuple[Run, ...], found: Begun, answer: Settled
+    asked: _Identification,
+    runs: tuple[Run, ...],
+    found: Begun,
+    answer: Settled,
+    others: Alternatives | None,
 ) -> tuple[Checks, dict[str, Quantity], tuple[Curve, ...]]:
     """Tests of the residuals, and what the runs determine of constants or curves."""
-    seen, constant, offset = found.seen, asked.map == "constant", asked.offset
-    delays = shorter(found.delay) if asked.delay is None else [asked.delay]
-    slopes, jitter = slopes_of(seen, answer.fit), float(answer.jitter.max())
-    sample = runs[0].parts * (1 if seen.part == 0.0 else 2)  # in rows
+    seen, constant, (_, physics, paths, offset) = found.seen, asked.map == "constant", asked.search
+    jitter = float(answer.jitter.max())
     errors = [noise.each for (noise,) in answer.noise]
     checks = checks_of(
         seen,
         tuple(rest for (rest,) in answer.rest),
-        RunNoises(seen.time, errors, answer.likely, sample if jitter else 0),
-        slopes,
-        used_by(answer.fit),
+        RunNoises(seen.time, errors, answer.likely, seen.parts if jitter else 0),
+        slopes_of(seen, answer.fit),
+        used_by(answer.fit) + (not paths.given and not seen.ends),  # a delay found is a number, too
         None if constant else found.plain.likelihood - answer.likelihood,
-        int(np.ceil(found.delay)) * (1 if found.delay % 1 == 0 else 2),  # in rows
+        int(np.floor(seen.delay)),
     )
     checks = checks._replace(
-        first_order=constant and is_first_order(found, offset),
+        first_order=constant and asked.search.is_first_order(runs, found),
         jitter=jitter,
-        **{"band_limited" if runs[0].parts == 1 else "between": asked.moving},
+        between=found.path.moving,
+        band_limited=() if found.path.moving else paths.moving,
     )
-    laws = (
-        laws_of(runs, seen, answer, delays, slopes)
-        if constant and not answer.exact(case_of(seen, offset))
-        else None
-    )
-    if laws is not None and laws.none < 0.5 and laws.fuller < 0.5:
+    others = others if constant else None
+    if others is not None and others.none < 0.5 and others.fuller < 0.5:
         checks = checks._replace(
-            law=laws.likeliest, law_probability=1.0 - laws.none, static_law=laws.static
+            law=others.likeliest, law_probability=1.0 - others.none, static_law=others.static
         )
     parts = answer.fit, answer.errors
-    quantities = quantities_of(*parts, laws, seen, asked.physics, found.delay) if constant else {}
+    quantities = quantities_of(*parts, others, seen, physics) if constant else {}
     limits = lag_limits(seen, answer, offset) if constant else LagLimits(None, None)
     curves = () if constant else curves_of(*parts, seen)
     return checks, *told(quantities, curves, seen, checks, limits)

@@ -13,8 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.stats import t as student
 
-from beamfit.dynamics.input_laws import CORRELATION_TIMES, WHITE
-from beamfit.dynamics.model import PreparedOutput, steps_of
+from beamfit.dynamics.alternatives import CORRELATION_TIMES, WHITE
+from beamfit.dynamics.model import PreparedOutput
 from beamfit.dynamics.response import ARX, FIRST_ORDER
 from beamfit.dynamics.search import (
     LONGEST,
@@ -74,7 +74,7 @@ class _Lags(NamedTuple):
     def whitened(self, shape: np.ndarray) -> Whitened:
         """A basis of what gains, first states and offset do, and the readings, by each noise."""
         model, parts = self.found.fit.model, []
-        runs = [replace(run, dt=steps_of(model, run)) for run in self.seen.runs]
+        runs = [replace(run, part=run.part + model["late"]) for run in self.seen.runs]
         for i, y in enumerate(self.seen.measured):
             columns = linear_columns(runs, i, jnp.asarray(shape[None]), self.offset)[0]
             part = np.column_stack([columns, y])

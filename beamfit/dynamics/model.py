@@ -8,9 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from beamfit.arrays import padded_length
-from beamfit.dynamics.record import Run
-from beamfit.dynamics.response import Physics, simulate, simulate_evenly
+from beamfit.dynamics.response import Physics, even_response, response_at
 from beamfit.greybox import tree
 from beamfit.greybox.mlp import MLP, Port, dense
 from beamfit.greybox.problem import Prior
@@ -25,11 +23,11 @@ WEIGHT = 3.0
 
 @tree.node("physics", "turn")
 class Driven:
-    """A run as the model sees it: inputs, its operating points, and steps, padded; what was read.
+    """A run as the model sees it: inputs, whole rows late, and steps, padded; what was read.
 
-    Shapes (samples, inputs), (samples,), (readings,), (readings,); `run` is its number, `held` by
-    how much each step grows, s, for a delay that is longer by a sample, where the delay is no whole
-    number of them. `turn` is the number of steps after which they repeat, 0 where they do not.
+    Shapes (rows, inputs), (rows,), (readings,), (readings,); `run` is its number, `part` the part
+    of a row by which inputs come later still. `turn` is the number of rows a sample where all
+    steps are equal, 0 where they are not.
     """
 
     physics: Physics
@@ -38,33 +36,37 @@ class Driven:
     time: Any
     index: Any
     run: Any
-    held: Any
+    part: Any
     turn: int = 0
 
     def predicted(self, model: Any) -> jax.Array:
         """The output where it was read, running free from the start of the run."""
-        of, start, dt = model["map"], model["start"][self.run], steps_of(model, self)
+        of, start, part = model["map"], model["start"][self.run], self.part + model["late"]
         if callable(of):
-            p = parameters_at(self.physics, of, self.u)
-            return model["offset"] + simulate(self.physics, p, self.u, dt, start)[self.index]
-        return model["offset"] + self.constant(
-            self.physics.physical(of, self.u.shape[1]), dt, start
-        )
+            return model["offset"] + self.changing(
+                parameters_at(self.physics, of, self.u), start, part
+            )
+        p = self.physics.physical(of, self.u.shape[1])
+        return model["offset"] + self.constant(p, start, part)
 
-    def constant(self, p: jax.Array, dt: jax.Array, start: jax.Array) -> jax.Array:
+    def changing(self, p: jax.Array, start: jax.Array, part: Any) -> jax.Array:
+        """The response of parameters at every row where it was read, without an offset."""
+        return response_at(self.physics, p, self.u, self.dt, start, self.index, part)
+
+    def constant(self, p: jax.Array, start: jax.Array, part: Any) -> jax.Array:
         """The response of constant parameters where it was read, without an offset."""
         if self.turn:
-            y = simulate_evenly(self.physics, p, self.u, dt[: self.turn], start)
+            y = even_response(self.physics, p, self.u, self.dt[0], start, self.turn, part)
             return y[self.index // self.turn]
-        p = jnp.broadcast_to(p, (len(self.u), len(p)))
-        return simulate(self.physics, p, self.u, dt, start)[self.index]
+        return self.changing(jnp.broadcast_to(p, (len(self.u), len(p))), start, part)
 
 
 class PreparedOutput(NamedTuple):
     """Runs of one output, with what the model needs of them.
 
     `runs` by `Driven`; `measured` are the readings of each, without missing ones; `size_u` and
-    `size_y` the scatter of inputs and output.
+    `size_y` the scatter of inputs and output; `delay` in rows, of which there are `parts` a sample;
+    `ends` between which a delay that is a number of the fit may be longer.
     """
 
     inputs: tuple[str, ...]
@@ -75,6 +77,9 @@ class PreparedOutput(NamedTuple):
     mean_u: np.ndarray
     size_u: np.ndarray
     size_y: float
+    delay: float
+    parts: int
+    ends: tuple[float, float] | None
 
     @property
     def wide(self) -> np.ndarray:
@@ -85,14 +90,6 @@ class PreparedOutput(NamedTuple):
     def points(self) -> np.ndarray:
         """The inputs at all readings, shape (readings, inputs)."""
         return np.concatenate([np.asarray(run.u)[np.asarray(run.index)] for run in self.runs])
-
-    @property
-    def part(self) -> float:
-        """The part of a sample in the delay."""
-        if self.runs[0].held is None:
-            return 0.0
-        first, second = np.asarray(self.runs[0].dt[:2])
-        return float(first / (first + second))
 
     @property
     def apart(self) -> float:
@@ -107,40 +104,6 @@ class PreparedOutput(NamedTuple):
     def scaled(self, u: Any) -> np.ndarray:
         """Inputs in units of their scatter."""
         return (np.asarray(u) - self.mean_u) / self.wide
-
-
-def delayed(u: np.ndarray, delay: float) -> np.ndarray:
-    """Inputs `delay` samples late, shape (rows, inputs), padded; earlier ones equal the first.
-
-    A delay of no whole number of samples has two rows a sample, one for each input that it feels.
-    """
-    whole = int(np.floor(delay))
-    shifts = (whole,) if delay == whole else (whole + 1, whole)
-    each = [u[np.clip(np.arange(len(u)) - k, 0, len(u) - 1)] for k in shifts]
-    late = np.stack(each, axis=1).reshape(-1, u.shape[1])
-    longer = padded_length(len(late)) - len(late)
-    return np.concatenate([late, np.repeat(late[-1:], longer, axis=0)])
-
-
-def driven(run: Run, number: int, output: str, physics: Physics, delay: float) -> Driven:
-    """A run with its inputs late, as of `delayed`."""
-    late, part = delayed(np.stack(list(run.inputs.values()), axis=1), delay), delay % 1.0
-    apart = np.append(np.diff(run.time), 0.0)
-    shares, held = ([[1.0]], None) if part == 0.0 else ([[part], [1.0 - part]], [[1.0], [-1.0]])
-    longer = len(late) - len(shares) * len(run)
-    dt, held = (None if s is None else np.append((s * apart).T.ravel(), np.zeros(longer))
-                for s in (shares, held))  # fmt: skip
-    rows = np.flatnonzero(np.isfinite(run.outputs[output]))
-    seen = (late, dt, run.time[rows] - run.time[0], rows * len(shares))
-    arrays = (jnp.asarray(v) for v in seen)
-    held = None if held is None else jnp.asarray(held)
-    turn = len(shares) if np.ptp(apart[:-1]) <= EQUAL * apart[0] else 0
-    return Driven(physics, *arrays, jnp.asarray(number), held, turn)
-
-
-def steps_of(model: Any, seen: Driven) -> jax.Array:
-    """The distances of the rows, of which a delay that is estimated decides."""
-    return seen.dt if seen.held is None else seen.dt + model["late"] * seen.held
 
 
 def parameters_at(physics: Physics, of: Any, point: jax.Array, more: Any = 0.0) -> jax.Array:
@@ -173,7 +136,7 @@ def changed_by(model: Any, seen: Driven, scaled: jax.Array) -> jax.Array:
 
     def output(more):
         p = parameters_at(seen.physics, model["map"], seen.u, scaled @ more.T)
-        return simulate(seen.physics, p, seen.u, steps_of(model, seen), start)[seen.index]
+        return seen.changing(p, start, seen.part + model["late"])
 
     slopes = jax.jacfwd(output)(jnp.zeros((count, scaled.shape[1])))
     return slopes.reshape(len(slopes), -1)

@@ -39,8 +39,6 @@ class Run:
         The file, if there is one.
     provenance, notes : tuple of str
         Comments of the file, and what was done to its numbers.
-    parts : int
-        Rows a sample, of which the first was recorded (`between`).
 
     Raises
     ------
@@ -63,7 +61,6 @@ class Run:
     sha256: str = ""
     provenance: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
-    parts: int = 1
 
     def __post_init__(self):
         object.__setattr__(self, "time", np.asarray(self.time, float))
@@ -161,32 +158,22 @@ def band_limited(runs: Sequence[Run]) -> tuple[str, ...]:
     return tuple(found)
 
 
-def between(run: Run, names: Sequence[str]) -> Run:
-    """The run with rows between its own, where some inputs move without high frequencies.
+def rows_of(run: Run, moving: Sequence[str], parts: int) -> np.ndarray:
+    """Inputs at so many rows a sample, shape (samples * parts, inputs), some moving between them.
 
-    They go on by the sines that they are made of (C. E. Shannon 1949), mirrored at both ends.
+    Those go on by the sines that they are made of (C. E. Shannon 1949), mirrored at both ends.
     """
-    n, inputs = len(run), {}
-    rows = np.arange((n - 1) * PARTS + 1)
+    columns = []
     for name, u in run.inputs.items():
-        waves = np.fft.rfft(np.concatenate([u, u[::-1]]))
-        turn = 2j * np.pi * np.fft.rfftfreq(2 * n)
-        late = (np.arange(PARTS) + 0.5) / PARTS  # each part holds its middle
-        moved = [np.fft.irfft(waves * np.exp(turn * s), 2 * n)[:n] for s in late]
-        fine = np.stack(moved if name in names else [u] * PARTS, axis=1)
-        inputs[name] = fine.ravel()[: len(rows)]
-    outputs = {name: np.full(len(rows), np.nan) for name in run.outputs}
-    for name, y in run.outputs.items():
-        outputs[name][::PARTS] = y
-    time = np.interp(rows / PARTS, np.arange(n), run.time)
-    return replace(run, time=time, inputs=inputs, outputs=outputs, parts=PARTS)
-
-
-def recorded(run: Run) -> Run:
-    """The run without rows between those of its record."""
-    parts = slice(None, None, run.parts)
-    inputs, outputs = ({n: v[parts] for n, v in each.items()} for each in (run.inputs, run.outputs))
-    return replace(run, time=run.time[parts], inputs=inputs, outputs=outputs, parts=1)
+        if name in moving:
+            waves = np.fft.rfft(np.concatenate([u, u[::-1]]))
+            turn = 2j * np.pi * np.fft.rfftfreq(2 * len(u))
+            late = (np.arange(parts) + 0.5) / parts  # each part holds its middle
+            fine = [np.fft.irfft(waves * np.exp(turn * s), 2 * len(u))[: len(u)] for s in late]
+            columns.append(np.stack(fine, axis=1).ravel())
+        else:
+            columns.append(np.repeat(u, parts))
+    return np.stack(columns, axis=1)
 
 
 def ordered(run: Run, first: Run) -> Run:

@@ -193,43 +193,90 @@ def simulate(
     return run_from(physics, p, u, dt, physics.begin(free, u[0]))
 
 
-def simulate_evenly(
-    physics: Physics, p: jax.Array, u: jax.Array, dt: jax.Array, free: jax.Array
+def response_at(
+    physics: Physics,
+    p: jax.Array,
+    u: jax.Array,
+    dt: jax.Array,
+    free: jax.Array,
+    index: jax.Array,
+    part: jax.Array,
 ) -> jax.Array:
-    """Run a response of constant parameters at steps that repeat, many at once.
+    """The output at some samples, the input coming a part of a step late.
 
     Parameters
     ----------
-    physics, u, free
-        As for `simulate`; as many samples as a multiple of the steps.
-    p : array, shape (parameters,)
-        Its parameters.
-    dt : array, shape (steps,)
-        Time from each sample to the next, again and again.
+    physics, p, u, dt, free
+        As for `simulate`.
+    index : array of int, shape (readings,)
+        The samples.
+    part : float
+        The part.
 
     Returns
     -------
-    jax.Array
-        The output at the first sample of every turn.
+    jax.Array, shape (readings,)
 
     Examples
     --------
-    >>> p, dt = jnp.array([2.0, 3.0]), jnp.array([2.0])
-    >>> y = simulate_evenly(FIRST_ORDER, p, jnp.ones((4, 1)), dt, jnp.zeros(1))
+    >>> p, dt, u = jnp.array([[2.0, 3.0]] * 4), jnp.full(4, 2.0), jnp.ones((4, 1))
+    >>> y = response_at(FIRST_ORDER, p, u, dt, jnp.zeros(1), jnp.arange(4), 0.0)
     >>> [round(float(v), 4) for v in y]
     [0.0, 1.8964, 2.594, 2.8506]
     """
-    x0, turn = physics.begin(free, u[0]), (len(dt), u.shape[1])
+    x0 = physics.begin(free, u[0])
+    first = x0 if physics.even else physics.advance(p[0], x0, u[0], part * dt[0])
+    step = (1.0 - part) * dt + part * jnp.append(dt[1:], dt[-1:])
+    x = affine_course(lambda x, p, *now: physics.advance(p, x, *now), first, p, u, step)[1]
+    before = jnp.maximum(index - 1, 0)
+    y = jax.vmap(physics.advance)(p[before], x[before], u[before], (1.0 - part) * dt[before])[:, 0]
+    return jnp.where(index == 0, x0[0], y)
 
-    def after(x, now):
-        for step, felt in zip(dt, now.reshape(turn), strict=True):
-            x = physics.advance(p, x, felt, step)
-        return x
 
-    rest, none = jnp.zeros_like(x0), jnp.zeros(turn[0] * turn[1])
-    a, b = jax.jacfwd(after, (0, 1))(rest, none)
-    read = Matrices(a, b, jnp.eye(1, len(x0)), jnp.zeros((1, len(none))), jnp.zeros(1))
-    return linear_outputs(read, u.reshape(-1, len(none)), x0)[0][:, 0]
+def even_response(
+    physics: Physics,
+    p: jax.Array,
+    u: jax.Array,
+    dt: jax.Array,
+    free: jax.Array,
+    turn: int,
+    part: jax.Array,
+) -> jax.Array:
+    """The output of constant parameters p at every `turn`-th of equal steps dt, many at once.
+
+    The input comes a part of a step late; as many samples as a multiple of the turn.
+
+    Examples
+    --------
+    >>> p, u = jnp.array([2.0, 3.0]), jnp.ones((4, 1))
+    >>> y = even_response(FIRST_ORDER, p, u, 2.0, jnp.zeros(1), 1, 0.0)
+    >>> [round(float(v), 4) for v in y]
+    [0.0, 1.8964, 2.594, 2.8506]
+    """
+    x0, m = physics.begin(free, u[0]), u.shape[1]
+    n, none = len(x0), jnp.zeros(m)
+
+    def step(length):
+        moved = lambda x, felt: physics.advance(p, x, felt, length)  # noqa: E731
+        return jax.jacfwd(moved, (0, 1))(0.0 * x0, none)
+
+    (a, b), (last, into) = step(dt), step((1.0 - part) * dt)
+    powers = [jnp.eye(n)]
+    for _ in range(turn):
+        powers.append(a @ powers[-1])
+    whole = jnp.concatenate([powers[k] @ b for k in range(turn - 1, -1, -1)], axis=1)
+    read = jnp.concatenate([*(last @ powers[k] @ b for k in range(turn - 2, -1, -1)), into], axis=1)
+    felt = u.reshape(-1, turn * m)
+    felt = felt @ jnp.concatenate([whole, read[:1]]).T  # what moves the state, and the next output
+    system = Matrices(
+        powers[turn],
+        jnp.eye(n, n + 1),
+        (last @ powers[turn - 1])[:1],
+        jnp.zeros((1, n + 1)).at[0, n].set(1.0),
+        jnp.zeros(1),
+    )
+    first = x0 if physics.even else physics.advance(p, x0, u[0], part * dt)
+    return jnp.append(x0[:1], linear_outputs(system, felt, first)[0][:-1, 0])
 
 
 def run_from(

@@ -17,18 +17,17 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.optimize import minimize, minimize_scalar
 
 from beamfit.dynamics.model import (
     CLOSE,
     Driven,
     PreparedOutput,
-    driven,
     output_of,
     predicted,
     weight_priors,
 )
-from beamfit.dynamics.record import Run
+from beamfit.dynamics.paths import Path, Paths, handed_on, prepared, undriven
+from beamfit.dynamics.record import PARTS, Run
 from beamfit.dynamics.response import ARX, FIRST_ORDER, SECOND_ORDER, Physics
 from beamfit.errors import Status
 from beamfit.greybox.fit import Fit
@@ -37,18 +36,17 @@ from beamfit.greybox.solve import solve
 from beamfit.noise.correlated import TIMES, Memory, noises, range_of, whitened_by_each
 from beamfit.noise.memory import BESIDE, CorrelatedNoise, innovations, remembers
 
-# Longest delay that is tried, in samples, and as a share of the run.
-LATEST, SHARE = 24, 0.1
-# Gain in log likelihood that a longer delay needs over a shorter one; fractions of a sample
-# that are tried besides.
-BETTER, PARTS = 5.0, (-0.75, -0.5, -0.25, 0.25, 0.5, 0.75)
-# Where the search for a fraction ends, in samples; the fit goes on from there.
-CLOSE_DELAY = 0.02
 # Time constants of the grid, and dampings of a second order.
 LAGS, DAMPINGS = 16, (0.2, 0.6, 1.0, 2.0)
-# Step of their logarithms in a slope; their range, in intervals and in runs, beyond which nothing
-# tells them from zero and from infinity.
-STEP, RANGE = 1e-3, (1e-3, 1e3)
+# Gain in log likelihood that a longer delay needs over a shorter one, a path over that of a fit.
+BETTER = 5.0
+# Part of a row from its ends within which a delay has left it.
+INSIDE = 1e-3
+# Paths that are looked at together: one program is compiled for all.
+BATCH = 16
+# Range of time constants, in intervals and in runs, beyond which nothing tells them from zero and
+# from infinity.
+RANGE = (1e-3, 1e3)
 
 
 # Most half periods in a run of a drift of the output.
@@ -66,58 +64,136 @@ def drift_columns(times: Sequence[Any], i: int) -> jax.Array:
 
 
 class Start(NamedTuple):
-    """Parameters, first states (runs, free states), offset, and -2 ln L with the drift's cost."""
+    """A path, the model that a search begins with, and -2 ln L with the cost of a drift."""
 
-    p: np.ndarray
-    first: np.ndarray
-    offset: float
+    path: Path
+    model: dict[str, Any]
     cost: float
 
-    def model(self, seen: PreparedOutput) -> dict[str, Any]:
-        """The model that a search begins with."""
-        raw = seen.runs[0].physics.raw(jnp.asarray(self.p), len(seen.inputs))
-        return {"map": raw, "start": self.first, "offset": self.offset, "late": 0.0}
+
+def _grid(ends: Sequence[np.ndarray]) -> np.ndarray:
+    """All pairs of values of two axes, or the values of one, shape (points, axes)."""
+    return np.stack(np.meshgrid(*ends, indexing="ij"), axis=-1).reshape(-1, len(ends))
 
 
-def best_start(seen: PreparedOutput, offset: bool) -> Start:
-    """The best of the grid, of a difference equation that of second orders (eqs 13, 14)."""
-    physics = seen.runs[0].physics
-    apart, span = seen.apart, seen.span
-    times = np.geomspace(0.1 * apart, span, LAGS)
-    grid = np.log([[t] for t in times] if physics is FIRST_ORDER
-                  else [[t, z] for t in times for z in DAMPINGS])  # fmt: skip
+class ResponseSearch(NamedTuple):
+    """Output, physics and paths of a search, and whether the output at rest is a free number."""
 
-    def shapes(logarithms: np.ndarray) -> np.ndarray:
-        found = np.exp(logarithms)
-        return found if physics is not ARX else difference(found, apart)
+    output: str
+    physics: Physics
+    paths: Paths
+    offset: bool
 
-    def triangles(shapes: np.ndarray) -> np.ndarray:
-        return np.asarray(_triangles(seen.runs, seen.measured, shapes, offset))
+    def starts(self, runs: tuple[Run, ...], physics: Physics, paths: Sequence[Path]) -> list[Start]:
+        """The best start of a physics by each path, `BATCH` at once."""
+        size, found = BATCH if len(paths) > 2 else len(paths), []
+        for k in range(0, len(paths), size):
+            some = [*paths[k : k + size]]
+            more = some[:1] * (size - len(some))
+            found += self._starts(runs, physics, [*some, *more])[: len(some)]
+        return found
 
-    def left(logarithms: np.ndarray) -> np.ndarray:
-        return _costs(triangles(shapes(logarithms)), seen).min(axis=1)
+    def _starts(
+        self, runs: tuple[Run, ...], physics: Physics, paths: Sequence[Path]
+    ) -> list[Start]:
+        """The best of a grid of time constants and dampings, and of a finer one about it."""
+        seen, every = prepared(runs, self.output, physics, paths[0]), np.arange(len(paths))
+        drives, measured = undriven(runs, self.output, physics, self.paths.parts)
+        inputs, part = handed_on(runs, drives, self.paths.parts, paths)
+        axes = [np.log(np.geomspace(0.1 * seen.apart, seen.span, LAGS))]
+        axes += [np.log(DAMPINGS)] if physics is not FIRST_ORDER else []
+        reach = np.array([axis[1] - axis[0] for axis in axes])
+        around = _grid([np.linspace(-1.0, 1.0, len(axis)) for axis in axes])
+        grid = np.tile(_grid(axes), (len(paths), 1, 1))
 
-    def with_slope(x: np.ndarray) -> tuple[float, np.ndarray]:
-        moved = STEP * np.eye(len(x))
-        here, up, down = np.split(left(np.vstack([x, x + moved, x - moved])), [1, 1 + len(x)])
-        return float(here[0]), (up - down) / (2.0 * STEP)
+        def least(logarithms):
+            found = np.exp(logarithms)
+            found = found if physics is not ARX else difference(found, seen.apart)
+            asked = ([u[..., 0] for u in inputs], part), found
+            triangles = np.asarray(_triangles(drives, measured, *asked, self.offset))
+            costs = _costs(triangles, seen)
+            return costs.min(axis=2).argmin(axis=1), found, triangles, costs
 
-    bounds = [tuple(np.log(np.multiply(RANGE, (apart, span))))] * grid.shape[1]
-    begin = grid[np.argmin(left(grid))]
-    x = minimize(with_slope, begin, jac=True, bounds=bounds, method="L-BFGS-B").x
-    (shape,) = shapes(x[None])
-    triangle = triangles(shape[None])
-    (costs,), triangle = _costs(triangle, seen), triangle[0]
-    waves = DRIFT * len(seen.runs)
-    design = triangle[:, : triangle.shape[1] - 1 - waves + len(seen.runs) * int(costs.argmin())]
-    size = np.linalg.norm(design, axis=0)
-    size = np.where(size > 0, size, 1.0)
-    found = np.linalg.lstsq(design / size, triangle[:, -1], rcond=1e-10)[0] / size
-    found = found[: triangle.shape[1] - 1 - waves]
-    k = len(seen.runs) * physics.free_states + offset
-    first = found[len(found) - k :][: k - offset].reshape(len(seen.runs), -1)
-    p, level = np.append(shape, found[: len(found) - k]), float(found[-1]) if offset else 0.0
-    return Start(p, first, level, float(costs.min()))
+        near = grid[every, least(grid)[0]]
+        at, shapes, triangles, costs = least(near[:, None] + reach * around)
+        best = paths, shapes[every, at], triangles[every, at], costs[every, at]
+        return [
+            Start(path, self._model(physics, seen, *each, cost), float(cost.min()))
+            for path, *each, cost in zip(*best, strict=True)
+        ]
+
+    def _model(
+        self,
+        physics: Physics,
+        seen: PreparedOutput,
+        shape: np.ndarray,
+        triangle: np.ndarray,
+        costs: np.ndarray,
+    ) -> dict[str, Any]:
+        """The model of a shape by its triangular factor and the costs of drifts."""
+        runs, own = len(seen.runs), triangle.shape[1] - 1 - DRIFT * len(seen.runs)
+        design = triangle[:, : own + runs * int(costs.argmin())]
+        size = np.linalg.norm(design, axis=0)
+        size = np.where(size > 0, size, 1.0)
+        found = (np.linalg.lstsq(design / size, triangle[:, -1], rcond=1e-10)[0] / size)[:own]
+        k = own - self.offset - runs * physics.free_states
+        gains, first = np.split(found[: own - self.offset], [k])
+        raw = physics.raw(jnp.asarray(np.append(shape, gains)), len(seen.inputs))
+        level = float(found[-1]) if self.offset else 0.0
+        return {"map": raw, "start": first.reshape(runs, -1), "offset": level, "late": 0.0}
+
+    def start(self, runs: tuple[Run, ...]) -> Start:
+        """The start of the shortest whole delay about as likely as any, noise being white, or of a
+        likelier part of a sample about it.
+
+        The delay of a difference equation is that of a second order: its own gains of two samples
+        let a shorter one pass.
+        """
+        law = SECOND_ORDER if self.physics is ARX and not self.paths.given else self.physics
+
+        def cost(start: Start) -> float:
+            return start.cost - 2.0 * self.paths.log_prior(start.path)
+
+        tried = self.starts(runs, law, self.paths.plain())
+        near = min(map(cost, tried)) + 2.0 * BETTER
+        near = min(abs(each.path.delay) for each in tried if cost(each) <= near)
+        found = min((each for each in tried if abs(each.path.delay) == near), key=cost)
+        if parts := self.paths.around(found.path.delay):
+            found = min([found, *self.starts(runs, law, parts)], key=cost)
+        return found if law is self.physics else self.starts(runs, self.physics, [found.path])[0]
+
+    def begun(self, runs: tuple[Run, ...]) -> Begun:
+        """Identify with constant parameters."""
+        start = self.start(runs)
+        return self.along(runs, start.path, start.model)
+
+    def along(self, runs: tuple[Run, ...], path: Path, model: dict[str, Any]) -> Begun:
+        """Identify with constant parameters by a path, from a model.
+
+        A part of a sample that is a whole number of rows may lie in the row before or after, where
+        a fit ends within it; where none does the other rows are alternatives.
+        """
+        aside = (0.0,)
+        if path.moving and path.delay % 1.0 and not self.paths.given:
+            aside = (0.0, -0.5 / PARTS, 0.5 / PARTS)
+        found = []
+        for more in aside:
+            near = path._replace(delay=path.delay + more)
+            seen = prepared(runs, self.output, self.physics, near)
+            fit = fitted(case_of(seen, self.offset), [model | {"late": 0.0}])
+            late = float(fit.fit.model["late"])
+            if not more or min(np.abs(late - np.array(seen.ends))) > INSIDE:
+                found.append(Begun(seen, near, fit))
+        return min(found, key=lambda each: each.plain.likelihood)
+
+    def is_first_order(self, runs: tuple[Run, ...], found: Begun) -> bool:
+        """True if a first order does as well as a higher one by the information criterion."""
+        if self.physics is FIRST_ORDER:
+            return False
+        lower = found.seen._replace(runs=driven_by(found.seen, FIRST_ORDER))
+        (start,) = self.starts(runs, FIRST_ORDER, [found.path])
+        fit = fitted(case_of(lower, self.offset), [start.model])
+        return fit.likelihood <= found.plain.likelihood
 
 
 def _costs(triangles: np.ndarray, seen: PreparedOutput) -> np.ndarray:
@@ -126,18 +202,18 @@ def _costs(triangles: np.ndarray, seen: PreparedOutput) -> np.ndarray:
     The Bayesian information criterion, with the noise's size at its likeliest.
     """
     runs, count = len(seen.runs), sum(map(len, seen.measured))
-    used = triangles.shape[2] - 1 - runs * DRIFT + runs * np.arange(DRIFT + 1)
-    missed = np.stack([np.sum(triangles[:, k:, -1] ** 2, axis=1) for k in used], axis=1)
+    used = triangles.shape[-1] - 1 - runs * DRIFT + runs * np.arange(DRIFT + 1)
+    missed = np.stack([np.sum(triangles[..., k:, -1] ** 2, axis=-1) for k in used], axis=-1)
     least = count * (CLOSE * seen.size_y) ** 2
     return count * np.log(np.maximum(missed, least)) + np.log(count) * used
 
 
 def difference(shapes: np.ndarray, apart: float) -> np.ndarray:
     """a1 and a2 of the difference equations that samples of second orders obey."""
-    time, zeta = shapes.T.astype(complex)
+    time, zeta = np.moveaxis(shapes, -1, 0).astype(complex)
     root = np.sqrt(zeta**2 - 1.0)
     one, other = (np.exp(-apart / time * (zeta + sign * root)) for sign in (1, -1))
-    return np.stack([-(one + other), one * other], axis=1).real
+    return np.stack([-(one + other), one * other], axis=-1).real
 
 
 @jax.jit
@@ -146,7 +222,7 @@ def unit_outputs(run: Driven, shapes: jax.Array) -> jax.Array:
     m, k = len(run.physics.units(run.u.shape[1])) - shapes.shape[1], run.physics.free_states
 
     def one(shape, gains, first):
-        return run.constant(jnp.concatenate([shape, gains]), run.dt, first)
+        return run.constant(jnp.concatenate([shape, gains]), first, run.part)
 
     gains = jnp.concatenate([jnp.eye(m), jnp.zeros((k, m))])
     firsts = jnp.concatenate([jnp.zeros((m, k)), jnp.eye(k)])
@@ -163,83 +239,31 @@ def linear_columns(runs: Sequence[Driven], i: int, shapes: jax.Array, offset: bo
     return jnp.concatenate([columns[..., :-k], jnp.pad(columns[..., -k:], others), level], axis=2)
 
 
-@partial(jax.jit, static_argnums=3)
-def _triangles(runs: tuple[Driven, ...], measured: Any, shapes: jax.Array, offset: bool):
+@partial(jax.jit, static_argnums=4)
+def _triangles(runs: tuple[Driven, ...], measured: Any, inputs: Any, shapes: Any, offset: bool):
     """Triangular factors of outputs of unit gains, first states and offset, cosines of a drift of
-    each run, from the slowest, and of the readings: one for each shape.
+    each run, from the slowest, and of the readings: for each path one for each of its shapes.
     """
-    parts = []
-    for i, y in enumerate(measured):
-        waves = drift_columns([run.time for run in runs], i)
-        rest = jnp.concatenate([waves.reshape(len(y), -1), y[:, None]], axis=1)
-        rest = jnp.broadcast_to(rest, (len(shapes), *rest.shape))
-        parts.append(jnp.concatenate([linear_columns(runs, i, shapes, offset), rest], axis=2))
-    rows = jnp.concatenate(parts, axis=1)
-    few = max(0, rows.shape[2] - rows.shape[1])
-    return jnp.linalg.qr(jnp.pad(rows, ((0, 0), (0, few), (0, 0))), mode="r")
+
+    def one(asked):
+        (inputs, part), shapes = asked
+        felt = [replace(run, u=u, part=part) for run, u in zip(runs, inputs, strict=True)]
+        parts = []
+        for i, y in enumerate(measured):
+            waves = drift_columns([run.time for run in runs], i)
+            rest = jnp.concatenate([waves.reshape(len(y), -1), y[:, None]], axis=1)
+            rest = jnp.broadcast_to(rest, (len(shapes), *rest.shape))
+            parts.append(jnp.concatenate([linear_columns(felt, i, shapes, offset), rest], axis=2))
+        rows = jnp.concatenate(parts, axis=1)
+        few = max(0, rows.shape[2] - rows.shape[1])
+        return jnp.linalg.qr(jnp.pad(rows, ((0, 0), (0, few), (0, 0))), mode="r")
+
+    return jax.lax.map(one, (inputs, shapes))
 
 
 def driven_by(seen: PreparedOutput, physics: Physics) -> tuple[Driven, ...]:
     """The runs with another physics."""
     return tuple(replace(run, physics=physics) for run in seen.runs)
-
-
-def seen_of(runs: tuple[Run, ...], output: str, physics: Physics, delay: float) -> PreparedOutput:
-    """The runs as the model sees them."""
-    drives = tuple(driven(run, i, output, physics, delay) for i, run in enumerate(runs))
-    read = [np.isfinite(run.outputs[output]) for run in runs]
-    measured = tuple(run.outputs[output][k] for run, k in zip(runs, read, strict=True))
-    time = tuple(run.time[k] for run, k in zip(runs, read, strict=True))
-    u = np.concatenate([np.stack(list(run.inputs.values()), axis=1) for run in runs])
-    spread = float(np.concatenate(measured).std()) or 1.0
-    return PreparedOutput(
-        tuple(runs[0].inputs), output, drives, measured, time, u.mean(0), u.std(0), spread
-    )
-
-
-def starts_of(
-    runs: tuple[Run, ...], output: str, physics: Physics, delay: float | None, offset: bool
-) -> list[tuple[Start, PreparedOutput, float]]:
-    """The best start, and the delay: the shortest of those that fit about as well as any. After it
-    the best with a part of a sample in the delay.
-
-    A delay below zero must do as much better: it stands for clocks of input and output that differ.
-    The delay of a difference equation is that of a second order: its own gains of two samples let a
-    shorter one pass.
-    """
-
-    def at(late: float, law: Physics = physics) -> tuple[Start, PreparedOutput, float]:
-        seen = seen_of(runs, output, law, late)
-        return best_start(seen, offset), seen, late
-
-    if delay is not None:
-        return [at(delay)]
-    law = SECOND_ORDER if physics is ARX else physics
-    step = runs[0].parts
-    found = [at(late, law) for late in range(0, latest(runs) + 1, step)]
-    near = 2.0 * BETTER + min(start.cost for start, _, _ in found)
-    whole = next(each for each in found if each[0].cost <= near)
-    while whole[2] <= 0 and whole[2] > -latest(runs):
-        earlier = at(whole[2] - step, law)
-        if earlier[0].cost + 2.0 * BETTER >= whole[0].cost:
-            break
-        whole = earlier
-    if physics.even:
-        return [at(whole[2])]
-    longest = max(latest(runs), step)
-    parts = [at(whole[2] + step * part) for part in PARTS if whole[2] + step * part < longest]
-    middle = min([whole, *parts], key=lambda each: each[0].cost)[2]
-    ends = middle - 0.25 * step, min(middle + 0.25 * step, longest)
-    found = minimize_scalar(
-        lambda late: at(late)[0].cost, bounds=ends, options={"xatol": CLOSE_DELAY}
-    )
-    return [whole, at(found.x)] if found.fun < whole[0].cost else [whole]
-
-
-def latest(runs: tuple[Run, ...]) -> int:
-    """The longest delay that is tried, in rows."""
-    step = runs[0].parts
-    return step * min(LATEST, int(SHARE * min(map(len, runs)) / step))
 
 
 def noises_of(
@@ -603,7 +627,7 @@ def case_of(seen: PreparedOutput, offset: bool, network: bool = False) -> Case:
     """The case of one output: constant raw numbers or a network of them."""
     free = [Free("start", nuisance=True), Free("map", nuisance=network)]
     free += [Free("offset")] if offset else []
-    free += [Free("late", -seen.part, 1.0 - seen.part)] if seen.part else []
+    free += [Free("late", *seen.ends)] if seen.ends else []
     return Case((seen,), seen.runs, tuple(free), weight_priors("map") if network else ())
 
 
@@ -623,39 +647,20 @@ def fitted(case: Case, models: Sequence[Any]) -> Settled:
 
 
 class Begun(NamedTuple):
-    """Runs as the model sees them, the delay, and the fit with constant parameters."""
+    """Runs as the model sees them behind a path, and the fit."""
 
     seen: PreparedOutput
-    delay: float
+    path: Path
     plain: Settled
 
+    @property
+    def exact(self) -> float:
+        """The delay in samples, by the fit where it is a number of it."""
+        late = float(self.plain.fit.model["late"]) if self.seen.ends else 0.0
+        return (self.seen.delay + late) / self.seen.parts
 
-def begun(
-    runs: tuple[Run, ...], output: str, physics: Physics, delay: float | None, offset: bool
-) -> Begun:
-    """Identify with constant parameters; the delay among candidates if None.
-
-    A part of a sample in the delay must do better by the Bayesian information criterion, under the
-    noise that the fits have. If it makes the delay negative it must do as much better as another
-    whole number; also if times jitter, of which late ones see a new input in its own row.
-    """
-    starts = starts_of(runs, output, physics, delay, offset)
-    whole, *part = (
-        Begun(seen, late, fitted(case_of(seen, offset), [start.model(seen)]))
-        for start, seen, late in starts
-    )
-    for other in part:
-        doubtful = other.delay < 0 <= whole.delay or whole.plain.jitter.any()
-        margin = 2.0 * BETTER if doubtful else 0.0
-        if other.plain.likelihood + margin < whole.plain.likelihood:
-            return other
-    return whole
-
-
-def is_first_order(found: Begun, offset: bool) -> bool:
-    """True if a first order does as well as a higher one by the Bayesian information criterion."""
-    if found.seen.runs[0].physics is FIRST_ORDER:
-        return False
-    lower = found.seen._replace(runs=driven_by(found.seen, FIRST_ORDER))
-    start = best_start(lower, offset)
-    return fitted(case_of(lower, offset), [start.model(lower)]).likelihood <= found.plain.likelihood
+    def contains(self, path: Path) -> bool:
+        """True if the fit is by that path, or estimates its delay."""
+        apart = abs(path.delay - self.exact)
+        near = 1.0 / self.seen.parts if self.seen.ends else 1e-9
+        return path.law is None and path.moving == self.path.moving and apart < near

@@ -18,13 +18,13 @@ from beamfit.answer import Table, answer, json_of
 from beamfit.dynamics.answer import ResponseEvidence, judged, limit_words, quantity
 from beamfit.dynamics.checks import Checks, HeldOutRun, RunNoises, RunSlopes, checks_of, percent
 from beamfit.dynamics.model import PreparedOutput, weight_priors
+from beamfit.dynamics.paths import Path, prepared
 from beamfit.dynamics.record import Run, checked
 from beamfit.dynamics.response import FIRST_ORDER
 from beamfit.dynamics.search import (
     GAINED,
     Case,
     Settled,
-    seen_of,
     settled,
     used_by,
     with_memory,
@@ -331,7 +331,8 @@ def case_of(
     runs: Sequence[Run], system: System, free: Sequence[Free], priors: Sequence[Prior], delay: int
 ) -> Case:
     """The runs as the model sees them."""
-    seen = tuple(seen_of(tuple(runs), name, FIRST_ORDER, delay) for name in runs[0].outputs)
+    late = Path(None, (), float(delay))
+    seen = tuple(prepared(runs, name, FIRST_ORDER, late) for name in runs[0].outputs)
     courses = tuple(course_of(system, seen, i) for i in range(len(runs)))
     return Case(seen, courses, tuple(free), tuple(priors))
 

@@ -190,11 +190,7 @@ class Whitened(NamedTuple):
         """-2 ln of the probability of the values, numbers and noise integrated out: up to a
         constant, flat in the numbers, in the logarithm of the errors' size and over the noises.
         """
-        return -2.0 * float(logsumexp(-0.5 * self.evidences()))
-
-    def evidences(self) -> np.ndarray:
-        """The same by each noise, shape (g,)."""
-        return -2.0 * self._solved(None)[3]
+        return -2.0 * float(logsumexp(self._solved(None)[3]))
 
     def memory(self, numbers: int | None = None) -> Memory:
         """Posterior over noise models with the first `numbers` free and the others held.
@@ -219,11 +215,15 @@ class Whitened(NamedTuple):
         >>> print(f"{found.mean_step[0]:.1f}, {np.exp(-1 / found.time[found.likely]):.1f}")
         4.9, 0.8
         """
+        return self.weighed(numbers)[0]
+
+    def weighed(self, numbers: int | None = None) -> tuple[Memory, np.ndarray]:
+        """The same and, by each noise, the logarithm of the probability of the values."""
         half, along, squares, logs = self._solved(numbers)
         weight = np.exp(logs - logs.max())
         step = -(half @ along)[..., 0]
         dof = self.count - step.shape[1]
-        return Memory(weight / weight.sum(), *self.noise, step, half, squares, dof)
+        return Memory(weight / weight.sum(), *self.noise, step, half, squares, dof), logs
 
     def _solved(self, numbers: int | None) -> tuple[np.ndarray, ...]:
         """Root of the covariance, components of the residuals, what is left of their squares, and
@@ -241,7 +241,7 @@ class Whitened(NamedTuple):
         logs = self.volume + np.sum(np.log(np.where(seen, unit * inverse, 1.0)), axis=1)
         logs -= 0.5 * (self.count - seen.sum(axis=1)) * np.log(squares)
         alone = self.noise.white == 0
-        if not alone.all():  # even odds for a white part
+        if alone.any() and not alone.all():  # even odds for a white part
             logs += np.where(alone, np.log(alone.size / alone.sum() - 1.0), 0.0)
         return half, along, squares, logs
 

@@ -3,8 +3,10 @@
 import numpy as np
 import pytest
 
+from beamfit.dynamics.alternatives import Alternatives
 from beamfit.dynamics.fit import identify
-from beamfit.dynamics.input_laws import LawEvidence, moved
+from beamfit.dynamics.input_laws import moved
+from beamfit.dynamics.paths import Path
 from beamfit.dynamics.record import Run
 from beamfit.errors import Status
 
@@ -32,11 +34,12 @@ def test_a_hysteresis_is_the_mean_of_plays():
     np.testing.assert_allclose(moved(UP_AND_DOWN, "hysteresis", 0.3), np.mean(plays, axis=0))
 
 
-def test_an_error_is_that_of_the_mixture_about_the_value_without_a_law():
+def test_an_error_is_that_of_the_mixture_about_the_value_of_the_answer():
     """Beside draws from the mixture."""
     random = np.random.default_rng(0)
     shift, covariance = np.array([[2.0, 1.0], [0.0, -3.0]]), np.stack([np.diag([1.0, 0.5])] * 2)
-    found = LawEvidence(0.5, 0.0, "", False, np.array([0.3, 0.2]), shift, covariance)
+    own, weight = Path(None, (), 0.0), np.array([0.3, 0.2])
+    found = Alternatives(own, 0.5, 0.0, "", False, weight, shift, covariance)
     slope = np.array([1.0, 0.5])
     which = random.choice(3, 200_000, p=[0.5, 0.3, 0.2])
     laws = [random.multivariate_normal(s, c, 200_000) @ slope

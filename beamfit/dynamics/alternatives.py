@@ -1,0 +1,468 @@
+"""Alternatives of what stands between the inputs and an output, compared by one evidence.
+
+Inputs are held from sample to sample or move between, pass a law or none, and come late by whole
+samples or by a part of one; the response may have one more term. Each is fitted under every noise
+of a grid, white or wandering, and weighed by its likelihood with the numbers and the noise
+integrated out: a noise that wanders takes for its own what a law leaves, and gains are then far
+off. The likeliest is named, and what stays open goes into errors.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy.special import expit, logsumexp
+
+from beamfit.dynamics.checks import RunSlopes, slow_paths
+from beamfit.dynamics.input_laws import STATIC, InputLaw, laws_between, moved
+from beamfit.dynamics.model import Driven, PreparedOutput, predicted
+from beamfit.dynamics.paths import Path, Paths, handed_on, undriven
+from beamfit.dynamics.record import Run
+from beamfit.dynamics.search import BETTER, Begun, noises_of
+from beamfit.greybox import tree
+from beamfit.greybox.problem import with_slope
+from beamfit.noise.correlated import Whitened
+from beamfit.noise.memory import CorrelatedNoise, innovations
+
+# Correlation times and white variances of the noises that each is fitted with, and most readings.
+CORRELATION_TIMES, WHITE, MOST = 6, (0.0, 1.0, 10.0, 100.0), 2048
+# Probability of the laws that are named, where several are possible.
+NAMED = 0.99
+# How many times a law of the value alone is looked at in finer steps.
+ZOOMS = 2
+# Share of what a law hands on that no gain and level give, below which it is none.
+SAME = 1e-6
+# Largest residual, of a step that went astray.
+VAST = 1e100
+# Gauss-Newton rounds of all, and of the `MANY` that are likeliest then; every how many-th noise of
+# the grid the first one looks at, and how many the others.
+FIRST, MANY, ROUNDS, SPREAD, FEW = 2, 128, 3, 3, 4
+# Shorter delays that a law may stand for.
+LATE = 3
+# Alternatives that are fitted at once: one program is compiled for all.
+BATCH = 64
+
+
+class Trial(NamedTuple):
+    """A path, the logarithm of its prior, and the number of a further term of the response."""
+
+    path: Path
+    prior: float
+    term: int | None = None
+
+    @property
+    def lawful(self) -> bool:
+        """True for a law or a further term."""
+        return self.path.law is not None or self.term is not None
+
+
+class Alternatives(NamedTuple):
+    """Posterior over what may stand between the inputs and an output.
+
+    Attributes
+    ----------
+    path : Path
+        The likeliest one without a law, if it is clearly likelier than that of the fit.
+    none : float
+        Probability of no law, where a law is the only other possibility.
+    fuller : float
+        Probability that one more term of a fuller response explains more than a law does.
+    likeliest : str
+        The likeliest kind of law in words, or those that make 99 % with their probabilities.
+    static : bool
+        Whether the likeliest law is one of the value alone.
+    weight : array, shape (a,)
+        Probability of each alternative to the answer.
+    shift : array, shape (a, p)
+        The numbers of the fit with each, less those of the answer.
+    covariance : array, shape (a, p, p)
+        Of the numbers, with each.
+    """
+
+    path: Path
+    none: float
+    fuller: float
+    likeliest: str
+    static: bool
+    weight: np.ndarray
+    shift: np.ndarray
+    covariance: np.ndarray
+
+    def error(self, slopes: np.ndarray, alone: np.ndarray) -> np.ndarray:
+        """Errors of quantities by their slopes, shape (..., p), about the value of the answer.
+
+        `alone` has the errors without alternatives.
+        """
+        slopes = slopes[..., : self.shift.shape[1]]  # a delay is that of each path
+        spread = np.einsum("...p,apq,...q->...a", slopes, self.covariance, slopes)
+        others = (spread + (slopes @ self.shift.T) ** 2) @ self.weight
+        return np.sqrt(max(1.0 - self.weight.sum(), 0.0) * alone**2 + others)
+
+
+@partial(jax.jit, static_argnums=0)
+def _triangles(chosen: Any, model: Any, run: Driven, data: Any, theta: Any, u: Any, noise: Any):
+    """Triangular factors of slopes and residuals of each trial, and log volumes, by each noise.
+
+    `data` are readings, their times, their errors, what is added, and the parts of a row in delays;
+    `noise` all that are looked at, which of them first, and how many. The last number is the share
+    of what is added, or by how much the width of a law is another.
+    """
+    y, time, error, term, part = data
+    every, order, count = noise
+
+    def one(theta, u, term, part):
+        def output(t):
+            own = replace(run, u=u[..., 0] + t[-1] * u[..., 1], part=part)
+            return predicted(tree.replace(model, chosen, t[:-1]), own) + t[-1] * term
+
+        return with_slope(output, theta)
+
+    value, slope = jax.vmap(one)(theta, u, term, part)
+    rows = jnp.concatenate([slope, (value - y)[..., None]], axis=2) / error[:, None]
+    rows = jnp.swapaxes(jnp.clip(jnp.nan_to_num(rows, nan=VAST), -VAST, VAST), 0, 1)
+
+    def whiten(k, found):
+        at = order[k]
+        white, volume = innovations(rows, time, jax.tree.map(lambda v: v[at], every))
+        triangle = jnp.linalg.qr(jnp.swapaxes(white, 0, 1), mode="r")
+        return found[0].at[at].set(triangle), found[1].at[at].set(-volume)
+
+    least = min(rows.shape[0], rows.shape[2])
+    size = len(order), len(theta), least, rows.shape[2]
+    return jax.lax.fori_loop(0, count, whiten, (jnp.zeros(size), jnp.full(size[0], -jnp.inf)))
+
+
+class _Batch(NamedTuple):
+    """Trials to be fitted, each under every noise of a grid: their inputs and terms, by run."""
+
+    comparison: Comparison
+    inputs: list[np.ndarray]
+    part: np.ndarray
+    terms: list[np.ndarray]
+
+    def whitened(self, theta: np.ndarray, noises: Sequence[int]) -> Whitened:
+        """Rows of every trial by some noises of the grid."""
+        c, grid = self.comparison, self.comparison.grid
+        some = np.array(noises)
+        order = np.resize(some, len(grid.time))
+        triangles, volume, count = [], 0.0, 0
+        for run, data, term, u in zip(c.drives, c.data, self.terms, self.inputs, strict=True):
+            noise = grid, order, len(some)
+            each = _triangles(c.chosen, c.model, run, (*data, term, self.part), theta, u, noise)
+            triangles.append(np.asarray(each[0])[some])
+            volume, count = volume + np.asarray(each[1])[some], count + len(data[0])
+        prior = np.eye(len(c.begin))[c.near]
+        away = (theta - c.begin) @ prior.T
+        known = np.concatenate([np.tile(prior, (len(theta), 1, 1)), away[..., None]], axis=2)
+        both = np.concatenate([*triangles, np.tile(known, (len(some), 1, 1, 1))], axis=2)
+        noise = CorrelatedNoise(*np.repeat(np.array(grid)[:, some], len(theta), axis=1))
+        both, volume = both.reshape(-1, *both.shape[2:]), np.repeat(volume, len(theta))
+        return Whitened(noise, both, volume, count + len(prior))
+
+    def fitted(self, begin: np.ndarray, rounds: int) -> tuple[np.ndarray, np.ndarray]:
+        """The numbers of each trial, by Gauss-Newton steps that lower -2 ln L, and its least.
+
+        The first step is by the noise of a few that is likeliest with each trial, further ones by
+        the `FEW` that are so with the likeliest trials.
+        """
+        count, noises = len(begin), np.arange(len(self.comparison.grid.time))[::SPREAD]
+        best, each = begin, np.arange(count)
+        step, least = np.zeros_like(best), np.full(count, np.inf)
+        for _ in range(rounds):
+            white = self.whitened(best + step, noises)
+            memory, squares = white.memory(), np.sum(white.triangle[..., -1] ** 2, axis=1)
+            now, after = (_minus(white, s).reshape(-1, count) for s in (squares, memory.squares))
+            likeliest = after.argmin(axis=0)
+            further = memory.step.reshape(-1, count, best.shape[1])[likeliest, each]
+            better = now.min(axis=0) < least
+            best = np.where(better[:, None], best + step, best)
+            least = np.minimum(least, now.min(axis=0))
+            step = np.where(better[:, None], further, 0.25 * step)
+            ranked = noises[likeliest[np.argsort(after.min(axis=0))]]
+            noises = np.array(list(dict.fromkeys(ranked))[:FEW])
+        return best, np.minimum(least, after.min(axis=0))
+
+    def weighed(self, begin: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Log evidence, numbers and covariances of each trial, numbers and noise integrated out."""
+        (at, _), grid = self.fitted(begin, ROUNDS), len(self.comparison.grid.time)
+        white = self.whitened(at, range(grid))
+        memory, logs = white.weighed()
+        logs = logs.reshape(grid, -1)
+        likelihood = logsumexp(logs, axis=0)
+        share, step = np.exp(logs - likelihood), memory.step.reshape(*logs.shape, -1)
+        half = memory.half.reshape(*logs.shape, *memory.half.shape[1:])
+        size = (memory.squares / memory.dof).reshape(logs.shape)
+        mean = np.einsum("ga,gap->ap", share, step)
+        spread = np.einsum("ga,gapr,gaqr->apq", share * size, half, half, optimize=True)
+        away = step - mean
+        spread += np.einsum("ga,gap,gaq->apq", share, away, away, optimize=True)
+        return likelihood, at + mean, spread
+
+
+def _minus(white: Whitened, squares: np.ndarray) -> np.ndarray:
+    """-2 ln L by each noise, up to a constant, of so large sums of squares."""
+    return white.count * np.log(np.maximum(squares, np.finfo(float).tiny)) - 2.0 * white.volume
+
+
+class _Weighed(NamedTuple):
+    """Trials with the logarithms of their likelihoods, their numbers, and the covariances."""
+
+    trials: list[Trial]
+    log: np.ndarray
+    numbers: np.ndarray
+    spread: np.ndarray
+
+    def where(self, kept: np.ndarray) -> _Weighed:
+        """Some of them."""
+        trials = [trial for trial, keep in zip(self.trials, kept, strict=True) if keep]
+        return _Weighed(trials, *(each[kept] for each in self[1:]))
+
+    def beside(self, other: _Weighed) -> _Weighed:
+        """These and others."""
+        parts = zip(self[1:], other[1:], strict=True)
+        return _Weighed(self.trials + other.trials, *(np.concatenate(pair) for pair in parts))
+
+    @property
+    def logs(self) -> np.ndarray:
+        """Logarithm of the probability of each, up to a constant."""
+        return self.log + np.array([trial.prior for trial in self.trials])
+
+    @property
+    def chance(self) -> np.ndarray:
+        """Probability of each."""
+        return np.exp(self.logs - logsumexp(self.logs))
+
+    @property
+    def none(self) -> np.ndarray:
+        """True for those without a law."""
+        return np.array([trial.path.law is None for trial in self.trials])
+
+    @property
+    def further(self) -> np.ndarray:
+        """True for those with a further term."""
+        return np.array([trial.term is not None for trial in self.trials])
+
+    def best(self) -> dict[tuple[str, str], int]:
+        """The likeliest law of the value alone, by kind and input."""
+        logs, found = self.logs, {}
+        for k, trial in enumerate(self.trials):
+            law = trial.path.law
+            if law is not None and law.kind in STATIC:
+                key = law.kind, law.input
+                found[key] = k if logs[k] > logs[found.get(key, k)] else found.get(key, k)
+        return found
+
+
+class Comparison(NamedTuple):
+    """A fit that alternatives are compared with: its runs, readings, numbers and noises.
+
+    `data` are readings, their times and errors, by run; `begin` the numbers of the fit without its
+    delay and, last, a share of nothing; `near` those that have a prior of width 1: the logarithm of
+    a time constant, what a damping is made of, the share of a term or the change of a width. An
+    alternative may take them to where nothing tells them.
+    """
+
+    runs: tuple[Run, ...]
+    drives: tuple[Driven, ...]
+    data: list[tuple[np.ndarray, ...]]
+    parts: int
+    chosen: tuple[Any, ...]
+    model: Any
+    begin: np.ndarray
+    near: list[int]
+    grid: CorrelatedNoise
+    terms: list[np.ndarray]
+
+    @classmethod
+    def of(
+        cls, runs: tuple[Run, ...], found: Begun, paths: Paths, slopes: Sequence[RunSlopes]
+    ) -> Comparison:
+        """Prepare the fit of runs; `slopes` has terms of a fuller response."""
+        seen, fit = found.seen, found.plain.fit
+        drives, measured = undriven(runs, seen.output, seen.runs[0].physics, paths.parts, MOST)
+        errors = [noise.each[:MOST] for (noise,) in found.plain.noise]
+        data = list(zip(measured, [time[:MOST] for time in seen.time], errors, strict=True))
+        more, bent = [], _bent(seen)
+        for slow, each in zip(slow_paths(seen), slopes, strict=True):
+            more.append(np.concatenate([slow, each.changing[:, ~bent]], axis=1))
+        unit = np.sqrt(np.mean(np.concatenate(more) ** 2, axis=0)) / seen.size_y
+        terms = [(each / np.where(unit > 0, unit, 1.0)).T[:, :MOST] for each in more]
+        numbers = [v.name for v in fit.variables if v.name != "late"]
+        powers = seen.runs[0].physics.units(len(seen.inputs))
+        near = [numbers.index(f"map[{k}]") for k, (_, gain) in enumerate(powers)
+                if not gain and f"map[{k}]" in numbers] + [len(numbers)]  # fmt: skip
+        core = fit.problem.core
+        chosen = tuple(leaf for leaf in core.chosen if leaf.path != "late")
+        grid = CorrelatedNoise(*np.array(noises_of(seen.time, CORRELATION_TIMES, WHITE)).T)
+        begin = np.append(fit.theta[: len(numbers)], 0.0)
+        model = core.model | {"late": jnp.zeros(())}
+        return cls(runs, drives, data, paths.parts, chosen, model, begin, near, grid, terms)
+
+    def weighed(self, trials: list[Trial]) -> _Weighed:
+        """Weigh trials: those of no law, and the likeliest after a step or two from the fit."""
+        begin = np.tile(self.begin, (len(trials), 1))
+        if len(trials) > MANY:
+            steps = [batch.fitted(each, FIRST) for batch, each in self._batches(trials, begin)]
+            parts = zip(*steps, strict=True)
+            begin, cost = (np.concatenate(part)[: len(trials)] for part in parts)
+            cost -= [2.0 * t.prior if t.lawful else np.inf for t in trials]
+            kept = np.argsort(cost)[:MANY]
+            trials, begin = [trials[k] for k in kept], begin[kept]
+        found = [batch.weighed(each) for batch, each in self._batches(trials, begin)]
+        parts = (np.concatenate(part)[: len(trials)] for part in zip(*found, strict=True))
+        return _Weighed(trials, *parts)
+
+    def _batches(
+        self, trials: list[Trial], begin: np.ndarray
+    ) -> Iterator[tuple[_Batch, np.ndarray]]:
+        """`BATCH` trials at once, the last ones repeated, and where they begin."""
+        more = -len(trials) % BATCH
+        trials, begin = trials + trials[-1:] * more, np.pad(begin, ((0, more), (0, 0)), mode="edge")
+        for k in range(0, len(trials), BATCH):
+            some = trials[k : k + BATCH]
+            inputs, part = handed_on(
+                self.runs, self.drives, self.parts, [trial.path for trial in some]
+            )
+            terms = [np.stack([0.0 * each[0] if t.term is None else each[t.term] for t in some])
+                     for each in self.terms]  # fmt: skip
+            yield _Batch(self, inputs, part, terms), begin[k : k + BATCH]
+
+
+def alternatives_of(
+    runs: tuple[Run, ...],
+    found: Begun,
+    paths: Paths,
+    slopes: Sequence[RunSlopes],
+    lawful: bool,
+) -> Alternatives:
+    """Weigh every path and law of the inputs against those of a fit.
+
+    Terms of a fuller response are a further path of first order or a parameter that changes with
+    an input, as large as the output's scatter. `lawful` is False where no law is looked for.
+    """
+    comparison = Comparison.of(runs, found, paths, slopes)
+    own = found.path._replace(delay=found.exact)
+    plain = [own, *paths.plain(), *paths.around(own.delay)]
+    trials = [Trial(path, paths.log_prior(path)) for path in dict.fromkeys(plain)]
+    if lawful:
+        terms = len(comparison.terms[0])
+        prior = paths.log_prior(own) - np.log(terms)
+        trials += _lawful(comparison, own, paths)
+        trials += [Trial(own, prior, k) for k in range(terms)]
+    whole = comparison.weighed(trials)
+    posterior = whole.where(~whole.further)
+    laws, terms = posterior.logs[~posterior.none], whole.logs[whole.further]
+    fuller = expit(logsumexp(terms) - logsumexp(laws)) if lawful and len(laws) else 0.0
+    if posterior.chance[posterior.none].sum() < 0.5:
+        posterior = _finer(comparison, posterior)
+    chance, none = posterior.chance, posterior.none
+    others = np.array([not found.contains(trial.path) for trial in posterior.trials])
+    logs = np.where(none, posterior.logs, -np.inf)
+    clear = logs.max() > logs[~others].max() + BETTER
+    words, static = _named(posterior)
+    return Alternatives(
+        posterior.trials[logs.argmax()].path if clear else found.path,
+        float(chance[none].sum()),
+        float(fuller),
+        words,
+        static,
+        chance[others],
+        (posterior.numbers - comparison.begin)[others, :-1],
+        posterior.spread[others, :-1, :-1],
+    )
+
+
+def _lawful(comparison: Comparison, own: Path, paths: Paths) -> list[Trial]:
+    """Every law at even odds: over its kinds, the widths of one, and the paths.
+
+    Delays are that of the fit and, where none is given, shorter ones that a law may stand for. Laws
+    that a gain and a level stand for are none.
+    """
+    runs = comparison.runs
+    delays, whole = [own.delay], int(np.ceil(own.delay))
+    if not paths.given:
+        delays += range(max(0, whole - LATE), whole)
+    ways = [Path(None, kind, float(delay)) for delay in delays for kind in paths.kinds]
+    laws = [law for name in runs[0].inputs for law in _laws_of(runs, name)]
+    alike = Counter(law.kind for law in laws)
+    return [
+        Trial(way._replace(law=law), paths.log_prior(way) - np.log(len(alike) * alike[law.kind]))
+        for law in laws for way in ways
+    ]  # fmt: skip
+
+
+def _laws_of(runs: Sequence[Run], name: str) -> list[InputLaw]:
+    """Laws of an input that a gain and a level do not stand for, from its first change on: what was
+    before is a number at the start.
+    """
+    inputs = [run.inputs[name] for run in runs]
+    since = [u[int(np.argmax(u != u[0])) :] for u in inputs]
+    plain = np.concatenate(since)
+    laws = laws_between(name, *map(float, (min(map(np.min, inputs)), max(map(np.max, inputs)))))
+    at = np.stack([
+        np.concatenate([moved(u, law.kind, law.width, law.place)[-len(some) :]
+                        for u, some in zip(inputs, since, strict=True)])
+        for law in laws
+    ], axis=1)  # fmt: skip
+    basis = np.linalg.qr(np.stack([np.ones(len(plain)), plain], axis=1))[0]
+    at = at - at.mean(axis=0)
+    left = np.linalg.norm(at - basis @ (basis.T @ at), axis=0)
+    bends = left > SAME * np.linalg.norm(at, axis=0)
+    return [law for law, own in zip(laws, bends, strict=True) if own]
+
+
+def _finer(comparison: Comparison, posterior: _Weighed) -> _Weighed:
+    """The posterior with the likeliest laws of the value alone in finer steps."""
+    for _ in range(ZOOMS):
+        best, kept = posterior.best().values(), np.ones(len(posterior.trials), bool)
+        trials: list[Trial] = []
+        for at in best:
+            path, prior, _ = posterior.trials[at]
+            laws = path.law.finer(posterior.numbers[at, -1])
+            trials += [Trial(path._replace(law=law), prior - np.log(len(laws))) for law in laws]
+            kept[at] = False
+        if trials:
+            posterior = posterior.where(kept).beside(comparison.weighed(trials))
+    return posterior
+
+
+def _named(posterior: _Weighed) -> tuple[str, bool]:
+    """The likeliest law of each kind and input in words, as many as make 99 % of all laws, and if
+    the first is one of the value alone.
+    """
+    best: dict[tuple[str, str], tuple[float, InputLaw]] = {}
+    whole: Counter[tuple[str, str]] = Counter()
+    for trial, p, numbers in zip(
+        posterior.trials, posterior.chance, posterior.numbers, strict=True
+    ):
+        if trial.path.law is not None:
+            law = trial.path.law.changed(numbers[-1])
+            kind = law.kind, law.input
+            whole[kind] += float(p)
+            best[kind] = max(best.get(kind, (0.0, law)), (float(p), law), key=lambda each: each[0])
+    if not whole:
+        return "", False
+    total = max(sum(whole.values()), np.finfo(float).tiny)
+    ranked = [(kind, p / total) for kind, p in whole.most_common()]
+    above = np.cumsum([0.0, *(p for _, p in ranked)])[:-1]
+    ranked = [each for each, before in zip(ranked, above, strict=True) if before < NAMED]
+    words = [best[kind][1].words() for kind, _ in ranked]
+    if len(words) > 1:
+        words = [f"{w} (P = {p:.2f})" for w, (_, p) in zip(words, ranked, strict=True)]
+    return " or ".join(words), ranked[0][0][0] in STATIC
+
+
+def _bent(seen: PreparedOutput) -> np.ndarray:
+    """True for the terms of a fuller response that are static laws: gains by their own input."""
+    m = len(seen.inputs)
+    gains = [power for _, power in seen.runs[0].physics.units(m)]
+    number = np.cumsum(gains) - 1
+    own = [gain and k % m == number[i] % m for i, gain in enumerate(gains) for k in range(2 * m)]
+    return np.array(own, bool)

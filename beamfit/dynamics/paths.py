@@ -1,0 +1,182 @@
+"""Paths from the recorded inputs to a process: behind a law, held or moving between samples, late.
+
+Every path hands on rows of its own, as many a sample for all paths of a comparison.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import groupby
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from beamfit.arrays import padded_length
+from beamfit.dynamics.input_laws import InputLaw, moved
+from beamfit.dynamics.model import EQUAL, Driven, PreparedOutput
+from beamfit.dynamics.record import PARTS, Run, rows_of
+from beamfit.dynamics.response import Physics
+
+# Longest delay that is tried, in samples, and as a share of the run; most samples that clocks are
+# taken to be apart.
+LATEST, SHARE, EARLIEST = 24, 0.1, 3
+# Logarithm of the odds of clocks of input and output that differ: 1 in 150, a guess.
+AHEAD = 5.0
+
+
+class Path(NamedTuple):
+    """A law or none, names of the inputs that move between samples, and the delay in samples."""
+
+    law: InputLaw | None
+    moving: tuple[str, ...]
+    delay: float
+
+
+class Paths(NamedTuple):
+    """The paths without a law that a record may have.
+
+    Attributes
+    ----------
+    moving : tuple of str
+        Inputs without high frequencies, which may move between samples.
+    delays : tuple of float
+        Whole samples, or the one delay that is given.
+    some : bool
+        Whether parts of a sample are possible besides.
+    """
+
+    moving: tuple[str, ...]
+    delays: tuple[float, ...]
+    some: bool
+
+    @classmethod
+    def of(
+        cls, runs: Sequence[Run], moving: tuple[str, ...], delay: float | None, parts: bool
+    ) -> Paths:
+        """List those of runs; one delay if it is given."""
+        if delay is not None:
+            return cls(moving, (delay,), False)
+        most = latest(runs)
+        return cls(moving, tuple(map(float, range(-min(EARLIEST, most), most + 1))), parts)
+
+    @property
+    def given(self) -> bool:
+        """True if the delay is."""
+        return len(self.delays) == 1
+
+    @property
+    def kinds(self) -> tuple[tuple[str, ...], ...]:
+        """Inputs that move between samples, of each kind of path."""
+        return ((), self.moving) if self.moving else ((),)
+
+    @property
+    def parts(self) -> int:
+        """Rows a sample that all paths have in common."""
+        return PARTS if self.moving else 1
+
+    def plain(self) -> list[Path]:
+        """Paths of whole delays."""
+        return [Path(None, kind, delay) for delay in self.delays for kind in self.kinds]
+
+    def around(self, delay: float) -> list[Path]:
+        """Paths of parts of a sample less than one from a delay."""
+        ends = (np.ceil(delay) - 1, np.floor(delay) + 1) if self.some else (0, 0)
+        near = np.arange(PARTS * ends[0], PARTS * min(ends[1], max(self.delays[-1], 1))) / PARTS
+        return [Path(None, kind, float(each)) for each in near if each % 1.0 for kind in self.kinds]
+
+    def log_prior(self, path: Path) -> float:
+        """Even over delays, over whole ones and parts, and over the ways between samples."""
+        log = -np.log(len(self.kinds))
+        if self.given:
+            return float(log)
+        log -= np.log(self.delays[-1] + 1.0) + (AHEAD if path.delay < 0 else 0.0)
+        if self.some:
+            log -= np.log(2.0) + (np.log(PARTS - 1.0) if path.delay % 1.0 else 0.0)
+        return float(log)
+
+
+def latest(runs: Sequence[Run]) -> int:
+    """The longest delay that is tried, in samples."""
+    return min(LATEST, int(SHARE * min(map(len, runs))))
+
+
+def undriven(
+    runs: Sequence[Run], output: str, physics: Physics, parts: int, most: int | None = None
+) -> tuple[tuple[Driven, ...], tuple[np.ndarray, ...]]:
+    """Runs without inputs, of so many rows a sample, and their readings, `most` of each run."""
+    found, measured = [], []
+    for i, run in enumerate(runs):
+        read = np.flatnonzero(np.isfinite(run.outputs[output]))[:most]
+        time = run.time[: None if most is None else read[-1] + 1]
+        apart = np.diff(time, append=time[-1:])
+        dt = np.repeat(np.pad(apart, (0, padded_length(len(time)) - len(time))) / parts, parts)
+        turn = parts if np.ptp(apart[:-1]) <= EQUAL * apart[0] else 0
+        each = (jnp.asarray(v) for v in (dt, run.time[read] - run.time[0], read * parts, i))
+        found.append(Driven(physics, None, *each, 0.0, turn))
+        measured.append(run.outputs[output][read])
+    return tuple(found), tuple(measured)
+
+
+def handed_on(
+    runs: Sequence[Run], drives: Sequence[Driven], parts: int, paths: Sequence[Path]
+) -> tuple[list[np.ndarray], np.ndarray]:
+    """Inputs of each run behind each path and their changes by a step of a law's width, and the
+    part of a row by which each path is later still.
+
+    Shape (paths, rows, inputs, 2). Inputs before the first sample equal it.
+    """
+    whole = [int(np.floor(path.delay * parts)) for path in paths]
+    found = []
+    for run, drive in zip(runs, drives, strict=True):
+        plain = {moving: rows_of(run, moving, parts) for moving in {p.moving for p in paths}}
+        behind = _behind(run, plain, paths)
+        each, rows = [], np.arange(len(drive.dt))
+        for path, late in zip(paths, whole, strict=True):
+            u = plain[path.moving]
+            u = np.stack([u, np.zeros_like(u)], axis=2)
+            if path.law is not None:
+                u[:, list(run.inputs).index(path.law.input)] = behind[path.law, path.moving]
+            each.append(u[np.clip(rows - late, 0, len(u) - 1)])
+        found.append(np.stack(each))
+    return found, np.array([parts * path.delay for path in paths]) - whole
+
+
+def _behind(run: Run, plain: dict, paths: Sequence[Path]) -> dict[Any, np.ndarray]:
+    """An input behind laws and its changes, shape (rows, 2): alike laws at once."""
+
+    def alike(each: tuple[InputLaw, tuple[str, ...]]) -> tuple:
+        return each[0].kind, each[0].place, each[0].input, each[1]
+
+    lawful = {(path.law, path.moving) for path in paths if path.law is not None}
+    found = {}
+    for (kind, place, name, moving), group in groupby(sorted(lawful, key=alike), alike):
+        group = list(group)
+        u = plain[moving][:, list(run.inputs).index(name)]
+        width, step = np.array([(law.width, law.step) for law, _ in group]).T
+        widths = width * np.exp(np.multiply.outer([0.0, 1.0, -1.0], step))
+        for key, at, wider, closer in zip(group, *moved(u, kind, widths, place), strict=True):
+            found[key] = np.stack([at, 0.5 * (wider - closer)], axis=1)
+    return found
+
+
+def prepared(runs: Sequence[Run], output: str, physics: Physics, path: Path) -> PreparedOutput:
+    """Runs as the model sees them behind a path without a law.
+
+    A part of a row in the delay is a number of the fit.
+    """
+    parts = PARTS if path.moving else 1
+    drives, measured = undriven(runs, output, physics, parts)
+    inputs, (part,) = handed_on(runs, drives, parts, [path])
+    drives = tuple(replace(drive, u=jnp.asarray(u[0, ..., 0]), part=part)
+                   for drive, u in zip(drives, inputs, strict=True))  # fmt: skip
+    ends = (-part, 1.0 - part) if part else None
+    time = tuple(np.asarray(drive.time) for drive in drives)
+    u = np.concatenate([np.stack(list(run.inputs.values()), axis=1) for run in runs])
+    spread = float(np.concatenate(measured).std()) or 1.0
+    delay = parts * path.delay
+    names = tuple(runs[0].inputs)
+    return PreparedOutput(
+        names, output, drives, measured, time, u.mean(0), u.std(0), spread, delay, parts, ends
+    )
