@@ -408,8 +408,8 @@ class Evidence:
 
     @cached_property
     def hidden(self) -> tuple[float, float] | None:
-        """What a cycle loses, and the least refill that the noise does not hide, mA, where that is
-        more, of cycles that were found.
+        """Loss of a cycle and the least refill that the noise does not hide, mA, if that is more,
+        of cycles that were found.
 
         The refill that holds the current gives back what a cycle loses. It is told from the noise
         by the means of half a cycle before and after.
