@@ -194,7 +194,7 @@ def identify(
     >>> import beamfit
     >>> (level,) = beamfit.identify("measurements/valve_level_simulated.csv")
     >>> list(level.quantities), level.status.value
-    (['tau', 'K', 'offset'], 'poor_fit')
+    (['tau', 'K', 'offset', 'delay'], 'poor_fit')
     """
     check_model(model, map, order=order, delay=delay, offset=offset)
     runs = [runs] if not isinstance(runs, list | tuple) else runs
