@@ -51,11 +51,12 @@ def test_what_only_the_limits_of_the_scales_decide_is_not_determined(machine):
 TRUE, PRIOR = 1.012, (1.0, 0.01)
 
 
-def read_low(machine, count=12):
-    """Decays at a voltage above its reading, at several voltages, scrapers and currents."""
+@pytest.fixture(scope="module")
+def read_low(machine):
+    """Twelve decays at a voltage above its reading, at several voltages, scrapers and currents."""
     random = np.random.default_rng(3)
     time, made = np.arange(0.0, 7200.0, 60.0), []
-    for k in range(count):
+    for k in range(12):
         stated = machine.operation._replace(
             rf_voltage=(1.6e6, 2.2e6, 2.8e6)[k % 3], scraper_y=(6e-3, 3e-3)[k % 2]
         )
@@ -71,11 +72,15 @@ def read_low(machine, count=12):
     return made
 
 
-def test_the_calibration_of_the_rf_voltage_is_found_and_told(machine):
-    decays = read_low(machine)
-    plain = fit_scales(decays, machine)
+@pytest.fixture(scope="module")
+def free(machine, read_low):
+    """Scales of these, with the voltage's."""
+    return fit_scales(read_low, machine, priors={"rf_voltage": PRIOR})
+
+
+def test_the_calibration_of_the_rf_voltage_is_found_and_told(machine, read_low, free):
+    plain = fit_scales(read_low, machine)
     assert plain.status is Status.poor_fit
-    free = fit_scales(decays, machine, priors={"rf_voltage": PRIOR})
     assert free.status is Status.converged
     assert abs(free.rf_voltage.value - TRUE) < 3 * free.rf_voltage.error
     assert free.rf_voltage.error < 0.002
@@ -143,18 +148,16 @@ def test_a_gauge_that_contradicts_the_ring_file_is_used_and_said(machine):
     assert far.lifetime < 0.6 * close.lifetime
 
 
-def test_a_correction_begins_at_the_voltage_that_was_found(machine):
+def test_a_correction_begins_at_the_voltage_that_was_found(read_low, free):
     """The network of decays that follow first principles is zero: it had to mend 1 % of voltage."""
-    decays = read_low(machine)
-    free = fit_scales(decays, machine, priors={"rf_voltage": PRIOR})
-    network = fit_loss_network(decays, free, starts=1)
+    network = fit_loss_network(read_low, free, starts=1)
     points = np.linspace(*np.transpose([*network.certificate.box.values()]), 9)
     added = np.array([network.fit.model["map"].values(point)[0] for point in points])
     assert np.abs(added).max() < 4e-3  # of ln a; it was up to 2.8 %
 
 
-def test_a_study_with_a_voltage_of_its_own_is_whole(machine):
-    shift = study_shift(read_low(machine), machine, priors={"rf_voltage": PRIOR})
+def test_a_study_with_a_voltage_of_its_own_is_whole(machine, read_low):
+    shift = study_shift(read_low, machine, priors={"rf_voltage": PRIOR})
     assert shift.fit.rf_voltage.error < 0.002
     [table] = shift.tables()
     assert "rf_voltage, true over read" in dict(table.rows)
@@ -164,10 +167,9 @@ def test_a_study_with_a_voltage_of_its_own_is_whole(machine):
     assert abs(shift.best.lifetime.value - truth) < 3 * shift.best.lifetime.error
 
 
-def test_the_best_voltage_is_a_reading_and_as_uncertain_as_its_scale(machine):
+def test_the_best_voltage_is_a_reading_and_as_uncertain_as_its_scale(machine, free):
     """Bucket and lattice meet at a true voltage; what is read there is 1.2 % less."""
     ring = machine.ring._replace(momentum_acceptance=0.025)
-    free = fit_scales(read_low(machine), machine, priors={"rf_voltage": PRIOR})
     narrow = replace(free, machine=machine._replace(ring=ring))
     sample = free.sample(seed=1, target_ess=300)
     best = best_operating_point(
