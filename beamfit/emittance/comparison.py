@@ -35,10 +35,10 @@ from beamfit.noise.sizes import (
     wide_scales,
 )
 
-# What scans turn out to be, before their sizes are seen: most are scans of a beam.
 BEAM, FLAT = "beam", "beam of no emittance"
 CONSTANT, RANDOM, DRIFTING = "one constant size", "sizes at random", "sizes that drift"
 CURVE = "a smooth curve that is no beam's"
+# What scans turn out to be, before their sizes are seen: most are scans of a beam.
 MODELS = {BEAM: 0.85, FLAT: 0.03, CONSTANT: 0.03, RANDOM: 0.04, DRIFTING: 0.02, CURVE: 0.03}
 # Of rows that moved no magnet only a beam and sizes at random are possible.
 UNMOVED = {BEAM: 0.9, FLAT: 0.05, RANDOM: 0.05}

@@ -36,7 +36,7 @@ MOST_NAMED = 5
 # What to check where a rival explains the sizes.
 REMEDIES = {
     FLAT: "The smallest sizes decide: measure over the waist, and check resolution_um.",
-    CONSTANT: ("Check that the magnet moved and that the screen shows the beam, and scan further."),
+    CONSTANT: "Check that the magnet moved and that the screen shows the beam, and scan further.",
     RANDOM: "Check settings, units, energy and screen, or measure more settings.",
     DRIFTING: "Check that the beam was stable while the scan was taken.",
     CURVE: (
