@@ -7,19 +7,15 @@ of them says how likely it is and what the numbers are with it.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import groupby
 from typing import NamedTuple
 
-import jax
 import numpy as np
-from scipy.special import logsumexp, stdtr, stdtrit
+from scipy.special import logsumexp, ndtri, stdtr, stdtrit
 
-from beamfit.arrays import padded_length
 from beamfit.noise.memory import (
     BESIDE,
     CorrelatedNoise,
     Levels,
-    levelled,
     products_by_each,
     white_shares,
 )
@@ -32,7 +28,7 @@ SHORTEST, LONGEST, TIMES = 0.3, 5.0, 20
 # Central 68 %, one standard deviation to either side of a normal distribution, and its upper end.
 CENTRAL, HALF = 0.682689492, 0.841344746
 # Most steps to a distance of given probability, and the last step's share of its size.
-ROUNDS, ENOUGH = 50, 1e-10
+ROUNDS, ENOUGH = 50, 1e-8
 
 
 class AveragedMoments(NamedTuple):
@@ -126,11 +122,11 @@ class Memory(NamedTuple):
 
 
 def reach_of_probability(within, scale: np.ndarray, probability: float) -> np.ndarray:
-    """Distance within which this probability lies.
+    """Distance within which this probability lies; `scale` is what a normal error would be.
 
     By Newton steps, and halves of the bracket where one leaves it or is no shorter by half.
     """
-    low, high, at = np.zeros_like(scale), 100.0 * scale, scale
+    low, high, at = np.zeros_like(scale), 100.0 * scale, ndtri((1 + probability) / 2) * scale
     last = high
     for _ in range(ROUNDS):
         found, slope = within(at)
@@ -139,7 +135,7 @@ def reach_of_probability(within, scale: np.ndarray, probability: float) -> np.nd
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             step = (probability - found) / slope
         usable = (at + step >= low) & (at + step <= high) & (2 * np.abs(step) <= last)
-        step = np.where(usable, step, 0.5 * (low + high) - at)
+        step = np.where(usable | (np.abs(step) <= ENOUGH * at), step, 0.5 * (low + high) - at)
         at, last = at + step, np.abs(step)
         if np.all(last <= ENOUGH * at):
             break
@@ -256,10 +252,8 @@ def whitened_by_each(
 
     `known` are rows of priors, in units of the noise; `levels`, of each run, are eliminated.
     """
-    if levels:
-        parts = [_levelled(grid, *run, own) for run, own in zip(runs, levels, strict=True)]
-    else:
-        parts = [_triangles(grid, rows, np.diff(time)) for rows, time in runs]
+    every = levels or [None] * len(runs)
+    parts = [_triangles(grid, *run, own) for run, own in zip(runs, every, strict=True)]
     triangles, volume = [triangle for triangle, _ in parts], sum(volume for _, volume in parts)
     count = sum(len(rows) for rows, _ in runs) - sum(own.first.size for own in levels)
     if known is not None:
@@ -270,34 +264,16 @@ def whitened_by_each(
 
 
 def _triangles(
-    grid: Sequence[CorrelatedNoise], rows: np.ndarray, interval: np.ndarray
+    grid: Sequence[CorrelatedNoise], rows: np.ndarray, time: np.ndarray, levels: Levels | None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Triangular factors of one run's whitened rows, and log volumes, for each noise: of columns
-    at right angles products lose no digit.
+    """Roots of the products of one run's whitened rows, and log volumes, for each noise: of columns
+    at right angles products lose no digit. What levels alone explain has a product of 0.
     """
-    rows, triangle = np.linalg.qr(rows)
-    products, volumes = products_by_each(grid, rows, interval)
-    return np.swapaxes(np.linalg.cholesky(products), 1, 2) @ triangle, volumes
-
-
-_levelled_by_each = jax.jit(jax.vmap(levelled, in_axes=(None, None, None, None, 0)))
-
-
-def _levelled(
-    grid: Sequence[CorrelatedNoise], rows: np.ndarray, time: np.ndarray, levels: Levels
-) -> tuple[np.ndarray, np.ndarray]:
-    """The same without levels, the rows padded to one of a few lengths; noises of one time after
-    the other, since all rows together take gigabytes.
-    """
-    extra = (0, padded_length(max(time.size, 64)) - time.size)
-    begins = np.isin(np.arange(time.size + extra[1]), levels.first)
-    padded = np.pad(rows, (extra, (0, 0))), np.pad(time, extra, mode="edge"), begins
-    slope, triangles, volumes = np.pad(levels.slope, extra, mode="edge"), [], []
-    for _, alike in groupby(grid, key=lambda noise: noise.time):
-        found, volume = _levelled_by_each(*padded, slope, CorrelatedNoise(*np.array([*alike]).T))
-        triangles.append(np.linalg.qr(np.asarray(found), mode="r"))
-        volumes.append(-np.asarray(volume))
-    return np.concatenate(triangles), np.concatenate(volumes)
+    rows, triangle = np.linalg.qr(rows if levels is None else levels.left(rows))
+    products, volumes = products_by_each(grid, rows, np.diff(time), levels)
+    sizes, along = np.linalg.eigh(products)
+    root = np.sqrt(np.maximum(sizes, 0.0))[..., None] * np.swapaxes(along, 1, 2)
+    return root @ triangle, volumes
 
 
 def range_of(time: np.ndarray) -> tuple[float, float]:
