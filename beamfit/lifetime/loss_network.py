@@ -24,7 +24,7 @@ from beamfit.greybox.mlp import MLP, Port
 from beamfit.greybox.problem import Prior, Problem, Record
 from beamfit.greybox.signed_network import GainCertificate, certificate_of, signed_network
 from beamfit.greybox.solve import solve
-from beamfit.lifetime.mechanisms import scaled_losses
+from beamfit.lifetime.mechanisms import SCALES, scaled_losses, terms_along
 from beamfit.lifetime.ring import Operation
 from beamfit.lifetime.scales import ScaleFit, by_losses, loss_parts
 from beamfit.lifetime.study import Decay, settings_of
@@ -364,7 +364,8 @@ def _single_maximum(
 ) -> bool:
     """Look along the voltage at every corner of the other settings."""
     corners = itertools.product(*zip(low[1:], high[1:], strict=True))
-    voltages = np.linspace(low[0], high[0], VOLTAGES)
+    voltages, scales = np.linspace(low[0], high[0], VOLTAGES), corrected.vector
+    true = 1e6 * voltages * (1.0 if corrected.voltages is None else scales[len(SCALES)])
     for scraper, pressure, bunches in corners:
         operation = corrected.machine.operation._replace(
             scraper_y=1e-3 * np.exp(scraper),
@@ -372,12 +373,8 @@ def _single_maximum(
             pressure_slope=0.0,
             bunches=np.exp(bunches),
         )
-        base = jax.lax.map(
-            lambda v, o=operation: jnp.log(
-                jnp.stack(corrected.losses_at(o._replace(rf_voltage=v), current))
-            ),
-            jnp.asarray(1e6 * voltages),
-        )
+        terms = terms_along(corrected.machine.ring, operation, current, true)
+        base = jnp.log(jnp.stack(scaled_losses(scales, terms), axis=1))
         rest = np.tile([scraper, pressure, bunches], (VOLTAGES, 1))
         inputs = jnp.asarray(np.column_stack([voltages, rest]))
         a, b = np.exp(np.asarray(_logs(fit.model, (inputs, base)))).T

@@ -563,14 +563,11 @@ def loss_terms(
     >>> print(f"{terms.base:.1e} Pa, P1/P0 = {terms.slope / terms.base:.3f} /mA")
     2.0e-08 Pa, P1/P0 = 0.008 /mA
     """
-
-    def parts_at(voltage: Array) -> tuple[Array, ...]:
-        return terms_of(ring, operation._replace(rf_voltage=voltage), current)
-
     if voltages is None:
-        parts = parts_at(operation.rf_voltage)
+        parts = terms_of(ring, operation, current)
     else:
-        parts = jax.lax.map(parts_at, operation.rf_voltage * jnp.asarray(voltages, float))
+        true = operation.rf_voltage * jnp.asarray(voltages, float)
+        parts = terms_along(ring, operation, current, true).parts
     return LossTerms(
         parts,
         base=jnp.asarray(operation.pressure_base, float),
@@ -578,6 +575,16 @@ def loss_terms(
         current=jnp.asarray(current, float),
         voltages=None if voltages is None else jnp.asarray(voltages, float),
     )
+
+
+@jax.jit
+def terms_along(ring: Ring, operation: Operation, current: Array, voltages: Array) -> LossTerms:
+    """Terms at some RF voltages, V: each has an axis of them."""
+
+    def one(voltage: Array) -> LossTerms:
+        return loss_terms(ring, operation._replace(rf_voltage=voltage), current)
+
+    return jax.lax.map(one, voltages)
 
 
 def scaled_losses(

@@ -26,9 +26,9 @@ from beamfit.lifetime.mechanisms import (
     MECHANISMS,
     SCALES,
     LossTerms,
-    loss_terms,
     scaled_losses,
     scaled_parts,
+    terms_along,
 )
 from beamfit.lifetime.record import DecayRecord
 from beamfit.lifetime.ring import Operation
@@ -423,10 +423,7 @@ def best_operating_point(
     ends = max(low * by.min(), 1.01 * loss), max(high, low) * by.max()
     for _ in range(2):
         at = np.linspace(*ends, VOLTAGES)
-        terms = jax.lax.map(
-            lambda v: loss_terms(fit.machine.ring, wide._replace(rf_voltage=v), current),
-            jnp.asarray(at),
-        )
+        terms = terms_along(fit.machine.ring, wide, current, jnp.asarray(at))
         true = at[np.argmin(jax.vmap(_rate, (0, None))(jnp.asarray(draws), terms), axis=1)]
         step = at[1] - at[0]
         ends = max(at[0], true.min() - step), min(at[-1], true.max() + step)

@@ -7,13 +7,17 @@ likelihoods are products over readings. Nothing here is taken from the package b
 import math
 
 import numpy as np
-from scipy.stats import cauchy, multivariate_t, norm
+from scipy.stats import multivariate_t, norm
 
 GRID = 80
 
 
 def log_normal(off, deviation):
     return -0.5 * (off / deviation) ** 2 - np.log(deviation) - 0.5 * math.log(2.0 * math.pi)
+
+
+def log_cauchy(off, scale):
+    return -np.log(math.pi * scale * (1.0 + (off / scale) ** 2))
 
 
 def log_sum(log, axis=-1):
@@ -52,7 +56,7 @@ def unstated_scales(noise):
 def log_readings(off, deviation, noise):
     """Log density of readings of shape (..., n), each good or bad."""
     good = log_normal(off, deviation)
-    wide = cauchy.logpdf(off, scale=noise.width * deviation)
+    wide = log_cauchy(off, noise.width * deviation)
     either = np.logaddexp(math.log(1.0 - noise.bad) + good, math.log(noise.bad) + wide)
     return either.sum(-1)
 
@@ -121,9 +125,8 @@ def log_of_one_bad(off, covariance, deviation, noise):
         rest = np.arange(n) != i
         pull = np.linalg.solve(covariance[np.ix_(rest, rest)], covariance[rest, i])
         left = covariance[i, i] - pull @ covariance[rest, i] - sd**2
-        bad = cauchy.logpdf(
-            off[i] - pull @ off[rest], scale=math.hypot(noise.width * sd, math.sqrt(max(left, 0)))
-        )
+        scale = math.hypot(noise.width * sd, math.sqrt(max(left, 0)))
+        bad = log_cauchy(off[i] - pull @ off[rest], scale)
         others = log_of_all(off[rest], covariance[np.ix_(rest, rest)])
         found.append((n - 1) * good + math.log(noise.bad) + others + bad)
     return log_sum(np.array(found))
