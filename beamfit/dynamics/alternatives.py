@@ -22,14 +22,14 @@ from scipy.special import expit, logsumexp
 
 from beamfit.dynamics.checks import RunSlopes, slow_paths
 from beamfit.dynamics.input_laws import STATIC, InputLaw, laws_between, moved
-from beamfit.dynamics.model import Driven, PreparedOutput, predicted
+from beamfit.dynamics.model import Driven, PreparedOutput, filled, predicted
 from beamfit.dynamics.paths import Path, Paths, handed_on, undriven
 from beamfit.dynamics.record import Run
 from beamfit.dynamics.search import BETTER, Begun, noises_of
 from beamfit.greybox import tree
 from beamfit.greybox.problem import with_slope
-from beamfit.noise.correlated import Whitened
-from beamfit.noise.memory import CorrelatedNoise, innovations
+from beamfit.noise.correlated import Whitened, roots_by_each
+from beamfit.noise.memory import CorrelatedNoise
 
 # Correlation times and white variances of the noises that each is fitted with, and most readings.
 CORRELATION_TIMES, WHITE, MOST = 6, (0.0, 1.0, 10.0, 100.0), 2048
@@ -107,15 +107,13 @@ class Alternatives(NamedTuple):
 
 
 @partial(jax.jit, static_argnums=0)
-def _triangles(chosen: Any, model: Any, run: Driven, data: Any, theta: Any, u: Any, noise: Any):
-    """Triangular factors of slopes and residuals of each trial, and log volumes, by each noise.
+def _columns(chosen: Any, model: Any, run: Driven, data: Any, theta: Any, u: Any):
+    """Slopes and residuals of each trial: columns at right angles, and the triangle they make.
 
-    `data` are readings, their times, their errors, what is added, and the parts of a row in delays;
-    `noise` all that are looked at, which of them first, and how many. The last number is the share
-    of what is added, or by how much the width of a law is another.
+    `data` are readings, their errors, what is added, and the parts of a row in delays. The last
+    number is the share of what is added, or by how much the width of a law is another.
     """
-    y, time, error, term, part = data
-    every, order, count = noise
+    y, error, term, part = data
 
     def one(theta, u, term, part):
         def output(t):
@@ -125,18 +123,8 @@ def _triangles(chosen: Any, model: Any, run: Driven, data: Any, theta: Any, u: A
         return with_slope(output, theta)
 
     value, slope = jax.vmap(one)(theta, u, term, part)
-    rows = jnp.concatenate([slope, (value - y)[..., None]], axis=2) / error[:, None]
-    rows = jnp.swapaxes(jnp.clip(jnp.nan_to_num(rows, nan=VAST), -VAST, VAST), 0, 1)
-
-    def whiten(k, found):
-        at = order[k]
-        white, volume = innovations(rows, time, jax.tree.map(lambda v: v[at], every))
-        triangle = jnp.linalg.qr(jnp.swapaxes(white, 0, 1), mode="r")
-        return found[0].at[at].set(triangle), found[1].at[at].set(-volume)
-
-    least = min(rows.shape[0], rows.shape[2])
-    size = len(order), len(theta), least, rows.shape[2]
-    return jax.lax.fori_loop(0, count, whiten, (jnp.zeros(size), jnp.full(size[0], -jnp.inf)))
+    rows = jnp.concatenate([slope, (value - y)[..., None]], axis=2)
+    return jnp.linalg.qr(jnp.clip(jnp.nan_to_num(rows, nan=VAST), -VAST, VAST) / error[:, None])
 
 
 class _Batch(NamedTuple):
@@ -149,20 +137,21 @@ class _Batch(NamedTuple):
 
     def whitened(self, theta: np.ndarray, noises: Sequence[int]) -> Whitened:
         """Rows of every trial by some noises of the grid."""
-        c, grid = self.comparison, self.comparison.grid
-        some = np.array(noises)
-        order = np.resize(some, len(grid.time))
+        c, some = self.comparison, [self.comparison.grid[k] for k in noises]
         triangles, volume, count = [], 0.0, 0
         for run, data, term, u in zip(c.drives, c.data, self.terms, self.inputs, strict=True):
-            noise = grid, order, len(some)
-            each = _triangles(c.chosen, c.model, run, (*data, term, self.part), theta, u, noise)
-            triangles.append(np.asarray(each[0])[some])
-            volume, count = volume + np.asarray(each[1])[some], count + len(data[0])
+            y, time, error = data
+            found = _columns(c.chosen, c.model, run, (y, error, term, self.part), theta, u)
+            columns, triangle = map(np.asarray, found)
+            columns = np.swapaxes(columns[:, : len(time)], 0, 1)
+            roots, each = roots_by_each(some, columns, np.diff(time))
+            triangles.append(roots @ triangle)
+            volume, count = volume + each, count + len(time)
         prior = np.eye(len(c.begin))[c.near]
         away = (theta - c.begin) @ prior.T
         known = np.concatenate([np.tile(prior, (len(theta), 1, 1)), away[..., None]], axis=2)
         both = np.concatenate([*triangles, np.tile(known, (len(some), 1, 1, 1))], axis=2)
-        noise = CorrelatedNoise(*np.repeat(np.array(grid)[:, some], len(theta), axis=1))
+        noise = CorrelatedNoise(*np.repeat(np.array(some).T, len(theta), axis=1))
         both, volume = both.reshape(-1, *both.shape[2:]), np.repeat(volume, len(theta))
         return Whitened(noise, both, volume, count + len(prior))
 
@@ -172,7 +161,7 @@ class _Batch(NamedTuple):
         The first step is by the noise of a few that is likeliest with each trial, further ones by
         the `FEW` that are so with the likeliest trials.
         """
-        count, noises = len(begin), np.arange(len(self.comparison.grid.time))[::SPREAD]
+        count, noises = len(begin), np.arange(len(self.comparison.grid))[::SPREAD]
         best, each = begin, np.arange(count)
         step, least = np.zeros_like(best), np.full(count, np.inf)
         for _ in range(rounds):
@@ -191,7 +180,7 @@ class _Batch(NamedTuple):
 
     def weighed(self, begin: np.ndarray) -> tuple[np.ndarray, ...]:
         """Log evidence, numbers and covariances of each trial, numbers and noise integrated out."""
-        (at, _), grid = self.fitted(begin, ROUNDS), len(self.comparison.grid.time)
+        (at, _), grid = self.fitted(begin, ROUNDS), len(self.comparison.grid)
         white = self.whitened(at, range(grid))
         memory, logs = white.weighed()
         logs = logs.reshape(grid, -1)
@@ -263,10 +252,10 @@ class _Weighed(NamedTuple):
 class Comparison(NamedTuple):
     """A fit that alternatives are compared with: its runs, readings, numbers and noises.
 
-    `data` are readings, their times and errors, by run; `begin` the numbers of the fit without its
-    delay and, last, a share of nothing; `near` those that have a prior of width 1: the logarithm of
-    a time constant, what a damping is made of, the share of a term or the change of a width. An
-    alternative may take them to where nothing tells them.
+    `data` are readings, their times and errors, by run, readings and errors padded; `begin` the
+    numbers of the fit without its delay and, last, a share of nothing; `near` those that have a
+    prior of width 1: the logarithm of a time constant, what a damping is made of, the share of a
+    term or the change of a width. An alternative may take them to where nothing tells them.
     """
 
     runs: tuple[Run, ...]
@@ -277,7 +266,7 @@ class Comparison(NamedTuple):
     model: Any
     begin: np.ndarray
     near: list[int]
-    grid: CorrelatedNoise
+    grid: list[CorrelatedNoise]
     terms: list[np.ndarray]
 
     @classmethod
@@ -288,19 +277,23 @@ class Comparison(NamedTuple):
         seen, fit = found.seen, found.plain.fit
         drives, measured = undriven(runs, seen.output, seen.runs[0].physics, paths.parts, MOST)
         errors = [noise.each[:MOST] for (noise,) in found.plain.noise]
-        data = list(zip(measured, [time[:MOST] for time in seen.time], errors, strict=True))
+        data = [
+            (filled(drive, y), time[:MOST], filled(drive, error, np.inf))
+            for drive, y, time, error in zip(drives, measured, seen.time, errors, strict=True)
+        ]
         more, bent = [], _bent(seen)
         for slow, each in zip(slow_paths(seen), slopes, strict=True):
             more.append(np.concatenate([slow, each.changing[:, ~bent]], axis=1))
         unit = np.sqrt(np.mean(np.concatenate(more) ** 2, axis=0)) / seen.size_y
-        terms = [(each / np.where(unit > 0, unit, 1.0)).T[:, :MOST] for each in more]
+        terms = [filled(drive, (each / np.where(unit > 0, unit, 1.0)).T[:, :MOST])
+                 for drive, each in zip(drives, more, strict=True)]  # fmt: skip
         numbers = [v.name for v in fit.variables if v.name != "late"]
         powers = seen.runs[0].physics.units(len(seen.inputs))
         near = [numbers.index(f"map[{k}]") for k, (_, gain) in enumerate(powers)
                 if not gain and f"map[{k}]" in numbers] + [len(numbers)]  # fmt: skip
         core = fit.problem.core
         chosen = tuple(leaf for leaf in core.chosen if leaf.path != "late")
-        grid = CorrelatedNoise(*np.array(noises_of(seen.time, CORRELATION_TIMES, WHITE)).T)
+        grid = noises_of(seen.time, CORRELATION_TIMES, WHITE)
         begin = np.append(fit.theta[: len(numbers)], 0.0)
         model = core.model | {"late": jnp.zeros(())}
         return cls(runs, drives, data, paths.parts, chosen, model, begin, near, grid, terms)

@@ -66,7 +66,7 @@ def _beside(
     """Readings of each run, and the free-running output there."""
     seen = prepared(runs, output, found.seen.runs[0].physics, found.path)
     pairs = zip(seen.measured, seen.runs, strict=True)
-    return [(y, np.asarray(output_of(found.plain.fit.model, run))) for y, run in pairs]
+    return [(y, output_of(found.plain.fit.model, run)) for y, run in pairs]
 
 
 def _without(

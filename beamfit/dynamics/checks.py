@@ -204,8 +204,8 @@ class RunNoises(NamedTuple):
         """Columns of readings, by run, in noise without a memory and of size 1."""
         each = zip(parts, self.errors, self.times, strict=True)
         return np.concatenate([
-            np.asarray(whitened_rows(part / np.expand_dims(error, tuple(range(1, part.ndim))),
-                                     time, self.memory)[0])
+            whitened_rows(part / np.expand_dims(error, tuple(range(1, part.ndim))),
+                          time, self.memory)[0]
             for part, error, time in each
         ])  # fmt: skip
 
@@ -214,8 +214,12 @@ class RunNoises(NamedTuple):
         the Bayesian information criterion wants.
         """
         count, runs = len(rest), len(self.times)
-        waves = self.white([np.asarray(drift_columns(self.times, i)).reshape(len(t), -1)
-                            for i, t in enumerate(self.times)])  # fmt: skip
+        waves = self.white(
+            [
+                drift_columns(t / t[-1], i, runs).reshape(len(t), -1)
+                for i, t in enumerate(self.times)
+            ]
+        )
         triangle = np.linalg.qr(np.column_stack([_basis(own), waves, rest]), mode="r")
         least = np.cumsum(triangle[::-1, -1] ** 2)[::-1]
         used = len(triangle) - 1 - runs * np.arange(DRIFT, -1, -1)
@@ -227,7 +231,7 @@ class RunNoises(NamedTuple):
         found = []
         for r, error, time in zip(residuals, self.errors, self.times, strict=True):
             white, volume = whitened_rows(r / error, time, self.memory)
-            found.append(np.asarray(white) * error * np.exp(float(volume) / len(r)))
+            found.append(white * error * np.exp(volume / len(r)))
         return np.concatenate(found)
 
 
@@ -257,7 +261,7 @@ def _explained(
     own, quick, later = [each.own for each in slopes], [], []
     for run, each in zip(seen.runs, slopes, strict=True):
         u = seen.scaled(run.u)
-        index = np.asarray(run.index)
+        index = run.read
         past = [u[np.clip(index + k, 0, len(u) - 1)] for k in range(-PAST, delay)]
         first = delay + noise.jitter  # a late reading has seen the input of its row
         after = [u[np.clip(index + first + k, 0, len(u) - 1)] for k in range(LATER)]
@@ -290,7 +294,7 @@ def slow_paths(seen: PreparedOutput) -> list[np.ndarray]:
     """Outputs of further paths of first order from each input, shape (readings, paths) by run."""
     times = np.geomspace(seen.apart, seen.span / 4, SLOW)[:, None]
     m, paths = len(seen.inputs), driven_by(seen, FIRST_ORDER)
-    found = [np.asarray(unit_outputs(path, times))[:, :m] for path in paths]
+    found = [np.asarray(unit_outputs(path, times))[:, :m, : path.count] for path in paths]
     return [each.reshape(-1, each.shape[2]).T for each in found]
 
 
@@ -325,5 +329,6 @@ def slopes_of(seen: PreparedOutput, fit: Fit) -> list[RunSlopes]:
     for run in seen.runs:
         u = seen.scaled(run.u)
         added = changed_by(fit.model, run, np.concatenate([u, u**2], axis=1))
-        found.append(RunSlopes(fit.derive(predicted, run).slope, np.asarray(added)))
+        own = fit.derive(predicted, run).slope
+        found.append(RunSlopes(*(np.asarray(each)[: run.count] for each in (own, added))))
     return found

@@ -112,7 +112,7 @@ class ResponseFit:
     @cached_property
     def fitted(self) -> tuple[np.ndarray, ...]:
         """The free-running output at the readings of each run."""
-        return tuple(np.asarray(output_of(self.fit.model, run)) for run in self.seen.runs)
+        return tuple(output_of(self.fit.model, run) for run in self.seen.runs)
 
     def tables(self) -> tuple[Table, ...]:
         """All numbers, to be shown."""

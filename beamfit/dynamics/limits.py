@@ -77,7 +77,7 @@ class _Lags(NamedTuple):
         runs = [replace(run, part=run.part + model["late"]) for run in self.seen.runs]
         for i, y in enumerate(self.seen.measured):
             columns = linear_columns(runs, i, jnp.asarray(shape[None]), self.offset)[0]
-            part = np.column_stack([columns, y])
+            part = np.column_stack([np.asarray(columns)[: len(y)], y])
             parts.append((part / self.found.noise[i][0].each[:, None])[:LONGEST])
         time = [each[:LONGEST] for each in self.seen.time]
         both = np.concatenate(parts)

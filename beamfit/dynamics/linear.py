@@ -368,7 +368,7 @@ def _scaled(
         count = int(np.count_nonzero(np.asarray(run.dt))) + 1
         each = (np.asarray(run.u)[:count] - units["u"][0]) / units["u"][1]
         u.append(np.pad(each, ((0, 0), (0, int(offset))), constant_values=1.0))
-        read = [np.interp(np.arange(count), np.asarray(s.runs[i].index), s.measured[i])
+        read = [np.interp(np.arange(count), s.runs[i].read, s.measured[i])
                 for s in case.seen]  # fmt: skip
         y.append((np.stack(read, axis=1) - units["y"][0]) / units["y"][1])
     return u, y

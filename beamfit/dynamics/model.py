@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from beamfit.arrays import padded_length
 from beamfit.dynamics.response import Physics, even_response, response_at
 from beamfit.greybox import tree
 from beamfit.greybox.mlp import MLP, Port, dense
@@ -23,11 +24,11 @@ WEIGHT = 3.0
 
 @tree.node("physics", "turn")
 class Driven:
-    """A run as the model sees it: inputs, whole rows late, and steps, padded; what was read.
+    """A run as the model sees it: inputs, whole rows late, and steps; when and where it was read.
 
-    Shapes (rows, inputs), (rows,), (readings,), (readings,); `run` is its number, `part` the part
-    of a row by which inputs come later still. `turn` is the number of rows a sample where all
-    steps are equal, 0 where they are not.
+    Shapes (rows, inputs), (rows,), (readings,), (readings,), all padded: there are `count`
+    readings. `run` is its number, `part` the part of a row by which inputs come later still. `turn`
+    is the number of rows a sample where all steps are equal, 0 where they are not.
     """
 
     physics: Physics
@@ -35,9 +36,15 @@ class Driven:
     dt: Any
     time: Any
     index: Any
+    count: Any
     run: Any
     part: Any
     turn: int = 0
+
+    @property
+    def read(self) -> np.ndarray:
+        """Rows where the output was read."""
+        return np.asarray(self.index)[: self.count]
 
     def predicted(self, model: Any) -> jax.Array:
         """The output where it was read, running free from the start of the run."""
@@ -89,7 +96,7 @@ class PreparedOutput(NamedTuple):
     @property
     def points(self) -> np.ndarray:
         """The inputs at all readings, shape (readings, inputs)."""
-        return np.concatenate([np.asarray(run.u)[np.asarray(run.index)] for run in self.runs])
+        return np.concatenate([np.asarray(run.u)[run.read] for run in self.runs])
 
     @property
     def apart(self) -> float:
@@ -121,7 +128,25 @@ def predicted(model: Any, course: Any) -> jax.Array:
     return course.predicted(model)
 
 
-output_of = jax.jit(predicted)
+def readings_of(time: np.ndarray, index: np.ndarray) -> tuple[jax.Array, jax.Array]:
+    """When and where readings were taken, padded: a noise goes on to the end."""
+    more = (0, padded_length(len(time)) - len(time))
+    time = np.pad(time, more, "linear_ramp", end_values=2 * time[-1])
+    return jnp.asarray(time), jnp.asarray(np.pad(index, more, "edge"))
+
+
+def filled(course: Any, values: np.ndarray, by: float = 0.0) -> np.ndarray:
+    """Values of the readings, along the last axis, as many as the course has with its padding."""
+    more = len(course.index) - values.shape[-1]
+    return np.pad(values, [(0, 0)] * (values.ndim - 1) + [(0, more)], constant_values=by)
+
+
+_predicted = jax.jit(predicted)
+
+
+def output_of(model: Any, course: Any) -> np.ndarray:
+    """Those that were taken."""
+    return np.asarray(_predicted(model, course))[: course.count]
 
 
 @jax.jit

@@ -15,7 +15,7 @@ import numpy as np
 
 from beamfit.arrays import padded_length
 from beamfit.dynamics.input_laws import InputLaw, moved
-from beamfit.dynamics.model import EQUAL, Driven, PreparedOutput
+from beamfit.dynamics.model import EQUAL, Driven, PreparedOutput, readings_of
 from beamfit.dynamics.record import PARTS, Run, rows_of
 from beamfit.dynamics.response import Physics
 
@@ -113,8 +113,8 @@ def undriven(
         apart = np.diff(time, append=time[-1:])
         dt = np.repeat(np.pad(apart, (0, padded_length(len(time)) - len(time))) / parts, parts)
         turn = parts if np.ptp(apart[:-1]) <= EQUAL * apart[0] else 0
-        each = (jnp.asarray(v) for v in (dt, run.time[read] - run.time[0], read * parts, i))
-        found.append(Driven(physics, None, *each, 0.0, turn))
+        each = (jnp.asarray(dt), *readings_of(run.time[read] - run.time[0], read * parts))
+        found.append(Driven(physics, None, *each, len(read), jnp.asarray(i), 0.0, turn))
         measured.append(run.outputs[output][read])
     return tuple(found), tuple(measured)
 
@@ -172,7 +172,7 @@ def prepared(runs: Sequence[Run], output: str, physics: Physics, path: Path) -> 
     drives = tuple(replace(drive, u=jnp.asarray(u[0, ..., 0]), part=part)
                    for drive, u in zip(drives, inputs, strict=True))  # fmt: skip
     ends = (-part, 1.0 - part) if part else None
-    time = tuple(np.asarray(drive.time) for drive in drives)
+    time = tuple(np.asarray(drive.time)[: drive.count] for drive in drives)
     u = np.concatenate([np.stack(list(run.inputs.values()), axis=1) for run in runs])
     spread = float(np.concatenate(measured).std()) or 1.0
     delay = parts * path.delay

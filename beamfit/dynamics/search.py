@@ -18,10 +18,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from beamfit.arrays import Array, array_module
 from beamfit.dynamics.model import (
     CLOSE,
     Driven,
     PreparedOutput,
+    filled,
     output_of,
     predicted,
     weight_priors,
@@ -34,7 +36,7 @@ from beamfit.greybox.fit import Fit
 from beamfit.greybox.problem import Free, Prior, Problem, Record
 from beamfit.greybox.solve import solve
 from beamfit.noise.correlated import TIMES, Memory, noises, range_of, whitened_by_each
-from beamfit.noise.memory import BESIDE, CorrelatedNoise, innovations, remembers
+from beamfit.noise.memory import BESIDE, CorrelatedNoise, filtered, innovations, remembers
 
 # Time constants of the grid, and dampings of a second order.
 LAGS, DAMPINGS = 16, (0.2, 0.6, 1.0, 2.0)
@@ -53,14 +55,15 @@ RANGE = (1e-3, 1e3)
 DRIFT = 8
 
 
-def drift_columns(times: Sequence[Any], i: int) -> jax.Array:
-    """Cosines of a slow drift of each run, from the slowest, at the readings of run i.
+def drift_columns(through: Array, i: int, runs: int) -> Array:
+    """Cosines of a slow drift of each run, from the slowest, at the readings of run i, whose times
+    are in lengths of the run.
 
     Shape (readings, DRIFT, runs), zero but for run i.
     """
-    through = jnp.pi * times[i] / times[i][-1]
-    waves = jnp.zeros((len(times[i]), DRIFT, len(times)))
-    return waves.at[:, :, i].set(jnp.cos(through[:, None] * jnp.arange(1, DRIFT + 1)))
+    xp = array_module(through)
+    waves = xp.cos(xp.pi * through[:, None] * np.arange(1, DRIFT + 1))
+    return xp.pad(waves[..., None], ((0, 0), (0, 0), (i, runs - 1 - i)))
 
 
 class Start(NamedTuple):
@@ -99,6 +102,7 @@ class ResponseSearch(NamedTuple):
         """The best of a grid of time constants and dampings, and of a finer one about it."""
         seen, every = prepared(runs, self.output, physics, paths[0]), np.arange(len(paths))
         drives, measured = undriven(runs, self.output, physics, self.paths.parts)
+        measured = tuple(map(filled, drives, measured))
         inputs, part = handed_on(runs, drives, self.paths.parts, paths)
         axes = [np.log(np.geomspace(0.1 * seen.apart, seen.span, LAGS))]
         axes += [np.log(DAMPINGS)] if physics is not FIRST_ORDER else []
@@ -250,10 +254,12 @@ def _triangles(runs: tuple[Driven, ...], measured: Any, inputs: Any, shapes: Any
         felt = [replace(run, u=u, part=part) for run, u in zip(runs, inputs, strict=True)]
         parts = []
         for i, y in enumerate(measured):
-            waves = drift_columns([run.time for run in runs], i)
+            through = runs[i].time / runs[i].time[runs[i].count - 1]
+            waves = drift_columns(through, i, len(runs))
             rest = jnp.concatenate([waves.reshape(len(y), -1), y[:, None]], axis=1)
             rest = jnp.broadcast_to(rest, (len(shapes), *rest.shape))
-            parts.append(jnp.concatenate([linear_columns(felt, i, shapes, offset), rest], axis=2))
+            part = jnp.concatenate([linear_columns(felt, i, shapes, offset), rest], axis=2)
+            parts.append(jnp.where((jnp.arange(len(y)) < runs[i].count)[:, None], part, 0.0))
         rows = jnp.concatenate(parts, axis=1)
         few = max(0, rows.shape[2] - rows.shape[1])
         return jnp.linalg.qr(jnp.pad(rows, ((0, 0), (0, few), (0, 0))), mode="r")
@@ -324,7 +330,7 @@ def reading_errors(
     if not (np.isfinite(usual) and usual > 0):
         return ReadingErrors(np.full(len(rest), max(float(rest.std()), least)))
     scale = np.hypot(1.0, np.outer(RATIOS, moves / usual))
-    white = np.asarray(whitened_rows((rest / scale).T, time, memory)[0])
+    white = whitened_rows((rest / scale).T, time, memory)[0]
     size = np.maximum(np.sqrt(np.mean(white**2, axis=0)), least)
     minus = 2.0 * (len(rest) * np.log(size) + np.log(scale).sum(axis=1))
     minus[1:] += 2.0 * np.log(len(RATIOS) - 1)
@@ -337,7 +343,7 @@ def reading_errors(
 
 def whitened_rows(
     rows: np.ndarray, time: np.ndarray, memory: CorrelatedNoise | None
-) -> tuple[Any, Any]:
+) -> tuple[np.ndarray, float]:
     """Rows whitened, and the log sum of the errors; as they are without a memory."""
     return (rows, 0.0) if memory is None else innovations(rows, time, memory)
 
@@ -382,7 +388,7 @@ class Case(NamedTuple):
     def rest(self, model: Any) -> tuple[tuple[np.ndarray, ...], ...]:
         """Residuals of a model, by run and output."""
         return tuple(
-            tuple(self.split(i, self.measured(i) - np.asarray(output_of(model, course))))
+            tuple(self.split(i, self.measured(i) - output_of(model, course)))
             for i, course in enumerate(self.courses)
         )
 
@@ -429,18 +435,20 @@ class Case(NamedTuple):
         records = []
         cuts = model["nodes"].shape[1] if len(gap) else 0
         for i, course in enumerate(self.courses):
-            y, predict = self.measured(i), _with_gaps if cuts else predicted
+            y, asked, predict = self.measured(i), course, predicted
             error = np.concatenate([each.each for each in noise[i]])
             exact = all(_exact(n, s.size_y) for n, s in zip(noise[i], self.seen, strict=True))
-            if cuts:
-                y = np.concatenate([y, np.zeros(cuts * len(gap))])
-                error = np.concatenate([error, np.tile(gap, cuts)])
             if memory is not None:
-                course = (course, jnp.asarray(error), CorrelatedNoise(*map(jnp.asarray, memory)))
-                y, predict = np.asarray(_surprises(y, *course)), _surprising
-                error = np.ones_like(y)
+                y = innovations(y / error, np.asarray(course.time)[: len(y)], memory)[0]
+                asked = course, jnp.asarray(filled(course, error, 1.0)), jnp.asarray(memory)
+                error, predict = np.ones_like(y), _surprising
+            rows = [filled(course, *each) for each in ((y,), (error, 1.0), (np.ones_like(y),))]
+            if cuts:
+                gaps, predict = cuts * len(gap), _with_gaps
+                more = np.zeros(gaps), np.tile(gap, cuts), np.ones(gaps)
+                rows = [np.concatenate(pair) for pair in zip(rows, more, strict=True)]
             worth = np.inf if exact else 1.0
-            records.append(Record(f"run {i + 1}", predict, course, y, error, worth=worth))
+            records.append(Record(f"run {i + 1}", predict, asked, *rows, worth))
         free = [*self.free, *([Free("nodes", nuisance=True)] if cuts else [])]
         return Problem(model, free, records, self.priors)
 
@@ -481,7 +489,10 @@ class Settled(NamedTuple):
     def slopes(self, case: Case) -> list[np.ndarray]:
         """Slopes of each run's outputs by the free numbers; 0 by those that are held."""
         free = self.fit.problem.moving
-        return [free * self.fit.derive(predicted, course).slope for course in case.courses]
+        return [
+            free * np.asarray(self.fit.derive(predicted, course).slope)[: course.count]
+            for course in case.courses
+        ]
 
     def remembered(
         self, case: Case, noise: CorrelatedNoise | None = None, most: int | None = None
@@ -550,20 +561,17 @@ def _minus(
     scale = error / error.min()
     white, volume = whitened_rows(rest / scale, time, memory)
     size = max(float(np.std(white)), least)
-    return 2.0 * (len(rest) * np.log(size) + float(np.log(scale).sum()) + float(volume))
+    return 2.0 * (len(rest) * np.log(size) + float(np.log(scale).sum()) + volume)
 
 
 def _with_gaps(model: Any, course: Any) -> jax.Array:
     return jnp.concatenate(course.shot(model))
 
 
-def _surprising(model: Any, asked: tuple[Any, jax.Array, CorrelatedNoise]) -> jax.Array:
-    return _surprises(predicted(model, asked[0]), *asked)
-
-
-def _surprises(y: Any, course: Any, error: jax.Array, memory: CorrelatedNoise) -> jax.Array:
-    """Innovations of a run: readings less their prediction from earlier ones, over their errors."""
-    return innovations(y / error, course.time, memory)[0]
+def _surprising(model: Any, asked: tuple[Any, jax.Array, jax.Array]) -> jax.Array:
+    """Innovations of a run: an output less its prediction from earlier ones, over the errors."""
+    course, error, memory = asked
+    return filtered(predicted(model, course) / error, course.time, CorrelatedNoise(*memory))
 
 
 def rounds(found: Any, again: Callable[[Any], Any], gained: float, most: int) -> tuple[Any, bool]:

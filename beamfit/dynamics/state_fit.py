@@ -17,7 +17,7 @@ import numpy as np
 from beamfit.answer import Table, answer, json_of
 from beamfit.dynamics.answer import ResponseEvidence, judged, limit_words, quantity
 from beamfit.dynamics.checks import Checks, HeldOutRun, RunNoises, RunSlopes, checks_of, percent
-from beamfit.dynamics.model import PreparedOutput, weight_priors
+from beamfit.dynamics.model import PreparedOutput, readings_of, weight_priors
 from beamfit.dynamics.paths import Path, prepared
 from beamfit.dynamics.record import Run, checked
 from beamfit.dynamics.response import FIRST_ORDER
@@ -61,17 +61,19 @@ class System(Protocol):
 
 @tree.node("system")
 class Course:
-    """A run as the model sees it: inputs and steps, padded, and which outputs were read.
+    """A run as the model sees it: inputs and steps, and which outputs were read, all padded.
 
     Shapes (samples, m), (samples,); `index` (readings,) points into all outputs one after the
-    other, `time` is theirs, s, far apart from output to output; `run` is its number.
+    other, `time` is theirs, s, far apart from output to output; there are `count`. `run` is its
+    number.
     """
 
     system: System
     u: Any
     dt: Any
-    index: Any
     time: Any
+    index: Any
+    count: Any
     run: Any
 
     def shot(self, model: Any) -> tuple[jax.Array, jax.Array]:
@@ -91,11 +93,11 @@ class Course:
 def course_of(system: System, seen: Sequence[PreparedOutput], i: int) -> Course:
     """Course of a run, from the prepared outputs."""
     run = seen[0].runs[i]
-    index = [k * len(run.u) + np.asarray(s.runs[i].index) for k, s in enumerate(seen)]
+    index = [k * len(run.u) + s.runs[i].read for k, s in enumerate(seen)]
     far = APART * float(np.sum(np.asarray(run.dt)))
-    time = [far * k + np.asarray(s.runs[i].time) for k, s in enumerate(seen)]
-    index, time = (jnp.asarray(np.concatenate(part)) for part in (index, time))
-    return Course(system, run.u, run.dt, index, time, run.run)
+    time = [far * k + s.time[i] for k, s in enumerate(seen)]
+    index, time = np.concatenate(index), np.concatenate(time)
+    return Course(system, run.u, run.dt, *readings_of(time, index), len(index), run.run)
 
 
 _round = partial(Case.search, steps=STEPS)
@@ -383,7 +385,7 @@ def _nodes(case: Case, model: Any, segments: int) -> tuple[np.ndarray, np.ndarra
         x = jnp.asarray(model["start"][i])
         for j in range(1, count):
             at = j * len(course.u) // count
-            near = [int(np.argmin(np.abs(np.asarray(s.runs[i].index) - at))) for s in case.seen]
+            near = [int(np.argmin(np.abs(s.runs[i].read - at))) for s in case.seen]
             y = np.array([s.measured[i][k] for s, k in zip(case.seen, near, strict=True)])
             read = [course.system.read(model["p"], x, course.u[at])]
             slope = jax.jacfwd(course.system.read, 1)(model["p"], x, course.u[at])
@@ -447,7 +449,7 @@ def states_answer(
 
 def _added(seen: PreparedOutput, i: int, fitted: np.ndarray) -> np.ndarray:
     """First terms of a nonlinear state space: products of output and inputs."""
-    u = seen.scaled(seen.runs[i].u)[np.asarray(seen.runs[i].index)]
+    u = seen.scaled(seen.runs[i].u)[seen.runs[i].read]
     y = ((fitted - np.mean(fitted)) / seen.size_y)[:, None]
     return np.concatenate([y**2, y**3, u**2, u * y], axis=1)
 

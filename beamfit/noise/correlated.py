@@ -23,6 +23,8 @@ from beamfit.statistics import log_student
 
 # A direction is determined if its singular value exceeds this share of the largest: 1e6 roundings.
 CUT = 1e-10
+# What rounding leaves of products of rows that are nothing.
+ROUNDING = 1e-15
 # Grid of correlation times: from this share of the median interval to this many records, and count.
 SHORTEST, LONGEST, TIMES = 0.3, 5.0, 20
 # Central 68 %, one standard deviation to either side of a normal distribution, and its upper end.
@@ -253,7 +255,11 @@ def whitened_by_each(
     `known` are rows of priors, in units of the noise; `levels`, of each run, are eliminated.
     """
     every = levels or [None] * len(runs)
-    parts = [_triangles(grid, *run, own) for run, own in zip(runs, every, strict=True)]
+    parts = []
+    for (rows, time), own in zip(runs, every, strict=True):
+        rows, triangle = np.linalg.qr(rows if own is None else own.left(rows))
+        roots, volume = roots_by_each(grid, rows, np.diff(time), own)
+        parts.append((roots @ triangle, volume))
     triangles, volume = [triangle for triangle, _ in parts], sum(volume for _, volume in parts)
     count = sum(len(rows) for rows, _ in runs) - sum(own.first.size for own in levels)
     if known is not None:
@@ -263,17 +269,19 @@ def whitened_by_each(
     )
 
 
-def _triangles(
-    grid: Sequence[CorrelatedNoise], rows: np.ndarray, time: np.ndarray, levels: Levels | None
+def roots_by_each(
+    grid: Sequence[CorrelatedNoise],
+    rows: np.ndarray,
+    interval: np.ndarray,
+    levels: Levels | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Roots of the products of one run's whitened rows, and log volumes, for each noise: of columns
-    at right angles products lose no digit. What levels alone explain has a product of 0.
+    """Triangular roots of `products_by_each` of columns at right angles, of which products lose no
+    digit; of what levels alone explain nothing is left.
     """
-    rows, triangle = np.linalg.qr(rows if levels is None else levels.left(rows))
-    products, volumes = products_by_each(grid, rows, np.diff(time), levels)
-    sizes, along = np.linalg.eigh(products)
-    root = np.sqrt(np.maximum(sizes, 0.0))[..., None] * np.swapaxes(along, 1, 2)
-    return root @ triangle, volumes
+    products, volumes = products_by_each(grid, rows, interval, levels)
+    least = ROUNDING * np.trace(products, axis1=-2, axis2=-1)[..., None, None]
+    roots = np.linalg.cholesky(products + least * np.eye(products.shape[-1]))
+    return np.swapaxes(roots, -1, -2), volumes
 
 
 def range_of(time: np.ndarray) -> tuple[float, float]:

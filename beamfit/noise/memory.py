@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from scipy.fft import irfft, next_fast_len, rfft
-from scipy.linalg.lapack import dpttrf, dpttrs
+from scipy.linalg.lapack import dpttrf, dpttrs, dtbtrs
 from scipy.special import logsumexp
 
 # Correlation of neighbouring residuals, in standard errors of that of independent ones, from which
@@ -120,11 +120,41 @@ class CorrelatedNoise(NamedTuple):
     white: float = 0.0
 
 
-@jax.jit  # a scan that is called as it is would be compiled at every call
 def innovations(
-    rows: jax.Array, time: jax.Array, noise: CorrelatedNoise
-) -> tuple[jax.Array, jax.Array]:
+    rows: np.ndarray, time: np.ndarray, noise: CorrelatedNoise
+) -> tuple[np.ndarray, float]:
     """Rows less what those before foretell, over the error of that; and log sum of the errors.
+
+    Both by the Cholesky factor of the covariance: W⁻¹ and that of T, as in `products_by_each`.
+
+    Examples
+    --------
+    >>> innovations(np.ones(3), np.arange(3.0), CorrelatedNoise(1.0, 1.0))[0].tolist()
+    [1.0, 1.0, 1.0]
+    """
+    apart = np.diff(time) / noise.time
+    (size, below), begun = _factor(noise.white, *_whitening(apart)), whitened(rows, apart)
+    band = np.stack([np.ones_like(size), np.append(below, 0.0)])
+    white = dtbtrs(band, begun.reshape(len(begun), -1), uplo="L", diag="U")[0]
+    white = white / np.sqrt(size)[:, None]
+    volume = 0.5 * float(np.sum(np.log(size))) - float(log_volume(apart))
+    return white.reshape(begun.shape), volume
+
+
+def _whitening(apart: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Diagonals of the matrix of `whitened`: of each row itself and of the one before."""
+    new = np.sqrt(-np.expm1(-2 * apart))
+    return np.append(1.0, 1.0 / new), np.append(0.0, -np.exp(-apart) / new)
+
+
+def _factor(white: float, own: np.ndarray, before: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """T of `products_by_each` as L D Lᵀ: D, and what is below the ones of L."""
+    diagonal = 1.0 - white + white * (own**2 + before**2)
+    return dpttrf(diagonal, white * before[1:] * own[:-1])[:2]
+
+
+def filtered(rows: jax.Array, time: jax.Array, noise: CorrelatedNoise) -> jax.Array:
+    """The innovations in JAX, of rows that a search derives.
 
     The Kalman filter of an Ornstein-Uhlenbeck process read with white noise (A. C. Harvey,
     Forecasting, structural time series models and the Kalman filter, 1989, section 3.4), O(n).
@@ -139,11 +169,10 @@ def innovations(
         surprise = row - mean
         mean = k * (mean + variance / whole * surprise)
         variance = k**2 * variance * noise.white / whole + wander * (1.0 - k**2)
-        return (mean, variance), (surprise / jnp.sqrt(whole), 0.5 * jnp.log(whole))
+        return (mean, variance), surprise / jnp.sqrt(whole)
 
     begin = jnp.zeros(rows.shape[1:]), jnp.asarray(wander)
-    _, (white, sizes) = jax.lax.scan(on, begin, (rows, kept))
-    return white, jnp.sum(sizes)
+    return jax.lax.scan(on, begin, (rows, kept))[1]
 
 
 def white_shares(apart, ratios=BESIDE) -> np.ndarray:
@@ -221,16 +250,16 @@ def products_by_each(
     ----------
     noises : sequence of CorrelatedNoise or MemoryKind, length k
         Those of one correlation time in a row.
-    rows : array, shape (n, m)
-        One row for each reading.
+    rows : array, shape (n, ..., m)
+        One row for each reading, of one or more sets.
     interval : array, shape (n - 1,)
         Times between readings, s.
     levels : Levels, optional
-        Eliminated; the noise of a block begins anew with its level.
+        Eliminated from one set; the noise of a block begins anew with its level.
 
     Returns
     -------
-    matrix : array, shape (k, m, m)
+    matrix : array, shape (k, ..., m, m)
     volume : array, shape (k,)
 
     Notes
@@ -252,15 +281,13 @@ def products_by_each(
     for time, alike in groupby(noises, key=lambda noise: noise.time):
         with np.errstate(divide="ignore"):
             apart = interval / time
-        kept, new = np.exp(-apart), np.sqrt(-np.expm1(-2 * apart))
-        own, before = np.append(1.0, 1.0 / new), np.append(0.0, -kept / new)
-        begun = np.asfortranarray(whitened(rows, apart))
-        volume = float(log_volume(apart))
+        begun = np.asfortranarray(whitened(rows, apart).reshape(len(rows), -1))
+        columns = begun.T.reshape(*rows.shape[1:], -1)
+        diagonals, volume = _whitening(apart), float(log_volume(apart))
         for noise in alike:
-            diagonal = 1.0 - noise.white + noise.white * (own**2 + before**2)
-            size, next_, _ = dpttrf(diagonal, noise.white * before[1:] * own[:-1])
-            solved, log = dpttrs(size, next_, begun)[0], np.sum(np.log(size))
-            product = begun.T @ solved
+            size, below = _factor(noise.white, *diagonals)
+            solved, log = dpttrs(size, below, begun)[0], np.sum(np.log(size))
+            product = columns @ np.swapaxes(solved.T.reshape(columns.shape), -1, -2)
             if levels is not None:
                 along, squares = levels.split(begun * solved[:, -1:])
                 product, log = product[:-1, :-1] - along.T @ along, log + squares

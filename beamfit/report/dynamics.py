@@ -140,7 +140,7 @@ def _draw_correlations(fit: ResponseFit | StateSpaceOutput, figure: FigureBase) 
     squares = sum(float(r @ r) for r in rest)
     own.bar(lags, [sum(float(r[k:] @ r[:-k]) for r in rest) / squares for k in lags], color=BLUE)
     for j, name in enumerate(fit.seen.inputs):
-        u = [(np.asarray(d.u)[np.asarray(d.index), j] - fit.seen.mean_u[j]) for d in fit.seen.runs]
+        u = [(np.asarray(d.u)[d.read, j] - fit.seen.mean_u[j]) for d in fit.seen.runs]
         size = np.sqrt(squares * sum(float(v @ v) for v in u)) or 1.0
         found = [sum(float(r[k:] @ v[:-k]) for r, v in zip(rest, u, strict=True)) for k in lags]
         others.plot(lags, np.array(found) / size, "o-", markersize=3, label=name)

@@ -12,7 +12,7 @@ from beamfit.dynamics.fit import identify
 from beamfit.dynamics.record import Run
 from beamfit.dynamics.response import FIRST_ORDER, SECOND_ORDER, simulate
 from beamfit.errors import InputError, Status
-from beamfit.noise.memory import CorrelatedNoise, innovations
+from beamfit.noise.memory import CorrelatedNoise, filtered, innovations
 from tests.simulations import simulations, widened
 
 simulate = jax.jit(simulate, static_argnums=0)  # a program a shape, not one an operation
@@ -233,8 +233,10 @@ def test_innovations_of_a_noise_are_those_of_its_covariance():
     rows = rng.normal(size=(30, 2))
     apart = np.abs(time[:, None] - time[None, :])
     factor = np.linalg.cholesky(0.6 * np.exp(-apart / 3.0) + 0.4 * np.eye(30))
-    found, volume = innovations(jnp.asarray(rows), jnp.asarray(time), noise)
+    found, volume = innovations(rows, time, noise)
     np.testing.assert_allclose(found, np.linalg.solve(factor, rows), atol=1e-12)
+    inside = jax.jit(filtered)(jnp.asarray(rows), jnp.asarray(time), noise)
+    np.testing.assert_allclose(inside, found, atol=1e-12)
     assert float(volume) == pytest.approx(np.log(np.diag(factor)).sum())
 
 
