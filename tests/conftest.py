@@ -31,7 +31,7 @@ settings.load_profile("beamfit")
 ROOT = Path(__file__).resolve().parents[1]
 # JAX keeps every program it compiled; past this many MB they are dropped between two tests.
 # Those that are needed again come from the cache on disk.
-MOST_MEMORY = 1400
+MOST_MEMORY = 2500
 
 
 def resident():

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from beamfit.arrays import array_module
 from beamfit.compile_cache import prepare_jax
 
 prepare_jax()
@@ -25,15 +26,13 @@ WEIGHTS = np.array([5.0, 8.0, 5.0]) / 18
 LEAST = 1e-12
 
 
-def mean_exponential(x, xp=jnp):
+def mean_exponential(x):
     """(1 - exp(-x))/x, smooth through x = 0 with all derivatives.
 
     Parameters
     ----------
     x : float or array
-        Any number.
-    xp : module, optional
-        jax.numpy or numpy.
+        Any number, NumPy's or JAX's.
 
     Returns
     -------
@@ -45,6 +44,7 @@ def mean_exponential(x, xp=jnp):
     >>> print(mean_exponential(0.0), f"{mean_exponential(1.0):.6f}")
     1.0 0.632121
     """
+    xp = array_module(x)
     small = xp.abs(x) < SERIES_BELOW
     inner = xp.where(small, x, 0.0)
     series = 1.0
@@ -101,7 +101,7 @@ class Moments(NamedTuple):
     gas: np.ndarray | None = None
 
 
-def closed_form(level, quadratic, power, lost, whole, xp=jnp):
+def closed_form(level, quadratic, power, lost, whole):
     """Solve dx/dt = -A x^(1 + c) - b(t) x by Bernoulli's substitution, c = 1 + power.
 
     x = x0 exp(-B) (1 + c A x0^c W)^(-1/c) with B, `lost`, the integral of b and W, `whole`, that of
@@ -112,7 +112,7 @@ def closed_form(level, quadratic, power, lost, whole, xp=jnp):
     >>> print(f"{closed_form(1.0, 0.5, 0.0, 0.0, 2.0):.3f}")
     0.500
     """
-    c = 1.0 + power
+    xp, c = array_module(level, quadratic, power, lost, whole), 1.0 + power
     left = 1.0 + c * quadratic * level**c * whole
     left = xp.where(xp.real(left) > 0, left, np.nan)  # a negative loss without end
     return level * xp.exp(-lost) * left ** (-1.0 / c)
@@ -178,8 +178,8 @@ def beam_current(
         return np.asarray(_shaped(at.time, level, quadratic, linear, power, shape))
     if at.gas is None and kind is None:
         lost = linear * at.time
-        whole = at.time * mean_exponential((1.0 + power) * lost, np)
-        return closed_form(level, quadratic, power, lost, whole, np)
+        whole = at.time * mean_exponential((1.0 + power) * lost)
+        return closed_form(level, quadratic, power, lost, whole)
 
     def gone(time: np.ndarray, gas: np.ndarray) -> np.ndarray:
         pairs = zip(further[::2], further[1::2], strict=True)
@@ -191,7 +191,7 @@ def beam_current(
     node_gas = gas[:-1, None] + np.diff(gas)[:, None] * NODES
     parts = inside * (np.exp(-(1.0 + power) * gone(node, node_gas)) @ WEIGHTS)
     whole = np.append(0.0, np.cumsum(parts))
-    return closed_form(level, quadratic, power, gone(at.time, gas), whole, np)
+    return closed_form(level, quadratic, power, gone(at.time, gas), whole)
 
 
 @partial(jax.jit, static_argnames="shape")

@@ -168,7 +168,7 @@ def node_currents(level, quadratic, power, lost, xp=np):
     inside = c * quadratic * level**c
     least = (1e-3 - 1) / xp.where(inside == 0, 1.0, inside)
     whole = xp.where(inside * whole < 1e-3 - 1, least, whole)
-    return closed_form(level, quadratic, power, lost, whole, xp)
+    return closed_form(level, quadratic, power, lost, whole)
 
 
 def log_prior(power, xp=np):
