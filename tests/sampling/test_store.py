@@ -93,7 +93,6 @@ def test_a_larger_target_goes_on_from_the_store(tmp_path):
 
 VICTIM = """
 import sys
-import time
 from tests.sampling.test_store import OPTIONS
 from tests.sampling.targets import half_normal, target
 from beamfit.sampling import ensemble
@@ -101,46 +100,48 @@ from beamfit.sampling.ensemble import draw
 ensemble.WRITING = 1e9  # a checkpoint after every block: as many moments to be killed at
 advance = ensemble._block
 
-def slowly(*arguments):
-    time.sleep(0.05)
+def asked(*arguments):
+    print("block", flush=True)
+    sys.stdin.readline()
     return advance(*arguments)
 
-ensemble._block = slowly
-print("begun", flush=True)
+ensemble._block = asked
 draw(target(half_normal), store=sys.argv[1], **OPTIONS)
 print("finished", flush=True)
 """
 
 
+def interrupted(path, blocks, delay):
+    """Let the victim go on by some blocks, and kill it within the next: True unless it finished."""
+    process = subprocess.Popen(
+        [sys.executable, "-c", VICTIM, str(path)],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        env=os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)},
+    )
+    with process:
+        for _ in range(blocks + 1):
+            if process.stdout.readline() == b"finished\n":
+                return False
+            process.stdin.write(b"\n")
+            process.stdin.flush()
+        time.sleep(delay)
+        os.kill(process.pid, signal.SIGKILL)
+    return True
+
+
 def test_killed_at_any_moment_the_finished_chain_is_the_uninterrupted_one(tmp_path, whole):
-    """SIGKILL after delays that fall before, between and within checkpoints."""
+    """SIGKILL before the first checkpoint, and at any moment within later blocks."""
     path = tmp_path / "chain.h5"
     random = np.random.default_rng(1)
     kills, seen = 0, set()
-    for attempt in range(40):
-        process = subprocess.Popen(
-            [sys.executable, "-c", VICTIM, str(path)],
-            stdout=subprocess.PIPE,
-            env=os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)},
-        )
-        assert process.stdout.readline() == b"begun\n"
-        # Before the first checkpoint, between and within later ones; in the end it may finish.
-        until = time.monotonic() + random.uniform(0.0, 0.3)
-        until += 0.15 * attempt + 0.04 * attempt**2
-        while time.monotonic() < until and process.poll() is None:
-            time.sleep(0.005)
-        if process.poll() is None:
-            os.kill(process.pid, signal.SIGKILL)
-            kills += 1
-        output = process.communicate()[0]
+    while interrupted(path, kills, random.uniform(0.0, 0.1)):
+        kills += 1
         if path.exists():
             backend = stored_chain(path)
             seen.add(backend.iteration)
             found = backend.get_chain()  # the file is whole
             assert np.isfinite(found).all()
-        if b"finished" in output:
-            break
-    assert b"finished" in output
     assert kills >= 3
     assert len(seen - {700}) >= 2  # it was interrupted at different places
     assert stored_chain(path).iteration == 700
