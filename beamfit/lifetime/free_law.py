@@ -25,6 +25,7 @@ import numpy as np
 from numpy.polynomial.chebyshev import chebint, chebvander
 from scipy.special import expit, log_expit, log_ndtr, logsumexp, ndtri
 
+from beamfit.arrays import array_module
 from beamfit.lifetime.decay_law import closed_form
 from beamfit.lifetime.expansion import Physical
 from beamfit.lifetime.record import DecayRecord
@@ -98,7 +99,7 @@ BEND, POWER, CHANGE, PACE = range(2, 6)
 CONSTANT = (0, 1, BEND)
 
 
-def gas_change(s, pace, xp=np):
+def gas_change(s, pace):
     """Change of the gas at a time over the span, of 1 from the first to the last reading and 0 in
     the mean: a straight line at a pace of 0.
 
@@ -107,12 +108,14 @@ def gas_change(s, pace, xp=np):
     >>> gas_change(0.0, 0.0).item(), (gas_change(1.0, 3.0) - gas_change(0.0, 3.0)).round(9).item()
     (-0.5, 1.0)
     """
+    xp = array_module(s, pace)
     k = xp.where(pace > 0, pace, 1.0)
     return xp.where(pace > 0, 1 / k + xp.exp(-k * s) / xp.expm1(-k), s - 0.5)
 
 
-def gas_changed(pace, xp=np):
+def gas_changed(pace):
     """Integral of that up to the nodes, one column a pace."""
+    xp = array_module(pace)
     s, k = NODE[:, None], xp.where(pace > 0, pace, 1.0)
     return xp.where(pace > 0, (s - xp.expm1(-k * s) / xp.expm1(-k)) / k, (s**2 - s) / 2)
 
@@ -158,10 +161,11 @@ class Numbers(NamedTuple):
         return node_currents(self.level, self.share * self.rate, self.power, self.rate * lost)
 
 
-def node_currents(level, quadratic, power, lost, xp=np):
+def node_currents(level, quadratic, power, lost):
     """Currents at the nodes over the mean, (14, m), as of `closed_form` with W = ∫ exp(-c B) ds,
     where B is what is lost to gas up to each node.
     """
+    xp = array_module(level, quadratic, power, lost)
     c, lost = 1 + power, xp.clip(lost, -200, 200)  # a factor that no beam has, and no overflow
     whole = INTEGRAL @ xp.exp(-c * lost)
     # Where a loss that is no beam's would have ended the record the law has no value.
@@ -171,8 +175,9 @@ def node_currents(level, quadratic, power, lost, xp=np):
     return closed_form(level, quadratic, power, lost, whole)
 
 
-def log_prior(power, xp=np):
+def log_prior(power):
     """Log density of exponents, and of its flat part alone."""
+    xp = array_module(power)
     width = xp.where(power < 0, BELOW, ABOVE)
     usual = xp.exp(-0.5 * (power / width) ** 2) / (np.sqrt(np.pi / 2) * (BELOW + ABOVE))
     odd = ODD / (MOST - LEAST)
@@ -184,18 +189,9 @@ def log_straight(change):
     return -0.5 * (change / DRIFT) ** 2 - math.log(DRIFT * math.sqrt(2 * math.pi))
 
 
-def log_walk(walk, xp=np):
-    """Log density of a walk at the nodes, with the odds of there being any."""
-    squares = xp.sum((np.linalg.inv(HALF_WALK) @ walk) ** 2)
-    widths = np.log(WALKS)
-    log = -0.5 * squares * xp.exp(-2 * widths) - NODES * widths
-    log = xp.log(xp.mean(xp.exp(log - xp.max(log)))) + xp.max(log)
-    log = log - 0.5 * NODES * math.log(2 * math.pi) - np.log(np.diag(HALF_WALK)).sum()
-    return xp.where(squares > 0, log + LOG_WANDERS, 0.0)
-
-
-def log_pumped(share, gas, pace, xp=np):
+def log_pumped(share, gas, pace):
     """Log density of gas that is pumped away, and of its pace, with the odds of there being any."""
+    xp = array_module(share, gas, pace)
     size = gas / xp.expm1(-pace)  # of its loss at first
     inside = (size > SIZES[0]) & (size < SIZES[1]) & (-gas < pace * (1 - share))  # some is left
     width = math.log(SIZES[1] / SIZES[0]) * math.log(TIMES[1] / TIMES[0])

@@ -18,10 +18,13 @@ from beamfit.lifetime.free_law import (
     BELOW,
     CONSTANT,
     DRIFT,
+    HALF_WALK,
     INTEGRAL,
     LEAST,
+    LOG_WANDERS,
     MOST,
     NODES,
+    WALKS,
     DrawnLaw,
     Draws,
     SeenDecay,
@@ -33,7 +36,6 @@ from beamfit.lifetime.free_law import (
     log_prior,
     log_pumped,
     log_straight,
-    log_walk,
     middle_of,
     mixed,
     node_currents,
@@ -115,9 +117,18 @@ def _numbers(data: _Data, theta: Array) -> DecayNumbers:
 
 def _nodes(data: _Data, numbers: DecayNumbers) -> Array:
     quadratic, linear = numbers.a * data.mean * data.span, numbers.b * data.span
-    lost = linear * (data.gas[:, None] + numbers.drift * gas_changed(numbers.pace, jnp))
-    found = node_currents(numbers.i0 / data.mean, quadratic, numbers.exponent, lost, jnp)
+    lost = linear * (data.gas[:, None] + numbers.drift * gas_changed(numbers.pace))
+    found = node_currents(numbers.i0 / data.mean, quadratic, numbers.exponent, lost)
     return found * jnp.exp(-(quadratic + linear) * (INTEGRAL @ numbers.walk))[:, None]
+
+
+def _log_walk(walk: Array) -> Array:
+    """Log density of a walk at the nodes, with the odds of there being any."""
+    squares, widths = jnp.sum((np.linalg.inv(HALF_WALK) @ walk) ** 2), np.log(WALKS)
+    log = jax.nn.logsumexp(-0.5 * squares * np.exp(-2 * widths) - NODES * widths)
+    log = log - np.log(len(WALKS)) - 0.5 * NODES * np.log(2 * np.pi)
+    log = log - np.log(np.diag(HALF_WALK)).sum()
+    return jnp.where(squares > 0, log + LOG_WANDERS, 0.0)
 
 
 def _log_density(data: _Data, theta: Array) -> Array:
@@ -129,9 +140,9 @@ def _log_density(data: _Data, theta: Array) -> Array:
     rate = numbers.a * data.mean + numbers.b
     share = numbers.a * data.mean / rate
     gas, pace = (1 - share) * numbers.drift, jnp.maximum(numbers.pace, 1.0)
-    pumped = log_pumped(share, gas, pace, jnp) + jnp.log1p(-share)
-    smooth = log_prior(numbers.exponent, jnp)[0] + log_straight(numbers.drift)
-    smooth = smooth + log_walk(numbers.walk, jnp)
+    pumped = log_pumped(share, gas, pace) + jnp.log1p(-share)
+    smooth = log_prior(numbers.exponent)[0] + log_straight(numbers.drift)
+    smooth = smooth + _log_walk(numbers.walk)
     law = jnp.where(numbers.pace > 0, pumped, smooth)
     shifts = theta[theta.size - data.moved.shape[0] :]
     inside = (numbers.a >= 0) & (numbers.b >= 0)
@@ -144,7 +155,7 @@ def _derived(data: _Data, theta: Array) -> Array:
     n = _built(data, theta)
     moments, whole = jnp.stack([0.0, data.middle, 1.0]), n.a * data.mean + n.b
     walked = whole * (data.moments @ n.walk)
-    changed = n.b * n.drift * gas_change(moments, n.pace, jnp) + walked
+    changed = n.b * n.drift * gas_change(moments, n.pace) + walked
     rates = rates_of(n.a * data.mean, n.b, n.exponent, changed, _nodes(data, n)[:, 0], data)
     return 1.0 / HOUR / jnp.stack(rates)
 
