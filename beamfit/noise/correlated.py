@@ -7,15 +7,19 @@ of them says how likely it is and what the numbers are with it.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import groupby
 from typing import NamedTuple
 
+import jax
 import numpy as np
 from scipy.special import logsumexp, ndtri, stdtr, stdtrit
 
+from beamfit.arrays import padded_length
 from beamfit.noise.memory import (
     BESIDE,
     CorrelatedNoise,
     Levels,
+    levelled,
     products_by_each,
     white_shares,
 )
@@ -254,12 +258,10 @@ def whitened_by_each(
 
     `known` are rows of priors, in units of the noise; `levels`, of each run, are eliminated.
     """
-    every = levels or [None] * len(runs)
-    parts = []
-    for (rows, time), own in zip(runs, every, strict=True):
-        rows, triangle = np.linalg.qr(rows if own is None else own.left(rows))
-        roots, volume = roots_by_each(grid, rows, np.diff(time), own)
-        parts.append((roots @ triangle, volume))
+    if levels:
+        parts = [_levelled(grid, *run, own) for run, own in zip(runs, levels, strict=True)]
+    else:
+        parts = [_triangles(grid, rows, np.diff(time)) for rows, time in runs]
     triangles, volume = [triangle for triangle, _ in parts], sum(volume for _, volume in parts)
     count = sum(len(rows) for rows, _ in runs) - sum(own.first.size for own in levels)
     if known is not None:
@@ -269,19 +271,45 @@ def whitened_by_each(
     )
 
 
+def _triangles(
+    grid: Sequence[CorrelatedNoise], rows: np.ndarray, interval: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Triangular factors of one run's whitened rows, and log volumes, for each noise."""
+    rows, triangle = np.linalg.qr(rows)
+    roots, volumes = roots_by_each(grid, rows, interval)
+    return roots @ triangle, volumes
+
+
 def roots_by_each(
-    grid: Sequence[CorrelatedNoise],
-    rows: np.ndarray,
-    interval: np.ndarray,
-    levels: Levels | None = None,
+    grid: Sequence[CorrelatedNoise], rows: np.ndarray, interval: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Triangular roots of `products_by_each` of columns at right angles, of which products lose no
-    digit; of what levels alone explain nothing is left.
+    digit; columns may be nothing.
     """
-    products, volumes = products_by_each(grid, rows, interval, levels)
+    products, volumes = products_by_each(grid, rows, interval)
     least = ROUNDING * np.trace(products, axis1=-2, axis2=-1)[..., None, None]
     roots = np.linalg.cholesky(products + least * np.eye(products.shape[-1]))
     return np.swapaxes(roots, -1, -2), volumes
+
+
+_levelled_by_each = jax.jit(jax.vmap(levelled, in_axes=(None, None, None, None, 0)))
+
+
+def _levelled(
+    grid: Sequence[CorrelatedNoise], rows: np.ndarray, time: np.ndarray, levels: Levels
+) -> tuple[np.ndarray, np.ndarray]:
+    """The same without levels, the rows padded to one of a few lengths; noises of one time after
+    the other, since all rows together take gigabytes.
+    """
+    extra = (0, padded_length(max(time.size, 64)) - time.size)
+    begins = np.isin(np.arange(time.size + extra[1]), levels.first)
+    padded = np.pad(rows, (extra, (0, 0))), np.pad(time, extra, mode="edge"), begins
+    slope, triangles, volumes = np.pad(levels.slope, extra, mode="edge"), [], []
+    for _, alike in groupby(grid, key=lambda noise: noise.time):
+        found, volume = _levelled_by_each(*padded, slope, CorrelatedNoise(*np.array([*alike]).T))
+        triangles.append(np.linalg.qr(np.asarray(found), mode="r"))
+        volumes.append(-np.asarray(volume))
+    return np.concatenate(triangles), np.concatenate(volumes)
 
 
 def range_of(time: np.ndarray) -> tuple[float, float]:

@@ -224,25 +224,62 @@ class Levels(NamedTuple):
             rows = rows - self.slope[:, None] * np.repeat(found, lengths, axis=0)
         return rows
 
-    def apart(self, interval: np.ndarray) -> np.ndarray:
-        """Intervals between readings, endless ones where a block begins."""
-        interval = interval.astype(float)
-        interval[self.first[1:] - 1] = np.inf
-        return interval
 
-    def split(self, products: np.ndarray) -> tuple[np.ndarray, float]:
-        """From products of every row and, last, of the level's column with that column: what rows
-        have along each level, shape (k, m), and the logarithm of the levels' squares.
-        """
-        found = np.add.reduceat(products, self.first)
-        return found[:, :-1] / np.sqrt(found[:, -1:]), float(np.sum(np.log(found[:, -1])))
+@jax.jit
+def levelled(
+    rows: jax.Array, time: jax.Array, begins: jax.Array, slope: jax.Array, noise: CorrelatedNoise
+) -> tuple[jax.Array, jax.Array]:
+    """Rows without levels, whitened as by `innovations`; and log sum of the errors.
+
+    Parameters
+    ----------
+    rows : array, shape (n, p)
+        Residuals and their slopes, which the noise of the readings is beside.
+    time : array, shape (n,)
+        When. Noise goes on from block to block; rows at the time of the one before are padding.
+    begins : array of bool, shape (n,)
+        Where a block begins, of whose level nothing is known.
+    slope : array, shape (n,)
+        As of `Levels`, which are all free: their density is flat.
+    noise : CorrelatedNoise
+        Of the readings.
+
+    Notes
+    -----
+    The filter has the level as a second state. The first row of a block says what the level is,
+    and no more: a diffuse start (A. C. Harvey, 1989, section 3.3.4).
+    """
+    interval = jnp.diff(time, append=time[-1:])
+    kept, wander = jnp.exp(-interval / noise.time), 1.0 - noise.white
+    used = jnp.append(True, interval[:-1] > 0)
+
+    def on(carry, now):
+        (value, level), (own, both, whole) = carry
+        row, k, begin, s, counts = now
+        size = jnp.where(begin, 1.0, own + 2 * s * both + s**2 * whole + noise.white)
+        surprise = row - value - s * level
+        gains = (own + s * both) / size, (both + s * whole) / size
+        gains = jnp.where(begin, 0.0, gains[0]), jnp.where(begin, 1.0 / s, gains[1])
+        value, level = value + gains[0] * surprise, level + gains[1] * surprise
+        known = own - gains[0] * (own + s * both), both - gains[1] * (own + s * both)
+        known += (whole - gains[1] * (both + s * whole),)
+        fresh = own, -own / s, (own + noise.white) / s**2
+        own, both, whole = (jnp.where(begin, f, g) for f, g in zip(fresh, known, strict=True))
+        carry = (k * value, level), (k**2 * own + wander * (1.0 - k**2), k * both, whole)
+        tells = counts & ~begin
+        return carry, (jnp.where(tells, surprise / jnp.sqrt(size), 0.0),
+                       jnp.where(tells, 0.5 * jnp.log(size), 0.0))  # fmt: skip
+
+    nothing = jnp.zeros(rows.shape[1])
+    start = (nothing, nothing), (jnp.asarray(wander), jnp.zeros(()), jnp.zeros(()))
+    _, (white, sizes) = jax.lax.scan(on, start, (rows, kept, begins, slope, used))
+    return white, jnp.sum(sizes)
 
 
 def products_by_each(
     noises: Sequence[CorrelatedNoise],
     rows: np.ndarray,
     interval: np.ndarray,
-    levels: Levels | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Products of rows whitened by each noise, and logs of the volume.
 
@@ -254,8 +291,6 @@ def products_by_each(
         One row for each reading, of one or more sets.
     interval : array, shape (n - 1,)
         Times between readings, s.
-    levels : Levels, optional
-        Eliminated from one set; the noise of a block begins anew with its level.
 
     Returns
     -------
@@ -265,8 +300,7 @@ def products_by_each(
     Notes
     -----
     With W of `whitened`, the covariance of both parts of the noise is that of W⁻¹ T W⁻ᵀ with
-    T = (1 - white) 1 + white W Wᵀ, of three diagonals: all is done in O(n). A level's density is
-    flat: it takes the square of what the rows have along it, and the size of its column.
+    T = (1 - white) 1 + white W Wᵀ, of three diagonals: all is done in O(n).
 
     Examples
     --------
@@ -276,8 +310,6 @@ def products_by_each(
     ([5.0], [0.0])
     """
     matrix, volumes = [], []
-    if levels is not None:
-        rows, interval = np.column_stack([rows, levels.slope]), levels.apart(interval)
     for time, alike in groupby(noises, key=lambda noise: noise.time):
         with np.errstate(divide="ignore"):
             apart = interval / time
@@ -288,9 +320,6 @@ def products_by_each(
             size, below = _factor(noise.white, *diagonals)
             solved, log = dpttrs(size, below, begun)[0], np.sum(np.log(size))
             product = columns @ np.swapaxes(solved.T.reshape(columns.shape), -1, -2)
-            if levels is not None:
-                along, squares = levels.split(begun * solved[:, -1:])
-                product, log = product[:-1, :-1] - along.T @ along, log + squares
             matrix.append(product)
             volumes.append(volume - 0.5 * float(log))
     return np.array(matrix), np.array(volumes)

@@ -102,7 +102,6 @@ def test_the_fit_is_that_of_all_numbers_at_once():
 
 
 def test_levels_are_eliminated_as_if_they_were_numbers():
-    # The noise of a block begins anew with its level.
     rng = np.random.default_rng(1)
     time, first = np.cumsum(rng.uniform(0.5, 1.5, 40)), np.array([0, 5, 17, 30])
     slope, rows = rng.uniform(0.5, 1.5, 40), rng.normal(size=(40, 2))
@@ -117,7 +116,7 @@ def test_levels_are_eliminated_as_if_they_were_numbers():
     for k, noise in enumerate(grid):
         apart = np.abs(time[:, None] - time)
         covariance = (1 - noise.white) * np.exp(-apart / noise.time)
-        covariance = covariance * (block @ block.T) + noise.white * np.eye(40)
+        covariance += noise.white * np.eye(40)
         weighed = np.linalg.solve(covariance, columns)
         precision = columns.T @ weighed
         step = -np.linalg.solve(precision, weighed.T @ residuals)
