@@ -214,12 +214,8 @@ class RunNoises(NamedTuple):
         the Bayesian information criterion wants.
         """
         count, runs = len(rest), len(self.times)
-        waves = self.white(
-            [
-                drift_columns(t / t[-1], i, runs).reshape(len(t), -1)
-                for i, t in enumerate(self.times)
-            ]
-        )
+        waves = self.white([drift_columns(t / t[-1], i, runs).reshape(len(t), -1)
+                            for i, t in enumerate(self.times)])  # fmt: skip
         triangle = np.linalg.qr(np.column_stack([_basis(own), waves, rest]), mode="r")
         least = np.cumsum(triangle[::-1, -1] ** 2)[::-1]
         used = len(triangle) - 1 - runs * np.arange(DRIFT, -1, -1)

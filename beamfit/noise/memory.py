@@ -198,6 +198,52 @@ def white_shares(apart, ratios=BESIDE) -> np.ndarray:
     return white / (1.0 + white)
 
 
+def products_by_each(
+    noises: Sequence[CorrelatedNoise], rows: np.ndarray, interval: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Products of rows whitened by each noise, and logs of the volume.
+
+    Parameters
+    ----------
+    noises : sequence of CorrelatedNoise or MemoryKind, length k
+        Those of one correlation time in a row.
+    rows : array, shape (n, ..., m)
+        One row for each reading, of one or more sets.
+    interval : array, shape (n - 1,)
+        Times between readings, s.
+
+    Returns
+    -------
+    matrix : array, shape (k, ..., m, m)
+    volume : array, shape (k,)
+
+    Notes
+    -----
+    With W of `whitened`, the covariance of both parts of the noise is that of W⁻¹ T W⁻ᵀ with
+    T = (1 - white) 1 + white W Wᵀ, of three diagonals: all is done in O(n).
+
+    Examples
+    --------
+    >>> rows, noises = np.array([[1.0], [2.0]]), [CorrelatedNoise(1.0, 1.0)]
+    >>> matrix, volume = products_by_each(noises, rows, np.array([1.0]))
+    >>> matrix.ravel().round(9).tolist(), (volume.round(9) + 0.0).tolist()
+    ([5.0], [0.0])
+    """
+    matrix, volumes = [], []
+    for time, alike in groupby(noises, key=lambda noise: noise.time):
+        with np.errstate(divide="ignore"):
+            apart = interval / time
+        begun = np.asfortranarray(whitened(rows, apart).reshape(len(rows), -1))
+        columns = begun.T.reshape(*rows.shape[1:], -1)
+        diagonals, volume = _whitening(apart), float(log_volume(apart))
+        for noise in alike:
+            size, below = _factor(noise.white, *diagonals)
+            solved = dpttrs(size, below, begun)[0].T.reshape(columns.shape)
+            matrix.append(columns @ np.swapaxes(solved, -1, -2))
+            volumes.append(volume - 0.5 * float(np.sum(np.log(size))))
+    return np.array(matrix), np.array(volumes)
+
+
 class Levels(NamedTuple):
     """Numbers of which each moves the rows of one block alone: a level for every cycle.
 
@@ -274,55 +320,6 @@ def levelled(
     start = (nothing, nothing), (jnp.asarray(wander), jnp.zeros(()), jnp.zeros(()))
     _, (white, sizes) = jax.lax.scan(on, start, (rows, kept, begins, slope, used))
     return white, jnp.sum(sizes)
-
-
-def products_by_each(
-    noises: Sequence[CorrelatedNoise],
-    rows: np.ndarray,
-    interval: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Products of rows whitened by each noise, and logs of the volume.
-
-    Parameters
-    ----------
-    noises : sequence of CorrelatedNoise or MemoryKind, length k
-        Those of one correlation time in a row.
-    rows : array, shape (n, ..., m)
-        One row for each reading, of one or more sets.
-    interval : array, shape (n - 1,)
-        Times between readings, s.
-
-    Returns
-    -------
-    matrix : array, shape (k, ..., m, m)
-    volume : array, shape (k,)
-
-    Notes
-    -----
-    With W of `whitened`, the covariance of both parts of the noise is that of W⁻¹ T W⁻ᵀ with
-    T = (1 - white) 1 + white W Wᵀ, of three diagonals: all is done in O(n).
-
-    Examples
-    --------
-    >>> rows, noises = np.array([[1.0], [2.0]]), [CorrelatedNoise(1.0, 1.0)]
-    >>> matrix, volume = products_by_each(noises, rows, np.array([1.0]))
-    >>> matrix.ravel().round(9).tolist(), (volume.round(9) + 0.0).tolist()
-    ([5.0], [0.0])
-    """
-    matrix, volumes = [], []
-    for time, alike in groupby(noises, key=lambda noise: noise.time):
-        with np.errstate(divide="ignore"):
-            apart = interval / time
-        begun = np.asfortranarray(whitened(rows, apart).reshape(len(rows), -1))
-        columns = begun.T.reshape(*rows.shape[1:], -1)
-        diagonals, volume = _whitening(apart), float(log_volume(apart))
-        for noise in alike:
-            size, below = _factor(noise.white, *diagonals)
-            solved, log = dpttrs(size, below, begun)[0], np.sum(np.log(size))
-            product = columns @ np.swapaxes(solved.T.reshape(columns.shape), -1, -2)
-            matrix.append(product)
-            volumes.append(volume - 0.5 * float(log))
-    return np.array(matrix), np.array(volumes)
 
 
 class MemoryKind(NamedTuple):
