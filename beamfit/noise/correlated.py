@@ -7,10 +7,8 @@ of them says how likely it is and what the numbers are with it.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import groupby
 from typing import NamedTuple
 
-import jax
 import numpy as np
 from scipy.special import logsumexp, ndtri, stdtr, stdtrit
 
@@ -19,7 +17,7 @@ from beamfit.noise.memory import (
     BESIDE,
     CorrelatedNoise,
     Levels,
-    levelled,
+    levelled_products,
     products_by_each,
     white_shares,
 )
@@ -287,29 +285,26 @@ def roots_by_each(
     digit; columns may be nothing.
     """
     products, volumes = products_by_each(grid, rows, interval)
+    return _roots(products), volumes
+
+
+def _roots(products: np.ndarray) -> np.ndarray:
     least = ROUNDING * np.trace(products, axis1=-2, axis2=-1)[..., None, None]
     roots = np.linalg.cholesky(products + least * np.eye(products.shape[-1]))
-    return np.swapaxes(roots, -1, -2), volumes
-
-
-_levelled_by_each = jax.jit(jax.vmap(levelled, in_axes=(None, None, None, None, 0)))
+    return np.swapaxes(roots, -1, -2)
 
 
 def _levelled(
     grid: Sequence[CorrelatedNoise], rows: np.ndarray, time: np.ndarray, levels: Levels
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The same without levels, the rows padded to one of a few lengths; noises of one time after
-    the other, since all rows together take gigabytes.
-    """
+    """The same without levels, the rows padded to one of a few lengths."""
     extra = (0, padded_length(max(time.size, 64)) - time.size)
-    begins = np.isin(np.arange(time.size + extra[1]), levels.first)
-    padded = np.pad(rows, (extra, (0, 0))), np.pad(time, extra, mode="edge"), begins
-    slope, triangles, volumes = np.pad(levels.slope, extra, mode="edge"), [], []
-    for _, alike in groupby(grid, key=lambda noise: noise.time):
-        found, volume = _levelled_by_each(*padded, slope, CorrelatedNoise(*np.array([*alike]).T))
-        triangles.append(np.linalg.qr(np.asarray(found), mode="r"))
-        volumes.append(-np.asarray(volume))
-    return np.concatenate(triangles), np.concatenate(volumes)
+    rows, triangle = np.linalg.qr(np.pad(levels.left(rows), (extra, (0, 0))))
+    begins = np.isin(np.arange(len(rows)), levels.first)
+    time, slope = (np.pad(each, extra, mode="edge") for each in (time, levels.slope))
+    noises = CorrelatedNoise(*np.array(grid).T)
+    products, volumes = map(np.asarray, levelled_products(noises, rows, time, begins, slope))
+    return _roots(products) @ triangle, volumes
 
 
 def range_of(time: np.ndarray) -> tuple[float, float]:

@@ -19,6 +19,9 @@ from scipy.fft import irfft, next_fast_len, rfft
 from scipy.linalg.lapack import dpttrf, dpttrs, dtbtrs
 from scipy.special import logsumexp
 
+from beamfit.compile_cache import prepare_jax
+
+prepare_jax()
 # Correlation of neighbouring residuals, in standard errors of that of independent ones, from which
 # they count as correlated.
 SEEN = 2.0
@@ -272,14 +275,17 @@ class Levels(NamedTuple):
 
 
 @jax.jit
-def levelled(
-    rows: jax.Array, time: jax.Array, begins: jax.Array, slope: jax.Array, noise: CorrelatedNoise
+def levelled_products(
+    noises: CorrelatedNoise, rows: jax.Array, time: jax.Array, begins: jax.Array, slope: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """Rows without levels, whitened as by `innovations`; and log sum of the errors.
+    """Products of rows without levels whitened by each noise, and logs of the volume, as of
+    `products_by_each`.
 
     Parameters
     ----------
-    rows : array, shape (n, p)
+    noises : CorrelatedNoise of array, shape (k,)
+        Of the readings.
+    rows : array, shape (n, m)
         Residuals and their slopes, which the noise of the readings is beside.
     time : array, shape (n,)
         When. Noise goes on from block to block; rows at the time of the one before are padding.
@@ -287,39 +293,40 @@ def levelled(
         Where a block begins, of whose level nothing is known.
     slope : array, shape (n,)
         As of `Levels`, which are all free: their density is flat.
-    noise : CorrelatedNoise
-        Of the readings.
 
     Notes
     -----
-    The filter has the level as a second state. The first row of a block says what the level is,
-    and no more: a diffuse start (A. C. Harvey, 1989, section 3.3.4).
+    The filter of `filtered` has the level as a second state. The first row of a block says what
+    the level is, and no more: a diffuse start (A. C. Harvey, 1989, section 3.3.4).
     """
     interval = jnp.diff(time, append=time[-1:])
-    kept, wander = jnp.exp(-interval / noise.time), 1.0 - noise.white
+    kept, white = jnp.exp(-interval[:, None] / noises.time), noises.white
     used = jnp.append(True, interval[:-1] > 0)
 
     def on(carry, now):
-        (value, level), (own, both, whole) = carry
+        value, level, (own, both, whole), found, volume = carry
         row, k, begin, s, counts = now
-        size = jnp.where(begin, 1.0, own + 2 * s * both + s**2 * whole + noise.white)
+        size = jnp.where(begin, 1.0, own + 2 * s * both + s**2 * whole + white)
         surprise = row - value - s * level
-        gains = (own + s * both) / size, (both + s * whole) / size
-        gains = jnp.where(begin, 0.0, gains[0]), jnp.where(begin, 1.0 / s, gains[1])
-        value, level = value + gains[0] * surprise, level + gains[1] * surprise
-        known = own - gains[0] * (own + s * both), both - gains[1] * (own + s * both)
-        known += (whole - gains[1] * (both + s * whole),)
-        fresh = own, -own / s, (own + noise.white) / s**2
+        gain = jnp.where(begin, 0.0, (own + s * both) / size)
+        rise = jnp.where(begin, 1.0 / s, (both + s * whole) / size)
+        value, level = value + gain[:, None] * surprise, level + rise[:, None] * surprise
+        known = own - gain * (own + s * both), both - gain * (both + s * whole)
+        known += (whole - rise * (both + s * whole),)
+        fresh = own, -own / s, (own + white) / s**2
         own, both, whole = (jnp.where(begin, f, g) for f, g in zip(fresh, known, strict=True))
-        carry = (k * value, level), (k**2 * own + wander * (1.0 - k**2), k * both, whole)
+        states = k**2 * own + (1.0 - white) * (1.0 - k**2), k * both, whole
         tells = counts & ~begin
-        return carry, (jnp.where(tells, surprise / jnp.sqrt(size), 0.0),
-                       jnp.where(tells, 0.5 * jnp.log(size), 0.0))  # fmt: skip
+        squares = surprise[:, :, None] * surprise[:, None, :] / size[:, None, None]
+        found = found + jnp.where(tells, squares, 0.0)
+        volume = volume - jnp.where(tells, 0.5 * jnp.log(size), 0.0)
+        return (k[:, None] * value, level, states, found, volume), None
 
-    nothing = jnp.zeros(rows.shape[1])
-    start = (nothing, nothing), (jnp.asarray(wander), jnp.zeros(()), jnp.zeros(()))
-    _, (white, sizes) = jax.lax.scan(on, start, (rows, kept, begins, slope, used))
-    return white, jnp.sum(sizes)
+    nothing = jnp.zeros((len(white), rows.shape[1]))
+    start = nothing, nothing, (1.0 - white, 0.0 * white, 0.0 * white)
+    start += nothing[:, :, None] * nothing[:, None, :], 0.0 * white
+    *_, found, volume = jax.lax.scan(on, start, (rows, kept, begins, slope, used))[0]
+    return found, volume
 
 
 class MemoryKind(NamedTuple):
