@@ -185,6 +185,20 @@ def told(
     )
 
 
+# A model that the runs do not follow, or that was not found: no error contains what is wrong.
+WRONG = (Status.poor_fit, Status.not_converged, Status.not_finite)
+
+
+def quoted(
+    status: Status, quantities: Mapping[str, Quantity], curves: Sequence[Curve] = ()
+) -> tuple[dict[str, Quantity], tuple[Curve, ...]]:
+    """Quantities and curves as they are quoted: without errors where the verdict is `WRONG`."""
+    if status not in WRONG:
+        return dict(quantities), tuple(curves)
+    blank = (c._replace(error=np.full_like(c.error, np.nan)) for c in curves)
+    return {name: q.open() for name, q in quantities.items()}, tuple(blank)
+
+
 def limit_words(q: Quantity) -> str:
     """The limit of a quantity without an error; nothing if it has none."""
     if q.error is not None or q.interval_95 is None:

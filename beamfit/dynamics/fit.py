@@ -18,6 +18,7 @@ from beamfit.dynamics.answer import (
     judged,
     limit_words,
     quantities_of,
+    quoted,
     told,
 )
 from beamfit.dynamics.bad_readings import BadReadings, sound
@@ -251,6 +252,7 @@ def _answered(
     rms = float(np.sqrt(np.mean(answer.rms**2)))
     early = 0.0 if paths.given else max(-exact, 0.0)
     status, message = judged({output: ResponseEvidence(*evidence, rms, early)})
+    quantities, curves = quoted(status, quantities, curves)
     longest = [LATEST] if not paths.given and exact == latest(runs) > 0 else []
     message = " ".join([message, *longest, *(f"Left out: {each}." for each in left_out)])
     noise = tuple(answer.rms[:, 0].tolist())

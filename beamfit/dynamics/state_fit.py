@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from beamfit.answer import Table, answer, json_of
-from beamfit.dynamics.answer import ResponseEvidence, judged, limit_words, quantity
+from beamfit.dynamics.answer import ResponseEvidence, judged, limit_words, quantity, quoted
 from beamfit.dynamics.checks import Checks, HeldOutRun, RunNoises, RunSlopes, checks_of, percent
 from beamfit.dynamics.model import PreparedOutput, readings_of, weight_priors
 from beamfit.dynamics.paths import Path, prepared
@@ -439,6 +439,7 @@ def states_answer(
         for k, part in enumerate(parts)
     }  # fmt: skip
     status, message = judged(evidence)
+    told, _ = quoted(status, told)
     order = order or found.fit.model["start"].shape[1]
     held_back = ahead if held else {}
     return StatesFit(
