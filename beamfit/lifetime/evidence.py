@@ -560,7 +560,9 @@ class Evidence:
 
     @cached_property
     def course(self) -> tuple[RatePart, ...]:
-        """Lifetimes of the parts of many cycles whose loss rate is not the same all along."""
+        """Lifetimes of the parts of many cycles whose loss rate is not the same all along; without
+        errors where that of all has none.
+        """
         parts, (span, _) = self.about.parts, self.about.pieces.units
         if parts is None:
             return ()
@@ -572,6 +574,8 @@ class Evidence:
         ends = np.append(since[parts.first[1:]], since[-1])
         lifetimes = (lifetime_of(*pair, clear=True) for pair in
                      zip(rates, found.error, strict=True))  # fmt: skip
+        if not self.tells_lifetime:
+            lifetimes = (one.open() for one in lifetimes)
         return tuple(map(RatePart, since[parts.first].tolist(), ends.tolist(), lifetimes))
 
     @cached_property

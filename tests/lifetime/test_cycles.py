@@ -258,6 +258,16 @@ def test_a_loss_rate_that_changes_has_a_course():
     assert fit_cycles(cut(*top_up(0.01, 1)), found=False).course == ()
 
 
+def test_a_course_has_no_errors_where_its_mean_has_none():
+    """Three readings a cycle: faster refills would look the same."""
+    cycles = cut(*top_up(0.01, 1, step=60.0, change=0.4))
+    for found in (False, True):
+        fit = fit_cycles(cycles, found=found)
+        known = [part.lifetime.error is not None for part in fit.course]
+        assert len(known) > 1
+        assert {fit.lifetime_mean.error is not None, *known} == {not found}
+
+
 def test_a_change_within_a_cycle_is_somewhere_in_it():
     """Its parts are known far better than when one turns to the other."""
     time, current, number = top_up(0.002, 1, hours=6.0)
