@@ -3,6 +3,8 @@
 Table 2's second row. Scans are SIMULATED (tests/greybox/appendices.py).
 """
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,6 +15,7 @@ from beamfit.emittance.assumptions import Assumptions
 from beamfit.emittance.statement import prepare
 from beamfit.emittance.transport_network import SCENARIO
 from beamfit.errors import InputError
+from beamfit.greybox.problem import with_slope
 from beamfit.greybox.signed_network import certificate_of
 from tests.greybox.appendices import (
     CURRENTS,
@@ -75,10 +78,6 @@ def split(problem):
     return beam, weights
 
 
-def value_and_slope(function):
-    return jax.jit(lambda both: (function(both), jax.jacfwd(function)(both)))
-
-
 def by_numbers(problem, function, beam_of):
     """A function of a problem as one of σ in 1e-8 SI and the weights."""
     beam, weights = split(problem)
@@ -90,21 +89,25 @@ def by_numbers(problem, function, beam_of):
     return of
 
 
+def together(functions):
+    return lambda theta: [function(theta) for function in functions]
+
+
 def test_it_is_the_appendix_in_value_and_gradient(ours, theirs):
     named = [n.split("[")[0] for n in theirs.names if n.startswith("map.")]
     assert [n.split("[")[0] for n in ours.names if n.startswith("map.")] == named
     assert len(named) == 22
-    pairs = [
-        (lambda t: ours.residual(t)[:14], theirs.residual),
-        (lambda t: ours.constraint_values(t)[:64], theirs.constraint_values),
-        (ours.cost, theirs.cost),
-    ]
-    for mine, hand in pairs:
-        f = value_and_slope(by_numbers(ours, mine, factor))
-        g = value_and_slope(by_numbers(theirs, hand, lambda sigma: sigma))
-        for seed in (1, 2, 3):
-            both = jnp.concatenate([jnp.asarray(v) for v in numbers(seed)])
-            for found, expected in zip(f(both), g(both), strict=True):
+    limits = lambda t: ours.constraint_values(t)[:64]  # noqa: E731
+    mine = lambda t: ours.residual(t)[:14], limits, ours.cost
+    hand = theirs.residual, theirs.constraint_values, theirs.cost
+    f, g = (
+        jax.jit(partial(with_slope, by_numbers(problem, together(parts), beam_of)))
+        for problem, parts, beam_of in ((ours, mine, factor), (theirs, hand, lambda sigma: sigma))
+    )
+    for seed in (1, 2, 3):
+        both = jnp.concatenate([jnp.asarray(v) for v in numbers(seed)])
+        for pair in zip(f(both), g(both), strict=True):
+            for found, expected in zip(*pair, strict=True):
                 scale = np.abs(expected).max()
                 np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12 * scale)
 
@@ -129,7 +132,7 @@ def test_boxes_and_limits_are_the_appendix_s(ours, theirs):
 
 
 def test_the_fit_keeps_to_box_and_gains_and_determines_nothing(scan, line):
-    told = {"bounds": BOX, "gains": GAINS, "weights": "measured", "starts": 1}
+    told = {"bounds": BOX, "gains": GAINS, "weights": "measured", "starts": 1, "hidden": 3}
     fit = beamfit.fit_emittance(scan, line, scenario="transport-network", **told)
     assert fit.x.status.value == "unidentified"
     assert "box x" in fit.x.message
