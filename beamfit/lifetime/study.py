@@ -251,18 +251,22 @@ def budget(record: DecayRecord, machine: Machine) -> Budget:
     return Budget(operation, parts, current, length, emittances, filed if contradicted else None)
 
 
-def stands_alone(cycle: DecayRecord, fit: DecayFit) -> bool:
-    """Tell if a cycle by itself would separate a and b, by the bend of its decay and the noise that
-    all cycles show, or its neighbouring readings, where one law does not hold for all.
+def standing_alone(cycles: Sequence[DecayRecord], fit: DecayFit) -> list[DecayRecord]:
+    """Cycles that by themselves would separate a and b, by the bend of their decay and the noise
+    that all cycles show, or its neighbouring readings, where one law does not hold for all.
     """
     # Of very many readings the fit has means of neighbours.
-    mean, one = (np.median(np.diff(times)) for times in (fit.readings.time, cycle.time))
-    of_reading = fit.rms_residual * math.sqrt(max(mean / one, 1.0))
-    noise = min(of_reading * fit.inflation, OWN * noise_of(cycle.time, cycle.current))
-    loss = math.log(cycle.current[0] / cycle.current[-1])
-    # The parabola t²/2 scatters about its line by its length squared over 24 sqrt(5).
-    bend = float(cycle.current.mean()) * loss**2 / 24 * math.sqrt(len(cycle) / 5)
-    return noise < SEPARABLE * bend
+    mean, noise = np.median(np.diff(fit.readings.time)), fit.rms_residual * fit.inflation
+
+    def separates(cycle: DecayRecord) -> bool:
+        averaged = math.sqrt(max(mean / np.median(np.diff(cycle.time)), 1.0))
+        own = min(noise * averaged, OWN * noise_of(cycle.time, cycle.current))
+        loss = math.log(cycle.current[0] / cycle.current[-1])
+        # The parabola t²/2 scatters about its line by its length squared over 24 sqrt(5).
+        bend = float(cycle.current.mean()) * loss**2 / 24 * math.sqrt(len(cycle) / 5)
+        return own < SEPARABLE * bend
+
+    return [cycle for cycle in cycles if len(cycle) >= FEWEST and separates(cycle)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -411,7 +415,7 @@ def _pooled(
             continue
         called = name if many == 1 else f"{name}@{len(pooled) + 1}"
         fit = fit_cycles(group, called, law)
-        own = [c for c in group if len(c) >= FEWEST and stands_alone(c, fit)]
+        own = standing_alone(group, fit)
         alone += own
         known = fit.status not in REFUTED and fit.lifetime_mean.error is not None
         if not known and len(own) == len(group):  # fills of no one law
