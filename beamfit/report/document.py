@@ -32,6 +32,7 @@ STYLE = {
     "axes.titlesize": 11,
     "axes.titlelocation": "left",
     "figure.dpi": 110,
+    "axes.formatter.useoffset": False,  # 9.99 h is no -0.01 and +1e1
     "text.parse_math": False,  # a $ in a name is a $
 }
 # Blue and red of the page; those of the planes.

@@ -54,6 +54,8 @@ BUDGET = (
 )
 # Columns of a table of decays that fit the page.
 ABREAST = 2
+# Most cycles of which each is drawn, and how many of more are.
+MOST_CYCLES, SOME = 60, 12
 
 
 def decay_page(
@@ -201,7 +203,8 @@ def _source(study: RecordStudy) -> str:
 
 
 def draw_record(figure: FigureBase, study: RecordStudy) -> None:
-    """Draw a record with the fit of each decay, and the residuals below.
+    """Draw a record with the fit of each decay, and the residuals below; of very many cycles some
+    with their fits, and the residuals of all.
 
     Parameters
     ----------
@@ -210,7 +213,8 @@ def draw_record(figure: FigureBase, study: RecordStudy) -> None:
     study : RecordStudy
         The record.
     """
-    above, below = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1))
+    some = _some_cycles(study)
+    above, below = figure.subplots(2, 1, sharex=some is None, height_ratios=(3, 1))
     record, scale, unit = study.record, *_time_unit(study.record.span)
     many = len(record) > MANY
     dots = partial(dict, marker="o", ls="", ms=2 if many else 5, rasterized=many)
@@ -230,8 +234,25 @@ def draw_record(figure: FigureBase, study: RecordStudy) -> None:
         above.plot([], [], "o", color="0.65", ms=5, label="left out")
     above.legend(frameon=False, loc="best")
     above.set(title="beam current", ylabel="beam current, mA")
+    if some is not None:
+        seen = record.current[(record.time >= some[0]) & (record.time <= some[1])]
+        more = 0.1 * float(np.ptp(seen))
+        count = study.pooled[0].fit.first.size
+        above.set(title=f"beam current, {SOME} of {count} cycles", xlim=some / scale)
+        above.set_ylim(seen.min() - more, seen.max() + more)
     below.axhline(0, color="0.6", lw=0.8)
     below.set(xlabel=f"time, {unit}", ylabel="fit - reading,\nmA")
+
+
+def _some_cycles(study: RecordStudy) -> np.ndarray | None:
+    """From when to when cycles are drawn where all of them would be a block of colour, s."""
+    if study.decays or len(study.pooled) != 1:
+        return None
+    readings, first = study.pooled[0].fit.readings, study.pooled[0].fit.first
+    if first.size <= MOST_CYCLES:
+        return None
+    middle = first[first.size // 2 + np.array([0, SOME])]
+    return readings.start + readings.time[middle]
 
 
 def _draw_cycles(above: Axes, below: Axes, fit: DecayFit, scale: float, dots: Callable) -> None:

@@ -78,3 +78,15 @@ def test_many_decays_have_a_row_each_and_alike_verdicts_are_said_once(tmp_path):
     page = (tmp_path / "many.html").read_text()
     assert "<td>#6</td>" in page
     assert page.count('<div class="verdict') - len(study.pooled) < 6
+
+
+def test_of_many_cycles_some_are_drawn_one_by_one():
+    """Cycles of 180 s for six hours: all of them would be a block of colour."""
+    time = np.arange(0.0, 6 * 3600.0, 10.0)
+    noise = 1e-3 * np.random.default_rng(1).normal(size=time.size)
+    study = study_record(DecayRecord(time, 300 * np.exp(-(time % 180) / 36000) + noise))
+    above, below = beamfit.figures.decay(study).axes
+    assert above.get_title(loc="left") == "beam current, 12 of 120 cycles"
+    low, high = above.get_xlim()
+    assert high - low == pytest.approx(12 * 180 / 3600, rel=0.01)
+    assert below.get_xlim()[1] > 5.9
