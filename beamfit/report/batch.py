@@ -172,4 +172,6 @@ def draw_course(figure: FigureBase, course: ControlChart) -> None:
     axes.set_ylabel(f"{plain_name(course.name)}, {unit}")
     if dated:
         date_axis(axes)
+    else:
+        axes.xaxis.get_major_locator().set_params(integer=True)
     legend_below(figure, axes, 3)
