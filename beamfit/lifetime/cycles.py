@@ -311,8 +311,9 @@ def _steps_of(time: np.ndarray, current: np.ndarray, grain: float) -> np.ndarray
             free, change = _changes(total, found, window)
             if free.sum() < PLACES:
                 break
-            size = np.where(free, np.abs(change), 0.0)
-            least = max(THRESHOLD * 1.4826 * np.median(size[free]), DIGITS * grain)
+            usually = 1.4826 * np.median(np.abs(change[0, free]))
+            size = np.where(free, np.abs(change).min(axis=0), 0.0)
+            least = max(THRESHOLD * usually, DIGITS * grain)
             peak = size >= maximum_filter1d(size, 2 * window - 1)
             found[window : current.size - window + 1] |= peak & (size > least)
     clear = steps = np.flatnonzero(found)
@@ -367,7 +368,8 @@ def _mean_variance(change: np.ndarray, longest: int) -> Callable[[np.ndarray], n
 
 def _changes(total: np.ndarray, found: np.ndarray, window: int) -> tuple[np.ndarray, np.ndarray]:
     """At every place, whether no step is found within a window, and by how much the means of so
-    many readings before and after differ beside their usual difference; from sums of readings.
+    many readings before and after differ beside their usual difference there, earlier and later,
+    shape (3, places): where a loss rate changes one of these is right. From sums of readings.
     """
     place = np.arange(window, found.size - window + 1)
     steps = np.append(0, np.cumsum(found))
@@ -377,9 +379,11 @@ def _changes(total: np.ndarray, found: np.ndarray, window: int) -> tuple[np.ndar
 
 
 def _usual(values: np.ndarray, size: int) -> np.ndarray:
-    """The median of each block of about this size, for each value; 0 where none is finite."""
+    """The median of the block of about this size about each value, of the block before and of that
+    after it; 0 where none is finite.
+    """
     if not values.size:
-        return values
+        return np.zeros((3, 0))
     blocks = max(1, values.size // size)
     size = -(-values.size // blocks)
     padded = np.append(values, np.full(blocks * size - values.size, np.nan)).reshape(blocks, size)
@@ -387,7 +391,9 @@ def _usual(values: np.ndarray, size: int) -> np.ndarray:
     count = np.isfinite(ordered).sum(axis=1)[:, None]
     middle = np.concatenate([np.maximum(count - 1, 0) // 2, count // 2], axis=1)
     found = np.take_along_axis(ordered, np.minimum(middle, size - 1), axis=1).mean(axis=1)
-    return np.repeat(np.where(count[:, 0] > 0, found, 0.0), size)[: values.size]
+    found = np.pad(np.where(count[:, 0] > 0, found, 0.0), 1, mode="edge")
+    every = np.stack([found[1:-1], found[:-2], found[2:]])
+    return np.repeat(every, size, axis=1)[:, : values.size]
 
 
 def _placed(total: np.ndarray, steps: np.ndarray) -> np.ndarray:
@@ -486,12 +492,16 @@ def _far(values: np.ndarray) -> np.ndarray:
 
 
 def _odd_cycles(about: Expansion) -> np.ndarray:
-    """Which cycles have a loss rate far off that of their neighbours."""
+    """Which cycles have a loss rate far off what is usual near them, and none beside them that is
+    alike: two cycles may be a part of a course.
+    """
     first, slope, residual = about.pieces.first, about.left[:, LOSS], about.left[:, -1]
     squares = np.add.reduceat(slope**2, first)
     rate = -np.add.reduceat(slope * residual, first) / squares
-    near = median_filter(rate, NEXT, mode="nearest")
-    return _far((rate - near) * np.sqrt(squares))
+    off = rate - median_filter(rate, NEXT, mode="nearest")
+    apart = np.pad(np.abs(np.diff(rate)), 1, constant_values=np.inf)
+    alone = np.minimum(apart[:-1], apart[1:]) > 0.5 * np.abs(off)
+    return _far(off * np.sqrt(squares)) & alone
 
 
 def _edges(about: Expansion) -> np.ndarray:
