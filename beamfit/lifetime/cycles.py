@@ -10,7 +10,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
-from scipy.ndimage import maximum_filter1d, median_filter
+from numpy.lib.stride_tricks import sliding_window_view
+from scipy.ndimage import maximum_filter1d
 from scipy.special import logsumexp, ndtr
 
 from beamfit.lifetime.expansion import (
@@ -498,7 +499,8 @@ def _odd_cycles(about: Expansion) -> np.ndarray:
     first, slope, residual = about.pieces.first, about.left[:, LOSS], about.left[:, -1]
     squares = np.add.reduceat(slope**2, first)
     rate = -np.add.reduceat(slope * residual, first) / squares
-    off = rate - median_filter(rate, NEXT, mode="nearest")
+    near = sliding_window_view(np.pad(rate, NEXT // 2, mode="reflect"), NEXT)
+    off = rate - np.median(np.delete(near, NEXT // 2, axis=1), axis=1)  # not of itself
     apart = np.pad(np.abs(np.diff(rate)), 1, constant_values=np.inf)
     alone = np.minimum(apart[:-1], apart[1:]) > 0.5 * np.abs(off)
     return _far(off * np.sqrt(squares)) & alone
