@@ -666,12 +666,19 @@ def _change(rate: np.ndarray, error: np.ndarray, mean: float) -> tuple[float, in
 def _with_parts(about: Expansion, begins: np.ndarray) -> Expansion:
     """The law about the mean loss rate and the departures of parts that begin with these cycles.
 
-    The last departure follows from the others: weighed by readings they add up to none. What was
-    found with one loss rate may be far off, so that rows are taken anew, `COURSE_STEPS` times.
+    The last departure follows from the others: weighed by time they add up to none. A cycle stands
+    for the time until the next one, also where one between them was left out, but for no gap; of
+    one that was left out between two parts each has a half. What was found with one loss rate may
+    be far off, so that rows are taken anew, `COURSE_STEPS` times.
     """
-    first = about.pieces.first[begins]
-    count = np.diff(first, append=about.pieces.time.size)
-    shares = np.vstack([np.eye(begins.size - 1), -count[:-1] / count[-1]])
+    first, time = about.pieces.first[begins], about.pieces.time
+    count = np.diff(first, append=time.size)
+    apart = np.diff(time[about.pieces.first], append=time[-1])
+    usual = float(np.median(apart))
+    apart = np.minimum(apart, 2 * usual)
+    half = 0.5 * np.maximum(apart[begins[1:] - 1] - usual, 0.0)
+    lasts = np.add.reduceat(apart, begins) + np.append(0.0, half) - np.append(half, 0.0)
+    shares = np.vstack([np.eye(begins.size - 1), -lasts[:-1] / lasts[-1]])
     numbers, departure = about.numbers, np.zeros(begins.size)
     for _ in range(COURSE_STEPS):
         found = Expansion.of(

@@ -305,6 +305,28 @@ def test_a_lifetime_that_wanders_is_followed_and_its_mean_is_right():
     assert longest == pytest.approx(10.51, abs=0.05)
 
 
+@simulations(12, 60)
+def test_a_loss_rate_that_steps_or_wanders_loses_no_cycle(count):
+    """At little noise: what is not usual in most cycles near it was cut to pieces, or left out."""
+    rng, pulls, lost = np.random.default_rng(12), [], []
+    time = 5.0 * np.arange(4000)
+    for k in range(count):
+        period, moment = rng.uniform(120.0, 300.0), rng.uniform(0.2, 0.8)
+        steps = np.where(time > moment * time[-1], rng.choice([0.87, 1.15]), 1.0)
+        wanders = 1 + 0.06 * np.sin(6 * time / time[-1] + 6 * moment)
+        loss = (steps if k % 2 else wanders) / LIFETIME
+        gone = np.append(0.0, np.cumsum(5.0 * loss[:-1]))
+        number = (time // period).astype(int)
+        beam = 300 * np.exp(gone[np.searchsorted(number, number)] - gone)
+        [found] = study_record(DecayRecord(time, beam + 0.004 * rng.normal(size=time.size))).answers
+        lifetime = found.fit.lifetime_mean
+        pulls.append((lifetime.value - 1 / loss.mean() / 3600) / lifetime.error)
+        lost.append(1 - len(found.fit.readings) / time.size)
+    assert np.max(np.abs(pulls)) < 4.0, pulls
+    assert np.mean(np.square(pulls)) < 1.0 + widened(0.4, 60, count)
+    assert np.mean(lost) < 0.01, lost
+
+
 def test_a_that_depends_on_the_current_is_seen():
     time = np.arange(0.0, 6 * 3600, 30.0)
     rate = 1 / LIFETIME
