@@ -542,8 +542,9 @@ def _best(
 
 def _model(x: np.ndarray, c: Coordinates) -> np.ndarray:
     squared = (c.rows @ x[..., None])[..., 0] + c.known
-    least, most = (of(c.size, axis=-1, keepdims=True) for of in (np.min, np.max))
-    return np.sqrt(np.clip(squared, (least / FURTHEST) ** 2, (most * FURTHEST) ** 2))
+    # No upper limit: where the setting slipped a beam may be a hundred times larger than any size.
+    least = c.size.min(-1, keepdims=True)
+    return np.sqrt(np.maximum(squared, (least / FURTHEST) ** 2))
 
 
 def _expecting(
