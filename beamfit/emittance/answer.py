@@ -170,7 +170,7 @@ def plane_answer(
         rms_residual=Quantity(float(np.sqrt(np.mean((p.size - p.model) ** 2))), None, "m"),
         covariance=_covariance(post, b, scale, bool(known[SIGMA].all())),
         error_scale=scale,
-        noise=noise_words(work.sizes.likeness[1], post.scale, post.relative, p),
+        noise=noise_words(post.noise, post.scale, post.relative, p),
         method=seen.method,
         weights=seen.weights,
         identifiability=_identifiability(p, n, e, advice, b),
@@ -211,7 +211,7 @@ def _remarks(
     post, p, remarks = work.posterior, work.points, [work.shot_words]
     if e.of_a_beam:
         likely = chi2_probability(post.chi2, max(len(p.size) - 3, 0))
-        remarks.insert(0, noise_remark(work.sizes.likeness[1], post.scale, likely))
+        remarks.insert(0, noise_remark(post.noise, post.scale, likely))
         without = carrying.without * value[1] / value[0]
         place = "" if e.opened else carrying.place
         if place:
@@ -389,8 +389,9 @@ def _influence(p: Points, sigma: np.ndarray, error: float) -> Influence:
 
 def noise_words(noise: str, scale: np.ndarray, relative: float, p: Points) -> str:
     """Source of the errors, in a few words."""
-    if noise == "shots":
-        return f"of the shots, settings ± {100 * scale[0]:.2g} % beyond"
+    if noise in ("shots", "beyond"):
+        source = "of the shots" if noise == "shots" else "given"
+        return f"{source}, settings ± {100 * scale[0]:.2g} % beyond"
     if noise != "none":
         return "given" if scale[1] <= 1.05 else f"given, × {scale[0]:.2f}"
     if relative < 0.5:

@@ -331,6 +331,8 @@ class PlanePosterior(NamedTuple):
         (NaN without); NaN where the settings do not separate the three numbers.
     model, error, bad : ndarray
         Shape (n,): fitted sizes and the errors found, m, and the probability of a bad reading.
+    noise : {"stated", "share", "beyond", "shots", "none"}
+        What was known of it, or "beyond" if settings scatter beyond their stated errors.
     scale : ndarray
         Shape (3,): median and central 68 % of the scale of the noise.
     relative : float
@@ -359,6 +361,7 @@ class PlanePosterior(NamedTuple):
     model: np.ndarray
     error: np.ndarray
     bad: np.ndarray
+    noise: str
     scale: np.ndarray
     relative: float
     chi2: float
@@ -575,7 +578,7 @@ def _posterior(
     found, unit = c.sigma(best.x[i][None])[0], float(c.unit)
     positive = bool(found[0] > 0 and found[0] * found[2] > found[1] ** 2) and bool(c.seen)
     model = best.model[i] * unit
-    error = unit / np.sqrt(best.precision[i])
+    error, likelier = unit / np.sqrt(best.precision[i]), int(np.argmax(of_kind))
     weighed = model if weights == "model" else plane.size
     rows = np.stack(coefficients(plane.r11, plane.r12), -1) / (2.0 * weighed)[:, None]
     none = np.full((3, 3), np.nan)
@@ -599,7 +602,8 @@ def _posterior(
         model=model,
         error=error,
         bad=best.bad[i],
-        scale=_scale_of(i, draws, of_kind),
+        noise=_noise_word(plane, s.kinds[likelier]),
+        scale=_scale_of(i, draws[likelier]),
         relative=float(sum(w * k.power for w, k in zip(of_kind, s.kinds, strict=True))),
         chi2=chi2,
         seen=bool(c.seen),
@@ -619,9 +623,12 @@ def _covariance(rows: np.ndarray) -> np.ndarray:
     return half @ half.T
 
 
-def _scale_of(i: int, draws: Sequence[BeamDraws], of_kind: np.ndarray) -> np.ndarray:
-    """Median and central 68 % of the scale of the likelier kind of noise."""
-    own = draws[int(np.argmax(of_kind))]
+def _noise_word(plane: PlaneSizes, kind: NoiseKind) -> str:
+    return "beyond" if np.any(kind.floor) and not plane.of_shots else plane.likeness[1]
+
+
+def _scale_of(i: int, own: BeamDraws) -> np.ndarray:
+    """Median and central 68 % of the scale of the noise."""
     return weighted_quantiles(own.scales.scale[i], own.scale_weight[i], (AT[2], AT[1], AT[3]))
 
 

@@ -190,8 +190,8 @@ def noise_remark(noise: str, scale: np.ndarray, probability: float | None = None
 
     Parameters
     ----------
-    noise : {"stated", "share", "shots", "none"}
-        What was known of it.
+    noise : {"stated", "share", "beyond", "shots", "none"}
+        What was known of it, or "beyond" if settings scatter beyond their stated errors.
     scale : ndarray
         Median and central 68 % of its scale.
     probability : float, optional
@@ -214,10 +214,11 @@ def noise_remark(noise: str, scale: np.ndarray, probability: float | None = None
                 "Stated errors seem too large, and so is the error here: the sizes scatter less "
                 f"(probability {1.0 - probability:.1g})."
             )
-    if noise == "shots" and middle > 0.005:
+    if noise in ("shots", "beyond") and middle > 0.005:
+        than = "shots" if noise == "shots" else "stated errors"
         return (
             f"Settings scatter by {100 * middle:.2g} % ({100 * low:.2g} to {100 * high:.2g} %) of "
-            "the size beyond their shots, which the error includes."
+            f"the size beyond their {than}, which the error includes."
         )
     return ""
 

@@ -36,7 +36,7 @@ class Sample(NamedTuple):
     noise : str
         "shots", "stated" or "none": which prior it tells of.
     kinds : tuple of NoiseKind
-        Kinds of noise, one but for "none".
+        Kinds of noise.
     scales : tuple of Scales
         Their nodes.
     log_evidence : tuple of ndarray
@@ -143,17 +143,16 @@ def _log_evidence(
 ) -> float:
     """Log evidence of a plane under other priors than those of its nodes."""
     parts = []
+    more = math.log(probability) - math.log(chance)
+    less = math.log1p(-probability) - math.log1p(-chance)
     for own, scales, evidence in zip(s.kinds, s.scales, s.log_evidence, strict=True):
         skip = int(own.chance > 0)
         log = np.log(scales.scale[skip:])
-        ratio = new.log_density(log) - prior.log_density(log)
-        ratio -= new.log_probability_above(own.least) - prior.log_probability_above(own.least)
-        if kind == "none":
-            share = probability if own.power else 1.0 - probability
-            parts.append(averaged(evidence + scales.log_weight + ratio, 0.0) + math.log(share))
-            continue
-        ratio += math.log1p(-probability) - math.log1p(-chance)
-        first = [math.log(probability) - math.log(chance)]
-        weight = scales.log_weight + np.concatenate([first, ratio])
+        ratio = np.full(len(log), more if kind == "none" and own.power else less)
+        # Stated errors may be too small by what settings scatter beyond: that has another prior.
+        if own.prior == prior:
+            ratio += new.log_density(log) - prior.log_density(log)
+            ratio -= new.log_probability_above(own.least) - prior.log_probability_above(own.least)
+        weight = scales.log_weight + own.log_weight + np.append(np.full(skip, more), ratio)
         parts.append(averaged(evidence + weight, 0.0))
     return float(np.logaddexp.reduce(parts))
