@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from beamfit.density.profiles import FEWEST_BINS, profile_size
-from beamfit.emittance.scan import PLANES, Profile, QuadScan, row_keys
+from beamfit.emittance.scan import KNOB, PLANES, Profile, QuadScan, row_keys
 from beamfit.errors import InputError
 from beamfit.io.columns import Sheet, columns_of, spelled
 from beamfit.io.files import LARGEST, read_bytes
@@ -21,6 +21,9 @@ ENOUGH_DEGREES = 3
 # What a table of images names, and what an image should be.
 IMAGE, SHOT, PICTURES = "image", "shot", "PNG, or TIFF"
 COUNTS, BACKGROUND, POSITION = "counts", "background", "position"
+# Readbacks of one setting differ by at most this share of what is scanned: supplies repeat to 1e-4
+# of their range, and the steps of a scan are a hundredth of it or more.
+READBACK = 1e-3
 # Settings without which a plane has no emittance.
 FEWEST_SETTINGS = 3
 
@@ -164,6 +167,46 @@ def _shots(sheet: Sheet, rest: list[str]) -> tuple[np.ndarray, np.ndarray]:
     return np.array(new), np.array([*new[1:], len(sheet)])
 
 
+def steady_settings(scan: QuadScan) -> QuadScan:
+    """Give rows that stand together, and whose readbacks agree, the median of these.
+
+    Parameters
+    ----------
+    scan : QuadScan
+        Rows in the order in which they were measured.
+
+    Returns
+    -------
+    QuadScan
+        Settings read to a thousandth of their range. A magnet that moves less than that of its
+        value was held, and tells no rows apart.
+
+    Examples
+    --------
+    >>> read = QuadScan({"Q": [1, 1.0004, 2, 3.0002, 3]}, {"Q": "A"}, {"x": [1e-4] * 5})
+    >>> steady_settings(read).settings["Q"].round(4).tolist()
+    [1.0002, 1.0002, 2.0, 3.0001, 3.0001]
+    """
+    if not scan.settings:
+        return scan
+    values = np.stack(list(scan.settings.values()), -1)
+    span, largest = np.ptp(values, axis=0), np.abs(values).max(0)
+    held = (span <= READBACK * largest) & [scan.units[name] != KNOB for name in scan.settings]
+    near = np.where(held, np.inf, READBACK * span)
+    step = np.abs(np.diff(values, axis=0))
+    if not np.any((step <= near).all(1) & (step > 0).any(1)):
+        return scan
+    first, run = 0, np.zeros(len(values), int)
+    for i, row in enumerate(values):
+        first = first if np.all(np.abs(row - values[first]) <= near) else i
+        run[i] = first
+    for rows in np.split(np.arange(len(run)), np.flatnonzero(np.diff(run)) + 1):
+        values[rows] = np.median(values[rows], axis=0)
+    said = f"Settings that agree to {READBACK:.1%} of their range from row to row count as one."
+    settings = dict(zip(scan.settings, values.T, strict=True))
+    return replace(scan, settings=settings, notes=(*scan.notes, said))
+
+
 def average_shots(scan: QuadScan, *, marked: bool) -> QuadScan:
     """Average the rows that repeat a setting, an energy, a screen and a slice.
 
@@ -173,7 +216,8 @@ def average_shots(scan: QuadScan, *, marked: bool) -> QuadScan:
         One row a shot.
     marked : bool
         Whether the file says its rows are shots. If not, rows that carry errors of their own
-        stay as they are: each is a measurement by itself.
+        are shots of a setting only where they stand together: one that was set again is measured
+        again.
 
     Returns
     -------
@@ -195,7 +239,8 @@ def average_shots(scan: QuadScan, *, marked: bool) -> QuadScan:
     keys = row_keys(scan)
     group = np.array([rows.setdefault(key, len(rows)) for key in keys])
     shots = {plane: _by_setting(values, group) for plane, values in scan.size.items()}
-    alone = len(rows) == len(group) or (scan.error and not marked)
+    again = bool(np.any(np.diff(group) < 0))
+    alone = len(rows) == len(group) or (scan.error and again and not marked)
     if alone or not (marked or all(map(_alike, shots.values()))):
         return scan if scan.error else replace(scan, error_source="none given")
     size, scatter, given = {}, {}, {}

@@ -15,6 +15,7 @@ from tests.emittance.conftest import TABLE_2, design, scan_of
 from tests.simulations import simulations
 
 BEAM = BeamMatrix.from_twiss(1e-6 / 264.1865, 5.5, 5.3)
+HEADER = "Q525_kG,size_x_um,size_x_error_um"
 REAL = np.array([-4.219, -3.153, -2.64, -2.124, -1.026])
 
 
@@ -130,6 +131,26 @@ def test_what_settings_scatter_beyond_errors_that_differ_is_said_and_included(ot
     assert inside >= 0.85 * answered
     assert len(scatters) > 0.8 * answered
     assert np.median(scatters) == pytest.approx(3.0, rel=0.2)
+
+
+@simulations(15, 60)
+@pytest.mark.parametrize("digits", [0.0, 2e-4], ids=["repeated", "read back"])
+def test_rows_of_one_setting_share_what_settings_scatter(otr2, true, tmp_path, digits, count):
+    """Three rows of 2 % a setting, settings that scatter by 5 %: three rows are not three answers."""
+    settings, rng, far, answered = np.linspace(-4.5, -1.0, 6), np.random.default_rng(3), 0, 0
+    for _ in range(count):
+        level = np.repeat(true(settings) * (1 + 0.05 * rng.normal(size=6)), 3)
+        size = 1e6 * level * (1 + 0.02 * rng.normal(size=18))
+        read = np.repeat(settings, 3) + 3.5 * digits * rng.normal(size=18)
+        rows = np.stack([read, size, 0.02 * size], -1)
+        file = tmp_path / "scan.csv"
+        np.savetxt(file, rows, delimiter=",", comments="", header=HEADER)
+        found = beamfit.fit_emittance(beamfit.read_quad_scan(file), otr2).x.emittance
+        if found.error is not None:
+            answered += 1
+            far += abs(found.value - 1e-6 / 264.1865) > 3 * found.error
+    assert answered >= 0.8 * count
+    assert far <= 0.05 * count
 
 
 # Four points of 3 % stated at half are refused in a third of scans: P(beam) is .985 there.
