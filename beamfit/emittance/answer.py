@@ -32,6 +32,7 @@ from beamfit.emittance.verdict import (
     PlaneEvidence,
     noise_remark,
     point_remarks,
+    resolution_remark,
     verdict,
     waist_bracketed,
 )
@@ -217,6 +218,7 @@ def _remarks(
         if place:
             place += _bad_elsewhere(seen, plane, carrying.point)
         remarks += point_remarks(p, place, float(without), abs(carrying.shift) > MOVES)
+    remarks.append(resolution_remark(p.size, p.known))
     if b is not None and e.determined:
         remarks.append(b.remark)
     return " ".join(filter(None, remarks))
@@ -315,8 +317,9 @@ def _evidence(seen: PreparedScan, plane: str, n: PlaneNumbers, b: Beside | None)
     own, said = ("mm", "um") if little else ("um", "mm")
     remedy = (
         f"Check the units of '{seen.scan.columns.get(f'size_{plane}', f'size_{plane}')}', the "
-        f"settings and the energy: sizes in {own} under a header that says {said} make it a "
-        f"million times {'less' if little else 'more'}."
+        f"settings and the energy: sizes a thousand times too {'small' if little else 'large'} (such "
+        f"as {own} under a header that says {said}) make it a million times "
+        f"{'less' if little else 'more'}."
     )
     return replace(e, ending=Finding(Status.unidentified, cause, remedy))
 

@@ -348,6 +348,16 @@ def test_what_is_not_determined_has_an_interval_that_holds(otr2, true, count):
     assert np.mean(from_zero) > 0.5
 
 
+def test_sizes_below_the_resolution_are_counted(otr2, true):
+    settings = np.linspace(-4.5, -1.0, 12)
+    size = true(settings)
+    at = np.full(12, 1.1 * size.min())
+    fit = beamfit.fit_emittance(otr2_scan(settings, size, 0.02 * size, resolution=at), otr2).x
+    below = int(np.sum(size < at))
+    verb = f"{below} of 12 sizes are" if below > 1 else "1 of 12 sizes is"
+    assert f"{verb} smaller than resolution and dispersion alone" in fit.message
+
+
 def test_overstated_errors_are_said(otr2, true):
     settings = np.linspace(-4.5, -1.0, 12)
     size = true(settings) * (1 + 0.002 * np.random.default_rng(6).normal(size=12))

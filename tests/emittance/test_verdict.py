@@ -277,8 +277,8 @@ def test_phase_of_a_drift_from_a_waist():
 @pytest.mark.parametrize(
     ("factor", "words", "units"),
     [
-        (1e-3, "less than any", "in mm under a header that says um make it a million times less"),
-        (600.0, "more than any", "in um under a header that says mm make it a million times more"),
+        (1e-3, "less than any", "mm under a header that says um) make it a million times less"),
+        (600.0, "more than any", "um under a header that says mm) make it a million times more"),
     ],
 )
 def test_an_emittance_that_only_a_wrong_unit_explains_is_not_given(gtf, factor, words, units, root):
