@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 from collections.abc import Mapping
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -216,8 +217,7 @@ def average_shots(scan: QuadScan, *, marked: bool) -> QuadScan:
         One row a shot.
     marked : bool
         Whether the file says its rows are shots. If not, rows that carry errors of their own
-        are shots of a setting only where they stand together: one that was set again is measured
-        again.
+        are shots of a setting where they stand together: one that was set again is measured again.
 
     Returns
     -------
@@ -237,10 +237,12 @@ def average_shots(scan: QuadScan, *, marked: bool) -> QuadScan:
     """
     rows: dict[tuple, int] = {}
     keys = row_keys(scan)
+    if scan.error and not marked:
+        visit = np.cumsum([0, *(a != b for a, b in pairwise(keys))])
+        keys = list(zip(visit, keys, strict=True))
     group = np.array([rows.setdefault(key, len(rows)) for key in keys])
     shots = {plane: _by_setting(values, group) for plane, values in scan.size.items()}
-    again = bool(np.any(np.diff(group) < 0))
-    alone = len(rows) == len(group) or (scan.error and again and not marked)
+    alone = len(rows) == len(group)
     if alone or not (marked or all(map(_alike, shots.values()))):
         return scan if scan.error else replace(scan, error_source="none given")
     size, scatter, given = {}, {}, {}

@@ -167,7 +167,7 @@ def test_rows_with_errors_of_their_own_are_shots_where_they_stand_together(read)
     text = "\n".join(["Q_A,size_x_um,size_x_error_um", *rows])
     assert len(read(text)) == 3
     text = "\n".join(["Q_A,size_x_um,size_x_error_um", *rows, "0,102,1"])
-    assert len(read(text)) == 5
+    assert len(read(text)) == 4
     marked = text.replace("Q_A,", "shot,Q_A,").replace("\n", "\n1,")
     assert len(read(marked)) == 3
 
