@@ -34,8 +34,9 @@ class Lognormal(NamedTuple):
         """
         if not least > 0.0:
             return 0.0
-        pull = (math.log(least) - math.log(self.middle)) / self.spread
-        return math.log(0.5 * math.erfc(pull / math.sqrt(2.0)))
+        from scipy.special import log_ndtr  # a scan is read without scipy
+
+        return float(log_ndtr((math.log(self.middle) - math.log(least)) / self.spread))
 
 
 # The probability of a bad reading among so few that nothing is left to test them by.
