@@ -317,8 +317,8 @@ def _evidence(seen: PreparedScan, plane: str, n: PlaneNumbers, b: Beside | None)
     own, said = ("mm", "um") if little else ("um", "mm")
     remedy = (
         f"Check the units of '{seen.scan.columns.get(f'size_{plane}', f'size_{plane}')}', the "
-        f"settings and the energy: sizes a thousand times too {'small' if little else 'large'} (such "
-        f"as {own} under a header that says {said}) make it a million times "
+        f"settings and the energy: sizes a thousand times too {'small' if little else 'large'} "
+        f"(such as {own} under a header that says {said}) make it a million times "
         f"{'less' if little else 'more'}."
     )
     return replace(e, ending=Finding(Status.unidentified, cause, remedy))

@@ -113,7 +113,7 @@ def test_errors_far_too_small_are_said_and_enlarged(otr2, true, count):
 
 @simulations(40, 60)
 def test_what_settings_scatter_beyond_errors_that_differ_is_said_and_included(otr2, true, count):
-    """Errors of single profiles, .1 to 1 %, where settings scatter by 3 %: none takes the answer."""
+    """Errors of profiles, .1 to 1 %, where settings scatter by 3 %: none takes the answer."""
     settings, rng, inside, scatters = np.linspace(-4.5, -1.0, 10), np.random.default_rng(8), 0, []
     sizes, answered = true(settings), 0
     for _ in range(count):
@@ -136,7 +136,7 @@ def test_what_settings_scatter_beyond_errors_that_differ_is_said_and_included(ot
 @simulations(15, 60)
 @pytest.mark.parametrize("digits", [0.0, 2e-4], ids=["repeated", "read back"])
 def test_rows_of_one_setting_share_what_settings_scatter(otr2, true, tmp_path, digits, count):
-    """Three rows of 2 % a setting, settings that scatter by 5 %: three rows are not three answers."""
+    """Three rows of 2 % a setting, settings that scatter by 5 %: they are not three answers."""
     settings, rng, far, answered = np.linspace(-4.5, -1.0, 6), np.random.default_rng(3), 0, 0
     for _ in range(count):
         level = np.repeat(true(settings) * (1 + 0.05 * rng.normal(size=6)), 3)

@@ -63,7 +63,7 @@ def stated(factor, count, alike, seed=0):
 @pytest.mark.parametrize("alike", [True, False], ids=["one share", "different"])
 @pytest.mark.parametrize("factor", [1.0, 2.0])
 def test_stated_errors_are_learned_to_be_right_or_too_small(factor, alike):
-    """Where all are right the factor may be anything near one: no narrow prior wins by its nodes."""
+    """Where all are right the factor may be near one: no narrow prior wins by its nodes."""
     learned = learn_noise(list(noise_samples(stated(factor, 25, alike), Noise())), Noise(), "own")
     right, middle = learned.noise.right, learned.noise.factor.middle
     assert right > 0.8 if factor == 1.0 else right < 0.2
