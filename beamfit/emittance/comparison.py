@@ -436,14 +436,14 @@ class _Stack(NamedTuple):
     kinds: tuple[NoiseKind, ...]
 
 
-def _stacked(planes: Sequence[PlaneSizes], noise: Noise) -> _Stack:
+def _stacked(planes: Sequence[PlaneSizes], noise: Noise, alike: bool | None = None) -> _Stack:
     r11, r12, known, size = (np.stack([p[i] for p in planes]) for i in range(4))
     c = coordinates(r11, r12, size, known)
     first, error = planes[0], None
     if first.error is not None:
         error = np.stack([p.error for p in planes]) / c.unit[:, None]
     floor = error if first.of_shots else None
-    kinds = kinds_of(noise, c.size, None if first.of_shots else error, floor)
+    kinds = kinds_of(noise, c.size, None if first.of_shots else error, floor, alike)
     return _Stack(c, np.stack([r11, r12], -1), kinds)
 
 
@@ -455,7 +455,9 @@ def _compared(
         draws = [draw_beams(s.c, kind, noise) for kind in s.kinds]
         few, own = s, draws
         if s.c.size.shape[-1] > COMPARED:
-            few = _stacked([p.thinned(COMPARED) for p in planes], noise)
+            # Few of errors that differ may be alike: the noise is that of all.
+            alike = planes[0].likeness[1] == "share"
+            few = _stacked([p.thinned(COMPARED) for p in planes], noise, alike)
             own = [draw_beams(few.c, kind, noise) for kind in few.kinds]
         evidence = np.array([_evidences(few, i, d, noise) for i, d in enumerate(own)])
         of_kind = np.logaddexp.reduce(evidence, axis=-1)

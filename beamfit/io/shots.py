@@ -203,7 +203,7 @@ def steady_settings(scan: QuadScan) -> QuadScan:
         run[i] = first
     for rows in np.split(np.arange(len(run)), np.flatnonzero(np.diff(run)) + 1):
         values[rows] = np.median(values[rows], axis=0)
-    said = f"Settings that agree to {READBACK:.1%} of their range from row to row count as one."
+    said = f"Settings that agree to {100 * READBACK:g} % of their range, row to row, count as one."
     settings = dict(zip(scan.settings, values.T, strict=True))
     return replace(scan, settings=settings, notes=(*scan.notes, said))
 
@@ -260,6 +260,7 @@ def average_shots(scan: QuadScan, *, marked: bool) -> QuadScan:
     # Errors that the file gives are not taken from these shots.
     means = {"size": size, "error": scatter | given, "shots": None if given else np.bincount(group)}
     means["shot_size"] = single
+    said = f"{said}, in the place of the file's" if scatter and scan.error else said
     said = said if scatter or given else "none given"
     profiles = tuple(p._replace(row=int(group[p.row])) for p in scan.profiles)
     means |= {"error_source": said, "profiles": profiles}

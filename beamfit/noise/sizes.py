@@ -79,6 +79,7 @@ def kinds_of(
     size: np.ndarray,
     error: np.ndarray | None,
     floor: np.ndarray | None = None,
+    alike: bool | None = None,
 ) -> tuple[NoiseKind, ...]:
     """Kinds of noise that sizes may have.
 
@@ -92,6 +93,8 @@ def kinds_of(
         Shape (..., n), stated.
     floor : ndarray, optional
         Shape (..., n): standard errors of means of shots, beyond which settings scatter.
+    alike : bool, optional
+        Whether stated errors are one share of the size; by themselves if None.
 
     Returns
     -------
@@ -110,7 +113,8 @@ def kinds_of(
             NoiseKind(0, zero, middle, noise.unstated, 1.0, 0.0, 0.0, same),
         )
     share = error / size
-    alike = bool(np.all(np.ptp(share, axis=-1) <= 0.01 * share.mean(-1)))
+    if alike is None:
+        alike = bool(np.all(np.ptp(share, axis=-1) <= 0.01 * share.mean(-1)))
     if alike:
         return (NoiseKind(1, zero, share, noise.factor, 1.0, noise.right, 1.0, 0.0),)
     # A factor or a scatter: nobody knows which before the sizes are seen.

@@ -348,6 +348,16 @@ def test_what_is_not_determined_has_an_interval_that_holds(otr2, true, count):
     assert np.mean(from_zero) > 0.5
 
 
+def test_two_errors_among_many_that_differ_are_enough(otr2, true):
+    """Models are compared by a hundred of 150 points, which may miss those two."""
+    settings = np.linspace(-4.5, -1.0, 150)
+    size = true(settings) * (1 + 0.02 * np.random.default_rng(6).normal(size=150))
+    error = 0.02 * size
+    error[[2, 5]] *= 1.5
+    fit = beamfit.fit_emittance(otr2_scan(settings, size, error), otr2).x
+    assert fit.emittance.interval_95[0] < 1e-6 / 264.1865 < fit.emittance.interval_95[1]
+
+
 def test_sizes_below_the_resolution_are_counted(otr2, true):
     settings = np.linspace(-4.5, -1.0, 12)
     size = true(settings)
