@@ -191,8 +191,10 @@ def steady_settings(scan: QuadScan) -> QuadScan:
     if not scan.settings:
         return scan
     values = np.stack(list(scan.settings.values()), -1)
-    span, largest = np.ptp(values, axis=0), np.abs(values).max(0)
-    held = (span <= READBACK * largest) & [scan.units[name] != KNOB for name in scan.settings]
+    held = np.ptp(values, axis=0) <= READBACK * np.abs(values).max(0)
+    held &= [scan.units[name] != KNOB for name in scan.settings]
+    # The range of even settings, which one wrong cell does not change.
+    span = 4.0 * np.median(np.abs(values - np.median(values, axis=0)), axis=0)
     near = np.where(held, np.inf, READBACK * span)
     step = np.abs(np.diff(values, axis=0))
     if not np.any((step <= near).all(1) & (step > 0).any(1)):

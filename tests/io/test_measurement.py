@@ -184,9 +184,12 @@ def test_readbacks_that_differ_in_their_digits_are_one_setting(read):
     assert any("count as one" in note for note in scan.notes)
 
 
-def test_a_fine_scan_keeps_its_settings(read):
+def test_fine_steps_and_those_beside_a_wrong_cell_are_settings_of_their_own(read):
     rows = [f"{q:.6g},{100 + q:.6g}" for q in np.linspace(0.0, 1.0, 500)]
     assert len(read("\n".join(["Q_A,size_x_um", *rows]))) == 500
+    assert len(read("Q_A,size_x_um\n0,100\n1,90\n2,95\n3000,110\n4,120")) == 5
+    crossed = ["0,1,100", "0,2,90", "0,3,95", "0,4,99", "1,4,90", "2,4,95", "0,4,98"]
+    assert len(read("\n".join(["P_A,Q_A,size_x_um", *crossed]))) == 6
 
 
 def test_errors_of_the_file_are_no_scatter_of_two_shots(read):
