@@ -226,8 +226,8 @@ def average_shots(scan: QuadScan, *, marked: bool) -> QuadScan:
     QuadScan
         One row a setting, with ``shot_size``, the shots themselves, for the fit. The error is the
         standard error of the mean, s/√n with n - 1 in s, and ``shots`` says of how many. With
-        fewer than three repeats in all the errors of the file stand, or there are none and the fit
-        infers them. Rows that are not said to be shots, and differ at one setting far more than at
+        fewer than three repeats in all, or less than half of the settings repeated in a file that
+        does not speak of shots, its errors stand, or there are none and the fit infers them. Rows that are not said to be shots, and differ at one setting far more than at
         the others, stay as they are.
 
     Examples
@@ -248,9 +248,10 @@ def average_shots(scan: QuadScan, *, marked: bool) -> QuadScan:
     if alone or not (marked or all(map(_alike, shots.values()))):
         return scan if scan.error else replace(scan, error_source="none given")
     size, scatter, given = {}, {}, {}
+    usual = marked or np.median(np.bincount(group)) > 1
     for plane, values in shots.items():
         size[plane], error = _shot_means(values)
-        if error is not None:
+        if error is not None and (usual or plane not in scan.error):
             scatter[plane] = error
         elif plane in scan.error:  # too few repeats: what the file says of its shots is kept
             square = _by_setting(scan.error[plane] ** 2, group)
