@@ -227,8 +227,9 @@ def average_shots(scan: QuadScan, *, marked: bool) -> QuadScan:
         One row a setting, with ``shot_size``, the shots themselves, for the fit. The error is the
         standard error of the mean, s/√n with n - 1 in s, and ``shots`` says of how many. With
         fewer than three repeats in all, or less than half of the settings repeated in a file that
-        does not speak of shots, its errors stand, or there are none and the fit infers them. Rows that are not said to be shots, and differ at one setting far more than at
-        the others, stay as they are.
+        does not speak of shots, its errors stand, or there are none and the fit infers them. Rows
+        that are not said to be shots, and differ at one setting far more than at the others, stay
+        as they are.
 
     Examples
     --------

@@ -173,7 +173,7 @@ def test_rows_with_errors_of_their_own_are_shots_where_they_stand_together(read)
 
 
 def test_errors_of_the_file_stand_where_few_settings_are_repeated(read):
-    """One setting of five was measured four times: its errors are averaged, the others' are kept."""
+    """One setting of five was measured four times: its errors are averaged, others are kept."""
     rows = ["0,200,4", *(f"1,{150 + i},3" for i in range(4)), "2,100,2", "3,140,3", "4,190,4"]
     scan = read("\n".join(["Q_A,size_x_um,size_x_error_um", *rows]))
     np.testing.assert_allclose(scan.error["x"], 1e-6 * np.array([4, 1.5, 2, 3, 4]), rtol=1e-12)
