@@ -146,6 +146,20 @@ def of_shots(scatter: float, lost: float = 0.0) -> Callable:
     return draw
 
 
+def stated_short(rng, n):
+    """Errors of single profiles, .1 to 1 % and different at each; settings scatter by 3 %."""
+    t = truth(rng, n)
+    size = noisy(rng, t, 0.03 * t.size)
+    return t, scan_of(t, size, 0.003 * np.exp(0.7 * rng.standard_normal(n)) * size)
+
+
+def few_shots(rng, n):
+    """Means of three shots of 3 %, with their standard errors; of how many shots is not said."""
+    t = truth(rng, n)
+    shots = np.abs(t.size[:, None] * (1 + 0.03 * rng.standard_normal((n, 3))))
+    return t, scan_of(t, shots.mean(1), shots.std(1, ddof=1) / np.sqrt(3))
+
+
 def one_sided(rng, n):
     """The waist at the end of the scan or beyond; 2 % stated."""
     t = truth(rng, n, (0.6, 1.0))
@@ -197,6 +211,8 @@ BEAMS = {
     "five shots, one in twenty shows no beam": of_shots(0.02, 0.05),
     "one side of the waist, 2 %": one_sided,
     **{f"smallest size × {f}, 3 %": bad_at_waist(f) for f in (0.7, 1.3, 1.6)},
+    "errors stated, .1 to 1 %, settings ± 3 %": stated_short,
+    "errors of three shots, of how many not said": few_shots,
 }
 OTHERS = {
     "sizes uniform from 40 to 160 %": nothing("uniform"),

@@ -32,6 +32,7 @@ from beamfit.emittance.verdict import (
     PlaneEvidence,
     noise_remark,
     point_remarks,
+    resolution_remark,
     verdict,
     waist_bracketed,
 )
@@ -170,7 +171,7 @@ def plane_answer(
         rms_residual=Quantity(float(np.sqrt(np.mean((p.size - p.model) ** 2))), None, "m"),
         covariance=_covariance(post, b, scale, bool(known[SIGMA].all())),
         error_scale=scale,
-        noise=noise_words(work.sizes.likeness[1], post.scale, post.relative, p),
+        noise=noise_words(post.noise, post.scale, post.relative, p),
         method=seen.method,
         weights=seen.weights,
         identifiability=_identifiability(p, n, e, advice, b),
@@ -211,12 +212,13 @@ def _remarks(
     post, p, remarks = work.posterior, work.points, [work.shot_words]
     if e.of_a_beam:
         likely = chi2_probability(post.chi2, max(len(p.size) - 3, 0))
-        remarks.insert(0, noise_remark(work.sizes.likeness[1], post.scale, likely))
+        remarks.insert(0, noise_remark(post.noise, post.scale, likely))
         without = carrying.without * value[1] / value[0]
         place = "" if e.opened else carrying.place
         if place:
             place += _bad_elsewhere(seen, plane, carrying.point)
         remarks += point_remarks(p, place, float(without), abs(carrying.shift) > MOVES)
+    remarks.append(resolution_remark(p.size, p.known))
     if b is not None and e.determined:
         remarks.append(b.remark)
     return " ".join(filter(None, remarks))
@@ -315,8 +317,9 @@ def _evidence(seen: PreparedScan, plane: str, n: PlaneNumbers, b: Beside | None)
     own, said = ("mm", "um") if little else ("um", "mm")
     remedy = (
         f"Check the units of '{seen.scan.columns.get(f'size_{plane}', f'size_{plane}')}', the "
-        f"settings and the energy: sizes in {own} under a header that says {said} make it a "
-        f"million times {'less' if little else 'more'}."
+        f"settings and the energy: sizes a thousand times too {'small' if little else 'large'} "
+        f"(such as {own} under a header that says {said}) make it a million times "
+        f"{'less' if little else 'more'}."
     )
     return replace(e, ending=Finding(Status.unidentified, cause, remedy))
 
@@ -389,8 +392,9 @@ def _influence(p: Points, sigma: np.ndarray, error: float) -> Influence:
 
 def noise_words(noise: str, scale: np.ndarray, relative: float, p: Points) -> str:
     """Source of the errors, in a few words."""
-    if noise == "shots":
-        return f"of the shots, settings ± {100 * scale[0]:.2g} % beyond"
+    if noise in ("shots", "beyond"):
+        source = "of the shots" if noise == "shots" else "given"
+        return f"{source}, settings ± {100 * scale[0]:.2g} % beyond"
     if noise != "none":
         return "given" if scale[1] <= 1.05 else f"given, × {scale[0]:.2f}"
     if relative < 0.5:

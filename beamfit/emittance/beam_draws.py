@@ -249,9 +249,9 @@ def fits(c: Coordinates, kind: NoiseKind) -> tuple[np.ndarray, np.ndarray]:
     n = c.size.shape[-1]
     kept = left_out(n)
     kept = np.broadcast_to(kept, (*c.unit.shape, *kept.shape))
-    found = [_fitted(c, kind, deviation, kept) for deviation in _deviations(kind, c)]
+    found = [_fitted(c, kind, deviation, kept) for deviation in _deviations(kind)]
     if WORST * n > 2:
-        found += [_greedy(c, kind, deviation) for deviation in _deviations(kind, c)]
+        found += [_greedy(c, kind, deviation) for deviation in _deviations(kind)]
     return _joined(found)
 
 
@@ -261,11 +261,11 @@ def _joined(found: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.
     return np.concatenate(centres, -2), np.concatenate(roots, -3)
 
 
-def _deviations(kind: NoiseKind, c: Coordinates) -> list[np.ndarray]:
+def _deviations(kind: NoiseKind) -> list[np.ndarray]:
     """Deviations of points to weigh them by: as stated, and with the usual scatter beside."""
-    if kind.special == 0.0 and kind.chance:
-        return [kind.floor, np.hypot(kind.floor, kind.prior.middle * kind.unit)]
-    return [(1.0 if kind.chance else kind.prior.middle) * kind.unit]
+    special = [kind.special] if kind.chance else []
+    usual = [] if kind.least else [kind.prior.middle]
+    return [np.hypot(kind.floor, scale * kind.unit) for scale in special + usual]
 
 
 def _fitted(

@@ -331,6 +331,8 @@ class PlanePosterior(NamedTuple):
         (NaN without); NaN where the settings do not separate the three numbers.
     model, error, bad : ndarray
         Shape (n,): fitted sizes and the errors found, m, and the probability of a bad reading.
+    noise : {"stated", "share", "beyond", "shots", "none"}
+        What was known of it, or "beyond" if settings scatter beyond their stated errors.
     scale : ndarray
         Shape (3,): median and central 68 % of the scale of the noise.
     relative : float
@@ -359,6 +361,7 @@ class PlanePosterior(NamedTuple):
     model: np.ndarray
     error: np.ndarray
     bad: np.ndarray
+    noise: str
     scale: np.ndarray
     relative: float
     chi2: float
@@ -433,14 +436,14 @@ class _Stack(NamedTuple):
     kinds: tuple[NoiseKind, ...]
 
 
-def _stacked(planes: Sequence[PlaneSizes], noise: Noise) -> _Stack:
+def _stacked(planes: Sequence[PlaneSizes], noise: Noise, alike: bool | None = None) -> _Stack:
     r11, r12, known, size = (np.stack([p[i] for p in planes]) for i in range(4))
     c = coordinates(r11, r12, size, known)
     first, error = planes[0], None
     if first.error is not None:
         error = np.stack([p.error for p in planes]) / c.unit[:, None]
     floor = error if first.of_shots else None
-    kinds = kinds_of(noise, c.size, None if first.of_shots else error, floor)
+    kinds = kinds_of(noise, c.size, None if first.of_shots else error, floor, alike)
     return _Stack(c, np.stack([r11, r12], -1), kinds)
 
 
@@ -452,7 +455,9 @@ def _compared(
         draws = [draw_beams(s.c, kind, noise) for kind in s.kinds]
         few, own = s, draws
         if s.c.size.shape[-1] > COMPARED:
-            few = _stacked([p.thinned(COMPARED) for p in planes], noise)
+            # Few of errors that differ may be alike: the noise is that of all.
+            alike = planes[0].likeness[1] == "share"
+            few = _stacked([p.thinned(COMPARED) for p in planes], noise, alike)
             own = [draw_beams(few.c, kind, noise) for kind in few.kinds]
         evidence = np.array([_evidences(few, i, d, noise) for i, d in enumerate(own)])
         of_kind = np.logaddexp.reduce(evidence, axis=-1)
@@ -542,8 +547,9 @@ def _best(
 
 def _model(x: np.ndarray, c: Coordinates) -> np.ndarray:
     squared = (c.rows @ x[..., None])[..., 0] + c.known
-    least, most = (of(c.size, axis=-1, keepdims=True) for of in (np.min, np.max))
-    return np.sqrt(np.clip(squared, (least / FURTHEST) ** 2, (most * FURTHEST) ** 2))
+    # No upper limit: where the setting slipped a beam may be a hundred times larger than any size.
+    least = c.size.min(-1, keepdims=True)
+    return np.sqrt(np.maximum(squared, (least / FURTHEST) ** 2))
 
 
 def _expecting(
@@ -574,7 +580,7 @@ def _posterior(
     found, unit = c.sigma(best.x[i][None])[0], float(c.unit)
     positive = bool(found[0] > 0 and found[0] * found[2] > found[1] ** 2) and bool(c.seen)
     model = best.model[i] * unit
-    error = unit / np.sqrt(best.precision[i])
+    error, likelier = unit / np.sqrt(best.precision[i]), int(np.argmax(of_kind))
     weighed = model if weights == "model" else plane.size
     rows = np.stack(coefficients(plane.r11, plane.r12), -1) / (2.0 * weighed)[:, None]
     none = np.full((3, 3), np.nan)
@@ -598,7 +604,8 @@ def _posterior(
         model=model,
         error=error,
         bad=best.bad[i],
-        scale=_scale_of(i, draws, of_kind),
+        noise=_noise_word(plane, s.kinds[likelier]),
+        scale=_scale_of(i, draws[likelier]),
         relative=float(sum(w * k.power for w, k in zip(of_kind, s.kinds, strict=True))),
         chi2=chi2,
         seen=bool(c.seen),
@@ -618,9 +625,12 @@ def _covariance(rows: np.ndarray) -> np.ndarray:
     return half @ half.T
 
 
-def _scale_of(i: int, draws: Sequence[BeamDraws], of_kind: np.ndarray) -> np.ndarray:
-    """Median and central 68 % of the scale of the likelier kind of noise."""
-    own = draws[int(np.argmax(of_kind))]
+def _noise_word(plane: PlaneSizes, kind: NoiseKind) -> str:
+    return "beyond" if np.any(kind.floor) and not plane.of_shots else plane.likeness[1]
+
+
+def _scale_of(i: int, own: BeamDraws) -> np.ndarray:
+    """Median and central 68 % of the scale of the noise."""
     return weighted_quantiles(own.scales.scale[i], own.scale_weight[i], (AT[2], AT[1], AT[3]))
 
 

@@ -190,8 +190,8 @@ def noise_remark(noise: str, scale: np.ndarray, probability: float | None = None
 
     Parameters
     ----------
-    noise : {"stated", "share", "shots", "none"}
-        What was known of it.
+    noise : {"stated", "share", "beyond", "shots", "none"}
+        What was known of it, or "beyond" if settings scatter beyond their stated errors.
     scale : ndarray
         Median and central 68 % of its scale.
     probability : float, optional
@@ -210,14 +210,17 @@ def noise_remark(noise: str, scale: np.ndarray, probability: float | None = None
                 "which the error includes."
             )
         if probability is not None and probability > OVERSTATED:
+            rest = 1.0 - probability
+            chance = f"{rest:.1g}" if rest > 1e-6 else "below 1e-6"
             return (
                 "Stated errors seem too large, and so is the error here: the sizes scatter less "
-                f"(probability {1.0 - probability:.1g})."
+                f"(probability {chance})."
             )
-    if noise == "shots" and middle > 0.005:
+    if noise in ("shots", "beyond") and middle > 0.005:
+        than = "shots" if noise == "shots" else "stated errors"
         return (
             f"Settings scatter by {100 * middle:.2g} % ({100 * low:.2g} to {100 * high:.2g} %) of "
-            "the size beyond their shots, which the error includes."
+            f"the size beyond their {than}, which the error includes."
         )
     return ""
 
@@ -253,6 +256,24 @@ def point_remarks(
             f"It rests on the point at {carrying}: without it the normalised emittance is "
             f"{without / factor:.3g} {unit}{reach}."
         )
+
+
+def resolution_remark(size: np.ndarray, known: np.ndarray) -> str:
+    """Count sizes below what resolution and dispersion alone make, size² in m², as ``known`` says.
+
+    Examples
+    --------
+    >>> resolution_remark(np.array([2e-5, 9e-5]), np.array([9e-10, 9e-10]))
+    '1 of 2 sizes is smaller than resolution and dispersion alone make it: check both.'
+    """
+    below = int(np.sum(size**2 < known))
+    if not below:
+        return ""
+    verb, them = ("are", "them") if below > 1 else ("is", "it")
+    return (
+        f"{below} of {len(size)} sizes {verb} smaller than resolution and dispersion alone make "
+        f"{them}: check both."
+    )
 
 
 def one_magnet(settings: dict[str, np.ndarray], screens: tuple[str, ...]) -> np.ndarray | None:

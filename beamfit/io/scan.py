@@ -31,7 +31,7 @@ from beamfit.io.columns import (
 )
 from beamfit.io.emittance_gui import is_emittance_gui, read_emittance_gui
 from beamfit.io.files import name_of, text_lines
-from beamfit.io.shots import IMAGE, average_shots, of_images, of_profiles
+from beamfit.io.shots import IMAGE, average_shots, of_images, of_profiles, steady_settings
 from beamfit.io.table import read_columns
 from beamfit.particles import ENERGY_KEYS
 from beamfit.tuning.knobs import EmittanceTable
@@ -548,7 +548,7 @@ def scan_of_sheet(
     notes = [*column_notes(columns), *comment_notes(sheet, columns), *odd]
     notes += [*ignored(sheet, columns), *left_out(sheet)]
     with located(sheet.path):
-        scan = _scan(sheet, columns, values, notes=tuple(notes), profiles=profiles)
+        scan = steady_settings(_scan(sheet, columns, values, notes=tuple(notes), profiles=profiles))
     rows = row_keys(scan)
     return average_shots(scan, marked="shot" in columns) if len(set(rows)) < len(rows) else scan
 

@@ -5,12 +5,13 @@ from __future__ import annotations
 import io
 from collections.abc import Mapping
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 
 from beamfit.density.profiles import FEWEST_BINS, profile_size
-from beamfit.emittance.scan import PLANES, Profile, QuadScan, row_keys
+from beamfit.emittance.scan import KNOB, PLANES, Profile, QuadScan, row_keys
 from beamfit.errors import InputError
 from beamfit.io.columns import Sheet, columns_of, spelled
 from beamfit.io.files import LARGEST, read_bytes
@@ -21,6 +22,9 @@ ENOUGH_DEGREES = 3
 # What a table of images names, and what an image should be.
 IMAGE, SHOT, PICTURES = "image", "shot", "PNG, or TIFF"
 COUNTS, BACKGROUND, POSITION = "counts", "background", "position"
+# Readbacks of one setting differ by at most this share of what is scanned: supplies repeat to 1e-4
+# of their range, and the steps of a scan are a hundredth of it or more.
+READBACK = 1e-3
 # Settings without which a plane has no emittance.
 FEWEST_SETTINGS = 3
 
@@ -164,6 +168,48 @@ def _shots(sheet: Sheet, rest: list[str]) -> tuple[np.ndarray, np.ndarray]:
     return np.array(new), np.array([*new[1:], len(sheet)])
 
 
+def steady_settings(scan: QuadScan) -> QuadScan:
+    """Give rows that stand together, and whose readbacks agree, the median of these.
+
+    Parameters
+    ----------
+    scan : QuadScan
+        Rows in the order in which they were measured.
+
+    Returns
+    -------
+    QuadScan
+        Settings read to a thousandth of their range. A magnet that moves less than that of its
+        value was held, and tells no rows apart.
+
+    Examples
+    --------
+    >>> read = QuadScan({"Q": [1, 1.0004, 2, 3.0002, 3]}, {"Q": "A"}, {"x": [1e-4] * 5})
+    >>> steady_settings(read).settings["Q"].round(4).tolist()
+    [1.0002, 1.0002, 2.0, 3.0001, 3.0001]
+    """
+    if not scan.settings:
+        return scan
+    values = np.stack(list(scan.settings.values()), -1)
+    held = np.ptp(values, axis=0) <= READBACK * np.abs(values).max(0)
+    held &= [scan.units[name] != KNOB for name in scan.settings]
+    # The range of even settings, which one wrong cell does not change.
+    span = 4.0 * np.median(np.abs(values - np.median(values, axis=0)), axis=0)
+    near = np.where(held, np.inf, READBACK * span)
+    step = np.abs(np.diff(values, axis=0))
+    if not np.any((step <= near).all(1) & (step > 0).any(1)):
+        return scan
+    first, run = 0, np.zeros(len(values), int)
+    for i, row in enumerate(values):
+        first = first if np.all(np.abs(row - values[first]) <= near) else i
+        run[i] = first
+    for rows in np.split(np.arange(len(run)), np.flatnonzero(np.diff(run)) + 1):
+        values[rows] = np.median(values[rows], axis=0)
+    said = f"Settings that agree to {100 * READBACK:g} % of their range, row to row, count as one."
+    settings = dict(zip(scan.settings, values.T, strict=True))
+    return replace(scan, settings=settings, notes=(*scan.notes, said))
+
+
 def average_shots(scan: QuadScan, *, marked: bool) -> QuadScan:
     """Average the rows that repeat a setting, an energy, a screen and a slice.
 
@@ -173,16 +219,17 @@ def average_shots(scan: QuadScan, *, marked: bool) -> QuadScan:
         One row a shot.
     marked : bool
         Whether the file says its rows are shots. If not, rows that carry errors of their own
-        stay as they are: each is a measurement by itself.
+        are shots of a setting where they stand together: one that was set again is measured again.
 
     Returns
     -------
     QuadScan
         One row a setting, with ``shot_size``, the shots themselves, for the fit. The error is the
         standard error of the mean, s/√n with n - 1 in s, and ``shots`` says of how many. With
-        fewer than three repeats in all the errors of the file stand, or there are none and the fit
-        infers them. Rows that are not said to be shots, and differ at one setting far more than at
-        the others, stay as they are.
+        fewer than three repeats in all, or less than half of the settings repeated in a file that
+        does not speak of shots, its errors stand, or there are none and the fit infers them. Rows
+        that are not said to be shots, and differ at one setting far more than at the others, stay
+        as they are.
 
     Examples
     --------
@@ -193,15 +240,19 @@ def average_shots(scan: QuadScan, *, marked: bool) -> QuadScan:
     """
     rows: dict[tuple, int] = {}
     keys = row_keys(scan)
+    if scan.error and not marked:
+        visit = np.cumsum([0, *(a != b for a, b in pairwise(keys))])
+        keys = list(zip(visit, keys, strict=True))
     group = np.array([rows.setdefault(key, len(rows)) for key in keys])
     shots = {plane: _by_setting(values, group) for plane, values in scan.size.items()}
-    alone = len(rows) == len(group) or (scan.error and not marked)
+    alone = len(rows) == len(group)
     if alone or not (marked or all(map(_alike, shots.values()))):
         return scan if scan.error else replace(scan, error_source="none given")
     size, scatter, given = {}, {}, {}
+    usual = marked or np.median(np.bincount(group)) > 1
     for plane, values in shots.items():
         size[plane], error = _shot_means(values)
-        if error is not None:
+        if error is not None and (usual or plane not in scan.error):
             scatter[plane] = error
         elif plane in scan.error:  # too few repeats: what the file says of its shots is kept
             square = _by_setting(scan.error[plane] ** 2, group)
@@ -213,6 +264,7 @@ def average_shots(scan: QuadScan, *, marked: bool) -> QuadScan:
     # Errors that the file gives are not taken from these shots.
     means = {"size": size, "error": scatter | given, "shots": None if given else np.bincount(group)}
     means["shot_size"] = single
+    said = f"{said}, in the place of the file's" if scatter and scan.error else said
     said = said if scatter or given else "none given"
     profiles = tuple(p._replace(row=int(group[p.row])) for p in scan.profiles)
     means |= {"error_source": said, "profiles": profiles}

@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import minimize
+from scipy.special import log_ndtr
 
 from beamfit.errors import InputError
 from beamfit.noise.model import Lognormal, Noise
@@ -36,7 +37,7 @@ class Sample(NamedTuple):
     noise : str
         "shots", "stated" or "none": which prior it tells of.
     kinds : tuple of NoiseKind
-        Kinds of noise, one but for "none".
+        Kinds of noise.
     scales : tuple of Scales
         Their nodes.
     log_evidence : tuple of ndarray
@@ -138,22 +139,31 @@ def _second_differences(cost: Callable[[np.ndarray], float], at: np.ndarray) -> 
     return np.array([[across(a, b) for b in steps] for a in steps])
 
 
+def _log_masses(prior: Lognormal, log: np.ndarray) -> np.ndarray:
+    """Log probabilities of the cells of nodes: a density may be narrower than their distance."""
+    ends = np.concatenate([log[:1], 0.5 * (log[1:] + log[:-1]), log[-1:]])
+    z = (ends - math.log(prior.middle)) / prior.spread
+    # In the lower of the two tails, whose small numbers are exact.
+    low, high = np.where(z[:-1] > 0, -z[1:], z[:-1]), np.where(z[:-1] > 0, -z[:-1], z[1:])
+    with np.errstate(divide="ignore"):
+        return log_ndtr(high) + np.log(-np.expm1(log_ndtr(low) - log_ndtr(high)))
+
+
 def _log_evidence(
     s: Sample, new: Lognormal, probability: float, prior: Lognormal, chance: float, kind: str
 ) -> float:
     """Log evidence of a plane under other priors than those of its nodes."""
     parts = []
+    more = math.log(probability) - math.log(chance)
+    less = math.log1p(-probability) - math.log1p(-chance)
     for own, scales, evidence in zip(s.kinds, s.scales, s.log_evidence, strict=True):
         skip = int(own.chance > 0)
         log = np.log(scales.scale[skip:])
-        ratio = new.log_density(log) - prior.log_density(log)
-        ratio -= new.log_probability_above(own.least) - prior.log_probability_above(own.least)
-        if kind == "none":
-            share = probability if own.power else 1.0 - probability
-            parts.append(averaged(evidence + scales.log_weight + ratio, 0.0) + math.log(share))
-            continue
-        ratio += math.log1p(-probability) - math.log1p(-chance)
-        first = [math.log(probability) - math.log(chance)]
-        weight = scales.log_weight + np.concatenate([first, ratio])
+        ratio = np.full(len(log), more if kind == "none" and own.power else less)
+        # Stated errors may be too small by what settings scatter beyond: that has another prior.
+        if own.prior == prior:
+            ratio += _log_masses(new, log) - _log_masses(prior, log)
+            ratio -= new.log_probability_above(own.least) - prior.log_probability_above(own.least)
+        weight = scales.log_weight + own.log_weight + np.append(np.full(skip, more), ratio)
         parts.append(averaged(evidence + weight, 0.0))
     return float(np.logaddexp.reduce(parts))

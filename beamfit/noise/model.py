@@ -34,8 +34,9 @@ class Lognormal(NamedTuple):
         """
         if not least > 0.0:
             return 0.0
-        pull = (math.log(least) - math.log(self.middle)) / self.spread
-        return math.log(0.5 * math.erfc(pull / math.sqrt(2.0)))
+        from scipy.special import log_ndtr  # a scan is read without scipy
+
+        return float(log_ndtr((math.log(self.middle) - math.log(least)) / self.spread))
 
 
 # The probability of a bad reading among so few that nothing is left to test them by.
@@ -53,8 +54,8 @@ class Noise:
         Probability that stated errors are right. Most are; a third to a half of the real scans
         with stated errors scatter more (docs/verdict.md).
     factor : Lognormal
-        Where they are not, the factor, above 1, by which they are too small. Real errors are often
-        half of the truth, since shots do not show what differs from setting to setting.
+        Where they are not, the factor, above 1, by which they are too small: real errors are often
+        half of the truth. As often it is ``scatter`` that they lack.
     unstated : Lognormal
         Noise that nobody stated, as a share of the size: a reading has the jitter of its shot
         beside the 4 to 5 % that settings scatter, from 3 % for good wires to 30 % for bad screens.
@@ -64,8 +65,8 @@ class Noise:
     even : float
         Probability that settings scatter no more than their shots say.
     scatter : Lognormal
-        What settings scatter beyond their shots, as a share of the size: 4 to 5 % in LCLS scans
-        whose shots say 1 % (docs/verdict.md).
+        What settings scatter beyond their shots, or beyond stated errors that are not right, as a
+        share of the size: 4 to 5 % in LCLS scans whose shots say 1 % (docs/verdict.md).
     bad : float
         Probability that a reading is bad: a shot that missed, a wrong cell.
     width : float

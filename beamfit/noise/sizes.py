@@ -79,6 +79,7 @@ def kinds_of(
     size: np.ndarray,
     error: np.ndarray | None,
     floor: np.ndarray | None = None,
+    alike: bool | None = None,
 ) -> tuple[NoiseKind, ...]:
     """Kinds of noise that sizes may have.
 
@@ -92,11 +93,14 @@ def kinds_of(
         Shape (..., n), stated.
     floor : ndarray, optional
         Shape (..., n): standard errors of means of shots, beyond which settings scatter.
+    alike : bool, optional
+        Whether stated errors are one share of the size; by themselves if None.
 
     Returns
     -------
     tuple of NoiseKind
-        Of sizes without errors a share and the same everywhere; else one.
+        Of sizes without errors a share and the same everywhere. Of stated errors that are too small
+        by a factor, or by what settings scatter beyond them; one where that is a factor, too.
     """
     zero, one = np.zeros_like(size), np.ones_like(size)
     if floor is not None:
@@ -109,9 +113,18 @@ def kinds_of(
             NoiseKind(0, zero, middle, noise.unstated, 1.0, 0.0, 0.0, same),
         )
     share = error / size
-    alike = bool(np.all(np.ptp(share, axis=-1) <= 0.01 * share.mean(-1)))
-    unit = share if alike else error
-    return (NoiseKind(int(alike), zero, unit, noise.factor, 1.0, noise.right, 1.0, 0.0),)
+    if alike is None:
+        alike = bool(np.all(np.ptp(share, axis=-1) <= 0.01 * share.mean(-1)))
+    if alike:
+        return (NoiseKind(1, zero, share, noise.factor, 1.0, noise.right, 1.0, 0.0),)
+    # A factor or a scatter: nobody knows which before the sizes are seen.
+    wrong = 0.5 * (1.0 - noise.right)
+    whole = noise.right + wrong
+    right = noise.right / whole
+    return (
+        NoiseKind(0, zero, error, noise.factor, 1.0, right, 1.0, math.log(whole)),
+        NoiseKind(0, error, size, noise.scatter, 0.0, 0.0, 0.0, math.log(wrong)),
+    )
 
 
 def scales_between(kind: NoiseKind, low: np.ndarray, high: np.ndarray) -> Scales:

@@ -49,6 +49,8 @@ def likelihood(kind, size, error, noise):
         return lambda model: ref.log_stated(size, model, error, noise)
     if kind == "share":
         return lambda model: ref.log_share(size, model, error / size, noise)
+    if kind == "factor":
+        return lambda model: ref.log_factor(size, model, error, noise)
     if kind == "shots":
         return lambda model: ref.log_of_shots(size, model, error, noise)
     if kind == "same":
@@ -110,7 +112,15 @@ def noises(kind, size, error, noise):
         scale, weight = ref.shot_scales(noise)
         return [(1.0, np.hypot(error / size, scale[:, None]), weight)]
     scale, weight = ref.stated_scales(noise)
-    return [(1.0, scale[:, None] * error / size, weight)]
+    if kind == "share":
+        return [(1.0, scale[:, None] * error / size, weight)]
+    wrong = 0.5 * (1.0 - noise.right)
+    weight[1:] *= 0.5
+    scatter, further = ref.lognormal_grid(noise.scatter)
+    return [
+        (1.0 - wrong, scale[:, None] * error / size, weight / weight.sum()),
+        (wrong, np.hypot(error / size, scatter[:, None]), further),
+    ]
 
 
 def brute_probabilities(fit, kind, noise):
@@ -127,7 +137,7 @@ def brute_probabilities(fit, kind, noise):
     drawn = rows, size, p.known, log, post.best, covariance, turn
     beam = ref.log_evidence_of_beam(*drawn, number=5000)
     # Noise that is a share of the size would vanish where such a beam does: of what was measured.
-    own = {"share": "stated", "none": "same"}.get(kind, kind)
+    own = {"share": "factor", "none": "same"}.get(kind, kind)
     log = likelihood(own, size, error, noise)
     flat = ref.log_evidence_of_flat_beam(rows2, size, p.known, log, turn)
     mean = np.exp(np.log(size).mean())

@@ -97,12 +97,13 @@ def test_size_fit_is_where_scipy_finds_the_largest_likelihood(gtf, gtf_sizes):
 
 @pytest.mark.parametrize("method", ["size_squared", "size"])
 def test_with_stated_errors_and_no_bad_reading_it_is_weighted_least_squares(gtf, gtf_sizes, method):
-    """No reading may be bad; one factor for all errors moves nothing."""
+    """No reading may be bad, and errors are right; a scatter beside them would even out weights."""
     currents, _, sizes = gtf_sizes
     size = sizes * (1.0 + 0.015 * np.resize([1.0, -1.0, -1.0, 1.0], 14))
     error = 0.02 * sizes
     scan = beamfit.QuadScan({"Q2": currents}, {"Q2": "A"}, {"x": size}, {"x": error})
-    fit = beamfit.fit_emittance(scan, gtf, method=method, noise=beamfit.Noise(bad=1e-12)).x
+    sure = beamfit.Noise(bad=1e-12, right=1 - 1e-9)
+    fit = beamfit.fit_emittance(scan, gtf, method=method, noise=sure).x
     r11, r12 = fit.points.r11, fit.points.r12
     same = np.asarray(beamfit.fit_sizes(r11, r12, size, error).sigma)
     if method == "size":

@@ -160,6 +160,22 @@ def test_what_is_called_determined_is_right(gtf, first, relative, count):
             assert fit.emittance.relative < 0.25
 
 
+def test_a_setting_of_the_wrong_sign_does_not_take_the_answer():
+    """A beam that one slipped setting would make a hundred times larger has no weight there."""
+    line = beamfit.Beamline((Quadrupole("Q", 0.0812134), Drift("D", 0.924), Screen("S")), 398.0626)
+    k1 = np.linspace(10.594, 12.473, 21)
+    k1[1] *= -1
+    sizes = [30.684, 28.618, 26.584, 23.974, 22.552, 20.339, 17.941, 16.616, 14.756, 12.51, 11.299]
+    sizes += [10.124, 9.191, 8.611, 8.777, 9.693, 10.812, 12.368, 14.037, 16.004, 17.671]
+    size = 1e-6 * np.array(sizes)
+    fit = beamfit.fit_emittance(
+        beamfit.QuadScan({"Q": k1}, {"Q": "k1"}, {"x": size}, {"x": 0.01414 * size}), line
+    ).x
+    assert fit.status is Status.converged
+    assert fit.normalized_emittance.value == pytest.approx(2.2146e-6, rel=0.02)
+    assert f"1 of 21 readings is probably bad: Q = {k1[1]:.4g}" in fit.message
+
+
 @pytest.mark.parametrize("errors", [True, False], ids=["errors", "no errors"])
 @pytest.mark.parametrize("factor", [100.0, 10.0, 5.0, 0.1, 0.01])
 def test_a_slip_of_the_decimal_point_is_named_and_left_out(gtf, factor, errors):
@@ -261,8 +277,8 @@ def test_phase_of_a_drift_from_a_waist():
 @pytest.mark.parametrize(
     ("factor", "words", "units"),
     [
-        (1e-3, "less than any", "in mm under a header that says um make it a million times less"),
-        (600.0, "more than any", "in um under a header that says mm make it a million times more"),
+        (1e-3, "less than any", "mm under a header that says um) make it a million times less"),
+        (600.0, "more than any", "um under a header that says mm) make it a million times more"),
     ],
 )
 def test_an_emittance_that_only_a_wrong_unit_explains_is_not_given(gtf, factor, words, units, root):

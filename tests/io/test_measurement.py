@@ -161,11 +161,43 @@ def test_repeats_that_differ_far_more_than_others_are_not_averaged(read):
     assert len(read(marked)) == 6
 
 
-def test_rows_with_errors_of_their_own_are_averaged_only_if_marked_as_shots(read):
-    text = "Q_A,size_x_um,size_x_error_um\n0,100,1\n0,102,1\n1,90,1\n2,95,1\n"
+def test_rows_with_errors_of_their_own_are_shots_where_they_stand_together(read):
+    """A setting that was set again is measured again: what settings scatter differs."""
+    rows = ["0,100,1", "1,90,1", "1,91,1", "2,95,1"]
+    text = "\n".join(["Q_A,size_x_um,size_x_error_um", *rows])
+    assert len(read(text)) == 3
+    text = "\n".join(["Q_A,size_x_um,size_x_error_um", *rows, "0,102,1"])
     assert len(read(text)) == 4
-    marked = text.replace("Q_A,", "Q_A,shot,").replace("\n0,", "\n0,1,").replace("\n1,", "\n1,1,")
-    assert len(read(marked.replace("\n2,", "\n2,1,"))) == 3
+    marked = text.replace("Q_A,", "shot,Q_A,").replace("\n", "\n1,")
+    assert len(read(marked)) == 3
+
+
+def test_errors_of_the_file_stand_where_few_settings_are_repeated(read):
+    """One setting of five was measured four times: its errors are averaged, others are kept."""
+    rows = ["0,200,4", *(f"1,{150 + i},3" for i in range(4)), "2,100,2", "3,140,3", "4,190,4"]
+    scan = read("\n".join(["Q_A,size_x_um,size_x_error_um", *rows]))
+    np.testing.assert_allclose(scan.error["x"], 1e-6 * np.array([4, 1.5, 2, 3, 4]), rtol=1e-12)
+    assert scan.shots is None
+
+
+def test_readbacks_that_differ_in_their_digits_are_one_setting(read):
+    """Three shots of each of four settings, the other magnet held: its readback tells nothing."""
+    rng = np.random.default_rng(1)
+    first = np.repeat([1.0, 2.0, 3.0, 4.0], 3) + 5e-4 * rng.normal(size=12)
+    held = 7.0 + 1e-3 * rng.normal(size=12)
+    rows = [f"{a:.6g},{b:.6g},{100 + i}" for i, (a, b) in enumerate(zip(first, held, strict=True))]
+    scan = read("\n".join(["Q_A,P_A,size_x_um", *rows]))
+    assert scan.shots.tolist() == [3] * 4
+    np.testing.assert_allclose(scan.settings["Q"], [1, 2, 3, 4], atol=2e-3)
+    assert any("count as one" in note for note in scan.notes)
+
+
+def test_fine_steps_and_those_beside_a_wrong_cell_are_settings_of_their_own(read):
+    rows = [f"{q:.6g},{100 + q:.6g}" for q in np.linspace(0.0, 1.0, 500)]
+    assert len(read("\n".join(["Q_A,size_x_um", *rows]))) == 500
+    assert len(read("Q_A,size_x_um\n0,100\n1,90\n2,95\n3000,110\n4,120")) == 5
+    crossed = ["0,1,100", "0,2,90", "0,3,95", "0,4,99", "1,4,90", "2,4,95", "0,4,98"]
+    assert len(read("\n".join(["P_A,Q_A,size_x_um", *crossed]))) == 6
 
 
 def test_errors_of_the_file_are_no_scatter_of_two_shots(read):

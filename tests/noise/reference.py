@@ -62,7 +62,22 @@ def log_readings(off, deviation, noise):
 
 
 def log_stated(size, model, error, noise):
-    """Sizes with stated errors, that are right or all too small by one factor."""
+    """Sizes with stated errors: right, too small by one factor, or by what settings scatter."""
+    factor, weight = stated_scales(noise)
+    scatter, further = lognormal_grid(noise.scatter)
+    weight[1:] *= 0.5
+    deviations = [s * error for s in factor] + [np.hypot(error, s * size) for s in scatter]
+    weights = np.append(weight, 0.5 * (1.0 - noise.right) * further)
+    parts = [
+        math.log(w) + log_readings(size - model, deviation, noise)
+        for deviation, w in zip(deviations, weights, strict=True)
+        if w > 0.0
+    ]
+    return log_sum(np.array(parts), 0)
+
+
+def log_factor(size, model, error, noise):
+    """Sizes with stated errors that are right or too small by one factor."""
     parts = [
         math.log(w) + log_readings(size - model, s * error, noise)
         for s, w in zip(*stated_scales(noise), strict=True)
@@ -73,12 +88,7 @@ def log_stated(size, model, error, noise):
 
 def log_share(size, model, share, noise):
     """The same of errors that are one share of the size, and so of the beam's own."""
-    parts = [
-        math.log(w) + log_readings(size - model, s * share * model, noise)
-        for s, w in zip(*stated_scales(noise), strict=True)
-        if w > 0.0
-    ]
-    return log_sum(np.array(parts), 0)
+    return log_factor(size, model, share * model, noise)
 
 
 def log_of_shots(size, model, floor, noise):

@@ -45,6 +45,32 @@ def test_the_scatter_of_settings_is_learned_with_its_error(scatter):
     assert learned.planes == {"shots": 30, "stated": 0, "none": 0}
 
 
+def stated(factor, count, alike, seed=0):
+    """SIMULATED scans whose stated errors are too small by a factor; of one share, or not."""
+    rng = np.random.default_rng(seed)
+    r11, r12 = np.linspace(1.5, -1.5, 8), np.full(8, 2.0)
+    true = np.sqrt(r11**2 * 1e-8 + r12**2 * 4e-10)
+    for _ in range(count):
+        error = 0.02 * np.exp((0.0 if alike else 0.4) * rng.standard_normal(8))
+        size = true * (1 + factor * error * rng.standard_normal(8))
+        transfer = {"x": np.stack([r11, r12], -1)}
+        sizes = {"x": size}, {"x": error * size}
+        energy = np.full(8, 100.0)
+        scan = QuadScan({"Q": np.arange(8.0)}, {"Q": "A"}, *sizes, energy=energy, transfer=transfer)
+        yield scan, rows_line(scan)
+
+
+@pytest.mark.parametrize("alike", [True, False], ids=["one share", "different"])
+@pytest.mark.parametrize("factor", [1.0, 2.0])
+def test_stated_errors_are_learned_to_be_right_or_too_small(factor, alike):
+    """Where all are right the factor may be near one: no narrow prior wins by its nodes."""
+    learned = learn_noise(list(noise_samples(stated(factor, 25, alike), Noise())), Noise(), "own")
+    right, middle = learned.noise.right, learned.noise.factor.middle
+    assert right > 0.8 if factor == 1.0 else right < 0.2
+    assert middle == pytest.approx(2.0, rel=0.25) or factor == 1.0
+    assert "nan" not in learned.errors["factor"] + learned.errors["right"]
+
+
 def test_a_few_scans_teach_nothing():
     with pytest.raises(InputError, match="3 of shots"):
         learn_noise(list(noise_samples(archive(0.03, 3), Noise())), Noise(), "three")

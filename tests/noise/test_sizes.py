@@ -60,7 +60,7 @@ def test_it_is_the_average_over_scale_and_bad_readings(kind, case):
 
 
 def test_the_written_out_one_is_an_integral():
-    """The reference itself, by adaptive quadrature over the factor, of three readings, none bad."""
+    """The reference itself, by adaptive quadrature over factor and scatter; no reading is bad."""
     noise, off, error = (
         Noise(bad=1e-12),
         np.array([0.02, -0.05, 0.01]),
@@ -72,7 +72,13 @@ def test_the_written_out_one_is_an_integral():
     def density(s):
         return np.prod(norm.pdf(off, 0.0, s * error)) * prior.pdf(s) / whole
 
+    scatter = lognorm(noise.scatter.spread, scale=noise.scatter.middle)
+
+    def beyond(s):
+        return np.prod(norm.pdf(off, 0.0, np.hypot(error, s * (1.0 + off)))) * scatter.pdf(s)
+
     wrong = quad(density, 1.0, 10.0)[0] + quad(density, 10.0, 300.0)[0]
+    wrong = 0.5 * (wrong + quad(beyond, 0.0, 0.3)[0] + quad(beyond, 0.3, 9.0)[0])
     expected = noise.right * np.prod(norm.pdf(off, 0.0, error)) + (1 - noise.right) * wrong
     found = ref.log_stated(1.0 + off, np.ones((1, 3)), error, noise)
     assert found[0] == pytest.approx(np.log(expected), abs=0.01)
@@ -84,7 +90,7 @@ def test_compiled_it_is_the_same(n, options):
     """The second largest of doubts was found by comparing numbers that XLA computes twice."""
     noise = Noise()
     size, model, error = data(n, "stated", noise)
-    [kind] = kinds_of(noise, size, error)
+    kind, _ = kinds_of(noise, size, error)
     scale = wide_scales(kind, ()).scale
     many = np.repeat(model, 30, axis=0) * (
         1 + 0.01 * np.random.default_rng(1).normal(size=(300, n))
@@ -112,7 +118,7 @@ def test_stated_errors_are_never_too_large():
     """Sizes that scatter less than stated say that errors are right, and no more."""
     size = np.linspace(1.0, 2.0, 12)
     model = np.repeat((size * (1 + 1e-4))[None], 2, axis=0)
-    [kind] = kinds_of(Noise(), size, 0.05 * np.ones(12))
+    kind, _ = kinds_of(Noise(), size, 0.05 * np.ones(12))
     scales = wide_scales(kind, ())
     assert scales.scale.min() == 1.0
     log = log_likelihood(size - model, model, kind, scales.scale, Noise())[0] + scales.log_weight
