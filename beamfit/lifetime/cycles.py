@@ -313,6 +313,8 @@ def _steps_of(time: np.ndarray, current: np.ndarray, grain: float) -> np.ndarray
             if free.sum() < PLACES:
                 break
             usually = 1.4826 * np.median(np.abs(change[0, free]))
+            # Beside it the loss is another one only if it differs by more than that.
+            change = np.where(np.abs(change - change[0]) > usually, change, change[0])
             size = np.where(free, np.abs(change).min(axis=0), 0.0)
             least = max(THRESHOLD * usually, DIGITS * grain)
             peak = size >= maximum_filter1d(size, 2 * window - 1)
