@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import beamfit
+from beamfit import figures
 from beamfit.io.ring import read_operation, read_ring
 from beamfit.lifetime.record import DecayRecord
 from beamfit.lifetime.study import Machine, study_record
@@ -85,7 +86,7 @@ def test_of_many_cycles_some_are_drawn_one_by_one():
     time = np.arange(0.0, 6 * 3600.0, 10.0)
     noise = 1e-3 * np.random.default_rng(1).normal(size=time.size)
     study = study_record(DecayRecord(time, 300 * np.exp(-(time % 180) / 36000) + noise))
-    above, below = beamfit.figures.decay(study).axes
+    above, below = figures.decay(study).axes
     assert above.get_title(loc="left") == "beam current, 12 of 120 cycles"
     low, high = above.get_xlim()
     assert high - low == pytest.approx(12 * 180 / 3600, rel=0.01)
