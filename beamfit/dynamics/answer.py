@@ -56,6 +56,10 @@ class Curve(NamedTuple):
     error: np.ndarray
     visited: np.ndarray
 
+    def open(self) -> Curve:
+        """The same of which nothing is known: without errors."""
+        return self._replace(error=np.full_like(self.error, np.nan))
+
     def quantity(self, i: int) -> Quantity:
         """The value at one point, without an error where the runs never were."""
         known = self.visited[i] and np.isfinite(self.error[i])
@@ -179,10 +183,7 @@ def told(
     known |= {n: replace(known[n], interval_95=limits.interval) for n in ("tau", "tau1")
               if n in known and limits.interval and not nothing}  # fmt: skip
     blank = (nothing or c.parameter in joint for c in curves)
-    return known, tuple(
-        c._replace(error=np.full_like(c.error, np.nan)) if b else c
-        for c, b in zip(curves, blank, strict=True)
-    )
+    return known, tuple(c.open() if b else c for c, b in zip(curves, blank, strict=True))
 
 
 # A model that the runs do not follow, or that was not found: no error contains what is wrong.
@@ -195,8 +196,7 @@ def quoted(
     """Quantities and curves as they are quoted: without errors where the verdict is `WRONG`."""
     if status not in WRONG:
         return dict(quantities), tuple(curves)
-    blank = (c._replace(error=np.full_like(c.error, np.nan)) for c in curves)
-    return {name: q.open() for name, q in quantities.items()}, tuple(blank)
+    return {name: q.open() for name, q in quantities.items()}, tuple(c.open() for c in curves)
 
 
 def limit_words(q: Quantity) -> str:

@@ -30,6 +30,7 @@ from beamfit.noise.sizes import (
     bad_density,
     kinds_of,
     log_likelihood,
+    of_one_share,
     scales_of,
     variance_of,
     wide_scales,
@@ -307,9 +308,8 @@ class PlaneSizes(NamedTuple):
         """Key of the planes that can be compared in one call: points, errors, moved magnets."""
         if self.error is None:
             return len(self.size), "none", self.moved
-        share = self.error / self.size
-        same = np.ptp(share) <= 0.01 * share.mean()
-        word = "shots" if self.of_shots else "share" if same else "stated"
+        same = "share" if of_one_share(self.error, self.size) else "stated"
+        word = "shots" if self.of_shots else same
         return len(self.size), word, self.moved
 
 

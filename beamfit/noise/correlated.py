@@ -297,7 +297,7 @@ def _roots(products: np.ndarray) -> np.ndarray:
 def _levelled(
     grid: Sequence[CorrelatedNoise], rows: np.ndarray, time: np.ndarray, levels: Levels
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The same without levels, the rows padded to one of a few lengths."""
+    """Triangular factors as of `_triangles` without levels, the rows padded to a few lengths."""
     extra = (0, padded_length(max(time.size, 64)) - time.size)
     rows, triangle = np.linalg.qr(np.pad(levels.left(rows), (extra, (0, 0))))
     begins = np.isin(np.arange(len(rows)), levels.first)

@@ -74,6 +74,18 @@ class Scales(NamedTuple):
     log_weight: Any
 
 
+def of_one_share(error: np.ndarray, size: np.ndarray) -> bool:
+    """Tell errors, shape (..., n), that are one share of the sizes, to a hundredth of it.
+
+    Examples
+    --------
+    >>> of_one_share(np.array([1.0, 2.0]), np.array([50.0, 100.0]))
+    True
+    """
+    share = error / size
+    return bool(np.all(np.ptp(share, axis=-1) <= 0.01 * share.mean(-1)))
+
+
 def kinds_of(
     noise: Noise,
     size: np.ndarray,
@@ -112,11 +124,8 @@ def kinds_of(
             NoiseKind(1, zero, one, noise.unstated, 1.0, 0.0, 0.0, share),
             NoiseKind(0, zero, middle, noise.unstated, 1.0, 0.0, 0.0, same),
         )
-    share = error / size
-    if alike is None:
-        alike = bool(np.all(np.ptp(share, axis=-1) <= 0.01 * share.mean(-1)))
-    if alike:
-        return (NoiseKind(1, zero, share, noise.factor, 1.0, noise.right, 1.0, 0.0),)
+    if of_one_share(error, size) if alike is None else alike:
+        return (NoiseKind(1, zero, error / size, noise.factor, 1.0, noise.right, 1.0, 0.0),)
     # A factor or a scatter: nobody knows which before the sizes are seen.
     wrong = 0.5 * (1.0 - noise.right)
     whole = noise.right + wrong
