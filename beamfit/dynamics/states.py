@@ -15,7 +15,7 @@ from beamfit.compile_cache import prepare_jax
 
 prepare_jax()
 # Samples that `linear_outputs` computes by one matrix product.
-BLOCK = 32
+BLOCK = 16
 # Scaling and terms of the matrix exponential: exact to 1e-12 up to 4000 time constants in a step.
 HALVINGS, TERMS = 16, 8
 
