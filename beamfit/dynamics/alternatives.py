@@ -382,7 +382,7 @@ def _lawful(comparison: Comparison, own: Path, paths: Paths) -> list[Trial]:
     delays, whole = [own.delay], int(np.ceil(own.delay))
     if not paths.given:
         delays += range(max(0, whole - LATE), whole)
-    ways = [Path(None, kind, float(delay)) for delay in delays for kind in paths.kinds]
+    ways = [Path(None, way, float(delay)) for delay in delays for way in paths.ways]
     laws = [law for name in runs[0].inputs for law in _laws_of(runs, name)]
     alike = Counter(law.kind for law in laws)
     return [

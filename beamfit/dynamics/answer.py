@@ -118,6 +118,11 @@ def quantities_of(
         names, units = [*names, "tau1", "tau2"], [*units, TIME, TIME]
     if physics is ARX:
         names, units = [*names, *FIRST_ORDER.parameters(seen.inputs)[1:]], [*units, *[GAIN] * m]
+    gains = np.array([GAIN in unit for unit in units])
+    unsure = np.where(gains, seen.unsure[np.cumsum(gains) % m - 1], 0.0)  # all inputs in turn
+    error = found.error.copy()
+    error[: len(units)] = np.hypot(error[: len(units)], unsure * np.abs(found.value[: len(units)]))
+    found = found._replace(error=error)
     said = {
         name: quantity(found, i, unit)
         for i, (name, unit) in enumerate(zip(names, units, strict=True))
@@ -417,9 +422,11 @@ def _good(e: ResponseEvidence) -> Finding:
     cause = f"The free run explains {e.checks.free_run_percent:.2f} % of the output."
     if e.checks.white_probability < POOR_FIT:
         cause += " The noise has a memory, which the errors contain."
-    if e.checks.between:
-        names = ", ".join(e.checks.between)
-        cause += f" Without high frequencies, {names} is taken to move between samples."
+    moving, standing = map(", ".join, e.checks.way)
+    if moving:
+        cause += f" Without high frequencies, {moving} is taken to move between samples."
+    if standing:
+        cause += f" Readings of {standing} scatter about levels; the output follows the levels."
     if e.checks.jitter:
         cause += f" Times of readings are uncertain by {e.checks.jitter:.2g} s: errors contain it."
     if e.checks.law is not None:

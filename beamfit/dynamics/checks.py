@@ -14,6 +14,7 @@ from beamfit.dynamics.model import (
     changed_by,
     predicted,
 )
+from beamfit.dynamics.record import Way
 from beamfit.dynamics.response import FIRST_ORDER
 from beamfit.dynamics.search import (
     DRIFT,
@@ -69,8 +70,9 @@ class Checks(NamedTuple):
     band_limited : tuple of str
         Inputs without high frequencies that the model holds from sample to sample; if they move
         between, that goes with later inputs.
-    between : tuple of str
-        Inputs without high frequencies that the model follows between samples.
+    way : Way
+        Inputs without high frequencies that the model follows between samples, and those that it
+        has at the levels about which their readings scatter.
     delay_growth : float
         Samples by which the delay grows along the record, if this is what explains the residuals
         best: clocks of input and output then run at different rates. Else 0.
@@ -93,7 +95,7 @@ class Checks(NamedTuple):
     law_probability: float = 0.0
     static_law: bool = False
     band_limited: tuple[str, ...] = ()
-    between: tuple[str, ...] = ()
+    way: Way = Way()
     delay_growth: float = 0.0
     jitter: float = 0.0
 

@@ -32,7 +32,7 @@ from beamfit.dynamics.checks import (
 from beamfit.dynamics.limits import LagLimits, lag_limits
 from beamfit.dynamics.model import PreparedOutput, network_of, output_of
 from beamfit.dynamics.paths import Paths, latest, prepared
-from beamfit.dynamics.record import Run, band_limited, check_inputs, checked
+from beamfit.dynamics.record import Run, check_inputs, checked
 from beamfit.dynamics.response import PHYSICS, Physics
 from beamfit.dynamics.search import Begun, Case, ResponseSearch, Settled, case_of, fitted, used_by
 from beamfit.errors import InputError, Status, nearest
@@ -213,8 +213,7 @@ def identify(
     shortest = min(len(run) for run in runs)
     if delay is not None and not abs(delay) < shortest - 1:
         raise InputError(f"a delay of {delay:g} samples", f"less than the {shortest} rows of a run")
-    moving = () if physics.even else band_limited(runs)
-    paths = Paths.of(runs, moving, delay, not physics.even)
+    paths = Paths.of(runs, delay, physics.even)
     search = ResponseSearch(output, physics, paths, offset)
     asked = _Identification(search, map, hidden, range(seed, seed + starts), held)
     sound_runs, left_out, found = sound(runs, output, asked.search.begun)
@@ -321,8 +320,8 @@ def _known(
     checks = checks._replace(
         first_order=constant and asked.search.is_first_order(runs, found),
         jitter=jitter,
-        between=found.path.moving,
-        band_limited=() if found.path.moving else paths.moving,
+        way=found.path.way,
+        band_limited=() if found.path.way.moving else paths.most.moving,
     )
     others = others if constant else None
     if others is not None and others.none < 0.5 and others.fuller < 0.5:

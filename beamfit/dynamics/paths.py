@@ -1,4 +1,4 @@
-"""Paths from the recorded inputs to a process: behind a law, held or moving between samples, late.
+"""Paths from the recorded inputs to a process: behind a law, by a way between samples, late.
 
 Every path hands on rows of its own, as many a sample for all paths of a comparison.
 """
@@ -16,7 +16,7 @@ import numpy as np
 from beamfit.arrays import padded_length
 from beamfit.dynamics.input_laws import InputLaw, moved
 from beamfit.dynamics.model import EQUAL, Driven, PreparedOutput, readings_of
-from beamfit.dynamics.record import PARTS, Run, rows_of
+from beamfit.dynamics.record import PARTS, Run, Way, band_limited, rows_of, stepwise, unsure_gain
 from beamfit.dynamics.response import Physics
 
 # Longest delay that is tried, in samples, and as a share of the run; most samples that clocks are
@@ -27,10 +27,10 @@ AHEAD = 5.0
 
 
 class Path(NamedTuple):
-    """A law or none, names of the inputs that move between samples, and the delay in samples."""
+    """A law or none, the way of the inputs between samples, and the delay in samples."""
 
     law: InputLaw | None
-    moving: tuple[str, ...]
+    way: Way
     delay: float
 
 
@@ -39,27 +39,27 @@ class Paths(NamedTuple):
 
     Attributes
     ----------
-    moving : tuple of str
-        Inputs without high frequencies, which may move between samples.
+    most : Way
+        Inputs without high frequencies, which may move between samples, and those that scatter
+        about levels, at which they may stand.
     delays : tuple of float
         Whole samples, or the one delay that is given.
     some : bool
         Whether parts of a sample are possible besides.
     """
 
-    moving: tuple[str, ...]
+    most: Way
     delays: tuple[float, ...]
     some: bool
 
     @classmethod
-    def of(
-        cls, runs: Sequence[Run], moving: tuple[str, ...], delay: float | None, parts: bool
-    ) -> Paths:
-        """List those of runs; one delay if it is given."""
+    def of(cls, runs: Sequence[Run], delay: float | None, even: bool) -> Paths:
+        """List those of runs, `even` where a model has whole samples; one delay if it is given."""
+        way = Way(() if even else band_limited(runs), stepwise(runs))
         if delay is not None:
-            return cls(moving, (delay,), False)
+            return cls(way, (delay,), False)
         most = latest(runs)
-        return cls(moving, tuple(map(float, range(-min(EARLIEST, most), most + 1))), parts)
+        return cls(way, tuple(map(float, range(-min(EARLIEST, most), most + 1))), not even)
 
     @property
     def given(self) -> bool:
@@ -67,28 +67,29 @@ class Paths(NamedTuple):
         return len(self.delays) == 1
 
     @property
-    def kinds(self) -> tuple[tuple[str, ...], ...]:
-        """Inputs that move between samples, of each kind of path."""
-        return ((), self.moving) if self.moving else ((),)
+    def ways(self) -> tuple[Way, ...]:
+        """Ways of the inputs between samples."""
+        moving, standing = (((), each) for each in self.most)
+        return tuple(dict.fromkeys(Way(m, s) for m in moving for s in standing))
 
     @property
     def parts(self) -> int:
         """Rows a sample that all paths have in common."""
-        return PARTS if self.moving else 1
+        return PARTS if self.most.moving else 1
 
     def plain(self) -> list[Path]:
         """Paths of whole delays."""
-        return [Path(None, kind, delay) for delay in self.delays for kind in self.kinds]
+        return [Path(None, way, delay) for delay in self.delays for way in self.ways]
 
     def around(self, delay: float) -> list[Path]:
         """Paths of parts of a sample less than one from a delay."""
         ends = (np.ceil(delay) - 1, np.floor(delay) + 1) if self.some else (0, 0)
         near = np.arange(PARTS * ends[0], PARTS * min(ends[1], max(self.delays[-1], 1))) / PARTS
-        return [Path(None, kind, float(each)) for each in near if each % 1.0 for kind in self.kinds]
+        return [Path(None, way, float(each)) for each in near if each % 1.0 for way in self.ways]
 
     def log_prior(self, path: Path) -> float:
         """Even over delays, over whole ones and parts, and over the ways between samples."""
-        log = -np.log(len(self.kinds))
+        log = -np.log(len(self.ways))
         if self.given:
             return float(log)
         log -= np.log(self.delays[-1] + 1.0) + (AHEAD if path.delay < 0 else 0.0)
@@ -130,14 +131,14 @@ def handed_on(
     whole = [int(np.floor(path.delay * parts)) for path in paths]
     found = []
     for run, drive in zip(runs, drives, strict=True):
-        plain = {moving: rows_of(run, moving, parts) for moving in {p.moving for p in paths}}
+        plain = {way: rows_of(run, way, parts) for way in {path.way for path in paths}}
         behind = _behind(run, plain, paths)
         each, rows = [], np.arange(len(drive.dt))
         for path, late in zip(paths, whole, strict=True):
-            u = plain[path.moving]
+            u = plain[path.way]
             u = np.stack([u, np.zeros_like(u)], axis=2)
             if path.law is not None:
-                u[:, list(run.inputs).index(path.law.input)] = behind[path.law, path.moving]
+                u[:, list(run.inputs).index(path.law.input)] = behind[path.law, path.way]
             each.append(u[np.clip(rows - late, 0, len(u) - 1)])
         found.append(np.stack(each))
     return found, np.array([parts * path.delay for path in paths]) - whole
@@ -146,14 +147,14 @@ def handed_on(
 def _behind(run: Run, plain: dict, paths: Sequence[Path]) -> dict[Any, np.ndarray]:
     """An input behind laws and its changes, shape (rows, 2): alike laws at once."""
 
-    def alike(each: tuple[InputLaw, tuple[str, ...]]) -> tuple:
+    def alike(each: tuple[InputLaw, Way]) -> tuple:
         return each[0].kind, each[0].place, each[0].input, each[1]
 
-    lawful = {(path.law, path.moving) for path in paths if path.law is not None}
+    lawful = {(path.law, path.way) for path in paths if path.law is not None}
     found = {}
-    for (kind, place, name, moving), group in groupby(sorted(lawful, key=alike), alike):
+    for (kind, place, name, way), group in groupby(sorted(lawful, key=alike), alike):
         group = list(group)
-        u = plain[moving][:, list(run.inputs).index(name)]
+        u = plain[way][:, list(run.inputs).index(name)]
         width, step = np.array([(law.width, law.step) for law, _ in group]).T
         widths = width * np.exp(np.multiply.outer([0.0, 1.0, -1.0], step))
         for key, at, wider, closer in zip(group, *moved(u, kind, widths, place), strict=True):
@@ -166,7 +167,7 @@ def prepared(runs: Sequence[Run], output: str, physics: Physics, path: Path) -> 
 
     A part of a row in the delay is a number of the fit.
     """
-    parts = PARTS if path.moving else 1
+    parts = PARTS if path.way.moving else 1
     drives, measured = undriven(runs, output, physics, parts)
     inputs, (part,) = handed_on(runs, drives, parts, [path])
     drives = tuple(replace(drive, u=jnp.asarray(u[0, ..., 0]), part=part)
@@ -177,6 +178,8 @@ def prepared(runs: Sequence[Run], output: str, physics: Physics, path: Path) -> 
     spread = float(np.concatenate(measured).std()) or 1.0
     delay = parts * path.delay
     names = tuple(runs[0].inputs)
+    unsure = [unsure_gain(runs, name) if name in path.way.standing else 0.0 for name in names]
+    scatter = u.mean(0), u.std(0), spread
     return PreparedOutput(
-        names, output, drives, measured, time, u.mean(0), u.std(0), spread, delay, parts, ends
+        names, output, drives, measured, time, *scatter, delay, parts, ends, np.array(unsure)
     )

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
 from beamfit.answer import shown
 from beamfit.errors import InputError
+from beamfit.noise.memory import is_correlated
 
 # Fewest readings of an output; with fewer its response and its start are not separable.
 LEAST = 8
@@ -18,6 +20,11 @@ HIGH, FAINT = 0.9, 2e-3
 # Rows a sample by which an input that moves between samples is followed: what is left of a sine of
 # half the highest frequency is right to 1e-3.
 PARTS = 8
+# A step of an input's readings makes their squares less by so many logarithms of their number than
+# none: the modified information criterion of N. R. Zhang and D. O. Siegmund, Biometrics 63 (2007).
+STEP = 3.0
+# Correlation of neighbours about levels, in standard errors, of an input that is smooth instead.
+SMOOTH = 4.0
 
 
 @shown
@@ -158,14 +165,111 @@ def band_limited(runs: Sequence[Run]) -> tuple[str, ...]:
     return tuple(found)
 
 
-def rows_of(run: Run, moving: Sequence[str], parts: int) -> np.ndarray:
-    """Inputs at so many rows a sample, shape (samples * parts, inputs), some moving between them.
+def _means(values: np.ndarray, weight: np.ndarray, least: float) -> np.ndarray:
+    """Means of pieces, divided in two as long as two means explain so much more."""
+    total, sums = (np.append(0.0, np.cumsum(each)) for each in (weight, weight * values))
+    waiting, found = [(0, len(values))], [0]
+    while waiting:
+        low, high = waiting.pop()
+        at = np.arange(low + 1, high)
+        before, after = total[at] - total[low], total[high] - total[at]
+        change = (sums[high] - sums[at]) / after - (sums[at] - sums[low]) / before
+        explained = change**2 * before * after / (total[high] - total[low])
+        if at.size and explained.max() > least:
+            middle = int(at[explained.argmax()])
+            found.append(middle)
+            waiting += [(low, middle), (middle, high)]
+    first = np.sort(found)
+    means = np.add.reduceat(weight * values, first) / np.add.reduceat(weight, first)
+    return np.repeat(means, np.diff(first, append=len(values)))
 
-    Those go on by the sines that they are made of (C. E. Shannon 1949), mirrored at both ends.
+
+class Levels(NamedTuple):
+    """Levels at which an input stood, by row, their variances, and how many rows each has."""
+
+    at: np.ndarray
+    variance: np.ndarray
+    rows: np.ndarray
+
+
+def levels_of(u: np.ndarray) -> Levels:
+    """Levels of an input between its steps, if readings scatter about them by more than digits;
+    those that are alike within their errors are one where that is likelier.
+
+    Means of readings lie farther apart than what they are means of, by their errors: a gain would
+    be too small (regression calibration: R. J. Carroll et al., Measurement Error in Nonlinear
+    Models (2006), section 4.4).
+
+    Examples
+    --------
+    >>> read = np.repeat([0.0, 1.0, 0.0], 20) + 0.01 * np.random.default_rng(1).normal(size=60)
+    >>> np.abs(np.unique(levels_of(read).at)).round(2).tolist()
+    [0.0, 1.0]
+    """
+    size = 1.4826 * np.median(np.abs(np.diff(u))) / np.sqrt(2)
+    if size == 0:
+        return Levels(u, np.zeros(len(u)), np.ones(len(u)))
+    least = STEP * np.log(len(u)) * size**2
+    found = _means(u, np.ones(len(u)), least)
+    first = np.flatnonzero(np.diff(found, prepend=np.nan) != 0)
+    lengths, order = np.diff(first, append=len(u)), np.argsort(found[first])
+    means, weight = found[first][order], lengths[order].astype(float)
+    alike = _means(means, weight, least)
+    # Levels anywhere in the range, or each one of a few: what places cost, or saying which.
+    few, error = len(np.unique(alike)), size / np.sqrt(lengths.mean())
+    places = (len(means) - few) * np.log(max(np.ptp(means) / error, 1.0) / np.sqrt(2 * np.pi))
+    missed = 0.5 * weight @ (means - alike) ** 2 / size**2
+    if places > missed + len(means) * np.log(few):
+        found = np.repeat(alike[np.argsort(order)], lengths)
+    levels, which, count = np.unique(found, return_inverse=True, return_counts=True)
+    error = np.sum((u - found) ** 2) / max(len(u) - len(levels), 1) / count
+    kept = np.maximum(1.0 - error / max(found.var(), np.finfo(float).tiny), 0.0)
+    at = found.mean() + kept * (levels - found.mean())
+    return Levels(at[which], (kept * error)[which], count[which])
+
+
+def unsure_gain(runs: Sequence[Run], name: str) -> float:
+    """Share by which the errors of an input's levels make a gain unsure, as those of a straight
+    line's points.
+    """
+    squares = spread = 0.0
+    for run in runs:
+        at, variance, rows = levels_of(run.inputs[name])
+        away = at - at.mean()
+        squares, spread = squares + np.sum(rows * away**2 * variance), spread + away @ away
+    return float(np.sqrt(squares) / spread)
+
+
+def stepwise(runs: Sequence[Run]) -> tuple[str, ...]:
+    """Inputs whose readings scatter at random about levels between steps."""
+
+    def steps(u: np.ndarray) -> bool:
+        levels = levels_of(u).at
+        scatters = bool(np.ptp(levels) and np.any(u != levels))
+        return scatters and not is_correlated(u - levels, np.unique(levels).size, SMOOTH)
+
+    return tuple(name for name in runs[0].inputs if all(steps(run.inputs[name]) for run in runs))
+
+
+class Way(NamedTuple):
+    """Names of inputs that move between samples, and of those that stand at levels between steps
+    though their readings scatter; others are as they were read, and hold to the next sample.
+    """
+
+    moving: tuple[str, ...] = ()
+    standing: tuple[str, ...] = ()
+
+
+def rows_of(run: Run, way: Way, parts: int) -> np.ndarray:
+    """Inputs by a way at so many rows a sample, shape (samples * parts, inputs).
+
+    Those that move go on by the sines that they are made of (C. E. Shannon 1949), mirrored at both
+    ends.
     """
     columns = []
     for name, u in run.inputs.items():
-        if name in moving:
+        u = levels_of(u).at if name in way.standing else u
+        if name in way.moving:
             waves = np.fft.rfft(np.concatenate([u, u[::-1]]))
             turn = 2j * np.pi * np.fft.rfftfreq(2 * len(u))
             late = (np.arange(parts) + 0.5) / parts  # each part holds its middle

@@ -180,7 +180,7 @@ class ResponseSearch(NamedTuple):
         a fit ends within it; where none does the other rows are alternatives.
         """
         aside = (0.0,)
-        if path.moving and path.delay % 1.0 and not self.paths.given:
+        if path.way.moving and path.delay % 1.0 and not self.paths.given:
             aside = (0.0, -0.5 / PARTS, 0.5 / PARTS)
         found = []
         for more in aside:
@@ -681,4 +681,4 @@ class Begun(NamedTuple):
         """True if the fit is by that path, or estimates its delay."""
         apart = abs(path.delay - self.exact)
         near = 1.0 / self.seen.parts if self.seen.ends else 1e-9
-        return path.law is None and path.moving == self.path.moving and apart < near
+        return path.law is None and path.way == self.path.way and apart < near

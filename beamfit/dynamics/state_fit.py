@@ -19,7 +19,7 @@ from beamfit.dynamics.answer import ResponseEvidence, judged, limit_words, quant
 from beamfit.dynamics.checks import Checks, HeldOutRun, RunNoises, RunSlopes, checks_of, percent
 from beamfit.dynamics.model import PreparedOutput, readings_of, weight_priors
 from beamfit.dynamics.paths import Path, prepared
-from beamfit.dynamics.record import Run, checked
+from beamfit.dynamics.record import Run, Way, checked
 from beamfit.dynamics.response import FIRST_ORDER
 from beamfit.dynamics.search import (
     GAINED,
@@ -333,7 +333,7 @@ def case_of(
     runs: Sequence[Run], system: System, free: Sequence[Free], priors: Sequence[Prior], delay: int
 ) -> Case:
     """The runs as the model sees them."""
-    late = Path(None, (), float(delay))
+    late = Path(None, Way(), float(delay))
     seen = tuple(prepared(runs, name, FIRST_ORDER, late) for name in runs[0].outputs)
     courses = tuple(course_of(system, seen, i) for i in range(len(runs)))
     return Case(seen, courses, tuple(free), tuple(priors))

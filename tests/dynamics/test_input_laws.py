@@ -7,7 +7,7 @@ from beamfit.dynamics.alternatives import Alternatives
 from beamfit.dynamics.fit import identify
 from beamfit.dynamics.input_laws import moved
 from beamfit.dynamics.paths import Path
-from beamfit.dynamics.record import Run
+from beamfit.dynamics.record import Run, Way, levels_of, stepwise, unsure_gain
 from beamfit.errors import Status
 
 UP_AND_DOWN = np.array([0.0, 1.0, 2.0, 2.0, 1.5, 1.0, 0.0, -1.0])
@@ -38,7 +38,7 @@ def test_an_error_is_that_of_the_mixture_about_the_value_of_the_answer():
     """Beside draws from the mixture."""
     random = np.random.default_rng(0)
     shift, covariance = np.array([[2.0, 1.0], [0.0, -3.0]]), np.stack([np.diag([1.0, 0.5])] * 2)
-    own, weight = Path(None, (), 0.0), np.array([0.3, 0.2])
+    own, weight = Path(None, Way(), 0.0), np.array([0.3, 0.2])
     found = Alternatives(own, 0.5, 0.0, "", False, weight, shift, covariance)
     slope = np.array([1.0, 0.5])
     which = random.choice(3, 200_000, p=[0.5, 0.3, 0.2])
@@ -137,3 +137,61 @@ def test_two_values_of_an_input_do_not_tell_a_dead_zone():
     assert fit.status is Status.converged
     assert fit.quantities["K"].error < 0.1
     assert abs(fit.quantities["K"].value - 2) < 3 * fit.quantities["K"].error
+
+
+@pytest.mark.parametrize("few", [True, False])
+def test_levels_of_a_readback_are_those_that_were_set(few):
+    """Of a few settings all readings tell each; twelve tell one of many."""
+    random, off, squares = np.random.default_rng(4), [], []
+    for _ in range(8):
+        set_to = random.choice([0.0, 1.0, 2.5], 40) if few else random.uniform(-1, 1, 40)
+        u = np.repeat(set_to, 12)
+        found = levels_of(u + 0.02 * random.normal(size=u.size))
+        off.append(np.sqrt(np.mean((found.at - u) ** 2)))
+        squares.append((found.at - u) ** 2 / found.variance)
+    assert np.median(off) < (0.0025 if few else 0.008)
+    assert 0.7 < np.sqrt(np.mean(squares)) < 1.5
+    assert np.array_equal(levels_of(u).at, u)
+
+
+def test_inputs_without_steps_have_no_levels():
+    random, t = np.random.default_rng(5), np.arange(300.0)
+    smooth = {"walk": np.cumsum(random.normal(size=300)), "sine": np.sin(t / 10)}
+    smooth |= {"white": random.normal(size=300), "set": np.repeat(random.uniform(size=30), 10)}
+    smooth["noisy sine"] = smooth["sine"] + 0.02 * random.normal(size=300)
+    read = smooth["set"] + 0.01 * random.normal(size=300)
+    assert stepwise([Run(t, {**smooth, "read": read}, {"level": t})]) == ("read",)
+
+
+def test_a_gain_is_unsure_by_the_errors_of_levels():
+    """Beside slopes of straight lines through points whose places are read with noise."""
+    random = np.random.default_rng(6)
+    u = np.repeat([0.0, 1.0, 3.0, 0.0, 3.0], 20)
+    reads = [u + 0.2 * random.normal(size=100) for _ in range(400)]
+    gains = [np.polyfit(levels_of(read).at, 2.0 * u, 1)[0] for read in reads]
+    own = np.mean([unsure_gain([Run(np.arange(100.0), {"u": read}, {"y": u})], "u")
+                   for read in reads[:40]])  # fmt: skip
+    assert np.std(gains) / 2.0 == pytest.approx(own, rel=0.25)
+    assert abs(np.mean(gains) / 2.0 - 1) < 3 * np.std(gains) / 20
+
+
+@pytest.mark.parametrize("count", SEEDS)
+def test_a_readback_that_scatters_about_its_steps_is_no_law(count):
+    """A saturation that hides the scatter of two values was beyond doubt."""
+    for seed in range(count):
+        random = np.random.default_rng([seed, 8])
+        u = np.repeat(random.choice([-1.0, 1.0], 30), 10)
+        run = response(u, u, 0.01, random)
+        read = Run(run.time, {"valve": u + 0.03 * random.normal(size=300)}, run.outputs)
+        fit = identify(read)
+        assert fit.status is Status.converged, fit.message
+        assert "Readings of valve scatter about levels" in fit.message
+        assert abs(fit.quantities["K"].value - 2) < 3 * fit.quantities["K"].error, seed
+
+
+def test_an_output_that_follows_the_scatter_is_driven_by_it():
+    random = np.random.default_rng(9)
+    u = np.repeat(random.choice([-1.0, 1.0], 30), 10) + 0.1 * random.normal(size=300)
+    fit = identify(response(u, u, 0.01, random))
+    assert fit.status is Status.converged, fit.message
+    assert fit.checks.way.standing == ()
