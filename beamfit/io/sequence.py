@@ -6,7 +6,6 @@ What a first-order, uncoupled line of one energy cannot hold is refused, never d
 from __future__ import annotations
 
 import math
-import re
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from itertools import count
@@ -14,12 +13,14 @@ from os import PathLike
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from lark import Tree
+
 from beamfit.errors import InputError, nearest
 from beamfit.io.dialects import DIALECTS, ELEGANT, MADX, coded
 from beamfit.io.files import digest, read_text
 from beamfit.io.lattice import MOST, LatticeFile
 from beamfit.io.madx import NO_MATTER, Attribute, Definition, Interpreter, word_of
-from beamfit.io.madx_values import NAME, words
+from beamfit.io.madx_values import parsed, words
 from beamfit.particles import LIGHT, REST_ENERGY, expected_energy
 
 # Gaps and overlaps in m that MAD-X takes for none.
@@ -35,7 +36,6 @@ MEANT = words(
     "l k0 k1 angle tilt knl ksl k1s k0s ktap hgap fint fintx ks ksi volt ex ey ex_l ey_l "
     "kill_ent_fringe kill_exi_fringe dx dy ds h knll charge cnll bet sigx sigy xma yma"
 )
-MEMBER = re.compile(rf"\s*([-+]?)\s*(?:(\d+)\s*\*)?\s*(?:({NAME})|(\())", re.I)
 # GeV; the charges of those that MAD-X knows by name.
 KNOWN = {"positron": 1.0, "electron": -1.0, "proton": 1.0, "antiproton": -1.0}
 # Relative: masses that differ by less are one particle's.
@@ -255,46 +255,33 @@ class _Line:
         """Names of the elements of a LINE, in order, and whether each is reflected."""
         if line.name in within:
             raise line.error(f"'{line.name}', which holds itself", "a line of others")
-        text = line.members.strip()
-        if not text.startswith("("):
-            raise line.error(f"'{text[:40]}' where a list belongs", "NAME: LINE = (A, B, ...);")
-        found, end = self._list(line, text, 1, (*within, line.name))
-        if text[end:].strip():
-            raise line.error(f"'{text[end:][:40]}' after a list", "NAME: LINE = (A, B, ...);")
-        return found
+        try:
+            tree = parsed(line.members, "list")
+        except ValueError as error:
+            raise line.error(f"a list {error}", "NAME: LINE = (A, 2*B, -C, (D, E));") from None
+        return self._list(line, tree, (*within, line.name))
 
     def _list(
-        self, line: Definition, text: str, at: int, within: tuple[str, ...]
-    ) -> tuple[list[tuple[str, bool]], int]:
-        """Names in a list in parentheses, as of `_members`, and where it ends."""
+        self, line: Definition, tree: Tree, within: tuple[str, ...]
+    ) -> list[tuple[str, bool]]:
+        """Names in a list, as of `_members`."""
         every: list[tuple[str, bool]] = []
-        while True:
-            found = MEMBER.match(text, at)
-            if found is None:
-                said = text[at:].strip()[:30]
-                raise line.error(f"'{said}' in a LINE", "names, lists, N*name and -name")
-            sign, times, name, _ = found.groups()
-            if name:
-                one, at = self._member(line, name.lower(), within), found.end()
-            else:
-                one, at = self._list(line, text, found.end(), within)
-            number = 1 if times is None else int(times)
+        for *said, own in (member.children for member in tree.children):
+            number = next((int(word) for word in said if word.isdigit()), 1)
             if number < 1:
                 raise line.error(f"{number} times an element", "one or more")
+            found = self._list if isinstance(own, Tree) else self._member
+            one = found(line, own, within)
             self._count(line, number * len(one))
-            if sign == "-":
-                one = [(own, not reflected) for own, reflected in one[::-1]]
+            if "-" in said:
+                one = [(name, not reflected) for name, reflected in one[::-1]]
             every += one * number
-            mark = re.compile(r"\s*([,)])").match(text, at)
-            if mark is None:
-                raise line.error(f"'{text[at:].strip()[:30]}' in a LINE", "',' or ')'")
-            at = mark.end()
-            if mark[1] == ")":
-                return every, at
+        return every
 
     def _member(
-        self, line: Definition, name: str, within: tuple[str, ...]
+        self, line: Definition, label: str, within: tuple[str, ...]
     ) -> list[tuple[str, bool]]:
+        name = label.lower()
         if name in self.program.elements:
             return [(name, False)]
         known = self.program.lines
