@@ -230,6 +230,8 @@ class Sheet:
         Of dates whose day and month are numbers, where a layout says it.
     arranged : bool
         Whether there is a layout: unknown columns are then ignored.
+    skip : str
+        What may be done about a row with something wrong in it, for messages.
     """
 
     path: str | PathLike[str]
@@ -244,6 +246,7 @@ class Sheet:
     called: Mapping[str, str] = field(default_factory=dict)
     order: str = ""
     arranged: bool = False
+    skip: str = ""
 
     def __len__(self) -> int:
         return len(self.cells[0])
@@ -256,10 +259,10 @@ class Sheet:
     ) -> InputError:
         """Make the error that names the file, and the row and column if there are any."""
         if row is not None and self.lines is None:
-            return self.error(f"reading {row + 1}: {found}", expected, None, column)
-        line = None if row is None else self.lines[row]
+            return self.error(f"reading {row + 1}: {found}", expected + self.skip, None, column)
+        line, skip = (None, "") if row is None else (self.lines[row], self.skip)
         column = self.called.get(column, column)
-        return InputError(found, expected, path=self.path, line=line, column=column)
+        return InputError(found, expected + skip, path=self.path, line=line, column=column)
 
     def header_error(self, found: str, expected: str, column: str | None = None) -> InputError:
         """Make the error that names the header, and the column if it is one alone."""

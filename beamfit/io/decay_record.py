@@ -49,7 +49,7 @@ LIFETIMES = {
     "lifetime_error": "time",
     "beam_current": "current",
 }
-INCREASE = "times that increase; --skip-bad leaves out rows whose time does not"
+INCREASE = "times that increase"
 # Seconds beyond this many are counted from 1970, not from the start of a record (1973 or later);
 # beyond the others after 2050, of another origin, or after the year 5000, and are milliseconds.
 UNIX, LATEST, MILLISECONDS = 1e8, 2.5e9, 1e11
@@ -219,7 +219,7 @@ def _record(sheet: Sheet, skip_bad: bool, offset: str | None) -> DecayRecord:
     if skip_bad:
         sheet, moment = _forward(sheet, columns, moment)
     rest = {key: column for key, column in columns.items() if key not in ("time", "nanos")}
-    values = {key: _values(sheet, column) for key, column in rest.items()}
+    values = {key: sheet.values(column) for key, column in rest.items()}
     if len(moment) < 2:
         raise sheet.error(f"{len(moment)} readings", "two or more")
     _check_base(sheet, columns["time"], moment)
@@ -245,20 +245,10 @@ def _record(sheet: Sheet, skip_bad: bool, offset: str | None) -> DecayRecord:
     )
 
 
-def _values(sheet: Sheet, column: Column) -> np.ndarray:
-    try:
-        return sheet.values(column)
-    except InputError as error:
-        if "," in error.found:
-            raise
-        expected = f"{error.expected}; --skip-bad leaves such rows out"
-        raise replace(error, expected=expected) from None
-
-
 def _moments(sheet: Sheet, columns: Mapping[str, Column]) -> np.ndarray:
     """Times of the rows, s."""
-    moment = _values(sheet, columns["time"])
-    return moment + _values(sheet, columns["nanos"]) if "nanos" in columns else moment
+    moment = sheet.values(columns["time"])
+    return moment + sheet.values(columns["nanos"]) if "nanos" in columns else moment
 
 
 def _goes_back(sheet: Sheet, columns: Mapping[str, Column], row: int, latest: object) -> InputError:
@@ -277,7 +267,8 @@ def _refused(
     column, row = columns[fault.quantity], int(rows[fault.row])
     if column.unit == DATE and fault.row:
         return _goes_back(sheet, columns, row, sheet[column.header][int(rows[fault.row - 1])])
-    expected = INCREASE if fault.quantity == "time" else fault.expected
+    expected = fault.expected
+    sheet = sheet if fault.quantity == "time" else replace(sheet, skip="")
     if fault.quantity == "current" and negative:
         expected = "the other sign: most readings are negative"
     return sheet.error(fault.found, expected, row, column.header)
@@ -286,7 +277,7 @@ def _refused(
 def _check_alone(sheet: Sheet, columns: Mapping[str, Column], positive: bool) -> None:
     """Refuse a row that is wrong whatever the others are."""
     for key, column in columns.items():
-        values = _values(sheet, column)
+        values = sheet.values(column)
         if key == "current" and positive:
             found = "a negative current, {:.6g} mA"
             sheet.refuse(column.header, values < 0, "zero or more", found, values)
@@ -294,9 +285,8 @@ def _check_alone(sheet: Sheet, columns: Mapping[str, Column], positive: bool) ->
 
 def _below_zero(sheet: Sheet, columns: Mapping[str, Column]) -> tuple[str, ...]:
     """Note on readings below zero, which are left out: an offset is in the others, too."""
-    values = _values(
-        sheet.good(lambda rows: _check_alone(rows, columns, False)), columns["current"]
-    )
+    read = sheet.good(lambda rows: _check_alone(rows, columns, False))
+    values = read.values(columns["current"])
     below = values[values < 0]
     if below.size < FEWEST:
         return ()
@@ -322,7 +312,7 @@ def _forward(
 
 
 def _check_base(sheet: Sheet, column: Column, moment: np.ndarray) -> None:
-    latest = np.max(moment)
+    latest, sheet = np.max(moment), replace(sheet, skip="")
     if LATEST < latest < MILLISECONDS:
         found = f"{latest:.6g} s since 1970, after the year 2050"
         expected = (
@@ -357,7 +347,7 @@ def _lifetimes(sheet: Sheet, skip_bad: bool) -> LifetimeTable:
 
 
 def _positive(sheet: Sheet, column: Column) -> np.ndarray:
-    values = _values(sheet, column)
+    values = sheet.values(column)
     found, written = f"{{:.6g}} {column.unit}", values / column.factor
     sheet.refuse(column.header, values <= 0, "above zero", found, written)
     return values

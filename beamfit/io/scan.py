@@ -476,9 +476,9 @@ def scan_of_sheet(
     """Understand the columns of a sheet as a scan; knobs of the machine are settings, too."""
     profiles: tuple[Profile, ...] = ()
     if IMAGE in sheet.names:
-        sheet = of_images(sheet)
+        sheet = of_images(replace(sheet, skip=""))
     if {"counts_x", "counts_y"} & set(sheet.names):
-        sheet, profiles = of_profiles(sheet)
+        sheet, profiles = of_profiles(replace(sheet, skip=""))
     columns = scan_columns(sheet, knobs or {})
     sheet = _without_dark(sheet, columns) if "shot" in columns else sheet
     if skip_bad:
@@ -487,13 +487,8 @@ def scan_of_sheet(
         sheet = sheet.good(
             lambda rows: _check_slipped(rows, columns, _values(rows, columns), usual)
         )
-    try:
-        values = _values(sheet, columns)
-        odd = _check_sizes(sheet, columns, values)
-    except InputError as error:
-        skip = error.line is not None and not skip_bad and "--ignore" not in error.expected
-        more = "; --skip-bad leaves such rows out" if skip else ""
-        raise replace(error, expected=error.expected + more) from None
+    values = _values(sheet, columns)
+    odd = _check_sizes(sheet, columns, values)
     notes = [*column_notes(columns), *comment_notes(sheet, columns), *odd]
     notes += [*ignored(sheet, columns), *left_out(sheet)]
     with located(sheet.path):
@@ -603,6 +598,7 @@ def _checked(sheet: Sheet, column: Column, length: bool) -> np.ndarray:
     if (wrong := (values <= low) | (values > high)).any():
         if column.key.endswith("error") and not np.any(values > 0):
             expected += f"; --ignore '{column.header}' leaves them unread: the noise is inferred"
+            raise sheet.header_error("no error above zero", expected, column.header)
         sheet.refuse(column.header, wrong, expected)
     return values
 
@@ -715,7 +711,7 @@ def read_tuning_scan(
     names = {knob: _header(knob, sheet) for knob in dict.fromkeys(knobs)}
     called = {knob: sheet.called.get(name, name) for knob, name in names.items()}
     if any(EMITTANCE.match(name) for name in sheet.names):
-        return _emittances(sheet, names, called)
+        return _emittances(replace(sheet, skip=""), names, called)
     units = {knob: _unit(knob, header) for knob, header in called.items()}
     knobs = {f"setting {k}": Column(n, f"setting {k}", units[k]) for k, n in names.items()}
     scan = scan_of_sheet(replace(sheet, arranged=True), skip_bad, knobs)

@@ -36,6 +36,7 @@ MOST_ROWS, MOST_WORDS = 12_000_000, 4_000_000
 HDF5 = {".h5", ".hdf5"}
 MATLAB = ".mat"
 BINARY = {*HDF5, MATLAB}
+SKIP = "; --skip-bad leaves such rows out"
 # How Excel says which separator a file has.
 SEPARATOR_LINE = re.compile(r"\s*\"?sep=.\"?\s*$", re.IGNORECASE)
 # In the names of a file without a header: cells that are not read.
@@ -84,10 +85,9 @@ def read_columns(
     InputError
         As `read_sheet`, and of what is said of columns.
     """
-    if columns is None:
-        return read_sheet(path, example, most, ragged=skip_bad).without(ignore)
     layout = layout_of(columns)
     sheet = read_sheet(path, example, most, ragged=skip_bad, names=layout.header or None)
+    sheet = replace(sheet, skip="" if skip_bad else SKIP)
     return arranged(sheet.without(ignore), layout)
 
 
@@ -180,8 +180,7 @@ def _read_text(
             if bad and not ragged:
                 break
     if bad and not (ragged and rows):
-        more = "; --skip-bad leaves such rows out" if ragged is False else ""
-        raise replace(bad[0], expected=bad[0].expected + more)
+        raise replace(bad[0], expected=bad[0].expected + SKIP * (ragged is False))
     if columns is None:
         rows, notes = with_points(rows, separator)
         columns = zip(*rows, strict=True) if rows else [()] * len(names)
