@@ -232,6 +232,8 @@ class Sheet:
         Whether there is a layout: unknown columns are then ignored.
     skip : str
         What may be done about a row with something wrong in it, for messages.
+    optional : bool
+        Whether a person can say --columns and --ignore.
     """
 
     path: str | PathLike[str]
@@ -247,6 +249,7 @@ class Sheet:
     order: str = ""
     arranged: bool = False
     skip: str = ""
+    optional: bool = False
 
     def __len__(self) -> int:
         return len(self.cells[0])
@@ -474,31 +477,47 @@ def columns_of(
     0.001
     """
     found: dict[str, Column] = {}
+    unknown: list[InputError] = []
     for header in sorted(sheet.names, key=lambda name: name not in sheet.called):
         aside = sheet.arranged and header not in sheet.called
         said = spelled(header)
         try:
-            column = _known(said, quantities, sheet) or other(said)
+            if (column := _known(said, quantities, sheet) or other(said)) is None:
+                usual = [f"{q}_{next(iter(UNITS[k]))}" if k else q for q, k in quantities.items()]
+                raise sheet.header_error("an unknown column", nearest(header, usual), header)
         except InputError as error:
-            if aside:
-                continue
-            raise replace(error, column=sheet.called.get(header, header)) from None
-        column = column and column._replace(header=header)
-        if aside and (column is None or column.key in found):
+            own = sheet.called.get(header, header)
+            unknown += [] if aside else [replace(error, column=own)]
             continue
-        if column is None:
-            usual = [f"{q}_{next(iter(UNITS[k]))}" if k else q for q, k in quantities.items()]
-            raise sheet.header_error("an unknown column", nearest(header, usual), header)
-        if column.key in found:
-            first = found[column.key].header
-            twice = f"{column.key} also in column '{sheet.called.get(first, first)}'"
-            expected = "one column for it, in one unit, and none twice"
-            if header == found[column.key].header:
-                twice = f"{column.key} twice or more under one name"
-                expected = "a row for each shot, or names that differ"
-            raise sheet.header_error(twice, expected, header)
-        found[column.key] = column
+        if column.key not in found:
+            found[column.key] = column._replace(header=header)
+        elif not aside:
+            raise _twice(sheet, column.key, found[column.key].header, header)
+    if unknown:
+        raise _not_understood(unknown) if sheet.optional else unknown[0]
     return found
+
+
+def _twice(sheet: Sheet, key: str, first: str, header: str) -> InputError:
+    """Error of a quantity in two columns."""
+    if header == first:
+        expected = "a row for each shot, or names that differ"
+        return sheet.header_error(f"{key} twice or more under one name", expected, header)
+    expected = "one column for it, in one unit, and none twice"
+    expected += f"; --ignore '{header}' leaves this one unread" if sheet.optional else ""
+    named = sheet.called.get(first, first)
+    return sheet.header_error(f"{key} also in column '{named}'", expected, header)
+
+
+def _not_understood(unknown: Sequence[InputError]) -> InputError:
+    """Error of columns that nobody knows, all of which are named, and what may be said of them."""
+    first, names = unknown[0], [f"--ignore '{error.column}'" for error in unknown]
+    said = f"--columns '{first.column}=NAME' says what it is"
+    expected = f"{first.expected}; {said}, --ignore leaves it unread"
+    if len(unknown) > 1:
+        expected = f"names with units, such as size_x_um or time_s; {said} (`beamfit check` "
+        expected += f"proposes a layout), or to leave them unread: {' '.join(names)}"
+    return replace(first, expected=expected)
 
 
 def _known(header: str, quantities: Mapping[str, str], sheet: Sheet) -> Column | None:

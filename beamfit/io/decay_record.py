@@ -507,11 +507,7 @@ def record_columns(sheet: Sheet) -> dict[str, Column]:
     >>> {key: column.unit for key, column in record_columns(sheet).items()}
     {'time': 'a date', 'current': 'mA'}
     """
-    try:
-        found = columns_of(sheet, QUANTITIES, _other(sheet))
-    except InputError as error:
-        more = f"; --columns '{error.column}=NAME' says what it is, --ignore leaves it unread"
-        raise replace(error, expected=error.expected + more) from None
+    found = columns_of(sheet, QUANTITIES, _other(sheet))
     called = {CALLED.get(key, key): column for key, column in found.items()}
     return {key: column for key, column in called.items() if key in USED}
 

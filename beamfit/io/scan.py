@@ -132,7 +132,12 @@ def scan_columns(
         raise sheet.header_error("a record of beam current", expected)
     taken = {column.header for column in knobs.values()}
     rest = [name for name in sheet.names if name not in taken]
-    columns = dict(knobs) | _understood(sheet.only(rest) if knobs else sheet)
+    if "plane" in map(str.lower, rest) and not sheet.arranged:
+        expected = "a column for each plane, size_x_um and size_y_um, and a row for each setting"
+        raise sheet.header_error("rows of two planes", expected)
+    columns = dict(knobs) | columns_of(
+        sheet.only(rest) if knobs else sheet, QUANTITIES, lambda header: _other(header, sheet)
+    )
     if not {"size_x", "size_y"} & set(columns):
         missing = "a beam size column, such as size_x_um"
     elif not (any(key.startswith(SETTING) for key in columns) or SEEN & set(columns)):
@@ -152,35 +157,12 @@ def scan_columns(
     return columns
 
 
-def _understood(sheet: Sheet) -> dict[str, Column]:
-    """Every column; all that are not understood are named at once."""
-    try:
-        return columns_of(sheet, QUANTITIES, lambda header: _other(header, sheet))
-    except InputError as error:
-        unknown = [name for name in sheet.names if not is_known(name, sheet)]
-        if error.column not in unknown:
-            one = sheet.names.count(error.column) == 1  # more would all be left unread
-            more = f"; --ignore '{error.column}' leaves this one unread" if one else ""
-            expected = error.expected + more
-            raise replace(error, expected=expected) from None
-        if len(unknown) < 2:
-            raise
-        if "plane" in map(str.lower, unknown):
-            expected = (
-                "a column for each plane, size_x_um and size_y_um, and a row for each setting"
-            )
-            raise sheet.header_error("rows of two planes", expected, error.column) from None
-        ignored = " ".join(f"--ignore '{name}'" for name in unknown)
-        expected = "a magnet with its unit, a size such as size_x_um, --columns (`beamfit check` "
-        expected += "proposes a layout), or to leave them unread: "
-        raise replace(error, expected=expected + ignored) from None
-
-
 def is_known(name: str, sheet: Sheet) -> bool:
     """Tell a header that means something in a scan from others."""
-    alone = replace(sheet, names=(name,), cells=[sheet[name]])
     try:
-        return bool(columns_of(alone, QUANTITIES, lambda header: _other(header, sheet)))
+        return bool(
+            columns_of(sheet.only([name]), QUANTITIES, lambda header: _other(header, sheet))
+        )
     except InputError:
         return False
 
@@ -221,7 +203,7 @@ def _other(header: str, sheet: Sheet) -> Column:
         return Column(header, f"r{OF_Y[of_y]}_y" if of_y else f"r{of_x}_{plane or 'x'}")
     if COUPLED.fullmatch(header) is not None:
         found = "the correlation of x and y, or a tilt: coupled beams are not fitted"
-        raise sheet.header_error(found, f"two planes; --ignore '{header}' fits them alone", header)
+        raise sheet.header_error(found, "two planes, which are fitted alone", header)
     unit = next((u for u in SETTINGS if header.endswith(f"_{u}")), "")
     name = header.removesuffix(f"_{unit}") if unit else ""
     while (bare := ATTRIBUTE.sub("", name)) != name:
@@ -233,9 +215,7 @@ def _other(header: str, sheet: Sheet) -> Column:
     usual += ["shot", "shots", "screen", "slice"]
     raise sheet.header_error(
         _not_understood(header),
-        "a magnet with _A, _kG, _T_per_m or _k1 at the end, "
-        + nearest(header, usual)
-        + f"; --columns '{header}=NAME' says what it is, --ignore leaves it unread",
+        f"a magnet with _A, _kG, _T_per_m or _k1 at the end, {nearest(header, usual)}",
         header,
     )
 

@@ -87,7 +87,7 @@ def read_columns(
     """
     layout = layout_of(columns)
     sheet = read_sheet(path, example, most, ragged=skip_bad, names=layout.header or None)
-    sheet = replace(sheet, skip="" if skip_bad else SKIP)
+    sheet = replace(sheet, skip="" if skip_bad else SKIP, optional=True)
     return arranged(sheet.without(ignore), layout)
 
 
