@@ -65,13 +65,10 @@ ALSO = {
     }.items()
     for word in words
 }
-# A header that ends with one of them, the longest.
-WRITTEN = re.compile(f"(.*?)[\\s_]({'|'.join(map(re.escape, ALSO))})")
 # A number and what stands behind it.
 NUMBER = re.compile(r"([-+]?(?:\d+[.,]?\d*|[.,]\d+)(?:[eE][-+]?\d+)?)\s*([^\W\d_].*|[%\[(].*)")
-# A name, and its unit in brackets or behind a stroke between blanks.
-BRACKETS = re.compile(r"(.*?)[\s_]*(?:\[(.*?)\]|\((.*?)\)|\s/\s+(\S+))\s*")
-APART = re.compile(r"([^/,]+?)(?:/|, ?| in )([^/,\s]+)")  # I/A, "I, A", I in A
+# What stands between a name and its unit: size x (µm), Q [T/m], I/A, "I, A", I in A, Time / h.
+BETWEEN = re.compile(r"\s+in\s+|[\s_]*[\[(]|\s+/\s+|/|,\s?|[\s_]+")
 
 
 def known_unit(text: str) -> str | None:
@@ -101,18 +98,14 @@ def spelled(header: str) -> str:
     >>> [spelled(h) for h in ("I/A", "size x, um", "size x in um", "Q1_T/m", "sr/dcct/A")]
     ['I_A', 'size_x_um', 'size_x_um', 'Q1_T_per_m', 'sr/dcct/A']
     """
-    if (found := BRACKETS.fullmatch(header)) and found[1]:
-        name, unit = found[1], next(part for part in found.groups()[1:] if part is not None)
-        if (known := known_unit(unit)) is not None:
-            return named(name.strip().removesuffix(f"_{known}"), known)
     if header.endswith(ENDS):
         return header
-    if found := WRITTEN.fullmatch(header):
-        return named(found[1], ALSO[found[2]])
-    if (found := APART.fullmatch(header)) and (known := known_unit(found[2])):
-        return named(found[1], known)
-    words = header.split()
-    return "_".join(words) if len(words) > 1 and words[-1] in KNOWN else header
+    for found in BETWEEN.finditer(header):
+        name, unit = header[: found.start()].strip(), known_unit(header[found.end() :])
+        path = found[0] in "/," and re.search("[/,]", name)  # such as sr/dcct/A
+        if name and unit and not path:
+            return named(name.removesuffix(f"_{unit}"), unit)
+    return header
 
 
 def unit_at_end(name: str) -> str | None:
