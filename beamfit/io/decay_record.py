@@ -53,9 +53,6 @@ INCREASE = "times that increase"
 # Seconds beyond this many are counted from 1970, not from the start of a record (1973 or later);
 # beyond the others after 2050, of another origin, or after the year 5000, and are milliseconds.
 UNIX, LATEST, MILLISECONDS = 1e8, 2.5e9, 1e11
-# Seconds since 1970 that are milliseconds, ... below these.
-FINER = ((1e14, "ms", "milliseconds"), (1e17, "us", "microseconds"))
-FINER += ((np.inf, "ns", "nanoseconds"),)
 QUANTITIES = {
     "time": "time",
     "beam_current": "current",
@@ -322,9 +319,9 @@ def _check_base(sheet: Sheet, column: Column, moment: np.ndarray) -> None:
         raise sheet.error(found, expected, int(np.argmax(moment)), column.header)
     if latest >= MILLISECONDS:
         found = f"{latest:.6g} s, after the year 5000"
-        unit, long = next(said for most, *said in FINER if latest < most)
+        finer = [u for u in ("ms", "us", "ns") if UNITS["time"][u] * latest < MILLISECONDS]
         header = sheet.called.get(column.header, column.header)
-        expected = f"the unit of the time: of {long} --columns '{header}=time_{unit}'"
+        expected = f"the unit of the time: --columns '{header}=time_{(finer or ['ns'])[0]}'"
         raise sheet.error(found, expected, int(np.argmax(moment)), column.header)
 
 

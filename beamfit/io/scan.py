@@ -15,7 +15,7 @@ import numpy as np
 
 from beamfit.emittance.scan import KNOB, POSSIBLE, USUAL, Profile, QuadScan, middle, row_keys
 from beamfit.errors import InputError, located, nearest, short
-from beamfit.io.cells import number, numbers_of
+from beamfit.io.cells import is_number, number
 from beamfit.io.columns import (
     SETTINGS,
     UNITS,
@@ -481,22 +481,16 @@ def _without_dark(sheet: Sheet, columns: Mapping[str, Column]) -> Sheet:
     """Blank the sizes of shots that show no beam, for which programs write 0."""
     cells, count = dict(zip(sheet.names, sheet.cells, strict=True)), 0
     for plane in (p for p in "xy" if f"size_{p}" in columns):
-        size, wrong = numbers_of(cells[columns[f"size_{plane}"].header], number, True)
-        if wrong is not None:
-            continue
-        dark, count = size == 0.0, count + int(np.sum(size == 0.0))
+        sizes = cells[columns[f"size_{plane}"].header]
+        dark = [is_number(cell) and number(cell) == 0.0 for cell in sizes]
+        count += sum(dark)
         for key in {f"size_{plane}", f"size_{plane}_error"} & set(columns):
             header = columns[key].header
             cells[header] = ["" if d else c for d, c in zip(dark, cells[header], strict=True)]
-    if not count:
-        return sheet
-    show = (
-        "shot of size 0 shows no beam and is"
-        if count == 1
-        else "shots of size 0 show no beam and are"
-    )
-    note = f"{count} {show} left out."
-    return replace(sheet, cells=list(cells.values()), notes=(*sheet.notes, note))
+    shown = "shows no beam and is" if count == 1 else "show no beam and are"
+    note = f"{count} shot{'s' * (count > 1)} of size 0 {shown} left out."
+    notes = (*sheet.notes, note) if count else sheet.notes
+    return replace(sheet, cells=list(cells.values()), notes=notes)
 
 
 def _scan(

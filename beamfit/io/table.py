@@ -21,7 +21,6 @@ from beamfit.io.columns import (
     has_unit,
     is_header,
     layout_of,
-    spelled,
     units_below,
     with_units,
 )
@@ -141,7 +140,7 @@ def read_sheet(
     if hasattr(path, "itertuples"):
         return _of_frame(path, most)
     expect(path, str | PathLike, "'scan.csv', or a pandas frame")
-    if is_binary(path):
+    if _is_binary(path):
         return _binary(path, most)
     if Path(path).suffix.lower() == ".json":
         return _of_json(path, most)
@@ -244,15 +243,6 @@ def _without_blanks(cells: list[str], least: int) -> list[str]:
     return cells[: max(len(cells) - more, least)]
 
 
-def header_of(path: str | PathLike[str]) -> list[str]:
-    """The header of a file of text, as `read_sheet` finds it, with units that stand below."""
-    names, _, separator, numbered = _head(path, "Q2_A,size_x_um", [])
-    line, text = next((one for one in numbered if one[1].strip()), (0, ""))
-    cells, wrong = _row(text, separator, path, line, len(names))
-    names = names if wrong else with_units(names, cells, path, line) or names
-    return [spelled(name) for name in names]
-
-
 def _row(
     text: str,
     separator: str,
@@ -313,7 +303,7 @@ def _check_header(names: list[str], example: str, path: str | PathLike[str], lin
         raise InputError("a table on its side", expected, path=path, line=line)
 
 
-def is_binary(path: str | PathLike[str]) -> bool:
+def _is_binary(path: str | PathLike[str]) -> bool:
     """Tell a file that a library reads: HDF5 and MATLAB by the name, SDDS by how it begins."""
     return Path(path).suffix.lower() in BINARY or first_bytes(path, 4) == b"SDDS"
 
