@@ -609,8 +609,8 @@ class Layout:
             other.header or self.header,
         )
 
-    def called(self, headers: Sequence[str], path: str | PathLike[str]) -> dict[str, str]:
-        """The name of each of a file's headers for which the layout has one.
+    def called(self, sheet: Sheet) -> dict[str, str]:
+        """The name of each of a sheet's headers for which the layout has one.
 
         Raises
         ------
@@ -619,19 +619,20 @@ class Layout:
 
         Examples
         --------
-        >>> layout_of("xrms=size_x_um, QUAD:BACT=Q525_kG").called(["QUAD:BACT", "xrms"], "a.csv")
-        {'xrms': 'size_x_um', 'QUAD:BACT': 'Q525_kG'}
+        >>> sheet = Sheet("a.csv", ("Q5:BACT", "xrms"), [["1"], ["9"]], [2], 1, ())
+        >>> layout_of("xrms=size_x_um, Q5:BACT=Q5_kG").called(sheet)
+        {'xrms': 'size_x_um', 'Q5:BACT': 'Q5_kG'}
         """
         found: dict[str, str] = {}
         for said, name in self.names:
-            matching = [h for h in headers if said in _spellings(h)]
-            matching = matching or [h for h in headers if fnmatchcase(h, said)]
+            matching = [h for h in sheet.names if said in _spellings(h)]
+            matching = matching or [h for h in sheet.names if fnmatchcase(h, said)]
             if not matching and said in self.needed:
-                raise InputError(f"no column '{said}'", nearest(said, list(headers)), path)
+                raise sheet.no_column(said)
             if len(matching) > 1 or (matching and name in found.values()):
                 expected = "one column for each name"
                 both = " and ".join(matching or [said])
-                raise InputError(f"{both} for {name}", expected, path, column=said)
+                raise sheet.header_error(f"{both} for {name}", expected, said)
             found |= dict.fromkeys(matching, name)
         return found
 
@@ -735,7 +736,7 @@ def arranged(sheet: Sheet, layout: Layout) -> Sheet:
         return sheet
     present = [p for p in layout.ignore if any(fnmatchcase(name, p) for name in sheet.names)]
     sheet = sheet.without(present) if present else sheet
-    called = layout.called(sheet.names, sheet.path)
+    called = layout.called(sheet)
     # A column that has such a name already is not the one that was meant.
     kept = [n for n in sheet.names if n in called or n not in called.values()]
     sheet = sheet.only(kept)

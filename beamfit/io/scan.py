@@ -21,6 +21,7 @@ from beamfit.io.columns import (
     UNITS,
     Column,
     Columns,
+    Layout,
     Sheet,
     columns_of,
     ignored,
@@ -682,7 +683,9 @@ def read_tuning_scan(
     ([5.0, 6.0, 5.0], 'knob')
     """
     sheet = read_columns(path, "Q2_A,knob,size_x_um", columns, ignore, skip_bad, MOST_ROWS)
-    names = {knob: _header(knob, sheet) for knob in dict.fromkeys(knobs)}
+    knobs = tuple(dict.fromkeys(knobs))
+    layout = Layout(tuple(zip(knobs, knobs, strict=True)), knobs)
+    names = {knob: name for name, knob in layout.called(sheet).items()}
     called = {knob: sheet.called.get(name, name) for knob, name in names.items()}
     if any(EMITTANCE.match(name) for name in sheet.names):
         return _emittances(replace(sheet, skip=""), names, called)
@@ -717,20 +720,6 @@ def _emittances(sheet: Sheet, names: Mapping[str, str], called: dict[str, str]) 
         notes=left_out(sheet),
         columns=called | {k.replace(word, "emittance "): c.header for k, c in found.items()},
     )
-
-
-def _header(knob: str, sheet: Sheet) -> str:
-    """The header of a knob: its name, or its name with a unit."""
-    if knob in sheet.names:
-        return knob
-    found = [name for name in sheet.names if spelled(name).rpartition("_")[0] == knob]
-    if not found:
-        expected = nearest(knob, list(sheet.names))
-        raise sheet.header_error(f"no column of the knob '{knob}'", expected)
-    if len(found) > 1:
-        expected = "its header as it stands: " + " or ".join(found)
-        raise InputError(f"a knob '{knob}' of several columns", expected)
-    return found[0]
 
 
 def _unit(knob: str, header: str) -> str:
