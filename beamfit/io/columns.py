@@ -336,6 +336,11 @@ class Sheet:
         cells = [c[keep] if isinstance(c, np.ndarray) else [c[r] for r in keep] for c in self.cells]
         return replace(self, cells=cells, lines=lines)
 
+    def without_rows(self, keep: Sequence[int], bad: Iterable[InputError]) -> Sheet:
+        """Some of the rows, and what is wrong with the others."""
+        errors = sorted((*self.bad, *bad), key=lambda error: error.line or 0)
+        return replace(self.rows(keep), bad=tuple(errors))
+
     def good(self, check: Callable[[Sheet], object]) -> Sheet:
         """Leave out the rows that a check of each row refuses, and keep what it said of them.
 
@@ -345,7 +350,7 @@ class Sheet:
             If no row is left: the first that was wrong.
         """
         keep: list[int] = []
-        bad = list(self.bad)
+        bad: list[InputError] = []
         waiting = [range(len(self))]
         while waiting:
             rows = waiting.pop()
@@ -361,8 +366,7 @@ class Sheet:
                     waiting += [rows[half:], rows[:half]]
         if bad and not keep:
             raise bad[0]
-        bad.sort(key=lambda error: error.line or 0)
-        return replace(self.rows(keep), bad=tuple(bad))
+        return self.without_rows(keep, bad)
 
     def numbers(
         self,

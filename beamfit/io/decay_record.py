@@ -207,8 +207,10 @@ def _record(sheet: Sheet, skip_bad: bool, offset: str | None) -> DecayRecord:
             raise sheet.header_error(found, option)
     notes = taken_for_current(columns)
     if skip_bad:
-        whole, sheet = sheet, sheet.good(lambda rows: _check_alone(rows, columns, offset is None))
-        notes += _below_zero(whole, columns) if offset is None else ()
+        sheet = sheet.good(lambda rows: [rows.values(column) for column in columns.values()])
+    if skip_bad and offset is None:
+        sheet, below = _not_negative(sheet, columns["current"])
+        notes += below
     moment = _moments(sheet, columns)
     if moment.size > 2 and moment[0] > moment[-1] and np.all(np.diff(moment) <= 0):
         notes += ("The rows stand newest first, and were read in order of time.",)
@@ -271,26 +273,25 @@ def _refused(
     return sheet.error(fault.found, expected, row, column.header)
 
 
-def _check_alone(sheet: Sheet, columns: Mapping[str, Column], positive: bool) -> None:
-    """Refuse a row that is wrong whatever the others are."""
-    for key, column in columns.items():
-        values = sheet.values(column)
-        if key == "current" and positive:
-            found = "a negative current, {:.6g} mA"
-            sheet.refuse(column.header, values < 0, "zero or more", found, values)
-
-
-def _below_zero(sheet: Sheet, columns: Mapping[str, Column]) -> tuple[str, ...]:
-    """Note on readings below zero, which are left out: an offset is in the others, too."""
-    read = sheet.good(lambda rows: _check_alone(rows, columns, False))
-    values = read.values(columns["current"])
-    below = values[values < 0]
+def _not_negative(sheet: Sheet, column: Column) -> tuple[Sheet, tuple[str, ...]]:
+    """Leave out readings below zero, and say of many that an offset is in the others, too."""
+    values = sheet.values(column)
+    below = np.flatnonzero(values < 0)
+    bad = [
+        sheet.error(
+            f"a negative current, {values[k]:.6g} mA", "zero or more", int(k), column.header
+        )
+        for k in below
+    ]
+    if below.size == values.size:
+        raise bad[0]
+    sheet = sheet.without_rows(np.flatnonzero(values >= 0).tolist(), bad)
     if below.size < FEWEST:
-        return ()
-    return (
-        f"{below.size} readings are below zero, {np.median(below):.3g} mA in the middle: what the "
-        "monitor reads without beam is in the others too, and of noise about zero half is left. "
-        "Take it off with --offset zero-beam instead.",
+        return sheet, ()
+    return sheet, (
+        f"{below.size} readings are below zero, {np.median(values[below]):.3g} mA in the middle: "
+        "what the monitor reads without beam is in the others too, and of noise about zero half is "
+        "left. Take it off with --offset zero-beam instead.",
     )
 
 
@@ -304,8 +305,7 @@ def _forward(
     last = keep[np.searchsorted(keep, np.arange(moment.size)) - 1]
     wrong = np.flatnonzero(moment <= late)
     bad = [_goes_back(sheet, columns, int(k), cells[last[k]]) for k in wrong]
-    bad = tuple(sorted((*sheet.bad, *bad), key=lambda e: e.line or 0))
-    return replace(sheet.rows([int(k) for k in keep]), bad=bad), moment[keep]
+    return sheet.without_rows(keep.tolist(), bad), moment[keep]
 
 
 def _check_base(sheet: Sheet, column: Column, moment: np.ndarray) -> None:
