@@ -31,17 +31,17 @@ from beamfit.particles import LIGHT
 
 UNITS: dict[str, dict[str, float]] = {
     # quantity: unit at the end of a name -> factor to SI (a stored current: to mA)
-    "length": {"um": 1e-6, "mm": 1e-3, "m": 1.0, "µm": 1e-6, "μm": 1e-6, "nm": 1e-9, "cm": 1e-2},
+    "length": {"um": 1e-6, "mm": 1e-3, "m": 1.0, "nm": 1e-9, "cm": 1e-2},
     "length or duration": {"mm": 1e-3, "m": 1.0, "ps": LIGHT / 1e12},
     "time": {"s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9},
-    "current": {"mA": 1.0, "A": 1e3, "uA": 1e-3, "µA": 1e-3, "μA": 1e-3, "nA": 1e-6},
+    "current": {"mA": 1.0, "A": 1e3, "uA": 1e-3, "nA": 1e-6},
     "voltage": {"kV": 1e3, "V": 1.0, "MV": 1e6},
     "pressure": {"Pa": 1.0, "mbar": 100.0, "Torr": 101325 / 760},
     "energy in MeV": {"MeV": 1.0},
 }
 UNITS["length or share"] = UNITS["length"] | {"%": 0.01}
 # Units at the end of a header, as the columns' names have them.
-KNOWN = {*SETTINGS, "µs", *(unit for units in UNITS.values() for unit in units)}
+KNOWN = {*SETTINGS, *(unit for units in UNITS.values() for unit in units)}
 ENDS = tuple(f"_{unit}" for unit in KNOWN)
 # Other ways to write one; in capitals or small letters no other unit is meant by these.
 ALSO = {
@@ -72,14 +72,9 @@ BETWEEN = re.compile(r"\s+in\s+|[\s_]*[\[(]|\s+/\s+|/|,\s?|[\s_]+")
 
 
 def known_unit(text: str) -> str | None:
-    """A unit as the names of columns have it; None if the text is none."""
-    text = text.strip().strip("[]()").strip()
+    """A unit as the names of columns have it, with u for either letter µ; None if it is none."""
+    text = re.sub("[µμ]", "u", text.strip().strip("[]()").strip())
     return text if text in KNOWN else ALSO.get(text)
-
-
-def plain_unit(text: str) -> str:
-    """A unit, or a name that ends with one, with u for either letter µ."""
-    return re.sub("[µμ]", "u", text)
 
 
 def named(name: str, unit: str) -> str:
@@ -94,7 +89,7 @@ def spelled(header: str) -> str:
     Examples
     --------
     >>> [spelled(h) for h in ("Q525 [T/m]", "size x (µm)", "Time / h", "SIZE_X_MM", "Q5 T m^-1")]
-    ['Q525_T_per_m', 'size_x_µm', 'Time_h', 'SIZE_X_mm', 'Q5_T_per_m']
+    ['Q525_T_per_m', 'size_x_um', 'Time_h', 'SIZE_X_mm', 'Q5_T_per_m']
     >>> [spelled(h) for h in ("I/A", "size x, um", "size x in um", "Q1_T/m", "sr/dcct/A")]
     ['I_A', 'size_x_um', 'size_x_um', 'Q1_T_per_m', 'sr/dcct/A']
     """
@@ -122,7 +117,7 @@ def number_and_unit(cell: str) -> tuple[str, str] | None:
     [('627', 'um'), ('1.5', 'A'), None, None]
     """
     found = None if cell[-1:].isdigit() else NUMBER.fullmatch(cell)
-    unit = known_unit(plain_unit(found[2])) if found else None
+    unit = known_unit(found[2]) if found else None
     return (found[1], unit) if unit else None
 
 
@@ -171,7 +166,7 @@ def with_units(
     found = []
     for name, unit in zip(names, units, strict=True):
         own = unit_at_end(spelled(name))
-        if own and unit and plain_unit(own) != plain_unit(unit):
+        if own and unit and own != unit:
             expected = "one unit, in the header or below it"
             raise InputError(f"'{unit}' below a header in {own}", expected, path, line, name)
         found.append(name if own or unit is None else named(name, unit))
@@ -403,7 +398,7 @@ class Sheet:
         values, row = numbers_of(cells, read, blank)
         if row is not None and unit and number_and_unit(str(cells[row])):
             apart = ((cell, number_and_unit(str(cell))) for cell in cells)
-            cells = [own[0] if own and own[1] == plain_unit(unit) else cell for cell, own in apart]
+            cells = [own[0] if own and own[1] == unit else cell for cell, own in apart]
             values, row = numbers_of(cells, read, blank)
         if row is None:
             return values
@@ -527,10 +522,9 @@ def _known(header: str, quantities: Mapping[str, str], sheet: Sheet) -> Column |
         return None
     units = UNITS[kind]
     if unit not in units:
-        listed = ", ".join(u for u in units if u.isascii())
         whole = header.lower() in quantities  # such as size_x_error
         named, found = (header, "no unit") if whole else (name, f"unknown unit '{unit}'")
-        expected = f"one of {listed} at the end, such as {named}_{next(iter(units))}"
+        expected = f"one of {', '.join(units)} at the end, such as {named}_{next(iter(units))}"
         raise sheet.header_error(found, expected, header)
     return Column(header, name, unit, units[unit])
 

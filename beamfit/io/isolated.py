@@ -27,7 +27,7 @@ import numpy as np
 
 from beamfit.errors import InputError, plain
 from beamfit.io.cells import check_length
-from beamfit.io.columns import SETTINGS, known_unit, named, plain_unit, spelled, unit_at_end
+from beamfit.io.columns import SETTINGS, known_unit, named, spelled, unit_at_end
 from beamfit.io.files import digest_now, read_bytes
 from beamfit.particles import LIGHT
 
@@ -204,7 +204,7 @@ def _with_units(
             known = own
         elif own is None:
             name = named(name, known or unit)
-        elif known is None or plain_unit(known) != plain_unit(own):
+        elif known is None or known != own:
             expected = f"one unit, {own} or the attribute's"
             raise InputError(f"the attribute units = '{unit}'", expected, path, column=name)
         found[name] = values
