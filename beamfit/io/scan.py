@@ -21,7 +21,6 @@ from beamfit.io.columns import (
     UNITS,
     Column,
     Columns,
-    Layout,
     Sheet,
     columns_of,
     ignored,
@@ -683,9 +682,7 @@ def read_tuning_scan(
     ([5.0, 6.0, 5.0], 'knob')
     """
     sheet = read_columns(path, "Q2_A,knob,size_x_um", columns, ignore, skip_bad, MOST_ROWS)
-    knobs = tuple(dict.fromkeys(knobs))
-    layout = Layout(tuple(zip(knobs, knobs, strict=True)), knobs)
-    names = {knob: name for name, knob in layout.called(sheet).items()}
+    names = {knob: _header(knob, sheet) for knob in dict.fromkeys(knobs)}
     called = {knob: sheet.called.get(name, name) for knob, name in names.items()}
     if any(EMITTANCE.match(name) for name in sheet.names):
         return _emittances(replace(sheet, skip=""), names, called)
@@ -720,6 +717,19 @@ def _emittances(sheet: Sheet, names: Mapping[str, str], called: dict[str, str]) 
         notes=left_out(sheet),
         columns=called | {k.replace(word, "emittance "): c.header for k, c in found.items()},
     )
+
+
+def _header(knob: str, sheet: Sheet) -> str:
+    """The header of a knob: its name, or its name with a unit."""
+    if knob in sheet.names:
+        return knob
+    found = [name for name in sheet.names if spelled(name).rpartition("_")[0] == knob]
+    if not found:
+        raise sheet.no_column(knob)
+    if len(found) > 1:
+        expected = "its header as it stands: " + " or ".join(found)
+        raise sheet.header_error(f"a knob '{knob}' of several columns", expected)
+    return found[0]
 
 
 def _unit(knob: str, header: str) -> str:
