@@ -36,8 +36,9 @@ MEANT = words(
     "l k0 k1 angle tilt knl ksl k1s k0s ktap hgap fint fintx ks ksi volt ex ey ex_l ey_l "
     "kill_ent_fringe kill_exi_fringe dx dy ds h knll charge cnll bet sigx sigy xma yma"
 )
-# GeV; the charges of those that MAD-X knows by name.
-KNOWN = {"positron": 1.0, "electron": -1.0, "proton": 1.0, "antiproton": -1.0}
+# Particles that MAD-X knows by name, and those whose charge is -1.
+BY_NAME = words("positron electron proton antiproton")
+NEGATIVE = dict.fromkeys(words("electron antiproton H-"), -1.0)
 # Relative: masses that differ by less are one particle's.
 SAME_MASS = 2e-4
 # Parameters that bend, focus, couple or accelerate in a way beamfit does not model.
@@ -498,7 +499,7 @@ def _beam(
             expected = "" if program.dialect is ELEGANT else "BEAM, ENERGY = or "
             expected += "--energy in MeV (energy= from Python)"
             raise InputError("no beam energy in the file", expected, path)
-        value, rest = _of_beam(program, beam[key]), 1e-3 * REST_ENERGY[particle]
+        value, rest = _single(program, beam[key]), 1e-3 * REST_ENERGY[particle]
         if key == "beta" and not 0.0 < value < 1.0:
             raise InputError(f"BEAM with BETA = {value:g}", "one between 0 and 1", path)
         momentum = value if key == "pc" else LIGHT / 1e9 * value
@@ -513,14 +514,6 @@ def _beam(
     return particle, float(total)
 
 
-def _of_beam(program: Interpreter, parameter: Attribute) -> float:
-    try:
-        return _single(program, parameter)
-    except InputError as error:
-        found = f"a BEAM that cannot be read ({error.found})"
-        raise InputError(found, "a number", parameter.path, parameter.line) from None
-
-
 def _particle(beam: dict[str, Attribute], program: Interpreter, path: str | PathLike[str]) -> str:
     """The particle of a BEAM by its name, which goes before, or by its mass and charge.
 
@@ -528,24 +521,20 @@ def _particle(beam: dict[str, Attribute], program: Interpreter, path: str | Path
     refused here.
     """
     named = word_of(beam["particle"]).lower() if "particle" in beam else None
-    mass = _of_beam(program, beam["mass"]) if "mass" in beam else None
-    charge = _of_beam(program, beam["charge"]) if "charge" in beam else None
+    mass, charge = (
+        _single(program, beam[key]) if key in beam else None for key in ("mass", "charge")
+    )
     if named is None and mass is None:
         named = program.dialect.particle
-    known = [*KNOWN] if named in KNOWN else [*REST_ENERGY]
-    names = [named] if named in KNOWN else known
-    fits = []
-    for name in names:
-        own = KNOWN.get(name, -1.0 if name == "H-" else 1.0)
+    byname = named in BY_NAME
+    for name in [named] if byname else REST_ENERGY:
         same = mass is None or abs(1e3 * mass / REST_ENERGY[name] - 1.0) < SAME_MASS
-        if same and (
-            (charge is None and named in KNOWN) or own == (1.0 if charge is None else charge)
-        ):
-            fits.append(name)
-    if not fits or (named not in KNOWN and mass is None):
-        found = f"particle '{named}'" if named else "a particle"
-        found += "" if mass is None else f" of mass {mass:g} GeV"
-        found += "" if charge is None else f" and charge {charge:g}"
-        expected = f"{nearest(str(named), known)}, by a name that MAD-X knows or by mass and charge"
-        raise InputError(found, expected, path)
-    return fits[0]
+        usual = NEGATIVE.get(name, 1.0) if byname else 1.0
+        own = NEGATIVE.get(name, 1.0)
+        if same and (byname or mass is not None) and own == (usual if charge is None else charge):
+            return name
+    found = f"particle '{named}'" if named else "a particle"
+    found += "" if mass is None else f" of mass {mass:g} GeV"
+    found += "" if charge is None else f" and charge {charge:g}"
+    near = nearest(str(named), list(BY_NAME if byname else REST_ENERGY))
+    raise InputError(found, f"{near}, by a name that MAD-X knows or by mass and charge", path)

@@ -140,9 +140,10 @@ def read_sheet(
     if hasattr(path, "itertuples"):
         return _of_frame(path, most)
     expect(path, str | PathLike, "'scan.csv', or a pandas frame")
-    if _is_binary(path):
+    suffix = Path(path).suffix.lower()
+    if suffix in BINARY or first_bytes(path, 4) == b"SDDS":
         return _binary(path, most)
-    if Path(path).suffix.lower() == ".json":
+    if suffix == ".json":
         return _of_json(path, most)
     return _read_text(path, example, most, ragged, names)
 
@@ -301,11 +302,6 @@ def _check_header(names: list[str], example: str, path: str | PathLike[str], lin
     if len(names) > 3 and all(map(is_number, names[1:])):
         expected = f"columns below a header such as {example}, a row for each setting"
         raise InputError("a table on its side", expected, path=path, line=line)
-
-
-def _is_binary(path: str | PathLike[str]) -> bool:
-    """Tell a file that a library reads: HDF5 and MATLAB by the name, SDDS by how it begins."""
-    return Path(path).suffix.lower() in BINARY or first_bytes(path, 4) == b"SDDS"
 
 
 def _binary(path: str | PathLike[str], most: int) -> Sheet:

@@ -288,7 +288,7 @@ def test_which_line(written):
         ("a.lte", "C: CHARGE, TOTAL=1e-9\nLC: LINE=(C)", "without elements"),
         ("a.madx", "beam, energy=1; d: drift, l=1; lc: line=(d, pi);", "'pi' in a LINE"),
         ("a.madx", "beam, energy=1; k := 3**; lc: line=(k);", "'3**'"),
-        ("a.madx", "beam, energy=k; k := 3; d: drift, l=1; lc: line=(d);", "BEAM"),
+        ("a.madx", "beam, energy=k; k := 3; d: drift, l=1; lc: line=(d);", "undefined 'k'"),
         ("a.madx", MADX.replace("at=0.5", "at=0.1"), "overlap"),
         ("a.madx", "call, file='nowhere.madx';\n", "nowhere.madx"),
         ("a.ele", "&run_setup\n lattice = line.lte\n&end\n", "command file"),
