@@ -30,7 +30,7 @@ TO_CENTRE = {"entry": 0.5, "centre": 0.0, "center": 0.0, "exit": -0.5}
 SCREENS = words("monitor hmonitor vmonitor imonitor blmonitor slmonitor instrument profile wire")
 SPACES = words(
     "drift kicker hkicker vkicker tkicker sextupole octupole collimator ecollimator rcollimator "
-    "solenoid rfcavity elseparator placeholder"
+    "solenoid rfcavity twcavity hacdipole vacdipole elseparator placeholder"
 )
 MEANT = words(
     "l k0 k1 angle tilt knl ksl k1s k0s ktap hgap fint fintx ks ksi volt ex ey ex_l ey_l "
@@ -41,37 +41,16 @@ BY_NAME = words("positron electron proton antiproton")
 NEGATIVE = dict.fromkeys(words("electron antiproton H-"), -1.0)
 # Relative: masses that differ by less are one particle's.
 SAME_MASS = 2e-4
-# Parameters that bend, focus, couple or accelerate in a way beamfit does not model.
-UNMODELLED = {
-    "ks": "a solenoid field",
-    "ksi": "a solenoid field",
-    "b": "a field given as B",
-    "k1s": "a skew gradient",
-    "k0s": "a skew bend",
-    "ktap": "a tapered field",
-    "fse": "a field error",
-    "etilt": "a tilt error",
-    "t0": "a tilted component",
-    "t1": "a tilted component",
-    "bore": "a field given by its bore",
-    "use_bn": "a field given by B1, B2, ...",
-    "volt": "an accelerating voltage",
-    "ex": "an electric field",
-    "ey": "an electric field",
-    "kill_ent_fringe": "an edge switched off",
-    "kill_exi_fringe": "an edge switched off",
-}
-# Elements that are nothing where some parameter is zero.
+# Parameters that bend, focus, couple or accelerate in a way beamfit does not model, of any element
+# and of some that are nothing without.
+UNMODELLED = words(
+    "ks ksi b k1s k0s ktap fse etilt t0 t1 bore use_bn volt ex ey kill_ent_fringe kill_exi_fringe"
+)
 NOTHING_AT_ZERO = {
-    "srotation": ("angle",),
-    "xrotation": ("angle",),
-    "yrotation": ("angle",),
+    **dict.fromkeys(words("srotation xrotation yrotation"), ("angle",)),
     "translation": ("dx", "dy", "ds"),
     "dipedge": ("h",),
     "nllens": ("knll",),
-    "twcavity": ("volt",),
-    "hacdipole": ("volt",),
-    "vacdipole": ("volt",),
     "beambeam": ("charge",),
 }
 EDGES = ("edge1_effects", "edge2_effects")
@@ -364,10 +343,7 @@ class _Element:
         return (*(value if isinstance(value, tuple) else (value,)), 0.0, 0.0)[:2]
 
     def _check_unmodelled(self) -> None:
-        for key, meaning in UNMODELLED.items():
-            if self._number(key) != 0.0:
-                raise self._refuse(f"with {meaning} ({key.upper()} = {self._number(key):g})")
-        for key in NOTHING_AT_ZERO.get(self.own.type.lower(), ()):
+        for key in (*UNMODELLED, *NOTHING_AT_ZERO.get(self.own.type.lower(), ())):
             if self._number(key) != 0.0:
                 raise self._refuse(f"with {key.upper()} = {self._number(key):g}")
         for key in EDGES:
