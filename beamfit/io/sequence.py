@@ -101,7 +101,11 @@ def read_sequence(
     program.finish(path)
     chosen = _chosen(program, path, use)
     particle, total = _beam(program, path, chosen.name.lower(), energy)
-    elements = numbered(_Line(program, chosen).tables())
+    try:
+        elements = numbered(_Line(program, chosen).tables())
+    except RecursionError:
+        found = f"'{chosen.name}', lists within lists without end"
+        raise chosen.error(found, "a line that a machine has") from None
     if not elements:
         raise chosen.error(f"'{chosen.name}' without elements", "a line with magnets and a screen")
     return LatticeFile(path, digest(path), chosen.name, total, particle, tuple(elements))
@@ -247,7 +251,7 @@ class _Line:
         """Names in a list, as of `_members`."""
         every: list[tuple[str, bool]] = []
         for *said, own in (member.children for member in tree.children):
-            number = next((int(word) for word in said if word.isdigit()), 1)
+            number = next((int(word[:9]) for word in said if word.isdigit()), 1)
             if number < 1:
                 raise line.error(f"{number} times an element", "one or more")
             found = self._list if isinstance(own, Tree) else self._member

@@ -436,6 +436,8 @@ HOSTILE = {
     "lines that double": (f"L0: line=(Q1);{DOUBLED}LC: line=(L60,B);", "more than 50000 elements"),
     "a list for a number": ("a = (1,2);" + "a = a + a;" * 60, "',' where it cannot stand"),
     "parentheses": (f"a = {'(1+' * 5000}1{')' * 5000};Q1->k1=a;LC: line=(Q1,B);", "recursion"),
+    "lists in lists": (f"LC: line={'(' * 5000}Q1{')' * 5000};", "lists within lists"),
+    "a number of copies": (f"LC: line=({'9' * 5000}*Q1,B);", "more than 50000 elements"),
     "names in a ring": ("a := b; b := a; Q1->k1 = a; LC: line=(Q1,B);", "defined by itself"),
     "comments": ("/*\n" * 100_000 + "LC: line=(Q1,B);", "no LINE"),
     "a file that calls itself": ('call, file="a.madx";', "more than 50 files called"),
