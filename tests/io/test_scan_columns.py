@@ -262,32 +262,49 @@ def test_a_size_that_says_nan_was_not_measured(read):
         read("Q_A,size_x_um,size_x_error_um\n0,90,1\n1,nan,1\n2,60,1\n3,90,1\n")
 
 
-# A comment -> the header that would not be asked about, and what stands below which is.
-SPOKEN = {
-    "Gauss fit, FWHM by eye": "fwhm_x_um",
-    "sizes were FWHM, divided by 2.35": "fwhm_x_um",
+def test_a_comment_that_speaks_of_another_width_is_asked_about(read):
+    for said in ("Gauss fit, FWHM by eye", "sizes were FWHM, divided by 2.35", "1 px = 27 um"):
+        text = f"# {said}\n" + table(["Q_A", "size_x_um", "note_"])
+        (note,) = read(text).notes
+        assert f"'{said}'" in note
+        assert "fwhm_x_um" in note
+        assert said not in "".join(read(text.replace("size_x", "fwhm_x")).notes)
+    (note,) = read("# units: A, mm\n" + table(["Q_A", "size_x_um", "note_"])).notes
+    assert "'units: A, mm', and the sizes are taken in um" in note
+    assert not read("# units: A, µm\n" + table(["Q_A", "size_x_um", "note_"])).notes
+
+
+# What is stated of all sizes -> the header under which it would be true.
+STATEMENTS = {
     "all widths are FWHM": "fwhm_x_um",
-    "OTR2: sizes = 4 sigma": "fwhm_x_um",
-    "1 px = 27 um": "fwhm_x_um",
-    "units: A, mm": "size_x_mm",
+    "scan of QA, FWHM sizes": None,
+    "FWHM beam sizes": "fwhm_x_um",
     "Beam size (rms) in mm": "size_x_mm",
+    "OTR2: sizes = 4 sigma": "4sigma_x_um",
+    "screen size in mm": None,
+    "size errors in mm": None,
+    "sizes in µm": None,
 }
 
 
-@pytest.mark.parametrize("said", SPOKEN)
-def test_a_comment_of_another_width_or_unit_than_the_header_is_asked_about(said, read):
-    text = f"# day 3\n# {said}\n" + table(["Q_A", "size_x_um", "note_"])
-    (note,) = read(text).notes
-    assert note.startswith(f"A comment says '{said}', and the header size_x_um that sizes are rms")
-    assert f"such as fwhm_x_{SPOKEN[said][-2:]}" in note
-    assert said not in "".join(read(text.replace("size_x_um", SPOKEN[said])).notes)
+@pytest.mark.parametrize("said", STATEMENTS)
+def test_a_comment_that_contradicts_the_header_is_refused_in_its_line(said, read):
+    text, mend = f"# day 3\n# {said}\n" + table(["Q_A", "size_x_um", "note_"]), STATEMENTS[said]
+    if mend is None:
+        assert len(read(text)) == len(ROWS)
+        return
+    with pytest.raises(InputError, match=rf":2: column 'size_x_um': .*'{re.escape(said)}'") as no:
+        read(text)
+    assert f"rename the column {mend} if" in str(no.value)
+    assert len(read(text.replace("size_x_um", mend))) == len(ROWS)
 
 
-def test_a_comment_of_rms_over_a_fwhm_is_asked_about(read):
-    notes = read("# sizes are rms\n" + table(["Q_A", "fwhm_x_um", "note_"])).notes
-    assert "sizes are no rms in um: is that so?" in " ".join(notes)
-    for said in ("sizes in µm", "sizes are rms", "units: A, µm", "by me"):
-        assert not read(f"# {said}\n" + table(["Q_A", "size_x_um", "note_"])).notes
+def test_a_comment_of_rms_over_a_fwhm_and_one_of_pixels_are_refused(read):
+    text = "# sizes are rms\n" + table(["Q_A", "fwhm_x_um", "note_"])
+    with pytest.raises(InputError, match="rename the column size_x_um"):
+        read(text)
+    with pytest.raises(InputError, match="give lengths, in um"):
+        read(text.replace("rms", "in pixels").replace("fwhm", "size"))
 
 
 def test_errors_that_are_all_zero_are_to_be_left_unread(read):
