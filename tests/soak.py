@@ -33,14 +33,15 @@ from beamfit.greybox.mlp import dense
 from beamfit.io import isolated
 from beamfit.io.columns import SHIPPED, layout_of
 from beamfit.io.emittance_gui import read_emittance_gui
-from beamfit.io.formulation import read_formulation, read_network, read_numbers
+from beamfit.io.files import read_text
+from beamfit.io.formulation import read_formulation, read_numbers
 from beamfit.io.line import read_lattice
 from beamfit.io.machine import read_scan_machine
 from beamfit.io.result import load_fit, read_fitted_beams, save_fit
-from beamfit.io.ring import read_ring, read_twiss
+from beamfit.io.ring import read_along, read_ring
 from beamfit.io.run import read_run
 from beamfit.io.scan import read_quad_scan
-from beamfit.language.network_xml import format_network
+from beamfit.language.network_xml import format_network, parse_network
 from beamfit.language.plan import check_document
 from beamfit.sampling.ensemble import draw
 from beamfit.sampling.store import load
@@ -144,14 +145,14 @@ def readers(folder: Path, with_store: bool) -> dict[str, Reader]:
         "layout .toml": Reader(".toml", layouts, layout_of),
         "machine .toml": Reader(".toml", [machine.encode()], read_scan_machine),
         "ring .toml": Reader(".toml", [of("lattices/spear3_2003.toml")], read_ring),
-        "optics .csv": Reader(".csv", [ring], lambda p: read_twiss(p, 234.144)),
-        "optics .tfs": Reader(".tfs", [twiss], lambda p: read_twiss(p, 10.0)),
+        "optics .csv": Reader(".csv", [ring], lambda p: read_along(234.144, Path(p), None)[0]),
+        "optics .tfs": Reader(".tfs", [twiss], lambda p: read_along(10.0, Path(p), None)[0]),
         "MAD-X": Reader(".madx", [MADX.encode()], read_lattice),
         "MAD-8": Reader(".mad8", [MAD8.encode()], read_lattice),
         "elegant": Reader(".lte", [ELEGANT.encode()], lambda p: read_lattice(p, energy=135.0)),
         "formulation .bf": Reader(".bf", text, documents),
         "formulation .xml": Reader(".xml", xml, documents),
-        "network .xml": Reader(".xml", [network], read_network),
+        "network .xml": Reader(".xml", [network], lambda p: parse_network(read_text(p), p)),
         "numbers": Reader(".csv", [of("formulations/fitdata_simulated.csv")], read_numbers),
         "kept fit": Reader(".json", [(folder / "fit.json").read_bytes()], load_fit),
         "fitted beams": Reader(".json", [result], lambda p: read_fitted_beams(p, 0.511)),

@@ -293,15 +293,7 @@ class QuadScan:
 
     def columns_at(self, rows: Sequence[int]) -> dict[str, Any]:
         """Select some rows: arguments of `QuadScan` by name."""
-
-        def taken(values: Any) -> Any:
-            if isinstance(values, Mapping):
-                return {name: taken(v) for name, v in values.items()}
-            if values is None or isinstance(values, tuple):
-                return values and tuple(values[i] for i in rows)
-            return np.asarray(values)[rows]
-
-        return {name: taken(getattr(self, name)) for name in EACH_ROW}
+        return {name: at_rows(getattr(self, name), rows) for name in EACH_ROW}
 
     def of_slice(self, name: str) -> QuadScan:
         """The rows of one slice of the beam, in the planes it was measured in.
@@ -457,6 +449,21 @@ class QuadScan:
                     f"{number} distinct {distinct}{'s' * (number != 1)}{of} in plane {plane}",
                     "at least three: the beam matrix has three numbers",
                 )
+
+
+def at_rows(values: Any, rows: Sequence[int]) -> Any:
+    """Some rows of a column, of each of several by name, or of words; None of none.
+
+    Examples
+    --------
+    >>> at_rows({"x": np.array([1.0, 2.0]), "screen": ("A", "B")}, [1])
+    {'x': array([2.]), 'screen': ('B',)}
+    """
+    if isinstance(values, Mapping):
+        return {name: at_rows(v, rows) for name, v in values.items()}
+    if values is None or isinstance(values, tuple):
+        return values and tuple(values[i] for i in rows)
+    return np.asarray(values)[rows]
 
 
 def row_keys(scan: QuadScan) -> list[tuple]:

@@ -287,11 +287,17 @@ def numeric_rows(
     return np.concatenate(parts, axis=1)
 
 
-def check_length(rows: int, most: int, path: str | PathLike[str], line: int | None = None) -> None:
+def check_length(
+    rows: int,
+    most: int,
+    path: str | PathLike[str] | None = None,
+    line: int | None = None,
+    column: str | None = None,
+) -> None:
     """Refuse more rows than can be meant."""
     if rows > most:
         expected = "fewer: average what is repeated, or cut the file"
-        raise InputError(f"more than {most} rows", expected, path=path, line=line)
+        raise InputError(f"more than {most} rows", expected, path, line, column)
 
 
 COMMA = re.compile(r"[-+]?(\d+|\d{1,3}(?:[.'’\xa0\u202f]\d{3})+),\d+([eEdD][-+]?\d+)?")

@@ -26,7 +26,7 @@ from beamfit.io.line import FOREIGN, build_line, read_lattice
 from beamfit.io.ring import read_operation, read_ring
 from beamfit.io.run import read_run
 from beamfit.io.scan import is_known, is_size, likely_scan_name, read_quad_scan
-from beamfit.io.table import header_of, is_binary, read_columns, read_sheet
+from beamfit.io.table import read_columns
 from beamfit.io.toml import read_toml
 from beamfit.language.document import Document
 from beamfit.lifetime.record import DecayRecord, LifetimeTable
@@ -192,10 +192,7 @@ def _kind(path: str | PathLike[str], layout: Layout) -> str:
         return "formulation"
     if is_emittance_gui(path):
         return "scan"
-    tabled = suffix == ".json" or is_binary(path)
-    names = read_sheet(path, "").names if tabled else layout.header or header_of(path)
-    called = layout.called(names, path)
-    names = [called.get(name, name) for name in names]
+    names = read_columns(path, "Q2_A,size_x_um", layout, skip_bad=True).names
     head = ",".join(names)
     if re.search(r"\bbeta_x_m\b|\bBETX\b", head):
         found = "the optics of a ring"

@@ -31,17 +31,17 @@ from beamfit.particles import LIGHT
 
 UNITS: dict[str, dict[str, float]] = {
     # quantity: unit at the end of a name -> factor to SI (a stored current: to mA)
-    "length": {"um": 1e-6, "mm": 1e-3, "m": 1.0, "µm": 1e-6, "μm": 1e-6, "nm": 1e-9, "cm": 1e-2},
+    "length": {"um": 1e-6, "mm": 1e-3, "m": 1.0, "nm": 1e-9, "cm": 1e-2},
     "length or duration": {"mm": 1e-3, "m": 1.0, "ps": LIGHT / 1e12},
     "time": {"s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9},
-    "current": {"mA": 1.0, "A": 1e3, "uA": 1e-3, "µA": 1e-3, "μA": 1e-3, "nA": 1e-6},
+    "current": {"mA": 1.0, "A": 1e3, "uA": 1e-3, "nA": 1e-6},
     "voltage": {"kV": 1e3, "V": 1.0, "MV": 1e6},
     "pressure": {"Pa": 1.0, "mbar": 100.0, "Torr": 101325 / 760},
     "energy in MeV": {"MeV": 1.0},
 }
 UNITS["length or share"] = UNITS["length"] | {"%": 0.01}
 # Units at the end of a header, as the columns' names have them.
-KNOWN = {*SETTINGS, "µs", *(unit for units in UNITS.values() for unit in units)}
+KNOWN = {*SETTINGS, *(unit for units in UNITS.values() for unit in units)}
 ENDS = tuple(f"_{unit}" for unit in KNOWN)
 # Other ways to write one; in capitals or small letters no other unit is meant by these.
 ALSO = {
@@ -65,24 +65,16 @@ ALSO = {
     }.items()
     for word in words
 }
-# A header that ends with one of them, the longest.
-WRITTEN = re.compile(f"(.*?)[\\s_]({'|'.join(map(re.escape, ALSO))})")
 # A number and what stands behind it.
 NUMBER = re.compile(r"([-+]?(?:\d+[.,]?\d*|[.,]\d+)(?:[eE][-+]?\d+)?)\s*([^\W\d_].*|[%\[(].*)")
-# A name, and its unit in brackets or behind a stroke between blanks.
-BRACKETS = re.compile(r"(.*?)[\s_]*(?:\[(.*?)\]|\((.*?)\)|\s/\s+(\S+))\s*")
-APART = re.compile(r"([^/,]+?)(?:/|, ?| in )([^/,\s]+)")  # I/A, "I, A", I in A
+# What stands between a name and its unit: size x (µm), Q [T/m], I/A, "I, A", I in A, Time / h.
+BETWEEN = re.compile(r"\s+in\s+|[\s_]*[\[(]|\s+/\s+|/|,\s?|[\s_]+")
 
 
 def known_unit(text: str) -> str | None:
-    """A unit as the names of columns have it; None if the text is none."""
-    text = text.strip().strip("[]()").strip()
+    """A unit as the names of columns have it, with u for either letter µ; None if it is none."""
+    text = re.sub("[µμ]", "u", text.strip().strip("[]()").strip())
     return text if text in KNOWN else ALSO.get(text)
-
-
-def plain_unit(text: str) -> str:
-    """A unit, or a name that ends with one, with u for either letter µ."""
-    return re.sub("[µμ]", "u", text)
 
 
 def named(name: str, unit: str) -> str:
@@ -97,22 +89,18 @@ def spelled(header: str) -> str:
     Examples
     --------
     >>> [spelled(h) for h in ("Q525 [T/m]", "size x (µm)", "Time / h", "SIZE_X_MM", "Q5 T m^-1")]
-    ['Q525_T_per_m', 'size_x_µm', 'Time_h', 'SIZE_X_mm', 'Q5_T_per_m']
+    ['Q525_T_per_m', 'size_x_um', 'Time_h', 'SIZE_X_mm', 'Q5_T_per_m']
     >>> [spelled(h) for h in ("I/A", "size x, um", "size x in um", "Q1_T/m", "sr/dcct/A")]
     ['I_A', 'size_x_um', 'size_x_um', 'Q1_T_per_m', 'sr/dcct/A']
     """
-    if (found := BRACKETS.fullmatch(header)) and found[1]:
-        name, unit = found[1], next(part for part in found.groups()[1:] if part is not None)
-        if (known := known_unit(unit)) is not None:
-            return named(name.strip().removesuffix(f"_{known}"), known)
     if header.endswith(ENDS):
         return header
-    if found := WRITTEN.fullmatch(header):
-        return named(found[1], ALSO[found[2]])
-    if (found := APART.fullmatch(header)) and (known := known_unit(found[2])):
-        return named(found[1], known)
-    words = header.split()
-    return "_".join(words) if len(words) > 1 and words[-1] in KNOWN else header
+    for found in BETWEEN.finditer(header):
+        name, unit = header[: found.start()].strip(), known_unit(header[found.end() :])
+        path = found[0] in "/," and re.search("[/,]", name)  # such as sr/dcct/A
+        if name and unit and not path:
+            return named(name.removesuffix(f"_{unit}"), unit)
+    return header
 
 
 def unit_at_end(name: str) -> str | None:
@@ -129,7 +117,7 @@ def number_and_unit(cell: str) -> tuple[str, str] | None:
     [('627', 'um'), ('1.5', 'A'), None, None]
     """
     found = None if cell[-1:].isdigit() else NUMBER.fullmatch(cell)
-    unit = known_unit(plain_unit(found[2])) if found else None
+    unit = known_unit(found[2]) if found else None
     return (found[1], unit) if unit else None
 
 
@@ -178,7 +166,7 @@ def with_units(
     found = []
     for name, unit in zip(names, units, strict=True):
         own = unit_at_end(spelled(name))
-        if own and unit and plain_unit(own) != plain_unit(unit):
+        if own and unit and own != unit:
             expected = "one unit, in the header or below it"
             raise InputError(f"'{unit}' below a header in {own}", expected, path, line, name)
         found.append(name if own or unit is None else named(name, unit))
@@ -230,6 +218,10 @@ class Sheet:
         Of dates whose day and month are numbers, where a layout says it.
     arranged : bool
         Whether there is a layout: unknown columns are then ignored.
+    skip : str
+        What may be done about a row with something wrong in it, for messages.
+    optional : bool
+        Whether a person can say --columns and --ignore.
     """
 
     path: str | PathLike[str]
@@ -244,6 +236,8 @@ class Sheet:
     called: Mapping[str, str] = field(default_factory=dict)
     order: str = ""
     arranged: bool = False
+    skip: str = ""
+    optional: bool = False
 
     def __len__(self) -> int:
         return len(self.cells[0])
@@ -256,10 +250,10 @@ class Sheet:
     ) -> InputError:
         """Make the error that names the file, and the row and column if there are any."""
         if row is not None and self.lines is None:
-            return self.error(f"reading {row + 1}: {found}", expected, None, column)
-        line = None if row is None else self.lines[row]
+            return self.error(f"reading {row + 1}: {found}", expected + self.skip, None, column)
+        line, skip = (None, "") if row is None else (self.lines[row], self.skip)
         column = self.called.get(column, column)
-        return InputError(found, expected, path=self.path, line=line, column=column)
+        return InputError(found, expected + skip, path=self.path, line=line, column=column)
 
     def header_error(self, found: str, expected: str, column: str | None = None) -> InputError:
         """Make the error that names the header, and the column if it is one alone."""
@@ -337,6 +331,11 @@ class Sheet:
         cells = [c[keep] if isinstance(c, np.ndarray) else [c[r] for r in keep] for c in self.cells]
         return replace(self, cells=cells, lines=lines)
 
+    def without_rows(self, keep: Sequence[int], bad: Iterable[InputError]) -> Sheet:
+        """Some of the rows, and what is wrong with the others."""
+        errors = sorted((*self.bad, *bad), key=lambda error: error.line or 0)
+        return replace(self.rows(keep), bad=tuple(errors))
+
     def good(self, check: Callable[[Sheet], object]) -> Sheet:
         """Leave out the rows that a check of each row refuses, and keep what it said of them.
 
@@ -346,7 +345,7 @@ class Sheet:
             If no row is left: the first that was wrong.
         """
         keep: list[int] = []
-        bad = list(self.bad)
+        bad: list[InputError] = []
         waiting = [range(len(self))]
         while waiting:
             rows = waiting.pop()
@@ -362,8 +361,7 @@ class Sheet:
                     waiting += [rows[half:], rows[:half]]
         if bad and not keep:
             raise bad[0]
-        bad.sort(key=lambda error: error.line or 0)
-        return replace(self.rows(keep), bad=tuple(bad))
+        return self.without_rows(keep, bad)
 
     def numbers(
         self,
@@ -400,7 +398,7 @@ class Sheet:
         values, row = numbers_of(cells, read, blank)
         if row is not None and unit and number_and_unit(str(cells[row])):
             apart = ((cell, number_and_unit(str(cell))) for cell in cells)
-            cells = [own[0] if own and own[1] == plain_unit(unit) else cell for cell, own in apart]
+            cells = [own[0] if own and own[1] == unit else cell for cell, own in apart]
             values, row = numbers_of(cells, read, blank)
         if row is None:
             return values
@@ -471,31 +469,47 @@ def columns_of(
     0.001
     """
     found: dict[str, Column] = {}
+    unknown: list[InputError] = []
     for header in sorted(sheet.names, key=lambda name: name not in sheet.called):
         aside = sheet.arranged and header not in sheet.called
         said = spelled(header)
         try:
-            column = _known(said, quantities, sheet) or other(said)
+            if (column := _known(said, quantities, sheet) or other(said)) is None:
+                usual = [f"{q}_{next(iter(UNITS[k]))}" if k else q for q, k in quantities.items()]
+                raise sheet.header_error("an unknown column", nearest(header, usual), header)
         except InputError as error:
-            if aside:
-                continue
-            raise replace(error, column=sheet.called.get(header, header)) from None
-        column = column and column._replace(header=header)
-        if aside and (column is None or column.key in found):
+            own = sheet.called.get(header, header)
+            unknown += [] if aside else [replace(error, column=own)]
             continue
-        if column is None:
-            usual = [f"{q}_{next(iter(UNITS[k]))}" if k else q for q, k in quantities.items()]
-            raise sheet.header_error("an unknown column", nearest(header, usual), header)
-        if column.key in found:
-            first = found[column.key].header
-            twice = f"{column.key} also in column '{sheet.called.get(first, first)}'"
-            expected = "one column for it, in one unit, and none twice"
-            if header == found[column.key].header:
-                twice = f"{column.key} twice or more under one name"
-                expected = "a row for each shot, or names that differ"
-            raise sheet.header_error(twice, expected, header)
-        found[column.key] = column
+        if column.key not in found:
+            found[column.key] = column._replace(header=header)
+        elif not aside:
+            raise _twice(sheet, column.key, found[column.key].header, header)
+    if unknown:
+        raise _not_understood(unknown) if sheet.optional else unknown[0]
     return found
+
+
+def _twice(sheet: Sheet, key: str, first: str, header: str) -> InputError:
+    """Error of a quantity in two columns."""
+    if header == first:
+        expected = "a row for each shot, or names that differ"
+        return sheet.header_error(f"{key} twice or more under one name", expected, header)
+    expected = "one column for it, in one unit, and none twice"
+    expected += f"; --ignore '{header}' leaves this one unread" if sheet.optional else ""
+    named = sheet.called.get(first, first)
+    return sheet.header_error(f"{key} also in column '{named}'", expected, header)
+
+
+def _not_understood(unknown: Sequence[InputError]) -> InputError:
+    """Error of columns that nobody knows, all of which are named, and what may be said of them."""
+    first, names = unknown[0], [f"--ignore '{error.column}'" for error in unknown]
+    said = f"--columns '{first.column}=NAME' says what it is"
+    expected = f"{first.expected}; {said}, --ignore leaves it unread"
+    if len(unknown) > 1:
+        expected = f"names with units, such as size_x_um or time_s; {said} (`beamfit check` "
+        expected += f"proposes a layout), or to leave them unread: {' '.join(names)}"
+    return replace(first, expected=expected)
 
 
 def _known(header: str, quantities: Mapping[str, str], sheet: Sheet) -> Column | None:
@@ -508,10 +522,9 @@ def _known(header: str, quantities: Mapping[str, str], sheet: Sheet) -> Column |
         return None
     units = UNITS[kind]
     if unit not in units:
-        listed = ", ".join(u for u in units if u.isascii())
         whole = header.lower() in quantities  # such as size_x_error
         named, found = (header, "no unit") if whole else (name, f"unknown unit '{unit}'")
-        expected = f"one of {listed} at the end, such as {named}_{next(iter(units))}"
+        expected = f"one of {', '.join(units)} at the end, such as {named}_{next(iter(units))}"
         raise sheet.header_error(found, expected, header)
     return Column(header, name, unit, units[unit])
 
@@ -594,8 +607,8 @@ class Layout:
             other.header or self.header,
         )
 
-    def called(self, headers: Sequence[str], path: str | PathLike[str]) -> dict[str, str]:
-        """The name of each of a file's headers for which the layout has one.
+    def called(self, sheet: Sheet) -> dict[str, str]:
+        """The name of each of a sheet's headers for which the layout has one.
 
         Raises
         ------
@@ -604,19 +617,20 @@ class Layout:
 
         Examples
         --------
-        >>> layout_of("xrms=size_x_um, QUAD:BACT=Q525_kG").called(["QUAD:BACT", "xrms"], "a.csv")
-        {'xrms': 'size_x_um', 'QUAD:BACT': 'Q525_kG'}
+        >>> sheet = Sheet("a.csv", ("Q5:BACT", "xrms"), [["1"], ["9"]], [2], 1, ())
+        >>> layout_of("xrms=size_x_um, Q5:BACT=Q5_kG").called(sheet)
+        {'xrms': 'size_x_um', 'Q5:BACT': 'Q5_kG'}
         """
         found: dict[str, str] = {}
         for said, name in self.names:
-            matching = [h for h in headers if said in _spellings(h)]
-            matching = matching or [h for h in headers if fnmatchcase(h, said)]
+            matching = [h for h in sheet.names if said in _spellings(h)]
+            matching = matching or [h for h in sheet.names if fnmatchcase(h, said)]
             if not matching and said in self.needed:
-                raise InputError(f"no column '{said}'", nearest(said, list(headers)), path)
+                raise sheet.no_column(said)
             if len(matching) > 1 or (matching and name in found.values()):
                 expected = "one column for each name"
                 both = " and ".join(matching or [said])
-                raise InputError(f"{both} for {name}", expected, path, column=said)
+                raise sheet.header_error(f"{both} for {name}", expected, said)
             found |= dict.fromkeys(matching, name)
         return found
 
@@ -720,7 +734,7 @@ def arranged(sheet: Sheet, layout: Layout) -> Sheet:
         return sheet
     present = [p for p in layout.ignore if any(fnmatchcase(name, p) for name in sheet.names)]
     sheet = sheet.without(present) if present else sheet
-    called = layout.called(sheet.names, sheet.path)
+    called = layout.called(sheet)
     # A column that has such a name already is not the one that was meant.
     kept = [n for n in sheet.names if n in called or n not in called.values()]
     sheet = sheet.only(kept)

@@ -49,13 +49,10 @@ LIFETIMES = {
     "lifetime_error": "time",
     "beam_current": "current",
 }
-INCREASE = "times that increase; --skip-bad leaves out rows whose time does not"
+INCREASE = "times that increase"
 # Seconds beyond this many are counted from 1970, not from the start of a record (1973 or later);
 # beyond the others after 2050, of another origin, or after the year 5000, and are milliseconds.
 UNIX, LATEST, MILLISECONDS = 1e8, 2.5e9, 1e11
-# Seconds since 1970 that are milliseconds, ... below these.
-FINER = ((1e14, "ms", "milliseconds"), (1e17, "us", "microseconds"))
-FINER += ((np.inf, "ns", "nanoseconds"),)
 QUANTITIES = {
     "time": "time",
     "beam_current": "current",
@@ -210,8 +207,10 @@ def _record(sheet: Sheet, skip_bad: bool, offset: str | None) -> DecayRecord:
             raise sheet.header_error(found, option)
     notes = taken_for_current(columns)
     if skip_bad:
-        whole, sheet = sheet, sheet.good(lambda rows: _check_alone(rows, columns, offset is None))
-        notes += _below_zero(whole, columns) if offset is None else ()
+        sheet = sheet.good(lambda rows: [rows.values(column) for column in columns.values()])
+    if skip_bad and offset is None:
+        sheet, below = _not_negative(sheet, columns["current"])
+        notes += below
     moment = _moments(sheet, columns)
     if moment.size > 2 and moment[0] > moment[-1] and np.all(np.diff(moment) <= 0):
         notes += ("The rows stand newest first, and were read in order of time.",)
@@ -219,7 +218,7 @@ def _record(sheet: Sheet, skip_bad: bool, offset: str | None) -> DecayRecord:
     if skip_bad:
         sheet, moment = _forward(sheet, columns, moment)
     rest = {key: column for key, column in columns.items() if key not in ("time", "nanos")}
-    values = {key: _values(sheet, column) for key, column in rest.items()}
+    values = {key: sheet.values(column) for key, column in rest.items()}
     if len(moment) < 2:
         raise sheet.error(f"{len(moment)} readings", "two or more")
     _check_base(sheet, columns["time"], moment)
@@ -245,20 +244,10 @@ def _record(sheet: Sheet, skip_bad: bool, offset: str | None) -> DecayRecord:
     )
 
 
-def _values(sheet: Sheet, column: Column) -> np.ndarray:
-    try:
-        return sheet.values(column)
-    except InputError as error:
-        if "," in error.found:
-            raise
-        expected = f"{error.expected}; --skip-bad leaves such rows out"
-        raise replace(error, expected=expected) from None
-
-
 def _moments(sheet: Sheet, columns: Mapping[str, Column]) -> np.ndarray:
     """Times of the rows, s."""
-    moment = _values(sheet, columns["time"])
-    return moment + _values(sheet, columns["nanos"]) if "nanos" in columns else moment
+    moment = sheet.values(columns["time"])
+    return moment + sheet.values(columns["nanos"]) if "nanos" in columns else moment
 
 
 def _goes_back(sheet: Sheet, columns: Mapping[str, Column], row: int, latest: object) -> InputError:
@@ -277,33 +266,32 @@ def _refused(
     column, row = columns[fault.quantity], int(rows[fault.row])
     if column.unit == DATE and fault.row:
         return _goes_back(sheet, columns, row, sheet[column.header][int(rows[fault.row - 1])])
-    expected = INCREASE if fault.quantity == "time" else fault.expected
+    expected = fault.expected
+    sheet = sheet if fault.quantity == "time" else replace(sheet, skip="")
     if fault.quantity == "current" and negative:
         expected = "the other sign: most readings are negative"
     return sheet.error(fault.found, expected, row, column.header)
 
 
-def _check_alone(sheet: Sheet, columns: Mapping[str, Column], positive: bool) -> None:
-    """Refuse a row that is wrong whatever the others are."""
-    for key, column in columns.items():
-        values = _values(sheet, column)
-        if key == "current" and positive:
-            found = "a negative current, {:.6g} mA"
-            sheet.refuse(column.header, values < 0, "zero or more", found, values)
-
-
-def _below_zero(sheet: Sheet, columns: Mapping[str, Column]) -> tuple[str, ...]:
-    """Note on readings below zero, which are left out: an offset is in the others, too."""
-    values = _values(
-        sheet.good(lambda rows: _check_alone(rows, columns, False)), columns["current"]
-    )
-    below = values[values < 0]
+def _not_negative(sheet: Sheet, column: Column) -> tuple[Sheet, tuple[str, ...]]:
+    """Leave out readings below zero, and say of many that an offset is in the others, too."""
+    values = sheet.values(column)
+    below = np.flatnonzero(values < 0)
+    bad = [
+        sheet.error(
+            f"a negative current, {values[k]:.6g} mA", "zero or more", int(k), column.header
+        )
+        for k in below
+    ]
+    if below.size == values.size:
+        raise bad[0]
+    sheet = sheet.without_rows(np.flatnonzero(values >= 0).tolist(), bad)
     if below.size < FEWEST:
-        return ()
-    return (
-        f"{below.size} readings are below zero, {np.median(below):.3g} mA in the middle: what the "
-        "monitor reads without beam is in the others too, and of noise about zero half is left. "
-        "Take it off with --offset zero-beam instead.",
+        return sheet, ()
+    return sheet, (
+        f"{below.size} readings are below zero, {np.median(values[below]):.3g} mA in the middle: "
+        "what the monitor reads without beam is in the others too, and of noise about zero half is "
+        "left. Take it off with --offset zero-beam instead.",
     )
 
 
@@ -317,12 +305,11 @@ def _forward(
     last = keep[np.searchsorted(keep, np.arange(moment.size)) - 1]
     wrong = np.flatnonzero(moment <= late)
     bad = [_goes_back(sheet, columns, int(k), cells[last[k]]) for k in wrong]
-    bad = tuple(sorted((*sheet.bad, *bad), key=lambda e: e.line or 0))
-    return replace(sheet.rows([int(k) for k in keep]), bad=bad), moment[keep]
+    return sheet.without_rows(keep.tolist(), bad), moment[keep]
 
 
 def _check_base(sheet: Sheet, column: Column, moment: np.ndarray) -> None:
-    latest = np.max(moment)
+    latest, sheet = np.max(moment), replace(sheet, skip="")
     if LATEST < latest < MILLISECONDS:
         found = f"{latest:.6g} s since 1970, after the year 2050"
         expected = (
@@ -332,9 +319,9 @@ def _check_base(sheet: Sheet, column: Column, moment: np.ndarray) -> None:
         raise sheet.error(found, expected, int(np.argmax(moment)), column.header)
     if latest >= MILLISECONDS:
         found = f"{latest:.6g} s, after the year 5000"
-        unit, long = next(said for most, *said in FINER if latest < most)
+        finer = [u for u in ("ms", "us", "ns") if UNITS["time"][u] * latest < MILLISECONDS]
         header = sheet.called.get(column.header, column.header)
-        expected = f"the unit of the time: of {long} --columns '{header}=time_{unit}'"
+        expected = f"the unit of the time: --columns '{header}=time_{(finer or ['ns'])[0]}'"
         raise sheet.error(found, expected, int(np.argmax(moment)), column.header)
 
 
@@ -357,7 +344,7 @@ def _lifetimes(sheet: Sheet, skip_bad: bool) -> LifetimeTable:
 
 
 def _positive(sheet: Sheet, column: Column) -> np.ndarray:
-    values = _values(sheet, column)
+    values = sheet.values(column)
     found, written = f"{{:.6g}} {column.unit}", values / column.factor
     sheet.refuse(column.header, values <= 0, "above zero", found, written)
     return values
@@ -517,11 +504,7 @@ def record_columns(sheet: Sheet) -> dict[str, Column]:
     >>> {key: column.unit for key, column in record_columns(sheet).items()}
     {'time': 'a date', 'current': 'mA'}
     """
-    try:
-        found = columns_of(sheet, QUANTITIES, _other(sheet))
-    except InputError as error:
-        more = f"; --columns '{error.column}=NAME' says what it is, --ignore leaves it unread"
-        raise replace(error, expected=error.expected + more) from None
+    found = columns_of(sheet, QUANTITIES, _other(sheet))
     called = {CALLED.get(key, key): column for key, column in found.items()}
     return {key: column for key, column in called.items() if key in USED}
 

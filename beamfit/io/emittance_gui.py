@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from beamfit.emittance.scan import PLANES, POSSIBLE, Profile, QuadScan
+from beamfit.emittance.scan import PLANES, POSSIBLE, Profile, QuadScan, at_rows
 from beamfit.errors import InputError, nearest
 from beamfit.io.files import digest, laid_out, name_of
 from beamfit.io.isolated import matlab_variables
@@ -241,16 +241,6 @@ class _Settings(NamedTuple):
     about: dict[str, Any]
     notes: tuple[str, ...]
 
-    def rows(self, at: np.ndarray) -> dict[str, Any]:
-        """The columns for rows of these numbers."""
-
-        def taken(values: Any) -> Any:
-            if isinstance(values, dict):
-                return {name: v[at] for name, v in values.items()}
-            return tuple(values[i] for i in at) if isinstance(values, list) else values[at]
-
-        return {name: taken(values) for name, values in self.columns.items()} | self.about
-
 
 def _settings(source: _Fields, used: np.ndarray, n: int, lattice: LatticeFile) -> _Settings:
     cells = source.need("rMatrix").ravel()
@@ -268,7 +258,8 @@ def _settings(source: _Fields, used: np.ndarray, n: int, lattice: LatticeFile) -
     }
     if _of_several(source):
         names = _monitors(source, n)
-        labels = columns["screen"] = [names[i] for i in used]
+        labels = [names[i] for i in used]
+        columns["screen"] = tuple(labels)
     else:
         magnet = source.text("quadName", "quadrupole")
         columns["settings"] = {magnet: source.numbers("quadVal", n)[used]}
@@ -379,7 +370,8 @@ def _scan(
         for p in profiles
         if p.row in own and p.plane in kept
     )
-    return QuadScan(**settings.rows(own), size=size, error=error, name=name, profiles=seen)
+    part = at_rows(settings.columns, own) | settings.about
+    return QuadScan(**part, size=size, error=error, name=name, profiles=seen)
 
 
 def _distinct(sizes: np.ndarray, labels: list[str]) -> int:

@@ -1,8 +1,7 @@
-"""Formulations, the tables of numbers they use, and networks, from files."""
+"""Formulations and the tables of numbers they use, from files."""
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterable, Mapping, Sequence
 from os import PathLike
 from pathlib import Path
@@ -21,7 +20,6 @@ from beamfit.language.xml import format_xml, parse_xml
 from beamfit.writing import write_atomically
 
 if TYPE_CHECKING:
-    from beamfit.greybox.mlp import MLP
     from beamfit.language.compiled import Computed
     from beamfit.language.solution import ProblemSolution
 
@@ -215,40 +213,3 @@ def solved_formulation(
         from beamfit.language.solution import solve_document
 
         return solve_document(document, tables, starts, values, gains, **options)
-
-
-def read_network(path: str | os.PathLike[str]) -> MLP:
-    """Read a network from a file.
-
-    Parameters
-    ----------
-    path : path
-        An XML file in UTF-8.
-
-    Returns
-    -------
-    MLP
-
-    Raises
-    ------
-    InputError
-        If the file cannot be read or is not a network.
-    """
-    from beamfit.language.network_xml import parse_network  # JAX from here on
-
-    return parse_network(read_text(path), path)
-
-
-def write_network(path: str | os.PathLike[str], net: MLP) -> None:
-    """Write a network to a file, whole or not at all.
-
-    Parameters
-    ----------
-    path : path
-        Replaced if it exists.
-    net : MLP
-        The network.
-    """
-    from beamfit.language.network_xml import format_network
-
-    write_atomically(path, format_network(net).encode())

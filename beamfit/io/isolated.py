@@ -26,7 +26,8 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from beamfit.errors import InputError, plain
-from beamfit.io.columns import SETTINGS, known_unit, named, plain_unit, spelled, unit_at_end
+from beamfit.io.cells import check_length
+from beamfit.io.columns import SETTINGS, known_unit, named, spelled, unit_at_end
 from beamfit.io.files import digest_now, read_bytes
 from beamfit.particles import LIGHT
 
@@ -43,7 +44,6 @@ FILTERS = {1, 2, 3, 32000}
 IMAGES, PIXEL = "images", "pixel_um"
 # Letters of an attribute that is kept as a comment; a whole log may stand in one.
 LONGEST_COMMENT = 1000
-FEWER = "fewer: average what is repeated, or cut the file"
 ELSEWHERE = "datasets that hold their numbers in this file"
 MATLAB = (
     "a MATLAB file of version 5 to 7: save(name, 'data', '-v7'), or columns as CSV, by writetable"
@@ -204,7 +204,7 @@ def _with_units(
             known = own
         elif own is None:
             name = named(name, known or unit)
-        elif known is None or plain_unit(known) != plain_unit(own):
+        elif known is None or known != own:
             expected = f"one unit, {own} or the attribute's"
             raise InputError(f"the attribute units = '{unit}'", expected, path, column=name)
         found[name] = values
@@ -239,8 +239,7 @@ def _projections(
     if PIXEL not in names:
         raise InputError(f"images and no dataset {PIXEL}", "the width of a pixel", column=IMAGES)
     count, bins = data.shape[0], max(data.shape[1:])
-    if count * bins > rows:
-        raise InputError(f"projections of {count * bins} bins", FEWER, column=IMAGES)
+    check_length(count * bins, rows, column=IMAGES)
     told = {n: _column(place, n, rows, texts) for n in names if n not in (IMAGES, PIXEL)}
     for name, values in told.items():
         if len(values) != count:
@@ -344,8 +343,7 @@ def _column(store: Any, name: str, rows: int, texts: int) -> list[str] | np.ndar
         )
     if not is_text and data.dtype.kind not in "iuf":
         raise InputError(f"values of type {data.dtype}", "numbers or text", column=name)
-    if data.size > (most := texts if is_text else rows):
-        raise InputError(f"more than {most} rows", FEWER, column=name)
+    check_length(data.size, texts if is_text else rows, column=name)
     if not is_text:
         return np.ravel(data[()]).astype(float)
     try:
@@ -476,8 +474,7 @@ def _sdds_loaded(content: bytes) -> Any:
 
 def _sdds_values(name: str, values: list[Any], rows: int, texts: int) -> Sequence[Any]:
     words = bool(values) and isinstance(values[0], str)
-    if len(values) > (most := texts if words else rows):
-        raise InputError(f"more than {most} rows", FEWER, column=name)
+    check_length(len(values), texts if words else rows, column=name)
     return values if words else np.array(values, float)
 
 

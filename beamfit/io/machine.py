@@ -234,7 +234,9 @@ def read_scan_machine(path: str | PathLike[str]) -> ScanMachine:
     first = _numbers(wanted, "first", plan.pop("first"), magnets[0].span)
     plan["points"] = plan["points"] or (ROWS if knobs else POINTS)
     screen, guard = _screen(top.section("screen"), lattice), _guard(top.section("beam"))
-    lattice, before = _seen_at(lattice, screen.name)
+    lattice = part_of(lattice, screen=screen.name)
+    at = [e["name"] for e in lattice.elements].index(screen.name)
+    before = {name for e in lattice.elements[:at] for name in (e["name"], e.get("supply"))}
     for magnet, section in zip(scanned, top.sections("magnet"), strict=True):
         if magnet.name not in before:
             found = f"{magnet.name} behind the screen {screen.name}"
@@ -325,18 +327,6 @@ def _screen(section: Section, lattice: LatticeFile) -> Profiler:
         raise section.error(f"no screen '{name}'", expected, "name")
     rest = {key: said[key] for key in ("unit", "pixel", "shots", "timeout")}
     return Profiler(name, sizes, profiles, **rest)
-
-
-def _seen_at(lattice: LatticeFile, screen: str) -> tuple[LatticeFile, set[str]]:
-    """A lattice with one screen, since nothing is measured at others, and what stands before it."""
-    cut, found, before = part_of(lattice, screen=screen), [], set()
-    for e in cut.elements:
-        if e["name"] == screen:
-            before = {name for each in found for name in (each["name"], each.get("supply"))}
-        elif e["type"] == "screen":
-            e = {"type": "marker", "name": e["name"]}
-        found.append(e)
-    return replace(cut, elements=tuple(found)), before
 
 
 def _guard(section: Section) -> Guard:

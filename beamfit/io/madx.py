@@ -8,6 +8,7 @@ The rules are those of MAD-X 5.09, found by experiment where its manual is silen
 from __future__ import annotations
 
 import re
+from bisect import bisect
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from os import PathLike
@@ -17,7 +18,7 @@ from typing import Any, NamedTuple
 from beamfit.errors import InputError, nearest
 from beamfit.io.dialects import ELEGANT, MADX, Dialect, blanked, decoded
 from beamfit.io.files import read_text
-from beamfit.io.madx_values import NAME, Values, compared, words
+from beamfit.io.madx_values import NAME, Values, shown, words
 
 # Files that call one another.
 MOST_CALLS = 50
@@ -97,10 +98,8 @@ class MadxStatement(NamedTuple):
 
     def error(self, found: str = "", expected: str = "") -> InputError:
         """Make the error that names the statement's place."""
-        short = " ".join(self.text.split())
-        short = short if len(short) <= 60 else short[:57] + "..."
         expected = expected or "a file without it: run it in MAD-X, and SAVE the sequence"
-        found = found or f"'{short}', which beamfit does not carry out"
+        found = found or f"'{shown(self.text)}', which beamfit does not carry out"
         return InputError(found, expected, self.path, self.line)
 
 
@@ -114,10 +113,11 @@ def statements(text: str, path: str | PathLike[str], line: int = 1) -> Iterator[
     """
     text = COMMENT.sub(blanked, text)
     begin, depth, opened = 0, 0, None
+    ends = [found.start() for found in re.finditer("\n", text)]
 
     def made(end: int, block: str | None = None) -> MadxStatement:
         said = text[begin:end]
-        at = line + text.count("\n", 0, begin + len(said) - len(said.lstrip()))
+        at = line + bisect(ends, begin + len(said) - len(said.lstrip()))
         return MadxStatement(said.strip(), block, path, at)
 
     for found in PART.finditer(text):
@@ -270,7 +270,7 @@ class Interpreter:
 
     def _holds(self, statement: MadxStatement, text: str) -> bool:
         try:
-            return compared(self.values, text)
+            return self.values.holds(text)
         except ValueError as error:
             raise statement.error(str(error), "a comparison of numbers") from None
 

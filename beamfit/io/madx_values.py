@@ -4,9 +4,14 @@ from __future__ import annotations
 
 import math
 import operator
-import re
-from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
+from functools import lru_cache
+from typing import Any
+
+from lark import Lark, Token, Tree
+from lark.exceptions import UnexpectedCharacters, UnexpectedInput
+
+from beamfit.errors import short
 
 
 def words(text: str) -> tuple[str, ...]:
@@ -21,18 +26,6 @@ def words(text: str) -> tuple[str, ...]:
 
 
 NAME = r"[A-Za-z_][\w.$]*"
-TOKEN = re.compile(
-    rf"\s*(?:((?:\d+\.?\d*|\.\d+)(?:[eEdD][-+]?\d+)?)|({NAME})(?:->({NAME}))?|([-+*/^(),]))"
-)
-COMPARISON = re.compile(r"(<=|>=|<>|==|<|>)")
-COMPARED = {
-    "<=": operator.le,
-    ">=": operator.ge,
-    "<>": operator.ne,
-    "==": operator.eq,
-    "<": operator.lt,
-    ">": operator.gt,
-}
 # The constants of MAD-X 5.09: GeV, m, s, as it has them.
 CONSTANTS = {
     "pi": math.pi,
@@ -67,8 +60,80 @@ FUNCTIONS |= {
 }
 
 
-class NoExpression(ValueError):
-    """A text that MAD-X does not read as an expression, whatever its names stand for."""
+def _power(base: float, exponent: float) -> float:
+    value = base**exponent
+    if isinstance(value, complex):
+        raise ArithmeticError("a root of a negative number")
+    return value
+
+
+OPERATORS: dict[str, Callable[[float, float], Any]] = {
+    "+": operator.add,
+    "-": operator.sub,
+    "*": operator.mul,
+    "/": operator.truediv,
+    "^": _power,
+    "<=": operator.le,
+    ">=": operator.ge,
+    "<>": operator.ne,
+    "==": operator.eq,
+    "<": operator.lt,
+    ">": operator.gt,
+}
+# Expressions, conditions of IF and lists of LINE. Powers too are taken from left to right, and a
+# sign stands only in front of a sum.
+GRAMMAR = rf"""
+condition: "(" both ("||" both)* ")"
+both: comparison ("&&" comparison)*
+comparison: sum COMPARED sum
+list: "(" member ("," member)* ")"
+member: SIGN? (COUNT "*")? (NAME | list)
+?sum: SIGN? product (SIGN product)*
+?product: power (TIMES power)*
+?power: atom (POWER atom)*
+?atom: NUMBER -> number
+    | NAME -> variable
+    | NAME "->" NAME -> attribute
+    | NAME "(" sum ("," sum)* ")" -> call
+    | "(" sum ")"
+COMPARED: "<=" | ">=" | "<>" | "==" | "<" | ">"
+SIGN: "+" | "-"
+TIMES: "*" | "/"
+POWER: "^"
+COUNT: /\d+/
+NUMBER: /(\d+\.?\d*|\.\d+)([eEdD][-+]?\d+)?/
+NAME: /{NAME}/
+%ignore /\s+/
+"""
+
+
+@lru_cache
+def _grammar() -> Lark:
+    return Lark(GRAMMAR, parser="lalr", start=["sum", "condition", "list"])
+
+
+@lru_cache(maxsize=10_000)
+def parsed(text: str, kind: str = "sum") -> Tree:
+    """Parse an expression, the condition of an IF ("condition") or the list of a LINE ("list").
+
+    Raises
+    ------
+    ValueError
+        If it is none.
+
+    Examples
+    --------
+    >>> len(parsed("(a, -2*b)", "list").children)
+    2
+    """
+    try:
+        return _grammar().parse(text, kind)
+    except UnexpectedCharacters as error:
+        cause = f"'{error.char}' in it"
+    except UnexpectedInput as error:
+        said = str(getattr(error, "token", ""))
+        cause = f"'{short(said, 20)}' where it cannot stand" if said else "it ends early"
+    raise ValueError(f"'{shown(text)}' ({cause})")
 
 
 class Values:
@@ -107,7 +172,7 @@ class Values:
             raise ValueError(f"'{name}', a constant of MAD-X that stays as it is")
         if name in self._fixed:
             return  # as MAD-X does
-        self._check(text)
+        parsed(text)
         value: float | str | ValueError = text
         if not later or "const" in kind:
             try:
@@ -129,29 +194,57 @@ class Values:
         ValueError
             If it is none, names what nothing defines, or has no finite value.
         """
+        return self._finite(parsed(text), text)
+
+    def holds(self, text: str) -> bool:
+        """Evaluate the condition of an IF: comparisons joined by && and ||.
+
+        Raises
+        ------
+        ValueError
+            As `of`.
+
+        Examples
+        --------
+        >>> Values(lambda name, key: 0.0).holds("(1 < 2 && 3 <> 3)")
+        False
+        """
+        return any(
+            all(
+                OPERATORS[sign](self._finite(left, text), self._finite(right, text))
+                for left, sign, right in (comparison.children for comparison in both.children)
+            )
+            for both in parsed(text, "condition").children
+        )
+
+    def _finite(self, tree: Tree, text: str) -> float:
+        """The value of a part of a text."""
         try:
-            tokens = deque(_tokens(text))
-            value = self._sum(tokens)
-            if tokens:
-                raise NoExpression("something after it")
-        except NoExpression as error:
-            raise NoExpression(f"'{_short(text)}' ({error})") from None
+            value = self._value(tree)
         except (ArithmeticError, RecursionError) as error:
-            raise ValueError(f"'{_short(text)}' without a value ({error})") from None
+            raise ValueError(f"'{shown(text)}' without a value ({error})") from None
         if not math.isfinite(value):
-            raise ValueError(f"'{_short(text)}' without a finite value")
+            raise ValueError(f"'{shown(text)}' without a finite value")
         return value
 
-    def _check(self, text: str) -> None:
-        """Refuse what is no expression; every name is 1 for once."""
-        dry = Values(lambda name, key: 1.0)
-        dry._variable = lambda name: 1.0
-        try:
-            dry.of(text)
-        except NoExpression:
-            raise
-        except ValueError:
-            return
+    def _value(self, tree: Tree) -> float:
+        first, *steps = tree.children
+        match tree.data:
+            case "number":
+                return float(first.lower().replace("d", "e"))
+            case "variable":
+                return self._variable(first.lower())
+            case "attribute":
+                return self._attribute(first.lower(), steps[0].lower())
+            case "call":
+                if (name := first.lower()) not in FUNCTIONS or len(steps) > 1:
+                    raise ValueError(f"the function '{name}'")
+                return FUNCTIONS[name](self._value(steps[0]))
+        signed = isinstance(first, Token)
+        value, steps = (0.0, tree.children) if signed else (self._value(first), steps)
+        for sign, part in zip(steps[::2], steps[1::2], strict=True):
+            value = OPERATORS[sign](value, self._value(part))
+        return value
 
     def _variable(self, name: str) -> float:
         if name in CONSTANTS:
@@ -171,98 +264,7 @@ class Values:
                 self._pending.pop()
         return self._known[name]
 
-    def _sum(self, tokens: deque[tuple], level: int = 0) -> float:
-        """Left to right at each level, powers too; a sign stands only in front of a sum."""
-        if level == len(OPERATORS):
-            return self._atom(tokens)
-        sign = tokens.popleft()[1] if level == 0 and tokens and tokens[0] in SIGNS else "+"
-        value = self._sum(tokens, level + 1)
-        value = -value if sign == "-" else value
-        while tokens and tokens[0][0] == "op" and tokens[0][1] in OPERATORS[level]:
-            operation = OPERATORS[level][tokens.popleft()[1]]
-            value = operation(value, self._sum(tokens, level + 1))
-        return value
 
-    def _atom(self, tokens: deque[tuple]) -> float:
-        if not tokens:
-            raise NoExpression("it ends early")
-        kind, *said = tokens.popleft()
-        if kind == "number":
-            return said[0]
-        if kind == "attribute":
-            return self._attribute(*said)
-        if kind == "name" and not (tokens and tokens[0] == OPENED):
-            return self._variable(said[0])
-        if kind == "name":
-            tokens.popleft()
-            if said[0] not in FUNCTIONS:
-                raise ValueError(f"the function '{said[0]}'")
-        elif said[0] != "(":
-            raise NoExpression(f"'{said[0]}' where a number belongs")
-        value = self._sum(tokens)
-        if not tokens or tokens.popleft() != ("op", ")"):
-            raise NoExpression("'(' without ')'")
-        return FUNCTIONS[said[0]](value) if kind == "name" else value
-
-
-def _power(base: float, exponent: float) -> float:
-    value = base**exponent
-    if isinstance(value, complex):
-        raise ArithmeticError("a root of a negative number")
-    return value
-
-
-OPENED, SIGNS = ("op", "("), (("op", "-"), ("op", "+"))
-# From those that bind last.
-OPERATORS = (
-    {"+": operator.add, "-": operator.sub},
-    {"*": operator.mul, "/": operator.truediv},
-    {"^": _power},
-)
-
-
-def compared(values: Values, text: str) -> bool:
-    """Evaluate the condition of an IF: comparisons joined by && and ||.
-
-    Examples
-    --------
-    >>> compared(Values(lambda name, key: 0.0), "(1 < 2 && 3 <> 3)")
-    False
-    """
-    text = text.strip()
-    if not (text.startswith("(") and text.endswith(")")):
-        raise ValueError(f"'{_short(text)}' without parentheses around it")
-    return any(
-        all(_holds(values, part) for part in either.split("&&"))
-        for either in text[1:-1].split("||")
-    )
-
-
-def _holds(values: Values, text: str) -> bool:
-    parts = COMPARISON.split(text)
-    if len(parts) != 3:
-        raise ValueError(f"'{_short(text)}', which is no comparison")
-    return COMPARED[parts[1]](values.of(parts[0]), values.of(parts[2]))
-
-
-def _tokens(text: str) -> Iterator[tuple]:
-    at, text = 0, text.rstrip()
-    if not text:
-        raise NoExpression("nothing")
-    while at < len(text):
-        found = TOKEN.match(text, at)
-        if found is None:
-            raise NoExpression(f"'{text[at:].strip()[:1]}' in it")
-        number, name, key, sign = found.groups()
-        if number:
-            yield "number", float(number.lower().replace("d", "e"))
-        elif key:
-            yield "attribute", name.lower(), key.lower()
-        else:
-            yield ("name", name.lower()) if name else ("op", sign)
-        at = found.end()
-
-
-def _short(text: str) -> str:
-    text = " ".join(text.split())
-    return text if len(text) <= 40 else text[:37] + "..."
+def shown(text: str) -> str:
+    """A text on one line, its middle left out where it is long."""
+    return short(" ".join(text.split()), 40)

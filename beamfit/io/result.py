@@ -174,14 +174,11 @@ def _number(value: object, name: str) -> float:
 
 def _covariance(rows: object, where: str) -> np.ndarray:
     """Check a covariance by its correlations, which have no unit."""
-    name = f"covariance {where}"
-    if not (
-        isinstance(rows, list)
-        and len(rows) == 3
-        and all(isinstance(row, list) and len(row) == 3 for row in rows)
-    ):
-        raise InputError(f"{name} of another shape", "three rows of three numbers")
-    found = np.array([[_number(v, f"a number in the {name}") for v in row] for row in rows])
+    name, found = f"covariance {where}", np.array(rows)
+    if found.shape != (3, 3) or found.dtype.kind not in "if" or not np.isfinite(found).all():
+        raise InputError(
+            f"{name} of another shape", "three rows of three numbers, each a finite number"
+        )
     variance = np.diagonal(found)
     sd = np.sqrt(np.where(variance > 0, variance, 1.0))
     correlation = found / np.outer(sd, sd)

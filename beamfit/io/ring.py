@@ -361,39 +361,6 @@ def ring_from_pyat(
     )
 
 
-def read_twiss(path: str | PathLike[str], circumference: float) -> Optics:
-    """Read the optics along a ring.
-
-    Parameters
-    ----------
-    path : str or path
-        CSV with the columns `s_m, beta_x_m, beta_y_m, alpha_x, alpha_y, dispersion_x_m,
-        dispersion_slope_x` (and optionally the vertical dispersion), or MAD-X TFS. The table
-        covers the whole ring, or one of its equal (or mirror-symmetric) parts. Points close
-        together, inside magnets too: averages are taken by the trapezoidal rule.
-    circumference : float
-        Circumference of the ring, m.
-
-    Returns
-    -------
-    Optics
-        One point for each row.
-
-    Raises
-    ------
-    InputError
-        With file, line and column, if a column is missing, a cell is not a number, a Twiss beta
-        is not positive, or the table does not cover the ring.
-
-    Examples
-    --------
-    >>> optics = read_twiss("lattices/spear3_2003_twiss.csv", 234.144)
-    >>> print(f"mean beta_y {optics.average(optics.beta_y):.3f} m")
-    mean beta_y 8.785 m
-    """
-    return _twiss(path, circumference)[1]
-
-
 def _twiss(path: str | PathLike[str], circumference: float) -> tuple[np.ndarray, Optics]:
     """Positions of the points, m, and the optics there."""
     sheet = read_sheet(path, "s_m,beta_x_m,beta_y_m")
@@ -415,7 +382,11 @@ def read_along(
     circumference : float
         Circumference of the ring, m.
     optics : mapping of str to float, or path
-        Ring averages by their fields in `Optics`, or a table as of `read_twiss`.
+        Ring averages by their fields in `Optics`; or CSV with the columns `s_m, beta_x_m, beta_y_m,
+        alpha_x, alpha_y, dispersion_x_m, dispersion_slope_x` (and optionally the vertical
+        dispersion), or MAD-X TFS. The table covers the whole ring, or one of its equal (or
+        mirror-symmetric) parts. Points close together, inside magnets too: averages are taken by
+        the trapezoidal rule.
     apertures : path or None
         A table with `s_m, delta_plus, delta_minus`: momentum acceptance of the lattice up and down
         (with either sign), relative, over the same part of the ring as the optics.
@@ -430,7 +401,15 @@ def read_along(
     Raises
     ------
     InputError
-        As `read_twiss`, and if an aperture is no share between 0 and 1.
+        With file, line and column, if a column is missing, a cell is not a number, a Twiss beta
+        is not positive, an aperture is no share between 0 and 1, or a table does not cover the
+        ring.
+
+    Examples
+    --------
+    >>> optics, _ = read_along(234.144, Path("lattices/spear3_2003_twiss.csv"), None)
+    >>> print(f"mean beta_y {optics.average(optics.beta_y):.3f} m")
+    mean beta_y 8.785 m
     """
     if isinstance(optics, Path):
         s, found = _twiss(optics, circumference)

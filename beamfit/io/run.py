@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import replace
 from os import PathLike
 from typing import TYPE_CHECKING
 
@@ -98,7 +99,8 @@ def read_run(
     if late.size:
         row = int(late[0]) + 1
         found = f"time {time[row]:.10g} s after {time[row - 1]:.10g} s"
-        raise sheet.error(found, "times that increase", row, columns[TIME].header)
+        whole = replace(sheet, skip="")
+        raise whole.error(found, "times that increase", row, columns[TIME].header)
     name, aside = name_of(sheet.path), ignored(sheet, columns)
     said = {
         "provenance": sheet.comments,

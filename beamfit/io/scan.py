@@ -15,7 +15,7 @@ import numpy as np
 
 from beamfit.emittance.scan import KNOB, POSSIBLE, USUAL, Profile, QuadScan, middle, row_keys
 from beamfit.errors import InputError, located, nearest, short
-from beamfit.io.cells import number, numbers_of
+from beamfit.io.cells import is_number, number
 from beamfit.io.columns import (
     SETTINGS,
     UNITS,
@@ -132,7 +132,12 @@ def scan_columns(
         raise sheet.header_error("a record of beam current", expected)
     taken = {column.header for column in knobs.values()}
     rest = [name for name in sheet.names if name not in taken]
-    columns = dict(knobs) | _understood(sheet.only(rest) if knobs else sheet)
+    if "plane" in map(str.lower, rest) and not sheet.arranged:
+        expected = "a column for each plane, size_x_um and size_y_um, and a row for each setting"
+        raise sheet.header_error("rows of two planes", expected)
+    columns = dict(knobs) | columns_of(
+        sheet.only(rest) if knobs else sheet, QUANTITIES, lambda header: _other(header, sheet)
+    )
     if not {"size_x", "size_y"} & set(columns):
         missing = "a beam size column, such as size_x_um"
     elif not (any(key.startswith(SETTING) for key in columns) or SEEN & set(columns)):
@@ -152,35 +157,12 @@ def scan_columns(
     return columns
 
 
-def _understood(sheet: Sheet) -> dict[str, Column]:
-    """Every column; all that are not understood are named at once."""
-    try:
-        return columns_of(sheet, QUANTITIES, lambda header: _other(header, sheet))
-    except InputError as error:
-        unknown = [name for name in sheet.names if not is_known(name, sheet)]
-        if error.column not in unknown:
-            one = sheet.names.count(error.column) == 1  # more would all be left unread
-            more = f"; --ignore '{error.column}' leaves this one unread" if one else ""
-            expected = error.expected + more
-            raise replace(error, expected=expected) from None
-        if len(unknown) < 2:
-            raise
-        if "plane" in map(str.lower, unknown):
-            expected = (
-                "a column for each plane, size_x_um and size_y_um, and a row for each setting"
-            )
-            raise sheet.header_error("rows of two planes", expected, error.column) from None
-        ignored = " ".join(f"--ignore '{name}'" for name in unknown)
-        expected = "a magnet with its unit, a size such as size_x_um, --columns (`beamfit check` "
-        expected += "proposes a layout), or to leave them unread: "
-        raise replace(error, expected=expected + ignored) from None
-
-
 def is_known(name: str, sheet: Sheet) -> bool:
     """Tell a header that means something in a scan from others."""
-    alone = replace(sheet, names=(name,), cells=[sheet[name]])
     try:
-        return bool(columns_of(alone, QUANTITIES, lambda header: _other(header, sheet)))
+        return bool(
+            columns_of(sheet.only([name]), QUANTITIES, lambda header: _other(header, sheet))
+        )
     except InputError:
         return False
 
@@ -221,7 +203,7 @@ def _other(header: str, sheet: Sheet) -> Column:
         return Column(header, f"r{OF_Y[of_y]}_y" if of_y else f"r{of_x}_{plane or 'x'}")
     if COUPLED.fullmatch(header) is not None:
         found = "the correlation of x and y, or a tilt: coupled beams are not fitted"
-        raise sheet.header_error(found, f"two planes; --ignore '{header}' fits them alone", header)
+        raise sheet.header_error(found, "two planes, which are fitted alone", header)
     unit = next((u for u in SETTINGS if header.endswith(f"_{u}")), "")
     name = header.removesuffix(f"_{unit}") if unit else ""
     while (bare := ATTRIBUTE.sub("", name)) != name:
@@ -233,9 +215,7 @@ def _other(header: str, sheet: Sheet) -> Column:
     usual += ["shot", "shots", "screen", "slice"]
     raise sheet.header_error(
         _not_understood(header),
-        "a magnet with _A, _kG, _T_per_m or _k1 at the end, "
-        + nearest(header, usual)
-        + f"; --columns '{header}=NAME' says what it is, --ignore leaves it unread",
+        f"a magnet with _A, _kG, _T_per_m or _k1 at the end, {nearest(header, usual)}",
         header,
     )
 
@@ -527,9 +507,9 @@ def scan_of_sheet(
     """Understand the columns of a sheet as a scan; knobs of the machine are settings, too."""
     profiles: tuple[Profile, ...] = ()
     if IMAGE in sheet.names:
-        sheet = of_images(sheet)
+        sheet = of_images(replace(sheet, skip=""))
     if {"counts_x", "counts_y"} & set(sheet.names):
-        sheet, profiles = of_profiles(sheet)
+        sheet, profiles = of_profiles(replace(sheet, skip=""))
     columns = scan_columns(sheet, knobs or {})
     sheet = _without_dark(sheet, columns) if "shot" in columns else sheet
     if skip_bad:
@@ -538,13 +518,8 @@ def scan_of_sheet(
         sheet = sheet.good(
             lambda rows: _check_slipped(rows, columns, _values(rows, columns), usual)
         )
-    try:
-        values = _values(sheet, columns)
-        odd = _check_sizes(sheet, columns, values)
-    except InputError as error:
-        skip = error.line is not None and not skip_bad and "--ignore" not in error.expected
-        more = "; --skip-bad leaves such rows out" if skip else ""
-        raise replace(error, expected=error.expected + more) from None
+    values = _values(sheet, columns)
+    odd = _check_sizes(sheet, columns, values)
     notes = [*column_notes(columns), *comment_notes(sheet, columns), *odd]
     notes += [*ignored(sheet, columns), *left_out(sheet)]
     with located(sheet.path):
@@ -557,22 +532,16 @@ def _without_dark(sheet: Sheet, columns: Mapping[str, Column]) -> Sheet:
     """Blank the sizes of shots that show no beam, for which programs write 0."""
     cells, count = dict(zip(sheet.names, sheet.cells, strict=True)), 0
     for plane in (p for p in "xy" if f"size_{p}" in columns):
-        size, wrong = numbers_of(cells[columns[f"size_{plane}"].header], number, True)
-        if wrong is not None:
-            continue
-        dark, count = size == 0.0, count + int(np.sum(size == 0.0))
+        sizes = cells[columns[f"size_{plane}"].header]
+        dark = [is_number(cell) and number(cell) == 0.0 for cell in sizes]
+        count += sum(dark)
         for key in {f"size_{plane}", f"size_{plane}_error"} & set(columns):
             header = columns[key].header
             cells[header] = ["" if d else c for d, c in zip(dark, cells[header], strict=True)]
-    if not count:
-        return sheet
-    show = (
-        "shot of size 0 shows no beam and is"
-        if count == 1
-        else "shots of size 0 show no beam and are"
-    )
-    note = f"{count} {show} left out."
-    return replace(sheet, cells=list(cells.values()), notes=(*sheet.notes, note))
+    shown = "shows no beam and is" if count == 1 else "show no beam and are"
+    note = f"{count} shot{'s' * (count > 1)} of size 0 {shown} left out."
+    notes = (*sheet.notes, note) if count else sheet.notes
+    return replace(sheet, cells=list(cells.values()), notes=notes)
 
 
 def _scan(
@@ -654,6 +623,7 @@ def _checked(sheet: Sheet, column: Column, length: bool) -> np.ndarray:
     if (wrong := (values <= low) | (values > high)).any():
         if column.key.endswith("error") and not np.any(values > 0):
             expected += f"; --ignore '{column.header}' leaves them unread: the noise is inferred"
+            raise sheet.header_error("no error above zero", expected, column.header)
         sheet.refuse(column.header, wrong, expected)
     return values
 
@@ -766,7 +736,7 @@ def read_tuning_scan(
     names = {knob: _header(knob, sheet) for knob in dict.fromkeys(knobs)}
     called = {knob: sheet.called.get(name, name) for knob, name in names.items()}
     if any(EMITTANCE.match(name) for name in sheet.names):
-        return _emittances(sheet, names, called)
+        return _emittances(replace(sheet, skip=""), names, called)
     units = {knob: _unit(knob, header) for knob, header in called.items()}
     knobs = {f"setting {k}": Column(n, f"setting {k}", units[k]) for k, n in names.items()}
     scan = scan_of_sheet(replace(sheet, arranged=True), skip_bad, knobs)
@@ -806,11 +776,10 @@ def _header(knob: str, sheet: Sheet) -> str:
         return knob
     found = [name for name in sheet.names if spelled(name).rpartition("_")[0] == knob]
     if not found:
-        expected = nearest(knob, list(sheet.names))
-        raise sheet.header_error(f"no column of the knob '{knob}'", expected)
+        raise sheet.no_column(knob)
     if len(found) > 1:
         expected = "its header as it stands: " + " or ".join(found)
-        raise InputError(f"a knob '{knob}' of several columns", expected)
+        raise sheet.header_error(f"a knob '{knob}' of several columns", expected)
     return found[0]
 
 

@@ -6,7 +6,6 @@ What a first-order, uncoupled line of one energy cannot hold is refused, never d
 from __future__ import annotations
 
 import math
-import re
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from itertools import count
@@ -14,12 +13,14 @@ from os import PathLike
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from lark import Tree
+
 from beamfit.errors import InputError, nearest
 from beamfit.io.dialects import DIALECTS, ELEGANT, MADX, coded
 from beamfit.io.files import digest, read_text
 from beamfit.io.lattice import MOST, LatticeFile
 from beamfit.io.madx import NO_MATTER, Attribute, Definition, Interpreter, word_of
-from beamfit.io.madx_values import NAME, words
+from beamfit.io.madx_values import parsed, words
 from beamfit.particles import LIGHT, REST_ENERGY, expected_energy
 
 # Gaps and overlaps in m that MAD-X takes for none.
@@ -29,48 +30,27 @@ TO_CENTRE = {"entry": 0.5, "centre": 0.0, "center": 0.0, "exit": -0.5}
 SCREENS = words("monitor hmonitor vmonitor imonitor blmonitor slmonitor instrument profile wire")
 SPACES = words(
     "drift kicker hkicker vkicker tkicker sextupole octupole collimator ecollimator rcollimator "
-    "solenoid rfcavity elseparator placeholder"
+    "solenoid rfcavity twcavity hacdipole vacdipole elseparator placeholder"
 )
 MEANT = words(
     "l k0 k1 angle tilt knl ksl k1s k0s ktap hgap fint fintx ks ksi volt ex ey ex_l ey_l "
     "kill_ent_fringe kill_exi_fringe dx dy ds h knll charge cnll bet sigx sigy xma yma"
 )
-MEMBER = re.compile(rf"\s*([-+]?)\s*(?:(\d+)\s*\*)?\s*(?:({NAME})|(\())", re.I)
-# GeV; the charges of those that MAD-X knows by name.
-KNOWN = {"positron": 1.0, "electron": -1.0, "proton": 1.0, "antiproton": -1.0}
+# Particles that MAD-X knows by name, and those whose charge is -1.
+BY_NAME = words("positron electron proton antiproton")
+NEGATIVE = dict.fromkeys(words("electron antiproton H-"), -1.0)
 # Relative: masses that differ by less are one particle's.
 SAME_MASS = 2e-4
-# Parameters that bend, focus, couple or accelerate in a way beamfit does not model.
-UNMODELLED = {
-    "ks": "a solenoid field",
-    "ksi": "a solenoid field",
-    "b": "a field given as B",
-    "k1s": "a skew gradient",
-    "k0s": "a skew bend",
-    "ktap": "a tapered field",
-    "fse": "a field error",
-    "etilt": "a tilt error",
-    "t0": "a tilted component",
-    "t1": "a tilted component",
-    "bore": "a field given by its bore",
-    "use_bn": "a field given by B1, B2, ...",
-    "volt": "an accelerating voltage",
-    "ex": "an electric field",
-    "ey": "an electric field",
-    "kill_ent_fringe": "an edge switched off",
-    "kill_exi_fringe": "an edge switched off",
-}
-# Elements that are nothing where some parameter is zero.
+# Parameters that bend, focus, couple or accelerate in a way beamfit does not model, of any element
+# and of some that are nothing without.
+UNMODELLED = words(
+    "ks ksi b k1s k0s ktap fse etilt t0 t1 bore use_bn volt ex ey kill_ent_fringe kill_exi_fringe"
+)
 NOTHING_AT_ZERO = {
-    "srotation": ("angle",),
-    "xrotation": ("angle",),
-    "yrotation": ("angle",),
+    **dict.fromkeys(words("srotation xrotation yrotation"), ("angle",)),
     "translation": ("dx", "dy", "ds"),
     "dipedge": ("h",),
     "nllens": ("knll",),
-    "twcavity": ("volt",),
-    "hacdipole": ("volt",),
-    "vacdipole": ("volt",),
     "beambeam": ("charge",),
 }
 EDGES = ("edge1_effects", "edge2_effects")
@@ -121,7 +101,11 @@ def read_sequence(
     program.finish(path)
     chosen = _chosen(program, path, use)
     particle, total = _beam(program, path, chosen.name.lower(), energy)
-    elements = numbered(_Line(program, chosen).tables())
+    try:
+        elements = numbered(_Line(program, chosen).tables())
+    except RecursionError:
+        found = f"'{chosen.name}', lists within lists without end"
+        raise chosen.error(found, "a line that a machine has") from None
     if not elements:
         raise chosen.error(f"'{chosen.name}' without elements", "a line with magnets and a screen")
     return LatticeFile(path, digest(path), chosen.name, total, particle, tuple(elements))
@@ -255,46 +239,33 @@ class _Line:
         """Names of the elements of a LINE, in order, and whether each is reflected."""
         if line.name in within:
             raise line.error(f"'{line.name}', which holds itself", "a line of others")
-        text = line.members.strip()
-        if not text.startswith("("):
-            raise line.error(f"'{text[:40]}' where a list belongs", "NAME: LINE = (A, B, ...);")
-        found, end = self._list(line, text, 1, (*within, line.name))
-        if text[end:].strip():
-            raise line.error(f"'{text[end:][:40]}' after a list", "NAME: LINE = (A, B, ...);")
-        return found
+        try:
+            tree = parsed(line.members, "list")
+        except ValueError as error:
+            raise line.error(f"a list {error}", "NAME: LINE = (A, 2*B, -C, (D, E));") from None
+        return self._list(line, tree, (*within, line.name))
 
     def _list(
-        self, line: Definition, text: str, at: int, within: tuple[str, ...]
-    ) -> tuple[list[tuple[str, bool]], int]:
-        """Names in a list in parentheses, as of `_members`, and where it ends."""
+        self, line: Definition, tree: Tree, within: tuple[str, ...]
+    ) -> list[tuple[str, bool]]:
+        """Names in a list, as of `_members`."""
         every: list[tuple[str, bool]] = []
-        while True:
-            found = MEMBER.match(text, at)
-            if found is None:
-                said = text[at:].strip()[:30]
-                raise line.error(f"'{said}' in a LINE", "names, lists, N*name and -name")
-            sign, times, name, _ = found.groups()
-            if name:
-                one, at = self._member(line, name.lower(), within), found.end()
-            else:
-                one, at = self._list(line, text, found.end(), within)
-            number = 1 if times is None else int(times)
+        for *said, own in (member.children for member in tree.children):
+            number = next((int(word[:9]) for word in said if word.isdigit()), 1)
             if number < 1:
                 raise line.error(f"{number} times an element", "one or more")
+            found = self._list if isinstance(own, Tree) else self._member
+            one = found(line, own, within)
             self._count(line, number * len(one))
-            if sign == "-":
-                one = [(own, not reflected) for own, reflected in one[::-1]]
+            if "-" in said:
+                one = [(name, not reflected) for name, reflected in one[::-1]]
             every += one * number
-            mark = re.compile(r"\s*([,)])").match(text, at)
-            if mark is None:
-                raise line.error(f"'{text[at:].strip()[:30]}' in a LINE", "',' or ')'")
-            at = mark.end()
-            if mark[1] == ")":
-                return every, at
+        return every
 
     def _member(
-        self, line: Definition, name: str, within: tuple[str, ...]
+        self, line: Definition, label: str, within: tuple[str, ...]
     ) -> list[tuple[str, bool]]:
+        name = label.lower()
         if name in self.program.elements:
             return [(name, False)]
         known = self.program.lines
@@ -376,10 +347,7 @@ class _Element:
         return (*(value if isinstance(value, tuple) else (value,)), 0.0, 0.0)[:2]
 
     def _check_unmodelled(self) -> None:
-        for key, meaning in UNMODELLED.items():
-            if self._number(key) != 0.0:
-                raise self._refuse(f"with {meaning} ({key.upper()} = {self._number(key):g})")
-        for key in NOTHING_AT_ZERO.get(self.own.type.lower(), ()):
+        for key in (*UNMODELLED, *NOTHING_AT_ZERO.get(self.own.type.lower(), ())):
             if self._number(key) != 0.0:
                 raise self._refuse(f"with {key.upper()} = {self._number(key):g}")
         for key in EDGES:
@@ -511,7 +479,7 @@ def _beam(
             expected = "" if program.dialect is ELEGANT else "BEAM, ENERGY = or "
             expected += "--energy in MeV (energy= from Python)"
             raise InputError("no beam energy in the file", expected, path)
-        value, rest = _of_beam(program, beam[key]), 1e-3 * REST_ENERGY[particle]
+        value, rest = _single(program, beam[key]), 1e-3 * REST_ENERGY[particle]
         if key == "beta" and not 0.0 < value < 1.0:
             raise InputError(f"BEAM with BETA = {value:g}", "one between 0 and 1", path)
         momentum = value if key == "pc" else LIGHT / 1e9 * value
@@ -526,14 +494,6 @@ def _beam(
     return particle, float(total)
 
 
-def _of_beam(program: Interpreter, parameter: Attribute) -> float:
-    try:
-        return _single(program, parameter)
-    except InputError as error:
-        found = f"a BEAM that cannot be read ({error.found})"
-        raise InputError(found, "a number", parameter.path, parameter.line) from None
-
-
 def _particle(beam: dict[str, Attribute], program: Interpreter, path: str | PathLike[str]) -> str:
     """The particle of a BEAM by its name, which goes before, or by its mass and charge.
 
@@ -541,24 +501,20 @@ def _particle(beam: dict[str, Attribute], program: Interpreter, path: str | Path
     refused here.
     """
     named = word_of(beam["particle"]).lower() if "particle" in beam else None
-    mass = _of_beam(program, beam["mass"]) if "mass" in beam else None
-    charge = _of_beam(program, beam["charge"]) if "charge" in beam else None
+    mass, charge = (
+        _single(program, beam[key]) if key in beam else None for key in ("mass", "charge")
+    )
     if named is None and mass is None:
         named = program.dialect.particle
-    known = [*KNOWN] if named in KNOWN else [*REST_ENERGY]
-    names = [named] if named in KNOWN else known
-    fits = []
-    for name in names:
-        own = KNOWN.get(name, -1.0 if name == "H-" else 1.0)
+    byname = named in BY_NAME
+    for name in [named] if byname else REST_ENERGY:
         same = mass is None or abs(1e3 * mass / REST_ENERGY[name] - 1.0) < SAME_MASS
-        if same and (
-            (charge is None and named in KNOWN) or own == (1.0 if charge is None else charge)
-        ):
-            fits.append(name)
-    if not fits or (named not in KNOWN and mass is None):
-        found = f"particle '{named}'" if named else "a particle"
-        found += "" if mass is None else f" of mass {mass:g} GeV"
-        found += "" if charge is None else f" and charge {charge:g}"
-        expected = f"{nearest(str(named), known)}, by a name that MAD-X knows or by mass and charge"
-        raise InputError(found, expected, path)
-    return fits[0]
+        usual = NEGATIVE.get(name, 1.0) if byname else 1.0
+        own = NEGATIVE.get(name, 1.0)
+        if same and (byname or mass is not None) and own == (usual if charge is None else charge):
+            return name
+    found = f"particle '{named}'" if named else "a particle"
+    found += "" if mass is None else f" of mass {mass:g} GeV"
+    found += "" if charge is None else f" and charge {charge:g}"
+    near = nearest(str(named), list(BY_NAME if byname else REST_ENERGY))
+    raise InputError(found, f"{near}, by a name that MAD-X knows or by mass and charge", path)

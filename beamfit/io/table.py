@@ -21,7 +21,6 @@ from beamfit.io.columns import (
     has_unit,
     is_header,
     layout_of,
-    spelled,
     units_below,
     with_units,
 )
@@ -36,6 +35,7 @@ MOST_ROWS, MOST_WORDS = 12_000_000, 4_000_000
 HDF5 = {".h5", ".hdf5"}
 MATLAB = ".mat"
 BINARY = {*HDF5, MATLAB}
+SKIP = "; --skip-bad leaves such rows out"
 # How Excel says which separator a file has.
 SEPARATOR_LINE = re.compile(r"\s*\"?sep=.\"?\s*$", re.IGNORECASE)
 # In the names of a file without a header: cells that are not read.
@@ -84,10 +84,9 @@ def read_columns(
     InputError
         As `read_sheet`, and of what is said of columns.
     """
-    if columns is None:
-        return read_sheet(path, example, most, ragged=skip_bad).without(ignore)
     layout = layout_of(columns)
     sheet = read_sheet(path, example, most, ragged=skip_bad, names=layout.header or None)
+    sheet = replace(sheet, skip="" if skip_bad else SKIP, optional=True)
     return arranged(sheet.without(ignore), layout)
 
 
@@ -141,9 +140,10 @@ def read_sheet(
     if hasattr(path, "itertuples"):
         return _of_frame(path, most)
     expect(path, str | PathLike, "'scan.csv', or a pandas frame")
-    if is_binary(path):
+    suffix = Path(path).suffix.lower()
+    if suffix in BINARY or first_bytes(path, 4) == b"SDDS":
         return _binary(path, most)
-    if Path(path).suffix.lower() == ".json":
+    if suffix == ".json":
         return _of_json(path, most)
     return _read_text(path, example, most, ragged, names)
 
@@ -180,8 +180,7 @@ def _read_text(
             if bad and not ragged:
                 break
     if bad and not (ragged and rows):
-        more = "; --skip-bad leaves such rows out" if ragged is False else ""
-        raise replace(bad[0], expected=bad[0].expected + more)
+        raise replace(bad[0], expected=bad[0].expected + SKIP * (ragged is False))
     if columns is None:
         rows, notes = with_points(rows, separator)
         columns = zip(*rows, strict=True) if rows else [()] * len(names)
@@ -245,15 +244,6 @@ def _without_blanks(cells: list[str], least: int) -> list[str]:
     return cells[: max(len(cells) - more, least)]
 
 
-def header_of(path: str | PathLike[str]) -> list[str]:
-    """The header of a file of text, as `read_sheet` finds it, with units that stand below."""
-    names, _, separator, numbered = _head(path, "Q2_A,size_x_um", [])
-    line, text = next((one for one in numbered if one[1].strip()), (0, ""))
-    cells, wrong = _row(text, separator, path, line, len(names))
-    names = names if wrong else with_units(names, cells, path, line) or names
-    return [spelled(name) for name in names]
-
-
 def _row(
     text: str,
     separator: str,
@@ -312,11 +302,6 @@ def _check_header(names: list[str], example: str, path: str | PathLike[str], lin
     if len(names) > 3 and all(map(is_number, names[1:])):
         expected = f"columns below a header such as {example}, a row for each setting"
         raise InputError("a table on its side", expected, path=path, line=line)
-
-
-def is_binary(path: str | PathLike[str]) -> bool:
-    """Tell a file that a library reads: HDF5 and MATLAB by the name, SDDS by how it begins."""
-    return Path(path).suffix.lower() in BINARY or first_bytes(path, 4) == b"SDDS"
 
 
 def _binary(path: str | PathLike[str], most: int) -> Sheet:

@@ -32,7 +32,7 @@ def test_the_answer_as_json(run):
     ("words", "said"),
     [
         ((), "no --vary"),
-        (("--vary", "SOLL=1:2"), f"{TABLE}:2: no column of the knob 'SOLL'"),
+        (("--vary", "SOLL=1:2"), f"{TABLE}:2: no column 'SOLL'"),
         (("--vary", "SOL=1:2"), "limits 1:2 of SOL, which was set from 190"),
         (("--vary", "SOL=210:190", *KNOBS[2:]), "limits 210:190 of SOL; expected two numbers"),
         (KNOBS[2:], f"{TABLE}: column 'SOL_A': no magnet 'SOL' in the lattice"),

@@ -229,7 +229,7 @@ def test_the_beam_is_that_of_madx(beam, tmp_path):
         ("particle=electron, charge=2, energy=3", "charge 2"),
         ("particle=negmuon, energy=3", "'negmuon'"),
         ("particle=proton, energy=0.5", "rest energy"),
-        ("particle=proton, energy:=e0", "BEAM"),
+        ("particle=proton, energy:=e0", "the undefined 'e0'"),
         ("particle=proton", "--energy"),
         ("particle=proton, energy=3, bv=-1", "BV = -1"),
         ("particle=proton, beta=1.2", "between 0 and 1"),

@@ -311,7 +311,7 @@ def test_one_record_as_programs_export_it(export, tmp_path):
         ("time_d", 739312.5, "MATLAB"),  # days from the year 0
         ("time_d", 45352.5, "Excel"),  # days from 1899
         ("time_s", 3792139200, "LabVIEW"),  # seconds from 1904
-        ("time_s", 1709294400000, "milliseconds"),
+        ("time_s", 1709294400000, "time_s=time_ms"),
     ],
 )
 def test_times_from_another_origin_are_no_dates(column, value, words, tmp_path):
