@@ -8,6 +8,7 @@ from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.special import stdtr
 
 from beamfit.answer import json_of, shown
 from beamfit.errors import Status
@@ -31,10 +32,12 @@ from beamfit.lifetime.expansion import (
     lifetime_of,
 )
 from beamfit.lifetime.free_law import BELOW, ENDS, PACES, UNITS, FreeLaw, Law, free_law
+from beamfit.lifetime.pieces import LONE
 from beamfit.lifetime.record import DecayRecord
 from beamfit.noise.correlated import AveragedMoments, Memory
 from beamfit.noise.memory import CLOSE, Products
 from beamfit.quantity import HOUR, Quantity
+from beamfit.statistics import POOR_FIT
 
 # The share of a in the loss lies between 0 and 1: known to 0.2, the record tells pure Touschek
 # from pure gas at five standard deviations; known worse, a and b are one number.
@@ -435,9 +438,26 @@ class Evidence:
         """True if the readings contradict constant a and b, or show values that no beam has."""
         if self.changed or self.constant_a.status is Status.poor_fit:
             return True
+        if self.ends_oddly and self.rival is not None:
+            return True
         return self.cycles == 1 and any(
             value < -BELIEVED * error for value, error in map(self.sure, "ab")
         )
+
+    @cached_property
+    def ends_oddly(self) -> bool:
+        """True if a reading at an end of a decay lies off what the others say of it, by a power of
+        the current and by more than chance: it alone tells the current there.
+        """
+        columns = np.linalg.qr(self.about.left[:, self.about.columns(POWER)])[0]
+        after, dof = self.about.left[:, -1], len(columns) - columns.shape[1] - 1
+        if self.cycles > 1 or not self.about.rested or dof < 1:
+            return False
+        after = after - columns @ (columns.T @ after)
+        own = after**2 / np.maximum(1.0 - np.sum(columns**2, axis=1), EXACT)
+        ratio = dof * own / np.maximum(after @ after - own, 1e-300)
+        ends = np.sqrt(np.append(ratio[:LONE], ratio[-LONE:]))
+        return bool(2 * LONE * 2 * stdtr(dof, -ends.max()) < POOR_FIT)
 
     @cached_property
     def rival(self) -> Rival | None:

@@ -18,6 +18,7 @@ from beamfit.lifetime.decay_law import current
 from beamfit.lifetime.evidence import BELIEVED, UNITS, Evidence, RatePart, Separability
 from beamfit.lifetime.expansion import Expansion, Pieces, Shape, solved
 from beamfit.lifetime.free_law import FreeLaw, Law
+from beamfit.lifetime.pieces import with_common_errors
 from beamfit.lifetime.record import DecayRecord, Monitor
 from beamfit.quantity import Quantity, Status
 
@@ -323,7 +324,7 @@ def fit_decay(
     converged 28.704763 ± 0.000026 h
     """
     expect(record, DecayRecord, "beamfit.read_decay_record(path)")
-    record = record if monitor is None else replace(record, monitor=monitor)
+    record = with_common_errors(record if monitor is None else replace(record, monitor=monitor))
     if _says_nothing(record):
         return _constant(record, f"All {len(record)} readings are {record.current[0]:.6g} mA")
     return _judged(record, solved(Pieces.of(record), shape=shape), shape, Law(law))
