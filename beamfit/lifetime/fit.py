@@ -324,10 +324,13 @@ def fit_decay(
     converged 28.704763 ± 0.000026 h
     """
     expect(record, DecayRecord, "beamfit.read_decay_record(path)")
-    record = with_common_errors(record if monitor is None else replace(record, monitor=monitor))
+    record = record if monitor is None else replace(record, monitor=monitor)
     if _says_nothing(record):
         return _constant(record, f"All {len(record)} readings are {record.current[0]:.6g} mA")
-    return _judged(record, solved(Pieces.of(record), shape=shape), shape, Law(law))
+    about = solved(Pieces.of(record), shape=shape)
+    even = with_common_errors(record, about.residuals * about.pieces.over)
+    about = about if even is record else solved(Pieces.of(even), shape=shape)
+    return _judged(even, about, shape, Law(law))
 
 
 def fit_decays(records: Sequence[DecayRecord], law: Law | str = Law.free) -> tuple[DecayFit, ...]:

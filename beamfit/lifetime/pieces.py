@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from scipy.ndimage import maximum_filter1d, median_filter, minimum_filter1d, uniform_filter1d
 
 from beamfit.answer import shown
@@ -105,33 +106,26 @@ def noise_of(time: np.ndarray, current: np.ndarray) -> float:
     >>> f"{noise_of(t, 100 - t / 100 + noise):.3f}"
     '0.010'
     """
-    off, first, last = _off_neighbours(time, current)
-    off /= np.sqrt(1 + first**2 + last**2)
+    share = (time[1:-1] - time[:-2]) / (time[2:] - time[:-2])
+    off = current[1:-1] - (1 - share) * current[:-2] - share * current[2:]
+    off /= np.sqrt(1 + share**2 + (1 - share) ** 2)
     return float(1.4826 * np.median(np.abs(off, out=off), overwrite_input=True))
 
 
-def _off_neighbours(
-    time: np.ndarray, current: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Distance of each reading from the line through its neighbours, and the shares of these."""
-    last = (time[1:-1] - time[:-2]) / (time[2:] - time[:-2])
-    first = 1 - last
-    return current[1:-1] - first * current[:-2] - last * current[2:], first, last
-
-
-def with_common_errors(record: DecayRecord) -> DecayRecord:
+def with_common_errors(record: DecayRecord, residuals: np.ndarray) -> DecayRecord:
     """Take the rms of the errors near each reading for its error where they differ by chance.
 
     An error of three readings is known to a half, and the root of a number of counts goes with
     that number: as weights both prefer readings by their own noise. Errors that differ for a reason
-    make how far readings lie off their neighbours much likelier, and stay.
+    make how far residuals lie off those beside them much likelier, and stay.
 
     Examples
     --------
     >>> random, t = np.random.default_rng(1), np.linspace(0.0, 3600.0, 60)
-    >>> shots = (100 - t / 100)[:, None] + random.normal(size=(60, 3))
+    >>> shots = random.normal(size=(60, 3))
     >>> errors = shots.std(axis=1, ddof=1) / np.sqrt(3)
-    >>> found = with_common_errors(DecayRecord(t, shots.mean(axis=1), errors)).error
+    >>> record = DecayRecord(t, 100 - t / 100 + shots.mean(axis=1), errors)
+    >>> found = with_common_errors(record, shots.mean(axis=1)).error
     >>> f"{errors.min():.2f} to {errors.max():.2f}, {found.min():.2f} to {found.max():.2f}"
     '0.06 to 1.20, 0.43 to 0.61'
     """
@@ -139,12 +133,18 @@ def with_common_errors(record: DecayRecord) -> DecayRecord:
     if error is None or len(record) < FEWEST or not np.ptp(error):
         return record
     near = np.sqrt(uniform_filter1d(error**2, min(NEIGHBOURS, len(record)), mode="mirror"))
-    off, first, last = _off_neighbours(record.time, record.current)
+    times, off = (sliding_window_view(v, 5) for v in (record.time, residuals))
+    since, off = np.delete(times - times[:, 2:3], 2, 1), np.delete(off - off[:, 2:3], 2, 1)
 
     def misfit(error: np.ndarray) -> float:
         """-2 ln of their probability, whatever factor all errors are wrong by."""
-        variance = error[1:-1] ** 2 + (first * error[:-2]) ** 2 + (last * error[2:]) ** 2
-        return float(np.sum(np.log(variance)) + off.size * np.log(np.mean(off**2 / variance)))
+        weight = np.delete(1 / sliding_window_view(error, 5) ** 2, 2, 1)
+        sums = (np.sum(weight * part, axis=1) for part in (1, since, since**2, off, off * since))
+        count, first, second, level, slope = sums
+        spread = count * second - first**2
+        line = (second * level - first * slope) / spread
+        variance = error[2:-2] ** 2 + second / spread
+        return float(np.sum(np.log(variance)) + line.size * np.log(np.mean(line**2 / variance)))
 
     with np.errstate(divide="ignore", invalid="ignore"):
         if misfit(near) - misfit(error) > -2 * np.log(POOR_FIT):
