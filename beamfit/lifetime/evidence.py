@@ -451,9 +451,11 @@ class Evidence:
         """True if a reading at an end of a decay lies off what the others say of it, by a power of
         the current and by more than chance: it alone tells the current there.
         """
+        if self.cycles > 1 or not self.about.rested:
+            return False
         columns = np.linalg.qr(self.about.left[:, self.about.columns(POWER)])[0]
         after, dof = self.about.left[:, -1], len(columns) - columns.shape[1] - 1
-        if self.cycles > 1 or not self.about.rested or dof < 1:
+        if dof < 1:
             return False
         after = after - columns @ (columns.T @ after)
         own = after**2 / np.maximum(1.0 - np.sum(columns**2, axis=1), EXACT)
