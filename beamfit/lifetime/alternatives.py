@@ -10,6 +10,7 @@ from __future__ import annotations
 import itertools
 import math
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -57,6 +58,9 @@ FOUND = float(ndtri(1 - POOR_FIT / 2) + ndtri(0.9))
 GRID = np.linspace(0.05, 0.95, 40)
 # Changes are placed on ever finer grids about the best of the last, so often.
 FINER = 3
+# They are placed anew about the law with them while its squares fall by such a share, so often at
+# most.
+AGAIN, NEARER = 5, 1e-3
 # Two changes within so many readings are a step.
 STEP = 3.0
 # An alternative is fitted if in linear approximation its evidence, by noises of so many correlation
@@ -80,13 +84,17 @@ class Alternative(NamedTuple):
     power: bool = False
 
 
-# Constant a and b, a power of a, and a drift of b beside; one change of the loss rate, two, gas
-# that relaxes, current lost at once between two readings, each as likely, once or twice.
+# Constant a and b, a power of a, and a drift of b beside; one change of the loss rate, two, each of
+# b, as of gas or a scraper, or of a, as of the RF voltage; gas that relaxes; current lost at once
+# between two readings, each as likely, once or twice.
 CONSTANT, POWERED = Alternative(SMOOTH - 0.4), Alternative(0.2, power=True)
 DRIFTING = Alternative(0.2, "drift", power=True)
-OTHERS = (Alternative(0.08, "step", 1), Alternative(0.04, "step", 2),
+OTHERS = (Alternative(0.04, "step", 1), Alternative(0.02, "step", 2),
+          Alternative(0.04, "step of a", 1), Alternative(0.02, "step of a", 2),
           Alternative(OUTGASSING, "relaxing", 1),
           Alternative(0.04, "sudden", 1), Alternative(0.02, "sudden", 2))  # fmt: skip
+# What is not looked for where a gauge says how the gas goes.
+UNGAUGED = ("relaxing", "step of a")
 
 
 @shown
@@ -325,8 +333,9 @@ class Rival(NamedTuple):
             for size, time in zip(further[::2], further[1::2], strict=True):
                 if self.kind == "relaxing":
                     rates = rates + size * np.exp(-when / time)
-                elif self.kind == "step":
-                    rates = rates + size * (when > np.real(time))
+                elif self.kind != "sudden":
+                    by = np.array([level, x[-1], 1.0]) if self.kind == "step of a" else 1.0
+                    rates = rates + size * by * (when > np.real(time))
             return np.append(rates / span, level * mean)
 
         columns = [LEVEL, *PLAIN, *range(FURTHER, self.law.rows.shape[1])]
@@ -373,7 +382,8 @@ def rival_of(plain: Expansion) -> Rival | None:
     log, one, best = max(found, key=lambda each: each[0], default=(-math.inf, CONSTANT, plain))
     if not log > smooth:
         return None
-    told = {"step": _change, "relaxing": _outgassing, "sudden": _sudden_loss}
+    told = {"relaxing": _outgassing, "sudden": _sudden_loss}
+    told |= {"step": _change, "step of a": partial(_change, of_a=True)}
     scatter = float(np.sqrt(np.mean((best.residuals * pieces.over) ** 2)))
     return Rival(told[one.kind](best), log - smooth, scatter, best, one.kind)
 
@@ -392,7 +402,7 @@ def _likely(plain: Expansion) -> dict[Alternative, _Further]:
     their evidence in linear approximation about the law without, at their best times.
     """
     gauged = plain.pieces.gauge is not None
-    others = [one for one in OTHERS if not (gauged and one.kind == "relaxing")]
+    others = [one for one in OTHERS if not (gauged and one.kind in UNGAUGED)]
     best = {one: _at_best(plain, one.count, one.kind) for one in others}
     columns = [plain.residuals, *plain.rows[:, [LEVEL, *PLAIN]].T]
     places, widths = {CONSTANT: range(0)}, {CONSTANT: np.zeros(0)}
@@ -453,17 +463,30 @@ class _Further(NamedTuple):
     sizes: np.ndarray
 
 
-def _at_best(plain: Expansion, count: int, kind: str) -> _Further:
-    """Further losses that explain most, in linear approximation about the law without."""
-    basis = np.linalg.qr(plain.left[:, [LEVEL, *PLAIN]])[0]
+def _looked_at(pieces: Pieces, kind: str) -> np.ndarray:
+    """Times that are looked at first, over the span: current is lost between any two readings."""
+    if kind != "sudden":
+        return GRID
+    between = (pieces.time[1:] + pieces.time[:-1]) / 2 / pieces.units[0]
+    few = np.linspace(0, between.size - 1, min(GRID.size, between.size))
+    return between[few.astype(int)]
+
+
+def _at_best(about: Expansion, count: int, kind: str) -> _Further:
+    """Further losses that explain most, in place of those of a law and in linear approximation
+    about it.
+    """
+    basis = np.linalg.qr(about.left[:, [LEVEL, *PLAIN]])[0]
 
     def beside(columns: np.ndarray) -> np.ndarray:
         return columns - basis @ (basis.T @ columns)
 
-    residual, windows = beside(plain.residuals), [GRID] * count
+    without = about.residuals - about.rows[:, FURTHER::2] @ about.numbers[FURTHER - 1 :: 2]
+    grid = _looked_at(about.pieces, kind)
+    residual, windows = beside(without), [grid] * count
     for _ in range(FINER):
         every = np.concatenate(windows)
-        kinks = beside(further_columns(plain, kind, every))
+        kinks = beside(further_columns(about, kind, every))
         size = np.linalg.norm(kinks, axis=0) + 1e-300
         along, products = kinks.T @ residual / size, kinks.T @ kinks / size / size[:, None]
         place = np.array(list(itertools.product(*np.split(np.arange(every.size), count))))
@@ -471,24 +494,45 @@ def _at_best(plain: Expansion, count: int, kind: str) -> _Further:
         sizes = np.linalg.solve(pairs, along[place][..., None])[..., 0]
         best = int(np.argmax(np.sum(sizes * along[place], axis=1)))
         times, steps = every[place[best]], [window[1] - window[0] for window in windows]
-        windows = [np.linspace(t - d, t + d, GRID.size) for t, d in zip(times, steps, strict=True)]
+        windows = [np.linspace(max(t - d, grid[0]), min(t + d, grid[-1]), GRID.size)
+                   for t, d in zip(times, steps, strict=True)]  # fmt: skip
     return _Further(kind, times, -sizes[best] / size[place[best]])
 
 
 def _with_further(plain: Expansion, more: _Further) -> Expansion | None:
-    """The law with changes of the loss rate, or sudden losses, at their times, or with gas that
-    relaxes, whose time is found.
+    """The law with changes of the loss rate, or sudden losses, or with gas that relaxes, whose
+    time is found. Those of the others are looked for again about the law with them, while it is
+    better: a large change bends the decay otherwise than a small one.
     """
-    further = np.column_stack([more.sizes, more.times])[np.argsort(more.times)].ravel()
-    gas = more.kind == "relaxing"
-    free = (*PLAIN, *range(FURTHER, FURTHER + further.size, 1 if gas else 2))
-    law = solved(plain.pieces, free, more.kind, start=np.append(plain.numbers, further))
+    gas, law, found = more.kind == "relaxing", plain, None
+    for _ in range(AGAIN):
+        further = np.column_stack([more.sizes, more.times])[np.argsort(more.times)].ravel()
+        free = (*PLAIN, *range(FURTHER, FURTHER + further.size, 1 if gas else 2))
+        law = solved(
+            plain.pieces,
+            free,
+            more.kind,
+            start=np.append(law.numbers[: plain.numbers.size], further),
+        )
+        if found is not None and not _squares(law) < (1 - NEARER) * _squares(found):
+            break
+        found = law
+        if gas or not law.rested:
+            break
+        more = _at_best(law, more.times.size, more.kind)
     shortest = float(np.median(np.diff(plain.pieces.time))) / plain.pieces.units[0]
     if gas:
-        known = law.numbers[3] > 0 and shortest < law.numbers[4] < TIMES[1]
+        known = found.numbers[3] > 0 and shortest < found.numbers[4] < TIMES[1]
+    elif more.kind == "sudden":
+        known = np.all(np.diff(found.numbers[4::2]) > shortest)
     else:
-        known = np.all(np.diff([0.0, *law.numbers[4::2], 1.0]) > STEP * shortest)
-    return law if law.rested and known else None
+        known = np.all(np.diff([0.0, *found.numbers[4::2], 1.0]) > STEP * shortest)
+    return found if found.rested and known else None
+
+
+def _squares(law: Expansion) -> float:
+    """Sum of squares of the residuals."""
+    return float(law.residuals @ law.residuals)
 
 
 def _log_evidence(law: Expansion, one: Alternative) -> float:
@@ -559,15 +603,17 @@ def _laplace(products: Products, width: np.ndarray, centre: np.ndarray) -> float
     return float(logsumexp(log)) - float(np.log(width[finite]).sum())
 
 
-def _change(law: Expansion) -> Change:
+def _change(law: Expansion, of_a: bool = False) -> Change:
     """The lifetimes before and after each time, from the law with changes there."""
     (span, mean), count = law.pieces.units, law.numbers.size // 2 - 1
     times = law.numbers[4::2]
     x = np.interp(times * span, law.pieces.time, law.pieces.current) / mean
 
     def rates(level, loss, quadratic, power, *further):
-        before = loss + quadratic * (x - 1) + np.append(0.0, np.cumsum(further[::2])[:-1])
-        return np.concatenate([before, before + further[::2], further[1::2]]) / span
+        more = np.array(further[::2])
+        own = loss + quadratic * (x - 1)
+        sides = (own + (x if of_a else 1.0) * (np.cumsum(more) - part) for part in (more, 0.0))
+        return np.concatenate([*sides, further[1::2]]) / span
 
     values, errors = law.quoted(rates, [LEVEL, *PLAIN, *range(FURTHER, law.rows.shape[1])])
     lifetimes = [lifetime_of(*one) for one in zip(values, errors, strict=True)]

@@ -151,8 +151,8 @@ def beam_current(
         shape, and k times a further loss and its time; complex where slopes are wanted.
     at : Moments
         When; with a gauge or further losses of a single piece.
-    kind : {"relaxing", "step", "drift", "sudden"}, optional
-        The further losses, as of `course`.
+    kind : {"relaxing", "step", "drift", "sudden", "step of a"}, optional
+        The further losses, as of `course`, or of a, which go with the current; not with a gauge.
     shape : callable, optional
         Dependence of a on the current over its mean, up to a factor, where it is no power; the rate
         equation of a single piece is integrated then, without further losses.
@@ -176,10 +176,16 @@ def beam_current(
     linear = loss - quadratic
     if shape is not None:
         return np.asarray(_shaped(at.time, level, quadratic, linear, power, shape))
-    if at.gas is None and kind is None:
+    if at.gas is None and kind in (None, "step of a"):
         lost = linear * at.time
-        whole = at.time * mean_exponential((1.0 + power) * lost)
-        return closed_form(level, quadratic, power, lost, whole)
+
+        def whole(time: np.ndarray) -> np.ndarray:
+            return time * mean_exponential((1.0 + power) * linear * time)
+
+        bent, pairs = quadratic * whole(at.time), zip(further[::2], further[1::2], strict=True)
+        for more, when in pairs:
+            bent = bent + more * np.where(at.time > np.real(when), whole(at.time) - whole(when), 0)
+        return closed_form(level, 1.0, power, lost, bent)
 
     def gone(time: np.ndarray, gas: np.ndarray) -> np.ndarray:
         pairs = zip(further[::2], further[1::2], strict=True)

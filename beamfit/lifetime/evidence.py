@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.special import stdtr
 
 from beamfit.answer import json_of, shown
 from beamfit.errors import Status
@@ -27,14 +28,18 @@ from beamfit.lifetime.expansion import (
     POWER,
     Expansion,
     Physical,
+    Pieces,
     further_columns,
     lifetime_of,
+    solved,
 )
 from beamfit.lifetime.free_law import BELOW, ENDS, PACES, UNITS, FreeLaw, Law, free_law
+from beamfit.lifetime.pieces import LONE
 from beamfit.lifetime.record import DecayRecord
 from beamfit.noise.correlated import AveragedMoments, Memory
 from beamfit.noise.memory import CLOSE, Products
 from beamfit.quantity import HOUR, Quantity
+from beamfit.statistics import POOR_FIT
 
 # The share of a in the loss lies between 0 and 1: known to 0.2, the record tells pure Touschek
 # from pure gas at five standard deviations; known worse, a and b are one number.
@@ -435,9 +440,28 @@ class Evidence:
         """True if the readings contradict constant a and b, or show values that no beam has."""
         if self.changed or self.constant_a.status is Status.poor_fit:
             return True
+        if self.ends_oddly and self.rival is not None:
+            return True
         return self.cycles == 1 and any(
             value < -BELIEVED * error for value, error in map(self.sure, "ab")
         )
+
+    @cached_property
+    def ends_oddly(self) -> bool:
+        """True if a reading at an end of a decay lies off what the others say of it, by a power of
+        the current and by more than chance: it alone tells the current there.
+        """
+        if self.cycles > 1 or not self.about.rested:
+            return False
+        columns = np.linalg.qr(self.about.left[:, self.about.columns(POWER)])[0]
+        after, dof = self.about.left[:, -1], len(columns) - columns.shape[1] - 1
+        if dof < 1:
+            return False
+        after = after - columns @ (columns.T @ after)
+        own = after**2 / np.maximum(1.0 - np.sum(columns**2, axis=1), EXACT)
+        ratio = dof * own / np.maximum(after @ after - own, 1e-300)
+        ends = np.sqrt(np.append(ratio[:LONE], ratio[-LONE:]))
+        return bool(2 * LONE * 2 * stdtr(dof, -ends.max()) < POOR_FIT)
 
     @cached_property
     def rival(self) -> Rival | None:
@@ -502,6 +526,20 @@ class Evidence:
         step = np.linalg.lstsq(rows[:, : len(plain)], -size * rows[:, -1], rcond=None)[0]
         return Physical(*np.abs(self.about.slopes[:, columns] @ np.append(step, size)))
 
+    @cached_property
+    def freely_drifted(self) -> dict[str, float]:
+        """Shifts of what the free law says by a stated instability of the monitor: it follows that
+        otherwise than constant a and b do.
+        """
+        names, every, record = tuple(self.free.quantities), [], self.record
+        for change in self.monitor_changes:
+            current = record.current + change * self.about.pieces.over
+            read = replace(record, current=current, mean=record.mean_current)
+            found = free_law(read, solved(Pieces.of(read)).values) or self.free
+            every.append([found.quantities[n].value - self.free.quantities[n].value for n in names])
+        moved = np.linalg.norm(every, axis=0) if every else np.zeros(len(names))
+        return dict(zip(names, moved.tolist(), strict=True))
+
     def widely(self, name: str, exact: Quantity) -> Quantity:
         """A quantity with the exponent and the drift of b that the readings leave open.
 
@@ -510,18 +548,18 @@ class Evidence:
         """
         if not math.isfinite(exact.value):
             return exact
-        rate = name.replace("lifetime", "rate")
-        by = HOUR if rate != name else 0.0
         if self.bending is not None and exact.error is not None and not self.refuted:
-            value, error, interval, more = exact.value, exact.error, exact.interval_95, self.bending
+            value, error, interval = exact.value, exact.error, exact.interval_95
+            rate = name.replace("lifetime", "rate")
+            unit = HOUR * value**2 if rate != name else 1.0
+            moved = unit * float(getattr(self.bending, rate))
         elif self.free is not None:
-            found, more = self.free.quantities[name], Physical(*self.drifted)
+            found, moved = self.free.quantities[name], self.freely_drifted[name]
             error, interval = found.error, found.interval_95
             value = found.value if self.freed else exact.value
             value = float(np.clip(value, *interval))
         else:
             return exact
-        moved = float(getattr(more, rate)) * (by * value**2 or 1.0)
         low, high = (float(np.hypot(value - end, NORMAL * moved)) for end in interval)
         known = exact.error is not None and (name not in ("a", "b") or self.separability.separable)
         error = math.hypot(error, moved) if known else None

@@ -594,9 +594,11 @@ def further_columns(about: Expansion, kind: str, times: np.ndarray) -> np.ndarra
 
     (span, _), level = about.pieces.units, about.rows[:, [LEVEL]]
     time, model = about.pieces.time / span, about.pieces.current / about.pieces.over
-    fading = (model + about.residuals)[:, None] / level
-    if kind == "step":
-        whole = cumulative_simpson(fading, x=time, axis=0, initial=0.0)
+    model = (model + about.residuals)[:, None]
+    fading = model / level
+    if kind in ("step", "step of a"):
+        share = 1.0 if kind == "step" else model / about.pieces.weight[:, None]
+        whole = cumulative_simpson(share * fading, x=time, axis=0, initial=0.0)
         return -level * np.maximum(whole - np.interp(times, time, whole[:, 0]), 0.0)
     if kind == "sudden":
         return -level * np.interp(times, time, fading[:, 0]) * (time[:, None] > times)

@@ -18,6 +18,7 @@ from beamfit.lifetime.decay_law import current
 from beamfit.lifetime.evidence import BELIEVED, UNITS, Evidence, RatePart, Separability
 from beamfit.lifetime.expansion import Expansion, Pieces, Shape, solved
 from beamfit.lifetime.free_law import FreeLaw, Law
+from beamfit.lifetime.pieces import with_common_errors
 from beamfit.lifetime.record import DecayRecord, Monitor
 from beamfit.quantity import Quantity, Status
 
@@ -326,7 +327,10 @@ def fit_decay(
     record = record if monitor is None else replace(record, monitor=monitor)
     if _says_nothing(record):
         return _constant(record, f"All {len(record)} readings are {record.current[0]:.6g} mA")
-    return _judged(record, solved(Pieces.of(record), shape=shape), shape, Law(law))
+    about = solved(Pieces.of(record), shape=shape)
+    even = with_common_errors(record, about.residuals * about.pieces.over)
+    about = about if even is record else solved(Pieces.of(even), shape=shape)
+    return _judged(even, about, shape, Law(law))
 
 
 def fit_decays(records: Sequence[DecayRecord], law: Law | str = Law.free) -> tuple[DecayFit, ...]:

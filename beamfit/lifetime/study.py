@@ -21,6 +21,7 @@ from beamfit.lifetime.cycles import (
     joined,
 )
 from beamfit.lifetime.evidence import SEPARABLE
+from beamfit.lifetime.fit import FEWEST as FEWEST_FITTED
 from beamfit.lifetime.fit import DecayFit, bare, fit_cycles, fit_decay, fit_pieces
 from beamfit.lifetime.free_law import DRIFT, Law
 from beamfit.lifetime.mechanisms import MECHANISMS, Losses, loss_coefficients
@@ -28,6 +29,8 @@ from beamfit.lifetime.pieces import (
     FEWEST,
     Event,
     Split,
+    beam_readings,
+    event_of,
     noise_of,
     on_edges,
     split_record,
@@ -449,8 +452,10 @@ def _decays(record: DecayRecord) -> tuple[list[DecayRecord], tuple[Event, ...]]:
     pieces = [piece for segment in split.segments for piece in at_settings(segment)]
     if pieces:
         return pieces, split.events
-    moving = [name for name, steps in _steps(record).items() if steps.any()]
     kinds = {event.kind for event in split.events}
+    if kinds == {"spike"} and (kept := beam_readings(record)[0]).size >= FEWEST_FITTED:
+        return [record.select(kept)], split.events
+    moving = [name for name, steps in _steps(record).items() if steps.any()]
     if moving or "short" not in kinds:
         changes = f"changes of {', '.join(moving)} by more than {100 * CHANGED:g} %"
         found = ", ".join(sorted(kinds)) or changes
@@ -488,11 +493,14 @@ def _parts(piece: DecayRecord, law: Law, whole: bool) -> tuple[list[Decay], list
         # Of means of neighbours the time is anywhere within one.
         within += float(np.median(np.diff(segment.time))) * (len(segment) < len(piece))
         sides = piece.time < at - within, piece.time > at + within
-        halves = [piece.select(rows) for rows in sides]
-        if min(map(len, halves)) >= FEWEST:
-            decays, events = _fitted(halves, law, whole)
-            return decays, [*events, event._replace(time=piece.start + at)]
-    return [Decay(segment, piece.start, fit, None)], []
+        long = [piece.select(rows) for rows in sides if np.sum(rows) >= FEWEST]
+        if long and max(map(len, long)) < len(piece):
+            decays, events = _fitted(long, law, whole)
+            short = [event_of(piece, "short", *np.flatnonzero(rows)[[0, -1]]) for rows in sides
+                     if 0 < np.sum(rows) < FEWEST]  # fmt: skip
+            here = [one._replace(time=piece.start + one.time) for one in short]
+            return decays, [*events, *here, event._replace(time=piece.start + at)]
+    return [Decay(segment, segment.start, fit, None)], []
 
 
 def _cut(segment: DecayRecord, fit: DecayFit) -> tuple[Event, float] | None:

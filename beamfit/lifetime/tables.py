@@ -165,13 +165,16 @@ def systematic_table(decay: Decay, title: str) -> Table:
     fit = decay.fit
     values = fit.a.value, fit.b.value, fit.lifetime_mean.value
     rows = [
-        [cause, *(_percent(moved / value) for moved, value in zip(by, values, strict=True))]
+        [cause, *(_percent(*pair) for pair in zip(by, values, strict=True))]
         for cause, *by in decay.systematics
     ]
     return Table(title, ["if the", "a", "b", "lifetime at the mean"], rows)
 
 
-def _percent(share: float) -> str:
+def _percent(moved: float, value: float) -> str:
+    if value == 0:  # no part of nothing, such as of a that is at its limit
+        return "-"
+    share = moved / value
     return f"{100 * share:+.0f} %" if abs(share) > 1 - 1e-9 else f"{100 * share:+.2g} %"
 
 

@@ -54,6 +54,42 @@ def test_correlated_noise_is_covered(correlation, count):
         assert np.mean(pulls < 1) < 0.68 + widened(0.2, 60, count)
 
 
+def few_shots(rng, time):
+    """Means of two or three readings, and their errors."""
+    shots = law(time)[:, None] + 0.3 * rng.normal(size=(time.size, rng.integers(2, 4)))
+    error = shots.std(axis=1, ddof=1) / np.sqrt(shots.shape[1])
+    return shots.mean(axis=1), np.maximum(error, 1e-9)
+
+
+def counted(rng, time):
+    """Some thousand counts, and their roots."""
+    unit = I0 / 10 ** rng.uniform(3, 4)
+    counts = rng.poisson(law(time) / unit)
+    return counts * unit, np.sqrt(counts) * unit
+
+
+@simulations(12, 100)
+@pytest.mark.parametrize("read", [few_shots, counted])
+def test_errors_that_go_with_the_noise_of_their_reading_are_shared(read, count):
+    """As weights they took the answer: half of the lifetimes held."""
+    pulls, time = [], np.linspace(0, 10 * SPAN, 150)
+    for seed in range(count):
+        current, error = read(np.random.default_rng(seed), time)
+        fit = fit_decay(DecayRecord(time, current, error))
+        assert "differ by chance" in fit.readings.notes[0]
+        true = 1 / (A * fit.mean_current + B) / HOUR
+        pulls.append(abs(fit.lifetime_mean.value - true) / fit.lifetime_mean.error)
+    assert np.mean(np.array(pulls) < 1.96) > 0.95 - widened(0.07, 100, count)
+    assert max(pulls) < 4
+
+
+def test_errors_that_differ_for_a_reason_stay():
+    time, rng = np.linspace(0, SPAN, 60), np.random.default_rng(1)
+    error = np.where(np.arange(60) % 2, 0.02, 0.2)
+    own = DecayRecord(time, law(time) + error * rng.normal(size=60), error)
+    assert np.array_equal(fit_decay(own).readings.error, error)
+
+
 def test_independent_noise_gives_plain_least_squares():
     for seed in range(5):
         plain = record(0.0, seed=seed)

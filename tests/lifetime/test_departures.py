@@ -47,11 +47,12 @@ LAWS = {
     "step": ("step", (0.2, 0.4)),
     "steps": ("step", (0.2, 0.4, -0.1, 0.7)),
     "drift": ("drift", (0.2, 0.0)),
+    "step of a": ("step of a", (0.2, 0.4, -0.1, 0.7)),
 }
+GAUGED = [*((name, False) for name in LAWS), *((name, True) for name in LAWS if "of a" not in name)]
 
 
-@pytest.mark.parametrize("gauged", [False, True])
-@pytest.mark.parametrize("name", LAWS)
+@pytest.mark.parametrize(("name", "gauged"), GAUGED)
 def test_the_closed_form_is_the_integrated_law(name, gauged):
     """Any power of a, any course of b, and a pressure that is read."""
     kind, further = LAWS[name]
@@ -59,13 +60,14 @@ def test_the_closed_form_is_the_integrated_law(name, gauged):
     gauge = time + 0.1 * time * (1 - time)
 
     def more(t):
-        if kind == "step":
+        if kind in ("step", "step of a"):
             return sum(f * (t > w) for f, w in zip(further[::2], further[1::2], strict=True))
         return {"relaxing": 0.2 * np.exp(-t / 0.3), "drift": 0.2 * (t - 0.5)}.get(kind, 0.0)
 
     def slope(t, x):
         gas = 1 + 0.1 * (1 - 2 * t) if gauged else 1.0
-        return -(0.4 * x ** (2 + power) + (0.3 * gas + more(t)) * x)
+        by = x if kind == "step of a" else 1.0
+        return -(0.4 * x ** (2 + power) + (0.3 * gas + by * more(t)) * x)
 
     true = solve_ivp(slope, (0, 1), [1.3], t_eval=time, rtol=1e-11, atol=1e-12, max_step=1e-3).y[0]
     numbers = np.array([0.7, 0.4, power, *further])
@@ -372,18 +374,21 @@ def test_five_readings_are_an_answer_also_where_they_refute_the_law():
 @pytest.mark.parametrize(
     ("kind", "when", "course"),
     [
-        ("step", 0.4, lambda s: s >= 0.4),
-        ("relaxing", 0.2, lambda s: np.exp(-s / 0.2)),
-        ("drift", 0.0, lambda s: s - 0.5),
+        ("step", 0.4, lambda s, x: s >= 0.4),
+        ("step of a", 0.4, lambda s, x: x * (s >= 0.4)),
+        ("relaxing", 0.2, lambda s, x: np.exp(-s / 0.2)),
+        ("drift", 0.0, lambda s, x: s - 0.5),
     ],
 )
 def test_slopes_by_a_further_loss_are_differences_of_the_integrated_law(kind, when, course):
-    ends = []
+    time, plain = integrated(lambda t, i: A * i + B)
+    ends, about = [], solved(Pieces.of(DecayRecord(time, plain)))
     for more in (0.05, -0.05):
-        rate = lambda t, i, more=more: A * i + B + more / SPAN * course(t / SPAN)  # noqa: E731
-        time, beam = integrated(rate)
-        ends.append(beam)
-    about = solved(Pieces.of(DecayRecord(time, integrated(lambda t, i: A * i + B)[1])))
+
+        def rate(t, i, more=more):
+            return A * i + B + more / SPAN * course(t / SPAN, i / plain.mean())
+
+        ends.append(integrated(rate)[1])
     found = further_columns(about, kind, np.array([when]))[:, 0]
     expected = (ends[0] - ends[1]) / 0.1
     assert found == pytest.approx(expected, abs=2e-3 * np.abs(expected).max())

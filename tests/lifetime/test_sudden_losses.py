@@ -95,6 +95,58 @@ def test_the_record_is_cut_where_the_loss_rate_changes_sharply():
     assert {decay.fit.status for decay in study.decays} <= {Status.converged, Status.unidentified}
 
 
+@simulations(3, 30)
+@pytest.mark.parametrize("factor", [0.55, 1.8])
+def test_a_large_change_of_a_is_cut_where_it_is(factor, count):
+    """The RF voltage changes: a loss of b in its place had the time 5 to 30 readings off."""
+    for k in range(count):
+        record, true = rate_change(factor, 0.0, np.random.default_rng(k))
+        study = study_record(record)
+        assert [event.kind for event in study.events] == ["loss rate changes"]
+        before, after = study.decays
+        changed = 0.4 * SPAN
+        assert before.offset + before.segment.span < changed < after.offset
+        at = np.searchsorted(TIME, after.offset)
+        rate = factor * A * true[at] + B
+        assert abs(after.fit.lifetime_start.value * HOUR * rate - 1) < 0.03
+
+
+def test_a_beam_that_is_lost_over_some_readings_ends_before_them():
+    """A monitor that averages shows a dump in two or three readings."""
+    true = decay()
+    true[400:403] *= [0.9, 0.5, 0.1]
+    true[403:] = 0.0
+    noise = 0.1 * np.random.default_rng(1).normal(size=COUNT)
+    study = study_record(DecayRecord(TIME, np.maximum(true + noise, 0.0)))
+    [found] = study.decays
+    assert found.segment.span == TIME[399]
+    assert found.fit.status is Status.converged
+    low, high = found.fit.lifetime_end.interval_95
+    assert low <= 1 / (A * true[399] + B) / HOUR <= high
+
+
+def test_a_first_reading_that_is_wrong_is_left_out():
+    """Of few readings a spike at an end took gas that is pumped away within a reading."""
+    time = np.linspace(0.0, 10 * HOUR, 18)
+    true = solve_ivp(lambda t, i: -(A * i + B) * i, (0, time[-1]), [START], t_eval=time,
+                     rtol=1e-10).y[0]  # fmt: skip
+    current = true + 0.05 * np.random.default_rng(1).normal(size=18)
+    current[0] += 6.0
+    study = study_record(DecayRecord(time, current))
+    [found] = study.decays
+    assert found.offset == time[1]
+    assert abs(found.fit.i0.value - true[1]) < 3 * found.fit.i0.error
+
+
+def test_eight_readings_of_which_one_is_a_spike_are_answered():
+    time = np.linspace(0.0, 7 * HOUR, 8)
+    current = 200 * np.exp(-time / (10 * HOUR)) + np.tile([0.2, -0.2], 4)
+    current[0] += 25.0
+    study = study_record(DecayRecord(time, current))
+    assert [event.kind for event in study.events] == ["spike"]
+    assert len(study.decays[0].segment) == 7
+
+
 def test_a_vacuum_that_wanders_is_not_cut():
     """A loss rate that goes up and down is told from one that changes once."""
     record, _ = rate_change(1.0, 0.05, np.random.default_rng(3))

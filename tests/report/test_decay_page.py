@@ -49,6 +49,15 @@ def test_pdf_is_whole(studies, tmp_path):
     assert content.rstrip().endswith(b"%%EOF")
 
 
+def test_a_that_is_at_its_limit_still_has_a_page(tmp_path):
+    """SIMULATED: in a ring of protons the best a is often zero, and a shift is no part of it."""
+    time = np.linspace(0.0, 8 * 3600.0, 200)
+    noise = 0.05 * np.random.default_rng(2).normal(size=200)
+    study = study_record(DecayRecord(time, 200 * np.exp(-time / 36000) + noise))
+    assert study.decays[0].fit.a.value == 0
+    beamfit.write_report(tmp_path / "protons.html", (study,))
+
+
 def test_a_record_that_says_nothing_still_has_a_page(tmp_path):
     study = study_record(DecayRecord(np.arange(20.0), np.full(20, 100.0), name="<flat>"))
     for suffix in ("html", "pdf"):
