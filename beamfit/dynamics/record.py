@@ -184,7 +184,7 @@ def _means(values: np.ndarray, weight: np.ndarray, least: float) -> np.ndarray:
     return np.repeat(means, np.diff(first, append=len(values)))
 
 
-class Levels(NamedTuple):
+class InputLevels(NamedTuple):
     """Levels at which an input stood, by row, their variances, and how many rows each has."""
 
     at: np.ndarray
@@ -192,7 +192,7 @@ class Levels(NamedTuple):
     rows: np.ndarray
 
 
-def levels_of(u: np.ndarray) -> Levels:
+def levels_of(u: np.ndarray) -> InputLevels:
     """Levels of an input between its steps, if readings scatter about them by more than digits;
     those that are alike within their errors are one where that is likelier.
 
@@ -208,7 +208,7 @@ def levels_of(u: np.ndarray) -> Levels:
     """
     size = 1.4826 * np.median(np.abs(np.diff(u))) / np.sqrt(2)
     if size == 0:
-        return Levels(u, np.zeros(len(u)), np.ones(len(u)))
+        return InputLevels(u, np.zeros(len(u)), np.ones(len(u)))
     least = STEP * np.log(len(u)) * size**2
     found = _means(u, np.ones(len(u)), least)
     first = np.flatnonzero(np.diff(found, prepend=np.nan) != 0)
@@ -225,7 +225,7 @@ def levels_of(u: np.ndarray) -> Levels:
     error = np.sum((u - found) ** 2) / max(len(u) - len(levels), 1) / count
     kept = np.maximum(1.0 - error / max(found.var(), np.finfo(float).tiny), 0.0)
     at = found.mean() + kept * (levels - found.mean())
-    return Levels(at[which], (kept * error)[which], count[which])
+    return InputLevels(at[which], (kept * error)[which], count[which])
 
 
 def unsure_gain(runs: Sequence[Run], name: str) -> float:
