@@ -105,12 +105,17 @@ def quantities_of(
     others: Alternatives | None,
     seen: PreparedOutput,
     physics: Physics,
+    digits: np.ndarray,
 ) -> dict[str, Quantity]:
-    """Constant parameters with errors, and the offset and the delay if they are free."""
+    """Constant parameters with errors, and the offset and the delay if they are free; `digits` is
+    the covariance of the numbers by the digits of the output.
+    """
     m = len(seen.inputs)
     found = alone = derived(fit, errors, _quoted, (seen.runs[0], seen.delay))
     if others is not None:
         found = alone._replace(error=others.error(alone.slope, alone.error))
+    rounded = np.einsum("qp,pr,qr->q", alone.slope, digits, alone.slope)
+    found = found._replace(error=np.sqrt(found.error**2 + rounded))
     names, units = list(physics.parameters(seen.inputs)), _units(physics, m)
     if physics is FIRST_ORDER:
         names, units = [*names, *(f"{k}/tau" for k in names[1:])], [*units, *[f"{GAIN}/s"] * m]

@@ -24,6 +24,7 @@ from beamfit.dynamics.search import (
     whitened_rows,
 )
 from beamfit.greybox.fit import Fit
+from beamfit.noise.digits import digit_of, rounding_variance
 from beamfit.noise.memory import CorrelatedNoise
 
 # Most lags of residuals, of earlier inputs, and of later inputs.
@@ -157,6 +158,11 @@ def checks_of(
     white = _white([r / error for r, error in zip(residuals, noise.errors, strict=True)])
     if rest.std() <= CLOSE * seen.size_y:  # what is left is rounding, or the network's own detail
         explained, chance, later, fed, white, grown = 0.0, 1.0, 0.0, 1.0, 1.0, 0.0
+    rounded = variance_of_digits(seen, rest.std())  # what is explained may be no more than that
+    if explained * rest.var() <= rounded:
+        explained, chance, grown = 0.0, 1.0, 0.0
+    if later * rest.var() <= rounded:
+        later, fed = 0.0, 1.0
     return Checks(
         percent(rest, np.concatenate(y)),
         percent(noise.ahead(residuals), np.concatenate(y)),
@@ -319,6 +325,28 @@ class RunSlopes(NamedTuple):
 
     own: np.ndarray
     changing: np.ndarray
+
+
+def variance_of_digits(seen: PreparedOutput, rms: float) -> float:
+    """Variance of the mean error of readings that were rounded to the digits of the output."""
+    digit = digit_of(np.concatenate(seen.measured))
+    if digit is None:
+        return 0.0
+    return rounding_variance(digit, max(rms**2 - digit**2 / 12, 0.0) ** 0.5)
+
+
+def covariance_of_digits(
+    seen: PreparedOutput, slopes: Sequence[RunSlopes], rms: float
+) -> np.ndarray:
+    """Covariance of the model's numbers by the digits of the output: readings of one value were all
+    rounded alike, so that many are worth no more than one.
+    """
+    y, own = np.concatenate(seen.measured), np.concatenate([each.own for each in slopes])
+    values, which = np.unique(y, return_inverse=True)
+    by_reading = np.linalg.pinv(own)
+    by_value = np.zeros((len(values), len(by_reading)))
+    np.add.at(by_value, which, by_reading.T)
+    return variance_of_digits(seen, rms) * by_value.T @ by_value
 
 
 def slopes_of(seen: PreparedOutput, fit: Fit) -> list[RunSlopes]:

@@ -27,6 +27,7 @@ from beamfit.dynamics.checks import (
     HeldOutRun,
     RunNoises,
     checks_of,
+    covariance_of_digits,
     slopes_of,
 )
 from beamfit.dynamics.limits import LagLimits, lag_limits
@@ -308,11 +309,12 @@ def _known(
     seen, constant, (_, physics, paths, offset) = found.seen, asked.map == "constant", asked.search
     jitter = float(answer.jitter.max())
     errors = [noise.each for (noise,) in answer.noise]
+    slopes = slopes_of(seen, answer.fit)
     checks = checks_of(
         seen,
         tuple(rest for (rest,) in answer.rest),
         RunNoises(seen.time, errors, answer.likely, seen.parts if jitter else 0),
-        slopes_of(seen, answer.fit),
+        slopes,
         used_by(answer.fit) + (not paths.given and not seen.ends),  # a delay found is a number, too
         None if constant else found.plain.likelihood - answer.likelihood,
         int(np.floor(seen.delay)),
@@ -329,7 +331,10 @@ def _known(
             law=others.likeliest, law_probability=1.0 - others.none, static_law=others.static
         )
     parts = answer.fit, answer.errors
-    quantities = quantities_of(*parts, others, seen, physics) if constant else {}
+    quantities: dict[str, Quantity] = {}
+    if constant:
+        digits = covariance_of_digits(seen, slopes, float(np.sqrt(np.mean(answer.rms**2))))
+        quantities = quantities_of(*parts, others, seen, physics, digits)
     limits = lag_limits(seen, answer, offset) if constant else LagLimits(None, None)
     curves = () if constant else curves_of(*parts, seen)
     return checks, *told(quantities, curves, seen, checks, limits)

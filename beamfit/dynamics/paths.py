@@ -16,14 +16,17 @@ import numpy as np
 from beamfit.arrays import padded_length
 from beamfit.dynamics.input_laws import InputLaw, moved
 from beamfit.dynamics.model import EQUAL, Driven, PreparedOutput, readings_of
-from beamfit.dynamics.record import PARTS, Run, Way, band_limited, rows_of, stepwise, unsure_gain
+from beamfit.dynamics.record import PARTS, Run, Way, band_limited, levels_of, rows_of, unsure_gain
 from beamfit.dynamics.response import Physics
+from beamfit.noise.memory import is_correlated
 
 # Longest delay that is tried, in samples, and as a share of the run; most samples that clocks are
 # taken to be apart.
 LATEST, SHARE, EARLIEST = 24, 0.1, 3
 # Logarithm of the odds of clocks of input and output that differ: 1 in 150, a guess.
 AHEAD = 5.0
+# Correlation of neighbours about levels, in standard errors, of an input that is smooth instead.
+SMOOTH = 4.0
 
 
 class Path(NamedTuple):
@@ -96,6 +99,17 @@ class Paths(NamedTuple):
         if self.some:
             log -= np.log(2.0) + (np.log(PARTS - 1.0) if path.delay % 1.0 else 0.0)
         return float(log)
+
+
+def stepwise(runs: Sequence[Run]) -> tuple[str, ...]:
+    """Inputs whose readings scatter at random about levels between steps."""
+
+    def steps(u: np.ndarray) -> bool:
+        levels = levels_of(u).at
+        scatters = bool(np.ptp(levels) and np.any(u != levels))
+        return scatters and not is_correlated(u - levels, np.unique(levels).size, SMOOTH)
+
+    return tuple(name for name in runs[0].inputs if all(steps(run.inputs[name]) for run in runs))
 
 
 def latest(runs: Sequence[Run]) -> int:

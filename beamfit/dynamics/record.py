@@ -10,7 +10,6 @@ import numpy as np
 
 from beamfit.answer import shown
 from beamfit.errors import InputError
-from beamfit.noise.memory import is_correlated
 
 # Fewest readings of an output; with fewer its response and its start are not separable.
 LEAST = 8
@@ -23,8 +22,6 @@ PARTS = 8
 # A step of an input's readings makes their squares less by so many logarithms of their number than
 # none: the modified information criterion of N. R. Zhang and D. O. Siegmund, Biometrics 63 (2007).
 STEP = 3.0
-# Correlation of neighbours about levels, in standard errors, of an input that is smooth instead.
-SMOOTH = 4.0
 
 
 @shown
@@ -238,17 +235,6 @@ def unsure_gain(runs: Sequence[Run], name: str) -> float:
         away = at - at.mean()
         squares, spread = squares + np.sum(rows * away**2 * variance), spread + away @ away
     return float(np.sqrt(squares) / spread)
-
-
-def stepwise(runs: Sequence[Run]) -> tuple[str, ...]:
-    """Inputs whose readings scatter at random about levels between steps."""
-
-    def steps(u: np.ndarray) -> bool:
-        levels = levels_of(u).at
-        scatters = bool(np.ptp(levels) and np.any(u != levels))
-        return scatters and not is_correlated(u - levels, np.unique(levels).size, SMOOTH)
-
-    return tuple(name for name in runs[0].inputs if all(steps(run.inputs[name]) for run in runs))
 
 
 class Way(NamedTuple):

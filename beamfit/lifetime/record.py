@@ -11,6 +11,7 @@ import numpy as np
 
 from beamfit.answer import MOST_ROWS, Table, frame_of, shown
 from beamfit.errors import InputError
+from beamfit.noise.digits import digit_of
 from beamfit.quantity import HOUR
 
 if TYPE_CHECKING:
@@ -212,28 +213,9 @@ class Monitor(NamedTuple):
 
 
 FEWEST_LIFETIMES = 4
-# Multiples of a digit are exact to this part of it where readings seldom repeat; so many tell.
-EXACT, ENOUGH = 1e-3, 4096
 # A pressure that departs from P0 + P1 I by less than this share of the record's mean, on average
 # up to any time, follows the current.
 FOLLOWS = 2e-3
-
-
-def _digit(values: np.ndarray) -> float | None:
-    """The step of which all differences are multiples; None where there is none, as of values that
-    are held until the next. Where readings seldom repeat, those of an exact line are none either.
-    """
-    levels = np.unique(values)
-    if levels.size < 2:
-        return None
-    steps = np.diff(levels)
-    step, steps = float(steps.min()), steps[:ENOUGH]
-    multiples = np.round(steps / step)
-    off = np.abs(steps / step - multiples)
-    if levels.size <= values.size / 2:
-        return step if float(np.median(off)) < 0.1 else None
-    a_line = levels.size == values.size and multiples.max() == 1
-    return step if off.max() < EXACT and not a_line else None
 
 
 def _frozen(values: object, rows: int, quantity: str) -> np.ndarray:
@@ -370,7 +352,7 @@ class DecayRecord:
     @cached_property
     def resolution(self) -> float | None:
         """Step of a quantised reading, mA; None where readings lie at no multiples of one."""
-        return _digit(self.current)
+        return digit_of(self.current)
 
     @cached_property
     def gauge(self) -> np.ndarray | None:
@@ -385,7 +367,7 @@ class DecayRecord:
         slope, base = np.polyfit(self.current, pressure, 1)
         off = pressure - base - slope * self.current
         follows = np.abs(self.integral(off)).max() < FOLLOWS * pressure.mean() * self.span
-        if base > 0 and (follows or np.abs(off).max() < (_digit(pressure) or 0.0)):
+        if base > 0 and (follows or np.abs(off).max() < (digit_of(pressure) or 0.0)):
             return None
         return self.integral(pressure / self.integral(pressure)[-1] * self.span)
 

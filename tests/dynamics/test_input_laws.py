@@ -6,8 +6,8 @@ import pytest
 from beamfit.dynamics.alternatives import Alternatives
 from beamfit.dynamics.fit import identify
 from beamfit.dynamics.input_laws import moved
-from beamfit.dynamics.paths import Path
-from beamfit.dynamics.record import Run, Way, levels_of, stepwise, unsure_gain
+from beamfit.dynamics.paths import Path, stepwise
+from beamfit.dynamics.record import Run, Way, levels_of, unsure_gain
 from beamfit.errors import Status
 
 UP_AND_DOWN = np.array([0.0, 1.0, 2.0, 2.0, 1.5, 1.0, 0.0, -1.0])

@@ -177,6 +177,25 @@ def test_an_output_that_moves_before_its_input_has_another_clock_or_feedback():
         assert abs(fit.quantities[name].value - truth) < 4 * fit.quantities[name].error
 
 
+@simulations(4, 20)
+def test_digits_of_an_output_are_in_the_errors(count):
+    """A level that is rounded is as far off at each reading: gains were up to six errors off, and
+    what rounding leaves was a part of the response that the model lacks.
+    """
+    off = []
+    for seed in range(count):
+        rng, t = np.random.default_rng([seed, 21]), 0.5 * np.arange(250)
+        u = np.where(t > 30, 1.0, 0.0) - np.where(t > 80, 0.4, 0.0)
+        y = followed(t, u) + 0.2 * rng.random()
+        level = 0.2 * np.round((y + 0.01 * rng.normal(size=250)) / 0.2)
+        fit = identify(Run(t, {"valve": u}, {"level": level}), delay=0)
+        assert fit.status is Status.converged, fit.message
+        gain = fit.quantities["K"]
+        assert 0.02 < gain.error < 0.15
+        off.append(abs(gain.value - 2.0) / gain.error)
+    assert max(off) < 3
+
+
 def test_clocks_of_two_rates_are_said():
     """The delay grows from 0.5 s to 1.5 s."""
     rng, t = np.random.default_rng(0), 0.5 * np.arange(400)
