@@ -119,7 +119,8 @@ class Spread(NamedTuple):
     def share(self, gradient: np.ndarray) -> np.ndarray:
         """Share of each quantity's variance that rests on bounds or on nothing, from 0 to 1."""
         along = gradient @ self.half
-        from_bounds = (along @ self.half.T) ** 2 @ self.from_bounds
+        with np.errstate(over="ignore", invalid="ignore"):  # of what nothing is known: no share
+            from_bounds = (along @ self.half.T) ** 2 @ self.from_bounds
         whole = np.sum(along**2, axis=-1)
         share = from_bounds / np.where(whole > 0, whole, 1.0)
         return np.where(self._open(gradient), 1.0, share)
