@@ -38,8 +38,9 @@ from beamfit.greybox.solve import solve
 from beamfit.noise.correlated import TIMES, Memory, noises, range_of, whitened_by_each
 from beamfit.noise.memory import BESIDE, CorrelatedNoise, filtered, innovations, remembers
 
-# Time constants of the grid, and dampings of a second order.
-LAGS, DAMPINGS = 16, (0.2, 0.6, 1.0, 2.0)
+# Time constants of the grid, as near as a damping of 0.2 tells them apart, and dampings of a second
+# order.
+LAGS, DAMPINGS = 32, (0.2, 0.6, 1.0, 2.0)
 # Gain in log likelihood that a longer delay needs over a shorter one, a path over that of a fit.
 BETTER = 5.0
 # Part of a row from its ends within which a delay has left it.

@@ -510,6 +510,20 @@ def test_where_the_runs_never_were_a_curve_has_no_error():
     assert curve.quantity(len(curve.at) // 2).error is None
 
 
+def test_a_response_that_rings_is_not_taken_for_a_drift():
+    """Between two time constants of a coarser grid a drift explained more: the gain was nothing."""
+    u = np.repeat([-1.0, 1.0, -1.0, 1.0, -1.0, 1.0, -1.0], [60, 36, 24, 48, 36, 37, 37])
+    truth = np.array([15.3, 0.15, -3.8])
+    y = np.asarray(
+        simulate(SECOND_ORDER, np.tile(truth, (278, 1)), u[:, None], np.ones(278), np.zeros(2))
+    )
+    noise = 0.1 * y.std() * np.random.default_rng(7).normal(size=u.size)
+    fit = identify(Run(np.arange(u.size), {"valve": u}, {"level": y + noise}), "second-order")
+    assert fit.status is Status.converged, fit.message
+    for name, true in zip(("T", "zeta", "K"), truth, strict=True):
+        assert abs(fit.quantities[name].value - true) < 3 * fit.quantities[name].error, name
+
+
 def test_the_difference_equation_is_identified_inside_the_stability_triangle():
     fit = identify(run_of(SECOND_ORDER, constant(2.0, 0.5, 3.0), noise=0.02), "arx", delay=0)
     a1, a2 = (fit.quantities[n] for n in ("a1", "a2"))
