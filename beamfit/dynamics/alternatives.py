@@ -24,7 +24,7 @@ from beamfit.dynamics.checks import RunSlopes, slow_paths
 from beamfit.dynamics.input_laws import STATIC, InputLaw, laws_between, moved
 from beamfit.dynamics.model import Driven, PreparedOutput, filled, predicted
 from beamfit.dynamics.paths import Path, Paths, handed_on, undriven
-from beamfit.dynamics.record import Run
+from beamfit.dynamics.record import Run, Way
 from beamfit.dynamics.search import BETTER, Begun, noises_of
 from beamfit.greybox import tree
 from beamfit.greybox.problem import with_slope
@@ -383,7 +383,7 @@ def _lawful(comparison: Comparison, own: Path, paths: Paths) -> list[Trial]:
     if not paths.given:
         delays += range(max(0, whole - LATE), whole)
     ways = [Path(None, way, float(delay)) for delay in delays for way in paths.ways]
-    laws = [law for name in runs[0].inputs for law in _laws_of(runs, name)]
+    laws = [law for name in runs[0].inputs for law in _laws_of(runs, name, paths.most)]
     alike = Counter(law.kind for law in laws)
     return [
         Trial(way._replace(law=law), paths.log_prior(way) - np.log(len(alike) * alike[law.kind]))
@@ -391,11 +391,14 @@ def _lawful(comparison: Comparison, own: Path, paths: Paths) -> list[Trial]:
     ]  # fmt: skip
 
 
-def _laws_of(runs: Sequence[Run], name: str) -> list[InputLaw]:
+def _laws_of(runs: Sequence[Run], name: str, way: Way) -> list[InputLaw]:
     """Laws of an input that a gain and a level do not stand for, from its first change on: what was
     before is a number at the start.
+
+    Of readings that may scatter about levels these are what counts: a narrow saturation of two of
+    them hides the scatter, and says no more.
     """
-    inputs = [run.inputs[name] for run in runs]
+    inputs = [way.taken(run, name) for run in runs]
     since = [u[int(np.argmax(u != u[0])) :] for u in inputs]
     plain = np.concatenate(since)
     laws = laws_between(name, *map(float, (min(map(np.min, inputs)), max(map(np.max, inputs)))))

@@ -106,16 +106,17 @@ def quantities_of(
     seen: PreparedOutput,
     physics: Physics,
     digits: np.ndarray,
+    unsure: Sequence[float],
 ) -> dict[str, Quantity]:
-    """Constant parameters with errors, and the offset and the delay if they are free; `digits` is
-    the covariance of the numbers by the digits of the output.
+    """Constant parameters with errors, and the offset and the delay if they are free.
+
+    `digits` is the covariance of the numbers by the digits of the output, `unsure` has the share by
+    which each input's own errors make its gain unsure.
     """
     m = len(seen.inputs)
     found = alone = derived(fit, errors, _quoted, (seen.runs[0], seen.delay))
     if others is not None:
         found = alone._replace(error=others.error(alone.slope, alone.error))
-    rounded = np.einsum("qp,pr,qr->q", alone.slope, digits, alone.slope)
-    found = found._replace(error=np.sqrt(found.error**2 + rounded))
     names, units = list(physics.parameters(seen.inputs)), _units(physics, m)
     if physics is FIRST_ORDER:
         names, units = [*names, *(f"{k}/tau" for k in names[1:])], [*units, *[f"{GAIN}/s"] * m]
@@ -123,11 +124,10 @@ def quantities_of(
         names, units = [*names, "tau1", "tau2"], [*units, TIME, TIME]
     if physics is ARX:
         names, units = [*names, *FIRST_ORDER.parameters(seen.inputs)[1:]], [*units, *[GAIN] * m]
-    gains = np.array([GAIN in unit for unit in units])
-    unsure = np.where(gains, seen.unsure[np.cumsum(gains) % m - 1], 0.0)  # all inputs in turn
-    error = found.error.copy()
-    error[: len(units)] = np.hypot(error[: len(units)], unsure * np.abs(found.value[: len(units)]))
-    found = found._replace(error=error)
+    more = np.einsum("qp,pr,qr->q", alone.slope, digits, alone.slope)
+    gains = [i for i, unit in enumerate(units) if GAIN in unit]  # of all inputs in turn
+    more[gains] += (np.resize(unsure, len(gains)) * found.value[gains]) ** 2
+    found = found._replace(error=np.sqrt(found.error**2 + more))
     said = {
         name: quantity(found, i, unit)
         for i, (name, unit) in enumerate(zip(names, units, strict=True))

@@ -341,12 +341,13 @@ def covariance_of_digits(
     """Covariance of the model's numbers by the digits of the output: readings of one value were all
     rounded alike, so that many are worth no more than one.
     """
-    y, own = np.concatenate(seen.measured), np.concatenate([each.own for each in slopes])
-    values, which = np.unique(y, return_inverse=True)
-    by_reading = np.linalg.pinv(own)
-    by_value = np.zeros((len(values), len(by_reading)))
-    np.add.at(by_value, which, by_reading.T)
-    return variance_of_digits(seen, rms) * by_value.T @ by_value
+    own, variance = np.concatenate([each.own for each in slopes]), variance_of_digits(seen, rms)
+    if not variance:
+        return np.zeros((own.shape[1], own.shape[1]))
+    values, which = np.unique(np.concatenate(seen.measured), return_inverse=True)
+    by_value = np.zeros((len(values), own.shape[1]))
+    np.add.at(by_value, which, np.linalg.pinv(own).T)
+    return variance * by_value.T @ by_value
 
 
 def slopes_of(seen: PreparedOutput, fit: Fit) -> list[RunSlopes]:

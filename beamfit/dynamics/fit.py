@@ -33,7 +33,7 @@ from beamfit.dynamics.checks import (
 from beamfit.dynamics.limits import LagLimits, lag_limits
 from beamfit.dynamics.model import PreparedOutput, network_of, output_of
 from beamfit.dynamics.paths import Paths, latest, prepared
-from beamfit.dynamics.record import Run, check_inputs, checked
+from beamfit.dynamics.record import Run, check_inputs, checked, unsure_gain
 from beamfit.dynamics.response import PHYSICS, Physics
 from beamfit.dynamics.search import Begun, Case, ResponseSearch, Settled, case_of, fitted, used_by
 from beamfit.errors import InputError, Status, nearest
@@ -334,7 +334,8 @@ def _known(
     quantities: dict[str, Quantity] = {}
     if constant:
         digits = covariance_of_digits(seen, slopes, float(np.sqrt(np.mean(answer.rms**2))))
-        quantities = quantities_of(*parts, others, seen, physics, digits)
+        unsure = [unsure_gain(runs, found.path.way, name) for name in seen.inputs]
+        quantities = quantities_of(*parts, others, seen, physics, digits, unsure)
     limits = lag_limits(seen, answer, offset) if constant else LagLimits(None, None)
     curves = () if constant else curves_of(*parts, seen)
     return checks, *told(quantities, curves, seen, checks, limits)

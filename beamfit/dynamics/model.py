@@ -73,8 +73,7 @@ class PreparedOutput(NamedTuple):
 
     `runs` by `Driven`; `measured` are the readings of each, without missing ones; `size_u` and
     `size_y` the scatter of inputs and output; `delay` in rows, of which there are `parts` a sample;
-    `ends` between which a delay that is a number of the fit may be longer; `unsure` the share by
-    which errors of each input's levels make its gain unsure.
+    `ends` between which a delay that is a number of the fit may be longer.
     """
 
     inputs: tuple[str, ...]
@@ -88,7 +87,6 @@ class PreparedOutput(NamedTuple):
     delay: float
     parts: int
     ends: tuple[float, float] | None
-    unsure: np.ndarray
 
     @property
     def wide(self) -> np.ndarray:

@@ -16,7 +16,7 @@ import numpy as np
 from beamfit.arrays import padded_length
 from beamfit.dynamics.input_laws import InputLaw, moved
 from beamfit.dynamics.model import EQUAL, Driven, PreparedOutput, readings_of
-from beamfit.dynamics.record import PARTS, Run, Way, band_limited, levels_of, rows_of, unsure_gain
+from beamfit.dynamics.record import PARTS, Run, Way, band_limited, levels_of, rows_of
 from beamfit.dynamics.response import Physics
 from beamfit.noise.memory import is_correlated
 
@@ -192,8 +192,6 @@ def prepared(runs: Sequence[Run], output: str, physics: Physics, path: Path) -> 
     spread = float(np.concatenate(measured).std()) or 1.0
     delay = parts * path.delay
     names = tuple(runs[0].inputs)
-    unsure = [unsure_gain(runs, name) if name in path.way.standing else 0.0 for name in names]
-    scatter = u.mean(0), u.std(0), spread
     return PreparedOutput(
-        names, output, drives, measured, time, *scatter, delay, parts, ends, np.array(unsure)
+        names, output, drives, measured, time, u.mean(0), u.std(0), spread, delay, parts, ends
     )

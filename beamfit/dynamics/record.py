@@ -225,18 +225,6 @@ def levels_of(u: np.ndarray) -> InputLevels:
     return InputLevels(at[which], (kept * error)[which], count[which])
 
 
-def unsure_gain(runs: Sequence[Run], name: str) -> float:
-    """Share by which the errors of an input's levels make a gain unsure, as those of a straight
-    line's points.
-    """
-    squares = spread = 0.0
-    for run in runs:
-        at, variance, rows = levels_of(run.inputs[name])
-        away = at - at.mean()
-        squares, spread = squares + np.sum(rows * away**2 * variance), spread + away @ away
-    return float(np.sqrt(squares) / spread)
-
-
 class Way(NamedTuple):
     """Names of inputs that move between samples, and of those that stand at levels between steps
     though their readings scatter; others are as they were read, and hold to the next sample.
@@ -244,6 +232,25 @@ class Way(NamedTuple):
 
     moving: tuple[str, ...] = ()
     standing: tuple[str, ...] = ()
+
+    def taken(self, run: Run, name: str) -> np.ndarray:
+        """An input of a run as it was read, or at its levels."""
+        u = run.inputs[name]
+        return levels_of(u).at if name in self.standing else u
+
+
+def unsure_gain(runs: Sequence[Run], way: Way, name: str) -> float:
+    """Share by which the errors of an input's levels make its gain unsure, as those of a straight
+    line's points; 0 of an input that does not stand at levels.
+    """
+    if name not in way.standing:
+        return 0.0
+    squares = spread = 0.0
+    for run in runs:
+        at, variance, rows = levels_of(run.inputs[name])
+        away = at - at.mean()
+        squares, spread = squares + np.sum(rows * away**2 * variance), spread + away @ away
+    return float(np.sqrt(squares) / spread)
 
 
 def rows_of(run: Run, way: Way, parts: int) -> np.ndarray:
@@ -253,8 +260,8 @@ def rows_of(run: Run, way: Way, parts: int) -> np.ndarray:
     ends.
     """
     columns = []
-    for name, u in run.inputs.items():
-        u = levels_of(u).at if name in way.standing else u
+    for name in run.inputs:
+        u = way.taken(run, name)
         if name in way.moving:
             waves = np.fft.rfft(np.concatenate([u, u[::-1]]))
             turn = 2j * np.pi * np.fft.rfftfreq(2 * len(u))
