@@ -30,6 +30,7 @@ from beamfit.greybox import tree
 from beamfit.greybox.problem import with_slope
 from beamfit.noise.correlated import Whitened, roots_by_each
 from beamfit.noise.memory import CorrelatedNoise
+from beamfit.statistics import OPEN
 
 # Correlation times and white variances of the noises that each is fitted with, and most readings.
 CORRELATION_TIMES, WHITE, MOST = 6, (0.0, 1.0, 10.0, 100.0), 2048
@@ -395,12 +396,16 @@ def _laws_of(runs: Sequence[Run], name: str, way: Way) -> list[InputLaw]:
     """Laws of an input that a gain and a level do not stand for, from its first change on: what was
     before is a number at the start.
 
-    Of readings that may scatter about levels these are what counts: a narrow saturation of two of
-    them hides the scatter, and says no more.
+    Of readings that may scatter about levels these are what counts, but for their errors: a narrow
+    saturation of two of them hides the scatter, and a dead zone about the middle one of three is
+    undetermined.
     """
-    inputs = [way.taken(run, name) for run in runs]
+    levels = [way.taken(run, name) for run in runs]
+    inputs = [each.at for each in levels]
     since = [u[int(np.argmax(u != u[0])) :] for u in inputs]
     plain = np.concatenate(since)
+    unsure = np.sqrt(sum(np.sum(each.variance[-len(u) :])
+                         for each, u in zip(levels, since, strict=True)))  # fmt: skip
     laws = laws_between(name, *map(float, (min(map(np.min, inputs)), max(map(np.max, inputs)))))
     at = np.stack([
         np.concatenate([moved(u, law.kind, law.width, law.place)[-len(some) :]
@@ -409,8 +414,10 @@ def _laws_of(runs: Sequence[Run], name: str, way: Way) -> list[InputLaw]:
     ], axis=1)  # fmt: skip
     basis = np.linalg.qr(np.stack([np.ones(len(plain)), plain], axis=1))[0]
     at = at - at.mean(axis=0)
-    left = np.linalg.norm(at - basis @ (basis.T @ at), axis=0)
-    bends = left > SAME * np.linalg.norm(at, axis=0)
+    same = basis @ (basis.T @ at)
+    gain = np.linalg.norm(same, axis=0) / np.linalg.norm(plain - plain.mean())
+    least = np.maximum(SAME * np.linalg.norm(at, axis=0), OPEN * gain * unsure)
+    bends = np.linalg.norm(at - same, axis=0) > least
     return [law for law, own in zip(laws, bends, strict=True) if own]
 
 

@@ -233,21 +233,21 @@ class Way(NamedTuple):
     moving: tuple[str, ...] = ()
     standing: tuple[str, ...] = ()
 
-    def taken(self, run: Run, name: str) -> np.ndarray:
-        """An input of a run as it was read, or at its levels."""
+    def taken(self, run: Run, name: str) -> InputLevels:
+        """An input of a run as it was read, each row a level without an error, or at its levels."""
         u = run.inputs[name]
-        return levels_of(u).at if name in self.standing else u
+        if name in self.standing:
+            return levels_of(u)
+        return InputLevels(u, np.zeros(len(u)), np.ones(len(u)))
 
 
 def unsure_gain(runs: Sequence[Run], way: Way, name: str) -> float:
     """Share by which the errors of an input's levels make its gain unsure, as those of a straight
-    line's points; 0 of an input that does not stand at levels.
+    line's points.
     """
-    if name not in way.standing:
-        return 0.0
     squares = spread = 0.0
     for run in runs:
-        at, variance, rows = levels_of(run.inputs[name])
+        at, variance, rows = way.taken(run, name)
         away = at - at.mean()
         squares, spread = squares + np.sum(rows * away**2 * variance), spread + away @ away
     return float(np.sqrt(squares) / spread)
@@ -261,7 +261,7 @@ def rows_of(run: Run, way: Way, parts: int) -> np.ndarray:
     """
     columns = []
     for name in run.inputs:
-        u = way.taken(run, name)
+        u = way.taken(run, name).at
         if name in way.moving:
             waves = np.fft.rfft(np.concatenate([u, u[::-1]]))
             turn = 2j * np.pi * np.fft.rfftfreq(2 * len(u))
