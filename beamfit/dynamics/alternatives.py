@@ -416,7 +416,8 @@ def _laws_of(runs: Sequence[Run], name: str, way: Way) -> list[InputLaw]:
     at = at - at.mean(axis=0)
     same = basis @ (basis.T @ at)
     gain = np.linalg.norm(same, axis=0) / np.linalg.norm(plain - plain.mean())
-    least = np.maximum(SAME * np.linalg.norm(at, axis=0), OPEN * gain * unsure)
+    # Beside its gain a law hands errors on as they are, outside a dead zone.
+    least = np.maximum(SAME * np.linalg.norm(at, axis=0), OPEN * np.maximum(gain, 1.0) * unsure)
     bends = np.linalg.norm(at - same, axis=0) > least
     return [law for law, own in zip(laws, bends, strict=True) if own]
 

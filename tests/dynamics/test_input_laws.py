@@ -192,6 +192,17 @@ def test_a_readback_that_scatters_about_its_steps_is_no_law(count):
         assert gain.error < 0.02, seed
 
 
+@pytest.mark.parametrize("scatter", [0.005, 0.04])
+def test_three_settings_leave_a_gain_whatever_their_errors_bend(scatter):
+    """A dead zone about the middle one is a gain, but for errors of levels: K was 2 ± 4."""
+    random = np.random.default_rng(3)
+    u = np.repeat(random.choice([0.5, 1.5, 2.5], 30), 10)
+    run = response(u, u, 0.01, random)
+    read = {"valve": u + scatter * random.normal(size=300)}
+    gain = identify(Run(run.time, read, run.outputs)).quantities["K"]
+    assert abs(gain.value - 2) < 3 * gain.error < 0.1
+
+
 def test_an_output_that_follows_the_scatter_is_driven_by_it():
     random = np.random.default_rng(9)
     u = np.repeat(random.choice([-1.0, 1.0], 30), 10) + 0.1 * random.normal(size=300)
