@@ -398,12 +398,14 @@ def _laws_of(runs: Sequence[Run], name: str, way: Way) -> list[InputLaw]:
 
     Of readings that may scatter about levels these are what counts, but for their errors: a narrow
     saturation of two of them hides the scatter, and a dead zone about the middle one of three is
-    undetermined.
+    undetermined. An input that stays where it is has none.
     """
     levels = [way.taken(run, name) for run in runs]
     inputs = [each.at for each in levels]
     since = [u[int(np.argmax(u != u[0])) :] for u in inputs]
     plain = np.concatenate(since)
+    if np.ptp(plain) == 0.0:
+        return []
     unsure = np.sqrt(sum(np.sum(each.variance[-len(u) :])
                          for each, u in zip(levels, since, strict=True)))  # fmt: skip
     laws = laws_between(name, *map(float, (min(map(np.min, inputs)), max(map(np.max, inputs)))))
