@@ -23,9 +23,9 @@ from scipy.special import expit, logsumexp
 from beamfit.dynamics.checks import RunSlopes, slow_paths
 from beamfit.dynamics.input_laws import STATIC, InputLaw, laws_between, moved
 from beamfit.dynamics.model import Driven, PreparedOutput, filled, predicted
-from beamfit.dynamics.paths import Path, Paths, handed_on, undriven
-from beamfit.dynamics.record import Run, Way
-from beamfit.dynamics.search import BETTER, Begun, noises_of
+from beamfit.dynamics.paths import Path, Paths, Undriven, handed_on, undriven
+from beamfit.dynamics.record import PARTS, Run, Way
+from beamfit.dynamics.search import Begun, noises_of
 from beamfit.greybox import tree
 from beamfit.greybox.problem import with_slope
 from beamfit.noise.correlated import Whitened, roots_by_each
@@ -45,6 +45,8 @@ VAST = 1e100
 # Gauss-Newton rounds of all, and of the `MANY` that are likeliest then; every how many-th noise of
 # the grid the first one looks at, and how many the others.
 FIRST, MANY, ROUNDS, SPREAD, FEW = 2, 128, 3, 3, 4
+# Standard deviation of a delay in its part of a sample, in samples.
+WIDTH = 1 / (PARTS * np.sqrt(12))
 # Shorter delays that a law may stand for.
 LATE = 3
 # Alternatives that are fitted at once: one program is compiled for all.
@@ -70,7 +72,10 @@ class Alternatives(NamedTuple):
     Attributes
     ----------
     path : Path
-        The likeliest one without a law, if it is clearly likelier than that of the fit.
+        The likeliest one without a law; that of the fit where it contains it.
+    late, ahead : float
+        Standard deviation of the delay about that of the fit, in samples, and the probability that
+        it is below zero, without a law.
     none : float
         Probability of no law, where a law is the only other possibility.
     fuller : float
@@ -88,6 +93,8 @@ class Alternatives(NamedTuple):
     """
 
     path: Path
+    late: float
+    ahead: float
     none: float
     fuller: float
     likeliest: str
@@ -111,38 +118,42 @@ class Alternatives(NamedTuple):
 def _columns(chosen: Any, model: Any, run: Driven, data: Any, theta: Any, u: Any):
     """Slopes and residuals of each trial: columns at right angles, and the triangle they make.
 
-    `data` are readings, their errors, what is added, and the parts of a row in delays. The last
-    number is the share of what is added, or by how much the width of a law is another.
+    `data` are readings, their errors, what is added, and the parts of a row in delays with their
+    widths. The last number is the share of what is added, by how much the width of a law is
+    another, or in widths the delay.
     """
-    y, error, term, part = data
+    y, error, term, late = data
 
-    def one(theta, u, term, part):
+    def one(theta, u, term, late):
         def output(t):
-            own = replace(run, u=u[..., 0] + t[-1] * u[..., 1], part=part)
+            part, width = late
+            own = replace(run, u=u[..., 0] + t[-1] * u[..., 1], part=part + t[-1] * width)
             return predicted(tree.replace(model, chosen, t[:-1]), own) + t[-1] * term
 
         return with_slope(output, theta)
 
-    value, slope = jax.vmap(one)(theta, u, term, part)
+    value, slope = jax.vmap(one)(theta, u, term, late)
     rows = jnp.concatenate([slope, (value - y)[..., None]], axis=2)
     return jnp.linalg.qr(jnp.clip(jnp.nan_to_num(rows, nan=VAST), -VAST, VAST) / error[:, None])
 
 
 class _Batch(NamedTuple):
-    """Trials to be fitted, each under every noise of a grid: their inputs and terms, by run."""
+    """Trials to be fitted, each under every noise of a grid: their inputs and terms, by run, and
+    the parts of a row in their delays with their widths.
+    """
 
     comparison: Comparison
     inputs: list[np.ndarray]
-    part: np.ndarray
+    late: tuple[np.ndarray, np.ndarray]
     terms: list[np.ndarray]
 
     def whitened(self, theta: np.ndarray, noises: Sequence[int]) -> Whitened:
         """Rows of every trial by some noises of the grid."""
         c, some = self.comparison, [self.comparison.grid[k] for k in noises]
         triangles, volume, count = [], 0.0, 0
-        for run, data, term, u in zip(c.drives, c.data, self.terms, self.inputs, strict=True):
+        for run, data, term, u in zip(c.seen.drives, c.data, self.terms, self.inputs, strict=True):
             y, time, error = data
-            found = _columns(c.chosen, c.model, run, (y, error, term, self.part), theta, u)
+            found = _columns(c.chosen, c.model, run, (y, error, term, self.late), theta, u)
             columns, triangle = map(np.asarray, found)
             columns = np.swapaxes(columns[:, : len(time)], 0, 1)
             roots, each = roots_by_each(some, columns, np.diff(time))
@@ -239,6 +250,14 @@ class _Weighed(NamedTuple):
         """True for those with a further term."""
         return np.array([trial.term is not None for trial in self.trials])
 
+    def late(self, about: float) -> tuple[float, float]:
+        """Standard deviation of the delay about one, and the probability that it is below zero."""
+        delays = np.array([trial.path.delay for trial in self.trials])
+        width = np.where(delays % 1.0, WIDTH, 0.0)
+        away = delays + width * self.numbers[:, -1] - about
+        squares = away**2 + width**2 * self.spread[:, -1, -1]
+        return float(np.sqrt(self.chance @ squares)), float(self.chance @ (delays < 0))
+
     def best(self) -> dict[tuple[str, str], int]:
         """The likeliest law of the value alone, by kind and input."""
         logs, found = self.logs, {}
@@ -260,7 +279,7 @@ class Comparison(NamedTuple):
     """
 
     runs: tuple[Run, ...]
-    drives: tuple[Driven, ...]
+    seen: Undriven
     data: list[tuple[np.ndarray, ...]]
     parts: int
     chosen: tuple[Any, ...]
@@ -276,11 +295,13 @@ class Comparison(NamedTuple):
     ) -> Comparison:
         """Prepare the fit of runs; `slopes` has terms of a fuller response."""
         seen, fit = found.seen, found.plain.fit
-        drives, measured = undriven(runs, seen.output, seen.runs[0].physics, paths.parts, MOST)
+        physics, delay = seen.runs[0].physics, found.path.delay
+        whole = undriven(runs, seen.output, physics, paths.parts, delay, MOST)
+        drives = whole.drives
         errors = [noise.each[:MOST] for (noise,) in found.plain.noise]
         data = [
             (filled(drive, y), time[:MOST], filled(drive, error, np.inf))
-            for drive, y, time, error in zip(drives, measured, seen.time, errors, strict=True)
+            for drive, y, time, error in zip(drives, whole.measured, seen.time, errors, strict=True)
         ]
         more, bent = [], _bent(seen)
         for slow, each in zip(slow_paths(seen), slopes, strict=True):
@@ -289,7 +310,7 @@ class Comparison(NamedTuple):
         terms = [filled(drive, (each / np.where(unit > 0, unit, 1.0)).T[:, :MOST])
                  for drive, each in zip(drives, more, strict=True)]  # fmt: skip
         numbers = [v.name for v in fit.variables if v.name != "late"]
-        powers = seen.runs[0].physics.units(len(seen.inputs))
+        powers = physics.units(len(seen.inputs))
         near = [numbers.index(f"map[{k}]") for k, (_, gain) in enumerate(powers)
                 if not gain and f"map[{k}]" in numbers] + [len(numbers)]  # fmt: skip
         core = fit.problem.core
@@ -297,7 +318,7 @@ class Comparison(NamedTuple):
         grid = noises_of(seen.time, CORRELATION_TIMES, WHITE)
         begin = np.append(fit.theta[: len(numbers)], 0.0)
         model = core.model | {"late": jnp.zeros(())}
-        return cls(runs, drives, data, paths.parts, chosen, model, begin, near, grid, terms)
+        return cls(runs, whole, data, paths.parts, chosen, model, begin, near, grid, terms)
 
     def weighed(self, trials: list[Trial]) -> _Weighed:
         """Weigh trials: those of no law, and the likeliest after a step or two from the fit."""
@@ -322,11 +343,12 @@ class Comparison(NamedTuple):
         for k in range(0, len(trials), BATCH):
             some = trials[k : k + BATCH]
             inputs, part = handed_on(
-                self.runs, self.drives, self.parts, [trial.path for trial in some]
+                self.runs, self.seen, self.parts, [trial.path for trial in some]
             )
             terms = [np.stack([0.0 * each[0] if t.term is None else each[t.term] for t in some])
                      for each in self.terms]  # fmt: skip
-            yield _Batch(self, inputs, part, terms), begin[k : k + BATCH]
+            width = np.array([self.parts * WIDTH * bool(t.path.delay % 1.0) for t in some])
+            yield _Batch(self, inputs, (part, width), terms), begin[k : k + BATCH]
 
 
 def alternatives_of(
@@ -343,8 +365,8 @@ def alternatives_of(
     """
     comparison = Comparison.of(runs, found, paths, slopes)
     own = found.path._replace(delay=found.exact)
-    plain = [own, *paths.plain(), *paths.around(own.delay)]
-    trials = [Trial(path, paths.log_prior(path)) for path in dict.fromkeys(plain)]
+    plain = paths.plain() + paths.around(own.delay)
+    trials = [Trial(path, paths.log_prior(path)) for path in plain]
     if lawful:
         terms = len(comparison.terms[0])
         prior = paths.log_prior(own) - np.log(terms)
@@ -359,10 +381,11 @@ def alternatives_of(
     chance, none = posterior.chance, posterior.none
     others = np.array([not found.contains(trial.path) for trial in posterior.trials])
     logs = np.where(none, posterior.logs, -np.inf)
-    clear = logs.max() > logs[~others].max() + BETTER
+    likeliest = posterior.trials[logs.argmax()].path
     words, static = _named(posterior)
     return Alternatives(
-        posterior.trials[logs.argmax()].path if clear else found.path,
+        found.path if found.contains(likeliest) else likeliest,
+        *posterior.where(none).late(found.exact),
         float(chance[none].sum()),
         float(fuller),
         words,

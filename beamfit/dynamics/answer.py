@@ -116,7 +116,9 @@ def quantities_of(
     m = len(seen.inputs)
     found = alone = derived(fit, errors, _quoted, (seen.runs[0], seen.delay))
     if others is not None:
-        found = alone._replace(error=others.error(alone.slope, alone.error))
+        late = others.late * seen.parts * float(seen.runs[0].dt[0])
+        error = others.error(alone.slope[:-1], alone.error[:-1])
+        found = alone._replace(error=np.append(error, late))
     names, units = list(physics.parameters(seen.inputs)), _units(physics, m)
     if physics is FIRST_ORDER:
         names, units = [*names, *(f"{k}/tau" for k in names[1:])], [*units, *[f"{GAIN}/s"] * m]
@@ -134,7 +136,7 @@ def quantities_of(
     }
     free = {v.name for v in fit.variables}
     said |= {"offset": quantity(found, -2, "output")} if "offset" in free else {}
-    return said | ({"delay": quantity(alone, -1, TIME)} if "late" in free else {})
+    return said | ({"delay": quantity(found, -1, TIME)} if "late" in free else {})
 
 
 def derived(fit: Fit, errors: Memory | None, function: Callable, data: Any) -> Derived:
@@ -427,9 +429,11 @@ def _good(e: ResponseEvidence) -> Finding:
     cause = f"The free run explains {e.checks.free_run_percent:.2f} % of the output."
     if e.checks.white_probability < POOR_FIT:
         cause += " The noise has a memory, which the errors contain."
-    moving, standing = map(", ".join, e.checks.way)
-    if moving:
-        cause += f" Without high frequencies, {moving} is taken to move between samples."
+    smooth, ramping, standing = map(", ".join, e.checks.way)
+    if smooth:
+        cause += f" Without high frequencies, {smooth} is taken to move between samples."
+    if ramping:
+        cause += f" Between samples {ramping} is taken to move in straight lines."
     if standing:
         cause += f" Readings of {standing} scatter about levels; the output follows the levels."
     if e.checks.jitter:

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.ndimage import median_filter
 
 from beamfit.dynamics.model import CLOSE, output_of
-from beamfit.dynamics.paths import prepared
+from beamfit.dynamics.paths import heard, prepared
 from beamfit.dynamics.record import LEAST, Run
 from beamfit.dynamics.search import Begun
 
@@ -41,19 +41,21 @@ def sound(
     """Runs without readings that show no output, what those were, and the fit of the others."""
     found, left_out = begin(runs), []
     for _ in range(ROUNDS):
+        delay = found.path.delay
         masks = [_lone(y, f, found.seen.size_y) for y, f in _beside(runs, output, found)]
-        trial, which = _without(runs, output, masks, "readings far off their neighbours")
+        trial, which = _without(runs, output, delay, masks, "readings far off their neighbours")
         if trial is None:
             break
         runs, left_out, found = trial, [*left_out, *which], begin(trial)
-    trial, _ = _without(runs, output, [_still(y) for y in found.seen.measured], "")
+    delay = found.path.delay
+    trial, _ = _without(runs, output, delay, [_still(y) for y in found.seen.measured], "")
     if trial is not None:  # the process may stand still as well: a fit without them tells
         other = begin(trial)
         rest = np.concatenate([left for (left,) in other.plain.rest])
         noise = 1.4826 * float(np.median(np.abs(rest)))
         masks = [_still(y, f, noise) for y, f in _beside(runs, output, other)]
         trial, which = _without(
-            runs, output, masks, "readings that stand still as the process moves"
+            runs, output, other.path.delay, masks, "readings that stand still as the process moves"
         )
         if trial is not None:
             runs, left_out, found = trial, [*left_out, *which], begin(trial)
@@ -70,13 +72,15 @@ def _beside(
 
 
 def _without(
-    runs: tuple[Run, ...], output: str, masks: Sequence[np.ndarray], what: str
+    runs: tuple[Run, ...], output: str, delay: float, masks: Sequence[np.ndarray], what: str
 ) -> tuple[tuple[Run, ...] | None, list[BadReadings]]:
-    """Runs without some readings, and which; None if there are none, or too few others."""
+    """Runs without some of the readings that are used, and which; None if there are none, or too
+    few others.
+    """
     kept, found = [], []
     for run, mask in zip(runs, masks, strict=True):
         y = run.outputs[output].copy()
-        rows = np.flatnonzero(np.isfinite(y))[mask]
+        rows = heard(run, output, delay)[mask]
         y[rows] = np.nan
         if np.isfinite(y).sum() < max(LEAST, len(rows)):
             return None, []

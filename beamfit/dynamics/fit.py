@@ -32,8 +32,8 @@ from beamfit.dynamics.checks import (
 )
 from beamfit.dynamics.limits import LagLimits, lag_limits
 from beamfit.dynamics.model import PreparedOutput, network_of, output_of
-from beamfit.dynamics.paths import Paths, latest, prepared
-from beamfit.dynamics.record import Run, check_inputs, checked, unsure_gain
+from beamfit.dynamics.paths import Paths, heard, latest, prepared
+from beamfit.dynamics.record import LEAST, Run, check_inputs, checked, unsure_gain
 from beamfit.dynamics.response import PHYSICS, Physics
 from beamfit.dynamics.search import Begun, Case, ResponseSearch, Settled, case_of, fitted, used_by
 from beamfit.errors import InputError, Status, nearest
@@ -212,8 +212,9 @@ def identify(
     check_inputs(runs)
     output = _output(runs[0], output)
     shortest = min(len(run) for run in runs)
-    if delay is not None and not abs(delay) < shortest - 1:
-        raise InputError(f"a delay of {delay:g} samples", f"less than the {shortest} rows of a run")
+    if delay is not None and min(heard(run, output, delay).size for run in runs) < LEAST:
+        expected = f"less than the {shortest} rows of a run by {LEAST} readings"
+        raise InputError(f"a delay of {delay:g} samples", expected)
     paths = Paths.of(runs, delay, physics.even)
     search = ResponseSearch(output, physics, paths, offset)
     asked = _Identification(search, map, hidden, range(seed, seed + starts), held)
@@ -250,7 +251,8 @@ def _answered(
     exact = found._replace(plain=answer).exact
     exact = int(exact) if exact == int(exact) else exact
     rms = float(np.sqrt(np.mean(answer.rms**2)))
-    early = 0.0 if paths.given else max(-exact, 0.0)
+    clocks = not paths.given and (others is None or others.ahead >= 0.5)
+    early = max(-exact, 0.0) if clocks else 0.0
     status, message = judged({output: ResponseEvidence(*evidence, rms, early)})
     quantities, curves = quoted(status, quantities, curves)
     longest = [LATEST] if not paths.given and exact == latest(runs) > 0 else []
@@ -263,20 +265,20 @@ def _answered(
 
 
 # Most searches by a path that was likelier than that of the search before.
-AGAIN = 2
+AGAIN = 3
 
 
 def _likeliest(
     asked: _Identification, runs: tuple[Run, ...], found: Begun
 ) -> tuple[Begun, Alternatives | None]:
     """The fit by the likeliest path without a law, and the alternatives to it."""
-    lawful = asked.map == "constant"
-    for _ in range(AGAIN):
+    for left in reversed(range(AGAIN)):
         if found.plain.exact(case_of(found.seen, asked.search.offset)):
             return found, None
         slopes = slopes_of(found.seen, found.plain.fit)
+        lawful = asked.map == "constant"
         others = alternatives_of(runs, found, asked.search.paths, slopes, lawful)
-        if others.path == found.path:
+        if others.path == found.path or not left:
             break
         found = asked.search.along(runs, others.path, found.plain.fit.model)
     return found, others
@@ -323,7 +325,7 @@ def _known(
         first_order=constant and asked.search.is_first_order(runs, found),
         jitter=jitter,
         way=found.path.way,
-        band_limited=() if found.path.way.moving else paths.most.moving,
+        band_limited=() if found.path.way.moving else paths.most.smooth,
     )
     others = others if constant else None
     if others is not None and others.none < 0.5 and others.fuller < 0.5:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import groupby
+from itertools import groupby, product
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -25,6 +25,8 @@ from beamfit.noise.memory import is_correlated
 LATEST, SHARE, EARLIEST = 24, 0.1, 3
 # Logarithm of the odds of clocks of input and output that differ: 1 in 150, a guess.
 AHEAD = 5.0
+# Change of a step, as a share of the largest, that digits make.
+STRAIGHT = 1e-3
 # Correlation of neighbours about levels, in standard errors, of an input that is smooth instead.
 SMOOTH = 4.0
 
@@ -43,8 +45,8 @@ class Paths(NamedTuple):
     Attributes
     ----------
     most : Way
-        Inputs without high frequencies, which may move between samples, and those that scatter
-        about levels, at which they may stand.
+        Inputs that may move between samples, without high frequencies or in straight lines, and
+        those that scatter about levels, at which they may stand.
     delays : tuple of float
         Whole samples, or the one delay that is given.
     some : bool
@@ -58,7 +60,8 @@ class Paths(NamedTuple):
     @classmethod
     def of(cls, runs: Sequence[Run], delay: float | None, even: bool) -> Paths:
         """List those of runs, `even` where a model has whole samples; one delay if it is given."""
-        way = Way(() if even else band_limited(runs), stepwise(runs))
+        smooth, ramping = ((), ()) if even else moving(runs)
+        way = Way(smooth, ramping, stepwise(runs))
         if delay is not None:
             return cls(way, (delay,), False)
         most = latest(runs)
@@ -72,8 +75,8 @@ class Paths(NamedTuple):
     @property
     def ways(self) -> tuple[Way, ...]:
         """Ways of the inputs between samples."""
-        moving, standing = (((), each) for each in self.most)
-        return tuple(dict.fromkeys(Way(m, s) for m in moving for s in standing))
+        each = (((), names) for names in self.most)
+        return tuple(dict.fromkeys(Way(*some) for some in product(*each)))
 
     @property
     def parts(self) -> int:
@@ -85,20 +88,40 @@ class Paths(NamedTuple):
         return [Path(None, way, delay) for delay in self.delays for way in self.ways]
 
     def around(self, delay: float) -> list[Path]:
-        """Paths of parts of a sample less than one from a delay."""
+        """Paths of parts of a sample less than one from a delay, at the middle of each part."""
         ends = (np.ceil(delay) - 1, np.floor(delay) + 1) if self.some else (0, 0)
-        near = np.arange(PARTS * ends[0], PARTS * min(ends[1], max(self.delays[-1], 1))) / PARTS
-        return [Path(None, way, float(each)) for each in near if each % 1.0 for way in self.ways]
+        parts = np.arange(PARTS * ends[0], PARTS * min(ends[1], max(self.delays[-1], 1)))
+        return [Path(None, way, (k + 0.5) / PARTS) for k in parts.tolist() for way in self.ways]
 
     def log_prior(self, path: Path) -> float:
-        """Even over delays, over whole ones and parts, and over the ways between samples."""
+        """Even over the ways between samples, over delays, and over whole ones and parts: an input
+        that is held may be set by the clock of the readings, one that moves knows no clock.
+        """
         log = -np.log(len(self.ways))
         if self.given:
             return float(log)
         log -= np.log(self.delays[-1] + 1.0) + (AHEAD if path.delay < 0 else 0.0)
-        if self.some:
-            log -= np.log(2.0) + (np.log(PARTS - 1.0) if path.delay % 1.0 else 0.0)
+        if self.some and path.way.moving:
+            log -= np.log(PARTS + 1.0)
+        elif self.some:
+            log -= np.log(2.0) + (np.log(PARTS) if path.delay % 1.0 else 0.0)
         return float(log)
+
+
+def moving(runs: Sequence[Run]) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Inputs that may move between samples: those without high frequencies, and those that rest or
+    go straight on at most samples and some of whose changes take several.
+    """
+    smooth = band_limited(runs)
+
+    def goes_on(u: np.ndarray) -> bool:
+        steps = np.diff(u)
+        least = np.minimum(np.abs(steps[1:]), np.abs(np.diff(steps)))
+        straight = least <= STRAIGHT * np.abs(steps).max()
+        return bool(steps[1:] @ steps[:-1] > 0 and straight.mean() > 0.5)
+
+    others = (name for name in runs[0].inputs if name not in smooth)
+    return smooth, tuple(n for n in others if all(goes_on(run.inputs[n]) for run in runs))
 
 
 def stepwise(runs: Sequence[Run]) -> tuple[str, ...]:
@@ -117,25 +140,52 @@ def latest(runs: Sequence[Run]) -> int:
     return min(LATEST, int(SHARE * min(map(len, runs))))
 
 
+def heard(run: Run, output: str, delay: float) -> np.ndarray:
+    """Rows with a reading that hears an input of the record: nobody knows what it was before."""
+    rows = np.arange(len(run))
+    since = (rows >= delay) & (rows < len(run) + delay)
+    return np.flatnonzero(np.isfinite(run.outputs[output]) & since)
+
+
+class Undriven(NamedTuple):
+    """Runs without inputs, their readings, and the row of each where it begins: the first with a
+    reading of any output.
+    """
+
+    drives: tuple[Driven, ...]
+    measured: tuple[np.ndarray, ...]
+    first: tuple[int, ...]
+
+
 def undriven(
-    runs: Sequence[Run], output: str, physics: Physics, parts: int, most: int | None = None
-) -> tuple[tuple[Driven, ...], tuple[np.ndarray, ...]]:
-    """Runs without inputs, of so many rows a sample, and their readings, `most` of each run."""
-    found, measured = [], []
+    runs: Sequence[Run],
+    output: str,
+    physics: Physics,
+    parts: int,
+    delay: float = 0.0,
+    most: int | None = None,
+) -> Undriven:
+    """Runs of so many rows a sample as they are heard after a delay, `most` readings of each."""
+    found, measured, first = [], [], []
     for i, run in enumerate(runs):
-        read = np.flatnonzero(np.isfinite(run.outputs[output]))[:most]
-        time = run.time[: None if most is None else read[-1] + 1]
+        read = heard(run, output, delay)[:most]
+        if not read.size:
+            said = f"no reading of {output} that a delay of {delay:g} samples lets hear an input"
+            raise run.unusable(said, "a longer run")
+        since = min(int(rows[0]) for n in run.outputs if (rows := heard(run, n, delay)).size)
+        time = run.time[since : None if most is None else read[-1] + 1]
         apart = np.diff(time, append=time[-1:])
         dt = np.repeat(np.pad(apart, (0, padded_length(len(time)) - len(time))) / parts, parts)
         turn = parts if np.ptp(apart[:-1]) <= EQUAL * apart[0] else 0
-        each = (jnp.asarray(dt), *readings_of(run.time[read] - run.time[0], read * parts))
+        each = (jnp.asarray(dt), *readings_of(run.time[read] - run.time[0], (read - since) * parts))
         found.append(Driven(physics, None, *each, len(read), jnp.asarray(i), 0.0, turn))
         measured.append(run.outputs[output][read])
-    return tuple(found), tuple(measured)
+        first.append(since)
+    return Undriven(tuple(found), tuple(measured), tuple(first))
 
 
 def handed_on(
-    runs: Sequence[Run], drives: Sequence[Driven], parts: int, paths: Sequence[Path]
+    runs: Sequence[Run], seen: Undriven, parts: int, paths: Sequence[Path]
 ) -> tuple[list[np.ndarray], np.ndarray]:
     """Inputs of each run behind each path and their changes by a step of a law's width, and the
     part of a row by which each path is later still.
@@ -144,10 +194,10 @@ def handed_on(
     """
     whole = [int(np.floor(path.delay * parts)) for path in paths]
     found = []
-    for run, drive in zip(runs, drives, strict=True):
+    for run, drive, first in zip(runs, seen.drives, seen.first, strict=True):
         plain = {way: rows_of(run, way, parts) for way in {path.way for path in paths}}
         behind = _behind(run, plain, paths)
-        each, rows = [], np.arange(len(drive.dt))
+        each, rows = [], first * parts + np.arange(len(drive.dt))
         for path, late in zip(paths, whole, strict=True):
             u = plain[path.way]
             u = np.stack([u, np.zeros_like(u)], axis=2)
@@ -182,16 +232,16 @@ def prepared(runs: Sequence[Run], output: str, physics: Physics, path: Path) -> 
     A part of a row in the delay is a number of the fit.
     """
     parts = PARTS if path.way.moving else 1
-    drives, measured = undriven(runs, output, physics, parts)
-    inputs, (part,) = handed_on(runs, drives, parts, [path])
+    found = undriven(runs, output, physics, parts, path.delay)
+    inputs, (part,) = handed_on(runs, found, parts, [path])
     drives = tuple(replace(drive, u=jnp.asarray(u[0, ..., 0]), part=part)
-                   for drive, u in zip(drives, inputs, strict=True))  # fmt: skip
+                   for drive, u in zip(found.drives, inputs, strict=True))  # fmt: skip
     ends = (-part, 1.0 - part) if part else None
     time = tuple(np.asarray(drive.time)[: drive.count] for drive in drives)
     u = np.concatenate([np.stack(list(run.inputs.values()), axis=1) for run in runs])
-    spread = float(np.concatenate(measured).std()) or 1.0
+    spread = float(np.concatenate(found.measured).std()) or 1.0
     delay = parts * path.delay
     names = tuple(runs[0].inputs)
     return PreparedOutput(
-        names, output, drives, measured, time, u.mean(0), u.std(0), spread, delay, parts, ends
+        names, output, drives, found.measured, time, u.mean(0), u.std(0), spread, delay, parts, ends
     )

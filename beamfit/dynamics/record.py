@@ -226,12 +226,19 @@ def levels_of(u: np.ndarray) -> InputLevels:
 
 
 class Way(NamedTuple):
-    """Names of inputs that move between samples, and of those that stand at levels between steps
-    though their readings scatter; others are as they were read, and hold to the next sample.
+    """Names of inputs that move between samples, smoothly or in straight lines, and of those that
+    stand at levels between steps though their readings scatter; others are as they were read, and
+    hold to the next sample.
     """
 
-    moving: tuple[str, ...] = ()
+    smooth: tuple[str, ...] = ()
+    ramping: tuple[str, ...] = ()
     standing: tuple[str, ...] = ()
+
+    @property
+    def moving(self) -> tuple[str, ...]:
+        """Those that move."""
+        return self.smooth + self.ramping
 
     def taken(self, run: Run, name: str) -> InputLevels:
         """An input of a run as it was read, each row a level without an error, or at its levels."""
@@ -254,20 +261,27 @@ def unsure_gain(runs: Sequence[Run], way: Way, name: str) -> float:
 
 
 def rows_of(run: Run, way: Way, parts: int) -> np.ndarray:
-    """Inputs by a way at so many rows a sample, shape (samples * parts, inputs).
+    """Inputs by a way at so many rows a sample, each held from its middle, shape
+    (samples * parts, inputs).
 
-    Those that move go on by the sines that they are made of (C. E. Shannon 1949), mirrored at both
-    ends.
+    Smooth ones go on by the sines that they are made of (C. E. Shannon 1949) beside the line from
+    the first sample to the last, as if they swung on about both ends.
     """
+    late = (np.arange(parts) + 0.5) / parts
     columns = []
     for name in run.inputs:
         u = way.taken(run, name).at
-        if name in way.moving:
-            waves = np.fft.rfft(np.concatenate([u, u[::-1]]))
-            turn = 2j * np.pi * np.fft.rfftfreq(2 * len(u))
-            late = (np.arange(parts) + 0.5) / parts  # each part holds its middle
-            fine = [np.fft.irfft(waves * np.exp(turn * s), 2 * len(u))[: len(u)] for s in late]
-            columns.append(np.stack(fine, axis=1).ravel())
+        if name in way.smooth:
+            slope, rows = (u[-1] - u[0]) / (len(u) - 1), np.arange(len(u))
+            swing = u - u[0] - slope * rows
+            waves = np.fft.rfft(np.concatenate([swing, -swing[-2:0:-1]]))
+            turn = 2j * np.pi * np.fft.rfftfreq(2 * len(u) - 2)
+            fine = [np.fft.irfft(waves * np.exp(turn * s), 2 * len(u) - 2)[: len(u)] for s in late]
+            line = u[0] + slope * np.add.outer(rows, late)
+            columns.append((line + np.stack(fine, axis=1)).ravel())
+        elif name in way.ramping:
+            steps = np.diff(u, append=2.0 * u[-1] - u[-2])
+            columns.append((u[:, None] + np.outer(steps, late)).ravel())
         else:
             columns.append(np.repeat(u, parts))
     return np.stack(columns, axis=1)

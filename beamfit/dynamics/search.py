@@ -29,7 +29,7 @@ from beamfit.dynamics.model import (
     weight_priors,
 )
 from beamfit.dynamics.paths import Path, Paths, handed_on, prepared, undriven
-from beamfit.dynamics.record import PARTS, Run
+from beamfit.dynamics.record import Run
 from beamfit.dynamics.response import ARX, FIRST_ORDER, SECOND_ORDER, Physics
 from beamfit.errors import Status
 from beamfit.greybox.fit import Fit
@@ -43,8 +43,6 @@ from beamfit.noise.memory import BESIDE, CorrelatedNoise, filtered, innovations,
 LAGS, DAMPINGS = 32, (0.2, 0.6, 1.0, 2.0)
 # Gain in log likelihood that a longer delay needs over a shorter one, a path over that of a fit.
 BETTER = 5.0
-# Part of a row from its ends within which a delay has left it.
-INSIDE = 1e-3
 # Paths that are looked at together: one program is compiled for all.
 BATCH = 16
 # What rounding leaves of the squares of columns that others explain.
@@ -104,9 +102,9 @@ class ResponseSearch(NamedTuple):
     ) -> list[Start]:
         """The best of a grid of time constants and dampings, and of a finer one about it."""
         seen, every = prepared(runs, self.output, physics, paths[0]), np.arange(len(paths))
-        drives, measured = undriven(runs, self.output, physics, self.paths.parts)
-        measured = tuple(map(filled, drives, measured))
-        inputs, part = handed_on(runs, drives, self.paths.parts, paths)
+        whole = undriven(runs, self.output, physics, self.paths.parts)
+        drives, measured = whole.drives, tuple(map(filled, whole.drives, whole.measured))
+        inputs, part = handed_on(runs, whole, self.paths.parts, paths)
         axes = [np.log(np.geomspace(0.1 * seen.apart, seen.span, LAGS))]
         axes += [np.log(DAMPINGS)] if physics is not FIRST_ORDER else []
         reach = np.array([axis[1] - axis[0] for axis in axes])
@@ -175,23 +173,9 @@ class ResponseSearch(NamedTuple):
         return self.along(runs, start.path, start.model)
 
     def along(self, runs: tuple[Run, ...], path: Path, model: dict[str, Any]) -> Begun:
-        """Identify with constant parameters by a path, from a model.
-
-        A part of a sample that is a whole number of rows may lie in the row before or after, where
-        a fit ends within it; where none does the other rows are alternatives.
-        """
-        aside = (0.0,)
-        if path.way.moving and path.delay % 1.0 and not self.paths.given:
-            aside = (0.0, -0.5 / PARTS, 0.5 / PARTS)
-        found = []
-        for more in aside:
-            near = path._replace(delay=path.delay + more)
-            seen = prepared(runs, self.output, self.physics, near)
-            fit = fitted(case_of(seen, self.offset), [model | {"late": 0.0}])
-            late = float(fit.fit.model["late"])
-            if not more or min(np.abs(late - np.array(seen.ends))) > INSIDE:
-                found.append(Begun(seen, near, fit))
-        return min(found, key=lambda each: each.plain.likelihood)
+        """Identify with constant parameters by a path, from a model."""
+        seen = prepared(runs, self.output, self.physics, path)
+        return Begun(seen, path, fitted(case_of(seen, self.offset), [model | {"late": 0.0}]))
 
     def is_first_order(self, runs: tuple[Run, ...], found: Begun) -> bool:
         """True if a first order does as well as a higher one by the information criterion."""
@@ -680,6 +664,6 @@ class Begun(NamedTuple):
 
     def contains(self, path: Path) -> bool:
         """True if the fit is by that path, or estimates its delay."""
-        apart = abs(path.delay - self.exact)
-        near = 1.0 / self.seen.parts if self.seen.ends else 1e-9
-        return path.law is None and path.way == self.path.way and apart < near
+        low, high = (self.seen.delay + end for end in self.seen.ends or (0.0, 0.0))
+        inside = low <= path.delay * self.seen.parts <= high
+        return path.law is None and path.way == self.path.way and inside

@@ -106,7 +106,7 @@ def _draw_run(fit: ResponseFit | StateSpaceOutput, i: int, figure: FigureBase) -
     middle.axhline(0.0, color="0.7", linewidth=0.8)
     middle.set_ylabel("measured -\nsimulated")
     for name, values in run.inputs.items():
-        below.step(run.time[thin], values[thin], where="post", label=name)
+        below.step((run.time - run.time[0])[thin], values[thin], where="post", label=name)
     names = list(run.inputs)
     below.set(xlabel="time, s", ylabel="inputs" if len(names) > 1 else names[0])
     if len(names) > 1:

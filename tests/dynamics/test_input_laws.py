@@ -39,7 +39,7 @@ def test_an_error_is_that_of_the_mixture_about_the_value_of_the_answer():
     random = np.random.default_rng(0)
     shift, covariance = np.array([[2.0, 1.0], [0.0, -3.0]]), np.stack([np.diag([1.0, 0.5])] * 2)
     own, weight = Path(None, Way(), 0.0), np.array([0.3, 0.2])
-    found = Alternatives(own, 0.5, 0.0, "", False, weight, shift, covariance)
+    found = Alternatives(own, 0.0, 0.0, 0.5, 0.0, "", False, weight, shift, covariance)
     slope = np.array([1.0, 0.5])
     which = random.choice(3, 200_000, p=[0.5, 0.3, 0.2])
     laws = [random.multivariate_normal(s, c, 200_000) @ slope
@@ -169,7 +169,7 @@ def test_a_gain_is_unsure_by_the_errors_of_levels():
     u = np.repeat([0.0, 1.0, 3.0, 0.0, 3.0], 20)
     reads = [u + 0.2 * random.normal(size=100) for _ in range(400)]
     gains = [np.polyfit(levels_of(read).at, 2.0 * u, 1)[0] for read in reads]
-    own = np.mean([unsure_gain([Run(np.arange(100.0), {"u": read}, {"y": u})], Way((), ("u",)), "u")
+    own = np.mean([unsure_gain([Run(np.arange(100.0), {"u": read}, {"y": u})], Way(standing=("u",)), "u")
                    for read in reads[:40]])  # fmt: skip
     assert np.std(gains) / 2.0 == pytest.approx(own, rel=0.25)
     assert abs(np.mean(gains) / 2.0 - 1) < 3 * np.std(gains) / 20
