@@ -89,8 +89,8 @@ class Paths(NamedTuple):
 
     def around(self, delay: float) -> list[Path]:
         """Paths of parts of a sample less than one from a delay, at the middle of each part."""
-        ends = (np.ceil(delay) - 1, np.floor(delay) + 1) if self.some else (0, 0)
-        parts = np.arange(PARTS * ends[0], PARTS * min(ends[1], max(self.delays[-1], 1)))
+        low, high = PARTS * (delay - 1), min(PARTS * (delay + 1), PARTS * max(self.delays[-1], 1))
+        parts = np.arange(np.ceil(low), np.floor(high)) if self.some else np.zeros(0)
         return [Path(None, way, (k + 0.5) / PARTS) for k in parts.tolist() for way in self.ways]
 
     def log_prior(self, path: Path) -> float:

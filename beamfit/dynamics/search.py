@@ -102,7 +102,8 @@ class ResponseSearch(NamedTuple):
     ) -> list[Start]:
         """The best of a grid of time constants and dampings, and of a finer one about it."""
         seen, every = prepared(runs, self.output, physics, paths[0]), np.arange(len(paths))
-        whole = undriven(runs, self.output, physics, self.paths.parts)
+        first = max(self.paths.delays[0], 0.0)
+        whole = undriven(runs, self.output, physics, self.paths.parts, first)
         drives, measured = whole.drives, tuple(map(filled, whole.drives, whole.measured))
         inputs, part = handed_on(runs, whole, self.paths.parts, paths)
         axes = [np.log(np.geomspace(0.1 * seen.apart, seen.span, LAGS))]

@@ -169,8 +169,10 @@ def test_a_gain_is_unsure_by_the_errors_of_levels():
     u = np.repeat([0.0, 1.0, 3.0, 0.0, 3.0], 20)
     reads = [u + 0.2 * random.normal(size=100) for _ in range(400)]
     gains = [np.polyfit(levels_of(read).at, 2.0 * u, 1)[0] for read in reads]
-    own = np.mean([unsure_gain([Run(np.arange(100.0), {"u": read}, {"y": u})], Way(standing=("u",)), "u")
-                   for read in reads[:40]])  # fmt: skip
+    t, way = np.arange(100.0), Way(standing=("u",))
+    own = np.mean(
+        [unsure_gain([Run(t, {"u": u_read}, {"y": u})], way, "u") for u_read in reads[:40]]
+    )
     assert np.std(gains) / 2.0 == pytest.approx(own, rel=0.25)
     assert abs(np.mean(gains) / 2.0 - 1) < 3 * np.std(gains) / 20
 
