@@ -130,7 +130,8 @@ def _shot(profile: Profile) -> tuple[np.ndarray, np.ndarray] | None:
     n = max(3, round(ENDS * len(x)))
     ends = np.stack([counts[:n], counts[-n:]])
     level = np.median(ends, axis=1, keepdims=True)
-    charge = counts - level.mean()
+    low, high = x[n // 2], x[-1 - n // 2]  # the middles of the ends
+    charge = counts - level[0] - (level[1] - level[0]) * (x - low) / (high - low)
     # Second differences of normal noise have sqrt(6) times its error; so have those of a beam of
     # few bins, whose background tells the noise then.
     jagged = np.median(np.abs(np.diff(charge, 2))) / (np.sqrt(6.0) * 0.6745)

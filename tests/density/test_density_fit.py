@@ -10,7 +10,8 @@ import beamfit
 from beamfit.density.fit import SHARES
 from beamfit.emittance.scan import Profile, QuadScan
 from beamfit.io.emittance_gui import read_emittance_gui
-from benchmarks.density import BEAMS, REFUSED, fitted, simulated
+from beamfit.particles import ELECTRON_MASS, beta_gamma
+from benchmarks.density import BEAMS, EMITTANCE, ENERGY, REFUSED, fitted, simulated, truth
 from tests.simulations import simulations
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -32,6 +33,25 @@ def test_intervals_of_answers_hold_the_truth(kind, count):
                 assert abs(q.value - true) < 6.0 * q.error
     # Shares of one scan stand and fall together: 95 % of few scans may lose one.
     assert np.mean(held) >= (0.5 if count < 10 else 0.85)
+
+
+@pytest.mark.parametrize("number", [2, 3, 5])
+def test_a_background_that_slopes_hides_nothing(number):
+    """Stray light that grows over each window, by 6 % of the peak from its middle to its end."""
+    scan, beam = simulated("gaussian", np.random.default_rng([5, number, 0]))
+    sloping = []
+    for p in scan.profiles:
+        along = (p.position - p.position.mean()) / (0.5 * np.ptp(p.position))
+        counts = p.counts + 0.06 * p.counts.max() * along
+        sloping.append(p._replace(counts=counts))
+    even, found = (
+        beamfit.fit_density(s)["x"] for s in (scan, replace(scan, profiles=tuple(sloping)))
+    )
+    assert found.status.value == even.status.value == "converged"
+    true = EMITTANCE * beta_gamma(ENERGY, ELECTRON_MASS) * truth(beam)[2]
+    whole = found.emittance["90 %"]
+    assert whole.interval_95[0] < true < whole.interval_95[1]
+    assert whole.error < 1.5 * even.emittance["90 %"].error
 
 
 def test_noise_alone_shows_no_beam():
