@@ -39,6 +39,9 @@ LENGTH, EMITTANCE, TWISS = (0.2, 0.4), (0.0, 1.0), (-0.4, 0.9)
 # Rounds of scales and map; steps of the map and of the scales in each; steps tried.
 ROUNDS, STEPS, NEWTON = 6, 6, 2
 TRIED = np.array([1.0, 0.5, 0.2, 0.05, 0.0])
+# Weights of all readings that a search begins with: bad ones that stand together hide each other
+# from a map that begins with all of them.
+GOOD = np.array([1.0, 0.1])
 # Draws of the scales, and the farthest step of them in standard deviations of the prior.
 SETS, FAR = 64, 1.5
 
@@ -209,7 +212,8 @@ class MapPosterior(NamedTuple):
     log_evidence : Array
         Of the sizes, all scales averaged over.
     bad, model : Array
-        Shape (rows,): probability of a bad reading, fitted ln size.
+        Shape (rows,): share of its weight that a reading lost, near the probability that it is
+        bad; fitted ln size.
     error : Array
         Shape (rows,): relative error of the sizes that was found.
     """
@@ -341,8 +345,37 @@ def _scoring(eta: Array, by: _Linear, orders: np.ndarray) -> tuple[Array, Array]
     return slope - (eta - mean) / spread**2, fisher + jnp.diag(spread**-2)
 
 
+def _judged(eta: Array, by: _Linear, orders: np.ndarray) -> tuple[Array, Array]:
+    """Weight of each reading by what the others predict of it, and what that adds to the evidence.
+
+    A reading is good, or bad as those of scans: `beamfit.noise.sizes.log_likelihood`. A map bends
+    to any reading that it has; so it is judged by the map that it has no part in (Rasmussen and
+    Williams, eq. 5.12), as expectation propagation does (sect. 3.6).
+    """
+    data, covariance = by.data, _covariance(eta, by, orders)
+    inverse = jax.scipy.linalg.cho_solve(
+        jax.scipy.linalg.cho_factor(covariance), jnp.eye(len(covariance))
+    )
+    alone = 1.0 / jnp.diag(inverse)
+    square = (alone * (inverse @ by.off)) ** 2
+    own = _variance(data, jnp.exp(eta[-1]), 1.0)
+    known = jnp.maximum(alone - own / by.good, 0.0)
+
+    def log_normal(variance: Array) -> Array:
+        return -0.5 * (square / variance + jnp.log(variance))
+
+    wide = known + data.wide**2 * own
+    bad = jnp.log(data.odds) + 0.5 * jnp.log(2.0 / jnp.pi / wide) - jnp.log1p(square / wide)
+    either = jnp.logaddexp(log_normal(known + own), bad)
+    doubt = jnp.exp(bad - either)
+    good = 1.0 - doubt + doubt * 2.0 * own / (wide + square)
+    beside = either - jnp.log1p(data.odds) - log_normal(known + own / good)
+    there = data.there > 0
+    return jnp.where(there, good, 1.0), jnp.sum(jnp.where(there, beside, 0.0))
+
+
 def _fitted(
-    data: KnobReadings, start: Array, varies: Array, orders: np.ndarray
+    data: KnobReadings, start: Array, good: Array, varies: Array, orders: np.ndarray
 ) -> tuple[_Peak, _Linear, Array, Array]:
     """The best map and scales, readings about it, log evidence, root of the scales' covariance."""
     mean, spread = prior_of(data)
@@ -357,24 +390,17 @@ def _fitted(
 
     def settled(state: _Peak) -> tuple[_Peak, _Linear, Array]:
         v = _settled(data, state, varies, orders)
-        scales = scales_of(state.eta, varies)
-        u = _numbers_at(data, scales, orders) @ v
-        pull = (data.y - _slopes(data, u)[0]) ** 2 / _variance(data, scales.noise, 1.0)
-        narrower = data.wide**-2
-        doubt = jnp.exp(jnp.minimum(0.5 * pull * (1.0 - narrower), 500.0))
-        doubt = doubt * data.odds / data.wide
-        good = jnp.where(data.there > 0, (1.0 + doubt * narrower) / (1.0 + doubt), 1.0)
-        # ln of good and bad readings together, over the normal density in their place.
-        both = jnp.log1p(doubt) - jnp.log1p(data.odds) - 0.5 * (pull * (1.0 - good) + jnp.log(good))
-        beside = jnp.sum(data.there * both)
-        return _Peak(v, state.eta, good), _linear(data, u, good, varies), beside
+        u = _numbers_at(data, scales_of(state.eta, varies), orders) @ v
+        by = _linear(data, u, state.good, varies)
+        good, beside = _judged(state.eta, by, orders)
+        return _Peak(v, state.eta, good), by._replace(good=good), beside
 
     def round_of(state: _Peak, _: None) -> tuple[_Peak, None]:
         state, by, _ = settled(state)
         eta = jax.lax.fori_loop(0, NEWTON, lambda _, e: newton(e, by), state.eta)
         return state._replace(eta=eta), None
 
-    state = _Peak(start, mean, jnp.ones(len(data.y)))
+    state = _Peak(start, mean, jnp.full(len(data.y), good))
     state, by, beside = settled(jax.lax.scan(round_of, state, length=ROUNDS)[0])
     root = jnp.linalg.cholesky(jnp.linalg.inv(_scoring(state.eta, by, orders)[1]))
     whole = _log_evidence(state.eta, by, orders) + beside + 0.5 * len(mean) * LN_2PI
@@ -433,7 +459,9 @@ def map_posterior(
     of_sets, of_choice, of_draws = jax.random.split(jax.random.key(seed), 3)
 
     def drawn(varies: Array) -> MapPosterior:
-        state, by, log_evidence, root = _fitted(data, first, varies, orders)
+        every = jax.lax.map(lambda good: _fitted(data, first, good, varies, orders), GOOD)
+        best = jnp.nanargmax(every[2])
+        state, by, log_evidence, root = jax.tree.map(lambda v: v[best], every)
         z = jax.random.normal(of_sets, (SETS, len(state.eta))).at[0].set(0.0)
         eta = state.eta + z @ root.T
         log = jax.vmap(lambda e: _log_evidence(e, by, orders))(eta)
@@ -445,10 +473,9 @@ def map_posterior(
         coefficients = jax.vmap(
             lambda key, i: _draw(key, data, _Peak(settled[i], eta[i], state.good), varies, orders)
         )(jax.random.split(of_draws, draws), chosen)
-        error = jnp.sqrt(_variance(data, jnp.exp(state.eta[-1]), 1.0))
+        bad, error = 1.0 - state.good, jnp.sqrt(_variance(data, jnp.exp(state.eta[-1]), 1.0))
         u = _numbers_at(data, scales_of(state.eta, varies), orders) @ state.v
         scales = jax.vmap(lambda e: scales_of(e, varies))(eta[chosen])
-        bad = 1.0 - (state.good - data.wide**-2) / (1.0 - data.wide**-2)
         return MapPosterior(scales, coefficients, log_evidence, bad, _slopes(data, u)[0], error)
 
     return jax.lax.map(drawn, jnp.array([1.0, 0.0]))
