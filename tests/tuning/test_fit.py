@@ -178,13 +178,15 @@ def test_wrong_sizes_are_named_and_move_nothing(seed, stated, scatter):
 @pytest.mark.parametrize("spread", [0.1, 0.5])
 @pytest.mark.parametrize("count", [16, 32])
 def test_sizes_at_random_are_of_no_beam_and_open_everything(count, spread):
+    """Of 16 sizes that scatter by a half a beam has 4 %, summed by importance over maps and scales;
+    a search that stops short of the likeliest noise says 0.2 %. The three others have less."""
     rng = np.random.default_rng(count)
     size = 5e-5 * np.exp(spread * rng.normal(size=count))
     scan = scan_of(MACHINE, rng, count)
     found = fit_tuning(
         replace(scan, size={"x": size}, error={"x": 0.01 * size}), LINE, limits_of(MACHINE)
     )
-    assert found.of_a_beam < 0.5
+    assert found.of_a_beam < 0.1
     assert found.status is Status.unidentified
     assert "of no beam" in found.message
     assert not any(q.determined for q in (*found.place.values(), found.minimum, found.emittance))
