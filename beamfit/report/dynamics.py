@@ -37,7 +37,7 @@ def response_page(fits: Sequence[ResponseFit | StatesFit]) -> ReportPage:
         verdicts=[Verdict.of(fit) for fit in fits],
         tables=[table for fit in fits for table in _tables(fit)],
         pictures=[picture for fit in fits for part in fit.parts for picture in _pictures(part)],
-        pictures_title="Measured and simulated",
+        pictures_title="Runs and residuals",
         notes=RESPONSE,
         **about_runs(runs),
     )
@@ -104,9 +104,11 @@ def _draw_run(fit: ResponseFit | StateSpaceOutput, i: int, figure: FigureBase) -
     above.margins(y=0.2)
     middle.plot(time[thin], (y - simulated)[thin], ".", color=RED, markersize=2)
     middle.axhline(0.0, color="0.7", linewidth=0.8)
-    middle.set_ylabel("measured -\nsimulated")
+    middle.set_ylabel("residual")
     for name, values in run.inputs.items():
-        below.step((run.time - run.time[0])[thin], values[thin], where="post", label=name)
+        style = "default" if name in fit.checks.way.moving else "steps-post"
+        since = run.time[thin] - run.time[0]
+        below.plot(since, values[thin], drawstyle=style, label=name)
     names = list(run.inputs)
     below.set(xlabel="time, s", ylabel="inputs" if len(names) > 1 else names[0])
     if len(names) > 1:
