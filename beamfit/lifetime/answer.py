@@ -22,7 +22,8 @@ from beamfit.lifetime.evidence import (
     Evidence,
 )
 from beamfit.lifetime.free_law import LIKELIER, Law
-from beamfit.lifetime.pieces import noise_of, split_record
+from beamfit.lifetime.pieces import split_record
+from beamfit.lifetime.readings import noise_of
 from beamfit.lifetime.record import Monitor
 from beamfit.quantity import HOUR, percent
 from beamfit.statistics import MANY, POOR_FIT, chi2_probability, few_words, of_use

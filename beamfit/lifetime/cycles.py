@@ -1,17 +1,15 @@
-"""The cycles of a record with many refills, as of top-up: found, cleaned for one law, and how their
-loss rate changes.
+"""The cycles of a record with many refills, as of top-up: cleaned for one law, and how their loss
+rate changes.
 """
 
 from __future__ import annotations
 
-import itertools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
-from scipy.ndimage import maximum_filter1d
 from scipy.special import logsumexp, ndtr
 
 from beamfit.lifetime.expansion import (
@@ -25,46 +23,12 @@ from beamfit.lifetime.expansion import (
     solved,
 )
 from beamfit.lifetime.free_law import BELOW
-from beamfit.lifetime.pieces import (
-    Event,
-    Split,
-    beam_readings,
-    by_stretches,
-    event_of,
-    split_record,
-)
+from beamfit.lifetime.pieces import FEWEST_CYCLES, FEWEST_READINGS
 from beamfit.lifetime.record import Conditions, DecayRecord
 from beamfit.statistics import CLEAR_ODDS, log_evidence_of_change
 
-# Standard deviations by which two levels must differ to be two: a false step costs no more than an
-# own current for the rest.
-THRESHOLD = 5.0
-# Least step in units of the last digit of the readings.
-DIGITS = 1.5
-# Readings in which steps are sought at once, and how many beside them are looked at.
-STRETCH, OVERLAP = 1 << 16, 1 << 11
-# Readings on either side whose means are compared, and the fewest places that tell their scatter.
-WINDOWS, PLACES = (1, 2, 4, 8, 16, 32, 64), 20
-# In so many windows the usual difference, which the decay makes, is taken off.
-BLOCK = 16
-# A step is placed to the reading within so many of where it was seen.
-NEAR = 8
-# How often steps are sought with the law that those found leave.
-ROUNDS = 20
-# Share of the usual length below which a piece is the head of a cycle, as of fresh beam.
-SHORT = 0.25
-# Refills by the clock are so far apart to this share of it.
-REGULAR = 0.1
-# Least step as a share of what is lost in the piece that it divides.
-LEAST = 0.2
-# Share of what cycles lose that refills give back at least, and of steps that are to be refills.
-RETURNED = 0.5
-# A step that both searches find is seen within so many readings.
-BESIDE = 2.0
 # Cycles whose settings and pressure agree to this share have one a and one b.
 SAME = 0.02
-# Currents so alike that a and b do as one number.
-NARROW = 0.02
 # Noise over the height of a sawtooth that is looked at.
 NOISES = (0.01, 0.03, 0.1, 0.2)
 # Refills of top-up come every 3 min, within a factor 3, those of fills hours apart; lifetimes are
@@ -73,113 +37,6 @@ NOISES = (0.01, 0.03, 0.1, 0.2)
 PERIOD, LIFETIME = (180.0, 1.2, 12.0), (15 * 3600.0, 1.2, 17.0)
 # Of these so many are usual; and records without a decay so often have refills that none shows.
 USUAL, HELD = 0.8, 0.1
-# Readings beyond which the scatter of their mean is followed no farther.
-LONG = 4096
-
-
-def find_cycles(record: DecayRecord) -> Split:
-    """Cut a record at every refill, also where it exceeds the noise but little.
-
-    Parameters
-    ----------
-    record : DecayRecord
-        Top-up, or fills with refills between them.
-
-    Returns
-    -------
-    Split
-        Cycles, and the refills, losses and pieces left out.
-
-    Notes
-    -----
-    Steps that stand out in the means of 1, 2, 4, ... 64 readings before and after, by the scatter
-    of most places, come first. Between them one law -a I² - b I for all pieces puts the loss back,
-    and two levels are tested against one by their likelihood ratio, in noise whose memory the
-    differences of neighbours show; what is found improves the law, and so on. Steps of three
-    standard deviations of the noise are found in cycles of 60 readings and more, of ten always.
-    Pieces of less than three readings or a quarter of the usual length, as of spikes, injection
-    ramps and fresh beam, are left out, and the rest is looked at anew.
-
-    Examples
-    --------
-    >>> t = np.arange(0.0, 3600.0, 10.0)
-    >>> noise = np.random.default_rng(1).normal(size=t.size)
-    >>> split = find_cycles(DecayRecord(t, 500 - (t % 180) / 180 + 0.2 * noise))
-    >>> len(split.segments), str(split.events[0])
-    (20, 'refill at 180 s (+0.9698 mA)')
-    """
-    kept, events = beam_readings(record, spikes=False)
-    grain = record.resolution or 0.0
-    for _ in range(2):
-        pieces = np.split(kept, _steps(record.time[kept], record.current[kept], grain))
-        lengths = [piece.size for piece in pieces]
-        usual = np.median(np.repeat(lengths, lengths)) if kept.size else 0  # of most readings
-        fewest = max(FEWEST_READINGS, usual * SHORT)
-        long = [piece for piece in pieces if piece.size >= fewest]
-        short = [piece for piece in pieces if 0 < piece.size < fewest]
-        events += [event_of(record, "short", piece[0], piece[-1]) for piece in short]
-        kept = np.concatenate(long or [kept[:0]])
-    long = _by_the_clock(long)
-    for after, change in zip(long[1:], _changes_between(record, long), strict=True):
-        kind, at = "refill" if change > 0 else "loss", float(record.time[after[0]])
-        events.append(Event(kind, at, 0.0, change))
-    cycles = (record.select(piece, f"{record.name}#{k}") for k, piece in enumerate(long, 1))
-    return Split(tuple(cycles), tuple(sorted(events, key=lambda event: event.time)))
-
-
-def _by_the_clock(pieces: list[np.ndarray]) -> list[np.ndarray]:
-    """Divide pieces of several usual lengths, where most readings are in those of one: a refill may
-    be too small to be found. One that is missed bends a long piece, which tells most.
-    """
-    lengths = np.array([piece.size for piece in pieces])
-    usual = np.median(np.repeat(lengths, lengths)) if pieces else 1.0
-    regular = np.abs(lengths - usual) <= max(REGULAR * usual, 1.0)
-    if lengths @ regular < 0.5 * lengths.sum():
-        return pieces
-    return [
-        part
-        for piece in pieces
-        for part in np.array_split(piece, max(round(piece.size / usual), 1))
-    ]
-
-
-def cut_at_refills(record: DecayRecord) -> Split:
-    """As `split_record`, but as `find_cycles` where that finds more cycles: the former cuts
-    nothing but clear steps between pieces of eight readings, whatever the law of the decay.
-
-    The finer one is right where it finds what is clear, and most of what it finds besides raises
-    the current, as refills do: what a wrong law or the noise makes of a decay goes both ways.
-    """
-    clear, fine = split_record(record), find_cycles(record)
-    if len(fine.segments) <= len(clear.segments) or not is_refilled(fine):
-        return clear
-    usual, kinds = float(np.median(np.diff(record.time))), ("refill", "loss")
-    seen, found = ([e for e in split.events if e.kind in kinds] for split in (clear, fine))
-    both = [np.array([event.time for event in events]) for events in (seen, found)]
-    agreed, old = (_nearest(*pair) < BESIDE * usual for pair in (both, both[::-1]))
-    new = np.array([event.change for event in found])[~old]
-    agree = agreed.sum() >= RETURNED * agreed.size
-    return fine if agree and new.sum() >= RETURNED * np.abs(new).sum() else clear
-
-
-def _nearest(times: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """Distance of each time from the nearest of others, both in order."""
-    ends = np.concatenate([[-np.inf], others, [np.inf]])
-    after = np.searchsorted(ends, times)
-    return np.minimum(times - ends[after - 1], ends[after] - times)
-
-
-def is_refilled(split: Split) -> bool:
-    """Tell three or more cycles held by refills from a decay with odd steps.
-
-    Refills give back at least half of what the cycles lose.
-    """
-    cycles = split.segments
-    if len(cycles) < FEWEST_CYCLES:
-        return False
-    refills = [event.change for event in split.events if event.kind in ("refill", "ramp")]
-    lost = sum(float(cycle.current[0] - cycle.current[-1]) for cycle in cycles)
-    return len(refills) + 1 >= FEWEST_CYCLES and sum(refills) > RETURNED * lost > 0
 
 
 def is_sawtooth(residuals: np.ndarray) -> bool:
@@ -257,161 +114,6 @@ def _prior(value: np.ndarray, middle: float, width: float, wide: float) -> np.nd
     return USUAL * normal + (1 - USUAL) / wide
 
 
-def _levelled(time: np.ndarray, current: np.ndarray, first: np.ndarray) -> np.ndarray:
-    """Currents with the loss put back, by one a and one b for all pieces."""
-    if not first.size:
-        return current
-    parts = np.diff(time) * np.array([current[:-1], current[:-1] ** 2])
-    columns = np.vstack([np.zeros(2), np.cumsum(parts, axis=1).T])
-    lengths = np.diff(first, append=time.size)
-    both = np.column_stack([columns, current])
-    both -= np.repeat(np.add.reduceat(both, first) / lengths[:, None], lengths, axis=0)
-    scale = np.linalg.norm(both[:, :2], axis=0) + 1e-300
-    loss = np.linalg.lstsq(both[:, :2] / scale, both[:, 2], rcond=NARROW)[0] / scale
-    return current - columns @ loss
-
-
-def _changes_between(record: DecayRecord, pieces: Sequence[np.ndarray]) -> list[float]:
-    """Changes of the current from each piece to the next, mA, the loss put back; by one
-    law for some pieces together.
-    """
-    if not pieces:
-        return []
-    ends, found = np.cumsum([piece.size for piece in pieces]) // STRETCH, []
-    for batch in np.split(np.arange(len(pieces)), np.flatnonzero(np.diff(ends)) + 1):
-        some = [pieces[k] for k in batch] + list(pieces[batch[-1] + 1 : batch[-1] + 2])
-        rows, first = np.concatenate(some), np.cumsum([0] + [piece.size for piece in some[:-1]])
-        level = _levelled(record.time[rows], record.current[rows], first)
-        for begin, middle, end in zip(first, first[1:], [*first[2:], rows.size], strict=False):
-            before = level[max(begin, middle - NEAR) : middle]
-            after = level[middle : min(end, middle + NEAR)]
-            found.append(float(np.median(after) - np.median(before)))
-    return found
-
-
-def _steps(time: np.ndarray, current: np.ndarray, grain: float) -> np.ndarray:
-    """Indices of the first readings after a step, in order."""
-
-    def begins(time: np.ndarray, current: np.ndarray) -> np.ndarray:
-        found = np.zeros(time.size, bool)
-        found[_steps_of(time, current, grain)] = True
-        return found
-
-    found = by_stretches(begins, time, current, stretch=STRETCH, overlap=OVERLAP)
-    return np.flatnonzero(found)
-
-
-def _steps_of(time: np.ndarray, current: np.ndarray, grain: float) -> np.ndarray:
-    if current.size < PLACES:
-        return np.zeros(0, int)
-    found = np.zeros(current.size, bool)
-    for window in WINDOWS:
-        level = _levelled(time, current, np.append(0, np.flatnonzero(found)))
-        total = np.append(0.0, np.cumsum(level))
-        for _ in range(2):
-            free, change = _changes(total, found, window)
-            if free.sum() < PLACES:
-                break
-            usually = 1.4826 * np.median(np.abs(change[0, free]))
-            # Beside it the loss is another one only if it differs by more than that.
-            change = np.where(np.abs(change - change[0]) > usually, change, change[0])
-            size = np.where(free, np.abs(change).min(axis=0), 0.0)
-            least = max(THRESHOLD * usually, DIGITS * grain)
-            peak = size >= maximum_filter1d(size, 2 * window - 1)
-            found[window : current.size - window + 1] |= peak & (size > least)
-    clear = steps = np.flatnonzero(found)
-    for _ in range(ROUNDS):
-        level = _levelled(time, current, np.append(0, steps))
-        total = np.append(0.0, np.cumsum(level))
-        more = _placed(total, _divided(level, total, level - current, clear, grain))
-        if np.array_equal(more, steps):
-            break
-        steps = more
-    return steps
-
-
-def _divided(
-    level: np.ndarray, total: np.ndarray, lost: np.ndarray, clear: np.ndarray, grain: float
-) -> np.ndarray:
-    """Divide pieces in two as long as two levels explain them better than one, and give back some
-    of what a piece loses: a law that is not quite right makes smaller steps.
-    """
-    variance = _mean_variance(np.delete(np.diff(level), clear - 1), min(level.size, LONG))
-    ends = [0, *clear.tolist(), level.size]
-    waiting, found = list(itertools.pairwise(ends)), clear.tolist()
-    while waiting:
-        low, high = waiting.pop()
-        if high - low < 2:
-            continue
-        at = np.arange(low + 1, high)
-        step = (total[high] - total[at]) / (high - at) - (total[at] - total[low]) / (at - low)
-        scatter = np.sqrt(variance(at - low) + variance(high - at))
-        best = int(np.argmax(np.abs(step) / scatter))
-        least = max(DIGITS * grain, LEAST * (lost[high - 1] - lost[low]))
-        if abs(step[best]) > max(THRESHOLD * scatter[best], least):
-            found.append(int(at[best]))
-            waiting += [(low, int(at[best])), (int(at[best]), high)]
-    return np.sort(found)
-
-
-def _mean_variance(change: np.ndarray, longest: int) -> Callable[[np.ndarray], np.ndarray]:
-    """Variance of the mean of so many readings in autoregressive noise, by its differences.
-
-    Those over two intervals have 1 + c times the variance of those over one, c being the
-    correlation of neighbours; medians, for the steps among them.
-    """
-    one, two = (np.median(np.abs(values)) for values in (change, change[1:] + change[:-1]))
-    kept = float(np.clip((two / max(one, 1e-300)) ** 2 - 1, 0.0, 0.99))
-    many = np.arange(1, longest + 1)
-    # The sum of many readings: n + 2 sum (n - k) c^k.
-    sums = many + 2 * (kept * many / (1 - kept) - kept * (1 - kept**many) / (1 - kept) ** 2)
-    table = (1.4826 * one) ** 2 / 2 / (1 - kept) * sums / many**2 + 1e-300
-    return lambda count: table[np.minimum(count, longest) - 1]
-
-
-def _changes(total: np.ndarray, found: np.ndarray, window: int) -> tuple[np.ndarray, np.ndarray]:
-    """At every place, whether no step is found within a window, and by how much the means of so
-    many readings before and after differ beside their usual difference there, earlier and later,
-    shape (3, places): where a loss rate changes one of these is right. From sums of readings.
-    """
-    place = np.arange(window, found.size - window + 1)
-    steps = np.append(0, np.cumsum(found))
-    free = steps[place + window] == steps[place - window + 1]
-    change = (total[place + window] - 2 * total[place] + total[place - window]) / window
-    return free, change - _usual(np.where(free, change, np.nan), BLOCK * window)
-
-
-def _usual(values: np.ndarray, size: int) -> np.ndarray:
-    """The median of the block of about this size about each value, of the block before and of that
-    after it; 0 where none is finite.
-    """
-    if not values.size:
-        return np.zeros((3, 0))
-    blocks = max(1, values.size // size)
-    size = -(-values.size // blocks)
-    padded = np.append(values, np.full(blocks * size - values.size, np.nan)).reshape(blocks, size)
-    ordered = np.sort(padded, axis=1)  # what is not finite comes last
-    count = np.isfinite(ordered).sum(axis=1)[:, None]
-    middle = np.concatenate([np.maximum(count - 1, 0) // 2, count // 2], axis=1)
-    found = np.take_along_axis(ordered, np.minimum(middle, size - 1), axis=1).mean(axis=1)
-    found = np.pad(np.where(count[:, 0] > 0, found, 0.0), 1, mode="edge")
-    every = np.stack([found[1:-1], found[:-2], found[2:]])
-    return np.repeat(every, size, axis=1)[:, : values.size]
-
-
-def _placed(total: np.ndarray, steps: np.ndarray) -> np.ndarray:
-    """Each step where two levels between its neighbours explain most."""
-    ends = np.concatenate([[0], steps, [total.size - 1]])
-    widest = WINDOWS[-1]
-    for k in range(1, ends.size - 1):
-        low, high = max(ends[k - 1], ends[k] - widest), min(ends[k + 1], ends[k] + widest)
-        at = np.arange(max(low + 1, ends[k] - NEAR), min(high, ends[k] + NEAR + 1))
-        before = (total[at] - total[low]) / (at - low)
-        after = (total[high] - total[at]) / (high - at)
-        ends[k] = at[np.argmax((before - after) ** 2 * (at - low) * (high - at))]
-    return np.unique(ends[1:-1])
-
-
 def usual_cycle(cycles: Sequence[DecayRecord]) -> tuple[float, float]:
     """Median number of readings of cycles, and time between them, s."""
     count = float(np.median([len(cycle) for cycle in cycles]))
@@ -455,7 +157,6 @@ def joined(cycles: Sequence[DecayRecord], name: str) -> DecayRecord:
     )  # fmt: skip
 
 
-FEWEST_CYCLES, FEWEST_READINGS = 3, 3
 # Readings beyond which neighbours are averaged, in blocks within a cycle.
 MOST = 16384
 # Robust standard deviations off which a reading or a cycle is left out; at most this share of them.

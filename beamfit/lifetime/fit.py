@@ -18,7 +18,7 @@ from beamfit.lifetime.decay_law import current
 from beamfit.lifetime.evidence import BELIEVED, UNITS, Evidence, RatePart, Separability
 from beamfit.lifetime.expansion import Expansion, Pieces, Shape, solved
 from beamfit.lifetime.free_law import FreeLaw, Law
-from beamfit.lifetime.pieces import with_common_errors
+from beamfit.lifetime.readings import with_common_errors
 from beamfit.lifetime.record import DecayRecord, Monitor
 from beamfit.quantity import Quantity, Status
 
@@ -432,7 +432,7 @@ def fit_cycles(
     Parameters
     ----------
     cycles : sequence of DecayRecord
-        Three or more, of three readings or more, in order of time; as of `find_cycles`. Their
+        Three or more, of three readings or more, in order of time; as of `split_record`. Their
         `start`, where all have it, says how far apart they lie.
     name : str, optional
         What to call them together.

@@ -1,35 +1,37 @@
-"""Clean decays of a record: cut at refills, steps and gaps, without repeats; means and edges."""
+"""Clean decays of a record: cut at refills, losses and gaps, without dropouts and spikes."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import replace
+import itertools
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
 from scipy.ndimage import maximum_filter1d, median_filter, minimum_filter1d, uniform_filter1d
 
 from beamfit.answer import shown
 from beamfit.errors import expect
-from beamfit.lifetime.record import Conditions, DecayRecord
-from beamfit.quantity import HOUR
-from beamfit.statistics import POOR_FIT
+from beamfit.lifetime.readings import (
+    FEWEST,
+    NEIGHBOURS,
+    THRESHOLD,
+    WINDOW,
+    by_stretches,
+    noise_of,
+)
+from beamfit.lifetime.record import DecayRecord
 
-# Robust z-score at which a step or spike is an event: one false alarm in 1e20 Gaussian readings.
-THRESHOLD = 10.0
 # Readings below this share of the largest one near them are dropouts of the monitor.
 DROPOUT = 0.02
-WINDOW = 9
 # A record shows the beam in a hundredth of its readings at least.
 SEEN = 0.99
-FEWEST = 8
-# Readings that tell the noise near one, and the error of the median of `WINDOW` over theirs.
-NEIGHBOURS, OF_MEDIAN = 21, 0.42
+# Error of the median of `WINDOW` over the noise of what it is of.
+OF_MEDIAN = 0.42
+# Share of changes that equal the usual one near them to the numbers' own accuracy, beyond which
+# digits are larger than the noise; the usual one is one of nine, and the median of these.
+REPEATS, EXACT, TINY = 1 / 3, 1e-11, 1e-300
 # Readings of a spike at most.
 LONE = 3
-# Readings that are looked through at once, and how many of their neighbours.
-STRETCH, OVERLAP = 1 << 18, 64
 # Readings whose means are looked at for a ramp at the head, the share of its rise by which a fall
 # ends it, and by how much it exceeds any later rise.
 SMOOTH, FALL, RISE = 5, 0.1, 3.0
@@ -40,6 +42,28 @@ BLOCK = 4096
 COARSE, FASTER = 24, 4.0
 # A gap is this many usual sampling intervals.
 GAP = 10.0
+# Standard deviations by which two levels must differ to be two: a false step costs no more than an
+# own current for the rest.
+LIKELY = 5.0
+# Places that tell the scatter, at least.
+PLACES = 20
+# Least step in units of the last digit of the readings.
+DIGITS = 1.5
+# Readings that have one law, and how many beside them are looked at; readings beyond which the
+# scatter of their mean is followed no farther.
+ONE_LAW, BESIDE, LONG = 1 << 16, 1 << 11, 4096
+# A step is placed to the reading within so many of where it was seen, by so many on either side.
+NEAR, WIDEST = 8, 64
+# How often steps are sought with the law that those found leave.
+ROUNDS = 20
+# Share of the usual length below which a piece is the head of a cycle, as of fresh beam.
+SHORT = 0.25
+# Refills by the clock are so far apart to this share of it.
+REGULAR = 0.1
+# Share of what cycles lose that refills give back at least, and of steps that are to be refills.
+RETURNED = 0.5
+# Cycles that tell a law together, and readings of each.
+FEWEST_CYCLES, FEWEST_READINGS = 3, 3
 
 
 class Event(NamedTuple):
@@ -85,74 +109,6 @@ class Split(NamedTuple):
     events: tuple[Event, ...]
 
 
-def noise_of(time: np.ndarray, current: np.ndarray) -> float:
-    """Noise of single readings, from how far each lies off the line through its neighbours.
-
-    Parameters
-    ----------
-    time, current : array, shape (n,)
-        Readings; n at least 3.
-
-    Returns
-    -------
-    float
-        Robust standard deviation, in the unit of the current.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> t = np.arange(1000.0)
-    >>> noise = 0.01 * np.random.default_rng(1).normal(size=1000)
-    >>> f"{noise_of(t, 100 - t / 100 + noise):.3f}"
-    '0.010'
-    """
-    share = (time[1:-1] - time[:-2]) / (time[2:] - time[:-2])
-    off = current[1:-1] - (1 - share) * current[:-2] - share * current[2:]
-    off /= np.sqrt(1 + share**2 + (1 - share) ** 2)
-    return float(1.4826 * np.median(np.abs(off, out=off), overwrite_input=True))
-
-
-def with_common_errors(record: DecayRecord, residuals: np.ndarray) -> DecayRecord:
-    """Take the rms of the errors near each reading for its error where they differ by chance.
-
-    An error of three readings is known to a half, and the root of a number of counts goes with
-    that number: as weights both prefer readings by their own noise. Errors that differ for a reason
-    make how far residuals lie off those beside them much likelier, and stay.
-
-    Examples
-    --------
-    >>> random, t = np.random.default_rng(1), np.linspace(0.0, 3600.0, 60)
-    >>> shots = random.normal(size=(60, 3))
-    >>> errors = shots.std(axis=1, ddof=1) / np.sqrt(3)
-    >>> record = DecayRecord(t, 100 - t / 100 + shots.mean(axis=1), errors)
-    >>> found = with_common_errors(record, shots.mean(axis=1)).error
-    >>> f"{errors.min():.2f} to {errors.max():.2f}, {found.min():.2f} to {found.max():.2f}"
-    '0.06 to 1.20, 0.43 to 0.61'
-    """
-    error = record.error
-    if error is None or len(record) < FEWEST or not np.ptp(error):
-        return record
-    near = np.sqrt(uniform_filter1d(error**2, min(NEIGHBOURS, len(record)), mode="mirror"))
-    times, off = (sliding_window_view(v, 5) for v in (record.time, residuals))
-    since, off = np.delete(times - times[:, 2:3], 2, 1), np.delete(off - off[:, 2:3], 2, 1)
-
-    def misfit(error: np.ndarray) -> float:
-        """-2 ln of their probability, whatever factor all errors are wrong by."""
-        weight = np.delete(1 / sliding_window_view(error, 5) ** 2, 2, 1)
-        sums = (np.sum(weight * part, axis=1) for part in (1, since, since**2, off, off * since))
-        count, first, second, level, slope = sums
-        spread = count * second - first**2
-        line = (second * level - first * slope) / spread
-        variance = error[2:-2] ** 2 + second / spread
-        return float(np.sum(np.log(variance)) + line.size * np.log(np.mean(line**2 / variance)))
-
-    with np.errstate(divide="ignore", invalid="ignore"):
-        if misfit(near) - misfit(error) > -2 * np.log(POOR_FIT):
-            return record
-    note = "Errors of neighbouring readings differ by chance: each is the rms of those near it."
-    return replace(record, error=near, notes=(*record.notes, note))
-
-
 def _dropouts(current: np.ndarray) -> tuple[np.ndarray, int]:
     """Readings near zero although the beam comes back, and where it is gone for good."""
     flagged = np.zeros(current.size, bool)
@@ -196,28 +152,6 @@ def _noise_near(off: np.ndarray) -> np.ndarray:
     return maximum_filter1d(1.4826 * median_filter(off, NEIGHBOURS, mode="mirror"), NEIGHBOURS)
 
 
-def by_stretches(
-    function: Callable[..., np.ndarray],
-    *columns: np.ndarray,
-    stretch: int = STRETCH,
-    overlap: int = OVERLAP,
-) -> np.ndarray:
-    """Values of a function of near neighbours for each reading: of a long record by stretches,
-    since all at once takes gigabytes.
-
-    Examples
-    --------
-    >>> by_stretches(lambda x: np.gradient(x), np.arange(6.0) ** 2, stretch=3, overlap=1).tolist()
-    [1.0, 2.0, 4.0, 6.0, 8.0, 9.0]
-    """
-    found, size = [], columns[0].size
-    for start in range(0, size, stretch):
-        low, stop = max(start - overlap, 0), min(start + stretch, size)
-        some = function(*(column[low : stop + overlap] for column in columns))
-        found.append(some[start - low : stop - low])
-    return np.concatenate(found)
-
-
 def _usual_rate(time: np.ndarray, current: np.ndarray) -> np.ndarray:
     """Rate of change near each reading, which a step does not move."""
     return median_filter(np.diff(current) / np.diff(time), WINDOW, mode="mirror")
@@ -234,6 +168,8 @@ def _spikes(time: np.ndarray, current: np.ndarray, noise: float) -> np.ndarray:
     beside = np.concatenate([level[LONE:0:-1], level, np.repeat(level[-1:], LONE)])
     off = np.abs(level - median_filter(beside, 2 * LONE + 1)[LONE:-LONE])
     off -= LONE * np.append(changes[0], changes)
+    digits = _digits_near(current, np.diff(current) - lost)
+    noise = np.maximum(noise, np.append(digits[0], digits) / 2)
     return off > THRESHOLD * np.maximum(noise, _noise_near(off))
 
 
@@ -253,21 +189,15 @@ def event_of(record: DecayRecord, kind: str, first: int, last: int, sudden: bool
     return Event(kind, float(record.time[first]), float(lasts), float(change))
 
 
-def _noise(record: DecayRecord, time: np.ndarray, current: np.ndarray) -> float:
-    return max(noise_of(time, current), (record.resolution or 0.0) / 2)
-
-
-def beam_readings(record: DecayRecord, spikes: bool = True) -> tuple[np.ndarray, list[Event]]:
-    """Indices of the readings that show the beam, and what the others are; of short cycles the
-    first readings look like spikes.
-    """
+def beam_readings(record: DecayRecord) -> tuple[np.ndarray, list[Event]]:
+    """Indices of the readings that show the beam, and what the others are."""
     dropped, end_of_beam = _dropouts(record.current)
     found = {"dropout": dropped, "saturated": _saturated(record.current)}
     kept = np.flatnonzero(~dropped & ~found["saturated"] & (np.arange(len(record)) < end_of_beam))
-    if spikes and kept.size >= FEWEST:
+    if kept.size >= FEWEST:
         found["spike"] = np.zeros(len(record), bool)
         time, current = record.time[kept], record.current[kept]
-        noise = _noise(record, time, current)
+        noise = noise_of(time, current)
         lone = by_stretches(lambda t, i: _spikes(t, i, noise), time, current)
         found["spike"][kept[lone]] = True
         kept = kept[~lone]
@@ -281,21 +211,38 @@ def beam_readings(record: DecayRecord, spikes: bool = True) -> tuple[np.ndarray,
     return kept, events
 
 
-def _steps(time: np.ndarray, current: np.ndarray, noise: float) -> np.ndarray:
-    """Change from each reading to the next, less what the decay around it explains, where that is
-    more than noise; or zero.
+def _digits_near(current: np.ndarray, excess: np.ndarray) -> np.ndarray:
+    """The last digit near each change, the usual size of departures that are not zero; 0 where few
+    are zero. A record may be of several detectors.
+    """
+    moves = np.abs(excess) > EXACT * np.max(current)
+    still = uniform_filter1d((~moves).astype(float), NEIGHBOURS) > REPEATS
+    place = np.flatnonzero(moves)
+    if not place.size or not still.any():
+        return np.zeros(excess.size)
+    near = median_filter(np.abs(excess[place]), NEIGHBOURS, mode="mirror")
+    near = near[np.minimum(np.searchsorted(place, np.arange(excess.size)), place.size - 1)]
+    return maximum_filter1d(np.where(still, near, 0.0), NEIGHBOURS)
+
+
+def _departures(time: np.ndarray, current: np.ndarray) -> np.ndarray:
+    """Change from each reading to the next less what the decay around it explains; by how many
+    standard deviations of such changes near it that exceeds half of what is lost; and the digit
+    near it, shape (n - 1, 3).
     """
 
-    def beyond(time: np.ndarray, current: np.ndarray) -> np.ndarray:
+    def near(time: np.ndarray, current: np.ndarray) -> np.ndarray:
         interval, change, usual = np.diff(time), np.diff(current), _usual_rate(time, current)
         error = OF_MEDIAN * interval * _noise_near(np.abs(change / interval - usual))
         lost = usual * interval
         excess = change - lost
-        near = np.maximum(np.sqrt(2) * noise, _noise_near(np.abs(excess)))
-        allowed = 0.5 * np.abs(lost) + THRESHOLD * np.hypot(near, error)
-        return np.append(0.0, np.where(np.abs(excess) > allowed, excess, 0.0))
+        least = max(_scatter(excess), EXACT * np.max(current))
+        scatter = np.maximum(least, _noise_near(np.abs(excess)))
+        score = (np.abs(excess) - 0.5 * np.abs(lost)) / (np.hypot(scatter, error) + TINY)
+        found = np.column_stack([excess, score, _digits_near(current, excess)])
+        return np.vstack([np.zeros(3), found]).astype(np.float32)  # of 1e7 readings 120 MB
 
-    return by_stretches(beyond, time, current)[1:]
+    return by_stretches(near, time, current)[1:]
 
 
 def _highest(smooth: np.ndarray, low: float, noise: float) -> int:
@@ -310,7 +257,7 @@ def _ramp(current: np.ndarray, noise: float) -> int:
     than noise and three times more than anywhere later. Half as many again are cut, where a ramp
     that ends smoothly still counts.
     """
-    if current.size < 3 * FEWEST:
+    if current.size < 3 * FEWEST or np.max(current) - np.min(current[:SMOOTH]) <= 6 * noise:
         return 0
     smooth = np.convolve(current, np.full(SMOOTH, 1 / SMOOTH), "valid")
     highest = _highest(smooth, smooth[0], noise)
@@ -332,8 +279,10 @@ def _is_slow_step(beyond: np.ndarray, change: np.ndarray) -> np.ndarray:
     return seen
 
 
-class SlowStep(NamedTuple):
-    """A fall or a rise of many readings: the first, the one past the last, and if it is a rise."""
+class Step(NamedTuple):
+    """A fall or a rise: the first reading of it, the first one after it, which is the same where it
+    is sudden, and if it is a rise.
+    """
 
     first: int
     end: int
@@ -351,35 +300,84 @@ def _bounds(first: int, last: int, size: int, cuts: np.ndarray) -> tuple[int, in
     return before if begin - before < 2 * size else begin, after if after - end < 2 * size else end
 
 
-def _slow_steps(
-    time: np.ndarray, level: np.ndarray, steps: Mapping[int, float], noise: float
-) -> list[SlowStep]:
-    """Falls and rises of many readings: steps of means of 2, 4, 8, ... neighbours, besides those
-    of single readings. Fresh beam, as after a rise, may fall fast by itself.
+def _search(time: np.ndarray, current: np.ndarray) -> tuple[list[Step], np.ndarray, np.ndarray]:
+    """Clear steps of readings and of the means of 2, 4, 8, ... neighbours, in order; readings about
+    which there may be others; and the last digit near each reading.
     """
-    known, size, found = np.zeros(level.size, bool), 2, []
-    known[list(steps)] = True
-    refills = [first for first, change in steps.items() if change > 0]
-    while (count := level.size // size) >= COARSE:
-        t, x, old = (v[: count * size].reshape(count, size).mean(1) for v in (time, level, known))
-        beyond = _steps(t, x, noise)
-        apart = (old[1:] == 0) & (old[:-1] == 0)
-        fresh = np.sort([0, *refills, *(step.end for step in found if step.rises)])
-        ends = [end for step in found for end in (step.first, step.end)]
-        cuts = np.sort([-level.size, *steps, *ends, 2 * level.size])
-        for first, last in _runs(_is_slow_step(beyond, np.diff(x)) & apart):
-            since = first * size - fresh[np.searchsorted(fresh, first * size, "right") - 1]
-            if beyond[first] > 0 or since >= WINDOW // 2 * size:
-                begin, end = _bounds(first, last, size, cuts)
-                found.append(SlowStep(begin, min(end, level.size), bool(beyond[first] > 0)))
-                known[begin:end] = True
+    size, steps, level = 1, [], current.copy()
+    known, likely = np.zeros(level.size, bool), np.zeros(level.size, bool)
+    while level.size // size >= (COARSE if size > 1 else 2):
+        for late in range(0, size, max(size // 2, 1)):
+            count = (level.size - late) // size
+            columns = (v[late : late + count * size] for v in (time, level, known, likely))
+            t, x, old, seen = (v.reshape(count, size) for v in columns)
+            t, x, old, seen = t.mean(axis=1), x.mean(axis=1), old.any(axis=1), seen.any(axis=1)
+            excess, score, digit = _departures(t, x).T
+            if size == 1:
+                digits = np.append(np.float32(0), digit)
+                least = THRESHOLD * np.maximum(_scatter(excess), digits * 2**-0.5)
+            coarse = digits[late + size :: size][: count - 1]
+            clear = (score > THRESHOLD) & (np.abs(excess) > least[late + size :: size][: count - 1])
+            beyond = np.where(clear & ~old[1:] & ~old[:-1], excess, np.float32(0))
+            if size == 1:
+                steps += [Step(k + 1, k + 1, beyond[k] > 0) for k in np.flatnonzero(beyond)]
+                known[1:] = clear
+                level[1:] -= np.cumsum(beyond, dtype=float)
+            elif not late:
+                steps += (more := _slow_steps(steps, beyond, level, size, least))
+                for step in more:
+                    known[step.first : max(step.end, step.first + 1)] = True
+            free = ~seen[1:] & ~seen[:-1]
+            peaks = _peaks(np.abs(excess), free, DIGITS * coarse)
+            likely[late + (peaks + 1) * size] = True
         size *= 2
-    return _joined(found)
+    return _joined(steps), likely, digits
 
 
-def _joined(steps: list[SlowStep]) -> list[SlowStep]:
+def _scatter(values: np.ndarray) -> float:
+    """Robust standard deviation about zero."""
+    return float(1.4826 * np.median(np.abs(values)))
+
+
+def _peaks(size: np.ndarray, free: np.ndarray, grain: np.ndarray) -> np.ndarray:
+    """Changes that stand out among those that are free of what was found before, and of these."""
+    found = np.zeros(size.size, bool)
+    for _ in range(2):
+        if free.sum() < PLACES:
+            break
+        high = np.where(free, size, 0.0)
+        found |= high > np.maximum(LIKELY * _scatter(high[free]), grain)
+        found &= high >= maximum_filter1d(high, 3)
+        free = free & ~maximum_filter1d(found, 3)
+    return np.flatnonzero(found)
+
+
+def _slow_steps(
+    before: Sequence[Step], beyond: np.ndarray, level: np.ndarray, size: int, least: np.ndarray
+) -> list[Step]:
+    """Steps from mean to mean of so many readings besides others, those sudden that a single change
+    makes. Fresh beam, as after a rise, may fall fast by itself.
+    """
+    fresh = np.sort([0, *(step.end for step in before if step.rises)])
+    ends = (end for step in before for end in step[:2])
+    cuts, found = np.sort([-level.size, *ends, 2 * level.size]), []
+    change = np.diff(level[: level.size // size * size].reshape(-1, size).mean(axis=1))
+    for first, last in _runs(_is_slow_step(beyond, change)):
+        since = first * size - fresh[np.searchsorted(fresh, first * size, "right") - 1]
+        if beyond[first] < 0 and since < WINDOW // 2 * size:
+            continue
+        begin, end = _bounds(first, last, size, cuts)
+        single = np.diff(level[max(begin - 1, 0) : end])
+        largest = int(np.argmax(np.abs(single)))
+        if abs(beyond[first:last].sum() - single[largest]) < 0.5 * least[begin]:
+            begin = end = max(begin, 1) + largest
+        found.append(Step(begin, min(end, level.size), bool(beyond[first] > 0)))
+    return found
+
+
+def _joined(steps: list[Step]) -> list[Step]:
     """Steps in order, those that overlap as one."""
-    apart: list[SlowStep] = []
+    apart: list[Step] = []
     for step in sorted(steps):
         if apart and step.first < apart[-1].end:
             before = apart.pop()
@@ -399,7 +397,7 @@ def split_record(record: DecayRecord) -> Split:
     Returns
     -------
     Split
-        Decays of at least 8 readings, and the events between and in them.
+        Decays of at least 8 readings, or cycles of at least 3, and the events between and in them.
 
     Notes
     -----
@@ -407,6 +405,13 @@ def split_record(record: DecayRecord) -> Split:
     meanwhile, as in a gap. Losses and refills of many readings, up to a twentieth of the record,
     are steps of the means of 2, 4, 8, ... neighbours; slower changes stay in. A gap alone does not
     end a decay; a step across it does.
+
+    Where refills hold the beam smaller ones are sought, too. One law -a I² - b I for all pieces
+    puts the loss back, and two levels are tested against one by their likelihood ratio, in noise
+    whose memory the differences of neighbours show; what is found improves the law, and so on.
+    Steps of three standard deviations of the noise are found in cycles of 60 readings and more, of
+    ten always. Most of them must raise the current, as refills do: what a wrong law or the noise
+    makes of a decay goes both ways.
 
     Examples
     --------
@@ -421,201 +426,288 @@ def split_record(record: DecayRecord) -> Split:
     kept, events = beam_readings(record)
     if kept.size < FEWEST:
         return Split((), tuple(events))
-    time, current = record.time[kept], record.current[kept]
-    noise = _noise(record, time, current)
-    beyond = _steps(time, current, noise)
-    steps = {int(k) + 1: float(beyond[k]) for k in np.flatnonzero(beyond)}
-    for first, size in steps.items():
-        change = float(current[first] - current[first - 1])
-        events.append(Event("refill" if size > 0 else "loss", float(time[first]), 0.0, change))
-    current[1:] -= np.cumsum(beyond)
-    del beyond  # of 1e7 readings 80 MB
-    slow = _slow_steps(time, current, steps, noise)
-    del time, current
     interval = np.diff(record.time)
     for before in np.flatnonzero(interval > GAP * np.median(interval)):
         events.append(event_of(record, "gap", before, before + 1))
-    ends = [*steps]
-    for first, last, rises in slow:
-        kind = "ramp" if rises else "loss"
-        events.append(event_of(record, kind, kept[first], kept[last - 1]))
-        ends += [first, last]
-    between, long = np.split(kept, np.sort(ends)), []
-    within = {kept[first] for first, *_ in slow}
-    for piece in between:
-        if not piece.size or piece[0] in within:
-            continue
-        if cut := _ramp(record.current[piece], noise):
-            events.append(event_of(record, "ramp", piece[0], piece[cut - 1]))
-        if piece.size < FEWEST:
-            events.append(event_of(record, "short", piece[0], piece[-1]))
-        else:
-            long.append(piece[cut:])
+    del interval  # of 1e7 readings 80 MB
+    clear = _clear_steps(record, kept)
+    pieces, steps, fewest = clear.pieces, [], FEWEST
+    if (finer := _cycles(record, clear)) is not None:
+        (pieces, steps), fewest = finer, FEWEST_READINGS
+    events += [*clear.steps, *steps]
+    short = [piece for piece in pieces if piece.size < fewest]
+    events += [event_of(record, "short", piece[0], piece[-1]) for piece in short]
+    long = [piece for piece in pieces if piece.size >= fewest]
     names = [record.name if len(long) == 1 else f"{record.name}#{k + 1}" for k in range(len(long))]
     segments = tuple(record.select(rows, name) for rows, name in zip(long, names, strict=True))
     return Split(segments, tuple(sorted(events, key=lambda event: event.time)))
 
 
-# An hour is skipped to such a share of the usual interval.
-SAME = 0.1
-# Readings beyond which neighbours are averaged.
-MOST_READINGS = 1 << 16
-# Repeats are of a monitor slower than its archive if half of the readings are, and nearly all come
-# by equal numbers, or what changes, changes by more than so many digits. Runs so much longer than
-# usual are of a monitor that stands.
-EQUAL, DIGITS, STANDS = 0.95, 3.0, 5
-# Readings that a step of a staircase lasts at least, and by how much of a digit steps may differ.
-STAIR, ROUNDING = 3, 1e-6
-
-
-def without_repeats(record: DecayRecord) -> DecayRecord:
-    """Leave out readings that repeat the one before where the monitor is slower than its archive:
-    they are late, and a curve through them lies half a step too high.
+class ClearSteps(NamedTuple):
+    """Readings between clear steps, as their places in the record, and these steps; of each reading
+    whether it may be the first after another step, and the last digit near it.
     """
-    fresh = np.diff(record.current, prepend=np.nan) != 0
-    first = np.flatnonzero(fresh)
-    runs = np.diff(first, append=fresh.size)
-    usual = int(np.median(runs))
-    if not FEWEST <= first.size <= len(record) / 2 or usual < 2:
-        return record
-    change = float(np.median(np.abs(np.diff(record.current[first]))))
-    kept = fresh | np.repeat(runs > STANDS * usual, runs)
-    period = int(np.bincount(runs).argmax())
-    if period > 1 and np.mean(runs % period == 0) > EQUAL:
-        # Two values in a row may be equal by themselves.
-        kept |= (np.arange(fresh.size) - np.repeat(first, runs)) % period == 0
-    elif record.resolution is not None and change <= DIGITS * record.resolution:
-        return record
-    note = (
-        f"{np.sum(~kept)} of {len(record)} readings repeat the one before to the last digit, as of "
-        "a monitor slower than its archive: left out."
-    )
-    return replace(record.select(kept), notes=(*record.notes, note))
+
+    pieces: list[np.ndarray]
+    steps: list[Event]
+    likely: np.ndarray
+    digits: np.ndarray
 
 
-def without_summer_time(record: DecayRecord) -> DecayRecord:
-    """Take out the hour that a local clock skips in spring: between two readings an hour passes
-    besides the usual interval, and the current goes on as if it had not. Refills may hold a beam
-    over an hour that was not recorded: with them nothing is taken out.
+def _clear_steps(record: DecayRecord, kept: np.ndarray) -> ClearSteps:
+    steps, likely, digits = _search(record.time[kept], record.current[kept])
+    ends, within, events = [], set(), []
+    for first, end, rises in steps:
+        if end > first:
+            kind = "ramp" if rises else "loss"
+            events.append(event_of(record, kind, kept[first], kept[end - 1]))
+            within.add(kept[first])
+        else:
+            change = float(np.subtract(*record.current[kept[[first, first - 1]]]))
+            kind = "refill" if rises else "loss"
+            events.append(Event(kind, float(record.time[kept[first]]), 0.0, change))
+        ends += [first, end]
+    pieces = [p for p in np.split(kept, ends) if p.size and p[0] not in within]
+    columns = np.zeros(len(record), bool), np.zeros(len(record), np.float32)
+    for column, values in zip(columns, (likely, digits), strict=True):
+        column[kept] = values
+    noise = noise_of(record.time[kept], record.current[kept])
+    for k, piece in enumerate(pieces):
+        if cut := _ramp(record.current[piece], max(noise, columns[1][piece].max() / 2)):
+            events.append(event_of(record, "ramp", piece[0], piece[cut - 1]))
+            pieces[k] = piece[cut:]
+    return ClearSteps(pieces, events, *columns)
 
-    Examples
-    --------
-    >>> t = np.arange(0.0, 7200.0, 60.0)
-    >>> beam = 100 * np.exp(-t / 36000)
-    >>> print(without_summer_time(DecayRecord(t + np.where(t > 3600, 3600.0, 0.0), beam)))
-    record: 120 readings over 1.98 h, 100 to 82.0096 mA
+
+def _cycles(record: DecayRecord, clear: ClearSteps) -> tuple[list[np.ndarray], list[Event]] | None:
+    """Pieces divided at refills that are too small to be clear, and these; None if refills do not
+    hold the beam, or there are no more of them.
+
+    Parts of less than three readings or a quarter of the usual length, as of spikes, injection
+    ramps and fresh beam, are left out, and the rest is looked at anew.
     """
-    interval = np.diff(record.time)
-    usual = float(np.median(interval))
-    found = np.flatnonzero(np.abs(interval - usual - HOUR) < SAME * usual) + 1
-    if found.size != 1 or not WINDOW <= found[0] <= len(record) - WINDOW:
-        return record
-    after, at = int(found[0]), float(record.time[found[0] - 1])
-    since = np.where(record.time > at, record.time - HOUR, record.time)
-    sides = slice(after - WINDOW, after), slice(after, after + WINDOW)
-    lines = [np.polyfit(since[side] - at, record.current[side], 1) for side in sides]
-    step, noise = abs(lines[1][1] - lines[0][1]), _noise(record, record.time, record.current)
-    refilled = np.max(record.current - np.minimum.accumulate(record.current)) > THRESHOLD * noise
-    if refilled or min(-slope * HOUR for slope, _ in lines) < THRESHOLD * max(step, noise):
-        return record
-    note = (
-        f"The clock skips an hour after {at:.0f} s while the current goes on as before, as local "
-        "times do in spring: the hour was taken out. Give times with their zone."
-    )
-    return replace(record, time=since, notes=(*record.notes, note))
+    whole = clear.pieces
+    rows, number = np.concatenate(whole), np.repeat(np.arange(len(whole)), [*map(len, whole)])
+    guess = clear.likely[rows]
+    for _ in range(2):
+        if rows.size < PLACES:
+            return None
+        begins, level = _steps_by_law(record, rows, number, guess, clear.digits[rows])
+        lengths = np.diff(begins, append=rows.size)
+        short = _is_short(number, begins, lengths)
+        keep, lengths = np.repeat(~short, lengths), lengths[~short]
+        rows, number, level = rows[keep], number[keep], level[keep]
+        if not short.any():
+            break
+        guess = np.zeros(rows.size, bool)
+        guess[np.cumsum(lengths) - lengths] = True
+    parts, owner = _restored(record, whole, rows, number, level, lengths)
+    count = _by_the_clock(np.array([*map(len, parts)]))
+    pieces = [p for part, n in zip(parts, count, strict=True) for p in np.array_split(part, n)]
+    owner, events, levels = np.repeat(owner, count), [], np.full(len(record), np.nan)
+    levels[rows] = level
+    for k in np.flatnonzero(np.diff(owner) == 0) + 1:
+        later, earlier = levels[pieces[k][:NEAR]], levels[pieces[k - 1][-NEAR:]]
+        change = float(np.nan_to_num(np.nanmedian(later) - np.nanmedian(earlier)))
+        kind = "refill" if change > 0 else "loss"
+        events.append(Event(kind, float(record.time[pieces[k][0]]), 0.0, change))
+    cycles = sum(piece.size >= FEWEST_READINGS for piece in pieces)
+    if cycles <= sum(piece.size >= FEWEST for piece in whole):
+        return None
+    found = np.array([event.change for event in events])
+    raised = found.sum() >= RETURNED * np.abs(found).sum()
+    held = _hold([record.current[piece] for piece in pieces], [*clear.steps, *events])
+    return (pieces, [*events, *_left_out(record, whole, pieces)]) if raised and held else None
 
 
-def on_edges(record: DecayRecord) -> DecayRecord:
-    """Take the edges between the digits of a monitor that has less noise than a digit.
+def _left_out(
+    record: DecayRecord, clear: Sequence[np.ndarray], pieces: Sequence[np.ndarray]
+) -> list[Event]:
+    """Readings of the clear pieces that are in none of others."""
+    left = np.zeros(len(record), bool)
+    left[np.concatenate(clear)] = True
+    left[np.concatenate(pieces)] = False
+    return [event_of(record, "short", first, end - 1) for first, end in _runs(left)]
 
-    Parameters
-    ----------
-    record : DecayRecord
-        One decay. One that is no staircase of single digits, or has errors, is given back.
 
-    Returns
-    -------
-    DecayRecord
-        Half a digit between both readings of each step. The readings themselves are off by up to
-        half a digit for as long as a step lasts, as of noise with a memory; the edges are off by
-        what the beam loses between two readings.
-
-    Examples
-    --------
-    >>> t = np.arange(0.0, 3600.0, 10.0)
-    >>> print(on_edges(DecayRecord(t, np.round(100 * np.exp(-t / 36000), 1))))
-    record: 95 readings over 0.989 h, 99.95 to 90.55 mA
+def _restored(
+    record: DecayRecord, clear: Sequence[np.ndarray], rows: np.ndarray, number: np.ndarray,
+    level: np.ndarray, lengths: np.ndarray,
+) -> tuple[list[np.ndarray], list[int]]:  # fmt: skip
+    """Parts, and of which clear piece each is; one that a law of its own explains without the steps
+    in it as well as these do, with one law for all, is whole again. A step costs its size and its
+    place.
     """
-    digit, change = record.resolution, np.diff(record.current)
-    edge = np.flatnonzero(change)
-    if digit is None or record.error is not None or edge.size < FEWEST:
-        return record
-    single = np.abs(change[edge] + digit) < ROUNDING * digit
-    if not single.all() or np.median(np.diff(edge)) < STAIR:
-        return record
-    note = f"Steps of {digit:.3g} mA without noise: the {edge.size} edges between them were fitted."
-    at = record.select(edge)
-    middle = (record.time[edge] + record.time[edge + 1]) / 2
-    return replace(
-        at, time=middle, current=(record.current[edge] + record.current[edge + 1]) / 2,
-        start=None if record.start is None else record.start + float(middle[0]),
-        notes=(*record.notes, note), mean=record.mean_current,
-    )  # fmt: skip
+    begins = np.cumsum(lengths) - lengths
+    off = level - np.repeat(np.add.reduceat(level, begins) / lengths, lengths)
+    first = np.flatnonzero(np.diff(number, prepend=-1))
+    found, owner = [], []
+    for low, high in itertools.pairwise([*first.tolist(), rows.size]):
+        piece, inside = number[low], begins[slice(*np.searchsorted(begins, (low, high)))]
+        parts, every = np.split(rows[low:high], inside[1:] - low), clear[piece]
+        if len(parts) > 1 or high - low < every.size:
+            alone = _levelled(record.time[every], record.current[every], np.zeros(1, int))
+            worse = np.log((alone.var() + TINY) / (np.mean(off[low:high] ** 2) + TINY))
+            if (high - low) * worse < 2 * (len(parts) - 1) * np.log(high - low):
+                parts = [every]
+        found += parts
+        owner += [piece] * len(parts)
+    return found, owner
 
 
-def thinned(record: DecayRecord) -> DecayRecord:
-    """Average neighbours of a long decay in equal blocks, up to 65536.
-
-    Parameters
-    ----------
-    record : DecayRecord
-        One decay: means across a refill are of neither side. A short one is given back.
-
-    Returns
-    -------
-    DecayRecord
-        Means of time, current and conditions of each block; errors are those of a mean of
-        independent readings. Single readings far off, as of spikes and dropouts, do not enter.
-        `notes` says how many were averaged.
-
-    Notes
-    -----
-    Over a block of length d a decay of lifetime T bends by (d/T)²/24 of the current, 1e-9 for the
-    8 s of a week's blocks at 15 h. Noise of a memory shorter than a block is white in the means.
-
-    Examples
-    --------
-    >>> t = np.arange(200_000.0)
-    >>> thinned(DecayRecord(t, 500 - t / 1e4)).notes
-    ('The means of 4 readings each were fitted, of 200000 in all.',)
+def _is_short(number: np.ndarray, begins: np.ndarray, lengths: np.ndarray) -> np.ndarray:
+    """Which parts are too short, of the clear pieces with these numbers: not one of eight readings,
+    and not all parts of one.
     """
-    size = -(-len(record) // MOST_READINGS)
-    if size == 1:
-        return record
-    first = np.arange(0, len(record), size)
-    count = np.diff(first, append=len(record))
-    whole = len(record) // size * size
-    # In parts: all at once takes gigabytes.
-    blocks = np.array_split(record.current[:whole].reshape(-1, size), -(-whole // STRETCH))
-    off = [np.abs(part - np.median(part, axis=1, keepdims=True)) for part in blocks]
-    spread = [1.4826 * np.median(part, axis=1) for part in off]
-    kept = np.ones(len(record), bool)
-    limit = THRESHOLD * max(float(np.median(np.concatenate(spread))), record.resolution or 0.0)
-    pairs = zip(off, spread, strict=True)
-    within = [part <= np.maximum(THRESHOLD * own, limit)[:, None] for part, own in pairs]
-    kept[:whole] = np.concatenate(within).ravel()
-    count = np.maximum(np.add.reduceat(kept.astype(int), first), 1)
+    piece, sizes = number[begins], np.bincount(number)
+    usual = np.median(np.repeat(lengths, lengths))  # of most readings
+    short = lengths < max(FEWEST_READINGS, SHORT * usual)
+    lost = np.bincount(piece, weights=~short) == 0
+    return short & ~(lost & (sizes >= FEWEST))[piece]
 
-    def mean(values: np.ndarray) -> np.ndarray:
-        return np.add.reduceat(values * kept, first) / count
 
-    error = record.error
-    conditions = {name: mean(values) for name, values in record.conditions.given.items()}
-    note = f"The means of {size} readings each were fitted, of {len(record)} in all."
-    time = mean(record.time)
-    return replace(
-        record, time=time, current=mean(record.current),
-        error=None if error is None else np.sqrt(mean(error**2) / count),
-        start=None if record.start is None else record.start + float(time[0]),
-        conditions=Conditions(**conditions), notes=(*record.notes, note),
-    )  # fmt: skip
+def _by_the_clock(lengths: np.ndarray) -> np.ndarray:
+    """Count the cycles in each piece, where most readings are in those of one usual length: a
+    refill may be too small to be found. One that is missed bends a long piece, which tells most.
+    """
+    usual = np.median(np.repeat(lengths, lengths))
+    regular = np.abs(lengths - usual) <= max(REGULAR * usual, 1.0)
+    if lengths @ regular < 0.5 * lengths.sum():
+        return np.ones(lengths.size, int)
+    return np.maximum(np.round(lengths / usual).astype(int), 1)
+
+
+def is_refilled(split: Split) -> bool:
+    """Tell three or more cycles held by refills from a decay with odd steps.
+
+    Refills give back at least half of what the cycles lose.
+    """
+    return _hold([cycle.current for cycle in split.segments], split.events)
+
+
+def _hold(pieces: Sequence[np.ndarray], steps: Sequence[Event]) -> bool:
+    refills = [event.change for event in steps if event.kind in ("refill", "ramp")]
+    lost = sum(float(current[0] - current[-1]) for current in pieces)
+    many = min(len(pieces), len(refills) + 1) >= FEWEST_CYCLES
+    return many and sum(refills) > RETURNED * lost > 0
+
+
+def _steps_by_law(
+    record: DecayRecord, rows: np.ndarray, number: np.ndarray, guess: np.ndarray,
+    digits: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    """Places at which the level steps, with 0, and the level: the current with the loss put back.
+    Some of them are known, where the number of the piece changes.
+    """
+
+    def near(*columns: np.ndarray) -> np.ndarray:
+        time, current, edge, maybe, grain = columns
+        clear, found = np.flatnonzero(edge[1:]) + 1, np.zeros(time.size, bool)
+        both = np.flatnonzero((edge | maybe)[1:]) + 1
+        steps, level, firm = _settled(time, current, clear, both, grain)
+        found[steps[firm]] = True
+        lost = np.diff(level - current, prepend=0.0)
+        return np.column_stack([found, lost]).astype(np.float32)
+
+    edge, current = np.diff(number, prepend=number[0]) != 0, record.current[rows]
+    columns = record.time[rows], current, edge, guess, digits
+    found, lost = by_stretches(near, *columns, stretch=ONE_LAW, overlap=BESIDE).T
+    return np.append(0, np.flatnonzero(found)), current + np.cumsum(lost, dtype=float)
+
+
+def _settled(
+    time: np.ndarray, current: np.ndarray, clear: np.ndarray, guess: np.ndarray, grain: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Steps besides some, when the law that they leave shows no others; the level, and which of
+    the steps are clear or what two levels differ by beside them.
+    """
+    interval, steps = np.diff(time), guess
+    gaps = np.flatnonzero(interval > GAP * np.median(interval)) + 1
+    for _ in range(ROUNDS):
+        # A refill in a gap would be a part of the law.
+        level = _levelled(time, current, np.union1d(np.append(0, steps), gaps))
+        total = np.append(0.0, np.cumsum(level))
+        change = np.delete(np.diff(level), steps - 1)
+        change = change if change.size >= PLACES else np.diff(level)
+        variance = _mean_variance(change, min(level.size, LONG))
+        more = _divided(total, clear, variance, grain)
+        more = _placed(total, more, clear)
+        if np.array_equal(more, steps):
+            break
+        steps = more
+    ends = np.concatenate([[0], steps, [level.size]])
+    lengths = np.diff(ends)
+    scatter = np.sqrt(variance(lengths[1:]) + variance(lengths[:-1]))
+    firm = np.abs(np.diff(np.diff(total[ends]) / lengths)) > LIKELY * scatter
+    return steps, level, firm | np.isin(steps, clear)
+
+
+def _levelled(time: np.ndarray, current: np.ndarray, first: np.ndarray) -> np.ndarray:
+    """Currents with the loss put back, by one a and one b for all pieces; by one number where two
+    are not likelier.
+    """
+    columns = np.array([current, current**2])
+    parts = 0.5 * np.diff(time) * (columns[:, :-1] + columns[:, 1:])
+    columns = np.vstack([np.zeros(2), np.cumsum(parts, axis=1).T])
+    lengths = np.diff(first, append=time.size)
+    both = np.column_stack([columns, current])
+    both -= np.repeat(np.add.reduceat(both, first) / lengths[:, None], lengths, axis=0)
+    scale = np.linalg.norm(both[:, :2], axis=0) + TINY
+    left, known = both[:, 2], both[:, :2] / scale
+    squares, ways = np.linalg.eigh(known.T @ known)
+    numbers = ways.T @ (known.T @ left) / (squares + TINY)
+    rest = left @ left - squares[1] * numbers[1] ** 2
+    fewer = max(rest - squares[0] * numbers[0] ** 2, EXACT * rest) + TINY
+    if time.size * np.log((rest + TINY) / fewer) < 2 * np.log(time.size):
+        numbers[0] = 0.0
+    return current - columns @ (ways @ numbers / scale)
+
+
+def _divided(
+    total: np.ndarray, steps: np.ndarray, variance: Callable[[np.ndarray], np.ndarray],
+    grain: np.ndarray,
+) -> np.ndarray:  # fmt: skip
+    """Divide pieces in two as long as two levels explain them better than one."""
+    ends = [0, *steps.tolist(), total.size - 1]
+    waiting, found = list(itertools.pairwise(ends)), steps.tolist()
+    while waiting:
+        low, high = waiting.pop()
+        if high - low < 2:
+            continue
+        at = np.arange(low + 1, high)
+        step = (total[high] - total[at]) / (high - at) - (total[at] - total[low]) / (at - low)
+        scatter = np.sqrt(variance(at - low) + variance(high - at))
+        best = int(np.argmax(np.abs(step) / scatter))
+        least = DIGITS * grain[low:high].max()
+        if abs(step[best]) > max(LIKELY * scatter[best], least):
+            found.append(int(at[best]))
+            waiting += [(low, int(at[best])), (int(at[best]), high)]
+    return np.sort(np.array(found, int))
+
+
+def _mean_variance(change: np.ndarray, longest: int) -> Callable[[np.ndarray], np.ndarray]:
+    """Variance of the mean of so many readings in autoregressive noise, by its differences.
+
+    Those over two intervals have 1 + c times the variance of those over one, c being the
+    correlation of neighbours; medians, for the steps among them.
+    """
+    change = change - np.median(change)  # what the law does not put back
+    one, two = (np.median(np.abs(values)) for values in (change, change[1:] + change[:-1]))
+    kept = float(np.clip((two / max(one, EXACT * two, TINY)) ** 2 - 1, 0.0, 0.99))
+    many = np.arange(1, longest + 1)
+    # The sum of many readings: n + 2 sum (n - k) c^k.
+    sums = many + 2 * (kept * many / (1 - kept) - kept * (1 - kept**many) / (1 - kept) ** 2)
+    table = (1.4826 * one) ** 2 / 2 / (1 - kept) * sums / many**2 + TINY
+    return lambda count: table[np.minimum(count, longest) - 1]
+
+
+def _placed(total: np.ndarray, steps: np.ndarray, clear: np.ndarray) -> np.ndarray:
+    """Each step that is not clear where two levels between its neighbours explain most."""
+    ends = np.concatenate([[0], steps, [total.size - 1]])
+    for k in np.flatnonzero(~np.isin(steps, clear)) + 1:
+        low, high = max(ends[k - 1], ends[k] - WIDEST), min(ends[k + 1], ends[k] + WIDEST)
+        at = np.arange(max(low + 1, ends[k] - NEAR), min(high, ends[k] + NEAR + 1))
+        before = (total[at] - total[low]) / (at - low)
+        after = (total[high] - total[at]) / (high - at)
+        ends[k] = at[np.argmax((before - after) ** 2 * (at - low) * (high - at))]
+    return np.unique(ends[1:-1])

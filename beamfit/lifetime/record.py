@@ -89,6 +89,8 @@ def _first(bad: np.ndarray) -> int | None:
 
 def _unit_change(current: np.ndarray) -> int | None:
     """Row at which the unit switches between A and mA: by 1000, and the decay goes on there."""
+    if np.max(current) < 977 * np.min(current):
+        return None
     with np.errstate(divide="ignore", invalid="ignore"):
         decades = current[1:] / current[:-1]
         np.abs(np.log10(decades, out=decades), out=decades)

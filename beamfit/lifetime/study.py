@@ -13,27 +13,25 @@ import numpy as np
 
 from beamfit.answer import answer, json_of, shown
 from beamfit.errors import InputError, expect
-from beamfit.lifetime.cycles import (
-    FEWEST_CYCLES,
-    alike,
-    cut_at_refills,
-    is_refilled,
-    joined,
-)
+from beamfit.lifetime.cycles import alike, joined
 from beamfit.lifetime.evidence import SEPARABLE
 from beamfit.lifetime.fit import FEWEST as FEWEST_FITTED
 from beamfit.lifetime.fit import DecayFit, bare, fit_cycles, fit_decay, fit_pieces
 from beamfit.lifetime.free_law import DRIFT, Law
 from beamfit.lifetime.mechanisms import MECHANISMS, Losses, loss_coefficients
 from beamfit.lifetime.pieces import (
-    FEWEST,
+    FEWEST_CYCLES,
     Event,
     Split,
     beam_readings,
     event_of,
+    is_refilled,
+    split_record,
+)
+from beamfit.lifetime.readings import (
+    FEWEST,
     noise_of,
     on_edges,
-    split_record,
     thinned,
     without_repeats,
     without_summer_time,
@@ -254,16 +252,19 @@ def budget(record: DecayRecord, machine: Machine) -> Budget:
     return Budget(operation, parts, current, length, emittances, filed if contradicted else None)
 
 
-def standing_alone(cycles: Sequence[DecayRecord], fit: DecayFit) -> list[DecayRecord]:
+def standing_alone(
+    cycles: Sequence[DecayRecord], together: DecayRecord, fit: DecayFit
+) -> list[DecayRecord]:
     """Cycles that by themselves would separate a and b, by the bend of their decay and the noise
-    that all cycles show, or its neighbouring readings, where one law does not hold for all.
+    that all cycles show together, or neighbouring readings, where one law does not hold for all.
     """
     # Of very many readings the fit has means of neighbours.
-    mean, noise = np.median(np.diff(fit.readings.time)), fit.rms_residual * fit.inflation
+    intervals = (np.median(np.diff(record.time)) for record in (fit.readings, together))
+    averaged = math.sqrt(max(np.divide(*intervals), 1.0))
+    own = OWN * noise_of(together.time, together.current)
+    own = min(fit.rms_residual * fit.inflation * averaged, own)
 
     def separates(cycle: DecayRecord) -> bool:
-        averaged = math.sqrt(max(mean / np.median(np.diff(cycle.time)), 1.0))
-        own = min(noise * averaged, OWN * noise_of(cycle.time, cycle.current))
         loss = math.log(cycle.current[0] / cycle.current[-1])
         # The parabola t²/2 scatters about its line by its length squared over 24 sqrt(5).
         bend = float(cycle.current.mean()) * loss**2 / 24 * math.sqrt(len(cycle) / 5)
@@ -418,43 +419,34 @@ def _pooled(
             continue
         called = name if many == 1 else f"{name}@{len(pooled) + 1}"
         fit = fit_cycles(group, called, law)
-        own = standing_alone(group, fit)
+        segment = joined(group, called)
+        own = standing_alone(group, segment, fit)
         alone += own
         known = fit.status not in REFUTED and fit.lifetime_mean.error is not None
         if not known and len(own) == len(group):  # fills of no one law
             continue
-        segment = joined(group, called)
         pooled.append(Decay.of(segment, segment.start, fit, machine))
     return pooled, alone
 
 
-def _refilled(record: DecayRecord) -> Split:
-    """The cycles of what is held by refills in a record, of all its settings, and the decays of
-    the rest; no cycle if nothing is.
-    """
-    sections = at_settings(record)
-    found = [cut_at_refills(section) for section in sections]
-    if not any(map(is_refilled, found)):
-        return Split((), ())
-    placed = [
-        event._replace(time=event.time + part.start)
-        for split, part in zip(found, sections, strict=True)
-        for event in split.events
-    ]
-    return Split(tuple(c for split in found for c in split.segments), tuple(placed))
-
-
-def _decays(record: DecayRecord) -> tuple[list[DecayRecord], tuple[Event, ...]]:
-    """Clean decays at constant settings, and the events."""
+def _decays(record: DecayRecord) -> tuple[Split, bool]:
+    """Clean decays at constant settings, the events between them, and if refills hold the beam."""
     if len(record) < FEWEST:
-        return [record], ()
-    split = split_record(record)
-    pieces = [piece for segment in split.segments for piece in at_settings(segment)]
+        return Split((record,), ()), False
+    sections = at_settings(record)
+    splits = [split_record(section) for section in sections]
+    placed = zip(splits, sections, strict=True)
+    events = [one._replace(time=one.time + s.start) for split, s in placed for one in split.events]
+    pieces = [piece for split in splits for piece in split.segments]
+    refilled = any(map(is_refilled, splits))
+    if len(sections) != 1 and not refilled:  # a fill may begin where a setting is changed
+        pieces, events = split_record(record)
+        pieces = [part for piece in pieces for part in at_settings(piece)]
     if pieces:
-        return pieces, split.events
-    kinds = {event.kind for event in split.events}
+        return Split(tuple(pieces), tuple(events)), refilled
+    kinds = {event.kind for event in events}
     if kinds == {"spike"} and (kept := beam_readings(record)[0]).size >= FEWEST_FITTED:
-        return [record.select(kept)], split.events
+        return Split((record.select(kept),), tuple(events)), False
     moving = [name for name, steps in _steps(record).items() if steps.any()]
     if moving or "short" not in kinds:
         changes = f"changes of {', '.join(moving)} by more than {100 * CHANGED:g} %"
@@ -462,7 +454,13 @@ def _decays(record: DecayRecord) -> tuple[list[DecayRecord], tuple[Event, ...]]:
         expected = f"at least {FEWEST} readings in a row of a stored beam"
         expected += "; leave out a setting that only scatters with --ignore" if moving else ""
         raise InputError(f"no decay between {found}", expected, record.name, column="current")
-    return [], split.events
+    return Split((), tuple(events)), False
+
+
+def _rise_between_steps(split: Split) -> bool:
+    """True where the current rises between losses: refills that the record does not resolve."""
+    risen = sum(event.change for event in split.events if event.kind == "short")
+    return risen > sum(float(piece.current[0] - piece.current[-1]) for piece in split.segments)
 
 
 def _fitted(
@@ -557,11 +555,13 @@ def study_record(
     law = Law(law) if machine is None else Law.constant
     # Segments move `start` with them: counted from zero it is their place in the record.
     placed = replace(record, start=0.0)
-    cycles, events = _refilled(placed)
-    pooled, pieces = _pooled(cycles, record.name, machine, law)
-    del cycles  # of 1e7 readings 160 MB
-    if not pooled:
-        pieces, events = _decays(placed)
+    split, refilled = _decays(placed)
+    events, pieces, pooled = split.events, split.segments, []
+    if refilled:
+        pooled, pieces = _pooled(pieces, record.name, machine, law)
+    elif _rise_between_steps(split):
+        pieces = ()
+    del split  # of 1e7 readings 160 MB
     # A record that does nothing but rise is an error; a slow refill within one is not.
     only = len(pieces) == 1 and not pooled
     found, more = _parts(pieces[0], law, False) if only else _fitted(pieces, law, bool(pooled))

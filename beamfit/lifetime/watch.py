@@ -16,12 +16,12 @@ from beamfit.answer import json_of
 from beamfit.errors import InputError
 from beamfit.lifetime import alarm
 from beamfit.lifetime.course import BEST_MONITOR, normalised, reference_of
-from beamfit.lifetime.cycles import alike, cut_at_refills, joined
+from beamfit.lifetime.cycles import alike, joined
 from beamfit.lifetime.evidence import UNITS
 from beamfit.lifetime.fit import DecayFit, bare, fit_decay, fit_pieces
 from beamfit.lifetime.free_law import Law
 from beamfit.lifetime.mechanisms import added, loss_coefficients, terms_of
-from beamfit.lifetime.pieces import DROPOUT, FEWEST
+from beamfit.lifetime.pieces import DROPOUT, FEWEST, split_record
 from beamfit.lifetime.record import PLAUSIBLE, Conditions, DecayRecord
 from beamfit.lifetime.study import (
     CHANGED,
@@ -164,7 +164,7 @@ def fit_window(rows: Sequence[WindowRow], name: str, law: Law = Law.free) -> Win
         decay
         for piece in _pieces(rows, name)
         for section in at_settings(piece)
-        for decay in cut_at_refills(section).segments
+        for decay in split_record(section).segments
     ]
     if not decays:
         return Window(None, None, 0, f"fewer than {FEWEST} readings in a row of a stored beam")

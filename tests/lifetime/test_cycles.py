@@ -7,10 +7,11 @@ from scipy.signal import lfilter
 from scipy.stats import binom
 
 from beamfit.errors import InputError
-from beamfit.lifetime.cycles import averaged, find_cycles, is_refilled
+from beamfit.lifetime.cycles import averaged
 from beamfit.lifetime.expansion import solved
 from beamfit.lifetime.fit import fit_cycles
-from beamfit.lifetime.pieces import thinned
+from beamfit.lifetime.pieces import is_refilled, split_record
+from beamfit.lifetime.readings import thinned
 from beamfit.lifetime.record import Conditions, DecayRecord
 from beamfit.lifetime.study import study_record
 from beamfit.noise.correlated import whitened_by_each
@@ -150,7 +151,7 @@ def test_three_fills_of_eight_hours_have_one_a_and_one_b():
 @pytest.mark.parametrize(("noise", "step"), [(0.8, 2.0), (0.25, 10.0), (0.02, 60.0)])
 def test_steps_of_a_few_standard_deviations_are_found(noise, step):
     time, current, number = top_up(noise, 2, step=step, hours=5.0)
-    split = find_cycles(DecayRecord(time, current))
+    split = split_record(DecayRecord(time, current))
     assert is_refilled(split)
     refills = [event for event in split.events if event.kind == "refill"]
     assert len(refills) == number[-1]
@@ -347,8 +348,8 @@ def test_one_decay_is_no_cycles_whatever_its_noise():
     for seed, memory in enumerate([0.0, 0.5, 0.9, 0.97] * 3):
         noise = lfilter([1], [1, -memory], np.random.default_rng(seed).normal(size=time.size))
         current = 500 / (1 + time / 36000) + 10.0 ** (seed % 4 - 3) * noise
-        assert not is_refilled(find_cycles(DecayRecord(time, current)))
-        assert not is_refilled(find_cycles(DecayRecord(time, np.round(current, 1))))
+        assert not is_refilled(split_record(DecayRecord(time, current)))
+        assert not is_refilled(split_record(DecayRecord(time, np.round(current, 1))))
 
 
 def test_cycles_at_two_settings_have_two_answers():

@@ -8,7 +8,6 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from beamfit.errors import InputError
-from beamfit.lifetime.cycles import find_cycles
 from beamfit.lifetime.expansion import Pieces, solved
 from beamfit.lifetime.fit import fit_cycles, fit_decay, fit_decays
 from beamfit.lifetime.free_law import (
@@ -22,6 +21,7 @@ from beamfit.lifetime.free_law import (
     quantiles,
 )
 from beamfit.lifetime.lifetime_table import fit_lifetimes
+from beamfit.lifetime.pieces import split_record
 from beamfit.lifetime.record import Conditions, DecayRecord, LifetimeTable
 from beamfit.lifetime.study import study_record
 from tests.simulations import simulations
@@ -255,10 +255,10 @@ def test_long_top_up_is_cut_before_it_is_averaged():
 
 def test_stretches_find_the_steps_of_the_whole(monkeypatch):
     one = sawtooth(10.0, 6000, 0.02)
-    whole = [event.time for event in find_cycles(one).events if event.kind == "refill"]
-    monkeypatch.setattr("beamfit.lifetime.cycles.STRETCH", 1024)
-    monkeypatch.setattr("beamfit.lifetime.cycles.OVERLAP", 256)
-    parts = [event.time for event in find_cycles(one).events if event.kind == "refill"]
+    whole = [event.time for event in split_record(one).events if event.kind == "refill"]
+    monkeypatch.setattr("beamfit.lifetime.pieces.ONE_LAW", 1024)
+    monkeypatch.setattr("beamfit.lifetime.pieces.BESIDE", 256)
+    parts = [event.time for event in split_record(one).events if event.kind == "refill"]
     assert len(set(whole) ^ set(parts)) <= 0.02 * len(whole)
 
 

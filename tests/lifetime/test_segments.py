@@ -4,7 +4,8 @@ from scipy.signal import lfilter
 
 from beamfit.errors import InputError
 from beamfit.lifetime.fit import fit_decays
-from beamfit.lifetime.pieces import noise_of, split_record
+from beamfit.lifetime.pieces import split_record
+from beamfit.lifetime.readings import noise_of
 from beamfit.lifetime.record import Conditions, DecayRecord
 from beamfit.lifetime.study import study_record
 
@@ -409,3 +410,28 @@ def test_readings_between_overlapping_steps_are_of_neither_side():
     for part in split.segments:
         slope = np.polyfit(part.time, np.log(part.current), 1)[0]
         assert slope == pytest.approx(-1 / 36000, rel=1e-3)
+
+
+def test_digits_of_two_detectors_are_no_steps():
+    """SIMULATED: one shows the upper half of three fills to 0.1 mA, the other to 1 µA."""
+    beam = 300 * np.exp(-(10.0 * np.arange(1200) % 4000) / 36000)
+    beam += 0.01 * np.random.default_rng(1).normal(size=beam.size)
+    shown = np.where(beam > np.median(beam), np.round(beam, 1), np.round(beam, 3))
+    split = split_record(DecayRecord(10.0 * np.arange(1200), shown))
+    assert [len(part) for part in split.segments] == [400] * 3
+    assert kinds(split) == ["refill"] * 2
+
+
+def test_top_up_with_a_gap_dropouts_and_spikes_is_cut_at_its_refills():
+    """SIMULATED: cycles of 40 readings; the refills of 5 h are within a gap."""
+    rng, time = np.random.default_rng(2), 5.0 * np.arange(4000)
+    beam = 300 * np.exp(-(time % 200) / 36000) + 0.01 * rng.normal(size=time.size)
+    for first in (330, 1290, 3470):
+        beam[first : first + 10] = 0.0
+    beam[[555, 556, 2222, 3010]] *= 1.01
+    time[2025:] += 5 * 3600.0
+    study = study_record(DecayRecord(time, beam))
+    [pooled] = study.pooled
+    assert abs(pooled.fit.first.size - 101) <= 1
+    assert abs(pooled.fit.lifetime_mean.value - 10) < 3 * pooled.fit.lifetime_mean.error < 0.1
+    assert {"gap", "dropout", "spike"} <= set(kinds(study))
