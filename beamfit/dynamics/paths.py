@@ -141,7 +141,7 @@ def latest(runs: Sequence[Run]) -> int:
 
 
 def heard(run: Run, output: str, delay: float) -> np.ndarray:
-    """Rows with a reading that hears an input of the record: nobody knows what it was before."""
+    """Rows with a reading that hears an input of the record: others hear what nobody knows."""
     rows = np.arange(len(run))
     since = (rows >= delay) & (rows < len(run) + delay)
     return np.flatnonzero(np.isfinite(run.outputs[output]) & since)
@@ -169,8 +169,8 @@ def undriven(
     found, measured, first = [], [], []
     for i, run in enumerate(runs):
         read = heard(run, output, delay)[:most]
-        if not read.size:
-            said = f"no reading of {output} that a delay of {delay:g} samples lets hear an input"
+        if read.size < 2:
+            said = f"{read.size} readings of {output} after a delay of {delay:g} samples"
             raise run.unusable(said, "a longer run")
         since = min(int(rows[0]) for n in run.outputs if (rows := heard(run, n, delay)).size)
         time = run.time[since : None if most is None else read[-1] + 1]

@@ -6,7 +6,7 @@ import pytest
 from beamfit.dynamics.fit import identify
 from beamfit.dynamics.paths import heard, moving
 from beamfit.dynamics.record import Run, Way, rows_of
-from beamfit.errors import Status
+from beamfit.errors import InputError, Status
 
 TAU, GAIN = 4.0, 2.0
 
@@ -113,3 +113,13 @@ def test_ways_between_samples_are_lines_and_sines():
     run = Run(t, {"u": np.sin(w * t)}, {"y": t})
     rows = rows_of(run, Way(smooth=("u",)), 4)[:, 0]
     assert rows[20:220] == pytest.approx(np.sin(w * middles)[20:220], abs=2e-3)
+
+
+def test_a_held_back_run_shorter_than_the_delay_is_named():
+    t, u, y = held(12.0, np.random.default_rng(4))
+    short = Run(t[:12], {"valve": u[:12]}, {"level": y[:12]}, "friday")
+    with pytest.raises(InputError) as found:
+        identify(Run(t, {"valve": u}, {"level": y}), delay=12, held=[short])
+    assert str(found.value) == (
+        "friday: 0 readings of level after a delay of 12 samples; expected a longer run"
+    )
