@@ -24,7 +24,7 @@ from beamfit.dynamics.checks import RunSlopes, slow_paths
 from beamfit.dynamics.input_laws import STATIC, InputLaw, laws_between, moved
 from beamfit.dynamics.model import Driven, PreparedOutput, filled, predicted
 from beamfit.dynamics.paths import Path, Paths, Undriven, handed_on, undriven
-from beamfit.dynamics.record import PARTS, Run, Way
+from beamfit.dynamics.record import Run, Way
 from beamfit.dynamics.search import Begun, noises_of
 from beamfit.greybox import tree
 from beamfit.greybox.problem import with_slope
@@ -45,8 +45,6 @@ VAST = 1e100
 # Gauss-Newton rounds of all, and of the `MANY` that are likeliest then; every how many-th noise of
 # the grid the first one looks at, and how many the others.
 FIRST, MANY, ROUNDS, SPREAD, FEW = 2, 128, 3, 3, 4
-# Standard deviation of a delay in its part of a sample, in samples.
-WIDTH = 1 / (PARTS * np.sqrt(12))
 # Shorter delays that a law may stand for.
 LATE = 3
 # Alternatives that are fitted at once: one program is compiled for all.
@@ -252,8 +250,8 @@ class _Weighed(NamedTuple):
 
     def late(self, about: float) -> tuple[float, float]:
         """Standard deviation of the delay about one, and the probability that it is below zero."""
-        delays = np.array([trial.path.delay for trial in self.trials])
-        width = np.where(delays % 1.0, WIDTH, 0.0)
+        paths = [trial.path for trial in self.trials]
+        delays, width = np.array([(path.delay, path.width) for path in paths]).T
         away = delays + width * self.numbers[:, -1] - about
         squares = away**2 + width**2 * self.spread[:, -1, -1]
         return float(np.sqrt(self.chance @ squares)), float(self.chance @ (delays < 0))
@@ -342,12 +340,11 @@ class Comparison(NamedTuple):
         trials, begin = trials + trials[-1:] * more, np.pad(begin, ((0, more), (0, 0)), mode="edge")
         for k in range(0, len(trials), BATCH):
             some = trials[k : k + BATCH]
-            inputs, part = handed_on(
-                self.runs, self.seen, self.parts, [trial.path for trial in some]
-            )
+            paths = [trial.path for trial in some]
+            inputs, part = handed_on(self.runs, self.seen, self.parts, paths)
             terms = [np.stack([0.0 * each[0] if t.term is None else each[t.term] for t in some])
                      for each in self.terms]  # fmt: skip
-            width = np.array([self.parts * WIDTH * bool(t.path.delay % 1.0) for t in some])
+            width = self.parts * np.array([path.width for path in paths])
             yield _Batch(self, inputs, (part, width), terms), begin[k : k + BATCH]
 
 

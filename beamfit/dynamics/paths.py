@@ -38,6 +38,11 @@ class Path(NamedTuple):
     way: Way
     delay: float
 
+    @property
+    def width(self) -> float:
+        """Standard deviation of the delay in its part of a sample, in samples; 0 of a whole one."""
+        return 1 / (PARTS * np.sqrt(12)) if self.delay % 1.0 else 0.0
+
 
 class Paths(NamedTuple):
     """The paths without a law that a record may have.

@@ -41,7 +41,7 @@ from beamfit.noise.memory import BESIDE, CorrelatedNoise, filtered, innovations,
 # Time constants of the grid, as near as a damping of 0.2 tells them apart, and dampings of a second
 # order.
 LAGS, DAMPINGS = 32, (0.2, 0.6, 1.0, 2.0)
-# Gain in log likelihood that a longer delay needs over a shorter one, a path over that of a fit.
+# Gain in log likelihood that a longer delay needs over a shorter one.
 BETTER = 5.0
 # Paths that are looked at together: one program is compiled for all.
 BATCH = 16

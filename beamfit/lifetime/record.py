@@ -89,12 +89,13 @@ def _first(bad: np.ndarray) -> int | None:
 
 def _unit_change(current: np.ndarray) -> int | None:
     """Row at which the unit switches between A and mA: by 1000, and the decay goes on there."""
-    if np.max(current) < 977 * np.min(current):
+    low, high = 2.99, 3.01
+    if np.max(current) < 10**low * np.min(current):
         return None
     with np.errstate(divide="ignore", invalid="ignore"):
         decades = current[1:] / current[:-1]
         np.abs(np.log10(decades, out=decades), out=decades)
-    for row in np.flatnonzero((decades > 2.99) & (decades < 3.01)) + 1:
+    for row in np.flatnonzero((decades > low) & (decades < high)) + 1:
         before, after = np.median(current[max(row - 3, 0) : row]), current[row : row + 3]
         # The noise after a dump is by chance a thousandth once, not again and again.
         with np.errstate(divide="ignore", invalid="ignore"):
