@@ -430,6 +430,7 @@ def test_cycles_of_equal_readings_show_no_decay(step):
 @simulations(4, 40)
 def test_the_first_readings_of_fills_whose_fresh_beam_decays_faster_are_left_out(count):
     """By .1 to 1 % for 50 to 200 s: of five fills single readings did not show the tail."""
+    held = []
     for k in range(count):
         rng = np.random.default_rng([5, k])
         since = [10.0 * np.arange(n) for n in rng.integers(400, 900, 5)]
@@ -442,6 +443,7 @@ def test_the_first_readings_of_fills_whose_fresh_beam_decays_faster_are_left_out
             start += t[-1] + 10.0
         fit = fit_cycles(cycles)
         low, high = fit.lifetime_mean.interval_95
-        assert low <= LIFETIME / 3600 <= high
+        held.append(low <= LIFETIME / 3600 <= high)
         assert high - low < 0.03 * LIFETIME / 3600
         assert "fresh beam decays faster" in fit.message
+    assert np.mean(held) >= 1 - widened(0.08, 40, count)
