@@ -166,9 +166,8 @@ OUTLIER, SHARE = 7.0, 0.2
 EDGE, WITHIN = 2.5, "they lie within injections"
 # Neighbours that tell where a cycle, or a reading at the edge of one, should lie.
 NEXT = 9
-# Time constants of fresh beam that are looked for, and in how many of them it has settled to less
-# than a hundredth.
-FRESH, SETTLED = 12, 5.0
+# Time constants of fresh beam that are looked for, and the part of its error to which it has settled.
+FRESH, SETTLED = 12, 0.1
 
 
 def averaged(cycles: Sequence[DecayRecord]) -> Pieces:
@@ -236,7 +235,7 @@ def _fresh(about: Expansion, most: int) -> int:
     """
     first, lengths = about.pieces.first, about.pieces.lengths
     place = np.arange(about.pieces.time.size) - np.repeat(first, lengths)
-    times = np.geomspace(1.0, max(most / SETTLED, 1.0), FRESH)
+    times = np.geomspace(1.0, max(most / math.log(EDGE / SETTLED), 1.0), FRESH)
     columns = about.beside(np.exp(-place[:, None] / times) * about.pieces.weight[:, None])
     law = np.linalg.qr(about.left[:, about.columns()])[0]
     columns -= law @ (law.T @ columns)
@@ -247,8 +246,9 @@ def _fresh(about: Expansion, most: int) -> int:
     error = np.sqrt(np.sum(off**2, axis=0) * cycles / (cycles - 1))
     excess = above.sum(axis=0) / np.maximum(error, 1e-300)
     best = int(np.argmax(excess))
-    clear = stdtr(cycles - 1, -excess[best]) < ndtr(-EDGE)
-    return min(math.ceil(SETTLED * times[best]), most) if clear else 0
+    if not stdtr(cycles - 1, -excess[best]) < ndtr(-EDGE):
+        return 0
+    return min(math.ceil(math.log(excess[best] / SETTLED) * times[best]), most)
 
 
 def _trimmed(about: Expansion) -> tuple[Expansion, list[str]]:
