@@ -281,12 +281,11 @@ def learnt(
 
 
 def _usual(window: Window, machine: Machine | None) -> alarm.Reference | None:
-    """The loss of a fit that knows a and b if they are constant, which the readings do not refute,
-    or the loss rate and a ring their ratio.
+    """The loss of a fit that knows a and b if they are constant, or the loss rate and a ring their
+    ratio.
     """
     fit, ring = window.fit, None
-    refuted = fit.constant_a is not None and fit.constant_a.status is Status.poor_fit
-    if refuted or fit.status not in (Status.converged, Status.unidentified):
+    if fit.status not in (Status.converged, Status.unidentified):
         return None
     known = tuple(fit.if_constant(name) for name in "ab")
     if not all(one.determined for one in known):
@@ -457,7 +456,7 @@ class State(NamedTuple):
     def said(self) -> str:
         """The alarm in words."""
         if self.alarm is None:
-            return "no usual loss yet: it needs a fit that tells a from b, or a ring"
+            return "no usual loss yet: it needs a fit of constant a and b that tells them, or a ring"
         if self.alarm.raised is not None:
             raised = alarm.when(self.alarm.raised - self.shift, True)
             return f"the loss moved, raised {raised}; what moved is told from the readings since"

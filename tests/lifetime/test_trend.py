@@ -52,6 +52,18 @@ def test_a_change_is_found_dated_and_named(leaking):
     assert json.loads(json.dumps(leaking.to_json()))["alarms"][0]["a"] is None
 
 
+def test_decays_that_refute_a_constant_a_are_no_reference():
+    """SIMULATED: a as I^-1/3, of which constant a and b made "b moved by -286 ± 28 %"."""
+    time, beam, beams = np.arange(0.0, 6 * FILL, STEP), 500.0, []
+    for now in time:
+        beam = 500.0 if now % FILL == 0 else beam_after(beam, STEP, A * (450 / beam) ** (1 / 3))
+        beams.append(beam)
+    read = np.array(beams) + 2e-3 * np.random.default_rng(3).normal(size=time.size)
+    found = trend_of([study_record(DecayRecord(time, read, name="weeks", start=1.7e9))])
+    assert (found.reference, found.alarms) == (None, ())
+    assert "Readings are not watched: the first decays give no constant a and b" in found.message
+
+
 def test_nothing_moves_and_nothing_is_said():
     quiet = trend_of([study_record(fills(4, seed=1))])
     assert (quiet.status, quiet.alarms) == ("converged", ())
