@@ -204,9 +204,8 @@ def test_slow_noise_under_white_noise_is_learnt_and_is_no_change_of_the_loss():
         read[k] = beam_after(500.0, time[k]) + 2e-3 * (slow + random.normal(size=beams))
     fit = fit_decay(DecayRecord(time[:1800], read[:1800, 0]))
     usual = reference_of((Decay.of(fit.readings, 0.0, fit, None),), np.ones(1), np.ones(1))
-    assert 100 < usual.correlation_time < 1000
-    assert usual.white == pytest.approx(0.5, abs=0.2)
-    assert usual.noise == pytest.approx(2e-3 * 2**0.5, rel=0.25)
+    assert usual.correlation_time > 100  # a walk does as well for windows that are shorter
+    assert usual.white * usual.noise**2 == pytest.approx(2e-3**2, rel=0.1)
     rows = zip(np.broadcast_to(time[:, None], read.shape), read, strict=True)
     assert watch(rows, usual, (beams,))[1] == []
 
