@@ -15,7 +15,7 @@ import numpy as np
 
 from beamfit.lifetime.pieces import GAP
 from beamfit.quantity import HOUR, Quantity, relative_change
-from beamfit.statistics import CLEAR_ODDS, log_evidence_of_change
+from beamfit.statistics import CLEAR_ODDS, OPEN, log_evidence_of_change
 
 MINUTE = 60.0
 # Windows, s: four begin in turn in each length, so that one of nearly any age is at hand.
@@ -443,6 +443,7 @@ def _judged(
     apart = np.zeros(quiet.shape, int)
     if not quiet.all():
         a, b, both = seen_in(state, slice(-1, None)).evidence[..., 0]
+        a, b = (np.where(_is_loss(state, k), v, -np.inf) for k, v in ((1, a), (2, b)))
         either_one = np.logaddexp(a, b)
         found = [both - either_one, a - np.logaddexp(b, 0.0), b - np.logaddexp(a, 0.0)]
         found = [odds > CLEAR_ODDS for odds in found]
@@ -456,6 +457,14 @@ def _judged(
     change, error, covariance = change_since(state, moved)
     told = AlarmStep(raised, moved, change, error, _since(usual, state, change))
     return _adopted(state, moved > 0, change, covariance), told
+
+
+def _is_loss(state: AlarmState, moved: int) -> np.ndarray:
+    """Tell if what moved alone, a or b, may still be above zero: a current that stops to fall, as of
+    a monitor that stands still, has lost both.
+    """
+    change, error, _ = change_since(state, np.full(state.raised.shape, moved))
+    return (1 + change + OPEN * error)[..., moved - 1] > 0
 
 
 def _shown(usual: Reference, state: AlarmState) -> tuple[np.ndarray, np.ndarray]:

@@ -210,6 +210,17 @@ def test_slow_noise_under_white_noise_is_learnt_and_is_no_change_of_the_loss():
     assert watch(rows, usual, (beams,))[1] == []
 
 
+def test_a_monitor_that_stands_still_has_lost_a_and_b():
+    """A alone would have moved by -160 %, which no loss does."""
+    time = np.arange(0.0, 3000.0)
+    beam = beam_after(500.0, np.minimum(time, 1000.0))
+    beam = beam + 1e-3 * np.random.default_rng(4).normal(size=time.size)
+    first, *_ = alarms_of(USUAL, time, beam)
+    assert first.moved == "a and b"
+    for change in (first.a, first.b):
+        assert change.value == pytest.approx(-1.0, abs=3 * change.error)
+
+
 def test_many_beams_at_once_are_each_as_alone():
     rows = np.array(list(decays(3, 200, 6)))
     together, *_ = watch(zip(rows[:, 0], rows[:, 1], strict=True), shape=(3,))
