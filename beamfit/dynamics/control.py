@@ -35,8 +35,9 @@ ROUNDS, SHARES = 3, (1.0, 0.5, 0.25, 0.0)
 class Response(NamedTuple):
     """An output as the controller knows it.
 
-    `of` is its map or raw numbers, `delay` in steps, whole or not, `size` its scatter, `correction`
-    the share of a surprise that is taken for a disturbance, `margin` what its limits are held off by.
+    `of` is its map or raw numbers, `delay` in steps, whole or not, `size` its scatter,
+    `correction` the share of a surprise that is taken for a disturbance, `margin` what its limits
+    are held off by.
     """
 
     name: str
@@ -446,7 +447,7 @@ def controller(
         horizon += math.ceil(max(r.delay for r in responses))
     if not (max(r.delay for r in responses) < horizon <= LONGEST and smooth > 0):
         said = f"a horizon of {horizon} steps with smooth {smooth:g}"
-        expected = f"a horizon longer than the delay, of at most {LONGEST} steps, and smooth above 0"
+        expected = f"one longer than the delay, of at most {LONGEST} steps, and smooth above 0"
         raise InputError(said, expected)
     values = np.concatenate([np.stack(list(run.inputs.values()), axis=1) for run in fits[0].runs])
     usual = {n: (v.min(), v.max()) for n, v in zip(names, values.T, strict=True)}
@@ -886,7 +887,8 @@ def _short(loop: Loop) -> Finding | None:
             return Finding(Status.at_limit, cause, "Wish for less, or widen the limit.")
         if names := _mostly(loop, fastest(loop)):
             cause = f"{off}: {names} moves at its largest rate."
-            return Finding(Status.not_converged, cause, "Give it longer, or let inputs move faster.")
+            remedy = "Give it longer, or let inputs move faster."
+            return Finding(Status.not_converged, cause, remedy)
         cause = f"{change.output} has not settled at {change.after:.4g}."
         return Finding(Status.not_converged, cause, "Give it longer, or a longer horizon.")
     return None
@@ -911,7 +913,7 @@ def _kept(loop: Loop) -> Finding | None:
 
 
 def _poor(loop: Loop) -> str:
-    """What is said of every loop on a model that its runs refute."""
+    """Sentence about models that their runs refute, for every verdict."""
     poor = [fit.output for fit in loop.fits if fit.status is Status.poor_fit]
     said = f" But the model of {', '.join(poor)} does not explain its runs: see beamfit identify."
     return said if poor else ""

@@ -323,8 +323,9 @@ def watched(
     ln I follows -∫(a I + b)dt, so that its excess over the expected is linear in relative changes
     of a and b; each window fits them with an offset for every piece between refills, gaps and
     steps, by weighted sums of what each reading says beside those before it (Kalman filter of white
-    noise and of one with the correlation exp(-dt/time)). With information J, score s and the reference's covariance C, the test
-    of a change d = (1, 0) or (0, 1) is (dᵀ M s')²/(dᵀ M d), M = (1 + J C)⁻¹ J, s' = (1 + J C)⁻¹ s.
+    noise and of one with the correlation exp(-dt/time)). With information J, score s and the
+    reference's covariance C, the test of a change d = (1, 0) or (0, 1) is (dᵀ M s')²/(dᵀ M d),
+    M = (1 + J C)⁻¹ J, s' = (1 + J C)⁻¹ s.
     What moved is told by readings after the alarm alone: a window that spans the change bends.
 
     Examples
@@ -418,7 +419,7 @@ def _moved_on(usual: Reference, state: AlarmState, reading: Reading) -> AlarmSta
 def _alone(
     usual: Reference, state: AlarmState, path: np.ndarray, kept: np.ndarray
 ) -> tuple[np.ndarray, ...]:
-    """Value and weight of a reading beside those before it, and the noise that all of them foretell.
+    """Value and weight of a reading beside those before it, and the noise foretold by all of them.
 
     The Kalman filter of noise of which a part keeps so much from one reading to the next; the
     column of ones shows how much of an offset is left.
@@ -460,8 +461,8 @@ def _judged(
 
 
 def _is_loss(state: AlarmState, moved: int) -> np.ndarray:
-    """Tell if what moved alone, a or b, may still be above zero: a current that stops to fall, as of
-    a monitor that stands still, has lost both.
+    """Tell if what moved alone, a or b, may still be above zero: a current that stops to fall, as
+    of a monitor that stands still, has lost both.
     """
     change, error, _ = change_since(state, np.full(state.raised.shape, moved))
     return (1 + change + OPEN * error)[..., moved - 1] > 0

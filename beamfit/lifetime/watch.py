@@ -458,7 +458,7 @@ class State(NamedTuple):
     def said(self) -> str:
         """The alarm in words."""
         if self.alarm is None:
-            return "no usual loss yet: it needs a fit of constant a and b that tells them, or a ring"
+            return "no usual loss yet: it needs a fit that tells constant a from b, or a ring"
         if self.alarm.raised is not None:
             raised = alarm.when(self.alarm.raised - self.shift, True)
             return f"the loss moved, raised {raised}; what moved is told from the readings since"
