@@ -166,7 +166,7 @@ OUTLIER, SHARE = 7.0, 0.2
 EDGE, WITHIN = 2.5, "they lie within injections"
 # Neighbours that tell where a cycle, or a reading at the edge of one, should lie.
 NEXT = 9
-# Time constants of fresh beam that are looked for, and the part of its error to which it has settled.
+# Time constants of fresh beam that are looked for, and to which part of its error it has settled.
 FRESH, SETTLED = 12, 0.1
 
 
