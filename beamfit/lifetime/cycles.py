@@ -246,7 +246,7 @@ def _fresh(about: Expansion, most: int) -> int:
     error = np.sqrt(np.sum(off**2, axis=0) * cycles / (cycles - 1))
     excess = above.sum(axis=0) / np.maximum(error, 1e-300)
     best = int(np.argmax(excess))
-    if not stdtr(cycles - 1, -excess[best]) < ndtr(-EDGE):
+    if not stdtr(cycles - 1, -excess[best]) * times.size < ndtr(-EDGE):
         return 0
     return min(math.ceil(math.log(excess[best] / SETTLED) * times[best]), most)
 

@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
+from numpy.polynomial.chebyshev import chebvander
 from scipy.ndimage import maximum_filter1d, median_filter, minimum_filter1d, uniform_filter1d
 
 from beamfit.answer import shown
@@ -52,6 +53,9 @@ DIGITS = 1.5
 # Readings that have one law, and how many beside them are looked at; readings beyond which the
 # scatter of their mean is followed no farther.
 ONE_LAW, BESIDE, LONG = 1 << 16, 1 << 11, 4096
+# Degree of the smooth curve by which a piece may depart from a law: an exponent of a, gas that
+# changes.
+BENDS = 6
 # A step is placed to the reading within so many of where it was seen, by so many on either side.
 NEAR, WIDEST = 8, 64
 # How often steps are sought with the law that those found leave.
@@ -501,7 +505,7 @@ def _cycles(record: DecayRecord, clear: ClearSteps) -> tuple[list[np.ndarray], l
             break
         guess = np.zeros(rows.size, bool)
         guess[np.cumsum(lengths) - lengths] = True
-    parts, owner = _restored(record, whole, rows, number, level, lengths)
+    parts, owner = _restored(record, whole, rows, number, lengths)
     count = _by_the_clock(np.array([*map(len, parts)]))
     pieces = [p for part, n in zip(parts, count, strict=True) for p in np.array_split(part, n)]
     owner, events, levels = np.repeat(owner, count), [], np.full(len(record), np.nan)
@@ -531,28 +535,49 @@ def _left_out(
 
 
 def _restored(
-    record: DecayRecord, clear: Sequence[np.ndarray], rows: np.ndarray, number: np.ndarray,
-    level: np.ndarray, lengths: np.ndarray,
-) -> tuple[list[np.ndarray], list[int]]:  # fmt: skip
-    """Parts, and of which clear piece each is; one that a law of its own explains without the steps
-    in it as well as these do, with one law for all, is whole again. A step costs its size and its
-    place.
+    record: DecayRecord,
+    clear: Sequence[np.ndarray],
+    rows: np.ndarray,
+    number: np.ndarray,
+    lengths: np.ndarray,
+) -> tuple[list[np.ndarray], list[int]]:
+    """Parts, and of which clear piece each is; one whose steps explain no more than their sizes and
+    places cost, beside a law of its own and a smooth curve, is whole again.
     """
     begins = np.cumsum(lengths) - lengths
-    off = level - np.repeat(np.add.reduceat(level, begins) / lengths, lengths)
-    first = np.flatnonzero(np.diff(number, prepend=-1))
+    pieces = np.flatnonzero(np.diff(number, prepend=-1)).tolist()
     found, owner = [], []
-    for low, high in itertools.pairwise([*first.tolist(), rows.size]):
+    for low, high in itertools.pairwise([*pieces, rows.size]):
         piece, inside = number[low], begins[slice(*np.searchsorted(begins, (low, high)))]
         parts, every = np.split(rows[low:high], inside[1:] - low), clear[piece]
         if len(parts) > 1 or high - low < every.size:
             alone = _levelled(record.time[every], record.current[every], np.zeros(1, int))
-            worse = np.log((alone.var() + TINY) / (np.mean(off[low:high] ** 2) + TINY))
-            if (high - low) * worse < 2 * (len(parts) - 1) * np.log(high - low):
+            bent = np.column_stack([chebvander(np.linspace(-1.0, 1.0, every.size), BENDS), alone])
+            ends = np.searchsorted(every, [(part[0], part[-1] + 1) for part in parts])
+            first = np.union1d(0, ends[ends < every.size])
+            worse = np.log(
+                (_left(bent) + TINY) / (_left(_without_means(bent[:, 1:], first)) + TINY)
+            )
+            # Twice the log evidence: log n for a size, 2 log n for a place among n readings.
+            cost = 3 * (first.size - 1) * np.log(every.size)
+            if (every.size - BENDS - first.size) * worse < cost:
                 parts = [every]
         found += parts
         owner += [piece] * len(parts)
     return found, owner
+
+
+def _without_means(columns: np.ndarray, first: np.ndarray) -> np.ndarray:
+    """Columns less their means in parts that begin with these rows."""
+    lengths = np.diff(first, append=len(columns))
+    means = np.add.reduceat(columns, first) / lengths[:, None]
+    return columns - np.repeat(means, lengths, axis=0)
+
+
+def _left(columns: np.ndarray) -> float:
+    """Variance that all columns but the last leave of that."""
+    found = np.linalg.lstsq(columns[:, :-1], columns[:, -1], rcond=None)[0]
+    return float(np.mean((columns[:, -1] - columns[:, :-1] @ found) ** 2))
 
 
 def _is_short(number: np.ndarray, begins: np.ndarray, lengths: np.ndarray) -> np.ndarray:
@@ -649,9 +674,7 @@ def _levelled(time: np.ndarray, current: np.ndarray, first: np.ndarray) -> np.nd
     columns = np.array([current, current**2])
     parts = 0.5 * np.diff(time) * (columns[:, :-1] + columns[:, 1:])
     columns = np.vstack([np.zeros(2), np.cumsum(parts, axis=1).T])
-    lengths = np.diff(first, append=time.size)
-    both = np.column_stack([columns, current])
-    both -= np.repeat(np.add.reduceat(both, first) / lengths[:, None], lengths, axis=0)
+    both = _without_means(np.column_stack([columns, current]), first)
     scale = np.linalg.norm(both[:, :2], axis=0) + TINY
     left, known = both[:, 2], both[:, :2] / scale
     squares, ways = np.linalg.eigh(known.T @ known)

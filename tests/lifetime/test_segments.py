@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 from scipy.signal import lfilter
 
 from beamfit.errors import InputError
@@ -435,3 +436,21 @@ def test_top_up_with_a_gap_dropouts_and_spikes_is_cut_at_its_refills():
     assert abs(pooled.fit.first.size - 101) <= 1
     assert abs(pooled.fit.lifetime_mean.value - 10) < 3 * pooled.fit.lifetime_mean.error < 0.1
     assert {"gap", "dropout", "spike"} <= set(kinds(study))
+
+
+@pytest.mark.parametrize("power", [-1 / 3, 0.3])
+def test_fills_whose_a_goes_with_the_current_are_not_cut(power):
+    """One a and one b for all fills bend what is left by more than a small noise: no steps."""
+    for seed in range(4):
+        rng, fills = np.random.default_rng(seed), []
+        for hours in rng.uniform(5.6, 10.4, 6):
+            t = np.arange(0, hours * 3600, 60.0)
+            found = solve_ivp(
+                lambda t, i: -(0.6 * (i / 300) ** (1 + power) + 0.4) / 36000 * i,
+                (0, t[-1]), [300.0], t_eval=t, rtol=1e-11, atol=1e-9,
+            )  # fmt: skip
+            fills.append(found.y[0])
+        beam = np.concatenate(fills)
+        beam += 0.005 * rng.normal(size=beam.size)
+        split = split_record(DecayRecord(60.0 * np.arange(beam.size), beam))
+        assert [len(s) for s in split.segments] == [len(fill) for fill in fills]
