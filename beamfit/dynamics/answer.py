@@ -438,6 +438,8 @@ def _good(e: ResponseEvidence) -> Finding:
         cause += f" Readings of {standing} scatter about levels; the output follows the levels."
     if e.checks.jitter:
         cause += f" Times of readings are uncertain by {e.checks.jitter:.2g} s: errors contain it."
+    if e.checks.drift:
+        cause += f" The output drifts beside it (degree {e.checks.drift} in time): errors contain it."
     if e.checks.law is not None:
         odds = f"P = {e.checks.law_probability:.2f}"
         law = e.checks.law[0].upper() + e.checks.law[1:]

@@ -17,9 +17,10 @@ from beamfit.dynamics.model import (
 from beamfit.dynamics.record import Way
 from beamfit.dynamics.response import FIRST_ORDER
 from beamfit.dynamics.search import (
-    DRIFT,
     drift_columns,
+    drift_costs,
     driven_by,
+    spanned,
     unit_outputs,
     whitened_rows,
 )
@@ -79,6 +80,8 @@ class Checks(NamedTuple):
         best: clocks of input and output then run at different rates. Else 0.
     jitter : float
         Standard deviation of the times of readings about those of the record, s.
+    drift : int
+        Degree of the drift of the output that is fitted beside the response.
     """
 
     free_run_percent: float
@@ -99,6 +102,7 @@ class Checks(NamedTuple):
     way: Way = Way()
     delay_growth: float = 0.0
     jitter: float = 0.0
+    drift: int = 0
 
     def rows(self) -> list[list[str]]:
         """Label and value."""
@@ -147,12 +151,14 @@ def checks_of(
     used: int,
     gain: float | None,
     delay: int,
+    drifts: Sequence[np.ndarray],
 ) -> Checks:
     """Test the residuals of every run together.
 
-    `slopes` has those of the output by the model's own numbers, and what fuller models would add.
+    `slopes` has those of the output by the model's own numbers, and what fuller models would add;
+    `drifts` are what each run's output has beside the response.
     """
-    y = [m - m.mean() for m in seen.measured]
+    y = [m - d - np.mean(m - d) for m, d in zip(seen.measured, drifts, strict=True)]
     rest = np.concatenate(residuals)
     (explained, chance), (later, fed), grown = _explained(seen, residuals, noise, slopes, delay)
     white = _white([r / error for r, error in zip(residuals, noise.errors, strict=True)])
@@ -218,17 +224,14 @@ class RunNoises(NamedTuple):
         ])  # fmt: skip
 
     def drift(self, own: np.ndarray, rest: np.ndarray) -> np.ndarray:
-        """Cosines of a drift that whitened residuals show beside a model's own slopes, as many as
+        """Columns of a drift that whitened residuals show beside a model's own slopes, as many as
         the Bayesian information criterion wants.
         """
-        count, runs = len(rest), len(self.times)
+        runs = len(self.times)
         waves = self.white([drift_columns(t / t[-1], i, runs).reshape(len(t), -1)
                             for i, t in enumerate(self.times)])  # fmt: skip
-        triangle = np.linalg.qr(np.column_stack([_basis(own), waves, rest]), mode="r")
-        least = np.cumsum(triangle[::-1, -1] ** 2)[::-1]
-        used = len(triangle) - 1 - runs * np.arange(DRIFT, -1, -1)
-        cost = count * np.log(np.maximum(least[used], np.finfo(float).tiny)) + np.log(count) * used
-        return waves[:, : runs * int(cost.argmin())]
+        triangle = np.linalg.qr(np.column_stack([spanned(own), waves, rest]), mode="r")
+        return waves[:, : runs * int(drift_costs(triangle, runs, len(rest)).argmin())]
 
     def ahead(self, residuals: Sequence[np.ndarray]) -> np.ndarray:
         """Residuals of predictions from the readings before."""
@@ -274,7 +277,7 @@ def _explained(
     own, slow, quick, later = (noise.white(part) for part in (own, slow_paths(seen), quick, later))
     rest = noise.white(residuals)
     own = np.hstack([own, noise.drift(own, rest)])
-    basis = _basis(own)
+    basis = spanned(own)
     rest = rest - basis @ (basis.T @ rest)
     pairs = zip(seen.measured, residuals, noise.times, strict=True)
     clock = noise.white([_late(y - r, t) for y, r, t in pairs])
@@ -282,7 +285,7 @@ def _explained(
     tests = [_tested(rest, basis, columns) for columns in (slow, quick, clock)]
     share, chance = found = min(tests, key=lambda each: each[1])
     grown = float(clock[:, 0] @ rest / (clock[:, 0] @ clock[:, 0])) if found is tests[2] else 0.0
-    basis = _basis(np.hstack([own, slow, quick]))
+    basis = spanned(np.hstack([own, slow, quick]))
     rest = rest - basis @ (basis.T @ rest)
     chance = min(len(tests) * chance, 1.0)
     return (share, chance), _tested(rest, basis, later), grown
@@ -304,20 +307,13 @@ def slow_paths(seen: PreparedOutput) -> list[np.ndarray]:
 
 def _tested(rest: np.ndarray, basis: np.ndarray, columns: np.ndarray) -> tuple[float, float]:
     """Share of the squares that columns explain beyond a basis, and its chance (F)."""
-    new = _basis(columns - basis @ (basis.T @ columns), np.linalg.norm(columns, axis=0))
+    new = spanned(columns - basis @ (basis.T @ columns), np.linalg.norm(columns, axis=0))
     k, left = new.shape[1], len(rest) - basis.shape[1] - new.shape[1]
     inside, whole = float(np.sum((new.T @ rest) ** 2)), float(rest @ rest)
     if left < 1 or whole <= 0 or k == 0:
         return 0.0, 1.0
     ratio = (inside / k) / max((whole - inside) / left, 1e-300)
     return inside / whole, float(f.sf(ratio, k, left))
-
-
-def _basis(columns: np.ndarray, size: np.ndarray | None = None) -> np.ndarray:
-    """Orthonormal columns that span these; those that are nothing beside their size are none."""
-    size = np.linalg.norm(columns, axis=0) if size is None else size
-    found, values, _ = np.linalg.svd(columns / np.where(size > 0, size, 1.0), full_matrices=False)
-    return found[:, values > 1e-6]
 
 
 class RunSlopes(NamedTuple):

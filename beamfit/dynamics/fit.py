@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -21,7 +21,7 @@ from beamfit.dynamics.answer import (
     quoted,
     told,
 )
-from beamfit.dynamics.bad_readings import BadReadings, sound
+from beamfit.dynamics.bad_readings import BadReadings, judged_without
 from beamfit.dynamics.checks import (
     Checks,
     HeldOutRun,
@@ -218,13 +218,7 @@ def identify(
     paths = Paths.of(runs, delay, physics.even)
     search = ResponseSearch(output, physics, paths, offset)
     asked = _Identification(search, map, hidden, range(seed, seed + starts), held)
-    sound_runs, left_out, found = sound(runs, output, asked.search.begun)
-    fit = _answered(asked, sound_runs, found, left_out)
-    if not left_out or fit.status is not Status.poor_fit:
-        return fit
-    # A model that is refuted misses good readings.
-    whole = _answered(asked, runs, asked.search.begun(runs), ())
-    return whole if whole.status is Status.poor_fit else fit
+    return judged_without(runs, search.begun, search.beside, partial(_answered, asked))
 
 
 class _Identification(NamedTuple):
@@ -320,6 +314,7 @@ def _known(
         used_by(answer.fit) + (not paths.given and not seen.ends),  # a delay found is a number, too
         None if constant else found.plain.likelihood - answer.likelihood,
         int(np.floor(seen.delay)),
+        [np.zeros(len(y)) for y in seen.measured],
     )
     checks = checks._replace(
         first_order=constant and asked.search.is_first_order(runs, found),

@@ -22,10 +22,21 @@ from beamfit.dynamics.fit import MAPS
 from beamfit.dynamics.limits import SINGLE_END, LagLimits
 from beamfit.dynamics.model import WEIGHT
 from beamfit.dynamics.record import Run, check_inputs, checked
-from beamfit.dynamics.search import LONGEST, Case, Settled, information, noise_of, used_by
+from beamfit.dynamics.search import (
+    DRIFT,
+    LONGEST,
+    Case,
+    Settled,
+    drift_waves,
+    information,
+    noise_of,
+    used_by,
+)
 from beamfit.dynamics.state_fit import (
     Course,
     StatesFit,
+    begun,
+    beside_drift,
     case_of,
     remembering,
     states_answer,
@@ -141,30 +152,35 @@ def realisations(
         mean = [each[: len(each) // stride * stride].reshape(-1, stride, each.shape[1]).mean(1)
                 for each in u]  # fmt: skip
         read = [each[::stride][: len(v)] for each, v in zip(y, mean, strict=True)]
-        found = _regressed(mean, read, order)
-        if found is None:
-            continue
-        a, b, c, d = found
-        values, vectors = np.linalg.eig(a)
-        most = np.exp(-stride / (1000.0 * longest))
-        values = values * np.minimum(1.0, most / np.maximum(np.abs(values), 1e-12))
-        if stride > 1:
-            if np.any((np.abs(values.imag) < 1e-9) & (values.real <= 0)):
-                continue  # no root of it is real
-            values = values ** (1.0 / stride)
-        once = (vectors * values) @ np.linalg.pinv(vectors)
-        many = sum(np.linalg.matrix_power(once, i) for i in range(stride))
-        if np.isfinite(many).all():
-            yield once.real, np.linalg.lstsq(many, b, rcond=1e-10)[0].real, c, d
+        for degree in (0, DRIFT):
+            found = _regressed(mean, read, order, degree)
+            if found is not None and (a := _each_sample(found[0], stride, longest)) is not None:
+                many = sum(np.linalg.matrix_power(a, i) for i in range(stride))
+                yield a, np.linalg.lstsq(many, found[1], rcond=1e-10)[0], *found[2:]
+
+
+def _each_sample(a: np.ndarray, stride: int, longest: int) -> np.ndarray | None:
+    """The matrix of a sample by that of a stride, its poles inside the unit circle; None where
+    there is no real one.
+    """
+    values, vectors = np.linalg.eig(a)
+    most = np.exp(-stride / (1000.0 * longest))
+    values = values * np.minimum(1.0, most / np.maximum(np.abs(values), 1e-12))
+    if stride > 1 and np.any((np.abs(values.imag) < 1e-9) & (values.real <= 0)):
+        return None
+    once = ((vectors * values ** (1.0 / stride)) @ np.linalg.pinv(vectors)).real
+    return once if np.isfinite(once).all() else None
 
 
 def _regressed(
-    u: list[np.ndarray], y: list[np.ndarray], order: int
+    u: list[np.ndarray], y: list[np.ndarray], order: int, degree: int
 ) -> tuple[np.ndarray, ...] | None:
+    """The system beside drifts of a degree: polynomials that come later are of the same degree."""
     m, k = u[0].shape[1], y[0].shape[1]
     count = sum(map(len, y))
     horizon = int(np.clip(count // (4 * (m + k) + 4 * m), order // k + 2, HORIZON))
-    rows = [_rows(v, w, horizon) for v, w in zip(u, y, strict=True) if len(v) > 2 * horizon + 1]
+    rows = [_rows(v, w, horizon, degree)
+            for v, w in zip(u, y, strict=True) if len(v) > 2 * horizon + 1]  # fmt: skip
     if not rows or sum(len(r[0]) for r in rows) < horizon * (2 * m + k):
         return None
     past, later, future, inputs, now_u, now_y = (
@@ -184,17 +200,22 @@ def _regressed(
     return ab[:, :order], ab[:, order:], cd[:, :order], cd[:, order:]
 
 
-def _rows(u: np.ndarray, y: np.ndarray, horizon: int) -> tuple[np.ndarray, ...]:
-    """Past, past a sample later, future, future inputs, and inputs and outputs now, by row."""
+def _rows(u: np.ndarray, y: np.ndarray, horizon: int, degree: int) -> tuple[np.ndarray, ...]:
+    """Past, past a sample later, future, future inputs, and inputs and outputs now, by row; less
+    a drift of the degree.
+    """
     both, count = np.hstack([y, u]), len(y) - 2 * horizon
     at = np.arange(horizon, horizon + count, max(1, count // ROWS))
+    waves = np.column_stack([np.ones(len(at)), drift_waves(at / len(y))])
+    slow = np.linalg.qr(waves[:, : degree + 1 if degree else 0])[0]
 
     def around(of, begin, end):
-        return np.concatenate([of[at + k] for k in range(begin, end)], axis=1)
+        found = np.concatenate([of[at + k] for k in range(begin, end)], axis=1)
+        return found - slow @ (slow.T @ found)
 
     return (
         around(both, -horizon, 0), around(both, 1 - horizon, 1), around(y, 0, horizon),
-        around(u, 0, horizon), u[at], y[at],
+        around(u, 0, horizon), around(u, 0, 1), around(y, 0, 1),
     )  # fmt: skip
 
 
@@ -230,8 +251,7 @@ def padded(model: dict[str, Any], size: int) -> dict[str, Any]:
     around[np.ix_(at, at)] = p["around"]
     wide = {"z": np.pad(p["z"], ((0, more), (0, 0))), "c": np.pad(p["c"], ((0, 0), (0, more)))}
     start = np.pad(model["start"], ((0, 0), (0, more)))
-    nodes = np.zeros((len(start), 0, size))
-    return {"p": p | wide | {"around": around}, "start": start, "nodes": nodes}
+    return {"p": p | wide | {"around": around}, **begun(start, len(p["c"]))}
 
 
 def stripped(model: dict[str, Any], n: int) -> dict[str, Any]:
@@ -239,7 +259,7 @@ def stripped(model: dict[str, Any], n: int) -> dict[str, Any]:
     p, (size, m) = model["p"], model["p"]["z"].shape
     at = np.array([*range(n), *range(size, size + m)])
     less = {"z": p["z"][:n], "c": p["c"][:, :n], "around": p["around"][at][:, at]}
-    return {"p": p | less, "start": model["start"][:, :n], "nodes": model["nodes"][:, :, :n]}
+    return model | {"p": p | less, "start": model["start"][:, :n], "nodes": model["nodes"][..., :n]}
 
 
 # State counts of the compiled searches (unused states are held at 0), and number of orders without
@@ -282,7 +302,7 @@ def orders(case: Case, order: int | None, offset: bool) -> tuple[TriedOrder, lis
     full = tried[int(np.argmin(told))]
     model = full.found.fit.model
     p = model["p"] | {"d": model["p"]["d"].at[:, : len(case.seen[0].inputs)].set(0.0)}
-    bounded = case._replace(free=free_of(case, full.order, len(p["z"]), offset, False))
+    bounded = full.case._replace(free=free_of(case, full.order, len(p["z"]), offset, False))
     plain = TriedOrder(full.order, False, bounded, trained(bounded, [model | {"p": p}]))
     tried.append(plain)
     told = criterion(case, [t.found for t in tried], tried[-2].found)
@@ -333,7 +353,8 @@ def _tried(case: Case, n: int, offset: bool, before: TriedOrder | None) -> Tried
         return padded({"p": p, "start": start @ to.T}, size)
 
     models = [model(*found) for found in realisations(u, y, n)]
-    missed = [case.squares(case.rest(each)) for each in models]
+    slow = case._replace(degree=DRIFT)
+    missed = [_missed(slow, each) for each in models]
     best = [i for i in np.argsort(missed, kind="stable") if np.isfinite(missed[i])]
     models = [models[i] for i in best[:BEGINS]]
     if before is not None:
@@ -346,7 +367,13 @@ def _tried(case: Case, n: int, offset: bool, before: TriedOrder | None) -> Tried
     if not models:  # runs too short for a regression
         a = np.diag(NEW ** np.arange(1.0, n + 1))
         models = [model(a, np.ones((n, m)), np.full((k, n), FAINT), np.zeros((k, m)))]
-    return TriedOrder(n, True, bounded, trained(bounded, models))
+    return TriedOrder(n, True, *beside_drift(bounded, models))
+
+
+def _missed(case: Case, model: Any) -> float:
+    """Sum of squared residuals of a model beside drifts and levels of the runs."""
+    rest = case.rest(case.beside_drift(model))
+    return case.squares([[r - r.mean() for r in row] for row in rest])
 
 
 def _units(case: Case, offset: bool) -> dict[str, np.ndarray]:
@@ -451,6 +478,7 @@ def identify_states(
         free = [f for f in free_of(case, n, n, offset, best.direct) if f.path != "start"]
         free += [Free("start", nuisance=True), Free("p.net", nuisance=True)]
         case = case_of(runs, NETWORK, free, [Prior("p.net", 0.0, WEIGHT)], delay)
+        case = case._replace(degree=best.case.degree)
         found = likely(case, [trained(case, [net]) for net in nets])
         gain = criterion(best.case, [best.found])[0] - criterion(case, found[:1])[0]
     case = best.case if map == "constant" else case

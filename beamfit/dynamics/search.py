@@ -19,6 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from beamfit.arrays import Array, array_module
+from beamfit.dynamics.bad_readings import FreeRun
 from beamfit.dynamics.model import (
     CLOSE,
     Driven,
@@ -50,21 +51,44 @@ ROUNDING = 1e-14
 # Range of time constants, in intervals and in runs, beyond which nothing tells them from zero and
 # from infinity.
 RANGE = (1e-3, 1e3)
-
-
-# Most half periods in a run of a drift of the output.
+TINY = np.finfo(float).tiny
+# Highest degree of a drift of the output in a run: it turns once less.
 DRIFT = 8
 
 
-def drift_columns(through: Array, i: int, runs: int) -> Array:
-    """Cosines of a slow drift of each run, from the slowest, at the readings of run i, whose times
-    are in lengths of the run.
+def drift_waves(through: Array) -> Array:
+    """Polynomials of a slow drift, from the line on, at times in lengths of the run.
 
-    Shape (readings, DRIFT, runs), zero but for run i.
+    Shape (readings, DRIFT): Chebyshev's, cosines of an angle, less their means over the run.
     """
+    xp, degree = array_module(through), np.arange(1, DRIFT + 1)
+    angle = xp.arccos(xp.clip(2.0 * through - 1.0, -1.0, 1.0))
+    mean = np.where(degree % 2, 0.0, 1.0 / (1.0 - np.maximum(degree, 2) ** 2))
+    return xp.cos(angle[:, None] * degree) - mean
+
+
+def drift_columns(through: Array, i: int, runs: int) -> Array:
+    """Those of each run at the readings of run i, shape (readings, DRIFT, runs), zero but for i."""
     xp = array_module(through)
-    waves = xp.cos(xp.pi * through[:, None] * np.arange(1, DRIFT + 1))
-    return xp.pad(waves[..., None], ((0, 0), (0, 0), (i, runs - 1 - i)))
+    return xp.pad(drift_waves(through)[..., None], ((0, 0), (0, 0), (i, runs - 1 - i)))
+
+
+def drift_costs(triangles: np.ndarray, runs: int, count: int, least: float = TINY) -> np.ndarray:
+    """-2 ln L with a drift of degree 0, 1, … of so many runs, and the cost of its numbers.
+
+    The Bayesian information criterion of `count` readings, with the noise's size at its likeliest;
+    `triangles` are factors of a model's own columns, of drifts by degree, and of the readings.
+    """
+    used = triangles.shape[-1] - 1 - runs * DRIFT + runs * np.arange(DRIFT + 1)
+    missed = np.stack([np.sum(triangles[..., k:, -1] ** 2, axis=-1) for k in used], axis=-1)
+    return count * np.log(np.maximum(missed, least)) + np.log(count) * used
+
+
+def spanned(columns: np.ndarray, size: np.ndarray | None = None) -> np.ndarray:
+    """Orthonormal columns that span these; those that are nothing beside their size are none."""
+    size = np.linalg.norm(columns, axis=0) if size is None else size
+    found, values, _ = np.linalg.svd(columns / np.where(size > 0, size, 1.0), full_matrices=False)
+    return found[:, values > 1e-6]
 
 
 class Start(NamedTuple):
@@ -109,6 +133,8 @@ class ResponseSearch(NamedTuple):
         axes = [np.log(np.geomspace(0.1 * seen.apart, seen.span, LAGS))]
         axes += [np.log(DAMPINGS)] if physics is not FIRST_ORDER else []
         reach = np.array([axis[1] - axis[0] for axis in axes])
+        count = sum(map(len, seen.measured))
+        exact = count * (CLOSE * seen.size_y) ** 2
         around = _grid([np.linspace(-1.0, 1.0, len(axis)) for axis in axes])
         grid = np.tile(_grid(axes), (len(paths), 1, 1))
 
@@ -117,7 +143,7 @@ class ResponseSearch(NamedTuple):
             found = found if physics is not ARX else difference(found, seen.apart)
             asked = ([u[..., 0] for u in inputs], part), found
             triangles = np.asarray(_triangles(drives, measured, *asked, self.offset))
-            costs = _costs(triangles, seen)
+            costs = drift_costs(triangles, len(seen.runs), count, exact)
             return costs.min(axis=2).argmin(axis=1), found, triangles, costs
 
         near = grid[every, least(grid)[0]]
@@ -178,6 +204,12 @@ class ResponseSearch(NamedTuple):
         seen = prepared(runs, self.output, self.physics, path)
         return Begun(seen, path, fitted(case_of(seen, self.offset), [model | {"late": 0.0}]))
 
+    def beside(self, runs: tuple[Run, ...], found: Begun) -> list[FreeRun]:
+        """Readings of some runs beside a fit of others."""
+        seen = prepared(runs, self.output, self.physics, found.path)
+        fitted = [output_of(found.plain.fit.model, run) for run in seen.runs]
+        return [FreeRun(self.output, found.path.delay, found.seen.size_y, seen.measured, fitted)]
+
     def is_first_order(self, runs: tuple[Run, ...], found: Begun) -> bool:
         """True if a first order does as well as a higher one by the information criterion."""
         if self.physics is FIRST_ORDER:
@@ -186,18 +218,6 @@ class ResponseSearch(NamedTuple):
         (start,) = self.starts(runs, FIRST_ORDER, [found.path])
         fit = fitted(case_of(lower, self.offset), [start.model])
         return fit.likelihood <= found.plain.likelihood
-
-
-def _costs(triangles: np.ndarray, seen: PreparedOutput) -> np.ndarray:
-    """-2 ln L of each shape with a drift of 0, 1, … cosines a run, and the cost of these numbers.
-
-    The Bayesian information criterion, with the noise's size at its likeliest.
-    """
-    runs, count = len(seen.runs), sum(map(len, seen.measured))
-    used = triangles.shape[-1] - 1 - runs * DRIFT + runs * np.arange(DRIFT + 1)
-    missed = np.stack([np.sum(triangles[..., k:, -1] ** 2, axis=-1) for k in used], axis=-1)
-    least = count * (CLOSE * seen.size_y) ** 2
-    return count * np.log(np.maximum(missed, least)) + np.log(count) * used
 
 
 def difference(shapes: np.ndarray, apart: float) -> np.ndarray:
@@ -233,10 +253,10 @@ def linear_columns(runs: Sequence[Driven], i: int, shapes: jax.Array, offset: bo
 
 @partial(jax.jit, static_argnums=4)
 def _triangles(runs: tuple[Driven, ...], measured: Any, inputs: Any, shapes: Any, offset: bool):
-    """Triangular factors of outputs of unit gains, first states and offset, cosines of a drift of
-    each run, from the slowest, and of the readings: for each path one for each of its shapes.
+    """Triangular factors of outputs of unit gains, first states and offset, of drifts of each run
+    by degree, and of the readings: for each path one for each of its shapes.
 
-    Cosines and readings are the same for all, and made orthonormal once. What a shape leaves of
+    Drifts and readings are the same for all, and made orthonormal once. What a shape leaves of
     them comes of their products with its outputs: to 1e-7, while `CLOSE` counts as exact.
     """
     rest, read = [], []
@@ -357,13 +377,15 @@ Noises = tuple[tuple[ReadingErrors, ...], ...]
 class Case(NamedTuple):
     """A fit to be made: prepared outputs, runs, free numbers and priors.
 
-    A course is a run as its model sees it: `model.Driven` or `shooting.Course`.
+    A course is a run as its model sees it: `model.Driven` or `state_fit.Course`. Of models that
+    have drifts of the outputs, those of this `degree` are free.
     """
 
     seen: tuple[PreparedOutput, ...]
     courses: tuple[Any, ...]
     free: tuple[Free, ...]
     priors: tuple[Prior, ...]
+    degree: int = 0
 
     @property
     def guess(self) -> Noises:
@@ -408,6 +430,23 @@ class Case(NamedTuple):
             for r, n, s in zip(row, noise[i], self.seen, strict=True)
         ]
 
+    def drifts(self, model: Any) -> tuple[tuple[np.ndarray, ...], ...]:
+        """Drifts that a model has, at the readings, by run and output."""
+        return tuple(
+            tuple(self.split(i, np.asarray(course.drift(model))[: course.count]))
+            for i, course in enumerate(self.courses)
+        )
+
+    def beside_drift(self, model: Any) -> Any:
+        """The model with the drifts that explain most of its residuals."""
+        still = model | {"drift": np.zeros_like(model["drift"])}
+        for i, row in enumerate(self.rest(still)):
+            columns = self.split(i, np.asarray(self.courses[i].waves)[: self.courses[i].count])
+            for k, (rest, waves) in enumerate(zip(row, columns, strict=True)):
+                level = np.column_stack([waves[:, k, : self.degree], np.ones(len(rest))])
+                still["drift"][i, k, : self.degree] = np.linalg.lstsq(level, rest)[0][:-1]
+        return still
+
     def squares(self, rest: Any) -> float:
         """Sum of squared residuals, in units of each output's scatter."""
         return sum(float(np.sum((r / s.size_y) ** 2))
@@ -446,6 +485,9 @@ class Case(NamedTuple):
             worth = np.inf if exact else 1.0
             records.append(Record(f"run {i + 1}", predict, asked, *rows, worth))
         free = [*self.free, *([Free("nodes", nuisance=True)] if cuts else [])]
+        if "drift" in model:
+            end = np.where(np.arange(DRIFT) < self.degree, np.inf, np.zeros_like(model["drift"]))
+            free.append(Free("drift", -end, end, nuisance=True))
         return Problem(model, free, records, self.priors)
 
     def search(
@@ -490,18 +532,40 @@ class Settled(NamedTuple):
             for course in case.courses
         ]
 
+    def linear_rows(self, case: Case, most: int | None = None) -> list[tuple[np.ndarray, ...]]:
+        """Slopes and, last, residuals of each run and output in units of the errors, and times, of
+        so many readings at most.
+        """
+        own = [part for i, s in enumerate(self.slopes(case)) for part in case.split(i, s)]
+        return [(np.column_stack([slope, -rest])[:most] / error[:most, None], time[:most])
+                for slope, (rest, error, time, _) in zip(
+                    own, case.rows(self.rest, self.noise), strict=True)]  # fmt: skip
+
     def remembered(
         self, case: Case, noise: CorrelatedNoise | None = None, most: int | None = None
     ) -> tuple[Memory, CorrelatedNoise, float]:
         """The noise with a memory that the residuals have, of so many of them at most."""
-        problem, size = self.fit.problem, self.fit.problem.size
-        rest = case.rows(self.rest, self.noise)
-        own = [part for i, s in enumerate(self.slopes(case)) for part in case.split(i, s)]
-        rows = [np.column_stack([slope, -r])[:most] / error[:most, None]
-                for slope, (r, error, *_) in zip(own, rest, strict=True)]  # fmt: skip
-        prior = np.asarray(problem.residual(self.fit.theta))[size:]
-        known = np.column_stack([self.fit.dense_jacobian[size:], prior])
-        return noise_of(rows, [time[:most] for _, _, time, _ in rest], known, noise)
+        rows, time = zip(*self.linear_rows(case, most), strict=True)
+        prior = np.asarray(self.fit.problem.residual(self.fit.theta))[self.fit.problem.size :]
+        known = np.column_stack([self.fit.dense_jacobian[self.fit.problem.size :], prior])
+        return noise_of(rows, time, known, noise)
+
+    def drift_degree(self, case: Case) -> int:
+        """The degree of drifts that the information criterion wants beside the other numbers.
+
+        All are free in the fit. The noise may have a memory: what wanders at random is no drift.
+        """
+        memory = self.remembered(case, most=LONGEST)[1] if self.correlated(case) else None
+        white = [whitened_rows(*each, memory)[0] for each in self.linear_rows(case)]
+        rows = np.concatenate(white)
+        drift = np.array([name.startswith("drift[") for name in self.fit.problem.names])
+        own, waves = rows[:, :-1][:, ~drift], rows[:, :-1][:, drift]
+        without = waves @ self.fit.theta[drift] - rows[:, -1]  # readings less the response
+        waves = np.moveaxis(waves.reshape(len(rows), -1, DRIFT), 2, 1).reshape(len(rows), -1)
+        columns = np.column_stack([spanned(own), waves, without])
+        more = max(0, columns.shape[1] - len(columns))
+        triangle = np.linalg.qr(np.pad(columns, ((0, more), (0, 0))), mode="r")
+        return int(drift_costs(triangle, waves.shape[1] // DRIFT, len(rows)).argmin())
 
     def exact(self, case: Case) -> bool:
         """True if the model explains all outputs but for rounding."""

@@ -22,9 +22,11 @@ from beamfit.dynamics.paths import Path, prepared
 from beamfit.dynamics.record import Run, Way, checked
 from beamfit.dynamics.response import FIRST_ORDER
 from beamfit.dynamics.search import (
+    DRIFT,
     GAINED,
     Case,
     Settled,
+    drift_waves,
     settled,
     used_by,
     with_memory,
@@ -64,8 +66,8 @@ class Course:
     """A run as the model sees it: inputs and steps, and which outputs were read, all padded.
 
     Shapes (samples, m), (samples,); `index` (readings,) points into all outputs one after the
-    other, `time` is theirs, s, far apart from output to output; there are `count`. `run` is its
-    number.
+    other, `time` is theirs, s, far apart from output to output; there are `count`. `waves` are
+    columns of drifts of each output, (readings, outputs, degrees). `run` is its number.
     """
 
     system: System
@@ -74,6 +76,7 @@ class Course:
     time: Any
     index: Any
     count: Any
+    waves: Any
     run: Any
 
     def shot(self, model: Any) -> tuple[jax.Array, jax.Array]:
@@ -83,7 +86,11 @@ class Course:
         parts = [v.reshape(len(starts), -1, *v.shape[1:]) for v in (self.u, self.dt)]
         y, last = jax.vmap(self.system.run, (None, 0, 0, 0))(model["p"], *parts, starts)
         y = y.reshape(len(self.u), -1)
-        return y.T.ravel()[self.index], (last[:-1] - nodes).ravel()
+        return y.T.ravel()[self.index] + self.drift(model), (last[:-1] - nodes).ravel()
+
+    def drift(self, model: Any) -> jax.Array:
+        """Drifts of the outputs where they were read, shape (readings,)."""
+        return jnp.tensordot(self.waves, model["drift"][self.run], 2)
 
     def predicted(self, model: Any) -> jax.Array:
         """Outputs where they were read, one after the other, shape (readings,)."""
@@ -94,10 +101,16 @@ def course_of(system: System, seen: Sequence[PreparedOutput], i: int) -> Course:
     """Course of a run, from the prepared outputs."""
     run = seen[0].runs[i]
     index = [k * len(run.u) + s.runs[i].read for k, s in enumerate(seen)]
-    far = APART * float(np.sum(np.asarray(run.dt)))
+    span = float(np.sum(np.asarray(run.dt)))
+    far = APART * span
     time = [far * k + s.time[i] for k, s in enumerate(seen)]
     index, time = np.concatenate(index), np.concatenate(time)
-    return Course(system, run.u, run.dt, *readings_of(time, index), len(index), run.run)
+    readings, waves = readings_of(time, index), np.zeros((0, len(seen), DRIFT))
+    for k, s in enumerate(seen):
+        own = drift_waves(s.time[i] / span)[:, None]
+        waves = np.append(waves, np.pad(own, ((0, 0), (k, len(seen) - 1 - k), (0, 0))), axis=0)
+    waves = jnp.asarray(np.pad(waves, ((0, len(readings[0]) - len(waves)), (0, 0), (0, 0))))
+    return Course(system, run.u, run.dt, *readings, len(index), waves, run.run)
 
 
 _round = partial(Case.search, steps=STEPS)
@@ -119,8 +132,23 @@ def closed(case: Case, model: Any, close: np.ndarray) -> Any:
 
 def trained(case: Case, models: Sequence[Any]) -> Settled:
     """Fit from each start for a round, then from the best until nothing is gained."""
-    enough = GAINED + EACH * sum(len(each) for s in case.seen for each in s.measured)
-    return settled(case, models, _round, lambda found: enough, ROUNDS)
+    return settled(case, models, _round, _enough, ROUNDS)
+
+
+def _enough(found: Settled) -> float:
+    return GAINED + EACH * sum(len(rest) for row in found.rest for rest in row)
+
+
+def beside_drift(case: Case, models: Sequence[Any]) -> tuple[Case, Settled]:
+    """The case with the drift that the outputs want beside a model, and its fit.
+
+    All drifts are free first: a state that grows for ever would take a drift for its own.
+    """
+    whole = case._replace(degree=DRIFT)
+    first = settled(whole, [whole.beside_drift(model) for model in models], _round, _enough, 0)
+    case = case._replace(degree=first.drift_degree(whole))
+    models = [case.beside_drift(model) for model in (*models, first.fit.model)]
+    return case, trained(case, models)
 
 
 def remembering(case: Case, white: Settled) -> Settled:
@@ -305,7 +333,7 @@ def fit_states(
     start = np.tile(start, (len(runs), 1)) if start.ndim < 2 else start
     if len(start) != len(runs):
         raise InputError(f"first states of shape {start.shape}", f"one row for {len(runs)} runs")
-    model = {"p": parameters, "start": start, "nodes": np.zeros((len(runs), 0, start.shape[1]))}
+    model = {"p": parameters, **begun(start, len(runs[0].outputs))}
     nets = tuple(
         f"p.{path}".rstrip(".") for path, net in _networks(parameters) if isinstance(net, MLP)
     )
@@ -321,6 +349,7 @@ def fit_states(
         nodes, close = _nodes(case, model, segments or SEGMENTS)
         shot = trained(case, [closed(case, model | {"nodes": nodes}, close)])
         found = shot if found is None or shot.likelihood < found.likelihood else found
+    case, found = beside_drift(case, [found.fit.model])
     found = remembering(case, found)
     numbers = _numbers(found)
     said = {name.removeprefix("p."): quantity(numbers, i, "")
@@ -337,6 +366,12 @@ def case_of(
     seen = tuple(prepared(runs, name, FIRST_ORDER, late) for name in runs[0].outputs)
     courses = tuple(course_of(system, seen, i) for i in range(len(runs)))
     return Case(seen, courses, tuple(free), tuple(priors))
+
+
+def begun(start: np.ndarray, outputs: int) -> dict[str, np.ndarray]:
+    """First states of runs, shape (runs, n), without segments and drifts, as a model has them."""
+    nodes, drift = np.zeros((len(start), 0, start.shape[1])), np.zeros((len(start), outputs, DRIFT))
+    return {"start": start, "nodes": nodes, "drift": drift}
 
 
 def _networks(parameters: Any) -> list[tuple[str, Any]]:
@@ -414,8 +449,7 @@ def states_answer(
     `by_input` names the quantities that are an input's own.
     """
     used = used_by(found.fit)
-    slopes = found.slopes(case)
-    parts = []
+    slopes, drifts, parts = found.slopes(case), case.drifts(found.fit.model), []
     for k, s in enumerate(case.seen):
         rest = tuple(row[k] for row in found.rest)
         own = [case.split(i, each)[k] for i, each in enumerate(slopes)]
@@ -424,8 +458,9 @@ def states_answer(
         pairs = (RunSlopes(o, a) for o, a in zip(own, added, strict=True))
         noise = RunNoises(s.time, [row[k].each for row in found.noise], found.likely)
         used_each = max(1, used // len(case.seen))
-        checks = checks_of(s, rest, noise, list(pairs), used_each, gain, delay)
-        checks = checks._replace(jitter=float(found.jitter[:, k].max()))
+        slow = [row[k] for row in drifts]
+        checks = checks_of(s, rest, noise, list(pairs), used_each, gain, delay, slow)
+        checks = checks._replace(jitter=float(found.jitter[:, k].max()), drift=case.degree)
         parts.append(StateSpaceOutput(list(runs[0].outputs)[k], runs, s, fitted, checks))
     ahead = _ahead(case, found, held, delay)
     nothing = all(part.checks.nothing_probability >= POOR_FIT for part in parts)
@@ -462,8 +497,8 @@ def _ahead(
     ahead: dict[str, list[HeldOutRun]] = {name: [] for name in held[0].outputs} if held else {}
     for run in held:
         one = case_of((run,), case.courses[0].system, (), (), delay)
-        start = np.mean(np.asarray(found.fit.model["start"]), axis=0)[None]
-        start = {"start": start, "nodes": np.zeros((1, 0, start.shape[1]))}
+        one = one._replace(degree=case.degree)
+        start = begun(np.mean(np.asarray(found.fit.model["start"]), axis=0)[None], len(case.seen))
         for s, r in zip(one.seen, one.ahead(found, start), strict=True):
             ahead[s.output].append(HeldOutRun.of(run.name, r, s.measured[0]))
     names = [s.output for s in case.seen]
