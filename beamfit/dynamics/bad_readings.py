@@ -150,4 +150,3 @@ def _still(each: FreeRun) -> list[np.ndarray]:
 def _lengths(y: np.ndarray) -> np.ndarray:
     """Lengths of series of equal readings."""
     return np.diff(np.flatnonzero(np.diff(y, prepend=np.nan, append=np.nan) != 0))
-

@@ -332,18 +332,28 @@ def variance_of_digits(seen: PreparedOutput, rms: float) -> float:
 
 
 def covariance_of_digits(
-    seen: PreparedOutput, slopes: Sequence[RunSlopes], rms: float
+    outputs: Sequence[tuple[PreparedOutput, np.ndarray, float]],
 ) -> np.ndarray:
-    """Covariance of the model's numbers by the digits of the output: readings of one value were all
+    """Covariance of the model's numbers by the digits of outputs: readings of one value were all
     rounded alike, so that many are worth no more than one.
+
+    Each output comes with the slopes of its readings, shape (readings, p), and the rms residual.
     """
-    own, variance = np.concatenate([each.own for each in slopes]), variance_of_digits(seen, rms)
-    if not variance:
-        return np.zeros((own.shape[1], own.shape[1]))
-    values, which = np.unique(np.concatenate(seen.measured), return_inverse=True)
-    by_value = np.zeros((len(values), own.shape[1]))
-    np.add.at(by_value, which, np.linalg.pinv(own).T)
-    return variance * by_value.T @ by_value
+    variances = [variance_of_digits(seen, rms) for seen, _, rms in outputs]
+    found = np.zeros((outputs[0][1].shape[1],) * 2)
+    if not any(variances):
+        return found
+    weight = np.concatenate([np.full(len(own), 1.0 / max(rms, CLOSE * seen.size_y))
+                             for seen, own, rms in outputs])  # fmt: skip
+    inverse = np.linalg.pinv(weight[:, None] * np.concatenate([own for _, own, _ in outputs]))
+    ends = np.cumsum([len(own) for _, own, _ in outputs])[:-1]
+    parts = np.split((inverse * weight).T, ends)
+    for (seen, _, _), variance, part in zip(outputs, variances, parts, strict=True):
+        values, which = np.unique(np.concatenate(seen.measured), return_inverse=True)
+        by_value = np.zeros((len(values), len(found)))
+        np.add.at(by_value, which, part)
+        found += variance * by_value.T @ by_value
+    return found
 
 
 def slopes_of(seen: PreparedOutput, fit: Fit) -> list[RunSlopes]:

@@ -19,6 +19,7 @@ from beamfit.dynamics.answer import (
     limit_words,
     quantities_of,
     quoted,
+    remarked,
     told,
 )
 from beamfit.dynamics.bad_readings import BadReadings, judged_without
@@ -42,7 +43,6 @@ from beamfit.noise.memory import CorrelatedNoise
 from beamfit.quantity import Quantity
 
 MAPS = ("constant", "network")
-LATEST = "The delay is the longest that was tried: say a longer one by --delay."
 
 
 @answer
@@ -249,8 +249,7 @@ def _answered(
     early = max(-exact, 0.0) if clocks else 0.0
     status, message = judged({output: ResponseEvidence(*evidence, rms, early)})
     quantities, curves = quoted(status, quantities, curves)
-    longest = [LATEST] if not paths.given and exact == latest(runs) > 0 else []
-    message = " ".join([message, *longest, *(f"Left out: {each}." for each in left_out)])
+    message = remarked(message, not paths.given and exact == latest(runs) > 0, left_out)
     noise = tuple(answer.rms[:, 0].tolist())
     parts = (quantities, curves, noise, answer.memory, checks, ahead, left_out)
     return ResponseFit(
@@ -330,7 +329,8 @@ def _known(
     parts = answer.fit, answer.errors
     quantities: dict[str, Quantity] = {}
     if constant:
-        digits = covariance_of_digits(seen, slopes, float(np.sqrt(np.mean(answer.rms**2))))
+        own = np.concatenate([each.own for each in slopes])
+        digits = covariance_of_digits([(seen, own, float(np.sqrt(np.mean(answer.rms**2))))])
         unsure = [unsure_gain(runs, found.path.way, name) for name in seen.inputs]
         quantities = quantities_of(*parts, others, seen, physics, digits, unsure)
     limits = lag_limits(seen, answer, offset) if constant else LagLimits(None, None)

@@ -17,12 +17,15 @@ import numpy as np
 from scipy.linalg import solve_discrete_lyapunov
 from scipy.special import ndtr, ndtri
 
-from beamfit.dynamics.answer import GAIN, PURE, TIME, derived, quantity
-from beamfit.dynamics.fit import MAPS
+from beamfit.dynamics.answer import GAIN, PURE, TIME, derived, quantity, widened
+from beamfit.dynamics.bad_readings import judged_without
+from beamfit.dynamics.fit import AGAIN, MAPS
 from beamfit.dynamics.limits import SINGLE_END, LagLimits
 from beamfit.dynamics.model import WEIGHT
-from beamfit.dynamics.record import Run, check_inputs, checked
+from beamfit.dynamics.paths import Path, Paths
+from beamfit.dynamics.record import Run, Way, check_inputs, checked, unsure_gain
 from beamfit.dynamics.search import (
+    BETTER,
     DRIFT,
     LONGEST,
     Case,
@@ -33,10 +36,12 @@ from beamfit.dynamics.search import (
     used_by,
 )
 from beamfit.dynamics.state_fit import (
+    PLAIN,
+    BegunStates,
     Course,
     StatesFit,
+    at_start,
     begun,
-    beside_drift,
     case_of,
     remembering,
     states_answer,
@@ -251,7 +256,7 @@ def padded(model: dict[str, Any], size: int) -> dict[str, Any]:
     around[np.ix_(at, at)] = p["around"]
     wide = {"z": np.pad(p["z"], ((0, more), (0, 0))), "c": np.pad(p["c"], ((0, 0), (0, more)))}
     start = np.pad(model["start"], ((0, 0), (0, more)))
-    return {"p": p | wide | {"around": around}, **begun(start, len(p["c"]))}
+    return {"p": p | wide | {"around": around}, **at_start(start, len(p["c"]))}
 
 
 def stripped(model: dict[str, Any], n: int) -> dict[str, Any]:
@@ -276,8 +281,8 @@ class TriedOrder(NamedTuple):
 
     order: int
     direct: bool
-    case: Case
-    found: Settled
+    begun: BegunStates
+    bic: float = np.nan
 
 
 def count_of(case: Case) -> int:
@@ -291,30 +296,80 @@ def largest_order(case: Case) -> int:
     return int((count_of(case) / EACH - k * (m + 1)) / (m + k + len(case.courses)))
 
 
-def orders(case: Case, order: int | None, offset: bool) -> tuple[TriedOrder, list[dict[str, Any]]]:
-    """Fit 1, 2, … states, or as many as asked for; give the best, and what was tried."""
-    tried: list[TriedOrder] = []
-    for n in [order] if order else range(1, min(SIZES[-1], largest_order(case)) + 1):
-        tried.append(_tried(case, n, offset, tried[-1] if tried else None))
-        told = criterion(case, [t.found for t in tried])
-        if n - tried[int(np.argmin(told))].order >= BEYOND:
-            break
-    full = tried[int(np.argmin(told))]
-    model = full.found.fit.model
-    p = model["p"] | {"d": model["p"]["d"].at[:, : len(case.seen[0].inputs)].set(0.0)}
-    bounded = full.case._replace(free=free_of(case, full.order, len(p["z"]), offset, False))
-    plain = TriedOrder(full.order, False, bounded, trained(bounded, [model | {"p": p}]))
-    tried.append(plain)
-    told = criterion(case, [t.found for t in tried], tried[-2].found)
-    best = plain if told[-1] <= min(told[:-1]) else full
-    return best, [{"order": t.order, "direct": t.direct, "bic": v}
-                  for t, v in zip(tried, told, strict=True)]  # fmt: skip
+class StatesSearch(NamedTuple):
+    """States of a linear system if said, its paths, and if outputs at rest are free numbers."""
+
+    order: int | None
+    paths: Paths
+    offset: bool
+
+    def found(self, runs: tuple[Run, ...]) -> tuple[TriedOrder, ...]:
+        """The likeliest order by the likeliest path, and what else was tried there."""
+        first = min(self.paths.delays, key=abs)
+        tried = self.orders(runs, Path(None, Way(), first))
+        for _ in range(AGAIN):
+            path = self.path(runs, tried[0])
+            if path == tried[0].begun.path:
+                break
+            tried = self.orders(runs, path)
+        return tried
+
+    def path(self, runs: tuple[Run, ...], best: TriedOrder) -> Path:
+        """The likeliest path about a fit: each next one with as many states, or a sample later and
+        with one less, which a state may have stood for.
+        """
+        while True:
+            at, n = best.begun.path, best.order
+            near = [(at._replace(way=way), n) for way in self.paths.ways]
+            near += [(at._replace(delay=at.delay + late), n) for late in (-1.0, 1.0)]
+            near += [(at._replace(delay=at.delay + 1.0), n - 1)] if n > 1 and not self.order else []
+            others = [_tried(case_of(runs, LINEAR, (), (), path), path, states, self.offset,
+                             best.direct, None)
+                      for path, states in near
+                      if path != at and path.delay in self.paths.delays]  # fmt: skip
+            told = criterion([each.begun for each in (best, *others)], best.begun)
+            found = min(zip(told, (best, *others), strict=True), key=self._cost)[1]
+            if found is best:
+                return at
+            best = found
+
+    def _cost(self, told: tuple[float, TriedOrder]) -> float:
+        """The criterion with the prior of the path; a longer delay must be `BETTER`."""
+        cost, path = told[0], told[1].begun.path
+        return cost - 2.0 * self.paths.log_prior(path) + 2.0 * BETTER * abs(path.delay)
+
+    def orders(self, runs: tuple[Run, ...], path: Path) -> tuple[TriedOrder, ...]:
+        """Fits of 1, 2, … states, or as many as said, the likeliest first; that also without a
+        direct path from inputs to outputs.
+        """
+        case = case_of(runs, LINEAR, (), (), path)
+        tried: list[TriedOrder] = []
+        most = min(SIZES[-1], largest_order(case))
+        for n in [self.order] if self.order else range(1, most + 1):
+            before = tried[-1] if tried else None
+            tried.append(_tried(case, path, n, self.offset, True, before))
+            told = criterion([each.begun for each in tried])
+            if n - tried[int(np.argmin(told))].order >= BEYOND:
+                break
+        full, last = tried[int(np.argmin(told))], tried[-1]
+        model = full.begun.found.fit.model
+        p = model["p"] | {"d": model["p"]["d"].at[:, : len(case.seen[0].inputs)].set(0.0)}
+        free = free_of(case, full.order, len(p["z"]), self.offset, False)
+        bounded = full.begun.case._replace(free=free)
+        plain = BegunStates(bounded, trained(bounded, [model | {"p": p}]), path)
+        tried.append(TriedOrder(full.order, False, plain))
+        told = criterion([each.begun for each in tried], last.begun)
+        return tuple(tried[k]._replace(bic=told[k]) for k in np.argsort(told, kind="stable"))
 
 
-def criterion(case: Case, found: Sequence[Settled], last: Settled | None = None) -> list[float]:
-    """The Bayesian information criterion of fits under the noise, with its memory, of the last."""
-    noise = _noise_of(case, last or found[-1])
-    return [information(case, each, noise) for each in found]
+def criterion(tried: Sequence[BegunStates], last: BegunStates | None = None) -> list[float]:
+    """The Bayesian information criterion of fits under the noise, with its memory, of the last.
+
+    By the readings that all of them have: those of a longer delay begin later.
+    """
+    noise = _noise_of((last or tried[-1]).case, (last or tried[-1]).found)
+    lengths = [[len(rest) for row in each.found.rest for rest in row] for each in tried]
+    return [information(each.case, each.found, noise, np.min(lengths, axis=0)) for each in tried]
 
 
 def _noise_of(case: Case, found: Settled) -> CorrelatedNoise | None:
@@ -339,16 +394,19 @@ def free_of(case: Case, order: int, size: int, offset: bool, direct: bool) -> tu
                  for name, on in parts.items())  # fmt: skip
 
 
-def _tried(case: Case, n: int, offset: bool, before: TriedOrder | None) -> TriedOrder:
+def _tried(
+    case: Case, path: Path, n: int, offset: bool, direct: bool, before: TriedOrder | None
+) -> TriedOrder:
     """The fit of an order from its best realisations, and from the order before and one more."""
     size = next((s for s in SIZES if s >= n), n)
-    bounded = case._replace(free=free_of(case, n, size, offset, True))
+    bounded = case._replace(free=free_of(case, n, size, offset, direct))
     units, k = _units(case, offset), len(case.seen)
     u, y = _scaled(case, units, offset)
     m, rest = u[0].shape[1], np.zeros((len(y), n))
 
     def model(a, b, c, d, start=rest):
         around, c, to = normal_form(a, b, c)
+        d = np.where(direct | (np.arange(m) >= m - offset), d, 0.0)
         p = {"z": np.zeros((n, m)), "around": around, "c": c, "d": d, "units": units}
         return padded({"p": p, "start": start @ to.T}, size)
 
@@ -358,7 +416,7 @@ def _tried(case: Case, n: int, offset: bool, before: TriedOrder | None) -> Tried
     best = [i for i in np.argsort(missed, kind="stable") if np.isfinite(missed[i])]
     models = [models[i] for i in best[:BEGINS]]
     if before is not None:
-        old, last = before.order, before.found.fit.model
+        old, last = before.order, before.begun.found.fit.model
         a, b, c, d, _ = map(np.asarray, LINEAR.matrices(last["p"]))
         a = np.diag([*np.zeros(old), NEW]) + np.pad(a[:old, :old], ((0, 1), (0, 1)))
         b, c = np.vstack([b[:old], np.ones(m)]), np.hstack([c[:, :old], np.full((k, 1), FAINT)])
@@ -367,7 +425,7 @@ def _tried(case: Case, n: int, offset: bool, before: TriedOrder | None) -> Tried
     if not models:  # runs too short for a regression
         a = np.diag(NEW ** np.arange(1.0, n + 1))
         models = [model(a, np.ones((n, m)), np.full((k, n), FAINT), np.zeros((k, m)))]
-    return TriedOrder(n, True, *beside_drift(bounded, models))
+    return TriedOrder(n, direct, begun(bounded, models, path))
 
 
 def _missed(case: Case, model: Any) -> float:
@@ -406,7 +464,7 @@ def identify_states(
     order: int | None = None,
     map: str = "constant",
     *,
-    delay: int = 0,
+    delay: int | None = None,
     offset: bool = True,
     hidden: int = 5,
     starts: int = 5,
@@ -424,8 +482,9 @@ def identify_states(
         ones are no better, 10 at most.
     map : {"constant", "network"}
         With ``"network"`` the next state has a network of state and inputs added.
-    delay : int
-        Samples by which the outputs follow late.
+    delay : int, optional
+        Samples by which the outputs follow late; found beside the order if None. Below zero where
+        the clocks of inputs and outputs differ.
     offset : bool
         Whether the outputs at rest are free numbers; else they are 0 where the inputs are.
     hidden, starts, seed : int
@@ -469,24 +528,48 @@ def identify_states(
         raise InputError(f"map '{map}'", nearest(map, list(MAPS)))
     runs, held = checked(runs, held, True)
     check_inputs(runs)
-    case = case_of(runs, LINEAR, (), (), delay)
-    _check_order(case, runs, order or 1)
-    best, tried = orders(case, order, offset)
-    n, found, gain = best.order, [best.found], None
-    if map == "network":
-        nets = _networks(best, hidden, range(seed, seed + starts))
-        free = [f for f in free_of(case, n, n, offset, best.direct) if f.path != "start"]
-        free += [Free("start", nuisance=True), Free("p.net", nuisance=True)]
-        case = case_of(runs, NETWORK, free, [Prior("p.net", 0.0, WEIGHT)], delay)
-        case = case._replace(degree=best.case.degree)
-        found = likely(case, [trained(case, [net]) for net in nets])
-        gain = criterion(best.case, [best.found])[0] - criterion(case, found[:1])[0]
-    case = best.case if map == "constant" else case
-    found = [remembering(case, each) for each in found]
-    said, gains = _quantities(case, found, n, runs, offset)
-    more = {"delay_samples": delay, "tried": tried, "matrices": _matrices(case, found, n)}
-    judged = {"held": held, "map": map, "gain": gain, "delay": delay, "order": n}
-    return states_answer(case, found[0], runs, said, by_input=gains, more=more, **judged)
+    given = None if delay is None else float(delay)
+    search = StatesSearch(order, Paths.of(runs, given, True), offset)
+    _check_order(case_of(runs, LINEAR, (), ()), runs, order or 1)
+    asked = _Identification(search, map, hidden, range(seed, seed + starts), held)
+    return judged_without(
+        runs, search.found, lambda runs, tried: tried[0].begun.beside(runs), asked.answer
+    )
+
+
+class _Identification(NamedTuple):
+    """Settings of an identification."""
+
+    search: StatesSearch
+    map: str
+    hidden: int
+    seeds: range
+    held: tuple[Run, ...]
+
+    def answer(
+        self, runs: tuple[Run, ...], tried: tuple[TriedOrder, ...], left_out: Any
+    ) -> StatesFit:
+        """Judge runs whose orders were tried, the likeliest first."""
+        best, offset = tried[0], self.search.offset
+        (case, found, path), n, gain = best.begun, best.order, None
+        fits = [found]
+        if self.map == "network":
+            nets = _networks(best, self.hidden, self.seeds)
+            free = [f for f in free_of(case, n, n, offset, best.direct) if f.path != "start"]
+            free += [Free("start", nuisance=True), Free("p.net", nuisance=True)]
+            priors = [Prior("p.net", 0.0, WEIGHT)]
+            case = case_of(runs, NETWORK, free, priors, path)._replace(degree=case.degree)
+            fits = likely(case, [trained(case, [net]) for net in nets])
+            linear, bent = criterion([best.begun, BegunStates(case, fits[0], path)], best.begun)
+            gain = linear - bent
+        fits = [BegunStates(case, remembering(case, each), path) for each in fits]
+        said, gains = _quantities(fits, n, runs, offset)
+        rows = [{"order": t.order, "direct": t.direct, "bic": t.bic}
+                for t in sorted(tried, key=lambda t: (not t.direct, t.order))]  # fmt: skip
+        more = {"delay_samples": int(path.delay), "tried": rows, "matrices": _matrices(fits, n)}
+        judged = {"map": self.map, "gain": gain, "order": n, "given": self.search.paths.given}
+        judged |= {"held": self.held, "left_out": left_out, "by_input": gains, "more": more}
+        return states_answer(fits[0], runs, said, **judged)
 
 
 def likely(case: Case, found: Sequence[Settled]) -> list[Settled]:
@@ -495,17 +578,18 @@ def likely(case: Case, found: Sequence[Settled]) -> list[Settled]:
     Draws from the posterior about an optimum of p numbers lie above its -2 ln L by chi-square of p
     degrees of freedom, by p in the mean: an end that is nearer is another part of the posterior.
     """
-    told = np.array(criterion(case, found, min(found, key=lambda each: each.likelihood)))
+    each = [BegunStates(case, fit, PLAIN) for fit in found]
+    told = np.array(criterion(each, min(each, key=lambda one: one.found.likelihood)))
     best, *others = np.argsort(np.where(np.isfinite(told), told, np.inf))
     most = told[best] + used_by(found[best].fit)
     return [found[best], *(found[i] for i in others if told[i] <= most)]
 
 
-def _derived(found: Sequence[Settled], function: Any, asked: UsedStates) -> Derived:
+def _derived(fits: Sequence[BegunStates], function: Any, asked: UsedStates) -> Derived:
     """Numbers of the best fit; within their errors 68 % of all fits' posterior lies, each of which
     counts as much: the posterior of a network is bent, and each tells a part of it.
     """
-    each = [derived(f.fit, f.errors, function, asked) for f in found]
+    each = [derived(f.found.fit, f.found.errors, function, asked) for f in fits]
     if len(each) == 1:
         return each[0]
     values, errors = (np.stack([getattr(one, name) for one in each]) for name in ("value", "error"))
@@ -555,12 +639,12 @@ def _check_order(case: Case, runs: Sequence[Run], order: int) -> None:
 
 def _networks(best: TriedOrder, hidden: int, seeds: range) -> list[dict[str, Any]]:
     """Models with networks of small random weights beside the linear part."""
-    model = stripped(best.found.fit.model, best.order)
+    model = stripped(best.begun.found.fit.model, best.order)
     p, (n, m) = model["p"], model["p"]["z"].shape
     moved = LINEAR.linear(p)._replace(c=jnp.eye(n), d=jnp.zeros((n, m)), offset=jnp.zeros(n))
     run = jax.jit(lambda u, x0: linear_outputs(moved, u, x0)[0])
     x = [np.asarray(run(LINEAR.scaled(p, c.u), model["start"][i]))
-         for i, c in enumerate(best.case.courses)]  # fmt: skip
+         for i, c in enumerate(best.begun.case.courses)]  # fmt: skip
     sizes = {"sizes": np.concatenate(x).std(0)}
     sizes["steps"] = np.concatenate([np.diff(each, axis=0) for each in x]).std(0)
     found = []
@@ -598,12 +682,16 @@ def _quoted(model: Any, asked: UsedStates) -> jax.Array:
 
 
 def _quantities(
-    case: Case, found: Sequence[Settled], n: int, runs: Sequence[Run], offset: bool
+    fits: Sequence[BegunStates], n: int, runs: Sequence[Run], offset: bool
 ) -> tuple[dict[str, Quantity], dict[str, list[str]]]:
     """Time constants from the slowest, gains and levels; and the names of each input's gains."""
-    numbers = _derived(found, _quoted, UsedStates(n, case.courses[0]))
-    step, said = float(case.courses[0].dt[0]), {}
+    course, path = fits[0].case.courses[0], fits[0].path
+    step, said = float(course.dt[0]), {}
     inputs, outputs = list(runs[0].inputs), list(runs[0].outputs)
+    numbers = _derived(fits, _quoted, UsedStates(n, course))
+    unsure = [0.0] * (5 * n) + [unsure_gain(runs, path.way, name) for name in inputs] * len(outputs)
+    unsure += [0.0] * (len(numbers.value) - len(unsure))
+    numbers = widened(numbers, fits[0].digits(), np.array(unsure))
     tau, time, zeta, pole, turn = np.arange(5 * n).reshape(5, n)
     slow = [i for i in np.argsort(-numbers.value[time]) if numbers.value[turn[i]] >= 0.0]
     endless = False  # a pole is compatible with 1, so that gains are with infinity
@@ -669,21 +757,21 @@ def _taylor(model: Any, asked: UsedStates) -> jax.Array:
                              to @ b[:n, : len(size_u)] / size_u])  # fmt: skip
 
 
-def _matrices(case: Case, found: Sequence[Settled], n: int) -> dict[str, Any]:
+def _matrices(fits: Sequence[BegunStates], n: int) -> dict[str, Any]:
     """A, B, C, D in the units of the record, for inputs less their mean.
 
     Of as many states as outputs, all of which are read, also the first terms of report eq 2 with
     errors: the states are the outputs, so that no change of basis is open.
     """
-    more = {}
+    case, more = fits[0].case, {}
     if n == len(case.seen):
-        read = _derived(found, _taylor, UsedStates(n, case.courses[0]))
+        read = _derived(fits, _taylor, UsedStates(n, case.courses[0]))
         ends = {"A": slice(n), "B": slice(n, None)}
         more["outputs_as_states"] = {
             name + said: part[:, ends[name]] for name in ends
             for said, part in (("", read.value), ("_error", read.error))
         }  # fmt: skip
-    p = found[0].fit.model["p"]
+    p = fits[0].found.fit.model["p"]
     a, b, c, d, _ = map(np.asarray, case.courses[0].system.matrices(p))
     (mean_u, size_u), (mean_y, size_y) = (np.asarray(p["units"][kind]) for kind in "uy")
     by, m = size_y[:, None], len(mean_u)

@@ -603,9 +603,19 @@ def used_by(fit: Fit) -> int:
     return max(round(sum(group.count - group.dof for group in fit.groups)), 1)
 
 
-def information(case: Case, found: Settled, noise: CorrelatedNoise | None) -> float:
-    """The Bayesian information criterion of a fit under a noise with a memory, or without."""
+def information(
+    case: Case,
+    found: Settled,
+    noise: CorrelatedNoise | None,
+    lengths: Sequence[int] | None = None,
+) -> float:
+    """The Bayesian information criterion of a fit under a noise with a memory, or without, by all
+    readings or by the last ones of each run and output.
+    """
     rows = case.rows(found.rest, found.noise)
+    if lengths is not None:
+        rows = [(*(each[-n:] for each in row[:3]), row[3])
+                for row, n in zip(rows, lengths, strict=True)]  # fmt: skip
     cost = used_by(found.fit) * np.log(sum(len(rest) for rest, *_ in rows))
     return float(cost + sum(_minus(*row, noise) for row in rows))
 

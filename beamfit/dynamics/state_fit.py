@@ -15,10 +15,27 @@ import jax.numpy as jnp
 import numpy as np
 
 from beamfit.answer import Table, answer, json_of
-from beamfit.dynamics.answer import ResponseEvidence, judged, limit_words, quantity, quoted
-from beamfit.dynamics.checks import Checks, HeldOutRun, RunNoises, RunSlopes, checks_of, percent
+from beamfit.dynamics.answer import (
+    ResponseEvidence,
+    judged,
+    limit_words,
+    quantity,
+    quoted,
+    remarked,
+    widened,
+)
+from beamfit.dynamics.bad_readings import BadReadings, FreeRun, judged_without
+from beamfit.dynamics.checks import (
+    Checks,
+    HeldOutRun,
+    RunNoises,
+    RunSlopes,
+    checks_of,
+    covariance_of_digits,
+    percent,
+)
 from beamfit.dynamics.model import PreparedOutput, readings_of, weight_priors
-from beamfit.dynamics.paths import Path, prepared
+from beamfit.dynamics.paths import Path, latest, prepared
 from beamfit.dynamics.record import Run, Way, checked
 from beamfit.dynamics.response import FIRST_ORDER
 from beamfit.dynamics.search import (
@@ -48,6 +65,8 @@ STEPS, ROUNDS, EACH = 25, 80, 1e-4
 CLOSING = (1.0, 0.1, 1e-2, 1e-3, 1e-4)
 # Distance in time between the series of two outputs, in lengths of the run: no correlation is left.
 APART = 1e6
+# A path of inputs that hold from sample to sample and come at once.
+PLAIN = Path(None, Way(), 0.0)
 # Factor by which a fit with correlated noise may leave larger squares than the fit without.
 WORSE = 1.5
 
@@ -139,16 +158,42 @@ def _enough(found: Settled) -> float:
     return GAINED + EACH * sum(len(rest) for row in found.rest for rest in row)
 
 
-def beside_drift(case: Case, models: Sequence[Any]) -> tuple[Case, Settled]:
-    """The case with the drift that the outputs want beside a model, and its fit.
+class BegunStates(NamedTuple):
+    """Runs as a state space sees them behind a path, and the fit."""
+
+    case: Case
+    found: Settled
+    path: Path
+
+    def beside(self, runs: tuple[Run, ...]) -> list[FreeRun]:
+        """Readings of some runs beside the fit of others."""
+        case = case_of(runs, self.case.courses[0].system, (), (), self.path)
+        rest = case.rest(self.found.fit.model)
+        return [
+            FreeRun(s.output, self.path.delay, s.size_y, s.measured,
+                    [y - row[k] for y, row in zip(s.measured, rest, strict=True)])
+            for k, s in enumerate(case.seen)
+        ]  # fmt: skip
+
+    def digits(self) -> np.ndarray:
+        """Covariance of the free numbers by the digits of the outputs."""
+        case, slopes, rms = self.case, self.found.slopes(self.case), self.found.rms
+        parts = [case.split(i, each) for i, each in enumerate(slopes)]
+        return covariance_of_digits([
+            (s, np.concatenate([row[k] for row in parts]), float(np.sqrt(np.mean(rms[:, k] ** 2))))
+            for k, s in enumerate(case.seen)
+        ])  # fmt: skip
+
+
+def begun(case: Case, models: Sequence[Any], path: Path = PLAIN) -> BegunStates:
+    """The fit beside the drift that the outputs want.
 
     All drifts are free first: a state that grows for ever would take a drift for its own.
     """
     whole = case._replace(degree=DRIFT)
     first = settled(whole, [whole.beside_drift(model) for model in models], _round, _enough, 0)
     case = case._replace(degree=first.drift_degree(whole))
-    models = [case.beside_drift(model) for model in (*models, first.fit.model)]
-    return case, trained(case, models)
+    return BegunStates(case, trained(case, [case.beside_drift(first.fit.model)]), path)
 
 
 def remembering(case: Case, white: Settled) -> Settled:
@@ -200,6 +245,8 @@ class StatesFit:
         How the noise of all outputs wanders; None where it does not.
     held : dict of str to tuple of HeldOutRun
         How runs are predicted that were not used, by output.
+    left_out : tuple of BadReadings
+        Readings that show no output; they are missing from ``runs``.
     more : dict
         Further entries of the JSON.
     """
@@ -215,6 +262,7 @@ class StatesFit:
     noise: np.ndarray
     memory: CorrelatedNoise | None
     held: dict[str, tuple[HeldOutRun, ...]]
+    left_out: tuple[BadReadings, ...]
     more: dict[str, Any]
 
     @property
@@ -259,6 +307,7 @@ class StatesFit:
             | {"noise_rms": self.noise, "noise_memory": self.memory}
             | {"checks": {part.output: part.checks._asdict() for part in self.parts}}
             | {"held_back": {k: [h._asdict() for h in v] for k, v in self.held.items()}}
+            | {"left_out": self.left_out}
             | self.more
         )
 
@@ -333,7 +382,7 @@ def fit_states(
     start = np.tile(start, (len(runs), 1)) if start.ndim < 2 else start
     if len(start) != len(runs):
         raise InputError(f"first states of shape {start.shape}", f"one row for {len(runs)} runs")
-    model = {"p": parameters, **begun(start, len(runs[0].outputs))}
+    model = {"p": parameters, **at_start(start, len(runs[0].outputs))}
     nets = tuple(
         f"p.{path}".rstrip(".") for path, net in _networks(parameters) if isinstance(net, MLP)
     )
@@ -342,33 +391,44 @@ def fit_states(
         free = [Free(n, nuisance=any(n.startswith(f"{net}.") for net in nets)) for n in names]
     free = [*free, *([] if known else [Free("start", nuisance=True)])]
     inside = [prior for net in nets for prior in weight_priors(net)]
-    case = case_of(runs, system, free, (*inside, *priors), 0)
-    _check_outputs(case, model)
+
+    def search(runs: tuple[Run, ...]) -> BegunStates:
+        case = case_of(runs, system, free, (*inside, *priors))
+        _check_outputs(case, model)
+        return begun(case, [_free_run(case, model, segments).fit.model])
+
+    def answer(runs: tuple[Run, ...], found: BegunStates, left_out: Any) -> StatesFit:
+        found = found._replace(found=remembering(found.case, found.found))
+        options = {"held": held, "left_out": left_out, "map": "network" if nets else "constant"}
+        return states_answer(found, runs, _told(found), **options)
+
+    return judged_without(runs, search, lambda runs, found: found.beside(runs), answer)
+
+
+def _free_run(case: Case, model: Any, segments: int | None) -> Settled:
+    """The fit of a free run, by segments where that goes astray."""
     found = None if segments is not None and segments > 1 else trained(case, [model])
     if found is None or (segments is None and not min(_explained(case, found)) > ASTRAY):
         nodes, close = _nodes(case, model, segments or SEGMENTS)
         shot = trained(case, [closed(case, model | {"nodes": nodes}, close)])
         found = shot if found is None or shot.likelihood < found.likelihood else found
-    case, found = beside_drift(case, [found.fit.model])
-    found = remembering(case, found)
-    numbers = _numbers(found)
-    said = {name.removeprefix("p."): quantity(numbers, i, "")
-            for i, name in enumerate(found.fit.problem.names)
-            if name.startswith("p.") and not found.fit.problem.nuisance[i]}  # fmt: skip
-    return states_answer(case, found, runs, said, held=held, map="network" if nets else "constant")
+    return found
 
 
 def case_of(
-    runs: Sequence[Run], system: System, free: Sequence[Free], priors: Sequence[Prior], delay: int
+    runs: Sequence[Run],
+    system: System,
+    free: Sequence[Free],
+    priors: Sequence[Prior],
+    path: Path = PLAIN,
 ) -> Case:
     """The runs as the model sees them."""
-    late = Path(None, Way(), float(delay))
-    seen = tuple(prepared(runs, name, FIRST_ORDER, late) for name in runs[0].outputs)
+    seen = tuple(prepared(runs, name, FIRST_ORDER, path) for name in runs[0].outputs)
     courses = tuple(course_of(system, seen, i) for i in range(len(runs)))
     return Case(seen, courses, tuple(free), tuple(priors))
 
 
-def begun(start: np.ndarray, outputs: int) -> dict[str, np.ndarray]:
+def at_start(start: np.ndarray, outputs: int) -> dict[str, np.ndarray]:
     """First states of runs, shape (runs, n), without segments and drifts, as a model has them."""
     nodes, drift = np.zeros((len(start), 0, start.shape[1])), np.zeros((len(start), outputs, DRIFT))
     return {"start": start, "nodes": nodes, "drift": drift}
@@ -389,14 +449,17 @@ def _check_outputs(case: Case, model: Any) -> None:
         raise InputError(found, f"{len(case.seen)} outputs and {model['start'][0].shape} states")
 
 
-def _numbers(found: Settled) -> Derived:
-    """The free numbers with errors."""
-    rows = [(v.value, v.error, v.error_raw) for v in found.fit.variables]
-    value, error, raw = np.array(rows).T
+def _told(begun: BegunStates) -> dict[str, Quantity]:
+    """The free numbers of the equations with errors."""
+    found = begun.found
+    value, error, raw = np.array([(v.value, v.error, v.error_raw) for v in found.fit.variables]).T
     one = np.eye(len(value))
     if found.errors is not None:
         error = np.where(np.isfinite(error), found.errors.moments(one).error, np.nan)
-    return Derived(value, error, raw, np.zeros(len(value)), one)
+    numbers = widened(Derived(value, error, raw, np.zeros(len(value)), one), begun.digits())
+    return {name.removeprefix("p."): quantity(numbers, i, "")
+            for i, name in enumerate(found.fit.problem.names)
+            if name.startswith("p.") and not found.fit.problem.nuisance[i]}  # fmt: skip
 
 
 def _explained(case: Case, found: Settled) -> list[float]:
@@ -431,23 +494,24 @@ def _nodes(case: Case, model: Any, segments: int) -> tuple[np.ndarray, np.ndarra
 
 
 def states_answer(
-    case: Case,
-    found: Settled,
+    begun: BegunStates,
     runs: tuple[Run, ...],
     quantities: Mapping[str, Quantity],
     *,
     held: Sequence[Run] = (),
+    left_out: tuple[BadReadings, ...] = (),
     map: str = "constant",
     order: int | None = None,
     gain: float | None = None,
-    delay: int = 0,
+    given: bool = True,
     by_input: Mapping[str, Sequence[str]] | None = None,
     more: Mapping[str, Any] | None = None,
 ) -> StatesFit:
     """Judge a fit: tests of each output's residuals, held-back runs, the verdict.
 
-    `by_input` names the quantities that are an input's own.
+    `by_input` names the quantities that are an input's own; `given` tells if the delay is.
     """
+    (case, found, path), delay = begun, int(begun.path.delay)
     used = used_by(found.fit)
     slopes, drifts, parts = found.slopes(case), case.drifts(found.fit.model), []
     for k, s in enumerate(case.seen):
@@ -457,29 +521,31 @@ def states_answer(
         added = [_added(s, i, y) for i, y in enumerate(fitted)]
         pairs = (RunSlopes(o, a) for o, a in zip(own, added, strict=True))
         noise = RunNoises(s.time, [row[k].each for row in found.noise], found.likely)
-        used_each = max(1, used // len(case.seen))
+        used_each = max(1, used // len(case.seen)) + (not given)
         slow = [row[k] for row in drifts]
         checks = checks_of(s, rest, noise, list(pairs), used_each, gain, delay, slow)
-        checks = checks._replace(jitter=float(found.jitter[:, k].max()), drift=case.degree)
+        own = {"jitter": float(found.jitter[:, k].max()), "drift": case.degree, "way": path.way}
+        checks = checks._replace(**own)
         parts.append(StateSpaceOutput(list(runs[0].outputs)[k], runs, s, fitted, checks))
-    ahead = _ahead(case, found, held, delay)
+    ahead = _ahead(begun, held)
     nothing = all(part.checks.nothing_probability >= POOR_FIT for part in parts)
     joint = {q for name in parts[0].checks.together for q in (by_input or {}).get(name, ())}
     told = {n: q.open() if nothing or n in joint else q for n, q in quantities.items()}
     evidence = {
         part.output: ResponseEvidence(
             found.fit, found.rests, part.checks, told, (), ahead[part.output], map,
-            float(np.sqrt(np.mean(found.rms[:, k] ** 2))),
+            float(np.sqrt(np.mean(found.rms[:, k] ** 2))), 0.0 if given else max(-path.delay, 0.0),
         )
         for k, part in enumerate(parts)
     }  # fmt: skip
     status, message = judged(evidence)
     told, _ = quoted(status, told)
+    message = remarked(message, not given and delay == latest(runs) > 0, left_out)
     order = order or found.fit.model["start"].shape[1]
     held_back = ahead if held else {}
     return StatesFit(
         status, message, map, order, runs, tuple(parts), found.fit, told, found.rms,
-        found.memory, held_back, dict(more or {}),
+        found.memory, held_back, left_out, dict(more or {}),
     )  # fmt: skip
 
 
@@ -490,16 +556,14 @@ def _added(seen: PreparedOutput, i: int, fitted: np.ndarray) -> np.ndarray:
     return np.concatenate([y**2, y**3, u**2, u * y], axis=1)
 
 
-def _ahead(
-    case: Case, found: Settled, held: Sequence[Run], delay: int
-) -> dict[str, tuple[HeldOutRun, ...]]:
-    """Predict runs that were held back; only the state at their start is estimated."""
-    ahead: dict[str, list[HeldOutRun]] = {name: [] for name in held[0].outputs} if held else {}
+def _ahead(begun: BegunStates, held: Sequence[Run]) -> dict[str, tuple[HeldOutRun, ...]]:
+    """Predict runs that were held back; only their start and drift are estimated."""
+    case, found, path = begun
+    ahead: dict[str, list[HeldOutRun]] = {s.output: [] for s in case.seen}
     for run in held:
-        one = case_of((run,), case.courses[0].system, (), (), delay)
-        one = one._replace(degree=case.degree)
-        start = begun(np.mean(np.asarray(found.fit.model["start"]), axis=0)[None], len(case.seen))
-        for s, r in zip(one.seen, one.ahead(found, start), strict=True):
+        one = case_of((run,), case.courses[0].system, (), (), path)._replace(degree=case.degree)
+        start = np.mean(np.asarray(found.fit.model["start"]), axis=0)[None]
+        rest = one.ahead(found, at_start(start, len(case.seen)))
+        for s, r in zip(one.seen, rest, strict=True):
             ahead[s.output].append(HeldOutRun.of(run.name, r, s.measured[0]))
-    names = [s.output for s in case.seen]
-    return {name: tuple(ahead.get(name, ())) for name in names}
+    return {name: tuple(each) for name, each in ahead.items()}

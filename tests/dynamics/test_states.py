@@ -11,7 +11,7 @@ from scipy.signal import cont2discrete, dlsim, lfilter
 from beamfit.dynamics.linear import criterion, identify_states, joint_error
 from beamfit.dynamics.record import Run
 from beamfit.dynamics.search import Case, ReadingErrors
-from beamfit.dynamics.state_fit import fit_states
+from beamfit.dynamics.state_fit import PLAIN, BegunStates, fit_states
 from beamfit.dynamics.states import StateSpace
 from beamfit.errors import InputError, Status
 
@@ -160,7 +160,8 @@ def test_an_order_is_worth_what_it_adds_to_what_readings_before_foretell():
         noise = ((ReadingErrors(np.full(n, 0.3)),),)
         return SimpleNamespace(rest=((0.3 * rest / rest.std(),),), noise=noise, fit=fit)
 
-    rough, smooth, more = criterion(case, [missed(0.9, 3), missed(0.99, 6), missed(0.99, 7)])
+    tried = [missed(0.9, 3), missed(0.99, 6), missed(0.99, 7)]
+    rough, smooth, more = criterion([BegunStates(case, each, PLAIN) for each in tried])
     assert smooth < rough - 100.0
     assert more - smooth == pytest.approx(np.log(n))
 
