@@ -33,19 +33,20 @@ from beamfit.dynamics.search import (
     drift_waves,
     information,
     noise_of,
+    settled,
     used_by,
+    with_memory,
 )
 from beamfit.dynamics.state_fit import (
     PLAIN,
+    WORSE,
     BegunStates,
     Course,
     StatesFit,
     at_start,
     begun,
     case_of,
-    remembering,
     states_answer,
-    trained,
 )
 from beamfit.dynamics.states import Matrices, contraction, linear_outputs
 from beamfit.errors import InputError, nearest
@@ -303,10 +304,14 @@ class StatesSearch(NamedTuple):
     paths: Paths
     offset: bool
 
-    def found(self, runs: tuple[Run, ...]) -> tuple[TriedOrder, ...]:
-        """The likeliest order by the likeliest path, and what else was tried there."""
-        first = min(self.paths.delays, key=abs)
-        tried = self.orders(runs, Path(None, Way(), first))
+    def begun(self, runs: tuple[Run, ...]) -> tuple[TriedOrder, ...]:
+        """Orders by the shortest delay of inputs that are as they were read."""
+        return self.orders(runs, Path(None, Way(), min(self.paths.delays, key=abs)))
+
+    def likeliest(
+        self, runs: tuple[Run, ...], tried: tuple[TriedOrder, ...]
+    ) -> tuple[TriedOrder, ...]:
+        """Orders by the likeliest path."""
         for _ in range(AGAIN):
             path = self.path(runs, tried[0])
             if path == tried[0].begun.path:
@@ -356,7 +361,7 @@ class StatesSearch(NamedTuple):
         p = model["p"] | {"d": model["p"]["d"].at[:, : len(case.seen[0].inputs)].set(0.0)}
         free = free_of(case, full.order, len(p["z"]), self.offset, False)
         bounded = full.begun.case._replace(free=free)
-        plain = BegunStates(bounded, trained(bounded, [model | {"p": p}]), path)
+        plain = BegunStates(bounded, settled(bounded, [model | {"p": p}]), path)
         tried.append(TriedOrder(full.order, False, plain))
         told = criterion([each.begun for each in tried], last.begun)
         return tuple(tried[k]._replace(bic=told[k]) for k in np.argsort(told, kind="stable"))
@@ -531,13 +536,17 @@ def identify_states(
     given = None if delay is None else float(delay)
     search = StatesSearch(order, Paths.of(runs, given, True), offset)
     _check_order(case_of(runs, LINEAR, (), ()), runs, order or 1)
-    asked = _Identification(search, map, hidden, range(seed, seed + starts), held)
+    asked = _StatesIdentification(search, map, hidden, range(seed, seed + starts), held)
     return judged_without(
-        runs, search.found, lambda runs, tried: tried[0].begun.beside(runs), asked.answer
+        runs, asked.begun, lambda runs, each: each[1][0].beside(runs), asked.answer
     )
 
 
-class _Identification(NamedTuple):
+# Orders that were tried, and likely fits.
+_Found = tuple[tuple[TriedOrder, ...], list[BegunStates]]
+
+
+class _StatesIdentification(NamedTuple):
     """Settings of an identification."""
 
     search: StatesSearch
@@ -546,24 +555,38 @@ class _Identification(NamedTuple):
     seeds: range
     held: tuple[Run, ...]
 
-    def answer(
-        self, runs: tuple[Run, ...], tried: tuple[TriedOrder, ...], left_out: Any
-    ) -> StatesFit:
+    def begun(self, runs: tuple[Run, ...]) -> _Found:
+        """Orders, and the fit: by the likeliest path where a network follows."""
+        tried = self.search.begun(runs)
+        if self.map == "constant":
+            return tried, [tried[0].begun]
+        tried = self.search.likeliest(runs, tried)
+        return tried, self.trained(runs, tried[0])
+
+    def trained(self, runs: tuple[Run, ...], best: TriedOrder) -> list[BegunStates]:
+        """Networks beside a linear system, those that are likely."""
+        n, path = best.order, best.begun.path
+        free = [f for f in free_of(best.begun.case, n, n, self.search.offset, best.direct)
+                if f.path != "start"]  # fmt: skip
+        free += [Free("start", nuisance=True), Free("p.net", nuisance=True)]
+        case = case_of(runs, NETWORK, free, [Prior("p.net", 0.0, WEIGHT)], path)
+        case = case._replace(degree=best.begun.case.degree)
+        nets = _networks(best, self.hidden, self.seeds)
+        fits = likely(case, [settled(case, [net]) for net in nets])
+        return [BegunStates(case, each, path) for each in fits]
+
+    def answer(self, runs: tuple[Run, ...], found: _Found, left_out: Any) -> StatesFit:
         """Judge runs whose orders were tried, the likeliest first."""
-        best, offset = tried[0], self.search.offset
-        (case, found, path), n, gain = best.begun, best.order, None
-        fits = [found]
+        (tried, fits), gain = found, None
         if self.map == "network":
-            nets = _networks(best, self.hidden, self.seeds)
-            free = [f for f in free_of(case, n, n, offset, best.direct) if f.path != "start"]
-            free += [Free("start", nuisance=True), Free("p.net", nuisance=True)]
-            priors = [Prior("p.net", 0.0, WEIGHT)]
-            case = case_of(runs, NETWORK, free, priors, path)._replace(degree=case.degree)
-            fits = likely(case, [trained(case, [net]) for net in nets])
-            linear, bent = criterion([best.begun, BegunStates(case, fits[0], path)], best.begun)
+            linear, bent = criterion([tried[0].begun, fits[0]], tried[0].begun)
             gain = linear - bent
-        fits = [BegunStates(case, remembering(case, each), path) for each in fits]
-        said, gains = _quantities(fits, n, runs, offset)
+        else:
+            tried = self.search.likeliest(runs, tried)
+            fits = [tried[0].begun]
+        n, path = tried[0].order, fits[0].path
+        fits = [fit._replace(found=with_memory(fit.case, fit.found, WORSE)) for fit in fits]
+        said, gains = _quantities(fits, n, runs, self.search.offset)
         rows = [{"order": t.order, "direct": t.direct, "bic": t.bic}
                 for t in sorted(tried, key=lambda t: (not t.direct, t.order))]  # fmt: skip
         more = {"delay_samples": int(path.delay), "tried": rows, "matrices": _matrices(fits, n)}

@@ -364,8 +364,9 @@ def whitened_rows(
     return (rows, 0.0) if memory is None else innovations(rows, time, memory)
 
 
-# Most rounds with a memory of the noise, and the gain in -2 ln L below which they end.
-AGAIN, GAINED = 3, 0.05
+# Steps of a round, after which the noise is estimated again, and most rounds, also with a memory of
+# the noise; they end below a gain in -2 ln L of GAINED and of EACH for a reading.
+STEPS, ROUNDS, AGAIN, GAINED, EACH = 25, 80, 3, 0.05, 1e-4
 # Most readings of each output that estimate correlated noise.
 LONGEST = 5000
 
@@ -494,26 +495,28 @@ class Case(NamedTuple):
         self,
         model: Any,
         noise: Noises,
-        steps: int,
         memory: CorrelatedNoise | None = None,
         gap: Any = (),
     ) -> Settled:
-        """Fit with the noise that the residuals of the round before had."""
-        fit = solve(self.problem(model, noise, memory, gap), iterations=steps)
+        """Fit with the noise that the residuals of the round before had.
+
+        The part of a sample in a delay begins anew.
+        """
+        model = model | {name: 0.0 for name in ("late",) if name in model}
+        fit = solve(self.problem(model, noise, memory, gap), iterations=STEPS)
         rest = self.rest(fit.model)
-        found = self.errors(rest, memory)
-        minus = sum(_minus(*row, None) for row in self.rows(rest, found))
-        minus = minus if np.isfinite(minus) else np.inf
         rests = fit.status not in (Status.not_finite, Status.not_converged)
-        return Settled(fit, rest, found, memory, None, minus, rests)
+        found = Settled(fit, rest, self.errors(rest, memory), memory, None, np.inf, rests)
+        minus = information(self, found, memory)
+        return found._replace(likelihood=minus if np.isfinite(minus) else np.inf)
 
 
 class Settled(NamedTuple):
     """A fit whose noise is that of its own residuals.
 
     `rest` and `noise` by run and output; `memory` of a noise with one and `errors` that average
-    over what is open of it; `likelihood` is -2 ln L, for responses with the cost of the Bayesian
-    information criterion; `rests` whether a further round would gain nothing.
+    over what is open of it; `likelihood` is -2 ln L with the cost of the Bayesian information
+    criterion; `rests` whether a further round would gain nothing.
     """
 
     fit: Fit
@@ -655,23 +658,16 @@ def rounds(found: Any, again: Callable[[Any], Any], gained: float, most: int) ->
     return found, False
 
 
-def settled(
-    case: Case,
-    models: Sequence[Any],
-    search: Callable[..., Settled],
-    gained: Callable[[Settled], float],
-    most: int,
-) -> Settled:
+def settled(case: Case, models: Sequence[Any], most: int = ROUNDS) -> Settled:
     """Search from each start for a round, then from the best until nothing is gained."""
-    tried = (search(case, model, case.guess) for model in models)
+    tried = (case.search(model, case.guess) for model in models)
     found = min(tried, key=lambda each: each.likelihood)
-    found, rests = rounds(found, lambda f: search(case, f.fit.model, f.noise), gained(found), most)
+    enough = GAINED + EACH * sum(len(rest) for row in found.rest for rest in row)
+    found, rests = rounds(found, lambda f: case.search(f.fit.model, f.noise), enough, most)
     return found._replace(rests=rests or found.rests)
 
 
-def with_memory(
-    case: Case, white: Settled, search: Callable[..., Settled], worse: float = np.inf
-) -> Settled:
+def with_memory(case: Case, white: Settled, worse: float = np.inf) -> Settled:
     """The fit again, its noise with a memory, where residuals are correlated.
 
     It may leave squares larger by the factor `worse`. Errors average over what the residuals leave
@@ -685,7 +681,7 @@ def with_memory(
     def again(found: Settled) -> Settled:
         _, memory, size = found.remembered(case, most=LONGEST)
         noise = tuple(tuple(n._replace(each=size * n.each) for n in row) for row in found.noise)
-        return search(case, found.fit.model, noise, memory=memory)
+        return case.search(found.fit.model, noise, memory)
 
     found = rounds(white, again, GAINED, AGAIN)[0]
     if case.squares(found.rest) > worse * case.squares(white.rest):
@@ -697,10 +693,6 @@ def with_memory(
     return found._replace(rests=white.rests, errors=errors)
 
 
-# Steps of a round, after which the noise is estimated again, and most rounds.
-STEPS, ROUNDS = 100, 30
-
-
 def case_of(seen: PreparedOutput, offset: bool, network: bool = False) -> Case:
     """The case of one output: constant raw numbers or a network of them."""
     free = [Free("start", nuisance=True), Free("map", nuisance=network)]
@@ -709,19 +701,12 @@ def case_of(seen: PreparedOutput, offset: bool, network: bool = False) -> Case:
     return Case((seen,), seen.runs, tuple(free), weight_priors("map") if network else ())
 
 
-def _round(case: Case, model: Any, noise: Noises, memory: CorrelatedNoise | None = None) -> Settled:
-    """A search that pays for what it uses; the part of a sample in a delay begins anew."""
-    found = case.search(model | {"late": 0.0}, noise, STEPS, memory)
-    return found._replace(likelihood=information(case, found, memory))
-
-
 def fitted(case: Case, models: Sequence[Any]) -> Settled:
     """The best fit from some starts, its noise with a memory where residuals are correlated.
 
     The noise weighs against the priors of a network, so it is taken anew in every round.
     """
-    found = settled(case, models, _round, lambda f: GAINED + 1e-9 * abs(f.likelihood), ROUNDS)
-    return with_memory(case, found, _round)
+    return with_memory(case, settled(case, models))
 
 
 class Begun(NamedTuple):

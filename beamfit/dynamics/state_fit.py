@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property
 from typing import Any, NamedTuple, Protocol
 
 import jax
@@ -40,7 +40,6 @@ from beamfit.dynamics.record import Run, Way, checked
 from beamfit.dynamics.response import FIRST_ORDER
 from beamfit.dynamics.search import (
     DRIFT,
-    GAINED,
     Case,
     Settled,
     drift_waves,
@@ -58,9 +57,6 @@ from beamfit.noise.memory import CorrelatedNoise
 from beamfit.quantity import Quantity
 from beamfit.statistics import POOR_FIT
 
-# Steps of a round, after which the noise is estimated again; most rounds; gain in -2 ln L per
-# reading below which they end.
-STEPS, ROUNDS, EACH = 25, 80, 1e-4
 # Allowed gaps between segments in turn, in units of the states' scatter.
 CLOSING = (1.0, 0.1, 1e-2, 1e-3, 1e-4)
 # Distance in time between the series of two outputs, in lengths of the run: no correlation is left.
@@ -132,9 +128,6 @@ def course_of(system: System, seen: Sequence[PreparedOutput], i: int) -> Course:
     return Course(system, run.u, run.dt, *readings, len(index), waves, run.run)
 
 
-_round = partial(Case.search, steps=STEPS)
-
-
 def closed(case: Case, model: Any, close: np.ndarray) -> Any:
     """The model from where the free run may begin: ends of segments have met.
 
@@ -142,20 +135,11 @@ def closed(case: Case, model: Any, close: np.ndarray) -> Any:
     """
     noise = case.guess
     for width in CLOSING:
-        shot = _round(case, model, noise, gap=width * close)
+        shot = case.search(model, noise, gap=width * close)
         if not np.isfinite(shot.likelihood):
             break
         model, noise = shot.fit.model, shot.noise
     return model | {"nodes": model["nodes"][:, :0]}
-
-
-def trained(case: Case, models: Sequence[Any]) -> Settled:
-    """Fit from each start for a round, then from the best until nothing is gained."""
-    return settled(case, models, _round, _enough, ROUNDS)
-
-
-def _enough(found: Settled) -> float:
-    return GAINED + EACH * sum(len(rest) for row in found.rest for rest in row)
 
 
 class BegunStates(NamedTuple):
@@ -191,14 +175,10 @@ def begun(case: Case, models: Sequence[Any], path: Path = PLAIN) -> BegunStates:
     All drifts are free first: a state that grows for ever would take a drift for its own.
     """
     whole = case._replace(degree=DRIFT)
-    first = settled(whole, [whole.beside_drift(model) for model in models], _round, _enough, 0)
+    first = settled(whole, [whole.beside_drift(model) for model in models], 0)
     case = case._replace(degree=first.drift_degree(whole))
-    return BegunStates(case, trained(case, [case.beside_drift(first.fit.model)]), path)
-
-
-def remembering(case: Case, white: Settled) -> Settled:
-    """The fit again, its noise with a memory, where residuals are correlated."""
-    return with_memory(case, white, _round, WORSE)
+    models = [case.beside_drift(model) for model in (first.fit.model, *models)]
+    return BegunStates(case, settled(case, models), path)
 
 
 # Percent of an output explained by the free run below which segments are tried.
@@ -398,7 +378,7 @@ def fit_states(
         return begun(case, [_free_run(case, model, segments).fit.model])
 
     def answer(runs: tuple[Run, ...], found: BegunStates, left_out: Any) -> StatesFit:
-        found = found._replace(found=remembering(found.case, found.found))
+        found = found._replace(found=with_memory(found.case, found.found, WORSE))
         options = {"held": held, "left_out": left_out, "map": "network" if nets else "constant"}
         return states_answer(found, runs, _told(found), **options)
 
@@ -407,10 +387,10 @@ def fit_states(
 
 def _free_run(case: Case, model: Any, segments: int | None) -> Settled:
     """The fit of a free run, by segments where that goes astray."""
-    found = None if segments is not None and segments > 1 else trained(case, [model])
+    found = None if segments is not None and segments > 1 else settled(case, [model])
     if found is None or (segments is None and not min(_explained(case, found)) > ASTRAY):
         nodes, close = _nodes(case, model, segments or SEGMENTS)
-        shot = trained(case, [closed(case, model | {"nodes": nodes}, close)])
+        shot = settled(case, [closed(case, model | {"nodes": nodes}, close)])
         found = shot if found is None or shot.likelihood < found.likelihood else found
     return found
 
