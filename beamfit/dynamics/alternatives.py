@@ -292,11 +292,11 @@ class Comparison(NamedTuple):
         cls, runs: tuple[Run, ...], found: Begun, paths: Paths, slopes: Sequence[RunSlopes]
     ) -> Comparison:
         """Prepare the fit of runs; `slopes` has terms of a fuller response."""
-        seen, fit = found.seen, found.plain.fit
+        seen, fit = found.seen, found.settled.fit
         physics, delay = seen.runs[0].physics, found.path.delay
         whole = undriven(runs, seen.output, physics, paths.parts, delay, MOST)
         drives = whole.drives
-        errors = [noise.each[:MOST] for (noise,) in found.plain.noise]
+        errors = [noise.each[:MOST] for (noise,) in found.settled.noise]
         data = [
             (filled(drive, y), time[:MOST], filled(drive, error, np.inf))
             for drive, y, time, error in zip(drives, whole.measured, seen.time, errors, strict=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple, Protocol, TypeVar
 
 import numpy as np
 from scipy.ndimage import median_filter
@@ -46,14 +46,20 @@ class FreeRun(NamedTuple):
     fitted: Sequence[np.ndarray]
 
 
-F, A = TypeVar("F"), TypeVar("A")
+class HasFreeRun(Protocol):
+    """A fit of runs: `beamfit.dynamics.search.Begun`, or several of them."""
+
+    def beside(self, runs: Sequence[Run]) -> list[FreeRun]:
+        """Readings of some runs beside the fit."""
+
+
+F, A = TypeVar("F", bound=HasFreeRun), TypeVar("A")
 Runs = tuple[Run, ...]
 
 
 def judged_without(
     runs: Runs,
     begin: Callable[[Runs], F],
-    beside: Callable[[Runs, F], Sequence[FreeRun]],
     answer: Callable[[Runs, F, tuple[BadReadings, ...]], A],
 ) -> A:
     """The answer of runs without readings that show no output.
@@ -61,7 +67,7 @@ def judged_without(
     A model that is refuted misses good readings: it is judged with all of them.
     """
     whole = begin(runs)
-    fit = answer(*_sound(runs, whole, begin, beside))
+    fit = answer(*_sound(runs, whole, begin))
     if not fit.left_out or fit.status is not Status.poor_fit:
         return fit
     again = answer(runs, whole, ())
@@ -72,19 +78,18 @@ def _sound(
     runs: Runs,
     found: F,
     begin: Callable[[Runs], F],
-    beside: Callable[[Runs, F], Sequence[FreeRun]],
 ) -> tuple[Runs, F, tuple[BadReadings, ...]]:
     """Runs without readings that show no output, the fit of the others, and what those were."""
     left_out: list[BadReadings] = []
     for _ in range(ROUNDS):
-        trial, which = _without(runs, beside(runs, found), _lone, "far off their neighbours")
+        trial, which = _without(runs, found.beside(runs), _lone, "far off their neighbours")
         if trial is None:
             break
         runs, left_out, found = trial, [*left_out, *which], begin(trial)
-    trial, _ = _without(runs, beside(runs, found), _equal, "equal")
+    trial, _ = _without(runs, found.beside(runs), _equal, "equal")
     if trial is not None:  # the process may stand still as well: a fit without them tells
         what = "that stand still as the process moves"
-        trial, which = _without(runs, beside(runs, begin(trial)), _still, what)
+        trial, which = _without(runs, begin(trial).beside(runs), _still, what)
         if trial is not None:
             runs, left_out, found = trial, [*left_out, *which], begin(trial)
     return runs, found, tuple(left_out)

@@ -14,9 +14,10 @@ from beamfit.dynamics.model import (
     changed_by,
     predicted,
 )
-from beamfit.dynamics.record import Way
+from beamfit.dynamics.record import Run, Way
 from beamfit.dynamics.response import FIRST_ORDER
 from beamfit.dynamics.search import (
+    Begun,
     drift_columns,
     drift_costs,
     driven_by,
@@ -354,6 +355,25 @@ def covariance_of_digits(
         np.add.at(by_value, which, part)
         found += variance * by_value.T @ by_value
     return found
+
+
+def digits_of(begun: Begun) -> np.ndarray:
+    """Covariance of a fit's free numbers by the digits of its outputs."""
+    case, found = begun.case, begun.settled
+    parts = [case.split(i, each) for i, each in enumerate(found.slopes(case))]
+    rms = np.sqrt(np.mean(found.rms**2, axis=0))
+    return covariance_of_digits([(s, np.concatenate([row[k] for row in parts]), float(rms[k]))
+                                 for k, s in enumerate(case.seen)])  # fmt: skip
+
+
+def held_out(begun: Begun, runs: Sequence[Run]) -> dict[str, tuple[HeldOutRun, ...]]:
+    """Predict runs that were held back, by output."""
+    ahead: dict[str, list[HeldOutRun]] = {s.output: [] for s in begun.case.seen}
+    for run in runs:
+        case = begun.on((run,))
+        for s, rest in zip(case.seen, case.ahead(begun.settled), strict=True):
+            ahead[s.output].append(HeldOutRun.of(run.name, rest, s.measured[0]))
+    return {name: tuple(each) for name, each in ahead.items()}
 
 
 def slopes_of(seen: PreparedOutput, fit: Fit) -> list[RunSlopes]:

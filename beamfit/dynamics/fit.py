@@ -28,15 +28,16 @@ from beamfit.dynamics.checks import (
     HeldOutRun,
     RunNoises,
     checks_of,
-    covariance_of_digits,
+    digits_of,
+    held_out,
     slopes_of,
 )
 from beamfit.dynamics.limits import LagLimits, lag_limits
 from beamfit.dynamics.model import PreparedOutput, network_of, output_of
-from beamfit.dynamics.paths import Paths, heard, latest, prepared
+from beamfit.dynamics.paths import Paths, heard, latest
 from beamfit.dynamics.record import LEAST, Run, check_inputs, checked, unsure_gain
-from beamfit.dynamics.response import PHYSICS, Physics
-from beamfit.dynamics.search import Begun, Case, ResponseSearch, Settled, case_of, fitted, used_by
+from beamfit.dynamics.response import PHYSICS
+from beamfit.dynamics.search import Begun, ResponseSearch, Settled, case_of, fitted, used_by
 from beamfit.errors import InputError, Status, nearest
 from beamfit.greybox.fit import Fit
 from beamfit.noise.memory import CorrelatedNoise
@@ -218,7 +219,7 @@ def identify(
     paths = Paths.of(runs, delay, physics.even)
     search = ResponseSearch(output, physics, paths, offset)
     asked = _Identification(search, map, hidden, range(seed, seed + starts), held)
-    return judged_without(runs, search.begun, search.beside, partial(_answered, asked))
+    return judged_without(runs, search.begun, partial(_answered, asked))
 
 
 class _Identification(NamedTuple):
@@ -237,12 +238,13 @@ def _answered(
     """Judge runs whose fit with constant parameters was found."""
     (output, physics, paths, _), map = asked.search, asked.map
     found, others = _likeliest(asked, runs, found)
-    answer = found.plain if map == "constant" else _with_network(asked, found)
+    answer = found.settled if map == "constant" else _with_network(asked, found)
     checks, quantities, curves = _known(asked, runs, found, answer, others)
     fit = answer.fit
-    ahead = tuple(_ahead(run, output, answer, physics, found) for run in asked.held)
+    whole = found._replace(settled=answer)
+    ahead = held_out(whole, asked.held)[output]
     evidence = (fit, answer.rests, checks, quantities, curves, ahead, map)
-    exact = found._replace(plain=answer).exact
+    exact = whole.exact
     exact = int(exact) if exact == int(exact) else exact
     rms = float(np.sqrt(np.mean(answer.rms**2)))
     clocks = not paths.given and (others is None or others.ahead >= 0.5)
@@ -266,28 +268,20 @@ def _likeliest(
 ) -> tuple[Begun, Alternatives | None]:
     """The fit by the likeliest path without a law, and the alternatives to it."""
     for left in reversed(range(AGAIN)):
-        if found.plain.exact(case_of(found.seen, asked.search.offset)):
+        if found.settled.exact(found.case):
             return found, None
-        slopes = slopes_of(found.seen, found.plain.fit)
+        slopes = slopes_of(found.seen, found.settled.fit)
         lawful = asked.map == "constant"
         others = alternatives_of(runs, found, asked.search.paths, slopes, lawful)
         if others.path == found.path or not left:
             break
-        found = asked.search.along(runs, others.path, found.plain.fit.model)
+        found = asked.search.along(runs, others.path, found.settled.fit.model)
     return found, others
-
-
-def _ahead(run: Run, output: str, answer: Settled, physics: Physics, found: Begun) -> HeldOutRun:
-    """Predict a run that was held back."""
-    seen = prepared((run,), output, physics, found.path)
-    start = {"start": np.zeros((1, physics.free_states))}
-    (rest,) = Case((seen,), seen.runs, (), ()).ahead(answer, start)
-    return HeldOutRun.of(run.name, rest, seen.measured[0])
 
 
 def _with_network(asked: _Identification, found: Begun) -> Settled:
     """The best fit with a network of parameters, from the constant ones."""
-    seen, first, (_, physics, _, offset) = found.seen, found.plain.fit.model, asked.search
+    seen, first, (_, physics, _, offset) = found.seen, found.settled.fit.model, asked.search
     raw = np.asarray(first["map"])
     nets = (network_of(seen, physics, raw, asked.hidden, seed) for seed in asked.seeds)
     return fitted(case_of(seen, offset, True), [first | {"map": net} for net in nets])
@@ -311,7 +305,7 @@ def _known(
         RunNoises(seen.time, errors, answer.likely, seen.parts if jitter else 0),
         slopes,
         used_by(answer.fit) + (not paths.given and not seen.ends),  # a delay found is a number, too
-        None if constant else found.plain.likelihood - answer.likelihood,
+        None if constant else found.settled.likelihood - answer.likelihood,
         int(np.floor(seen.delay)),
         [np.zeros(len(y)) for y in seen.measured],
     )
@@ -329,8 +323,7 @@ def _known(
     parts = answer.fit, answer.errors
     quantities: dict[str, Quantity] = {}
     if constant:
-        own = np.concatenate([each.own for each in slopes])
-        digits = covariance_of_digits([(seen, own, float(np.sqrt(np.mean(answer.rms**2))))])
+        digits = digits_of(found)
         unsure = [unsure_gain(runs, found.path.way, name) for name in seen.inputs]
         quantities = quantities_of(*parts, others, seen, physics, digits, unsure)
     limits = lag_limits(seen, answer, offset) if constant else LagLimits(None, None)

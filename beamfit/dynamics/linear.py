@@ -18,7 +18,8 @@ from scipy.linalg import solve_discrete_lyapunov
 from scipy.special import ndtr, ndtri
 
 from beamfit.dynamics.answer import GAIN, PURE, TIME, derived, quantity, widened
-from beamfit.dynamics.bad_readings import judged_without
+from beamfit.dynamics.bad_readings import FreeRun, judged_without
+from beamfit.dynamics.checks import digits_of
 from beamfit.dynamics.fit import AGAIN, MAPS
 from beamfit.dynamics.limits import SINGLE_END, LagLimits
 from beamfit.dynamics.model import WEIGHT
@@ -28,6 +29,7 @@ from beamfit.dynamics.search import (
     BETTER,
     DRIFT,
     LONGEST,
+    Begun,
     Case,
     Settled,
     drift_waves,
@@ -40,7 +42,6 @@ from beamfit.dynamics.search import (
 from beamfit.dynamics.state_fit import (
     PLAIN,
     WORSE,
-    BegunStates,
     Course,
     StatesFit,
     at_start,
@@ -282,7 +283,7 @@ class TriedOrder(NamedTuple):
 
     order: int
     direct: bool
-    begun: BegunStates
+    begun: Begun
     bic: float = np.nan
 
 
@@ -357,24 +358,24 @@ class StatesSearch(NamedTuple):
             if n - tried[int(np.argmin(told))].order >= BEYOND:
                 break
         full, last = tried[int(np.argmin(told))], tried[-1]
-        model = full.begun.found.fit.model
+        model = full.begun.settled.fit.model
         p = model["p"] | {"d": model["p"]["d"].at[:, : len(case.seen[0].inputs)].set(0.0)}
         free = free_of(case, full.order, len(p["z"]), self.offset, False)
         bounded = full.begun.case._replace(free=free)
-        plain = BegunStates(bounded, settled(bounded, [model | {"p": p}]), path)
+        plain = Begun(bounded, path, settled(bounded, [model | {"p": p}]))
         tried.append(TriedOrder(full.order, False, plain))
         told = criterion([each.begun for each in tried], last.begun)
         return tuple(tried[k]._replace(bic=told[k]) for k in np.argsort(told, kind="stable"))
 
 
-def criterion(tried: Sequence[BegunStates], last: BegunStates | None = None) -> list[float]:
+def criterion(tried: Sequence[Begun], last: Begun | None = None) -> list[float]:
     """The Bayesian information criterion of fits under the noise, with its memory, of the last.
 
     By the readings that all of them have: those of a longer delay begin later.
     """
-    noise = _noise_of((last or tried[-1]).case, (last or tried[-1]).found)
-    lengths = [[len(rest) for row in each.found.rest for rest in row] for each in tried]
-    return [information(each.case, each.found, noise, np.min(lengths, axis=0)) for each in tried]
+    noise = _noise_of((last or tried[-1]).case, (last or tried[-1]).settled)
+    lengths = [[len(rest) for row in each.settled.rest for rest in row] for each in tried]
+    return [information(each.case, each.settled, noise, np.min(lengths, axis=0)) for each in tried]
 
 
 def _noise_of(case: Case, found: Settled) -> CorrelatedNoise | None:
@@ -421,7 +422,7 @@ def _tried(
     best = [i for i in np.argsort(missed, kind="stable") if np.isfinite(missed[i])]
     models = [models[i] for i in best[:BEGINS]]
     if before is not None:
-        old, last = before.order, before.begun.found.fit.model
+        old, last = before.order, before.begun.settled.fit.model
         a, b, c, d, _ = map(np.asarray, LINEAR.matrices(last["p"]))
         a = np.diag([*np.zeros(old), NEW]) + np.pad(a[:old, :old], ((0, 1), (0, 1)))
         b, c = np.vstack([b[:old], np.ones(m)]), np.hstack([c[:, :old], np.full((k, 1), FAINT)])
@@ -537,13 +538,18 @@ def identify_states(
     search = StatesSearch(order, Paths.of(runs, given, True), offset)
     _check_order(case_of(runs, LINEAR, (), ()), runs, order or 1)
     asked = _StatesIdentification(search, map, hidden, range(seed, seed + starts), held)
-    return judged_without(
-        runs, asked.begun, lambda runs, each: each[1][0].beside(runs), asked.answer
-    )
+    return judged_without(runs, asked.begun, asked.answer)
 
 
-# Orders that were tried, and likely fits.
-_Found = tuple[tuple[TriedOrder, ...], list[BegunStates]]
+class _Fits(NamedTuple):
+    """Orders that were tried, the likeliest first, and likely fits."""
+
+    tried: tuple[TriedOrder, ...]
+    each: list[Begun]
+
+    def beside(self, runs: Sequence[Run]) -> list[FreeRun]:
+        """Readings of some runs beside the likeliest."""
+        return self.each[0].beside(runs)
 
 
 class _StatesIdentification(NamedTuple):
@@ -555,15 +561,15 @@ class _StatesIdentification(NamedTuple):
     seeds: range
     held: tuple[Run, ...]
 
-    def begun(self, runs: tuple[Run, ...]) -> _Found:
+    def begun(self, runs: tuple[Run, ...]) -> _Fits:
         """Orders, and the fit: by the likeliest path where a network follows."""
         tried = self.search.begun(runs)
         if self.map == "constant":
-            return tried, [tried[0].begun]
+            return _Fits(tried, [tried[0].begun])
         tried = self.search.likeliest(runs, tried)
-        return tried, self.trained(runs, tried[0])
+        return _Fits(tried, self.trained(runs, tried[0]))
 
-    def trained(self, runs: tuple[Run, ...], best: TriedOrder) -> list[BegunStates]:
+    def trained(self, runs: tuple[Run, ...], best: TriedOrder) -> list[Begun]:
         """Networks beside a linear system, those that are likely."""
         n, path = best.order, best.begun.path
         free = [f for f in free_of(best.begun.case, n, n, self.search.offset, best.direct)
@@ -573,9 +579,9 @@ class _StatesIdentification(NamedTuple):
         case = case._replace(degree=best.begun.case.degree)
         nets = _networks(best, self.hidden, self.seeds)
         fits = likely(case, [settled(case, [net]) for net in nets])
-        return [BegunStates(case, each, path) for each in fits]
+        return [Begun(case, path, each) for each in fits]
 
-    def answer(self, runs: tuple[Run, ...], found: _Found, left_out: Any) -> StatesFit:
+    def answer(self, runs: tuple[Run, ...], found: _Fits, left_out: Any) -> StatesFit:
         """Judge runs whose orders were tried, the likeliest first."""
         (tried, fits), gain = found, None
         if self.map == "network":
@@ -585,7 +591,7 @@ class _StatesIdentification(NamedTuple):
             tried = self.search.likeliest(runs, tried)
             fits = [tried[0].begun]
         n, path = tried[0].order, fits[0].path
-        fits = [fit._replace(found=with_memory(fit.case, fit.found, WORSE)) for fit in fits]
+        fits = [fit._replace(settled=with_memory(fit.case, fit.settled, WORSE)) for fit in fits]
         said, gains = _quantities(fits, n, runs, self.search.offset)
         rows = [{"order": t.order, "direct": t.direct, "bic": t.bic}
                 for t in sorted(tried, key=lambda t: (not t.direct, t.order))]  # fmt: skip
@@ -601,18 +607,18 @@ def likely(case: Case, found: Sequence[Settled]) -> list[Settled]:
     Draws from the posterior about an optimum of p numbers lie above its -2 ln L by chi-square of p
     degrees of freedom, by p in the mean: an end that is nearer is another part of the posterior.
     """
-    each = [BegunStates(case, fit, PLAIN) for fit in found]
-    told = np.array(criterion(each, min(each, key=lambda one: one.found.likelihood)))
+    each = [Begun(case, PLAIN, fit) for fit in found]
+    told = np.array(criterion(each, min(each, key=lambda one: one.settled.likelihood)))
     best, *others = np.argsort(np.where(np.isfinite(told), told, np.inf))
     most = told[best] + used_by(found[best].fit)
     return [found[best], *(found[i] for i in others if told[i] <= most)]
 
 
-def _derived(fits: Sequence[BegunStates], function: Any, asked: UsedStates) -> Derived:
+def _derived(fits: Sequence[Begun], function: Any, asked: UsedStates) -> Derived:
     """Numbers of the best fit; within their errors 68 % of all fits' posterior lies, each of which
     counts as much: the posterior of a network is bent, and each tells a part of it.
     """
-    each = [derived(f.found.fit, f.found.errors, function, asked) for f in fits]
+    each = [derived(f.settled.fit, f.settled.errors, function, asked) for f in fits]
     if len(each) == 1:
         return each[0]
     values, errors = (np.stack([getattr(one, name) for one in each]) for name in ("value", "error"))
@@ -662,7 +668,7 @@ def _check_order(case: Case, runs: Sequence[Run], order: int) -> None:
 
 def _networks(best: TriedOrder, hidden: int, seeds: range) -> list[dict[str, Any]]:
     """Models with networks of small random weights beside the linear part."""
-    model = stripped(best.begun.found.fit.model, best.order)
+    model = stripped(best.begun.settled.fit.model, best.order)
     p, (n, m) = model["p"], model["p"]["z"].shape
     moved = LINEAR.linear(p)._replace(c=jnp.eye(n), d=jnp.zeros((n, m)), offset=jnp.zeros(n))
     run = jax.jit(lambda u, x0: linear_outputs(moved, u, x0)[0])
@@ -705,7 +711,7 @@ def _quoted(model: Any, asked: UsedStates) -> jax.Array:
 
 
 def _quantities(
-    fits: Sequence[BegunStates], n: int, runs: Sequence[Run], offset: bool
+    fits: Sequence[Begun], n: int, runs: Sequence[Run], offset: bool
 ) -> tuple[dict[str, Quantity], dict[str, list[str]]]:
     """Time constants from the slowest, gains and levels; and the names of each input's gains."""
     course, path = fits[0].case.courses[0], fits[0].path
@@ -714,7 +720,7 @@ def _quantities(
     numbers = _derived(fits, _quoted, UsedStates(n, course))
     unsure = [0.0] * (5 * n) + [unsure_gain(runs, path.way, name) for name in inputs] * len(outputs)
     unsure += [0.0] * (len(numbers.value) - len(unsure))
-    numbers = widened(numbers, fits[0].digits(), np.array(unsure))
+    numbers = widened(numbers, digits_of(fits[0]), np.array(unsure))
     tau, time, zeta, pole, turn = np.arange(5 * n).reshape(5, n)
     slow = [i for i in np.argsort(-numbers.value[time]) if numbers.value[turn[i]] >= 0.0]
     endless = False  # a pole is compatible with 1, so that gains are with infinity
@@ -780,7 +786,7 @@ def _taylor(model: Any, asked: UsedStates) -> jax.Array:
                              to @ b[:n, : len(size_u)] / size_u])  # fmt: skip
 
 
-def _matrices(fits: Sequence[BegunStates], n: int) -> dict[str, Any]:
+def _matrices(fits: Sequence[Begun], n: int) -> dict[str, Any]:
     """A, B, C, D in the units of the record, for inputs less their mean.
 
     Of as many states as outputs, all of which are read, also the first terms of report eq 2 with
@@ -794,7 +800,7 @@ def _matrices(fits: Sequence[BegunStates], n: int) -> dict[str, Any]:
             name + said: part[:, ends[name]] for name in ends
             for said, part in (("", read.value), ("_error", read.error))
         }  # fmt: skip
-    p = fits[0].found.fit.model["p"]
+    p = fits[0].settled.fit.model["p"]
     a, b, c, d, _ = map(np.asarray, case.courses[0].system.matrices(p))
     (mean_u, size_u), (mean_y, size_y) = (np.asarray(p["units"][kind]) for kind in "uy")
     by, m = size_y[:, None], len(mean_u)

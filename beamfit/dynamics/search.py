@@ -201,14 +201,8 @@ class ResponseSearch(NamedTuple):
 
     def along(self, runs: tuple[Run, ...], path: Path, model: dict[str, Any]) -> Begun:
         """Identify with constant parameters by a path, from a model."""
-        seen = prepared(runs, self.output, self.physics, path)
-        return Begun(seen, path, fitted(case_of(seen, self.offset), [model | {"late": 0.0}]))
-
-    def beside(self, runs: tuple[Run, ...], found: Begun) -> list[FreeRun]:
-        """Readings of some runs beside a fit of others."""
-        seen = prepared(runs, self.output, self.physics, found.path)
-        fitted = [output_of(found.plain.fit.model, run) for run in seen.runs]
-        return [FreeRun(self.output, found.path.delay, found.seen.size_y, seen.measured, fitted)]
+        case = case_of(prepared(runs, self.output, self.physics, path), self.offset)
+        return Begun(case, path, fitted(case, [model | {"late": 0.0}]))
 
     def is_first_order(self, runs: tuple[Run, ...], found: Begun) -> bool:
         """True if a first order does as well as a higher one by the information criterion."""
@@ -217,7 +211,7 @@ class ResponseSearch(NamedTuple):
         lower = found.seen._replace(runs=driven_by(found.seen, FIRST_ORDER))
         (start,) = self.starts(runs, FIRST_ORDER, [found.path])
         fit = fitted(case_of(lower, self.offset), [start.model])
-        return fit.likelihood <= found.plain.likelihood
+        return fit.likelihood <= found.settled.likelihood
 
 
 def difference(shapes: np.ndarray, apart: float) -> np.ndarray:
@@ -371,6 +365,8 @@ STEPS, ROUNDS, AGAIN, GAINED, EACH = 25, 80, 3, 0.05, 1e-4
 LONGEST = 5000
 
 
+# Parts of a model that each run has for itself.
+OWN = ("start", "nodes", "drift")
 # Errors of the readings, by run and output.
 Noises = tuple[tuple[ReadingErrors, ...], ...]
 
@@ -453,13 +449,17 @@ class Case(NamedTuple):
         return sum(float(np.sum((r / s.size_y) ** 2))
                    for row in rest for r, s in zip(row, self.seen, strict=True))  # fmt: skip
 
-    def ahead(self, found: Settled, start: dict[str, Any]) -> tuple[np.ndarray, ...]:
-        """Residuals of a run that was held back, by output: only its `start` is fitted."""
+    def ahead(self, found: Settled) -> tuple[np.ndarray, ...]:
+        """Residuals of a run that was held back, by output: only its start and its drift are
+        fitted.
+        """
         sizes = np.sqrt(np.mean(found.rms**2, axis=0))
         noise = tuple(ReadingErrors(np.full(len(s.measured[0]), size))
                       for s, size in zip(self.seen, sizes, strict=True))  # fmt: skip
+        model = dict(found.fit.model)
+        model |= {name: np.mean(model[name], axis=0)[None] for name in OWN if name in model}
         case = self._replace(free=(Free("start", nuisance=True),), priors=())
-        return case.rest(solve(case.problem(found.fit.model | start, (noise,))).model)[0]
+        return case.rest(solve(case.problem(model, (noise,))).model)[0]
 
     def problem(
         self, model: Any, noise: Noises, memory: CorrelatedNoise | None = None, gap: Any = ()
@@ -710,16 +710,21 @@ def fitted(case: Case, models: Sequence[Any]) -> Settled:
 
 
 class Begun(NamedTuple):
-    """Runs as the model sees them behind a path, and the fit."""
+    """Runs as a model sees them behind a path, and the fit."""
 
-    seen: PreparedOutput
+    case: Case
     path: Path
-    plain: Settled
+    settled: Settled
+
+    @property
+    def seen(self) -> PreparedOutput:
+        """The runs of the first output, which is the only one of a response."""
+        return self.case.seen[0]
 
     @property
     def exact(self) -> float:
         """The delay in samples, by the fit where it is a number of it."""
-        late = float(self.plain.fit.model["late"]) if self.seen.ends else 0.0
+        late = float(self.settled.fit.model["late"]) if self.seen.ends else 0.0
         return (self.seen.delay + late) / self.seen.parts
 
     def contains(self, path: Path) -> bool:
@@ -727,3 +732,19 @@ class Begun(NamedTuple):
         low, high = (self.seen.delay + end for end in self.seen.ends or (0.0, 0.0))
         inside = low <= path.delay * self.seen.parts <= high
         return path.law is None and path.way == self.path.way and inside
+
+    def on(self, runs: Sequence[Run]) -> Case:
+        """The case of other runs."""
+        seen = tuple(prepared(runs, s.output, s.runs[0].physics, self.path) for s in self.case.seen)
+        courses = tuple(self.case.courses[0].like(seen, i) for i in range(len(runs)))
+        return self.case._replace(seen=seen, courses=courses)
+
+    def beside(self, runs: Sequence[Run]) -> list[FreeRun]:
+        """Readings of some runs beside the fit of others."""
+        case = self.on(runs)
+        rest = case.rest(self.settled.fit.model)
+        return [
+            FreeRun(s.output, self.path.delay, s.size_y, s.measured,
+                    [y - row[k] for y, row in zip(s.measured, rest, strict=True)])
+            for k, s in enumerate(case.seen)
+        ]  # fmt: skip

@@ -24,14 +24,15 @@ from beamfit.dynamics.answer import (
     remarked,
     widened,
 )
-from beamfit.dynamics.bad_readings import BadReadings, FreeRun, judged_without
+from beamfit.dynamics.bad_readings import BadReadings, judged_without
 from beamfit.dynamics.checks import (
     Checks,
     HeldOutRun,
     RunNoises,
     RunSlopes,
     checks_of,
-    covariance_of_digits,
+    digits_of,
+    held_out,
     percent,
 )
 from beamfit.dynamics.model import PreparedOutput, readings_of, weight_priors
@@ -40,6 +41,7 @@ from beamfit.dynamics.record import Run, Way, checked
 from beamfit.dynamics.response import FIRST_ORDER
 from beamfit.dynamics.search import (
     DRIFT,
+    Begun,
     Case,
     Settled,
     drift_waves,
@@ -111,6 +113,10 @@ class Course:
         """Outputs where they were read, one after the other, shape (readings,)."""
         return self.shot(model)[0]
 
+    def like(self, seen: Sequence[PreparedOutput], i: int) -> Course:
+        """Course of a run with the same system, from the prepared outputs."""
+        return course_of(self.system, seen, i)
+
 
 def course_of(system: System, seen: Sequence[PreparedOutput], i: int) -> Course:
     """Course of a run, from the prepared outputs."""
@@ -142,34 +148,7 @@ def closed(case: Case, model: Any, close: np.ndarray) -> Any:
     return model | {"nodes": model["nodes"][:, :0]}
 
 
-class BegunStates(NamedTuple):
-    """Runs as a state space sees them behind a path, and the fit."""
-
-    case: Case
-    found: Settled
-    path: Path
-
-    def beside(self, runs: tuple[Run, ...]) -> list[FreeRun]:
-        """Readings of some runs beside the fit of others."""
-        case = case_of(runs, self.case.courses[0].system, (), (), self.path)
-        rest = case.rest(self.found.fit.model)
-        return [
-            FreeRun(s.output, self.path.delay, s.size_y, s.measured,
-                    [y - row[k] for y, row in zip(s.measured, rest, strict=True)])
-            for k, s in enumerate(case.seen)
-        ]  # fmt: skip
-
-    def digits(self) -> np.ndarray:
-        """Covariance of the free numbers by the digits of the outputs."""
-        case, slopes, rms = self.case, self.found.slopes(self.case), self.found.rms
-        parts = [case.split(i, each) for i, each in enumerate(slopes)]
-        return covariance_of_digits([
-            (s, np.concatenate([row[k] for row in parts]), float(np.sqrt(np.mean(rms[:, k] ** 2))))
-            for k, s in enumerate(case.seen)
-        ])  # fmt: skip
-
-
-def begun(case: Case, models: Sequence[Any], path: Path = PLAIN) -> BegunStates:
+def begun(case: Case, models: Sequence[Any], path: Path = PLAIN) -> Begun:
     """The fit beside the drift that the outputs want.
 
     All drifts are free first: a state that grows for ever would take a drift for its own.
@@ -178,7 +157,7 @@ def begun(case: Case, models: Sequence[Any], path: Path = PLAIN) -> BegunStates:
     first = settled(whole, [whole.beside_drift(model) for model in models], 0)
     case = case._replace(degree=first.drift_degree(whole))
     models = [case.beside_drift(model) for model in (first.fit.model, *models)]
-    return BegunStates(case, settled(case, models), path)
+    return Begun(case, path, settled(case, models))
 
 
 # Percent of an output explained by the free run below which segments are tried.
@@ -372,17 +351,17 @@ def fit_states(
     free = [*free, *([] if known else [Free("start", nuisance=True)])]
     inside = [prior for net in nets for prior in weight_priors(net)]
 
-    def search(runs: tuple[Run, ...]) -> BegunStates:
+    def search(runs: tuple[Run, ...]) -> Begun:
         case = case_of(runs, system, free, (*inside, *priors))
         _check_outputs(case, model)
         return begun(case, [_free_run(case, model, segments).fit.model])
 
-    def answer(runs: tuple[Run, ...], found: BegunStates, left_out: Any) -> StatesFit:
-        found = found._replace(found=with_memory(found.case, found.found, WORSE))
+    def answer(runs: tuple[Run, ...], found: Begun, left_out: Any) -> StatesFit:
+        found = found._replace(settled=with_memory(found.case, found.settled, WORSE))
         options = {"held": held, "left_out": left_out, "map": "network" if nets else "constant"}
         return states_answer(found, runs, _told(found), **options)
 
-    return judged_without(runs, search, lambda runs, found: found.beside(runs), answer)
+    return judged_without(runs, search, answer)
 
 
 def _free_run(case: Case, model: Any, segments: int | None) -> Settled:
@@ -429,14 +408,14 @@ def _check_outputs(case: Case, model: Any) -> None:
         raise InputError(found, f"{len(case.seen)} outputs and {model['start'][0].shape} states")
 
 
-def _told(begun: BegunStates) -> dict[str, Quantity]:
+def _told(begun: Begun) -> dict[str, Quantity]:
     """The free numbers of the equations with errors."""
-    found = begun.found
+    found = begun.settled
     value, error, raw = np.array([(v.value, v.error, v.error_raw) for v in found.fit.variables]).T
     one = np.eye(len(value))
     if found.errors is not None:
         error = np.where(np.isfinite(error), found.errors.moments(one).error, np.nan)
-    numbers = widened(Derived(value, error, raw, np.zeros(len(value)), one), begun.digits())
+    numbers = widened(Derived(value, error, raw, np.zeros(len(value)), one), digits_of(begun))
     return {name.removeprefix("p."): quantity(numbers, i, "")
             for i, name in enumerate(found.fit.problem.names)
             if name.startswith("p.") and not found.fit.problem.nuisance[i]}  # fmt: skip
@@ -474,7 +453,7 @@ def _nodes(case: Case, model: Any, segments: int) -> tuple[np.ndarray, np.ndarra
 
 
 def states_answer(
-    begun: BegunStates,
+    begun: Begun,
     runs: tuple[Run, ...],
     quantities: Mapping[str, Quantity],
     *,
@@ -491,7 +470,7 @@ def states_answer(
 
     `by_input` names the quantities that are an input's own; `given` tells if the delay is.
     """
-    (case, found, path), delay = begun, int(begun.path.delay)
+    (case, path, found), delay = begun, int(begun.path.delay)
     used = used_by(found.fit)
     slopes, drifts, parts = found.slopes(case), case.drifts(found.fit.model), []
     for k, s in enumerate(case.seen):
@@ -507,7 +486,7 @@ def states_answer(
         own = {"jitter": float(found.jitter[:, k].max()), "drift": case.degree, "way": path.way}
         checks = checks._replace(**own)
         parts.append(StateSpaceOutput(list(runs[0].outputs)[k], runs, s, fitted, checks))
-    ahead = _ahead(begun, held)
+    ahead = held_out(begun, held)
     nothing = all(part.checks.nothing_probability >= POOR_FIT for part in parts)
     joint = {q for name in parts[0].checks.together for q in (by_input or {}).get(name, ())}
     told = {n: q.open() if nothing or n in joint else q for n, q in quantities.items()}
@@ -534,16 +513,3 @@ def _added(seen: PreparedOutput, i: int, fitted: np.ndarray) -> np.ndarray:
     u = seen.scaled(seen.runs[i].u)[seen.runs[i].read]
     y = ((fitted - np.mean(fitted)) / seen.size_y)[:, None]
     return np.concatenate([y**2, y**3, u**2, u * y], axis=1)
-
-
-def _ahead(begun: BegunStates, held: Sequence[Run]) -> dict[str, tuple[HeldOutRun, ...]]:
-    """Predict runs that were held back; only their start and drift are estimated."""
-    case, found, path = begun
-    ahead: dict[str, list[HeldOutRun]] = {s.output: [] for s in case.seen}
-    for run in held:
-        one = case_of((run,), case.courses[0].system, (), (), path)._replace(degree=case.degree)
-        start = np.mean(np.asarray(found.fit.model["start"]), axis=0)[None]
-        rest = one.ahead(found, at_start(start, len(case.seen)))
-        for s, r in zip(one.seen, rest, strict=True):
-            ahead[s.output].append(HeldOutRun.of(run.name, r, s.measured[0]))
-    return {name: tuple(each) for name, each in ahead.items()}

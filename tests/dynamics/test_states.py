@@ -10,8 +10,8 @@ from scipy.signal import cont2discrete, dlsim, lfilter
 
 from beamfit.dynamics.linear import criterion, identify_states, joint_error
 from beamfit.dynamics.record import Run
-from beamfit.dynamics.search import Case, ReadingErrors
-from beamfit.dynamics.state_fit import PLAIN, BegunStates, fit_states
+from beamfit.dynamics.search import Begun, Case, ReadingErrors
+from beamfit.dynamics.state_fit import PLAIN, fit_states
 from beamfit.dynamics.states import StateSpace
 from beamfit.errors import InputError, Status
 
@@ -161,7 +161,7 @@ def test_an_order_is_worth_what_it_adds_to_what_readings_before_foretell():
         return SimpleNamespace(rest=((0.3 * rest / rest.std(),),), noise=noise, fit=fit)
 
     tried = [missed(0.9, 3), missed(0.99, 6), missed(0.99, 7)]
-    rough, smooth, more = criterion([BegunStates(case, each, PLAIN) for each in tried])
+    rough, smooth, more = criterion([Begun(case, PLAIN, each) for each in tried])
     assert smooth < rough - 100.0
     assert more - smooth == pytest.approx(np.log(n))
 
