@@ -129,6 +129,9 @@ def _lone(each: FreeRun) -> list[np.ndarray]:
         noise = max(1.4826 * float(np.median(off)), CLOSE * each.size)
         steps = np.abs(np.diff(fitted, prepend=fitted[0], append=fitted[-1]))
         far = off > FAR * noise + MOVES * (steps[1:] + steps[:-1])
+        if far.mean() > MOST:  # the model lacks something there, but what stands alone
+            around = np.pad(far, 1)
+            far = far & ~(around[2:] | around[:-2])
         masks.append(far & (far.mean() <= MOST))
     return masks
 
