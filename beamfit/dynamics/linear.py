@@ -20,13 +20,12 @@ from scipy.special import ndtr, ndtri
 from beamfit.dynamics.answer import GAIN, PURE, TIME, derived, quantity, widened
 from beamfit.dynamics.bad_readings import FreeRun, judged_without
 from beamfit.dynamics.checks import digits_of
-from beamfit.dynamics.fit import AGAIN, MAPS
+from beamfit.dynamics.fit import MAPS
 from beamfit.dynamics.limits import SINGLE_END, LagLimits
 from beamfit.dynamics.model import WEIGHT
 from beamfit.dynamics.paths import Path, Paths
-from beamfit.dynamics.record import Run, Way, check_inputs, checked, unsure_gain
+from beamfit.dynamics.record import Run, Way, band_limited, check_inputs, checked, unsure_gain
 from beamfit.dynamics.search import (
-    BETTER,
     DRIFT,
     LONGEST,
     Begun,
@@ -164,6 +163,28 @@ def realisations(
             if found is not None and (a := _each_sample(found[0], stride, longest)) is not None:
                 many = sum(np.linalg.matrix_power(a, i) for i in range(stride))
                 yield a, np.linalg.lstsq(many, found[1], rcond=1e-10)[0], *found[2:]
+
+
+def first_lag(u: list[np.ndarray], y: list[np.ndarray]) -> int:
+    """The first sample before each output at which inputs act, by the information criterion.
+
+    Outputs are regressed on themselves and on inputs before, and on a drift. 1 where no lag acts, and
+    of short runs.
+    """
+    (m, k), count = (u[0].shape[1], y[0].shape[1]), sum(map(len, y))
+    horizon = min(count // (8 * (m + k)), HORIZON)
+    rows = [_rows(v, w, horizon, DRIFT)
+            for v, w in zip(u, y, strict=True) if len(v) > 2 * horizon + 1]  # fmt: skip
+    if horizon < 2 or not rows:
+        return 1
+    past, now = (np.concatenate([each[i] for each in rows]) for i in (0, 5))
+    lags = past.reshape(len(past), horizon, k + m)  # from the longest to 1
+    own, others = lags[..., :k].reshape(len(past), -1), lags[..., k:].reshape(len(past), -1)
+    triangle = np.linalg.qr(np.hstack([own, others, now]), mode="r")
+    used = own.shape[1] + m * np.arange(horizon, -1, -1)  # with lags from 1, 2, … on, and without
+    missed = np.array([np.sum(triangle[n:, -k:] ** 2, axis=0) for n in used])
+    cost = len(now) * np.log(np.maximum(missed, np.finfo(float).tiny)).sum(axis=1)
+    return 1 + int(np.argmin(cost + np.log(len(now)) * k * used)) % horizon
 
 
 def _each_sample(a: np.ndarray, stride: int, longest: int) -> np.ndarray | None:
@@ -305,44 +326,36 @@ class StatesSearch(NamedTuple):
     paths: Paths
     offset: bool
 
+    def delay(self, runs: tuple[Run, ...]) -> float:
+        """Samples of delay that lags of the inputs tell; 0 of smooth ones, whose lags are alike."""
+        if self.paths.given or band_limited(runs):
+            return min(self.paths.delays, key=abs)
+        case = case_of(runs, LINEAR, (), (), Path(None, self.paths.ways[-1], 0.0))
+        found = first_lag(*_scaled(case, _units(case, True), False)) - 1
+        return min(float(found), self.paths.delays[-1])
+
     def begun(self, runs: tuple[Run, ...]) -> tuple[TriedOrder, ...]:
-        """Orders by the shortest delay of inputs that are as they were read."""
+        """Orders by inputs as they were read, on time if no delay is said."""
         return self.orders(runs, Path(None, Way(), min(self.paths.delays, key=abs)))
 
     def likeliest(
         self, runs: tuple[Run, ...], tried: tuple[TriedOrder, ...]
     ) -> tuple[TriedOrder, ...]:
-        """Orders by the likeliest path."""
-        for _ in range(AGAIN):
-            path = self.path(runs, tried[0])
-            if path == tried[0].begun.path:
-                break
-            tried = self.orders(runs, path)
-        return tried
-
-    def path(self, runs: tuple[Run, ...], best: TriedOrder) -> Path:
-        """The likeliest path about a fit: each next one with as many states, or a sample later and
-        with one less, which a state may have stood for.
+        """Orders by the delay that the runs tell, and by inputs at their levels where the best is
+        likelier with these.
         """
-        while True:
-            at, n = best.begun.path, best.order
-            near = [(at._replace(way=way), n) for way in self.paths.ways]
-            near += [(at._replace(delay=at.delay + late), n) for late in (-1.0, 1.0)]
-            near += [(at._replace(delay=at.delay + 1.0), n - 1)] if n > 1 and not self.order else []
-            others = [_tried(case_of(runs, LINEAR, (), (), path), path, states, self.offset,
-                             best.direct, None)
-                      for path, states in near
-                      if path != at and path.delay in self.paths.delays]  # fmt: skip
-            told = criterion([each.begun for each in (best, *others)], best.begun)
-            found = min(zip(told, (best, *others), strict=True), key=self._cost)[1]
-            if found is best:
-                return at
-            best = found
-
-    def _cost(self, told: tuple[float, TriedOrder]) -> float:
-        """The criterion with the prior of the path; a longer delay must be `BETTER`."""
-        cost, path = told[0], told[1].begun.path
-        return cost - 2.0 * self.paths.log_prior(path) + 2.0 * BETTER * abs(path.delay)
+        late = self.delay(runs)
+        if late != tried[0].begun.path.delay:
+            tried = self.orders(runs, Path(None, Way(), late))
+        best = tried[0]
+        for way in self.paths.ways:
+            path = best.begun.path._replace(way=way)
+            other = _tried(case_of(runs, LINEAR, (), (), path), path, best.order, self.offset,
+                           best.direct, None) if way.standing else best  # fmt: skip
+            as_read, at_levels = criterion([best.begun, other.begun], best.begun)
+            if at_levels < as_read:
+                return self.orders(runs, path)
+        return tried
 
     def orders(self, runs: tuple[Run, ...], path: Path) -> tuple[TriedOrder, ...]:
         """Fits of 1, 2, … states, or as many as said, the likeliest first; that also without a
