@@ -12,7 +12,6 @@ from beamfit.dynamics.model import (
     CLOSE,
     PreparedOutput,
     changed_by,
-    predicted,
 )
 from beamfit.dynamics.record import Run, Way
 from beamfit.dynamics.response import FIRST_ORDER
@@ -145,23 +144,23 @@ def percent(rest: np.ndarray, y: np.ndarray) -> float:
 
 
 def checks_of(
-    seen: PreparedOutput,
-    residuals: tuple[np.ndarray, ...],
-    noise: RunNoises,
-    slopes: Sequence[RunSlopes],
-    used: int,
-    gain: float | None,
-    delay: int,
-    drifts: Sequence[np.ndarray],
+    begun: Begun, k: int, changing: Sequence[np.ndarray], used: int, gain: float | None = None
 ) -> Checks:
-    """Test the residuals of every run together.
+    """Test the residuals of an output in every run together.
 
-    `slopes` has those of the output by the model's own numbers, and what fuller models would add;
-    `drifts` are what each run's output has beside the response.
+    `changing` are slopes of each run's output by what fuller models would have, `used` is the
+    count of numbers that were fitted to it.
     """
-    y = [m - d - np.mean(m - d) for m, d in zip(seen.measured, drifts, strict=True)]
+    (case, path, found), seen = begun, begun.case.seen[k]
+    residuals = tuple(row[k] for row in found.rest)
+    own = [case.split(i, slopes)[k] for i, slopes in enumerate(found.slopes(case))]
+    jitter, likely = float(found.jitter[:, k].max()), found.likely
+    errors = [row[k].each for row in found.noise]
+    noise = RunNoises(seen.time, errors, likely, seen.parts if jitter else 0)
+    moved = zip(seen.measured, case.drifts(found.fit.model), strict=True)
+    y = [m - row[k] - np.mean(m - row[k]) for m, row in moved]
     rest = np.concatenate(residuals)
-    (explained, chance), (later, fed), grown = _explained(seen, residuals, noise, slopes, delay)
+    (explained, chance), (later, fed), grown = _explained(seen, residuals, noise, own, changing)
     white = _white([r / error for r, error in zip(residuals, noise.errors, strict=True)])
     if rest.std() <= CLOSE * seen.size_y:  # what is left is rounding, or the network's own detail
         explained, chance, later, fed, white, grown = 0.0, 1.0, 0.0, 1.0, 1.0, 0.0
@@ -182,6 +181,9 @@ def checks_of(
         gain,
         _together(seen),
         delay_growth=grown,
+        way=path.way,
+        jitter=jitter,
+        drift=case.degree,
     )
 
 
@@ -256,8 +258,8 @@ def _explained(
     seen: PreparedOutput,
     residuals: tuple[np.ndarray, ...],
     noise: RunNoises,
-    slopes: Sequence[RunSlopes],
-    delay: int,
+    own: Sequence[np.ndarray],
+    changing: Sequence[np.ndarray],
 ) -> tuple[tuple[float, float], tuple[float, float], float]:
     """Share of the whitened residuals that a fuller model explains, with its chance, the share of
     the rest that later inputs explain, and the growth of the delay if it explains most.
@@ -266,15 +268,15 @@ def _explained(
     further paths of first order, the slopes of the output by parameters that change with the
     operating point, and by a delay that grows, less what the model's own numbers can do.
     """
-    own, quick, later = [each.own for each in slopes], [], []
-    for run, each in zip(seen.runs, slopes, strict=True):
+    quick, later, delay = [], [], int(np.floor(seen.delay))
+    for run, added in zip(seen.runs, changing, strict=True):
         u = seen.scaled(run.u)
         index = run.read
         past = [u[np.clip(index + k, 0, len(u) - 1)] for k in range(-PAST, delay)]
         first = delay + noise.jitter  # a late reading has seen the input of its row
         after = [u[np.clip(index + first + k, 0, len(u) - 1)] for k in range(LATER)]
         later.append(np.concatenate(after, axis=1))
-        quick.append(np.concatenate([*past, each.changing], axis=1))
+        quick.append(np.concatenate([*past, added], axis=1))
     own, slow, quick, later = (noise.white(part) for part in (own, slow_paths(seen), quick, later))
     rest = noise.white(residuals)
     own = np.hstack([own, noise.drift(own, rest)])
@@ -315,13 +317,6 @@ def _tested(rest: np.ndarray, basis: np.ndarray, columns: np.ndarray) -> tuple[f
         return 0.0, 1.0
     ratio = (inside / k) / max((whole - inside) / left, 1e-300)
     return inside / whole, float(f.sf(ratio, k, left))
-
-
-class RunSlopes(NamedTuple):
-    """Slopes of a run's output by the model's numbers, and by what a fuller model would have."""
-
-    own: np.ndarray
-    changing: np.ndarray
 
 
 def variance_of_digits(seen: PreparedOutput, rms: float) -> float:
@@ -376,12 +371,11 @@ def held_out(begun: Begun, runs: Sequence[Run]) -> dict[str, tuple[HeldOutRun, .
     return {name: tuple(each) for name, each in ahead.items()}
 
 
-def slopes_of(seen: PreparedOutput, fit: Fit) -> list[RunSlopes]:
-    """Slopes of the output by the model's own numbers, and by what fuller models would have."""
+def changing_of(seen: PreparedOutput, fit: Fit) -> list[np.ndarray]:
+    """Slopes of a response's output by parameters that change with the inputs, by run."""
     found = []
     for run in seen.runs:
         u = seen.scaled(run.u)
         added = changed_by(fit.model, run, np.concatenate([u, u**2], axis=1))
-        own = fit.derive(predicted, run).slope
-        found.append(RunSlopes(*(np.asarray(each)[: run.count] for each in (own, added))))
+        found.append(np.asarray(added)[: run.count])
     return found

@@ -26,11 +26,10 @@ from beamfit.dynamics.bad_readings import BadReadings, judged_without
 from beamfit.dynamics.checks import (
     Checks,
     HeldOutRun,
-    RunNoises,
+    changing_of,
     checks_of,
     digits_of,
     held_out,
-    slopes_of,
 )
 from beamfit.dynamics.limits import LagLimits, lag_limits
 from beamfit.dynamics.model import PreparedOutput, network_of, output_of
@@ -270,7 +269,7 @@ def _likeliest(
     for left in reversed(range(AGAIN)):
         if found.settled.exact(found.case):
             return found, None
-        slopes = slopes_of(found.seen, found.settled.fit)
+        slopes = changing_of(found.seen, found.settled.fit)
         lawful = asked.map == "constant"
         others = alternatives_of(runs, found, asked.search.paths, slopes, lawful)
         if others.path == found.path or not left:
@@ -296,23 +295,11 @@ def _known(
 ) -> tuple[Checks, dict[str, Quantity], tuple[Curve, ...]]:
     """Tests of the residuals, and what the runs determine of constants or curves."""
     seen, constant, (_, physics, paths, offset) = found.seen, asked.map == "constant", asked.search
-    jitter = float(answer.jitter.max())
-    errors = [noise.each for (noise,) in answer.noise]
-    slopes = slopes_of(seen, answer.fit)
-    checks = checks_of(
-        seen,
-        tuple(rest for (rest,) in answer.rest),
-        RunNoises(seen.time, errors, answer.likely, seen.parts if jitter else 0),
-        slopes,
-        used_by(answer.fit) + (not paths.given and not seen.ends),  # a delay found is a number, too
-        None if constant else found.settled.likelihood - answer.likelihood,
-        int(np.floor(seen.delay)),
-        [np.zeros(len(y)) for y in seen.measured],
-    )
-    checks = checks._replace(
+    used = used_by(answer.fit) + (not paths.given and not seen.ends)  # a delay found is a number
+    gain = None if constant else found.settled.likelihood - answer.likelihood
+    whole = found._replace(settled=answer)
+    checks = checks_of(whole, 0, changing_of(seen, answer.fit), used, gain)._replace(
         first_order=constant and asked.search.is_first_order(runs, found),
-        jitter=jitter,
-        way=found.path.way,
         band_limited=() if found.path.way.moving else paths.most.smooth,
     )
     others = others if constant else None

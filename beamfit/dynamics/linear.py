@@ -168,8 +168,8 @@ def realisations(
 def first_lag(u: list[np.ndarray], y: list[np.ndarray]) -> int:
     """The first sample before each output at which inputs act, by the information criterion.
 
-    Outputs are regressed on themselves and on inputs before, and on a drift. 1 where no lag acts, and
-    of short runs.
+    Outputs are regressed on themselves and on inputs before, and on a drift. 1 where no lag acts,
+    and of short runs.
     """
     (m, k), count = (u[0].shape[1], y[0].shape[1]), sum(map(len, y))
     horizon = min(count // (8 * (m + k)), HORIZON)

@@ -429,6 +429,9 @@ class Case(NamedTuple):
 
     def drifts(self, model: Any) -> tuple[tuple[np.ndarray, ...], ...]:
         """Drifts that a model has, at the readings, by run and output."""
+        if "drift" not in model:
+            return tuple(tuple(np.zeros(len(s.measured[i])) for s in self.seen)
+                         for i in range(len(self.courses)))  # fmt: skip
         return tuple(
             tuple(self.split(i, np.asarray(course.drift(model))[: course.count]))
             for i, course in enumerate(self.courses)

@@ -28,8 +28,6 @@ from beamfit.dynamics.bad_readings import BadReadings, judged_without
 from beamfit.dynamics.checks import (
     Checks,
     HeldOutRun,
-    RunNoises,
-    RunSlopes,
     checks_of,
     digits_of,
     held_out,
@@ -470,22 +468,13 @@ def states_answer(
 
     `by_input` names the quantities that are an input's own; `given` tells if the delay is.
     """
-    (case, path, found), delay = begun, int(begun.path.delay)
-    used = used_by(found.fit)
-    slopes, drifts, parts = found.slopes(case), case.drifts(found.fit.model), []
+    (case, path, found), parts = begun, []
+    used = max(1, used_by(found.fit) // len(case.seen)) + (not given)
     for k, s in enumerate(case.seen):
-        rest = tuple(row[k] for row in found.rest)
-        own = [case.split(i, each)[k] for i, each in enumerate(slopes)]
-        fitted = tuple(y - r for y, r in zip(s.measured, rest, strict=True))
+        fitted = tuple(y - row[k] for y, row in zip(s.measured, found.rest, strict=True))
         added = [_added(s, i, y) for i, y in enumerate(fitted)]
-        pairs = (RunSlopes(o, a) for o, a in zip(own, added, strict=True))
-        noise = RunNoises(s.time, [row[k].each for row in found.noise], found.likely)
-        used_each = max(1, used // len(case.seen)) + (not given)
-        slow = [row[k] for row in drifts]
-        checks = checks_of(s, rest, noise, list(pairs), used_each, gain, delay, slow)
-        own = {"jitter": float(found.jitter[:, k].max()), "drift": case.degree, "way": path.way}
-        checks = checks._replace(**own)
-        parts.append(StateSpaceOutput(list(runs[0].outputs)[k], runs, s, fitted, checks))
+        checks = checks_of(begun, k, added, used, gain)
+        parts.append(StateSpaceOutput(s.output, runs, s, fitted, checks))
     ahead = held_out(begun, held)
     nothing = all(part.checks.nothing_probability >= POOR_FIT for part in parts)
     joint = {q for name in parts[0].checks.together for q in (by_input or {}).get(name, ())}
@@ -499,7 +488,7 @@ def states_answer(
     }  # fmt: skip
     status, message = judged(evidence)
     told, _ = quoted(status, told)
-    message = remarked(message, not given and delay == latest(runs) > 0, left_out)
+    message = remarked(message, not given and path.delay == latest(runs) > 0, left_out)
     order = order or found.fit.model["start"].shape[1]
     held_back = ahead if held else {}
     return StatesFit(
