@@ -26,6 +26,7 @@ from beamfit.dynamics.model import WEIGHT
 from beamfit.dynamics.paths import Path, Paths
 from beamfit.dynamics.record import Run, Way, band_limited, check_inputs, checked, unsure_gain
 from beamfit.dynamics.search import (
+    BETTER,
     DRIFT,
     LONGEST,
     Begun,
@@ -346,7 +347,9 @@ class StatesSearch(NamedTuple):
         """
         late = self.delay(runs)
         if late != tried[0].begun.path.delay:
-            tried = self.orders(runs, Path(None, Way(), late))
+            other = self.orders(runs, Path(None, Way(), late))
+            on_time, then = criterion([tried[0].begun, other[0].begun], tried[0].begun)
+            tried = other if then + 2.0 * BETTER < on_time else tried
         best = tried[0]
         for way in self.paths.ways:
             path = best.begun.path._replace(way=way)
