@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -100,9 +99,11 @@ def _steps(texts: tuple[str, ...], option: str) -> list[tuple[str, float, float]
 def _rates(texts: tuple[str, ...]) -> dict[str, float]:
     found = {}
     for text in texts:
-        if not (match := re.fullmatch(r"\s*([^=]+?)\s*=\s*([-+.\deE]+)\s*", text)):
-            raise InputError(f"--rate '{text}'", "INPUT=PER_SECOND such as valve=0.2")
-        found[match[1]] = float(match[2])
+        name, _, value = text.partition("=")
+        try:
+            found[name.strip()] = float(value)
+        except ValueError:
+            raise InputError(f"--rate '{text}'", "INPUT=PER_SECOND such as valve=0.2") from None
     return found
 
 

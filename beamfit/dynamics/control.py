@@ -7,6 +7,7 @@ from fits, with its horizon, margins of limits, and observer; `simulate_loop` ju
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
@@ -34,15 +35,16 @@ ROUNDS, SHARES = 3, (1.0, 0.5, 0.25, 0.0)
 class Response(NamedTuple):
     """An output as the controller knows it.
 
-    `of` is its map or raw numbers, `delay` in steps, `size` its scatter, `correction` the share of
-    a surprise that is taken for a disturbance, `margin` what its limits are held off by.
+    `of` is its map or raw numbers, `delay` in steps, whole or not, `size` its scatter,
+    `correction` the share of a surprise that is taken for a disturbance, `margin` what its limits
+    are held off by.
     """
 
     name: str
     physics: Physics
     of: Any
     offset: float
-    delay: int
+    delay: float
     size: float
     correction: float
     margin: float
@@ -210,7 +212,7 @@ def settled(response: Response, u: jax.Array, step: float, factor: Any = 1.0) ->
 
 def start(control: Controller, u: jax.Array, reading: Any = None) -> ControllerState:
     """The state at rest under u."""
-    latest = max(1, *(r.delay for r in control.responses))
+    latest = max(1, *(math.ceil(r.delay) for r in control.responses))
     x = tuple(settled(r, u, control.step) for r in control.responses)
     level = jnp.zeros(len(x))
     if reading is not None:
@@ -221,9 +223,15 @@ def start(control: Controller, u: jax.Array, reading: Any = None) -> ControllerS
 
 
 def late(response: Response, past: jax.Array, plan: jax.Array) -> jax.Array:
-    """The inputs as the response feels them, shape (plan, m)."""
-    first = len(past) - response.delay
-    return jnp.concatenate([past, plan])[first : first + len(plan)]
+    """The inputs as the response feels them, shape (plan, m).
+
+    In a step within which the input changes, its mean.
+    """
+    steps = math.ceil(response.delay)
+    newer, first = steps - response.delay, len(past) - steps
+    given = jnp.concatenate([past, plan])
+    felt = given[first : first + len(plan)]
+    return felt if not newer else felt + newer * jnp.diff(given, axis=0)[first : first + len(plan)]
 
 
 def moved(
@@ -373,6 +381,8 @@ def _output_rows(
 MARGIN = 2.0
 # Fewest and most steps of a horizon; share of a transient that is left at its end.
 FEWEST, MOST, LEFT = 8, 40, 0.05
+# Steps of a plan at most, whose matrix has 8 MB then, and of a loop, which takes a minute.
+LONGEST, LOOP = 1000, 100_000
 # Drift of the disturbance in a step, as a share of white noise.
 DRIFT = 0.2
 
@@ -434,10 +444,11 @@ def controller(
     step, responses = every * apart, tuple(_response(fit, every, every * apart) for fit in fits)
     if horizon is None:
         horizon = int(np.clip(np.ceil(max(steps) / every), FEWEST, MOST))
-        horizon += max(r.delay for r in responses)
-    if not (horizon > max(r.delay for r in responses) and smooth > 0):
+        horizon += math.ceil(max(r.delay for r in responses))
+    if not (max(r.delay for r in responses) < horizon <= LONGEST and smooth > 0):
         said = f"a horizon of {horizon} steps with smooth {smooth:g}"
-        raise InputError(said, "a horizon longer than the delay, and smooth above 0")
+        expected = f"one longer than the delay, of at most {LONGEST} steps, and smooth above 0"
+        raise InputError(said, expected)
     values = np.concatenate([np.stack(list(run.inputs.values()), axis=1) for run in fits[0].runs])
     usual = {n: (v.min(), v.max()) for n, v in zip(names, values.T, strict=True)}
     low, high = _ranges(names, inputs or {}, usual)
@@ -480,7 +491,7 @@ def _response(fit: ResponseFit, every: int, step: float) -> Response:
         PHYSICS[fit.model],
         model["map"],
         float(model["offset"]),
-        max(int(np.ceil(fit.delay / every)), 0),
+        max(fit.delay / every, 0.0),
         fit.seen.size_y,
         ahead / (ahead + 1.0),
         MARGIN * float(np.hypot(noise, band)),
@@ -584,7 +595,8 @@ class StepResponse(NamedTuple):
     """A step of a target or of a disturbance, and how the loop takes it.
 
     `disturbed` is by how much, or 0; `settling` None where it does not settle before the next
-    one; `overshoot` a share of the target's step; `left` the mean error at the end.
+    one; `overshoot` a share of the target's step, None where that is within the noise; `left` the
+    mean error at the end.
     """
 
     output: str
@@ -644,7 +656,9 @@ class Loop:
         return f"{outputs} by {', '.join(self.control.inputs)}: {self.status}"
 
     def tables(self) -> tuple[Table, ...]:
-        """All numbers, to be shown."""
+        """All numbers, to be shown; none of a model that is no base."""
+        if _unknown(self):
+            return ()
         head = ["output", "at", "change", "settles in", "overshoot"]
         rows = [change.row() for change in self.changes]
         return Table("Changes", head, rows), Table("Limits", *self._limits())
@@ -659,9 +673,8 @@ class Loop:
                 said += f" (the runs: {_range(seen.min(), seen.max())})"
             rows.append([name, said, f"at it in {ends.sum()} of {len(ends)} steps"])
             if np.isfinite(c.limits.rate[i]):
-                rate, moves = c.limits.rate[i], np.abs(np.diff(self.trace.inputs[:, i]))
-                fast = int((moves > rate - TOUCHED * c.sizes[i]).sum())
-                said = f"{rate / c.step:.4g} a second"
+                said = f"{c.limits.rate[i] / c.step:.4g} a second"
+                fast = fastest(self)[:, i].sum()
                 rows.append([name, said, f"at it in {fast} of {len(ends)} steps"])
         for i, r in enumerate(c.responses):
             low, high = c.limits.below[i], c.limits.above[i]
@@ -694,6 +707,13 @@ def touched(loop: Loop) -> np.ndarray:
     c, u = loop.control, loop.trace.inputs
     near = TOUCHED * c.sizes
     return (u <= c.limits.low + near) | (u >= c.limits.high - near)
+
+
+def fastest(loop: Loop) -> np.ndarray:
+    """True for each input that moves at its largest rate, shape (steps - 1, m)."""
+    c, rate = loop.control, loop.control.limits.rate
+    least = np.maximum(rate - TOUCHED * c.sizes, rate / 2)  # also where it hardly moves
+    return np.abs(np.diff(loop.trace.inputs, axis=0)) > least
 
 
 def simulate_loop(
@@ -733,8 +753,9 @@ def simulate_loop(
     fits = (fits,) if isinstance(fits, ResponseFit) else tuple(fits)
     last = max([at for _, _, at in (*targets, *disturbances)], default=0.0)
     long = last + HORIZONS * control.horizon * control.step if duration is None else duration
-    if not control.step < long < np.inf:
-        raise InputError(f"a loop of {long:g} s", f"more than a step, {control.step:g} s")
+    if not control.step < long <= LOOP * control.step:
+        expected = f"more than a step, {control.step:g} s, and at most {LOOP} steps"
+        raise InputError(f"a loop of {long:g} s", expected)
     time = control.step * np.arange(int(np.ceil(long / control.step)))
     begin = np.clip(fits[0].seen.mean_u, control.limits.low, control.limits.high)
     rest = [r.offset + float(settled(r, jnp.asarray(begin), control.step)[0])
@@ -751,7 +772,7 @@ def simulate_loop(
     loop = Loop(Status.converged, "", control, fits, time, wanted, trace, ())
     loop = replace(loop, changes=tuple(_changes(loop, load)))
     found = judge(loop, RULES)
-    return replace(loop, status=found.status, message=found.message)
+    return replace(loop, status=found.status, message=found.message + _poor(loop))
 
 
 def _series(
@@ -809,11 +830,14 @@ def _changes(loop: Loop, load: np.ndarray) -> list[StepResponse]:
             end = min(every[every > k], default=len(time))
             error = trace.outputs[k:end, i] - wanted[k, i]
             step = float(aim[k])
-            near = max(SETTLED * abs(step or push[k]), float(np.mean(fit.noise)))
+            noise = float(np.mean(fit.noise))
+            near = max(SETTLED * abs(step or push[k]), noise)
             off = np.flatnonzero(np.abs(error) > near)
             after = int(off[-1]) + 1 if off.size else 0
             settling = None if after >= len(error) else after * loop.control.step
-            over = max(0.0, float((error * np.sign(step)).max()) / abs(step)) if step else None
+            over = None
+            if abs(step) > noise:
+                over = max(0.0, float((error * np.sign(step)).max()) / abs(step))
             left = float(error[-max(1, int(LAST * len(error))) :].mean())
             end_at, load_step = float(wanted[k, i]), float(push[k])
             found.append(StepResponse(fit.output, float(time[k]), end_at - step, end_at, load_step,
@@ -836,10 +860,11 @@ def _passed(loop: Loop) -> Finding | None:
         low, high = loop.control.limits.below[i], loop.control.limits.above[i]
         y = loop.trace.outputs[:, i]
         over = np.maximum(y - high, low - y)
+        over = over[np.argmax(over <= 0) :]  # where it rests at first is not the loop's
         if over.max() <= SOFT * r.size:
             continue
         cause = f"{r.name} passes its limit by up to {over.max():.3g}"
-        cause += f" in {int((over > 0).sum())} of {len(y)} steps."
+        cause += f" in {int((over > 0).sum())} of {len(over)} steps."
         return Finding(
             Status.infeasible, cause, "Keep the target further off it, or let inputs move faster."
         )
@@ -857,27 +882,41 @@ def _short(loop: Loop) -> Finding | None:
             margin = loop.control.responses[i].margin
             cause = f"{off}: its limit has a safety margin of {margin:.3g} for noise and model."
             return Finding(Status.at_limit, cause, "Wish for less, or identify with less noise.")
-        ends = touched(loop)[-max(1, int(LAST * len(loop.time))) :].mean(axis=0) > 0.5
-        if ends.any():
-            names = [n for n, end in zip(loop.control.inputs, ends, strict=True) if end]
-            cause = f"{off}: {', '.join(names)} at its limit."
+        if names := _mostly(loop, touched(loop)):
+            cause = f"{off}: {names} at its limit."
             return Finding(Status.at_limit, cause, "Wish for less, or widen the limit.")
+        if names := _mostly(loop, fastest(loop)):
+            cause = f"{off}: {names} moves at its largest rate."
+            remedy = "Give it longer, or let inputs move faster."
+            return Finding(Status.not_converged, cause, remedy)
         cause = f"{change.output} has not settled at {change.after:.4g}."
         return Finding(Status.not_converged, cause, "Give it longer, or a longer horizon.")
     return None
 
 
+def _mostly(loop: Loop, at: np.ndarray) -> str:
+    """Inputs that are so in most of the last steps."""
+    often = at[-max(1, int(LAST * len(at))) :].mean(axis=0) > 0.5
+    return ", ".join(n for n, each in zip(loop.control.inputs, often, strict=True) if each)
+
+
 def _kept(loop: Loop) -> Finding | None:
-    poor = [fit.output for fit in loop.fits if fit.status is Status.poor_fit]
     soft = [r.name for i, r in enumerate(loop.control.responses)
             if (loop.trace.beyond[:, i] > SOFT * r.size).any()]  # fmt: skip
-    words = "The loop settles and keeps all limits."
+    first = loop.trace.outputs[0]
+    within = (first >= loop.control.limits.below) & (first <= loop.control.limits.above)
+    words = "The loop settles and keeps all limits"
+    words += "." if within.all() else ", once within them."
     if soft:
         words += f" {', '.join(soft)} came within the safety margin of a limit."
-    if not poor:
-        return Finding(Status.converged, words)
-    words += f" But the model of {', '.join(poor)} does not explain its runs."
-    return Finding(Status.poor_fit, words, "See beamfit identify; a network, say.")
+    return Finding(Status.poor_fit if _poor(loop) else Status.converged, words)
+
+
+def _poor(loop: Loop) -> str:
+    """Sentence about models that their runs refute, for every verdict."""
+    poor = [fit.output for fit in loop.fits if fit.status is Status.poor_fit]
+    said = f" But the model of {', '.join(poor)} does not explain its runs: see beamfit identify."
+    return said if poor else ""
 
 
 RULES = (_unknown, _passed, _short, _kept)

@@ -15,7 +15,7 @@ import numpy as np
 
 from beamfit.lifetime.pieces import GAP
 from beamfit.quantity import HOUR, Quantity, relative_change
-from beamfit.statistics import CLEAR_ODDS, log_evidence_of_change
+from beamfit.statistics import CLEAR_ODDS, OPEN, log_evidence_of_change
 
 MINUTE = 60.0
 # Windows, s: four begin in turn in each length, so that one of nearly any age is at hand.
@@ -41,6 +41,9 @@ class AlarmState(NamedTuple):
         Seconds watched, and seconds still to wait after a step.
     path : array, shape (..., 3)
         Since the last cut: ln I over the expected, and its derivatives by relative changes of a, b.
+    foretold, unsure : array, shapes (..., 4), (...)
+        Noise with a memory, in the path and a 1 beside it, as the readings tell it; variance of
+        that over the reference's.
     noise : array
         Variance of readings over that of the reference.
     factor, covariance : array, shapes (..., 2), (..., 2, 2)
@@ -61,6 +64,8 @@ class AlarmState(NamedTuple):
     clock: np.ndarray
     hold: np.ndarray
     path: np.ndarray
+    foretold: np.ndarray
+    unsure: np.ndarray
     noise: np.ndarray
     factor: np.ndarray
     covariance: np.ndarray
@@ -204,12 +209,14 @@ class Reference(NamedTuple):
     noise : float
         Standard deviation of a reading, mA.
     correlation_time : float
-        Of that noise, s; 0 where readings are independent.
+        Of the part of that noise that has one, s; 0 where readings are independent.
     interval : float
         Usual time between readings, s.
     covariance : array, shape (2, 2)
         Of relative errors of a and b: how well they are known, and how far they wander on an
         ordinary day.
+    white : float
+        Share of the noise's variance without memory.
     """
 
     a: float
@@ -218,6 +225,7 @@ class Reference(NamedTuple):
     correlation_time: float = 0.0
     interval: float = 1.0
     covariance: np.ndarray = WANDER**2 * np.eye(2)
+    white: float = 0.0
 
 
 class Reading(NamedTuple):
@@ -280,7 +288,8 @@ def started(reference: Reference, shape: tuple[int, ...] = ()) -> AlarmState:
     none, zero = np.full(shape, np.nan), np.zeros(shape)
     return AlarmState(
         time=none, current=none, step=zero, pace=zero, expected=np.ones((*shape, 2)), clock=zero,
-        hold=zero, path=np.zeros((*shape, 3)), noise=np.ones(shape), factor=np.ones((*shape, 2)),
+        hold=zero, path=np.zeros((*shape, 3)), foretold=np.zeros((*shape, 4)), unsure=zero,
+        noise=np.ones(shape), factor=np.ones((*shape, 2)),
         covariance=np.broadcast_to(np.asarray(reference.covariance, float), (*shape, 2, 2)),
         age=np.zeros(windows), weight=np.zeros(windows), mean=np.zeros((*windows, 3)),
         product=np.zeros((*windows, 5)), raised=none, excess=zero, before=zero,
@@ -313,9 +322,10 @@ def watched(
     -----
     ln I follows -∫(a I + b)dt, so that its excess over the expected is linear in relative changes
     of a and b; each window fits them with an offset for every piece between refills, gaps and
-    steps, by weighted sums of readings freed of their correlation exp(-dt/time) (as in docs,
-    "Noise with a memory"). With information J, score s and the reference's covariance C, the test
-    of a change d = (1, 0) or (0, 1) is (dᵀ M s')²/(dᵀ M d), M = (1 + J C)⁻¹ J, s' = (1 + J C)⁻¹ s.
+    steps, by weighted sums of what each reading says beside those before it (Kalman filter of white
+    noise and of one with the correlation exp(-dt/time)). With information J, score s and the
+    reference's covariance C, the test of a change d = (1, 0) or (0, 1) is (dᵀ M s')²/(dᵀ M d),
+    M = (1 + J C)⁻¹ J, s' = (1 + J C)⁻¹ s.
     What moved is told by readings after the alarm alone: a window that spans the change bends.
 
     Examples
@@ -346,7 +356,7 @@ def is_gap(seconds: np.ndarray | float, interval: float) -> np.ndarray | bool:
 def _step(usual: Reference, state: AlarmState, reading: Reading) -> tuple[np.ndarray, ...]:
     """From one reading to the next: seconds, whether the path goes on, and whether it was cut by
     a step; how far ln I moved against the expected, with derivatives; what is expected of a and b;
-    noise and its memory.
+    noise, its memory, and its change from reading to reading.
     """
     with np.errstate(invalid="ignore", divide="ignore"):
         seconds = np.asarray(reading.time - state.time)
@@ -363,32 +373,31 @@ def _step(usual: Reference, state: AlarmState, reading: Reading) -> tuple[np.nda
         # A longer interval than the last is held to the pace of the last and to the share.
         alike = np.where(state.step > 0, np.minimum(seconds, state.step), 0.0)
         ratio = alike / np.where(state.step > 0, state.step, 1.0)
-        spread = noise * np.sqrt(2 * (1 - memory) * (1 + ratio + ratio**2))
+        change = noise * np.sqrt(2 * (1 - (1 - usual.white) * memory))
+        spread = change * np.sqrt(1 + ratio + ratio**2)
         off = np.abs(excess - state.pace * alike)
         level = off <= JUMP * spread + SHARE * (a_part + b_part)
         level &= excess - a_part - b_part <= JUMP * spread  # what rises is a refill
         expected = np.stack(np.broadcast_arrays(reading.a_factor, reading.b_factor, noise)[:2], -1)
         level &= (np.abs(expected / state.expected - 1) <= SET).all(-1)
     moved = np.stack([excess, -a_part, -b_part], axis=-1)
-    return seconds, going & level, going & ~level, moved, expected, noise, memory
+    return seconds, going & level, going & ~level, moved, expected, noise, memory, change
 
 
 def _moved_on(usual: Reference, state: AlarmState, reading: Reading) -> AlarmState:
     """The path from the last reading to this one, and every window with it."""
-    seconds, going, cut, moved, expected, noise, memory = _step(usual, state, reading)
+    seconds, going, cut, moved, expected, noise, memory, change = _step(usual, state, reading)
     between = np.where(going, seconds, 0.0)
     hold = np.where(cut, SETTLE, np.maximum(state.hold - between, 0.0))
     path = np.where(going[..., None], state.path + np.where(going[..., None], moved, 0.0), 0.0)
     begins = ~going | (state.hold > 0)
-    # Of a reading less its memory of the last one: what it alone says, as value and weight.
-    kept = np.where(begins, 0.0, memory)
-    alone = (path - kept[..., None] * state.path) / (1 - kept)[..., None]
-    weight = np.where(hold > 0, 0.0, (1 - kept) / ((1 + kept) * noise**2))
+    alone, weight, foretold, unsure = _alone(usual, state, path, np.where(begins, 0.0, memory))
+    weight = np.where(hold > 0, 0.0, weight / noise**2)
     windows = with_reading(
         state, np.where(begins[..., None], 0.0, state.weight), alone, weight, between
     )
     known = going | cut
-    off = moved[..., 0] ** 2 / (2 * (1 - memory) * noise**2)
+    off = moved[..., 0] ** 2 / change**2
     grown = np.where(going, np.minimum(off, JUMP**2) * state.noise - state.noise, 0.0) / MEMORY
     return state._replace(
         time=np.broadcast_to(reading.time, state.time.shape).astype(float),
@@ -399,10 +408,29 @@ def _moved_on(usual: Reference, state: AlarmState, reading: Reading) -> AlarmSta
         clock=state.clock + between,
         hold=hold,
         path=path,
+        foretold=foretold,
+        unsure=unsure,
         noise=np.maximum(state.noise + grown, 1.0),
         raised=state.raised + between,
         **windows,
     )
+
+
+def _alone(
+    usual: Reference, state: AlarmState, path: np.ndarray, kept: np.ndarray
+) -> tuple[np.ndarray, ...]:
+    """Value and weight of a reading beside those before it, and the noise foretold by all of them.
+
+    The Kalman filter of noise of which a part keeps so much from one reading to the next; the
+    column of ones shows how much of an offset is left.
+    """
+    ahead = kept[..., None] * state.foretold
+    unsure = kept**2 * state.unsure + (1 - usual.white) * (1 - kept**2)
+    news = np.concatenate([path, np.ones_like(path[..., :1])], axis=-1) - ahead
+    gain = unsure / (unsure + usual.white)
+    weight = news[..., 3] ** 2 / (unsure + usual.white)
+    alone = news[..., :3] / news[..., 3:]
+    return alone, weight, ahead + gain[..., None] * news, (1 - gain) * unsure
 
 
 def _judged(
@@ -416,6 +444,7 @@ def _judged(
     apart = np.zeros(quiet.shape, int)
     if not quiet.all():
         a, b, both = seen_in(state, slice(-1, None)).evidence[..., 0]
+        a, b = (np.where(_is_loss(state, k), v, -np.inf) for k, v in ((1, a), (2, b)))
         either_one = np.logaddexp(a, b)
         found = [both - either_one, a - np.logaddexp(b, 0.0), b - np.logaddexp(a, 0.0)]
         found = [odds > CLEAR_ODDS for odds in found]
@@ -429,6 +458,14 @@ def _judged(
     change, error, covariance = change_since(state, moved)
     told = AlarmStep(raised, moved, change, error, _since(usual, state, change))
     return _adopted(state, moved > 0, change, covariance), told
+
+
+def _is_loss(state: AlarmState, moved: int) -> np.ndarray:
+    """Tell if what moved alone, a or b, may still be above zero: a current that stops to fall, as
+    of a monitor that stands still, has lost both.
+    """
+    change, error, _ = change_since(state, np.full(state.raised.shape, moved))
+    return (1 + change + OPEN * error)[..., moved - 1] > 0
 
 
 def _shown(usual: Reference, state: AlarmState) -> tuple[np.ndarray, np.ndarray]:

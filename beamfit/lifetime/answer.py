@@ -284,7 +284,8 @@ def _freely(e: Evidence) -> Finding | None:
         said = f": {e.explained}" if known else ""
         return Finding(Status.converged, f"{told}. {likely}, which the errors contain{said}")
     if e.free.wanders > LIKELIER:
-        likely = f"The loss rate wanders within the record ({percent(e.free.wanders)})"
+        chance = percent(e.free.wanders)
+        likely = f"The loss rate or the monitor wanders within the record ({chance})"
         return Finding(Status.converged, f"{told}. {likely}, which the errors contain")
     if e.constant_a.status is Status.poor_fit:
         return Finding(Status.converged, f"{told}. {_departs(e)}, which the errors contain")

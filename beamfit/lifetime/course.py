@@ -12,6 +12,7 @@ import numpy as np
 from beamfit.answer import Table, answer, cell, json_of
 from beamfit.errors import InputError
 from beamfit.lifetime.alarm import WANDER, Alarm, Reference, alarms_of, when
+from beamfit.lifetime.alternatives import constant_a
 from beamfit.lifetime.fit import DecayFit, bare
 from beamfit.lifetime.mechanisms import Losses, loss_coefficients
 from beamfit.lifetime.scales import by_losses, summarise
@@ -274,12 +275,15 @@ def _drift(time: np.ndarray, values: Sequence[Quantity], centre: float) -> Quant
 def reference_of(
     decays: Sequence[Decay], a: np.ndarray, b: np.ndarray, ring: Losses | None = None
 ) -> Reference | None:
-    """Usual a and b of some decays, with their noise; None where they do not give both above zero.
+    """Usual a and b of some decays, with their noise; None where they do not give both above zero,
+    or refute that they are constant.
 
     Least squares on what each decay says of a I and a I + b; with a ring its ratio of a to b is
     known, to `SHARES`. How far the decays scatter about it is how far a and b are expected to
     wander.
     """
+    if is_refuted([decay.fit for decay in decays]):
+        return None
     current, parts, root = map(np.asarray, summarise(decays))
     rows = by_losses(a * current, b)
     weighted = (root @ rows).reshape(-1, 2)
@@ -297,23 +301,38 @@ def reference_of(
     off = parts[:, 1] / (rows @ found)[:, 1] - 1
     wander = math.sqrt(float(off @ off) / max(off.size - 2, 1))
     covariance = covariance + max(WANDER, wander) ** 2 * np.eye(2)
-    return Reference(*map(float, found), *_noise(decays), covariance)
+    noise, time, interval, white = np.median([_noise(decay.fit) for decay in decays], axis=0)
+    return Reference(*map(float, found), noise, time, interval, covariance, max(white, 0.0))
 
 
-def _alike_over(fit: DecayFit) -> float:
-    """Correlation time of noise with a fit's neighbours and no white part, s; 0 for none."""
-    alike = fit.identifiability.residual_correlation
-    return -float(np.median(np.diff(fit.readings.time))) / math.log(alike) if alike else 0.0
+def is_refuted(fits: Sequence[DecayFit]) -> bool:
+    """Tell if decays together reject a constant a, by the mean of their exponents; where these
+    scatter more than their errors, by their scatter.
+    """
+    found = [fit.constant_a.exponent for fit in fits if fit.constant_a is not None]
+    told = [(float(q.value), float(q.error)) for q in found if q.error]
+    if not told:
+        return False
+    value, error = np.array(told).T
+    mean, whole = np.average(value, weights=error**-2), np.sum(error**-2) ** -0.5
+    squares = float(np.sum(((value - mean) / error) ** 2))
+    whole *= math.sqrt(max(squares / max(value.size - 1, 1), 1.0))
+    chance = 2 * one_sided_probability(abs(mean) / whole, math.inf)
+    return constant_a(mean, whole, whole, chance).status is Status.poor_fit
 
 
-def _noise(decays: Sequence[Decay]) -> tuple[float, float, float]:
-    """Noise of a reading, mA, its correlation time and the interval of readings, s."""
-    fits = [decay.fit for decay in decays]
-    memory = np.median([_alike_over(fit) for fit in fits])
-    least = BEST_MONITOR * np.median([fit.mean_current for fit in fits])
-    noise = max(np.median([fit.noise for fit in fits]), least)
-    interval = np.median([np.median(np.diff(decay.segment.time)) for decay in decays])
-    return float(noise), float(memory), float(interval)
+def _noise(fit: DecayFit) -> tuple[float, float, float, float]:
+    """Noise of a reading, mA, its correlation time, the interval of readings, s, and the share of
+    the variance without memory.
+
+    The size is that of changes from reading to reading: how far noise with a long memory gets the
+    residuals of one decay do not tell.
+    """
+    interval, time = float(np.median(np.diff(fit.readings.time))), fit.correlation_time or 0.0
+    alike = fit.identifiability.residual_correlation or 0.0
+    white = 1 - alike * math.exp(interval / time) if alike else 0.0
+    size = math.sqrt(float(np.mean(np.diff(fit.residuals) ** 2)) / (2 * (1 - alike)))
+    return max(size, BEST_MONITOR * fit.mean_current), time if alike else 0.0, interval, white
 
 
 def _alarms(
@@ -348,7 +367,7 @@ def _verdict(trend: Trend) -> tuple[Status, str]:
     if drift.error is not None and _is_sure(abs(drift.value) / drift.error, count - 2):
         said += f" It changes by {relative_change(drift)} a week."
     if trend.reference is None:
-        said += " Readings are not watched: the first decays give no a and b above zero."
+        said += " Readings are not watched: the first decays give no constant a and b above zero."
     if trend.alarms:
         first = "Alarm" if len(trend.alarms) == 1 else f"{len(trend.alarms)} alarms, the first"
         said += f" {first}: {trend.alarms[0].said(trend.dated)}."

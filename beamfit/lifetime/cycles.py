@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
-from scipy.special import logsumexp, ndtr
+from scipy.special import logsumexp, ndtr, stdtr
 
 from beamfit.lifetime.expansion import (
     LOSS,
@@ -166,6 +166,8 @@ OUTLIER, SHARE = 7.0, 0.2
 EDGE, WITHIN = 2.5, "they lie within injections"
 # Neighbours that tell where a cycle, or a reading at the edge of one, should lie.
 NEXT = 9
+# Time constants of fresh beam that are looked for, and to which part of its error it has settled.
+FRESH, SETTLED = 12, 0.1
 
 
 def averaged(cycles: Sequence[DecayRecord]) -> Pieces:
@@ -227,21 +229,43 @@ def _edges(about: Expansion) -> np.ndarray:
     return beside.mean(axis=1) * math.sqrt(ends.shape[1] / (1 + 1 / (NEXT - 1)))
 
 
+def _fresh(about: Expansion, most: int) -> int:
+    """Readings at the start of a cycle until fresh beam, which decays faster, has settled; at most
+    so many. How its size differs from cycle to cycle tells the error: noise may have a memory.
+    """
+    first, lengths = about.pieces.first, about.pieces.lengths
+    place = np.arange(about.pieces.time.size) - np.repeat(first, lengths)
+    times = np.geomspace(1.0, max(most / math.log(EDGE / SETTLED), 1.0), FRESH)
+    columns = about.beside(np.exp(-place[:, None] / times) * about.pieces.weight[:, None])
+    law = np.linalg.qr(about.left[:, about.columns()])[0]
+    columns -= law @ (law.T @ columns)
+    above = np.add.reduceat(-about.left[:, [-1]] * columns, first)
+    squares = np.add.reduceat(columns**2, first)
+    off = above - above.sum(axis=0) / squares.sum(axis=0) * squares
+    cycles = first.size
+    error = np.sqrt(np.sum(off**2, axis=0) * cycles / (cycles - 1))
+    excess = above.sum(axis=0) / np.maximum(error, 1e-300)
+    best = int(np.argmax(excess))
+    if not stdtr(cycles - 1, -excess[best]) < ndtr(-EDGE):
+        return 0
+    return min(math.ceil(math.log(excess[best] / SETTLED) * times[best]), most)
+
+
 def _trimmed(about: Expansion) -> tuple[Expansion, list[str]]:
     """The fit without readings at the edges of cycles that are not of the decay."""
     cut, high = np.zeros(2, int), 0
     most = int(np.median(about.pieces.lengths)) // 3
     while cut.max() < most:
         first_off, last_off = _edges(about)
-        far = np.array([abs(first_off), last_off]) > EDGE
+        fresh = _fresh(about, most - cut[0])
+        far = np.array([max(abs(first_off) > EDGE, fresh), last_off > EDGE], int)
         if not far.any():
             break
-        high += int(first_off > EDGE)
-        keep = np.ones(about.pieces.time.size, bool)
+        high += max(int(first_off > EDGE), fresh)
         first, lengths = about.pieces.first, about.pieces.lengths
-        long = lengths > NEXT
-        for side, ends in enumerate((first, first + lengths - 1)):
-            keep[ends[long]] &= not far[side]
+        place = np.arange(about.pieces.time.size) - np.repeat(first, lengths)
+        whole = np.repeat(lengths, lengths)
+        keep = (place >= far[0]) & (place < whole - far[1]) | (whole <= NEXT)
         about = with_course(solved(about.pieces.kept(keep, FEWEST_READINGS)))
         cut = cut + far
     said = []

@@ -48,6 +48,9 @@ SMOOTH, OUTGASSING, TIMES, SIZES = 0.6, 0.08, (1e-3, 1.0), (1e-3, 10.0)
 # shares of the loss it has gone at the end, each as likely.
 WANDERS, WALKS = 0.14, (0.003, 0.015, 0.07, 0.3)
 LOG_WANDERS = math.log(WANDERS / SMOOTH)
+# Share of the current by which a monitor itself goes up and down in a record, at most: transformers
+# are calibrated to that. What wanders by less is as likely the monitor as the loss rate.
+STEADY = 1e-3
 # Spans over the time of gas that is pumped away: shorter times are seen by themselves.
 PACES = (1.0, 20.0)
 # Where the record's bend does not depend on the share its coordinate has this slope.
@@ -550,6 +553,26 @@ class Draws(NamedTuple):
     log: float
     worth: float
 
+    def of_the_monitor(self) -> Draws:
+        """The same readings where the monitor wanders and the loss rate does not.
+
+        A walk of the loss makes the readings wander about the law, from nothing at the first to
+        nothing at the last one. A monitor's own ends differ as any two of its readings do, which
+        the loss rate in the span contains.
+        """
+        share = INTEGRAL[-1]
+        read = self.numbers.rate * (INTEGRAL @ self.walk)
+        size = np.sqrt(share @ (read - share @ read) ** 2)
+        ends = math.sqrt(2) * size * ndtri(_even(size.size, 1, 2)[0])
+        numbers = self.numbers._replace(rate=np.maximum(self.numbers.rate + ends, 1e-300))
+        weight = self.weight * np.exp(-0.5 * (size / STEADY) ** 2)
+        part = max(float(weight.sum()), 1e-300)
+        worth = part**2 / max(float(weight @ weight), 1e-300)
+        return Draws(
+            numbers, np.zeros_like(self.walk), self.currents, weight / part,
+            self.log + math.log(part), worth,
+        )  # fmt: skip
+
 
 @lru_cache(maxsize=16)
 def _even(draws: int, count: int, seed: int) -> np.ndarray:
@@ -758,7 +781,7 @@ class FreeLaw:
     pumped : float
         Probability of gas that is pumped away after a fill, in the place of exponent and drift.
     wanders : float
-        Probability that the loss rate wanders besides.
+        Probability that the loss rate or the monitor wanders besides.
     nodes : array, shape (14,)
         Mean current at the nodes, mA.
     span : float
@@ -853,6 +876,7 @@ def free_law(record: DecayRecord, values: Physical) -> FreeLaw | None:
     seen = SeenDecay.of(record, values)
     proposed = proposals(seen)
     laws = list(zip(proposed, drawn(proposed), strict=True))
+    laws += [(law, own.of_the_monitor()) for law, own in laws if law.seen.walk is not None]
     draws = mixed([own for _, own in laws])
     smooth = mixed([own for law, own in laws if not law.is_pumped])
     if not np.isfinite(smooth.log) or draws.worth < LEAST_WORTH:

@@ -281,12 +281,11 @@ def learnt(
 
 
 def _usual(window: Window, machine: Machine | None) -> alarm.Reference | None:
-    """The loss of a fit that knows a and b if they are constant, which the readings do not refute,
-    or the loss rate and a ring their ratio.
+    """The loss of a fit that knows a and b if they are constant, or the loss rate and a ring their
+    ratio.
     """
     fit, ring = window.fit, None
-    refuted = fit.constant_a is not None and fit.constant_a.status is Status.poor_fit
-    if refuted or fit.status not in (Status.converged, Status.unidentified):
+    if fit.status not in (Status.converged, Status.unidentified):
         return None
     known = tuple(fit.if_constant(name) for name in "ab")
     if not all(one.determined for one in known):
@@ -419,8 +418,9 @@ class State(NamedTuple):
         late one.
     settings : Conditions
         Last ones read, in SI.
-    highest, noise, due : float
-        Highest current of the window and noise of a reading, mA; when to fit, s.
+    highest, zero, noise, due : float
+        Highest current of the window, farthest reading from zero without beam, and noise of a
+        reading, mA; when to fit, s.
     counts, events, course, answer
         What happened, with its time; what was found.
     alarm, alarms : Alarmed or None, tuple of Alarm
@@ -438,6 +438,7 @@ class State(NamedTuple):
     late: tuple[int, float] = (0, -math.inf)
     settings: Conditions = Conditions(*[math.nan] * len(Conditions._fields))
     highest: float = 0.0
+    zero: float = 0.0
     noise: float = math.inf
     due: float = -math.inf
     counts: Counts = Counts()
@@ -457,7 +458,7 @@ class State(NamedTuple):
     def said(self) -> str:
         """The alarm in words."""
         if self.alarm is None:
-            return "no usual loss yet: it needs a fit that tells a from b, or a ring"
+            return "no usual loss yet: it needs a fit that tells constant a from b, or a ring"
         if self.alarm.raised is not None:
             raised = alarm.when(self.alarm.raised - self.shift, True)
             return f"the loss moved, raised {raised}; what moved is told from the readings since"
@@ -560,8 +561,9 @@ def _placed(plan: Plan, state: State, own: float, value: float) -> State:
     state, time = state._replace(last=own), own - state.shift
     if not value > DROPOUT * state.highest:
         if state.dead + 1 == IN_A_ROW:
-            state = noted(_cut(plan, state), time, "the beam was lost")
-        return state._replace(dead=state.dead + 1)
+            state = noted(_cut(plan, state), time, "the beam was lost")._replace(zero=0.0)
+        zero = max(state.zero, abs(value)) if state.dead >= IN_A_ROW else state.zero
+        return state._replace(dead=state.dead + 1, zero=zero)
     if state.dead >= IN_A_ROW:
         state = noted(state, time, "beam again")
     if state.highest and DROPOUT * value > state.highest and state.spikes + 1 < IN_A_ROW:
@@ -613,7 +615,8 @@ def _answered(plan: Plan, state: State) -> State:
         due=state.last + plan.every,
         alarm=usual or state.alarm,
         alarms=tuple(a for a in state.alarms if (a.told or a.time) >= begin - shift),
-        highest=max((row.current for row in state.rows), default=0.0),
+        # Without a beam in the window one must stand as far above zero as a spike above a beam.
+        highest=max((row.current for row in state.rows), default=state.zero / DROPOUT**2),
         noise=state.noise if fit is None else _noise_of_one(plan, state, fit.rms_residual),
     )
 

@@ -48,6 +48,8 @@ def test_a_loop_answers_in_json_and_on_a_page(run, record, tmp_path, well_shown)
         (("--set", "level=2", "--limit", "pump=0:1"), ["--limit of 'pump'", "valve"]),
         (("--set", "level=2", "--limit", "valve=2:1"), ["limits 2 to 1 of valve"]),
         (("--set", "level=2", "--rate", "valve=fast"), ["--rate 'valve=fast'"]),
+        (("--set", "level=2", "--rate", "valve=1.2.3"), ["--rate 'valve=1.2.3'"]),
+        (("--set", "level=2", "--for", 1e9), ["a loop of 1e+09 s", "at most 100000 steps"]),
         (("--set", "level=2", "--rate", "pump=1"), ["--rate of 'pump'", "valve"]),
         (("--set", "level=2", "--for", -3), ["a loop of -3 s", "a step"]),
         (("--set", "level=nan"), ["nan for level", "finite"]),

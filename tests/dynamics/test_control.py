@@ -2,6 +2,7 @@
 
 import json
 import re
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
@@ -15,6 +16,7 @@ from beamfit.dynamics.control import (
     Response,
     closed_loop,
     controller,
+    outputs,
     simulate_loop,
     start,
 )
@@ -227,6 +229,46 @@ def test_what_cannot_be_kept_or_reached_is_named(fit):
     loop = simulate_loop(fit, control, [("level", 2.0, 0.0)], disturbances=[("level", 0.9, 20.0)])
     assert loop.status is Status.infeasible
     assert "passes its limit by up to 0." in loop.message
+    control = controller(fit, rates={"valve": 1e-4})
+    loop = simulate_loop(fit, control, [("level", 2.5, 0.0)])
+    assert loop.status is Status.not_converged
+    assert "valve moves at its largest rate" in loop.message
+
+
+def test_where_a_loop_rests_at_first_is_no_fault_of_it_and_a_step_within_the_noise_has_no_overshoot(
+    fit,
+):
+    control = controller(fit)
+    [rest] = simulate_loop(fit, control, [("level", 2.0, 0.0)]).trace.outputs[0]
+    control = controller(fit, outputs={"level": (-INF, rest - 0.1)})
+    loop = simulate_loop(fit, control, [("level", rest - 0.4, 0.0)])
+    assert (loop.status, loop.message.endswith("once within them.")) == (Status.converged, True)
+    near = rest + 0.5 * fit.noise[0]
+    [change] = simulate_loop(fit, controller(fit), [("level", near, 0.0)]).changes
+    assert change.overshoot is None
+
+
+def test_a_model_that_is_no_base_or_explains_no_runs_is_said(fit):
+    unknown = replace(fit, status=Status.unidentified, message="Too few.")
+    loop = simulate_loop(unknown, controller(fit), [("level", 2.0, 0.0)])
+    assert (loop.status, loop.tables()) == (Status.unidentified, ())
+    poor = replace(fit, status=Status.poor_fit)
+    for far in (1.0, 9.0):
+        loop = simulate_loop(poor, controller(fit), [("level", far, 0.0)])
+        assert loop.status in (Status.poor_fit, Status.at_limit)
+        assert "the model of level does not explain its runs" in loop.message
+
+
+def test_a_delay_of_parts_of_a_step_is_felt_in_parts():
+    """Against ten times finer steps, in which it is whole."""
+    coarse = response(FIRST_ORDER, [2.0, 1.5], delay=1.3)
+    fine = coarse._replace(delay=13)
+    given = jnp.array(np.random.default_rng(0).uniform(0.0, 2.0, (12, 1)))
+    found = []
+    for one, step, plan in ((coarse, 0.5, given), (fine, 0.05, jnp.repeat(given, 10, axis=0))):
+        control = made(one, horizon=len(plan), step=step)
+        found.append(np.asarray(outputs(control, start(control, jnp.ones(1)), plan)).ravel())
+    np.testing.assert_allclose(found[0], found[1][9::10], atol=0.02 * np.ptp(found[1]))
 
 
 @pytest.mark.parametrize(
@@ -238,6 +280,7 @@ def test_what_cannot_be_kept_or_reached_is_named(fit):
         ({"rates": {"valve": 0.0}}, "rate 0 of valve"),
         ({"horizon": 0}, "horizon of 0 steps"),
         ({"smooth": 0.0}, "smooth 0"),
+        ({"horizon": 100_000}, "at most 1000 steps"),
     ],
 )
 def test_a_controller_refuses_in_a_line(fit, said, words):

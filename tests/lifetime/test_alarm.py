@@ -15,6 +15,10 @@ from beamfit.lifetime.alarm import (
     started,
     watched,
 )
+from beamfit.lifetime.course import reference_of
+from beamfit.lifetime.fit import fit_decay
+from beamfit.lifetime.record import DecayRecord
+from beamfit.lifetime.study import Decay
 from beamfit.statistics import CHANGED, log_evidence_of_change
 
 # Ten hours at 500 mA, two thirds of the loss from a; 1 µA a second.
@@ -147,18 +151,19 @@ def test_a_pressure_that_the_gauge_shows_is_no_alarm():
     assert alarms_of(USUAL, time, beam) != ()
 
 
-def test_the_tests_are_those_of_generalised_least_squares():
+@pytest.mark.parametrize("white", [0.0, 0.6])
+def test_the_tests_are_those_of_generalised_least_squares(white):
     """All windows that began with the record, against the dense matrices of the same statement."""
     covariance = np.array([[4e-4, -1e-4], [-1e-4, 9e-4]])
     # Stated larger than it is, so that the noise that is followed stays as stated.
-    usual = Reference(3.7e-7, 9.26e-5, 1.5e-3, 4.0, covariance=covariance)
+    usual = Reference(3.7e-7, 9.26e-5, 1.5e-3, 4.0, covariance=covariance, white=white)
     random, count = np.random.default_rng(5), 220
     time = np.cumsum(random.uniform(0.5, 1.5, count))
     pieces = np.split(np.arange(count), [120])
     worse = 1.2 * usual.a
     parts = [beam_after(50.0, time[rows] - time[rows[0]], worse, usual.b) for rows in pieces]
     beam = np.concatenate([parts[0], 1.0 + parts[1]])
-    lag = np.exp(-np.abs(time[:, None] - time) / 4.0)
+    lag = (1 - white) * np.exp(-np.abs(time[:, None] - time) / 4.0) + white * np.eye(count)
     beam = beam + 1e-3 * np.linalg.cholesky(lag) @ random.normal(size=count)
     # A window forgets nothing but the ten seconds after a refill, which shows in two readings.
     looked = [pieces[0], pieces[1][time[pieces[1]] > time[121] + 10.0]]
@@ -187,6 +192,33 @@ def test_the_tests_are_those_of_generalised_least_squares():
     for name, part, wanted in zip("ab2", (a, b, a + beside), expected, strict=True):
         assert part[begun] == pytest.approx(wanted, rel=5e-3), name
     assert expected[2] > 3
+
+
+def test_slow_noise_under_white_noise_is_learnt_and_is_no_change_of_the_loss():
+    """SIMULATED: half of the variance wanders over five minutes; neighbours hardly show it."""
+    random, beams, count = np.random.default_rng(8), 20, 3000
+    time, slow, kept = 2.0 * np.arange(count), random.normal(size=beams), np.exp(-2 / 300)
+    read = np.empty((count, beams))
+    for k in range(count):
+        slow = kept * slow + np.sqrt(1 - kept**2) * random.normal(size=beams)
+        read[k] = beam_after(500.0, time[k]) + 2e-3 * (slow + random.normal(size=beams))
+    fit = fit_decay(DecayRecord(time[:1800], read[:1800, 0]))
+    usual = reference_of((Decay.of(fit.readings, 0.0, fit, None),), np.ones(1), np.ones(1))
+    assert usual.correlation_time > 100  # a walk does as well for windows that are shorter
+    assert usual.white * usual.noise**2 == pytest.approx(2e-3**2, rel=0.1)
+    rows = zip(np.broadcast_to(time[:, None], read.shape), read, strict=True)
+    assert watch(rows, usual, (beams,))[1] == []
+
+
+def test_a_monitor_that_stands_still_has_lost_a_and_b():
+    """A alone would have moved by -160 %, which no loss does."""
+    time = np.arange(0.0, 3000.0)
+    beam = beam_after(500.0, np.minimum(time, 1000.0))
+    beam = beam + 1e-3 * np.random.default_rng(4).normal(size=time.size)
+    first, *_ = alarms_of(USUAL, time, beam)
+    assert first.moved == "a and b"
+    for change in (first.a, first.b):
+        assert change.value == pytest.approx(-1.0, abs=3 * change.error)
 
 
 def test_many_beams_at_once_are_each_as_alone():

@@ -52,6 +52,22 @@ def test_a_change_is_found_dated_and_named(leaking):
     assert json.loads(json.dumps(leaking.to_json()))["alarms"][0]["a"] is None
 
 
+def test_decays_that_refute_a_constant_a_are_no_reference():
+    """SIMULATED: a as I^-1/3, of which constant a and b made "b moved by -286 ± 28 %"."""
+    random, studies = np.random.default_rng(3), []
+    for fill in range(6):
+        beams = [500.0]
+        for _ in range(int(FILL / STEP)):
+            beams.append(beam_after(beams[-1], STEP, A * (450 / beams[-1]) ** (1 / 3)))
+        read = np.array(beams) + 2e-3 * random.normal(size=len(beams))
+        start = 1.7e9 + fill * (FILL + 2 * STEP)
+        time = STEP * np.arange(read.size)
+        studies.append(study_record(DecayRecord(time, read, name=f"fill {fill}", start=start)))
+    found = trend_of(studies)
+    assert (found.reference, found.alarms) == (None, ())
+    assert "Readings are not watched: the first decays give no constant a and b" in found.message
+
+
 def test_nothing_moves_and_nothing_is_said():
     quiet = trend_of([study_record(fills(4, seed=1))])
     assert (quiet.status, quiet.alarms) == ("converged", ())

@@ -135,6 +135,15 @@ def test_without_a_beam_there_is_no_lifetime():
     assert [text for _, text in state.events][-1] == "beam again"
 
 
+def test_the_noise_of_a_monitor_without_beam_is_none_whenever_the_window_ends():
+    state, random = watch(decay(1000)), np.random.default_rng(9)
+    state = watch(((1000.0 + 8 * k, 2e-3 * random.normal()) for k in range(900)), state=state)
+    assert (state.rows, state.answer.message) == ((), "No lifetime: no beam.")
+    assert [text for _, text in state.events] == ["the beam was lost"]
+    state = watch(((time + 8200, beam - 480) for time, beam in decay(100, seed=7)), state=state)
+    assert "beam again" in [text for _, text in state.events]
+
+
 def test_a_pressure_that_the_gauge_shows_is_no_alarm_and_is_normalised(machine):
     """First principles themselves, with the pressure of the ring's file and twice as much."""
     ring, operation = machine
