@@ -206,7 +206,8 @@ def identify(
     if model == STATES:
         from beamfit.dynamics.linear import identify_states
 
-        return (identify_states(runs, order, map, delay=int(delay or 0), offset=offset, **options),)
+        whole = None if delay is None else int(delay)
+        return (identify_states(runs, order, map, delay=whole, offset=offset, **options),)
     from beamfit.dynamics.fit import identify as respond
 
     options |= {"delay": delay, "offset": offset}
@@ -230,7 +231,7 @@ def check_model(
     """
     if order is not None and model != STATES:
         raise InputError(f"--order {order} with --model {model}", f"--model {STATES}")
-    if model == STATES and delay and not (delay > 0 and float(delay).is_integer()):
+    if model == STATES and delay and not float(delay).is_integer():
         raise InputError(f"--delay {delay:g} with --model {STATES}", "a whole number of samples")
     if model == FED_BATCH and (map != "network" or delay or not offset):
         expected = "--map network, without --delay or --no-offset: its rates are a network's"

@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.special import expit, logsumexp
 
-from beamfit.dynamics.checks import RunSlopes, slow_paths
+from beamfit.dynamics.checks import slow_paths
 from beamfit.dynamics.input_laws import STATIC, InputLaw, laws_between, moved
 from beamfit.dynamics.model import Driven, PreparedOutput, filled, predicted
 from beamfit.dynamics.paths import Path, Paths, Undriven, handed_on, undriven
@@ -289,21 +289,21 @@ class Comparison(NamedTuple):
 
     @classmethod
     def of(
-        cls, runs: tuple[Run, ...], found: Begun, paths: Paths, slopes: Sequence[RunSlopes]
+        cls, runs: tuple[Run, ...], found: Begun, paths: Paths, slopes: Sequence[np.ndarray]
     ) -> Comparison:
         """Prepare the fit of runs; `slopes` has terms of a fuller response."""
-        seen, fit = found.seen, found.plain.fit
+        seen, fit = found.seen, found.settled.fit
         physics, delay = seen.runs[0].physics, found.path.delay
         whole = undriven(runs, seen.output, physics, paths.parts, delay, MOST)
         drives = whole.drives
-        errors = [noise.each[:MOST] for (noise,) in found.plain.noise]
+        errors = [noise.each[:MOST] for (noise,) in found.settled.noise]
         data = [
             (filled(drive, y), time[:MOST], filled(drive, error, np.inf))
             for drive, y, time, error in zip(drives, whole.measured, seen.time, errors, strict=True)
         ]
         more, bent = [], _bent(seen)
         for slow, each in zip(slow_paths(seen), slopes, strict=True):
-            more.append(np.concatenate([slow, each.changing[:, ~bent]], axis=1))
+            more.append(np.concatenate([slow, each[:, ~bent]], axis=1))
         unit = np.sqrt(np.mean(np.concatenate(more) ** 2, axis=0)) / seen.size_y
         terms = [filled(drive, (each / np.where(unit > 0, unit, 1.0)).T[:, :MOST])
                  for drive, each in zip(drives, more, strict=True)]  # fmt: skip
@@ -352,7 +352,7 @@ def alternatives_of(
     runs: tuple[Run, ...],
     found: Begun,
     paths: Paths,
-    slopes: Sequence[RunSlopes],
+    slopes: Sequence[np.ndarray],
     lawful: bool,
 ) -> Alternatives:
     """Weigh every path and law of the inputs against those of a fit.

@@ -15,6 +15,7 @@ import numpy as np
 
 from beamfit.answer import Table, cell, json_of
 from beamfit.dynamics.alternatives import Alternatives
+from beamfit.dynamics.bad_readings import BadReadings
 from beamfit.dynamics.checks import Checks, HeldOutRun
 from beamfit.dynamics.limits import LagLimits
 from beamfit.dynamics.model import PreparedOutput, curves
@@ -126,10 +127,9 @@ def quantities_of(
         names, units = [*names, "tau1", "tau2"], [*units, TIME, TIME]
     if physics is ARX:
         names, units = [*names, *FIRST_ORDER.parameters(seen.inputs)[1:]], [*units, *[GAIN] * m]
-    more = np.einsum("qp,pr,qr->q", alone.slope, digits, alone.slope)
-    gains = [i for i, unit in enumerate(units) if GAIN in unit]  # of all inputs in turn
-    more[gains] += (np.resize(unsure, len(gains)) * found.value[gains]) ** 2
-    found = found._replace(error=np.sqrt(found.error**2 + more))
+    gains, shares = [GAIN in unit for unit in units], np.zeros(len(found.value))
+    shares[: len(units)][gains] = np.resize(unsure, sum(gains))  # of all inputs in turn
+    found = widened(found, digits, shares)
     said = {
         name: quantity(found, i, unit)
         for i, (name, unit) in enumerate(zip(names, units, strict=True))
@@ -147,6 +147,16 @@ def derived(fit: Fit, errors: Memory | None, function: Callable, data: Any) -> D
     slopes = found.slope.reshape(-1, found.slope.shape[-1])
     averaged = errors.moments(slopes).error.reshape(found.value.shape)
     return found._replace(error=np.where(np.isfinite(found.error), averaged, np.nan))
+
+
+def widened(found: Derived, digits: np.ndarray, unsure: Any = 0.0) -> Derived:
+    """Numbers whose errors contain the digits of outputs and the errors of inputs.
+
+    `digits` is the covariance of the free numbers by digits, `unsure` the share of each number by
+    which its input's own errors make it unsure.
+    """
+    more = np.einsum("...p,pr,...r->...", found.slope, digits, found.slope)
+    return found._replace(error=np.sqrt(found.error**2 + more + (unsure * found.value) ** 2))
 
 
 def quantity(found: Derived, i: Any, unit: str) -> Quantity:
@@ -209,6 +219,15 @@ def quoted(
     if status not in WRONG:
         return dict(quantities), tuple(curves)
     return {name: q.open() for name, q in quantities.items()}, tuple(c.open() for c in curves)
+
+
+LATEST = "The delay is the longest that was tried: say a longer one by --delay."
+
+
+def remarked(message: str, longest: bool, left_out: Sequence[BadReadings]) -> str:
+    """A message that tells if the delay is the longest one, and the readings that are left out."""
+    left = (f"Left out: {each}." for each in left_out)
+    return " ".join([message, *([LATEST] if longest else []), *left])
 
 
 def limit_words(q: Quantity) -> str:
@@ -337,6 +356,8 @@ def _open(e: ResponseEvidence) -> Finding | None:
     cause += "".join(f" {n} is {words} (95 %)." for n, words in limits.items())
     if TIME in left.values():
         remedy = "Sample faster around steps, and wait until the output settles."
+        if limits and all("above" in words for words in limits.values()):
+            remedy = "Record longer, until the output settles, or repeat the steps."
         if e.checks.white_probability < POOR_FIT:
             cause, remedy = f"{cause} {WANDERS}", REPEAT
     return Finding(Status.unidentified, cause, remedy)
@@ -425,23 +446,25 @@ def _worse(e: ResponseEvidence) -> Finding | None:
     return Finding(Status.poor_fit, cause, remedy)
 
 
+def _beside(c: Checks) -> str:
+    """Sentences on what stands beside the response and what its errors contain."""
+    smooth, ramping, standing = map(", ".join, c.way)
+    law = c.law[:1].upper() + c.law[1:] if c.law is not None else ""
+    said = {
+        "The noise has a memory, which the errors contain.": c.white_probability < POOR_FIT,
+        f"Without high frequencies, {smooth} is taken to move between samples.": smooth,
+        f"Between samples {ramping} is taken to move in straight lines.": ramping,
+        f"Readings of {standing} scatter about levels; the output follows the levels.": standing,
+        f"Times of readings are uncertain by {c.jitter:.2g} s: errors contain it.": c.jitter,
+        f"The output drifts as well (degree {c.drift} in time): errors contain it.": c.drift,
+        f"{law} is likelier than none (P = {c.law_probability:.2f}): errors contain it.": law,
+    }
+    return "".join(f" {sentence}" for sentence, holds in said.items() if holds)
+
+
 def _good(e: ResponseEvidence) -> Finding:
     cause = f"The free run explains {e.checks.free_run_percent:.2f} % of the output."
-    if e.checks.white_probability < POOR_FIT:
-        cause += " The noise has a memory, which the errors contain."
-    smooth, ramping, standing = map(", ".join, e.checks.way)
-    if smooth:
-        cause += f" Without high frequencies, {smooth} is taken to move between samples."
-    if ramping:
-        cause += f" Between samples {ramping} is taken to move in straight lines."
-    if standing:
-        cause += f" Readings of {standing} scatter about levels; the output follows the levels."
-    if e.checks.jitter:
-        cause += f" Times of readings are uncertain by {e.checks.jitter:.2g} s: errors contain it."
-    if e.checks.law is not None:
-        odds = f"P = {e.checks.law_probability:.2f}"
-        law = e.checks.law[0].upper() + e.checks.law[1:]
-        cause += f" {law} is likelier than none ({odds}): errors contain it."
+    cause += _beside(e.checks)
     gains = [q for name, q in e.quantities.items() if name.startswith("K")]
     if gains and all(q.error is not None and abs(q.value) < 2 * q.error for q in gains):
         cause += " All gains are compatible with 0: only the return of the output to rest is seen."

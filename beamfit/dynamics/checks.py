@@ -12,14 +12,15 @@ from beamfit.dynamics.model import (
     CLOSE,
     PreparedOutput,
     changed_by,
-    predicted,
 )
-from beamfit.dynamics.record import Way
+from beamfit.dynamics.record import Run, Way
 from beamfit.dynamics.response import FIRST_ORDER
 from beamfit.dynamics.search import (
-    DRIFT,
+    Begun,
     drift_columns,
+    drift_costs,
     driven_by,
+    spanned,
     unit_outputs,
     whitened_rows,
 )
@@ -79,6 +80,8 @@ class Checks(NamedTuple):
         best: clocks of input and output then run at different rates. Else 0.
     jitter : float
         Standard deviation of the times of readings about those of the record, s.
+    drift : int
+        Degree of the drift of the output that is fitted beside the response.
     """
 
     free_run_percent: float
@@ -99,6 +102,7 @@ class Checks(NamedTuple):
     way: Way = Way()
     delay_growth: float = 0.0
     jitter: float = 0.0
+    drift: int = 0
 
     def rows(self) -> list[list[str]]:
         """Label and value."""
@@ -140,21 +144,23 @@ def percent(rest: np.ndarray, y: np.ndarray) -> float:
 
 
 def checks_of(
-    seen: PreparedOutput,
-    residuals: tuple[np.ndarray, ...],
-    noise: RunNoises,
-    slopes: Sequence[RunSlopes],
-    used: int,
-    gain: float | None,
-    delay: int,
+    begun: Begun, k: int, changing: Sequence[np.ndarray], used: int, gain: float | None = None
 ) -> Checks:
-    """Test the residuals of every run together.
+    """Test the residuals of an output in every run together.
 
-    `slopes` has those of the output by the model's own numbers, and what fuller models would add.
+    `changing` are slopes of each run's output by what fuller models would have, `used` is the
+    count of numbers that were fitted to it.
     """
-    y = [m - m.mean() for m in seen.measured]
+    (case, path, found), seen = begun, begun.case.seen[k]
+    residuals = tuple(row[k] for row in found.rest)
+    own = [case.split(i, slopes)[k] for i, slopes in enumerate(found.slopes(case))]
+    jitter, likely = float(found.jitter[:, k].max()), found.likely
+    errors = [row[k].each for row in found.noise]
+    noise = RunNoises(seen.time, errors, likely, seen.parts if jitter else 0)
+    moved = zip(seen.measured, case.drifts(found.fit.model), strict=True)
+    y = [m - row[k] - np.mean(m - row[k]) for m, row in moved]
     rest = np.concatenate(residuals)
-    (explained, chance), (later, fed), grown = _explained(seen, residuals, noise, slopes, delay)
+    (explained, chance), (later, fed), grown = _explained(seen, residuals, noise, own, changing)
     white = _white([r / error for r, error in zip(residuals, noise.errors, strict=True)])
     if rest.std() <= CLOSE * seen.size_y:  # what is left is rounding, or the network's own detail
         explained, chance, later, fed, white, grown = 0.0, 1.0, 0.0, 1.0, 1.0, 0.0
@@ -175,6 +181,9 @@ def checks_of(
         gain,
         _together(seen),
         delay_growth=grown,
+        way=path.way,
+        jitter=jitter,
+        drift=case.degree,
     )
 
 
@@ -218,17 +227,14 @@ class RunNoises(NamedTuple):
         ])  # fmt: skip
 
     def drift(self, own: np.ndarray, rest: np.ndarray) -> np.ndarray:
-        """Cosines of a drift that whitened residuals show beside a model's own slopes, as many as
+        """Columns of a drift that whitened residuals show beside a model's own slopes, as many as
         the Bayesian information criterion wants.
         """
-        count, runs = len(rest), len(self.times)
+        runs = len(self.times)
         waves = self.white([drift_columns(t / t[-1], i, runs).reshape(len(t), -1)
                             for i, t in enumerate(self.times)])  # fmt: skip
-        triangle = np.linalg.qr(np.column_stack([_basis(own), waves, rest]), mode="r")
-        least = np.cumsum(triangle[::-1, -1] ** 2)[::-1]
-        used = len(triangle) - 1 - runs * np.arange(DRIFT, -1, -1)
-        cost = count * np.log(np.maximum(least[used], np.finfo(float).tiny)) + np.log(count) * used
-        return waves[:, : runs * int(cost.argmin())]
+        triangle = np.linalg.qr(np.column_stack([spanned(own), waves, rest]), mode="r")
+        return waves[:, : runs * int(drift_costs(triangle, runs, len(rest)).argmin())]
 
     def ahead(self, residuals: Sequence[np.ndarray]) -> np.ndarray:
         """Residuals of predictions from the readings before."""
@@ -252,8 +258,8 @@ def _explained(
     seen: PreparedOutput,
     residuals: tuple[np.ndarray, ...],
     noise: RunNoises,
-    slopes: Sequence[RunSlopes],
-    delay: int,
+    own: Sequence[np.ndarray],
+    changing: Sequence[np.ndarray],
 ) -> tuple[tuple[float, float], tuple[float, float], float]:
     """Share of the whitened residuals that a fuller model explains, with its chance, the share of
     the rest that later inputs explain, and the growth of the delay if it explains most.
@@ -262,19 +268,19 @@ def _explained(
     further paths of first order, the slopes of the output by parameters that change with the
     operating point, and by a delay that grows, less what the model's own numbers can do.
     """
-    own, quick, later = [each.own for each in slopes], [], []
-    for run, each in zip(seen.runs, slopes, strict=True):
+    quick, later, delay = [], [], int(np.floor(seen.delay))
+    for run, added in zip(seen.runs, changing, strict=True):
         u = seen.scaled(run.u)
         index = run.read
         past = [u[np.clip(index + k, 0, len(u) - 1)] for k in range(-PAST, delay)]
         first = delay + noise.jitter  # a late reading has seen the input of its row
         after = [u[np.clip(index + first + k, 0, len(u) - 1)] for k in range(LATER)]
         later.append(np.concatenate(after, axis=1))
-        quick.append(np.concatenate([*past, each.changing], axis=1))
+        quick.append(np.concatenate([*past, added], axis=1))
     own, slow, quick, later = (noise.white(part) for part in (own, slow_paths(seen), quick, later))
     rest = noise.white(residuals)
     own = np.hstack([own, noise.drift(own, rest)])
-    basis = _basis(own)
+    basis = spanned(own)
     rest = rest - basis @ (basis.T @ rest)
     pairs = zip(seen.measured, residuals, noise.times, strict=True)
     clock = noise.white([_late(y - r, t) for y, r, t in pairs])
@@ -282,7 +288,7 @@ def _explained(
     tests = [_tested(rest, basis, columns) for columns in (slow, quick, clock)]
     share, chance = found = min(tests, key=lambda each: each[1])
     grown = float(clock[:, 0] @ rest / (clock[:, 0] @ clock[:, 0])) if found is tests[2] else 0.0
-    basis = _basis(np.hstack([own, slow, quick]))
+    basis = spanned(np.hstack([own, slow, quick]))
     rest = rest - basis @ (basis.T @ rest)
     chance = min(len(tests) * chance, 1.0)
     return (share, chance), _tested(rest, basis, later), grown
@@ -304,27 +310,13 @@ def slow_paths(seen: PreparedOutput) -> list[np.ndarray]:
 
 def _tested(rest: np.ndarray, basis: np.ndarray, columns: np.ndarray) -> tuple[float, float]:
     """Share of the squares that columns explain beyond a basis, and its chance (F)."""
-    new = _basis(columns - basis @ (basis.T @ columns), np.linalg.norm(columns, axis=0))
+    new = spanned(columns - basis @ (basis.T @ columns), np.linalg.norm(columns, axis=0))
     k, left = new.shape[1], len(rest) - basis.shape[1] - new.shape[1]
     inside, whole = float(np.sum((new.T @ rest) ** 2)), float(rest @ rest)
     if left < 1 or whole <= 0 or k == 0:
         return 0.0, 1.0
     ratio = (inside / k) / max((whole - inside) / left, 1e-300)
     return inside / whole, float(f.sf(ratio, k, left))
-
-
-def _basis(columns: np.ndarray, size: np.ndarray | None = None) -> np.ndarray:
-    """Orthonormal columns that span these; those that are nothing beside their size are none."""
-    size = np.linalg.norm(columns, axis=0) if size is None else size
-    found, values, _ = np.linalg.svd(columns / np.where(size > 0, size, 1.0), full_matrices=False)
-    return found[:, values > 1e-6]
-
-
-class RunSlopes(NamedTuple):
-    """Slopes of a run's output by the model's numbers, and by what a fuller model would have."""
-
-    own: np.ndarray
-    changing: np.ndarray
 
 
 def variance_of_digits(seen: PreparedOutput, rms: float) -> float:
@@ -336,26 +328,54 @@ def variance_of_digits(seen: PreparedOutput, rms: float) -> float:
 
 
 def covariance_of_digits(
-    seen: PreparedOutput, slopes: Sequence[RunSlopes], rms: float
+    outputs: Sequence[tuple[PreparedOutput, np.ndarray, float]],
 ) -> np.ndarray:
-    """Covariance of the model's numbers by the digits of the output: readings of one value were all
+    """Covariance of the model's numbers by the digits of outputs: readings of one value were all
     rounded alike, so that many are worth no more than one.
+
+    Each output comes with the slopes of its readings, shape (readings, p), and the rms residual.
     """
-    own, variance = np.concatenate([each.own for each in slopes]), variance_of_digits(seen, rms)
-    if not variance:
-        return np.zeros((own.shape[1], own.shape[1]))
-    values, which = np.unique(np.concatenate(seen.measured), return_inverse=True)
-    by_value = np.zeros((len(values), own.shape[1]))
-    np.add.at(by_value, which, np.linalg.pinv(own).T)
-    return variance * by_value.T @ by_value
+    variances = [variance_of_digits(seen, rms) for seen, _, rms in outputs]
+    found = np.zeros((outputs[0][1].shape[1],) * 2)
+    if not any(variances):
+        return found
+    weight = np.concatenate([np.full(len(own), 1.0 / max(rms, CLOSE * seen.size_y))
+                             for seen, own, rms in outputs])  # fmt: skip
+    inverse = np.linalg.pinv(weight[:, None] * np.concatenate([own for _, own, _ in outputs]))
+    ends = np.cumsum([len(own) for _, own, _ in outputs])[:-1]
+    parts = np.split((inverse * weight).T, ends)
+    for (seen, _, _), variance, part in zip(outputs, variances, parts, strict=True):
+        values, which = np.unique(np.concatenate(seen.measured), return_inverse=True)
+        by_value = np.zeros((len(values), len(found)))
+        np.add.at(by_value, which, part)
+        found += variance * by_value.T @ by_value
+    return found
 
 
-def slopes_of(seen: PreparedOutput, fit: Fit) -> list[RunSlopes]:
-    """Slopes of the output by the model's own numbers, and by what fuller models would have."""
+def digits_of(begun: Begun) -> np.ndarray:
+    """Covariance of a fit's free numbers by the digits of its outputs."""
+    case, found = begun.case, begun.settled
+    parts = [case.split(i, each) for i, each in enumerate(found.slopes(case))]
+    rms = np.sqrt(np.mean(found.rms**2, axis=0))
+    return covariance_of_digits([(s, np.concatenate([row[k] for row in parts]), float(rms[k]))
+                                 for k, s in enumerate(case.seen)])  # fmt: skip
+
+
+def held_out(begun: Begun, runs: Sequence[Run]) -> dict[str, tuple[HeldOutRun, ...]]:
+    """Predict runs that were held back, by output."""
+    ahead: dict[str, list[HeldOutRun]] = {s.output: [] for s in begun.case.seen}
+    for run in runs:
+        case = begun.on((run,))
+        for s, rest in zip(case.seen, case.ahead(begun.settled), strict=True):
+            ahead[s.output].append(HeldOutRun.of(run.name, rest, s.measured[0]))
+    return {name: tuple(each) for name, each in ahead.items()}
+
+
+def changing_of(seen: PreparedOutput, fit: Fit) -> list[np.ndarray]:
+    """Slopes of a response's output by parameters that change with the inputs, by run."""
     found = []
     for run in seen.runs:
         u = seen.scaled(run.u)
         added = changed_by(fit.model, run, np.concatenate([u, u**2], axis=1))
-        own = fit.derive(predicted, run).slope
-        found.append(RunSlopes(*(np.asarray(each)[: run.count] for each in (own, added))))
+        found.append(np.asarray(added)[: run.count])
     return found

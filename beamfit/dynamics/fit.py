@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,30 +19,30 @@ from beamfit.dynamics.answer import (
     limit_words,
     quantities_of,
     quoted,
+    remarked,
     told,
 )
-from beamfit.dynamics.bad_readings import BadReadings, sound
+from beamfit.dynamics.bad_readings import BadReadings, judged_without
 from beamfit.dynamics.checks import (
     Checks,
     HeldOutRun,
-    RunNoises,
+    changing_of,
     checks_of,
-    covariance_of_digits,
-    slopes_of,
+    digits_of,
+    held_out,
 )
 from beamfit.dynamics.limits import LagLimits, lag_limits
 from beamfit.dynamics.model import PreparedOutput, network_of, output_of
-from beamfit.dynamics.paths import Paths, heard, latest, prepared
+from beamfit.dynamics.paths import Paths, heard, latest
 from beamfit.dynamics.record import LEAST, Run, check_inputs, checked, unsure_gain
-from beamfit.dynamics.response import PHYSICS, Physics
-from beamfit.dynamics.search import Begun, Case, ResponseSearch, Settled, case_of, fitted, used_by
+from beamfit.dynamics.response import PHYSICS
+from beamfit.dynamics.search import Begun, ResponseSearch, Settled, case_of, fitted, used_by
 from beamfit.errors import InputError, Status, nearest
 from beamfit.greybox.fit import Fit
 from beamfit.noise.memory import CorrelatedNoise
 from beamfit.quantity import Quantity
 
 MAPS = ("constant", "network")
-LATEST = "The delay is the longest that was tried: say a longer one by --delay."
 
 
 @answer
@@ -218,13 +218,7 @@ def identify(
     paths = Paths.of(runs, delay, physics.even)
     search = ResponseSearch(output, physics, paths, offset)
     asked = _Identification(search, map, hidden, range(seed, seed + starts), held)
-    sound_runs, left_out, found = sound(runs, output, asked.search.begun)
-    fit = _answered(asked, sound_runs, found, left_out)
-    if not left_out or fit.status is not Status.poor_fit:
-        return fit
-    # A model that is refuted misses good readings.
-    whole = _answered(asked, runs, asked.search.begun(runs), ())
-    return whole if whole.status is Status.poor_fit else fit
+    return judged_without(runs, search.begun, partial(_answered, asked))
 
 
 class _Identification(NamedTuple):
@@ -243,20 +237,20 @@ def _answered(
     """Judge runs whose fit with constant parameters was found."""
     (output, physics, paths, _), map = asked.search, asked.map
     found, others = _likeliest(asked, runs, found)
-    answer = found.plain if map == "constant" else _with_network(asked, found)
+    answer = found.settled if map == "constant" else _with_network(asked, found)
     checks, quantities, curves = _known(asked, runs, found, answer, others)
     fit = answer.fit
-    ahead = tuple(_ahead(run, output, answer, physics, found) for run in asked.held)
+    whole = found._replace(settled=answer)
+    ahead = held_out(whole, asked.held)[output]
     evidence = (fit, answer.rests, checks, quantities, curves, ahead, map)
-    exact = found._replace(plain=answer).exact
+    exact = whole.exact
     exact = int(exact) if exact == int(exact) else exact
     rms = float(np.sqrt(np.mean(answer.rms**2)))
     clocks = not paths.given and (others is None or others.ahead >= 0.5)
     early = max(-exact, 0.0) if clocks else 0.0
     status, message = judged({output: ResponseEvidence(*evidence, rms, early)})
     quantities, curves = quoted(status, quantities, curves)
-    longest = [LATEST] if not paths.given and exact == latest(runs) > 0 else []
-    message = " ".join([message, *longest, *(f"Left out: {each}." for each in left_out)])
+    message = remarked(message, not paths.given and exact == latest(runs) > 0, left_out)
     noise = tuple(answer.rms[:, 0].tolist())
     parts = (quantities, curves, noise, answer.memory, checks, ahead, left_out)
     return ResponseFit(
@@ -273,28 +267,20 @@ def _likeliest(
 ) -> tuple[Begun, Alternatives | None]:
     """The fit by the likeliest path without a law, and the alternatives to it."""
     for left in reversed(range(AGAIN)):
-        if found.plain.exact(case_of(found.seen, asked.search.offset)):
+        if found.settled.exact(found.case):
             return found, None
-        slopes = slopes_of(found.seen, found.plain.fit)
+        slopes = changing_of(found.seen, found.settled.fit)
         lawful = asked.map == "constant"
         others = alternatives_of(runs, found, asked.search.paths, slopes, lawful)
         if others.path == found.path or not left:
             break
-        found = asked.search.along(runs, others.path, found.plain.fit.model)
+        found = asked.search.along(runs, others.path, found.settled.fit.model)
     return found, others
-
-
-def _ahead(run: Run, output: str, answer: Settled, physics: Physics, found: Begun) -> HeldOutRun:
-    """Predict a run that was held back."""
-    seen = prepared((run,), output, physics, found.path)
-    start = {"start": np.zeros((1, physics.free_states))}
-    (rest,) = Case((seen,), seen.runs, (), ()).ahead(answer, start)
-    return HeldOutRun.of(run.name, rest, seen.measured[0])
 
 
 def _with_network(asked: _Identification, found: Begun) -> Settled:
     """The best fit with a network of parameters, from the constant ones."""
-    seen, first, (_, physics, _, offset) = found.seen, found.plain.fit.model, asked.search
+    seen, first, (_, physics, _, offset) = found.seen, found.settled.fit.model, asked.search
     raw = np.asarray(first["map"])
     nets = (network_of(seen, physics, raw, asked.hidden, seed) for seed in asked.seeds)
     return fitted(case_of(seen, offset, True), [first | {"map": net} for net in nets])
@@ -309,22 +295,11 @@ def _known(
 ) -> tuple[Checks, dict[str, Quantity], tuple[Curve, ...]]:
     """Tests of the residuals, and what the runs determine of constants or curves."""
     seen, constant, (_, physics, paths, offset) = found.seen, asked.map == "constant", asked.search
-    jitter = float(answer.jitter.max())
-    errors = [noise.each for (noise,) in answer.noise]
-    slopes = slopes_of(seen, answer.fit)
-    checks = checks_of(
-        seen,
-        tuple(rest for (rest,) in answer.rest),
-        RunNoises(seen.time, errors, answer.likely, seen.parts if jitter else 0),
-        slopes,
-        used_by(answer.fit) + (not paths.given and not seen.ends),  # a delay found is a number, too
-        None if constant else found.plain.likelihood - answer.likelihood,
-        int(np.floor(seen.delay)),
-    )
-    checks = checks._replace(
+    used = used_by(answer.fit) + (not paths.given and not seen.ends)  # a delay found is a number
+    gain = None if constant else found.settled.likelihood - answer.likelihood
+    whole = found._replace(settled=answer)
+    checks = checks_of(whole, 0, changing_of(seen, answer.fit), used, gain)._replace(
         first_order=constant and asked.search.is_first_order(runs, found),
-        jitter=jitter,
-        way=found.path.way,
         band_limited=() if found.path.way.moving else paths.most.smooth,
     )
     others = others if constant else None
@@ -335,7 +310,7 @@ def _known(
     parts = answer.fit, answer.errors
     quantities: dict[str, Quantity] = {}
     if constant:
-        digits = covariance_of_digits(seen, slopes, float(np.sqrt(np.mean(answer.rms**2))))
+        digits = digits_of(found)
         unsure = [unsure_gain(runs, found.path.way, name) for name in seen.inputs]
         quantities = quantities_of(*parts, others, seen, physics, digits, unsure)
     limits = lag_limits(seen, answer, offset) if constant else LagLimits(None, None)

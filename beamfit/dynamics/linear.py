@@ -17,19 +17,37 @@ import numpy as np
 from scipy.linalg import solve_discrete_lyapunov
 from scipy.special import ndtr, ndtri
 
-from beamfit.dynamics.answer import GAIN, PURE, TIME, derived, quantity
+from beamfit.dynamics.answer import GAIN, PURE, TIME, derived, quantity, widened
+from beamfit.dynamics.bad_readings import FreeRun, judged_without
+from beamfit.dynamics.checks import digits_of
 from beamfit.dynamics.fit import MAPS
 from beamfit.dynamics.limits import SINGLE_END, LagLimits
 from beamfit.dynamics.model import WEIGHT
-from beamfit.dynamics.record import Run, check_inputs, checked
-from beamfit.dynamics.search import LONGEST, Case, Settled, information, noise_of, used_by
+from beamfit.dynamics.paths import Path, Paths
+from beamfit.dynamics.record import Run, Way, band_limited, check_inputs, checked, unsure_gain
+from beamfit.dynamics.search import (
+    BETTER,
+    DRIFT,
+    LONGEST,
+    Begun,
+    Case,
+    Settled,
+    drift_waves,
+    information,
+    noise_of,
+    settled,
+    used_by,
+    with_memory,
+)
 from beamfit.dynamics.state_fit import (
+    PLAIN,
+    WORSE,
     Course,
     StatesFit,
+    at_start,
+    begun,
     case_of,
-    remembering,
     states_answer,
-    trained,
 )
 from beamfit.dynamics.states import Matrices, contraction, linear_outputs
 from beamfit.errors import InputError, nearest
@@ -141,30 +159,57 @@ def realisations(
         mean = [each[: len(each) // stride * stride].reshape(-1, stride, each.shape[1]).mean(1)
                 for each in u]  # fmt: skip
         read = [each[::stride][: len(v)] for each, v in zip(y, mean, strict=True)]
-        found = _regressed(mean, read, order)
-        if found is None:
-            continue
-        a, b, c, d = found
-        values, vectors = np.linalg.eig(a)
-        most = np.exp(-stride / (1000.0 * longest))
-        values = values * np.minimum(1.0, most / np.maximum(np.abs(values), 1e-12))
-        if stride > 1:
-            if np.any((np.abs(values.imag) < 1e-9) & (values.real <= 0)):
-                continue  # no root of it is real
-            values = values ** (1.0 / stride)
-        once = (vectors * values) @ np.linalg.pinv(vectors)
-        many = sum(np.linalg.matrix_power(once, i) for i in range(stride))
-        if np.isfinite(many).all():
-            yield once.real, np.linalg.lstsq(many, b, rcond=1e-10)[0].real, c, d
+        for degree in (0, DRIFT):
+            found = _regressed(mean, read, order, degree)
+            if found is not None and (a := _each_sample(found[0], stride, longest)) is not None:
+                many = sum(np.linalg.matrix_power(a, i) for i in range(stride))
+                yield a, np.linalg.lstsq(many, found[1], rcond=1e-10)[0], *found[2:]
+
+
+def first_lag(u: list[np.ndarray], y: list[np.ndarray]) -> int:
+    """The first sample before each output at which inputs act, by the information criterion.
+
+    Outputs are regressed on themselves and on inputs before, and on a drift. 1 where no lag acts,
+    and of short runs.
+    """
+    (m, k), count = (u[0].shape[1], y[0].shape[1]), sum(map(len, y))
+    horizon = min(count // (8 * (m + k)), HORIZON)
+    rows = [_rows(v, w, horizon, DRIFT)
+            for v, w in zip(u, y, strict=True) if len(v) > 2 * horizon + 1]  # fmt: skip
+    if horizon < 2 or not rows:
+        return 1
+    past, now = (np.concatenate([each[i] for each in rows]) for i in (0, 5))
+    lags = past.reshape(len(past), horizon, k + m)  # from the longest to 1
+    own, others = lags[..., :k].reshape(len(past), -1), lags[..., k:].reshape(len(past), -1)
+    triangle = np.linalg.qr(np.hstack([own, others, now]), mode="r")
+    used = own.shape[1] + m * np.arange(horizon, -1, -1)  # with lags from 1, 2, … on, and without
+    missed = np.array([np.sum(triangle[n:, -k:] ** 2, axis=0) for n in used])
+    cost = len(now) * np.log(np.maximum(missed, np.finfo(float).tiny)).sum(axis=1)
+    return 1 + int(np.argmin(cost + np.log(len(now)) * k * used)) % horizon
+
+
+def _each_sample(a: np.ndarray, stride: int, longest: int) -> np.ndarray | None:
+    """The matrix of a sample by that of a stride, its poles inside the unit circle; None where
+    there is no real one.
+    """
+    values, vectors = np.linalg.eig(a)
+    most = np.exp(-stride / (1000.0 * longest))
+    values = values * np.minimum(1.0, most / np.maximum(np.abs(values), 1e-12))
+    if stride > 1 and np.any((np.abs(values.imag) < 1e-9) & (values.real <= 0)):
+        return None
+    once = ((vectors * values ** (1.0 / stride)) @ np.linalg.pinv(vectors)).real
+    return once if np.isfinite(once).all() else None
 
 
 def _regressed(
-    u: list[np.ndarray], y: list[np.ndarray], order: int
+    u: list[np.ndarray], y: list[np.ndarray], order: int, degree: int
 ) -> tuple[np.ndarray, ...] | None:
+    """The system beside drifts of a degree: polynomials that come later are of the same degree."""
     m, k = u[0].shape[1], y[0].shape[1]
     count = sum(map(len, y))
     horizon = int(np.clip(count // (4 * (m + k) + 4 * m), order // k + 2, HORIZON))
-    rows = [_rows(v, w, horizon) for v, w in zip(u, y, strict=True) if len(v) > 2 * horizon + 1]
+    rows = [_rows(v, w, horizon, degree)
+            for v, w in zip(u, y, strict=True) if len(v) > 2 * horizon + 1]  # fmt: skip
     if not rows or sum(len(r[0]) for r in rows) < horizon * (2 * m + k):
         return None
     past, later, future, inputs, now_u, now_y = (
@@ -184,17 +229,22 @@ def _regressed(
     return ab[:, :order], ab[:, order:], cd[:, :order], cd[:, order:]
 
 
-def _rows(u: np.ndarray, y: np.ndarray, horizon: int) -> tuple[np.ndarray, ...]:
-    """Past, past a sample later, future, future inputs, and inputs and outputs now, by row."""
+def _rows(u: np.ndarray, y: np.ndarray, horizon: int, degree: int) -> tuple[np.ndarray, ...]:
+    """Past, past a sample later, future, future inputs, and inputs and outputs now, by row; less
+    a drift of the degree.
+    """
     both, count = np.hstack([y, u]), len(y) - 2 * horizon
     at = np.arange(horizon, horizon + count, max(1, count // ROWS))
+    waves = np.column_stack([np.ones(len(at)), drift_waves(at / len(y))])
+    slow = np.linalg.qr(waves[:, : degree + 1 if degree else 0])[0]
 
     def around(of, begin, end):
-        return np.concatenate([of[at + k] for k in range(begin, end)], axis=1)
+        found = np.concatenate([of[at + k] for k in range(begin, end)], axis=1)
+        return found - slow @ (slow.T @ found)
 
     return (
         around(both, -horizon, 0), around(both, 1 - horizon, 1), around(y, 0, horizon),
-        around(u, 0, horizon), u[at], y[at],
+        around(u, 0, horizon), around(u, 0, 1), around(y, 0, 1),
     )  # fmt: skip
 
 
@@ -230,8 +280,7 @@ def padded(model: dict[str, Any], size: int) -> dict[str, Any]:
     around[np.ix_(at, at)] = p["around"]
     wide = {"z": np.pad(p["z"], ((0, more), (0, 0))), "c": np.pad(p["c"], ((0, 0), (0, more)))}
     start = np.pad(model["start"], ((0, 0), (0, more)))
-    nodes = np.zeros((len(start), 0, size))
-    return {"p": p | wide | {"around": around}, "start": start, "nodes": nodes}
+    return {"p": p | wide | {"around": around}, **at_start(start, len(p["c"]))}
 
 
 def stripped(model: dict[str, Any], n: int) -> dict[str, Any]:
@@ -239,7 +288,7 @@ def stripped(model: dict[str, Any], n: int) -> dict[str, Any]:
     p, (size, m) = model["p"], model["p"]["z"].shape
     at = np.array([*range(n), *range(size, size + m)])
     less = {"z": p["z"][:n], "c": p["c"][:, :n], "around": p["around"][at][:, at]}
-    return {"p": p | less, "start": model["start"][:, :n], "nodes": model["nodes"][:, :, :n]}
+    return model | {"p": p | less, "start": model["start"][:, :n], "nodes": model["nodes"][..., :n]}
 
 
 # State counts of the compiled searches (unused states are held at 0), and number of orders without
@@ -256,8 +305,8 @@ class TriedOrder(NamedTuple):
 
     order: int
     direct: bool
-    case: Case
-    found: Settled
+    begun: Begun
+    bic: float = np.nan
 
 
 def count_of(case: Case) -> int:
@@ -271,30 +320,78 @@ def largest_order(case: Case) -> int:
     return int((count_of(case) / EACH - k * (m + 1)) / (m + k + len(case.courses)))
 
 
-def orders(case: Case, order: int | None, offset: bool) -> tuple[TriedOrder, list[dict[str, Any]]]:
-    """Fit 1, 2, … states, or as many as asked for; give the best, and what was tried."""
-    tried: list[TriedOrder] = []
-    for n in [order] if order else range(1, min(SIZES[-1], largest_order(case)) + 1):
-        tried.append(_tried(case, n, offset, tried[-1] if tried else None))
-        told = criterion(case, [t.found for t in tried])
-        if n - tried[int(np.argmin(told))].order >= BEYOND:
-            break
-    full = tried[int(np.argmin(told))]
-    model = full.found.fit.model
-    p = model["p"] | {"d": model["p"]["d"].at[:, : len(case.seen[0].inputs)].set(0.0)}
-    bounded = case._replace(free=free_of(case, full.order, len(p["z"]), offset, False))
-    plain = TriedOrder(full.order, False, bounded, trained(bounded, [model | {"p": p}]))
-    tried.append(plain)
-    told = criterion(case, [t.found for t in tried], tried[-2].found)
-    best = plain if told[-1] <= min(told[:-1]) else full
-    return best, [{"order": t.order, "direct": t.direct, "bic": v}
-                  for t, v in zip(tried, told, strict=True)]  # fmt: skip
+class StatesSearch(NamedTuple):
+    """States of a linear system if said, its paths, and if outputs at rest are free numbers."""
+
+    order: int | None
+    paths: Paths
+    offset: bool
+
+    def delay(self, runs: tuple[Run, ...]) -> float:
+        """Samples of delay that lags of the inputs tell; 0 of smooth ones, whose lags are alike."""
+        if self.paths.given or band_limited(runs):
+            return min(self.paths.delays, key=abs)
+        case = case_of(runs, LINEAR, (), (), Path(None, self.paths.ways[-1], 0.0))
+        found = first_lag(*_scaled(case, _units(case, True), False)) - 1
+        return min(float(found), self.paths.delays[-1])
+
+    def begun(self, runs: tuple[Run, ...]) -> tuple[TriedOrder, ...]:
+        """Orders by inputs as they were read, on time if no delay is said."""
+        return self.orders(runs, Path(None, Way(), min(self.paths.delays, key=abs)))
+
+    def likeliest(
+        self, runs: tuple[Run, ...], tried: tuple[TriedOrder, ...]
+    ) -> tuple[TriedOrder, ...]:
+        """Orders by the delay that the runs tell, and by inputs at their levels where the best is
+        likelier with these.
+        """
+        late = self.delay(runs)
+        if late != tried[0].begun.path.delay:
+            other = self.orders(runs, Path(None, Way(), late))
+            on_time, then = criterion([tried[0].begun, other[0].begun], tried[0].begun)
+            tried = other if then + 2.0 * BETTER < on_time else tried
+        best = tried[0]
+        for way in self.paths.ways:
+            path = best.begun.path._replace(way=way)
+            other = _tried(case_of(runs, LINEAR, (), (), path), path, best.order, self.offset,
+                           best.direct, None) if way.standing else best  # fmt: skip
+            as_read, at_levels = criterion([best.begun, other.begun], best.begun)
+            if at_levels < as_read:
+                return self.orders(runs, path)
+        return tried
+
+    def orders(self, runs: tuple[Run, ...], path: Path) -> tuple[TriedOrder, ...]:
+        """Fits of 1, 2, … states, or as many as said, the likeliest first; that also without a
+        direct path from inputs to outputs.
+        """
+        case = case_of(runs, LINEAR, (), (), path)
+        tried: list[TriedOrder] = []
+        most = min(SIZES[-1], largest_order(case))
+        for n in [self.order] if self.order else range(1, most + 1):
+            before = tried[-1] if tried else None
+            tried.append(_tried(case, path, n, self.offset, True, before))
+            told = criterion([each.begun for each in tried])
+            if n - tried[int(np.argmin(told))].order >= BEYOND:
+                break
+        full, last = tried[int(np.argmin(told))], tried[-1]
+        model = full.begun.settled.fit.model
+        p = model["p"] | {"d": model["p"]["d"].at[:, : len(case.seen[0].inputs)].set(0.0)}
+        free = free_of(case, full.order, len(p["z"]), self.offset, False)
+        bounded = full.begun.case._replace(free=free)
+        plain = Begun(bounded, path, settled(bounded, [model | {"p": p}]))
+        tried.append(TriedOrder(full.order, False, plain))
+        told = criterion([each.begun for each in tried], last.begun)
+        return tuple(tried[k]._replace(bic=told[k]) for k in np.argsort(told, kind="stable"))
 
 
-def criterion(case: Case, found: Sequence[Settled], last: Settled | None = None) -> list[float]:
-    """The Bayesian information criterion of fits under the noise, with its memory, of the last."""
-    noise = _noise_of(case, last or found[-1])
-    return [information(case, each, noise) for each in found]
+def criterion(tried: Sequence[Begun], last: Begun | None = None) -> list[float]:
+    """The Bayesian information criterion of fits under the noise, with its memory, of the last.
+
+    By the readings that all of them have: those of a longer delay begin later.
+    """
+    noise = _noise_of((last or tried[-1]).case, (last or tried[-1]).settled)
+    lengths = [[len(rest) for row in each.settled.rest for rest in row] for each in tried]
+    return [information(each.case, each.settled, noise, np.min(lengths, axis=0)) for each in tried]
 
 
 def _noise_of(case: Case, found: Settled) -> CorrelatedNoise | None:
@@ -319,25 +416,29 @@ def free_of(case: Case, order: int, size: int, offset: bool, direct: bool) -> tu
                  for name, on in parts.items())  # fmt: skip
 
 
-def _tried(case: Case, n: int, offset: bool, before: TriedOrder | None) -> TriedOrder:
+def _tried(
+    case: Case, path: Path, n: int, offset: bool, direct: bool, before: TriedOrder | None
+) -> TriedOrder:
     """The fit of an order from its best realisations, and from the order before and one more."""
     size = next((s for s in SIZES if s >= n), n)
-    bounded = case._replace(free=free_of(case, n, size, offset, True))
+    bounded = case._replace(free=free_of(case, n, size, offset, direct))
     units, k = _units(case, offset), len(case.seen)
     u, y = _scaled(case, units, offset)
     m, rest = u[0].shape[1], np.zeros((len(y), n))
 
     def model(a, b, c, d, start=rest):
         around, c, to = normal_form(a, b, c)
+        d = np.where(direct | (np.arange(m) >= m - offset), d, 0.0)
         p = {"z": np.zeros((n, m)), "around": around, "c": c, "d": d, "units": units}
         return padded({"p": p, "start": start @ to.T}, size)
 
     models = [model(*found) for found in realisations(u, y, n)]
-    missed = [case.squares(case.rest(each)) for each in models]
+    slow = case._replace(degree=DRIFT)
+    missed = [_missed(slow, each) for each in models]
     best = [i for i in np.argsort(missed, kind="stable") if np.isfinite(missed[i])]
     models = [models[i] for i in best[:BEGINS]]
     if before is not None:
-        old, last = before.order, before.found.fit.model
+        old, last = before.order, before.begun.settled.fit.model
         a, b, c, d, _ = map(np.asarray, LINEAR.matrices(last["p"]))
         a = np.diag([*np.zeros(old), NEW]) + np.pad(a[:old, :old], ((0, 1), (0, 1)))
         b, c = np.vstack([b[:old], np.ones(m)]), np.hstack([c[:, :old], np.full((k, 1), FAINT)])
@@ -346,7 +447,13 @@ def _tried(case: Case, n: int, offset: bool, before: TriedOrder | None) -> Tried
     if not models:  # runs too short for a regression
         a = np.diag(NEW ** np.arange(1.0, n + 1))
         models = [model(a, np.ones((n, m)), np.full((k, n), FAINT), np.zeros((k, m)))]
-    return TriedOrder(n, True, bounded, trained(bounded, models))
+    return TriedOrder(n, direct, begun(bounded, models, path))
+
+
+def _missed(case: Case, model: Any) -> float:
+    """Sum of squared residuals of a model beside drifts and levels of the runs."""
+    rest = case.rest(case.beside_drift(model))
+    return case.squares([[r - r.mean() for r in row] for row in rest])
 
 
 def _units(case: Case, offset: bool) -> dict[str, np.ndarray]:
@@ -379,7 +486,7 @@ def identify_states(
     order: int | None = None,
     map: str = "constant",
     *,
-    delay: int = 0,
+    delay: int | None = None,
     offset: bool = True,
     hidden: int = 5,
     starts: int = 5,
@@ -397,8 +504,9 @@ def identify_states(
         ones are no better, 10 at most.
     map : {"constant", "network"}
         With ``"network"`` the next state has a network of state and inputs added.
-    delay : int
-        Samples by which the outputs follow late.
+    delay : int, optional
+        Samples by which the outputs follow late; found beside the order if None. Below zero where
+        the clocks of inputs and outputs differ.
     offset : bool
         Whether the outputs at rest are free numbers; else they are 0 where the inputs are.
     hidden, starts, seed : int
@@ -442,23 +550,71 @@ def identify_states(
         raise InputError(f"map '{map}'", nearest(map, list(MAPS)))
     runs, held = checked(runs, held, True)
     check_inputs(runs)
-    case = case_of(runs, LINEAR, (), (), delay)
-    _check_order(case, runs, order or 1)
-    best, tried = orders(case, order, offset)
-    n, found, gain = best.order, [best.found], None
-    if map == "network":
-        nets = _networks(best, hidden, range(seed, seed + starts))
-        free = [f for f in free_of(case, n, n, offset, best.direct) if f.path != "start"]
+    given = None if delay is None else float(delay)
+    search = StatesSearch(order, Paths.of(runs, given, True), offset)
+    _check_order(case_of(runs, LINEAR, (), ()), runs, order or 1)
+    asked = _StatesIdentification(search, map, hidden, range(seed, seed + starts), held)
+    return judged_without(runs, asked.begun, asked.answer)
+
+
+class _Fits(NamedTuple):
+    """Orders that were tried, the likeliest first, and likely fits."""
+
+    tried: tuple[TriedOrder, ...]
+    each: list[Begun]
+
+    def beside(self, runs: Sequence[Run]) -> list[FreeRun]:
+        """Readings of some runs beside the likeliest."""
+        return self.each[0].beside(runs)
+
+
+class _StatesIdentification(NamedTuple):
+    """Settings of an identification."""
+
+    search: StatesSearch
+    map: str
+    hidden: int
+    seeds: range
+    held: tuple[Run, ...]
+
+    def begun(self, runs: tuple[Run, ...]) -> _Fits:
+        """Orders, and the fit: by the likeliest path where a network follows."""
+        tried = self.search.begun(runs)
+        if self.map == "constant":
+            return _Fits(tried, [tried[0].begun])
+        tried = self.search.likeliest(runs, tried)
+        return _Fits(tried, self.trained(runs, tried[0]))
+
+    def trained(self, runs: tuple[Run, ...], best: TriedOrder) -> list[Begun]:
+        """Networks beside a linear system, those that are likely."""
+        n, path = best.order, best.begun.path
+        free = [f for f in free_of(best.begun.case, n, n, self.search.offset, best.direct)
+                if f.path != "start"]  # fmt: skip
         free += [Free("start", nuisance=True), Free("p.net", nuisance=True)]
-        case = case_of(runs, NETWORK, free, [Prior("p.net", 0.0, WEIGHT)], delay)
-        found = likely(case, [trained(case, [net]) for net in nets])
-        gain = criterion(best.case, [best.found])[0] - criterion(case, found[:1])[0]
-    case = best.case if map == "constant" else case
-    found = [remembering(case, each) for each in found]
-    said, gains = _quantities(case, found, n, runs, offset)
-    more = {"delay_samples": delay, "tried": tried, "matrices": _matrices(case, found, n)}
-    judged = {"held": held, "map": map, "gain": gain, "delay": delay, "order": n}
-    return states_answer(case, found[0], runs, said, by_input=gains, more=more, **judged)
+        case = case_of(runs, NETWORK, free, [Prior("p.net", 0.0, WEIGHT)], path)
+        case = case._replace(degree=best.begun.case.degree)
+        nets = _networks(best, self.hidden, self.seeds)
+        fits = likely(case, [settled(case, [net]) for net in nets])
+        return [Begun(case, path, each) for each in fits]
+
+    def answer(self, runs: tuple[Run, ...], found: _Fits, left_out: Any) -> StatesFit:
+        """Judge runs whose orders were tried, the likeliest first."""
+        (tried, fits), gain = found, None
+        if self.map == "network":
+            linear, bent = criterion([tried[0].begun, fits[0]], tried[0].begun)
+            gain = linear - bent
+        else:
+            tried = self.search.likeliest(runs, tried)
+            fits = [tried[0].begun]
+        n, path = tried[0].order, fits[0].path
+        fits = [fit._replace(settled=with_memory(fit.case, fit.settled, WORSE)) for fit in fits]
+        said, gains = _quantities(fits, n, runs, self.search.offset)
+        rows = [{"order": t.order, "direct": t.direct, "bic": t.bic}
+                for t in sorted(tried, key=lambda t: (not t.direct, t.order))]  # fmt: skip
+        more = {"delay_samples": int(path.delay), "tried": rows, "matrices": _matrices(fits, n)}
+        judged = {"map": self.map, "gain": gain, "order": n, "given": self.search.paths.given}
+        judged |= {"held": self.held, "left_out": left_out, "by_input": gains, "more": more}
+        return states_answer(fits[0], runs, said, **judged)
 
 
 def likely(case: Case, found: Sequence[Settled]) -> list[Settled]:
@@ -467,17 +623,18 @@ def likely(case: Case, found: Sequence[Settled]) -> list[Settled]:
     Draws from the posterior about an optimum of p numbers lie above its -2 ln L by chi-square of p
     degrees of freedom, by p in the mean: an end that is nearer is another part of the posterior.
     """
-    told = np.array(criterion(case, found, min(found, key=lambda each: each.likelihood)))
+    each = [Begun(case, PLAIN, fit) for fit in found]
+    told = np.array(criterion(each, min(each, key=lambda one: one.settled.likelihood)))
     best, *others = np.argsort(np.where(np.isfinite(told), told, np.inf))
     most = told[best] + used_by(found[best].fit)
     return [found[best], *(found[i] for i in others if told[i] <= most)]
 
 
-def _derived(found: Sequence[Settled], function: Any, asked: UsedStates) -> Derived:
+def _derived(fits: Sequence[Begun], function: Any, asked: UsedStates) -> Derived:
     """Numbers of the best fit; within their errors 68 % of all fits' posterior lies, each of which
     counts as much: the posterior of a network is bent, and each tells a part of it.
     """
-    each = [derived(f.fit, f.errors, function, asked) for f in found]
+    each = [derived(f.settled.fit, f.settled.errors, function, asked) for f in fits]
     if len(each) == 1:
         return each[0]
     values, errors = (np.stack([getattr(one, name) for one in each]) for name in ("value", "error"))
@@ -527,12 +684,12 @@ def _check_order(case: Case, runs: Sequence[Run], order: int) -> None:
 
 def _networks(best: TriedOrder, hidden: int, seeds: range) -> list[dict[str, Any]]:
     """Models with networks of small random weights beside the linear part."""
-    model = stripped(best.found.fit.model, best.order)
+    model = stripped(best.begun.settled.fit.model, best.order)
     p, (n, m) = model["p"], model["p"]["z"].shape
     moved = LINEAR.linear(p)._replace(c=jnp.eye(n), d=jnp.zeros((n, m)), offset=jnp.zeros(n))
     run = jax.jit(lambda u, x0: linear_outputs(moved, u, x0)[0])
     x = [np.asarray(run(LINEAR.scaled(p, c.u), model["start"][i]))
-         for i, c in enumerate(best.case.courses)]  # fmt: skip
+         for i, c in enumerate(best.begun.case.courses)]  # fmt: skip
     sizes = {"sizes": np.concatenate(x).std(0)}
     sizes["steps"] = np.concatenate([np.diff(each, axis=0) for each in x]).std(0)
     found = []
@@ -570,12 +727,16 @@ def _quoted(model: Any, asked: UsedStates) -> jax.Array:
 
 
 def _quantities(
-    case: Case, found: Sequence[Settled], n: int, runs: Sequence[Run], offset: bool
+    fits: Sequence[Begun], n: int, runs: Sequence[Run], offset: bool
 ) -> tuple[dict[str, Quantity], dict[str, list[str]]]:
     """Time constants from the slowest, gains and levels; and the names of each input's gains."""
-    numbers = _derived(found, _quoted, UsedStates(n, case.courses[0]))
-    step, said = float(case.courses[0].dt[0]), {}
+    course, path = fits[0].case.courses[0], fits[0].path
+    step, said = float(course.dt[0]), {}
     inputs, outputs = list(runs[0].inputs), list(runs[0].outputs)
+    numbers = _derived(fits, _quoted, UsedStates(n, course))
+    unsure = [0.0] * (5 * n) + [unsure_gain(runs, path.way, name) for name in inputs] * len(outputs)
+    unsure += [0.0] * (len(numbers.value) - len(unsure))
+    numbers = widened(numbers, digits_of(fits[0]), np.array(unsure))
     tau, time, zeta, pole, turn = np.arange(5 * n).reshape(5, n)
     slow = [i for i in np.argsort(-numbers.value[time]) if numbers.value[turn[i]] >= 0.0]
     endless = False  # a pole is compatible with 1, so that gains are with infinity
@@ -641,21 +802,21 @@ def _taylor(model: Any, asked: UsedStates) -> jax.Array:
                              to @ b[:n, : len(size_u)] / size_u])  # fmt: skip
 
 
-def _matrices(case: Case, found: Sequence[Settled], n: int) -> dict[str, Any]:
+def _matrices(fits: Sequence[Begun], n: int) -> dict[str, Any]:
     """A, B, C, D in the units of the record, for inputs less their mean.
 
     Of as many states as outputs, all of which are read, also the first terms of report eq 2 with
     errors: the states are the outputs, so that no change of basis is open.
     """
-    more = {}
+    case, more = fits[0].case, {}
     if n == len(case.seen):
-        read = _derived(found, _taylor, UsedStates(n, case.courses[0]))
+        read = _derived(fits, _taylor, UsedStates(n, case.courses[0]))
         ends = {"A": slice(n), "B": slice(n, None)}
         more["outputs_as_states"] = {
             name + said: part[:, ends[name]] for name in ends
             for said, part in (("", read.value), ("_error", read.error))
         }  # fmt: skip
-    p = found[0].fit.model["p"]
+    p = fits[0].settled.fit.model["p"]
     a, b, c, d, _ = map(np.asarray, case.courses[0].system.matrices(p))
     (mean_u, size_u), (mean_y, size_y) = (np.asarray(p["units"][kind]) for kind in "uy")
     by, m = size_y[:, None], len(mean_u)

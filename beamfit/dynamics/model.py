@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -45,6 +46,11 @@ class Driven:
     def read(self) -> np.ndarray:
         """Rows where the output was read."""
         return np.asarray(self.index)[: self.count]
+
+    @staticmethod
+    def like(seen: Sequence[PreparedOutput], i: int) -> Driven:
+        """A run of an output that was prepared."""
+        return seen[0].runs[i]
 
     def predicted(self, model: Any) -> jax.Array:
         """The output where it was read, running free from the start of the run."""

@@ -19,6 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from beamfit.arrays import Array, array_module
+from beamfit.dynamics.bad_readings import FreeRun
 from beamfit.dynamics.model import (
     CLOSE,
     Driven,
@@ -50,21 +51,44 @@ ROUNDING = 1e-14
 # Range of time constants, in intervals and in runs, beyond which nothing tells them from zero and
 # from infinity.
 RANGE = (1e-3, 1e3)
-
-
-# Most half periods in a run of a drift of the output.
+TINY = np.finfo(float).tiny
+# Highest degree of a drift of the output in a run: it turns once less.
 DRIFT = 8
 
 
-def drift_columns(through: Array, i: int, runs: int) -> Array:
-    """Cosines of a slow drift of each run, from the slowest, at the readings of run i, whose times
-    are in lengths of the run.
+def drift_waves(through: Array) -> Array:
+    """Polynomials of a slow drift, from the line on, at times in lengths of the run.
 
-    Shape (readings, DRIFT, runs), zero but for run i.
+    Shape (readings, DRIFT): Chebyshev's, cosines of an angle, less their means over the run.
     """
+    xp, degree = array_module(through), np.arange(1, DRIFT + 1)
+    angle = xp.arccos(xp.clip(2.0 * through - 1.0, -1.0, 1.0))
+    mean = np.where(degree % 2, 0.0, 1.0 / (1.0 - np.maximum(degree, 2) ** 2))
+    return xp.cos(angle[:, None] * degree) - mean
+
+
+def drift_columns(through: Array, i: int, runs: int) -> Array:
+    """Those of each run at the readings of run i, shape (readings, DRIFT, runs), zero but for i."""
     xp = array_module(through)
-    waves = xp.cos(xp.pi * through[:, None] * np.arange(1, DRIFT + 1))
-    return xp.pad(waves[..., None], ((0, 0), (0, 0), (i, runs - 1 - i)))
+    return xp.pad(drift_waves(through)[..., None], ((0, 0), (0, 0), (i, runs - 1 - i)))
+
+
+def drift_costs(triangles: np.ndarray, runs: int, count: int, least: float = TINY) -> np.ndarray:
+    """-2 ln L with a drift of degree 0, 1, … of so many runs, and the cost of its numbers.
+
+    The Bayesian information criterion of `count` readings, with the noise's size at its likeliest;
+    `triangles` are factors of a model's own columns, of drifts by degree, and of the readings.
+    """
+    used = triangles.shape[-1] - 1 - runs * DRIFT + runs * np.arange(DRIFT + 1)
+    missed = np.stack([np.sum(triangles[..., k:, -1] ** 2, axis=-1) for k in used], axis=-1)
+    return count * np.log(np.maximum(missed, least)) + np.log(count) * used
+
+
+def spanned(columns: np.ndarray, size: np.ndarray | None = None) -> np.ndarray:
+    """Orthonormal columns that span these; those that are nothing beside their size are none."""
+    size = np.linalg.norm(columns, axis=0) if size is None else size
+    found, values, _ = np.linalg.svd(columns / np.where(size > 0, size, 1.0), full_matrices=False)
+    return found[:, values > 1e-6]
 
 
 class Start(NamedTuple):
@@ -109,6 +133,8 @@ class ResponseSearch(NamedTuple):
         axes = [np.log(np.geomspace(0.1 * seen.apart, seen.span, LAGS))]
         axes += [np.log(DAMPINGS)] if physics is not FIRST_ORDER else []
         reach = np.array([axis[1] - axis[0] for axis in axes])
+        count = sum(map(len, seen.measured))
+        exact = count * (CLOSE * seen.size_y) ** 2
         around = _grid([np.linspace(-1.0, 1.0, len(axis)) for axis in axes])
         grid = np.tile(_grid(axes), (len(paths), 1, 1))
 
@@ -117,7 +143,7 @@ class ResponseSearch(NamedTuple):
             found = found if physics is not ARX else difference(found, seen.apart)
             asked = ([u[..., 0] for u in inputs], part), found
             triangles = np.asarray(_triangles(drives, measured, *asked, self.offset))
-            costs = _costs(triangles, seen)
+            costs = drift_costs(triangles, len(seen.runs), count, exact)
             return costs.min(axis=2).argmin(axis=1), found, triangles, costs
 
         near = grid[every, least(grid)[0]]
@@ -175,8 +201,8 @@ class ResponseSearch(NamedTuple):
 
     def along(self, runs: tuple[Run, ...], path: Path, model: dict[str, Any]) -> Begun:
         """Identify with constant parameters by a path, from a model."""
-        seen = prepared(runs, self.output, self.physics, path)
-        return Begun(seen, path, fitted(case_of(seen, self.offset), [model | {"late": 0.0}]))
+        case = case_of(prepared(runs, self.output, self.physics, path), self.offset)
+        return Begun(case, path, fitted(case, [model | {"late": 0.0}]))
 
     def is_first_order(self, runs: tuple[Run, ...], found: Begun) -> bool:
         """True if a first order does as well as a higher one by the information criterion."""
@@ -185,19 +211,7 @@ class ResponseSearch(NamedTuple):
         lower = found.seen._replace(runs=driven_by(found.seen, FIRST_ORDER))
         (start,) = self.starts(runs, FIRST_ORDER, [found.path])
         fit = fitted(case_of(lower, self.offset), [start.model])
-        return fit.likelihood <= found.plain.likelihood
-
-
-def _costs(triangles: np.ndarray, seen: PreparedOutput) -> np.ndarray:
-    """-2 ln L of each shape with a drift of 0, 1, … cosines a run, and the cost of these numbers.
-
-    The Bayesian information criterion, with the noise's size at its likeliest.
-    """
-    runs, count = len(seen.runs), sum(map(len, seen.measured))
-    used = triangles.shape[-1] - 1 - runs * DRIFT + runs * np.arange(DRIFT + 1)
-    missed = np.stack([np.sum(triangles[..., k:, -1] ** 2, axis=-1) for k in used], axis=-1)
-    least = count * (CLOSE * seen.size_y) ** 2
-    return count * np.log(np.maximum(missed, least)) + np.log(count) * used
+        return fit.likelihood <= found.settled.likelihood
 
 
 def difference(shapes: np.ndarray, apart: float) -> np.ndarray:
@@ -233,10 +247,10 @@ def linear_columns(runs: Sequence[Driven], i: int, shapes: jax.Array, offset: bo
 
 @partial(jax.jit, static_argnums=4)
 def _triangles(runs: tuple[Driven, ...], measured: Any, inputs: Any, shapes: Any, offset: bool):
-    """Triangular factors of outputs of unit gains, first states and offset, cosines of a drift of
-    each run, from the slowest, and of the readings: for each path one for each of its shapes.
+    """Triangular factors of outputs of unit gains, first states and offset, of drifts of each run
+    by degree, and of the readings: for each path one for each of its shapes.
 
-    Cosines and readings are the same for all, and made orthonormal once. What a shape leaves of
+    Drifts and readings are the same for all, and made orthonormal once. What a shape leaves of
     them comes of their products with its outputs: to 1e-7, while `CLOSE` counts as exact.
     """
     rest, read = [], []
@@ -344,12 +358,15 @@ def whitened_rows(
     return (rows, 0.0) if memory is None else innovations(rows, time, memory)
 
 
-# Most rounds with a memory of the noise, and the gain in -2 ln L below which they end.
-AGAIN, GAINED = 3, 0.05
+# Steps of a round, after which the noise is estimated again, and most rounds, also with a memory of
+# the noise; they end below a gain in -2 ln L of GAINED and of EACH for a reading.
+STEPS, ROUNDS, AGAIN, GAINED, EACH = 25, 80, 3, 0.05, 1e-4
 # Most readings of each output that estimate correlated noise.
 LONGEST = 5000
 
 
+# Parts of a model that each run has for itself.
+OWN = ("start", "nodes", "drift")
 # Errors of the readings, by run and output.
 Noises = tuple[tuple[ReadingErrors, ...], ...]
 
@@ -357,13 +374,15 @@ Noises = tuple[tuple[ReadingErrors, ...], ...]
 class Case(NamedTuple):
     """A fit to be made: prepared outputs, runs, free numbers and priors.
 
-    A course is a run as its model sees it: `model.Driven` or `shooting.Course`.
+    A course is a run as its model sees it: `model.Driven` or `state_fit.Course`. Of models that
+    have drifts of the outputs, those of this `degree` are free.
     """
 
     seen: tuple[PreparedOutput, ...]
     courses: tuple[Any, ...]
     free: tuple[Free, ...]
     priors: tuple[Prior, ...]
+    degree: int = 0
 
     @property
     def guess(self) -> Noises:
@@ -408,18 +427,42 @@ class Case(NamedTuple):
             for r, n, s in zip(row, noise[i], self.seen, strict=True)
         ]
 
+    def drifts(self, model: Any) -> tuple[tuple[np.ndarray, ...], ...]:
+        """Drifts that a model has, at the readings, by run and output."""
+        if "drift" not in model:
+            return tuple(tuple(np.zeros(len(s.measured[i])) for s in self.seen)
+                         for i in range(len(self.courses)))  # fmt: skip
+        return tuple(
+            tuple(self.split(i, np.asarray(course.drift(model))[: course.count]))
+            for i, course in enumerate(self.courses)
+        )
+
+    def beside_drift(self, model: Any) -> Any:
+        """The model with the drifts that explain most of its residuals."""
+        still = model | {"drift": np.zeros_like(model["drift"])}
+        for i, row in enumerate(self.rest(still)):
+            columns = self.split(i, np.asarray(self.courses[i].waves)[: self.courses[i].count])
+            for k, (rest, waves) in enumerate(zip(row, columns, strict=True)):
+                level = np.column_stack([waves[:, k, : self.degree], np.ones(len(rest))])
+                still["drift"][i, k, : self.degree] = np.linalg.lstsq(level, rest)[0][:-1]
+        return still
+
     def squares(self, rest: Any) -> float:
         """Sum of squared residuals, in units of each output's scatter."""
         return sum(float(np.sum((r / s.size_y) ** 2))
                    for row in rest for r, s in zip(row, self.seen, strict=True))  # fmt: skip
 
-    def ahead(self, found: Settled, start: dict[str, Any]) -> tuple[np.ndarray, ...]:
-        """Residuals of a run that was held back, by output: only its `start` is fitted."""
+    def ahead(self, found: Settled) -> tuple[np.ndarray, ...]:
+        """Residuals of a run that was held back, by output: only its start and its drift are
+        fitted.
+        """
         sizes = np.sqrt(np.mean(found.rms**2, axis=0))
         noise = tuple(ReadingErrors(np.full(len(s.measured[0]), size))
                       for s, size in zip(self.seen, sizes, strict=True))  # fmt: skip
+        model = dict(found.fit.model)
+        model |= {name: np.mean(model[name], axis=0)[None] for name in OWN if name in model}
         case = self._replace(free=(Free("start", nuisance=True),), priors=())
-        return case.rest(solve(case.problem(found.fit.model | start, (noise,))).model)[0]
+        return case.rest(solve(case.problem(model, (noise,))).model)[0]
 
     def problem(
         self, model: Any, noise: Noises, memory: CorrelatedNoise | None = None, gap: Any = ()
@@ -446,32 +489,37 @@ class Case(NamedTuple):
             worth = np.inf if exact else 1.0
             records.append(Record(f"run {i + 1}", predict, asked, *rows, worth))
         free = [*self.free, *([Free("nodes", nuisance=True)] if cuts else [])]
+        if "drift" in model:
+            end = np.where(np.arange(DRIFT) < self.degree, np.inf, np.zeros_like(model["drift"]))
+            free.append(Free("drift", -end, end, nuisance=True))
         return Problem(model, free, records, self.priors)
 
     def search(
         self,
         model: Any,
         noise: Noises,
-        steps: int,
         memory: CorrelatedNoise | None = None,
         gap: Any = (),
     ) -> Settled:
-        """Fit with the noise that the residuals of the round before had."""
-        fit = solve(self.problem(model, noise, memory, gap), iterations=steps)
+        """Fit with the noise that the residuals of the round before had.
+
+        The part of a sample in a delay begins anew.
+        """
+        model = model | {name: 0.0 for name in ("late",) if name in model}
+        fit = solve(self.problem(model, noise, memory, gap), iterations=STEPS)
         rest = self.rest(fit.model)
-        found = self.errors(rest, memory)
-        minus = sum(_minus(*row, None) for row in self.rows(rest, found))
-        minus = minus if np.isfinite(minus) else np.inf
         rests = fit.status not in (Status.not_finite, Status.not_converged)
-        return Settled(fit, rest, found, memory, None, minus, rests)
+        found = Settled(fit, rest, self.errors(rest, memory), memory, None, np.inf, rests)
+        minus = information(self, found, memory)
+        return found._replace(likelihood=minus if np.isfinite(minus) else np.inf)
 
 
 class Settled(NamedTuple):
     """A fit whose noise is that of its own residuals.
 
     `rest` and `noise` by run and output; `memory` of a noise with one and `errors` that average
-    over what is open of it; `likelihood` is -2 ln L, for responses with the cost of the Bayesian
-    information criterion; `rests` whether a further round would gain nothing.
+    over what is open of it; `likelihood` is -2 ln L with the cost of the Bayesian information
+    criterion; `rests` whether a further round would gain nothing.
     """
 
     fit: Fit
@@ -490,18 +538,40 @@ class Settled(NamedTuple):
             for course in case.courses
         ]
 
+    def linear_rows(self, case: Case, most: int | None = None) -> list[tuple[np.ndarray, ...]]:
+        """Slopes and, last, residuals of each run and output in units of the errors, and times, of
+        so many readings at most.
+        """
+        own = [part for i, s in enumerate(self.slopes(case)) for part in case.split(i, s)]
+        return [(np.column_stack([slope, -rest])[:most] / error[:most, None], time[:most])
+                for slope, (rest, error, time, _) in zip(
+                    own, case.rows(self.rest, self.noise), strict=True)]  # fmt: skip
+
     def remembered(
         self, case: Case, noise: CorrelatedNoise | None = None, most: int | None = None
     ) -> tuple[Memory, CorrelatedNoise, float]:
         """The noise with a memory that the residuals have, of so many of them at most."""
-        problem, size = self.fit.problem, self.fit.problem.size
-        rest = case.rows(self.rest, self.noise)
-        own = [part for i, s in enumerate(self.slopes(case)) for part in case.split(i, s)]
-        rows = [np.column_stack([slope, -r])[:most] / error[:most, None]
-                for slope, (r, error, *_) in zip(own, rest, strict=True)]  # fmt: skip
-        prior = np.asarray(problem.residual(self.fit.theta))[size:]
-        known = np.column_stack([self.fit.dense_jacobian[size:], prior])
-        return noise_of(rows, [time[:most] for _, _, time, _ in rest], known, noise)
+        rows, time = zip(*self.linear_rows(case, most), strict=True)
+        prior = np.asarray(self.fit.problem.residual(self.fit.theta))[self.fit.problem.size :]
+        known = np.column_stack([self.fit.dense_jacobian[self.fit.problem.size :], prior])
+        return noise_of(rows, time, known, noise)
+
+    def drift_degree(self, case: Case) -> int:
+        """The degree of drifts that the information criterion wants beside the other numbers.
+
+        All are free in the fit. The noise may have a memory: what wanders at random is no drift.
+        """
+        memory = self.remembered(case, most=LONGEST)[1] if self.correlated(case) else None
+        white = [whitened_rows(*each, memory)[0] for each in self.linear_rows(case)]
+        rows = np.concatenate(white)
+        drift = np.array([name.startswith("drift[") for name in self.fit.problem.names])
+        own, waves = rows[:, :-1][:, ~drift], rows[:, :-1][:, drift]
+        without = waves @ self.fit.theta[drift] - rows[:, -1]  # readings less the response
+        waves = np.moveaxis(waves.reshape(len(rows), -1, DRIFT), 2, 1).reshape(len(rows), -1)
+        columns = np.column_stack([spanned(own), waves, without])
+        more = max(0, columns.shape[1] - len(columns))
+        triangle = np.linalg.qr(np.pad(columns, ((0, more), (0, 0))), mode="r")
+        return int(drift_costs(triangle, waves.shape[1] // DRIFT, len(rows)).argmin())
 
     def exact(self, case: Case) -> bool:
         """True if the model explains all outputs but for rounding."""
@@ -539,9 +609,19 @@ def used_by(fit: Fit) -> int:
     return max(round(sum(group.count - group.dof for group in fit.groups)), 1)
 
 
-def information(case: Case, found: Settled, noise: CorrelatedNoise | None) -> float:
-    """The Bayesian information criterion of a fit under a noise with a memory, or without."""
+def information(
+    case: Case,
+    found: Settled,
+    noise: CorrelatedNoise | None,
+    lengths: Sequence[int] | None = None,
+) -> float:
+    """The Bayesian information criterion of a fit under a noise with a memory, or without, by all
+    readings or by the last ones of each run and output.
+    """
     rows = case.rows(found.rest, found.noise)
+    if lengths is not None:
+        rows = [(*(each[-n:] for each in row[:3]), row[3])
+                for row, n in zip(rows, lengths, strict=True)]  # fmt: skip
     cost = used_by(found.fit) * np.log(sum(len(rest) for rest, *_ in rows))
     return float(cost + sum(_minus(*row, noise) for row in rows))
 
@@ -581,23 +661,16 @@ def rounds(found: Any, again: Callable[[Any], Any], gained: float, most: int) ->
     return found, False
 
 
-def settled(
-    case: Case,
-    models: Sequence[Any],
-    search: Callable[..., Settled],
-    gained: Callable[[Settled], float],
-    most: int,
-) -> Settled:
+def settled(case: Case, models: Sequence[Any], most: int = ROUNDS) -> Settled:
     """Search from each start for a round, then from the best until nothing is gained."""
-    tried = (search(case, model, case.guess) for model in models)
+    tried = (case.search(model, case.guess) for model in models)
     found = min(tried, key=lambda each: each.likelihood)
-    found, rests = rounds(found, lambda f: search(case, f.fit.model, f.noise), gained(found), most)
+    enough = GAINED + EACH * sum(len(rest) for row in found.rest for rest in row)
+    found, rests = rounds(found, lambda f: case.search(f.fit.model, f.noise), enough, most)
     return found._replace(rests=rests or found.rests)
 
 
-def with_memory(
-    case: Case, white: Settled, search: Callable[..., Settled], worse: float = np.inf
-) -> Settled:
+def with_memory(case: Case, white: Settled, worse: float = np.inf) -> Settled:
     """The fit again, its noise with a memory, where residuals are correlated.
 
     It may leave squares larger by the factor `worse`. Errors average over what the residuals leave
@@ -611,7 +684,7 @@ def with_memory(
     def again(found: Settled) -> Settled:
         _, memory, size = found.remembered(case, most=LONGEST)
         noise = tuple(tuple(n._replace(each=size * n.each) for n in row) for row in found.noise)
-        return search(case, found.fit.model, noise, memory=memory)
+        return case.search(found.fit.model, noise, memory)
 
     found = rounds(white, again, GAINED, AGAIN)[0]
     if case.squares(found.rest) > worse * case.squares(white.rest):
@@ -623,10 +696,6 @@ def with_memory(
     return found._replace(rests=white.rests, errors=errors)
 
 
-# Steps of a round, after which the noise is estimated again, and most rounds.
-STEPS, ROUNDS = 100, 30
-
-
 def case_of(seen: PreparedOutput, offset: bool, network: bool = False) -> Case:
     """The case of one output: constant raw numbers or a network of them."""
     free = [Free("start", nuisance=True), Free("map", nuisance=network)]
@@ -635,32 +704,30 @@ def case_of(seen: PreparedOutput, offset: bool, network: bool = False) -> Case:
     return Case((seen,), seen.runs, tuple(free), weight_priors("map") if network else ())
 
 
-def _round(case: Case, model: Any, noise: Noises, memory: CorrelatedNoise | None = None) -> Settled:
-    """A search that pays for what it uses; the part of a sample in a delay begins anew."""
-    found = case.search(model | {"late": 0.0}, noise, STEPS, memory)
-    return found._replace(likelihood=information(case, found, memory))
-
-
 def fitted(case: Case, models: Sequence[Any]) -> Settled:
     """The best fit from some starts, its noise with a memory where residuals are correlated.
 
     The noise weighs against the priors of a network, so it is taken anew in every round.
     """
-    found = settled(case, models, _round, lambda f: GAINED + 1e-9 * abs(f.likelihood), ROUNDS)
-    return with_memory(case, found, _round)
+    return with_memory(case, settled(case, models))
 
 
 class Begun(NamedTuple):
-    """Runs as the model sees them behind a path, and the fit."""
+    """Runs as a model sees them behind a path, and the fit."""
 
-    seen: PreparedOutput
+    case: Case
     path: Path
-    plain: Settled
+    settled: Settled
+
+    @property
+    def seen(self) -> PreparedOutput:
+        """The runs of the first output, which is the only one of a response."""
+        return self.case.seen[0]
 
     @property
     def exact(self) -> float:
         """The delay in samples, by the fit where it is a number of it."""
-        late = float(self.plain.fit.model["late"]) if self.seen.ends else 0.0
+        late = float(self.settled.fit.model["late"]) if self.seen.ends else 0.0
         return (self.seen.delay + late) / self.seen.parts
 
     def contains(self, path: Path) -> bool:
@@ -668,3 +735,19 @@ class Begun(NamedTuple):
         low, high = (self.seen.delay + end for end in self.seen.ends or (0.0, 0.0))
         inside = low <= path.delay * self.seen.parts <= high
         return path.law is None and path.way == self.path.way and inside
+
+    def on(self, runs: Sequence[Run]) -> Case:
+        """The case of other runs."""
+        seen = tuple(prepared(runs, s.output, s.runs[0].physics, self.path) for s in self.case.seen)
+        courses = tuple(self.case.courses[0].like(seen, i) for i in range(len(runs)))
+        return self.case._replace(seen=seen, courses=courses)
+
+    def beside(self, runs: Sequence[Run]) -> list[FreeRun]:
+        """Readings of some runs beside the fit of others."""
+        case = self.on(runs)
+        rest = case.rest(self.settled.fit.model)
+        return [
+            FreeRun(s.output, self.path.delay, s.size_y, s.measured,
+                    [y - row[k] for y, row in zip(s.measured, rest, strict=True)])
+            for k, s in enumerate(case.seen)
+        ]  # fmt: skip

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property
 from typing import Any, NamedTuple, Protocol
 
 import jax
@@ -15,16 +15,34 @@ import jax.numpy as jnp
 import numpy as np
 
 from beamfit.answer import Table, answer, json_of
-from beamfit.dynamics.answer import ResponseEvidence, judged, limit_words, quantity, quoted
-from beamfit.dynamics.checks import Checks, HeldOutRun, RunNoises, RunSlopes, checks_of, percent
+from beamfit.dynamics.answer import (
+    ResponseEvidence,
+    judged,
+    limit_words,
+    quantity,
+    quoted,
+    remarked,
+    widened,
+)
+from beamfit.dynamics.bad_readings import BadReadings, judged_without
+from beamfit.dynamics.checks import (
+    Checks,
+    HeldOutRun,
+    checks_of,
+    digits_of,
+    held_out,
+    percent,
+)
 from beamfit.dynamics.model import PreparedOutput, readings_of, weight_priors
-from beamfit.dynamics.paths import Path, prepared
+from beamfit.dynamics.paths import Path, latest, prepared
 from beamfit.dynamics.record import Run, Way, checked
 from beamfit.dynamics.response import FIRST_ORDER
 from beamfit.dynamics.search import (
-    GAINED,
+    DRIFT,
+    Begun,
     Case,
     Settled,
+    drift_waves,
     settled,
     used_by,
     with_memory,
@@ -39,13 +57,12 @@ from beamfit.noise.memory import CorrelatedNoise
 from beamfit.quantity import Quantity
 from beamfit.statistics import POOR_FIT
 
-# Steps of a round, after which the noise is estimated again; most rounds; gain in -2 ln L per
-# reading below which they end.
-STEPS, ROUNDS, EACH = 25, 80, 1e-4
 # Allowed gaps between segments in turn, in units of the states' scatter.
 CLOSING = (1.0, 0.1, 1e-2, 1e-3, 1e-4)
 # Distance in time between the series of two outputs, in lengths of the run: no correlation is left.
 APART = 1e6
+# A path of inputs that hold from sample to sample and come at once.
+PLAIN = Path(None, Way(), 0.0)
 # Factor by which a fit with correlated noise may leave larger squares than the fit without.
 WORSE = 1.5
 
@@ -64,8 +81,8 @@ class Course:
     """A run as the model sees it: inputs and steps, and which outputs were read, all padded.
 
     Shapes (samples, m), (samples,); `index` (readings,) points into all outputs one after the
-    other, `time` is theirs, s, far apart from output to output; there are `count`. `run` is its
-    number.
+    other, `time` is theirs, s, far apart from output to output; there are `count`. `waves` are
+    columns of drifts of each output, (readings, outputs, degrees). `run` is its number.
     """
 
     system: System
@@ -74,6 +91,7 @@ class Course:
     time: Any
     index: Any
     count: Any
+    waves: Any
     run: Any
 
     def shot(self, model: Any) -> tuple[jax.Array, jax.Array]:
@@ -83,24 +101,35 @@ class Course:
         parts = [v.reshape(len(starts), -1, *v.shape[1:]) for v in (self.u, self.dt)]
         y, last = jax.vmap(self.system.run, (None, 0, 0, 0))(model["p"], *parts, starts)
         y = y.reshape(len(self.u), -1)
-        return y.T.ravel()[self.index], (last[:-1] - nodes).ravel()
+        return y.T.ravel()[self.index] + self.drift(model), (last[:-1] - nodes).ravel()
+
+    def drift(self, model: Any) -> jax.Array:
+        """Drifts of the outputs where they were read, shape (readings,)."""
+        return jnp.tensordot(self.waves, model["drift"][self.run], 2)
 
     def predicted(self, model: Any) -> jax.Array:
         """Outputs where they were read, one after the other, shape (readings,)."""
         return self.shot(model)[0]
+
+    def like(self, seen: Sequence[PreparedOutput], i: int) -> Course:
+        """Course of a run with the same system, from the prepared outputs."""
+        return course_of(self.system, seen, i)
 
 
 def course_of(system: System, seen: Sequence[PreparedOutput], i: int) -> Course:
     """Course of a run, from the prepared outputs."""
     run = seen[0].runs[i]
     index = [k * len(run.u) + s.runs[i].read for k, s in enumerate(seen)]
-    far = APART * float(np.sum(np.asarray(run.dt)))
+    span = float(np.sum(np.asarray(run.dt)))
+    far = APART * span
     time = [far * k + s.time[i] for k, s in enumerate(seen)]
     index, time = np.concatenate(index), np.concatenate(time)
-    return Course(system, run.u, run.dt, *readings_of(time, index), len(index), run.run)
-
-
-_round = partial(Case.search, steps=STEPS)
+    readings, waves = readings_of(time, index), np.zeros((0, len(seen), DRIFT))
+    for k, s in enumerate(seen):
+        own = drift_waves(s.time[i] / span)[:, None]
+        waves = np.append(waves, np.pad(own, ((0, 0), (k, len(seen) - 1 - k), (0, 0))), axis=0)
+    waves = jnp.asarray(np.pad(waves, ((0, len(readings[0]) - len(waves)), (0, 0), (0, 0))))
+    return Course(system, run.u, run.dt, *readings, len(index), waves, run.run)
 
 
 def closed(case: Case, model: Any, close: np.ndarray) -> Any:
@@ -110,22 +139,23 @@ def closed(case: Case, model: Any, close: np.ndarray) -> Any:
     """
     noise = case.guess
     for width in CLOSING:
-        shot = _round(case, model, noise, gap=width * close)
+        shot = case.search(model, noise, gap=width * close)
         if not np.isfinite(shot.likelihood):
             break
         model, noise = shot.fit.model, shot.noise
     return model | {"nodes": model["nodes"][:, :0]}
 
 
-def trained(case: Case, models: Sequence[Any]) -> Settled:
-    """Fit from each start for a round, then from the best until nothing is gained."""
-    enough = GAINED + EACH * sum(len(each) for s in case.seen for each in s.measured)
-    return settled(case, models, _round, lambda found: enough, ROUNDS)
+def begun(case: Case, models: Sequence[Any], path: Path = PLAIN) -> Begun:
+    """The fit beside the drift that the outputs want.
 
-
-def remembering(case: Case, white: Settled) -> Settled:
-    """The fit again, its noise with a memory, where residuals are correlated."""
-    return with_memory(case, white, _round, WORSE)
+    All drifts are free first: a state that grows for ever would take a drift for its own.
+    """
+    whole = case._replace(degree=DRIFT)
+    first = settled(whole, [whole.beside_drift(model) for model in models], 0)
+    case = case._replace(degree=first.drift_degree(whole))
+    models = [case.beside_drift(model) for model in (first.fit.model, *models)]
+    return Begun(case, path, settled(case, models))
 
 
 # Percent of an output explained by the free run below which segments are tried.
@@ -172,6 +202,8 @@ class StatesFit:
         How the noise of all outputs wanders; None where it does not.
     held : dict of str to tuple of HeldOutRun
         How runs are predicted that were not used, by output.
+    left_out : tuple of BadReadings
+        Readings that show no output; they are missing from ``runs``.
     more : dict
         Further entries of the JSON.
     """
@@ -187,6 +219,7 @@ class StatesFit:
     noise: np.ndarray
     memory: CorrelatedNoise | None
     held: dict[str, tuple[HeldOutRun, ...]]
+    left_out: tuple[BadReadings, ...]
     more: dict[str, Any]
 
     @property
@@ -231,6 +264,7 @@ class StatesFit:
             | {"noise_rms": self.noise, "noise_memory": self.memory}
             | {"checks": {part.output: part.checks._asdict() for part in self.parts}}
             | {"held_back": {k: [h._asdict() for h in v] for k, v in self.held.items()}}
+            | {"left_out": self.left_out}
             | self.more
         )
 
@@ -305,7 +339,7 @@ def fit_states(
     start = np.tile(start, (len(runs), 1)) if start.ndim < 2 else start
     if len(start) != len(runs):
         raise InputError(f"first states of shape {start.shape}", f"one row for {len(runs)} runs")
-    model = {"p": parameters, "start": start, "nodes": np.zeros((len(runs), 0, start.shape[1]))}
+    model = {"p": parameters, **at_start(start, len(runs[0].outputs))}
     nets = tuple(
         f"p.{path}".rstrip(".") for path, net in _networks(parameters) if isinstance(net, MLP)
     )
@@ -314,29 +348,47 @@ def fit_states(
         free = [Free(n, nuisance=any(n.startswith(f"{net}.") for net in nets)) for n in names]
     free = [*free, *([] if known else [Free("start", nuisance=True)])]
     inside = [prior for net in nets for prior in weight_priors(net)]
-    case = case_of(runs, system, free, (*inside, *priors), 0)
-    _check_outputs(case, model)
-    found = None if segments is not None and segments > 1 else trained(case, [model])
+
+    def search(runs: tuple[Run, ...]) -> Begun:
+        case = case_of(runs, system, free, (*inside, *priors))
+        _check_outputs(case, model)
+        return begun(case, [_free_run(case, model, segments).fit.model])
+
+    def answer(runs: tuple[Run, ...], found: Begun, left_out: Any) -> StatesFit:
+        found = found._replace(settled=with_memory(found.case, found.settled, WORSE))
+        options = {"held": held, "left_out": left_out, "map": "network" if nets else "constant"}
+        return states_answer(found, runs, _told(found), **options)
+
+    return judged_without(runs, search, answer)
+
+
+def _free_run(case: Case, model: Any, segments: int | None) -> Settled:
+    """The fit of a free run, by segments where that goes astray."""
+    found = None if segments is not None and segments > 1 else settled(case, [model])
     if found is None or (segments is None and not min(_explained(case, found)) > ASTRAY):
         nodes, close = _nodes(case, model, segments or SEGMENTS)
-        shot = trained(case, [closed(case, model | {"nodes": nodes}, close)])
+        shot = settled(case, [closed(case, model | {"nodes": nodes}, close)])
         found = shot if found is None or shot.likelihood < found.likelihood else found
-    found = remembering(case, found)
-    numbers = _numbers(found)
-    said = {name.removeprefix("p."): quantity(numbers, i, "")
-            for i, name in enumerate(found.fit.problem.names)
-            if name.startswith("p.") and not found.fit.problem.nuisance[i]}  # fmt: skip
-    return states_answer(case, found, runs, said, held=held, map="network" if nets else "constant")
+    return found
 
 
 def case_of(
-    runs: Sequence[Run], system: System, free: Sequence[Free], priors: Sequence[Prior], delay: int
+    runs: Sequence[Run],
+    system: System,
+    free: Sequence[Free],
+    priors: Sequence[Prior],
+    path: Path = PLAIN,
 ) -> Case:
     """The runs as the model sees them."""
-    late = Path(None, Way(), float(delay))
-    seen = tuple(prepared(runs, name, FIRST_ORDER, late) for name in runs[0].outputs)
+    seen = tuple(prepared(runs, name, FIRST_ORDER, path) for name in runs[0].outputs)
     courses = tuple(course_of(system, seen, i) for i in range(len(runs)))
     return Case(seen, courses, tuple(free), tuple(priors))
+
+
+def at_start(start: np.ndarray, outputs: int) -> dict[str, np.ndarray]:
+    """First states of runs, shape (runs, n), without segments and drifts, as a model has them."""
+    nodes, drift = np.zeros((len(start), 0, start.shape[1])), np.zeros((len(start), outputs, DRIFT))
+    return {"start": start, "nodes": nodes, "drift": drift}
 
 
 def _networks(parameters: Any) -> list[tuple[str, Any]]:
@@ -354,14 +406,17 @@ def _check_outputs(case: Case, model: Any) -> None:
         raise InputError(found, f"{len(case.seen)} outputs and {model['start'][0].shape} states")
 
 
-def _numbers(found: Settled) -> Derived:
-    """The free numbers with errors."""
-    rows = [(v.value, v.error, v.error_raw) for v in found.fit.variables]
-    value, error, raw = np.array(rows).T
+def _told(begun: Begun) -> dict[str, Quantity]:
+    """The free numbers of the equations with errors."""
+    found = begun.settled
+    value, error, raw = np.array([(v.value, v.error, v.error_raw) for v in found.fit.variables]).T
     one = np.eye(len(value))
     if found.errors is not None:
         error = np.where(np.isfinite(error), found.errors.moments(one).error, np.nan)
-    return Derived(value, error, raw, np.zeros(len(value)), one)
+    numbers = widened(Derived(value, error, raw, np.zeros(len(value)), one), digits_of(begun))
+    return {name.removeprefix("p."): quantity(numbers, i, "")
+            for i, name in enumerate(found.fit.problem.names)
+            if name.startswith("p.") and not found.fit.problem.nuisance[i]}  # fmt: skip
 
 
 def _explained(case: Case, found: Settled) -> list[float]:
@@ -396,55 +451,49 @@ def _nodes(case: Case, model: Any, segments: int) -> tuple[np.ndarray, np.ndarra
 
 
 def states_answer(
-    case: Case,
-    found: Settled,
+    begun: Begun,
     runs: tuple[Run, ...],
     quantities: Mapping[str, Quantity],
     *,
     held: Sequence[Run] = (),
+    left_out: tuple[BadReadings, ...] = (),
     map: str = "constant",
     order: int | None = None,
     gain: float | None = None,
-    delay: int = 0,
+    given: bool = True,
     by_input: Mapping[str, Sequence[str]] | None = None,
     more: Mapping[str, Any] | None = None,
 ) -> StatesFit:
     """Judge a fit: tests of each output's residuals, held-back runs, the verdict.
 
-    `by_input` names the quantities that are an input's own.
+    `by_input` names the quantities that are an input's own; `given` tells if the delay is.
     """
-    used = used_by(found.fit)
-    slopes = found.slopes(case)
-    parts = []
+    (case, path, found), parts = begun, []
+    used = max(1, used_by(found.fit) // len(case.seen)) + (not given)
     for k, s in enumerate(case.seen):
-        rest = tuple(row[k] for row in found.rest)
-        own = [case.split(i, each)[k] for i, each in enumerate(slopes)]
-        fitted = tuple(y - r for y, r in zip(s.measured, rest, strict=True))
+        fitted = tuple(y - row[k] for y, row in zip(s.measured, found.rest, strict=True))
         added = [_added(s, i, y) for i, y in enumerate(fitted)]
-        pairs = (RunSlopes(o, a) for o, a in zip(own, added, strict=True))
-        noise = RunNoises(s.time, [row[k].each for row in found.noise], found.likely)
-        used_each = max(1, used // len(case.seen))
-        checks = checks_of(s, rest, noise, list(pairs), used_each, gain, delay)
-        checks = checks._replace(jitter=float(found.jitter[:, k].max()))
-        parts.append(StateSpaceOutput(list(runs[0].outputs)[k], runs, s, fitted, checks))
-    ahead = _ahead(case, found, held, delay)
+        checks = checks_of(begun, k, added, used, gain)
+        parts.append(StateSpaceOutput(s.output, runs, s, fitted, checks))
+    ahead = held_out(begun, held)
     nothing = all(part.checks.nothing_probability >= POOR_FIT for part in parts)
     joint = {q for name in parts[0].checks.together for q in (by_input or {}).get(name, ())}
     told = {n: q.open() if nothing or n in joint else q for n, q in quantities.items()}
     evidence = {
         part.output: ResponseEvidence(
             found.fit, found.rests, part.checks, told, (), ahead[part.output], map,
-            float(np.sqrt(np.mean(found.rms[:, k] ** 2))),
+            float(np.sqrt(np.mean(found.rms[:, k] ** 2))), 0.0 if given else max(-path.delay, 0.0),
         )
         for k, part in enumerate(parts)
     }  # fmt: skip
     status, message = judged(evidence)
     told, _ = quoted(status, told)
+    message = remarked(message, not given and path.delay == latest(runs) > 0, left_out)
     order = order or found.fit.model["start"].shape[1]
     held_back = ahead if held else {}
     return StatesFit(
         status, message, map, order, runs, tuple(parts), found.fit, told, found.rms,
-        found.memory, held_back, dict(more or {}),
+        found.memory, held_back, left_out, dict(more or {}),
     )  # fmt: skip
 
 
@@ -453,18 +502,3 @@ def _added(seen: PreparedOutput, i: int, fitted: np.ndarray) -> np.ndarray:
     u = seen.scaled(seen.runs[i].u)[seen.runs[i].read]
     y = ((fitted - np.mean(fitted)) / seen.size_y)[:, None]
     return np.concatenate([y**2, y**3, u**2, u * y], axis=1)
-
-
-def _ahead(
-    case: Case, found: Settled, held: Sequence[Run], delay: int
-) -> dict[str, tuple[HeldOutRun, ...]]:
-    """Predict runs that were held back; only the state at their start is estimated."""
-    ahead: dict[str, list[HeldOutRun]] = {name: [] for name in held[0].outputs} if held else {}
-    for run in held:
-        one = case_of((run,), case.courses[0].system, (), (), delay)
-        start = np.mean(np.asarray(found.fit.model["start"]), axis=0)[None]
-        start = {"start": start, "nodes": np.zeros((1, 0, start.shape[1]))}
-        for s, r in zip(one.seen, one.ahead(found, start), strict=True):
-            ahead[s.output].append(HeldOutRun.of(run.name, r, s.measured[0]))
-    names = [s.output for s in case.seen]
-    return {name: tuple(ahead.get(name, ())) for name in names}
