@@ -350,6 +350,9 @@ def _open(e: ResponseEvidence) -> Finding | None:
         tied = gauges(e.fit.problem, e.fit.theta, e.fit.undetermined)
         if tied := [g for g in tied if {n.removeprefix("p.") for n in g.names} & set(left)]:
             return together(tied)
+    if e.curves and all(np.isfinite(c.error[c.visited]).all() for c in e.curves):
+        cause = f"The runs determine {', '.join(left)} only at the few values that inputs had."
+        return Finding(Status.unidentified, cause, "Step the inputs to values in between.")
     cause = f"The runs do not determine {', '.join(left)}."
     remedy = "Move the inputs over more of their range."
     limits = {n: words for n, q in e.quantities.items() if (words := limit_words(q))}

@@ -22,7 +22,7 @@ from beamfit.dynamics.answer import (
     remarked,
     told,
 )
-from beamfit.dynamics.bad_readings import BadReadings, judged_without
+from beamfit.dynamics.bad_readings import BadReadings, FreeRun, judged_without
 from beamfit.dynamics.checks import (
     Checks,
     HeldOutRun,
@@ -218,7 +218,7 @@ def identify(
     paths = Paths.of(runs, delay, physics.even)
     search = ResponseSearch(output, physics, paths, offset)
     asked = _Identification(search, map, hidden, range(seed, seed + starts), held)
-    return judged_without(runs, search.begun, partial(_answered, asked))
+    return judged_without(runs, partial(_begun, asked), partial(_answered, asked))
 
 
 class _Identification(NamedTuple):
@@ -231,13 +231,39 @@ class _Identification(NamedTuple):
     held: tuple[Run, ...]
 
 
-def _answered(
-    asked: _Identification, runs: tuple[Run, ...], found: Begun, left_out: tuple[BadReadings, ...]
-) -> ResponseFit:
-    """Judge runs whose fit with constant parameters was found."""
-    (output, physics, paths, _), map = asked.search, asked.map
+class _Trial(NamedTuple):
+    """A fit with constant parameters; where a network was asked for by the likeliest path, with
+    what was compared with it, and with a network.
+    """
+
+    constant: Begun
+    others: Alternatives | None = None
+    network: Settled | None = None
+
+    def beside(self, runs: Sequence[Run]) -> list[FreeRun]:
+        """Readings of some runs beside the fit that was asked for."""
+        network = self.network or self.constant.settled
+        return self.constant._replace(settled=network).beside(runs)
+
+
+def _begun(asked: _Identification, runs: tuple[Run, ...]) -> _Trial:
+    """The fit that readings are judged by: constants miss good ones where parameters change."""
+    found = asked.search.begun(runs)
+    if asked.map == "constant":
+        return _Trial(found)
     found, others = _likeliest(asked, runs, found)
-    answer = found.settled if map == "constant" else _with_network(asked, found)
+    return _Trial(found, others, _with_network(asked, found))
+
+
+def _answered(
+    asked: _Identification, runs: tuple[Run, ...], trial: _Trial, left_out: tuple[BadReadings, ...]
+) -> ResponseFit:
+    """Judge a fit of runs."""
+    (output, physics, paths, _), map = asked.search, asked.map
+    found, others, network = trial
+    if network is None:
+        found, others = _likeliest(asked, runs, found)
+    answer = network or found.settled
     checks, quantities, curves = _known(asked, runs, found, answer, others)
     fit = answer.fit
     whole = found._replace(settled=answer)

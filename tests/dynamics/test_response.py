@@ -590,3 +590,18 @@ def test_what_cannot_be_used_is_refused_in_words(case):
     make, words = BAD[case]
     with pytest.raises(InputError, match=words):
         make()
+
+
+def test_a_network_at_few_values_is_told_as_that():
+    """Four levels of an input: parameters are known there, and good readings stay."""
+    rng = np.random.default_rng(3)
+    u = np.repeat(rng.choice([0.5, 1.0, 1.5, 2.0], 30), 15)
+    y = np.zeros(u.size)
+    for k in range(u.size - 1):
+        tau, level = 4.0 * np.exp(0.5 * (u[k] - 1.25)), 2.0 * np.exp(-0.3 * u[k]) * u[k]
+        y[k + 1] = level + (y[k] - level) * np.exp(-1.0 / tau)
+    noise = 0.005 * rng.normal(size=u.size)
+    fit = identify(Run(np.arange(u.size) * 1.0, {"u": u}, {"y": y + noise}), map="network")
+    assert fit.status is Status.unidentified
+    assert "only at the few values that inputs had" in fit.message
+    assert not fit.left_out
