@@ -29,6 +29,7 @@ from beamfit.dynamics.search import (
     BETTER,
     DRIFT,
     LONGEST,
+    TINY,
     Begun,
     Case,
     Settled,
@@ -184,7 +185,7 @@ def first_lag(u: list[np.ndarray], y: list[np.ndarray]) -> int:
     triangle = np.linalg.qr(np.hstack([own, others, now]), mode="r")
     used = own.shape[1] + m * np.arange(horizon, -1, -1)  # with lags from 1, 2, … on, and without
     missed = np.array([np.sum(triangle[n:, -k:] ** 2, axis=0) for n in used])
-    cost = len(now) * np.log(np.maximum(missed, np.finfo(float).tiny)).sum(axis=1)
+    cost = len(now) * np.log(np.maximum(missed, TINY)).sum(axis=1)
     return 1 + int(np.argmin(cost + np.log(len(now)) * k * used)) % horizon
 
 
@@ -327,17 +328,22 @@ class StatesSearch(NamedTuple):
     paths: Paths
     offset: bool
 
+    @property
+    def on_time(self) -> float:
+        """The delay that is said, or none, samples."""
+        return min(self.paths.delays, key=abs)
+
     def delay(self, runs: tuple[Run, ...]) -> float:
         """Samples of delay that lags of the inputs tell; 0 of smooth ones, whose lags are alike."""
         if self.paths.given or band_limited(runs):
-            return min(self.paths.delays, key=abs)
+            return self.on_time
         case = case_of(runs, LINEAR, (), (), Path(None, self.paths.ways[-1], 0.0))
         found = first_lag(*_scaled(case, _units(case, True), False)) - 1
         return min(float(found), self.paths.delays[-1])
 
     def begun(self, runs: tuple[Run, ...]) -> tuple[TriedOrder, ...]:
         """Orders by inputs as they were read, on time if no delay is said."""
-        return self.orders(runs, Path(None, Way(), min(self.paths.delays, key=abs)))
+        return self.orders(runs, Path(None, Way(), self.on_time))
 
     def likeliest(
         self, runs: tuple[Run, ...], tried: tuple[TriedOrder, ...]
@@ -350,15 +356,14 @@ class StatesSearch(NamedTuple):
             other = self.orders(runs, Path(None, Way(), late))
             on_time, then = criterion([tried[0].begun, other[0].begun], tried[0].begun)
             tried = other if then + 2.0 * BETTER < on_time else tried
-        best = tried[0]
-        for way in self.paths.ways:
-            path = best.begun.path._replace(way=way)
-            other = _tried(case_of(runs, LINEAR, (), (), path), path, best.order, self.offset,
-                           best.direct, None) if way.standing else best  # fmt: skip
-            as_read, at_levels = criterion([best.begun, other.begun], best.begun)
-            if at_levels < as_read:
-                return self.orders(runs, path)
-        return tried
+        best, way = tried[0], self.paths.ways[-1]
+        if not way.standing:
+            return tried
+        path = best.begun.path._replace(way=way)
+        case = case_of(runs, LINEAR, (), (), path)
+        other = _tried(case, path, best.order, self.offset, best.direct, None)
+        as_read, at_levels = criterion([best.begun, other.begun], best.begun)
+        return self.orders(runs, path) if at_levels < as_read else tried
 
     def orders(self, runs: tuple[Run, ...], path: Path) -> tuple[TriedOrder, ...]:
         """Fits of 1, 2, … states, or as many as said, the likeliest first; that also without a

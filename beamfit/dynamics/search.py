@@ -505,7 +505,7 @@ class Case(NamedTuple):
 
         The part of a sample in a delay begins anew.
         """
-        model = model | {name: 0.0 for name in ("late",) if name in model}
+        model = model | {"late": 0.0} if "late" in model else model
         fit = solve(self.problem(model, noise, memory, gap), iterations=STEPS)
         rest = self.rest(fit.model)
         rests = fit.status not in (Status.not_finite, Status.not_converged)

@@ -166,8 +166,8 @@ OUTLIER, SHARE = 7.0, 0.2
 EDGE, WITHIN = 2.5, "they lie within injections"
 # Neighbours that tell where a cycle, or a reading at the edge of one, should lie.
 NEXT = 9
-# Time constants of fresh beam that are looked for, and to which part of its error it has settled.
-FRESH, SETTLED = 12, 0.1
+# Time constants of fresh beam that are looked for, and the part of its error to which it has faded.
+TAILS, FADED = 12, 0.1
 
 
 def averaged(cycles: Sequence[DecayRecord]) -> Pieces:
@@ -233,10 +233,9 @@ def _fresh(about: Expansion, most: int) -> int:
     """Readings at the start of a cycle until fresh beam, which decays faster, has settled; at most
     so many. How its size differs from cycle to cycle tells the error: noise may have a memory.
     """
-    first, lengths = about.pieces.first, about.pieces.lengths
-    place = np.arange(about.pieces.time.size) - np.repeat(first, lengths)
-    times = np.geomspace(1.0, max(most / math.log(EDGE / SETTLED), 1.0), FRESH)
-    columns = about.beside(np.exp(-place[:, None] / times) * about.pieces.weight[:, None])
+    pieces, first = about.pieces, about.pieces.first
+    times = np.geomspace(1.0, max(most / math.log(EDGE / FADED), 1.0), TAILS)
+    columns = about.beside(np.exp(-pieces.place[:, None] / times) * pieces.weight[:, None])
     law = np.linalg.qr(about.left[:, about.columns()])[0]
     columns -= law @ (law.T @ columns)
     above = np.add.reduceat(-about.left[:, [-1]] * columns, first)
@@ -248,7 +247,7 @@ def _fresh(about: Expansion, most: int) -> int:
     best = int(np.argmax(excess))
     if not stdtr(cycles - 1, -excess[best]) * times.size < ndtr(-EDGE):
         return 0
-    return min(math.ceil(math.log(excess[best] / SETTLED) * times[best]), most)
+    return min(math.ceil(math.log(excess[best] / FADED) * times[best]), most)
 
 
 def _trimmed(about: Expansion) -> tuple[Expansion, list[str]]:
@@ -262,8 +261,7 @@ def _trimmed(about: Expansion) -> tuple[Expansion, list[str]]:
         if not far.any():
             break
         high += max(int(first_off > EDGE), fresh)
-        first, lengths = about.pieces.first, about.pieces.lengths
-        place = np.arange(about.pieces.time.size) - np.repeat(first, lengths)
+        place, lengths = about.pieces.place, about.pieces.lengths
         whole = np.repeat(lengths, lengths)
         keep = (place >= far[0]) & (place < whole - far[1]) | (whole <= NEXT)
         about = with_course(solved(about.pieces.kept(keep, FEWEST_READINGS)))

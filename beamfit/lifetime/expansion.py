@@ -121,6 +121,11 @@ class Pieces:
         return np.diff(self.first, append=self.time.size)
 
     @cached_property
+    def place(self) -> np.ndarray:
+        """Number of readings of the piece before each."""
+        return np.arange(self.time.size) - np.repeat(self.first, self.lengths)
+
+    @cached_property
     def units(self) -> tuple[float, float]:
         """The longest piece, s, and the mean current, mA."""
         mean = float(self.current.mean()) if self.mean is None else self.mean

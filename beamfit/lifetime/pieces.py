@@ -55,7 +55,7 @@ DIGITS = 1.5
 ONE_LAW, BESIDE, LONG = 1 << 16, 1 << 11, 4096
 # Degree of the smooth curve by which a piece may depart from a law: an exponent of a, gas that
 # changes.
-BENDS = 6
+CURVED = 6
 # A step is placed to the reading within so many of where it was seen, by so many on either side.
 NEAR, WIDEST = 8, 64
 # How often steps are sought with the law that those found leave.
@@ -552,7 +552,7 @@ def _restored(
         parts, every = np.split(rows[low:high], inside[1:] - low), clear[piece]
         if len(parts) > 1 or high - low < every.size:
             alone = _levelled(record.time[every], record.current[every], np.zeros(1, int))
-            bent = np.column_stack([chebvander(np.linspace(-1.0, 1.0, every.size), BENDS), alone])
+            bent = np.column_stack([chebvander(np.linspace(-1.0, 1.0, every.size), CURVED), alone])
             ends = np.searchsorted(every, [(part[0], part[-1] + 1) for part in parts])
             first = np.union1d(0, ends[ends < every.size])
             worse = np.log(
@@ -560,7 +560,7 @@ def _restored(
             )
             # Twice the log evidence: log n for a size, 2 log n for a place among n readings.
             cost = 3 * (first.size - 1) * np.log(every.size)
-            if (every.size - BENDS - first.size) * worse < cost:
+            if (every.size - CURVED - first.size) * worse < cost:
                 parts = [every]
         found += parts
         owner += [piece] * len(parts)
