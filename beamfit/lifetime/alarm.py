@@ -23,7 +23,7 @@ LENGTHS = np.repeat([4.0, 8.0, 16.0, 32.0, 64.0, 128.0], 4) * MINUTE
 PHASES = LENGTHS * np.tile([0.0, 0.25, 0.5, 0.75], 6)
 # Before an alarm a and b may be off by this much.
 WIDE = 0.3
-# a and b wander by so much on an ordinary day.
+# a and b wander by so much on an ordinary day, and from fill to fill where that is not known.
 WANDER = 0.005
 
 
@@ -48,9 +48,13 @@ class AlarmState(NamedTuple):
         Variance of readings over that of the reference.
     factor, covariance : array, shapes (..., 2), (..., 2, 2)
         a and b over the reference's after earlier alarms, and their relative covariance.
+    spread : array
+        Relative variance of a and of b from fill to fill.
     age, weight, mean, product : array, shapes (..., w), (..., w), (..., w, 3), (..., w, 5)
-        Of each window and of what came since the alarm, in the last place: seconds, sum of
-        weights, means and central products of the path.
+        Of each window and of what came since the alarm, in the last place: seconds, and of its last
+        piece the sum of weights, means and central products of the path.
+    past : array, shape (..., w, 5)
+        What its earlier pieces say, each beside a and b of its own, as products.
     raised, excess, before : array
         Seconds since an alarm was raised, NaN where none is; ln I over the expected at that moment,
         and the age, s, of the window that showed it.
@@ -69,10 +73,12 @@ class AlarmState(NamedTuple):
     noise: np.ndarray
     factor: np.ndarray
     covariance: np.ndarray
+    spread: np.ndarray
     age: np.ndarray
     weight: np.ndarray
     mean: np.ndarray
     product: np.ndarray
+    past: np.ndarray
     raised: np.ndarray
     excess: np.ndarray
     before: np.ndarray
@@ -106,7 +112,27 @@ def with_reading(
     product = np.where(due[..., None], 0.0, state.product)
     product = product + (share * before)[..., None] * pairs
     age = np.where(due, 0.0, state.age) + step[..., None]
-    return {"age": age, "weight": total, "mean": mean, "product": product}
+    past = np.where(due[..., None], 0.0, state.past)
+    return {"age": age, "weight": total, "mean": mean, "product": product, "past": past}
+
+
+def beside(product: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+    """What products say where a and b depart by themselves with such a covariance.
+
+    With information J and score s these are (1 + J C)⁻¹ (J, s), written out: 2 by 2.
+    """
+    uu, uv, vv, uy, vy = np.moveaxis(product, -1, 0)
+    caa, cab, cbb = covariance[..., 0, 0], covariance[..., 0, 1], covariance[..., 1, 1]
+    p, q = 1 + uu * caa + uv * cab, uu * cab + uv * cbb
+    r, t = uv * caa + vv * cab, 1 + uv * cab + vv * cbb
+    rows = t * uu - q * uv, t * uv - q * vv, p * vv - r * uv, t * uy - q * vy, p * vy - r * uy
+    return np.stack(rows, axis=-1) / (p * t - q * r)[..., None]
+
+
+def shown_in(state: AlarmState, windows: slice = slice(None)) -> np.ndarray:
+    """What all pieces of some windows say of a lasting change, as products."""
+    spread = state.spread[..., None, None, None] * np.eye(2)
+    return state.past[..., windows, :] + beside(state.product[..., windows, :], spread)
 
 
 class Seen(NamedTuple):
@@ -126,19 +152,12 @@ class Seen(NamedTuple):
 
 def seen_in(state: AlarmState, windows: slice = slice(None)) -> Seen:
     """Changes that some of the windows show."""
-    uu, uv, vv, uy, vy = np.moveaxis(state.product[..., windows, :], -1, 0)
-    covariance = state.covariance[..., None, :, :]
-    caa, cab, cbb = covariance[..., 0, 0], covariance[..., 0, 1], covariance[..., 1, 1]
-    # 1 + J C and its inverse times (J, s), written out: 2 by 2.
-    p, q = 1 + uu * caa + uv * cab, uu * cab + uv * cbb
-    r, t = uv * caa + vv * cab, 1 + uv * cab + vv * cbb
-    det = p * t - q * r
-    maa, mab, mbb = (t * uu - q * uv) / det, (t * uv - q * vv) / det, (p * vv - r * uv) / det
-    sa, sb = (t * uy - q * vy) / det, (p * vy - r * uy) / det
+    found = beside(shown_in(state, windows), state.covariance[..., None, :, :])
+    maa, mab, mbb, sa, sb = np.moveaxis(found, -1, 0)
     slope = mab / np.where(maa > 0, maa, np.inf)
-    beside, left = sb - sa * slope, mbb - mab * slope
+    rest, left = sb - sa * slope, mbb - mab * slope
     left = np.where(left > 1e-9 * mbb, left, 0.0)  # else rounding: the two are not told apart
-    scores, information = (sa, sb, beside), (maa, mbb, left)
+    scores, information = (sa, sb, rest), (maa, mbb, left)
     pairs = zip(scores, information, strict=True)
     return Seen(tuple(s**2 / np.where(i > 0, i, np.inf) for s, i in pairs), information)
 
@@ -148,7 +167,7 @@ def change_since(state: AlarmState, moved: np.ndarray) -> tuple[np.ndarray, np.n
 
     Errors contain those of the reference.
     """
-    uu, uv, vv, uy, vy = np.moveaxis(state.product[..., -1, :], -1, 0)
+    uu, uv, vv, uy, vy = np.moveaxis(shown_in(state, slice(-1, None))[..., 0, :], -1, 0)
     uu, vv = uu + WIDE**-2, vv + WIDE**-2
     det = uu * vv - uv**2
     rows = np.stack([np.stack([vv, -uv], -1), np.stack([-uv, uu], -1)], axis=-2)
@@ -178,6 +197,7 @@ def set_off(state: AlarmState, raised: np.ndarray, best: np.ndarray) -> AlarmSta
         age=np.where(anew, 0.0, state.age),
         weight=np.where(anew, 0.0, state.weight),
         product=np.where(anew[..., None], 0.0, state.product),
+        past=np.where(anew[..., None], 0.0, state.past),
         raised=np.where(raised, 0.0, state.raised),
         excess=np.where(raised, state.path[..., 0] - level, state.excess),
         before=np.where(raised, age, state.before),
@@ -217,6 +237,8 @@ class Reference(NamedTuple):
         ordinary day.
     white : float
         Share of the noise's variance without memory.
+    wander : float
+        By what share of themselves a and b differ from fill to fill, each by itself.
     """
 
     a: float
@@ -226,6 +248,7 @@ class Reference(NamedTuple):
     interval: float = 1.0
     covariance: np.ndarray = WANDER**2 * np.eye(2)
     white: float = 0.0
+    wander: float = WANDER
 
 
 class Reading(NamedTuple):
@@ -291,8 +314,9 @@ def started(reference: Reference, shape: tuple[int, ...] = ()) -> AlarmState:
         hold=zero, path=np.zeros((*shape, 3)), foretold=np.zeros((*shape, 4)), unsure=zero,
         noise=np.ones(shape), factor=np.ones((*shape, 2)),
         covariance=np.broadcast_to(np.asarray(reference.covariance, float), (*shape, 2, 2)),
+        spread=np.full(shape, reference.wander**2),
         age=np.zeros(windows), weight=np.zeros(windows), mean=np.zeros((*windows, 3)),
-        product=np.zeros((*windows, 5)), raised=none, excess=zero, before=zero,
+        product=np.zeros((*windows, 5)), past=np.zeros((*windows, 5)), raised=none, excess=zero, before=zero,
     )  # fmt: skip
 
 
@@ -393,6 +417,8 @@ def _moved_on(usual: Reference, state: AlarmState, reading: Reading) -> AlarmSta
     begins = ~going | (state.hold > 0)
     alone, weight, foretold, unsure = _alone(usual, state, path, np.where(begins, 0.0, memory))
     weight = np.where(hold > 0, 0.0, weight / noise**2)
+    if begins.any():
+        state = _closed(state, begins[..., None, None])
     windows = with_reading(
         state, np.where(begins[..., None], 0.0, state.weight), alone, weight, between
     )
@@ -414,6 +440,12 @@ def _moved_on(usual: Reference, state: AlarmState, reading: Reading) -> AlarmSta
         raised=state.raised + between,
         **windows,
     )
+
+
+def _closed(state: AlarmState, begins: np.ndarray) -> AlarmState:
+    """The last piece of each window with those before it, where another begins."""
+    past = np.where(begins, shown_in(state), state.past)
+    return state._replace(past=past, product=np.where(begins, 0.0, state.product))
 
 
 def _alone(
@@ -496,7 +528,7 @@ def _adopted(
     state: AlarmState, done: np.ndarray, change: np.ndarray, covariance: np.ndarray
 ) -> AlarmState:
     """After a named alarm, take the loss that was found as the usual one."""
-    new = {name: np.zeros_like(getattr(state, name)) for name in ("age", "weight", "product")}
+    new = {name: np.zeros_like(getattr(state, name)) for name in ("age", "weight", "product", "past")}
     new["factor"], new["covariance"] = state.factor * (1 + change), state.covariance + covariance
     new["raised"] = np.full_like(state.raised, np.nan)
     return state._replace(**{n: either(done, v, getattr(state, n)) for n, v in new.items()})

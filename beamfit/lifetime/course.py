@@ -15,7 +15,7 @@ from beamfit.lifetime.alarm import WANDER, Alarm, Reference, alarms_of, when
 from beamfit.lifetime.alternatives import constant_a
 from beamfit.lifetime.fit import DecayFit, bare
 from beamfit.lifetime.mechanisms import Losses, loss_coefficients
-from beamfit.lifetime.scales import by_losses, summarise
+from beamfit.lifetime.scales import by_losses, summarise, widened
 from beamfit.lifetime.study import Decay, Machine, RecordStudy
 from beamfit.quantity import HOUR, Quantity, Status, percent, relative_change
 from beamfit.statistics import (
@@ -279,30 +279,41 @@ def reference_of(
     or refute that they are constant.
 
     Least squares on what each decay says of a I and a I + b; with a ring its ratio of a to b is
-    known, to `SHARES`. How far the decays scatter about it is how far a and b are expected to
-    wander.
+    known, to `SHARES`. How far the decays scatter beyond that is how far a and b are expected to
+    differ from decay to decay, and the errors of each contain it.
     """
     if is_refuted([decay.fit for decay in decays]):
         return None
     current, parts, root = map(np.asarray, summarise(decays))
-    rows = by_losses(a * current, b)
-    weighted = (root @ rows).reshape(-1, 2)
-    seen = np.einsum("nij,nj->ni", root, parts).ravel()
+    rows, known = by_losses(a * current, b), np.zeros(2)
     if ring is not None:
         by = parts[0, 1] / float(ring.a * current[0] + ring.b)
-        ratio = np.array([1 / float(ring.a), -1 / float(ring.b)]) / by / SHARES
-        weighted, seen = np.vstack([weighted, ratio]), np.append(seen, 0.0)
-    size = np.linalg.norm(weighted, axis=0)
-    found = np.linalg.lstsq(weighted / size, seen, rcond=None)[0] / size
+        known = np.array([1 / float(ring.a), -1 / float(ring.b)]) / by / SHARES
+    found, _ = _common(rows, parts, root, known)
+    quadratic = np.clip(parts[:, 0], 0.0, parts[:, 1])
+    own = by_losses(quadratic, parts[:, 1] - quadratic)
+    off, share = parts[:, 1] - (rows @ found)[:, 1], np.mean(own[:, 1] ** 2) * 2
+    wander = math.sqrt(float(off @ off) / max(off.size - 2, 1) / share)
+    found, relative = _common(rows, parts, np.asarray(widened(root, wander * own)), known)
     if not (np.isfinite(found).all() and found.min() > 0):
         return None
-    relative = weighted * found
-    covariance = np.linalg.pinv(relative.T @ relative, hermitian=True)
-    off = parts[:, 1] / (rows @ found)[:, 1] - 1
-    wander = math.sqrt(float(off @ off) / max(off.size - 2, 1))
-    covariance = covariance + max(WANDER, wander) ** 2 * np.eye(2)
+    covariance = np.linalg.pinv(relative.T @ relative, hermitian=True) + WANDER**2 * np.eye(2)
     noise, time, interval, white = np.median([_noise(decay.fit) for decay in decays], axis=0)
-    return Reference(*map(float, found), noise, time, interval, covariance, max(white, 0.0))
+    return Reference(*map(float, found), noise, time, interval, covariance, max(white, 0.0),
+                     max(WANDER, wander))  # fmt: skip
+
+
+def _common(
+    rows: np.ndarray, parts: np.ndarray, root: np.ndarray, known: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """a and b of all decays by least squares, and slopes of what is known, over its errors, by
+    relative changes of them; `known` is a further combination that is zero within 1.
+    """
+    weighted = np.vstack([(root @ rows).reshape(-1, 2), known])
+    seen = np.append(np.einsum("nij,nj->ni", root, parts), 0.0)
+    size = np.linalg.norm(weighted, axis=0)
+    found = np.linalg.lstsq(weighted / size, seen, rcond=None)[0] / size
+    return found, weighted * found
 
 
 def is_refuted(fits: Sequence[DecayFit]) -> bool:

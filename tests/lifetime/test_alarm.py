@@ -156,7 +156,7 @@ def test_the_tests_are_those_of_generalised_least_squares(white):
     """All windows that began with the record, against the dense matrices of the same statement."""
     covariance = np.array([[4e-4, -1e-4], [-1e-4, 9e-4]])
     # Stated larger than it is, so that the noise that is followed stays as stated.
-    usual = Reference(3.7e-7, 9.26e-5, 1.5e-3, 4.0, covariance=covariance, white=white)
+    usual = Reference(3.7e-7, 9.26e-5, 1.5e-3, 4.0, covariance=covariance, white=white, wander=0.01)
     random, count = np.random.default_rng(5), 220
     time = np.cumsum(random.uniform(0.5, 1.5, count))
     pieces = np.split(np.arange(count), [120])
@@ -177,8 +177,11 @@ def test_the_tests_are_those_of_generalised_least_squares(white):
         )
         design = np.stack([np.ones_like(u), u, v], axis=1)
         full, right = design.T @ weight @ design, design.T @ weight @ y
-        information += full[1:, 1:] - np.outer(full[1:, 0], full[0, 1:]) / full[0, 0]
-        score += right[1:] - full[1:, 0] * right[0] / full[0, 0]
+        own = full[1:, 1:] - np.outer(full[1:, 0], full[0, 1:]) / full[0, 0]
+        # Each piece has an a and a b of its own about those of all.
+        alone = np.linalg.inv(np.eye(2) + own * 0.01**2)
+        information += alone @ own
+        score += alone @ (right[1:] - full[1:, 0] * right[0] / full[0, 0])
     inverse = np.linalg.inv(np.linalg.inv(information) + covariance)
     found = np.linalg.solve(information, score)
     expected = [(inverse @ found)[k] ** 2 / inverse[k, k] for k in (0, 1)]
