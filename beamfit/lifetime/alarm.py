@@ -239,6 +239,8 @@ class Reference(NamedTuple):
         Share of the noise's variance without memory.
     wander : float
         By what share of themselves a and b differ from fill to fill, each by itself.
+    power, current : float
+        a goes as this power of the current, and is `a` at this one, mA.
     """
 
     a: float
@@ -249,6 +251,13 @@ class Reference(NamedTuple):
     covariance: np.ndarray = WANDER**2 * np.eye(2)
     white: float = 0.0
     wander: float = WANDER
+    power: float = 0.0
+    current: float = 1.0
+
+    def rates(self, current: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Loss rates by a and by b at a current, 1/s."""
+        bent = (current / self.current) ** self.power if self.power else 1.0
+        return self.a * current * bent, np.full_like(current, self.b)
 
 
 class Reading(NamedTuple):
@@ -387,8 +396,9 @@ def _step(usual: Reference, state: AlarmState, reading: Reading) -> tuple[np.nda
         going = (seconds > 0) & ~is_gap(seconds, usual.interval)
         seconds = np.where(going, seconds, 1.0)
         middle = (reading.current + state.current) / 2
-        a_part = usual.a * state.factor[..., 0] * reading.a_factor * middle * seconds
-        b_part = usual.b * state.factor[..., 1] * reading.b_factor * seconds
+        by_a, by_b = usual.rates(middle)
+        a_part = by_a * state.factor[..., 0] * reading.a_factor * seconds
+        b_part = by_b * state.factor[..., 1] * reading.b_factor * seconds
         excess = np.log(reading.current / state.current) + a_part + b_part
         noise = usual.noise / reading.current * np.sqrt(state.noise)
         memory = np.zeros_like(seconds)
@@ -517,7 +527,7 @@ def _shown(usual: Reference, state: AlarmState) -> tuple[np.ndarray, np.ndarray]
 
 def _since(usual: Reference, state: AlarmState, change: np.ndarray) -> np.ndarray:
     """When the loss found later had made the excess that raised the alarm, within its window."""
-    rates = np.stack([usual.a * state.current, np.full_like(state.current, usual.b)], axis=-1)
+    rates = np.stack(usual.rates(state.current), axis=-1)
     pace = -np.sum(rates * state.factor * change, axis=-1)
     with np.errstate(invalid="ignore", divide="ignore"):
         made = np.clip(np.nan_to_num(state.excess / pace), 0.0, state.before)

@@ -141,7 +141,8 @@ class Trend:
     def to_json(self) -> dict[str, Any]:
         """Return the points, what is usual, and the alarms as JSON's types."""
         usual = self.reference
-        known = usual and {"a": bare(usual.a, "1/(mA s)"), "b": bare(usual.b, "1/s")}
+        known = usual and {"a": bare(usual.a, "1/(mA s)"), "b": bare(usual.b, "1/s"),
+                           "exponent": bare(usual.power, "1")}  # fmt: skip
         named = ("status", "message", "points", "drift", "alarms")
         rest = {
             "current": bare(self.current, "mA"),
@@ -251,7 +252,8 @@ def _point(
     fit = decay.fit
     relative: list[Quantity | None] = [None, None]
     pumped = fit.free_law is not None and fit.free_law.is_pumped
-    if usual is not None and fit.status is not Status.poor_fit and not pumped:
+    same = usual is not None and not usual.power
+    if same and fit.status is not Status.poor_fit and not pumped:
         relative = [
             None if q.error is None else Quantity(q.value / by, q.error / by, "1")
             for q, by in ((fit.if_constant("a"), usual.a * a), (fit.if_constant("b"), usual.b * b))
@@ -276,16 +278,20 @@ def reference_of(
     decays: Sequence[Decay], a: np.ndarray, b: np.ndarray, ring: Losses | None = None
 ) -> Reference | None:
     """Usual a and b of some decays, with their noise; None where they do not give both above zero,
-    or refute that they are constant.
+    or the loss rate falls with the current as no bunch length makes it.
+
+    Where decays together reject a constant a it goes as the power of the current that they show.
 
     Least squares on what each decay says of a I and a I + b; with a ring its ratio of a to b is
     known, to `SHARES`. How far the decays scatter beyond that is how far a and b are expected to
     differ from decay to decay, and the errors of each contain it.
     """
-    if is_refuted([decay.fit for decay in decays]):
+    power = power_of([decay.fit for decay in decays])
+    if power > 0:
         return None
-    current, parts, root = map(np.asarray, summarise(decays))
-    rows, known = by_losses(a * current, b), np.zeros(2)
+    current, parts, root = map(np.asarray, summarise(decays, power))
+    usual = float(np.median(current))
+    rows, known = by_losses(a * current * (current / usual) ** power, b), np.zeros(2)
     if ring is not None:
         by = parts[0, 1] / float(ring.a * current[0] + ring.b)
         known = np.array([1 / float(ring.a), -1 / float(ring.b)]) / by / SHARES
@@ -293,14 +299,15 @@ def reference_of(
     quadratic = np.clip(parts[:, 0], 0.0, parts[:, 1])
     own = by_losses(quadratic, parts[:, 1] - quadratic)
     off, share = parts[:, 1] - (rows @ found)[:, 1], np.mean(own[:, 1] ** 2) * 2
-    wander = math.sqrt(float(off @ off) / max(off.size - 2, 1) / share)
+    # One more decay, as of an ordinary day, for few of them.
+    wander = math.sqrt((float(off @ off) / share + WANDER**2) / max(off.size - 1, 1))
     found, relative = _common(rows, parts, np.asarray(widened(root, wander * own)), known)
     if not (np.isfinite(found).all() and found.min() > 0):
         return None
     covariance = np.linalg.pinv(relative.T @ relative, hermitian=True) + WANDER**2 * np.eye(2)
-    noise, time, interval, white = np.median([_noise(decay.fit) for decay in decays], axis=0)
+    noise, time, interval, white = np.median([_noise(decay.fit, power) for decay in decays], axis=0)
     return Reference(*map(float, found), noise, time, interval, covariance, max(white, 0.0),
-                     max(WANDER, wander))  # fmt: skip
+                     wander, power, usual)  # fmt: skip
 
 
 def _common(
@@ -316,33 +323,39 @@ def _common(
     return found, weighted * found
 
 
-def is_refuted(fits: Sequence[DecayFit]) -> bool:
-    """Tell if decays together reject a constant a, by the mean of their exponents; where these
-    scatter more than their errors, by their scatter.
+def power_of(fits: Sequence[DecayFit]) -> float:
+    """The power of the current as which a goes where decays together reject a constant one, by the
+    mean of their exponents; where these scatter more than their errors, by their scatter. 0 else.
     """
     found = [fit.constant_a.exponent for fit in fits if fit.constant_a is not None]
     told = [(float(q.value), float(q.error)) for q in found if q.error]
     if not told:
-        return False
+        return 0.0
     value, error = np.array(told).T
     mean, whole = np.average(value, weights=error**-2), np.sum(error**-2) ** -0.5
     squares = float(np.sum(((value - mean) / error) ** 2))
     whole *= math.sqrt(max(squares / max(value.size - 1, 1), 1.0))
     chance = 2 * one_sided_probability(abs(mean) / whole, math.inf)
-    return constant_a(mean, whole, whole, chance).status is Status.poor_fit
+    refuted = constant_a(mean, whole, whole, chance).status is Status.poor_fit
+    return float(mean) if refuted else 0.0
 
 
-def _noise(fit: DecayFit) -> tuple[float, float, float, float]:
+def _noise(fit: DecayFit, power: float) -> tuple[float, float, float, float]:
     """Noise of a reading, mA, its correlation time, the interval of readings, s, and the share of
-    the variance without memory.
+    the variance without memory, where a goes as a power of the current.
 
     The size is that of changes from reading to reading: how far noise with a long memory gets the
     residuals of one decay do not tell.
     """
     interval, time = float(np.median(np.diff(fit.readings.time))), fit.correlation_time or 0.0
-    alike = fit.identifiability.residual_correlation or 0.0
+    alike, rest = fit.identifiability.residual_correlation or 0.0, fit.residuals
+    if power and fit.first is None:
+        about = fit.with_power(power)
+        rest, found = about.residuals * about.pieces.over, about.memory(about.columns(), False)
+        time = found.noise.time if about.wanders else 0.0
+        alike = (1 - found.noise.white) * math.exp(-interval / time) if time else 0.0
     white = 1 - alike * math.exp(interval / time) if alike else 0.0
-    size = math.sqrt(float(np.mean(np.diff(fit.residuals) ** 2)) / (2 * (1 - alike)))
+    size = math.sqrt(float(np.mean(np.diff(rest) ** 2)) / (2 * (1 - alike)))
     return max(size, BEST_MONITOR * fit.mean_current), time if alike else 0.0, interval, white
 
 
@@ -378,7 +391,7 @@ def _verdict(trend: Trend) -> tuple[Status, str]:
     if drift.error is not None and _is_sure(abs(drift.value) / drift.error, count - 2):
         said += f" It changes by {relative_change(drift)} a week."
     if trend.reference is None:
-        said += " Readings are not watched: the first decays give no constant a and b above zero."
+        said += " Readings are not watched: the first decays tell no usual a and b above zero."
     if trend.alarms:
         first = "Alarm" if len(trend.alarms) == 1 else f"{len(trend.alarms)} alarms, the first"
         said += f" {first}: {trend.alarms[0].said(trend.dated)}."

@@ -204,6 +204,11 @@ class DecayFit:
         numbers = (self.if_constant(name).value for name in ("i0", "a", "b"))
         return Expansion.at(self.readings, *numbers)
 
+    def with_power(self, power: float) -> Expansion:
+        """The law with a as a power of the current, best for the readings of this single decay."""
+        about = self.about
+        return about if not power else solved(about.pieces, start=[*about.numbers[:2], power])
+
     @property
     def quantities(self) -> dict[str, Quantity]:
         """Quoted quantities, by name."""

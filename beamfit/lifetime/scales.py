@@ -74,12 +74,8 @@ def information_root(about: Expansion, scale: float = 1.0) -> np.ndarray:
     return np.linalg.qr(rows, mode="r")[1:, 1:]
 
 
-def _root(decay: Decay, parts: np.ndarray) -> np.ndarray:
+def _root(fit: DecayFit, about: Expansion) -> np.ndarray:
     """The information that a decay holds on its parts, as of `Summaries`."""
-    fit = decay.fit
-    if fit.first is not None:
-        return _together(fit, parts[1])
-    about = fit.about
     scale = max(np.sqrt(about.residuals @ about.residuals / fit.dof), about.given)
     return _with_monitor(information_root(about, scale * fit.inflation), about)
 
@@ -119,7 +115,7 @@ def _together(fit: DecayFit, rate: float) -> np.ndarray:
     return np.diag(1 / (rate * np.array([np.inf if share is None else share, error])))
 
 
-def summarise(decays: Sequence[Decay]) -> Summaries:
+def summarise(decays: Sequence[Decay], power: float = 0.0) -> Summaries:
     """Reduce decays to what they say of the loss.
 
     Parameters
@@ -127,6 +123,9 @@ def summarise(decays: Sequence[Decay]) -> Summaries:
     decays : sequence of Decay
         Fitted decays. One without a finite fit or without noise says nothing: it gets no
         information.
+    power : float
+        a goes as this power of the current, and is that at the mean current; many cycles fitted
+        together say nothing of such a law.
 
     Returns
     -------
@@ -159,9 +158,15 @@ def summarise(decays: Sequence[Decay]) -> Summaries:
     for k, decay in enumerate(decays):
         fit = decay.fit
         a, b = fit.if_constant("a").value, fit.if_constant("b").value
-        if np.isfinite(a) and fit.rms_residual > 0:
+        if not (np.isfinite(a) and fit.rms_residual > 0):
+            continue
+        if fit.first is None:
+            about = fit.with_power(power)
+            parts[k] = loss_parts(about.values.a, about.values.b, fit.mean_current)
+            root[k] = _root(fit, about)
+        elif not power:
             parts[k] = loss_parts(a, b, fit.mean_current)
-            root[k] = _root(decay, parts[k])
+            root[k] = _together(fit, parts[k, 1])
     return Summaries(*map(jnp.asarray, (current, parts, root)))
 
 
