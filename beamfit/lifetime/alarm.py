@@ -325,7 +325,8 @@ def started(reference: Reference, shape: tuple[int, ...] = ()) -> AlarmState:
         covariance=np.broadcast_to(np.asarray(reference.covariance, float), (*shape, 2, 2)),
         spread=np.full(shape, reference.wander**2),
         age=np.zeros(windows), weight=np.zeros(windows), mean=np.zeros((*windows, 3)),
-        product=np.zeros((*windows, 5)), past=np.zeros((*windows, 5)), raised=none, excess=zero, before=zero,
+        product=np.zeros((*windows, 5)), past=np.zeros((*windows, 5)), raised=none, excess=zero,
+        before=zero,
     )  # fmt: skip
 
 
@@ -538,7 +539,8 @@ def _adopted(
     state: AlarmState, done: np.ndarray, change: np.ndarray, covariance: np.ndarray
 ) -> AlarmState:
     """After a named alarm, take the loss that was found as the usual one."""
-    new = {name: np.zeros_like(getattr(state, name)) for name in ("age", "weight", "product", "past")}
+    names = ("age", "weight", "product", "past")
+    new = {name: np.zeros_like(getattr(state, name)) for name in names}
     new["factor"], new["covariance"] = state.factor * (1 + change), state.covariance + covariance
     new["raised"] = np.full_like(state.raised, np.nan)
     return state._replace(**{n: either(done, v, getattr(state, n)) for n, v in new.items()})

@@ -82,7 +82,7 @@ def test_a_ring_whose_a_goes_with_the_current_is_watched_by_that_law():
 
 
 def test_fills_that_differ_as_they_usually_do_are_no_alarm():
-    """Fill to fill a and b by 2 %: a window over two fills took that for a change of one of them."""
+    """a and b differ by 2 %: a window over two fills took that for a change of one of them."""
     found = bent(10, power=0.0, wander=0.02)
     assert found.alarms == ()
     assert 0.01 < found.reference.wander < 0.04
