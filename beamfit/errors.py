@@ -200,10 +200,10 @@ class Status(StrEnum):
 
     @property
     def colour(self) -> str:
-        """Colour on screen: green, yellow or red."""
+        """Colour on screen: green, yellow where something is open and what is told holds, else red."""
         good = (Status.converged, Status.optimal)
-        doubtful = (Status.poor_fit, Status.local_optimum)
-        return "green" if self in good else "yellow" if self in doubtful else "red"
+        open_ = (Status.unidentified, Status.at_limit, Status.local_optimum)
+        return "green" if self in good else "yellow" if self in open_ else "red"
 
 
 class Finding(NamedTuple):
