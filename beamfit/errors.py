@@ -200,7 +200,7 @@ class Status(StrEnum):
 
     @property
     def colour(self) -> str:
-        """Colour on screen: green, yellow where something is open and what is told holds, else red."""
+        """Colour on screen: green; yellow where what is told holds but some is open; red else."""
         good = (Status.converged, Status.optimal)
         open_ = (Status.unidentified, Status.at_limit, Status.local_optimum)
         return "green" if self in good else "yellow" if self in open_ else "red"
