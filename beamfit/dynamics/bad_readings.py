@@ -79,6 +79,8 @@ def _sound(
             if trial is None or _same(now, off):
                 break
             kept, off, found = trial, now, search(trial)
+    if any(np.any(mask.mean(axis=0) > MOST) for mask in off):
+        kept, off, found = runs, _none(runs), search(runs)
     left_out = _named(runs, off, OFF)
     trial = _without(kept, _judged(kept, fit_of(found), _equal))
     if trial is not kept and trial is not None:  # the process may stand still as well: a fit tells
@@ -144,7 +146,7 @@ def _without(runs: Runs, masks: Masks) -> Runs | None:
 
 
 def _named(runs: Runs, masks: Masks, what: str) -> tuple[BadReadings, ...]:
-    """What is left out, by run and output."""
+    """Readings that are left out, by run and output."""
     found = []
     for run, mask in zip(runs, masks, strict=True):
         for k, name in enumerate(run.outputs):
@@ -162,8 +164,7 @@ def _lone(seen: PreparedOutput, residuals: Sequence[np.ndarray]) -> list[np.ndar
     each = zip(seen.measured, residuals, seen.time, _equal(seen, residuals), strict=True)
     for y, rest, time, equal in each:
         off = rest - median_filter(rest, AROUND, mode="nearest")
-        bad = odds_of_bad(off, y - rest, time, float(least)) > CLEAR_ODDS
-        found.append(bad & ~equal & (bad.mean() <= MOST))
+        found.append((odds_of_bad(off, y - rest, time, float(least)) > CLEAR_ODDS) & ~equal)
     return found
 
 
