@@ -418,15 +418,20 @@ def _refuted(e: ResponseEvidence) -> Finding | None:
     c = e.checks
     if c.input_probability >= POOR_FIT:
         return None
-    if abs(c.delay_growth) > 0:
+    p = f"along the record (p = {c.input_probability:.1g})"
+    cut = "Cut the record into shorter ones"
+    if c.delay_growth:
         way = "grows" if c.delay_growth > 0 else "falls"
         cause = (
-            f"The delay {way} by about {abs(c.delay_growth):.2g} samples along the record "
-            f"(p = {c.input_probability:.1g}): clocks of inputs and output run at different rates."
+            f"The delay {way} by about {abs(c.delay_growth):.2g} samples {p}: clocks of inputs and "
+            "output run at different rates, or the process becomes slower or quicker."
         )
-        return Finding(
-            Status.poor_fit, cause, "Cut the record into shorter ones, or correct times."
-        )
+        return Finding(Status.poor_fit, cause, f"{cut}, or correct times.")
+    if c.gain_growth:
+        way = "grew" if c.gain_growth > 0 else "fell"
+        by = f"{100 * abs(c.gain_growth):.2g} %"
+        cause = f"The response changes as if its gain {way} by about {by} {p}."
+        return Finding(Status.poor_fit, cause, f"{cut}, or give what it changes with as an input.")
     cause = (
         f"Past inputs, or parameters that change with them, explain {100 * c.input_share:.0f} % of "
         f"the residuals (p = {c.input_probability:.1g}): the model lacks a part of the response. "

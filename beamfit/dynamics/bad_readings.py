@@ -4,22 +4,30 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import NamedTuple, Protocol, TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from scipy.ndimage import median_filter
+from scipy.special import expit
 
-from beamfit.dynamics.model import CLOSE
+from beamfit.dynamics.model import CLOSE, PreparedOutput
 from beamfit.dynamics.paths import heard
 from beamfit.dynamics.record import LEAST, Run
+from beamfit.dynamics.search import JITTER_COST, Begun, spread_by_jitter
 from beamfit.errors import Status
+from beamfit.noise.digits import digit_of
+from beamfit.noise.model import Noise
+from beamfit.noise.sizes import bad_density
+from beamfit.statistics import CLEAR_ODDS
 
-# A single reading is bad beyond FAR times the noise, the residual about a running median of AROUND
-# readings, plus MOVES times the model's step there. More than the share MOST are the
-# process's own. The search is repeated ROUNDS times, each beside a fit without those found.
-FAR, MOST, AROUND, MOVES, ROUNDS = 10.0, 0.05, 7, 3.0, 3
+# Of more readings than this share the model is wrong and not the monitor.
+MOST = 0.2
+# A residual is judged about the running median of so many, most searches in turn, and rounds
+# in which the noise of good readings is found.
+AROUND, ROUNDS, ROUNDS_OF_NOISE = 7, 5, 50
 # Number of equal readings that count as stuck, if the model moves away by AWAY times the noise.
 HELD, AWAY = 8, 3.0
+OFF, STILL = "far off their neighbours", "that stand still as the process moves"
 
 
 class BadReadings(NamedTuple):
@@ -34,120 +42,191 @@ class BadReadings(NamedTuple):
         return f"{self.count} {self.what} ({self.run}, the first at {self.since:.4g} s)"
 
 
-class FreeRun(NamedTuple):
-    """An output beside the model that runs free: readings and what the model has there, by run, the
-    delay in samples, and the scatter of the output.
-    """
-
-    output: str
-    delay: float
-    size: float
-    measured: Sequence[np.ndarray]
-    fitted: Sequence[np.ndarray]
-
-
-class HasFreeRun(Protocol):
-    """A fit of runs: `beamfit.dynamics.search.Begun`, or several of them."""
-
-    def beside(self, runs: Sequence[Run]) -> list[FreeRun]:
-        """Readings of some runs beside the fit."""
-
-
-F, A = TypeVar("F", bound=HasFreeRun), TypeVar("A")
+F, A = TypeVar("F"), TypeVar("A")
 Runs = tuple[Run, ...]
+# True for readings of each run, shape (rows, outputs).
+Masks = tuple[np.ndarray, ...]
 
 
 def judged_without(
     runs: Runs,
-    begin: Callable[[Runs], F],
+    searches: Sequence[Callable[[Runs], F]],
+    fit_of: Callable[[F], Begun],
     answer: Callable[[Runs, F, tuple[BadReadings, ...]], A],
 ) -> A:
     """The answer of runs without readings that show no output.
 
-    A model that is refuted misses good readings: it is judged with all of them.
+    Readings are judged beside each search's fit, which `fit_of` gives: the last search is the one
+    that is answered by, others before it are quicker. A model that is refuted misses good readings:
+    it is judged with all of them.
     """
-    whole = begin(runs)
-    fit = answer(*_sound(runs, whole, begin))
+    fit = answer(*_sound(runs, searches, fit_of))
     if not fit.left_out or fit.status is not Status.poor_fit:
         return fit
-    again = answer(runs, whole, ())
+    again = answer(runs, searches[-1](runs), ())
     return again if again.status is Status.poor_fit else fit
 
 
 def _sound(
-    runs: Runs,
-    found: F,
-    begin: Callable[[Runs], F],
+    runs: Runs, searches: Sequence[Callable[[Runs], F]], fit_of: Callable[[F], Begun]
 ) -> tuple[Runs, F, tuple[BadReadings, ...]]:
     """Runs without readings that show no output, the fit of the others, and what those were."""
-    left_out: list[BadReadings] = []
-    for _ in range(ROUNDS):
-        trial, which = _without(runs, found.beside(runs), _lone, "far off their neighbours")
-        if trial is None:
-            break
-        runs, left_out, found = trial, [*left_out, *which], begin(trial)
-    trial, _ = _without(runs, found.beside(runs), _equal, "equal")
-    if trial is not None:  # the process may stand still as well: a fit without them tells
-        what = "that stand still as the process moves"
-        trial, which = _without(runs, begin(trial).beside(runs), _still, what)
-        if trial is not None:
-            runs, left_out, found = trial, [*left_out, *which], begin(trial)
-    return runs, found, tuple(left_out)
+    kept, off = runs, _none(runs)
+    for search in searches:
+        found = search(kept)
+        for _ in range(ROUNDS):
+            trial, now = _settled(runs, fit_of(found), off)
+            if trial is None or _same(now, off):
+                break
+            kept, off, found = trial, now, search(trial)
+    if any(np.any(mask.mean(axis=0) > MOST) for mask in off):
+        kept, off, found = runs, _none(runs), search(runs)
+    left_out = _named(runs, off, OFF)
+    trial = _without(kept, _judged(kept, fit_of(found), _equal))
+    if trial is not kept and trial is not None:  # the process may stand still as well: a fit tells
+        stuck = _judged(kept, fit_of(found).again(trial), _still)
+        trial = _without(kept, stuck)
+        if trial is not kept and trial is not None:
+            kept, found = trial, search(trial)
+            left_out += _named(runs, stuck, STILL)
+    return kept, found, left_out
 
 
-def _without(
-    runs: Runs,
-    outputs: Sequence[FreeRun],
-    judge: Callable[[FreeRun], list[np.ndarray]],
-    what: str,
-) -> tuple[Runs | None, list[BadReadings]]:
-    """Runs without the readings that are judged so, and which; None if there are none, or too few
-    others.
+def _settled(runs: Runs, fit: Begun, off: Masks) -> tuple[Runs | None, Masks]:
+    """Runs without readings that are far off a fit of the others, and which they are.
+
+    Each round judges all readings: one that a worse fit missed comes back.
     """
-    kept, found = list(runs), []
-    for each in outputs:
-        for i, mask in enumerate(judge(each)):
-            run, y = kept[i], kept[i].outputs[each.output].copy()
-            rows = heard(run, each.output, each.delay)[mask]
-            y[rows] = np.nan
-            if np.isfinite(y).sum() < max(LEAST, len(rows)):
-                return None, []
-            kept[i] = replace(run, outputs={**run.outputs, each.output: y})
-            if rows.size:
-                said = f"readings of {each.output}" if len(outputs) > 1 else "readings"
-                first = float(run.time[rows[0]])
-                found.append(BadReadings(run.name, int(rows.size), first, f"{said} {what}"))
-    return (tuple(kept) if found else None), found
+    before: list[Masks] = []
+    while True:
+        before.append(off)
+        off = _judged(runs, fit, _lone)
+        trial = _without(runs, off)
+        if trial is None or any(_same(off, each) for each in before):
+            return trial, off
+        fit = fit.again(trial)
 
 
-def _lone(each: FreeRun) -> list[np.ndarray]:
-    """Single readings that lie off, beyond the noise and the model's change nearby."""
-    masks = []
-    for y, fitted in zip(each.measured, each.fitted, strict=True):
-        rest = y - fitted
-        off = np.abs(rest - median_filter(rest, AROUND, mode="nearest"))
-        noise = max(1.4826 * float(np.median(off)), CLOSE * each.size)
-        steps = np.abs(np.diff(fitted, prepend=fitted[0], append=fitted[-1]))
-        far = off > FAR * noise + MOVES * (steps[1:] + steps[:-1])
-        if far.mean() > MOST:  # the model lacks something there, but what stands alone
-            around = np.pad(far, 1)
-            far = far & ~(around[2:] | around[:-2])
-        masks.append(far & (far.mean() <= MOST))
+def _none(runs: Runs) -> Masks:
+    return tuple(np.zeros((len(run), len(run.outputs)), bool) for run in runs)
+
+
+def _same(one: Masks, other: Masks) -> bool:
+    return all(np.array_equal(*pair) for pair in zip(one, other, strict=True))
+
+
+def _judged(
+    runs: Runs,
+    fit: Begun,
+    judge: Callable[[PreparedOutput, Sequence[np.ndarray]], list[np.ndarray]],
+) -> Masks:
+    """Readings of runs that are judged so beside a fit of some of them."""
+    case, masks = fit.on(runs), _none(runs)
+    rest = case.rest(fit.settled.fit.model)
+    for k, seen in enumerate(case.seen):
+        for i, mask in enumerate(judge(seen, [row[k] for row in rest])):
+            masks[i][heard(runs[i], seen.output, fit.path.delay), k] = mask
     return masks
 
 
-def _equal(each: FreeRun) -> list[np.ndarray]:
+def _without(runs: Runs, masks: Masks) -> Runs | None:
+    """Runs without some readings; None if too few others are left."""
+    if not any(map(np.any, masks)):
+        return runs
+    kept = []
+    for run, mask in zip(runs, masks, strict=True):
+        outputs = {}
+        for (name, y), out in zip(run.outputs.items(), mask.T, strict=True):
+            outputs[name] = np.where(out, np.nan, y)
+            left, read = (int(np.isfinite(each).sum()) for each in (outputs[name], y))
+            if left < max(LEAST, read - left):
+                return None
+        kept.append(replace(run, outputs=outputs))
+    return tuple(kept)
+
+
+def _named(runs: Runs, masks: Masks, what: str) -> tuple[BadReadings, ...]:
+    """Readings that are left out, by run and output."""
+    found = []
+    for run, mask in zip(runs, masks, strict=True):
+        for k, name in enumerate(run.outputs):
+            if mask[:, k].any():
+                said = f"readings of {name}" if len(run.outputs) > 1 else "readings"
+                first = float(run.time[mask[:, k].argmax()])
+                found.append(BadReadings(run.name, int(mask[:, k].sum()), first, f"{said} {what}"))
+    return tuple(found)
+
+
+def _lone(seen: PreparedOutput, residuals: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """Readings that lie off beyond the noise by clear odds and are in no series of equal ones."""
+    digit = digit_of(np.concatenate(seen.measured)) or 0.0
+    least, found = np.hypot(CLOSE * seen.size_y, digit / np.sqrt(12.0)), []
+    each = zip(seen.measured, residuals, seen.time, _equal(seen, residuals), strict=True)
+    for y, rest, time, equal in each:
+        off = rest - median_filter(rest, AROUND, mode="nearest")
+        found.append((odds_of_bad(off, y - rest, time, float(least)) > CLEAR_ODDS) & ~equal)
+    return found
+
+
+def odds_of_bad(
+    off: np.ndarray, fitted: np.ndarray, time: np.ndarray, least: float, noise: Noise | None = None
+) -> np.ndarray:
+    """Logarithm of the odds that readings are bad.
+
+    Parameters
+    ----------
+    off, fitted, time : array, shape (n,)
+        Residuals, the model, and when readings were taken, s.
+    least : float
+        Smallest standard deviation of good readings.
+    noise : Noise, optional
+        Of bad readings.
+
+    Returns
+    -------
+    array, shape (n,)
+
+    Notes
+    -----
+    The good-and-bad-data model of `beamfit.noise.sizes.bad_density`. Good readings scatter by a
+    part that is the same everywhere and one that goes with the model's slope (a jitter of the
+    clock, or a model that comes a little late), both at their likeliest by expectation and
+    maximisation.
+
+    Examples
+    --------
+    >>> off = np.append(np.random.default_rng(0).normal(size=50), 9.0)
+    >>> (odds_of_bad(off, np.zeros(51), np.arange(51.0), 1e-3) > 0).nonzero()[0].tolist()
+    [50]
+    """
+    noise = Noise() if noise is None else noise
+    scale, _ = spread_by_jitter(fitted, time)
+    pulls = off / scale
+    size = np.maximum(1.4826 * np.median(np.abs(pulls), axis=1), least)[:, None]
+    for _ in range(ROUNDS_OF_NOISE):
+        pull = (pulls / size) ** 2
+        bad = np.log(bad_density(pull, noise))
+        good = expit(-0.5 * pull - bad)
+        size = np.sqrt(
+            np.sum(good * pulls**2, axis=1, keepdims=True) / good.sum(axis=1, keepdims=True)
+        )
+        size = np.maximum(size, least)
+    minus = np.log(size * scale) - np.logaddexp(-0.5 * pull, bad)
+    cost = 2.0 * minus.sum(axis=1) + JITTER_COST * (np.arange(len(scale)) > 0)
+    return (bad + 0.5 * pull)[cost.argmin()]
+
+
+def _equal(seen: PreparedOutput, residuals: Sequence[np.ndarray]) -> list[np.ndarray]:
     """Readings in long series of equal ones."""
-    return [np.repeat(lengths >= HELD, lengths) for lengths in map(_lengths, each.measured)]
+    return [np.repeat(lengths >= HELD, lengths) for lengths in map(_lengths, seen.measured)]
 
 
-def _still(each: FreeRun) -> list[np.ndarray]:
+def _still(seen: PreparedOutput, residuals: Sequence[np.ndarray]) -> list[np.ndarray]:
     """Those from which a model that was fitted without them moves away."""
-    equal, masks = _equal(each), []
-    rest = [y - f for y, f in zip(each.measured, each.fitted, strict=True)]
-    others = np.concatenate([r[~mask] for r, mask in zip(rest, equal, strict=True)])
+    equal, masks = _equal(seen, residuals), []
+    others = np.concatenate([r[~mask] for r, mask in zip(residuals, equal, strict=True)])
     noise = 1.4826 * float(np.median(np.abs(others)))
-    for y, r, mask in zip(each.measured, rest, equal, strict=True):
+    for y, r, mask in zip(seen.measured, residuals, equal, strict=True):
         lengths = _lengths(y)
         first = np.append(0, np.cumsum(lengths)[:-1])
         off = np.sqrt(np.add.reduceat(r**2, first) / lengths)

@@ -16,6 +16,7 @@ from beamfit.dynamics.model import (
 from beamfit.dynamics.record import Run, Way
 from beamfit.dynamics.response import FIRST_ORDER
 from beamfit.dynamics.search import (
+    TINY,
     Begun,
     drift_columns,
     drift_costs,
@@ -77,7 +78,10 @@ class Checks(NamedTuple):
         has at the levels about which their readings scatter.
     delay_growth : float
         Samples by which the delay grows along the record, if this is what explains the residuals
-        best: clocks of input and output then run at different rates. Else 0.
+        best: clocks of input and output then run at different rates, or a time constant grows.
+        Else 0.
+    gain_growth : float
+        Share by which gains grow along the record, if this explains them best, else 0.
     jitter : float
         Standard deviation of the times of readings about those of the record, s.
     drift : int
@@ -101,6 +105,7 @@ class Checks(NamedTuple):
     band_limited: tuple[str, ...] = ()
     way: Way = Way()
     delay_growth: float = 0.0
+    gain_growth: float = 0.0
     jitter: float = 0.0
     drift: int = 0
 
@@ -163,10 +168,10 @@ def checks_of(
     (explained, chance), (later, fed), grown = _explained(seen, residuals, noise, own, changing)
     white = _white([r / error for r, error in zip(residuals, noise.errors, strict=True)])
     if rest.std() <= CLOSE * seen.size_y:  # what is left is rounding, or the network's own detail
-        explained, chance, later, fed, white, grown = 0.0, 1.0, 0.0, 1.0, 1.0, 0.0
+        explained, chance, later, fed, white, grown = 0.0, 1.0, 0.0, 1.0, 1.0, (0.0, 0.0)
     rounded = variance_of_digits(seen, rest.std())  # what is explained may be no more than that
     if explained * rest.var() <= rounded:
-        explained, chance, grown = 0.0, 1.0, 0.0
+        explained, chance, grown = 0.0, 1.0, (0.0, 0.0)
     if later * rest.var() <= rounded:
         later, fed = 0.0, 1.0
     return Checks(
@@ -180,7 +185,8 @@ def checks_of(
         later,
         gain,
         _together(seen),
-        delay_growth=grown,
+        delay_growth=grown[0],
+        gain_growth=grown[1],
         way=path.way,
         jitter=jitter,
         drift=case.degree,
@@ -260,13 +266,13 @@ def _explained(
     noise: RunNoises,
     own: Sequence[np.ndarray],
     changing: Sequence[np.ndarray],
-) -> tuple[tuple[float, float], tuple[float, float], float]:
+) -> tuple[tuple[float, float], tuple[float, float], tuple[float, float]]:
     """Share of the whitened residuals that a fuller model explains, with its chance, the share of
-    the rest that later inputs explain, and the growth of the delay if it explains most.
+    the rest that later inputs explain, and the growth of the delay or the gain if it explains most.
 
     A score test (Lagrange multipliers): columns are inputs before, those within the delay too,
     further paths of first order, the slopes of the output by parameters that change with the
-    operating point, and by a delay that grows, less what the model's own numbers can do.
+    operating point, and by a delay and a gain that grow, less what the model's own numbers can do.
     """
     quick, later, delay = [], [], int(np.floor(seen.delay))
     for run, added in zip(seen.runs, changing, strict=True):
@@ -283,21 +289,33 @@ def _explained(
     basis = spanned(own)
     rest = rest - basis @ (basis.T @ rest)
     pairs = zip(seen.measured, residuals, noise.times, strict=True)
-    clock = noise.white([_late(y - r, t) for y, r, t in pairs])
-    clock = clock - basis @ (basis.T @ clock)
-    tests = [_tested(rest, basis, columns) for columns in (slow, quick, clock)]
-    share, chance = found = min(tests, key=lambda each: each[1])
-    grown = float(clock[:, 0] @ rest / (clock[:, 0] @ clock[:, 0])) if found is tests[2] else 0.0
+    growing = noise.white([_growing(y - r, t) for y, r, t in pairs])
+    growing = growing - basis @ (basis.T @ growing)
+    # A gain that grows moves the level too, which a drift does as well.
+    beside = spanned(np.hstack([basis, growing[:, 2:]]))
+    delay, gain = growing[:, :1], growing[:, 1:2] - beside @ (beside.T @ growing[:, 1:2])
+    left = rest - beside @ (beside.T @ rest)
+    tests = [_tested(rest, basis, columns) for columns in (slow, quick, delay)]
+    tests.append(_tested(left, beside, gain))
+    which = min(range(len(tests)), key=lambda k: tests[k][1])
+    share, chance = tests[which]
+    by = [
+        float(c[:, 0] @ r / max(c[:, 0] @ c[:, 0], TINY)) for c, r in ((delay, rest), (gain, left))
+    ]
+    grown = by[0] * (which == 2), by[1] * (which == 3)
     basis = spanned(np.hstack([own, slow, quick]))
     rest = rest - basis @ (basis.T @ rest)
     chance = min(len(tests) * chance, 1.0)
     return (share, chance), _tested(rest, basis, later), grown
 
 
-def _late(fitted: np.ndarray, time: np.ndarray) -> np.ndarray:
-    """Change of an output whose delay grows by a sample along the record, as a column."""
+def _growing(fitted: np.ndarray, time: np.ndarray) -> np.ndarray:
+    """Changes of an output whose delay grows by a sample along the record, whose gain does by
+    itself, and whose level does by 1, as columns.
+    """
     through = (time - time[0]) / (time[-1] - time[0]) - 0.5
-    return (-through * np.diff(fitted, prepend=fitted[0]))[:, None]
+    late = -through * np.diff(fitted, prepend=fitted[0])
+    return np.stack([late, through * (fitted - fitted.mean()), through], axis=1)
 
 
 def slow_paths(seen: PreparedOutput) -> list[np.ndarray]:

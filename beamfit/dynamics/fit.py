@@ -22,7 +22,7 @@ from beamfit.dynamics.answer import (
     remarked,
     told,
 )
-from beamfit.dynamics.bad_readings import BadReadings, FreeRun, judged_without
+from beamfit.dynamics.bad_readings import BadReadings, judged_without
 from beamfit.dynamics.checks import (
     Checks,
     HeldOutRun,
@@ -218,7 +218,8 @@ def identify(
     paths = Paths.of(runs, delay, physics.even)
     search = ResponseSearch(output, physics, paths, offset)
     asked = _Identification(search, map, hidden, range(seed, seed + starts), held)
-    return judged_without(runs, partial(_begun, asked), partial(_answered, asked))
+    begin, answer = partial(_begun, asked), partial(_answered, asked)
+    return judged_without(runs, [begin], lambda trial: trial.fit, answer)
 
 
 class _Identification(NamedTuple):
@@ -238,12 +239,12 @@ class _Trial(NamedTuple):
 
     constant: Begun
     others: Alternatives | None = None
-    network: Settled | None = None
+    network: Begun | None = None
 
-    def beside(self, runs: Sequence[Run]) -> list[FreeRun]:
-        """Readings of some runs beside the fit that was asked for."""
-        network = self.network or self.constant.settled
-        return self.constant._replace(settled=network).beside(runs)
+    @property
+    def fit(self) -> Begun:
+        """The fit that was asked for."""
+        return self.network or self.constant
 
 
 def _begun(asked: _Identification, runs: tuple[Run, ...]) -> _Trial:
@@ -260,13 +261,13 @@ def _answered(
 ) -> ResponseFit:
     """Judge a fit of runs."""
     (output, physics, paths, _), map = asked.search, asked.map
-    found, others, network = trial
-    if network is None:
+    found, others, _ = trial
+    if trial.network is None:
         found, others = _likeliest(asked, runs, found)
-    answer = network or found.settled
+    whole = trial.network or found
+    answer = whole.settled
     checks, quantities, curves = _known(asked, runs, found, answer, others)
     fit = answer.fit
-    whole = found._replace(settled=answer)
     ahead = held_out(whole, asked.held)[output]
     evidence = (fit, answer.rests, checks, quantities, curves, ahead, map)
     exact = whole.exact
@@ -304,12 +305,13 @@ def _likeliest(
     return found, others
 
 
-def _with_network(asked: _Identification, found: Begun) -> Settled:
+def _with_network(asked: _Identification, found: Begun) -> Begun:
     """The best fit with a network of parameters, from the constant ones."""
     seen, first, (_, physics, _, offset) = found.seen, found.settled.fit.model, asked.search
     raw = np.asarray(first["map"])
     nets = (network_of(seen, physics, raw, asked.hidden, seed) for seed in asked.seeds)
-    return fitted(case_of(seen, offset, True), [first | {"map": net} for net in nets])
+    case = case_of(seen, offset, True)
+    return found._replace(case=case, settled=fitted(case, [first | {"map": net} for net in nets]))
 
 
 def _known(

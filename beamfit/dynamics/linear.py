@@ -18,7 +18,7 @@ from scipy.linalg import solve_discrete_lyapunov
 from scipy.special import ndtr, ndtri
 
 from beamfit.dynamics.answer import GAIN, PURE, TIME, derived, quantity, widened
-from beamfit.dynamics.bad_readings import FreeRun, judged_without
+from beamfit.dynamics.bad_readings import judged_without
 from beamfit.dynamics.checks import digits_of
 from beamfit.dynamics.fit import MAPS
 from beamfit.dynamics.limits import SINGLE_END, LagLimits
@@ -342,28 +342,32 @@ class StatesSearch(NamedTuple):
         return min(float(found), self.paths.delays[-1])
 
     def begun(self, runs: tuple[Run, ...]) -> tuple[TriedOrder, ...]:
-        """Orders by inputs as they were read, on time if no delay is said."""
-        return self.orders(runs, Path(None, Way(), self.on_time))
-
-    def likeliest(
-        self, runs: tuple[Run, ...], tried: tuple[TriedOrder, ...]
-    ) -> tuple[TriedOrder, ...]:
-        """Orders by the delay that the runs tell, and by inputs at their levels where the best is
-        likelier with these.
+        """Orders by the delay that lags tell, on time unless that is clearly likelier, and by
+        inputs at their levels where the best order is likelier with these.
         """
-        late = self.delay(runs)
-        if late != tried[0].begun.path.delay:
-            other = self.orders(runs, Path(None, Way(), late))
-            on_time, then = criterion([tried[0].begun, other[0].begun], tried[0].begun)
-            tried = other if then + 2.0 * BETTER < on_time else tried
-        best, way = tried[0], self.paths.ways[-1]
-        if not way.standing:
-            return tried
-        path = best.begun.path._replace(way=way)
+        late, way = self.delay(runs), self.paths.ways[-1]
+        tried = self.orders(runs, Path(None, Way(), late))
+        if late != self.on_time:
+            tried = self.unless(runs, tried, Path(None, Way(), self.on_time), 2.0 * BETTER)
+        if way.standing:
+            tried = self.unless(runs, tried, tried[0].begun.path._replace(way=way), 0.0)
+        return tried
+
+    def glanced(self, runs: tuple[Run, ...]) -> Begun:
+        """The fit of the order that is said, or of a few states, by the delay that lags tell."""
+        path = Path(None, Way(), self.delay(runs))
         case = case_of(runs, LINEAR, (), (), path)
+        n = self.order or min(SIZES[0], largest_order(case))
+        return _tried(case, path, n, self.offset, True, None).begun
+
+    def unless(
+        self, runs: tuple[Run, ...], tried: tuple[TriedOrder, ...], path: Path, better: float
+    ) -> tuple[TriedOrder, ...]:
+        """Orders by another path, unless the best that were tried is better by so much."""
+        best, case = tried[0], case_of(runs, LINEAR, (), (), path)
         other = _tried(case, path, best.order, self.offset, best.direct, None)
-        as_read, at_levels = criterion([best.begun, other.begun], best.begun)
-        return self.orders(runs, path) if at_levels < as_read else tried
+        before, then = criterion([best.begun, other.begun], best.begun)
+        return self.orders(runs, path) if then < before + better else tried
 
     def orders(self, runs: tuple[Run, ...], path: Path) -> tuple[TriedOrder, ...]:
         """Fits of 1, 2, … states, or as many as said, the likeliest first; that also without a
@@ -437,18 +441,20 @@ def _tried(
         p = {"z": np.zeros((n, m)), "around": around, "c": c, "d": d, "units": units}
         return padded({"p": p, "start": start @ to.T}, size)
 
-    models = [model(*found) for found in realisations(u, y, n)]
     slow = case._replace(degree=DRIFT)
-    missed = [_missed(slow, each) for each in models]
-    best = [i for i in np.argsort(missed, kind="stable") if np.isfinite(missed[i])]
-    models = [models[i] for i in best[:BEGINS]]
+
+    def best(models):
+        missed = [_missed(slow, each) for each in models]
+        return [models[i] for i in np.argsort(missed, kind="stable") if np.isfinite(missed[i])]
+
+    models = best([model(*found) for found in realisations(u, y, n)])[:BEGINS]
     if before is not None:
         old, last = before.order, before.begun.settled.fit.model
         a, b, c, d, _ = map(np.asarray, LINEAR.matrices(last["p"]))
         a = np.diag([*np.zeros(old), NEW]) + np.pad(a[:old, :old], ((0, 1), (0, 1)))
         b, c = np.vstack([b[:old], np.ones(m)]), np.hstack([c[:, :old], np.full((k, 1), FAINT)])
         start = np.pad(np.asarray(last["start"])[:, :old], ((0, 0), (0, 1)))
-        models.append(model(a, b, c, d, start))
+        models = best([*models, model(a, b, c, d, start)])
     if not models:  # runs too short for a regression
         a = np.diag(NEW ** np.arange(1.0, n + 1))
         models = [model(a, np.ones((n, m)), np.full((k, n), FAINT), np.zeros((k, m)))]
@@ -559,7 +565,8 @@ def identify_states(
     search = StatesSearch(order, Paths.of(runs, given, True), offset)
     _check_order(case_of(runs, LINEAR, (), ()), runs, order or 1)
     asked = _StatesIdentification(search, map, hidden, range(seed, seed + starts), held)
-    return judged_without(runs, asked.begun, asked.answer)
+    searches = asked.glanced, asked.begun
+    return judged_without(runs, searches, lambda found: found.each[0], asked.answer)
 
 
 class _Fits(NamedTuple):
@@ -567,10 +574,6 @@ class _Fits(NamedTuple):
 
     tried: tuple[TriedOrder, ...]
     each: list[Begun]
-
-    def beside(self, runs: Sequence[Run]) -> list[FreeRun]:
-        """Readings of some runs beside the likeliest."""
-        return self.each[0].beside(runs)
 
 
 class _StatesIdentification(NamedTuple):
@@ -582,13 +585,15 @@ class _StatesIdentification(NamedTuple):
     seeds: range
     held: tuple[Run, ...]
 
+    def glanced(self, runs: tuple[Run, ...]) -> _Fits:
+        """The fit of one order: bad readings would take many for the noise to be small."""
+        return _Fits((), [self.search.glanced(runs)])
+
     def begun(self, runs: tuple[Run, ...]) -> _Fits:
-        """Orders, and the fit: by the likeliest path where a network follows."""
+        """Orders, and likely fits of the best."""
         tried = self.search.begun(runs)
-        if self.map == "constant":
-            return _Fits(tried, [tried[0].begun])
-        tried = self.search.likeliest(runs, tried)
-        return _Fits(tried, self.trained(runs, tried[0]))
+        constant = self.map == "constant"
+        return _Fits(tried, [tried[0].begun] if constant else self.trained(runs, tried[0]))
 
     def trained(self, runs: tuple[Run, ...], best: TriedOrder) -> list[Begun]:
         """Networks beside a linear system, those that are likely."""
@@ -608,9 +613,6 @@ class _StatesIdentification(NamedTuple):
         if self.map == "network":
             linear, bent = criterion([tried[0].begun, fits[0]], tried[0].begun)
             gain = linear - bent
-        else:
-            tried = self.search.likeliest(runs, tried)
-            fits = [tried[0].begun]
         n, path = tried[0].order, fits[0].path
         fits = [fit._replace(settled=with_memory(fit.case, fit.settled, WORSE)) for fit in fits]
         said, gains = _quantities(fits, n, runs, self.search.offset)

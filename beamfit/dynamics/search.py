@@ -19,7 +19,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from beamfit.arrays import Array, array_module
-from beamfit.dynamics.bad_readings import FreeRun
 from beamfit.dynamics.model import (
     CLOSE,
     Driven,
@@ -313,6 +312,7 @@ def noise_of(
 # Ratios of the noise by a clock's jitter, rms, to the rest; the prior is as much for none as for
 # all of them. Longest jitter: by more than half a sample readings would not be in their order.
 RATIOS, LONGEST_JITTER = np.append(0.0, np.geomspace(0.2, 50.0, 24)), 0.5
+JITTER_COST = 2.0 * float(np.log(len(RATIOS) - 1))
 
 
 class ReadingErrors(NamedTuple):
@@ -326,6 +326,18 @@ class ReadingErrors(NamedTuple):
     jitter: float = 0.0
 
 
+def spread_by_jitter(fitted: np.ndarray, time: np.ndarray) -> tuple[np.ndarray, float]:
+    """Errors of readings over those at rest, a row for each of `RATIOS`, and the model's usual
+    slope; one row of 1 where it does not move.
+    """
+    slope = np.diff(fitted) / np.diff(time)
+    moves = np.sqrt(0.5 * (np.append(slope, 0.0) ** 2 + np.append(0.0, slope) ** 2))
+    usual = float(np.sqrt(np.mean(moves**2)))
+    if not (np.isfinite(usual) and usual > 0):
+        return np.ones((1, len(time))), 0.0
+    return np.hypot(1.0, np.outer(RATIOS, moves / usual)), usual
+
+
 def reading_errors(
     rest: np.ndarray,
     fitted: np.ndarray,
@@ -334,16 +346,13 @@ def reading_errors(
     memory: CorrelatedNoise | None,
 ) -> ReadingErrors:
     """The likeliest errors of readings, by their residuals."""
-    slope = np.diff(fitted) / np.diff(time)
-    moves = np.sqrt(0.5 * (np.append(slope, 0.0) ** 2 + np.append(0.0, slope) ** 2))
-    usual = float(np.sqrt(np.mean(moves**2)))
-    if not (np.isfinite(usual) and usual > 0):
+    scale, usual = spread_by_jitter(fitted, time)
+    if not usual:
         return ReadingErrors(np.full(len(rest), max(float(rest.std()), least)))
-    scale = np.hypot(1.0, np.outer(RATIOS, moves / usual))
     white = whitened_rows((rest / scale).T, time, memory)[0]
     size = np.maximum(np.sqrt(np.mean(white**2, axis=0)), least)
     minus = 2.0 * (len(rest) * np.log(size) + np.log(scale).sum(axis=1))
-    minus[1:] += 2.0 * np.log(len(RATIOS) - 1)
+    minus[1:] += JITTER_COST
     jitter = RATIOS * size / usual
     minus[jitter > LONGEST_JITTER * np.median(np.diff(time))] = np.inf
     at = int(minus.argmin())
@@ -728,7 +737,7 @@ class Begun(NamedTuple):
     def exact(self) -> float:
         """The delay in samples, by the fit where it is a number of it."""
         late = float(self.settled.fit.model["late"]) if self.seen.ends else 0.0
-        return (self.seen.delay + late) / self.seen.parts
+        return round((self.seen.delay + late) / self.seen.parts, 9)  # an end of a range may be 0
 
     def contains(self, path: Path) -> bool:
         """True if the fit is by that path, or estimates its delay."""
@@ -742,12 +751,7 @@ class Begun(NamedTuple):
         courses = tuple(self.case.courses[0].like(seen, i) for i in range(len(runs)))
         return self.case._replace(seen=seen, courses=courses)
 
-    def beside(self, runs: Sequence[Run]) -> list[FreeRun]:
-        """Readings of some runs beside the fit of others."""
+    def again(self, runs: Sequence[Run]) -> Begun:
+        """The same model fitted to other runs, for a round."""
         case = self.on(runs)
-        rest = case.rest(self.settled.fit.model)
-        return [
-            FreeRun(s.output, self.path.delay, s.size_y, s.measured,
-                    [y - row[k] for y, row in zip(s.measured, rest, strict=True)])
-            for k, s in enumerate(case.seen)
-        ]  # fmt: skip
+        return self._replace(case=case, settled=case.search(self.settled.fit.model, case.guess))

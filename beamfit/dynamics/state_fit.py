@@ -147,12 +147,12 @@ def closed(case: Case, model: Any, close: np.ndarray) -> Any:
 
 
 def begun(case: Case, models: Sequence[Any], path: Path = PLAIN) -> Begun:
-    """The fit beside the drift that the outputs want.
+    """The fit from some starts, the best first, beside the drift that the outputs want.
 
     All drifts are free first: a state that grows for ever would take a drift for its own.
     """
     whole = case._replace(degree=DRIFT)
-    first = settled(whole, [whole.beside_drift(model) for model in models], 0)
+    first = settled(whole, [whole.beside_drift(models[0])], 0)
     case = case._replace(degree=first.drift_degree(whole))
     models = [case.beside_drift(model) for model in (first.fit.model, *models)]
     return Begun(case, path, settled(case, models))
@@ -359,7 +359,7 @@ def fit_states(
         options = {"held": held, "left_out": left_out, "map": "network" if nets else "constant"}
         return states_answer(found, runs, _told(found), **options)
 
-    return judged_without(runs, search, answer)
+    return judged_without(runs, [search], lambda found: found, answer)
 
 
 def _free_run(case: Case, model: Any, segments: int | None) -> Settled:

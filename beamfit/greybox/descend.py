@@ -405,7 +405,8 @@ def costs(p: Problem, d: Descent, points: np.ndarray) -> np.ndarray:
     """Half the sum of squares at points; of few numbers by the call that is compiled already."""
     look = p.compiled(residual)
     found = map(look, points) if d.many else d.slopes(np.zeros(len(points), int), points)[0]
-    return np.array([0.5 * float(r @ r) for r in map(np.asarray, found)])
+    with np.errstate(over="ignore"):  # of a model that went astray
+        return np.array([0.5 * float(r @ r) for r in map(np.asarray, found)])
 
 
 def slopes_of_few(p: Problem) -> Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]:

@@ -471,6 +471,36 @@ def test_readings_that_show_no_output_are_left_out_and_named():
         assert fit.quantities[name].error < 0.05 * truth
 
 
+def test_bad_readings_of_an_output_that_moves_fast_are_found_and_good_ones_kept():
+    """A time constant of one sample, bad readings of half its scatter on: none was found."""
+    rng = np.random.default_rng(6)
+    u = rng.uniform(0, 3, 150).repeat(2)
+    p, drive = jnp.tile(jnp.array([1.0, 2.0]), (300, 1)), jnp.asarray(u)[:, None]
+    level = np.array(simulate(FIRST_ORDER, p, drive, jnp.ones(300), 2.0 * drive[0]))
+    size, bad = level.std(), rng.choice(np.arange(5, 295), 25, replace=False)
+    level += 0.03 * size * rng.normal(size=300)
+    level[bad] += size * rng.uniform(0.5, 20.0, 25) * rng.choice([-1.0, 1.0], 25)
+    fit = identify(Run(np.arange(300.0), {"valve": u}, {"level": level}), delay=0)
+    assert fit.status is Status.converged, fit.message
+    assert set(np.flatnonzero(np.isnan(fit.runs[0].outputs["level"]))) == set(bad)
+    for name, truth in (("tau", 1.0), ("K", 2.0)):
+        assert abs(fit.quantities[name].value - truth) < 4 * fit.quantities[name].error
+
+
+def test_a_gain_that_grows_along_the_record_is_said():
+    """By a fifth: it was an answer with a noise that has a memory, and an error of 1.4 %."""
+    rng = np.random.default_rng(7)
+    u = steps(300, rng, 0.0, 3.0, 10)
+    p, drive = jnp.tile(jnp.array([4.0, 2.0]), (300, 1)), jnp.asarray(u)[:, None]
+    level = np.array(simulate(FIRST_ORDER, p, drive, jnp.ones(300), 2.0 * drive[0]))
+    level *= 1.0 + 0.2 * np.arange(300) / 300
+    level += 0.03 * level.std() * rng.normal(size=300)
+    fit = identify(Run(np.arange(300.0), {"valve": u}, {"level": level}), delay=0)
+    assert fit.status is Status.poor_fit
+    assert "as if its gain grew by about" in fit.message, fit.message
+    assert 0.12 < fit.checks.gain_growth < 0.26
+
+
 def test_a_higher_order_of_a_first_order_plant_says_what_is_determined():
     run = run_of(FIRST_ORDER, constant(3.0, 2.0))
     for model, words in (("arx", "a pole and a zero cancel"), ("second-order", "shorter lag")):
