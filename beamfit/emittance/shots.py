@@ -53,6 +53,8 @@ def steady_settings(scan: QuadScan) -> QuadScan:
     values = np.stack(list(scan.settings.values()), -1)
     held = np.ptp(values, axis=0) <= READBACK * np.abs(values).max(0)
     held &= [scan.units[name] != KNOB for name in scan.settings]
+    if held.all():  # a magnet that hardly moved is no repeat
+        return scan
     # The range of even settings, which one wrong cell does not change.
     span = 4.0 * np.median(np.abs(values - np.median(values, axis=0)), axis=0)
     near = np.where(held, np.inf, READBACK * span)
