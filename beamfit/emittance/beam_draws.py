@@ -14,7 +14,15 @@ import numpy as np
 from scipy.special import fdtri, gammaln, ndtri
 
 from beamfit.noise.model import LN_2PI, Noise
-from beamfit.noise.sizes import NoiseKind, Scales, averaged, log_likelihood, scales_of
+from beamfit.noise.sizes import (
+    NoiseKind,
+    Scales,
+    averaged,
+    drifting,
+    log_likelihood,
+    scales_of,
+    whitening,
+)
 
 # Draws of a plane, and degrees of freedom of the Student distributions they are drawn from.
 DRAWS, TAIL = 1536, 4.0
@@ -27,6 +35,8 @@ ROUNDS, FURTHEST = 6, 3.0
 # Fits leave out every two of up to so many points, every one of up to so many more, and of any
 # number the worst ones up to this share in so many steps.
 PAIRS, SINGLES, WORST, STEPS = 24, 50, 0.25, 12
+# Variance that makes a point of no weight.
+LEFT_OUT = 1e8
 # Numbers that one draw of many points may have, with all draws of few: memory and time.
 ROOM, FEWEST = 500_000, 128
 # Numbers worked on at once: what a processor has at hand.
@@ -274,16 +284,21 @@ def _fitted(
     rows, target = c.rows[..., None, :, :], (c.size**2 - c.known)[..., None, :]
     size = c.size[..., None, :]
     model = np.broadcast_to(size, kept.shape)
+    weigh = kept[..., None]
+    if kind.slow:  # what is left out is of no weight
+        weigh = whitening(
+            drifting(size.shape[-1]) + LEFT_OUT * (1.0 - weigh) * np.eye(size.shape[-1])
+        )
     for _ in range(ROUNDS):
-        weight = kept / (2.0 * model * deviation[..., None, :] * model**kind.power) ** 2
-        normal = np.swapaxes(rows * weight[..., None], -1, -2) @ rows
+        each = 1.0 / (2.0 * model * deviation[..., None, :] * model**kind.power)[..., None]
+        design, wanted = _weighed(weigh, each * rows), _weighed(weigh, each * target[..., None])
+        turned = np.swapaxes(design, -1, -2)
+        normal = turned @ design
         normal = normal + _little(normal)
-        x = np.linalg.solve(normal, np.swapaxes(rows, -1, -2) @ (weight * target)[..., None])[
-            ..., 0
-        ]
+        x = np.linalg.solve(normal, turned @ wanted)[..., 0]
         squared = (rows @ x[..., None])[..., 0] + c.known[..., None, :]
         model = np.sqrt(np.clip(squared, (size / FURTHEST) ** 2, (size * FURTHEST) ** 2))
-    chi2 = (weight * (target - (rows @ x[..., None])[..., 0]) ** 2).sum(-1)
+    chi2 = ((wanted - design @ x[..., None]) ** 2).sum((-2, -1))
     dof = np.maximum(kept.sum(-1) - 3.0, 0.0)
     if kind.chance:
         factor = np.maximum(1.0, chi2 / np.maximum(dof, 1.0))
@@ -291,6 +306,11 @@ def _fitted(
         factor = (2.0 + chi2) / (2.0 + dof)
     root = np.linalg.cholesky(np.linalg.inv(normal)) * np.sqrt(factor)[..., None, None]
     return _inside(x), WIDER * root
+
+
+def _weighed(weigh: np.ndarray, columns: np.ndarray) -> np.ndarray:
+    """Columns times weights of points, shape (..., n, 1), or a matrix of them."""
+    return weigh * columns if weigh.shape[-1] == 1 else weigh @ columns
 
 
 def _little(normal: np.ndarray) -> np.ndarray:

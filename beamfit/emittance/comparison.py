@@ -24,6 +24,7 @@ from beamfit.emittance.beam_draws import (
 from beamfit.emittance.model import coefficients
 from beamfit.noise.model import LN_2PI, Noise
 from beamfit.noise.sizes import (
+    LONG,
     NoiseKind,
     Scales,
     averaged,
@@ -44,7 +45,7 @@ MODELS = {BEAM: 0.85, FLAT: 0.03, CONSTANT: 0.03, RANDOM: 0.04, DRIFTING: 0.02, 
 # Of rows that moved no magnet only a beam and sizes at random are possible.
 UNMOVED = {BEAM: 0.9, FLAT: 0.05, RANDOM: 0.05}
 # Models are told apart by at most so many points, evenly among all: the beam by every one.
-COMPARED = 100
+COMPARED = LONG
 # Planes that are looked at in one call, and rounds of the best fit and when it rests.
 TOGETHER, ROUNDS, REST = 16, 40, 1e-11
 # Steps of ln size of sizes at random or in a drift; bends of a curve as shares of the mean size,
@@ -482,12 +483,14 @@ def _evidences(s: _Stack, i: int, draws: BeamDraws, noise: Noise) -> np.ndarray:
     flat = np.full_like(beam, -np.inf)
     if not kind.power:
         flat = flat_beam(s.c, kind, noise)
-    elif len(s.kinds) == 1:
+    elif all(k.power for k in s.kinds):
         flat = flat_beam(s.c, replace(kind, power=0, unit=kind.unit * s.c.size), noise)
     jacobian = np.log(s.c.size).sum(-1)
-    curves = curve_evidences(s.u, s.c, kind, noise)
-    near = beam + jacobian + departure_odds(draws.best, s.u, s.c, kind, noise)
-    curves[-1] = np.logaddexp(curves[-1] + math.log1p(-NEAR), near + math.log(NEAR))
+    # Rivals of slow noise are slow themselves, or as random as without it.
+    curves = curve_evidences(s.u, s.c, replace(kind, slow=False), noise)
+    if not kind.slow:
+        near = beam + jacobian + departure_odds(draws.best, s.u, s.c, kind, noise)
+        curves[-1] = np.logaddexp(curves[-1] + math.log1p(-NEAR), near + math.log(NEAR))
     return np.stack([beam + jacobian, flat + jacobian, *curves], -1)
 
 

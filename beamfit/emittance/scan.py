@@ -115,8 +115,8 @@ def first_unusable(values: np.ndarray, *, blank: bool = False) -> tuple[int, str
 class QuadScan:
     """Beam sizes against magnet settings or at several screens, in one or both planes.
 
-    Each row is a measurement of its own: shots of one setting are ``shot_size`` of one row, as
-    `beamfit.read_quad_scan` makes them of a table's rows.
+    Rows that repeat a setting are its shots, where they stand together or have no errors of their
+    own: a fit takes them as ``shot_size`` of one row, as `beamfit.read_quad_scan` does.
 
     Parameters
     ----------

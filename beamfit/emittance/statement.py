@@ -19,6 +19,7 @@ from beamfit.emittance.comparison import PlanePosterior, PlaneSizes, compare
 from beamfit.emittance.model import UNIT, Asked, predict_sizes
 from beamfit.emittance.results import Parameter, PlaneFit, Points
 from beamfit.emittance.scan import QuadScan, check_names
+from beamfit.emittance.shots import of_settings
 from beamfit.emittance.transport import (
     Look,
     Rows,
@@ -338,7 +339,7 @@ def prepare(
 def of_one_beam(
     scan: QuadScan, line: Beamline | None, scenario: str = "known"
 ) -> tuple[QuadScan, Beamline]:
-    """A scan of one beam with total energies, and its line.
+    """A scan of one beam with total energies, one row a setting, and its line.
 
     Raises
     ------
@@ -350,7 +351,7 @@ def of_one_beam(
         raise scan.unusable(found, "rows of one, as scan.of_slice(name) gives")
     line = rows_line(scan) if line is None else line
     _check_own(scan, line, scenario)
-    return scan.of_particle(line.mass), line
+    return of_settings(scan.of_particle(line.mass)), line
 
 
 def _check_own(scan: QuadScan, line: Beamline, scenario: str) -> None:

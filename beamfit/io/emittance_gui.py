@@ -14,11 +14,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from beamfit.emittance.scan import PLANES, POSSIBLE, Profile, QuadScan, at_rows
+from beamfit.emittance.shots import average_shots
 from beamfit.errors import InputError, nearest
 from beamfit.io.files import digest, laid_out, name_of
 from beamfit.io.isolated import matlab_variables
 from beamfit.io.lattice import LatticeFile
-from beamfit.io.shots import FEWEST_SETTINGS, average_shots
+from beamfit.io.shots import FEWEST_SETTINGS
 from beamfit.quantity import Quantity
 
 # GeV, of files that have none; the electron's is the only particle there.

@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from beamfit.emittance.scan import KNOB, POSSIBLE, USUAL, Profile, QuadScan, middle, row_keys
+from beamfit.emittance.scan import KNOB, POSSIBLE, USUAL, Profile, QuadScan, middle
+from beamfit.emittance.shots import of_settings
 from beamfit.errors import InputError, located, nearest, short
 from beamfit.io.cells import is_number, number
 from beamfit.io.columns import (
@@ -31,7 +32,7 @@ from beamfit.io.columns import (
 )
 from beamfit.io.emittance_gui import is_emittance_gui, read_emittance_gui
 from beamfit.io.files import name_of, text_lines
-from beamfit.io.shots import IMAGE, average_shots, of_images, of_profiles, steady_settings
+from beamfit.io.shots import IMAGE, of_images, of_profiles
 from beamfit.io.table import read_columns
 from beamfit.particles import ENERGY_KEYS
 from beamfit.tuning.knobs import EmittanceTable
@@ -523,9 +524,8 @@ def scan_of_sheet(
     notes = [*column_notes(columns), *comment_notes(sheet, columns), *odd]
     notes += [*ignored(sheet, columns), *left_out(sheet)]
     with located(sheet.path):
-        scan = steady_settings(_scan(sheet, columns, values, notes=tuple(notes), profiles=profiles))
-    rows = row_keys(scan)
-    return average_shots(scan, marked="shot" in columns) if len(set(rows)) < len(rows) else scan
+        scan = _scan(sheet, columns, values, notes=tuple(notes), profiles=profiles)
+        return of_settings(scan, marked="shot" in columns)
 
 
 def _without_dark(sheet: Sheet, columns: Mapping[str, Column]) -> Sheet:

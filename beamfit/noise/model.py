@@ -64,6 +64,9 @@ class Noise:
         setting. A few points do not tell which.
     even : float
         Probability that settings scatter no more than their shots say.
+    slow : float
+        Probability that the noise goes on from row to row, as that of a beam that drifts within
+        its feedbacks: one scan in ten.
     scatter : Lognormal
         What settings scatter beyond their shots, or beyond stated errors that are not right, as a
         share of the size: 4 to 5 % in LCLS scans whose shots say 1 % (docs/verdict.md).
@@ -93,6 +96,7 @@ class Noise:
     unstated: Lognormal = UNSTATED
     share: float = 0.5
     even: float = 0.05
+    slow: float = 0.1
     scatter: Lognormal = SCATTER
     bad: float = 0.03
     width: float = 12.0
@@ -100,7 +104,7 @@ class Noise:
     source: str = "beamfit's own, from published scans (docs/verdict.md)"
 
     def __post_init__(self) -> None:
-        for name in ("right", "share", "even", "bad", "bad_shot"):
+        for name in ("right", "share", "even", "slow", "bad", "bad_shot"):
             if not 0.0 < getattr(self, name) < 1.0:
                 found = f"noise prior {name} = {getattr(self, name):g}"
                 raise InputError(found, "a probability between 0 and 1")

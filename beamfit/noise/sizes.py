@@ -7,14 +7,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.special import expit
 
 from beamfit.arrays import registered
-from beamfit.noise.model import LN_2PI, Lognormal, Noise
+from beamfit.noise.model import LN_2PI, UNTESTED, Lognormal, Noise
 from beamfit.statistics import log_student
 
 # Nodes over the scale of the noise, and how far below its peak the likelihood still counts.
@@ -23,6 +23,11 @@ NODES, DEEP = 12, 12.0
 REACH = 4.5
 # Densities that are multiplied before a logarithm is taken.
 AT_ONCE = 8
+# Slow noise: the share of its variance that is new at each row, and its correlation time as a part
+# of the scan. What is faster averages out, and what is slower changes all sizes alike.
+WHITE, MEMORY = 0.2, 0.25
+# From so many points on none is looked for: time goes with their number cubed.
+LONG = 100
 # Degrees of freedom that the scatter of all settings counts beside a setting's own: the scatter
 # of a setting differs from the others' by a third of itself at most (Gelman et al., sect. 2.6).
 POOLED = 20.0
@@ -51,6 +56,9 @@ class NoiseKind:
         large may hold what these points do not show.
     log_weight : float
         Log prior probability of the kind.
+    slow : bool
+        Whether s goes on from row to row, as that of a beam or screen that drifts. A bad reading
+        is none of these: it would be a step, and steps explain a curve that is no beam's.
     """
 
     power: int
@@ -61,10 +69,11 @@ class NoiseKind:
     chance: float
     least: float
     log_weight: float
+    slow: bool = False
 
 
 # A tree of arrays for JAX: what is the same at every point is structure.
-registered(NoiseKind, ("power", "prior", "special", "chance", "least", "log_weight"))
+registered(NoiseKind, ("power", "prior", "special", "chance", "least", "log_weight", "slow"))
 
 
 class Scales(NamedTuple):
@@ -112,28 +121,36 @@ def kinds_of(
     -------
     tuple of NoiseKind
         Of sizes without errors a share and the same everywhere. Of stated errors that are too small
-        by a factor, or by what settings scatter beyond them; one where that is a factor, too.
+        by a factor, or by what settings scatter beyond them; one where that is a factor, too. The
+        last one is the first, slow (where errors are stated with these), of fewer than `LONG`
+        points.
     """
     zero, one = np.zeros_like(size), np.ones_like(size)
+    swift, slow = math.log1p(-noise.slow), math.log(noise.slow)
     if floor is not None:
-        return (NoiseKind(0, floor, size, noise.scatter, 0.0, noise.even, 0.0, 0.0),)
-    if error is None:
+        kinds = (NoiseKind(0, floor, size, noise.scatter, 0.0, noise.even, 0.0, swift),)
+    elif error is None:
         middle = np.median(size, axis=-1, keepdims=True) * np.ones_like(size)
-        share, same = math.log(noise.share), math.log1p(-noise.share)
-        return (
+        share, same = math.log(noise.share) + swift, math.log1p(-noise.share) + swift
+        kinds = (
             NoiseKind(1, zero, one, noise.unstated, 1.0, 0.0, 0.0, share),
             NoiseKind(0, zero, middle, noise.unstated, 1.0, 0.0, 0.0, same),
         )
-    if of_one_share(error, size) if alike is None else alike:
-        return (NoiseKind(1, zero, error / size, noise.factor, 1.0, noise.right, 1.0, 0.0),)
-    # A factor or a scatter: nobody knows which before the sizes are seen.
-    wrong = 0.5 * (1.0 - noise.right)
-    whole = noise.right + wrong
-    right = noise.right / whole
-    return (
-        NoiseKind(0, zero, error, noise.factor, 1.0, right, 1.0, math.log(whole)),
-        NoiseKind(0, error, size, noise.scatter, 0.0, 0.0, 0.0, math.log(wrong)),
-    )
+    elif of_one_share(error, size) if alike is None else alike:
+        kinds = (NoiseKind(1, zero, error / size, noise.factor, 1.0, noise.right, 1.0, swift),)
+    else:  # a factor or a scatter: nobody knows which before the sizes are seen
+        wrong = 0.5 * (1.0 - noise.right)
+        whole = noise.right + wrong
+        right = noise.right / whole
+        kinds = (
+            NoiseKind(0, zero, error, noise.factor, 1.0, right, 1.0, math.log(whole) + swift),
+            NoiseKind(0, error, size, noise.scatter, 0.0, 0.0, 0.0, math.log(wrong) + swift),
+        )
+    if size.shape[-1] >= LONG:
+        return kinds
+    first = replace(kinds[0], slow=True, log_weight=slow)
+    # Errors that are stated too small, and go on from row to row, are a drift: a rival.
+    return (*kinds, replace(first, chance=1.0 - UNTESTED) if first.least else first)
 
 
 def scales_between(kind: NoiseKind, low: np.ndarray, high: np.ndarray) -> Scales:
@@ -222,17 +239,44 @@ def log_likelihood(off: Any, model: Any, kind: NoiseKind, scale: Any, noise: Noi
     """
     xp = off.__array_namespace__()
     n = off.shape[-1]
-    squared, variance = (off / model if kind.power else off) ** 2, variance_of(kind, scale)
-    found = -0.5 * xp.sum(xp.log(variance), axis=-1)[..., None]
-    found = found + n * (math.log1p(-noise.bad) - 0.5 * LN_2PI)
+    found = n * (math.log1p(-noise.bad) - 0.5 * LN_2PI)
     if kind.power:
-        found = found - xp.sum(xp.log(model), axis=-1)[..., None, :]
+        off = off / model
+        found = found - xp.sum(xp.log(model), axis=-1)[..., None]
+    if kind.slow:
+        whiten = whitening(covariance_of(kind, scale))
+        own = xp.sum(xp.log(xp.linalg.diagonal(whiten)), axis=-1)[..., None, :]
+        pull = (off[..., None, :, :] @ xp.swapaxes(whiten, -1, -2)) ** 2
+        return found + own - 0.5 * xp.swapaxes(xp.sum(pull, axis=-1), -1, -2)
+    variance = variance_of(kind, scale)
     # Points first, so that sums over them run along memory.
-    pull = _points_first(1.0 / variance, xp)[..., None] * _points_first(squared, xp)[..., None, :]
-    either = xp.exp(-0.5 * pull) + bad_density(pull, noise)
+    squared = _points_first(off**2, xp)[..., None, :]
+    either = _points_first(1.0 / variance, xp)[..., None] * squared
+    either = xp.exp(-0.5 * either) + bad_density(either, noise)
+    log = -0.5 * xp.sum(xp.log(variance), axis=-1)[..., None]
     for first in range(0, n, AT_ONCE):
-        found = found + xp.log(xp.prod(either[first : first + AT_ONCE], axis=0))
-    return xp.moveaxis(found, -1, -2)
+        log = log + xp.log(xp.prod(either[first : first + AT_ONCE], axis=0))
+    return found + xp.moveaxis(log, -1, -2)
+
+
+def drifting(n: int) -> np.ndarray:
+    """Correlation of slow noise between n rows in the order of the file."""
+    apart = np.abs(np.subtract.outer(np.arange(n), np.arange(n)))
+    return WHITE * np.eye(n) + (1.0 - WHITE) * np.exp(-apart / (MEMORY * n))
+
+
+def covariance_of(kind: NoiseKind, scale: Any) -> Any:
+    """Covariance over model^(2 power) at every scale, shape (..., k, n, n), of slow noise."""
+    grown = scale[..., :, None] * kind.unit[..., None, :]
+    n = grown.shape[-1]
+    slow = grown[..., :, None] * grown[..., None, :] * drifting(n)
+    return slow + kind.floor[..., None, :, None] ** 2 * np.eye(n)
+
+
+def whitening(covariance: Any) -> Any:
+    """Inverse Cholesky factors of covariances, shape (..., n, n)."""
+    xp = covariance.__array_namespace__()
+    return xp.linalg.inv(xp.linalg.cholesky(covariance))
 
 
 def bad_density(pull: Any, noise: Noise) -> Any:

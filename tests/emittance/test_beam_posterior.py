@@ -158,10 +158,16 @@ def brute_probabilities(fit, kind, noise):
             size / mean - model, slopes, model, far, deviation * model, np.log(weight)
         )
         near.append(beam + odds + np.log(chance))
-    curves = ref.log_sum(np.array(parts), 0)
+    # Rivals of slow noise are those of the first kind of noise.
+    first = parts[0] - np.log(noises(kind, size, error, noise)[0][0]) + np.log(noise.slow)
+    parts = [part + np.log(1.0 - noise.slow) for part in parts]
+    near = [each + np.log(1.0 - noise.slow) for each in near]
+    slow = first[-1]
+    curves = ref.log_sum(np.array([*parts, np.append(first[:-1], -np.inf)]), 0)
     curves[-1] = np.logaddexp(
         curves[-1] + np.log(1 - NEAR), ref.log_sum(np.array(near)) + np.log(NEAR)
     )
+    curves[-1] = np.logaddexp(curves[-1], slow)
     log = np.array([beam, flat, *curves]) + np.log(list(MODELS.values()))
     return dict(zip(MODELS, np.exp(log - ref.log_sum(log)), strict=True))
 

@@ -61,6 +61,37 @@ def log_readings(off, deviation, noise):
     return either.sum(-1)
 
 
+def log_averaged(log_of, deviations, weights):
+    """Log density averaged over deviations of the readings."""
+    parts = [
+        math.log(w) + log_of(deviation)
+        for deviation, w in zip(deviations, weights, strict=True)
+        if w > 0.0
+    ]
+    return log_sum(np.array(parts), 0)
+
+
+def log_slow(off, slow, own, noise):
+    """Log density of readings of shape (..., n), none bad, part of whose noise goes on.
+
+    ``slow`` (..., n) is the deviation of that, ``own`` of what is new at each reading.
+    """
+    n = off.shape[-1]
+    apart = np.abs(np.arange(n)[:, None] - np.arange(n))
+    correlation = 0.2 * np.eye(n) + 0.8 * np.exp(-apart / (n / 4))
+    slow, own = (np.broadcast_to(v, off.shape) for v in (slow, own))
+    covariance = slow[..., :, None] * slow[..., None, :] * correlation
+    covariance = covariance + own[..., None, :] ** 2 * np.eye(n)
+    pull = np.sum(off * np.linalg.solve(covariance, off[..., None])[..., 0], -1)
+    log = -0.5 * (pull + np.linalg.slogdet(covariance)[1] + n * math.log(2.0 * math.pi))
+    return n * math.log(1.0 - noise.bad) + log
+
+
+def either_way(swift, slow, noise):
+    """Noise that is new at each reading, or goes on from row to row."""
+    return np.logaddexp(math.log(1.0 - noise.slow) + swift, math.log(noise.slow) + slow)
+
+
 def log_stated(size, model, error, noise):
     """Sizes with stated errors: right, too small by one factor, or by what settings scatter."""
     factor, weight = stated_scales(noise)
@@ -68,22 +99,17 @@ def log_stated(size, model, error, noise):
     weight[1:] *= 0.5
     deviations = [s * error for s in factor] + [np.hypot(error, s * size) for s in scatter]
     weights = np.append(weight, 0.5 * (1.0 - noise.right) * further)
-    parts = [
-        math.log(w) + log_readings(size - model, deviation, noise)
-        for deviation, w in zip(deviations, weights, strict=True)
-        if w > 0.0
-    ]
-    return log_sum(np.array(parts), 0)
+    off = size - model
+    swift = log_averaged(lambda d: log_readings(off, d, noise), deviations, weights)
+    return either_way(swift, log_slow(off, error, 0.0, noise), noise)
 
 
 def log_factor(size, model, error, noise):
     """Sizes with stated errors that are right or too small by one factor."""
-    parts = [
-        math.log(w) + log_readings(size - model, s * error, noise)
-        for s, w in zip(*stated_scales(noise), strict=True)
-        if w > 0.0
-    ]
-    return log_sum(np.array(parts), 0)
+    factor, weight = stated_scales(noise)
+    off, deviations = size - model, [s * error for s in factor]
+    swift = log_averaged(lambda d: log_readings(off, d, noise), deviations, weight)
+    return either_way(swift, log_slow(off, error, 0.0, noise), noise)
 
 
 def log_share(size, model, share, noise):
@@ -93,23 +119,24 @@ def log_share(size, model, share, noise):
 
 def log_of_shots(size, model, floor, noise):
     """Means of shots, whose settings scatter beyond by a share of the size measured."""
-    parts = [
-        math.log(w) + log_readings(size - model, np.hypot(floor, s * size), noise)
-        for s, w in zip(*shot_scales(noise), strict=True)
-        if w > 0.0
-    ]
-    return log_sum(np.array(parts), 0)
+    scales, weight = shot_scales(noise)
+    off, beyond = size - model, [s * size for s in scales]
+    swift = log_averaged(lambda d: log_readings(off, np.hypot(floor, d), noise), beyond, weight)
+    slow = log_averaged(lambda d: log_slow(off, d, floor, noise), beyond, weight)
+    return either_way(swift, slow, noise)
 
 
 def log_same(size, model, noise, share=False):
     """Sizes without errors, whose noise is the same everywhere, or else a share of the beam's."""
     unit = model if share else np.median(size)
-    parts = [
-        math.log(w) + log_readings(size - model, s * unit, noise)
-        for s, w in zip(*unstated_scales(noise), strict=True)
-        if w > 0.0
-    ]
-    return math.log(noise.share if share else 1.0 - noise.share) + log_sum(np.array(parts), 0)
+    scales, weight = unstated_scales(noise)
+    off, deviations = size - model, [s * unit for s in scales]
+    swift = log_averaged(lambda d: log_readings(off, d, noise), deviations, weight)
+    swift = swift + math.log(noise.share if share else 1.0 - noise.share)
+    if not share:
+        return math.log(1.0 - noise.slow) + swift
+    slow = log_averaged(lambda d: log_slow(off, d, 0.0, noise), deviations, weight)
+    return either_way(swift, slow, noise)
 
 
 def log_unstated(size, model, noise):

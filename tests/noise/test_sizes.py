@@ -62,7 +62,7 @@ def test_it_is_the_average_over_scale_and_bad_readings(kind, case):
 def test_the_written_out_one_is_an_integral():
     """The reference itself, by adaptive quadrature over factor and scatter; no reading is bad."""
     noise, off, error = (
-        Noise(bad=1e-12),
+        Noise(bad=1e-12, slow=1e-12),
         np.array([0.02, -0.05, 0.01]),
         np.array([0.02, 0.02, 0.03]),
     )
@@ -90,7 +90,7 @@ def test_compiled_it_is_the_same(n, options):
     """The second largest of doubts was found by comparing numbers that XLA computes twice."""
     noise = Noise()
     size, model, error = data(n, "stated", noise)
-    kind, _ = kinds_of(noise, size, error)
+    kind = kinds_of(noise, size, error)[0]
     scale = wide_scales(kind, ()).scale
     many = np.repeat(model, 30, axis=0) * (
         1 + 0.01 * np.random.default_rng(1).normal(size=(300, n))
@@ -109,16 +109,18 @@ def test_errors_of_one_share_are_the_models_own():
     size = np.array([1.0, 2.0, 3.0])
     assert kinds_of(Noise(), size, 0.05 * size)[0].power == 1
     assert kinds_of(Noise(), size, np.full(3, 0.05))[0].power == 0
-    assert [k.power for k in kinds_of(Noise(), size, None)] == [1, 0]
-    [shots] = kinds_of(Noise(), size, None, np.full(3, 0.05))
+    assert [k.power for k in kinds_of(Noise(), size, None)] == [1, 0, 1]
+    shots, slow = kinds_of(Noise(), size, None, np.full(3, 0.05))
     assert (shots.power, shots.special, shots.chance) == (0, 0.0, Noise().even)
+    assert not shots.slow
+    assert slow.slow
 
 
 def test_stated_errors_are_never_too_large():
     """Sizes that scatter less than stated say that errors are right, and no more."""
     size = np.linspace(1.0, 2.0, 12)
     model = np.repeat((size * (1 + 1e-4))[None], 2, axis=0)
-    kind, _ = kinds_of(Noise(), size, 0.05 * np.ones(12))
+    kind = kinds_of(Noise(), size, 0.05 * np.ones(12))[0]
     scales = wide_scales(kind, ())
     assert scales.scale.min() == 1.0
     log = log_likelihood(size - model, model, kind, scales.scale, Noise())[0] + scales.log_weight
