@@ -280,16 +280,19 @@ def reference_of(
     """Usual a and b of some decays, with their noise; None where they do not give both above zero,
     or the loss rate falls with the current as no bunch length makes it.
 
-    Where decays together reject a constant a it goes as the power of the current that they show.
+    Where several together reject a constant a it goes as the power of the current that they show.
 
     Least squares on what each decay says of a I and a I + b; with a ring its ratio of a to b is
     known, to `SHARES`. How far the decays scatter beyond that is how far a and b are expected to
     differ from decay to decay, and the errors of each contain it.
     """
     power = power_of([decay.fit for decay in decays])
-    if power > 0:
+    # One decay alone does not tell an exponent from a monitor or a vacuum that wanders.
+    if power > 0 or (power and len(decays) == 1):
         return None
     current, parts, root = map(np.asarray, summarise(decays, power))
+    if not root.any():  # many cycles say nothing of an exponent
+        return None
     usual = float(np.median(current))
     rows, known = by_losses(a * current * (current / usual) ** power, b), np.zeros(2)
     if ring is not None:
