@@ -160,11 +160,12 @@ def _alike(shots: np.ndarray) -> bool:
     from beamfit.noise.sizes import means_of  # scipy, which most scans are read without
     from beamfit.statistics import POOR_FIT
 
+    shots = shots[np.any(shots > 0.0, axis=1)]
     found = means_of(shots)
     mean, degrees, square = _scatter(
         shots if found is None else np.where(found.bad > 0.5, np.nan, shots)
     )
-    return bool(_outstanding(square / mean**2, degrees).min() > POOR_FIT)
+    return bool(_outstanding(square / mean**2, degrees).min(initial=1.0) > POOR_FIT)
 
 
 def _outstanding(square: np.ndarray, degrees: np.ndarray) -> np.ndarray:

@@ -372,8 +372,8 @@ def watched(
     ...     state, told = watched(usual, state, Reading(second, beam))
     ...     if told.raised or told.moved:
     ...         print(second, NAMES[told.moved] or "raised", f"{100 * told.change[0]:.0f} % in a")
-    620 raised 0 % in a
-    1054 a 10 % in a
+    618 raised 0 % in a
+    1055 a 10 % in a
     """
     usable = np.isfinite(reading.current) & (np.nan_to_num(reading.current) > 0)
     reading = reading._replace(current=np.where(usable, reading.current, 1.0))

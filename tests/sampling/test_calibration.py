@@ -47,7 +47,7 @@ def test_known_transport_by_quadrature(gtf, kind):
     rows = np.stack([p.r11**2, 2 * p.r11 * p.r12, p.r12**2], -1)
     spread = rows / (2 * p.model * p.error)[:, None]
     root = np.linalg.cholesky(np.linalg.inv(spread.T @ spread))
-    side = np.linspace(-7.0, 7.0, 33)
+    side = np.linspace(-11.0, 11.0, 33)  # noise that may go on from row to row has wide tails
     steps = np.stack(np.meshgrid(side, side, side, indexing="ij"), -1).reshape(-1, 3)
     grid = fit.seen.solutions["x"].posterior.best + steps @ root.T
     s11, s12, s22 = grid.T
