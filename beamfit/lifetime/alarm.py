@@ -117,7 +117,7 @@ def with_reading(
 
 
 def beside(product: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    """What products say where a and b depart by themselves with such a covariance.
+    """Products that are left where a and b depart by themselves with such a covariance.
 
     With information J and score s these are (1 + J C)⁻¹ (J, s), written out: 2 by 2.
     """
@@ -130,7 +130,7 @@ def beside(product: np.ndarray, covariance: np.ndarray) -> np.ndarray:
 
 
 def shown_in(state: AlarmState, windows: slice = slice(None)) -> np.ndarray:
-    """What all pieces of some windows say of a lasting change, as products."""
+    """Products of all pieces of some windows, as they tell a lasting change."""
     spread = state.spread[..., None, None, None] * np.eye(2)
     return state.past[..., windows, :] + beside(state.product[..., windows, :], spread)
 
