@@ -414,9 +414,14 @@ def _pictures(studies: Sequence[RecordStudy]) -> list[Picture]:
 RELATIVE = ("a", "b")
 
 
+def _relative(trend: Trend) -> bool:
+    """True if some decay has an a or b over the usual ones."""
+    return any(point.a is not None or point.b is not None for point in trend.points)
+
+
 def trend_picture(trend: Trend) -> Picture:
     """The picture of a page."""
-    height = 2.6 if trend.reference is None else 5.4
+    height = 5.4 if _relative(trend) else 2.6
     ends = [when(point.time, trend.dated) for point in trend.points[:1] + trend.points[-1:]]
     source = f"{len(trend.points)} decays, {' to '.join(ends)}"
     return Picture("course of the lifetime", height, partial(draw_trend, trend=trend), source)
@@ -432,7 +437,7 @@ def draw_trend(figure: FigureBase, trend: Trend) -> None:
     trend : Trend
         The lifetimes. Hours of the record where they have no dates.
     """
-    rows = 1 if trend.reference is None else 3
+    rows = 3 if _relative(trend) else 1
     panels = figure.subplots(rows, 1, sharex=True, squeeze=False)[:, 0]
     at = np.array([_at(trend, point.time) for point in trend.points])
     _lifetimes(panels[0], trend, at)
