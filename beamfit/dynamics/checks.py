@@ -293,14 +293,14 @@ def _explained(
     growing = growing - basis @ (basis.T @ growing)
     # A gain that grows moves the level too, which a drift does as well.
     beside = spanned(np.hstack([basis, growing[:, 2:]]))
-    delay, gain = growing[:, :1], growing[:, 1:2] - beside @ (beside.T @ growing[:, 1:2])
+    late, gain = growing[:, :1], growing[:, 1:2] - beside @ (beside.T @ growing[:, 1:2])
     left = rest - beside @ (beside.T @ rest)
-    tests = [_tested(rest, basis, columns) for columns in (slow, quick, delay)]
+    tests = [_tested(rest, basis, columns) for columns in (slow, quick, late)]
     tests.append(_tested(left, beside, gain))
     which = min(range(len(tests)), key=lambda k: tests[k][1])
     share, chance = tests[which]
     by = [
-        float(c[:, 0] @ r / max(c[:, 0] @ c[:, 0], TINY)) for c, r in ((delay, rest), (gain, left))
+        float(c[:, 0] @ r / max(c[:, 0] @ c[:, 0], TINY)) for c, r in ((late, rest), (gain, left))
     ]
     grown = by[0] * (which == 2), by[1] * (which == 3)
     basis = spanned(np.hstack([own, slow, quick]))

@@ -301,7 +301,7 @@ def reference_of(
     found, _ = _common(rows, parts, root, known)
     quadratic = np.clip(parts[:, 0], 0.0, parts[:, 1])
     own = by_losses(quadratic, parts[:, 1] - quadratic)
-    off, share = parts[:, 1] - (rows @ found)[:, 1], np.mean(own[:, 1] ** 2) * 2
+    off, share = parts[:, 1] - (rows @ found)[:, 1], np.sum(own[:, 1] ** 2, axis=1).mean()
     # One more decay, as of an ordinary day, for few of them.
     wander = math.sqrt((float(off @ off) / share + WANDER**2) / max(off.size - 1, 1))
     found, relative = _common(rows, parts, np.asarray(widened(root, wander * own)), known)

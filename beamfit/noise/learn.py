@@ -154,11 +154,10 @@ def _log_evidence(
 ) -> float:
     """Log evidence of a plane under other priors than those of its nodes."""
     parts = []
+    moved = math.log(probability / chance), math.log1p(-probability) - math.log1p(-chance)
     for own, scales, evidence in zip(s.kinds, s.scales, s.log_evidence, strict=True):
-        more = math.log(probability) - math.log(chance)
-        less = math.log1p(-probability) - math.log1p(-chance)
-        if own.slow and kind != "shots":  # neither of stated errors that are right nor of a share
-            more = less = 0.0
+        # Slow noise is neither of stated errors that are right nor of a share.
+        more, less = (0.0, 0.0) if own.slow and kind != "shots" else moved
         skip = int(own.chance > 0)
         log = np.log(scales.scale[skip:])
         ratio = np.full(len(log), more if kind == "none" and own.power else less)
