@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.polynomial.chebyshev import chebvander
 from scipy.ndimage import maximum_filter1d, median_filter, minimum_filter1d, uniform_filter1d
+from scipy.special import logsumexp
 
 from beamfit.answer import shown
 from beamfit.errors import expect
@@ -56,6 +57,9 @@ ONE_LAW, BESIDE, LONG = 1 << 16, 1 << 11, 4096
 # Degree of the smooth curve by which a piece may depart from a law: an exponent of a, gas that
 # changes.
 CURVED = 6
+# Levels whose steps are weighed together, groups of them at most, means of readings by which, and
+# correlation times of the noise that are looked at.
+LEVELS, GROUPS, ROWS, NOISES = 20, 8, 512, 7
 # A step is placed to the reading within so many of where it was seen, by so many on either side.
 NEAR, WIDEST = 8, 64
 # How often steps are sought with the law that those found leave.
@@ -542,26 +546,20 @@ def _restored(
     lengths: np.ndarray,
 ) -> tuple[list[np.ndarray], list[int]]:
     """Parts, and of which clear piece each is; one whose steps explain no more than their sizes and
-    places cost, beside a law of its own and a smooth curve, is whole again.
+    places cost, beside a law of its own and a smooth curve, is whole again but for gaps.
     """
     begins = np.cumsum(lengths) - lengths
     pieces = np.flatnonzero(np.diff(number, prepend=-1)).tolist()
-    found, owner = [], []
+    found, owner, missing = [], [], GAP * np.median(np.diff(record.time))
     for low, high in itertools.pairwise([*pieces, rows.size]):
         piece, inside = number[low], begins[slice(*np.searchsorted(begins, (low, high)))]
         parts, every = np.split(rows[low:high], inside[1:] - low), clear[piece]
         if len(parts) > 1 or high - low < every.size:
-            alone = _levelled(record.time[every], record.current[every], np.zeros(1, int))
-            bent = np.column_stack([chebvander(np.linspace(-1.0, 1.0, every.size), CURVED), alone])
             ends = np.searchsorted(every, [(part[0], part[-1] + 1) for part in parts])
             first = np.union1d(0, ends[ends < every.size])
-            worse = np.log(
-                (_left(bent) + TINY) / (_left(_without_means(bent[:, 1:], first)) + TINY)
-            )
-            # Twice the log evidence: log n for a size, 2 log n for a place among n readings.
-            cost = 3 * (first.size - 1) * np.log(every.size)
-            if (every.size - CURVED - first.size) * worse < cost:
-                parts = [every]
+            gap = np.append(False, np.diff(record.time[every])[first[1:] - 1] > missing)
+            if _log_odds_of_steps(record.time[every], record.current[every], first, gap) < 0:
+                parts = np.split(every, first[gap])
         found += parts
         owner += [piece] * len(parts)
     return found, owner
@@ -574,10 +572,55 @@ def _without_means(columns: np.ndarray, first: np.ndarray) -> np.ndarray:
     return columns - np.repeat(means, lengths, axis=0)
 
 
-def _left(columns: np.ndarray) -> float:
-    """Variance that all columns but the last leave of that."""
-    found = np.linalg.lstsq(columns[:, :-1], columns[:, -1], rcond=None)[0]
-    return float(np.mean((columns[:, -1] - columns[:, :-1] @ found) ** 2))
+def _log_odds_of_steps(
+    time: np.ndarray, current: np.ndarray, first: np.ndarray, gap: np.ndarray
+) -> float:
+    """Log odds of levels that begin at these readings against those that begin after a gap, each
+    beside a law and a smooth curve, averaged over the noise: what is slow goes up and down by
+    itself. Of many levels some tell it.
+    """
+    from beamfit.noise.memory import Products  # JAX, for steps alone
+
+    level = _levelled(time, current, np.zeros(1, int))
+    ends, odds, told = np.append(first, time.size), 0.0, 0
+    groups = -(-first.size // LEVELS)
+    for k in np.unique(np.linspace(0, groups - 1, min(groups, GROUPS)).astype(int)):
+        some = ends[k * LEVELS : (k + 1) * LEVELS + 1]
+        size = -(-(some[-1] - some[0]) // ROWS)
+        begin = np.concatenate([np.arange(*ends, size) for ends in itertools.pairwise(some)])
+        lengths = np.diff(begin, append=some[-1])
+        at, of = (np.add.reduceat(v[: some[-1]], begin) / lengths for v in (time, level))
+        sure = gap[k * LEVELS + 1 : (k + 1) * LEVELS]
+        steps = np.greater_equal.outer(begin, some[1:-1][np.argsort(~sure, kind="stable")])
+        # By number: the readings on both sides of a gap have a slope.
+        curve = chebvander(np.interp(begin, begin[[0, -1]], [-1.0, 1.0]), CURVED)
+        products = Products.of(np.column_stack([of, curve, steps]), at, False, NOISES)
+        free = max(at.size - CURVED - some.size + 1, 1)
+        for sign, columns in ((1, None), (-1, CURVED + 2 + sure.sum())):
+            left = _left(products.matrix, columns)
+            odds += sign * logsumexp(products.log_prior - 0.5 * free * np.log(left + TINY))
+        told += np.sum(~sure)
+    return odds - told / max(first.size - 1, 1) * _log_cost(np.diff(ends))
+
+
+def _log_cost(lengths: np.ndarray) -> float:
+    """What places and sizes of steps between levels of so many readings cost in log evidence: log
+    n for a place, or what the lengths differ by from the usual one; for a size half the logarithm
+    of the readings that tell it.
+    """
+    steps, count = lengths.size - 1, lengths.sum()
+    differ = np.mean(np.abs(lengths - np.median(lengths)))
+    by_the_clock = np.log(count) + steps * (1.0 + np.log1p(2 * differ))
+    size = 0.5 * np.log(count / lengths.size)
+    return float(min(steps * np.log(count), by_the_clock) + steps * size)
+
+
+def _left(matrix: np.ndarray, columns: int | None) -> np.ndarray:
+    """Squares of the first column that the others, up to one, leave, of products of columns."""
+    known, with_first = matrix[:, 1:columns, 1:columns], matrix[:, 1:columns, 0]
+    known = known * (1.0 + EXACT * np.eye(known.shape[1]))  # what others repeat
+    numbers = np.linalg.solve(known, with_first[:, :, None])[:, :, 0]
+    return np.maximum(matrix[:, 0, 0] - np.sum(with_first * numbers, axis=1), 0.0)
 
 
 def _is_short(number: np.ndarray, begins: np.ndarray, lengths: np.ndarray) -> np.ndarray:

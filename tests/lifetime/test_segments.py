@@ -454,3 +454,16 @@ def test_fills_whose_a_goes_with_the_current_are_not_cut(power):
         beam += 0.005 * rng.normal(size=beam.size)
         split = split_record(DecayRecord(60.0 * np.arange(beam.size), beam))
         assert [len(s) for s in split.segments] == [len(fill) for fill in fills]
+
+
+@pytest.mark.parametrize("power", [1.0, 2.0])
+def test_a_monitor_that_wanders_beside_refills_is_not_cut(power):
+    """SIMULATED: refilled at 90 %, which is clear; noise of 1/f^power goes up and down by itself."""
+    time = 2.0 * np.arange(3600)
+    beam = 500 * np.exp(-(time % 2500) / 25000)
+    for seed in range(8):
+        spectrum = np.fft.rfft(np.random.default_rng(seed).normal(size=8192))
+        spectrum[1:] *= np.arange(1, spectrum.size) ** (-power / 2)
+        slow = np.fft.irfft(spectrum)[: time.size]
+        split = split_record(DecayRecord(time, beam + 0.01 * slow / np.std(slow)))
+        assert [len(part) for part in split.segments] == [1250, 1250, 1100]
