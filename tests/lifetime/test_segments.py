@@ -458,7 +458,7 @@ def test_fills_whose_a_goes_with_the_current_are_not_cut(power):
 
 @pytest.mark.parametrize("power", [1.0, 2.0])
 def test_a_monitor_that_wanders_beside_refills_is_not_cut(power):
-    """SIMULATED: refilled at 90 %, which is clear; noise of 1/f^power goes up and down by itself."""
+    """SIMULATED: clear refills; noise of 1/f^power goes up and down by itself."""
     time = 2.0 * np.arange(3600)
     beam = 500 * np.exp(-(time % 2500) / 25000)
     for seed in range(8):
