@@ -30,6 +30,9 @@ QUICK, TRIED = "xla_cpu_use_fusion_emitters", "0.10."
 # compiled in half the time. No other compiled function can call such a one.
 SELDOM = {"xla_backend_optimization_level": 0}
 
+# For a loop over thousands of readings: optimised, whatever XLA_FLAGS say of all other programs.
+LONG = {"xla_backend_optimization_level": 3}
+
 
 def prepare_jax() -> None:
     """Import JAX with 64 bits, a compile cache, quick compilation and calls that wait.

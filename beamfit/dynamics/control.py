@@ -179,9 +179,12 @@ class Controller:
         """Outputs by inputs of the horizon where that is a constant, else None."""
         if any(callable(r.of) for r in self.responses):
             return None
+
+        def found(plan: jax.Array) -> jax.Array:
+            return outputs(self, start(self, jnp.zeros(len(self.sizes))), plan)
+
         with jax.ensure_compile_time_eval():  # also where a step is being compiled
-            state = start(self, jnp.zeros(len(self.sizes)))
-            return np.asarray(jax.jacfwd(lambda plan: outputs(self, state, plan))(self.rest))
+            return np.asarray(jax.jit(jax.jacfwd(found))(self.rest))
 
     @property
     def held(self) -> tuple[np.ndarray, np.ndarray]:
@@ -758,9 +761,8 @@ def simulate_loop(
         raise InputError(f"a loop of {long:g} s", expected)
     time = control.step * np.arange(int(np.ceil(long / control.step)))
     begin = np.clip(fits[0].seen.mean_u, control.limits.low, control.limits.high)
-    rest = [r.offset + float(settled(r, jnp.asarray(begin), control.step)[0])
-            for r in control.responses]  # fmt: skip
-    wanted = _series(control, time, targets, np.array(rest), add=False)
+    rest = np.asarray(jax.jit(lambda u: _now(control, start(control, u).x))(begin))
+    wanted = _series(control, time, targets, rest, add=False)
     load = _series(control, time, disturbances, np.zeros(len(rest)), add=True)
     for name, value, _ in targets:
         low, high = (ends[_output(control, name)] for ends in control.limits[3:])

@@ -518,11 +518,12 @@ def _product(
     model: Any, seen: PreparedBatches, names: Sequence[str], hidden: int, seed: int
 ) -> dict[str, Any]:
     """The product's part of the model a search begins with."""
-    b, top, points = seen.batches, [], []
-    for x, u, t in zip(_whole(seen), np.asarray(b.u), seen.time, strict=True):
-        made = x[:, 3] * x[:, 2]
-        top.append(made.max() / np.trapezoid(x[:, 0] * x[:, 2], t))
-        points.append(jax.vmap(partial(points_at, b, model, names))(x[:, :3], u[: len(t)]))
+    b, whole = seen.batches, _whole(seen)
+    top = [(x[:, 3] * x[:, 2]).max() / np.trapezoid(x[:, 0] * x[:, 2], t)
+           for x, t in zip(whole, seen.time, strict=True)]  # fmt: skip
+    every = jax.jit(jax.vmap(jax.vmap(partial(points_at, b, model, names))))
+    points = every(padded([x[:, :3] for x in whole], b.dt.shape[1]), b.u)
+    points = [p[: len(t)] for p, t in zip(np.asarray(points), seen.time, strict=True)]
     if not max(top) > 0:
         raise InputError("a titre that never rises", "batches that make product")
     net = network_of(names, np.concatenate(points), ["q"], hidden, seed)
@@ -596,6 +597,9 @@ VISITS, BESIDE, LEAST = 3, 0.5, 1e-3
 def _rates(model: Any, asked: tuple[Any, Any, Any]) -> jax.Array:
     b, x, u = asked
     return jax.vmap(partial(rates_at, b, model))(x, u)
+
+
+_rated = jax.jit(_rates)
 
 
 def curves_of(fit: Fit, seen: PreparedBatches) -> tuple[Curve, ...]:
@@ -675,7 +679,7 @@ def rank_inputs(rates: FedBatchFit, output: str = TITRE, seed: int = 0) -> tuple
     for i, (run, t, x) in enumerate(zip(rates.runs, rates.seen.time, rates.courses, strict=True)):
         total = np.append(0.0, np.cumsum(run.inputs["feed"][:-1] * np.diff(t)))
         columns = known_of(run) | {"total feed": total}
-        found = jax.vmap(partial(rates_at, b, rates.fit.model))(x[:, :3], b.u[i, : len(t)])
+        found = _rated(rates.fit.model, (b, x[:, :3], b.u[i, : len(t)]))
         for name, y in zip((*STATES, *RATES), np.column_stack([x[:, :3], found]).T, strict=True):
             columns[f"predicted {name}"] = y
         read = np.isfinite(run.outputs[output])

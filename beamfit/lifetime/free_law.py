@@ -387,9 +387,7 @@ class SeenDecay:
         """Draw how far the loss rate has walked at the nodes, as shares of the loss, (14, d), by
         even points of a cube, beside these currents and the squares that they leave.
         """
-        walked = np.zeros_like(currents)
-        if self.walk is None:
-            return walked
+        walked = np.empty_like(currents)
         away, normal = self.away(currents), ndtri(even)
         noise = np.sqrt(self.products.variance(squares, 0))
         for mean, half, part in zip(*self.walk, self._parts(kind), strict=True):
@@ -686,8 +684,10 @@ class DrawnLaw(NamedTuple):
         whole = float(logsumexp(log))
         weight = np.exp(log - max(whole, -1e300))
         worth = float(weight.sum() / max(np.sum(weight**2), 1e-300))
-        walk = seen.walked(currents, kind, squares, _even(draws, NODES, seed + 1))
-        currents = currents * np.exp(-numbers.rate * (INTEGRAL @ walk))
+        walk = np.zeros_like(currents)
+        if seen.walk is not None:
+            walk = seen.walked(currents, kind, squares, _even(draws, NODES, seed + 1))
+            currents = currents * np.exp(-numbers.rate * (INTEGRAL @ walk))
         return Draws(numbers, walk, currents, weight, whole - math.log(draws), worth)
 
 
@@ -734,9 +734,11 @@ def quantiles(values: np.ndarray, weight: np.ndarray, at: np.ndarray) -> np.ndar
     return np.interp(at, below, values[order])
 
 
-def quantity_of(values: np.ndarray, weight: np.ndarray, unit: str) -> Quantity:
-    """Median, half of the central 68 % and the central 95 % of weighted draws."""
-    found = quantiles(values, weight, np.array([0.5, *CENTRAL, *WIDE]))
+def quantity_of(
+    values: np.ndarray, weight: np.ndarray, unit: str, ends: tuple[float, float] = WIDE
+) -> Quantity:
+    """Median, half of the central 68 % and, between probabilities, 95 % of weighted draws."""
+    found = quantiles(values, weight, np.array([0.5, *CENTRAL, *ends]))
     middle, less, more, *interval = map(float, found)
     return Quantity(middle, (more - less) / 2, unit, None, tuple(interval))
 
@@ -755,10 +757,10 @@ def _share_of(
     """A loss that is a share of a whole; the interval reaches to a bound that is not excluded: from
     0 to the limit of 95 %, or up to the whole.
     """
-    found = quantity_of(values, weight, unit)
-    low, high = quantiles(values, weight, np.array(ends_of(none, all_)))
+    found = quantity_of(values, weight, unit, ends_of(none, all_))
+    low, high = found.interval_95
     high = quantiles(whole, weight, np.array([WIDE[1]]))[0] if all_ else high
-    return replace(found, interval_95=(0.0 if none else float(low), float(high)))
+    return replace(found, interval_95=(0.0 if none else low, float(high)))
 
 
 @dataclass(frozen=True)
@@ -879,26 +881,30 @@ def free_law(record: DecayRecord, values: Physical) -> FreeLaw | None:
     laws = list(zip(proposed, drawn(proposed), strict=True))
     laws += [(law, own.of_the_monitor()) for law, own in laws if law.seen.walk is not None]
     draws = mixed([own for _, own in laws])
-    smooth = mixed([own for law, own in laws if not law.is_pumped])
-    if not np.isfinite(smooth.log) or draws.worth < LEAST_WORTH:
+    smooth = draws.numbers.pace == 0
+    part = float(draws.weight[smooth].sum())
+    if not (np.isfinite(draws.log) and part > 0) or draws.worth < LEAST_WORTH:
         return None
     plain = DrawnLaw.of(seen, CONSTANT).weighed(FEW)
     if not 0 <= values.share <= 1:
         rival = DrawnLaw.of(replace(seen, share=NO_BEAM), CONSTANT).weighed(FEW)
         if rival.log + np.log(UNPHYSICAL) > draws.log:
             return None
-    usual, odd = log_prior(smooth.numbers.power)
-    odd = math.exp(smooth.log - draws.log) * float(smooth.weight @ np.exp(odd - usual))
-    found = _quantities(record, seen, draws)
-    power, drift = smooth.numbers.power, smooth.numbers.drift if seen.drifts else None
-    power, drift = (v if v is None else quantity_of(v, smooth.weight, "1") for v in (power, drift))
+    power, weight = draws.numbers.power[smooth], draws.weight[smooth]
+    usual, odd = log_prior(power)
+    odd = float(weight @ np.exp(odd - usual))
+    found, drift = _quantities(record, seen, draws), None
+    exponent = quantity_of(power, weight / part, "1")
+    if seen.drifts:
+        drift = quantity_of(draws.numbers.drift[smooth], weight / part, "1")
     constant = float(expit(plain.log - draws.log))
     chances = [(law, math.exp(own.log - draws.log)) for law, own in laws]
     pumped = sum((chance for law, chance in chances if law.is_pumped), 0.0)
     wanders = sum((chance for law, chance in chances if law.seen.walk is not None), 0.0)
     nodes = record.mean_current * draws.currents @ draws.weight
     share = quantity_of(draws.numbers.share, draws.weight, "1")
-    return FreeLaw(found, share, power, drift, constant, odd, pumped, wanders, nodes, record.span)
+    return FreeLaw(found, share, exponent, drift, constant, odd, pumped, wanders, nodes,
+                   record.span)  # fmt: skip
 
 
 def proposals(seen: SeenDecay) -> list[DrawnLaw]:

@@ -736,18 +736,19 @@ def _divided(
     """Divide pieces in two as long as two levels explain them better than one."""
     ends = [0, *steps.tolist(), total.size - 1]
     waiting, found = list(itertools.pairwise(ends)), steps.tolist()
+    count = np.arange(1, total.size)
+    each = variance(count)
     while waiting:
         low, high = waiting.pop()
         if high - low < 2:
             continue
-        at = np.arange(low + 1, high)
-        step = (total[high] - total[at]) / (high - at) - (total[at] - total[low]) / (at - low)
-        scatter = np.sqrt(variance(at - low) + variance(high - at))
-        best = int(np.argmax(np.abs(step) / scatter))
-        least = DIGITS * grain[low:high].max()
-        if abs(step[best]) > max(LIKELY * scatter[best], least):
-            found.append(int(at[best]))
-            waiting += [(low, int(at[best])), (int(at[best]), high)]
+        at, before, own = total[low + 1 : high], count[: high - low - 1], each[: high - low - 1]
+        step = (total[high] - at) / before[::-1] - (at - total[low]) / before
+        scatter = np.sqrt(own + own[::-1])
+        best = int((np.abs(step) / scatter).argmax())
+        if abs(step[best]) > max(LIKELY * scatter[best], DIGITS * grain[low:high].max()):
+            found.append(low + 1 + best)
+            waiting += [(low, found[-1]), (found[-1], high)]
     return np.sort(np.array(found, int))
 
 
@@ -769,11 +770,13 @@ def _mean_variance(change: np.ndarray, longest: int) -> Callable[[np.ndarray], n
 
 def _placed(total: np.ndarray, steps: np.ndarray, clear: np.ndarray) -> np.ndarray:
     """Each step that is not clear where two levels between its neighbours explain most."""
-    ends = np.concatenate([[0], steps, [total.size - 1]])
-    for k in np.flatnonzero(~np.isin(steps, clear)) + 1:
+    ends, count = [0, *steps.tolist(), total.size - 1], np.arange(2 * WIDEST)
+    for k in (np.flatnonzero(~np.isin(steps, clear)) + 1).tolist():
         low, high = max(ends[k - 1], ends[k] - WIDEST), min(ends[k + 1], ends[k] + WIDEST)
-        at = np.arange(max(low + 1, ends[k] - NEAR), min(high, ends[k] + NEAR + 1))
-        before = (total[at] - total[low]) / (at - low)
-        after = (total[high] - total[at]) / (high - at)
-        ends[k] = at[np.argmax((before - after) ** 2 * (at - low) * (high - at))]
-    return np.unique(ends[1:-1])
+        first, last = max(low + 1, ends[k] - NEAR), min(high, ends[k] + NEAR + 1)
+        at = total[first:last]
+        before, after = count[first - low : last - low], count[high - last + 1 : high - first + 1]
+        after = after[::-1]
+        step = (at - total[low]) / before - (total[high] - at) / after
+        ends[k] = first + int((step**2 * before * after).argmax())
+    return np.unique(np.array(ends[1:-1], int))

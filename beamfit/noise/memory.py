@@ -9,6 +9,7 @@ columns once; their products are all that a fit needs later, however many readin
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from itertools import groupby
 from typing import NamedTuple
 
@@ -19,7 +20,7 @@ from scipy.fft import irfft, next_fast_len, rfft
 from scipy.linalg.lapack import dpttrf, dpttrs, dtbtrs
 from scipy.special import logsumexp
 
-from beamfit.compile_cache import prepare_jax
+from beamfit.compile_cache import LONG, prepare_jax
 
 prepare_jax()
 # Correlation of neighbouring residuals, in standard errors of that of independent ones, from which
@@ -274,7 +275,7 @@ class Levels(NamedTuple):
         return rows
 
 
-@jax.jit
+@partial(jax.jit, compiler_options=LONG)
 def levelled_products(
     noises: CorrelatedNoise, rows: jax.Array, time: jax.Array, begins: jax.Array, slope: jax.Array
 ) -> tuple[jax.Array, jax.Array]:

@@ -154,7 +154,7 @@ def test_what_a_titre_hangs_on_is_ranked(fit, monkeypatch):
 
 
 def test_residuals_that_follow_one_another_are_no_noise(fit):
-    fitted = np.asarray(predicted(fit.fit.model, fit.seen.batches))
+    fitted = np.asarray(jax.jit(predicted)(fit.fit.model, fit.seen.batches))
     slow = 1.0 + 0.02 * np.sin(np.arange(fitted.shape[1]) / 4)[None, :, None]
     for factor, status in ((1.0, Status.converged), (slow, Status.poor_fit)):
         evidence = BatchEvidence(fit.fit, True, fit.seen, factor * fitted, fit.noise, fit.curves)
@@ -163,7 +163,7 @@ def test_residuals_that_follow_one_another_are_no_noise(fit):
 
 def test_what_is_left_of_an_output_read_seldom_is_poor_fit_and_said_before_what_is_open(fit):
     """A third of the biomass is not explained at every sixth row, and the curves are open."""
-    fitted = np.array(predicted(fit.fit.model, fit.seen.batches))
+    fitted = np.array(jax.jit(predicted)(fit.fit.model, fit.seen.batches))
     read = fit.seen.read.copy()
     read[:, np.arange(read.shape[1]) % 6 > 0, 0] = False
     measured = fit.seen.measured.copy()
