@@ -552,14 +552,14 @@ def _restored(
     pieces = np.flatnonzero(np.diff(number, prepend=-1)).tolist()
     found, owner, missing = [], [], GAP * np.median(np.diff(record.time))
     for low, high in itertools.pairwise([*pieces, rows.size]):
-        piece, inside = number[low], begins[slice(*np.searchsorted(begins, (low, high)))]
-        parts, every = np.split(rows[low:high], inside[1:] - low), clear[piece]
-        if len(parts) > 1 or high - low < every.size:
-            ends = np.searchsorted(every, [(part[0], part[-1] + 1) for part in parts])
-            first = np.union1d(0, ends[ends < every.size])
-            gap = np.append(False, np.diff(record.time[every])[first[1:] - 1] > missing)
-            if _log_odds_of_steps(record.time[every], record.current[every], first, gap) < 0:
-                parts = np.split(every, first[gap])
+        piece, kept = number[low], rows[low:high]
+        first = begins[slice(*np.searchsorted(begins, (low, high)))] - low
+        parts, every = np.split(kept, first[1:]), clear[piece]
+        if len(parts) > 1:
+            after = every[1:][np.diff(record.time[every]) > missing]
+            gap = np.diff(np.searchsorted(after, kept, "right"), prepend=0)[first] > 0
+            if _log_odds_of_steps(record.time[kept], record.current[kept], first, gap) < 0:
+                parts = np.split(every, np.searchsorted(every, kept[first[gap]]))
         found += parts
         owner += [piece] * len(parts)
     return found, owner
