@@ -13,6 +13,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
+from itertools import groupby
 from typing import Any, NamedTuple
 
 import jax
@@ -432,11 +433,12 @@ def _laws_of(runs: Sequence[Run], name: str, way: Way) -> list[InputLaw]:
     unsure = np.sqrt(sum(np.sum(each.variance[-len(u) :])
                          for each, u in zip(levels, since, strict=True)))  # fmt: skip
     laws = laws_between(name, *map(float, (min(map(np.min, inputs)), max(map(np.max, inputs)))))
-    at = np.stack([
-        np.concatenate([moved(u, law.kind, law.width, law.place)[-len(some) :]
-                        for u, some in zip(inputs, since, strict=True)])
-        for law in laws
-    ], axis=1)  # fmt: skip
+    alike = groupby(laws, lambda law: (law.kind, law.place))
+    at = np.concatenate([
+        np.concatenate([moved(u, kind, widths, place)[:, -len(some) :]
+                        for u, some in zip(inputs, since, strict=True)], axis=1)
+        for (kind, place), widths in [(k, np.array([law.width for law in g])) for k, g in alike]
+    ]).T  # fmt: skip
     basis = np.linalg.qr(np.stack([np.ones(len(plain)), plain], axis=1))[0]
     at = at - at.mean(axis=0)
     same = basis @ (basis.T @ at)
