@@ -13,19 +13,21 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
+from itertools import groupby
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.special import expit, logsumexp
+from scipy.special import logsumexp
 
-from beamfit.dynamics.checks import slow_paths
+from beamfit.dynamics.checks import SLOW, paths_by, slow_lags, slow_paths
 from beamfit.dynamics.input_laws import STATIC, InputLaw, laws_between, moved
-from beamfit.dynamics.model import Driven, PreparedOutput, filled, predicted
+from beamfit.dynamics.model import Driven, filled, growing_of, predicted
 from beamfit.dynamics.paths import Path, Paths, Undriven, handed_on, undriven
 from beamfit.dynamics.record import Run, Way
-from beamfit.dynamics.search import Begun, noises_of
+from beamfit.dynamics.response import ARX
+from beamfit.dynamics.search import Begun, drift_columns, noises_of, shape_of, spanned
 from beamfit.greybox import tree
 from beamfit.greybox.problem import with_slope
 from beamfit.noise.correlated import Whitened, roots_by_each
@@ -34,6 +36,8 @@ from beamfit.statistics import OPEN
 
 # Correlation times and white variances of the noises that each is fitted with, and most readings.
 CORRELATION_TIMES, WHITE, MOST = 6, (0.0, 1.0, 10.0, 100.0), 2048
+# Odds that a response has no more terms than the model that was asked for: a guess.
+FULLER = 10.0
 # Probability of the laws that are named, where several are possible.
 NAMED = 0.99
 # How many times a law of the value alone is looked at in finer steps.
@@ -49,6 +53,35 @@ FIRST, MANY, ROUNDS, SPREAD, FEW = 2, 128, 3, 3, 4
 LATE = 3
 # Alternatives that are fitted at once: one program is compiled for all.
 BATCH = 64
+
+
+# Kinds of departures that are no laws of an input.
+FURTHER, GROWTH = "further term", "growth"
+
+
+class Departure(NamedTuple):
+    """A law of an input, a term of a fuller response, or something that grows along the record,
+    beside a response. In words, by its kind, and its probability where no departure and
+    these are all that can be; `growth` is by how much a term grows if its share is 1.
+    """
+
+    words: str
+    kind: str
+    growth: float = 0.0
+    probability: float = 0.0
+
+    def grown(self, share: float) -> Departure:
+        """The same with the amount by which it grows."""
+        if self.kind != GROWTH:
+            return self
+        by, unit = share * self.growth, "samples" if self.words == "a delay" else "%"
+        way = "grows" if by > 0 else "falls"
+        return self._replace(words=f"{self.words} that {way} by about {abs(by):.2g} {unit}")
+
+
+NONE = Departure("", "")
+# Departures by the columns of `growing_of`: a delay grows by a sample, a gain by itself.
+GROWING = [Departure("a delay", GROWTH, 1.0), Departure("a gain", GROWTH, 100.0)]
 
 
 class Trial(NamedTuple):
@@ -74,14 +107,8 @@ class Alternatives(NamedTuple):
     late, ahead : float
         Standard deviation of the delay about that of the fit, in samples, and the probability that
         it is below zero, without a law.
-    none : float
-        Probability of no law, where a law is the only other possibility.
-    fuller : float
-        Probability that one more term of a fuller response explains more than a law does.
-    likeliest : str
-        The likeliest kind of law in words, or those that make 99 % with their probabilities.
-    static : bool
-        Whether the likeliest law is one of the value alone.
+    departure : Departure
+        The likeliest law or further term, or those that make 99 % with their probabilities.
     weight : array, shape (a,)
         Probability of each alternative to the answer.
     shift : array, shape (a, p)
@@ -93,10 +120,7 @@ class Alternatives(NamedTuple):
     path: Path
     late: float
     ahead: float
-    none: float
-    fuller: float
-    likeliest: str
-    static: bool
+    departure: Departure
     weight: np.ndarray
     shift: np.ndarray
     covariance: np.ndarray
@@ -240,13 +264,8 @@ class _Weighed(NamedTuple):
 
     @property
     def none(self) -> np.ndarray:
-        """True for those without a law."""
-        return np.array([trial.path.law is None for trial in self.trials])
-
-    @property
-    def further(self) -> np.ndarray:
-        """True for those with a further term."""
-        return np.array([trial.term is not None for trial in self.trials])
+        """True for those without a law or a further term."""
+        return np.array([not trial.lawful for trial in self.trials])
 
     def late(self, about: float) -> tuple[float, float]:
         """Standard deviation of the delay about one, and the probability that it is below zero."""
@@ -286,12 +305,13 @@ class Comparison(NamedTuple):
     near: list[int]
     grid: list[CorrelatedNoise]
     terms: list[np.ndarray]
+    names: list[Departure]
 
     @classmethod
     def of(
         cls, runs: tuple[Run, ...], found: Begun, paths: Paths, slopes: Sequence[np.ndarray]
     ) -> Comparison:
-        """Prepare the fit of runs; `slopes` has terms of a fuller response."""
+        """Prepare the fit of runs; `slopes` are those of `changing_of`."""
         seen, fit = found.seen, found.settled.fit
         physics, delay = seen.runs[0].physics, found.path.delay
         whole = undriven(runs, seen.output, physics, paths.parts, delay, MOST)
@@ -301,12 +321,8 @@ class Comparison(NamedTuple):
             (filled(drive, y), time[:MOST], filled(drive, error, np.inf))
             for drive, y, time, error in zip(drives, whole.measured, seen.time, errors, strict=True)
         ]
-        more, bent = [], _bent(seen)
-        for slow, each in zip(slow_paths(seen), slopes, strict=True):
-            more.append(np.concatenate([slow, each[:, ~bent]], axis=1))
-        unit = np.sqrt(np.mean(np.concatenate(more) ** 2, axis=0)) / seen.size_y
-        terms = [filled(drive, (each / np.where(unit > 0, unit, 1.0)).T[:, :MOST])
-                 for drive, each in zip(drives, more, strict=True)]  # fmt: skip
+        names, more = _terms(found, slopes)
+        terms = [filled(drive, each.T[:, :MOST]) for drive, each in zip(drives, more, strict=True)]
         numbers = [v.name for v in fit.variables if v.name != "late"]
         powers = physics.units(len(seen.inputs))
         near = [numbers.index(f"map[{k}]") for k, (_, gain) in enumerate(powers)
@@ -316,7 +332,7 @@ class Comparison(NamedTuple):
         grid = noises_of(seen.time, CORRELATION_TIMES, WHITE)
         begin = np.append(fit.theta[: len(numbers)], 0.0)
         model = core.model | {"late": jnp.zeros(())}
-        return cls(runs, whole, data, paths.parts, chosen, model, begin, near, grid, terms)
+        return cls(runs, whole, data, paths.parts, chosen, model, begin, near, grid, terms, names)
 
     def weighed(self, trials: list[Trial]) -> _Weighed:
         """Weigh trials: those of no law, and the likeliest after a step or two from the fit."""
@@ -349,16 +365,11 @@ class Comparison(NamedTuple):
 
 
 def alternatives_of(
-    runs: tuple[Run, ...],
-    found: Begun,
-    paths: Paths,
-    slopes: Sequence[np.ndarray],
-    lawful: bool,
+    runs: tuple[Run, ...], found: Begun, paths: Paths, slopes: Sequence[np.ndarray], lawful: bool
 ) -> Alternatives:
     """Weigh every path and law of the inputs against those of a fit.
 
-    Terms of a fuller response are a further path of first order or a parameter that changes with
-    an input, as large as the output's scatter. `lawful` is False where no law is looked for.
+    `lawful` is False where no law, and no term of a fuller response, is looked for.
     """
     comparison = Comparison.of(runs, found, paths, slopes)
     own = found.path._replace(delay=found.exact)
@@ -366,27 +377,20 @@ def alternatives_of(
     trials = [Trial(path, paths.log_prior(path)) for path in plain]
     if lawful:
         terms = len(comparison.terms[0])
-        prior = paths.log_prior(own) - np.log(terms)
+        prior = paths.log_prior(own) - np.log(FULLER * terms)
         trials += _lawful(comparison, own, paths)
         trials += [Trial(own, prior, k) for k in range(terms)]
-    whole = comparison.weighed(trials)
-    posterior = whole.where(~whole.further)
-    laws, terms = posterior.logs[~posterior.none], whole.logs[whole.further]
-    fuller = expit(logsumexp(terms) - logsumexp(laws)) if lawful and len(laws) else 0.0
-    if posterior.chance[posterior.none].sum() < 0.5:
+    posterior = comparison.weighed(trials)
+    behind = np.array([trial.path.law is not None for trial in posterior.trials])
+    if posterior.chance[behind].sum() > posterior.chance[posterior.none].sum():
         posterior = _finer(comparison, posterior)
     chance, none = posterior.chance, posterior.none
-    others = np.array([not found.contains(trial.path) for trial in posterior.trials])
-    logs = np.where(none, posterior.logs, -np.inf)
-    likeliest = posterior.trials[logs.argmax()].path
-    words, static = _named(posterior)
+    others = ~none | [not found.contains(trial.path) for trial in posterior.trials]
+    likeliest = posterior.trials[np.where(none, posterior.logs, -np.inf).argmax()].path
     return Alternatives(
         found.path if found.contains(likeliest) else likeliest,
         *posterior.where(none).late(found.exact),
-        float(chance[none].sum()),
-        float(fuller),
-        words,
-        static,
+        _named(posterior, comparison.names),
         chance[others],
         (posterior.numbers - comparison.begin)[others, :-1],
         posterior.spread[others, :-1, :-1],
@@ -429,11 +433,12 @@ def _laws_of(runs: Sequence[Run], name: str, way: Way) -> list[InputLaw]:
     unsure = np.sqrt(sum(np.sum(each.variance[-len(u) :])
                          for each, u in zip(levels, since, strict=True)))  # fmt: skip
     laws = laws_between(name, *map(float, (min(map(np.min, inputs)), max(map(np.max, inputs)))))
-    at = np.stack([
-        np.concatenate([moved(u, law.kind, law.width, law.place)[-len(some) :]
-                        for u, some in zip(inputs, since, strict=True)])
-        for law in laws
-    ], axis=1)  # fmt: skip
+    alike = groupby(laws, lambda law: (law.kind, law.place))
+    at = np.concatenate([
+        np.concatenate([moved(u, kind, widths, place)[:, -len(some) :]
+                        for u, some in zip(inputs, since, strict=True)], axis=1)
+        for (kind, place), widths in [(k, np.array([law.width for law in g])) for k, g in alike]
+    ]).T  # fmt: skip
     basis = np.linalg.qr(np.stack([np.ones(len(plain)), plain], axis=1))[0]
     at = at - at.mean(axis=0)
     same = basis @ (basis.T @ at)
@@ -459,36 +464,73 @@ def _finer(comparison: Comparison, posterior: _Weighed) -> _Weighed:
     return posterior
 
 
-def _named(posterior: _Weighed) -> tuple[str, bool]:
-    """The likeliest law of each kind and input in words, as many as make 99 % of all laws, and if
-    the first is one of the value alone.
+def _named(posterior: _Weighed, names: Sequence[Departure]) -> Departure:
+    """The likeliest law of each kind and input, or further term, in words: as many as make 99 % of
+    all, of the kind of the first, with the probability of any.
     """
-    best: dict[tuple[str, str], tuple[float, InputLaw]] = {}
-    whole: Counter[tuple[str, str]] = Counter()
+    best: dict[Any, tuple[float, Departure]] = {}
+    whole: Counter[Any] = Counter()
     for trial, p, numbers in zip(
         posterior.trials, posterior.chance, posterior.numbers, strict=True
     ):
-        if trial.path.law is not None:
+        if not trial.lawful:
+            continue
+        if trial.term is not None:
+            key, named = names[trial.term], names[trial.term].grown(numbers[-1])
+        else:
             law = trial.path.law.changed(numbers[-1])
-            kind = law.kind, law.input
-            whole[kind] += float(p)
-            best[kind] = max(best.get(kind, (0.0, law)), (float(p), law), key=lambda each: each[0])
+            key, named = (law.kind, law.input), Departure(law.words(), law.kind)
+        whole[key] += float(p)
+        best[key] = max(best.get(key, (0.0, named)), (float(p), named), key=lambda each: each[0])
     if not whole:
-        return "", False
+        return NONE
     total = max(sum(whole.values()), np.finfo(float).tiny)
-    ranked = [(kind, p / total) for kind, p in whole.most_common()]
+    ranked = [(key, p / total) for key, p in whole.most_common()]
     above = np.cumsum([0.0, *(p for _, p in ranked)])[:-1]
     ranked = [each for each, before in zip(ranked, above, strict=True) if before < NAMED]
-    words = [best[kind][1].words() for kind, _ in ranked]
+    words = [best[key][1].words for key, _ in ranked]
     if len(words) > 1:
         words = [f"{w} (P = {p:.2f})" for w, (_, p) in zip(words, ranked, strict=True)]
-    return " or ".join(words), ranked[0][0][0] in STATIC
+    first = best[ranked[0][0]][1]
+    none = float(posterior.chance[posterior.none].sum())
+    return first._replace(words=" or ".join(words), probability=max(1.0 - none, 0.0))
 
 
-def _bent(seen: PreparedOutput) -> np.ndarray:
-    """True for the terms of a fuller response that are static laws: gains by their own input."""
-    m = len(seen.inputs)
-    gains = [power for _, power in seen.runs[0].physics.units(m)]
-    number = np.cumsum(gains) - 1
-    own = [gain and k % m == number[i] % m for i, gain in enumerate(gains) for k in range(2 * m)]
-    return np.array(own, bool)
+def _terms(found: Begun, slopes: Sequence[np.ndarray]) -> tuple[list[Departure], list[np.ndarray]]:
+    """Terms that a fuller response may have, and their columns by run: further lags, parameters
+    that change with an input or grow along the record, a gain or a delay that grows.
+
+    Their prior is of width 1: of the output's scatter, of the logarithm of a lag, of a sample of
+    delay. A gain that changes with its own input is a static law, and none of these.
+    """
+    seen, slow = found.seen, slow_paths(found.seen)
+    physics, m = seen.runs[0].physics, len(seen.inputs)
+    names = [Departure(f"a further lag of about {lag:.2g} s of {name}", FURTHER)
+             for lag in slow_lags(seen) for name in seen.inputs]  # fmt: skip
+    sized, kept = [True] * len(names), []
+    powers = zip(physics.parameters(seen.inputs), physics.units(m), strict=True)
+    number = np.cumsum([gain for _, gain in physics.units(m)]) - 1
+    for i, (name, (time, gain)) in enumerate(powers):
+        for k, by in enumerate((*seen.inputs, *seen.inputs, None)):
+            if time if by is None else not (gain and k % m == number[i] % m):
+                kept.append(i * (2 * m + 1) + k)
+                sized.append(bool(gain))
+                names.append(Departure(f"a {name}", GROWTH, 100.0) if by is None else
+                             Departure(f"{name} that changes with {by}", FURTHER))  # fmt: skip
+    model, shape = found.settled.fit.model, shape_of(seen, found.settled.fit.model)
+    fitted = [y - row[0] for y, row in zip(seen.measured, found.settled.rest, strict=True)]
+    more = [np.concatenate([*columns, growing_of(y, t)], axis=1) for *columns, y, t in zip(
+        slow, [each[:, kept] for each in slopes], fitted, seen.time, strict=True)]  # fmt: skip
+    unit = np.sqrt(np.mean(np.concatenate(more) ** 2, axis=0)) / seen.size_y
+    unit[~np.array(sized + [False] * len(GROWING)) | (unit == 0)] = 1.0
+    # A further lag is a way for a part of the gain: what settles stays the same.
+    gain = 1.0 + shape.sum() if physics is ARX else 1.0
+    for run, each in zip(seen.runs, more, strict=True):
+        own = gain * paths_by(replace(run, part=run.part + model["late"]), shape[None])
+        each[:, : m * SLOW] -= np.tile(own, SLOW)
+    # What a slow drift of the output does as well is no term.
+    waves = spanned(np.concatenate([drift_columns(t / t[-1], i, len(more)).reshape(len(t), -1)
+                                    for i, t in enumerate(seen.time)]))  # fmt: skip
+    whole = np.concatenate(more) / unit
+    ends = np.cumsum([len(each) for each in more])[:-1]
+    return names + GROWING, np.split(whole - waves @ (waves.T @ whole), ends)

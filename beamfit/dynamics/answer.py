@@ -14,12 +14,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from beamfit.answer import Table, cell, json_of
-from beamfit.dynamics.alternatives import Alternatives
+from beamfit.dynamics.alternatives import FURTHER, GROWTH, Alternatives
 from beamfit.dynamics.bad_readings import BadReadings
 from beamfit.dynamics.checks import Checks, HeldOutRun
+from beamfit.dynamics.input_laws import STATIC
 from beamfit.dynamics.limits import LagLimits
 from beamfit.dynamics.model import PreparedOutput, curves
-from beamfit.dynamics.response import ARX, FIRST_ORDER, SECOND_ORDER, Physics
+from beamfit.dynamics.response import ARX, FIRST_ORDER, SECOND_ORDER, Physics, mean_step
 from beamfit.errors import Finding, Status
 from beamfit.greybox.fit import Derived, Fit
 from beamfit.greybox.judge import gauges, together
@@ -96,7 +97,7 @@ def _quoted(model: Any, of: tuple[Any, float]) -> jax.Array:
     if seen.physics is SECOND_ORDER:  # both lags of eq 8 where there are two
         root = jnp.sqrt(jnp.maximum(p[1] ** 2 - 1.0, 1e-12))
         parts.append(p[0] * (p[1] + jnp.stack([root, -root])))
-    late = (delay + model["late"]) * seen.dt[0]
+    late = (delay + model["late"]) * mean_step(seen.dt)
     return jnp.concatenate([*parts, jnp.stack([jnp.asarray(model["offset"]), late])])
 
 
@@ -117,7 +118,7 @@ def quantities_of(
     m = len(seen.inputs)
     found = alone = derived(fit, errors, _quoted, (seen.runs[0], seen.delay))
     if others is not None:
-        late = others.late * seen.parts * float(seen.runs[0].dt[0])
+        late = others.late * seen.parts * float(mean_step(seen.runs[0].dt))
         error = others.error(alone.slope[:-1], alone.error[:-1])
         found = alone._replace(error=np.append(error, late))
     names, units = list(physics.parameters(seen.inputs)), _units(physics, m)
@@ -292,8 +293,9 @@ def judged(found: Mapping[str, ResponseEvidence]) -> tuple[Status, str]:
     raise AssertionError("the last rule always finds something")
 
 
-def _lost(e: ResponseEvidence) -> Finding | None:
-    if e.rests:
+def search_failed(e: Any) -> Finding | None:
+    """Find that the search of some evidence did not end."""
+    if e.rests and e.fit.groups:
         return None
     lost = e.fit.status is Status.not_finite
     return Finding(Status.not_finite if lost else Status.not_converged, e.fit.message)
@@ -403,12 +405,22 @@ def _lawful(e: ResponseEvidence) -> Finding | None:
     c = e.checks
     if c.law is None or 1.0 - c.law_probability >= POOR_FIT:
         return None
-    cause = f"The output follows {c.law} (p = {1.0 - c.law_probability:.1g} without): "
-    if c.static_law:
-        cause += "the gain then changes with the input."
+    follows = "has" if c.law_kind in (FURTHER, GROWTH) else "follows"
+    cause = f"The output {follows} {c.law} (p = {max(1.0 - c.law_probability, 0.0):.1g} without)"
+    if c.law_kind == GROWTH:
+        remedy = "Cut the record into shorter ones, or give what it changes with as an input."
+        cause += " along the record."
+    elif c.law_kind == FURTHER:
+        cause += ": the model lacks a part of the response."
+        remedy = f"Try {_more(e)}."
+    elif c.law_kind in STATIC:
+        cause += ": the gain then changes with the input."
         remedy = "Stay where the gain is the same, or let it change: --map network."
+    elif c.law_kind == "rate limit":
+        cause += ": it takes its time for a step, the longer the larger."
+        remedy = "Record what it really does, or move in smaller steps."
     else:
-        cause += "what moves up and down then differs."
+        cause += ": what moves up and down then differs."
         remedy = "Go to each value from the same side, or move by much more than the width."
     cause += f" The free run explains {c.free_run_percent:.1f} % of the output."
     return Finding(Status.poor_fit, cause, remedy)
@@ -418,28 +430,18 @@ def _refuted(e: ResponseEvidence) -> Finding | None:
     c = e.checks
     if c.input_probability >= POOR_FIT:
         return None
-    p = f"along the record (p = {c.input_probability:.1g})"
-    cut = "Cut the record into shorter ones"
-    if c.delay_growth:
-        way = "grows" if c.delay_growth > 0 else "falls"
-        cause = (
-            f"The delay {way} by about {abs(c.delay_growth):.2g} samples {p}: clocks of inputs and "
-            "output run at different rates, or the process becomes slower or quicker."
-        )
-        return Finding(Status.poor_fit, cause, f"{cut}, or correct times.")
-    if c.gain_growth:
-        way = "grew" if c.gain_growth > 0 else "fell"
-        by = f"{100 * abs(c.gain_growth):.2g} %"
-        cause = f"The response changes as if its gain {way} by about {by} {p}."
-        return Finding(Status.poor_fit, cause, f"{cut}, or give what it changes with as an input.")
     cause = (
         f"Past inputs, or parameters that change with them, explain {100 * c.input_share:.0f} % of "
         f"the residuals (p = {c.input_probability:.1g}): the model lacks a part of the response. "
         f"The free run explains {c.free_run_percent:.1f} % of the output."
     )
-    more = "parameters that change with the operating point (--map network), or a higher order"
-    more = "a higher order" if e.map == "network" else more
-    return Finding(Status.poor_fit, cause, f"Try {more}.")
+    return Finding(Status.poor_fit, cause, f"Try {_more(e)}.")
+
+
+def _more(e: ResponseEvidence) -> str:
+    """A fuller model."""
+    more = "parameters that change with the operating point (--map network), or "
+    return f"{'' if e.map == 'network' else more}a higher order"
 
 
 def _worse(e: ResponseEvidence) -> Finding | None:
@@ -486,7 +488,7 @@ def _good(e: ResponseEvidence) -> Finding:
 
 
 RULES = (
-    _lost,
+    search_failed,
     _nothing,
     _joint,
     _ahead,

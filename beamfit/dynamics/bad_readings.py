@@ -9,6 +9,7 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 from scipy.ndimage import median_filter
 from scipy.special import expit
+from scipy.stats import mannwhitneyu
 
 from beamfit.dynamics.model import CLOSE, PreparedOutput
 from beamfit.dynamics.paths import heard
@@ -18,9 +19,10 @@ from beamfit.errors import Status
 from beamfit.noise.digits import digit_of
 from beamfit.noise.model import Noise
 from beamfit.noise.sizes import bad_density
-from beamfit.statistics import CLEAR_ODDS
+from beamfit.statistics import CLEAR_ODDS, POOR_FIT
 
-# Of more readings than this share the model is wrong and not the monitor.
+# Of more readings than this share, or of such as follow the inputs, the model is wrong and not the
+# monitor.
 MOST = 0.2
 # A residual is judged about the running median of so many, most searches in turn, and rounds
 # in which the noise of good readings is found.
@@ -79,7 +81,7 @@ def _sound(
             if trial is None or _same(now, off):
                 break
             kept, off, found = trial, now, search(trial)
-    if any(np.any(mask.mean(axis=0) > MOST) for mask in off):
+    if any(np.any(mask.mean(axis=0) > MOST) for mask in off) or _follows(runs, off):
         kept, off, found = runs, _none(runs), search(runs)
     left_out = _named(runs, off, OFF)
     trial = _without(kept, _judged(kept, fit_of(found), _equal))
@@ -105,6 +107,21 @@ def _settled(runs: Runs, fit: Begun, off: Masks) -> tuple[Runs | None, Masks]:
         if trial is None or any(_same(off, each) for each in before):
             return trial, off
         fit = fit.again(trial)
+
+
+def _follows(runs: Runs, off: Masks) -> bool:
+    """True if readings that are far off come sooner after a change of an input than others, by
+    their ranks: the model then misses how the output begins to move.
+    """
+    late, out = [], []
+    for run, mask in zip(runs, off, strict=True):
+        moves = np.any([np.diff(u, prepend=u[0]) != 0 for u in run.inputs.values()], axis=0)
+        rows = np.arange(len(run))
+        late.append(rows - np.maximum.accumulate(np.where(moves, rows, -len(run))))
+        out.append(mask.any(axis=1))
+    late, out = np.concatenate(late), np.concatenate(out)
+    sooner = mannwhitneyu(late[out], late[~out], alternative="less") if out.any() else None
+    return sooner is not None and bool(sooner.pvalue < POOR_FIT)
 
 
 def _none(runs: Runs) -> Masks:

@@ -8,15 +8,10 @@ from typing import NamedTuple
 import numpy as np
 from scipy.stats import chi2, f
 
-from beamfit.dynamics.model import (
-    CLOSE,
-    PreparedOutput,
-    changed_by,
-)
+from beamfit.dynamics.model import CLOSE, Driven, PreparedOutput, changed_by
 from beamfit.dynamics.record import Run, Way
 from beamfit.dynamics.response import FIRST_ORDER
 from beamfit.dynamics.search import (
-    TINY,
     Begun,
     drift_columns,
     drift_costs,
@@ -64,24 +59,18 @@ class Checks(NamedTuple):
     first_order : bool
         Whether a first order does as well.
     law : str or None
-        The law of an input that is likelier than none, or the laws between which the runs do not
-        tell, in words.
+        The law of an input, or the further term of a fuller response, that is likelier than none,
+        or those between which the runs do not tell, in words.
     law_probability : float
-        Its probability, where no law and laws of inputs are all that can be.
-    static_law : bool
-        Whether it is one of the value alone, whatever came before.
+        Its probability, where it and none are all that can be.
+    law_kind : str
+        Its kind.
     band_limited : tuple of str
         Inputs without high frequencies that the model holds from sample to sample; if they move
         between, that goes with later inputs.
     way : Way
         Inputs without high frequencies that the model follows between samples, and those that it
         has at the levels about which their readings scatter.
-    delay_growth : float
-        Samples by which the delay grows along the record, if this is what explains the residuals
-        best: clocks of input and output then run at different rates, or a time constant grows.
-        Else 0.
-    gain_growth : float
-        Share by which gains grow along the record, if this explains them best, else 0.
     jitter : float
         Standard deviation of the times of readings about those of the record, s.
     drift : int
@@ -101,11 +90,9 @@ class Checks(NamedTuple):
     first_order: bool = False
     law: str | None = None
     law_probability: float = 0.0
-    static_law: bool = False
+    law_kind: str = ""
     band_limited: tuple[str, ...] = ()
     way: Way = Way()
-    delay_growth: float = 0.0
-    gain_growth: float = 0.0
     jitter: float = 0.0
     drift: int = 0
 
@@ -165,13 +152,13 @@ def checks_of(
     moved = zip(seen.measured, case.drifts(found.fit.model), strict=True)
     y = [m - row[k] - np.mean(m - row[k]) for m, row in moved]
     rest = np.concatenate(residuals)
-    (explained, chance), (later, fed), grown = _explained(seen, residuals, noise, own, changing)
+    (explained, chance), (later, fed) = _explained(seen, residuals, noise, own, changing)
     white = _white([r / error for r, error in zip(residuals, noise.errors, strict=True)])
     if rest.std() <= CLOSE * seen.size_y:  # what is left is rounding, or the network's own detail
-        explained, chance, later, fed, white, grown = 0.0, 1.0, 0.0, 1.0, 1.0, (0.0, 0.0)
+        explained, chance, later, fed, white = 0.0, 1.0, 0.0, 1.0, 1.0
     rounded = variance_of_digits(seen, rest.std())  # what is explained may be no more than that
     if explained * rest.var() <= rounded:
-        explained, chance, grown = 0.0, 1.0, (0.0, 0.0)
+        explained, chance = 0.0, 1.0
     if later * rest.var() <= rounded:
         later, fed = 0.0, 1.0
     return Checks(
@@ -185,8 +172,6 @@ def checks_of(
         later,
         gain,
         _together(seen),
-        delay_growth=grown[0],
-        gain_growth=grown[1],
         way=path.way,
         jitter=jitter,
         drift=case.degree,
@@ -266,13 +251,13 @@ def _explained(
     noise: RunNoises,
     own: Sequence[np.ndarray],
     changing: Sequence[np.ndarray],
-) -> tuple[tuple[float, float], tuple[float, float], tuple[float, float]]:
-    """Share of the whitened residuals that a fuller model explains, with its chance, the share of
-    the rest that later inputs explain, and the growth of the delay or the gain if it explains most.
+) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Share of the whitened residuals that a fuller model explains, with its chance, and the share
+    of the rest that later inputs explain.
 
     A score test (Lagrange multipliers): columns are inputs before, those within the delay too,
-    further paths of first order, the slopes of the output by parameters that change with the
-    operating point, and by a delay and a gain that grow, less what the model's own numbers can do.
+    further paths of first order, and the slopes of the output by parameters that change with the
+    operating point, less what the model's own numbers can do.
     """
     quick, later, delay = [], [], int(np.floor(seen.delay))
     for run, added in zip(seen.runs, changing, strict=True):
@@ -288,42 +273,27 @@ def _explained(
     own = np.hstack([own, noise.drift(own, rest)])
     basis = spanned(own)
     rest = rest - basis @ (basis.T @ rest)
-    pairs = zip(seen.measured, residuals, noise.times, strict=True)
-    growing = noise.white([_growing(y - r, t) for y, r, t in pairs])
-    growing = growing - basis @ (basis.T @ growing)
-    # A gain that grows moves the level too, which a drift does as well.
-    beside = spanned(np.hstack([basis, growing[:, 2:]]))
-    late, gain = growing[:, :1], growing[:, 1:2] - beside @ (beside.T @ growing[:, 1:2])
-    left = rest - beside @ (beside.T @ rest)
-    tests = [_tested(rest, basis, columns) for columns in (slow, quick, late)]
-    tests.append(_tested(left, beside, gain))
-    which = min(range(len(tests)), key=lambda k: tests[k][1])
-    share, chance = tests[which]
-    by = [
-        float(c[:, 0] @ r / max(c[:, 0] @ c[:, 0], TINY)) for c, r in ((late, rest), (gain, left))
-    ]
-    grown = by[0] * (which == 2), by[1] * (which == 3)
+    tests = [_tested(rest, basis, columns) for columns in (slow, quick)]
+    share, chance = min(tests, key=lambda each: each[1])
     basis = spanned(np.hstack([own, slow, quick]))
     rest = rest - basis @ (basis.T @ rest)
-    chance = min(len(tests) * chance, 1.0)
-    return (share, chance), _tested(rest, basis, later), grown
+    return (share, min(2.0 * chance, 1.0)), _tested(rest, basis, later)
 
 
-def _growing(fitted: np.ndarray, time: np.ndarray) -> np.ndarray:
-    """Changes of an output whose delay grows by a sample along the record, whose gain does by
-    itself, and whose level does by 1, as columns.
-    """
-    through = (time - time[0]) / (time[-1] - time[0]) - 0.5
-    late = -through * np.diff(fitted, prepend=fitted[0])
-    return np.stack([late, through * (fitted - fitted.mean()), through], axis=1)
+def slow_lags(seen: PreparedOutput) -> np.ndarray:
+    """Time constants of the further paths, s."""
+    return np.geomspace(seen.apart, seen.span / 4, SLOW)
 
 
 def slow_paths(seen: PreparedOutput) -> list[np.ndarray]:
     """Outputs of further paths of first order from each input, shape (readings, paths) by run."""
-    times = np.geomspace(seen.apart, seen.span / 4, SLOW)[:, None]
-    m, paths = len(seen.inputs), driven_by(seen, FIRST_ORDER)
-    found = [np.asarray(unit_outputs(path, times))[:, :m, : path.count] for path in paths]
-    return [each.reshape(-1, each.shape[2]).T for each in found]
+    return [paths_by(run, slow_lags(seen)[:, None]) for run in driven_by(seen, FIRST_ORDER)]
+
+
+def paths_by(run: Driven, shapes: np.ndarray) -> np.ndarray:
+    """Outputs of a run for unit gains by each shape, shape (readings, shapes * inputs)."""
+    found = np.asarray(unit_outputs(run, shapes))[:, : run.u.shape[1], : run.count]
+    return found.reshape(-1, run.count).T
 
 
 def _tested(rest: np.ndarray, basis: np.ndarray, columns: np.ndarray) -> tuple[float, float]:
@@ -345,9 +315,7 @@ def variance_of_digits(seen: PreparedOutput, rms: float) -> float:
     return rounding_variance(digit, max(rms**2 - digit**2 / 12, 0.0) ** 0.5)
 
 
-def covariance_of_digits(
-    outputs: Sequence[tuple[PreparedOutput, np.ndarray, float]],
-) -> np.ndarray:
+def covariance_of_digits(outputs: Sequence[tuple[PreparedOutput, np.ndarray, float]]) -> np.ndarray:
     """Covariance of the model's numbers by the digits of outputs: readings of one value were all
     rounded alike, so that many are worth no more than one.
 
@@ -390,10 +358,14 @@ def held_out(begun: Begun, runs: Sequence[Run]) -> dict[str, tuple[HeldOutRun, .
 
 
 def changing_of(seen: PreparedOutput, fit: Fit) -> list[np.ndarray]:
-    """Slopes of a response's output by parameters that change with the inputs, by run."""
+    """Slopes of a response's output by parameters that change with the inputs, their squares and
+    the time, by run: all about their means, so that a parameter is its mean.
+    """
     found = []
     for run in seen.runs:
-        u = seen.scaled(run.u)
-        added = changed_by(fit.model, run, np.concatenate([u, u**2], axis=1))
+        u, time = seen.scaled(run.u), np.cumsum(np.asarray(run.dt))[:, None]
+        added = changed_by(
+            fit.model, run, np.concatenate([u, u**2 - 1.0, time / time[-1] - 0.5], axis=1)
+        )
         found.append(np.asarray(added)[: run.count])
     return found

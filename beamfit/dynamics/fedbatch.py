@@ -14,7 +14,7 @@ import numpy as np
 from scipy.special import logit, ndtri
 
 from beamfit.answer import Table, answer, json_of
-from beamfit.dynamics.answer import NEAR, POINTS, WORSE, Curve
+from beamfit.dynamics.answer import NEAR, POINTS, WORSE, Curve, search_failed
 from beamfit.dynamics.balances import (
     BEYOND,
     FLOWS,
@@ -201,13 +201,6 @@ class BatchEvidence(NamedTuple):
     held: Mapping[str, HeldBatch] = MappingProxyType({})
 
 
-def _lost(e: BatchEvidence) -> Finding | None:
-    if e.rests and e.fit.groups:
-        return None
-    lost = e.fit.status is Status.not_finite
-    return Finding(Status.not_finite if lost else Status.not_converged, e.fit.message)
-
-
 def _refuted(e: BatchEvidence) -> Finding | None:
     """Find the output of which most is left by residuals that follow one another."""
     lean, found = 1.0 - e.fit.groups[0].dof / int(e.seen.read.sum()), []
@@ -266,7 +259,7 @@ def _good(e: BatchEvidence) -> Finding:
 
 # Rates above this share of their bound count as at the bound.
 BOUND = 0.95
-RULES = (_lost, _refuted, _worse, _open, _bounded, _good)
+RULES = (search_failed, _refuted, _worse, _open, _bounded, _good)
 
 
 @answer

@@ -211,9 +211,7 @@ def best_feed(
         low = np.append([product + off[0], -np.inf], np.full(rows, -np.inf))
         high = np.append([np.inf, volume], substrate - off[1])
         limits = [Constraint("batch", _limited, data, low, high, labels)]
-        end = solve(
-            Problem(model, free, (), (), limits, [Objective("hours", _hours)]),
-        )
+        end = solve(Problem(model, free, (), (), limits, [Objective("hours", _hours)]))
         model = dict(end.model)
         found = fit.fit.derive(_planned_by, (model["feed"], model["hours"], data))
         mass = found.error[-1, 3] * found.value[-1, 2]

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from beamfit.answer import Table, answer, json_of
-from beamfit.dynamics.alternatives import Alternatives, alternatives_of
+from beamfit.dynamics.alternatives import FURTHER, GROWTH, Alternatives, alternatives_of
 from beamfit.dynamics.answer import (
     Curve,
     ResponseEvidence,
@@ -23,14 +23,7 @@ from beamfit.dynamics.answer import (
     told,
 )
 from beamfit.dynamics.bad_readings import BadReadings, judged_without
-from beamfit.dynamics.checks import (
-    Checks,
-    HeldOutRun,
-    changing_of,
-    checks_of,
-    digits_of,
-    held_out,
-)
+from beamfit.dynamics.checks import Checks, HeldOutRun, changing_of, checks_of, digits_of, held_out
 from beamfit.dynamics.limits import LagLimits, lag_limits
 from beamfit.dynamics.model import PreparedOutput, network_of, output_of
 from beamfit.dynamics.paths import Paths, heard, latest
@@ -331,10 +324,10 @@ def _known(
         band_limited=() if found.path.way.moving else paths.most.smooth,
     )
     others = others if constant else None
-    if others is not None and others.none < 0.5 and others.fuller < 0.5:
-        checks = checks._replace(
-            law=others.likeliest, law_probability=1.0 - others.none, static_law=others.static
-        )
+    if others is not None and others.departure.probability > 0.5:
+        words, kind, _, chance = others.departure
+        if checks.input_share or kind not in (FURTHER, GROWTH):  # more than digits do
+            checks = checks._replace(law=words, law_probability=chance, law_kind=kind)
     parts = answer.fit, answer.errors
     quantities: dict[str, Quantity] = {}
     if constant:

@@ -12,7 +12,8 @@ import numpy as np
 # A saturation leaves this share of the range on one side of its place, flat in the logarithm of
 # what is cut off. A square law bends up or down; as wide as the range it is a square from one end.
 LAWS = {law: np.geomspace(0.005, 0.4, count) for law, count in
-        (("play", 8), ("hysteresis", 8), ("stop", 24), ("shift", 8), ("dead zone", 8))}  # fmt: skip
+        (("play", 8), ("hysteresis", 8), ("stop", 24), ("shift", 8), ("rate limit", 8),
+         ("dead zone", 8))}  # fmt: skip
 LAWS |= {
     "saturation": 1.0 - np.geomspace(0.02, 0.9, 8),
     "square law": np.outer((1.0, -1.0), np.geomspace(0.1, 50.0, 8)).ravel(),
@@ -37,7 +38,8 @@ def moved(u: np.ndarray, law: str, width: float | np.ndarray, place: float = 0.0
 
     A play follows when its clearance is used up; a hysteresis is the mean of plays of several
     widths (Prandtl, Ishlinskii); a stop (Coulomb friction) goes all the way once it moves at all; a
-    shift (friction against a spring) is to the side that the input last came from. A dead zone lies
+    shift (friction against a spring) is to the side that the input last came from. A rate limit
+    goes its width a row at most. A dead zone lies
     about a place, a saturation leaves what is about one, and a square law bends about one.
     """
     half = np.asarray(width)[..., None]
@@ -51,12 +53,13 @@ def moved(u: np.ndarray, law: str, width: float | np.ndarray, place: float = 0.0
         sign = np.sign(np.diff(u, prepend=u[0]))
         last = np.maximum.accumulate(np.where(sign != 0, np.arange(len(u)), 0))
         return u - half * sign[last]
-    changes = np.diff(u, prepend=np.nan) != 0
+    changes = (np.diff(u, prepend=np.nan) != 0) | (law == "rate limit")
     widths = np.multiply.outer(width, PLAYS if law == "hysteresis" else (1.0,))
     at, found = u[0] + 0 * widths, []
     for now in u[changes]:
-        at = (np.where(np.abs(now - at) > widths, now, at) if law == "stop"
-              else np.clip(at, now - widths, now + widths))  # fmt: skip
+        near = np.clip(at, now - widths, now + widths)
+        at = (np.where(at != near, now, at) if law == "stop"
+              else at + (now - near) if law == "rate limit" else near)  # fmt: skip
         found.append(at)
     return np.moveaxis(np.mean(found, axis=-1), 0, -1)[..., np.cumsum(changes) - 1]
 
@@ -108,6 +111,8 @@ class InputLaw(NamedTuple):
         if self.kind == "square law":
             ends = 1.0 + np.array([-1.0, 1.0]) * (self.high - self.low) / width
             return f"a square law of {name} (gain {ends[0]:.2g} to {ends[1]:.2g} of its mean)"
+        if self.kind == "rate limit":
+            return f"a rate limit of {name}"
         about = f" about {self.place:.3g}" if self.kind in STATIC else ""
         return f"a {self.kind} of {name} by ±{width:.2g}{about}"
 

@@ -23,6 +23,7 @@ from beamfit.dynamics.search import (
     difference,
     linear_columns,
     noises_of,
+    shape_of,
 )
 from beamfit.noise.correlated import Whitened, whitened_by_each
 from beamfit.statistics import POOR_FIT
@@ -67,9 +68,7 @@ class _Lags(NamedTuple):
     @property
     def own(self) -> np.ndarray:
         """Lags, or poles, that the fit found, as of `unit_outputs`."""
-        physics, m = self.seen.runs[0].physics, len(self.seen.inputs)
-        count = len(physics.units(m)) - m * (2 if physics is ARX else 1)
-        return np.asarray(physics.physical(self.found.fit.model["map"], m))[:count]
+        return shape_of(self.seen, self.found.fit.model)
 
     def whitened(self, shape: np.ndarray) -> Whitened:
         """A basis of what gains, first states and offset do, and the readings, by each noise."""

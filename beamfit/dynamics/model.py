@@ -173,6 +173,15 @@ def changed_by(model: Any, seen: Driven, scaled: jax.Array) -> jax.Array:
     return slopes.reshape(len(slopes), -1)
 
 
+def growing_of(fitted: np.ndarray, time: np.ndarray) -> np.ndarray:
+    """Changes of an output whose delay grows by a sample along the record, and whose gain does by
+    itself, as columns.
+    """
+    through = (time - time[0]) / (time[-1] - time[0]) - 0.5
+    late = -through * np.diff(fitted, prepend=fitted[0])
+    return np.stack([late, through * (fitted - fitted.mean())], axis=1)
+
+
 def curves(model: Any, asked: tuple[Driven, Any]) -> jax.Array:
     """Parameters at operating points, shape (points, parameters)."""
     seen, point = asked

@@ -202,7 +202,7 @@ def response_at(
     index: jax.Array,
     part: jax.Array,
 ) -> jax.Array:
-    """The output at some samples, the input coming a part of a step late.
+    """The output at some samples, the input coming a part of the mean step late, or until the next.
 
     Parameters
     ----------
@@ -225,12 +225,18 @@ def response_at(
     [0.0, 1.8964, 2.594, 2.8506]
     """
     x0 = physics.begin(free, u[0])
-    first = x0 if physics.even else physics.advance(p[0], x0, u[0], part * dt[0])
-    step = (1.0 - part) * dt + part * jnp.append(dt[1:], dt[-1:])
+    late = jnp.minimum(part * mean_step(dt), dt)
+    first = x0 if physics.even else physics.advance(p[0], x0, u[0], late[0])
+    step = dt - late + jnp.append(late[1:], late[-1:])
     x = affine_course(lambda x, p, *now: physics.advance(p, x, *now), first, p, u, step)[1]
     before = jnp.maximum(index - 1, 0)
-    y = jax.vmap(physics.advance)(p[before], x[before], u[before], (1.0 - part) * dt[before])[:, 0]
+    y = jax.vmap(physics.advance)(p[before], x[before], u[before], (dt - late)[before])[:, 0]
     return jnp.where(index == 0, x0[0], y)
+
+
+def mean_step(dt: jax.Array) -> jax.Array:
+    """Mean of steps, which are 0 in the padding."""
+    return jnp.sum(dt) / jnp.maximum(jnp.sum(dt > 0), 1)
 
 
 def even_response(

@@ -221,6 +221,13 @@ def difference(shapes: np.ndarray, apart: float) -> np.ndarray:
     return np.stack([-(one + other), one * other], axis=-1).real
 
 
+def shape_of(seen: PreparedOutput, model: Any) -> np.ndarray:
+    """Lags, or poles, of a model with constant parameters, as of `unit_outputs`."""
+    physics, m = seen.runs[0].physics, len(seen.inputs)
+    count = len(physics.units(m)) - m * (2 if physics is ARX else 1)
+    return np.asarray(physics.physical(model["map"], m))[:count]
+
+
 @jax.jit
 def unit_outputs(run: Driven, shapes: jax.Array) -> jax.Array:
     """Outputs for unit gains and unit first states, shape (shapes, columns, readings)."""
@@ -504,11 +511,7 @@ class Case(NamedTuple):
         return Problem(model, free, records, self.priors)
 
     def search(
-        self,
-        model: Any,
-        noise: Noises,
-        memory: CorrelatedNoise | None = None,
-        gap: Any = (),
+        self, model: Any, noise: Noises, memory: CorrelatedNoise | None = None, gap: Any = ()
     ) -> Settled:
         """Fit with the noise that the residuals of the round before had.
 
@@ -619,10 +622,7 @@ def used_by(fit: Fit) -> int:
 
 
 def information(
-    case: Case,
-    found: Settled,
-    noise: CorrelatedNoise | None,
-    lengths: Sequence[int] | None = None,
+    case: Case, found: Settled, noise: CorrelatedNoise | None, lengths: Sequence[int] | None = None
 ) -> float:
     """The Bayesian information criterion of a fit under a noise with a memory, or without, by all
     readings or by the last ones of each run and output.

@@ -25,15 +25,8 @@ from beamfit.dynamics.answer import (
     widened,
 )
 from beamfit.dynamics.bad_readings import BadReadings, judged_without
-from beamfit.dynamics.checks import (
-    Checks,
-    HeldOutRun,
-    checks_of,
-    digits_of,
-    held_out,
-    percent,
-)
-from beamfit.dynamics.model import PreparedOutput, readings_of, weight_priors
+from beamfit.dynamics.checks import Checks, HeldOutRun, checks_of, digits_of, held_out, percent
+from beamfit.dynamics.model import PreparedOutput, growing_of, readings_of, weight_priors
 from beamfit.dynamics.paths import Path, latest, prepared
 from beamfit.dynamics.record import Run, Way, checked
 from beamfit.dynamics.response import FIRST_ORDER
@@ -498,7 +491,8 @@ def states_answer(
 
 
 def _added(seen: PreparedOutput, i: int, fitted: np.ndarray) -> np.ndarray:
-    """First terms of a nonlinear state space: products of output and inputs."""
+    """First terms of a nonlinear state space, products of output and inputs, and what grows."""
     u = seen.scaled(seen.runs[i].u)[seen.runs[i].read]
     y = ((fitted - np.mean(fitted)) / seen.size_y)[:, None]
-    return np.concatenate([y**2, y**3, u**2, u * y], axis=1)
+    growing = growing_of(fitted, seen.time[i])
+    return np.concatenate([y**2, y**3, u**2, u * y, growing], axis=1)
