@@ -31,7 +31,7 @@ demo: .venv/runtime
 	$(BIN)/beamfit emittance measurements/lcls_otr2.csv --lattice lattices/lcls_otr2.toml --report demo/lcls_otr2.html
 
 test: .venv/test lint
-	$(BIN)/python -m pytest --quiet --numprocesses 2 --dist loadfile
+	$(BIN)/python -m pytest --quiet --numprocesses 3 --dist loadfile
 
 # The site, in build/site/index.html. Offline; warnings are errors; notebooks are executed, pictures made.
 docs: .venv/test

@@ -604,9 +604,9 @@ def _log_odds_of_steps(
 
 
 def _log_cost(lengths: np.ndarray) -> float:
-    """What places and sizes of steps between levels of so many readings cost in log evidence: log
-    n for a place, or what the lengths differ by from the usual one; for a size half the logarithm
-    of the readings that tell it.
+    """Log evidence that the steps between levels of so many readings cost: for a place log n, or
+    what the lengths differ by from the usual one; for a size half the log of the readings that
+    tell it.
     """
     steps, count = lengths.size - 1, lengths.sum()
     differ = np.mean(np.abs(lengths - np.median(lengths)))
