@@ -277,8 +277,7 @@ def _freely(e: Evidence) -> Finding | None:
         return None
     told = "; ".join(filter(None, (_clear(e), *(_extent(e, name) for name in "ab"))))
     if e.pumped:
-        which = "Gas that is pumped away after a fill, or a monitor that settles, is likely"
-        likely = f"{which} ({percent(e.free.pumped)})"
+        likely = f"Gas that is pumped away after a fill is likely ({percent(e.free.pumped)})"
         gas = e.outgassing if e.by_gas else None
         # A lifetime afterwards that is not determined, or a below zero, is no explanation.
         known = gas and math.isfinite(gas.after.value) and min(gas.a.value, gas.b.value) > 0

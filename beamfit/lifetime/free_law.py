@@ -50,7 +50,7 @@ WANDERS, WALKS = 0.14, (0.003, 0.015, 0.07, 0.3)
 LOG_WANDERS = math.log(WANDERS / SMOOTH)
 # Standard deviation of how far a monitor itself goes up and down in a record, as a share of the
 # current: between two calibrations of the transformer of MIT-Bates its zero moved by 0.1 to 0.2 %
-# (T. Botto, BlastTalk 2712). What wanders or settles by less is as likely the monitor's doing.
+# (T. Botto, BlastTalk 2712). What wanders by less is as likely the monitor's doing.
 MONITOR = 1e-3
 # Spans over the time of gas that is pumped away: shorter times are seen by themselves.
 PACES = (1.0, 20.0)
@@ -553,27 +553,17 @@ class Draws(NamedTuple):
     worth: float
 
     def of_the_monitor(self) -> Draws:
-        """The same readings where the monitor wanders, or settles after a fill, and the loss rate
-        does not.
+        """The same readings where the monitor wanders and the loss rate does not.
 
         A walk of the loss makes the readings wander about the law, from nothing at the first to
         nothing at the last one. A monitor's own ends differ as any two of its readings do, which
-        the loss rate in the span contains. What gas takes away while it is pumped away a monitor
-        reads too high at first.
+        the loss rate in the span contains.
         """
-        share, n = INTEGRAL[-1], self.numbers
-        read = n.rate * (INTEGRAL @ self.walk)
+        share = INTEGRAL[-1]
+        read = self.numbers.rate * (INTEGRAL @ self.walk)
         size = np.sqrt(share @ (read - share @ read) ** 2)
         ends = math.sqrt(2) * size * ndtri(_even(size.size, 1, 2)[0])
-        pace = np.where(n.pace > 0, n.pace, 1.0)
-        # The loss that is left in the end, of the whole at the mean current.
-        left = np.where(n.pace > 0, 1.0 + n.gas / pace, 1.0)
-        settles = np.where(n.pace > 0, n.rate * n.gas / (pace * np.expm1(-pace)), 0.0)
-        size = np.where(n.pace > 0, settles, size)
-        numbers = n._replace(
-            level=n.level * (1.0 - settles), rate=np.maximum(n.rate * left + ends, 1e-300),
-            share=n.share / left, gas=np.where(n.pace > 0, 0.0, n.gas),
-        )  # fmt: skip
+        numbers = self.numbers._replace(rate=np.maximum(self.numbers.rate + ends, 1e-300))
         weight = self.weight * np.exp(-0.5 * (size / MONITOR) ** 2)
         part = max(float(weight.sum()), 1e-300)
         worth = part**2 / max(float(weight @ weight), 1e-300)
@@ -792,8 +782,7 @@ class FreeLaw:
     odd : float
         Probability that the exponent is none of a bunch's length.
     pumped : float
-        Probability of gas that is pumped away after a fill, or a monitor that settles, in the place
-        of exponent and drift.
+        Probability of gas that is pumped away after a fill, in the place of exponent and drift.
     wanders : float
         Probability that the loss rate or the monitor wanders besides.
     nodes : array, shape (14,)
@@ -890,11 +879,7 @@ def free_law(record: DecayRecord, values: Physical) -> FreeLaw | None:
     seen = SeenDecay.of(record, values)
     proposed = proposals(seen)
     laws = list(zip(proposed, drawn(proposed), strict=True))
-    laws += [
-        (law, own.of_the_monitor())
-        for law, own in laws
-        if law.seen.walk is not None or law.is_pumped
-    ]
+    laws += [(law, own.of_the_monitor()) for law, own in laws if law.seen.walk is not None]
     draws = mixed([own for _, own in laws])
     smooth = draws.numbers.pace == 0
     part = float(draws.weight[smooth].sum())

@@ -340,17 +340,3 @@ def test_a_share_that_is_known_no_better_than_before_is_not_told():
     assert free.a.interval_95[0] < A < free.a.interval_95[1]
     assert "If a and b are constant" in free.message
     assert free.lifetime_mean.error is not None
-
-
-def test_a_monitor_that_settles_after_a_fill_is_no_certain_gas():
-    """SIMULATED: it reads a thousandth high at first; the mean lifetime is that of the beam."""
-    time = np.linspace(0.0, 36000.0, 500)
-    beam = 300 / (1 + time / 36000)
-    read = beam * (1 + 1e-3 * np.exp(-time / 4000)) + 3e-3 * np.random.default_rng(1).normal(
-        size=500
-    )
-    fit = fit_decay(DecayRecord(time, read))
-    low, high = fit.lifetime_mean.interval_95
-    assert "or a monitor that settles, is likely" in fit.message
-    assert low < 10.0 * 300 / fit.mean_current < high
-    assert fit.lifetime_mean.error < 0.01 * fit.lifetime_mean.value
