@@ -23,7 +23,7 @@ from scipy.special import logsumexp
 
 from beamfit.dynamics.checks import SLOW, paths_by, slow_lags, slow_paths
 from beamfit.dynamics.input_laws import STATIC, InputLaw, laws_between, moved
-from beamfit.dynamics.model import Driven, filled, growing_of, predicted
+from beamfit.dynamics.model import Driven, PreparedOutput, filled, growing_of, predicted
 from beamfit.dynamics.paths import Path, Paths, Undriven, handed_on, undriven
 from beamfit.dynamics.record import Run, Way
 from beamfit.dynamics.response import ARX
@@ -501,36 +501,60 @@ def _terms(found: Begun, slopes: Sequence[np.ndarray]) -> tuple[list[Departure],
     that change with an input or grow along the record, a gain or a delay that grows.
 
     Their prior is of width 1: of the output's scatter, of the logarithm of a lag, of a sample of
-    delay. A gain that changes with its own input is a static law, and none of these.
+    delay. What a slow drift of the output does as well is no term.
     """
-    seen, slow = found.seen, slow_paths(found.seen)
-    physics, m = seen.runs[0].physics, len(seen.inputs)
+    seen = found.seen
+    (lags, further), (names, changing) = _further_lags(found), _changing(seen, slopes)
+    fitted = (y - row[0] for y, row in zip(seen.measured, found.settled.rest, strict=True))
+    growing = (growing_of(y, t) for y, t in zip(fitted, seen.time, strict=True))
+    each = [np.hstack(columns) for columns in zip(further, changing, growing, strict=True)]
+    drifts = (drift_columns(t / t[-1], k, len(each)) for k, t in enumerate(seen.time))
+    drift = spanned(np.concatenate([columns.reshape(len(columns), -1) for columns in drifts]))
+    whole, ends = np.concatenate(each), np.cumsum([len(columns) for columns in each])[:-1]
+    return lags + names + GROWING, np.split(whole - drift @ (drift.T @ whole), ends)
+
+
+def _further_lags(found: Begun) -> tuple[list[Departure], list[np.ndarray]]:
+    """Further lags of the inputs, and their columns by run: a part of the gain goes by each in the
+    place of the response's own way, so that what the output settles at stays the same.
+    """
+    seen, model = found.seen, found.settled.fit.model
     names = [Departure(f"a further lag of about {lag:.2g} s of {name}", FURTHER)
              for lag in slow_lags(seen) for name in seen.inputs]  # fmt: skip
-    sized, kept = [True] * len(names), []
+    shape, slow = shape_of(seen, model), slow_paths(seen)
+    gain = 1.0 + shape.sum() if seen.runs[0].physics is ARX else 1.0
+    late = (replace(run, part=run.part + model["late"]) for run in seen.runs)
+    own = (np.tile(gain * paths_by(run, shape[None]), SLOW) for run in late)
+    unit = _scatter(slow, seen)
+    return names, [(path - away) / unit for path, away in zip(slow, own, strict=True)]
+
+
+def _changing(
+    seen: PreparedOutput, slopes: Sequence[np.ndarray]
+) -> tuple[list[Departure], list[np.ndarray]]:
+    """Parameters that change with an input or its square, and times that grow along the record;
+    their columns by run. A gain that changes with its own input is a static law, and none of these.
+    """
+    physics, m = seen.runs[0].physics, len(seen.inputs)
+    names, kept, gains = [], [], []
     powers = zip(physics.parameters(seen.inputs), physics.units(m), strict=True)
     number = np.cumsum([gain for _, gain in physics.units(m)]) - 1
     for i, (name, (time, gain)) in enumerate(powers):
         for k, by in enumerate((*seen.inputs, *seen.inputs, None)):
-            if time if by is None else not (gain and k % m == number[i] % m):
-                kept.append(i * (2 * m + 1) + k)
-                sized.append(bool(gain))
-                names.append(Departure(f"a {name}", GROWTH, 100.0) if by is None else
-                             Departure(f"{name} that changes with {by}", FURTHER))  # fmt: skip
-    model, shape = found.settled.fit.model, shape_of(seen, found.settled.fit.model)
-    fitted = [y - row[0] for y, row in zip(seen.measured, found.settled.rest, strict=True)]
-    more = [np.concatenate([*columns, growing_of(y, t)], axis=1) for *columns, y, t in zip(
-        slow, [each[:, kept] for each in slopes], fitted, seen.time, strict=True)]  # fmt: skip
-    unit = np.sqrt(np.mean(np.concatenate(more) ** 2, axis=0)) / seen.size_y
-    unit[~np.array(sized + [False] * len(GROWING)) | (unit == 0)] = 1.0
-    # A further lag is a way for a part of the gain: what settles stays the same.
-    gain = 1.0 + shape.sum() if physics is ARX else 1.0
-    for run, each in zip(seen.runs, more, strict=True):
-        own = gain * paths_by(replace(run, part=run.part + model["late"]), shape[None])
-        each[:, : m * SLOW] -= np.tile(own, SLOW)
-    # What a slow drift of the output does as well is no term.
-    waves = spanned(np.concatenate([drift_columns(t / t[-1], i, len(more)).reshape(len(t), -1)
-                                    for i, t in enumerate(seen.time)]))  # fmt: skip
-    whole = np.concatenate(more) / unit
-    ends = np.cumsum([len(each) for each in more])[:-1]
-    return names + GROWING, np.split(whole - waves @ (waves.T @ whole), ends)
+            if by is None and time:
+                names.append(Departure(f"a {name}", GROWTH, 100.0))
+            elif by is not None and not (gain and k % m == number[i] % m):
+                names.append(Departure(f"a {name} that changes with {by}", FURTHER))
+            else:
+                continue
+            kept.append(i * (2 * m + 1) + k)
+            gains.append(bool(gain))
+    columns = [each[:, kept] for each in slopes]
+    unit = np.where(gains, _scatter(columns, seen), 1.0)
+    return names, [each / unit for each in columns]
+
+
+def _scatter(columns: Sequence[np.ndarray], seen: PreparedOutput) -> np.ndarray:
+    """Root mean square of each column over the output's scatter; 1 of one that is zero."""
+    found = np.sqrt(np.mean(np.concatenate(columns) ** 2, axis=0)) / seen.size_y
+    return np.where(found > 0, found, 1.0)
