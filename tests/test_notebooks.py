@@ -58,7 +58,7 @@ SAID = {
     "density": ["x by sizes 0.899 ± 0.039 µm by the density 1.0"],
     "tuning": ["converged: normalised emittance 0.734 ± 0.026 µm at SOL = 197.8 A"],
     "posterior": ["converged", "fit:     0.702 ± 0.025 µm"],
-    "identification": ["poor_fit The output has tau that changes", "converged The free run"],
+    "identification": ["poor_fit The output has a tau that changes", "converged The free run"],
 }
 SLOW = {"lifetime_study", "identification", "density", "tuning"}
 
