@@ -15,11 +15,16 @@ from scipy.special import logsumexp, ndtri, stdtr, stdtrit
 from beamfit.arrays import padded_length
 from beamfit.noise.memory import (
     BESIDE,
+    CORRELATED,
+    POWERS,
+    WALK,
+    WHITE,
     CorrelatedNoise,
     Levels,
     levelled_products,
     products_by_each,
     white_shares,
+    without_flicker,
 )
 from beamfit.statistics import log_student
 
@@ -77,7 +82,8 @@ class Memory(NamedTuple):
     @property
     def likely(self) -> int:
         """Index of the median correlation time, and of the share that is likeliest with it."""
-        median = self.time[np.searchsorted(np.cumsum(self.weight), 0.5)]
+        order = np.argsort(self.time, kind="stable")
+        median = self.time[order[np.searchsorted(np.cumsum(self.weight[order]), 0.5)]]
         return int(np.argmax(np.where(self.time == median, self.weight, -1.0)))
 
     @property
@@ -222,8 +228,11 @@ class Whitened(NamedTuple):
         half, along, squares, logs = self._solved(numbers)
         weight = np.exp(logs - logs.max())
         step = -(half @ along)[..., 0]
-        dof = self.count - step.shape[1]
-        return Memory(weight / weight.sum(), *self.noise, step, half, squares, dof), logs
+        dof, flicker = self.count - step.shape[1], np.isnan(self.noise.time)
+        # 1/f noise has no time: it is named by the one that is most like it.
+        like = int(np.argmax(np.where(flicker, -np.inf, logs)))
+        time, white = (np.where(flicker, own[like], own) for own in self.noise)
+        return Memory(weight / weight.sum(), time, white, step, half, squares, dof), logs
 
     def _solved(self, numbers: int | None) -> tuple[np.ndarray, ...]:
         """Root of the covariance, components of the residuals, what is left of their squares, and
@@ -242,7 +251,8 @@ class Whitened(NamedTuple):
         logs -= 0.5 * (self.count - seen.sum(axis=1)) * np.log(squares)
         alone = self.noise.white == 0
         if alone.any() and not alone.all():  # even odds for a white part
-            logs += np.where(alone, np.log(alone.size / alone.sum() - 1.0), 0.0)
+            beside = np.sum(self.noise.white > 0)
+            logs += np.where(alone, np.log(beside / alone.sum()), 0.0)
         return half, along, squares, logs
 
 
@@ -254,19 +264,23 @@ def whitened_by_each(
 ) -> Whitened:
     """Whiten runs, each of rows and times, by each noise; all of them have the same.
 
-    `known` are rows of priors, in units of the noise; `levels`, of each run, are eliminated.
+    `known` are rows of priors, in units of the noise; `levels`, of each run, are eliminated, and
+    noise may be 1/f beside the grid's then.
     """
+    noise = CorrelatedNoise(*np.array(grid).T)
     if levels:
         parts = [_levelled(grid, *run, own) for run, own in zip(runs, levels, strict=True)]
+        noise = CorrelatedNoise(*np.pad(noise, ((0, 0), (0, len(POWERS))), constant_values=np.nan))
     else:
         parts = [_triangles(grid, rows, np.diff(time)) for rows, time in runs]
     triangles, volume = [triangle for triangle, _ in parts], sum(volume for _, volume in parts)
+    if levels:  # those with a part that is white have half of what is correlated
+        odds = (1.0 - WHITE - CORRELATED - WALK) / (CORRELATED + WALK) / len(POWERS)
+        volume[len(grid) :] += np.log(2.0 * odds * np.sum(noise.white > 0.0))
     count = sum(len(rows) for rows, _ in runs) - sum(own.first.size for own in levels)
     if known is not None:
-        triangles, count = [*triangles, np.tile(known, (len(grid), 1, 1))], count + len(known)
-    return Whitened(
-        CorrelatedNoise(*np.array(grid).T), np.concatenate(triangles, axis=1), volume, count
-    )
+        triangles, count = [*triangles, np.tile(known, (noise.time.size, 1, 1))], count + len(known)
+    return Whitened(noise, np.concatenate(triangles, axis=1), volume, count)
 
 
 def _triangles(
@@ -297,14 +311,41 @@ def _roots(products: np.ndarray) -> np.ndarray:
 def _levelled(
     grid: Sequence[CorrelatedNoise], rows: np.ndarray, time: np.ndarray, levels: Levels
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Triangular factors as of `_triangles` without levels, the rows padded to a few lengths."""
+    """Triangular factors as of `_triangles` without levels, the rows padded to a few lengths; by
+    1/f noises, too.
+    """
     extra = (0, padded_length(max(time.size, 64)) - time.size)
     rows, triangle = np.linalg.qr(np.pad(levels.left(rows), (extra, (0, 0))))
+    flicker = [_by_flicker(rows[: time.size], levels, power) for power in POWERS]
     begins = np.isin(np.arange(len(rows)), levels.first)
     time, slope = (np.pad(each, extra, mode="edge") for each in (time, levels.slope))
     noises = CorrelatedNoise(*np.array(grid).T)
     products, volumes = map(np.asarray, levelled_products(noises, rows, time, begins, slope))
-    return _roots(products) @ triangle, volumes
+    more, further = map(np.array, zip(*flicker, strict=True))
+    roots = _roots(np.concatenate([products, more]))
+    return roots @ triangle, np.concatenate([volumes, further])
+
+
+def _by_flicker(rows: np.ndarray, levels: Levels, power: float) -> tuple[np.ndarray, float]:
+    """Products and log volume as of `levelled_products` in noise of the spectrum 1/f^power, of each
+    block by itself: what is slower its level takes.
+    """
+    columns, found, volume = np.column_stack([levels.slope, rows]), 0.0, 0.0
+    lengths = np.diff(levels.first, append=len(rows))
+    padded = np.array([padded_length(n) for n in lengths.tolist()])
+    for size in np.unique(padded):
+        first, count = levels.first[padded == size], lengths[padded == size]
+        place = np.arange(size)[:, None]
+        there = (place < count)[..., None]
+        blocks = np.where(there, columns[np.minimum(first + place, len(rows) - 1)], 0.0)
+        white = without_flicker(blocks.reshape(size, -1), power).reshape(blocks.shape)
+        own, rest = np.split(np.where(there, white, 0.0), [1], axis=2)
+        squares = np.sum(own**2, axis=0)
+        rest = (rest - own * (np.sum(own * rest, axis=0) / squares)).reshape(-1, rows.shape[1])
+        found = found + rest.T @ rest
+        # The first reading of a block says what its level is, as there.
+        volume += float(np.sum(np.log(np.abs(levels.slope[first])) - 0.5 * np.log(squares[:, 0])))
+    return found, volume
 
 
 def range_of(time: np.ndarray) -> tuple[float, float]:

@@ -1,12 +1,14 @@
 import numpy as np
 import pytest
-from scipy.linalg import cholesky, solve_triangular
+from scipy.linalg import cholesky, solve_triangular, toeplitz
 from scipy.signal import lfilter
 from scipy.stats import multivariate_normal
 
 from beamfit.noise.correlated import usual_noises, whitened_by_each
 from beamfit.noise.memory import (
+    POWERS,
     CorrelatedNoise,
+    Levels,
     is_correlated,
     log_volume,
     products_by_each,
@@ -125,3 +127,30 @@ def test_the_evidence_is_the_integral_over_numbers_and_the_size_of_the_noise():
         found.append([white.evidence(), -2 * np.log(np.sum(density))])
     (one, by_sum), (other, by_sum_too) = found
     assert other - one == pytest.approx(by_sum_too - by_sum, rel=1e-6)
+
+
+@pytest.mark.parametrize("power", POWERS)
+def test_levels_in_flicker_noise_are_those_of_dense_matrices(power):
+    """Blocks of 11 and 70 readings, each in fractional noise (J. Hosking, Biometrika 68 (1981)
+    165, eq. 2.2) of its own; densities integrated over flat levels, beside those of white noise.
+    """
+    random, blocks = np.random.default_rng(5), (slice(0, 11), slice(11, 81))
+    slope, rows = random.uniform(0.5, 2.0, 81), random.normal(size=(81, 3))
+    products, volume = 0.0, np.zeros(2)
+    for part in blocks:
+        own, lag, some = slope[part], np.arange(1, part.stop - part.start), rows[part]
+        weights = np.cumprod(np.append(1.0, (lag - 1 - power / 2) / lag))
+        differences = np.tril(toeplitz(weights))
+        inverse = differences.T @ differences
+        along = inverse @ own
+        products += some.T @ (inverse - np.outer(along, along) / (own @ along)) @ some
+        volume += np.log(own[0]) - 0.5 * np.log([own @ own, own @ along])
+    noises = [CorrelatedNoise(1e-3, 0.0), CorrelatedNoise(1.0, 0.5)]  # the first is white
+    run, levels = (rows, np.arange(81.0)), Levels(np.array([0, 11]), slope)
+    found = whitened_by_each(noises, [run], levels=[levels])
+    k = len(noises) + POWERS.index(power)
+    triangle = found.triangle[k]
+    np.testing.assert_allclose(triangle.T @ triangle, products, rtol=1e-9, atol=1e-9)
+    # .15 for three powers beside .35 for correlation times, half of that with a white part: of one.
+    odds = np.log(2 * 0.15 / 0.35 / 3)
+    assert found.volume[k] - found.volume[0] == pytest.approx(volume[1] - volume[0] + odds)
