@@ -114,9 +114,9 @@ def closed_form(level, quadratic, power, lost, whole):
     """
     xp, c = array_module(level, quadratic, power, lost, whole), 1.0 + power
     left = 1.0 + c * quadratic * level**c * whole
-    ends = xp.real(left) > 0  # a negative loss without end has no value
-    kept = xp.where(ends, left, 1.0) ** (-1.0 / c)
-    return level * xp.exp(-lost) * xp.where(ends, kept, np.nan)
+    some = xp.real(left) > 0  # a negative loss without end has no value
+    kept = xp.where(some, left, 1.0) ** (-1.0 / c)
+    return level * xp.exp(-lost) * xp.where(some, kept, np.nan)
 
 
 def course(kind: str, time: np.ndarray, when: complex) -> np.ndarray:

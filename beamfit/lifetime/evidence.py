@@ -591,10 +591,7 @@ class Evidence:
             gas = further_columns(self.about, "relaxing", 1 / np.array(PACES))
             columns = np.column_stack([columns, gas])
         products = Products.of(columns, self.time, stated=True, times=CLOSE)
-        rest, rows = products.matrix[:, :1, 1:], products.matrix[:, 1:, 1:]
-        step = np.linalg.solve(rows, np.swapaxes(rest, 1, 2))
-        squares = products.matrix[:, 0, 0] - (rest @ step)[:, 0, 0]
-        return products.stated_odds(np.maximum(squares, 0.0), rows.shape[1])
+        return products.stated_odds(products.left(), columns.shape[1] - 1)
 
     @cached_property
     def course(self) -> tuple[RatePart, ...]:

@@ -465,7 +465,8 @@ def fit_cycles(
     Notes
     -----
     Least squares; the currents at the starts are eliminated, so that time and memory grow with the
-    readings alone. Noise with a memory goes on from cycle to cycle (`beamfit.noise.memory`).
+    readings alone. Noise with a memory goes on from cycle to cycle, 1/f noise within each
+    (`beamfit.noise.correlated`).
     Readings, cycles and heads of cycles that lie far off are left out and counted. Where the loss
     rate is not the same in all cycles the answer is that of the mean rate, and `course` has the
     lifetimes of parts (`beamfit.lifetime.cycles`).

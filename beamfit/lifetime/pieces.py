@@ -597,10 +597,10 @@ def _log_odds_of_steps(
         products = Products.of(np.column_stack([of, curve, steps]), at, False, NOISES)
         free = max(at.size - CURVED - some.size + 1, 1)
         for sign, columns in ((1, None), (-1, CURVED + 2 + sure.sum())):
-            left = _left(products.matrix, columns)
-            odds += sign * logsumexp(products.log_prior - 0.5 * free * np.log(left + TINY))
+            left = np.log(products.left(columns) + TINY)
+            odds += sign * logsumexp(products.log_prior - 0.5 * free * left)
         told += np.sum(~sure)
-    return odds - told / max(first.size - 1, 1) * _log_cost(np.diff(ends))
+    return odds - told / (first.size - 1) * _log_cost(np.diff(ends))
 
 
 def _log_cost(lengths: np.ndarray) -> float:
@@ -613,14 +613,6 @@ def _log_cost(lengths: np.ndarray) -> float:
     by_the_clock = np.log(count) + steps * (1.0 + np.log1p(2 * differ))
     size = 0.5 * np.log(count / lengths.size)
     return float(min(steps * np.log(count), by_the_clock) + steps * size)
-
-
-def _left(matrix: np.ndarray, columns: int | None) -> np.ndarray:
-    """Squares of the first column that the others, up to one, leave, of products of columns."""
-    known, with_first = matrix[:, 1:columns, 1:columns], matrix[:, 1:columns, 0]
-    known = known * (1.0 + EXACT * np.eye(known.shape[1]))  # what others repeat
-    numbers = np.linalg.solve(known, with_first[:, :, None])[:, :, 0]
-    return np.maximum(matrix[:, 0, 0] - np.sum(with_first * numbers, axis=1), 0.0)
 
 
 def _is_short(number: np.ndarray, begins: np.ndarray, lengths: np.ndarray) -> np.ndarray:

@@ -16,9 +16,9 @@ from beamfit.arrays import padded_length
 from beamfit.noise.memory import (
     BESIDE,
     CORRELATED,
+    FLICKER,
     POWERS,
     WALK,
-    WHITE,
     CorrelatedNoise,
     Levels,
     levelled_products,
@@ -270,13 +270,13 @@ def whitened_by_each(
     noise = CorrelatedNoise(*np.array(grid).T)
     if levels:
         parts = [_levelled(grid, *run, own) for run, own in zip(runs, levels, strict=True)]
-        noise = CorrelatedNoise(*np.pad(noise, ((0, 0), (0, len(POWERS))), constant_values=np.nan))
     else:
         parts = [_triangles(grid, rows, np.diff(time)) for rows, time in runs]
     triangles, volume = [triangle for triangle, _ in parts], sum(volume for _, volume in parts)
     if levels:  # those with a part that is white have half of what is correlated
-        odds = (1.0 - WHITE - CORRELATED - WALK) / (CORRELATED + WALK) / len(POWERS)
+        odds = FLICKER / len(POWERS) / (CORRELATED + WALK)
         volume[len(grid) :] += np.log(2.0 * odds * np.sum(noise.white > 0.0))
+        noise = CorrelatedNoise(*np.pad(noise, ((0, 0), (0, len(POWERS))), constant_values=np.nan))
     count = sum(len(rows) for rows, _ in runs) - sum(own.first.size for own in levels)
     if known is not None:
         triangles, count = [*triangles, np.tile(known, (noise.time.size, 1, 1))], count + len(known)

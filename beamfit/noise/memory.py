@@ -35,6 +35,7 @@ BLOCKS = (4, 16)
 # noise has the rest. Readings are white unless something slow moves the monitor: amplifiers have
 # 1/f noise, and what a changing temperature adds up in a monitor is a walk.
 WHITE, CORRELATED, WALK = 0.5, 0.25, 0.1
+FLICKER = 1.0 - WHITE - CORRELATED - WALK
 # Correlation times, from this share of the interval between readings to so many records, flat in
 # the logarithm.
 SHORTEST, LONGEST, TIMES = 0.5, 3.0, 17
@@ -43,6 +44,8 @@ SHORTEST, LONGEST, TIMES = 0.5, 3.0, 17
 POWERS = (0.4, 0.7, 1.0)
 # A verdict on the size of the noise needs correlation times as close as this many.
 CLOSE = 49
+# Columns may repeat each other: their products are enlarged by such a share.
+SINGULAR = 1e-11
 # Stated errors are worth so many readings that tell the size of the noise: right within 25 %.
 STATED = 8.0
 # The rival to stated errors is a size flat in its logarithm, a factor 30 to either side.
@@ -357,8 +360,8 @@ def kinds_of(time: np.ndarray, count: int = TIMES) -> list[MemoryKind]:
         for t, each, row in zip(times, chance, white_shares(usual / times), strict=True)
         for white in row
     ]
-    flicker = (1.0 - WHITE - CORRELATED - WALK) / len(POWERS)
-    return [MemoryKind(WHITE), *(MemoryKind(flicker, power=power) for power in POWERS), *memory]
+    flicker = [MemoryKind(FLICKER / len(POWERS), power=power) for power in POWERS]
+    return [MemoryKind(WHITE), *flicker, *memory]
 
 
 def without_flicker(rows: np.ndarray, power: float) -> np.ndarray:
@@ -441,6 +444,13 @@ class Products(NamedTuple):
         found = half.reshape(count, -1, columns) @ sets
         found = found.reshape(count, some, -1, some).transpose(1, 3, 2, 0)
         return np.ascontiguousarray(found)
+
+    def left(self, columns: int | None = None) -> np.ndarray:
+        """Squares of the first column that the others, up to one, leave, by noise."""
+        known, along = self.matrix[:, 1:columns, 1:columns], self.matrix[:, 1:columns, 0]
+        known = known * (1.0 + SINGULAR * np.eye(known.shape[1]))
+        step = np.linalg.solve(known, along[:, :, None])[:, :, 0]
+        return np.maximum(self.matrix[:, 0, 0] - np.sum(along * step, axis=1), 0.0)
 
     def log_size(self, squares: np.ndarray) -> np.ndarray:
         """Log likelihood of sums of squares, the size of the noise integrated over.
