@@ -33,18 +33,18 @@ from beamfit.lifetime.expansion import (
 )
 from beamfit.lifetime.free_law import (
     ABOVE,
+    ASIDES,
     BELOW,
+    BESIDE,
     DRIFT,
     ENDS,
     ENOUGH,
-    HALF_WALK,
     INTEGRAL,
+    NODES,
     OUTGASSING,
     SIZES,
     SMOOTH,
     TIMES,
-    WALKS,
-    WANDERS,
     from_nodes,
 )
 from beamfit.lifetime.record import DecayRecord
@@ -419,8 +419,10 @@ def _likely(plain: Expansion) -> dict[Alternative, _Further]:
 
     def log_evidence(one: Alternative) -> float:
         own, width = [0, 1, 2, 3, *places[one]], np.append([np.inf] * 3, widths[one])
-        some = products._replace(matrix=products.matrix[:, own][:, :, own])
-        return _laplace(some, width, np.zeros(width.size)) + _log_chance(one, plain)
+        own = np.eye(len(columns))[:, own]
+        return _laplace(products.combined(own), width, np.zeros(width.size)) + _log_chance(
+            one, plain
+        )
 
     constant = log_evidence(CONSTANT) + HOPELESS
     return {one: more for one, more in best.items() if log_evidence(one) > constant}
@@ -537,25 +539,27 @@ def _squares(law: Expansion) -> float:
 
 def _log_evidence(law: Expansion, one: Alternative) -> float:
     """Logarithm of the probability of the readings, the noise averaged over, up to a constant: also
-    if the loss rate goes by a random walk besides, in linear approximation.
+    if something goes by itself besides, in linear approximation.
     """
     columns, width, centre = _given(law, one)
-    walk = _walked(law) if law.pieces.gauge is None else np.zeros((law.residuals.size, 0))
-    rows = np.column_stack([law.residuals, law.rows[:, columns], walk])
-    products = Products.of(rows, law.pieces.time, law.pieces.error is not None)
-    own = products._replace(matrix=products.matrix[:, : len(width) + 1, : len(width) + 1])
-    found, every = [_laplace(own, width, centre)], np.ones(walk.shape[1])
-    for share in WALKS if every.size else ():
-        wanders = _laplace(products, np.append(width, share * every), np.append(centre, 0 * every))
-        found.append(wanders + math.log(WANDERS / SMOOTH / len(WALKS)))
-    return float(logsumexp(found)) + _log_chance(one, law)
-
-
-def _walked(law: Expansion) -> np.ndarray:
-    """Slopes of the residuals by a random walk of the loss rate, shape (n, 14)."""
-    walk = from_nodes(law.pieces.time / law.pieces.units[0]) @ INTEGRAL @ HALF_WALK
     model = law.pieces.current / law.pieces.over + law.residuals
-    return -law.numbers[0] * model[:, None] * walk
+    nodes = model[:, None] * from_nodes(law.pieces.time / law.pieces.units[0])
+    rows = np.column_stack([law.residuals, law.rows[:, columns], nodes])
+    products = Products.of(rows, law.pieces.time, law.pieces.error is not None)
+    own = np.eye(rows.shape[1])[:, : 1 + width.size]
+    found = [_laplace(products.combined(own), width, centre)]
+    if law.pieces.gauge is None:
+        log = products.log_prior + products.log_size(products.left())
+        near = products.some(log > log.max() - BESIDE)
+        for walks, chance, of_loss in ASIDES:
+            shown = -law.numbers[0] * INTEGRAL if of_loss else np.eye(NODES)
+            for walk in walks:
+                more = np.vstack([np.zeros((1 + width.size, walk.shape[1])), shown @ walk])
+                numbers = np.append(width, np.ones(walk.shape[1]))
+                some = near.combined(np.hstack([own, more]))
+                log = _laplace(some, numbers, np.append(centre, np.zeros(walk.shape[1])))
+                found.append(log + math.log(chance / SMOOTH / len(walks)))
+    return float(logsumexp(found)) + _log_chance(one, law)
 
 
 def _given(law: Expansion, one: Alternative) -> tuple[list[int], np.ndarray, np.ndarray]:

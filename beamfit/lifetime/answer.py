@@ -283,6 +283,9 @@ def _freely(e: Evidence) -> Finding | None:
         known = gas and math.isfinite(gas.after.value) and min(gas.a.value, gas.b.value) > 0
         said = f": {e.explained}" if known else ""
         return Finding(Status.converged, f"{told}. {likely}, which the errors contain{said}")
+    if e.free.settles > LIKELIER:
+        likely = f"A monitor that settles after a fill is likely ({percent(e.free.settles)})"
+        return Finding(Status.converged, f"{told}. {likely}, which the errors contain")
     if e.free.wanders > LIKELIER:
         chance = percent(e.free.wanders)
         likely = f"The loss rate or the monitor wanders within the record ({chance})"

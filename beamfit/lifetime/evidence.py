@@ -33,7 +33,17 @@ from beamfit.lifetime.expansion import (
     lifetime_of,
     solved,
 )
-from beamfit.lifetime.free_law import BELOW, ENDS, PACES, UNITS, FreeLaw, Law, free_law
+from beamfit.lifetime.free_law import (
+    BELOW,
+    ENDS,
+    LIKELIER,
+    PACES,
+    UNITS,
+    FreeLaw,
+    Law,
+    free_law,
+    settled,
+)
 from beamfit.lifetime.pieces import LONE
 from beamfit.lifetime.record import DecayRecord
 from beamfit.noise.correlated import AveragedMoments, Memory
@@ -590,6 +600,10 @@ class Evidence:
         if self.pumped:
             gas = further_columns(self.about, "relaxing", 1 / np.array(PACES))
             columns = np.column_stack([columns, gas])
+        if self.free is not None and self.free.settles > LIKELIER:
+            model = self.record.current / self.about.pieces.over + self.about.residuals
+            shapes = np.hstack([*settled(self.record.time / self.record.span)])
+            columns = np.column_stack([columns, model[:, None] * shapes])
         products = Products.of(columns, self.time, stated=True, times=CLOSE)
         return products.stated_odds(products.left(), columns.shape[1] - 1)
 

@@ -6,9 +6,9 @@ share R x^(1 + g) + (1 - share) R (1 + h f(s)) with the share of a from 0 to 1. 
 of itself: in a straight line, f = s - 1/2, or as what is pumped away after a fill, f = 1/k -
 exp(-k s)/(1 - exp(-k)), where a is then constant. The exponent g, the change h and the pace k have
 priors, the first current, the loss rate and the share of a are flat. Beside g and h the whole loss
-may go by a random walk. The law has a closed form with one integral, taken to rounding on Chebyshev
-nodes, which readings see through one matrix: whitened products of its columns are all that they
-say.
+or the monitor may wander; beside constant a and b the monitor may settle after a fill. The law has
+a closed form with one integral, taken to rounding on Chebyshev nodes, which readings see through
+one matrix: whitened products of its columns are all that they say.
 """
 
 from __future__ import annotations
@@ -45,19 +45,23 @@ DRIFT = 0.1
 # thousandth of the mean loss to ten times that.
 SMOOTH, OUTGASSING, TIMES, SIZES = 0.6, 0.08, (1e-3, 1.0), (1e-3, 10.0)
 # Prior probability that the loss rate wanders, as a pressure does, by a random walk: by which
-# shares of the loss it has gone at the end, each as likely.
+# shares of the loss it has gone at the end, each as likely. That the monitor does is as likely.
 WANDERS, WALKS = 0.14, (0.003, 0.015, 0.07, 0.3)
 LOG_WANDERS = math.log(WANDERS / SMOOTH)
-# Standard deviation of how far a monitor itself goes up and down in a record, as a share of the
-# current: between two calibrations of the transformer of MIT-Bates its zero moved by 0.1 to 0.2 %
-# (T. Botto, BlastTalk 2712). What wanders by less is as likely the monitor's doing.
-MONITOR = 1e-3
+# Standard deviation of how far a monitor itself is off in a record, as a share of the current:
+# between two calibrations of the transformer of MIT-Bates its zero moved by 0.1 to 0.2 % (T. Botto,
+# BlastTalk 2712). By which shares of that it wanders, and over which lengths, each as likely.
+MONITOR, PARTS, LENGTHS = 1e-3, (0.03, 0.3, 3.0), (0.4, 0.2, 0.1, 0.05)
+# A monitor that settles after a fill is as likely as gas that is pumped away. Spans over the time
+# that takes, each as likely, and how wide each of them stands for its neighbourhood.
+SETTLING = 2.0 ** np.arange(1, 7)
+BETWEEN = math.log(2.0) / math.sqrt(12.0)
 # Spans over the time of gas that is pumped away: shorter times are seen by themselves.
 PACES = (1.0, 20.0)
 # Where the record's bend does not depend on the share its coordinate has this slope.
 FLAT = 1e-3
 # Nodes of the integral: exact to rounding up to four lifetimes in a record.
-NODES = 14
+NODES = 18
 
 ANGLE = -np.cos(np.pi * np.arange(NODES) / (NODES - 1))
 NODE = (1 + ANGLE) / 2
@@ -70,10 +74,14 @@ INTEGRAL = chebvander(ANGLE, NODES) @ chebint(FROM_NODES, lbnd=-1) / 2
 _PART = NODE - NODE**2 / 2
 _COVARIANCE = np.minimum.outer(NODE, NODE) - np.add.outer(_PART, _PART) + 1 / 3
 HALF_WALK = np.linalg.cholesky(_COVARIANCE + 1e-12 * np.eye(NODES))
+# A monitor that goes up and down: smooth, of a variance of 1 and correlated over a length.
+_SQUARES = np.subtract.outer(NODE, NODE) ** 2
+_WAVES = [np.linalg.cholesky(np.exp(-0.5 * _SQUARES / length**2) + 1e-9 * np.eye(NODES))
+          for length in LENGTHS]  # fmt: skip
 
 
 def from_nodes(s: np.ndarray) -> np.ndarray:
-    """Matrix that takes values at the nodes to those at times over the span, shape (n, 14).
+    """Matrix that takes values at the nodes to those at times over the span, shape (n, 18).
 
     Examples
     --------
@@ -81,6 +89,28 @@ def from_nodes(s: np.ndarray) -> np.ndarray:
     [0.0625]
     """
     return chebvander(2 * s - 1, NODES - 1) @ FROM_NODES
+
+
+def settled(s: np.ndarray) -> np.ndarray:
+    """Shapes exp(-k s) of a monitor that settles at each pace k, and beside each its slope by the
+    logarithm of the pace times the spread of that, shape (6, n, 2).
+
+    Examples
+    --------
+    >>> settled(np.array([0.5]))[0].round(4).tolist()
+    [[0.3679, 0.0736]]
+    """
+    gone = np.multiply.outer(SETTLING, s)
+    return np.exp(-gone)[..., None] * np.stack([np.ones_like(gone), BETWEEN * gone], axis=-1)
+
+
+# What goes by itself: shares of the loss rate, or of the current, at the nodes by normal numbers,
+# each of several as likely; the probability of all of them, and whether it is the loss rate.
+ASIDES = (
+    (np.multiply.outer(WALKS, HALF_WALK), WANDERS, True),
+    (np.array([MONITOR * part * wave for part in PARTS for wave in _WAVES]), WANDERS, False),
+    (MONITOR * settled(NODE), OUTGASSING, False),
+)
 
 
 class Law(StrEnum):
@@ -166,7 +196,7 @@ class Numbers(NamedTuple):
 
 
 def node_currents(level, quadratic, power, lost):
-    """Currents at the nodes over the mean, (14, m), as of `closed_form` with W = ∫ exp(-c B) ds,
+    """Currents at the nodes over the mean, (18, m), as of `closed_form` with W = ∫ exp(-c B) ds,
     where B is what is lost to gas up to each node.
     """
     xp = array_module(level, quadratic, power, lost)
@@ -203,8 +233,8 @@ def log_pumped(share, gas, pace):
     return xp.where(inside, density, -np.inf)
 
 
-# A walk is looked at beside noises that are not less likely than the likeliest by more than this;
-# fewer readings tell no noise beside a curve as free.
+# What goes by itself is looked at beside noises that are not less likely than the likeliest by more
+# than this; fewer readings tell no noise beside a curve as free.
 BESIDE, FEWEST = 3.0, 2 * NODES
 # No monitor reads a current to less of itself: transformers of direct current to 1e-6.
 QUIET = 1e-7
@@ -252,12 +282,14 @@ def _turned(matrices: np.ndarray) -> np.ndarray:
 
 
 class Walk(NamedTuple):
-    """A loss rate that wanders, by noise: its mean at the nodes from what the readings leave,
-    (k, 14, 15), and a half of its covariance over the noise, (k, 14, 14), as shares of the loss.
+    """What goes by itself, by noise: its mean at the nodes from what the readings leave,
+    (k, 18, 19), and a half of its covariance over the noise, (k, 18, r), as shares of the loss, or
+    of the current that the monitor shows.
     """
 
     mean: np.ndarray
     half: np.ndarray
+    of_loss: bool
 
 
 @dataclass(frozen=True)
@@ -270,9 +302,9 @@ class SeenDecay:
         Of what is left of the readings at `start`, and of the columns of the nodes.
     start : array, shape (6, 1)
         Numbers of a law near the most probable one.
-    origin : array, shape (14, 1)
+    origin : array, shape (18, 1)
         Its currents at the nodes.
-    gas : array, shape (14,)
+    gas : array, shape (18,)
         Integral of the pressure over its mean at the nodes, over the span.
     ends : tuple of float
         Pressure over its mean at the first and the last reading.
@@ -281,7 +313,8 @@ class SeenDecay:
     share : tuple of float
         Between which the share of a lies.
     walk : Walk or None
-        What the readings say of a loss rate that wanders, by noise; None where it does not.
+        What the readings say of a loss rate that wanders, or a monitor that does or settles, by
+        noise; None where none does.
     """
 
     products: Products
@@ -335,38 +368,50 @@ class SeenDecay:
 
     def of_noises(self, kept: np.ndarray) -> SeenDecay:
         """The same with some of the noises."""
-        walk = self.walk and Walk(*(part[kept] for part in self.walk))
+        walk = self.walk and Walk(self.walk.mean[kept], self.walk.half[kept], self.walk.of_loss)
         return replace(self, products=self.products.some(kept), walk=walk)
 
-    def wandering(self) -> SeenDecay:
-        """The same with a loss rate that wanders, averaged over, beside the likeliest noises.
+    def beside(self, walks: np.ndarray, chance: float, of_loss: bool) -> SeenDecay:
+        """The same with something that goes by itself, averaged over, beside the likeliest noises:
+        the monitor, or the loss rate, as shares of what it shows.
 
-        A walk of normal numbers z makes the currents `columns` z more, in units of the noise.
+        Parameters
+        ----------
+        walks : array, shape (w, 18, r)
+            Each as likely: at the nodes by normal numbers.
+        chance : float
+            Prior probability of all of them.
+        of_loss : bool
+            Whether it is the loss rate that goes.
         """
         least, best = self.likely()
         near = best > best.max() - BESIDE
         some, unit = self.of_noises(near), np.sqrt(self.products.variance(least[near], NODES))
-        size = np.outer(WALKS, 1 / np.maximum(unit, QUIET)).ravel()[:, None, None] * HALF_WALK
-        columns = -np.exp(self.start[1, 0]) * self.origin * (INTEGRAL @ size)
-        matrix = np.tile(some.products.matrix, (len(WALKS), 1, 1))
+        count, _, numbers = walks.shape
+        size = walks[:, None] / np.maximum(unit, QUIET)[:, None, None]
+        size = size.reshape(-1, NODES, numbers)
+        shown = -np.exp(self.start[1, 0]) * INTEGRAL if of_loss else np.eye(NODES)
+        columns = self.origin * (shown @ size)
+        matrix = np.tile(some.products.matrix, (count, 1, 1))
         known = LEAST_LEFT * np.einsum("kpp->kp", matrix)[..., None] * np.eye(NODES + 1)
         root = _turned(np.linalg.cholesky(matrix + known))
         seen = root[:, :, 1:] @ columns
-        # What readings say beside a walk: square roots lose no digit where there is little noise.
+        # What readings say beside it: square roots lose no digit where there is little noise.
         lower = np.linalg.cholesky(np.eye(NODES + 1) + seen @ _turned(seen))
         left = np.linalg.solve(lower, root)
-        half = np.linalg.inv(np.linalg.cholesky(np.eye(NODES) + _turned(seen) @ seen))
-        volume = np.sum(np.log(np.einsum("kpp->kp", lower)), axis=1) + math.log(len(WALKS))
+        half = np.linalg.inv(np.linalg.cholesky(np.eye(numbers) + _turned(seen) @ seen))
+        volume = np.sum(np.log(np.einsum("kpp->kp", lower)), axis=1)
         products = some.products._replace(
-            kinds=some.products.kinds * len(WALKS),
-            log_prior=np.tile(some.products.log_prior, len(WALKS)) - volume,
+            kinds=some.products.kinds * count,
+            log_prior=np.tile(some.products.log_prior, count) - volume
+            + math.log(chance / SMOOTH / count),
             matrix=_turned(left) @ left,
-        )
+        )  # fmt: skip
         mean = -size @ _turned(np.linalg.solve(lower, seen)) @ left
-        return replace(self, products=products, walk=Walk(mean, size @ _turned(half)))
+        return replace(self, products=products, walk=Walk(mean, size @ _turned(half), of_loss))
 
     def away(self, currents: np.ndarray) -> np.ndarray:
-        """Currents at the nodes, (14, d), as multiples of the columns that they leave."""
+        """Currents at the nodes, (18, d), as multiples of the columns that they leave."""
         return np.vstack([-np.ones(currents.shape[1]), currents - self.origin])
 
     def squares(self, currents: np.ndarray, kind: np.ndarray) -> np.ndarray:
@@ -382,16 +427,16 @@ class SeenDecay:
         return [slice(*part) for part in pairwise(ends)]
 
     def walked(
-        self, currents: np.ndarray, kind: np.ndarray, squares: np.ndarray, even: np.ndarray
+        self, currents: np.ndarray, kind: np.ndarray, squares: np.ndarray, seed: int
     ) -> np.ndarray:
-        """Draw how far the loss rate has walked at the nodes, as shares of the loss, (14, d), by
-        even points of a cube, beside these currents and the squares that they leave.
+        """Draw how far what goes by itself has gone at the nodes, (18, d), by even points,
+        beside these currents and the squares that they leave.
         """
-        walked = np.empty_like(currents)
-        away, normal = self.away(currents), ndtri(even)
+        walked, (mean, half, _) = np.empty_like(currents), self.walk
+        away, normal = self.away(currents), ndtri(_even(kind.size, half.shape[2], seed))
         noise = np.sqrt(self.products.variance(squares, 0))
-        for mean, half, part in zip(*self.walk, self._parts(kind), strict=True):
-            walked[:, part] = mean @ away[:, part] + half @ (normal[:, part] * noise[part])
+        for middle, more, part in zip(mean, half, self._parts(kind), strict=True):
+            walked[:, part] = middle @ away[:, part] + more @ (normal[:, part] * noise[part])
         return walked
 
 
@@ -541,36 +586,17 @@ def _along(seen: SeenDecay, row: int, low: float, high: float, free: list[int]) 
 
 
 class Draws(NamedTuple):
-    """Numbers with walks of the loss rate and currents at the nodes, (14, d), their weights, their
-    log evidence, and how many draws they are worth.
+    """Numbers with walks of the loss rate, currents and what the monitor shows of them at the
+    nodes, (18, d), their weights, their log evidence, and how many draws they are worth.
     """
 
     numbers: Numbers
     walk: np.ndarray
     currents: np.ndarray
+    shown: np.ndarray
     weight: np.ndarray
     log: float
     worth: float
-
-    def of_the_monitor(self) -> Draws:
-        """The same readings where the monitor wanders and the loss rate does not.
-
-        A walk of the loss makes the readings wander about the law, from nothing at the first to
-        nothing at the last one. A monitor's own ends differ as any two of its readings do, which
-        the loss rate in the span contains.
-        """
-        share = INTEGRAL[-1]
-        read = self.numbers.rate * (INTEGRAL @ self.walk)
-        size = np.sqrt(share @ (read - share @ read) ** 2)
-        ends = math.sqrt(2) * size * ndtri(_even(size.size, 1, 2)[0])
-        numbers = self.numbers._replace(rate=np.maximum(self.numbers.rate + ends, 1e-300))
-        weight = self.weight * np.exp(-0.5 * (size / MONITOR) ** 2)
-        part = max(float(weight.sum()), 1e-300)
-        worth = part**2 / max(float(weight @ weight), 1e-300)
-        return Draws(
-            numbers, np.zeros_like(self.walk), self.currents, weight / part,
-            self.log + math.log(part), worth,
-        )  # fmt: skip
 
 
 @lru_cache(maxsize=16)
@@ -634,13 +660,17 @@ class DrawnLaw(NamedTuple):
         """True if the gas is pumped away after a fill."""
         return PACE in self.free
 
+    @property
+    def settles(self) -> bool:
+        """True if the monitor settles after a fill."""
+        return self.seen.walk is not None and POWER not in self.free
+
     def _log_prior(self, numbers: Numbers) -> np.ndarray:
         free, (low, high) = self.free, self.seen.share
         inside = (numbers.share >= low) & (numbers.share <= high)
         log = np.where(inside, -math.log(high - low), -np.inf)
         if self.is_pumped:
             return log + log_pumped(numbers.share, numbers.gas, numbers.pace)
-        log = log if self.seen.walk is None else log + LOG_WANDERS
         log = log + log_prior(numbers.power)[0] if POWER in free else log
         return log + log_straight(numbers.drift) if CHANGE in free else log
 
@@ -674,7 +704,8 @@ class DrawnLaw(NamedTuple):
         if not np.isfinite(peaks.log).all():
             numbers, none = Numbers.of(peaks.numbers), np.zeros(peaks.log.shape[1])
             currents = numbers.currents(seen.gas)
-            return Draws(numbers, np.zeros_like(currents), currents, none, -np.inf, 0.0)
+            walk = np.zeros_like(currents)
+            return Draws(numbers, walk, currents, currents, none, -np.inf, 0.0)
         kind, numbers, given = self._proposed(draws, seed)
         currents = numbers.currents(seen.gas)
         squares = seen.squares(currents, kind)
@@ -684,11 +715,15 @@ class DrawnLaw(NamedTuple):
         whole = float(logsumexp(log))
         weight = np.exp(log - max(whole, -1e300))
         worth = float(weight.sum() / max(np.sum(weight**2), 1e-300))
-        walk = np.zeros_like(currents)
+        walk, shown = np.zeros_like(currents), currents
         if seen.walk is not None:
-            walk = seen.walked(currents, kind, squares, _even(draws, NODES, seed + 1))
-            currents = currents * np.exp(-numbers.rate * (INTEGRAL @ walk))
-        return Draws(numbers, walk, currents, weight, whole - math.log(draws), worth)
+            walked = seen.walked(currents, kind, squares, seed + 1)
+            if seen.walk.of_loss:
+                walk = walked
+                shown = currents = currents * np.exp(-numbers.rate * (INTEGRAL @ walk))
+            else:
+                shown = currents * (1 + walked)
+        return Draws(numbers, walk, currents, shown, weight, whole - math.log(draws), worth)
 
 
 def drawn(laws: Sequence[DrawnLaw]) -> list[Draws]:
@@ -717,8 +752,8 @@ def mixed(laws: Sequence[Draws]) -> Draws:
         return laws[0]
     weight = np.concatenate([law.weight * math.exp(law.log - whole) for law in laws])
     numbers = Numbers(*map(np.concatenate, zip(*(law.numbers for law in laws), strict=True)))
-    walk, currents = (np.hstack([law[row] for law in laws]) for row in (1, 2))
-    return Draws(numbers, walk, currents, weight, whole, float(1 / np.sum(weight**2)))
+    walk, currents, shown = (np.hstack([law[row] for law in laws]) for row in (1, 2, 3))
+    return Draws(numbers, walk, currents, shown, weight, whole, float(1 / np.sum(weight**2)))
 
 
 def quantiles(values: np.ndarray, weight: np.ndarray, at: np.ndarray) -> np.ndarray:
@@ -785,8 +820,10 @@ class FreeLaw:
         Probability of gas that is pumped away after a fill, in the place of exponent and drift.
     wanders : float
         Probability that the loss rate or the monitor wanders besides.
-    nodes : array, shape (14,)
-        Mean current at the nodes, mA.
+    settles : float
+        Probability of a monitor that settles after a fill, in the place of exponent and drift.
+    nodes : array, shape (18,)
+        What the monitor shows at the nodes in the mean, mA.
     span : float
         Length of the record, s.
     """
@@ -799,6 +836,7 @@ class FreeLaw:
     odd: float
     pumped: float
     wanders: float
+    settles: float
     nodes: np.ndarray
     span: float
 
@@ -823,7 +861,7 @@ class FreeLaw:
         return self.likelier and self.pumped > LIKELIER
 
     def curve(self, time: np.ndarray) -> np.ndarray:
-        """Mean current at times in s, mA."""
+        """What the monitor shows in the mean at times in s, mA."""
         return from_nodes(time / self.span) @ self.nodes
 
     def to_json(self) -> dict[str, object]:
@@ -831,7 +869,8 @@ class FreeLaw:
         told = {"exponent": self.exponent, "drift": self.drift}
         told |= {"probability_of_constant_a_and_b": self.constant}
         told |= {"probability_of_outgassing": self.pumped}
-        return told | {"probability_of_wandering": self.wanders}
+        told |= {"probability_of_wandering": self.wanders}
+        return told | {"probability_of_settling": self.settles}
 
 
 def at_bounds(share: np.ndarray, weight: np.ndarray) -> tuple[bool, bool]:
@@ -879,43 +918,44 @@ def free_law(record: DecayRecord, values: Physical) -> FreeLaw | None:
     seen = SeenDecay.of(record, values)
     proposed = proposals(seen)
     laws = list(zip(proposed, drawn(proposed), strict=True))
-    laws += [(law, own.of_the_monitor()) for law, own in laws if law.seen.walk is not None]
     draws = mixed([own for _, own in laws])
-    smooth = draws.numbers.pace == 0
-    part = float(draws.weight[smooth].sum())
-    if not (np.isfinite(draws.log) and part > 0) or draws.worth < LEAST_WORTH:
+    freed = mixed([own for law, own in laws if POWER in law.free])
+    if not (np.isfinite(freed.log) and draws.worth >= LEAST_WORTH):
         return None
     plain = DrawnLaw.of(seen, CONSTANT).weighed(FEW)
     if not 0 <= values.share <= 1:
         rival = DrawnLaw.of(replace(seen, share=NO_BEAM), CONSTANT).weighed(FEW)
         if rival.log + np.log(UNPHYSICAL) > draws.log:
             return None
-    power, weight = draws.numbers.power[smooth], draws.weight[smooth]
-    usual, odd = log_prior(power)
-    odd = float(weight @ np.exp(odd - usual))
-    found, drift = _quantities(record, seen, draws), None
-    exponent = quantity_of(power, weight / part, "1")
+    usual, odd = log_prior(freed.numbers.power)
+    odd = math.exp(freed.log - draws.log) * float(freed.weight @ np.exp(odd - usual))
+    exponent, drift = quantity_of(freed.numbers.power, freed.weight, "1"), None
     if seen.drifts:
-        drift = quantity_of(draws.numbers.drift[smooth], weight / part, "1")
+        drift = quantity_of(freed.numbers.drift, freed.weight, "1")
     constant = float(expit(plain.log - draws.log))
     chances = [(law, math.exp(own.log - draws.log)) for law, own in laws]
     pumped = sum((chance for law, chance in chances if law.is_pumped), 0.0)
-    wanders = sum((chance for law, chance in chances if law.seen.walk is not None), 0.0)
-    nodes = record.mean_current * draws.currents @ draws.weight
+    settles = sum((chance for law, chance in chances if law.settles), 0.0)
+    wanders = sum((chance for law, chance in chances if law.seen.walk is not None), 0.0) - settles
+    nodes = record.mean_current * draws.shown @ draws.weight
     share = quantity_of(draws.numbers.share, draws.weight, "1")
-    return FreeLaw(found, share, exponent, drift, constant, odd, pumped, wanders, nodes,
+    found = _quantities(record, seen, draws)
+    return FreeLaw(found, share, exponent, drift, constant, odd, pumped, wanders, settles, nodes,
                    record.span)  # fmt: skip
 
 
 def proposals(seen: SeenDecay) -> list[DrawnLaw]:
-    """The free law, and where no gauge tells the gas, gas that is pumped away and a walk."""
+    """The free law, and where no gauge tells the gas, gas that is pumped away, a monitor that
+    settles, and a loss rate or a monitor that wanders.
+    """
     if not seen.drifts:
         return [DrawnLaw.of(seen, [*CONSTANT, POWER])]
     smooth = [*CONSTANT, POWER, CHANGE]
     laws = [DrawnLaw.of(seen, smooth), DrawnLaw.of(seen, [*CONSTANT, CHANGE, PACE])]
     if seen.products.count < FEWEST:
         return laws
-    return [*laws, DrawnLaw.of(seen.wandering(), smooth)]
+    beside = zip(ASIDES, (smooth, smooth, CONSTANT), strict=True)
+    return [*laws, *(DrawnLaw.of(seen.beside(*aside), free) for aside, free in beside)]
 
 
 def rates_of(a, b, power, changed, x, seen: SeenDecay):

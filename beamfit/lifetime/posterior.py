@@ -60,6 +60,8 @@ SHOWN = ("i0", "a", "b", "exponent", "drift")
 LIFETIMES = {"lifetime_start": "h", "lifetime_end": "h", "lifetime_mean": "h"}
 STATED = {"exponent": f"normal about 0, {BELOW} below and {ABOVE} above",
           "drift": f"normal, 0 ± {DRIFT}, or that of gas that is pumped away"}  # fmt: skip
+# Monitors that a noise is with, by the law beside.
+ANY, WANDERS, SETTLES = range(3)
 # Where all of the loss may be of one kind its interval ends, as the last of a thousand draws does.
 UTMOST = 0.999
 # Independent draws that intervals need at least.
@@ -88,11 +90,13 @@ class DecayNumbers(NamedTuple):
 class _Data(NamedTuple):
     """Readings as of `SeenDecay`, the matrix that takes nodes to the first reading, the middle and
     the last one, mean current, mA, and span, s; shifts of I0, a and b by what is stated of the
-    monitor, shape (k, 3).
+    monitor, shape (k, 3). Of each noise, beside which law its monitor is: any, the free one where
+    the monitor wanders, or constant a and b where it settles.
     """
 
     matrix: Array
     log_prior: Array
+    beside: Array
     count: Array
     known: Array
     origin: Array
@@ -137,13 +141,17 @@ def _log_density(data: _Data, theta: Array) -> Array:
     away = jnp.append(-1.0, _nodes(data, numbers)[:, 0] - data.origin)
     squares = jnp.maximum(jnp.einsum("p,kpq,q->k", away, data.matrix, away), 1e-30)
     noises = data.log_prior - 0.5 * (data.count + data.known) * jnp.log(data.known + squares)
+    constant = (numbers.exponent == 0) & (numbers.drift == 0) & jnp.any(data.beside == SETTLES)
+    wanders = (data.beside == WANDERS) & (numbers.pace == 0) & jnp.all(numbers.walk == 0)
+    known = jnp.where(constant, data.beside == SETTLES, (data.beside == ANY) | wanders)
+    noises = jnp.where(known, noises, -jnp.inf)
     rate = numbers.a * data.mean + numbers.b
     share = numbers.a * data.mean / rate
     gas, pace = (1 - share) * numbers.drift, jnp.maximum(numbers.pace, 1.0)
     pumped = log_pumped(share, gas, pace) + jnp.log1p(-share)
     smooth = log_prior(numbers.exponent)[0] + log_straight(numbers.drift)
     smooth = smooth + _log_walk(numbers.walk)
-    law = jnp.where(numbers.pace > 0, pumped, smooth)
+    law = jnp.where(numbers.pace > 0, pumped, jnp.where(constant, 0.0, smooth))
     shifts = theta[theta.size - data.moved.shape[0] :]
     inside = (numbers.a >= 0) & (numbers.b >= 0)
     log = jax.scipy.special.logsumexp(noises) + law - jnp.log(rate) - 0.5 * jnp.sum(shifts**2)
@@ -195,7 +203,7 @@ class _Prepared(NamedTuple):
     def names(self) -> tuple[str, ...]:
         """Numbers that are drawn."""
         law = max(max(one.free) for one in self.laws) + 1
-        walk = NODES * any(one.seen.walk is not None for one in self.laws)
+        walk = NODES * any(one.seen.walk and one.seen.walk.of_loss for one in self.laws)
         hidden = [("walk", walk), ("monitor", len(self.moved))]
         return *list(UNITS)[:law], *(f"{n}_{k + 1}" for n, count in hidden for k in range(count))
 
@@ -218,9 +226,20 @@ class _Prepared(NamedTuple):
         fit, seen, draws = self.fit, self.seen, self.draws(STEPS * WALKERS)
         record, thetas = fit.readings, self.thetas(draws, np.random.default_rng(0))
         middle = middle_of(draws.currents, draws.weight)
-        products, count = seen.products, len(self.names)
+        own = [(seen.products, ANY)]
+        own += [
+            (law.seen.products, SETTLES if law.settles else WANDERS)
+            for law in self.laws
+            if law.seen.walk is not None and not law.seen.walk.of_loss
+        ]
+        beside = np.concatenate([np.full(len(one.kinds), which) for one, which in own])
+        matrix, log_prior = (
+            np.concatenate([getattr(one, name) for one, _ in own])
+            for name in ("matrix", "log_prior")
+        )
+        count = len(self.names)
         data = _Data(
-            products.matrix, products.log_prior, products.count, products.known,
+            matrix, log_prior, beside, seen.products.count, seen.products.known,
             seen.origin[:, 0], seen.gas, np.array(seen.ends),
             middle, from_nodes(np.array([0.0, middle, 1.0])),
             record.mean_current, record.span, self.moved,

@@ -434,6 +434,10 @@ class Products(NamedTuple):
         kinds = [kind for kind, keep in zip(self.kinds, kept, strict=True) if keep]
         return self._replace(kinds=kinds, log_prior=self.log_prior[kept], matrix=self.matrix[kept])
 
+    def combined(self, columns: np.ndarray) -> Products:
+        """Products of combinations of the columns, shape (m, p)."""
+        return self._replace(matrix=columns.T @ self.matrix @ columns)
+
     def between(self, sets: np.ndarray) -> np.ndarray:
         """Products (p, p, k, s) of p combinations of the columns by noise, of sets (m, p, s)."""
         sets = np.ascontiguousarray(np.moveaxis(sets, 2, 0))
