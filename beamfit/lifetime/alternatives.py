@@ -33,14 +33,12 @@ from beamfit.lifetime.expansion import (
 )
 from beamfit.lifetime.free_law import (
     ABOVE,
-    ASIDES,
     BELOW,
     BESIDE,
+    DISTURBANCES,
     DRIFT,
     ENDS,
     ENOUGH,
-    INTEGRAL,
-    NODES,
     OUTGASSING,
     SIZES,
     SMOOTH,
@@ -539,7 +537,7 @@ def _squares(law: Expansion) -> float:
 
 def _log_evidence(law: Expansion, one: Alternative) -> float:
     """Logarithm of the probability of the readings, the noise averaged over, up to a constant: also
-    if something goes by itself besides, in linear approximation.
+    beside a disturbance, in linear approximation.
     """
     columns, width, centre = _given(law, one)
     model = law.pieces.current / law.pieces.over + law.residuals
@@ -551,14 +549,13 @@ def _log_evidence(law: Expansion, one: Alternative) -> float:
     if law.pieces.gauge is None:
         log = products.log_prior + products.log_size(products.left())
         near = products.some(log > log.max() - BESIDE)
-        for walks, chance, of_loss in ASIDES:
-            shown = -law.numbers[0] * INTEGRAL if of_loss else np.eye(NODES)
-            for walk in walks:
-                more = np.vstack([np.zeros((1 + width.size, walk.shape[1])), shown @ walk])
-                numbers = np.append(width, np.ones(walk.shape[1]))
-                some = near.combined(np.hstack([own, more]))
-                log = _laplace(some, numbers, np.append(centre, np.zeros(walk.shape[1])))
-                found.append(log + math.log(chance / SMOOTH / len(walks)))
+        for kind in DISTURBANCES:
+            count, _, numbers = kind.shapes.shape
+            known = np.append(width, np.ones(numbers)), np.append(centre, np.zeros(numbers))
+            for shape in kind.shown(law.numbers[0]):
+                further = np.vstack([np.zeros((1 + width.size, numbers)), shape])
+                log = _laplace(near.combined(np.hstack([own, further])), *known)
+                found.append(log + math.log(kind.chance / SMOOTH / count))
     return float(logsumexp(found)) + _log_chance(one, law)
 
 

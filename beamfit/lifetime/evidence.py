@@ -42,7 +42,8 @@ from beamfit.lifetime.free_law import (
     FreeLaw,
     Law,
     free_law,
-    settled,
+    from_nodes,
+    settling,
 )
 from beamfit.lifetime.pieces import LONE
 from beamfit.lifetime.record import DecayRecord
@@ -602,7 +603,7 @@ class Evidence:
             columns = np.column_stack([columns, gas])
         if self.free is not None and self.free.settles > LIKELIER:
             model = self.record.current / self.about.pieces.over + self.about.residuals
-            shapes = np.hstack([*settled(self.record.time / self.record.span)])
+            shapes = from_nodes(self.record.time / self.record.span) @ np.hstack([*settling()])
             columns = np.column_stack([columns, model[:, None] * shapes])
         products = Products.of(columns, self.time, stated=True, times=CLOSE)
         return products.stated_odds(products.left(), columns.shape[1] - 1)

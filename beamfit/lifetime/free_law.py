@@ -44,20 +44,22 @@ DRIFT = 0.1
 # flat in its logarithm from a thousandth of the span to all of it, its loss at first from a
 # thousandth of the mean loss to ten times that.
 SMOOTH, OUTGASSING, TIMES, SIZES = 0.6, 0.08, (1e-3, 1.0), (1e-3, 10.0)
-# Prior probability that the loss rate wanders, as a pressure does, by a random walk: by which
-# shares of the loss it has gone at the end, each as likely. That the monitor does is as likely.
-WANDERS, WALKS = 0.14, (0.003, 0.015, 0.07, 0.3)
-LOG_WANDERS = math.log(WANDERS / SMOOTH)
-# Standard deviation of how far a monitor itself is off in a record, as a share of the current:
-# between two calibrations of the transformer of MIT-Bates its zero moved by 0.1 to 0.2 % (T. Botto,
-# BlastTalk 2712). By which shares of that it wanders, and over which lengths, each as likely.
-MONITOR, PARTS, LENGTHS = 1e-3, (0.03, 0.3, 3.0), (0.4, 0.2, 0.1, 0.05)
-# A monitor that settles after a fill is as likely as gas that is pumped away. Spans over the time
-# that takes, each as likely, and how wide each of them stands for its neighbourhood.
+# Prior probability that the loss rate goes up and down in a record, as a pressure does, by which
+# shares of the loss and over which lengths of the record, each as likely. That the monitor does is
+# as likely.
+WANDERS, SHARES, LENGTHS = 0.14, (0.003, 0.03, 0.3), (0.4, 0.2, 0.1, 0.05)
+# Standard deviation of how far a monitor is off, as a share of the current: between two
+# calibrations of the transformer of MIT-Bates its zero moved by 0.1 to 0.2 % (T. Botto, BlastTalk
+# 2712). By which multiples of that it wanders, each as likely.
+MONITOR, MULTIPLES = 1e-3, (0.03, 0.3, 3.0)
+# A monitor that settles after a fill is as likely as gas that is pumped away: spans over the time
+# that takes, each as likely, and the standard deviation of its logarithm that each stands for.
 SETTLING = 2.0 ** np.arange(1, 7)
 BETWEEN = math.log(2.0) / math.sqrt(12.0)
 # Spans over the time of gas that is pumped away: shorter times are seen by themselves.
 PACES = (1.0, 20.0)
+# What keeps a covariance of smooth shapes from being singular.
+SINGULAR = 1e-9
 # Where the record's bend does not depend on the share its coordinate has this slope.
 FLAT = 1e-3
 # Nodes of the integral: exact to rounding up to four lifetimes in a record.
@@ -67,17 +69,6 @@ ANGLE = -np.cos(np.pi * np.arange(NODES) / (NODES - 1))
 NODE = (1 + ANGLE) / 2
 FROM_NODES = np.linalg.inv(chebvander(ANGLE, NODES - 1))
 INTEGRAL = chebvander(ANGLE, NODES) @ chebint(FROM_NODES, lbnd=-1) / 2
-
-
-# A random walk about its mean at the nodes: a half of its covariance, min(s, t) less the means over
-# s, over t and over both.
-_PART = NODE - NODE**2 / 2
-_COVARIANCE = np.minimum.outer(NODE, NODE) - np.add.outer(_PART, _PART) + 1 / 3
-HALF_WALK = np.linalg.cholesky(_COVARIANCE + 1e-12 * np.eye(NODES))
-# A monitor that goes up and down: smooth, of a variance of 1 and correlated over a length.
-_SQUARES = np.subtract.outer(NODE, NODE) ** 2
-_WAVES = [np.linalg.cholesky(np.exp(-0.5 * _SQUARES / length**2) + 1e-9 * np.eye(NODES))
-          for length in LENGTHS]  # fmt: skip
 
 
 def from_nodes(s: np.ndarray) -> np.ndarray:
@@ -91,26 +82,63 @@ def from_nodes(s: np.ndarray) -> np.ndarray:
     return chebvander(2 * s - 1, NODES - 1) @ FROM_NODES
 
 
-def settled(s: np.ndarray) -> np.ndarray:
-    """Shapes exp(-k s) of a monitor that settles at each pace k, and beside each its slope by the
-    logarithm of the pace times the spread of that, shape (6, n, 2).
+def _turned(matrices: np.ndarray) -> np.ndarray:
+    return np.swapaxes(matrices, 1, 2)
 
-    Examples
-    --------
-    >>> settled(np.array([0.5]))[0].round(4).tolist()
-    [[0.3679, 0.0736]]
+
+@dataclass(frozen=True, eq=False)
+class Disturbance:
+    """What goes by itself beside the law: a loss rate or a monitor.
+
+    Parameters
+    ----------
+    shapes : array, shape (w, 18, r)
+        At the nodes, as shares of the loss rate or of the current, by r normal numbers; each of w
+        as likely.
+    chance : float
+        Prior probability of all of them.
+    of_loss : bool
+        Whether it is the loss rate that goes.
     """
-    gone = np.multiply.outer(SETTLING, s)
+
+    shapes: np.ndarray
+    chance: float
+    of_loss: bool = False
+
+    def shown(self, rate: float) -> np.ndarray:
+        """What the monitor shows of it, as a share of the current."""
+        return -rate * (INTEGRAL @ self.shapes) if self.of_loss else self.shapes
+
+
+def _wandering() -> tuple[np.ndarray, np.ndarray]:
+    """Shapes of a variance of 1 about their mean, by length: what goes up and down smoothly, its
+    covariance a Gaussian of the time between, and what drifts as fast as that.
+    """
+    apart = np.subtract.outer(NODE, NODE) / np.array(LENGTHS)[:, None, None]
+    half = np.linalg.cholesky(np.exp(-0.5 * apart**2) + SINGULAR * np.eye(NODES))
+    less = np.eye(NODES) - INTEGRAL[-1]
+    drifts = less @ INTEGRAL @ half
+    variance = np.einsum("s,wsr->w", INTEGRAL[-1], drifts**2)
+    covariance = less @ half @ _turned(half) @ less.T + SINGULAR * np.eye(NODES)
+    return np.linalg.cholesky(covariance), drifts / np.sqrt(variance)[:, None, None]
+
+
+def settling() -> np.ndarray:
+    """Shapes exp(-k s) of a monitor that settles, for each pace k, and beside each its slope by the
+    logarithm of the pace.
+    """
+    gone = np.multiply.outer(SETTLING, NODE)
     return np.exp(-gone)[..., None] * np.stack([np.ones_like(gone), BETWEEN * gone], axis=-1)
 
 
-# What goes by itself: shares of the loss rate, or of the current, at the nodes by normal numbers,
-# each of several as likely; the probability of all of them, and whether it is the loss rate.
-ASIDES = (
-    (np.multiply.outer(WALKS, HALF_WALK), WANDERS, True),
-    (np.array([MONITOR * part * wave for part in PARTS for wave in _WAVES]), WANDERS, False),
-    (MONITOR * settled(NODE), OUTGASSING, False),
+WALKS, _DRIFTS = _wandering()
+LOSS_WANDERS = Disturbance(np.concatenate([share * WALKS for share in SHARES]), WANDERS, True)
+MONITOR_WANDERS = Disturbance(
+    MONITOR * np.concatenate([size * one for size in MULTIPLES for one in (WALKS, _DRIFTS)]),
+    WANDERS,
 )
+MONITOR_SETTLES = Disturbance(MONITOR * settling(), OUTGASSING)
+DISTURBANCES = LOSS_WANDERS, MONITOR_WANDERS, MONITOR_SETTLES
 
 
 class Law(StrEnum):
@@ -233,8 +261,8 @@ def log_pumped(share, gas, pace):
     return xp.where(inside, density, -np.inf)
 
 
-# What goes by itself is looked at beside noises that are not less likely than the likeliest by more
-# than this; fewer readings tell no noise beside a curve as free.
+# A disturbance is looked at beside noises that are not less likely than the likeliest by more than
+# this; fewer readings tell no noise beside a curve as free.
 BESIDE, FEWEST = 3.0, 2 * NODES
 # No monitor reads a current to less of itself: transformers of direct current to 1e-6.
 QUIET = 1e-7
@@ -277,19 +305,14 @@ UNITS = {
 }
 
 
-def _turned(matrices: np.ndarray) -> np.ndarray:
-    return np.swapaxes(matrices, 1, 2)
-
-
-class Walk(NamedTuple):
-    """What goes by itself, by noise: its mean at the nodes from what the readings leave,
-    (k, 18, 19), and a half of its covariance over the noise, (k, 18, r), as shares of the loss, or
-    of the current that the monitor shows.
+class Disturbed(NamedTuple):
+    """A disturbance by noise: its mean at the nodes from what the readings leave, (k, 18, 19), and
+    a half of its covariance over the noise, (k, 18, r).
     """
 
     mean: np.ndarray
     half: np.ndarray
-    of_loss: bool
+    kind: Disturbance
 
 
 @dataclass(frozen=True)
@@ -312,9 +335,8 @@ class SeenDecay:
         Whether b may drift.
     share : tuple of float
         Between which the share of a lies.
-    walk : Walk or None
-        What the readings say of a loss rate that wanders, or a monitor that does or settles, by
-        noise; None where none does.
+    disturbed : Disturbed or None
+        What the readings say of a disturbance; None where there is none.
     """
 
     products: Products
@@ -324,7 +346,7 @@ class SeenDecay:
     ends: tuple[float, float]
     drifts: bool
     share: tuple[float, float] = (0.0, 1.0)
-    walk: Walk | None = None
+    disturbed: Disturbed | None = None
 
     @classmethod
     def of(cls, record: DecayRecord, values: Physical) -> SeenDecay:
@@ -368,30 +390,22 @@ class SeenDecay:
 
     def of_noises(self, kept: np.ndarray) -> SeenDecay:
         """The same with some of the noises."""
-        walk = self.walk and Walk(self.walk.mean[kept], self.walk.half[kept], self.walk.of_loss)
-        return replace(self, products=self.products.some(kept), walk=walk)
+        own = self.disturbed
+        own = own and own._replace(mean=own.mean[kept], half=own.half[kept])
+        return replace(self, products=self.products.some(kept), disturbed=own)
 
-    def beside(self, walks: np.ndarray, chance: float, of_loss: bool) -> SeenDecay:
-        """The same with something that goes by itself, averaged over, beside the likeliest noises:
-        the monitor, or the loss rate, as shares of what it shows.
-
-        Parameters
-        ----------
-        walks : array, shape (w, 18, r)
-            Each as likely: at the nodes by normal numbers.
-        chance : float
-            Prior probability of all of them.
-        of_loss : bool
-            Whether it is the loss rate that goes.
-        """
+    def beside(self, kind: Disturbance) -> SeenDecay:
+        """The same with a disturbance, averaged over, beside the likeliest noises."""
         least, best = self.likely()
         near = best > best.max() - BESIDE
         some, unit = self.of_noises(near), np.sqrt(self.products.variance(least[near], NODES))
-        count, _, numbers = walks.shape
-        size = walks[:, None] / np.maximum(unit, QUIET)[:, None, None]
-        size = size.reshape(-1, NODES, numbers)
-        shown = -np.exp(self.start[1, 0]) * INTEGRAL if of_loss else np.eye(NODES)
-        columns = self.origin * (shown @ size)
+        count, _, numbers = kind.shapes.shape
+        unit = np.maximum(unit, QUIET)[:, None, None]
+        size, shown = (
+            (shapes[:, None] / unit).reshape(-1, NODES, numbers)
+            for shapes in (kind.shapes, kind.shown(np.exp(self.start[1, 0])))
+        )
+        columns = self.origin * shown
         matrix = np.tile(some.products.matrix, (count, 1, 1))
         known = LEAST_LEFT * np.einsum("kpp->kp", matrix)[..., None] * np.eye(NODES + 1)
         root = _turned(np.linalg.cholesky(matrix + known))
@@ -401,14 +415,16 @@ class SeenDecay:
         left = np.linalg.solve(lower, root)
         half = np.linalg.inv(np.linalg.cholesky(np.eye(numbers) + _turned(seen) @ seen))
         volume = np.sum(np.log(np.einsum("kpp->kp", lower)), axis=1)
+        log = math.log(kind.chance / SMOOTH / count) - volume
         products = some.products._replace(
             kinds=some.products.kinds * count,
-            log_prior=np.tile(some.products.log_prior, count) - volume
-            + math.log(chance / SMOOTH / count),
+            log_prior=np.tile(some.products.log_prior, count) + log,
             matrix=_turned(left) @ left,
-        )  # fmt: skip
+        )
         mean = -size @ _turned(np.linalg.solve(lower, seen)) @ left
-        return replace(self, products=products, walk=Walk(mean, size @ _turned(half), of_loss))
+        return replace(
+            self, products=products, disturbed=Disturbed(mean, size @ _turned(half), kind)
+        )
 
     def away(self, currents: np.ndarray) -> np.ndarray:
         """Currents at the nodes, (18, d), as multiples of the columns that they leave."""
@@ -426,18 +442,18 @@ class SeenDecay:
         ends = np.searchsorted(kind, np.arange(len(self.products.matrix) + 1))
         return [slice(*part) for part in pairwise(ends)]
 
-    def walked(
+    def gone(
         self, currents: np.ndarray, kind: np.ndarray, squares: np.ndarray, seed: int
     ) -> np.ndarray:
-        """Draw how far what goes by itself has gone at the nodes, (18, d), by even points,
-        beside these currents and the squares that they leave.
+        """Draw the disturbance at the nodes, (18, d), by even points, beside these currents and the
+        squares that they leave.
         """
-        walked, (mean, half, _) = np.empty_like(currents), self.walk
+        found, (mean, half, _) = np.empty_like(currents), self.disturbed
         away, normal = self.away(currents), ndtri(_even(kind.size, half.shape[2], seed))
         noise = np.sqrt(self.products.variance(squares, 0))
         for middle, more, part in zip(mean, half, self._parts(kind), strict=True):
-            walked[:, part] = middle @ away[:, part] + more @ (normal[:, part] * noise[part])
-        return walked
+            found[:, part] = middle @ away[:, part] + more @ (normal[:, part] * noise[part])
+        return found
 
 
 class Peaks(NamedTuple):
@@ -663,7 +679,12 @@ class DrawnLaw(NamedTuple):
     @property
     def settles(self) -> bool:
         """True if the monitor settles after a fill."""
-        return self.seen.walk is not None and POWER not in self.free
+        return self.disturbance is MONITOR_SETTLES
+
+    @property
+    def disturbance(self) -> Disturbance | None:
+        """What goes by itself beside the law."""
+        return self.seen.disturbed and self.seen.disturbed.kind
 
     def _log_prior(self, numbers: Numbers) -> np.ndarray:
         free, (low, high) = self.free, self.seen.share
@@ -716,13 +737,13 @@ class DrawnLaw(NamedTuple):
         weight = np.exp(log - max(whole, -1e300))
         worth = float(weight.sum() / max(np.sum(weight**2), 1e-300))
         walk, shown = np.zeros_like(currents), currents
-        if seen.walk is not None:
-            walked = seen.walked(currents, kind, squares, seed + 1)
-            if seen.walk.of_loss:
-                walk = walked
+        if seen.disturbed is not None:
+            gone = seen.gone(currents, kind, squares, seed + 1)
+            if seen.disturbed.kind.of_loss:
+                walk = gone
                 shown = currents = currents * np.exp(-numbers.rate * (INTEGRAL @ walk))
             else:
-                shown = currents * (1 + walked)
+                shown = currents * (1 + gone)
         return Draws(numbers, walk, currents, shown, weight, whole - math.log(draws), worth)
 
 
@@ -936,7 +957,8 @@ def free_law(record: DecayRecord, values: Physical) -> FreeLaw | None:
     chances = [(law, math.exp(own.log - draws.log)) for law, own in laws]
     pumped = sum((chance for law, chance in chances if law.is_pumped), 0.0)
     settles = sum((chance for law, chance in chances if law.settles), 0.0)
-    wanders = sum((chance for law, chance in chances if law.seen.walk is not None), 0.0) - settles
+    wander = LOSS_WANDERS, MONITOR_WANDERS
+    wanders = sum((chance for law, chance in chances if law.disturbance in wander), 0.0)
     nodes = record.mean_current * draws.shown @ draws.weight
     share = quantity_of(draws.numbers.share, draws.weight, "1")
     found = _quantities(record, seen, draws)
@@ -954,8 +976,8 @@ def proposals(seen: SeenDecay) -> list[DrawnLaw]:
     laws = [DrawnLaw.of(seen, smooth), DrawnLaw.of(seen, [*CONSTANT, CHANGE, PACE])]
     if seen.products.count < FEWEST:
         return laws
-    beside = zip(ASIDES, (smooth, smooth, CONSTANT), strict=True)
-    return [*laws, *(DrawnLaw.of(seen.beside(*aside), free) for aside, free in beside)]
+    beside = zip(DISTURBANCES, (smooth, smooth, CONSTANT), strict=True)
+    return [*laws, *(DrawnLaw.of(seen.beside(kind), free) for kind, free in beside)]
 
 
 def rates_of(a, b, power, changed, x, seen: SeenDecay):

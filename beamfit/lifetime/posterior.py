@@ -18,13 +18,12 @@ from beamfit.lifetime.free_law import (
     BELOW,
     CONSTANT,
     DRIFT,
-    HALF_WALK,
     INTEGRAL,
     LEAST,
-    LOG_WANDERS,
+    LOSS_WANDERS,
     MOST,
     NODES,
-    WALKS,
+    SMOOTH,
     DrawnLaw,
     Draws,
     SeenDecay,
@@ -127,12 +126,13 @@ def _nodes(data: _Data, numbers: DecayNumbers) -> Array:
 
 
 def _log_walk(walk: Array) -> Array:
-    """Log density of a walk at the nodes, with the odds of there being any."""
-    squares, widths = jnp.sum((np.linalg.inv(HALF_WALK) @ walk) ** 2), np.log(WALKS)
-    log = jax.nn.logsumexp(-0.5 * squares * np.exp(-2 * widths) - NODES * widths)
-    log = log - np.log(len(WALKS)) - 0.5 * NODES * np.log(2 * np.pi)
-    log = log - np.log(np.diag(HALF_WALK)).sum()
-    return jnp.where(squares > 0, log + LOG_WANDERS, 0.0)
+    """Log density of a loss rate that wanders at the nodes, with the odds of there being any."""
+    halves, count = LOSS_WANDERS.shapes, len(LOSS_WANDERS.shapes)
+    squares = jnp.sum((np.linalg.inv(halves) @ walk) ** 2, axis=1)
+    volume = np.log(np.diagonal(halves, axis1=1, axis2=2)).sum(axis=1)
+    log = jax.nn.logsumexp(-0.5 * squares - volume) - 0.5 * NODES * np.log(2 * np.pi)
+    log = log + np.log(LOSS_WANDERS.chance / SMOOTH / count)
+    return jnp.where(jnp.any(walk != 0), log, 0.0)
 
 
 def _log_density(data: _Data, theta: Array) -> Array:
@@ -203,7 +203,7 @@ class _Prepared(NamedTuple):
     def names(self) -> tuple[str, ...]:
         """Numbers that are drawn."""
         law = max(max(one.free) for one in self.laws) + 1
-        walk = NODES * any(one.seen.walk and one.seen.walk.of_loss for one in self.laws)
+        walk = NODES * any(one.disturbance is LOSS_WANDERS for one in self.laws)
         hidden = [("walk", walk), ("monitor", len(self.moved))]
         return *list(UNITS)[:law], *(f"{n}_{k + 1}" for n, count in hidden for k in range(count))
 
@@ -230,7 +230,7 @@ class _Prepared(NamedTuple):
         own += [
             (law.seen.products, SETTLES if law.settles else WANDERS)
             for law in self.laws
-            if law.seen.walk is not None and not law.seen.walk.of_loss
+            if law.disturbance not in (None, LOSS_WANDERS)
         ]
         beside = np.concatenate([np.full(len(one.kinds), which) for one, which in own])
         matrix, log_prior = (
