@@ -203,6 +203,7 @@ def _inseparable(e: Evidence) -> Finding | None:
         f"of a in the loss {found.share:.2g} ± {found.share_error:.2g}), the lifetime at the mean "
         "current is determined. "
     )
+    told += f"{likely}. " if (likely := _disturbed(e)) else ""
     if e.apart:
         open_ = "An exponent of a and a drift of b leave them open: record farther, or give the "
         told += f"{open_}ring, the pressure, or --law constant. {_if_constant(e)}"
@@ -283,18 +284,25 @@ def _freely(e: Evidence) -> Finding | None:
         known = gas and math.isfinite(gas.after.value) and min(gas.a.value, gas.b.value) > 0
         said = f": {e.explained}" if known else ""
         return Finding(Status.converged, f"{told}. {likely}, which the errors contain{said}")
-    if e.free.settles > LIKELIER:
-        likely = f"A monitor that settles after a fill is likely ({percent(e.free.settles)})"
-        return Finding(Status.converged, f"{told}. {likely}, which the errors contain")
-    if e.free.wanders > LIKELIER:
-        chance = percent(e.free.wanders)
-        likely = f"The loss rate or the monitor wanders within the record ({chance})"
-        return Finding(Status.converged, f"{told}. {likely}, which the errors contain")
+    if likely := _disturbed(e):
+        return Finding(Status.converged, f"{told}. {likely}")
     if e.constant_a.status is Status.poor_fit:
         return Finding(Status.converged, f"{told}. {_departs(e)}, which the errors contain")
     gas = "" if e.free.drift is None else ", a drift of b and gas that is pumped away"
     open_ = f"with an exponent of a{gas} left open"
     return Finding(Status.converged, f"{told}, {open_}. {_if_constant(e)}")
+
+
+def _disturbed(e: Evidence) -> str:
+    """Name what goes by itself beside the law, if that is likelier than not."""
+    free, contained = e.free, "which the errors contain"
+    if free is not None and free.settles > LIKELIER:
+        likely = f"A monitor that settles after a fill is likely ({percent(free.settles)})"
+        return f"{likely}, {contained}"
+    if free is not None and free.wanders > LIKELIER:
+        likely = f"The loss rate or the monitor wanders within the record ({percent(free.wanders)})"
+        return f"{likely}, {contained}"
+    return ""
 
 
 def _departs(e: Evidence) -> str:
