@@ -220,8 +220,8 @@ class Sheet:
         Whether there is a layout: unknown columns are then ignored.
     skip : str
         What may be done about a row with something wrong in it, for messages.
-    optional : bool
-        Whether a person can say --columns and --ignore.
+    skip_bad : bool or None
+        Whether such rows are left out; None where nobody can say so, nor --columns and --ignore.
     """
 
     path: str | PathLike[str]
@@ -237,7 +237,7 @@ class Sheet:
     order: str = ""
     arranged: bool = False
     skip: str = ""
-    optional: bool = False
+    skip_bad: bool | None = None
 
     def __len__(self) -> int:
         return len(self.cells[0])
@@ -337,13 +337,17 @@ class Sheet:
         return replace(self.rows(keep), bad=tuple(errors))
 
     def good(self, check: Callable[[Sheet], object]) -> Sheet:
-        """Leave out the rows that a check of each row refuses, and keep what it said of them.
+        """Leave out the rows that a check of each row refuses, where a person asks for that.
+
+        What it said of them is kept.
 
         Raises
         ------
         InputError
             If no row is left: the first that was wrong.
         """
+        if not self.skip_bad:
+            return self
         keep: list[int] = []
         bad: list[InputError] = []
         waiting = [range(len(self))]
@@ -486,7 +490,7 @@ def columns_of(
         elif not aside:
             raise _twice(sheet, column.key, found[column.key].header, header)
     if unknown:
-        raise _not_understood(unknown) if sheet.optional else unknown[0]
+        raise unknown[0] if sheet.skip_bad is None else _not_understood(unknown)
     return found
 
 
@@ -496,7 +500,7 @@ def _twice(sheet: Sheet, key: str, first: str, header: str) -> InputError:
         expected = "a row for each shot, or names that differ"
         return sheet.header_error(f"{key} twice or more under one name", expected, header)
     expected = "one column for it, in one unit, and none twice"
-    expected += f"; --ignore '{header}' leaves this one unread" if sheet.optional else ""
+    expected += f"; --ignore '{header}' leaves this one unread" * (sheet.skip_bad is not None)
     named = sheet.called.get(first, first)
     return sheet.header_error(f"{key} also in column '{named}'", expected, header)
 

@@ -88,8 +88,7 @@ def read_run(
     for kind, word in (("u", "input"), ("y", "output")):
         if not kinds[kind]:
             raise sheet.header_error(f"no {word}", f"a column {kind}_…, or --{word} COLUMN")
-    if skip_bad:
-        sheet = sheet.good(lambda rows: _values(rows, columns, kinds))
+    sheet = sheet.good(lambda rows: _values(rows, columns, kinds))
     time, u, y = _values(sheet, columns, kinds)
     if time is None:
         if not step > 0:

@@ -499,21 +499,19 @@ def read_quad_scan(
             raise InputError("--columns for a file of emittance_gui", "none: it says them", path)
         return read_emittance_gui(path).scan()
     sheet = read_columns(path, "Q2_A,size_x_um", columns, ignore, skip_bad, MOST_ROWS)
-    return scan_of_sheet(sheet, skip_bad)
+    return scan_of_sheet(sheet)
 
 
-def scan_of_sheet(
-    sheet: Sheet, skip_bad: bool = False, knobs: Mapping[str, Column] | None = None
-) -> QuadScan:
+def scan_of_sheet(sheet: Sheet, knobs: Mapping[str, Column] = MappingProxyType({})) -> QuadScan:
     """Understand the columns of a sheet as a scan; knobs of the machine are settings, too."""
     profiles: tuple[Profile, ...] = ()
     if IMAGE in sheet.names:
         sheet = of_images(replace(sheet, skip=""))
     if {"counts_x", "counts_y"} & set(sheet.names):
         sheet, profiles = of_profiles(replace(sheet, skip=""))
-    columns = scan_columns(sheet, knobs or {})
+    columns = scan_columns(sheet, knobs)
     sheet = _without_dark(sheet, columns) if "shot" in columns else sheet
-    if skip_bad:
+    if sheet.skip_bad:
         sheet = sheet.good(lambda rows: _values(rows, columns))
         usual = _usual(_values(sheet, columns))
         sheet = sheet.good(
@@ -739,7 +737,7 @@ def read_tuning_scan(
         return _emittances(replace(sheet, skip=""), names, called)
     units = {knob: _unit(knob, header) for knob, header in called.items()}
     knobs = {f"setting {k}": Column(n, f"setting {k}", units[k]) for k, n in names.items()}
-    scan = scan_of_sheet(replace(sheet, arranged=True), skip_bad, knobs)
+    scan = scan_of_sheet(replace(sheet, arranged=True), knobs)
     return replace(scan, columns=scan.columns | called)
 
 

@@ -85,8 +85,8 @@ def read_columns(
         As `read_sheet`, and of what is said of columns.
     """
     layout = layout_of(columns)
-    sheet = read_sheet(path, example, most, ragged=skip_bad, names=layout.header or None)
-    sheet = replace(sheet, skip="" if skip_bad else SKIP, optional=True)
+    sheet = read_sheet(path, example, most, skip_bad=skip_bad, names=layout.header or None)
+    sheet = replace(sheet, skip="" if skip_bad else SKIP, skip_bad=skip_bad)
     return arranged(sheet.without(ignore), layout)
 
 
@@ -95,7 +95,7 @@ def read_sheet(
     example: str,
     most: int = MOST_ROWS,
     *,
-    ragged: bool | None = None,
+    skip_bad: bool | None = None,
     names: Sequence[str] | None = None,
 ) -> Sheet:
     """Read the columns of a CSV, TFS, SDDS, HDF5 or MATLAB file.
@@ -110,7 +110,7 @@ def read_sheet(
         A header such as the file should have, for messages.
     most : int
         Most rows there may be.
-    ragged : bool, optional
+    skip_bad : bool, optional
         Whether rows that have not as many cells as the header are left out, and named in ``bad``;
         None where nobody can ask for it.
     names : sequence of str, optional
@@ -145,14 +145,14 @@ def read_sheet(
         return _binary(path, most)
     if suffix == ".json":
         return _of_json(path, most)
-    return _read_text(path, example, most, ragged, names)
+    return _read_text(path, example, most, skip_bad, names)
 
 
 def _read_text(
     path: str | PathLike[str],
     example: str,
     most: int,
-    ragged: bool | None,
+    skip_bad: bool | None,
     names: Sequence[str] | None,
 ) -> Sheet:
     comments, rows, lines, bad, columns, notes = [], [], [], [], None, ()
@@ -177,10 +177,10 @@ def _read_text(
             lines += [] if wrong else [line]
             if len(rows) + len(bad) > least:
                 check_length(len(rows) + len(bad), least, path, line)
-            if bad and not ragged:
+            if bad and not skip_bad:
                 break
-    if bad and not (ragged and rows):
-        raise replace(bad[0], expected=bad[0].expected + SKIP * (ragged is False))
+    if bad and not (skip_bad and rows):
+        raise replace(bad[0], expected=bad[0].expected + SKIP * (skip_bad is False))
     if columns is None:
         rows, notes = with_points(rows, separator)
         columns = zip(*rows, strict=True) if rows else [()] * len(names)
