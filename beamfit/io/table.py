@@ -415,24 +415,14 @@ def header_at(lines: Sequence[str]) -> int:
     >>> header_at(["time,current", "1,2", "Q2_A,size_x_um"])
     0
     """
-    first: int | None = None
-    for i, text in enumerate(lines):
-        if _is_aside(text):
-            continue
-        cells = _words(text)
+    rows = [(i, _words(text)) for i, text in enumerate(lines) if not _is_aside(text)]
+    for i, cells in rows:
         if is_header(cells):
             return i
-        if first is None:
-            first = i
-        elif (
-            any(map(is_number, cells))
-            and is_value(cells[0])
-            and len(cells) == len(_words(lines[first]))
-        ):
+        below = i > rows[0][0] and len(cells) == len(rows[0][1])
+        if below and is_value(cells[0]) and any(map(is_number, cells)):
             break
-    if first is None or _has_rows(lines, first):
-        return first or 0
-    return next((i for i in range(first, len(lines)) if _has_rows(lines, i)), first)
+    return next((i for i, _ in rows if _has_rows(lines, i)), rows[0][0] if rows else 0)
 
 
 def _is_aside(text: str) -> bool:
