@@ -43,8 +43,6 @@ SILENCE = 30.0
 UNLIKE = (ArithmeticError, AttributeError, LookupError, RecursionError, TypeError, ValueError)
 # SHA-256 of what was last read whole, by path: a file may change after that.
 _READ: dict[str, str] = {}
-# Digests that are kept: those of a large batch, at 200 bytes each.
-MOST_KEPT = 10_000
 # Lines of a file, each with its number.
 Numbered = Iterator[tuple[int, str]]
 
@@ -251,8 +249,6 @@ def laid_out(
 def remember(path: str | PathLike[str], seen: Any) -> None:
     """Keep the digest of what was read of a file."""
     _READ[os.path.abspath(path)] = seen.hexdigest()
-    if len(_READ) > MOST_KEPT:
-        del _READ[next(iter(_READ))]
 
 
 def name_of(path: str | PathLike[str]) -> str:

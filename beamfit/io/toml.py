@@ -13,11 +13,12 @@ from typing import Any, NamedTuple
 from beamfit.errors import InputError, nearest
 from beamfit.io.files import digest, read_text
 
-# Parts of a key between dots.
-DEEPEST = 20
-DEEP = re.compile(rf"(?:[\w\"'-]+[ \t]*\.[ \t]*){{{DEEPEST}}}")
-# A whole number that no other program reads, and whose decimal digits Python does not write.
-LONG = re.compile(r"\b0[xob][0-9A-Fa-f_]{250,}")
+# A key whose parts between dots take tomllib minutes; a whole number that no other program reads,
+# and whose decimal digits Python does not write.
+ENDLESS = {
+    re.compile(r"(?:[\w\"'-]+[ \t]*\.[ \t]*){20}"): "a key of more than 20 parts",
+    re.compile(r"\b0[xob][0-9A-Fa-f_]{250,}"): "an integer of {} digits",
+}
 # Words of which all are named, and not the nearest.
 MOST_LISTED = 3
 REQUIRED: Any = object()
@@ -272,12 +273,10 @@ def read_toml(
     text = read_text(path)
     lines = tuple(text.splitlines())
     try:
-        if deep := DEEP.search(text):  # which takes tomllib minutes
-            line = text.count("\n", 0, deep.start()) + 1
-            raise ValueError(f"a key of more than {DEEPEST} parts (at line {line})")
-        if long := LONG.search(text):
-            line = text.count("\n", 0, long.start()) + 1
-            raise ValueError(f"an integer of {len(long[0]) - 2} digits (at line {line})")
+        for endless, said in ENDLESS.items():
+            if found := endless.search(text):
+                line = text.count("\n", 0, found.start()) + 1
+                raise ValueError(f"{said.format(len(found[0]) - 2)} (at line {line})")
         table = tomllib.loads(text)
     except (ValueError, RecursionError) as error:  # integers too long, nesting too deep
         if re.search(r"^[^#=\n]*\bsize_[xy]_", text, re.MULTILINE):
