@@ -405,7 +405,7 @@ class Interpreter:
                 )
 
     def _beam_command(self, statement: MadxStatement, given: dict[str, Attribute]) -> None:
-        sequence = word_of(given.pop("sequence")).lower() if "sequence" in given else ""
+        sequence = word_of(given.pop("sequence", None)).lower()
         if "bv" in given and self.number(given["bv"]) != 1.0:
             raise statement.error("a beam with BV = -1, which runs the other way", "BV = 1")
         beam = self.beams.setdefault(sequence, {})
@@ -416,12 +416,12 @@ class Interpreter:
         beam |= own
 
     def _resbeam_command(self, statement: MadxStatement, given: Mapping[str, Attribute]) -> None:
-        self.beams[word_of(given["sequence"]).lower() if "sequence" in given else ""] = {}
+        self.beams[word_of(given.get("sequence")).lower()] = {}
 
 
 ENERGIES = {"energy", "pc", "gamma", "beta", "brho"}
 
 
-def word_of(parameter: Attribute) -> str:
-    """The text of a parameter that is a word, without its quotes."""
-    return parameter.text.strip().strip("\"'").strip()
+def word_of(parameter: Attribute | None, default: str = "") -> str:
+    """The text of a parameter that is a word, without its quotes, if it is there."""
+    return default if parameter is None else parameter.text.strip().strip("\"'").strip()
