@@ -479,8 +479,8 @@ def columns_of(
         said = spelled(header)
         try:
             if (column := _known(said, quantities, sheet) or other(said)) is None:
-                usual = [f"{q}_{next(iter(UNITS[k]))}" if k else q for q, k in quantities.items()]
-                raise sheet.header_error("an unknown column", nearest(header, usual), header)
+                known = nearest(header, examples(quantities))
+                raise sheet.header_error("an unknown column", known, header)
         except InputError as error:
             own = sheet.called.get(header, header)
             unknown += [] if aside else [replace(error, column=own)]
@@ -492,6 +492,11 @@ def columns_of(
     if unknown:
         raise unknown[0] if sheet.skip_bad is None else _not_understood(unknown)
     return found
+
+
+def examples(quantities: Mapping[str, str]) -> list[str]:
+    """A header of each quantity of `columns_of`, with the first of its units."""
+    return [f"{q}_{next(iter(UNITS[kind]))}" if kind else q for q, kind in quantities.items()]
 
 
 def _twice(sheet: Sheet, key: str, first: str, header: str) -> InputError:

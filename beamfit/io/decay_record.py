@@ -308,20 +308,17 @@ def _forward(
 
 
 def _check_base(sheet: Sheet, column: Column, moment: np.ndarray) -> None:
-    latest, sheet = np.max(moment), replace(sheet, skip="")
-    if LATEST < latest < MILLISECONDS:
-        found = f"{latest:.6g} s since 1970, after the year 2050"
-        expected = (
-            "a date, or time from the start of the record: LabVIEW counts seconds from 1904, "
-        )
-        expected += "Excel days from 1899, MATLAB days from the year 0"
-        raise sheet.error(found, expected, int(np.argmax(moment)), column.header)
+    if (latest := np.max(moment)) <= LATEST:
+        return
+    found = f"{latest:.6g} s since 1970, after the year 2050"
+    expected = "a date, or time from the start of the record: LabVIEW counts seconds from 1904, "
+    expected += "Excel days from 1899, MATLAB days from the year 0"
     if latest >= MILLISECONDS:
         found = f"{latest:.6g} s, after the year 5000"
-        finer = [u for u in ("ms", "us", "ns") if UNITS["time"][u] * latest < MILLISECONDS]
+        finer = (u for u in ("ms", "us") if UNITS["time"][u] * latest < MILLISECONDS)
         header = sheet.called.get(column.header, column.header)
-        expected = f"the unit of the time: --columns '{header}=time_{(finer or ['ns'])[0]}'"
-        raise sheet.error(found, expected, int(np.argmax(moment)), column.header)
+        expected = f"the unit of the time: --columns '{header}=time_{next(finer, 'ns')}'"
+    raise replace(sheet, skip="").error(found, expected, int(np.argmax(moment)), column.header)
 
 
 def _lifetimes(sheet: Sheet) -> LifetimeTable:

@@ -24,6 +24,7 @@ from beamfit.io.columns import (
     Columns,
     Sheet,
     columns_of,
+    examples,
     ignored,
     known_unit,
     left_out,
@@ -53,9 +54,11 @@ QUANTITIES = {
     "screen": "",
     "slice": "",
 }
-# How the keys of settings begin, and what tells rows apart besides.
+# How the keys of settings begin; what a scan cannot do without, and how its keys begin.
 SETTING = "setting "
-SEEN = {"screen", "r11_x", "r11_y"}
+SIZE = "a beam size column, such as size_x_um"
+SEEN = "a magnet setting column, such as Q2_A, Q2_kG or Q2_k1, or a column screen"
+NEEDED = {SIZE: ("size_x", "size_y"), SEEN: (SETTING, "screen", "r11_")}
 CARRIED = re.compile(
     r"note_.*|comments?|charge[ _]?[\[(]?[np]C[\])]?|index|n[or]\.?|point|row|seq"
     r"|(date|(date[ _]?|elapsed[ _]?)?time([ _]?stamp)?|t)(_(h|m?s|min))?",
@@ -139,14 +142,9 @@ def scan_columns(
     columns = dict(knobs) | columns_of(
         sheet.only(rest) if knobs else sheet, QUANTITIES, lambda header: _other(header, sheet)
     )
-    if not {"size_x", "size_y"} & set(columns):
-        missing = "a beam size column, such as size_x_um"
-    elif not (any(key.startswith(SETTING) for key in columns) or SEEN & set(columns)):
-        missing = "a magnet setting column, such as Q2_A, Q2_kG or Q2_k1, or a column screen"
-    else:
-        missing = ""
-    if missing:
-        raise sheet.header_error("columns " + ", ".join(sheet.names), missing)
+    for needed, begin in NEEDED.items():
+        if not any(key.startswith(begin) for key in columns):
+            raise sheet.header_error("columns " + ", ".join(sheet.names), needed)
     for plane in "xy":
         _check_error(sheet, columns, plane)
         _check_elements(sheet, columns, plane)
@@ -211,14 +209,9 @@ def _other(header: str, sheet: Sheet) -> Column:
         name = bare
     if name and not re.match(r"(size|sigma|rms|fwhm)_[xy](_|$)", name):
         return Column(header, f"{SETTING}{name}", unit)
-    usual = [f"{q}_um" for q in QUANTITIES if q.startswith("size")]
-    usual += ["resolution_um", *ENERGY_KEYS, "energy_spread"]
-    usual += ["shot", "shots", "screen", "slice"]
-    raise sheet.header_error(
-        _not_understood(header),
-        f"a magnet with _A, _kG, _T_per_m or _k1 at the end, {nearest(header, usual)}",
-        header,
-    )
+    known = nearest(header, examples(QUANTITIES))
+    expected = f"a magnet with _A, _kG, _T_per_m or _k1 at the end, {known}"
+    raise sheet.header_error(_not_understood(header), expected, header)
 
 
 def likely_scan_name(header: str, cell: object = "") -> str | None:
