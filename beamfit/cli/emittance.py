@@ -55,11 +55,7 @@ Examples:
     choices=["size-squared", "size"],
     default="size-squared",
 )
-@option(
-    "--robust",
-    "Expect more bad readings: one in ten, instead of 3 %.",
-    is_flag=True,
-)
+@option("--robust", "Expect more bad readings: one in ten, instead of 3 %.", is_flag=True)
 @options("noise weights scenario prior bounds gain anchor")
 @option(
     "--systematics FILE",
