@@ -51,14 +51,15 @@ def named_of(
     found: dict[str, Any] = {}
     for text in texts:
         name, _, rest = (part.strip() for part in text.partition("="))
+        try:
+            value = read(rest)
+        except ValueError:
+            raise InputError(f"--{option} '{text}'", form) from None
         if not (name and rest):
             raise InputError(f"--{option} '{text}'", form)
         if name in found:
             raise InputError(f"--{option} {name} given twice", "each name once")
-        try:
-            found[name] = read(rest)
-        except ValueError:
-            raise InputError(f"--{option} '{text}'", form) from None
+        found[name] = value
     return found
 
 

@@ -54,11 +54,11 @@ QUANTITIES = {
     "screen": "",
     "slice": "",
 }
-# How the keys of settings begin; what a scan cannot do without, and how its keys begin.
+# How the keys of settings begin; what a scan cannot do without, and its keys.
 SETTING = "setting "
 SIZE = "a beam size column, such as size_x_um"
 SEEN = "a magnet setting column, such as Q2_A, Q2_kG or Q2_k1, or a column screen"
-NEEDED = {SIZE: ("size_x", "size_y"), SEEN: (SETTING, "screen", "r11_")}
+NEEDED = {SIZE: "size_[xy]", SEEN: rf"{SETTING}.*|screen|r11_[xy]"}
 CARRIED = re.compile(
     r"note_.*|comments?|charge[ _]?[\[(]?[np]C[\])]?|index|n[or]\.?|point|row|seq"
     r"|(date|(date[ _]?|elapsed[ _]?)?time([ _]?stamp)?|t)(_(h|m?s|min))?",
@@ -142,8 +142,8 @@ def scan_columns(
     columns = dict(knobs) | columns_of(
         sheet.only(rest) if knobs else sheet, QUANTITIES, lambda header: _other(header, sheet)
     )
-    for needed, begin in NEEDED.items():
-        if not any(key.startswith(begin) for key in columns):
+    for needed, keys in NEEDED.items():
+        if not any(re.fullmatch(keys, key) for key in columns):
             raise sheet.header_error("columns " + ", ".join(sheet.names), needed)
     for plane in "xy":
         _check_error(sheet, columns, plane)
