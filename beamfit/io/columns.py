@@ -317,13 +317,10 @@ class Sheet:
 
     def named(self) -> Sheet:
         """Leave out columns without a name, such as the index that pandas writes."""
-        left = [i for i, name in enumerate(self.names) if name and not name.startswith("Unnamed:")]
+        left = [name for name in self.names if name and not name.startswith("Unnamed:")]
         if len(left) in (0, len(self.names)):
             return self
-        names = tuple(self.names[i] for i in left)
-        note = "A column without a name was ignored."
-        cells = [self.cells[i] for i in left]
-        return replace(self, names=names, cells=cells, notes=(*self.notes, note))
+        return replace(self.only(left), notes=(*self.notes, "A column without a name was ignored."))
 
     def rows(self, keep: Sequence[int]) -> Sheet:
         """Some of the rows."""

@@ -10,6 +10,7 @@ from __future__ import annotations
 import re
 from bisect import bisect
 from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from os import PathLike
 from pathlib import Path
@@ -101,6 +102,14 @@ class MadxStatement(NamedTuple):
         expected = expected or "a file without it: run it in MAD-X, and SAVE the sequence"
         found = found or f"'{shown(self.text)}', which beamfit does not carry out"
         return InputError(found, expected, self.path, self.line)
+
+    @contextmanager
+    def read(self, expected: str) -> Iterator[None]:
+        """Name the statement's place where an expression in it has no value."""
+        try:
+            yield
+        except ValueError as error:
+            raise self.error(str(error), expected) from None
 
 
 def statements(text: str, path: str | PathLike[str], line: int = 1) -> Iterator[MadxStatement]:
@@ -261,23 +270,20 @@ class Interpreter:
                 taken = False
             holds = word == "else"
             if not holds and not taken:
-                holds = self._holds(statement, statement.text[len(word) :].strip())
+                with statement.read("a comparison of numbers"):
+                    holds = self.values.holds(statement.text[len(word) :].strip())
             if holds and not taken:
                 self.run(statement.block, statement.path, statement.line, block=True)
             self._taken = None if word == "else" else bool(taken or holds)
         elif word == "while":
             raise statement.error()
 
-    def _holds(self, statement: MadxStatement, text: str) -> bool:
-        try:
-            return self.values.holds(text)
-        except ValueError as error:
-            raise statement.error(str(error), "a comparison of numbers") from None
-
     def _one(self, statement: MadxStatement) -> None:
         text = statement.text
         if found := ASSIGNMENT.fullmatch(text):
-            self._assign(statement, *found.groups())
+            kind, name, equals, value = found.groups(default="")
+            with statement.read("an expression that MAD-X reads"):
+                self.values.assign(kind.lower(), name.lower(), equals == ":=", value.strip())
         elif found := ARROW.fullmatch(text):
             # Evaluated at once, as MAD-X does even after :=
             given = self._parameter(statement, False, found[3].strip())
@@ -289,14 +295,6 @@ class Interpreter:
             self._command(statement, found[1].lower(), found[2])
         else:
             raise statement.error()
-
-    def _assign(
-        self, statement: MadxStatement, kind: str, name: str, equals: str, text: str
-    ) -> None:
-        try:
-            self.values.assign((kind or "").lower(), name.lower(), equals == ":=", text.strip())
-        except ValueError as error:
-            raise statement.error(str(error), "an expression that MAD-X reads") from None
 
     def _set(self, statement: MadxStatement, name: str, given: Mapping[str, Attribute]) -> None:
         """Change parameters of an element; as in MAD-X, not of those derived from it."""
