@@ -43,6 +43,8 @@ SILENCE = 30.0
 UNLIKE = (ArithmeticError, AttributeError, LookupError, RecursionError, TypeError, ValueError)
 # SHA-256 of what was last read whole, by path: a file may change after that.
 _READ: dict[str, str] = {}
+# Digests that are kept: those of a large batch, at 200 bytes each.
+MOST_KEPT = 10_000
 # Lines of a file, each with its number.
 Numbered = Iterator[tuple[int, str]]
 
@@ -215,10 +217,8 @@ def read_json(path: str | PathLike[str], found: str, expected: str) -> Any:
         in itself than can be followed. An integer of hundreds of digits is infinite.
     """
     content = read_bytes(path, expected)
-    try:
+    with laid_out(path, found, expected):
         return json.loads(content, parse_int=lambda t: int(t) if len(t) < 300 else float(t))
-    except (ValueError, RecursionError):
-        raise InputError(found, expected, path=path) from None
 
 
 @contextmanager
@@ -249,6 +249,8 @@ def laid_out(
 def remember(path: str | PathLike[str], seen: Any) -> None:
     """Keep the digest of what was read of a file."""
     _READ[os.path.abspath(path)] = seen.hexdigest()
+    if len(_READ) > MOST_KEPT:
+        del _READ[next(iter(_READ))]
 
 
 def name_of(path: str | PathLike[str]) -> str:
