@@ -245,15 +245,14 @@ class Sheet:
     def __getitem__(self, name: str) -> Sequence[Any]:
         return self.cells[self.names.index(name)]
 
-    def error(
-        self, found: str, expected: str, row: int | None = None, column: str | None = None
-    ) -> InputError:
-        """Make the error that names the file, and the row and column if there are any."""
-        if row is not None and self.lines is None:
-            return self.error(f"reading {row + 1}: {found}", expected + self.skip, None, column)
-        line, skip = (None, "") if row is None else (self.lines[row], self.skip)
-        column = self.called.get(column, column)
-        return InputError(found, expected + skip, path=self.path, line=line, column=column)
+    def error(self, found: str, expected: str, row: int, column: str | None = None) -> InputError:
+        """Make the error that names the file, the row, and the column if it is one alone."""
+        line, column = None, self.called.get(column, column)
+        if self.lines is None:
+            found = f"reading {row + 1}: {found}"
+        else:
+            line = self.lines[row]
+        return InputError(found, expected + self.skip, path=self.path, line=line, column=column)
 
     def header_error(self, found: str, expected: str, column: str | None = None) -> InputError:
         """Make the error that names the header, and the column if it is one alone."""

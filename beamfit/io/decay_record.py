@@ -219,7 +219,7 @@ def _record(sheet: Sheet, offset: str | None) -> DecayRecord:
     rest = {key: column for key, column in columns.items() if key not in ("time", "nanos")}
     values = {key: sheet.values(column) for key, column in rest.items()}
     if len(moment) < 2:
-        raise sheet.error(f"{len(moment)} readings", "two or more")
+        raise InputError(f"{len(moment)} readings", "two or more", sheet.path)
     _check_base(sheet, columns["time"], moment)
     found = offset_of(offset, values["current"], sheet.path)
     values["current"] = values["current"] - found.value

@@ -412,7 +412,7 @@ def read_along(
         elif max(abs(at[0] - s[0]), abs(at[-1] - s[-1])) > 1e-3 * circumference:
             ends = f"s from {at[0]:.6g} to {at[-1]:.6g} m"
             expected = f"that of the optics, {s[0]:.6g} to {s[-1]:.6g} m"
-            raise sheet.error(ends, expected, None, "s_m")
+            raise sheet.header_error(ends, expected, "s_m")
         else:
             sides = [np.interp(s, at, side) for side in sides]
     from beamfit.lifetime.ring import Optics  # JAX from here on: the tables are in order
@@ -442,14 +442,13 @@ def _column(sheet: Sheet, name: str) -> np.ndarray:
 def _weights(sheet: Sheet, s: np.ndarray, circumference: float) -> np.ndarray:
     """Share of the ring for each point (trapezoid); the table covers the ring or a part 1/k."""
     steps = np.diff(s)
-    if s.size < 2 or np.any(steps < 0):
-        row = int(np.argmin(steps)) + 1 if s.size > 1 else None
-        raise sheet.error("s falls", "positions that rise", row, "s_m")
-    span = s[-1] - s[0]
+    if np.any(steps < 0):
+        raise sheet.error("s falls", "positions that rise", int(np.argmin(steps)) + 1, "s_m")
+    span = s[-1] - s[0] if s.size else 0.0
     parts = circumference / span if span > 0 else 0.0
     if abs(parts - max(1, round(parts))) > 1e-3 * parts:
         found = f"a table over {span:.6g} m"
         expected = f"the circumference of {circumference:.6g} m or a whole fraction of it"
-        raise sheet.error(found, expected, None, "s_m")
+        raise sheet.header_error(found, expected, "s_m")
     weight = (np.r_[steps, 0.0] + np.r_[0.0, steps]) / 2
     return weight / span

@@ -152,7 +152,7 @@ def scan_columns(
     if len(given) > 1:
         raise sheet.header_error("columns " + " and ".join(given), "one of them", given[1])
     if not len(sheet):
-        raise sheet.error("a header and no rows", "at least three settings")
+        raise sheet.header_error("a header and no rows", "at least three settings")
     return columns
 
 
@@ -651,7 +651,7 @@ def _check_sizes(
         column, error = columns[f"size_{plane}"], columns.get(f"size_{plane}_error")
         if plane not in usual:
             expected = f"sizes in {column.unit}"
-            raise sheet.error("no number at all", expected, None, column.header)
+            raise sheet.header_error("no number at all", expected, column.header)
         if not POSSIBLE[0] <= usual[plane] <= POSSIBLE[1]:
             raise _implausible(sheet, column, usual[plane] / column.factor)
         if error is None:
@@ -660,7 +660,7 @@ def _check_sizes(
             ratio = middle(values[f"size_{plane}_error"] / values[f"size_{plane}"])
         if not 1e-6 < ratio < 1.0:
             found = f"errors that are {ratio:g} of the sizes"
-            raise sheet.error(found, "errors in the unit of the header", None, error.header)
+            raise sheet.header_error(found, "errors in the unit of the header", error.header)
         if ratio < SMALLEST:
             said = f"Errors in {plane} are {ratio:.1g} of the sizes"
             notes.append(f"{said}: are both in the units of their headers?")
@@ -675,7 +675,7 @@ def _implausible(sheet: Sheet, column: Column, written: float) -> InputError:
     found = f"sizes around {written:g} {column.unit}, implausible for a beam"
     expected = f"sizes between {1e9 * POSSIBLE[0]:g} nm and {1e3 * POSSIBLE[1]:g} mm; if these are "
     expected += f"{likely}, rename the column {column.key}_{likely}"
-    return sheet.error(found, expected, None, column.header)
+    return sheet.header_error(found, expected, column.header)
 
 
 EMITTANCE = re.compile(r"(normalized_)?emittance_[xy]")
