@@ -146,13 +146,13 @@ class Section:
 
     def error(self, found: str, expected: str, key: str | None = None) -> InputError:
         """Make the error that names the line on which the key (or the table) stands."""
-        line = self.start + 1 if key is None else self._line(re.escape(key)) + 1
+        line = self.start + 1 if key is None else self._line(key) + 1
         return InputError(found, expected, path=self.path, line=line, column=key)
 
     def _line(self, key: str) -> int:
         """Find the line of `key =` before the next table, or of a table of that name."""
-        value = re.compile(rf"\s*['\"]?{key}['\"]?\s*=")
-        head = re.compile(rf"\s*\[\[?\s*{self.prefix}{key}\s*\]")
+        value = re.compile(rf"\s*['\"]?{re.escape(key)}['\"]?\s*[=.]")
+        head = re.compile(rf"\s*\[\[?\s*{re.escape(self.prefix + key)}\s*\]")
         inside = True
         for n in range(self.start, len(self.lines)):
             inside = inside and (n == self.start or not self.lines[n].lstrip().startswith("["))
@@ -171,8 +171,7 @@ class Section:
         table = self.table.get(name, {})
         if not isinstance(table, dict):
             raise self.error(f"{name} = {table!r}"[:80], f"a table [{name}]", name)
-        head = re.compile(rf"\s*\[?\s*({re.escape(self.prefix)})?{re.escape(name)}\b")
-        start = next((n for n, text in enumerate(self.lines) if head.match(text)), 0)
+        start = self._line(name)
         return Section(self.path, self.lines, table, start, f"in [{name}]", f"{name}.")
 
     def sections(self, name: str) -> list[Section]:
