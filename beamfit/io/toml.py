@@ -6,7 +6,7 @@ import math
 import re
 import tomllib
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, fields
 from os import PathLike
 from typing import Any, NamedTuple
 
@@ -107,6 +107,12 @@ class Key(NamedTuple):
         if self.kind is WHOLE:
             return int(value)
         return value * self.factor if self.kind in (NUMBER, NUMBERS) else value
+
+
+def keyed(name: str, default: Any = REQUIRED, **how: Any) -> Any:
+    """A field of a dataclass with the key of a table that gives it; see `Section.read`."""
+    given = {} if default is REQUIRED else {"default": default}
+    return field(**given, metadata={name: Key(default=default, **how)})
 
 
 def is_number(value: object) -> bool:
@@ -216,6 +222,22 @@ class Section:
             for name, key in keys.items()
             if key.field
         }
+
+    def read(self, kind: type[Any]) -> Any:
+        """Make a dataclass whose fields are `keyed`; checked as by `values`.
+
+        Examples
+        --------
+        >>> @dataclass
+        ... class Shot:
+        ...     wait: float = keyed("wait_s", low=0.0, said="a time above zero")
+        >>> Section("a.toml", (), {"wait_s": 2.5}).read(Shot)
+        Shot(wait=2.5)
+        """
+        own = [
+            (name, k._replace(field=f.name)) for f in fields(kind) for name, k in f.metadata.items()
+        ]
+        return kind(**self.values(dict(own)))
 
     def one_of(self, names: Iterable[str], hint: str = "") -> str:
         """The one of some keys that is given; a hint says what may stand for none.
