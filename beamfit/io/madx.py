@@ -264,17 +264,16 @@ class Interpreter:
 
     def _block(self, statement: MadxStatement, word: str, taken: bool | None) -> None:
         if word in ("if", "elseif", "else"):
-            if word != "if" and taken is None:
-                raise statement.error(f"{word.upper()} without IF", "IF (...) {...} before it")
             if word == "if":
                 taken = False
-            holds = word == "else"
-            if not holds and not taken:
+            elif taken is None:
+                raise statement.error(f"{word.upper()} without IF", "IF (...) {...} before it")
+            if not taken:
                 with statement.read("a comparison of numbers"):
-                    holds = self.values.holds(statement.text[len(word) :].strip())
-            if holds and not taken:
-                self.run(statement.block, statement.path, statement.line, block=True)
-            self._taken = None if word == "else" else bool(taken or holds)
+                    taken = word == "else" or self.values.holds(statement.text[len(word) :].strip())
+                if taken:
+                    self.run(statement.block, statement.path, statement.line, block=True)
+            self._taken = None if word == "else" else taken
         elif word == "while":
             raise statement.error()
 
