@@ -422,7 +422,10 @@ def header_at(lines: Sequence[str]) -> int:
         below = i > rows[0][0] and len(cells) == len(rows[0][1])
         if below and is_value(cells[0]) and any(map(is_number, cells)):
             break
-    return next((i for i, _ in rows if _has_rows(lines, i)), rows[0][0] if rows else 0)
+    for k, (i, cells) in enumerate(rows, start=1):
+        if _has_rows(cells, [row for _, row in rows[k:]]):
+            return i
+    return rows[0][0] if rows else 0
 
 
 def _is_aside(text: str) -> bool:
@@ -435,15 +438,11 @@ def is_value(cell: str) -> bool:
     return cell.lstrip("+-.")[:1].isdigit()
 
 
-def _has_rows(lines: Sequence[str], i: int) -> bool:
+def _has_rows(cells: Sequence[str], below: list[list[str]]) -> bool:
     """Tell a line of words that rows of as many cells follow, below its units perhaps."""
-    cells = _words(lines[i])
-    rows = [_words(text) for text in lines[i + 1 :] if not _is_aside(text)][:3]
-    if rows and units_below(rows[0]):
-        del rows[0]
-    alike = rows and all(len(row) == len(cells) and is_value(row[0]) for row in rows[:2])
-    words = not _is_aside(lines[i]) and not any(map(is_value, cells))
-    return bool(alike) and len(cells) > 1 and words
+    below = below[1:] if below and units_below(below[0]) else below
+    alike = all(len(row) == len(cells) and is_value(row[0]) for row in below[:2])
+    return bool(below) and alike and len(cells) > 1 and not any(map(is_value, cells))
 
 
 def uncommented(lines: Sequence[str]) -> list[str]:
