@@ -76,7 +76,10 @@ class _Option(click.Option):
 
 
 class Command(click.Command):
-    """A command whose help lists options under headings, in the order in which these come."""
+    """A command whose help lists options under headings, in the order in which these come.
+
+    Its function takes --json, --report and --full as one ``output``, an `Output`.
+    """
 
     def invoke(self, ctx: click.Context) -> Any:
         """Run the command; where it is silent for long, count the seconds."""
