@@ -194,11 +194,10 @@ def _with_units(
     for header, values in columns.items():
         name, unit = plain(header), units.get(header, "")
         own, known = unit_at_end(spelled(name)), known_unit(unit)
-        if unit.strip() in ("", "1", "none", "dimensionless"):
-            known = own
-        elif own is None:
+        said = unit.strip() not in ("", "1", "none", "dimensionless")
+        if said and own is None:
             name = named(name, known or unit)
-        elif known is None or known != own:
+        elif said and known != own:
             expected = f"one unit, {own} or the attribute's"
             raise InputError(f"the attribute units = '{unit}'", expected, path, column=name)
         found[name] = values
