@@ -19,7 +19,6 @@ import beamfit
 from beamfit.dynamics.fedbatch import identify_batches, rank_inputs
 from beamfit.dynamics.feed import best_feed, predict
 from beamfit.io.run import read_run
-from beamfit.report.dynamics import draw_ranking
 
 PLACE = Path(__file__).resolve().parents[1] / "measurements"
 START, REST = (1.0, 8.0, 4.0, 0.0), {"feed_substrate": 200.0, "air": 1.0}
@@ -71,7 +70,9 @@ def main() -> None:
         beamfit.write_report(Path(sys.argv[1]) / f"{name}.html", result)
     if sys.argv[1:]:
         figure = Figure(figsize=(6, 4), layout="constrained")
-        draw_ranking(ranked, figure)
+        axes, order = figure.subplots(), ranked[::-1]
+        axes.barh([each.name for each in order], [each.correlation for each in order])
+        axes.set_xlabel("nonlinear correlation, sqrt(1 - exp(-2 I))")
         figure.savefig(Path(sys.argv[1]) / "ranking.png", dpi=150)
 
 

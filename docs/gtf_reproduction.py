@@ -42,8 +42,7 @@ from beamfit.report.document import (
     ReportPage,
     Verdict,
     html_of,
-    provenance,
-    written,
+    written_now,
 )
 from beamfit.writing import write_atomically
 
@@ -166,17 +165,17 @@ def reproduction_page(
     found: Reproduction, command: str, inputs: Mapping[str, str | None]
 ) -> ReportPage:
     """Lay the page out."""
-    return ReportPage(
+    page = ReportPage(
         title="Gun Test Facility: Table 2 and figures 19 to 25 of the PUNDA report",
         subtitle="On a SIMULATED scan: the report's 14 measured points were never published. "
-        f"The simulation's true beam is Table 2, row 1, with 2 % errors; {written()}",
+        "The simulation's true beam is Table 2, row 1, with 2 % errors",
         verdicts=_verdicts(found),
         tables=[_table_2(found), _beams(found), _slopes(found), _figures_table()],
         pictures=_pictures(found),
         pictures_title="Figures 19 to 25, on the simulated scan",
-        provenance=provenance(inputs, [], command),
         notes=found.known.scan.provenance,
     )
+    return written_now(page, command, inputs)
 
 
 def _verdicts(found: Reproduction) -> list[Verdict]:

@@ -10,7 +10,7 @@ import click
 
 import beamfit
 from beamfit.answer import Table
-from beamfit.cli.options import Command, answered, command_line, option, options
+from beamfit.cli.options import Command, Output, command_line, option, options
 from beamfit.errors import InputError
 from beamfit.writing import check_place
 
@@ -62,8 +62,7 @@ def batch(
     noise: str | None,
     weights: str,
     lattice: str | None,
-    report: str | None,
-    as_json: bool,
+    output: Output,
     **told: Any,
 ) -> None:
     """Answer for many scans or records, each as by itself, in one row an answer.
@@ -81,7 +80,7 @@ def batch(
     if learned is not None:
         check_place(learned)
     job = beamfit.Job(kind, lattice, part, reading, weights, noise=noise)
-    with _progress(shown=not as_json) as progress:
+    with _progress(shown=not output.as_json) as progress:
         found = beamfit.run_batch(
             path, out, job, workers=workers, scheduler=scheduler, progress=progress
         )
@@ -90,16 +89,16 @@ def batch(
 
         write_noise(learned, job.learned_noise(found.files))
     # The table is read again only where somebody looks at it.
-    courses = [] if as_json and report is None else courses_of(found, quantity)
-    if report is not None:
+    courses = [] if output.as_json and output.report is None else courses_of(found, quantity)
+    if output.report is not None:
         from beamfit.report.batch import write_batch_report
 
-        write_batch_report(report, found, courses, command_line())
+        write_batch_report(output.report, found, courses, command_line())
     inputs = {} if lattice is None else {lattice: job.lattice_sha256}
     results = {"table": out, "files": len(found.files), "new": found.new}
     results |= {"statuses": found.statuses, "unusable": found.refused}
     summary = summary_of(courses) if courses else None
-    answered(as_json, [results], inputs, lambda t: _show(t, found, out, summary), report)
+    output.answer([results], inputs, lambda t: _show(t, found, out, summary))
 
 
 def _check_kind(kind: str, of_scans: dict[str, Any]) -> None:

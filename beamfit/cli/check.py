@@ -9,7 +9,7 @@ import click
 
 import beamfit
 from beamfit.answer import text_of
-from beamfit.cli.options import Command, command_line, options
+from beamfit.cli.options import Command, Output, command_line, options
 from beamfit.errors import InputError
 from beamfit.io.check import Understood, proposed_layout, with_lattice
 from beamfit.io.columns import Layout
@@ -25,7 +25,7 @@ Examples:
 @click.command(cls=Command, epilog=EXAMPLE)
 @click.argument("files", nargs=-1, required=True, metavar="FILE...")
 @options("columns ignore skip-bad use energy json")
-def check(files: tuple[str, ...], as_json: bool, **reading: Any) -> None:
+def check(files: tuple[str, ...], output: Output, **reading: Any) -> None:
     """Say what is understood of scans, lattices, records, rings, runs and formulations.
 
     Of each FILE the kind, the rows, the magnets and their units, the range of the sizes and where
@@ -44,7 +44,7 @@ def check(files: tuple[str, ...], as_json: bool, **reading: Any) -> None:
             layouts += filter(None, [_proposed(path, reading["columns"])])
     lattices = [each for each in found if each.kind == "lattice"]
     found = [_on_all(each, lattices) if each.kind == "scan" else each for each in found]
-    if as_json:
+    if output.as_json:
         said: list[Any] = [*found]
         said += [{"file": path, "kind": None, "error": str(error)} for path, error in wrong]
         inputs = {each.path: each.sha256 for each in found}

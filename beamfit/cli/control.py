@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 import click
 
 import beamfit
-from beamfit.cli.option_text import gains_of
-from beamfit.cli.options import Command, answered, option, options, reported
+from beamfit.cli.option_text import gains_of, named_of
+from beamfit.cli.options import Command, Output, option, options
 from beamfit.errors import InputError
 from beamfit.io.files import digest
 from beamfit.io.run import read_run
@@ -26,6 +26,7 @@ Examples:
 """
 READING = ("columns", "inputs", "outputs", "step", "ignore", "skip_bad")
 TARGET = "OUTPUT=VALUE or OUTPUT=VALUE@SECONDS such as level=2.5@60"
+RATE = "INPUT=PER_SECOND such as valve=0.2"
 LIMIT = "NAME=LOW:HIGH, one of them may be left out, such as level=:3"
 
 
@@ -62,8 +63,7 @@ def control(
     limit: tuple[str, ...],
     rate: tuple[str, ...],
     disturb: tuple[str, ...],
-    report: str | None,
-    as_json: bool,
+    output: Output,
     **told: Any,
 ) -> None:
     """Control a process: identify it, plan its inputs within limits, and simulate the loop.
@@ -73,14 +73,17 @@ def control(
     can keep them; what cannot be kept is named.
     """
     targets, loads = _steps(targets, "set"), _steps(disturb, "disturb")
-    told |= {"limits": gains_of(limit, "limit", LIMIT), "rates": _rates(rate)}
+    told |= {
+        "limits": gains_of(limit, "limit", LIMIT),
+        "rates": named_of(rate, "rate", RATE, float),
+    }
     reading = {n: told.pop(n) for n in READING}
     runs = [read_run(path, **reading) for path in record]
     told |= {"offset": not no_offset, "disturbances": loads}
     loop = beamfit.control(runs, targets, **told)  # JAX from here on
     digests = {path: digest(path) for path in record}
-    reported(report, loop, digests)
-    answered(as_json, [loop], digests, lambda terminal: _show(terminal, loop), report)
+    output.write(loop, digests)
+    output.answer([loop], digests, lambda terminal: _show(terminal, loop))
 
 
 def _steps(texts: tuple[str, ...], option: str) -> list[tuple[str, float, float]]:
@@ -93,17 +96,6 @@ def _steps(texts: tuple[str, ...], option: str) -> list[tuple[str, float, float]
             found.append((name.strip(), float(value), float(at or 0.0)))
         except ValueError:
             raise InputError(f"--{option} '{text}'", TARGET) from None
-    return found
-
-
-def _rates(texts: tuple[str, ...]) -> dict[str, float]:
-    found = {}
-    for text in texts:
-        name, _, value = text.partition("=")
-        try:
-            found[name.strip()] = float(value)
-        except ValueError:
-            raise InputError(f"--rate '{text}'", "INPUT=PER_SECOND such as valve=0.2") from None
     return found
 
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from beamfit.cli.options import Command, answered, options, reported
+from beamfit.cli.options import Command, Output, options
 from beamfit.errors import InputError
 from beamfit.io.line import build_line, read_inputs
 from beamfit.io.priors import read_noise
@@ -25,9 +25,7 @@ Examples:
     "scan columns ignore skip-bad size-method maybe-lattice use from to screen energy particle"
 )
 @options("noise seed report json")
-def density(
-    scan: str, noise: str | None, seed: int, report: str | None, as_json: bool, **given: Any
-) -> None:
+def density(scan: str, noise: str | None, seed: int, output: Output, **given: Any) -> None:
     """Find the density of a beam in phase space, and its emittance against charge, with errors.
 
     SCAN is a .mat file of SLAC's emittance_gui, or a CSV or HDF5 table with a line for each bin of
@@ -46,5 +44,5 @@ def density(
 
     fit = fit_density(read.scan, line, noise=own, seed=seed)
     fit = fit if read.gui is None else replace(fit, stored=read.gui.stored)
-    reported(report, fit, read.digests)
-    answered(as_json, [fit], read.digests, report=report)
+    output.write(fit, read.digests)
+    output.answer([fit], read.digests)

@@ -9,7 +9,7 @@ import click
 import beamfit
 from beamfit.answer import text_of
 from beamfit.cli.option_text import energies_of
-from beamfit.cli.options import Command, answered, option, options
+from beamfit.cli.options import Command, Output, option, options
 from beamfit.emittance.assumptions import Assumptions
 from beamfit.io.line import build_line, read_inputs
 from beamfit.io.priors import read_noise
@@ -51,7 +51,7 @@ def design(
     criterion: str,
     goal: float | None,
     count: int,
-    as_json: bool,
+    output: Output,
     **told: Any,
 ) -> None:
     """Say which settings to measure next, given what is measured, and when to stop.
@@ -73,7 +73,7 @@ def design(
     wanted = {"criterion": criterion, "goal": goal, "count": count, "energies": others}
     advice = beamfit.design(fit, limits=limits or None, **wanted)
     title = f"{fit.scan.name} on {fit.line.name}"
-    answered(as_json, [advice], read.digests, lambda terminal: _show(terminal, advice, title))
+    output.answer([advice], read.digests, lambda terminal: _show(terminal, advice, title))
 
 
 def _show(terminal: Terminal, advice: Advice, title: str) -> None:

@@ -9,7 +9,7 @@ import click
 
 import beamfit
 from beamfit.answer import Table, determined, labelled
-from beamfit.cli.options import Command, Sampling, answered, option, options, reported
+from beamfit.cli.options import Command, Output, Sampling, option, options
 from beamfit.emittance.assumptions import Assumptions
 from beamfit.errors import InputError
 from beamfit.io.line import build_line, read_inputs
@@ -55,11 +55,7 @@ Examples:
     choices=["size-squared", "size"],
     default="size-squared",
 )
-@option(
-    "--robust",
-    "Expect more bad readings: one in ten, instead of 3 %.",
-    is_flag=True,
-)
+@option("--robust", "Expect more bad readings: one in ten, instead of 3 %.", is_flag=True)
 @options("noise weights scenario prior bounds gain anchor")
 @option(
     "--systematics FILE",
@@ -85,9 +81,7 @@ def emittance(
     known: str | None,
     sample: bool,
     store: str | None,
-    report: str | None,
-    full: bool,
-    as_json: bool,
+    output: Output,
     **told: Any,
 ) -> None:
     """Fit the emittance to a quadrupole scan and say whether to believe it.
@@ -124,23 +118,18 @@ def emittance(
         from beamfit.emittance.slices import fit_slices
 
         fits = fit_slices(measured, line, **told)
-        reported(report, fits, inputs)
+        output.write(fits, inputs)
         results = (entry for fit in fits for entry in results_of(fit))
-        answered(
-            as_json, results, inputs, lambda terminal: _show_slices(terminal, fits), report, full
-        )
+        output.answer(results, inputs, lambda terminal: _show_slices(terminal, fits))
         return
     fit = beamfit.fit_emittance(measured, line, **told)
     methods = () if gui is None else compared(gui, line, planes)
-    (posterior,) = sampling.drawn([fit], inputs, quiet=as_json)
-    reported(report, fit, inputs, posterior=posterior, methods=methods)
-    answered(
-        as_json,
+    (posterior,) = sampling.drawn([fit], inputs, quiet=output.as_json)
+    output.write(fit, inputs, posterior=posterior, methods=methods)
+    output.answer(
         results_of(fit, methods),
         inputs,
         lambda terminal: show(terminal, fit, posterior, methods),
-        report,
-        full,
         posterior=posterior,
     )
 
@@ -154,12 +143,10 @@ def _show_slices(terminal: Terminal, fits: SliceFits) -> None:
     for note in fits.notes:
         terminal.line(note)
     terminal.line()
-    for table in fits.tables():
-        terminal.table(table if terminal.full else _without(table, ("status", "chi2/dof")))
-        terminal.line()
+    left = () if terminal.full else ("status", "chi2/dof")
+    terminal.tables(_without(table, left) for table in fits.tables())
     _about_the_input(terminal, fits, ())
-    if not terminal.full:
-        terminal.line("All columns: --full. A page with pictures: --report FILE.html.", style="dim")
+    terminal.rest("columns")
 
 
 def _without(table: Table, names: tuple[str, ...]) -> Table:
@@ -259,15 +246,13 @@ def _show_briefly(terminal: Terminal, fit: EmittanceFit) -> None:
         terminal.line(f"Largest systematic, not in the error: {said}.")
     for words in fit.null_directions:
         terminal.line(f"Not determined: {words}.")
-    terminal.line("All tables: --full. A page with pictures: --report FILE.html.", style="dim")
+    terminal.rest()
 
 
 def _about_the_input(
     terminal: Terminal, fit: EmittanceFit | SliceFits, methods: tuple[SizeMethods, ...]
 ) -> None:
     """Say what other sizes give, and where the errors are from."""
-    for way in methods:
-        terminal.table(way.table())
-        terminal.line()
+    terminal.tables(way.table() for way in methods)
     errors = fit.scan.error_source if fit.scan.error else "inferred from the residuals"
     terminal.line(f"Errors of the sizes: {errors}.", style="dim")

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 import beamfit
-from beamfit.cli.options import Command, answered, option, options, reported
+from beamfit.cli.options import Command, Output, option, options
 from beamfit.commands import check_model
 from beamfit.errors import InputError
 from beamfit.io.files import digest
@@ -48,9 +48,7 @@ def identify(
     hidden: int,
     hold_back: tuple[str, ...],
     seed: int,
-    report: str | None,
-    full: bool,
-    as_json: bool,
+    output: Output,
     **reading: Any,
 ) -> None:
     """Identify how the outputs of a process respond to its inputs.
@@ -71,8 +69,8 @@ def identify(
     settings |= {"hidden": hidden, "seed": seed, "held": held}
     fits = beamfit.identify(runs, model, map, **settings)  # JAX from here on
     digests = {path: digest(path) for path in (*record, *hold_back)}
-    reported(report, fits, digests)
-    answered(as_json, fits, digests, lambda terminal: _show(terminal, fits), report, full)
+    output.write(fits, digests)
+    output.answer(fits, digests, lambda terminal: _show(terminal, fits))
 
 
 def _show(terminal: Terminal, fits: tuple[ResponseFit | StatesFit | FedBatchFit, ...]) -> None:
@@ -84,13 +82,8 @@ def _show(terminal: Terminal, fits: tuple[ResponseFit | StatesFit | FedBatchFit,
         terminal.answer(fit.headline, fit.status, fit.message)
         terminal.line()
         numbers, *curves = fit.tables()
-        terminal.table(numbers)
-        terminal.line()
-        for curve in curves:
-            terminal.table(curve if terminal.full else _ends(curve))
-            terminal.line()
-    if not terminal.full:
-        terminal.line("All tables: --full. A page with pictures: --report FILE.html.", style="dim")
+        terminal.tables([numbers, *(curves if terminal.full else map(_ends, curves))])
+    terminal.rest()
 
 
 def _ends(curve: Table) -> Table:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 import beamfit
-from beamfit.cli.options import Command, Sampling, answered, option, options, reported
+from beamfit.cli.options import Command, Output, Sampling, option, options
 from beamfit.commands import machine_of
 from beamfit.errors import InputError
 from beamfit.io.decay_record import monitor_of, read_lifetime_input
@@ -100,9 +100,7 @@ def lifetime(
     sample: bool,
     store: str | None,
     seed: int,
-    report: str | None,
-    full: bool,
-    as_json: bool,
+    output: Output,
     **reading: Any,
 ) -> None:
     """Fit the lifetime to decay records and say what they cannot tell.
@@ -126,12 +124,12 @@ def lifetime(
     inputs = {path: digest(path) for path in (*record, ring) if path is not None}
 
     tables = [each for each in records if isinstance(each, LifetimeTable)]
-    with_more = sample or study or trend or report or ring or monitor
+    with_more = sample or study or trend or output.report or ring or monitor
     if tables and (len(tables) < len(records) or with_more):
         expected = "tables of lifetimes by themselves, with no option but --json"
         raise InputError("a table of lifetimes", expected, path=tables[0].name)
     if tables:
-        _lifetimes(tables, inputs, as_json)
+        _lifetimes(tables, inputs, output)
         return
 
     if monitor is not None:
@@ -141,28 +139,25 @@ def lifetime(
     single = [decay for each in studies for decay in each.decays or each.pooled]
     shift = beamfit.study_shift(single, machine, 0, network, priors) if study else None
     course = beamfit.trend(studies, machine) if trend else None
-    drawn = sampling.drawn([decay.fit for decay in decays], inputs, quiet=as_json)
+    drawn = sampling.drawn([decay.fit for decay in decays], inputs, quiet=output.as_json)
     posteriors = drawn if sample else None
-    reported(report, studies, inputs, posterior=posteriors, shift=shift, trend=course)
-    answered(
-        as_json,
+    output.write(studies, inputs, posterior=posteriors, shift=shift, trend=course)
+    output.answer(
         (
             decay.to_json() | ({"posterior": posterior} if sample else {})
             for decay, posterior in zip(decays, drawn, strict=True)
         ),
         inputs,
         lambda terminal: _show(terminal, studies, posteriors, shift, course),
-        report,
-        full,
         study=shift,
         trend=course,
     )
 
 
-def _lifetimes(tables: list[LifetimeTable], inputs: dict[str, str], as_json: bool) -> None:
+def _lifetimes(tables: list[LifetimeTable], inputs: dict[str, str], output: Output) -> None:
     """Fit and show tables of lifetimes."""
     fits = [beamfit.fit_lifetimes(table) for table in tables]
-    answered(as_json, fits, inputs, lambda terminal: _show_lifetimes(terminal, fits))
+    output.answer(fits, inputs, lambda terminal: _show_lifetimes(terminal, fits))
 
 
 def _show_lifetimes(terminal: Terminal, fits: list[LifetimeFit]) -> None:
@@ -212,8 +207,7 @@ def _show(
         terminal.table(table if terminal.full else table.quoted())
     for table in () if trend is None else trend.tables():
         terminal.table(table, wrap=False)
-    if not terminal.full:
-        terminal.line("All tables: --full. A page with pictures: --report FILE.html.", style="dim")
+    terminal.rest()
 
 
 def _show_record(terminal: Terminal, study: RecordStudy) -> None:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable
+from typing import Any
 
 from beamfit.emittance.assumptions import Anchor
 from beamfit.emittance.targets import Target
@@ -37,6 +38,31 @@ def _deviation(text: str, mean: float) -> float:
     return _fraction(text) * (abs(mean) if "%" in text else 1.0)
 
 
+def named_of(
+    texts: Iterable[str], option: str, form: str, read: Callable[[str], Any] = str
+) -> dict[str, Any]:
+    """Read NAME=VALUE, each name once.
+
+    Examples
+    --------
+    >>> named_of(["valve=0.2"], "rate", "INPUT=PER_SECOND", float)
+    {'valve': 0.2}
+    """
+    found: dict[str, Any] = {}
+    for text in texts:
+        name, _, rest = (part.strip() for part in text.partition("="))
+        try:
+            value = read(rest)
+        except ValueError:
+            raise InputError(f"--{option} '{text}'", form) from None
+        if not (name and rest):
+            raise InputError(f"--{option} '{text}'", form)
+        if name in found:
+            raise InputError(f"--{option} {name} given twice", "each name once")
+        found[name] = value
+    return found
+
+
 def _pairs(
     texts: Iterable[str],
     option: str,
@@ -45,20 +71,12 @@ def _pairs(
     second: Callable[[str, float], float] = lambda text, first: float(text),
 ) -> dict[str, tuple[float, float]]:
     """Read NAME=A<separator>B, each name once."""
-    found: dict[str, tuple[float, float]] = {}
-    for text in texts:
-        name, _, rest = text.partition("=")
-        try:
-            left, right = re.split(separator, rest)
-            pair = float(left), second(right, float(left))
-        except ValueError:
-            raise InputError(f"--{option} '{text}'", form) from None
-        if not (name := name.strip()):
-            raise InputError(f"--{option} '{text}'", form)
-        if name in found:
-            raise InputError(f"--{option} {name} given twice", "each number once")
-        found[name] = pair
-    return found
+
+    def pair(text: str) -> tuple[float, float]:
+        left, right = re.split(separator, text)
+        return float(left), second(right, float(left))
+
+    return named_of(texts, option, form, pair)
 
 
 def priors_of(texts: Iterable[str]) -> dict[str, tuple[float, float]]:

@@ -76,10 +76,15 @@ class _Option(click.Option):
 
 
 class Command(click.Command):
-    """A command whose help lists options under headings, in the order in which these come."""
+    """A command whose help lists options under headings, in the order in which these come.
+
+    Its function takes --json, --report and --full as one ``output``, an `Output`.
+    """
 
     def invoke(self, ctx: click.Context) -> Any:
         """Run the command; where it is silent for long, count the seconds."""
+        given = {n: ctx.params.pop(n) for n in Output._fields if n in ctx.params}
+        ctx.params["output"] = Output(**given)
         ctx.obj = None if self.name in TALKING else Waiting(f"beamfit {self.name}")
         try:
             return super().invoke(ctx)
@@ -349,42 +354,45 @@ class Sampling(NamedTuple):
         return [fit.sample(**told, progress=not quiet) for fit in fits]
 
 
-def reported(
-    path: str | None, result: Any, inputs: Mapping[str, str | None], **further: Any
-) -> None:
-    """Write the report of a result, if one is wanted."""
-    if path is not None:
-        beamfit.write_report(path, result, command=command_line(), inputs=inputs, **further)
+class Output(NamedTuple):
+    """Values of --json, --report and --full: where an answer goes."""
 
+    as_json: bool
+    report: str | None = None
+    full: bool = True
 
-def answered(
-    as_json: bool,
-    results: Iterable[Any],
-    inputs: Mapping[str, str | None],
-    show: Callable[[Terminal], None] | None = None,
-    report: str | None = None,
-    full: bool = True,
-    **further: Any,
-) -> None:
-    """Print the one JSON object of a command, or have the answer shown, and where its report is.
+    def write(self, result: Any, inputs: Mapping[str, str | None], **further: Any) -> None:
+        """Write the report of a result, if one is wanted."""
+        if self.report is not None:
+            further |= {"command": command_line(), "inputs": inputs}
+            beamfit.write_report(self.report, result, **further)
 
-    Without ``show`` each result shows itself. Results are asked for if they are printed; what there
-    is ``further`` is named beside them.
-    """
-    ended()
-    if as_json:
-        further = {name: found for name, found in further.items() if found is not None}
-        click.echo(results_text(list(results), inputs, command_line(), **further))
-        return
-    from beamfit.cli.show import Terminal  # rich
+    def answer(
+        self,
+        results: Iterable[Any],
+        inputs: Mapping[str, str | None],
+        show: Callable[[Terminal], None] | None = None,
+        **further: Any,
+    ) -> None:
+        """Print the one JSON object of a command, or show the answer, and where its report is.
 
-    terminal = Terminal(full)
-    if show is None:
-        for each in results:
-            terminal.result(each)
-    else:
-        show(terminal)
-    terminal.report(report)
+        Without ``show`` each result shows itself. Results are asked for if they are printed; what
+        there is ``further`` is named beside them.
+        """
+        ended()
+        if self.as_json:
+            further = {name: found for name, found in further.items() if found is not None}
+            click.echo(results_text(list(results), inputs, command_line(), **further))
+            return
+        from beamfit.cli.show import Terminal  # rich
+
+        terminal = Terminal(self.full)
+        if show is None:
+            for each in results:
+                terminal.result(each)
+        else:
+            show(terminal)
+        terminal.report(self.report)
 
 
 def command_line() -> str:

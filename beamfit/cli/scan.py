@@ -15,7 +15,7 @@ import click
 
 import beamfit
 from beamfit.answer import cell
-from beamfit.cli.options import Command, answered, command_line, option, options, reported
+from beamfit.cli.options import Command, Output, command_line, option, options
 from beamfit.errors import InputError, Status, plain
 from beamfit.io.files import digest
 from beamfit.io.line import build_line, read_inputs
@@ -52,8 +52,7 @@ def scan(
     journal: str | None,
     goal: float | None,
     points: int | None,
-    report: str | None,
-    as_json: bool,
+    output: Output,
 ) -> int:
     """Scan a machine's quadrupoles and fit the emittance, choosing each setting by what it tells.
 
@@ -63,11 +62,11 @@ def scan(
     """
     if (machine is None) == (recover is None):
         raise InputError("both or neither of MACHINE and --recover", "one of them")
-    say = _Lines(err=as_json)
+    say = _Lines(err=output.as_json)
     if recover is not None:
-        if dry_run or save or journal or goal or points or report:
+        if dry_run or save or journal or goal or points or output.report:
             raise InputError("--recover with an option of a scan", "--recover JOURNAL alone")
-        return _recovered(recover, say, as_json)
+        return _recovered(recover, say, output.as_json)
     wanted = {"goal": goal, "points": points}
     told = replace(read_scan_machine(machine), **{k: v for k, v in wanted.items() if v})
 
@@ -76,10 +75,10 @@ def scan(
 
     place = journal_of(told, journal)
     if dry_run:
-        return run(_planned(told, place, as_json))
+        return run(_planned(told, place, output.as_json))
     target = Path(save or time.strftime(f"{_word(told.name)}_%Y%m%d_%H%M%S.csv"))
     found = beamfit.scan_machine(told, target, journal=journal, tell=say.told, note=say)
-    return _answered(found, told, target, report, as_json)
+    return _answered(found, told, target, output)
 
 
 class _Lines:
@@ -175,9 +174,7 @@ async def _planned(machine: ScanMachine, journal: Path, as_json: bool) -> int:
     return 0
 
 
-def _answered(
-    found: Outcome, machine: ScanMachine, out: Path, report: str | None, as_json: bool
-) -> int:
+def _answered(found: Outcome, machine: ScanMachine, out: Path, output: Output) -> int:
     """Answer as `beamfit emittance` would for the file, and say how the scan ended."""
     from beamfit.cli.emittance import results_of, show
     from beamfit.cli.tune import show_tuning
@@ -198,7 +195,7 @@ def _answered(
     if found.fit is None:
         few = f"The scan ended: {found.reason}; too few points for a fit."
         few += f" It is in {out}." if found.points else ""
-        answered(as_json, [], inputs, lambda terminal: click.echo(few), scan=said)
+        output._replace(report=None).answer([], inputs, lambda terminal: click.echo(few), scan=said)
     else:
         if machine.knobs:
             results, shown, fit = [found.fit], partial(show_tuning, fit=found.fit), found.fit
@@ -206,12 +203,12 @@ def _answered(
             measured, described, _ = read_inputs(str(out), machine.lattice)
             fit = beamfit.fit_emittance(measured, build_line(described))
             results, shown = results_of(fit), partial(show, fit=fit)
-        reported(report, fit, inputs)
-        if not as_json:
+        output.write(fit, inputs)
+        if not output.as_json:
             click.echo(
                 f"The scan ended: {found.reason}. It is in {out}. {found.doubt}".rstrip() + "\n"
             )
-        answered(as_json, results, inputs, shown, report, scan=said)
+        output.answer(results, inputs, shown, scan=said)
     return 128 + found.signal if found.signal else 0
 
 

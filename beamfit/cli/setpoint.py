@@ -11,7 +11,7 @@ import numpy as np
 import beamfit
 from beamfit.answer import text_of
 from beamfit.cli.option_text import target_of
-from beamfit.cli.options import Command, answered, option, options
+from beamfit.cli.options import Command, Output, option, options
 from beamfit.emittance.targets import Beam, Target, common_energy
 from beamfit.errors import InputError, located
 from beamfit.io.files import digest
@@ -59,7 +59,7 @@ def setpoint(
     limits: dict[str, tuple[float, float]],
     target: tuple[str, ...],
     plane: str,
-    as_json: bool,
+    output: Output,
     **part: Any,
 ) -> None:
     """Find the magnet settings that bring the beam nearest to a wanted size and divergence.
@@ -81,7 +81,7 @@ def setpoint(
     line = build_line(described)  # JAX from here on
     found = beamfit.find_setpoint(line, beams, limits, targets, screen=part["screen"])
     inputs = {path: digest(path) for path in (lattice, fitted) if path is not None}
-    answered(as_json, [found], inputs, lambda terminal: _show(terminal, found))
+    output.answer([found], inputs, lambda terminal: _show(terminal, found))
 
 
 def _given(sigma: str | None, plane: str) -> dict[str, Beam]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -93,6 +93,18 @@ class Terminal:
         """Show intervals, verdict and diagnostics."""
         self.table(posterior.table()._replace(title=f"\n{title}"), wrap=False)
         self.verdict("posterior", posterior.status, posterior.message)
+
+    def tables(self, tables: Iterable[Table]) -> None:
+        """Lay out tables, a blank line behind each."""
+        for table in tables:
+            self.table(table)
+            self.line()
+
+    def rest(self, columns: str = "tables") -> None:
+        """Say how to see what the first screen leaves out, where it is one."""
+        if not self.full:
+            page = "A page with pictures: --report FILE.html."
+            self.line(f"All {columns}: --full. {page}", style="dim")
 
     def report(self, path: str | None) -> None:
         """Say where the report is, if there is one."""

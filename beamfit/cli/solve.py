@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any
 import click
 
 import beamfit
-from beamfit.cli.options import Command, answered, option, options, reported
+from beamfit.cli.option_text import named_of
+from beamfit.cli.options import Command, Output, option, options
 from beamfit.errors import InputError, located
 from beamfit.io.files import digest
 
@@ -67,8 +68,7 @@ def solve(
     values: tuple[str, ...],
     derivatives: tuple[str, ...],
     start: str,
-    report: str | None,
-    as_json: bool,
+    output: Output,
     **told: Any,
 ) -> None:
     """Solve a formulation: a constrained problem as text (.bf) or the report's XML.
@@ -82,8 +82,10 @@ def solve(
         if told[name] is not None and not 0 < told[name] < math.inf:
             raise InputError(f"--{name} {told[name]:g}", "a number above 0")
     told["seconds"] = told.pop("within")
-    tables = _pairs("data", data, "FILE")
-    numbers = {name: _numbers(name, text) for name, text in _pairs("set", values, "NUMBER").items()}
+    tables = named_of(data, "data", "NAME=FILE")
+    numbers = {
+        name: _numbers(name, text) for name, text in named_of(values, "set", "NAME=NUMBER").items()
+    }
     starts = 1 if start == "seeds" else int(start)
     from beamfit.io.formulation import read_formulation, read_tables  # scipy
 
@@ -93,19 +95,8 @@ def solve(
     with located(document):
         found = beamfit.solve(formulation, numbers_of, **told)
     inputs = {path: digest(path) for path in (document, *files.values())}
-    reported(report, found, inputs)
-    answered(as_json, [found], inputs, lambda terminal: _show(terminal, found), report)
-
-
-def _pairs(option: str, texts: tuple[str, ...], what: str) -> dict[str, str]:
-    """Names and what stands behind their =."""
-    given: dict[str, str] = {}
-    for text in texts:
-        name, equals, value = (part.strip() for part in text.partition("="))
-        if not (name and equals and value) or name in given:
-            raise InputError(f"--{option} '{text}'", f"NAME={what}, each name once")
-        given[name] = value
-    return given
+    output.write(found, inputs)
+    output.answer([found], inputs, lambda terminal: _show(terminal, found))
 
 
 def _numbers(name: str, text: str) -> list[float]:
@@ -126,9 +117,7 @@ def _show(terminal: Terminal, found: ProblemSolution | Computed) -> None:
         for note in found.notes:
             terminal.line(note)
         terminal.line()
-    for table in found.tables():
-        terminal.table(table)
-        terminal.line()
+    terminal.tables(found.tables())
     if isinstance(found, ProblemSolution):
         asked = found.made.document.solver
         said = f"Solver: {found.solver}" + (f" (asked for: {asked.name})" if asked else "")

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from beamfit.cli.options import Command, answered, option, options, reported
+from beamfit.cli.options import Command, Output, option, options
 from beamfit.errors import InputError
 from beamfit.io.line import build_line, lattice_of
 from beamfit.io.priors import read_noise
@@ -38,8 +38,7 @@ def tune(
     close: float,
     noise: str | None,
     seed: int,
-    report: str | None,
-    as_json: bool,
+    output: Output,
     columns: Any,
     ignore: tuple[str, ...],
     skip_bad: bool,
@@ -70,8 +69,8 @@ def tune(
 
     fit = fit_tuning(scan, line, limits, goal=goal, within=close, noise=own, seed=seed)
     inputs = {str(each.path): each.sha256 for each in inputs}
-    reported(report, fit, inputs)
-    answered(as_json, [fit], inputs, lambda terminal: show_tuning(terminal, fit), report)
+    output.write(fit, inputs)
+    output.answer([fit], inputs, lambda terminal: show_tuning(terminal, fit))
 
 
 def show_tuning(terminal: Terminal, fit: TuningFit) -> None:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from beamfit.answer import Table, cell
-from beamfit.cli.options import Command, answered, option, options
+from beamfit.cli.options import Command, Output, option, options
 from beamfit.commands import watch_plan
 from beamfit.errors import plain
 from beamfit.io.files import digest
@@ -40,7 +40,7 @@ Examples:
     default="127.0.0.1",
 )
 @options("json")
-def watch(machine: str, seconds: float | None, port: int, bind: str, as_json: bool) -> int:
+def watch(machine: str, seconds: float | None, port: int, bind: str, output: Output) -> int:
     """Watch the lifetime of a stored beam: how long, a and b, what moved and since when.
 
     MACHINE is a TOML file (docs/live.md) that names the variables of the ring: its current, and
@@ -51,9 +51,9 @@ def watch(machine: str, seconds: float | None, port: int, bind: str, as_json: bo
 
     from beamfit.live.channel import run
 
-    last, number = run(_watched(told, seconds, bind, port, as_json))
+    last, number = run(_watched(told, seconds, bind, port, output.as_json))
     inputs = {str(path): digest(path) for path in (told.path, told.ring) if path is not None}
-    answered(as_json, _results(last), inputs, lambda terminal: terminal.table(_table(last)))
+    output.answer(_results(last), inputs, lambda terminal: terminal.table(_table(last)))
     if number:
         click.echo("beamfit: interrupted", err=True)
     return 128 + number if number else 0

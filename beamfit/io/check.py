@@ -167,10 +167,8 @@ def with_lattice(scan: Understood, lattice: Understood) -> Understood:
     except InputError as error:
         said = str(replace(error, path=None))
         return replace(scan, facts=(*scan.facts, Fact(label, said, {"fits": False, "why": said})))
-    from beamfit.emittance.transport import (
-        scanned_line,
-        unit_warnings,  # JAX from here on
-    )
+    # JAX from here on
+    from beamfit.emittance.transport import scanned_line, unit_warnings
 
     line = build_line(lattice.content)
     own = scan.content.of_particle(line.mass)

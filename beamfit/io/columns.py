@@ -220,8 +220,8 @@ class Sheet:
         Whether there is a layout: unknown columns are then ignored.
     skip : str
         What may be done about a row with something wrong in it, for messages.
-    optional : bool
-        Whether a person can say --columns and --ignore.
+    skip_bad : bool or None
+        Whether such rows are left out; None where nobody can say so, nor --columns and --ignore.
     """
 
     path: str | PathLike[str]
@@ -237,7 +237,7 @@ class Sheet:
     order: str = ""
     arranged: bool = False
     skip: str = ""
-    optional: bool = False
+    skip_bad: bool | None = None
 
     def __len__(self) -> int:
         return len(self.cells[0])
@@ -245,15 +245,14 @@ class Sheet:
     def __getitem__(self, name: str) -> Sequence[Any]:
         return self.cells[self.names.index(name)]
 
-    def error(
-        self, found: str, expected: str, row: int | None = None, column: str | None = None
-    ) -> InputError:
-        """Make the error that names the file, and the row and column if there are any."""
-        if row is not None and self.lines is None:
-            return self.error(f"reading {row + 1}: {found}", expected + self.skip, None, column)
-        line, skip = (None, "") if row is None else (self.lines[row], self.skip)
-        column = self.called.get(column, column)
-        return InputError(found, expected + skip, path=self.path, line=line, column=column)
+    def error(self, found: str, expected: str, row: int, column: str | None = None) -> InputError:
+        """Make the error that names the file, the row, and the column if it is one alone."""
+        line, column = None, self.called.get(column, column)
+        if self.lines is None:
+            found = f"reading {row + 1}: {found}"
+        else:
+            line = self.lines[row]
+        return InputError(found, expected + self.skip, path=self.path, line=line, column=column)
 
     def header_error(self, found: str, expected: str, column: str | None = None) -> InputError:
         """Make the error that names the header, and the column if it is one alone."""
@@ -317,13 +316,10 @@ class Sheet:
 
     def named(self) -> Sheet:
         """Leave out columns without a name, such as the index that pandas writes."""
-        left = [i for i, name in enumerate(self.names) if name and not name.startswith("Unnamed:")]
+        left = [name for name in self.names if name and not name.startswith("Unnamed:")]
         if len(left) in (0, len(self.names)):
             return self
-        names = tuple(self.names[i] for i in left)
-        note = "A column without a name was ignored."
-        cells = [self.cells[i] for i in left]
-        return replace(self, names=names, cells=cells, notes=(*self.notes, note))
+        return replace(self.only(left), notes=(*self.notes, "A column without a name was ignored."))
 
     def rows(self, keep: Sequence[int]) -> Sheet:
         """Some of the rows."""
@@ -337,13 +333,17 @@ class Sheet:
         return replace(self.rows(keep), bad=tuple(errors))
 
     def good(self, check: Callable[[Sheet], object]) -> Sheet:
-        """Leave out the rows that a check of each row refuses, and keep what it said of them.
+        """Leave out the rows that a check of each row refuses, where a person asks for that.
+
+        What it said of them is kept.
 
         Raises
         ------
         InputError
             If no row is left: the first that was wrong.
         """
+        if not self.skip_bad:
+            return self
         keep: list[int] = []
         bad: list[InputError] = []
         waiting = [range(len(self))]
@@ -475,8 +475,8 @@ def columns_of(
         said = spelled(header)
         try:
             if (column := _known(said, quantities, sheet) or other(said)) is None:
-                usual = [f"{q}_{next(iter(UNITS[k]))}" if k else q for q, k in quantities.items()]
-                raise sheet.header_error("an unknown column", nearest(header, usual), header)
+                known = nearest(header, examples(quantities))
+                raise sheet.header_error("an unknown column", known, header)
         except InputError as error:
             own = sheet.called.get(header, header)
             unknown += [] if aside else [replace(error, column=own)]
@@ -486,8 +486,13 @@ def columns_of(
         elif not aside:
             raise _twice(sheet, column.key, found[column.key].header, header)
     if unknown:
-        raise _not_understood(unknown) if sheet.optional else unknown[0]
+        raise unknown[0] if sheet.skip_bad is None else _not_understood(unknown)
     return found
+
+
+def examples(quantities: Mapping[str, str]) -> list[str]:
+    """A header of each quantity of `columns_of`, with the first of its units."""
+    return [f"{q}_{next(iter(UNITS[kind]))}" if kind else q for q, kind in quantities.items()]
 
 
 def _twice(sheet: Sheet, key: str, first: str, header: str) -> InputError:
@@ -496,7 +501,7 @@ def _twice(sheet: Sheet, key: str, first: str, header: str) -> InputError:
         expected = "a row for each shot, or names that differ"
         return sheet.header_error(f"{key} twice or more under one name", expected, header)
     expected = "one column for it, in one unit, and none twice"
-    expected += f"; --ignore '{header}' leaves this one unread" if sheet.optional else ""
+    expected += f"; --ignore '{header}' leaves this one unread" * (sheet.skip_bad is not None)
     named = sheet.called.get(first, first)
     return sheet.header_error(f"{key} also in column '{named}'", expected, header)
 

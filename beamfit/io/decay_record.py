@@ -102,8 +102,8 @@ def read_lifetime_input(
     lifetimes = any(spelled(n).lower().startswith(("tau_", "lifetime_")) for n in sheet.names)
     moments = any((c := known(sheet, name)) and c.key == "time" for name in sheet.names)
     if lifetimes and not moments:
-        return _lifetimes(sheet, skip_bad)
-    return _record(sheet, skip_bad, offset)
+        return _lifetimes(sheet)
+    return _record(sheet, offset)
 
 
 def read_lifetimes(
@@ -140,7 +140,7 @@ def read_lifetimes(
     >>> print(read_lifetimes(file))
     lifetimes.csv: 4 lifetimes at 100 to 400 mA
     """
-    return _lifetimes(read_columns(path, EXAMPLE, columns, ignore, skip_bad), skip_bad)
+    return _lifetimes(read_columns(path, EXAMPLE, columns, ignore, skip_bad))
 
 
 def read_decay_record(
@@ -191,10 +191,10 @@ def read_decay_record(
     >>> print(read_decay_record("measurements/aps_1999_decay.csv"))
     aps_1999_decay.csv: 27 readings over 8.81 h, 101.999 to 81.464 mA
     """
-    return _record(read_columns(path, EXAMPLE, columns, ignore, skip_bad), skip_bad, offset)
+    return _record(read_columns(path, EXAMPLE, columns, ignore, skip_bad), offset)
 
 
-def _record(sheet: Sheet, skip_bad: bool, offset: str | None) -> DecayRecord:
+def _record(sheet: Sheet, offset: str | None) -> DecayRecord:
     if any(map(is_size, sheet.names)) and not sheet.arranged:
         found, expected = "a column of beam sizes", "a record of beam current; `beamfit emittance`"
         raise sheet.header_error(found, f"{expected} reads scans")
@@ -206,21 +206,20 @@ def _record(sheet: Sheet, skip_bad: bool, offset: str | None) -> DecayRecord:
             found = f"no column of {quantity} among {', '.join(sheet.names)}"
             raise sheet.header_error(found, option)
     notes = taken_for_current(columns)
-    if skip_bad:
-        sheet = sheet.good(lambda rows: [rows.values(column) for column in columns.values()])
-    if skip_bad and offset is None:
+    sheet = sheet.good(lambda rows: [rows.values(column) for column in columns.values()])
+    if sheet.skip_bad and offset is None:
         sheet, below = _not_negative(sheet, columns["current"])
         notes += below
     moment = _moments(sheet, columns)
     if moment.size > 2 and moment[0] > moment[-1] and np.all(np.diff(moment) <= 0):
         notes += ("The rows stand newest first, and were read in order of time.",)
         sheet, moment = sheet.rows(list(range(len(sheet)))[::-1]), moment[::-1]
-    if skip_bad:
+    if sheet.skip_bad:
         sheet, moment = _forward(sheet, columns, moment)
     rest = {key: column for key, column in columns.items() if key not in ("time", "nanos")}
     values = {key: sheet.values(column) for key, column in rest.items()}
     if len(moment) < 2:
-        raise sheet.error(f"{len(moment)} readings", "two or more")
+        raise InputError(f"{len(moment)} readings", "two or more", sheet.path)
     _check_base(sheet, columns["time"], moment)
     found = offset_of(offset, values["current"], sheet.path)
     values["current"] = values["current"] - found.value
@@ -309,23 +308,20 @@ def _forward(
 
 
 def _check_base(sheet: Sheet, column: Column, moment: np.ndarray) -> None:
-    latest, sheet = np.max(moment), replace(sheet, skip="")
-    if LATEST < latest < MILLISECONDS:
-        found = f"{latest:.6g} s since 1970, after the year 2050"
-        expected = (
-            "a date, or time from the start of the record: LabVIEW counts seconds from 1904, "
-        )
-        expected += "Excel days from 1899, MATLAB days from the year 0"
-        raise sheet.error(found, expected, int(np.argmax(moment)), column.header)
+    if (latest := np.max(moment)) <= LATEST:
+        return
+    found = f"{latest:.6g} s since 1970, after the year 2050"
+    expected = "a date, or time from the start of the record: LabVIEW counts seconds from 1904, "
+    expected += "Excel days from 1899, MATLAB days from the year 0"
     if latest >= MILLISECONDS:
         found = f"{latest:.6g} s, after the year 5000"
-        finer = [u for u in ("ms", "us", "ns") if UNITS["time"][u] * latest < MILLISECONDS]
+        finer = (u for u in ("ms", "us") if UNITS["time"][u] * latest < MILLISECONDS)
         header = sheet.called.get(column.header, column.header)
-        expected = f"the unit of the time: --columns '{header}=time_{(finer or ['ns'])[0]}'"
-        raise sheet.error(found, expected, int(np.argmax(moment)), column.header)
+        expected = f"the unit of the time: --columns '{header}=time_{next(finer, 'ns')}'"
+    raise replace(sheet, skip="").error(found, expected, int(np.argmax(moment)), column.header)
 
 
-def _lifetimes(sheet: Sheet, skip_bad: bool) -> LifetimeTable:
+def _lifetimes(sheet: Sheet) -> LifetimeTable:
     columns = columns_of(sheet, LIFETIMES)
     kinds = [kind for kind in ("tau", "lifetime") if kind in columns]
     if len(kinds) != 1 or "beam_current" not in columns:
@@ -335,8 +331,7 @@ def _lifetimes(sheet: Sheet, skip_bad: bool) -> LifetimeTable:
     wanted = {"current": columns["beam_current"], "lifetime": columns[kinds[0]]}
     if (error := columns.get(f"{kinds[0]}_error")) is not None:
         wanted["error"] = error
-    if skip_bad:
-        sheet = sheet.good(lambda rows: [_positive(rows, column) for column in wanted.values()])
+    sheet = sheet.good(lambda rows: [_positive(rows, column) for column in wanted.values()])
     values = {key: _positive(sheet, column) for key, column in wanted.items()}
     hours = {key: values[key] / 3600 for key in ("lifetime", "error") if key in values}
     said = {"comments": sheet.comments, "notes": left_out(sheet)}

@@ -341,7 +341,7 @@ def _own(source: _Fields, field: str, used: np.ndarray, k: int) -> dict[str, np.
     beams = source.get(field)
     if beams is None or "stats" not in (beams.dtype.names or ()) or beams.ndim != 2:
         return {}
-    if len(beams) <= used.max() or k >= beams.shape[1]:
+    if beams.shape[0] <= used.max() or beams.shape[1] <= k:
         return {}
     own = beams[used, k, None]
     return {p: _sizes(own, p) if field == "beam" else 1e-6 * _stat(own, p) for p in PLANES}
@@ -442,17 +442,14 @@ def _stored(source: _Fields, methods: list[str]) -> dict[str, dict[str, Quantity
         return {}
     shape = (4, 2, len(methods))
     values, errors = (np.asarray(v, float) for v in (values, errors))
-    if values.ndim < 3 or values.shape[:3] != shape or errors.shape != values.shape:
+    if values.shape[:3] != shape or errors.shape != values.shape:
         return {}
-    values, errors = (v.reshape(*shape, -1)[..., 0] for v in (values, errors))
-    return {
-        name: {
-            plane: Quantity(float(values[0, p, k]), float(errors[0, p, k]), "m")
-            for p, plane in enumerate(PLANES)
-            if np.isfinite([values[0, p, k], errors[0, p, k]]).all() and values[0, p, k] > 0.0
-        }
-        for k, name in enumerate(methods)
-    }
+    values, errors = (v.reshape(*shape, -1)[0, ..., 0] for v in (values, errors))
+    found: dict[str, dict[str, Quantity]] = {name: {} for name in methods}
+    for p, k in np.argwhere(np.isfinite(values + errors) & (values > 0.0)):
+        quantity = Quantity(float(values[p, k]), float(errors[p, k]), "m")
+        found[methods[k]][PLANES[p]] = quantity
+    return found
 
 
 def _lattice(source: _Fields, n: int) -> LatticeFile:

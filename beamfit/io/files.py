@@ -105,64 +105,62 @@ def text_lines(path: str | PathLike[str]) -> Iterator[str]:
         If the file cannot be opened, is empty, is binary, is neither UTF-8 (µ and ° of Windows and
         comments apart) nor UTF-16 with its mark, or has a line longer than any text table has.
     """
-    number, seen = 0, hashlib.sha256()
+    number = 0
     with _opened(path) as stream:
-        for number, raw in enumerate(_raw_lines(stream, seen), start=1):
-            if number == 1:
-                _check_signature(raw, path)
-            if b"\0" in raw:
+        hashed = _Hashed(stream)
+        wide = _start(stream, path).startswith(UTF16)
+        form = ("utf-16", "replace") if wide else ("utf-8-sig", "surrogateescape")
+        text = io.TextIOWrapper(io.BufferedReader(hashed), *form)
+        while line := text.readline(LONGEST_LINE + 1):
+            number += 1
+            if "\0" in line:
                 raise InputError("a binary file", "a text file", path=path, line=number)
-            if len(raw) > LONGEST_LINE:
+            if len(line) > LONGEST_LINE:
                 found = f"a line of more than {LONGEST_LINE} characters"
                 raise InputError(found, "a text table", path, number)
-            yield _decoded(raw, path, number).rstrip("\r\n")
+            yield _decoded(line, path, number).rstrip("\n")
     if number == 0:
         raise InputError("an empty file", "a file with content", path=path)
-    remember(path, seen)
+    remember(path, hashed.seen)
 
 
-def _raw_lines(stream: BinaryIO, seen: Any) -> Iterator[bytes]:
-    """Lines with their ends; of one that is too long a part."""
-    left = b""
-    for block in _blocks(stream, seen):
-        lines = (left + block).splitlines(keepends=True)
-        # A carriage return at the end of a block may have its line feed in the next one.
-        left = b"" if not lines or lines[-1].endswith(b"\n") else lines.pop()
-        yield from lines
-        if len(left) > LONGEST_LINE:
-            break
-    if left:
-        yield left
+class _Hashed(io.RawIOBase):
+    """A stream whose digest is taken as it is read."""
+
+    def __init__(self, stream: BinaryIO) -> None:
+        self.stream, self.seen = stream, hashlib.sha256()
+
+    def readable(self) -> bool:
+        return True
+
+    def readinto(self, buffer: memoryview) -> int:
+        count = self.stream.readinto(buffer)
+        self.seen.update(buffer[:count])
+        return count
 
 
-def _blocks(stream: BinaryIO, seen: Any) -> Iterator[bytes]:
-    """Content of a file, part by part; UTF-16 as UTF-8, where what is no letter is no number."""
-    block = stream.read(1 << 16)
-    wide = block.startswith(UTF16)
-    decoder = codecs.getincrementaldecoder("utf-16")("replace")
-    while block:
-        seen.update(block)
-        yield decoder.decode(block).encode() if wide else block
-        block = stream.read(1 << 16)
-    yield decoder.decode(b"", final=True).encode()
+def _start(stream: BinaryIO, path: str | PathLike[str]) -> bytes:
+    """Read how a stream begins, and refuse the beginning of a file that is no text."""
+    start = stream.read(max(map(len, SIGNATURES)))
+    stream.seek(0)
+    for signature, (found, expected) in SIGNATURES.items():
+        if start.startswith(signature):
+            raise InputError(found, expected, path=path, line=1)
+    return start
 
 
-def _decoded(raw: bytes, path: str | PathLike[str], number: int) -> str:
+def _decoded(line: str, path: str | PathLike[str], number: int) -> str:
+    """A line in which surrogates stand for bytes that are no UTF-8."""
     try:
-        return raw.decode("utf-8-sig" if number == 1 else "utf-8")
-    except UnicodeDecodeError:
-        pass
+        line.encode()
+        return line
+    except UnicodeEncodeError:
+        raw = line.encode(errors="surrogateescape")
     # Windows writes µ, ° and the like in one byte; in a comment any letter may be so.
     if raw.lstrip().startswith(b"#") or not raw.translate(None, MARKS + ASCII):
         return raw.decode("cp1252", errors="replace")
     expected = "UTF-8 text; save it as CSV (UTF-8)"
     raise InputError("bytes that are not text", expected, path, number)
-
-
-def _check_signature(start: bytes, path: str | PathLike[str]) -> None:
-    for signature, (found, expected) in SIGNATURES.items():
-        if start.startswith(signature):
-            raise InputError(found, expected, path=path, line=1)
 
 
 def read_text(path: str | PathLike[str]) -> str:
@@ -217,10 +215,8 @@ def read_json(path: str | PathLike[str], found: str, expected: str) -> Any:
         in itself than can be followed. An integer of hundreds of digits is infinite.
     """
     content = read_bytes(path, expected)
-    try:
+    with laid_out(path, found, expected):
         return json.loads(content, parse_int=lambda t: int(t) if len(t) < 300 else float(t))
-    except (ValueError, RecursionError):
-        raise InputError(found, expected, path=path) from None
 
 
 @contextmanager

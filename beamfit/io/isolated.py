@@ -50,17 +50,11 @@ MATLAB = (
 )
 HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
 # Classes of MATLAB's arrays that are numbers.
-NUMBERS = {
-    "double",
-    "single",
-    "logical",
-    *(f"{u}int{n}" for u in ("", "u") for n in (8, 16, 32, 64)),
-}
+NUMBERS = {f"{u}int{n}" for u in ("", "u") for n in (8, 16, 32, 64)}
+NUMBERS |= {"double", "single", "logical"}
 SDDS_HEAD = re.compile(rb"&data\b.*?&end[^\n]*\n", re.DOTALL)
 # How the name of a magnet's setting ends.
 SETTING_ENDS = tuple(f"_{unit}" for unit in SETTINGS)
-# What ends an exponent or an index in a unit, and what begins one: 1/m$a2$n.
-SHIFTS = {"$a": "^", "$b": "", "$n": "", "$e": ""}
 # Values by name, the unit that the file says of each, and its comments.
 Columns = tuple[dict[str, Sequence[Any]], dict[str, str], list[str]]
 
@@ -200,11 +194,10 @@ def _with_units(
     for header, values in columns.items():
         name, unit = plain(header), units.get(header, "")
         own, known = unit_at_end(spelled(name)), known_unit(unit)
-        if unit.strip() in ("", "1", "none", "dimensionless"):
-            known = own
-        elif own is None:
+        said = unit.strip() not in ("", "1", "none", "dimensionless")
+        if said and own is None:
             name = named(name, known or unit)
-        elif known is None or known != own:
+        elif said and known != own:
             expected = f"one unit, {own} or the attribute's"
             raise InputError(f"the attribute units = '{unit}'", expected, path, column=name)
         found[name] = values
@@ -479,10 +472,8 @@ def _sdds_values(name: str, values: list[Any], rows: int, texts: int) -> Sequenc
 
 
 def _sdds_unit(unit: str) -> str:
-    """A unit without the marks of its exponents, 1/m$a2$n."""
-    for mark, meant in SHIFTS.items():
-        unit = unit.replace(mark, meant)
-    return unit
+    """A unit without the marks of its exponents and indices, 1/m$a2$n."""
+    return re.sub(r"\$[bne]", "", unit.replace("$a", "^"))
 
 
 LIBRARIES = {

@@ -408,11 +408,10 @@ def gradient_table(section: Section, key: str, length: float) -> list[tuple[floa
     """
     said = section.table[key]
     if key == "gradient_table":
-        pairs = [p for p in said if isinstance(p, list) and len(p) == 2 and all(map(is_number, p))]
-        if len(pairs) < len(said):
-            wrong = next(p for p in said if p not in pairs)
-            raise section.error(f"{wrong!r}"[:80], "pairs [current in A, gradient in T/m]", key)
-        points = [(float(current), float(gradient)) for current, gradient in pairs]
+        for pair in said:
+            if not (isinstance(pair, list) and len(pair) == 2 and all(map(is_number, pair))):
+                raise section.error(f"{pair!r}"[:80], "pairs [current in A, gradient in T/m]", key)
+        points = [(float(current), float(gradient)) for current, gradient in said]
     else:
         points = _points(read_sheet(Path(section.path).parent / said, EXAMPLE), length)
     currents = sorted(current for current, _ in points)

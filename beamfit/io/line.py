@@ -158,21 +158,17 @@ def read_lattice(
     **part: str | None,
 ) -> LatticeFile:
     """Read and check a lattice file of any kind without building it; see `load_lattice`."""
-    return part_of(_whole(path, use, energy), **part)
-
-
-def _whole(path: str | PathLike[str], use: str | None, energy: float | None) -> LatticeFile:
     expect(path, str | PathLike, "'line.toml'")
     if Path(path).suffix.lower() in FOREIGN:
         from beamfit.io.sequence import read_sequence
 
-        return read_sequence(path, use=use, energy=energy)
+        return part_of(read_sequence(path, use=use, energy=energy), **part)
     for option, value, instead in (("use", use, "one line"), ("energy", energy, "energy_MeV")):
         if value is not None:
             raise InputError(
                 f"--{option} for a TOML lattice", f"none: the file has {instead}", path=path
             )
-    return read_toml_lattice(path)
+    return part_of(read_toml_lattice(path), **part)
 
 
 def lattice_of(

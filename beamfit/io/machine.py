@@ -14,7 +14,7 @@ from beamfit.io.columns import ALSO, SETTINGS, UNITS, known_unit
 from beamfit.io.decay_record import QUANTITIES
 from beamfit.io.lattice import LatticeFile
 from beamfit.io.line import part_of, read_lattice
-from beamfit.io.toml import LIST, TABLE, TEXT, WHOLE, Key, Section, is_number, read_toml
+from beamfit.io.toml import LIST, TABLE, TEXT, WHOLE, Key, Section, is_number, keyed, read_toml
 from beamfit.lifetime.record import Conditions
 
 FORMAT = "beamfit-machine-1"
@@ -28,35 +28,6 @@ LENGTHS = {"um": 1e-6, "mm": 1e-3, "m": 1.0}
 # Bounds that several keys share.
 WAIT = {"low": 0.0, "said": "a time above zero"}
 POSITIVE = {"low": 0.0, "said": "a positive number"}
-MAGNET = {
-    "name": Key("name", kind=TEXT),
-    "set": Key("set", kind=TEXT),
-    "read": Key("read", kind=TEXT),
-    "unit": Key("unit", kind=TEXT),
-    "low": Key("low"),
-    "high": Key("high"),
-    "tolerance": Key("tolerance", **POSITIVE),
-    "settle_s": Key("settle", low=-1e-9, high=3600.0, said="a time of zero or more"),
-    "timeout_s": Key("timeout", default=60.0, **WAIT),
-    "approach": Key("approach", kind=TEXT, default="either", among=APPROACHES),
-    "approach_by": Key("approach_by", default=0.0, low=-1e-12, said="zero or more"),
-    "degauss": Key("degauss", kind=LIST, default=()),
-}
-SCREEN = {
-    "name": Key("name", kind=TEXT, default=None),
-    **{name: Key(name, kind=TEXT, default=None) for name in ("x", "y", "profile_x", "profile_y")},
-    "unit": Key("unit", kind=TEXT, default="um", among=tuple(LENGTHS)),
-    "pixel_um": Key("pixel", 1e-6, default=None, **POSITIVE),
-    "shots": Key("shots", kind=WHOLE, default=5, low=1, high=1001, said="2 to 1000 shots"),
-    "timeout_s": Key("timeout", default=10.0, **WAIT),
-}
-BEAM = {
-    "present": Key("present", kind=TEXT, default=None),
-    "present_above": Key("present_above", default=None),
-    "loss": Key("loss", kind=TEXT, default=None),
-    "loss_below": Key("loss_below", default=None),
-    "wait_s": Key("wait", default=60.0, **WAIT),
-}
 SCAN = {
     "goal_percent": Key("goal", 1e-2, default=0.03, low=0.0, high=100.0, said="0 to 100 %"),
     "points": Key("points", kind=WHOLE, default=None, low=3, high=201, said="4 to 200 points"),
@@ -91,18 +62,18 @@ class Magnet:
         Settings gone through before a scan.
     """
 
-    name: str
-    set: str
-    read: str
-    unit: str
-    low: float
-    high: float
-    tolerance: float
-    settle: float
-    timeout: float = 60.0
-    approach: str = "either"
-    approach_by: float = 0.0
-    degauss: tuple[float, ...] = ()
+    name: str = keyed("name", kind=TEXT)
+    set: str = keyed("set", kind=TEXT)
+    read: str = keyed("read", kind=TEXT)
+    unit: str = keyed("unit", kind=TEXT)
+    low: float = keyed("low")
+    high: float = keyed("high")
+    tolerance: float = keyed("tolerance", **POSITIVE)
+    settle: float = keyed("settle_s", low=-1e-9, high=3600.0, said="a time of zero or more")
+    timeout: float = keyed("timeout_s", 60.0, **WAIT)
+    approach: str = keyed("approach", "either", kind=TEXT, among=APPROACHES)
+    approach_by: float = keyed("approach_by", 0.0, low=-1e-12, said="zero or more")
+    degauss: tuple[float, ...] = keyed("degauss", (), kind=LIST)
 
     @property
     def span(self) -> tuple[float, float]:
@@ -125,8 +96,8 @@ class Profiler:
     ----------
     name : str
         Its name in the lattice.
-    sizes, profiles : mapping of str to str
-        Plane to variable; one of the two is empty.
+    x, y, profile_x, profile_y : str or None
+        The variables; `sizes` and `profiles` have them by plane, one of the two is empty.
     unit : str
         Of the sizes.
     pixel : float or None
@@ -137,24 +108,36 @@ class Profiler:
         How long a new time stamp is waited for, s.
     """
 
-    name: str
-    sizes: dict[str, str]
-    profiles: dict[str, str]
-    unit: str
-    pixel: float | None
-    shots: int
-    timeout: float
+    name: str | None = keyed("name", None, kind=TEXT)
+    x: str | None = keyed("x", None, kind=TEXT)
+    y: str | None = keyed("y", None, kind=TEXT)
+    profile_x: str | None = keyed("profile_x", None, kind=TEXT)
+    profile_y: str | None = keyed("profile_y", None, kind=TEXT)
+    unit: str = keyed("unit", "um", kind=TEXT, among=tuple(LENGTHS))
+    pixel: float | None = keyed("pixel_um", None, factor=1e-6, **POSITIVE)
+    shots: int = keyed("shots", 5, kind=WHOLE, low=1, high=1001, said="2 to 1000 shots")
+    timeout: float = keyed("timeout_s", 10.0, **WAIT)
+
+    @property
+    def sizes(self) -> dict[str, str]:
+        """Plane to the variable of its rms size."""
+        return {p: v for p, v in zip("xy", (self.x, self.y), strict=True) if v}
+
+    @property
+    def profiles(self) -> dict[str, str]:
+        """Plane to the variable of its projection."""
+        return {p: v for p, v in zip("xy", (self.profile_x, self.profile_y), strict=True) if v}
 
 
 @dataclass(frozen=True)
 class Guard:
     """Conditions of a shot that counts: beam above, loss below. Limits are None without one."""
 
-    present: str | None = None
-    present_above: float | None = None
-    loss: str | None = None
-    loss_below: float | None = None
-    wait: float = 60.0
+    present: str | None = keyed("present", None, kind=TEXT)
+    present_above: float | None = keyed("present_above", None)
+    loss: str | None = keyed("loss", None, kind=TEXT)
+    loss_below: float | None = keyed("loss_below", None)
+    wait: float = keyed("wait_s", 60.0, **WAIT)
 
 
 @dataclass(frozen=True)
@@ -271,7 +254,7 @@ def unit_of(word: str) -> str | None:
 
 def _magnet(section: Section, lattice: LatticeFile | None = None) -> Magnet:
     """A magnet of the lattice; or without one a knob of the machine, in whatever unit it has."""
-    magnet = Magnet(**section.values(MAGNET))
+    magnet = section.read(Magnet)
     unit = unit_of(magnet.unit)
     if lattice is not None and magnet.name not in lattice.calibrations:
         expected = nearest(magnet.name, list(lattice.calibrations)) + f", of {lattice.path}"
@@ -311,26 +294,21 @@ def _numbers(
 
 
 def _screen(section: Section, lattice: LatticeFile) -> Profiler:
-    said = section.values(SCREEN)
-    sizes, profiles = (
-        {plane: said[f"{kind}{plane}"] for plane in "xy" if said[f"{kind}{plane}"]}
-        for kind in ("", "profile_")
-    )
-    if bool(sizes) == bool(profiles):
-        found = "sizes and projections" if sizes else "no sizes"
+    screen = section.read(Profiler)
+    if bool(screen.sizes) == bool(screen.profiles):
+        found = "sizes and projections" if screen.sizes else "no sizes"
         raise section.error(found, "x and y, or profile_x and profile_y", "x")
-    if profiles and said["pixel"] is None:
+    if screen.profiles and screen.pixel is None:
         raise section.error("projections without a scale", "pixel_um = ...", "pixel_um")
-    name = said["name"] or lattice.default_screen
-    if name not in lattice.places:
-        expected = nearest(str(name), lattice.places) + f", of {lattice.path}"
-        raise section.error(f"no screen '{name}'", expected, "name")
-    rest = {key: said[key] for key in ("unit", "pixel", "shots", "timeout")}
-    return Profiler(name, sizes, profiles, **rest)
+    screen = replace(screen, name=screen.name or lattice.default_screen)
+    if screen.name not in lattice.places:
+        expected = nearest(str(screen.name), lattice.places) + f", of {lattice.path}"
+        raise section.error(f"no screen '{screen.name}'", expected, "name")
+    return screen
 
 
 def _guard(section: Section) -> Guard:
-    guard = Guard(**section.values(BEAM))
+    guard = section.read(Guard)
     for variable, limit in (("present", "present_above"), ("loss", "loss_below")):
         name, value = getattr(guard, variable), getattr(guard, limit)
         if (name is None) != (value is None) or (value is not None and math.isnan(value)):

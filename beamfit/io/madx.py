@@ -10,6 +10,7 @@ from __future__ import annotations
 import re
 from bisect import bisect
 from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from os import PathLike
 from pathlib import Path
@@ -101,6 +102,14 @@ class MadxStatement(NamedTuple):
         expected = expected or "a file without it: run it in MAD-X, and SAVE the sequence"
         found = found or f"'{shown(self.text)}', which beamfit does not carry out"
         return InputError(found, expected, self.path, self.line)
+
+    @contextmanager
+    def read(self, expected: str) -> Iterator[None]:
+        """Name the statement's place where an expression in it has no value."""
+        try:
+            yield
+        except ValueError as error:
+            raise self.error(str(error), expected) from None
 
 
 def statements(text: str, path: str | PathLike[str], line: int = 1) -> Iterator[MadxStatement]:
@@ -255,29 +264,25 @@ class Interpreter:
 
     def _block(self, statement: MadxStatement, word: str, taken: bool | None) -> None:
         if word in ("if", "elseif", "else"):
-            if word != "if" and taken is None:
-                raise statement.error(f"{word.upper()} without IF", "IF (...) {...} before it")
             if word == "if":
                 taken = False
-            holds = word == "else"
-            if not holds and not taken:
-                holds = self._holds(statement, statement.text[len(word) :].strip())
-            if holds and not taken:
-                self.run(statement.block, statement.path, statement.line, block=True)
-            self._taken = None if word == "else" else bool(taken or holds)
+            elif taken is None:
+                raise statement.error(f"{word.upper()} without IF", "IF (...) {...} before it")
+            if not taken:
+                with statement.read("a comparison of numbers"):
+                    taken = word == "else" or self.values.holds(statement.text[len(word) :].strip())
+                if taken:
+                    self.run(statement.block, statement.path, statement.line, block=True)
+            self._taken = None if word == "else" else taken
         elif word == "while":
             raise statement.error()
-
-    def _holds(self, statement: MadxStatement, text: str) -> bool:
-        try:
-            return self.values.holds(text)
-        except ValueError as error:
-            raise statement.error(str(error), "a comparison of numbers") from None
 
     def _one(self, statement: MadxStatement) -> None:
         text = statement.text
         if found := ASSIGNMENT.fullmatch(text):
-            self._assign(statement, *found.groups())
+            kind, name, equals, value = found.groups(default="")
+            with statement.read("an expression that MAD-X reads"):
+                self.values.assign(kind.lower(), name.lower(), equals == ":=", value.strip())
         elif found := ARROW.fullmatch(text):
             # Evaluated at once, as MAD-X does even after :=
             given = self._parameter(statement, False, found[3].strip())
@@ -289,14 +294,6 @@ class Interpreter:
             self._command(statement, found[1].lower(), found[2])
         else:
             raise statement.error()
-
-    def _assign(
-        self, statement: MadxStatement, kind: str, name: str, equals: str, text: str
-    ) -> None:
-        try:
-            self.values.assign((kind or "").lower(), name.lower(), equals == ":=", text.strip())
-        except ValueError as error:
-            raise statement.error(str(error), "an expression that MAD-X reads") from None
 
     def _set(self, statement: MadxStatement, name: str, given: Mapping[str, Attribute]) -> None:
         """Change parameters of an element; as in MAD-X, not of those derived from it."""
@@ -405,7 +402,7 @@ class Interpreter:
                 )
 
     def _beam_command(self, statement: MadxStatement, given: dict[str, Attribute]) -> None:
-        sequence = word_of(given.pop("sequence")).lower() if "sequence" in given else ""
+        sequence = word_of(given.pop("sequence", None)).lower()
         if "bv" in given and self.number(given["bv"]) != 1.0:
             raise statement.error("a beam with BV = -1, which runs the other way", "BV = 1")
         beam = self.beams.setdefault(sequence, {})
@@ -416,12 +413,12 @@ class Interpreter:
         beam |= own
 
     def _resbeam_command(self, statement: MadxStatement, given: Mapping[str, Attribute]) -> None:
-        self.beams[word_of(given["sequence"]).lower() if "sequence" in given else ""] = {}
+        self.beams[word_of(given.get("sequence")).lower()] = {}
 
 
 ENERGIES = {"energy", "pc", "gamma", "beta", "brho"}
 
 
-def word_of(parameter: Attribute) -> str:
-    """The text of a parameter that is a word, without its quotes."""
-    return parameter.text.strip().strip("\"'").strip()
+def word_of(parameter: Attribute | None, default: str = "") -> str:
+    """The text of a parameter that is a word, without its quotes, if it is there."""
+    return default if parameter is None else parameter.text.strip().strip("\"'").strip()

@@ -147,7 +147,10 @@ def read_ring(path: str | PathLike[str]) -> Ring:
     section.one_of(("emittance_y_nm", "coupling"))
     if (coupling := machine.pop("coupling")) is not None:
         machine["emittance_y"] = machine["emittance_x"] * coupling
-    _check_loss(section, machine)
+    if machine["energy_loss"] >= machine["energy"]:
+        found = f"{machine['energy_loss'] / 1e3:.6g} keV a turn"
+        expected = f"less than the energy of {machine['energy'] / 1e9:.6g} GeV"
+        raise section.error(found, expected, "energy_loss_keV")
     aperture, table = apertures.values(ACCEPTANCE), apertures.table.get("momentum_table")
     if table is not None:
         apertures.one_of(("momentum", "momentum_table"))
@@ -158,13 +161,6 @@ def read_ring(path: str | PathLike[str]) -> Ring:
     from beamfit.lifetime.ring import Ring
 
     return Ring(**machine, **aperture, optics=optics)
-
-
-def _check_loss(section: Section, machine: dict[str, Any]) -> None:
-    if machine["energy_loss"] >= machine["energy"]:
-        found = f"{machine['energy_loss'] / 1e3:.6g} keV a turn"
-        expected = f"less than the energy of {machine['energy'] / 1e9:.6g} GeV"
-        raise section.error(found, expected, "energy_loss_keV")
 
 
 def _top(path: str | PathLike[str]) -> Section:
@@ -361,17 +357,6 @@ def ring_from_pyat(
     )
 
 
-def _twiss(path: str | PathLike[str], circumference: float) -> tuple[np.ndarray, Optics]:
-    """Positions of the points, m, and the optics there."""
-    sheet = read_sheet(path, "s_m,beta_x_m,beta_y_m")
-    columns = {name: _column(sheet, name) for name in COLUMNS}
-    s = columns.pop("s_m")
-    weight = _weights(sheet, s, circumference)
-    from beamfit.lifetime.ring import Optics  # JAX from here on: the table is in order
-
-    return s, Optics(weight, *columns.values())
-
-
 def read_along(
     circumference: float, optics: Mapping[str, float] | Path, apertures: Path | None
 ) -> tuple[Optics, np.ndarray | None]:
@@ -382,11 +367,11 @@ def read_along(
     circumference : float
         Circumference of the ring, m.
     optics : mapping of str to float, or path
-        Ring averages by their fields in `Optics`; or CSV with the columns `s_m, beta_x_m, beta_y_m,
-        alpha_x, alpha_y, dispersion_x_m, dispersion_slope_x` (and optionally the vertical
-        dispersion), or MAD-X TFS. The table covers the whole ring, or one of its equal (or
-        mirror-symmetric) parts. Points close together, inside magnets too: averages are taken by
-        the trapezoidal rule.
+        Ring averages by their fields in `Optics`, in that order; or CSV with the columns `s_m,
+        beta_x_m, beta_y_m, alpha_x, alpha_y, dispersion_x_m, dispersion_slope_x` (and optionally
+        the vertical dispersion), or MAD-X TFS. The table covers the whole ring, or one of its equal
+        (or mirror-symmetric) parts. Points close together, inside magnets too: averages are taken
+        by the trapezoidal rule.
     apertures : path or None
         A table with `s_m, delta_plus, delta_minus`: momentum acceptance of the lattice up and down
         (with either sign), relative, over the same part of the ring as the optics.
@@ -412,25 +397,27 @@ def read_along(
     mean beta_y 8.785 m
     """
     if isinstance(optics, Path):
-        s, found = _twiss(optics, circumference)
+        sheet = read_sheet(optics, "s_m,beta_x_m,beta_y_m")
+        s, *values = (_column(sheet, name) for name in COLUMNS)
+        weight = _weights(sheet, s, circumference)
     else:
-        from beamfit.lifetime.ring import Optics
+        s, weight, values = None, np.ones(1), np.array(list(optics.values()))[:, None]
+    sides = None
+    if apertures is not None:
+        sheet = read_sheet(apertures, "s_m,delta_plus,delta_minus")
+        at, *sides = (_column(sheet, name) for name in ("s_m", *SIDES))
+        own = _weights(sheet, at, circumference)
+        if s is None:
+            weight, values = own, np.broadcast_to(values, (len(values), at.size))
+        elif max(abs(at[0] - s[0]), abs(at[-1] - s[-1])) > 1e-3 * circumference:
+            ends = f"s from {at[0]:.6g} to {at[-1]:.6g} m"
+            expected = f"that of the optics, {s[0]:.6g} to {s[-1]:.6g} m"
+            raise sheet.header_error(ends, expected, "s_m")
+        else:
+            sides = [np.interp(s, at, side) for side in sides]
+    from beamfit.lifetime.ring import Optics  # JAX from here on: the tables are in order
 
-        averages = {field: np.array([value]) for field, value in optics.items()}
-        s, found = None, Optics(np.ones(1), **averages)
-    if apertures is None:
-        return found, None
-    sheet = read_sheet(apertures, "s_m,delta_plus,delta_minus")
-    at, *sides = (_column(sheet, name) for name in ("s_m", *SIDES))
-    weight = _weights(sheet, at, circumference)
-    if s is None:
-        spread = found._make(np.broadcast_to(values, at.shape) for values in found)
-        return spread._replace(weight=weight), np.stack(sides)
-    if max(abs(at[0] - s[0]), abs(at[-1] - s[-1])) > 1e-3 * circumference:
-        ends = f"s from {at[0]:.6g} to {at[-1]:.6g} m"
-        expected = f"that of the optics, {s[0]:.6g} to {s[-1]:.6g} m"
-        raise sheet.error(ends, expected, None, "s_m")
-    return found, np.stack([np.interp(s, at, side) for side in sides])
+    return Optics(weight, *values), None if sides is None else np.stack(sides)
 
 
 def _column(sheet: Sheet, name: str) -> np.ndarray:
@@ -455,14 +442,13 @@ def _column(sheet: Sheet, name: str) -> np.ndarray:
 def _weights(sheet: Sheet, s: np.ndarray, circumference: float) -> np.ndarray:
     """Share of the ring for each point (trapezoid); the table covers the ring or a part 1/k."""
     steps = np.diff(s)
-    if s.size < 2 or np.any(steps < 0):
-        row = int(np.argmin(steps)) + 1 if s.size > 1 else None
-        raise sheet.error("s falls", "positions that rise", row, "s_m")
-    span = s[-1] - s[0]
+    if np.any(steps < 0):
+        raise sheet.error("s falls", "positions that rise", int(np.argmin(steps)) + 1, "s_m")
+    span = s[-1] - s[0] if s.size else 0.0
     parts = circumference / span if span > 0 else 0.0
     if abs(parts - max(1, round(parts))) > 1e-3 * parts:
         found = f"a table over {span:.6g} m"
         expected = f"the circumference of {circumference:.6g} m or a whole fraction of it"
-        raise sheet.error(found, expected, None, "s_m")
+        raise sheet.header_error(found, expected, "s_m")
     weight = (np.r_[steps, 0.0] + np.r_[0.0, steps]) / 2
     return weight / span

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from os import PathLike
 from typing import TYPE_CHECKING
@@ -15,9 +15,11 @@ from beamfit.io.columns import (
     DATE,
     Column,
     Columns,
+    Layout,
     Sheet,
     columns_of,
     ignored,
+    layout_of,
     left_out,
 )
 from beamfit.io.files import name_of
@@ -78,20 +80,20 @@ def read_run(
     >>> print(read_run(file))
     run.csv: 10 rows over 9 s, inputs valve, outputs level
     """
-    sheet = read_columns(path, EXAMPLE, columns, ignore, skip_bad)
-    named = {"u": tuple(inputs), "y": tuple(outputs)}
-    columns = _columns(sheet, named)
+    named = [(name, f"u_{name}") for name in inputs] + [(name, f"y_{name}") for name in outputs]
+    layout = layout_of(columns) + Layout(tuple(named), tuple(name for name, _ in named))
+    sheet = read_columns(path, EXAMPLE, layout, ignore, skip_bad)
+    columns = columns_of(sheet, {TIME: "time"}, lambda header: _other(header, sheet, bool(named)))
+    columns = {key: column for key, column in columns.items() if not key.startswith(ASIDE)}
     if TIME not in columns and step is None:
         raise sheet.header_error("no column of time", "time_s, or --step SECONDS")
-    kinds = {kind: {k[2:]: c for k, c in columns.items() if k.startswith(f"{kind}_")}
-             for kind in "uy"}  # fmt: skip
     for kind, word in (("u", "input"), ("y", "output")):
-        if not kinds[kind]:
+        if not any(key.startswith(f"{kind}_") for key in columns):
             raise sheet.header_error(f"no {word}", f"a column {kind}_…, or --{word} COLUMN")
-    if skip_bad:
-        sheet = sheet.good(lambda rows: _values(rows, columns, kinds))
-    time, u, y = _values(sheet, columns, kinds)
-    if time is None:
+    sheet = sheet.good(lambda rows: _values(rows, columns))
+    values = _values(sheet, columns)
+    u, y = ({k[2:]: v for k, v in values.items() if k.startswith(f"{kind}_")} for kind in "uy")
+    if (time := values.get(TIME)) is None:
         if not step > 0:
             raise InputError(f"--step {step}", "seconds between the rows, above 0")
         time = float(step) * np.arange(len(sheet))
@@ -101,44 +103,22 @@ def read_run(
         found = f"time {time[row]:.10g} s after {time[row - 1]:.10g} s"
         whole = replace(sheet, skip="")
         raise whole.error(found, "times that increase", row, columns[TIME].header)
-    name, aside = name_of(sheet.path), ignored(sheet, columns)
     said = {
         "provenance": sheet.comments,
-        "notes": (*aside, *left_out(sheet)),
+        "notes": (*ignored(sheet, columns), *left_out(sheet)),
         "sha256": sheet.sha256,
     }
-    return Run(time, u, y, name=name, path=str(sheet.path), **said)
+    return Run(time, u, y, name=name_of(sheet.path), path=str(sheet.path), **said)
 
 
-def _columns(sheet: Sheet, named: dict[str, tuple[str, ...]]) -> dict[str, Column]:
-    """Every column that is read, under ``time``, ``u_…`` or ``y_…``."""
-    found = {}
-    for kind, names in named.items():
-        for name in names:
-            if name not in sheet.names:
-                raise sheet.no_column(name)
-            found[name] = Column(name, f"{kind}_{name}")
-    any_named = bool(found)
-
-    def other(header: str) -> Column | None:
-        if header.lower() == TIME:
-            return Column(header, TIME, DATE)
-        if header[:2] in ("u_", "y_") and len(header) > 2 and not any_named:
-            return Column(header, header)
-        aside = any_named or header.startswith("note_")
-        return Column(header, f"{ASIDE} {header}") if aside else None
-
-    left = [n for n in sheet.names if n not in found]
-    known = columns_of(sheet.only(left), {TIME: "time"}, other)
-    return {k: c for k, c in known.items() if not k.startswith(ASIDE)} | {
-        c.key: c for c in found.values()
-    }
+def _other(header: str, sheet: Sheet, named: bool) -> Column | None:
+    """An input or an output; where some are named, no others are read."""
+    if header.lower() == TIME:
+        return Column(header, TIME, DATE)
+    if header[:2] in ("u_", "y_") and len(header) > 2 and (header in sheet.called or not named):
+        return Column(header, header)
+    return Column(header, f"{ASIDE} {header}") if header.startswith("note_") else None
 
 
-def _values(
-    sheet: Sheet, columns: dict[str, Column], kinds: dict[str, dict[str, Column]]
-) -> tuple[np.ndarray | None, dict[str, np.ndarray], dict[str, np.ndarray]]:
-    time = sheet.values(columns[TIME]) if TIME in columns else None
-    u = {name: sheet.values(c) for name, c in kinds["u"].items()}
-    y = {name: sheet.values(c, blank=True) for name, c in kinds["y"].items()}
-    return time, u, y
+def _values(sheet: Sheet, columns: Mapping[str, Column]) -> dict[str, np.ndarray]:
+    return {key: sheet.values(c, blank=key.startswith("y_")) for key, c in columns.items()}

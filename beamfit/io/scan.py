@@ -24,6 +24,7 @@ from beamfit.io.columns import (
     Columns,
     Sheet,
     columns_of,
+    examples,
     ignored,
     known_unit,
     left_out,
@@ -53,9 +54,11 @@ QUANTITIES = {
     "screen": "",
     "slice": "",
 }
-# How the keys of settings begin, and what tells rows apart besides.
+# How the keys of settings begin; what a scan cannot do without, and its keys.
 SETTING = "setting "
-SEEN = {"screen", "r11_x", "r11_y"}
+SIZE = "a beam size column, such as size_x_um"
+SEEN = "a magnet setting column, such as Q2_A, Q2_kG or Q2_k1, or a column screen"
+NEEDED = {SIZE: "size_[xy]", SEEN: rf"{SETTING}.*|screen|r11_[xy]"}
 CARRIED = re.compile(
     r"note_.*|comments?|charge[ _]?[\[(]?[np]C[\])]?|index|n[or]\.?|point|row|seq"
     r"|(date|(date[ _]?|elapsed[ _]?)?time([ _]?stamp)?|t)(_(h|m?s|min))?",
@@ -139,14 +142,9 @@ def scan_columns(
     columns = dict(knobs) | columns_of(
         sheet.only(rest) if knobs else sheet, QUANTITIES, lambda header: _other(header, sheet)
     )
-    if not {"size_x", "size_y"} & set(columns):
-        missing = "a beam size column, such as size_x_um"
-    elif not (any(key.startswith(SETTING) for key in columns) or SEEN & set(columns)):
-        missing = "a magnet setting column, such as Q2_A, Q2_kG or Q2_k1, or a column screen"
-    else:
-        missing = ""
-    if missing:
-        raise sheet.header_error("columns " + ", ".join(sheet.names), missing)
+    for needed, keys in NEEDED.items():
+        if not any(re.fullmatch(keys, key) for key in columns):
+            raise sheet.header_error("columns " + ", ".join(sheet.names), needed)
     for plane in "xy":
         _check_error(sheet, columns, plane)
         _check_elements(sheet, columns, plane)
@@ -154,7 +152,7 @@ def scan_columns(
     if len(given) > 1:
         raise sheet.header_error("columns " + " and ".join(given), "one of them", given[1])
     if not len(sheet):
-        raise sheet.error("a header and no rows", "at least three settings")
+        raise sheet.header_error("a header and no rows", "at least three settings")
     return columns
 
 
@@ -211,14 +209,9 @@ def _other(header: str, sheet: Sheet) -> Column:
         name = bare
     if name and not re.match(r"(size|sigma|rms|fwhm)_[xy](_|$)", name):
         return Column(header, f"{SETTING}{name}", unit)
-    usual = [f"{q}_um" for q in QUANTITIES if q.startswith("size")]
-    usual += ["resolution_um", *ENERGY_KEYS, "energy_spread"]
-    usual += ["shot", "shots", "screen", "slice"]
-    raise sheet.header_error(
-        _not_understood(header),
-        f"a magnet with _A, _kG, _T_per_m or _k1 at the end, {nearest(header, usual)}",
-        header,
-    )
+    known = nearest(header, examples(QUANTITIES))
+    expected = f"a magnet with _A, _kG, _T_per_m or _k1 at the end, {known}"
+    raise sheet.header_error(_not_understood(header), expected, header)
 
 
 def likely_scan_name(header: str, cell: object = "") -> str | None:
@@ -499,21 +492,19 @@ def read_quad_scan(
             raise InputError("--columns for a file of emittance_gui", "none: it says them", path)
         return read_emittance_gui(path).scan()
     sheet = read_columns(path, "Q2_A,size_x_um", columns, ignore, skip_bad, MOST_ROWS)
-    return scan_of_sheet(sheet, skip_bad)
+    return scan_of_sheet(sheet)
 
 
-def scan_of_sheet(
-    sheet: Sheet, skip_bad: bool = False, knobs: Mapping[str, Column] | None = None
-) -> QuadScan:
+def scan_of_sheet(sheet: Sheet, knobs: Mapping[str, Column] = MappingProxyType({})) -> QuadScan:
     """Understand the columns of a sheet as a scan; knobs of the machine are settings, too."""
     profiles: tuple[Profile, ...] = ()
     if IMAGE in sheet.names:
         sheet = of_images(replace(sheet, skip=""))
     if {"counts_x", "counts_y"} & set(sheet.names):
         sheet, profiles = of_profiles(replace(sheet, skip=""))
-    columns = scan_columns(sheet, knobs or {})
+    columns = scan_columns(sheet, knobs)
     sheet = _without_dark(sheet, columns) if "shot" in columns else sheet
-    if skip_bad:
+    if sheet.skip_bad:
         sheet = sheet.good(lambda rows: _values(rows, columns))
         usual = _usual(_values(sheet, columns))
         sheet = sheet.good(
@@ -660,7 +651,7 @@ def _check_sizes(
         column, error = columns[f"size_{plane}"], columns.get(f"size_{plane}_error")
         if plane not in usual:
             expected = f"sizes in {column.unit}"
-            raise sheet.error("no number at all", expected, None, column.header)
+            raise sheet.header_error("no number at all", expected, column.header)
         if not POSSIBLE[0] <= usual[plane] <= POSSIBLE[1]:
             raise _implausible(sheet, column, usual[plane] / column.factor)
         if error is None:
@@ -669,7 +660,7 @@ def _check_sizes(
             ratio = middle(values[f"size_{plane}_error"] / values[f"size_{plane}"])
         if not 1e-6 < ratio < 1.0:
             found = f"errors that are {ratio:g} of the sizes"
-            raise sheet.error(found, "errors in the unit of the header", None, error.header)
+            raise sheet.header_error(found, "errors in the unit of the header", error.header)
         if ratio < SMALLEST:
             said = f"Errors in {plane} are {ratio:.1g} of the sizes"
             notes.append(f"{said}: are both in the units of their headers?")
@@ -684,7 +675,7 @@ def _implausible(sheet: Sheet, column: Column, written: float) -> InputError:
     found = f"sizes around {written:g} {column.unit}, implausible for a beam"
     expected = f"sizes between {1e9 * POSSIBLE[0]:g} nm and {1e3 * POSSIBLE[1]:g} mm; if these are "
     expected += f"{likely}, rename the column {column.key}_{likely}"
-    return sheet.error(found, expected, None, column.header)
+    return sheet.header_error(found, expected, column.header)
 
 
 EMITTANCE = re.compile(r"(normalized_)?emittance_[xy]")
@@ -739,7 +730,7 @@ def read_tuning_scan(
         return _emittances(replace(sheet, skip=""), names, called)
     units = {knob: _unit(knob, header) for knob, header in called.items()}
     knobs = {f"setting {k}": Column(n, f"setting {k}", units[k]) for k, n in names.items()}
-    scan = scan_of_sheet(replace(sheet, arranged=True), skip_bad, knobs)
+    scan = scan_of_sheet(replace(sheet, arranged=True), knobs)
     return replace(scan, columns=scan.columns | called)
 
 

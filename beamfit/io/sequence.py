@@ -104,7 +104,7 @@ def read_sequence(
     try:
         elements = numbered(_Line(program, chosen).tables())
     except RecursionError:
-        found = f"'{chosen.name}', lists within lists without end"
+        found = f"'{chosen.name}', lists within lists or places FROM one another without end"
         raise chosen.error(found, "a line that a machine has") from None
     if not elements:
         raise chosen.error(f"'{chosen.name}' without elements", "a line with magnets and a screen")
@@ -147,13 +147,13 @@ class _Line:
     def tables(self) -> Iterator[dict[str, Any]]:
         """The table of each element of the line, with drifts where nothing stands."""
         if self.line.kind == "line":
-            for name, reflected in self._members(self.line, ()):
+            for name, reflected in self._members(self.line):
                 turned = reflected and self.program.dialect is not MADX  # which does not
                 yield from self._whole(self.program.elements[name], turned)
             return
         end, number = 0.0, count()
         last = _Placed(None, self._length(self.line), 0.0, (self.line.path, self.line.line))
-        for one in [*self._placed(self.line, 0.0, ()), last]:
+        for one in [*self._placed(self.line, 0.0), last]:
             gap = one.start - end
             if gap < -TINY:
                 what = f"'{one.own.name}' overlapping" if one.own else "elements beyond the end"
@@ -165,9 +165,8 @@ class _Line:
                 yield from self._whole(one.own)
                 end = one.start + one.length
 
-    def _number(self, own: Definition, key: str, usual: float = 0.0) -> float:
-        parameter = own.parameters.get(key)
-        return usual if parameter is None else _single(self.program, parameter)
+    def _number(self, own: Definition, key: str) -> float:
+        return _single(self.program, own.parameters[key]) if key in own.parameters else 0.0
 
     def _length(self, own: Definition) -> float:
         """Length along the beam; MAD-X has that of an RBEND straight, unless RBARC is off."""
@@ -181,20 +180,16 @@ class _Line:
         half = 0.5 * self._number(own, "angle") if own.kind == "rbend" else 0.0
         return length * half / math.sin(half) if half and self.program.rbarc else length
 
-    def _placed(
-        self, sequence: Definition, start: float, within: tuple[str, ...]
-    ) -> Iterator[_Placed]:
+    def _placed(self, sequence: Definition, start: float) -> Iterator[_Placed]:
         """Elements of a sequence that begins at a place."""
-        if sequence.name in within:
-            raise sequence.error(f"'{sequence.name}', which holds itself", "a sequence of others")
-        for i, (name, _) in enumerate(sequence.placed):
+        for i, (name, place) in enumerate(sequence.placed):
             self._count(sequence)
             own = self._part(sequence, name)
-            first = start + self._centre(sequence, i, ()) - 0.5 * self._length(own)
+            first = start + self._centre(sequence, i) - 0.5 * self._length(own)
             if own.kind == "sequence":
-                yield from self._placed(own, first, (*within, sequence.name))
+                yield from self._placed(own, first)
             else:
-                at = sequence.placed[i][1]["at"]
+                at = place["at"]
                 yield _Placed(own, first, self._length(own), (at.path, at.line))
 
     def _part(self, sequence: Definition, name: str) -> Definition:
@@ -204,12 +199,10 @@ class _Line:
             raise sequence.error(found, "elements and sequences")
         return own
 
-    def _centre(self, sequence: Definition, i: int, behind: tuple[int, ...]) -> float:
+    def _centre(self, sequence: Definition, i: int) -> float:
         """Place of the centre of one part of a sequence, from the sequence's start."""
         name, place = sequence.placed[i]
         own = self._part(sequence, name)
-        if i in behind or len(behind) > 100:
-            raise sequence.error(f"'{own.name}', placed FROM itself", "FROM another element")
         if "at" not in place:
             raise sequence.error(f"'{own.name}' without a place", "AT = ...")
         at = _single(self.program, place["at"])
@@ -218,36 +211,30 @@ class _Line:
             names = [n for n, _ in sequence.placed]
             if other not in names:
                 raise sequence.error(f"'{own.name}' FROM '{other}'", nearest(other, names))
-            at += self._centre(sequence, names.index(other), (*behind, i))
+            at += self._centre(sequence, names.index(other))
         if own.kind == "sequence" and "refpos" in own.parameters:
             return at + 0.5 * self._length(own) - self._reference(own)
-        refer = (
-            word_of(sequence.parameters["refer"]) if "refer" in sequence.parameters else "centre"
-        )
-        if refer.lower() not in TO_CENTRE:
+        refer = word_of(sequence.parameters.get("refer"), "centre").lower()
+        if refer not in TO_CENTRE:
             raise sequence.error(f"REFER = {refer}", "ENTRY, CENTRE or EXIT")
-        return at + TO_CENTRE[refer.lower()] * self._length(own)
+        return at + TO_CENTRE[refer] * self._length(own)
 
     def _reference(self, own: Definition) -> float:
         """Place in a sequence of the element that its REFPOS names."""
         name, names = word_of(own.parameters["refpos"]).lower(), [n for n, _ in own.placed]
         if name not in names:
             raise own.error(f"REFPOS = '{name}'", nearest(name, names))
-        return self._centre(own, names.index(name), ())
+        return self._centre(own, names.index(name))
 
-    def _members(self, line: Definition, within: tuple[str, ...]) -> list[tuple[str, bool]]:
+    def _members(self, line: Definition) -> list[tuple[str, bool]]:
         """Names of the elements of a LINE, in order, and whether each is reflected."""
-        if line.name in within:
-            raise line.error(f"'{line.name}', which holds itself", "a line of others")
         try:
             tree = parsed(line.members, "list")
         except ValueError as error:
             raise line.error(f"a list {error}", "NAME: LINE = (A, 2*B, -C, (D, E));") from None
-        return self._list(line, tree, (*within, line.name))
+        return self._list(line, tree)
 
-    def _list(
-        self, line: Definition, tree: Tree, within: tuple[str, ...]
-    ) -> list[tuple[str, bool]]:
+    def _list(self, line: Definition, tree: Tree) -> list[tuple[str, bool]]:
         """Names in a list, as of `_members`."""
         every: list[tuple[str, bool]] = []
         for *said, own in (member.children for member in tree.children):
@@ -255,16 +242,14 @@ class _Line:
             if number < 1:
                 raise line.error(f"{number} times an element", "one or more")
             found = self._list if isinstance(own, Tree) else self._member
-            one = found(line, own, within)
+            one = found(line, own)
             self._count(line, number * len(one))
             if "-" in said:
                 one = [(name, not reflected) for name, reflected in one[::-1]]
             every += one * number
         return every
 
-    def _member(
-        self, line: Definition, label: str, within: tuple[str, ...]
-    ) -> list[tuple[str, bool]]:
+    def _member(self, line: Definition, label: str) -> list[tuple[str, bool]]:
         name = label.lower()
         if name in self.program.elements:
             return [(name, False)]
@@ -273,7 +258,7 @@ class _Line:
             names = [d.name for d in (*self.program.elements.values(), *known.values())]
             what = "a sequence" if name in known else "which nothing defines"
             raise line.error(f"'{name}' in a LINE, {what}", nearest(name, names))
-        return self._members(known[name], within)
+        return self._members(known[name])
 
     def _count(self, own: Definition, number: int = 1) -> None:
         self.made += number
@@ -500,7 +485,7 @@ def _particle(beam: dict[str, Attribute], program: Interpreter, path: str | Path
     MAD-X passes over a mass and a charge beside a name that it knows; one that contradicts is
     refused here.
     """
-    named = word_of(beam["particle"]).lower() if "particle" in beam else None
+    named = word_of(beam.get("particle")).lower() or None
     mass, charge = (
         _single(program, beam[key]) if key in beam else None for key in ("mass", "charge")
     )

@@ -121,14 +121,13 @@ def of_profiles(sheet: Sheet) -> tuple[Sheet, tuple[Profile, ...]]:
             Profile(plane, row, x[a:b], counts[a:b], None)
             for row, (a, b) in enumerate(zip(starts, ends, strict=True))
         ]
-        short = next((s for s in shots if len(s.position) < FEWEST_BINS), None)
-        if short is not None:
-            said = f"a profile of {len(short.position)} bins"
-            raise sheet.error(said, f"{FEWEST_BINS} lines or more a shot", int(starts[short.row]))
-        twice = next((s for s in shots if len(set(s.position)) < len(s.position)), None)
-        if twice is not None:
-            expected = "bins at positions of their own, a pixel above zero, and a column shot"
-            raise sheet.error("a profile with a position twice", expected, int(starts[twice.row]))
+        for row, count, places in ((s.row, len(s.position), len(set(s.position))) for s in shots):
+            if count < FEWEST_BINS:
+                expected = f"{FEWEST_BINS} lines or more a shot"
+                raise sheet.error(f"a profile of {count} bins", expected, int(starts[row]))
+            if places < count:
+                expected = "bins at positions of their own, a pixel above zero, and a column shot"
+                raise sheet.error("a profile with a position twice", expected, int(starts[row]))
         sizes[plane], found[plane] = np.array([profile_size(s) for s in shots]), shots
     kept = sheet.only(rest).rows(list(starts))
     seen, notes = _settings_with_beam(kept, sizes), list(kept.notes)

@@ -85,8 +85,8 @@ def read_columns(
         As `read_sheet`, and of what is said of columns.
     """
     layout = layout_of(columns)
-    sheet = read_sheet(path, example, most, ragged=skip_bad, names=layout.header or None)
-    sheet = replace(sheet, skip="" if skip_bad else SKIP, optional=True)
+    sheet = read_sheet(path, example, most, skip_bad=skip_bad, names=layout.header or None)
+    sheet = replace(sheet, skip="" if skip_bad else SKIP, skip_bad=skip_bad)
     return arranged(sheet.without(ignore), layout)
 
 
@@ -95,7 +95,7 @@ def read_sheet(
     example: str,
     most: int = MOST_ROWS,
     *,
-    ragged: bool | None = None,
+    skip_bad: bool | None = None,
     names: Sequence[str] | None = None,
 ) -> Sheet:
     """Read the columns of a CSV, TFS, SDDS, HDF5 or MATLAB file.
@@ -110,7 +110,7 @@ def read_sheet(
         A header such as the file should have, for messages.
     most : int
         Most rows there may be.
-    ragged : bool, optional
+    skip_bad : bool, optional
         Whether rows that have not as many cells as the header are left out, and named in ``bad``;
         None where nobody can ask for it.
     names : sequence of str, optional
@@ -145,14 +145,14 @@ def read_sheet(
         return _binary(path, most)
     if suffix == ".json":
         return _of_json(path, most)
-    return _read_text(path, example, most, ragged, names)
+    return _read_text(path, example, most, skip_bad, names)
 
 
 def _read_text(
     path: str | PathLike[str],
     example: str,
     most: int,
-    ragged: bool | None,
+    skip_bad: bool | None,
     names: Sequence[str] | None,
 ) -> Sheet:
     comments, rows, lines, bad, columns, notes = [], [], [], [], None, ()
@@ -177,10 +177,10 @@ def _read_text(
             lines += [] if wrong else [line]
             if len(rows) + len(bad) > least:
                 check_length(len(rows) + len(bad), least, path, line)
-            if bad and not ragged:
+            if bad and not skip_bad:
                 break
-    if bad and not (ragged and rows):
-        raise replace(bad[0], expected=bad[0].expected + SKIP * (ragged is False))
+    if bad and not (skip_bad and rows):
+        raise replace(bad[0], expected=bad[0].expected + SKIP * (skip_bad is False))
     if columns is None:
         rows, notes = with_points(rows, separator)
         columns = zip(*rows, strict=True) if rows else [()] * len(names)
@@ -415,24 +415,17 @@ def header_at(lines: Sequence[str]) -> int:
     >>> header_at(["time,current", "1,2", "Q2_A,size_x_um"])
     0
     """
-    first: int | None = None
-    for i, text in enumerate(lines):
-        if _is_aside(text):
-            continue
-        cells = _words(text)
+    rows = [(i, _words(text)) for i, text in enumerate(lines) if not _is_aside(text)]
+    for i, cells in rows:
         if is_header(cells):
             return i
-        if first is None:
-            first = i
-        elif (
-            any(map(is_number, cells))
-            and is_value(cells[0])
-            and len(cells) == len(_words(lines[first]))
-        ):
+        below = i > rows[0][0] and len(cells) == len(rows[0][1])
+        if below and is_value(cells[0]) and any(map(is_number, cells)):
             break
-    if first is None or _has_rows(lines, first):
-        return first or 0
-    return next((i for i in range(first, len(lines)) if _has_rows(lines, i)), first)
+    for k, (i, cells) in enumerate(rows, start=1):
+        if _has_rows(cells, [row for _, row in rows[k:]]):
+            return i
+    return rows[0][0] if rows else 0
 
 
 def _is_aside(text: str) -> bool:
@@ -445,15 +438,11 @@ def is_value(cell: str) -> bool:
     return cell.lstrip("+-.")[:1].isdigit()
 
 
-def _has_rows(lines: Sequence[str], i: int) -> bool:
+def _has_rows(cells: Sequence[str], below: list[list[str]]) -> bool:
     """Tell a line of words that rows of as many cells follow, below its units perhaps."""
-    cells = _words(lines[i])
-    rows = [_words(text) for text in lines[i + 1 :] if not _is_aside(text)][:3]
-    if rows and units_below(rows[0]):
-        del rows[0]
-    alike = rows and all(len(row) == len(cells) and is_value(row[0]) for row in rows[:2])
-    words = not _is_aside(lines[i]) and not any(map(is_value, cells))
-    return bool(alike) and len(cells) > 1 and words
+    below = below[1:] if below and units_below(below[0]) else below
+    alike = all(len(row) == len(cells) and is_value(row[0]) for row in below[:2])
+    return bool(below) and alike and len(cells) > 1 and not any(map(is_value, cells))
 
 
 def uncommented(lines: Sequence[str]) -> list[str]:

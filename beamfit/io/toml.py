@@ -6,18 +6,19 @@ import math
 import re
 import tomllib
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, fields
 from os import PathLike
 from typing import Any, NamedTuple
 
 from beamfit.errors import InputError, nearest
 from beamfit.io.files import digest, read_text
 
-# Parts of a key between dots.
-DEEPEST = 20
-DEEP = re.compile(rf"(?:[\w\"'-]+[ \t]*\.[ \t]*){{{DEEPEST}}}")
-# A whole number that no other program reads, and whose decimal digits Python does not write.
-LONG = re.compile(r"\b0[xob][0-9A-Fa-f_]{250,}")
+# A key whose parts between dots take tomllib minutes; a whole number that no other program reads,
+# and whose decimal digits Python does not write.
+ENDLESS = {
+    re.compile(r"(?:[\w\"'-]+[ \t]*\.[ \t]*){20}"): "a key of more than 20 parts",
+    re.compile(r"\b0[xob][0-9A-Fa-f_]{250,}"): "an integer of {} digits",
+}
 # Words of which all are named, and not the nearest.
 MOST_LISTED = 3
 REQUIRED: Any = object()
@@ -108,6 +109,12 @@ class Key(NamedTuple):
         return value * self.factor if self.kind in (NUMBER, NUMBERS) else value
 
 
+def keyed(name: str, default: Any = REQUIRED, **how: Any) -> Any:
+    """A field of a dataclass with the key of a table that gives it; see `Section.read`."""
+    given = {} if default is REQUIRED else {"default": default}
+    return field(**given, metadata={name: Key(default=default, **how)})
+
+
 def is_number(value: object) -> bool:
     """Tell a value that is a finite number (an integer of 400 digits is none)."""
     return isinstance(value, NUMBER) and not isinstance(value, bool) and abs(value) < 1e300
@@ -145,13 +152,13 @@ class Section:
 
     def error(self, found: str, expected: str, key: str | None = None) -> InputError:
         """Make the error that names the line on which the key (or the table) stands."""
-        line = self.start + 1 if key is None else self._line(re.escape(key)) + 1
+        line = self.start + 1 if key is None else self._line(key) + 1
         return InputError(found, expected, path=self.path, line=line, column=key)
 
     def _line(self, key: str) -> int:
         """Find the line of `key =` before the next table, or of a table of that name."""
-        value = re.compile(rf"\s*['\"]?{key}['\"]?\s*=")
-        head = re.compile(rf"\s*\[\[?\s*{self.prefix}{key}\s*\]")
+        value = re.compile(rf"\s*['\"]?{re.escape(key)}['\"]?\s*[=.]")
+        head = re.compile(rf"\s*\[\[?\s*{re.escape(self.prefix + key)}\s*\]")
         inside = True
         for n in range(self.start, len(self.lines)):
             inside = inside and (n == self.start or not self.lines[n].lstrip().startswith("["))
@@ -170,8 +177,7 @@ class Section:
         table = self.table.get(name, {})
         if not isinstance(table, dict):
             raise self.error(f"{name} = {table!r}"[:80], f"a table [{name}]", name)
-        head = re.compile(rf"\s*\[?\s*({re.escape(self.prefix)})?{re.escape(name)}\b")
-        start = next((n for n, text in enumerate(self.lines) if head.match(text)), 0)
+        start = self._line(name)
         return Section(self.path, self.lines, table, start, f"in [{name}]", f"{name}.")
 
     def sections(self, name: str) -> list[Section]:
@@ -216,6 +222,22 @@ class Section:
             for name, key in keys.items()
             if key.field
         }
+
+    def read(self, kind: type[Any]) -> Any:
+        """Make a dataclass whose fields are `keyed`; checked as by `values`.
+
+        Examples
+        --------
+        >>> @dataclass
+        ... class Shot:
+        ...     wait: float = keyed("wait_s", low=0.0, said="a time above zero")
+        >>> Section("a.toml", (), {"wait_s": 2.5}).read(Shot)
+        Shot(wait=2.5)
+        """
+        own = [
+            (name, k._replace(field=f.name)) for f in fields(kind) for name, k in f.metadata.items()
+        ]
+        return kind(**self.values(dict(own)))
 
     def one_of(self, names: Iterable[str], hint: str = "") -> str:
         """The one of some keys that is given; a hint says what may stand for none.
@@ -272,12 +294,10 @@ def read_toml(
     text = read_text(path)
     lines = tuple(text.splitlines())
     try:
-        if deep := DEEP.search(text):  # which takes tomllib minutes
-            line = text.count("\n", 0, deep.start()) + 1
-            raise ValueError(f"a key of more than {DEEPEST} parts (at line {line})")
-        if long := LONG.search(text):
-            line = text.count("\n", 0, long.start()) + 1
-            raise ValueError(f"an integer of {len(long[0]) - 2} digits (at line {line})")
+        for endless, said in ENDLESS.items():
+            if found := endless.search(text):
+                line = text.count("\n", 0, found.start()) + 1
+                raise ValueError(f"{said.format(len(found[0]) - 2)} (at line {line})")
         table = tomllib.loads(text)
     except (ValueError, RecursionError) as error:  # integers too long, nesting too deep
         if re.search(r"^[^#=\n]*\bsize_[xy]_", text, re.MULTILINE):

@@ -102,14 +102,10 @@ def _page(
             for file, value, error, off in zip(c.files, c.value, c.error, c.beyond, strict=True)
             if off
         ]
-        more = f"the first {MOST_ROWS} of {len(rows)}" if len(rows) > MOST_ROWS else ""
         title = f"Beyond the control limits: {c.label}"
-        tables += [Table(title, ["file", plain_name(c.name)], rows[:MOST_ROWS], more)] * bool(rows)
-    if batch.refused:
-        more = f"the first {MOST_ROWS} of {len(batch.refused)}; all are in the table of answers"
-        rows = [[reason] for reason in islice(batch.refused.values(), MOST_ROWS)]
-        note = more if len(batch.refused) > MOST_ROWS else ""
-        tables.append(Table("Without an answer", ["file and reason"], rows, note))
+        tables += _first(Table(title, ["file", plain_name(c.name)], rows))
+    rows = [[reason] for reason in batch.refused.values()]
+    tables += _first(Table("Without an answer", ["file and reason"], rows))
     pictures = [
         Picture(f"course of {c.label}", 3.0, partial(draw_course, course=c), _source(c, job.kind))
         for c in courses
@@ -127,6 +123,14 @@ def _page(
         remarks=[("table", str(batch.ledger.out)), ("options", job.key[1])],
         links=links,
     )
+
+
+def _first(table: Table) -> list[Table]:
+    """The first rows of a table, if it has any; the file of answers has all."""
+    count = len(table.rows)
+    note = f"the first {MOST_ROWS} of {count}; all are in the table of answers"
+    shown = table._replace(rows=table.rows[:MOST_ROWS], note=note if count > MOST_ROWS else "")
+    return [shown] if count else []
 
 
 def _source(c: ControlChart, kind: str) -> str:

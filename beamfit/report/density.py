@@ -39,10 +39,8 @@ def density_page(fit: DensityFit) -> ReportPage:
             continue
         rows = math.ceil(len(p.profiles) / ABREAST)
         methods = [said[p.plane] for said in fit.stored.values() if p.plane in said]
-        draw, seen = (
-            partial(draw_density, plane=p, methods=methods),
-            partial(draw_profiles, plane=p),
-        )
+        draw = partial(draw_density, plane=p, methods=methods)
+        seen = partial(draw_profiles, plane=p)
         pictures.append(Picture(f"density in {p.plane}, emittance against charge", 3.2, draw,
                                 source))  # fmt: skip
         pictures.append(Picture(f"profiles in {p.plane}", 0.6 + 1.9 * rows, seen, source))

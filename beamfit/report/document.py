@@ -39,8 +39,6 @@ STYLE = {
 BLUE, RED = "#1f5fa8", "#b5421f"
 # Points above which a curve is drawn as an image, to keep the page small.
 MANY = 500
-# Dots an inch of a picture in a notebook.
-SHARP = 110
 # Most curves, bars or profiles in a picture; the tables have all.
 MOST_DRAWN = 12
 
@@ -115,28 +113,17 @@ def written_now(
     page: ReportPage, command: str | None = None, inputs: Mapping[str, str | None] | None = None
 ) -> ReportPage:
     """Say on a page when it is written and where it comes from: its own inputs unless given."""
-    made = provenance(inputs or page.inputs or {}, page.remarks, command)
-    subtitle = "; ".join(filter(None, (page.subtitle, written())))
-    return page._replace(subtitle=subtitle, provenance=made)
-
-
-def provenance(
-    inputs: Mapping[str, str | None], remarks: Sequence[tuple[str, str]], command: str | None
-) -> list[tuple[str, str]]:
-    """List where a report comes from: input digests, remarks, versions, command."""
     packages = ", ".join(f"{n} {version(n)}" for n in ("jax", "numpy", "scipy", "matplotlib"))
-    return [
-        *((f"sha256 of {name}", digest or "-") for name, digest in inputs.items()),
-        *remarks,
+    digests = inputs or page.inputs or {}
+    made = [
+        *((f"sha256 of {name}", digest or "-") for name, digest in digests.items()),
+        *page.remarks,
         ("made by", f"beamfit {beamfit.__version__} on Python {platform.python_version()}"),
         ("with", packages),
         ("command", command or "from Python"),
     ]
-
-
-def written() -> str:
-    """Time of writing, for a subtitle."""
-    return "written " + datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
+    now = "written " + datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
+    return page._replace(subtitle="; ".join(filter(None, (page.subtitle, now))), provenance=made)
 
 
 def moments(words: str) -> list[datetime]:
@@ -267,7 +254,7 @@ class ShownFigure(Figure):
 
     def _repr_png_(self) -> bytes:
         buffer = io.BytesIO()
-        self.savefig(buffer, format="png", dpi=SHARP)
+        self.savefig(buffer, format="png", dpi=STYLE["figure.dpi"])
         return buffer.getvalue()
 
 

@@ -10,8 +10,9 @@ import numpy as np
 from matplotlib.figure import FigureBase
 
 from beamfit.answer import Table
+from beamfit.dynamics.answer import Curve
 from beamfit.dynamics.control import Loop
-from beamfit.dynamics.fedbatch import FedBatchFit, Ranked
+from beamfit.dynamics.fedbatch import FedBatchFit
 from beamfit.dynamics.feed import FeedCourse, FeedPlan
 from beamfit.dynamics.fit import ResponseFit
 from beamfit.dynamics.record import Run
@@ -82,13 +83,19 @@ def _pictures(fit: ResponseFit | StateSpaceOutput) -> list[Picture]:
         for i in runs
     ]  # fmt: skip
     every = ", ".join(run.name for run in fit.runs)
-    found += [
-        Picture(f"{c.parameter} against {c.input} with its band", 2.8,
-                partial(draw_curve, fit, j), f"{fit.output} in {every}")
-        for j, c in enumerate(fit.curves)
-    ]  # fmt: skip
     words = f"Correlations of the residuals of {fit.output}"
-    return [*found, Picture(words, 2.8, partial(_draw_correlations, fit), every)]
+    last = Picture(words, 2.8, partial(_draw_correlations, fit), every)
+    return [*found, *_curves(fit, "against", f"{fit.output} in {every}"), last]
+
+
+def _curves(
+    fit: ResponseFit | StateSpaceOutput | FedBatchFit, by: str, source: str
+) -> list[Picture]:
+    """The picture of each parameter curve."""
+    return [
+        Picture(f"{c.parameter} {by} {c.input} with its band", 2.8, partial(draw_curve, c), source)
+        for c in fit.curves
+    ]
 
 
 def _draw_run(fit: ResponseFit | StateSpaceOutput, i: int, figure: FigureBase) -> None:
@@ -116,9 +123,8 @@ def _draw_run(fit: ResponseFit | StateSpaceOutput, i: int, figure: FigureBase) -
     figure.align_ylabels()
 
 
-def draw_curve(fit: ResponseFit | StateSpaceOutput, j: int, figure: FigureBase) -> None:
+def draw_curve(c: Curve, figure: FigureBase) -> None:
     """A parameter against the operating point, dashed where the runs never were."""
-    c = fit.curves[j]
     axes = figure.subplots()
     known = c.visited & np.isfinite(c.error)
     axes.plot(c.at, c.value, "--", color="0.6", linewidth=1)
@@ -168,18 +174,11 @@ def fedbatch_page(rates: FedBatchFit) -> ReportPage:
         )
         for i, run in enumerate(rates.runs)
     ]
-    pictures += [
-        Picture(
-            f"{c.parameter} by {c.input} with its band",
-            2.8,
-            partial(draw_curve, rates, j),
-            ", ".join(run.name for run in rates.runs),
-        )
-        for j, c in enumerate(rates.curves)
-    ]
+    every = ", ".join(run.name for run in rates.runs)
+    pictures += _curves(rates, "by", every)
     return ReportPage(
         title="Fed-batch process",
-        subtitle=f"identified from {', '.join(run.name for run in rates.runs)}",
+        subtitle=f"identified from {every}",
         verdicts=[Verdict.of(rates)],
         tables=list(rates.tables()),
         pictures=pictures,
@@ -232,14 +231,6 @@ def draw_course(course: FeedCourse, figure: FigureBase) -> None:
     axes[-1].step(course.time, course.feed, where="post", color=RED)
     axes[-1].set(xlabel="time, h", ylabel="feed, L/h")
     figure.align_ylabels(axes)
-
-
-def draw_ranking(ranked: Sequence[Ranked], figure: FigureBase) -> None:
-    """Draw the nonlinear correlation of an output with each input."""
-    axes = figure.subplots()
-    order = list(reversed(ranked))
-    axes.barh([each.name for each in order], [each.correlation for each in order], color=BLUE)
-    axes.set_xlabel("nonlinear correlation, sqrt(1 - exp(-2 I))")
 
 
 DISTURBED = "#7b4fa3"

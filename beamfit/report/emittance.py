@@ -125,9 +125,7 @@ def _pictures(fit: EmittanceFit) -> list[Picture]:
     return listed
 
 
-def identifiability_rows(
-    planes: tuple[PlaneFit, ...],
-) -> list[tuple[str, list[str]]]:
+def identifiability_rows(planes: tuple[PlaneFit, ...]) -> list[tuple[str, list[str]]]:
     """Label and one cell per plane for what the data determine."""
     rows: list[tuple[str, Callable[[PlaneFit], object]]] = [
         ("emittance", lambda p: "determined" if p.identifiability.determined else "not determined"),

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from functools import partial
 from textwrap import fill
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -13,15 +15,7 @@ from matplotlib.figure import FigureBase
 from beamfit.emittance.fit import EmittanceFit
 from beamfit.emittance.results import PlaneFit
 from beamfit.emittance.scan import Profile
-from beamfit.report.document import (
-    BLUE,
-    MANY,
-    RED,
-    Picture,
-    day_of,
-    legend_below,
-    quality,
-)
+from beamfit.report.document import BLUE, MANY, RED, Picture, day_of, legend_below, quality
 
 # Profiles in a row of the picture.
 PROFILES_ABREAST = 3
@@ -29,6 +23,7 @@ COLOUR = {"x": BLUE, "y": RED}
 # Of further screens: each has a colour, a marker and a line of its own.
 FURTHER = {"x": ("#0f8b8d", "#7b4fa3", "#5a6570"), "y": ("#c98a00", "#8a3b6b", "#5a6570")}
 MARKERS, LINES = "os^D", ("-", "--", ":", "-.")
+DOUBTED = "probably bad"
 
 
 # The picture of a scan where two stand side by side: narrow, so that its letters can be read.
@@ -116,12 +111,8 @@ def _residuals(axes: Axes, p: PlaneFit) -> None:
     at, words = setting_axis(p)
     axes.axhspan(-1, 1, color="0.93")
     axes.axhline(0, color="0.6", lw=0.8)
-    for rows, colour, marker, _ in _screens(p):
-        many = len(at) > MANY
-        for keep, face in ((rows & ~_doubted(p), colour), (rows & _doubted(p), "white")):
-            style = {"color": colour, "mfc": face, "ms": 5, "rasterized": many}
-            if keep.any():
-                axes.plot(at[keep], p.points.pull[keep], marker, **style)
+    for rows, _, style in _groups(p):
+        axes.errorbar(at[rows], p.points.pull[rows], **style)
     finite = np.abs(p.points.pull[np.isfinite(p.points.pull)])
     reach = max(3.0, 1.15 * float(finite.max(initial=0.0)))
     axes.set(xlabel=words, ylabel="residual,\nstd. errors", ylim=(-reach, reach))
@@ -169,24 +160,20 @@ def _curves(axes: Axes, fit: EmittanceFit, p: PlaneFit, magnet: str) -> None:
 def _points(axes: Axes, p: PlaneFit, at: np.ndarray) -> None:
     """Measured points; those that are probably bad are hollow, and their errors nobody knows."""
     error, size = np.nan_to_num(1e6 * p.points.error), 1e6 * p.points.size
-    doubted = _doubted(p)
-    screens = _screens(p)
+    for rows, label, style in _groups(p):
+        bar = None if label == DOUBTED else error[rows]
+        axes.errorbar(at[rows], size[rows], bar, capsize=3, label=label, **style)
+
+
+def _groups(p: PlaneFit) -> Iterator[tuple[np.ndarray, str, dict[str, Any]]]:
+    """Rows of each screen, those that are probably bad by themselves; their label and style."""
+    screens, bad = _screens(p), p.points.outlier_probability >= 0.5
     for rows, colour, marker, screen in screens:
         name = "measured" if len(screens) == 1 else f"measured at {screen}"
-        for keep, face, label in (
-            (rows & ~doubted, colour, name),
-            (rows & doubted, "white", "probably bad"),
-        ):
+        for keep, face, label in ((rows & ~bad, colour, name), (rows & bad, "white", DOUBTED)):
+            style = {"fmt": marker, "ms": 5, "color": colour, "mfc": face}
             if keep.any():
-                style = {"fmt": marker, "ms": 5, "capsize": 3, "color": colour, "mfc": face}
-                style |= {"rasterized": len(at) > MANY, "label": label}
-                bar = error[keep] if face == colour else None
-                axes.errorbar(at[keep], size[keep], bar, **style)
-
-
-def _doubted(p: PlaneFit) -> np.ndarray:
-    """Which points are probably bad."""
-    return p.points.outlier_probability >= 0.5
+                yield keep, label, style | {"rasterized": len(rows) > MANY}
 
 
 def draw_profiles(figure: FigureBase, profiles: list[Profile], fit: EmittanceFit) -> None:
