@@ -25,6 +25,7 @@ from beamfit.lifetime.free_law import LIKELIER, Law
 from beamfit.lifetime.pieces import split_record
 from beamfit.lifetime.readings import noise_of
 from beamfit.lifetime.record import Monitor
+from beamfit.noise.memory import remembers
 from beamfit.quantity import HOUR, percent
 from beamfit.statistics import MANY, POOR_FIT, chi2_probability, few_words, of_use
 
@@ -295,14 +296,14 @@ def _freely(e: Evidence) -> Finding | None:
 
 def _disturbed(e: Evidence) -> str:
     """Name what goes by itself beside the law, if that is likelier than not."""
-    free, contained = e.free, "which the errors contain"
-    if free is not None and free.settles > LIKELIER:
-        likely = f"A monitor that settles after a fill is likely ({percent(free.settles)})"
-        return f"{likely}, {contained}"
-    if free is not None and free.wanders > LIKELIER:
-        likely = f"The loss rate or the monitor wanders within the record ({percent(free.wanders)})"
-        return f"{likely}, {contained}"
-    return ""
+    if e.free is None or not e.free.is_disturbed:
+        return ""
+    likely = f"A monitor that settles after a fill is likely ({percent(e.free.settles)})"
+    if e.free.wanders > LIKELIER:
+        likely = (
+            f"The loss rate or the monitor wanders within the record ({percent(e.free.wanders)})"
+        )
+    return f"{likely}, which the errors contain"
 
 
 def _departs(e: Evidence) -> str:
@@ -474,7 +475,7 @@ def _few(e: Evidence) -> str | None:
 
 def _correlated(e: Evidence) -> str | None:
     found, length = e.separability, e.correlation_time
-    if length is None:
+    if length is None or (e.freed and not remembers(e.residuals, e.time.size - e.dof)):
         return None
     times = found.error_inflation
     than = f": they are {times:.1f} times those of independent readings" if times else ""

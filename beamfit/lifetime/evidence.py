@@ -639,7 +639,8 @@ class Evidence:
             known = self.separability.separable and not (refuted and self.course)
         else:
             plain = not self.shaped and self.about.pieces.gauge is None
-            known = plain and refuted and self.outgassing is None and not self.pumped
+            own = self.pumped or (self.free is not None and self.free.is_disturbed)
+            known = plain and refuted and self.outgassing is None and not own
         return lifetime_law(self.about, self.independent, refuted) if known else None
 
     @cached_property

@@ -881,6 +881,11 @@ class FreeLaw:
         """True if what is quoted is gas that is pumped away."""
         return self.likelier and self.pumped > LIKELIER
 
+    @property
+    def is_disturbed(self) -> bool:
+        """True if something is likely to go by itself beside the law."""
+        return max(self.wanders, self.settles) > LIKELIER
+
     def curve(self, time: np.ndarray) -> np.ndarray:
         """What the monitor shows in the mean at times in s, mA."""
         return from_nodes(time / self.span) @ self.nodes
