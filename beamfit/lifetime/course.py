@@ -251,9 +251,9 @@ def _point(
     beyond = int(np.sign(off)) if abs(off) > max(limit, 3 * value.error) else 0
     fit = decay.fit
     relative: list[Quantity | None] = [None, None]
-    pumped = fit.free_law is not None and fit.free_law.is_pumped
-    same = usual is not None and not usual.power
-    if same and fit.status is not Status.poor_fit and not pumped:
+    law = fit.free_law
+    same = usual is not None and not usual.power and fit.status is not Status.poor_fit
+    if same and not (law is not None and (law.is_pumped or law.is_disturbed)):
         relative = [
             None if q.error is None else Quantity(q.value / by, q.error / by, "1")
             for q, by in ((fit.if_constant("a"), usual.a * a), (fit.if_constant("b"), usual.b * b))
