@@ -133,10 +133,8 @@ def settling() -> np.ndarray:
 
 WALKS, _DRIFTS = _wandering()
 LOSS_WANDERS = Disturbance(np.concatenate([share * WALKS for share in SHARES]), WANDERS, True)
-MONITOR_WANDERS = Disturbance(
-    MONITOR * np.concatenate([size * one for size in MULTIPLES for one in (WALKS, _DRIFTS)]),
-    WANDERS,
-)
+_OFF = np.concatenate([size * shape for size in MULTIPLES for shape in (WALKS, _DRIFTS)])
+MONITOR_WANDERS = Disturbance(MONITOR * _OFF, WANDERS)
 MONITOR_SETTLES = Disturbance(MONITOR * settling(), OUTGASSING)
 DISTURBANCES = LOSS_WANDERS, MONITOR_WANDERS, MONITOR_SETTLES
 
@@ -422,9 +420,8 @@ class SeenDecay:
             matrix=_turned(left) @ left,
         )
         mean = -size @ _turned(np.linalg.solve(lower, seen)) @ left
-        return replace(
-            self, products=products, disturbed=Disturbed(mean, size @ _turned(half), kind)
-        )
+        found = Disturbed(mean, size @ _turned(half), kind)
+        return replace(self, products=products, disturbed=found)
 
     def away(self, currents: np.ndarray) -> np.ndarray:
         """Currents at the nodes, (18, d), as multiples of the columns that they leave."""
@@ -972,17 +969,17 @@ def free_law(record: DecayRecord, values: Physical) -> FreeLaw | None:
 
 
 def proposals(seen: SeenDecay) -> list[DrawnLaw]:
-    """The free law, and where no gauge tells the gas, gas that is pumped away, a monitor that
-    settles, and a loss rate or a monitor that wanders.
+    """The free law, gas that is pumped away, and disturbances; where a gauge tells the gas, only
+    those of the monitor.
     """
-    if not seen.drifts:
-        return [DrawnLaw.of(seen, [*CONSTANT, POWER])]
-    smooth = [*CONSTANT, POWER, CHANGE]
-    laws = [DrawnLaw.of(seen, smooth), DrawnLaw.of(seen, [*CONSTANT, CHANGE, PACE])]
+    free = [*CONSTANT, POWER, CHANGE] if seen.drifts else [*CONSTANT, POWER]
+    laws, beside = [DrawnLaw.of(seen, free)], [(MONITOR_WANDERS, free), (MONITOR_SETTLES, CONSTANT)]
+    if seen.drifts:
+        laws.append(DrawnLaw.of(seen, [*CONSTANT, CHANGE, PACE]))
+        beside.append((LOSS_WANDERS, free))
     if seen.products.count < FEWEST:
         return laws
-    beside = zip(DISTURBANCES, (smooth, smooth, CONSTANT), strict=True)
-    return [*laws, *(DrawnLaw.of(seen.beside(kind), free) for kind, free in beside)]
+    return [*laws, *(DrawnLaw.of(seen.beside(kind), own) for kind, own in beside)]
 
 
 def rates_of(a, b, power, changed, x, seen: SeenDecay):

@@ -253,6 +253,21 @@ def test_a_gauge_leaves_no_drift_open():
     assert blind.drift is not None
 
 
+def test_a_gauge_leaves_the_monitor_open():
+    time = law()[0]
+    pressure = 1 + 0.2 * np.sin(time / 5000.0)
+
+    def slope(t, i):
+        return -(A * i + B * (1 + 0.2 * np.sin(t / 5000.0))) * i
+
+    beam = solve_ivp(slope, (0, time[-1]), [I0], t_eval=time, rtol=1e-11, atol=1e-10).y[0]
+    shown = beam - 0.3 * np.exp(-time / 2000) + 0.02 * np.random.default_rng(1).normal(size=300)
+    fit = fit_decay(DecayRecord(time, shown, conditions=Conditions(pressure=1e-7 * pressure)))
+    assert fit.free_law.settles > 0.9
+    low, high = fit.lifetime_mean.interval_95
+    assert low <= 1 / (A * fit.mean_current + B * pressure.mean()) / HOUR <= high
+
+
 @simulations(4, 12)
 def test_correlated_noise_of_stated_size_is_no_poor_fit(count):
     found = []
