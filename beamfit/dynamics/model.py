@@ -17,19 +17,17 @@ from beamfit.greybox.problem import Prior
 
 # Residual, as a share of the output's scatter, below which a fit counts as exact.
 CLOSE = 2e-4
-# Distances of samples that differ by less than this share are equal.
-EQUAL = 1e-9
 # Standard deviation of the prior on a network's weights; inputs and outputs are of size 1.
 WEIGHT = 3.0
 
 
-@tree.node("physics", "turn")
+@tree.node("physics", "even")
 class Driven:
     """A run as the model sees it: inputs, whole rows late, and steps; when and where it was read.
 
     Shapes (rows, inputs), (rows,), (readings,), (readings,), all padded: there are `count`
-    readings. `run` is its number, `part` the part of a row by which inputs come later still. `turn`
-    is the number of rows a sample where all steps are equal, 0 where they are not.
+    readings. `run` is its number, `part` the part of a row by which inputs come later still. `even`
+    is whether all steps are equal.
     """
 
     physics: Physics
@@ -40,7 +38,7 @@ class Driven:
     count: Any
     run: Any
     part: Any
-    turn: int = 0
+    even: bool = False
 
     @property
     def read(self) -> np.ndarray:
@@ -68,9 +66,8 @@ class Driven:
 
     def constant(self, p: jax.Array, start: jax.Array, part: Any) -> jax.Array:
         """The response of constant parameters where it was read, without an offset."""
-        if self.turn:
-            y = even_response(self.physics, p, self.u, self.dt[0], start, self.turn, part)
-            return y[self.index // self.turn]
+        if self.even:
+            return even_response(self.physics, p, self.u, self.dt[0], start, part)[self.index]
         return self.changing(jnp.broadcast_to(p, (len(self.u), len(p))), start, part)
 
 

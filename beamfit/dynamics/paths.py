@@ -15,7 +15,7 @@ import numpy as np
 
 from beamfit.arrays import padded_length
 from beamfit.dynamics.input_laws import InputLaw, moved
-from beamfit.dynamics.model import EQUAL, Driven, PreparedOutput, readings_of
+from beamfit.dynamics.model import Driven, PreparedOutput, readings_of
 from beamfit.dynamics.record import PARTS, Run, Way, band_limited, levels_of, rows_of
 from beamfit.dynamics.response import Physics
 from beamfit.noise.memory import is_correlated
@@ -181,9 +181,9 @@ def undriven(
         time = run.time[since : None if most is None else read[-1] + 1]
         apart = np.diff(time, append=time[-1:])
         dt = np.repeat(np.pad(apart, (0, padded_length(len(time)) - len(time))) / parts, parts)
-        turn = parts if np.ptp(apart[:-1]) <= EQUAL * apart[0] else 0
+        even = bool(np.ptp(apart[:-1]) <= 1e-9 * apart[0])
         each = (jnp.asarray(dt), *readings_of(run.time[read] - run.time[0], (read - since) * parts))
-        found.append(Driven(physics, None, *each, len(read), jnp.asarray(i), 0.0, turn))
+        found.append(Driven(physics, None, *each, len(read), jnp.asarray(i), 0.0, even))
         measured.append(run.outputs[output][read])
         first.append(since)
     return Undriven(tuple(found), tuple(measured), tuple(first))
