@@ -175,11 +175,10 @@ def first_lag(u: list[np.ndarray], y: list[np.ndarray]) -> int:
     """
     (m, k), count = (u[0].shape[1], y[0].shape[1]), sum(map(len, y))
     horizon = min(count // (8 * (m + k)), HORIZON)
-    rows = [_rows(v, w, horizon, DRIFT)
-            for v, w in zip(u, y, strict=True) if len(v) > 2 * horizon + 1]  # fmt: skip
-    if horizon < 2 or not rows:
+    rows = _rows(u, y, horizon, DRIFT) if horizon > 1 else []
+    if not rows:
         return 1
-    past, now = (np.concatenate([each[i] for each in rows]) for i in (0, 5))
+    past, *_, now = rows
     lags = past.reshape(len(past), horizon, k + m)  # from the longest to 1
     own, others = lags[..., :k].reshape(len(past), -1), lags[..., k:].reshape(len(past), -1)
     triangle = np.linalg.qr(np.hstack([own, others, now]), mode="r")
@@ -209,13 +208,10 @@ def _regressed(
     m, k = u[0].shape[1], y[0].shape[1]
     count = sum(map(len, y))
     horizon = int(np.clip(count // (4 * (m + k) + 4 * m), order // k + 2, HORIZON))
-    rows = [_rows(v, w, horizon, degree)
-            for v, w in zip(u, y, strict=True) if len(v) > 2 * horizon + 1]  # fmt: skip
-    if not rows or sum(len(r[0]) for r in rows) < horizon * (2 * m + k):
+    rows = _rows(u, y, horizon, degree)
+    if not rows or len(rows[0]) < horizon * (2 * m + k):
         return None
-    past, later, future, inputs, now_u, now_y = (
-        np.concatenate(parts) for parts in zip(*rows, strict=True)
-    )
+    past, later, future, inputs, now_u, now_y = rows
     by = np.linalg.lstsq(np.hstack([past, inputs]), future, rcond=1e-10)[0][: past.shape[1]]
     triangle = np.linalg.qr(past, mode="r")
     _, _, right = np.linalg.svd(triangle @ by, full_matrices=False)
@@ -230,23 +226,24 @@ def _regressed(
     return ab[:, :order], ab[:, order:], cd[:, :order], cd[:, order:]
 
 
-def _rows(u: np.ndarray, y: np.ndarray, horizon: int, degree: int) -> tuple[np.ndarray, ...]:
-    """Past, past a sample later, future, future inputs, and inputs and outputs now, by row; less
-    a drift of the degree.
+def _rows(u: list[np.ndarray], y: list[np.ndarray], horizon: int, degree: int) -> list[np.ndarray]:
+    """Past, past a sample later, future, future inputs, and inputs and outputs now, by row of all
+    runs; less a drift of the degree in each. Nothing of runs that are too short.
     """
-    both, count = np.hstack([y, u]), len(y) - 2 * horizon
-    at = np.arange(horizon, horizon + count, max(1, count // ROWS))
-    waves = np.column_stack([np.ones(len(at)), drift_waves(at / len(y))])
-    slow = np.linalg.qr(waves[:, : degree + 1 if degree else 0])[0]
-
-    def around(of, begin, end):
-        found = np.concatenate([of[at + k] for k in range(begin, end)], axis=1)
-        return found - slow @ (slow.T @ found)
-
-    return (
-        around(both, -horizon, 0), around(both, 1 - horizon, 1), around(y, 0, horizon),
-        around(u, 0, horizon), around(u, 0, 1), around(y, 0, 1),
-    )  # fmt: skip
+    found = []
+    for v, w in zip(u, y, strict=True):
+        both, count = np.hstack([w, v]), len(w) - 2 * horizon
+        if count < 2:
+            continue
+        at = np.arange(horizon, horizon + count, max(1, count // ROWS))
+        waves = np.column_stack([np.ones(len(at)), drift_waves(at / len(w))])
+        slow = np.linalg.qr(waves[:, : degree + 1 if degree else 0])[0]
+        parts = ((both, -horizon, 0), (both, 1 - horizon, 1), (w, 0, horizon), (v, 0, horizon),
+                 (v, 0, 1), (w, 0, 1))  # fmt: skip
+        around = [np.concatenate([of[at + k] for k in range(begin, end)], axis=1)
+                  for of, begin, end in parts]  # fmt: skip
+        found.append([each - slow @ (slow.T @ each) for each in around])
+    return [np.concatenate(each) for each in zip(*found, strict=True)]
 
 
 def normal_form(
@@ -321,12 +318,25 @@ def largest_order(case: Case) -> int:
     return int((count_of(case) / EACH - k * (m + 1)) / (m + k + len(case.courses)))
 
 
+class _Fits(NamedTuple):
+    """Orders that were tried, the likeliest first, and likely fits."""
+
+    tried: tuple[TriedOrder, ...]
+    each: list[Begun]
+
+
 class StatesSearch(NamedTuple):
-    """States of a linear system if said, its paths, and if outputs at rest are free numbers."""
+    """Settings of an identification: states of the system if said, its paths, if outputs at rest
+    are free numbers, constants or a network of so many nodes from so many seeds.
+    """
 
     order: int | None
     paths: Paths
     offset: bool
+    map: str
+    hidden: int
+    seeds: range
+    held: tuple[Run, ...]
 
     @property
     def on_time(self) -> float:
@@ -341,7 +351,7 @@ class StatesSearch(NamedTuple):
         found = first_lag(*_scaled(case, _units(case, True), False)) - 1
         return min(float(found), self.paths.delays[-1])
 
-    def begun(self, runs: tuple[Run, ...]) -> tuple[TriedOrder, ...]:
+    def begun(self, runs: tuple[Run, ...]) -> _Fits:
         """Orders by the delay that lags tell, on time unless that is clearly likelier, and by
         inputs at their levels where the best order is likelier with these.
         """
@@ -351,14 +361,17 @@ class StatesSearch(NamedTuple):
             tried = self.unless(runs, tried, Path(None, Way(), self.on_time), 2.0 * BETTER)
         if way.standing:
             tried = self.unless(runs, tried, tried[0].begun.path._replace(way=way), 0.0)
-        return tried
+        constant = self.map == "constant"
+        return _Fits(tried, [tried[0].begun] if constant else self.trained(runs, tried[0]))
 
-    def glanced(self, runs: tuple[Run, ...]) -> Begun:
-        """The fit of the order that is said, or of a few states, by the delay that lags tell."""
+    def glanced(self, runs: tuple[Run, ...]) -> _Fits:
+        """The fit of the order that is said, or of a few states, by the delay that lags tell: bad
+        readings would take many for the noise to be small.
+        """
         path = Path(None, Way(), self.delay(runs))
         case = case_of(runs, LINEAR, (), (), path)
         n = self.order or min(SIZES[0], largest_order(case))
-        return _tried(case, path, n, self.offset, True, None).begun
+        return _Fits((), [_tried(case, path, n, self.offset, True, None).begun])
 
     def unless(
         self, runs: tuple[Run, ...], tried: tuple[TriedOrder, ...], path: Path, better: float
@@ -391,6 +404,34 @@ class StatesSearch(NamedTuple):
         tried.append(TriedOrder(full.order, False, plain))
         told = criterion([each.begun for each in tried], last.begun)
         return tuple(tried[k]._replace(bic=told[k]) for k in np.argsort(told, kind="stable"))
+
+    def trained(self, runs: tuple[Run, ...], best: TriedOrder) -> list[Begun]:
+        """Networks beside a linear system, those that are likely."""
+        n, path = best.order, best.begun.path
+        free = [f for f in free_of(best.begun.case, n, n, self.offset, best.direct)
+                if f.path != "start"]  # fmt: skip
+        free += [Free("start", nuisance=True), Free("p.net", nuisance=True)]
+        case = case_of(runs, NETWORK, free, [Prior("p.net", 0.0, WEIGHT)], path)
+        case = case._replace(degree=best.begun.case.degree)
+        nets = _networks(best, self.hidden, self.seeds)
+        fits = likely(case, [settled(case, [net]) for net in nets])
+        return [Begun(case, path, each) for each in fits]
+
+    def answer(self, runs: tuple[Run, ...], found: _Fits, left_out: Any) -> StatesFit:
+        """Judge runs whose orders were tried, the likeliest first."""
+        (tried, fits), gain = found, None
+        if self.map == "network":
+            linear, bent = criterion([tried[0].begun, fits[0]], tried[0].begun)
+            gain = linear - bent
+        n, path = tried[0].order, fits[0].path
+        fits = [fit._replace(settled=with_memory(fit.case, fit.settled, WORSE)) for fit in fits]
+        said, gains = _quantities(fits, n, runs, self.offset)
+        rows = [{"order": t.order, "direct": t.direct, "bic": t.bic}
+                for t in sorted(tried, key=lambda t: (not t.direct, t.order))]  # fmt: skip
+        more = {"delay_samples": int(path.delay), "tried": rows, "matrices": _matrices(fits, n)}
+        judged = {"map": self.map, "gain": gain, "order": n, "given": self.paths.given}
+        judged |= {"held": self.held, "left_out": left_out, "by_input": gains, "more": more}
+        return states_answer(fits[0], runs, said, **judged)
 
 
 def criterion(tried: Sequence[Begun], last: Begun | None = None) -> list[float]:
@@ -562,66 +603,15 @@ def identify_states(
     runs, held = checked(runs, held, True)
     check_inputs(runs)
     given = None if delay is None else float(delay)
-    search = StatesSearch(order, Paths.of(runs, given, True), offset)
-    _check_order(case_of(runs, LINEAR, (), ()), runs, order or 1)
-    asked = _StatesIdentification(search, map, hidden, range(seed, seed + starts), held)
-    searches = asked.glanced, asked.begun
-    return judged_without(runs, searches, lambda found: found.each[0], asked.answer)
-
-
-class _Fits(NamedTuple):
-    """Orders that were tried, the likeliest first, and likely fits."""
-
-    tried: tuple[TriedOrder, ...]
-    each: list[Begun]
-
-
-class _StatesIdentification(NamedTuple):
-    """Settings of an identification."""
-
-    search: StatesSearch
-    map: str
-    hidden: int
-    seeds: range
-    held: tuple[Run, ...]
-
-    def glanced(self, runs: tuple[Run, ...]) -> _Fits:
-        """The fit of one order: bad readings would take many for the noise to be small."""
-        return _Fits((), [self.search.glanced(runs)])
-
-    def begun(self, runs: tuple[Run, ...]) -> _Fits:
-        """Orders, and likely fits of the best."""
-        tried = self.search.begun(runs)
-        constant = self.map == "constant"
-        return _Fits(tried, [tried[0].begun] if constant else self.trained(runs, tried[0]))
-
-    def trained(self, runs: tuple[Run, ...], best: TriedOrder) -> list[Begun]:
-        """Networks beside a linear system, those that are likely."""
-        n, path = best.order, best.begun.path
-        free = [f for f in free_of(best.begun.case, n, n, self.search.offset, best.direct)
-                if f.path != "start"]  # fmt: skip
-        free += [Free("start", nuisance=True), Free("p.net", nuisance=True)]
-        case = case_of(runs, NETWORK, free, [Prior("p.net", 0.0, WEIGHT)], path)
-        case = case._replace(degree=best.begun.case.degree)
-        nets = _networks(best, self.hidden, self.seeds)
-        fits = likely(case, [settled(case, [net]) for net in nets])
-        return [Begun(case, path, each) for each in fits]
-
-    def answer(self, runs: tuple[Run, ...], found: _Fits, left_out: Any) -> StatesFit:
-        """Judge runs whose orders were tried, the likeliest first."""
-        (tried, fits), gain = found, None
-        if self.map == "network":
-            linear, bent = criterion([tried[0].begun, fits[0]], tried[0].begun)
-            gain = linear - bent
-        n, path = tried[0].order, fits[0].path
-        fits = [fit._replace(settled=with_memory(fit.case, fit.settled, WORSE)) for fit in fits]
-        said, gains = _quantities(fits, n, runs, self.search.offset)
-        rows = [{"order": t.order, "direct": t.direct, "bic": t.bic}
-                for t in sorted(tried, key=lambda t: (not t.direct, t.order))]  # fmt: skip
-        more = {"delay_samples": int(path.delay), "tried": rows, "matrices": _matrices(fits, n)}
-        judged = {"map": self.map, "gain": gain, "order": n, "given": self.search.paths.given}
-        judged |= {"held": self.held, "left_out": left_out, "by_input": gains, "more": more}
-        return states_answer(fits[0], runs, said, **judged)
+    case = case_of(runs, LINEAR, (), ())
+    most = largest_order(case)
+    if not 1 <= (order or 1) <= most:
+        expected = f"1 to {most}" if most >= 1 else "a longer run, or another --model"
+        raise runs[0].unusable(f"order {order or 1} with {count_of(case)} readings", expected)
+    seeds = range(seed, seed + starts)
+    search = StatesSearch(order, Paths.of(runs, given, True), offset, map, hidden, seeds, held)
+    searches = search.glanced, search.begun
+    return judged_without(runs, searches, lambda found: found.each[0], search.answer)
 
 
 def likely(case: Case, found: Sequence[Settled]) -> list[Settled]:
@@ -679,14 +669,6 @@ def joint_error(values: np.ndarray, errors: np.ndarray) -> np.ndarray:
     widest = np.max(np.where(seen, np.abs(away) + errors, 0.0), axis=0)
     reach = reach_of_probability(within, widest, CENTRAL)
     return np.where(seen[0] & (seen.mean(axis=0) > CENTRAL), reach, np.nan)
-
-
-def _check_order(case: Case, runs: Sequence[Run], order: int) -> None:
-    """Refuse orders with more numbers than readings allow."""
-    most = largest_order(case)
-    if not 1 <= order <= most:
-        expected = f"1 to {most}" if most >= 1 else "a longer run, or another --model"
-        raise runs[0].unusable(f"order {order} with {count_of(case)} readings", expected)
 
 
 def _networks(best: TriedOrder, hidden: int, seeds: range) -> list[dict[str, Any]]:
@@ -791,12 +773,8 @@ def _lag(numbers: Derived, i: int, pole: int, step: float) -> Quantity:
         return found
     below, above = ((-step / np.log(end) if 0.0 < end < 1.0 else None)
                     for end in at + ndtri(SINGLE_END) * error * np.array([1.0, -1.0]))  # fmt: skip
-    return replace(
-        found.open(),
-        interval_95=LagLimits(
-            above if high >= 1.0 else None, below if low <= 0.0 else None
-        ).interval,
-    )
+    limits = LagLimits(above if high >= 1.0 else None, below if low <= 0.0 else None)
+    return replace(found.open(), interval_95=limits.interval)
 
 
 def _taylor(model: Any, asked: UsedStates) -> jax.Array:
