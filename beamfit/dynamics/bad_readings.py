@@ -185,9 +185,7 @@ def _lone(seen: PreparedOutput, residuals: Sequence[np.ndarray]) -> list[np.ndar
     return found
 
 
-def odds_of_bad(
-    off: np.ndarray, fitted: np.ndarray, time: np.ndarray, least: float, noise: Noise | None = None
-) -> np.ndarray:
+def odds_of_bad(off: np.ndarray, fitted: np.ndarray, time: np.ndarray, least: float) -> np.ndarray:
     """Logarithm of the odds that readings are bad.
 
     Parameters
@@ -196,8 +194,6 @@ def odds_of_bad(
         Residuals, the model, and when readings were taken, s.
     least : float
         Smallest standard deviation of good readings.
-    noise : Noise, optional
-        Of bad readings.
 
     Returns
     -------
@@ -216,13 +212,12 @@ def odds_of_bad(
     >>> (odds_of_bad(off, np.zeros(51), np.arange(51.0), 1e-3) > 0).nonzero()[0].tolist()
     [50]
     """
-    noise = Noise() if noise is None else noise
     scale, _ = spread_by_jitter(fitted, time)
     pulls = off / scale
     size = np.maximum(1.4826 * np.median(np.abs(pulls), axis=1), least)[:, None]
     for _ in range(ROUNDS_OF_NOISE):
         pull = (pulls / size) ** 2
-        bad = np.log(bad_density(pull, noise))
+        bad = np.log(bad_density(pull, Noise()))
         good = expit(-0.5 * pull - bad)
         size = np.sqrt(
             np.sum(good * pulls**2, axis=1, keepdims=True) / good.sum(axis=1, keepdims=True)

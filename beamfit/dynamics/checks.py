@@ -156,10 +156,11 @@ def checks_of(
         explained, chance = 0.0, 1.0
     if later * rest.var() <= rounded:
         later, fed = 0.0, 1.0
+    whole, left = (float(v @ v) for v in (noise.white(y), noise.white(residuals)))
     return Checks(
         percent(rest, np.concatenate(y)),
         percent(noise.ahead(residuals), np.concatenate(y)),
-        _chance(noise.white(y), noise.white(residuals), used),
+        _chance(whole - left, left, used, len(rest) - used),
         white,
         chance,
         explained,
@@ -185,11 +186,11 @@ def _together(seen: PreparedOutput) -> tuple[str, ...]:
     return tuple(found)
 
 
-def _chance(y: np.ndarray, rest: np.ndarray, used: int) -> float:
-    whole, left, free = float(y @ y), float(rest @ rest), len(rest) - used
-    if free < 1 or left >= whole:
+def _chance(explained: float, left: float, used: int, free: int) -> float:
+    """Chance that so many numbers explain so much of squares if nothing is to be explained (F)."""
+    if free < 1 or used < 1 or explained <= 0.0:
         return 1.0
-    return float(f.sf((whole - left) / used / max(left / free, 1e-300), used, free))
+    return float(f.sf(explained / used / max(left / free, 1e-300), used, free))
 
 
 class RunNoises(NamedTuple):
@@ -294,12 +295,11 @@ def paths_by(run: Driven, shapes: np.ndarray) -> np.ndarray:
 def _tested(rest: np.ndarray, basis: np.ndarray, columns: np.ndarray) -> tuple[float, float]:
     """Share of the squares that columns explain beyond a basis, and its chance (F)."""
     new = spanned(columns - basis @ (basis.T @ columns), np.linalg.norm(columns, axis=0))
-    k, left = new.shape[1], len(rest) - basis.shape[1] - new.shape[1]
+    free = len(rest) - basis.shape[1] - new.shape[1]
     inside, whole = float(np.sum((new.T @ rest) ** 2)), float(rest @ rest)
-    if left < 1 or whole <= 0 or k == 0:
+    if free < 1 or not inside:
         return 0.0, 1.0
-    ratio = (inside / k) / max((whole - inside) / left, 1e-300)
-    return inside / whole, float(f.sf(ratio, k, left))
+    return inside / whole, _chance(inside, whole - inside, new.shape[1], free)
 
 
 def variance_of_digits(seen: PreparedOutput, rms: float) -> float:

@@ -129,15 +129,13 @@ class Controller:
     horizon: int
     smooth: float = 0.1
 
-    def begin(self, inputs: Any, reading: Any = None) -> ControllerState:
+    def begin(self, inputs: Any) -> ControllerState:
         """Give the state of a process at rest.
 
         Parameters
         ----------
         inputs : array, shape (m,)
             Held so far.
-        reading : array, shape (outputs,), optional
-            What is read; what the model says if None.
 
         Raises
         ------
@@ -149,7 +147,7 @@ class Controller:
             if not self.limits.low[i] <= u[i] <= self.limits.high[i]:
                 expected = f"{self.limits.low[i]:g} to {self.limits.high[i]:g}, its limits"
                 raise InputError(f"{name} at {u[i]:g} to begin with", expected)
-        return start(self, jnp.asarray(u), reading)
+        return start(self, jnp.asarray(u))
 
     def __call__(
         self, state: ControllerState, reading: Any, target: Any
@@ -191,6 +189,10 @@ class Controller:
         """Limits of the outputs less their margins."""
         margin = np.array([r.margin for r in self.responses])
         return self.limits.below + margin, self.limits.above - margin
+
+    def output(self, name: str) -> int:
+        """The place of an output; other names are refused."""
+        return _place([r.name for r in self.responses], name, "no output")
 
     @property
     def rest(self) -> np.ndarray:
@@ -453,11 +455,10 @@ def controller(
         expected = f"one longer than the delay, of at most {LONGEST} steps, and smooth above 0"
         raise InputError(said, expected)
     values = np.concatenate([np.stack(list(run.inputs.values()), axis=1) for run in fits[0].runs])
-    usual = {n: (v.min(), v.max()) for n, v in zip(names, values.T, strict=True)}
-    low, high = _ranges(names, inputs or {}, usual)
-    below, above = _ranges([fit.output for fit in fits], outputs or {}, {})
-    rate = step * np.array([_rates(names, rates or {}).get(name, np.inf) for name in names])
-    limits = ControlLimits(low, high, rate, below, above)
+    low, high = _ranges(names, inputs or {}, np.stack([values.min(0), values.max(0)]))
+    wanted = [fit.output for fit in fits]
+    ends = _ranges(wanted, outputs or {}, np.outer([-np.inf, np.inf], np.ones(len(wanted))))
+    limits = ControlLimits(low, high, step * _rates(names, rates or {}), *ends)
     return Controller(names, responses, step, seen.wide, limits, horizon, smooth)
 
 
@@ -488,41 +489,41 @@ def _response(fit: ResponseFit, every: int, step: float) -> Response:
         wander = (1.0 - fit.memory.white) * -np.expm1(-2.0 * step / fit.memory.time)
         q = max(q, wander / max(fit.memory.white, 1e-6))
     ahead = 0.5 * (q + np.sqrt(q**2 + 4.0 * q))
-    model = fit.fit.model
+    model, late = fit.fit.model, max(fit.delay / every, 0.0)
     return Response(
-        fit.output,
-        PHYSICS[fit.model],
-        model["map"],
-        float(model["offset"]),
-        max(fit.delay / every, 0.0),
-        fit.seen.size_y,
-        ahead / (ahead + 1.0),
-        MARGIN * float(np.hypot(noise, band)),
-    )
+        fit.output, PHYSICS[fit.model], model["map"], float(model["offset"]), late, fit.seen.size_y,
+        ahead / (ahead + 1.0), MARGIN * float(np.hypot(noise, band)),
+    )  # fmt: skip
+
+
+def _place(names: Sequence[str], name: str, what: str) -> int:
+    """The place of a name; others are refused."""
+    if name not in names:
+        raise InputError(f"{what} '{name}'", nearest(name, list(names)))
+    return names.index(name)
 
 
 def _ranges(
-    names: Sequence[str],
-    said: Mapping[str, tuple[float, float]],
-    usual: Mapping[str, tuple[float, float]],
-) -> tuple[np.ndarray, np.ndarray]:
+    names: Sequence[str], said: Mapping[str, tuple[float, float]], usual: np.ndarray
+) -> np.ndarray:
+    """Lower and upper limits, the usual ones, shape (2, names), where none are said."""
     for name, (low, high) in said.items():
-        if name not in names:
-            raise InputError(f"a limit of '{name}'", nearest(name, list(names)))
+        at = _place(names, name, "a limit of")
         if not low < high:
             raise InputError(f"limits {low:g} to {high:g} of {name}", "the lower one first")
-    every = {name: (-np.inf, np.inf) for name in names} | dict(usual) | dict(said)
-    both = np.array([every[name] for name in names])
-    return both[:, 0], both[:, 1]
+        usual[:, at] = low, high
+    return usual
 
 
-def _rates(names: Sequence[str], said: Mapping[str, float]) -> Mapping[str, float]:
+def _rates(names: Sequence[str], said: Mapping[str, float]) -> np.ndarray:
+    """Largest changes of inputs in a second; infinite where none is said."""
+    found = np.full(len(names), np.inf)
     for name, rate in said.items():
-        if name not in names:
-            raise InputError(f"a rate of '{name}'", nearest(name, list(names)))
+        at = _place(names, name, "a rate of")
         if not rate > 0:
             raise InputError(f"rate {rate:g} of {name}", "above 0, in units a second")
-    return said
+        found[at] = rate
+    return found
 
 
 # ---- a loop with a simulated process
@@ -765,7 +766,7 @@ def simulate_loop(
     wanted = _series(control, time, targets, rest, add=False)
     load = _series(control, time, disturbances, np.zeros(len(rest)), add=True)
     for name, value, _ in targets:
-        low, high = (ends[_output(control, name)] for ends in control.limits[3:])
+        low, high = (ends[control.output(name)] for ends in control.limits[3:])
         if not low <= value <= high:
             raise InputError(f"{name} wanted at {value:g}", f"{_range(low, high)}, its limits")
     noise = np.stack([_noise(fit, time, seed + i) for i, fit in enumerate(fits)], axis=1)
@@ -787,7 +788,7 @@ def _series(
     """Values that step, shape (steps, outputs)."""
     found = np.tile(at_first, (len(time), 1))
     for name, value, at in sorted(steps, key=lambda each: each[2]):
-        i = _output(control, name)
+        i = control.output(name)
         if not 0 <= at < time[-1]:
             raise InputError(f"{name} at {at:g} s", f"a time within the loop, 0 to {time[-1]:g} s")
         if not np.isfinite(value):
@@ -795,13 +796,6 @@ def _series(
         after = time >= at - 1e-9
         found[after, i] = found[after, i] * add + value
     return found
-
-
-def _output(control: Controller, name: str) -> int:
-    names = [r.name for r in control.responses]
-    if name not in names:
-        raise InputError(f"no output '{name}'", nearest(name, names))
-    return names.index(name)
 
 
 def _noise(fit: ResponseFit, time: np.ndarray, seed: int) -> np.ndarray:
@@ -877,7 +871,7 @@ def _short(loop: Loop) -> Finding | None:
     for change in loop.changes:
         if change.settling is not None:
             continue
-        i = _output(loop.control, change.output)
+        i = loop.control.output(change.output)
         low, high = (ends[i] for ends in loop.control.held)
         off = f"{change.output} stays {abs(change.left):.3g} off {change.after:.4g}"
         if not low <= change.after <= high:

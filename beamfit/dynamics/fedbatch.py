@@ -341,10 +341,8 @@ class FedBatchFit:
             {"output": self.output, "status": self.status, "message": self.message}
             | {"model": "fed-batch", "map": "network", "substrate_scale": self.half}
             | {"records": [run.path or run.name for run in self.runs]}
-            | {"curves": [curve.to_json() for curve in self.curves]}
-            | {"noise": {name: noise._asdict() for name, noise in self.noise.items()}}
-            | {"batch_spread": self.spread}
-            | {"held_back": {name: held._asdict() for name, held in self.held.items()}}
+            | {"curves": self.curves, "noise": self.noise}
+            | {"batch_spread": self.spread, "held_back": self.held}
         )
 
 
@@ -436,14 +434,11 @@ def identify_batches(
 
 
 def _check(run: Run, first: Run) -> None:
-    for kind, has, needs in (
-        ("output", run.outputs, STATES),
-        ("input", run.inputs, ("feed", "feed_substrate")),
-    ):
-        missing = [name for name in needs if name not in has]
-        if missing:
-            prefix = "y" if kind == "output" else "u"
-            raise run.unusable(f"no {kind} {missing[0]}", f"a column {prefix}_{missing[0]}")
+    needed = [("output", "y", run.outputs, name) for name in STATES]
+    needed += [("input", "u", run.inputs, name) for name in ("feed", "feed_substrate")]
+    for kind, prefix, has, name in needed:
+        if name not in has:
+            raise run.unusable(f"no {kind} {name}", f"a column {prefix}_{name}")
     if set(run.inputs) != set(first.inputs):
         raise run.unusable(f"inputs {', '.join(run.inputs)}", f"those of {first.name}")
     for name in ("biomass", "volume"):

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
+from scipy.signal import resample
 
 from beamfit.answer import shown
 from beamfit.errors import InputError
@@ -274,11 +275,9 @@ def rows_of(run: Run, way: Way, parts: int) -> np.ndarray:
         if name in way.smooth:
             slope, rows = (u[-1] - u[0]) / (len(u) - 1), np.arange(len(u))
             swing = u - u[0] - slope * rows
-            waves = np.fft.rfft(np.concatenate([swing, -swing[-2:0:-1]]))
-            turn = 2j * np.pi * np.fft.rfftfreq(2 * len(u) - 2)
-            fine = [np.fft.irfft(waves * np.exp(turn * s), 2 * len(u) - 2)[: len(u)] for s in late]
-            line = u[0] + slope * np.add.outer(rows, late)
-            columns.append((line + np.stack(fine, axis=1)).ravel())
+            both = np.concatenate([swing, -swing[-2:0:-1]])
+            fine = resample(both, 2 * parts * len(both))[1 : 2 * parts * len(u) : 2]
+            columns.append(u[0] + slope * np.add.outer(rows, late).ravel() + fine)
         elif name in way.ramping:
             steps = np.diff(u, append=2.0 * u[-1] - u[-2])
             columns.append((u[:, None] + np.outer(steps, late)).ravel())

@@ -255,9 +255,8 @@ class StatesFit:
             | {"records": [run.path or run.name for run in self.runs]}
             | {"parameters": self.quantities}
             | {"noise_rms": self.noise, "noise_memory": self.memory}
-            | {"checks": {part.output: part.checks._asdict() for part in self.parts}}
-            | {"held_back": {k: [h._asdict() for h in v] for k, v in self.held.items()}}
-            | {"left_out": self.left_out}
+            | {"checks": {part.output: part.checks for part in self.parts}}
+            | {"held_back": self.held, "left_out": self.left_out}
             | self.more
         )
 
