@@ -13,7 +13,6 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
-from itertools import groupby
 from typing import Any, NamedTuple
 
 import jax
@@ -22,7 +21,7 @@ import numpy as np
 from scipy.special import logsumexp
 
 from beamfit.dynamics.checks import SLOW, paths_by, slow_lags, slow_paths
-from beamfit.dynamics.input_laws import STATIC, InputLaw, laws_between, moved
+from beamfit.dynamics.input_laws import STATIC, InputLaw, laws_between
 from beamfit.dynamics.model import Driven, PreparedOutput, filled, growing_of, predicted
 from beamfit.dynamics.paths import Path, Paths, Undriven, handed_on, undriven
 from beamfit.dynamics.record import Run, Way
@@ -277,13 +276,8 @@ class _Weighed(NamedTuple):
 
     def best(self) -> dict[tuple[str, str], int]:
         """The likeliest law of the value alone, by kind and input."""
-        logs, found = self.logs, {}
-        for k, trial in enumerate(self.trials):
-            law = trial.path.law
-            if law is not None and law.kind in STATIC:
-                key = law.kind, law.input
-                found[key] = k if logs[k] > logs[found.get(key, k)] else found.get(key, k)
-        return found
+        laws = [(int(k), self.trials[k].path.law) for k in np.argsort(self.logs)]  # the last stays
+        return {(law.kind, law.input): k for k, law in laws if law and law.kind in STATIC}
 
 
 class Comparison(NamedTuple):
@@ -433,12 +427,10 @@ def _laws_of(runs: Sequence[Run], name: str, way: Way) -> list[InputLaw]:
     unsure = np.sqrt(sum(np.sum(each.variance[-len(u) :])
                          for each, u in zip(levels, since, strict=True)))  # fmt: skip
     laws = laws_between(name, *map(float, (min(map(np.min, inputs)), max(map(np.max, inputs)))))
-    alike = groupby(laws, lambda law: (law.kind, law.place))
-    at = np.concatenate([
-        np.concatenate([moved(u, kind, widths, place)[:, -len(some) :]
-                        for u, some in zip(inputs, since, strict=True)], axis=1)
-        for (kind, place), widths in [(k, np.array([law.width for law in g])) for k, g in alike]
-    ]).T  # fmt: skip
+    at = np.stack([
+        np.concatenate([law.behind(u)[-len(some) :, 0]
+                        for u, some in zip(inputs, since, strict=True)]) for law in laws
+    ], axis=1)  # fmt: skip
     basis = np.linalg.qr(np.stack([np.ones(len(plain)), plain], axis=1))[0]
     at = at - at.mean(axis=0)
     same = basis @ (basis.T @ at)
