@@ -24,9 +24,8 @@ from beamfit.statistics import CLEAR_ODDS, POOR_FIT
 # Of more readings than this share, or of such as follow the inputs, the model is wrong and not the
 # monitor.
 MOST = 0.2
-# A residual is judged about the running median of so many, most searches in turn, and rounds
-# in which the noise of good readings is found.
-AROUND, ROUNDS, ROUNDS_OF_NOISE = 7, 5, 50
+# A residual is judged about the running median of so many; most searches in turn.
+AROUND, ROUNDS = 7, 5
 # Number of equal readings that count as stuck, if the model moves away by AWAY times the noise.
 HELD, AWAY = 8, 3.0
 OFF, STILL = "far off their neighbours", "that stand still as the process moves"
@@ -215,7 +214,7 @@ def odds_of_bad(off: np.ndarray, fitted: np.ndarray, time: np.ndarray, least: fl
     scale, _ = spread_by_jitter(fitted, time)
     pulls = off / scale
     size = np.maximum(1.4826 * np.median(np.abs(pulls), axis=1), least)[:, None]
-    for _ in range(ROUNDS_OF_NOISE):
+    for _ in range(50):
         pull = (pulls / size) ** 2
         bad = np.log(bad_density(pull, Noise()))
         good = expit(-0.5 * pull - bad)

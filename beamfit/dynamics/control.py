@@ -531,10 +531,10 @@ def _rates(names: Sequence[str], said: Mapping[str, float]) -> np.ndarray:
 # Band of a settled step, as a share of it (or the noise if larger); last share of the steps whose
 # mean is the remaining offset.
 SETTLED, LAST = 0.02, 0.2
-# Horizons simulated after the last change; distance, in units of the input, that touches a limit.
-HORIZONS, TOUCHED = 4, 1e-6
-# Excess, as a share of the output's scatter, from which a plan uses the safety margin.
-SOFT = 1e-4
+# Horizons simulated after the last change.
+HORIZONS = 4
+# Share of the scatter within which an input is at its limit, and an output still keeps its own.
+NEAR = 1e-4
 
 
 class Trace(NamedTuple):
@@ -683,7 +683,7 @@ class Loop:
         for i, r in enumerate(c.responses):
             low, high = c.limits.below[i], c.limits.above[i]
             if np.isfinite([low, high]).any():
-                soft = int((self.trace.beyond[:, i] > SOFT * r.size).sum())
+                soft = int((self.trace.beyond[:, i] > NEAR * r.size).sum())
                 said = f"{_range(low, high)}, held off by {r.margin:.2g}"
                 rows.append([r.name, said, f"soft in {soft} of {len(self.time)} steps"])
         return ["", "limit", "used"], rows
@@ -709,14 +709,14 @@ def _range(low: float, high: float) -> str:
 def touched(loop: Loop) -> np.ndarray:
     """True for each input at one of its limits, shape (steps, m)."""
     c, u = loop.control, loop.trace.inputs
-    near = TOUCHED * c.sizes
+    near = NEAR * c.sizes
     return (u <= c.limits.low + near) | (u >= c.limits.high - near)
 
 
 def fastest(loop: Loop) -> np.ndarray:
     """True for each input that moves at its largest rate, shape (steps - 1, m)."""
     c, rate = loop.control, loop.control.limits.rate
-    least = np.maximum(rate - TOUCHED * c.sizes, rate / 2)  # also where it hardly moves
+    least = np.maximum(rate - NEAR * c.sizes, rate / 2)  # also where it hardly moves
     return np.abs(np.diff(loop.trace.inputs, axis=0)) > least
 
 
@@ -857,7 +857,7 @@ def _passed(loop: Loop) -> Finding | None:
         y = loop.trace.outputs[:, i]
         over = np.maximum(y - high, low - y)
         over = over[np.argmax(over <= 0) :]  # where it rests at first is not the loop's
-        if over.max() <= SOFT * r.size:
+        if over.max() <= NEAR * r.size:
             continue
         cause = f"{r.name} passes its limit by up to {over.max():.3g}"
         cause += f" in {int((over > 0).sum())} of {len(over)} steps."
@@ -898,7 +898,7 @@ def _mostly(loop: Loop, at: np.ndarray) -> str:
 
 def _kept(loop: Loop) -> Finding | None:
     soft = [r.name for i, r in enumerate(loop.control.responses)
-            if (loop.trace.beyond[:, i] > SOFT * r.size).any()]  # fmt: skip
+            if (loop.trace.beyond[:, i] > NEAR * r.size).any()]  # fmt: skip
     first = loop.trace.outputs[0]
     within = (first >= loop.control.limits.below) & (first <= loop.control.limits.above)
     words = "The loop settles and keeps all limits"

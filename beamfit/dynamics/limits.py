@@ -30,8 +30,6 @@ from beamfit.statistics import POOR_FIT
 
 # Other lags that are tried beside one that is given, and rounds of them, each about the best.
 OTHERS, ROUNDS = 8, 3
-# Halvings of the logarithm of a lag on the way to its limit.
-HALVES = 8
 # Quantile at the upper end of a one-sided 95 %.
 SINGLE_END = 0.95
 
@@ -130,7 +128,7 @@ def lag_limits(seen: PreparedOutput, found: Settled, offset: bool) -> LagLimits:
         if lags.least(limit) - least > lags.rise(1.0 - 0.5 * POOR_FIT):
             return None
         near, far, most = np.log(limit), np.log(other), lags.rise(SINGLE_END)
-        for _ in range(HALVES):
+        for _ in range(8):
             middle = 0.5 * (near + far)
             inside = lags.least(np.exp(middle)) - least < most
             near, far = (middle, far) if inside else (near, middle)

@@ -63,8 +63,6 @@ from beamfit.quantity import NORMAL_REACH, Quantity
 HORIZON, ROWS = 20, 20_000
 # Strides through the samples, for slow responses; fewest rows that must remain.
 STRIDES, FEWEST = (1, 5, 25, 125), 100
-# Newton steps to the rest of a network.
-REST = 20
 
 
 class Linear:
@@ -118,7 +116,7 @@ class LinearWithNetwork(Linear):
             return linear.a @ x + linear.b @ u + p["steps"] * (net["out"] @ jnp.tanh(inside))
 
         x, mean = jnp.zeros(n), jnp.zeros(m).at[p["units"]["u"].shape[1] :].set(1.0)
-        for _ in range(REST):
+        for _ in range(20):  # Newton steps
             slope = jnp.eye(n) - jax.jacfwd(after)(x, mean)
             x = x + jnp.linalg.solve(slope, after(x, mean) - x)
         a, b = jax.jacfwd(after, (0, 1))(x, mean)
