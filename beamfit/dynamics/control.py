@@ -172,17 +172,10 @@ class Controller:
     def _compiled(self) -> Any:
         return jax.jit(partial(advance, self))
 
-    @cached_property
-    def slope(self) -> np.ndarray | None:
-        """Outputs by inputs of the horizon where that is a constant, else None."""
-        if any(callable(r.of) for r in self.responses):
-            return None
-
-        def found(plan: jax.Array) -> jax.Array:
-            return outputs(self, start(self, jnp.zeros(len(self.sizes))), plan)
-
-        with jax.ensure_compile_time_eval():  # also where a step is being compiled
-            return np.asarray(jax.jit(jax.jacfwd(found))(self.rest))
+    @property
+    def linear(self) -> bool:
+        """True if no parameter changes: a plan is then the best at once."""
+        return not any(callable(r.of) for r in self.responses)
 
     @property
     def held(self) -> tuple[np.ndarray, np.ndarray]:
@@ -193,11 +186,6 @@ class Controller:
     def output(self, name: str) -> int:
         """The place of an output; other names are refused."""
         return _place([r.name for r in self.responses], name, "no output")
-
-    @property
-    def rest(self) -> np.ndarray:
-        """A plan of nothing."""
-        return np.zeros((self.horizon, len(self.inputs)))
 
 
 # ---- the process
@@ -277,7 +265,7 @@ def advance(
     level = state.level + jnp.where(jnp.isfinite(surprise), share * surprise, 0.0)
     state = state._replace(level=level)
     plan = state.plan
-    for _ in range(ROUNDS if control.slope is None else 1):
+    for _ in range(1 if control.linear else ROUNDS):
         plan = _better(control, state, target, plan)
     # By construction, whatever the plan is worth: within the rate of the last input, within limits.
     last, limits = state.past[-1], control.limits
@@ -302,11 +290,11 @@ def _better(
     control: Controller, state: ControllerState, target: jax.Array, plan: jax.Array
 ) -> jax.Array:
     """The best plan of the process as it is around a plan."""
-    slope = control.slope
-    if slope is not None:
-        return _planned(control, state, target, plan, jnp.asarray(slope))
     slope = jax.jacfwd(lambda each: outputs(control, state, each))(plan)
-    way = _planned(control, state, target, plan, slope) - plan
+    best = _planned(control, state, target, plan, slope)
+    if control.linear:
+        return best
+    way = best - plan
     # Second-order correction (J. Nocedal & S. Wright, Numerical Optimization, 2006, section 18.3):
     # else a full step passes a limit by the square of its length, and only shares of it are taken.
     bent = outputs(control, state, plan + way) - outputs(control, state, plan)
@@ -340,7 +328,7 @@ def _planned(
 
     `bent` is added to the outputs that limits are held against.
     """
-    size, n = np.array([r.size for r in control.responses]), control.rest.size
+    size, n = np.array([r.size for r in control.responses]), plan.size
     wide = np.tile(control.sizes, control.horizon)
     matrix = (slope / size[:, None, None] * control.sizes).reshape(-1, n)
     inputs = plan.ravel() / wide
