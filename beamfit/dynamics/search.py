@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
+from itertools import product
 from typing import Any, NamedTuple
 
 import jax
@@ -96,11 +97,6 @@ class Start(NamedTuple):
     cost: float
 
 
-def _grid(ends: Sequence[np.ndarray]) -> np.ndarray:
-    """All pairs of values of two axes, or the values of one, shape (points, axes)."""
-    return np.stack(np.meshgrid(*ends, indexing="ij"), axis=-1).reshape(-1, len(ends))
-
-
 class ResponseSearch(NamedTuple):
     """Output, physics and paths of a search, and whether the output at rest is a free number."""
 
@@ -132,8 +128,8 @@ class ResponseSearch(NamedTuple):
         reach = np.array([axis[1] - axis[0] for axis in axes])
         count = sum(map(len, seen.measured))
         exact = count * (CLOSE * seen.size_y) ** 2
-        around = _grid([np.linspace(-1.0, 1.0, len(axis)) for axis in axes])
-        grid = np.tile(_grid(axes), (len(paths), 1, 1))
+        around = np.array([*product(*(np.linspace(-1.0, 1.0, len(axis)) for axis in axes))])
+        grid = np.tile([*product(*axes)], (len(paths), 1, 1))
 
         def least(logarithms):
             found = np.exp(logarithms)
