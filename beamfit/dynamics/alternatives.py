@@ -61,26 +61,25 @@ FURTHER, GROWTH = "further term", "growth"
 class Departure(NamedTuple):
     """A law of an input, a term of a fuller response, or something that grows along the record,
     beside a response. In words, by its kind, and its probability where no departure and
-    these are all that can be; `growth` is by how much a term grows if its share is 1.
+    these are all that can be.
     """
 
     words: str
     kind: str
-    growth: float = 0.0
     probability: float = 0.0
 
     def grown(self, share: float) -> Departure:
         """The same with the amount by which it grows."""
         if self.kind != GROWTH:
             return self
-        by, unit = share * self.growth, "samples" if self.words == "a delay" else "%"
+        by, unit = (share, "samples") if self.words == "a delay" else (100.0 * share, "%")
         way = "grows" if by > 0 else "falls"
         return self._replace(words=f"{self.words} that {way} by about {abs(by):.2g} {unit}")
 
 
 NONE = Departure("", "")
 # Departures by the columns of `growing_of`: a delay grows by a sample, a gain by itself.
-GROWING = [Departure("a delay", GROWTH, 1.0), Departure("a gain", GROWTH, 100.0)]
+GROWING = [Departure("a delay", GROWTH), Departure("a gain", GROWTH)]
 
 
 class Trial(NamedTuple):
@@ -534,7 +533,7 @@ def _changing(
     for i, (name, (time, gain)) in enumerate(powers):
         for k, by in enumerate((*seen.inputs, *seen.inputs, None)):
             if by is None and time:
-                names.append(Departure(f"a {name}", GROWTH, 100.0))
+                names.append(Departure(f"a {name}", GROWTH))
             elif by is not None and not (gain and k % m == number[i] % m):
                 names.append(Departure(f"a {name} that changes with {by}", FURTHER))
             else:

@@ -319,7 +319,7 @@ class _Identification(NamedTuple):
             curves = curves_of(answer.fit, answer.errors, seen)
             return checks, *told({}, curves, seen, checks, LagLimits(None, None))
         if others is not None and others.departure.probability > 0.5:
-            words, kind, _, chance = others.departure
+            words, kind, chance = others.departure
             if checks.input_share or kind not in (FURTHER, GROWTH):  # more than digits do
                 checks = checks._replace(law=words, law_probability=chance, law_kind=kind)
         unsure = [unsure_gain(runs, found.path.way, name) for name in seen.inputs]

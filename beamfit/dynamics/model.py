@@ -74,9 +74,10 @@ class Driven:
 class PreparedOutput(NamedTuple):
     """Runs of one output, with what the model needs of them.
 
-    `runs` by `Driven`; `measured` are the readings of each, without missing ones; `size_u` and
-    `size_y` the scatter of inputs and output; `delay` in rows, of which there are `parts` a sample;
-    `ends` between which a delay that is a number of the fit may be longer.
+    `runs` by `Driven`; `measured` are the readings of each, without missing ones; `wide` and
+    `size_y` the scatter of inputs (1 where one does not change) and output; `delay` in rows, of
+    which there are `parts` a sample; `ends` between which a delay that is a number of the fit may
+    be longer.
     """
 
     inputs: tuple[str, ...]
@@ -85,16 +86,11 @@ class PreparedOutput(NamedTuple):
     measured: tuple[np.ndarray, ...]
     time: tuple[np.ndarray, ...]
     mean_u: np.ndarray
-    size_u: np.ndarray
+    wide: np.ndarray
     size_y: float
     delay: float
     parts: int
     ends: tuple[float, float] | None
-
-    @property
-    def wide(self) -> np.ndarray:
-        """The scatter of the inputs, 1 where one does not change."""
-        return np.where(self.size_u > 0, self.size_u, 1.0)
 
     @property
     def points(self) -> np.ndarray:

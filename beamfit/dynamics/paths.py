@@ -232,6 +232,7 @@ def prepared(runs: Sequence[Run], output: str, physics: Physics, path: Path) -> 
     spread = float(np.concatenate(found.measured).std()) or 1.0
     delay = parts * path.delay
     names = tuple(runs[0].inputs)
+    wide = np.where(u.std(0) > 0, u.std(0), 1.0)
     return PreparedOutput(
-        names, output, drives, found.measured, time, u.mean(0), u.std(0), spread, delay, parts, ends
+        names, output, drives, found.measured, time, u.mean(0), wide, spread, delay, parts, ends
     )
