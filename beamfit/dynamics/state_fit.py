@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -60,25 +60,18 @@ PLAIN = Path(None, Way(), 0.0)
 WORSE = 1.5
 
 
-class System(Protocol):
-    """A system: `beamfit.dynamics.states.StateSpace`, or anything hashable with its `run`."""
-
-    def run(
-        self, p: Any, u: jax.Array, dt: jax.Array, x0: jax.Array
-    ) -> tuple[jax.Array, jax.Array]:
-        """Outputs at the samples and the state after the last."""
-
-
 @tree.node("system")
 class Course:
     """A run as the model sees it: inputs and steps, and which outputs were read, all padded.
+
+    The system is a `beamfit.dynamics.states.StateSpace`, or anything hashable with its `run`.
 
     Shapes (samples, m), (samples,); `index` (readings,) points into all outputs one after the
     other, `time` is theirs, s, far apart from output to output; there are `count`. `waves` are
     columns of drifts of each output, (readings, outputs, degrees). `run` is its number.
     """
 
-    system: System
+    system: Any
     u: Any
     dt: Any
     time: Any
@@ -109,7 +102,7 @@ class Course:
         return course_of(self.system, seen, i)
 
 
-def course_of(system: System, seen: Sequence[PreparedOutput], i: int) -> Course:
+def course_of(system: Any, seen: Sequence[PreparedOutput], i: int) -> Course:
     """Course of a run, from the prepared outputs."""
     run = seen[0].runs[i]
     index = [k * len(run.u) + s.runs[i].read for k, s in enumerate(seen)]
@@ -366,7 +359,7 @@ def _free_run(case: Case, model: Any, segments: int | None) -> Settled:
 
 def case_of(
     runs: Sequence[Run],
-    system: System,
+    system: Any,
     free: Sequence[Free],
     priors: Sequence[Prior],
     path: Path = PLAIN,
