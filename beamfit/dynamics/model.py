@@ -21,13 +21,13 @@ CLOSE = 2e-4
 WEIGHT = 3.0
 
 
-@tree.node("physics", "even")
+@tree.node("physics", "turn")
 class Driven:
     """A run as the model sees it: inputs, whole rows late, and steps; when and where it was read.
 
     Shapes (rows, inputs), (rows,), (readings,), (readings,), all padded: there are `count`
-    readings. `run` is its number, `part` the part of a row by which inputs come later still. `even`
-    is whether all steps are equal.
+    readings. `run` is its number, `part` the part of a row by which inputs come later still. `turn`
+    is the number of rows a sample where all steps are equal, 0 where they are not.
     """
 
     physics: Physics
@@ -38,7 +38,7 @@ class Driven:
     count: Any
     run: Any
     part: Any
-    even: bool = False
+    turn: int = 0
 
     @property
     def read(self) -> np.ndarray:
@@ -66,8 +66,9 @@ class Driven:
 
     def constant(self, p: jax.Array, start: jax.Array, part: Any) -> jax.Array:
         """The response of constant parameters where it was read, without an offset."""
-        if self.even:
-            return even_response(self.physics, p, self.u, self.dt[0], start, part)[self.index]
+        if self.turn:
+            y = even_response(self.physics, p, self.u, self.dt[0], start, self.turn, part)
+            return y[self.index // self.turn]
         return self.changing(jnp.broadcast_to(p, (len(self.u), len(p))), start, part)
 
 

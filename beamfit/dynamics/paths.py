@@ -181,9 +181,9 @@ def undriven(
         time = run.time[since : None if most is None else read[-1] + 1]
         apart = np.diff(time, append=time[-1:])
         dt = np.repeat(np.pad(apart, (0, padded_length(len(time)) - len(time))) / parts, parts)
-        even = bool(np.ptp(apart[:-1]) <= 1e-9 * apart[0])
+        turn = parts if np.ptp(apart[:-1]) <= 1e-9 * apart[0] else 0
         each = (jnp.asarray(dt), *readings_of(run.time[read] - run.time[0], (read - since) * parts))
-        found.append(Driven(physics, None, *each, len(read), jnp.asarray(i), 0.0, even))
+        found.append(Driven(physics, None, *each, len(read), jnp.asarray(i), 0.0, turn))
         measured.append(run.outputs[output][read])
         first.append(since)
     return Undriven(tuple(found), tuple(measured), tuple(first))

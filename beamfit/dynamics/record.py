@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from scipy.signal import resample
 
 from beamfit.answer import shown
 from beamfit.errors import InputError
@@ -276,8 +275,9 @@ def rows_of(run: Run, way: Way, parts: int) -> np.ndarray:
             slope, rows = (u[-1] - u[0]) / (len(u) - 1), np.arange(len(u))
             swing = u - u[0] - slope * rows
             both = np.concatenate([swing, -swing[-2:0:-1]])
-            fine = resample(both, 2 * parts * len(both))[1 : 2 * parts * len(u) : 2]
-            columns.append(u[0] + slope * np.add.outer(rows, late).ravel() + fine)
+            fine = 2 * parts * np.fft.irfft(np.fft.rfft(both), 2 * parts * len(both))
+            line = u[0] + slope * np.add.outer(rows, late).ravel()
+            columns.append(line + fine[1 : 2 * parts * len(u) : 2])
         elif name in way.ramping:
             steps = np.diff(u, append=2.0 * u[-1] - u[-2])
             columns.append((u[:, None] + np.outer(steps, late)).ravel())

@@ -240,31 +240,51 @@ def mean_step(dt: jax.Array) -> jax.Array:
 
 
 def even_response(
-    physics: Physics, p: jax.Array, u: jax.Array, dt: jax.Array, free: jax.Array, part: jax.Array
+    physics: Physics,
+    p: jax.Array,
+    u: jax.Array,
+    dt: jax.Array,
+    free: jax.Array,
+    turn: int,
+    part: jax.Array,
 ) -> jax.Array:
-    """The output of constant parameters p at every one of equal steps dt, many at once.
+    """The output of constant parameters p at every `turn`-th of equal steps dt, many at once.
 
-    The input comes a part of a step late.
+    The input comes a part of a step late; as many samples as a multiple of the turn.
 
     Examples
     --------
     >>> p, u = jnp.array([2.0, 3.0]), jnp.ones((4, 1))
-    >>> y = even_response(FIRST_ORDER, p, u, 2.0, jnp.zeros(1), 0.0)
+    >>> y = even_response(FIRST_ORDER, p, u, 2.0, jnp.zeros(1), 1, 0.0)
     >>> [round(float(v), 4) for v in y]
     [0.0, 1.8964, 2.594, 2.8506]
     """
-    x0 = physics.begin(free, u[0])
+    x0, m = physics.begin(free, u[0]), u.shape[1]
+    n = len(x0)
 
     def step(length):
         def moved(x, felt):
             return physics.advance(p, x, felt, length)
 
-        return jax.jacfwd(moved, (0, 1))(0.0 * x0, 0.0 * u[0])
+        return jax.jacfwd(moved, (0, 1))(0.0 * x0, jnp.zeros(m))
 
-    last, into = step((1.0 - part) * dt)  # from the change of the input before to an output
-    system = Matrices(*step(dt), last[:1], into[:1], jnp.zeros(1))
+    (a, b), (last, into) = step(dt), step((1.0 - part) * dt)
+    powers = [jnp.eye(n)]
+    for _ in range(turn):
+        powers.append(a @ powers[-1])
+    whole = jnp.concatenate([powers[k] @ b for k in range(turn - 1, -1, -1)], axis=1)
+    read = jnp.concatenate([*(last @ powers[k] @ b for k in range(turn - 2, -1, -1)), into], axis=1)
+    felt = u.reshape(-1, turn * m)
+    felt = felt @ jnp.concatenate([whole, read[:1]]).T  # what moves the state, and the next output
+    system = Matrices(
+        powers[turn],
+        jnp.eye(n, n + 1),
+        (last @ powers[turn - 1])[:1],
+        jnp.zeros((1, n + 1)).at[0, n].set(1.0),
+        jnp.zeros(1),
+    )
     first = x0 if physics.even else physics.advance(p, x0, u[0], part * dt)
-    return jnp.append(x0[:1], linear_outputs(system, u, first)[0][:-1, 0])
+    return jnp.append(x0[:1], linear_outputs(system, felt, first)[0][:-1, 0])
 
 
 def run_from(
