@@ -18,7 +18,6 @@ from beamfit.dynamics.model import PreparedOutput
 from beamfit.dynamics.response import ARX, FIRST_ORDER
 from beamfit.dynamics.search import (
     LONGEST,
-    RANGE,
     Settled,
     difference,
     linear_columns,
@@ -28,6 +27,9 @@ from beamfit.dynamics.search import (
 from beamfit.noise.correlated import Whitened, whitened_by_each
 from beamfit.statistics import POOR_FIT
 
+# Range of time constants, in intervals and in runs, beyond which nothing tells them from zero and
+# from infinity.
+RANGE = (1e-3, 1e3)
 # Other lags that are tried beside one that is given, and rounds of them, each about the best.
 OTHERS, ROUNDS = 8, 3
 # Quantile at the upper end of a one-sided 95 %.

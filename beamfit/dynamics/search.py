@@ -46,9 +46,6 @@ LAGS, DAMPINGS = 32, (0.2, 0.6, 1.0, 2.0)
 BETTER = 5.0
 # Paths that are looked at together: one program is compiled for all.
 BATCH = 16
-# Range of time constants, in intervals and in runs, beyond which nothing tells them from zero and
-# from infinity.
-RANGE = (1e-3, 1e3)
 TINY = np.finfo(float).tiny
 # Highest degree of a drift of the output in a run: it turns once less.
 DRIFT = 8
