@@ -35,7 +35,7 @@ from beamfit.dynamics.search import (
     Begun,
     Case,
     Settled,
-    drift_waves,
+    drift_columns,
     settled,
     used_by,
     with_memory,
@@ -110,10 +110,9 @@ def course_of(system: Any, seen: Sequence[PreparedOutput], i: int) -> Course:
     far = APART * span
     time = [far * k + s.time[i] for k, s in enumerate(seen)]
     index, time = np.concatenate(index), np.concatenate(time)
-    readings, waves = readings_of(time, index), np.zeros((0, len(seen), DRIFT))
-    for k, s in enumerate(seen):
-        own = drift_waves(s.time[i] / span)[:, None]
-        waves = np.append(waves, np.pad(own, ((0, 0), (k, len(seen) - 1 - k), (0, 0))), axis=0)
+    readings = readings_of(time, index)
+    waves = [drift_columns(s.time[i] / span, k, len(seen)) for k, s in enumerate(seen)]
+    waves = np.swapaxes(np.concatenate(waves), 1, 2)
     waves = jnp.asarray(np.pad(waves, ((0, len(readings[0]) - len(waves)), (0, 0), (0, 0))))
     return Course(system, run.u, run.dt, *readings, len(index), waves, run.run)
 
@@ -325,9 +324,9 @@ def fit_states(
     if len(start) != len(runs):
         raise InputError(f"first states of shape {start.shape}", f"one row for {len(runs)} runs")
     model = {"p": parameters, **at_start(start, len(runs[0].outputs))}
-    nets = tuple(
-        f"p.{path}".rstrip(".") for path, net in _networks(parameters) if isinstance(net, MLP)
-    )
+    parts = jax.tree_util.tree_leaves_with_path(parameters, is_leaf=lambda v: isinstance(v, MLP))
+    paths = {jax.tree_util.keystr(at, simple=True, separator="."): v for at, v in parts}
+    nets = [f"p.{path}".rstrip(".") for path, v in paths.items() if isinstance(v, MLP)]
     if free is None:
         names = [f"p.{leaf.path}".rstrip(".") for leaf in tree.leaves(parameters)]
         free = [Free(n, nuisance=any(n.startswith(f"{net}.") for net in nets)) for n in names]
@@ -374,11 +373,6 @@ def at_start(start: np.ndarray, outputs: int) -> dict[str, np.ndarray]:
     """First states of runs, shape (runs, n), without segments and drifts, as a model has them."""
     nodes, drift = np.zeros((len(start), 0, start.shape[1])), np.zeros((len(start), outputs, DRIFT))
     return {"start": start, "nodes": nodes, "drift": drift}
-
-
-def _networks(parameters: Any) -> list[tuple[str, Any]]:
-    found = jax.tree_util.tree_leaves_with_path(parameters, is_leaf=lambda v: isinstance(v, MLP))
-    return [(jax.tree_util.keystr(path, simple=True, separator="."), v) for path, v in found]
 
 
 def _check_outputs(case: Case, model: Any) -> None:
