@@ -52,7 +52,6 @@ from beamfit.dynamics.state_fit import (
 )
 from beamfit.dynamics.states import Matrices, contraction, linear_outputs
 from beamfit.errors import InputError, nearest
-from beamfit.greybox import tree
 from beamfit.greybox.fit import Derived
 from beamfit.greybox.problem import Free, Prior
 from beamfit.noise.correlated import CENTRAL, reach_of_probability
@@ -268,28 +267,9 @@ def normal_form(
     return around, c @ back, to
 
 
-def padded(model: dict[str, Any], size: int) -> dict[str, Any]:
-    """The model with further states that nothing moves and nobody reads."""
-    p, (n, m) = model["p"], model["p"]["z"].shape
-    more, at = size - n, [*range(n), *range(size, size + m)]
-    around = np.zeros((size + m, size + m))
-    around[np.ix_(at, at)] = p["around"]
-    wide = {"z": np.pad(p["z"], ((0, more), (0, 0))), "c": np.pad(p["c"], ((0, 0), (0, more)))}
-    start = np.pad(model["start"], ((0, 0), (0, more)))
-    return {"p": p | wide | {"around": around}, **at_start(start, len(p["c"]))}
-
-
-def stripped(model: dict[str, Any], n: int) -> dict[str, Any]:
-    """The model without the states beyond the first n."""
-    p, (size, m) = model["p"], model["p"]["z"].shape
-    at = np.array([*range(n), *range(size, size + m)])
-    less = {"z": p["z"][:n], "c": p["c"][:, :n], "around": p["around"][at][:, at]}
-    return model | {"p": p | less, "start": model["start"][:, :n], "nodes": model["nodes"][..., :n]}
-
-
-# State counts of the compiled searches (unused states are held at 0), and number of orders without
-# improvement that ends the search.
-SIZES, BEYOND = (4, 10), 2
+# Most states that are searched, those that bad readings are judged beside, and number of orders
+# without improvement that ends the search.
+HIGHEST, GLANCED, BEYOND = 10, 4, 2
 # Starts searched for each order, the best predictors; readings needed for each free number.
 BEGINS, EACH = 2, 3
 # Pole, and weight in the output, of a state that is added to an order.
@@ -368,7 +348,7 @@ class StatesSearch(NamedTuple):
         """
         path = Path(None, Way(), self.delay(runs))
         case = case_of(runs, LINEAR, (), (), path)
-        n = self.order or min(SIZES[0], largest_order(case))
+        n = self.order or min(GLANCED, largest_order(case))
         return _Fits((), [_tried(case, path, n, self.offset, True, None).begun])
 
     def unless(
@@ -386,7 +366,7 @@ class StatesSearch(NamedTuple):
         """
         case = case_of(runs, LINEAR, (), (), path)
         tried: list[TriedOrder] = []
-        most = min(SIZES[-1], largest_order(case))
+        most = min(HIGHEST, largest_order(case))
         for n in [self.order] if self.order else range(1, most + 1):
             before = tried[-1] if tried else None
             tried.append(_tried(case, path, n, self.offset, True, before))
@@ -396,7 +376,7 @@ class StatesSearch(NamedTuple):
         full, last = tried[int(np.argmin(told))], tried[-1]
         model = full.begun.settled.fit.model
         p = model["p"] | {"d": model["p"]["d"].at[:, : len(case.seen[0].inputs)].set(0.0)}
-        free = free_of(case, full.order, len(p["z"]), self.offset, False)
+        free = free_of(case, full.order, self.offset, False)
         bounded = full.begun.case._replace(free=free)
         plain = Begun(bounded, path, settled(bounded, [model | {"p": p}]))
         tried.append(TriedOrder(full.order, False, plain))
@@ -406,7 +386,7 @@ class StatesSearch(NamedTuple):
     def trained(self, runs: tuple[Run, ...], best: TriedOrder) -> list[Begun]:
         """Networks beside a linear system, those that are likely."""
         n, path = best.order, best.begun.path
-        free = [f for f in free_of(best.begun.case, n, n, self.offset, best.direct)
+        free = [f for f in free_of(best.begun.case, n, self.offset, best.direct)
                 if f.path != "start"]  # fmt: skip
         free += [Free("start", nuisance=True), Free("p.net", nuisance=True)]
         case = case_of(runs, NETWORK, free, [Prior("p.net", 0.0, WEIGHT)], path)
@@ -451,25 +431,22 @@ def _noise_of(case: Case, found: Settled) -> CorrelatedNoise | None:
     return noise_of(scaled, [time[:LONGEST] for _, _, time, _ in rows], np.zeros((0, 1)))[1]
 
 
-def free_of(case: Case, order: int, size: int, offset: bool, direct: bool) -> tuple[Free, ...]:
-    """Free numbers of a model of `size` states; those beyond the order are held at 0."""
-    k, m, runs = len(case.seen), len(case.seen[0].inputs), len(case.courses)
-    used, straight = np.arange(size) < order, np.full((k, m + offset), direct)
+def free_of(case: Case, order: int, offset: bool, direct: bool) -> tuple[Free, ...]:
+    """Free numbers of a model; those of a direct path that there is not are held at 0."""
+    m, start = len(case.seen[0].inputs), np.ones((len(case.courses), order), bool)
+    straight = np.full((len(case.seen), m + offset), direct)
     straight[:, m:] = True
-    start = np.tile(used, (runs, 1))
-    start[0] &= not offset  # where the first run begins, the offsets of a linear system say
-    parts = {"p.z": np.tile(used[:, None], (1, m + offset)), "p.c": np.tile(used, (k, 1))}
-    parts |= {"p.d": straight, "start": start}
-    return tuple(Free(name, np.where(on, -np.inf, 0.0), np.where(on, np.inf, 0.0), nuisance=True)
-                 for name, on in parts.items())  # fmt: skip
+    start[0] = not offset  # where the first run begins, the offsets of a linear system say
+    held = [Free(name, np.where(on, -np.inf, 0.0), np.where(on, np.inf, 0.0), nuisance=True)
+            for name, on in (("p.d", straight), ("start", start))]  # fmt: skip
+    return Free("p.z", nuisance=True), Free("p.c", nuisance=True), *held
 
 
 def _tried(
     case: Case, path: Path, n: int, offset: bool, direct: bool, before: TriedOrder | None
 ) -> TriedOrder:
     """The fit of an order from its best realisations, and from the order before and one more."""
-    size = next((s for s in SIZES if s >= n), n)
-    bounded = case._replace(free=free_of(case, n, size, offset, direct))
+    bounded = case._replace(free=free_of(case, n, offset, direct))
     units, k = _units(case, offset), len(case.seen)
     u, y = _scaled(case, units, offset)
     m, rest = u[0].shape[1], np.zeros((len(y), n))
@@ -478,7 +455,7 @@ def _tried(
         around, c, to = normal_form(a, b, c)
         d = np.where(direct | (np.arange(m) >= m - offset), d, 0.0)
         p = {"z": np.zeros((n, m)), "around": around, "c": c, "d": d, "units": units}
-        return padded({"p": p, "start": start @ to.T}, size)
+        return {"p": p, **at_start(start @ to.T, k)}
 
     slow = case._replace(degree=DRIFT)
 
@@ -488,11 +465,11 @@ def _tried(
 
     models = best([model(*found) for found in realisations(u, y, n)])[:BEGINS]
     if before is not None:
-        old, last = before.order, before.begun.settled.fit.model
+        last = before.begun.settled.fit.model
         a, b, c, d, _ = map(np.asarray, LINEAR.matrices(last["p"]))
-        a = np.diag([*np.zeros(old), NEW]) + np.pad(a[:old, :old], ((0, 1), (0, 1)))
-        b, c = np.vstack([b[:old], np.ones(m)]), np.hstack([c[:, :old], np.full((k, 1), FAINT)])
-        start = np.pad(np.asarray(last["start"])[:, :old], ((0, 0), (0, 1)))
+        a = np.diag([*np.zeros(len(a)), NEW]) + np.pad(a, ((0, 1), (0, 1)))
+        b, c = np.vstack([b, np.ones(m)]), np.hstack([c, np.full((k, 1), FAINT)])
+        start = np.pad(np.asarray(last["start"]), ((0, 0), (0, 1)))
         models = best([*models, model(a, b, c, d, start)])
     if not models:  # runs too short for a regression
         a = np.diag(NEW ** np.arange(1.0, n + 1))
@@ -625,11 +602,12 @@ def likely(case: Case, found: Sequence[Settled]) -> list[Settled]:
     return [found[best], *(found[i] for i in others if told[i] <= most)]
 
 
-def _derived(fits: Sequence[Begun], function: Any, asked: UsedStates) -> Derived:
+def _derived(fits: Sequence[Begun], function: Any) -> Derived:
     """Numbers of the best fit; within their errors 68 % of all fits' posterior lies, each of which
     counts as much: the posterior of a network is bent, and each tells a part of it.
     """
-    each = [derived(f.settled.fit, f.settled.errors, function, asked) for f in fits]
+    course = fits[0].case.courses[0]
+    each = [derived(f.settled.fit, f.settled.errors, function, course) for f in fits]
     if len(each) == 1:
         return each[0]
     values, errors = (np.stack([getattr(one, name) for one in each]) for name in ("value", "error"))
@@ -671,7 +649,7 @@ def joint_error(values: np.ndarray, errors: np.ndarray) -> np.ndarray:
 
 def _networks(best: TriedOrder, hidden: int, seeds: range) -> list[dict[str, Any]]:
     """Models with networks of small random weights beside the linear part."""
-    model = stripped(best.begun.settled.fit.model, best.order)
+    model = best.begun.settled.fit.model
     p, (n, m) = model["p"], model["p"]["z"].shape
     moved = LINEAR.linear(p)._replace(c=jnp.eye(n), d=jnp.zeros((n, m)), offset=jnp.zeros(n))
     run = jax.jit(lambda u, x0: linear_outputs(moved, u, x0)[0])
@@ -690,24 +668,15 @@ def _networks(best: TriedOrder, hidden: int, seeds: range) -> list[dict[str, Any
     return found
 
 
-@tree.node("order")
-class UsedStates:
-    """The states that a model uses, and a run."""
-
-    order: int
-    course: Course
-
-
-def _quoted(model: Any, asked: UsedStates) -> jax.Array:
+def _quoted(model: Any, course: Course) -> jax.Array:
     """Tau, T, zeta, value and frequency of each pole; static gains; outputs at the mean inputs."""
-    p, n, course = model["p"], asked.order, asked.course
+    p, units = model["p"], model["p"]["units"]
     a, b, c, d, _ = course.system.matrices(p)
-    a, b, c, units = a[:n, :n], b[:n], c[:, :n], p["units"]
     m, size = units["u"].shape[1], units["y"][1]
     poles = jnp.linalg.eigvals(a)
     poles = poles[jnp.lexsort((poles.imag, -jnp.abs(poles)))]  # the same of several fits
     s = jnp.log(poles) / course.dt[0]
-    gains = size[:, None] * (d + c @ jnp.linalg.solve(jnp.eye(n) - a, b))
+    gains = size[:, None] * (d + c @ jnp.linalg.solve(jnp.eye(len(a)) - a, b))
     parts = [-1.0 / s.real, 1.0 / jnp.abs(s), -s.real / jnp.abs(s), poles.real, s.imag]
     levels = (units["y"][0][:, None] + gains[:, m:]).ravel()
     return jnp.concatenate([*parts, (gains[:, :m] / units["u"][1]).ravel(), levels])
@@ -720,7 +689,7 @@ def _quantities(
     course, path = fits[0].case.courses[0], fits[0].path
     step, said = float(course.dt[0]), {}
     inputs, outputs = list(runs[0].inputs), list(runs[0].outputs)
-    numbers = _derived(fits, _quoted, UsedStates(n, course))
+    numbers = _derived(fits, _quoted)
     unsure = [0.0] * (5 * n) + [unsure_gain(runs, path.way, name) for name in inputs] * len(outputs)
     unsure += [0.0] * (len(numbers.value) - len(unsure))
     numbers = widened(numbers, digits_of(fits[0]), np.array(unsure))
@@ -775,14 +744,13 @@ def _lag(numbers: Derived, i: int, pole: int, step: float) -> Quantity:
     return replace(found.open(), interval_95=limits.interval)
 
 
-def _taylor(model: Any, asked: UsedStates) -> jax.Array:
+def _taylor(model: Any, course: Course) -> jax.Array:
     """A and B of states that are the outputs without noise, in the units of the record."""
-    p, n = model["p"], asked.order
-    a, b, c, _, _ = asked.course.system.matrices(p)
+    p = model["p"]
+    a, b, c, _, _ = course.system.matrices(p)
     (_, size_u), (_, size_y) = (p["units"][kind] for kind in "uy")
-    to = size_y[:, None] * c[:, :n]
-    return jnp.column_stack([to @ a[:n, :n] @ jnp.linalg.inv(to),
-                             to @ b[:n, : len(size_u)] / size_u])  # fmt: skip
+    to = size_y[:, None] * c
+    return jnp.column_stack([to @ a @ jnp.linalg.inv(to), to @ b[:, : len(size_u)] / size_u])
 
 
 def _matrices(fits: Sequence[Begun], n: int) -> dict[str, Any]:
@@ -793,7 +761,7 @@ def _matrices(fits: Sequence[Begun], n: int) -> dict[str, Any]:
     """
     case, more = fits[0].case, {}
     if n == len(case.seen):
-        read = _derived(fits, _taylor, UsedStates(n, case.courses[0]))
+        read = _derived(fits, _taylor)
         ends = {"A": slice(n), "B": slice(n, None)}
         more["outputs_as_states"] = {
             name + said: part[:, ends[name]] for name in ends
@@ -804,7 +772,7 @@ def _matrices(fits: Sequence[Begun], n: int) -> dict[str, Any]:
     (mean_u, size_u), (mean_y, size_y) = (np.asarray(p["units"][kind]) for kind in "uy")
     by, m = size_y[:, None], len(mean_u)
     return {
-        "step_s": float(case.courses[0].dt[0]), "input_mean": mean_u, "A": a[:n, :n],
-        "B": b[:n, :m] / size_u, "C": by * c[:, :n], "D": by * d[:, :m] / size_u,
-        "state_offset": b[:n, m:].sum(1), "output_offset": mean_y + size_y * d[:, m:].sum(1),
+        "step_s": float(case.courses[0].dt[0]), "input_mean": mean_u, "A": a,
+        "B": b[:, :m] / size_u, "C": by * c, "D": by * d[:, :m] / size_u,
+        "state_offset": b[:, m:].sum(1), "output_offset": mean_y + size_y * d[:, m:].sum(1),
     } | more  # fmt: skip
