@@ -13,7 +13,6 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
-from itertools import groupby
 from typing import Any, NamedTuple
 
 import jax
@@ -22,7 +21,7 @@ import numpy as np
 from scipy.special import logsumexp
 
 from beamfit.dynamics.checks import SLOW, paths_by, slow_lags, slow_paths
-from beamfit.dynamics.input_laws import STATIC, InputLaw, laws_between, moved
+from beamfit.dynamics.input_laws import STATIC, InputLaw, laws_between
 from beamfit.dynamics.model import Driven, PreparedOutput, filled, growing_of, predicted
 from beamfit.dynamics.paths import Path, Paths, Undriven, handed_on, undriven
 from beamfit.dynamics.record import Run, Way
@@ -62,26 +61,25 @@ FURTHER, GROWTH = "further term", "growth"
 class Departure(NamedTuple):
     """A law of an input, a term of a fuller response, or something that grows along the record,
     beside a response. In words, by its kind, and its probability where no departure and
-    these are all that can be; `growth` is by how much a term grows if its share is 1.
+    these are all that can be.
     """
 
     words: str
     kind: str
-    growth: float = 0.0
     probability: float = 0.0
 
     def grown(self, share: float) -> Departure:
         """The same with the amount by which it grows."""
         if self.kind != GROWTH:
             return self
-        by, unit = share * self.growth, "samples" if self.words == "a delay" else "%"
+        by, unit = (share, "samples") if self.words == "a delay" else (100.0 * share, "%")
         way = "grows" if by > 0 else "falls"
         return self._replace(words=f"{self.words} that {way} by about {abs(by):.2g} {unit}")
 
 
 NONE = Departure("", "")
 # Departures by the columns of `growing_of`: a delay grows by a sample, a gain by itself.
-GROWING = [Departure("a delay", GROWTH, 1.0), Departure("a gain", GROWTH, 100.0)]
+GROWING = [Departure("a delay", GROWTH), Departure("a gain", GROWTH)]
 
 
 class Trial(NamedTuple):
@@ -277,13 +275,8 @@ class _Weighed(NamedTuple):
 
     def best(self) -> dict[tuple[str, str], int]:
         """The likeliest law of the value alone, by kind and input."""
-        logs, found = self.logs, {}
-        for k, trial in enumerate(self.trials):
-            law = trial.path.law
-            if law is not None and law.kind in STATIC:
-                key = law.kind, law.input
-                found[key] = k if logs[k] > logs[found.get(key, k)] else found.get(key, k)
-        return found
+        laws = [(int(k), self.trials[k].path.law) for k in np.argsort(self.logs)]  # the last stays
+        return {(law.kind, law.input): k for k, law in laws if law and law.kind in STATIC}
 
 
 class Comparison(NamedTuple):
@@ -433,12 +426,10 @@ def _laws_of(runs: Sequence[Run], name: str, way: Way) -> list[InputLaw]:
     unsure = np.sqrt(sum(np.sum(each.variance[-len(u) :])
                          for each, u in zip(levels, since, strict=True)))  # fmt: skip
     laws = laws_between(name, *map(float, (min(map(np.min, inputs)), max(map(np.max, inputs)))))
-    alike = groupby(laws, lambda law: (law.kind, law.place))
-    at = np.concatenate([
-        np.concatenate([moved(u, kind, widths, place)[:, -len(some) :]
-                        for u, some in zip(inputs, since, strict=True)], axis=1)
-        for (kind, place), widths in [(k, np.array([law.width for law in g])) for k, g in alike]
-    ]).T  # fmt: skip
+    at = np.stack([
+        np.concatenate([law.behind(u)[-len(some) :, 0]
+                        for u, some in zip(inputs, since, strict=True)]) for law in laws
+    ], axis=1)  # fmt: skip
     basis = np.linalg.qr(np.stack([np.ones(len(plain)), plain], axis=1))[0]
     at = at - at.mean(axis=0)
     same = basis @ (basis.T @ at)
@@ -542,7 +533,7 @@ def _changing(
     for i, (name, (time, gain)) in enumerate(powers):
         for k, by in enumerate((*seen.inputs, *seen.inputs, None)):
             if by is None and time:
-                names.append(Departure(f"a {name}", GROWTH, 100.0))
+                names.append(Departure(f"a {name}", GROWTH))
             elif by is not None and not (gain and k % m == number[i] % m):
                 names.append(Departure(f"a {name} that changes with {by}", FURTHER))
             else:

@@ -30,8 +30,6 @@ from beamfit.statistics import POOR_FIT
 
 # Points of a curve; samples within a share of its range that make a point visited.
 POINTS, VISITS, NEAR = 41, 5, 0.05
-# Points of a curve in JSON and tables.
-SHOWN = 9
 TIME, GAIN, PURE = "s", "output/input", "1"
 
 
@@ -71,7 +69,7 @@ class Curve(NamedTuple):
         """A few points, to be shown."""
         rows = [
             [f"{self.at[i]:.4g}", cell(self.quantity(i)), "" if self.visited[i] else "not visited"]
-            for i in np.linspace(0, len(self.at) - 1, SHOWN).round().astype(int)
+            for i in np.linspace(0, len(self.at) - 1, 9).round().astype(int)
         ]
         return Table(f"{self.parameter} by {self.input}", [self.input, self.parameter, ""], rows)
 

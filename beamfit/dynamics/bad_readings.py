@@ -24,9 +24,8 @@ from beamfit.statistics import CLEAR_ODDS, POOR_FIT
 # Of more readings than this share, or of such as follow the inputs, the model is wrong and not the
 # monitor.
 MOST = 0.2
-# A residual is judged about the running median of so many, most searches in turn, and rounds
-# in which the noise of good readings is found.
-AROUND, ROUNDS, ROUNDS_OF_NOISE = 7, 5, 50
+# A residual is judged about the running median of so many; most searches in turn.
+AROUND, ROUNDS = 7, 5
 # Number of equal readings that count as stuck, if the model moves away by AWAY times the noise.
 HELD, AWAY = 8, 3.0
 OFF, STILL = "far off their neighbours", "that stand still as the process moves"
@@ -185,9 +184,7 @@ def _lone(seen: PreparedOutput, residuals: Sequence[np.ndarray]) -> list[np.ndar
     return found
 
 
-def odds_of_bad(
-    off: np.ndarray, fitted: np.ndarray, time: np.ndarray, least: float, noise: Noise | None = None
-) -> np.ndarray:
+def odds_of_bad(off: np.ndarray, fitted: np.ndarray, time: np.ndarray, least: float) -> np.ndarray:
     """Logarithm of the odds that readings are bad.
 
     Parameters
@@ -196,8 +193,6 @@ def odds_of_bad(
         Residuals, the model, and when readings were taken, s.
     least : float
         Smallest standard deviation of good readings.
-    noise : Noise, optional
-        Of bad readings.
 
     Returns
     -------
@@ -216,13 +211,12 @@ def odds_of_bad(
     >>> (odds_of_bad(off, np.zeros(51), np.arange(51.0), 1e-3) > 0).nonzero()[0].tolist()
     [50]
     """
-    noise = Noise() if noise is None else noise
     scale, _ = spread_by_jitter(fitted, time)
     pulls = off / scale
     size = np.maximum(1.4826 * np.median(np.abs(pulls), axis=1), least)[:, None]
-    for _ in range(ROUNDS_OF_NOISE):
+    for _ in range(50):
         pull = (pulls / size) ** 2
-        bad = np.log(bad_density(pull, noise))
+        bad = np.log(bad_density(pull, Noise()))
         good = expit(-0.5 * pull - bad)
         size = np.sqrt(
             np.sum(good * pulls**2, axis=1, keepdims=True) / good.sum(axis=1, keepdims=True)

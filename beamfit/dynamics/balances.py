@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from beamfit.arrays import padded_length
 from beamfit.compile_cache import prepare_jax
 from beamfit.dynamics.record import Run
 from beamfit.greybox import tree
@@ -80,8 +81,6 @@ BEYOND, STRETCHES = 4.0, 8
 STEP = 0.5
 # Least substrate, in units of its scale: no cell feels it.
 LEAST = 1e-9
-# Batches are padded to a multiple of this many rows, so that they share compiled code.
-PADDED = 32
 
 
 @tree.node("inputs", "steps")
@@ -241,7 +240,7 @@ def batches_of(
     times: Sequence[np.ndarray], known: Sequence[Mapping[str, np.ndarray]], like: Batches
 ) -> Batches:
     """Batches by their times (h) and what is known of their rows, with the bounds of others."""
-    n = -(-max(map(len, times)) // PADDED) * PADDED
+    n = padded_length(max(map(len, times)))
     dt = np.stack([np.pad(np.diff(t), (0, n + 1 - len(t))) for t in times])
 
     def column(name: str) -> np.ndarray:

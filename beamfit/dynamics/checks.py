@@ -119,11 +119,6 @@ class HeldOutRun(NamedTuple):
     free_run_percent: float
     rms: float
 
-    @classmethod
-    def of(cls, name: str, rest: np.ndarray, y: np.ndarray) -> HeldOutRun:
-        """The run by its residuals and readings."""
-        return cls(name, percent(rest, y), float(np.sqrt(np.mean(rest**2))))
-
     def row(self) -> list[str]:
         """Label and value."""
         return [f"held back {self.name}", f"{self.free_run_percent:.2f} %, rms {self.rms:.3g}"]
@@ -146,9 +141,9 @@ def checks_of(
     (case, path, found), seen = begun, begun.case.seen[k]
     residuals = tuple(row[k] for row in found.rest)
     own = [case.split(i, slopes)[k] for i, slopes in enumerate(found.slopes(case))]
-    jitter, likely = float(found.jitter[:, k].max()), found.likely
+    jitter, memory = max(row[k].jitter for row in found.noise), found.errors and found.errors.noise
     errors = [row[k].each for row in found.noise]
-    noise = RunNoises(seen.time, errors, likely, seen.parts if jitter else 0)
+    noise = RunNoises(seen.time, errors, memory, seen.parts if jitter else 0)
     moved = zip(seen.measured, case.drifts(found.fit.model), strict=True)
     y = [m - row[k] - np.mean(m - row[k]) for m, row in moved]
     rest = np.concatenate(residuals)
@@ -161,10 +156,11 @@ def checks_of(
         explained, chance = 0.0, 1.0
     if later * rest.var() <= rounded:
         later, fed = 0.0, 1.0
+    whole, left = (float(v @ v) for v in (noise.white(y), noise.white(residuals)))
     return Checks(
         percent(rest, np.concatenate(y)),
         percent(noise.ahead(residuals), np.concatenate(y)),
-        _chance(noise.white(y), noise.white(residuals), used),
+        _chance(whole - left, left, used, len(rest) - used),
         white,
         chance,
         explained,
@@ -190,11 +186,11 @@ def _together(seen: PreparedOutput) -> tuple[str, ...]:
     return tuple(found)
 
 
-def _chance(y: np.ndarray, rest: np.ndarray, used: int) -> float:
-    whole, left, free = float(y @ y), float(rest @ rest), len(rest) - used
-    if free < 1 or left >= whole:
+def _chance(explained: float, left: float, used: int, free: int) -> float:
+    """Chance that so many numbers explain so much of squares if nothing is to be explained (F)."""
+    if free < 1 or used < 1 or explained <= 0.0:
         return 1.0
-    return float(f.sf((whole - left) / used / max(left / free, 1e-300), used, free))
+    return float(f.sf(explained / used / max(left / free, 1e-300), used, free))
 
 
 class RunNoises(NamedTuple):
@@ -299,12 +295,11 @@ def paths_by(run: Driven, shapes: np.ndarray) -> np.ndarray:
 def _tested(rest: np.ndarray, basis: np.ndarray, columns: np.ndarray) -> tuple[float, float]:
     """Share of the squares that columns explain beyond a basis, and its chance (F)."""
     new = spanned(columns - basis @ (basis.T @ columns), np.linalg.norm(columns, axis=0))
-    k, left = new.shape[1], len(rest) - basis.shape[1] - new.shape[1]
+    free = len(rest) - basis.shape[1] - new.shape[1]
     inside, whole = float(np.sum((new.T @ rest) ** 2)), float(rest @ rest)
-    if left < 1 or whole <= 0 or k == 0:
+    if free < 1 or not inside:
         return 0.0, 1.0
-    ratio = (inside / k) / max((whole - inside) / left, 1e-300)
-    return inside / whole, float(f.sf(ratio, k, left))
+    return inside / whole, _chance(inside, whole - inside, new.shape[1], free)
 
 
 def variance_of_digits(seen: PreparedOutput, rms: float) -> float:
@@ -315,36 +310,28 @@ def variance_of_digits(seen: PreparedOutput, rms: float) -> float:
     return rounding_variance(digit, max(rms**2 - digit**2 / 12, 0.0) ** 0.5)
 
 
-def covariance_of_digits(outputs: Sequence[tuple[PreparedOutput, np.ndarray, float]]) -> np.ndarray:
-    """Covariance of the model's numbers by the digits of outputs: readings of one value were all
-    rounded alike, so that many are worth no more than one.
-
-    Each output comes with the slopes of its readings, shape (readings, p), and the rms residual.
+def digits_of(begun: Begun) -> np.ndarray:
+    """Covariance of a fit's free numbers by the digits of its outputs: readings of one value were
+    all rounded alike, so that many are worth no more than one.
     """
-    variances = [variance_of_digits(seen, rms) for seen, _, rms in outputs]
-    found = np.zeros((outputs[0][1].shape[1],) * 2)
+    case, slopes = begun.case, begun.settled.slopes(begun.case)
+    parts = zip(*(case.split(i, each) for i, each in enumerate(slopes)), strict=True)
+    own = [np.concatenate(part) for part in parts]  # by output
+    rms = np.sqrt(np.mean(begun.settled.rms**2, axis=0))
+    variances = [variance_of_digits(s, float(r)) for s, r in zip(case.seen, rms, strict=True)]
+    found = np.zeros((own[0].shape[1],) * 2)
     if not any(variances):
         return found
-    weight = np.concatenate([np.full(len(own), 1.0 / max(rms, CLOSE * seen.size_y))
-                             for seen, own, rms in outputs])  # fmt: skip
-    inverse = np.linalg.pinv(weight[:, None] * np.concatenate([own for _, own, _ in outputs]))
-    ends = np.cumsum([len(own) for _, own, _ in outputs])[:-1]
-    parts = np.split((inverse * weight).T, ends)
-    for (seen, _, _), variance, part in zip(outputs, variances, parts, strict=True):
-        values, which = np.unique(np.concatenate(seen.measured), return_inverse=True)
+    least = np.maximum(rms, [CLOSE * s.size_y for s in case.seen])
+    weight = np.repeat(1.0 / least, list(map(len, own)))
+    inverse = np.linalg.pinv(weight[:, None] * np.concatenate(own))
+    each = np.split((inverse * weight).T, np.cumsum(list(map(len, own)))[:-1])
+    for s, variance, part in zip(case.seen, variances, each, strict=True):
+        values, which = np.unique(np.concatenate(s.measured), return_inverse=True)
         by_value = np.zeros((len(values), len(found)))
         np.add.at(by_value, which, part)
         found += variance * by_value.T @ by_value
     return found
-
-
-def digits_of(begun: Begun) -> np.ndarray:
-    """Covariance of a fit's free numbers by the digits of its outputs."""
-    case, found = begun.case, begun.settled
-    parts = [case.split(i, each) for i, each in enumerate(found.slopes(case))]
-    rms = np.sqrt(np.mean(found.rms**2, axis=0))
-    return covariance_of_digits([(s, np.concatenate([row[k] for row in parts]), float(rms[k]))
-                                 for k, s in enumerate(case.seen)])  # fmt: skip
 
 
 def held_out(begun: Begun, runs: Sequence[Run]) -> dict[str, tuple[HeldOutRun, ...]]:
@@ -353,7 +340,8 @@ def held_out(begun: Begun, runs: Sequence[Run]) -> dict[str, tuple[HeldOutRun, .
     for run in runs:
         case = begun.on((run,))
         for s, rest in zip(case.seen, case.ahead(begun.settled), strict=True):
-            ahead[s.output].append(HeldOutRun.of(run.name, rest, s.measured[0]))
+            rms = float(np.sqrt(np.mean(rest**2)))
+            ahead[s.output].append(HeldOutRun(run.name, percent(rest, s.measured[0]), rms))
     return {name: tuple(each) for name, each in ahead.items()}
 
 

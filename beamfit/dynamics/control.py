@@ -129,15 +129,13 @@ class Controller:
     horizon: int
     smooth: float = 0.1
 
-    def begin(self, inputs: Any, reading: Any = None) -> ControllerState:
+    def begin(self, inputs: Any) -> ControllerState:
         """Give the state of a process at rest.
 
         Parameters
         ----------
         inputs : array, shape (m,)
             Held so far.
-        reading : array, shape (outputs,), optional
-            What is read; what the model says if None.
 
         Raises
         ------
@@ -149,7 +147,7 @@ class Controller:
             if not self.limits.low[i] <= u[i] <= self.limits.high[i]:
                 expected = f"{self.limits.low[i]:g} to {self.limits.high[i]:g}, its limits"
                 raise InputError(f"{name} at {u[i]:g} to begin with", expected)
-        return start(self, jnp.asarray(u), reading)
+        return start(self, jnp.asarray(u))
 
     def __call__(
         self, state: ControllerState, reading: Any, target: Any
@@ -174,17 +172,10 @@ class Controller:
     def _compiled(self) -> Any:
         return jax.jit(partial(advance, self))
 
-    @cached_property
-    def slope(self) -> np.ndarray | None:
-        """Outputs by inputs of the horizon where that is a constant, else None."""
-        if any(callable(r.of) for r in self.responses):
-            return None
-
-        def found(plan: jax.Array) -> jax.Array:
-            return outputs(self, start(self, jnp.zeros(len(self.sizes))), plan)
-
-        with jax.ensure_compile_time_eval():  # also where a step is being compiled
-            return np.asarray(jax.jit(jax.jacfwd(found))(self.rest))
+    @property
+    def linear(self) -> bool:
+        """True if no parameter changes: a plan is then the best at once."""
+        return not any(callable(r.of) for r in self.responses)
 
     @property
     def held(self) -> tuple[np.ndarray, np.ndarray]:
@@ -192,10 +183,9 @@ class Controller:
         margin = np.array([r.margin for r in self.responses])
         return self.limits.below + margin, self.limits.above - margin
 
-    @property
-    def rest(self) -> np.ndarray:
-        """A plan of nothing."""
-        return np.zeros((self.horizon, len(self.inputs)))
+    def output(self, name: str) -> int:
+        """The place of an output; other names are refused."""
+        return _place([r.name for r in self.responses], name, "no output")
 
 
 # ---- the process
@@ -275,7 +265,7 @@ def advance(
     level = state.level + jnp.where(jnp.isfinite(surprise), share * surprise, 0.0)
     state = state._replace(level=level)
     plan = state.plan
-    for _ in range(ROUNDS if control.slope is None else 1):
+    for _ in range(1 if control.linear else ROUNDS):
         plan = _better(control, state, target, plan)
     # By construction, whatever the plan is worth: within the rate of the last input, within limits.
     last, limits = state.past[-1], control.limits
@@ -300,11 +290,11 @@ def _better(
     control: Controller, state: ControllerState, target: jax.Array, plan: jax.Array
 ) -> jax.Array:
     """The best plan of the process as it is around a plan."""
-    slope = control.slope
-    if slope is not None:
-        return _planned(control, state, target, plan, jnp.asarray(slope))
     slope = jax.jacfwd(lambda each: outputs(control, state, each))(plan)
-    way = _planned(control, state, target, plan, slope) - plan
+    best = _planned(control, state, target, plan, slope)
+    if control.linear:
+        return best
+    way = best - plan
     # Second-order correction (J. Nocedal & S. Wright, Numerical Optimization, 2006, section 18.3):
     # else a full step passes a limit by the square of its length, and only shares of it are taken.
     bent = outputs(control, state, plan + way) - outputs(control, state, plan)
@@ -338,7 +328,7 @@ def _planned(
 
     `bent` is added to the outputs that limits are held against.
     """
-    size, n = np.array([r.size for r in control.responses]), control.rest.size
+    size, n = np.array([r.size for r in control.responses]), plan.size
     wide = np.tile(control.sizes, control.horizon)
     matrix = (slope / size[:, None, None] * control.sizes).reshape(-1, n)
     inputs = plan.ravel() / wide
@@ -453,11 +443,10 @@ def controller(
         expected = f"one longer than the delay, of at most {LONGEST} steps, and smooth above 0"
         raise InputError(said, expected)
     values = np.concatenate([np.stack(list(run.inputs.values()), axis=1) for run in fits[0].runs])
-    usual = {n: (v.min(), v.max()) for n, v in zip(names, values.T, strict=True)}
-    low, high = _ranges(names, inputs or {}, usual)
-    below, above = _ranges([fit.output for fit in fits], outputs or {}, {})
-    rate = step * np.array([_rates(names, rates or {}).get(name, np.inf) for name in names])
-    limits = ControlLimits(low, high, rate, below, above)
+    low, high = _ranges(names, inputs or {}, np.stack([values.min(0), values.max(0)]))
+    wanted = [fit.output for fit in fits]
+    ends = _ranges(wanted, outputs or {}, np.outer([-np.inf, np.inf], np.ones(len(wanted))))
+    limits = ControlLimits(low, high, step * _rates(names, rates or {}), *ends)
     return Controller(names, responses, step, seen.wide, limits, horizon, smooth)
 
 
@@ -488,41 +477,41 @@ def _response(fit: ResponseFit, every: int, step: float) -> Response:
         wander = (1.0 - fit.memory.white) * -np.expm1(-2.0 * step / fit.memory.time)
         q = max(q, wander / max(fit.memory.white, 1e-6))
     ahead = 0.5 * (q + np.sqrt(q**2 + 4.0 * q))
-    model = fit.fit.model
+    model, late = fit.fit.model, max(fit.delay / every, 0.0)
     return Response(
-        fit.output,
-        PHYSICS[fit.model],
-        model["map"],
-        float(model["offset"]),
-        max(fit.delay / every, 0.0),
-        fit.seen.size_y,
-        ahead / (ahead + 1.0),
-        MARGIN * float(np.hypot(noise, band)),
-    )
+        fit.output, PHYSICS[fit.model], model["map"], float(model["offset"]), late, fit.seen.size_y,
+        ahead / (ahead + 1.0), MARGIN * float(np.hypot(noise, band)),
+    )  # fmt: skip
+
+
+def _place(names: Sequence[str], name: str, what: str) -> int:
+    """The place of a name; others are refused."""
+    if name not in names:
+        raise InputError(f"{what} '{name}'", nearest(name, list(names)))
+    return names.index(name)
 
 
 def _ranges(
-    names: Sequence[str],
-    said: Mapping[str, tuple[float, float]],
-    usual: Mapping[str, tuple[float, float]],
-) -> tuple[np.ndarray, np.ndarray]:
+    names: Sequence[str], said: Mapping[str, tuple[float, float]], usual: np.ndarray
+) -> np.ndarray:
+    """Lower and upper limits, the usual ones, shape (2, names), where none are said."""
     for name, (low, high) in said.items():
-        if name not in names:
-            raise InputError(f"a limit of '{name}'", nearest(name, list(names)))
+        at = _place(names, name, "a limit of")
         if not low < high:
             raise InputError(f"limits {low:g} to {high:g} of {name}", "the lower one first")
-    every = {name: (-np.inf, np.inf) for name in names} | dict(usual) | dict(said)
-    both = np.array([every[name] for name in names])
-    return both[:, 0], both[:, 1]
+        usual[:, at] = low, high
+    return usual
 
 
-def _rates(names: Sequence[str], said: Mapping[str, float]) -> Mapping[str, float]:
+def _rates(names: Sequence[str], said: Mapping[str, float]) -> np.ndarray:
+    """Largest changes of inputs in a second; infinite where none is said."""
+    found = np.full(len(names), np.inf)
     for name, rate in said.items():
-        if name not in names:
-            raise InputError(f"a rate of '{name}'", nearest(name, list(names)))
+        at = _place(names, name, "a rate of")
         if not rate > 0:
             raise InputError(f"rate {rate:g} of {name}", "above 0, in units a second")
-    return said
+        found[at] = rate
+    return found
 
 
 # ---- a loop with a simulated process
@@ -530,10 +519,10 @@ def _rates(names: Sequence[str], said: Mapping[str, float]) -> Mapping[str, floa
 # Band of a settled step, as a share of it (or the noise if larger); last share of the steps whose
 # mean is the remaining offset.
 SETTLED, LAST = 0.02, 0.2
-# Horizons simulated after the last change; distance, in units of the input, that touches a limit.
-HORIZONS, TOUCHED = 4, 1e-6
-# Excess, as a share of the output's scatter, from which a plan uses the safety margin.
-SOFT = 1e-4
+# Horizons simulated after the last change.
+HORIZONS = 4
+# Share of the scatter within which an input is at its limit, and an output still keeps its own.
+NEAR = 1e-4
 
 
 class Trace(NamedTuple):
@@ -682,7 +671,7 @@ class Loop:
         for i, r in enumerate(c.responses):
             low, high = c.limits.below[i], c.limits.above[i]
             if np.isfinite([low, high]).any():
-                soft = int((self.trace.beyond[:, i] > SOFT * r.size).sum())
+                soft = int((self.trace.beyond[:, i] > NEAR * r.size).sum())
                 said = f"{_range(low, high)}, held off by {r.margin:.2g}"
                 rows.append([r.name, said, f"soft in {soft} of {len(self.time)} steps"])
         return ["", "limit", "used"], rows
@@ -708,14 +697,14 @@ def _range(low: float, high: float) -> str:
 def touched(loop: Loop) -> np.ndarray:
     """True for each input at one of its limits, shape (steps, m)."""
     c, u = loop.control, loop.trace.inputs
-    near = TOUCHED * c.sizes
+    near = NEAR * c.sizes
     return (u <= c.limits.low + near) | (u >= c.limits.high - near)
 
 
 def fastest(loop: Loop) -> np.ndarray:
     """True for each input that moves at its largest rate, shape (steps - 1, m)."""
     c, rate = loop.control, loop.control.limits.rate
-    least = np.maximum(rate - TOUCHED * c.sizes, rate / 2)  # also where it hardly moves
+    least = np.maximum(rate - NEAR * c.sizes, rate / 2)  # also where it hardly moves
     return np.abs(np.diff(loop.trace.inputs, axis=0)) > least
 
 
@@ -765,7 +754,7 @@ def simulate_loop(
     wanted = _series(control, time, targets, rest, add=False)
     load = _series(control, time, disturbances, np.zeros(len(rest)), add=True)
     for name, value, _ in targets:
-        low, high = (ends[_output(control, name)] for ends in control.limits[3:])
+        low, high = (ends[control.output(name)] for ends in control.limits[3:])
         if not low <= value <= high:
             raise InputError(f"{name} wanted at {value:g}", f"{_range(low, high)}, its limits")
     noise = np.stack([_noise(fit, time, seed + i) for i, fit in enumerate(fits)], axis=1)
@@ -787,7 +776,7 @@ def _series(
     """Values that step, shape (steps, outputs)."""
     found = np.tile(at_first, (len(time), 1))
     for name, value, at in sorted(steps, key=lambda each: each[2]):
-        i = _output(control, name)
+        i = control.output(name)
         if not 0 <= at < time[-1]:
             raise InputError(f"{name} at {at:g} s", f"a time within the loop, 0 to {time[-1]:g} s")
         if not np.isfinite(value):
@@ -795,13 +784,6 @@ def _series(
         after = time >= at - 1e-9
         found[after, i] = found[after, i] * add + value
     return found
-
-
-def _output(control: Controller, name: str) -> int:
-    names = [r.name for r in control.responses]
-    if name not in names:
-        raise InputError(f"no output '{name}'", nearest(name, names))
-    return names.index(name)
 
 
 def _noise(fit: ResponseFit, time: np.ndarray, seed: int) -> np.ndarray:
@@ -863,7 +845,7 @@ def _passed(loop: Loop) -> Finding | None:
         y = loop.trace.outputs[:, i]
         over = np.maximum(y - high, low - y)
         over = over[np.argmax(over <= 0) :]  # where it rests at first is not the loop's
-        if over.max() <= SOFT * r.size:
+        if over.max() <= NEAR * r.size:
             continue
         cause = f"{r.name} passes its limit by up to {over.max():.3g}"
         cause += f" in {int((over > 0).sum())} of {len(over)} steps."
@@ -877,7 +859,7 @@ def _short(loop: Loop) -> Finding | None:
     for change in loop.changes:
         if change.settling is not None:
             continue
-        i = _output(loop.control, change.output)
+        i = loop.control.output(change.output)
         low, high = (ends[i] for ends in loop.control.held)
         off = f"{change.output} stays {abs(change.left):.3g} off {change.after:.4g}"
         if not low <= change.after <= high:
@@ -904,7 +886,7 @@ def _mostly(loop: Loop, at: np.ndarray) -> str:
 
 def _kept(loop: Loop) -> Finding | None:
     soft = [r.name for i, r in enumerate(loop.control.responses)
-            if (loop.trace.beyond[:, i] > SOFT * r.size).any()]  # fmt: skip
+            if (loop.trace.beyond[:, i] > NEAR * r.size).any()]  # fmt: skip
     first = loop.trace.outputs[0]
     within = (first >= loop.control.limits.below) & (first <= loop.control.limits.above)
     words = "The loop settles and keeps all limits"

@@ -341,10 +341,8 @@ class FedBatchFit:
             {"output": self.output, "status": self.status, "message": self.message}
             | {"model": "fed-batch", "map": "network", "substrate_scale": self.half}
             | {"records": [run.path or run.name for run in self.runs]}
-            | {"curves": [curve.to_json() for curve in self.curves]}
-            | {"noise": {name: noise._asdict() for name, noise in self.noise.items()}}
-            | {"batch_spread": self.spread}
-            | {"held_back": {name: held._asdict() for name, held in self.held.items()}}
+            | {"curves": self.curves, "noise": self.noise}
+            | {"batch_spread": self.spread, "held_back": self.held}
         )
 
 
@@ -408,17 +406,16 @@ def identify_batches(
     rates, whose scatter is taken likewise.
     """
     runs = (runs,) if isinstance(runs, Run) else tuple(runs)
-    for run in (*runs, *held):
-        _check(run, runs[0])
-    runs, held = ([ordered(run, runs[0]) for run in each] for each in (runs, held))
-    if half is not None and not half > 0:
-        raise InputError(f"half {half:g}", "a substrate above 0, g/L")
     own = [n for n in runs[0].inputs if n not in FLOWS]
     names = ("substrate", *own) if points is None else tuple(points)
-    titred = all(TITRE in run.outputs for run in (*runs, *held))
     for run in (*runs, *held):
+        _check(run, runs[0])
         _check_names(names, (*STATES, *known_of(run)), "rates")
         _check_names(product, (*RATES, *STATES, *known_of(run)), "product")
+    if half is not None and not half > 0:
+        raise InputError(f"half {half:g}", "a substrate above 0, g/L")
+    titred = all(TITRE in run.outputs for run in (*runs, *held))
+    runs, held = ([ordered(run, runs[0]) for run in each] for each in (runs, held))
     parts = [stretches_of(run) for run in runs]
     like = bounded(runs, parts, most)
     seen = seen_of(runs, like, (*STATES, TITRE) if titred else STATES)
@@ -426,7 +423,7 @@ def identify_batches(
     first = _matched(first, seen, parts)
     if titred:
         first |= _product(first, seen, product, hidden, seed)
-    fit, noise, spread, rests = settled(seen, first)
+    (fit, noise, _, spread, _), rests = settled(seen, first)
     curves, y = curves_of(fit, seen), np.asarray(_fitted(fit.model, seen.batches))
     told = {run.name: held_back(run, like, fit, noise, spread) for run in held}
     found = judge(BatchEvidence(fit, rests, seen, y, noise, curves, told), RULES)
@@ -436,14 +433,11 @@ def identify_batches(
 
 
 def _check(run: Run, first: Run) -> None:
-    for kind, has, needs in (
-        ("output", run.outputs, STATES),
-        ("input", run.inputs, ("feed", "feed_substrate")),
-    ):
-        missing = [name for name in needs if name not in has]
-        if missing:
-            prefix = "y" if kind == "output" else "u"
-            raise run.unusable(f"no {kind} {missing[0]}", f"a column {prefix}_{missing[0]}")
+    needed = [("output", "y", run.outputs, name) for name in STATES]
+    needed += [("input", "u", run.inputs, name) for name in ("feed", "feed_substrate")]
+    for kind, prefix, has, name in needed:
+        if name not in has:
+            raise run.unusable(f"no {kind} {name}", f"a column {prefix}_{name}")
     if set(run.inputs) != set(first.inputs):
         raise run.unusable(f"inputs {', '.join(run.inputs)}", f"those of {first.name}")
     for name in ("biomass", "volume"):
@@ -535,7 +529,7 @@ FIRST, DIFFER = 0.1, 0.05
 
 class _Searched(NamedTuple):
     fit: Fit
-    noise: list[ReadingNoise]
+    noise: dict[str, ReadingNoise]
     error: np.ndarray
     spread: np.ndarray
     likelihood: float
@@ -545,9 +539,7 @@ def _own(model: Any, data: Any) -> jax.Array:
     return model["own"]
 
 
-def settled(
-    seen: PreparedBatches, model: Any
-) -> tuple[Fit, dict[str, ReadingNoise], np.ndarray, bool]:
+def settled(seen: PreparedBatches, model: Any) -> tuple[_Searched, bool]:
     """Search in rounds, each with the noise of the last one's residuals, until nothing is gained.
 
     With the noise, by how much batches differ is taken from the round before (expectation and
@@ -561,8 +553,9 @@ def settled(
         fit = solve(problem_of(seen, model, error, free, spread), iterations=STEPS)
         y, own = np.asarray(_fitted(fit.model, seen.batches)), fit.derive(_own)
         rest, known = seen.measured - y, np.where(np.isfinite(own.error), own.error, spread)
-        noise = [noise_of(rest[..., k], y[..., k], seen.read[..., k]) for k in range(len(names))]
-        error = errors_of(noise, y)
+        noise = {name: noise_of(rest[..., k], y[..., k], seen.read[..., k])
+                 for k, name in enumerate(names)}  # fmt: skip
+        error = errors_of(noise.values(), y)
         minus = float(np.sum((rest / error)[seen.read] ** 2 + 2 * np.log(error[seen.read])))
         each = np.vstack([own.value**2 + known**2, np.full((1, len(spread)), DIFFER**2)])
         spread = np.sqrt(each.mean(axis=0))
@@ -576,8 +569,7 @@ def settled(
         lambda f: search(f.fit.model, f.error, f.spread),
         GAINED, ROUNDS - 1,
     )  # fmt: skip
-    rests |= found.fit.status is Status.converged
-    return found.fit, dict(zip(names, found.noise, strict=True)), found.spread, rests
+    return found, rests or found.fit.status is Status.converged
 
 
 # ---- curves

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -36,6 +36,8 @@ from beamfit.noise.memory import CorrelatedNoise
 from beamfit.quantity import Quantity
 
 MAPS = ("constant", "network")
+# Most searches by a path that was likelier than that of the search before.
+AGAIN = 3
 
 
 @answer
@@ -200,29 +202,17 @@ def identify(
         raise InputError(f"model '{model}'", nearest(model, list(PHYSICS)))
     if map not in MAPS:
         raise InputError(f"map '{map}'", nearest(map, list(MAPS)))
-    physics = PHYSICS[model]
-    runs, held = checked(runs, held, physics.even)
+    runs, held = checked(runs, held, PHYSICS[model].even)
     check_inputs(runs)
     output = _output(runs[0], output)
     shortest = min(len(run) for run in runs)
     if delay is not None and min(heard(run, output, delay).size for run in runs) < LEAST:
         expected = f"less than the {shortest} rows of a run by {LEAST} readings"
         raise InputError(f"a delay of {delay:g} samples", expected)
-    paths = Paths.of(runs, delay, physics.even)
-    search = ResponseSearch(output, physics, paths, offset)
+    paths = Paths.of(runs, delay, PHYSICS[model].even)
+    search = ResponseSearch(output, PHYSICS[model], paths, offset)
     asked = _Identification(search, map, hidden, range(seed, seed + starts), held)
-    begin, answer = partial(_begun, asked), partial(_answered, asked)
-    return judged_without(runs, [begin], lambda trial: trial.fit, answer)
-
-
-class _Identification(NamedTuple):
-    """Settings of an identification."""
-
-    search: ResponseSearch
-    map: str
-    hidden: int
-    seeds: range
-    held: tuple[Run, ...]
+    return judged_without(runs, [asked.begun], lambda trial: trial.fit, asked.answer)
 
 
 class _Trial(NamedTuple):
@@ -240,103 +230,103 @@ class _Trial(NamedTuple):
         return self.network or self.constant
 
 
-def _begun(asked: _Identification, runs: tuple[Run, ...]) -> _Trial:
-    """The fit that readings are judged by: constants miss good ones where parameters change."""
-    found = asked.search.begun(runs)
-    if asked.map == "constant":
-        return _Trial(found)
-    found, others = _likeliest(asked, runs, found)
-    return _Trial(found, others, _with_network(asked, found))
+class _Identification(NamedTuple):
+    """Settings of an identification."""
 
+    search: ResponseSearch
+    map: str
+    hidden: int
+    seeds: range
+    held: tuple[Run, ...]
 
-def _answered(
-    asked: _Identification, runs: tuple[Run, ...], trial: _Trial, left_out: tuple[BadReadings, ...]
-) -> ResponseFit:
-    """Judge a fit of runs."""
-    (output, physics, paths, _), map = asked.search, asked.map
-    found, others, _ = trial
-    if trial.network is None:
-        found, others = _likeliest(asked, runs, found)
-    whole = trial.network or found
-    answer = whole.settled
-    checks, quantities, curves = _known(asked, runs, found, answer, others)
-    fit = answer.fit
-    ahead = held_out(whole, asked.held)[output]
-    evidence = (fit, answer.rests, checks, quantities, curves, ahead, map)
-    exact = whole.exact
-    exact = int(exact) if exact == int(exact) else exact
-    rms = float(np.sqrt(np.mean(answer.rms**2)))
-    clocks = not paths.given and (others is None or others.ahead >= 0.5)
-    early = max(-exact, 0.0) if clocks else 0.0
-    status, message = judged({output: ResponseEvidence(*evidence, rms, early)})
-    quantities, curves = quoted(status, quantities, curves)
-    message = remarked(message, not paths.given and exact == latest(runs) > 0, left_out)
-    noise = tuple(answer.rms[:, 0].tolist())
-    parts = (quantities, curves, noise, answer.memory, checks, ahead, left_out)
-    return ResponseFit(
-        output, status, message, physics.name, map, exact, runs, found.seen, fit, *parts
-    )
+    def begun(self, runs: tuple[Run, ...]) -> _Trial:
+        """The fit that readings are judged by: constants miss good ones where parameters change."""
+        found = self.search.begun(runs)
+        if self.map == "constant":
+            return _Trial(found)
+        found, others = self.likeliest(runs, found)
+        return _Trial(found, others, self.with_network(found))
 
+    def answer(
+        self, runs: tuple[Run, ...], trial: _Trial, left_out: tuple[BadReadings, ...]
+    ) -> ResponseFit:
+        """Judge a fit of runs."""
+        output, physics, paths, _ = self.search
+        found, others, network = trial
+        if network is None:
+            found, others = self.likeliest(runs, found)
+        whole = network or found
+        answer, exact = whole.settled, whole.exact
+        checks, quantities, curves = self.known(runs, found, answer, others)
+        ahead = held_out(whole, self.held)[output]
+        rms = float(np.sqrt(np.mean(answer.rms**2)))
+        clocks = not paths.given and (others is None or others.ahead >= 0.5)
+        status, message = judged({output: ResponseEvidence(
+            answer.fit, answer.rests, checks, quantities, curves, ahead, self.map, rms,
+            max(-exact, 0.0) if clocks else 0.0,
+        )})  # fmt: skip
+        quantities, curves = quoted(status, quantities, curves)
+        message = remarked(message, not paths.given and exact == latest(runs) > 0, left_out)
+        return ResponseFit(
+            output, status, message, physics.name, self.map,
+            int(exact) if exact == int(exact) else exact, runs, found.seen, answer.fit, quantities,
+            curves, tuple(answer.rms[:, 0].tolist()), answer.memory, checks, ahead, left_out,
+        )  # fmt: skip
 
-# Most searches by a path that was likelier than that of the search before.
-AGAIN = 3
+    def likeliest(self, runs: tuple[Run, ...], found: Begun) -> tuple[Begun, Alternatives | None]:
+        """The fit by the likeliest path without a law, and the alternatives to it."""
+        for left in reversed(range(AGAIN)):
+            if found.settled.exact(found.case):
+                return found, None
+            slopes = changing_of(found.seen, found.settled.fit)
+            lawful = self.map == "constant"
+            others = alternatives_of(runs, found, self.search.paths, slopes, lawful)
+            if others.path == found.path or not left:
+                break
+            found = self.search.along(runs, others.path, found.settled.fit.model)
+        return found, others
 
+    def with_network(self, found: Begun) -> Begun:
+        """The best fit with a network of parameters, from the constant ones."""
+        seen, first = found.seen, found.settled.fit.model
+        nets = (network_of(seen, self.search.physics, np.asarray(first["map"]), self.hidden, seed)
+                for seed in self.seeds)  # fmt: skip
+        case = case_of(seen, self.search.offset, True)
+        models = [first | {"map": net} for net in nets]
+        return found._replace(case=case, settled=fitted(case, models))
 
-def _likeliest(
-    asked: _Identification, runs: tuple[Run, ...], found: Begun
-) -> tuple[Begun, Alternatives | None]:
-    """The fit by the likeliest path without a law, and the alternatives to it."""
-    for left in reversed(range(AGAIN)):
-        if found.settled.exact(found.case):
-            return found, None
-        slopes = changing_of(found.seen, found.settled.fit)
-        lawful = asked.map == "constant"
-        others = alternatives_of(runs, found, asked.search.paths, slopes, lawful)
-        if others.path == found.path or not left:
-            break
-        found = asked.search.along(runs, others.path, found.settled.fit.model)
-    return found, others
-
-
-def _with_network(asked: _Identification, found: Begun) -> Begun:
-    """The best fit with a network of parameters, from the constant ones."""
-    seen, first, (_, physics, _, offset) = found.seen, found.settled.fit.model, asked.search
-    raw = np.asarray(first["map"])
-    nets = (network_of(seen, physics, raw, asked.hidden, seed) for seed in asked.seeds)
-    case = case_of(seen, offset, True)
-    return found._replace(case=case, settled=fitted(case, [first | {"map": net} for net in nets]))
-
-
-def _known(
-    asked: _Identification,
-    runs: tuple[Run, ...],
-    found: Begun,
-    answer: Settled,
-    others: Alternatives | None,
-) -> tuple[Checks, dict[str, Quantity], tuple[Curve, ...]]:
-    """Tests of the residuals, and what the runs determine of constants or curves."""
-    seen, constant, (_, physics, paths, offset) = found.seen, asked.map == "constant", asked.search
-    used = used_by(answer.fit) + (not paths.given and not seen.ends)  # a delay found is a number
-    gain = None if constant else found.settled.likelihood - answer.likelihood
-    whole = found._replace(settled=answer)
-    checks = checks_of(whole, 0, changing_of(seen, answer.fit), used, gain)._replace(
-        first_order=constant and asked.search.is_first_order(runs, found),
-        band_limited=() if found.path.way.moving else paths.most.smooth,
-    )
-    others = others if constant else None
-    if others is not None and others.departure.probability > 0.5:
-        words, kind, _, chance = others.departure
-        if checks.input_share or kind not in (FURTHER, GROWTH):  # more than digits do
-            checks = checks._replace(law=words, law_probability=chance, law_kind=kind)
-    parts = answer.fit, answer.errors
-    quantities: dict[str, Quantity] = {}
-    if constant:
-        digits = digits_of(found)
+    def known(
+        self,
+        runs: tuple[Run, ...],
+        found: Begun,
+        answer: Settled,
+        others: Alternatives | None,
+    ) -> tuple[Checks, dict[str, Quantity], tuple[Curve, ...]]:
+        """Tests of the residuals, and what the runs determine of constants or curves."""
+        seen, constant, (_, physics, paths, offset) = (
+            found.seen,
+            self.map == "constant",
+            self.search,
+        )
+        used = used_by(answer.fit) + (not paths.given and not seen.ends)  # a delay found counts
+        gain = None if constant else found.settled.likelihood - answer.likelihood
+        whole = found._replace(settled=answer)
+        checks = checks_of(whole, 0, changing_of(seen, answer.fit), used, gain)._replace(
+            first_order=constant and self.search.is_first_order(runs, found),
+            band_limited=() if found.path.way.moving else paths.most.smooth,
+        )
+        if not constant:
+            curves = curves_of(answer.fit, answer.errors, seen)
+            return checks, *told({}, curves, seen, checks, LagLimits(None, None))
+        if others is not None and others.departure.probability > 0.5:
+            words, kind, chance = others.departure
+            if checks.input_share or kind not in (FURTHER, GROWTH):  # more than digits do
+                checks = checks._replace(law=words, law_probability=chance, law_kind=kind)
         unsure = [unsure_gain(runs, found.path.way, name) for name in seen.inputs]
-        quantities = quantities_of(*parts, others, seen, physics, digits, unsure)
-    limits = lag_limits(seen, answer, offset) if constant else LagLimits(None, None)
-    curves = () if constant else curves_of(*parts, seen)
-    return checks, *told(quantities, curves, seen, checks, limits)
+        quantities = quantities_of(
+            answer.fit, answer.errors, others, seen, physics, digits_of(found), unsure
+        )
+        return checks, *told(quantities, (), seen, checks, lag_limits(seen, answer, offset))
 
 
 def _output(run: Run, output: str | None) -> str:

@@ -80,6 +80,12 @@ class InputLaw(NamedTuple):
     low: float
     high: float
 
+    def behind(self, u: np.ndarray) -> np.ndarray:
+        """The input as it is handed on, and its change by a step of the width, shape (rows, 2)."""
+        widths = self.width * np.exp(self.step * np.array([0.0, 1.0, -1.0]))
+        at, wider, closer = moved(u, self.kind, widths, self.place)
+        return np.stack([at, 0.5 * (wider - closer)], axis=1)
+
     def changed(self, change: float) -> InputLaw:
         """The law `change` steps wider; a dead zone to an end of the range is a saturation."""
         law = self._replace(width=self.width * float(np.exp(change * self.step)))

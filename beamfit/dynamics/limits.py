@@ -18,7 +18,6 @@ from beamfit.dynamics.model import PreparedOutput
 from beamfit.dynamics.response import ARX, FIRST_ORDER
 from beamfit.dynamics.search import (
     LONGEST,
-    RANGE,
     Settled,
     difference,
     linear_columns,
@@ -28,10 +27,11 @@ from beamfit.dynamics.search import (
 from beamfit.noise.correlated import Whitened, whitened_by_each
 from beamfit.statistics import POOR_FIT
 
+# Range of time constants, in intervals and in runs, beyond which nothing tells them from zero and
+# from infinity.
+RANGE = (1e-3, 1e3)
 # Other lags that are tried beside one that is given, and rounds of them, each about the best.
 OTHERS, ROUNDS = 8, 3
-# Halvings of the logarithm of a lag on the way to its limit.
-HALVES = 8
 # Quantile at the upper end of a one-sided 95 %.
 SINGLE_END = 0.95
 
@@ -130,7 +130,7 @@ def lag_limits(seen: PreparedOutput, found: Settled, offset: bool) -> LagLimits:
         if lags.least(limit) - least > lags.rise(1.0 - 0.5 * POOR_FIT):
             return None
         near, far, most = np.log(limit), np.log(other), lags.rise(SINGLE_END)
-        for _ in range(HALVES):
+        for _ in range(8):
             middle = 0.5 * (near + far)
             inside = lags.least(np.exp(middle)) - least < most
             near, far = (middle, far) if inside else (near, middle)

@@ -52,7 +52,6 @@ from beamfit.dynamics.state_fit import (
 )
 from beamfit.dynamics.states import Matrices, contraction, linear_outputs
 from beamfit.errors import InputError, nearest
-from beamfit.greybox import tree
 from beamfit.greybox.fit import Derived
 from beamfit.greybox.problem import Free, Prior
 from beamfit.noise.correlated import CENTRAL, reach_of_probability
@@ -63,8 +62,6 @@ from beamfit.quantity import NORMAL_REACH, Quantity
 HORIZON, ROWS = 20, 20_000
 # Strides through the samples, for slow responses; fewest rows that must remain.
 STRIDES, FEWEST = (1, 5, 25, 125), 100
-# Newton steps to the rest of a network.
-REST = 20
 
 
 class Linear:
@@ -118,7 +115,7 @@ class LinearWithNetwork(Linear):
             return linear.a @ x + linear.b @ u + p["steps"] * (net["out"] @ jnp.tanh(inside))
 
         x, mean = jnp.zeros(n), jnp.zeros(m).at[p["units"]["u"].shape[1] :].set(1.0)
-        for _ in range(REST):
+        for _ in range(20):  # Newton steps
             slope = jnp.eye(n) - jax.jacfwd(after)(x, mean)
             x = x + jnp.linalg.solve(slope, after(x, mean) - x)
         a, b = jax.jacfwd(after, (0, 1))(x, mean)
@@ -175,11 +172,10 @@ def first_lag(u: list[np.ndarray], y: list[np.ndarray]) -> int:
     """
     (m, k), count = (u[0].shape[1], y[0].shape[1]), sum(map(len, y))
     horizon = min(count // (8 * (m + k)), HORIZON)
-    rows = [_rows(v, w, horizon, DRIFT)
-            for v, w in zip(u, y, strict=True) if len(v) > 2 * horizon + 1]  # fmt: skip
-    if horizon < 2 or not rows:
+    rows = _rows(u, y, horizon, DRIFT) if horizon > 1 else []
+    if not rows:
         return 1
-    past, now = (np.concatenate([each[i] for each in rows]) for i in (0, 5))
+    past, *_, now = rows
     lags = past.reshape(len(past), horizon, k + m)  # from the longest to 1
     own, others = lags[..., :k].reshape(len(past), -1), lags[..., k:].reshape(len(past), -1)
     triangle = np.linalg.qr(np.hstack([own, others, now]), mode="r")
@@ -209,13 +205,10 @@ def _regressed(
     m, k = u[0].shape[1], y[0].shape[1]
     count = sum(map(len, y))
     horizon = int(np.clip(count // (4 * (m + k) + 4 * m), order // k + 2, HORIZON))
-    rows = [_rows(v, w, horizon, degree)
-            for v, w in zip(u, y, strict=True) if len(v) > 2 * horizon + 1]  # fmt: skip
-    if not rows or sum(len(r[0]) for r in rows) < horizon * (2 * m + k):
+    rows = _rows(u, y, horizon, degree)
+    if not rows or len(rows[0]) < horizon * (2 * m + k):
         return None
-    past, later, future, inputs, now_u, now_y = (
-        np.concatenate(parts) for parts in zip(*rows, strict=True)
-    )
+    past, later, future, inputs, now_u, now_y = rows
     by = np.linalg.lstsq(np.hstack([past, inputs]), future, rcond=1e-10)[0][: past.shape[1]]
     triangle = np.linalg.qr(past, mode="r")
     _, _, right = np.linalg.svd(triangle @ by, full_matrices=False)
@@ -230,23 +223,24 @@ def _regressed(
     return ab[:, :order], ab[:, order:], cd[:, :order], cd[:, order:]
 
 
-def _rows(u: np.ndarray, y: np.ndarray, horizon: int, degree: int) -> tuple[np.ndarray, ...]:
-    """Past, past a sample later, future, future inputs, and inputs and outputs now, by row; less
-    a drift of the degree.
+def _rows(u: list[np.ndarray], y: list[np.ndarray], horizon: int, degree: int) -> list[np.ndarray]:
+    """Past, past a sample later, future, future inputs, and inputs and outputs now, by row of all
+    runs; less a drift of the degree in each. Nothing of runs that are too short.
     """
-    both, count = np.hstack([y, u]), len(y) - 2 * horizon
-    at = np.arange(horizon, horizon + count, max(1, count // ROWS))
-    waves = np.column_stack([np.ones(len(at)), drift_waves(at / len(y))])
-    slow = np.linalg.qr(waves[:, : degree + 1 if degree else 0])[0]
-
-    def around(of, begin, end):
-        found = np.concatenate([of[at + k] for k in range(begin, end)], axis=1)
-        return found - slow @ (slow.T @ found)
-
-    return (
-        around(both, -horizon, 0), around(both, 1 - horizon, 1), around(y, 0, horizon),
-        around(u, 0, horizon), around(u, 0, 1), around(y, 0, 1),
-    )  # fmt: skip
+    found = []
+    for v, w in zip(u, y, strict=True):
+        both, count = np.hstack([w, v]), len(w) - 2 * horizon
+        if count < 2:
+            continue
+        at = np.arange(horizon, horizon + count, max(1, count // ROWS))
+        waves = np.column_stack([np.ones(len(at)), drift_waves(at / len(w))])
+        slow = np.linalg.qr(waves[:, : degree + 1 if degree else 0])[0]
+        parts = ((both, -horizon, 0), (both, 1 - horizon, 1), (w, 0, horizon), (v, 0, horizon),
+                 (v, 0, 1), (w, 0, 1))  # fmt: skip
+        around = [np.concatenate([of[at + k] for k in range(begin, end)], axis=1)
+                  for of, begin, end in parts]  # fmt: skip
+        found.append([each - slow @ (slow.T @ each) for each in around])
+    return [np.concatenate(each) for each in zip(*found, strict=True)]
 
 
 def normal_form(
@@ -273,28 +267,9 @@ def normal_form(
     return around, c @ back, to
 
 
-def padded(model: dict[str, Any], size: int) -> dict[str, Any]:
-    """The model with further states that nothing moves and nobody reads."""
-    p, (n, m) = model["p"], model["p"]["z"].shape
-    more, at = size - n, [*range(n), *range(size, size + m)]
-    around = np.zeros((size + m, size + m))
-    around[np.ix_(at, at)] = p["around"]
-    wide = {"z": np.pad(p["z"], ((0, more), (0, 0))), "c": np.pad(p["c"], ((0, 0), (0, more)))}
-    start = np.pad(model["start"], ((0, 0), (0, more)))
-    return {"p": p | wide | {"around": around}, **at_start(start, len(p["c"]))}
-
-
-def stripped(model: dict[str, Any], n: int) -> dict[str, Any]:
-    """The model without the states beyond the first n."""
-    p, (size, m) = model["p"], model["p"]["z"].shape
-    at = np.array([*range(n), *range(size, size + m)])
-    less = {"z": p["z"][:n], "c": p["c"][:, :n], "around": p["around"][at][:, at]}
-    return model | {"p": p | less, "start": model["start"][:, :n], "nodes": model["nodes"][..., :n]}
-
-
-# State counts of the compiled searches (unused states are held at 0), and number of orders without
-# improvement that ends the search.
-SIZES, BEYOND = (4, 10), 2
+# Most states that are searched, those that bad readings are judged beside, and number of orders
+# without improvement that ends the search.
+HIGHEST, GLANCED, BEYOND = 10, 4, 2
 # Starts searched for each order, the best predictors; readings needed for each free number.
 BEGINS, EACH = 2, 3
 # Pole, and weight in the output, of a state that is added to an order.
@@ -321,12 +296,25 @@ def largest_order(case: Case) -> int:
     return int((count_of(case) / EACH - k * (m + 1)) / (m + k + len(case.courses)))
 
 
+class _Fits(NamedTuple):
+    """Orders that were tried, the likeliest first, and likely fits."""
+
+    tried: tuple[TriedOrder, ...]
+    each: list[Begun]
+
+
 class StatesSearch(NamedTuple):
-    """States of a linear system if said, its paths, and if outputs at rest are free numbers."""
+    """Settings of an identification: states of the system if said, its paths, if outputs at rest
+    are free numbers, constants or a network of so many nodes from so many seeds.
+    """
 
     order: int | None
     paths: Paths
     offset: bool
+    map: str
+    hidden: int
+    seeds: range
+    held: tuple[Run, ...]
 
     @property
     def on_time(self) -> float:
@@ -341,7 +329,7 @@ class StatesSearch(NamedTuple):
         found = first_lag(*_scaled(case, _units(case, True), False)) - 1
         return min(float(found), self.paths.delays[-1])
 
-    def begun(self, runs: tuple[Run, ...]) -> tuple[TriedOrder, ...]:
+    def begun(self, runs: tuple[Run, ...]) -> _Fits:
         """Orders by the delay that lags tell, on time unless that is clearly likelier, and by
         inputs at their levels where the best order is likelier with these.
         """
@@ -351,14 +339,17 @@ class StatesSearch(NamedTuple):
             tried = self.unless(runs, tried, Path(None, Way(), self.on_time), 2.0 * BETTER)
         if way.standing:
             tried = self.unless(runs, tried, tried[0].begun.path._replace(way=way), 0.0)
-        return tried
+        constant = self.map == "constant"
+        return _Fits(tried, [tried[0].begun] if constant else self.trained(runs, tried[0]))
 
-    def glanced(self, runs: tuple[Run, ...]) -> Begun:
-        """The fit of the order that is said, or of a few states, by the delay that lags tell."""
+    def glanced(self, runs: tuple[Run, ...]) -> _Fits:
+        """The fit of the order that is said, or of a few states, by the delay that lags tell: bad
+        readings would take many for the noise to be small.
+        """
         path = Path(None, Way(), self.delay(runs))
         case = case_of(runs, LINEAR, (), (), path)
-        n = self.order or min(SIZES[0], largest_order(case))
-        return _tried(case, path, n, self.offset, True, None).begun
+        n = self.order or min(GLANCED, largest_order(case))
+        return _Fits((), [_tried(case, path, n, self.offset, True, None).begun])
 
     def unless(
         self, runs: tuple[Run, ...], tried: tuple[TriedOrder, ...], path: Path, better: float
@@ -375,7 +366,7 @@ class StatesSearch(NamedTuple):
         """
         case = case_of(runs, LINEAR, (), (), path)
         tried: list[TriedOrder] = []
-        most = min(SIZES[-1], largest_order(case))
+        most = min(HIGHEST, largest_order(case))
         for n in [self.order] if self.order else range(1, most + 1):
             before = tried[-1] if tried else None
             tried.append(_tried(case, path, n, self.offset, True, before))
@@ -385,12 +376,40 @@ class StatesSearch(NamedTuple):
         full, last = tried[int(np.argmin(told))], tried[-1]
         model = full.begun.settled.fit.model
         p = model["p"] | {"d": model["p"]["d"].at[:, : len(case.seen[0].inputs)].set(0.0)}
-        free = free_of(case, full.order, len(p["z"]), self.offset, False)
+        free = free_of(case, full.order, self.offset, False)
         bounded = full.begun.case._replace(free=free)
         plain = Begun(bounded, path, settled(bounded, [model | {"p": p}]))
         tried.append(TriedOrder(full.order, False, plain))
         told = criterion([each.begun for each in tried], last.begun)
         return tuple(tried[k]._replace(bic=told[k]) for k in np.argsort(told, kind="stable"))
+
+    def trained(self, runs: tuple[Run, ...], best: TriedOrder) -> list[Begun]:
+        """Networks beside a linear system, those that are likely."""
+        n, path = best.order, best.begun.path
+        free = [f for f in free_of(best.begun.case, n, self.offset, best.direct)
+                if f.path != "start"]  # fmt: skip
+        free += [Free("start", nuisance=True), Free("p.net", nuisance=True)]
+        case = case_of(runs, NETWORK, free, [Prior("p.net", 0.0, WEIGHT)], path)
+        case = case._replace(degree=best.begun.case.degree)
+        nets = _networks(best, self.hidden, self.seeds)
+        fits = likely(case, [settled(case, [net]) for net in nets])
+        return [Begun(case, path, each) for each in fits]
+
+    def answer(self, runs: tuple[Run, ...], found: _Fits, left_out: Any) -> StatesFit:
+        """Judge runs whose orders were tried, the likeliest first."""
+        (tried, fits), gain = found, None
+        if self.map == "network":
+            linear, bent = criterion([tried[0].begun, fits[0]], tried[0].begun)
+            gain = linear - bent
+        n, path = tried[0].order, fits[0].path
+        fits = [fit._replace(settled=with_memory(fit.case, fit.settled, WORSE)) for fit in fits]
+        said, gains = _quantities(fits, n, runs, self.offset)
+        rows = [{"order": t.order, "direct": t.direct, "bic": t.bic}
+                for t in sorted(tried, key=lambda t: (not t.direct, t.order))]  # fmt: skip
+        more = {"delay_samples": int(path.delay), "tried": rows, "matrices": _matrices(fits, n)}
+        judged = {"map": self.map, "gain": gain, "order": n, "given": self.paths.given}
+        judged |= {"held": self.held, "left_out": left_out, "by_input": gains, "more": more}
+        return states_answer(fits[0], runs, said, **judged)
 
 
 def criterion(tried: Sequence[Begun], last: Begun | None = None) -> list[float]:
@@ -412,25 +431,22 @@ def _noise_of(case: Case, found: Settled) -> CorrelatedNoise | None:
     return noise_of(scaled, [time[:LONGEST] for _, _, time, _ in rows], np.zeros((0, 1)))[1]
 
 
-def free_of(case: Case, order: int, size: int, offset: bool, direct: bool) -> tuple[Free, ...]:
-    """Free numbers of a model of `size` states; those beyond the order are held at 0."""
-    k, m, runs = len(case.seen), len(case.seen[0].inputs), len(case.courses)
-    used, straight = np.arange(size) < order, np.full((k, m + offset), direct)
+def free_of(case: Case, order: int, offset: bool, direct: bool) -> tuple[Free, ...]:
+    """Free numbers of a model; those of a direct path that there is not are held at 0."""
+    m, start = len(case.seen[0].inputs), np.ones((len(case.courses), order), bool)
+    straight = np.full((len(case.seen), m + offset), direct)
     straight[:, m:] = True
-    start = np.tile(used, (runs, 1))
-    start[0] &= not offset  # where the first run begins, the offsets of a linear system say
-    parts = {"p.z": np.tile(used[:, None], (1, m + offset)), "p.c": np.tile(used, (k, 1))}
-    parts |= {"p.d": straight, "start": start}
-    return tuple(Free(name, np.where(on, -np.inf, 0.0), np.where(on, np.inf, 0.0), nuisance=True)
-                 for name, on in parts.items())  # fmt: skip
+    start[0] = not offset  # where the first run begins, the offsets of a linear system say
+    held = [Free(name, np.where(on, -np.inf, 0.0), np.where(on, np.inf, 0.0), nuisance=True)
+            for name, on in (("p.d", straight), ("start", start))]  # fmt: skip
+    return Free("p.z", nuisance=True), Free("p.c", nuisance=True), *held
 
 
 def _tried(
     case: Case, path: Path, n: int, offset: bool, direct: bool, before: TriedOrder | None
 ) -> TriedOrder:
     """The fit of an order from its best realisations, and from the order before and one more."""
-    size = next((s for s in SIZES if s >= n), n)
-    bounded = case._replace(free=free_of(case, n, size, offset, direct))
+    bounded = case._replace(free=free_of(case, n, offset, direct))
     units, k = _units(case, offset), len(case.seen)
     u, y = _scaled(case, units, offset)
     m, rest = u[0].shape[1], np.zeros((len(y), n))
@@ -439,7 +455,7 @@ def _tried(
         around, c, to = normal_form(a, b, c)
         d = np.where(direct | (np.arange(m) >= m - offset), d, 0.0)
         p = {"z": np.zeros((n, m)), "around": around, "c": c, "d": d, "units": units}
-        return padded({"p": p, "start": start @ to.T}, size)
+        return {"p": p, **at_start(start @ to.T, k)}
 
     slow = case._replace(degree=DRIFT)
 
@@ -449,11 +465,11 @@ def _tried(
 
     models = best([model(*found) for found in realisations(u, y, n)])[:BEGINS]
     if before is not None:
-        old, last = before.order, before.begun.settled.fit.model
+        last = before.begun.settled.fit.model
         a, b, c, d, _ = map(np.asarray, LINEAR.matrices(last["p"]))
-        a = np.diag([*np.zeros(old), NEW]) + np.pad(a[:old, :old], ((0, 1), (0, 1)))
-        b, c = np.vstack([b[:old], np.ones(m)]), np.hstack([c[:, :old], np.full((k, 1), FAINT)])
-        start = np.pad(np.asarray(last["start"])[:, :old], ((0, 0), (0, 1)))
+        a = np.diag([*np.zeros(len(a)), NEW]) + np.pad(a, ((0, 1), (0, 1)))
+        b, c = np.vstack([b, np.ones(m)]), np.hstack([c, np.full((k, 1), FAINT)])
+        start = np.pad(np.asarray(last["start"]), ((0, 0), (0, 1)))
         models = best([*models, model(a, b, c, d, start)])
     if not models:  # runs too short for a regression
         a = np.diag(NEW ** np.arange(1.0, n + 1))
@@ -562,66 +578,15 @@ def identify_states(
     runs, held = checked(runs, held, True)
     check_inputs(runs)
     given = None if delay is None else float(delay)
-    search = StatesSearch(order, Paths.of(runs, given, True), offset)
-    _check_order(case_of(runs, LINEAR, (), ()), runs, order or 1)
-    asked = _StatesIdentification(search, map, hidden, range(seed, seed + starts), held)
-    searches = asked.glanced, asked.begun
-    return judged_without(runs, searches, lambda found: found.each[0], asked.answer)
-
-
-class _Fits(NamedTuple):
-    """Orders that were tried, the likeliest first, and likely fits."""
-
-    tried: tuple[TriedOrder, ...]
-    each: list[Begun]
-
-
-class _StatesIdentification(NamedTuple):
-    """Settings of an identification."""
-
-    search: StatesSearch
-    map: str
-    hidden: int
-    seeds: range
-    held: tuple[Run, ...]
-
-    def glanced(self, runs: tuple[Run, ...]) -> _Fits:
-        """The fit of one order: bad readings would take many for the noise to be small."""
-        return _Fits((), [self.search.glanced(runs)])
-
-    def begun(self, runs: tuple[Run, ...]) -> _Fits:
-        """Orders, and likely fits of the best."""
-        tried = self.search.begun(runs)
-        constant = self.map == "constant"
-        return _Fits(tried, [tried[0].begun] if constant else self.trained(runs, tried[0]))
-
-    def trained(self, runs: tuple[Run, ...], best: TriedOrder) -> list[Begun]:
-        """Networks beside a linear system, those that are likely."""
-        n, path = best.order, best.begun.path
-        free = [f for f in free_of(best.begun.case, n, n, self.search.offset, best.direct)
-                if f.path != "start"]  # fmt: skip
-        free += [Free("start", nuisance=True), Free("p.net", nuisance=True)]
-        case = case_of(runs, NETWORK, free, [Prior("p.net", 0.0, WEIGHT)], path)
-        case = case._replace(degree=best.begun.case.degree)
-        nets = _networks(best, self.hidden, self.seeds)
-        fits = likely(case, [settled(case, [net]) for net in nets])
-        return [Begun(case, path, each) for each in fits]
-
-    def answer(self, runs: tuple[Run, ...], found: _Fits, left_out: Any) -> StatesFit:
-        """Judge runs whose orders were tried, the likeliest first."""
-        (tried, fits), gain = found, None
-        if self.map == "network":
-            linear, bent = criterion([tried[0].begun, fits[0]], tried[0].begun)
-            gain = linear - bent
-        n, path = tried[0].order, fits[0].path
-        fits = [fit._replace(settled=with_memory(fit.case, fit.settled, WORSE)) for fit in fits]
-        said, gains = _quantities(fits, n, runs, self.search.offset)
-        rows = [{"order": t.order, "direct": t.direct, "bic": t.bic}
-                for t in sorted(tried, key=lambda t: (not t.direct, t.order))]  # fmt: skip
-        more = {"delay_samples": int(path.delay), "tried": rows, "matrices": _matrices(fits, n)}
-        judged = {"map": self.map, "gain": gain, "order": n, "given": self.search.paths.given}
-        judged |= {"held": self.held, "left_out": left_out, "by_input": gains, "more": more}
-        return states_answer(fits[0], runs, said, **judged)
+    case = case_of(runs, LINEAR, (), ())
+    most = largest_order(case)
+    if not 1 <= (order or 1) <= most:
+        expected = f"1 to {most}" if most >= 1 else "a longer run, or another --model"
+        raise runs[0].unusable(f"order {order or 1} with {count_of(case)} readings", expected)
+    seeds = range(seed, seed + starts)
+    search = StatesSearch(order, Paths.of(runs, given, True), offset, map, hidden, seeds, held)
+    searches = search.glanced, search.begun
+    return judged_without(runs, searches, lambda found: found.each[0], search.answer)
 
 
 def likely(case: Case, found: Sequence[Settled]) -> list[Settled]:
@@ -637,11 +602,12 @@ def likely(case: Case, found: Sequence[Settled]) -> list[Settled]:
     return [found[best], *(found[i] for i in others if told[i] <= most)]
 
 
-def _derived(fits: Sequence[Begun], function: Any, asked: UsedStates) -> Derived:
+def _derived(fits: Sequence[Begun], function: Any) -> Derived:
     """Numbers of the best fit; within their errors 68 % of all fits' posterior lies, each of which
     counts as much: the posterior of a network is bent, and each tells a part of it.
     """
-    each = [derived(f.settled.fit, f.settled.errors, function, asked) for f in fits]
+    course = fits[0].case.courses[0]
+    each = [derived(f.settled.fit, f.settled.errors, function, course) for f in fits]
     if len(each) == 1:
         return each[0]
     values, errors = (np.stack([getattr(one, name) for one in each]) for name in ("value", "error"))
@@ -681,17 +647,9 @@ def joint_error(values: np.ndarray, errors: np.ndarray) -> np.ndarray:
     return np.where(seen[0] & (seen.mean(axis=0) > CENTRAL), reach, np.nan)
 
 
-def _check_order(case: Case, runs: Sequence[Run], order: int) -> None:
-    """Refuse orders with more numbers than readings allow."""
-    most = largest_order(case)
-    if not 1 <= order <= most:
-        expected = f"1 to {most}" if most >= 1 else "a longer run, or another --model"
-        raise runs[0].unusable(f"order {order} with {count_of(case)} readings", expected)
-
-
 def _networks(best: TriedOrder, hidden: int, seeds: range) -> list[dict[str, Any]]:
     """Models with networks of small random weights beside the linear part."""
-    model = stripped(best.begun.settled.fit.model, best.order)
+    model = best.begun.settled.fit.model
     p, (n, m) = model["p"], model["p"]["z"].shape
     moved = LINEAR.linear(p)._replace(c=jnp.eye(n), d=jnp.zeros((n, m)), offset=jnp.zeros(n))
     run = jax.jit(lambda u, x0: linear_outputs(moved, u, x0)[0])
@@ -710,24 +668,15 @@ def _networks(best: TriedOrder, hidden: int, seeds: range) -> list[dict[str, Any
     return found
 
 
-@tree.node("order")
-class UsedStates:
-    """The states that a model uses, and a run."""
-
-    order: int
-    course: Course
-
-
-def _quoted(model: Any, asked: UsedStates) -> jax.Array:
+def _quoted(model: Any, course: Course) -> jax.Array:
     """Tau, T, zeta, value and frequency of each pole; static gains; outputs at the mean inputs."""
-    p, n, course = model["p"], asked.order, asked.course
+    p, units = model["p"], model["p"]["units"]
     a, b, c, d, _ = course.system.matrices(p)
-    a, b, c, units = a[:n, :n], b[:n], c[:, :n], p["units"]
     m, size = units["u"].shape[1], units["y"][1]
     poles = jnp.linalg.eigvals(a)
     poles = poles[jnp.lexsort((poles.imag, -jnp.abs(poles)))]  # the same of several fits
     s = jnp.log(poles) / course.dt[0]
-    gains = size[:, None] * (d + c @ jnp.linalg.solve(jnp.eye(n) - a, b))
+    gains = size[:, None] * (d + c @ jnp.linalg.solve(jnp.eye(len(a)) - a, b))
     parts = [-1.0 / s.real, 1.0 / jnp.abs(s), -s.real / jnp.abs(s), poles.real, s.imag]
     levels = (units["y"][0][:, None] + gains[:, m:]).ravel()
     return jnp.concatenate([*parts, (gains[:, :m] / units["u"][1]).ravel(), levels])
@@ -740,7 +689,7 @@ def _quantities(
     course, path = fits[0].case.courses[0], fits[0].path
     step, said = float(course.dt[0]), {}
     inputs, outputs = list(runs[0].inputs), list(runs[0].outputs)
-    numbers = _derived(fits, _quoted, UsedStates(n, course))
+    numbers = _derived(fits, _quoted)
     unsure = [0.0] * (5 * n) + [unsure_gain(runs, path.way, name) for name in inputs] * len(outputs)
     unsure += [0.0] * (len(numbers.value) - len(unsure))
     numbers = widened(numbers, digits_of(fits[0]), np.array(unsure))
@@ -791,22 +740,17 @@ def _lag(numbers: Derived, i: int, pole: int, step: float) -> Quantity:
         return found
     below, above = ((-step / np.log(end) if 0.0 < end < 1.0 else None)
                     for end in at + ndtri(SINGLE_END) * error * np.array([1.0, -1.0]))  # fmt: skip
-    return replace(
-        found.open(),
-        interval_95=LagLimits(
-            above if high >= 1.0 else None, below if low <= 0.0 else None
-        ).interval,
-    )
+    limits = LagLimits(above if high >= 1.0 else None, below if low <= 0.0 else None)
+    return replace(found.open(), interval_95=limits.interval)
 
 
-def _taylor(model: Any, asked: UsedStates) -> jax.Array:
+def _taylor(model: Any, course: Course) -> jax.Array:
     """A and B of states that are the outputs without noise, in the units of the record."""
-    p, n = model["p"], asked.order
-    a, b, c, _, _ = asked.course.system.matrices(p)
+    p = model["p"]
+    a, b, c, _, _ = course.system.matrices(p)
     (_, size_u), (_, size_y) = (p["units"][kind] for kind in "uy")
-    to = size_y[:, None] * c[:, :n]
-    return jnp.column_stack([to @ a[:n, :n] @ jnp.linalg.inv(to),
-                             to @ b[:n, : len(size_u)] / size_u])  # fmt: skip
+    to = size_y[:, None] * c
+    return jnp.column_stack([to @ a @ jnp.linalg.inv(to), to @ b[:, : len(size_u)] / size_u])
 
 
 def _matrices(fits: Sequence[Begun], n: int) -> dict[str, Any]:
@@ -817,7 +761,7 @@ def _matrices(fits: Sequence[Begun], n: int) -> dict[str, Any]:
     """
     case, more = fits[0].case, {}
     if n == len(case.seen):
-        read = _derived(fits, _taylor, UsedStates(n, case.courses[0]))
+        read = _derived(fits, _taylor)
         ends = {"A": slice(n), "B": slice(n, None)}
         more["outputs_as_states"] = {
             name + said: part[:, ends[name]] for name in ends
@@ -828,7 +772,7 @@ def _matrices(fits: Sequence[Begun], n: int) -> dict[str, Any]:
     (mean_u, size_u), (mean_y, size_y) = (np.asarray(p["units"][kind]) for kind in "uy")
     by, m = size_y[:, None], len(mean_u)
     return {
-        "step_s": float(case.courses[0].dt[0]), "input_mean": mean_u, "A": a[:n, :n],
-        "B": b[:n, :m] / size_u, "C": by * c[:, :n], "D": by * d[:, :m] / size_u,
-        "state_offset": b[:n, m:].sum(1), "output_offset": mean_y + size_y * d[:, m:].sum(1),
+        "step_s": float(case.courses[0].dt[0]), "input_mean": mean_u, "A": a,
+        "B": b[:, :m] / size_u, "C": by * c, "D": by * d[:, :m] / size_u,
+        "state_offset": b[:, m:].sum(1), "output_offset": mean_y + size_y * d[:, m:].sum(1),
     } | more  # fmt: skip

@@ -17,8 +17,6 @@ from beamfit.greybox.problem import Prior
 
 # Residual, as a share of the output's scatter, below which a fit counts as exact.
 CLOSE = 2e-4
-# Distances of samples that differ by less than this share are equal.
-EQUAL = 1e-9
 # Standard deviation of the prior on a network's weights; inputs and outputs are of size 1.
 WEIGHT = 3.0
 
@@ -77,9 +75,10 @@ class Driven:
 class PreparedOutput(NamedTuple):
     """Runs of one output, with what the model needs of them.
 
-    `runs` by `Driven`; `measured` are the readings of each, without missing ones; `size_u` and
-    `size_y` the scatter of inputs and output; `delay` in rows, of which there are `parts` a sample;
-    `ends` between which a delay that is a number of the fit may be longer.
+    `runs` by `Driven`; `measured` are the readings of each, without missing ones; `wide` and
+    `size_y` the scatter of inputs (1 where one does not change) and output; `delay` in rows, of
+    which there are `parts` a sample; `ends` between which a delay that is a number of the fit may
+    be longer.
     """
 
     inputs: tuple[str, ...]
@@ -88,16 +87,11 @@ class PreparedOutput(NamedTuple):
     measured: tuple[np.ndarray, ...]
     time: tuple[np.ndarray, ...]
     mean_u: np.ndarray
-    size_u: np.ndarray
+    wide: np.ndarray
     size_y: float
     delay: float
     parts: int
     ends: tuple[float, float] | None
-
-    @property
-    def wide(self) -> np.ndarray:
-        """The scatter of the inputs, 1 where one does not change."""
-        return np.where(self.size_u > 0, self.size_u, 1.0)
 
     @property
     def points(self) -> np.ndarray:

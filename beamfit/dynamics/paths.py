@@ -7,15 +7,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import groupby, product
+from itertools import product
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 
 from beamfit.arrays import padded_length
-from beamfit.dynamics.input_laws import InputLaw, moved
-from beamfit.dynamics.model import EQUAL, Driven, PreparedOutput, readings_of
+from beamfit.dynamics.input_laws import InputLaw
+from beamfit.dynamics.model import Driven, PreparedOutput, readings_of
 from beamfit.dynamics.record import PARTS, Run, Way, band_limited, levels_of, rows_of
 from beamfit.dynamics.response import Physics
 from beamfit.noise.memory import is_correlated
@@ -181,7 +181,7 @@ def undriven(
         time = run.time[since : None if most is None else read[-1] + 1]
         apart = np.diff(time, append=time[-1:])
         dt = np.repeat(np.pad(apart, (0, padded_length(len(time)) - len(time))) / parts, parts)
-        turn = parts if np.ptp(apart[:-1]) <= EQUAL * apart[0] else 0
+        turn = parts if np.ptp(apart[:-1]) <= 1e-9 * apart[0] else 0
         each = (jnp.asarray(dt), *readings_of(run.time[read] - run.time[0], (read - since) * parts))
         found.append(Driven(physics, None, *each, len(read), jnp.asarray(i), 0.0, turn))
         measured.append(run.outputs[output][read])
@@ -201,34 +201,19 @@ def handed_on(
     found = []
     for run, drive, first in zip(runs, seen.drives, seen.first, strict=True):
         plain = {way: rows_of(run, way, parts) for way in {path.way for path in paths}}
-        behind = _behind(run, plain, paths)
+        behind: dict[Any, np.ndarray] = {}
         each, rows = [], first * parts + np.arange(len(drive.dt))
         for path, late in zip(paths, whole, strict=True):
             u = plain[path.way]
             u = np.stack([u, np.zeros_like(u)], axis=2)
             if path.law is not None:
-                u[:, list(run.inputs).index(path.law.input)] = behind[path.law, path.way]
+                at = list(run.inputs).index(path.law.input)
+                if path[:2] not in behind:
+                    behind[path[:2]] = path.law.behind(u[:, at, 0])
+                u[:, at] = behind[path[:2]]
             each.append(u[np.clip(rows - late, 0, len(u) - 1)])
         found.append(np.stack(each))
     return found, np.array([parts * path.delay for path in paths]) - whole
-
-
-def _behind(run: Run, plain: dict, paths: Sequence[Path]) -> dict[Any, np.ndarray]:
-    """An input behind laws and its changes, shape (rows, 2): alike laws at once."""
-
-    def alike(each: tuple[InputLaw, Way]) -> tuple:
-        return each[0].kind, each[0].place, each[0].input, each[1]
-
-    lawful = {(path.law, path.way) for path in paths if path.law is not None}
-    found = {}
-    for (kind, place, name, way), group in groupby(sorted(lawful, key=alike), alike):
-        group = list(group)
-        u = plain[way][:, list(run.inputs).index(name)]
-        width, step = np.array([(law.width, law.step) for law, _ in group]).T
-        widths = width * np.exp(np.multiply.outer([0.0, 1.0, -1.0], step))
-        for key, at, wider, closer in zip(group, *moved(u, kind, widths, place), strict=True):
-            found[key] = np.stack([at, 0.5 * (wider - closer)], axis=1)
-    return found
 
 
 def prepared(runs: Sequence[Run], output: str, physics: Physics, path: Path) -> PreparedOutput:
@@ -247,6 +232,7 @@ def prepared(runs: Sequence[Run], output: str, physics: Physics, path: Path) -> 
     spread = float(np.concatenate(found.measured).std()) or 1.0
     delay = parts * path.delay
     names = tuple(runs[0].inputs)
+    wide = np.where(u.std(0) > 0, u.std(0), 1.0)
     return PreparedOutput(
-        names, output, drives, found.measured, time, u.mean(0), u.std(0), spread, delay, parts, ends
+        names, output, drives, found.measured, time, u.mean(0), wide, spread, delay, parts, ends
     )

@@ -274,11 +274,10 @@ def rows_of(run: Run, way: Way, parts: int) -> np.ndarray:
         if name in way.smooth:
             slope, rows = (u[-1] - u[0]) / (len(u) - 1), np.arange(len(u))
             swing = u - u[0] - slope * rows
-            waves = np.fft.rfft(np.concatenate([swing, -swing[-2:0:-1]]))
-            turn = 2j * np.pi * np.fft.rfftfreq(2 * len(u) - 2)
-            fine = [np.fft.irfft(waves * np.exp(turn * s), 2 * len(u) - 2)[: len(u)] for s in late]
-            line = u[0] + slope * np.add.outer(rows, late)
-            columns.append((line + np.stack(fine, axis=1)).ravel())
+            both = np.concatenate([swing, -swing[-2:0:-1]])
+            fine = 2 * parts * np.fft.irfft(np.fft.rfft(both), 2 * parts * len(both))
+            line = u[0] + slope * np.add.outer(rows, late).ravel()
+            columns.append(line + fine[1 : 2 * parts * len(u) : 2])
         elif name in way.ramping:
             steps = np.diff(u, append=2.0 * u[-1] - u[-2])
             columns.append((u[:, None] + np.outer(steps, late)).ravel())

@@ -260,11 +260,13 @@ def even_response(
     [0.0, 1.8964, 2.594, 2.8506]
     """
     x0, m = physics.begin(free, u[0]), u.shape[1]
-    n, none = len(x0), jnp.zeros(m)
+    n = len(x0)
 
     def step(length):
-        moved = lambda x, felt: physics.advance(p, x, felt, length)  # noqa: E731
-        return jax.jacfwd(moved, (0, 1))(0.0 * x0, none)
+        def moved(x, felt):
+            return physics.advance(p, x, felt, length)
+
+        return jax.jacfwd(moved, (0, 1))(0.0 * x0, jnp.zeros(m))
 
     (a, b), (last, into) = step(dt), step((1.0 - part) * dt)
     powers = [jnp.eye(n)]

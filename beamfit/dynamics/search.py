@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
+from itertools import product
 from typing import Any, NamedTuple
 
 import jax
@@ -45,11 +46,6 @@ LAGS, DAMPINGS = 32, (0.2, 0.6, 1.0, 2.0)
 BETTER = 5.0
 # Paths that are looked at together: one program is compiled for all.
 BATCH = 16
-# What rounding leaves of the squares of columns that others explain.
-ROUNDING = 1e-14
-# Range of time constants, in intervals and in runs, beyond which nothing tells them from zero and
-# from infinity.
-RANGE = (1e-3, 1e3)
 TINY = np.finfo(float).tiny
 # Highest degree of a drift of the output in a run: it turns once less.
 DRIFT = 8
@@ -98,11 +94,6 @@ class Start(NamedTuple):
     cost: float
 
 
-def _grid(ends: Sequence[np.ndarray]) -> np.ndarray:
-    """All pairs of values of two axes, or the values of one, shape (points, axes)."""
-    return np.stack(np.meshgrid(*ends, indexing="ij"), axis=-1).reshape(-1, len(ends))
-
-
 class ResponseSearch(NamedTuple):
     """Output, physics and paths of a search, and whether the output at rest is a free number."""
 
@@ -134,8 +125,8 @@ class ResponseSearch(NamedTuple):
         reach = np.array([axis[1] - axis[0] for axis in axes])
         count = sum(map(len, seen.measured))
         exact = count * (CLOSE * seen.size_y) ** 2
-        around = _grid([np.linspace(-1.0, 1.0, len(axis)) for axis in axes])
-        grid = np.tile(_grid(axes), (len(paths), 1, 1))
+        around = np.array([*product(*(np.linspace(-1.0, 1.0, len(axis)) for axis in axes))])
+        grid = np.tile([*product(*axes)], (len(paths), 1, 1))
 
         def least(logarithms):
             found = np.exp(logarithms)
@@ -255,30 +246,23 @@ def linear_columns(runs: Sequence[Driven], i: int, shapes: jax.Array, offset: bo
 def _triangles(runs: tuple[Driven, ...], measured: Any, inputs: Any, shapes: Any, offset: bool):
     """Triangular factors of outputs of unit gains, first states and offset, of drifts of each run
     by degree, and of the readings: for each path one for each of its shapes.
-
-    Drifts and readings are the same for all, and made orthonormal once. What a shape leaves of
-    them comes of their products with its outputs: to 1e-7, while `CLOSE` counts as exact.
     """
-    rest, read = [], []
+    rest = []
     for i, (run, y) in enumerate(zip(runs, measured, strict=True)):
         waves = drift_columns(run.time / run.time[run.count - 1], i, len(runs))
         rest.append(jnp.concatenate([waves.reshape(len(y), -1), y[:, None]], axis=1))
-        read.append(jnp.arange(len(y)) < run.count)
-    read, rest = jnp.concatenate(read)[:, None], jnp.concatenate(rest)
-    few = (0, max(0, rest.shape[1] - len(rest))), (0, 0)
-    basis, rest = jnp.linalg.qr(jnp.pad(jnp.where(read, rest, 0.0), few))
+    read = jnp.concatenate([jnp.arange(len(run.index)) < run.count for run in runs])[:, None]
+    rest = jnp.concatenate(rest)
 
     def one(asked):
         (inputs, part), shapes = asked
         felt = [replace(run, u=u, part=part) for run, u in zip(runs, inputs, strict=True)]
         parts = [linear_columns(felt, i, shapes, offset) for i in range(len(runs))]
-        rows = jnp.where(read, jnp.concatenate(parts, axis=1), 0.0)
-        rows, triangle = jnp.linalg.qr(jnp.pad(rows, ((0, 0), *few)))
-        seen = jnp.swapaxes(rows, 1, 2) @ basis
-        left = (1.0 + ROUNDING) * jnp.eye(len(rest)) - jnp.swapaxes(seen, 1, 2) @ seen
-        left = jnp.swapaxes(jnp.linalg.cholesky(left), 1, 2) @ rest
-        above = jnp.concatenate([triangle, seen @ rest], axis=2)
-        return jnp.concatenate([above, jnp.pad(left, ((0, 0), (0, 0), (rows.shape[2], 0)))], axis=1)
+        rows = jnp.concatenate(parts, axis=1)
+        every = jnp.broadcast_to(rest, (len(rows), *rest.shape))
+        rows = jnp.where(read, jnp.concatenate([rows, every], axis=2), 0.0)
+        few = (0, 0), (0, max(0, rows.shape[2] - rows.shape[1])), (0, 0)
+        return jnp.linalg.qr(jnp.pad(rows, few), mode="r")
 
     return jax.lax.map(one, (inputs, shapes))
 
@@ -597,19 +581,9 @@ class Settled(NamedTuple):
                    for r, error, _, least in case.rows(self.rest, self.noise))  # fmt: skip
 
     @property
-    def likely(self) -> CorrelatedNoise | None:
-        """The noise that the residuals make likely, also where they look white; None if exact."""
-        return None if self.errors is None else self.errors.noise
-
-    @property
     def rms(self) -> np.ndarray:
         """Root mean square of the residuals, by run and output."""
         return np.array([[float(np.sqrt(np.mean(r**2))) for r in row] for row in self.rest])
-
-    @property
-    def jitter(self) -> np.ndarray:
-        """Jitter of the clock, s, by run and output."""
-        return np.array([[n.jitter for n in row] for row in self.noise])
 
 
 def _exact(noise: ReadingErrors, size_y: float) -> bool:

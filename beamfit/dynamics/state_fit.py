@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -35,7 +35,7 @@ from beamfit.dynamics.search import (
     Begun,
     Case,
     Settled,
-    drift_waves,
+    drift_columns,
     settled,
     used_by,
     with_memory,
@@ -60,25 +60,18 @@ PLAIN = Path(None, Way(), 0.0)
 WORSE = 1.5
 
 
-class System(Protocol):
-    """A system: `beamfit.dynamics.states.StateSpace`, or anything hashable with its `run`."""
-
-    def run(
-        self, p: Any, u: jax.Array, dt: jax.Array, x0: jax.Array
-    ) -> tuple[jax.Array, jax.Array]:
-        """Outputs at the samples and the state after the last."""
-
-
 @tree.node("system")
 class Course:
     """A run as the model sees it: inputs and steps, and which outputs were read, all padded.
+
+    The system is a `beamfit.dynamics.states.StateSpace`, or anything hashable with its `run`.
 
     Shapes (samples, m), (samples,); `index` (readings,) points into all outputs one after the
     other, `time` is theirs, s, far apart from output to output; there are `count`. `waves` are
     columns of drifts of each output, (readings, outputs, degrees). `run` is its number.
     """
 
-    system: System
+    system: Any
     u: Any
     dt: Any
     time: Any
@@ -109,7 +102,7 @@ class Course:
         return course_of(self.system, seen, i)
 
 
-def course_of(system: System, seen: Sequence[PreparedOutput], i: int) -> Course:
+def course_of(system: Any, seen: Sequence[PreparedOutput], i: int) -> Course:
     """Course of a run, from the prepared outputs."""
     run = seen[0].runs[i]
     index = [k * len(run.u) + s.runs[i].read for k, s in enumerate(seen)]
@@ -117,10 +110,9 @@ def course_of(system: System, seen: Sequence[PreparedOutput], i: int) -> Course:
     far = APART * span
     time = [far * k + s.time[i] for k, s in enumerate(seen)]
     index, time = np.concatenate(index), np.concatenate(time)
-    readings, waves = readings_of(time, index), np.zeros((0, len(seen), DRIFT))
-    for k, s in enumerate(seen):
-        own = drift_waves(s.time[i] / span)[:, None]
-        waves = np.append(waves, np.pad(own, ((0, 0), (k, len(seen) - 1 - k), (0, 0))), axis=0)
+    readings = readings_of(time, index)
+    waves = [drift_columns(s.time[i] / span, k, len(seen)) for k, s in enumerate(seen)]
+    waves = np.swapaxes(np.concatenate(waves), 1, 2)
     waves = jnp.asarray(np.pad(waves, ((0, len(readings[0]) - len(waves)), (0, 0), (0, 0))))
     return Course(system, run.u, run.dt, *readings, len(index), waves, run.run)
 
@@ -255,9 +247,8 @@ class StatesFit:
             | {"records": [run.path or run.name for run in self.runs]}
             | {"parameters": self.quantities}
             | {"noise_rms": self.noise, "noise_memory": self.memory}
-            | {"checks": {part.output: part.checks._asdict() for part in self.parts}}
-            | {"held_back": {k: [h._asdict() for h in v] for k, v in self.held.items()}}
-            | {"left_out": self.left_out}
+            | {"checks": {part.output: part.checks for part in self.parts}}
+            | {"held_back": self.held, "left_out": self.left_out}
             | self.more
         )
 
@@ -333,9 +324,9 @@ def fit_states(
     if len(start) != len(runs):
         raise InputError(f"first states of shape {start.shape}", f"one row for {len(runs)} runs")
     model = {"p": parameters, **at_start(start, len(runs[0].outputs))}
-    nets = tuple(
-        f"p.{path}".rstrip(".") for path, net in _networks(parameters) if isinstance(net, MLP)
-    )
+    parts = jax.tree_util.tree_leaves_with_path(parameters, is_leaf=lambda v: isinstance(v, MLP))
+    paths = {jax.tree_util.keystr(at, simple=True, separator="."): v for at, v in parts}
+    nets = [f"p.{path}".rstrip(".") for path, v in paths.items() if isinstance(v, MLP)]
     if free is None:
         names = [f"p.{leaf.path}".rstrip(".") for leaf in tree.leaves(parameters)]
         free = [Free(n, nuisance=any(n.startswith(f"{net}.") for net in nets)) for n in names]
@@ -367,7 +358,7 @@ def _free_run(case: Case, model: Any, segments: int | None) -> Settled:
 
 def case_of(
     runs: Sequence[Run],
-    system: System,
+    system: Any,
     free: Sequence[Free],
     priors: Sequence[Prior],
     path: Path = PLAIN,
@@ -382,11 +373,6 @@ def at_start(start: np.ndarray, outputs: int) -> dict[str, np.ndarray]:
     """First states of runs, shape (runs, n), without segments and drifts, as a model has them."""
     nodes, drift = np.zeros((len(start), 0, start.shape[1])), np.zeros((len(start), outputs, DRIFT))
     return {"start": start, "nodes": nodes, "drift": drift}
-
-
-def _networks(parameters: Any) -> list[tuple[str, Any]]:
-    found = jax.tree_util.tree_leaves_with_path(parameters, is_leaf=lambda v: isinstance(v, MLP))
-    return [(jax.tree_util.keystr(path, simple=True, separator="."), v) for path, v in found]
 
 
 def _check_outputs(case: Case, model: Any) -> None:

@@ -247,7 +247,7 @@ class Whitened(NamedTuple):
         half = unit[..., None] * np.swapaxes(turned, 1, 2) * inverse[:, None]
         along = np.where(seen[..., None], np.swapaxes(left, 1, 2) @ rest, 0.0)
         squares = np.maximum(np.sum((rest - left @ along) ** 2, axis=(1, 2)), 1e-300)
-        logs = self.volume + np.sum(np.log(np.where(seen, unit * inverse, 1.0)), axis=1)
+        logs = self.volume + np.sum(np.log(unit) + np.log(np.where(seen, inverse, 1.0)), axis=1)
         logs -= 0.5 * (self.count - seen.sum(axis=1)) * np.log(squares)
         alone = self.noise.white == 0
         if alone.any() and not alone.all():  # even odds for a white part

@@ -112,6 +112,19 @@ def test_a_number_that_is_known_keeps_its_error_when_the_level_is_lost():
     assert slope.reach[0] > 1.7 * slope.error[0]
 
 
+def test_numbers_that_are_held_change_no_noise():
+    """Their columns are nothing."""
+    time, random = np.arange(80.0), np.random.default_rng(2)
+    rows = np.column_stack([np.sin(time / 9), time / 80, random.normal(size=80)])
+    grid = usual_noises(time)
+    own, held = (
+        whitened_by_each(grid, [(columns, time)]).memory()
+        for columns in (rows, np.insert(rows, [0, 1, 1], 0.0, axis=1))
+    )
+    np.testing.assert_allclose(held.weight, own.weight, rtol=1e-6, atol=1e-12)
+    np.testing.assert_allclose(held.step[:, [1, 4]], own.step, rtol=1e-6)
+
+
 def test_the_evidence_is_the_integral_over_numbers_and_the_size_of_the_noise():
     """One number, white noise: by a sum over a grid, of two sets of readings."""
     rng, x = np.random.default_rng(0), np.linspace(0.5, 1.5, 9)
