@@ -164,6 +164,7 @@ OUTLIER, SHARE = 7.0, 0.2
 # Errors of the mean by which readings at the edges of cycles lie off the law where they are of an
 # injection: what stays below is in the errors (`beamfit.lifetime.expansion.SHIFTS`).
 EDGE, WITHIN = 2.5, "they lie within injections"
+FRESH, SETTLES = "fresh beam decays faster", f"{WITHIN}, or the monitor settles"
 # Neighbours that tell where a cycle, or a reading at the edge of one, should lie.
 NEXT = 9
 # Time constants of fresh beam that are looked for, and the part of its error to which it has faded.
@@ -229,14 +230,15 @@ def _edges(about: Expansion) -> np.ndarray:
     return beside.mean(axis=1) * math.sqrt(ends.shape[1] / (1 + 1 / (NEXT - 1)))
 
 
-def _fresh(about: Expansion, most: int) -> int:
-    """Readings at the start of a cycle until fresh beam, which decays faster, has settled; at most
-    so many. How its size differs from cycle to cycle tells the error: noise may have a memory.
+def _settles(about: Expansion, most: int) -> tuple[int, bool]:
+    """Readings at the start of a cycle until fresh beam, which decays faster, or the monitor has
+    settled, at most so many; and whether they are high. How its size differs from cycle to cycle
+    tells the error: noise may have a memory.
     """
     pieces, first = about.pieces, about.pieces.first
     times = np.geomspace(1.0, max(most / math.log(EDGE / FADED), 1.0), TAILS)
     columns = about.beside(np.exp(-pieces.place[:, None] / times) * pieces.weight[:, None])
-    law = np.linalg.qr(about.left[:, about.columns()])[0]
+    law = np.linalg.qr(about.left[:, about.columns(POWER)])[0]
     columns -= law @ (law.T @ columns)
     above = np.add.reduceat(-about.left[:, [-1]] * columns, first)
     squares = np.add.reduceat(columns**2, first)
@@ -244,10 +246,11 @@ def _fresh(about: Expansion, most: int) -> int:
     cycles = first.size
     error = np.sqrt(np.sum(off**2, axis=0) * cycles / (cycles - 1))
     excess = above.sum(axis=0) / np.maximum(error, 1e-300)
-    best = int(np.argmax(excess))
-    if not stdtr(cycles - 1, -excess[best]) * times.size < ndtr(-EDGE):
-        return 0
-    return min(math.ceil(math.log(excess[best] / FADED) * times[best]), most)
+    best = int(np.argmax(np.abs(excess)))
+    size, high = abs(excess[best]), bool(excess[best] > 0)
+    if not 2 * stdtr(cycles - 1, -size) * times.size < ndtr(-EDGE):
+        return 0, high
+    return min(math.ceil(math.log(size / FADED) * times[best]), most), high
 
 
 def _trimmed(about: Expansion) -> tuple[Expansion, list[str]]:
@@ -256,20 +259,18 @@ def _trimmed(about: Expansion) -> tuple[Expansion, list[str]]:
     most = int(np.median(about.pieces.lengths)) // 3
     while cut.max() < most:
         first_off, last_off = _edges(about)
-        fresh = _fresh(about, most - cut[0])
-        far = np.array([max(abs(first_off) > EDGE, fresh), last_off > EDGE], int)
+        settled, above = _settles(about, most - cut[0])
+        far = np.array([max(abs(first_off) > EDGE, settled), last_off > EDGE], int)
         if not far.any():
             break
-        high += max(int(first_off > EDGE), fresh)
+        high += max(int(first_off > EDGE), settled * above)
         place, lengths = about.pieces.place, about.pieces.lengths
         whole = np.repeat(lengths, lengths)
         keep = (place >= far[0]) & (place < whole - far[1]) | (whole <= NEXT)
         about = with_course(solved(about.pieces.kept(keep, FEWEST_READINGS)))
         cut = cut + far
     said = []
-    for side, why in enumerate(
-        ("fresh beam decays faster" if 2 * high >= cut[0] else WITHIN, WITHIN)
-    ):
+    for side, why in enumerate((FRESH if 2 * high >= cut[0] else SETTLES, WITHIN)):
         if cut[side]:
             which = f"{('first', 'last')[side]} {cut[side]}"
             of_each = (
