@@ -228,7 +228,8 @@ class Whitened(NamedTuple):
         half, along, squares, logs = self._solved(numbers)
         weight = np.exp(logs - logs.max())
         step = -(half @ along)[..., 0]
-        dof, flicker = self.count - step.shape[1], np.isnan(self.noise.time)
+        seen = half.any(axis=1).sum(axis=1).max()  # numbers that are held are not fitted
+        dof, flicker = self.count - int(seen), np.isnan(self.noise.time)
         # 1/f noise has no time: it is named by the one that is most like it.
         like = int(np.argmax(np.where(flicker, -np.inf, logs)))
         time, white = (np.where(flicker, own[like], own) for own in self.noise)

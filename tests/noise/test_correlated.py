@@ -123,6 +123,7 @@ def test_numbers_that_are_held_change_no_noise():
     )
     np.testing.assert_allclose(held.weight, own.weight, rtol=1e-6, atol=1e-12)
     np.testing.assert_allclose(held.step[:, [1, 4]], own.step, rtol=1e-6)
+    assert held.dof == own.dof == 78
 
 
 def test_the_evidence_is_the_integral_over_numbers_and_the_size_of_the_noise():
