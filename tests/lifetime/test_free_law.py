@@ -6,6 +6,7 @@ All are simulated; truths are integrated by scipy.
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
+from scipy.special import logsumexp
 
 from beamfit.errors import InputError
 from beamfit.lifetime.decay_law import current
@@ -26,6 +27,7 @@ from beamfit.lifetime.free_law import (
 )
 from beamfit.lifetime.lifetime_table import fit_lifetimes
 from beamfit.lifetime.pieces import split_record
+from beamfit.lifetime.posterior import _log_density, _Prepared
 from beamfit.lifetime.record import Conditions, DecayRecord, LifetimeTable
 from beamfit.lifetime.study import study_record
 from tests.simulations import simulations
@@ -173,6 +175,28 @@ def test_a_monitor_that_settles_after_a_fill_is_in_the_errors(sign, count):
         assert fit.status == "converged"
     assert held >= count - 1
     assert told >= count / 2
+
+
+def test_the_density_of_samples_is_that_of_the_draws():
+    """Of gas that is pumped away and of a monitor that settles, up to one constant."""
+    time = np.linspace(0.0, 10 * HOUR, 300)
+    shown = np.array(current(time, I0, A, B)) + 0.1 * np.exp(-time / 3000)
+    fit = fit_decay(DecayRecord(time, shown + 0.03 * np.random.default_rng(1).normal(size=300)))
+    ready = _Prepared.of(fit)
+    data, apart = ready.target({}).data, []
+    for law in ready.laws:
+        if not (law.is_pumped or law.settles):
+            continue
+        draws, products = law.weighed(32), law.seen.products
+        away = law.seen.away(draws.currents)
+        squares = np.einsum("pd,kpq,qd->kd", away, products.matrix, away)
+        log = logsumexp(products.log_prior[:, None] + products.log_size(squares), axis=0)
+        log += law._log_prior(draws.numbers) - np.log(draws.numbers.rate)
+        log += np.log1p(-draws.numbers.share) if law.is_pumped else 0.0  # of b, not of the loss
+        thetas = ready.thetas(draws, np.random.default_rng(0))
+        density = np.array([float(_log_density(data, theta)) for theta in thetas])
+        apart.append((density - log)[np.isfinite(density)])
+    np.testing.assert_allclose(np.concatenate(apart), apart[0][0], atol=1e-3)
 
 
 @pytest.mark.parametrize("shape", [lambda s: np.exp(-20 * s), lambda s: np.sin(15 * s)])
