@@ -551,12 +551,12 @@ def _log_evidence(law: Expansion, one: Alternative) -> float:
     for kind in DISTURBANCES:
         if kind.of_loss and law.pieces.gauge is not None:
             continue
-        count, _, numbers = kind.shapes.shape
+        numbers = kind.shapes.shape[2]
         known = np.append(width, np.ones(numbers)), np.append(centre, np.zeros(numbers))
-        for shape in kind.shown(law.numbers[0]):
+        for shape, chance in zip(kind.shown(law.numbers[0]), kind.chance, strict=True):
             further = np.vstack([np.zeros((1 + width.size, numbers)), shape])
             log = _laplace(near.combined(np.hstack([own, further])), *known)
-            found.append(log + math.log(kind.chance / SMOOTH / count))
+            found.append(log + math.log(chance / SMOOTH))
     return float(logsumexp(found)) + _log_chance(one, law)
 
 

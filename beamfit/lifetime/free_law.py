@@ -47,11 +47,11 @@ SMOOTH, OUTGASSING, TIMES, SIZES = 0.6, 0.08, (1e-3, 1.0), (1e-3, 10.0)
 # Prior probability that the loss rate goes up and down in a record, as a pressure does, by which
 # shares of the loss and over which lengths of the record, each as likely. That the monitor does is
 # as likely.
-WANDERS, SHARES, LENGTHS = 0.14, (0.003, 0.03, 0.3), (0.4, 0.2, 0.1, 0.05)
+WANDERS, SHARES, LENGTHS = 0.14, (0.003, 0.01, 0.03, 0.1, 0.3), (0.4, 0.2, 0.1, 0.05)
 # Standard deviation of how far a monitor is off, as a share of the current: between two
 # calibrations of the transformer of MIT-Bates its zero moved by 0.1 to 0.2 % (T. Botto, BlastTalk
-# 2712). By which multiples of that it wanders, each as likely.
-MONITOR, MULTIPLES = 1e-3, (0.03, 0.3, 3.0)
+# 2712). By which multiples of that it wanders.
+MONITOR, MULTIPLES = 1e-3, (0.03, 0.1, 0.3, 1.0, 3.0)
 # A monitor that settles after a fill is as likely as gas that is pumped away: spans over the time
 # that takes, each as likely, and the standard deviation of its logarithm that each stands for.
 SETTLING = 2.0 ** np.arange(1, 7)
@@ -93,16 +93,15 @@ class Disturbance:
     Parameters
     ----------
     shapes : array, shape (w, 18, r)
-        At the nodes, as shares of the loss rate or of the current, by r normal numbers; each of w
-        as likely.
-    chance : float
-        Prior probability of all of them.
+        At the nodes, as shares of the loss rate or of the current, by r normal numbers.
+    chance : array, shape (w,)
+        Prior probability of each.
     of_loss : bool
         Whether it is the loss rate that goes.
     """
 
     shapes: np.ndarray
-    chance: float
+    chance: np.ndarray
     of_loss: bool = False
 
     def shown(self, rate: float) -> np.ndarray:
@@ -131,11 +130,25 @@ def settling() -> np.ndarray:
     return np.exp(-gone)[..., None] * np.stack([np.ones_like(gone), BETWEEN * gone], axis=-1)
 
 
+def _of_sizes(shapes: np.ndarray, sizes: np.ndarray, chance: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Shapes of each size with the probabilities of these, each shape as likely."""
+    every = np.multiply.outer(sizes, shapes).reshape(-1, *shapes.shape[1:])
+    return every, np.repeat(chance / len(shapes), len(shapes))
+
+
 WALKS, _DRIFTS = _wandering()
-LOSS_WANDERS = Disturbance(np.concatenate([share * WALKS for share in SHARES]), WANDERS, True)
-_OFF = np.concatenate([size * shape for size in MULTIPLES for shape in (WALKS, _DRIFTS)])
-MONITOR_WANDERS = Disturbance(MONITOR * _OFF, WANDERS)
-MONITOR_SETTLES = Disturbance(MONITOR * settling(), OUTGASSING)
+_OFF = 1 / (1 + np.square(MULTIPLES))
+LOSS_WANDERS = Disturbance(
+    *_of_sizes(WALKS, SHARES, np.full(len(SHARES), WANDERS / len(SHARES))), True
+)
+MONITOR_WANDERS = Disturbance(
+    *_of_sizes(
+        np.concatenate([WALKS, _DRIFTS]), MONITOR * np.array(MULTIPLES), WANDERS * _OFF / _OFF.sum()
+    )
+)
+MONITOR_SETTLES = Disturbance(
+    MONITOR * settling(), np.full(len(SETTLING), OUTGASSING / len(SETTLING))
+)
 DISTURBANCES = LOSS_WANDERS, MONITOR_WANDERS, MONITOR_SETTLES
 
 
@@ -413,7 +426,7 @@ class SeenDecay:
         left = np.linalg.solve(lower, root)
         half = np.linalg.inv(np.linalg.cholesky(np.eye(numbers) + _turned(seen) @ seen))
         volume = np.sum(np.log(np.einsum("kpp->kp", lower)), axis=1)
-        log = math.log(kind.chance / SMOOTH / count) - volume
+        log = np.repeat(np.log(kind.chance / SMOOTH), len(some.products.kinds)) - volume
         products = some.products._replace(
             kinds=some.products.kinds * count,
             log_prior=np.tile(some.products.log_prior, count) + log,

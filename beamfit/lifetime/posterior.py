@@ -127,11 +127,11 @@ def _nodes(data: _Data, numbers: DecayNumbers) -> Array:
 
 def _log_walk(walk: Array) -> Array:
     """Log density of a loss rate that wanders at the nodes, with the odds of there being any."""
-    halves, count = LOSS_WANDERS.shapes, len(LOSS_WANDERS.shapes)
+    halves, chance = LOSS_WANDERS.shapes, LOSS_WANDERS.chance
     squares = jnp.sum((np.linalg.inv(halves) @ walk) ** 2, axis=1)
     volume = np.log(np.diagonal(halves, axis1=1, axis2=2)).sum(axis=1)
-    log = jax.nn.logsumexp(-0.5 * squares - volume) - 0.5 * NODES * np.log(2 * np.pi)
-    log = log + np.log(LOSS_WANDERS.chance / SMOOTH / count)
+    log = jax.nn.logsumexp(np.log(chance / SMOOTH) - 0.5 * squares - volume)
+    log = log - 0.5 * NODES * np.log(2 * np.pi)
     return jnp.where(jnp.any(walk != 0), log, 0.0)
 
 
