@@ -21,7 +21,7 @@ from beamfit.lifetime.evidence import (
     UNITS,
     Evidence,
 )
-from beamfit.lifetime.free_law import LIKELIER, Law
+from beamfit.lifetime.free_law import Law
 from beamfit.lifetime.pieces import split_record
 from beamfit.lifetime.readings import noise_of
 from beamfit.lifetime.record import Monitor
@@ -294,12 +294,12 @@ def _freely(e: Evidence) -> Finding | None:
 
 
 def _disturbed(e: Evidence) -> str:
-    """Name what goes by itself beside the law, if that is likelier than not."""
+    """Name what goes by itself beside the law that is quoted, if that is likelier than not."""
     free, contained = e.free, "which the errors contain"
-    if free is not None and free.settles > LIKELIER:
+    if free is not None and free.is_settling:
         likely = f"A monitor that settles after a fill is likely ({percent(free.settles)})"
         return f"{likely}, {contained}"
-    if free is not None and free.wanders > LIKELIER:
+    if free is not None and free.is_wandering:
         likely = f"The loss rate or the monitor wanders within the record ({percent(free.wanders)})"
         return f"{likely}, {contained}"
     return ""

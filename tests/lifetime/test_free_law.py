@@ -64,7 +64,7 @@ def test_the_closed_form_is_the_integrated_law(power, change, pace):
         return -rate * (share * x**power * x + 1 - share + change * course) * x
 
     true = solve_ivp(slope, (0, 1), [level], t_eval=NODE, rtol=1e-12, atol=1e-12).y[0]
-    rtol = 1e-9 if pace < 5 else 5e-6  # 14 nodes of a fast course
+    rtol = 1e-9 if pace < 5 else 5e-6  # nodes of a fast course
     np.testing.assert_allclose(Numbers.of(found).currents(NODE)[:, 0], true, rtol=rtol)
 
 
@@ -122,12 +122,12 @@ def test_what_wanders_is_smooth_over_its_length_about_its_mean():
 
 def test_a_monitor_that_settles_is_followed_from_node_to_node():
     time = np.linspace(0.0, 1.0, 1001)
-    for pace, shape in zip(2.0 ** np.arange(1, 7), settling(), strict=True):
+    for pace, shape in zip(2.0 ** np.arange(1, 6.25, 0.25), settling(), strict=True):
         followed = from_nodes(time) @ shape[:, 0]
         np.testing.assert_allclose(followed, np.exp(-pace * time), atol=1e-9 if pace < 8 else 0.02)
         step = 1e-6
         slope = (np.exp(-pace * (1 + step) * NODE) - np.exp(-pace * NODE)) / step
-        np.testing.assert_allclose(shape[:, 1], -slope * np.log(2) / np.sqrt(12), atol=1e-5)
+        np.testing.assert_allclose(shape[:, 1], -slope * np.log(2) / 4 / np.sqrt(12), atol=1e-5)
 
 
 @pytest.mark.parametrize("kind", DISTURBANCES)
@@ -173,6 +173,37 @@ def test_a_monitor_that_settles_after_a_fill_is_in_the_errors(sign, count):
         assert fit.status == "converged"
     assert held >= count - 1
     assert told >= count / 2
+
+
+@simulations(6, 20)
+@pytest.mark.parametrize("given", [{}, {"exponent": -1 / 3}, {"drift": 0.1}])
+def test_a_quiet_monitor_that_settles_is_told_beside_any_law(given, count):
+    """SIMULATED, a noise of 1e-5: where a goes with the current or b drifts the monitor was said to
+    wander, with errors of .05 to .7 %; else paces between those looked at were up to 10 errors off.
+    """
+    held, told = 0, 0
+    time, beam = law(**given, span=30 * HOUR)
+    for seed in range(count):
+        random = np.random.default_rng(seed)
+        off = random.choice([-1, 1]) * 10 ** random.uniform(-3.7, -2.7)
+        shown = beam * (1 + off * np.exp(-random.uniform(12, 30) * time / time[-1]))
+        fit = fit_decay(DecayRecord(time, shown + 0.003 * random.normal(size=time.size)))
+        low, high = fit.lifetime_mean.interval_95
+        at = np.interp(-fit.mean_current, -beam, time)
+        power, drift = given.get("exponent", 0.0), given.get("drift", 0.0)
+        own = A * (fit.mean_current / I0) ** power * fit.mean_current
+        rate = own + B * (1 + drift * (at / time[-1] - 0.5))
+        held += low <= 1 / rate / HOUR <= high
+        told += "A monitor that settles after a fill is likely" in fit.message
+    assert held >= count - 1
+    assert told >= 0.75 * count
+
+
+def test_no_disturbance_is_named_where_constant_a_and_b_are_likelier():
+    fit = fit_decay(record(1, noise=0.003, span=60 * HOUR))
+    assert fit.free_law.settles > 0.5  # of the laws that are free
+    assert fit.free_law.constant > 0.9
+    assert "settles" not in fit.message
 
 
 @pytest.mark.parametrize("shape", [lambda s: np.exp(-20 * s), lambda s: np.sin(15 * s)])
