@@ -546,16 +546,16 @@ def _log_evidence(law: Expansion, one: Alternative) -> float:
     products = Products.of(rows, law.pieces.time, law.pieces.error is not None)
     own = np.eye(rows.shape[1])[:, : 1 + width.size]
     found = [_laplace(products.combined(own), width, centre)]
-    if law.pieces.gauge is None:
-        log = products.log_prior + products.log_size(products.left())
-        near = products.some(log > log.max() - BESIDE)
-        for kind in DISTURBANCES:
-            count, _, numbers = kind.shapes.shape
-            known = np.append(width, np.ones(numbers)), np.append(centre, np.zeros(numbers))
-            for shape in kind.shown(law.numbers[0]):
-                further = np.vstack([np.zeros((1 + width.size, numbers)), shape])
-                log = _laplace(near.combined(np.hstack([own, further])), *known)
-                found.append(log + math.log(kind.chance / SMOOTH / count))
+    log = products.log_prior + products.log_size(products.left())
+    near = products.some(log > log.max() - BESIDE)
+    gauged = law.pieces.gauge is not None
+    for kind in (each for each in DISTURBANCES if not (gauged and each.of_loss)):
+        count, _, numbers = kind.shapes.shape
+        known = np.append(width, np.ones(numbers)), np.append(centre, np.zeros(numbers))
+        for shape in kind.shown(law.numbers[0]):
+            further = np.vstack([np.zeros((1 + width.size, numbers)), shape])
+            log = _laplace(near.combined(np.hstack([own, further])), *known)
+            found.append(log + math.log(kind.chance / SMOOTH / count))
     return float(logsumexp(found)) + _log_chance(one, law)
 
 

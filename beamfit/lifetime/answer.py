@@ -474,7 +474,7 @@ def _few(e: Evidence) -> str | None:
 
 def _correlated(e: Evidence) -> str | None:
     found, length = e.separability, e.correlation_time
-    if length is None:
+    if length is None or _disturbed(e):  # residuals are those of constant a and b
         return None
     times = found.error_inflation
     than = f": they are {times:.1f} times those of independent readings" if times else ""

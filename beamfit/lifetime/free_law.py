@@ -978,16 +978,15 @@ def free_law(record: DecayRecord, values: Physical) -> FreeLaw | None:
 
 
 def proposals(seen: SeenDecay) -> list[DrawnLaw]:
-    """The free law, and where no gauge tells the gas, gas that is pumped away, a monitor that
-    settles, and a loss rate or a monitor that wanders.
+    """The free law, gas that is pumped away, and beside disturbances the free law, and constant a
+    and b where the monitor settles. Where a gauge tells the gas the monitor alone goes by itself.
     """
-    if not seen.drifts:
-        return [DrawnLaw.of(seen, [*CONSTANT, POWER])]
-    smooth = [*CONSTANT, POWER, CHANGE]
-    laws = [DrawnLaw.of(seen, smooth), DrawnLaw.of(seen, [*CONSTANT, CHANGE, PACE])]
+    smooth = [*CONSTANT, POWER, CHANGE] if seen.drifts else [*CONSTANT, POWER]
+    laws = [DrawnLaw.of(seen, smooth)]
+    laws += [DrawnLaw.of(seen, [*CONSTANT, CHANGE, PACE])] if seen.drifts else []
     if seen.products.count < FEWEST:
         return laws
-    beside = [seen.beside(kind) for kind in DISTURBANCES]
+    beside = [seen.beside(kind) for kind in DISTURBANCES if seen.drifts or not kind.of_loss]
     laws += [DrawnLaw.of(own, smooth) for own in beside]
     return [*laws, DrawnLaw.of(beside[-1], CONSTANT)]  # a monitor that settles
 
