@@ -21,7 +21,7 @@ from beamfit.lifetime.evidence import (
     UNITS,
     Evidence,
 )
-from beamfit.lifetime.free_law import LIKELIER, Law
+from beamfit.lifetime.free_law import Law
 from beamfit.lifetime.pieces import split_record
 from beamfit.lifetime.readings import noise_of
 from beamfit.lifetime.record import Monitor

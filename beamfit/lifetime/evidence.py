@@ -35,8 +35,8 @@ from beamfit.lifetime.expansion import (
 )
 from beamfit.lifetime.free_law import (
     BELOW,
+    DOUBLING,
     ENDS,
-    LIKELIER,
     PACES,
     UNITS,
     FreeLaw,
@@ -601,9 +601,10 @@ class Evidence:
         if self.pumped:
             gas = further_columns(self.about, "relaxing", 1 / np.array(PACES))
             columns = np.column_stack([columns, gas])
-        if self.free is not None and self.free.settles > LIKELIER:
+        if self.free is not None and self.free.is_settling:
             model = self.record.current / self.about.pieces.over + self.about.residuals
-            shapes = from_nodes(self.record.time / self.record.span) @ np.hstack([*settling()])
+            settles = np.hstack([*settling()[::DOUBLING]])
+            shapes = from_nodes(self.record.time / self.record.span) @ settles
             columns = np.column_stack([columns, model[:, None] * shapes])
         products = Products.of(columns, self.time, stated=True, times=CLOSE)
         return products.stated_odds(products.left(), columns.shape[1] - 1)

@@ -6,9 +6,9 @@ share R x^(1 + g) + (1 - share) R (1 + h f(s)) with the share of a from 0 to 1. 
 of itself: in a straight line, f = s - 1/2, or as what is pumped away after a fill, f = 1/k -
 exp(-k s)/(1 - exp(-k)), where a is then constant. The exponent g, the change h and the pace k have
 priors, the first current, the loss rate and the share of a are flat. Beside g and h the whole loss
-or the monitor may wander; beside constant a and b the monitor may settle after a fill. The law has
-a closed form with one integral, taken to rounding on Chebyshev nodes, which readings see through
-one matrix: whitened products of its columns are all that they say.
+or the monitor may wander; beside these or constant a and b the monitor may settle after a fill. The
+law has a closed form with one integral, taken to rounding on Chebyshev nodes, which readings see
+through one matrix: whitened products of its columns are all that they say.
 """
 
 from __future__ import annotations
@@ -54,8 +54,9 @@ WANDERS, SHARES, LENGTHS = 0.14, (0.003, 0.01, 0.03, 0.1, 0.3), (0.4, 0.2, 0.1, 
 MONITOR, MULTIPLES = 1e-3, (0.03, 0.1, 0.3, 1.0, 3.0)
 # A monitor that settles after a fill is as likely as gas that is pumped away: spans over the time
 # that takes, each as likely, and the standard deviation of its logarithm that each stands for.
-SETTLING = 2.0 ** np.arange(1, 7)
-BETWEEN = math.log(2.0) / math.sqrt(12.0)
+DOUBLING = 4  # in so many steps: between them shapes are straight in it to the noise of a monitor
+SETTLING = 2.0 ** np.arange(1, 6 + 1 / DOUBLING, 1 / DOUBLING)
+BETWEEN = math.log(2.0) / DOUBLING / math.sqrt(12.0)
 # Spans over the time of gas that is pumped away: shorter times are seen by themselves.
 PACES = (1.0, 20.0)
 # What keeps a covariance of smooth shapes from being singular.
@@ -852,7 +853,7 @@ class FreeLaw:
     wanders : float
         Probability that the loss rate or the monitor wanders besides.
     settles : float
-        Probability of a monitor that settles after a fill, in the place of exponent and drift.
+        Probability of a monitor that settles after a fill.
     nodes : array, shape (18,)
         What the monitor shows at the nodes in the mean, mA.
     span : float

@@ -23,6 +23,7 @@ from beamfit.lifetime.free_law import (
     LOSS_WANDERS,
     MOST,
     NODES,
+    POWER,
     SMOOTH,
     DrawnLaw,
     Draws,
@@ -59,8 +60,8 @@ SHOWN = ("i0", "a", "b", "exponent", "drift")
 LIFETIMES = {"lifetime_start": "h", "lifetime_end": "h", "lifetime_mean": "h"}
 STATED = {"exponent": f"normal about 0, {BELOW} below and {ABOVE} above",
           "drift": f"normal, 0 ± {DRIFT}, or that of gas that is pumped away"}  # fmt: skip
-# Monitors that a noise is with, by the law beside.
-ANY, WANDERS, SETTLES = range(3)
+# Laws that a noise is beside: with a monitor that is off it is beside one of these alone.
+ANY, FREE, SETTLED = range(3)
 # Where all of the loss may be of one kind its interval ends, as the last of a thousand draws does.
 UTMOST = 0.999
 # Independent draws that intervals need at least.
@@ -89,8 +90,8 @@ class DecayNumbers(NamedTuple):
 class _Data(NamedTuple):
     """Readings as of `SeenDecay`, the matrix that takes nodes to the first reading, the middle and
     the last one, mean current, mA, and span, s; shifts of I0, a and b by what is stated of the
-    monitor, shape (k, 3). Of each noise, beside which law its monitor is: any, the free one where
-    the monitor wanders, or constant a and b where it settles.
+    monitor, shape (k, 3). Of each noise, beside which law it is: any; with a monitor
+    that is off the free one, or constant a and b.
     """
 
     matrix: Array
@@ -141,9 +142,9 @@ def _log_density(data: _Data, theta: Array) -> Array:
     away = jnp.append(-1.0, _nodes(data, numbers)[:, 0] - data.origin)
     squares = jnp.maximum(jnp.einsum("p,kpq,q->k", away, data.matrix, away), 1e-30)
     noises = data.log_prior - 0.5 * (data.count + data.known) * jnp.log(data.known + squares)
-    constant = (numbers.exponent == 0) & (numbers.drift == 0) & jnp.any(data.beside == SETTLES)
-    wanders = (data.beside == WANDERS) & (numbers.pace == 0) & jnp.all(numbers.walk == 0)
-    known = jnp.where(constant, data.beside == SETTLES, (data.beside == ANY) | wanders)
+    constant = (numbers.exponent == 0) & (numbers.drift == 0) & jnp.any(data.beside == SETTLED)
+    freed = (data.beside == FREE) & (numbers.pace == 0) & jnp.all(numbers.walk == 0)
+    known = jnp.where(constant, data.beside == SETTLED, (data.beside == ANY) | freed)
     noises = jnp.where(known, noises, -jnp.inf)
     rate = numbers.a * data.mean + numbers.b
     share = numbers.a * data.mean / rate
@@ -228,7 +229,7 @@ class _Prepared(NamedTuple):
         middle = middle_of(draws.currents, draws.weight)
         own = [(seen.products, ANY)]
         own += [
-            (law.seen.products, SETTLES if law.settles else WANDERS)
+            (law.seen.products, FREE if POWER in law.free else SETTLED)
             for law in self.laws
             if law.disturbance not in (None, LOSS_WANDERS)
         ]
