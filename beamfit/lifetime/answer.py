@@ -296,14 +296,13 @@ def _freely(e: Evidence) -> Finding | None:
 
 def _disturbed(e: Evidence) -> str:
     """Name what goes by itself beside the law, if that is likelier than not."""
-    if e.free is None or not e.free.is_disturbed:
+    if e.free is not None and e.free.is_settling:
+        likely, chance = "A monitor that settles after a fill is likely", e.free.settles
+    elif e.free is not None and e.free.is_wandering:
+        likely, chance = "The loss rate or the monitor wanders within the record", e.free.wanders
+    else:
         return ""
-    likely = f"A monitor that settles after a fill is likely ({percent(e.free.settles)})"
-    if e.free.wanders > LIKELIER:
-        likely = (
-            f"The loss rate or the monitor wanders within the record ({percent(e.free.wanders)})"
-        )
-    return f"{likely}, which the errors contain"
+    return f"{likely} ({percent(chance)}), which the errors contain"
 
 
 def _departs(e: Evidence) -> str:

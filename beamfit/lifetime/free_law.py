@@ -138,6 +138,7 @@ def _of_sizes(shapes: np.ndarray, sizes: np.ndarray, chance: np.ndarray) -> tupl
 
 
 WALKS, _DRIFTS = _wandering()
+# How far a monitor wanders is known of one machine: larger multiples are as rare as of Cauchy's law.
 _OFF = 1 / (1 + np.square(MULTIPLES))
 LOSS_WANDERS = Disturbance(
     *_of_sizes(WALKS, SHARES, np.full(len(SHARES), WANDERS / len(SHARES))), True
@@ -893,9 +894,14 @@ class FreeLaw:
         return self.likelier and self.pumped > LIKELIER
 
     @property
-    def is_disturbed(self) -> bool:
-        """True if something is likely to go by itself beside the law."""
-        return max(self.wanders, self.settles) > LIKELIER
+    def is_settling(self) -> bool:
+        """True if what is quoted is beside a monitor that settles."""
+        return self.likelier and self.settles > LIKELIER
+
+    @property
+    def is_wandering(self) -> bool:
+        """True if what is quoted is beside a loss rate or a monitor that wanders."""
+        return self.likelier and self.wanders > LIKELIER
 
     def curve(self, time: np.ndarray) -> np.ndarray:
         """What the monitor shows in the mean at times in s, mA."""
@@ -983,17 +989,17 @@ def free_law(record: DecayRecord, values: Physical) -> FreeLaw | None:
 
 
 def proposals(seen: SeenDecay) -> list[DrawnLaw]:
-    """The free law, gas that is pumped away, and disturbances; where a gauge tells the gas, only
-    those of the monitor.
+    """The free law, gas that is pumped away, and the free law beside disturbances, or constant a
+    and b where the monitor settles; where a gauge tells the gas only the monitor is disturbed.
     """
     free = [*CONSTANT, POWER, CHANGE] if seen.drifts else [*CONSTANT, POWER]
-    laws, beside = [DrawnLaw.of(seen, free)], [(MONITOR_WANDERS, free), (MONITOR_SETTLES, CONSTANT)]
-    if seen.drifts:
-        laws.append(DrawnLaw.of(seen, [*CONSTANT, CHANGE, PACE]))
-        beside.append((LOSS_WANDERS, free))
+    laws = [DrawnLaw.of(seen, free)]
+    laws += [DrawnLaw.of(seen, [*CONSTANT, CHANGE, PACE])] if seen.drifts else []
     if seen.products.count < FEWEST:
         return laws
-    return [*laws, *(DrawnLaw.of(seen.beside(kind), own) for kind, own in beside)]
+    beside = [seen.beside(kind) for kind in DISTURBANCES if seen.drifts or not kind.of_loss]
+    laws += [DrawnLaw.of(own, free) for own in beside]
+    return [*laws, DrawnLaw.of(beside[-1], CONSTANT)]  # a monitor that settles
 
 
 def rates_of(a, b, power, changed, x, seen: SeenDecay):
