@@ -131,26 +131,23 @@ def settling() -> np.ndarray:
     return np.exp(-gone)[..., None] * np.stack([np.ones_like(gone), BETWEEN * gone], axis=-1)
 
 
-def _of_sizes(shapes: np.ndarray, sizes: np.ndarray, chance: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Shapes of each size with the probabilities of these, each shape as likely."""
+def _wanders(
+    shapes: np.ndarray, sizes: np.ndarray, weight: np.ndarray, of_loss: bool
+) -> Disturbance:
+    """Shapes of each size, these by their weight, each shape as likely."""
     every = np.multiply.outer(sizes, shapes).reshape(-1, *shapes.shape[1:])
-    return every, np.repeat(chance / len(shapes), len(shapes))
+    chance = np.repeat(WANDERS * weight / weight.sum() / len(shapes), len(shapes))
+    return Disturbance(every, chance, of_loss)
 
 
 WALKS, _DRIFTS = _wandering()
-# How far a monitor wanders is known of one machine: larger multiples are as rare as of Cauchy's law.
-_OFF = 1 / (1 + np.square(MULTIPLES))
-LOSS_WANDERS = Disturbance(
-    *_of_sizes(WALKS, SHARES, np.full(len(SHARES), WANDERS / len(SHARES))), True
+_OFF, _EVEN = np.array(MULTIPLES), np.full(len(SETTLING), 1 / len(SETTLING))
+LOSS_WANDERS = _wanders(WALKS, np.array(SHARES), np.ones(len(SHARES)), True)
+# The scale is that of one machine: larger multiples are as rare as of Cauchy's distribution.
+MONITOR_WANDERS = _wanders(
+    np.concatenate([WALKS, _DRIFTS]), MONITOR * _OFF, 1 / (1 + _OFF**2), False
 )
-MONITOR_WANDERS = Disturbance(
-    *_of_sizes(
-        np.concatenate([WALKS, _DRIFTS]), MONITOR * np.array(MULTIPLES), WANDERS * _OFF / _OFF.sum()
-    )
-)
-MONITOR_SETTLES = Disturbance(
-    MONITOR * settling(), np.full(len(SETTLING), OUTGASSING / len(SETTLING))
-)
+MONITOR_SETTLES = Disturbance(MONITOR * settling(), OUTGASSING * _EVEN)
 DISTURBANCES = LOSS_WANDERS, MONITOR_WANDERS, MONITOR_SETTLES
 
 
