@@ -35,7 +35,6 @@ from beamfit.lifetime.free_law import (
     ABOVE,
     BELOW,
     BESIDE,
-    DISTURBANCES,
     DRIFT,
     ENDS,
     ENOUGH,
@@ -43,6 +42,7 @@ from beamfit.lifetime.free_law import (
     SIZES,
     SMOOTH,
     TIMES,
+    disturbances,
     from_nodes,
 )
 from beamfit.lifetime.record import DecayRecord
@@ -548,7 +548,7 @@ def _log_evidence(law: Expansion, one: Alternative) -> float:
     found = [_laplace(products.combined(own), width, centre)]
     log = products.log_prior + products.log_size(products.left())
     near = products.some(log > log.max() - BESIDE)
-    for kind in DISTURBANCES:
+    for kind in disturbances(law.numbers[0]):
         if kind.of_loss and law.pieces.gauge is not None:
             continue
         numbers = kind.shapes.shape[2]

@@ -44,14 +44,12 @@ DRIFT = 0.1
 # flat in its logarithm from a thousandth of the span to all of it, its loss at first from a
 # thousandth of the mean loss to ten times that.
 SMOOTH, OUTGASSING, TIMES, SIZES = 0.6, 0.08, (1e-3, 1.0), (1e-3, 10.0)
-# Prior probability that the loss rate goes up and down in a record, as a pressure does, by which
-# shares of the loss and over which lengths of the record, each as likely. That the monitor does is
-# as likely.
-WANDERS, SHARES, LENGTHS = 0.14, (0.003, 0.01, 0.03, 0.1, 0.3), (0.4, 0.2, 0.1, 0.05)
-# Standard deviation of how far a monitor is off, as a share of the current: between two
-# calibrations of the transformer of MIT-Bates its zero moved by 0.1 to 0.2 % (T. Botto, BlastTalk
-# 2712). By which multiples of that it wanders.
-MONITOR, MULTIPLES = 1e-3, (0.03, 0.1, 0.3, 1.0, 3.0)
+# Prior probability that the loss rate wanders, as a pressure does, by a random walk: by which
+# shares of the loss it has gone at the end, each as likely. That the monitor does is as likely.
+WANDERS, WALKS = 0.14, (0.003, 0.015, 0.07, 0.3)
+# How far a monitor is off, as a share of the current: between two calibrations of that of MIT-Bates
+# its zero moved by 0.1 to 0.2 % (T. Botto, BlastTalk 2712).
+MONITOR = 1e-3
 # A monitor that settles after a fill is as likely as gas that is pumped away: spans over the time
 # that takes, each as likely, and the standard deviation of its logarithm that each stands for.
 DOUBLING = 4  # in so many steps: between them shapes are straight in it to the noise of a monitor
@@ -59,8 +57,6 @@ SETTLING = 2.0 ** np.arange(1, 6 + 1 / DOUBLING, 1 / DOUBLING)
 BETWEEN = math.log(2.0) / DOUBLING / math.sqrt(12.0)
 # Spans over the time of gas that is pumped away: shorter times are seen by themselves.
 PACES = (1.0, 20.0)
-# What keeps a covariance of smooth shapes from being singular.
-SINGULAR = 1e-9
 # Where the record's bend does not depend on the share its coordinate has this slope.
 FLAT = 1e-3
 # Nodes of the integral: exact to rounding up to four lifetimes in a record.
@@ -70,6 +66,13 @@ ANGLE = -np.cos(np.pi * np.arange(NODES) / (NODES - 1))
 NODE = (1 + ANGLE) / 2
 FROM_NODES = np.linalg.inv(chebvander(ANGLE, NODES - 1))
 INTEGRAL = chebvander(ANGLE, NODES) @ chebint(FROM_NODES, lbnd=-1) / 2
+
+
+# A random walk about its mean at the nodes: a half of its covariance, min(s, t) less the means over
+# s, over t and over both.
+_PART = NODE - NODE**2 / 2
+_COVARIANCE = np.minimum.outer(NODE, NODE) - np.add.outer(_PART, _PART) + 1 / 3
+HALF_WALK = np.linalg.cholesky(_COVARIANCE + 1e-12 * np.eye(NODES))
 
 
 def from_nodes(s: np.ndarray) -> np.ndarray:
@@ -110,19 +113,6 @@ class Disturbance:
         return -rate * (INTEGRAL @ self.shapes) if self.of_loss else self.shapes
 
 
-def _wandering() -> tuple[np.ndarray, np.ndarray]:
-    """Shapes of a variance of 1 about their mean, by length: what goes up and down smoothly, its
-    covariance a Gaussian of the time between, and what drifts as fast as that.
-    """
-    apart = np.subtract.outer(NODE, NODE) / np.array(LENGTHS)[:, None, None]
-    half = np.linalg.cholesky(np.exp(-0.5 * apart**2) + SINGULAR * np.eye(NODES))
-    less = np.eye(NODES) - INTEGRAL[-1]
-    drifts = less @ INTEGRAL @ half
-    variance = np.einsum("s,wsr->w", INTEGRAL[-1], drifts**2)
-    covariance = less @ half @ _turned(half) @ less.T + SINGULAR * np.eye(NODES)
-    return np.linalg.cholesky(covariance), drifts / np.sqrt(variance)[:, None, None]
-
-
 def settling() -> np.ndarray:
     """Shapes exp(-k s) of a monitor that settles, for each pace k, and beside each its slope by the
     logarithm of the pace.
@@ -131,24 +121,28 @@ def settling() -> np.ndarray:
     return np.exp(-gone)[..., None] * np.stack([np.ones_like(gone), BETWEEN * gone], axis=-1)
 
 
-def _wanders(
-    shapes: np.ndarray, sizes: np.ndarray, weight: np.ndarray, of_loss: bool
-) -> Disturbance:
-    """Shapes of each size, these by their weight, each shape as likely."""
-    every = np.multiply.outer(sizes, shapes).reshape(-1, *shapes.shape[1:])
-    chance = np.repeat(WANDERS * weight / weight.sum() / len(shapes), len(shapes))
-    return Disturbance(every, chance, of_loss)
+_SHAPES = np.multiply.outer(WALKS, HALF_WALK)
+LOSS_WANDERS = Disturbance(_SHAPES, np.full(len(WALKS), WANDERS / len(WALKS)), True)
+_EACH = np.full(len(SETTLING), OUTGASSING / len(SETTLING))
+MONITOR_SETTLES = Disturbance(MONITOR * settling(), _EACH)
 
 
-WALKS, _DRIFTS = _wandering()
-_OFF, _EVEN = np.array(MULTIPLES), np.full(len(SETTLING), 1 / len(SETTLING))
-LOSS_WANDERS = _wanders(WALKS, np.array(SHARES), np.ones(len(SHARES)), True)
-# The scale is that of one machine: larger multiples are as rare as of Cauchy's distribution.
-MONITOR_WANDERS = _wanders(
-    np.concatenate([WALKS, _DRIFTS]), MONITOR * _OFF, 1 / (1 + _OFF**2), False
-)
-MONITOR_SETTLES = Disturbance(MONITOR * settling(), OUTGASSING * _EVEN)
-DISTURBANCES = LOSS_WANDERS, MONITOR_WANDERS, MONITOR_SETTLES
+def monitor_wanders(rate: float) -> Disturbance:
+    """A monitor that shows what it would of a loss rate that wanders, but for its ends, which
+    differ as any two of its readings do: as likely where it is no farther off than monitors are,
+    and by Cauchy's distribution beyond.
+    """
+    shapes = LOSS_WANDERS.shown(rate)
+    shapes = shapes - np.einsum("s,wsr->wr", INTEGRAL[-1], shapes)[:, None]
+    size = np.sqrt(np.einsum("s,wsr->w", INTEGRAL[-1], shapes**2))[:, None, None]
+    ends = math.sqrt(2.0) * size * (NODE - 0.5)[:, None]
+    chance = LOSS_WANDERS.chance / (1 + (size.ravel() / MONITOR) ** 2)
+    return Disturbance(np.concatenate([shapes, ends], axis=2), chance)
+
+
+def disturbances(rate: float) -> tuple[Disturbance, ...]:
+    """All of them, at a loss in the span."""
+    return LOSS_WANDERS, monitor_wanders(rate), MONITOR_SETTLES
 
 
 class Law(StrEnum):
@@ -976,8 +970,8 @@ def free_law(record: DecayRecord, values: Physical) -> FreeLaw | None:
     chances = [(law, math.exp(own.log - draws.log)) for law, own in laws]
     pumped = sum((chance for law, chance in chances if law.is_pumped), 0.0)
     settles = sum((chance for law, chance in chances if law.settles), 0.0)
-    wander = LOSS_WANDERS, MONITOR_WANDERS
-    wanders = sum((chance for law, chance in chances if law.disturbance in wander), 0.0)
+    other = None, MONITOR_SETTLES
+    wanders = sum((chance for law, chance in chances if law.disturbance not in other), 0.0)
     nodes = record.mean_current * draws.shown @ draws.weight
     share = quantity_of(draws.numbers.share, draws.weight, "1")
     found = _quantities(record, seen, draws)
@@ -994,7 +988,8 @@ def proposals(seen: SeenDecay) -> list[DrawnLaw]:
     laws += [DrawnLaw.of(seen, [*CONSTANT, CHANGE, PACE])] if seen.drifts else []
     if seen.products.count < FEWEST:
         return laws
-    beside = [seen.beside(kind) for kind in DISTURBANCES if seen.drifts or not kind.of_loss]
+    every = disturbances(float(np.exp(seen.start[1, 0])))
+    beside = [seen.beside(kind) for kind in every if seen.drifts or not kind.of_loss]
     laws += [DrawnLaw.of(own, free) for own in beside]
     return [*laws, DrawnLaw.of(beside[-1], CONSTANT)]  # a monitor that settles
 

@@ -14,14 +14,15 @@ from beamfit.lifetime.expansion import Pieces, solved
 from beamfit.lifetime.fit import fit_cycles, fit_decay, fit_decays
 from beamfit.lifetime.free_law import (
     CONSTANT,
-    DISTURBANCES,
     INTEGRAL,
+    LOSS_WANDERS,
     NODE,
     POWER,
-    WALKS,
+    SHARES,
     DrawnLaw,
     Numbers,
     SeenDecay,
+    disturbances,
     from_nodes,
     quantiles,
     settling,
@@ -115,7 +116,9 @@ def test_gas_that_is_pumped_away_is_left_open(count):
 def test_what_wanders_is_smooth_over_its_length_about_its_mean():
     """Against SIMULATED paths of 500 times, less their means: noise that is smoothed."""
     time, random = np.linspace(0.0, 1.0, 500), np.random.default_rng(0)
-    for length, half in zip((0.4, 0.2, 0.1, 0.05), WALKS, strict=True):
+    assert SHARES[-1] == 0.3
+    halves = LOSS_WANDERS.shapes[-4:] / 0.3
+    for length, half in zip((0.4, 0.2, 0.1, 0.05), halves, strict=True):
         apart = np.subtract.outer(time, np.linspace(-2.0, 3.0, 2501))
         weights = np.exp(-((apart / length) ** 2))
         paths = weights / np.linalg.norm(weights[250]) @ random.normal(size=(2501, 20_000))
@@ -133,7 +136,7 @@ def test_a_monitor_that_settles_is_followed_from_node_to_node():
         np.testing.assert_allclose(shape[:, 1], -slope * np.log(2) / 4 / np.sqrt(12), atol=1e-5)
 
 
-@pytest.mark.parametrize("kind", DISTURBANCES)
+@pytest.mark.parametrize("kind", disturbances(0.5))
 def test_a_disturbance_is_averaged_over_in_closed_form(kind):
     """The likelihood is that of the noise's covariance with the disturbance's."""
     one = record(3, noise=3.0, count=40)
