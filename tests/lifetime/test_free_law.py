@@ -14,16 +14,17 @@ from beamfit.lifetime.expansion import Pieces, solved
 from beamfit.lifetime.fit import fit_cycles, fit_decay, fit_decays
 from beamfit.lifetime.free_law import (
     CONSTANT,
+    HALF_WALK,
     INTEGRAL,
     LOSS_WANDERS,
     NODE,
     POWER,
-    SHARES,
     DrawnLaw,
     Numbers,
     SeenDecay,
     disturbances,
     from_nodes,
+    monitor_wanders,
     quantiles,
     settling,
 )
@@ -113,17 +114,23 @@ def test_gas_that_is_pumped_away_is_left_open(count):
     assert held >= count - 1
 
 
-def test_what_wanders_is_smooth_over_its_length_about_its_mean():
-    """Against SIMULATED paths of 500 times, less their means: noise that is smoothed."""
-    time, random = np.linspace(0.0, 1.0, 500), np.random.default_rng(0)
-    assert SHARES[-1] == 0.3
-    halves = LOSS_WANDERS.shapes[-4:] / 0.3
-    for length, half in zip((0.4, 0.2, 0.1, 0.05), halves, strict=True):
-        apart = np.subtract.outer(time, np.linspace(-2.0, 3.0, 2501))
-        weights = np.exp(-((apart / length) ** 2))
-        paths = weights / np.linalg.norm(weights[250]) @ random.normal(size=(2501, 20_000))
-        paths = (paths - paths.mean(axis=0))[(NODE * 499).round().astype(int)]
-        np.testing.assert_allclose(half @ half.T, paths @ paths.T / 20_000, atol=0.05)
+def test_a_walk_at_the_nodes_is_a_random_walk_about_its_mean():
+    """Against 40 000 SIMULATED walks of 1 000 steps."""
+    steps = np.random.default_rng(0).normal(size=(40_000, 1000)) / np.sqrt(1000)
+    walks = np.cumsum(steps, axis=1)
+    walks = (walks - walks.mean(axis=1, keepdims=True))[:, (NODE * 999).round().astype(int)]
+    np.testing.assert_allclose(HALF_WALK @ HALF_WALK.T, walks.T @ walks / len(walks), atol=0.01)
+
+
+def test_a_monitor_that_wanders_shows_what_a_loss_would_and_ends_apart():
+    shown, own = LOSS_WANDERS.shown(0.5), monitor_wanders(0.5)
+    inner = (own.shapes @ np.swapaxes(own.shapes, 1, 2))[0]
+    line = own.shapes[0][:, -1]
+    loss = shown[0] - INTEGRAL[-1] @ shown[0]
+    np.testing.assert_allclose(inner - np.outer(line, line), loss @ loss.T, atol=1e-15)
+    size = INTEGRAL[-1] @ np.diagonal(loss @ loss.T)
+    assert (line[-1] - line[0]) ** 2 == pytest.approx(2 * size)
+    assert own.chance[0] == pytest.approx(0.14 / 4 / (1 + size / 1e-6))
 
 
 def test_a_monitor_that_settles_is_followed_from_node_to_node():
