@@ -90,6 +90,22 @@ def walks(random: np.random.Generator) -> Callable[[np.ndarray], np.ndarray]:
     return lambda s: 1 + np.cos(np.multiply.outer(s, turns)) @ waves
 
 
+def settles(
+    random: np.random.Generator, time: np.ndarray, shown: np.ndarray, noise: float
+) -> np.ndarray:
+    """A monitor that reads .02 to .2 % high or low at first, for .01 to .15 of the record."""
+    off = random.choice([-1, 1]) * START * 10 ** random.uniform(-3.7, -2.7)
+    return shown + off * np.exp(-time / time[-1] / random.uniform(0.01, 0.15))
+
+
+def waves(
+    random: np.random.Generator, time: np.ndarray, shown: np.ndarray, noise: float
+) -> np.ndarray:
+    """A monitor that goes up and down one to five times, by 1 to 10 times the noise."""
+    turned = time / time[-1] * random.uniform(1.0, 5.0) + random.random()
+    return shown + noise * random.uniform(1.0, 10.0) * np.sin(2 * np.pi * turned)
+
+
 def noise_of(kind: str, count: int, random: np.random.Generator) -> np.ndarray:
     """Noise of variance 1."""
     if kind == "white":
@@ -205,6 +221,8 @@ FAMILIES: dict[str, Callable[[np.random.Generator], Case]] = {
     "top-up, monitor walks": lambda r: changing_top_up(r, "", walk=0.3),
     "top-up, wanders, monitor walks": lambda r: changing_top_up(r, "wanders", walk=0.3),
     "archive slower than refills": lambda r: top_up(r, r.uniform(310.0, 2000.0), 500),
+    "monitor settles": lambda r: decay(Decay(spoil=settles, level=(-4.5, -3.2)), r),
+    "monitor waves": lambda r: decay(Decay(spoil=waves, level=(-4.5, -3.5)), r),
 }
 
 
