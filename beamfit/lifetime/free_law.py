@@ -268,7 +268,8 @@ def log_pumped(share, gas, pace):
 # A disturbance is looked at beside noises that are not less likely than the likeliest by more than
 # this; fewer readings tell no noise beside a curve as free.
 BESIDE, FEWEST = 3.0, 2 * NODES
-# No monitor reads a current to less of itself: transformers of direct current to 1e-6.
+# No monitor reads a current to less of itself: transformers of direct current to 1e-6. What leaves
+# less was computed, and nothing disturbs it.
 QUIET = 1e-7
 # Width of the change of gas that is pumped away in what draws come from.
 PUMPED = 0.5
@@ -387,6 +388,12 @@ class SeenDecay:
         least = np.maximum(self.products.matrix[:, 0, 0] - explained, 1e-30)
         return least, self.products.log_prior + self.products.log_size(least)
 
+    @property
+    def noise(self) -> float:
+        """Size of the noise beside the likeliest smooth curve, in the unit of the columns."""
+        least, best = self.likely()
+        return float(np.sqrt(self.products.variance(least[np.argmax(best)], NODES)))
+
     def without_hopeless(self) -> SeenDecay:
         """Leave out noises in which no smooth curve is as likely as this one in another."""
         _, best = self.likely()
@@ -404,9 +411,8 @@ class SeenDecay:
         near = best > best.max() - BESIDE
         some, unit = self.of_noises(near), np.sqrt(self.products.variance(least[near], NODES))
         count, _, numbers = kind.shapes.shape
-        unit = np.maximum(unit, QUIET)[:, None, None]
         size, shown = (
-            (shapes[:, None] / unit).reshape(-1, NODES, numbers)
+            (shapes[:, None] / unit[:, None, None]).reshape(-1, NODES, numbers)
             for shapes in (kind.shapes, kind.shown(np.exp(self.start[1, 0])))
         )
         columns = self.origin * shown
@@ -986,7 +992,7 @@ def proposals(seen: SeenDecay) -> list[DrawnLaw]:
     free = [*CONSTANT, POWER, CHANGE] if seen.drifts else [*CONSTANT, POWER]
     laws = [DrawnLaw.of(seen, free)]
     laws += [DrawnLaw.of(seen, [*CONSTANT, CHANGE, PACE])] if seen.drifts else []
-    if seen.products.count < FEWEST:
+    if seen.products.count < FEWEST or seen.noise < QUIET:
         return laws
     every = disturbances(float(np.exp(seen.start[1, 0])))
     beside = [seen.beside(kind) for kind in every if seen.drifts or not kind.of_loss]

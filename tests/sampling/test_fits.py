@@ -371,13 +371,28 @@ def test_arviz_gets_walkers_as_chains(beam, monkeypatch, version):
     assert given["sample_stats"]["lp"].shape == (walkers, steps)
 
 
-def test_a_decay_that_no_law_follows_is_sampled_all_the_same():
-    """SIMULATED: a vacuum that rises and falls leaves no white noise likely, and none is drawn."""
+@pytest.mark.parametrize(
+    ("course", "status", "lifetime"),
+    [
+        (
+            lambda t: 600 * (1 - np.exp(-t / 2000)) + 45 * (1 - np.cos(t / 900)),
+            "unidentified",
+            47.57,
+        ),
+        (lambda t: 3 * np.clip(t - 9000, 0, 6000), "poor_fit", None),
+    ],
+)
+def test_a_decay_that_no_law_follows_is_sampled_all_the_same(course, status, lifetime):
+    """SIMULATED: a vacuum that rises and falls, or is worse for a while, leaves no white noise
+    likely, and none is drawn.
+    """
     time = np.linspace(0.0, 8 * 3600.0, 300)
-    gas = time + 600 * (1 - np.exp(-time / 2000)) + 45 * (1 - np.cos(time / 900))
-    left = np.exp(-4.9e-6 * gas)
+    left = np.exp(-4.9e-6 * (time + course(time)))
     beam = 100 * left / (1 + 1e-6 * np.cumsum(left) * time[1])
     noise = 0.01 * np.random.default_rng(1).normal(size=time.size)
     fit = beamfit.fit_decay(beamfit.DecayRecord(time, beam + noise))
-    assert fit.status == "poor_fit"
-    assert fit.sample(seed=1).status == "poor_fit"
+    assert fit.status == status
+    assert fit.sample(seed=1).status == "unidentified"
+    if lifetime is not None:  # of the rates at the mean current, h
+        low, high = fit.lifetime_mean.interval_95
+        assert low <= lifetime <= high
