@@ -92,7 +92,7 @@ def _turned(matrices: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class Disturbance:
-    """What goes by itself beside the law: a loss rate or a monitor.
+    """A loss rate or a monitor that goes by itself beside the law.
 
     Parameters
     ----------
@@ -109,7 +109,7 @@ class Disturbance:
     of_loss: bool = False
 
     def shown(self, rate: float) -> np.ndarray:
-        """What the monitor shows of it, as a share of the current."""
+        """Give the share of the current by which the monitor shows it."""
         return -rate * (INTEGRAL @ self.shapes) if self.of_loss else self.shapes
 
 
@@ -692,7 +692,7 @@ class DrawnLaw(NamedTuple):
 
     @property
     def disturbance(self) -> Disturbance | None:
-        """What goes by itself beside the law."""
+        """The disturbance beside the law, if there is any."""
         return self.seen.disturbed and self.seen.disturbed.kind
 
     def _log_prior(self, numbers: Numbers) -> np.ndarray:
@@ -901,7 +901,7 @@ class FreeLaw:
         return self.likelier and self.wanders > LIKELIER
 
     def curve(self, time: np.ndarray) -> np.ndarray:
-        """What the monitor shows in the mean at times in s, mA."""
+        """Mean of the monitor's readings at times in s, mA."""
         return from_nodes(time / self.span) @ self.nodes
 
     def to_json(self) -> dict[str, object]:
