@@ -417,10 +417,8 @@ def _likely(plain: Expansion) -> dict[Alternative, _Further]:
 
     def log_evidence(one: Alternative) -> float:
         own, width = [0, 1, 2, 3, *places[one]], np.append([np.inf] * 3, widths[one])
-        own = np.eye(len(columns))[:, own]
-        return _laplace(products.combined(own), width, np.zeros(width.size)) + _log_chance(
-            one, plain
-        )
+        some = products.combined(np.eye(len(columns))[:, own])
+        return _laplace(some, width, np.zeros(width.size)) + _log_chance(one, plain)
 
     constant = log_evidence(CONSTANT) + HOPELESS
     return {one: more for one, more in best.items() if log_evidence(one) > constant}

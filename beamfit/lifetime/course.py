@@ -253,7 +253,7 @@ def _point(
     relative: list[Quantity | None] = [None, None]
     law = fit.free_law
     same = usual is not None and not usual.power and fit.status is not Status.poor_fit
-    if same and not (law and (law.is_pumped or law.is_settling or law.is_wandering)):
+    if same and not (law is not None and law.goes_in_time):
         relative = [
             None if q.error is None else Quantity(q.value / by, q.error / by, "1")
             for q, by in ((fit.if_constant("a"), usual.a * a), (fit.if_constant("b"), usual.b * b))

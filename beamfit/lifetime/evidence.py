@@ -640,8 +640,7 @@ class Evidence:
             known = self.separability.separable and not (refuted and self.course)
         else:
             plain = not self.shaped and self.about.pieces.gauge is None
-            law = self.free
-            own = law and (law.is_pumped or law.is_settling or law.is_wandering)
+            own = self.free is not None and self.free.goes_in_time
             known = plain and refuted and self.outgassing is None and not own
         return lifetime_law(self.about, self.independent, refuted) if known else None
 

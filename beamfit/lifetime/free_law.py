@@ -900,6 +900,11 @@ class FreeLaw:
         """True if what is quoted is beside a loss rate or a monitor that wanders."""
         return self.likelier and self.wanders > LIKELIER
 
+    @property
+    def goes_in_time(self) -> bool:
+        """True if gas or a disturbance stands beside the a and b that are quoted."""
+        return self.is_pumped or self.is_settling or self.is_wandering
+
     def curve(self, time: np.ndarray) -> np.ndarray:
         """Mean of the monitor's readings at times in s, mA."""
         return from_nodes(time / self.span) @ self.nodes

@@ -90,8 +90,8 @@ class DecayNumbers(NamedTuple):
 class _Data(NamedTuple):
     """Readings as of `SeenDecay`, the matrix that takes nodes to the first reading, the middle and
     the last one, mean current, mA, and span, s; shifts of I0, a and b by what is stated of the
-    monitor, shape (k, 3). Of each noise, beside which law it is: any; with a monitor
-    that is off the free one, or constant a and b.
+    monitor, shape (k, 3). Of each noise, beside which law it is: any; with a monitor that is off
+    the free one, or constant a and b.
     """
 
     matrix: Array
