@@ -439,12 +439,14 @@ class SeenDecay:
         """Currents at the nodes, (18, d), as multiples of the columns that they leave."""
         return np.vstack([-np.ones(currents.shape[1]), currents - self.origin])
 
-    def squares(self, currents: np.ndarray, kind: np.ndarray) -> np.ndarray:
-        """Whitened squares of what currents leave, in the noises of these places, in order."""
-        away, squares = self.away(currents), np.empty(kind.size)
+    def along(self, away: np.ndarray, kind: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Products of the columns with what currents leave, in the noises of these places, in
+        order, and its squares.
+        """
+        along = np.empty_like(away)
         for matrix, part in zip(self.products.matrix, self._parts(kind), strict=True):
-            squares[part] = np.sum(away[:, part] * (matrix @ away[:, part]), axis=0)
-        return np.maximum(squares, 1e-30)
+            along[:, part] = matrix @ away[:, part]
+        return along, np.maximum(np.sum(away * along, axis=0), 1e-30)
 
     def _parts(self, kind: np.ndarray) -> list[slice]:
         """Draws of each noise: of one noise they are one product of matrices."""
@@ -558,7 +560,7 @@ def _expanded(seen: SeenDecay, numbers: np.ndarray, free: list[int]) -> Peaks:
     by_share = share[:-1, None]
     moved = share[-1] + np.sum(by_share * step, axis=0)
     log = log + _log_within(seen.share, moved, _spread(lower, by_share))
-    log = log + np.log(np.abs(by_share[1]))  # the share is flat, not the bend
+    log = log + np.log(np.abs(by_share[2]))  # the share is flat, not the bend
     log = log + log_prior(numbers[POWER])[0] - np.log(np.maximum(numbers[PACE], 1.0))
     if np.any(numbers[PACE]):  # gas that is pumped away gets less
         own = np.broadcast_to(np.eye(len(free))[-1][:, None, None], by_share.shape)
@@ -650,17 +652,20 @@ def _rows(free: Sequence[int]) -> tuple[list[int], list[int]]:
     """Rows of numbers that are nearly normal, in the order that they are eliminated in, and of
     those at places.
     """
-    return [r for r in (0, BEND, 1, CHANGE) if r in free], [r for r in (POWER, PACE) if r in free]
+    return [r for r in (0, 1, BEND, CHANGE) if r in free], [r for r in (POWER, PACE) if r in free]
 
 
 class DrawnLaw(NamedTuple):
-    """A law that is drawn from: the record with the noises that are left, its peaks, and rows of
-    the numbers that are free.
+    """A law that is drawn from: the record with the noises that are left, its peaks, rows of the
+    numbers that are free, and at each place slopes by ln level and ln rate, the share being the
+    same, (19, 2, m), and lower triangles of their products by noise, (2, 2, k, m).
     """
 
     seen: SeenDecay
     peaks: Peaks
     free: tuple[int, ...]
+    slopes: np.ndarray
+    beam: np.ndarray
 
     @classmethod
     def of(cls, seen: SeenDecay, free: Sequence[int]) -> DrawnLaw:
@@ -675,10 +680,12 @@ class DrawnLaw(NamedTuple):
         else:
             found = _searched(seen, seen.start, normal)
         kept = found.log.max(axis=1) > found.log.max() - FAR
-        if not kept.any():  # not finite
-            return cls(seen, found, tuple(free))
-        peaks = Peaks(*(part[..., kept, :] for part in found[:3]), found.numbers)
-        return cls(seen.of_noises(kept), peaks, tuple(free))
+        if kept.any():  # finite
+            found = Peaks(*(part[..., kept, :] for part in found[:3]), found.numbers)
+            seen = seen.of_noises(kept)
+        slopes, share = _seen_slopes(seen, found.numbers, normal)
+        slopes = slopes[:, :2] - slopes[:, [2]] * share[:2] / share[2]
+        return cls(seen, found, tuple(free), slopes, _triangle(seen.products.between(slopes)))
 
     @property
     def is_pumped(self) -> bool:
@@ -706,9 +713,10 @@ class DrawnLaw(NamedTuple):
 
     def _proposed(self, draws: int, seed: int) -> tuple[np.ndarray, Numbers, np.ndarray]:
         """Noises, in order, numbers and their log density of draws from the normal approximations,
-        with wider tails: of shares and changes of the gas between their bounds.
+        with wider tails: changes of the gas and shares between their bounds, and levels and rates
+        about the best ones beside these, found anew.
         """
-        seen, peaks, free = self
+        seen, peaks, free = self[:3]
         odds = np.exp(peaks.log - peaks.log.max()).ravel()
         ends = np.cumsum(odds) / odds.sum()
         which = np.minimum(np.searchsorted(ends, (np.arange(draws) + 0.5) / draws), odds.size - 1)
@@ -716,21 +724,47 @@ class DrawnLaw(NamedTuple):
         lower, centre = peaks.lower[..., kind, at], peaks.centre[:, kind, at]
         (rows, places), numbers = _rows(free), peaks.numbers[:, at]
         even, far = _even(draws, len(rows), seed), np.full(draws, np.inf)
-        own, log = _between(even, -far, far)
-        if self.is_pumped:  # gas gets less
-            own[-1], log[-1] = _between(even[-1], -far, -centre[-1] * lower[-1, -1])
+        own, log = np.zeros_like(centre), np.zeros(draws)
+        if CHANGE in free:
+            most = -centre[-1] * lower[-1, -1] if self.is_pumped else far  # gas gets less
+            own[-1], more = _between(even[-1], -far, most)
+            log = more + np.log(lower[-1, -1])
         numbers[rows] = centre + _backward(lower, own)
-        named = Numbers.of(numbers)  # the bend is found after the rate and the change
-        low, high = (own[1] + lower[1, 1] * (s - named.share) / named.unit for s in seen.share)
-        own[1], log[1] = _between(even[1], np.minimum(low, high), np.maximum(low, high))
+        named = Numbers.of(numbers)
+        bounds = [lower[2, 2] * (s - named.share) / named.unit for s in seen.share]
+        own[2], more = _between(even[2], np.minimum(*bounds), np.maximum(*bounds))
+        log = log + more + np.log(lower[2, 2] / np.abs(named.unit))
+        share = named.share + named.unit * own[2] / lower[2, 2]
         numbers[rows] = centre + _backward(lower, own)
-        log = np.sum(log + np.log(np.einsum("ppd->pd", lower)), axis=0)
+        gas = named.gas if self.is_pumped else (1 - share) * numbers[CHANGE]
+        named = Numbers.of(numbers)._replace(share=share, gas=gas)
+        step, lower = self._best_beam(kind, at, named)
+        for k in (0, 1):
+            own[k], more = _between(even[k], -far, far)
+            log = log + more + np.log(lower[k, k])
+        step = np.clip(step + _backward(lower, own[:2]), -5.0, 5.0)
+        named = named._replace(
+            level=named.level * np.exp(step[0]), rate=named.rate * np.exp(step[1])
+        )
         spacing = math.prod(np.diff(peaks.numbers[row])[0] for row in places)
-        return kind, Numbers.of(numbers), log + np.log(odds[which] / odds.sum() / spacing)
+        return kind, named, log + np.log(odds[which] / odds.sum() / spacing)
+
+    def _best_beam(
+        self, kind: np.ndarray, at: np.ndarray, near: Numbers
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Steps of ln level and ln rate to the best ones beside the other numbers, and lower
+        triangles of their inverse covariance.
+        """
+        seen, lower = self.seen, self.beam[..., kind, at]
+        away = seen.away(near.currents(seen.gas))
+        along, squares = seen.along(away, kind)
+        pull = _forward(lower, -np.sum(self.slopes[..., at] * along[:, None], axis=0))
+        left = np.maximum(squares - np.sum(pull**2, axis=0), 1e-30)
+        return _backward(lower, pull), lower / np.sqrt(seen.products.variance(left, 2))
 
     def weighed(self, draws: int, seed: int = 0) -> Draws:
         """Draw from the normal approximations, each draw weighed by the posterior."""
-        seen, peaks, _ = self
+        seen, peaks = self[:2]
         if not np.isfinite(peaks.log).all():
             numbers, none = Numbers.of(peaks.numbers), np.zeros(peaks.log.shape[1])
             currents = numbers.currents(seen.gas)
@@ -738,10 +772,9 @@ class DrawnLaw(NamedTuple):
             return Draws(numbers, walk, currents, currents, none, -np.inf, 0.0)
         kind, numbers, given = self._proposed(draws, seed)
         currents = numbers.currents(seen.gas)
-        squares = seen.squares(currents, kind)
+        _, squares = seen.along(seen.away(currents), kind)
         log = seen.products.log_prior[kind] + seen.products.log_size(squares)
-        log = log + np.log(numbers.level * numbers.rate * np.abs(numbers.unit))
-        log = log + self._log_prior(numbers) - given
+        log = log + np.log(numbers.level * numbers.rate) + self._log_prior(numbers) - given
         whole = float(logsumexp(log))
         weight = np.exp(log - max(whole, -1e300))
         worth = float(weight.sum() / max(np.sum(weight**2), 1e-300))

@@ -283,15 +283,14 @@ class Posterior:
         return self._number(name)[1]
 
     def __getitem__(self, name: str) -> Quantity:
-        """Mean of a number, and half of its central 68 %; no error where the data do not decide."""
-        values = self.values(name)
-        if not values.size:
-            return Quantity(float("nan"), None, self.unit(name))
-        low, one, _, other, high = map(float, self.quantiles(name))
-        mean, unit = float(np.mean(values)), self.unit(name)
-        if name in self.held or self.apart:
-            return Quantity(mean, None, unit)
-        return Quantity(mean, 0.5 * (other - one), unit, interval_95=(low, high))
+        """Median of a number, as fits quote, and half of its central 68 %; no error where the data
+        do not decide.
+        """
+        low, one, middle, other, high = map(float, self.quantiles(name))
+        unit = self.unit(name)
+        if not self.values(name).size or name in self.held or self.apart:
+            return Quantity(middle, None, unit)
+        return Quantity(middle, 0.5 * (other - one), unit, interval_95=(low, high))
 
     def quantiles(self, name: str, probabilities: Sequence[float] | None = None) -> np.ndarray:
         """Quantiles of a number; NaN where nothing was sampled. By default the median and the ends
@@ -402,7 +401,7 @@ class Posterior:
         return f"{self.status}: {draws} draws of {brief(self.names)}"
 
     def summary(self, name: str) -> Summary:
-        """A number's mean, standard deviation and quantiles, and whether they may be quoted."""
+        """A number's median and quantiles, and whether they may be quoted."""
         doubt = "walkers disagree" if self.apart else ""
         doubt = "the prior's" if name in self.held else doubt
         return Summary(name, self[name], self.quantiles(name), doubt)
