@@ -382,10 +382,7 @@ class SeenDecay:
 
     def likely(self) -> tuple[np.ndarray, np.ndarray]:
         """Squares that the likeliest smooth curve leaves in each noise, and its log likelihood."""
-        along, matrix = self.products.matrix[:, 1:, :1], self.products.matrix[:, 1:, 1:]
-        known = LEAST_LEFT * np.trace(matrix, axis1=1, axis2=2)[:, None, None] * np.eye(NODES)
-        explained = np.sum(along * np.linalg.solve(matrix + known, along), axis=(1, 2))
-        least = np.maximum(self.products.matrix[:, 0, 0] - explained, 1e-30)
+        least = np.maximum(self.products.left(), 1e-30)
         return least, self.products.log_prior + self.products.log_size(least)
 
     @property
