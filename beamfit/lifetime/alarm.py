@@ -90,6 +90,12 @@ def either(chosen: np.ndarray, new: np.ndarray, old: np.ndarray) -> np.ndarray:
     return np.where(np.reshape(chosen, shape), new, old)
 
 
+def emptied(state: AlarmState, chosen: np.ndarray) -> AlarmState:
+    """Let windows begin anew."""
+    names = ("age", "weight", "product", "past")
+    return state._replace(**{name: either(chosen, 0.0, getattr(state, name)) for name in names})
+
+
 def with_reading(
     state: AlarmState, before: np.ndarray, path: np.ndarray, weight: np.ndarray, step: np.ndarray
 ) -> dict[str, np.ndarray]:
@@ -101,7 +107,7 @@ def with_reading(
     turns = np.floor((clock - PHASES) / LENGTHS)
     due = np.floor((clock + step[..., None] - PHASES) / LENGTHS) > turns
     due = np.concatenate([due, np.zeros_like(clock, bool)], axis=-1)
-    before = np.where(due, 0.0, before)
+    state, before = emptied(state, due), np.where(due, 0.0, before)
     total = before + weight[..., None]
     share = np.where(total > 0, weight[..., None] / np.where(total > 0, total, 1.0), 0.0)
     off = np.where((before > 0)[..., None], path[..., None, :] - state.mean, 0.0)
@@ -109,11 +115,8 @@ def with_reading(
     mean = np.where(start, path[..., None, :], state.mean + share[..., None] * off)
     y, u, v = np.moveaxis(off, -1, 0)
     pairs = np.stack([u * u, u * v, v * v, u * y, v * y], axis=-1)
-    product = np.where(due[..., None], 0.0, state.product)
-    product = product + (share * before)[..., None] * pairs
-    age = np.where(due, 0.0, state.age) + step[..., None]
-    past = np.where(due[..., None], 0.0, state.past)
-    return {"age": age, "weight": total, "mean": mean, "product": product, "past": past}
+    product, age = state.product + (share * before)[..., None] * pairs, state.age + step[..., None]
+    return {"age": age, "weight": total, "mean": mean, "product": product, "past": state.past}
 
 
 def beside(product: np.ndarray, covariance: np.ndarray) -> np.ndarray:
@@ -193,11 +196,7 @@ def set_off(state: AlarmState, raised: np.ndarray, best: np.ndarray) -> AlarmSta
     anew = raised[..., None] & (np.arange(LENGTHS.size + 1) == LENGTHS.size)
     level = np.take_along_axis(state.mean[..., 0], best[..., None], -1)[..., 0]
     age = np.take_along_axis(state.age, best[..., None], -1)[..., 0]
-    return state._replace(
-        age=np.where(anew, 0.0, state.age),
-        weight=np.where(anew, 0.0, state.weight),
-        product=np.where(anew[..., None], 0.0, state.product),
-        past=np.where(anew[..., None], 0.0, state.past),
+    return emptied(state, anew)._replace(
         raised=np.where(raised, 0.0, state.raised),
         excess=np.where(raised, state.path[..., 0] - level, state.excess),
         before=np.where(raised, age, state.before),
@@ -539,10 +538,9 @@ def _adopted(
     state: AlarmState, done: np.ndarray, change: np.ndarray, covariance: np.ndarray
 ) -> AlarmState:
     """After a named alarm, take the loss that was found as the usual one."""
-    names = ("age", "weight", "product", "past")
-    new = {name: np.zeros_like(getattr(state, name)) for name in names}
-    new["factor"], new["covariance"] = state.factor * (1 + change), state.covariance + covariance
-    new["raised"] = np.full_like(state.raised, np.nan)
+    factor, covariance = state.factor * (1 + change), state.covariance + covariance
+    new = {"factor": factor, "covariance": covariance, "raised": np.full_like(state.raised, np.nan)}
+    state = emptied(state, done[..., None])
     return state._replace(**{n: either(done, v, getattr(state, n)) for n, v in new.items()})
 
 
