@@ -23,6 +23,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.polynomial.chebyshev import chebint, chebvander
+from scipy.linalg import block_diag
 from scipy.special import expit, log_expit, log_ndtr, logsumexp, ndtri
 
 from beamfit.arrays import array_module
@@ -266,8 +267,8 @@ def log_pumped(share, gas, pace):
 
 
 # A disturbance is looked at beside noises that are not less likely than the likeliest by more than
-# this; fewer readings tell no noise beside a curve as free.
-BESIDE, FEWEST = 3.0, 2 * NODES
+# this; fewer readings tell no noise beside a curve as free as the law.
+BESIDE, FEWEST = 3.0, 10
 # No monitor reads a current to less of itself: transformers of direct current to 1e-6. What leaves
 # less was computed, and nothing disturbs it.
 QUIET = 1e-7
@@ -380,16 +381,22 @@ class SeenDecay:
         products = Products.of(rows, time, error is not None)
         return cls(products, start, origin, gas, ends, record.gauge is None).without_hopeless()
 
+    @property
+    def smooth(self) -> int:
+        """Numbers of a smooth curve, of few readings half as many as these."""
+        return min(NODES, self.products.count // 2)
+
     def likely(self) -> tuple[np.ndarray, np.ndarray]:
         """Squares that the likeliest smooth curve leaves in each noise, and its log likelihood."""
-        least = np.maximum(self.products.left(), 1e-30)
+        curve = block_diag(1.0, chebvander(ANGLE, self.smooth - 1))
+        least = np.maximum(self.products.combined(curve).left(), 1e-30)
         return least, self.products.log_prior + self.products.log_size(least)
 
     @property
     def noise(self) -> float:
         """Size of the noise beside the likeliest smooth curve, in the unit of the columns."""
         least, best = self.likely()
-        return float(np.sqrt(self.products.variance(least[np.argmax(best)], NODES)))
+        return float(np.sqrt(self.products.variance(least[np.argmax(best)], self.smooth)))
 
     def without_hopeless(self) -> SeenDecay:
         """Leave out noises in which no smooth curve is as likely as this one in another."""
@@ -406,7 +413,7 @@ class SeenDecay:
         """The same with a disturbance, averaged over, beside the likeliest noises."""
         least, best = self.likely()
         near = best > best.max() - BESIDE
-        some, unit = self.of_noises(near), np.sqrt(self.products.variance(least[near], NODES))
+        some, unit = self.of_noises(near), np.sqrt(self.products.variance(least[near], self.smooth))
         count, _, numbers = kind.shapes.shape
         size, shown = (
             (shapes[:, None] / unit[:, None, None]).reshape(-1, NODES, numbers)
