@@ -14,6 +14,7 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.linalg import block_diag
 from scipy.special import logsumexp, ndtri
 
 from beamfit.answer import json_of, shown
@@ -44,6 +45,7 @@ from beamfit.lifetime.free_law import (
     TIMES,
     disturbances,
     from_nodes,
+    smooth_curves,
 )
 from beamfit.lifetime.record import DecayRecord
 from beamfit.noise.memory import Products
@@ -544,7 +546,10 @@ def _log_evidence(law: Expansion, one: Alternative) -> float:
     products = Products.of(rows, law.pieces.time, law.pieces.error is not None)
     own = np.eye(rows.shape[1])[:, : 1 + width.size]
     found = [_laplace(products.combined(own), width, centre)]
-    log = products.log_prior + products.log_size(products.left())
+    # Few readings tell no noise beside as many numbers.
+    curves = smooth_curves(max(products.count // 2 - width.size, 0))
+    smooth = products.combined(block_diag(np.eye(1 + width.size), curves))
+    log = smooth.log_prior + smooth.log_size(smooth.left())
     near = products.some(log > log.max() - BESIDE)
     for kind in disturbances(law.numbers[0]):
         if kind.of_loss and law.pieces.gauge is not None:

@@ -175,7 +175,8 @@ def _explained(e: Evidence | TableEvidence) -> str | None:
 
 def _refuted(e: Evidence | TableEvidence) -> Finding | None:
     """Data that refute constant a and b: what is quoted of them is not of this beam."""
-    if (e.constant_a.status is not Status.poor_fit and not e.changed) or e.free is not None:
+    shown = e.constant_a.status is Status.poor_fit or e.changed or e.explained is not None
+    if not shown or e.free is not None:
         return None
     offered = "" if e.lifetimes is None else f". Use the lifetime by current: {e.lifetimes}"
     if (explained := _explained(e)) is not None:

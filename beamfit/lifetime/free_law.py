@@ -87,6 +87,17 @@ def from_nodes(s: np.ndarray) -> np.ndarray:
     return chebvander(2 * s - 1, NODES - 1) @ FROM_NODES
 
 
+def smooth_curves(count: int) -> np.ndarray:
+    """Smooth curves of so many numbers at most at the nodes, (18, m).
+
+    Examples
+    --------
+    >>> smooth_curves(2).round(1)[[0, -1]].tolist()
+    [[1.0, -1.0], [1.0, 1.0]]
+    """
+    return chebvander(ANGLE, NODES - 1)[:, :count]
+
+
 def _turned(matrices: np.ndarray) -> np.ndarray:
     return np.swapaxes(matrices, 1, 2)
 
@@ -388,7 +399,7 @@ class SeenDecay:
 
     def likely(self) -> tuple[np.ndarray, np.ndarray]:
         """Squares that the likeliest smooth curve leaves in each noise, and its log likelihood."""
-        curve = block_diag(1.0, chebvander(ANGLE, self.smooth - 1))
+        curve = block_diag(1.0, smooth_curves(self.smooth))
         least = np.maximum(self.products.combined(curve).left(), 1e-30)
         return least, self.products.log_prior + self.products.log_size(least)
 

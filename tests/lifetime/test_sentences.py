@@ -26,6 +26,19 @@ def test_one_far_reading_is_no_step_to_cut_at():
     assert "split_record" not in fit.message
 
 
+@pytest.mark.parametrize("seed", [6, 9, 24])
+def test_a_and_b_without_errors_are_not_called_determined(seed):
+    """SIMULATED: few readings whose first lies high, which current lost after it explains."""
+    random = np.random.default_rng(seed)
+    time = np.linspace(0.0, 15 * HOUR, int(random.integers(12, 36)))
+    beam = 300 / (1 + 4e-8 * 300 * -np.expm1(-6e-6 * time) / 6e-6) * np.exp(-6e-6 * time)
+    noise = 0.03 * random.normal(size=time.size)
+    first = 0.3 * np.exp(-time / time[-1] * random.uniform(20, 60))
+    fit = fit_decay(DecayRecord(time, beam + noise + first))
+    assert (fit.a.error is None) == (fit.status is not Status.converged)
+    assert "are determined" not in fit.message
+
+
 def test_a_drift_is_not_called_an_exponent_that_is_zero():
     time, _ = decay()
     noise = 3e-4 * np.random.default_rng(2).normal(size=time.size)
