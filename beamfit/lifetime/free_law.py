@@ -728,54 +728,55 @@ class DrawnLaw(NamedTuple):
 
     def _proposed(self, draws: int, seed: int) -> tuple[np.ndarray, Numbers, np.ndarray]:
         """Noises, in order, numbers and their log density of draws from the normal approximations,
-        with wider tails: changes of the gas and shares between their bounds, and levels and rates
-        about the best ones beside these, found anew.
+        with wider tails.
         """
-        seen, peaks, free = self[:3]
+        peaks, (rows, places) = self.peaks, _rows(self.free)
         odds = np.exp(peaks.log - peaks.log.max()).ravel()
         ends = np.cumsum(odds) / odds.sum()
         which = np.minimum(np.searchsorted(ends, (np.arange(draws) + 0.5) / draws), odds.size - 1)
         kind, at = np.unravel_index(which, peaks.log.shape)
+        even = _even(draws, len(rows), seed)
+        near, log = self._with_share(kind, at, even[2:])
+        numbers, more = self._with_beam(kind, at, near, even[:2])
+        spacing = math.prod(np.diff(peaks.numbers[row])[0] for row in places)
+        return kind, numbers, log + more + np.log(odds[which] / odds.sum() / spacing)
+
+    def _with_share(
+        self, kind: np.ndarray, at: np.ndarray, even: np.ndarray
+    ) -> tuple[Numbers, np.ndarray]:
+        """Draw changes of the gas and shares of a between their bounds."""
+        peaks, free = self.peaks, self.free
         lower, centre = peaks.lower[..., kind, at], peaks.centre[:, kind, at]
-        (rows, places), numbers = _rows(free), peaks.numbers[:, at]
-        even, far = _even(draws, len(rows), seed), np.full(draws, np.inf)
-        own, log = np.zeros_like(centre), np.zeros(draws)
+        rows, numbers, own = _rows(free)[0], peaks.numbers[:, at], np.zeros_like(centre)
+        log, far = np.zeros(kind.size), np.full(kind.size, np.inf)
         if CHANGE in free:
             most = -centre[-1] * lower[-1, -1] if self.is_pumped else far  # gas gets less
-            own[-1], more = _between(even[-1], -far, most)
-            log = more + np.log(lower[-1, -1])
+            own[-1], log = _between(even[-1], -far, most)
+            log = log + np.log(lower[-1, -1])
         numbers[rows] = centre + _backward(lower, own)
-        named = Numbers.of(numbers)
-        bounds = [lower[2, 2] * (s - named.share) / named.unit for s in seen.share]
-        own[2], more = _between(even[2], np.minimum(*bounds), np.maximum(*bounds))
-        log = log + more + np.log(lower[2, 2] / np.abs(named.unit))
-        share = named.share + named.unit * own[2] / lower[2, 2]
+        middle = Numbers.of(numbers)
+        bounds = [lower[2, 2] * (s - middle.share) / middle.unit for s in self.seen.share]
+        own[2], more = _between(even[0], np.minimum(*bounds), np.maximum(*bounds))
+        share = middle.share + middle.unit * own[2] / lower[2, 2]
         numbers[rows] = centre + _backward(lower, own)
-        gas = named.gas if self.is_pumped else (1 - share) * numbers[CHANGE]
-        named = Numbers.of(numbers)._replace(share=share, gas=gas)
-        step, lower = self._best_beam(kind, at, named)
-        for k in (0, 1):
-            own[k], more = _between(even[k], -far, far)
-            log = log + more + np.log(lower[k, k])
-        step = np.clip(step + _backward(lower, own[:2]), -5.0, 5.0)
-        named = named._replace(
-            level=named.level * np.exp(step[0]), rate=named.rate * np.exp(step[1])
-        )
-        spacing = math.prod(np.diff(peaks.numbers[row])[0] for row in places)
-        return kind, named, log + np.log(odds[which] / odds.sum() / spacing)
+        gas = middle.gas if self.is_pumped else (1 - share) * numbers[CHANGE]
+        found = Numbers.of(numbers)._replace(share=share, gas=gas)
+        return found, log + more + np.log(lower[2, 2] / np.abs(middle.unit))
 
-    def _best_beam(
-        self, kind: np.ndarray, at: np.ndarray, near: Numbers
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Steps of ln level and ln rate to the best ones beside the other numbers, and lower
-        triangles of their inverse covariance.
-        """
+    def _with_beam(
+        self, kind: np.ndarray, at: np.ndarray, near: Numbers, even: np.ndarray
+    ) -> tuple[Numbers, np.ndarray]:
+        """Draw levels and rates about the best ones beside the other numbers, found anew."""
         seen, lower = self.seen, self.beam[..., kind, at]
-        away = seen.away(near.currents(seen.gas))
-        along, squares = seen.along(away, kind)
+        along, squares = seen.along(seen.away(near.currents(seen.gas)), kind)
         pull = _forward(lower, -np.sum(self.slopes[..., at] * along[:, None], axis=0))
         left = np.maximum(squares - np.sum(pull**2, axis=0), 1e-30)
-        return _backward(lower, pull), lower / np.sqrt(seen.products.variance(left, 2))
+        noise, far = np.sqrt(seen.products.variance(left, 2)), np.full(kind.size, np.inf)
+        own, log = _between(even, -far, far)
+        step = _backward(lower, pull + noise * own)
+        level, rate = np.exp(np.clip(np.log([near.level, near.rate]) + step, -30.0, 8.0))
+        log = np.sum(log, axis=0) + np.log(lower[0, 0] * lower[1, 1] / noise**2)
+        return near._replace(level=level, rate=rate), log
 
     def weighed(self, draws: int, seed: int = 0) -> Draws:
         """Draw from the normal approximations, each draw weighed by the posterior."""
