@@ -18,15 +18,16 @@ from beamfit.dynamics.alternatives import FURTHER, GROWTH, Alternatives
 from beamfit.dynamics.bad_readings import BadReadings
 from beamfit.dynamics.checks import Checks, HeldOutRun
 from beamfit.dynamics.input_laws import STATIC
-from beamfit.dynamics.limits import LagLimits
+from beamfit.dynamics.limits import LagLimits, LagPosterior
 from beamfit.dynamics.model import PreparedOutput, curves
 from beamfit.dynamics.response import ARX, FIRST_ORDER, SECOND_ORDER, Physics, mean_step
+from beamfit.dynamics.search import Begun
 from beamfit.errors import Finding, Status
 from beamfit.greybox.fit import Derived, Fit
 from beamfit.greybox.judge import gauges, together
 from beamfit.noise.correlated import Memory
 from beamfit.quantity import Quantity
-from beamfit.statistics import POOR_FIT
+from beamfit.statistics import POOR_FIT, quantity_of_draws
 
 # Points of a curve; samples within a share of its range that make a point visited.
 POINTS, VISITS, NEAR = 41, 5, 0.05
@@ -100,42 +101,59 @@ def _quoted(model: Any, of: tuple[Any, float]) -> jax.Array:
 
 
 def quantities_of(
-    fit: Fit,
-    errors: Memory | None,
+    begun: Begun,
     others: Alternatives | None,
-    seen: PreparedOutput,
-    physics: Physics,
+    lags: LagPosterior,
     digits: np.ndarray,
     unsure: Sequence[float],
 ) -> dict[str, Quantity]:
     """Constant parameters with errors, and the offset and the delay if they are free.
 
-    `digits` is the covariance of the numbers by the digits of the output, `unsure` has the share by
-    which each input's own errors make its gain unsure.
+    Of a first order the lag, gains and offset have the errors of `lags`. `digits` is the
+    covariance of the numbers by the digits of the output, `unsure` has the share by which each
+    input's own errors make its gain unsure.
     """
-    m = len(seen.inputs)
-    found = alone = derived(fit, errors, _quoted, (seen.runs[0], seen.delay))
-    if others is not None:
-        late = others.late * seen.parts * float(mean_step(seen.runs[0].dt))
-        error = others.error(alone.slope[:-1], alone.error[:-1])
-        found = alone._replace(error=np.append(error, late))
+    seen, fit, physics = begun.seen, begun.settled.fit, begun.seen.runs[0].physics
+    m, drawn = len(seen.inputs), {}
+    found = derived(fit, begun.settled.errors, _quoted, (seen.runs[0], seen.delay))
     names, units = list(physics.parameters(seen.inputs)), _units(physics, m)
+    gains = FIRST_ORDER.parameters(seen.inputs)[1:]
     if physics is FIRST_ORDER:
-        names, units = [*names, *(f"{k}/tau" for k in names[1:])], [*units, *[f"{GAIN}/s"] * m]
-    if physics is SECOND_ORDER and found.value[1] > 1.0:
+        names, units = [*names, *(f"{k}/tau" for k in gains)], [*units, *[f"{GAIN}/s"] * m]
+        drawn = lags.drawn(gains)
+    if physics is SECOND_ORDER:
         names, units = [*names, "tau1", "tau2"], [*units, TIME, TIME]
     if physics is ARX:
-        names, units = [*names, *FIRST_ORDER.parameters(seen.inputs)[1:]], [*units, *[GAIN] * m]
-    gains, shares = [GAIN in unit for unit in units], np.zeros(len(found.value))
-    shares[: len(units)][gains] = np.resize(unsure, sum(gains))  # of all inputs in turn
-    found = widened(found, digits, shares)
-    said = {
-        name: quantity(found, i, unit)
-        for i, (name, unit) in enumerate(zip(names, units, strict=True))
-    }
+        names, units = [*names, *gains], [*units, *[GAIN] * m]
+    names, units = [*names, "offset", "delay"], [*units, "output", TIME]
+    each = {n: quantity_of_draws(drawn[n], "", found.value[names.index(n)]) for n in drawn}
+    alone = np.array([each[n].error if n in each else error
+                      for n, error in zip(names, found.error, strict=True)])  # fmt: skip
+    alone = np.where(np.isfinite(found.error), alone, np.nan)
+    error = alone
+    if others is not None:
+        late = others.late * seen.parts * float(mean_step(seen.runs[0].dt))
+        error = np.append(others.error(found.slope[:-1], alone[:-1]), late)
+    shares = np.zeros(len(names))
+    of_inputs = np.flatnonzero([GAIN in unit for unit in units])  # of all inputs in turn
+    shares[of_inputs] = np.resize(unsure, len(of_inputs))
+    found = widened(found._replace(error=error), digits, shares)
+    said = {name: quantity(found, i, unit)
+            for i, (name, unit) in enumerate(zip(names, units, strict=True))}  # fmt: skip
+    for name, q in each.items():
+        if said[name].determined:
+            said[name] = replace(said[name], interval_95=_wider(q, said[name]))
     free = {v.name for v in fit.variables}
-    said |= {"offset": quantity(found, -2, "output")} if "offset" in free else {}
-    return said | ({"delay": quantity(found, -1, TIME)} if "late" in free else {})
+    left = {name for name, leaf in (("offset", "offset"), ("delay", "late")) if leaf not in free}
+    left |= {"tau1", "tau2"} if physics is SECOND_ORDER and found.value[1] <= 1.0 else set()
+    return {name: q for name, q in said.items() if name not in left}
+
+
+def _wider(drawn: Quantity, found: Quantity) -> tuple[float, float]:
+    """The interval of a quantity as much wider as its error is, of a lag in its logarithm."""
+    more, ends, value = found.error / drawn.error, np.array(drawn.interval_95), drawn.value
+    ends = value * (ends / value) ** more if found.unit == TIME else value + more * (ends - value)
+    return float(ends[0]), float(ends[1])
 
 
 def derived(fit: Fit, errors: Memory | None, function: Callable, data: Any) -> Derived:
@@ -183,16 +201,12 @@ def told(
     gains = [name for name, (_, gain) in powers if gain]
     joint = {n for k, n in enumerate(gains) if inputs[k % len(inputs)] in checks.together}
 
-    def wide(name: str) -> bool:
-        q = quantities.get(name)
-        return q is not None and q.unit == TIME and q.determined and q.interval_95[0] <= 0.0
-
     def is_open(name: str, q: Quantity) -> bool:
         # The gain that goes with an infinite lag is infinite.
         grows = name.startswith(("tau", "T", "zeta", "K", "offset")) and not name.endswith("/tau")
-        endless = (wide("tau") or limits.above is not None) and grows
+        endless = limits.above is not None and grows
         none = limits.below is not None and name.startswith(("tau", "T", "zeta"))
-        none |= name != "delay" and wide(name)
+        none |= name != "delay" and q.unit == TIME and q.determined and q.interval_95[0] <= 0.0
         # A higher order that is a first one determines only its gains and its longer lag.
         more = checks.first_order and not name.startswith(("K", "offset", "tau1", "delay"))
         # A number that ran to the end of its range has no slope there.

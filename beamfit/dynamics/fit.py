@@ -24,7 +24,7 @@ from beamfit.dynamics.answer import (
 )
 from beamfit.dynamics.bad_readings import BadReadings, judged_without
 from beamfit.dynamics.checks import Checks, HeldOutRun, changing_of, checks_of, digits_of, held_out
-from beamfit.dynamics.limits import LagLimits, lag_limits
+from beamfit.dynamics.limits import LagLimits, lag_posterior
 from beamfit.dynamics.model import PreparedOutput, network_of, output_of
 from beamfit.dynamics.paths import Paths, heard, latest
 from beamfit.dynamics.record import LEAST, Run, check_inputs, checked, unsure_gain
@@ -303,11 +303,8 @@ class _Identification(NamedTuple):
         others: Alternatives | None,
     ) -> tuple[Checks, dict[str, Quantity], tuple[Curve, ...]]:
         """Tests of the residuals, and what the runs determine of constants or curves."""
-        seen, constant, (_, physics, paths, offset) = (
-            found.seen,
-            self.map == "constant",
-            self.search,
-        )
+        seen, constant = found.seen, self.map == "constant"
+        _, _, paths, offset = self.search
         used = used_by(answer.fit) + (not paths.given and not seen.ends)  # a delay found counts
         gain = None if constant else found.settled.likelihood - answer.likelihood
         whole = found._replace(settled=answer)
@@ -323,10 +320,9 @@ class _Identification(NamedTuple):
             if checks.input_share or kind not in (FURTHER, GROWTH):  # more than digits do
                 checks = checks._replace(law=words, law_probability=chance, law_kind=kind)
         unsure = [unsure_gain(runs, found.path.way, name) for name in seen.inputs]
-        quantities = quantities_of(
-            answer.fit, answer.errors, others, seen, physics, digits_of(found), unsure
-        )
-        return checks, *told(quantities, (), seen, checks, lag_limits(seen, answer, offset))
+        lags = lag_posterior(found, offset)
+        quantities = quantities_of(found, others, lags, digits_of(found), unsure)
+        return checks, *told(quantities, (), seen, checks, lags.limits)
 
 
 def _output(run: Run, output: str | None) -> str:

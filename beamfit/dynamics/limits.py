@@ -1,11 +1,12 @@
-"""Time constants that runs do not tell from infinity, or from zero.
+"""Posterior over the longest lag of a response, from zero to infinity.
 
 A run of 100 s does not tell a lag of 1e7 s from an integrator with the same K/tau. Linear errors
-say nothing of it, since the output bends with the lag: the evidence is compared at the limits.
+say nothing of it, since the output bends with the lag: the evidence is taken at many lags.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -13,27 +14,23 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.stats import t as student
 
-from beamfit.dynamics.alternatives import CORRELATION_TIMES, WHITE
-from beamfit.dynamics.model import PreparedOutput
+from beamfit.dynamics.alternatives import CORRELATION_TIMES, WHITE, by_each, over_noises
 from beamfit.dynamics.response import ARX, FIRST_ORDER
-from beamfit.dynamics.search import (
-    LONGEST,
-    Settled,
-    difference,
-    linear_columns,
-    noises_of,
-    shape_of,
-)
-from beamfit.noise.correlated import Whitened, whitened_by_each
+from beamfit.dynamics.search import LONGEST, Begun, difference, linear_columns, noises_of, shape_of
+from beamfit.noise.correlated import roots_by_each
 from beamfit.statistics import POOR_FIT
 
 # Range of time constants, in intervals and in runs, beyond which nothing tells them from zero and
 # from infinity.
 RANGE = (1e-3, 1e3)
-# Other lags that are tried beside one that is given, and rounds of them, each about the best.
-OTHERS, ROUNDS = 8, 3
+# Lags that are looked at together, and rounds of them; other lags beside each, and rounds of those.
+LAGS, CLOSER, OTHERS, ROUNDS = 24, 4, 8, 3
 # Quantile at the upper end of a one-sided 95 %.
 SINGLE_END = 0.95
+# Errors of a delay within which the output is linear in it beside every lag.
+DELAYED = 3.0
+# Draws of the posterior, at as many quantiles of it.
+DRAWS = 2000
 
 
 class LagLimits(NamedTuple):
@@ -58,82 +55,134 @@ class LagLimits(NamedTuple):
         return (0.0, self.below) if self.above is None else (self.above, np.inf)
 
 
-class _Lags(NamedTuple):
-    """Evidence by the longest lag: the other lag at its best, all that is linear integrated out."""
+class LagPosterior(NamedTuple):
+    """Posterior over the longest lag, flat beforehand in its logarithm.
 
-    seen: PreparedOutput
-    found: Settled
-    offset: bool
+    Attributes
+    ----------
+    lag, log : array, shape (g,)
+        Logarithms of lags, that grow, and of the evidence of each.
+    mean, error : array, shape (g, q)
+        Gains and, last, the offset with each.
+    dof : int
+        Degrees of freedom.
+    best : float
+        The logarithm at the lags of the fit, or more.
+    """
+
+    lag: np.ndarray
+    log: np.ndarray
+    mean: np.ndarray
+    error: np.ndarray
+    dof: int
+    best: float = 0.0
+
+    def quantiles(self, at: np.ndarray) -> np.ndarray:
+        """Logarithms of the lags below which the truth lies with these probabilities."""
+        density = np.exp(self.log - self.log.max())
+        below = np.cumsum((density[1:] + density[:-1]) * np.diff(self.lag))
+        return np.interp(at * below[-1], np.append(0.0, below), self.lag)
+
+    def drawn(self, gains: Sequence[str]) -> dict[str, np.ndarray]:
+        """Draws of the lag, s, of gains, of these over it, and of the offset, by name."""
+        at = (np.arange(DRAWS) + 0.5) / DRAWS
+        lag, away = self.quantiles(at), student.ppf(at, self.dof)
+        away = np.random.default_rng(0).permutation(away)
+        numbers = [np.interp(lag, self.lag, mean) + away * np.interp(lag, self.lag, error)
+                   for mean, error in zip(self.mean.T, self.error.T, strict=True)]  # fmt: skip
+        found = {"tau": np.exp(lag), **dict(zip([*gains, "offset"], numbers, strict=False))}
+        return found | {f"{name}/tau": found[name] / found["tau"] for name in gains}
 
     @property
-    def own(self) -> np.ndarray:
-        """Lags, or poles, that the fit found, as of `unit_outputs`."""
-        return shape_of(self.seen, self.found.fit.model)
-
-    def whitened(self, shape: np.ndarray) -> Whitened:
-        """A basis of what gains, first states and offset do, and the readings, by each noise."""
-        model, parts = self.found.fit.model, []
-        runs = [replace(run, part=run.part + model["late"]) for run in self.seen.runs]
-        for i, y in enumerate(self.seen.measured):
-            columns = linear_columns(runs, i, jnp.asarray(shape[None]), self.offset)[0]
-            part = np.column_stack([np.asarray(columns)[: len(y)], y])
-            parts.append((part / self.found.noise[i][0].each[:, None])[:LONGEST])
-        time = [each[:LONGEST] for each in self.seen.time]
-        both = np.concatenate(parts)
-        both[:, :-1] = np.linalg.qr(both[:, :-1])[0]
-        rows = np.split(both, np.cumsum([len(each) for each in time])[:-1])
-        grid = noises_of(self.seen.time, CORRELATION_TIMES, WHITE)
-        return whitened_by_each(grid, list(zip(rows, time, strict=True)))
-
-    def evidence(self, lag: float, other: float) -> float:
-        """-2 ln of the evidence of two lags; a first order has the one."""
-        physics, time = self.seen.runs[0].physics, np.sqrt(lag * other)
-        shape = np.array([time, 0.5 * (lag + other) / time])
-        if physics is FIRST_ORDER:
-            shape = np.array([lag])
-        elif physics is ARX:
-            (shape,) = difference(shape[None], self.seen.apart)
-        return self.whitened(shape).evidence()
-
-    def least(self, lag: float) -> float:
-        """The same of the longest lag, the other one at its best."""
-        if self.seen.runs[0].physics is FIRST_ORDER:
-            return self.evidence(lag, lag)
-        ends = np.log([RANGE[0] * self.seen.apart, lag])
-        for _ in range(ROUNDS):
-            tried = np.linspace(*ends, OTHERS)
-            told = [self.evidence(lag, other) for other in np.exp(tried)]
-            around = tried[np.argmin(told)] + np.array([-1, 1]) * (tried[1] - tried[0])
-            ends = np.clip(around, *ends)
-        return float(min(told))
-
-    def rise(self, end: float) -> float:
-        """Rise of -2 ln of the evidence up to a quantile, by Student's distribution."""
-        white = self.whitened(self.own)
-        dof = max(white.count - white.triangle.shape[2] + 1 - len(self.own), 1)
-        return dof * float(np.log1p(student.ppf(end, dof) ** 2 / dof))
+    def limits(self) -> LagLimits:
+        """Zero and infinity, unless the evidence there is so much lower that they are refuted:
+        where a limit is as little as likely, the error of a lag says nothing.
+        """
+        rise = self.dof * np.log1p(student.ppf(1.0 - 0.5 * POOR_FIT, self.dof) ** 2 / self.dof)
+        zero, endless = 2.0 * (self.best - self.log[[0, -1]]) <= rise
+        low, high = np.exp(self.quantiles(np.array([1.0 - SINGLE_END, SINGLE_END])))
+        return LagLimits(float(low) if endless else None, float(high) if zero else None)
 
 
-def lag_limits(seen: PreparedOutput, found: Settled, offset: bool) -> LagLimits:
-    """Compare the longest lag of constant parameters with zero and infinity.
+def lag_posterior(begun: Begun, offset: bool) -> LagPosterior:
+    """Look at lags from zero to infinity, of a first order in each further round where the
+    posterior of those before lies.
 
-    The gain that goes with a lag far beyond the runs is as large, K/tau being the same, and of a
-    lag far below a sample nothing is left. A limit is possible unless its evidence, the noise and
-    all that is linear integrated out, is so much lower than the best that it is refuted: where a
-    limit is as little as likely, the error of a lag says nothing.
+    A higher order has its other lag at its best. All that is linear, a part of a sample in the
+    delay and the noise are integrated out.
     """
-    lags = _Lags(seen, found, offset)
-    least = lags.whitened(lags.own).evidence()
-    ends = np.multiply(RANGE, (seen.apart, seen.span))
+    seen, ends = begun.seen, np.multiply(RANGE, (begun.seen.apart, begun.seen.span))
+    ends, own = np.log(ends), shape_of(seen, begun.settled.fit.model)
+    first = seen.runs[0].physics is FIRST_ORDER
+    asked = np.linspace(*ends, LAGS)
+    if first:
+        asked[1:] = np.sort(np.append(asked[2:], np.clip(np.log(own), *ends)))
+    found = LagPosterior(asked, *_at(begun, offset, asked, ends[0]))
+    for _ in range(CLOSER if first else 0):
+        asked = found.quantiles((np.arange(LAGS) + 0.5) / LAGS)
+        more = asked, *_at(begun, offset, asked, ends[0])[:3]
+        both = [np.concatenate(pair) for pair in zip(found[:4], more, strict=True)]
+        order = np.unique(both[0], return_index=True)[1]
+        found = LagPosterior(*(each[order] for each in both), found.dof)
+    best = max(found.log.max(), *_weighed(begun, offset, own[None])[0])
+    return found._replace(best=best)
 
-    def reached(limit: float, other: float) -> float | None:
-        if lags.least(limit) - least > lags.rise(1.0 - 0.5 * POOR_FIT):
-            return None
-        near, far, most = np.log(limit), np.log(other), lags.rise(SINGLE_END)
-        for _ in range(8):
-            middle = 0.5 * (near + far)
-            inside = lags.least(np.exp(middle)) - least < most
-            near, far = (middle, far) if inside else (near, middle)
-        return float(np.exp(0.5 * (near + far)))
 
-    return LagLimits(reached(ends[1], ends[0]), reached(ends[0], ends[1]))
+def _at(
+    begun: Begun, offset: bool, lag: np.ndarray, least: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
+    """Log evidence, numbers and their errors at logarithms of lags, and degrees of freedom."""
+    physics = begun.seen.runs[0].physics
+    if physics is FIRST_ORDER:
+        return _weighed(begun, offset, np.exp(lag)[:, None])
+    low, high, every = np.full(len(lag), least), lag, np.arange(len(lag))
+    for _ in range(ROUNDS):
+        other = np.linspace(low, high, OTHERS)
+        time = np.exp(0.5 * (lag + other))
+        shapes = np.stack([time, np.cosh(0.5 * (lag - other))], axis=-1).reshape(-1, 2)
+        shapes = difference(shapes, begun.seen.apart) if physics is ARX else shapes
+        *each, dof = _weighed(begun, offset, shapes)
+        each = [one.reshape(OTHERS, len(lag), *one.shape[1:]) for one in each]
+        best = each[0].argmax(axis=0)
+        low = other[np.maximum(best - 1, 0), every]
+        high = other[np.minimum(best + 1, OTHERS - 1), every]
+    log, mean, error = (one[best, every] for one in each)
+    return log, mean, error, dof
+
+
+def _weighed(
+    begun: Begun, offset: bool, shapes: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
+    """The same by lags, or poles, as of `unit_outputs`."""
+    seen, found = begun.seen, begun.settled
+    late = np.array([v.name == "late" for v in found.fit.variables])
+    late &= found.errors is not None
+    runs = [replace(run, part=run.part + found.fit.model["late"]) for run in seen.runs]
+    rows = []
+    for i, (y, slope) in enumerate(zip(seen.measured, found.slopes(begun.case), strict=True)):
+        columns = np.asarray(linear_columns(runs, i, jnp.asarray(shapes), offset))[:, : len(y)]
+        own = np.column_stack([slope[:, late], y])
+        own = np.broadcast_to(own, (len(shapes), *own.shape))
+        rows.append(np.concatenate([columns, own], axis=2) / found.noise[i][0].each[:, None])
+    prior = np.zeros((0, rows[0].shape[2]))
+    if late.any():
+        prior = np.eye(rows[0].shape[2])[-2:-1]
+        prior /= DELAYED * found.errors.moments(np.eye(len(late))[late]).error
+    rows.append(np.broadcast_to(prior, (len(shapes), *prior.shape)))
+    both = np.concatenate(rows, axis=1)
+    basis, own = np.linalg.qr(both[..., :-1])
+    ends = np.cumsum(list(map(len, seen.measured)))
+    parts = np.split(np.concatenate([basis, both[..., -1:]], axis=2), ends, axis=1)
+    long = max(map(len, seen.measured)) > LONGEST and found.errors is not None
+    grid = [found.errors.noise] if long else noises_of(seen.time, CORRELATION_TIMES, WHITE)
+    triangles, volume = [np.tile(parts.pop(), (len(grid), 1, 1, 1))], 0.0
+    for part, time in zip(parts, seen.time, strict=True):
+        root, each = roots_by_each(grid, np.swapaxes(part, 0, 1), np.diff(time))
+        triangles, volume = [*triangles, root], volume + each
+    white = by_each(grid, np.concatenate(triangles, axis=2), volume, both.shape[1])
+    log, step, spread, dof = over_noises(white, len(grid))
+    inverse = np.linalg.pinv(own)
+    chosen = [*range(len(seen.inputs)), *([own.shape[1] - 1 - late.sum()] if offset else [])]
+    inverse = inverse[:, chosen]
+    variance = np.einsum("gqa,gab,gqb->gq", inverse, spread, inverse)
+    return log, -np.einsum("gqa,ga->gq", inverse, step), np.sqrt(variance), dof
