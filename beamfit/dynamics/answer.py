@@ -18,7 +18,7 @@ from beamfit.dynamics.alternatives import FURTHER, GROWTH, Alternatives
 from beamfit.dynamics.bad_readings import BadReadings
 from beamfit.dynamics.checks import Checks, HeldOutRun
 from beamfit.dynamics.input_laws import STATIC
-from beamfit.dynamics.limits import LagLimits, LagPosterior
+from beamfit.dynamics.limits import LagPosterior
 from beamfit.dynamics.model import PreparedOutput, curves
 from beamfit.dynamics.response import ARX, FIRST_ORDER, SECOND_ORDER, Physics, mean_step
 from beamfit.dynamics.search import Begun
@@ -113,39 +113,35 @@ def quantities_of(
     covariance of the numbers by the digits of the output, `unsure` has the share by which each
     input's own errors make its gain unsure.
     """
-    seen, fit, physics = begun.seen, begun.settled.fit, begun.seen.runs[0].physics
-    m, drawn = len(seen.inputs), {}
-    found = derived(fit, begun.settled.errors, _quoted, (seen.runs[0], seen.delay))
-    names, units = list(physics.parameters(seen.inputs)), _units(physics, m)
+    seen, physics, m = begun.seen, begun.seen.runs[0].physics, len(begun.seen.inputs)
+    found = derived(begun.settled.fit, begun.settled.errors, _quoted, (seen.runs[0], seen.delay))
     gains = FIRST_ORDER.parameters(seen.inputs)[1:]
-    if physics is FIRST_ORDER:
-        names, units = [*names, *(f"{k}/tau" for k in gains)], [*units, *[f"{GAIN}/s"] * m]
-        drawn = lags.drawn(gains)
-    if physics is SECOND_ORDER:
-        names, units = [*names, "tau1", "tau2"], [*units, TIME, TIME]
-    if physics is ARX:
-        names, units = [*names, *gains], [*units, *[GAIN] * m]
-    names, units = [*names, "offset", "delay"], [*units, "output", TIME]
-    each = {n: quantity_of_draws(drawn[n], "", found.value[names.index(n)]) for n in drawn}
-    alone = np.array([each[n].error if n in each else error
-                      for n, error in zip(names, found.error, strict=True)])  # fmt: skip
-    alone = np.where(np.isfinite(found.error), alone, np.nan)
-    error = alone
+    units = dict(zip(physics.parameters(seen.inputs), _units(physics, m), strict=True))
+    units |= {
+        FIRST_ORDER: {f"{name}/tau": f"{GAIN}/s" for name in gains},
+        SECOND_ORDER: {"tau1": TIME, "tau2": TIME},
+        ARX: dict.fromkeys(gains, GAIN),
+    }[physics] | {"offset": "output", "delay": TIME}
+    drawn = lags.drawn(gains) if physics is FIRST_ORDER else {}
+    values, error = dict(zip(units, found.value, strict=True)), found.error
+    drawn = {name: quantity_of_draws(draws, "", values[name]) for name, draws in drawn.items()}
+    alone = np.array(
+        [drawn[n].error if n in drawn else e for n, e in zip(units, error, strict=True)]
+    )
+    error = np.where(np.isfinite(error), alone, np.nan)
     if others is not None:
         late = others.late * seen.parts * float(mean_step(seen.runs[0].dt))
-        error = np.append(others.error(found.slope[:-1], alone[:-1]), late)
-    shares = np.zeros(len(names))
-    of_inputs = np.flatnonzero([GAIN in unit for unit in units])  # of all inputs in turn
+        error = np.append(others.error(found.slope[:-1], error[:-1]), late)
+    shares = np.zeros(len(units))
+    of_inputs = np.flatnonzero([GAIN in unit for unit in units.values()])  # of all in turn
     shares[of_inputs] = np.resize(unsure, len(of_inputs))
     found = widened(found._replace(error=error), digits, shares)
-    said = {name: quantity(found, i, unit)
-            for i, (name, unit) in enumerate(zip(names, units, strict=True))}  # fmt: skip
-    for name, q in each.items():
-        if said[name].determined:
-            said[name] = replace(said[name], interval_95=_wider(q, said[name]))
-    free = {v.name for v in fit.variables}
+    said = {name: quantity(found, i, unit) for i, (name, unit) in enumerate(units.items())}
+    said |= {name: replace(said[name], interval_95=_wider(q, said[name]))
+             for name, q in drawn.items() if said[name].determined}  # fmt: skip
+    free = {v.name for v in begun.settled.fit.variables}
     left = {name for name, leaf in (("offset", "offset"), ("delay", "late")) if leaf not in free}
-    left |= {"tau1", "tau2"} if physics is SECOND_ORDER and found.value[1] <= 1.0 else set()
+    left |= {"tau1", "tau2"} if values.get("zeta", 2.0) <= 1.0 else set()  # not two real lags
     return {name: q for name, q in said.items() if name not in left}
 
 
@@ -188,35 +184,36 @@ def told(
     curves: Sequence[Curve],
     seen: PreparedOutput,
     checks: Checks,
-    limits: LagLimits,
+    limits: tuple[float, float] = (np.nan, np.nan),
 ) -> tuple[dict[str, Quantity], tuple[Curve, ...]]:
     """Quantities and curves with errors only where the runs determine them.
 
     No errors: of anything where the inputs explain no more than chance, of the gains of inputs that
     move together, of lags that runs do not tell from 0 or infinity, and of what grows with them.
+    `limits` are those of the longest lag by a one-sided 95 %, 0 or infinity where it is possible.
     """
     nothing = checks.nothing_probability >= POOR_FIT
     physics, inputs = seen.runs[0].physics, seen.inputs
     powers = zip(physics.parameters(inputs), physics.units(len(inputs)), strict=True)
     gains = [name for name, (_, gain) in powers if gain]
     joint = {n for k, n in enumerate(gains) if inputs[k % len(inputs)] in checks.together}
+    zero, endless = limits[0] == 0.0, np.isinf(limits[1])
 
     def is_open(name: str, q: Quantity) -> bool:
         # The gain that goes with an infinite lag is infinite.
         grows = name.startswith(("tau", "T", "zeta", "K", "offset")) and not name.endswith("/tau")
-        endless = limits.above is not None and grows
-        none = limits.below is not None and name.startswith(("tau", "T", "zeta"))
+        none = zero and name.startswith(("tau", "T", "zeta"))
         none |= name != "delay" and q.unit == TIME and q.determined and q.interval_95[0] <= 0.0
         # A higher order that is a first one determines only its gains and its longer lag.
         more = checks.first_order and not name.startswith(("K", "offset", "tau1", "delay"))
         # A number that ran to the end of its range has no slope there.
         ended = name != "delay" and q.error == 0
-        return nothing or endless or none or more or ended or name in joint
+        return nothing or (endless and grows) or none or more or ended or name in joint
 
     known = {n: q.open() if is_open(n, q) else q for n, q in quantities.items()
-             if limits.above is not None or not n.endswith("/tau")}  # fmt: skip
-    known |= {n: replace(known[n], interval_95=limits.interval) for n in ("tau", "tau1")
-              if n in known and limits.interval and not nothing}  # fmt: skip
+             if endless or not n.endswith("/tau")}  # fmt: skip
+    known |= {n: replace(known[n], interval_95=limits) for n in ("tau", "tau1")
+              if n in known and zero != endless and not nothing}  # fmt: skip
     blank = (nothing or c.parameter in joint for c in curves)
     return known, tuple(c.open() if b else c for c, b in zip(curves, blank, strict=True))
 

@@ -24,7 +24,7 @@ from beamfit.dynamics.answer import (
 )
 from beamfit.dynamics.bad_readings import BadReadings, judged_without
 from beamfit.dynamics.checks import Checks, HeldOutRun, changing_of, checks_of, digits_of, held_out
-from beamfit.dynamics.limits import LagLimits, lag_posterior
+from beamfit.dynamics.limits import lag_posterior
 from beamfit.dynamics.model import PreparedOutput, network_of, output_of
 from beamfit.dynamics.paths import Paths, heard, latest
 from beamfit.dynamics.record import LEAST, Run, check_inputs, checked, unsure_gain
@@ -314,7 +314,7 @@ class _Identification(NamedTuple):
         )
         if not constant:
             curves = curves_of(answer.fit, answer.errors, seen)
-            return checks, *told({}, curves, seen, checks, LagLimits(None, None))
+            return checks, *told({}, curves, seen, checks)
         if others is not None and others.departure.probability > 0.5:
             words, kind, chance = others.departure
             if checks.input_share or kind not in (FURTHER, GROWTH):  # more than digits do

@@ -33,30 +33,6 @@ FINER = 5
 PLAYS = (0.0, 0.4, 0.8, 1.2, 1.6, 2.0)
 
 
-def moved(u: np.ndarray, law: str, width: float | np.ndarray, place: float = 0.0) -> np.ndarray:
-    """One input as a law hands it on, shape (rows,), for each of several widths if given.
-
-    A play follows when its clearance is used up; a hysteresis is the mean of plays of several
-    widths (Prandtl, Ishlinskii); a stop (Coulomb friction) goes all the way once it moves at all; a
-    shift (friction against a spring) is to the side that the input last came from. A rate limit
-    goes its width a row at most. A dead zone lies
-    about a place, a saturation leaves what is about one, and a square law bends about one.
-    """
-    half = np.asarray(width)[..., None]
-    if law in FOLLOWING:
-        return _followed(u, law, width)
-    near = np.clip(u - place, -half, half)
-    if law == "dead zone":
-        return u - near
-    if law == "saturation":
-        return place + near
-    if law == "square law":
-        return u + (u - place) ** 2 / half
-    sign = np.sign(np.diff(u, prepend=u[0]))  # a shift
-    last = np.maximum.accumulate(np.where(sign != 0, np.arange(len(u)), 0))
-    return u - half * sign[last]
-
-
 def _played(at: np.ndarray, now: float, width: np.ndarray) -> np.ndarray:
     return np.clip(at, now - width, now + width)
 
@@ -69,19 +45,37 @@ def _limited(at: np.ndarray, now: float, width: np.ndarray) -> np.ndarray:
     return np.clip(now, at - width, at + width)
 
 
-# What follows an input row by row: where it is after each, by where it was, the input and a width.
+# Laws that follow an input row by row: where they are after each, by where they were, the input
+# and the width.
 FOLLOWING = {"play": _played, "hysteresis": _played, "stop": _stopped, "rate limit": _limited}
 
 
-def _followed(u: np.ndarray, law: str, width: float | np.ndarray) -> np.ndarray:
-    """The mean of what follows an input by widths of a law; all but a rate limit rest with it."""
-    changes = (np.diff(u, prepend=np.nan) != 0) | (law == "rate limit")
-    widths = np.multiply.outer(width, PLAYS if law == "hysteresis" else (1.0,))
-    at, found = u[0] + 0 * widths, []
-    for now in u[changes]:
-        at = FOLLOWING[law](at, now, widths)
-        found.append(at)
-    return np.moveaxis(np.mean(found, axis=-1), 0, -1)[..., np.cumsum(changes) - 1]
+def moved(u: np.ndarray, law: str, width: float | np.ndarray, place: float = 0.0) -> np.ndarray:
+    """One input as a law hands it on, shape (rows,), for each of several widths if given.
+
+    A play follows when its clearance is used up; a hysteresis is the mean of plays of several
+    widths (Prandtl, Ishlinskii); a stop (Coulomb friction) goes all the way once it moves at all; a
+    shift (friction against a spring) is to the side that the input last came from. A rate limit
+    goes its width a row at most. A dead zone lies
+    about a place, a saturation leaves what is about one, and a square law bends about one.
+    """
+    half = np.asarray(width)[..., None]
+    if law in FOLLOWING:  # what rests with the input, but for a rate limit
+        changes = (np.diff(u, prepend=np.nan) != 0) | (law == "rate limit")
+        widths = np.multiply.outer(width, PLAYS if law == "hysteresis" else (1.0,))
+        at, found = u[0] + 0 * widths, []
+        for now in u[changes]:
+            at = FOLLOWING[law](at, now, widths)
+            found.append(at)
+        return np.moveaxis(np.mean(found, axis=-1), 0, -1)[..., np.cumsum(changes) - 1]
+    if law == "shift":
+        sign = np.sign(np.diff(u, prepend=u[0]))
+        last = np.maximum.accumulate(np.where(sign != 0, np.arange(len(u)), 0))
+        return u - half * sign[last]
+    near = np.clip(u - place, -half, half)
+    if law == "dead zone":
+        return u - near
+    return place + near if law == "saturation" else u + (u - place) ** 2 / half
 
 
 class InputLaw(NamedTuple):

@@ -33,28 +33,6 @@ DELAYED = 3.0
 DRAWS = 2000
 
 
-class LagLimits(NamedTuple):
-    """Limits that the longest lag is compatible with.
-
-    Attributes
-    ----------
-    above : float or None
-        The lag is larger than this, s (95 %), and nothing tells it from infinity.
-    below : float or None
-        It is smaller than this, s (95 %), and nothing tells it from zero.
-    """
-
-    above: float | None
-    below: float | None
-
-    @property
-    def interval(self) -> tuple[float, float] | None:
-        """The one-sided 95 %; None where both limits, or none, are possible."""
-        if (self.above is None) == (self.below is None):
-            return None
-        return (0.0, self.below) if self.above is None else (self.above, np.inf)
-
-
 class LagPosterior(NamedTuple):
     """Posterior over the longest lag, flat beforehand in its logarithm.
 
@@ -94,14 +72,14 @@ class LagPosterior(NamedTuple):
         return found | {f"{name}/tau": found[name] / found["tau"] for name in gains}
 
     @property
-    def limits(self) -> LagLimits:
-        """Zero and infinity, unless the evidence there is so much lower that they are refuted:
-        where a limit is as little as likely, the error of a lag says nothing.
+    def limits(self) -> tuple[float, float]:
+        """Ends of a one-sided 95 %, s; 0 and infinity unless the evidence there is so much lower
+        that they are refuted: where they are as little as likely, an error says nothing.
         """
         rise = self.dof * np.log1p(student.ppf(1.0 - 0.5 * POOR_FIT, self.dof) ** 2 / self.dof)
         zero, endless = 2.0 * (self.best - self.log[[0, -1]]) <= rise
-        low, high = np.exp(self.quantiles(np.array([1.0 - SINGLE_END, SINGLE_END])))
-        return LagLimits(float(low) if endless else None, float(high) if zero else None)
+        low, high = np.exp(self.quantiles(np.array([1.0 - SINGLE_END, SINGLE_END]))).tolist()
+        return 0.0 if zero else low, np.inf if endless else high
 
 
 def lag_posterior(begun: Begun, offset: bool) -> LagPosterior:
@@ -124,8 +102,8 @@ def lag_posterior(begun: Begun, offset: bool) -> LagPosterior:
         both = [np.concatenate(pair) for pair in zip(found[:4], more, strict=True)]
         order = np.unique(both[0], return_index=True)[1]
         found = LagPosterior(*(each[order] for each in both), found.dof)
-    best = max(found.log.max(), *_weighed(begun, offset, own[None])[0])
-    return found._replace(best=best)
+    at_fit = found.log if first else _weighed(begun, offset, own[None])[0]
+    return found._replace(best=max(found.log.max(), at_fit.max()))
 
 
 def _at(
