@@ -50,6 +50,8 @@ VAST = 1e100
 FIRST, MANY, ROUNDS, SPREAD, FEW = 2, 128, 3, 3, 4
 # Shorter delays that a law may stand for.
 LATE = 3
+# Probability of an alternative below which it moves no end of a 95 % interval, however far off it is.
+LEAST = 1e-5
 # Alternatives that are fitted at once: one program is compiled for all.
 BATCH = 64
 
@@ -394,6 +396,7 @@ def alternatives_of(
         posterior = _finer(comparison, posterior)
     chance, none = posterior.chance, posterior.none
     others = ~none | [not found.contains(trial.path) for trial in posterior.trials]
+    others &= chance > LEAST
     likeliest = posterior.trials[np.where(none, posterior.logs, -np.inf).argmax()].path
     return Alternatives(
         found.path if found.contains(likeliest) else likeliest,

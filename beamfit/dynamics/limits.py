@@ -66,10 +66,10 @@ class LagPosterior(NamedTuple):
         at = (np.arange(DRAWS) + 0.5) / DRAWS
         lag, away = self.quantiles(at), student.ppf(at, self.dof)
         away = np.random.default_rng(0).permutation(away)
-        numbers = [np.interp(lag, self.lag, mean) + away * np.interp(lag, self.lag, error)
-                   for mean, error in zip(self.mean.T, self.error.T, strict=True)]  # fmt: skip
-        found = {"tau": np.exp(lag), **dict(zip([*gains, "offset"], numbers, strict=False))}
-        return found | {f"{name}/tau": found[name] / found["tau"] for name in gains}
+        near = np.searchsorted(0.5 * (self.lag[1:] + self.lag[:-1]), lag)
+        numbers = self.mean[near] + away[:, None] * self.error[near]
+        found = {"tau": np.exp(lag), **dict(zip([*gains, "offset"], numbers.T, strict=False))}
+        return found | {f"{name}/tau": found[name] / np.exp(self.lag[near]) for name in gains}
 
     @property
     def limits(self) -> tuple[float, float]:
