@@ -50,7 +50,7 @@ VAST = 1e100
 FIRST, MANY, ROUNDS, SPREAD, FEW = 2, 128, 3, 3, 4
 # Shorter delays that a law may stand for.
 LATE = 3
-# Probability of an alternative below which it moves no end of a 95 % interval, however far off it is.
+# Below this probability an alternative moves no end of a 95 % interval, however far off it is.
 LEAST = 1e-5
 # Alternatives that are fitted at once: one program is compiled for all.
 BATCH = 64

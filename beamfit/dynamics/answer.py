@@ -103,13 +103,15 @@ def _quoted(model: Any, of: tuple[Any, float]) -> jax.Array:
 def quantities_of(
     begun: Begun,
     others: Alternatives | None,
+    late: float,
     lags: LagPosterior,
     digits: np.ndarray,
     unsure: Sequence[float],
 ) -> dict[str, Quantity]:
     """Constant parameters with errors, and the offset and the delay if they are free.
 
-    Of a first order the lag, gains and offset have the errors of `lags`. `digits` is the
+    Of a first order the lag, gains and offset have the errors of `lags`. `late` is the standard
+    deviation of the delay by others, s, `digits` the
     covariance of the numbers by the digits of the output, `unsure` has the share by which each
     input's own errors make its gain unsure.
     """
@@ -130,7 +132,6 @@ def quantities_of(
     )
     error = np.where(np.isfinite(error), alone, np.nan)
     if others is not None:
-        late = others.late * seen.parts * float(mean_step(seen.runs[0].dt))
         error = np.append(others.error(found.slope[:-1], error[:-1]), late)
     shares = np.zeros(len(units))
     of_inputs = np.flatnonzero([GAIN in unit for unit in units.values()])  # of all in turn
@@ -138,7 +139,7 @@ def quantities_of(
     found = widened(found._replace(error=error), digits, shares)
     said = {name: quantity(found, i, unit) for i, (name, unit) in enumerate(units.items())}
     said |= {name: replace(said[name], interval_95=_wider(q, said[name]))
-             for name, q in drawn.items() if said[name].determined}  # fmt: skip
+             for name, q in drawn.items() if q.error and said[name].determined}  # fmt: skip
     free = {v.name for v in begun.settled.fit.variables}
     left = {name for name, leaf in (("offset", "offset"), ("delay", "late")) if leaf not in free}
     left |= {"tau1", "tau2"} if values.get("zeta", 2.0) <= 1.0 else set()  # not two real lags

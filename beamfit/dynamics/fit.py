@@ -28,7 +28,7 @@ from beamfit.dynamics.limits import lag_posterior
 from beamfit.dynamics.model import PreparedOutput, network_of, output_of
 from beamfit.dynamics.paths import Paths, heard, latest
 from beamfit.dynamics.record import LEAST, Run, check_inputs, checked, unsure_gain
-from beamfit.dynamics.response import PHYSICS
+from beamfit.dynamics.response import PHYSICS, mean_step
 from beamfit.dynamics.search import Begun, ResponseSearch, Settled, case_of, fitted, used_by
 from beamfit.errors import InputError, Status, nearest
 from beamfit.greybox.fit import Fit
@@ -321,8 +321,10 @@ class _Identification(NamedTuple):
                 checks = checks._replace(law=words, law_probability=chance, law_kind=kind)
         unsure = [unsure_gain(runs, found.path.way, name) for name in seen.inputs]
         lags = lag_posterior(found, offset)
-        quantities = quantities_of(found, others, lags, digits_of(found), unsure)
-        return checks, *told(quantities, (), seen, checks, lags.limits)
+        row = float(mean_step(seen.runs[0].dt))
+        late = others.late * seen.parts * row if others is not None else 0.0
+        quantities = quantities_of(found, others, late, lags, digits_of(found), unsure)
+        return checks, *told(quantities, (), seen, checks, lags.limits(late))
 
 
 def _output(run: Run, output: str | None) -> str:

@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
+from scipy.special import ndtri
 from scipy.stats import t as student
 
 from beamfit.dynamics.alternatives import CORRELATION_TIMES, WHITE, by_each, over_noises
@@ -71,14 +72,16 @@ class LagPosterior(NamedTuple):
         found = {"tau": np.exp(lag), **dict(zip([*gains, "offset"], numbers.T, strict=False))}
         return found | {f"{name}/tau": found[name] / np.exp(self.lag[near]) for name in gains}
 
-    @property
-    def limits(self) -> tuple[float, float]:
+    def limits(self, late: float) -> tuple[float, float]:
         """Ends of a one-sided 95 %, s; 0 and infinity unless the evidence there is so much lower
         that they are refuted: where they are as little as likely, an error says nothing.
+
+        `late` is the standard deviation of the delay, s: one that is shorter is a longer lag.
         """
         rise = self.dof * np.log1p(student.ppf(1.0 - 0.5 * POOR_FIT, self.dof) ** 2 / self.dof)
         zero, endless = 2.0 * (self.best - self.log[[0, -1]]) <= rise
         low, high = np.exp(self.quantiles(np.array([1.0 - SINGLE_END, SINGLE_END]))).tolist()
+        high = float(np.hypot(high, ndtri(SINGLE_END) * late))
         return 0.0 if zero else low, np.inf if endless else high
 
 
@@ -132,12 +135,12 @@ def _weighed(
     begun: Begun, offset: bool, shapes: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
     """The same by lags, or poles, as of `unit_outputs`."""
-    seen, found = begun.seen, begun.settled
+    seen, found, slopes = begun.seen, begun.settled, begun.settled.slopes(begun.case)
     late = np.array([v.name == "late" for v in found.fit.variables])
-    late &= found.errors is not None
+    late &= np.any(np.concatenate(slopes), axis=0) & (found.errors is not None)
     runs = [replace(run, part=run.part + found.fit.model["late"]) for run in seen.runs]
     rows = []
-    for i, (y, slope) in enumerate(zip(seen.measured, found.slopes(begun.case), strict=True)):
+    for i, (y, slope) in enumerate(zip(seen.measured, slopes, strict=True)):
         columns = np.asarray(linear_columns(runs, i, jnp.asarray(shapes), offset))[:, : len(y)]
         own = np.column_stack([slope[:, late], y])
         own = np.broadcast_to(own, (len(shapes), *own.shape))
@@ -147,20 +150,20 @@ def _weighed(
         prior = np.eye(rows[0].shape[2])[-2:-1]
         prior /= DELAYED * found.errors.moments(np.eye(len(late))[late]).error
     rows.append(np.broadcast_to(prior, (len(shapes), *prior.shape)))
-    both = np.concatenate(rows, axis=1)
-    basis, own = np.linalg.qr(both[..., :-1])
-    ends = np.cumsum(list(map(len, seen.measured)))
-    parts = np.split(np.concatenate([basis, both[..., -1:]], axis=2), ends, axis=1)
+    basis, own = np.linalg.qr(np.concatenate(rows, axis=1))
+    whole = np.broadcast_to(np.eye(own.shape[1]), own.shape).copy()  # in columns of the basis
+    whole[..., -1] = own[..., -1]
+    *parts, known = np.split(basis, np.cumsum(list(map(len, seen.measured))), axis=1)
     long = max(map(len, seen.measured)) > LONGEST and found.errors is not None
     grid = [found.errors.noise] if long else noises_of(seen.time, CORRELATION_TIMES, WHITE)
-    triangles, volume = [np.tile(parts.pop(), (len(grid), 1, 1, 1))], 0.0
+    triangles, volume = [np.tile(known @ whole, (len(grid), 1, 1, 1))], 0.0
     for part, time in zip(parts, seen.time, strict=True):
         root, each = roots_by_each(grid, np.swapaxes(part, 0, 1), np.diff(time))
-        triangles, volume = [*triangles, root], volume + each
-    white = by_each(grid, np.concatenate(triangles, axis=2), volume, both.shape[1])
+        triangles, volume = [*triangles, root @ whole], volume + each
+    white = by_each(grid, np.concatenate(triangles, axis=2), volume, basis.shape[1])
     log, step, spread, dof = over_noises(white, len(grid))
-    inverse = np.linalg.pinv(own)
-    chosen = [*range(len(seen.inputs)), *([own.shape[1] - 1 - late.sum()] if offset else [])]
+    inverse = np.linalg.pinv(own[:, :-1, :-1])
+    chosen = [*range(len(seen.inputs)), *([own.shape[1] - 2 - late.sum()] if offset else [])]
     inverse = inverse[:, chosen]
     variance = np.einsum("gqa,gab,gqb->gq", inverse, spread, inverse)
     return log, -np.einsum("gqa,ga->gq", inverse, step), np.sqrt(variance), dof
