@@ -28,8 +28,9 @@ RANGE = (1e-3, 1e3)
 LAGS, CLOSER, OTHERS, ROUNDS = 24, 4, 8, 3
 # Quantile at the upper end of a one-sided 95 %.
 SINGLE_END = 0.95
-# Errors of a delay within which the output is linear in it beside every lag.
-DELAYED = 3.0
+# Errors of a delay, and standard deviation of one anywhere in a row, within which the output is
+# linear in it beside every lag.
+DELAYED, ROW = 3.0, 12**-0.5
 # Draws of the posterior, at as many quantiles of it.
 DRAWS = 2000
 
@@ -148,7 +149,7 @@ def _weighed(
     prior = np.zeros((0, rows[0].shape[2]))
     if late.any():
         prior = np.eye(rows[0].shape[2])[-2:-1]
-        prior /= DELAYED * found.errors.moments(np.eye(len(late))[late]).error
+        prior /= np.minimum(DELAYED * found.errors.moments(np.eye(len(late))[late]).error, ROW)
     rows.append(np.broadcast_to(prior, (len(shapes), *prior.shape)))
     basis, own = np.linalg.qr(np.concatenate(rows, axis=1))
     whole = np.broadcast_to(np.eye(own.shape[1]), own.shape).copy()  # in columns of the basis
