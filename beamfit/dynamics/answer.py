@@ -21,7 +21,7 @@ from beamfit.dynamics.input_laws import STATIC
 from beamfit.dynamics.limits import LagPosterior
 from beamfit.dynamics.model import PreparedOutput, curves
 from beamfit.dynamics.response import ARX, FIRST_ORDER, SECOND_ORDER, Physics, mean_step
-from beamfit.dynamics.search import Begun
+from beamfit.dynamics.search import LONGEST, Begun
 from beamfit.errors import Finding, Status
 from beamfit.greybox.fit import Derived, Fit
 from beamfit.greybox.judge import gauges, together
@@ -110,10 +110,10 @@ def quantities_of(
 ) -> dict[str, Quantity]:
     """Constant parameters with errors, and the offset and the delay if they are free.
 
-    Of a first order the lag, gains and offset have the errors of `lags`. `late` is the standard
-    deviation of the delay by others, s, `digits` the
-    covariance of the numbers by the digits of the output, `unsure` has the share by which each
-    input's own errors make its gain unsure.
+    Of a first order the lag, gains and offset have the errors of `lags` where all readings count
+    in them. `late` is the standard deviation of the delay by others, s, `digits` the covariance of
+    the numbers by the digits of the output, `unsure` has the share by which each input's own errors
+    make its gain unsure.
     """
     seen, physics, m = begun.seen, begun.seen.runs[0].physics, len(begun.seen.inputs)
     found = derived(begun.settled.fit, begun.settled.errors, _quoted, (seen.runs[0], seen.delay))
@@ -124,7 +124,8 @@ def quantities_of(
         SECOND_ORDER: {"tau1": TIME, "tau2": TIME},
         ARX: dict.fromkeys(gains, GAIN),
     }[physics] | {"offset": "output", "delay": TIME}
-    drawn = lags.drawn(gains) if physics is FIRST_ORDER else {}
+    whole = max(map(len, seen.measured)) <= LONGEST
+    drawn = lags.drawn(gains) if physics is FIRST_ORDER and whole else {}
     values, error = dict(zip(units, found.value, strict=True)), found.error
     drawn = {name: quantity_of_draws(draws, "", values[name]) for name, draws in drawn.items()}
     alone = np.array(

@@ -91,7 +91,7 @@ def lag_posterior(begun: Begun, offset: bool) -> LagPosterior:
     posterior of those before lies.
 
     A higher order has its other lag at its best. All that is linear, a part of a sample in the
-    delay and the noise are integrated out.
+    delay and the noise are integrated out; of each run `LONGEST` readings count.
     """
     seen, ends = begun.seen, np.multiply(RANGE, (begun.seen.apart, begun.seen.span))
     ends, own = np.log(ends), shape_of(seen, begun.settled.fit.model)
@@ -142,10 +142,11 @@ def _weighed(
     runs = [replace(run, part=run.part + found.fit.model["late"]) for run in seen.runs]
     rows = []
     for i, (y, slope) in enumerate(zip(seen.measured, slopes, strict=True)):
-        columns = np.asarray(linear_columns(runs, i, jnp.asarray(shapes), offset))[:, : len(y)]
-        own = np.column_stack([slope[:, late], y])
+        own = np.column_stack([slope[:, late], y])[:LONGEST]
+        columns = np.asarray(linear_columns(runs, i, jnp.asarray(shapes), offset))[:, : len(own)]
         own = np.broadcast_to(own, (len(shapes), *own.shape))
-        rows.append(np.concatenate([columns, own], axis=2) / found.noise[i][0].each[:, None])
+        each = found.noise[i][0].each[:LONGEST, None]
+        rows.append(np.concatenate([columns, own], axis=2) / each)
     prior = np.zeros((0, rows[0].shape[2]))
     if late.any():
         prior = np.eye(rows[0].shape[2])[-2:-1]
@@ -154,11 +155,10 @@ def _weighed(
     basis, own = np.linalg.qr(np.concatenate(rows, axis=1))
     whole = np.broadcast_to(np.eye(own.shape[1]), own.shape).copy()  # in columns of the basis
     whole[..., -1] = own[..., -1]
-    *parts, known = np.split(basis, np.cumsum(list(map(len, seen.measured))), axis=1)
-    long = max(map(len, seen.measured)) > LONGEST and found.errors is not None
-    grid = [found.errors.noise] if long else noises_of(seen.time, CORRELATION_TIMES, WHITE)
+    times, grid = [t[:LONGEST] for t in seen.time], noises_of(seen.time, CORRELATION_TIMES, WHITE)
+    *parts, known = np.split(basis, np.cumsum(list(map(len, times))), axis=1)
     triangles, volume = [np.tile(known @ whole, (len(grid), 1, 1, 1))], 0.0
-    for part, time in zip(parts, seen.time, strict=True):
+    for part, time in zip(parts, times, strict=True):
         root, each = roots_by_each(grid, np.swapaxes(part, 0, 1), np.diff(time))
         triangles, volume = [*triangles, root @ whole], volume + each
     white = by_each(grid, np.concatenate(triangles, axis=2), volume, basis.shape[1])
