@@ -50,6 +50,8 @@ VAST = 1e100
 FIRST, MANY, ROUNDS, SPREAD, FEW = 2, 128, 3, 3, 4
 # Shorter delays that a law may stand for.
 LATE = 3
+# Below this probability an alternative moves no end of a 95 % interval, however far off it is.
+LEAST = 1e-5
 # Alternatives that are fitted at once: one program is compiled for all.
 BATCH = 64
 
@@ -183,9 +185,7 @@ class _Batch(NamedTuple):
         away = (theta - c.begin) @ prior.T
         known = np.concatenate([np.tile(prior, (len(theta), 1, 1)), away[..., None]], axis=2)
         both = np.concatenate([*triangles, np.tile(known, (len(some), 1, 1, 1))], axis=2)
-        noise = CorrelatedNoise(*np.repeat(np.array(some).T, len(theta), axis=1))
-        both, volume = both.reshape(-1, *both.shape[2:]), np.repeat(volume, len(theta))
-        return Whitened(noise, both, volume, count + len(prior))
+        return by_each(some, both, volume, count + len(prior))
 
     def fitted(self, begin: np.ndarray, rounds: int) -> tuple[np.ndarray, np.ndarray]:
         """The numbers of each trial, by Gauss-Newton steps that lower -2 ln L, and its least.
@@ -213,18 +213,35 @@ class _Batch(NamedTuple):
     def weighed(self, begin: np.ndarray) -> tuple[np.ndarray, ...]:
         """Log evidence, numbers and covariances of each trial, numbers and noise integrated out."""
         (at, _), grid = self.fitted(begin, ROUNDS), len(self.comparison.grid)
-        white = self.whitened(at, range(grid))
-        memory, logs = white.weighed()
-        logs = logs.reshape(grid, -1)
-        likelihood = logsumexp(logs, axis=0)
-        share, step = np.exp(logs - likelihood), memory.step.reshape(*logs.shape, -1)
-        half = memory.half.reshape(*logs.shape, *memory.half.shape[1:])
-        size = (memory.squares / memory.dof).reshape(logs.shape)
-        mean = np.einsum("ga,gap->ap", share, step)
-        spread = np.einsum("ga,gapr,gaqr->apq", share * size, half, half, optimize=True)
-        away = step - mean
-        spread += np.einsum("ga,gap,gaq->apq", share, away, away, optimize=True)
+        likelihood, mean, spread, _ = over_noises(self.whitened(at, range(grid)), grid)
         return likelihood, at + mean, spread
+
+
+def by_each(
+    noises: Sequence[CorrelatedNoise], triangles: np.ndarray, volume: np.ndarray, count: int
+) -> Whitened:
+    """Trials by each noise, shape (noises, trials, rows, columns), in one row."""
+    trials = triangles.shape[1]
+    noise = CorrelatedNoise(*np.repeat(np.array(noises).T, trials, axis=1))
+    each = triangles.reshape(-1, *triangles.shape[2:])
+    return Whitened(noise, each, np.repeat(volume, trials), count)
+
+
+def over_noises(white: Whitened, grid: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
+    """Log evidence of each trial by so many noises in turn, its step and the covariance with the
+    noise integrated out, and the degrees of freedom.
+    """
+    memory, logs = white.weighed()
+    logs = logs.reshape(grid, -1)
+    likelihood = logsumexp(logs, axis=0)
+    share, step = np.exp(logs - likelihood), memory.step.reshape(*logs.shape, -1)
+    half = memory.half.reshape(*logs.shape, *memory.half.shape[1:])
+    size = (memory.squares / memory.dof).reshape(logs.shape)
+    mean = np.einsum("ga,gap->ap", share, step)
+    spread = np.einsum("ga,gapr,gaqr->apq", share * size, half, half, optimize=True)
+    away = step - mean
+    spread += np.einsum("ga,gap,gaq->apq", share, away, away, optimize=True)
+    return likelihood, mean, spread, memory.dof
 
 
 def _minus(white: Whitened, squares: np.ndarray) -> np.ndarray:
@@ -379,6 +396,7 @@ def alternatives_of(
         posterior = _finer(comparison, posterior)
     chance, none = posterior.chance, posterior.none
     others = ~none | [not found.contains(trial.path) for trial in posterior.trials]
+    others &= chance > LEAST
     likeliest = posterior.trials[np.where(none, posterior.logs, -np.inf).argmax()].path
     return Alternatives(
         found.path if found.contains(likeliest) else likeliest,

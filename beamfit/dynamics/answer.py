@@ -18,15 +18,16 @@ from beamfit.dynamics.alternatives import FURTHER, GROWTH, Alternatives
 from beamfit.dynamics.bad_readings import BadReadings
 from beamfit.dynamics.checks import Checks, HeldOutRun
 from beamfit.dynamics.input_laws import STATIC
-from beamfit.dynamics.limits import LagLimits
+from beamfit.dynamics.limits import LagPosterior
 from beamfit.dynamics.model import PreparedOutput, curves
 from beamfit.dynamics.response import ARX, FIRST_ORDER, SECOND_ORDER, Physics, mean_step
+from beamfit.dynamics.search import LONGEST, Begun
 from beamfit.errors import Finding, Status
 from beamfit.greybox.fit import Derived, Fit
 from beamfit.greybox.judge import gauges, together
 from beamfit.noise.correlated import Memory
 from beamfit.quantity import Quantity
-from beamfit.statistics import POOR_FIT
+from beamfit.statistics import POOR_FIT, quantity_of_draws
 
 # Points of a curve; samples within a share of its range that make a point visited.
 POINTS, VISITS, NEAR = 41, 5, 0.05
@@ -100,42 +101,57 @@ def _quoted(model: Any, of: tuple[Any, float]) -> jax.Array:
 
 
 def quantities_of(
-    fit: Fit,
-    errors: Memory | None,
+    begun: Begun,
     others: Alternatives | None,
-    seen: PreparedOutput,
-    physics: Physics,
+    late: float,
+    lags: LagPosterior,
     digits: np.ndarray,
     unsure: Sequence[float],
 ) -> dict[str, Quantity]:
     """Constant parameters with errors, and the offset and the delay if they are free.
 
-    `digits` is the covariance of the numbers by the digits of the output, `unsure` has the share by
-    which each input's own errors make its gain unsure.
+    Of a first order the lag, gains and offset have the errors of `lags` where all readings count
+    in them. `late` is the standard deviation of the delay by others, s, `digits` the covariance of
+    the numbers by the digits of the output, `unsure` has the share by which each input's own errors
+    make its gain unsure.
     """
-    m = len(seen.inputs)
-    found = alone = derived(fit, errors, _quoted, (seen.runs[0], seen.delay))
+    seen, physics, m = begun.seen, begun.seen.runs[0].physics, len(begun.seen.inputs)
+    found = derived(begun.settled.fit, begun.settled.errors, _quoted, (seen.runs[0], seen.delay))
+    gains = FIRST_ORDER.parameters(seen.inputs)[1:]
+    units = dict(zip(physics.parameters(seen.inputs), _units(physics, m), strict=True))
+    units |= {
+        FIRST_ORDER: {f"{name}/tau": f"{GAIN}/s" for name in gains},
+        SECOND_ORDER: {"tau1": TIME, "tau2": TIME},
+        ARX: dict.fromkeys(gains, GAIN),
+    }[physics] | {"offset": "output", "delay": TIME}
+    whole = max(map(len, seen.measured)) <= LONGEST
+    drawn = lags.drawn(gains) if physics is FIRST_ORDER and whole else {}
+    values, error = dict(zip(units, found.value, strict=True)), found.error
+    drawn = {name: quantity_of_draws(draws, "", values[name]) for name, draws in drawn.items()}
+    alone = np.array(
+        [drawn[n].error if n in drawn else e for n, e in zip(units, error, strict=True)]
+    )
+    error = np.where(np.isfinite(error), alone, np.nan)
     if others is not None:
-        late = others.late * seen.parts * float(mean_step(seen.runs[0].dt))
-        error = others.error(alone.slope[:-1], alone.error[:-1])
-        found = alone._replace(error=np.append(error, late))
-    names, units = list(physics.parameters(seen.inputs)), _units(physics, m)
-    if physics is FIRST_ORDER:
-        names, units = [*names, *(f"{k}/tau" for k in names[1:])], [*units, *[f"{GAIN}/s"] * m]
-    if physics is SECOND_ORDER and found.value[1] > 1.0:
-        names, units = [*names, "tau1", "tau2"], [*units, TIME, TIME]
-    if physics is ARX:
-        names, units = [*names, *FIRST_ORDER.parameters(seen.inputs)[1:]], [*units, *[GAIN] * m]
-    gains, shares = [GAIN in unit for unit in units], np.zeros(len(found.value))
-    shares[: len(units)][gains] = np.resize(unsure, sum(gains))  # of all inputs in turn
-    found = widened(found, digits, shares)
-    said = {
-        name: quantity(found, i, unit)
-        for i, (name, unit) in enumerate(zip(names, units, strict=True))
-    }
-    free = {v.name for v in fit.variables}
-    said |= {"offset": quantity(found, -2, "output")} if "offset" in free else {}
-    return said | ({"delay": quantity(found, -1, TIME)} if "late" in free else {})
+        error = np.append(others.error(found.slope[:-1], error[:-1]), late)
+    shares = np.zeros(len(units))
+    of_inputs = np.flatnonzero([GAIN in unit for unit in units.values()])  # of all in turn
+    shares[of_inputs] = np.resize(unsure, len(of_inputs))
+    found = widened(found._replace(error=error), digits, shares)
+    said = {name: quantity(found, i, unit) for i, (name, unit) in enumerate(units.items())}
+    said |= {name: replace(said[name], interval_95=_wider(q, said[name]))
+             for name, q in drawn.items() if q.error and said[name].determined}  # fmt: skip
+    free = {v.name for v in begun.settled.fit.variables}
+    left = {name for name, leaf in (("offset", "offset"), ("delay", "late")) if leaf not in free}
+    left |= {"tau1", "tau2"} if values.get("zeta", 2.0) <= 1.0 else set()  # not two real lags
+    return {name: q for name, q in said.items() if name not in left}
+
+
+def _wider(drawn: Quantity, found: Quantity) -> tuple[float, float]:
+    """The interval of a quantity as much wider as its error is, of a lag in its logarithm."""
+    more, ends, value = found.error / drawn.error, np.array(drawn.interval_95), drawn.value
+    ends = value * (ends / value) ** more if found.unit == TIME else value + more * (ends - value)
+    return float(ends[0]), float(ends[1])
 
 
 def derived(fit: Fit, errors: Memory | None, function: Callable, data: Any) -> Derived:
@@ -170,39 +186,36 @@ def told(
     curves: Sequence[Curve],
     seen: PreparedOutput,
     checks: Checks,
-    limits: LagLimits,
+    limits: tuple[float, float] = (np.nan, np.nan),
 ) -> tuple[dict[str, Quantity], tuple[Curve, ...]]:
     """Quantities and curves with errors only where the runs determine them.
 
     No errors: of anything where the inputs explain no more than chance, of the gains of inputs that
     move together, of lags that runs do not tell from 0 or infinity, and of what grows with them.
+    `limits` are those of the longest lag by a one-sided 95 %, 0 or infinity where it is possible.
     """
     nothing = checks.nothing_probability >= POOR_FIT
     physics, inputs = seen.runs[0].physics, seen.inputs
     powers = zip(physics.parameters(inputs), physics.units(len(inputs)), strict=True)
     gains = [name for name, (_, gain) in powers if gain]
     joint = {n for k, n in enumerate(gains) if inputs[k % len(inputs)] in checks.together}
-
-    def wide(name: str) -> bool:
-        q = quantities.get(name)
-        return q is not None and q.unit == TIME and q.determined and q.interval_95[0] <= 0.0
+    zero, endless = limits[0] == 0.0, np.isinf(limits[1])
 
     def is_open(name: str, q: Quantity) -> bool:
         # The gain that goes with an infinite lag is infinite.
         grows = name.startswith(("tau", "T", "zeta", "K", "offset")) and not name.endswith("/tau")
-        endless = (wide("tau") or limits.above is not None) and grows
-        none = limits.below is not None and name.startswith(("tau", "T", "zeta"))
-        none |= name != "delay" and wide(name)
+        none = zero and name.startswith(("tau", "T", "zeta"))
+        none |= name != "delay" and q.unit == TIME and q.determined and q.interval_95[0] <= 0.0
         # A higher order that is a first one determines only its gains and its longer lag.
         more = checks.first_order and not name.startswith(("K", "offset", "tau1", "delay"))
         # A number that ran to the end of its range has no slope there.
         ended = name != "delay" and q.error == 0
-        return nothing or endless or none or more or ended or name in joint
+        return nothing or (endless and grows) or none or more or ended or name in joint
 
     known = {n: q.open() if is_open(n, q) else q for n, q in quantities.items()
-             if limits.above is not None or not n.endswith("/tau")}  # fmt: skip
-    known |= {n: replace(known[n], interval_95=limits.interval) for n in ("tau", "tau1")
-              if n in known and limits.interval and not nothing}  # fmt: skip
+             if endless or not n.endswith("/tau")}  # fmt: skip
+    known |= {n: replace(known[n], interval_95=limits) for n in ("tau", "tau1")
+              if n in known and zero != endless and not nothing}  # fmt: skip
     blank = (nothing or c.parameter in joint for c in curves)
     return known, tuple(c.open() if b else c for c, b in zip(curves, blank, strict=True))
 

@@ -24,11 +24,11 @@ from beamfit.dynamics.answer import (
 )
 from beamfit.dynamics.bad_readings import BadReadings, judged_without
 from beamfit.dynamics.checks import Checks, HeldOutRun, changing_of, checks_of, digits_of, held_out
-from beamfit.dynamics.limits import LagLimits, lag_limits
+from beamfit.dynamics.limits import lag_posterior
 from beamfit.dynamics.model import PreparedOutput, network_of, output_of
 from beamfit.dynamics.paths import Paths, heard, latest
 from beamfit.dynamics.record import LEAST, Run, check_inputs, checked, unsure_gain
-from beamfit.dynamics.response import PHYSICS
+from beamfit.dynamics.response import PHYSICS, mean_step
 from beamfit.dynamics.search import Begun, ResponseSearch, Settled, case_of, fitted, used_by
 from beamfit.errors import InputError, Status, nearest
 from beamfit.greybox.fit import Fit
@@ -303,11 +303,8 @@ class _Identification(NamedTuple):
         others: Alternatives | None,
     ) -> tuple[Checks, dict[str, Quantity], tuple[Curve, ...]]:
         """Tests of the residuals, and what the runs determine of constants or curves."""
-        seen, constant, (_, physics, paths, offset) = (
-            found.seen,
-            self.map == "constant",
-            self.search,
-        )
+        seen, constant = found.seen, self.map == "constant"
+        _, _, paths, offset = self.search
         used = used_by(answer.fit) + (not paths.given and not seen.ends)  # a delay found counts
         gain = None if constant else found.settled.likelihood - answer.likelihood
         whole = found._replace(settled=answer)
@@ -317,16 +314,17 @@ class _Identification(NamedTuple):
         )
         if not constant:
             curves = curves_of(answer.fit, answer.errors, seen)
-            return checks, *told({}, curves, seen, checks, LagLimits(None, None))
+            return checks, *told({}, curves, seen, checks)
         if others is not None and others.departure.probability > 0.5:
             words, kind, chance = others.departure
             if checks.input_share or kind not in (FURTHER, GROWTH):  # more than digits do
                 checks = checks._replace(law=words, law_probability=chance, law_kind=kind)
         unsure = [unsure_gain(runs, found.path.way, name) for name in seen.inputs]
-        quantities = quantities_of(
-            answer.fit, answer.errors, others, seen, physics, digits_of(found), unsure
-        )
-        return checks, *told(quantities, (), seen, checks, lag_limits(seen, answer, offset))
+        lags = lag_posterior(found, offset)
+        row = float(mean_step(seen.runs[0].dt))
+        late = others.late * seen.parts * row if others is not None else 0.0
+        quantities = quantities_of(found, others, late, lags, digits_of(found), unsure)
+        return checks, *told(quantities, (), seen, checks, lags.limits(late))
 
 
 def _output(run: Run, output: str | None) -> str:

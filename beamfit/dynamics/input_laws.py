@@ -18,8 +18,8 @@ LAWS |= {
     "saturation": 1.0 - np.geomspace(0.02, 0.9, 8),
     "square law": np.outer((1.0, -1.0), np.geomspace(0.1, 50.0, 8)).ravel(),
 }
-# Places in the range about which a law lies, as shares of it: prior flat. A dead zone of a range
-# with 0 lies there; a saturation about an end of the range is one of the other end.
+# Places in the range about which a law lies, as shares of it: prior flat. A dead zone may lie about
+# 0 as well; a saturation about an end of the range is one of the other end.
 PLACES = {
     "dead zone": (0.1, 0.3, 0.5, 0.7, 0.9),
     "saturation": (0.0, 0.5, 1.0),
@@ -33,6 +33,23 @@ FINER = 5
 PLAYS = (0.0, 0.4, 0.8, 1.2, 1.6, 2.0)
 
 
+def _played(at: np.ndarray, now: float, width: np.ndarray) -> np.ndarray:
+    return np.clip(at, now - width, now + width)
+
+
+def _stopped(at: np.ndarray, now: float, width: np.ndarray) -> np.ndarray:
+    return np.where(np.abs(now - at) > width, now, at)
+
+
+def _limited(at: np.ndarray, now: float, width: np.ndarray) -> np.ndarray:
+    return np.clip(now, at - width, at + width)
+
+
+# Laws that follow an input row by row: where they are after each, by where they were, the input
+# and the width.
+FOLLOWING = {"play": _played, "hysteresis": _played, "stop": _stopped, "rate limit": _limited}
+
+
 def moved(u: np.ndarray, law: str, width: float | np.ndarray, place: float = 0.0) -> np.ndarray:
     """One input as a law hands it on, shape (rows,), for each of several widths if given.
 
@@ -43,25 +60,22 @@ def moved(u: np.ndarray, law: str, width: float | np.ndarray, place: float = 0.0
     about a place, a saturation leaves what is about one, and a square law bends about one.
     """
     half = np.asarray(width)[..., None]
-    if law == "dead zone":
-        return u - np.clip(u - place, -half, half)
-    if law == "saturation":
-        return place + np.clip(u - place, -half, half)
-    if law == "square law":
-        return u + (u - place) ** 2 / half
+    if law in FOLLOWING:  # what rests with the input, but for a rate limit
+        changes = (np.diff(u, prepend=np.nan) != 0) | (law == "rate limit")
+        widths = np.multiply.outer(width, PLAYS if law == "hysteresis" else (1.0,))
+        at, found = u[0] + 0 * widths, []
+        for now in u[changes]:
+            at = FOLLOWING[law](at, now, widths)
+            found.append(at)
+        return np.moveaxis(np.mean(found, axis=-1), 0, -1)[..., np.cumsum(changes) - 1]
     if law == "shift":
         sign = np.sign(np.diff(u, prepend=u[0]))
         last = np.maximum.accumulate(np.where(sign != 0, np.arange(len(u)), 0))
         return u - half * sign[last]
-    changes = (np.diff(u, prepend=np.nan) != 0) | (law == "rate limit")
-    widths = np.multiply.outer(width, PLAYS if law == "hysteresis" else (1.0,))
-    at, found = u[0] + 0 * widths, []
-    for now in u[changes]:
-        near = np.clip(at, now - widths, now + widths)
-        at = (np.where(at != near, now, at) if law == "stop"
-              else at + (now - near) if law == "rate limit" else near)  # fmt: skip
-        found.append(at)
-    return np.moveaxis(np.mean(found, axis=-1), 0, -1)[..., np.cumsum(changes) - 1]
+    near = np.clip(u - place, -half, half)
+    if law == "dead zone":
+        return u - near
+    return place + near if law == "saturation" else u + (u - place) ** 2 / half
 
 
 class InputLaw(NamedTuple):
@@ -127,9 +141,10 @@ def laws_between(name: str, low: float, high: float) -> list[InputLaw]:
     """The laws that are looked at of an input with this range."""
     found = []
     for kind, shares in LAWS.items():
-        at_zero = kind not in PLACES or (kind == "dead zone" and low < 0 < high)
-        places = [0.0] if at_zero else low + np.array(PLACES[kind]) * (high - low)
+        places = low + np.array(PLACES[kind]) * (high - low) if kind in PLACES else np.zeros(1)
         stride = 0.5 * (places[1] - places[0]) if len(places) > 1 else 0.0
+        if kind == "dead zone" and low < 0 < high:
+            places = np.append(places, 0.0)
         apart = np.abs(np.diff(np.log(np.abs(shares))))
         near = 0.5 * np.minimum(np.append(apart, np.inf), np.append(np.inf, apart))
         for place in places:

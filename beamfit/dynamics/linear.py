@@ -21,7 +21,7 @@ from beamfit.dynamics.answer import GAIN, PURE, TIME, derived, quantity, widened
 from beamfit.dynamics.bad_readings import judged_without
 from beamfit.dynamics.checks import digits_of
 from beamfit.dynamics.fit import MAPS
-from beamfit.dynamics.limits import SINGLE_END, LagLimits
+from beamfit.dynamics.limits import SINGLE_END
 from beamfit.dynamics.model import WEIGHT
 from beamfit.dynamics.paths import Path, Paths
 from beamfit.dynamics.record import Run, Way, band_limited, check_inputs, checked, unsure_gain
@@ -738,10 +738,12 @@ def _lag(numbers: Derived, i: int, pole: int, step: float) -> Quantity:
     low, high = at + NORMAL_REACH * error * np.array([-1.0, 1.0])
     if low > 0.0 and high < 1.0:
         return found
-    below, above = ((-step / np.log(end) if 0.0 < end < 1.0 else None)
-                    for end in at + ndtri(SINGLE_END) * error * np.array([1.0, -1.0]))  # fmt: skip
-    limits = LagLimits(above if high >= 1.0 else None, below if low <= 0.0 else None)
-    return replace(found.open(), interval_95=limits.interval)
+    zero, endless = low <= 0.0, high >= 1.0
+    end = at + ndtri(SINGLE_END) * error * (1.0 if zero else -1.0)
+    if (zero and endless) or not 0.0 < end < 1.0:
+        return found.open()
+    lag = -step / np.log(end)
+    return replace(found.open(), interval_95=(0.0, lag) if zero else (lag, np.inf))
 
 
 def _taylor(model: Any, course: Course) -> jax.Array:

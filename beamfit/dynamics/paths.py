@@ -65,8 +65,9 @@ class Paths(NamedTuple):
     @classmethod
     def of(cls, runs: Sequence[Run], delay: float | None, even: bool) -> Paths:
         """List those of runs, `even` where a model has whole samples; one delay if it is given."""
-        smooth, ramping = ((), ()) if even else moving(runs)
-        way = Way(smooth, ramping, stepwise(runs))
+        moves = moving(runs)
+        standing = tuple(name for name in stepwise(runs) if name not in sum(moves, ()))
+        way = Way(*(((), ()) if even else moves), standing)
         if delay is not None:
             return cls(way, (delay,), False)
         most = latest(runs)

@@ -5,8 +5,8 @@ import pytest
 
 from beamfit.dynamics.alternatives import NONE, Alternatives
 from beamfit.dynamics.fit import identify
-from beamfit.dynamics.input_laws import moved
-from beamfit.dynamics.paths import Path, stepwise
+from beamfit.dynamics.input_laws import laws_between, moved
+from beamfit.dynamics.paths import Path, Paths, stepwise
 from beamfit.dynamics.record import Run, Way, levels_of, unsure_gain
 from beamfit.errors import Status
 
@@ -22,6 +22,7 @@ UP_AND_DOWN = np.array([0.0, 1.0, 2.0, 2.0, 1.5, 1.0, 0.0, -1.0])
         ("dead zone", 0.5, [0.0, 0.5, 1.5, 1.5, 1.0, 0.5, 0.0, -0.5]),
         ("shift", 0.5, [0.0, 0.5, 1.5, 1.5, 2.0, 1.5, 0.5, -0.5]),
         ("saturation", 0.8, [0.0, 0.8, 0.8, 0.8, 0.8, 0.8, 0.0, -0.8]),
+        ("rate limit", 0.75, [0.0, 0.75, 1.5, 2.0, 1.5, 1.0, 0.25, -0.5]),
         ("square law", 2.0, [0.0, 1.5, 4.0, 4.0, 2.625, 1.5, 0.0, -0.5]),
     ],
 )
@@ -118,6 +119,35 @@ def test_a_bend_of_the_gain_is_named_for_what_it_is(words):
         assert fit.status is Status.poor_fit
         assert fit.checks.law.startswith(words), fit.checks.law
         assert "--map network" in fit.message
+
+
+def test_a_dead_zone_of_a_range_with_zero_may_lie_elsewhere():
+    """About 0 alone it was none, and the gain 6 errors off."""
+    random = np.random.default_rng(7)
+    u = np.repeat(random.uniform(-1, 1, 30), 12)
+    fit = identify(response(u, u - np.clip(u - 0.3, -0.2, 0.2), 0.2, random), delay=0)
+    gain = fit.quantities["K"]
+    assert fit.status is Status.poor_fit or abs(gain.value - 2) < 3 * gain.error
+    assert fit.checks.law.startswith("a dead zone of valve by ±"), fit.message
+    assert {law.place for law in laws_between("valve", -1.0, 1.0) if law.kind == "dead zone"} > {
+        0.0
+    }
+
+
+def test_what_is_all_but_impossible_is_in_no_error():
+    """A dead zone that hands on a sliver of the input had a gain of 1e13 and P = 2e-17."""
+    random = np.random.default_rng(1)
+    u = np.repeat([0.0, 1.0, -0.95, 0.1], 20)
+    fit = identify(response(u, u, 0.05, random, tau=300.0), delay=0)
+    slope = fit.quantities["K/tau"]
+    assert abs(slope.value - 2 / 300) < 4 * slope.error < 0.003
+
+
+def test_ramps_do_not_stand_at_levels():
+    u = np.interp(np.arange(160), [0, 40, 70, 120, 159], [0.0, 1.0, 0.3, 0.9, 0.2])
+    most = Paths.of([Run(np.arange(160.0), {"valve": u}, {"level": u})], None, False).most
+    assert most.moving == ("valve",)
+    assert not most.standing
 
 
 def test_a_few_values_of_an_input_leave_several_bends_possible():

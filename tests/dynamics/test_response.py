@@ -10,6 +10,7 @@ import pytest
 from scipy.signal import lfilter
 
 from beamfit.dynamics.fit import identify
+from beamfit.dynamics.limits import LagPosterior
 from beamfit.dynamics.record import Run
 from beamfit.dynamics.response import FIRST_ORDER, SECOND_ORDER, simulate
 from beamfit.errors import InputError, Status
@@ -238,6 +239,33 @@ def test_a_lag_below_a_sample_has_an_upper_limit_and_a_gain():
     assert 0.1 < q["tau"].interval_95[1] < 0.5
     assert "tau is below" in fit.message
     assert abs(q["K"].value - 2.0) < 4 * q["K"].error
+
+
+def test_a_limit_of_a_lag_is_a_quantile_of_its_posterior():
+    """Zero is as little as likely: a bisection from there ended where it began."""
+    lag = np.linspace(-7.0, 9.0, 3201)
+    log = -0.5 * ((lag - 1.0) / 0.3) ** 2
+    log = np.where(lag < 1.0, np.maximum(log, -4.5), log)
+    found = LagPosterior(lag, log, np.ones((3201, 1)), np.full((3201, 1), 0.1), 200)
+    below = np.cumsum(np.exp(log)) / np.exp(log).sum()
+    low, high = found.limits(0.0)
+    assert low == 0.0
+    assert np.log(high) == pytest.approx(lag[np.searchsorted(below, 0.95)], abs=0.01)
+    draws = found.drawn(["K"])
+    np.testing.assert_allclose(np.quantile(draws["K"], [0.025, 0.975]), [0.803, 1.197], atol=0.01)
+    assert np.quantile(draws["tau"], 0.95) == pytest.approx(high, rel=0.01)
+
+
+@simulations(6, 40)
+def test_the_interval_of_a_lag_longer_than_the_record_holds(count):
+    """By linear errors about the place where a flat search ended the truth was up to 5 off."""
+    held = []
+    for seed in range(count):
+        tau = 200.0 * np.random.default_rng([seed, 8]).uniform(0.4, 4.0)
+        q = identify(lagging(tau, seed, noise=0.05), delay=0).quantities
+        low, high = q["tau"].interval_95
+        held.append(low < tau < high)
+    assert np.mean(held) >= 0.8, held
 
 
 @pytest.mark.parametrize("tau", [0.4, 60.0, 200.0])
