@@ -1,4 +1,6 @@
-"""docs/verdict_constants.md names every constant that the judgement of a scan rests on."""
+"""docs/verdict_constants.md names every constant that the judgement of a scan rests on, and
+docs/lifetime_study.md those of decays that scatter.
+"""
 
 import ast
 from pathlib import Path
@@ -32,6 +34,12 @@ def test_every_constant_has_a_row_with_its_reason(path):
     for name in numbers_of(path):
         if name not in TABLES:
             assert f"`{name}`" in table, f"{name} of {path.name}"
+
+
+def test_the_page_of_a_study_has_the_priors_of_its_noise():
+    page = (ROOT / "docs" / "lifetime_study.md").read_text()
+    for name in numbers_of(ROOT / "beamfit" / "lifetime" / "fill_noise.py"):
+        assert f"`{name}`" in page, name
 
 
 def test_the_priors_of_the_page_are_those_of_the_code():

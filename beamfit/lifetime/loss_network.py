@@ -80,6 +80,9 @@ class Box(NamedTuple):
 
 # Sizes that are weighed, as relative errors of a and of b.
 SIZES = tuple(0.005 * 2 ** (k / 2) for k in range(13))
+# Prior of a size: half a normal of this width. Smooth decays tell a network that bends hardly from
+# a flat one with a large error, and what a network of losses leaves is a few per cent.
+USUAL = 0.05
 
 
 class Discrepancy(NamedTuple):
@@ -131,7 +134,8 @@ class Discrepancy(NamedTuple):
 
 
 def sized(trial: Discrepancy, fit: Fit, left: np.ndarray) -> Discrepancy:
-    """The size by restricted likelihood: weights integrated out about a fit made with a trial size.
+    """The size by restricted likelihood and its prior: weights integrated out about a fit made with
+    a trial size.
 
     `left` are the decays' residuals, in their errors.
     """
@@ -150,7 +154,10 @@ def sized(trial: Discrepancy, fit: Fit, left: np.ndarray) -> Discrepancy:
         rest = off @ off - pull @ np.linalg.solve(information, pull)
         return -np.log(np.diag(root)).sum() - 0.5 * (np.linalg.slogdet(information)[1] + rest)
 
-    return trial._replace(size=max(itertools.product(SIZES, SIZES), key=likelihood))
+    def posterior(size: tuple[float, float]) -> float:
+        return likelihood(size) - 0.5 * float(np.sum(np.square(size))) / USUAL**2
+
+    return trial._replace(size=max(itertools.product(SIZES, SIZES), key=posterior))
 
 
 # Units of a, b and the lifetime.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -13,13 +13,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from scipy.special import chdtrc, chdtri
+from scipy.linalg import solve_triangular
+from scipy.special import chdtrc, logsumexp
 
 from beamfit.answer import Row, Table, answer, cell, json_of, labelled
 from beamfit.errors import InputError
 from beamfit.greybox.design import Information, scores
 from beamfit.lifetime.decay_law import current as beam_at
 from beamfit.lifetime.expansion import DETERMINED, Expansion, lifetime_of
+from beamfit.lifetime.fill_noise import quantiles
 from beamfit.lifetime.fit import bare
 from beamfit.lifetime.loss_network import VOLTAGES, NetworkFit, fit_loss_network
 from beamfit.lifetime.mechanisms import (
@@ -33,19 +35,19 @@ from beamfit.lifetime.mechanisms import (
 from beamfit.lifetime.record import DecayRecord
 from beamfit.lifetime.ring import Operation
 from beamfit.lifetime.scales import (
+    LIKELY,
     VOLTAGE,
     DecaySet,
     ScaleFit,
     Summaries,
-    by_losses,
     fit_scales,
     information_root,
     loss_parts,
 )
 from beamfit.lifetime.study import Decay, Machine, settings_json, settings_of
-from beamfit.quantity import HOUR, Quantity, Status
+from beamfit.quantity import HOUR, Quantity, Status, percent
 from beamfit.sampling.posterior import Interval, Posterior
-from beamfit.statistics import POOR_FIT, quantity_of_draws
+from beamfit.statistics import CENTRAL, POOR_FIT, quantity_of_draws
 
 CAUSES = {
     "a": "the bunch or the momentum acceptance changed, or the beam-induced pressure",
@@ -82,21 +84,43 @@ class Anomaly(NamedTuple):
     probability: float
 
 
-def _linearised(
-    fit: ScaleFit, decays: Sequence[Decay]
-) -> tuple[np.ndarray, Callable[[int], np.ndarray]]:
-    """Readings minus model (2n,), and their slopes (2n, 2) by relative changes of a and b from a
-    decay on; whitened, with the errors of scales and pressures.
+class Later(NamedTuple):
+    """Later decays beside one of the noises, whitened with the errors of scales and pressures.
+
+    Attributes
+    ----------
+    off : array, shape (2n,)
+        Readings minus model.
+    change : array, shape (2n, n, 2)
+        Slopes by relative changes of a and of b of each decay.
     """
+
+    off: np.ndarray
+    change: np.ndarray
+
+    def since(self, first: int) -> np.ndarray:
+        """Slopes by relative changes from a decay on, shape (2n, 2)."""
+        return self.change[:, first:].sum(axis=1)
+
+
+def _linearised(fit: ScaleFit, decays: Sequence[Decay]) -> list[Later]:
+    """Later decays beside each of the noises that earlier ones may have."""
     together = DecaySet.of(decays, fit.machine, fit.decays.pressure_error, fit.voltages)
-    weight, off, by_scale = fit.about(together)
-    off, by_scale = off.ravel(), by_scale.reshape(off.size, -1)
-    a, b = map(np.asarray, scaled_losses(jnp.asarray(fit.vector), together.terms))
-    change = (weight @ by_losses(a * np.asarray(together.terms.current), b)).reshape(-1, 2)
-    from_scales = by_scale @ fit.spread.half
-    covariance = fit.error_scale**2 * (np.eye(off.size) + from_scales @ from_scales.T)
-    whiten = np.linalg.inv(np.linalg.cholesky(covariance))
-    return -whiten @ off, lambda first: whiten[:, 2 * first :] @ change[2 * first :]
+    weight, off, rows = fit.about(together)
+    change, count = fit.changes(together, weight), len(decays)
+    blocks, noise, found = np.arange(count), fit.noise, []
+    whole = np.zeros((count, 2, count, 2))
+    whole[blocks, :, blocks] = change
+    for k in range(noise.weight.size):
+        by_scales = (rows @ noise.half[k]).reshape(2 * count, -1)
+        scattered = (whole * noise.scatter[k]).reshape(2 * count, -1)
+        moved = (off + rows @ (noise.shift[k] - noise.centre)).ravel()
+        covariance = np.eye(2 * count) + by_scales @ by_scales.T + scattered @ scattered.T
+        root = np.linalg.cholesky(covariance)
+        both = np.column_stack([-moved, whole.reshape(2 * count, -1)])
+        white = solve_triangular(root, both, lower=True)
+        found.append(Later(white[:, 0], white[:, 1:].reshape(-1, count, 2)))
+    return found
 
 
 def _fitted(off: np.ndarray, change: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
@@ -130,24 +154,29 @@ def find_anomaly(fit: ScaleFit, decays: Sequence[Decay]) -> Anomaly:
     Notes
     -----
     For each possible start, the relative changes of a and b from there on are fitted by linear
-    least squares with the covariance of readings, pressure gauge and scales. The fall of chi² has
-    two degrees of freedom; its probability is multiplied by the number of starts. A pressure
+    least squares with the covariance of readings, scatter, pressure gauge and scales. The fall of
+    chi² has two degrees of freedom; its probability, averaged over the noise that the earlier
+    decays leave open, is multiplied by the number of starts. A pressure
     rise that the gauge shows is part of the model and no anomaly.
     """
     if not decays:
         raise InputError("no decay", "one or more to compare with the model")
-    off, since = _linearised(fit, decays)
-    trials = [_fitted(off, since(first)) for first in range(len(decays))]
-    falls = np.array([fall for fall, _, _ in trials])
-    best = int(np.argmax(falls))
-    fall, found, covariance = trials[best]
-    chance = min(1.0, len(decays) * float(chdtrc(2, fall)))
-    error = np.sqrt(np.diag(covariance))
-    a, b = (Quantity(float(v), float(e), "1") for v, e in zip(found, error, strict=True))
+    # A fall of chi² by two numbers has the probability exp(-fall/2), averaged over the noise.
+    later, weight = _linearised(fit, decays), fit.noise.weight
+    trials = [[_fitted(one.off, one.since(first)) for one in later] for first in range(len(decays))]
+    falls = np.array([[fall for fall, _, _ in trial] for trial in trials])
+    logs = logsumexp(np.log(weight) - falls / 2, axis=1)
+    best = int(np.argmin(logs))
+    chance = min(1.0, len(decays) * math.exp(logs[best]))
+    found, covariance = (np.array(part) for part in list(zip(*trials[best], strict=True))[1:])
+    middle = weight @ found
+    spread = np.diagonal(covariance, axis1=1, axis2=2) + (found - middle) ** 2
+    error = np.sqrt(weight @ spread)
+    a, b = (Quantity(float(v), float(e), "1") for v, e in zip(middle, error, strict=True))
     if chance > POOR_FIT:
         message = f"{len(decays)} decays follow the model (p = {chance:.2g})."
         return Anomaly(Status.converged, message, None, (), a, b, chance)
-    moved, begun = _moved(off, since(best), fall), decays[best].fit.record
+    moved, begun = _moved(later, best, falls[best], weight), decays[best].fit.record
     names = " and ".join(moved)
     changes = ", ".join(
         f"{name} by {100 * q.value:+.3g} ± {100 * q.error:.2g} %"
@@ -158,11 +187,18 @@ def find_anomaly(fit: ScaleFit, decays: Sequence[Decay]) -> Anomaly:
     return Anomaly(Status.poor_fit, message, begun, moved, a, b, chance)
 
 
-def _moved(off: np.ndarray, change: np.ndarray, fall: float) -> tuple[str, ...]:
+def _moved(
+    later: Sequence[Later], first: int, falls: np.ndarray, weight: np.ndarray
+) -> tuple[str, ...]:
     """Test if one of the two explains as much as both."""
-    alone = {name: _fitted(off, change[:, [k]])[0] for k, name in enumerate("ab")}
-    best = max(alone, key=alone.get)
-    return (best,) if fall - alone[best] < chdtri(1.0, POOR_FIT) else ("a", "b")
+    alone = {
+        name: np.array([_fitted(one.off, one.since(first)[:, [k]])[0] for one in later])
+        for k, name in enumerate("ab")
+    }
+    falls = {name: np.maximum(falls - own, 0.0) for name, own in alone.items()}
+    chance = {name: weight @ chdtrc(1.0, fall) for name, fall in falls.items()}
+    best = max(chance, key=chance.get)
+    return (best,) if chance[best] > POOR_FIT else ("a", "b")
 
 
 def budget_intervals(
@@ -273,7 +309,11 @@ def _rows(fit: ScaleFit, candidate: DecayCandidate) -> np.ndarray:
     summary = Summaries(mean, loss_parts(a, b, mean), root)
     one = terms._replace(current=mean), summary
     alone = jax.tree.map(lambda part: jnp.asarray(part)[None], one)
-    return fit.about(DecaySet(*alone, fit.decays.pressure_error))[2][0]
+    one = DecaySet(*alone, fit.decays.pressure_error)
+    weight, _, [rows] = fit.about(one)
+    # A new decay scatters as the likeliest noise says.
+    own = fit.changes(one, weight)[0] * fit.noise.scatter[fit.noise.likeliest]
+    return np.linalg.solve(np.linalg.cholesky(np.eye(2) + own @ own.T), rows)
 
 
 def next_decays(fit: ScaleFit, candidates: Sequence[DecayCandidate]) -> tuple[Proposal, ...]:
@@ -312,7 +352,7 @@ def next_decays(fit: ScaleFit, candidates: Sequence[DecayCandidate]) -> tuple[Pr
     [before] = scores(known, np.zeros((1, *rows.shape[1:])), volume=True)
     gains = 0.5 * (before - scores(known, rows, volume=True))
     proposals = [
-        Proposal(candidate, float(gain), known.with_rows(own).error * fit.error_scale)
+        Proposal(candidate, float(gain), known.with_rows(own).error)
         for candidate, own, gain in zip(candidates, rows, gains, strict=True)
     ]
     return tuple(sorted(proposals, key=lambda proposal: -proposal.information))
@@ -458,7 +498,7 @@ class HeldBack(NamedTuple):
         Of the decay.
     predicted : Quantity
         Lifetime at its mean current, h, from a fit to the other decays; the error is that of the
-        scales and of this decay's pressure reading.
+        scales, of this decay's pressure reading, and of its scatter.
     measured : Quantity
         What the decay itself says, h.
     pull : float
@@ -487,9 +527,10 @@ def predict_held_back(fit: ScaleFit) -> tuple[HeldBack, ...]:
 
     Notes
     -----
-    Least squares linear about the fit: with H = J (JᵀJ)⁻¹ Jᵀ of one decay's whitened rows J and its
-    residuals r, those of the fit without it are (1 - H)⁻¹ r, with the covariance (1 - H)⁻¹: R. D.
-    Cook and S. Weisberg, Residuals and Influence in Regression (1982), section 2.2.
+    Least squares linear about the fit, averaged over the noise: with H = J (JᵀJ)⁻¹ Jᵀ of one
+    decay's whitened rows J and its residuals r, those of the fit without it are (1 - H)⁻¹ r, with
+    the covariance (1 - H)⁻¹: R. D. Cook and S. Weisberg, Residuals and Influence in Regression
+    (1982), section 2.2.
 
     Examples
     --------
@@ -503,27 +544,55 @@ def predict_held_back(fit: ScaleFit) -> tuple[HeldBack, ...]:
     >>> print(found[3].predicted, "predicted,", found[3].measured, "measured")
     9.82 ± 0.14 h predicted, 9.730669 ± 0.000098 h measured
     """
-    measured = fit.decays.measured
+    measured, noise, found = fit.decays.measured, fit.noise, []
     weight, left, rows = fit.about(fit.decays)
-    found = []
+    change = fit.changes(fit.decays, weight)
     for k, name in enumerate(fit.names):
-        own = rows[k] @ fit.spread.half
-        shares, turned = np.linalg.eigh(own @ own.T)
-        # A decay that alone tells of something is predicted by nothing else: infinitely badly.
-        rest = turned / np.maximum(1 - shares, np.finfo(float).eps) @ turned.T
         root = np.asarray(measured.root[k])
         if not np.any(root):
             continue
         back = np.linalg.inv(weight[k])
-        spread = back @ rest @ back.T * fit.error_scale**2
-        off = (back @ rest @ left[k])[1]
+        each = [
+            _left_out(
+                left[k] + rows[k] @ (noise.shift[i] - noise.centre),
+                rows[k] @ noise.half[i],
+                change[k] * noise.sizes(i, len(fit.names))[k],
+                change[k] * noise.scatter[i],
+            )
+            for i in range(noise.weight.size)
+        ]
+        off = np.array([(back @ one)[1] for one, _ in each])
+        square = np.array([back[1] @ spread @ back[1] for _, spread in each])
         reading = np.linalg.inv(root)[1]
-        rate, error = measured.parts[k, 1], fit.error_scale * np.linalg.norm(reading)
-        by_others = np.sqrt(max(spread[1, 1] - error**2, 0.0))
-        if by_others < DETERMINED * rate:
-            both = lifetime_of(rate + off, by_others), lifetime_of(rate, error)
-            found.append(HeldBack(name, *both, float(off / np.sqrt(spread[1, 1]))))
+        rate, error = measured.parts[k, 1], np.linalg.norm(reading)
+        # By some noises a decay may alone tell of something.
+        told = square - error**2 < (DETERMINED * rate) ** 2
+        weight_told = noise.weight * told
+        if not weight_told.sum() > LIKELY:
+            continue
+        low, high = quantiles(weight_told / weight_told.sum(), off, np.sqrt(square), CENTRAL)
+        middle, spread = (low + high) / 2, (high - low) / 2
+        by_others = np.sqrt(max(spread**2 - error**2, 0.0))
+        both = lifetime_of(rate + middle, by_others), lifetime_of(rate, error)
+        found.append(HeldBack(name, *both, middle / spread))
     return tuple(found)
+
+
+def _left_out(
+    off: np.ndarray, own: np.ndarray, here: np.ndarray, usual: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Residuals (2,) of a decay by the fit to the others, and their covariance.
+
+    `own` are its slopes by what the scales err by in the fit to all, `here` and `usual` its scatter
+    there and that of any decay.
+    """
+    covariance = np.eye(2) + here @ here.T
+    root = np.linalg.cholesky(covariance)
+    shares, turned = np.linalg.eigh(np.linalg.solve(root, own) @ np.linalg.solve(root, own).T)
+    # A decay that alone tells of something is predicted by nothing else: infinitely badly.
+    rest = turned / np.maximum(1 - shares, np.finfo(float).eps) @ turned.T
+    spread = root @ rest @ root.T - covariance + np.eye(2) + usual @ usual.T
+    return root @ rest @ np.linalg.solve(root, off), spread
 
 
 NOTE = (
@@ -633,7 +702,9 @@ class Shift:
                 of, untold = "true over read", "not told: its prior's"
             rows.append(Row(f"{name}, {of}", [untold if scale.error is None else scale], True))
         worth = f"{fit.chi2:.4g}/{fit.dof}" if fit.dof > 0 else "not testable"
-        rows.append(Row("chi2/dof", [worth], True))
+        rows.append(Row("chi2/dof without scatter", [worth], True))
+        sizes = " and ".join(percent(fit.scatter[name].value) for name in "ab")
+        rows.append(Row("a and b scatter from fill to fill by", [sizes], True))
         for row in self.budget:
             said = str(row).removeprefix(f"{row.name}: ") if row.separable else "not determined"
             rows.append(Row(f"{row.name} at {self.current:.4g} mA", [said], row.name == "lifetime"))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -12,8 +11,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.scipy.special import logsumexp
+from scipy.linalg import block_diag, solve_triangular
 
 from beamfit.answer import json_of, shown
+from beamfit.arrays import padded_length
 from beamfit.errors import Finding, InputError, Judged, judge, nearest
 from beamfit.greybox.covariance import Spread, spread_of
 from beamfit.greybox.fit import Fit
@@ -21,12 +23,20 @@ from beamfit.greybox.posterior import Optimum, Statement, target_of
 from beamfit.greybox.problem import Free, Prior, Problem, Record
 from beamfit.greybox.solve import solve
 from beamfit.lifetime.expansion import DETERMINED, LEVEL, LOSS, QUADRATIC, Expansion
+from beamfit.lifetime.fill_noise import (
+    BY,
+    SHORTEST,
+    FillNoise,
+    Linear,
+    compared,
+    log_likelihood,
+)
 from beamfit.lifetime.fit import DecayFit
 from beamfit.lifetime.mechanisms import SCALES, LossTerms, loss_terms, scaled_losses
 from beamfit.lifetime.ring import Operation
 from beamfit.lifetime.study import Decay, Machine, settings_of
-from beamfit.quantity import Quantity, Status
-from beamfit.statistics import POOR_FIT, chi2_probability
+from beamfit.quantity import Quantity, Status, percent
+from beamfit.statistics import CENTRAL, POOR_FIT, WIDE
 
 if TYPE_CHECKING:
     from beamfit.sampling.posterior import Posterior
@@ -177,6 +187,14 @@ LARGEST = 1e3
 VOLTAGE = "rf_voltage"
 # It is sought within so many errors of that prior, and losses computed at each of them.
 WIDEST = 3
+# Noises are weighed about the scales, and these fitted, in so many rounds, until they move by less.
+ROUNDS, SETTLED = 8, 1e-3
+# Scatter, or that a decay is odd, is said from this probability on.
+LIKELY = 0.95
+# Share of the RF voltage by which losses are differentiated.
+STEP = 2e-3
+# Noises that stand for all of them in the sampler.
+SAMPLED = 48
 
 
 class DecaySet(NamedTuple):
@@ -241,29 +259,36 @@ class ScaleFit(Judged):
     Parameters
     ----------
     fit : Fit
-        Of the core, with the priors among its parts.
+        Of the core by the likeliest noise, with the priors among its parts.
     machine : Machine
         The ring and its usual operation.
     decays : DecaySet
         What it was fitted to.
     names : tuple of str
         Names of the decays.
+    noise : FillNoise
+        How they scatter, and what may be wrong besides, averaged over.
+    as_read : float
+        Probability that the RF voltage is what is read, where its scale was freed without a prior.
     """
 
     fit: Fit
     machine: Machine
     decays: DecaySet
     names: tuple[str, ...]
+    noise: FillNoise
+    as_read: float = 1.0
 
-    @property
+    @cached_property
     def vector(self) -> np.ndarray:
-        """All scales, separable or not, shape (n,)."""
-        return self.fit.theta
+        """All scales, separable or not, by the likeliest model, its noise averaged over."""
+        problem = self.fit.problem
+        return np.clip(self.fit.theta + self.noise.centre, problem.lower, problem.upper)
 
-    @property
+    @cached_property
     def chi2(self) -> float:
-        """Sum of squares, priors not counted."""
-        return self.fit.group(RECORD).chi2
+        """Sum of squares by the decays' own errors and the pressures', without scatter."""
+        return float(np.sum(self.about(self.decays)[1] ** 2))
 
     @property
     def dof(self) -> int:
@@ -271,26 +296,69 @@ class ScaleFit(Judged):
         told = np.any(np.asarray(self.decays.measured.root) != 0, axis=-1)
         return int(np.sum(told)) - len(SCALES)
 
-    @property
-    def error_scale(self) -> float:
-        """sqrt(chi²/dof) where above 1."""
-        return math.sqrt(max(1.0, self.chi2 / self.dof)) if self.dof > 0 else 1.0
-
-    @property
-    def improbable(self) -> bool:
-        """True if chi² is improbable."""
-        return self.dof > 0 and chi2_probability(self.chi2, self.dof) < POOR_FIT
+    @cached_property
+    def spread_raw(self) -> Spread:
+        """Spread of the scales by the decays' own errors and the pressures', without scatter."""
+        _, _, rows = self.about(self.decays)
+        priors = self.fit.dense_jacobian[2 * len(rows) :]
+        unbounded = np.full(self.vector.shape, np.inf)
+        rows = np.vstack([rows.reshape(-1, unbounded.size), priors])
+        # Bounds stand for nothing known.
+        return spread_of(rows, -unbounded, unbounded)
 
     @cached_property
     def spread(self) -> Spread:
-        """Spread of the scales without their bounds, which stand for nothing known."""
-        unbounded = np.full(self.vector.shape, np.inf)
-        return spread_of(self.fit.jacobian, -unbounded, unbounded)
+        """Spread of the scales over all noises."""
+        return self.noise.spread(self.spread_raw)
+
+    @cached_property
+    def scatter(self) -> dict[str, Quantity]:
+        """Scatter of a and of b from fill to fill beyond what decays and pressures err by."""
+        return {name: self._scatter(k) for k, name in enumerate("ab")}
+
+    def _scatter(self, k: int) -> Quantity:
+        sizes = self.noise.scatter[:, k]
+        order = np.argsort(sizes)
+        heap = np.cumsum(self.noise.weight[order])
+        at = np.minimum(np.searchsorted(heap, (0.5, *CENTRAL, *WIDE)), len(order) - 1)
+        middle, low, high, *ends = map(float, sizes[order][at])
+        return Quantity(middle, (high - low) / 2, "1", None, tuple(ends))
+
+    @property
+    def remark(self) -> str:
+        """Sentences on scatter and an odd decay, where they are likely."""
+        noise, said = self.noise, []
+        if POOR_FIT < self.as_read < 1:
+            said.append(f"{_misread(self)} (probability {1 - self.as_read:.2g}).")
+        scatters = noise.scatter > 0
+        likely = noise.weight @ scatters > 0.5
+        sizes = [
+            f"{percent(self.scatter[name].value)} in {name}"
+            for name, has in zip("ab", likely, strict=True)
+            if has and noise.weight @ scatters.any(axis=1) > LIKELY
+        ]
+        if sizes:
+            said.append(
+                f"Decays scatter by {' and '.join(sizes)} beyond their errors, which the errors "
+                "contain: record more fills, with orbit, coupling and fill pattern kept the same."
+            )
+        odd = np.bincount(noise.odd + 1, noise.weight, len(self.names) + 1)[1:]
+        if odd.max() > LIKELY:
+            name = self.names[int(np.argmax(odd))]
+            said.append(f"{name} does not follow the others and hardly counts: look at its record.")
+        return " ".join(said)
+
+    @cached_property
+    def refuted_by(self) -> str | None:
+        """The likeliest departure from first principles where these are refuted beside scatter."""
+        if self.as_read < POOR_FIT:
+            return VOLTAGE
+        return None if self.noise.probabilities[0] > POOR_FIT else self.noise.model_name
 
     @property
     def covariance(self) -> np.ndarray:
-        """Linearised, not enlarged, of all scales whether separable or not, shape (n, n); infinite
-        along directions that nothing determines.
+        """Linearised, of all scales whether separable or not, shape (n, n); infinite along
+        directions that nothing determines.
         """
         blind = ~np.isfinite(self.spread.errors)
         return np.where(np.outer(blind, blind), np.inf, self.spread.seen)
@@ -302,29 +370,29 @@ class ScaleFit(Judged):
         true over stated, where it has a prior.
         """
         priors = {prior.name: prior.sd for prior in self.fit.problem.priors}
-        found = {}
-        numbers = zip(self.fit.problem.names, self.vector, self.spread.errors, strict=True)
-        for name, value, raw in numbers:
-            quantity = Quantity(float(value), self.error_scale * float(raw), "1", float(raw))
+        names, blind, found = self.fit.problem.names, ~np.isfinite(self.spread.errors), {}
+        for k, name in enumerate(names):
+            raw = float(self.spread_raw.errors[k])
+            quantity = self.noise.quantity(float(self.fit.theta[k]), k, raw)
+            value = quantity.value
             # Against 1 where the value is smaller: a mechanism found absent, 0.0 ± 0.1, is
             # separable. A voltage that its prior tells better than the decays is the prior's.
             known = quantity.error < DETERMINED * max(value, 1.0)
             if name == VOLTAGE:
-                known = 2 * raw**2 < priors[name] ** 2
-            found[name] = quantity if known else quantity.open()
+                known = 2 * quantity.error**2 < priors[name] ** 2
+            found[name] = quantity if known and not blind[k] else quantity.open()
         return found
 
     @cached_property
     def finding(self) -> Finding:
-        """Status and sentences on the scales: `converged`; `poor_fit` if chi² is improbable;
-        `unidentified` if a mechanism is not separable from the others; `not_converged` if the
-        search failed.
+        """Status and sentences on the scales: `converged`; `poor_fit` if decays depart from first
+        principles otherwise than by scatter; `unidentified` if a mechanism is not separable from
+        the others; `not_converged` if the search failed.
         """
         found, voltage = judge(self, RULES), self.scales.get(VOLTAGE)
-        if voltage is None or voltage.error is not None:
-            return found
-        said = f"{found.cause} The decays do not tell the scale of the RF voltage: its prior does."
-        return Finding(found.status, said)
+        untold = voltage is not None and voltage.error is None
+        prior = "The decays do not tell the scale of the RF voltage: its prior does." * untold
+        return Finding(found.status, " ".join(filter(None, (found.cause, prior, self.remark))))
 
     @property
     def voltages(self) -> np.ndarray | None:
@@ -350,14 +418,17 @@ class ScaleFit(Judged):
         usual = jnp.ones_like(vector)
         size = np.maximum(np.abs(quantity(vector)), np.abs(quantity(usual)))
         error = self.spread.error(np.asarray(jax.jacfwd(quantity)(vector)))
-        return self.error_scale * error < DETERMINED * size
+        return error < DETERMINED * size
 
     def about(self, decays: DecaySet) -> tuple[np.ndarray, ...]:
-        """Expand decays: their weights, their `pulls`, and the slopes of these by the scales."""
-        vector = jnp.asarray(self.vector)
-        weight = whitener(vector, decays)
-        given = vector, decays, weight
-        return tuple(map(np.asarray, (weight, pulls(*given), _by_scales(*given))))
+        """Expand decays: their weights without scatter, their `pulls`, and the slopes of these by
+        the scales.
+        """
+        return _expanded(self.vector, decays)
+
+    def changes(self, decays: DecaySet, weight: np.ndarray) -> np.ndarray:
+        """Slopes of `pulls` by ln a and ln b of each decay, shape (n, 2, 2)."""
+        return weight @ _changes(self.vector, decays)
 
     def __str__(self) -> str:
         rows = [f"{len(self.names)} decays: {self.status}. {self.message}"]
@@ -383,26 +454,26 @@ class ScaleFit(Judged):
         -------
         Posterior
             Of Touschek, bremsstrahlung, elastic, desorption, with the priors of the fit, otherwise
-            flat from 0 to 1000. The pressure errors are integrated out as in the fit.
+            flat from 0 to 1000. Pressure errors are integrated out and the scatter is averaged
+            over as in the fit.
         """
         from beamfit.sampling.ensemble import draw
 
-        data = (self.decays, self.error_scale)
-        record = Record(RECORD, _pulls, data, np.zeros(self.decays.measured.parts.shape), 1.0)
         stated = Statement(
-            data=data,
+            data=(self.decays, Sampled.of(self)),
             log_volume=_log_volume,
             units=dict.fromkeys(self.scales, "1"),
+            averaged=[RECORD],
             priors_own=[name for name, scale in self.scales.items() if scale.error is None],
         )
         optimum = Optimum(self.vector, self.finding, [1.0], [True])
-        problem = replace(self.fit.problem, records=[record])
+        problem = self.fit.problem
         return draw(target_of(problem, optimum, stated), seed=seed, **options)
 
     def to_json(self) -> dict[str, Any]:
         """Return the scales and the verdict as JSON's types."""
         verdict = {"status": self.status, "message": self.message}
-        rest = {"chi2": self.chi2, "dof": self.dof, "decays": self.names}
+        rest = {"scatter": self.scatter, "chi2": self.chi2, "dof": self.dof, "decays": self.names}
         return json_of({**verdict, **self.scales, **rest})
 
 
@@ -467,7 +538,9 @@ def fit_scales(
     -----
     Least squares on the pairs of `Summaries`, which is least squares on all readings to second
     order about each decay's own fit. The pressure factor of each record is integrated out with
-    the model linearised in it.
+    the model linearised in it. How a and b scatter from fill to fill is averaged over, and what is
+    no scatter compared with it (`FillNoise`), with all linear in the scales. Where a misread RF
+    voltage is the likeliest, its scale is free with a prior of 1 ± 2 %.
     """
     if not decays:
         raise InputError("no decay", "one or more; several settings separate the mechanisms")
@@ -479,38 +552,163 @@ def fit_scales(
     free += [] if voltages is None else [Free(VOLTAGE, voltages[0], voltages[-1])]
     names = (*SCALES, VOLTAGE)[: len(free)]
     vector = np.array([priors.get(name, (1.0, 0.0))[0] for name in names])
-    for _ in range(5):  # the weight moves little with the scales: it settles in two or three
-        weight = whitener(vector, together)
-        record = Record(RECORD, _weighted, (together, weight), nothing, 1.0)
+    models = _departures(decays, machine, vector, voltages)
+    limits = np.array([(each.lower, each.upper) for each in free], float).T
+    before = None
+    for _ in range(ROUNDS):
+        linear = _linear(vector, together, known, names)
+        noise = compared(linear, models, limits - vector)
+        weight = _whole(vector, together, noise)
+        record = Record(RECORD, _weighted, (together, weight), nothing.ravel(), 1.0)
         found = solve(Problem(dict(zip(names, vector, strict=True)), free, [record], known))
-        vector = found.theta
-    return ScaleFit(found, machine, together, tuple(d.fit.record for d in decays))
+        moved, vector = found.theta - vector, found.theta
+        noise = replace(noise, shift=noise.shift - moved)
+        likeliest = noise.model[noise.likeliest], *noise.scatter[noise.likeliest]
+        if before == likeliest and np.all(np.abs(moved) < SETTLED * np.maximum(vector, 1.0)):
+            break
+        before = likeliest
+    named = tuple(decay.fit.record for decay in decays)
+    fit = ScaleFit(found, machine, together, named, noise)
+    if noise.model_name != VOLTAGE:
+        return fit
+    # What a misread voltage predicts needs its scale.
+    try:
+        free = {**priors, VOLTAGE: (1.0, BY[VOLTAGE])}
+        freed = fit_scales(decays, machine, pressure_error=pressure_error, priors=free)
+    except InputError:  # a decay would not be stored three errors lower
+        return fit
+    return replace(freed, as_read=float(noise.probabilities[0]))
 
 
 def _vector(model: Mapping[str, Array]) -> Array:
     return jnp.stack([model[name] for name in (*SCALES, VOLTAGE) if name in model])
 
 
-def _weighted(model: Mapping[str, Array], data: tuple[DecaySet, Array]) -> Array:
-    """Model minus measurement, in standard errors taken at the last scales."""
-    return pulls(_vector(model), *data)
+def _weighted(model: Mapping[str, Array], data: tuple[DecaySet, tuple[Array, Array]]) -> Array:
+    """Model minus measurement in standard errors taken at the last scales."""
+    decays, (weight, whiten) = data
+    return whiten @ pulls(_vector(model), decays, weight).ravel()
 
 
-def _pulls(scales: Mapping[str, Array], data: tuple[DecaySet, Array]) -> Array:
-    """Model minus measurement in standard errors, which move with the scales; the second of the
-    data is a factor on all errors.
+def _expanded(vector: np.ndarray, decays: DecaySet) -> tuple[np.ndarray, ...]:
+    vector = jnp.asarray(vector)
+    weight = whitener(vector, decays)
+    given = vector, decays, weight
+    return tuple(map(np.asarray, (weight, pulls(*given), _by_scales(*given))))
+
+
+def _changes(vector: np.ndarray, decays: DecaySet) -> np.ndarray:
+    """Changes of the parts by ln a and ln b of each decay, shape (n, 2, 2)."""
+    a, b = map(np.asarray, scaled_losses(jnp.asarray(vector), decays.terms))
+    return by_losses(a * np.asarray(decays.terms.current), b)
+
+
+def _linear(
+    vector: np.ndarray, decays: DecaySet, priors: Sequence[Prior], names: Sequence[str]
+) -> Linear:
+    """Decays about some scales, and the priors of these."""
+    weight, off, rows = _expanded(vector, decays)
+    at = [names.index(prior.name) for prior in priors]
+    mean, sd = (np.array([getattr(p, n) for p in priors], float) for n in ("mean", "sd"))
+    known = np.eye(len(names))[at] / sd[:, None]
+    return Linear(off, rows, weight @ _changes(vector, decays), (vector[at] - mean) / sd, known)
+
+
+def _whole(vector: np.ndarray, decays: DecaySet, noise: FillNoise) -> tuple[Array, Array]:
+    """Roots of the information of each decay, and of all beside the likeliest noise, (2n, 2n)."""
+    weight = np.asarray(whitener(jnp.asarray(vector), decays))
+    change, k = weight @ _changes(vector, decays), noise.likeliest
+    scattered = block_diag(*(change * noise.sizes(k, len(change))[:, None, :]))
+    smooth = (change @ noise.columns[noise.model[k]]).reshape(len(scattered), -1)
+    covariance = np.eye(len(scattered)) + scattered @ scattered.T + smooth @ smooth.T
+    whiten = solve_triangular(np.linalg.cholesky(covariance), np.eye(len(covariance)), lower=True)
+    return jnp.asarray(weight), jnp.asarray(whiten)
+
+
+def _departures(
+    decays: Sequence[Decay], machine: Machine, vector: np.ndarray, voltages: np.ndarray | None
+) -> dict[str, np.ndarray]:
+    """Changes of ln a and ln b of each decay by what may be wrong besides, as of `compared`."""
+    settings, scales = settings_of(decays, machine), jnp.asarray(vector[: len(SCALES)])
+
+    def logs(operation: Operation, current: float) -> np.ndarray:
+        terms = loss_terms(machine.ring, operation, current)
+        return np.log(np.array(scaled_losses(scales, terms), float))
+
+    found = {}
+    if voltages is None:
+        higher = [(o._replace(rf_voltage=(1 + STEP) * o.rf_voltage), beam) for o, beam in settings]
+        change = np.array([logs(*to) - logs(*at) for to, at in zip(higher, settings, strict=True)])
+        found[VOLTAGE] = BY[VOLTAGE] / STEP * change[..., None]
+    inputs = np.array([
+        (1e-6 * o.rf_voltage, np.log(o.scraper_y), np.log(o.bunches)) for o, _ in settings
+    ], float)  # fmt: skip
+    middle, half = (inputs.max(0) + inputs.min(0)) / 2, np.ptp(inputs, axis=0) / 2
+    moved = (inputs - middle)[:, half > SHORTEST] / half[half > SHORTEST]
+    bends = np.hstack([moved, moved**2 - np.mean(moved**2, axis=0)])
+    if bends.size:
+        found["settings"] = BY["settings"] * np.stack([np.kron(row, np.eye(2)) for row in bends])
+    return {name: rows for name, rows in found.items() if np.any(rows)}
+
+
+class Sampled(NamedTuple):
+    """Noises for the sampler.
+
+    Attributes
+    ----------
+    prior : array, shape (k,)
+        Logarithm of their weight before the decays.
+    sizes : array, shape (k, n, 2)
+        Scatter of ln a and ln b.
+    rows : array, shape (n, 2, 2)
+        Changes of the parts by ln a and ln b. Those of the fit: a scatter that grew with the losses
+        would allow any loss.
+    columns : array, shape (k, n, 2, m)
+        Changes of ln a and ln b by further numbers.
     """
-    decays, factor = data
+
+    prior: Array
+    sizes: Array
+    rows: Array
+    columns: Array
+
+    @classmethod
+    def of(cls, fit: ScaleFit) -> Sampled:
+        """Draw noises evenly by their weight: a few stand for many."""
+        noise, count = fit.noise, len(fit.names)
+        order = np.lexsort((*noise.scatter.T, noise.odd, noise.model))
+        at = (np.arange(SAMPLED) + 0.5) / SAMPLED
+        place = np.searchsorted(np.cumsum(noise.weight[order]), at)
+        drawn, often = np.unique(order[np.minimum(place, len(order) - 1)], return_counts=True)
+        # Compiled code is shared by a few numbers of noises.
+        drawn = np.pad(drawn, (0, padded_length(len(drawn)) - len(drawn)), mode="edge")
+        often = np.pad(often, (0, len(drawn) - len(often)))
+        own = [noise.columns[noise.model[k]] for k in drawn]
+        wide = max(one.shape[2] for one in own)
+        columns = [np.pad(one, ((0, 0), (0, 0), (0, wide - one.shape[2]))) for one in own]
+        return cls(
+            prior=jnp.asarray(noise.prior[drawn] - np.log(noise.weight[drawn])) + jnp.log(often),
+            sizes=jnp.asarray([noise.sizes(k, count) for k in drawn]),
+            rows=jnp.asarray(_changes(fit.vector, fit.decays)),
+            columns=jnp.asarray(columns),
+        )
+
+
+def _log_volume(scales: Mapping[str, Array], data: tuple[DecaySet, Sampled]) -> Array:
+    """Log likelihood of the decays, the noise averaged over."""
+    decays, noise = data
     vector = _vector(scales)
-    return pulls(vector, decays, whitener(vector, decays)) / factor
+    weight = whitener(vector, decays)
+    off, change = pulls(vector, decays, weight), weight @ noise.rows
 
+    def beside(sizes: Array, columns: Array) -> Array:
+        return log_likelihood(off, change, sizes, change @ columns)
 
-def _log_volume(scales: Mapping[str, Array], data: tuple[DecaySet, Array]) -> Array:
-    """det(W)/det(R): the normalisation, which changes with the scales as the errors do."""
-    decays, _ = data
-    volume = jnp.abs(jnp.linalg.det(whitener(_vector(scales), decays)))
+    # det(W)/det(R): the normalisation, which changes with the scales as the errors do.
+    volume = jnp.abs(jnp.linalg.det(weight))
     known = jnp.abs(jnp.linalg.det(decays.measured.root)) > 0
-    return jnp.sum(jnp.where(known, jnp.log(jnp.where(known, volume, 1.0)), 0.0))
+    usual = jnp.sum(jnp.where(known, jnp.log(jnp.where(known, volume, 1.0)), 0.0))
+    return usual + logsumexp(noise.prior + jax.vmap(beside)(noise.sizes, noise.columns))
 
 
 def _search_failed(found: ScaleFit) -> Finding | None:
@@ -527,28 +725,41 @@ def _not_separable(found: ScaleFit) -> Finding | None:
     count = len(found.names)
     many = "one decay" if count == 1 else f"{count} decays"
     advice = ", ".join(dict.fromkeys(SCALES[name] for name in names))
-    more = ""
-    if found.improbable:
-        worth = f"chi²/dof is {found.chi2 / found.dof:.3g}"
-        more = f" First principles miss something besides: {worth}."
+    more = f" {_departure(found)}" if found.refuted_by else ""
     return Finding(
         Status.unidentified,
         f"{' and '.join(names)} not separable by {many}: vary {advice}, or give a prior.{more}",
     )
 
 
-def _improbable(found: ScaleFit) -> Finding | None:
-    if not found.improbable:
+def _departure(found: ScaleFit) -> str:
+    """How decays depart from first principles beside their scatter."""
+    worth = f"chi²/dof is {found.chi2 / found.dof:.3g}" if found.dof > 0 else "beside their scatter"
+    if found.refuted_by == "settings":
+        return (
+            f"Decays depart smoothly from first principles with the settings ({worth}): correct by "
+            "a network."
+        )
+    return f"{_misread(found)}: give a prior on rf_voltage, its calibration."
+
+
+def _misread(found: ScaleFit) -> str:
+    """How far the RF voltage is off its reading."""
+    if (scale := found.scales.get(VOLTAGE)) is None:
+        return "The RF voltage is off its reading"
+    error = "" if scale.error is None else f" ± {100 * scale.error:.1g}"
+    return f"The RF voltage is {100 * (scale.value - 1):+.2g}{error} % off its reading"
+
+
+def _refuted(found: ScaleFit) -> Finding | None:
+    if not found.refuted_by:
         return None
-    return Finding(
-        Status.poor_fit,
-        f"chi²/dof is {found.chi2 / found.dof:.3g}, improbable for first principles with these "
-        "scales; the errors are enlarged to match: look for an anomaly, or correct by a network.",
-    )
+    said = f"{_departure(found)} The errors contain it."
+    return Finding(Status.poor_fit, said)
 
 
 def _separable(found: ScaleFit) -> Finding:
     return Finding(Status.converged, "Every mechanism is separable.")
 
 
-RULES = (_search_failed, _not_separable, _improbable, _separable)
+RULES = (_search_failed, _not_separable, _refuted, _separable)

@@ -107,8 +107,8 @@ def test_the_errors_of_the_scales_are_those_of_repetition(machine):
     pulls = []
     for seed in range(10):
         found = fit_scales(simulated(machine, 8, seed=seed), machine, pressure_error=1e-4)
-        pulls.append([(getattr(found, n).value - 1) / found.covariance[k, k] ** 0.5
-                      for k, n in ((0, "touschek"), (3, "desorption"))])  # fmt: skip
+        pair = found.touschek, found.desorption
+        pulls.append([(scale.value - 1) / scale.error for scale in pair])
     width = np.sqrt(np.mean(np.square(pulls), axis=0))
     assert ((width > 0.4) & (width < 1.8)).all(), width
 
@@ -146,7 +146,7 @@ def test_bad_requests(machine, decays, fit, sample):
 
 def test_sampling_agrees_with_the_linear_errors(fit, sample):
     assert sample.diagnostics.settled
-    error = np.sqrt(np.diag(fit.covariance)) * fit.error_scale
+    error = np.sqrt(np.diag(fit.covariance))
     assert np.abs(sample.draws.mean(0) - fit.vector).max() < 0.25 * error.max()
     assert sample.draws.std(0) == pytest.approx(error, rel=0.2)
     assert sample.draws.min() >= 0

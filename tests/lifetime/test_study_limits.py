@@ -81,6 +81,10 @@ def free(machine, read_low):
 def test_the_calibration_of_the_rf_voltage_is_found_and_told(machine, read_low, free):
     plain = fit_scales(read_low, machine)
     assert plain.status is Status.poor_fit
+    # No scatter: the voltage is named, and the scales are those of the true one.
+    assert "RF voltage is +1" in plain.message
+    assert plain.scatter["a"].interval_95[1] < 0.003
+    assert abs(plain.touschek.value - 1) < 3 * plain.touschek.error
     assert free.status is Status.converged
     assert abs(free.rf_voltage.value - TRUE) < 3 * free.rf_voltage.error
     assert free.rf_voltage.error < 0.002
