@@ -248,7 +248,7 @@ def compared(linear: Linear, models: Mapping[str, np.ndarray], room: np.ndarray)
     kept = []
     for log, prior, number, scatter, systems in found:
         for j, k in np.argwhere(log > best + np.log(LEAST)):
-            kept.append((log[j, k], prior[j, k], number, scatter[j], k - 1, systems(j, k)))
+            kept.append((log[j, k], prior[j, k], number, scatter[j], k - 1, systems[j, k]))
     log, prior, number, scatter, odd, systems = zip(*kept, strict=True)
     solved = [_scales(system, half, seen, room) for system in systems]
     shift, halves = map(np.array, zip(*solved, strict=True))
@@ -265,8 +265,12 @@ def compared(linear: Linear, models: Mapping[str, np.ndarray], room: np.ndarray)
     )
 
 
-def _evidence(linear: Linear, half: np.ndarray, more: np.ndarray, scatter: np.ndarray):
-    """Log evidence (g, n + 1) of scatters, no decay being odd or each, and their equations."""
+def _evidence(
+    linear: Linear, half: np.ndarray, more: np.ndarray, scatter: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Log evidence (g, n + 1) of scatters, no decay being odd or each, and their normal equations
+    for what is seen of the scales, further numbers and, last, residuals.
+    """
     rows = np.concatenate([linear.rows @ half, linear.change @ more, linear.off[..., None]], axis=2)
     parts = np.stack([rows[:, 0], rows[:, 1], *_crossed(linear.change, rows)])
     products = np.einsum("cni,cnj->cnij", parts, parts)
@@ -289,14 +293,14 @@ def _evidence(linear: Linear, half: np.ndarray, more: np.ndarray, scatter: np.nd
     diagonal = np.diagonal(root, axis1=-2, axis2=-1) * size
     log = -0.5 * volume[:, None] - np.log(diagonal[..., :-1]).sum(-1) - 0.5 * diagonal[..., -1] ** 2
     log[:, 1:] -= 0.5 * change
-    return log, lambda j, k: (systems[j, k], free)
+    return log, systems
 
 
 def _scales(
-    system: tuple[np.ndarray, int], half: np.ndarray, seen: np.ndarray, room: np.ndarray
+    products: np.ndarray, half: np.ndarray, seen: np.ndarray, room: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Shift of the scales and root of their covariance."""
-    (products, free), size = system, np.sqrt(np.diag(system[0]))
+    """Shift of the scales and root of their covariance, by normal equations."""
+    free, size = half.shape[1], np.sqrt(np.diag(products))
     scaled = products / np.outer(size, size) + ROUNDING * np.eye(len(size))
     inverse = np.linalg.inv(scaled[:-1, :-1]) / np.outer(size[:-1], size[:-1])
     found = -inverse @ products[:-1, -1]

@@ -703,8 +703,10 @@ class Shift:
             rows.append(Row(f"{name}, {of}", [untold if scale.error is None else scale], True))
         worth = f"{fit.chi2:.4g}/{fit.dof}" if fit.dof > 0 else "not testable"
         rows.append(Row("chi2/dof without scatter", [worth], True))
-        sizes = " and ".join(percent(fit.scatter[name].value) for name in "ab")
-        rows.append(Row("a and b scatter from fill to fill by", [sizes], True))
+        for name, scatter in fit.scatter.items():
+            most = f"below {percent(scatter.interval_95[1])} at 95 %"
+            said = percent(scatter.value) if scatter.value else most
+            rows.append(Row(f"scatter of {name} from fill to fill", [said], True))
         for row in self.budget:
             said = str(row).removeprefix(f"{row.name}: ") if row.separable else "not determined"
             rows.append(Row(f"{row.name} at {self.current:.4g} mA", [said], row.name == "lifetime"))
