@@ -189,7 +189,7 @@ def _inverse(change: Array, squares: Array) -> tuple[Array, Array]:
     return xp.stack([one, one, a * one, b * one]), xp.log(determinant).sum(axis=-1)
 
 
-class Linear(NamedTuple):
+class LinearDecays(NamedTuple):
     """Decays linear in the scales.
 
     Attributes
@@ -211,12 +211,12 @@ class Linear(NamedTuple):
     prior_rows: np.ndarray
 
 
-def compared(linear: Linear, models: Mapping[str, np.ndarray], room: np.ndarray) -> FillNoise:
+def compared(linear: LinearDecays, models: Mapping[str, np.ndarray], room: np.ndarray) -> FillNoise:
     """Weigh noises and models by their evidence, the scales integrated out.
 
     Parameters
     ----------
-    linear : Linear
+    linear : LinearDecays
         The decays.
     models : mapping of str to array, shape (n, 2, m)
         Changes of ln a and ln b by the numbers of each model of `RIVALS`.
@@ -266,7 +266,7 @@ def compared(linear: Linear, models: Mapping[str, np.ndarray], room: np.ndarray)
 
 
 def _evidence(
-    linear: Linear, half: np.ndarray, more: np.ndarray, scatter: np.ndarray
+    linear: LinearDecays, half: np.ndarray, more: np.ndarray, scatter: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Log evidence (g, n + 1) of scatters, no decay being odd or each, and their normal equations
     for what is seen of the scales, further numbers and, last, residuals.

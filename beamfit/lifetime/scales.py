@@ -27,7 +27,7 @@ from beamfit.lifetime.fill_noise import (
     BY,
     SHORTEST,
     FillNoise,
-    Linear,
+    LinearDecays,
     compared,
     log_likelihood,
 )
@@ -460,7 +460,7 @@ class ScaleFit(Judged):
         from beamfit.sampling.ensemble import draw
 
         stated = Statement(
-            data=(self.decays, Sampled.of(self)),
+            data=(self.decays, SampledNoises.of(self)),
             log_volume=_log_volume,
             units=dict.fromkeys(self.scales, "1"),
             averaged=[RECORD],
@@ -605,13 +605,15 @@ def _changes(vector: np.ndarray, decays: DecaySet) -> np.ndarray:
 
 def _linear(
     vector: np.ndarray, decays: DecaySet, priors: Sequence[Prior], names: Sequence[str]
-) -> Linear:
+) -> LinearDecays:
     """Decays about some scales, and the priors of these."""
     weight, off, rows = _expanded(vector, decays)
     at = [names.index(prior.name) for prior in priors]
     mean, sd = (np.array([getattr(p, n) for p in priors], float) for n in ("mean", "sd"))
     known = np.eye(len(names))[at] / sd[:, None]
-    return Linear(off, rows, weight @ _changes(vector, decays), (vector[at] - mean) / sd, known)
+    return LinearDecays(
+        off, rows, weight @ _changes(vector, decays), (vector[at] - mean) / sd, known
+    )
 
 
 def _whole(vector: np.ndarray, decays: DecaySet, noise: FillNoise) -> tuple[Array, Array]:
@@ -651,7 +653,7 @@ def _departures(
     return {name: rows for name, rows in found.items() if np.any(rows)}
 
 
-class Sampled(NamedTuple):
+class SampledNoises(NamedTuple):
     """Noises for the sampler.
 
     Attributes
@@ -673,7 +675,7 @@ class Sampled(NamedTuple):
     columns: Array
 
     @classmethod
-    def of(cls, fit: ScaleFit) -> Sampled:
+    def of(cls, fit: ScaleFit) -> SampledNoises:
         """Draw noises evenly by their weight: a few stand for many."""
         noise, count = fit.noise, len(fit.names)
         order = np.lexsort((*noise.scatter.T, noise.odd, noise.model))
@@ -694,7 +696,7 @@ class Sampled(NamedTuple):
         )
 
 
-def _log_volume(scales: Mapping[str, Array], data: tuple[DecaySet, Sampled]) -> Array:
+def _log_volume(scales: Mapping[str, Array], data: tuple[DecaySet, SampledNoises]) -> Array:
     """Log likelihood of the decays, the noise averaged over."""
     decays, noise = data
     vector = _vector(scales)
@@ -733,7 +735,7 @@ def _not_separable(found: ScaleFit) -> Finding | None:
 
 
 def _departure(found: ScaleFit) -> str:
-    """How decays depart from first principles beside their scatter."""
+    """Sentence on a departure from first principles beside scatter."""
     worth = f"chi²/dof is {found.chi2 / found.dof:.3g}" if found.dof > 0 else "beside their scatter"
     if found.refuted_by == "settings":
         return (
@@ -744,7 +746,7 @@ def _departure(found: ScaleFit) -> str:
 
 
 def _misread(found: ScaleFit) -> str:
-    """How far the RF voltage is off its reading."""
+    """Words for an RF voltage that is off its reading."""
     if (scale := found.scales.get(VOLTAGE)) is None:
         return "The RF voltage is off its reading"
     error = "" if scale.error is None else f" ± {100 * scale.error:.1g}"
