@@ -67,7 +67,7 @@ def test_numbers_of_fits(root):
     decay = beamfit.fit_decay(beamfit.read_decay_record(root / "measurements/aps_1999_decay.csv"))
     assert decay.to_frame().loc[("aps_1999_decay.csv", "a"), "error"] == decay.a.error
     draws = decay.sample(seed=1, target_ess=50)
-    assert draws.to_frame()["lifetime_mean"].mean() == pytest.approx(draws["lifetime_mean"].value)
+    assert draws.to_frame()["lifetime_mean"].median() == pytest.approx(draws["lifetime_mean"].value)
 
 
 def test_without_pandas_it_is_said(monkeypatch):
