@@ -283,7 +283,7 @@ class Posterior:
         return self._number(name)[1]
 
     def __getitem__(self, name: str) -> Quantity:
-        """Median of a number and half of its central 68 %; no error where the data do not decide."""
+        """Median of a number and half of its central 68 %; no error if the data do not decide."""
         low, one, middle, other, high = map(float, self.quantiles(name))
         unit = self.unit(name)
         if not self.values(name).size or name in self.held or self.apart:
