@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.special import ndtri
 
 from beamfit.answer import Table, answer, json_of
 from beamfit.dynamics.alternatives import FURTHER, GROWTH, Alternatives, alternatives_of
@@ -24,7 +25,7 @@ from beamfit.dynamics.answer import (
 )
 from beamfit.dynamics.bad_readings import BadReadings, judged_without
 from beamfit.dynamics.checks import Checks, HeldOutRun, changing_of, checks_of, digits_of, held_out
-from beamfit.dynamics.limits import lag_posterior
+from beamfit.dynamics.limits import RANGE, lag_posterior
 from beamfit.dynamics.model import PreparedOutput, network_of, output_of
 from beamfit.dynamics.paths import Paths, heard, latest
 from beamfit.dynamics.record import LEAST, Run, check_inputs, checked, unsure_gain
@@ -34,6 +35,7 @@ from beamfit.errors import InputError, Status, nearest
 from beamfit.greybox.fit import Fit
 from beamfit.noise.memory import CorrelatedNoise
 from beamfit.quantity import Quantity
+from beamfit.statistics import POOR_FIT
 
 MAPS = ("constant", "network")
 # Most searches by a path that was likelier than that of the search before.
@@ -260,10 +262,9 @@ class _Identification(NamedTuple):
         checks, quantities, curves = self.known(runs, found, answer, others)
         ahead = held_out(whole, self.held)[output]
         rms = float(np.sqrt(np.mean(answer.rms**2)))
-        clocks = not paths.given and (others is None or others.ahead >= 0.5)
         status, message = judged({output: ResponseEvidence(
             answer.fit, answer.rests, checks, quantities, curves, ahead, self.map, rms,
-            max(-exact, 0.0) if clocks else 0.0,
+            0.0 if paths.given else _early(whole, others, quantities),
         )})  # fmt: skip
         quantities, curves = quoted(status, quantities, curves)
         message = remarked(message, not paths.given and exact == latest(runs) > 0, left_out)
@@ -325,6 +326,21 @@ class _Identification(NamedTuple):
         late = others.late * seen.parts * row if others is not None else 0.0
         quantities = quantities_of(found, others, late, lags, digits_of(found), unsure)
         return checks, *told(quantities, (), seen, checks, lags.limits(late))
+
+
+def _early(found: Begun, others: Alternatives | None, quantities: Mapping[str, Quantity]) -> float:
+    """Samples by which the output moves before its inputs; 0 unless that is likely, or of an exact
+    output clear of the error of the delay and of the shortest lag, which is never quite 0.
+    """
+    delay = quantities.get("delay")
+    if others is not None:
+        likely = others.ahead >= 0.5
+    elif delay is None or delay.error is None:
+        likely = True
+    else:
+        row = float(mean_step(found.seen.runs[0].dt))
+        likely = delay.value + RANGE[0] * row < ndtri(POOR_FIT) * delay.error
+    return max(-found.exact, 0.0) if likely else 0.0
 
 
 def _output(run: Run, output: str | None) -> str:

@@ -472,11 +472,12 @@ def gauges(p: Problem, theta: np.ndarray, unseen: np.ndarray) -> tuple[Gauge, ..
 
 def _still(p: Problem, theta: np.ndarray, unseen: np.ndarray) -> np.ndarray:
     """Combinations of directions along which rows change at no made-up settings."""
-    if not unseen.shape[1]:
-        return unseen
     random, size = np.random.default_rng(0), _size(theta)
+    length = np.linalg.norm(unseen / size[:, None], axis=0)
+    along = unseen[:, length > 0] / length[length > 0]  # numbers that are held move nowhere
+    if not along.shape[1]:
+        return along
     rows = np.vstack([_made_up(p, theta, random) for _ in range(LOOKS)])
-    along = unseen / np.linalg.norm(unseen / size[:, None], axis=0)
     _, sizes, turned = np.linalg.svd(rows / size @ along, full_matrices=True)
     return along @ turned[int(np.sum(sizes > STILL)) :].T
 
@@ -505,8 +506,10 @@ def _made_up(p: Problem, theta: np.ndarray, random: np.random.Generator) -> np.n
     core = dataclasses.replace(p.core, records=records)
     rows = np.asarray(FlatCore.of(core).compiled(sloped)(theta)[1]) * _size(theta)
     rows = rows[np.all(np.isfinite(rows), axis=1)]
-    terms = np.linalg.norm(rows, axis=1, keepdims=True)
-    return rows / np.where(terms > 0, terms, 1.0)
+    for order in (np.inf, 2):  # the square of what grows without end has no number
+        terms = np.linalg.norm(rows, order, axis=1, keepdims=True)
+        rows = rows / np.where(terms > 0, terms, 1.0)
+    return rows
 
 
 def _moved(value: Any, random: np.random.Generator) -> Any:

@@ -123,3 +123,33 @@ def test_a_held_back_run_shorter_than_the_delay_is_named():
     assert str(found.value) == (
         "friday: 0 readings of level after a delay of 12 samples; expected a longer run"
     )
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_a_lag_that_is_never_quite_zero_puts_no_output_before_its_inputs(seed):
+    """SIMULATED: a first order, exact to 3e-5, asked for as a second one."""
+    random = np.random.default_rng(seed)
+    u = np.repeat(random.normal(size=40), 4)
+    output, kept = np.zeros(u.size), np.exp(-1 / 60)
+    for k in range(1, u.size):
+        output[k] = kept * output[k - 1] + (1 - kept) * 0.7 * u[k - 1]
+    output += 3e-5 * output.std() * random.normal(size=u.size)
+    found = identify(Run(np.arange(u.size) * 1.0, {"u": u}, {"y": output}), model="second-order")
+    assert "before its inputs" not in found.message
+
+
+def test_held_numbers_are_no_freedom_of_a_model():
+    """SIMULATED, tau a thirtieth of a sample: directions of no length broke the judgement."""
+    random = np.random.default_rng([6, 5])
+    n, dt = int(random.integers(20, 200)), 10 ** random.uniform(-2, 2)
+    u = np.repeat(random.normal(size=n), int(random.integers(1, 8)))[:n]
+    u *= 10 ** random.uniform(-3, 3)
+    kept = np.exp(-1 / 10 ** random.uniform(-1.5, 4))
+    gain, output = random.normal() * 10 ** random.uniform(-2, 2), np.zeros(n)
+    for k in range(1, n):
+        output[k] = kept * output[k - 1] + (1 - kept) * gain * u[k - 1]
+    output += output.std() * 10 ** random.uniform(-5, 0.5) * random.normal(size=n)
+    output += random.choice([0, 5])
+    with np.errstate(over="ignore"):  # of slopes at places where the model grows without end
+        found = identify(Run(np.arange(n) * dt, {"u": u}, {"y": output}), model="second-order")
+    assert found.status in ("poor_fit", "unidentified", "converged")
