@@ -95,10 +95,10 @@ class FillNoise:
         weight = self.weight * (self.model == np.argmax(self.probabilities))
         return weight @ self.shift / weight.sum()
 
-    def sizes(self, k: int, count: int, odd: bool = True) -> np.ndarray:
+    def sizes(self, k: int, count: int) -> np.ndarray:
         """Scatter of ln a and ln b of each decay by one of the noises, shape (count, 2)."""
         found = np.tile(self.scatter[k], (count, 1))
-        if odd and self.odd[k] >= 0:
+        if self.odd[k] >= 0:
             found[self.odd[k]] = np.hypot(found[self.odd[k]], FAR)
         return found
 

@@ -17,7 +17,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -397,6 +397,7 @@ class SeenDecay:
         """Numbers of a smooth curve, of few readings half as many as these."""
         return min(NODES, self.products.count // 2)
 
+    @cached_property
     def likely(self) -> tuple[np.ndarray, np.ndarray]:
         """Squares that the likeliest smooth curve leaves in each noise, and its log likelihood."""
         curve = block_diag(1.0, smooth_curves(self.smooth))
@@ -406,12 +407,12 @@ class SeenDecay:
     @property
     def noise(self) -> float:
         """Size of the noise beside the likeliest smooth curve, in the unit of the columns."""
-        least, best = self.likely()
+        least, best = self.likely
         return float(np.sqrt(self.products.variance(least[np.argmax(best)], self.smooth)))
 
     def without_hopeless(self) -> SeenDecay:
         """Leave out noises in which no smooth curve is as likely as this one in another."""
-        _, best = self.likely()
+        _, best = self.likely
         return self.of_noises(best > self.products.log_likelihood().max() - 2 * FAR)
 
     def of_noises(self, kept: np.ndarray) -> SeenDecay:
@@ -422,7 +423,7 @@ class SeenDecay:
 
     def beside(self, kind: Disturbance) -> SeenDecay:
         """The same with a disturbance, averaged over, beside the likeliest noises."""
-        least, best = self.likely()
+        least, best = self.likely
         near = best > best.max() - BESIDE
         some, unit = self.of_noises(near), np.sqrt(self.products.variance(least[near], self.smooth))
         count, _, numbers = kind.shapes.shape

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from scipy.linalg import solve_triangular
+from scipy.linalg import block_diag, solve_triangular
 from scipy.special import chdtrc, logsumexp
 
 from beamfit.answer import Row, Table, answer, cell, json_of, labelled
@@ -43,6 +43,7 @@ from beamfit.lifetime.scales import (
     fit_scales,
     information_root,
     loss_parts,
+    widened,
 )
 from beamfit.lifetime.study import Decay, Machine, settings_json, settings_of
 from beamfit.quantity import HOUR, Quantity, Status, percent
@@ -107,10 +108,8 @@ def _linearised(fit: ScaleFit, decays: Sequence[Decay]) -> list[Later]:
     """Later decays beside each of the noises that earlier ones may have."""
     together = DecaySet.of(decays, fit.machine, fit.decays.pressure_error, fit.voltages)
     weight, off, rows = fit.about(together)
-    change, count = fit.changes(together, weight), len(decays)
-    blocks, noise, found = np.arange(count), fit.noise, []
-    whole = np.zeros((count, 2, count, 2))
-    whole[blocks, :, blocks] = change
+    count, noise, found = len(decays), fit.noise, []
+    whole = block_diag(*fit.changes(together, weight)).reshape(2 * count, count, 2)
     for k in range(noise.weight.size):
         by_scales = (rows @ noise.half[k]).reshape(2 * count, -1)
         scattered = (whole * noise.scatter[k]).reshape(2 * count, -1)
@@ -313,7 +312,7 @@ def _rows(fit: ScaleFit, candidate: DecayCandidate) -> np.ndarray:
     weight, _, [rows] = fit.about(one)
     # A new decay scatters as the likeliest noise says.
     own = fit.changes(one, weight)[0] * fit.noise.scatter[fit.noise.likeliest]
-    return np.linalg.solve(np.linalg.cholesky(np.eye(2) + own @ own.T), rows)
+    return np.asarray(widened(np.eye(2), own)) @ rows
 
 
 def next_decays(fit: ScaleFit, candidates: Sequence[DecayCandidate]) -> tuple[Proposal, ...]:
@@ -588,7 +587,8 @@ def _left_out(
     """
     covariance = np.eye(2) + here @ here.T
     root = np.linalg.cholesky(covariance)
-    shares, turned = np.linalg.eigh(np.linalg.solve(root, own) @ np.linalg.solve(root, own).T)
+    white = np.linalg.solve(root, own)
+    shares, turned = np.linalg.eigh(white @ white.T)
     # A decay that alone tells of something is predicted by nothing else: infinitely badly.
     rest = turned / np.maximum(1 - shares, np.finfo(float).eps) @ turned.T
     spread = root @ rest @ root.T - covariance + np.eye(2) + usual @ usual.T

@@ -558,8 +558,8 @@ def fit_scales(
     for _ in range(ROUNDS):
         linear = _linear(vector, together, known, names)
         noise = compared(linear, models, limits - vector)
-        weight = _whole(vector, together, noise)
-        record = Record(RECORD, _weighted, (together, weight), nothing.ravel(), 1.0)
+        given = together, (whitener(vector, together), _whole(linear.change, noise))
+        record = Record(RECORD, _weighted, given, nothing.ravel(), 1.0)
         found = solve(Problem(dict(zip(names, vector, strict=True)), free, [record], known))
         moved, vector = found.theta - vector, found.theta
         noise = replace(noise, shift=noise.shift - moved)
@@ -616,15 +616,16 @@ def _linear(
     )
 
 
-def _whole(vector: np.ndarray, decays: DecaySet, noise: FillNoise) -> tuple[Array, Array]:
-    """Roots of the information of each decay, and of all beside the likeliest noise, (2n, 2n)."""
-    weight = np.asarray(whitener(jnp.asarray(vector), decays))
-    change, k = weight @ _changes(vector, decays), noise.likeliest
+def _whole(change: np.ndarray, noise: FillNoise) -> Array:
+    """Root of the information of all decays beside the likeliest noise, (2n, 2n), over that of
+    each; `change` has their slopes by ln a and ln b.
+    """
+    k = noise.likeliest
     scattered = block_diag(*(change * noise.sizes(k, len(change))[:, None, :]))
     smooth = (change @ noise.columns[noise.model[k]]).reshape(len(scattered), -1)
     covariance = np.eye(len(scattered)) + scattered @ scattered.T + smooth @ smooth.T
     whiten = solve_triangular(np.linalg.cholesky(covariance), np.eye(len(covariance)), lower=True)
-    return jnp.asarray(weight), jnp.asarray(whiten)
+    return jnp.asarray(whiten)
 
 
 def _departures(

@@ -149,7 +149,7 @@ def test_a_disturbance_is_averaged_over_in_closed_form(kind):
     one = record(3, noise=3.0, count=40)
     seen = SeenDecay.of(one, solved(Pieces.of(one)).values)
     white = seen.of_noises(np.array([kind.time == kind.power == 0 for kind in seen.products.kinds]))
-    found, least = white.beside(kind), white.likely()[0][0]
+    found, least = white.beside(kind), white.likely[0][0]
     noise = np.sqrt(least / (40 - NODE.size))
     sees = np.polynomial.chebyshev.chebvander(2 * one.time / one.span - 1, NODE.size - 1)
     sees = sees @ np.linalg.inv(np.polynomial.chebyshev.chebvander(2 * NODE - 1, NODE.size - 1))
