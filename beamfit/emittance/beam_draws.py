@@ -203,7 +203,7 @@ def draw_beams(c: Coordinates, kind: NoiseKind, noise: Noise) -> BeamDraws:
     log_density = np.logaddexp(math.log1p(-part) + log_density, math.log(part) + log_prior(x))
     each = _log_likelihood(x, c, kind, scales.scale, noise)
     drawn = log_prior(x) - log_density - math.log(count)
-    weight = averaged(each, scales.log_weight[..., None, :]) + drawn + kind.log_weight
+    weight = averaged(each, scales.log_weight[..., None, :]) + drawn + kind.log_weight[..., None]
     weight = np.where(np.isnan(weight), -np.inf, weight)
     by_scale = averaged(np.swapaxes(each, -1, -2), drawn[..., None, :])
     top_log = found.max(-1) + kind.log_weight
@@ -273,9 +273,9 @@ def _joined(found: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.
 
 def _deviations(kind: NoiseKind) -> list[np.ndarray]:
     """Deviations of points to weigh them by: as stated, and with the usual scatter beside."""
-    special = [kind.special] if kind.chance else []
+    special = [] if kind.special is None else [kind.special]
     usual = [] if kind.least else [kind.prior.middle]
-    return [np.hypot(kind.floor, scale * kind.unit) for scale in special + usual]
+    return [kind.deviation(scale) for scale in special + usual]
 
 
 def _fitted(
@@ -300,7 +300,7 @@ def _fitted(
         model = np.sqrt(np.clip(squared, (size / FURTHEST) ** 2, (size * FURTHEST) ** 2))
     chi2 = ((wanted - design @ x[..., None]) ** 2).sum((-2, -1))
     dof = np.maximum(kept.sum(-1) - 3.0, 0.0)
-    if kind.chance:
+    if kind.special is not None:
         factor = np.maximum(1.0, chi2 / np.maximum(dof, 1.0))
     else:
         factor = (2.0 + chi2) / (2.0 + dof)

@@ -80,8 +80,7 @@ def flat_beam(c: Coordinates, kind: NoiseKind, noise: Noise) -> np.ndarray:
     own = (np.take_along_axis(v, order, -1) for v in (kind.floor, kind.unit))
     kind = replace(kind, **dict(zip(("floor", "unit"), own, strict=True)))
     target = np.sqrt(np.maximum(size**2 - known, 0.0))
-    scale = kind.special or kind.prior.middle
-    deviation = np.hypot(kind.floor, scale * kind.unit) * (size if kind.power else 1.0)
+    deviation = kind.deviation(kind.special or kind.prior.middle) * (size if kind.power else 1.0)
     side = np.where(np.arange(n) < np.arange(n)[:, None], -1.0, 1.0)
     rows = (w / deviation[..., None])[..., None, :, :] * side[..., None]
     normal = np.swapaxes(rows, -1, -2) @ rows
@@ -95,7 +94,9 @@ def flat_beam(c: Coordinates, kind: NoiseKind, noise: Noise) -> np.ndarray:
     v = np.take_along_axis(v[..., 0], best[..., None], -2)
     normal = np.take_along_axis(normal, best[..., None, None], -3)
     least = np.take_along_axis(chi2, best, -1)
-    factor = np.maximum(1.0, least / max(n - 2, 1)) if kind.chance else (2.0 + least) / n
+    factor = (
+        np.maximum(1.0, least / max(n - 2, 1)) if kind.special is not None else (2.0 + least) / n
+    )
     root = WIDER * np.linalg.cholesky(np.linalg.inv(normal)) * np.sqrt(factor)[..., None, None]
 
     def each(v: np.ndarray, scale: np.ndarray) -> np.ndarray:
@@ -304,6 +305,11 @@ class PlaneSizes(NamedTuple):
         rows = self.r11[at], self.r12[at], self.known[at], self.size[at]
         return PlaneSizes(*rows, error, self.of_shots, self.moved)
 
+    def kinds_under(self, unit: float, noise: Noise) -> tuple[NoiseKind, ...]:
+        """Kinds of noise under some priors, in some unit of the sizes, m."""
+        error = None if self.error is None else self.error / unit
+        return kinds_of(noise, self.size / unit, error, self.of_shots)
+
     @property
     def likeness(self) -> tuple:
         """Key of the planes that can be compared in one call: points, errors, moved magnets."""
@@ -443,8 +449,7 @@ def _stacked(planes: Sequence[PlaneSizes], noise: Noise, alike: bool | None = No
     first, error = planes[0], None
     if first.error is not None:
         error = np.stack([p.error for p in planes]) / c.unit[:, None]
-    floor = error if first.of_shots else None
-    kinds = kinds_of(noise, c.size, None if first.of_shots else error, floor, alike)
+    kinds = kinds_of(noise, c.size, error, first.of_shots, alike)
     return _Stack(c, np.stack([r11, r12], -1), kinds)
 
 

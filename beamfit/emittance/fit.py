@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any
 
 from beamfit.answer import (
@@ -493,4 +493,5 @@ def noise_samples(scans: Iterable[tuple[QuadScan, Beamline]], noise: Noise) -> I
             if len(work.sizes.size) > 3 and post.probability[BEAM] > SURE:
                 word = work.sizes.likeness[1]
                 word = "stated" if word == "share" else word
-                yield Sample(word, post.kinds, post.scales, post.by_scale)
+                under = partial(work.sizes.kinds_under, post.unit)
+                yield Sample(word, under, post.kinds, post.scales, post.by_scale)

@@ -36,8 +36,10 @@ class Sample(NamedTuple):
     ----------
     noise : str
         "shots", "stated" or "none": which prior it tells of.
+    kinds_under : callable
+        From priors to kinds of noise.
     kinds : tuple of NoiseKind
-        Kinds of noise.
+        Those under the priors that it was looked at with.
     scales : tuple of Scales
         Their nodes.
     log_evidence : tuple of ndarray
@@ -45,6 +47,7 @@ class Sample(NamedTuple):
     """
 
     noise: str
+    kinds_under: Callable[[Noise], tuple[NoiseKind, ...]]
     kinds: tuple[NoiseKind, ...]
     scales: tuple[Scales, ...]
     log_evidence: tuple[np.ndarray, ...]
@@ -93,7 +96,7 @@ def learn_noise(samples: Sequence[Sample], noise: Noise, source: str) -> Learned
         planes[kind] = len(own)
         if len(own) < FEWEST:
             continue
-        values, spread = _learned(own, getattr(noise, scale), getattr(noise, chance), kind)
+        values, spread = _learned(own, noise, scale, chance)
         middle, width, probability = _numbers(values)
         found = replace(found, **{scale: Lognormal(middle, width), chance: probability})
         errors[scale] = (
@@ -112,17 +115,16 @@ def _numbers(values: np.ndarray) -> tuple[float, float, float]:
 
 
 def _learned(
-    samples: Sequence[Sample], prior: Lognormal, chance: float, kind: str
+    samples: Sequence[Sample], noise: Noise, scale: str, chance: str
 ) -> tuple[np.ndarray, np.ndarray]:
-    start = np.array(
-        [math.log(prior.middle), math.log(prior.spread), math.log(chance / (1 - chance))]
-    )
+    (middle, spread), odds = getattr(noise, scale), getattr(noise, chance)
+    start = np.array([math.log(middle), math.log(spread), math.log(odds / (1.0 - odds))])
     width = np.array([MIDDLE, SPREAD, LOGIT])
 
     def cost(values: np.ndarray) -> float:
         middle, spread, probability = _numbers(values)
-        new = Lognormal(middle, spread)
-        each = [_log_evidence(s, new, probability, prior, chance, kind) for s in samples]
+        new = replace(noise, **{scale: Lognormal(middle, spread), chance: probability})
+        each = [_log_evidence(s, new) for s in samples]
         return 0.5 * float(np.sum(((values - start) / width) ** 2)) - float(np.sum(each))
 
     best = minimize(cost, start, method="Nelder-Mead", options={"xatol": 1e-3, "fatol": 1e-4}).x
@@ -149,22 +151,17 @@ def _log_masses(prior: Lognormal, log: np.ndarray) -> np.ndarray:
         return log_ndtr(high) + np.log(-np.expm1(log_ndtr(low) - log_ndtr(high)))
 
 
-def _log_evidence(
-    s: Sample, new: Lognormal, probability: float, prior: Lognormal, chance: float, kind: str
-) -> float:
+def _log_evidence(s: Sample, noise: Noise) -> float:
     """Log evidence of a plane under other priors than those of its nodes."""
     parts = []
-    moved = math.log(probability / chance), math.log1p(-probability) - math.log1p(-chance)
-    for own, scales, evidence in zip(s.kinds, s.scales, s.log_evidence, strict=True):
-        # Slow noise is neither of stated errors that are right nor of a share.
-        more, less = (0.0, 0.0) if own.slow and kind != "shots" else moved
-        skip = int(own.chance > 0)
+    kinds = s.kinds_under(noise)
+    for old, new, scales, evidence in zip(s.kinds, kinds, s.scales, s.log_evidence, strict=True):
+        skip = int(old.special is not None)
         log = np.log(scales.scale[skip:])
-        ratio = np.full(len(log), more if kind == "none" and own.power else less)
-        # Stated errors may be too small by what settings scatter beyond: that has another prior.
-        if own.prior == prior:
-            ratio += _log_masses(new, log) - _log_masses(prior, log)
-            ratio -= new.log_probability_above(own.least) - prior.log_probability_above(own.least)
-        weight = scales.log_weight + own.log_weight + np.append(np.full(skip, more), ratio)
-        parts.append(averaged(evidence + weight, 0.0))
+        ratio = _log_masses(new.prior, log) - _log_masses(old.prior, log)
+        above = (k.prior.log_probability_above(k.least) for k in (old, new))
+        ratio += next(above) - next(above) + np.log1p(-new.chance) - np.log1p(-old.chance)
+        if skip:
+            ratio = np.append(np.log(new.chance) - np.log(old.chance), ratio)
+        parts.append(averaged(evidence + scales.log_weight + ratio + new.log_weight, 0.0))
     return float(np.logaddexp.reduce(parts))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -14,17 +14,20 @@ LN_2PI = math.log(2.0 * math.pi)
 
 
 class Lognormal(NamedTuple):
-    """A positive number known within a factor: its middle, and the standard deviation of its ln."""
+    """A positive number known within a factor: its middle, and the standard deviation of its ln.
 
-    middle: float
-    spread: float
+    Of many numbers arrays of one shape.
+    """
+
+    middle: Any
+    spread: Any
 
     def log_density(self, log: np.ndarray) -> np.ndarray:
-        """Log density in ln of the number, at values of that ln, any shape."""
-        pull = (log - math.log(self.middle)) / self.spread
-        return -0.5 * pull**2 - math.log(self.spread) - 0.5 * LN_2PI
+        """Log density in ln of the number, at values of that ln."""
+        pull = (log - np.log(self.middle)) / self.spread
+        return -0.5 * pull**2 - np.log(self.spread) - 0.5 * LN_2PI
 
-    def log_probability_above(self, least: float) -> float:
+    def log_probability_above(self, least: float) -> np.ndarray:
         """Log probability that the number exceeds some value.
 
         Examples
@@ -33,15 +36,44 @@ class Lognormal(NamedTuple):
         -0.693147
         """
         if not least > 0.0:
-            return 0.0
+            return 0.0 * np.log(self.middle)
         from scipy.special import log_ndtr  # a scan is read without scipy
 
-        return float(log_ndtr((math.log(self.middle) - math.log(least)) / self.spread))
+        return log_ndtr((np.log(self.middle) - math.log(least)) / self.spread)
+
+    def and_also(self, other: Lognormal) -> tuple[Lognormal, np.ndarray]:
+        """Combine two statements on one number, and the log of how well they agree.
+
+        Returns
+        -------
+        Lognormal
+            The product of both densities, normalised.
+        ndarray
+            Log of its integral over ln of the number.
+
+        Examples
+        --------
+        >>> both, log = Lognormal(1.0, 1.0).and_also(Lognormal(4.0, 1.0))
+        >>> round(both.middle, 6), round(both.spread**2, 6)
+        (2.0, 0.5)
+        """
+        spread = np.hypot(self.spread, other.spread)
+        share = (self.spread / spread) ** 2
+        middle = np.log(self.middle) * (1.0 - share) + np.log(other.middle) * share
+        both = Lognormal(np.exp(middle), self.spread * other.spread / spread)
+        return both, Lognormal(self.middle, spread).log_density(np.log(other.middle))
 
 
 # The probability of a bad reading among so few that nothing is left to test them by.
 UNTESTED = 1e-12
 FACTOR, UNSTATED, SCATTER = Lognormal(1.5, 0.8), Lognormal(0.1, 0.6), Lognormal(0.05, 0.7)
+
+
+class StatedErrors(NamedTuple):
+    """Probability that stated errors are right, and else the factor, above 1, they lack."""
+
+    right: np.ndarray
+    factor: Lognormal
 
 
 @dataclass(frozen=True)
@@ -51,8 +83,8 @@ class Noise:
     Parameters
     ----------
     right : float
-        Probability that stated errors are right. Most are; a third to a half of the real scans
-        with stated errors scatter more (docs/verdict.md).
+        Probability that stated errors are right, before their size is seen. Most are; a third to
+        a half of the real scans with stated errors scatter more (docs/verdict.md).
     factor : Lognormal
         Where they are not, the factor, above 1, by which they are too small: real errors are often
         half of the truth. As often it is ``scatter`` that they lack.
@@ -68,8 +100,9 @@ class Noise:
         Probability that the noise goes on from row to row, as that of a beam that drifts within
         its feedbacks: one scan in ten.
     scatter : Lognormal
-        What settings scatter beyond their shots, or beyond stated errors that are not right, as a
-        share of the size: 4 to 5 % in LCLS scans whose shots say 1 % (docs/verdict.md).
+        What settings scatter, beyond their shots or beyond stated errors that are not right, as a
+        share of the size: 4 to 5 % in LCLS scans whose shots say 1 % (docs/verdict.md). Errors that
+        are right contain it, so that errors far below it are seldom right.
     bad : float
         Probability that a reading is bad: a shot that missed, a wrong cell.
     width : float
@@ -120,6 +153,31 @@ class Noise:
             object.__setattr__(self, name, values)
         if not self.width > 1:
             raise InputError(f"noise prior width = {self.width:g}", "a width above 1")
+
+    def stated(self, share: np.ndarray) -> StatedErrors:
+        """Say what stated errors are worth by their size.
+
+        Parameters
+        ----------
+        share : ndarray
+            Typical stated errors of planes, as shares of the size.
+
+        Notes
+        -----
+        Bayes' theorem. Errors that are right are as large as what settings scatter; those that are
+        not are that over a factor above 1. Either says how often errors are as large as these.
+
+        Examples
+        --------
+        >>> Noise().stated(np.array([0.003, 0.02, 0.1])).right.round(2).tolist()
+        [0.01, 0.45, 0.83]
+        """
+        total = Lognormal(self.scatter.middle / share, np.full_like(share, self.scatter.spread))
+        factor, seldom = self.factor.and_also(total)
+        more = factor.log_probability_above(1.0) - self.factor.log_probability_above(1.0)
+        small = math.log1p(-self.right) + seldom + more
+        right = math.log(self.right) + total.log_density(0.0)
+        return StatedErrors(np.exp(right - np.logaddexp(right, small)), factor)
 
     def of_points(self, count: int) -> Noise:
         """Take three readings as good: they leave nothing that could show one of them to be bad.

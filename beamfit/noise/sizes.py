@@ -48,14 +48,16 @@ class NoiseKind:
     floor, unit : array
         Shape (..., n): what is there in any case, and what the scale s multiplies.
     prior : Lognormal
-        Of s.
-    special, chance : float
-        A value that s has with this probability: 1 where stated errors are right.
+        Of s, of every plane.
+    chance : array
+        Probability of the special value of s, of every plane.
+    log_weight : array
+        Log prior probability of the kind, of every plane.
+    special : float or None
+        A value that s may have: 1 where stated errors are right.
     least : float
         s is no less than this: stated errors are right or too small, since an error that seems too
         large may hold what these points do not show.
-    log_weight : float
-        Log prior probability of the kind.
     slow : bool
         Whether s goes on from row to row, as that of a beam or screen that drifts. A bad reading
         is none of these: it would be a step, and steps explain a curve that is no beam's.
@@ -65,15 +67,19 @@ class NoiseKind:
     floor: Any
     unit: Any
     prior: Lognormal
-    special: float
-    chance: float
-    least: float
-    log_weight: float
+    chance: Any
+    log_weight: Any
+    special: float | None = None
+    least: float = 0.0
     slow: bool = False
 
+    def deviation(self, scale: Any) -> Any:
+        """Standard deviation of every point over model^power, at one scale of each plane."""
+        return np.hypot(self.floor, np.asarray(scale)[..., None] * self.unit)
 
-# A tree of arrays for JAX: what is the same at every point is structure.
-registered(NoiseKind, ("power", "prior", "special", "chance", "least", "log_weight", "slow"))
+
+# A tree of arrays for JAX: what all planes share is structure.
+registered(NoiseKind, ("power", "special", "least", "slow"))
 
 
 class Scales(NamedTuple):
@@ -99,7 +105,7 @@ def kinds_of(
     noise: Noise,
     size: np.ndarray,
     error: np.ndarray | None,
-    floor: np.ndarray | None = None,
+    of_shots: bool = False,
     alike: bool | None = None,
 ) -> tuple[NoiseKind, ...]:
     """Kinds of noise that sizes may have.
@@ -112,8 +118,8 @@ def kinds_of(
         Shape (..., n), measured.
     error : ndarray or None
         Shape (..., n), stated.
-    floor : ndarray, optional
-        Shape (..., n): standard errors of means of shots, beyond which settings scatter.
+    of_shots : bool
+        Whether errors are those of means of shots, beyond which settings scatter.
     alike : bool, optional
         Whether stated errors are one share of the size; by themselves if None.
 
@@ -125,32 +131,37 @@ def kinds_of(
         last one is the first, slow (where errors are stated with these), of fewer than `LONG`
         points.
     """
-    zero, one = np.zeros_like(size), np.ones_like(size)
-    swift, slow = math.log1p(-noise.slow), math.log(noise.slow)
-    if floor is not None:
-        kinds = (NoiseKind(0, floor, size, noise.scatter, 0.0, noise.even, 0.0, swift),)
+    zero, one, every = np.zeros_like(size), np.ones_like(size), np.ones(size.shape[:-1])
+    swift, slow = math.log1p(-noise.slow) * every, math.log(noise.slow) * every
+    scatter = Lognormal(*(v * every for v in noise.scatter))
+    if of_shots:
+        kinds = (NoiseKind(0, error, size, scatter, noise.even * every, swift, special=0.0),)
     elif error is None:
-        middle = np.median(size, axis=-1, keepdims=True) * np.ones_like(size)
+        middle = np.median(size, axis=-1, keepdims=True) * one
+        unstated = Lognormal(*(v * every for v in noise.unstated))
         share, same = math.log(noise.share) + swift, math.log1p(-noise.share) + swift
         kinds = (
-            NoiseKind(1, zero, one, noise.unstated, 1.0, 0.0, 0.0, share),
-            NoiseKind(0, zero, middle, noise.unstated, 1.0, 0.0, 0.0, same),
+            NoiseKind(1, zero, one, unstated, zero[..., 0], share),
+            NoiseKind(0, zero, middle, unstated, zero[..., 0], same),
         )
-    elif of_one_share(error, size) if alike is None else alike:
-        kinds = (NoiseKind(1, zero, error / size, noise.factor, 1.0, noise.right, 1.0, swift),)
-    else:  # a factor or a scatter: nobody knows which before the sizes are seen
-        wrong = 0.5 * (1.0 - noise.right)
-        whole = noise.right + wrong
-        right = noise.right / whole
-        kinds = (
-            NoiseKind(0, zero, error, noise.factor, 1.0, right, 1.0, math.log(whole) + swift),
-            NoiseKind(0, error, size, noise.scatter, 0.0, 0.0, 0.0, math.log(wrong) + swift),
-        )
+    else:
+        right, factor = noise.stated(np.median(error / size, axis=-1))
+        slow = slow + np.log(right)
+        if of_one_share(error, size) if alike is None else alike:
+            kinds = (NoiseKind(1, zero, error / size, factor, right, swift, 1.0, 1.0),)
+        else:  # a factor or a scatter: nobody knows which before the sizes are seen
+            wrong = 0.5 * (1.0 - right)
+            by_factor, beyond = swift + np.log1p(-wrong), swift + np.log(wrong)
+            kinds = (
+                NoiseKind(0, zero, error, factor, right / (1.0 - wrong), by_factor, 1.0, 1.0),
+                NoiseKind(0, error, size, scatter, zero[..., 0], beyond),
+            )
     if size.shape[-1] >= LONG:
         return kinds
     first = replace(kinds[0], slow=True, log_weight=slow)
     # Errors that are stated too small, and go on from row to row, are a drift: a rival.
-    return (*kinds, replace(first, chance=1.0 - UNTESTED) if first.least else first)
+    sure = (1.0 - UNTESTED) * every
+    return (*kinds, replace(first, chance=sure) if first.least else first)
 
 
 def scales_between(kind: NoiseKind, low: np.ndarray, high: np.ndarray) -> Scales:
@@ -160,21 +171,24 @@ def scales_between(kind: NoiseKind, low: np.ndarray, high: np.ndarray) -> Scales
         high = np.maximum(high, low + 0.01)
     step = (high - low) / (NODES - 1)
     log = low[..., None] + step[..., None] * np.arange(NODES)
-    whole = math.log1p(-kind.chance) - kind.prior.log_probability_above(kind.least)
-    weight = whole + kind.prior.log_density(log) + np.log(step)[..., None]
+    whole = np.log1p(-kind.chance) - kind.prior.log_probability_above(kind.least)
+    prior = Lognormal(*(np.asarray(v)[..., None] for v in kind.prior))
+    weight = prior.log_density(log) + (whole + np.log(step))[..., None]
     # The trapezoidal rule.
     weight = weight - math.log(2.0) * np.isin(np.arange(NODES), (0, NODES - 1))
-    if not kind.chance:
+    if kind.special is None:
         return Scales(np.exp(log), weight)
     first = np.ones_like(log[..., :1])
     scale = np.concatenate([kind.special * first, np.exp(log)], axis=-1)
-    return Scales(scale, np.concatenate([math.log(kind.chance) * first, weight], axis=-1))
+    chance = np.log(kind.chance)[..., None] * first
+    return Scales(scale, np.concatenate([chance, weight], axis=-1))
 
 
 def wide_scales(kind: NoiseKind, lead: tuple[int, ...]) -> Scales:
     """Nodes over all of the prior, for planes of leading shape ``lead``."""
-    middle, far = math.log(kind.prior.middle), REACH * kind.prior.spread
-    return scales_between(kind, np.full(lead, middle - far), np.full(lead, middle + far))
+    middle, far = np.log(kind.prior.middle), REACH * kind.prior.spread
+    low, high = (np.broadcast_to(end, lead) for end in (middle - far, middle + far))
+    return scales_between(kind, low, high)
 
 
 def scales_of(
@@ -190,7 +204,7 @@ def scales_of(
 
 def narrowed(kind: NoiseKind, scales: Scales, log_posterior: np.ndarray) -> Scales:
     """New nodes where the log posterior of the present ones, shape (..., k), counts."""
-    skip = int(kind.chance > 0)
+    skip = int(kind.special is not None)
     log = np.log(scales.scale[..., skip:])
     step = log[..., 1] - log[..., 0]
     here = log_posterior[..., skip:]

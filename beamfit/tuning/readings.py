@@ -139,14 +139,14 @@ def _relative_noise(
     size: np.ndarray, error: np.ndarray | None, of_shots: bool, noise: Noise
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Relative floor and unit of the errors, and the prior of ln of the scale of the unit."""
-    floor = error if of_shots else None
-    kind = kinds_of(noise, size, None if of_shots else error, floor)[0]
+    kind = kinds_of(noise, size, error, of_shots)[0]
     share = 1.0 if kind.power else size
-    floor, unit, middle = kind.floor / share, kind.unit / share, kind.prior.middle
+    prior = noise.factor if kind.least else kind.prior
+    floor, unit, middle = kind.floor / share, kind.unit / share, prior.middle
     if kind.least:
         # Stated errors are a floor; with the scatter beside them they are larger by the factor.
         floor, middle = np.hypot(floor, kind.least * unit), math.sqrt(middle**2 - kind.least**2)
-    return floor, unit, np.array([math.log(middle), kind.prior.spread])
+    return floor, unit, np.array([math.log(middle), prior.spread])
 
 
 def _constant_beam(c: Coordinates) -> np.ndarray:

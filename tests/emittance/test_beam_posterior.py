@@ -111,10 +111,10 @@ def noises(kind, size, error, noise):
     if kind == "shots":
         scale, weight = ref.shot_scales(noise)
         return [(1.0, np.hypot(error / size, scale[:, None]), weight)]
-    scale, weight = ref.stated_scales(noise)
+    scale, weight = ref.stated_scales(noise, size, error)
     if kind == "share":
         return [(1.0, scale[:, None] * error / size, weight)]
-    wrong = 0.5 * (1.0 - noise.right)
+    wrong = 0.5 * (1.0 - weight[0])
     weight[1:] *= 0.5
     scatter, further = ref.lognormal_grid(noise.scatter)
     return [
@@ -135,7 +135,7 @@ def brute_probabilities(fit, kind, noise):
     post = fit.seen.solutions["x"].posterior
     log = likelihood(kind, size, error, noise)
     drawn = rows, size, p.known, log, post.best, covariance, turn
-    beam = ref.log_evidence_of_beam(*drawn, number=5000)
+    beam = ref.log_evidence_of_beam(*drawn, number=30_000)
     # Noise that is a share of the size would vanish where such a beam does: of what was measured.
     own = {"share": "factor", "none": "same"}.get(kind, kind)
     log = likelihood(own, size, error, noise)
@@ -160,6 +160,8 @@ def brute_probabilities(fit, kind, noise):
         near.append(beam + odds + np.log(chance))
     # Rivals of slow noise are those of the first kind of noise.
     first = parts[0] - np.log(noises(kind, size, error, noise)[0][0]) + np.log(noise.slow)
+    if kind in ("stated", "share"):
+        first = first + np.log(ref.stated_scales(noise, size, error)[1][0])
     parts = [part + np.log(1.0 - noise.slow) for part in parts]
     near = [each + np.log(1.0 - noise.slow) for each in near]
     slow = first[-1]

@@ -37,10 +37,14 @@ def lognormal_grid(prior, least=0.0, reach=6.0):
     return np.exp(log), weight / weight.sum()
 
 
-def stated_scales(noise):
-    """Factors of stated errors: 1, or more than 1."""
+def stated_scales(noise, size, error):
+    """Factors of stated errors, 1 or more than 1: with them they are what settings scatter."""
     factor, weight = lognormal_grid(noise.factor, least=1.0)
-    return np.append(1.0, factor), np.append(noise.right, (1.0 - noise.right) * weight)
+    factor = np.append(1.0, factor)
+    weight = np.append(noise.right, (1.0 - noise.right) * weight)
+    true = np.log(np.median(error / size) * factor)
+    weight *= norm.pdf(true, math.log(noise.scatter.middle), noise.scatter.spread)
+    return factor, weight / weight.sum()
 
 
 def shot_scales(noise):
@@ -94,27 +98,28 @@ def either_way(swift, slow, noise):
 
 def log_stated(size, model, error, noise):
     """Sizes with stated errors: right, too small by one factor, or by what settings scatter."""
-    factor, weight = stated_scales(noise)
+    factor, weight = stated_scales(noise, size, error)
+    right = weight[0]
     scatter, further = lognormal_grid(noise.scatter)
     weight[1:] *= 0.5
     deviations = [s * error for s in factor] + [np.hypot(error, s * size) for s in scatter]
-    weights = np.append(weight, 0.5 * (1.0 - noise.right) * further)
+    weights = np.append(weight, 0.5 * (1.0 - right) * further)
     off = size - model
     swift = log_averaged(lambda d: log_readings(off, d, noise), deviations, weights)
-    return either_way(swift, log_slow(off, error, 0.0, noise), noise)
+    return either_way(swift, math.log(right) + log_slow(off, error, 0.0, noise), noise)
 
 
-def log_factor(size, model, error, noise):
+def log_factor(size, model, error, noise, share=None):
     """Sizes with stated errors that are right or too small by one factor."""
-    factor, weight = stated_scales(noise)
+    factor, weight = stated_scales(noise, size, error if share is None else share * size)
     off, deviations = size - model, [s * error for s in factor]
     swift = log_averaged(lambda d: log_readings(off, d, noise), deviations, weight)
-    return either_way(swift, log_slow(off, error, 0.0, noise), noise)
+    return either_way(swift, math.log(weight[0]) + log_slow(off, error, 0.0, noise), noise)
 
 
 def log_share(size, model, share, noise):
     """The same of errors that are one share of the size, and so of the beam's own."""
-    return log_factor(size, model, share * model, noise)
+    return log_factor(size, model, share * model, noise, share)
 
 
 def log_of_shots(size, model, floor, noise):

@@ -33,7 +33,8 @@ def found_and_expected(kind, size, model, error, noise):
     if kind == "none":
         kinds, log = kinds_of(noise, size, None), ref.log_unstated(size, model, noise)
     elif kind == "shots":
-        kinds, log = kinds_of(noise, size, None, error), ref.log_of_shots(size, model, error, noise)
+        kinds = kinds_of(noise, size, error, of_shots=True)
+        log = ref.log_of_shots(size, model, error, noise)
     elif kind == "share":
         kinds, log = kinds_of(noise, size, error), ref.log_share(size, model, error / size, noise)
     else:
@@ -67,19 +68,26 @@ def test_the_written_out_one_is_an_integral():
         np.array([0.02, 0.02, 0.03]),
     )
     prior = lognorm(noise.factor.spread, scale=noise.factor.middle)
-    whole = prior.sf(1.0)
+    scatter = lognorm(noise.scatter.spread, scale=noise.scatter.middle)
+    share = np.median(error / (1.0 + off))
+
+    def stated(s):
+        """How often errors are stated that lack the factor s, as a density of it."""
+        return share * s * scatter.pdf(share * s) * prior.pdf(s) / prior.sf(1.0)
+
+    seldom = quad(stated, 1.0, 10.0)[0] + quad(stated, 10.0, 300.0)[0]
+    right = noise.right * share * scatter.pdf(share)
+    right /= right + (1.0 - noise.right) * seldom
 
     def density(s):
-        return np.prod(norm.pdf(off, 0.0, s * error)) * prior.pdf(s) / whole
-
-    scatter = lognorm(noise.scatter.spread, scale=noise.scatter.middle)
+        return np.prod(norm.pdf(off, 0.0, s * error)) * stated(s) / seldom
 
     def beyond(s):
         return np.prod(norm.pdf(off, 0.0, np.hypot(error, s * (1.0 + off)))) * scatter.pdf(s)
 
     wrong = quad(density, 1.0, 10.0)[0] + quad(density, 10.0, 300.0)[0]
     wrong = 0.5 * (wrong + quad(beyond, 0.0, 0.3)[0] + quad(beyond, 0.3, 9.0)[0])
-    expected = noise.right * np.prod(norm.pdf(off, 0.0, error)) + (1 - noise.right) * wrong
+    expected = right * np.prod(norm.pdf(off, 0.0, error)) + (1 - right) * wrong
     found = ref.log_stated(1.0 + off, np.ones((1, 3)), error, noise)
     assert found[0] == pytest.approx(np.log(expected), abs=0.01)
 
@@ -110,7 +118,7 @@ def test_errors_of_one_share_are_the_models_own():
     assert kinds_of(Noise(), size, 0.05 * size)[0].power == 1
     assert kinds_of(Noise(), size, np.full(3, 0.05))[0].power == 0
     assert [k.power for k in kinds_of(Noise(), size, None)] == [1, 0, 1]
-    shots, slow = kinds_of(Noise(), size, None, np.full(3, 0.05))
+    shots, slow = kinds_of(Noise(), size, np.full(3, 0.05), of_shots=True)
     assert (shots.power, shots.special, shots.chance) == (0, 0.0, Noise().even)
     assert not shots.slow
     assert slow.slow
