@@ -53,7 +53,7 @@ SAID = {
     "lifetime_aps": ["converged 39.149 ± 0.038 h", "a (7.0 ± 1.2)e-08"],
     "when_data_do_not_tell": [" 8 settings: unidentified", " 9 settings: converged"],
     "calibration": ["converged 0.679 ± 0.015 µm", "Q2.slope 167.2 ± 3.3"],
-    "slices": ["3          converged 0.4954 ± 0.0056 µm"],
+    "slices": ["3          converged 0.4954 ± 0.0057 µm"],
     "loss_mechanisms": ["longest: 18.4 h at 3.2 MV"],
     "density": ["x by sizes 0.899 ± 0.039 µm by the density 1.0"],
     "tuning": ["converged: normalised emittance 0.734 ± 0.026 µm at SOL = 197.8 A"],
