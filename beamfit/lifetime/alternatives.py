@@ -63,11 +63,6 @@ FINER = 3
 AGAIN, NEARER = 5, 1e-3
 # Two changes within so many readings are a step.
 STEP = 3.0
-# An alternative is fitted if in linear approximation its evidence, by noises of so many correlation
-# times, is not below that of constant a and b by more than this: it is good to about 1.
-COARSE, HOPELESS = 7, -1.0
-# Step of a time for the slope by it, over the span.
-MOVED = 1e-3
 # Currents at which a lifetime is offered.
 CURRENTS = 5
 
@@ -373,13 +368,11 @@ def rival_of(plain: Expansion) -> Rival | None:
     if pieces.time.size <= WHEN + 2:
         return None
     plain = solved(pieces) if pieces is not plain.pieces else plain
-    likely = _likely(plain)
-    if not likely:
-        return None
-    smooth = _smooth(plain)
-    laws = [(one, _with_further(plain, further)) for one, further in likely.items()]
+    others = [one for one in OTHERS if pieces.gauge is None or one.kind not in UNGAUGED]
+    laws = [(one, _with_further(plain, one.kind, one.count)) for one in others]
     found = [(_log_evidence(law, one), one, law) for one, law in laws if law is not None]
     log, one, best = max(found, key=lambda each: each[0], default=(-math.inf, CONSTANT, plain))
+    smooth = _smooth(plain)
     if not log > smooth:
         return None
     told = {"relaxing": _outgassing, "sudden": _sudden_loss}
@@ -395,35 +388,6 @@ def _averaged(pieces: Pieces) -> Pieces:
     record = DecayRecord(pieces.time, pieces.current, pieces.error, monitor=pieces.monitor)
     means = record.means(-(-len(record) // ENOUGH))
     return Pieces.of(DecayRecord(*means, monitor=pieces.monitor))
-
-
-def _likely(plain: Expansion) -> dict[Alternative, _Further]:
-    """Further losses of the alternatives that are not much less likely than constant a and b: by
-    their evidence in linear approximation about the law without, at their best times.
-    """
-    gauged = plain.pieces.gauge is not None
-    others = [one for one in OTHERS if not (gauged and one.kind in UNGAUGED)]
-    best = {one: _at_best(plain, one.count, one.kind) for one in others}
-    columns = [plain.residuals, *plain.rows[:, [LEVEL, *PLAIN]].T]
-    places, widths = {CONSTANT: range(0)}, {CONSTANT: np.zeros(0)}
-    for one, more in best.items():
-        own = list(further_columns(plain, more.kind, more.times).T)
-        size, time = _widths(more.kind, more.sizes, more.times, plain.numbers[0])
-        if more.kind != "sudden":
-            ends = (further_columns(plain, more.kind, more.times + d) for d in (MOVED, -MOVED))
-            own += list(more.sizes[:, None] * np.subtract(*ends).T / (2 * MOVED))
-            size = np.append(size, time)
-        places[one], widths[one] = range(len(columns), len(columns) + len(own)), size
-        columns += own
-    products = Products.of(np.column_stack(columns), plain.pieces.time, bool(plain.given), COARSE)
-
-    def log_evidence(one: Alternative) -> float:
-        own, width = [0, 1, 2, 3, *places[one]], np.append([np.inf] * 3, widths[one])
-        some = products.combined(np.eye(len(columns))[:, own])
-        return _laplace(some, width, np.zeros(width.size)) + _log_chance(one, plain)
-
-    constant = log_evidence(CONSTANT) + HOPELESS
-    return {one: more for one, more in best.items() if log_evidence(one) > constant}
 
 
 def _log_chance(one: Alternative, law: Expansion) -> float:
@@ -455,14 +419,6 @@ def _smooth(plain: Expansion) -> float:
     return float(logsumexp([_log_evidence(law, one) for law, one in each if law.rested]))
 
 
-class _Further(NamedTuple):
-    """Further losses of a kind: their times and sizes."""
-
-    kind: str
-    times: np.ndarray
-    sizes: np.ndarray
-
-
 def _looked_at(pieces: Pieces, kind: str) -> np.ndarray:
     """Times that are looked at first, over the span: current is lost between any two readings."""
     if kind != "sudden":
@@ -472,9 +428,9 @@ def _looked_at(pieces: Pieces, kind: str) -> np.ndarray:
     return between[few.astype(int)]
 
 
-def _at_best(about: Expansion, count: int, kind: str) -> _Further:
-    """Further losses that explain most, in place of those of a law and in linear approximation
-    about it.
+def _at_best(about: Expansion, kind: str, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Sizes and times of further losses that explain most, in place of those of a law and in linear
+    approximation about it.
     """
     basis = np.linalg.qr(about.left[:, [LEVEL, *PLAIN]])[0]
 
@@ -496,34 +452,30 @@ def _at_best(about: Expansion, count: int, kind: str) -> _Further:
         times, steps = every[place[best]], [window[1] - window[0] for window in windows]
         windows = [np.linspace(max(t - d, grid[0]), min(t + d, grid[-1]), GRID.size)
                    for t, d in zip(times, steps, strict=True)]  # fmt: skip
-    return _Further(kind, times, -sizes[best] / size[place[best]])
+    return -sizes[best] / size[place[best]], times
 
 
-def _with_further(plain: Expansion, more: _Further) -> Expansion | None:
+def _with_further(plain: Expansion, kind: str, count: int) -> Expansion | None:
     """The law with changes of the loss rate, or sudden losses, or with gas that relaxes, whose
     time is found. Those of the others are looked for again about the law with them, while it is
     better: a large change bends the decay otherwise than a small one.
     """
-    gas, law, found = more.kind == "relaxing", plain, None
+    gas, law, found = kind == "relaxing", plain, None
     for _ in range(AGAIN):
-        further = np.column_stack([more.sizes, more.times])[np.argsort(more.times)].ravel()
+        further = np.column_stack(_at_best(law, kind, count))
+        further = further[np.argsort(further[:, 1])].ravel()
         free = (*PLAIN, *range(FURTHER, FURTHER + further.size, 1 if gas else 2))
-        law = solved(
-            plain.pieces,
-            free,
-            more.kind,
-            start=np.append(law.numbers[: plain.numbers.size], further),
-        )
+        start = np.append(law.numbers[: plain.numbers.size], further)
+        law = solved(plain.pieces, free, kind, start=start)
         if found is not None and not _squares(law) < (1 - NEARER) * _squares(found):
             break
         found = law
         if gas or not law.rested:
             break
-        more = _at_best(law, more.times.size, more.kind)
     shortest = float(np.median(np.diff(plain.pieces.time))) / plain.pieces.units[0]
     if gas:
         known = found.numbers[3] > 0 and shortest < found.numbers[4] < TIMES[1]
-    elif more.kind == "sudden":
+    elif kind == "sudden":
         known = np.all(np.diff(found.numbers[4::2]) > shortest)
     else:
         known = np.all(np.diff([0.0, *found.numbers[4::2], 1.0]) > STEP * shortest)
