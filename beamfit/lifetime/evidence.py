@@ -203,13 +203,17 @@ class Evidence:
         floor = np.sum((EXACT * self.about.pieces.current / self.about.pieces.over) ** 2)
         return memory._replace(squares=np.maximum(memory.squares, floor))
 
-    def _moments(self, memory: Memory, columns: list[int]) -> AveragedMoments:
-        return memory.moments(self.about.slopes[:, columns], self.about.given)
+    @cached_property
+    def exponent(self) -> AveragedMoments:
+        """The power of the current as which a goes, beside the other numbers."""
+        place = np.eye(self.about.rows.shape[1])[[POWER]][:, self.about.columns(POWER)]
+        return self.power.moments(place, self.about.given)
 
     @cached_property
     def moments(self) -> AveragedMoments:
         """Shifts of the values by the noise, their errors and the reach of 95 %."""
-        found = self._moments(self.memory, self.about.columns())
+        slopes = self.about.slopes[:, self.about.columns()]
+        found = self.memory.moments(slopes, self.about.given)
         if not self.independent:
             return found
         # The weak prior stays where the noise is that of the search.
@@ -266,9 +270,7 @@ class Evidence:
         """Test of a constant a by an exponent beside the other numbers."""
         if self.cycles > 1 and not self.separability.separable:
             return constant_a(math.nan, math.inf, math.inf, math.nan)
-        place = np.eye(self.about.rows.shape[1])[[POWER]][:, self.about.columns(POWER)]
-        found = self.power.moments(place, self.about.given)
-        error = float(found.error[0])
+        found, error = self.exponent, float(self.exponent.error[0])
         test = constant_a(float(found.shift[0]), error, error, float(found.chance[0]))
         return test.widened(float(self.drifted[-1])) if self.monitor_changes else test
 
@@ -529,9 +531,7 @@ class Evidence:
         """
         if self.law is Law.constant or self.cycles == 1 or not self.separability.separable:
             return None
-        columns = self.about.columns(POWER)
-        place = np.eye(self.about.rows.shape[1])[[POWER]][:, columns]
-        seen = self.power.moments(place, self.about.given).error[0]
+        columns, seen = self.about.columns(POWER), self.exponent.error[0]
         size = 1 / math.hypot(1 / BELOW, 1 / seen)
         rows, plain = self.about.left[:, columns], self.about.columns()
         step = np.linalg.lstsq(rows[:, : len(plain)], -size * rows[:, -1], rcond=None)[0]
