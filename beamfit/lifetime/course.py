@@ -269,7 +269,7 @@ def _point(
     relative: list[Quantity | None] = [None, None]
     law = fit.free_law
     same = usual is not None and not usual.power and fit.status is not Status.poor_fit
-    if same and not (law is not None and law.goes_in_time):
+    if same and (law is None or law.beside is None):
         relative = [
             None if q.error is None else Quantity(q.value / by, q.error / by, "1")
             for q, by in ((fit.if_constant("a"), usual.a * a), (fit.if_constant("b"), usual.b * b))

@@ -517,9 +517,9 @@ class Evidence:
         return found if isinstance(found, Outgassing) else None
 
     @property
-    def pumped(self) -> bool:
-        """True if what is quoted is gas that is pumped away."""
-        return self.free is not None and self.free.is_pumped
+    def beside(self) -> str | None:
+        """Name of what is likely to go by itself beside the law, as of `FreeLaw`."""
+        return self.free and self.free.beside
 
     @cached_property
     def bending(self) -> Physical | None:
@@ -598,10 +598,10 @@ class Evidence:
     def stated_odds(self) -> float:
         """Log odds that the stated errors are right, whatever memory the noise has."""
         columns = np.column_stack([self.about.residuals, self.about.rows[:, : POWER + 1]])
-        if self.pumped:
+        if self.beside == "pumped":
             gas = further_columns(self.about, "relaxing", 1 / np.array(PACES))
             columns = np.column_stack([columns, gas])
-        if self.free is not None and self.free.is_settling:
+        if self.beside == "settles":
             model = self.record.current / self.about.pieces.over + self.about.residuals
             settles = np.hstack([*settling()[::DOUBLING]])
             shapes = from_nodes(self.record.time / self.record.span) @ settles
@@ -640,8 +640,7 @@ class Evidence:
             known = self.separability.separable and not (refuted and self.course)
         else:
             plain = not self.shaped and self.about.pieces.gauge is None
-            own = self.free is not None and self.free.goes_in_time
-            known = plain and refuted and self.outgassing is None and not own
+            known = plain and refuted and self.outgassing is None and self.beside is None
         return lifetime_law(self.about, self.independent, refuted) if known else None
 
     @cached_property

@@ -354,6 +354,14 @@ class ScaleFit(Judged):
             return VOLTAGE
         return None if self.noise.probabilities[0] > POOR_FIT else self.noise.model_name
 
+    @property
+    def covariance(self) -> np.ndarray:
+        """Linearised, of all scales whether separable or not, shape (n, n); infinite along
+        directions that nothing determines.
+        """
+        blind = ~np.isfinite(self.spread.errors)
+        return np.where(np.outer(blind, blind), np.inf, self.spread.seen)
+
     @cached_property
     def scales(self) -> dict[str, Quantity]:
         """Factors on the ring file's values: touschek, bremsstrahlung, elastic, desorption, also as
