@@ -63,6 +63,11 @@ FINER = 3
 AGAIN, NEARER = 5, 1e-3
 # Two changes within so many readings are a step.
 STEP = 3.0
+# An alternative is fitted if in linear approximation its evidence, by noises of so many correlation
+# times, is not below that of constant a and b by more than this: it is good to about 1.
+COARSE, HOPELESS = 7, -1.0
+# Step of a time for the slope by it, over the span.
+MOVED = 1e-3
 # Currents at which a lifetime is offered.
 CURRENTS = 5
 
@@ -368,8 +373,10 @@ def rival_of(plain: Expansion) -> Rival | None:
     if pieces.time.size <= WHEN + 2:
         return None
     plain = solved(pieces) if pieces is not plain.pieces else plain
-    others = [one for one in OTHERS if pieces.gauge is None or one.kind not in UNGAUGED]
-    laws = [(one, _with_further(plain, one.kind, one.count)) for one in others]
+    likely = _likely(plain)
+    if not likely:
+        return None
+    laws = [(one, _with_further(plain, one.kind, one.count)) for one in likely]
     found = [(_log_evidence(law, one), one, law) for one, law in laws if law is not None]
     log, one, best = max(found, key=lambda each: each[0], default=(-math.inf, CONSTANT, plain))
     smooth = _smooth(plain)
@@ -388,6 +395,35 @@ def _averaged(pieces: Pieces) -> Pieces:
     record = DecayRecord(pieces.time, pieces.current, pieces.error, monitor=pieces.monitor)
     means = record.means(-(-len(record) // ENOUGH))
     return Pieces.of(DecayRecord(*means, monitor=pieces.monitor))
+
+
+def _likely(plain: Expansion) -> list[Alternative]:
+    """Alternatives that are not much less likely than constant a and b: by their evidence in linear
+    approximation about the law without, at their best times.
+    """
+    gauged = plain.pieces.gauge is not None
+    others = [one for one in OTHERS if not (gauged and one.kind in UNGAUGED)]
+    columns = [plain.residuals, *plain.rows[:, [LEVEL, *PLAIN]].T]
+    places, widths = {CONSTANT: range(0)}, {CONSTANT: np.zeros(0)}
+    for one in others:
+        sizes, times = _at_best(plain, one.kind, one.count)
+        own = list(further_columns(plain, one.kind, times).T)
+        size, time = _widths(one.kind, sizes, times, plain.numbers[0])
+        if one.kind != "sudden":
+            ends = (further_columns(plain, one.kind, times + d) for d in (MOVED, -MOVED))
+            own += list(sizes[:, None] * np.subtract(*ends).T / (2 * MOVED))
+            size = np.append(size, time)
+        places[one], widths[one] = range(len(columns), len(columns) + len(own)), size
+        columns += own
+    products = Products.of(np.column_stack(columns), plain.pieces.time, bool(plain.given), COARSE)
+
+    def log_evidence(one: Alternative) -> float:
+        own, width = [0, 1, 2, 3, *places[one]], np.append([np.inf] * 3, widths[one])
+        some = products.combined(np.eye(len(columns))[:, own])
+        return _laplace(some, width, np.zeros(width.size)) + _log_chance(one, plain)
+
+    constant = log_evidence(CONSTANT) + HOPELESS
+    return [one for one in others if log_evidence(one) > constant]
 
 
 def _log_chance(one: Alternative, law: Expansion) -> float:
@@ -520,21 +556,18 @@ def _given(law: Expansion, one: Alternative) -> tuple[list[int], np.ndarray, np.
     are from the middle of these.
     """
     loss, quadratic, power, *further = law.numbers
-    extra: dict[int, float] = {}
+    extra: dict[int, tuple[float, float]] = {}
     if one.power:
-        extra[POWER] = BELOW if power < 0 else ABOVE
+        extra[POWER] = (BELOW if power < 0 else ABOVE), power
     if one.kind == "drift":
-        extra[FURTHER] = DRIFT * max(abs(loss - quadratic), 1e-300)
-    flat: dict[int, float] = {}
+        extra[FURTHER] = DRIFT * max(abs(loss - quadratic), 1e-300), further[0]
     if one.count:
         sizes, times = _widths(one.kind, np.array(further[::2]), np.array(further[1::2]), loss)
-        flat = {FURTHER + 2 * k: size for k, size in enumerate(sizes)}
+        extra |= {FURTHER + 2 * k: (size, 0.0) for k, size in enumerate(sizes)}
         if one.kind != "sudden":
-            flat |= {WHEN + 2 * k: time for k, time in enumerate(times)}
-    extra |= flat
-    known = [0.0 if column in flat else law.numbers[column - 1] for column in extra]
-    width = np.array([np.inf] * 3 + list(extra.values()))
-    return [LEVEL, *PLAIN, *extra], width, np.array([0.0] * 3 + known)
+            extra |= {WHEN + 2 * k: (time, 0.0) for k, time in enumerate(times)}
+    width, centre = np.array([(np.inf, 0.0)] * 3 + list(extra.values())).T
+    return [LEVEL, *PLAIN, *extra], width, centre
 
 
 def _laplace(products: Products, width: np.ndarray, centre: np.ndarray) -> float:

@@ -643,12 +643,8 @@ class Evidence:
             known = plain and refuted and self.outgassing is None and self.beside is None
         return lifetime_law(self.about, self.independent, refuted) if known else None
 
-    @cached_property
-    def by_drift(self) -> Physical:
-        """Shifts of the values by a straight drift of the monitor of 1 mA over the record."""
-        return self.about.moved(self.time / self.time[-1] / self.about.pieces.over)
-
     def drift_of_one_error(self, name: str) -> float:
         """Straight drift of the monitor over the record, mA, that moves a value by its error."""
-        moved = abs(float(getattr(self.by_drift, name)))
+        by_one = self.about.moved(self.time / self.time[-1] / self.about.pieces.over)
+        moved = abs(float(getattr(by_one, name)))
         return float(getattr(self.errors, name)) / moved if moved > 0 else math.inf

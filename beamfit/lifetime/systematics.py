@@ -152,12 +152,6 @@ class OneLifetime:
         """Return the fields as JSON's types; a bias that is not known is null."""
         return json_of(vars(self) | {"rms_residual": bare(self.rms_residual, "mA")})
 
-    def __str__(self) -> str:
-        return (
-            f"{self.lifetime}, {100 * self.bias_start:+.3g} % from the lifetime at the start, "
-            f"{100 * self.bias_mean:+.3g} % from that at the mean current"
-        )
-
 
 def _one_lifetime(
     rate: float, error: float, residuals: np.ndarray, record: DecayRecord, fit: DecayFit | None

@@ -5,7 +5,9 @@ from functools import partial
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp, trapezoid
+from scipy.signal import lfilter
 
+from beamfit.lifetime import alternatives
 from beamfit.lifetime.decay_law import Moments, beam_current
 from beamfit.lifetime.expansion import Pieces, further_columns, solved
 from beamfit.lifetime.fit import fit_decay
@@ -390,3 +392,24 @@ def test_slopes_by_a_further_loss_are_differences_of_the_integrated_law(kind, wh
     found = further_columns(about, kind, np.array([when]))[:, 0]
     expected = (ends[0] - ends[1]) / 0.1
     assert found == pytest.approx(expected, abs=2e-3 * np.abs(expected).max())
+
+
+def test_no_alternative_that_wins_is_left_out_unfitted(monkeypatch):
+    random, records = np.random.default_rng(8), []
+    for further in (0.0, 0.003, 0.03):
+        rate = lambda t, i, f=further: A * i + B + f / HOUR * (t > 0.4 * SPAN)  # noqa: E731
+        time, beam = integrated(rate, count=150)
+        steps = random.normal(size=time.size)
+        noise = lfilter([0.6], [1, -0.8], steps)
+        records += [DecayRecord(time, beam + 0.02 * part) for part in (steps, noise)]
+    abouts = [solved(Pieces.of(record)) for record in records]
+    likely, looked = alternatives._likely, []
+    noted = lambda *law: looked.append(likely(*law)) or looked[-1]  # noqa: E731
+    monkeypatch.setattr(alternatives, "_likely", noted)
+    chosen = [alternatives.rival_of(about) for about in abouts]
+    left_out = sum(len(names) < 5 for names in looked)
+    monkeypatch.setattr(alternatives, "HOPELESS", -np.inf)
+    answers = [alternatives.rival_of(about) for about in abouts]
+    assert list(map(str, chosen)) == list(map(str, answers))
+    assert any(answers)
+    assert left_out >= 2
