@@ -455,8 +455,9 @@ def finding_of_cycles(
     evidence: Evidence, monitor: Monitor | None, left_out: Sequence[str]
 ) -> Finding:
     """Status and sentences on many cycles fitted together; `left_out` is what was not fitted."""
-    found, (low, high) = judge(evidence, CYCLE_RULES), evidence.currents
-    first = f"One answer from {evidence.cycles} cycles between {low:.4g} and {high:.4g} mA"
+    found, current = judge(evidence, CYCLE_RULES), evidence.about.pieces.current
+    between = f"between {current.min():.4g} and {current.max():.4g} mA"
+    first = f"One answer from {evidence.cycles} cycles {between}"
     remarks = [remark(evidence) for remark in (_course, _noise_inferred, _correlated, _odd_clock)]
     remarks += [] if monitor is None else [_stated(monitor)]
     remarks += [text[0].upper() + text[1:] for text in left_out]

@@ -151,11 +151,6 @@ class Evidence:
         return self.about.level.size
 
     @property
-    def currents(self) -> tuple[float, float]:
-        """Lowest and highest, mA."""
-        return float(self.about.pieces.current.min()), float(self.about.pieces.current.max())
-
-    @property
     def time(self) -> np.ndarray:
         """Times of the readings, s."""
         return self.about.pieces.time

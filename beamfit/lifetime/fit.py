@@ -95,6 +95,8 @@ class DecayFit(LossFit):
         Model minus reading, mA.
     identifiability : Separability
         Whether the record tells a from b.
+    readings : DecayRecord
+        What was fitted.
     constant_a : ConstantA or None
         Whether the record contradicts a constant a; None where nothing decays.
     correlation_time : float or None
@@ -106,8 +108,6 @@ class DecayFit(LossFit):
     alternative : Change, Outgassing, SuddenLoss or None
         A change of the loss rate, a gas loss that relaxes, or current lost at once, where that
         explains a refuted law; also as `change`, `outgassing` or `loss`.
-    readings : DecayRecord, optional
-        What was fitted.
     shaped : bool
         Whether a was given a dependence on the current.
     first : array of int, optional
@@ -143,12 +143,12 @@ class DecayFit(LossFit):
     noise_inferred: bool
     residuals: np.ndarray
     identifiability: Separability
+    readings: DecayRecord
     constant_a: ConstantA | None = None
     correlation_time: float | None = None
     inflation: float = 1.0
     lifetimes: LifetimeLaw | None = None
     alternative: Change | Outgassing | SuddenLoss | None = None
-    readings: DecayRecord | None = None
     shaped: bool = False
     first: np.ndarray | None = None
     exact: Mapping[str, Quantity] = field(default_factory=dict)

@@ -28,7 +28,7 @@ from scipy.special import expit, log_expit, log_ndtr, logsumexp, ndtri
 
 from beamfit.arrays import array_module
 from beamfit.lifetime.decay_law import closed_form
-from beamfit.lifetime.expansion import Physical
+from beamfit.lifetime.expansion import Physical, Pieces
 from beamfit.lifetime.record import DecayRecord
 from beamfit.noise.memory import Products
 from beamfit.quantity import HOUR, Quantity
@@ -375,15 +375,13 @@ class SeenDecay:
         rate = max(float(values.rate_mean) * span, 1e-9)
         share = float(np.clip(values.share, -0.2, 1.2))
         start = np.array([[np.log(values.i0 / mean), np.log(rate), share, 0.0, 0.0, 0.0]]).T
-        gas, bumps, ends = NODE, 0.0, (1.0, 1.0)
+        gas, ends = NODE, tuple(Pieces.of(record).pressure.tolist())
         time, current, error = record.time, record.current, record.error
         if record.gauge is not None:
             s = record.time / span
             smooth = np.linalg.lstsq(chebvander(2 * s - 1, 9), record.gauge / span, rcond=None)[0]
             gas = chebvander(ANGLE, 9) @ smooth
             bumps = record.gauge / span - chebvander(2 * s - 1, 9) @ smooth
-            slope = np.diff(record.gauge) / np.diff(record.time)
-            ends = float(slope[0]), float(slope[-1])
             current = current * np.exp((1 - share) * rate * bumps)
         if len(record) > ENOUGH:
             size = -(-len(record) // ENOUGH)

@@ -93,7 +93,7 @@ def systematics(fit: DecayFit) -> tuple[Systematic, ...]:
     """
     a, b = fit.if_constant("a").value, fit.if_constant("b").value
     record, another = fit.readings, fit.shaped or fit.first is not None
-    if record is None or another or fit.status is Status.infeasible or fit.a.error is None:
+    if another or fit.status is Status.infeasible or fit.a.error is None:
         return ()
     about = fit.about
     over, share = about.pieces.over, record.time / record.span
