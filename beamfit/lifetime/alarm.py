@@ -135,17 +135,17 @@ def shown_in(state: AlarmState, windows: slice = slice(None)) -> np.ndarray:
 
 
 class Seen(NamedTuple):
-    """Squares of changes over their errors, and one over the squares of these, in each window: of
-    a alone, of b alone, and of b beside a.
+    """Squares of changes over their errors, and one over the squares of these, in each window,
+    shape (3, ..., w): of a alone, of b alone, and of b beside a.
     """
 
-    squares: tuple[np.ndarray, np.ndarray, np.ndarray]
-    information: tuple[np.ndarray, np.ndarray, np.ndarray]
+    squares: np.ndarray
+    information: np.ndarray
 
     @property
     def evidence(self) -> np.ndarray:
         """Logarithms of how many times likelier a change of a, of b, of both is than none."""
-        a, b, beside = map(log_evidence_of_change, *self)
+        a, b, beside = log_evidence_of_change(*self)
         return np.stack([a, b, a + beside])
 
 
@@ -156,9 +156,8 @@ def seen_in(state: AlarmState, windows: slice = slice(None)) -> Seen:
     slope = mab / np.where(maa > 0, maa, np.inf)
     rest, left = sb - sa * slope, mbb - mab * slope
     left = np.where(left > 1e-9 * mbb, left, 0.0)  # else rounding: the two are not told apart
-    scores, information = (sa, sb, rest), (maa, mbb, left)
-    pairs = zip(scores, information, strict=True)
-    return Seen(tuple(s**2 / np.where(i > 0, i, np.inf) for s, i in pairs), information)
+    scores, information = np.stack([sa, sb, rest]), np.stack([maa, mbb, left])
+    return Seen(scores**2 / np.where(information > 0, information, np.inf), information)
 
 
 def change_since(state: AlarmState, moved: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

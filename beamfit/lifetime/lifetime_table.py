@@ -82,7 +82,7 @@ class LifetimeFit(LossFit):
 
     @property
     def identifiability(self) -> dict[str, Any]:
-        """Whether the table tells a from b, and the share of a in the loss."""
+        """Separability of a and b by the table, and the share of a in the loss."""
         share, error = self.share.value, self.share.error
         return {"separable": self.a.error is not None, "share": share, "share_error": error}
 
