@@ -50,10 +50,11 @@ class AlarmState(NamedTuple):
         a and b over the reference's after earlier alarms, and their relative covariance.
     spread : array
         Relative variance of a and of b from fill to fill.
-    age, weight, mean, product : array, shapes (..., w), (..., w), (..., w, 3), (..., w, 5)
+    age, weight, mean, product : array, shapes (..., w), (..., w), (..., w, 3), (..., w, 2, 3)
         Of each window and of what came since the alarm, in the last place: seconds, and of its last
-        piece the sum of weights, means and central products of the path.
-    past : array, shape (..., w, 5)
+        piece the sum of weights, means of the path, and central products of its derivatives with
+        these (the information) and with ln I (the score).
+    past : array, shape (..., w, 2, 3)
         What its earlier pieces say, each beside a and b of its own, as products.
     raised, excess, before : array
         Seconds since an alarm was raised, NaN where none is; ln I over the expected at that moment,
@@ -113,56 +114,50 @@ def with_reading(
     off = np.where((before > 0)[..., None], path[..., None, :] - state.mean, 0.0)
     start = (before == 0)[..., None] & (weight > 0)[..., None, None]
     mean = np.where(start, path[..., None, :], state.mean + share[..., None] * off)
-    y, u, v = np.moveaxis(off, -1, 0)
-    pairs = np.stack([u * u, u * v, v * v, u * y, v * y], axis=-1)
-    product, age = state.product + (share * before)[..., None] * pairs, state.age + step[..., None]
+    pairs = off[..., 1:, None] * off[..., None, [1, 2, 0]]
+    product = state.product + (share * before)[..., None, None] * pairs
+    age = state.age + step[..., None]
     return {"age": age, "weight": total, "mean": mean, "product": product, "past": state.past}
 
 
 def beside(product: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    """Products that are left where a and b depart by themselves with such a covariance.
-
-    With information J and score s these are (1 + J C)⁻¹ (J, s), written out: 2 by 2.
+    """Products that are left where a and b depart by themselves with such a covariance C: with
+    information J and score s (1 + J C)⁻¹ (J, s).
     """
-    uu, uv, vv, uy, vy = np.moveaxis(product, -1, 0)
-    caa, cab, cbb = covariance[..., 0, 0], covariance[..., 0, 1], covariance[..., 1, 1]
-    p, q = 1 + uu * caa + uv * cab, uu * cab + uv * cbb
-    r, t = uv * caa + vv * cab, 1 + uv * cab + vv * cbb
-    rows = t * uu - q * uv, t * uv - q * vv, p * vv - r * uv, t * uy - q * vy, p * vy - r * uy
-    return np.stack(rows, axis=-1) / (p * t - q * r)[..., None]
+    return np.linalg.solve(np.eye(2) + product[..., :2] @ covariance, product)
 
 
 def shown_in(state: AlarmState, windows: slice = slice(None)) -> np.ndarray:
     """Products of all pieces of some windows, as they tell a lasting change."""
     spread = state.spread[..., None, None, None] * np.eye(2)
-    return state.past[..., windows, :] + beside(state.product[..., windows, :], spread)
+    product = state.product[..., windows, :, :]
+    return state.past[..., windows, :, :] + beside(product, spread)
 
 
 class Seen(NamedTuple):
-    """Squares of changes over their errors, and one over the squares of these, in each window: of
-    a alone, of b alone, and of b beside a.
+    """Squares of changes over their errors, and one over the squares of these, in each window,
+    shape (3, ..., w): of a alone, of b alone, and of b beside a.
     """
 
-    squares: tuple[np.ndarray, np.ndarray, np.ndarray]
-    information: tuple[np.ndarray, np.ndarray, np.ndarray]
+    squares: np.ndarray
+    information: np.ndarray
 
     @property
     def evidence(self) -> np.ndarray:
         """Logarithms of how many times likelier a change of a, of b, of both is than none."""
-        a, b, beside = map(log_evidence_of_change, *self)
+        a, b, beside = log_evidence_of_change(*self)
         return np.stack([a, b, a + beside])
 
 
 def seen_in(state: AlarmState, windows: slice = slice(None)) -> Seen:
     """Changes that some of the windows show."""
     found = beside(shown_in(state, windows), state.covariance[..., None, :, :])
-    maa, mab, mbb, sa, sb = np.moveaxis(found, -1, 0)
+    (maa, mab, sa), (_, mbb, sb) = np.moveaxis(found, (-2, -1), (0, 1))
     slope = mab / np.where(maa > 0, maa, np.inf)
     rest, left = sb - sa * slope, mbb - mab * slope
     left = np.where(left > 1e-9 * mbb, left, 0.0)  # else rounding: the two are not told apart
-    scores, information = (sa, sb, rest), (maa, mbb, left)
-    pairs = zip(scores, information, strict=True)
-    return Seen(tuple(s**2 / np.where(i > 0, i, np.inf) for s, i in pairs), information)
+    scores, information = np.stack([sa, sb, rest]), np.stack([maa, mbb, left])
+    return Seen(scores**2 / np.where(information > 0, information, np.inf), information)
 
 
 def change_since(state: AlarmState, moved: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -170,25 +165,17 @@ def change_since(state: AlarmState, moved: np.ndarray) -> tuple[np.ndarray, np.n
 
     Errors contain those of the reference.
     """
-    uu, uv, vv, uy, vy = np.moveaxis(shown_in(state, slice(-1, None))[..., 0, :], -1, 0)
-    uu, vv = uu + WIDE**-2, vv + WIDE**-2
-    det = uu * vv - uv**2
-    rows = np.stack([np.stack([vv, -uv], -1), np.stack([-uv, uu], -1)], axis=-2)
-    covariance = rows / det[..., None, None]
-    both = np.stack([vv * uy - uv * vy, uu * vy - uv * uy], axis=-1) / det[..., None]
+    product = shown_in(state, slice(-1, None))[..., 0, :, :] + WIDE**-2 * np.eye(2, 3)
+    information, score = product[..., :2], product[..., 2]
+    own = np.diagonal(information, axis1=-2, axis2=-1)
+    share, covariance = information / own[..., None], np.linalg.inv(information)
+    both = np.einsum("...ij,...j->...i", covariance, score)
     total = np.diagonal(covariance + state.covariance, axis1=-2, axis2=-1)
-    caa, cab, cbb = (state.covariance[..., i, j] for i, j in ((0, 0), (0, 1), (1, 1)))
-    a_error = 1 / uu + caa + 2 * uv / uu * cab + (uv / uu) ** 2 * cbb
-    b_error = 1 / vv + cbb + 2 * uv / vv * cab + (uv / vv) ** 2 * caa
-
-    def told(a: np.ndarray, b: np.ndarray, whole: np.ndarray) -> np.ndarray:
-        """Fall of chi² by a alone, by b alone, or by both."""
-        zero = np.zeros_like(a)
-        rest = either(moved == 2, np.stack([zero, b], -1), whole)
-        return either(moved == 1, np.stack([a, zero], -1), rest)
-
-    change, square = told(uy / uu, vy / vv, both), told(a_error, b_error, total)
-    return change, np.sqrt(square), covariance
+    single = 1 / own + np.einsum("...ij,...jk,...ik->...i", share, state.covariance, share)
+    alone = np.asarray(moved)[..., None] == [1, 2]
+    which = alone.any(axis=-1, keepdims=True)
+    change = np.where(which, alone * score / own, both)
+    return change, np.sqrt(np.where(which, alone * single, total)), covariance
 
 
 def set_off(state: AlarmState, raised: np.ndarray, best: np.ndarray) -> AlarmState:
@@ -324,8 +311,8 @@ def started(reference: Reference, shape: tuple[int, ...] = ()) -> AlarmState:
         covariance=np.broadcast_to(np.asarray(reference.covariance, float), (*shape, 2, 2)),
         spread=np.full(shape, reference.wander**2),
         age=np.zeros(windows), weight=np.zeros(windows), mean=np.zeros((*windows, 3)),
-        product=np.zeros((*windows, 5)), past=np.zeros((*windows, 5)), raised=none, excess=zero,
-        before=zero,
+        product=np.zeros((*windows, 2, 3)), past=np.zeros((*windows, 2, 3)), raised=none,
+        excess=zero, before=zero,
     )  # fmt: skip
 
 
@@ -428,7 +415,9 @@ def _moved_on(usual: Reference, state: AlarmState, reading: Reading) -> AlarmSta
     alone, weight, foretold, unsure = _alone(usual, state, path, np.where(begins, 0.0, memory))
     weight = np.where(hold > 0, 0.0, weight / noise**2)
     if begins.any():
-        state = _closed(state, begins[..., None, None])
+        # The last piece of each window with those before it: another begins.
+        past = either(begins, shown_in(state), state.past)
+        state = state._replace(past=past, product=either(begins, 0.0, state.product))
     windows = with_reading(
         state, np.where(begins[..., None], 0.0, state.weight), alone, weight, between
     )
@@ -450,12 +439,6 @@ def _moved_on(usual: Reference, state: AlarmState, reading: Reading) -> AlarmSta
         raised=state.raised + between,
         **windows,
     )
-
-
-def _closed(state: AlarmState, begins: np.ndarray) -> AlarmState:
-    """The last piece of each window with those before it, where another begins."""
-    past = np.where(begins, shown_in(state), state.past)
-    return state._replace(past=past, product=np.where(begins, 0.0, state.product))
 
 
 def _alone(

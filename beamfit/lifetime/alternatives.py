@@ -376,10 +376,10 @@ def rival_of(plain: Expansion) -> Rival | None:
     likely = _likely(plain)
     if not likely:
         return None
-    smooth = _smooth(plain)
-    laws = [(one, _with_further(plain, further)) for one, further in likely.items()]
+    laws = [(one, _with_further(plain, one.kind, one.count)) for one in likely]
     found = [(_log_evidence(law, one), one, law) for one, law in laws if law is not None]
     log, one, best = max(found, key=lambda each: each[0], default=(-math.inf, CONSTANT, plain))
+    smooth = _smooth(plain)
     if not log > smooth:
         return None
     told = {"relaxing": _outgassing, "sudden": _sudden_loss}
@@ -397,21 +397,21 @@ def _averaged(pieces: Pieces) -> Pieces:
     return Pieces.of(DecayRecord(*means, monitor=pieces.monitor))
 
 
-def _likely(plain: Expansion) -> dict[Alternative, _Further]:
-    """Further losses of the alternatives that are not much less likely than constant a and b: by
-    their evidence in linear approximation about the law without, at their best times.
+def _likely(plain: Expansion) -> list[Alternative]:
+    """Alternatives that are not much less likely than constant a and b: by their evidence in linear
+    approximation about the law without, at their best times.
     """
     gauged = plain.pieces.gauge is not None
     others = [one for one in OTHERS if not (gauged and one.kind in UNGAUGED)]
-    best = {one: _at_best(plain, one.count, one.kind) for one in others}
     columns = [plain.residuals, *plain.rows[:, [LEVEL, *PLAIN]].T]
     places, widths = {CONSTANT: range(0)}, {CONSTANT: np.zeros(0)}
-    for one, more in best.items():
-        own = list(further_columns(plain, more.kind, more.times).T)
-        size, time = _widths(more.kind, more.sizes, more.times, plain.numbers[0])
-        if more.kind != "sudden":
-            ends = (further_columns(plain, more.kind, more.times + d) for d in (MOVED, -MOVED))
-            own += list(more.sizes[:, None] * np.subtract(*ends).T / (2 * MOVED))
+    for one in others:
+        sizes, times = _at_best(plain, one.kind, one.count)
+        own = list(further_columns(plain, one.kind, times).T)
+        size, time = _widths(one.kind, sizes, times, plain.numbers[0])
+        if one.kind != "sudden":
+            ends = (further_columns(plain, one.kind, times + d) for d in (MOVED, -MOVED))
+            own += list(sizes[:, None] * np.subtract(*ends).T / (2 * MOVED))
             size = np.append(size, time)
         places[one], widths[one] = range(len(columns), len(columns) + len(own)), size
         columns += own
@@ -423,7 +423,7 @@ def _likely(plain: Expansion) -> dict[Alternative, _Further]:
         return _laplace(some, width, np.zeros(width.size)) + _log_chance(one, plain)
 
     constant = log_evidence(CONSTANT) + HOPELESS
-    return {one: more for one, more in best.items() if log_evidence(one) > constant}
+    return [one for one in others if log_evidence(one) > constant]
 
 
 def _log_chance(one: Alternative, law: Expansion) -> float:
@@ -455,14 +455,6 @@ def _smooth(plain: Expansion) -> float:
     return float(logsumexp([_log_evidence(law, one) for law, one in each if law.rested]))
 
 
-class _Further(NamedTuple):
-    """Further losses of a kind: their times and sizes."""
-
-    kind: str
-    times: np.ndarray
-    sizes: np.ndarray
-
-
 def _looked_at(pieces: Pieces, kind: str) -> np.ndarray:
     """Times that are looked at first, over the span: current is lost between any two readings."""
     if kind != "sudden":
@@ -472,9 +464,9 @@ def _looked_at(pieces: Pieces, kind: str) -> np.ndarray:
     return between[few.astype(int)]
 
 
-def _at_best(about: Expansion, count: int, kind: str) -> _Further:
-    """Further losses that explain most, in place of those of a law and in linear approximation
-    about it.
+def _at_best(about: Expansion, kind: str, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Sizes and times of further losses that explain most, in place of those of a law and in linear
+    approximation about it.
     """
     basis = np.linalg.qr(about.left[:, [LEVEL, *PLAIN]])[0]
 
@@ -496,34 +488,30 @@ def _at_best(about: Expansion, count: int, kind: str) -> _Further:
         times, steps = every[place[best]], [window[1] - window[0] for window in windows]
         windows = [np.linspace(max(t - d, grid[0]), min(t + d, grid[-1]), GRID.size)
                    for t, d in zip(times, steps, strict=True)]  # fmt: skip
-    return _Further(kind, times, -sizes[best] / size[place[best]])
+    return -sizes[best] / size[place[best]], times
 
 
-def _with_further(plain: Expansion, more: _Further) -> Expansion | None:
+def _with_further(plain: Expansion, kind: str, count: int) -> Expansion | None:
     """The law with changes of the loss rate, or sudden losses, or with gas that relaxes, whose
     time is found. Those of the others are looked for again about the law with them, while it is
     better: a large change bends the decay otherwise than a small one.
     """
-    gas, law, found = more.kind == "relaxing", plain, None
+    gas, law, found = kind == "relaxing", plain, None
     for _ in range(AGAIN):
-        further = np.column_stack([more.sizes, more.times])[np.argsort(more.times)].ravel()
+        further = np.column_stack(_at_best(law, kind, count))
+        further = further[np.argsort(further[:, 1])].ravel()
         free = (*PLAIN, *range(FURTHER, FURTHER + further.size, 1 if gas else 2))
-        law = solved(
-            plain.pieces,
-            free,
-            more.kind,
-            start=np.append(law.numbers[: plain.numbers.size], further),
-        )
+        start = np.append(law.numbers[: plain.numbers.size], further)
+        law = solved(plain.pieces, free, kind, start=start)
         if found is not None and not _squares(law) < (1 - NEARER) * _squares(found):
             break
         found = law
         if gas or not law.rested:
             break
-        more = _at_best(law, more.times.size, more.kind)
     shortest = float(np.median(np.diff(plain.pieces.time))) / plain.pieces.units[0]
     if gas:
         known = found.numbers[3] > 0 and shortest < found.numbers[4] < TIMES[1]
-    elif more.kind == "sudden":
+    elif kind == "sudden":
         known = np.all(np.diff(found.numbers[4::2]) > shortest)
     else:
         known = np.all(np.diff([0.0, *found.numbers[4::2], 1.0]) > STEP * shortest)
@@ -568,21 +556,18 @@ def _given(law: Expansion, one: Alternative) -> tuple[list[int], np.ndarray, np.
     are from the middle of these.
     """
     loss, quadratic, power, *further = law.numbers
-    extra: dict[int, float] = {}
+    extra: dict[int, tuple[float, float]] = {}
     if one.power:
-        extra[POWER] = BELOW if power < 0 else ABOVE
+        extra[POWER] = (BELOW if power < 0 else ABOVE), power
     if one.kind == "drift":
-        extra[FURTHER] = DRIFT * max(abs(loss - quadratic), 1e-300)
-    flat: dict[int, float] = {}
+        extra[FURTHER] = DRIFT * max(abs(loss - quadratic), 1e-300), further[0]
     if one.count:
         sizes, times = _widths(one.kind, np.array(further[::2]), np.array(further[1::2]), loss)
-        flat = {FURTHER + 2 * k: size for k, size in enumerate(sizes)}
+        extra |= {FURTHER + 2 * k: (size, 0.0) for k, size in enumerate(sizes)}
         if one.kind != "sudden":
-            flat |= {WHEN + 2 * k: time for k, time in enumerate(times)}
-    extra |= flat
-    known = [0.0 if column in flat else law.numbers[column - 1] for column in extra]
-    width = np.array([np.inf] * 3 + list(extra.values()))
-    return [LEVEL, *PLAIN, *extra], width, np.array([0.0] * 3 + known)
+            extra |= {WHEN + 2 * k: (time, 0.0) for k, time in enumerate(times)}
+    width, centre = np.array([(np.inf, 0.0)] * 3 + list(extra.values())).T
+    return [LEVEL, *PLAIN, *extra], width, centre
 
 
 def _laplace(products: Products, width: np.ndarray, centre: np.ndarray) -> float:

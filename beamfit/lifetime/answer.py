@@ -279,7 +279,7 @@ def _freely(e: Evidence) -> Finding | None:
     if e.free is None:
         return None
     told = "; ".join(filter(None, (_clear(e), *(_extent(e, name) for name in "ab"))))
-    if e.pumped:
+    if e.beside == "pumped":
         likely = f"Gas that is pumped away after a fill is likely ({percent(e.free.pumped)})"
         gas = e.outgassing if e.by_gas else None
         # A lifetime afterwards that is not determined, or a below zero, is no explanation.
@@ -295,15 +295,18 @@ def _freely(e: Evidence) -> Finding | None:
     return Finding(Status.converged, f"{told}, {open_}. {_if_constant(e)}")
 
 
+DISTURBED = {
+    "settles": "A monitor that settles after a fill is likely",
+    "wanders": "The loss rate or the monitor wanders within the record",
+}
+
+
 def _disturbed(e: Evidence) -> str:
     """Name what goes by itself beside the law, if that is likelier than not."""
-    if e.free is not None and e.free.is_settling:
-        likely, chance = "A monitor that settles after a fill is likely", e.free.settles
-    elif e.free is not None and e.free.is_wandering:
-        likely, chance = "The loss rate or the monitor wanders within the record", e.free.wanders
-    else:
+    if e.beside not in DISTURBED:
         return ""
-    return f"{likely} ({percent(chance)}), which the errors contain"
+    chance = percent(getattr(e.free, e.beside))
+    return f"{DISTURBED[e.beside]} ({chance}), which the errors contain"
 
 
 def _departs(e: Evidence) -> str:
@@ -452,8 +455,9 @@ def finding_of_cycles(
     evidence: Evidence, monitor: Monitor | None, left_out: Sequence[str]
 ) -> Finding:
     """Status and sentences on many cycles fitted together; `left_out` is what was not fitted."""
-    found, (low, high) = judge(evidence, CYCLE_RULES), evidence.currents
-    first = f"One answer from {evidence.cycles} cycles between {low:.4g} and {high:.4g} mA"
+    found, current = judge(evidence, CYCLE_RULES), evidence.about.pieces.current
+    between = f"between {current.min():.4g} and {current.max():.4g} mA"
+    first = f"One answer from {evidence.cycles} cycles {between}"
     remarks = [remark(evidence) for remark in (_course, _noise_inferred, _correlated, _odd_clock)]
     remarks += [] if monitor is None else [_stated(monitor)]
     remarks += [text[0].upper() + text[1:] for text in left_out]

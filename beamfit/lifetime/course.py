@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from beamfit.answer import Table, answer, cell, json_of
-from beamfit.errors import InputError
+from beamfit.errors import Finding, InputError, Judged
 from beamfit.lifetime.alarm import WANDER, Alarm, Reference, alarms_of, when
 from beamfit.lifetime.alternatives import constant_a
 from beamfit.lifetime.fit import DecayFit, bare
@@ -70,16 +71,11 @@ class CoursePoint(NamedTuple):
 
 @answer
 @dataclass(frozen=True, eq=False)
-class Trend:
+class Trend(Judged):
     """Many decays in order of time.
 
     Parameters
     ----------
-    status : Status
-        `converged` if all is usual, `poor_fit` if an alarm was raised or a lifetime lies beyond the
-        limits, `unidentified` if there are too few lifetimes to say what is usual.
-    message : str
-        The verdict in a sentence.
     points : tuple of CoursePoint
         The decays whose lifetime is determined.
     current : float
@@ -98,8 +94,6 @@ class Trend:
         Whether times are Unix times.
     """
 
-    status: Status
-    message: str
     points: tuple[CoursePoint, ...]
     current: float
     scaled: bool
@@ -109,6 +103,29 @@ class Trend:
     reference: Reference | None
     alarms: tuple[Alarm, ...]
     dated: bool
+
+    @cached_property
+    def finding(self) -> Finding:
+        """`converged` if all is usual, `poor_fit` if an alarm was raised or a lifetime lies
+        beyond the limits, `unidentified` if there are too few lifetimes to say what is usual.
+        """
+        count, centre = len(self.points), self.centre
+        many = f"{count} lifetime" + "s" * (count > 1)
+        usual = f"{many}; current times lifetime is usually {centre:.4g} mA h"
+        if not math.isfinite(self.limit):
+            more = f"{FEWEST + 1} or more decays are needed to say what is usual."
+            return Finding(Status.unidentified, f"{usual}; {more}")
+        beyond = sum(point.beyond != 0 for point in self.points)
+        said = f"{usual} ± {percent(self.limit / centre)}, {beyond} beyond that."
+        drift = self.drift
+        if drift.error is not None and _is_sure(abs(drift.value) / drift.error, count - 2):
+            said += f" It changes by {relative_change(drift)} a week."
+        if self.reference is None:
+            said += " Readings are not watched: the first decays tell no usual a and b above zero."
+        if self.alarms:
+            first = "Alarm" if len(self.alarms) == 1 else f"{len(self.alarms)} alarms, the first"
+            said += f" {first}: {self.alarms[0].said(self.dated)}."
+        return Finding(Status.poor_fit if beyond or self.alarms else Status.converged, said)
 
     @property
     def headline(self) -> str:
@@ -229,9 +246,8 @@ def trend_of(studies: Sequence[RecordStudy], machine: Machine | None = None) -> 
     )
     drift = _drift(np.array(times), values, centre)
     alarms = () if usual is None else _alarms(studies, usual, times[first:], a[first:], b[first:])
-    found = (points, current, machine is not None, centre, limit, drift, usual, alarms, dated)
-    trend = Trend(Status.converged, "", *found)
-    return replace(trend, **dict(zip(("status", "message"), _verdict(trend), strict=True)))
+    scaled = machine is not None
+    return Trend(points, current, scaled, centre, limit, drift, usual, alarms, dated)
 
 
 def normalised(decay: Decay, ring: Losses | None, current: float) -> Quantity:
@@ -253,7 +269,7 @@ def _point(
     relative: list[Quantity | None] = [None, None]
     law = fit.free_law
     same = usual is not None and not usual.power and fit.status is not Status.poor_fit
-    if same and not (law is not None and law.goes_in_time):
+    if same and (law is None or law.beside is None):
         relative = [
             None if q.error is None else Quantity(q.value / by, q.error / by, "1")
             for q, by in ((fit.if_constant("a"), usual.a * a), (fit.if_constant("b"), usual.b * b))
@@ -379,26 +395,6 @@ def _alarms(
     rows = rows[:: math.ceil(len(rows) / MOST)]
     place = np.searchsorted(times, rows[:, 0], side="right") - 1
     return alarms_of(usual, *rows.T, a[place], b[place])
-
-
-def _verdict(trend: Trend) -> tuple[Status, str]:
-    count, centre = len(trend.points), trend.centre
-    many = f"{count} lifetime" + "s" * (count > 1)
-    usual = f"{many}; current times lifetime is usually {centre:.4g} mA h"
-    if not math.isfinite(trend.limit):
-        more = f"{FEWEST + 1} or more decays are needed to say what is usual."
-        return Status.unidentified, f"{usual}; {more}"
-    beyond = sum(point.beyond != 0 for point in trend.points)
-    said = f"{usual} ± {percent(trend.limit / centre)}, {beyond} beyond that."
-    drift = trend.drift
-    if drift.error is not None and _is_sure(abs(drift.value) / drift.error, count - 2):
-        said += f" It changes by {relative_change(drift)} a week."
-    if trend.reference is None:
-        said += " Readings are not watched: the first decays tell no usual a and b above zero."
-    if trend.alarms:
-        first = "Alarm" if len(trend.alarms) == 1 else f"{len(trend.alarms)} alarms, the first"
-        said += f" {first}: {trend.alarms[0].said(trend.dated)}."
-    return (Status.poor_fit if beyond or trend.alarms else Status.converged), said
 
 
 def _is_sure(errors: float, dof: int) -> bool:

@@ -151,11 +151,6 @@ class Evidence:
         return self.about.level.size
 
     @property
-    def currents(self) -> tuple[float, float]:
-        """Lowest and highest, mA."""
-        return float(self.about.pieces.current.min()), float(self.about.pieces.current.max())
-
-    @property
     def time(self) -> np.ndarray:
         """Times of the readings, s."""
         return self.about.pieces.time
@@ -203,13 +198,17 @@ class Evidence:
         floor = np.sum((EXACT * self.about.pieces.current / self.about.pieces.over) ** 2)
         return memory._replace(squares=np.maximum(memory.squares, floor))
 
-    def _moments(self, memory: Memory, columns: list[int]) -> AveragedMoments:
-        return memory.moments(self.about.slopes[:, columns], self.about.given)
+    @cached_property
+    def exponent(self) -> AveragedMoments:
+        """The power of the current as which a goes, beside the other numbers."""
+        place = np.eye(self.about.rows.shape[1])[[POWER]][:, self.about.columns(POWER)]
+        return self.power.moments(place, self.about.given)
 
     @cached_property
     def moments(self) -> AveragedMoments:
         """Shifts of the values by the noise, their errors and the reach of 95 %."""
-        found = self._moments(self.memory, self.about.columns())
+        slopes = self.about.slopes[:, self.about.columns()]
+        found = self.memory.moments(slopes, self.about.given)
         if not self.independent:
             return found
         # The weak prior stays where the noise is that of the search.
@@ -266,9 +265,7 @@ class Evidence:
         """Test of a constant a by an exponent beside the other numbers."""
         if self.cycles > 1 and not self.separability.separable:
             return constant_a(math.nan, math.inf, math.inf, math.nan)
-        place = np.eye(self.about.rows.shape[1])[[POWER]][:, self.about.columns(POWER)]
-        found = self.power.moments(place, self.about.given)
-        error = float(found.error[0])
+        found, error = self.exponent, float(self.exponent.error[0])
         test = constant_a(float(found.shift[0]), error, error, float(found.chance[0]))
         return test.widened(float(self.drifted[-1])) if self.monitor_changes else test
 
@@ -515,9 +512,9 @@ class Evidence:
         return found if isinstance(found, Outgassing) else None
 
     @property
-    def pumped(self) -> bool:
-        """True if what is quoted is gas that is pumped away."""
-        return self.free is not None and self.free.is_pumped
+    def beside(self) -> str | None:
+        """Name of what is likely to go by itself beside the law, as of `FreeLaw`."""
+        return self.free and self.free.beside
 
     @cached_property
     def bending(self) -> Physical | None:
@@ -529,9 +526,7 @@ class Evidence:
         """
         if self.law is Law.constant or self.cycles == 1 or not self.separability.separable:
             return None
-        columns = self.about.columns(POWER)
-        place = np.eye(self.about.rows.shape[1])[[POWER]][:, columns]
-        seen = self.power.moments(place, self.about.given).error[0]
+        columns, seen = self.about.columns(POWER), self.exponent.error[0]
         size = 1 / math.hypot(1 / BELOW, 1 / seen)
         rows, plain = self.about.left[:, columns], self.about.columns()
         step = np.linalg.lstsq(rows[:, : len(plain)], -size * rows[:, -1], rcond=None)[0]
@@ -598,10 +593,10 @@ class Evidence:
     def stated_odds(self) -> float:
         """Log odds that the stated errors are right, whatever memory the noise has."""
         columns = np.column_stack([self.about.residuals, self.about.rows[:, : POWER + 1]])
-        if self.pumped:
+        if self.beside == "pumped":
             gas = further_columns(self.about, "relaxing", 1 / np.array(PACES))
             columns = np.column_stack([columns, gas])
-        if self.free is not None and self.free.is_settling:
+        if self.beside == "settles":
             model = self.record.current / self.about.pieces.over + self.about.residuals
             settles = np.hstack([*settling()[::DOUBLING]])
             shapes = from_nodes(self.record.time / self.record.span) @ settles
@@ -640,16 +635,11 @@ class Evidence:
             known = self.separability.separable and not (refuted and self.course)
         else:
             plain = not self.shaped and self.about.pieces.gauge is None
-            own = self.free is not None and self.free.goes_in_time
-            known = plain and refuted and self.outgassing is None and not own
+            known = plain and refuted and self.outgassing is None and self.beside is None
         return lifetime_law(self.about, self.independent, refuted) if known else None
-
-    @cached_property
-    def by_drift(self) -> Physical:
-        """Shifts of the values by a straight drift of the monitor of 1 mA over the record."""
-        return self.about.moved(self.time / self.time[-1] / self.about.pieces.over)
 
     def drift_of_one_error(self, name: str) -> float:
         """Straight drift of the monitor over the record, mA, that moves a value by its error."""
-        moved = abs(float(getattr(self.by_drift, name)))
+        by_one = self.about.moved(self.time / self.time[-1] / self.about.pieces.over)
+        moved = abs(float(getattr(by_one, name)))
         return float(getattr(self.errors, name)) / moved if moved > 0 else math.inf

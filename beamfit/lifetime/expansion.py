@@ -43,8 +43,6 @@ POWERS, TIMES = (-0.95, 3.0), (1e-3, 10.0)
 SLOW, FEWEST = 3.0, 12
 # A loss rate less than three errors from zero leaves the lifetime without an upper limit.
 DETERMINED = 1 / 3
-# Noises of so small a part of the largest probability move no digit.
-NO_WEIGHT = 1e-12
 # Readings at the edges of cycles may lie within refills, or beside them: standard deviations of
 # what these have in common, over the noise, and their prior probabilities.
 SHIFTS = ((0.01, 0.5), *((width, 0.1) for width in (0.1, 0.3, 1.0, 3.0, 10.0)))
@@ -404,14 +402,12 @@ class Expansion:
         """Posterior over noises, given the slopes by some columns and the residuals.
 
         Independent noise has the prior beside the residuals, for one too short a record; whatever
-        memory the noise may have otherwise. Noises of no weight are left out.
+        memory the noise may have otherwise.
         """
         if not independent:
             least = list(columns) in (self.columns(), self.columns(POWER))
             found = self._with_power if least else self._whitened(columns)
-            found = found.memory(self.shifted.shape[1] + len(columns)).of_last(len(columns))
-            kept = found.weight > NO_WEIGHT * found.weight.max()
-            return Memory(*(part[kept] for part in found[:-1]), found.dof)
+            return found.memory(self.shifted.shape[1] + len(columns)).of_last(len(columns))
         known = np.append(np.equal(columns, QUADRATIC), self.numbers[QUADRATIC - 1])
         rows = np.vstack([self.triangle[:, [*columns, -1]], self.prior * known])
         count = self.residuals.size - (0 if self.levels is None else self.level.size)

@@ -16,7 +16,7 @@ from beamfit.lifetime.answer import finding_of, finding_of_cycles
 from beamfit.lifetime.cycles import FEWEST_CYCLES, FEWEST_READINGS, averaged, cleaned, usual_cycle
 from beamfit.lifetime.decay_law import current
 from beamfit.lifetime.evidence import BELIEVED, UNITS, Evidence, RatePart, Separability
-from beamfit.lifetime.expansion import Expansion, Pieces, Shape, solved
+from beamfit.lifetime.expansion import Expansion, Pieces, solved
 from beamfit.lifetime.free_law import FreeLaw, Law
 from beamfit.lifetime.readings import with_common_errors
 from beamfit.lifetime.record import DecayRecord, Monitor
@@ -36,9 +36,34 @@ def bare(value: float | None, unit: str) -> dict[str, Any]:
     return {"value": value, "error": None, "unit": unit}
 
 
+class LossFit:
+    """A fitted loss: the forms that the fits of a decay and of a table of lifetimes have alike."""
+
+    @property
+    def quantities(self) -> dict[str, Quantity]:
+        """Quoted quantities, by name."""
+        return {name: getattr(self, name) for name in UNITS if hasattr(self, name)}
+
+    @property
+    def headline(self) -> str:
+        """The record, its status and its lifetime in a line."""
+        return f"{self.record} {cell(self.status)}: mean lifetime {self.lifetime_mean}"
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the result as one JSON object, as `beamfit lifetime --json` prints it."""
+        first, last = ("record", "status", "message"), ("chi2", "dof", "noise_inferred")
+        last = (*last, "identifiability", "constant_a")
+        found = {name: getattr(self, name) for name in (*first, *self.quantities, *last)}
+        more = {
+            "mean_current": bare(self.mean_current, "mA"),
+            "lifetime_by_current": self.lifetimes,
+        }
+        return json_of(found | more)
+
+
 @answer
 @dataclass(frozen=True, eq=False)
-class DecayFit:
+class DecayFit(LossFit):
     """The result of `fit_decay`.
 
     Parameters
@@ -70,6 +95,8 @@ class DecayFit:
         Model minus reading, mA.
     identifiability : Separability
         Whether the record tells a from b.
+    readings : DecayRecord
+        What was fitted.
     constant_a : ConstantA or None
         Whether the record contradicts a constant a; None where nothing decays.
     correlation_time : float or None
@@ -81,8 +108,6 @@ class DecayFit:
     alternative : Change, Outgassing, SuddenLoss or None
         A change of the loss rate, a gas loss that relaxes, or current lost at once, where that
         explains a refuted law; also as `change`, `outgassing` or `loss`.
-    readings : DecayRecord, optional
-        What was fitted.
     shaped : bool
         Whether a was given a dependence on the current.
     first : array of int, optional
@@ -118,12 +143,12 @@ class DecayFit:
     noise_inferred: bool
     residuals: np.ndarray
     identifiability: Separability
+    readings: DecayRecord
     constant_a: ConstantA | None = None
     correlation_time: float | None = None
     inflation: float = 1.0
     lifetimes: LifetimeLaw | None = None
     alternative: Change | Outgassing | SuddenLoss | None = None
-    readings: DecayRecord | None = None
     shaped: bool = False
     first: np.ndarray | None = None
     exact: Mapping[str, Quantity] = field(default_factory=dict)
@@ -210,19 +235,9 @@ class DecayFit:
         return about if not power else solved(about.pieces, start=[*about.numbers[:2], power])
 
     @property
-    def quantities(self) -> dict[str, Quantity]:
-        """Quoted quantities, by name."""
-        return {name: getattr(self, name) for name in UNITS}
-
-    @property
     def noise(self) -> float:
         """Standard deviation of a reading that the residuals show, mA."""
         return self.rms_residual * math.sqrt(self.residuals.size / self.dof)
-
-    @property
-    def headline(self) -> str:
-        """The record, its status and its lifetime in a line."""
-        return f"{self.record} {cell(self.status)}: mean lifetime {self.lifetime_mean}"
 
     def tables(self) -> tuple[Table, ...]:
         """The numbers, to be shown."""
@@ -251,21 +266,10 @@ class DecayFit:
         return quantity_frame(rows, ("record", "quantity"))
 
     def to_json(self) -> dict[str, Any]:
-        """Return the result as one JSON object, as `beamfit lifetime --json` prints it."""
-        found = {
-            "record": self.record,
-            "status": self.status,
-            "message": self.message,
-            **self.quantities,
-            "mean_current": bare(self.mean_current, "mA"),
-            "chi2": self.chi2,
-            "dof": self.dof,
+        """Return the same of a decay, with its noise and what else explains it."""
+        found = super().to_json() | {
             "rms_residual": bare(self.rms_residual, "mA"),
-            "noise_inferred": self.noise_inferred,
-            "identifiability": self.identifiability,
-            "constant_a": self.constant_a,
             "correlation_time": bare(self.correlation_time, "s"),
-            "lifetime_by_current": self.lifetimes,
             "change": self.change,
         }
         if self.free_law is not None:
@@ -330,12 +334,31 @@ def fit_decay(
     """
     expect(record, DecayRecord, "beamfit.read_decay_record(path)")
     record = record if monitor is None else replace(record, monitor=monitor)
-    if _says_nothing(record):
+    if len(record) < FEWEST:
+        expected = f"{FEWEST} or more for a decay"
+        raise InputError(f"{len(record)} readings", expected, path=record.name)
+    if np.ptp(record.current) == 0:
         return _constant(record, f"All {len(record)} readings are {record.current[0]:.6g} mA")
     about = solved(Pieces.of(record), shape=shape)
     even = with_common_errors(record, about.residuals * about.pieces.over)
     about = about if even is record else solved(Pieces.of(even), shape=shape)
-    return _judged(even, about, shape, Law(law))
+    evidence = Evidence(about, Law(law), shape is not None, even)
+    rate, error = evidence.sure("rate_mean")
+    if rate < -BELIEVED * error:
+        first, last = record.current[0], record.current[-1]
+        expected = "a decay; cut out refills with split_record"
+        found = f"a current that rises, {first:.6g} to {last:.6g} mA"
+        raise InputError(found, expected, path=record.name, column="current")
+    finding = finding_of(evidence)
+    return DecayFit(
+        record=record.name,
+        status=finding.status,
+        message=finding.message,
+        **evidence.quoted(about.rested),
+        mean_current=record.mean_current,
+        rms_residual=evidence.rms,
+        readings=even,
+    )
 
 
 def fit_decays(records: Sequence[DecayRecord], law: Law | str = Law.free) -> tuple[DecayFit, ...]:
@@ -369,14 +392,6 @@ def fit_decays(records: Sequence[DecayRecord], law: Law | str = Law.free) -> tup
     return tuple(fit_decay(record, law=law) for record in records)
 
 
-def _says_nothing(record: DecayRecord) -> bool:
-    """True if all readings are equal; a record too short for any fit is an error."""
-    if len(record) < FEWEST:
-        expected = f"{FEWEST} or more for a decay"
-        raise InputError(f"{len(record)} readings", expected, path=record.name)
-    return bool(np.ptp(record.current) == 0)
-
-
 def _constant(record: DecayRecord, found: str) -> DecayFit:
     """The result for readings that are all equal: no decay is seen, and no noise either."""
     level = record.mean_current
@@ -398,29 +413,6 @@ def _constant(record: DecayRecord, found: str) -> DecayFit:
         noise_inferred=record.error is None,
         residuals=np.zeros(len(record)),
         identifiability=Separability(False, None, None, None, None, 1.0),
-        readings=record,
-    )
-
-
-def _judged(
-    record: DecayRecord, about: Expansion, shape: Shape | None = None, law: Law = Law.constant
-) -> DecayFit:
-    """Turn a solution into quantities, a status and its sentence."""
-    evidence = Evidence(about, law, shape is not None, record)
-    rate, error = evidence.sure("rate_mean")
-    if rate < -BELIEVED * error:
-        first, last = record.current[0], record.current[-1]
-        expected = "a decay; cut out refills with split_record"
-        found = f"a current that rises, {first:.6g} to {last:.6g} mA"
-        raise InputError(found, expected, path=record.name, column="current")
-    finding = finding_of(evidence)
-    return DecayFit(
-        record=record.name,
-        status=finding.status,
-        message=finding.message,
-        **evidence.quoted(about.rested),
-        mean_current=record.mean_current,
-        rms_residual=evidence.rms,
         readings=record,
     )
 

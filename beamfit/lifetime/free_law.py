@@ -28,7 +28,7 @@ from scipy.special import expit, log_expit, log_ndtr, logsumexp, ndtri
 
 from beamfit.arrays import array_module
 from beamfit.lifetime.decay_law import closed_form
-from beamfit.lifetime.expansion import Physical
+from beamfit.lifetime.expansion import Physical, Pieces
 from beamfit.lifetime.record import DecayRecord
 from beamfit.noise.memory import Products
 from beamfit.quantity import HOUR, Quantity
@@ -310,6 +310,9 @@ FAR = 9.0
 
 # A law is taken for the record's where it is likelier than not.
 LIKELIER = 0.5
+# What goes by itself beside a and b: gas that is pumped away, a loss rate or a monitor that
+# wanders, a monitor that settles after a fill.
+BESIDES = ("pumped", "wanders", "settles")
 
 ENDS = ("start", "end", "mean")
 UNITS = {
@@ -372,15 +375,13 @@ class SeenDecay:
         rate = max(float(values.rate_mean) * span, 1e-9)
         share = float(np.clip(values.share, -0.2, 1.2))
         start = np.array([[np.log(values.i0 / mean), np.log(rate), share, 0.0, 0.0, 0.0]]).T
-        gas, bumps, ends = NODE, 0.0, (1.0, 1.0)
+        gas, ends = NODE, tuple(Pieces.of(record).pressure.tolist())
         time, current, error = record.time, record.current, record.error
         if record.gauge is not None:
             s = record.time / span
             smooth = np.linalg.lstsq(chebvander(2 * s - 1, 9), record.gauge / span, rcond=None)[0]
             gas = chebvander(ANGLE, 9) @ smooth
             bumps = record.gauge / span - chebvander(2 * s - 1, 9) @ smooth
-            slope = np.diff(record.gauge) / np.diff(record.time)
-            ends = float(slope[0]), float(slope[-1])
             current = current * np.exp((1 - share) * rate * bumps)
         if len(record) > ENOUGH:
             size = -(-len(record) // ENOUGH)
@@ -704,25 +705,23 @@ class DrawnLaw(NamedTuple):
         return cls(seen, found, tuple(free), slopes, _triangle(seen.products.between(slopes)))
 
     @property
-    def is_pumped(self) -> bool:
-        """True if the gas is pumped away after a fill."""
-        return PACE in self.free
-
-    @property
-    def settles(self) -> bool:
-        """True if the monitor settles after a fill."""
-        return self.disturbance is MONITOR_SETTLES
-
-    @property
     def disturbance(self) -> Disturbance | None:
         """The disturbance beside the law, if there is any."""
         return self.seen.disturbed and self.seen.disturbed.kind
+
+    @property
+    def beside(self) -> str | None:
+        """Name, of `BESIDES`, of what goes beside a and b."""
+        if PACE in self.free:
+            return "pumped"
+        kind = self.disturbance
+        return kind and ("settles" if kind is MONITOR_SETTLES else "wanders")
 
     def _log_prior(self, numbers: Numbers) -> np.ndarray:
         free, (low, high) = self.free, self.seen.share
         inside = (numbers.share >= low) & (numbers.share <= high)
         log = np.where(inside, -math.log(high - low), -np.inf)
-        if self.is_pumped:
+        if PACE in self.free:
             return log + log_pumped(numbers.share, numbers.gas, numbers.pace)
         log = log + log_prior(numbers.power)[0] if POWER in free else log
         return log + log_straight(numbers.drift) if CHANGE in free else log
@@ -751,7 +750,7 @@ class DrawnLaw(NamedTuple):
         rows, numbers, own = _rows(free)[0], peaks.numbers[:, at], np.zeros_like(centre)
         log, far = np.zeros(kind.size), np.full(kind.size, np.inf)
         if CHANGE in free:
-            most = -centre[-1] * lower[-1, -1] if self.is_pumped else far  # gas gets less
+            most = -centre[-1] * lower[-1, -1] if PACE in free else far  # gas gets less
             own[-1], log = _between(even[-1], -far, most)
             log = log + np.log(lower[-1, -1])
         numbers[rows] = centre + _backward(lower, own)
@@ -760,7 +759,7 @@ class DrawnLaw(NamedTuple):
         own[2], more = _between(even[0], np.minimum(*bounds), np.maximum(*bounds))
         share = middle.share + middle.unit * own[2] / lower[2, 2]
         numbers[rows] = centre + _backward(lower, own)
-        gas = middle.gas if self.is_pumped else (1 - share) * numbers[CHANGE]
+        gas = middle.gas if PACE in free else (1 - share) * numbers[CHANGE]
         found = Numbers.of(numbers)._replace(share=share, gas=gas)
         return found, log + more + np.log(lower[2, 2] / np.abs(middle.unit))
 
@@ -936,24 +935,10 @@ class FreeLaw:
         return self.odd > LIKELIER
 
     @property
-    def is_pumped(self) -> bool:
-        """True if what is quoted is gas that is pumped away."""
-        return self.likelier and self.pumped > LIKELIER
-
-    @property
-    def is_settling(self) -> bool:
-        """True if what is quoted is beside a monitor that settles."""
-        return self.likelier and self.settles > LIKELIER
-
-    @property
-    def is_wandering(self) -> bool:
-        """True if what is quoted is beside a loss rate or a monitor that wanders."""
-        return self.likelier and self.wanders > LIKELIER
-
-    @property
-    def goes_in_time(self) -> bool:
-        """True if gas or a disturbance stands beside the a and b that are quoted."""
-        return self.is_pumped or self.is_settling or self.is_wandering
+    def beside(self) -> str | None:
+        """Name, of `BESIDES`, of what is likely to go beside the a and b that are quoted."""
+        likely = (name for name in BESIDES if getattr(self, name) > LIKELIER)
+        return next(likely, None) if self.likelier else None
 
     def curve(self, time: np.ndarray) -> np.ndarray:
         """Mean of the monitor's readings at times in s, mA."""
@@ -1028,11 +1013,10 @@ def free_law(record: DecayRecord, values: Physical) -> FreeLaw | None:
     if seen.drifts:
         drift = quantity_of(freed.numbers.drift, freed.weight, "1")
     constant = float(expit(plain.log - draws.log))
-    chances = [(law, math.exp(own.log - draws.log)) for law, own in laws]
-    pumped = sum((chance for law, chance in chances if law.is_pumped), 0.0)
-    settles = sum((chance for law, chance in chances if law.settles), 0.0)
-    other = None, MONITOR_SETTLES
-    wanders = sum((chance for law, chance in chances if law.disturbance not in other), 0.0)
+    chances = [(law.beside, math.exp(own.log - draws.log)) for law, own in laws]
+    pumped, wanders, settles = (
+        sum((chance for beside, chance in chances if beside == name), 0.0) for name in BESIDES
+    )
     nodes = record.mean_current * draws.shown @ draws.weight
     share = quantity_of(draws.numbers.share, draws.weight, "1")
     found = _quantities(record, seen, draws)

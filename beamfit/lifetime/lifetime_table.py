@@ -11,7 +11,7 @@ import numpy as np
 from jax import Array
 from scipy.special import chdtrc, fdtrc
 
-from beamfit.answer import Table, answer, cell, json_of, labelled, plain_name
+from beamfit.answer import Table, answer, json_of, labelled, plain_name
 from beamfit.arrays import padded_length
 from beamfit.errors import expect
 from beamfit.greybox.fit import Derived, Fit
@@ -20,7 +20,7 @@ from beamfit.greybox.solve import solve
 from beamfit.lifetime.alternatives import CURRENTS, ConstantA, LifetimeLaw, constant_a
 from beamfit.lifetime.answer import TableEvidence, finding_of_table
 from beamfit.lifetime.evidence import EXACT, UNITS
-from beamfit.lifetime.fit import bare
+from beamfit.lifetime.fit import LossFit, bare
 from beamfit.lifetime.record import FEWEST_LIFETIMES, LifetimeTable
 from beamfit.quantity import HOUR, Quantity, Status
 from beamfit.statistics import reach_of
@@ -35,7 +35,7 @@ RECORD = "lifetimes"
 
 @answer
 @dataclass(frozen=True, eq=False)
-class LifetimeFit:
+class LifetimeFit(LossFit):
     """The result of `fit_lifetimes`.
 
     Parameters
@@ -76,47 +76,29 @@ class LifetimeFit:
     readings: LifetimeTable
 
     @property
-    def quantities(self) -> dict[str, Quantity]:
-        """Quoted quantities, by name."""
-        return {name: getattr(self, name) for name in UNITS if hasattr(self, name)}
+    def noise_inferred(self) -> bool:
+        """True if the table came without errors."""
+        return self.readings.error is None
 
     @property
-    def headline(self) -> str:
-        """The table, its status and its lifetime in a line."""
-        return f"{self.record} {cell(self.status)}: mean lifetime {self.lifetime_mean}"
+    def identifiability(self) -> dict[str, Any]:
+        """Separability of a and b by the table, and the share of a in the loss."""
+        share, error = self.share.value, self.share.error
+        return {"separable": self.a.error is not None, "share": share, "share_error": error}
 
     def tables(self) -> tuple[Table, ...]:
         """Quoted quantities, to be shown."""
         rows = [(plain_name(name), [value]) for name, value in self.quantities.items()]
         rows.append(("share of a in the loss", [self.share]))
-        tested = self.readings.error is not None
-        chi2 = f"{self.chi2:.4g}/{self.dof}" if tested else f"not testable ({self.dof} dof)"
+        tested = f"{self.chi2:.4g}/{self.dof}"
+        chi2 = f"not testable ({self.dof} dof)" if self.noise_inferred else tested
         rows = [("status", [self.status]), *rows, ("chi2/dof", [chi2])]
         return (labelled("", [self.record], rows),)
 
     def to_json(self) -> dict[str, Any]:
-        """Return the result as `beamfit lifetime --json` prints it."""
-        told = {
-            "record": self.record,
-            "status": self.status,
-            "message": self.message,
-            **self.quantities,
-            "i0": bare(None, "mA"),
-            "mean_current": bare(self.mean_current, "mA"),
-            "chi2": self.chi2,
-            "dof": self.dof,
-            "noise_inferred": self.readings.error is None,
-            "identifiability": {
-                "separable": self.a.error is not None,
-                "share": self.share.value,
-                "share_error": self.share.error,
-            },
-            "constant_a": self.constant_a,
-            "lifetime_by_current": self.lifetimes,
-            "outliers": self.outliers,
-            "notes": self.readings.notes,
-        }
-        return json_of(told)
+        """Return the same of a table, with what was left out."""
+        more = {"i0": bare(None, "mA"), "outliers": self.outliers, "notes": self.readings.notes}
+        return super().to_json() | json_of(more)
 
 
 def _rate(model: dict[str, Array], x: Array) -> Array:

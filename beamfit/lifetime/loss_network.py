@@ -26,7 +26,7 @@ from beamfit.greybox.signed_network import GainCertificate, certificate_of, sign
 from beamfit.greybox.solve import solve
 from beamfit.lifetime.mechanisms import SCALES, scaled_losses, terms_along
 from beamfit.lifetime.ring import Operation
-from beamfit.lifetime.scales import ScaleFit, by_losses, loss_parts
+from beamfit.lifetime.scales import ScaleFit, loss_parts
 from beamfit.lifetime.study import Decay, settings_of
 from beamfit.quantity import HOUR, Quantity, percent
 
@@ -339,7 +339,7 @@ def fit_loss_network(
     outputs = [Port(name, "", scale=CORRECTION) for name in OUTPUTS]
     net, free = signed_network("map", ports, outputs, RISING, hidden, seed, MOST)
     terms, measured = corrected.decays.terms, corrected.decays.measured
-    weight, *_ = corrected.about(corrected.decays)
+    weight, _, _, change = corrected.about(corrected.decays)
     losses = np.array(scaled_losses(jnp.asarray(corrected.vector), terms), float)
     base, whole = jnp.log(losses.T), block_diag(*weight)
     seen = whole @ np.asarray(measured.parts).ravel()
@@ -356,9 +356,8 @@ def fit_loss_network(
         fit = solve(problem, starts=starts, seed=seed, iterations=300)
         return fit, seen - np.asarray(_predict(fit.model, (*data[:3], jnp.asarray(whole))))
 
-    rows = block_diag(*(weight @ by_losses(losses[0] * np.asarray(measured.current), losses[1])))
     middle = SIZES[len(SIZES) // 2]
-    trial = Discrepancy((middle, middle), inputs, LENGTH * half, rows)
+    trial = Discrepancy((middle, middle), inputs, LENGTH * half, block_diag(*change))
     wrong = sized(trial, *fitted(trial))
     fit, left = fitted(wrong)
     held = certificate_of(fit.problem, fit.model["map"])

@@ -306,15 +306,13 @@ def sampled(
     Raises
     ------
     InputError
-        If the fit has no readings or a shape of a, or as `draw`.
+        If the fit has a shape of a, or as `draw`.
 
     Notes
     -----
     The weighed draws of `beamfit.lifetime.free_law`, drawn again by their weight (importance
     resampling): no chain has to settle, and no step is left out.
     """
-    if fit.readings is None:
-        raise InputError("a fit without its readings", "the result of fit_decay or fit_decays")
     if fit.shaped:
         expected = "a fit of eq. 44 with constant a and b; sample fit_decay(record) without shape"
         raise InputError("a fit with a shape of a(I), which is not sampled", expected)

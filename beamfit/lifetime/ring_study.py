@@ -13,11 +13,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from scipy.linalg import block_diag, solve_triangular
+from scipy.linalg import block_diag
 from scipy.special import chdtrc, logsumexp
 
 from beamfit.answer import Row, Table, answer, cell, json_of, labelled
-from beamfit.errors import InputError
+from beamfit.errors import Finding, InputError, Judged
 from beamfit.greybox.design import Information, scores
 from beamfit.lifetime.decay_law import current as beam_at
 from beamfit.lifetime.expansion import DETERMINED, Expansion, lifetime_of
@@ -85,49 +85,31 @@ class Anomaly(NamedTuple):
     probability: float
 
 
-class Later(NamedTuple):
-    """Later decays beside one of the noises, whitened with the errors of scales and pressures.
-
-    Attributes
-    ----------
-    off : array, shape (2n,)
-        Readings minus model.
-    change : array, shape (2n, n, 2)
-        Slopes by relative changes of a and of b of each decay.
+def _linearised(fit: ScaleFit, decays: Sequence[Decay]) -> tuple[np.ndarray, np.ndarray]:
+    """Later decays beside each of the noises that earlier ones may have, whitened with the errors
+    of scales and pressures: readings minus model, (k, 2n), and their slopes by relative changes of
+    a and of b of each decay, (k, 2n, n, 2).
     """
-
-    off: np.ndarray
-    change: np.ndarray
-
-    def since(self, first: int) -> np.ndarray:
-        """Slopes by relative changes from a decay on, shape (2n, 2)."""
-        return self.change[:, first:].sum(axis=1)
-
-
-def _linearised(fit: ScaleFit, decays: Sequence[Decay]) -> list[Later]:
-    """Later decays beside each of the noises that earlier ones may have."""
     together = DecaySet.of(decays, fit.machine, fit.decays.pressure_error, fit.voltages)
-    weight, off, rows = fit.about(together)
-    count, noise, found = len(decays), fit.noise, []
-    whole = block_diag(*fit.changes(together, weight)).reshape(2 * count, count, 2)
+    _, off, rows, change = fit.about(together)
+    count, noise, found = 2 * len(decays), fit.noise, []
+    whole = block_diag(*change).reshape(count, -1, 2)
     for k in range(noise.weight.size):
-        by_scales = (rows @ noise.half[k]).reshape(2 * count, -1)
-        scattered = (whole * noise.scatter[k]).reshape(2 * count, -1)
+        by_scales = (rows @ noise.half[k]).reshape(count, -1)
+        scattered = (whole * noise.scatter[k]).reshape(count, -1)
         moved = (off + rows @ (noise.shift[k] - noise.centre)).ravel()
-        covariance = np.eye(2 * count) + by_scales @ by_scales.T + scattered @ scattered.T
-        root = np.linalg.cholesky(covariance)
-        both = np.column_stack([-moved, whole.reshape(2 * count, -1)])
-        white = solve_triangular(root, both, lower=True)
-        found.append(Later(white[:, 0], white[:, 1:].reshape(-1, count, 2)))
-    return found
+        whiten = np.asarray(widened(np.eye(count), np.hstack([by_scales, scattered])))
+        found.append((-whiten @ moved, np.tensordot(whiten, whole, 1)))
+    return tuple(map(np.array, zip(*found, strict=True)))
 
 
-def _fitted(off: np.ndarray, change: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
-    """Fall of chi², the changes that bring it, and their covariance."""
-    information = change.T @ change
-    covariance = np.linalg.pinv(information)
-    found = covariance @ (change.T @ off)
-    return float(found @ information @ found), found, covariance
+def _fitted(off: np.ndarray, change: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Fall of chi², the changes that bring it, and their covariance, by noise."""
+    turned = np.swapaxes(change, 1, 2)
+    covariance = np.linalg.pinv(turned @ change)
+    score = np.einsum("kij,kj->ki", turned, off)
+    found = np.einsum("kij,kj->ki", covariance, score)
+    return np.sum(found * score, axis=1), found, covariance
 
 
 def find_anomaly(fit: ScaleFit, decays: Sequence[Decay]) -> Anomaly:
@@ -161,13 +143,13 @@ def find_anomaly(fit: ScaleFit, decays: Sequence[Decay]) -> Anomaly:
     if not decays:
         raise InputError("no decay", "one or more to compare with the model")
     # A fall of chi² by two numbers has the probability exp(-fall/2), averaged over the noise.
-    later, weight = _linearised(fit, decays), fit.noise.weight
-    trials = [[_fitted(one.off, one.since(first)) for one in later] for first in range(len(decays))]
-    falls = np.array([[fall for fall, _, _ in trial] for trial in trials])
-    logs = logsumexp(np.log(weight) - falls / 2, axis=1)
+    (off, change), weight = _linearised(fit, decays), fit.noise.weight
+    since = [change[:, :, first:].sum(axis=2) for first in range(len(decays))]
+    trials = [_fitted(off, one) for one in since]
+    logs = [logsumexp(np.log(weight) - fall / 2) for fall, *_ in trials]
     best = int(np.argmin(logs))
     chance = min(1.0, len(decays) * math.exp(logs[best]))
-    found, covariance = (np.array(part) for part in list(zip(*trials[best], strict=True))[1:])
+    falls, found, covariance = trials[best]
     middle = weight @ found
     spread = np.diagonal(covariance, axis1=1, axis2=2) + (found - middle) ** 2
     error = np.sqrt(weight @ spread)
@@ -175,7 +157,7 @@ def find_anomaly(fit: ScaleFit, decays: Sequence[Decay]) -> Anomaly:
     if chance > POOR_FIT:
         message = f"{len(decays)} decays follow the model (p = {chance:.2g})."
         return Anomaly(Status.converged, message, None, (), a, b, chance)
-    moved, begun = _moved(later, best, falls[best], weight), decays[best].fit.record
+    moved, begun = _moved(off, since[best], falls, weight), decays[best].fit.record
     names = " and ".join(moved)
     changes = ", ".join(
         f"{name} by {100 * q.value:+.3g} ± {100 * q.error:.2g} %"
@@ -187,13 +169,10 @@ def find_anomaly(fit: ScaleFit, decays: Sequence[Decay]) -> Anomaly:
 
 
 def _moved(
-    later: Sequence[Later], first: int, falls: np.ndarray, weight: np.ndarray
+    off: np.ndarray, change: np.ndarray, falls: np.ndarray, weight: np.ndarray
 ) -> tuple[str, ...]:
     """Test if one of the two explains as much as both."""
-    alone = {
-        name: np.array([_fitted(one.off, one.since(first)[:, [k]])[0] for one in later])
-        for k, name in enumerate("ab")
-    }
+    alone = {name: _fitted(off, change[:, :, [k]])[0] for k, name in enumerate("ab")}
     falls = {name: np.maximum(falls - own, 0.0) for name, own in alone.items()}
     chance = {name: weight @ chdtrc(1.0, fall) for name, fall in falls.items()}
     best = max(chance, key=chance.get)
@@ -309,10 +288,10 @@ def _rows(fit: ScaleFit, candidate: DecayCandidate) -> np.ndarray:
     one = terms._replace(current=mean), summary
     alone = jax.tree.map(lambda part: jnp.asarray(part)[None], one)
     one = DecaySet(*alone, fit.decays.pressure_error)
-    weight, _, [rows] = fit.about(one)
+    *_, [rows], [change] = fit.about(one)
     # A new decay scatters as the likeliest noise says.
-    own = fit.changes(one, weight)[0] * fit.noise.scatter[fit.noise.likeliest]
-    return np.asarray(widened(np.eye(2), own)) @ rows
+    scattered = change * fit.noise.scatter[fit.noise.likeliest]
+    return np.asarray(widened(np.eye(2), scattered)) @ rows
 
 
 def next_decays(fit: ScaleFit, candidates: Sequence[DecayCandidate]) -> tuple[Proposal, ...]:
@@ -544,8 +523,7 @@ def predict_held_back(fit: ScaleFit) -> tuple[HeldBack, ...]:
     9.82 ± 0.14 h predicted, 9.730669 ± 0.000098 h measured
     """
     measured, noise, found = fit.decays.measured, fit.noise, []
-    weight, left, rows = fit.about(fit.decays)
-    change = fit.changes(fit.decays, weight)
+    weight, left, rows, change = fit.about(fit.decays)
     for k, name in enumerate(fit.names):
         root = np.asarray(measured.root[k])
         if not np.any(root):
@@ -603,7 +581,7 @@ NOTE = (
 
 @answer
 @dataclass(frozen=True, eq=False)
-class Shift:
+class Shift(Judged):
     """Joint answer of many decays.
 
     Parameters
@@ -637,14 +615,9 @@ class Shift:
     network: NetworkFit | None = None
 
     @property
-    def status(self) -> Status:
-        """Status of the scales."""
-        return self.fit.status
-
-    @property
-    def message(self) -> str:
-        """Sentence on the scales."""
-        return self.fit.message
+    def finding(self) -> Finding:
+        """Status and sentence on the scales."""
+        return self.fit.finding
 
     @property
     def headline(self) -> str:
@@ -841,6 +814,6 @@ def _anomaly(
         return None
     reference = fit_scales(decays[:half], machine, priors=priors)
     # What the first half does not tell, the second cannot contradict.
-    if not np.isfinite(reference.covariance).all():
+    if not np.isfinite(reference.spread.errors).all():
         return None
     return find_anomaly(reference, decays[half:])

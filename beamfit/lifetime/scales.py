@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jax.scipy.special import logsumexp
-from scipy.linalg import block_diag, solve_triangular
+from scipy.linalg import block_diag
 
 from beamfit.answer import json_of, shown
 from beamfit.arrays import padded_length
@@ -85,38 +85,37 @@ def information_root(about: Expansion, scale: float = 1.0) -> np.ndarray:
 
 
 def _root(fit: DecayFit, about: Expansion) -> np.ndarray:
-    """The information that a decay holds on its parts, as of `Summaries`."""
-    scale = max(np.sqrt(about.residuals @ about.residuals / fit.dof), about.given)
-    return _with_monitor(information_root(about, scale * fit.inflation), about)
-
-
-def widened(root: Array, changes: Array) -> Array:
-    """Root of the information where the parts also err by independent changes.
-
-    Parameters
-    ----------
-    root : array, shape (..., 2, 2)
-        As of `Summaries`.
-    changes : array, shape (..., 2, k)
-        By how much each of k errors moves the parts, one standard deviation.
-
-    Returns
-    -------
-    array, shape (..., 2, 2)
-        W with WᵀW = Rᵀ (1 + G Gᵀ)⁻¹ R, G = R times the changes: the errors integrated out.
+    """The information that a decay holds on its parts, as of `Summaries`; what is stated of the
+    monitor is added to their covariance.
     """
-    own = root @ changes
-    whole = jnp.linalg.cholesky(jnp.eye(2) + own @ jnp.swapaxes(own, -1, -2))
-    return jnp.linalg.solve(whole, root)
-
-
-def _with_monitor(root: np.ndarray, about: Expansion) -> np.ndarray:
-    """The root with what is stated of the monitor added to the covariance of the parts."""
+    scale = max(np.sqrt(about.residuals @ about.residuals / fit.dof), about.given)
+    root = information_root(about, scale * fit.inflation)
     moved = [about.moved(change) for change in about.pieces.monitor_changes]
     if not moved:
         return root
     changes = np.array([[m.a * about.pieces.units[1], m.rate_mean] for m in moved]).T
     return np.linalg.qr(widened(root, changes), mode="r")
+
+
+def widened(root: Array, changes: Array) -> Array:
+    """Root of the information where values also err by independent changes.
+
+    Parameters
+    ----------
+    root : array, shape (..., n, n)
+        As of `Summaries`, of two values; or of more.
+    changes : array, shape (..., n, k)
+        By how much each of k errors moves the values, one standard deviation.
+
+    Returns
+    -------
+    array, shape (..., n, n)
+        W with WᵀW = Rᵀ (1 + G Gᵀ)⁻¹ R, G = R times the changes: the errors integrated out.
+    """
+    own = root @ changes
+    unit = jnp.eye(root.shape[-1])
+    whole = jnp.linalg.cholesky(unit + own @ jnp.swapaxes(own, -1, -2))
+    return jnp.linalg.solve(whole, root)
 
 
 def _together(fit: DecayFit, rate: float) -> np.ndarray:
@@ -299,7 +298,7 @@ class ScaleFit(Judged):
     @cached_property
     def spread_raw(self) -> Spread:
         """Spread of the scales by the decays' own errors and the pressures', without scatter."""
-        _, _, rows = self.about(self.decays)
+        _, _, rows, _ = self.about(self.decays)
         priors = self.fit.dense_jacobian[2 * len(rows) :]
         unbounded = np.full(self.vector.shape, np.inf)
         rows = np.vstack([rows.reshape(-1, unbounded.size), priors])
@@ -422,13 +421,9 @@ class ScaleFit(Judged):
 
     def about(self, decays: DecaySet) -> tuple[np.ndarray, ...]:
         """Expand decays: their weights without scatter, their `pulls`, and the slopes of these by
-        the scales.
+        the scales and by ln a and ln b of each decay, shape (n, 2, 2).
         """
         return _expanded(self.vector, decays)
-
-    def changes(self, decays: DecaySet, weight: np.ndarray) -> np.ndarray:
-        """Slopes of `pulls` by ln a and ln b of each decay, shape (n, 2, 2)."""
-        return weight @ _changes(self.vector, decays)
 
     def __str__(self) -> str:
         rows = [f"{len(self.names)} decays: {self.status}. {self.message}"]
@@ -591,10 +586,10 @@ def _weighted(model: Mapping[str, Array], data: tuple[DecaySet, tuple[Array, Arr
 
 
 def _expanded(vector: np.ndarray, decays: DecaySet) -> tuple[np.ndarray, ...]:
-    vector = jnp.asarray(vector)
-    weight = whitener(vector, decays)
-    given = vector, decays, weight
-    return tuple(map(np.asarray, (weight, pulls(*given), _by_scales(*given))))
+    weight = whitener(jnp.asarray(vector), decays)
+    given = jnp.asarray(vector), decays, weight
+    weight, off, rows = map(np.asarray, (weight, pulls(*given), _by_scales(*given)))
+    return weight, off, rows, weight @ _changes(vector, decays)
 
 
 def _changes(vector: np.ndarray, decays: DecaySet) -> np.ndarray:
@@ -607,13 +602,11 @@ def _linear(
     vector: np.ndarray, decays: DecaySet, priors: Sequence[Prior], names: Sequence[str]
 ) -> LinearDecays:
     """Decays about some scales, and the priors of these."""
-    weight, off, rows = _expanded(vector, decays)
+    _, off, rows, change = _expanded(vector, decays)
     at = [names.index(prior.name) for prior in priors]
     mean, sd = (np.array([getattr(p, n) for p in priors], float) for n in ("mean", "sd"))
     known = np.eye(len(names))[at] / sd[:, None]
-    return LinearDecays(
-        off, rows, weight @ _changes(vector, decays), (vector[at] - mean) / sd, known
-    )
+    return LinearDecays(off, rows, change, (vector[at] - mean) / sd, known)
 
 
 def _whole(change: np.ndarray, noise: FillNoise) -> Array:
@@ -623,9 +616,7 @@ def _whole(change: np.ndarray, noise: FillNoise) -> Array:
     k = noise.likeliest
     scattered = block_diag(*(change * noise.sizes(k, len(change))[:, None, :]))
     smooth = (change @ noise.columns[noise.model[k]]).reshape(len(scattered), -1)
-    covariance = np.eye(len(scattered)) + scattered @ scattered.T + smooth @ smooth.T
-    whiten = solve_triangular(np.linalg.cholesky(covariance), np.eye(len(covariance)), lower=True)
-    return jnp.asarray(whiten)
+    return widened(np.eye(len(scattered)), np.hstack([scattered, smooth]))
 
 
 def _departures(

@@ -38,7 +38,13 @@ from beamfit.lifetime.readings import (
 )
 from beamfit.lifetime.record import DecayRecord
 from beamfit.lifetime.ring import MeasuredLength, Operation, Ring, stored_bunch, unstored
-from beamfit.lifetime.systematics import DecayChecks, Systematic, check_decay, systematics
+from beamfit.lifetime.systematics import (
+    OneLifetime,
+    Systematic,
+    log_linear,
+    single_exponential,
+    systematics,
+)
 from beamfit.quantity import HOUR, Quantity, Status
 
 # A setting that moves by more than this share between two readings was changed by somebody.
@@ -328,11 +334,15 @@ class Decay:
         return found
 
     @cached_property
-    def checks(self) -> DecayChecks | None:
-        """Simpler analyses, and the test of a constant a; None if nothing decays, and
-        for many cycles.
+    def checks(self) -> dict[str, OneLifetime | None]:
+        """Simpler analyses by name, None where a current is zero; none of them if nothing decays,
+        and for many cycles.
         """
-        return check_decay(self.segment, self.fit) if self.fit.first is None else None
+        record, fit = self.segment, self.fit
+        if fit.first is not None or np.ptp(record.current) == 0:
+            return {}
+        line = log_linear(record, fit) if record.current.min() > 0 else None
+        return {"single_exponential": single_exponential(record, fit), "log_linear": line}
 
     @cached_property
     def systematics(self) -> tuple[Systematic, ...]:
@@ -341,8 +351,7 @@ class Decay:
 
     def to_json(self) -> dict[str, Any]:
         """Give one entry of the ``results`` list of the JSON contract."""
-        more = {"start": bare(self.offset, "s")} | (vars(self.checks) if self.checks else {})
-        more["systematics"] = self.systematics
+        more = {"start": bare(self.offset, "s"), **self.checks, "systematics": self.systematics}
         more |= {"notes": self.segment.notes} if self.segment.notes else {}
         more |= {} if self.budget is None else {"budget": self.budget}
         return self.fit.to_json() | json_of(more)

@@ -93,7 +93,7 @@ def systematics(fit: DecayFit) -> tuple[Systematic, ...]:
     """
     a, b = fit.if_constant("a").value, fit.if_constant("b").value
     record, another = fit.readings, fit.shaped or fit.first is not None
-    if record is None or another or fit.status is Status.infeasible or fit.a.error is None:
+    if another or fit.status is Status.infeasible or fit.a.error is None:
         return ()
     about = fit.about
     over, share = about.pieces.over, record.time / record.span
@@ -151,12 +151,6 @@ class OneLifetime:
     def to_json(self) -> dict[str, Any]:
         """Return the fields as JSON's types; a bias that is not known is null."""
         return json_of(vars(self) | {"rms_residual": bare(self.rms_residual, "mA")})
-
-    def __str__(self) -> str:
-        return (
-            f"{self.lifetime}, {100 * self.bias_start:+.3g} % from the lifetime at the start, "
-            f"{100 * self.bias_mean:+.3g} % from that at the mean current"
-        )
 
 
 def _one_lifetime(
@@ -342,48 +336,3 @@ def constant_a_test(record: DecayRecord) -> ConstantA:
     if found is None:
         raise InputError("readings that are all equal", "a decay", path=record.name)
     return found
-
-
-@dataclass(frozen=True)
-class DecayChecks:
-    """Simpler analyses beside an (a, b) fit.
-
-    Parameters
-    ----------
-    single_exponential : OneLifetime
-        From `single_exponential`.
-    log_linear : OneLifetime or None
-        From `log_linear`; None where a current is zero.
-    """
-
-    single_exponential: OneLifetime
-    log_linear: OneLifetime | None
-
-
-def check_decay(record: DecayRecord, fit: DecayFit | None = None) -> DecayChecks | None:
-    """Do every check of a decay.
-
-    Parameters
-    ----------
-    record : DecayRecord
-        One decay.
-    fit : DecayFit, optional
-        As for `single_exponential`.
-
-    Returns
-    -------
-    DecayChecks or None
-        None for a record that does not decay, of which nothing can be said.
-
-    Examples
-    --------
-    >>> t = np.linspace(0, 8 * 3600, 500)
-    >>> checks = check_decay(DecayRecord(t, 500 / (1 + t / 36000)))
-    >>> f"{checks.log_linear.bias_start:.2f}"
-    '0.38'
-    """
-    if np.ptp(record.current) == 0:
-        return None
-    fit = fit or fit_decay(record, law=Law.constant)
-    line = log_linear(record, fit) if record.current.min() > 0 else None
-    return DecayChecks(single_exponential(record, fit), line)

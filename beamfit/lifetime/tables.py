@@ -143,7 +143,7 @@ def _checks(decay: Decay) -> Cells:
 
 
 def _one_lifetime(decay: Decay, name: str) -> str | None:
-    found = getattr(decay.checks, name, None)
+    found = decay.checks.get(name)
     if found is None:
         return None
     known = math.isfinite(found.bias_start)

@@ -169,20 +169,18 @@ def fit_window(rows: Sequence[WindowRow], name: str, law: Law = Law.free) -> Win
     if not decays:
         return Window(None, None, 0, f"fewer than {FEWEST} readings in a row of a stored beam")
     group = _at_last(decays)
-    one = group[0] if len(group) == 1 else joined(group, name)
+    alone = len(group) == 1
+    one = replace(group[0], name=name) if alone else joined(group, name)
     if len(one) < FEWEST:
         return Window(None, one, len(group), f"{len(one)} readings since the last change")
     try:
-        fit = _fitted(group, name, law)
+        if alone:
+            fit = fit_decay(one, law=law)
+        else:
+            fit = fit_pieces(group, name, law, found=len(group) > 2)
     except InputError as error:  # a current that rises
         return Window(None, one, len(group), error.found)
     return Window(fit, one, len(group))
-
-
-def _fitted(group: list[DecayRecord], name: str, law: Law) -> DecayFit:
-    if len(group) == 1:
-        return fit_decay(replace(group[0], name=name), law=law)
-    return fit_pieces(group, name, law, found=len(group) > 2)
 
 
 def _pieces(rows: Sequence[WindowRow], name: str) -> list[DecayRecord]:

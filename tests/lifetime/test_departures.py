@@ -153,7 +153,7 @@ def test_outgassing_is_named_with_its_time_constant_and_lifetimes(a, b, further,
 def test_the_curve_that_is_drawn_is_that_of_the_residuals(further):
     time, beam = integrated(lambda t, i: 1e-8 * i + 4e-6 + further * np.exp(-t / 7200))
     fit = fit_decay(noisy(time, beam))
-    assert bool(further) == fit.free_law.is_pumped
+    assert bool(further) == (fit.free_law.beside == "pumped")
     np.testing.assert_allclose(fit.curve(time), fit.readings.current + fit.residuals, rtol=1e-9)
     assert np.std(fit.curve(time) - beam) < 1e-3  # half of the noise of a reading
 

@@ -228,7 +228,7 @@ def test_a_quiet_monitor_that_settles_is_told_beside_any_law(given, count):
         rate = own + B * (1 + drift * (at / time[-1] - 0.5))
         held += low <= 1 / rate / HOUR <= high
         told += "A monitor that settles after a fill is likely" in fit.message
-        assert "residuals are correlated" not in fit.message or not fit.free_law.is_settling
+        assert "residuals are correlated" not in fit.message or fit.free_law.beside != "settles"
     assert held >= count - 1
     assert told >= 0.75 * count
 
@@ -255,7 +255,9 @@ def test_the_density_of_samples_is_that_of_the_draws():
         squares = np.einsum("pd,kpq,qd->kd", away, products.matrix, away)
         log = logsumexp(products.log_prior[:, None] + products.log_size(squares), axis=0)
         log += law._log_prior(draws.numbers) - np.log(draws.numbers.rate)
-        log += np.log1p(-draws.numbers.share) if law.is_pumped else 0.0  # of b, not of the loss
+        log += (
+            np.log1p(-draws.numbers.share) if law.beside == "pumped" else 0.0
+        )  # of b, not of the loss
         thetas = ready.thetas(draws, np.random.default_rng(0))
         density = np.array([float(_log_density(data, theta)) for theta in thetas])
         apart.append((density - log)[np.isfinite(density)])
