@@ -240,8 +240,18 @@ def scan_of_two_planes(x_of, y_of):
     return beamfit.QuadScan({"Q": k1}, {"Q": "k1"}, size, error), line
 
 
+def test_a_waist_of_one_plane_hides_no_setting_from_the_other():
+    """The screen that showed y at 231 µm shows x at 150 µm, too: y is led towards its waist."""
+    scan, line = scan_of_two_planes(lambda x: x, lambda y: y)
+    size, error = {"y": scan.size["y"]}, {"y": scan.error["y"]}
+    alone = beamfit.QuadScan(scan.settings, scan.units, size, error)
+    both, one = (beamfit.fit_emittance(s, line).y.identifiability for s in (scan, alone))
+    assert "beyond the scanned range" in one.next_measurement
+    assert both.next_measurement == one.next_measurement
+
+
 def test_a_bad_size_of_one_plane_changes_no_advice_on_the_other():
-    """Settings at which a plane gets larger than measured are none; a bad size is not measured."""
+    """Settings at which a size gets larger than measured are none; a bad size is not measured."""
     slipped = np.array([1, 1, 1, 10, 1, 1, 1, 1, 1])
     said = [
         beamfit.fit_emittance(*scan_of_two_planes(x_of, lambda y: y)).y.message
