@@ -237,8 +237,8 @@ def noise_remark(noise: str, scale: np.ndarray, probability: float | None = None
     if noise in ("shots", "beyond") and middle > 0.005:
         than = "shots" if noise == "shots" else "stated errors"
         return (
-            f"Settings scatter by {100 * middle:.2g} % ({100 * low:.2g} to {100 * high:.2g} %) of "
-            f"the size beyond their {than}, which the error includes."
+            f"Settings scatter by {100 * middle:.2g} % ({round(100 * low, 2):.2g} to "
+            f"{100 * high:.2g} %) of the size beyond their {than}, which the error includes."
         )
     return ""
 

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 import beamfit
 from beamfit.emittance.model import phase_coverage
-from beamfit.emittance.verdict import waist_bracketed
+from beamfit.emittance.verdict import noise_remark, waist_bracketed
 from beamfit.optics.elements import Drift, Quadrupole, Screen
 from beamfit.quantity import Status
 from tests.emittance.conftest import TABLE_2, design, scan_of
@@ -333,3 +333,8 @@ def test_noise_far_beyond_the_stated_errors_is_told_what_to_check(otr2, stated):
     assert "Check the line" in said.message
     assert "Stated errors that are far too small look like that" in said.message
     assert bare.status is Status.converged
+
+
+def test_no_scatter_is_said_to_a_ten_thousandth_of_a_per_cent():
+    said = noise_remark("shots", np.array([0.014, 5.7e-5, 0.028]))
+    assert "1.4 % (0.01 to 2.8 %)" in said
