@@ -87,9 +87,10 @@ def summary_of(courses: Sequence[ControlChart]) -> Table:
         ("median", np.median),
         ("lowest", np.min),
         ("highest", np.max),
-        ("standard deviation", np.std),
     ):
         rows.append((label, [c.shown(float(number(c.value))) for c in courses]))
+    spread = [c.shown(float(np.std(c.value))) if len(c.value) > 1 else None for c in courses]
+    rows.append(("standard deviation", spread))
     rows.append(("median error", [c.shown(float(np.median(c.error))) for c in courses]))
     beyond = [f"{c.beyond.sum()}" if math.isfinite(c.reach) else "no limits" for c in courses]
     rows.append(("beyond the limits", beyond))

@@ -101,11 +101,12 @@ class Adviser(NamedTuple):
     ) -> tuple[list[Candidate], np.ndarray]:
         """List single further measurements with their rows, of shape (candidates, planes, n).
 
-        Where no limits are given, those in which no plane's size exceeds the measured ones, if
-        there are any: screens have edges. Bad readings, and sizes that are no beam's, are none.
+        Where no limits are given, those in which no size exceeds the largest measured one of
+        either plane, if there are any: screens have edges. Bad readings, and sizes that are no
+        beam's, are none.
         """
         found, rows, screens = [], [], tuple(screens)
-        largest = np.array([[_largest(self.seen, plane)] for plane in self.seen.planes])
+        largest = max(_largest(self.seen, plane) for plane in self.seen.planes)
         for table in candidate_settings(self.seen.scan.settings, limits).values():
             rows_of_table = zip(*table.values(), strict=True)
             points = [dict(zip(table, map(float, row), strict=True)) for row in rows_of_table]

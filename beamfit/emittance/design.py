@@ -348,8 +348,10 @@ def plan_measurements(
     expect(fit, EmittanceFit, "beamfit.fit_emittance(scan, line)")
     if criterion not in CRITERIA:
         raise InputError(f"criterion '{criterion}'", "emittance or D")
-    if count < 1 or (goal is not None and not goal > 0):
-        raise InputError(f"{count} points to a goal of {goal}", "at least one, and a positive goal")
+    if count < 1:
+        raise InputError(f"a count of {count}", "at least one measurement")
+    if goal is not None and not goal > 0:
+        raise InputError(f"a goal of {goal}", "a relative error above 0")
     _check_energies(energies, float(fit.seen.line.mass))
     adviser = adviser_of(fit)
     steps, stop = best_steps(fit, adviser, limits, criterion, goal, count, energies)

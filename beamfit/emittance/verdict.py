@@ -44,6 +44,11 @@ REMEDIES = {
         "(saturation, background, cut edges)."
     ),
 }
+# Errors far below the scatter turn noise into a curve.
+OVERCONFIDENT = (
+    "Stated errors that are far too small look like that, too: without their column the noise is "
+    "inferred."
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,7 +136,7 @@ def verdict(e: PlaneEvidence, remarks: str = "", advice: str = "") -> Finding:
         status = Status.poor_fit
     where = f" in scenario {e.scenario}" if e.scenario else ""
     said = f"Not determined{where}: {_open(e)}."
-    help_ = [advice or (REMEDIES.get(post.cause, "") if not e.of_a_beam and post.seen else "")]
+    help_ = [advice or (_remedy(e) if not e.of_a_beam and post.seen else "")]
     help_ += [f"Needed: {e.remedy}."] if e.remedy and e.of_a_beam else []
     return Finding(status, f"{said} {remarks}".strip(), " ".join(filter(None, help_)))
 
@@ -148,6 +153,20 @@ def _determined(e: PlaneEvidence) -> str:
     return f"Determined{where}: the sizes are those of a beam with {sure}{waist[e.bracketed]}."
 
 
+def _rival(e: PlaneEvidence) -> str:
+    """The likeliest cause of the sizes that is no beam's, of an emittance or none."""
+    rest = {k: v for k, v in e.posterior.probability.items() if k not in (BEAM, FLAT)}
+    return max(rest, key=rest.__getitem__)
+
+
+def _remedy(e: PlaneEvidence) -> str:
+    """What to check where the sizes may be a rival's."""
+    rival = e.posterior.cause
+    rival = _rival(e) if rival == BEAM and not e.few else rival
+    stated = rival == CURVE and e.sizes.error is not None and not e.sizes.of_shots
+    return REMEDIES.get(rival, "") + f" {OVERCONFIDENT}" * stated
+
+
 def _open(e: PlaneEvidence) -> str:
     """Why the emittance is not determined."""
     probability, rival = e.posterior.probability, e.posterior.cause
@@ -161,11 +180,10 @@ def _open(e: PlaneEvidence) -> str:
             "three points fit any three numbers exactly and leave nothing to judge them by; "
             "measure a fourth setting"
         )
-    rest = {k: v for k, v in probability.items() if k not in (BEAM, FLAT)}
-    other = max(rest, key=rest.__getitem__)
+    other = _rival(e)
     maybe = (
         f"these sizes may be a beam's (P = {e.beam:.4g}, and {SURE:g} is needed), or else {other} "
-        f"(P = {rest[other]:.2g})"
+        f"(P = {probability[other]:.2g})"
     )
     if not e.of_a_beam:
         if rival in (BEAM, FLAT):
@@ -174,7 +192,7 @@ def _open(e: PlaneEvidence) -> str:
     if e.opened:
         return e.opened
     if e.beam <= SURE:
-        if rest[other] > probability[FLAT]:
+        if probability[other] > probability[FLAT]:
             return maybe
         return f"a beam of no emittance explains the sizes, too (P = {probability[FLAT]:.2g})"
     if not e.low > 0.0:
@@ -219,8 +237,8 @@ def noise_remark(noise: str, scale: np.ndarray, probability: float | None = None
     if noise in ("shots", "beyond") and middle > 0.005:
         than = "shots" if noise == "shots" else "stated errors"
         return (
-            f"Settings scatter by {100 * middle:.2g} % ({100 * low:.2g} to {100 * high:.2g} %) of "
-            f"the size beyond their {than}, which the error includes."
+            f"Settings scatter by {100 * middle:.2g} % ({round(100 * low, 2):.2g} to "
+            f"{100 * high:.2g} %) of the size beyond their {than}, which the error includes."
         )
     return ""
 

@@ -228,7 +228,8 @@ def _record(sheet: Sheet, offset: str | None) -> DecayRecord:
     beam, error = values.pop("current"), values.pop("error", None)
     conditions = Conditions(**values)
     if (fault := first_fault(moment, beam, error, conditions)) is not None:
-        raise _refused(sheet, columns, fault, np.flatnonzero(found.beam), np.median(beam) < 0)
+        rows = np.flatnonzero(found.beam)
+        raise _refused(sheet, columns, fault, rows, np.median(beam) < 0, found.value)
     absolute = moment[0] > UNIX or (columns["time"].unit == DATE and moment[0] > DAY)
     return DecayRecord(
         time=moment,
@@ -259,7 +260,12 @@ def _goes_back(sheet: Sheet, columns: Mapping[str, Column], row: int, latest: ob
 
 
 def _refused(
-    sheet: Sheet, columns: Mapping[str, Column], fault: Fault, rows: np.ndarray, negative: bool
+    sheet: Sheet,
+    columns: Mapping[str, Column],
+    fault: Fault,
+    rows: np.ndarray,
+    negative: bool,
+    offset: float,
 ) -> InputError:
     """Error of a record, at its row of the file."""
     column, row = columns[fault.quantity], int(rows[fault.row])
@@ -269,6 +275,8 @@ def _refused(
     sheet = sheet if fault.quantity == "time" else replace(sheet, skip="")
     if fault.quantity == "current" and negative:
         expected = "the other sign: most readings are negative"
+        if offset > 0:
+            expected = f"--offset below the readings: {offset:g} mA leaves most of them negative"
     return sheet.error(fault.found, expected, row, column.header)
 
 

@@ -21,6 +21,7 @@ from beamfit.io.columns import (
     ignored,
     layout_of,
     left_out,
+    spelled,
 )
 from beamfit.io.files import name_of
 from beamfit.io.table import read_columns
@@ -80,7 +81,8 @@ def read_run(
     >>> print(read_run(file))
     run.csv: 10 rows over 9 s, inputs valve, outputs level
     """
-    named = [(name, f"u_{name}") for name in inputs] + [(name, f"y_{name}") for name in outputs]
+    named = [(name, f"u_{spelled(name)}") for name in inputs]
+    named += [(name, f"y_{spelled(name)}") for name in outputs]
     layout = layout_of(columns) + Layout(tuple(named), tuple(name for name, _ in named))
     sheet = read_columns(path, EXAMPLE, layout, ignore, skip_bad)
     columns = columns_of(sheet, {TIME: "time"}, lambda header: _other(header, sheet, bool(named)))

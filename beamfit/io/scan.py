@@ -223,10 +223,15 @@ def likely_scan_name(header: str, cell: object = "") -> str | None:
     ['size_x_um', 'QUAD_525_kG', None]
     >>> likely_scan_name("xrms", "0.11 mm"), likely_scan_name("Q5 current", "1.5 A")
     ('size_x_mm', 'Q5_A')
+    >>> likely_scan_name("err_x"), likely_scan_name("err x [mm]"), likely_scan_name("x")
+    ('size_x_error_um', 'size_x_error_mm', None)
     """
     _, own = number_and_unit(str(cell)) or ("", None)
-    if (size := _size(f"{header}_um")) is not None:
+    size = _size(f"{header}_um") or _error_alone(f"{header}_um")
+    if size is not None:
         return f"{size.key}_{own if own in UNITS['length'] else 'um'}"
+    if (error := _error_alone(spelled(header))) is not None:
+        return f"{error.key}_{error.unit}"
     bare, unit = ATTRIBUTE.sub("", header), own or "kG"
     if bare == header or unit not in SETTINGS:
         return None
@@ -237,6 +242,10 @@ def _not_understood(header: str) -> str:
     """Reason why a header is unknown."""
     bracket = re.search(r"[\[(]([^\[\]()]*)[\])]\s*$", header)
     before, _, last = header.rpartition("_")
+    if is_size(re.sub(r"[ _.#-]*[0-9]+$", "", header)) and header[-1].isdecimal():
+        return "a size with a number behind it: shots stand in rows, each with its setting"
+    if (error := _error_alone(header)) is not None:
+        return f"an error without what it is of; {error.key}_{error.unit} is that of a size"
     if _size(f"{header}_um") is not None:
         return "a size without a unit"
     if header.lower().startswith("beam_current"):
@@ -284,6 +293,12 @@ def _size(header: str) -> Column | None:
     rms = FWHM if "fwhm" in widths else 1.0 / int(several[1]) if several else 1.0
     key = f"size_{PLANES[planes[0]]}" + ("_error" if errors else "")
     return Column(header, key, unit, units[unit] * (rms if unit != PERCENT else 1.0))
+
+
+def _error_alone(header: str) -> Column | None:
+    """The error of a size whose header says the plane and not that it is a size's: ``err_x_um``."""
+    error = _size(f"size_{header}")
+    return error if error is not None and error.key.endswith("_error") else None
 
 
 def rms_of(column: Column) -> float:

@@ -135,7 +135,11 @@ def _first(table: Table) -> list[Table]:
 
 def _source(c: ControlChart, kind: str) -> str:
     first, last = (Path(c.files[i]).name for i in (0, -1))
-    return f"{kind} of {len(c.value)} files, {first} to {last}"
+    return (
+        f"{kind} of {first}"
+        if first == last
+        else f"{kind} of {len(c.value)} files, {first} to {last}"
+    )
 
 
 def _verdict(c: ControlChart) -> Verdict:
@@ -143,7 +147,7 @@ def _verdict(c: ControlChart) -> Verdict:
     status = Status.poor_fit if beyond else Status.converged
     factor, unit = display_unit(abs(c.centre), c.unit)
     if not math.isfinite(c.reach):
-        few = f"{points} points are too few for control limits."
+        few = f"{points} point{'s are' if points > 1 else ' is'} too few for control limits."
         return Verdict(Status.converged, f"{c.label}: median {c.shown(middle)}", few)
     usual = f"{c.centre / factor:#.4g} ± {c.limit / factor:.2g} {unit}".strip()
     message = f"{beyond} of {points} points lie beyond the control limits"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from datetime import UTC, datetime
 from functools import partial
@@ -99,11 +100,20 @@ def decay_page(
         title=f"Beam lifetime of {title}",
         subtitle=f"{count} in {hours:.3g} h of record",
         verdicts=[*_together(shift, trend), *map(_verdict, pooled), *_verdicts(decays)],
-        tables=listed,
+        tables=_distinct(listed),
         pictures=_of_all(decays, shift, trend) + _pictures(studies),
         pictures_title="Lifetime along the record" if len(studies) == 1 else "Records and fits",
         notes=from_head([note for study in studies for note in study.record.comments]),
     )
+
+
+def _distinct(listed: Sequence[Table]) -> list[Table]:
+    """Add the names of its columns to a heading that several tables have."""
+    count = Counter(table.title for table in listed)
+    return [
+        t._replace(title=f"{t.title}: {', '.join(t.header[1:])}") if count[t.title] > 1 else t
+        for t in listed
+    ]
 
 
 def _side_by_side(decays: Sequence[Decay]) -> list[Table]:
@@ -230,16 +240,21 @@ def draw_record(figure: FigureBase, study: RecordStudy) -> None:
         below.plot(at, decay.fit.residuals, **dots(color=BLUE))
     above.plot([], [], "o", color=BLUE, ms=5, label="readings")
     above.plot([], [], color=RED, label="fit")
-    if sum(len(d.segment) for d in study.pooled or study.decays) < len(record):
-        above.plot([], [], "o", color="0.65", ms=5, label="left out")
-    above.legend(frameon=False, loc="best")
-    above.set(title="beam current", ylabel="beam current, mA")
+    fitted = [decay.segment.current for decay in study.pooled or study.decays]
+    shown, title = np.concatenate(fitted), "beam current"
     if some is not None:
-        seen = record.current[(record.time >= some[0]) & (record.time <= some[1])]
-        more = 0.1 * float(np.ptp(seen))
-        count = study.pooled[0].fit.first.size
-        above.set(title=f"beam current, {SOME} of {count} cycles", xlim=some / scale)
-        above.set_ylim(seen.min() - more, seen.max() + more)
+        shown = record.current[(record.time >= some[0]) & (record.time <= some[1])]
+        title += f", {SOME} of {study.pooled[0].fit.first.size} cycles"
+        above.set_xlim(some / scale)
+    # Spikes, dumps and injections would make a straight line of the decay.
+    more = 0.1 * float(np.ptp(shown)) or 1.0
+    low, high = float(shown.min()) - more, float(shown.max()) + more
+    above.set(title=title, ylabel="beam current, mA", ylim=(low, high))
+    if sum(map(len, fitted)) < len(record):
+        beyond = int(np.sum((record.current < low) | (record.current > high)))
+        label = "left out" + f", {beyond} beyond the axes" * (some is None and beyond > 0)
+        above.plot([], [], "o", color="0.65", ms=5, label=label)
+    above.legend(frameon=False, loc="best")
     below.axhline(0, color="0.6", lw=0.8)
     below.set(xlabel=f"time, {unit}", ylabel="fit - reading,\nmA")
 

@@ -16,7 +16,7 @@ import pytest
 
 from beamfit.batch import run as running
 from beamfit.batch.columns import COLUMNS, NUMBERS
-from beamfit.batch.course import courses_of
+from beamfit.batch.course import courses_of, summary_of
 from beamfit.batch.job import Job
 from beamfit.batch.run import run_batch
 from beamfit.errors import InputError
@@ -161,6 +161,8 @@ def test_records_are_answered_too(root, tmp_path):
     assert float(row["lifetime_mean_h"]) == pytest.approx(39.149, abs=1e-3)
     # Of the law that is quoted; of constant a and b 0.901.
     assert float(row["share"]) == pytest.approx(0.829, abs=2e-3)
+    # One answer scatters by nothing that it knows of.
+    assert ["standard deviation", "-"] in [list(r) for r in summary_of(courses_of(found)).rows]
 
 
 @pytest.mark.parametrize(

@@ -52,6 +52,18 @@ def test_columns_of_any_name_without_a_time(run, tmp_path):
     assert json.loads(out)["results"][0]["output"] == "Level"
 
 
+def test_a_named_column_may_have_its_unit_in_brackets(run, tmp_path):
+    lines = [
+        "Time [s],Valve [%],Level (m)\n",
+        *(f"{k},{(k // 8) % 2},{k % 8 / 9:.3f}\n" for k in range(64)),
+    ]
+    (tmp_path / "log.csv").write_text("".join(lines))
+    said = ("--input", "Valve [%]", "--output", "Level (m)", "--json")
+    status, out, err = run("identify", tmp_path / "log.csv", *said)
+    assert status == 0, err
+    assert json.loads(out)["results"][0]["output"] == "Level_m"
+
+
 BAD = {
     "time backwards": (table(*ROWS[:9], ROWS[3], *ROWS[10:]), (), [":11:", "time_s", "increase"]),
     "a constant input": (

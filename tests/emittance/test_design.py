@@ -157,7 +157,8 @@ def test_a_magnet_that_was_not_scanned_may_be_set(known):
         ({"limits": {"Q9": (0.0, 1.0)}}, "Q9"),
         ({"limits": {"Q2": (1.0, 0.0)}}, "lower first"),
         ({"criterion": "A"}, "emittance or D"),
-        ({"count": 0}, "at least one"),
+        ({"count": 0}, "a count of 0; expected at least one"),
+        ({"goal": 0.0}, "a goal of 0.0; expected a relative error above 0"),
     ],
 )
 def test_bad_wishes_are_named(known, options, words):

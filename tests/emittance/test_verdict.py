@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 import beamfit
 from beamfit.emittance.model import phase_coverage
-from beamfit.emittance.verdict import waist_bracketed
+from beamfit.emittance.verdict import noise_remark, waist_bracketed
 from beamfit.optics.elements import Drift, Quadrupole, Screen
 from beamfit.quantity import Status
 from tests.emittance.conftest import TABLE_2, design, scan_of
@@ -240,8 +240,18 @@ def scan_of_two_planes(x_of, y_of):
     return beamfit.QuadScan({"Q": k1}, {"Q": "k1"}, size, error), line
 
 
+def test_a_waist_of_one_plane_hides_no_setting_from_the_other():
+    """The screen that showed y at 231 µm shows x at 150 µm, too: y is led towards its waist."""
+    scan, line = scan_of_two_planes(lambda x: x, lambda y: y)
+    size, error = {"y": scan.size["y"]}, {"y": scan.error["y"]}
+    alone = beamfit.QuadScan(scan.settings, scan.units, size, error)
+    both, one = (beamfit.fit_emittance(s, line).y.identifiability for s in (scan, alone))
+    assert "beyond the scanned range" in one.next_measurement
+    assert both.next_measurement == one.next_measurement
+
+
 def test_a_bad_size_of_one_plane_changes_no_advice_on_the_other():
-    """Settings at which a plane gets larger than measured are none; a bad size is not measured."""
+    """Settings at which a size gets larger than measured are none; a bad size is not measured."""
     slipped = np.array([1, 1, 1, 10, 1, 1, 1, 1, 1])
     said = [
         beamfit.fit_emittance(*scan_of_two_planes(x_of, lambda y: y)).y.message
@@ -302,3 +312,29 @@ def test_an_emittance_of_few_accelerators_is_asked_about(gtf, factor, words, roo
     fit = beamfit.fit_emittance(replace(scan, size=size, error=error), gtf)
     assert fit.x.status is Status.converged
     assert any(words in note for note in fit.notes)
+
+
+@pytest.mark.parametrize("stated", [1e-4, 5e-4])
+def test_noise_far_beyond_the_stated_errors_is_told_what_to_check(otr2, stated):
+    """SIMULATED sizes with 2 % noise under errors such as those of fits to their profiles."""
+    settings = np.linspace(-3.0, 3.0, 9)
+    beam = beamfit.BeamMatrix.from_twiss(1e-6 / 264.1865, 6.5, 3.0)
+    sigma = np.asarray(beam.sigma)[[0, 0, 1], [0, 1, 1]]
+    noise = 1 + 0.02 * np.random.default_rng(6).normal(size=9)
+    sizes = noise * np.sqrt(design(otr2, {"Q525": settings}) @ sigma)
+    said, bare = (
+        beamfit.fit_emittance(
+            beamfit.QuadScan({"Q525": settings}, {"Q525": "kG"}, {"x": sizes}, error), otr2
+        ).x
+        for error in ({"x": stated * sizes}, {})
+    )
+    assert said.status is not Status.converged
+    assert ("may be a beam's" in said.message) is (stated > 2e-4)
+    assert "Check the line" in said.message
+    assert "Stated errors that are far too small look like that" in said.message
+    assert bare.status is Status.converged
+
+
+def test_no_scatter_is_said_to_a_ten_thousandth_of_a_per_cent():
+    said = noise_remark("shots", np.array([0.014, 5.7e-5, 0.028]))
+    assert "1.4 % (0.01 to 2.8 %)" in said

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from beamfit.errors import InputError
-from beamfit.io.check import understand
+from beamfit.io.check import proposed_layout, understand
 from beamfit.io.columns import spelled
 from beamfit.io.decay_record import read_decay_record
 from beamfit.io.scan import read_quad_scan
@@ -95,3 +95,13 @@ def test_a_header_behind_a_mark_may_stand_above_dates(tmp_path):
     (tmp_path / "a.txt").write_text("# Data Browser\n#Time\tSR:I\n" + rows)
     record = read_decay_record(tmp_path / "a.txt", columns="SR:I=beam_current_mA")
     assert record.current.tolist() == [500, 499, 498, 497]
+
+
+def test_shots_side_by_side_and_errors_of_nothing_are_told_what_to_do(tmp_path):
+    (tmp_path / "a.csv").write_text("Q525_kG,size_x_um_1,size_x_um_2\n" + ROWS)
+    with pytest.raises(InputError, match="'size_x_um_1': a size with a number behind it: shots"):
+        read_quad_scan(tmp_path / "a.csv")
+    (tmp_path / "b.csv").write_text("Q525_kG,size_x_um,err_x_mm\n" + ROWS)
+    with pytest.raises(InputError, match="size_x_error_mm is that of a size"):
+        read_quad_scan(tmp_path / "b.csv")
+    assert '"err_x_mm" = "size_x_error_mm"' in proposed_layout(tmp_path / "b.csv")

@@ -68,6 +68,11 @@ def test_what_gives_no_offset_is_refused(said, current, words):
         offset_of(said, current)
 
 
+def test_an_offset_above_the_readings_is_not_called_a_wrong_sign(shifted):
+    with pytest.raises(InputError, match="--offset below the readings: 600 mA leaves most"):
+        read_decay_record(shifted, offset="600mA")
+
+
 def test_ignored_columns_are_named(tmp_path):
     path = tmp_path / "a.csv"
     path.write_text("t,SR:I,BPM1,Ring temp\n0,100,1,20\n1,99,1,20\n")

@@ -100,3 +100,27 @@ def test_of_many_cycles_some_are_drawn_one_by_one():
     low, high = above.get_xlim()
     assert high - low == pytest.approx(12 * 180 / 3600, rel=0.01)
     assert below.get_xlim()[1] > 5.9
+
+
+def test_a_spike_does_not_flatten_the_decay():
+    """SIMULATED: a reading of 999 mA and a dump leave the axes to the 18 mA that were fitted."""
+    time = np.arange(0.0, 7200.0, 20.0)
+    noise = 0.01 * np.random.default_rng(1).normal(size=time.size)
+    current = 100 * np.exp(-time / 36000) + noise
+    current[100], current[340:] = 999.0, 0.0
+    above = figures.decay(study_record(DecayRecord(time, current))).axes[0]
+    low, high = above.get_ylim()
+    assert 75 < low < 85 < 100 < high < 105
+    words = [text.get_text() for text in above.get_legend().get_texts()]
+    assert "left out, 21 beyond the axes" in words
+
+
+def test_headings_of_several_tables_name_their_decays(tmp_path):
+    """Tables of two decays each had one heading: nobody saw which of them to unfold."""
+    time = np.arange(0.0, 6000.0, 10.0)
+    saw = 100 * np.exp(-(time % 2000) / 36000) + 1e-3 * np.random.default_rng(1).normal(size=600)
+    beamfit.write_report(tmp_path / "saw.html", (study_record(DecayRecord(time, saw)),))
+    page = (tmp_path / "saw.html").read_text().replace("<span>", "").replace("</span>", "")
+    headings = re.findall("<h2>(.*?)</h2>", page)
+    assert len(set(headings)) == len(headings)
+    assert {"All numbers: record#1, record#2", "All numbers: record#3"} < set(headings)
