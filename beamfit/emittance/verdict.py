@@ -44,11 +44,6 @@ REMEDIES = {
         "(saturation, background, cut edges)."
     ),
 }
-# Errors far below the scatter turn noise into a curve.
-OVERCONFIDENT = (
-    "Stated errors that are far too small look like that, too: without their column the noise is "
-    "inferred."
-)
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,9 +157,7 @@ def _rival(e: PlaneEvidence) -> str:
 def _remedy(e: PlaneEvidence) -> str:
     """What to check where the sizes may be a rival's."""
     rival = e.posterior.cause
-    rival = _rival(e) if rival == BEAM and not e.few else rival
-    stated = rival == CURVE and e.sizes.error is not None and not e.sizes.of_shots
-    return REMEDIES.get(rival, "") + f" {OVERCONFIDENT}" * stated
+    return REMEDIES.get(_rival(e) if rival == BEAM and not e.few else rival, "")
 
 
 def _open(e: PlaneEvidence) -> str:

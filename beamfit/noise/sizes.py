@@ -127,9 +127,8 @@ def kinds_of(
     -------
     tuple of NoiseKind
         Of sizes without errors a share and the same everywhere. Of stated errors that are too small
-        by a factor, or by what settings scatter beyond them; one where that is a factor, too. The
-        last one is the first, slow (where errors are stated with these), of fewer than `LONG`
-        points.
+        by a factor, or by what settings scatter beyond them. The last one is the first, slow (where
+        errors are stated with these), of fewer than `LONG` points.
     """
     zero, one, every = np.zeros_like(size), np.ones_like(size), np.ones(size.shape[:-1])
     swift, slow = math.log1p(-noise.slow) * every, math.log(noise.slow) * every
@@ -147,15 +146,15 @@ def kinds_of(
     else:
         right, factor = noise.stated(np.median(error / size, axis=-1))
         slow = slow + np.log(right)
-        if of_one_share(error, size) if alike is None else alike:
-            kinds = (NoiseKind(1, zero, error / size, factor, right, swift, 1.0, 1.0),)
-        else:  # a factor or a scatter: nobody knows which before the sizes are seen
-            wrong = 0.5 * (1.0 - right)
-            by_factor, beyond = swift + np.log1p(-wrong), swift + np.log(wrong)
-            kinds = (
-                NoiseKind(0, zero, error, factor, right / (1.0 - wrong), by_factor, 1.0, 1.0),
-                NoiseKind(0, error, size, scatter, zero[..., 0], beyond),
-            )
+        if power := int(of_one_share(error, size) if alike is None else alike):
+            error, size = error / size, one
+        # A factor or a scatter: nobody knows which before the sizes are seen.
+        wrong = 0.5 * (1.0 - right)
+        by_factor, beyond = swift + np.log1p(-wrong), swift + np.log(wrong)
+        kinds = (
+            NoiseKind(power, zero, error, factor, right / (1.0 - wrong), by_factor, 1.0, 1.0),
+            NoiseKind(power, error, size, scatter, zero[..., 0], beyond),
+        )
     if size.shape[-1] >= LONG:
         return kinds
     first = replace(kinds[0], slow=True, log_weight=slow)

@@ -49,8 +49,6 @@ def likelihood(kind, size, error, noise):
         return lambda model: ref.log_stated(size, model, error, noise)
     if kind == "share":
         return lambda model: ref.log_share(size, model, error / size, noise)
-    if kind == "factor":
-        return lambda model: ref.log_factor(size, model, error, noise)
     if kind == "shots":
         return lambda model: ref.log_of_shots(size, model, error, noise)
     if kind == "same":
@@ -112,8 +110,6 @@ def noises(kind, size, error, noise):
         scale, weight = ref.shot_scales(noise)
         return [(1.0, np.hypot(error / size, scale[:, None]), weight)]
     scale, weight = ref.stated_scales(noise, size, error)
-    if kind == "share":
-        return [(1.0, scale[:, None] * error / size, weight)]
     wrong = 0.5 * (1.0 - weight[0])
     weight[1:] *= 0.5
     scatter, further = ref.lognormal_grid(noise.scatter)
@@ -135,9 +131,9 @@ def brute_probabilities(fit, kind, noise):
     post = fit.seen.solutions["x"].posterior
     log = likelihood(kind, size, error, noise)
     drawn = rows, size, p.known, log, post.best, covariance, turn
-    beam = ref.log_evidence_of_beam(*drawn, number=30_000)
+    beam = ref.log_evidence_of_beam(*drawn, number=80_000)
     # Noise that is a share of the size would vanish where such a beam does: of what was measured.
-    own = {"share": "factor", "none": "same"}.get(kind, kind)
+    own = {"share": "stated", "none": "same"}.get(kind, kind)
     log = likelihood(own, size, error, noise)
     flat = ref.log_evidence_of_flat_beam(rows2, size, p.known, log, turn)
     mean = np.exp(np.log(size).mean())

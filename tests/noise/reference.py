@@ -96,30 +96,23 @@ def either_way(swift, slow, noise):
     return np.logaddexp(math.log(1.0 - noise.slow) + swift, math.log(noise.slow) + slow)
 
 
-def log_stated(size, model, error, noise):
+def log_stated(size, model, error, noise, share=None, unit=None):
     """Sizes with stated errors: right, too small by one factor, or by what settings scatter."""
-    factor, weight = stated_scales(noise, size, error)
+    factor, weight = stated_scales(noise, size, error if share is None else share * size)
+    unit = size if unit is None else unit
     right = weight[0]
     scatter, further = lognormal_grid(noise.scatter)
     weight[1:] *= 0.5
-    deviations = [s * error for s in factor] + [np.hypot(error, s * size) for s in scatter]
+    deviations = [s * error for s in factor] + [np.hypot(error, s * unit) for s in scatter]
     weights = np.append(weight, 0.5 * (1.0 - right) * further)
     off = size - model
     swift = log_averaged(lambda d: log_readings(off, d, noise), deviations, weights)
     return either_way(swift, math.log(right) + log_slow(off, error, 0.0, noise), noise)
 
 
-def log_factor(size, model, error, noise, share=None):
-    """Sizes with stated errors that are right or too small by one factor."""
-    factor, weight = stated_scales(noise, size, error if share is None else share * size)
-    off, deviations = size - model, [s * error for s in factor]
-    swift = log_averaged(lambda d: log_readings(off, d, noise), deviations, weight)
-    return either_way(swift, math.log(weight[0]) + log_slow(off, error, 0.0, noise), noise)
-
-
 def log_share(size, model, share, noise):
     """The same of errors that are one share of the size, and so of the beam's own."""
-    return log_factor(size, model, share * model, noise, share)
+    return log_stated(size, model, share * model, noise, share, model)
 
 
 def log_of_shots(size, model, floor, noise):
