@@ -148,7 +148,8 @@ def systematics(fit: EmittanceFit, plane: str) -> list[BudgetChange]:
     energy, mass = fit.seen.energy, fit.line.mass
     changes[of_energy := _energy_cause(energy, mass)] = 0.01 * float(by_energy)
     changes |= _within_scan(fit.seen.rows, len(fit.scan), *by_row)
-    changes |= _of_screen(fit, p, np.asarray(by_known)[keep])
+    blurred = np.asarray(fit.seen.rows.resolution)[keep]
+    changes |= _of_screen(fit, p, blurred, np.asarray(by_known)[keep])
     changes |= _of_rolls(fit, plane, np.asarray(by_known))
     # ln βγ rises by E²/(E² - m²) for each relative step of the energy.
     stiffer = 0.01 * energy**2 / (energy**2 - mass**2)
@@ -239,7 +240,9 @@ def _magnet_cause(fit: EmittanceFit, name: str) -> str:
     return f"{name} {word} +1 %" + ", not scanned" * (name not in varied_magnets(fit.scan))
 
 
-def _of_screen(fit: EmittanceFit, p: Points, by_known: np.ndarray) -> dict[str, float]:
+def _of_screen(
+    fit: EmittanceFit, p: Points, resolution: np.ndarray, by_known: np.ndarray
+) -> dict[str, float]:
     """Changes by the screen's scale and resolution, and by dispersion of the incoming beam."""
     spread = float(fit.seen.scanned.energy_spread) or SPREAD
     if fit.scan.energy_spread is not None:
@@ -248,12 +251,13 @@ def _of_screen(fit: EmittanceFit, p: Points, by_known: np.ndarray) -> dict[str, 
     scale = 2.0 * (1.0 - float(by_known @ p.known))
     dispersed = float(by_known @ (p.r11 * DISPERSION * spread) ** 2)
     smallest = float(np.min(p.size))
+    larger = (resolution + RESOLUTION) ** 2 - resolution**2
     return {
         "screen scale +1 %": 0.01 * scale,
         "smallest size 5 % too large (saturation, space charge)": float(by_known.sum())
         * ((1.0 + AT_WAIST) ** 2 - 1.0)
         * smallest**2,
-        "screen resolution 10 µm larger": float(by_known.sum()) * RESOLUTION**2,
+        "screen resolution 10 µm larger": float(by_known @ larger),
         f"dispersion 1 cm larger (spread {100 * spread:.2g} %)": dispersed,
     }
 

@@ -122,7 +122,7 @@ MOST_READINGS = 1 << 16
 # usual are of a monitor that stands.
 EQUAL, DIGITS, STANDS = 0.95, 3.0, 5
 # Readings that a step of a staircase lasts at least, and by how much of a digit steps may differ.
-STAIR, ROUNDING = 3, 1e-6
+STAIR, ROUNDING = 6, 1e-6
 
 
 def without_repeats(record: DecayRecord) -> DecayRecord:
@@ -183,13 +183,15 @@ def without_summer_time(record: DecayRecord) -> DecayRecord:
     return replace(record, time=since, notes=(*record.notes, note))
 
 
-def on_edges(record: DecayRecord) -> DecayRecord:
+def on_edges(record: DecayRecord, fewest: int = FEWEST) -> DecayRecord:
     """Take the edges between the digits of a monitor that has less noise than a digit.
 
     Parameters
     ----------
     record : DecayRecord
         One decay. One that is no staircase of single digits, or has errors, is given back.
+    fewest : int
+        Steps that it has at least.
 
     Returns
     -------
@@ -204,18 +206,20 @@ def on_edges(record: DecayRecord) -> DecayRecord:
     >>> print(on_edges(DecayRecord(t, np.round(100 * np.exp(-t / 36000), 1))))
     record: 95 readings over 0.989 h, 99.95 to 90.55 mA
     """
-    digit, change = record.resolution, np.diff(record.current)
-    edge = np.flatnonzero(change)
-    if digit is None or record.error is not None or edge.size < FEWEST:
+    digit, falling = record.resolution, np.sort(record.current)[::-1]
+    edge = np.flatnonzero(np.diff(falling))
+    if digit is None or record.error is not None or edge.size < fewest:
         return record
-    single = np.abs(change[edge] + digit) < ROUNDING * digit
-    if not single.all() or np.median(np.diff(edge)) < STAIR:
+    # Readings that go to and fro at an edge are as many above it as if they did not.
+    apart = np.abs(np.concatenate([np.diff(record.current), record.current - falling]))
+    single = np.abs(np.diff(falling)[edge] + digit) < ROUNDING * digit
+    if apart.max() > (1 + ROUNDING) * digit or not single.all() or np.median(np.diff(edge)) < STAIR:
         return record
     note = f"Steps of {digit:.3g} mA without noise: the {edge.size} edges between them were fitted."
     at = record.select(edge)
     middle = (record.time[edge] + record.time[edge + 1]) / 2
     return replace(
-        at, time=middle, current=(record.current[edge] + record.current[edge + 1]) / 2,
+        at, time=middle, current=(falling[edge] + falling[edge + 1]) / 2,
         start=None if record.start is None else record.start + float(middle[0]),
         notes=(*record.notes, note), mean=record.mean_current,
     )  # fmt: skip

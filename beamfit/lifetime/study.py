@@ -21,6 +21,7 @@ from beamfit.lifetime.free_law import DRIFT, Law
 from beamfit.lifetime.mechanisms import MECHANISMS, Losses, loss_coefficients
 from beamfit.lifetime.pieces import (
     FEWEST_CYCLES,
+    FEWEST_READINGS,
     Event,
     Split,
     beam_readings,
@@ -427,7 +428,9 @@ def _pooled(
             alone += [cycle for cycle in group if len(cycle) >= FEWEST]
             continue
         called = name if many == 1 else f"{name}@{len(pooled) + 1}"
-        fit = fit_cycles(group, called, law)
+        group = _on_edges(group)
+        # A refill between the edges of a staircase would show as a step.
+        fit = fit_cycles(group, called, law, found=group[0].mean is None)
         segment = joined(group, called)
         own = standing_alone(group, segment, fit)
         alone += own
@@ -436,6 +439,13 @@ def _pooled(
             continue
         pooled.append(Decay.of(segment, segment.start, fit, machine))
     return pooled, alone
+
+
+def _on_edges(cycles: list[DecayRecord]) -> list[DecayRecord]:
+    """The edges of cycles, of those that have enough, where most are staircases of digits."""
+    edges = [(cycle, on_edges(cycle, FEWEST_READINGS)) for cycle in cycles]
+    stairs = [found for cycle, found in edges if found is not cycle]
+    return stairs if len(stairs) >= max(FEWEST_CYCLES, len(cycles) / 2) else cycles
 
 
 def _decays(record: DecayRecord) -> tuple[Split, bool]:

@@ -141,7 +141,7 @@ def test_the_screen_in_the_budget_is_the_slope_of_a_refit(gtf, gtf_sizes, weight
     added = 1e-13  # m²
     ends = [gtf.with_element(Screen("SCREEN", float(np.sqrt(4e-10 + s)))) for s in (added, -added)]
     slope = (emittance(scan, ends[0]) - emittance(scan, ends[1])) / (2 * added)
-    assert changes["screen resolution 10 µm larger"] == pytest.approx(1e-10 * slope, rel=1e-5)
+    assert changes["screen resolution 10 µm larger"] == pytest.approx(5e-10 * slope, rel=1e-5)
     # What makes the smallest size 5 % too large is in every size², as a resolution is.
     waist = changes["smallest size 5 % too large (saturation, space charge)"]
     at_waist = (1.05**2 - 1.0) * scan.size["x"].min() ** 2
