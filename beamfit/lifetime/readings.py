@@ -122,7 +122,7 @@ MOST_READINGS = 1 << 16
 # usual are of a monitor that stands.
 EQUAL, DIGITS, STANDS = 0.95, 3.0, 5
 # Readings that a step of a staircase lasts at least, and by how much of a digit steps may differ.
-STAIR, ROUNDING = 6, 1e-6
+STAIR, ROUNDING = 3, 1e-6
 
 
 def without_repeats(record: DecayRecord) -> DecayRecord:
@@ -183,15 +183,15 @@ def without_summer_time(record: DecayRecord) -> DecayRecord:
     return replace(record, time=since, notes=(*record.notes, note))
 
 
-def on_edges(record: DecayRecord, fewest: int = FEWEST) -> DecayRecord:
+def on_edges(record: DecayRecord, fewest: int = FEWEST, lasting: int = STAIR) -> DecayRecord:
     """Take the edges between the digits of a monitor that has less noise than a digit.
 
     Parameters
     ----------
     record : DecayRecord
         One decay. One that is no staircase of single digits, or has errors, is given back.
-    fewest : int
-        Steps that it has at least.
+    fewest, lasting : int
+        Steps that it has at least, and readings that one lasts.
 
     Returns
     -------
@@ -213,7 +213,8 @@ def on_edges(record: DecayRecord, fewest: int = FEWEST) -> DecayRecord:
     # Readings that go to and fro at an edge are as many above it as if they did not.
     apart = np.abs(np.concatenate([np.diff(record.current), record.current - falling]))
     single = np.abs(np.diff(falling)[edge] + digit) < ROUNDING * digit
-    if apart.max() > (1 + ROUNDING) * digit or not single.all() or np.median(np.diff(edge)) < STAIR:
+    steady = apart.max() <= (1 + ROUNDING) * digit and single.all()
+    if not steady or np.median(np.diff(edge)) < lasting:
         return record
     note = f"Steps of {digit:.3g} mA without noise: the {edge.size} edges between them were fitted."
     at = record.select(edge)

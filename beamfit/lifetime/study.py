@@ -31,6 +31,7 @@ from beamfit.lifetime.pieces import (
 )
 from beamfit.lifetime.readings import (
     FEWEST,
+    STAIR,
     noise_of,
     on_edges,
     thinned,
@@ -442,8 +443,11 @@ def _pooled(
 
 
 def _on_edges(cycles: list[DecayRecord]) -> list[DecayRecord]:
-    """The edges of cycles, of those that have enough, where most are staircases of digits."""
-    edges = [(cycle, on_edges(cycle, FEWEST_READINGS)) for cycle in cycles]
+    """The edges of cycles, of those that have enough, where most are staircases of digits.
+
+    Their steps last twice as long: a few edges are off by as much again in every cycle.
+    """
+    edges = [(cycle, on_edges(cycle, FEWEST_READINGS, 2 * STAIR)) for cycle in cycles]
     stairs = [found for cycle, found in edges if found is not cycle]
     return stairs if len(stairs) >= max(FEWEST_CYCLES, len(cycles) / 2) else cycles
 

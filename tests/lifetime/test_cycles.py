@@ -470,3 +470,13 @@ def test_fills_in_flicker_noise_have_the_lifetime_of_the_beam():
         off.append((lifetime.value - 10.0) / lifetime.error)
     assert np.max(np.abs(off)) < 2.5
     assert np.sqrt(np.mean(np.square(off))) < 1.4
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.003, 0.01])
+def test_top_up_of_a_monitor_with_few_digits_is_fitted_at_its_edges(noise):
+    """SIMULATED: refills of .6 mA, steps of .1 mA that last for half a minute."""
+    time, current, _ = top_up(noise, 3, cycle=220.0, step=1.0, hours=2.0)
+    [pooled] = study_record(DecayRecord(time, np.round(current, 1))).pooled
+    lifetime = pooled.fit.lifetime_mean
+    true = true_lifetime(pooled.fit.mean_current)
+    assert abs(lifetime.value - true) < 4 * lifetime.error < 0.012 * true
