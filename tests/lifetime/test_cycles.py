@@ -479,4 +479,4 @@ def test_top_up_of_a_monitor_with_few_digits_is_fitted_at_its_edges(noise):
     [pooled] = study_record(DecayRecord(time, np.round(current, 1))).pooled
     lifetime = pooled.fit.lifetime_mean
     true = true_lifetime(pooled.fit.mean_current)
-    assert abs(lifetime.value - true) < 4 * lifetime.error < 0.012 * true
+    assert abs(lifetime.value - true) < 4 * lifetime.error < 0.0016 * true
