@@ -155,7 +155,7 @@ def _rival(e: PlaneEvidence) -> str:
 
 
 def _remedy(e: PlaneEvidence) -> str:
-    """What to check where the sizes may be a rival's."""
+    """Say what to check where the sizes may be a rival's."""
     rival = e.posterior.cause
     return REMEDIES.get(_rival(e) if rival == BEAM and not e.few else rival, "")
 

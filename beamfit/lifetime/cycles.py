@@ -149,11 +149,12 @@ def joined(cycles: Sequence[DecayRecord], name: str) -> DecayRecord:
     for part, cycle in zip(np.split(time, ends), cycles, strict=True):
         part += cycle.start - begin
     time.flags.writeable = False
+    stands = cycles[0].mean and float(np.mean([cycle.mean_current for cycle in cycles]))
     return DecayRecord(
         time, all_of([cycle.current for cycle in cycles]),
         all_of([cycle.error for cycle in cycles]), name, begin,
         Conditions(*map(all_of, zip(*(c.conditions for c in cycles), strict=True))),
-        notes=cycles[0].notes,
+        notes=cycles[0].notes, mean=stands,
     )  # fmt: skip
 
 

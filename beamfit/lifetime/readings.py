@@ -216,7 +216,7 @@ def on_edges(record: DecayRecord, fewest: int = FEWEST, lasting: int = STAIR) ->
     steady = apart.max() <= (1 + ROUNDING) * digit and single.all()
     if not steady or np.median(np.diff(edge)) < lasting:
         return record
-    note = f"Steps of {digit:.3g} mA without noise: the {edge.size} edges between them were fitted."
+    note = f"Steps of {digit:.3g} mA with little noise: the edges between them were fitted."
     at = record.select(edge)
     middle = (record.time[edge] + record.time[edge + 1]) / 2
     return replace(

@@ -331,7 +331,7 @@ class Decay:
             rows = [cycles[0].start, cycles[-1].start + cycles[-1].span] - np.array(self.offset)
             within = slice(*np.searchsorted(self.segment.time, rows))
             segment = self.segment.select(within, name)
-            own = fit_pieces(cycles, name, found=True)
+            own = fit_pieces(cycles, name, found=self.segment.mean is None)
             found.append(Decay.of(segment, cycles[0].start, own, machine))
         return found
 

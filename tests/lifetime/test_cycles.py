@@ -480,3 +480,6 @@ def test_top_up_of_a_monitor_with_few_digits_is_fitted_at_its_edges(noise):
     lifetime = pooled.fit.lifetime_mean
     true = true_lifetime(pooled.fit.mean_current)
     assert abs(lifetime.value - true) < 4 * lifetime.error < 0.0016 * true
+    begin, end = pooled.parts(2, None)
+    assert begin.fit.lifetime_mean.error < 2 * lifetime.error
+    assert end.fit.lifetime_mean.error < 2 * lifetime.error
