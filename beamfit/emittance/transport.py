@@ -413,7 +413,8 @@ def unit_warnings(scan: QuadScan, scanned: Beamline) -> tuple[str, ...]:
     tuple of str
         Sentences; nothing was changed because of them.
     """
-    return (*of_sizes(scan), *_of_gradients(scan, scanned), *_of_tables(scan, scanned))
+    asked = _of_energies, _of_gradients, _of_tables
+    return (*of_sizes(scan), *(said for ask in asked for said in ask(scan, scanned)))
 
 
 def of_sizes(scan: QuadScan) -> Iterator[str]:
@@ -427,6 +428,18 @@ def of_sizes(scan: QuadScan) -> Iterator[str]:
                 f"Sizes in {plane} around {usual / factor:.3g} {unit} are taken as they stand, but "
                 f"are unusually {unusual}: is that the unit they are in?"
             )
+
+
+def _of_energies(scan: QuadScan, scanned: Beamline) -> Iterator[str]:
+    """Ask about rows whose energy is another than the line's by a factor of two."""
+    if scan.energy is None:
+        return
+    given, own = middle(scan.energy), float(scanned.energy)
+    if not 0.5 < given / own < 2.0:
+        yield (
+            f"The rows have energies around {given:.4g} MeV, the line one of {own:.4g} MeV: are "
+            "both in MeV?"
+        )
 
 
 def of_emittances(planes: Iterable[Any]) -> Iterator[str]:

@@ -314,6 +314,14 @@ def test_an_emittance_of_few_accelerators_is_asked_about(gtf, factor, words, roo
     assert any(words in note for note in fit.notes)
 
 
+@pytest.mark.parametrize(("factor", "asked"), [(1.25, False), (10.0, True), (0.1, True)])
+def test_rows_of_another_energy_than_the_lines_are_asked_about(gtf, factor, asked, root):
+    scan = beamfit.read_quad_scan(root / "measurements/gtf_simulated.csv")
+    energy = np.full(len(scan), factor * float(gtf.energy))
+    fit = beamfit.fit_emittance(replace(scan, energy=energy), gtf)
+    assert any("the line one of 30.5 MeV" in note for note in fit.notes) is asked
+
+
 @pytest.mark.parametrize("stated", [1e-4, 5e-4, 2e-3])
 def test_stated_errors_far_too_small_refuse_no_beam(otr2, stated):
     """SIMULATED sizes with 2 % noise under errors such as those of fits to their profiles."""
