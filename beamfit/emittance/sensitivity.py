@@ -147,7 +147,7 @@ def systematics(fit: EmittanceFit, plane: str) -> list[BudgetChange]:
             changes[cause] = changes.get(cause, 0.0) + step * float(slope)
     energy, mass = fit.seen.energy, fit.line.mass
     changes[of_energy := _energy_cause(energy, mass)] = 0.01 * float(by_energy)
-    changes |= _within_scan(fit.seen.rows, len(fit.scan), *by_row)
+    changes |= _within_scan(rows, len(fit.scan), keep, *by_row)
     blurred = np.asarray(fit.seen.rows.resolution)[keep]
     changes |= _of_screen(fit, p, blurred, np.asarray(by_known)[keep])
     changes |= _of_rolls(fit, plane, np.asarray(by_known))
@@ -160,18 +160,21 @@ def systematics(fit: EmittanceFit, plane: str) -> list[BudgetChange]:
 
 
 def _within_scan(
-    rows: Rows, count: int, by_energy: Array, by_setting: dict[str, Array]
+    rows: Rows, count: int, own: np.ndarray, by_energy: Array, by_setting: dict[str, Array]
 ) -> dict[str, float]:
-    """Changes by what moves from row to row: a drift of the energy, and magnets that are late."""
+    """Changes by what moves from row to row: a drift of the energy, and magnets that are late.
+
+    Steps are those between the plane's own rows: from one plane's sweep back to the start of the
+    other's a magnet has time.
+    """
     # Rows beyond the scan's are of no weight.
     rises = float(np.asarray(by_energy)[:count] @ np.linspace(-0.5, 0.5, count))
     found = {"energy rises by 1 % within the scan": DRIFT * rises}
     for name, slope in by_setting.items():
-        setting = np.asarray(rows.settings[name])
+        setting = np.asarray(rows.settings[name])[own]
         behind = LATE * np.diff(setting, axis=0, prepend=setting[:1])
-        behind[count:] = 0.0
         if behind.any():
-            late = -float(np.sum(np.asarray(slope) * behind))
+            late = -float(np.sum(np.asarray(slope)[own] * behind))
             found[f"{name} late by 10 % of each step, row by row"] = late
     return found
 

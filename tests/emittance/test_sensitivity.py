@@ -92,6 +92,27 @@ def test_what_moves_within_a_scan_is_the_slope_of_a_refit(gtf, gtf_sizes):
         assert changes[cause] == pytest.approx(step * np.log(up / down) / (2 * h), rel=0.02)
 
 
+def test_a_magnet_has_time_between_the_sweeps_of_two_planes(root):
+    """Sizes of x and then those of y: the magnet goes back between them."""
+    scan = beamfit.read_quad_scan(root / "measurements/lcls_otr2.csv")
+    line = beamfit.load_lattice(root / "lattices/lcls_otr2.toml")
+    gap = np.full(len(scan), np.nan)
+    both = replace(
+        scan,
+        settings={name: np.tile(v, 2) for name, v in scan.settings.items()},
+        size={"x": np.append(scan.size["x"], gap), "y": np.append(gap, scan.size["y"])},
+        error={"x": np.append(scan.error["x"], gap), "y": np.append(gap, scan.error["y"])},
+        shots=np.tile(scan.shots, 2),
+    )
+    for plane in "xy":
+        one, other = (
+            {c.cause: c.emittance for c in systematics(beamfit.fit_emittance(each, line), plane)}
+            for each in (scan, both)
+        )
+        cause = "Q525 late by 10 % of each step, row by row"
+        assert other[cause] == pytest.approx(one[cause], rel=1e-6)
+
+
 def test_budget_of_a_drift_in_parts_is_that_of_the_whole(gtf, gtf_sizes):
     """1 cm more is 1 cm more in whichever of sixty parts; the table shows the largest."""
     currents, _, sizes = gtf_sizes
