@@ -146,7 +146,7 @@ def plane_answer(
     n, carrying = _numbers(post, p, places, b)
     e = _evidence(seen, plane, n, b)
     advice = next_measurement(seen, plane) if _advised(e, b) else None
-    finding = verdict(e, _remarks(seen, plane, e, b, carrying, n.value), advice or "")
+    finding = verdict(e, _remarks(seen, plane, e, b, carrying, n), advice or "")
     holds = e.of_a_beam and e.ending is None
     known = e.determined | (LINEAR & holds & (b is None))
     emittance, normalized, beta, alpha, s11, s12, s22, *screen, mismatch = n.quantities(
@@ -205,15 +205,17 @@ def _advised(e: PlaneEvidence, b: Beside | None) -> bool:
 
 def _remarks(
     seen: PreparedScan, plane: str, e: PlaneEvidence, b: Beside | None, carrying: Influence,
-    value: np.ndarray,
+    n: PlaneNumbers,
 ) -> str:  # fmt: skip
     """Further sentences on noise and points."""
     work = seen.solutions[plane]
     post, p, remarks = work.posterior, work.points, [work.shot_words]
     if e.of_a_beam:
         likely = chi2_probability(post.chi2, max(len(p.size) - 3, 0))
-        remarks.insert(0, noise_remark(post.noise, post.scale, likely))
-        without = carrying.without * value[1] / value[0]
+        by_noise = e.determined and b is None and abs(carrying.shift) <= MOVES
+        enlarged = _scale(n) if by_noise else 1.0
+        remarks.insert(0, noise_remark(post.noise, post.scale, likely, enlarged))
+        without = carrying.without * n.value[1] / n.value[0]
         place = "" if e.opened else carrying.place
         if place:
             place += _bad_elsewhere(seen, plane, carrying.point)

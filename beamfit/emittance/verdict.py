@@ -29,6 +29,8 @@ SURE = 0.99
 # A point carries the answer if the emittance moves by so many errors without it; the interval
 # reaches to where it goes if that is farther than any noise would move it.
 CARRIES, MOVES = 2.0, 3.0
+# An error so many times that by the stated errors is explained, where nothing else explains it.
+ENLARGED = 1.5
 # Above this probability of χ² stated errors are called too large.
 OVERSTATED = 0.999
 # Points that a sentence names.
@@ -196,7 +198,9 @@ def _open(e: PlaneEvidence) -> str:
     return f"the 95 % interval of the emittance spans a factor {said}{waist}"
 
 
-def noise_remark(noise: str, scale: np.ndarray, probability: float | None = None) -> str:
+def noise_remark(
+    noise: str, scale: np.ndarray, probability: float | None = None, enlarged: float = 1.0
+) -> str:
     """Say what the noise turned out to be, where that differs from what was stated.
 
     Parameters
@@ -207,6 +211,8 @@ def noise_remark(noise: str, scale: np.ndarray, probability: float | None = None
         Median and central 68 % of its scale.
     probability : float, optional
         Of a χ² at least as large as that of the stated errors.
+    enlarged : float
+        Error over that by the stated errors alone.
 
     Examples
     --------
@@ -226,6 +232,11 @@ def noise_remark(noise: str, scale: np.ndarray, probability: float | None = None
             return (
                 "Stated errors seem too large, and so is the error here: the sizes scatter less "
                 f"(probability {chance})."
+            )
+        if enlarged > ENLARGED:
+            return (
+                f"The error is {enlarged:.2g} times that by the stated errors alone: errors like "
+                "these are often too small, and these points do not tell."
             )
     if noise in ("shots", "beyond") and middle > 0.005:
         than = "shots" if noise == "shots" else "stated errors"

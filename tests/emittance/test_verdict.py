@@ -341,6 +341,24 @@ def test_stated_errors_far_too_small_refuse_no_beam(otr2, stated):
     assert said.error == pytest.approx(right.error, rel=0.3)
 
 
+def test_an_error_beyond_the_stated_ones_is_explained(gtf, root):
+    """SIMULATED: errors of .5 % that are right; five points do not tell that they are."""
+    scan = beamfit.read_quad_scan(root / "measurements/gtf_simulated.csv")
+    true = beamfit.fit_emittance(scan, gtf).x.points.model
+    size = true * (1 + 0.005 * np.random.default_rng(2).normal(size=len(true)))
+    for rows, told in ((slice(1, None, 3), True), (slice(None), False)):
+        some = replace(
+            scan,
+            settings={"Q2": scan.settings["Q2"][rows]},
+            size={"x": size[rows]},
+            error={"x": 0.005 * size[rows]},
+        )
+        fit = beamfit.fit_emittance(some, gtf).x
+        assert fit.status is Status.converged
+        assert ("times that by the stated errors alone" in fit.message) is told
+        assert (fit.emittance.error > 1.5 * fit.emittance.error_raw) is told
+
+
 def test_no_scatter_is_said_to_a_ten_thousandth_of_a_per_cent():
     said = noise_remark("shots", np.array([0.014, 5.7e-5, 0.028]))
     assert "1.4 % (0.01 to 2.8 %)" in said
