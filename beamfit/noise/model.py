@@ -32,7 +32,7 @@ class Lognormal(NamedTuple):
 
         Examples
         --------
-        >>> round(Lognormal(1.0, 0.5).log_probability_above(1.0), 6)
+        >>> print(Lognormal(1.0, 0.5).log_probability_above(1.0).round(6))
         -0.693147
         """
         if not least > 0.0:
@@ -54,8 +54,8 @@ class Lognormal(NamedTuple):
         Examples
         --------
         >>> both, log = Lognormal(1.0, 1.0).and_also(Lognormal(4.0, 1.0))
-        >>> round(both.middle, 6), round(both.spread**2, 6)
-        (2.0, 0.5)
+        >>> print(both.middle.round(6), (both.spread**2).round(6))
+        2.0 0.5
         """
         spread = np.hypot(self.spread, other.spread)
         share = (self.spread / spread) ** 2
