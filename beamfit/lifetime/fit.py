@@ -36,34 +36,23 @@ def bare(value: float | None, unit: str) -> dict[str, Any]:
     return {"value": value, "error": None, "unit": unit}
 
 
-class LossFit:
-    """A fitted loss: the forms that the fits of a decay and of a table of lifetimes have alike."""
+def headline_of(fit: Any) -> str:
+    """The record, the status and the lifetime of a decay or a table of lifetimes in a line."""
+    return f"{fit.record} {cell(fit.status)}: mean lifetime {fit.lifetime_mean}"
 
-    @property
-    def quantities(self) -> dict[str, Quantity]:
-        """Quoted quantities, by name."""
-        return {name: getattr(self, name) for name in UNITS if hasattr(self, name)}
 
-    @property
-    def headline(self) -> str:
-        """The record, its status and its lifetime in a line."""
-        return f"{self.record} {cell(self.status)}: mean lifetime {self.lifetime_mean}"
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the result as one JSON object, as `beamfit lifetime --json` prints it."""
-        first, last = ("record", "status", "message"), ("chi2", "dof", "noise_inferred")
-        last = (*last, "identifiability", "constant_a")
-        found = {name: getattr(self, name) for name in (*first, *self.quantities, *last)}
-        more = {
-            "mean_current": bare(self.mean_current, "mA"),
-            "lifetime_by_current": self.lifetimes,
-        }
-        return json_of(found | more)
+def loss_json(fit: Any) -> dict[str, Any]:
+    """Say in JSON what the fits of a decay and of a table of lifetimes have alike."""
+    first, last = ("record", "status", "message"), ("chi2", "dof", "noise_inferred")
+    last = (*last, "identifiability", "constant_a")
+    found = {name: getattr(fit, name) for name in (*first, *fit.quantities, *last)}
+    more = {"mean_current": bare(fit.mean_current, "mA"), "lifetime_by_current": fit.lifetimes}
+    return json_of(found | more)
 
 
 @answer
 @dataclass(frozen=True, eq=False)
-class DecayFit(LossFit):
+class DecayFit:
     """The result of `fit_decay`.
 
     Parameters
@@ -235,6 +224,16 @@ class DecayFit(LossFit):
         return about if not power else solved(about.pieces, start=[*about.numbers[:2], power])
 
     @property
+    def quantities(self) -> dict[str, Quantity]:
+        """Quoted quantities, by name."""
+        return {name: getattr(self, name) for name in UNITS}
+
+    @property
+    def headline(self) -> str:
+        """The answer in a line."""
+        return headline_of(self)
+
+    @property
     def noise(self) -> float:
         """Standard deviation of a reading that the residuals show, mA."""
         return self.rms_residual * math.sqrt(self.residuals.size / self.dof)
@@ -266,8 +265,8 @@ class DecayFit(LossFit):
         return quantity_frame(rows, ("record", "quantity"))
 
     def to_json(self) -> dict[str, Any]:
-        """Return the same of a decay, with its noise and what else explains it."""
-        found = super().to_json() | {
+        """Return the result as one JSON object, as `beamfit lifetime --json` prints it."""
+        found = loss_json(self) | {
             "rms_residual": bare(self.rms_residual, "mA"),
             "correlation_time": bare(self.correlation_time, "s"),
             "change": self.change,

@@ -20,7 +20,7 @@ from beamfit.greybox.solve import solve
 from beamfit.lifetime.alternatives import CURRENTS, ConstantA, LifetimeLaw, constant_a
 from beamfit.lifetime.answer import TableEvidence, finding_of_table
 from beamfit.lifetime.evidence import EXACT, UNITS
-from beamfit.lifetime.fit import LossFit, bare
+from beamfit.lifetime.fit import bare, headline_of, loss_json
 from beamfit.lifetime.record import FEWEST_LIFETIMES, LifetimeTable
 from beamfit.quantity import HOUR, Quantity, Status
 from beamfit.statistics import reach_of
@@ -35,7 +35,7 @@ RECORD = "lifetimes"
 
 @answer
 @dataclass(frozen=True, eq=False)
-class LifetimeFit(LossFit):
+class LifetimeFit:
     """The result of `fit_lifetimes`.
 
     Parameters
@@ -76,6 +76,16 @@ class LifetimeFit(LossFit):
     readings: LifetimeTable
 
     @property
+    def quantities(self) -> dict[str, Quantity]:
+        """Quoted quantities, by name."""
+        return {name: getattr(self, name) for name in UNITS if name != "i0"}
+
+    @property
+    def headline(self) -> str:
+        """The answer in a line."""
+        return headline_of(self)
+
+    @property
     def noise_inferred(self) -> bool:
         """True if the table came without errors."""
         return self.readings.error is None
@@ -96,9 +106,9 @@ class LifetimeFit(LossFit):
         return (labelled("", [self.record], rows),)
 
     def to_json(self) -> dict[str, Any]:
-        """Return the same of a table, with what was left out."""
+        """Return the result as one JSON object, with what was left out."""
         more = {"i0": bare(None, "mA"), "outliers": self.outliers, "notes": self.readings.notes}
-        return super().to_json() | json_of(more)
+        return loss_json(self) | json_of(more)
 
 
 def _rate(model: dict[str, Array], x: Array) -> Array:
