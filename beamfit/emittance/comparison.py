@@ -94,9 +94,7 @@ def flat_beam(c: Coordinates, kind: NoiseKind, noise: Noise) -> np.ndarray:
     v = np.take_along_axis(v[..., 0], best[..., None], -2)
     normal = np.take_along_axis(normal, best[..., None, None], -3)
     least = np.take_along_axis(chi2, best, -1)
-    factor = (
-        np.maximum(1.0, least / max(n - 2, 1)) if kind.special is not None else (2.0 + least) / n
-    )
+    factor = (2.0 + least) / n if kind.special is None else np.maximum(1.0, least / max(n - 2, 1))
     root = WIDER * np.linalg.cholesky(np.linalg.inv(normal)) * np.sqrt(factor)[..., None, None]
 
     def each(v: np.ndarray, scale: np.ndarray) -> np.ndarray:

@@ -148,7 +148,7 @@ def systematics(fit: EmittanceFit, plane: str) -> list[BudgetChange]:
     energy, mass = fit.seen.energy, fit.line.mass
     changes[of_energy := _energy_cause(energy, mass)] = 0.01 * float(by_energy)
     changes |= _within_scan(rows, len(fit.scan), keep, *by_row)
-    blurred = np.asarray(fit.seen.rows.resolution)[keep]
+    blurred = np.asarray(rows.resolution)[keep]
     changes |= _of_screen(fit, p, blurred, np.asarray(by_known)[keep])
     changes |= _of_rolls(fit, plane, np.asarray(by_known))
     # ln βγ rises by E²/(E² - m²) for each relative step of the energy.

@@ -206,9 +206,11 @@ def on_edges(record: DecayRecord, fewest: int = FEWEST, lasting: int = STAIR) ->
     >>> print(on_edges(DecayRecord(t, np.round(100 * np.exp(-t / 36000), 1))))
     record: 95 readings over 0.989 h, 99.95 to 90.55 mA
     """
-    digit, falling = record.resolution, np.sort(record.current)[::-1]
+    if (digit := record.resolution) is None or record.error is not None:
+        return record
+    falling = np.sort(record.current)[::-1]
     edge = np.flatnonzero(np.diff(falling))
-    if digit is None or record.error is not None or edge.size < fewest:
+    if edge.size < fewest:
         return record
     # Readings that go to and fro at an edge are as many above it as if they did not.
     apart = np.abs(np.concatenate([np.diff(record.current), record.current - falling]))

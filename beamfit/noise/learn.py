@@ -159,8 +159,7 @@ def _log_evidence(s: Sample, noise: Noise) -> float:
         skip = int(old.special is not None)
         log = np.log(scales.scale[skip:])
         ratio = _log_masses(new.prior, log) - _log_masses(old.prior, log)
-        above = (k.prior.log_probability_above(k.least) for k in (old, new))
-        ratio += next(above) - next(above) + np.log1p(-new.chance) - np.log1p(-old.chance)
+        ratio += new.log_range - old.log_range
         if skip:
             ratio = np.append(np.log(new.chance) - np.log(old.chance), ratio)
         parts.append(averaged(evidence + scales.log_weight + ratio + new.log_weight, 0.0))

@@ -73,6 +73,11 @@ class NoiseKind:
     least: float = 0.0
     slow: bool = False
 
+    @property
+    def log_range(self) -> Any:
+        """Log probability that s is not the special value, over that of its prior above `least`."""
+        return np.log1p(-self.chance) - self.prior.log_probability_above(self.least)
+
     def deviation(self, scale: Any) -> Any:
         """Standard deviation of every point over model^power, at one scale of each plane."""
         return np.hypot(self.floor, np.asarray(scale)[..., None] * self.unit)
@@ -132,12 +137,16 @@ def kinds_of(
     """
     zero, one, every = np.zeros_like(size), np.ones_like(size), np.ones(size.shape[:-1])
     swift, slow = math.log1p(-noise.slow) * every, math.log(noise.slow) * every
-    scatter = Lognormal(*(v * every for v in noise.scatter))
+
+    def of_all(prior: Lognormal) -> Lognormal:
+        return Lognormal(prior.middle * every, prior.spread * every)
+
+    scatter = of_all(noise.scatter)
     if of_shots:
         kinds = (NoiseKind(0, error, size, scatter, noise.even * every, swift, special=0.0),)
     elif error is None:
         middle = np.median(size, axis=-1, keepdims=True) * one
-        unstated = Lognormal(*(v * every for v in noise.unstated))
+        unstated = of_all(noise.unstated)
         share, same = math.log(noise.share) + swift, math.log1p(-noise.share) + swift
         kinds = (
             NoiseKind(1, zero, one, unstated, zero[..., 0], share),
@@ -170,9 +179,8 @@ def scales_between(kind: NoiseKind, low: np.ndarray, high: np.ndarray) -> Scales
         high = np.maximum(high, low + 0.01)
     step = (high - low) / (NODES - 1)
     log = low[..., None] + step[..., None] * np.arange(NODES)
-    whole = np.log1p(-kind.chance) - kind.prior.log_probability_above(kind.least)
     prior = Lognormal(*(np.asarray(v)[..., None] for v in kind.prior))
-    weight = prior.log_density(log) + (whole + np.log(step))[..., None]
+    weight = prior.log_density(log) + (kind.log_range + np.log(step))[..., None]
     # The trapezoidal rule.
     weight = weight - math.log(2.0) * np.isin(np.arange(NODES), (0, NODES - 1))
     if kind.special is None:
