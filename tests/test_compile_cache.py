@@ -4,10 +4,12 @@ import json
 import os
 import subprocess
 import sys
+from importlib.metadata import version
 
 import pytest
 
 from beamfit import compile_cache
+from beamfit.compile_cache import TRIED
 
 # Says where code is kept and how often it was found there; runs one of the package's functions.
 SCRIPT = """
@@ -103,6 +105,7 @@ def test_what_the_user_has_set_stands(tmp_path):
 
 ANSWER = """
 import sys
+from importlib.metadata import version
 import beamfit
 scan = beamfit.read_quad_scan("measurements/lcls_otr2.csv")
 print(beamfit.fit_emittance(scan, beamfit.load_lattice("lattices/lcls_otr2.toml")))
@@ -129,10 +132,12 @@ def test_compilation_is_quick_unless_the_user_says_otherwise():
     """XLA would end the process at a flag it does not know."""
     code = (
         "import os; os.environ.pop('XLA_FLAGS', None); from beamfit.compile_cache import *\n"
-        "prepare_jax(); prepare_jax(); print(os.environ['XLA_FLAGS'])\n"
+        "prepare_jax(); prepare_jax(); print(os.environ.get('XLA_FLAGS', 'untried'))\n"
         "import jax.numpy as jnp; print(float(jnp.sin(jnp.arange(3.0)).sum() * 0))\n"
         "own = '--xla_cpu_use_fusion_emitters=true'; os.environ['XLA_FLAGS'] = own\n"
         "prepare_jax(); print(os.environ['XLA_FLAGS'] == own)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert done.stdout.split() == ["--xla_cpu_use_fusion_emitters=false", "0.0", "True"]
+    tried = version("jax").startswith(TRIED)
+    flag = "--xla_cpu_use_fusion_emitters=false" if tried else "untried"
+    assert done.stdout.split() == [flag, "0.0", "True"]

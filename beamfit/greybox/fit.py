@@ -240,7 +240,7 @@ class Fit:
         usable = np.isfinite(value) & np.isfinite(slope).all(axis=-1)
         flat = np.where(usable[..., None], slope, 0.0)
         share = np.where(usable, self.spread.share(flat), 1.0)
-        known = (share < MOST_SHARE) & ~any(group.unknown for group in self.groups)
+        known = (share < MOST_SHARE) & (not any(group.unknown for group in self.groups))
         errors = (
             np.where(known, part.error(flat), np.nan) for part in (self.spread, self.spread_raw)
         )
