@@ -123,18 +123,26 @@ def _results(step, operands: list[Any]) -> list[Any]:
     if inner is not None and name not in ("scan", "while", "cond"):
         return _followed(inner.jaxpr, inner.consts, operands)
     if name == "scan" and step.params["length"] * len(inner.jaxpr.eqns) <= UNROLLED:
-        return _looped(step.params, inner, operands)
+        return _looped(step, inner, operands)
     found = _of_step(step, operands)
     if found.sign is None and not np.isfinite(found.degree):
         raise _Unknown
     return [found] * len(step.outvars)
 
 
-def _looped(params: dict[str, Any], inner: ClosedJaxpr, operands: list[Any]) -> list[Any]:
-    """A loop of known length, step by step; all elements of an array have one curvature."""
-    fixed, kept = params["num_consts"], params["num_carry"]
+def _looped(step, inner: ClosedJaxpr, operands: list[Any]) -> list[Any]:
+    """A loop of known length, step by step; all elements of an array have one curvature.
+
+    What differs from step to step has one axis more outside of the loop than within.
+    """
+
+    def same(outer, own) -> list[bool]:
+        return [a.aval.shape == b.aval.shape for a, b in zip(outer, own, strict=True)]
+
+    kept = sum(same(step.outvars, inner.jaxpr.outvars))
+    fixed = sum(same(step.invars, inner.jaxpr.invars)) - kept
     constants, carry, each = operands[:fixed], operands[fixed:][:kept], operands[fixed + kept :]
-    times = range(params["length"])[:: -1 if params["reverse"] else 1]
+    times = range(step.params["length"])[:: -1 if step.params["reverse"] else 1]
     found: dict[int, list[Any]] = {}
     for t in times:
         now = [v if isinstance(v, Curvature) else v[t] for v in each]
