@@ -33,27 +33,78 @@ class SearchLimit(NamedTuple):
         return np.inf if self.until is None else self.until - time.perf_counter()
 
 
-class _TimeIsUp(Exception):
-    """Ends a solver that cannot be told of a limit."""
+def _tame(size: np.ndarray) -> np.ndarray:
+    """Sizes near 1 are left alone: solvers' own steps and tolerances are made for those."""
+    return np.where((size > 1e2) | (size < 1e-2), size, 1.0)
 
 
-class NonlinearProgram(NamedTuple):
-    """A constrained minimisation in plain NumPy functions of x, well scaled.
+class NonlinearProgram:
+    """A problem for a solver in functions of x: moving numbers, cost and limits in their sizes.
 
-    `values(x)` gives cost and constraints, `slopes(x)` the cost's gradient and the constraints'
-    Jacobian, `hessian(x, sigma, y)` the Hessian of sigma * cost - y @ constraints.
-    `numbers(x)` are the problem's own, `point(theta)` is x of them.
+    Parameters
+    ----------
+    p : Problem
+        The problem.
+    start : array, shape (n,)
+        Holds the numbers that do not move.
+    at : Slopes
+        At the start.
+    scale : Scale
+        Of the problem.
+    hessian : str
+        ``gauss_newton`` or anything else for the exact one.
     """
 
-    values: Callable[[np.ndarray], tuple[float, np.ndarray]]
-    slopes: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
-    hessian: Callable[[np.ndarray, float, np.ndarray], np.ndarray]
-    lower: np.ndarray
-    upper: np.ndarray
-    c_lower: np.ndarray
-    c_upper: np.ndarray
-    numbers: Callable[[np.ndarray], np.ndarray]
-    point: Callable[[np.ndarray], np.ndarray]
+    def __init__(
+        self, p: Problem, start: np.ndarray, at: assess.Slopes, scale: assess.Scale, hessian: str
+    ):
+        self.problem, self.start, self.gauss_newton = p, start, hessian == "gauss_newton"
+        self.moving = np.flatnonzero(p.moving)
+        self.unit, self.limit = _tame(scale.unit)[self.moving], _tame(scale.limit)
+        steepest = max(np.max(np.abs(at.gradient * scale.unit)), 1e-300)
+        # Squares are counted in their errors; a steep cost is flattened, as IPOPT does.
+        self.flat = 1.0 / scale.cost if p.objectives else min(1.0, 100.0 / steepest)
+        self.lower, self.upper = (self.point(end) for end in (p.lower, p.upper))
+        self.c_lower, self.c_upper = (
+            p.constraint_lower / self.limit,
+            p.constraint_upper / self.limit,
+        )
+        # A solver asks for cost and limits of one point after the other: the last are remembered.
+        self._parts = lru_cache(maxsize=8)(self._computed)
+
+    def point(self, theta: np.ndarray) -> np.ndarray:
+        """X of the problem's own numbers."""
+        return theta[self.moving] / self.unit
+
+    def numbers(self, x: np.ndarray) -> np.ndarray:
+        """The problem's own numbers."""
+        theta = self.start.copy()
+        theta[self.moving] = x * self.unit
+        return theta
+
+    def _computed(self, function: Callable, x: bytes) -> list[np.ndarray]:
+        theta = self.numbers(np.frombuffer(x))
+        return [np.asarray(part) for part in self.problem.compiled(function)(theta)]
+
+    def values(self, x: np.ndarray) -> tuple[float, np.ndarray]:
+        """Cost and constraints."""
+        cost, c = self._parts(problem.values, x.tobytes())
+        return self.flat * float(cost), c / self.limit
+
+    def slopes(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Gradient of the cost and Jacobian of the constraints."""
+        s = assess.Slopes(*self._parts(assess.first_order, x.tobytes()))
+        jacobian = s.jacobian[:, self.moving] * self.unit / self.limit[:, None]
+        return self.flat * s.gradient[self.moving] * self.unit, jacobian
+
+    def hessian(self, x: np.ndarray, sigma: float, y: np.ndarray) -> np.ndarray:
+        """Hessian of sigma * cost - y @ constraints."""
+        if self.gauss_newton:
+            rows = self._parts(assess.first_order, x.tobytes())[1][:, self.moving] * self.unit
+            return sigma * self.flat * rows.T @ rows
+        exact = self.problem.compiled(assess.lagrangian_hessian)
+        h = np.asarray(exact(self.numbers(x), sigma * self.flat, y / self.limit))
+        return h[np.ix_(self.moving, self.moving)] * np.outer(self.unit, self.unit)
 
 
 class SolverEnd(NamedTuple):
@@ -67,9 +118,7 @@ class SolverEnd(NamedTuple):
 def _uno(preset: str, **more: float) -> Callable[[NonlinearProgram, np.ndarray, int], SolverEnd]:
     """A solver by Uno with one of its presets, and options of its own."""
 
-    def solve(
-        program: NonlinearProgram, x: np.ndarray, iterations: int, budget: SearchLimit
-    ) -> SolverEnd:
+    def solve(program, x: np.ndarray, iterations: int, budget: SearchLimit) -> SolverEnd:
         import unopy
 
         solver = unopy.UnoSolver()
@@ -92,13 +141,8 @@ def _uno(preset: str, **more: float) -> Callable[[NonlinearProgram, np.ndarray, 
 def _uno_model(unopy, program: NonlinearProgram, x: np.ndarray):
     """State the program to Uno with dense derivatives."""
     n, m = len(x), len(program.c_lower)
-    model = unopy.Model(
-        unopy.PROBLEM_NONLINEAR,
-        n,
-        program.lower.tolist(),
-        program.upper.tolist(),
-        unopy.ZERO_BASED_INDEXING,
-    )
+    ends = program.lower.tolist(), program.upper.tolist()
+    model = unopy.Model(unopy.PROBLEM_NONLINEAR, n, *ends, unopy.ZERO_BASED_INDEXING)
 
     def gradient(at, out):
         out[:] = program.slopes(np.array(at))[0]
@@ -115,28 +159,17 @@ def _uno_model(unopy, program: NonlinearProgram, x: np.ndarray):
         out[:] = program.hessian(np.array(at), sigma, np.array(y))[low]
 
     model.set_objective(unopy.MINIMIZE, lambda at: float(program.values(np.array(at))[0]), gradient)
-    rows, columns = (i.ravel().tolist() for i in np.indices((m, n)))
-    model.set_constraints(
-        m,
-        constraints,
-        program.c_lower.tolist(),
-        program.c_upper.tolist(),
-        m * n,
-        rows,
-        columns,
-        jacobian,
-    )
-    model.set_lagrangian_hessian(
-        len(low[0]), unopy.LOWER_TRIANGLE, low[0].tolist(), low[1].tolist(), hessian
-    )
+    places = [i.ravel().tolist() for i in np.indices((m, n))]
+    ends = program.c_lower.tolist(), program.c_upper.tolist()
+    model.set_constraints(m, constraints, *ends, m * n, *places, jacobian)
+    places = [i.tolist() for i in low]
+    model.set_lagrangian_hessian(len(low[0]), unopy.LOWER_TRIANGLE, *places, hessian)
     model.set_lagrangian_sign_convention(unopy.MULTIPLIER_NEGATIVE)
     model.set_initial_primal_iterate(x.tolist())
     return model
 
 
-def _slsqp(
-    program: NonlinearProgram, x: np.ndarray, iterations: int, budget: SearchLimit
-) -> SolverEnd:
+def _slsqp(program, x: np.ndarray, iterations: int, budget: SearchLimit) -> SolverEnd:
     """Solve by scipy's sequential quadratic programming."""
     from scipy import optimize
 
@@ -155,7 +188,7 @@ def _slsqp(
 
     def in_time(at):
         if budget.left <= 0:
-            raise _TimeIsUp
+            raise TimeoutError
         last[0] = at.copy()
 
     try:
@@ -169,7 +202,7 @@ def _slsqp(
             callback=in_time,
             options={"maxiter": iterations, "ftol": 1e-15},
         )
-    except _TimeIsUp:
+    except TimeoutError:
         return SolverEnd(last[0], 0, "time is up")
     return SolverEnd(found.x, int(found.nit), found.message)
 
@@ -201,76 +234,3 @@ SOLVERS: tuple[Stage, ...] = (
     Stage("scipy SLSQP", "slsqp", "none", 300, _slsqp),
 )
 """In the order of trying; what an interior point leaves short of its limits is sharpened."""
-
-
-def _tame(size: np.ndarray) -> np.ndarray:
-    """Sizes near 1 are left alone: solvers' own steps and tolerances are made for those."""
-    return np.where((size > 1e2) | (size < 1e-2), size, 1.0)
-
-
-def scaled(
-    p: Problem, start: np.ndarray, at: assess.Slopes, scale: assess.Scale, hessian: str
-) -> NonlinearProgram:
-    """A problem for a solver: moving numbers, cost and constraints in their sizes.
-
-    Parameters
-    ----------
-    p : Problem
-        The problem.
-    start : array, shape (n,)
-        Holds the numbers that do not move.
-    at : Slopes
-        At the start.
-    scale : Scale
-        Of the problem.
-    hessian : str
-        ``gauss_newton`` or anything else for the exact one.
-
-    Returns
-    -------
-    NonlinearProgram
-        That remembers its last points.
-    """
-    moving = np.flatnonzero(p.moving)
-    unit, limit = _tame(scale.unit)[moving], _tame(scale.limit)
-    steepest = max(np.max(np.abs(at.gradient * scale.unit)), 1e-300)
-    # Squares are counted in their errors; a steep cost is flattened, as IPOPT does.
-    flat = 1.0 / scale.cost if p.objectives else min(1.0, 100.0 / steepest)
-
-    def full(x):
-        theta = start.copy()
-        theta[moving] = x * unit
-        return theta
-
-    @lru_cache(maxsize=8)
-    def parts(function, x):
-        return [np.asarray(part) for part in p.compiled(function)(full(np.frombuffer(x)))]
-
-    def values(x):
-        cost, c = parts(problem.values, x.tobytes())
-        return flat * float(cost), c / limit
-
-    def slopes(x):
-        s = assess.Slopes(*parts(assess.first_order, x.tobytes()))
-        return flat * s.gradient[moving] * unit, s.jacobian[:, moving] * unit / limit[:, None]
-
-    def squares(x, sigma, y):
-        rows = parts(assess.first_order, x.tobytes())[1][:, moving] * unit
-        return sigma * flat * rows.T @ rows
-
-    def bend(x, sigma, y):
-        exact = p.compiled(assess.lagrangian_hessian)
-        h = np.asarray(exact(full(x), sigma * flat, y / limit))
-        return h[np.ix_(moving, moving)] * np.outer(unit, unit)
-
-    return NonlinearProgram(
-        values,
-        slopes,
-        squares if hessian == "gauss_newton" else bend,
-        p.lower[moving] / unit,
-        p.upper[moving] / unit,
-        p.constraint_lower / limit,
-        p.constraint_upper / limit,
-        full,
-        lambda theta: theta[moving] / unit,
-    )

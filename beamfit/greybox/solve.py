@@ -17,7 +17,7 @@ from beamfit.greybox.diagnosis import contradictory, not_finite
 from beamfit.greybox.fit import Attempt, Fit
 from beamfit.greybox.judge import Search, conclude, outgrown, refused, settled
 from beamfit.greybox.problem import Problem
-from beamfit.greybox.programs import INSIDE, SOLVERS, SearchLimit, scaled
+from beamfit.greybox.programs import INSIDE, SOLVERS, NonlinearProgram, SearchLimit
 
 METHOD, SQUARES = "Levenberg-Marquardt", "levenberg-marquardt"
 # Steps from each of many starts, and number of cheapest ends that are polished.
@@ -349,7 +349,7 @@ def _program(
     exact = hessian == "exact"
     best, tried, steps, said = None, [], 0, ""
     for stage in stages:
-        program = scaled(p, start, at, scale, stage.hessian)
+        program = NonlinearProgram(p, start, at, scale, stage.hessian)
         near = best is not None and best.feasible
         begin = best.theta if near else start
         if not near and stage.name in tried:
