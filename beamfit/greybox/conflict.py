@@ -145,7 +145,7 @@ def dependence(p: Problem, s: SearchState, stationary: bool) -> Dependence | Non
         return None
     # Free in sign: equalities, and multipliers that may become smaller.
     equal = low & high
-    force = np.concatenate([s.found.bounds, s.found.constraints])
+    force = np.concatenate([s.bounds.multiplier, s.limits.multiplier])
     pull = np.concatenate([unit, np.linalg.norm(s.at.jacobian * unit, axis=1)])
     strength = np.max(gradient_size(p, s.at, s.scale) * unit)
     free = equal | (stationary & (np.abs(force) * pull > p.tolerance * strength))

@@ -136,7 +136,7 @@ def known(p: Problem, s: SearchState) -> Known:
     nowhere = np.full(len(held), np.inf)
     seen = spread_of(_stacked(blocks), -nowhere, nowhere, held, None, equations)
     groups = groups_of(p.records, np.split(s.at.residual, ends)[:-1], blocks, seen)
-    still = (np.isin(s.bounds.states(s.found.bounds), EDGES) & p.nuisance) | ~p.moving
+    still = (np.isin(s.bounds.states, EDGES) & p.nuisance) | ~p.moving
 
     limited = np.isfinite(p.upper - p.lower) & p.moving & ~p.with_prior
     alike = np.array_equal(still, held) and not limited.any()
@@ -237,13 +237,13 @@ def _variables(p: Problem, s: SearchState, found: Known) -> tuple[FittedVariable
     nothing = (found.spread.shares >= MOST_SHARE) | found.held
     nothing |= any(group.unknown for group in found.groups)
     errors = (np.where(nothing, np.nan, part.errors) for part in (found.spread, found.raw))
-    columns = (s.theta, *errors, p.lower, p.upper, s.bounds.states(s.found.bounds), s.found.bounds)
+    columns = (s.theta, *errors, p.lower, p.upper, s.bounds.states, s.bounds.multiplier)
     return _rows(FittedVariable, p.names, *columns)
 
 
 def _constraints(p: Problem, s: SearchState) -> tuple[FittedConstraint, ...]:
-    states = s.limits.states(s.found.constraints)
-    return _rows(FittedConstraint, p.constraint_names, *s.limits[:3], states, s.found.constraints)
+    columns = (*s.limits[:3], s.limits.states, s.limits.multiplier)
+    return _rows(FittedConstraint, p.constraint_names, *columns)
 
 
 def _rows(kind: type, names: tuple[str, ...], *columns: np.ndarray) -> tuple:

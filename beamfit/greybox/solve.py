@@ -198,7 +198,7 @@ def _best(p: Problem, found: list[SearchState]) -> int:
 
     def rank(s: SearchState) -> tuple:
         feasible = s.feasible
-        saved = np.abs(s.found.constraints) @ (s.limits.violation * s.limits.size)
+        saved = np.abs(s.limits.multiplier) @ (s.limits.violation * s.limits.size)
         return (not feasible, s.at.cost + saved if feasible else s.kkt.feasibility)
 
     order = sorted(range(len(found)), key=lambda i: rank(found[i]))
