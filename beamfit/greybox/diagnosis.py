@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -132,17 +132,21 @@ def _depends(looks: list[np.ndarray]) -> np.ndarray:
     return np.any([rows != 0 for rows in looks], axis=0)
 
 
+def _named(kind: str, names: Sequence[str], which: np.ndarray, said: str) -> Iterator[Ailment]:
+    """An ailment of some names, if there are any; they stand in the place of {} in what is said."""
+    found = tuple(np.array(names)[which].tolist())
+    if found:
+        yield Ailment(kind, found, said.format(listed(found)))
+
+
 def _unused(p: Problem, looks: list[assess.Slopes]) -> Iterator[Ailment]:
     every = [np.vstack([a.residual_jacobian, a.gradient[None], a.jacobian]) for a in looks]
-    names = tuple(np.array(p.names)[p.moving & ~_depends(every).any(axis=0)].tolist())
-    if names:
-        said = f"nothing depends on {listed(names)}; fix or remove what is not needed."
-        yield Ailment("unused", names, said)
+    loose = p.moving & ~_depends(every).any(axis=0)
+    said = "nothing depends on {}; fix or remove what is not needed."
+    yield from _named("unused", p.names, loose, said)
     idle = ~_depends([at.jacobian for at in looks])[:, p.moving].any(axis=1)
-    names = tuple(np.array(p.constraint_names)[idle].tolist())
-    if names:
-        said = f"{listed(names)} depends on no free number; free what it limits, or remove it."
-        yield Ailment("constant", names, said)
+    said = "{} depends on no free number; free what it limits, or remove it."
+    yield from _named("constant", p.constraint_names, idle, said)
 
 
 def _undetermined(p: Problem, looks: list[assess.Slopes]) -> Iterator[Ailment]:
@@ -151,14 +155,12 @@ def _undetermined(p: Problem, looks: list[assess.Slopes]) -> Iterator[Ailment]:
         return
     every = [np.vstack([at.residual_jacobian, at.jacobian[p.equations]]) for at in looks]
     used = np.flatnonzero(_depends(every).any(axis=0) & p.moving)
-    loose = _open([rows[:, used] for rows in every])
-    names = tuple(np.array(p.names)[used][loose].tolist())
-    if names:
-        said = (
-            f"{len(every[0])} rows do not determine {listed(names)} each: only "
-            "combinations of them; fix some, or add data or priors."
-        )
-        yield Ailment("undetermined", names, said)
+    said = (
+        f"{len(every[0])} rows do not determine {{}} each: only combinations of them; fix some, or "
+        "add data or priors."
+    )
+    loose = used[_open([rows[:, used] for rows in every])]
+    yield from _named("undetermined", p.names, loose, said)
 
 
 def _open(looks: list[np.ndarray]) -> np.ndarray:
@@ -177,13 +179,9 @@ def _dependent(p: Problem, looks: list[assess.Slopes]) -> Iterator[Ailment]:
     equal = np.flatnonzero(p.equations)
     if not len(equal):
         return
-    loose = _open([at.jacobian[equal][:, p.moving].T for at in looks])
-    names = tuple(np.array(p.constraint_names)[equal][loose].tolist())
-    if names:
-        said = (
-            f"the equations {listed(names)} are not independent; remove what follows from others."
-        )
-        yield Ailment("dependent_equations", names, said)
+    loose = equal[_open([at.jacobian[equal][:, p.moving].T for at in looks])]
+    said = "the equations {} are not independent; remove what follows from others."
+    yield from _named("dependent_equations", p.constraint_names, loose, said)
 
 
 def _scaled(p: Problem, looks: list[assess.Slopes]) -> Iterator[Ailment]:
@@ -192,11 +190,9 @@ def _scaled(p: Problem, looks: list[assess.Slopes]) -> Iterator[Ailment]:
     size = np.max([np.max(np.abs(at.jacobian) * unit, axis=1, initial=0) for at in looks], axis=0)
     usual = np.median(size[size > 0]) if (size > 0).any() else 1.0
     off = (size > 0) & ((size > APART * usual) | (size < usual / APART))
-    names = tuple(np.array(p.constraint_names)[off].tolist())
-    if names:
-        worst = size[off][np.argmax(np.abs(np.log(size[off] / usual)))]
-        said = (
-            f"{listed(names)} changes by {worst:.1e} where others change by {usual:.1e}; state "
-            "it in units in which it is of their size."
-        )
-        yield Ailment("badly_scaled", names, said)
+    worst = size[off][np.argmax(np.abs(np.log(size[off] / usual)))] if off.any() else usual
+    said = (
+        f"{{}} changes by {worst:.1e} where others change by {usual:.1e}; state it in units in "
+        "which it is of their size."
+    )
+    yield from _named("badly_scaled", p.constraint_names, off, said)

@@ -35,7 +35,7 @@ from beamfit.greybox.covariance import (
 )
 from beamfit.greybox.equations import Implicit
 from beamfit.greybox.fit import Attempt, Fit, FittedConstraint, FittedVariable
-from beamfit.greybox.problem import FlatCore, Problem, sloped
+from beamfit.greybox.problem import Problem, flattened, sloped
 from beamfit.greybox.sparse import Rows
 from beamfit.statistics import POOR_FIT, chi2_probability
 
@@ -226,7 +226,8 @@ def conclude(p: Problem, s: SearchState, search: Search, seconds: float) -> Fit:
 
 def _inner_failure(p: Problem, theta: np.ndarray) -> str | None:
     """Failure of an implicit map in the model to converge at the answer, or None."""
-    if not p.has_part(Implicit):
+    parts = jax.tree.leaves(p.core, is_leaf=lambda part: isinstance(part, Implicit))
+    if not any(isinstance(part, Implicit) for part in parts):
         return None
     look = checkify.checkify(jax.jit(problem.values), errors=checkify.user_checks)
     said = look(p.core, jnp.asarray(theta, float))[0].get()
@@ -504,7 +505,7 @@ def _made_up(p: Problem, theta: np.ndarray, random: np.random.Generator) -> np.n
         for r in p.core.records
     )
     core = dataclasses.replace(p.core, records=records)
-    rows = np.asarray(FlatCore.of(core).compiled(sloped)(theta)[1]) * _size(theta)
+    rows = np.asarray(flattened(core)(sloped)(theta)[1]) * _size(theta)
     rows = rows[np.all(np.isfinite(rows), axis=1)]
     for order in (np.inf, 2):  # the square of what grows without end has no number
         terms = np.linalg.norm(rows, order, axis=1, keepdims=True)
