@@ -167,7 +167,7 @@ def _declare_statements(
         if isinstance(s, d.Block):
             _declare_statements(scope, s.statements, widened(scope, axes, s.each))
         elif isinstance(s, d.Real) and s.value is not None:
-            what = d.Assignment(x.Name(s.name, (), s.at), s.value, (), s.at)
+            what = d.Assignment(x.Name(s.name, at=s.at), s.value, at=s.at)
             scope.steps.append(MappingStep(len(scope.steps), {}, what))
         elif isinstance(s, d.Assignment | d.Call):
             inner = widened(scope, axes, s.each)

@@ -26,8 +26,11 @@ class Place(NamedTuple):
 NOWHERE = Place()
 
 
-# A field that says where something stands, which does not make it another thing.
-PLACE = {"default": NOWHERE, "compare": False, "repr": False}
+@dataclass(frozen=True)
+class Placed:
+    """A part of a document: it stands somewhere, which does not make it another thing."""
+
+    at: Place = field(default=NOWHERE, compare=False, repr=False, kw_only=True)
 
 
 def error_at(at: Place, found: str, expected: str) -> InputError:
@@ -35,10 +38,8 @@ def error_at(at: Place, found: str, expected: str) -> InputError:
     return InputError(found, expected, line=at.line, column=at.column)
 
 
-class Expression:
+class Expression(Placed):
     """A formula or a part of one."""
-
-    at: Place
 
     def __str__(self) -> str:
         return text_of(self)
@@ -49,7 +50,6 @@ class Literal(Expression):
     """A number, kept as it was written."""
 
     text: str
-    at: Place = field(**PLACE)
 
     @property
     def value(self) -> float:
@@ -61,8 +61,6 @@ class Literal(Expression):
 class Whole(Expression):
     """All elements along a dimension, written ``:`` in the place of an index."""
 
-    at: Place = field(**PLACE)
-
 
 @dataclass(frozen=True)
 class Name(Expression):
@@ -70,7 +68,6 @@ class Name(Expression):
 
     name: str
     indices: tuple[Expression, ...] = ()
-    at: Place = field(**PLACE)
 
 
 @dataclass(frozen=True)
@@ -79,7 +76,6 @@ class Arithmetic(Expression):
 
     symbol: str
     parts: tuple[Expression, ...]
-    at: Place = field(**PLACE)
 
 
 @dataclass(frozen=True)
@@ -88,7 +84,6 @@ class Application(Expression):
 
     function: str
     arguments: tuple[Expression, ...]
-    at: Place = field(**PLACE)
 
 
 @dataclass(frozen=True)
@@ -97,7 +92,6 @@ class Elements(Expression):
 
     parts: tuple[Expression, ...]
     ranged: bool = True
-    at: Place = field(**PLACE)
 
 
 @dataclass(frozen=True)
@@ -106,7 +100,6 @@ class Iterator(Expression):
 
     name: str
     over: str | Elements
-    at: Place = field(**PLACE)
 
 
 @dataclass(frozen=True)
@@ -116,7 +109,6 @@ class Reduction(Expression):
     kind: str
     iterators: tuple[Iterator, ...]
     body: Expression
-    at: Place = field(**PLACE)
 
 
 def children(e: Expression) -> tuple[Expression, ...]:

@@ -41,20 +41,11 @@ class IndexSet:
         return len(self.elements)
 
     @cached_property
-    def step(self) -> int:
-        """The distance of neighbours where it is everywhere the same; 0 elsewhere."""
-        steps = np.diff(self.elements)
-        return 1 if len(self) == 1 else int(steps[0]) * bool(np.all(steps == steps[0]))
-
-    @cached_property
     def _sorted(self) -> np.ndarray:
         return np.argsort(self.elements, kind="stable")
 
     def positions(self, values: np.ndarray) -> np.ndarray:
         """Positions of values in the set; -1 for values that are no elements."""
-        if self.step == 1:
-            at = values - self.elements[0]
-            return np.where((at >= 0) & (at < len(self)), at, -1)
         order = self._sorted
         at = np.minimum(np.searchsorted(self.elements, values, sorter=order), len(self) - 1)
         found = order[at]
@@ -235,7 +226,7 @@ def index_of(scope: Scope, e: x.Expression, axes: Axes) -> np.ndarray:
             place = list(axes).index(name)
             return axes[name].elements.reshape([-1 if i == place else 1 for i in range(len(axes))])
         case x.Name(name, ()) if (value := scope.constant(name)) is not None:
-            return index_of(scope, x.Literal(repr(value), e.at), axes)
+            return index_of(scope, x.Literal(repr(value), at=e.at), axes)
         case x.Arithmetic(symbol, parts) if symbol in "+-*":
             found = [index_of(scope, part, axes) for part in parts]
             if max(float(np.max(np.abs(f))) for f in found) > 2**31:

@@ -311,7 +311,7 @@ def _variable(e: Node) -> d.FreeInput:
 def _solver(node: Node) -> d.Solver:
     _check(node, "solver")
     settings = tuple((e.need("name"), e.need("value")) for e in node.all("parameter"))
-    return d.Solver(node.given.get("classname", "default"), settings, node.at)
+    return d.Solver(node.given.get("classname", "default"), settings, at=node.at)
 
 
 # ---- mappings
@@ -333,7 +333,7 @@ def _mapping(node: Node) -> d.Mapping:
     text = _one(node, "expressions")
     statements = parse_statements("".join(text.text)) if text else ()
     return d.Mapping(
-        node.given.get("name", ""), tables, inner, *groups, (*sets, *statements), node.at
+        node.given.get("name", ""), tables, inner, *groups, (*sets, *statements), at=node.at
     )
 
 
@@ -341,7 +341,7 @@ def _table(e: Node) -> d.DataTable:
     rows, columns = e.number("rowCount", None, int), e.number("columnCount", None, int)
     if (rows is None) != (columns is None):
         raise e.error("one of rowCount and columnCount", "both, or neither")
-    return d.DataTable(e.name(), e.need("file"), rows, columns, e.at)
+    return d.DataTable(e.name(), e.need("file"), rows, columns, at=e.at)
 
 
 def _declared(e: Node) -> d.Declared:
@@ -355,9 +355,9 @@ def _declared(e: Node) -> d.Declared:
             dimensions.append(dim.number("size", 1, int))
     values = _one(e, "values")
     if values is not None:
-        return d.Declared(e.name(), tuple(dimensions), values.numbers(), e.at)
+        return d.Declared(e.name(), tuple(dimensions), values.numbers(), at=e.at)
     given = (e.number("value", 0.0),) if "value" in e.given else None
-    return d.Declared(e.name(), tuple(dimensions), given, e.at)
+    return d.Declared(e.name(), tuple(dimensions), given, at=e.at)
 
 
 def _set(e: Node) -> d.IndexedSet:
@@ -373,7 +373,7 @@ def _set(e: Node) -> d.IndexedSet:
         keys = ("start", "stop", *(["step"] if "step" in inner.given else []))
         numbers = [str(inner.number(key, inner.need(key), int)) for key in keys]
     parts = parse_statements(f"set s = |{', '.join(numbers)}|;")[0].elements.parts
-    return d.IndexedSet(e.name(), Elements(parts, kind == "range", e.at), e.at)
+    return d.IndexedSet(e.name(), Elements(parts, kind == "range", at=e.at), at=e.at)
 
 
 def _network(node: Node) -> d.NetworkDefinition:
@@ -384,8 +384,8 @@ def _network(node: Node) -> d.NetworkDefinition:
         rest = [(k, v) for k, v in e.given.items() if k not in heads]
         values = e.numbers() if "".join(e.text).strip() else None
         head = [(k, e.name(k)) for k in heads]
-        parts.append(d.NetworkElement(e.tag, (*head, *rest), values, e.at))
-    return d.NetworkDefinition(node.name(), tuple(parts), node.at)
+        parts.append(d.NetworkElement(e.tag, (*head, *rest), values, at=e.at))
+    return d.NetworkDefinition(node.name(), tuple(parts), at=node.at)
 
 
 # ---- writing
