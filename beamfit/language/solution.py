@@ -113,18 +113,12 @@ class ProblemSolution:
 
     def tables(self) -> list[Table]:
         """Objective, variables, constraints and outputs as tables."""
-        tables = [_table("variable", self.variables(), self._row, self.made.squares)]
+        tables = [_table("variable", self.variables(), "reduced gradient", self.made.squares)]
         if self.fit.constraints:
-            rows = self.constraints()
-            tables.append(_table("constraint", rows, _limited, False, "multiplier"))
+            tables.append(_table("constraint", self.constraints(), "multiplier", False))
         values = [[n, f"{v:.8g}" if v.ndim == 0 else _range(v)] for n, v in self.outputs.items()]
         tables += [Table("", ["output", "value"], values, numeric=True)] if values else []
         return tables + gain_tables(self.made.program.scope, self.gains)
-
-    def _row(self, v: FittedVariable) -> list[str]:
-        error = ["-" if not math.isfinite(v.error) else f"{v.error:.2g}"] * self.made.squares
-        slope = f"{v.reduced_gradient + 0.0:.3g}"
-        return [v.name, f"{v.value:.8g}", *error, *_ends(v), v.state, slope]
 
     def _variable(self, v: FittedVariable) -> dict[str, Any]:
         kept = ("name", "lower", "upper", "state", "reduced_gradient")
@@ -163,17 +157,15 @@ def _range(values: np.ndarray) -> str:
     return f"{values.size} from {np.min(values):.5g} to {np.max(values):.5g}"
 
 
-def _ends(row: FittedVariable | FittedConstraint) -> list[str]:
-    return [f"{end:.6g}" for end in (row.lower, row.upper)]
-
-
-def _limited(c: FittedConstraint) -> list[str]:
-    return [c.name, f"{c.value:.8g}", *_ends(c), c.state, f"{c.multiplier + 0.0:.3g}"]
-
-
-def _table(name: str, rows: Sequence, row_of, errors: bool, last="reduced gradient") -> Table:
+def _table(name: str, rows: Sequence, last: str, errors: bool) -> Table:
     header = [name, "value", *["error"] * errors, "lower", "upper", "state", last]
-    return limited(header, [row_of(row) for row in rows])
+    return limited(header, [_cells(row, errors) for row in rows])
+
+
+def _cells(row: FittedVariable | FittedConstraint, errors: bool) -> list[str]:
+    error = ["-" if not math.isfinite(row.error) else f"{row.error:.2g}"] if errors else []
+    ends = [f"{end:.6g}" for end in (row.lower, row.upper)]
+    return [row.name, f"{row.value:.8g}", *error, *ends, row.state, f"{row[-1] + 0.0:.3g}"]
 
 
 # ---- solving

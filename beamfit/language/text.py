@@ -149,7 +149,8 @@ def _dims(dimensions: Sequence[str | int]) -> str:
     return f"[{', '.join(map(str, dimensions))}]" if dimensions else ""
 
 
-def _values(values: Sequence[float]) -> str:
+def values_text(values: Sequence[float]) -> str:
+    """Write numbers as they stand behind a name."""
     return f"[{', '.join(map(number_text, values))}]"
 
 
@@ -157,7 +158,7 @@ def _declared(n: d.Declared) -> str:
     value = ""
     if n.values is not None:
         single = not n.dimensions and len(n.values) == 1
-        value = " = " + (number_text(n.values[0]) if single else _values(n.values))
+        value = " = " + (number_text(n.values[0]) if single else values_text(n.values))
     return f"{n.name}{_dims(n.dimensions)}{value}"
 
 
@@ -165,7 +166,7 @@ def _part(p: d.NetworkElement) -> str:
     heads = 2 if p.kind == "connection" else 1
     name = " -> ".join(value for _, value in p.attributes[:heads])
     rest = ", ".join(f"{k} = {_word(v)}" for k, v in p.attributes[heads:])
-    values = "" if p.values is None else f" = {_values(p.values)}"
+    values = "" if p.values is None else f" = {values_text(p.values)}"
     return f"{p.kind} {name}{f' ({rest})' if rest else ''}{values};"
 
 

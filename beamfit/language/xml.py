@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import lru_cache
 from typing import Any, NamedTuple
 from xml.etree import ElementTree as Plain
@@ -22,7 +22,7 @@ from beamfit.errors import InputError, nearest
 from beamfit.language import document as d
 from beamfit.language.expression import Elements, Place, error_at
 from beamfit.language.parse import parse_statements
-from beamfit.language.text import NAME, format_statements, number_text
+from beamfit.language.text import NAME, format_statements, number_text, values_text
 
 # Most nested elements, and most lines of an opening tag.
 MOST_DEEP, MOST_LINES = 40, 12
@@ -473,13 +473,9 @@ def _declare(e: Plain.Element, of: d.Declared) -> None:
         given = {"type": "ID", "set": dim} if isinstance(dim, str) else None
         Plain.SubElement(e, "dimension", given or {"type": "size", "size": str(dim)})
     if of.values is not None and (of.dimensions or len(of.values) != 1):
-        Plain.SubElement(e, "values").text = _row(of.values)
+        Plain.SubElement(e, "values").text = values_text(of.values)
     elif of.values is not None:
         e.set("value", number_text(of.values[0]))
-
-
-def _row(values: Sequence[float]) -> str:
-    return f"[{', '.join(map(number_text, values))}]"
 
 
 def _network_element(n: d.NetworkDefinition) -> Plain.Element:
