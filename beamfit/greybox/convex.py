@@ -55,24 +55,17 @@ class Curvature(NamedTuple):
 def convex(p: Problem) -> bool:
     """True if the problem is proved convex: a convex cost within a convex set."""
     cost = _curve(p, problem.cost)
-    if cost is None or not (_upward(cost) or (cost.degree <= 2 and _positive(p))):
+    if cost is None or not (cost.sign in (0, 1) or (cost.degree <= 2 and _positive(p))):
         return False
     if not p.constraints:
         return True
     limits = _curve(p, problem.constraints)
     if limits is None:
         return False
-    below, above = np.isfinite(p.constraint_lower).any(), np.isfinite(p.constraint_upper).any()
-    return bool(
-        limits.sign == 0
-        or limits.degree <= 1
-        or (limits.sign == 1 and not below)
-        or (limits.sign == -1 and not above)
-    )
-
-
-def _upward(curve: Curvature) -> bool:
-    return curve.sign in (0, 1)
+    # A convex function may be limited from above, a concave one from below.
+    ends = {1: p.constraint_lower, -1: p.constraint_upper}
+    straight = limits.sign == 0 or limits.degree <= 1
+    return straight or (limits.sign in ends and not np.isfinite(ends[limits.sign]).any())
 
 
 def _positive(p: Problem) -> bool:
@@ -163,14 +156,13 @@ def _of_step(step, operands: list[Any]) -> Curvature:
     if name == "neg":
         return Curvature(_times(first.sign, -1), degree)
     if name == "sub":
-        signs = [v.sign if i == 0 else _times(v.sign, -1)
-                 for i, v in enumerate(operands) if isinstance(v, Curvature)]  # fmt: skip
+        signed = zip(operands, (1, -1), strict=True)
+        signs = [_times(v.sign, way) for v, way in signed if isinstance(v, Curvature)]
         return Curvature(_common(signs), degree)
     if name in ("mul", "dot_general") or (name == "div" and not isinstance(operands[1], Curvature)):
         return _product(step, operands, numbers)
     if name in ("square", "integer_pow"):
-        power = 2 if name == "square" else step.params["y"]
-        return _power(first, power)
+        return _power(first, step.params.get("y", 2))
     return Curvature(_composed(name, numbers), np.inf)
 
 
@@ -185,14 +177,11 @@ def _only_moved(name: str, operands: list[Any]) -> bool:
 
 def _product(step, operands: list[Any], numbers: list[Curvature]) -> Curvature:
     if len(numbers) == 2:
-        same = step.invars[0] is step.invars[1]
-        return Curvature(
-            1 if same and numbers[0].sign == 0 else None, sum(v.degree for v in numbers)
-        )
+        square = step.invars[0] is step.invars[1] and numbers[0].sign == 0
+        return Curvature(1 if square else None, sum(v.degree for v in numbers))
     factor = np.asarray(next(v for v in operands if not isinstance(v, Curvature)))
     sign = 1 if np.all(factor >= 0) else -1 if np.all(factor <= 0) else None
-    known = numbers[0].sign
-    return Curvature(0 if known == 0 else _times(known, sign), numbers[0].degree)
+    return Curvature(_times(numbers[0].sign, sign), numbers[0].degree)
 
 
 def _power(v: Curvature, power: int) -> Curvature:

@@ -155,16 +155,12 @@ def signed_network(
     way = node[lead] or 1.0
     start[first][lead] = way
     towards = np.where(out != 0, out, 1.0)
-    start[last] += _straight(thresholds)[:, None] * towards
+    # Weights, none negative, with which the nodes add up to a straight line from -1 to 1.
+    x = np.linspace(-1.0, 1.0, 41)
+    start[last] += nnls(np.tanh(x[:, None] + thresholds), x)[0][:, None] * towards
     biases = {"layer1": way * thresholds, "layer2": np.zeros(len(outputs))}
     net = replace(net, weights=start, biases=biases)
     return net, signed_weights(path, net, {first: node[:, None], last: out}, most, WIDE)
-
-
-def _straight(thresholds: np.ndarray) -> np.ndarray:
-    """Weights, none negative, that make the nodes add up to a straight line from -1 to 1."""
-    x = np.linspace(-1.0, 1.0, 41)
-    return nnls(np.tanh(x[:, None] + thresholds), x)[0]
 
 
 def _pattern(rising: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

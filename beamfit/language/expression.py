@@ -113,18 +113,9 @@ class Reduction(Expression):
 
 def children(e: Expression) -> tuple[Expression, ...]:
     """The parts of an expression."""
-    match e:
-        case Name():
-            return e.indices
-        case Arithmetic() | Elements():
-            return e.parts
-        case Application():
-            return e.arguments
-        case Reduction():
-            return (*e.iterators, e.body)
-        case Iterator(over=Elements() as over):
-            return (over,)
-    return ()
+    values = (getattr(e, name) for name in e.__match_args__)
+    each = (v if isinstance(v, tuple) else (v,) for v in values)
+    return tuple(part for parts in each for part in parts if isinstance(part, Expression))
 
 
 def check_depth(e: Expression) -> Expression:

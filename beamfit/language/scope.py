@@ -312,11 +312,10 @@ def reads(scope: Scope, e: x.Expression, axes: Axes) -> Iterator[Read]:
                 raise _unknown(scope, e, axes)
         case x.Reduction():
             yield from reads(scope, e.body, widened(scope, axes, e.iterators))
-        case x.Application():
-            _check_arguments(scope, e)
-            yield from (r for part in e.arguments for r in reads(scope, part, axes))
-        case x.Arithmetic():
-            yield from (r for part in e.parts for r in reads(scope, part, axes))
+        case x.Application() | x.Arithmetic():
+            if isinstance(e, x.Application):
+                _check_arguments(scope, e)
+            yield from (r for part in x.children(e) for r in reads(scope, part, axes))
         case x.Whole():
             raise error_at(e.at, "':'", "an expression")
 
