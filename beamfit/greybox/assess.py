@@ -488,10 +488,7 @@ def _weakest(p: Problem, s: SearchState) -> np.ndarray:
 
 
 def _along(
-    p: Problem,
-    s: SearchState,
-    direction: np.ndarray,
-    lagrangian: Look,
+    p: Problem, s: SearchState, direction: np.ndarray, lagrangian: Look
 ) -> np.ndarray | None:
     """The best of some points along a direction, None if none is better by what counts."""
     steps = [

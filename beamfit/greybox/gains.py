@@ -233,12 +233,7 @@ class _CertifiedGain:
 
 
 def gain_at(
-    path: str,
-    output: str,
-    by: Sequence[str],
-    points,
-    lower: float = -np.inf,
-    upper: float = np.inf,
+    path: str, output: str, by: Sequence[str], points, lower: float = -np.inf, upper: float = np.inf
 ) -> Constraint:
     """Constrain a gain of order 1 to 3 at points; between them it stays free.
 
