@@ -29,28 +29,24 @@ MOST_DEEP, MOST_LINES = 40, 12
 MLP_CLASS = "com.pav.pdas.model.mlp.MlpMapping"
 EXPRESSIONS = "com.pav.pdas.model.expression.ExpressionMapping"
 NLP = "com.pav.pdas.optimization.common.NLPProblem"
-KNOWN = {
-    "formulation": "problem mapping solver",
-    "problem": "variable constraint objective",
-    "mapping": "data set mapping input output parameter expressions",
-    "network": "input output gain layer connection",
-    "solver": "parameter",
-    "input": "dimension values", "output": "dimension", "parameter": "dimension values",
-    "set": "elements",
+# Children and attributes of each element; a misspelt one would be lost without a word.
+PARTS = {
+    "formulation": ("problem mapping solver", ""),
+    "problem": ("variable constraint objective", "classname direction"),
+    "objective": ("", "label modelVariable coefficient"),
+    "variable": ("", "label modelVariable lower upper value useRandomInitial randomLower "
+                     "randomUpper randomSeed"),
+    "constraint": ("", "label modelVariable lower upper"),
+    "solver": ("parameter", "classname"),
+    "mapping": ("data set mapping input output parameter expressions", "classname name"),
+    "data": ("", "name file rowCount columnCount"),
+    "set": ("elements", "name"), "elements": ("", "type start stop step"),
+    "input": ("dimension values", "name value isScalar"), "output": ("dimension", "name isScalar"),
+    "parameter": ("dimension values", "name value isScalar"),
+    "dimension": ("", "type set size"), "values": ("", ""), "expressions": ("", ""),
 }  # fmt: skip
-
-# Attributes of each element; a misspelt one would be lost without a word.
-GIVEN = {
-    "formulation": "", "problem": "classname direction",
-    "objective": "label modelVariable coefficient",
-    "variable": "label modelVariable lower upper value useRandomInitial randomLower randomUpper "
-                "randomSeed",
-    "constraint": "label modelVariable lower upper", "solver": "classname",
-    "mapping": "classname name", "data": "name file rowCount columnCount", "set": "name",
-    "elements": "type start stop step", "input": "name value isScalar", "output": "name isScalar",
-    "parameter": "name value isScalar", "dimension": "type set size", "values": "",
-    "expressions": "",
-}  # fmt: skip
+NETWORK_PARTS = ["input", "output", "gain", "layer", "connection"]
+SILENT = {"formulation", "problem", "mapping", "solver", "set", "output"}  # elements without text
 
 
 class Node(NamedTuple):
@@ -230,12 +226,11 @@ def parse_xml(text: str) -> d.Document:
     ('y', '2')
     """
     root = read_elements(text)
-    _check_attributes(root)
+    if root.tag not in ("formulation", "mapping"):
+        raise root.error(f"an element <{root.tag}>", "<formulation> or <mapping>")
+    _check(root)
     if root.tag == "mapping":
         return d.Document(_mapping(root))
-    if root.tag != "formulation":
-        raise root.error(f"an element <{root.tag}>", "<formulation> or <mapping>")
-    _check(root, "formulation")
     mapping, problem, solver = (_one(root, tag) for tag in ("mapping", "problem", "solver"))
     if mapping is None:
         raise root.error("<formulation> without <mapping>", "a mapping to optimise")
@@ -246,25 +241,22 @@ def parse_xml(text: str) -> d.Document:
     )
 
 
-def _check(node: Node, kind: str) -> None:
-    known = KNOWN[kind].split()
+def _check(node: Node) -> None:
+    """Refuse children, attributes and text that mean nothing; a network has its own attributes."""
+    network = node.given.get("classname") == MLP_CLASS
+    children, attributes = (part.split() for part in PARTS[node.tag])
+    children = NETWORK_PARTS if network else children
     for child in node.children:
-        if child.tag not in known:
-            raise child.error(f"<{child.tag}> in <{node.tag}>", nearest(child.tag, known))
-    if kind != "expressions" and "".join(node.text).strip() and kind not in ("input", "parameter"):
+        if child.tag not in children:
+            known = nearest(child.tag, children) if children else "no elements"
+            raise child.error(f"<{child.tag}> in <{node.tag}>", known)
+    if node.tag in SILENT and "".join(node.text).strip():
         raise node.error(f"text in <{node.tag}>", "elements only")
-
-
-def _check_attributes(node: Node) -> None:
-    """Refuse attributes that mean nothing; a network has its own."""
-    known = GIVEN.get(node.tag, "").split()
-    for key in node.given if node.tag in GIVEN else ():
-        if key not in known:
-            raise node.error(f"{key}='{node.given[key]}' in <{node.tag}>", nearest(key, known), key)
-    for child in node.children if node.given.get("classname") != MLP_CLASS else ():
-        if node.tag == "expressions":
-            raise child.error(f"<{child.tag}> in <expressions>", "statements only")
-        _check_attributes(child)
+    for key, value in node.given.items():
+        if key not in attributes:
+            raise node.error(f"{key}='{value}' in <{node.tag}>", nearest(key, attributes), key)
+    for child in () if network else node.children:
+        _check(child)
 
 
 def _one(node: Node, tag: str) -> Node | None:
@@ -275,7 +267,6 @@ def _one(node: Node, tag: str) -> Node | None:
 
 
 def _problem(node: Node) -> d.ProblemStatement:
-    _check(node, "problem")
     direction = node.given.get("direction", "minimize").strip().lower()
     if direction not in ("minimize", "maximize"):
         found = f"direction='{direction}'"
@@ -309,7 +300,6 @@ def _variable(e: Node) -> d.FreeInput:
 
 
 def _solver(node: Node) -> d.Solver:
-    _check(node, "solver")
     settings = tuple((e.need("name"), e.need("value")) for e in node.all("parameter"))
     return d.Solver(node.given.get("classname", "default"), settings, at=node.at)
 
@@ -322,7 +312,6 @@ def _mapping(node: Node) -> d.Mapping:
     if kind != EXPRESSIONS:
         found = f"classname='{kind}'"
         raise node.error(found, nearest(kind, [EXPRESSIONS, MLP_CLASS]), "classname")
-    _check(node, "mapping")
     tables = tuple(map(_table, node.all("data")))
     inner = tuple(_network(e) if e.given.get("classname") == MLP_CLASS else _mapping(e)
                   for e in node.all("mapping"))  # fmt: skip
@@ -345,7 +334,6 @@ def _table(e: Node) -> d.DataTable:
 
 
 def _declared(e: Node) -> d.Declared:
-    _check(e, e.tag)
     dimensions: list[str | int] = []
     for dim in e.all("dimension"):
         if "set" in dim.given:
@@ -361,7 +349,6 @@ def _declared(e: Node) -> d.Declared:
 
 
 def _set(e: Node) -> d.IndexedSet:
-    _check(e, "set")
     inner = _one(e, "elements")
     if inner is None:
         raise e.error("<set> without <elements>", "<elements type='range' start='1' stop='9'/>")
@@ -377,7 +364,6 @@ def _set(e: Node) -> d.IndexedSet:
 
 
 def _network(node: Node) -> d.NetworkDefinition:
-    _check(node, "network")
     parts = []
     for e in node.children:
         heads = ("srcName", "dstName") if e.tag == "connection" else ("name",)
