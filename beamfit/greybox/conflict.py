@@ -141,8 +141,6 @@ def dependence(p: Problem, s: SearchState, stationary: bool) -> Dependence | Non
         np.concatenate(pair) for pair in zip(s.bounds.reached, s.limits.reached, strict=True)
     )
     on = (low | high) & np.concatenate([moving, np.ones(len(s.limits.size), bool)])
-    if not on.any():
-        return None
     # Free in sign: equalities, and multipliers that may become smaller.
     equal = low & high
     force = np.concatenate([s.bounds.multiplier, s.limits.multiplier])

@@ -187,8 +187,6 @@ def _product(step, operands: list[Any], numbers: list[Curvature]) -> Curvature:
 def _power(v: Curvature, power: int) -> Curvature:
     if power < 0:
         return Curvature(None, np.inf)
-    if power <= 1:
-        return Curvature(v.sign if power else 0, v.degree * power)
     return Curvature(1 if v.sign == 0 and power % 2 == 0 else None, v.degree * power)
 
 

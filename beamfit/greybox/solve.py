@@ -96,7 +96,7 @@ def solve(
     (<Status.converged: 'converged'>, 1.9929, 0.0267)
     """
     began = time.perf_counter() if began is None else began
-    _check(starts, iterations, hessian, seconds)
+    _check(hessian, seconds)
     squares = not (p.constraints or p.objectives)
     _check_solver(solver, squares)
     wrong = contradictory(p)
@@ -133,11 +133,9 @@ def solve(
     return conclude(p, best, done, time.perf_counter() - began)
 
 
-def _check(starts: int, iterations: int, hessian: str, seconds: float | None) -> None:
+def _check(hessian: str, seconds: float | None) -> None:
     if hessian not in ("exact", "gauss_newton"):
         raise InputError(f"hessian '{hessian}'", "one of exact, gauss_newton")
-    if starts < 1 or iterations < 1:
-        raise InputError(f"{starts} starts of {iterations} iterations", "at least one of each")
     if seconds is not None and not seconds > 0:
         raise InputError(f"{seconds} seconds", "a time above 0, or none")
 

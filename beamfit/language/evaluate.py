@@ -93,8 +93,6 @@ def evaluate(e: x.Expression, s: Setting) -> Value:
             found = _applied(e, s)
         case x.Reduction():
             found = _reduced(e, s)
-        case _:
-            raise TypeError(e)
     if s.watch is not None:
         s.watch(e, found, s.axes)
     return found

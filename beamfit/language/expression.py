@@ -165,7 +165,6 @@ def text_of(e: Expression) -> str:
             return f"{e.name} in {e.over}"
         case Reduction():
             return f"{e.kind}({iterators_text(e.iterators)} | {text_of(e.body)})"
-    raise TypeError(e)
 
 
 def _operation_text(e: Arithmetic) -> str:

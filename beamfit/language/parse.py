@@ -79,12 +79,8 @@ def _parsed(text: str, start: str) -> Any:
 
 def _place(children: list[Any]) -> Place:
     """Place of the first of some parts."""
-    for child in children:
-        if isinstance(child, Token):
-            return Place(child.line, child.column)
-        if getattr(child, "at", None):
-            return child.at
-    return x.NOWHERE
+    first = next(c for c in children if isinstance(c, Token) or getattr(c, "at", None))
+    return Place(first.line, first.column) if isinstance(first, Token) else first.at
 
 
 def _number(token: Token) -> float:

@@ -205,4 +205,3 @@ def _statement(s: d.Statement) -> list[str]:
         case d.Block():
             body = [indent(line, "  ") for line in _statements(s.statements)]
             return [_each(s.each).strip() + " {", *body, "}"]
-    raise TypeError(s)

@@ -97,8 +97,6 @@ class _Watch:
 
     def _said(self, part: x.Expression, at: np.ndarray) -> str:
         array = np.asarray(self.seen[id(part)].array)
-        if array.ndim < len(at):
-            return f"{part} of {array.size} numbers"
         picked = array[tuple(min(i, n - 1) for i, n in zip(at, array.shape, strict=False))]
         return f"{part} = {picked:.4g}" if picked.ndim == 0 else f"{part} of {picked.size} numbers"
 
