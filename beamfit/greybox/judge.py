@@ -8,7 +8,6 @@ prediction, whatever the data, are told as a freedom of the model.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable
 from typing import Any, NamedTuple
 
 import jax
@@ -22,7 +21,6 @@ from beamfit import errors
 from beamfit.errors import Finding, Status
 from beamfit.greybox import assess, problem
 from beamfit.greybox.assess import LOOKS, NEAR, SearchState
-from beamfit.greybox.conflict import Conflict, dependence
 from beamfit.greybox.convex import convex
 from beamfit.greybox.covariance import (
     MOST_SHARE,
@@ -33,6 +31,7 @@ from beamfit.greybox.covariance import (
     spread_of,
     triangle,
 )
+from beamfit.greybox.diagnosis import Conflict, dependence, listed
 from beamfit.greybox.equations import Implicit
 from beamfit.greybox.fit import Attempt, Fit, FittedConstraint, FittedVariable
 from beamfit.greybox.problem import Problem, flattened, sloped
@@ -175,12 +174,6 @@ def settled(p: Problem, s: SearchState) -> bool:
     outward = np.where(s.bounds.reached[0], pull > 0, s.bounds.reached[1] & (pull < 0))
     pull = np.where(outward | found.held, 0.0, pull)
     return bool(found.raw.size(pull) ** 2 < SETTLED)
-
-
-def listed(names: Iterable[str]) -> str:
-    """A few names for a sentence."""
-    names = list(names)
-    return ", ".join(names[:4]) + (f" and {len(names) - 4} more" if len(names) > 4 else "")
 
 
 # ---- the answer

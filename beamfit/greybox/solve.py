@@ -11,9 +11,8 @@ import numpy as np
 from beamfit.errors import InputError, Status
 from beamfit.greybox import assess
 from beamfit.greybox.assess import SearchState
-from beamfit.greybox.conflict import relaxed
 from beamfit.greybox.descend import Descent, costs, descent_of
-from beamfit.greybox.diagnosis import contradictory, not_finite
+from beamfit.greybox.diagnosis import contradictory, not_finite, relaxed
 from beamfit.greybox.fit import Attempt, Fit
 from beamfit.greybox.judge import Search, conclude, outgrown, refused, settled
 from beamfit.greybox.problem import Problem

@@ -11,6 +11,11 @@ from beamfit.errors import InputError
 # Most levels of a formula, which is walked by recursion; people write ten.
 MOST_LEVELS = 120
 REDUCTIONS = ("sum", "prod", "min", "max", "mean")
+ONE = """sin cos tan asin acos atan sinh cosh tanh asinh acosh atanh exp log log10 sqrt abs sign erf
+sigmoid transpose inverse det trace norm sum"""
+FUNCTIONS: dict[str, tuple[int, int]] = {name: (1, 1) for name in ONE.split()}
+FUNCTIONS |= {"atan2": (2, 2), "pow": (2, 2), "dot": (2, 2), "min": (1, 99), "max": (1, 99)}
+"""Built-in functions: least and most number of arguments."""
 
 
 class Place(NamedTuple):

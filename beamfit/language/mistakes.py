@@ -11,8 +11,7 @@ from lark import Token
 from lark.exceptions import UnexpectedCharacters, UnexpectedToken
 
 from beamfit.errors import InputError
-from beamfit.language.expression import Place, error_at
-from beamfit.language.scope import FUNCTIONS
+from beamfit.language.expression import FUNCTIONS, Place, error_at
 
 # Most open brackets, and most letters of a wrong word in a message.
 MOST_OPEN, LONGEST = 60, 30

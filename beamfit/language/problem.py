@@ -15,8 +15,8 @@ from beamfit.greybox import problem as core
 from beamfit.language import document as d
 from beamfit.language import expression as x
 from beamfit.language.compiled import Program, compile_mapping, values_of
-from beamfit.language.declare import check_problem
 from beamfit.language.expression import error_at
+from beamfit.language.scope import check_problem
 
 
 class Square(NamedTuple):

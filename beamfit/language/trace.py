@@ -9,11 +9,11 @@ import numpy as np
 
 from beamfit.language import document as d
 from beamfit.language import expression as x
-from beamfit.language.calls import Arrays, given_to
 from beamfit.language.compiled import Program, carry_out
 from beamfit.language.evaluate import Setting, Value, evaluate
 from beamfit.language.plan import RecurrencePlan, StepGroup, callee_of
 from beamfit.language.scope import Axes, IndexSet, MappingStep, Scope, said_at
+from beamfit.language.steps import Arrays, given_to
 
 
 class _FoundError(Exception):
