@@ -53,13 +53,8 @@ class Setting:
     watch: Callable[[x.Expression, Value, Axes], None] | None = None
 
 
-ELEMENTWISE: dict[str, Callable] = {
-    "sin": jnp.sin, "cos": jnp.cos, "tan": jnp.tan, "asin": jnp.arcsin, "acos": jnp.arccos,
-    "atan": jnp.arctan, "sinh": jnp.sinh, "cosh": jnp.cosh, "tanh": jnp.tanh,
-    "asinh": jnp.arcsinh, "acosh": jnp.arccosh, "atanh": jnp.arctanh, "exp": jnp.exp,
-    "log": jnp.log, "log10": jnp.log10, "sqrt": jnp.sqrt, "abs": jnp.abs, "atan2": jnp.arctan2,
-    "sign": jnp.sign, "erf": jax.scipy.special.erf, "sigmoid": jax.nn.sigmoid,
-}  # fmt: skip
+# Built-in functions of elements that JAX's numpy does not have under their names.
+OTHERS = {"erf": jax.scipy.special.erf, "sigmoid": jax.nn.sigmoid}
 MATRIX: dict[str, tuple[int, int, Callable]] = {
     # rank of the argument, of the result
     "transpose": (2, 2, lambda m: jnp.swapaxes(m, -1, -2)),
@@ -172,7 +167,8 @@ def _applied(e: x.Application, s: Setting) -> Value:
     arrays, rank = _spread(values, e)
     if name in ("min", "max"):
         return Value(reduce(jnp.minimum if name == "min" else jnp.maximum, arrays), rank)
-    return Value(ELEMENTWISE[name](*arrays), rank)
+    elementwise = OTHERS.get(name) or getattr(jnp, name)
+    return Value(elementwise(*arrays), rank)
 
 
 def _matrix(e: x.Application, wanted: int, given: int, function: Callable, v: Value) -> Value:

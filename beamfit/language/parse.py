@@ -139,9 +139,6 @@ class _Builder(Transformer):
     def iterators(self, c):
         return tuple(c)
 
-    def each(self, c):
-        return c[0]
-
     def iterator(self, c):
         over = c[1] if isinstance(c[1], x.Elements) else str(c[1])
         return x.Iterator(str(c[0]), over, at=_place(c))
@@ -225,14 +222,8 @@ class _Builder(Transformer):
     def network(self, c):
         return "mappings", d.NetworkDefinition(str(c[1]), tuple(c[2:]), at=_place(c[1:]))
 
-    def inputs(self, c):
-        return "inputs", c[1:]
-
-    def outputs(self, c):
-        return "outputs", c[1:]
-
-    def parameters(self, c):
-        return "parameters", c[1:]
+    def face(self, c):
+        return f"{c[0]}s", c[1:]
 
     def title(self, c):
         return "titles", str(c[1])
@@ -245,9 +236,6 @@ class _Builder(Transformer):
     def label(self, c):
         name = str(c[0])
         return d.Goal(name, name if c[1] is None else str(c[1]), at=_place(c))
-
-    def pair(self, c):
-        return _number(c[0]), _number(c[1])
 
     def half(self, c):
         end = _number(c[1])
@@ -267,9 +255,6 @@ class _Builder(Transformer):
     def limit(self, c):
         low, high = c[2] if len(c) == 3 else (_number(c[3]), _number(c[3]))
         return "limits", d.Limit(c[1].label, c[1].model, low, high, at=c[1].at)
-
-    def setting(self, c):
-        return str(c[0]), str(c[1])
 
     def solver(self, c):
         return "solvers", d.Solver(c[1], tuple(s for s in c[2:] if s is not None), at=_place(c))
