@@ -303,6 +303,7 @@ def _taylor(middle: _Nodes, whole: _Nodes, radius: jax.Array) -> Range:
     return Range(middle.first.middle - down - reach, middle.first.middle + up + reach)
 
 
+@jax.jit
 def gain_bounds(net: Any, lower: jax.Array, upper: jax.Array) -> Range:
     """Enclose every first-order gain of a network over one box.
 
@@ -326,12 +327,7 @@ def gain_bounds(net: Any, lower: jax.Array, upper: jax.Array) -> Range:
     >>> bool(found.lower[0, 0] < found.upper[0, 0])
     True
     """
-    return _bounds(net, jnp.asarray(lower, float), jnp.asarray(upper, float))
-
-
-@jax.jit
-def _bounds(net: Any, lower: jax.Array, upper: jax.Array) -> Range:
-    """The bounds of `gain_bounds`, compiled once for each structure of network."""
+    lower, upper = jnp.asarray(lower, float), jnp.asarray(upper, float)
     finite = jnp.all(jnp.isfinite(upper - lower))
     low, high = (jnp.where(finite, end, 0.0) for end in (lower, upper))
     centre = 0.5 * (low + high)

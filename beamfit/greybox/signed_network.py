@@ -26,35 +26,6 @@ WIDE = 1.5
 ROUNDING = 1e-9
 
 
-def signed_weights(
-    path: str, net: MLP, signs: Mapping[str, np.ndarray], most: float, start: float
-) -> list[Free]:
-    """The weights of a network as free numbers that nobody asks for, within the signs they have.
-
-    Parameters
-    ----------
-    path : str
-        Where the network is in the model.
-    net : MLP
-        The network.
-    signs : mapping of str to array
-        Connection to signs that spread to its weights; 0 and connections that are missing are free.
-    most, start : float
-        Largest magnitude of a weight or bias, and of random starts.
-
-    Returns
-    -------
-    list of Free
-        One for each connection, and one for all biases.
-    """
-    found = []
-    for name, weights in net.weights.items():
-        sign = np.broadcast_to(signs.get(name, 0), weights.shape)
-        low, high = np.where(sign > 0, 0.0, -most), np.where(sign < 0, 0.0, most)
-        found.append(Free(f"{path}.weights.{name}", low, high, (-start, start), nuisance=True))
-    return [*found, Free(f"{path}.biases", -most, most, (-start, start), nuisance=True)]
-
-
 def monotone_signs(net: MLP, signs: Mapping[str, int]) -> dict[str, np.ndarray]:
     """Signs of the weights that make every output monotonic in chosen inputs by construction.
 
@@ -160,7 +131,12 @@ def signed_network(
     start[last] += nnls(np.tanh(x[:, None] + thresholds), x)[0][:, None] * towards
     biases = {"layer1": way * thresholds, "layer2": np.zeros(len(outputs))}
     net = replace(net, weights=start, biases=biases)
-    return net, signed_weights(path, net, {first: node[:, None], last: out}, most, WIDE)
+    free = []
+    for name, sign in ((first, node[:, None]), (last, out)):
+        sign = np.broadcast_to(sign, start[name].shape)
+        ends = np.where(sign > 0, 0.0, -most), np.where(sign < 0, 0.0, most)
+        free.append(Free(f"{path}.weights.{name}", *ends, (-WIDE, WIDE), nuisance=True))
+    return net, [*free, Free(f"{path}.biases", -most, most, (-WIDE, WIDE), nuisance=True)]
 
 
 def _pattern(rising: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

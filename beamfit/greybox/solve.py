@@ -95,9 +95,8 @@ def solve(
     (<Status.converged: 'converged'>, 1.9929, 0.0267)
     """
     began = time.perf_counter() if began is None else began
-    _check(hessian, seconds)
     squares = not (p.constraints or p.objectives)
-    _check_solver(solver, squares)
+    _check(hessian, seconds, solver, squares)
     wrong = contradictory(p)
     if wrong:
         spent = time.perf_counter() - began
@@ -132,14 +131,11 @@ def solve(
     return conclude(p, best, done, time.perf_counter() - began)
 
 
-def _check(hessian: str, seconds: float | None) -> None:
+def _check(hessian: str, seconds: float | None, solver: str | None, squares: bool) -> None:
     if hessian not in ("exact", "gauss_newton"):
         raise InputError(f"hessian '{hessian}'", "one of exact, gauss_newton")
     if seconds is not None and not seconds > 0:
         raise InputError(f"{seconds} seconds", "a time above 0, or none")
-
-
-def _check_solver(solver: str | None, squares: bool) -> None:
     known = [SQUARES] * squares + list(dict.fromkeys(stage.preset for stage in SOLVERS))
     if solver is not None and solver not in known:
         raise InputError(f"solver '{solver}' for this problem", f"one of {', '.join(known)}")

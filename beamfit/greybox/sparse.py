@@ -10,9 +10,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 from scipy import linalg, sparse
@@ -61,22 +60,19 @@ class Factor:
 
     def __init__(self, matrix: Rows):
         self.matrix = matrix
+        # The solution x of A x = b, b of shape (n,) or (n, k).
+        self.solve: Callable[[np.ndarray], np.ndarray]
         if not sparse.issparse(matrix):
-            self.factors: Any = linalg.cho_factor(matrix, check_finite=False)
+            factor = linalg.cho_factor(matrix, check_finite=False)
+            self.solve = partial(linalg.cho_solve, factor, check_finite=False)
             return
         try:
-            self.factors = splu(
+            self.solve = splu(
                 sparse.csc_array(matrix), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0,
                 options={"SymmetricMode": True},
-            )  # fmt: skip
+            ).solve  # fmt: skip
         except RuntimeError as error:
             raise np.linalg.LinAlgError(str(error)) from None
-
-    def solve(self, right: np.ndarray) -> np.ndarray:
-        """The solution x of A x = b, b of shape (n,) or (n, k)."""
-        if sparse.issparse(self.matrix):
-            return self.factors.solve(right)
-        return linalg.cho_solve(self.factors, right, check_finite=False)
 
 
 def weakest(rows: Rows, count: int) -> np.ndarray:
@@ -118,27 +114,16 @@ class Pattern:
 
     def jacobian(self, sweep: Sweep) -> tuple[np.ndarray, sparse.csr_array | None]:
         """Residuals and their Jacobian; None where places are missing."""
-        r, swept = _swept(sweep, self.seeds)
-        found = _filled_in(self.places, self.colours, swept)
+        padded = np.pad(self.seeds, ((0, -len(self.seeds) % SWEEPS), (0, 0)))
+        (r, *_), products = zip(*map(sweep, np.split(padded, len(padded) // SWEEPS)), strict=True)
+        swept, places = np.concatenate(products)[: len(self.seeds)], self.places
+        rows = np.repeat(np.arange(places.shape[0]), np.diff(places.indptr))
+        values = swept[self.colours[places.indices], rows]
+        found = sparse.csr_array((values, places.indices, places.indptr), shape=places.shape)
         size = abs(found) @ self.seeds[-1]
         wrong = np.abs(found @ self.seeds[-1] - swept[-1])
         complete = not np.any(wrong > PROBE * (size + np.max(size, initial=0.0)))
-        return r, found if complete else None
-
-
-def _swept(sweep: Sweep, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Residuals, and products with any number of directions."""
-    padded = np.pad(directions, ((0, -len(directions) % SWEEPS), (0, 0)))
-    found = [sweep(part) for part in np.split(padded, len(padded) // SWEEPS)]
-    products = np.concatenate([np.asarray(part) for _, part in found])
-    return np.asarray(found[0][0]), products[: len(directions)]
-
-
-def _filled_in(places: sparse.csr_array, colours: np.ndarray, swept: np.ndarray):
-    """A matrix with these places, from its products with the directions of its colours."""
-    rows = np.repeat(np.arange(places.shape[0]), np.diff(places.indptr))
-    values = swept[colours[places.indices], rows]
-    return sparse.csr_array((values, places.indices, places.indptr), shape=places.shape)
+        return np.asarray(r), found if complete else None
 
 
 def pattern_at(sweep: Sweep, shape: tuple[int, int], known: Pattern | None = None):
