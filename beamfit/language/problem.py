@@ -258,11 +258,6 @@ def starts_of(made: Formulation) -> Iterator[dict[str, np.ndarray]]:
         yield model | {name: next(draw) for name, draw in draws.items()}
 
 
-def at_start(made: Formulation, model: dict[str, np.ndarray]) -> Formulation:
-    """The same problem, begun from another model."""
-    return replace(made, problem=replace(made.problem, model=model))
-
-
 def _unqualified(document: d.Document) -> Iterator[str]:
     """Limits on sums of squares that only zero meets: where they hold, they have no gradient."""
     for c in document.problem.limits:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import islice
 from typing import Any
 
@@ -20,7 +20,7 @@ from beamfit.greybox.problem import TOLERANCE
 from beamfit.greybox.solve import solve
 from beamfit.language import document as d
 from beamfit.language.compiled import gain_tables, gains_at, limited, outputs_at
-from beamfit.language.problem import Formulation, at_start, formulate, starts_of
+from beamfit.language.problem import Formulation, formulate, starts_of
 from beamfit.language.trace import cause_of
 from beamfit.quantity import Quantity
 from beamfit.statistics import reach_of
@@ -223,7 +223,9 @@ def solve_document(
     tolerance = told.pop("tolerance", TOLERANCE)
     made, notes = _started(formulate(document, tables, values, tolerance))
     fit = solve(made.problem, starts=starts, began=began, **told)
-    notes = (*made.notes, *notes, *_ailments(made, fit), *warnings, *_places(made, fit))
+    notes = (*made.notes, *notes, *_ailments(made, fit), *warnings)
+    if places := _where(made, fit.about):
+        notes = (*notes, f"The verdict is about {places}.")
     if fit.status is Status.not_finite:
         cause = _cause(made, fit.model)
         told = cause is None or any(cause in note for note in notes)
@@ -246,7 +248,8 @@ def _started(made: Formulation) -> tuple[Formulation, tuple[str, ...]]:
         if slopes(p, np.concatenate([np.ravel(model[v.model]) for v in variables])).finite:
             times = "once" if draws == 1 else f"{draws} times"
             said = f"At the start of the seeds {cause}"
-            return at_start(made, model), (f"{said}; drawn again from the same seeds, {times}.",)
+            begun = replace(made, problem=replace(made.problem, model=model))
+            return begun, (f"{said}; drawn again from the same seeds, {times}.",)
     return made, (f"At the start {cause}.",) if cause else ()
 
 
@@ -273,12 +276,6 @@ def _where(made: Formulation, names: Iterable[str]) -> str:
     labels = {one.label: one.at for one in (*problem.variables, *problem.limits)}
     told = dict.fromkeys(name.partition("[")[0] for name in names)
     return ", ".join(f"'{name}' at {labels[name]}" for name in told if name in labels)
-
-
-def _places(made: Formulation, fit: Fit) -> list[str]:
-    """Places in the document that the verdict is about."""
-    places = _where(made, fit.about)
-    return [f"The verdict is about {places}."] if places else []
 
 
 def _told(solver: d.Solver | None) -> tuple[dict[str, Any], list[str]]:
