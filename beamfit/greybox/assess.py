@@ -49,9 +49,6 @@ SHARE, PARTS = 1e-2, (1.0, 1e-2)
 # squares, and count at random or inward from bounds.
 BESIDE, WEAKEST, AROUND = 1e-3, 2, 4
 
-# Newton steps that bring a point back onto its constraints, and the tolerance of these.
-RESTORED, BACK = 10, 1e-10
-
 
 class Slopes(NamedTuple):
     """Values and first derivatives at a point."""
@@ -521,13 +518,13 @@ def _restored(p: Problem, s: SearchState, point: np.ndarray) -> np.ndarray | Non
     """
     held, on = holding(p, s, p.tolerance)
     unit = np.where(held, 0.0, s.scale.unit)
-    for _ in range(RESTORED):
+    for _ in range(10):  # Newton steps
         at = slopes(p, point)
         if not at.finite:
             return None
         inside = np.clip(at.constraints, p.constraint_lower, p.constraint_upper)
         gap = at.constraints - np.where(on, s.at.constraints, inside)
-        if np.all(np.abs(gap) <= BACK * s.limits.size):
+        if np.all(np.abs(gap) <= 1e-10 * s.limits.size):
             return point
         left = gap != 0
         step = np.linalg.lstsq(at.jacobian[left] * unit, gap[left], rcond=None)[0]

@@ -33,8 +33,6 @@ FAR = 1e12
 SAFE = 1e-10
 # Gradients of which errors are computed at once, for the memory that a dense block takes.
 BLOCK = 256
-# Noise of data that a model meets exactly; zero would divide by zero.
-EXACT = 1e-30
 
 
 class Group(NamedTuple):
@@ -56,7 +54,8 @@ class Group(NamedTuple):
     @property
     def factor(self) -> float:
         """Divisor of the residuals before their information counts; 1 if the scatter is unknown."""
-        return 1.0 if math.isnan(self.scale) else max(self.scale, EXACT)
+        # A model that meets its data exactly must not divide by zero.
+        return 1.0 if math.isnan(self.scale) else max(self.scale, 1e-30)
 
     @property
     def unknown(self) -> bool:

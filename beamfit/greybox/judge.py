@@ -183,16 +183,17 @@ def conclude(p: Problem, s: SearchState, search: Search, seconds: float) -> Fit:
     """Judge the best point of a search, `seconds` being the time taken."""
     failure = _inner_failure(p, s.theta)
     if failure or not s.at.finite:
-        status, said = Status.not_finite, (
-            "the cost or a derivative is not finite at the end of the search; bound the free "
-            "numbers away from there, or use a parametrisation that stays defined."
-        )  # fmt: skip
+        lost = Finding(
+            Status.not_finite,
+            "the cost or a derivative is not finite at the end of the search;",
+            "bound the free numbers away from there, or use a parametrisation that stays defined.",
+        )
         if failure:
-            status, said = Status.not_converged, (
-                f"{failure} at the end of the search; start it nearer to its root, or bound the "
-                "free numbers to where a root exists."
-            )  # fmt: skip
-        return refused(p, status, said, seconds, s.theta, search.attempts)
+            remedy = (
+                "start it nearer to its root, or bound the free numbers to where a root exists."
+            )
+            lost = Finding(Status.not_converged, f"{failure} at the end of the search;", remedy)
+        return refused(p, lost, seconds, s.theta, search.attempts)
     found = known(p, s)
     variables, constraints = _variables(p, s, found), _constraints(p, s)
     chi2 = float(s.at.residual @ s.at.residual)
@@ -239,14 +240,7 @@ def _rows(kind: type, names: tuple[str, ...], *columns: np.ndarray) -> tuple:
     return tuple(map(kind, names, *(column.tolist() for column in columns)))
 
 
-def refused(
-    p: Problem,
-    status: Status,
-    message: str,
-    seconds: float,
-    theta: np.ndarray | None = None,
-    attempts: tuple[Attempt, ...] = (),
-) -> Fit:
+def refused(p: Problem, found: Finding, seconds: float, theta=None, attempts=()) -> Fit:
     """A fit without an answer: where it stopped, and nothing determined."""
     theta = p.start if theta is None else theta
     n, nan = len(theta), np.nan
@@ -257,7 +251,7 @@ def refused(
     ends, free = (p.constraint_lower, p.constraint_upper), np.full(len(none), "free")
     constraints = _rows(FittedConstraint, p.constraint_names, none, *ends, free, none)
     return Fit(
-        p, theta, status, message, nan, nan, 0, (), assess.LOST, variables,
+        p, theta, found.status, found.message, nan, nan, 0, (), assess.LOST, variables,
         constraints, lost, lost, np.zeros((p.size, n)), np.eye(n), nan, attempts, seconds,
     )  # fmt: skip
 

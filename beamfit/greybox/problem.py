@@ -22,8 +22,6 @@ from beamfit.greybox import tree
 
 # Default tolerance on limits and on the conditions of an optimum, in sizes.
 TOLERANCE = 1e-6
-# Numbers up to which an array is handed over with every call: JAX takes longer to make it its own.
-SMALL = 1000
 
 
 class Free(NamedTuple):
@@ -231,7 +229,8 @@ def flattened(core: Core) -> Callable[[Callable], Callable]:
     keys = [id(x) if np.ndim(x) else -i for i, x in enumerate(leaves)]
     once = dict(zip(keys, leaves, strict=True))
     order = {key: i for i, key in enumerate(once)}
-    arrays = [jnp.asarray(x) if np.size(x) > SMALL else np.asarray(x) for x in once.values()]
+    # Small arrays are handed over with every call: JAX takes longer to make them its own.
+    arrays = [jnp.asarray(x) if np.size(x) > 1000 else np.asarray(x) for x in once.values()]
     places = tuple(order[key] for key in keys)
     return lambda function: partial(_compiled(function, places, structure), arrays)
 

@@ -8,7 +8,7 @@ from functools import partial
 
 import numpy as np
 
-from beamfit.errors import InputError, Status
+from beamfit.errors import Finding, InputError, Status
 from beamfit.greybox import assess
 from beamfit.greybox.assess import SearchState
 from beamfit.greybox.descend import Descent, costs, descent_of
@@ -23,10 +23,6 @@ METHOD, SQUARES = "Levenberg-Marquardt", "levenberg-marquardt"
 STEPS, POLISHED = 300, 4
 # A search stops if its cost falls by less than this share in this many steps.
 NOTHING, STRETCH = 1e-7, 100
-# Bytes for the Jacobians of starts that are searched together.
-MEMORY = 2**24
-# Starts of the search for the least violation of constraints that no search could keep.
-ELASTIC = 6
 # Most moves of a search off a saddle.
 MOVES = 3
 
@@ -100,7 +96,7 @@ def solve(
     wrong = contradictory(p)
     if wrong:
         spent = time.perf_counter() - began
-        return refused(p, Status.contradictory_bounds, wrong[0].message, spent)
+        return refused(p, Finding(Status.contradictory_bounds, wrong[0].message), spent)
     drawn = _drawn(p, starts, seed)
     points = np.clip(drawn, p.lower, p.upper)
     moved = int(np.sum(np.any(points != drawn, axis=1)))
@@ -112,16 +108,15 @@ def solve(
         found, attempts = _together(p, points, budget)
     spent = time.perf_counter() - began
     if not found:
-        said = (
-            "the cost or a constraint is not finite at any start; "
-            "start elsewhere, or use a parametrisation that is defined there."
-        )
-        traced = not_finite(p, points[0]) if starts == 1 else []
-        said = traced[0].message if traced else said
-        return refused(p, Status.not_finite, said, spent, None, attempts)
+        said = "the cost or a constraint is not finite at any start;"
+        remedy = "start elsewhere, or use a parametrisation that is defined there."
+        lost = Finding(Status.not_finite, said, remedy)
+        if starts == 1 and (traced := not_finite(p, points[0])):
+            lost = Finding(Status.not_finite, traced[0].message)
+        return refused(p, lost, spent, None, attempts)
     best, conflict = found[_best(p, found)], None
     if not best.feasible and p.constraints and best.at.finite and budget.left > 0:
-        conflict = relaxed(p, best, starting_points(p, ELASTIC, seed))
+        conflict = relaxed(p, best, starting_points(p, 6, seed))
         if conflict.feasible:
             more, again = _one_by_one(p, conflict.theta[None], budget, hessian)
             found, attempts = found + more, attempts + again
@@ -239,7 +234,7 @@ def _together(
     p: Problem, points: np.ndarray, budget: SearchLimit
 ) -> tuple[list[SearchState], tuple[Attempt, ...]]:
     """Search from all starts, in parts that fit the memory, and polish the cheapest ends."""
-    part = max(1, MEMORY // (8 * (p.size + 1) * len(p.names)))
+    part = max(1, 2**21 // ((p.size + 1) * len(p.names)))  # Jacobians of 16 MB
     found: list[SearchState] = []
     attempts: list[Attempt] = []
     for some in np.split(points, range(part, len(points), part)):

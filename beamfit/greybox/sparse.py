@@ -17,8 +17,6 @@ import numpy as np
 from scipy import linalg, sparse
 from scipy.sparse.linalg import splu
 
-# Rounds of inverse iteration for the weakest directions; each gains the ratio of eigenvalues.
-ROUNDS = 10
 # Added to the diagonal of A = J'J, columns of unit length, so that rounding leaves it positive.
 RIDGE = 1e-13
 
@@ -80,7 +78,7 @@ def weakest(rows: Rows, count: int) -> np.ndarray:
     normal = rows.T @ rows
     factor = Factor(with_diagonal(normal, RIDGE * np.max(normal.diagonal(), initial=1e-300)))
     found = np.random.default_rng(0).normal(size=(rows.shape[1], count))
-    for _ in range(ROUNDS):
+    for _ in range(10):  # inverse iteration: each round gains the ratio of the eigenvalues
         found = np.linalg.qr(factor.solve(found))[0]
     return found
 

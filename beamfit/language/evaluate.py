@@ -64,7 +64,6 @@ MATRIX: dict[str, tuple[int, int, Callable]] = {
     "norm": (1, 0, lambda v: jnp.sqrt(jnp.sum(v * v, axis=-1))),
 }
 OPERATORS = {"+": add, "-": sub, "*": mul, "/": truediv, "^": pow}
-FOLDS = {"sum": jnp.sum, "prod": jnp.prod, "min": jnp.min, "max": jnp.max, "mean": jnp.mean}
 
 
 def evaluate(e: x.Expression, s: Setting) -> Value:
@@ -161,7 +160,7 @@ def _applied(e: x.Application, s: Setting) -> Value:
         return _product(e, *values)
     if name in ("sum", "min", "max") and len(values) == 1:
         own = tuple(range(-values[0].rank, 0))
-        return Value(FOLDS[name](values[0].array, axis=own))
+        return Value(getattr(jnp, name)(values[0].array, axis=own))
     if name == "pow":
         return _operated(e, "^", values)
     arrays, rank = _spread(values, e)
@@ -189,7 +188,7 @@ def _reduced(e: x.Reduction, s: Setting) -> Value:
     # What does not change with an iterator has one element along it and counts for all.
     lengths = [len(one) for one in list(axes.values())[len(s.axes) :]]
     same = np.prod([n for n, i in zip(lengths, over, strict=True) if body.array.shape[i] == 1])
-    found = FOLDS[e.kind](body.array, axis=over)
+    found = getattr(jnp, e.kind)(body.array, axis=over)
     if same != 1 and e.kind in ("sum", "prod"):
         found = found * same if e.kind == "sum" else found ** int(same)
     return Value(found, body.rank)

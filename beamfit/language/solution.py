@@ -25,8 +25,6 @@ from beamfit.language.trace import cause_of
 from beamfit.quantity import Quantity
 from beamfit.statistics import reach_of
 
-# Most draws of a random start until it is finite.
-MOST_DRAWS = 100
 # Solver options that are used, with the argument of `solve` that each sets.
 TOLD = {
     "major iterations limit": "iterations",
@@ -244,7 +242,7 @@ def _started(made: Formulation) -> tuple[Formulation, tuple[str, ...]]:
         return made, ()
     cause = _cause(made, p.core.model)
     drawn = any(v.random for v in variables)
-    for draws, model in enumerate(islice(starts_of(made), 1, MOST_DRAWS if drawn else 1), 1):
+    for draws, model in enumerate(islice(starts_of(made), 1, 100 if drawn else 1), 1):
         if slopes(p, np.concatenate([np.ravel(model[v.model]) for v in variables])).finite:
             times = "once" if draws == 1 else f"{draws} times"
             said = f"At the start of the seeds {cause}"

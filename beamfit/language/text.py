@@ -15,8 +15,6 @@ from textwrap import indent, wrap
 from beamfit.language import document as d
 from beamfit.language.expression import iterators_text
 
-# Letters in a line of a written document.
-WIDTH = 96
 # Superscripts and fractions are letters to Python, not here.
 NAME = re.compile(r"[^\W\d²³¹⁰⁴-⁹½¼¾][^\W²³¹⁰⁴-⁹½¼¾]*")
 NUMBER = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?")
@@ -135,7 +133,7 @@ def _listed(word: str, names: list[str]) -> list[str]:
         return []
     # Blanks within one declaration must not be broken.
     joined = ", ".join(name.replace(" ", "\0") for name in names) + ";"
-    lines = wrap(joined, WIDTH, initial_indent=f"{word} ", subsequent_indent="  ",
+    lines = wrap(joined, 96, initial_indent=f"{word} ", subsequent_indent="  ",
                  break_long_words=False, break_on_hyphens=False)  # fmt: skip
     return [line.replace("\0", " ") for line in lines]
 

@@ -24,8 +24,8 @@ from beamfit.language.expression import Elements, Place, error_at
 from beamfit.language.parse import parse_statements
 from beamfit.language.text import NAME, format_statements, number_text, values_text
 
-# Most nested elements, and most lines of an opening tag.
-MOST_DEEP, MOST_LINES = 40, 12
+# Most nested elements.
+MOST_DEEP = 40
 MLP_CLASS = "com.pav.pdas.model.mlp.MlpMapping"
 EXPRESSIONS = "com.pav.pdas.model.expression.ExpressionMapping"
 NLP = "com.pav.pdas.optimization.common.NLPProblem"
@@ -133,7 +133,8 @@ class _ElementReader(ContentHandler):
     def _places(self, given: dict[str, str]) -> dict[str, Place]:
         """Places of an element's attribute values; its own under the empty key."""
         here = self._here()
-        first = "".join(self.lines[here.line - 1 : here.line + MOST_LINES])[here.column - 1 :]
+        # An opening tag of more than a dozen lines has its attributes where it begins.
+        first = "".join(self.lines[here.line - 1 : here.line + 12])[here.column - 1 :]
         found = {"": here}
         for key in given:
             match = re.search(rf"\s{re.escape(key)}\s*=\s*['\"]", first)
