@@ -256,13 +256,8 @@ def gain_at(
     >>> falls.name
     'dA/dc'
     """
-    return Constraint(
-        f"d{output}/d{'d'.join(by)}",
-        _GainAt(path, output, tuple(by)),
-        jnp.asarray(points, float),
-        lower,
-        upper,
-    )
+    gains, name = _GainAt(path, output, tuple(by)), f"d{output}/d{'d'.join(by)}"
+    return Constraint(name, gains, jnp.asarray(points, float), lower, upper)
 
 
 @lru_cache(maxsize=64)
@@ -311,14 +306,11 @@ def certified_gain(
     ['max dA/dc']
     """
     corners = _corners(*(tuple(map(float, corner)) for corner in box), number)
-    wanted = [("upper", "max", -np.inf, upper), ("lower", "min", lower, np.inf)]
-    found = [
-        Constraint(
-            f"{word} d{output}/d{by}", _CertifiedGain(path, output, by, end), corners, low, high
-        )
-        for end, word, low, high in wanted
-        if np.isfinite(low) or np.isfinite(high)
-    ]
+    found = []
+    for end, word, low, high in (("upper", "max", -np.inf, upper), ("lower", "min", lower, np.inf)):
+        if np.isfinite(low) or np.isfinite(high):
+            bound = _CertifiedGain(path, output, by, end)
+            found.append(Constraint(f"{word} d{output}/d{by}", bound, corners, low, high))
     if not found:
         raise InputError(f"no limit on d{output}/d{by}", "lower, upper or both")
     return found

@@ -17,7 +17,7 @@ from beamfit.answer import json_of
 from beamfit.errors import InputError
 from beamfit.greybox.bounds import KINDS, cells, over_cells
 from beamfit.greybox.maps import positions
-from beamfit.greybox.mlp import MLP, Port, dense
+from beamfit.greybox.mlp import MLP, Port, connection, dense
 from beamfit.greybox.problem import Free, Problem
 
 # Largest threshold of a node and random start of a weight: a network's range is -1 to 1.
@@ -71,12 +71,11 @@ def monotone_signs(net: MLP, signs: Mapping[str, int]) -> dict[str, np.ndarray]:
     flips = {np.sign(port.scale) for port in net.output_ports}
     if flips != {1.0}:
         raise InputError("an output with a negative scale", "positive scales for monotonic outputs")
-    return {
-        f"{a}->{b}": np.broadcast_to(
-            rows[a][:, None] if a in rows else 1.0, net.weights[f"{a}->{b}"].shape
-        )
-        for a, b in net.connections
-    }
+    found = {}
+    for a, b in net.connections:
+        first = rows[a][:, None] if a in rows else 1.0
+        found[connection(a, b)] = np.broadcast_to(first, net.weights[connection(a, b)].shape)
+    return found
 
 
 def signed_network(

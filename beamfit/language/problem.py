@@ -160,17 +160,10 @@ def formulate(
             records.append(core.Record(name, predict, constants, np.zeros(length)))
         else:
             objectives.append(core.Objective(name, _Output(program, name), constants, weight))
-    limits = [
-        core.Constraint(
-            c.label,
-            _Output(program, c.model),
-            constants,
-            c.lower,
-            c.upper,
-            _names(c, program.scope.outputs[c.model]),
-        )
-        for c in p.limits
-    ]
+    limits = []
+    for c in p.limits:
+        names, limited = _names(c, program.scope.outputs[c.model]), _Output(program, c.model)
+        limits.append(core.Constraint(c.label, limited, constants, c.lower, c.upper, names))
     problem = core.Problem(model, free, records, (), limits, objectives, tolerance)
     sign = -1.0 if p.maximize else 1.0
     notes += tuple(_unqualified(document))

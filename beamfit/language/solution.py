@@ -26,11 +26,8 @@ from beamfit.quantity import Quantity
 from beamfit.statistics import reach_of
 
 # Solver options that are used, with the argument of `solve` that each sets.
-TOLD = {
-    "major iterations limit": "iterations",
-    "iterations limit": "iterations",
-    "time limit": "seconds",
-}
+TOLD = dict.fromkeys(("major iterations limit", "iterations limit"), "iterations")
+TOLD["time limit"] = "seconds"
 NOISE = "Errors treat squared terms as data residuals, with the noise inferred from their scatter."
 # Kinds of defects that are reported elsewhere, with their place in the document.
 TOLD_ELSEWHERE = {"contradictory_bounds", "not_finite", "unused"}
