@@ -54,13 +54,12 @@ class Curvature(NamedTuple):
 
 def convex(p: Problem) -> bool:
     """True if the problem is proved convex: a convex cost within a convex set."""
-    cost = _curve(p, problem.cost)
-    if cost is None or not (cost.sign in (0, 1) or (cost.degree <= 2 and _positive(p))):
+    try:
+        cost = _curve(p, problem.cost)
+        limits = _curve(p, problem.constraints) if p.constraints else Curvature(0, 0.0)
+    except _Unknown:
         return False
-    if not p.constraints:
-        return True
-    limits = _curve(p, problem.constraints)
-    if limits is None:
+    if not (cost.sign in (0, 1) or (cost.degree <= 2 and _positive(p))):
         return False
     # A convex function may be limited from above, a concave one from below.
     ends = {1: p.constraint_lower, -1: p.constraint_upper}
@@ -81,14 +80,11 @@ def _hessian(core, theta):
     return jax.hessian(problem.cost, 1)(core, theta)
 
 
-def _curve(p: Problem, function) -> Curvature | None:
-    """Curvature of a compiled function of (core, theta) in theta; None if it is not known."""
+def _curve(p: Problem, function) -> Curvature:
+    """Curvature of a compiled function of (core, theta) in theta."""
     program = function.trace(p.core, jnp.asarray(p.start)).jaxpr
     arguments = [*jax.tree.leaves(p.core), Curvature(0, 1.0)]
-    try:
-        (found,) = _followed(program.jaxpr, program.consts, arguments)
-    except _Unknown:
-        return None
+    (found,) = _followed(program.jaxpr, program.consts, arguments)
     return found if isinstance(found, Curvature) else Curvature(0, 0.0)
 
 
