@@ -27,6 +27,12 @@ class Place(NamedTuple):
     def __str__(self) -> str:
         return f"line {self.line}, column {self.column}"
 
+    def behind(self, text: str) -> Place:
+        """The place behind a text that begins here."""
+        more = text.count("\n")
+        column = len(text) - text.rfind("\n") if more else self.column + len(text)
+        return Place(self.line + more, column)
+
 
 NOWHERE = Place()
 

@@ -97,8 +97,7 @@ def check_brackets(text: str) -> None:
 
 
 def _at(text: str, position: int) -> Place:
-    before = text[:position]
-    return Place(before.count("\n") + 1, position - before.rfind("\n"))
+    return Place(1, 1).behind(text[:position])
 
 
 def explained(error: UnexpectedCharacters | UnexpectedToken, text: str) -> InputError:

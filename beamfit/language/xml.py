@@ -138,13 +138,7 @@ class _ElementReader(ContentHandler):
         found = {"": here}
         for key in given:
             match = re.search(rf"\s{re.escape(key)}\s*=\s*['\"]", first)
-            if match:
-                before = first[: match.end()]
-                more = before.count("\n")
-                column = len(before) - before.rfind("\n") if more else here.column + len(before)
-                found[key] = Place(here.line + more, column)
-            else:
-                found[key] = here
+            found[key] = here.behind(first[: match.end()]) if match else here
         return found
 
     def endElement(self, name):
@@ -157,9 +151,7 @@ class _ElementReader(ContentHandler):
             lines = here.line - self.end.line
             blanks = here.column - (1 if lines else self.end.column)
             self.open[-1].text.append("\n" * lines + " " * blanks)
-            more = content.count("\n")
-            column = len(content) - content.rfind("\n") if more else here.column + len(content)
-            self.end = Place(here.line + more, column)
+            self.end = here.behind(content)
         self.open[-1].text.append(content)
 
 
