@@ -136,8 +136,12 @@ def known(p: Problem, s: SearchState) -> Known:
     seen = spread_of(_stacked(blocks), -nowhere, nowhere, held, None, equations)
     groups = groups_of(p.records, np.split(s.at.residual, ends)[:-1], blocks, seen)
     still = (np.isin(s.bounds.states, EDGES) & p.nuisance) | ~p.moving
+    limited = np.isfinite(p.upper - p.lower) & p.moving & ~p.with_prior
+    alike = np.array_equal(still, held) and not limited.any()
 
     def spread(factors, still):
+        if alike and {*factors} <= {1.0}:
+            return seen
         parts = [block / f for block, f in zip(blocks, [*factors, 1.0], strict=True)]
         return spread_of(_stacked(parts), p.lower, p.upper, still, p.with_prior, equations)
 
