@@ -140,8 +140,8 @@ def known(p: Problem, s: SearchState) -> Known:
     alike = np.array_equal(still, held) and not limited.any()
 
     def spread(factors, still):
-        if alike and {*factors} <= {1.0}:
-            return seen
+        if alike and len({*factors, *[1.0] * bool(p.priors)}) <= 1:
+            return seen.times(factors[0] if factors else 1.0)
         parts = [block / f for block, f in zip(blocks, [*factors, 1.0], strict=True)]
         return spread_of(_stacked(parts), p.lower, p.upper, still, p.with_prior, equations)
 
