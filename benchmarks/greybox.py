@@ -85,7 +85,7 @@ def ipopt(build, p):
 def ours(p):
     def run(start):
         state, attempt = solve.search(p, start)
-        return state.theta, attempt.iterations, state.found.constraints
+        return state.theta, attempt.iterations, state.limits.multiplier
 
     return run, 0.0
 

@@ -22,10 +22,7 @@ from beamfit.statistics import baseline, control_limits
 # Student's quantile they show.
 WIDEST = 6.0
 # Quantities of each kind, and the default one.
-FOLLOWED = {
-    "emittance": (QUANTITIES, "normalized_emittance"),
-    "lifetime": (UNITS, "lifetime_mean"),
-}
+FOLLOWED = {"emittance": (QUANTITIES, "normalized_emittance"), "lifetime": (UNITS, "lifetime_mean")}
 
 
 class ControlChart(NamedTuple):
@@ -83,11 +80,7 @@ class ControlChart(NamedTuple):
 def summary_of(courses: Sequence[ControlChart]) -> Table:
     """The spread of each quantity through the files."""
     rows = [("answers", [f"{len(c.value)}" for c in courses])]
-    for label, number in (
-        ("median", np.median),
-        ("lowest", np.min),
-        ("highest", np.max),
-    ):
+    for label, number in (("median", np.median), ("lowest", np.min), ("highest", np.max)):
         rows.append((label, [c.shown(float(number(c.value))) for c in courses]))
     spread = [c.shown(float(np.std(c.value))) if len(c.value) > 1 else None for c in courses]
     rows.append(("standard deviation", spread))

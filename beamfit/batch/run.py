@@ -21,10 +21,8 @@ if TYPE_CHECKING:
 
 # Files in a task: handing out a task costs milliseconds, about as much as fitting a file.
 TASK = 256
-# Tasks queued for each worker, so that none waits for the scheduler.
-AHEAD = 3
-# Seconds to wait for an answer; waits in a row with too few workers before one more is started.
-PATIENCE, CHECKS = 10.0, 3
+# Seconds to wait for an answer.
+PATIENCE = 10.0
 SUFFIXES = {
     "emittance": (".csv", ".txt", ".h5", ".hdf5", ".mat", ".tfs"),
     "lifetime": (".csv", ".txt", ".h5", ".hdf5", ".json"),
@@ -218,14 +216,15 @@ def _spread(
         given.update((client.submit(job.answer, task, pure=False), task) for task in few)
         return bool(given)
 
-    hand_out(islice(tasks, AHEAD * max(len(client.ncores()), 1)))
+    # Three tasks for each worker, so that none waits for the scheduler.
+    hand_out(islice(tasks, 3 * max(len(client.ncores()), 1)))
     while given or hand_out([suspects.pop()] if suspects else []):
         try:
             future = next(iter(wait(list(given), PATIENCE, "FIRST_COMPLETED").done))
             text = future.result(PATIENCE)
         except TimeoutError:  # also where what was found died with its worker
             waited = waited + 1 if workers and len(client.ncores()) < workers else 0
-            if waited == CHECKS:  # one that dies as it starts is not started again
+            if waited == 3:  # one that dies as it starts is not started again
                 client.cluster.scale(len(client.cluster.workers) + 1)
                 waited = 0
             continue

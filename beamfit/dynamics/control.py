@@ -23,7 +23,7 @@ from beamfit.dynamics.fit import ResponseFit
 from beamfit.dynamics.model import parameters_at, predicted
 from beamfit.dynamics.response import ARX, PHYSICS, Physics, run_from
 from beamfit.errors import Finding, InputError, Status, judge, nearest
-from beamfit.greybox.quadratic import Quadratic, minimum
+from beamfit.greybox.programs import Quadratic, minimum
 
 # Penalty on an output beyond its limit, per unit of its scatter: larger than any multiplier of a
 # limit that can be kept, so that such a limit is kept exactly.

@@ -49,9 +49,6 @@ SHARE, PARTS = 1e-2, (1.0, 1e-2)
 # squares, and count at random or inward from bounds.
 BESIDE, WEAKEST, AROUND = 1e-3, 2, 4
 
-# Newton steps that bring a point back onto its constraints, and the tolerance of these.
-RESTORED, BACK = 10, 1e-10
-
 
 class Slopes(NamedTuple):
     """Values and first derivatives at a point."""
@@ -79,13 +76,14 @@ class Scale(NamedTuple):
 
 
 class LimitedValues(NamedTuple):
-    """Values with their lower and upper limits, their sizes, and how near counts as reached."""
+    """Values with limits, their sizes, how near counts as reached, and the limits' multipliers."""
 
     value: np.ndarray
     lower: np.ndarray
     upper: np.ndarray
     size: np.ndarray
     near: np.ndarray
+    multiplier: np.ndarray | float = 0.0
 
     @property
     def violation(self) -> np.ndarray:
@@ -99,23 +97,18 @@ class LimitedValues(NamedTuple):
         """True for each lower and each upper limit that is reached."""
         return self.value - self.lower <= self.near, self.upper - self.value <= self.near
 
-    def distance(self, multiplier: np.ndarray) -> np.ndarray:
+    @property
+    def distance(self) -> np.ndarray:
         """Distance from the limit a multiplier belongs to; zero where there is none."""
         low, high = self.value - self.lower, self.upper - self.value
-        return np.where(multiplier > 0, low, np.where(multiplier < 0, high, 0.0))
+        return np.where(self.multiplier > 0, low, np.where(self.multiplier < 0, high, 0.0))
 
-    def states(self, multiplier: np.ndarray) -> np.ndarray:
+    @property
+    def states(self) -> np.ndarray:
         """State of each value: free, at its lower or upper limit, or fixed."""
         low, high = self.reached
-        cases = [self.lower == self.upper, low & ((multiplier > 0) | ~high), high]
+        cases = [self.lower == self.upper, low & ((self.multiplier > 0) | ~high), high]
         return np.select(cases, ["fixed", "lower", "upper"], "free")
-
-
-class Multipliers(NamedTuple):
-    """Multipliers of the bounds (reduced gradients) and of the constraints."""
-
-    bounds: np.ndarray
-    constraints: np.ndarray
 
 
 class KKT(NamedTuple):
@@ -159,7 +152,6 @@ class SearchState(NamedTuple):
     at: Slopes
     bounds: LimitedValues
     limits: LimitedValues
-    found: Multipliers
     kkt: KKT
     scale: Scale
     tolerance: float
@@ -169,6 +161,12 @@ class SearchState(NamedTuple):
     def feasible(self) -> bool:
         """True if all limits hold within the tolerance."""
         return self.kkt.feasibility <= self.tolerance
+
+    @property
+    def left(self) -> np.ndarray:
+        """Gradient of the Lagrangian: what multipliers leave of that of the cost."""
+        pull = self.at.jacobian.T @ self.limits.multiplier
+        return self.at.gradient - self.bounds.multiplier - pull
 
     @property
     def optimal(self) -> bool:
@@ -256,8 +254,8 @@ def gradient_size(p: Problem, at: Slopes, scale: Scale) -> np.ndarray:
 def holding(p: Problem, s: SearchState, least: float) -> tuple[np.ndarray, np.ndarray]:
     """Numbers that do not move and constraints that hold, by forces above a share."""
     size = gradient_size(p, s.at, s.scale)
-    held = ~p.moving | (np.abs(s.found.bounds) > least * size)
-    pulls = np.abs(s.found.constraints) * np.linalg.norm(s.at.jacobian / size, axis=1)
+    held = ~p.moving | (np.abs(s.bounds.multiplier) > least * size)
+    pulls = np.abs(s.limits.multiplier) * np.linalg.norm(s.at.jacobian / size, axis=1)
     return held, p.equations | (pulls > least)
 
 
@@ -289,20 +287,19 @@ def state(p: Problem, theta: np.ndarray, scale: Scale, at: Slopes | None = None)
         pushed = np.abs(at.gradient) > p.tolerance * size
         near = np.where(pushed, np.maximum(near, CLOSE * cost / np.abs(at.gradient)), near)
     near = np.where(np.isfinite(near), near, 0.0)
-    bounds = LimitedValues(theta, p.lower, p.upper, scale.unit, near)
+    bounds = LimitedValues(theta, p.lower, p.upper, scale.unit, near, np.zeros(len(theta)))
     # A number that ends at zero does not make what it limits small.
     largest = np.maximum(np.abs(theta), scale.unit)
     here = scale_of(p, largest, at) if p.constraints else scale
     size_here = np.fmin(scale.limit, GROWN * here.limit)
-    limits = LimitedValues(
-        at.constraints, p.constraint_lower, p.constraint_upper, size_here, p.tolerance * size_here
-    )
-    none = Multipliers(np.zeros(len(theta)), np.zeros(len(at.constraints)))
-    s = SearchState(theta, at, bounds, limits, none, LOST, scale, p.tolerance)
+    ends, near = (p.constraint_lower, p.constraint_upper), p.tolerance * size_here
+    limits = LimitedValues(at.constraints, *ends, size_here, near, np.zeros(len(near)))
+    s = SearchState(theta, at, bounds, limits, LOST, scale, p.tolerance)
     if not at.finite:
         return s
-    s = s._replace(found=multipliers(at.gradient, at.jacobian, bounds, limits, size))
-    return s._replace(kkt=_distance(s, size, cost))
+    pulls, forces = multipliers(at.gradient, at.jacobian, bounds, limits, size)
+    bounds, limits = bounds._replace(multiplier=pulls), limits._replace(multiplier=forces)
+    return _at_distance(s._replace(bounds=bounds, limits=limits), size, cost)
 
 
 def multipliers(
@@ -311,7 +308,7 @@ def multipliers(
     bounds: LimitedValues,
     limits: LimitedValues,
     scale: np.ndarray,
-) -> Multipliers:
+) -> tuple[np.ndarray, np.ndarray]:
     """Find the multipliers of the right signs that come nearest to stationarity.
 
     Parameters
@@ -327,7 +324,8 @@ def multipliers(
 
     Returns
     -------
-    Multipliers
+    (array, shape (n,); array, shape (m,))
+        Of the bounds (reduced gradients) and of the constraints.
 
     Examples
     --------
@@ -336,14 +334,14 @@ def multipliers(
     >>> one, none = np.ones(1), np.zeros(0)
     >>> at = LimitedValues(one, np.array([-np.inf]), one, one, 1e-6 * one)
     >>> free = LimitedValues(none, none, none, none, none)
-    >>> multipliers(np.array([-2.0]), np.zeros((0, 1)), at, free, one).bounds.tolist()
+    >>> multipliers(np.array([-2.0]), np.zeros((0, 1)), at, free, one)[0].tolist()
     [-2.0]
     """
     n = len(gradient)
     low, high = (np.concatenate(pair) for pair in zip(bounds.reached, limits.reached, strict=True))
     if not (low[n:].any() or high[n:].any()):
         own = np.where(low[:n] & (gradient > 0) | high[:n] & (gradient < 0), gradient, 0.0)
-        return Multipliers(own, np.zeros(len(limits.value)))
+        return own, np.zeros(len(limits.value))
     rows = np.vstack([np.eye(n), np.reshape(jacobian, (-1, n))])
     chosen = np.concatenate([np.flatnonzero(low), np.flatnonzero(high)])
     sign = np.concatenate([np.ones(low.sum()), -np.ones(high.sum())])
@@ -360,22 +358,17 @@ def multipliers(
     sharp = np.linalg.lstsq(columns[:, used], right, rcond=None)[0]
     guess[used] = np.where(sharp > 0, sharp, guess[used])
     np.add.at(found, chosen, sign * guess / np.where(size > 0, size, 1.0))
-    return Multipliers(found[:n], found[n:])
+    return found[:n], found[n:]
 
 
-def _distance(s: SearchState, scale: np.ndarray, cost: float) -> KKT:
+def _at_distance(s: SearchState, scale: np.ndarray, cost: float) -> SearchState:
     """Measure how far a point with multipliers is from an optimum, `cost` being a size of it."""
-    at, found = s.at, s.found
-    left = at.gradient - found.bounds - at.jacobian.T @ found.constraints
-    size = scale + np.abs(found.constraints) @ np.abs(at.jacobian)
-    parts = ((found.bounds, s.bounds), (found.constraints, s.limits))
-    products = [np.abs(y * part.distance(y)) for y, part in parts]
+    size = scale + np.abs(s.limits.multiplier) @ np.abs(s.at.jacobian)
+    products = [np.abs(part.multiplier * part.distance) for part in (s.bounds, s.limits)]
     crossed = np.concatenate([s.bounds.violation, s.limits.violation, [0.0]])
-    return KKT(
-        float(np.max(np.abs(left) / size, initial=0.0)),
-        float(np.max(crossed)),
-        float(np.max(np.concatenate(products), initial=0.0) / cost),
-    )
+    stationarity = np.max(np.abs(s.left) / size, initial=0.0)
+    complementarity = np.max(np.concatenate(products), initial=0.0) / cost
+    return s._replace(kkt=KKT(*map(float, (stationarity, np.max(crossed), complementarity))))
 
 
 # ---- second order
@@ -415,7 +408,7 @@ def second_order(p: Problem, s: SearchState, exact: bool) -> tuple[SearchState, 
 
     def lagrangian(points):
         found = (p.compiled(problem.values)(point) for point in points)
-        return np.array([float(c) - s.found.constraints @ np.asarray(held) for c, held in found])
+        return np.array([float(c) - s.limits.multiplier @ np.asarray(held) for c, held in found])
 
     if not (p.objectives and exact):
         point = lower_beside(p, s, lagrangian)
@@ -492,10 +485,7 @@ def _weakest(p: Problem, s: SearchState) -> np.ndarray:
 
 
 def _along(
-    p: Problem,
-    s: SearchState,
-    direction: np.ndarray,
-    lagrangian: Look,
+    p: Problem, s: SearchState, direction: np.ndarray, lagrangian: Look
 ) -> np.ndarray | None:
     """The best of some points along a direction, None if none is better by what counts."""
     steps = [
@@ -528,13 +518,13 @@ def _restored(p: Problem, s: SearchState, point: np.ndarray) -> np.ndarray | Non
     """
     held, on = holding(p, s, p.tolerance)
     unit = np.where(held, 0.0, s.scale.unit)
-    for _ in range(RESTORED):
+    for _ in range(10):  # Newton steps
         at = slopes(p, point)
         if not at.finite:
             return None
         inside = np.clip(at.constraints, p.constraint_lower, p.constraint_upper)
         gap = at.constraints - np.where(on, s.at.constraints, inside)
-        if np.all(np.abs(gap) <= BACK * s.limits.size):
+        if np.all(np.abs(gap) <= 1e-10 * s.limits.size):
             return point
         left = gap != 0
         step = np.linalg.lstsq(at.jacobian[left] * unit, gap[left], rcond=None)[0]
@@ -545,17 +535,16 @@ def _restored(p: Problem, s: SearchState, point: np.ndarray) -> np.ndarray | Non
 def _bend(p: Problem, s: SearchState) -> Bend:
     """Curvature on the directions that active limits leave, from exact derivatives."""
     unit, cost = s.scale.unit, s.scale.cost
-    h = np.asarray(p.compiled(lagrangian_hessian)(s.theta, 1.0, s.found.constraints))
+    h = np.asarray(p.compiled(lagrangian_hessian)(s.theta, 1.0, s.limits.multiplier))
     h = h * np.outer(unit, unit) / cost
     tangent = _tangent(p, s)
     if not tangent.shape[1] or not np.all(np.isfinite(h)):
         return Bend(None)
     values, vectors = np.linalg.eigh(tangent.T @ h @ tangent)
-    left = s.at.gradient - s.found.bounds - s.at.jacobian.T @ s.found.constraints
-    slope = vectors.T @ (tangent.T @ (left * unit / cost))
+    slope = vectors.T @ (tangent.T @ (s.left * unit / cost))
     largest = np.max(np.abs(values))
     steep = values > FLAT * largest
-    terms = np.abs(s.at.gradient) + np.abs(s.found.constraints) @ np.abs(s.at.jacobian)
+    terms = np.abs(s.at.gradient) + np.abs(s.limits.multiplier) @ np.abs(s.at.jacobian)
     told = steep & (np.abs(slope) > ROUNDING * np.max(terms * unit / cost))
     newton = np.max(np.abs(slope[told] / values[told]), initial=0.0)
     down = tangent @ vectors[:, 0] * unit if values[0] < -FLAT * max(largest, FLAT) else None

@@ -10,8 +10,8 @@ constraint.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple, Protocol
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -135,21 +135,6 @@ _ROUNDING = 2.0**-53
 _TINY = 1e-300  # covers underflow, which a relative error does not
 
 
-class LayeredNetwork(Protocol):
-    """The parts of a network that a bound reads (of `beamfit.greybox.mlp.MLP`, which uses this).
-
-    `order` holds its layers in the order of computation, each with name, kind and size; a port has
-    layer, node, scale and bias.
-    """
-
-    order: tuple[Any, ...]
-    connections: tuple[tuple[str, str], ...]
-    input_ports: tuple[Any, ...]
-    output_ports: tuple[Any, ...]
-    weights: Mapping[str, jax.Array]
-    biases: Mapping[str, jax.Array]
-
-
 class _Ball(NamedTuple):
     """An enclosure of finite numbers: within `radius` of `middle`.
 
@@ -246,7 +231,7 @@ def _activated(s: _Nodes, kind: str) -> _Nodes:
     return _Nodes(range_of(kind, 0, s.value), _times(d1[n, new], s.first), second, third)
 
 
-def _entered(s: _Nodes, net: LayeredNetwork, layer: str, box: Range) -> _Nodes:
+def _entered(s: _Nodes, net: Any, layer: str, box: Range) -> _Nodes:
     """Add the inputs that enter a layer."""
     value, first = s.value, s.first
     for i, port in enumerate(net.input_ports):
@@ -265,7 +250,7 @@ def _entered(s: _Nodes, net: LayeredNetwork, layer: str, box: Range) -> _Nodes:
     return s._replace(value=value, first=first)
 
 
-def _enclose(net: LayeredNetwork, box: Range) -> _Nodes:
+def _enclose(net: Any, box: Range) -> _Nodes:
     """Enclose the derivatives of every output over a box (values keep their node's scale)."""
     inputs = len(net.input_ports)
     done: dict[str, _Nodes] = {}
@@ -318,12 +303,13 @@ def _taylor(middle: _Nodes, whole: _Nodes, radius: jax.Array) -> Range:
     return Range(middle.first.middle - down - reach, middle.first.middle + up + reach)
 
 
-def gain_bounds(net: LayeredNetwork, lower: jax.Array, upper: jax.Array) -> Range:
+@jax.jit
+def gain_bounds(net: Any, lower: jax.Array, upper: jax.Array) -> Range:
     """Enclose every first-order gain of a network over one box.
 
     Parameters
     ----------
-    net : LayeredNetwork
+    net : MLP
         The network; its own gain outputs play no part.
     lower, upper : array, shape (inputs,)
         Corners of the box; infinite sides are allowed.
@@ -341,12 +327,7 @@ def gain_bounds(net: LayeredNetwork, lower: jax.Array, upper: jax.Array) -> Rang
     >>> bool(found.lower[0, 0] < found.upper[0, 0])
     True
     """
-    return _bounds(net, jnp.asarray(lower, float), jnp.asarray(upper, float))
-
-
-@jax.jit
-def _bounds(net: LayeredNetwork, lower: jax.Array, upper: jax.Array) -> Range:
-    """The bounds of `gain_bounds`, compiled once for each structure of network."""
+    lower, upper = jnp.asarray(lower, float), jnp.asarray(upper, float)
     finite = jnp.all(jnp.isfinite(upper - lower))
     low, high = (jnp.where(finite, end, 0.0) for end in (lower, upper))
     centre = 0.5 * (low + high)
@@ -405,12 +386,12 @@ def cells(lower, upper, number: int) -> tuple[np.ndarray, np.ndarray]:
     return low.reshape(-1, lower.size), high.reshape(-1, lower.size)
 
 
-def over_cells(net: LayeredNetwork, lower: jax.Array, upper: jax.Array) -> Range:
+def over_cells(net: Any, lower: jax.Array, upper: jax.Array) -> Range:
     """Enclose every first-order gain over each of some boxes.
 
     Parameters
     ----------
-    net : LayeredNetwork
+    net : MLP
         The network.
     lower, upper : array, shape (cells, inputs)
         Corners of the boxes, such as those of `cells`.

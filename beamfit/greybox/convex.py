@@ -54,25 +54,17 @@ class Curvature(NamedTuple):
 
 def convex(p: Problem) -> bool:
     """True if the problem is proved convex: a convex cost within a convex set."""
-    cost = _curve(p, problem.cost)
-    if cost is None or not (_upward(cost) or (cost.degree <= 2 and _positive(p))):
+    try:
+        cost = _curve(p, problem.cost)
+        limits = _curve(p, problem.constraints) if p.constraints else Curvature(0, 0.0)
+    except _Unknown:
         return False
-    if not p.constraints:
-        return True
-    limits = _curve(p, problem.constraints)
-    if limits is None:
+    if not (cost.sign in (0, 1) or (cost.degree <= 2 and _positive(p))):
         return False
-    below, above = np.isfinite(p.constraint_lower).any(), np.isfinite(p.constraint_upper).any()
-    return bool(
-        limits.sign == 0
-        or limits.degree <= 1
-        or (limits.sign == 1 and not below)
-        or (limits.sign == -1 and not above)
-    )
-
-
-def _upward(curve: Curvature) -> bool:
-    return curve.sign in (0, 1)
+    # A convex function may be limited from above, a concave one from below.
+    ends = {1: p.constraint_lower, -1: p.constraint_upper}
+    straight = limits.sign == 0 or limits.degree <= 1
+    return straight or (limits.sign in ends and not np.isfinite(ends[limits.sign]).any())
 
 
 def _positive(p: Problem) -> bool:
@@ -88,14 +80,11 @@ def _hessian(core, theta):
     return jax.hessian(problem.cost, 1)(core, theta)
 
 
-def _curve(p: Problem, function) -> Curvature | None:
-    """Curvature of a compiled function of (core, theta) in theta; None if it is not known."""
+def _curve(p: Problem, function) -> Curvature:
+    """Curvature of a compiled function of (core, theta) in theta."""
     program = function.trace(p.core, jnp.asarray(p.start)).jaxpr
     arguments = [*jax.tree.leaves(p.core), Curvature(0, 1.0)]
-    try:
-        (found,) = _followed(program.jaxpr, program.consts, arguments)
-    except _Unknown:
-        return None
+    (found,) = _followed(program.jaxpr, program.consts, arguments)
     return found if isinstance(found, Curvature) else Curvature(0, 0.0)
 
 
@@ -171,14 +160,13 @@ def _of_step(step, operands: list[Any]) -> Curvature:
     if name == "neg":
         return Curvature(_times(first.sign, -1), degree)
     if name == "sub":
-        signs = [v.sign if i == 0 else _times(v.sign, -1)
-                 for i, v in enumerate(operands) if isinstance(v, Curvature)]  # fmt: skip
+        signed = zip(operands, (1, -1), strict=True)
+        signs = [_times(v.sign, way) for v, way in signed if isinstance(v, Curvature)]
         return Curvature(_common(signs), degree)
     if name in ("mul", "dot_general") or (name == "div" and not isinstance(operands[1], Curvature)):
         return _product(step, operands, numbers)
     if name in ("square", "integer_pow"):
-        power = 2 if name == "square" else step.params["y"]
-        return _power(first, power)
+        return _power(first, step.params.get("y", 2))
     return Curvature(_composed(name, numbers), np.inf)
 
 
@@ -193,21 +181,16 @@ def _only_moved(name: str, operands: list[Any]) -> bool:
 
 def _product(step, operands: list[Any], numbers: list[Curvature]) -> Curvature:
     if len(numbers) == 2:
-        same = step.invars[0] is step.invars[1]
-        return Curvature(
-            1 if same and numbers[0].sign == 0 else None, sum(v.degree for v in numbers)
-        )
+        square = step.invars[0] is step.invars[1] and numbers[0].sign == 0
+        return Curvature(1 if square else None, sum(v.degree for v in numbers))
     factor = np.asarray(next(v for v in operands if not isinstance(v, Curvature)))
     sign = 1 if np.all(factor >= 0) else -1 if np.all(factor <= 0) else None
-    known = numbers[0].sign
-    return Curvature(0 if known == 0 else _times(known, sign), numbers[0].degree)
+    return Curvature(_times(numbers[0].sign, sign), numbers[0].degree)
 
 
 def _power(v: Curvature, power: int) -> Curvature:
     if power < 0:
         return Curvature(None, np.inf)
-    if power <= 1:
-        return Curvature(v.sign if power else 0, v.degree * power)
     return Curvature(1 if v.sign == 0 and power % 2 == 0 else None, v.degree * power)
 
 

@@ -136,11 +136,6 @@ class Descent:
         cost = 0.5 * _dot(self.residual, self.residual)
         return np.where(np.isfinite(cost), cost, np.inf)
 
-    @property
-    def found(self) -> Found:
-        """The ends."""
-        return Found(self.theta, self.cost, self.steps, self.rested)
-
     def go(self, lanes: np.ndarray, limit: int, until: float | None = None) -> None:
         """Move some searches on to a number of steps, or until a moment on the clock."""
         with np.errstate(all="ignore"):
@@ -526,4 +521,4 @@ def descend_all(
 
     search = Descent(slopes, every, np.asarray(lower), np.asarray(upper), tolerance)
     search.go(np.arange(len(every)), iterations)
-    return search.found
+    return Found(search.theta, search.cost, search.steps, search.rested)

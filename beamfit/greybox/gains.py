@@ -64,15 +64,19 @@ def sensitivities(m: Map, x: jax.Array, variables: Sequence[str] | None = None) 
     >>> sensitivities(m, jnp.array([5.0, 7.0]), ["v", "matrix"]).tolist()
     [[3.0, 5.0, 7.0]]
     """
-    chosen = m.inputs if variables is None else tuple(variables)
-    return _forward(m, jnp.asarray(x, float), chosen)
+    return _swept(jax.jacfwd, m, x, m.outputs, m.inputs if variables is None else variables)
 
 
-@partial(jax.jit, static_argnums=2)
-def _forward(m: Map, x: jax.Array, variables: tuple[str, ...]) -> jax.Array:
-    """Forward sweeps, compiled once for each structure of map."""
+def _swept(sweep, m: Map, x, functions: Sequence[str], variables: Sequence[str]) -> jax.Array:
+    rows = tuple(positions(functions, m.outputs, "output"))
+    return _jacobian(sweep, rows, tuple(variables), m, jnp.asarray(x, float))
+
+
+@partial(jax.jit, static_argnums=(0, 1, 2))
+def _jacobian(sweep, rows: tuple[int, ...], variables: tuple[str, ...], m: Map, x: jax.Array):
+    """Forward or backward sweeps, compiled once for each structure of map."""
     function, start = _restricted(m, x, variables)
-    return jax.jacfwd(function)(start)
+    return sweep(lambda v: function(v)[jnp.array(rows)])(start)
 
 
 def adjoints(
@@ -110,17 +114,8 @@ def adjoints(
     >>> adjoints(m, jnp.array([5.0]), ["z"]).tolist()
     [[3.0]]
     """
-    rows = positions(m.outputs if functions is None else functions, m.outputs, "output")
-    chosen = m.inputs if variables is None else tuple(variables)
-    return _backward(m, jnp.asarray(x, float), tuple(rows), chosen)
-
-
-@partial(jax.jit, static_argnums=(2, 3))
-def _backward(m: Map, x: jax.Array, rows: tuple[int, ...], variables: tuple[str, ...]):
-    """Backward sweeps, compiled once for each structure of map."""
-    function, start = _restricted(m, x, variables)
-    _, pull = jax.vjp(function, start)
-    return jax.vmap(lambda w: pull(w)[0])(jnp.eye(len(m.outputs))[jnp.array(rows)])
+    chosen = m.inputs if variables is None else variables
+    return _swept(jax.jacrev, m, x, m.outputs if functions is None else functions, chosen)
 
 
 def gain(m: Map, x: jax.Array, output: str, by: Sequence[str]) -> jax.Array:
@@ -233,12 +228,7 @@ class _CertifiedGain:
 
 
 def gain_at(
-    path: str,
-    output: str,
-    by: Sequence[str],
-    points,
-    lower: float = -np.inf,
-    upper: float = np.inf,
+    path: str, output: str, by: Sequence[str], points, lower: float = -np.inf, upper: float = np.inf
 ) -> Constraint:
     """Constrain a gain of order 1 to 3 at points; between them it stays free.
 
@@ -266,13 +256,8 @@ def gain_at(
     >>> falls.name
     'dA/dc'
     """
-    return Constraint(
-        f"d{output}/d{'d'.join(by)}",
-        _GainAt(path, output, tuple(by)),
-        jnp.asarray(points, float),
-        lower,
-        upper,
-    )
+    gains, name = _GainAt(path, output, tuple(by)), f"d{output}/d{'d'.join(by)}"
+    return Constraint(name, gains, jnp.asarray(points, float), lower, upper)
 
 
 @lru_cache(maxsize=64)
@@ -321,14 +306,11 @@ def certified_gain(
     ['max dA/dc']
     """
     corners = _corners(*(tuple(map(float, corner)) for corner in box), number)
-    wanted = [("upper", "max", -np.inf, upper), ("lower", "min", lower, np.inf)]
-    found = [
-        Constraint(
-            f"{word} d{output}/d{by}", _CertifiedGain(path, output, by, end), corners, low, high
-        )
-        for end, word, low, high in wanted
-        if np.isfinite(low) or np.isfinite(high)
-    ]
+    found = []
+    for end, word, low, high in (("upper", "max", -np.inf, upper), ("lower", "min", lower, np.inf)):
+        if np.isfinite(low) or np.isfinite(high):
+            bound = _CertifiedGain(path, output, by, end)
+            found.append(Constraint(f"{word} d{output}/d{by}", bound, corners, low, high))
     if not found:
         raise InputError(f"no limit on d{output}/d{by}", "lower, upper or both")
     return found

@@ -8,7 +8,6 @@ prediction, whatever the data, are told as a freedom of the model.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable
 from typing import Any, NamedTuple
 
 import jax
@@ -22,7 +21,6 @@ from beamfit import errors
 from beamfit.errors import Finding, Status
 from beamfit.greybox import assess, problem
 from beamfit.greybox.assess import LOOKS, NEAR, SearchState
-from beamfit.greybox.conflict import Conflict, dependence
 from beamfit.greybox.convex import convex
 from beamfit.greybox.covariance import (
     MOST_SHARE,
@@ -33,9 +31,10 @@ from beamfit.greybox.covariance import (
     spread_of,
     triangle,
 )
+from beamfit.greybox.diagnosis import Conflict, dependence, listed
 from beamfit.greybox.equations import Implicit
 from beamfit.greybox.fit import Attempt, Fit, FittedConstraint, FittedVariable
-from beamfit.greybox.problem import FlatCore, Problem, sloped
+from beamfit.greybox.problem import Problem, flattened, sloped
 from beamfit.greybox.sparse import Rows
 from beamfit.statistics import POOR_FIT, chi2_probability
 
@@ -136,8 +135,7 @@ def known(p: Problem, s: SearchState) -> Known:
     nowhere = np.full(len(held), np.inf)
     seen = spread_of(_stacked(blocks), -nowhere, nowhere, held, None, equations)
     groups = groups_of(p.records, np.split(s.at.residual, ends)[:-1], blocks, seen)
-    still = (np.isin(s.bounds.states(s.found.bounds), EDGES) & p.nuisance) | ~p.moving
-
+    still = (np.isin(s.bounds.states, EDGES) & p.nuisance) | ~p.moving
     limited = np.isfinite(p.upper - p.lower) & p.moving & ~p.with_prior
     alike = np.array_equal(still, held) and not limited.any()
 
@@ -182,12 +180,6 @@ def settled(p: Problem, s: SearchState) -> bool:
     return bool(found.raw.size(pull) ** 2 < SETTLED)
 
 
-def listed(names: Iterable[str]) -> str:
-    """A few names for a sentence."""
-    names = list(names)
-    return ", ".join(names[:4]) + (f" and {len(names) - 4} more" if len(names) > 4 else "")
-
-
 # ---- the answer
 
 
@@ -195,16 +187,17 @@ def conclude(p: Problem, s: SearchState, search: Search, seconds: float) -> Fit:
     """Judge the best point of a search, `seconds` being the time taken."""
     failure = _inner_failure(p, s.theta)
     if failure or not s.at.finite:
-        status, said = Status.not_finite, (
-            "the cost or a derivative is not finite at the end of the search; bound the free "
-            "numbers away from there, or use a parametrisation that stays defined."
-        )  # fmt: skip
+        lost = Finding(
+            Status.not_finite,
+            "the cost or a derivative is not finite at the end of the search;",
+            "bound the free numbers away from there, or use a parametrisation that stays defined.",
+        )
         if failure:
-            status, said = Status.not_converged, (
-                f"{failure} at the end of the search; start it nearer to its root, or bound the "
-                "free numbers to where a root exists."
-            )  # fmt: skip
-        return refused(p, status, said, seconds, s.theta, search.attempts)
+            remedy = (
+                "start it nearer to its root, or bound the free numbers to where a root exists."
+            )
+            lost = Finding(Status.not_converged, f"{failure} at the end of the search;", remedy)
+        return refused(p, lost, seconds, s.theta, search.attempts)
     found = known(p, s)
     variables, constraints = _variables(p, s, found), _constraints(p, s)
     chi2 = float(s.at.residual @ s.at.residual)
@@ -226,7 +219,8 @@ def conclude(p: Problem, s: SearchState, search: Search, seconds: float) -> Fit:
 
 def _inner_failure(p: Problem, theta: np.ndarray) -> str | None:
     """Failure of an implicit map in the model to converge at the answer, or None."""
-    if not p.has_part(Implicit):
+    parts = jax.tree.leaves(p.core, is_leaf=lambda part: isinstance(part, Implicit))
+    if not any(isinstance(part, Implicit) for part in parts):
         return None
     look = checkify.checkify(jax.jit(problem.values), errors=checkify.user_checks)
     said = look(p.core, jnp.asarray(theta, float))[0].get()
@@ -237,27 +231,20 @@ def _variables(p: Problem, s: SearchState, found: Known) -> tuple[FittedVariable
     nothing = (found.spread.shares >= MOST_SHARE) | found.held
     nothing |= any(group.unknown for group in found.groups)
     errors = (np.where(nothing, np.nan, part.errors) for part in (found.spread, found.raw))
-    columns = (s.theta, *errors, p.lower, p.upper, s.bounds.states(s.found.bounds), s.found.bounds)
+    columns = (s.theta, *errors, p.lower, p.upper, s.bounds.states, s.bounds.multiplier)
     return _rows(FittedVariable, p.names, *columns)
 
 
 def _constraints(p: Problem, s: SearchState) -> tuple[FittedConstraint, ...]:
-    states = s.limits.states(s.found.constraints)
-    return _rows(FittedConstraint, p.constraint_names, *s.limits[:3], states, s.found.constraints)
+    columns = (*s.limits[:3], s.limits.states, s.limits.multiplier)
+    return _rows(FittedConstraint, p.constraint_names, *columns)
 
 
 def _rows(kind: type, names: tuple[str, ...], *columns: np.ndarray) -> tuple:
     return tuple(map(kind, names, *(column.tolist() for column in columns)))
 
 
-def refused(
-    p: Problem,
-    status: Status,
-    message: str,
-    seconds: float,
-    theta: np.ndarray | None = None,
-    attempts: tuple[Attempt, ...] = (),
-) -> Fit:
+def refused(p: Problem, found: Finding, seconds: float, theta=None, attempts=()) -> Fit:
     """A fit without an answer: where it stopped, and nothing determined."""
     theta = p.start if theta is None else theta
     n, nan = len(theta), np.nan
@@ -268,7 +255,7 @@ def refused(
     ends, free = (p.constraint_lower, p.constraint_upper), np.full(len(none), "free")
     constraints = _rows(FittedConstraint, p.constraint_names, none, *ends, free, none)
     return Fit(
-        p, theta, status, message, nan, nan, 0, (), assess.LOST, variables,
+        p, theta, found.status, found.message, nan, nan, 0, (), assess.LOST, variables,
         constraints, lost, lost, np.zeros((p.size, n)), np.eye(n), nan, attempts, seconds,
     )  # fmt: skip
 
@@ -504,7 +491,7 @@ def _made_up(p: Problem, theta: np.ndarray, random: np.random.Generator) -> np.n
         for r in p.core.records
     )
     core = dataclasses.replace(p.core, records=records)
-    rows = np.asarray(FlatCore.of(core).compiled(sloped)(theta)[1]) * _size(theta)
+    rows = np.asarray(flattened(core)(sloped)(theta)[1]) * _size(theta)
     rows = rows[np.all(np.isfinite(rows), axis=1)]
     for order in (np.inf, 2):  # the square of what grows without end has no number
         terms = np.linalg.norm(rows, order, axis=1, keepdims=True)

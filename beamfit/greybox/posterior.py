@@ -224,8 +224,11 @@ def target_of(
         If a constraint is an equation, an option is not understood, or a prior's name is not that
         of a sampled number.
     """
-    _refuse_equations(problem)
     p, stated = problem, stated or Statement()
+    if p.equations.any():
+        name = p.constraint_names[int(np.argmax(p.equations))]
+        expected = "limits that differ: nothing that is drawn at random meets an equation"
+        raise InputError(f"the equation '{name}'", expected)
     moving = np.flatnonzero(p.moving)
     names = tuple(stated.renamed.get(p.names[i], p.names[i]) for i in moving)
     priors = checked(priors, names)
@@ -236,7 +239,9 @@ def target_of(
     data = _data(p, theta, moving, stated)
     slopes = slopes_of(law._replace(residual=with_priors), data, theta[moving])
     noise_found = tuple(scale if scale > 0 else 1.0 for scale in optimum.scales) or (1.0,)
-    width = _widths(upper - lower, names, priors)
+    # Largest distance of each number from the optimum where the data do not determine it.
+    box = np.where(np.isfinite(upper - lower), 0.5 * (upper - lower), np.inf)
+    width = np.minimum(box, [float(priors[n].std()) if n in priors else np.inf for n in names])
     covariance = covariance_of(slopes, (*noise_found, 1.0), width)
     unseen = np.zeros((len(theta), 0)) if optimum.undetermined is None else optimum.undetermined
     with_prior = np.array([name in priors for name in names])
@@ -311,13 +316,6 @@ def predicted(posterior: Posterior, name: str) -> Predicted:
     return Predicted(measured + residual * error / np.sqrt(weight), measured, error)
 
 
-def _refuse_equations(p: Problem) -> None:
-    if p.equations.any():
-        name = p.constraint_names[int(np.argmax(p.equations))]
-        expected = "limits that differ: nothing that is drawn at random meets an equation"
-        raise InputError(f"the equation '{name}'", expected)
-
-
 def _changed(p: Problem, stated: Statement, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The optimum in the numbers that are sampled, and their derivatives by the problem's own."""
     if stated.quoted is unchanged:
@@ -344,15 +342,6 @@ def _data(p: Problem, theta: np.ndarray, moving: np.ndarray, stated: Statement) 
     loose = p.lower == p.upper
     ends = np.where(loose, -np.inf, p.lower), np.where(loose, np.inf, p.upper)
     return jax.tree.map(jnp.asarray, Sampled(core, fixed, moving, ends, stated.data))
-
-
-def _widths(
-    box: np.ndarray, names: Sequence[str], priors: Mapping[str, Distribution]
-) -> np.ndarray:
-    """Largest distance of each number from the optimum where the data do not determine it."""
-    width = np.where(np.isfinite(box), 0.5 * box, np.inf)
-    spread = [float(priors[name].std()) if name in priors else np.inf for name in names]
-    return np.minimum(width, spread)
 
 
 def _groups(

@@ -22,8 +22,6 @@ from beamfit.greybox import tree
 
 # Default tolerance on limits and on the conditions of an optimum, in sizes.
 TOLERANCE = 1e-6
-# Numbers up to which an array is handed over with every call: JAX takes longer to make it its own.
-SMALL = 1000
 
 
 class Free(NamedTuple):
@@ -221,29 +219,20 @@ class Core:
     objectives: tuple[Objective, ...]
 
 
-class FlatCore(NamedTuple):
-    """The arrays of a core, each once, and where they stand among the leaves of its structure.
+def flattened(core: Core) -> Callable[[Callable], Callable]:
+    """Compiler of functions of (core, theta, ...) to functions of (theta, ...) at this core.
 
-    What two parts compute of the same arrays, a compiled function computes once.
+    Its arrays are handed over once each: what two parts compute of the same arrays, a compiled
+    function computes once.
     """
-
-    arrays: list[Any]
-    places: tuple[int, ...]
-    structure: jax.tree_util.PyTreeDef
-
-    @classmethod
-    def of(cls, core: Core) -> FlatCore:
-        """Flatten a core."""
-        leaves, structure = jax.tree_util.tree_flatten(core)
-        keys = [id(x) if np.ndim(x) else -i for i, x in enumerate(leaves)]
-        once = dict(zip(keys, leaves, strict=True))
-        order = {key: i for i, key in enumerate(once)}
-        arrays = [jnp.asarray(x) if np.size(x) > SMALL else np.asarray(x) for x in once.values()]
-        return cls(arrays, tuple(order[key] for key in keys), structure)
-
-    def compiled(self, function: Callable) -> Callable:
-        """A function of (core, theta, ...) as a compiled function of (theta, ...)."""
-        return partial(_compiled(function, self.places, self.structure), self.arrays)
+    leaves, structure = jax.tree_util.tree_flatten(core)
+    keys = [id(x) if np.ndim(x) else -i for i, x in enumerate(leaves)]
+    once = dict(zip(keys, leaves, strict=True))
+    order = {key: i for i, key in enumerate(once)}
+    # Small arrays are handed over with every call: JAX takes longer to make them its own.
+    arrays = [jnp.asarray(x) if np.size(x) > 1000 else np.asarray(x) for x in once.values()]
+    places = tuple(order[key] for key in keys)
+    return lambda function: partial(_compiled(function, places, structure), arrays)
 
 
 @lru_cache(maxsize=256)
@@ -355,7 +344,8 @@ class Problem:
     core: Core = field(init=False, repr=False)
 
     def __post_init__(self):
-        model = jax.tree_util.tree_map(_number, self.model)
+        # Floats of NumPy: JAX takes longer to make a small array its own than to take it.
+        model = jax.tree.map(partial(np.array, dtype=float), self.model)
         spread = [(leaf, f) for f in self.free for leaf in tree.find_leaves(model, f.path)]
         paths = [leaf.path for leaf, _ in spread]
         twice = sorted({path for path in paths if paths.count(path) > 1})
@@ -365,12 +355,9 @@ class Problem:
             raise InputError("no free number", "at least one")
         if not (self.records or self.priors or self.objectives):
             raise InputError("nothing to fit", "a record, a prior or an objective")
-        groups = [
-            tuple(group) for group in (self.records, self.priors, self.constraints, self.objectives)
-        ]
-        for name, group in zip(_GROUPS, groups, strict=True):
-            object.__setattr__(self, name, group)
-        object.__setattr__(self, "free", tuple(self.free))
+        for name in ("free", "records", "priors", "constraints", "objectives"):
+            object.__setattr__(self, name, tuple(getattr(self, name)))
+        groups = self.records, self.priors, self.constraints, self.objectives
         object.__setattr__(self, "core", Core(tuple(leaf for leaf, _ in spread), model, *groups))
         object.__setattr__(self, "_spread", tuple(spread))
         _check_shapes(self)
@@ -390,12 +377,12 @@ class Problem:
     @cached_property
     def lower(self) -> np.ndarray:
         """Lower bound of each free number."""
-        return self._column("lower")
+        return _spread_out("lower", self._free_shapes)
 
     @cached_property
     def upper(self) -> np.ndarray:
         """Upper bound of each free number."""
-        return self._column("upper")
+        return _spread_out("upper", self._free_shapes)
 
     @cached_property
     def moving(self) -> np.ndarray:
@@ -410,7 +397,7 @@ class Problem:
     @cached_property
     def nuisance(self) -> np.ndarray:
         """True for each free number that no result quotes."""
-        return self._column("nuisance").astype(bool)
+        return _spread_out("nuisance", self._free_shapes).astype(bool)
 
     @cached_property
     def with_prior(self) -> np.ndarray:
@@ -434,19 +421,19 @@ class Problem:
         """Name of each constraint element."""
         return tuple(
             name
-            for c, shape in self._constraint_shapes
-            for name in c.labels or tree.element_names(tree.Leaf(0, c.name, shape))
+            for name, shape, c in self._constraint_shapes
+            for name in c.labels or tree.element_names(tree.Leaf(0, name, shape))
         )
 
     @cached_property
     def constraint_lower(self) -> np.ndarray:
         """Lower limit of each constraint element."""
-        return self._limits("lower")
+        return _spread_out("lower", self._constraint_shapes)
 
     @cached_property
     def constraint_upper(self) -> np.ndarray:
         """Upper limit of each constraint element."""
-        return self._limits("upper")
+        return _spread_out("upper", self._constraint_shapes)
 
     @property
     def has_data(self) -> bool:
@@ -479,22 +466,14 @@ class Problem:
         squares = [np.sum(r.used * np.asarray(r.measured).ravel() ** 2) for r in self.records]
         return 1e-6 * float(np.sqrt(sum(squares))) or 1.0
 
-    def has_part(self, kind: type) -> bool:
-        """True if any part of the problem is an instance of this class."""
-        parts = jax.tree_util.tree_leaves(self.core, is_leaf=lambda part: isinstance(part, kind))
-        return any(isinstance(part, kind) for part in parts)
-
-    def compiled(self, function: Callable) -> Callable:
+    @cached_property
+    def compiled(self) -> Callable[[Callable], Callable]:
         """A function of (core, theta, ...) as a compiled function of (theta, ...) at this core.
 
         Compiled once for each structure of problem. A search calls it a thousand times, and walking
         the tree of the core for every call takes longer than the numbers of a small network.
         """
-        return self._flat.compiled(function)
-
-    @cached_property
-    def _flat(self) -> FlatCore:
-        return FlatCore.of(self.core)
+        return flattened(self.core)
 
     def model_at(self, theta) -> Any:
         """The model with the free numbers set to theta, all of them JAX's arrays."""
@@ -525,44 +504,29 @@ class Problem:
         value = -self.cost(theta)
         return jnp.where(inside & jnp.isfinite(value), value, -jnp.inf)
 
-    def _column(self, what: str) -> np.ndarray:
-        """One property of `Free`, spread over the elements."""
-        parts = []
-        for leaf, f in self._spread:
-            value = np.asarray(getattr(f, what), float)
-            if value.shape not in ((), leaf.shape):
-                raise InputError(
-                    f"{what} of shape {value.shape} for '{leaf.path}'",
-                    f"a number or an array of shape {leaf.shape}",
-                )
-            parts.append(np.broadcast_to(value, leaf.shape).ravel())
-        return np.concatenate(parts)
+    @property
+    def _free_shapes(self) -> list[tuple[str, tuple[int, ...], Free]]:
+        """Each leaf that is free: path, shape, and how."""
+        return [(leaf.path, leaf.shape, f) for leaf, f in self._spread]
 
     @cached_property
-    def _constraint_shapes(self) -> list[tuple[Constraint, tuple[int, ...]]]:
-        """Each constraint with the shape of its values."""
-        return [(c, shape_of(c.function, self.core.model, c.data)) for c in self.constraints]
-
-    def _limits(self, what: str) -> np.ndarray:
-        """One limit of every constraint, spread over its elements."""
-        parts = [np.zeros(0)]
-        for c, shape in self._constraint_shapes:
-            try:
-                parts.append(np.broadcast_to(np.asarray(getattr(c, what), float), shape).ravel())
-            except ValueError:
-                raise InputError(
-                    f"{what} limit of shape {np.shape(getattr(c, what))} for '{c.name}'",
-                    f"a number or an array that spreads to shape {shape}",
-                ) from None
-        return np.concatenate(parts)
+    def _constraint_shapes(self) -> list[tuple[str, tuple[int, ...], Constraint]]:
+        """Each constraint with its name and the shape of its values."""
+        model = self.core.model
+        return [(c.name, shape_of(c.function, model, c.data), c) for c in self.constraints]
 
 
-def _number(value: Any) -> np.ndarray:
-    """An array of floats, its own: JAX takes longer to make a small one its own than to take it."""
-    return np.array(value, float)
-
-
-_GROUPS = ("records", "priors", "constraints", "objectives")
+def _spread_out(what: str, parts: Sequence[tuple[str, tuple[int, ...], Any]]) -> np.ndarray:
+    """One property of what is free or limited, spread over the elements."""
+    found = [np.zeros(0)]
+    for name, shape, of in parts:
+        value = np.asarray(getattr(of, what), float)
+        try:
+            found.append(np.broadcast_to(value, shape).ravel())
+        except ValueError:
+            wanted = f"a number or an array of shape {shape}"
+            raise InputError(f"{what} of shape {value.shape} for '{name}'", wanted) from None
+    return np.concatenate(found)
 
 
 def shape_of(function: Callable, *arguments: Any) -> tuple[int, ...]:

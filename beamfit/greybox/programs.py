@@ -1,6 +1,7 @@
-"""Solvers for fits with constraints: Uno first, scipy where it fails.
+"""Programs: solvers for fits with constraints, and small quadratic programs inside JAX.
 
-They only propose points. Whether a point is an optimum is decided in `assess`.
+Uno comes first, scipy where it fails. They only propose points: whether one is an optimum is
+decided in `assess`. Quadratic programs are limits of a plan, solved again at every step.
 """
 
 from __future__ import annotations
@@ -10,7 +11,10 @@ from collections.abc import Callable
 from functools import lru_cache
 from typing import NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
+from jax.scipy.linalg import cho_factor, cho_solve
 
 from beamfit.greybox import assess, problem
 from beamfit.greybox.problem import Problem
@@ -33,27 +37,78 @@ class SearchLimit(NamedTuple):
         return np.inf if self.until is None else self.until - time.perf_counter()
 
 
-class _TimeIsUp(Exception):
-    """Ends a solver that cannot be told of a limit."""
+def _tame(size: np.ndarray) -> np.ndarray:
+    """Sizes near 1 are left alone: solvers' own steps and tolerances are made for those."""
+    return np.where((size > 1e2) | (size < 1e-2), size, 1.0)
 
 
-class NonlinearProgram(NamedTuple):
-    """A constrained minimisation in plain NumPy functions of x, well scaled.
+class NonlinearProgram:
+    """A problem for a solver in functions of x: moving numbers, cost and limits in their sizes.
 
-    `values(x)` gives cost and constraints, `slopes(x)` the cost's gradient and the constraints'
-    Jacobian, `hessian(x, sigma, y)` the Hessian of sigma * cost - y @ constraints.
-    `numbers(x)` are the problem's own, `point(theta)` is x of them.
+    Parameters
+    ----------
+    p : Problem
+        The problem.
+    start : array, shape (n,)
+        Holds the numbers that do not move.
+    at : Slopes
+        At the start.
+    scale : Scale
+        Of the problem.
+    hessian : str
+        ``gauss_newton`` or anything else for the exact one.
     """
 
-    values: Callable[[np.ndarray], tuple[float, np.ndarray]]
-    slopes: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
-    hessian: Callable[[np.ndarray, float, np.ndarray], np.ndarray]
-    lower: np.ndarray
-    upper: np.ndarray
-    c_lower: np.ndarray
-    c_upper: np.ndarray
-    numbers: Callable[[np.ndarray], np.ndarray]
-    point: Callable[[np.ndarray], np.ndarray]
+    def __init__(
+        self, p: Problem, start: np.ndarray, at: assess.Slopes, scale: assess.Scale, hessian: str
+    ):
+        self.problem, self.start, self.gauss_newton = p, start, hessian == "gauss_newton"
+        self.moving = np.flatnonzero(p.moving)
+        self.unit, self.limit = _tame(scale.unit)[self.moving], _tame(scale.limit)
+        steepest = max(np.max(np.abs(at.gradient * scale.unit)), 1e-300)
+        # Squares are counted in their errors; a steep cost is flattened, as IPOPT does.
+        self.flat = 1.0 / scale.cost if p.objectives else min(1.0, 100.0 / steepest)
+        self.lower, self.upper = (self.point(end) for end in (p.lower, p.upper))
+        self.c_lower, self.c_upper = (
+            p.constraint_lower / self.limit,
+            p.constraint_upper / self.limit,
+        )
+        # A solver asks for cost and limits of one point after the other: the last are remembered.
+        self._parts = lru_cache(maxsize=8)(self._computed)
+
+    def point(self, theta: np.ndarray) -> np.ndarray:
+        """X of the problem's own numbers."""
+        return theta[self.moving] / self.unit
+
+    def numbers(self, x: np.ndarray) -> np.ndarray:
+        """The problem's own numbers."""
+        theta = self.start.copy()
+        theta[self.moving] = x * self.unit
+        return theta
+
+    def _computed(self, function: Callable, x: bytes) -> list[np.ndarray]:
+        theta = self.numbers(np.frombuffer(x))
+        return [np.asarray(part) for part in self.problem.compiled(function)(theta)]
+
+    def values(self, x: np.ndarray) -> tuple[float, np.ndarray]:
+        """Cost and constraints."""
+        cost, c = self._parts(problem.values, x.tobytes())
+        return self.flat * float(cost), c / self.limit
+
+    def slopes(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Gradient of the cost and Jacobian of the constraints."""
+        s = assess.Slopes(*self._parts(assess.first_order, x.tobytes()))
+        jacobian = s.jacobian[:, self.moving] * self.unit / self.limit[:, None]
+        return self.flat * s.gradient[self.moving] * self.unit, jacobian
+
+    def hessian(self, x: np.ndarray, sigma: float, y: np.ndarray) -> np.ndarray:
+        """Hessian of sigma * cost - y @ constraints."""
+        if self.gauss_newton:
+            rows = self._parts(assess.first_order, x.tobytes())[1][:, self.moving] * self.unit
+            return sigma * self.flat * rows.T @ rows
+        exact = self.problem.compiled(assess.lagrangian_hessian)
+        h = np.asarray(exact(self.numbers(x), sigma * self.flat, y / self.limit))
+        return h[np.ix_(self.moving, self.moving)] * np.outer(self.unit, self.unit)
 
 
 class SolverEnd(NamedTuple):
@@ -67,9 +122,7 @@ class SolverEnd(NamedTuple):
 def _uno(preset: str, **more: float) -> Callable[[NonlinearProgram, np.ndarray, int], SolverEnd]:
     """A solver by Uno with one of its presets, and options of its own."""
 
-    def solve(
-        program: NonlinearProgram, x: np.ndarray, iterations: int, budget: SearchLimit
-    ) -> SolverEnd:
+    def solve(program, x: np.ndarray, iterations: int, budget: SearchLimit) -> SolverEnd:
         import unopy
 
         solver = unopy.UnoSolver()
@@ -92,13 +145,8 @@ def _uno(preset: str, **more: float) -> Callable[[NonlinearProgram, np.ndarray, 
 def _uno_model(unopy, program: NonlinearProgram, x: np.ndarray):
     """State the program to Uno with dense derivatives."""
     n, m = len(x), len(program.c_lower)
-    model = unopy.Model(
-        unopy.PROBLEM_NONLINEAR,
-        n,
-        program.lower.tolist(),
-        program.upper.tolist(),
-        unopy.ZERO_BASED_INDEXING,
-    )
+    ends = program.lower.tolist(), program.upper.tolist()
+    model = unopy.Model(unopy.PROBLEM_NONLINEAR, n, *ends, unopy.ZERO_BASED_INDEXING)
 
     def gradient(at, out):
         out[:] = program.slopes(np.array(at))[0]
@@ -115,28 +163,17 @@ def _uno_model(unopy, program: NonlinearProgram, x: np.ndarray):
         out[:] = program.hessian(np.array(at), sigma, np.array(y))[low]
 
     model.set_objective(unopy.MINIMIZE, lambda at: float(program.values(np.array(at))[0]), gradient)
-    rows, columns = (i.ravel().tolist() for i in np.indices((m, n)))
-    model.set_constraints(
-        m,
-        constraints,
-        program.c_lower.tolist(),
-        program.c_upper.tolist(),
-        m * n,
-        rows,
-        columns,
-        jacobian,
-    )
-    model.set_lagrangian_hessian(
-        len(low[0]), unopy.LOWER_TRIANGLE, low[0].tolist(), low[1].tolist(), hessian
-    )
+    places = [i.ravel().tolist() for i in np.indices((m, n))]
+    ends = program.c_lower.tolist(), program.c_upper.tolist()
+    model.set_constraints(m, constraints, *ends, m * n, *places, jacobian)
+    places = [i.tolist() for i in low]
+    model.set_lagrangian_hessian(len(low[0]), unopy.LOWER_TRIANGLE, *places, hessian)
     model.set_lagrangian_sign_convention(unopy.MULTIPLIER_NEGATIVE)
     model.set_initial_primal_iterate(x.tolist())
     return model
 
 
-def _slsqp(
-    program: NonlinearProgram, x: np.ndarray, iterations: int, budget: SearchLimit
-) -> SolverEnd:
+def _slsqp(program, x: np.ndarray, iterations: int, budget: SearchLimit) -> SolverEnd:
     """Solve by scipy's sequential quadratic programming."""
     from scipy import optimize
 
@@ -155,7 +192,7 @@ def _slsqp(
 
     def in_time(at):
         if budget.left <= 0:
-            raise _TimeIsUp
+            raise TimeoutError
         last[0] = at.copy()
 
     try:
@@ -169,7 +206,7 @@ def _slsqp(
             callback=in_time,
             options={"maxiter": iterations, "ftol": 1e-15},
         )
-    except _TimeIsUp:
+    except TimeoutError:
         return SolverEnd(last[0], 0, "time is up")
     return SolverEnd(found.x, int(found.nit), found.message)
 
@@ -203,74 +240,145 @@ SOLVERS: tuple[Stage, ...] = (
 """In the order of trying; what an interior point leaves short of its limits is sharpened."""
 
 
-def _tame(size: np.ndarray) -> np.ndarray:
-    """Sizes near 1 are left alone: solvers' own steps and tolerances are made for those."""
-    return np.where((size > 1e2) | (size < 1e-2), size, 1.0)
+# ---- quadratic programs
+
+# Most steps; mean complementarity and residuals that end them; share of the step to a limit.
+STEPS, CLOSE, SHARE = 40, 1e-9, 0.99
 
 
-def scaled(
-    p: Problem, start: np.ndarray, at: assess.Slopes, scale: assess.Scale, hessian: str
-) -> NonlinearProgram:
-    """A problem for a solver: moving numbers, cost and constraints in their sizes.
+class Quadratic(NamedTuple):
+    """Find the least z'Hz/2 + g'z + cost's with G z <= h + s, s >= 0.
+
+    Shapes (n, n), (n,), (rows, n), (rows,), (rows,). A row of infinite cost is hard; another is
+    kept wherever its multiplier is below its cost. H must be positive.
+    """
+
+    matrix: jax.Array
+    slope: jax.Array
+    rows: jax.Array
+    limits: jax.Array
+    cost: jax.Array
+
+
+class _Point(NamedTuple):
+    """Variables, room left in each row, its multiplier, and by how much it is passed."""
+
+    z: jax.Array
+    room: jax.Array
+    force: jax.Array
+    passed: jax.Array
+
+
+def minimum(program: Quadratic, start: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Solve a quadratic program by a primal-dual interior point.
 
     Parameters
     ----------
-    p : Problem
-        The problem.
+    program : Quadratic
+        Well scaled; it must have a point that keeps the hard rows.
     start : array, shape (n,)
-        Holds the numbers that do not move.
-    at : Slopes
-        At the start.
-    scale : Scale
-        Of the problem.
-    hessian : str
-        ``gauss_newton`` or anything else for the exact one.
+        Any point.
 
     Returns
     -------
-    NonlinearProgram
-        That remembers its last points.
+    (array, shape (n,); array, shape (rows,))
+        The minimum and the multipliers of the rows.
+
+    Notes
+    -----
+    Predictor and corrector of S. Mehrotra, SIAM J. Optim. 2 (1992) 575; for quadratic programs
+    J. Nocedal and S. Wright, Numerical Optimization (2006), algorithm 16.4. The multiplier of a
+    soft row and that of its s add to its cost, so both are eliminated. At most 40 steps, each with
+    one factorisation; it can be mapped and compiled.
+
+    Examples
+    --------
+    >>> one, inf = jnp.array, jnp.inf
+    >>> box = Quadratic(jnp.eye(2), one([-3.0, 0.5]), jnp.eye(2), one([1.0, 2.0]), one([inf, inf]))
+    >>> z, force = minimum(box, jnp.zeros(2))
+    >>> z.round(6).tolist(), force.round(6).tolist()
+    ([1.0, -0.5], [2.0, 0.0])
+    >>> minimum(box._replace(cost=one([0.5, 0.5])), z)[0].round(6).tolist()
+    [2.5, -0.5]
     """
-    moving = np.flatnonzero(p.moving)
-    unit, limit = _tame(scale.unit)[moving], _tame(scale.limit)
-    steepest = max(np.max(np.abs(at.gradient * scale.unit)), 1e-300)
-    # Squares are counted in their errors; a steep cost is flattened, as IPOPT does.
-    flat = 1.0 / scale.cost if p.objectives else min(1.0, 100.0 / steepest)
-
-    def full(x):
-        theta = start.copy()
-        theta[moving] = x * unit
-        return theta
-
-    @lru_cache(maxsize=8)
-    def parts(function, x):
-        return [np.asarray(part) for part in p.compiled(function)(full(np.frombuffer(x)))]
-
-    def values(x):
-        cost, c = parts(problem.values, x.tobytes())
-        return flat * float(cost), c / limit
-
-    def slopes(x):
-        s = assess.Slopes(*parts(assess.first_order, x.tobytes()))
-        return flat * s.gradient[moving] * unit, s.jacobian[:, moving] * unit / limit[:, None]
-
-    def squares(x, sigma, y):
-        rows = parts(assess.first_order, x.tobytes())[1][:, moving] * unit
-        return sigma * flat * rows.T @ rows
-
-    def bend(x, sigma, y):
-        exact = p.compiled(assess.lagrangian_hessian)
-        h = np.asarray(exact(full(x), sigma * flat, y / limit))
-        return h[np.ix_(moving, moving)] * np.outer(unit, unit)
-
-    return NonlinearProgram(
-        values,
-        slopes,
-        squares if hessian == "gauss_newton" else bend,
-        p.lower[moving] / unit,
-        p.upper[moving] / unit,
-        p.constraint_lower / limit,
-        p.constraint_upper / limit,
-        full,
-        lambda theta: theta[moving] / unit,
+    if program.rows.shape[0] == 0:
+        return jnp.linalg.solve(program.matrix, -program.slope), program.limits
+    soft, half = jnp.isfinite(program.cost), 0.5 * program.cost
+    room = jnp.maximum(program.limits - program.rows @ start, 1.0)
+    first = _Point(start, room, jnp.minimum(1.0, half), 1.0 * soft)
+    # Multipliers of the size that the problem's have (Nocedal and Wright, section 16.6).
+    step = _towards(program, first)(room * first.force, 0.0 * room)
+    room, force, passed = (
+        jnp.maximum(jnp.abs(v + d), 1.0) for v, d in zip(first[1:], step[1:], strict=True)
     )
+    begin = _Point(start, room, jnp.minimum(force, half), soft * passed)
+    end, _, _ = jax.lax.while_loop(
+        lambda now: (now[1] > CLOSE) & (now[2] < STEPS),
+        lambda now: _next(program, now[0], now[2]),
+        (begin, jnp.asarray(jnp.inf), jnp.asarray(0)),
+    )
+    return end.z, end.force
+
+
+def _residuals(program: Quadratic, now: _Point) -> tuple[jax.Array, jax.Array]:
+    dual = program.matrix @ now.z + program.slope + program.rows.T @ now.force
+    return dual, program.rows @ now.z + now.room - now.passed - program.limits
+
+
+def _other(program: Quadratic, now: _Point) -> jax.Array:
+    """Multipliers of the s of soft rows; 1 of hard ones, which have none."""
+    return jnp.where(jnp.isfinite(program.cost), program.cost - now.force, 1.0)
+
+
+def _towards(program: Quadratic, now: _Point) -> Callable[[jax.Array, jax.Array], _Point]:
+    """Steps on which room * force and passed * other fall by so much, the residuals to nothing."""
+    rows, other, (dual, primal) = program.rows, _other(program, now), _residuals(program, now)
+    weight = 1.0 / (now.room / now.force + now.passed / other)
+    factor = cho_factor(program.matrix + rows.T @ (rows * weight[:, None]))
+
+    def step(inner, outer):
+        lack = primal - inner / now.force + outer / other
+        dz = -cho_solve(factor, dual + rows.T @ (weight * lack))
+        d_force = weight * (rows @ dz + lack)
+        d_passed = (now.passed * d_force - outer) / other
+        return _Point(dz, (-inner - now.room * d_force) / now.force, d_force, d_passed)
+
+    return step
+
+
+def _next(program: Quadratic, now: _Point, steps: jax.Array) -> tuple[_Point, jax.Array, jax.Array]:
+    """Predict, correct, and say how far the point is from the minimum."""
+    soft, towards = jnp.isfinite(program.cost), _towards(program, now)
+    inner, outer = now.room * now.force, now.passed * _other(program, now)
+    far = towards(inner, outer)
+    reach = _reach(program, now, far)
+    gap, after = _gap(program, now), _gap(program, _along(now, far, reach))
+    centre = gap * (after / gap) ** 3
+    corrected = soft * (outer - far.passed * far.force - centre)
+    way = towards(inner + far.room * far.force - centre, corrected)
+    new = _along(now, way, SHARE * _reach(program, now, way))
+    dual, primal = _residuals(program, new)
+    dual = jnp.max(jnp.abs(dual)) / (1.0 + jnp.max(jnp.abs(program.slope)))
+    left = jnp.maximum(jnp.maximum(dual, jnp.max(jnp.abs(primal))), _gap(program, new))
+    good = jnp.isfinite(left)
+    kept = (jnp.where(good, a, b) for a, b in zip(new, now, strict=True))
+    # A point that is not finite ends the search: rounding leaves nothing to gain.
+    return _Point(*kept), jnp.where(good, left, 0.0), steps + 1
+
+
+def _along(now: _Point, way: _Point, reach: jax.Array) -> _Point:
+    return _Point(*(v + reach * d for v, d in zip(now, way, strict=True)))
+
+
+def _gap(program: Quadratic, now: _Point) -> jax.Array:
+    """Mean of multipliers times what they guard."""
+    count = now.room.size + jnp.sum(jnp.isfinite(program.cost))
+    return (now.room @ now.force + now.passed @ _other(program, now)) / count
+
+
+def _reach(program: Quadratic, now: _Point, way: _Point) -> jax.Array:
+    """Longest step, at most 1, that keeps all slacks and multipliers positive."""
+    soft = jnp.isfinite(program.cost)
+    values = jnp.concatenate([now.room, now.force, now.passed, _other(program, now)])
+    changes = jnp.concatenate([way.room, way.force, way.passed, -1.0 * soft * way.force])
+    return jnp.min(jnp.where(changes < 0, -values / changes, 1.0), initial=1.0)

@@ -17,42 +17,13 @@ from beamfit.answer import json_of
 from beamfit.errors import InputError
 from beamfit.greybox.bounds import KINDS, cells, over_cells
 from beamfit.greybox.maps import positions
-from beamfit.greybox.mlp import MLP, Port, dense
+from beamfit.greybox.mlp import MLP, Port, connection, dense
 from beamfit.greybox.problem import Free, Problem
 
 # Largest threshold of a node and random start of a weight: a network's range is -1 to 1.
 WIDE = 1.5
 # A point is in a box within so much.
 ROUNDING = 1e-9
-
-
-def signed_weights(
-    path: str, net: MLP, signs: Mapping[str, np.ndarray], most: float, start: float
-) -> list[Free]:
-    """The weights of a network as free numbers that nobody asks for, within the signs they have.
-
-    Parameters
-    ----------
-    path : str
-        Where the network is in the model.
-    net : MLP
-        The network.
-    signs : mapping of str to array
-        Connection to signs that spread to its weights; 0 and connections that are missing are free.
-    most, start : float
-        Largest magnitude of a weight or bias, and of random starts.
-
-    Returns
-    -------
-    list of Free
-        One for each connection, and one for all biases.
-    """
-    found = []
-    for name, weights in net.weights.items():
-        sign = np.broadcast_to(signs.get(name, 0), weights.shape)
-        low, high = np.where(sign > 0, 0.0, -most), np.where(sign < 0, 0.0, most)
-        found.append(Free(f"{path}.weights.{name}", low, high, (-start, start), nuisance=True))
-    return [*found, Free(f"{path}.biases", -most, most, (-start, start), nuisance=True)]
 
 
 def monotone_signs(net: MLP, signs: Mapping[str, int]) -> dict[str, np.ndarray]:
@@ -100,12 +71,11 @@ def monotone_signs(net: MLP, signs: Mapping[str, int]) -> dict[str, np.ndarray]:
     flips = {np.sign(port.scale) for port in net.output_ports}
     if flips != {1.0}:
         raise InputError("an output with a negative scale", "positive scales for monotonic outputs")
-    return {
-        f"{a}->{b}": np.broadcast_to(
-            rows[a][:, None] if a in rows else 1.0, net.weights[f"{a}->{b}"].shape
-        )
-        for a, b in net.connections
-    }
+    found = {}
+    for a, b in net.connections:
+        first = rows[a][:, None] if a in rows else 1.0
+        found[connection(a, b)] = np.broadcast_to(first, net.weights[connection(a, b)].shape)
+    return found
 
 
 def signed_network(
@@ -155,16 +125,17 @@ def signed_network(
     way = node[lead] or 1.0
     start[first][lead] = way
     towards = np.where(out != 0, out, 1.0)
-    start[last] += _straight(thresholds)[:, None] * towards
+    # Weights, none negative, with which the nodes add up to a straight line from -1 to 1.
+    x = np.linspace(-1.0, 1.0, 41)
+    start[last] += nnls(np.tanh(x[:, None] + thresholds), x)[0][:, None] * towards
     biases = {"layer1": way * thresholds, "layer2": np.zeros(len(outputs))}
     net = replace(net, weights=start, biases=biases)
-    return net, signed_weights(path, net, {first: node[:, None], last: out}, most, WIDE)
-
-
-def _straight(thresholds: np.ndarray) -> np.ndarray:
-    """Weights, none negative, that make the nodes add up to a straight line from -1 to 1."""
-    x = np.linspace(-1.0, 1.0, 41)
-    return nnls(np.tanh(x[:, None] + thresholds), x)[0]
+    free = []
+    for name, sign in ((first, node[:, None]), (last, out)):
+        sign = np.broadcast_to(sign, start[name].shape)
+        ends = np.where(sign > 0, 0.0, -most), np.where(sign < 0, 0.0, most)
+        free.append(Free(f"{path}.weights.{name}", *ends, (-WIDE, WIDE), nuisance=True))
+    return net, [*free, Free(f"{path}.biases", -most, most, (-WIDE, WIDE), nuisance=True)]
 
 
 def _pattern(rising: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

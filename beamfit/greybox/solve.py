@@ -8,26 +8,21 @@ from functools import partial
 
 import numpy as np
 
-from beamfit.errors import InputError, Status
+from beamfit.errors import Finding, InputError, Status
 from beamfit.greybox import assess
 from beamfit.greybox.assess import SearchState
-from beamfit.greybox.conflict import relaxed
 from beamfit.greybox.descend import Descent, costs, descent_of
-from beamfit.greybox.diagnosis import contradictory, not_finite
+from beamfit.greybox.diagnosis import contradictory, not_finite, relaxed
 from beamfit.greybox.fit import Attempt, Fit
 from beamfit.greybox.judge import Search, conclude, outgrown, refused, settled
 from beamfit.greybox.problem import Problem
-from beamfit.greybox.programs import INSIDE, SOLVERS, SearchLimit, scaled
+from beamfit.greybox.programs import INSIDE, SOLVERS, NonlinearProgram, SearchLimit
 
 METHOD, SQUARES = "Levenberg-Marquardt", "levenberg-marquardt"
 # Steps from each of many starts, and number of cheapest ends that are polished.
 STEPS, POLISHED = 300, 4
 # A search stops if its cost falls by less than this share in this many steps.
 NOTHING, STRETCH = 1e-7, 100
-# Bytes for the Jacobians of starts that are searched together.
-MEMORY = 2**24
-# Starts of the search for the least violation of constraints that no search could keep.
-ELASTIC = 6
 # Most moves of a search off a saddle.
 MOVES = 3
 
@@ -96,13 +91,12 @@ def solve(
     (<Status.converged: 'converged'>, 1.9929, 0.0267)
     """
     began = time.perf_counter() if began is None else began
-    _check(starts, iterations, hessian, seconds)
     squares = not (p.constraints or p.objectives)
-    _check_solver(solver, squares)
+    _check(hessian, seconds, solver, squares)
     wrong = contradictory(p)
     if wrong:
         spent = time.perf_counter() - began
-        return refused(p, Status.contradictory_bounds, wrong[0].message, spent)
+        return refused(p, Finding(Status.contradictory_bounds, wrong[0].message), spent)
     drawn = _drawn(p, starts, seed)
     points = np.clip(drawn, p.lower, p.upper)
     moved = int(np.sum(np.any(points != drawn, axis=1)))
@@ -114,16 +108,15 @@ def solve(
         found, attempts = _together(p, points, budget)
     spent = time.perf_counter() - began
     if not found:
-        said = (
-            "the cost or a constraint is not finite at any start; "
-            "start elsewhere, or use a parametrisation that is defined there."
-        )
-        traced = not_finite(p, points[0]) if starts == 1 else []
-        said = traced[0].message if traced else said
-        return refused(p, Status.not_finite, said, spent, None, attempts)
+        said = "the cost or a constraint is not finite at any start;"
+        remedy = "start elsewhere, or use a parametrisation that is defined there."
+        lost = Finding(Status.not_finite, said, remedy)
+        if starts == 1 and (traced := not_finite(p, points[0])):
+            lost = Finding(Status.not_finite, traced[0].message)
+        return refused(p, lost, spent, None, attempts)
     best, conflict = found[_best(p, found)], None
     if not best.feasible and p.constraints and best.at.finite and budget.left > 0:
-        conflict = relaxed(p, best, starting_points(p, ELASTIC, seed))
+        conflict = relaxed(p, best, starting_points(p, 6, seed))
         if conflict.feasible:
             more, again = _one_by_one(p, conflict.theta[None], budget, hessian)
             found, attempts = found + more, attempts + again
@@ -133,16 +126,11 @@ def solve(
     return conclude(p, best, done, time.perf_counter() - began)
 
 
-def _check(starts: int, iterations: int, hessian: str, seconds: float | None) -> None:
+def _check(hessian: str, seconds: float | None, solver: str | None, squares: bool) -> None:
     if hessian not in ("exact", "gauss_newton"):
         raise InputError(f"hessian '{hessian}'", "one of exact, gauss_newton")
-    if starts < 1 or iterations < 1:
-        raise InputError(f"{starts} starts of {iterations} iterations", "at least one of each")
     if seconds is not None and not seconds > 0:
         raise InputError(f"{seconds} seconds", "a time above 0, or none")
-
-
-def _check_solver(solver: str | None, squares: bool) -> None:
     known = [SQUARES] * squares + list(dict.fromkeys(stage.preset for stage in SOLVERS))
     if solver is not None and solver not in known:
         raise InputError(f"solver '{solver}' for this problem", f"one of {', '.join(known)}")
@@ -198,7 +186,7 @@ def _best(p: Problem, found: list[SearchState]) -> int:
 
     def rank(s: SearchState) -> tuple:
         feasible = s.feasible
-        saved = np.abs(s.found.constraints) @ (s.limits.violation * s.limits.size)
+        saved = np.abs(s.limits.multiplier) @ (s.limits.violation * s.limits.size)
         return (not feasible, s.at.cost + saved if feasible else s.kkt.feasibility)
 
     order = sorted(range(len(found)), key=lambda i: rank(found[i]))
@@ -246,7 +234,7 @@ def _together(
     p: Problem, points: np.ndarray, budget: SearchLimit
 ) -> tuple[list[SearchState], tuple[Attempt, ...]]:
     """Search from all starts, in parts that fit the memory, and polish the cheapest ends."""
-    part = max(1, MEMORY // (8 * (p.size + 1) * len(p.names)))
+    part = max(1, 2**21 // ((p.size + 1) * len(p.names)))  # Jacobians of 16 MB
     found: list[SearchState] = []
     attempts: list[Attempt] = []
     for some in np.split(points, range(part, len(points), part)):
@@ -349,7 +337,7 @@ def _program(
     exact = hessian == "exact"
     best, tried, steps, said = None, [], 0, ""
     for stage in stages:
-        program = scaled(p, start, at, scale, stage.hessian)
+        program = NonlinearProgram(p, start, at, scale, stage.hessian)
         near = best is not None and best.feasible
         begin = best.theta if near else start
         if not near and stage.name in tried:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any, NamedTuple, TypeVar, dataclass_transform
 
 import jax
@@ -86,10 +86,8 @@ def leaves(tree: Any) -> tuple[Leaf, ...]:
 def _leaves(structure: jax.tree_util.PyTreeDef, shapes: tuple[tuple[int, ...], ...]):
     """Leaves of all trees of a structure: a problem finds each of its numbers among them."""
     found = jax.tree_util.tree_leaves_with_path(structure.unflatten(range(len(shapes))))
-    return tuple(
-        Leaf(i, jax.tree_util.keystr(path, simple=True, separator="."), shapes[i])
-        for path, i in found
-    )
+    named = partial(jax.tree_util.keystr, simple=True, separator=".")
+    return tuple(Leaf(i, named(path), shapes[i]) for path, i in found)
 
 
 def find_leaves(tree: Any, path: str) -> tuple[Leaf, ...]:
@@ -118,11 +116,8 @@ def find_leaves(tree: Any, path: str) -> tuple[Leaf, ...]:
     ['b.0', 'b.1']
     """
     every = leaves(tree)
-    found = tuple(
-        leaf
-        for leaf in every
-        if path == "" or leaf.path == path or leaf.path.startswith(path + ".")
-    )
+    below = f"{path}."
+    found = tuple(one for one in every if path in ("", one.path) or one.path.startswith(below))
     if not found:
         known = nearest(path, [leaf.path for leaf in every])
         raise InputError(f"no leaf at '{path}'", f"a path in the model: {known}")

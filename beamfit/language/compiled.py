@@ -18,12 +18,11 @@ from beamfit.errors import InputError, nearest
 from beamfit.greybox.maps import Formula
 from beamfit.language import document as d
 from beamfit.language import expression as x
-from beamfit.language.calls import Arrays, called, defaults
 from beamfit.language.evaluate import Setting, check_rank, evaluate, stored
 from beamfit.language.expression import error_at
 from beamfit.language.plan import Order, StepGroup, checked
-from beamfit.language.recurrence import scanned
 from beamfit.language.scope import MappingStep, Scope, reads, widened
+from beamfit.language.steps import Arrays, called, defaults, scanned
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,44 +3,41 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
-from beamfit.language.expression import PLACE, Elements, Expression, Iterator, Name, Place
+from beamfit.language.expression import Elements, Expression, Iterator, Name, Placed
 
 # ---- statements
 
 
 @dataclass(frozen=True)
-class IndexedSet:
+class IndexedSet(Placed):
     """``set K = |1:14|;``"""
 
     name: str
     elements: Elements
-    at: Place = field(**PLACE)
 
 
 @dataclass(frozen=True)
-class Real:
+class Real(Placed):
     """``real A[K];``, with a value if one follows: a dimension is a set or a size."""
 
     name: str
     dimensions: tuple[str | int, ...] = ()
     value: Expression | None = None
-    at: Place = field(**PLACE)
 
 
 @dataclass(frozen=True)
-class Function:
+class Function(Placed):
     """``function square(x) = x^2;``"""
 
     name: str
     arguments: tuple[str, ...]
     body: Expression
-    at: Place = field(**PLACE)
 
 
 @dataclass(frozen=True)
-class Assignment:
+class Assignment(Placed):
     """``y[k] = 2*x[k] foreach k in K;``
 
     In a call: an input and its value, or a variable and an output.
@@ -49,27 +46,24 @@ class Assignment:
     target: Name
     value: Expression
     each: tuple[Iterator, ...] = ()
-    at: Place = field(**PLACE)
 
 
 @dataclass(frozen=True)
-class Call:
+class Call(Placed):
     """``Transfer(I = I_2[k] :: A[k] = A_T) foreach k in K;``"""
 
     mapping: str
     inputs: tuple[Assignment, ...]
     outputs: tuple[Assignment, ...]
     each: tuple[Iterator, ...] = ()
-    at: Place = field(**PLACE)
 
 
 @dataclass(frozen=True)
-class Block:
+class Block(Placed):
     """``foreach k in K { ... }``"""
 
     each: tuple[Iterator, ...]
     statements: tuple[Statement, ...]
-    at: Place = field(**PLACE)
 
 
 Statement = IndexedSet | Real | Function | Assignment | Call | Block
@@ -79,47 +73,43 @@ Statement = IndexedSet | Real | Function | Assignment | Call | Block
 
 
 @dataclass(frozen=True)
-class Declared:
+class Declared(Placed):
     """An input, an output or a parameter: name, dimensions, and values in C order if given."""
 
     name: str
     dimensions: tuple[str | int, ...] = ()
     values: tuple[float, ...] | None = None
-    at: Place = field(**PLACE)
 
 
 @dataclass(frozen=True)
-class DataTable:
+class DataTable(Placed):
     """A table of numbers in a file, with the rows and columns it should have."""
 
     name: str
     file: str
     rows: int | None = None
     columns: int | None = None
-    at: Place = field(**PLACE)
 
 
 @dataclass(frozen=True)
-class NetworkElement:
+class NetworkElement(Placed):
     """A layer, connection, input, output or gain of a network, as the report writes it."""
 
     kind: str
     attributes: tuple[tuple[str, str], ...]
     values: tuple[float, ...] | None = None
-    at: Place = field(**PLACE)
 
 
 @dataclass(frozen=True)
-class NetworkDefinition:
+class NetworkDefinition(Placed):
     """A multi-layer perceptron (report 3.1.3)."""
 
     name: str
     parts: tuple[NetworkElement, ...]
-    at: Place = field(**PLACE)
 
 
 @dataclass(frozen=True)
-class Mapping:
+class Mapping(Placed):
     """Inputs to outputs by expressions; other mappings and networks inside are called by name."""
 
     name: str = ""
@@ -129,14 +119,13 @@ class Mapping:
     outputs: tuple[Declared, ...] = ()
     parameters: tuple[Declared, ...] = ()
     statements: tuple[Statement, ...] = ()
-    at: Place = field(**PLACE)
 
 
 # ---- the problem
 
 
 @dataclass(frozen=True)
-class FreeInput:
+class FreeInput(Placed):
     """An input that is free: bounds, and where searches start.
 
     `random` is the range of a start drawn with `seed`; without it the start is `value`.
@@ -149,28 +138,25 @@ class FreeInput:
     value: float | None = None
     random: tuple[float, float] | None = None
     seed: int = 0
-    at: Place = field(**PLACE)
 
 
 @dataclass(frozen=True)
-class Limit:
+class Limit(Placed):
     """An output that is limited."""
 
     label: str
     model: str
     lower: float = -math.inf
     upper: float = math.inf
-    at: Place = field(**PLACE)
 
 
 @dataclass(frozen=True)
-class Goal:
+class Goal(Placed):
     """An output that counts in the objective, times its weight."""
 
     label: str
     model: str
     weight: float = 1.0
-    at: Place = field(**PLACE)
 
 
 @dataclass(frozen=True)
@@ -184,12 +170,11 @@ class ProblemStatement:
 
 
 @dataclass(frozen=True)
-class Solver:
+class Solver(Placed):
     """The solver asked for and its parameters, as they were written."""
 
     name: str
     settings: tuple[tuple[str, str], ...] = ()
-    at: Place = field(**PLACE)
 
 
 @dataclass(frozen=True)

@@ -53,13 +53,8 @@ class Setting:
     watch: Callable[[x.Expression, Value, Axes], None] | None = None
 
 
-ELEMENTWISE: dict[str, Callable] = {
-    "sin": jnp.sin, "cos": jnp.cos, "tan": jnp.tan, "asin": jnp.arcsin, "acos": jnp.arccos,
-    "atan": jnp.arctan, "sinh": jnp.sinh, "cosh": jnp.cosh, "tanh": jnp.tanh,
-    "asinh": jnp.arcsinh, "acosh": jnp.arccosh, "atanh": jnp.arctanh, "exp": jnp.exp,
-    "log": jnp.log, "log10": jnp.log10, "sqrt": jnp.sqrt, "abs": jnp.abs, "atan2": jnp.arctan2,
-    "sign": jnp.sign, "erf": jax.scipy.special.erf, "sigmoid": jax.nn.sigmoid,
-}  # fmt: skip
+# Built-in functions of elements that JAX's numpy does not have under their names.
+OTHERS = {"erf": jax.scipy.special.erf, "sigmoid": jax.nn.sigmoid}
 MATRIX: dict[str, tuple[int, int, Callable]] = {
     # rank of the argument, of the result
     "transpose": (2, 2, lambda m: jnp.swapaxes(m, -1, -2)),
@@ -69,7 +64,6 @@ MATRIX: dict[str, tuple[int, int, Callable]] = {
     "norm": (1, 0, lambda v: jnp.sqrt(jnp.sum(v * v, axis=-1))),
 }
 OPERATORS = {"+": add, "-": sub, "*": mul, "/": truediv, "^": pow}
-FOLDS = {"sum": jnp.sum, "prod": jnp.prod, "min": jnp.min, "max": jnp.max, "mean": jnp.mean}
 
 
 def evaluate(e: x.Expression, s: Setting) -> Value:
@@ -93,8 +87,6 @@ def evaluate(e: x.Expression, s: Setting) -> Value:
             found = _applied(e, s)
         case x.Reduction():
             found = _reduced(e, s)
-        case _:
-            raise TypeError(e)
     if s.watch is not None:
         s.watch(e, found, s.axes)
     return found
@@ -168,13 +160,14 @@ def _applied(e: x.Application, s: Setting) -> Value:
         return _product(e, *values)
     if name in ("sum", "min", "max") and len(values) == 1:
         own = tuple(range(-values[0].rank, 0))
-        return Value(FOLDS[name](values[0].array, axis=own))
+        return Value(getattr(jnp, name)(values[0].array, axis=own))
     if name == "pow":
         return _operated(e, "^", values)
     arrays, rank = _spread(values, e)
     if name in ("min", "max"):
         return Value(reduce(jnp.minimum if name == "min" else jnp.maximum, arrays), rank)
-    return Value(ELEMENTWISE[name](*arrays), rank)
+    elementwise = OTHERS.get(name) or getattr(jnp, name)
+    return Value(elementwise(*arrays), rank)
 
 
 def _matrix(e: x.Application, wanted: int, given: int, function: Callable, v: Value) -> Value:
@@ -195,7 +188,7 @@ def _reduced(e: x.Reduction, s: Setting) -> Value:
     # What does not change with an iterator has one element along it and counts for all.
     lengths = [len(one) for one in list(axes.values())[len(s.axes) :]]
     same = np.prod([n for n, i in zip(lengths, over, strict=True) if body.array.shape[i] == 1])
-    found = FOLDS[e.kind](body.array, axis=over)
+    found = getattr(jnp, e.kind)(body.array, axis=over)
     if same != 1 and e.kind in ("sum", "prod"):
         found = found * same if e.kind == "sum" else found ** int(same)
     return Value(found, body.rank)

@@ -11,6 +11,11 @@ from beamfit.errors import InputError
 # Most levels of a formula, which is walked by recursion; people write ten.
 MOST_LEVELS = 120
 REDUCTIONS = ("sum", "prod", "min", "max", "mean")
+ONE = """sin cos tan asin acos atan sinh cosh tanh asinh acosh atanh exp log log10 sqrt abs sign erf
+sigmoid transpose inverse det trace norm sum"""
+FUNCTIONS: dict[str, tuple[int, int]] = {name: (1, 1) for name in ONE.split()}
+FUNCTIONS |= {"atan2": (2, 2), "pow": (2, 2), "dot": (2, 2), "min": (1, 99), "max": (1, 99)}
+"""Built-in functions: least and most number of arguments."""
 
 
 class Place(NamedTuple):
@@ -22,12 +27,21 @@ class Place(NamedTuple):
     def __str__(self) -> str:
         return f"line {self.line}, column {self.column}"
 
+    def behind(self, text: str) -> Place:
+        """The place behind a text that begins here."""
+        more = text.count("\n")
+        column = len(text) - text.rfind("\n") if more else self.column + len(text)
+        return Place(self.line + more, column)
+
 
 NOWHERE = Place()
 
 
-# A field that says where something stands, which does not make it another thing.
-PLACE = {"default": NOWHERE, "compare": False, "repr": False}
+@dataclass(frozen=True)
+class Placed:
+    """A part of a document: it stands somewhere, which does not make it another thing."""
+
+    at: Place = field(default=NOWHERE, compare=False, repr=False, kw_only=True)
 
 
 def error_at(at: Place, found: str, expected: str) -> InputError:
@@ -35,10 +49,8 @@ def error_at(at: Place, found: str, expected: str) -> InputError:
     return InputError(found, expected, line=at.line, column=at.column)
 
 
-class Expression:
+class Expression(Placed):
     """A formula or a part of one."""
-
-    at: Place
 
     def __str__(self) -> str:
         return text_of(self)
@@ -49,7 +61,6 @@ class Literal(Expression):
     """A number, kept as it was written."""
 
     text: str
-    at: Place = field(**PLACE)
 
     @property
     def value(self) -> float:
@@ -61,8 +72,6 @@ class Literal(Expression):
 class Whole(Expression):
     """All elements along a dimension, written ``:`` in the place of an index."""
 
-    at: Place = field(**PLACE)
-
 
 @dataclass(frozen=True)
 class Name(Expression):
@@ -70,7 +79,6 @@ class Name(Expression):
 
     name: str
     indices: tuple[Expression, ...] = ()
-    at: Place = field(**PLACE)
 
 
 @dataclass(frozen=True)
@@ -79,7 +87,6 @@ class Arithmetic(Expression):
 
     symbol: str
     parts: tuple[Expression, ...]
-    at: Place = field(**PLACE)
 
 
 @dataclass(frozen=True)
@@ -88,7 +95,6 @@ class Application(Expression):
 
     function: str
     arguments: tuple[Expression, ...]
-    at: Place = field(**PLACE)
 
 
 @dataclass(frozen=True)
@@ -97,7 +103,6 @@ class Elements(Expression):
 
     parts: tuple[Expression, ...]
     ranged: bool = True
-    at: Place = field(**PLACE)
 
 
 @dataclass(frozen=True)
@@ -106,7 +111,6 @@ class Iterator(Expression):
 
     name: str
     over: str | Elements
-    at: Place = field(**PLACE)
 
 
 @dataclass(frozen=True)
@@ -116,23 +120,13 @@ class Reduction(Expression):
     kind: str
     iterators: tuple[Iterator, ...]
     body: Expression
-    at: Place = field(**PLACE)
 
 
 def children(e: Expression) -> tuple[Expression, ...]:
     """The parts of an expression."""
-    match e:
-        case Name():
-            return e.indices
-        case Arithmetic() | Elements():
-            return e.parts
-        case Application():
-            return e.arguments
-        case Reduction():
-            return (*e.iterators, e.body)
-        case Iterator(over=Elements() as over):
-            return (over,)
-    return ()
+    values = (getattr(e, name) for name in e.__match_args__)
+    each = (v if isinstance(v, tuple) else (v,) for v in values)
+    return tuple(part for parts in each for part in parts if isinstance(part, Expression))
 
 
 def check_depth(e: Expression) -> Expression:
@@ -182,7 +176,6 @@ def text_of(e: Expression) -> str:
             return f"{e.name} in {e.over}"
         case Reduction():
             return f"{e.kind}({iterators_text(e.iterators)} | {text_of(e.body)})"
-    raise TypeError(e)
 
 
 def _operation_text(e: Arithmetic) -> str:

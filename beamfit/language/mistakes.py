@@ -8,11 +8,10 @@ from difflib import get_close_matches
 from typing import Any
 
 from lark import Token
-from lark.exceptions import UnexpectedCharacters, UnexpectedInput, UnexpectedToken
+from lark.exceptions import UnexpectedCharacters, UnexpectedToken
 
 from beamfit.errors import InputError
-from beamfit.language.expression import Place, error_at
-from beamfit.language.scope import FUNCTIONS
+from beamfit.language.expression import FUNCTIONS, Place, error_at
 
 # Most open brackets, and most letters of a wrong word in a message.
 MOST_OPEN, LONGEST = 60, 30
@@ -98,11 +97,10 @@ def check_brackets(text: str) -> None:
 
 
 def _at(text: str, position: int) -> Place:
-    before = text[:position]
-    return Place(before.count("\n") + 1, position - before.rfind("\n"))
+    return Place(1, 1).behind(text[:position])
 
 
-def explained(error: UnexpectedInput, text: str) -> InputError:
+def explained(error: UnexpectedCharacters | UnexpectedToken, text: str) -> InputError:
     """Say where the text stops making sense, what stands there, and what could."""
     at, odd_at = Place(error.line, error.column), error.pos_in_stream or 0
     if known := _sign(text, odd_at) or _reduction(text, odd_at):
@@ -115,8 +113,6 @@ def explained(error: UnexpectedInput, text: str) -> InputError:
             ends = "a number, a name, '(' or a function"
             expected = ends if "a number" in names else "an operator, or the end of the formula"
         return error_at(at, f"{text[odd_at]!r}", expected)
-    if not isinstance(error, UnexpectedToken):
-        return error_at(at, "text that ends too early", "the rest of a statement")
     word, accepted = str(error.token), set(error.accepts or error.expected)
     before = error.token_history[-1] if error.token_history else None
     if hint := _misspelt(before, error.token, accepted):
@@ -192,7 +188,6 @@ HABITS: tuple[tuple[Callable[[Token, Token, set[str]], Any], str, bool], ...] = 
      "'=' as in NAME = FORMULA; a function is declared by function f(x) = ...;", False),
     (lambda b, t, a: b == "(" and t.type in ("NUMBER", "SIGNED"),
      "'[' before an index; (...) calls a mapping", False),
-    (lambda b, t, a: t == "for", "foreach k in K behind the statement", False),
     (lambda b, t, a: b in FUNCTIONS and t.type in ("NAME", "NUMBER", "SIGNED"),
      "brackets around its argument", True),
     (lambda b, t, a: t == "(" and "MULTIPLY" in a and b.type in ("NUMBER", "SIGNED"),

@@ -19,6 +19,9 @@ from beamfit.language import document as d
 from beamfit.language.expression import error_at
 from beamfit.language.xml import MLP_CLASS, Node, read_elements
 
+# Attributes of a port that are numbers, and what they are where nothing is said.
+NUMBERS = {name: value for name, value in Port._field_defaults.items() if name != "node"}
+
 
 def parse_network(text: str, path: str | os.PathLike[str] | None = None) -> MLP:
     """Read a network from the text of its XML form.
@@ -124,9 +127,8 @@ def format_network(net: MLP, name: str = "mlp") -> str:
     for tag, ports in (("input", net.input_ports), ("output", net.output_ports)):
         for port in ports:
             e = Plain.SubElement(root, tag, name=port.name, layer=port.layer, node=str(port.node))
-            for field, default in Port._field_defaults.items():
-                value = getattr(port, field)
-                if field != "node" and value != default:
+            for field, default in NUMBERS.items():
+                if (value := getattr(port, field)) != default:
                     e.set(field, repr(float(value)))
     for asked in net.gains:
         by = dict(zip(("da", "db", "dc"), asked.by, strict=False))
@@ -193,11 +195,7 @@ def _ports(elements: list[Node]) -> list[Port]:
         layer = e.need("layer")
         node = e.number("node", used[layer], int)
         used[layer] = node + 1
-        plain = {
-            field: e.number(field, default)
-            for field, default in Port._field_defaults.items()
-            if field != "node"
-        }
+        plain = {field: e.number(field, default) for field, default in NUMBERS.items()}
         ports.append(Port(e.need("name"), layer, node, **plain))
     return ports
 

@@ -79,12 +79,8 @@ def _parsed(text: str, start: str) -> Any:
 
 def _place(children: list[Any]) -> Place:
     """Place of the first of some parts."""
-    for child in children:
-        if isinstance(child, Token):
-            return Place(child.line, child.column)
-        if getattr(child, "at", None):
-            return child.at
-    return x.NOWHERE
+    first = next(c for c in children if isinstance(c, Token) or getattr(c, "at", None))
+    return Place(first.line, first.column) if isinstance(first, Token) else first.at
 
 
 def _number(token: Token) -> float:
@@ -118,41 +114,38 @@ class _Builder(Transformer):
 
     def number(self, c):
         _number(c[0])
-        return x.Literal(str(c[0]), _place(c))
+        return x.Literal(str(c[0]), at=_place(c))
 
     def element(self, c):
-        return x.Name(str(c[0]), tuple(part for part in c[1:] if part is not None), _place(c))
+        return x.Name(str(c[0]), tuple(part for part in c[1:] if part is not None), at=_place(c))
 
     def whole(self, c):
-        return x.Whole(_place(c))
+        return x.Whole(at=_place(c))
 
     def operation(self, c):
-        return x.Arithmetic(str(c[1]), (c[0], c[2]), c[0].at)
+        return x.Arithmetic(str(c[1]), (c[0], c[2]), at=c[0].at)
 
     def sign(self, c):
-        return c[1] if c[0] == "+" else x.Arithmetic("-", (c[1],), _place(c))
+        return c[1] if c[0] == "+" else x.Arithmetic("-", (c[1],), at=_place(c))
 
     def application(self, c):
-        return x.Application(str(c[0]), tuple(p for p in c[1:] if p is not None), _place(c))
+        return x.Application(str(c[0]), tuple(p for p in c[1:] if p is not None), at=_place(c))
 
     def reduction(self, c):
         if c[0] not in x.REDUCTIONS:
             raise error_at(_place(c), f"'{c[0]}'", nearest(c[0], list(x.REDUCTIONS)))
-        return x.Reduction(str(c[0]), c[1], c[2], _place(c))
+        return x.Reduction(str(c[0]), c[1], c[2], at=_place(c))
 
     def iterators(self, c):
         return tuple(c)
 
-    def each(self, c):
-        return c[0]
-
     def iterator(self, c):
         over = c[1] if isinstance(c[1], x.Elements) else str(c[1])
-        return x.Iterator(str(c[0]), over, _place(c))
+        return x.Iterator(str(c[0]), over, at=_place(c))
 
     def elements(self, c, ranged=True):
         parts = tuple(x.check_depth(part) for part in c[1:] if part is not None)
-        return x.Elements(parts, ranged, _place(c))
+        return x.Elements(parts, ranged, at=_place(c))
 
     def listed(self, c):
         return self.elements(c, False)
@@ -160,7 +153,7 @@ class _Builder(Transformer):
     # statements
 
     def set(self, c):
-        return [d.IndexedSet(str(c[1]), c[2], _place(c[1:]))]
+        return [d.IndexedSet(str(c[1]), c[2], at=_place(c[1:]))]
 
     def dimensions(self, c):
         return tuple(_count(t, 1) if t.type == "NUMBER" else str(t) for t in c)
@@ -168,19 +161,19 @@ class _Builder(Transformer):
     def real(self, c):
         if c[2] is not None:
             x.check_depth(c[2])
-        return d.Real(str(c[0]), c[1] or (), c[2], _place(c))
+        return d.Real(str(c[0]), c[1] or (), c[2], at=_place(c))
 
     def reals(self, c):
         return c[1:]
 
     def function(self, c):
         names = tuple(str(t) for t in c[2:-1])
-        return [d.Function(str(c[1]), names, x.check_depth(c[-1]), _place(c[1:]))]
+        return [d.Function(str(c[1]), names, x.check_depth(c[-1]), at=_place(c[1:]))]
 
     def wire(self, c):
         for part in (c[0], c[1]):
             x.check_depth(part)
-        return d.Assignment(c[0], c[1], c[2] or (), _place(c))
+        return d.Assignment(c[0], c[1], c[2] or (), at=_place(c))
 
     def assignment(self, c):
         return [self.wire(c)]
@@ -189,10 +182,10 @@ class _Builder(Transformer):
         return tuple(w for w in c if w is not None)
 
     def call(self, c):
-        return [d.Call(str(c[0]), c[1], c[2], c[3] or (), _place(c))]
+        return [d.Call(str(c[0]), c[1], c[2], c[3] or (), at=_place(c))]
 
     def block(self, c):
-        return [d.Block(c[0], tuple(s for part in c[1:] for s in part), _place(c[0]))]
+        return [d.Block(c[0], tuple(s for part in c[1:] for s in part), at=_place(c[0]))]
 
     def statements(self, c):
         return [s for part in c for s in part]
@@ -200,18 +193,18 @@ class _Builder(Transformer):
     # mappings
 
     def declared(self, c):
-        return d.Declared(str(c[0]), c[1] or (), None, _place(c))
+        return d.Declared(str(c[0]), c[1] or (), None, at=_place(c))
 
     def given(self, c):
         values = (_number(c[2]),) if isinstance(c[2], Token) else c[2]
-        return d.Declared(str(c[0]), c[1] or (), values, _place(c))
+        return d.Declared(str(c[0]), c[1] or (), values, at=_place(c))
 
     def values(self, c):
         return tuple(_number(t) for t in c if t is not None)
 
     def table(self, c):
         size = _count(c[3], 1), _count(c[4], 1)
-        return "tables", d.DataTable(str(c[1]), str(c[2]), *size, _place(c[1:]))
+        return "tables", d.DataTable(str(c[1]), str(c[2]), *size, at=_place(c[1:]))
 
     def attribute(self, c):
         return str(c[0]), str(c[1])
@@ -224,25 +217,19 @@ class _Builder(Transformer):
         attributes = tuple(a for a in c[3:-1] if a is not None)
         named = (("srcName", str(name)), ("dstName", str(target)))
         head = named if target is not None else (("name", str(name)),)
-        return d.NetworkElement(str(kind), (*head, *attributes), c[-1], _place(c))
+        return d.NetworkElement(str(kind), (*head, *attributes), c[-1], at=_place(c))
 
     def network(self, c):
-        return "mappings", d.NetworkDefinition(str(c[1]), tuple(c[2:]), _place(c[1:]))
+        return "mappings", d.NetworkDefinition(str(c[1]), tuple(c[2:]), at=_place(c[1:]))
 
-    def inputs(self, c):
-        return "inputs", c[1:]
-
-    def outputs(self, c):
-        return "outputs", c[1:]
-
-    def parameters(self, c):
-        return "parameters", c[1:]
+    def face(self, c):
+        return f"{c[0]}s", c[1:]
 
     def title(self, c):
         return "titles", str(c[1])
 
     def mapping(self, c):
-        return "mappings", _mapping(str(c[1]), _gathered(c[2:]), _place(c[1:]))
+        return "mappings", _mapping(str(c[1]), _gathered(c[2:]), at=_place(c[1:]))
 
     # the problem
 
@@ -250,33 +237,27 @@ class _Builder(Transformer):
         name = str(c[0])
         return d.Goal(name, name if c[1] is None else str(c[1]), at=_place(c))
 
-    def pair(self, c):
-        return _number(c[0]), _number(c[1])
-
     def half(self, c):
         end = _number(c[1])
         return (-math.inf, end) if c[0] == "<=" else (end, math.inf)
 
     def goal(self, c):
         weight = 1.0 if c[3] is None else _number(c[3])
-        return "goals", [(c[0], d.Goal(c[1].label, c[1].model, weight, c[1].at))]
+        return "goals", [(c[0], d.Goal(c[1].label, c[1].model, weight, at=c[1].at))]
 
     def variable(self, c):
         _, name, value, bounds, _, random, _, seed = c
         value = None if value is None else _number(value)
         low, high = bounds or (-math.inf, math.inf)
         start = value, random, _count(seed) or 0
-        return "variables", d.FreeInput(name.label, name.model, low, high, *start, name.at)
+        return "variables", d.FreeInput(name.label, name.model, low, high, *start, at=name.at)
 
     def limit(self, c):
         low, high = c[2] if len(c) == 3 else (_number(c[3]), _number(c[3]))
-        return "limits", d.Limit(c[1].label, c[1].model, low, high, c[1].at)
-
-    def setting(self, c):
-        return str(c[0]), str(c[1])
+        return "limits", d.Limit(c[1].label, c[1].model, low, high, at=c[1].at)
 
     def solver(self, c):
-        return "solvers", d.Solver(c[1], tuple(s for s in c[2:] if s is not None), _place(c))
+        return "solvers", d.Solver(c[1], tuple(s for s in c[2:] if s is not None), at=_place(c))
 
     def document(self, c):
         found = _gathered(c)
@@ -306,4 +287,4 @@ def _gathered(items: list[Any]) -> dict[str, list[Any]]:
 
 def _mapping(name: str, found: dict[str, list[Any]], at: Place = x.NOWHERE) -> d.Mapping:
     groups = ("tables", "mappings", "inputs", "outputs", "parameters", "statements")
-    return d.Mapping(name, *(tuple(found[kind]) for kind in groups), at)
+    return d.Mapping(name, *(tuple(found[kind]) for kind in groups), at=at)

@@ -19,7 +19,6 @@ from scipy.sparse.csgraph import connected_components
 from beamfit.errors import InputError, nearest
 from beamfit.language import document as d
 from beamfit.language import expression as x
-from beamfit.language.declare import check_problem, scope_of
 from beamfit.language.expression import error_at
 from beamfit.language.scope import (
     Array,
@@ -28,8 +27,10 @@ from beamfit.language.scope import (
     Net,
     Read,
     Scope,
+    check_problem,
     located,
     reads,
+    scope_of,
     whole_of,
     widened,
 )

@@ -15,8 +15,8 @@ from beamfit.greybox import problem as core
 from beamfit.language import document as d
 from beamfit.language import expression as x
 from beamfit.language.compiled import Program, compile_mapping, values_of
-from beamfit.language.declare import check_problem
 from beamfit.language.expression import error_at
+from beamfit.language.scope import check_problem
 
 
 class Square(NamedTuple):
@@ -160,17 +160,10 @@ def formulate(
             records.append(core.Record(name, predict, constants, np.zeros(length)))
         else:
             objectives.append(core.Objective(name, _Output(program, name), constants, weight))
-    limits = [
-        core.Constraint(
-            c.label,
-            _Output(program, c.model),
-            constants,
-            c.lower,
-            c.upper,
-            _names(c, program.scope.outputs[c.model]),
-        )
-        for c in p.limits
-    ]
+    limits = []
+    for c in p.limits:
+        names, limited = _names(c, program.scope.outputs[c.model]), _Output(program, c.model)
+        limits.append(core.Constraint(c.label, limited, constants, c.lower, c.upper, names))
     problem = core.Problem(model, free, records, (), limits, objectives, tolerance)
     sign = -1.0 if p.maximize else 1.0
     notes += tuple(_unqualified(document))
@@ -256,11 +249,6 @@ def starts_of(made: Formulation) -> Iterator[dict[str, np.ndarray]]:
         draws[v.model] = _starts(v, a.shape, given)
     while True:
         yield model | {name: next(draw) for name, draw in draws.items()}
-
-
-def at_start(made: Formulation, model: dict[str, np.ndarray]) -> Formulation:
-    """The same problem, begun from another model."""
-    return replace(made, problem=replace(made.problem, model=model))
 
 
 def _unqualified(document: d.Document) -> Iterator[str]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import islice
 from typing import Any
 
@@ -20,19 +20,14 @@ from beamfit.greybox.problem import TOLERANCE
 from beamfit.greybox.solve import solve
 from beamfit.language import document as d
 from beamfit.language.compiled import gain_tables, gains_at, limited, outputs_at
-from beamfit.language.problem import Formulation, at_start, formulate, starts_of
+from beamfit.language.problem import Formulation, formulate, starts_of
 from beamfit.language.trace import cause_of
 from beamfit.quantity import Quantity
 from beamfit.statistics import reach_of
 
-# Most draws of a random start until it is finite.
-MOST_DRAWS = 100
 # Solver options that are used, with the argument of `solve` that each sets.
-TOLD = {
-    "major iterations limit": "iterations",
-    "iterations limit": "iterations",
-    "time limit": "seconds",
-}
+TOLD = dict.fromkeys(("major iterations limit", "iterations limit"), "iterations")
+TOLD["time limit"] = "seconds"
 NOISE = "Errors treat squared terms as data residuals, with the noise inferred from their scatter."
 # Kinds of defects that are reported elsewhere, with their place in the document.
 TOLD_ELSEWHERE = {"contradictory_bounds", "not_finite", "unused"}
@@ -113,18 +108,12 @@ class ProblemSolution:
 
     def tables(self) -> list[Table]:
         """Objective, variables, constraints and outputs as tables."""
-        tables = [_table("variable", self.variables(), self._row, self.made.squares)]
+        tables = [_table("variable", self.variables(), "reduced gradient", self.made.squares)]
         if self.fit.constraints:
-            rows = self.constraints()
-            tables.append(_table("constraint", rows, _limited, False, "multiplier"))
+            tables.append(_table("constraint", self.constraints(), "multiplier", False))
         values = [[n, f"{v:.8g}" if v.ndim == 0 else _range(v)] for n, v in self.outputs.items()]
         tables += [Table("", ["output", "value"], values, numeric=True)] if values else []
         return tables + gain_tables(self.made.program.scope, self.gains)
-
-    def _row(self, v: FittedVariable) -> list[str]:
-        error = ["-" if not math.isfinite(v.error) else f"{v.error:.2g}"] * self.made.squares
-        slope = f"{v.reduced_gradient + 0.0:.3g}"
-        return [v.name, f"{v.value:.8g}", *error, *_ends(v), v.state, slope]
 
     def _variable(self, v: FittedVariable) -> dict[str, Any]:
         kept = ("name", "lower", "upper", "state", "reduced_gradient")
@@ -163,17 +152,15 @@ def _range(values: np.ndarray) -> str:
     return f"{values.size} from {np.min(values):.5g} to {np.max(values):.5g}"
 
 
-def _ends(row: FittedVariable | FittedConstraint) -> list[str]:
-    return [f"{end:.6g}" for end in (row.lower, row.upper)]
-
-
-def _limited(c: FittedConstraint) -> list[str]:
-    return [c.name, f"{c.value:.8g}", *_ends(c), c.state, f"{c.multiplier + 0.0:.3g}"]
-
-
-def _table(name: str, rows: Sequence, row_of, errors: bool, last="reduced gradient") -> Table:
+def _table(name: str, rows: Sequence, last: str, errors: bool) -> Table:
     header = [name, "value", *["error"] * errors, "lower", "upper", "state", last]
-    return limited(header, [row_of(row) for row in rows])
+    return limited(header, [_cells(row, errors) for row in rows])
+
+
+def _cells(row: FittedVariable | FittedConstraint, errors: bool) -> list[str]:
+    error = ["-" if not math.isfinite(row.error) else f"{row.error:.2g}"] if errors else []
+    ends = [f"{end:.6g}" for end in (row.lower, row.upper)]
+    return [row.name, f"{row.value:.8g}", *error, *ends, row.state, f"{row[-1] + 0.0:.3g}"]
 
 
 # ---- solving
@@ -231,7 +218,9 @@ def solve_document(
     tolerance = told.pop("tolerance", TOLERANCE)
     made, notes = _started(formulate(document, tables, values, tolerance))
     fit = solve(made.problem, starts=starts, began=began, **told)
-    notes = (*made.notes, *notes, *_ailments(made, fit), *warnings, *_places(made, fit))
+    notes = (*made.notes, *notes, *_ailments(made, fit), *warnings)
+    if places := _where(made, fit.about):
+        notes = (*notes, f"The verdict is about {places}.")
     if fit.status is Status.not_finite:
         cause = _cause(made, fit.model)
         told = cause is None or any(cause in note for note in notes)
@@ -250,11 +239,12 @@ def _started(made: Formulation) -> tuple[Formulation, tuple[str, ...]]:
         return made, ()
     cause = _cause(made, p.core.model)
     drawn = any(v.random for v in variables)
-    for draws, model in enumerate(islice(starts_of(made), 1, MOST_DRAWS if drawn else 1), 1):
+    for draws, model in enumerate(islice(starts_of(made), 1, 100 if drawn else 1), 1):
         if slopes(p, np.concatenate([np.ravel(model[v.model]) for v in variables])).finite:
             times = "once" if draws == 1 else f"{draws} times"
             said = f"At the start of the seeds {cause}"
-            return at_start(made, model), (f"{said}; drawn again from the same seeds, {times}.",)
+            begun = replace(made, problem=replace(made.problem, model=model))
+            return begun, (f"{said}; drawn again from the same seeds, {times}.",)
     return made, (f"At the start {cause}.",) if cause else ()
 
 
@@ -281,12 +271,6 @@ def _where(made: Formulation, names: Iterable[str]) -> str:
     labels = {one.label: one.at for one in (*problem.variables, *problem.limits)}
     told = dict.fromkeys(name.partition("[")[0] for name in names)
     return ", ".join(f"'{name}' at {labels[name]}" for name in told if name in labels)
-
-
-def _places(made: Formulation, fit: Fit) -> list[str]:
-    """Places in the document that the verdict is about."""
-    places = _where(made, fit.about)
-    return [f"The verdict is about {places}."] if places else []
 
 
 def _told(solver: d.Solver | None) -> tuple[dict[str, Any], list[str]]:

@@ -15,8 +15,6 @@ from textwrap import indent, wrap
 from beamfit.language import document as d
 from beamfit.language.expression import iterators_text
 
-# Letters in a line of a written document.
-WIDTH = 96
 # Superscripts and fractions are letters to Python, not here.
 NAME = re.compile(r"[^\W\d²³¹⁰⁴-⁹½¼¾][^\W²³¹⁰⁴-⁹½¼¾]*")
 NUMBER = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?")
@@ -135,7 +133,7 @@ def _listed(word: str, names: list[str]) -> list[str]:
         return []
     # Blanks within one declaration must not be broken.
     joined = ", ".join(name.replace(" ", "\0") for name in names) + ";"
-    lines = wrap(joined, WIDTH, initial_indent=f"{word} ", subsequent_indent="  ",
+    lines = wrap(joined, 96, initial_indent=f"{word} ", subsequent_indent="  ",
                  break_long_words=False, break_on_hyphens=False)  # fmt: skip
     return [line.replace("\0", " ") for line in lines]
 
@@ -149,7 +147,8 @@ def _dims(dimensions: Sequence[str | int]) -> str:
     return f"[{', '.join(map(str, dimensions))}]" if dimensions else ""
 
 
-def _values(values: Sequence[float]) -> str:
+def values_text(values: Sequence[float]) -> str:
+    """Write numbers as they stand behind a name."""
     return f"[{', '.join(map(number_text, values))}]"
 
 
@@ -157,7 +156,7 @@ def _declared(n: d.Declared) -> str:
     value = ""
     if n.values is not None:
         single = not n.dimensions and len(n.values) == 1
-        value = " = " + (number_text(n.values[0]) if single else _values(n.values))
+        value = " = " + (number_text(n.values[0]) if single else values_text(n.values))
     return f"{n.name}{_dims(n.dimensions)}{value}"
 
 
@@ -165,7 +164,7 @@ def _part(p: d.NetworkElement) -> str:
     heads = 2 if p.kind == "connection" else 1
     name = " -> ".join(value for _, value in p.attributes[:heads])
     rest = ", ".join(f"{k} = {_word(v)}" for k, v in p.attributes[heads:])
-    values = "" if p.values is None else f" = {_values(p.values)}"
+    values = "" if p.values is None else f" = {values_text(p.values)}"
     return f"{p.kind} {name}{f' ({rest})' if rest else ''}{values};"
 
 
@@ -204,4 +203,3 @@ def _statement(s: d.Statement) -> list[str]:
         case d.Block():
             body = [indent(line, "  ") for line in _statements(s.statements)]
             return [_each(s.each).strip() + " {", *body, "}"]
-    raise TypeError(s)

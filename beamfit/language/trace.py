@@ -9,11 +9,11 @@ import numpy as np
 
 from beamfit.language import document as d
 from beamfit.language import expression as x
-from beamfit.language.calls import Arrays, given_to
 from beamfit.language.compiled import Program, carry_out
 from beamfit.language.evaluate import Setting, Value, evaluate
 from beamfit.language.plan import RecurrencePlan, StepGroup, callee_of
 from beamfit.language.scope import Axes, IndexSet, MappingStep, Scope, said_at
+from beamfit.language.steps import Arrays, given_to
 
 
 class _FoundError(Exception):
@@ -55,20 +55,24 @@ def cause_of(
     >>> cause_of(compile_mapping(parse_document(text).mapping), {"a": 2.5}, ["y"])
     'sqrt(a - k) is not a number for k = 3 (line 1, column 52): a - k = -0.5'
     """
+    try:
+        _look(program, inputs, names, slopes)
+    except _FoundError as found:
+        return f"{inside}{found}"
+    return None
+
+
+def _look(program: Program, inputs: Mapping, names: Iterable[str], slopes: bool) -> None:
+    """Go from group to group, and into those of which something is not finite."""
     arrays = program.begin(inputs)
     for name, value in arrays.items():
         if not np.all(np.isfinite(value)):
-            return f"{inside}{name} is not finite"
+            raise _FoundError(f"{name} is not finite")
     for group in program.order.needed(names):
         changed = carry_out(program.order, group, arrays)
-        finite = all(np.all(np.isfinite(array)) for array in changed.values())
-        found = (
-            None if finite and not slopes else _of_group(program, group, arrays, changed, slopes)
-        )
-        if found is not None:
-            return inside + found
+        if slopes or not all(np.all(np.isfinite(array)) for array in changed.values()):
+            _look_into(program, group, arrays, changed, slopes)
         arrays |= changed
-    return None
 
 
 class _Watch:
@@ -97,8 +101,6 @@ class _Watch:
 
     def _said(self, part: x.Expression, at: np.ndarray) -> str:
         array = np.asarray(self.seen[id(part)].array)
-        if array.ndim < len(at):
-            return f"{part} of {array.size} numbers"
         picked = array[tuple(min(i, n - 1) for i, n in zip(at, array.shape, strict=False))]
         return f"{part} = {picked:.4g}" if picked.ndim == 0 else f"{part} of {picked.size} numbers"
 
@@ -112,10 +114,10 @@ def _may_be_steep(e: x.Expression) -> bool:
     return not (isinstance(e.parts[1], x.Literal) and e.parts[1].value >= 1)
 
 
-def _of_group(
+def _look_into(
     program: Program, group: StepGroup, arrays: Arrays, changed: Arrays, slopes: bool
-) -> str | None:
-    """Description of what is not finite in a group: in a call, or at the first bad time."""
+) -> None:
+    """Compute a group part by part: in a call, or up to the first bad time."""
     scope = program.scope
     for step in group.steps if group.plan is None else group.plan.steps:
         axes = step.axes
@@ -123,15 +125,15 @@ def _of_group(
             time = group.plan.time[step.number]
             elements = axes[time].elements[: _bad_time(group.plan, changed) + 1]
             axes = axes | {time: IndexSet(axes[time].name, elements)}
-        watch = _Watch(slopes)
-        found = _of_step(program, step, Setting(scope, arrays | changed, axes, watch=watch))
-        if found is not None:
-            return found
+        s = Setting(scope, arrays | changed, axes, watch=_Watch(slopes))
+        if isinstance(step.what, d.Call):
+            _look_behind(program, step, s)
+        else:
+            evaluate(step.what.value, s)
     for name, array in changed.items():
         if not np.all(np.isfinite(array)):
             element = scope.arrays[name].element(int(np.argmax(~np.isfinite(np.ravel(array)))))
-            return f"{element} is not finite ({group.steps[0].at})"
-    return None
+            raise _FoundError(f"{element} is not finite ({group.steps[0].at})")
 
 
 def _bad_time(plan: RecurrencePlan, changed: Arrays) -> int:
@@ -144,26 +146,13 @@ def _bad_time(plan: RecurrencePlan, changed: Arrays) -> int:
     return int(np.argmax(bad))
 
 
-def _of_step(program: Program, step: MappingStep, s: Setting) -> str | None:
-    if isinstance(step.what, d.Call):
-        return _of_call(program, step, s, s.watch.slopes)
-    try:
-        evaluate(step.what.value, s)
-    except _FoundError as found:
-        return str(found)
-    return None
-
-
-def _of_call(program: Program, step: MappingStep, s: Setting, slopes: bool) -> str | None:
-    """Description of what is not finite in a called mapping, at its first bad point; or None."""
+def _look_behind(program: Program, step: MappingStep, s: Setting) -> None:
+    """Go through a called mapping point by point."""
     callee = callee_of(s.scope, step.what)
     if not isinstance(callee, Scope):
-        return None
+        return
     inner = Program(program.order.inner[step.what.mapping], {})
-    try:
-        given = given_to(step.what, callee, s)
-    except _FoundError as found:
-        return str(found)
+    given = given_to(step.what, callee, s)
     names = sorted({w.value.name for w in step.what.outputs if isinstance(w.value, x.Name)})
     for at in np.ndindex(*[len(one) for one in s.axes.values()]):
         point = {
@@ -172,7 +161,6 @@ def _of_call(program: Program, step: MappingStep, s: Setting, slopes: bool) -> s
         }
         when = [f"{n} = {one.elements[i]}" for (n, one), i in zip(s.axes.items(), at, strict=True)]
         where = f" for {', '.join(when)}" if when else ""
-        found = cause_of(inner, point, names, f"in {step.what.mapping}{where}: ", slopes)
-        if found is not None:
-            return found
-    return None
+        inside = f"in {step.what.mapping}{where}: "
+        if found := cause_of(inner, point, names, inside, s.watch.slopes):
+            raise _FoundError(found)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import lru_cache
 from typing import Any, NamedTuple
 from xml.etree import ElementTree as Plain
@@ -22,35 +22,31 @@ from beamfit.errors import InputError, nearest
 from beamfit.language import document as d
 from beamfit.language.expression import Elements, Place, error_at
 from beamfit.language.parse import parse_statements
-from beamfit.language.text import NAME, format_statements, number_text
+from beamfit.language.text import NAME, format_statements, number_text, values_text
 
-# Most nested elements, and most lines of an opening tag.
-MOST_DEEP, MOST_LINES = 40, 12
+# Most nested elements.
+MOST_DEEP = 40
 MLP_CLASS = "com.pav.pdas.model.mlp.MlpMapping"
 EXPRESSIONS = "com.pav.pdas.model.expression.ExpressionMapping"
 NLP = "com.pav.pdas.optimization.common.NLPProblem"
-KNOWN = {
-    "formulation": "problem mapping solver",
-    "problem": "variable constraint objective",
-    "mapping": "data set mapping input output parameter expressions",
-    "network": "input output gain layer connection",
-    "solver": "parameter",
-    "input": "dimension values", "output": "dimension", "parameter": "dimension values",
-    "set": "elements",
+# Children and attributes of each element; a misspelt one would be lost without a word.
+PARTS = {
+    "formulation": ("problem mapping solver", ""),
+    "problem": ("variable constraint objective", "classname direction"),
+    "objective": ("", "label modelVariable coefficient"),
+    "variable": ("", "label modelVariable lower upper value useRandomInitial randomLower "
+                     "randomUpper randomSeed"),
+    "constraint": ("", "label modelVariable lower upper"),
+    "solver": ("parameter", "classname"),
+    "mapping": ("data set mapping input output parameter expressions", "classname name"),
+    "data": ("", "name file rowCount columnCount"),
+    "set": ("elements", "name"), "elements": ("", "type start stop step"),
+    "input": ("dimension values", "name value isScalar"), "output": ("dimension", "name isScalar"),
+    "parameter": ("dimension values", "name value isScalar"),
+    "dimension": ("", "type set size"), "values": ("", ""), "expressions": ("", ""),
 }  # fmt: skip
-
-# Attributes of each element; a misspelt one would be lost without a word.
-GIVEN = {
-    "formulation": "", "problem": "classname direction",
-    "objective": "label modelVariable coefficient",
-    "variable": "label modelVariable lower upper value useRandomInitial randomLower randomUpper "
-                "randomSeed",
-    "constraint": "label modelVariable lower upper", "solver": "classname",
-    "mapping": "classname name", "data": "name file rowCount columnCount", "set": "name",
-    "elements": "type start stop step", "input": "name value isScalar", "output": "name isScalar",
-    "parameter": "name value isScalar", "dimension": "type set size", "values": "",
-    "expressions": "",
-}  # fmt: skip
+NETWORK_PARTS = ["input", "output", "gain", "layer", "connection"]
+SILENT = {"formulation", "problem", "mapping", "solver", "set", "output"}  # elements without text
 
 
 class Node(NamedTuple):
@@ -137,17 +133,12 @@ class _ElementReader(ContentHandler):
     def _places(self, given: dict[str, str]) -> dict[str, Place]:
         """Places of an element's attribute values; its own under the empty key."""
         here = self._here()
-        first = "".join(self.lines[here.line - 1 : here.line + MOST_LINES])[here.column - 1 :]
+        # An opening tag of more than a dozen lines has its attributes where it begins.
+        first = "".join(self.lines[here.line - 1 : here.line + 12])[here.column - 1 :]
         found = {"": here}
         for key in given:
             match = re.search(rf"\s{re.escape(key)}\s*=\s*['\"]", first)
-            if match:
-                before = first[: match.end()]
-                more = before.count("\n")
-                column = len(before) - before.rfind("\n") if more else here.column + len(before)
-                found[key] = Place(here.line + more, column)
-            else:
-                found[key] = here
+            found[key] = here.behind(first[: match.end()]) if match else here
         return found
 
     def endElement(self, name):
@@ -160,9 +151,7 @@ class _ElementReader(ContentHandler):
             lines = here.line - self.end.line
             blanks = here.column - (1 if lines else self.end.column)
             self.open[-1].text.append("\n" * lines + " " * blanks)
-            more = content.count("\n")
-            column = len(content) - content.rfind("\n") if more else here.column + len(content)
-            self.end = Place(here.line + more, column)
+            self.end = here.behind(content)
         self.open[-1].text.append(content)
 
 
@@ -230,12 +219,11 @@ def parse_xml(text: str) -> d.Document:
     ('y', '2')
     """
     root = read_elements(text)
-    _check_attributes(root)
+    if root.tag not in ("formulation", "mapping"):
+        raise root.error(f"an element <{root.tag}>", "<formulation> or <mapping>")
+    _check(root)
     if root.tag == "mapping":
         return d.Document(_mapping(root))
-    if root.tag != "formulation":
-        raise root.error(f"an element <{root.tag}>", "<formulation> or <mapping>")
-    _check(root, "formulation")
     mapping, problem, solver = (_one(root, tag) for tag in ("mapping", "problem", "solver"))
     if mapping is None:
         raise root.error("<formulation> without <mapping>", "a mapping to optimise")
@@ -246,25 +234,22 @@ def parse_xml(text: str) -> d.Document:
     )
 
 
-def _check(node: Node, kind: str) -> None:
-    known = KNOWN[kind].split()
+def _check(node: Node) -> None:
+    """Refuse children, attributes and text that mean nothing; a network has its own attributes."""
+    network = node.given.get("classname") == MLP_CLASS
+    children, attributes = (part.split() for part in PARTS[node.tag])
+    children = NETWORK_PARTS if network else children
     for child in node.children:
-        if child.tag not in known:
-            raise child.error(f"<{child.tag}> in <{node.tag}>", nearest(child.tag, known))
-    if kind != "expressions" and "".join(node.text).strip() and kind not in ("input", "parameter"):
+        if child.tag not in children:
+            known = nearest(child.tag, children) if children else "no elements"
+            raise child.error(f"<{child.tag}> in <{node.tag}>", known)
+    if node.tag in SILENT and "".join(node.text).strip():
         raise node.error(f"text in <{node.tag}>", "elements only")
-
-
-def _check_attributes(node: Node) -> None:
-    """Refuse attributes that mean nothing; a network has its own."""
-    known = GIVEN.get(node.tag, "").split()
-    for key in node.given if node.tag in GIVEN else ():
-        if key not in known:
-            raise node.error(f"{key}='{node.given[key]}' in <{node.tag}>", nearest(key, known), key)
-    for child in node.children if node.given.get("classname") != MLP_CLASS else ():
-        if node.tag == "expressions":
-            raise child.error(f"<{child.tag}> in <expressions>", "statements only")
-        _check_attributes(child)
+    for key, value in node.given.items():
+        if key not in attributes:
+            raise node.error(f"{key}='{value}' in <{node.tag}>", nearest(key, attributes), key)
+    for child in () if network else node.children:
+        _check(child)
 
 
 def _one(node: Node, tag: str) -> Node | None:
@@ -275,7 +260,6 @@ def _one(node: Node, tag: str) -> Node | None:
 
 
 def _problem(node: Node) -> d.ProblemStatement:
-    _check(node, "problem")
     direction = node.given.get("direction", "minimize").strip().lower()
     if direction not in ("minimize", "maximize"):
         found = f"direction='{direction}'"
@@ -309,9 +293,8 @@ def _variable(e: Node) -> d.FreeInput:
 
 
 def _solver(node: Node) -> d.Solver:
-    _check(node, "solver")
     settings = tuple((e.need("name"), e.need("value")) for e in node.all("parameter"))
-    return d.Solver(node.given.get("classname", "default"), settings, node.at)
+    return d.Solver(node.given.get("classname", "default"), settings, at=node.at)
 
 
 # ---- mappings
@@ -322,7 +305,6 @@ def _mapping(node: Node) -> d.Mapping:
     if kind != EXPRESSIONS:
         found = f"classname='{kind}'"
         raise node.error(found, nearest(kind, [EXPRESSIONS, MLP_CLASS]), "classname")
-    _check(node, "mapping")
     tables = tuple(map(_table, node.all("data")))
     inner = tuple(_network(e) if e.given.get("classname") == MLP_CLASS else _mapping(e)
                   for e in node.all("mapping"))  # fmt: skip
@@ -333,7 +315,7 @@ def _mapping(node: Node) -> d.Mapping:
     text = _one(node, "expressions")
     statements = parse_statements("".join(text.text)) if text else ()
     return d.Mapping(
-        node.given.get("name", ""), tables, inner, *groups, (*sets, *statements), node.at
+        node.given.get("name", ""), tables, inner, *groups, (*sets, *statements), at=node.at
     )
 
 
@@ -341,11 +323,10 @@ def _table(e: Node) -> d.DataTable:
     rows, columns = e.number("rowCount", None, int), e.number("columnCount", None, int)
     if (rows is None) != (columns is None):
         raise e.error("one of rowCount and columnCount", "both, or neither")
-    return d.DataTable(e.name(), e.need("file"), rows, columns, e.at)
+    return d.DataTable(e.name(), e.need("file"), rows, columns, at=e.at)
 
 
 def _declared(e: Node) -> d.Declared:
-    _check(e, e.tag)
     dimensions: list[str | int] = []
     for dim in e.all("dimension"):
         if "set" in dim.given:
@@ -355,13 +336,12 @@ def _declared(e: Node) -> d.Declared:
             dimensions.append(dim.number("size", 1, int))
     values = _one(e, "values")
     if values is not None:
-        return d.Declared(e.name(), tuple(dimensions), values.numbers(), e.at)
+        return d.Declared(e.name(), tuple(dimensions), values.numbers(), at=e.at)
     given = (e.number("value", 0.0),) if "value" in e.given else None
-    return d.Declared(e.name(), tuple(dimensions), given, e.at)
+    return d.Declared(e.name(), tuple(dimensions), given, at=e.at)
 
 
 def _set(e: Node) -> d.IndexedSet:
-    _check(e, "set")
     inner = _one(e, "elements")
     if inner is None:
         raise e.error("<set> without <elements>", "<elements type='range' start='1' stop='9'/>")
@@ -373,19 +353,18 @@ def _set(e: Node) -> d.IndexedSet:
         keys = ("start", "stop", *(["step"] if "step" in inner.given else []))
         numbers = [str(inner.number(key, inner.need(key), int)) for key in keys]
     parts = parse_statements(f"set s = |{', '.join(numbers)}|;")[0].elements.parts
-    return d.IndexedSet(e.name(), Elements(parts, kind == "range", e.at), e.at)
+    return d.IndexedSet(e.name(), Elements(parts, kind == "range", at=e.at), at=e.at)
 
 
 def _network(node: Node) -> d.NetworkDefinition:
-    _check(node, "network")
     parts = []
     for e in node.children:
         heads = ("srcName", "dstName") if e.tag == "connection" else ("name",)
         rest = [(k, v) for k, v in e.given.items() if k not in heads]
         values = e.numbers() if "".join(e.text).strip() else None
         head = [(k, e.name(k)) for k in heads]
-        parts.append(d.NetworkElement(e.tag, (*head, *rest), values, e.at))
-    return d.NetworkDefinition(node.name(), tuple(parts), node.at)
+        parts.append(d.NetworkElement(e.tag, (*head, *rest), values, at=e.at))
+    return d.NetworkDefinition(node.name(), tuple(parts), at=node.at)
 
 
 # ---- writing
@@ -473,13 +452,9 @@ def _declare(e: Plain.Element, of: d.Declared) -> None:
         given = {"type": "ID", "set": dim} if isinstance(dim, str) else None
         Plain.SubElement(e, "dimension", given or {"type": "size", "size": str(dim)})
     if of.values is not None and (of.dimensions or len(of.values) != 1):
-        Plain.SubElement(e, "values").text = _row(of.values)
+        Plain.SubElement(e, "values").text = values_text(of.values)
     elif of.values is not None:
         e.set("value", number_text(of.values[0]))
-
-
-def _row(values: Sequence[float]) -> str:
-    return f"[{', '.join(map(number_text, values))}]"
 
 
 def _network_element(n: d.NetworkDefinition) -> Plain.Element:

@@ -44,8 +44,6 @@ class Diagnostics(NamedTuple):
     @property
     def settled(self) -> bool:
         """True if the walkers agree and the chain is many autocorrelation times long."""
-        if self.steps == 0:
-            return False
         agreed = bool(np.max(self.rhat) < AGREED)
         return agreed and self.steps >= LONG * float(np.max(self.autocorrelation))
 

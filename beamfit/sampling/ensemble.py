@@ -31,8 +31,6 @@ WARM = 1.15
 FEWEST_WALKERS = 64
 # Largest share of the time spent on writing checkpoints.
 WRITING = 0.05
-# Most draws of the walkers' starts until enough have a finite density.
-TRIES = 80
 
 
 def draw(
@@ -145,7 +143,7 @@ def first_walkers(
     proposal = about(target.covariance, target.widening, target.blocks, 10.0)
     found = np.zeros((0, len(target.mode)))
     centre, reach = target.mode, 1.0
-    for _ in range(TRIES):
+    for _ in range(80):  # nearer, each time that few are feasible
         offsets = proposal.draw(random, number) - target.mode
         points = centre + reach * offsets
         # Walkers may start anywhere, so those outside a bound are mirrored into it.

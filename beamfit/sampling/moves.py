@@ -159,10 +159,7 @@ def _root(covariance: np.ndarray) -> np.ndarray:
 
 
 def about(
-    covariance: np.ndarray,
-    widening: Widening,
-    blocks: tuple[np.ndarray, ...],
-    degrees: float = 5.0,
+    covariance: np.ndarray, widening: Widening, blocks: tuple[np.ndarray, ...], degrees: float = 5.0
 ) -> IndependenceProposal:
     """Leap about a centre with the covariance of a fit.
 

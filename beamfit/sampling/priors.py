@@ -32,10 +32,9 @@ class Distribution(Protocol):
 
 @dataclass(frozen=True)
 class _OfScipy:
-    """A prior with the names of its field, computed by the distribution of scipy it names."""
+    """A prior with names of its own for what scipy's distribution of it takes."""
 
-    # Name in scipy, and the fields that must be above zero.
-    _name: ClassVar[str]
+    # Fields that must be above zero.
     _positive: ClassVar[tuple[str, ...]] = ()
 
     def __post_init__(self) -> None:
@@ -47,15 +46,15 @@ class _OfScipy:
                 words = field.name.replace("_", " ")
                 raise InputError(f"{type(self).__name__} with {words} {value}", kind)
 
-    def _arguments(self) -> dict[str, float]:
-        """The fields as scipy calls them."""
+    def _of(self, stats: Any) -> Any:
+        """The distribution of scipy.stats."""
         raise NotImplementedError
 
     @cached_property
     def _frozen(self) -> Any:
         from scipy import stats  # half a second that only sampling should cost
 
-        return getattr(stats, self._name)(**self._arguments())
+        return self._of(stats)
 
     def logpdf(self, x: np.ndarray) -> np.ndarray:
         """Log density at x; -inf outside the support."""
@@ -95,13 +94,12 @@ class Normal(_OfScipy):
     -0.225791
     """
 
-    _name = "norm"
     _positive = ("sd",)
     centre: float
     sd: float
 
-    def _arguments(self) -> dict[str, float]:
-        return {"loc": self.centre, "scale": self.sd}
+    def _of(self, stats: Any) -> Any:
+        return stats.norm(self.centre, self.sd)
 
 
 @dataclass(frozen=True)
@@ -127,13 +125,12 @@ class LogNormal(_OfScipy):
     (-inf, 2.01)
     """
 
-    _name = "lognorm"
     _positive = ("median", "log_sd")
     median: float
     log_sd: float
 
-    def _arguments(self) -> dict[str, float]:
-        return {"s": self.log_sd, "scale": self.median}
+    def _of(self, stats: Any) -> Any:
+        return stats.lognorm(self.log_sd, scale=self.median)
 
 
 @dataclass(frozen=True)
@@ -156,7 +153,6 @@ class Uniform(_OfScipy):
     [-1.3863, -inf]
     """
 
-    _name = "uniform"
     low: float
     high: float
 
@@ -165,8 +161,8 @@ class Uniform(_OfScipy):
         if not self.low < self.high:
             raise InputError(f"a uniform prior from {self.low} to {self.high}", "two ends in order")
 
-    def _arguments(self) -> dict[str, float]:
-        return {"loc": self.low, "scale": self.high - self.low}
+    def _of(self, stats: Any) -> Any:
+        return stats.uniform(self.low, self.high - self.low)
 
 
 @dataclass(frozen=True)
@@ -189,12 +185,11 @@ class HalfNormal(_OfScipy):
     (0.7979, -inf)
     """
 
-    _name = "halfnorm"
     _positive = ("scale",)
     scale: float
 
-    def _arguments(self) -> dict[str, float]:
-        return {"scale": self.scale}
+    def _of(self, stats: Any) -> Any:
+        return stats.halfnorm(scale=self.scale)
 
 
 def checked(

@@ -248,16 +248,15 @@ def load(
     import h5py
 
     try:
-        body = _unsealed(Path(path).read_bytes(), path)
-        with h5py.File(io.BytesIO(body), "r") as file:
-            state = _checkpoint(file)
-            names = tuple(str(name) for name in file["mcmc"].attrs["names"])
-            digest = file.attrs["problem"]
-    except InputError:
-        raise
-    except (OSError, RuntimeError, ValueError, TypeError, KeyError, AttributeError):
+        content = Path(path).read_bytes()
+    except OSError:
         found = "a store that cannot be read"
         raise InputError(found, f"a posterior store{REMEDY}", path=path) from None
+    # What is sealed was written whole by this format: nothing in it can be missing.
+    with h5py.File(io.BytesIO(_unsealed(content, path)), "r") as file:
+        state = _checkpoint(file)
+        names = tuple(str(name) for name in file["mcmc"].attrs["names"])
+        digest = file.attrs["problem"]
     difference = _difference(state, names, digest, target, seed, walkers)
     if difference is not None:
         raise InputError(difference[0], f"{difference[1]}{REMEDY}", path=path)
@@ -293,13 +292,10 @@ def _difference(
 
 def _checkpoint(file: h5py.File) -> Checkpoint:
     group = file["mcmc"]
-    chain, log_prob = group["chain"][:], group["log_prob"][:]
-    if chain.shape[:2] != log_prob.shape or len(chain) != int(group.attrs["iteration"]):
-        raise ValueError("sizes that do not agree")
     kind, keys, *rest = (group.attrs[f"random_state_{i}"] for i in range(5))
     return Checkpoint(
-        chain=chain,
-        log_prob=log_prob,
+        chain=group["chain"][:],
+        log_prob=group["log_prob"][:],
         random_state=(str(kind), keys, int(rest[0]), int(rest[1]), float(rest[2])),
         share=float(group.attrs["share"]),
         began=int(group.attrs["began"]),

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.optimize import linprog, minimize
 
-from beamfit.greybox.quadratic import Quadratic, minimum
+from beamfit.greybox.programs import Quadratic, minimum
 
 solved = jax.jit(minimum)
 
