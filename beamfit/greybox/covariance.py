@@ -31,8 +31,6 @@ FAR = 1e12
 # Least eigenvalue of the normal equations, as a share of the largest with columns of unit length,
 # down to which their errors are good to 1e-6.
 SAFE = 1e-10
-# Gradients of which errors are computed at once, for the memory that a dense block takes.
-BLOCK = 256
 
 
 class Group(NamedTuple):
@@ -122,7 +120,8 @@ class Spread(NamedTuple):
         along = gradient @ self.half
         with np.errstate(over="ignore", invalid="ignore"):  # of what nothing is known: no share
             from_bounds = (along @ self.half.T) ** 2 @ self.from_bounds
-        share = _ratio(from_bounds, np.sum(along**2, axis=-1))
+        whole = np.sum(along**2, axis=-1)
+        share = from_bounds / np.where(whole > 0, whole, 1.0)
         return np.where(self._open(gradient), 1.0, share)
 
     def _open(self, gradient: np.ndarray) -> np.ndarray:
@@ -144,9 +143,7 @@ class FactoredSpread:
 
     def times(self, factor: float) -> FactoredSpread:
         """The spread where all rows are divided by a factor, bounds telling nothing."""
-        found = FactoredSpread(self.loose, self.unit / factor, self.factor, self.from_bounds)
-        found._each = factor**2 * self._each
-        return found
+        return FactoredSpread(self.loose, self.unit / factor, self.factor, self.from_bounds)
 
     @property
     def safe(self) -> bool:
@@ -154,69 +151,68 @@ class FactoredSpread:
 
         The trace of the inverse is not below 1 over the least eigenvalue.
         """
-        own = self._each[0][self.loose] * self.unit**2
+        own = self.factor.inverse.diagonal()
         largest = np.max(np.asarray(abs(self.factor.matrix).sum(axis=0)), initial=0.0)
         return bool(np.all(own > 0) and np.sum(own) * largest < 1 / SAFE)
 
-    @property
+    @cached_property
     def seen(self) -> np.ndarray:
-        """Covariance, shape (n, n); no direction is open."""
+        """Covariance, shape (n, n)."""
         found = np.zeros((len(self.loose),) * 2)
         half = self.factor.solve(np.diag(1.0 / self.unit)) / self.unit[:, None]
         found[np.ix_(self.loose, self.loose)] = half
         return found
 
-    covariance = seen
+    @property
+    def covariance(self) -> np.ndarray:
+        """The same: no direction is open."""
+        return self.seen
 
     @cached_property
-    def _each(self) -> np.ndarray:
-        return self._variances(sparse.eye_array(len(self.loose), format="csr"))
-
-    @property
     def errors(self) -> np.ndarray:
         """Standard error of each number."""
-        return np.sqrt(self._each[0])
+        return self._spread(np.sqrt(self.factor.inverse.diagonal()) / self.unit)
 
-    @property
+    @cached_property
     def shares(self) -> np.ndarray:
         """Share of each number's variance that rests on bounds."""
-        return _ratio(*self._each[::-1])
+        bounds = self.from_bounds[self.loose] / self.unit**2
+        if not bounds.any():
+            return np.zeros(len(self.loose))
+        return self._spread(self.factor.loss(bounds) / self.factor.inverse.diagonal())
+
+    def _spread(self, values: np.ndarray) -> np.ndarray:
+        found = np.zeros(len(self.loose))
+        found[self.loose] = values
+        return found
 
     def trace(self, rows: Rows) -> float:
         """Trace of these rows' part of the hat matrix."""
-        return float(self._variances(rows)[0].sum())
+        part = in_units(rows[:, self.loose], self.unit)
+        squares, inverse = part.T @ part, self.factor.inverse
+        both = inverse.multiply(squares) if sparse.issparse(inverse) else inverse * squares
+        return float(both.sum())
 
-    def _variances(self, gradients: Rows) -> np.ndarray:
-        """Variance along each row, and the part of it that rests on bounds, shape (2, rows)."""
-        rows = in_units(gradients[:, self.loose], self.unit)
-        information, found = (
-            self.from_bounds[self.loose] / self.unit**2,
-            np.zeros((2, rows.shape[0])),
-        )
-        for first in range(0, rows.shape[0], BLOCK):
-            some = rows[first : first + BLOCK]
-            some = some.toarray() if sparse.issparse(some) else some
-            along = self.factor.solve(some.T).T
-            found[:, first : first + BLOCK] = np.sum(some * along, axis=1), along**2 @ information
-        return found
-
-    def _of(self, gradient: np.ndarray) -> np.ndarray:
-        found = self._variances(np.reshape(gradient, (-1, len(self.loose))))
-        return found.reshape(2, *np.shape(gradient)[:-1])
+    def _along(self, gradient: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        flat = np.reshape(gradient, (-1, len(self.loose)))[:, self.loose] / self.unit
+        return flat, self.factor.solve(flat.T).T
 
     def size(self, gradient: np.ndarray) -> np.ndarray:
         """Standard error of quantities by their gradients, shape (..., n) to (...)."""
-        return np.sqrt(self._of(gradient)[0])
+        flat, along = self._along(gradient)
+        return np.sqrt(np.sum(flat * along, axis=-1)).reshape(np.shape(gradient)[:-1])
 
-    error = size
+    def error(self, gradient: np.ndarray) -> np.ndarray:
+        """The same."""
+        return self.size(gradient)
 
     def share(self, gradient: np.ndarray) -> np.ndarray:
         """Share of each quantity's variance that rests on bounds."""
-        return _ratio(*self._of(gradient)[::-1])
-
-
-def _ratio(part: np.ndarray, whole: np.ndarray) -> np.ndarray:
-    return part / np.where(whole > 0, whole, 1.0)
+        flat, along = self._along(gradient)
+        whole = np.sum(flat * along, axis=-1)
+        part = along**2 @ (self.from_bounds[self.loose] / self.unit**2)
+        share = part / np.where(whole > 0, whole, 1.0)
+        return share.reshape(np.shape(gradient)[:-1])
 
 
 def triangle(rows: Rows) -> Rows:
