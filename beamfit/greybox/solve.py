@@ -92,6 +92,8 @@ def solve(
     """
     began = time.perf_counter() if began is None else began
     squares = not (p.constraints or p.objectives)
+    if starts < 1 or iterations < 1:
+        raise InputError(f"{starts} starts of {iterations} iterations", "at least one of each")
     _check(hessian, seconds, solver, squares)
     wrong = contradictory(p)
     if wrong:
