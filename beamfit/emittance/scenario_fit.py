@@ -14,7 +14,7 @@ import numpy as np
 from jax import Array
 
 from beamfit.compile_cache import SELDOM
-from beamfit.emittance.answer import SIGMA, Beside, plane_answer, units_of
+from beamfit.emittance.answer import SIGMA, BestFit, plane_answer, units_of
 from beamfit.emittance.assumptions import Anchor, Assumptions
 from beamfit.emittance.model import (
     QUANTITIES,
@@ -176,7 +176,7 @@ def _beside(
     own: Derived,
     dof: float,
     jacobian: np.ndarray,
-) -> Beside:
+) -> BestFit:
     """Further unknowns of the fit, as they enter the posterior of the beam."""
     on_data = bool(np.isfinite(own.error[0])) and _held(fit) is None
     effects = effects_of(fit, told, float(own.value[1]), np.nan_to_num(own.slope[1]))
@@ -188,7 +188,7 @@ def _beside(
     )
     opened = "its value is decided by bounds and starting point, not by the data" + edges
     slopes = np.nan_to_num(own.slope[SIGMA])
-    return Beside(
+    return BestFit(
         value=own.value,
         spread=_further_spread(fit, plane, own, jacobian),
         covariance=slopes @ fit.covariance @ slopes.T,
