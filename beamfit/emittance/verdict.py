@@ -298,18 +298,6 @@ def resolution_remark(size: np.ndarray, known: np.ndarray) -> str:
     )
 
 
-def one_magnet(settings: dict[str, np.ndarray], screens: tuple[str, ...]) -> np.ndarray | None:
-    """The settings of the one magnet that was scanned before one screen; None if there were more.
-
-    Examples
-    --------
-    >>> one_magnet({"Q1": np.zeros(3), "Q2": np.arange(3.0)}, ("S",) * 3).tolist()
-    [0.0, 1.0, 2.0]
-    """
-    varied = [v for v in settings.values() if np.ptp(v) > 0]
-    return varied[0] if len(varied) == 1 and len(set(screens)) == 1 else None
-
-
 def waist_bracketed(
     settings: dict[str, np.ndarray], screens: tuple[str, ...], size: np.ndarray, error: np.ndarray
 ) -> bool | None:
@@ -335,10 +323,10 @@ def waist_bracketed(
     >>> waist_bracketed({"Q": np.arange(3.0)}, ("S",) * 3, sizes, 0.1 * sizes)
     True
     """
-    varied = one_magnet(settings, screens)
-    if varied is None:
+    varied = [v for v in settings.values() if np.ptp(v) > 0]
+    if len(varied) != 1 or len(set(screens)) != 1:
         return None
-    order = np.argsort(varied, kind="stable")
+    order = np.argsort(varied[0], kind="stable")
     size, error = size[order], error[order]
     low = int(np.argmin(size))
     rise = (size - size[low]) > 2.0 * np.hypot(error, error[low])
