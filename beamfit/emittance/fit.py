@@ -8,14 +8,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any
 
-from beamfit.answer import (
-    Table,
-    answer,
-    determined,
-    json_of,
-    labelled,
-    quantity_frame,
-)
+from beamfit.answer import Table, answer, determined, json_of, labelled, quantity_frame
 from beamfit.emittance.answer import judged_beam
 from beamfit.emittance.assumptions import Anchor, Assumptions
 from beamfit.emittance.comparison import BEAM

@@ -68,24 +68,22 @@ def predicted_sizes(
         expected = "a number for each magnet, or arrays of one length"
         raise InputError(f"settings {dict(settings)}", expected) from None
     rows = _rows(fit, given, n, plane, screen)
+    model = {} if fit.statement.closed else fit.solved.model
+    r11, r12, known = (np.asarray(part)[:n] for part in rows.elements(model))
+    post = fit.seen.solutions[plane].posterior
+    spread = _spread(post, r11, r12, known)
     if fit.statement.closed:
-        r11, r12, known = (np.asarray(part)[:n] for part in rows.elements({}))
         sigma = np.array([q.value for q in p.sigma])
         size = np.sqrt(np.maximum(size_squared(sigma, r11, r12, known), 0.0))
-        error = _spread(fit.seen.solutions[plane].posterior, r11, r12, known)
-        error = np.where(np.isfinite(p.covariance).all(), error, np.nan)
+        error = np.where(np.isfinite(p.covariance).all(), spread, np.nan)
     else:
         found = fit.solved.derive(predict_sizes, rows)
         size, whole = 1e-6 * found.value[:n], 1e-6 * found.error[:n]
-        r11, r12, known = (np.asarray(part)[:n] for part in rows.elements(fit.solved.model))
-        post = fit.seen.solutions[plane].posterior
         slope = np.stack(coefficients(r11, r12), -1) / (2.0 * size[:, None])
         held = np.einsum("ij,jk,ik->i", slope, post.covariance, slope)
         # What the other unknowns add in linear theory, beside the posterior of the beam.
         further = np.sqrt(np.maximum(whole**2 - held, 0.0))
-        error = np.where(
-            np.isfinite(whole), np.hypot(_spread(post, r11, r12, known), further), whole
-        )
+        error = np.where(np.isfinite(whole), np.hypot(spread, further), whole)
     return Prediction(plane, rows.places[0], given, size, error)
 
 

@@ -27,12 +27,7 @@ from beamfit.emittance.statement import WEIGHTS, varied_magnets
 from beamfit.emittance.transport import Rows
 from beamfit.optics.beamline import Beamline, transfer_rows
 from beamfit.optics.calibration import SlopeIntercept, scaled
-from beamfit.optics.elements import (
-    Drift,
-    Element,
-    Marker,
-    SectorDipole,
-)
+from beamfit.optics.elements import Drift, Element, Marker, SectorDipole
 from beamfit.optics.sections import ElementSeries
 
 # Leaving out one of more points than this tells nothing.
@@ -334,7 +329,13 @@ def _slopes(
     kinds = (
         k for e in rows.line.elements for k in (e.kinds if isinstance(e, ElementSeries) else (e,))
     )
-    changes = [jnp.zeros(_shape(kind)) for kind in kinds if not isinstance(kind, Marker)]
+    # The shape of elements stored together; () of one that stands alone.
+    shapes = (
+        max(map(np.shape, jax.tree.leaves(kind)), key=len, default=())
+        for kind in kinds
+        if not isinstance(kind, Marker)
+    )
+    changes = list(map(jnp.zeros, shapes))
     none = jnp.zeros(len(rows.energy))
     still = changes, jnp.ones(()), none, rows.settings, none
     unit = jnp.abs(sigma)
@@ -342,11 +343,6 @@ def _slopes(
     slope = unit * jax.grad(lambda s: 0.5 * jnp.log(s[0] * s[2] - s[1] ** 2))(sigma)
     back = -unit * jnp.linalg.solve(by_sigma.T, slope)
     return jax.grad(lambda still: back @ residuals(sigma, *still))(still)
-
-
-def _shape(kind: Element) -> tuple[int, ...]:
-    """Shape of the numbers of elements stored together; () of one that stands alone."""
-    return max(map(np.shape, jax.tree.leaves(kind)), key=len, default=())
 
 
 def range_sensitivity(plane: PlaneFit) -> list[RangeRow]:

@@ -31,7 +31,7 @@ from beamfit.emittance.transport import (
     scan_rows,
     scanned_line,
 )
-from beamfit.emittance.verdict import MOST_NAMED
+from beamfit.emittance.verdict import named
 from beamfit.greybox.problem import Constraint, Free, Prior, Problem, Record
 from beamfit.noise.model import Noise
 from beamfit.noise.sizes import ShotMeans, evened, means_of
@@ -350,19 +350,13 @@ def of_one_beam(
         found = f"a scan of {len(scan.slices)} slices of the beam"
         raise scan.unusable(found, "rows of one, as scan.of_slice(name) gives")
     line = rows_line(scan) if line is None else line
-    _check_own(scan, line, scenario)
-    return of_settings(scan.of_particle(line.mass)), line
-
-
-def _check_own(scan: QuadScan, line: Beamline, scenario: str) -> None:
-    """Refuse to have the matrices of rows both given and unknown, or given twice."""
-    if scan.transfer is None:
-        return
-    if line.magnets or float(line.length) > 0.0:
-        raise scan.unusable("rows with matrices of their own and a line", "one of the two")
-    if scenario != "known":
+    own = "rows with matrices of their own"
+    if scan.transfer and (line.magnets or float(line.length) > 0.0):
+        raise scan.unusable(f"{own} and a line", "one of the two")
+    if scan.transfer and scenario != "known":
         expected = "scenario known, or settings and a lattice"
-        raise scan.unusable(f"scenario {scenario} for rows with matrices of their own", expected)
+        raise scan.unusable(f"scenario {scenario} for {own}", expected)
+    return of_settings(scan.of_particle(line.mass)), line
 
 
 def unfitted(
@@ -483,21 +477,17 @@ def _shot_words(p: Points, shots: ShotMeans | None) -> str:
     """Count and name the shots that surely show no beam."""
     if shots is None:
         return ""
-    lost = np.argwhere(np.nan_to_num(shots.bad) > 0.99)
-    unsteady = ""
+    lost, said = np.argwhere(np.nan_to_num(shots.bad) > 0.99), []
+    if len(lost):
+        count, are = int((~np.isnan(shots.bad)).sum()), "are" if len(lost) > 1 else "is"
+        places = named([f"shot {j + 1} at {p.where(i)}" for i, j in lost])
+        said.append(f"{len(lost)} of {count} shots {are} left out, no beam there: {places}.")
     if shots.scatter > UNSTEADY:
-        unsteady = (
+        said.append(
             f"Shots of one setting scatter by {100 * shots.scatter:.2g} %: the beam changes from "
             "shot to shot, and this is that of the mean sizes."
         )
-    if not len(lost):
-        return unsteady
-    count = int((~np.isnan(shots.bad)).sum())
-    places = [f"shot {j + 1} at {p.where(i)}" for i, j in lost[:MOST_NAMED]]
-    places += [f"{len(lost) - MOST_NAMED} more"] * (len(lost) > MOST_NAMED)
-    are = "are" if len(lost) > 1 else "is"
-    said = f"{len(lost)} of {count} shots {are} left out, no beam there: {'; '.join(places)}."
-    return f"{said} {unsteady}".strip()
+    return " ".join(said)
 
 
 # Nothing but the beam is unknown; as a problem for those who want more than the posterior.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -264,11 +264,9 @@ def point_remarks(
     """
     bad = np.flatnonzero(p.outlier_probability > 0.5)
     if len(bad):
-        places = [p.where(i) for i in bad[:MOST_NAMED]]
-        places += [f"{len(bad) - MOST_NAMED} more"] * (len(bad) > MOST_NAMED)
         verb = "are" if len(bad) > 1 else "is"
         said = f"{len(bad)} of {len(p.size)} readings {verb} probably bad"
-        yield f"{said}: {'; '.join(places)}."
+        yield f"{said}: {named([p.where(i) for i in bad])}."
     if carrying and math.isnan(without):
         yield f"It rests on the point at {carrying}: without it there is no answer."
     elif carrying:
@@ -278,6 +276,18 @@ def point_remarks(
             f"It rests on the point at {carrying}: without it the normalised emittance is "
             f"{without / factor:.3g} {unit}{reach}."
         )
+
+
+def named(places: Sequence[str]) -> str:
+    """Name the first few places.
+
+    Examples
+    --------
+    >>> named("abcdefg")
+    'a; b; c; d; e; 2 more'
+    """
+    more = len(places) - MOST_NAMED
+    return "; ".join([*places[:MOST_NAMED], *[f"{more} more"] * (more > 0)])
 
 
 def resolution_remark(size: np.ndarray, known: np.ndarray) -> str:
