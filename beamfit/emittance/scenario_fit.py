@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
@@ -24,10 +23,10 @@ from beamfit.emittance.model import (
     size_squared,
     spoken,
 )
-from beamfit.emittance.results import Parameter, PlaneFit, Points
+from beamfit.emittance.results import Parameter, PlaneFit
 from beamfit.emittance.statement import (
-    PlaneSolution,
     PreparedScan,
+    Scanned,
     Scenario,
     asked_in,
     pulls,
@@ -38,11 +37,9 @@ from beamfit.emittance.statement import (
 from beamfit.emittance.systematics import effects_of
 from beamfit.emittance.transport import Look
 from beamfit.errors import Finding, Status
-from beamfit.greybox.covariance import Group
 from beamfit.greybox.fit import Derived, Fit
 from beamfit.greybox.problem import Problem
 from beamfit.greybox.solve import solve
-from beamfit.optics.beamline import Beamline
 from beamfit.statistics import Directions, scaled_directions
 
 # Ends of a search that are no answer.
@@ -50,8 +47,6 @@ NO_ANSWER = (Status.not_finite, Status.infeasible, Status.not_converged)
 NO_ANSWER += (Status.contradictory_bounds,)
 # How often errors are taken anew at most, and what change of them no longer matters.
 ROUNDS, SAME = 3, 1e-2
-# The noise of a record whose fit was refused.
-NOTHING = Group("", slice(0), True, math.nan, 0, 0.0, math.nan)
 
 
 def _numbers(model: Mapping[str, Any], asked: tuple[Asked, ...]) -> Array:
@@ -125,31 +120,25 @@ def _through(seen: PreparedScan, fit: Fit) -> PreparedScan:
     return with_posteriors([seen._replace(look=Look(*look))])[0]
 
 
-def judged_scenario(
-    fit: Fit,
-    seen: PreparedScan,
-    line: Beamline,
-    scenario: Scenario,
-    told: Assumptions,
-    parameters: tuple[Parameter, ...],
-) -> tuple[PlaneFit, ...]:
+def judged_scenario(of: Scanned) -> tuple[PlaneFit, ...]:
     """Answer for each plane of a scenario's fit.
 
     The posterior is that of the beam through the line as found, spread by what the other unknowns
     leave open.
     """
-    records = size_records(fit.problem)
-    asked = asked_in(fit.problem, seen, seen.planes, scenario.whole_map)
-    derived, jacobian = fit.derive(_numbers, asked), _loose_jacobian(fit)
+    fit, seen = of.solved, of.seen
+    asked = asked_in(fit.problem, seen, seen.planes, of.statement.whole_map)
+    derived = fit.derive(_numbers, asked)
     places, beams = jax.tree.map(np.asarray, _places(fit.model, asked)), []
     for i, plane in enumerate(seen.planes):
         own = Derived(*(part[i] for part in derived))
-        group = next((g for g in fit.groups if g.name == records[plane].name), NOTHING)
-        beside = _beside(fit, seen, plane, scenario, told, parameters, own, group.dof, jacobian)
         work = seen.solutions[plane]
-        points = _points_at(work, own.value[SIGMA], seen.rows.squared)
-        now = seen._replace(solutions=seen.solutions | {plane: work._replace(points=points)})
-        beams.append(plane_answer(now, line, plane, places[i], beside))
+        p = work.points
+        squared = size_squared(own.value[SIGMA], p.r11, p.r12, p.known)
+        p = p._replace(model=np.sqrt(np.maximum(squared, 0.0)))
+        p = p._replace(pull=pulls(p, seen.rows.squared))
+        now = seen._replace(solutions=seen.solutions | {plane: work._replace(points=p)})
+        beams.append(plane_answer(now, of.line, plane, places[i], _best_fit(of, plane, own)))
     return tuple(beams)
 
 
@@ -159,31 +148,16 @@ def _places(model: Mapping[str, Any], asked: tuple[Asked, ...]) -> list[tuple[An
     return [asked_places(model, each) for each in asked]
 
 
-def _points_at(work: PlaneSolution, sigma: np.ndarray, squared: bool) -> Points:
-    """The points as seen, with this fit's model."""
-    p = work.points
-    p = p._replace(model=np.sqrt(np.maximum(size_squared(sigma, p.r11, p.r12, p.known), 0.0)))
-    return p._replace(pull=pulls(p, squared))
-
-
-def _beside(
-    fit: Fit,
-    seen: PreparedScan,
-    plane: str,
-    scenario: Scenario,
-    told: Assumptions,
-    parameters: tuple[Parameter, ...],
-    own: Derived,
-    dof: float,
-    jacobian: np.ndarray,
-) -> BestFit:
+def _best_fit(of: Scanned, plane: str, own: Derived) -> BestFit:
     """Further unknowns of the fit, as they enter the posterior of the beam."""
+    fit, told, scenario, jacobian = of.solved, of.told, of.statement, _loose_jacobian(of.solved)
+    record = size_records(fit.problem)[plane].name
     on_data = bool(np.isfinite(own.error[0])) and _held(fit) is None
     effects = effects_of(fit, told, float(own.value[1]), np.nan_to_num(own.slope[1]))
     edges = "".join(
         f"; {p.name} ends at its {p.state} bound {p.value.value:.6g} "
         f"(d(chi2/2)/d(bound) = {p.multiplier:.2g})"
-        for p in parameters
+        for p in of.parameters
         if p.status is Status.at_limit
     )
     opened = "its value is decided by bounds and starting point, not by the data" + edges
@@ -193,11 +167,11 @@ def _beside(
         spread=_further_spread(fit, plane, own, jacobian),
         covariance=slopes @ fit.covariance @ slopes.T,
         directions=_directions(fit, own.value[SIGMA], slopes, jacobian),
-        dof=dof,
+        dof=next((g.dof for g in fit.groups if g.name == record), 0.0),
         ending=_ending(scenario, told, fit),
         opened="" if on_data else opened,
-        remedy=scenario.remedy(seen, told),
-        remark=(_remark(scenario, parameters) + (effects.words if effects else "")).strip(),
+        remedy=scenario.remedy(of.seen, told),
+        remark=(_remark(scenario, of.parameters) + (effects.words if effects else "")).strip(),
         scenario=scenario.name + (f" with {told.anchor.words}" if told.anchor != Anchor() else ""),
         holds="statistics, systematics" if told.systematics else "statistics only",
     )

@@ -192,9 +192,11 @@ class Scanned(Protocol):
     """A fitted scan, of any scenario."""
 
     planes: tuple[PlaneFit, ...]
+    line: Beamline
     statement: Scenario
     told: Assumptions
     seen: PreparedScan
+    parameters: tuple[Parameter, ...]
     solved: Fit | None
 
 
