@@ -215,11 +215,6 @@ class Asked:
     energy: Any
     design: Any
 
-    @property
-    def factor(self) -> Any:
-        """βγ."""
-        return beta_gamma(self.energy, self.line.mass)
-
 
 def asked_places(model: Mapping[str, Any], asked: Asked) -> tuple[Any, Any, Any, Any]:
     """βγ, matrices to the screen and the design's place, and the design, of a model's line."""
@@ -230,7 +225,7 @@ def asked_places(model: Mapping[str, Any], asked: Asked) -> tuple[Any, Any, Any,
         found = line_of(model, asked.line).matrices(places)
         to_screen, to_design = (getattr(found[at], asked.plane) for at in (asked.screen, place))
     energy = asked.energy * model.get("systematics", {}).get("energy", 1.0)
-    return replace(asked, energy=energy).factor, to_screen, to_design, asked.design
+    return beta_gamma(energy, asked.line.mass), to_screen, to_design, asked.design
 
 
 def asked_numbers(model: Mapping[str, Any], asked: Asked) -> Array:

@@ -29,7 +29,6 @@ from beamfit.emittance.statement import (
     Scanned,
     Scenario,
     asked_in,
-    pulls,
     size_record,
     size_records,
     with_posteriors,
@@ -136,7 +135,6 @@ def judged_scenario(of: Scanned) -> tuple[PlaneFit, ...]:
         p = work.points
         squared = size_squared(own.value[SIGMA], p.r11, p.r12, p.known)
         p = p._replace(model=np.sqrt(np.maximum(squared, 0.0)))
-        p = p._replace(pull=pulls(p, seen.rows.squared))
         now = seen._replace(solutions=seen.solutions | {plane: work._replace(points=p)})
         beams.append(plane_answer(now, of.line, plane, places[i], _best_fit(of, plane, own)))
     return tuple(beams)

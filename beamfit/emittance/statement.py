@@ -398,8 +398,7 @@ def looked_through(begun: Sequence[PreparedScan]) -> list[PreparedScan]:
             )
             looks = jax.tree.map(np.asarray, _looks([np.stack(c) for c in columns], kind))
             for lane, (i, _) in enumerate(own):
-                look = jax.tree.map(lambda a, lane=lane: a[lane], looks)
-                found[i] = begun[i]._replace(look=look)
+                found[i] = begun[i]._replace(look=Look(*(part[lane] for part in looks)))
     return found
 
 
@@ -458,21 +457,13 @@ def _work(
         weighed=post.model if follows else sizes.size,
         relative=post.relative if follows else 0.0,
         model=post.model,
-        pull=np.zeros(len(at)),
+        squared=seen.rows.squared,
         outlier_probability=post.bad,
         r11=sizes.r11,
         r12=sizes.r12,
         known=sizes.known,
     )
-    points = points._replace(pull=pulls(points, seen.rows.squared))
     return PlaneSolution(sizes, post, points, _shot_words(points, shots))
-
-
-def pulls(p: Points, squared: bool) -> np.ndarray:
-    """Residual of the quantity that was fitted, over its error."""
-    if squared:
-        return (p.size**2 - p.model**2) / (2.0 * p.weighed * p.error)
-    return (p.size - p.model) / p.error
 
 
 def _shot_words(p: Points, shots: ShotMeans | None) -> str:
