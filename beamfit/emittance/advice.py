@@ -19,7 +19,7 @@ from beamfit.emittance.comparison import AT, BEAM, FLAT, PlaneSizes, compare, em
 from beamfit.emittance.model import emittance_parts, predict_sizes, sigma_of, size_squared
 from beamfit.emittance.results import PlaneFit, in_words
 from beamfit.emittance.statement import PreparedScan, Scanned, size_records, varied_magnets
-from beamfit.emittance.transport import NetworkRows, Rows, rows_at, setting_units
+from beamfit.emittance.transport import NetworkRows, Rows, setting_units
 from beamfit.emittance.verdict import PlaneEvidence
 from beamfit.greybox import assess
 from beamfit.greybox.covariance import MOST_SHARE
@@ -272,7 +272,7 @@ def elements_at(
 ) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """R11, R12 and known size² of both planes at settings nobody need have measured."""
     settings = {n: jnp.asarray(v) for n, v in table.items()}
-    rows: Rows = rows_at(line, "x", screen, settings, energy, *seen.known_at(line, screen))
+    rows = seen.rows_at(line, "x", screen, settings, energy)
     return [rows.known(r) for r in np.asarray(rows.both(line, jnp.asarray(energy)))]
 
 
@@ -375,8 +375,7 @@ def _line_rows(fit: Scanned, line, plane, table, screen, energy) -> Rows:
         n: jnp.stack([v, jnp.ones(len(v))], -1) if shapes.get(n) == 2 else jnp.asarray(v)
         for n, v in table.items()
     }
-    known = fit.seen.known_at(line, screen)
-    return rows_at(line, plane, screen, settings, np.asarray(energy), *known)
+    return fit.seen.rows_at(line, plane, screen, settings, np.asarray(energy))
 
 
 def _network_rows(fit: Scanned, line, plane, table, screen, energy) -> NetworkRows:

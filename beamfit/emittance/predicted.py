@@ -15,7 +15,7 @@ from beamfit.emittance.comparison import AT, PlanePosterior, weighted_quantiles
 from beamfit.emittance.model import coefficients, emittance_parts, predict_sizes, size_squared
 from beamfit.emittance.results import PlaneFit
 from beamfit.emittance.statement import Scanned
-from beamfit.emittance.transport import Rows, padded, rows_at
+from beamfit.emittance.transport import Rows, padded
 from beamfit.errors import InputError, nearest
 from beamfit.optics.beamline import seen_line
 from beamfit.sampling.posterior import Correlations
@@ -117,7 +117,7 @@ def _rows(
     table = {name: padded(given.get(name, np.full(n, float(line[name].setting)))) for name in keep}
     energy = padded(np.full(n, seen.energy))
     seen_by = seen_line(line, tuple(keep), energy, (place,))
-    return rows_at(seen_by, plane, place, table, energy, *seen.known_at(line, place))
+    return seen.rows_at(seen_by, plane, place, table, energy)
 
 
 def correlations_of(p: PlaneFit) -> Correlations:

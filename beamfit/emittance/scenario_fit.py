@@ -33,7 +33,7 @@ from beamfit.emittance.statement import (
     size_records,
     with_posteriors,
 )
-from beamfit.emittance.systematics import effects_of
+from beamfit.emittance.systematics import effect_words
 from beamfit.emittance.transport import Look
 from beamfit.errors import Finding, Status
 from beamfit.greybox.fit import Derived, Fit
@@ -151,7 +151,7 @@ def _best_fit(of: Scanned, plane: str, own: Derived) -> BestFit:
     fit, told, scenario, jacobian = of.solved, of.told, of.statement, _loose_jacobian(of.solved)
     record = size_records(fit.problem)[plane].name
     on_data = bool(np.isfinite(own.error[0])) and _held(fit) is None
-    effects = effects_of(fit, told, float(own.value[1]), np.nan_to_num(own.slope[1]))
+    effects = effect_words(fit, told, float(own.value[1]), np.nan_to_num(own.slope[1]))
     edges = "".join(
         f"; {p.name} ends at its {p.state} bound {p.value.value:.6g} "
         f"(d(chi2/2)/d(bound) = {p.multiplier:.2g})"
@@ -169,7 +169,7 @@ def _best_fit(of: Scanned, plane: str, own: Derived) -> BestFit:
         ending=_ending(scenario, told, fit),
         opened="" if on_data else opened,
         remedy=scenario.remedy(of.seen, told),
-        remark=(_remark(scenario, of.parameters) + (effects.words if effects else "")).strip(),
+        remark=(_remark(scenario, of.parameters) + effects).strip(),
         scenario=scenario.name + (f" with {told.anchor.words}" if told.anchor != Anchor() else ""),
         holds="statistics, systematics" if told.systematics else "statistics only",
     )

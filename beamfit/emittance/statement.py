@@ -24,6 +24,7 @@ from beamfit.emittance.transport import (
     Look,
     Rows,
     check_gradients,
+    damping_of,
     look_through,
     names_of,
     padded,
@@ -127,11 +128,14 @@ class PreparedScan(NamedTuple):
         """Indices of the rows in which a plane was measured."""
         return np.flatnonzero(~np.isnan(self.scan.size[plane]))
 
-    def known_at(self, line: Beamline, place: str) -> tuple[float, float, float]:
-        """Energy spread, resolution (m) and energy (MeV) of a further row on a screen of a line.
+    def rows_at(
+        self, line: Beamline, plane: str, place: str, settings: Mapping[str, Any], energy: Any
+    ) -> Rows:
+        """Rows of one plane's sizes on a screen of a line, which nobody need have measured.
 
-        What the scan itself says, in the middle of its rows (of the resolution those on that
-        screen), goes before the line.
+        Settings and energies (MeV) are as of `Rows`. What the scan itself says of energy spread and
+        resolution, in the middle of its rows (of the resolution those on that screen), goes before
+        the line.
         """
         scan = self.scan
         spread = line.energy_spread if scan.energy_spread is None else np.median(scan.energy_spread)
@@ -139,7 +143,9 @@ class PreparedScan(NamedTuple):
         resolution = getattr(line[place], "resolution", 0.0)
         if scan.resolution is not None and place in screens:
             resolution = np.median(scan.resolution[np.array(screens) == place])
-        return float(spread), float(resolution), self.energy
+        one, damping = np.ones(len(energy)), damping_of(energy, self.energy, float(line.mass))
+        known = np.zeros(len(one), int), float(spread) * one, float(resolution) * one, damping
+        return Rows(plane, (place,), False, line, settings, energy, *known)
 
     @property
     def energy(self) -> float:

@@ -50,34 +50,6 @@ class Term(NamedTuple):
     unit: str
 
 
-class Effects(NamedTuple):
-    """Parts of the error of a normalised emittance, relative to it.
-
-    Attributes
-    ----------
-    statistical : float
-        With everything but the beam known.
-    systematic : dict of str to float
-        Of each number with a prior: what one standard deviation of it, as left by the fit, moves.
-    total : float
-        Of all together.
-    """
-
-    statistical: float
-    systematic: dict[str, float]
-    total: float
-
-    @property
-    def words(self) -> str:
-        """The largest one, and how it compares."""
-        name, most = max(self.systematic.items(), key=lambda item: item[1])
-        return (
-            f" Of its error of {100 * self.total:.2g} % statistics makes "
-            f"{100 * self.statistical:.2g} %; the largest systematic is {name} with "
-            f"{100 * most:.2g} %."
-        )
-
-
 def with_systematics(scenario: Scenario, told: Assumptions) -> Scenario:
     """Free the numbers of screen, beam and line that have priors, besides a scenario's own.
 
@@ -167,8 +139,8 @@ def _of_element(seen: PreparedScan, name: str, what: str) -> tuple[float, str]:
     return (1.0, "1") if what == "gradient" else (float(seen.scanned[name].length), "m")
 
 
-def effects_of(fit: Fit, told: Assumptions, emittance: float, slope: np.ndarray) -> Effects | None:
-    """Take the error of an emittance apart.
+def effect_words(fit: Fit, told: Assumptions, emittance: float, slope: np.ndarray) -> str:
+    """Take the error of an emittance apart, and name its largest part.
 
     Parameters
     ----------
@@ -181,8 +153,8 @@ def effects_of(fit: Fit, told: Assumptions, emittance: float, slope: np.ndarray)
 
     Returns
     -------
-    Effects or None
-        None where no such number is free.
+    str
+        Empty where no such number is free.
 
     Notes
     -----
@@ -193,15 +165,16 @@ def effects_of(fit: Fit, told: Assumptions, emittance: float, slope: np.ndarray)
         spoken(name): i for i, name in enumerate(fit.problem.names) if spoken(name) in told.priors
     }
     if not told.systematics or not emittance > 0:
-        return None
+        return ""
     covariance, at = fit.covariance, list(places.values())
     variance, across = float(slope @ covariance @ slope), covariance[at] @ slope
     own = covariance[np.ix_(at, at)]
     sd = np.sqrt(np.maximum(np.diag(own), 1e-300))
     rest = max(variance - float(across @ np.linalg.pinv(own, hermitian=True) @ across), 0.0)
-    each = np.abs(across) / sd / emittance
-    return Effects(
-        math.sqrt(rest) / emittance,
-        dict(zip(places, map(float, each), strict=True)),
-        math.sqrt(max(variance, 0.0)) / emittance,
+    most, name = max(zip((np.abs(across) / sd).tolist(), places, strict=True))
+    parts = math.sqrt(max(variance, 0.0)), math.sqrt(rest), most
+    total, statistical, most = (100 * part / emittance for part in parts)
+    return (
+        f" Of its error of {total:.2g} % statistics makes {statistical:.2g} %; the largest "
+        f"systematic is {name} with {most:.2g} %."
     )

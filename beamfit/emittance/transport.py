@@ -292,39 +292,6 @@ def scan_rows(
     )
 
 
-def rows_at(
-    line: Beamline,
-    plane: str,
-    place: str,
-    settings: Mapping[str, Any],
-    energy: np.ndarray,
-    spread: float,
-    resolution: float,
-    mean: float,
-) -> Rows:
-    """Rows of one plane's sizes at one place, which nobody need have measured.
-
-    Parameters
-    ----------
-    line : Beamline
-        As the rows see it.
-    plane, place : str
-        Which size, and where.
-    settings : mapping of str to array
-        As of `Rows`, shape (n,) or (n, 2).
-    energy : ndarray
-        MeV, shape (n,).
-    spread, resolution : float
-        Momentum spread, and point-spread rms in m.
-    mean : float
-        The energy of the beam that is asked for, MeV.
-    """
-    one, places = np.ones(len(energy)), np.zeros(len(energy), int)
-    known = float(spread) * one, float(resolution) * one
-    damping = damping_of(energy, mean, float(line.mass))
-    return Rows(plane, (place,), False, line, settings, energy, places, *known, damping)
-
-
 def damping_of(energy: np.ndarray, mean: float, mass: float) -> np.ndarray:
     """Square root of the ratio of a geometric emittance to that at the mean energy."""
     return np.sqrt(beta_gamma(mean, mass) / beta_gamma(energy, mass))
