@@ -488,10 +488,9 @@ def _evidences(s: _Stack, i: int, draws: BeamDraws, noise: Noise) -> np.ndarray:
 
 
 class _Best(NamedTuple):
-    """The best fit of planes: T, T p, normal matrix, model, precision and doubt of their points."""
+    """The best fit of planes: T, T p, model, precision and doubt of their points."""
 
     x: np.ndarray
-    normal: np.ndarray
     model: np.ndarray
     precision: np.ndarray
     bad: np.ndarray
@@ -534,7 +533,7 @@ def _best(
         if rests.all():
             break
     bad = sum(w[:, None] * b for w, (_, b) in zip(of_kind, parts, strict=True))
-    return _Best(x, normal, _model(x, c), precision, bad)
+    return _Best(x, _model(x, c), precision, bad)
 
 
 def _model(x: np.ndarray, c: Coordinates) -> np.ndarray:
