@@ -270,15 +270,13 @@ def _reaching(
     low: np.ndarray, high: np.ndarray, half: np.ndarray, value: np.ndarray, without: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Intervals that reach to the emittance without the point that carries it."""
-    shift = without - value[0]
-    if not math.isfinite(shift):
-        return low, high, half
+    shift = without - value[0]  # NaN where the others give no emittance
     reach = np.array([shift, shift * value[1] / value[0]])
     low, high, half = low.copy(), high.copy(), half.copy()
-    low[:2] = np.minimum(low[:2], value[:2] + reach)
-    high[:2] = np.maximum(high[:2], value[:2] + reach)
+    low[:2] = np.fmin(low[:2], value[:2] + reach)
+    high[:2] = np.fmax(high[:2], value[:2] + reach)
     # Two answers, one of which is right: half of what lies between them.
-    half[:2] = np.maximum(half[:2], 0.5 * np.abs(reach))
+    half[:2] = np.fmax(half[:2], 0.5 * np.abs(reach))
     return low, high, half
 
 

@@ -153,7 +153,7 @@ def fit_emittance(
     if told.systematics:
         from beamfit.emittance.systematics import with_systematics
 
-        statement = with_systematics(statement, told)
+        statement = with_systematics(statement)
     seen = prepare(scan, line, planes, method, noise, weights)
     if statement.closed:
         return EmittanceFit(judged_beam(seen), scan, line, statement, told, seen)

@@ -47,8 +47,8 @@ class Points(NamedTuple):
         The size that the error of size² was taken at, m: the model's, or the measured one.
     relative : float
         1 where errors grow with that size, 0 where they are as they stand.
-    squared : bool
-        Whether size² was fitted, not the size.
+    pull : ndarray
+        Residual of the fitted quantity over its error as used.
     outlier_probability : ndarray
         Probability that each reading is bad.
     r11, r12 : ndarray
@@ -65,18 +65,18 @@ class Points(NamedTuple):
     model: np.ndarray
     weighed: np.ndarray
     relative: float
-    squared: bool
+    pull: np.ndarray
     outlier_probability: np.ndarray
     r11: np.ndarray
     r12: np.ndarray
     known: np.ndarray
 
-    @property
-    def pull(self) -> np.ndarray:
-        """Residual of the quantity that was fitted, over its error as used."""
-        if self.squared:
-            return (self.size**2 - self.model**2) / (2.0 * self.weighed * self.error)
-        return (self.size - self.model) / self.error
+    def with_model(self, model: np.ndarray, squared: bool) -> Points:
+        """The points with fitted sizes, and their pulls: of size² or of the size."""
+        pull = (self.size - model) / self.error
+        if squared:
+            pull = (self.size**2 - model**2) / (2.0 * self.weighed * self.error)
+        return self._replace(model=model, pull=pull)
 
     def where(self, i: int) -> str:
         """The settings of a point, in words."""

@@ -134,7 +134,7 @@ def judged_scenario(of: Scanned) -> tuple[PlaneFit, ...]:
         work = seen.solutions[plane]
         p = work.points
         squared = size_squared(own.value[SIGMA], p.r11, p.r12, p.known)
-        p = p._replace(model=np.sqrt(np.maximum(squared, 0.0)))
+        p = p.with_model(np.sqrt(np.maximum(squared, 0.0)), seen.rows.squared)
         now = seen._replace(solutions=seen.solutions | {plane: work._replace(points=p)})
         beams.append(plane_answer(now, of.line, plane, places[i], _best_fit(of, plane, own)))
     return tuple(beams)

@@ -463,12 +463,13 @@ def _work(
         weighed=post.model if follows else sizes.size,
         relative=post.relative if follows else 0.0,
         model=post.model,
-        squared=seen.rows.squared,
+        pull=np.zeros(len(at)),
         outlier_probability=post.bad,
         r11=sizes.r11,
         r12=sizes.r12,
         known=sizes.known,
     )
+    points = points.with_model(post.model, seen.rows.squared)
     return PlaneSolution(sizes, post, points, _shot_words(points, shots))
 
 

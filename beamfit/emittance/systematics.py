@@ -80,25 +80,21 @@ class Term(NamedTuple):
     unit: str
 
 
-def with_systematics(scenario: Scenario, told: Assumptions) -> Scenario:
+def with_systematics(scenario: Scenario) -> Scenario:
     """Free the numbers of screen, beam and line that have priors, besides a scenario's own.
 
     Parameters
     ----------
     scenario : Scenario
         Any.
-    told : Assumptions
-        With priors on ``size_scale``, ``resolution`` and ``wire`` (the rms of a round wire is a
-        quarter of its diameter), ``energy``, ``dispersion`` and ``dispersion_slope`` of the
-        incoming beam, ``NAME.gradient`` of magnets and ``NAME.length`` of drifts.
 
     Returns
     -------
     Scenario
-        The same one if there are none.
+        For priors on ``size_scale``, ``resolution`` and ``wire`` (the rms of a round wire is a
+        quarter of its diameter), ``energy``, ``dispersion`` and ``dispersion_slope`` of the
+        incoming beam, ``NAME.gradient`` of magnets and ``NAME.length`` of drifts.
     """
-    if not told.systematics:
-        return scenario
 
     def state(seen: PreparedScan, told: Assumptions) -> Problem:
         terms = _terms(seen, told)
