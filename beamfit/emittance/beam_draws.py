@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import fdtri, gammaln, ndtri
 
+from beamfit.emittance.model import carried
 from beamfit.noise.model import LN_2PI, Noise
 from beamfit.noise.sizes import (
     NoiseKind,
@@ -76,15 +77,9 @@ class Coordinates(NamedTuple):
 
     def sigma(self, x: np.ndarray) -> np.ndarray:
         """σ11, σ12, σ22 in SI of T, T p_1, T p_2, shape (..., d, 3)."""
-        s = 0.5 * np.stack([x[..., 0] + x[..., 1], x[..., 2], x[..., 0] - x[..., 1]], -1)
-        (a, b), (c, d) = np.moveaxis(self.back, (-2, -1), (0, 1))[..., None]
-        s11, s12, s22 = np.moveaxis(s, -1, 0)
-        found = (
-            a * a * s11 + 2.0 * a * b * s12 + b * b * s22,
-            a * c * s11 + (a * d + b * c) * s12 + b * d * s22,
-            c * c * s11 + 2.0 * c * d * s12 + d * d * s22,
-        )
-        return np.stack(found, -1) * self.unit[..., None, None] ** 2
+        s = 0.5 * np.stack([x[..., 0] + x[..., 1], x[..., 2], x[..., 0] - x[..., 1]])
+        back = np.moveaxis(self.back, (-2, -1), (0, 1))[..., None]
+        return np.stack(carried(back, s), -1) * self.unit[..., None, None] ** 2
 
 
 def coordinates(

@@ -95,14 +95,14 @@ def beam_box(told: Assumptions, planes: Sequence[str]) -> list[Constraint]:
 
 
 def limited_network(
-    inputs: Sequence[str], box: np.ndarray, outputs: Sequence[str], told: Assumptions, cells: int
+    inputs: Sequence[str], box: np.ndarray, outputs: Sequence[str], told: Assumptions
 ) -> tuple[MLP, list[Free], list[Constraint]]:
     """The network of Appendix B: no scales, weights within ± 10, gains limited in a box (2, n)."""
     low, high = box.tolist()
     ports = [Port(n, "", lower=a, upper=b) for n, a, b in zip(inputs, low, high, strict=True)]
     net = dense(ports, outputs, [told.hidden], seed=told.seed, spread=START)
     free = [Free("map", -MOST, MOST, (-START, START), nuisance=True)]
-    limits = []
+    limits, cells = [], cells_along(len(inputs))
     for name, (least, most) in told.gains.items():
         output, by = (part.removeprefix("d") for part in name.split("/", 1))  # dA_x/dQ2
         limits += certified_gain("map", output, by, (low, high), cells, lower=least, upper=most)
@@ -133,11 +133,6 @@ class _Layout(NamedTuple):
     with_energy: bool
     elements: int
     box: np.ndarray
-
-    @property
-    def cells(self) -> int:
-        """Along each input, in which gains are enclosed."""
-        return cells_along(len(self.names))
 
 
 def _layout(seen: PreparedScan, told: Assumptions) -> _Layout:
@@ -221,7 +216,7 @@ def _state(seen: PreparedScan, told: Assumptions) -> Problem:
     outputs = _names(seen, lay)
     check_box(told, lay.names, outputs, seen.planes)
     if told.gains:
-        net, weights, limits = limited_network(lay.names, lay.box, outputs, told, lay.cells)
+        net, weights, limits = limited_network(lay.names, lay.box, outputs, told)
     else:
         (net, weights), limits = _signed(seen, lay, told), []
     limits += beam_box(told, seen.planes)
