@@ -185,8 +185,7 @@ class BeamSpread(NamedTuple):
 def spread_of(seen: PreparedScan, plane: str) -> BeamSpread:
     """Draws of a plane's beam about their mean."""
     post = seen.solutions[plane].posterior
-    kept = post.weight > 0.0
-    sigma, weight = post.sigma[kept], post.weight[kept]
+    sigma, weight = post.sigma, post.weight
     # In units of each number, so that a covariance can be solved with.
     unit = np.sqrt(weight @ sigma**2)
     off = (sigma - weight @ sigma) / unit

@@ -249,10 +249,9 @@ def _identifiability(
 
 def _quantiles(post: PlanePosterior, given: tuple, spread: np.ndarray) -> np.ndarray:
     """Quantiles `AT` of every number, shape (5, 11)."""
-    kept = post.weight > 0.0
-    sigma, weight = post.sigma[kept], post.weight[kept]
+    weight = post.weight
     with np.errstate(invalid="ignore", divide="ignore"):
-        numbers = numbers_of(sigma.T, *given)
+        numbers = numbers_of(post.sigma.T, *given)
     if spread.any():
         # Even steps of a normal distribution, in an order that has nothing to do with the draws'.
         z = ndtri((0.5 + np.arange(len(weight)) * 0.6180339887498949) % 1.0)

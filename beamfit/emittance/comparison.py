@@ -319,7 +319,7 @@ class PlanePosterior(NamedTuple):
     probability : dict of str to float
         Of a beam and of its rivals.
     sigma, weight : ndarray
-        Draws of σ11, σ12, σ22 in SI, shape (d, 3), and their weights, which sum to 1.
+        Draws of σ11, σ12, σ22 in SI, shape (d, 3), and their positive weights, which sum to 1.
     best : ndarray
         Shape (3,): σ that fits best, or the mean of the draws where that is no beam.
     positive : bool
@@ -562,8 +562,9 @@ def _posterior(
     c = Coordinates(*(part[i] for part in s.c))
     log = np.concatenate([d.log_weight[i] for d in draws])
     weight = np.exp(log - log.max()) if np.isfinite(log.max()) else np.ones(len(log))
-    weight /= weight.sum()
-    sigma = c.sigma(np.concatenate([d.x[i] for d in draws]))
+    kept = weight > 0.0
+    weight = weight[kept] / weight.sum()
+    sigma = c.sigma(np.concatenate([d.x[i] for d in draws]))[kept]
     found, unit = c.sigma(best.x[i][None])[0], float(c.unit)
     positive = bool(found[0] > 0 and found[0] * found[2] > found[1] ** 2) and bool(c.seen)
     model = best.model[i] * unit
@@ -579,12 +580,11 @@ def _posterior(
     turned = np.linalg.inv(c.back * unit)
     trace, own = turned.T @ turned, draws[likelier]
     beyond = np.any(s.kinds[likelier].floor) and not plane.of_shots
-    mean = np.maximum(weight, 0.0) @ np.where(weight[:, None] > 0, sigma, 0.0)
     return PlanePosterior(
         probability=dict(zip(MODELS, map(float, probability), strict=True)),
         sigma=sigma,
         weight=weight,
-        best=found if positive else mean,
+        best=found if positive else weight @ sigma,
         positive=positive,
         covariance=_covariance(rows / error[:, None]) if c.seen else none,
         stated=stated,

@@ -91,10 +91,8 @@ def _spread(
     post: PlanePosterior, r11: np.ndarray, r12: np.ndarray, known: np.ndarray
 ) -> np.ndarray:
     """Half of the central 68 % of the sizes that the posterior predicts."""
-    kept = post.weight > 0.0
-    sigma, weight = post.sigma[kept].T, post.weight[kept]
-    sizes = np.sqrt(size_squared(sigma, r11[:, None], r12[:, None], known[:, None]))
-    ends = [weighted_quantiles(row, weight, (AT[1], AT[3])) for row in sizes]
+    sizes = np.sqrt(size_squared(post.sigma.T, r11[:, None], r12[:, None], known[:, None]))
+    ends = [weighted_quantiles(row, post.weight, (AT[1], AT[3])) for row in sizes]
     return 0.5 * np.diff(ends, axis=1)[:, 0]
 
 
