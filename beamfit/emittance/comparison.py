@@ -562,9 +562,9 @@ def _posterior(
     c = Coordinates(*(part[i] for part in s.c))
     log = np.concatenate([d.log_weight[i] for d in draws])
     weight = np.exp(log - log.max()) if np.isfinite(log.max()) else np.ones(len(log))
-    kept = weight > 0.0
-    weight = weight[kept] / weight.sum()
-    sigma = c.sigma(np.concatenate([d.x[i] for d in draws]))[kept]
+    weight /= weight.sum()
+    sigma = c.sigma(np.concatenate([d.x[i] for d in draws]))[weight > 0.0]
+    weight = weight[weight > 0.0]
     found, unit = c.sigma(best.x[i][None])[0], float(c.unit)
     positive = bool(found[0] > 0 and found[0] * found[2] > found[1] ** 2) and bool(c.seen)
     model = best.model[i] * unit
