@@ -17,7 +17,7 @@ from beamfit.density.profiles import MeanProfile, mean_profiles
 from beamfit.density.tomography import GRID, Densities, tomography
 from beamfit.emittance.fit import fit_emittance
 from beamfit.emittance.model import phase_coverage
-from beamfit.emittance.results import PlaneFit
+from beamfit.emittance.results import PlaneFit, in_words
 from beamfit.emittance.scan import QuadScan
 from beamfit.emittance.sigma import fit_sizes
 from beamfit.errors import Finding, InputError, Judged, Status, expect, judge
@@ -276,9 +276,8 @@ def _densities(
 
 
 def _label(scan: QuadScan, row: int) -> str:
-    named = [f"{name} = {values[row]:.4g} {scan.units[name]}" for name, values in
-             scan.settings.items()]  # fmt: skip
-    return ", ".join(named) or (scan.screen[row] if scan.screen else f"row {row + 1}")
+    named = in_words({n: v[row] for n, v in scan.settings.items()}, scan.units)
+    return named or (scan.screen[row] if scan.screen else f"row {row + 1}")
 
 
 def _sizes(plane: PlaneDensity) -> Finding | None:

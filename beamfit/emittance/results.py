@@ -80,9 +80,9 @@ class Points(NamedTuple):
 
     def where(self, i: int) -> str:
         """The settings of a point, in words."""
-        settings = (f"{n} = {v[i]:.4g} {self.units[n]}" for n, v in self.settings.items())
-        screen = [f"screen {self.screen[i]}"] if len(set(self.screen)) > 1 else []
-        return ", ".join([*settings, *screen])
+        settings = in_words({n: v[i] for n, v in self.settings.items()}, self.units)
+        screen = f"screen {self.screen[i]}" if len(set(self.screen)) > 1 else ""
+        return ", ".join(filter(None, (settings, screen)))
 
 
 @shown

@@ -23,7 +23,7 @@ from jax import Array
 from beamfit.compile_cache import SELDOM
 from beamfit.emittance.assumptions import Assumptions
 from beamfit.emittance.model import coefficients, size_squared, spoken
-from beamfit.emittance.results import Parameter, PlaneFit, Points
+from beamfit.emittance.results import Parameter, PlaneFit, Points, in_words
 from beamfit.emittance.sigma import error_at, weighed_size
 from beamfit.emittance.statement import WEIGHTS, PreparedScan, Scanned, Scenario, varied_magnets
 from beamfit.emittance.transport import Rows
@@ -547,11 +547,9 @@ def _without(plane: PlaneFit, left_out: np.ndarray) -> float:
 
 def _place(points: Points, i: int) -> str:
     """Name a point by its screen, where there are several, and the settings that vary."""
-    varied = [
-        f"{n} = {v[i]:.4g} {points.units[n]}" for n, v in points.settings.items() if np.ptp(v) > 0
-    ]
-    screen = [points.screen[i]] if len(set(points.screen)) > 1 else []
-    return ", ".join(screen + varied)
+    varied = {n: v[i] for n, v in points.settings.items() if np.ptp(v) > 0}
+    screen = points.screen[i] if len(set(points.screen)) > 1 else ""
+    return ", ".join(filter(None, (screen, in_words(varied, points.units))))
 
 
 def budget_rows(fit: Scanned) -> list[tuple[str, list[str]]]:
