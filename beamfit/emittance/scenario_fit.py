@@ -128,7 +128,7 @@ def judged_scenario(of: Scanned) -> tuple[PlaneFit, ...]:
     fit, seen = of.solved, of.seen
     asked = asked_in(fit.problem, seen, seen.planes, of.statement.whole_map)
     derived = fit.derive(_numbers, asked)
-    places, beams = jax.tree.map(np.asarray, _places(fit.model, asked)), []
+    beams = []
     for i, plane in enumerate(seen.planes):
         own = Derived(*(part[i] for part in derived))
         work = seen.solutions[plane]
@@ -136,14 +136,9 @@ def judged_scenario(of: Scanned) -> tuple[PlaneFit, ...]:
         squared = size_squared(own.value[SIGMA], p.r11, p.r12, p.known)
         p = p.with_model(np.sqrt(np.maximum(squared, 0.0)), seen.rows.squared)
         now = seen._replace(solutions=seen.solutions | {plane: work._replace(points=p)})
-        beams.append(plane_answer(now, of.line, plane, places[i], _best_fit(of, plane, own)))
+        places = map(np.asarray, asked_places(fit.model, asked[i]))
+        beams.append(plane_answer(now, of.line, plane, tuple(places), _best_fit(of, plane, own)))
     return tuple(beams)
-
-
-@partial(jax.jit, compiler_options=SELDOM)
-def _places(model: Mapping[str, Any], asked: tuple[Asked, ...]) -> list[tuple[Any, ...]]:
-    """βγ, matrices and design of each plane, through the line as the model has it."""
-    return [asked_places(model, each) for each in asked]
 
 
 def _best_fit(of: Scanned, plane: str, own: Derived) -> BestFit:
