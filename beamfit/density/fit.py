@@ -230,7 +230,7 @@ def fit_density(
     noise = noise or Noise()
     fit = fit_emittance(scan, line, noise=noise)
     scan, seen = fit.scan, fit.seen
-    r11, r12, known = (np.asarray(part) for part in seen.look[:3])
+    r11, r12, known = seen.look
     boost, planes, lost = beta_gamma(seen.energy, seen.line.mass), [], []
     for plane in scan.planes:
         profiles, notes = mean_profiles(scan, plane)

@@ -34,7 +34,6 @@ from beamfit.emittance.statement import (
     with_posteriors,
 )
 from beamfit.emittance.systematics import effect_words
-from beamfit.emittance.transport import Look
 from beamfit.errors import Finding, Status
 from beamfit.greybox.fit import Derived, Fit
 from beamfit.greybox.problem import Problem
@@ -114,9 +113,9 @@ def _through(seen: PreparedScan, fit: Fit) -> PreparedScan:
     """See the scan through the line as a fit found it: each plane fitted in closed form."""
     records = size_records(fit.problem)
     elements = np.asarray(_elements(fit.model, tuple(records[p].data for p in seen.planes)))
-    look = np.array(seen.look)
+    look = seen.look.copy()
     look[:, ["xy".index(plane) for plane in seen.planes]] = np.swapaxes(elements, 0, 1)
-    return with_posteriors([seen._replace(look=Look(*look))])[0]
+    return with_posteriors([seen._replace(look=look)])[0]
 
 
 def judged_scenario(of: Scanned) -> tuple[PlaneFit, ...]:

@@ -21,7 +21,6 @@ from beamfit.emittance.results import Parameter, PlaneFit, Points
 from beamfit.emittance.scan import QuadScan, check_names
 from beamfit.emittance.shots import of_settings
 from beamfit.emittance.transport import (
-    Look,
     Rows,
     check_gradients,
     damping_of,
@@ -93,8 +92,9 @@ class PreparedScan(NamedTuple):
         The scan's rows through that line, padded; what no row changes is multiplied out.
     noise : Noise
         Priors of the noise of sizes.
-    look : Look
-        The same, with every magnet as the lattice has it; NumPy arrays.
+    look : ndarray
+        R11, R12 and known size² of both planes, shape (3, 2, rows), with every magnet as the
+        lattice has it.
     solutions : dict of str to PlaneSolution
         Plane to its fit; of every plane that was measured.
     kept, any_energy : tuple of str and bool
@@ -109,7 +109,7 @@ class PreparedScan(NamedTuple):
     weights: str
     rows: Rows
     noise: Noise
-    look: Look
+    look: np.ndarray
     solutions: dict[str, PlaneSolution]
     kept: tuple[str, ...] = ()
     any_energy: bool = False
@@ -402,9 +402,9 @@ def looked_through(begun: Sequence[PreparedScan]) -> list[PreparedScan]:
             columns = zip(
                 *(leaves for _, leaves in own + own[-1:] * (lanes - len(own))), strict=True
             )
-            looks = jax.tree.map(np.asarray, _looks([np.stack(c) for c in columns], kind))
+            looks = np.asarray(_looks([np.stack(c) for c in columns], kind))
             for lane, (i, _) in enumerate(own):
-                found[i] = begun[i]._replace(look=Look(*(part[lane] for part in looks)))
+                found[i] = begun[i]._replace(look=looks[lane])
     return found
 
 
@@ -433,7 +433,7 @@ def with_posteriors(begun: Sequence[PreparedScan]) -> list[PreparedScan]:
 def plane_sizes(seen: PreparedScan, plane: str) -> tuple[PlaneSizes, ShotMeans | None]:
     """The sizes of a plane with their errors, and what its shots say."""
     scan, at, i = seen.scan, seen.measured(plane), "xy".index(plane)
-    r11, r12, known = (part[i, at] for part in seen.look[:3])
+    r11, r12, known = seen.look[:, i, at]
     size, error, shots = scan.size[plane][at], scan.error.get(plane), None
     if plane in scan.shot_size and (shots := means_of(scan.shot_size[plane][at], seen.noise)):
         size, error = shots.size, shots.error

@@ -10,7 +10,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from functools import lru_cache
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -297,24 +297,16 @@ def damping_of(energy: np.ndarray, mean: float, mass: float) -> np.ndarray:
     return np.sqrt(beta_gamma(mean, mass) / beta_gamma(energy, mass))
 
 
-class Look(NamedTuple):
-    """Both planes of a scan's rows through a line, each of shape (2, rows).
+def look_through(rows: Rows) -> Array:
+    """Carry the rows of a scan to their screens, in both planes and one pass.
 
-    Attributes
-    ----------
-    r11, r12, known : Array
-        Transfer-matrix elements to the screens (R12 in m), size² not due to the beam, m².
+    Returns
+    -------
+    Array, shape (3, 2, rows)
+        R11, R12 (m) and the size² that is not due to the beam (m²), of x and y.
     """
-
-    r11: Array
-    r12: Array
-    known: Array
-
-
-def look_through(rows: Rows) -> Look:
-    """Carry the rows of a scan to their screens, in both planes and one pass."""
-    seen = [rows.known(r) for r in rows.both(rows.line, rows.energy)]
-    return Look(*(jnp.stack(part) for part in zip(*seen, strict=True)))
+    seen = [jnp.stack(rows.known(r)) for r in rows.both(rows.line, rows.energy)]
+    return jnp.stack(seen, axis=1)
 
 
 def setting_units(line: Beamline, magnets: Iterable[str]) -> dict[str, str]:
