@@ -2,7 +2,8 @@
 
 Signs of the gains, report eqs 38-39, are taken from first principles over the box of the scan,
 where they have one sign, and hold by the signs of the weights. What the sizes then leave open is
-large: see docs/scenarios.md.
+large: see docs/scenarios.md. Anchors, or limits of gains and a box (Appendix B), come first: the
+focusing network has the same anchors.
 """
 
 from __future__ import annotations
