@@ -73,7 +73,7 @@ _HOME = {
     "split_record": "beamfit.lifetime.pieces",
     "study": "beamfit.lifetime.study:study_record",
     "study_shift": "beamfit.lifetime.ring_study",
-    "systematics": "beamfit.emittance.sensitivity",
+    "systematics": "beamfit.emittance.systematics",
     "trend": "beamfit.lifetime.course:trend_of",
     "watch": "beamfit.commands",
     "write_report": "beamfit.report.page",

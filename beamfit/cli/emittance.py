@@ -170,7 +170,7 @@ def results_of(
     fit: EmittanceFit, methods: tuple[SizeMethods, ...] = ()
 ) -> Iterator[dict[str, Any]]:
     """JSON entry of each plane: the fit, its systematics and its sensitivity to the range."""
-    from beamfit.emittance.sensitivity import range_sensitivity, systematics
+    from beamfit.emittance.systematics import range_sensitivity, systematics
 
     ways = {m.plane: {"size_methods": m} for m in methods}
     for p, entry in zip(fit.planes, fit.to_json(), strict=True):
@@ -204,7 +204,7 @@ def show(
 def _show_fully(terminal: Terminal, fit: EmittanceFit, methods: tuple[SizeMethods, ...]) -> None:
     """Show every number, the systematics budget and the range of the scan."""
     from beamfit.emittance.results import result_rows
-    from beamfit.emittance.sensitivity import budget_rows, range_rows
+    from beamfit.emittance.systematics import budget_rows, range_rows
 
     names, statuses = [p.plane for p in fit.planes], [p.status for p in fit.planes]
     terminal.table(labelled("", names, determined(result_rows(fit.planes))), statuses)
@@ -231,7 +231,7 @@ def _show_fully(terminal: Terminal, fit: EmittanceFit, methods: tuple[SizeMethod
 def _show_briefly(terminal: Terminal, fit: EmittanceFit) -> None:
     """Show what is quoted, the largest systematic of each plane, and where the rest is."""
     from beamfit.emittance.results import result_rows
-    from beamfit.emittance.sensitivity import systematics
+    from beamfit.emittance.systematics import systematics
 
     table = labelled("", [p.plane for p in fit.planes], result_rows(fit.planes)).quoted()
     if table.rows:

@@ -17,7 +17,7 @@ from beamfit.density.profiles import MeanProfile, mean_profiles
 from beamfit.density.tomography import GRID, Densities, tomography
 from beamfit.emittance.fit import fit_emittance
 from beamfit.emittance.model import phase_coverage
-from beamfit.emittance.results import PlaneFit
+from beamfit.emittance.results import PlaneFit, in_words
 from beamfit.emittance.scan import QuadScan
 from beamfit.emittance.sigma import fit_sizes
 from beamfit.errors import Finding, InputError, Judged, Status, expect, judge
@@ -230,7 +230,7 @@ def fit_density(
     noise = noise or Noise()
     fit = fit_emittance(scan, line, noise=noise)
     scan, seen = fit.scan, fit.seen
-    r11, r12, known = (np.asarray(part) for part in seen.look[:3])
+    r11, r12, known = seen.look
     boost, planes, lost = beta_gamma(seen.energy, seen.line.mass), [], []
     for plane in scan.planes:
         profiles, notes = mean_profiles(scan, plane)
@@ -276,9 +276,8 @@ def _densities(
 
 
 def _label(scan: QuadScan, row: int) -> str:
-    named = [f"{name} = {values[row]:.4g} {scan.units[name]}" for name, values in
-             scan.settings.items()]  # fmt: skip
-    return ", ".join(named) or (scan.screen[row] if scan.screen else f"row {row + 1}")
+    named = in_words({n: v[row] for n, v in scan.settings.items()}, scan.units)
+    return named or (scan.screen[row] if scan.screen else f"row {row + 1}")
 
 
 def _sizes(plane: PlaneDensity) -> Finding | None:

@@ -16,21 +16,16 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from beamfit.emittance.comparison import AT, BEAM, FLAT, PlaneSizes, compare, emittance_quantiles
-from beamfit.emittance.model import (
-    emittance_parts,
-    predict_sizes,
-    sigma_of,
-    size_squared,
-)
+from beamfit.emittance.model import emittance_parts, predict_sizes, sigma_of, size_squared
 from beamfit.emittance.results import PlaneFit, in_words
 from beamfit.emittance.statement import PreparedScan, Scanned, size_records, varied_magnets
-from beamfit.emittance.transport import NetworkRows, Rows, rows_at, setting_units
+from beamfit.emittance.transport import NetworkRows, Rows, setting_units
 from beamfit.emittance.verdict import PlaneEvidence
 from beamfit.greybox import assess
 from beamfit.greybox.covariance import MOST_SHARE
 from beamfit.greybox.design import Information, greedy, rows_of
 from beamfit.greybox.fit import value_and_slope
-from beamfit.optics.beamline import Beamline, transfer_rows
+from beamfit.optics.beamline import Beamline
 from beamfit.quantity import NORMAL_REACH
 from beamfit.statistics import USEFUL
 
@@ -190,8 +185,7 @@ class BeamSpread(NamedTuple):
 def spread_of(seen: PreparedScan, plane: str) -> BeamSpread:
     """Draws of a plane's beam about their mean."""
     post = seen.solutions[plane].posterior
-    kept = post.weight > 0.0
-    sigma, weight = post.sigma[kept], post.weight[kept]
+    sigma, weight = post.sigma, post.weight
     # In units of each number, so that a covariance can be solved with.
     unit = np.sqrt(weight @ sigma**2)
     off = (sigma - weight @ sigma) / unit
@@ -277,9 +271,8 @@ def elements_at(
 ) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """R11, R12 and known size² of both planes at settings nobody need have measured."""
     settings = {n: jnp.asarray(v) for n, v in table.items()}
-    rows: Rows = rows_at(line, "x", screen, settings, energy, *seen.known_at(line, screen))
-    planes = np.asarray(transfer_rows(line, settings, jnp.asarray(energy), (screen,)).planes)
-    return [rows.known(r) for r in np.moveaxis(planes[:, :, 0, 0], 1, 0)]
+    rows = seen.rows_at(line, "x", screen, settings, energy)
+    return [rows.known(r) for r in np.asarray(rows.both(line, jnp.asarray(energy)))]
 
 
 def simulated(
@@ -381,8 +374,7 @@ def _line_rows(fit: Scanned, line, plane, table, screen, energy) -> Rows:
         n: jnp.stack([v, jnp.ones(len(v))], -1) if shapes.get(n) == 2 else jnp.asarray(v)
         for n, v in table.items()
     }
-    known = fit.seen.known_at(line, screen)
-    return rows_at(line, plane, screen, settings, np.asarray(energy), *known)
+    return fit.seen.rows_at(line, plane, screen, settings, np.asarray(energy))
 
 
 def _network_rows(fit: Scanned, line, plane, table, screen, energy) -> NetworkRows:
@@ -390,14 +382,9 @@ def _network_rows(fit: Scanned, line, plane, table, screen, energy) -> NetworkRo
     place = seen.rows.places.index(screen)
     which = next(i for i in seen.measured(plane) if seen.rows.which[i] == place)
     inputs = [table.get(n, np.full(count, seen.energy)) for n in fit.solved.model["map"].inputs]
-    return NetworkRows(
-        plane,
-        False,
-        jnp.asarray(np.stack(inputs, -1)),
-        jnp.tile(measured.columns[which], (count, 1)),
-        jnp.full(count, float(np.median(np.asarray(measured.known)))),
-        jnp.ones(count),
-    )
+    known = jnp.full(count, float(np.median(np.asarray(measured.known))))
+    columns, damping = jnp.tile(measured.columns[which], (count, 1)), jnp.ones(count)
+    return NetworkRows(plane, False, jnp.asarray(np.stack(inputs, -1)), columns, known, damping)
 
 
 def adviser_of(fit: Scanned) -> Adviser:

@@ -10,12 +10,7 @@ import numpy as np
 from scipy.special import ndtri
 
 from beamfit.emittance.advice import next_measurement
-from beamfit.emittance.comparison import (
-    AT,
-    PlanePosterior,
-    emittance_quantiles,
-    weighted_quantiles,
-)
+from beamfit.emittance.comparison import AT, PlanePosterior, emittance_quantiles, weighted_quantiles
 from beamfit.emittance.model import (
     QUANTITIES,
     asked_places,
@@ -53,8 +48,8 @@ SIGNED = np.isin(list(QUANTITIES), ("alpha", "sigma12", "screen_alpha"))
 Places = tuple[Any, Any, Any, Any]
 
 
-class Beside(NamedTuple):
-    """Further unknowns of a scenario, as they enter the answer of a plane.
+class BestFit(NamedTuple):
+    """The best fit of a plane, with what further unknowns of a scenario add to its answer.
 
     Attributes
     ----------
@@ -62,13 +57,13 @@ class Beside(NamedTuple):
         Shape (11,), in the order of `QUANTITIES`: best values, and standard deviations that the
         other unknowns add to those of known transport.
     covariance : ndarray
-        Shape (3, 3), of σ11, σ12, σ22.
+        Shape (3, 3), of σ11, σ12, σ22; in a scenario with the errors found.
     directions : Directions
         What the data leave open.
     dof : float
         Degrees of freedom of the plane's sizes.
     ending, opened, remedy, remark, scenario
-        As of `PlaneEvidence`, and a further sentence.
+        As of `PlaneEvidence`, and a further sentence; empty where nothing else is unknown.
     holds : str
         What the error includes.
     """
@@ -78,12 +73,12 @@ class Beside(NamedTuple):
     covariance: np.ndarray
     directions: Directions
     dof: float
-    ending: Finding | None
-    opened: str
-    remedy: str
-    remark: str
-    scenario: str
-    holds: str
+    ending: Finding | None = None
+    opened: str = ""
+    remedy: str = ""
+    remark: str = ""
+    scenario: str = ""
+    holds: str = "statistics only"
 
 
 class Influence(NamedTuple):
@@ -104,22 +99,41 @@ class PlaneNumbers(NamedTuple):
     high: np.ndarray
     raw: np.ndarray
 
+    @property
+    def scale(self) -> float:
+        """The error of the emittance over that by the stated errors alone; 1 without."""
+        half, raw = float(self.half[0]), float(self.raw[0])
+        return half / raw if math.isfinite(raw) and raw > 0 else 1.0
+
     def quantities(self, known: np.ndarray, limits: bool) -> list[Quantity]:
         """Quantities with errors where they are known, else with intervals if the model holds."""
-        rows = zip(*self, QUANTITIES.values(), known, strict=True)
-        return [_quantity(*row, limits) for row in rows]
+        found, rows = [], zip(*(part.tolist() for part in self), strict=True)
+        for (value, half, low, high, raw), unit, own in zip(
+            rows, QUANTITIES.values(), known, strict=True
+        ):
+            finite = math.isfinite(low) and math.isfinite(high)
+            error = half if own and finite else None
+            raw = raw if error is not None and math.isfinite(raw) else None
+            ends = (low, high) if finite and (own or limits) else None
+            found.append(Quantity(value, error, unit, raw, ends))
+        return found
 
 
 def judged_beam(seen: PreparedScan) -> tuple[PlaneFit, ...]:
     """Answer for each plane where nothing but the beam is unknown; no program is compiled."""
-    return tuple(
-        plane_answer(seen, seen.line, plane, asked_places({}, asked_of(seen, plane)), None)
-        for plane in seen.planes
-    )
+    found = []
+    for plane in seen.planes:
+        post, p = seen.solutions[plane].posterior, seen.solutions[plane].points
+        places = asked_places({}, asked_of(seen, plane))
+        covariance = post.stated if np.isfinite(post.stated).all() else post.covariance
+        value, dof = numbers_of(post.best, *places), max(len(p.size) - 3, 0)
+        b = BestFit(value, np.zeros(len(value)), covariance, _directions(p, post.best), dof)
+        found.append(plane_answer(seen, seen.line, plane, places, b))
+    return tuple(found)
 
 
 def plane_answer(
-    seen: PreparedScan, line: Beamline, plane: str, places: Places, b: Beside | None
+    seen: PreparedScan, line: Beamline, plane: str, places: Places, b: BestFit
 ) -> PlaneFit:
     """Answer for one plane.
 
@@ -133,8 +147,8 @@ def plane_answer(
         "x" or "y".
     places : tuple
         Where the beam is asked for, from `asked_places`.
-    b : Beside or None
-        What a scenario adds.
+    b : BestFit
+        What fits best, and what a scenario adds.
 
     Returns
     -------
@@ -145,14 +159,16 @@ def plane_answer(
     post, p = work.posterior, work.points
     n, carrying = _numbers(post, p, places, b)
     e = _evidence(seen, plane, n, b)
-    advice = next_measurement(seen, plane) if _advised(e, b) else None
+    asked = not b.scenario and e.of_a_beam and e.ending is None and not e.determined
+    advice = next_measurement(seen, plane) if asked else None
     finding = verdict(e, _remarks(seen, plane, e, b, carrying, n), advice or "")
     holds = e.of_a_beam and e.ending is None
-    known = e.determined | (LINEAR & holds & (b is None))
+    known = e.determined | (LINEAR & holds & (not b.scenario))
     emittance, normalized, beta, alpha, s11, s12, s22, *screen, mismatch = n.quantities(
         known, holds and not e.opened
     )
-    scale = _scale(n) if e.determined else 1.0
+    scale = n.scale if e.determined else 1.0
+    covariance = b.covariance if known[SIGMA].all() else np.full((3, 3), np.nan)
     place = seen.rows.places[-1]
     own = {name: float(line[name].setting) for name in line.upto(place).magnets}
     return PlaneFit(
@@ -167,44 +183,35 @@ def plane_answer(
         screen=ScreenTwiss(place, own, setting_units(line, own), *screen),
         mismatch=None if getattr(seen.line.design, plane, None) is None else mismatch,
         chi2=post.chi2 if math.isfinite(post.chi2) else None,
-        dof=max(len(p.size) - 3, 0) if b is None else round(b.dof),
+        dof=round(b.dof),
         rms_residual=Quantity(float(np.sqrt(np.mean((p.size - p.model) ** 2))), None, "m"),
-        covariance=_covariance(post, b, scale, bool(known[SIGMA].all())),
+        covariance=covariance / scale**2 if b.scenario else covariance,
         error_scale=scale,
         noise=noise_words(post.noise, post.scale, post.relative, p),
         method=seen.method,
         weights=seen.weights,
-        identifiability=_identifiability(p, n, e, advice, b),
+        identifiability=_identifiability(p, n, e, advice, b.directions),
         points=p,
-        holds="statistics only" if b is None else b.holds,
+        holds=b.holds,
     )
 
 
 def _numbers(
-    post: PlanePosterior, p: Points, places: Places, b: Beside | None
+    post: PlanePosterior, p: Points, places: Places, b: BestFit
 ) -> tuple[PlaneNumbers, Influence]:
     """The numbers of a plane, and the point that carries them."""
-    spread = None if b is None else b.spread
-    quantiles = _quantiles(post, places, spread)
-    value = numbers_of(post.best, *places) if b is None else b.value
-    half = 0.5 * (quantiles[3] - quantiles[1])
-    low, high = quantiles[0], quantiles[4]
+    low, *ends, high = _quantiles(post, places, b.spread)
+    half = 0.5 * (ends[2] - ends[0])
     alone = post.positive and len(p.size) > 3
     carrying = _influence(p, post.best, half[0]) if alone else Influence()
     if abs(carrying.shift) > MOVES:
-        low, high, half = _reaching(low, high, half, value, carrying.without)
-    raw = _raw(post, places)
-    raw = raw if b is None else np.hypot(raw, b.spread)
-    return PlaneNumbers(value, half, low, high, raw), carrying
-
-
-def _advised(e: PlaneEvidence, b: Beside | None) -> bool:
-    """True if a further size is to be named: of a beam whose emittance is open."""
-    return b is None and e.of_a_beam and e.ending is None and not e.determined
+        low, high, half = _reaching(low, high, half, b.value, carrying.without)
+    raw = np.hypot(_raw(post, places), b.spread)
+    return PlaneNumbers(b.value, half, low, high, raw), carrying
 
 
 def _remarks(
-    seen: PreparedScan, plane: str, e: PlaneEvidence, b: Beside | None, carrying: Influence,
+    seen: PreparedScan, plane: str, e: PlaneEvidence, b: BestFit, carrying: Influence,
     n: PlaneNumbers,
 ) -> str:  # fmt: skip
     """Further sentences on noise and points."""
@@ -212,8 +219,8 @@ def _remarks(
     post, p, remarks = work.posterior, work.points, [work.shot_words]
     if e.of_a_beam:
         likely = chi2_probability(post.chi2, max(len(p.size) - 3, 0))
-        by_noise = e.determined and b is None and abs(carrying.shift) <= MOVES
-        enlarged = _scale(n) if by_noise else 1.0
+        by_noise = e.determined and not b.scenario and abs(carrying.shift) <= MOVES
+        enlarged = n.scale if by_noise else 1.0
         remarks.insert(0, noise_remark(post.noise, post.scale, likely, enlarged))
         without = carrying.without * n.value[1] / n.value[0]
         place = "" if e.opened else carrying.place
@@ -221,29 +228,13 @@ def _remarks(
             place += _bad_elsewhere(seen, plane, carrying.point)
         remarks += point_remarks(p, place, float(without), abs(carrying.shift) > MOVES)
     remarks.append(resolution_remark(p.size, p.known))
-    if b is not None and e.determined:
-        remarks.append(b.remark)
+    remarks += [b.remark] * e.determined
     return " ".join(filter(None, remarks))
 
 
-def _scale(n: PlaneNumbers) -> float:
-    """The error of the emittance over that by the stated errors alone; 1 without."""
-    return float(n.half[0] / n.raw[0]) if np.isfinite(n.raw[0]) and n.raw[0] > 0 else 1.0
-
-
-def _covariance(post: PlanePosterior, b: Beside | None, scale: float, known: bool) -> np.ndarray:
-    """Covariance of σ over the square of ``scale``; NaN where σ is not known."""
-    if not known:
-        return np.full((3, 3), np.nan)
-    if b is not None:
-        return b.covariance / scale**2
-    return post.stated if np.isfinite(post.stated).all() else post.covariance
-
-
 def _identifiability(
-    p: Points, n: PlaneNumbers, e: PlaneEvidence, advice: str | None, b: Beside | None
+    p: Points, n: PlaneNumbers, e: PlaneEvidence, advice: str | None, directions: Directions
 ) -> Identifiability:
-    directions = _directions(p, e.posterior) if b is None else b.directions
     return Identifiability(
         determined=e.determined,
         probability=e.posterior.probability,
@@ -256,13 +247,12 @@ def _identifiability(
     )
 
 
-def _quantiles(post: PlanePosterior, given: tuple, spread: np.ndarray | None) -> np.ndarray:
+def _quantiles(post: PlanePosterior, given: tuple, spread: np.ndarray) -> np.ndarray:
     """Quantiles `AT` of every number, shape (5, 11)."""
-    kept = post.weight > 0.0
-    sigma, weight = post.sigma[kept], post.weight[kept]
+    weight = post.weight
     with np.errstate(invalid="ignore", divide="ignore"):
-        numbers = numbers_of(sigma.T, *given)
-    if spread is not None:
+        numbers = numbers_of(post.sigma.T, *given)
+    if spread.any():
         # Even steps of a normal distribution, in an order that has nothing to do with the draws'.
         z = ndtri((0.5 + np.arange(len(weight)) * 0.6180339887498949) % 1.0)
         with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
@@ -272,23 +262,20 @@ def _quantiles(post: PlanePosterior, given: tuple, spread: np.ndarray | None) ->
             numbers = np.where(np.isfinite(spread)[:, None], numbers, 0.0)
     emittances = [emittance_quantiles(row, weight, post.flat, AT) for row in numbers[:2]]
     others = [weighted_quantiles(row, weight, AT) for row in numbers[2:]]
-    found = np.array([*emittances, *others]).T
-    return found if spread is None else np.where(np.isfinite(spread), found, np.nan)
+    return np.where(np.isfinite(spread), np.array([*emittances, *others]).T, np.nan)
 
 
 def _reaching(
     low: np.ndarray, high: np.ndarray, half: np.ndarray, value: np.ndarray, without: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Intervals that reach to the emittance without the point that carries it."""
-    shift = without - value[0]
-    if not math.isfinite(shift):
-        return low, high, half
+    shift = without - value[0]  # NaN where the others give no emittance
     reach = np.array([shift, shift * value[1] / value[0]])
     low, high, half = low.copy(), high.copy(), half.copy()
-    low[:2] = np.minimum(low[:2], value[:2] + reach)
-    high[:2] = np.maximum(high[:2], value[:2] + reach)
+    low[:2] = np.fmin(low[:2], value[:2] + reach)
+    high[:2] = np.fmax(high[:2], value[:2] + reach)
     # Two answers, one of which is right: half of what lies between them.
-    half[:2] = np.maximum(half[:2], 0.5 * np.abs(reach))
+    half[:2] = np.fmax(half[:2], 0.5 * np.abs(reach))
     return low, high, half
 
 
@@ -301,13 +288,11 @@ def _bad_elsewhere(seen: PreparedScan, plane: str, point: int) -> str:
     return ""
 
 
-def _evidence(seen: PreparedScan, plane: str, n: PlaneNumbers, b: Beside | None) -> PlaneEvidence:
+def _evidence(seen: PreparedScan, plane: str, n: PlaneNumbers, b: BestFit) -> PlaneEvidence:
     work, low, high = seen.solutions[plane], float(n.low[1]), float(n.high[1])
-    p = work.points
+    p, told = work.points, (b.ending, b.scenario, b.opened, b.remedy)
     waist = waist_bracketed(p.settings, p.screen, p.size, p.error)
-    e = PlaneEvidence(work.posterior, work.sizes, low, high, waist)
-    if b is not None:
-        e = replace(e, ending=b.ending, scenario=b.scenario, opened=b.opened, remedy=b.remedy)
+    e = PlaneEvidence(work.posterior, work.sizes, low, high, waist, *told)
     emittance = float(n.value[1])
     if not e.determined or LEAST <= emittance <= MOST:
         return e
@@ -326,20 +311,6 @@ def _evidence(seen: PreparedScan, plane: str, n: PlaneNumbers, b: Beside | None)
     return replace(e, ending=Finding(Status.unidentified, cause, remedy))
 
 
-def _quantity(
-    value: float, half: float, low: float, high: float, raw: float, unit: str, known: bool,
-    limits: bool,
-) -> Quantity:  # fmt: skip
-    """A number with its error; of one that is not determined its interval, if the model holds."""
-    value, low, high = float(value), float(low), float(high)
-    if not (math.isfinite(low) and math.isfinite(high)):
-        return Quantity(value, None, unit)
-    if not known:
-        return Quantity(value, None, unit, None, (low, high) if limits else None)
-    raw = float(raw)
-    return Quantity(value, float(half), unit, raw if math.isfinite(raw) else None, (low, high))
-
-
 def _raw(post: PlanePosterior, given: tuple) -> np.ndarray:
     """Errors by the stated errors alone: sqrt(∇f C ∇f), derivatives by complex steps."""
     if not np.isfinite(post.stated).all():
@@ -351,11 +322,11 @@ def _raw(post: PlanePosterior, given: tuple) -> np.ndarray:
         return np.sqrt(np.sum((slope @ post.stated) * slope, axis=1))
 
 
-def _directions(p: Points, post: PlanePosterior) -> Directions:
+def _directions(p: Points, sigma: np.ndarray) -> Directions:
     """Directions of σ that the sizes leave open."""
     with np.errstate(divide="ignore", invalid="ignore"):
         jacobian = np.stack(coefficients(p.r11, p.r12), -1) / (2.0 * p.weighed * p.error)[:, None]
-    return scaled_directions(jacobian, np.array(units_of(post.best)), list(QUANTITIES)[SIGMA])
+    return scaled_directions(jacobian, np.array(units_of(sigma)), list(QUANTITIES)[SIGMA])
 
 
 def units_of(sigma: np.ndarray) -> list[float]:

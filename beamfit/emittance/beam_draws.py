@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import fdtri, gammaln, ndtri
 
+from beamfit.emittance.model import carried
 from beamfit.noise.model import LN_2PI, Noise
 from beamfit.noise.sizes import (
     NoiseKind,
@@ -76,15 +77,9 @@ class Coordinates(NamedTuple):
 
     def sigma(self, x: np.ndarray) -> np.ndarray:
         """σ11, σ12, σ22 in SI of T, T p_1, T p_2, shape (..., d, 3)."""
-        s = 0.5 * np.stack([x[..., 0] + x[..., 1], x[..., 2], x[..., 0] - x[..., 1]], -1)
-        (a, b), (c, d) = np.moveaxis(self.back, (-2, -1), (0, 1))[..., None]
-        s11, s12, s22 = np.moveaxis(s, -1, 0)
-        found = (
-            a * a * s11 + 2.0 * a * b * s12 + b * b * s22,
-            a * c * s11 + (a * d + b * c) * s12 + b * d * s22,
-            c * c * s11 + 2.0 * c * d * s12 + d * d * s22,
-        )
-        return np.stack(found, -1) * self.unit[..., None, None] ** 2
+        s = 0.5 * np.stack([x[..., 0] + x[..., 1], x[..., 2], x[..., 0] - x[..., 1]])
+        back = np.moveaxis(self.back, (-2, -1), (0, 1))[..., None]
+        return np.stack(carried(back, s), -1) * self.unit[..., None, None] ** 2
 
 
 def coordinates(
@@ -259,23 +254,15 @@ def fits(c: Coordinates, kind: NoiseKind) -> tuple[np.ndarray, np.ndarray]:
     n = c.size.shape[-1]
     kept = left_out(n)
     kept = np.broadcast_to(kept, (*c.unit.shape, *kept.shape))
-    found = [_fitted(c, kind, deviation, kept) for deviation in _deviations(kind)]
-    if WORST * n > 2:
-        found += [_greedy(c, kind, deviation) for deviation in _deviations(kind)]
-    return _joined(found)
-
-
-def _joined(found: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
-    """Centres and roots of several sets of fits as one."""
-    centres, roots = zip(*found, strict=True)
-    return np.concatenate(centres, -2), np.concatenate(roots, -3)
-
-
-def _deviations(kind: NoiseKind) -> list[np.ndarray]:
-    """Deviations of points to weigh them by: as stated, and with the usual scatter beside."""
+    # Points are weighed by what is stated, and with the usual scatter beside.
     special = [] if kind.special is None else [kind.special]
     usual = [] if kind.least else [kind.prior.middle]
-    return [kind.deviation(scale) for scale in special + usual]
+    deviations = [kind.deviation(scale) for scale in special + usual]
+    found = [_fitted(c, kind, deviation, kept) for deviation in deviations]
+    for deviation in deviations if WORST * n > 2 else ():
+        found += _greedy(c, kind, deviation)
+    centres, roots = zip(*found, strict=True)
+    return np.concatenate(centres, -2), np.concatenate(roots, -3)
 
 
 def _fitted(
@@ -294,7 +281,7 @@ def _fitted(
         design, wanted = _weighed(weigh, each * rows), _weighed(weigh, each * target[..., None])
         turned = np.swapaxes(design, -1, -2)
         normal = turned @ design
-        normal = normal + _little(normal)
+        normal = normal + little(normal)
         x = np.linalg.solve(normal, turned @ wanted)[..., 0]
         squared = (rows @ x[..., None])[..., 0] + c.known[..., None, :]
         model = np.sqrt(np.clip(squared, (size / FURTHEST) ** 2, (size * FURTHEST) ** 2))
@@ -313,15 +300,15 @@ def _weighed(weigh: np.ndarray, columns: np.ndarray) -> np.ndarray:
     return weigh * columns if weigh.shape[-1] == 1 else weigh @ columns
 
 
-def _little(normal: np.ndarray) -> np.ndarray:
+def little(normal: np.ndarray) -> np.ndarray:
     """A little of the unit matrix: points may say nothing of a direction."""
     trace = np.trace(normal, axis1=-2, axis2=-1)[..., None, None]
-    return 1e-9 * np.maximum(trace, 1e-30) * np.eye(3)
+    return 1e-9 * np.maximum(trace, 1e-30) * np.eye(normal.shape[-1])
 
 
 def _greedy(
     c: Coordinates, kind: NoiseKind, deviation: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+) -> list[tuple[np.ndarray, np.ndarray]]:
     """Fits that leave out the worst point of the one before, up to a share of them."""
     n = c.size.shape[-1]
     kept, found, most = np.ones((*c.unit.shape, 1, n)), [], int(WORST * n)
@@ -334,7 +321,7 @@ def _greedy(
         kept = kept.copy()
         np.put_along_axis(kept, worst, 0.0, axis=-1)
         found.append(_fitted(c, kind, deviation, kept))
-    return _joined(found)
+    return found
 
 
 def _inside(x: np.ndarray) -> np.ndarray:
@@ -351,15 +338,9 @@ def _even_cube(dim: int, number: int) -> np.ndarray:
 
     J. H. Halton, Numer. Math. 2, 84 (1960), eq. 1.
     """
-    columns = []
-    for base in (2, 3, 5, 7)[:dim]:
-        left, unit, inverse = np.arange(1, number + 1), 1.0, np.zeros(number)
-        while left.any():
-            unit /= base
-            inverse += unit * (left % base)
-            left = left // base
-        columns.append(inverse)
-    return np.stack(columns, -1)
+    base, place = np.array([[2], [3], [5], [7]])[:dim], np.arange(12)  # digits of up to 4095
+    digits = np.arange(1, number + 1)[:, None, None] // base**place % base
+    return (digits / base ** (place + 1.0)).sum(-1)
 
 
 @lru_cache(maxsize=8)

@@ -32,7 +32,6 @@ class NumberKind(Enum):
 
 
 # The numbers of a calibration in the order of its fields; of any further ones the last.
-_SCALE = ((NumberKind.slope, "1"),)
 _MEANINGS = {
     SlopeIntercept: ((NumberKind.slope, "MeV/(m^2 A)"), (NumberKind.offset, "MeV/m^2")),
     CurrentPolynomial: (
@@ -105,7 +104,7 @@ def numbers_of_magnets(line: Beamline, magnets: tuple[str, ...] | None = None) -
             wrong = f"a calibration of '{magnet}', which feeds several magnets"
             raise InputError(wrong, "scenario known, or a scan of magnets on supplies of their own")
         calibration = line[magnet].calibration
-        meanings = _MEANINGS.get(type(calibration), _SCALE)
+        meanings = _MEANINGS.get(type(calibration), ((NumberKind.slope, "1"),))
         values = [float(v) for v in jax.tree_util.tree_leaves(calibration)]
         told = [meanings[min(i, len(meanings) - 1)] for i in range(len(values))]
         slopes = [v for v, (kind, _) in zip(values, told, strict=True) if kind is NumberKind.slope]

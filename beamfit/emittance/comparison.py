@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from functools import lru_cache
 from typing import NamedTuple
 
 import jax
@@ -19,6 +18,7 @@ from beamfit.emittance.beam_draws import (
     Coordinates,
     coordinates,
     draw_beams,
+    little,
     student_mixture,
 )
 from beamfit.emittance.model import coefficients
@@ -85,8 +85,7 @@ def flat_beam(c: Coordinates, kind: NoiseKind, noise: Noise) -> np.ndarray:
     rows = (w / deviation[..., None])[..., None, :, :] * side[..., None]
     normal = np.swapaxes(rows, -1, -2) @ rows
     right = np.swapaxes(rows, -1, -2) @ (target / deviation)[..., None, :, None]
-    trace = np.trace(normal, axis1=-2, axis2=-1)[..., None, None]
-    normal = normal + 1e-9 * np.maximum(trace, 1e-30) * np.eye(2)
+    normal = normal + little(normal)
     v = np.linalg.solve(normal, right)
     off = (rows @ v)[..., 0] - (target / deviation)[..., None, :]
     chi2 = (off**2).sum(-1)
@@ -111,12 +110,6 @@ def flat_beam(c: Coordinates, kind: NoiseKind, noise: Noise) -> np.ndarray:
     found = averaged(each(x, scales.scale), scales.log_weight[..., None, :])
     found = found + prior - log_density - math.log(FEW)
     return averaged(found, 0.0) + kind.log_weight
-
-
-@lru_cache(maxsize=64)
-def _walk(n: int) -> np.ndarray:
-    """Covariance of a walk over n rows in the order of the file."""
-    return 1.0 * np.minimum.outer(np.arange(n), np.arange(n))
 
 
 def _bends(w: np.ndarray, length: float) -> np.ndarray:
@@ -169,7 +162,8 @@ def curve_evidences(u: np.ndarray, c: Coordinates, kind: NoiseKind, noise: Noise
     variance = variance_of(flat, wide.scale)
     same = np.broadcast_to(np.eye(n), (*c.unit.shape, n, n))
     random = _process(x, same, STEPS, variance, wide, noise)
-    walk = np.broadcast_to(_walk(n), same.shape)
+    # The covariance of a walk over the rows in the order of the file.
+    walk = np.broadcast_to(np.minimum.outer(np.arange(n), np.arange(n)), same.shape)
     drift = _process(x, walk, STEPS, variance, wide, noise)
     by_size, own = variance * c.size[..., None, :] ** 2, c.size - 1.0
     curves = [_process(own, _bends(u, each), BENDS, by_size, wide, noise) for each in LENGTHS]
@@ -299,9 +293,8 @@ class PlaneSizes(NamedTuple):
     def thinned(self, number: int) -> PlaneSizes:
         """So many points, evenly among all."""
         at = np.linspace(0, len(self.size) - 1, number).astype(int)
-        error = None if self.error is None else self.error[at]
-        rows = self.r11[at], self.r12[at], self.known[at], self.size[at]
-        return PlaneSizes(*rows, error, self.of_shots, self.moved)
+        rows = [None if v is None else v[at] for v in self[:5]]
+        return PlaneSizes(*rows, self.of_shots, self.moved)
 
     def kinds_under(self, unit: float, noise: Noise) -> tuple[NoiseKind, ...]:
         """Kinds of noise under some priors, in some unit of the sizes, m."""
@@ -326,7 +319,7 @@ class PlanePosterior(NamedTuple):
     probability : dict of str to float
         Of a beam and of its rivals.
     sigma, weight : ndarray
-        Draws of σ11, σ12, σ22 in SI, shape (d, 3), and their weights, which sum to 1.
+        Draws of σ11, σ12, σ22 in SI, shape (d, 3), and their positive weights, which sum to 1.
     best : ndarray
         Shape (3,): σ that fits best, or the mean of the draws where that is no beam.
     positive : bool
@@ -418,19 +411,16 @@ def compare(
     the odds of the models (D. J. C. MacKay, Information Theory, Inference, and Learning Algorithms
     (2003), eq. 28.4). All models share the noise.
     """
-    found: list[PlanePosterior | None] = [None] * len(planes)
     alike: dict[tuple, list[int]] = {}
     for i, plane in enumerate(planes):
         alike.setdefault(plane.likeness, []).append(i)
-    for members in alike.values():
+    found = {}
+    for (count, *_), members in alike.items():
         for start in range(0, len(members), TOGETHER):
             own = members[start : start + TOGETHER]
-            several = [planes[i] for i in own]
-            of_these = noise.of_points(len(several[0].size))
-            posteriors = _compared(several, of_these, method, weights)
-            for i, posterior in zip(own, posteriors, strict=True):
-                found[i] = posterior
-    return found
+            several = _compared([planes[i] for i in own], noise.of_points(count), method, weights)
+            found |= dict(zip(own, several, strict=True))
+    return [found[i] for i in range(len(planes))]
 
 
 class _Stack(NamedTuple):
@@ -473,7 +463,7 @@ def _compared(
     log = np.where(np.isfinite(log), log, -1e300)
     probability = np.exp(log - np.logaddexp.reduce(log, axis=-1)[:, None])
     return [
-        _posterior(plane, i, s, draws, of_kind[:, i], probability[i], best, noise, weights)
+        _posterior(plane, i, s, draws, of_kind[:, i], probability[i], best, weights)
         for i, plane in enumerate(planes)
     ]
 
@@ -498,23 +488,18 @@ def _evidences(s: _Stack, i: int, draws: BeamDraws, noise: Noise) -> np.ndarray:
 
 
 class _Best(NamedTuple):
-    """The best fit of planes: T, T p, normal matrix, model, precision and doubt of their points."""
+    """The best fit of planes: T, T p, model, precision and doubt of their points."""
 
     x: np.ndarray
-    normal: np.ndarray
     model: np.ndarray
     precision: np.ndarray
     bad: np.ndarray
 
 
 def _best(
-    s: _Stack,
-    draws: Sequence[BeamDraws],
-    of_kind: np.ndarray,
-    noise: Noise,
-    method: str,
+    s: _Stack, draws: Sequence[BeamDraws], of_kind: np.ndarray, noise: Noise, method: str,
     weights: str,
-) -> _Best:
+) -> _Best:  # fmt: skip
     """Find the weighted least squares at the expected precision of every point.
 
     How large the noise is comes from its posterior, which of the points are bad from the last fit
@@ -526,10 +511,10 @@ def _best(
     first = np.argmax(top, axis=0)
     x = np.array([d.best for d in draws])[first, np.arange(len(first))]
     rests = np.zeros(len(x), bool)
-    expecting = [_expecting(c, kind, d, noise) for kind, d in zip(s.kinds, draws, strict=True)]
     for _ in range(ROUNDS):
         model = _model(x, c)
-        parts = [expected(model) for expected in expecting]
+        kinds = zip(s.kinds, draws, strict=True)
+        parts = [_expected(model, c, kind, d, noise) for kind, d in kinds]
         precision = sum(w[:, None] * p for w, (p, _) in zip(of_kind, parts, strict=True))
         if method == "size_squared":
             target, at = c.size**2, model if weights == "model" else c.size
@@ -548,7 +533,7 @@ def _best(
         if rests.all():
             break
     bad = sum(w[:, None] * b for w, (_, b) in zip(of_kind, parts, strict=True))
-    return _Best(x, normal, _model(x, c), precision, bad)
+    return _Best(x, _model(x, c), precision, bad)
 
 
 def _model(x: np.ndarray, c: Coordinates) -> np.ndarray:
@@ -558,31 +543,28 @@ def _model(x: np.ndarray, c: Coordinates) -> np.ndarray:
     return np.sqrt(np.maximum(squared, (least / FURTHEST) ** 2))
 
 
-def _expecting(
-    c: Coordinates, kind: NoiseKind, draws: BeamDraws, noise: Noise
-) -> Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]:
+def _expected(
+    model: np.ndarray, c: Coordinates, kind: NoiseKind, draws: BeamDraws, noise: Noise
+) -> tuple[np.ndarray, np.ndarray]:
     """Expected precision of each point's size, and probability that it is bad, by the model."""
     variance, share = variance_of(kind, draws.scales.scale), draws.scale_weight[..., None]
-
-    def expected(model: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        pull = (((c.size - model) / model**kind.power) ** 2)[:, None, :] / variance
-        bad = 1.0 / (1.0 + np.exp(-0.5 * pull) / bad_density(pull, noise))
-        # A Cauchy distribution is a normal one of this mean precision.
-        each = (1.0 - bad + bad * 2.0 / (noise.width**2 + pull)) / variance
-        return (share * each).sum(1) / model ** (2 * kind.power), (share * bad).sum(1)
-
-    return expected
+    pull = (((c.size - model) / model**kind.power) ** 2)[:, None, :] / variance
+    bad = 1.0 / (1.0 + np.exp(-0.5 * pull) / bad_density(pull, noise))
+    # A Cauchy distribution is a normal one of this mean precision.
+    each = (1.0 - bad + bad * 2.0 / (noise.width**2 + pull)) / variance
+    return (share * each).sum(1) / model ** (2 * kind.power), (share * bad).sum(1)
 
 
 def _posterior(
     plane: PlaneSizes, i: int, s: _Stack, draws: Sequence[BeamDraws], of_kind: np.ndarray,
-    probability: np.ndarray, best: _Best, noise: Noise, weights: str,
+    probability: np.ndarray, best: _Best, weights: str,
 ) -> PlanePosterior:  # fmt: skip
     c = Coordinates(*(part[i] for part in s.c))
     log = np.concatenate([d.log_weight[i] for d in draws])
     weight = np.exp(log - log.max()) if np.isfinite(log.max()) else np.ones(len(log))
     weight /= weight.sum()
-    sigma = c.sigma(np.concatenate([d.x[i] for d in draws]))
+    sigma = c.sigma(np.concatenate([d.x[i] for d in draws]))[weight > 0.0]
+    weight = weight[weight > 0.0]
     found, unit = c.sigma(best.x[i][None])[0], float(c.unit)
     positive = bool(found[0] > 0 and found[0] * found[2] > found[1] ** 2) and bool(c.seen)
     model = best.model[i] * unit
@@ -596,22 +578,21 @@ def _posterior(
         stated = _covariance(rows / own[:, None]) if c.seen else none
         chi2 = float(np.sum(((plane.size - model) / own) ** 2))
     turned = np.linalg.inv(c.back * unit)
-    trace = turned.T @ turned
+    trace, own = turned.T @ turned, draws[likelier]
+    beyond = np.any(s.kinds[likelier].floor) and not plane.of_shots
     return PlanePosterior(
         probability=dict(zip(MODELS, map(float, probability), strict=True)),
         sigma=sigma,
         weight=weight,
-        best=found
-        if positive
-        else np.maximum(weight, 0.0) @ np.where(weight[:, None] > 0, sigma, 0.0),
+        best=found if positive else weight @ sigma,
         positive=positive,
         covariance=_covariance(rows / error[:, None]) if c.seen else none,
         stated=stated,
         model=model,
         error=error,
         bad=best.bad[i],
-        noise=_noise_word(plane, s.kinds[likelier]),
-        scale=_scale_of(i, draws[likelier]),
+        noise="beyond" if beyond else plane.likeness[1],
+        scale=weighted_quantiles(own.scales.scale[i], own.scale_weight[i], (AT[2], AT[1], AT[3])),
         relative=float(sum(w * k.power for w, k in zip(of_kind, s.kinds, strict=True))),
         chi2=chi2,
         seen=bool(c.seen),
@@ -629,15 +610,6 @@ def _covariance(rows: np.ndarray) -> np.ndarray:
     r = np.linalg.qr(rows / norm, mode="r")
     half = np.linalg.solve(r, np.eye(3)) / norm[:, None]
     return half @ half.T
-
-
-def _noise_word(plane: PlaneSizes, kind: NoiseKind) -> str:
-    return "beyond" if np.any(kind.floor) and not plane.of_shots else plane.likeness[1]
-
-
-def _scale_of(i: int, own: BeamDraws) -> np.ndarray:
-    """Median and central 68 % of the scale of the noise."""
-    return weighted_quantiles(own.scales.scale[i], own.scale_weight[i], (AT[2], AT[1], AT[3]))
 
 
 def weighted_quantiles(values: np.ndarray, weight: np.ndarray, at: Sequence[float]) -> np.ndarray:

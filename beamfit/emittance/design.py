@@ -18,9 +18,7 @@ from beamfit.emittance.advice import (
 )
 from beamfit.emittance.calibration import NumberKind, numbers_of_magnets
 from beamfit.emittance.fit import EmittanceFit
-from beamfit.emittance.model import (
-    spoken,
-)
+from beamfit.emittance.model import spoken
 from beamfit.emittance.statement import PreparedScan, varied_magnets
 from beamfit.emittance.targets import check_limits
 from beamfit.errors import InputError, Status, expect

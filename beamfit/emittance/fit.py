@@ -3,19 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any
 
-from beamfit.answer import (
-    Table,
-    answer,
-    determined,
-    json_of,
-    labelled,
-    quantity_frame,
-)
+from beamfit.answer import Table, answer, determined, json_of, labelled, quantity_frame
 from beamfit.emittance.answer import judged_beam
 from beamfit.emittance.assumptions import Anchor, Assumptions
 from beamfit.emittance.comparison import BEAM
@@ -161,7 +153,7 @@ def fit_emittance(
     if told.systematics:
         from beamfit.emittance.systematics import with_systematics
 
-        statement = with_systematics(statement, told)
+        statement = with_systematics(statement)
     seen = prepare(scan, line, planes, method, noise, weights)
     if statement.closed:
         return EmittanceFit(judged_beam(seen), scan, line, statement, told, seen)
@@ -171,10 +163,11 @@ def fit_emittance(
     fit, seen = settled_fit(seen, statement, told)
     parameters = tuple(statement.parameters(seen, told, fit))
     found = line_of(fit.model, seen.scanned)
-    judged = judged_scenario(fit, seen, found, statement, told, parameters)
+    begun = EmittanceFit((), scan, found, statement, told, seen, parameters, (), fit)
+    judged = judged_scenario(begun)
     identified = all(p.identifiability.determined for p in judged)
     left = statement.null_directions(seen, parameters, identified)
-    return EmittanceFit(judged, scan, found, statement, told, seen, parameters, left, fit)
+    return replace(begun, planes=judged, null_directions=left)
 
 
 @answer
@@ -483,12 +476,9 @@ def noise_samples(scans: Iterable[tuple[QuadScan, Beamline]], noise: Noise) -> I
     """
     from beamfit.noise.learn import Sample  # loads the minimiser
 
-    begun = []
-    for given in scans:
-        with suppress(InputError):
-            begun.append(unfitted(*of_one_beam(*given), noise=noise))
-    for seen in with_posteriors(looked_through(begun)):
-        for work in seen.solutions.values():
+    fits = (fit for fit in fit_many(scans, noise=noise) if isinstance(fit, EmittanceFit))
+    for fit in fits:
+        for work in fit.seen.solutions.values():
             post = work.posterior
             if len(work.sizes.size) > 3 and post.probability[BEAM] > SURE:
                 word = work.sizes.likeness[1]

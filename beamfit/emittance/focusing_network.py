@@ -17,14 +17,10 @@ from jax import Array
 from jax.typing import ArrayLike
 
 from beamfit.emittance.assumptions import Assumptions
-from beamfit.emittance.constrained_network import (
-    MOST,
-    known_record,
-    network_problem,
-)
 from beamfit.emittance.results import Parameter
 from beamfit.emittance.statement import PreparedScan, Scenario, varied_magnets
 from beamfit.emittance.transport import padded
+from beamfit.emittance.transport_network import MOST, known_record, network_problem
 from beamfit.errors import InputError, Status
 from beamfit.greybox import tree
 from beamfit.greybox.fit import Derived, Fit
@@ -192,11 +188,8 @@ def _anchors(seen: PreparedScan, name: str, told: Assumptions, branches: bool) -
     largest = float(np.abs(_first_strength(seen, name, settings)).max())
     places = np.array([place[name] for place in anchor.at if name in place], float)
     element, energy = seen.scanned[name], float(seen.scanned.energy)
-    ties = (
-        (np.unique(settings), anchor.deviation, _less_common),
-        (places, anchor.sd, _predicted),
-    )
-    for at, sd, predict in ties:
+    every = np.unique(settings), anchor.deviation, _less_common
+    for at, sd, predict in (every, (places, anchor.sd, _predicted)):
         if sd is None or not len(at):
             continue
         points = np.stack([at, np.zeros(len(at))], -1) if branches else at

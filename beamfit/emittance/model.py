@@ -183,8 +183,8 @@ def numbers_of(
     [6.0, 12.0, 0.6666666666666666]
     """
     emittance, beta, alpha = emittance_parts(sigma)
-    s11, s12, _ = _carried(to_screen, sigma)
-    d11, d12, d22 = _carried(to_design, sigma)
+    s11, s12, _ = carried(to_screen, sigma)
+    d11, d12, d22 = carried(to_design, sigma)
     gamma_d = (1.0 + design[1] ** 2) / design[0]
     # BMAG = Tr(σ σ_d⁻¹) ε_d/(2 ε), M. Sands, SLAC-AP-85 (1991).
     mismatch = 0.5 * (gamma_d * d11 + 2.0 * design[1] * d12 + design[0] * d22) / emittance
@@ -193,8 +193,8 @@ def numbers_of(
     return xp.stack([*start, s11 / emittance, -s12 / emittance, s11**0.5, mismatch])
 
 
-def _carried(matrix: Array, sigma: Array) -> tuple[Array, Array, Array]:
-    """σ at a place: R σ Rᵀ (report eq. 36)."""
+def carried(matrix: Any, sigma: Any) -> tuple[Any, Any, Any]:
+    """σ at a place: R σ Rᵀ (report eq. 36), R of shape (2, 2, ...), σ of shape (3, ...)."""
     (a, b), (c, d) = matrix[0, :2], matrix[1, :2]
     s11, s12, s22 = sigma
     crossed = a * c * s11 + (a * d + b * c) * s12 + b * d * s22
@@ -215,11 +215,6 @@ class Asked:
     energy: Any
     design: Any
 
-    @property
-    def factor(self) -> Any:
-        """βγ."""
-        return beta_gamma(self.energy, self.line.mass)
-
 
 def asked_places(model: Mapping[str, Any], asked: Asked) -> tuple[Any, Any, Any, Any]:
     """βγ, matrices to the screen and the design's place, and the design, of a model's line."""
@@ -230,7 +225,7 @@ def asked_places(model: Mapping[str, Any], asked: Asked) -> tuple[Any, Any, Any,
         found = line_of(model, asked.line).matrices(places)
         to_screen, to_design = (getattr(found[at], asked.plane) for at in (asked.screen, place))
     energy = asked.energy * model.get("systematics", {}).get("energy", 1.0)
-    return replace(asked, energy=energy).factor, to_screen, to_design, asked.design
+    return beta_gamma(energy, asked.line.mass), to_screen, to_design, asked.design
 
 
 def asked_numbers(model: Mapping[str, Any], asked: Asked) -> Array:

@@ -165,12 +165,7 @@ def beam_target(
         names = tuple(p.plane for p in kept or asked)
         problem = fit.statement.state(fit.seen._replace(planes=names), fit.told)
         optimum = _optimum(problem.names, kept or asked, given, priors or {})
-    return target_of(
-        problem,
-        optimum,
-        _stated(problem, fit, kept, asked),
-        priors=priors,
-    )
+    return target_of(problem, optimum, _stated(problem, fit, kept, asked), priors=priors)
 
 
 def _asked(fit: Scanned, planes: Sequence[str] | None) -> list[PlaneFit]:
@@ -209,6 +204,8 @@ def _stated(
     problem: Problem, fit: Scanned, kept: Sequence[PlaneFit], asked: Sequence[PlaneFit]
 ) -> Statement:
     chosen = kept or asked
+    planes = [p.plane for p in chosen]
+    places = asked_in(problem, fit.seen, planes, fit.statement.whole_map)
     shown = {(p.plane, name): getattr(p, name) for p in chosen for name in TWISS}
     lost = ", ".join(f"{p.plane} plane" for p in asked if p not in kept)
     sigmas = [f"{p.plane}.{name}" for p in chosen for name in SIGMA]
@@ -220,12 +217,7 @@ def _stated(
         derived={f"{plane}.{name}": QUANTITIES[name] for plane, name in shown},
         derive=_twiss,
         build=_beams,
-        data=DensityData(
-            asked_in(
-                problem, fit.seen, planes := [p.plane for p in chosen], fit.statement.whole_map
-            ),
-            _sizes_of(problem, fit.seen, planes),
-        ),
+        data=DensityData(places, _sizes_of(problem, fit.seen, planes)),
         log_volume=_log_volume,
         averaged=[f"size {plane}" for plane in planes],
         quoted=_quoted,

@@ -15,7 +15,7 @@ from beamfit.emittance.comparison import AT, PlanePosterior, weighted_quantiles
 from beamfit.emittance.model import coefficients, emittance_parts, predict_sizes, size_squared
 from beamfit.emittance.results import PlaneFit
 from beamfit.emittance.statement import Scanned
-from beamfit.emittance.transport import Rows, padded, rows_at
+from beamfit.emittance.transport import Rows, padded
 from beamfit.errors import InputError, nearest
 from beamfit.optics.beamline import seen_line
 from beamfit.sampling.posterior import Correlations
@@ -68,24 +68,22 @@ def predicted_sizes(
         expected = "a number for each magnet, or arrays of one length"
         raise InputError(f"settings {dict(settings)}", expected) from None
     rows = _rows(fit, given, n, plane, screen)
+    model = {} if fit.statement.closed else fit.solved.model
+    r11, r12, known = (np.asarray(part)[:n] for part in rows.elements(model))
+    post = fit.seen.solutions[plane].posterior
+    spread = _spread(post, r11, r12, known)
     if fit.statement.closed:
-        r11, r12, known = (np.asarray(part)[:n] for part in rows.elements({}))
         sigma = np.array([q.value for q in p.sigma])
         size = np.sqrt(np.maximum(size_squared(sigma, r11, r12, known), 0.0))
-        error = _spread(fit.seen.solutions[plane].posterior, r11, r12, known)
-        error = np.where(np.isfinite(p.covariance).all(), error, np.nan)
+        error = np.where(np.isfinite(p.covariance).all(), spread, np.nan)
     else:
         found = fit.solved.derive(predict_sizes, rows)
         size, whole = 1e-6 * found.value[:n], 1e-6 * found.error[:n]
-        r11, r12, known = (np.asarray(part)[:n] for part in rows.elements(fit.solved.model))
-        post = fit.seen.solutions[plane].posterior
         slope = np.stack(coefficients(r11, r12), -1) / (2.0 * size[:, None])
         held = np.einsum("ij,jk,ik->i", slope, post.covariance, slope)
         # What the other unknowns add in linear theory, beside the posterior of the beam.
         further = np.sqrt(np.maximum(whole**2 - held, 0.0))
-        error = np.where(
-            np.isfinite(whole), np.hypot(_spread(post, r11, r12, known), further), whole
-        )
+        error = np.where(np.isfinite(whole), np.hypot(spread, further), whole)
     return Prediction(plane, rows.places[0], given, size, error)
 
 
@@ -93,10 +91,8 @@ def _spread(
     post: PlanePosterior, r11: np.ndarray, r12: np.ndarray, known: np.ndarray
 ) -> np.ndarray:
     """Half of the central 68 % of the sizes that the posterior predicts."""
-    kept = post.weight > 0.0
-    sigma, weight = post.sigma[kept].T, post.weight[kept]
-    sizes = np.sqrt(size_squared(sigma, r11[:, None], r12[:, None], known[:, None]))
-    ends = [weighted_quantiles(row, weight, (AT[1], AT[3])) for row in sizes]
+    sizes = np.sqrt(size_squared(post.sigma.T, r11[:, None], r12[:, None], known[:, None]))
+    ends = [weighted_quantiles(row, post.weight, (AT[1], AT[3])) for row in sizes]
     return 0.5 * np.diff(ends, axis=1)[:, 0]
 
 
@@ -119,7 +115,7 @@ def _rows(
     table = {name: padded(given.get(name, np.full(n, float(line[name].setting)))) for name in keep}
     energy = padded(np.full(n, seen.energy))
     seen_by = seen_line(line, tuple(keep), energy, (place,))
-    return rows_at(seen_by, plane, place, table, energy, *seen.known_at(line, place))
+    return seen.rows_at(seen_by, plane, place, table, energy)
 
 
 def correlations_of(p: PlaneFit) -> Correlations:

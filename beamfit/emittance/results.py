@@ -71,11 +71,18 @@ class Points(NamedTuple):
     r12: np.ndarray
     known: np.ndarray
 
+    def with_model(self, model: np.ndarray, squared: bool) -> Points:
+        """The points with fitted sizes, and their pulls: of size² or of the size."""
+        pull = (self.size - model) / self.error
+        if squared:
+            pull = (self.size**2 - model**2) / (2.0 * self.weighed * self.error)
+        return self._replace(model=model, pull=pull)
+
     def where(self, i: int) -> str:
         """The settings of a point, in words."""
-        settings = (f"{n} = {v[i]:.4g} {self.units[n]}" for n, v in self.settings.items())
-        screen = [f"screen {self.screen[i]}"] if len(set(self.screen)) > 1 else []
-        return ", ".join([*settings, *screen])
+        settings = in_words({n: v[i] for n, v in self.settings.items()}, self.units)
+        screen = f"screen {self.screen[i]}" if len(set(self.screen)) > 1 else ""
+        return ", ".join(filter(None, (settings, screen)))
 
 
 @shown

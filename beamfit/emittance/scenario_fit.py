@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
@@ -14,7 +13,7 @@ import numpy as np
 from jax import Array
 
 from beamfit.compile_cache import SELDOM
-from beamfit.emittance.answer import SIGMA, Beside, plane_answer, units_of
+from beamfit.emittance.answer import SIGMA, BestFit, plane_answer, units_of
 from beamfit.emittance.assumptions import Anchor, Assumptions
 from beamfit.emittance.model import (
     QUANTITIES,
@@ -24,25 +23,21 @@ from beamfit.emittance.model import (
     size_squared,
     spoken,
 )
-from beamfit.emittance.results import Parameter, PlaneFit, Points
+from beamfit.emittance.results import Parameter, PlaneFit
 from beamfit.emittance.statement import (
-    PlaneSolution,
     PreparedScan,
+    Scanned,
     Scenario,
     asked_in,
-    pulls,
     size_record,
     size_records,
     with_posteriors,
 )
-from beamfit.emittance.systematics import effects_of
-from beamfit.emittance.transport import Look
+from beamfit.emittance.systematics import effect_words
 from beamfit.errors import Finding, Status
-from beamfit.greybox.covariance import Group
 from beamfit.greybox.fit import Derived, Fit
 from beamfit.greybox.problem import Problem
 from beamfit.greybox.solve import solve
-from beamfit.optics.beamline import Beamline
 from beamfit.statistics import Directions, scaled_directions
 
 # Ends of a search that are no answer.
@@ -50,8 +45,6 @@ NO_ANSWER = (Status.not_finite, Status.infeasible, Status.not_converged)
 NO_ANSWER += (Status.contradictory_bounds,)
 # How often errors are taken anew at most, and what change of them no longer matters.
 ROUNDS, SAME = 3, 1e-2
-# The noise of a record whose fit was refused.
-NOTHING = Group("", slice(0), True, math.nan, 0, 0.0, math.nan)
 
 
 def _numbers(model: Mapping[str, Any], asked: tuple[Asked, ...]) -> Array:
@@ -120,84 +113,57 @@ def _through(seen: PreparedScan, fit: Fit) -> PreparedScan:
     """See the scan through the line as a fit found it: each plane fitted in closed form."""
     records = size_records(fit.problem)
     elements = np.asarray(_elements(fit.model, tuple(records[p].data for p in seen.planes)))
-    look = np.array(seen.look)
+    look = seen.look.copy()
     look[:, ["xy".index(plane) for plane in seen.planes]] = np.swapaxes(elements, 0, 1)
-    return with_posteriors([seen._replace(look=Look(*look))])[0]
+    return with_posteriors([seen._replace(look=look)])[0]
 
 
-def judged_scenario(
-    fit: Fit,
-    seen: PreparedScan,
-    line: Beamline,
-    scenario: Scenario,
-    told: Assumptions,
-    parameters: tuple[Parameter, ...],
-) -> tuple[PlaneFit, ...]:
+def judged_scenario(of: Scanned) -> tuple[PlaneFit, ...]:
     """Answer for each plane of a scenario's fit.
 
     The posterior is that of the beam through the line as found, spread by what the other unknowns
     leave open.
     """
-    records = size_records(fit.problem)
-    asked = asked_in(fit.problem, seen, seen.planes, scenario.whole_map)
-    derived, jacobian = fit.derive(_numbers, asked), _loose_jacobian(fit)
-    places, beams = jax.tree.map(np.asarray, _places(fit.model, asked)), []
+    fit, seen = of.solved, of.seen
+    asked = asked_in(fit.problem, seen, seen.planes, of.statement.whole_map)
+    derived = fit.derive(_numbers, asked)
+    beams = []
     for i, plane in enumerate(seen.planes):
         own = Derived(*(part[i] for part in derived))
-        group = next((g for g in fit.groups if g.name == records[plane].name), NOTHING)
-        beside = _beside(fit, seen, plane, scenario, told, parameters, own, group.dof, jacobian)
         work = seen.solutions[plane]
-        points = _points_at(work, own.value[SIGMA], seen.rows.squared)
-        now = seen._replace(solutions=seen.solutions | {plane: work._replace(points=points)})
-        beams.append(plane_answer(now, line, plane, places[i], beside))
+        p = work.points
+        squared = size_squared(own.value[SIGMA], p.r11, p.r12, p.known)
+        p = p.with_model(np.sqrt(np.maximum(squared, 0.0)), seen.rows.squared)
+        now = seen._replace(solutions=seen.solutions | {plane: work._replace(points=p)})
+        places = map(np.asarray, asked_places(fit.model, asked[i]))
+        beams.append(plane_answer(now, of.line, plane, tuple(places), _best_fit(of, plane, own)))
     return tuple(beams)
 
 
-@partial(jax.jit, compiler_options=SELDOM)
-def _places(model: Mapping[str, Any], asked: tuple[Asked, ...]) -> list[tuple[Any, ...]]:
-    """βγ, matrices and design of each plane, through the line as the model has it."""
-    return [asked_places(model, each) for each in asked]
-
-
-def _points_at(work: PlaneSolution, sigma: np.ndarray, squared: bool) -> Points:
-    """The points as seen, with this fit's model."""
-    p = work.points
-    p = p._replace(model=np.sqrt(np.maximum(size_squared(sigma, p.r11, p.r12, p.known), 0.0)))
-    return p._replace(pull=pulls(p, squared))
-
-
-def _beside(
-    fit: Fit,
-    seen: PreparedScan,
-    plane: str,
-    scenario: Scenario,
-    told: Assumptions,
-    parameters: tuple[Parameter, ...],
-    own: Derived,
-    dof: float,
-    jacobian: np.ndarray,
-) -> Beside:
+def _best_fit(of: Scanned, plane: str, own: Derived) -> BestFit:
     """Further unknowns of the fit, as they enter the posterior of the beam."""
+    fit, told, scenario, jacobian = of.solved, of.told, of.statement, _loose_jacobian(of.solved)
+    record = size_records(fit.problem)[plane].name
     on_data = bool(np.isfinite(own.error[0])) and _held(fit) is None
-    effects = effects_of(fit, told, float(own.value[1]), np.nan_to_num(own.slope[1]))
+    effects = effect_words(fit, told, float(own.value[1]), np.nan_to_num(own.slope[1]))
     edges = "".join(
         f"; {p.name} ends at its {p.state} bound {p.value.value:.6g} "
         f"(d(chi2/2)/d(bound) = {p.multiplier:.2g})"
-        for p in parameters
+        for p in of.parameters
         if p.status is Status.at_limit
     )
     opened = "its value is decided by bounds and starting point, not by the data" + edges
     slopes = np.nan_to_num(own.slope[SIGMA])
-    return Beside(
+    return BestFit(
         value=own.value,
         spread=_further_spread(fit, plane, own, jacobian),
         covariance=slopes @ fit.covariance @ slopes.T,
         directions=_directions(fit, own.value[SIGMA], slopes, jacobian),
-        dof=dof,
+        dof=next((g.dof for g in fit.groups if g.name == record), 0.0),
         ending=_ending(scenario, told, fit),
         opened="" if on_data else opened,
-        remedy=scenario.remedy(seen, told),
-        remark=(_remark(scenario, parameters) + (effects.words if effects else "")).strip(),
+        remedy=scenario.remedy(of.seen, told),
+        remark=(_remark(scenario, of.parameters) + effects).strip(),
         scenario=scenario.name + (f" with {told.anchor.words}" if told.anchor != Anchor() else ""),
         holds="statistics, systematics" if told.systematics else "statistics only",
     )

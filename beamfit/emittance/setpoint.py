@@ -20,6 +20,7 @@ from beamfit.arrays import padded_length
 from beamfit.compile_cache import SELDOM
 from beamfit.emittance.calibration import with_numbers
 from beamfit.emittance.results import in_words
+from beamfit.emittance.scan import PLANES
 from beamfit.emittance.targets import (
     KINDS,
     SAME_ENERGY,
@@ -33,7 +34,7 @@ from beamfit.emittance.transport import setting_units
 from beamfit.errors import Finding, InputError, Status
 from beamfit.greybox import tree
 from beamfit.greybox.descend import Found, descend_all
-from beamfit.greybox.fit import Fit, FittedVariable
+from beamfit.greybox.fit import Fit
 from beamfit.greybox.problem import TOLERANCE, Free, Problem, Record, residual
 from beamfit.greybox.solve import search, solve
 from beamfit.optics.beamline import Beamline
@@ -47,7 +48,6 @@ STEPS, SHARP = 300, 1e-10
 # Two end points are one minimum if they differ by less than this share of the range.
 SAME = 1e-3
 MOST_MINIMA = 10
-PLANES = ("x", "y")
 # A target is met within the usual error of a measured size, or of the growth of a mismatch.
 MET = 0.02
 # What squares of a micrometre or a microradian, or BMAG - 1, come to by rounding.
@@ -280,7 +280,9 @@ def find_setpoint(
     listed = [Minimum(_settings(wanted, theta), value) for theta, value in minima]
     predicted = _predicted(wanted, used, fit.theta)
     misses = _relative_misses(wanted, targets, fit.theta)
-    held = [n for n, v in zip(vary, fit.variables, strict=True) if _pulled(v, fit.cost)]
+    ends = zip(vary, fit.variables, strict=True)
+    # A setting on its limit that would lower the objective by going on.
+    held = [n for n, v in ends if abs(v.value) == 1 and abs(v.reduced_gradient) > 1e-6 * fit.cost]
     reached, optimum = _reached_words(targets, predicted, misses), fit.kkt.worst <= TOLERANCE
     found = _verdict(reached, misses, listed[0].objective, optimum, held)
     return Setpoint(
@@ -334,26 +336,10 @@ def _settings(wanted: _Wanted, theta) -> dict[str, float]:
     return dict(zip(wanted.names, map(float, values), strict=True))
 
 
-def _plain(names: tuple[str, ...], line: Beamline, settings: Array) -> Array:
-    return line.matrix(dict(zip(names, settings, strict=True))).planes[:, :2, :2]
-
-
-# The derivatives by many settings of these eight numbers are had backwards, and once for all
-# directions: forwards they take five times as long with 31 magnets.
-_through = jax.custom_jvp(_plain, nondiff_argnums=(0,))
-
-
-@_through.defjvp
-def _through_slope(names, primals, tangents):
-    line, settings = primals
-    slope = jax.jacrev(_plain, 2)(names, line, settings)
-    return _plain(names, line, settings), slope @ tangents[1]
-
-
 def _at_place(wanted: _Wanted, theta: Array) -> Array:
     """R L of both planes, shape (2, 2, 2), with σ = L Lᵀ: rows are size and divergence."""
-    matrix = _through if len(wanted.names) > MANY else _plain
-    r = matrix(wanted.names, wanted.line, wanted.middle + wanted.reach * theta)
+    settings = dict(zip(wanted.names, wanted.middle + wanted.reach * theta, strict=True))
+    r = wanted.line.matrix(settings).planes[:, :2, :2]
     l11 = jnp.sqrt(wanted.sigma[:, 0])
     l21 = wanted.sigma[:, 1] / l11
     l22 = jnp.sqrt(wanted.sigma[:, 2] - l21**2)
@@ -467,11 +453,6 @@ def _relative_misses(wanted: _Wanted, targets, theta: np.ndarray) -> tuple[float
     lengths = np.linalg.norm(_misses({"settings": jnp.asarray(theta)}, wanted), axis=1)
     pairs = zip(targets, lengths, strict=False)  # the rest is padding
     return tuple(float(m / (1e6 * t.value) if np.ndim(t.value) == 0 else m**2) for t, m in pairs)
-
-
-def _pulled(v: FittedVariable, cost: float) -> bool:
-    """True if a setting on its limit would lower the objective by going on."""
-    return abs(v.value) == 1.0 and abs(v.reduced_gradient) > 1e-6 * cost
 
 
 def _setting_errors(

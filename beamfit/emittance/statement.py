@@ -21,9 +21,9 @@ from beamfit.emittance.results import Parameter, PlaneFit, Points
 from beamfit.emittance.scan import QuadScan, check_names
 from beamfit.emittance.shots import of_settings
 from beamfit.emittance.transport import (
-    Look,
     Rows,
     check_gradients,
+    damping_of,
     look_through,
     names_of,
     padded,
@@ -31,7 +31,7 @@ from beamfit.emittance.transport import (
     scan_rows,
     scanned_line,
 )
-from beamfit.emittance.verdict import MOST_NAMED
+from beamfit.emittance.verdict import named
 from beamfit.greybox.problem import Constraint, Free, Prior, Problem, Record
 from beamfit.noise.model import Noise
 from beamfit.noise.sizes import ShotMeans, evened, means_of
@@ -92,8 +92,9 @@ class PreparedScan(NamedTuple):
         The scan's rows through that line, padded; what no row changes is multiplied out.
     noise : Noise
         Priors of the noise of sizes.
-    look : Look
-        The same, with every magnet as the lattice has it; NumPy arrays.
+    look : ndarray
+        R11, R12 and known size² of both planes, shape (3, 2, rows), with every magnet as the
+        lattice has it.
     solutions : dict of str to PlaneSolution
         Plane to its fit; of every plane that was measured.
     kept, any_energy : tuple of str and bool
@@ -108,7 +109,7 @@ class PreparedScan(NamedTuple):
     weights: str
     rows: Rows
     noise: Noise
-    look: Look
+    look: np.ndarray
     solutions: dict[str, PlaneSolution]
     kept: tuple[str, ...] = ()
     any_energy: bool = False
@@ -127,11 +128,14 @@ class PreparedScan(NamedTuple):
         """Indices of the rows in which a plane was measured."""
         return np.flatnonzero(~np.isnan(self.scan.size[plane]))
 
-    def known_at(self, line: Beamline, place: str) -> tuple[float, float, float]:
-        """Energy spread, resolution (m) and energy (MeV) of a further row on a screen of a line.
+    def rows_at(
+        self, line: Beamline, plane: str, place: str, settings: Mapping[str, Any], energy: Any
+    ) -> Rows:
+        """Rows of one plane's sizes on a screen of a line, which nobody need have measured.
 
-        What the scan itself says, in the middle of its rows (of the resolution those on that
-        screen), goes before the line.
+        Settings and energies (MeV) are as of `Rows`. What the scan itself says of energy spread and
+        resolution, in the middle of its rows (of the resolution those on that screen), goes before
+        the line.
         """
         scan = self.scan
         spread = line.energy_spread if scan.energy_spread is None else np.median(scan.energy_spread)
@@ -139,7 +143,9 @@ class PreparedScan(NamedTuple):
         resolution = getattr(line[place], "resolution", 0.0)
         if scan.resolution is not None and place in screens:
             resolution = np.median(scan.resolution[np.array(screens) == place])
-        return float(spread), float(resolution), self.energy
+        one, damping = np.ones(len(energy)), damping_of(energy, self.energy, float(line.mass))
+        known = np.zeros(len(one), int), float(spread) * one, float(resolution) * one, damping
+        return Rows(plane, (place,), False, line, settings, energy, *known)
 
     @property
     def energy(self) -> float:
@@ -192,9 +198,11 @@ class Scanned(Protocol):
     """A fitted scan, of any scenario."""
 
     planes: tuple[PlaneFit, ...]
+    line: Beamline
     statement: Scenario
     told: Assumptions
     seen: PreparedScan
+    parameters: tuple[Parameter, ...]
     solved: Fit | None
 
 
@@ -350,19 +358,13 @@ def of_one_beam(
         found = f"a scan of {len(scan.slices)} slices of the beam"
         raise scan.unusable(found, "rows of one, as scan.of_slice(name) gives")
     line = rows_line(scan) if line is None else line
-    _check_own(scan, line, scenario)
-    return of_settings(scan.of_particle(line.mass)), line
-
-
-def _check_own(scan: QuadScan, line: Beamline, scenario: str) -> None:
-    """Refuse to have the matrices of rows both given and unknown, or given twice."""
-    if scan.transfer is None:
-        return
-    if line.magnets or float(line.length) > 0.0:
-        raise scan.unusable("rows with matrices of their own and a line", "one of the two")
-    if scenario != "known":
+    own = "rows with matrices of their own"
+    if scan.transfer and (line.magnets or float(line.length) > 0.0):
+        raise scan.unusable(f"{own} and a line", "one of the two")
+    if scan.transfer and scenario != "known":
         expected = "scenario known, or settings and a lattice"
-        raise scan.unusable(f"scenario {scenario} for rows with matrices of their own", expected)
+        raise scan.unusable(f"scenario {scenario} for {own}", expected)
+    return of_settings(scan.of_particle(line.mass)), line
 
 
 def unfitted(
@@ -400,10 +402,9 @@ def looked_through(begun: Sequence[PreparedScan]) -> list[PreparedScan]:
             columns = zip(
                 *(leaves for _, leaves in own + own[-1:] * (lanes - len(own))), strict=True
             )
-            looks = jax.tree.map(np.asarray, _looks([np.stack(c) for c in columns], kind))
+            looks = np.asarray(_looks([np.stack(c) for c in columns], kind))
             for lane, (i, _) in enumerate(own):
-                look = jax.tree.map(lambda a, lane=lane: a[lane], looks)
-                found[i] = begun[i]._replace(look=look)
+                found[i] = begun[i]._replace(look=looks[lane])
     return found
 
 
@@ -432,7 +433,7 @@ def with_posteriors(begun: Sequence[PreparedScan]) -> list[PreparedScan]:
 def plane_sizes(seen: PreparedScan, plane: str) -> tuple[PlaneSizes, ShotMeans | None]:
     """The sizes of a plane with their errors, and what its shots say."""
     scan, at, i = seen.scan, seen.measured(plane), "xy".index(plane)
-    r11, r12, known = (part[i, at] for part in seen.look[:3])
+    r11, r12, known = seen.look[:, i, at]
     size, error, shots = scan.size[plane][at], scan.error.get(plane), None
     if plane in scan.shot_size and (shots := means_of(scan.shot_size[plane][at], seen.noise)):
         size, error = shots.size, shots.error
@@ -468,36 +469,25 @@ def _work(
         r12=sizes.r12,
         known=sizes.known,
     )
-    points = points._replace(pull=pulls(points, seen.rows.squared))
+    points = points.with_model(post.model, seen.rows.squared)
     return PlaneSolution(sizes, post, points, _shot_words(points, shots))
-
-
-def pulls(p: Points, squared: bool) -> np.ndarray:
-    """Residual of the quantity that was fitted, over its error."""
-    if squared:
-        return (p.size**2 - p.model**2) / (2.0 * p.weighed * p.error)
-    return (p.size - p.model) / p.error
 
 
 def _shot_words(p: Points, shots: ShotMeans | None) -> str:
     """Count and name the shots that surely show no beam."""
     if shots is None:
         return ""
-    lost = np.argwhere(np.nan_to_num(shots.bad) > 0.99)
-    unsteady = ""
+    lost, said = np.argwhere(np.nan_to_num(shots.bad) > 0.99), []
+    if len(lost):
+        count, are = int((~np.isnan(shots.bad)).sum()), "are" if len(lost) > 1 else "is"
+        places = named([f"shot {j + 1} at {p.where(i)}" for i, j in lost])
+        said.append(f"{len(lost)} of {count} shots {are} left out, no beam there: {places}.")
     if shots.scatter > UNSTEADY:
-        unsteady = (
+        said.append(
             f"Shots of one setting scatter by {100 * shots.scatter:.2g} %: the beam changes from "
             "shot to shot, and this is that of the mean sizes."
         )
-    if not len(lost):
-        return unsteady
-    count = int((~np.isnan(shots.bad)).sum())
-    places = [f"shot {j + 1} at {p.where(i)}" for i, j in lost[:MOST_NAMED]]
-    places += [f"{len(lost) - MOST_NAMED} more"] * (len(lost) > MOST_NAMED)
-    are = "are" if len(lost) > 1 else "is"
-    said = f"{len(lost)} of {count} shots {are} left out, no beam there: {'; '.join(places)}."
-    return f"{said} {unsteady}".strip()
+    return " ".join(said)
 
 
 # Nothing but the beam is unknown; as a problem for those who want more than the posterior.

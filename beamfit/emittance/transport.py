@@ -10,7 +10,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from functools import lru_cache
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -292,62 +292,21 @@ def scan_rows(
     )
 
 
-def rows_at(
-    line: Beamline,
-    plane: str,
-    place: str,
-    settings: Mapping[str, Any],
-    energy: np.ndarray,
-    spread: float,
-    resolution: float,
-    mean: float,
-) -> Rows:
-    """Rows of one plane's sizes at one place, which nobody need have measured.
-
-    Parameters
-    ----------
-    line : Beamline
-        As the rows see it.
-    plane, place : str
-        Which size, and where.
-    settings : mapping of str to array
-        As of `Rows`, shape (n,) or (n, 2).
-    energy : ndarray
-        MeV, shape (n,).
-    spread, resolution : float
-        Momentum spread, and point-spread rms in m.
-    mean : float
-        The energy of the beam that is asked for, MeV.
-    """
-    one, places = np.ones(len(energy)), np.zeros(len(energy), int)
-    known = float(spread) * one, float(resolution) * one
-    damping = damping_of(energy, mean, float(line.mass))
-    return Rows(plane, (place,), False, line, settings, energy, places, *known, damping)
-
-
 def damping_of(energy: np.ndarray, mean: float, mass: float) -> np.ndarray:
     """Square root of the ratio of a geometric emittance to that at the mean energy."""
     return np.sqrt(beta_gamma(mean, mass) / beta_gamma(energy, mass))
 
 
-class Look(NamedTuple):
-    """Both planes of a scan's rows through a line, each of shape (2, rows).
+def look_through(rows: Rows) -> Array:
+    """Carry the rows of a scan to their screens, in both planes and one pass.
 
-    Attributes
-    ----------
-    r11, r12, known : Array
-        Transfer-matrix elements to the screens (R12 in m), size² not due to the beam, m².
+    Returns
+    -------
+    Array, shape (3, 2, rows)
+        R11, R12 (m) and the size² that is not due to the beam (m²), of x and y.
     """
-
-    r11: Array
-    r12: Array
-    known: Array
-
-
-def look_through(rows: Rows) -> Look:
-    """Carry the rows of a scan to their screens, in both planes and one pass."""
-    seen = [rows.known(r) for r in rows.both(rows.line, rows.energy)]
-    return Look(*(jnp.stack(part) for part in zip(*seen, strict=True)))
+    seen = [jnp.stack(rows.known(r)) for r in rows.both(rows.line, rows.energy)]
+    return jnp.stack(seen, axis=1)
 
 
 def setting_units(line: Beamline, magnets: Iterable[str]) -> dict[str, str]:

@@ -2,36 +2,128 @@
 
 Signs of the gains, report eqs 38-39, are taken from first principles over the box of the scan,
 where they have one sign, and hold by the signs of the weights. What the sizes then leave open is
-large: see docs/scenarios.md.
+large: see docs/scenarios.md. Anchors, or limits of gains and a box (Appendix B), come first: the
+focusing network has the same anchors.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import NamedTuple
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
 from beamfit.emittance.assumptions import Assumptions
-from beamfit.emittance.constrained_network import (
-    MOST,
-    beam_box,
-    check_box,
-    known_record,
-    limited_network,
-    network_problem,
-)
-from beamfit.emittance.statement import PreparedScan, Scenario, varied_magnets
+from beamfit.emittance.model import UNIT, sigma_of
+from beamfit.emittance.statement import PreparedScan, Scenario, beam_problem, varied_magnets
 from beamfit.emittance.transport import NetworkRows, padded
-from beamfit.greybox.mlp import MLP, Port
-from beamfit.greybox.problem import Free, Problem, Record
+from beamfit.errors import InputError, nearest
+from beamfit.greybox.gains import certified_gain
+from beamfit.greybox.mlp import MLP, Port, dense
+from beamfit.greybox.problem import Constraint, Free, Prior, Problem, Record
 from beamfit.greybox.signed_network import cells_along, signed_network
 from beamfit.optics.beamline import transfer_rows
 
+# Bounds of the weights: the report's (appendix B).
+MOST = 10.0
+# The appendix's random start of a weight; it gives the network no straight line to begin with.
+START = 0.01
+SIGMA = ("sigma11", "sigma12", "sigma22")
 ELEMENTS = "ABCD"
 # The sharpness of det T = 1.
 DETERMINANT = 1e-3
+
+
+def network_problem(
+    seen: PreparedScan,
+    told: Assumptions,
+    inputs: Sequence[str],
+    common: Iterable[str],
+    rows: Mapping[str, Any],
+    part: Mapping[str, Any],
+    weights: Iterable[Free],
+    records: Iterable[Record],
+    limits: Iterable[Constraint] = (),
+) -> Problem:
+    """Beams and networks, a part of the model, with the error that all settings share.
+
+    A wrong energy or slope moves every setting alike, and does not average out over them. How much
+    of a deviation is `common` to each of these nobody knows, so it may be all of it.
+    """
+    for name in (name for place in told.anchor.at for name in place):
+        if name not in inputs:
+            raise InputError(f"an anchor at '{name}'", f"a scanned magnet: {', '.join(inputs)}")
+    sd = told.anchor.deviation
+    shared = {} if sd is None else {"anchor": dict.fromkeys(common, 0.0)}
+    names = [f"anchor.{name}" for name in shared.get("anchor", ())]
+    free = [*weights, *(Free(name, -0.9, nuisance=True) for name in names)]
+    priors = [Prior(name, 0.0, sd) for name in names]
+    return beam_problem(seen, rows, {**part, **shared}, free, records, priors, limits)
+
+
+def known_record(
+    name: str, predict: Callable[[Any, Any], Any], data: Any, values: Any, sd: Any
+) -> Record:
+    """First principles as a record of a network, padded; ``data`` is padded already."""
+    values = np.asarray(values, float)
+    full = padded(values)
+    weight = np.zeros(full.shape)
+    weight[: len(values)] = 1.0
+    return Record(name, predict, data, full, padded(np.broadcast_to(sd, values.shape)), weight)
+
+
+@dataclass(frozen=True)
+class _Sigma:
+    """σ11, σ12, σ22 of a plane in units of 1e-8 SI; equal ones share their compiled code."""
+
+    plane: str
+
+    def __call__(self, model: Any, data: None) -> jax.Array:
+        return sigma_of(model["beam"][self.plane]) / UNIT**2
+
+
+def beam_box(told: Assumptions, planes: Sequence[str]) -> list[Constraint]:
+    """The box of each plane's beam matrix, one constraint a plane that has bounds."""
+    found = []
+    for plane in planes:
+        named = [told.bounds.get(f"{plane}.{name}", (-np.inf, np.inf)) for name in SIGMA]
+        low, high = np.array(named).T / UNIT**2
+        if np.isfinite(low).any():
+            found.append(Constraint(f"box {plane}", _Sigma(plane), None, low, high))
+    return found
+
+
+def limited_network(
+    inputs: Sequence[str], box: np.ndarray, outputs: Sequence[str], told: Assumptions
+) -> tuple[MLP, list[Free], list[Constraint]]:
+    """The network of Appendix B: no scales, weights within ± 10, gains limited in a box (2, n)."""
+    low, high = box.tolist()
+    ports = [Port(n, "", lower=a, upper=b) for n, a, b in zip(inputs, low, high, strict=True)]
+    net = dense(ports, outputs, [told.hidden], seed=told.seed, spread=START)
+    free = [Free("map", -MOST, MOST, (-START, START), nuisance=True)]
+    limits, cells = [], cells_along(len(inputs))
+    for name, (least, most) in told.gains.items():
+        output, by = (part.removeprefix("d") for part in name.split("/", 1))  # dA_x/dQ2
+        limits += certified_gain("map", output, by, (low, high), cells, lower=least, upper=most)
+    return net, free, limits
+
+
+def check_box(told: Assumptions, inputs: Sequence[str], outputs: Sequence[str], planes) -> None:
+    """Refuse bounds and gains of what there is not.
+
+    Raises
+    ------
+    InputError
+        Naming the nearest there is.
+    """
+    numbers = [f"{plane}.{name}" for plane in planes for name in SIGMA] + list(inputs)
+    gains = [f"d{output}/d{by}" for output in outputs for by in inputs]
+    for what, named, known in (("bounds on", told.bounds, numbers), ("gain", told.gains, gains)):
+        for name in named:
+            if name not in known:
+                raise InputError(f"{what} '{name}'", nearest(name, known))
 
 
 class _Layout(NamedTuple):
@@ -42,11 +134,6 @@ class _Layout(NamedTuple):
     with_energy: bool
     elements: int
     box: np.ndarray
-
-    @property
-    def cells(self) -> int:
-        """Along each input, in which gains are enclosed."""
-        return cells_along(len(self.names))
 
 
 def _layout(seen: PreparedScan, told: Assumptions) -> _Layout:
@@ -114,7 +201,7 @@ def network_rows(seen: PreparedScan, lay: _Layout, plane: str) -> NetworkRows:
         seen.rows.squared,
         padded(lay.columns),
         _columns(seen, lay, plane, seen.rows.which),
-        seen.look.known["xy".index(plane)],
+        seen.look[2, "xy".index(plane)],
         seen.rows.damping,
     )
 
@@ -130,7 +217,7 @@ def _state(seen: PreparedScan, told: Assumptions) -> Problem:
     outputs = _names(seen, lay)
     check_box(told, lay.names, outputs, seen.planes)
     if told.gains:
-        net, weights, limits = limited_network(lay.names, lay.box, outputs, told, lay.cells)
+        net, weights, limits = limited_network(lay.names, lay.box, outputs, told)
     else:
         (net, weights), limits = _signed(seen, lay, told), []
     limits += beam_box(told, seen.planes)

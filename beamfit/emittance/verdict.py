@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -264,11 +264,9 @@ def point_remarks(
     """
     bad = np.flatnonzero(p.outlier_probability > 0.5)
     if len(bad):
-        places = [p.where(i) for i in bad[:MOST_NAMED]]
-        places += [f"{len(bad) - MOST_NAMED} more"] * (len(bad) > MOST_NAMED)
         verb = "are" if len(bad) > 1 else "is"
         said = f"{len(bad)} of {len(p.size)} readings {verb} probably bad"
-        yield f"{said}: {'; '.join(places)}."
+        yield f"{said}: {named([p.where(i) for i in bad])}."
     if carrying and math.isnan(without):
         yield f"It rests on the point at {carrying}: without it there is no answer."
     elif carrying:
@@ -278,6 +276,18 @@ def point_remarks(
             f"It rests on the point at {carrying}: without it the normalised emittance is "
             f"{without / factor:.3g} {unit}{reach}."
         )
+
+
+def named(places: Sequence[str]) -> str:
+    """Name the first few places.
+
+    Examples
+    --------
+    >>> named("abcdefg")
+    'a; b; c; d; e; 2 more'
+    """
+    more = len(places) - MOST_NAMED
+    return "; ".join([*places[:MOST_NAMED], *[f"{more} more"] * (more > 0)])
 
 
 def resolution_remark(size: np.ndarray, known: np.ndarray) -> str:
@@ -296,18 +306,6 @@ def resolution_remark(size: np.ndarray, known: np.ndarray) -> str:
         f"{below} of {len(size)} sizes {verb} smaller than resolution and dispersion alone make "
         f"{them}: check both."
     )
-
-
-def one_magnet(settings: dict[str, np.ndarray], screens: tuple[str, ...]) -> np.ndarray | None:
-    """The settings of the one magnet that was scanned before one screen; None if there were more.
-
-    Examples
-    --------
-    >>> one_magnet({"Q1": np.zeros(3), "Q2": np.arange(3.0)}, ("S",) * 3).tolist()
-    [0.0, 1.0, 2.0]
-    """
-    varied = [v for v in settings.values() if np.ptp(v) > 0]
-    return varied[0] if len(varied) == 1 and len(set(screens)) == 1 else None
 
 
 def waist_bracketed(
@@ -335,10 +333,10 @@ def waist_bracketed(
     >>> waist_bracketed({"Q": np.arange(3.0)}, ("S",) * 3, sizes, 0.1 * sizes)
     True
     """
-    varied = one_magnet(settings, screens)
-    if varied is None:
+    varied = [v for v in settings.values() if np.ptp(v) > 0]
+    if len(varied) != 1 or len(set(screens)) != 1:
         return None
-    order = np.argsort(varied, kind="stable")
+    order = np.argsort(varied[0], kind="stable")
     size, error = size[order], error[order]
     low = int(np.argmin(size))
     rise = (size - size[low]) > 2.0 * np.hypot(error, error[low])

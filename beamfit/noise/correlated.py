@@ -22,8 +22,8 @@ from beamfit.noise.memory import (
     CorrelatedNoise,
     Levels,
     levelled_products,
+    noises,
     products_by_each,
-    white_shares,
     without_flicker,
 )
 from beamfit.statistics import log_student
@@ -353,26 +353,6 @@ def range_of(time: np.ndarray) -> tuple[float, float]:
     """Correlation times that readings at these times can tell from none and from a random walk."""
     usual = float(np.median(np.diff(time)))
     return SHORTEST * usual, LONGEST * float(time[-1] - time[0])
-
-
-def noises(
-    ends: tuple[float, float], usual: float, count: int, ratios: Sequence[float] = (0.0,)
-) -> list[CorrelatedNoise]:
-    """Noises that are looked at: correlation times between two, and with each the ratios of the
-    white variance to what the part with a memory gets anew in a usual interval.
-
-    Examples
-    --------
-    >>> [noise.time for noise in noises((1.0, 4.0), 1.0, 3)]
-    [1.0, 2.0, 4.0]
-    """
-    times = np.geomspace(*ends, count)
-    shares = white_shares(usual / times, ratios)
-    return [
-        CorrelatedNoise(float(each), float(white))
-        for each, row in zip(times, shares, strict=True)
-        for white in row
-    ]
 
 
 def usual_noises(time: np.ndarray) -> list[CorrelatedNoise]:

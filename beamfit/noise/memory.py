@@ -205,6 +205,22 @@ def white_shares(apart, ratios=BESIDE) -> np.ndarray:
     return white / (1.0 + white)
 
 
+def noises(
+    ends: tuple[float, float], usual: float, count: int, ratios: Sequence[float] = (0.0,)
+) -> list[CorrelatedNoise]:
+    """Noises that are looked at: correlation times between two, and with each the ratios of the
+    white variance to what the part with a memory gets anew in a usual interval.
+
+    Examples
+    --------
+    >>> [noise.time for noise in noises((1.0, 4.0), 1.0, 3)]
+    [1.0, 2.0, 4.0]
+    """
+    times = np.geomspace(*ends, count)
+    rows = zip(times.tolist(), white_shares(usual / times, ratios).tolist(), strict=True)
+    return [CorrelatedNoise(time, white) for time, row in rows for white in row]
+
+
 def products_by_each(
     noises: Sequence[CorrelatedNoise], rows: np.ndarray, interval: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -352,14 +368,11 @@ def kinds_of(time: np.ndarray, count: int = TIMES) -> list[MemoryKind]:
     (89, 1.0)
     """
     usual, span = float(np.median(np.diff(time))), float(time[-1] - time[0])
-    times = np.geomspace(SHORTEST * usual, LONGEST * span, count)
     chance = np.full(count, CORRELATED / count)
     chance[-1] += WALK  # the longest memory is as a walk of the record
-    memory = [
-        MemoryKind(float(each) / len(BESIDE), float(t), float(white))
-        for t, each, row in zip(times, chance, white_shares(usual / times), strict=True)
-        for white in row
-    ]
+    each = np.repeat(chance / len(BESIDE), len(BESIDE)).tolist()
+    found = noises((SHORTEST * usual, LONGEST * span), usual, count, BESIDE)
+    memory = [MemoryKind(chance, *noise) for chance, noise in zip(each, found, strict=True)]
     flicker = [MemoryKind(FLICKER / len(POWERS), power=power) for power in POWERS]
     return [MemoryKind(WHITE), *flicker, *memory]
 

@@ -16,9 +16,9 @@ from beamfit.answer import Table, cell, labelled
 from beamfit.emittance.fit import EmittanceFit
 from beamfit.emittance.results import PlaneFit, degrees, result_rows
 from beamfit.emittance.scan import PROJECTED, QuadScan
-from beamfit.emittance.sensitivity import budget_rows, range_rows
 from beamfit.emittance.size_methods import SizeMethods
 from beamfit.emittance.slices import SliceFits
+from beamfit.emittance.systematics import budget_rows, range_rows
 from beamfit.errors import Status
 from beamfit.report.document import MOST_DRAWN, Picture, ReportPage, Verdict, from_head
 from beamfit.report.scan_pictures import (

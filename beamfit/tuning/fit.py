@@ -38,12 +38,7 @@ from beamfit.tuning.minimum import (
     next_row,
     values_at,
 )
-from beamfit.tuning.readings import (
-    emittance_readings,
-    log_no_beam,
-    plane_readings,
-    seen_without,
-)
+from beamfit.tuning.readings import emittance_readings, log_no_beam, plane_readings, seen_without
 
 # Draws of the map: the ends of a 95 % interval are known to a tenth of its half-width.
 DRAWS = 256

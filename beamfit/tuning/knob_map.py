@@ -314,6 +314,11 @@ def _covariance(eta: Array, by: _Linear, orders: np.ndarray) -> Array:
     return a @ a.T + jnp.diag(_variance(by.data, scales.noise, by.good))
 
 
+def _inverse(covariance: Array) -> Array:
+    factor = jax.scipy.linalg.cho_factor(covariance)
+    return jax.scipy.linalg.cho_solve(factor, jnp.eye(len(covariance)))
+
+
 def _log_evidence(eta: Array, by: _Linear, orders: np.ndarray) -> Array:
     """Log evidence of the scales times their prior.
 
@@ -335,9 +340,7 @@ def _scoring(eta: Array, by: _Linear, orders: np.ndarray) -> tuple[Array, Array]
     """
     covariance = _covariance(eta, by, orders)
     changes = jnp.moveaxis(jax.jacfwd(_covariance)(eta, by, orders), -1, 0)
-    inverse = jax.scipy.linalg.cho_solve(
-        jax.scipy.linalg.cho_factor(covariance), jnp.eye(len(covariance))
-    )
+    inverse = _inverse(covariance)
     each, z = inverse @ changes, inverse @ by.off
     mean, spread = prior_of(by.data)
     slope = 0.5 * (jnp.einsum("i,kij,j->k", z, changes, z) - jnp.trace(each, axis1=1, axis2=2))
@@ -353,9 +356,7 @@ def _judged(eta: Array, by: _Linear, orders: np.ndarray) -> tuple[Array, Array]:
     Williams, eq. 5.12), as expectation propagation does (sect. 3.6).
     """
     data, covariance = by.data, _covariance(eta, by, orders)
-    inverse = jax.scipy.linalg.cho_solve(
-        jax.scipy.linalg.cho_factor(covariance), jnp.eye(len(covariance))
-    )
+    inverse = _inverse(covariance)
     alone = 1.0 / jnp.diag(inverse)
     square = (alone * (inverse @ by.off)) ** 2
     own = _variance(data, jnp.exp(eta[-1]), 1.0)

@@ -10,7 +10,7 @@ from scipy.optimize import curve_fit, minimize
 
 import beamfit
 from beamfit.emittance.fit import fit_many
-from beamfit.emittance.sensitivity import systematics
+from beamfit.emittance.systematics import systematics
 
 from .. import verdict
 from .answers import Answer, of_draws, of_quantity, of_sigma

@@ -9,7 +9,7 @@ import pytest
 from scipy.linalg import block_diag
 
 import beamfit
-from beamfit.emittance.sensitivity import (
+from beamfit.emittance.systematics import (
     MOST_CAUSES,
     budget_rows,
     range_sensitivity,

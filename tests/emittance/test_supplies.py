@@ -5,7 +5,7 @@ import pytest
 
 import beamfit
 from beamfit.emittance.design import plan_measurements
-from beamfit.emittance.sensitivity import systematics
+from beamfit.emittance.systematics import systematics
 from beamfit.emittance.targets import Target
 from beamfit.errors import InputError
 from beamfit.io.line import build_line, read_lattice

@@ -8,7 +8,7 @@ import pytest
 from scipy.stats import binom
 
 import beamfit
-from beamfit.emittance.sensitivity import systematics
+from beamfit.emittance.systematics import systematics
 from beamfit.errors import InputError
 from beamfit.io.priors import read_systematics
 from beamfit.optics.calibration import scaled
