@@ -25,6 +25,8 @@ from beamfit.particles import ELECTRON_MASS
 
 # Most matrices in memory, elements times rows, if each row has its own energy.
 MOST_AT_ONCE = 100_000
+# Most numbers of a calibration by which the line is differentiated directly; a network has more.
+MOST_DIRECT = 3
 
 
 def _plain(value: Any) -> Any:
@@ -451,11 +453,49 @@ def _condensed(same: Same, keep: frozenset[str], energy: float | None) -> Beamli
     return same.line.condensed(keep, energy)
 
 
+def _from_strengths(
+    places: tuple[str, ...], strengths: dict[str, Array], line: Beamline, energy: Array
+) -> Array:
+    found = line.matrices(places, strengths, energy)
+    return jnp.stack([jnp.asarray(found[p].planes) for p in places], axis=-3)
+
+
+# A row has few strengths, the weights of a network are many: so the line is differentiated by
+# strengths alone, and what those hang on is carried through one small product.
+_by_strengths = jax.custom_jvp(_from_strengths, nondiff_argnums=(0,))
+
+
+@partial(_by_strengths.defjvp, symbolic_zeros=True)
+def _through_strengths(places, given, changes):
+    strengths, *others = given
+    found = _from_strengths(places, *given)
+    slopes = jax.jacfwd(partial(_from_strengths, places))(*given)
+    moved = [slopes[name] * d for name, d in changes[0].items() if not _still(d)]
+    leaves, kind = jax.tree.flatten(others)
+    rest = jax.tree.leaves(changes[1:], is_leaf=_still)
+    moving = [i for i, d in enumerate(rest) if not _still(d)]
+
+    def by_rest(values):
+        every = dict(enumerate(leaves)) | dict(zip(moving, values, strict=True))
+        return _from_strengths(places, strengths, *jax.tree.unflatten(kind, every.values()))
+
+    if moving:
+        at, along = ([part[i] for i in moving] for part in (leaves, rest))
+        moved.append(jax.jvp(by_rest, (at,), (along,))[1])
+    return found, sum(moved, jnp.zeros_like(found))
+
+
+def _still(change: Any) -> bool:
+    return isinstance(change, jax.custom_derivatives.SymbolicZero)
+
+
 @partial(jax.jit, static_argnames="places")
 def _rows(
     line: Beamline, settings: dict[str, Array], energy: Array, places: tuple[str, ...]
 ) -> TransferMatrix:
     bare, members = line, [(m, name) for name in settings for m in line.members(name)]
+    weights = [np.size(v) for m, _ in members for v in jax.tree.leaves(line[m].calibration)]
+    through = _by_strengths if sum(weights) > MOST_DIRECT * len(members) else _from_strengths
     for m, _ in members:
         bare = bare.with_element(replace(line[m], calibration=IntegratedStrength(), setting=0.0))
 
@@ -466,8 +506,7 @@ def _rows(
             m: jnp.asarray(line[m].calibration.k1l(setting[name], line[m].length, at), float)
             for m, name in members
         }
-        found = bare.matrices(places, strengths, at)
-        return jnp.stack([jnp.asarray(found[p].planes) for p in places], axis=-3)
+        return through(places, strengths, bare, at)
 
     rows = (settings, None if jnp.ndim(energy) == 0 else energy)
     long = max((e.order.size for e in line.elements if isinstance(e, ElementSeries)), default=0)
