@@ -336,10 +336,26 @@ def _settings(wanted: _Wanted, theta) -> dict[str, float]:
     return dict(zip(wanted.names, map(float, values), strict=True))
 
 
+def _plain(names: tuple[str, ...], line: Beamline, settings: Array) -> Array:
+    return line.matrix(dict(zip(names, settings, strict=True))).planes[:, :2, :2]
+
+
+# The derivatives by many settings of these eight numbers are had backwards, and once for all
+# directions: forwards they take three to five times as long with 31 magnets.
+_through = jax.custom_jvp(_plain, nondiff_argnums=(0,))
+
+
+@_through.defjvp
+def _through_slope(names, primals, tangents):
+    line, settings = primals
+    slope = jax.jacrev(_plain, 2)(names, line, settings)
+    return _plain(names, line, settings), slope @ tangents[1]
+
+
 def _at_place(wanted: _Wanted, theta: Array) -> Array:
     """R L of both planes, shape (2, 2, 2), with σ = L Lᵀ: rows are size and divergence."""
-    settings = dict(zip(wanted.names, wanted.middle + wanted.reach * theta, strict=True))
-    r = wanted.line.matrix(settings).planes[:, :2, :2]
+    matrix = _through if len(wanted.names) > MANY else _plain
+    r = matrix(wanted.names, wanted.line, wanted.middle + wanted.reach * theta)
     l11 = jnp.sqrt(wanted.sigma[:, 0])
     l21 = wanted.sigma[:, 1] / l11
     l22 = jnp.sqrt(wanted.sigma[:, 2] - l21**2)
