@@ -413,6 +413,20 @@ def test_readings_between_overlapping_steps_are_of_neither_side():
         assert slope == pytest.approx(-1 / 36000, rel=1e-3)
 
 
+@pytest.mark.parametrize("clock", [1e-6, 1e-3, 0.2])
+def test_digits_of_readings_by_a_clock_that_is_not_exact_are_no_steps(clock):
+    """SIMULATED: the beam loses about a digit from reading to reading."""
+    rng = np.random.default_rng(4)
+    time = 20.3066 * np.arange(400)
+    time += clock * rng.uniform(-0.5, 0.5, 400)
+    beam = 400 / (1.2 * np.exp(time / 18000) - 0.2) + 0.02 * rng.normal(size=400)
+    [decay] = (study := study_record(DecayRecord(time - time[0], np.round(beam)))).answers
+    found = decay.fit.lifetime_mean
+    assert (study.events, len(decay.fit.readings)) == ((), 400)
+    share = 0.2 * decay.fit.mean_current / 400
+    assert abs(found.value - 5 / (1 + share)) < 3 * found.error < 0.2
+
+
 def test_digits_of_two_detectors_are_no_steps():
     """SIMULATED: one shows the upper half of three fills to 0.1 mA, the other to 1 µA."""
     beam = 300 * np.exp(-(10.0 * np.arange(1200) % 4000) / 36000)
