@@ -413,6 +413,18 @@ def test_readings_between_overlapping_steps_are_of_neither_side():
         assert slope == pytest.approx(-1 / 36000, rel=1e-3)
 
 
+def test_a_few_readings_of_a_decay_behind_a_slow_fill_are_fitted():
+    """SIMULATED: 20 readings of injection, in even steps, and 30 of a decay."""
+    a, b, since = 2.5e-7, 7.5e-5, 370.0 * np.arange(30)
+    beam = 262 * b / ((a * 262 + b) * np.exp(b * since) - a * 262)
+    beam += 0.1 * np.random.default_rng(1).normal(size=30)
+    record = DecayRecord(370.0 * np.arange(50), np.r_[np.linspace(0.0, 249.0, 20), beam])
+    [decay] = (study := study_record(record)).answers
+    assert "slow refill" in [event.kind for event in study.events]
+    found = decay.fit.lifetime_mean
+    assert abs(found.value - 1 / (a * decay.fit.mean_current + b) / 3600) < 3 * found.error < 0.2
+
+
 @pytest.mark.parametrize("clock", [1e-6, 1e-3, 0.2])
 def test_digits_of_readings_by_a_clock_that_is_not_exact_are_no_steps(clock):
     """SIMULATED: the beam loses about a digit from reading to reading."""
