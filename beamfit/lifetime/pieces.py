@@ -15,6 +15,7 @@ from beamfit.answer import shown
 from beamfit.errors import expect
 from beamfit.lifetime.readings import (
     FEWEST,
+    GAP,
     NEIGHBOURS,
     THRESHOLD,
     WINDOW,
@@ -42,8 +43,6 @@ BLOCK = 4096
 # Means of neighbours in which steps of many readings are sought, at least; at the end of a record,
 # where what comes after is not known, they change so many times as much as usual.
 COARSE, FASTER = 24, 4.0
-# A gap is this many usual sampling intervals.
-GAP = 10.0
 # Standard deviations by which two levels must differ to be two: a false step costs no more than an
 # own current for the rest.
 LIKELY = 5.0

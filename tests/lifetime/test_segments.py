@@ -413,6 +413,24 @@ def test_readings_between_overlapping_steps_are_of_neither_side():
         assert slope == pytest.approx(-1 / 36000, rel=1e-3)
 
 
+@pytest.mark.parametrize("stated", [False, True])
+@pytest.mark.parametrize("count", [1500, 70001])
+def test_a_gap_in_a_long_record_bends_no_mean(count, stated):
+    """SIMULATED: of many readings means are fitted; one across the gap is on no curve."""
+    a, b, noise = 2e-7, 4e-5, 2e-3
+    time = np.linspace(0.0, 12000.0, count)
+    time[count // 3 | 1 :] += 20000.0
+    beam = 100 * b / ((a * 100 + b) * np.exp(b * time) - a * 100)
+    beam += noise * np.random.default_rng(3).normal(size=count)
+    error = np.full(count, noise) if stated else None
+    [decay] = study_record(DecayRecord(time, beam, error)).answers
+    found = decay.fit.lifetime_mean
+    assert decay.fit.status.value == "converged"
+    assert "wanders" not in decay.fit.message
+    truth = 1 / (a * decay.fit.mean_current + b) / 3600
+    assert abs(found.value - truth) < 3 * found.error < 0.01 * truth
+
+
 def test_a_few_readings_of_a_decay_behind_a_slow_fill_are_fitted():
     """SIMULATED: 20 readings of injection, in even steps, and 30 of a decay."""
     a, b, since = 2.5e-7, 7.5e-5, 370.0 * np.arange(30)
