@@ -436,7 +436,8 @@ class SeenDecay:
         )
         columns = self.origin * shown
         matrix = np.tile(some.products.matrix, (count, 1, 1))
-        known = LEAST_LEFT * np.einsum("kpp->kp", matrix)[..., None] * np.eye(NODES + 1)
+        rounding = (NODES + 1) * LEAST_LEFT * np.einsum("kpp->kp", matrix)
+        known = rounding[..., None] * np.eye(NODES + 1)
         root = _turned(np.linalg.cholesky(matrix + known))
         seen = root[:, :, 1:] @ columns
         # What readings say beside it: square roots lose no digit where there is little noise.
