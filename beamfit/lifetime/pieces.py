@@ -517,8 +517,9 @@ def _cycles(record: DecayRecord, clear: ClearSteps) -> tuple[list[np.ndarray], l
     owner, events, levels = np.repeat(owner, count), [], np.full(len(record), np.nan)
     levels[rows] = level
     for k in np.flatnonzero(np.diff(owner) == 0) + 1:
-        later, earlier = levels[pieces[k][:NEAR]], levels[pieces[k - 1][-NEAR:]]
-        change = float(np.nan_to_num(np.nanmedian(later) - np.nanmedian(earlier)))
+        beside = levels[pieces[k][:NEAR]], levels[pieces[k - 1][-NEAR:]]
+        known = [side[~np.isnan(side)] for side in beside]
+        change = float(np.subtract(*map(np.median, known))) if all(map(len, known)) else 0.0
         kind = "refill" if change > 0 else "loss"
         events.append(Event(kind, float(record.time[pieces[k][0]]), 0.0, change))
     cycles = sum(piece.size >= FEWEST_READINGS for piece in pieces)

@@ -431,6 +431,27 @@ def test_a_gap_in_a_long_record_bends_no_mean(count, stated):
     assert abs(found.value - truth) < 3 * found.error < 0.01 * truth
 
 
+def test_a_step_beside_readings_of_no_known_level_warns_of_nothing():
+    """SIMULATED: four fills of 3000 readings, two gaps in each."""
+    rng = np.random.default_rng([9, 12])
+    first, lifetime, share = rng.uniform(50, 300), 3600 * 10 ** rng.uniform(0.2, 1), rng.random()
+    a, b = (0.2 + 0.6 * share) / lifetime / first, (0.8 - 0.6 * share) / lifetime
+    time, beam, begin, count = [], [], 0.0, rng.choice([3000, 20000])
+    for _ in range(4):
+        since = np.linspace(0, lifetime * 0.8, count)
+        for _ in range(2):
+            gap = int(count * rng.uniform(0.1, 0.9)) | 1
+            since[gap:] += lifetime * 10 ** rng.uniform(-1.5, -0.5)
+        i0 = first * rng.uniform(0.8, 1)
+        time.append(begin + since)
+        beam.append(i0 * b / ((a * i0 + b) * np.exp(b * since) - a * i0))
+        begin += since[-1] + since[1]
+    beam = np.concatenate(beam)
+    beam += first * 10 ** rng.uniform(-4.5, -3.3) * rng.normal(size=beam.size)
+    events = split_record(DecayRecord(np.concatenate(time), beam)).events
+    assert sum(event.kind == "refill" and event.change > 10 for event in events) == 3
+
+
 def test_a_few_readings_of_a_decay_behind_a_slow_fill_are_fitted():
     """SIMULATED: 20 readings of injection, in even steps, and 30 of a decay."""
     a, b, since = 2.5e-7, 7.5e-5, 370.0 * np.arange(30)
