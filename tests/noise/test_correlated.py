@@ -172,6 +172,6 @@ def test_levels_in_flicker_noise_are_those_of_dense_matrices(power):
 
 def test_a_reach_at_which_probability_jumps_warns_of_nothing():
     def within(reach):
-        return np.where(reach < 3.0, 0.5, 1.0), np.full(reach.shape, 1e-309)
+        return np.where(reach < 3.0, 0.5, 1.0), np.full(reach.shape, 3.75e-309)
 
     assert reach_of_probability(within, np.ones(1), 0.95) == pytest.approx(3.0, rel=1e-3)
