@@ -517,7 +517,8 @@ def _with_further(plain: Expansion, kind: str, count: int) -> Expansion | None:
         known = np.all(np.diff(found.numbers[4::2]) > shortest)
     else:
         known = np.all(np.diff([0.0, *found.numbers[4::2], 1.0]) > STEP * shortest)
-    return found if found.rested and known else None
+    told = found.rows[:, FURTHER::2].any(axis=0).all()  # not where all current is gone
+    return found if found.rested and known and told else None
 
 
 def _squares(law: Expansion) -> float:
