@@ -309,6 +309,9 @@ def _evidence(seen: PreparedScan, plane: str, n: PlaneNumbers, b: Beside | None)
     if b is not None:
         e = replace(e, ending=b.ending, scenario=b.scenario, opened=b.opened, remedy=b.remedy)
     emittance = float(n.value[1])
+    if b is None and e.determined and not low <= emittance <= high:
+        opened = "the likeliest emittance lies outside the 95 % interval, which the prior decides"
+        return replace(e, opened=opened)
     if not e.determined or LEAST <= emittance <= MOST:
         return e
     little = emittance < LEAST
