@@ -129,7 +129,7 @@ def _show(terminal: Terminal, found: Batch, out: str, summary: Table | None) -> 
     terminal.table(Table("", ["status", "answers"], rows, numeric=True))
     if summary is not None:
         terminal.line()
-        terminal.table(summary._replace(title=""), wrap=False)
+        terminal.table(summary._replace(title=""))
     for reason in list(found.refused.values())[:NAMED]:
         terminal.line(reason)
     if (more := len(found.refused) - NAMED) > 0:

@@ -215,7 +215,7 @@ def _show_fully(terminal: Terminal, fit: EmittanceFit, methods: tuple[SizeMethod
             ("Normalised emittance (shift in std. errors)", range_rows(fit)),
         ):
             if cells := [[label, *found] for label, found in rows]:
-                terminal.table(Table("", [head, *names], cells), wrap=False)
+                terminal.table(Table("", [head, *names], cells))
                 terminal.line()
     elif fit.parameters:
         terminal.table(fit.tables()[1])
@@ -235,7 +235,7 @@ def _show_briefly(terminal: Terminal, fit: EmittanceFit) -> None:
 
     table = labelled("", [p.plane for p in fit.planes], result_rows(fit.planes)).quoted()
     if table.rows:
-        terminal.table(table, wrap=False)
+        terminal.table(table)
     largest: dict[str, list[str]] = {}
     for p in fit.planes if fit.statement.closed else ():
         for change in systematics(fit, p.plane)[:1]:

@@ -206,7 +206,7 @@ def _show(
     for table in () if shift is None else shift.tables():
         terminal.table(table if terminal.full else table.quoted())
     for table in () if trend is None else trend.tables():
-        terminal.table(table, wrap=False)
+        terminal.table(table)
     terminal.rest()
 
 
@@ -230,7 +230,7 @@ def _show_record(terminal: Terminal, study: RecordStudy) -> None:
         terminal.answer(decay.fit.headline, status, decay.fit.message)
         terminal.line()
         if not terminal.full:
-            terminal.table(labelled("", [name], tables.decay_rows([decay])).quoted(), wrap=False)
+            terminal.table(labelled("", [name], tables.decay_rows([decay])).quoted())
             continue
         rows = tables.decay_rows([decay]) + tables.separability_rows([decay])[:2]
         rows += tables.check_rows([decay])

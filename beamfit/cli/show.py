@@ -22,7 +22,7 @@ def _style(status: Status) -> str:
     return f"bold {status.colour}"
 
 
-def laid_out(table: Table, statuses: Sequence[Status] = (), *, wrap: bool = True) -> RichTable:
+def laid_out(table: Table, statuses: Sequence[Status] = ()) -> RichTable:
     """A table as rich has it."""
     rich = RichTable(
         title=table.title,
@@ -32,10 +32,10 @@ def laid_out(table: Table, statuses: Sequence[Status] = (), *, wrap: bool = True
         pad_edge=False,
         header_style="bold",
     )
-    # A label cut short says nothing; a number may go on in the next line.
+    # Nothing is cut short: what is too wide goes on in the next line, labels before numbers.
     for i, name in enumerate(table.header):
         side = "right" if table.numeric and i else "left"
-        rich.add_column(name, no_wrap=i == 0 or not wrap, overflow="fold", justify=side)
+        rich.add_column(name, overflow="fold", justify=side)
     for number, (label, *cells) in enumerate(table.rows):
         styles = [_style(s) for s in statuses] if number == 0 and statuses else [""] * len(cells)
         shown = [Text(c, style=s) for c, s in zip(cells, styles, strict=True)]
@@ -66,9 +66,9 @@ class Terminal:
         """Say a line."""
         self.console.print(text, style=style or None)
 
-    def table(self, table: Table, statuses: Sequence[Status] = (), *, wrap: bool = True) -> None:
+    def table(self, table: Table, statuses: Sequence[Status] = ()) -> None:
         """Lay out a table; its first row has a colour where it is the results' statuses."""
-        self.console.print(laid_out(table, statuses, wrap=wrap))
+        self.console.print(laid_out(table, statuses))
 
     def verdict(self, name: str, status: Status, message: str) -> None:
         """Say a verdict in its colour."""
@@ -91,7 +91,7 @@ class Terminal:
 
     def posterior(self, title: str, posterior: Posterior) -> None:
         """Show intervals, verdict and diagnostics."""
-        self.table(posterior.table()._replace(title=f"\n{title}"), wrap=False)
+        self.table(posterior.table()._replace(title=f"\n{title}"))
         self.verdict("posterior", posterior.status, posterior.message)
 
     def tables(self, tables: Iterable[Table]) -> None:

@@ -294,6 +294,9 @@ def _evidence(seen: PreparedScan, plane: str, n: PlaneNumbers, b: BestFit) -> Pl
     waist = waist_bracketed(p.settings, p.screen, p.size, p.error)
     e = PlaneEvidence(work.posterior, work.sizes, low, high, waist, *told)
     emittance = float(n.value[1])
+    if b is None and e.determined and not low <= emittance <= high:
+        opened = "the likeliest emittance lies outside the 95 % interval, which the prior decides"
+        return replace(e, opened=opened)
     if not e.determined or LEAST <= emittance <= MOST:
         return e
     little = emittance < LEAST

@@ -19,6 +19,7 @@ from scipy.special import logsumexp, ndtri
 
 from beamfit.answer import json_of, shown
 from beamfit.errors import Status
+from beamfit.lifetime.decay_law import current
 from beamfit.lifetime.expansion import (
     DETERMINED,
     FURTHER,
@@ -190,7 +191,7 @@ def lifetime_law(about: Expansion, independent: bool, free: bool) -> LifetimeLaw
     None where the search for the power does not come to rest.
     """
     if free:
-        about = solved(_averaged(about.pieces), (*PLAIN, POWER))
+        about = solved(_averaged(about), (*PLAIN, POWER))
         if not about.rested:
             return None
     (span, mean), current = about.pieces.units, about.pieces.current
@@ -369,7 +370,7 @@ def rival_of(plain: Expansion) -> Rival | None:
     of the noise averaged over as in `beamfit.lifetime.free_law`. Further losses are flat in
     their logarithm, times in the record, those of gas in their logarithm up to its length.
     """
-    pieces = _averaged(plain.pieces)
+    pieces = _averaged(plain)
     if pieces.time.size <= WHEN + 2:
         return None
     plain = solved(pieces) if pieces is not plain.pieces else plain
@@ -388,12 +389,13 @@ def rival_of(plain: Expansion) -> Rival | None:
     return Rival(told[one.kind](best), log - smooth, scatter, best, one.kind)
 
 
-def _averaged(pieces: Pieces) -> Pieces:
-    """A long decay as the means of neighbouring readings: the curve is smooth between them."""
+def _averaged(about: Expansion) -> Pieces:
+    """A long decay as the means of neighbouring readings, which go on as the law does."""
+    pieces, (i0, a, b, *_) = about.pieces, about.values
     if pieces.time.size <= ENOUGH or pieces.first.size > 1 or pieces.gauge is not None:
         return pieces
     record = DecayRecord(pieces.time, pieces.current, pieces.error, monitor=pieces.monitor)
-    means = record.means(-(-len(record) // ENOUGH))
+    means = record.means(-(-len(record) // ENOUGH), lambda time: current(time, i0, a, b))
     return Pieces.of(DecayRecord(*means, monitor=pieces.monitor))
 
 
@@ -515,7 +517,8 @@ def _with_further(plain: Expansion, kind: str, count: int) -> Expansion | None:
         known = np.all(np.diff(found.numbers[4::2]) > shortest)
     else:
         known = np.all(np.diff([0.0, *found.numbers[4::2], 1.0]) > STEP * shortest)
-    return found if found.rested and known else None
+    told = found.rows[:, FURTHER::2].any(axis=0).all()  # not where all current is gone
+    return found if found.rested and known and told else None
 
 
 def _squares(law: Expansion) -> float:

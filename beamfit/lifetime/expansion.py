@@ -596,7 +596,7 @@ def further_columns(about: Expansion, kind: str, times: np.ndarray) -> np.ndarra
     (span, _), level = about.pieces.units, about.rows[:, [LEVEL]]
     time, model = about.pieces.time / span, about.pieces.current / about.pieces.over
     model = (model + about.residuals)[:, None]
-    fading = model / level
+    fading = np.divide(model, level, out=np.zeros_like(model), where=level > LEAST * level[0])
     if kind in ("step", "step of a"):
         share = 1.0 if kind == "step" else model / about.pieces.weight[:, None]
         whole = cumulative_simpson(share * fading, x=time, axis=0, initial=0.0)

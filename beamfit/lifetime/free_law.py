@@ -383,13 +383,15 @@ class SeenDecay:
             gas = chebvander(ANGLE, 9) @ smooth
             bumps = record.gauge / span - chebvander(2 * s - 1, 9) @ smooth
             current = current * np.exp((1 - share) * rate * bumps)
-        if len(record) > ENOUGH:
-            size = -(-len(record) // ENOUGH)
-            time, current, error = DecayRecord(time, current, error).means(size)
         origin = Numbers.of(start).currents(gas)
         sees = from_nodes(time / span)
         rows = np.column_stack([current / mean - sees @ origin[:, 0], sees])
         rows = rows if error is None else rows * (mean / error)[:, None]
+        if (size := -(-len(record) // ENOUGH)) > 1:  # of rows: a mean across a gap is on no curve
+            first = np.arange(0, len(record) // size * size, size)
+            whole = slice(first[-1] + size)
+            time, rows = (np.add.reduceat(v[whole], first) / size for v in (time, rows))
+            rows = rows if error is None else rows * size**0.5
         products = Products.of(rows, time, error is not None)
         return cls(products, start, origin, gas, ends, record.gauge is None).without_hopeless()
 
@@ -434,7 +436,8 @@ class SeenDecay:
         )
         columns = self.origin * shown
         matrix = np.tile(some.products.matrix, (count, 1, 1))
-        known = LEAST_LEFT * np.einsum("kpp->kp", matrix)[..., None] * np.eye(NODES + 1)
+        rounding = (NODES + 1) * LEAST_LEFT * np.einsum("kpp->kp", matrix)
+        known = rounding[..., None] * np.eye(NODES + 1)
         root = _turned(np.linalg.cholesky(matrix + known))
         seen = root[:, :, 1:] @ columns
         # What readings say beside it: square roots lose no digit where there is little noise.

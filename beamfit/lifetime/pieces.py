@@ -15,6 +15,7 @@ from beamfit.answer import shown
 from beamfit.errors import expect
 from beamfit.lifetime.readings import (
     FEWEST,
+    GAP,
     NEIGHBOURS,
     THRESHOLD,
     WINDOW,
@@ -42,8 +43,6 @@ BLOCK = 4096
 # Means of neighbours in which steps of many readings are sought, at least; at the end of a record,
 # where what comes after is not known, they change so many times as much as usual.
 COARSE, FASTER = 24, 4.0
-# A gap is this many usual sampling intervals.
-GAP = 10.0
 # Standard deviations by which two levels must differ to be two: a false step costs no more than an
 # own current for the rest.
 LIKELY = 5.0
@@ -205,7 +204,7 @@ def beam_readings(record: DecayRecord) -> tuple[np.ndarray, list[Event]]:
     if kept.size >= FEWEST:
         found["spike"] = np.zeros(len(record), bool)
         time, current = record.time[kept], record.current[kept]
-        noise = noise_of(time, current)
+        noise = max(noise_of(time, current), (record.resolution or 0.0) / 2)
         lone = by_stretches(lambda t, i: _spikes(t, i, noise), time, current)
         found["spike"][kept[lone]] = True
         kept = kept[~lone]
@@ -308,9 +307,11 @@ def _bounds(first: int, last: int, size: int, cuts: np.ndarray) -> tuple[int, in
     return before if begin - before < 2 * size else begin, after if after - end < 2 * size else end
 
 
-def _search(time: np.ndarray, current: np.ndarray) -> tuple[list[Step], np.ndarray, np.ndarray]:
+def _search(
+    time: np.ndarray, current: np.ndarray, digit_of_all: float
+) -> tuple[list[Step], np.ndarray, np.ndarray]:
     """Clear steps of readings and of the means of 2, 4, 8, ... neighbours, in order; readings about
-    which there may be others; and the last digit near each reading.
+    which there may be others; and the last digit near each reading, at least that of all.
     """
     size, steps, level = 1, [], current.copy()
     known, likely = np.zeros(level.size, bool), np.zeros(level.size, bool)
@@ -322,7 +323,7 @@ def _search(time: np.ndarray, current: np.ndarray) -> tuple[list[Step], np.ndarr
             t, x, old, seen = t.mean(axis=1), x.mean(axis=1), old.any(axis=1), seen.any(axis=1)
             excess, score, digit = _departures(t, x).T
             if size == 1:
-                digits = np.append(np.float32(0), digit)
+                digits = np.maximum(np.append(np.float32(0), digit), np.float32(digit_of_all))
                 least = THRESHOLD * np.maximum(_scatter(excess), digits * 2**-0.5)
             coarse = digits[late + size :: size][: count - 1]
             clear = (score > THRESHOLD) & (np.abs(excess) > least[late + size :: size][: count - 1])
@@ -463,7 +464,8 @@ class ClearSteps(NamedTuple):
 
 
 def _clear_steps(record: DecayRecord, kept: np.ndarray) -> ClearSteps:
-    steps, likely, digits = _search(record.time[kept], record.current[kept])
+    columns = record.time[kept], record.current[kept]
+    steps, likely, digits = _search(*columns, record.resolution or 0.0)
     ends, within, events = [], set(), []
     for first, end, rises in steps:
         if end > first:
@@ -515,8 +517,9 @@ def _cycles(record: DecayRecord, clear: ClearSteps) -> tuple[list[np.ndarray], l
     owner, events, levels = np.repeat(owner, count), [], np.full(len(record), np.nan)
     levels[rows] = level
     for k in np.flatnonzero(np.diff(owner) == 0) + 1:
-        later, earlier = levels[pieces[k][:NEAR]], levels[pieces[k - 1][-NEAR:]]
-        change = float(np.nan_to_num(np.nanmedian(later) - np.nanmedian(earlier)))
+        beside = levels[pieces[k][:NEAR]], levels[pieces[k - 1][-NEAR:]]
+        known = [side[~np.isnan(side)] for side in beside]
+        change = float(np.subtract(*map(np.median, known))) if all(map(len, known)) else 0.0
         kind = "refill" if change > 0 else "loss"
         events.append(Event(kind, float(record.time[pieces[k][0]]), 0.0, change))
     cycles = sum(piece.size >= FEWEST_READINGS for piece in pieces)

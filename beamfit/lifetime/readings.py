@@ -115,6 +115,8 @@ def with_common_errors(record: DecayRecord, residuals: np.ndarray) -> DecayRecor
 
 # An hour is skipped to such a share of the usual interval.
 SAME = 0.1
+# A gap is this many usual sampling intervals.
+GAP = 10.0
 # Readings beyond which neighbours are averaged.
 MOST_READINGS = 1 << 16
 # Repeats are of a monitor slower than its archive if half of the readings are, and nearly all come
@@ -240,8 +242,8 @@ def thinned(record: DecayRecord) -> DecayRecord:
     -------
     DecayRecord
         Means of time, current and conditions of each block; errors are those of a mean of
-        independent readings. Single readings far off, as of spikes and dropouts, do not enter.
-        `notes` says how many were averaged.
+        independent readings. Single readings far off, as of spikes and dropouts, and blocks across
+        a gap do not enter. `notes` says how many were averaged.
 
     Notes
     -----
@@ -269,10 +271,12 @@ def thinned(record: DecayRecord) -> DecayRecord:
     pairs = zip(off, spread, strict=True)
     within = [part <= np.maximum(THRESHOLD * own, limit)[:, None] for part, own in pairs]
     kept[:whole] = np.concatenate(within).ravel()
+    spans = record.time[first + count - 1] - record.time[first]
+    even = spans <= GAP * np.median(spans)  # means across a gap are on no curve
     count = np.maximum(np.add.reduceat(kept.astype(int), first), 1)
 
     def mean(values: np.ndarray) -> np.ndarray:
-        return np.add.reduceat(values * kept, first) / count
+        return (np.add.reduceat(values * kept, first) / count)[even]
 
     error = record.error
     conditions = {name: mean(values) for name, values in record.conditions.given.items()}
@@ -280,7 +284,7 @@ def thinned(record: DecayRecord) -> DecayRecord:
     time = mean(record.time)
     return replace(
         record, time=time, current=mean(record.current),
-        error=None if error is None else np.sqrt(mean(error**2) / count),
+        error=None if error is None else np.sqrt(mean(error**2) / count[even]),
         start=None if record.start is None else record.start + float(time[0]),
         conditions=Conditions(**conditions), notes=(*record.notes, note),
     )  # fmt: skip

@@ -483,7 +483,8 @@ def _decays(record: DecayRecord) -> tuple[Split, bool]:
 def _rise_between_steps(split: Split) -> bool:
     """True where the current rises between losses: refills that the record does not resolve."""
     risen = sum(event.change for event in split.events if event.kind == "short")
-    return risen > sum(float(piece.current[0] - piece.current[-1]) for piece in split.segments)
+    lost = (float(piece.current[0] - piece.current[-1]) for piece in split.segments)
+    return risen > sum(fall for fall in lost if fall > 0)  # what rises is a slow refill
 
 
 def _fitted(

@@ -144,7 +144,7 @@ def reach_of_probability(within, scale: np.ndarray, probability: float) -> np.nd
         low, high = np.where(less, at, low), np.where(less, high, at)
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             step = (probability - found) / slope
-        usable = (at + step >= low) & (at + step <= high) & (2 * np.abs(step) <= last)
+            usable = (at + step >= low) & (at + step <= high) & (2 * np.abs(step) <= last)
         step = np.where(usable | (np.abs(step) <= ENOUGH * at), step, 0.5 * (low + high) - at)
         at, last = at + step, np.abs(step)
         if np.all(last <= ENOUGH * at):

@@ -9,6 +9,7 @@ import pytest
 
 from beamfit import __main__ as command
 from beamfit import writing
+from beamfit.answer import Table
 from beamfit.cli.show import Terminal
 from beamfit.errors import InputError, nearest
 
@@ -44,6 +45,16 @@ def test_a_message_is_a_few_lines_of_a_terminal(error):
     assert len(f"beamfit: {said}") <= 400
     assert said.endswith(error.expected.strip()[-10:])
     assert error.path is None or "a.csv:" in said
+
+
+def test_a_narrow_terminal_cuts_nothing_short(monkeypatch, capsys):
+    monkeypatch.setenv("COLUMNS", "40")
+    label = "smallest size 5 % too large, as of saturation"
+    Terminal().table(Table("", ["if", "x", "y"], [[label, "+12.37 %", "-8 %"]]))
+    lines = capsys.readouterr().out.splitlines()
+    assert max(map(len, lines)) <= 40
+    assert all(number in lines[1] for number in ("+12.37 %", "-8 %"))
+    assert " ".join(line[:25].strip() for line in lines[1:]).startswith(label)
 
 
 def test_ctrl_c_is_one_line(tmp_path):

@@ -498,3 +498,16 @@ def test_a_share_that_is_known_no_better_than_before_is_not_told():
     assert free.a.interval_95[0] < A < free.a.interval_95[1]
     assert "If a and b are constant" in free.message
     assert free.lifetime_mean.error is not None
+
+
+@pytest.mark.parametrize("early", [1, 2])
+@pytest.mark.parametrize("later", [100, 450])
+def test_one_reading_long_before_the_others(early, later):
+    """SIMULATED: most numbers of a smooth curve are told by rounding alone."""
+    time = 3.0 * np.arange(early + later)
+    time[early:] += 3 * time[-1]
+    exact = current(time, 131.0, 2e-7, 3e-5)
+    noise = 0.01 * np.random.default_rng(0).normal(size=time.size)
+    found = fit_decay(DecayRecord(time, exact + noise))
+    lifetime, truth = found.lifetime_mean, 1 / (2e-7 * found.mean_current + 3e-5) / 3600
+    assert abs(lifetime.value - truth) < 3 * lifetime.error < 0.05 * truth

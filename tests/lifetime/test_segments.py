@@ -413,6 +413,71 @@ def test_readings_between_overlapping_steps_are_of_neither_side():
         assert slope == pytest.approx(-1 / 36000, rel=1e-3)
 
 
+@pytest.mark.parametrize("stated", [False, True])
+@pytest.mark.parametrize("count", [1500, 70001])
+def test_a_gap_in_a_long_record_bends_no_mean(count, stated):
+    """SIMULATED: of many readings means are fitted; one across the gap is on no curve."""
+    a, b, noise = 2e-7, 4e-5, 2e-3
+    time = np.linspace(0.0, 12000.0, count)
+    time[count // 3 | 1 :] += 20000.0
+    beam = 100 * b / ((a * 100 + b) * np.exp(b * time) - a * 100)
+    beam += noise * np.random.default_rng(3).normal(size=count)
+    error = np.full(count, noise) if stated else None
+    [decay] = study_record(DecayRecord(time, beam, error)).answers
+    found = decay.fit.lifetime_mean
+    assert decay.fit.status.value == "converged"
+    assert "wanders" not in decay.fit.message
+    truth = 1 / (a * decay.fit.mean_current + b) / 3600
+    assert abs(found.value - truth) < 3 * found.error < 0.01 * truth
+
+
+def test_a_step_beside_readings_of_no_known_level_warns_of_nothing():
+    """SIMULATED: four fills of 3000 readings, two gaps in each."""
+    rng = np.random.default_rng([9, 12])
+    first, lifetime, share = rng.uniform(50, 300), 3600 * 10 ** rng.uniform(0.2, 1), rng.random()
+    a, b = (0.2 + 0.6 * share) / lifetime / first, (0.8 - 0.6 * share) / lifetime
+    time, beam, begin, count = [], [], 0.0, rng.choice([3000, 20000])
+    for _ in range(4):
+        since = np.linspace(0, lifetime * 0.8, count)
+        for _ in range(2):
+            gap = int(count * rng.uniform(0.1, 0.9)) | 1
+            since[gap:] += lifetime * 10 ** rng.uniform(-1.5, -0.5)
+        i0 = first * rng.uniform(0.8, 1)
+        time.append(begin + since)
+        beam.append(i0 * b / ((a * i0 + b) * np.exp(b * since) - a * i0))
+        begin += since[-1] + since[1]
+    beam = np.concatenate(beam)
+    beam += first * 10 ** rng.uniform(-4.5, -3.3) * rng.normal(size=beam.size)
+    events = split_record(DecayRecord(np.concatenate(time), beam)).events
+    assert sum(event.kind == "refill" and event.change > 10 for event in events) == 3
+
+
+def test_a_few_readings_of_a_decay_behind_a_slow_fill_are_fitted():
+    """SIMULATED: 20 readings of injection, in even steps, and 30 of a decay."""
+    a, b, since = 2.5e-7, 7.5e-5, 370.0 * np.arange(30)
+    beam = 262 * b / ((a * 262 + b) * np.exp(b * since) - a * 262)
+    beam += 0.1 * np.random.default_rng(1).normal(size=30)
+    record = DecayRecord(370.0 * np.arange(50), np.r_[np.linspace(0.0, 249.0, 20), beam])
+    [decay] = (study := study_record(record)).answers
+    assert "slow refill" in [event.kind for event in study.events]
+    found = decay.fit.lifetime_mean
+    assert abs(found.value - 1 / (a * decay.fit.mean_current + b) / 3600) < 3 * found.error < 0.2
+
+
+@pytest.mark.parametrize("clock", [1e-6, 1e-3, 0.2])
+def test_digits_of_readings_by_a_clock_that_is_not_exact_are_no_steps(clock):
+    """SIMULATED: the beam loses about a digit from reading to reading."""
+    rng = np.random.default_rng(4)
+    time = 20.3066 * np.arange(400)
+    time += clock * rng.uniform(-0.5, 0.5, 400)
+    beam = 400 / (1.2 * np.exp(time / 18000) - 0.2) + 0.02 * rng.normal(size=400)
+    [decay] = (study := study_record(DecayRecord(time - time[0], np.round(beam)))).answers
+    found = decay.fit.lifetime_mean
+    assert (study.events, len(decay.fit.readings)) == ((), 400)
+    share = 0.2 * decay.fit.mean_current / 400
+    assert abs(found.value - 5 / (1 + share)) < 3 * found.error < 0.2
+
+
 def test_digits_of_two_detectors_are_no_steps():
     """SIMULATED: one shows the upper half of three fills to 0.1 mA, the other to 1 µA."""
     beam = 300 * np.exp(-(10.0 * np.arange(1200) % 4000) / 36000)

@@ -197,3 +197,11 @@ def test_the_record_is_cut_where_the_gas_of_a_fill_is_gone():
     assert study.events[0].time == pytest.approx(3000.0, rel=0.3)
     low, high = study.decays[-1].fit.a.interval_95
     assert low <= A <= high
+
+
+def test_of_eight_readings_the_last_is_after_a_loss():
+    """SIMULATED; a law that loses all current there has no slopes."""
+    beam = [28.1651919, 27.9847515, 27.8767830, 27.6478816]
+    beam += [27.4491300, 27.3593794, 27.2261220, 8.76068467]
+    [decay] = study_record(DecayRecord(156.312371 * np.arange(8), np.array(beam))).answers
+    assert decay.fit.status.value == "unidentified"

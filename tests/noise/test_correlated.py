@@ -4,7 +4,7 @@ from scipy.linalg import cholesky, solve_triangular, toeplitz
 from scipy.signal import lfilter
 from scipy.stats import multivariate_normal
 
-from beamfit.noise.correlated import usual_noises, whitened_by_each
+from beamfit.noise.correlated import reach_of_probability, usual_noises, whitened_by_each
 from beamfit.noise.memory import (
     POWERS,
     CorrelatedNoise,
@@ -168,3 +168,10 @@ def test_levels_in_flicker_noise_are_those_of_dense_matrices(power):
     # .15 for three powers beside .35 for correlation times, half of that with a white part: of one.
     odds = np.log(2 * 0.15 / 0.35 / 3)
     assert found.volume[k] - found.volume[0] == pytest.approx(volume[1] - volume[0] + odds)
+
+
+def test_a_reach_at_which_probability_jumps_warns_of_nothing():
+    def within(reach):
+        return np.where(reach < 3.0, 0.5, 1.0), np.full(reach.shape, 3.75e-309)
+
+    assert reach_of_probability(within, np.ones(1), 0.95) == pytest.approx(3.0, rel=1e-3)
