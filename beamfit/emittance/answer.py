@@ -40,6 +40,8 @@ SIGMA = slice(4, 7)
 # Normalised emittances in m beyond which only a wrong unit leads: rings and linacs have 1e-9 and
 # more, muons before cooling 2e-2; sizes a thousand times off are a million in this.
 LEAST, MOST = 1e-10, 0.1
+# Draws of a posterior that are worth less tell no interval.
+LEAST_WORTH = 10.0
 # What a beam of unknown emittance may have all the same: σ, and the size at the screen.
 LINEAR = np.isin(list(QUANTITIES), ("sigma11", "sigma12", "sigma22", "screen_size"))
 # Numbers of either sign; the others are positive, and spread by a factor.
@@ -294,8 +296,9 @@ def _evidence(seen: PreparedScan, plane: str, n: PlaneNumbers, b: BestFit) -> Pl
     waist = waist_bracketed(p.settings, p.screen, p.size, p.error)
     e = PlaneEvidence(work.posterior, work.sizes, low, high, waist, *told)
     emittance = float(n.value[1])
-    if b is None and e.determined and not low <= emittance <= high:
-        opened = "the likeliest emittance lies outside the 95 % interval, which the prior decides"
+    worth = work.posterior.worth
+    if e.determined and worth < LEAST_WORTH and not b.scenario:
+        opened = f"draws from its posterior are worth no more than {worth:.0f} independent ones"
         return replace(e, opened=opened)
     if not e.determined or LEAST <= emittance <= MOST:
         return e

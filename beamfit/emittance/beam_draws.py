@@ -22,6 +22,7 @@ from beamfit.noise.sizes import (
     drifting,
     log_likelihood,
     scales_of,
+    variance_of,
     whitening,
 )
 
@@ -36,6 +37,8 @@ ROUNDS, FURTHEST = 6, 3.0
 # Fits leave out every two of up to so many points, every one of up to so many more, and of any
 # number the worst ones up to this share in so many steps.
 PAIRS, SINGLES, WORST, STEPS = 24, 50, 0.25, 12
+# What fits as no beam is moved to |p| of this, a beam of nearly no emittance.
+EDGE = 0.999
 # Variance that makes a point of no weight.
 LEFT_OUT = 1e8
 # Numbers that one draw of many points may have, with all draws of few: memory and time.
@@ -175,13 +178,15 @@ def draw_beams(c: Coordinates, kind: NoiseKind, noise: Noise) -> BeamDraws:
     draw has the weight of its posterior over the density of the mixture (importance
     sampling; A. B. Owen and Y. Zhou, J. Am. Stat. Assoc. 95, 135 (2000), sect. 4).
     """
-    centre, root = fits(c, kind)
+    centre, root, deviation = fits(c, kind)
 
     def at_centres(scale: np.ndarray) -> np.ndarray:
         return _log_likelihood(centre, c, kind, scale, noise)
 
     scales = scales_of(kind, c.unit.shape, at_centres)
-    found = averaged(at_centres(scales.scale), scales.log_weight[..., None, :])
+    by_scale, prior = at_centres(scales.scale), scales.log_weight[..., None, :]
+    root = root * _wider(by_scale + prior, scales.scale, kind, deviation)[..., None, None]
+    found = averaged(by_scale, prior)
     found = np.where(np.isfinite(found), found, -np.inf)
     # In their own order: which of two equals is the better, rounding would decide.
     top = np.sort(np.argsort(found, axis=-1)[..., -PARTS:], axis=-1)
@@ -203,6 +208,18 @@ def draw_beams(c: Coordinates, kind: NoiseKind, noise: Noise) -> BeamDraws:
     by_scale = averaged(np.swapaxes(each, -1, -2), drawn[..., None, :])
     top_log = found.max(-1) + kind.log_weight
     return BeamDraws(x, weight, scales, by_scale, likeliest, top_log)
+
+
+def _wider(
+    log: np.ndarray, scale: np.ndarray, kind: NoiseKind, deviation: np.ndarray
+) -> np.ndarray:
+    """How much wider than by their deviations the fits are, by the noise that each of them finds:
+    from log probabilities of its scales, shape (..., m, k), and deviations, shape (..., m, n).
+    """
+    variance = variance_of(kind, scale)[..., None, :, :] / deviation[..., None, :] ** 2
+    log = np.nan_to_num(log, nan=-1e300, neginf=-1e300)
+    weight = np.exp(log - log.max(-1, keepdims=True))
+    return WIDER * np.sqrt((weight * variance.mean(-1)).sum(-1) / weight.sum(-1))
 
 
 def log_prior(x: np.ndarray) -> np.ndarray:
@@ -243,13 +260,14 @@ def left_out(n: int) -> np.ndarray:
     return kept
 
 
-def fits(c: Coordinates, kind: NoiseKind) -> tuple[np.ndarray, np.ndarray]:
-    """Fits of size² with all points and without some: centres and roots of their covariances.
+def fits(c: Coordinates, kind: NoiseKind) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Fits of size² with all points and without some: centres, roots of their covariances, and the
+    deviations of points that these are by.
 
     Returns
     -------
     tuple of ndarray
-        Shape (..., m, 3) and (..., m, 3, 3).
+        Shape (..., m, 3), (..., m, 3, 3) and (..., m, n).
     """
     n = c.size.shape[-1]
     kept = left_out(n)
@@ -258,11 +276,12 @@ def fits(c: Coordinates, kind: NoiseKind) -> tuple[np.ndarray, np.ndarray]:
     special = [] if kind.special is None else [kind.special]
     usual = [] if kind.least else [kind.prior.middle]
     deviations = [kind.deviation(scale) for scale in special + usual]
-    found = [_fitted(c, kind, deviation, kept) for deviation in deviations]
+    found = [(*_fitted(c, kind, deviation, kept), deviation) for deviation in deviations]
     for deviation in deviations if WORST * n > 2 else ():
-        found += _greedy(c, kind, deviation)
-    centres, roots = zip(*found, strict=True)
-    return np.concatenate(centres, -2), np.concatenate(roots, -3)
+        found += [(*each, deviation) for each in _greedy(c, kind, deviation)]
+    centres, roots, by = zip(*found, strict=True)
+    by = [np.broadcast_to(d[..., None, :], (*x.shape[:-1], n)) for x, _, d in found]
+    return (np.concatenate(part, axis) for part, axis in ((centres, -2), (roots, -3), (by, -2)))
 
 
 def _fitted(
@@ -285,14 +304,8 @@ def _fitted(
         x = np.linalg.solve(normal, turned @ wanted)[..., 0]
         squared = (rows @ x[..., None])[..., 0] + c.known[..., None, :]
         model = np.sqrt(np.clip(squared, (size / FURTHEST) ** 2, (size * FURTHEST) ** 2))
-    chi2 = ((wanted - design @ x[..., None]) ** 2).sum((-2, -1))
-    dof = np.maximum(kept.sum(-1) - 3.0, 0.0)
-    if kind.special is not None:
-        factor = np.maximum(1.0, chi2 / np.maximum(dof, 1.0))
-    else:
-        factor = (2.0 + chi2) / (2.0 + dof)
-    root = np.linalg.cholesky(np.linalg.inv(normal)) * np.sqrt(factor)[..., None, None]
-    return _inside(x), WIDER * root
+    covariance = np.linalg.inv(normal)
+    return _nearest(x, covariance), np.linalg.cholesky(covariance)
 
 
 def _weighed(weigh: np.ndarray, columns: np.ndarray) -> np.ndarray:
@@ -324,13 +337,20 @@ def _greedy(
     return found
 
 
-def _inside(x: np.ndarray) -> np.ndarray:
-    """The nearest beam of nearly no emittance in the place of what is no beam."""
-    t, p = x[..., 0], np.hypot(x[..., 1], x[..., 2])
-    edge = (t <= 0.05) | (p > 0.98 * t)
-    length = np.maximum(t, 0.3)
-    turned = 0.97 * x[..., 1:] / np.maximum(p, 1e-12)[..., None] * length[..., None]
-    return np.where(edge[..., None], np.concatenate([length[..., None], turned], -1), x)
+def _nearest(x: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+    """The nearest beam of nearly no emittance in the place of what is no beam, by how far errors of
+    this covariance reach.
+    """
+    for _ in range(ROUNDS):
+        t, turned = x[..., :1], x[..., 1:]
+        p = np.linalg.norm(turned, axis=-1, keepdims=True) + 1e-12
+        slope = np.concatenate([np.full_like(t, -EDGE), turned / p], -1)
+        along = (covariance @ slope[..., None])[..., 0]
+        reach = (slope * along).sum(-1, keepdims=True)
+        x = x - np.maximum(p - EDGE * t, 0.0) * along / reach
+    t = np.where(x[..., :1] > 0.05, x[..., :1], 0.3)
+    p = np.linalg.norm(x[..., 1:], axis=-1, keepdims=True) + 1e-12
+    return np.concatenate([t, x[..., 1:] * np.minimum(1.0, EDGE * t / p)], -1)
 
 
 def _even_cube(dim: int, number: int) -> np.ndarray:

@@ -376,6 +376,11 @@ class PlanePosterior(NamedTuple):
         return max(self.probability, key=self.probability.__getitem__)
 
     @property
+    def worth(self) -> float:
+        """How many independent draws these are worth."""
+        return float(1.0 / np.sum(self.weight**2))
+
+    @property
     def flat(self) -> float:
         """Probability that a beam has no emittance."""
         none, some = self.probability[FLAT], self.probability[BEAM]

@@ -364,8 +364,8 @@ def test_no_scatter_is_said_to_a_ten_thousandth_of_a_per_cent():
     assert "1.4 % (0.01 to 2.8 %)" in said
 
 
-def test_a_value_outside_its_own_interval_is_not_determined():
-    """SIMULATED, .05 % noise: 2 degrees of phase, where the prior of the beam decides."""
+def test_a_scan_of_two_degrees_is_not_determined():
+    """SIMULATED, .05 % noise: two draws of its posterior said 1.46 of the truth, as determined."""
     size = [1234.43, 1232.22, 1230.44, 1227.89, 1226.1, 1224.22, 1222.19, 1220.91, 1219.84, 1217.25]
     size += [1214.7, 1212.81, 1210.73, 1209.68, 1208.22, 1205.07, 1203.15, 1201.75, 1200.27]
     gradient = np.linspace(-0.0184092, 0.0184092, len(size))
@@ -374,4 +374,5 @@ def test_a_value_outside_its_own_interval_is_not_determined():
     line = beamfit.Beamline(elements, 50.0)
     fit = beamfit.fit_emittance(scan, line).x
     assert fit.status is Status.unidentified
-    assert "likeliest emittance lies outside" in fit.message
+    low, high = fit.emittance.interval_95
+    assert high / low > 2.5
