@@ -30,8 +30,8 @@ from beamfit.noise.sizes import (
 DRAWS, TAIL = 1536, 4.0
 # One draw in so many is from the prior: no weight is large by luck where the sizes say little.
 DEFENSIVE = 8
-# Proposals are so much wider than the linear theory, and their shares flattened by this power.
-WIDER, FLATTER, PARTS = 1.3, 0.5, 24
+# The shares of so many proposals are flattened by this power.
+FLATTER, PARTS = 0.5, 24
 # Rounds in which weights are taken anew from the model, within this factor of the measured size.
 ROUNDS, FURTHEST = 6, 3.0
 # Fits leave out every two of up to so many points, every one of up to so many more, and of any
@@ -217,9 +217,11 @@ def _wider(
     from log probabilities of its scales, shape (..., m, k), and deviations, shape (..., m, n).
     """
     variance = variance_of(kind, scale)[..., None, :, :] / deviation[..., None, :] ** 2
-    log = np.nan_to_num(log, nan=-1e300, neginf=-1e300)
+    variance = variance.mean(-1)
+    # The three numbers of a beam about the fit take a volume of so many deviations cubed.
+    log = np.nan_to_num(log + 1.5 * np.log(variance), nan=-1e300, neginf=-1e300)
     weight = np.exp(log - log.max(-1, keepdims=True))
-    return WIDER * np.sqrt((weight * variance.mean(-1)).sum(-1) / weight.sum(-1))
+    return np.sqrt((weight * variance).sum(-1) / weight.sum(-1))
 
 
 def log_prior(x: np.ndarray) -> np.ndarray:

@@ -13,7 +13,6 @@ import numpy as np
 from beamfit.emittance.beam_draws import (
     BRIGHT,
     FURTHEST,
-    WIDER,
     BeamDraws,
     Coordinates,
     coordinates,
@@ -46,6 +45,8 @@ MODELS = {BEAM: 0.85, FLAT: 0.03, CONSTANT: 0.03, RANDOM: 0.04, DRIFTING: 0.02, 
 UNMOVED = {BEAM: 0.9, FLAT: 0.05, RANDOM: 0.05}
 # Models are told apart by at most so many points, evenly among all: the beam by every one.
 COMPARED = LONG
+# Proposals of a beam without emittance are so much wider than the linear theory.
+WIDER = 1.3
 # Planes that are looked at in one call, and rounds of the best fit and when it rests.
 TOGETHER, ROUNDS, REST = 16, 40, 1e-11
 # Steps of ln size of sizes at random or in a drift; bends of a curve as shares of the mean size,
