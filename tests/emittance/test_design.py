@@ -201,7 +201,7 @@ def test_a_scan_that_ends_before_the_waist_is_led_to_it():
     settings = np.linspace(-6.0, -1.0, 6)
     advice = plan_measurements(fitted(settings), limits={"Q": (-6.0, 10.0)}, count=2)
     assert advice.message.endswith("1/m², then ask again.")
-    assert "(5 %)" in str(advice)  # for a beam that is not known: in brackets
+    assert "(6 %)" in str(advice)  # for a beam that is not known: in brackets
     for _ in range(6):  # what it says, done
         setting = advice.steps[0].candidate.settings["Q"]
         settings = np.append(settings, setting)
