@@ -213,8 +213,8 @@ def draw_beams(c: Coordinates, kind: NoiseKind, noise: Noise) -> BeamDraws:
 def _wider(
     log: np.ndarray, scale: np.ndarray, kind: NoiseKind, deviation: np.ndarray
 ) -> np.ndarray:
-    """How much wider than by their deviations the fits are, by the noise that each of them finds:
-    from log probabilities of its scales, shape (..., m, k), and deviations, shape (..., m, n).
+    """Widths of the fits over those by their deviations, by the noise that each of them finds: from
+    log probabilities of its scales, shape (..., m, k), and deviations, shape (..., m, n).
     """
     variance = variance_of(kind, scale)[..., None, :, :] / deviation[..., None, :] ** 2
     variance = variance.mean(-1)

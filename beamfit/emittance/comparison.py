@@ -378,7 +378,7 @@ class PlanePosterior(NamedTuple):
 
     @property
     def worth(self) -> float:
-        """How many independent draws these are worth."""
+        """Number of independent draws that these are worth."""
         return float(1.0 / np.sum(self.weight**2))
 
     @property
