@@ -25,6 +25,8 @@ BASELINE, FEWEST = 20, 3
 MANY = 8
 # Ends of the central 68 and 95 % of draws.
 CENTRAL, WIDE = (0.16, 0.84), (0.025, 0.975)
+# Draws that are worth fewer independent ones tell no error.
+LEAST_WORTH = 10.0
 # Widths of a change as a share of what changes: smaller ones are not seen, larger ones seldom.
 CHANGED = np.geomspace(1e-4, 0.5, 16)
 # Mean range of two normal numbers in standard deviations; degrees of freedom of a moving range.

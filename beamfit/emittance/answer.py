@@ -34,14 +34,12 @@ from beamfit.emittance.verdict import (
 from beamfit.errors import Finding, Status
 from beamfit.optics.beamline import Beamline
 from beamfit.quantity import Quantity
-from beamfit.statistics import Directions, chi2_probability, scaled_directions
+from beamfit.statistics import LEAST_WORTH, Directions, chi2_probability, scaled_directions
 
 SIGMA = slice(4, 7)
 # Normalised emittances in m beyond which only a wrong unit leads: rings and linacs have 1e-9 and
 # more, muons before cooling 2e-2; sizes a thousand times off are a million in this.
 LEAST, MOST = 1e-10, 0.1
-# Draws of a posterior that are worth less tell no interval.
-LEAST_WORTH = 10.0
 # What a beam of unknown emittance may have all the same: σ, and the size at the screen.
 LINEAR = np.isin(list(QUANTITIES), ("sigma11", "sigma12", "sigma22", "screen_size"))
 # Numbers of either sign; the others are positive, and spread by a factor.

@@ -278,17 +278,16 @@ def fits(c: Coordinates, kind: NoiseKind) -> tuple[np.ndarray, np.ndarray, np.nd
     special = [] if kind.special is None else [kind.special]
     usual = [] if kind.least else [kind.prior.middle]
     deviations = [kind.deviation(scale) for scale in special + usual]
-    found = [(*_fitted(c, kind, deviation, kept), deviation) for deviation in deviations]
+    found = [_fitted(c, kind, deviation, kept) for deviation in deviations]
     for deviation in deviations if WORST * n > 2 else ():
-        found += [(*each, deviation) for each in _greedy(c, kind, deviation)]
+        found += _greedy(c, kind, deviation)
     centres, roots, by = zip(*found, strict=True)
-    by = [np.broadcast_to(d[..., None, :], (*x.shape[:-1], n)) for x, _, d in found]
-    return (np.concatenate(part, axis) for part, axis in ((centres, -2), (roots, -3), (by, -2)))
+    return np.concatenate(centres, -2), np.concatenate(roots, -3), np.concatenate(by, -2)
 
 
 def _fitted(
     c: Coordinates, kind: NoiseKind, deviation: np.ndarray, kept: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     rows, target = c.rows[..., None, :, :], (c.size**2 - c.known)[..., None, :]
     size = c.size[..., None, :]
     model = np.broadcast_to(size, kept.shape)
@@ -307,7 +306,8 @@ def _fitted(
         squared = (rows @ x[..., None])[..., 0] + c.known[..., None, :]
         model = np.sqrt(np.clip(squared, (size / FURTHEST) ** 2, (size * FURTHEST) ** 2))
     covariance = np.linalg.inv(normal)
-    return _nearest(x, covariance), np.linalg.cholesky(covariance)
+    deviation = np.broadcast_to(deviation[..., None, :], kept.shape)
+    return _nearest(x, covariance), np.linalg.cholesky(covariance), deviation
 
 
 def _weighed(weigh: np.ndarray, columns: np.ndarray) -> np.ndarray:
@@ -323,13 +323,13 @@ def little(normal: np.ndarray) -> np.ndarray:
 
 def _greedy(
     c: Coordinates, kind: NoiseKind, deviation: np.ndarray
-) -> list[tuple[np.ndarray, np.ndarray]]:
+) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """Fits that leave out the worst point of the one before, up to a share of them."""
     n = c.size.shape[-1]
     kept, found, most = np.ones((*c.unit.shape, 1, n)), [], int(WORST * n)
     steps = min(most, STEPS)
     for _ in range(steps):
-        centre, _ = _fitted(c, kind, deviation, kept)
+        centre, *_ = _fitted(c, kind, deviation, kept)
         model = model_sizes(centre, c)
         pull = np.abs(c.size[..., None, :] - model) / deviation[..., None, :] / model**kind.power
         worst = np.argsort(np.where(kept > 0, pull, -1.0), axis=-1)[..., -(most // steps) :]
@@ -360,7 +360,7 @@ def _even_cube(dim: int, number: int) -> np.ndarray:
 
     J. H. Halton, Numer. Math. 2, 84 (1960), eq. 1.
     """
-    base, place = np.array([[2], [3], [5], [7]])[:dim], np.arange(12)  # digits of up to 4095
+    base, place = np.array([[2], [3], [5], [7]])[:dim], np.arange(number.bit_length())
     digits = np.arange(1, number + 1)[:, None, None] // base**place % base
     return (digits / base ** (place + 1.0)).sum(-1)
 

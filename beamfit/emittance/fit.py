@@ -450,17 +450,28 @@ def fit_many(
     >>> round(other.x.emittance.value / one.x.emittance.value, 9)
     4.0
     """
-    found: list[EmittanceFit | InputError | None] = []
-    begun: dict[int, PreparedScan] = {}
-    for i, given in enumerate(scans):
+    known, told = scenario_of("known"), Assumptions()
+    return [
+        one if isinstance(one, InputError)
+        else EmittanceFit(judged_beam(one), one.scan, one.line, known, told, one)
+        for one in _seen_together(scans, weights, noise)
+    ]  # fmt: skip
+
+
+def _seen_together(
+    scans: Iterable[tuple[QuadScan, Beamline]], weights: str, noise: Noise | None
+) -> list[PreparedScan | InputError]:
+    """Scans with the posteriors of their planes, or what is wrong with them, in their order."""
+    found: list[PreparedScan | InputError] = []
+    for given in scans:
         try:
-            begun[i] = unfitted(*of_one_beam(*given), noise=noise, weights=weights)
-            found.append(None)
+            found.append(unfitted(*of_one_beam(*given), noise=noise, weights=weights))
         except InputError as error:
             found.append(error)
-    for i, seen in zip(begun, with_posteriors(looked_through(list(begun.values()))), strict=True):
-        own = (seen.scan, seen.line, scenario_of("known"), Assumptions())
-        found[i] = EmittanceFit(judged_beam(seen), *own, seen)
+    usable = [i for i, one in enumerate(found) if isinstance(one, PreparedScan)]
+    seen = with_posteriors(looked_through([found[i] for i in usable]))
+    for i, one in zip(usable, seen, strict=True):
+        found[i] = one
     return found
 
 
@@ -476,9 +487,9 @@ def noise_samples(scans: Iterable[tuple[QuadScan, Beamline]], noise: Noise) -> I
     """
     from beamfit.noise.learn import Sample  # loads the minimiser
 
-    fits = (fit for fit in fit_many(scans, noise=noise) if isinstance(fit, EmittanceFit))
-    for fit in fits:
-        for work in fit.seen.solutions.values():
+    together = _seen_together(scans, WEIGHTS[0], noise)
+    for seen in (one for one in together if isinstance(one, PreparedScan)):
+        for work in seen.solutions.values():
             post = work.posterior
             if len(work.sizes.size) > 3 and post.probability[BEAM] > SURE:
                 word = work.sizes.likeness[1]

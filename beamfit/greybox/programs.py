@@ -122,7 +122,9 @@ class SolverEnd(NamedTuple):
 def _uno(preset: str, **more: float) -> Callable[[NonlinearProgram, np.ndarray, int], SolverEnd]:
     """A solver by Uno with one of its presets, and options of its own."""
 
-    def solve(program, x: np.ndarray, iterations: int, budget: SearchLimit) -> SolverEnd:
+    def solve(
+        program: NonlinearProgram, x: np.ndarray, iterations: int, budget: SearchLimit
+    ) -> SolverEnd:
         import unopy
 
         solver = unopy.UnoSolver()
@@ -173,7 +175,9 @@ def _uno_model(unopy, program: NonlinearProgram, x: np.ndarray):
     return model
 
 
-def _slsqp(program, x: np.ndarray, iterations: int, budget: SearchLimit) -> SolverEnd:
+def _slsqp(
+    program: NonlinearProgram, x: np.ndarray, iterations: int, budget: SearchLimit
+) -> SolverEnd:
     """Solve by scipy's sequential quadratic programming."""
     from scipy import optimize
 

@@ -32,7 +32,7 @@ from beamfit.lifetime.expansion import Physical, Pieces
 from beamfit.lifetime.record import DecayRecord
 from beamfit.noise.memory import Products
 from beamfit.quantity import HOUR, Quantity
-from beamfit.statistics import CENTRAL, WIDE
+from beamfit.statistics import CENTRAL, LEAST_WORTH, WIDE
 
 # Standard deviations of the exponent below and above zero. Bunches lengthen with the current, in
 # the potential well by x³ - x ∝ I (`beamfit.lifetime.ring`), so that a goes as I^0 to I^-1/3; that
@@ -293,8 +293,6 @@ ENOUGH = 1024
 # Draws of each law at first, how many independent ones all together are to be worth, and most of
 # them; the scale of the logistic distribution that they have in standard deviations.
 FEW, WORTH, MANY, TAIL = 512, 2500.0, 60000, 0.6
-# Draws worth less tell no error. More is enough: constant a and b in their place would be too sure.
-LEAST_WORTH = 10.0
 # Width of the share in what draws come from, which its bounds cut off otherwise.
 AROUND = 0.6
 # Standard deviations of the share beside a bound in which draws tell the density there.
@@ -1003,6 +1001,7 @@ def free_law(record: DecayRecord, values: Physical) -> FreeLaw | None:
     laws = list(zip(proposed, drawn(proposed), strict=True))
     draws = mixed([own for _, own in laws])
     freed = mixed([own for law, own in laws if POWER in law.free])
+    # Few draws are enough: constant a and b in their place would be too sure.
     if not (np.isfinite(freed.log) and draws.worth >= LEAST_WORTH):
         return None
     plain = DrawnLaw.of(seen, CONSTANT).weighed(FEW)
