@@ -274,8 +274,8 @@ def _reaching(
     low, high, half = low.copy(), high.copy(), half.copy()
     low[:2] = np.fmin(low[:2], value[:2] + reach)
     high[:2] = np.fmax(high[:2], value[:2] + reach)
-    # Two answers, one of which is right: half of what lies between them.
-    half[:2] = np.fmax(half[:2], 0.5 * np.abs(reach))
+    # The other answer is no further away than errors that noise explains.
+    half[:2] = np.fmax(half[:2], np.abs(reach) / MOVES)
     return low, high, half
 
 

@@ -26,6 +26,8 @@ from beamfit.noise.sizes import (
     whitening,
 )
 
+# Draws of a beam of no emittance, of which the evidence alone is wanted.
+FEW = 256
 # Draws of a plane, and degrees of freedom of the Student distributions they are drawn from.
 DRAWS, TAIL = 1536, 4.0
 # One draw in so many is from the prior: no weight is large by luck where the sizes say little.
@@ -37,8 +39,6 @@ ROUNDS, FURTHEST = 6, 3.0
 # Fits leave out every two of up to so many points, every one of up to so many more, and of any
 # number the worst ones up to this share in so many steps.
 PAIRS, SINGLES, WORST, STEPS = 24, 50, 0.25, 12
-# What fits as no beam is moved to |p| of this, a beam of nearly no emittance.
-EDGE = 0.999
 # Variance that makes a point of no weight.
 LEFT_OUT = 1e8
 # Numbers that one draw of many points may have, with all draws of few: memory and time.
@@ -172,67 +172,161 @@ def draw_beams(c: Coordinates, kind: NoiseKind, noise: Noise) -> BeamDraws:
 
     Notes
     -----
-    σ = T/2 (1 + p·(Z, X)) is positive definite for |p| < 1; the prior is lognormal in T and flat
-    in the emittance that T allows, T/2 (1 - |p|²)^½, and in the direction of p. Proposals
-    are Student distributions about the fits of all points, and of those without one or two; each
-    draw has the weight of its posterior over the density of the mixture (importance
-    sampling; A. B. Owen and Y. Zhou, J. Am. Stat. Assoc. 95, 135 (2000), sect. 4).
+    σ = T/2 (1 + p·(Z, X)) has the emittance ε = T/2 (1 - |p|²)^½: every beam is a point
+    (T p_1, T p_2, 2ε) of half a space, as far from its origin as T. The prior is lognormal in T and
+    has no preferred direction: flat in the emittance that T allows (Archimedes), without an edge
+    at a beam of no emittance. Proposals are Student distributions about the fits of all points, and
+    of those without one or two; each draw has the weight of its posterior over the density of the
+    mixture (importance sampling; A. B. Owen and Y. Zhou, J. Am. Stat. Assoc. 95, 135 (2000),
+    sect. 4).
     """
-    centre, root, deviation = fits(c, kind)
+    about = _proposals(c, kind, noise, flat=False)
+    mixture, scales = about.mixture, about.scales
+    count = int(np.clip(ROOM // c.size.shape[-1], FEWEST, DRAWS))
+    s = mixture.draw(count)
+    further = _prior_points(count)
+    s[..., -len(further) :, :] = further
+    # Both heights are one beam.
+    log_density = np.logaddexp(mixture.log_density(s), mixture.log_density(s * (1.0, 1.0, -1.0)))
+    # Draws from the prior among them bound every weight.
+    part = 1.0 / DEFENSIVE
+    log_density = np.logaddexp(math.log1p(-part) + log_density, math.log(part) + log_prior(s))
+    x = _numbers(s)
+    each = _log_likelihood(x, c, kind, scales.scale, noise)
+    drawn = log_prior(s) - log_density - math.log(count)
+    weight = averaged(each, scales.log_weight[..., None, :]) + drawn + kind.log_weight[..., None]
+    weight = np.where(np.isnan(weight), -np.inf, weight)
+    by_scale = averaged(np.swapaxes(each, -1, -2), drawn[..., None, :])
+    return BeamDraws(x, weight, scales, by_scale, about.best, about.best_log + kind.log_weight)
+
+
+def flat_evidence(c: Coordinates, kind: NoiseKind, noise: Noise) -> np.ndarray:
+    """Log evidence of a beam of no emittance, a line in phase space, shape (...,).
+
+    Parameters
+    ----------
+    c, kind, noise
+        As of `draw_beams`; with the same prior at 2ε = 0.
+    """
+    about = _proposals(c, kind, noise, flat=True)
+    whole, scales = about.mixture, about.scales
+    centre = whole.centre[..., :2]
+    plane = Mixture(centre, whole.root[..., :2, :2], np.zeros_like(centre), whole.share)
+    s = plane.draw(FEW)
+    log_density = plane.log_density(s)
+    s = np.concatenate([s, np.zeros_like(s[..., :1])], -1)
+    x = _numbers(s)
+    each = _log_likelihood(x, c, kind, scales.scale, noise)
+    found = averaged(each, scales.log_weight[..., None, :])
+    found = found + log_prior(s) + np.log(x[..., 0]) - log_density
+    return averaged(found, -math.log(FEW)) + kind.log_weight
+
+
+def _numbers(s: np.ndarray) -> np.ndarray:
+    """T, T p_1, T p_2 of T p_1, T p_2, 2ε."""
+    return np.concatenate([np.linalg.norm(s, axis=-1, keepdims=True), s[..., :2]], -1)
+
+
+class _Proposals(NamedTuple):
+    """Where beams are likely: a mixture, nodes of the noise's scale, and the likeliest of the fits,
+    T, T p_1, T p_2, with its log likelihood.
+    """
+
+    mixture: Mixture
+    scales: Scales
+    best: np.ndarray
+    best_log: np.ndarray
+
+
+def _proposals(c: Coordinates, kind: NoiseKind, noise: Noise, flat: bool) -> _Proposals:
+    fitted, covariance, deviation = fits(c, kind)
+    centre = _nearest(fitted, covariance, flat)
 
     def at_centres(scale: np.ndarray) -> np.ndarray:
         return _log_likelihood(centre, c, kind, scale, noise)
 
     scales = scales_of(kind, c.unit.shape, at_centres)
     by_scale, prior = at_centres(scales.scale), scales.log_weight[..., None, :]
-    root = root * _wider(by_scale + prior, scales.scale, kind, deviation)[..., None, None]
+    grown = _variance_found(by_scale + prior, scales.scale, kind, deviation)
+    centres, roots, bends = _in_half_space(fitted, centre, grown[..., None, None] * covariance)
     found = averaged(by_scale, prior)
     found = np.where(np.isfinite(found), found, -np.inf)
     # In their own order: which of two equals is the better, rounding would decide.
     top = np.sort(np.argsort(found, axis=-1)[..., -PARTS:], axis=-1)
     first = np.argmax(found, axis=-1)[..., None, None]
-    likeliest = np.take_along_axis(centre, first, -2)[..., 0, :]
     share = np.exp(FLATTER * (np.take_along_axis(found, top, -1) - found.max(-1, keepdims=True)))
     share /= share.sum(-1, keepdims=True)
-    centre = np.take_along_axis(centre, top[..., None], -2)
-    root = np.take_along_axis(root, top[..., None, None], -3)
-    count = int(np.clip(ROOM // c.size.shape[-1], FEWEST, DRAWS))
-    x, log_density = student_mixture(centre, root, share, count, _prior_points(count))
-    # Draws from the prior among them bound every weight.
-    part = 1.0 / DEFENSIVE
-    log_density = np.logaddexp(math.log1p(-part) + log_density, math.log(part) + log_prior(x))
-    each = _log_likelihood(x, c, kind, scales.scale, noise)
-    drawn = log_prior(x) - log_density - math.log(count)
-    weight = averaged(each, scales.log_weight[..., None, :]) + drawn + kind.log_weight[..., None]
-    weight = np.where(np.isnan(weight), -np.inf, weight)
-    by_scale = averaged(np.swapaxes(each, -1, -2), drawn[..., None, :])
-    top_log = found.max(-1) + kind.log_weight
-    return BeamDraws(x, weight, scales, by_scale, likeliest, top_log)
+    mixture = Mixture(
+        np.take_along_axis(centres, top[..., None], -2),
+        np.take_along_axis(roots, top[..., None, None], -3),
+        np.take_along_axis(bends, top[..., None], -2),
+        share,
+    )
+    likeliest = np.take_along_axis(centre, first, -2)[..., 0, :]
+    return _Proposals(mixture, scales, likeliest, found.max(-1))
 
 
-def _wider(
+def _variance_found(
     log: np.ndarray, scale: np.ndarray, kind: NoiseKind, deviation: np.ndarray
 ) -> np.ndarray:
-    """Widths of the fits over those by their deviations, by the noise that each of them finds: from
-    log probabilities of its scales, shape (..., m, k), and deviations, shape (..., m, n).
+    """Variances of the fits over those by their deviations, by the noise that each of them finds:
+    from log probabilities of its scales, shape (..., m, k), and deviations, shape (..., m, n).
     """
     variance = variance_of(kind, scale)[..., None, :, :] / deviation[..., None, :] ** 2
     variance = variance.mean(-1)
     # The three numbers of a beam about the fit take a volume of so many deviations cubed.
     log = np.nan_to_num(log + 1.5 * np.log(variance), nan=-1e300, neginf=-1e300)
     weight = np.exp(log - log.max(-1, keepdims=True))
-    return np.sqrt((weight * variance).sum(-1) / weight.sum(-1))
+    return (weight * variance).sum(-1) / weight.sum(-1)
 
 
-def log_prior(x: np.ndarray) -> np.ndarray:
-    """Log prior density of T, T p_1, T p_2, shape (..., 3) to (...); -inf where no beam is."""
-    t = np.maximum(x[..., 0], 1e-100)
-    left = 1.0 - (x[..., 1] ** 2 + x[..., 2] ** 2) / t**2
-    inside = (x[..., 0] > 0) & (left > 0)
-    bright = -0.5 * (np.log(t) / BRIGHT) ** 2 - math.log(BRIGHT) - 0.5 * LN_2PI
-    # |p|² = 1 - ε²/ε_max² at the same T: flat in ε, and in the direction of p.
-    flat = -math.log(2.0 * math.pi) - 0.5 * np.log(np.maximum(left, 1e-300))
-    return np.where(inside, bright + flat - 3.0 * np.log(t), -np.inf)
+def _in_half_space(
+    fitted: np.ndarray, beam: np.ndarray, covariance: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Centres, roots and bends of distributions of (T p_1, T p_2, 2ε) by fits of T, T p_1, T p_2.
+
+    Parameters
+    ----------
+    fitted, covariance : ndarray
+        Shape (..., 3) and (..., 3, 3): fits, some of which are no beams.
+    beam : ndarray
+        Shape (..., 3): the nearest beams to them.
+
+    Returns
+    -------
+    tuple of ndarray
+        As of a `Mixture`.
+
+    Notes
+    -----
+    (2ε)² = T² - |Tp|² is normal with mean m and deviation s, linear about the beam, and T p goes
+    with it. What is normal in 2ε about c with deviation w is nearest to that (C. M. Bishop, Pattern
+    Recognition and Machine Learning (2006), eq. 10.4) where c² + 3w² = m and
+    12w⁴ - 4mw² + s² = 0, or with c = 0 where 6w⁴ - 2mw² = s².
+    """
+    slope = 2.0 * beam * (1.0, -1.0, -1.0)
+    along = (covariance @ slope[..., None])[..., 0]
+    variance = np.maximum((slope * along).sum(-1), 1e-300)
+    mean = (slope * (fitted - 0.5 * beam)).sum(-1)
+    far = np.sqrt(np.maximum(mean**2 - 3.0 * variance, 0.0))
+    apart = mean > np.sqrt(3.0 * variance)
+    below = np.sqrt(mean**2 + 6.0 * variance) - mean
+    width = variance / np.where(apart, 2.0 * (mean + far), below)
+    height = np.sqrt(np.maximum(np.where(apart, mean - 3.0 * width, 0.0), 0.0))
+    bend = along[..., 1:] / variance[..., None]
+    across = covariance[..., 1:, 1:] - along[..., 1:, None] * bend[..., None, :]
+    root = np.zeros_like(covariance)
+    root[..., :2, :2] = np.linalg.cholesky(across + little(across))
+    root[..., 2, 2] = np.sqrt(width)
+    centre = np.concatenate([fitted[..., 1:] - bend * mean[..., None], height[..., None]], -1)
+    return centre, root, np.concatenate([bend, 0.0 * height[..., None]], -1)
+
+
+def log_prior(s: np.ndarray) -> np.ndarray:
+    """Log prior density of T p_1, T p_2, 2ε, shape (..., 3) to (...)."""
+    log_t = 0.5 * np.log(np.maximum((s**2).sum(-1), 1e-200))
+    bright = -0.5 * (log_t / BRIGHT) ** 2 - math.log(BRIGHT) - 0.5 * LN_2PI
+    return bright - math.log(2.0 * math.pi) - 3.0 * log_t
 
 
 def model_sizes(x: np.ndarray, c: Coordinates) -> np.ndarray:
@@ -263,8 +357,8 @@ def left_out(n: int) -> np.ndarray:
 
 
 def fits(c: Coordinates, kind: NoiseKind) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Fits of size² with all points and without some: centres, roots of their covariances, and the
-    deviations of points that these are by.
+    """Fits of size² with all points and without some, their covariances, and the deviations of
+    points that these are by.
 
     Returns
     -------
@@ -281,8 +375,8 @@ def fits(c: Coordinates, kind: NoiseKind) -> tuple[np.ndarray, np.ndarray, np.nd
     found = [_fitted(c, kind, deviation, kept) for deviation in deviations]
     for deviation in deviations if WORST * n > 2 else ():
         found += _greedy(c, kind, deviation)
-    centres, roots, by = zip(*found, strict=True)
-    return np.concatenate(centres, -2), np.concatenate(roots, -3), np.concatenate(by, -2)
+    fitted, covariances, by = zip(*found, strict=True)
+    return np.concatenate(fitted, -2), np.concatenate(covariances, -3), np.concatenate(by, -2)
 
 
 def _fitted(
@@ -307,7 +401,7 @@ def _fitted(
         model = np.sqrt(np.clip(squared, (size / FURTHEST) ** 2, (size * FURTHEST) ** 2))
     covariance = np.linalg.inv(normal)
     deviation = np.broadcast_to(deviation[..., None, :], kept.shape)
-    return _nearest(x, covariance), np.linalg.cholesky(covariance), deviation
+    return x, covariance, deviation
 
 
 def _weighed(weigh: np.ndarray, columns: np.ndarray) -> np.ndarray:
@@ -329,8 +423,8 @@ def _greedy(
     kept, found, most = np.ones((*c.unit.shape, 1, n)), [], int(WORST * n)
     steps = min(most, STEPS)
     for _ in range(steps):
-        centre, *_ = _fitted(c, kind, deviation, kept)
-        model = model_sizes(centre, c)
+        x, covariance, _ = _fitted(c, kind, deviation, kept)
+        model = model_sizes(_nearest(x, covariance), c)
         pull = np.abs(c.size[..., None, :] - model) / deviation[..., None, :] / model**kind.power
         worst = np.argsort(np.where(kept > 0, pull, -1.0), axis=-1)[..., -(most // steps) :]
         kept = kept.copy()
@@ -339,20 +433,20 @@ def _greedy(
     return found
 
 
-def _nearest(x: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    """The nearest beam of nearly no emittance in the place of what is no beam, by how far errors of
-    this covariance reach.
+def _nearest(x: np.ndarray, covariance: np.ndarray, flat: bool = False) -> np.ndarray:
+    """The nearest beam, one of no emittance, in the place of what is no beam (of everything if
+    `flat`), by how far errors of this covariance reach.
     """
     for _ in range(ROUNDS):
         t, turned = x[..., :1], x[..., 1:]
         p = np.linalg.norm(turned, axis=-1, keepdims=True) + 1e-12
-        slope = np.concatenate([np.full_like(t, -EDGE), turned / p], -1)
+        slope = np.concatenate([-np.ones_like(t), turned / p], -1)
         along = (covariance @ slope[..., None])[..., 0]
         reach = (slope * along).sum(-1, keepdims=True)
-        x = x - np.maximum(p - EDGE * t, 0.0) * along / reach
+        x = x - (p - t if flat else np.maximum(p - t, 0.0)) * along / reach
     t = np.where(x[..., :1] > 0.05, x[..., :1], 0.3)
     p = np.linalg.norm(x[..., 1:], axis=-1, keepdims=True) + 1e-12
-    return np.concatenate([t, x[..., 1:] * np.minimum(1.0, EDGE * t / p)], -1)
+    return np.concatenate([t, x[..., 1:] * np.minimum(1.0, t / p)], -1)
 
 
 def _even_cube(dim: int, number: int) -> np.ndarray:
@@ -379,63 +473,57 @@ def _even_points(dim: int, number: int) -> tuple[np.ndarray, np.ndarray]:
     return radius[:, None] * direction[:, :dim], cube[:, -1]
 
 
-def student_mixture(
-    centre: np.ndarray,
-    root: np.ndarray,
-    share: np.ndarray,
-    number: int = DRAWS,
-    further: np.ndarray | None = None,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Draws from a mixture of Student distributions, and their log density.
+class Mixture(NamedTuple):
+    """Student distributions in two or three dimensions, each bent as the square of the last one.
 
-    Parameters
+    Attributes
     ----------
-    centre, root, share : ndarray
-        Shape (..., m, dim), (..., m, dim, dim), lower triangles, and (..., m).
-    number : int
-        Of draws, d.
-    further : ndarray, optional
-        Shape (k, dim): points in the place of the last k draws.
-
-    Returns
-    -------
-    tuple of ndarray
-        Shape (..., d, dim) and (..., d).
+    centre, root, bend : ndarray
+        Shape (..., m, dim), (..., m, dim, dim), lower triangles, and (..., m, dim), whose last is
+        nothing: a bend moves no volume.
+    share : ndarray
+        Shape (..., m).
     """
-    z, cut = _even_points(centre.shape[-1], number)
-    part = (cut[:, None] > np.cumsum(share, -1)[..., None, :]).sum(-1)
-    part = np.minimum(part, share.shape[-1] - 1)
-    own = np.take_along_axis(root, part[..., None, None], -3)
-    x = np.take_along_axis(centre, part[..., None], -2) + (own @ z[..., None])[..., 0]
-    if further is not None:
-        x[..., -len(further) :, :] = further
-    return x, _student_density(x, centre, root, share)
 
+    centre: np.ndarray
+    root: np.ndarray
+    bend: np.ndarray
+    share: np.ndarray
 
-def _student_density(
-    x: np.ndarray, centre: np.ndarray, root: np.ndarray, share: np.ndarray
-) -> np.ndarray:
-    """Log density of a mixture of Student distributions at points, shape (..., d)."""
-    *lead, parts, dim = centre.shape
-    inverse = np.linalg.inv(root)
-    # L⁻¹x of every part in one product, less L⁻¹centre: shape (..., parts, dim, d).
-    rows = inverse.reshape(*lead, parts * dim, dim)
-    far = (rows @ np.swapaxes(x, -1, -2)).reshape(*lead, parts, dim, -1)
-    far -= inverse @ centre[..., None]
-    near = 1.0 / (1.0 + np.square(far, out=far).sum(-2) / TAIL)
-    near **= 0.5 * (TAIL + dim)
-    with np.errstate(divide="ignore"):
-        height = np.log(share) - np.log(np.abs(np.diagonal(root, axis1=-2, axis2=-1))).sum(-1)
-    top = height.max(-1, keepdims=True)
-    log = np.log((np.exp(height - top)[..., None, :] @ near)[..., 0, :]) + top
-    constant = gammaln(0.5 * (TAIL + dim)) - gammaln(0.5 * TAIL)
-    return log + constant - 0.5 * dim * math.log(TAIL * math.pi)
+    def draw(self, number: int) -> np.ndarray:
+        """Even draws, shape (..., number, dim)."""
+        z, cut = _even_points(self.centre.shape[-1], number)
+        part = (cut[:, None] > np.cumsum(self.share, -1)[..., None, :]).sum(-1)
+        part = np.minimum(part, self.share.shape[-1] - 1)[..., None]
+        own = np.take_along_axis(self.root, part[..., None], -3)
+        x = np.take_along_axis(self.centre, part, -2) + (own @ z[..., None])[..., 0]
+        return x + np.take_along_axis(self.bend, part, -2) * x[..., -1:] ** 2
+
+    def log_density(self, x: np.ndarray) -> np.ndarray:
+        """Log density at points, shape (..., d, dim) to (..., d)."""
+        *lead, parts, dim = self.centre.shape
+        inverse = np.linalg.inv(self.root)
+        # L⁻¹(x - bend x_dim²) of every part in one product, less L⁻¹centre.
+        rows = np.concatenate([inverse, -inverse @ self.bend[..., None]], -1)
+        seen = np.concatenate([x, x[..., -1:] ** 2], -1)
+        far = rows.reshape(*lead, parts * dim, dim + 1) @ np.swapaxes(seen, -1, -2)
+        far = far.reshape(*lead, parts, dim, -1)
+        far -= inverse @ self.centre[..., None]
+        near = 1.0 / (1.0 + np.square(far, out=far).sum(-2) / TAIL)
+        near **= 0.5 * (TAIL + dim)
+        volume = np.abs(np.diagonal(self.root, axis1=-2, axis2=-1))
+        with np.errstate(divide="ignore"):
+            height = np.log(self.share) - np.log(volume).sum(-1)
+        top = height.max(-1, keepdims=True)
+        log = np.log((np.exp(height - top)[..., None, :] @ near)[..., 0, :]) + top
+        constant = gammaln(0.5 * (TAIL + dim)) - gammaln(0.5 * TAIL)
+        return log + constant - 0.5 * dim * math.log(TAIL * math.pi)
 
 
 @lru_cache(maxsize=8)
 def _prior_points(number: int) -> np.ndarray:
-    """Even draws from the prior of T, T p_1, T p_2, one for every `DEFENSIVE` draws."""
+    """Even draws from the prior of T p_1, T p_2, 2ε, one for every `DEFENSIVE` draws."""
     bright, flat, turn = _even_cube(3, number // DEFENSIVE).T
     t, p = np.exp(BRIGHT * ndtri(bright)), np.sqrt(1.0 - flat**2)
     angle = 2.0 * math.pi * turn
-    return np.stack([t, t * p * np.cos(angle), t * p * np.sin(angle)], -1)
+    return np.stack([t * p * np.cos(angle), t * p * np.sin(angle), t * flat], -1)

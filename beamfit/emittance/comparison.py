@@ -11,14 +11,12 @@ import jax
 import numpy as np
 
 from beamfit.emittance.beam_draws import (
-    BRIGHT,
     FURTHEST,
     BeamDraws,
     Coordinates,
     coordinates,
     draw_beams,
-    little,
-    student_mixture,
+    flat_evidence,
 )
 from beamfit.emittance.model import coefficients
 from beamfit.noise.model import LN_2PI, Noise
@@ -45,8 +43,6 @@ MODELS = {BEAM: 0.85, FLAT: 0.03, CONSTANT: 0.03, RANDOM: 0.04, DRIFTING: 0.02, 
 UNMOVED = {BEAM: 0.9, FLAT: 0.05, RANDOM: 0.05}
 # Models are told apart by at most so many points, evenly among all: the beam by every one.
 COMPARED = LONG
-# Proposals of a beam without emittance are so much wider than the linear theory.
-WIDER = 1.3
 # Planes that are looked at in one call, and rounds of the best fit and when it rests.
 TOGETHER, ROUNDS, REST = 16, 40, 1e-11
 # Steps of ln size of sizes at random or in a drift; bends of a curve as shares of the mean size,
@@ -61,56 +57,6 @@ DEPARTURES, SMOOTH, NEAR = np.array([0.1, 0.2, 0.4]), 0.7, 1 / 30
 LEVEL = 1.0
 # Quantiles of a posterior: an error is half of the central 68 %, an interval the central 95 %.
 AT = (0.025, 0.1587, 0.5, 0.8413, 0.975)
-# Draws of a beam of no emittance, of which the evidence alone is wanted.
-FEW = 256
-
-
-def flat_beam(c: Coordinates, kind: NoiseKind, noise: Noise) -> np.ndarray:
-    """A beam of no emittance: sizes |w·v|, shape (...,).
-
-    Notes
-    -----
-    A line in phase space. Sorted by their directions, the rows before some row see it from one
-    side, those after it from the other: n linear fits, of which the best is drawn about.
-    """
-    n = c.size.shape[-1]
-    w = c.w * np.where(c.w[..., 1:] < 0, -1.0, 1.0)
-    order = np.argsort(np.arctan2(w[..., 1], w[..., 0]), axis=-1)
-    w = np.take_along_axis(w, order[..., None], -2)
-    size, known = (np.take_along_axis(v, order, -1) for v in (c.size, c.known))
-    own = (np.take_along_axis(v, order, -1) for v in (kind.floor, kind.unit))
-    kind = replace(kind, **dict(zip(("floor", "unit"), own, strict=True)))
-    target = np.sqrt(np.maximum(size**2 - known, 0.0))
-    deviation = kind.deviation(kind.special or kind.prior.middle) * (size if kind.power else 1.0)
-    side = np.where(np.arange(n) < np.arange(n)[:, None], -1.0, 1.0)
-    rows = (w / deviation[..., None])[..., None, :, :] * side[..., None]
-    normal = np.swapaxes(rows, -1, -2) @ rows
-    right = np.swapaxes(rows, -1, -2) @ (target / deviation)[..., None, :, None]
-    normal = normal + little(normal)
-    v = np.linalg.solve(normal, right)
-    off = (rows @ v)[..., 0] - (target / deviation)[..., None, :]
-    chi2 = (off**2).sum(-1)
-    best = np.argmin(chi2, axis=-1)[..., None]
-    v = np.take_along_axis(v[..., 0], best[..., None], -2)
-    normal = np.take_along_axis(normal, best[..., None, None], -3)
-    least = np.take_along_axis(chi2, best, -1)
-    factor = (2.0 + least) / n if kind.special is None else np.maximum(1.0, least / max(n - 2, 1))
-    root = WIDER * np.linalg.cholesky(np.linalg.inv(normal)) * np.sqrt(factor)[..., None, None]
-
-    def each(v: np.ndarray, scale: np.ndarray) -> np.ndarray:
-        seen = np.abs(v @ np.swapaxes(w, -1, -2))
-        model = np.sqrt(np.maximum(seen**2 + known[..., None, :], 1e-8))
-        return log_likelihood(size[..., None, :] - model, model, kind, scale, noise)
-
-    scales = scales_of(kind, c.unit.shape, lambda scale: each(v, scale))
-    x, log_density = student_mixture(v, root, np.ones((*v.shape[:-2], 1)), FEW)
-    t = np.maximum((x**2).sum(-1), 1e-300)
-    # v and -v are one beam: twice the density of the whole plane.
-    bright = -0.5 * LN_2PI - math.log(BRIGHT) - 0.5 * (np.log(t) / BRIGHT) ** 2
-    prior = bright - np.log(0.5 * math.pi * t)
-    found = averaged(each(x, scales.scale), scales.log_weight[..., None, :])
-    found = found + prior - log_density - math.log(FEW)
-    return averaged(found, 0.0) + kind.log_weight
 
 
 def _bends(w: np.ndarray, length: float) -> np.ndarray:
@@ -481,9 +427,9 @@ def _evidences(s: _Stack, i: int, draws: BeamDraws, noise: Noise) -> np.ndarray:
     # Noise in proportion to the size would vanish where such a beam does.
     flat = np.full_like(beam, -np.inf)
     if not kind.power:
-        flat = flat_beam(s.c, kind, noise)
+        flat = flat_evidence(s.c, kind, noise)
     elif all(k.power for k in s.kinds):
-        flat = flat_beam(s.c, replace(kind, power=0, unit=kind.unit * s.c.size), noise)
+        flat = flat_evidence(s.c, replace(kind, power=0, unit=kind.unit * s.c.size), noise)
     jacobian = np.log(s.c.size).sum(-1)
     # Rivals of slow noise are slow themselves, or as random as without it.
     curves = curve_evidences(s.u, s.c, replace(kind, slow=False), noise)

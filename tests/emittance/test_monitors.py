@@ -72,9 +72,9 @@ def test_sizes_at_five_wires_give_the_beam(plane):
 
 def test_a_row_may_bring_its_matrix_in_place_of_a_lattice():
     """The same numbers as with the lattice, whatever the noise, and at the same place."""
-    whole = beamfit.fit_emittance(wire_scan(WIRES, 0.0003, stated=0.0003), fodo())
+    whole = beamfit.fit_emittance(wire_scan(WIRES, 0.001, stated=0.001), fodo())
     own = wire_scan(
-        WIRES, 0.0003, stated=0.0003, transfer=seen_from(fodo(), WIRES), energy=np.full(5, 135.0)
+        WIRES, 0.001, stated=0.001, transfer=seen_from(fodo(), WIRES), energy=np.full(5, 135.0)
     )
     alone = beamfit.fit_emittance(own)
     for plane in "xy":
