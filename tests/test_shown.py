@@ -65,7 +65,7 @@ def values(root):
         "19 values": beamfit.moving_lifetime(record, 9000.0),
         "constant a": beamfit.constant_a_test(record),
         "sd": beamfit.Anchor(),
-        "2.341 ± 0.046 m": fit.x.beta,
+        "2.341 ± 0.045 m": fit.x.beta,
         "Q2": beamfit.find_setpoint(line, {"x": beam}, {"Q2": (0, 10)}, wish),
         "Measure next": plan_measurements(fit, count=1),
         "i0": posterior,
