@@ -9,7 +9,6 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 from scipy.ndimage import median_filter
 from scipy.special import expit
-from scipy.stats import mannwhitneyu
 
 from beamfit.dynamics.model import CLOSE, PreparedOutput
 from beamfit.dynamics.paths import heard
@@ -119,8 +118,12 @@ def _follows(runs: Runs, off: Masks) -> bool:
         late.append(rows - np.maximum.accumulate(np.where(moves, rows, -len(run))))
         out.append(mask.any(axis=1))
     late, out = np.concatenate(late), np.concatenate(out)
-    sooner = mannwhitneyu(late[out], late[~out], alternative="less") if out.any() else None
-    return sooner is not None and bool(sooner.pvalue < POOR_FIT)
+    if not out.any():
+        return False
+    from scipy.stats import mannwhitneyu  # half a second that only such readings should cost
+
+    sooner = mannwhitneyu(late[out], late[~out], alternative="less")
+    return bool(sooner.pvalue < POOR_FIT)
 
 
 def _none(runs: Runs) -> Masks:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import chi2, f
+from scipy.special import chdtrc, fdtrc
 
 from beamfit.dynamics.model import CLOSE, Driven, PreparedOutput, changed_by
 from beamfit.dynamics.record import Run, Way
@@ -190,7 +190,7 @@ def _chance(explained: float, left: float, used: int, free: int) -> float:
     """Chance that so many numbers explain so much of squares if nothing is to be explained (F)."""
     if free < 1 or used < 1 or explained <= 0.0:
         return 1.0
-    return float(f.sf(explained / used / max(left / free, 1e-300), used, free))
+    return float(fdtrc(used, free, explained / used / max(left / free, 1e-300)))
 
 
 class RunNoises(NamedTuple):
@@ -238,7 +238,7 @@ def _white(residuals: Sequence[np.ndarray]) -> float:
     squares = max(sum(float(r @ r) for r in residuals), 1e-300)
     found = [sum(float(r[k:] @ r[:-k]) for r in residuals) / squares for k in range(1, lags + 1)]
     q = count * (count + 2) * sum(c**2 / (count - k) for k, c in enumerate(found, start=1))
-    return float(chi2.sf(q, lags))
+    return float(chdtrc(lags, q))
 
 
 def _explained(

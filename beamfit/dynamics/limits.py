@@ -12,8 +12,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from scipy.special import ndtri
-from scipy.stats import t as student
+from scipy.special import ndtri, stdtrit
 
 from beamfit.dynamics.alternatives import CORRELATION_TIMES, WHITE, by_each, over_noises
 from beamfit.dynamics.response import ARX, FIRST_ORDER
@@ -66,7 +65,7 @@ class LagPosterior(NamedTuple):
     def drawn(self, gains: Sequence[str]) -> dict[str, np.ndarray]:
         """Draws of the lag, s, of gains, of these over it, and of the offset, by name."""
         at = (np.arange(DRAWS) + 0.5) / DRAWS
-        lag, away = self.quantiles(at), student.ppf(at, self.dof)
+        lag, away = self.quantiles(at), stdtrit(self.dof, at)
         away = np.random.default_rng(0).permutation(away)
         near = np.searchsorted(0.5 * (self.lag[1:] + self.lag[:-1]), lag)
         numbers = self.mean[near] + away[:, None] * self.error[near]
@@ -79,7 +78,7 @@ class LagPosterior(NamedTuple):
 
         `late` is the standard deviation of the delay, s: one that is shorter is a longer lag.
         """
-        rise = self.dof * np.log1p(student.ppf(1.0 - 0.5 * POOR_FIT, self.dof) ** 2 / self.dof)
+        rise = self.dof * np.log1p(stdtrit(self.dof, 1.0 - 0.5 * POOR_FIT) ** 2 / self.dof)
         zero, endless = 2.0 * (self.best - self.log[[0, -1]]) <= rise
         low, high = np.exp(self.quantiles(np.array([1.0 - SINGLE_END, SINGLE_END]))).tolist()
         high = float(np.hypot(high, ndtri(SINGLE_END) * late))
