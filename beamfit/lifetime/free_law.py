@@ -27,7 +27,6 @@ from scipy.linalg import block_diag
 from scipy.special import expit, log_expit, log_ndtr, logsumexp, ndtri
 
 from beamfit.arrays import array_module
-from beamfit.lifetime.decay_law import closed_form
 from beamfit.lifetime.expansion import Physical, Pieces
 from beamfit.lifetime.record import DecayRecord
 from beamfit.noise.memory import Products
@@ -235,8 +234,9 @@ class Numbers(NamedTuple):
     def currents(self, gas: np.ndarray) -> np.ndarray:
         """Currents at the nodes over the mean, one column a set; `gas` is ∫ P dt over the mean."""
         changed = gas_changed(self.pace if np.any(self.pace) else np.zeros(1))
-        lost = (1 - self.share) * gas[:, None] + self.gas * changed
-        return node_currents(self.level, self.share * self.rate, self.power, self.rate * lost)
+        quadratic = self.share * self.rate
+        lost = (self.rate - quadratic) * gas[:, None] + self.rate * self.gas * changed
+        return node_currents(self.level, quadratic, self.power, lost)
 
 
 def node_currents(level, quadratic, power, lost):
@@ -245,12 +245,9 @@ def node_currents(level, quadratic, power, lost):
     """
     xp = array_module(level, quadratic, power, lost)
     c, lost = 1 + power, xp.clip(lost, -200, 200)  # a factor that no beam has, and no overflow
-    whole = INTEGRAL @ xp.exp(-c * lost)
+    left = 1 + c * quadratic * level**c * (INTEGRAL @ xp.exp(-c * lost))
     # Where a loss that is no beam's would have ended the record the law has no value.
-    inside = c * quadratic * level**c
-    least = (1e-3 - 1) / xp.where(inside == 0, 1.0, inside)
-    whole = xp.where(inside * whole < 1e-3 - 1, least, whole)
-    return closed_form(level, quadratic, power, lost, whole)
+    return level * xp.exp(-lost) * xp.maximum(left, 1e-3) ** (-1 / c)
 
 
 def log_prior(power):
@@ -770,7 +767,7 @@ class DrawnLaw(NamedTuple):
         """Draw levels and rates about the best ones beside the other numbers, found anew."""
         seen, lower = self.seen, self.beam[..., kind, at]
         along, squares = seen.along(seen.away(near.currents(seen.gas)), kind)
-        pull = _forward(lower, -np.sum(self.slopes[..., at] * along[:, None], axis=0))
+        pull = _forward(lower, -np.einsum("prd,pd->rd", self.slopes[..., at], along))
         left = np.maximum(squares - np.sum(pull**2, axis=0), 1e-30)
         noise, far = np.sqrt(seen.products.variance(left, 2)), np.full(kind.size, np.inf)
         own, log = _between(even, -far, far)
@@ -814,8 +811,7 @@ def drawn(laws: Sequence[DrawnLaw]) -> list[Draws]:
     while True:
         log, worth = np.array([(one.log, max(one.worth, 1.0)) for one in found]).T
         part = np.exp(log - max(log.max(), -1e300))
-        errors = np.sqrt(part / max(part.sum(), 1e-300) * count / worth)  # of one draw of each
-        needed = np.minimum(WORTH * errors * errors.sum(), MANY)
+        needed = np.minimum(WORTH * part / max(part.sum(), 1e-300) * count / worth, MANY)
         short = np.flatnonzero(count < 0.8 * needed)
         if not short.size:
             return found
