@@ -599,8 +599,9 @@ def _searched(seen: SeenDecay, numbers: np.ndarray, free: list[int]) -> Peaks:
         named = Numbers.of(numbers)
         numbers[BEND] += (np.clip(named.share, -1.0, 2.0) - named.share) / named.unit
         spread = 1 / np.sqrt(np.sum(weight * np.sum(found.lower**2, axis=1), axis=1))
-        rests = (np.abs(numbers[free] - before) < RESTS * spread + 1e-9).all(axis=0)
-        if rests[whole > whole.max() - FAR].all():
+        moved = np.max(np.abs(numbers[free] - before) / (spread + 1e-9), axis=0)
+        likely = np.exp(whole - whole.max())
+        if likely @ moved < RESTS * likely.sum():
             break
     return found
 
