@@ -446,13 +446,12 @@ def _widths(kind: str, sizes: np.ndarray, times: np.ndarray, loss: float) -> np.
 
 def _smooth(plain: Expansion) -> float:
     """Log evidence of a power of the current with a drift of b, or of neither."""
-    start = np.append(plain.numbers, [0.0, 0.0])
-    laws = [plain, solved(plain.pieces, (*PLAIN, POWER))]
+    start, power = np.append(plain.numbers, [0.0, 0.0]), {POWER: (BELOW + ABOVE) / 2}
+    laws = [plain, solved(plain.pieces, (*PLAIN, POWER), start=plain.numbers, widths=power)]
     if plain.pieces.gauge is None:
         gas = abs(plain.numbers[0] - plain.numbers[1])
-        width = (BELOW + ABOVE) / 2
         laws.append(solved(plain.pieces, (*PLAIN, POWER, FURTHER), "drift", start=start,
-                           widths={POWER: width, FURTHER: DRIFT * gas}))  # fmt: skip
+                           widths=power | {FURTHER: DRIFT * gas}))  # fmt: skip
     each = zip(laws, (CONSTANT, POWERED, DRIFTING), strict=False)
     return float(logsumexp([_log_evidence(law, one) for law, one in each if law.rested]))
 
@@ -545,12 +544,11 @@ def _log_evidence(law: Expansion, one: Alternative) -> float:
     for kind in disturbances(law.numbers[0]):
         if kind.of_loss and law.pieces.gauge is not None:
             continue
-        numbers = kind.shapes.shape[2]
+        shown = np.pad(kind.shown(law.numbers[0]), ((0, 0), (1 + width.size, 0), (0, 0)))
+        each = np.concatenate([np.broadcast_to(own, (len(shown), *own.shape)), shown], axis=2)
+        numbers = shown.shape[2]
         known = np.append(width, np.ones(numbers)), np.append(centre, np.zeros(numbers))
-        for shape, chance in zip(kind.shown(law.numbers[0]), kind.chance, strict=True):
-            further = np.vstack([np.zeros((1 + width.size, numbers)), shape])
-            log = _laplace(near.combined(np.hstack([own, further])), *known)
-            found.append(log + math.log(chance / SMOOTH))
+        found.append(_laplace(near.by_each(each, kind.chance / SMOOTH), *known))
     return float(logsumexp(found)) + _log_chance(one, law)
 
 
