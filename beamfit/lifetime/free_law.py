@@ -290,8 +290,6 @@ ENOUGH = 1024
 # Draws of each law at first, how many independent ones all together are to be worth, and most of
 # them; the scale of the logistic distribution that they have in standard deviations.
 FEW, WORTH, MANY, TAIL = 512, 2500.0, 60000, 0.6
-# Width of the share in what draws come from, which its bounds cut off otherwise.
-AROUND = 0.6
 # Standard deviations of the share beside a bound in which draws tell the density there.
 NEAR = 0.25
 # Shares of a of losses that are no beam's, and the prior odds of one.
@@ -557,10 +555,9 @@ def _expanded(seen: SeenDecay, numbers: np.ndarray, free: list[int]) -> Peaks:
     products = seen.products.between(rows)
     normal, gradient, squares = products[:-1, :-1], -products[:-1, -1], products[-1, -1]
     change = np.where(numbers[PACE, 0] > 0, PUMPED, DRIFT)
-    width = np.array([np.inf, np.inf, AROUND, np.inf, change])[free, None]
-    middle = np.where(np.equal(free, BEND), 0.5, 0.0)[:, None]
+    width = np.where(np.equal(free, CHANGE), change, np.inf)[:, None]
     known = np.diag(1 / width[:, 0] ** 2)[..., None, None]
-    pull = ((middle - numbers[free]) / width**2)[:, None]
+    pull = (-numbers[free] / width**2)[:, None]
     after = np.maximum(squares, 1e-30)
     for _ in range(2):
         unit = seen.products.variance(after, len(free))
@@ -571,7 +568,7 @@ def _expanded(seen: SeenDecay, numbers: np.ndarray, free: list[int]) -> Peaks:
     centre = numbers[free][:, None] + step
     log = seen.products.log_prior[:, None] + seen.products.log_size(after)
     log = log - np.sum(np.log(np.einsum("ppkm->pkm", lower)), axis=0)
-    log = log - 0.5 * np.sum(((centre - middle[:, None]) / width[:, None]) ** 2, axis=0)
+    log = log - 0.5 * np.sum((centre / width[:, None]) ** 2, axis=0)
     by_share = share[:-1, None]
     moved = share[-1] + np.sum(by_share * step, axis=0)
     log = log + _log_within(seen.share, moved, _spread(lower, by_share))
