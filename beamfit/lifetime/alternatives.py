@@ -525,9 +525,7 @@ def _squares(law: Expansion) -> float:
     return float(law.residuals @ law.residuals)
 
 
-def _log_evidences(
-    plain: Expansion, laws: Sequence[tuple[Alternative, Expansion]]
-) -> list[float]:
+def _log_evidences(plain: Expansion, laws: Sequence[tuple[Alternative, Expansion]]) -> list[float]:
     """Logarithms of the probability of the readings by each law, the noise averaged over, up to a
     constant: also beside a disturbance of the plain law's currents, in linear approximation.
     """

@@ -183,9 +183,10 @@ def beam_current(
         def whole(time: np.ndarray) -> np.ndarray:
             return time * mean_exponential((1.0 + power) * linear * time)
 
-        bent, pairs = quadratic * whole(at.time), zip(further[::2], further[1::2], strict=True)
+        every = whole(at.time)
+        bent, pairs = quadratic * every, zip(further[::2], further[1::2], strict=True)
         for more, when in pairs:
-            bent = bent + more * np.where(at.time > np.real(when), whole(at.time) - whole(when), 0)
+            bent = bent + more * np.where(at.time > np.real(when), every - whole(when), 0)
         return closed_form(level, 1.0, power, lost, bent)
 
     def gone(time: np.ndarray, gas: np.ndarray) -> np.ndarray:

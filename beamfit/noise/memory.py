@@ -261,7 +261,8 @@ def products_by_each(
         diagonals, volume = _whitening(apart), float(log_volume(apart))
         for noise in alike:
             size, below = _factor(noise.white, *diagonals)
-            solved = dpttrs(size, below, begun)[0].T.reshape(columns.shape)
+            solved = dpttrs(size, below, begun)[0] if noise.white else begun
+            solved = solved.T.reshape(columns.shape)
             matrix.append(columns @ np.swapaxes(solved, -1, -2))
             volumes.append(volume - 0.5 * float(np.sum(np.log(size))))
     return np.array(matrix), np.array(volumes)
