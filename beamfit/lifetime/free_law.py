@@ -510,28 +510,30 @@ def _seen_slopes(
 
 def _triangle(matrix: np.ndarray) -> np.ndarray:
     """Lower triangles L of many small matrices L Lᵀ, numbers of the matrix first: (p, p, ...)."""
-    lower = np.zeros_like(matrix)
+    lower, left = np.zeros_like(matrix), matrix.copy()
     for j in range(len(matrix)):
-        left = matrix[j:, j] - np.sum(lower[j:, :j] * lower[j, :j], axis=1)
-        root = np.sqrt(np.maximum(left[0], LEAST_LEFT * matrix[j, j] + 1e-300))
-        lower[j:, j] = left / root
-        lower[j, j] = root
+        lower[j, j] = np.sqrt(np.maximum(left[j, j], LEAST_LEFT * matrix[j, j] + 1e-300))
+        below = lower[j + 1 :, j]
+        below[:] = left[j + 1 :, j] / lower[j, j]
+        left[j + 1 :, j + 1 :] -= below[:, None] * below
     return lower
 
 
 def _forward(lower: np.ndarray, right: np.ndarray) -> np.ndarray:
     """L⁻¹ of columns, (p, ...)."""
-    found = np.empty(lower.shape[1:])
+    found = np.broadcast_to(right, lower.shape[1:]).copy()
     for j in range(len(lower)):
-        found[j] = (right[j] - np.sum(lower[j, :j] * found[:j], axis=0)) / lower[j, j]
+        found[j] /= lower[j, j]
+        found[j + 1 :] -= lower[j + 1 :, j] * found[j]
     return found
 
 
 def _backward(lower: np.ndarray, right: np.ndarray) -> np.ndarray:
     """L⁻ᵀ of columns, (p, ...)."""
-    found = np.empty(lower.shape[1:])
+    found = np.broadcast_to(right, lower.shape[1:]).copy()
     for j in reversed(range(len(lower))):
-        found[j] = (right[j] - np.sum(lower[j + 1 :, j] * found[j + 1 :], axis=0)) / lower[j, j]
+        found[j] /= lower[j, j]
+        found[:j] -= lower[j, :j] * found[j]
     return found
 
 
