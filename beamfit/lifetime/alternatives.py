@@ -394,9 +394,10 @@ def _averaged(about: Expansion) -> Pieces:
     pieces, (i0, a, b, *_) = about.pieces, about.values
     if pieces.time.size <= ENOUGH or pieces.first.size > 1 or pieces.gauge is not None:
         return pieces
-    record = DecayRecord(pieces.time, pieces.current, pieces.error, monitor=pieces.monitor)
-    means = record.means(-(-len(record) // ENOUGH), lambda time: current(time, i0, a, b))
-    return Pieces.of(DecayRecord(*means, monitor=pieces.monitor))
+    record = DecayRecord(pieces.time, pieces.current, pieces.error)
+    size = -(-len(record) // ENOUGH)
+    time, *means = record.means(size, lambda time: current(time, i0, a, b))
+    return Pieces(time, time, *means, pieces.first, None, pieces.monitor)
 
 
 def _likely(plain: Expansion) -> list[Alternative]:

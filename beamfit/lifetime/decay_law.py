@@ -194,11 +194,10 @@ def beam_current(
         return linear * gas + sum(f * course(kind, time, w) for f, w in pairs)
 
     gas = at.time if at.gas is None else at.gas
-    inside = np.diff(at.time)
-    node = at.time[:-1, None] + inside[:, None] * NODES
-    node_gas = gas[:-1, None] + np.diff(gas)[:, None] * NODES
-    parts = inside * (np.exp(-(1.0 + power) * gone(node, node_gas)) @ WEIGHTS)
-    whole = np.append(0.0, np.cumsum(parts))
+    inside, more = np.diff(at.time, prepend=0.0), np.diff(gas, prepend=0.0)
+    node = at.time[:, None] + inside[:, None] * (NODES - 1)
+    node_gas = gas[:, None] + more[:, None] * (NODES - 1)
+    whole = np.cumsum(inside * (np.exp(-(1.0 + power) * gone(node, node_gas)) @ WEIGHTS))
     return closed_form(level, quadratic, power, gone(at.time, gas), whole)
 
 
