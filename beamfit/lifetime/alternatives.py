@@ -402,7 +402,7 @@ def _averaged(about: Expansion) -> Pieces:
 
 def _likely(plain: Expansion) -> list[Alternative]:
     """Alternatives that are not much less likely than constant a and b: by their evidence in linear
-    approximation about the law without, at their best times.
+    approximation about the law without, at their best times, also beside disturbances.
     """
     gauged = plain.pieces.gauge is not None
     others = [one for one in OTHERS if not (gauged and one.kind in UNGAUGED)]
@@ -418,12 +418,13 @@ def _likely(plain: Expansion) -> list[Alternative]:
             size = np.append(size, time)
         places[one], widths[one] = range(len(columns), len(columns) + len(own)), size
         columns += own
-    products = Products.of(np.column_stack(columns), plain.pieces.time, bool(plain.given), COARSE)
+    rows = np.column_stack([*columns, _by_nodes(plain)])
+    products = Products.of(rows, plain.pieces.time, bool(plain.given), COARSE)
+    every, nodes = np.split(np.eye(rows.shape[1]), [len(columns)], axis=1)
 
     def log_evidence(one: Alternative) -> float:
-        own, width = [0, 1, 2, 3, *places[one]], np.append([np.inf] * 3, widths[one])
-        some = products.combined(np.eye(len(columns))[:, own])
-        return _laplace(some, width, np.zeros(width.size)) + _log_chance(one, plain)
+        own, width = every[:, [0, 1, 2, 3, *places[one]]], np.append([np.inf] * 3, widths[one])
+        return _log_evidence(one, plain, products, nodes, own, width, np.zeros(width.size))
 
     constant = log_evidence(CONSTANT) + HOPELESS
     return [one for one in others if log_evidence(one) > constant]
@@ -531,8 +532,7 @@ def _log_evidences(plain: Expansion, laws: Sequence[tuple[Alternative, Expansion
     constant: also beside a disturbance of the plain law's currents, in linear approximation.
     """
     pieces, given = plain.pieces, [_given(law, one) for one, law in laws]
-    model = pieces.current / pieces.over + plain.residuals
-    parts = [model[:, None] * from_nodes(pieces.time / pieces.units[0])]
+    parts = [_by_nodes(plain)]
     parts += [np.column_stack([law.residuals, law.rows[:, columns]])
               for (_, law), (columns, *_) in zip(laws, given, strict=True)]  # fmt: skip
     products = Products.of(np.hstack(parts), pieces.time, pieces.error is not None)
@@ -540,6 +540,13 @@ def _log_evidences(plain: Expansion, laws: Sequence[tuple[Alternative, Expansion
     nodes, *owns = np.split(every, np.cumsum([part.shape[1] for part in parts[:-1]]), axis=1)
     each = zip(laws, owns, given, strict=True)
     return [_log_evidence(*pair, products, nodes, own, *known) for pair, own, (_, *known) in each]
+
+
+def _by_nodes(plain: Expansion) -> np.ndarray:
+    """Change of the readings by that of a share of the law's currents at each node."""
+    pieces = plain.pieces
+    model = pieces.current / pieces.over + plain.residuals
+    return model[:, None] * from_nodes(pieces.time / pieces.units[0])
 
 
 def _log_evidence(
