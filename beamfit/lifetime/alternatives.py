@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.linalg import block_diag
 from scipy.special import logsumexp, ndtri
 
 from beamfit.answer import json_of, shown
@@ -374,15 +374,15 @@ def rival_of(plain: Expansion) -> Rival | None:
     if pieces.time.size <= WHEN + 2:
         return None
     plain = solved(pieces) if pieces is not plain.pieces else plain
-    likely = _likely(plain)
-    if not likely:
+    each = ((one, _with_further(plain, one.kind, one.count)) for one in _likely(plain))
+    laws = [(one, law) for one, law in each if law is not None]
+    if not laws:
         return None
-    laws = [(one, _with_further(plain, one.kind, one.count)) for one in likely]
-    found = [(_log_evidence(law, one), one, law) for one, law in laws if law is not None]
-    log, one, best = max(found, key=lambda each: each[0], default=(-math.inf, CONSTANT, plain))
-    smooth = _smooth(plain)
+    logs = _log_evidences(plain, [*laws, *_smooth(plain)])
+    log, smooth = max(logs[: len(laws)]), float(logsumexp(logs[len(laws) :]))
     if not log > smooth:
         return None
+    one, best = laws[logs.index(log)]
     told = {"relaxing": _outgassing, "sudden": _sudden_loss}
     told |= {"step": _change, "step of a": partial(_change, of_a=True)}
     scatter = float(np.sqrt(np.mean((best.residuals * pieces.over) ** 2)))
@@ -394,14 +394,15 @@ def _averaged(about: Expansion) -> Pieces:
     pieces, (i0, a, b, *_) = about.pieces, about.values
     if pieces.time.size <= ENOUGH or pieces.first.size > 1 or pieces.gauge is not None:
         return pieces
-    record = DecayRecord(pieces.time, pieces.current, pieces.error, monitor=pieces.monitor)
-    means = record.means(-(-len(record) // ENOUGH), lambda time: current(time, i0, a, b))
-    return Pieces.of(DecayRecord(*means, monitor=pieces.monitor))
+    record = DecayRecord(pieces.time, pieces.current, pieces.error)
+    size = -(-len(record) // ENOUGH)
+    time, *means = record.means(size, lambda time: current(time, i0, a, b))
+    return Pieces(time, time, *means, pieces.first, None, pieces.monitor)
 
 
 def _likely(plain: Expansion) -> list[Alternative]:
     """Alternatives that are not much less likely than constant a and b: by their evidence in linear
-    approximation about the law without, at their best times.
+    approximation about the law without, at their best times, also beside disturbances.
     """
     gauged = plain.pieces.gauge is not None
     others = [one for one in OTHERS if not (gauged and one.kind in UNGAUGED)]
@@ -417,12 +418,13 @@ def _likely(plain: Expansion) -> list[Alternative]:
             size = np.append(size, time)
         places[one], widths[one] = range(len(columns), len(columns) + len(own)), size
         columns += own
-    products = Products.of(np.column_stack(columns), plain.pieces.time, bool(plain.given), COARSE)
+    rows = np.column_stack([*columns, _by_nodes(plain)])
+    products = Products.of(rows, plain.pieces.time, bool(plain.given), COARSE)
+    every, nodes = np.split(np.eye(rows.shape[1]), [len(columns)], axis=1)
 
     def log_evidence(one: Alternative) -> float:
-        own, width = [0, 1, 2, 3, *places[one]], np.append([np.inf] * 3, widths[one])
-        some = products.combined(np.eye(len(columns))[:, own])
-        return _laplace(some, width, np.zeros(width.size)) + _log_chance(one, plain)
+        own, width = every[:, [0, 1, 2, 3, *places[one]]], np.append([np.inf] * 3, widths[one])
+        return _log_evidence(one, plain, products, nodes, own, width, np.zeros(width.size))
 
     constant = log_evidence(CONSTANT) + HOPELESS
     return [one for one in others if log_evidence(one) > constant]
@@ -444,17 +446,16 @@ def _widths(kind: str, sizes: np.ndarray, times: np.ndarray, loss: float) -> np.
     return np.array([2 * sizes * math.log(SIZES[1] / SIZES[0]), times]) / math.sqrt(2 * math.pi)
 
 
-def _smooth(plain: Expansion) -> float:
-    """Log evidence of a power of the current with a drift of b, or of neither."""
-    start = np.append(plain.numbers, [0.0, 0.0])
-    laws = [plain, solved(plain.pieces, (*PLAIN, POWER))]
+def _smooth(plain: Expansion) -> list[tuple[Alternative, Expansion]]:
+    """Constant a and b, a power of the current, and one with a drift of b."""
+    start, power = np.append(plain.numbers, [0.0, 0.0]), {POWER: (BELOW + ABOVE) / 2}
+    laws = [plain, solved(plain.pieces, (*PLAIN, POWER), start=plain.numbers, widths=power)]
     if plain.pieces.gauge is None:
         gas = abs(plain.numbers[0] - plain.numbers[1])
-        width = (BELOW + ABOVE) / 2
         laws.append(solved(plain.pieces, (*PLAIN, POWER, FURTHER), "drift", start=start,
-                           widths={POWER: width, FURTHER: DRIFT * gas}))  # fmt: skip
-    each = zip(laws, (CONSTANT, POWERED, DRIFTING), strict=False)
-    return float(logsumexp([_log_evidence(law, one) for law, one in each if law.rested]))
+                           widths=power | {FURTHER: DRIFT * gas}))  # fmt: skip
+    each = zip((CONSTANT, POWERED, DRIFTING), laws, strict=False)
+    return [(one, law) for one, law in each if law.rested]
 
 
 def _looked_at(pieces: Pieces, kind: str) -> np.ndarray:
@@ -526,31 +527,47 @@ def _squares(law: Expansion) -> float:
     return float(law.residuals @ law.residuals)
 
 
-def _log_evidence(law: Expansion, one: Alternative) -> float:
-    """Logarithm of the probability of the readings, the noise averaged over, up to a constant: also
-    beside a disturbance, in linear approximation.
+def _log_evidences(plain: Expansion, laws: Sequence[tuple[Alternative, Expansion]]) -> list[float]:
+    """Logarithms of the probability of the readings by each law, the noise averaged over, up to a
+    constant: also beside a disturbance of the plain law's currents, in linear approximation.
     """
-    columns, width, centre = _given(law, one)
-    model = law.pieces.current / law.pieces.over + law.residuals
-    nodes = model[:, None] * from_nodes(law.pieces.time / law.pieces.units[0])
-    rows = np.column_stack([law.residuals, law.rows[:, columns], nodes])
-    products = Products.of(rows, law.pieces.time, law.pieces.error is not None)
-    own = np.eye(rows.shape[1])[:, : 1 + width.size]
+    pieces, given = plain.pieces, [_given(law, one) for one, law in laws]
+    parts = [_by_nodes(plain)]
+    parts += [np.column_stack([law.residuals, law.rows[:, columns]])
+              for (_, law), (columns, *_) in zip(laws, given, strict=True)]  # fmt: skip
+    products = Products.of(np.hstack(parts), pieces.time, pieces.error is not None)
+    every = np.eye(products.matrix.shape[1])
+    nodes, *owns = np.split(every, np.cumsum([part.shape[1] for part in parts[:-1]]), axis=1)
+    each = zip(laws, owns, given, strict=True)
+    return [_log_evidence(*pair, products, nodes, own, *known) for pair, own, (_, *known) in each]
+
+
+def _by_nodes(plain: Expansion) -> np.ndarray:
+    """Change of the readings by that of a share of the law's currents at each node."""
+    pieces = plain.pieces
+    model = pieces.current / pieces.over + plain.residuals
+    return model[:, None] * from_nodes(pieces.time / pieces.units[0])
+
+
+def _log_evidence(
+    one: Alternative, law: Expansion, products: Products, nodes: np.ndarray, own: np.ndarray,
+    width: np.ndarray, centre: np.ndarray,
+) -> float:  # fmt: skip
+    """That of a law from products of columns, those of the nodes and the law's own."""
     found = [_laplace(products.combined(own), width, centre)]
     # Few readings tell no noise beside as many numbers.
     curves = smooth_curves(max(products.count // 2 - width.size, 0))
-    smooth = products.combined(block_diag(np.eye(1 + width.size), curves))
+    smooth = products.combined(np.hstack([own, nodes @ curves]))
     log = smooth.log_prior + smooth.log_size(smooth.left())
     near = products.some(log > log.max() - BESIDE)
     for kind in disturbances(law.numbers[0]):
         if kind.of_loss and law.pieces.gauge is not None:
             continue
-        numbers = kind.shapes.shape[2]
+        shown = nodes @ kind.shown(law.numbers[0])
+        each = np.concatenate([np.broadcast_to(own, (len(shown), *own.shape)), shown], axis=2)
+        numbers = shown.shape[2]
         known = np.append(width, np.ones(numbers)), np.append(centre, np.zeros(numbers))
-        for shape, chance in zip(kind.shown(law.numbers[0]), kind.chance, strict=True):
-            further = np.vstack([np.zeros((1 + width.size, numbers)), shape])
-            log = _laplace(near.combined(np.hstack([own, further])), *known)
-            found.append(log + math.log(chance / SMOOTH))
+        found.append(_laplace(near.by_each(each, kind.chance / SMOOTH), *known))
     return float(logsumexp(found)) + _log_chance(one, law)
 
 

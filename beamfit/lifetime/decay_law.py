@@ -183,9 +183,10 @@ def beam_current(
         def whole(time: np.ndarray) -> np.ndarray:
             return time * mean_exponential((1.0 + power) * linear * time)
 
-        bent, pairs = quadratic * whole(at.time), zip(further[::2], further[1::2], strict=True)
+        every = whole(at.time)
+        bent, pairs = quadratic * every, zip(further[::2], further[1::2], strict=True)
         for more, when in pairs:
-            bent = bent + more * np.where(at.time > np.real(when), whole(at.time) - whole(when), 0)
+            bent = bent + more * np.where(at.time > np.real(when), every - whole(when), 0)
         return closed_form(level, 1.0, power, lost, bent)
 
     def gone(time: np.ndarray, gas: np.ndarray) -> np.ndarray:
@@ -193,11 +194,10 @@ def beam_current(
         return linear * gas + sum(f * course(kind, time, w) for f, w in pairs)
 
     gas = at.time if at.gas is None else at.gas
-    inside = np.diff(at.time)
-    node = at.time[:-1, None] + inside[:, None] * NODES
-    node_gas = gas[:-1, None] + np.diff(gas)[:, None] * NODES
-    parts = inside * (np.exp(-(1.0 + power) * gone(node, node_gas)) @ WEIGHTS)
-    whole = np.append(0.0, np.cumsum(parts))
+    inside, more = np.diff(at.time, prepend=0.0), np.diff(gas, prepend=0.0)
+    node = at.time[:, None] + inside[:, None] * (NODES - 1)
+    node_gas = gas[:, None] + more[:, None] * (NODES - 1)
+    whole = np.cumsum(inside * (np.exp(-(1.0 + power) * gone(node, node_gas)) @ WEIGHTS))
     return closed_form(level, quadratic, power, gone(at.time, gas), whole)
 
 

@@ -27,7 +27,6 @@ from scipy.linalg import block_diag
 from scipy.special import expit, log_expit, log_ndtr, logsumexp, ndtri
 
 from beamfit.arrays import array_module
-from beamfit.lifetime.decay_law import closed_form
 from beamfit.lifetime.expansion import Physical, Pieces
 from beamfit.lifetime.record import DecayRecord
 from beamfit.noise.memory import Products
@@ -235,8 +234,9 @@ class Numbers(NamedTuple):
     def currents(self, gas: np.ndarray) -> np.ndarray:
         """Currents at the nodes over the mean, one column a set; `gas` is ∫ P dt over the mean."""
         changed = gas_changed(self.pace if np.any(self.pace) else np.zeros(1))
-        lost = (1 - self.share) * gas[:, None] + self.gas * changed
-        return node_currents(self.level, self.share * self.rate, self.power, self.rate * lost)
+        quadratic = self.share * self.rate
+        lost = (self.rate - quadratic) * gas[:, None] + self.rate * self.gas * changed
+        return node_currents(self.level, quadratic, self.power, lost)
 
 
 def node_currents(level, quadratic, power, lost):
@@ -245,12 +245,9 @@ def node_currents(level, quadratic, power, lost):
     """
     xp = array_module(level, quadratic, power, lost)
     c, lost = 1 + power, xp.clip(lost, -200, 200)  # a factor that no beam has, and no overflow
-    whole = INTEGRAL @ xp.exp(-c * lost)
+    left = 1 + c * quadratic * level**c * (INTEGRAL @ xp.exp(-c * lost))
     # Where a loss that is no beam's would have ended the record the law has no value.
-    inside = c * quadratic * level**c
-    least = (1e-3 - 1) / xp.where(inside == 0, 1.0, inside)
-    whole = xp.where(inside * whole < 1e-3 - 1, least, whole)
-    return closed_form(level, quadratic, power, lost, whole)
+    return level * xp.exp(-lost) * xp.maximum(left, 1e-3) ** (-1 / c)
 
 
 def log_prior(power):
@@ -290,11 +287,10 @@ PUMPED = 0.5
 PLACES, RANGES, STEPS, RESTS = 33, 5, 6, 0.2
 # Readings beyond which neighbours are averaged: the curve is smooth between them.
 ENOUGH = 1024
-# Draws of each law at first, how many independent ones all together are to be worth, and most of
-# them; the scale of the logistic distribution that they have in standard deviations.
-FEW, WORTH, MANY, TAIL = 512, 2500.0, 60000, 0.6
-# Width of the share in what draws come from, which its bounds cut off otherwise.
-AROUND = 0.6
+# Draws of each law at first, how many independent ones all together are to be worth, as samples
+# are, and most of them; the scale of the logistic distribution that they have in standard
+# deviations.
+FEW, WORTH, MANY, TAIL = 512, 4000.0, 60000, 0.6
 # Standard deviations of the share beside a bound in which draws tell the density there.
 NEAR = 0.25
 # Shares of a of losses that are no beam's, and the prior odds of one.
@@ -515,28 +511,30 @@ def _seen_slopes(
 
 def _triangle(matrix: np.ndarray) -> np.ndarray:
     """Lower triangles L of many small matrices L Lᵀ, numbers of the matrix first: (p, p, ...)."""
-    lower = np.zeros_like(matrix)
+    lower, left = np.zeros_like(matrix), matrix.copy()
     for j in range(len(matrix)):
-        left = matrix[j:, j] - np.sum(lower[j:, :j] * lower[j, :j], axis=1)
-        root = np.sqrt(np.maximum(left[0], LEAST_LEFT * matrix[j, j] + 1e-300))
-        lower[j:, j] = left / root
-        lower[j, j] = root
+        lower[j, j] = np.sqrt(np.maximum(left[j, j], LEAST_LEFT * matrix[j, j] + 1e-300))
+        below = lower[j + 1 :, j]
+        below[:] = left[j + 1 :, j] / lower[j, j]
+        left[j + 1 :, j + 1 :] -= below[:, None] * below
     return lower
 
 
 def _forward(lower: np.ndarray, right: np.ndarray) -> np.ndarray:
     """L⁻¹ of columns, (p, ...)."""
-    found = np.empty(lower.shape[1:])
+    found = np.broadcast_to(right, lower.shape[1:]).copy()
     for j in range(len(lower)):
-        found[j] = (right[j] - np.sum(lower[j, :j] * found[:j], axis=0)) / lower[j, j]
+        found[j] /= lower[j, j]
+        found[j + 1 :] -= lower[j + 1 :, j] * found[j]
     return found
 
 
 def _backward(lower: np.ndarray, right: np.ndarray) -> np.ndarray:
     """L⁻ᵀ of columns, (p, ...)."""
-    found = np.empty(lower.shape[1:])
+    found = np.broadcast_to(right, lower.shape[1:]).copy()
     for j in reversed(range(len(lower))):
-        found[j] = (right[j] - np.sum(lower[j + 1 :, j] * found[j + 1 :], axis=0)) / lower[j, j]
+        found[j] /= lower[j, j]
+        found[:j] -= lower[j, :j] * found[j]
     return found
 
 
@@ -560,10 +558,9 @@ def _expanded(seen: SeenDecay, numbers: np.ndarray, free: list[int]) -> Peaks:
     products = seen.products.between(rows)
     normal, gradient, squares = products[:-1, :-1], -products[:-1, -1], products[-1, -1]
     change = np.where(numbers[PACE, 0] > 0, PUMPED, DRIFT)
-    width = np.array([np.inf, np.inf, AROUND, np.inf, change])[free, None]
-    middle = np.where(np.equal(free, BEND), 0.5, 0.0)[:, None]
+    width = np.where(np.equal(free, CHANGE), change, np.inf)[:, None]
     known = np.diag(1 / width[:, 0] ** 2)[..., None, None]
-    pull = ((middle - numbers[free]) / width**2)[:, None]
+    pull = (-numbers[free] / width**2)[:, None]
     after = np.maximum(squares, 1e-30)
     for _ in range(2):
         unit = seen.products.variance(after, len(free))
@@ -574,7 +571,7 @@ def _expanded(seen: SeenDecay, numbers: np.ndarray, free: list[int]) -> Peaks:
     centre = numbers[free][:, None] + step
     log = seen.products.log_prior[:, None] + seen.products.log_size(after)
     log = log - np.sum(np.log(np.einsum("ppkm->pkm", lower)), axis=0)
-    log = log - 0.5 * np.sum(((centre - middle[:, None]) / width[:, None]) ** 2, axis=0)
+    log = log - 0.5 * np.sum((centre / width[:, None]) ** 2, axis=0)
     by_share = share[:-1, None]
     moved = share[-1] + np.sum(by_share * step, axis=0)
     log = log + _log_within(seen.share, moved, _spread(lower, by_share))
@@ -602,8 +599,9 @@ def _searched(seen: SeenDecay, numbers: np.ndarray, free: list[int]) -> Peaks:
         named = Numbers.of(numbers)
         numbers[BEND] += (np.clip(named.share, -1.0, 2.0) - named.share) / named.unit
         spread = 1 / np.sqrt(np.sum(weight * np.sum(found.lower**2, axis=1), axis=1))
-        rests = (np.abs(numbers[free] - before) < RESTS * spread + 1e-9).all(axis=0)
-        if rests[whole > whole.max() - FAR].all():
+        moved = np.max(np.abs(numbers[free] - before) / (spread + 1e-9), axis=0)
+        likely = np.exp(whole - whole.max())
+        if likely @ moved < RESTS * likely.sum():
             break
     return found
 
@@ -770,7 +768,7 @@ class DrawnLaw(NamedTuple):
         """Draw levels and rates about the best ones beside the other numbers, found anew."""
         seen, lower = self.seen, self.beam[..., kind, at]
         along, squares = seen.along(seen.away(near.currents(seen.gas)), kind)
-        pull = _forward(lower, -np.sum(self.slopes[..., at] * along[:, None], axis=0))
+        pull = _forward(lower, -np.einsum("prd,pd->rd", self.slopes[..., at], along))
         left = np.maximum(squares - np.sum(pull**2, axis=0), 1e-30)
         noise, far = np.sqrt(seen.products.variance(left, 2)), np.full(kind.size, np.inf)
         own, log = _between(even, -far, far)
@@ -814,8 +812,7 @@ def drawn(laws: Sequence[DrawnLaw]) -> list[Draws]:
     while True:
         log, worth = np.array([(one.log, max(one.worth, 1.0)) for one in found]).T
         part = np.exp(log - max(log.max(), -1e300))
-        errors = np.sqrt(part / max(part.sum(), 1e-300) * count / worth)  # of one draw of each
-        needed = np.minimum(WORTH * errors * errors.sum(), MANY)
+        needed = np.minimum(WORTH * part / max(part.sum(), 1e-300) * count / worth, MANY)
         short = np.flatnonzero(count < 0.8 * needed)
         if not short.size:
             return found

@@ -261,7 +261,8 @@ def products_by_each(
         diagonals, volume = _whitening(apart), float(log_volume(apart))
         for noise in alike:
             size, below = _factor(noise.white, *diagonals)
-            solved = dpttrs(size, below, begun)[0].T.reshape(columns.shape)
+            solved = dpttrs(size, below, begun)[0] if noise.white else begun
+            solved = solved.T.reshape(columns.shape)
             matrix.append(columns @ np.swapaxes(solved, -1, -2))
             volumes.append(volume - 0.5 * float(np.sum(np.log(size))))
     return np.array(matrix), np.array(volumes)
@@ -450,6 +451,13 @@ class Products(NamedTuple):
     def combined(self, columns: np.ndarray) -> Products:
         """Products of combinations of the columns, shape (m, p)."""
         return self._replace(matrix=columns.T @ self.matrix @ columns)
+
+    def by_each(self, sets: np.ndarray, chance: np.ndarray) -> Products:
+        """The same of each of some sets of combinations, shape (w, m, p), with a probability."""
+        matrix = np.swapaxes(sets, 1, 2)[:, None] @ self.matrix @ sets[:, None]
+        log_prior = np.add.outer(np.log(chance), self.log_prior).ravel()
+        kinds = self.kinds * len(sets)
+        return self._replace(kinds=kinds, log_prior=log_prior, matrix=np.concatenate(matrix))
 
     def between(self, sets: np.ndarray) -> np.ndarray:
         """Products (p, p, k, s) of p combinations of the columns by noise, of sets (m, p, s)."""
