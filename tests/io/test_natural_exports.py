@@ -310,6 +310,8 @@ def test_one_record_as_programs_export_it(export, tmp_path):
     [
         ("time_d", 739312.5, "MATLAB"),  # days from the year 0
         ("time_d", 45352.5, "Excel"),  # days from 1899
+        ("time_d", 2460371.0, "^(?!.*time_ms).*Julian"),  # days from 4713 BC
+        ("time_d", 1.7e12, "time_d=time_ms"),
         ("time_s", 3792139200, "LabVIEW"),  # seconds from 1904
         ("time_s", 1709294400000, "time_s=time_ms"),
     ],
