@@ -285,6 +285,7 @@ RECORDS = {
                                 "month-day-year"),
     "a German spreadsheet": (lines("{};{}", clocks("%d.%m.%Y %H:%M:%S"), map(comma, CURRENT),
                                    head="Zeit;Strom\n"), "Zeit=time, Strom=beam_current_mA"),
+    "a logger": (lines("{},{}", ISO, CURRENT, head="Date/Time,Beam Current (mA)\n"), None),
     "two columns for a moment": (lines("{},{},{}", clocks("%Y-%m-%d"), clocks("%H:%M:%S"), CURRENT,
                                        head="Date,Time,Beam current [mA]\n"), None),
     "ampere": (lines("{},{}", SECONDS, [1e-3 * v for v in CURRENT], head="epoch,DCCT [A]\n"), None),
