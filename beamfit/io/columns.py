@@ -97,8 +97,9 @@ def spelled(header: str) -> str:
         return header
     for found in BETWEEN.finditer(header):
         name, unit = header[: found.start()].strip(), known_unit(header[found.end() :])
-        path = found[0] in "/," and re.search("[/,]", name)  # such as sr/dcct/A
-        if name and unit and not path:
+        # Within a path such as sr/dcct/A or a unit such as [G/cm].
+        within = found[0] in "/," and re.search(r"[/,]|[\[(][^\])]*$", name)
+        if name and unit and not within:
             return named(name.removesuffix(f"_{unit}"), unit)
     return header
 

@@ -53,6 +53,8 @@ INCREASE = "times that increase"
 # Seconds beyond this many are counted from 1970, not from the start of a record (1973 or later);
 # beyond the others after 2050, of another origin, or after the year 5000, and are milliseconds.
 UNIX, LATEST, MILLISECONDS = 1e8, 2.5e9, 1e11
+# Julian days of the years 1858 to 3501, s.
+JULIAN = (2.4e6 * DAY, 3e6 * DAY)
 QUANTITIES = {
     "time": "time",
     "beam_current": "current",
@@ -67,7 +69,8 @@ QUANTITIES = {
 CALLED = {"beam_current": "current", "beam_current_error": "error"}
 USED = {"time", "nanos", "current", "error", *Conditions._fields}
 # What a column of dates is called, and those of a day and of the time of that day.
-MOMENTS = {"time", "timestamp", "time_stamp", "datetime", "date_time", "data_time", "date"}
+MOMENTS = {"time", "timestamp", "time_stamp", "datetime", "date_time", "date/time", "data_time"}
+MOMENTS |= {"date"}
 DAYS, CLOCKS = {"date", "day"}, {"time"}
 # Behind its name: the zone that is meant where none stands.
 UTC = re.compile(r"[ _]?[\[(]?(utc|gmt)[\])]?$")
@@ -318,12 +321,15 @@ def _forward(
 def _check_base(sheet: Sheet, column: Column, moment: np.ndarray) -> None:
     if (latest := np.max(moment)) <= LATEST:
         return
-    found = f"{latest:.6g} s since 1970, after the year 2050"
+    said = latest / column.factor
+    found = f"{said:.10g} {column.unit} since 1970, after the year 2050"
     expected = "a date, or time from the start of the record: LabVIEW counts seconds from 1904, "
-    expected += "Excel days from 1899, MATLAB days from the year 0"
-    if latest >= MILLISECONDS:
+    expected += "Excel days from 1899, MATLAB days from the year 0, Julian days from 4713 BC, "
+    expected += "modified ones from 1858"
+    julian = column.unit == "d" and JULIAN[0] < np.min(moment) and latest < JULIAN[1]
+    if latest >= MILLISECONDS and not julian:
         found = f"{latest:.6g} s, after the year 5000"
-        finer = (u for u in ("ms", "us") if UNITS["time"][u] * latest < MILLISECONDS)
+        finer = (u for u in ("ms", "us") if UNITS["time"][u] * said < MILLISECONDS)
         header = sheet.called.get(column.header, column.header)
         expected = f"the unit of the time: --columns '{header}=time_{next(finer, 'ns')}'"
     raise replace(sheet, skip="").error(found, expected, int(np.argmax(moment)), column.header)

@@ -531,7 +531,8 @@ def _wandering(e: Evidence) -> str | None:
 
 
 def _quantised(e: Evidence) -> str | None:
-    step, noise = e.record.resolution, e.noise
+    # Of edges between digits a note says it.
+    step, noise = None if e.record.mean else e.record.resolution, e.noise
     if e.record.error is not None:
         noise *= float(np.min(e.record.error))
     if step is None or step <= 2 * noise:

@@ -18,7 +18,7 @@ from beamfit.lifetime.decay_law import current
 from beamfit.lifetime.evidence import BELIEVED, UNITS, Evidence, RatePart, Separability
 from beamfit.lifetime.expansion import Expansion, Pieces, solved
 from beamfit.lifetime.free_law import FreeLaw, Law
-from beamfit.lifetime.readings import with_common_errors
+from beamfit.lifetime.readings import rounding_error, with_common_errors, with_rounding
 from beamfit.lifetime.record import DecayRecord, Monitor
 from beamfit.quantity import Quantity, Status
 
@@ -339,7 +339,8 @@ def fit_decay(
     if np.ptp(record.current) == 0:
         return _constant(record, f"All {len(record)} readings are {record.current[0]:.6g} mA")
     about = solved(Pieces.of(record), shape=shape)
-    even = with_common_errors(record, about.residuals * about.pieces.over)
+    residuals = about.residuals * about.pieces.over
+    even = with_rounding(with_common_errors(record, residuals), residuals)
     about = about if even is record else solved(Pieces.of(even), shape=shape)
     evidence = Evidence(about, Law(law), shape is not None, even)
     rate, error = evidence.sure("rate_mean")
@@ -488,8 +489,11 @@ def fit_pieces(
         raise InputError("a cycle before the end of the one before", "an order in time", path=name)
     if not any(np.ptp(cycle.current) for cycle in cycles):
         said = f"The readings of each of {len(cycles)} cycles are equal"
-        return replace(_constant(_readings(gathered, name), said), first=gathered.first)
+        return replace(_constant(_readings(gathered, name, None), said), first=gathered.first)
     about, left_out = cleaned(gathered)
+    digit = cycles[0].resolution
+    if gathered.error is None and (least := rounding_error(digit, about.residuals)):
+        about, left_out = cleaned(replace(gathered, error=np.full(gathered.time.size, least)))
     usual = usual_cycle(cycles) if found else None
     evidence, pieces = Evidence(about, law, usual=usual), about.pieces
     finding = finding_of_cycles(evidence, pieces.monitor, left_out)
@@ -500,12 +504,12 @@ def fit_pieces(
         **evidence.quoted(evidence.tells_lifetime),
         mean_current=pieces.units[1],
         rms_residual=evidence.rms,
-        readings=_readings(pieces, name),
+        readings=_readings(pieces, name, digit),
         first=pieces.first,
     )
 
 
-def _readings(pieces: Pieces, name: str) -> DecayRecord:
+def _readings(pieces: Pieces, name: str, digit: float | None) -> DecayRecord:
     """Readings of many pieces as one record."""
     start = float(pieces.time[0])
-    return DecayRecord(pieces.time, pieces.current, pieces.error, name, start)
+    return DecayRecord(pieces.time, pieces.current, pieces.error, name, start, digit=digit)

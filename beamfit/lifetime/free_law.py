@@ -1039,15 +1039,23 @@ def proposals(seen: SeenDecay) -> list[DrawnLaw]:
 
 
 def rates_of(a, b, power, changed, x, seen: SeenDecay):
-    """Loss rates at the first and last reading and at the mean current, where x are the currents at
-    the nodes; in the unit of b, and of a at the mean current. `changed` is by how much the loss to
-    gas has changed at the first reading, at the mean current and at the last one.
+    """Loss rates at the first and last reading and at the mean current; in the unit of b, and of a
+    at the mean current. At the first reading, at the mean current and at the last one x are the
+    currents of the law, as of `of_law`, and `changed` is by how much the loss to gas has changed.
     """
-    first, last = (
-        a * x[k] ** (1 + power) + b * pressure + changed[k]
-        for k, pressure in zip((0, -1), seen.ends, strict=True)
+    first, middle, last = (
+        a * at ** (1 + power) + b * pressure + more
+        for at, pressure, more in zip(x, (seen.ends[0], 1.0, seen.ends[1]), changed, strict=True)
     )
-    return first, last, a + b + changed[1]
+    return first, last, middle
+
+
+def of_law(x, lost):
+    """Currents of the law at the first reading, at the mean current and at the last one, where x
+    are those at the nodes and `lost` is the part of the loss, by a walk until then, that is not in
+    the law: the loss to a goes with what the law alone leaves.
+    """
+    return x[0], np.e ** lost[1], x[-1] * np.e ** lost[2]
 
 
 def middle_of(currents: np.ndarray, weight: np.ndarray) -> float:
@@ -1063,11 +1071,13 @@ def _quantities(record: DecayRecord, seen: SeenDecay, draws: Draws) -> dict[str,
     whole = found.rate / mean / span, found.rate / span
     a, b = found.share * whole[0], (1 - found.share) * whole[1]
     moments = (0.0, middle_of(currents, weight), 1.0)
+    at = from_nodes(np.array(moments))
     changed = [
         whole[1] * (found.gas * gas_change(s, found.pace) + walked)
-        for s, walked in zip(moments, from_nodes(np.array(moments)) @ draws.walk, strict=True)
+        for s, walked in zip(moments, at @ draws.walk, strict=True)
     ]
-    rates = rates_of(a * mean, b, found.power, changed, currents, seen)
+    law = of_law(currents, found.rate * (at @ INTEGRAL @ draws.walk))
+    rates = rates_of(a * mean, b, found.power, changed, law, seen)
     quoted = {"i0": found.level * mean}
     quoted |= {f"lifetime_{at}": 1 / rate / HOUR for at, rate in zip(ENDS, rates, strict=True)}
     bounds = at_bounds(found.share, weight)

@@ -23,6 +23,7 @@ from beamfit.lifetime.readings import (
     noise_of,
 )
 from beamfit.lifetime.record import DecayRecord
+from beamfit.statistics import POOR_FIT
 
 # Readings below this share of the largest one near them are dropouts of the monitor.
 DROPOUT = 0.02
@@ -79,7 +80,8 @@ class Event(NamedTuple):
     Attributes
     ----------
     kind : str
-        `refill`, `loss`, `dropout`, `spike`, `saturated`, `gap`, `ramp` (a refill of many readings,
+        `refill`, `loss`, `dropout`, `spike`, `saturated`, `stuck` (a monitor that repeats one
+        reading), `gap`, `ramp` (a refill of many readings,
         or the end of one at the head of a decay), `short` (a piece too short to keep), `loss rate
         changes` or `gas is pumped away` (until then).
     time : float
@@ -154,6 +156,21 @@ def _saturated(current: np.ndarray) -> np.ndarray:
     return np.repeat(top & (lengths >= 5) & (lengths > 5 * usual), lengths)
 
 
+def _stuck(current: np.ndarray) -> np.ndarray:
+    """Readings that repeat the one before, of runs so long that by the readings on either side
+    (Laplace's rule of succession) they are no chance.
+    """
+    repeats = np.append(False, np.diff(current) == 0)
+    first, end = np.flatnonzero(np.diff(np.r_[repeats, False].astype(np.int8))).reshape(-1, 2).T + 1
+    before, after = np.maximum(first - NEIGHBOURS, 0), np.minimum(end + NEIGHBOURS, current.size)
+    total = np.append(0, np.cumsum(repeats))
+    sides = [(total[b] - total[a] + 1) / (b - a + 2) for a, b in ((before, first), (end, after))]
+    found = np.zeros(current.size, bool)
+    for k in np.flatnonzero(current.size * np.max(sides, axis=0) ** (end - first) < POOR_FIT):
+        found[first[k] : end[k]] = True
+    return found
+
+
 def _noise_near(off: np.ndarray) -> np.ndarray:
     """Noise about each of some departures; where it changes the greater one counts."""
     return maximum_filter1d(1.4826 * median_filter(off, NEIGHBOURS, mode="mirror"), NEIGHBOURS)
@@ -202,9 +219,16 @@ def beam_readings(record: DecayRecord) -> tuple[np.ndarray, list[Event]]:
     found = {"dropout": dropped, "saturated": _saturated(record.current)}
     kept = np.flatnonzero(~dropped & ~found["saturated"] & (np.arange(len(record)) < end_of_beam))
     if kept.size >= FEWEST:
-        found["spike"] = np.zeros(len(record), bool)
+        for kind in ("stuck", "spike"):
+            found[kind] = np.zeros(len(record), bool)
         time, current = record.time[kept], record.current[kept]
-        noise = max(noise_of(time, current), (record.resolution or 0.0) / 2)
+        digit = record.resolution or 0.0
+        if np.median(np.abs(np.diff(current))) > digit:  # else equal readings are of one digit
+            repeats = _stuck(current)
+            found["stuck"][kept[repeats]] = True
+            kept = kept[~repeats]
+            time, current = record.time[kept], record.current[kept]
+        noise = max(noise_of(time, current), digit / 2)
         lone = by_stretches(lambda t, i: _spikes(t, i, noise), time, current)
         found["spike"][kept[lone]] = True
         kept = kept[~lone]
@@ -219,16 +243,23 @@ def beam_readings(record: DecayRecord) -> tuple[np.ndarray, list[Event]]:
 
 
 def _digits_near(current: np.ndarray, excess: np.ndarray) -> np.ndarray:
-    """The last digit near each change, the usual size of departures that are not zero; 0 where few
-    are zero. A record may be of several detectors.
+    """The last digit near each change; 0 where few departures are zero. It is the usual size of
+    those that are not, or of changes if that is less, as of a beam that loses one digit at each
+    reading: only its refills depart. A record may be of several detectors.
     """
-    moves = np.abs(excess) > EXACT * np.max(current)
-    still = uniform_filter1d((~moves).astype(float), NEIGHBOURS) > REPEATS
-    place = np.flatnonzero(moves)
-    if not place.size or not still.any():
+    least = EXACT * np.max(current)
+    still = uniform_filter1d((np.abs(excess) <= least).astype(float), NEIGHBOURS) > REPEATS
+    if not still.any():
         return np.zeros(excess.size)
-    near = median_filter(np.abs(excess[place]), NEIGHBOURS, mode="mirror")
-    near = near[np.minimum(np.searchsorted(place, np.arange(excess.size)), place.size - 1)]
+
+    def usual(size: np.ndarray) -> np.ndarray:
+        place = np.flatnonzero(size > least)
+        if not place.size:
+            return np.zeros(size.size)
+        near = median_filter(size[place], NEIGHBOURS, mode="mirror")
+        return near[np.minimum(np.searchsorted(place, np.arange(size.size)), place.size - 1)]
+
+    near = np.minimum(usual(np.abs(excess)), usual(np.abs(np.diff(current))))
     return maximum_filter1d(np.where(still, near, 0.0), NEIGHBOURS)
 
 
@@ -716,10 +747,12 @@ def _levelled(time: np.ndarray, current: np.ndarray, first: np.ndarray) -> np.nd
     scale = np.linalg.norm(both[:, :2], axis=0) + TINY
     left, known = both[:, 2], both[:, :2] / scale
     squares, ways = np.linalg.eigh(known.T @ known)
-    numbers = ways.T @ (known.T @ left) / (squares + TINY)
-    rest = left @ left - squares[1] * numbers[1] ** 2
-    fewer = max(rest - squares[0] * numbers[0] ** 2, EXACT * rest) + TINY
-    if time.size * np.log((rest + TINY) / fewer) < 2 * np.log(time.size):
+    # Readings that are equal but for rounding make both columns one.
+    numbers = ways.T @ (known.T @ left) / np.maximum(squares, EXACT)
+    explained = squares * numbers**2
+    rest = max(left @ left - explained[1], 0.0) + TINY
+    fewer = max(rest - explained[0], EXACT * rest)
+    if time.size * np.log(rest / fewer) < 2 * np.log(time.size):
         numbers[0] = 0.0
     return current - columns @ (ways @ numbers / scale)
 

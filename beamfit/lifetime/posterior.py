@@ -39,6 +39,7 @@ from beamfit.lifetime.free_law import (
     middle_of,
     mixed,
     node_currents,
+    of_law,
     proposals,
     rates_of,
 )
@@ -164,8 +165,10 @@ def _derived(data: _Data, theta: Array) -> Array:
     n = _built(data, theta)
     moments, whole = jnp.stack([0.0, data.middle, 1.0]), n.a * data.mean + n.b
     walked = whole * (data.moments @ n.walk)
+    lost = whole * data.span * (data.moments @ (INTEGRAL @ n.walk))
     changed = n.b * n.drift * gas_change(moments, n.pace) + walked
-    rates = rates_of(n.a * data.mean, n.b, n.exponent, changed, _nodes(data, n)[:, 0], data)
+    x = _nodes(data, n)[:, 0]
+    rates = rates_of(n.a * data.mean, n.b, n.exponent, changed, of_law(x, lost), data)
     return 1.0 / HOUR / jnp.stack(rates)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from scipy.ndimage import uniform_filter1d
 
-from beamfit.lifetime.record import Conditions, DecayRecord
+from beamfit.lifetime.record import Conditions, DecayRecord, Monitor
 from beamfit.quantity import HOUR
 from beamfit.statistics import POOR_FIT
 
@@ -111,6 +111,33 @@ def with_common_errors(record: DecayRecord, residuals: np.ndarray) -> DecayRecor
             return record
     note = "Errors of neighbouring readings differ by chance: each is the rms of those near it."
     return replace(record, error=near, notes=(*record.notes, note))
+
+
+def rounding_error(digit: float | None, residuals: np.ndarray) -> float | None:
+    """Standard deviation of rounding, where readings scatter about a law by less than that: a beam
+    that loses a digit at each reading lies on a line, whose slope is not known the better.
+
+    Examples
+    --------
+    >>> print(rounding_error(1.0, np.zeros(9)), rounding_error(1.0, np.ones(9)))
+    0.28867513459481287 None
+    """
+    least = (digit or 0.0) / 12**0.5
+    return least if np.sqrt(np.mean(residuals**2)) < least else None
+
+
+def with_rounding(record: DecayRecord, residuals: np.ndarray) -> DecayRecord:
+    """State the error of rounding where it is needed; what residuals lack of it, beyond two
+    standard deviations of a mean square, moves both ends of the record, each by itself.
+    """
+    if record.error is not None or not (least := rounding_error(record.resolution, residuals)):
+        return record
+    lacks = least**2 * (1 - 2 / len(record) ** 0.5) - np.mean(residuals**2)
+    moved = Monitor(drift=float(2 * max(lacks, 0.0)) ** 0.5 * HOUR / record.span)
+    monitor = moved.beside(record.monitor) if lacks > 0 else record.monitor
+    note = "Readings scatter by less than the rounding of their digits: errors contain that."
+    notes = (*record.notes, note)
+    return replace(record, error=np.full(len(record), least), monitor=monitor, notes=notes)
 
 
 # An hour is skipped to such a share of the usual interval.
@@ -218,7 +245,8 @@ def on_edges(record: DecayRecord, fewest: int = FEWEST, lasting: int = STAIR) ->
     apart = np.abs(np.concatenate([np.diff(record.current), record.current - falling]))
     single = np.abs(np.diff(falling)[edge] + digit) < ROUNDING * digit
     steady = apart.max() <= (1 + ROUNDING) * digit and single.all()
-    if not steady or np.median(np.diff(edge)) < lasting:
+    lasts = np.diff(edge)
+    if not steady or np.median(lasts) < lasting:
         return record
     note = f"Steps of {digit:.3g} mA with little noise: the edges between them were fitted."
     at = record.select(edge)
@@ -226,7 +254,7 @@ def on_edges(record: DecayRecord, fewest: int = FEWEST, lasting: int = STAIR) ->
     return replace(
         at, time=middle, current=(falling[edge] + falling[edge + 1]) / 2,
         start=None if record.start is None else record.start + float(middle[0]),
-        notes=(*record.notes, note), mean=record.mean_current,
+        notes=(*record.notes, note), mean=record.mean_current, digit=digit / np.median(lasts),
     )  # fmt: skip
 
 
@@ -283,7 +311,7 @@ def thinned(record: DecayRecord) -> DecayRecord:
     note = f"The means of {size} readings each were fitted, of {len(record)} in all."
     time = mean(record.time)
     return replace(
-        record, time=time, current=mean(record.current),
+        record, time=time, current=mean(record.current), digit=None,
         error=None if error is None else np.sqrt(mean(error**2) / count[even]),
         start=None if record.start is None else record.start + float(time[0]),
         conditions=Conditions(**conditions), notes=(*record.notes, note),

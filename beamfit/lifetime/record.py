@@ -260,6 +260,8 @@ class DecayRecord:
         Stability of the current monitor, which errors of results then contain.
     mean : float, optional
         Mean current, mA, where these readings stand for others; their own if not given.
+    digit : float, optional
+        Step of the readings that these are a part of, mA, where these alone show none.
 
     Raises
     ------
@@ -284,6 +286,7 @@ class DecayRecord:
     notes: tuple[str, ...] = ()
     monitor: Monitor | None = None
     mean: float | None = None
+    digit: float | None = None
 
     def __post_init__(self) -> None:
         rows = np.size(self.time)
@@ -355,7 +358,7 @@ class DecayRecord:
     @cached_property
     def resolution(self) -> float | None:
         """Step of a quantised reading, mA; None where readings lie at no multiples of one."""
-        return digit_of(self.current)
+        return digit_of(self.current) or self.digit
 
     @cached_property
     def gauge(self) -> np.ndarray | None:
@@ -439,6 +442,7 @@ class DecayRecord:
         return replace(
             self,
             mean=None,
+            digit=self.digit or self.resolution,
             time=time,
             current=self.current[rows],
             error=None if self.error is None else self.error[rows],

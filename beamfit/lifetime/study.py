@@ -269,7 +269,8 @@ def standing_alone(
     # Of very many readings the fit has means of neighbours.
     intervals = (np.median(np.diff(record.time)) for record in (fit.readings, together))
     averaged = math.sqrt(max(np.divide(*intervals), 1.0))
-    own = OWN * noise_of(together.time, together.current)
+    rounding = (cycles[0].resolution or 0.0) / 12**0.5
+    own = OWN * max(noise_of(together.time, together.current), rounding)
     own = min(fit.rms_residual * fit.inflation * averaged, own)
 
     def separates(cycle: DecayRecord) -> bool:

@@ -6,6 +6,8 @@ import numpy as np
 
 # What differences of readings are off multiples of a digit at most, of so many of them.
 EXACT, ENOUGH = 1e-3, 4096
+# No digit is smaller than this share of the readings: their own accuracy is below 1e-3 of it.
+LEAST = 1e-12
 # Sines of the error of rounding: the sum of their squares is right to 3 %.
 SINES = 20
 
@@ -16,20 +18,24 @@ def digit_of(values: np.ndarray) -> float | None:
 
     Examples
     --------
-    >>> digit_of(np.array([1.0, 1.5, 1.5, 3.0, 1.0, 1.0]))
-    0.5
+    >>> digit_of(np.array([1.0, 1.5, 1.5, 3.0, 1.0, 1.0])), digit_of(np.array([1.0, 4.0, 6.0]))
+    (0.5, 1.0)
     """
     levels = np.unique(values)
     if levels.size < 2:
         return None
     steps = np.diff(levels)
     step, steps = float(steps.min()), steps[:ENOUGH]
-    multiples = np.round(steps / step)
-    off = np.abs(steps / step - multiples)
+    off = np.abs(steps / step - np.round(steps / step))
     if levels.size <= values.size / 2:
         return step if float(np.median(off)) < 0.1 else None
-    a_line = levels.size == values.size and multiples.max() == 1
-    return step if off.max() < EXACT and not a_line else None
+    while off.max() >= EXACT:  # the largest common divisor
+        step *= float(off[off >= EXACT].min())
+        if step < LEAST * np.abs(levels).max():
+            return None
+        off = np.abs(steps / step - np.round(steps / step))
+    a_line = levels.size == values.size and steps.max() < 1.5 * step
+    return None if a_line else step
 
 
 def rounding_variance(digit: float, noise: float) -> float:

@@ -285,6 +285,7 @@ RECORDS = {
                                 "month-day-year"),
     "a German spreadsheet": (lines("{};{}", clocks("%d.%m.%Y %H:%M:%S"), map(comma, CURRENT),
                                    head="Zeit;Strom\n"), "Zeit=time, Strom=beam_current_mA"),
+    "a logger": (lines("{},{}", ISO, CURRENT, head="Date/Time,Beam Current (mA)\n"), None),
     "two columns for a moment": (lines("{},{},{}", clocks("%Y-%m-%d"), clocks("%H:%M:%S"), CURRENT,
                                        head="Date,Time,Beam current [mA]\n"), None),
     "ampere": (lines("{},{}", SECONDS, [1e-3 * v for v in CURRENT], head="epoch,DCCT [A]\n"), None),
@@ -310,6 +311,8 @@ def test_one_record_as_programs_export_it(export, tmp_path):
     [
         ("time_d", 739312.5, "MATLAB"),  # days from the year 0
         ("time_d", 45352.5, "Excel"),  # days from 1899
+        ("time_d", 2460371.0, "^(?!.*time_ms).*Julian"),  # days from 4713 BC
+        ("time_d", 1.7e12, "time_d=time_ms"),
         ("time_s", 3792139200, "LabVIEW"),  # seconds from 1904
         ("time_s", 1709294400000, "time_s=time_ms"),
     ],

@@ -511,3 +511,19 @@ def test_one_reading_long_before_the_others(early, later):
     found = fit_decay(DecayRecord(time, exact + noise))
     lifetime, truth = found.lifetime_mean, 1 / (2e-7 * found.mean_current + 3e-5) / 3600
     assert abs(lifetime.value - truth) < 3 * lifetime.error < 0.05 * truth
+
+
+def test_the_lifetime_is_that_of_the_curve_where_the_loss_rate_wanders():
+    """SIMULATED: a vacuum that recovers from 3.4 h to 17 h, which is no power of the current."""
+    time = np.linspace(0.0, 22300.0, 400)
+    rate = 1 / (3600 * 3.4 * (1 + 6 * (1 - np.exp(-time / 2e4))))
+    lost = np.concatenate([[0.0], np.cumsum(np.diff(time) * (rate[1:] + rate[:-1]) / 2)])
+    noise = 0.02 * np.random.default_rng(1).normal(size=time.size)
+    fit = fit_decay(DecayRecord(time, 95 * np.exp(-lost) + noise))
+    assert fit.free_law.wanders > 0.9
+    at = np.interp(-fit.mean_current, -95 * np.exp(-lost), time)
+    true = 1 / 3600 / np.interp(at, time, rate)
+    lifetime = fit.lifetime_mean
+    assert abs(lifetime.value - true) < 3 * lifetime.error < 0.03 * true
+    drawn = np.median(fit.sample(seed=1).values("lifetime_mean"))
+    assert drawn == pytest.approx(lifetime.value, abs=lifetime.error)

@@ -532,3 +532,65 @@ def test_a_monitor_that_wanders_beside_refills_is_not_cut(power):
         slow = np.fft.irfft(spectrum)[: time.size]
         split = split_record(DecayRecord(time, beam + 0.01 * slow / np.std(slow)))
         assert [len(part) for part in split.segments] == [1250, 1250, 1100]
+
+
+def test_pieces_keep_the_digit_of_the_record():
+    """SIMULATED: each piece loses exactly one digit at each reading, and lies on a line."""
+    time = np.arange(90) * 60.0
+    exact = 500.03 - time / 600 - np.repeat([0.0, 7.04, 10.35], 30)
+    study = study_record(DecayRecord(time, np.round(exact, 1)))
+    assert [len(decay.segment) for decay in study.decays] == [30, 30, 30]
+    for decay in study.decays:  # a loss of 29 digits is one of 28 to 30
+        lifetime = decay.fit.lifetime_mean
+        assert 0.3 / 29 < lifetime.error / lifetime.value < 1 / 29
+
+
+def test_regular_stairs_are_no_exact_line():
+    """SIMULATED: each step lasts six readings, and their first ones lie on a line."""
+    time = np.arange(400) * 10.0
+    study = study_record(DecayRecord(time, np.round(500.03 - time / 600, 1)))
+    lifetime = study.decays[0].fit.lifetime_mean
+    true = study.decays[0].fit.mean_current / 6
+    assert abs(lifetime.value - true) < 3 * lifetime.error
+    assert 1e-4 < lifetime.error / true < 0.02
+
+
+def test_refills_are_found_where_a_beam_loses_one_digit_at_each_reading():
+    time = np.arange(200) * 60.0
+    exact = np.concatenate([(100.03 + 0.01 * k) * np.exp(-time[:40] / 6e4) for k in range(5)])
+    split = split_record(DecayRecord(time, np.round(exact, 1)))
+    assert [len(piece) for piece in split.segments] == 5 * [40]
+
+
+@pytest.mark.parametrize("digits", [2, 9])
+def test_a_stuck_monitor_is_left_out(digits):
+    time = np.arange(300) * 60.0
+    current = decay(time, 200.0, noise=0.05)
+    current[100:110] = current[100]
+    split = split_record(DecayRecord(time, np.round(current, digits)))
+    assert kinds(split) == ["stuck"]
+    assert [len(piece) for piece in split.segments] == [291]
+
+
+def test_readings_that_repeat_by_their_digits_are_not_stuck():
+    time = np.arange(3000) * 10.0
+    current = np.round(decay(time, 100.0, lifetime=1e6, noise=0.02), 1)
+    assert kinds(split_record(DecayRecord(time, current))) == []
+
+
+@pytest.mark.filterwarnings("error")
+def test_levels_that_are_equal_but_for_rounding_are_split_in_silence():
+    time = np.arange(400) * 10.0
+    current = 100 * np.exp(-(time % 90) / 1e15)
+    current[200:] *= 51
+    split_record(DecayRecord(time, current))
+
+
+def test_cycles_of_a_coarse_monitor_have_one_answer():
+    """SIMULATED: one of the five was answered alone, 227 errors off."""
+    time, cycle = np.arange(500) * 10.0, np.arange(500) // 100
+    level = 300.2 + np.random.default_rng(2).uniform(-0.5, 0.5, 5)
+    study = study_record(DecayRecord(time, np.round(level[cycle] * np.exp(-(time % 1000) / 3e4))))
+    [answer] = study.answers
+    lifetime = answer.fit.lifetime_mean
+    assert abs(lifetime.value - 3e4 / 3600) < 3 * lifetime.error < 0.01 * lifetime.value

@@ -21,3 +21,8 @@ def test_a_digit_is_the_step_of_readings_that_repeat():
     assert digit_of(np.round(level / 0.25) * 0.25) == 0.25
     assert digit_of(level) is None
     assert digit_of(np.ones(9)) is None
+
+
+def test_a_digit_divides_all_steps():
+    assert digit_of(np.array([1.0, 1.3, 1.5, 1.8])) == pytest.approx(0.1)
+    assert digit_of(np.arange(1.0, 2.0, 0.1)) is None  # a line
