@@ -424,12 +424,15 @@ def _evidences(s: _Stack, i: int, draws: BeamDraws, noise: Noise) -> np.ndarray:
     """Log evidences of all models under one kind of noise, as densities of ln size."""
     kind = s.kinds[i]
     beam = averaged(draws.log_weight, 0.0)
-    # Noise in proportion to the size would vanish where such a beam does.
     flat = np.full_like(beam, -np.inf)
     if not kind.power:
         flat = flat_evidence(s.c, kind, noise)
     elif all(k.power for k in s.kinds):
-        flat = flat_evidence(s.c, replace(kind, power=0, unit=kind.unit * s.c.size), noise)
+        # A share of such a beam's size would vanish where it does: of the likeliest beam's. Not of
+        # what was measured, of which slow noise as large would leave one size and no noise.
+        size = _model(draws.best, s.c)
+        own = replace(kind, power=0, floor=kind.floor * size, unit=kind.unit * size)
+        flat = flat_evidence(s.c, own, noise)
     jacobian = np.log(s.c.size).sum(-1)
     # Rivals of slow noise are slow themselves, or as random as without it.
     curves = curve_evidences(s.u, s.c, replace(kind, slow=False), noise)
