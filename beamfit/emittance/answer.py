@@ -23,7 +23,6 @@ from beamfit.emittance.statement import PreparedScan, asked_of
 from beamfit.emittance.transport import setting_units
 from beamfit.emittance.verdict import (
     CARRIES,
-    MOVES,
     PlaneEvidence,
     noise_remark,
     point_remarks,
@@ -204,7 +203,7 @@ def _numbers(
     half = 0.5 * (ends[2] - ends[0])
     alone = post.positive and len(p.size) > 3
     carrying = _influence(p, post.best, half[0]) if alone else Influence()
-    if abs(carrying.shift) > MOVES:
+    if carrying.place:
         low, high, half = _reaching(low, high, half, b.value, carrying.without)
     raw = np.hypot(_raw(post, places), b.spread)
     return PlaneNumbers(b.value, half, low, high, raw), carrying
@@ -219,14 +218,14 @@ def _remarks(
     post, p, remarks = work.posterior, work.points, [work.shot_words]
     if e.of_a_beam:
         likely = chi2_probability(post.chi2, max(len(p.size) - 3, 0))
-        by_noise = e.determined and not b.scenario and abs(carrying.shift) <= MOVES
+        by_noise = e.determined and not b.scenario and not carrying.place
         enlarged = n.scale if by_noise else 1.0
         remarks.insert(0, noise_remark(post.noise, post.scale, likely, enlarged))
         without = carrying.without * n.value[1] / n.value[0]
         place = "" if e.opened else carrying.place
         if place:
             place += _bad_elsewhere(seen, plane, carrying.point)
-        remarks += point_remarks(p, place, float(without), abs(carrying.shift) > MOVES)
+        remarks += point_remarks(p, place, float(without))
     remarks.append(resolution_remark(p.size, p.known))
     remarks += [b.remark] * e.determined
     return " ".join(filter(None, remarks))
@@ -274,8 +273,8 @@ def _reaching(
     low, high, half = low.copy(), high.copy(), half.copy()
     low[:2] = np.fmin(low[:2], value[:2] + reach)
     high[:2] = np.fmax(high[:2], value[:2] + reach)
-    # The other answer is no further away than errors that noise explains.
-    half[:2] = np.fmax(half[:2], np.abs(reach) / MOVES)
+    # Two answers, one of which is right: half of what lies between them.
+    half[:2] = np.fmax(half[:2], np.abs(reach) / CARRIES)
     return low, high, half
 
 

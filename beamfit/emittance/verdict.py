@@ -26,9 +26,9 @@ from beamfit.statistics import of_use
 
 # A beam is sure with this probability: one answer in a hundred may be another thing.
 SURE = 0.99
-# A point carries the answer if the emittance moves by so many errors without it; the interval
-# reaches to where it goes if that is farther than any noise would move it.
-CARRIES, MOVES = 2.0, 3.0
+# A point carries the answer if the emittance moves by so many errors without it: farther than the
+# interval, which then reaches there.
+CARRIES = 2.0
 # An error so many times that by the stated errors is explained, where nothing else explains it.
 ENLARGED = 1.5
 # Above this probability of χ² stated errors are called too large.
@@ -247,9 +247,7 @@ def noise_remark(
     return ""
 
 
-def point_remarks(
-    p: Points, carrying: str = "", without: float = math.nan, reached: bool = False
-) -> Iterator[str]:
+def point_remarks(p: Points, carrying: str = "", without: float = math.nan) -> Iterator[str]:
     """Name bad readings, and the point that carries the answer.
 
     Parameters
@@ -259,8 +257,6 @@ def point_remarks(
     carrying, without : str and float
         The point without which the emittance moves most, and what it is then, normalised, m; NaN
         where the others give none.
-    reached : bool
-        Whether the interval was widened to hold that.
     """
     bad = np.flatnonzero(p.outlier_probability > 0.5)
     if len(bad):
@@ -271,10 +267,9 @@ def point_remarks(
         yield f"It rests on the point at {carrying}: without it there is no answer."
     elif carrying:
         factor, unit = display_unit(without, "m")
-        reach = ", to which the interval reaches" * reached
         yield (
             f"It rests on the point at {carrying}: without it the normalised emittance is "
-            f"{without / factor:.3g} {unit}{reach}."
+            f"{without / factor:.3g} {unit}, to which the interval reaches."
         )
 
 

@@ -271,6 +271,21 @@ def test_the_point_that_carries_the_answer_is_named(otr2, true):
     assert "rests on the point at Q525 = -1 kG" in fit.message
 
 
+def test_neither_error_nor_interval_jumps_as_an_answer_begins_to_rest_on_a_point(otr2, true):
+    """Error and upper end grew by half where the answer without the point was 3 errors away."""
+    settings, found = np.array([-3.4, -3.3, -3.2, -3.1, -3.0, -2.9, -1.0]), []
+    for off in np.arange(1.0, 1.03, 0.001):
+        size = true(settings) * (1 + 1e-4 * np.array([1, -1, 1, -1, 1, -1, 1]))
+        size[-1] *= off
+        fit = beamfit.fit_emittance(otr2_scan(settings, size, 0.004 * size), otr2).x
+        quoted = fit.normalized_emittance
+        found.append((quoted.error, *quoted.interval_95, "rests on the point" in fit.message))
+    error, low, high, rests = np.array(found).T
+    assert 2 < rests.sum() < len(rests) - 2
+    assert np.abs(np.diff(np.log(error))).max() < 0.15
+    assert np.abs(np.diff([low, high]) / error[1:]).max() < 0.5
+
+
 @pytest.mark.parametrize("errors", [True, False])
 @pytest.mark.parametrize("robust", [True, False])
 def test_one_gross_outlier_is_named_and_spoils_nothing(otr2, true, errors, robust):
