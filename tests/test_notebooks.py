@@ -34,7 +34,7 @@ def test_one_runs_as_a_notebook(executed):
     text, pictures = executed("emittance_lcls.ipynb")
     assert pictures == 2
     assert "x converged 0.702 ± 0.025 µm" in text
-    assert "0.786 µm (+3.0 errors)" in text
+    assert "0.786 µm (+2.0 errors)" in text
 
 
 # Words of each. Those that take 10 s and more are executed by `make docs` and `make calibrate`;
