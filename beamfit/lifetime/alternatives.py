@@ -553,7 +553,7 @@ def _log_evidence(
     one: Alternative, law: Expansion, products: Products, nodes: np.ndarray, own: np.ndarray,
     width: np.ndarray, centre: np.ndarray,
 ) -> float:  # fmt: skip
-    """That of a law from products of columns, those of the nodes and the law's own."""
+    """Logarithm of the probability by one law, from products of the nodes' columns and its own."""
     found = [_laplace(products.combined(own), width, centre)]
     # Few readings tell no noise beside as many numbers.
     curves = smooth_curves(max(products.count // 2 - width.size, 0))
