@@ -228,8 +228,8 @@ def _numbers(s: np.ndarray) -> np.ndarray:
 
 
 class _Proposals(NamedTuple):
-    """Where beams are likely: a mixture, nodes of the noise's scale, and the likeliest of the fits,
-    T, T p_1, T p_2, with its log likelihood.
+    """Likely beams: a mixture, nodes of the noise's scale, and the likeliest of the fits, T, T p_1,
+    T p_2, with its log likelihood.
     """
 
     mixture: Mixture
