@@ -45,7 +45,7 @@ from beamfit.lifetime.free_law import (
     from_nodes,
     settling,
 )
-from beamfit.lifetime.pieces import LONE
+from beamfit.lifetime.pieces import DIGITS, LONE
 from beamfit.lifetime.record import DecayRecord
 from beamfit.noise.correlated import AveragedMoments, Memory
 from beamfit.noise.memory import CLOSE, Products
@@ -474,9 +474,17 @@ class Evidence:
     @cached_property
     def rival(self) -> Rival | None:
         """Alternative that explains a single decay better than any smooth law."""
-        if self.cycles > 1 or self.shaped or not self.about.rested:
+        if self.cycles > 1 or self.shaped or not self.about.rested or self.within_digits:
             return None
         return rival_of(self.about)
+
+    @property
+    def within_digits(self) -> bool:
+        """True if no reading lies farther off the law than half of the least step that digits show:
+        rounding to them may be all that departs from it.
+        """
+        off = np.max(np.abs(self.about.residuals * self.about.pieces.over))
+        return bool(off <= DIGITS / 2 * (self.record.resolution or 0.0))
 
     @property
     def explained(self) -> Rival | None:

@@ -18,7 +18,7 @@ from beamfit.lifetime.decay_law import current
 from beamfit.lifetime.evidence import BELIEVED, UNITS, Evidence, RatePart, Separability
 from beamfit.lifetime.expansion import Expansion, Pieces, solved
 from beamfit.lifetime.free_law import FreeLaw, Law
-from beamfit.lifetime.readings import rounding_error, with_common_errors, with_rounding
+from beamfit.lifetime.readings import rounding_of, with_common_errors, with_rounding
 from beamfit.lifetime.record import DecayRecord, Monitor
 from beamfit.quantity import Quantity, Status
 
@@ -491,9 +491,13 @@ def fit_pieces(
         said = f"The readings of each of {len(cycles)} cycles are equal"
         return replace(_constant(_readings(gathered, name, None), said), first=gathered.first)
     about, left_out = cleaned(gathered)
-    digit = cycles[0].resolution
-    if gathered.error is None and (least := rounding_error(digit, about.residuals)):
-        about, left_out = cleaned(replace(gathered, error=np.full(gathered.time.size, least)))
+    digit, span = cycles[0].resolution, float(np.median([cycle.span for cycle in cycles]))
+    rounding = rounding_of(digit, about.residuals * about.pieces.over, span)
+    if gathered.error is None and rounding is not None:
+        least, moved = rounding
+        monitor = moved.beside(gathered.monitor) if moved.drift else gathered.monitor
+        error = np.full(gathered.time.size, least)
+        about, left_out = cleaned(replace(gathered, error=error, monitor=monitor))
     usual = usual_cycle(cycles) if found else None
     evidence, pieces = Evidence(about, law, usual=usual), about.pieces
     finding = finding_of_cycles(evidence, pieces.monitor, left_out)

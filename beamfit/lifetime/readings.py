@@ -113,28 +113,38 @@ def with_common_errors(record: DecayRecord, residuals: np.ndarray) -> DecayRecor
     return replace(record, error=near, notes=(*record.notes, note))
 
 
-def rounding_error(digit: float | None, residuals: np.ndarray) -> float | None:
-    """Standard deviation of rounding, where readings scatter about a law by less than that: a beam
-    that loses a digit at each reading lies on a line, whose slope is not known the better.
+def rounding_of(
+    digit: float | None, residuals: np.ndarray, span: float
+) -> tuple[float, Monitor] | None:
+    """Standard deviation of rounding, and a drift, where readings scatter about a law by less: a
+    beam that loses a digit at each reading lies on a line, whose slope is not known the better.
+
+    What residuals lack of the variance of rounding, beyond two standard deviations of a mean
+    square, moves both ends of the record, or of all its cycles alike, of this span in s, each end
+    by itself.
 
     Examples
     --------
-    >>> print(rounding_error(1.0, np.zeros(9)), rounding_error(1.0, np.ones(9)))
-    0.28867513459481287 None
+    >>> print(rounding_of(1.0, np.ones(9), 3600.0))
+    None
+    >>> error, moved = rounding_of(1.0, np.zeros(900), 3600.0)
+    >>> print(f"{error:.3f} mA, {moved.drift:.3f} mA/h")
+    0.289 mA, 0.394 mA/h
     """
-    least = (digit or 0.0) / 12**0.5
-    return least if np.sqrt(np.mean(residuals**2)) < least else None
+    least, squared = (digit or 0.0) / 12**0.5, float(np.mean(residuals**2))
+    if squared >= least**2:
+        return None
+    lacks = max(least**2 * (1 - 2 / len(residuals) ** 0.5) - squared, 0.0)
+    return least, Monitor(drift=(2 * lacks) ** 0.5 * HOUR / span)
 
 
 def with_rounding(record: DecayRecord, residuals: np.ndarray) -> DecayRecord:
-    """State the error of rounding where it is needed; what residuals lack of it, beyond two
-    standard deviations of a mean square, moves both ends of the record, each by itself.
-    """
-    if record.error is not None or not (least := rounding_error(record.resolution, residuals)):
+    """State the error of rounding where it is needed."""
+    found = rounding_of(record.resolution, residuals, record.span)
+    if record.error is not None or found is None:
         return record
-    lacks = least**2 * (1 - 2 / len(record) ** 0.5) - np.mean(residuals**2)
-    moved = Monitor(drift=float(2 * max(lacks, 0.0)) ** 0.5 * HOUR / record.span)
-    monitor = moved.beside(record.monitor) if lacks > 0 else record.monitor
+    least, moved = found
+    monitor = moved.beside(record.monitor) if moved.drift else record.monitor
     note = "Readings scatter by less than the rounding of their digits: errors contain that."
     notes = (*record.notes, note)
     return replace(record, error=np.full(len(record), least), monitor=monitor, notes=notes)

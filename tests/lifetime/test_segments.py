@@ -594,3 +594,26 @@ def test_cycles_of_a_coarse_monitor_have_one_answer():
     [answer] = study.answers
     lifetime = answer.fit.lifetime_mean
     assert abs(lifetime.value - 3e4 / 3600) < 3 * lifetime.error < 0.01 * lifetime.value
+
+
+def test_a_digit_out_of_place_is_no_refill():
+    """Of a beam that loses .95 digits at each reading every twentieth stands: it was cut there, as
+    if a refill of a digit had come, into lines that lose one digit exactly."""
+    time = 60.0 * np.arange(90)
+    true = 200.0 - 0.95e-2 * np.arange(90)
+    found = study_record(DecayRecord(time, np.round(true, 2)))
+    assert [len(decay.segment) for decay in found.decays] == [90]
+    low, high = found.decays[0].fit.lifetime_mean.interval_95
+    assert low < np.mean(true) / (0.95e-2 / 60.0) / 3600.0 < high
+
+
+def test_cycles_that_are_rounded_alike_tell_no_more_than_one():
+    """Every cycle loses a digit in two readings, from the same current: the error of rounding is
+    that of all, and was divided by their number."""
+    since = np.tile(10.0 * np.arange(26), 31)
+    true = 217.2 * np.exp(-since / 4320.0)
+    record = DecayRecord(10.0 * np.arange(since.size), np.round(true))
+    fit = study_record(record).answers[0].fit
+    assert fit.first.size > 25
+    assert abs(fit.lifetime_mean.value - 1.2) < 3 * fit.lifetime_mean.error
+    assert fit.lifetime_mean.relative > 0.01
