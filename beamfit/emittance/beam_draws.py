@@ -246,22 +246,39 @@ def _proposals(c: Coordinates, kind: NoiseKind, noise: Noise, flat: bool) -> _Pr
         return _log_likelihood(centre, c, kind, scale, noise)
 
     scales = scales_of(kind, c.unit.shape, at_centres)
-    by_scale, prior = at_centres(scales.scale), scales.log_weight[..., None, :]
-    grown = _variance_found(by_scale + prior, scales.scale, kind, deviation)
-    centres, roots, bends = _in_half_space(fitted, centre, grown[..., None, None] * covariance)
-    found = averaged(by_scale, prior)
-    found = np.where(np.isfinite(found), found, -np.inf)
-    # In their own order: which of two equals is the better, rounding would decide.
-    top = np.sort(np.argsort(found, axis=-1)[..., -PARTS:], axis=-1)
-    first = np.argmax(found, axis=-1)[..., None, None]
-    share = np.exp(FLATTER * (np.take_along_axis(found, top, -1) - found.max(-1, keepdims=True)))
-    share /= share.sum(-1, keepdims=True)
-    mixture = Mixture(
-        np.take_along_axis(centres, top[..., None], -2),
-        np.take_along_axis(roots, top[..., None, None], -3),
-        np.take_along_axis(bends, top[..., None], -2),
-        share,
+    log = at_centres(scales.scale) + scales.log_weight[..., None, :]
+    # Right errors give a peak of their own, which may be a thousand times narrower than all others.
+    special = int(kind.special is not None)
+    groups = [slice(special)] * special + [slice(special, None)]
+    parts = []
+    for own in groups:
+        scale, here = scales.scale[..., own], log[..., own]
+        grown = _variance_found(here, scale, kind, deviation)
+        wide = grown[..., None, None] * covariance
+        centres, roots, bends = _in_half_space(fitted, centre, wide)
+        # A beam's three numbers take a volume of so many deviations cubed.
+        height = averaged(here, 1.5 * np.log(variance_of(kind, scale).mean(-1))[..., None, :])
+        height = np.where(np.isfinite(height), height, -np.inf)
+        # In their own order: which of two equals is the better, rounding would decide.
+        top = np.sort(np.argsort(height, axis=-1)[..., -PARTS // len(groups) :], axis=-1)
+        at = top[..., None]
+        parts.append(
+            (
+                np.take_along_axis(centres, at, -2),
+                np.take_along_axis(roots, at[..., None], -3),
+                np.take_along_axis(bends, at, -2),
+                np.take_along_axis(height, top, -1),
+            )
+        )
+    centres, roots, bends, height = (
+        np.concatenate(part, log.ndim - 2) for part in zip(*parts, strict=True)
     )
+    share = np.exp(FLATTER * (height - height.max(-1, keepdims=True)))
+    share /= share.sum(-1, keepdims=True)
+    mixture = Mixture(centres, roots, bends, share)
+    found = averaged(log, 0.0)
+    found = np.where(np.isfinite(found), found, -np.inf)
+    first = np.argmax(found, axis=-1)[..., None, None]
     likeliest = np.take_along_axis(centre, first, -2)[..., 0, :]
     return _Proposals(mixture, scales, likeliest, found.max(-1))
 

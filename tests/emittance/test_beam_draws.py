@@ -35,6 +35,24 @@ def test_draws_are_worth_a_hundred_whatever_the_noise(noise, seed):
     assert found.worth > 100
 
 
+@pytest.mark.parametrize("points", [4, 5])
+@pytest.mark.parametrize("noise", [1e-5, 1e-3])
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_a_peak_of_right_errors_is_drawn_beside_wide_ones(points, noise, seed):
+    """One width was for both: draws were worth 2 to 66, errors up to thousands of times off."""
+    sigma = 1e-8 * np.array([[4.0, -1.0], [-1.0, 1.0]])
+    gradients = np.linspace(0.2, 8.0, points)
+    each = simulated(0.0, gradients, seed, sigma).size["x"][:, None]
+    shots = each * (1 + noise * np.random.default_rng(seed).normal(size=(points, 5)))
+    sizes, single = {"x": shots.mean(1)}, {"x": shots}
+    scan = beamfit.QuadScan({"Q1": gradients}, {"Q1": "k1"}, sizes, shot_size=single)
+    fit = beamfit.fit_emittance(scan, LINE)
+    assert fit.seen.solutions["x"].posterior.worth > 100
+    truth, found = np.sqrt(np.linalg.det(sigma)), fit.x.emittance
+    assert found.error < 5 * noise * found.value
+    assert found.interval_95[0] < truth < found.interval_95[1]
+
+
 def test_what_fits_as_no_beam_is_drawn_about_the_nearest_one():
     """A scan of a few degrees far from the waist does not tell an emittance; three draws did."""
     beta, alpha, emittance = 3.0, 1.0, 6e-7

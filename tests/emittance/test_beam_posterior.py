@@ -176,9 +176,9 @@ def brute_probabilities(fit, kind, noise):
     log = likelihood(kind, size, error, noise)
     drawn = rows, size, p.known, log, post.best, covariance, turn
     beam = ref.log_evidence_of_beam(*drawn, number=80_000)
-    # Noise that is a share of the size would vanish where such a beam does: of what was measured.
+    # Noise that is a share of the size would vanish where such a beam does: of the best beam's.
     own = {"share": "stated", "none": "same"}.get(kind, kind)
-    log = likelihood(own, size, error, noise)
+    log = likelihood(own, size, error * p.model / size if kind == "share" else error, noise)
     flat = ref.log_evidence_of_flat_beam(rows2, size, p.known, log, turn)
     mean = np.exp(np.log(size).mean())
     x, walk = np.log(size / mean), np.minimum.outer(np.arange(n), np.arange(n)) * 1.0
