@@ -253,34 +253,28 @@ def _proposals(c: Coordinates, kind: NoiseKind, noise: Noise, flat: bool) -> _Pr
     parts = []
     for own in groups:
         scale, here = scales.scale[..., own], log[..., own]
-        grown = _variance_found(here, scale, kind, deviation)
-        wide = grown[..., None, None] * covariance
-        centres, roots, bends = _in_half_space(fitted, centre, wide)
+        wide = _variance_found(here, scale, kind, deviation)[..., None, None] * covariance
         # A beam's three numbers take a volume of so many deviations cubed.
-        height = averaged(here, 1.5 * np.log(variance_of(kind, scale).mean(-1))[..., None, :])
-        height = np.where(np.isfinite(height), height, -np.inf)
-        # In their own order: which of two equals is the better, rounding would decide.
-        top = np.sort(np.argsort(height, axis=-1)[..., -PARTS // len(groups) :], axis=-1)
-        at = top[..., None]
-        parts.append(
-            (
-                np.take_along_axis(centres, at, -2),
-                np.take_along_axis(roots, at[..., None], -3),
-                np.take_along_axis(bends, at, -2),
-                np.take_along_axis(height, top, -1),
-            )
-        )
-    centres, roots, bends, height = (
-        np.concatenate(part, log.ndim - 2) for part in zip(*parts, strict=True)
-    )
+        volume = 1.5 * np.log(variance_of(kind, scale).mean(-1))[..., None, :]
+        height = np.nan_to_num(averaged(here, volume), nan=-np.inf)
+        parts.append(_highest(PARTS // len(groups), height, *_in_half_space(fitted, centre, wide)))
+    height, *columns = (np.concatenate(part, log.ndim - 2) for part in zip(*parts, strict=True))
     share = np.exp(FLATTER * (height - height.max(-1, keepdims=True)))
-    share /= share.sum(-1, keepdims=True)
-    mixture = Mixture(centres, roots, bends, share)
+    mixture = Mixture(*columns, share / share.sum(-1, keepdims=True))
     found = averaged(log, 0.0)
     found = np.where(np.isfinite(found), found, -np.inf)
     first = np.argmax(found, axis=-1)[..., None, None]
     likeliest = np.take_along_axis(centre, first, -2)[..., 0, :]
     return _Proposals(mixture, scales, likeliest, found.max(-1))
+
+
+def _highest(count: int, height: np.ndarray, *columns: np.ndarray) -> list[np.ndarray]:
+    """The highest of some parts, and their columns, of shape (..., m, ...)."""
+    # In their own order: which of two equals is the better, rounding would decide.
+    top = np.sort(np.argsort(height, axis=-1)[..., -count:], axis=-1)
+    ranks = (np.expand_dims(top, tuple(range(top.ndim, v.ndim))) for v in (height, *columns))
+    pairs = zip((height, *columns), ranks, strict=True)
+    return [np.take_along_axis(v, at, top.ndim - 1) for v, at in pairs]
 
 
 def _variance_found(
