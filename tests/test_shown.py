@@ -47,7 +47,7 @@ def values(root):
     return {
         "gtf_simulated": scan,
         "GTF": line,
-        "0.6799 ± 0.0076 µm": fit,
+        "0.6799 ± 0.0077 µm": fit,
         "x converged": fit.x,
         "14 values": fit.x.points,
         "SCREEN": fit.x.screen,
@@ -88,8 +88,8 @@ def test_each_is_a_table_in_a_notebook(values):
         assert page.open == []
         assert page.text.strip()
     page = Balance()
-    page.feed(values["0.6799 ± 0.0076 µm"]._repr_html_())
-    assert "0.6799 ± 0.0076 µm" in page.text
+    page.feed(values["0.6799 ± 0.0077 µm"]._repr_html_())
+    assert "0.6799 ± 0.0077 µm" in page.text
 
 
 def test_a_long_line_or_record_shows_its_first_rows():
