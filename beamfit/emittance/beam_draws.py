@@ -29,7 +29,7 @@ from beamfit.noise.sizes import (
 # Draws of a beam of no emittance, of which the evidence alone is wanted.
 FEW = 256
 # Draws of a plane, and degrees of freedom of the Student distributions they are drawn from.
-DRAWS, TAIL = 1536, 4.0
+DRAWS, TAIL = 3072, 4.0
 # One draw in so many is from the prior: no weight is large by luck where the sizes say little.
 DEFENSIVE = 8
 # The shares of so many proposals are flattened by this power.
