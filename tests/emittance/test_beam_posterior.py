@@ -137,7 +137,7 @@ def test_the_low_end_of_a_short_scan_is_the_one_written_out(gtf, kind):
 def test_the_sampler_draws_from_it(gtf, scan_of_kind, kind):
     """Median and 95 % of emcee to 0.1 errors."""
     fit = beamfit.fit_emittance(scan_of_kind(kind, 9), gtf)
-    found = fit.sample(seed=1, target_ess=6000)
+    found = fit.sample(seed=1, target_ess=20000)
     own = fit.x.emittance
     ends = found.quantiles("x.emittance", (0.5, 0.025, 0.975))
     for drawn, quoted in zip(ends, (median(fit), *own.interval_95), strict=True):
