@@ -483,8 +483,9 @@ class Evidence:
         """True if no reading lies farther off the law than half of the least step that digits show:
         rounding to them may be all that departs from it.
         """
+        digit = None if self.record is None else self.record.resolution
         off = np.max(np.abs(self.about.residuals * self.about.pieces.over))
-        return bool(off <= DIGITS / 2 * (self.record.resolution or 0.0))
+        return digit is not None and bool(off <= DIGITS / 2 * digit)
 
     @property
     def explained(self) -> Rival | None:

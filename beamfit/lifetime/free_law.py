@@ -287,10 +287,9 @@ PUMPED = 0.5
 PLACES, RANGES, STEPS, RESTS = 33, 5, 6, 0.2
 # Readings beyond which neighbours are averaged: the curve is smooth between them.
 ENOUGH = 1024
-# Draws of each law at first, how many independent ones all together are to be worth, as samples
-# are, and most of them; the scale of the logistic distribution that they have in standard
-# deviations.
-FEW, WORTH, MANY, TAIL = 512, 4000.0, 60000, 0.6
+# Draws of each law at first, how many independent ones all together are to be worth, and most of
+# them; the scale of the logistic distribution that they have in standard deviations.
+FEW, WORTH, MANY, TAIL = 512, 2500.0, 60000, 0.6
 # Standard deviations of the share beside a bound in which draws tell the density there.
 NEAR = 0.25
 # Shares of a of losses that are no beam's, and the prior odds of one.
@@ -812,7 +811,8 @@ def drawn(laws: Sequence[DrawnLaw]) -> list[Draws]:
     while True:
         log, worth = np.array([(one.log, max(one.worth, 1.0)) for one in found]).T
         part = np.exp(log - max(log.max(), -1e300))
-        needed = np.minimum(WORTH * part / max(part.sum(), 1e-300) * count / worth, MANY)
+        errors = np.sqrt(part / max(part.sum(), 1e-300) * count / worth)  # of one draw of each
+        needed = np.minimum(WORTH * errors * errors.sum(), MANY)
         short = np.flatnonzero(count < 0.8 * needed)
         if not short.size:
             return found
