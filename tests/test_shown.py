@@ -55,7 +55,7 @@ def values(root):
         "l11": fit.x.beam,
         "Q1": line["Q1"],
         "27 readings": record,
-        "39.149 ± 0.038 h": decay,
+        "39.149 ± 0.037 h": decay,
         "separable": decay.identifiability,
         "234.144": ring,
         "761 values": ring.optics,
