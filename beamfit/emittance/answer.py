@@ -273,7 +273,8 @@ def _reaching(
     low, high, half = low.copy(), high.copy(), half.copy()
     low[:2] = np.fmin(low[:2], value[:2] + reach)
     high[:2] = np.fmax(high[:2], value[:2] + reach)
-    # Two answers, one of which is right: half of what lies between them.
+    # Two answers, one of which is right: half of what lies between them, which is the error where
+    # a point begins to carry the answer.
     half[:2] = np.fmax(half[:2], np.abs(reach) / CARRIES)
     return low, high, half
 

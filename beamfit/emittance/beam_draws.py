@@ -130,7 +130,7 @@ class BeamDraws(NamedTuple):
     x : ndarray
         Shape (..., d, 3): T, T p_1, T p_2.
     log_weight : ndarray
-        Shape (..., d): their sum is the evidence; -inf where no beam is.
+        Shape (..., d): their sum is the evidence.
     scales : Scales
         The nodes that the noise was averaged over.
     by_scale : ndarray
@@ -190,10 +190,11 @@ def draw_beams(c: Coordinates, kind: NoiseKind, noise: Noise) -> BeamDraws:
     log_density = np.logaddexp(mixture.log_density(s), mixture.log_density(s * (1.0, 1.0, -1.0)))
     # Draws from the prior among them bound every weight.
     part = 1.0 / DEFENSIVE
-    log_density = np.logaddexp(math.log1p(-part) + log_density, math.log(part) + log_prior(s))
+    prior = log_prior(s)
+    log_density = np.logaddexp(math.log1p(-part) + log_density, math.log(part) + prior)
     x = _numbers(s)
     each = _log_likelihood(x, c, kind, scales.scale, noise)
-    drawn = log_prior(s) - log_density - math.log(count)
+    drawn = prior - log_density - math.log(count)
     weight = averaged(each, scales.log_weight[..., None, :]) + drawn + kind.log_weight[..., None]
     weight = np.where(np.isnan(weight), -np.inf, weight)
     by_scale = averaged(np.swapaxes(each, -1, -2), drawn[..., None, :])

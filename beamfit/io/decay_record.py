@@ -69,8 +69,9 @@ QUANTITIES = {
 CALLED = {"beam_current": "current", "beam_current_error": "error"}
 USED = {"time", "nanos", "current", "error", *Conditions._fields}
 # What a column of dates is called, and those of a day and of the time of that day.
-MOMENTS = {"time", "timestamp", "time_stamp", "datetime", "date_time", "date/time", "data_time"}
-MOMENTS |= {"date"}
+MOMENTS = {
+    "time", "timestamp", "time_stamp", "datetime", "date_time", "date/time", "data_time", "date",
+}  # fmt: skip
 DAYS, CLOCKS = {"date", "day"}, {"time"}
 # Behind its name: the zone that is meant where none stands.
 UTC = re.compile(r"[ _]?[\[(]?(utc|gmt)[\])]?$")

@@ -385,7 +385,7 @@ def rival_of(plain: Expansion) -> Rival | None:
     one, best = laws[logs.index(log)]
     told = {"relaxing": _outgassing, "sudden": _sudden_loss}
     told |= {"step": _change, "step of a": partial(_change, of_a=True)}
-    scatter = float(np.sqrt(np.mean((best.residuals * pieces.over) ** 2)))
+    scatter = float(np.sqrt(np.mean(best.off**2)))
     return Rival(told[one.kind](best), log - smooth, scatter, best, one.kind)
 
 
@@ -641,7 +641,7 @@ def _sudden_loss(law: Expansion) -> SuddenLoss:
     # All times between two readings are one: the middle stands for them.
     after = int(np.searchsorted(law.pieces.time, times[largest] * span))
     when = float(law.pieces.time[after - 1 : after + 1].mean())
-    model = law.pieces.current + law.residuals * law.pieces.over
+    model = law.pieces.current + law.off
 
     def lost(level, loss, quadratic, power, *further):
         return np.array([-model[after - 1] * np.expm1(-further[2 * largest])])

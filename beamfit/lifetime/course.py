@@ -370,7 +370,7 @@ def _noise(fit: DecayFit, power: float) -> tuple[float, float, float, float]:
     alike, rest = fit.identifiability.residual_correlation or 0.0, fit.residuals
     if power and fit.first is None:
         about = fit.with_power(power)
-        rest, found = about.residuals * about.pieces.over, about.memory(about.columns(), False)
+        rest, found = about.off, about.memory(about.columns(), False)
         time = found.noise.time if about.wanders else 0.0
         alike = (1 - found.noise.white) * math.exp(-interval / time) if time else 0.0
     white = 1 - alike * math.exp(interval / time) if alike else 0.0

@@ -484,7 +484,7 @@ class Evidence:
         rounding to them may be all that departs from it.
         """
         digit = None if self.record is None else self.record.resolution
-        off = np.max(np.abs(self.about.residuals * self.about.pieces.over))
+        off = np.max(np.abs(self.about.off))
         return digit is not None and bool(off <= DIGITS / 2 * digit)
 
     @property

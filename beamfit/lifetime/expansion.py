@@ -305,6 +305,11 @@ class Expansion:
     rested: bool = True
     parts: Parts | None = None
 
+    @property
+    def off(self) -> np.ndarray:
+        """Model less reading, mA, shape (n,)."""
+        return self.residuals * self.pieces.over
+
     @classmethod
     def of(
         cls, pieces: Pieces, numbers: np.ndarray, level: np.ndarray, kind: str | None = None,

@@ -339,8 +339,7 @@ def fit_decay(
     if np.ptp(record.current) == 0:
         return _constant(record, f"All {len(record)} readings are {record.current[0]:.6g} mA")
     about = solved(Pieces.of(record), shape=shape)
-    residuals = about.residuals * about.pieces.over
-    even = with_rounding(with_common_errors(record, residuals), residuals)
+    even = with_rounding(with_common_errors(record, about.off), about.off)
     about = about if even is record else solved(Pieces.of(even), shape=shape)
     evidence = Evidence(about, Law(law), shape is not None, even)
     rate, error = evidence.sure("rate_mean")
@@ -492,10 +491,9 @@ def fit_pieces(
         return replace(_constant(_readings(gathered, name, None), said), first=gathered.first)
     about, left_out = cleaned(gathered)
     digit, span = cycles[0].resolution, float(np.median([cycle.span for cycle in cycles]))
-    rounding = rounding_of(digit, about.residuals * about.pieces.over, span)
+    rounding = rounding_of(digit, about.off, span, gathered.monitor)
     if gathered.error is None and rounding is not None:
-        least, moved = rounding
-        monitor = moved.beside(gathered.monitor) if moved.drift else gathered.monitor
+        least, monitor = rounding
         error = np.full(gathered.time.size, least)
         about, left_out = cleaned(replace(gathered, error=error, monitor=monitor))
     usual = usual_cycle(cycles) if found else None

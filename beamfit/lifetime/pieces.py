@@ -161,7 +161,7 @@ def _stuck(current: np.ndarray) -> np.ndarray:
     (Laplace's rule of succession) they are no chance.
     """
     repeats = np.append(False, np.diff(current) == 0)
-    first, end = np.flatnonzero(np.diff(np.r_[repeats, False].astype(np.int8))).reshape(-1, 2).T + 1
+    first, end = np.array(_runs(repeats), int).reshape(-1, 2).T
     before, after = np.maximum(first - NEIGHBOURS, 0), np.minimum(end + NEIGHBOURS, current.size)
     total = np.append(0, np.cumsum(repeats))
     sides = [(total[b] - total[a] + 1) / (b - a + 2) for a, b in ((before, first), (end, after))]

@@ -114,10 +114,11 @@ def with_common_errors(record: DecayRecord, residuals: np.ndarray) -> DecayRecor
 
 
 def rounding_of(
-    digit: float | None, residuals: np.ndarray, span: float
-) -> tuple[float, Monitor] | None:
-    """Standard deviation of rounding, and a drift, where readings scatter about a law by less: a
-    beam that loses a digit at each reading lies on a line, whose slope is not known the better.
+    digit: float | None, residuals: np.ndarray, span: float, monitor: Monitor | None
+) -> tuple[float, Monitor | None] | None:
+    """Error of rounding, and the monitor with a drift beside its own, where readings scatter about
+    a law by less: a beam that loses a digit at each reading lies on a line, whose slope is not
+    known the better.
 
     What residuals lack of the variance of rounding, beyond two standard deviations of a mean
     square, moves both ends of the record, or of all its cycles alike, of this span in s, each end
@@ -125,26 +126,27 @@ def rounding_of(
 
     Examples
     --------
-    >>> print(rounding_of(1.0, np.ones(9), 3600.0))
+    >>> print(rounding_of(1.0, np.ones(9), 3600.0, None))
     None
-    >>> error, moved = rounding_of(1.0, np.zeros(900), 3600.0)
+    >>> error, moved = rounding_of(1.0, np.zeros(900), 3600.0, None)
     >>> print(f"{error:.3f} mA, {moved.drift:.3f} mA/h")
     0.289 mA, 0.394 mA/h
     """
     least, squared = (digit or 0.0) / 12**0.5, float(np.mean(residuals**2))
     if squared >= least**2:
         return None
-    lacks = max(least**2 * (1 - 2 / len(residuals) ** 0.5) - squared, 0.0)
-    return least, Monitor(drift=(2 * lacks) ** 0.5 * HOUR / span)
+    lacks = least**2 * (1 - 2 / len(residuals) ** 0.5) - squared
+    if lacks > 0:
+        monitor = Monitor(drift=(2 * lacks) ** 0.5 * HOUR / span).beside(monitor)
+    return least, monitor
 
 
 def with_rounding(record: DecayRecord, residuals: np.ndarray) -> DecayRecord:
     """State the error of rounding where it is needed."""
-    found = rounding_of(record.resolution, residuals, record.span)
+    found = rounding_of(record.resolution, residuals, record.span, record.monitor)
     if record.error is not None or found is None:
         return record
-    least, moved = found
-    monitor = moved.beside(record.monitor) if moved.drift else record.monitor
+    least, monitor = found
     note = "Readings scatter by less than the rounding of their digits: errors contain that."
     notes = (*record.notes, note)
     return replace(record, error=np.full(len(record), least), monitor=monitor, notes=notes)

@@ -188,8 +188,7 @@ def single_exponential(record: DecayRecord, fit: DecayFit | None = None) -> OneL
     found = solved(Pieces.of(record), (LOSS,))
     moments = found.memory((LEVEL, LOSS), True).moments(np.eye(2)[1:], found.given)
     error = float(moments.error[0]) / record.span
-    left = found.residuals * found.pieces.over
-    return _one_lifetime(float(found.values.b), error, left, record, fit)
+    return _one_lifetime(float(found.values.b), error, found.off, record, fit)
 
 
 def log_linear(record: DecayRecord, fit: DecayFit | None = None) -> OneLifetime:
