@@ -126,10 +126,10 @@ def lifetime(
     tables = [each for each in records if isinstance(each, LifetimeTable)]
     with_more = sample or study or trend or output.report or ring or monitor
     if tables and (len(tables) < len(records) or with_more):
-        expected = "tables of lifetimes by themselves, with no option but --json"
+        expected = "tables of lifetimes by themselves, with no option but --law and --json"
         raise InputError("a table of lifetimes", expected, path=tables[0].name)
     if tables:
-        _lifetimes(tables, inputs, output)
+        _lifetimes(tables, law, inputs, output)
         return
 
     if monitor is not None:
@@ -154,9 +154,11 @@ def lifetime(
     )
 
 
-def _lifetimes(tables: list[LifetimeTable], inputs: dict[str, str], output: Output) -> None:
+def _lifetimes(
+    tables: list[LifetimeTable], law: str, inputs: dict[str, str], output: Output
+) -> None:
     """Fit and show tables of lifetimes."""
-    fits = [beamfit.fit_lifetimes(table) for table in tables]
+    fits = [beamfit.fit_lifetimes(table, law) for table in tables]
     output.answer(fits, inputs, lambda terminal: _show_lifetimes(terminal, fits))
 
 

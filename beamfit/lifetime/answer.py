@@ -21,12 +21,12 @@ from beamfit.lifetime.evidence import (
     UNITS,
     Evidence,
 )
-from beamfit.lifetime.free_law import Law
+from beamfit.lifetime.free_law import FreeLaw, Law
 from beamfit.lifetime.pieces import split_record
 from beamfit.lifetime.readings import noise_of
 from beamfit.lifetime.record import Monitor
 from beamfit.noise.memory import remembers
-from beamfit.quantity import HOUR, percent
+from beamfit.quantity import HOUR, Quantity, percent
 from beamfit.statistics import MANY, POOR_FIT, chi2_probability, few_words, of_use
 
 # Lifetimes, s, that stored beams seldom have, but times in a wrong unit often give.
@@ -50,21 +50,22 @@ SLOW = 0.01
 class TableEvidence(NamedTuple):
     """A table of lifetimes as the rules see it.
 
-    `numbers` has values and errors of a, b and the share of a in the loss at the mean current,
-    `outliers` names the points that were left out, `noise` is what the points scatter by, h, where
-    they have no errors.
+    `exact` has the quantities of constant a and b and the share of a in the loss at the mean
+    current, `outliers` names the points that were left out, `noise` is the scatter of points
+    without errors, h, and `free` the posterior of the free law.
     """
 
-    numbers: Mapping[str, tuple[float, float]]
+    exact: Mapping[str, Quantity]
     chi2: float
     dof: int
     constant_a: ConstantA
     lifetimes: LifetimeLaw | None
     outliers: tuple[str, ...]
     noise: float | None
+    free: FreeLaw | None
     explained: None = None
+    beside: None = None
     changed: bool = False
-    free: None = None
 
     @property
     def noise_inferred(self) -> bool:
@@ -73,9 +74,13 @@ class TableEvidence(NamedTuple):
 
     def scaled(self, name: str) -> tuple[float, float]:
         """A value and its error."""
-        return self.numbers[name]
+        return self.exact[name].value, self.exact[name].error
 
     sure = scaled
+
+    def quantity(self, name: str, known: bool) -> Quantity:
+        """Quote a or b of the constant law; without an error where it is not determined."""
+        return self.exact[name] if known else self.exact[name].open()
 
 
 def _lost(e: Evidence) -> Finding | None:
@@ -195,10 +200,7 @@ def _inseparable(e: Evidence) -> Finding | None:
         return _beyond(e, beyond)
     if e.free is not None and e.free.is_odd:
         return Finding(
-            Status.unidentified,
-            "a and b are open, the lifetime is determined: the loss goes with the current as no "
-            f"bunch length makes it, a as I^({e.free.exponent}). A vacuum that changes does, as "
-            "after a fill: give the pressure in a column",
+            Status.unidentified, f"{_odd(e)}, as after a fill: give the pressure in a column"
         )
     told = (
         f"a and b are not separable on this record (correlation {found.correlation:.6f}; share "
@@ -215,6 +217,14 @@ def _inseparable(e: Evidence) -> Finding | None:
     constant = "" if e.law is Law.constant else " if they are constant"
     told += f"A record {longer:.2g} times longer, or at several currents, would separate them"
     return Finding(Status.unidentified, told + constant)
+
+
+def _odd(e: Evidence | TableEvidence) -> str:
+    """Sentence on an exponent that no bunch length makes."""
+    return (
+        "a and b are open, the lifetime is determined: the loss goes with the current as no bunch "
+        f"length makes it, a as I^({e.free.exponent}). A vacuum that changes does"
+    )
 
 
 def _beyond(e: Evidence, errors: float) -> Finding:
@@ -326,7 +336,7 @@ def _departs(e: Evidence) -> str:
     return f"Constant a and b are rejected {chance}: {beside if moves else open_}"
 
 
-def _if_constant(e: Evidence) -> str:
+def _if_constant(e: Evidence | TableEvidence) -> str:
     a, b = (e.quantity(name, True) for name in "ab")
     return f"If a and b are constant, a is {a} and b is {b}"
 
@@ -353,15 +363,25 @@ RULES += (partial(_improbable, remedy=LOOK), _freely, _determined)
 
 
 def _narrow(e: TableEvidence) -> Finding | None:
+    """Lifetimes that do not separate a and b, by the constant law or the free one."""
     share, error = e.scaled("share")
-    if error < SEPARABLE:
+    if not error < SEPARABLE:
+        known = (
+            f" (share of a in the loss {share:.2g} ± {error:.2g})" if math.isfinite(error) else ""
+        )
+        cause = f"a and b are not separable by these lifetimes{known}: measure at a wider range of "
+        return Finding(Status.unidentified, f"{cause}currents")
+    if e.free is None or e.free.tells_share:
         return None
-    known = f" (share of a in the loss {share:.2g} ± {error:.2g})" if math.isfinite(error) else ""
-    cause = f"a and b are not separable by these lifetimes{known}: measure at a wider range of "
-    return Finding(Status.unidentified, f"{cause}currents")
+    if e.free.is_odd:
+        cause = f"{_odd(e)} with the current: measure the pressure beside the lifetimes"
+        return Finding(Status.unidentified, cause)
+    cause = "An exponent of a and a change of b along the current leave a and b open: measure at a "
+    cause += f"wider range of currents, or give --law constant. {_if_constant(e)}"
+    return Finding(Status.unidentified, cause)
 
 
-TABLE_RULES = (*NEGATIVE, _refuted, _narrow, _improbable, _determined)
+TABLE_RULES = (*NEGATIVE, _refuted, _narrow, _improbable, _freely, _determined)
 
 
 def finding_of_table(evidence: TableEvidence) -> Finding:

@@ -863,7 +863,7 @@ def ends_of(none: bool, all_: bool) -> tuple[float, float]:
     return least * (1 + all_), most - least * none
 
 
-def _share_of(
+def share_of(
     values: np.ndarray, weight: np.ndarray, unit: str, none: bool, all_: bool, whole: np.ndarray
 ) -> Quantity:
     """A loss that is a share of a whole; the interval reaches to a bound that is not excluded: from
@@ -899,8 +899,8 @@ class FreeLaw:
         Probability that the loss rate or the monitor wanders besides.
     settles : float
         Probability of a monitor that settles after a fill.
-    nodes : array, shape (18,)
-        What the monitor shows at the nodes in the mean, mA.
+    nodes : array, shape (18,), or None
+        What the monitor shows at the nodes in the mean, mA; None of a table of lifetimes.
     span : float
         Length of the record, s.
     """
@@ -911,11 +911,11 @@ class FreeLaw:
     drift: Quantity | None
     constant: float
     odd: float
-    pumped: float
-    wanders: float
-    settles: float
-    nodes: np.ndarray
-    span: float
+    pumped: float = 0.0
+    wanders: float = 0.0
+    settles: float = 0.0
+    nodes: np.ndarray | None = None
+    span: float = 0.0
 
     @property
     def likelier(self) -> bool:
@@ -1083,5 +1083,5 @@ def _quantities(record: DecayRecord, seen: SeenDecay, draws: Draws) -> dict[str,
     bounds = at_bounds(found.share, weight)
     own = {"a": (a, *bounds, whole[0]), "b": (b, *bounds[::-1], whole[1])}
     told = {name: quantity_of(values, weight, UNITS[name]) for name, values in quoted.items()}
-    told |= {n: _share_of(v, weight, UNITS[n], *more) for n, (v, *more) in own.items()}
+    told |= {n: share_of(v, weight, UNITS[n], *more) for n, (v, *more) in own.items()}
     return {name: told[name] for name in UNITS}

@@ -3,34 +3,53 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
-from jax import Array
-from scipy.special import chdtrc, fdtrc
+from scipy.optimize import least_squares
+from scipy.special import chdtrc, expit, fdtrc, logsumexp, ndtri, stdtrit
 
 from beamfit.answer import Table, answer, json_of, labelled, plain_name
-from beamfit.arrays import padded_length
 from beamfit.errors import expect
-from beamfit.greybox.fit import Derived, Fit
-from beamfit.greybox.problem import Free, Problem, Record
-from beamfit.greybox.solve import solve
 from beamfit.lifetime.alternatives import CURRENTS, ConstantA, LifetimeLaw, constant_a
 from beamfit.lifetime.answer import TableEvidence, finding_of_table
 from beamfit.lifetime.evidence import EXACT, UNITS
 from beamfit.lifetime.fit import bare, headline_of, loss_json
+from beamfit.lifetime.free_law import (
+    DRIFT,
+    FAR,
+    LEAST,
+    MOST,
+    NO_BEAM,
+    QUIET,
+    UNPHYSICAL,
+    FreeLaw,
+    Law,
+    at_bounds,
+    log_prior,
+    quantity_of,
+    share_of,
+)
 from beamfit.lifetime.record import FEWEST_LIFETIMES, LifetimeTable
+from beamfit.noise.memory import STATED
 from beamfit.quantity import HOUR, Quantity, Status
-from beamfit.statistics import reach_of
+from beamfit.statistics import POOR_FIT, chi2_probability, reach_of
 
 # Points so many robust standard deviations off the law with a free exponent are outliers; no more
 # than a fifth of them.
-OUTLIER, MOST = 5.0, 0.2
+OUTLIER, MOST_LEFT_OUT = 5.0, 0.2
 # Prior probability that a point of a table is a bad one.
 BAD = 0.03
-RECORD = "lifetimes"
+# Smallest loss rate of a trial law, over that of the median lifetime: it stays positive.
+SLOWEST = 1e-6
+# Ratio of singular values below which points do not determine a combination of a and b.
+RANK = 1e-10
+# Nodes of the integral over the share of a, the exponent and the change of b, how often the range
+# of exponents narrows to the posterior, the standard deviations that shares
+# reach to, and steps of the search of the most probable share.
+SHARES, EXPONENTS, CHANGES, ZOOMS, REACH, STEPS = 9, 33, 24, 4, 5.0, 12
 
 
 @answer
@@ -56,6 +75,9 @@ class LifetimeFit:
         Points that were left out, counted from 0.
     readings : LifetimeTable
         What was fitted.
+    free_law : FreeLaw or None
+        Posterior with an exponent of a and a change of b, which the errors contain; None where the
+        law is known.
     """
 
     record: str
@@ -74,6 +96,7 @@ class LifetimeFit:
     share: Quantity
     outliers: tuple[int, ...]
     readings: LifetimeTable
+    free_law: FreeLaw | None = None
 
     @property
     def quantities(self) -> dict[str, Quantity]:
@@ -108,44 +131,229 @@ class LifetimeFit:
     def to_json(self) -> dict[str, Any]:
         """Return the result as one JSON object, with what was left out."""
         more = {"i0": bare(None, "mA"), "outliers": self.outliers, "notes": self.readings.notes}
+        more |= {} if self.free_law is None else {"free_law": self.free_law}
         return loss_json(self) | json_of(more)
 
 
-def _rate(model: dict[str, Array], x: Array) -> Array:
-    """Loss rate over that at the mean current, 1, from the share of a there and its exponent."""
-    return model["rate"] * (1 + model["share"] * (x ** (1 + model["exponent"]) - 1))
+class _Points(NamedTuple):
+    """Points of a table in units of the mean current and the median lifetime, without outliers.
+
+    `error` has a scale that is free where none are stated; `known` is how many readings the stated
+    ones are worth.
+    """
+
+    current: np.ndarray
+    lifetime: np.ndarray
+    error: np.ndarray
+    known: float
+
+    @classmethod
+    def of(cls, table: LifetimeTable, kept: np.ndarray) -> tuple[_Points, ...]:
+        """Points of a table that are kept, with the stated errors or with each error model, the
+        most probable first: equal errors, or the same share of each lifetime.
+        """
+        unit = float(np.median(table.lifetime))
+        x, lifetime = table.current[kept] / table.current.mean(), table.lifetime[kept] / unit
+        if table.error is not None:
+            return (cls(x, lifetime, table.error[kept] / unit, STATED),)
+        equal = cls(x, lifetime, np.ones(x.size), 0.0)
+        curve = np.maximum(lifetime + _least_squares(equal).residuals, SLOWEST)
+        models = equal, equal._replace(error=curve)
+        return tuple(sorted(models, key=lambda one: one.log_likelihood(), reverse=True))
+
+    def log_likelihood(self) -> float:
+        """Log likelihood of the constant law with a free scale of the errors."""
+        squares = max(_least_squares(self).chi2, self.current.size * EXACT**2)
+        return -0.5 * self.current.size * math.log(squares) - float(np.sum(np.log(self.error)))
 
 
-def _lifetimes(model: dict[str, Array], x: Array) -> Array:
-    return 1 / jnp.maximum(_rate(model, x), 1e-6)
+class _LeastSquares(NamedTuple):
+    """Least squares of the lifetimes: loss rates to a and b at the mean current and the exponent,
+    the residuals and their slopes, over the errors.
+    """
+
+    numbers: np.ndarray
+    residuals: np.ndarray
+    slopes: np.ndarray
+    known: float
+
+    @property
+    def dof(self) -> int:
+        """Points less numbers."""
+        return self.residuals.size - self.numbers.size
+
+    @property
+    def chi2(self) -> float:
+        """Sum of squares of the residuals."""
+        return float(self.residuals @ self.residuals)
+
+    @property
+    def scale(self) -> float:
+        """Factor on the errors: the scatter where none are stated, else at least 1."""
+        return max(math.sqrt(self.chi2 / max(self.dof, 1)), 1.0 if self.known else 0.0)
+
+    def quantity(self, value: float, slopes: Sequence[float], unit: str, size: float) -> Quantity:
+        """A value in a unit of this size; `slopes` are its derivatives by the numbers."""
+        _, scales, axes = np.linalg.svd(self.slopes, full_matrices=False)
+        along, lost = axes @ slopes[: self.numbers.size], scales <= RANK * scales[0]
+        raw = float(np.linalg.norm(along[~lost] / scales[~lost]))
+        raw = math.inf if np.any(np.abs(along[lost]) > RANK) else max(raw, EXACT * abs(value))
+        raw, reach = raw * size, reach_of(math.inf if self.known else self.dof)
+        return Quantity.reaching(
+            float(value) * size, self.scale * raw, unit, raw, reach * self.scale * raw
+        )
 
 
-def _quoted(model: dict[str, Array], ends: Array) -> Array:
-    """a I, b, and the rates at the ends, in units of the usual rate; share and exponent."""
-    quadratic = model["rate"] * model["share"]
-    rest = jnp.stack([quadratic, model["rate"] - quadratic, model["share"], model["exponent"]])
-    return jnp.concatenate([rest, _rate(model, ends)])
+def _least_squares(points: _Points, exponent: bool = False) -> _LeastSquares:
+    """Fit loss rates to a and b, and an exponent of a, to lifetimes."""
+    x, lifetime, error, known = points
+
+    def rates(numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        power = x ** (1 + (numbers[2] if exponent else 0.0))
+        slopes = [power, np.ones_like(x), numbers[0] * power * np.log(x)]
+        rate = np.maximum(numbers[0] * power + numbers[1], SLOWEST)
+        return rate, np.column_stack(slopes[: 2 + exponent])
+
+    def residuals(numbers: np.ndarray) -> np.ndarray:
+        return (1 / rates(numbers)[0] - lifetime) / error
+
+    def slopes(numbers: np.ndarray) -> np.ndarray:
+        rate, columns = rates(numbers)
+        return -columns / (rate**2 * error)[:, None]
+
+    weight = (lifetime**2 / error)[:, None]
+    columns = np.column_stack([x, np.ones_like(x)])
+    start = np.linalg.lstsq(weight * columns, lifetime / error, rcond=RANK)[0]
+    ends = np.array([np.inf, np.inf, 3.0])[: 2 + exponent]
+    found = least_squares(
+        residuals, np.append(start, [0.0] * exponent), slopes, (-ends, ends),
+        x_scale="jac", ftol=1e-14, xtol=1e-14, gtol=1e-14,
+    )  # fmt: skip
+    return _LeastSquares(found.x, found.fun, found.jac, known)
 
 
-def _solved(table: LifetimeTable, rows: np.ndarray, exponent: bool) -> Fit:
-    """Fit in units of the mean current and the median lifetime; rows of weight 0 are padding."""
-    more, usual = (0, padded_length(len(table)) - len(table)), float(np.median(table.lifetime))
-    columns = [table.current / table.current.mean(), table.lifetime / usual]
-    columns += [] if table.error is None else [table.error / usual]
-    x, lifetime, *error = (np.pad(column, more, mode="edge") for column in columns)
-    free = [Free("rate", 1e-3, 1e3), Free("share")] + [Free("exponent", -3.0, 3.0)] * exponent
-    weight = np.pad(rows.astype(float), more)
-    record = Record(RECORD, _lifetimes, x, lifetime, *(error or [None]), weight)
-    return solve(Problem({"rate": 1.0, "share": 0.5, "exponent": 0.0}, free, [record]))
+class _Integral(NamedTuple):
+    """Nodes of a posterior, flat arrays: share of a, exponent, change of b, and the lifetime at the
+    mean current over the median one; weights of sum 1; and the log evidence.
+    """
+
+    share: np.ndarray
+    power: np.ndarray
+    change: np.ndarray
+    lifetime: np.ndarray
+    weight: np.ndarray
+    log: float
+
+    def rate(self, x: float, width: float) -> np.ndarray:
+        """Loss rate at a current x over the mean; `width` is the range of these currents."""
+        gas = (1 - self.share) * (1 + self.change * (x - 1) / width)
+        return (self.share * x ** (1 + self.power) + gas) / self.lifetime
+
+
+def _places(low: np.ndarray, high: np.ndarray, count: int) -> np.ndarray:
+    """Midpoints of equal parts of ranges, (m, count), shifted in each range by another part of a
+    step: those of all ranges together fill it evenly.
+    """
+    shift = np.modf(math.sqrt(2.0) * np.arange(1, low.size + 1))[0]
+    parts = (shift[:, None] + np.arange(count)) / count
+    return low[:, None] + parts * (high - low)[:, None]
+
+
+def _along_share(
+    points: _Points, power: np.ndarray, change: np.ndarray, bounds: tuple[float, float]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Nodes of the share of a at exponents and changes of b, (m,), the most probable lifetime at
+    the mean current with its standard deviation, and log weights, each of shape (m, SHARES).
+
+    The lifetime at the mean current is a factor on all lifetimes: at each share the integral over
+    it has a closed form, as has that over the noise level.
+    """
+    x, lifetime, error, known = points
+    gas = (1 + change[:, None] * (x - 1) / (np.ptp(x) or 1.0))[:, None]
+    bend = x ** (1 + power[:, None, None]) - gas
+    read, dof = lifetime / error, x.size + known - 1
+
+    def profile(share: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Lifetimes over that at the mean current and over their errors, the sum of their squares,
+        the most probable factor and the residual sum of squares.
+        """
+        shape = 1 / np.maximum(gas + share[..., None] * bend, SLOWEST) / error
+        norm = np.sum(shape**2, axis=-1)
+        best = shape @ read / norm
+        squares = np.sum((read - best[..., None] * shape) ** 2, axis=-1)
+        return shape, norm, best, known + np.maximum(squares, x.size * EXACT**2)
+
+    share = np.full((power.size, 1), 0.5)
+    for _ in range(STEPS):
+        shape, norm, best, squares = profile(share)
+        slope = -best[..., None] * shape**2 * error * bend
+        slope -= shape * (np.sum(shape * slope, axis=-1) / norm)[..., None]
+        whole = np.maximum(np.sum(slope**2, axis=-1), EXACT**2)
+        step = np.sum(slope * (read - best[..., None] * shape), axis=-1) / whole
+        share = np.clip(share + step, *NO_BEAM)
+    far, near = REACH * np.sqrt(squares / dof / whole), np.clip(share, *bounds)
+    low, high = np.maximum(near - far, bounds[0]), np.minimum(near + far, bounds[1])
+    nodes = _places(low[:, 0], high[:, 0], SHARES)
+    _, norm, best, squares = profile(nodes)
+    density = 1 / np.sqrt(norm) / best / (bounds[1] - bounds[0])
+    log = np.log(density * (high - low) / SHARES) - dof / 2 * np.log(squares)
+    return nodes, best, np.sqrt(squares / dof / norm), log
+
+
+def _exponents(points: _Points, change: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Exponents for each change of b, (m, EXPONENTS), in the range that the points allow, and the
+    log prior probability of each.
+    """
+    low, high = np.full(change.size, LEAST), np.full(change.size, MOST)
+    for _ in range(ZOOMS):
+        power = np.linspace(low, high, EXPONENTS, axis=1)
+        every = np.repeat(change, EXPONENTS)
+        log = logsumexp(_along_share(points, power.ravel(), every, (0.0, 1.0))[-1], axis=1)
+        log = log.reshape(power.shape) + log_prior(power)[0]
+        held = log > log.max(axis=1, keepdims=True) - FAR
+        first, last = held.argmax(axis=1), held.shape[1] - 1 - held[:, ::-1].argmax(axis=1)
+        ends = np.maximum(first - 1, 0), np.minimum(last + 1, EXPONENTS - 1)
+        low, high = (np.take_along_axis(power, end[:, None], axis=1)[:, 0] for end in ends)
+    power = _places(low, high, EXPONENTS)
+    return power, log_prior(power)[0] + np.log((high - low) / EXPONENTS)[:, None]
+
+
+def _integral(
+    every: Sequence[_Points], law: Law, bounds: tuple[float, float] = (0.0, 1.0)
+) -> _Integral:
+    """Posterior of the free or of the constant law, averaged over the error models."""
+    found = [_of_errors(points, law, bounds) for points in every]
+    whole = float(logsumexp([one.log for one in found]))
+    weight = np.concatenate([one.weight * math.exp(one.log - whole) for one in found])
+    numbers = (np.concatenate(part) for part in zip(*(one[:4] for one in found), strict=True))
+    return _Integral(*numbers, weight, whole - math.log(len(found)))
+
+
+def _of_errors(points: _Points, law: Law, bounds: tuple[float, float]) -> _Integral:
+    """Posterior of the free or of the constant law with one error model."""
+    change, power, prior = np.zeros(1), np.zeros((1, 1)), np.zeros((1, 1))
+    if law is Law.free:
+        change = DRIFT * ndtri((np.arange(CHANGES) + 0.5) / CHANGES)
+        power, prior = _exponents(points, change)
+    every = np.repeat(change, power.shape[1])
+    share, best, spread, log = _along_share(points, power.ravel(), every, bounds)
+    log = log + (prior - math.log(change.size)).ravel()[:, None]
+    # Student's distribution of the lifetime at each node: one draw, evenly over all nodes.
+    even = np.modf(math.sqrt(3.0) * np.arange(1, log.size + 1))[0].reshape(log.shape)
+    drawn = best + spread * stdtrit(points.current.size + points.known - 1, even)
+    whole = float(logsumexp(log)) - float(np.sum(np.log(points.error)))
+    numbers = (share, power.ravel()[:, None], every[:, None], np.maximum(drawn, SLOWEST))
+    flat = (np.broadcast_to(number, log.shape).ravel() for number in numbers)
+    return _Integral(*flat, np.exp(log - logsumexp(log)).ravel(), whole)
 
 
 def _outliers(table: LifetimeTable) -> np.ndarray:
     """Which points lie off every smooth law, the farthest first, one at a time."""
     kept = np.ones(len(table), bool)
-    for _ in range(int(MOST * len(table))):
+    for _ in range(int(MOST_LEFT_OUT * len(table))):
         bends = bool(kept.sum() > FEWEST_LIFETIMES)
-        found = _solved(table, kept, exponent=bends)
-        pulls = np.asarray(found.problem.residual(found.theta))[: len(table)]
+        pulls = np.full(len(table), 0.0)
+        pulls[kept] = _least_squares(_Points.of(table, kept)[0], exponent=bends).residuals
         scatter = 1.4826 * np.median(np.abs(pulls[kept]))
         scatter = scatter if table.error is None else max(1.0, scatter)
         worst = int(np.argmax(np.abs(pulls)))
@@ -197,106 +405,171 @@ def _bends_alone(table: LifetimeTable, kept: np.ndarray, power: np.ndarray) -> i
     return off.point if off.squared > OUTLIER**2 and likelier else None
 
 
-def _tested(table: LifetimeTable, plain: Fit, power: Fit) -> ConstantA:
+def _tested(points: _Points, plain: _LeastSquares, power: _LeastSquares) -> ConstantA:
     """Test a constant a by the fall of chi², which knows no curvature."""
-    before, after = plain.group(RECORD), power.group(RECORD)
-    found, dof = power["exponent"], max(after.dof, 1.0)
-    fall = max(before.chi2 - after.chi2, 0.0)
-    if table.error is None:
-        chance = fdtrc(1.0, dof, fall * dof / max(after.chi2, len(table) * EXACT**2))
+    fall, dof = max(plain.chi2 - power.chi2, 0.0), max(power.dof, 1)
+    if points.known:
+        chance = chdtrc(1, fall / max(1.0, power.chi2 / dof))
     else:
-        chance = chdtrc(1, fall / max(1.0, after.chi2 / dof))
-    return constant_a(found.value, found.error, found.error_raw, float(chance))
+        chance = fdtrc(1.0, dof, fall * dof / max(power.chi2, points.current.size * EXACT**2))
+    exponent = power.quantity(power.numbers[2], [0.0, 0.0, 1.0], "1", 1.0)
+    return constant_a(exponent.value, exponent.error, exponent.error_raw, float(chance))
 
 
-def fit_lifetimes(table: LifetimeTable) -> LifetimeFit:
+def _units(table: LifetimeTable) -> tuple[float, float, dict[str, float]]:
+    """Mean current, mA, median lifetime, h, and currents over the mean of the quoted lifetimes."""
+    mean, current = float(table.current.mean()), table.current
+    ends = {"start": current.max() / mean, "mean": 1.0, "end": current.min() / mean}
+    named = {f"lifetime_{name}": float(x) for name, x in ends.items()}
+    return mean, float(np.median(table.lifetime)), named
+
+
+def _lifetime(found: _LeastSquares, x: float, unit: float) -> Quantity:
+    """Lifetime at a current over the mean, h."""
+    a, b, *power = found.numbers
+    part = x ** (1 + sum(power))
+    rate = max(a * part + b, SLOWEST)
+    slopes = np.array([part, 1.0, a * part * math.log(x)]) / -(rate**2)
+    return found.quantity(1 / rate, slopes, "h", unit)
+
+
+def _by_least_squares(table: LifetimeTable, found: _LeastSquares) -> dict[str, Quantity]:
+    """Quantities of a law by least squares."""
+    (a, b), (mean, unit, ends) = found.numbers[:2], _units(table)
+    whole, rate = a + b, 1 / (unit * HOUR)
+    quoted = {
+        "a": found.quantity(a, [1.0, 0.0, 0.0], UNITS["a"], rate / mean),
+        "b": found.quantity(b, [0.0, 1.0, 0.0], UNITS["b"], rate),
+        "share": found.quantity(a / whole, [b / whole**2, -a / whole**2, 0.0], "1", 1.0),
+    }
+    return quoted | {name: _lifetime(found, x, unit) for name, x in ends.items()}
+
+
+def _by_current(table: LifetimeTable, power: _LeastSquares) -> LifetimeLaw:
+    """Lifetimes of the law with a as a power of the current."""
+    mean, unit, _ = _units(table)
+    current = np.geomspace(table.current.min(), table.current.max(), CURRENTS).tolist()
+    exponent = power.quantity(power.numbers[2], [0.0, 0.0, 1.0], "1", 1.0)
+    return LifetimeLaw(
+        tuple(current), tuple(_lifetime(power, i / mean, unit) for i in current), exponent
+    )
+
+
+def _free_law(
+    table: LifetimeTable, every: Sequence[_Points], plain: _LeastSquares
+) -> FreeLaw | None:
+    """Posterior with an exponent of a and a change of b; None where a negative a or b is more
+    probable.
+    """
+    found, constant = (_integral(every, law) for law in (Law.free, Law.constant))
+    if not np.all(plain.numbers[:2] >= 0):
+        rival = _integral(every, Law.constant, NO_BEAM)
+        if rival.log + math.log(UNPHYSICAL) > found.log:
+            return None
+    (mean, unit, ends), weight = _units(table), found.weight
+    width = float(np.ptp(every[0].current)) or 1.0
+    b, bounds = 1 / (found.lifetime * unit * HOUR), at_bounds(found.share, weight)
+    quoted = {
+        "a": share_of(found.share * b / mean, weight, UNITS["a"], *bounds, b / mean),
+        "b": share_of((1 - found.share) * b, weight, UNITS["b"], *bounds[::-1], b),
+        "share": quantity_of(found.share, weight, "1"),
+    }
+    for name, x in ends.items():
+        quoted[name] = quantity_of(unit / found.rate(x, width), weight, "h")
+    usual, odd = log_prior(found.power)
+    chances = float(expit(constant.log - found.log)), float(weight @ np.exp(odd - usual))
+    exponent = quantity_of(found.power, weight, "1")
+    return FreeLaw(quoted, quoted["share"], exponent, None, *chances)
+
+
+def _widely(exact: Quantity, free: Quantity, freed: bool) -> Quantity:
+    """A quantity with what the free law leaves open: at its median, or at the value of the constant
+    law.
+    """
+    value = free.value if freed else float(np.clip(exact.value, *free.interval_95))
+    return Quantity(value, free.error, free.unit, exact.error_raw, free.interval_95)
+
+
+def _single_departure(table: LifetimeTable, kept: np.ndarray) -> str | None:
+    """Sentence on one point that contradicts the constant law, which the others follow."""
+    off, given = _farthest_off(table, kept), table.error is not None
+    others = chi2_probability(off.rest, int(kept.sum()) - 3) if given else 1.0
+    if off.squared <= OUTLIER**2 or others < POOR_FIT:
+        return None
+    [named] = _named(table, np.arange(len(table)) == off.point)
+    return (
+        f"{named[0].upper()}{named[1:]} lies {math.sqrt(off.squared):.2g} errors off the constant "
+        "law of the others: measure it again"
+    )
+
+
+def fit_lifetimes(table: LifetimeTable, law: Law | str = Law.free) -> LifetimeFit:
     """Fit 1/tau = a I + b to lifetimes at several currents.
 
     Parameters
     ----------
     table : LifetimeTable
         Four points or more.
+    law : {"free", "constant"}
+        Errors contain an exponent of a and a change of b along the current, with the priors of
+        `beamfit.lifetime.free_law`; or both are constant.
 
     Returns
     -------
     LifetimeFit
-        With the verdicts of a decay. Where a constant a is refuted, the lifetimes are those of a
-        law with a free exponent.
+        With the verdicts of a decay. Where a constant a is refuted and the law is constant, the
+        lifetimes are those of a law with a power of the current.
 
     Notes
     -----
     Least squares on the lifetimes themselves: their errors, and not those of 1/tau, are what is
-    stated. Points five robust standard deviations off a law with a free exponent are left out and
-    named.
+    stated. The posterior of the free law is integrated on a grid over the share of a, the exponent
+    and the change of b; stated errors have the noise prior of a decay. Points five robust standard
+    deviations off a law with a free exponent are left out and named.
 
     Examples
     --------
     >>> from beamfit.lifetime.record import LifetimeTable
     >>> current = np.linspace(100, 500, 9)
-    >>> fit = fit_lifetimes(LifetimeTable(current, 1 / (1e-4 * current + 0.01), np.full(9, 0.1)))
+    >>> table = LifetimeTable(current, 1 / (1e-4 * current + 0.01), np.full(9, 0.1))
+    >>> fit = fit_lifetimes(table, law="constant")
     >>> fit.status.value, f"{fit.a.value * 3600:.4e}"
     ('converged', '1.0000e-04')
     """
     expect(table, LifetimeTable, "read_lifetimes(path)")
     left_out = _outliers(table)
-    plain, power = (_solved(table, ~left_out, exponent) for exponent in (False, True))
-    test, group = _tested(table, plain, power), plain.group(RECORD)
-    given, refuted = table.error is not None, test.status is Status.poor_fit
-    mean, usual = float(table.current.mean()), float(np.median(table.lifetime)) * HOUR
-    ends = np.array([table.current.max(), mean, table.current.min()]) / mean
-    law, quoted = (fit.derive(_quoted, ends) for fit in (plain, power if refuted else plain))
-    scale = {"a": usual * mean, "b": usual, "share": 1.0}
-    numbers = {
-        name: (float(value) / unit, max(float(error), EXACT) / unit)
-        for (name, unit), value, error in zip(scale.items(), law.value, law.error, strict=False)
-    }
+    every = _Points.of(table, ~left_out)
+    points = every[0]
+    plain, power = (_least_squares(points, exponent) for exponent in (False, True))
+    test, exact = _tested(points, plain, power), _by_least_squares(table, plain)
+    known = Law(law) is Law.constant or (table.error is None and plain.scale < QUIET)
+    free = None if known else _free_law(table, every, plain)
+    refuted, freed = test.status is Status.poor_fit, free is not None and free.likelier
+    best = power if freed else plain
+    given, unit = table.error is not None, float(np.median(table.lifetime))
     evidence = TableEvidence(
-        numbers, float(group.chi2), round(group.dof), test,
-        _by_current(table, power) if refuted else None, _named(table, left_out),
-        None if given else group.scale * usual / HOUR,
+        exact, best.chi2, best.dof, test, _by_current(table, power) if refuted else None,
+        _named(table, left_out), None if given else best.scale * unit, free,
     )  # fmt: skip
-    finding, far = finding_of_table(evidence), _reach(table, plain)
-    off = _farthest_off(table, ~left_out)
-    if off.squared > OUTLIER**2:
-        [named] = _named(table, np.arange(len(table)) == off.point)
-        more = f"{named[0].upper()}{named[1:]} lies {math.sqrt(off.squared):.2g} errors off the"
-        more += " constant law of the others: measure it again"
-        finding = finding._replace(cause=f"{finding.message} {more}.")
-
-    def quantity(name: str, raw: float | None = None) -> Quantity:
-        value, error = numbers[name]
-        return Quantity.reaching(value, error, UNITS.get(name, "1"), raw, far * error)
-
-    a, b = (quantity(n, float(law.error_raw[k]) / scale[n]) for k, n in enumerate("ab"))
+    finding = finding_of_table(evidence)
+    if (single := _single_departure(table, ~left_out)) is not None:
+        finding = finding._replace(cause=f"{finding.message} {single}.")
+    quoted = dict(exact)
+    if free is not None:
+        open_ = finding.status is Status.unidentified
+        found = free.quantities
+        quoted = {name: _widely(one, found[name], freed or open_) for name, one in exact.items()}
+    elif refuted:  # a and b stay those of the constant law
+        quoted |= {name: _lifetime(power, x, unit) for name, x in _units(table)[-1].items()}
     if finding.status is Status.unidentified:
-        a, b = a.open(), b.open()
+        quoted |= {name: replace(quoted[name], error=None) for name in "ab"}
+    shown = {name: quoted[name] for name in UNITS if name != "i0"}
     return LifetimeFit(
-        table.name, finding.status, finding.message, a, b, *_lifetimes_of(table, quoted, far),
-        mean, evidence.chi2 if given else float(evidence.dof), evidence.dof, test,
-        evidence.lifetimes, quantity("share"), tuple(map(int, np.flatnonzero(left_out))), table,
+        table.name, finding.status, finding.message, **shown,
+        mean_current=float(table.current.mean()), chi2=best.chi2 if given else float(best.dof),
+        dof=best.dof, constant_a=test, lifetimes=evidence.lifetimes, share=quoted["share"],
+        outliers=tuple(map(int, np.flatnonzero(left_out))), readings=table, free_law=free,
     )  # fmt: skip
-
-
-def _reach(table: LifetimeTable, fit: Fit) -> float:
-    """Half of the 95 % interval, in standard errors."""
-    return reach_of(math.inf if table.error is not None else round(fit.group(RECORD).dof))
-
-
-def _lifetimes_of(table: LifetimeTable, found: Derived, far: float) -> list[Quantity]:
-    """Lifetimes of the rates that `_quoted` gives."""
-    rate, error = found.value[4:], found.error[4:]
-    lifetime = float(np.median(table.lifetime)) / rate
-    pairs = zip(lifetime, lifetime * np.maximum(error / rate, EXACT), strict=True)
-    return [Quantity.reaching(float(v), float(e), "h", None, far * float(e)) for v, e in pairs]
-
-
-def _by_current(table: LifetimeTable, power: Fit) -> LifetimeLaw:
-    current = np.geomspace(table.current.min(), table.current.max(), CURRENTS)
-    found, far = power.derive(_quoted, current / table.current.mean()), _reach(table, power)
-    value, error = float(found.value[3]), float(found.error[3])
-    exponent = Quantity.reaching(value, error, "1", None, far * error)
-    lifetimes = tuple(_lifetimes_of(table, found, far))
-    return LifetimeLaw(tuple(map(float, current)), lifetimes, exponent)
 
 
 def _named(table: LifetimeTable, which: np.ndarray) -> tuple[str, ...]:
