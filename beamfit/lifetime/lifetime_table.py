@@ -8,8 +8,9 @@ from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.ndimage import median_filter
 from scipy.optimize import least_squares
-from scipy.special import chdtrc, expit, fdtrc, logsumexp, ndtri, stdtrit
+from scipy.special import chdtrc, expit, fdtrc, gammaln, logsumexp, ndtri, stdtr, stdtrit
 
 from beamfit.answer import Table, answer, json_of, labelled, plain_name
 from beamfit.errors import expect
@@ -32,16 +33,22 @@ from beamfit.lifetime.free_law import (
     quantity_of,
     share_of,
 )
-from beamfit.lifetime.record import FEWEST_LIFETIMES, LifetimeTable
-from beamfit.noise.memory import STATED
+from beamfit.lifetime.record import LifetimeTable
+from beamfit.noise.memory import STATED, WRONG
 from beamfit.quantity import HOUR, Quantity, Status
 from beamfit.statistics import POOR_FIT, chi2_probability, reach_of
 
-# Points so many robust standard deviations off the law with a free exponent are outliers; no more
-# than a fifth of them.
-OUTLIER, MOST_LEFT_OUT = 5.0, 0.2
-# Prior probability that a point of a table is a bad one.
-BAD = 0.03
+# Prior probability that a point of a table is bad. It is then off by anything between an error and
+# so many errors, flat in the logarithm. At most this share of the points is left out.
+BAD, BAD_RANGE, MOST_LEFT_OUT = 0.03, 1000.0, 0.2
+# Neighbours whose median lifetime gives a point its weight where bad points are looked for.
+MEDIAN = 5
+# A point nearer to the law of the others than this many errors is not bad.
+NEAR_LAW = 3.0
+# Exponents with which the law of the others is looked for.
+POWERS = np.linspace(LEAST, MOST, 30)
+# Prior probability that stated errors are wrong by a common factor.
+WRONG_ERRORS = 0.2
 # Smallest loss rate of a trial law, over that of the median lifetime: it stays positive.
 SLOWEST = 1e-6
 # Ratio of singular values below which points do not determine a combination of a and b.
@@ -136,35 +143,37 @@ class LifetimeFit:
 
 
 class _Points(NamedTuple):
-    """Points of a table in units of the mean current and the median lifetime, without outliers.
+    """Points of a table in units of the mean current and the median lifetime, with an error model.
 
-    `error` has a scale that is free where none are stated; `known` is how many readings the stated
-    ones are worth.
+    The errors have a common factor: near 1, as that many readings show it (`known`), or flat in its
+    logarithm (`known` 0). `log_prior` is that of the model.
     """
 
     current: np.ndarray
     lifetime: np.ndarray
     error: np.ndarray
     known: float
+    log_prior: float
 
     @classmethod
     def of(cls, table: LifetimeTable, kept: np.ndarray) -> tuple[_Points, ...]:
-        """Points of a table that are kept, with the stated errors or with each error model, the
-        most probable first: equal errors, or the same share of each lifetime.
+        """Points of a table that are kept, with each error model.
+
+        Stated errors are right, or wrong by a common factor. Those that are not stated are equal,
+        or the same share of each lifetime; the more probable model comes first.
         """
         unit = float(np.median(table.lifetime))
         x, lifetime = table.current[kept] / table.current.mean(), table.lifetime[kept] / unit
+        some = -math.log(4 * WRONG)  # of a factor within 1/30 to 30
         if table.error is not None:
-            return (cls(x, lifetime, table.error[kept] / unit, STATED),)
-        equal = cls(x, lifetime, np.ones(x.size), 0.0)
+            error = np.maximum(table.error[kept] / unit, QUIET * lifetime)
+            near = STATED / 2 * math.log(STATED) - gammaln(STATED / 2) + math.log1p(-WRONG_ERRORS)
+            right = cls(x, lifetime, error, STATED, near)
+            return right, right._replace(known=0.0, log_prior=some + math.log(WRONG_ERRORS))
+        equal = cls(x, lifetime, np.ones(x.size), 0.0, some)
         curve = np.maximum(lifetime + _least_squares(equal).residuals, SLOWEST)
         models = equal, equal._replace(error=curve)
-        return tuple(sorted(models, key=lambda one: one.log_likelihood(), reverse=True))
-
-    def log_likelihood(self) -> float:
-        """Log likelihood of the constant law with a free scale of the errors."""
-        squares = max(_least_squares(self).chi2, self.current.size * EXACT**2)
-        return -0.5 * self.current.size * math.log(squares) - float(np.sum(np.log(self.error)))
+        return tuple(sorted(models, key=lambda one: -_integral([one], Law.constant).log))
 
 
 class _LeastSquares(NamedTuple):
@@ -175,7 +184,7 @@ class _LeastSquares(NamedTuple):
     numbers: np.ndarray
     residuals: np.ndarray
     slopes: np.ndarray
-    known: float
+    stated: bool
 
     @property
     def dof(self) -> int:
@@ -190,7 +199,7 @@ class _LeastSquares(NamedTuple):
     @property
     def scale(self) -> float:
         """Factor on the errors: the scatter where none are stated, else at least 1."""
-        return max(math.sqrt(self.chi2 / max(self.dof, 1)), 1.0 if self.known else 0.0)
+        return max(math.sqrt(self.chi2 / max(self.dof, 1)), float(self.stated))
 
     def quantity(self, value: float, slopes: Sequence[float], unit: str, size: float) -> Quantity:
         """A value in a unit of this size; `slopes` are its derivatives by the numbers."""
@@ -198,7 +207,7 @@ class _LeastSquares(NamedTuple):
         along, lost = axes @ slopes[: self.numbers.size], scales <= RANK * scales[0]
         raw = float(np.linalg.norm(along[~lost] / scales[~lost]))
         raw = math.inf if np.any(np.abs(along[lost]) > RANK) else max(raw, EXACT * abs(value))
-        raw, reach = raw * size, reach_of(math.inf if self.known else self.dof)
+        raw, reach = raw * size, reach_of(math.inf if self.stated else self.dof)
         return Quantity.reaching(
             float(value) * size, self.scale * raw, unit, raw, reach * self.scale * raw
         )
@@ -206,7 +215,7 @@ class _LeastSquares(NamedTuple):
 
 def _least_squares(points: _Points, exponent: bool = False) -> _LeastSquares:
     """Fit loss rates to a and b, and an exponent of a, to lifetimes."""
-    x, lifetime, error, known = points
+    x, lifetime, error = points[:3]
 
     def rates(numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         power = x ** (1 + (numbers[2] if exponent else 0.0))
@@ -229,7 +238,7 @@ def _least_squares(points: _Points, exponent: bool = False) -> _LeastSquares:
         residuals, np.append(start, [0.0] * exponent), slopes, (-ends, ends),
         x_scale="jac", ftol=1e-14, xtol=1e-14, gtol=1e-14,
     )  # fmt: skip
-    return _LeastSquares(found.x, found.fun, found.jac, known)
+    return _LeastSquares(found.x, found.fun, found.jac, points.known > 0)
 
 
 class _Integral(NamedTuple):
@@ -268,7 +277,7 @@ def _along_share(
     The lifetime at the mean current is a factor on all lifetimes: at each share the integral over
     it has a closed form, as has that over the noise level.
     """
-    x, lifetime, error, known = points
+    x, lifetime, error, known = points[:4]
     gas = (1 + change[:, None] * (x - 1) / (np.ptp(x) or 1.0))[:, None]
     bend = x ** (1 + power[:, None, None]) - gas
     read, dof = lifetime / error, x.size + known - 1
@@ -326,7 +335,7 @@ def _integral(
     whole = float(logsumexp([one.log for one in found]))
     weight = np.concatenate([one.weight * math.exp(one.log - whole) for one in found])
     numbers = (np.concatenate(part) for part in zip(*(one[:4] for one in found), strict=True))
-    return _Integral(*numbers, weight, whole - math.log(len(found)))
+    return _Integral(*numbers, weight, whole)
 
 
 def _of_errors(points: _Points, law: Law, bounds: tuple[float, float]) -> _Integral:
@@ -341,68 +350,72 @@ def _of_errors(points: _Points, law: Law, bounds: tuple[float, float]) -> _Integ
     # Student's distribution of the lifetime at each node: one draw, evenly over all nodes.
     even = np.modf(math.sqrt(3.0) * np.arange(1, log.size + 1))[0].reshape(log.shape)
     drawn = best + spread * stdtrit(points.current.size + points.known - 1, even)
-    whole = float(logsumexp(log)) - float(np.sum(np.log(points.error)))
+    half = (points.current.size + points.known - 1) / 2
+    whole = float(logsumexp(log) - np.sum(np.log(points.error)) + gammaln(half)) + points.log_prior
+    whole -= (points.current.size - 1) / 2 * math.log(math.pi)
     numbers = (share, power.ravel()[:, None], every[:, None], np.maximum(drawn, SLOWEST))
     flat = (np.broadcast_to(number, log.shape).ravel() for number in numbers)
     return _Integral(*flat, np.exp(log - logsumexp(log)).ravel(), whole)
 
 
-def _outliers(table: LifetimeTable) -> np.ndarray:
-    """Which points lie off every smooth law, the farthest first, one at a time."""
-    kept = np.ones(len(table), bool)
-    for _ in range(int(MOST_LEFT_OUT * len(table))):
-        bends = bool(kept.sum() > FEWEST_LIFETIMES)
-        pulls = np.full(len(table), 0.0)
-        pulls[kept] = _least_squares(_Points.of(table, kept)[0], exponent=bends).residuals
-        scatter = 1.4826 * np.median(np.abs(pulls[kept]))
-        scatter = scatter if table.error is None else max(1.0, scatter)
-        worst = int(np.argmax(np.abs(pulls)))
-        if abs(pulls[worst]) <= OUTLIER * scatter:
-            worst = _bends_alone(table, kept, pulls) if bends else None
-        if worst is None:
-            break
-        kept[worst] = False
-    return ~kept
+def _log_evidence(models: Sequence[_Points]) -> float:
+    """Log evidence of the constant and the free law, which are equally probable."""
+    return float(np.logaddexp(*(_integral(models, law).log for law in Law)))
 
 
-class _Off(NamedTuple):
-    """The point farthest off the constant law of the others, by so many errors squared, and the sum
-    of squares without it.
+class _Departure(NamedTuple):
+    """The point without which a law fits the others best, how far it lies off that, h, and by how
+    many errors; and the residual sum of squares and degrees of freedom of the others.
     """
 
     point: int
-    squared: float
+    distance: float
+    errors: float
     rest: float
+    dof: int
 
 
-def _farthest_off(table: LifetimeTable, kept: np.ndarray) -> _Off:
-    """Point with the largest residual from the others (R. D. Cook and S. Weisberg, Residuals and
-    influence in regression, 1982, eq. 2.2.8), in the loss rates, which are linear in the current.
+def _farthest_off(table: LifetimeTable, kept: np.ndarray, exponents: np.ndarray) -> _Departure:
+    """Leave out each point in turn (R. D. Cook and S. Weisberg, Residuals and influence in
+    regression, 1982, eq. 2.2.8), in the loss rates, which are linear in those to a and b.
     """
     rows = np.flatnonzero(kept)
     current, lifetime, given = table.current[rows], table.lifetime[rows], table.error is not None
-    error = table.error[rows] if given else np.full(rows.size, np.median(lifetime))
-    columns = np.column_stack([current / current.mean(), np.ones(rows.size)])
-    basis = np.linalg.qr(columns * (lifetime**2 / error)[:, None])[0]
-    rates = lifetime / error
-    left, free = rates - basis @ (basis.T @ rates), 1 - np.sum(basis**2, axis=1)
-    falls = left**2 / np.maximum(free, 1e-12)
-    worst = int(np.argmax(falls))
-    rest = max(float(left @ left - falls[worst]), 1e-300)
-    unit = 1.0 if given else rest / max(rows.size - 3, 1)
-    return _Off(int(rows[worst]), float(falls[worst]) / unit, rest)
+    order = np.argsort(current)
+    near = median_filter(lifetime[order], min(MEDIAN, rows.size))[np.argsort(order)]
+    usual = np.clip(lifetime, near / 2, 2 * near)  # a slip has the weight of its neighbours
+    error = table.error[rows] if given else usual
+    power, weight = (current / current.mean()) ** (1 + exponents[:, None]), usual**2 / error
+    columns = np.stack([power, np.ones_like(power)], axis=-1) * weight[:, None]
+    basis, rates = np.linalg.qr(columns)[0], weight / lifetime
+    left = rates - (basis @ (np.swapaxes(basis, 1, 2) @ rates)[..., None])[..., 0]
+    free = np.maximum(1 - np.sum(basis**2, axis=2), RANK)
+    whole = np.sum(left**2, axis=1)
+    without = np.maximum(whole[:, None] - left**2 / free, 0.0)
+    law, worst = np.unravel_index(np.argmin(without), without.shape)
+    distance = abs(float(left[law, worst] / free[law, worst] * error[worst]))
+    rest, dof = float(without[law, worst]), rows.size - 3 - (exponents.size > 1)
+    known = STATED if given else 0.0
+    variance = max(known + rest, rows.size * QUIET**2) / max(known + dof, 1.0)
+    errors = math.sqrt(max(whole.min() - rest, 0.0) / variance)
+    return _Departure(int(rows[worst]), distance, errors, rest, dof)
 
 
-def _bends_alone(table: LifetimeTable, kept: np.ndarray, power: np.ndarray) -> int | None:
-    """The point that lies off the constant law of the others, if that law without it is likelier
-    than an exponent with it (`power` has its residuals), as where it stands at an end.
-    """
-    off, count = _farthest_off(table, kept), int(kept.sum())
-    squares = max(float(power[kept] @ power[kept]), 1e-300)
-    given = table.error is not None
-    better = squares - off.rest if given else (count - 3) * math.log(squares / off.rest)
-    likelier = better > 2 * math.log(count / BAD)
-    return off.point if off.squared > OUTLIER**2 and likelier else None
+def _outliers(table: LifetimeTable) -> np.ndarray:
+    """Points that are more probably bad than good, one at a time."""
+    kept = np.ones(len(table), bool)
+    for _ in range(int(MOST_LEFT_OUT * len(table))):
+        worst = _farthest_off(table, kept, POWERS)
+        if worst.errors < NEAR_LAW:
+            break
+        others = kept & (np.arange(len(table)) != worst.point)
+        good, rest = (_log_evidence(_Points.of(table, rows)) for rows in (kept, others))
+        off = worst.distance / float(np.median(table.lifetime))
+        bad = rest + math.log(BAD) - math.log(2 * math.log(BAD_RANGE) * off)
+        if good + math.log1p(-BAD) > bad:
+            break
+        kept = others
+    return ~kept
 
 
 def _tested(points: _Points, plain: _LeastSquares, power: _LeastSquares) -> ConstantA:
@@ -492,14 +505,15 @@ def _widely(exact: Quantity, free: Quantity, freed: bool) -> Quantity:
 
 def _single_departure(table: LifetimeTable, kept: np.ndarray) -> str | None:
     """Sentence on one point that contradicts the constant law, which the others follow."""
-    off, given = _farthest_off(table, kept), table.error is not None
-    others = chi2_probability(off.rest, int(kept.sum()) - 3) if given else 1.0
-    if off.squared <= OUTLIER**2 or others < POOR_FIT:
+    off = _farthest_off(table, kept, np.zeros(1))
+    given, dof = table.error is not None, off.dof + (STATED if table.error is not None else 0.0)
+    chance = 2 * int(kept.sum()) * float(stdtr(dof, -off.errors))
+    if chance >= POOR_FIT or (given and chi2_probability(off.rest, off.dof) < POOR_FIT):
         return None
     [named] = _named(table, np.arange(len(table)) == off.point)
     return (
-        f"{named[0].upper()}{named[1:]} lies {math.sqrt(off.squared):.2g} errors off the constant "
-        "law of the others: measure it again"
+        f"{named[0].upper()}{named[1:]} lies {off.errors:.2g} errors off the constant law of the "
+        "others: measure it again"
     )
 
 
@@ -542,7 +556,8 @@ def fit_lifetimes(table: LifetimeTable, law: Law | str = Law.free) -> LifetimeFi
     points = every[0]
     plain, power = (_least_squares(points, exponent) for exponent in (False, True))
     test, exact = _tested(points, plain, power), _by_least_squares(table, plain)
-    known = Law(law) is Law.constant or (table.error is None and plain.scale < QUIET)
+    quiet = table.error is None and plain.scale < QUIET
+    known = quiet or Law(law) is Law.constant
     free = None if known else _free_law(table, every, plain)
     refuted, freed = test.status is Status.poor_fit, free is not None and free.likelier
     best = power if freed else plain
@@ -552,7 +567,7 @@ def fit_lifetimes(table: LifetimeTable, law: Law | str = Law.free) -> LifetimeFi
         _named(table, left_out), None if given else best.scale * unit, free,
     )  # fmt: skip
     finding = finding_of_table(evidence)
-    if (single := _single_departure(table, ~left_out)) is not None:
+    if not quiet and (single := _single_departure(table, ~left_out)) is not None:
         finding = finding._replace(cause=f"{finding.message} {single}.")
     quoted = dict(exact)
     if free is not None:

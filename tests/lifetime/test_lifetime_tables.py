@@ -165,6 +165,46 @@ def test_an_outlier_is_left_out_and_named():
     assert fit.a.value == pytest.approx(fit_lifetimes(readings).a.value, rel=0.01)
 
 
+@pytest.mark.parametrize("stated", [True, False])
+@pytest.mark.parametrize("slip", [0.1, 2.0, 10.0])
+def test_a_lifetime_in_another_unit_or_digit_is_left_out(slip, stated):
+    """The error is that of the right one: the others must not be sacrificed to a precise slip."""
+    rng = np.random.default_rng(int(10 * slip))
+    for _ in range(5):
+        readings, true = departing(rng, True)
+        place, lifetime = int(rng.integers(len(readings))), readings.lifetime.copy()
+        lifetime[place] *= slip
+        error = readings.error if stated else None
+        fit = fit_lifetimes(LifetimeTable(readings.current, lifetime, error))
+        assert fit.outliers == (place,)
+        low, high = fit.lifetime_start.interval_95
+        assert low - 0.02 * high < true["lifetime_start"] < 1.02 * high
+
+
+def test_good_tables_are_not_told_to_measure_again():
+    rng = np.random.default_rng(8)
+    said = 0
+    for count in (4, 5, 6, 8) * 6:
+        current = np.linspace(100.0, 400.0, count)
+        lifetime = (1 + 0.01 * rng.normal(size=count)) / (1e-4 * current + 0.01)
+        said += "measure it again" in fit_lifetimes(LifetimeTable(current, lifetime)).message
+    assert said <= 1
+
+
+def test_errors_stated_at_a_third_are_not_believed():
+    """Of 15 points the scatter says so: intervals are those of the right errors."""
+    rng, ratios = np.random.default_rng(6), []
+    for _ in range(6):
+        lifetime = 1 / (A * CURRENT + B)
+        measured = lifetime * (1 + 0.01 * rng.normal(size=20))
+        small, right = (
+            fit_lifetimes(LifetimeTable(CURRENT, measured, share * lifetime))
+            for share in (0.01 / 3, 0.01)
+        )
+        ratios.append(small.lifetime_mean.error / right.lifetime_mean.error)
+    assert 0.8 < np.mean(ratios) < 1.25
+
+
 def test_currents_too_close_do_not_separate():
     fit = fit_lifetimes(table(current=np.linspace(495, 500, 20), noise=0.3))
     assert fit.status == "unidentified"
