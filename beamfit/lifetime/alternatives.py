@@ -34,16 +34,16 @@ from beamfit.lifetime.expansion import (
     solved,
 )
 from beamfit.lifetime.free_law import (
-    ABOVE,
-    BELOW,
-    BESIDE,
     DRIFT,
     ENDS,
-    ENOUGH,
-    OUTGASSING,
-    SIZES,
-    SMOOTH,
-    TIMES,
+    EXPONENT_SD_ABOVE,
+    EXPONENT_SD_BELOW,
+    LOG_LIKELIHOOD_RANGE,
+    MAX_ROWS,
+    OUTGASSING_PRIOR,
+    OUTGASSING_RATES,
+    OUTGASSING_TIMES,
+    SMOOTH_PRIOR,
     disturbances,
     from_nodes,
     smooth_curves,
@@ -88,11 +88,11 @@ class Alternative(NamedTuple):
 # Constant a and b, a power of a, and a drift of b beside; one change of the loss rate, two, each of
 # b, as of gas or a scraper, or of a, as of the RF voltage; gas that relaxes; current lost at once
 # between two readings, each as likely, once or twice.
-CONSTANT, POWERED = Alternative(SMOOTH - 0.4), Alternative(0.2, power=True)
+CONSTANT, POWERED = Alternative(SMOOTH_PRIOR - 0.4), Alternative(0.2, power=True)
 DRIFTING = Alternative(0.2, "drift", power=True)
 OTHERS = (Alternative(0.04, "step", 1), Alternative(0.02, "step", 2),
           Alternative(0.04, "step of a", 1), Alternative(0.02, "step of a", 2),
-          Alternative(OUTGASSING, "relaxing", 1),
+          Alternative(OUTGASSING_PRIOR, "relaxing", 1),
           Alternative(0.04, "sudden", 1), Alternative(0.02, "sudden", 2))  # fmt: skip
 # What is not looked for where a gauge says how the gas goes.
 UNGAUGED = ("relaxing", "step of a")
@@ -392,10 +392,10 @@ def rival_of(plain: Expansion) -> Rival | None:
 def _averaged(about: Expansion) -> Pieces:
     """A long decay as the means of neighbouring readings, which go on as the law does."""
     pieces, (i0, a, b, *_) = about.pieces, about.values
-    if pieces.time.size <= ENOUGH or pieces.first.size > 1 or pieces.gauge is not None:
+    if pieces.time.size <= MAX_ROWS or pieces.first.size > 1 or pieces.gauge is not None:
         return pieces
     record = DecayRecord(pieces.time, pieces.current, pieces.error)
-    size = -(-len(record) // ENOUGH)
+    size = -(-len(record) // MAX_ROWS)
     time, *means = record.means(size, lambda time: current(time, i0, a, b))
     return Pieces(time, time, *means, pieces.first, None, pieces.monitor)
 
@@ -440,15 +440,22 @@ def _widths(kind: str, sizes: np.ndarray, times: np.ndarray, loss: float) -> np.
     """Widths of normal priors on sizes and times of further losses that have the density of flat
     ones there: what is not determined costs nothing.
     """
-    sizes = np.maximum(np.abs(sizes), SIZES[0] * abs(loss))
+    sizes = np.maximum(np.abs(sizes), OUTGASSING_RATES[0] * abs(loss))
     gas = kind == "relaxing"
-    times = times * math.log(TIMES[1] / TIMES[0]) if gas else np.ones(times.size)
-    return np.array([2 * sizes * math.log(SIZES[1] / SIZES[0]), times]) / math.sqrt(2 * math.pi)
+    times = (
+        times * math.log(OUTGASSING_TIMES[1] / OUTGASSING_TIMES[0]) if gas else np.ones(times.size)
+    )
+    return np.array(
+        [2 * sizes * math.log(OUTGASSING_RATES[1] / OUTGASSING_RATES[0]), times]
+    ) / math.sqrt(2 * math.pi)
 
 
 def _smooth(plain: Expansion) -> list[tuple[Alternative, Expansion]]:
     """Constant a and b, a power of the current, and one with a drift of b."""
-    start, power = np.append(plain.numbers, [0.0, 0.0]), {POWER: (BELOW + ABOVE) / 2}
+    start, power = (
+        np.append(plain.numbers, [0.0, 0.0]),
+        {POWER: (EXPONENT_SD_BELOW + EXPONENT_SD_ABOVE) / 2},
+    )
     laws = [plain, solved(plain.pieces, (*PLAIN, POWER), start=plain.numbers, widths=power)]
     if plain.pieces.gauge is None:
         gas = abs(plain.numbers[0] - plain.numbers[1])
@@ -513,7 +520,7 @@ def _with_further(plain: Expansion, kind: str, count: int) -> Expansion | None:
             break
     shortest = float(np.median(np.diff(plain.pieces.time))) / plain.pieces.units[0]
     if gas:
-        known = found.numbers[3] > 0 and shortest < found.numbers[4] < TIMES[1]
+        known = found.numbers[3] > 0 and shortest < found.numbers[4] < OUTGASSING_TIMES[1]
     elif kind == "sudden":
         known = np.all(np.diff(found.numbers[4::2]) > shortest)
     else:
@@ -559,15 +566,15 @@ def _log_evidence(
     curves = smooth_curves(max(products.count // 2 - width.size, 0))
     smooth = products.combined(np.hstack([own, nodes @ curves]))
     log = smooth.log_prior + smooth.log_size(smooth.left())
-    near = products.some(log > log.max() - BESIDE)
+    near = products.some(log > log.max() - LOG_LIKELIHOOD_RANGE)
     for kind in disturbances(law.numbers[0]):
         if kind.of_loss and law.pieces.gauge is not None:
             continue
-        shown = nodes @ kind.shown(law.numbers[0])
+        shown = nodes @ kind.reading_shapes(law.numbers[0])
         each = np.concatenate([np.broadcast_to(own, (len(shown), *own.shape)), shown], axis=2)
         numbers = shown.shape[2]
         known = np.append(width, np.ones(numbers)), np.append(centre, np.zeros(numbers))
-        found.append(_laplace(near.by_each(each, kind.chance / SMOOTH), *known))
+        found.append(_laplace(near.by_each(each, kind.chance / SMOOTH_PRIOR), *known))
     return float(logsumexp(found)) + _log_chance(one, law)
 
 
@@ -578,7 +585,7 @@ def _given(law: Expansion, one: Alternative) -> tuple[list[int], np.ndarray, np.
     loss, quadratic, power, *further = law.numbers
     extra: dict[int, tuple[float, float]] = {}
     if one.power:
-        extra[POWER] = (BELOW if power < 0 else ABOVE), power
+        extra[POWER] = (EXPONENT_SD_BELOW if power < 0 else EXPONENT_SD_ABOVE), power
     if one.kind == "drift":
         extra[FURTHER] = DRIFT * max(abs(loss - quadratic), 1e-300), further[0]
     if one.count:

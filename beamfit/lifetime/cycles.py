@@ -22,7 +22,7 @@ from beamfit.lifetime.expansion import (
     least_squares_step,
     solved,
 )
-from beamfit.lifetime.free_law import BELOW
+from beamfit.lifetime.free_law import EXPONENT_SD_BELOW
 from beamfit.lifetime.pieces import FEWEST_CYCLES, FEWEST_READINGS
 from beamfit.lifetime.record import Conditions, DecayRecord
 from beamfit.statistics import CLEAR_ODDS, log_evidence_of_change
@@ -355,7 +355,7 @@ def _cycle_rates(about: Expansion) -> tuple[np.ndarray, np.ndarray]:
     power, rate = np.add.reduceat(slope[:, None] * columns, first).T / squares
     power, rate = (part - np.average(part, weights=squares) for part in (power, -rate))
     variance = max(float(squares @ rate**2) / rate.size, 1e-300)
-    found = float(squares @ (power * rate)) / (squares @ power**2 + variance / BELOW**2)
+    found = float(squares @ (power * rate)) / (squares @ power**2 + variance / EXPONENT_SD_BELOW**2)
     return rate - found * power, 1 / np.sqrt(squares)
 
 

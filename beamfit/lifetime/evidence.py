@@ -34,16 +34,16 @@ from beamfit.lifetime.expansion import (
     solved,
 )
 from beamfit.lifetime.free_law import (
-    BELOW,
-    DOUBLING,
     ENDS,
-    PACES,
+    EXPONENT_SD_BELOW,
+    OUTGASSING_PACES,
+    PACES_PER_OCTAVE,
     UNITS,
     FreeLaw,
     Law,
     free_law,
     from_nodes,
-    settling,
+    settling_shapes,
 )
 from beamfit.lifetime.pieces import DIGITS, LONE
 from beamfit.lifetime.record import DecayRecord
@@ -512,7 +512,7 @@ class Evidence:
         """True if gas explains a refuted law that is not gone before the free law can follow it."""
         if self.outgassing is None:
             return False
-        return self.record.span <= PACES[1] * self.outgassing.time_constant.value * HOUR
+        return self.record.span <= OUTGASSING_PACES[1] * self.outgassing.time_constant.value * HOUR
 
     @property
     def outgassing(self) -> Outgassing | None:
@@ -530,13 +530,12 @@ class Evidence:
         """Shifts of the values by an exponent of a within its prior, beside what cycles tell of
         it; None where the law is known, or a and b are one number.
 
-        The exponent is normal, `BELOW` wide to either side, and its error beside the other numbers
-        is combined with that.
+        The exponent has a normal prior of width `EXPONENT_SD_BELOW` to either side.
         """
         if self.law is Law.constant or self.cycles == 1 or not self.separability.separable:
             return None
         columns, seen = self.about.columns(POWER), self.exponent.error[0]
-        size = 1 / math.hypot(1 / BELOW, 1 / seen)
+        size = 1 / math.hypot(1 / EXPONENT_SD_BELOW, 1 / seen)
         rows, plain = self.about.left[:, columns], self.about.columns()
         step = np.linalg.lstsq(rows[:, : len(plain)], -size * rows[:, -1], rcond=None)[0]
         return Physical(*np.abs(self.about.slopes[:, columns] @ np.append(step, size)))
@@ -603,11 +602,11 @@ class Evidence:
         """Log odds that the stated errors are right, whatever memory the noise has."""
         columns = np.column_stack([self.about.residuals, self.about.rows[:, : POWER + 1]])
         if self.beside == "pumped":
-            gas = further_columns(self.about, "relaxing", 1 / np.array(PACES))
+            gas = further_columns(self.about, "relaxing", 1 / np.array(OUTGASSING_PACES))
             columns = np.column_stack([columns, gas])
         if self.beside == "settles":
             model = self.record.current / self.about.pieces.over + self.about.residuals
-            settles = np.hstack([*settling()[::DOUBLING]])
+            settles = np.hstack([*settling_shapes()[::PACES_PER_OCTAVE]])
             shapes = from_nodes(self.record.time / self.record.span) @ settles
             columns = np.column_stack([columns, model[:, None] * shapes])
         products = Products.of(columns, self.time, stated=True, times=CLOSE)

@@ -14,34 +14,34 @@ from jax import Array
 
 from beamfit.errors import Finding, InputError, Status, judge
 from beamfit.lifetime.free_law import (
-    ABOVE,
-    BELOW,
     CONSTANT,
     DRIFT,
+    EXPONENT_SD_ABOVE,
+    EXPONENT_SD_BELOW,
     INTEGRAL,
-    LEAST,
     LOSS_WANDERS,
-    MOST,
+    MAX_EXPONENT,
+    MIN_EXPONENT,
     NODES,
     POWER,
-    SMOOTH,
-    DrawnLaw,
+    SMOOTH_PRIOR,
     Draws,
-    SeenDecay,
+    LawProposal,
+    ReducedDecay,
     at_bounds,
-    ends_of,
     from_nodes,
     gas_change,
-    gas_changed,
-    log_prior,
-    log_pumped,
-    log_straight,
-    middle_of,
-    mixed,
+    gas_change_integral,
+    interval_probabilities,
+    law_currents,
+    log_drift_prior,
+    log_exponent_prior,
+    log_outgassing_prior,
+    loss_rates,
+    mean_current_time,
+    mixture,
     node_currents,
-    of_law,
     proposals,
-    rates_of,
 )
 from beamfit.noise.memory import WHITE, MemoryKind
 from beamfit.quantity import HOUR
@@ -56,10 +56,15 @@ from beamfit.sampling.target import PosteriorLaw, SamplingTarget
 from beamfit.writing import alone
 
 UNITS = {"i0": "mA", "a": "1/(mA s)", "b": "1/s", "exponent": "1", "drift": "1", "pace": "1"}
-BOUNDS = {"i0": (0.0, np.inf), "a": (0.0, np.inf), "b": (0.0, np.inf), "exponent": (LEAST, MOST)}
+BOUNDS = {
+    "i0": (0.0, np.inf),
+    "a": (0.0, np.inf),
+    "b": (0.0, np.inf),
+    "exponent": (MIN_EXPONENT, MAX_EXPONENT),
+}
 SHOWN = ("i0", "a", "b", "exponent", "drift")
 LIFETIMES = {"lifetime_start": "h", "lifetime_end": "h", "lifetime_mean": "h"}
-STATED = {"exponent": f"normal about 0, {BELOW} below and {ABOVE} above",
+STATED = {"exponent": f"normal about 0, {EXPONENT_SD_BELOW} below and {EXPONENT_SD_ABOVE} above",
           "drift": f"normal, 0 ± {DRIFT}, or that of gas that is pumped away"}  # fmt: skip
 # Laws that a noise is beside: with a monitor that is off it is beside one of these alone.
 ANY, FREE, SETTLED = range(3)
@@ -89,8 +94,8 @@ class DecayNumbers(NamedTuple):
 
 
 class _Data(NamedTuple):
-    """Readings as of `SeenDecay`, the matrix that takes nodes to the first reading, the middle and
-    the last one, mean current, mA, and span, s; shifts of I0, a and b by what is stated of the
+    """Readings as of `ReducedDecay`, the matrix that takes nodes to the first reading, the middle
+    and the last one, mean current, mA, and span, s; shifts of I0, a and b by what is stated of the
     monitor, shape (k, 3). Of each noise, beside which law it is: any; with a monitor that is off
     the free one, or constant a and b.
     """
@@ -122,7 +127,7 @@ def _numbers(data: _Data, theta: Array) -> DecayNumbers:
 
 def _nodes(data: _Data, numbers: DecayNumbers) -> Array:
     quadratic, linear = numbers.a * data.mean * data.span, numbers.b * data.span
-    lost = linear * (data.gas[:, None] + numbers.drift * gas_changed(numbers.pace))
+    lost = linear * (data.gas[:, None] + numbers.drift * gas_change_integral(numbers.pace))
     found = node_currents(numbers.i0 / data.mean, quadratic, numbers.exponent, lost)
     return found * jnp.exp(-(quadratic + linear) * (INTEGRAL @ numbers.walk))[:, None]
 
@@ -132,7 +137,7 @@ def _log_walk(walk: Array) -> Array:
     halves, chance = LOSS_WANDERS.shapes, LOSS_WANDERS.chance
     squares = jnp.sum((np.linalg.inv(halves) @ walk) ** 2, axis=1)
     volume = np.log(np.diagonal(halves, axis1=1, axis2=2)).sum(axis=1)
-    log = jax.nn.logsumexp(np.log(chance / SMOOTH) - 0.5 * squares - volume)
+    log = jax.nn.logsumexp(np.log(chance / SMOOTH_PRIOR) - 0.5 * squares - volume)
     log = log - 0.5 * NODES * np.log(2 * np.pi)
     return jnp.where(jnp.any(walk != 0), log, 0.0)
 
@@ -150,8 +155,8 @@ def _log_density(data: _Data, theta: Array) -> Array:
     rate = numbers.a * data.mean + numbers.b
     share = numbers.a * data.mean / rate
     gas, pace = (1 - share) * numbers.drift, jnp.maximum(numbers.pace, 1.0)
-    pumped = log_pumped(share, gas, pace) + jnp.log1p(-share)
-    smooth = log_prior(numbers.exponent)[0] + log_straight(numbers.drift)
+    pumped = log_outgassing_prior(share, gas, pace) + jnp.log1p(-share)
+    smooth = log_exponent_prior(numbers.exponent)[0] + log_drift_prior(numbers.drift)
     smooth = smooth + _log_walk(numbers.walk)
     law = jnp.where(numbers.pace > 0, pumped, jnp.where(constant, 0.0, smooth))
     shifts = theta[theta.size - data.moved.shape[0] :]
@@ -168,7 +173,7 @@ def _derived(data: _Data, theta: Array) -> Array:
     lost = whole * data.span * (data.moments @ (INTEGRAL @ n.walk))
     changed = n.b * n.drift * gas_change(moments, n.pace) + walked
     x = _nodes(data, n)[:, 0]
-    rates = rates_of(n.a * data.mean, n.b, n.exponent, changed, of_law(x, lost), data)
+    rates = loss_rates(n.a * data.mean, n.b, n.exponent, changed, law_currents(x, lost), data)
     return 1.0 / HOUR / jnp.stack(rates)
 
 
@@ -187,19 +192,19 @@ class _Prepared(NamedTuple):
     """A fit made ready: its laws, and shifts of I0, a and b by the monitor."""
 
     fit: Any
-    seen: SeenDecay
-    laws: list[DrawnLaw]
+    seen: ReducedDecay
+    laws: list[LawProposal]
     moved: np.ndarray
 
     @classmethod
     def of(cls, fit) -> _Prepared:
         """With the law of the fit, and where a and b are constant its noise."""
         about = fit.about
-        seen = SeenDecay.of(fit.readings, about.values)
+        seen = ReducedDecay.of(fit.readings, about.values)
         if fit.free_law is None and fit.correlation_time is None:
             white = np.array([kind == MemoryKind(WHITE) for kind in seen.products.kinds])
             seen = seen.of_noises(white) if white.any() else seen  # hopeless where nothing fits
-        laws = [DrawnLaw.of(seen, CONSTANT)] if fit.free_law is None else proposals(seen)
+        laws = [LawProposal.of(seen, CONSTANT)] if fit.free_law is None else proposals(seen)
         moved = [about.moved(change)[:3] for change in about.pieces.monitor_changes]
         return cls(fit, seen, laws, np.reshape(moved, (-1, 3)))
 
@@ -213,7 +218,7 @@ class _Prepared(NamedTuple):
 
     def draws(self, number: int, seed: int = 0) -> Draws:
         """Draw so many numbers from each law."""
-        return mixed([law.weighed(number, seed) for law in self.laws])
+        return mixture([law.weighted_draws(number, seed) for law in self.laws])
 
     def thetas(self, draws: Draws, rng: np.random.Generator) -> np.ndarray:
         """Draws as numbers of the target."""
@@ -229,10 +234,10 @@ class _Prepared(NamedTuple):
         """State the posterior."""
         fit, seen, draws = self.fit, self.seen, self.draws(STEPS * WALKERS)
         record, thetas = fit.readings, self.thetas(draws, np.random.default_rng(0))
-        middle = middle_of(draws.currents, draws.weight)
+        middle = mean_current_time(draws.currents, draws.weight)
         own = [(seen.products, ANY)]
         own += [
-            (law.seen.products, FREE if POWER in law.free else SETTLED)
+            (law.reduced.products, FREE if POWER in law.free else SETTLED)
             for law in self.laws
             if law.disturbance not in (None, LOSS_WANDERS)
         ]
@@ -270,7 +275,7 @@ def _reaching(draws: Draws) -> dict[str, tuple[float, float]]:
     found = {}
     for name, (low, high) in (("a", (none, all_)), ("b", (all_, none))):
         if low or high:
-            least, most = ends_of(low, high)
+            least, most = interval_probabilities(low, high)
             found[name] = (0.0 if low else least, UTMOST if high else most)
     return found
 
@@ -327,7 +332,7 @@ def sampled(
         return _refused(said, seed)
     with np.errstate(all="ignore"):
         ready = _Prepared.of(fit)
-        if not ready.draws(STEPS).worth > 0:
+        if not ready.draws(STEPS).effective_size > 0:
             return _refused(
                 f"no a and b that are not negative fit; {fit.message}".rstrip("."), seed
             )
