@@ -23,7 +23,7 @@ from beamfit.lifetime.expansion import (
     solved,
 )
 from beamfit.lifetime.free_law import EXPONENT_SD_BELOW
-from beamfit.lifetime.pieces import FEWEST_CYCLES, FEWEST_READINGS
+from beamfit.lifetime.pieces import MIN_CYCLE_READINGS, MIN_CYCLES
 from beamfit.lifetime.record import Conditions, DecayRecord
 from beamfit.statistics import CLEAR_ODDS, log_evidence_of_change
 
@@ -179,7 +179,7 @@ def averaged(cycles: Sequence[DecayRecord]) -> Pieces:
     known = all(cycle.start is not None for cycle in cycles)
     for cycle in cycles:
         begin = cycle.start if known else begin
-        time, current, error = cycle.means(min(size, len(cycle) // FEWEST_READINGS))
+        time, current, error = cycle.means(min(size, len(cycle) // MIN_CYCLE_READINGS))
         parts.append((begin + time, time - time[0], current, error, place))
         place += time.size
         begin += 2 * cycle.span  # nobody said when: as if a cycle were missing in between
@@ -221,7 +221,7 @@ def _edges(about: Expansion) -> np.ndarray:
     first, lengths = about.pieces.first, about.pieces.lengths
     long = lengths > NEXT
     ends = np.array([first[long], (first + lengths - 1)[long]])
-    if ends.shape[1] < FEWEST_CYCLES:
+    if ends.shape[1] < MIN_CYCLES:
         return np.zeros(2)
     off = -about.left[:, -1]
     scatter = max(1.4826 * float(np.median(np.abs(off))), 1e-300)
@@ -268,7 +268,7 @@ def _trimmed(about: Expansion) -> tuple[Expansion, list[str]]:
         place, lengths = about.pieces.place, about.pieces.lengths
         whole = np.repeat(lengths, lengths)
         keep = (place >= far[0]) & (place < whole - far[1]) | (whole <= NEXT)
-        about = with_course(solved(about.pieces.kept(keep, FEWEST_READINGS)))
+        about = with_course(solved(about.pieces.kept(keep, MIN_CYCLE_READINGS)))
         cut = cut + far
     said = []
     for side, why in enumerate((FRESH if 2 * high >= cut[0] else SETTLES, WITHIN)):
@@ -289,13 +289,13 @@ def cleaned(cycles: Pieces) -> tuple[Expansion, tuple[str, ...]]:
     plain = plain if before is cycles else solved(before)
     cut = np.repeat(_odd_cycles(plain), before.lengths)
     if cut.any():
-        about = with_course(solved(before.kept(~cut, FEWEST_READINGS)))
+        about = with_course(solved(before.kept(~cut, MIN_CYCLE_READINGS)))
         left = before.first.size - about.pieces.first.size
         were = "cycle was" if left == 1 else "cycles were"
         said.append(f"{left} {were} left out, whose loss rate lies far off the others'")
     if (lone := _far(about.left[:, -1])).any():
         said.append(f"{int(lone.sum())} readings were left out as outliers")
-        about = with_course(solved(about.pieces.kept(~lone, FEWEST_READINGS)))
+        about = with_course(solved(about.pieces.kept(~lone, MIN_CYCLE_READINGS)))
     return about, tuple(said)
 
 

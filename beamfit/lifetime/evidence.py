@@ -45,7 +45,7 @@ from beamfit.lifetime.free_law import (
     from_nodes,
     settling_shapes,
 )
-from beamfit.lifetime.pieces import DIGITS, LONE
+from beamfit.lifetime.pieces import MAX_SPIKE, MIN_STEP_DIGITS
 from beamfit.lifetime.record import DecayRecord
 from beamfit.noise.correlated import AveragedMoments, Memory
 from beamfit.noise.memory import CLOSE, Products
@@ -468,8 +468,8 @@ class Evidence:
         after = after - columns @ (columns.T @ after)
         own = after**2 / np.maximum(1.0 - np.sum(columns**2, axis=1), EXACT)
         ratio = dof * own / np.maximum(after @ after - own, 1e-300)
-        ends = np.sqrt(np.append(ratio[:LONE], ratio[-LONE:]))
-        return bool(2 * LONE * 2 * stdtr(dof, -ends.max()) < POOR_FIT)
+        ends = np.sqrt(np.append(ratio[:MAX_SPIKE], ratio[-MAX_SPIKE:]))
+        return bool(2 * MAX_SPIKE * 2 * stdtr(dof, -ends.max()) < POOR_FIT)
 
     @cached_property
     def rival(self) -> Rival | None:
@@ -485,7 +485,7 @@ class Evidence:
         """
         digit = None if self.record is None else self.record.resolution
         off = np.max(np.abs(self.about.off))
-        return digit is not None and bool(off <= DIGITS / 2 * digit)
+        return digit is not None and bool(off <= MIN_STEP_DIGITS / 2 * digit)
 
     @property
     def explained(self) -> Rival | None:

@@ -13,7 +13,7 @@ from beamfit.answer import Table, answer, cell, json_of, labelled, plain_name, q
 from beamfit.errors import InputError, expect
 from beamfit.lifetime.alternatives import Change, ConstantA, LifetimeLaw, Outgassing, SuddenLoss
 from beamfit.lifetime.answer import finding_of, finding_of_cycles
-from beamfit.lifetime.cycles import FEWEST_CYCLES, FEWEST_READINGS, averaged, cleaned, usual_cycle
+from beamfit.lifetime.cycles import MIN_CYCLE_READINGS, MIN_CYCLES, averaged, cleaned, usual_cycle
 from beamfit.lifetime.decay_law import current
 from beamfit.lifetime.evidence import BELIEVED, UNITS, Evidence, RatePart, Separability
 from beamfit.lifetime.expansion import Expansion, Pieces, solved
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from beamfit.sampling.posterior import Posterior
     from beamfit.sampling.priors import Distribution
 
-FEWEST = 5
+MIN_FITTED_READINGS = 5
 
 
 def bare(value: float | None, unit: str) -> dict[str, Any]:
@@ -333,8 +333,8 @@ def fit_decay(
     """
     expect(record, DecayRecord, "beamfit.read_decay_record(path)")
     record = record if monitor is None else replace(record, monitor=monitor)
-    if len(record) < FEWEST:
-        expected = f"{FEWEST} or more for a decay"
+    if len(record) < MIN_FITTED_READINGS:
+        expected = f"{MIN_FITTED_READINGS} or more for a decay"
         raise InputError(f"{len(record)} readings", expected, path=record.name)
     if np.ptp(record.current) == 0:
         return _constant(record, f"All {len(record)} readings are {record.current[0]:.6g} mA")
@@ -470,11 +470,11 @@ def fit_cycles(
     >>> print(fit_cycles(cycles).lifetime_mean)
     10.00002 ± 0.00049 h
     """
-    if len(cycles) < FEWEST_CYCLES:
-        raise InputError(f"{len(cycles)} cycles", f"{FEWEST_CYCLES} or more", path=name)
+    if len(cycles) < MIN_CYCLES:
+        raise InputError(f"{len(cycles)} cycles", f"{MIN_CYCLES} or more", path=name)
     for cycle in cycles:
-        if len(cycle) < FEWEST_READINGS:
-            found, expected = f"{len(cycle)} readings", f"{FEWEST_READINGS} or more in a cycle"
+        if len(cycle) < MIN_CYCLE_READINGS:
+            found, expected = f"{len(cycle)} readings", f"{MIN_CYCLE_READINGS} or more in a cycle"
             raise InputError(found, expected, path=cycle.name)
     return fit_pieces(cycles, name, Law(law), found=found)
 

@@ -15,13 +15,19 @@ from beamfit.answer import answer, json_of, shown
 from beamfit.errors import InputError, expect
 from beamfit.lifetime.cycles import alike, joined
 from beamfit.lifetime.evidence import SEPARABLE
-from beamfit.lifetime.fit import FEWEST as FEWEST_FITTED
-from beamfit.lifetime.fit import DecayFit, bare, fit_cycles, fit_decay, fit_pieces
+from beamfit.lifetime.fit import (
+    MIN_FITTED_READINGS,
+    DecayFit,
+    bare,
+    fit_cycles,
+    fit_decay,
+    fit_pieces,
+)
 from beamfit.lifetime.free_law import DRIFT, Law
 from beamfit.lifetime.mechanisms import MECHANISMS, Losses, loss_coefficients
 from beamfit.lifetime.pieces import (
-    FEWEST_CYCLES,
-    FEWEST_READINGS,
+    MIN_CYCLE_READINGS,
+    MIN_CYCLES,
     Event,
     Split,
     beam_readings,
@@ -30,8 +36,8 @@ from beamfit.lifetime.pieces import (
     split_record,
 )
 from beamfit.lifetime.readings import (
-    FEWEST,
-    STAIR,
+    MIN_READINGS,
+    MIN_STAIR_READINGS,
     noise_of,
     on_edges,
     thinned,
@@ -279,7 +285,7 @@ def standing_alone(
         bend = float(cycle.current.mean()) * loss**2 / 24 * math.sqrt(len(cycle) / 5)
         return own < SEPARABLE * bend
 
-    return [cycle for cycle in cycles if len(cycle) >= FEWEST and separates(cycle)]
+    return [cycle for cycle in cycles if len(cycle) >= MIN_READINGS and separates(cycle)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -414,9 +420,9 @@ def at_settings(segment: DecayRecord) -> list[DecayRecord]:
     """Cut where somebody changed a setting."""
     moved = np.any(list(_steps(segment).values()), axis=0)
     if not moved.any():
-        return [segment] if len(segment) >= FEWEST else []
+        return [segment] if len(segment) >= MIN_READINGS else []
     pieces = np.split(np.arange(len(segment)), np.flatnonzero(moved) + 1)
-    return [segment.select(rows) for rows in pieces if len(rows) >= FEWEST]
+    return [segment.select(rows) for rows in pieces if len(rows) >= MIN_READINGS]
 
 
 def _pooled(
@@ -424,10 +430,10 @@ def _pooled(
 ) -> tuple[list[Decay], list[DecayRecord]]:
     """Cycles at the same settings together, and those of them that also stand alone."""
     groups, pooled, alone = alike(cycles), [], []
-    many = sum(len(group) >= FEWEST_CYCLES for group in groups)
+    many = sum(len(group) >= MIN_CYCLES for group in groups)
     for group in groups:
-        if len(group) < FEWEST_CYCLES:
-            alone += [cycle for cycle in group if len(cycle) >= FEWEST]
+        if len(group) < MIN_CYCLES:
+            alone += [cycle for cycle in group if len(cycle) >= MIN_READINGS]
             continue
         called = name if many == 1 else f"{name}@{len(pooled) + 1}"
         group = _on_edges(group)
@@ -448,14 +454,16 @@ def _on_edges(cycles: list[DecayRecord]) -> list[DecayRecord]:
 
     Their steps last twice as long: a few edges are off by as much again in every cycle.
     """
-    edges = [(cycle, on_edges(cycle, FEWEST_READINGS, 2 * STAIR)) for cycle in cycles]
+    edges = [
+        (cycle, on_edges(cycle, MIN_CYCLE_READINGS, 2 * MIN_STAIR_READINGS)) for cycle in cycles
+    ]
     stairs = [found for cycle, found in edges if found is not cycle]
-    return stairs if len(stairs) >= max(FEWEST_CYCLES, len(cycles) / 2) else cycles
+    return stairs if len(stairs) >= max(MIN_CYCLES, len(cycles) / 2) else cycles
 
 
 def _decays(record: DecayRecord) -> tuple[Split, bool]:
     """Clean decays at constant settings, the events between them, and if refills hold the beam."""
-    if len(record) < FEWEST:
+    if len(record) < MIN_READINGS:
         return Split((record,), ()), False
     sections = at_settings(record)
     splits = [split_record(section) for section in sections]
@@ -469,13 +477,13 @@ def _decays(record: DecayRecord) -> tuple[Split, bool]:
     if pieces:
         return Split(tuple(pieces), tuple(events)), refilled
     kinds = {event.kind for event in events}
-    if kinds == {"spike"} and (kept := beam_readings(record)[0]).size >= FEWEST_FITTED:
+    if kinds == {"spike"} and (kept := beam_readings(record)[0]).size >= MIN_FITTED_READINGS:
         return Split((record.select(kept),), tuple(events)), False
     moving = [name for name, steps in _steps(record).items() if steps.any()]
     if moving or "short" not in kinds:
         changes = f"changes of {', '.join(moving)} by more than {100 * CHANGED:g} %"
         found = ", ".join(sorted(kinds)) or changes
-        expected = f"at least {FEWEST} readings in a row of a stored beam"
+        expected = f"at least {MIN_READINGS} readings in a row of a stored beam"
         expected += "; leave out a setting that only scatters with --ignore" if moving else ""
         raise InputError(f"no decay between {found}", expected, record.name, column="current")
     return Split((), tuple(events)), False
@@ -516,11 +524,11 @@ def _parts(piece: DecayRecord, law: Law, whole: bool) -> tuple[list[Decay], list
         # Of means of neighbours the time is anywhere within one.
         within += float(np.median(np.diff(segment.time))) * (len(segment) < len(piece))
         sides = piece.time < at - within, piece.time > at + within
-        long = [piece.select(rows) for rows in sides if np.sum(rows) >= FEWEST]
+        long = [piece.select(rows) for rows in sides if np.sum(rows) >= MIN_READINGS]
         if long and max(map(len, long)) < len(piece):
             decays, events = _fitted(long, law, whole)
             short = [event_of(piece, "short", *np.flatnonzero(rows)[[0, -1]]) for rows in sides
-                     if 0 < np.sum(rows) < FEWEST]  # fmt: skip
+                     if 0 < np.sum(rows) < MIN_READINGS]  # fmt: skip
             here = [one._replace(time=piece.start + one.time) for one in short]
             return decays, [*events, *here, event._replace(time=piece.start + at)]
     return [Decay(segment, segment.start, fit, None)], []

@@ -21,7 +21,7 @@ from beamfit.lifetime.expansion import (
     lifetime_of,
     solved,
 )
-from beamfit.lifetime.fit import FEWEST, DecayFit, bare, fit_decay
+from beamfit.lifetime.fit import MIN_FITTED_READINGS, DecayFit, bare, fit_decay
 from beamfit.lifetime.free_law import Law
 from beamfit.lifetime.record import DecayRecord
 from beamfit.quantity import HOUR, Quantity, Status
@@ -281,9 +281,11 @@ def moving_lifetime(record: DecayRecord, window: float) -> LifetimeTrace:
     centres = np.flatnonzero((time >= window / 2) & (time <= record.span - window / 2))
     first = np.searchsorted(time, time[centres] - window / 2, side="left")
     last = np.searchsorted(time, time[centres] + window / 2, side="right")
-    full = last - first >= FEWEST
+    full = last - first >= MIN_FITTED_READINGS
     if not full.any():
-        expected = f"one that holds {FEWEST} readings and fits into {record.span:.6g} s"
+        expected = (
+            f"one that holds {MIN_FITTED_READINGS} readings and fits into {record.span:.6g} s"
+        )
         raise InputError(f"a window of {window:.6g} s", expected, path=record.name)
     rows = []
     for start, end in zip(first[full], last[full], strict=True):

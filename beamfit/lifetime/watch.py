@@ -21,7 +21,7 @@ from beamfit.lifetime.evidence import UNITS
 from beamfit.lifetime.fit import DecayFit, bare, fit_decay, fit_pieces
 from beamfit.lifetime.free_law import Law
 from beamfit.lifetime.mechanisms import added, loss_coefficients, terms_of
-from beamfit.lifetime.pieces import DROPOUT, FEWEST, split_record
+from beamfit.lifetime.pieces import DROPOUT, MIN_READINGS, split_record
 from beamfit.lifetime.record import PLAUSIBLE, Conditions, DecayRecord
 from beamfit.lifetime.study import (
     CHANGED,
@@ -167,11 +167,13 @@ def fit_window(rows: Sequence[WindowRow], name: str, law: Law = Law.free) -> Win
         for decay in split_record(section).segments
     ]
     if not decays:
-        return Window(None, None, 0, f"fewer than {FEWEST} readings in a row of a stored beam")
+        return Window(
+            None, None, 0, f"fewer than {MIN_READINGS} readings in a row of a stored beam"
+        )
     group = _at_last(decays)
     alone = len(group) == 1
     one = replace(group[0], name=name) if alone else joined(group, name)
-    if len(one) < FEWEST:
+    if len(one) < MIN_READINGS:
         return Window(None, one, len(group), f"{len(one)} readings since the last change")
     try:
         if alone:
@@ -200,7 +202,7 @@ def _pieces(rows: Sequence[WindowRow], name: str) -> list[DecayRecord]:
             time[part], current[part], None, name, time[part[0]],
             Conditions(*(None if column is None else column[part] for column in filled)),
         )
-        for part in parts if part.size >= FEWEST
+        for part in parts if part.size >= MIN_READINGS
     ]  # fmt: skip
 
 
