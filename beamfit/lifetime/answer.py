@@ -15,7 +15,7 @@ from beamfit.lifetime.alternatives import ConstantA, LifetimeLaw, Outgassing
 from beamfit.lifetime.cycles import HELD, is_sawtooth, lives_longer
 from beamfit.lifetime.evidence import (
     BELIEVED,
-    DETERMINED,
+    MAX_RELATIVE_ERROR,
     OUTSIDE,
     SEPARABLE,
     UNITS,
@@ -71,15 +71,15 @@ class TableEvidence(NamedTuple):
         """True if the residuals of the points tell the noise."""
         return self.noise is not None
 
-    def scaled(self, name: str) -> tuple[float, float]:
+    def value_and_error(self, name: str) -> tuple[float, float]:
         """A value and its error."""
         return self.numbers[name]
 
-    sure = scaled
+    normal_equivalent = value_and_error
 
 
 def _lost(e: Evidence) -> Finding | None:
-    if e.about.rested:
+    if e.about.converged:
         return None
     cause = "The search found no finite minimum: look at the record for steps."
     return Finding(Status.not_finite, cause)
@@ -87,8 +87,8 @@ def _lost(e: Evidence) -> Finding | None:
 
 def _is_level(e: Evidence) -> bool:
     """True if the readings tell no loss, of either sign."""
-    rate, error = e.sure("rate_mean")
-    return not e.separability.separable and error > DETERMINED * abs(rate)
+    rate, error = e.normal_equivalent("rate_mean")
+    return not e.separability.separable and error > MAX_RELATIVE_ERROR * abs(rate)
 
 
 def _held(e: Evidence) -> Finding | None:
@@ -107,7 +107,7 @@ def _held(e: Evidence) -> Finding | None:
 def _within_noise(e: Evidence) -> Finding | None:
     if not _is_level(e):
         return None
-    rate, error = e.sure("rate_mean")
+    rate, error = e.normal_equivalent("rate_mean")
     # A rate below zero by chance is no reason for a longer lifetime than that of a rate of zero.
     limit = 1 / (max(rate, 0.0) + LIMIT * error) / HOUR
     if lives_longer(limit * HOUR) < HELD:
@@ -150,10 +150,10 @@ def _stepped(e: Evidence) -> Finding | None:
 
 
 def _negative(name: str, cause: str, e: Evidence | TableEvidence) -> Finding | None:
-    value, error = e.sure(name)
+    value, error = e.normal_equivalent(name)
     if not (value < -BELIEVED * error and value < 0) or e.free is not None:
         return None
-    cause, (_, error) = _explained(e) or cause, e.scaled(name)
+    cause, (_, error) = _explained(e) or cause, e.value_and_error(name)
     return Finding(Status.infeasible, f"{name} is negative by {-value / error:.1f} errors; {cause}")
 
 
@@ -168,7 +168,7 @@ def _explained(e: Evidence | TableEvidence) -> str | None:
     """Cause that explains a refuted law better than an exponent of the current, and the remedy."""
     if e.explained is None:
         return None
-    gas = isinstance(e.explained.found, Outgassing)
+    gas = isinstance(e.explained.explanation, Outgassing)
     remedy = ". Fit what comes later, or give the pressure in a column"
     return f"{e.explained}{remedy if gas else ': cut the record there'}"
 
@@ -206,7 +206,7 @@ def _inseparable(e: Evidence) -> Finding | None:
         "current is determined. "
     )
     told += f"{likely}. " if (likely := _disturbed(e)) else ""
-    if e.apart:
+    if e.is_separable:
         open_ = "An exponent of a and a drift of b leave them open: record farther, or give the "
         told += f"{open_}ring, the pressure, or --law constant. {_if_constant(e)}"
         return Finding(Status.unidentified, told)
@@ -224,8 +224,8 @@ def _beyond(e: Evidence, errors: float) -> Finding:
         f"The share of a in the loss is {found.share:.2g} ± {found.share_error:.2g}, {errors:.1f} "
         "errors outside 0 to 1: a longer record does not help. "
     )
-    if e.rival is not None:
-        return Finding(Status.unidentified, f"{cause}Likely {e.rival}: cut the record there")
+    if e.alternative is not None:
+        return Finding(Status.unidentified, f"{cause}Likely {e.alternative}: cut the record there")
     drift = abs(min(-found.share, 1.0 - found.share, key=abs)) / found.share_error
     drift *= e.drift_of_one_error("share")
     return Finding(
@@ -250,8 +250,8 @@ def _improbable(e: Evidence | TableEvidence, remedy: str = "") -> Finding | None
 
 def _determined(e: Evidence | TableEvidence) -> Finding:
     """Judge a and b each by itself; one that is compatible with zero has an upper limit."""
-    found = {name: e.sure(name) for name in "ab"}
-    small = {n: (v, error) for n, (v, error) in found.items() if not error < DETERMINED * v}
+    found = {name: e.normal_equivalent(name) for name in "ab"}
+    small = {n: (v, error) for n, (v, error) in found.items() if not error < MAX_RELATIVE_ERROR * v}
     if not small:
         return Finding(Status.converged, "a and b are determined")
     limits = " and ".join(
@@ -265,7 +265,7 @@ def _determined(e: Evidence | TableEvidence) -> Finding:
 
 def _bending(e: Evidence) -> Finding | None:
     """Cycles whose a and b contain an exponent of a."""
-    if e.bending is None:
+    if e.exponent_shifts is None:
         return None
     exact = " and ".join(f"{name} is {e.quantity(name, True)}" for name in "ab")
     found = _determined(e)
@@ -279,9 +279,9 @@ def _freely(e: Evidence) -> Finding | None:
     if e.free is None:
         return None
     told = "; ".join(filter(None, (_clear(e), *(_extent(e, name) for name in "ab"))))
-    if e.beside == "pumped":
+    if e.addition == "pumped":
         likely = f"Gas that is pumped away after a fill is likely ({percent(e.free.pumped)})"
-        gas = e.outgassing if e.by_gas else None
+        gas = e.outgassing if e.has_slow_gas else None
         # A lifetime afterwards that is not determined, or a below zero, is no explanation.
         known = gas and math.isfinite(gas.after.value) and min(gas.a.value, gas.b.value) > 0
         said = f": {e.explained}" if known else ""
@@ -303,10 +303,10 @@ DISTURBED = {
 
 def _disturbed(e: Evidence) -> str:
     """Name what goes by itself beside the law, if that is likelier than not."""
-    if e.beside not in DISTURBED:
+    if e.addition not in DISTURBED:
         return ""
-    chance = percent(getattr(e.free, e.beside))
-    return f"{DISTURBED[e.beside]} ({chance}), which the errors contain"
+    chance = percent(getattr(e.free, e.addition))
+    return f"{DISTURBED[e.addition]} ({chance}), which the errors contain"
 
 
 def _departs(e: Evidence) -> str:
@@ -353,7 +353,7 @@ RULES += (partial(_improbable, remedy=LOOK), _freely, _determined)
 
 
 def _narrow(e: TableEvidence) -> Finding | None:
-    share, error = e.scaled("share")
+    share, error = e.value_and_error("share")
     if error < SEPARABLE:
         return None
     known = f" (share of a in the loss {share:.2g} ± {error:.2g})" if math.isfinite(error) else ""
@@ -393,9 +393,9 @@ def _course(e: Evidence) -> str | None:
 
 def _bent(e: Evidence) -> Finding | None:
     """Cycles within which the current bends as no loss does: no lifetime is quoted."""
-    if not e.bends:
+    if not e.bends_impossibly:
         return None
-    share, error = e.scaled("share")
+    share, error = e.value_and_error("share")
     return Finding(
         Status.unidentified,
         f"The current bends within the cycles as no loss does: the share of a in it would be "
@@ -407,7 +407,7 @@ def _bent(e: Evidence) -> Finding | None:
 
 
 def _one_current(e: Evidence) -> Finding | None:
-    share, error = e.scaled("share")
+    share, error = e.value_and_error("share")
     if error < SEPARABLE:
         return None
     return Finding(
@@ -419,7 +419,7 @@ def _one_current(e: Evidence) -> Finding | None:
 
 
 def _rises(e: Evidence) -> Finding | None:
-    rate, error = e.sure("rate_mean")
+    rate, error = e.normal_equivalent("rate_mean")
     if rate > -BELIEVED * error:
         return None
     cause = "The current rises, by injection or a drift of the monitor: this is no decay"
@@ -428,17 +428,17 @@ def _rises(e: Evidence) -> Finding | None:
 
 def _missed(e: Evidence) -> Finding | None:
     """Refills that may have been missed: the beam then seems to live longer than it does."""
-    if e.aliased:
-        usual, interval = e.usual
+    if e.may_be_aliased:
+        usual, interval = e.usual_cycle
         return Finding(
             Status.unidentified,
             "The beam is held by refills that the record may not resolve: of those that were found "
             f"the next comes after {usual:.3g} readings, but faster ones look the same when read "
             f"every {interval:.3g} s. Record more readings from refill to refill",
         )
-    if e.hidden is None:
+    if e.hidden_refill is None:
         return None
-    lost, least = e.hidden
+    lost, least = e.hidden_refill
     return Finding(
         Status.unidentified,
         f"A cycle of the {e.cycles} that were found loses {lost:.2g} mA, and refills below "
@@ -479,7 +479,7 @@ def _few(e: Evidence) -> str | None:
 
 def _correlated(e: Evidence) -> str | None:
     found, length = e.separability, e.correlation_time
-    if length is None or (e.freed and not remembers(e.residuals, e.time.size - e.dof)):
+    if length is None or (e.quotes_free_law and not remembers(e.residuals, e.time.size - e.dof)):
         return None
     times = found.error_inflation
     than = f": they are {times:.1f} times those of independent readings" if times else ""
@@ -522,7 +522,7 @@ def _wandering(e: Evidence) -> str | None:
     local = noise_of(record.time, record.current)
     rms = float(np.std(e.residuals)) if rival is None else rival.scatter
     short = length is not None and length < record.span / 3
-    if not e.about.wanders or short or rms < WANDERS * local:
+    if not e.about.has_memory or short or rms < WANDERS * local:
         return None
     return (
         f"Neighbouring readings scatter by {local:.2g} mA alone: the loss rate or the monitor "
@@ -562,8 +562,8 @@ def _drifting(e: Evidence) -> str | None:
 
 
 def _odd_clock(e: Evidence) -> str | None:
-    rate, error = e.scaled("rate_mean")
-    if not error < DETERMINED * rate or 1 / LONGEST < rate < 1 / SHORTEST:
+    rate, error = e.value_and_error("rate_mean")
+    if not error < MAX_RELATIVE_ERROR * rate or 1 / LONGEST < rate < 1 / SHORTEST:
         return None
     wrong = "milliseconds" if rate < 1 / LONGEST else "minutes or hours"
     return (

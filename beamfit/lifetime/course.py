@@ -269,7 +269,7 @@ def _point(
     relative: list[Quantity | None] = [None, None]
     law = fit.free_law
     same = usual is not None and not usual.power and fit.status is not Status.poor_fit
-    if same and (law is None or law.beside is None):
+    if same and (law is None or law.addition is None):
         relative = [
             None if q.error is None else Quantity(q.value / by, q.error / by, "1")
             for q, by in ((fit.if_constant("a"), usual.a * a), (fit.if_constant("b"), usual.b * b))
@@ -370,8 +370,8 @@ def _noise(fit: DecayFit, power: float) -> tuple[float, float, float, float]:
     alike, rest = fit.identifiability.residual_correlation or 0.0, fit.residuals
     if power and fit.first is None:
         about = fit.with_power(power)
-        rest, found = about.off, about.memory(about.columns(), False)
-        time = found.noise.time if about.wanders else 0.0
+        rest, found = about.current_residuals, about.memory(about.columns(), False)
+        time = found.noise.time if about.has_memory else 0.0
         alike = (1 - found.noise.white) * math.exp(-interval / time) if time else 0.0
     white = 1 - alike * math.exp(interval / time) if alike else 0.0
     size = math.sqrt(float(np.mean(np.diff(rest) ** 2)) / (2 * (1 - alike)))

@@ -1072,14 +1072,14 @@ class FreeLaw:
     span: float
 
     @property
-    def likelier(self) -> bool:
+    def is_preferred(self) -> bool:
         """True if varying a and b are more probable than constant ones: their values are quoted
         then.
         """
         return self.constant <= MORE_PROBABLE
 
     @property
-    def tells_share(self) -> bool:
+    def determines_share(self) -> bool:
         """True if the record excludes that the loss is all or none due to a, and the exponent is
         one of bunch lengthening.
         """
@@ -1091,10 +1091,10 @@ class FreeLaw:
         return self.odd > MORE_PROBABLE
 
     @property
-    def beside(self) -> str | None:
+    def addition(self) -> str | None:
         """Name of the probable variation in addition to the quoted a and b, one of `ADDITIONS`."""
         likely = (name for name in ADDITIONS if getattr(self, name) > MORE_PROBABLE)
-        return next(likely, None) if self.likelier else None
+        return next(likely, None) if self.is_preferred else None
 
     def curve(self, time: np.ndarray) -> np.ndarray:
         """Mean readings of the monitor at times in s, mA."""
@@ -1146,11 +1146,11 @@ def free_law(record: DecayRecord, values: Physical) -> FreeLaw | None:
 
     Examples
     --------
-    >>> from beamfit.lifetime.expansion import Pieces, solved
+    >>> from beamfit.lifetime.expansion import Pieces, fit_law
     >>> t = np.linspace(0, 36000, 100)
     >>> noise = 1e-2 * np.random.default_rng(1).normal(size=100)
     >>> record = DecayRecord(t, 100.0 / (1.0 + 100.0 * 1e-7 * t) + noise)
-    >>> found = free_law(record, solved(Pieces.of(record)).values)
+    >>> found = free_law(record, fit_law(Pieces.of(record)).values)
     >>> low, high = found.quantities["a"].interval_95
     >>> low < 1e-7 <= high
     True

@@ -205,7 +205,7 @@ class _Prepared(NamedTuple):
             white = np.array([kind == MemoryKind(WHITE) for kind in seen.products.kinds])
             seen = seen.of_noises(white) if white.any() else seen  # hopeless where nothing fits
         laws = [LawProposal.of(seen, CONSTANT)] if fit.free_law is None else proposals(seen)
-        moved = [about.moved(change)[:3] for change in about.pieces.monitor_changes]
+        moved = [about.value_shifts(change)[:3] for change in about.pieces.monitor_changes]
         return cls(fit, seen, laws, np.reshape(moved, (-1, 3)))
 
     @property

@@ -20,7 +20,7 @@ from beamfit.answer import Row, Table, answer, cell, json_of, labelled
 from beamfit.errors import Finding, InputError, Judged
 from beamfit.greybox.design import Information, scores
 from beamfit.lifetime.decay_law import current as beam_at
-from beamfit.lifetime.expansion import DETERMINED, Expansion, lifetime_of
+from beamfit.lifetime.expansion import MAX_RELATIVE_ERROR, Expansion, lifetime_of
 from beamfit.lifetime.fill_noise import quantiles
 from beamfit.lifetime.fit import bare
 from beamfit.lifetime.loss_network import VOLTAGES, NetworkFit, fit_loss_network
@@ -543,7 +543,7 @@ def predict_held_back(fit: ScaleFit) -> tuple[HeldBack, ...]:
         reading = np.linalg.inv(root)[1]
         rate, error = measured.parts[k, 1], np.linalg.norm(reading)
         # By some noises a decay may alone tell of something.
-        told = square - error**2 < (DETERMINED * rate) ** 2
+        told = square - error**2 < (MAX_RELATIVE_ERROR * rate) ** 2
         weight_told = noise.weight * told
         if not weight_told.sum() > LIKELY:
             continue

@@ -22,7 +22,7 @@ from beamfit.greybox.fit import Fit
 from beamfit.greybox.posterior import Optimum, Statement, target_of
 from beamfit.greybox.problem import Free, Prior, Problem, Record
 from beamfit.greybox.solve import solve
-from beamfit.lifetime.expansion import DETERMINED, LEVEL, LOSS, QUADRATIC, Expansion
+from beamfit.lifetime.expansion import LEVEL, LOSS, MAX_RELATIVE_ERROR, QUADRATIC, Expansion
 from beamfit.lifetime.fill_noise import (
     BY,
     SHORTEST,
@@ -88,9 +88,9 @@ def _root(fit: DecayFit, about: Expansion) -> np.ndarray:
     """The information that a decay holds on its parts, as of `Summaries`; what is stated of the
     monitor is added to their covariance.
     """
-    scale = max(np.sqrt(about.residuals @ about.residuals / fit.dof), about.given)
+    scale = max(np.sqrt(about.residuals @ about.residuals / fit.dof), about.min_factor)
     root = information_root(about, scale * fit.inflation)
-    moved = [about.moved(change) for change in about.pieces.monitor_changes]
+    moved = [about.value_shifts(change) for change in about.pieces.monitor_changes]
     if not moved:
         return root
     changes = np.array([[m.a * about.pieces.units[1], m.rate_mean] for m in moved]).T
@@ -376,7 +376,7 @@ class ScaleFit(Judged):
             value = quantity.value
             # Against 1 where the value is smaller: a mechanism found absent, 0.0 ± 0.1, is
             # separable. A voltage that its prior tells better than the decays is the prior's.
-            known = quantity.error < DETERMINED * max(value, 1.0)
+            known = quantity.error < MAX_RELATIVE_ERROR * max(value, 1.0)
             if name == VOLTAGE:
                 known = 2 * quantity.error**2 < priors[name] ** 2
             found[name] = quantity if known and not blind[k] else quantity.open()
@@ -417,7 +417,7 @@ class ScaleFit(Judged):
         usual = jnp.ones_like(vector)
         size = np.maximum(np.abs(quantity(vector)), np.abs(quantity(usual)))
         error = self.spread.error(np.asarray(jax.jacfwd(quantity)(vector)))
-        return error < DETERMINED * size
+        return error < MAX_RELATIVE_ERROR * size
 
     def about(self, decays: DecaySet) -> tuple[np.ndarray, ...]:
         """Expand decays: their weights without scatter, their `pulls`, and the slopes of these by

@@ -13,7 +13,7 @@ import numpy as np
 
 from beamfit.answer import answer, json_of, shown
 from beamfit.errors import InputError, expect
-from beamfit.lifetime.cycles import alike, joined
+from beamfit.lifetime.cycles import group_by_settings, join_cycles
 from beamfit.lifetime.evidence import SEPARABLE
 from beamfit.lifetime.fit import (
     MIN_FITTED_READINGS,
@@ -429,7 +429,7 @@ def _pooled(
     cycles: Sequence[DecayRecord], name: str, machine: Machine | None, law: Law
 ) -> tuple[list[Decay], list[DecayRecord]]:
     """Cycles at the same settings together, and those of them that also stand alone."""
-    groups, pooled, alone = alike(cycles), [], []
+    groups, pooled, alone = group_by_settings(cycles), [], []
     many = sum(len(group) >= MIN_CYCLES for group in groups)
     for group in groups:
         if len(group) < MIN_CYCLES:
@@ -439,7 +439,7 @@ def _pooled(
         group = _on_edges(group)
         # A refill between the edges of a staircase would show as a step.
         fit = fit_cycles(group, called, law, found=group[0].mean is None)
-        segment = joined(group, called)
+        segment = join_cycles(group, called)
         own = standing_alone(group, segment, fit)
         alone += own
         known = fit.status not in REFUTED and fit.lifetime_mean.error is not None

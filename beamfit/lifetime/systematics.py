@@ -17,9 +17,9 @@ from beamfit.lifetime.expansion import (
     LOSS,
     POWER,
     Pieces,
+    fit_law,
     further_columns,
     lifetime_of,
-    solved,
 )
 from beamfit.lifetime.fit import MIN_FITTED_READINGS, DecayFit, bare, fit_decay
 from beamfit.lifetime.free_law import Law
@@ -96,7 +96,7 @@ def systematics(fit: DecayFit) -> tuple[Systematic, ...]:
     if another or fit.status is Status.infeasible or fit.a.error is None:
         return ()
     about = fit.about
-    over, share = about.pieces.over, record.time / record.span
+    over, share = about.pieces.divisor, record.time / record.span
     grown = further_columns(about, "drift", np.zeros(1))[:, 0] * over * record.span
     rises = f"pressure rises by {100 * PRESSURE:g} % over the record"
     bends = f"a goes as I^{EXPONENT:g}, as of a bunch that lengthens"
@@ -107,7 +107,7 @@ def systematics(fit: DecayFit) -> tuple[Systematic, ...]:
         causes = {cause: change for cause, change in causes.items() if cause not in contained}
     rate, found = a * fit.mean_current + b, []
     for cause, change in causes.items():
-        moved = about.moved(change / over)
+        moved = about.value_shifts(change / over)
         lifetime = -moved.rate_mean / rate**2 / HOUR
         found.append(Systematic(cause, moved.a, moved.b, lifetime))
     gas = max(b, 0.0) * FOLLOWING / (1 - FOLLOWING)
@@ -185,10 +185,10 @@ def single_exponential(record: DecayRecord, fit: DecayFit | None = None) -> OneL
     >>> print(single_exponential(DecayRecord(t, 500 / (1 + t / 36000))).lifetime.value > 10)
     True
     """
-    found = solved(Pieces.of(record), (LOSS,))
-    moments = found.memory((LEVEL, LOSS), True).moments(np.eye(2)[1:], found.given)
+    found = fit_law(Pieces.of(record), (LOSS,))
+    moments = found.memory((LEVEL, LOSS), True).moments(np.eye(2)[1:], found.min_factor)
     error = float(moments.error[0]) / record.span
-    return _one_lifetime(float(found.values.b), error, found.off, record, fit)
+    return _one_lifetime(float(found.values.b), error, found.current_residuals, record, fit)
 
 
 def log_linear(record: DecayRecord, fit: DecayFit | None = None) -> OneLifetime:

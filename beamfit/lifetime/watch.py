@@ -16,7 +16,7 @@ from beamfit.answer import json_of
 from beamfit.errors import InputError
 from beamfit.lifetime import alarm
 from beamfit.lifetime.course import BEST_MONITOR, normalised, reference_of
-from beamfit.lifetime.cycles import alike, joined
+from beamfit.lifetime.cycles import group_by_settings, join_cycles
 from beamfit.lifetime.evidence import UNITS
 from beamfit.lifetime.fit import DecayFit, bare, fit_decay, fit_pieces
 from beamfit.lifetime.free_law import Law
@@ -172,7 +172,7 @@ def fit_window(rows: Sequence[WindowRow], name: str, law: Law = Law.free) -> Win
         )
     group = _at_last(decays)
     alone = len(group) == 1
-    one = replace(group[0], name=name) if alone else joined(group, name)
+    one = replace(group[0], name=name) if alone else join_cycles(group, name)
     if len(one) < MIN_READINGS:
         return Window(None, one, len(group), f"{len(one)} readings since the last change")
     try:
@@ -209,10 +209,12 @@ def _pieces(rows: Sequence[WindowRow], name: str) -> list[DecayRecord]:
 def _at_last(decays: list[DecayRecord]) -> list[DecayRecord]:
     """Those at the settings of the last, and its pressure if that does not follow the beam."""
     compared = decays
-    if joined(decays, "").gauge is None:
+    if join_cycles(decays, "").gauge is None:
         compared = [replace(d, conditions=d.conditions._replace(pressure=None)) for d in decays]
     starts = next(
-        {decay.start for decay in group} for group in alike(compared) if compared[-1] in group
+        {decay.start for decay in group}
+        for group in group_by_settings(compared)
+        if compared[-1] in group
     )
     return [decay for decay in decays if decay.start in starts]
 

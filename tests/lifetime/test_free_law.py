@@ -10,7 +10,7 @@ from scipy.special import logsumexp
 
 from beamfit.errors import InputError
 from beamfit.lifetime.decay_law import current
-from beamfit.lifetime.expansion import Pieces, solved
+from beamfit.lifetime.expansion import Pieces, fit_law
 from beamfit.lifetime.fit import fit_cycles, fit_decay, fit_decays
 from beamfit.lifetime.free_law import (
     CONSTANT,
@@ -147,7 +147,7 @@ def test_a_monitor_that_settles_is_followed_from_node_to_node():
 def test_a_disturbance_is_averaged_over_in_closed_form(kind):
     """The likelihood is that of the noise's covariance with the disturbance's."""
     one = record(3, noise=3.0, count=40)
-    seen = ReducedDecay.of(one, solved(Pieces.of(one)).values)
+    seen = ReducedDecay.of(one, fit_law(Pieces.of(one)).values)
     white = seen.of_noises(np.array([kind.time == kind.power == 0 for kind in seen.products.kinds]))
     found, least = white.with_disturbance(kind), white.best_curve[0][0]
     noise = np.sqrt(least / (40 - NODE.size))
@@ -228,7 +228,7 @@ def test_a_quiet_monitor_that_settles_is_told_beside_any_law(given, count):
         rate = own + B * (1 + drift * (at / time[-1] - 0.5))
         held += low <= 1 / rate / HOUR <= high
         told += "A monitor that settles after a fill is likely" in fit.message
-        assert "residuals are correlated" not in fit.message or fit.free_law.beside != "settles"
+        assert "residuals are correlated" not in fit.message or fit.free_law.addition != "settles"
     assert held >= count - 1
     assert told >= 0.75 * count
 
@@ -303,7 +303,7 @@ def test_a_vacuum_that_walks_is_in_the_errors(count):
 def test_the_draws_are_those_of_the_posterior():
     """With constant a and b against a grid of the exact law in white noise."""
     one = record(3, noise=3.0)
-    values = solved(Pieces.of(one)).values
+    values = fit_law(Pieces.of(one)).values
     draws = LawProposal.of(ReducedDecay.of(one, values), CONSTANT).weighted_draws(6000)
     time, rates, shares = one.time, np.linspace(0.97, 1.03, 61), np.linspace(0.0, 1.0, 81)
     unit, mean, log = float(values.rate_mean), float(one.current.mean()), np.zeros((61, 81))
