@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 from jax import Array
 
-from beamfit.lifetime.decay_law import LEAST, Moments, beam_current
+from beamfit.lifetime.decay_law import MIN_CURRENT, Moments, beam_current
 from beamfit.lifetime.record import DecayRecord, Monitor
 from beamfit.noise.correlated import Memory, Whitened, usual_noises, whitened_by_each
 from beamfit.noise.memory import CorrelatedNoise, Levels, remembers
@@ -366,7 +366,7 @@ class Expansion:
             begin, parameters = level + step[0], (loss + departure, quadratic, power, *further)
             model = beam_current(pieces.per_reading(begin), parameters, pieces.at, kind, shape)
             x = highest if many else np.array([begin[0], model[-1]])
-            rates = quadratic * np.where(x.real > LEAST, x, LEAST) ** (1 + power)
+            rates = quadratic * np.where(x.real > MIN_CURRENT, x, MIN_CURRENT) ** (1 + power)
             rates = rates * (1.0 if shape is None else np.asarray(shape(x) / shape(1.0)))
             b = loss - quadratic
             values = begin.mean(), quadratic, b, *(rates + b * pieces.pressure), loss
@@ -681,7 +681,7 @@ def further_columns(about: Expansion, kind: str, times: np.ndarray) -> np.ndarra
     (span, _), level = about.pieces.units, about.rows[:, [LEVEL]]
     time, model = about.pieces.time / span, about.pieces.current / about.pieces.divisor
     model = (model + about.residuals)[:, None]
-    fading = np.divide(model, level, out=np.zeros_like(model), where=level > LEAST * level[0])
+    fading = np.divide(model, level, out=np.zeros_like(model), where=level > MIN_CURRENT * level[0])
     if kind in ("step", "step of a"):
         share = 1.0 if kind == "step" else model / about.pieces.weight[:, None]
         whole = cumulative_simpson(share * fading, x=time, axis=0, initial=0.0)
