@@ -414,8 +414,8 @@ def test_long_top_up_is_cut_before_it_is_averaged():
 def test_stretches_find_the_steps_of_the_whole(monkeypatch):
     one = sawtooth(10.0, 6000, 0.02)
     whole = [event.time for event in split_record(one).events if event.kind == "refill"]
-    monkeypatch.setattr("beamfit.lifetime.pieces.ONE_LAW", 1024)
-    monkeypatch.setattr("beamfit.lifetime.pieces.BESIDE", 256)
+    monkeypatch.setattr("beamfit.lifetime.pieces.LAW_CHUNK", 1024)
+    monkeypatch.setattr("beamfit.lifetime.pieces.LAW_OVERLAP", 256)
     parts = [event.time for event in split_record(one).events if event.kind == "refill"]
     assert len(set(whole) ^ set(parts)) <= 0.02 * len(whole)
 
