@@ -177,7 +177,7 @@ EDGE_THRESHOLD = 2.5
 WITHIN = "they lie within injections"
 FRESH, SETTLES = "fresh beam decays faster", f"{WITHIN}, or the monitor settles"
 # Neighbours with which a cycle, or a reading at the edge of one, is compared.
-NEIGHBOURS = 9
+REFERENCE_NEIGHBOURS = 9
 # Number of time constants of fresh beam that are tried; readings are left out until its excess has
 # fallen to this share of its error.
 TIME_CONSTANTS, FADED = 12, 0.1
@@ -223,8 +223,12 @@ def _odd_cycles(about: Expansion) -> np.ndarray:
     first, slope, residual = about.pieces.first, about.reduced[:, LOSS], about.reduced[:, -1]
     squares = np.add.reduceat(slope**2, first)
     rate = -np.add.reduceat(slope * residual, first) / squares
-    windows = sliding_window_view(np.pad(rate, NEIGHBOURS // 2, mode="reflect"), NEIGHBOURS)
-    off = rate - np.median(np.delete(windows, NEIGHBOURS // 2, axis=1), axis=1)  # without itself
+    windows = sliding_window_view(
+        np.pad(rate, REFERENCE_NEIGHBOURS // 2, mode="reflect"), REFERENCE_NEIGHBOURS
+    )
+    off = rate - np.median(
+        np.delete(windows, REFERENCE_NEIGHBOURS // 2, axis=1), axis=1
+    )  # without itself
     differences = np.pad(np.abs(np.diff(rate)), 1, constant_values=np.inf)
     isolated = np.minimum(differences[:-1], differences[1:]) > 0.5 * np.abs(off)
     return _outliers(off * np.sqrt(squares)) & isolated
@@ -238,16 +242,18 @@ def _edge_excess(about: Expansion) -> np.ndarray:
     lies below, the last above.
     """
     first, lengths = about.pieces.first, about.pieces.lengths
-    is_long = lengths > NEIGHBOURS
+    is_long = lengths > REFERENCE_NEIGHBOURS
     edges = np.array([first[is_long], (first + lengths - 1)[is_long]])
     if edges.shape[1] < MIN_CYCLES:
         return np.zeros(2)
     excess = -about.reduced[:, -1]
     scatter = max(1.4826 * float(np.median(np.abs(excess))), 1e-300)
-    inward = np.array([[1], [-1]])[..., None] * np.arange(1, NEIGHBOURS)
+    inward = np.array([[1], [-1]])[..., None] * np.arange(1, REFERENCE_NEIGHBOURS)
     differences = excess[edges] - excess[edges[..., None] + inward].mean(axis=2)
     differences = np.clip(differences / scatter, -OUTLIER, OUTLIER)
-    return differences.mean(axis=1) * math.sqrt(edges.shape[1] / (1 + 1 / (NEIGHBOURS - 1)))
+    return differences.mean(axis=1) * math.sqrt(
+        edges.shape[1] / (1 + 1 / (REFERENCE_NEIGHBOURS - 1))
+    )
 
 
 def _settling_readings(about: Expansion, most: int) -> tuple[int, bool]:
@@ -292,7 +298,9 @@ def _trim_edges(about: Expansion) -> tuple[Expansion, list[str]]:
         high += max(int(first_off > EDGE_THRESHOLD), settling * settles_high)
         index, lengths = about.pieces.index_in_piece, about.pieces.lengths
         length = np.repeat(lengths, lengths)
-        keep = (index >= cut_now[0]) & (index < length - cut_now[1]) | (length <= NEIGHBOURS)
+        keep = (index >= cut_now[0]) & (index < length - cut_now[1]) | (
+            length <= REFERENCE_NEIGHBOURS
+        )
         about = with_course(fit_law(about.pieces.select(keep, MIN_CYCLE_READINGS)))
         cut = cut + cut_now
     sentences = []

@@ -375,21 +375,21 @@ class Evidence:
         fields = (self.values, self.errors, self.raw, self.reach)
         return tuple(float(getattr(part, name)) for part in fields)
 
-    def quantity(self, name: str, known: bool) -> Quantity:
-        """I0, a or b; without an error if it is not `known`, i.e. determined."""
+    def quantity(self, name: str, determined: bool) -> Quantity:
+        """I0, a or b; without an error unless it is `determined`."""
         value, error, raw, reach = self._parts(name)
-        if not (known and math.isfinite(value) and math.isfinite(error)):
+        if not (determined and math.isfinite(value) and math.isfinite(error)):
             return Quantity(value, None, UNITS[name])
         return Quantity.reaching(value, error, UNITS[name], raw, reach)
 
-    def lifetime(self, name: str, known: bool) -> Quantity:
-        """Lifetime, h, from a loss rate; without an error if it is not `known`, or the rate not
+    def lifetime(self, name: str, determined: bool) -> Quantity:
+        """Lifetime, h, from a loss rate; without an error unless it is `determined` and the rate
         clear of zero.
         """
         rate, error, raw, reach = self._parts(name)
         if not rate > 0:
             return Quantity(math.nan, None, "h")
-        if not (known and self.is_clear(name)):
+        if not (determined and self.is_clear(name)):
             return Quantity(1 / rate / HOUR, None, "h")
         interval = tuple(1 / max(rate + sign * reach, 1e-300) / HOUR for sign in (1, -1))
         error, raw = (part / rate**2 / HOUR for part in (error, raw))
@@ -612,11 +612,13 @@ class Evidence:
         else:
             return exact
         low, high = (float(np.hypot(value - end, NORMAL * shift)) for end in interval)
-        known = exact.error is not None and (name not in ("a", "b") or self.separability.separable)
-        error = math.hypot(error, shift) if known else None
+        determined = exact.error is not None and (
+            name not in ("a", "b") or self.separability.separable
+        )
+        error = math.hypot(error, shift) if determined else None
         return Quantity(value, error, exact.unit, exact.error_raw, (value - low, value + high))
 
-    def fit_fields(self, known: bool = True) -> dict[str, Any]:
+    def fit_fields(self, determined: bool = True) -> dict[str, Any]:
         """Fields of a `DecayFit`, by name."""
         # A refuted law has no errors, except a and b if the law was given; I0 and lifetimes are
         # those of the alternative that explains the readings. The mean lifetime of many cycles
@@ -625,11 +627,11 @@ class Evidence:
                   "inflation", "residuals", "course")  # fmt: skip
         refuted = self.refuted and self.free is None
         is_single, errors_known = self.cycles == 1, not (refuted and self.law is Law.free)
-        exact = {"i0": self.quantity("i0", known and is_single and not refuted)}
-        separable = known and self.is_separable and errors_known
+        exact = {"i0": self.quantity("i0", determined and is_single and not refuted)}
+        separable = determined and self.is_separable and errors_known
         exact |= {name: self.quantity(name, separable) for name in "ab"}
-        determined = known and not (refuted and is_single)
-        exact |= {f"lifetime_{at}": self.lifetime(f"rate_{at}", determined) for at in ENDS}
+        rates_determined = determined and not (refuted and is_single)
+        exact |= {f"lifetime_{at}": self.lifetime(f"rate_{at}", rates_determined) for at in ENDS}
         found = {name: self.with_free_law(name, quantity) for name, quantity in exact.items()}
         found |= self.explained.quantities if refuted and self.explained is not None else {}
         found |= {"exact": exact, "free_law": self.free, "shaped": self.shaped}
@@ -681,11 +683,11 @@ class Evidence:
         refuted = self.constant_a.status is Status.poor_fit
         if self.cycles > 1:
             # The fit of a power has no parts.
-            known = self.separability.separable and not (refuted and self.course)
+            offered = self.separability.separable and not (refuted and self.course)
         else:
             plain = not self.shaped and self.about.pieces.gauge is None
-            known = plain and refuted and self.outgassing is None and self.addition is None
-        return lifetime_law(self.about, self.independent, refuted) if known else None
+            offered = plain and refuted and self.outgassing is None and self.addition is None
+        return lifetime_law(self.about, self.independent, refuted) if offered else None
 
     def drift_of_one_error(self, name: str) -> float:
         """Linear drift of the monitor over the record, mA, that shifts a value by its error."""

@@ -431,8 +431,7 @@ class Expansion:
         """Columns of slopes and, last, residuals, with the starting currents of many pieces
         eliminated.
         """
-        columns = np.column_stack([self.rows, self.residuals])
-        return columns if self.levels is None else self.without_levels(columns)
+        return self.without_levels(np.column_stack([self.rows, self.residuals]))
 
     @cached_property
     def qr_factor(self) -> np.ndarray:
@@ -465,8 +464,8 @@ class Expansion:
             is_plain = list(columns) in (self.columns(), self.columns(POWER))
             found = self._whitened_with_power if is_plain else self._whitened(columns)
             return found.memory(self.edge_columns.shape[1] + len(columns)).of_last(len(columns))
-        known = np.append(np.equal(columns, QUADRATIC), self.numbers[QUADRATIC - 1])
-        rows = np.vstack([self.qr_factor[:, [*columns, -1]], self.prior * known])
+        prior_row = np.append(np.equal(columns, QUADRATIC), self.numbers[QUADRATIC - 1])
+        rows = np.vstack([self.qr_factor[:, [*columns, -1]], self.prior * prior_row])
         count = self.residuals.size - (0 if self.levels is None else self.level.size)
         triangle = np.linalg.qr(rows, mode="r")[None]
         return Whitened(
@@ -581,12 +580,11 @@ def _search(
     if begin is None:
         plain = np.isin(PLAIN, free)
         numbers[:2], step[:2] = PLAIN_DECAY * plain, (start.both - PLAIN_DECAY) * plain
+    bounds = _parameter_bounds(numbers.size)
     cost, fraction, converged, best = np.inf, 1.0, False, None
     for _ in range(MAX_ITERATIONS):
         trial = numbers.copy()
-        trial[indices] = np.clip(numbers + fraction * step, *_parameter_bounds(numbers.size))[
-            indices
-        ]
+        trial[indices] = np.clip(numbers + fraction * step, *bounds)[indices]
         found = Expansion.of(pieces, trial, level - fraction * level_step, kind, shape)
         new_cost = found.residuals @ found.residuals + np.sum((prior * trial[indices]) ** 2)
         if not (found.converged and new_cost <= cost * (1 + 1e-15)):
@@ -597,18 +595,16 @@ def _search(
             continue
         numbers, level, cost, fraction, best = trial, found.level, new_cost, 1.0, found
         level_column, columns = found.rows[:, LEVEL], found.rows[:, free]
-        reduced = Levels(pieces.first, level_column).left(
-            np.column_stack([columns, found.residuals])
-        )
+        rows = np.column_stack([columns, found.residuals])
+        reduced = Levels(pieces.first, level_column).left(rows)
         prior_rows = np.column_stack([np.diag(prior), prior * numbers[indices]])
         free_step = least_squares_step(reduced, prior_rows)
         step = np.zeros(numbers.size)
         step[indices] = free_step
         level_step = pieces.project(level_column, found.residuals + columns @ free_step)
         predicted = np.linalg.norm(reduced[:, :-1] @ free_step)
-        if converged := bool(
-            predicted <= STEP_TOLERANCE * start.noise + 1e-14 * np.linalg.norm(level_column)
-        ):
+        rounding = 1e-14 * np.linalg.norm(level_column)
+        if converged := bool(predicted <= STEP_TOLERANCE * start.noise + rounding):
             break
     best = best or found
     return replace(best, prior=prior_weight, converged=converged and best.converged)
@@ -656,10 +652,10 @@ def fit_law(
     >>> print(f"{found.a:.6e} {found.b:.6e}")
     2.000000e-08 1.000000e-06
     """
-    known = np.array([(widths or {}).get(column, np.inf) for column in free])
-    begin = None if start is None else np.array(start, float)
+    prior_widths = np.array([(widths or {}).get(column, np.inf) for column in free])
+    first_parameters = None if start is None else np.array(start, float)
     with np.errstate(all="ignore"):
-        return _search(pieces, begin, known, tuple(free), kind, shape)
+        return _search(pieces, first_parameters, prior_widths, tuple(free), kind, shape)
 
 
 def further_columns(about: Expansion, kind: str, times: np.ndarray) -> np.ndarray:

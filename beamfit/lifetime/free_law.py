@@ -329,7 +329,7 @@ def log_outgassing_prior(share, gas, pace):
 # A disturbance is combined only with noises whose log likelihood is within this of the best.
 LOG_LIKELIHOOD_RANGE = 3.0
 # Fewer readings determine no noise level in addition to a curve as free as the law.
-MIN_READINGS = 10
+MIN_DISTURBED_READINGS = 10
 # Smallest relative noise of a measured record: DC current transformers resolve 1e-6. A record with
 # less was computed, and has no disturbance.
 MIN_NOISE = 1e-7
@@ -1093,8 +1093,8 @@ class FreeLaw:
     @property
     def addition(self) -> str | None:
         """Name of the probable variation in addition to the quoted a and b, one of `ADDITIONS`."""
-        likely = (name for name in ADDITIONS if getattr(self, name) > MORE_PROBABLE)
-        return next(likely, None) if self.is_preferred else None
+        probable = (name for name in ADDITIONS if getattr(self, name) > MORE_PROBABLE)
+        return next(probable, None) if self.is_preferred else None
 
     def curve(self, time: np.ndarray) -> np.ndarray:
         """Mean readings of the monitor at times in s, mA."""
@@ -1195,7 +1195,7 @@ def proposals(reduced: ReducedDecay) -> list[LawProposal]:
     free = [*CONSTANT, POWER, CHANGE] if reduced.drifts else [*CONSTANT, POWER]
     laws = [LawProposal.of(reduced, free)]
     laws += [LawProposal.of(reduced, [*CONSTANT, CHANGE, PACE])] if reduced.drifts else []
-    if reduced.products.count < MIN_READINGS or reduced.noise_level < MIN_NOISE:
+    if reduced.products.count < MIN_DISTURBED_READINGS or reduced.noise_level < MIN_NOISE:
         return laws
     kinds = disturbances(float(np.exp(reduced.start[1, 0])))
     disturbed = [

@@ -174,7 +174,7 @@ MAX_READINGS = 1 << 16
 # this share of the runs are multiples of one length, or if the usual change exceeds this many
 # digits.
 MIN_EQUAL_RUNS, MAX_CHANGE_DIGITS = 0.95, 3.0
-# Runs longer than usual by this factor are real: the current stands still.
+# Runs longer than usual by this factor are kept: there the monitor is stuck.
 LONG_RUN_FACTOR = 5
 # Shortest step of a staircase, in readings; tolerance, in digits, to which steps are equal.
 MIN_STAIR_READINGS, DIGIT_TOLERANCE = 3, 1e-6
