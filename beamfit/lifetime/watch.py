@@ -24,11 +24,11 @@ from beamfit.lifetime.mechanisms import added, loss_coefficients, terms_of
 from beamfit.lifetime.pieces import DROPOUT, FEWEST, split_record
 from beamfit.lifetime.record import PLAUSIBLE, Conditions, DecayRecord
 from beamfit.lifetime.study import (
-    CHANGED,
+    SETTING_STEP,
     Decay,
     Machine,
-    at_settings,
     operation_during,
+    split_at_settings,
 )
 from beamfit.quantity import Quantity, Status
 
@@ -163,7 +163,7 @@ def fit_window(rows: Sequence[WindowRow], name: str, law: Law = Law.free) -> Win
     decays = [
         decay
         for piece in _pieces(rows, name)
-        for section in at_settings(piece)
+        for section in split_at_settings(piece)
         for decay in split_record(section).segments
     ]
     if not decays:
@@ -305,7 +305,7 @@ def _terms(machine: Machine, before: Terms | None, row: WindowRow) -> Terms:
     moment = DecayRecord([0.0, 1.0], row.current * np.array([1.0, 1 - 1e-6]), conditions=at)
     operation = operation_during(moment, machine)
     place = np.array([row.current, *row.settings._replace(pressure=0.0)])
-    if before and np.allclose(place, before.place, rtol=CHANGED, atol=0.0, equal_nan=True):
+    if before and np.allclose(place, before.place, rtol=SETTING_STEP, atol=0.0, equal_nan=True):
         place, parts = before.place, before.parts
     else:
         parts = terms_of(machine.ring, operation, row.current)
