@@ -15,8 +15,8 @@ from matplotlib.figure import FigureBase
 from beamfit.answer import Table, labelled
 from beamfit.errors import InputError
 from beamfit.lifetime import tables
-from beamfit.lifetime.alarm import when
-from beamfit.lifetime.course import MOST_PARTS, Trend
+from beamfit.lifetime.alarm import time_label
+from beamfit.lifetime.course import MAX_PARTS, Trend
 from beamfit.lifetime.fit import DecayFit
 from beamfit.lifetime.ring_study import Shift
 from beamfit.lifetime.study import Decay, RecordStudy
@@ -336,9 +336,7 @@ def _cycle_lifetimes(fit: DecayFit) -> tuple[np.ndarray, np.ndarray, np.ndarray]
     columns = np.column_stack([record.time, fit.residuals])
     mean = np.add.reduceat(columns, first) / lengths[:, None]
     since, residual = (columns - np.repeat(mean, lengths, axis=0)).T
-    part = first[
-        np.linspace(0, first.size, min(first.size, MOST_PARTS), endpoint=False).astype(int)
-    ]
+    part = first[np.linspace(0, first.size, min(first.size, MAX_PARTS), endpoint=False).astype(int)]
     count = np.diff(part, append=len(record))
     at, level = (np.add.reduceat(v, part) / count for v in (record.time, record.current))
     squares = np.add.reduceat(since**2, part)
@@ -437,7 +435,7 @@ def _relative(trend: Trend) -> bool:
 def trend_picture(trend: Trend) -> Picture:
     """The picture of a page."""
     height = 5.4 if _relative(trend) else 2.6
-    ends = [when(point.time, trend.dated) for point in trend.points[:1] + trend.points[-1:]]
+    ends = [time_label(point.time, trend.dated) for point in trend.points[:1] + trend.points[-1:]]
     source = f"{len(trend.points)} decays, {' to '.join(ends)}"
     return Picture("course of the lifetime", height, partial(draw_trend, trend=trend), source)
 
