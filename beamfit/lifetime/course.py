@@ -16,7 +16,7 @@ from beamfit.lifetime.alarm import WANDER, Alarm, Reference, alarms_of, time_lab
 from beamfit.lifetime.alternatives import constant_a
 from beamfit.lifetime.fit import DecayFit, bare
 from beamfit.lifetime.mechanisms import Losses, loss_coefficients
-from beamfit.lifetime.scales import by_losses, summarise, widened
+from beamfit.lifetime.scales import add_errors, loss_part_slopes, summarise
 from beamfit.lifetime.study import Decay, Machine, RecordStudy
 from beamfit.quantity import HOUR, Quantity, Status, percent, relative_change
 from beamfit.statistics import (
@@ -340,19 +340,20 @@ def reference_of(
     if not root.any():  # cycles fitted together have no exponent
         return None
     typical_current = float(np.median(current))
-    rows, ring_row = by_losses(a * current * (current / typical_current) ** power, b), np.zeros(2)
+    rows = loss_part_slopes(a * current * (current / typical_current) ** power, b)
+    ring_row = np.zeros(2)
     if ring is not None:
         parts_scale = parts[0, 1] / float(ring.a * current[0] + ring.b)
         ring_row = np.array([1 / float(ring.a), -1 / float(ring.b)]) / parts_scale / RATIO_ERROR
     coefficients, _ = _fit_loss(rows, parts, root, ring_row)
     quadratic = np.clip(parts[:, 0], 0.0, parts[:, 1])
-    slopes = by_losses(quadratic, parts[:, 1] - quadratic)
+    slopes = loss_part_slopes(quadratic, parts[:, 1] - quadratic)
     residual = parts[:, 1] - (rows @ coefficients)[:, 1]
     share = np.sum(slopes[:, 1] ** 2, axis=1).mean()
     # One more decay, off by an ordinary day's wander, regularises the variance of few decays.
     wander = float(residual @ residual) / share + WANDER**2
     wander = math.sqrt(wander / max(residual.size - 1, 1))
-    root = np.asarray(widened(root, wander * slopes))
+    root = np.asarray(add_errors(root, wander * slopes))
     coefficients, jacobian = _fit_loss(rows, parts, root, ring_row)
     if not (np.isfinite(coefficients).all() and coefficients.min() > 0):
         return None

@@ -339,7 +339,7 @@ def fit_loss_network(
     outputs = [Port(name, "", scale=CORRECTION) for name in OUTPUTS]
     net, free = signed_network("map", ports, outputs, RISING, hidden, seed, MOST)
     terms, measured = corrected.decays.terms, corrected.decays.measured
-    weight, _, _, change = corrected.about(corrected.decays)
+    weight, _, _, change = corrected.linearise(corrected.decays)
     losses = np.array(scaled_losses(jnp.asarray(corrected.vector), terms), float)
     base, whole = jnp.log(losses.T), block_diag(*weight)
     seen = whole @ np.asarray(measured.parts).ravel()

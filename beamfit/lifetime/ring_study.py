@@ -35,15 +35,15 @@ from beamfit.lifetime.mechanisms import (
 from beamfit.lifetime.record import DecayRecord
 from beamfit.lifetime.ring import Operation
 from beamfit.lifetime.scales import (
-    LIKELY,
+    MENTION_PROBABILITY,
     VOLTAGE,
     DecaySet,
     ScaleFit,
     Summaries,
+    add_errors,
     fit_scales,
     information_root,
     loss_parts,
-    widened,
 )
 from beamfit.lifetime.study import Decay, Machine, settings_json, settings_of
 from beamfit.quantity import HOUR, Quantity, Status, percent
@@ -91,14 +91,14 @@ def _linearised(fit: ScaleFit, decays: Sequence[Decay]) -> tuple[np.ndarray, np.
     a and of b of each decay, (k, 2n, n, 2).
     """
     together = DecaySet.of(decays, fit.machine, fit.decays.pressure_error, fit.voltages)
-    _, off, rows, change = fit.about(together)
+    _, off, rows, change = fit.linearise(together)
     count, noise, found = 2 * len(decays), fit.noise, []
     whole = block_diag(*change).reshape(count, -1, 2)
     for k in range(noise.weight.size):
-        by_scales = (rows @ noise.half[k]).reshape(count, -1)
+        by_scales = (rows @ noise.covariance_root[k]).reshape(count, -1)
         scattered = (whole * noise.scatter[k]).reshape(count, -1)
         moved = (off + rows @ (noise.shift[k] - noise.centre)).ravel()
-        whiten = np.asarray(widened(np.eye(count), np.hstack([by_scales, scattered])))
+        whiten = np.asarray(add_errors(np.eye(count), np.hstack([by_scales, scattered])))
         found.append((-whiten @ moved, np.tensordot(whiten, whole, 1)))
     return tuple(map(np.array, zip(*found, strict=True)))
 
@@ -288,10 +288,10 @@ def _rows(fit: ScaleFit, candidate: DecayCandidate) -> np.ndarray:
     one = terms._replace(current=mean), summary
     alone = jax.tree.map(lambda part: jnp.asarray(part)[None], one)
     one = DecaySet(*alone, fit.decays.pressure_error)
-    *_, [rows], [change] = fit.about(one)
+    *_, [rows], [change] = fit.linearise(one)
     # A new decay scatters as the likeliest noise says.
-    scattered = change * fit.noise.scatter[fit.noise.likeliest]
-    return np.asarray(widened(np.eye(2), scattered)) @ rows
+    scattered = change * fit.noise.scatter[fit.noise.most_probable]
+    return np.asarray(add_errors(np.eye(2), scattered)) @ rows
 
 
 def next_decays(fit: ScaleFit, candidates: Sequence[DecayCandidate]) -> tuple[Proposal, ...]:
@@ -523,7 +523,7 @@ def predict_held_back(fit: ScaleFit) -> tuple[HeldBack, ...]:
     9.82 ± 0.14 h predicted, 9.730669 ± 0.000098 h measured
     """
     measured, noise, found = fit.decays.measured, fit.noise, []
-    weight, left, rows, change = fit.about(fit.decays)
+    weight, left, rows, change = fit.linearise(fit.decays)
     for k, name in enumerate(fit.names):
         root = np.asarray(measured.root[k])
         if not np.any(root):
@@ -532,7 +532,7 @@ def predict_held_back(fit: ScaleFit) -> tuple[HeldBack, ...]:
         each = [
             _left_out(
                 left[k] + rows[k] @ (noise.shift[i] - noise.centre),
-                rows[k] @ noise.half[i],
+                rows[k] @ noise.covariance_root[i],
                 change[k] * noise.sizes(i, len(fit.names))[k],
                 change[k] * noise.scatter[i],
             )
@@ -545,7 +545,7 @@ def predict_held_back(fit: ScaleFit) -> tuple[HeldBack, ...]:
         # By some noises a decay may alone tell of something.
         told = square - error**2 < (DETERMINED * rate) ** 2
         weight_told = noise.weight * told
-        if not weight_told.sum() > LIKELY:
+        if not weight_told.sum() > MENTION_PROBABILITY:
             continue
         low, high = quantiles(weight_told / weight_told.sum(), off, np.sqrt(square), CENTRAL)
         middle, spread = (low + high) / 2, (high - low) / 2

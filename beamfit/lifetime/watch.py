@@ -326,9 +326,7 @@ def _reference(window: Window, machine: Machine | None) -> alarm.Reference | Non
 
 def _terms(machine: Machine, before: RingTerms | None, row: WindowRow) -> RingTerms:
     """Losses of the ring at the settings of a row; terms are reused if only the pressure moved."""
-    settings = Conditions(
-        *(None if math.isnan(value) else [value, value] for value in row.settings)
-    )
+    settings = Conditions(*(None if math.isnan(v) else [v, v] for v in row.settings))
     instant = DecayRecord([0.0, 1.0], row.current * np.array([1.0, 1 - 1e-6]), conditions=settings)
     operation = operation_during(instant, machine)
     point = np.array([row.current, *row.settings._replace(pressure=0.0)])
@@ -367,11 +365,8 @@ def follow_settings(
     except InputError:  # ignore settings at which the ring stores no beam
         return active
     new, old = ring.losses / active.losses, np.array(active.expected)
-    share = (
-        1.0
-        if np.abs(new / old - 1).max() > alarm.EXPECTATION_STEP
-        else min(elapsed / SMOOTHING_TIME, 1.0)
-    )
+    is_step = np.abs(new / old - 1).max() > alarm.EXPECTATION_STEP
+    share = 1.0 if is_step else min(elapsed / SMOOTHING_TIME, 1.0)
     a, b = old + share * (new - old)
     return active._replace(ring=ring, expected=(float(a), float(b)))
 
@@ -600,9 +595,8 @@ def _add_to_row(plan: Plan, state: State, clock: float, value: float) -> State:
     state, time = state._replace(last=clock), clock - state.shift
     if not value > DROPOUT * state.highest:
         if state.dead + 1 == CONFIRMING_READINGS:
-            state = add_event(_begin_piece(plan, state), time, "the beam was lost")._replace(
-                zero=0.0
-            )
+            state = add_event(_begin_piece(plan, state), time, "the beam was lost")
+            state = state._replace(zero=0.0)
         zero = max(state.zero, abs(value)) if state.dead >= CONFIRMING_READINGS else state.zero
         return state._replace(dead=state.dead + 1, zero=zero)
     if state.dead >= CONFIRMING_READINGS:
@@ -639,9 +633,8 @@ def _refit(plan: Plan, state: State) -> State:
     begin, shift = state.last - plan.window, state.shift
     state = _drop_before(state, begin)
     none = Window(None, None, 0, "no beam")
-    law = (
-        Law.free if plan.machine is None else Law.constant
-    )  # first principles give the shape of the loss
+    # With a ring, first principles give the loss at other currents.
+    law = Law.free if plan.machine is None else Law.constant
     window = fit_window(state.rows, plan.name, law) if state.dead < CONFIRMING_READINGS else none
     answer = _answer(plan, state, window)
     found = answer.lifetime
@@ -651,9 +644,9 @@ def _refit(plan: Plan, state: State) -> State:
     if not course or point.time - course[-1].time >= plan.window / MAX_POINTS:
         course = (*course, point)
     fit = window.fit
-    reference = (
-        None if state.alarms else learn_reference(state.alarm, window, state.rows, plan.machine)
-    )
+    learnt = None
+    if not state.alarms:
+        learnt = learn_reference(state.alarm, window, state.rows, plan.machine)
     return state._replace(
         answer=answer,
         course=course,
