@@ -169,7 +169,7 @@ CORRECTION, MOST = 0.3, 10.0
 # model's error is correlated over so much of that, chosen on simulated shifts.
 SHORTEST, LENGTH = 0.1, 0.8
 # Voltages that are looked at, for a maximum or for the longest lifetime.
-VOLTAGES = 65
+N_VOLTAGES = 65
 
 
 @shown
@@ -370,7 +370,7 @@ def _single_maximum(
 ) -> bool:
     """Look along the voltage at every corner of the other settings."""
     corners = itertools.product(*zip(low[1:], high[1:], strict=True))
-    voltages, scales = np.linspace(low[0], high[0], VOLTAGES), corrected.vector
+    voltages, scales = np.linspace(low[0], high[0], N_VOLTAGES), corrected.vector
     true = 1e6 * voltages * (1.0 if corrected.voltages is None else scales[len(SCALES)])
     for scraper, pressure, bunches in corners:
         operation = corrected.machine.operation._replace(
@@ -381,7 +381,7 @@ def _single_maximum(
         )
         terms = terms_along(corrected.machine.ring, operation, current, true)
         base = jnp.log(jnp.stack(scaled_losses(scales, terms), axis=1))
-        rest = np.tile([scraper, pressure, bunches], (VOLTAGES, 1))
+        rest = np.tile([scraper, pressure, bunches], (N_VOLTAGES, 1))
         inputs = jnp.asarray(np.column_stack([voltages, rest]))
         a, b = np.exp(np.asarray(_logs(fit.model, (inputs, base)))).T
         turns = np.diff(np.sign(np.diff(a * current + b)))
