@@ -24,7 +24,7 @@ from beamfit.greybox.mlp import MLP, Port
 from beamfit.greybox.problem import Prior, Problem, Record
 from beamfit.greybox.signed_network import GainCertificate, certificate_of, signed_network
 from beamfit.greybox.solve import solve
-from beamfit.lifetime.mechanisms import SCALES, scaled_losses, terms_along
+from beamfit.lifetime.mechanisms import SCALES, scaled_losses, terms_at_voltages
 from beamfit.lifetime.ring import Operation
 from beamfit.lifetime.scales import ScaleFit, loss_parts
 from beamfit.lifetime.study import Decay, settings_of
@@ -379,7 +379,7 @@ def _single_maximum(
             pressure_slope=0.0,
             bunches=np.exp(bunches),
         )
-        terms = terms_along(corrected.machine.ring, operation, current, true)
+        terms = terms_at_voltages(corrected.machine.ring, operation, current, true)
         base = jnp.log(jnp.stack(scaled_losses(scales, terms), axis=1))
         rest = np.tile([scraper, pressure, bunches], (N_VOLTAGES, 1))
         inputs = jnp.asarray(np.column_stack([voltages, rest]))

@@ -30,7 +30,7 @@ from beamfit.lifetime.mechanisms import (
     LossTerms,
     scaled_losses,
     scaled_parts,
-    terms_along,
+    terms_at_voltages,
 )
 from beamfit.lifetime.record import DecayRecord
 from beamfit.lifetime.ring import Operation
@@ -454,7 +454,7 @@ def best_operating_point(
     ends = max(low * ratio.min(), 1.01 * loss), max(high, low) * ratio.max()
     for _ in range(2):
         voltages = np.linspace(*ends, N_VOLTAGES)
-        terms = terms_along(fit.machine.ring, open_settings, current, jnp.asarray(voltages))
+        terms = terms_at_voltages(fit.machine.ring, open_settings, current, jnp.asarray(voltages))
         true = voltages[np.argmin(jax.vmap(_rate, (0, None))(jnp.asarray(draws), terms), axis=1)]
         step = voltages[1] - voltages[0]
         ends = max(voltages[0], true.min() - step), min(voltages[-1], true.max() + step)

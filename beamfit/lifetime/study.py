@@ -39,7 +39,7 @@ from beamfit.lifetime.readings import (
     without_summer_time,
 )
 from beamfit.lifetime.record import DecayRecord
-from beamfit.lifetime.ring import MeasuredLength, Operation, Ring, stored_bunch, unstored
+from beamfit.lifetime.ring import MeasuredLength, Operation, Ring, required_voltage, stored_bunch
 from beamfit.lifetime.systematics import (
     OneLifetime,
     Systematic,
@@ -202,7 +202,7 @@ def operation_during(record: DecayRecord, machine: Machine) -> Operation:
             raise InputError(f"{name} {value:g}", "above zero", path=record.name, column=name)
     if "rf_voltage" in medians:
         operation = operation._replace(rf_voltage=medians["rf_voltage"])
-        expected = unstored(operation, machine.ring.energy_loss, machine.ring.energy)
+        expected = required_voltage(operation, machine.ring.energy_loss, machine.ring.energy)
         if expected is not None:
             found = f"{medians['rf_voltage'] / 1e3:.6g} kV"
             raise InputError(found, expected, path=record.name, column="rf_voltage_kV")

@@ -21,7 +21,7 @@ from beamfit.lifetime.cycles import alike, joined
 from beamfit.lifetime.evidence import UNITS
 from beamfit.lifetime.fit import DecayFit, bare, fit_decay, fit_pieces
 from beamfit.lifetime.free_law import Law
-from beamfit.lifetime.mechanisms import added, loss_coefficients, terms_of
+from beamfit.lifetime.mechanisms import loss_coefficients, losses_from_terms, mechanism_terms
 from beamfit.lifetime.pieces import DROPOUT, FEWEST, split_record
 from beamfit.lifetime.record import PLAUSIBLE, Conditions, DecayRecord
 from beamfit.lifetime.study import (
@@ -230,7 +230,7 @@ class RingTerms(NamedTuple):
     point : array
         Current, mA, and settings for which the terms were computed.
     terms : tuple
-        Terms without and per pressure, of `terms_of`.
+        Terms of the mechanisms, from `mechanism_terms`.
     losses : array, shape (2,)
         a, 1/(mA s), and b, 1/s.
     """
@@ -333,8 +333,8 @@ def _terms(machine: Machine, before: RingTerms | None, row: WindowRow) -> RingTe
     if before and np.allclose(point, before.point, rtol=SETTING_STEP, atol=0.0, equal_nan=True):
         point, terms = before.point, before.terms
     else:
-        terms = terms_of(machine.ring, operation, row.current)
-    losses = added(terms, operation.pressure_base, operation.pressure_slope)
+        terms = mechanism_terms(machine.ring, operation, row.current)
+    losses = losses_from_terms(terms, operation.pressure_base, operation.pressure_slope)
     return RingTerms(point, terms, np.array([losses.a, losses.b], float))
 
 
