@@ -139,7 +139,7 @@ def _side_by_side(decays: Sequence[Decay]) -> list[Table]:
 
 def _single(decays: Sequence[Decay]) -> list[Table]:
     """Every number of a few decays; the main numbers of many, one row each."""
-    if len(decays) > tables.FEW:
+    if len(decays) > tables.MAX_FULL_DECAYS:
         result, *more = tables.overview(decays)
         return [result._replace(note=ERRORS), *more]
     listed = _side_by_side(decays)
@@ -150,9 +150,9 @@ def _single(decays: Sequence[Decay]) -> list[Table]:
 
 def _verdicts(decays: Sequence[Decay]) -> list[Verdict]:
     """Verdict of each decay; of many decays one for each distinct message."""
-    if len(decays) <= tables.FEW:
+    if len(decays) <= tables.MAX_FULL_DECAYS:
         return [_verdict(decay) for decay in decays]
-    return [Verdict(status, who, message) for status, who, message in tables.alike(decays)]
+    return [Verdict(*verdict) for verdict in tables.distinct_verdicts(decays)]
 
 
 def _verdict(decay: Decay) -> Verdict:
@@ -395,7 +395,7 @@ def draw_budget(figure: FigureBase, decays: Sequence[Decay]) -> None:
             hollow = "white" if found.error is None else "black"
             axes.errorbar(1 / found.value, y, xerr=error, fmt="D", color="black", mfc=hollow, ms=5)
     axes.errorbar([], [], fmt="D", color="black", ms=5, label="measured")
-    names = tables.numbered(shown)
+    names = tables.short_names(shown)
     axes.set_yticks(place, [names[decay.fit.record] for decay in shown])
     more = f", {MOST_DRAWN} of {len(decays)} decays" if len(decays) > MOST_DRAWN else ""
     axes.set(title=f"computed losses{more}", xlabel="loss rate at the mean current, 1/h")
