@@ -195,25 +195,25 @@ class LifetimeLaw:
         return ", ".join(f"{lifetime} at {current:.4g} mA" for current, lifetime in pairs)
 
 
-def lifetime_law(about: Expansion, independent: bool, free: bool) -> LifetimeLaw | None:
+def lifetime_law(expansion: Expansion, independent: bool, free: bool) -> LifetimeLaw | None:
     """Compute lifetimes by current from a law with a power of the current in a, fitted (`free`) or
-    as it is in `about`.
+    as it is in `expansion`.
 
     None if the fit of the power does not converge.
     """
     if free:
-        about = fit_law(_average_neighbours(about), (*PLAIN, POWER))
-        if not about.converged:
+        expansion = fit_law(_average_neighbours(expansion), (*PLAIN, POWER))
+        if not expansion.converged:
             return None
-    (span, mean), current = about.pieces.units, about.pieces.current
+    (span, mean), current = expansion.pieces.units, expansion.pieces.current
     x = np.geomspace(current.min(), current.max(), CURRENTS) / mean
 
     def rates(level, loss, quadratic, power):
         rates_found = (quadratic * x ** (1 + power) + loss - quadratic) / span
         return np.append(rates_found, power)
 
-    columns = about.columns(*[POWER] * free)
-    (*rates_found, power), errors = about.propagate(rates, columns, independent)
+    columns = expansion.columns(*[POWER] * free)
+    (*rates_found, power), errors = expansion.propagate(rates, columns, independent)
     exponent = Quantity(float(power), float(errors[-1]) if free else None, "1")
     lifetimes = (
         lifetime_of(*pair, clear=True) for pair in zip(rates_found, errors[:-1], strict=True)
@@ -416,9 +416,9 @@ def best_alternative(plain: Expansion) -> BestAlternative | None:
     return BestAlternative(explain[kind](best), log - smooth, scatter, best, kind)
 
 
-def _average_neighbours(about: Expansion) -> Pieces:
+def _average_neighbours(expansion: Expansion) -> Pieces:
     """Average neighbouring readings of a long decay, corrected for the bend of the law."""
-    pieces, (i0, a, b, *_) = about.pieces, about.values
+    pieces, (i0, a, b, *_) = expansion.pieces, expansion.values
     if pieces.time.size <= MAX_ROWS or pieces.first.size > 1 or pieces.gauge is not None:
         return pieces
     record = DecayRecord(pieces.time, pieces.current, pieces.error)
@@ -498,23 +498,23 @@ def _first_times(pieces: Pieces, kind: str) -> np.ndarray:
     return between[few.astype(int)]
 
 
-def _best_times(about: Expansion, one: Alternative) -> tuple[np.ndarray, np.ndarray]:
+def _best_times(expansion: Expansion, one: Alternative) -> tuple[np.ndarray, np.ndarray]:
     """Find sizes and times of further losses that explain most, in linear approximation about a
     law.
 
     They replace the further losses that the law has.
     """
-    basis = np.linalg.qr(about.reduced[:, [LEVEL, *PLAIN]])[0]
+    basis = np.linalg.qr(expansion.reduced[:, [LEVEL, *PLAIN]])[0]
 
     def orthogonal(columns: np.ndarray) -> np.ndarray:
         return columns - basis @ (basis.T @ columns)
 
-    residuals = about.residuals - about.rows[:, FURTHER::2] @ about.numbers[FURTHER - 1 :: 2]
-    grid = _first_times(about.pieces, one.kind)
-    residual, windows = orthogonal(residuals), [grid] * one.count
+    further = expansion.rows[:, FURTHER::2] @ expansion.numbers[FURTHER - 1 :: 2]
+    grid = _first_times(expansion.pieces, one.kind)
+    residual, windows = orthogonal(expansion.residuals - further), [grid] * one.count
     for _ in range(GRIDS):
         times_tried = np.concatenate(windows)
-        slopes = orthogonal(further_columns(about, one.kind, times_tried))
+        slopes = orthogonal(further_columns(expansion, one.kind, times_tried))
         size = np.linalg.norm(slopes, axis=0) + 1e-300
         projections, products = slopes.T @ residual / size, slopes.T @ slopes / size / size[:, None]
         groups = np.split(np.arange(times_tried.size), one.count)

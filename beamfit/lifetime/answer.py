@@ -96,7 +96,7 @@ class TableEvidence(NamedTuple):
 
 
 def _search_failed(e: Evidence) -> Finding | None:
-    if e.about.converged:
+    if e.expansion.converged:
         return None
     cause = "The search found no finite minimum: look at the record for steps."
     return Finding(Status.not_finite, cause)
@@ -494,7 +494,7 @@ def finding_of_cycles(
     evidence: Evidence, monitor: Monitor | None, left_out: Sequence[str]
 ) -> Finding:
     """Status and sentences of cycles fitted together; `left_out` says what was not fitted."""
-    found, current = judge(evidence, CYCLE_RULES), evidence.about.pieces.current
+    found, current = judge(evidence, CYCLE_RULES), evidence.expansion.pieces.current
     between = f"between {current.min():.4g} and {current.max():.4g} mA"
     first = f"One answer from {evidence.cycles} cycles {between}"
     remarks = [
@@ -563,7 +563,7 @@ def _slow_residuals(e: Evidence) -> str | None:
     local = noise_of(record.time, record.current)
     rms = float(np.std(e.residuals)) if rival is None else rival.scatter
     short = length is not None and length < record.span / 3
-    if not e.about.has_memory or short or rms < SLOW_RESIDUAL_RATIO * local:
+    if not e.expansion.has_memory or short or rms < SLOW_RESIDUAL_RATIO * local:
         return None
     return (
         f"Neighbouring readings scatter by {local:.2g} mA alone: the loss rate or the monitor "

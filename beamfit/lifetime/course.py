@@ -406,9 +406,9 @@ def _noise(fit: DecayFit, power: float) -> tuple[float, float, float, float]:
     interval, time = float(np.median(np.diff(fit.readings.time))), fit.correlation_time or 0.0
     correlation, residuals = fit.identifiability.residual_correlation or 0.0, fit.residuals
     if power and fit.first is None:
-        about = fit.with_power(power)
-        residuals, found = about.current_residuals, about.memory(about.columns(), False)
-        time = found.noise.time if about.has_memory else 0.0
+        expansion = fit.with_power(power)
+        residuals, found = expansion.current_residuals, expansion.memory(expansion.columns(), False)
+        time = found.noise.time if expansion.has_memory else 0.0
         correlation = (1 - found.noise.white) * math.exp(-interval / time) if time else 0.0
     white = 1 - correlation * math.exp(interval / time) if correlation else 0.0
     noise = math.sqrt(float(np.mean(np.diff(residuals) ** 2)) / (2 * (1 - correlation)))

@@ -214,39 +214,39 @@ def _outliers(values: np.ndarray) -> np.ndarray:
     return np.zeros(values.size, bool)
 
 
-def _odd_cycles(about: Expansion) -> np.ndarray:
+def _odd_cycles(expansion: Expansion) -> np.ndarray:
     """Flag cycles whose loss rate is far off that of the cycles near them, unless a neighbour has
     the same.
 
     Two cycles with the same rate may be a part of a course.
     """
-    first, slope, residual = about.pieces.first, about.reduced[:, LOSS], about.reduced[:, -1]
+    first, reduced = expansion.pieces.first, expansion.reduced
+    slope, residual = reduced[:, LOSS], reduced[:, -1]
     squares = np.add.reduceat(slope**2, first)
     rate = -np.add.reduceat(slope * residual, first) / squares
     windows = sliding_window_view(
         np.pad(rate, REFERENCE_NEIGHBOURS // 2, mode="reflect"), REFERENCE_NEIGHBOURS
     )
-    off = rate - np.median(
-        np.delete(windows, REFERENCE_NEIGHBOURS // 2, axis=1), axis=1
-    )  # without itself
+    others = np.delete(windows, REFERENCE_NEIGHBOURS // 2, axis=1)
+    off = rate - np.median(others, axis=1)
     differences = np.pad(np.abs(np.diff(rate)), 1, constant_values=np.inf)
     isolated = np.minimum(differences[:-1], differences[1:]) > 0.5 * np.abs(off)
     return _outliers(off * np.sqrt(squares)) & isolated
 
 
-def _edge_excess(about: Expansion) -> np.ndarray:
+def _edge_excess(expansion: Expansion) -> np.ndarray:
     """Mean excess of the first and of the last readings of all cycles over their neighbours in the
     cycle, in standard errors.
 
     Fresh beam decays faster: the first reading lies above. Within an injection the first reading
     lies below, the last above.
     """
-    first, lengths = about.pieces.first, about.pieces.lengths
+    first, lengths = expansion.pieces.first, expansion.pieces.lengths
     is_long = lengths > REFERENCE_NEIGHBOURS
     edges = np.array([first[is_long], (first + lengths - 1)[is_long]])
     if edges.shape[1] < MIN_CYCLES:
         return np.zeros(2)
-    excess = -about.reduced[:, -1]
+    excess = -expansion.reduced[:, -1]
     scatter = max(1.4826 * float(np.median(np.abs(excess))), 1e-300)
     inward = np.array([[1], [-1]])[..., None] * np.arange(1, REFERENCE_NEIGHBOURS)
     differences = excess[edges] - excess[edges[..., None] + inward].mean(axis=2)
@@ -256,20 +256,20 @@ def _edge_excess(about: Expansion) -> np.ndarray:
     )
 
 
-def _settling_readings(about: Expansion, most: int) -> tuple[int, bool]:
+def _settling_readings(expansion: Expansion, most: int) -> tuple[int, bool]:
     """Number of readings at the start of a cycle, at most `most`, until fresh beam or the monitor
     has settled, and whether they are high.
 
     Exponential tails are fitted; the error of their size is taken from its scatter between cycles,
     because the noise may have a memory.
     """
-    pieces, first = about.pieces, about.pieces.first
+    pieces, first = expansion.pieces, expansion.pieces.first
     times = np.geomspace(1.0, max(most / math.log(EDGE_THRESHOLD / FADED), 1.0), TIME_CONSTANTS)
     tails = np.exp(-pieces.index_in_piece[:, None] / times)
-    columns = about.without_levels(tails * pieces.weight[:, None])
-    law = np.linalg.qr(about.reduced[:, about.columns(POWER)])[0]
+    columns = expansion.without_levels(tails * pieces.weight[:, None])
+    law = np.linalg.qr(expansion.reduced[:, expansion.columns(POWER)])[0]
     columns -= law @ (law.T @ columns)
-    sums = np.add.reduceat(-about.reduced[:, [-1]] * columns, first)
+    sums = np.add.reduceat(-expansion.reduced[:, [-1]] * columns, first)
     squares = np.add.reduceat(columns**2, first)
     off = sums - sums.sum(axis=0) / squares.sum(axis=0) * squares
     cycles = first.size
@@ -282,26 +282,26 @@ def _settling_readings(about: Expansion, most: int) -> tuple[int, bool]:
     return min(math.ceil(math.log(size / FADED) * times[best]), most), high
 
 
-def _trim_edges(about: Expansion) -> tuple[Expansion, list[str]]:
+def _trim_edges(expansion: Expansion) -> tuple[Expansion, list[str]]:
     """Fit without readings at the edges of cycles that do not belong to the decay; sentences say
     which.
     """
     cut, high = np.zeros(2, int), 0
-    most = int(np.median(about.pieces.lengths)) // 3
+    most = int(np.median(expansion.pieces.lengths)) // 3
     while cut.max() < most:
-        first_off, last_off = _edge_excess(about)
-        settling, settles_high = _settling_readings(about, most - cut[0])
+        first_off, last_off = _edge_excess(expansion)
+        settling, settles_high = _settling_readings(expansion, most - cut[0])
         head = max(abs(first_off) > EDGE_THRESHOLD, settling)
         cut_now = np.array([head, last_off > EDGE_THRESHOLD], int)
         if not cut_now.any():
             break
         high += max(int(first_off > EDGE_THRESHOLD), settling * settles_high)
-        index, lengths = about.pieces.index_in_piece, about.pieces.lengths
+        index, lengths = expansion.pieces.index_in_piece, expansion.pieces.lengths
         length = np.repeat(lengths, lengths)
         keep = (index >= cut_now[0]) & (index < length - cut_now[1]) | (
             length <= REFERENCE_NEIGHBOURS
         )
-        about = with_course(fit_law(about.pieces.select(keep, MIN_CYCLE_READINGS)))
+        expansion = with_course(fit_law(expansion.pieces.select(keep, MIN_CYCLE_READINGS)))
         cut = cut + cut_now
     sentences = []
     for side, reason in enumerate((FRESH if 2 * high >= cut[0] else SETTLES, WITHIN)):
@@ -311,7 +311,7 @@ def _trim_edges(about: Expansion) -> tuple[Expansion, list[str]]:
                 "reading of each cycle was" if cut[side] == 1 else "readings of each cycle were"
             )
             sentences.append(f"the {which} {of_each} left out: {reason}")
-    return about, sentences
+    return expansion, sentences
 
 
 def clean_cycles(cycles: Pieces) -> tuple[Expansion, tuple[str, ...]]:
@@ -319,19 +319,19 @@ def clean_cycles(cycles: Pieces) -> tuple[Expansion, tuple[str, ...]]:
     say which.
     """
     plain = fit_law(cycles)
-    about, sentences = _trim_edges(with_course(plain))
-    before = about.pieces
+    expansion, sentences = _trim_edges(with_course(plain))
+    before = expansion.pieces
     plain = plain if before is cycles else fit_law(before)
     cut = np.repeat(_odd_cycles(plain), before.lengths)
     if cut.any():
-        about = with_course(fit_law(before.select(~cut, MIN_CYCLE_READINGS)))
-        omitted = before.first.size - about.pieces.first.size
+        expansion = with_course(fit_law(before.select(~cut, MIN_CYCLE_READINGS)))
+        omitted = before.first.size - expansion.pieces.first.size
         were = "cycle was" if omitted == 1 else "cycles were"
         sentences.append(f"{omitted} {were} left out, whose loss rate lies far off the others'")
-    if (outliers := _outliers(about.reduced[:, -1])).any():
+    if (outliers := _outliers(expansion.reduced[:, -1])).any():
         sentences.append(f"{int(outliers.sum())} readings were left out as outliers")
-        about = with_course(fit_law(about.pieces.select(~outliers, MIN_CYCLE_READINGS)))
-    return about, tuple(sentences)
+        expansion = with_course(fit_law(expansion.pieces.select(~outliers, MIN_CYCLE_READINGS)))
+    return expansion, tuple(sentences)
 
 
 # Prior probability that the loss rate changes within a part, as in a machine left alone.
@@ -342,12 +342,12 @@ MIN_PART_CYCLES, MAX_PARTS = 2, 64
 COURSE_STEPS = 3
 
 
-def with_course(about: Expansion) -> Expansion:
+def with_course(expansion: Expansion) -> Expansion:
     """Divide cycles into parts with different loss rates, as far as the readings support it.
 
     Parameters
     ----------
-    about : Expansion
+    expansion : Expansion
         Fit of many cycles with one a and one b.
 
     Returns
@@ -371,24 +371,24 @@ def with_course(about: Expansion) -> Expansion:
     >>> with_course(fit_law(collect_cycles(beam))).parts.first.size
     2
     """
-    if not about.converged or about.level.size < 2 * MIN_PART_CYCLES:
-        return about
-    rate, error = _cycle_rates(about)
+    if not expansion.converged or expansion.level.size < 2 * MIN_PART_CYCLES:
+        return expansion
+    rate, error = _cycle_rates(expansion)
     apart = np.abs(np.diff(rate)) / np.hypot(error[1:], error[:-1])
     error = error * max(1.4826 * float(np.median(apart)), 1e-12)
-    begins = _part_begins(rate, error, abs(float(about.numbers[0])))
-    return _with_parts(about, np.array([0, *begins])) if begins else about
+    begins = _part_begins(rate, error, abs(float(expansion.numbers[0])))
+    return _with_parts(expansion, np.array([0, *begins])) if begins else expansion
 
 
-def _cycle_rates(about: Expansion) -> tuple[np.ndarray, np.ndarray]:
+def _cycle_rates(expansion: Expansion) -> tuple[np.ndarray, np.ndarray]:
     """Departure of the loss of each cycle from the mean, in units of the search, and its error for
     unit noise.
 
     The effect of a power of a, within its prior, on cycles at different currents is subtracted.
     """
-    first, slope = about.pieces.first, about.reduced[:, LOSS]
+    first, slope = expansion.pieces.first, expansion.reduced[:, LOSS]
     squares = np.add.reduceat(slope**2, first)
-    columns = about.reduced[:, [POWER, -1]]
+    columns = expansion.reduced[:, [POWER, -1]]
     power, rate = np.add.reduceat(slope[:, None] * columns, first).T / squares
     power, rate = (part - np.average(part, weights=squares) for part in (power, -rate))
     variance = max(float(squares @ rate**2) / rate.size, 1e-300)
@@ -429,7 +429,7 @@ def _change(rate: np.ndarray, error: np.ndarray, mean: float) -> tuple[float, in
     return float(odds), int(np.argmax(log)) + MIN_PART_CYCLES
 
 
-def _with_parts(about: Expansion, begins: np.ndarray) -> Expansion:
+def _with_parts(expansion: Expansion, begins: np.ndarray) -> Expansion:
     """Expand the law about the mean loss rate and the departures of parts that begin with these
     cycles.
 
@@ -438,25 +438,25 @@ def _with_parts(about: Expansion, begins: np.ndarray) -> Expansion:
     omitted cycle between two parts is shared equally. Departures may be large, so that the
     expansion is repeated `COURSE_STEPS` times.
     """
-    first, time = about.pieces.first[begins], about.pieces.time
+    first, time = expansion.pieces.first[begins], expansion.pieces.time
     count = np.diff(first, append=time.size)
-    durations = np.diff(time[about.pieces.first], append=time[-1])
+    durations = np.diff(time[expansion.pieces.first], append=time[-1])
     usual_duration = float(np.median(durations))
     durations = np.minimum(durations, 2 * usual_duration)
     shared = 0.5 * np.maximum(durations[begins[1:] - 1] - usual_duration, 0.0)
     part_time = np.add.reduceat(durations, begins) + np.append(0.0, shared) - np.append(shared, 0.0)
     shares = np.vstack([np.eye(begins.size - 1), -part_time[:-1] / part_time[-1]])
-    numbers, departure = about.numbers, np.zeros(begins.size)
+    numbers, departure = expansion.numbers, np.zeros(begins.size)
     for _ in range(COURSE_STEPS):
         found = Expansion.of(
-            about.pieces, numbers, about.level, departure=np.repeat(departure, count)
+            expansion.pieces, numbers, expansion.level, departure=np.repeat(departure, count)
         )
         rows = np.column_stack([found.rows, found.rows[:, [LOSS]] * np.repeat(shares, count, 0)])
         slopes = np.pad(found.slopes, ((0, 0), (0, begins.size - 1)))
         parts = Parts(first, shares, departure)
-        found = replace(found, rows=rows, slopes=slopes, parts=parts, prior=about.prior)
+        found = replace(found, rows=rows, slopes=slopes, parts=parts, prior=expansion.prior)
         if not found.converged:  # the law has no value for such a course
-            return about
+            return expansion
         columns = found.columns()
         step = least_squares_step(found.reduced[:, [*columns, -1]], np.zeros((0, len(columns) + 1)))
         numbers, departure = numbers + np.append(step[:2], 0.0), departure + shares @ step[2:]

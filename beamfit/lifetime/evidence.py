@@ -130,7 +130,7 @@ class Evidence:
 
     Parameters
     ----------
-    about : Expansion
+    expansion : Expansion
         The law with constant a and b, or with a given dependence of a.
     law : Law
         Assumption on the law: an exponent of a and a drift of b are free, or constant.
@@ -143,7 +143,7 @@ class Evidence:
         record.
     """
 
-    about: Expansion
+    expansion: Expansion
     law: Law = Law.constant
     shaped: bool = False
     record: DecayRecord | None = None
@@ -152,37 +152,37 @@ class Evidence:
     @property
     def cycles(self) -> int:
         """Number of pieces."""
-        return self.about.level.size
+        return self.expansion.level.size
 
     @property
     def time(self) -> np.ndarray:
         """Times of the readings, s."""
-        return self.about.pieces.time
+        return self.expansion.pieces.time
 
     @property
     def noise_inferred(self) -> bool:
         """True if the noise is taken from the residuals."""
-        return self.about.pieces.error is None
+        return self.expansion.pieces.error is None
 
     @cached_property
     def changed(self) -> bool:
         """True if an alternative, not noise, correlates the residuals of a decay."""
-        return self.cycles == 1 and self.about.has_memory and self.alternative is not None
+        return self.cycles == 1 and self.expansion.has_memory and self.alternative is not None
 
     @cached_property
     def independent(self) -> bool:
         """True if errors of neighbouring readings are taken as independent; never for many cycles,
         whose noise is averaged over its memory.
         """
-        return self.cycles == 1 and (not self.about.has_memory or self.changed)
+        return self.cycles == 1 and (not self.expansion.has_memory or self.changed)
 
     @property
     def has_memory(self) -> bool:
         """True if the residuals are correlated by noise."""
-        return self.about.has_memory and not self.independent
+        return self.expansion.has_memory and not self.independent
 
     def _memory(self, independent: bool, *more: int) -> Memory:
-        return self.about.memory(self.about.columns(*more), independent)
+        return self.expansion.memory(self.expansion.columns(*more), independent)
 
     @cached_property
     def memory(self) -> Memory:
@@ -204,20 +204,20 @@ class Evidence:
         """Posterior over noises, with a power of the current in a."""
         memory = self._memory(self.independent, POWER)
         # Differences of an exact curve are those of the arithmetic.
-        floor = np.sum((EXACT * self.about.pieces.current / self.about.pieces.divisor) ** 2)
+        floor = np.sum((EXACT * self.expansion.pieces.current / self.expansion.pieces.divisor) ** 2)
         return memory._replace(squares=np.maximum(memory.squares, floor))
 
     @cached_property
     def exponent(self) -> AveragedMoments:
         """Power of the current in a, fitted together with the other parameters."""
-        place = np.eye(self.about.rows.shape[1])[[POWER]][:, self.about.columns(POWER)]
-        return self.power_memory.moments(place, self.about.min_factor)
+        place = np.eye(self.expansion.rows.shape[1])[[POWER]][:, self.expansion.columns(POWER)]
+        return self.power_memory.moments(place, self.expansion.min_factor)
 
     @cached_property
     def moments(self) -> AveragedMoments:
         """Shifts of the values by the memory of the noise, with their errors and 95 % reaches."""
-        slopes = self.about.slopes[:, self.about.columns()]
-        found = self.memory.moments(slopes, self.about.min_factor)
+        slopes = self.expansion.slopes[:, self.expansion.columns()]
+        found = self.memory.moments(slopes, self.expansion.min_factor)
         if not self.independent:
             return found
         # The values are those of the search, which has the weak prior.
@@ -226,30 +226,30 @@ class Evidence:
     @cached_property
     def monitor_shifts(self) -> np.ndarray:
         """Shifts of the values by the stated instability of the monitor."""
-        shifts = [self.about.value_shifts(change) for change in self.monitor_changes]
+        shifts = [self.expansion.value_shifts(change) for change in self.monitor_changes]
         return np.linalg.norm(shifts, axis=0) if shifts else np.zeros(len(Physical._fields))
 
     @property
     def monitor_changes(self) -> list[np.ndarray]:
         """Stated instabilities of the monitor, over the errors of readings."""
-        return self.about.pieces.monitor_changes if self.about.converged else []
+        return self.expansion.pieces.monitor_changes if self.expansion.converged else []
 
     @cached_property
     def values(self) -> Physical:
         """Values of the law with constant a and b."""
-        return Physical(*(np.array(self.about.values) + self.moments.shift))
+        return Physical(*(np.array(self.expansion.values) + self.moments.shift))
 
     @cached_property
     def part_shifts(self) -> np.ndarray:
         """Errors of the values because a change of the loss rate may lie anywhere in a cycle."""
-        about = self.about
-        if about.parts is None:
+        expansion = self.expansion
+        if expansion.parts is None:
             return np.zeros(len(Physical._fields))
-        first, lengths = about.pieces.first, about.pieces.lengths
-        share = lengths[np.isin(first, about.parts.first[1:])] / lengths.sum()
+        first, lengths = expansion.pieces.first, expansion.pieces.lengths
+        share = lengths[np.isin(first, expansion.parts.first[1:])] / lengths.sum()
         # Standard deviation of a uniform distribution.
-        shift = np.linalg.norm(np.diff(about.parts.departure) * share) / math.sqrt(12)
-        return np.abs(about.slopes[:, LOSS]) * shift
+        shift = np.linalg.norm(np.diff(expansion.parts.departure) * share) / math.sqrt(12)
+        return np.abs(expansion.slopes[:, LOSS]) * shift
 
     @cached_property
     def errors(self) -> Physical:
@@ -267,8 +267,8 @@ class Evidence:
     @cached_property
     def raw(self) -> Physical:
         """Standard deviations by independent errors, as stated."""
-        slopes = self.about.slopes[:, self.about.columns()]
-        size = 1.0 if self.about.min_factor else self._white_noise
+        slopes = self.expansion.slopes[:, self.expansion.columns()]
+        size = 1.0 if self.expansion.min_factor else self._white_noise
         return Physical(*(size * np.linalg.norm(slopes @ self.white_memory.half[0], axis=1)))
 
     @cached_property
@@ -289,17 +289,18 @@ class Evidence:
     def residuals(self) -> np.ndarray:
         """Model less reading, mA, for the law whose values are quoted."""
         if self.quotes_free_law:
-            return self.free.curve(self.time) - self.about.pieces.current
-        residuals = self.about.residuals
+            return self.free.curve(self.time) - self.expansion.pieces.current
+        residuals = self.expansion.residuals
         if self.cycles == 1 and not self.independent:
-            residuals = residuals + self.about.rows[:, self.about.columns()] @ self.memory.mean_step
-        return residuals * self.about.pieces.divisor
+            rows = self.expansion.rows[:, self.expansion.columns()]
+            residuals = residuals + rows @ self.memory.mean_step
+        return residuals * self.expansion.pieces.divisor
 
     @property
     def rms(self) -> float:
         """Root mean square of the residuals, mA, with a starting current for each cycle."""
         if self.cycles > 1:
-            residuals = self.about.reduced[:, -1] * self.about.pieces.divisor
+            residuals = self.expansion.reduced[:, -1] * self.expansion.pieces.divisor
         else:
             residuals = self.residuals
         return float(np.sqrt(np.mean(residuals**2)))
@@ -313,7 +314,7 @@ class Evidence:
         """
         likely = self.memory.likely
         if self.quotes_free_law or self.memory.white[likely]:
-            return float(np.sum((self.residuals / self.about.pieces.divisor) ** 2))
+            return float(np.sum((self.residuals / self.expansion.pieces.divisor) ** 2))
         return float(self.memory.squares[likely])
 
     @property
@@ -326,12 +327,12 @@ class Evidence:
     @property
     def noise(self) -> float:
         """Factor on stated errors (at least 1), or the noise level in mA."""
-        return max(math.sqrt(self.squares / self.dof), self.about.min_factor)
+        return max(math.sqrt(self.squares / self.dof), self.expansion.min_factor)
 
     @property
     def correlation(self) -> float:
         """Correlation of a and b."""
-        a, b = self.about.slopes[1:3, self.about.columns()] @ self.white_memory.half[0]
+        a, b = self.expansion.slopes[1:3, self.expansion.columns()] @ self.white_memory.half[0]
         return float(a @ b / np.linalg.norm(a) / np.linalg.norm(b))
 
     @property
@@ -352,7 +353,7 @@ class Evidence:
         # The share of a means nothing if the loss rate is not clear of zero.
         names = ("rate_mean", "share")[: 1 + (self.cycles == 1 and self.is_clear("rate_mean"))]
         # Without stated errors the raw errors have the noise level already.
-        size = max(self._white_noise, 1.0) if self.about.min_factor else 1.0
+        size = max(self._white_noise, 1.0) if self.expansion.min_factor else 1.0
         return max(1.0, *(getattr(self.errors, n) / getattr(self.raw, n) / size for n in names))
 
     def normal_equivalent(self, name: str) -> tuple[float, float]:
@@ -461,7 +462,7 @@ class Evidence:
         mean_variance = (1 + memory) / (1 - memory) / half_cycle
         smallest = FOUND_REFILL * self.rms * math.sqrt(2 * min(mean_variance, 1.0))
         cycle_time = 2 * half_cycle * float(np.median(np.diff(self.time)))
-        loss = self.about.pieces.units[1] * rate * cycle_time
+        loss = self.expansion.pieces.units[1] * rate * cycle_time
         return None if loss >= smallest else (loss, smallest)
 
     @property
@@ -487,10 +488,10 @@ class Evidence:
 
         Such a reading alone determines the current there, and hides in the residuals.
         """
-        if self.cycles > 1 or not self.about.converged:
+        if self.cycles > 1 or not self.expansion.converged:
             return False
-        columns = np.linalg.qr(self.about.reduced[:, self.about.columns(POWER)])[0]
-        residuals, dof = self.about.reduced[:, -1], len(columns) - columns.shape[1] - 1
+        columns = np.linalg.qr(self.expansion.reduced[:, self.expansion.columns(POWER)])[0]
+        residuals, dof = self.expansion.reduced[:, -1], len(columns) - columns.shape[1] - 1
         if dof < 1:
             return False
         residuals = residuals - columns @ (columns.T @ residuals)
@@ -502,9 +503,9 @@ class Evidence:
     @cached_property
     def alternative(self) -> BestAlternative | None:
         """Alternative that explains a single decay better than any smooth law."""
-        if self.cycles > 1 or self.shaped or not self.about.converged or self.within_digits:
+        if self.cycles > 1 or self.shaped or not self.expansion.converged or self.within_digits:
             return None
-        return best_alternative(self.about)
+        return best_alternative(self.expansion)
 
     @property
     def within_digits(self) -> bool:
@@ -513,7 +514,7 @@ class Evidence:
         Rounding alone may then explain all residuals.
         """
         digit = None if self.record is None else self.record.resolution
-        off = np.max(np.abs(self.about.current_residuals))
+        off = np.max(np.abs(self.expansion.current_residuals))
         return digit is not None and bool(off <= MIN_STEP_DIGITS / 2 * digit)
 
     @property
@@ -570,11 +571,11 @@ class Evidence:
         """
         if self.law is Law.constant or self.cycles == 1 or not self.separability.separable:
             return None
-        columns, error = self.about.columns(POWER), self.exponent.error[0]
+        columns, error = self.expansion.columns(POWER), self.exponent.error[0]
         posterior_sd = 1 / math.hypot(1 / EXPONENT_SD_BELOW, 1 / error)
-        rows, plain = self.about.reduced[:, columns], self.about.columns()
+        rows, plain = self.expansion.reduced[:, columns], self.expansion.columns()
         step = np.linalg.lstsq(rows[:, : len(plain)], -posterior_sd * rows[:, -1], rcond=None)[0]
-        return Physical(*np.abs(self.about.slopes[:, columns] @ np.append(step, posterior_sd)))
+        return Physical(*np.abs(self.expansion.slopes[:, columns] @ np.append(step, posterior_sd)))
 
     @cached_property
     def free_monitor_shifts(self) -> dict[str, float]:
@@ -584,7 +585,7 @@ class Evidence:
         """
         quantities, shifts, record = self.free.quantities, [], self.record
         for change in self.monitor_changes:
-            current = record.current + change * self.about.pieces.divisor
+            current = record.current + change * self.expansion.pieces.divisor
             shifted = replace(record, current=current, mean=record.mean_current)
             found = free_law(shifted, fit_law(Pieces.of(shifted)).values) or self.free
             shifts.append([found.quantities[n].value - q.value for n, q in quantities.items()])
@@ -642,12 +643,12 @@ class Evidence:
     @cached_property
     def stated_odds(self) -> float:
         """Log odds that the stated errors are right, averaged over the memory of the noise."""
-        columns = np.column_stack([self.about.residuals, self.about.rows[:, : POWER + 1]])
+        columns = np.column_stack([self.expansion.residuals, self.expansion.rows[:, : POWER + 1]])
         if self.addition == "pumped":
-            gas = further_columns(self.about, "relaxing", 1 / np.array(OUTGASSING_PACES))
+            gas = further_columns(self.expansion, "relaxing", 1 / np.array(OUTGASSING_PACES))
             columns = np.column_stack([columns, gas])
         if self.addition == "settles":
-            model = self.record.current / self.about.pieces.divisor + self.about.residuals
+            model = self.record.current / self.expansion.pieces.divisor + self.expansion.residuals
             settles = np.hstack([*settling_shapes()[::PACES_PER_OCTAVE]])
             shapes = from_nodes(self.record.time / self.record.span) @ settles
             columns = np.column_stack([columns, model[:, None] * shapes])
@@ -660,13 +661,13 @@ class Evidence:
 
         They have no errors if the mean lifetime has none.
         """
-        parts, (span, _) = self.about.parts, self.about.pieces.units
+        parts, (span, _) = self.expansion.parts, self.expansion.pieces.units
         if parts is None:
             return ()
         slopes = np.hstack([np.tile([1.0, 0.0], (parts.first.size, 1)), parts.shares]) / span
-        found = self.memory.moments(slopes, self.about.min_factor)
+        found = self.memory.moments(slopes, self.expansion.min_factor)
         shift = 0.0 if self.independent else found.shift
-        rates = (self.about.numbers[LOSS - 1] + parts.departure) / span + shift
+        rates = (self.expansion.numbers[LOSS - 1] + parts.departure) / span + shift
         since = self.time - self.time[0]
         ends = np.append(since[parts.first[1:]], since[-1])
         lifetimes = (lifetime_of(*pair, clear=True) for pair in
@@ -685,12 +686,13 @@ class Evidence:
             # The fit of a power has no parts.
             offered = self.separability.separable and not (refuted and self.course)
         else:
-            plain = not self.shaped and self.about.pieces.gauge is None
+            plain = not self.shaped and self.expansion.pieces.gauge is None
             offered = plain and refuted and self.outgassing is None and self.addition is None
-        return lifetime_law(self.about, self.independent, refuted) if offered else None
+        return lifetime_law(self.expansion, self.independent, refuted) if offered else None
 
     def drift_of_one_error(self, name: str) -> float:
         """Linear drift of the monitor over the record, mA, that shifts a value by its error."""
-        shifts = self.about.value_shifts(self.time / self.time[-1] / self.about.pieces.divisor)
+        drift = self.time / self.time[-1] / self.expansion.pieces.divisor
+        shifts = self.expansion.value_shifts(drift)
         shift = abs(float(getattr(shifts, name)))
         return float(getattr(self.errors, name)) / shift if shift > 0 else math.inf

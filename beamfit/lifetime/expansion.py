@@ -658,7 +658,7 @@ def fit_law(
         return _search(pieces, first_parameters, prior_widths, tuple(free), kind, shape)
 
 
-def further_columns(about: Expansion, kind: str, times: np.ndarray) -> np.ndarray:
+def further_columns(expansion: Expansion, kind: str, times: np.ndarray) -> np.ndarray:
     """Slopes of the residuals of a single decay by a further loss at each time, in units of the
     search.
 
@@ -674,12 +674,12 @@ def further_columns(about: Expansion, kind: str, times: np.ndarray) -> np.ndarra
     """
     from scipy.integrate import cumulative_simpson  # slow to import, and few records need it
 
-    (span, _), level = about.pieces.units, about.rows[:, [LEVEL]]
-    time, model = about.pieces.time / span, about.pieces.current / about.pieces.divisor
-    model = (model + about.residuals)[:, None]
+    (span, _), level = expansion.pieces.units, expansion.rows[:, [LEVEL]]
+    time, model = expansion.pieces.time / span, expansion.pieces.current / expansion.pieces.divisor
+    model = (model + expansion.residuals)[:, None]
     fading = np.divide(model, level, out=np.zeros_like(model), where=level > MIN_CURRENT * level[0])
     if kind in ("step", "step of a"):
-        share = 1.0 if kind == "step" else model / about.pieces.weight[:, None]
+        share = 1.0 if kind == "step" else model / expansion.pieces.weight[:, None]
         whole = cumulative_simpson(share * fading, x=time, axis=0, initial=0.0)
         return -level * np.maximum(whole - np.interp(times, time, whole[:, 0]), 0.0)
     if kind == "sudden":

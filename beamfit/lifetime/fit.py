@@ -224,15 +224,17 @@ class DecayFit:
         return np.asarray(current(time, *numbers))
 
     @property
-    def about(self) -> Expansion:
+    def expansion(self) -> Expansion:
         """Expansion of the law with constant a and b, about this fit of a single decay."""
         numbers = (self.if_constant(name).value for name in ("i0", "a", "b"))
         return Expansion.at(self.readings, *numbers)
 
     def with_power(self, power: float) -> Expansion:
         """Fit the law with a power of the current in a to the readings of this single decay."""
-        about = self.about
-        return about if not power else fit_law(about.pieces, start=[*about.numbers[:2], power])
+        expansion = self.expansion
+        if not power:
+            return expansion
+        return fit_law(expansion.pieces, start=[*expansion.numbers[:2], power])
 
     @property
     def quantities(self) -> dict[str, Quantity]:
@@ -348,11 +350,11 @@ def fit_decay(
         raise InputError(f"{len(record)} readings", expected, path=record.name)
     if np.ptp(record.current) == 0:
         return _constant(record, f"All {len(record)} readings are {record.current[0]:.6g} mA")
-    about = fit_law(Pieces.of(record), shape=shape)
-    residuals = about.current_residuals
+    expansion = fit_law(Pieces.of(record), shape=shape)
+    residuals = expansion.current_residuals
     prepared = with_rounding(with_common_errors(record, residuals), residuals)
-    about = about if prepared is record else fit_law(Pieces.of(prepared), shape=shape)
-    evidence = Evidence(about, Law(law), shape is not None, prepared)
+    expansion = expansion if prepared is record else fit_law(Pieces.of(prepared), shape=shape)
+    evidence = Evidence(expansion, Law(law), shape is not None, prepared)
     rate, error = evidence.normal_equivalent("rate_mean")
     if rate < -BELIEVED * error:
         first, last = record.current[0], record.current[-1]
@@ -364,7 +366,7 @@ def fit_decay(
         record=record.name,
         status=finding.status,
         message=finding.message,
-        **evidence.fit_fields(about.converged),
+        **evidence.fit_fields(expansion.converged),
         mean_current=record.mean_current,
         rms_residual=evidence.rms,
         readings=prepared,
@@ -505,15 +507,15 @@ def fit_pieces(
         sentence = f"The readings of each of {len(cycles)} cycles are equal"
         fit = _constant(_readings(collected, name, None), sentence)
         return replace(fit, first=collected.first)
-    about, left_out = clean_cycles(collected)
+    expansion, left_out = clean_cycles(collected)
     digit, span = cycles[0].resolution, float(np.median([cycle.span for cycle in cycles]))
-    rounding = rounding_of(digit, about.current_residuals, span, collected.monitor)
+    rounding = rounding_of(digit, expansion.current_residuals, span, collected.monitor)
     if collected.error is None and rounding is not None:
         rounding_error, monitor = rounding
         error = np.full(collected.time.size, rounding_error)
-        about, left_out = clean_cycles(replace(collected, error=error, monitor=monitor))
+        expansion, left_out = clean_cycles(replace(collected, error=error, monitor=monitor))
     cycle = usual_cycle(cycles) if found else None
-    evidence, pieces = Evidence(about, law, usual_cycle=cycle), about.pieces
+    evidence, pieces = Evidence(expansion, law, usual_cycle=cycle), expansion.pieces
     finding = finding_of_cycles(evidence, pieces.monitor, left_out)
     return DecayFit(
         record=name,

@@ -235,14 +235,14 @@ class _Prepared(NamedTuple):
     @classmethod
     def of(cls, fit) -> _Prepared:
         """Prepare a fit with its law and, if a and b are constant, its noise."""
-        about = fit.about
-        seen = ReducedDecay.of(fit.readings, about.values)
+        expansion = fit.expansion
+        seen = ReducedDecay.of(fit.readings, expansion.values)
         if fit.free_law is None and fit.correlation_time is None:
             white = np.array([kind == MemoryKind(WHITE) for kind in seen.products.kinds])
             # There is no white noise where nothing fits.
             seen = seen.of_noises(white) if white.any() else seen
         laws = [LawProposal.of(seen, CONSTANT)] if fit.free_law is None else proposals(seen)
-        moved = [about.value_shifts(change)[:3] for change in about.pieces.monitor_changes]
+        moved = [expansion.value_shifts(change)[:3] for change in expansion.pieces.monitor_changes]
         return cls(fit, seen, laws, np.reshape(moved, (-1, 3)))
 
     @property

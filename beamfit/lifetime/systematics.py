@@ -101,7 +101,7 @@ def systematics(fit: DecayFit) -> tuple[Systematic, ...]:
     record, other_law = fit.readings, fit.shaped or fit.first is not None
     if other_law or fit.status is Status.infeasible or fit.a.error is None:
         return ()
-    expansion = fit.about
+    expansion = fit.expansion
     errors, share = expansion.pieces.divisor, record.time / record.span
     rise = further_columns(expansion, "drift", np.zeros(1))[:, 0] * errors * record.span
     rises = f"pressure rises by {100 * PRESSURE_RISE:g} % over the record"

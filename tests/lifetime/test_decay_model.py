@@ -82,11 +82,11 @@ def test_what_a_record_of_this_length_can_tell(span, error_a, error_b, count):
         for seed in range(count)
     ]
     fits = [Evidence(fit_law(Pieces.of(record))) for record in records]
-    assert all(fit.about.converged for fit in fits)
+    assert all(fit.expansion.converged for fit in fits)
     # 64 records know a standard deviation to 9 %.
     for name in ("a", "b", "rate_mean"):
         stated = np.median([getattr(fit.raw, name) for fit in fits])
-        values = [getattr(fit.about.values, name) for fit in fits]
+        values = [getattr(fit.expansion.values, name) for fit in fits]
         assert np.std(values) == pytest.approx(stated, rel=widened(0.3, 64, count))
     assert np.median([fit.raw.a for fit in fits]) / a == pytest.approx(error_a, rel=0.25)
     assert np.median([fit.raw.b for fit in fits]) / b == pytest.approx(error_b, rel=0.25)
@@ -131,7 +131,7 @@ def test_a_known_shape_gives_the_true_gas_term():
     assert shaped.values.b == pytest.approx(2e-7, abs=4 * shaped.raw.b)
     assert about.residuals @ about.residuals < 1.3 * 297
     # The constant-a law puts the difference into a gas loss three times too large.
-    assert plain.about.values.b > 3 * 2e-7
+    assert plain.expansion.values.b > 3 * 2e-7
     assert blind.residuals @ blind.residuals > 10 * (about.residuals @ about.residuals)
 
 
