@@ -365,6 +365,7 @@ MORE_PROBABLE = 0.5
 # wanders, a monitor that settles after a fill.
 ADDITIONS = ("pumped", "wanders", "settles")
 
+# Places at which a lifetime is quoted, and units of the quoted quantities.
 ENDS = ("start", "end", "mean")
 UNITS = {
     "a": "1/(mA s)",
@@ -1198,25 +1199,22 @@ def proposals(reduced: ReducedDecay) -> list[LawProposal]:
     if reduced.products.count < MIN_DISTURBED_READINGS or reduced.noise_level < MIN_NOISE:
         return laws
     kinds = disturbances(float(np.exp(reduced.start[1, 0])))
-    disturbed = [
-        reduced.with_disturbance(kind) for kind in kinds if reduced.drifts or not kind.of_loss
-    ]
-    laws += [LawProposal.of(own, free) for own in disturbed]
+    kinds = [kind for kind in kinds if reduced.drifts or not kind.of_loss]
+    disturbed = [reduced.with_disturbance(kind) for kind in kinds]
+    laws += [LawProposal.of(one, free) for one in disturbed]
     return [*laws, LawProposal.of(disturbed[-1], CONSTANT)]  # a monitor that settles
 
 
-def loss_rates(a, b, power, changed, x, reduced: ReducedDecay):
+def loss_rates(a, b, power, changed, x, ends):
     """Loss rates at the first reading, at the last one and at the mean current, in the unit of b.
 
     `a` is in the same unit, at the mean current. `x` are the currents of the law at the first
     reading, at the mean current and at the last reading (`law_currents`), and `changed` the changes
-    of the gas loss there.
+    of the gas loss there. `ends` are the pressures over their mean at the first and last reading.
     """
     first, middle, last = (
         a * at ** (1 + power) + b * pressure + more
-        for at, pressure, more in zip(
-            x, (reduced.ends[0], 1.0, reduced.ends[1]), changed, strict=True
-        )
+        for at, pressure, more in zip(x, (ends[0], 1.0, ends[1]), changed, strict=True)
     )
     return first, last, middle
 
@@ -1249,13 +1247,11 @@ def _quantities(record: DecayRecord, reduced: ReducedDecay, draws: Draws) -> dic
         for s, walk in zip(moments, at @ draws.walk, strict=True)
     ]
     law = law_currents(currents, parameters.rate * (at @ INTEGRAL @ draws.walk))
-    rates = loss_rates(a * mean, b, parameters.power, changed, law, reduced)
+    rates = loss_rates(a * mean, b, parameters.power, changed, law, reduced.ends)
     quoted = {"i0": parameters.level * mean}
     quoted |= {f"lifetime_{at}": 1 / rate / HOUR for at, rate in zip(ENDS, rates, strict=True)}
     bounds = at_bounds(parameters.share, weight)
     losses = {"a": (a, *bounds, whole[0]), "b": (b, *bounds[::-1], whole[1])}
-    quantities = {
-        name: weighted_quantity(values, weight, UNITS[name]) for name, values in quoted.items()
-    }
+    quantities = {n: weighted_quantity(v, weight, UNITS[n]) for n, v in quoted.items()}
     quantities |= {n: _partial_loss(v, weight, UNITS[n], *more) for n, (v, *more) in losses.items()}
     return {name: quantities[name] for name in UNITS}

@@ -207,9 +207,8 @@ def _derived(data: _Data, theta: Array) -> Array:
     wander_loss = total * data.span * (data.moments @ (INTEGRAL @ n.walk))
     changed = n.b * n.drift * gas_change(moments, n.pace) + wander
     currents = _nodes(data, n)[:, 0]
-    rates = loss_rates(
-        n.a * data.mean, n.b, n.exponent, changed, law_currents(currents, wander_loss), data
-    )
+    x = law_currents(currents, wander_loss)
+    rates = loss_rates(n.a * data.mean, n.b, n.exponent, changed, x, data.ends)
     return 1.0 / HOUR / jnp.stack(rates)
 
 
