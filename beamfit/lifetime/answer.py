@@ -16,7 +16,7 @@ from scipy.special import ndtri
 
 from beamfit.errors import Finding, Status, judge
 from beamfit.lifetime.alternatives import ConstantA, LifetimeLaw, Outgassing
-from beamfit.lifetime.cycles import HELD, is_sawtooth, lives_longer
+from beamfit.lifetime.cycles import HIDDEN_REFILLS_PRIOR, is_sawtooth, lives_longer
 from beamfit.lifetime.evidence import (
     BELIEVED,
     MAX_RELATIVE_ERROR,
@@ -127,7 +127,7 @@ def _within_noise(e: Evidence) -> Finding | None:
     rate, error = e.normal_equivalent("rate_mean")
     # A rate that is negative by chance does not lengthen the limit.
     limit = 1 / (max(rate, 0.0) + LIMIT_95 * error) / HOUR
-    if lives_longer(limit * HOUR) < HELD:
+    if lives_longer(limit * HOUR) < HIDDEN_REFILLS_PRIOR:
         return Finding(
             Status.unidentified,
             "The current does not fall: that refills hold the beam, which the noise hides, is "

@@ -38,7 +38,7 @@ PERIOD, LIFETIME = (180.0, 1.2, 12.0), (15 * 3600.0, 1.2, 17.0)
 # Share of the normal part of these priors; the rest is flat.
 USUAL = 0.8
 # Prior probability that a record without a decay has refills hidden by the noise.
-HELD = 0.1
+HIDDEN_REFILLS_PRIOR = 0.1
 
 
 def is_sawtooth(residuals: np.ndarray) -> bool:
@@ -374,8 +374,8 @@ def with_course(expansion: Expansion) -> Expansion:
     if not expansion.converged or expansion.level.size < 2 * MIN_PART_CYCLES:
         return expansion
     rate, error = _cycle_rates(expansion)
-    apart = np.abs(np.diff(rate)) / np.hypot(error[1:], error[:-1])
-    error = error * max(1.4826 * float(np.median(apart)), 1e-12)
+    differences = np.abs(np.diff(rate)) / np.hypot(error[1:], error[:-1])
+    error = error * max(1.4826 * float(np.median(differences)), 1e-12)
     begins = _part_begins(rate, error, abs(float(expansion.numbers[0])))
     return _with_parts(expansion, np.array([0, *begins])) if begins else expansion
 

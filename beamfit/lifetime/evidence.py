@@ -514,8 +514,8 @@ class Evidence:
         Rounding alone may then explain all residuals.
         """
         digit = None if self.record is None else self.record.resolution
-        off = np.max(np.abs(self.expansion.current_residuals))
-        return digit is not None and bool(off <= MIN_STEP_DIGITS / 2 * digit)
+        largest = np.max(np.abs(self.expansion.current_residuals))
+        return digit is not None and bool(largest <= MIN_STEP_DIGITS / 2 * digit)
 
     @property
     def explained(self) -> BestAlternative | None:

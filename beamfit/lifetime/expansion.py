@@ -276,8 +276,8 @@ class _Start(NamedTuple):
         x, weight, inside = pieces.relative_current, pieces.weight, np.diff(pieces.at.time)
 
         def integral(values: np.ndarray) -> np.ndarray:
-            whole = np.append(0.0, np.cumsum(inside * (values[1:] + values[:-1]) / 2))
-            return whole - pieces.per_reading(whole[pieces.first])
+            cumulative = np.append(0.0, np.cumsum(inside * (values[1:] + values[:-1]) / 2))
+            return cumulative - pieces.per_reading(cumulative[pieces.first])
 
         columns = np.stack([-integral(x), -integral(x * (x - 1)), x], axis=1) * weight[:, None]
         loss, bend, y = Levels(pieces.first, weight).left(columns).T
@@ -288,10 +288,10 @@ class _Start(NamedTuple):
         width = PRIOR_WIDTH * (abs(slope) + 3 * noise / size) + 1e-300
         prior_row = np.array([[0.0, noise / width, 0.0]])
         both = least_squares_step(np.stack([loss, bend, -y], axis=1), prior_row)
-        after = np.linalg.norm(y - both @ (loss, bend)) / root
+        residual = np.linalg.norm(y - both @ (loss, bend)) / root
         smallest = 1e-15 * np.linalg.norm(weight * x) / root
         level = pieces.project(weight, columns[:, 2] - columns[:, :2] @ both)
-        return cls(both, level, max(min(noise, after), smallest), width)
+        return cls(both, level, max(min(noise, residual), smallest), width)
 
 
 def _parameter_bounds(count: int) -> np.ndarray:
@@ -533,9 +533,9 @@ class Expansion:
         )
         triangle, count = found.triangle, found.triangle.shape[1] // len(part_slices)
         edges = self.edge_columns.shape[1]
-        more = triangle[..., [edges]] * np.repeat(cycle_parts.shares, count, axis=0)
+        part_columns = triangle[..., [edges]] * np.repeat(cycle_parts.shares, count, axis=0)
         parts = np.split(triangle, [edges + len(PLAIN)], axis=2)
-        found = found._replace(triangle=np.concatenate([parts[0], more, parts[1]], axis=2))
+        found = found._replace(triangle=np.concatenate([parts[0], part_columns, parts[1]], axis=2))
         return found.with_widths(SHIFTS, edges)
 
     @cached_property
@@ -680,8 +680,8 @@ def further_columns(expansion: Expansion, kind: str, times: np.ndarray) -> np.nd
     fading = np.divide(model, level, out=np.zeros_like(model), where=level > MIN_CURRENT * level[0])
     if kind in ("step", "step of a"):
         share = 1.0 if kind == "step" else model / expansion.pieces.weight[:, None]
-        whole = cumulative_simpson(share * fading, x=time, axis=0, initial=0.0)
-        return -level * np.maximum(whole - np.interp(times, time, whole[:, 0]), 0.0)
+        total = cumulative_simpson(share * fading, x=time, axis=0, initial=0.0)
+        return -level * np.maximum(total - np.interp(times, time, total[:, 0]), 0.0)
     if kind == "sudden":
         return -level * np.interp(times, time, fading[:, 0]) * (time[:, None] > times)
     rates = time[:, None] - 0.5 if kind == "drift" else np.exp(-time[:, None] / times)

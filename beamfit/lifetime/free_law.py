@@ -773,11 +773,12 @@ def _truncated_logistic(
     density.
     """
     above = low > 0  # both ends on one side: the tail that is not near 1
-    start, end = log_expit(np.where(above, [-high, -low], [low, high]) / PROPOSAL_SCALE)
-    below = np.logaddexp(start + np.log1p(-points), end + np.log(points))
-    rest, part = np.log1p(-np.exp(below)), end + np.log(-np.expm1(start - end))
-    draws = np.where(above, -PROPOSAL_SCALE, PROPOSAL_SCALE) * (below - rest)
-    return draws, below + rest - part - math.log(PROPOSAL_SCALE)
+    log_low, log_high = log_expit(np.where(above, [-high, -low], [low, high]) / PROPOSAL_SCALE)
+    log_below = np.logaddexp(log_low + np.log1p(-points), log_high + np.log(points))
+    log_above = np.log1p(-np.exp(log_below))
+    log_mass = log_high + np.log(-np.expm1(log_low - log_high))
+    draws = np.where(above, -PROPOSAL_SCALE, PROPOSAL_SCALE) * (log_below - log_above)
+    return draws, log_below + log_above - log_mass - math.log(PROPOSAL_SCALE)
 
 
 def _split_free(free: Sequence[int]) -> tuple[list[int], list[int]]:
@@ -1002,8 +1003,8 @@ def weighted_quantity(
 ) -> Quantity:
     """Median, half of the central 68 %, and interval between two probabilities, of draws."""
     found = quantiles(values, weight, np.array([0.5, *CENTRAL, *ends]))
-    middle, less, more, *interval = map(float, found)
-    return Quantity(middle, (more - less) / 2, unit, None, tuple(interval))
+    middle, lower, upper, *interval = map(float, found)
+    return Quantity(middle, (upper - lower) / 2, unit, None, tuple(interval))
 
 
 def interval_probabilities(none: bool, all_: bool) -> tuple[float, float]:
@@ -1012,12 +1013,12 @@ def interval_probabilities(none: bool, all_: bool) -> tuple[float, float]:
     Where a share of 0 (`none`) or 1 (`all_`) is not excluded the interval ends at that bound, and
     is one-sided.
     """
-    least, most = WIDE
-    return least * (1 + all_), most - least * none
+    low, high = WIDE
+    return low * (1 + all_), high - low * none
 
 
 def _partial_loss(
-    values: np.ndarray, weight: np.ndarray, unit: str, none: bool, all_: bool, whole: np.ndarray
+    values: np.ndarray, weight: np.ndarray, unit: str, none: bool, all_: bool, full: np.ndarray
 ) -> Quantity:
     """Quantity of a loss that is a share of a whole one.
 
@@ -1026,7 +1027,7 @@ def _partial_loss(
     """
     found = weighted_quantity(values, weight, unit, interval_probabilities(none, all_))
     low, high = found.interval_95
-    high = quantiles(whole, weight, np.array([WIDE[1]]))[0] if all_ else high
+    high = quantiles(full, weight, np.array([WIDE[1]]))[0] if all_ else high
     return replace(found, interval_95=(0.0 if none else low, float(high)))
 
 
@@ -1213,8 +1214,8 @@ def loss_rates(a, b, power, changed, x, ends):
     of the gas loss there. `ends` are the pressures over their mean at the first and last reading.
     """
     first, middle, last = (
-        a * at ** (1 + power) + b * pressure + more
-        for at, pressure, more in zip(x, (ends[0], 1.0, ends[1]), changed, strict=True)
+        a * at ** (1 + power) + b * pressure + change
+        for at, pressure, change in zip(x, (ends[0], 1.0, ends[1]), changed, strict=True)
     )
     return first, last, middle
 
@@ -1238,20 +1239,20 @@ def _quantities(record: DecayRecord, reduced: ReducedDecay, draws: Draws) -> dic
     """Compute the quoted quantities from draws."""
     parameters, currents, weight = draws.numbers, draws.currents, draws.weight
     span, mean = record.span, record.mean_current
-    whole = parameters.rate / mean / span, parameters.rate / span
-    a, b = parameters.share * whole[0], (1 - parameters.share) * whole[1]
+    full = parameters.rate / mean / span, parameters.rate / span
+    a, b = parameters.share * full[0], (1 - parameters.share) * full[1]
     moments = (0.0, mean_current_time(currents, weight), 1.0)
-    at = from_nodes(np.array(moments))
+    to_moments = from_nodes(np.array(moments))
     changed = [
-        whole[1] * (parameters.gas * gas_change(s, parameters.pace) + walk)
-        for s, walk in zip(moments, at @ draws.walk, strict=True)
+        full[1] * (parameters.gas * gas_change(s, parameters.pace) + walk)
+        for s, walk in zip(moments, to_moments @ draws.walk, strict=True)
     ]
-    law = law_currents(currents, parameters.rate * (at @ INTEGRAL @ draws.walk))
+    law = law_currents(currents, parameters.rate * (to_moments @ INTEGRAL @ draws.walk))
     rates = loss_rates(a * mean, b, parameters.power, changed, law, reduced.ends)
     quoted = {"i0": parameters.level * mean}
     quoted |= {f"lifetime_{at}": 1 / rate / HOUR for at, rate in zip(ENDS, rates, strict=True)}
     bounds = at_bounds(parameters.share, weight)
-    losses = {"a": (a, *bounds, whole[0]), "b": (b, *bounds[::-1], whole[1])}
+    losses = {"a": (a, *bounds, full[0]), "b": (b, *bounds[::-1], full[1])}
     quantities = {n: weighted_quantity(v, weight, UNITS[n]) for n, v in quoted.items()}
     quantities |= {n: _partial_loss(v, weight, UNITS[n], *more) for n, (v, *more) in losses.items()}
     return {name: quantities[name] for name in UNITS}

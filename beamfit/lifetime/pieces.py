@@ -182,9 +182,10 @@ def _stuck(current: np.ndarray) -> np.ndarray:
     return found
 
 
-def _local_noise(off: np.ndarray) -> np.ndarray:
+def _local_noise(departures: np.ndarray) -> np.ndarray:
     """Robust noise near each departure; where it changes the larger value counts."""
-    return maximum_filter1d(1.4826 * median_filter(off, NEIGHBOURS, mode="mirror"), NEIGHBOURS)
+    noise = 1.4826 * median_filter(departures, NEIGHBOURS, mode="mirror")
+    return maximum_filter1d(noise, NEIGHBOURS)
 
 
 def _local_rate(time: np.ndarray, current: np.ndarray) -> np.ndarray:
@@ -263,14 +264,14 @@ def _local_digits(current: np.ndarray, excess: np.ndarray) -> np.ndarray:
     that loses one digit at each reading only refills depart. A record may come from several
     detectors.
     """
-    least = EXACT * np.max(current)
-    equal = (np.abs(excess) <= least).astype(float)
+    rounding = EXACT * np.max(current)
+    equal = (np.abs(excess) <= rounding).astype(float)
     quantised = uniform_filter1d(equal, NEIGHBOURS) > MAX_EQUAL_SHARE
     if not quantised.any():
         return np.zeros(excess.size)
 
     def running_median(size: np.ndarray) -> np.ndarray:
-        nonzero = np.flatnonzero(size > least)
+        nonzero = np.flatnonzero(size > rounding)
         if not nonzero.size:
             return np.zeros(size.size)
         near = median_filter(size[nonzero], NEIGHBOURS, mode="mirror")
@@ -288,12 +289,12 @@ def _step_scores(time: np.ndarray, current: np.ndarray) -> np.ndarray:
     """
 
     def scores_of_chunk(time: np.ndarray, current: np.ndarray) -> np.ndarray:
-        interval, change, usual = np.diff(time), np.diff(current), _local_rate(time, current)
-        error = MEDIAN_ERROR * interval * _local_noise(np.abs(change / interval - usual))
-        loss = usual * interval
+        interval, change, local_rate = np.diff(time), np.diff(current), _local_rate(time, current)
+        error = MEDIAN_ERROR * interval * _local_noise(np.abs(change / interval - local_rate))
+        loss = local_rate * interval
         excess = change - loss
-        least = max(_scatter(excess), EXACT * np.max(current))
-        scatter = np.maximum(least, _local_noise(np.abs(excess)))
+        min_scatter = max(_scatter(excess), EXACT * np.max(current))
+        scatter = np.maximum(min_scatter, _local_noise(np.abs(excess)))
         score = (np.abs(excess) - 0.5 * np.abs(loss)) / (np.hypot(scatter, error) + TINY)
         found = np.column_stack([excess, score, _local_digits(current, excess)])
         return np.vstack([np.zeros(3), found]).astype(np.float32)  # 120 MB for 1e7 readings
@@ -397,9 +398,9 @@ def _find_clear_steps(
             excess, score, digit = _step_scores(t, x).T
             if size == 1:
                 digits = np.maximum(np.append(np.float32(0), digit), np.float32(digit_of_all))
-                least = THRESHOLD * np.maximum(_scatter(excess), digits * 2**-0.5)
+                min_step = THRESHOLD * np.maximum(_scatter(excess), digits * 2**-0.5)
             mean_digits = digits[shift + size :: size][: count - 1]
-            limit = least[shift + size :: size][: count - 1]
+            limit = min_step[shift + size :: size][: count - 1]
             clear = (score > THRESHOLD) & (np.abs(excess) > limit)
             significant = np.where(clear & ~in_step[1:] & ~in_step[:-1], excess, np.float32(0))
             if size == 1:
@@ -408,8 +409,8 @@ def _find_clear_steps(
                 flagged[1:] = clear
                 level[1:] -= np.cumsum(significant, dtype=float)
             elif not shift:
-                steps += (more := _slow_steps(steps, significant, level, size, least))
-                for step in more:
+                steps += (slow_steps := _slow_steps(steps, significant, level, size, min_step))
+                for step in slow_steps:
                     flagged[step.first : max(step.end, step.first + 1)] = True
             free = ~tried[1:] & ~tried[:-1]
             peak_rows = _peaks(np.abs(excess), free, MIN_STEP_DIGITS * mean_digits)
@@ -423,21 +424,25 @@ def _scatter(values: np.ndarray) -> float:
     return float(1.4826 * np.median(np.abs(values)))
 
 
-def _peaks(size: np.ndarray, free: np.ndarray, least: np.ndarray) -> np.ndarray:
+def _peaks(size: np.ndarray, free: np.ndarray, min_size: np.ndarray) -> np.ndarray:
     """Find changes that stand out among the free ones, and then among the rest of these."""
     found = np.zeros(size.size, bool)
     for _ in range(2):
         if free.sum() < MIN_CHANGES:
             break
         high = np.where(free, size, 0.0)
-        found |= high > np.maximum(LEVEL_THRESHOLD * _scatter(high[free]), least)
+        found |= high > np.maximum(LEVEL_THRESHOLD * _scatter(high[free]), min_size)
         found &= high >= maximum_filter1d(high, 3)
         free = free & ~maximum_filter1d(found, 3)
     return np.flatnonzero(found)
 
 
 def _slow_steps(
-    before: Sequence[Step], significant: np.ndarray, level: np.ndarray, size: int, least: np.ndarray
+    before: Sequence[Step],
+    significant: np.ndarray,
+    level: np.ndarray,
+    size: int,
+    min_step: np.ndarray,
 ) -> list[Step]:
     """Find steps between means of `size` readings that are not in `before`.
 
@@ -455,7 +460,7 @@ def _slow_steps(
         begin, end = _slow_step_bounds(first, last, size, cuts)
         single = np.diff(level[max(begin - 1, 0) : end])
         largest = int(np.argmax(np.abs(single)))
-        if abs(significant[first:last].sum() - single[largest]) < 0.5 * least[begin]:
+        if abs(significant[first:last].sum() - single[largest]) < 0.5 * min_step[begin]:
             begin = end = max(begin, 1) + largest
         found.append(Step(begin, min(end, level.size), bool(significant[first] > 0)))
     return found
@@ -627,10 +632,10 @@ def _omitted_events(
     record: DecayRecord, clear: Sequence[np.ndarray], pieces: Sequence[np.ndarray]
 ) -> list[Event]:
     """List the readings of clear pieces that are in none of the new pieces."""
-    left = np.zeros(len(record), bool)
-    left[np.concatenate(clear)] = True
-    left[np.concatenate(pieces)] = False
-    return [event_of(record, "short", first, end - 1) for first, end in _runs(left)]
+    omitted = np.zeros(len(record), bool)
+    omitted[np.concatenate(clear)] = True
+    omitted[np.concatenate(pieces)] = False
+    return [event_of(record, "short", first, end - 1) for first, end in _runs(omitted)]
 
 
 def _undo_divisions(

@@ -71,8 +71,8 @@ def by_chunks(
     found, size = [], columns[0].size
     for start in range(0, size, chunk):
         low, stop = max(start - overlap, 0), min(start + chunk, size)
-        some = function(*(column[low : stop + overlap] for column in columns))
-        found.append(some[start - low : stop - low])
+        values = function(*(column[low : stop + overlap] for column in columns))
+        found.append(values[start - low : stop - low])
     return np.concatenate(found)
 
 
@@ -147,9 +147,9 @@ def rounding_of(
     rounding, mean_square = (digit or 0.0) / 12**0.5, float(np.mean(residuals**2))
     if mean_square >= rounding**2:
         return None
-    missing = rounding**2 * (1 - 2 / len(residuals) ** 0.5) - mean_square
-    if missing > 0:
-        monitor = Monitor(drift=(2 * missing) ** 0.5 * HOUR / span).beside(monitor)
+    missing_variance = rounding**2 * (1 - 2 / len(residuals) ** 0.5) - mean_square
+    if missing_variance > 0:
+        monitor = Monitor(drift=(2 * missing_variance) ** 0.5 * HOUR / span).beside(monitor)
     return rounding, monitor
 
 

@@ -21,7 +21,8 @@ if TYPE_CHECKING:
 # since.
 MAX_CURRENT = 1e5
 # Plausible ranges of the conditions; outside them a column is in another unit than its name says.
-# RF voltages reach 3.6 GV (LEP), scrapers 0.1 mm; in the pressures a beam can be stored.
+# RF voltages reach 3.6 GV (LEP), scrapers stand 0.1 mm or more from the beam, and the pressures are
+# those at which a beam can be stored.
 PLAUSIBLE = {
     "rf_voltage": (1e3, 4e9, "V"),
     "scraper_y": (1e-4, 0.5, "m"),
