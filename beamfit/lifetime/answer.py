@@ -495,9 +495,7 @@ def finding_of_cycles(
     found, current = judge(evidence, CYCLE_RULES), evidence.about.pieces.current
     between = f"between {current.min():.4g} and {current.max():.4g} mA"
     first = f"One answer from {evidence.cycles} cycles {between}"
-    remarks = [
-        remark(evidence) for remark in (_course, _inferred_noise, _correlation, _odd_lifetime)
-    ]
+    remarks = [remark(evidence) for remark in CYCLE_REMARKS]
     remarks += [] if monitor is None else [_stated_stability(monitor)]
     remarks += [text[0].upper() + text[1:] for text in left_out]
     return _with_remarks(found._replace(cause=f"{first}. {found.cause}"), remarks)

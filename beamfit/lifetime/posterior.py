@@ -118,7 +118,7 @@ class _Data(NamedTuple):
         Interpolation from nodes to the first reading, `middle` and the last reading.
     mean, span : float
         Mean current, mA, and span, s.
-    moved : array, shape (m, 3)
+    monitor_shifts : array, shape (m, 3)
         Shifts of I0, a and b by one standard deviation of each stated error of the monitor.
     """
 
@@ -134,17 +134,17 @@ class _Data(NamedTuple):
     moments: Array
     mean: Array
     span: Array
-    moved: Array
+    monitor_shifts: Array
 
 
 def _read_parameters(data: _Data, theta: Array) -> DecayParameters:
     """Parameters as the monitor reads them; theta ends with its errors in standard deviations."""
-    errors = data.moved.shape[0]
-    own, shifts = theta[: theta.size - errors], theta[theta.size - errors :]
+    errors = data.monitor_shifts.shape[0]
+    parameters, shifts = theta[: theta.size - errors], theta[theta.size - errors :]
     last = len(UNITS)
-    walk = own[last:] if own.size > last else jnp.zeros(NODES)
-    law = jnp.append(own[3:last], jnp.zeros(last - own[:last].size))
-    return DecayParameters(*(own[:3] - shifts @ data.moved), *law, walk)
+    walk = parameters[last:] if parameters.size > last else jnp.zeros(NODES)
+    law = jnp.append(parameters[3:last], jnp.zeros(last - parameters[:last].size))
+    return DecayParameters(*(parameters[:3] - shifts @ data.monitor_shifts), *law, walk)
 
 
 def _nodes(data: _Data, numbers: DecayParameters) -> Array:
@@ -185,7 +185,7 @@ def _log_density(data: _Data, theta: Array) -> Array:
     smooth = log_prior(p.exponent)[0] + log_straight(p.drift)
     smooth = smooth + _log_walk(p.walk)
     law = jnp.where(p.pace > 0, pumped, jnp.where(constant, 0.0, smooth))
-    shifts = theta[theta.size - data.moved.shape[0] :]
+    shifts = theta[theta.size - data.monitor_shifts.shape[0] :]
     inside = (p.a >= 0) & (p.b >= 0)
     log_density = jax.scipy.special.logsumexp(noises) + law
     log_density = log_density - jnp.log(rate) - 0.5 * jnp.sum(shifts**2)
@@ -221,7 +221,7 @@ class _Prepared(NamedTuple):
     fit: Any
     seen: SeenDecay
     laws: list[DrawnLaw]
-    moved: np.ndarray
+    monitor_shifts: np.ndarray
 
     @classmethod
     def of(cls, fit) -> _Prepared:
@@ -241,7 +241,7 @@ class _Prepared(NamedTuple):
         """Names of the sampled parameters."""
         law = max(max(one.free) for one in self.laws) + 1
         walk = NODES * any(one.disturbance is LOSS_WANDERS for one in self.laws)
-        hidden = [("walk", walk), ("monitor", len(self.moved))]
+        hidden = [("walk", walk), ("monitor", len(self.monitor_shifts))]
         return *list(UNITS)[:law], *(f"{n}_{k + 1}" for n, count in hidden for k in range(count))
 
     def draws(self, number: int, seed: int = 0) -> Draws:
@@ -253,10 +253,10 @@ class _Prepared(NamedTuple):
         found, span, mean = draws.numbers, self.fit.readings.span, self.fit.readings.mean_current
         a, b = found.share * found.rate / mean / span, (1 - found.share) * found.rate / span
         law = [found.level * mean, a, b, found.power, found.drift, found.pace]
-        own = np.column_stack([*law, draws.walk.T])
-        shifts = rng.normal(size=(len(own), len(self.moved)))
-        own[:, :3] += shifts @ self.moved
-        return np.hstack([own[:, : len(self.names) - len(self.moved)], shifts])
+        parameters = np.column_stack([*law, draws.walk.T])
+        shifts = rng.normal(size=(len(parameters), len(self.monitor_shifts)))
+        parameters[:, :3] += shifts @ self.monitor_shifts
+        return np.hstack([parameters[:, : len(self.names) - len(self.monitor_shifts)], shifts])
 
     def target(self, priors: Mapping[str, Distribution]) -> SamplingTarget:
         """Target of the sampler: the posterior with its data, bounds and priors."""
@@ -279,7 +279,7 @@ class _Prepared(NamedTuple):
             matrix, log_prior, applies_to, seen.products.count, seen.products.known,
             seen.origin[:, 0], seen.gas, np.array(seen.ends),
             middle, from_nodes(np.array([0.0, middle, 1.0])),
-            record.mean_current, record.span, self.moved,
+            record.mean_current, record.span, self.monitor_shifts,
         )  # fmt: skip
         lower, upper = np.array([BOUNDS.get(name, (-np.inf, np.inf)) for name in self.names]).T
         separable = fit.identifiability.separable or {"a", "b"} & set(priors)
