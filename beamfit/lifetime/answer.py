@@ -19,7 +19,7 @@ from beamfit.lifetime.alternatives import ConstantA, LifetimeLaw, Outgassing
 from beamfit.lifetime.cycles import HELD, is_sawtooth, lives_longer
 from beamfit.lifetime.evidence import (
     BELIEVED,
-    DETERMINED,
+    MAX_RELATIVE_ERROR,
     OUTSIDE,
     SEPARABLE,
     UNITS,
@@ -88,15 +88,15 @@ class TableEvidence(NamedTuple):
         """True if the noise is estimated from the residuals."""
         return self.noise is not None
 
-    def scaled(self, name: str) -> tuple[float, float]:
+    def value_and_error(self, name: str) -> tuple[float, float]:
         """Value and error of a number."""
         return self.numbers[name]
 
-    sure = scaled
+    normal_equivalent = value_and_error
 
 
 def _search_failed(e: Evidence) -> Finding | None:
-    if e.about.rested:
+    if e.expansion.converged:
         return None
     cause = "The search found no finite minimum: look at the record for steps."
     return Finding(Status.not_finite, cause)
@@ -104,8 +104,8 @@ def _search_failed(e: Evidence) -> Finding | None:
 
 def _is_level(e: Evidence) -> bool:
     """Return True if the loss rate is compatible with zero."""
-    rate, error = e.sure("rate_mean")
-    return not e.separability.separable and error > DETERMINED * abs(rate)
+    rate, error = e.normal_equivalent("rate_mean")
+    return not e.separability.separable and error > MAX_RELATIVE_ERROR * abs(rate)
 
 
 def _held_by_refills(e: Evidence) -> Finding | None:
@@ -124,7 +124,7 @@ def _held_by_refills(e: Evidence) -> Finding | None:
 def _within_noise(e: Evidence) -> Finding | None:
     if not _is_level(e):
         return None
-    rate, error = e.sure("rate_mean")
+    rate, error = e.normal_equivalent("rate_mean")
     # A rate that is negative by chance does not lengthen the limit.
     limit = 1 / (max(rate, 0.0) + LIMIT_95 * error) / HOUR
     if lives_longer(limit * HOUR) < HELD:
@@ -167,10 +167,10 @@ def _step_or_spike(e: Evidence) -> Finding | None:
 
 
 def _negative(name: str, cause: str, e: Evidence | TableEvidence) -> Finding | None:
-    value, error = e.sure(name)
+    value, error = e.normal_equivalent(name)
     if not (value < -BELIEVED * error and value < 0) or e.free is not None:
         return None
-    cause, (_, error) = _explanation(e) or cause, e.scaled(name)
+    cause, (_, error) = _explanation(e) or cause, e.value_and_error(name)
     return Finding(Status.infeasible, f"{name} is negative by {-value / error:.1f} errors; {cause}")
 
 
@@ -185,7 +185,7 @@ def _explanation(e: Evidence | TableEvidence) -> str | None:
     """Alternative that explains a refuted law better than an exponent of a, and the remedy."""
     if e.explained is None:
         return None
-    gas = isinstance(e.explained.found, Outgassing)
+    gas = isinstance(e.explained.explanation, Outgassing)
     remedy = ". Fit what comes later, or give the pressure in a column"
     return f"{e.explained}{remedy if gas else ': cut the record there'}"
 
@@ -223,7 +223,7 @@ def _not_separable(e: Evidence) -> Finding | None:
         "current is determined. "
     )
     cause += f"{disturbance}. " if (disturbance := _disturbance(e)) else ""
-    if e.apart:
+    if e.is_separable:
         remedy = "An exponent of a and a drift of b leave them open: record farther, or give the "
         cause += f"{remedy}ring, the pressure, or --law constant. {_values_if_constant(e)}"
         return Finding(Status.unidentified, cause)
@@ -241,8 +241,8 @@ def _impossible_share(e: Evidence, errors: float) -> Finding:
         f"The share of a in the loss is {found.share:.2g} ± {found.share_error:.2g}, {errors:.1f} "
         "errors outside 0 to 1: a longer record does not help. "
     )
-    if e.rival is not None:
-        return Finding(Status.unidentified, f"{cause}Likely {e.rival}: cut the record there")
+    if e.alternative is not None:
+        return Finding(Status.unidentified, f"{cause}Likely {e.alternative}: cut the record there")
     drift = abs(min(-found.share, 1.0 - found.share, key=abs)) / found.share_error
     drift *= e.drift_of_one_error("share")
     return Finding(
@@ -267,8 +267,10 @@ def _improbable_chi2(e: Evidence | TableEvidence, remedy: str = "") -> Finding |
 
 def _determination(e: Evidence | TableEvidence) -> Finding:
     """Finding on a and on b: determined, or an upper limit where compatible with zero."""
-    found = {name: e.sure(name) for name in "ab"}
-    near_zero = {n: (v, error) for n, (v, error) in found.items() if not error < DETERMINED * v}
+    found = {name: e.normal_equivalent(name) for name in "ab"}
+    near_zero = {
+        n: (v, error) for n, (v, error) in found.items() if not error < MAX_RELATIVE_ERROR * v
+    }
     if not near_zero:
         return Finding(Status.converged, "a and b are determined")
     limits = " and ".join(
@@ -282,7 +284,7 @@ def _determination(e: Evidence | TableEvidence) -> Finding:
 
 def _cycles_with_exponent(e: Evidence) -> Finding | None:
     """Cycles whose errors of a and b include a free exponent of a."""
-    if e.bending is None:
+    if e.exponent_shifts is None:
         return None
     constants = " and ".join(f"{name} is {e.quantity(name, True)}" for name in "ab")
     found = _determination(e)
@@ -298,9 +300,9 @@ def _free_law(e: Evidence) -> Finding | None:
     words = "; ".join(
         filter(None, (_determined_names(e), *(_interval_words(e, name) for name in "ab")))
     )
-    if e.beside == "pumped":
+    if e.addition == "pumped":
         likely = f"Gas that is pumped away after a fill is likely ({percent(e.free.pumped)})"
-        gas = e.outgassing if e.by_gas else None
+        gas = e.outgassing if e.has_slow_gas else None
         # An undetermined lifetime after outgassing, or a negative a or b, explains nothing.
         explains = gas and math.isfinite(gas.after.value) and min(gas.a.value, gas.b.value) > 0
         outgassing = f": {e.explained}" if explains else ""
@@ -322,10 +324,10 @@ DISTURBANCES = {
 
 def _disturbance(e: Evidence) -> str:
     """Sentence on a disturbance in addition to the law, if it is more probable than not."""
-    if e.beside not in DISTURBANCES:
+    if e.addition not in DISTURBANCES:
         return ""
-    chance = percent(getattr(e.free, e.beside))
-    return f"{DISTURBANCES[e.beside]} ({chance}), which the errors contain"
+    chance = percent(getattr(e.free, e.addition))
+    return f"{DISTURBANCES[e.addition]} ({chance}), which the errors contain"
 
 
 def _departure(e: Evidence) -> str:
@@ -380,7 +382,7 @@ RULES += (partial(_improbable_chi2, remedy=LOOK), _free_law, _determination)
 
 
 def _narrow_range(e: TableEvidence) -> Finding | None:
-    share, error = e.scaled("share")
+    share, error = e.value_and_error("share")
     if error < SEPARABLE:
         return None
     measured = (
@@ -422,9 +424,9 @@ def _course(e: Evidence) -> str | None:
 
 def _bend_within_cycles(e: Evidence) -> Finding | None:
     """Curvature within cycles that no loss has: no lifetime is quoted."""
-    if not e.bends:
+    if not e.bends_impossibly:
         return None
-    share, error = e.scaled("share")
+    share, error = e.value_and_error("share")
     return Finding(
         Status.unidentified,
         f"The current bends within the cycles as no loss does: the share of a in it would be "
@@ -436,7 +438,7 @@ def _bend_within_cycles(e: Evidence) -> Finding | None:
 
 
 def _single_current(e: Evidence) -> Finding | None:
-    share, error = e.scaled("share")
+    share, error = e.value_and_error("share")
     if error < SEPARABLE:
         return None
     return Finding(
@@ -448,7 +450,7 @@ def _single_current(e: Evidence) -> Finding | None:
 
 
 def _rising_current(e: Evidence) -> Finding | None:
-    rate, error = e.sure("rate_mean")
+    rate, error = e.normal_equivalent("rate_mean")
     if rate > -BELIEVED * error:
         return None
     cause = "The current rises, by injection or a drift of the monitor: this is no decay"
@@ -457,17 +459,17 @@ def _rising_current(e: Evidence) -> Finding | None:
 
 def _missed_refills(e: Evidence) -> Finding | None:
     """Refills that may have been missed: the lifetime then seems longer than it is."""
-    if e.aliased:
-        typical, interval = e.usual
+    if e.may_be_aliased:
+        typical, interval = e.usual_cycle
         return Finding(
             Status.unidentified,
             "The beam is held by refills that the record may not resolve: of those that were found "
             f"the next comes after {typical:.3g} readings, but faster ones look the same when read "
             f"every {interval:.3g} s. Record more readings from refill to refill",
         )
-    if e.hidden is None:
+    if e.hidden_refill is None:
         return None
-    lost, limit = e.hidden
+    lost, limit = e.hidden_refill
     return Finding(
         Status.unidentified,
         f"A cycle of the {e.cycles} that were found loses {lost:.2g} mA, and refills below "
@@ -492,7 +494,7 @@ def finding_of_cycles(
     evidence: Evidence, monitor: Monitor | None, left_out: Sequence[str]
 ) -> Finding:
     """Status and sentences of cycles fitted together; `left_out` says what was not fitted."""
-    found, current = judge(evidence, CYCLE_RULES), evidence.about.pieces.current
+    found, current = judge(evidence, CYCLE_RULES), evidence.expansion.pieces.current
     between = f"between {current.min():.4g} and {current.max():.4g} mA"
     first = f"One answer from {evidence.cycles} cycles {between}"
     remarks = [remark(evidence) for remark in CYCLE_REMARKS]
@@ -516,7 +518,7 @@ def _few_residuals(e: Evidence) -> str | None:
 
 def _correlation(e: Evidence) -> str | None:
     found, length = e.separability, e.correlation_time
-    if length is None or (e.freed and not remembers(e.residuals, e.time.size - e.dof)):
+    if length is None or (e.quotes_free_law and not remembers(e.residuals, e.time.size - e.dof)):
         return None
     times = found.error_inflation
     than = f": they are {times:.1f} times those of independent readings" if times else ""
@@ -559,7 +561,7 @@ def _slow_residuals(e: Evidence) -> str | None:
     local = noise_of(record.time, record.current)
     rms = float(np.std(e.residuals)) if rival is None else rival.scatter
     short = length is not None and length < record.span / 3
-    if not e.about.wanders or short or rms < SLOW_RESIDUAL_RATIO * local:
+    if not e.expansion.has_memory or short or rms < SLOW_RESIDUAL_RATIO * local:
         return None
     return (
         f"Neighbouring readings scatter by {local:.2g} mA alone: the loss rate or the monitor "
@@ -599,8 +601,8 @@ def _monitor_drift(e: Evidence) -> str | None:
 
 
 def _odd_lifetime(e: Evidence) -> str | None:
-    rate, error = e.scaled("rate_mean")
-    if not error < DETERMINED * rate or 1 / MAX_LIFETIME < rate < 1 / MIN_LIFETIME:
+    rate, error = e.value_and_error("rate_mean")
+    if not error < MAX_RELATIVE_ERROR * rate or 1 / MAX_LIFETIME < rate < 1 / MIN_LIFETIME:
         return None
     wrong = "milliseconds" if rate < 1 / MAX_LIFETIME else "minutes or hours"
     return (

@@ -300,7 +300,7 @@ def _point(
     relative: list[Quantity | None] = [None, None]
     law = fit.free_law
     comparable = reference is not None and not reference.power and fit.status is not Status.poor_fit
-    if comparable and (law is None or law.beside is None):
+    if comparable and (law is None or law.addition is None):
         relative = [
             None if q.error is None else Quantity(q.value / expected, q.error / expected, "1")
             for q, expected in (
@@ -424,9 +424,9 @@ def _noise(fit: DecayFit, power: float) -> tuple[float, float, float, float]:
     interval, time = float(np.median(np.diff(fit.readings.time))), fit.correlation_time or 0.0
     correlation, residuals = fit.identifiability.residual_correlation or 0.0, fit.residuals
     if power and fit.first is None:
-        about = fit.with_power(power)
-        residuals, found = about.off, about.memory(about.columns(), False)
-        time = found.noise.time if about.wanders else 0.0
+        expansion = fit.with_power(power)
+        residuals, found = expansion.current_residuals, expansion.memory(expansion.columns(), False)
+        time = found.noise.time if expansion.has_memory else 0.0
         correlation = (1 - found.noise.white) * math.exp(-interval / time) if time else 0.0
     white = 1 - correlation * math.exp(interval / time) if correlation else 0.0
     noise = math.sqrt(float(np.mean(np.diff(residuals) ** 2)) / (2 * (1 - correlation)))

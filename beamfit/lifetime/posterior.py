@@ -14,34 +14,34 @@ from jax import Array
 
 from beamfit.errors import Finding, InputError, Status, judge
 from beamfit.lifetime.free_law import (
-    ABOVE,
-    BELOW,
     CONSTANT,
     DRIFT,
+    EXPONENT_SD_ABOVE,
+    EXPONENT_SD_BELOW,
     INTEGRAL,
-    LEAST,
     LOSS_WANDERS,
-    MOST,
+    MAX_EXPONENT,
+    MIN_EXPONENT,
     NODES,
     POWER,
-    SMOOTH,
-    DrawnLaw,
+    SMOOTH_PRIOR,
     Draws,
-    SeenDecay,
+    LawProposal,
+    ReducedDecay,
     at_bounds,
-    ends_of,
     from_nodes,
     gas_change,
-    gas_changed,
-    log_prior,
-    log_pumped,
-    log_straight,
-    middle_of,
-    mixed,
+    gas_change_integral,
+    interval_probabilities,
+    law_currents,
+    log_drift_prior,
+    log_exponent_prior,
+    log_outgassing_prior,
+    loss_rates,
+    mean_current_time,
+    mixture,
     node_currents,
-    of_law,
     proposals,
-    rates_of,
 )
 from beamfit.noise.memory import WHITE, MemoryKind
 from beamfit.quantity import HOUR
@@ -58,11 +58,18 @@ from beamfit.writing import alone
 # Units and bounds of the sampled parameters, names of those that are shown, units of the derived
 # lifetimes, and priors in words.
 UNITS = {"i0": "mA", "a": "1/(mA s)", "b": "1/s", "exponent": "1", "drift": "1", "pace": "1"}
-BOUNDS = {"i0": (0.0, np.inf), "a": (0.0, np.inf), "b": (0.0, np.inf), "exponent": (LEAST, MOST)}
+BOUNDS = {
+    "i0": (0.0, np.inf),
+    "a": (0.0, np.inf),
+    "b": (0.0, np.inf),
+    "exponent": (MIN_EXPONENT, MAX_EXPONENT),
+}
 SHOWN = ("i0", "a", "b", "exponent", "drift")
 LIFETIMES = {"lifetime_start": "h", "lifetime_end": "h", "lifetime_mean": "h"}
-PRIOR_WORDS = {"exponent": f"normal about 0, {BELOW} below and {ABOVE} above",
-          "drift": f"normal, 0 ± {DRIFT}, or that of gas that is pumped away"}  # fmt: skip
+PRIOR_WORDS = {
+    "exponent": f"normal about 0, {EXPONENT_SD_BELOW} below and {EXPONENT_SD_ABOVE} above",
+    "drift": f"normal, 0 ± {DRIFT}, or that of gas that is pumped away",
+}
 # Law to which a noise applies: any, or, for a noise that includes a settling monitor, only the free
 # law or only constant a and b.
 ANY_LAW, FREE_LAW, CONSTANT_LAW = range(3)
@@ -106,12 +113,12 @@ class _Data(NamedTuple):
     ----------
     matrix, log_prior : array, shapes (k, p, p), (k,)
         Gram matrix of the whitened residuals and node columns under each noise, and log prior of
-        the noise, as in `SeenDecay.products`.
+        the noise, as in `ReducedDecay.products`.
     applies_to : array, shape (k,)
         Law to which each noise applies: `ANY_LAW`, `FREE_LAW` or
         `CONSTANT_LAW`.
     count, known, origin, gas, ends : array
-        As in `SeenDecay` and its products.
+        As in `ReducedDecay` and its products.
     middle : float
         Time of the mean current over the span.
     moments : array, shape (3, nodes)
@@ -150,7 +157,7 @@ def _read_parameters(data: _Data, theta: Array) -> DecayParameters:
 def _nodes(data: _Data, numbers: DecayParameters) -> Array:
     """Current at the nodes over the mean current, shape (nodes, 1)."""
     quadratic, linear = numbers.a * data.mean * data.span, numbers.b * data.span
-    lost = linear * (data.gas[:, None] + numbers.drift * gas_changed(numbers.pace))
+    lost = linear * (data.gas[:, None] + numbers.drift * gas_change_integral(numbers.pace))
     found = node_currents(numbers.i0 / data.mean, quadratic, numbers.exponent, lost)
     return found * jnp.exp(-(quadratic + linear) * (INTEGRAL @ numbers.walk))[:, None]
 
@@ -160,7 +167,7 @@ def _log_walk(walk: Array) -> Array:
     roots, probability = LOSS_WANDERS.shapes, LOSS_WANDERS.chance
     chi2 = jnp.sum((np.linalg.inv(roots) @ walk) ** 2, axis=1)
     volume = np.log(np.diagonal(roots, axis1=1, axis2=2)).sum(axis=1)
-    log = jax.nn.logsumexp(np.log(probability / SMOOTH) - 0.5 * chi2 - volume)
+    log = jax.nn.logsumexp(np.log(probability / SMOOTH_PRIOR) - 0.5 * chi2 - volume)
     log = log - 0.5 * NODES * np.log(2 * np.pi)
     return jnp.where(jnp.any(walk != 0), log, 0.0)
 
@@ -181,8 +188,8 @@ def _log_density(data: _Data, theta: Array) -> Array:
     rate = p.a * data.mean + p.b
     share = p.a * data.mean / rate
     gas_drift, pace = (1 - share) * p.drift, jnp.maximum(p.pace, 1.0)
-    pumped = log_pumped(share, gas_drift, pace) + jnp.log1p(-share)
-    smooth = log_prior(p.exponent)[0] + log_straight(p.drift)
+    pumped = log_outgassing_prior(share, gas_drift, pace) + jnp.log1p(-share)
+    smooth = log_exponent_prior(p.exponent)[0] + log_drift_prior(p.drift)
     smooth = smooth + _log_walk(p.walk)
     law = jnp.where(p.pace > 0, pumped, jnp.where(constant, 0.0, smooth))
     shifts = theta[theta.size - data.monitor_shifts.shape[0] :]
@@ -200,7 +207,8 @@ def _derived(data: _Data, theta: Array) -> Array:
     wander_loss = total * data.span * (data.moments @ (INTEGRAL @ n.walk))
     changed = n.b * n.drift * gas_change(moments, n.pace) + wander
     currents = _nodes(data, n)[:, 0]
-    rates = rates_of(n.a * data.mean, n.b, n.exponent, changed, of_law(currents, wander_loss), data)
+    x = law_currents(currents, wander_loss)
+    rates = loss_rates(n.a * data.mean, n.b, n.exponent, changed, x, data.ends)
     return 1.0 / HOUR / jnp.stack(rates)
 
 
@@ -219,21 +227,21 @@ class _Prepared(NamedTuple):
     """Fit prepared for sampling: its laws, and shifts of I0, a and b by errors of the monitor."""
 
     fit: Any
-    seen: SeenDecay
-    laws: list[DrawnLaw]
+    seen: ReducedDecay
+    laws: list[LawProposal]
     monitor_shifts: np.ndarray
 
     @classmethod
     def of(cls, fit) -> _Prepared:
         """Prepare a fit with its law and, if a and b are constant, its noise."""
-        about = fit.about
-        seen = SeenDecay.of(fit.readings, about.values)
+        expansion = fit.expansion
+        seen = ReducedDecay.of(fit.readings, expansion.values)
         if fit.free_law is None and fit.correlation_time is None:
             white = np.array([kind == MemoryKind(WHITE) for kind in seen.products.kinds])
             # There is no white noise where nothing fits.
             seen = seen.of_noises(white) if white.any() else seen
-        laws = [DrawnLaw.of(seen, CONSTANT)] if fit.free_law is None else proposals(seen)
-        moved = [about.moved(change)[:3] for change in about.pieces.monitor_changes]
+        laws = [LawProposal.of(seen, CONSTANT)] if fit.free_law is None else proposals(seen)
+        moved = [expansion.value_shifts(change)[:3] for change in expansion.pieces.monitor_changes]
         return cls(fit, seen, laws, np.reshape(moved, (-1, 3)))
 
     @property
@@ -246,7 +254,7 @@ class _Prepared(NamedTuple):
 
     def draws(self, number: int, seed: int = 0) -> Draws:
         """Draw `number` samples from each law."""
-        return mixed([law.weighed(number, seed) for law in self.laws])
+        return mixture([law.weighted_draws(number, seed) for law in self.laws])
 
     def thetas(self, draws: Draws, rng: np.random.Generator) -> np.ndarray:
         """Draws as parameter vectors of the target."""
@@ -262,10 +270,10 @@ class _Prepared(NamedTuple):
         """Target of the sampler: the posterior with its data, bounds and priors."""
         fit, seen, draws = self.fit, self.seen, self.draws(STEPS * WALKERS)
         record, thetas = fit.readings, self.thetas(draws, np.random.default_rng(0))
-        middle = middle_of(draws.currents, draws.weight)
+        middle = mean_current_time(draws.currents, draws.weight)
         noises = [(seen.products, ANY_LAW)]
         noises += [
-            (law.seen.products, FREE_LAW if POWER in law.free else CONSTANT_LAW)
+            (law.reduced.products, FREE_LAW if POWER in law.free else CONSTANT_LAW)
             for law in self.laws
             if law.disturbance not in (None, LOSS_WANDERS)
         ]
@@ -303,7 +311,7 @@ def _interval_ends(draws: Draws) -> dict[str, tuple[float, float]]:
     found = {}
     for name, (low, high) in (("a", (at_zero, at_one)), ("b", (at_one, at_zero))):
         if low or high:
-            low_end, high_end = ends_of(low, high)
+            low_end, high_end = interval_probabilities(low, high)
             found[name] = (0.0 if low else low_end, BOUND_QUANTILE if high else high_end)
     return found
 
@@ -360,7 +368,7 @@ def sampled(
         return _not_sampled(reason, seed)
     with np.errstate(all="ignore"):
         ready = _Prepared.of(fit)
-        if not ready.draws(STEPS).worth > 0:
+        if not ready.draws(STEPS).effective_size > 0:
             return _not_sampled(
                 f"no a and b that are not negative fit; {fit.message}".rstrip("."), seed
             )

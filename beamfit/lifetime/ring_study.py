@@ -20,7 +20,7 @@ from beamfit.answer import Row, Table, answer, cell, json_of, labelled
 from beamfit.errors import Finding, InputError, Judged
 from beamfit.greybox.design import Information, scores
 from beamfit.lifetime.decay_law import current as beam_at
-from beamfit.lifetime.expansion import DETERMINED, Expansion, lifetime_of
+from beamfit.lifetime.expansion import MAX_RELATIVE_ERROR, Expansion, lifetime_of
 from beamfit.lifetime.fill_noise import quantiles
 from beamfit.lifetime.fit import bare
 from beamfit.lifetime.loss_network import N_VOLTAGES, NetworkFit, fit_loss_network
@@ -559,7 +559,7 @@ def predict_held_back(fit: ScaleFit) -> tuple[LeaveOneOut, ...]:
         reading = np.linalg.inv(root)[1]
         rate, error = measured.parts[k, 1], np.linalg.norm(reading)
         # Under some noises a decay alone determines a scale, and is not predicted by the others.
-        predicted = variance - error**2 < (DETERMINED * rate) ** 2
+        predicted = variance - error**2 < (MAX_RELATIVE_ERROR * rate) ** 2
         noise_weight = noise.weight * predicted
         if not noise_weight.sum() > MENTION_PROBABILITY:
             continue

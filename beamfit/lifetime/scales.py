@@ -22,7 +22,7 @@ from beamfit.greybox.fit import Fit
 from beamfit.greybox.posterior import Optimum, Statement, target_of
 from beamfit.greybox.problem import Free, Prior, Problem, Record
 from beamfit.greybox.solve import solve
-from beamfit.lifetime.expansion import DETERMINED, LEVEL, LOSS, QUADRATIC, Expansion
+from beamfit.lifetime.expansion import LEVEL, LOSS, MAX_RELATIVE_ERROR, QUADRATIC, Expansion
 from beamfit.lifetime.fill_noise import (
     MIN_HALF_RANGE,
     MODEL_SIZES,
@@ -92,9 +92,9 @@ def information_root(expansion: Expansion, scale: float = 1.0) -> np.ndarray:
 
 def _decay_root(fit: DecayFit, expansion: Expansion) -> np.ndarray:
     """Root of the information of a decay, as in `Summaries`, with stated monitor errors added."""
-    scale = max(np.sqrt(expansion.residuals @ expansion.residuals / fit.dof), expansion.given)
+    scale = max(np.sqrt(expansion.residuals @ expansion.residuals / fit.dof), expansion.min_factor)
     root = information_root(expansion, scale * fit.inflation)
-    moved = [expansion.moved(change) for change in expansion.pieces.monitor_changes]
+    moved = [expansion.value_shifts(change) for change in expansion.pieces.monitor_changes]
     if not moved:
         return root
     changes = np.array([[m.a * expansion.pieces.units[1], m.rate_mean] for m in moved]).T
@@ -387,7 +387,7 @@ class ScaleFit(Judged):
             value = quantity.value
             # The error is compared with 1 where the value is smaller: an absent mechanism,
             # 0.0 ± 0.1, is separable. The voltage must be determined better than by its prior.
-            determined = quantity.error < DETERMINED * max(value, 1.0)
+            determined = quantity.error < MAX_RELATIVE_ERROR * max(value, 1.0)
             if name == VOLTAGE:
                 determined = 2 * quantity.error**2 < priors[name] ** 2
             found[name] = quantity if determined and not undetermined[k] else quantity.open()
@@ -430,7 +430,7 @@ class ScaleFit(Judged):
         ring_file = jnp.ones_like(vector)
         size = np.maximum(np.abs(quantity(vector)), np.abs(quantity(ring_file)))
         error = self.spread.error(np.asarray(jax.jacfwd(quantity)(vector)))
-        return error < DETERMINED * size
+        return error < MAX_RELATIVE_ERROR * size
 
     def linearise(self, decays: DecaySet) -> tuple[np.ndarray, ...]:
         """Linearise decays about the fitted scales.

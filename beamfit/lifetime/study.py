@@ -13,15 +13,21 @@ import numpy as np
 
 from beamfit.answer import answer, json_of, shown
 from beamfit.errors import InputError, expect
-from beamfit.lifetime.cycles import alike, joined
+from beamfit.lifetime.cycles import group_by_settings, join_cycles
 from beamfit.lifetime.evidence import SEPARABLE
-from beamfit.lifetime.fit import FEWEST as FEWEST_FITTED
-from beamfit.lifetime.fit import DecayFit, bare, fit_cycles, fit_decay, fit_pieces
+from beamfit.lifetime.fit import (
+    MIN_FITTED_READINGS,
+    DecayFit,
+    bare,
+    fit_cycles,
+    fit_decay,
+    fit_pieces,
+)
 from beamfit.lifetime.free_law import DRIFT, Law
 from beamfit.lifetime.mechanisms import MECHANISMS, Losses, loss_coefficients
 from beamfit.lifetime.pieces import (
-    FEWEST_CYCLES,
-    FEWEST_READINGS,
+    MIN_CYCLE_READINGS,
+    MIN_CYCLES,
     Event,
     Split,
     beam_readings,
@@ -30,8 +36,8 @@ from beamfit.lifetime.pieces import (
     split_record,
 )
 from beamfit.lifetime.readings import (
-    FEWEST,
-    STAIR,
+    MIN_READINGS,
+    MIN_STAIR_READINGS,
     noise_of,
     on_edges,
     thinned,
@@ -286,7 +292,7 @@ def separable_cycles(
         bend = float(cycle.current.mean()) * loss**2 / 24 * math.sqrt(len(cycle) / 5)
         return noise < SEPARABLE * bend
 
-    return [cycle for cycle in cycles if len(cycle) >= FEWEST and separates(cycle)]
+    return [cycle for cycle in cycles if len(cycle) >= MIN_READINGS and separates(cycle)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -425,26 +431,26 @@ def split_at_settings(segment: DecayRecord) -> list[DecayRecord]:
     """Split a segment where a setting changes."""
     moved = np.any(list(_setting_steps(segment).values()), axis=0)
     if not moved.any():
-        return [segment] if len(segment) >= FEWEST else []
+        return [segment] if len(segment) >= MIN_READINGS else []
     pieces = np.split(np.arange(len(segment)), np.flatnonzero(moved) + 1)
-    return [segment.select(rows) for rows in pieces if len(rows) >= FEWEST]
+    return [segment.select(rows) for rows in pieces if len(rows) >= MIN_READINGS]
 
 
 def _pool_cycles(
     cycles: Sequence[DecayRecord], name: str, machine: Machine | None, law: Law
 ) -> tuple[list[Decay], list[DecayRecord]]:
     """Fit cycles at the same settings together; also return those to be fitted alone."""
-    groups, pooled, single = alike(cycles), [], []
-    pooled_groups = sum(len(group) >= FEWEST_CYCLES for group in groups)
+    groups, pooled, single = group_by_settings(cycles), [], []
+    pooled_groups = sum(len(group) >= MIN_CYCLES for group in groups)
     for group in groups:
-        if len(group) < FEWEST_CYCLES:
-            single += [cycle for cycle in group if len(cycle) >= FEWEST]
+        if len(group) < MIN_CYCLES:
+            single += [cycle for cycle in group if len(cycle) >= MIN_READINGS]
             continue
         group_name = name if pooled_groups == 1 else f"{name}@{len(pooled) + 1}"
         group = _edges_of_cycles(group)
         # Edges of digits (`mean` is set) show a missed refill only as a step: do not search them.
         fit = fit_cycles(group, group_name, law, found=group[0].mean is None)
-        segment = joined(group, group_name)
+        segment = join_cycles(group, group_name)
         separable = separable_cycles(group, segment, fit)
         single += separable
         answered = fit.status not in REFUTING and fit.lifetime_mean.error is not None
@@ -460,14 +466,16 @@ def _edges_of_cycles(cycles: list[DecayRecord]) -> list[DecayRecord]:
     A step must last twice as many readings as in a single decay: a cycle has few edges, so the
     error of each counts more.
     """
-    edges = [(cycle, on_edges(cycle, FEWEST_READINGS, 2 * STAIR)) for cycle in cycles]
+    edges = [
+        (cycle, on_edges(cycle, MIN_CYCLE_READINGS, 2 * MIN_STAIR_READINGS)) for cycle in cycles
+    ]
     stairs = [found for cycle, found in edges if found is not cycle]
-    return stairs if len(stairs) >= max(FEWEST_CYCLES, len(cycles) / 2) else cycles
+    return stairs if len(stairs) >= max(MIN_CYCLES, len(cycles) / 2) else cycles
 
 
 def _split_at_changes(record: DecayRecord) -> tuple[Split, bool]:
     """Split a record into decays at constant settings; also return if refills hold the beam."""
-    if len(record) < FEWEST:
+    if len(record) < MIN_READINGS:
         return Split((record,), ()), False
     sections = split_at_settings(record)
     splits = [split_record(section) for section in sections]
@@ -481,13 +489,13 @@ def _split_at_changes(record: DecayRecord) -> tuple[Split, bool]:
     if pieces:
         return Split(tuple(pieces), tuple(events)), refilled
     kinds = {event.kind for event in events}
-    if kinds == {"spike"} and (kept := beam_readings(record)[0]).size >= FEWEST_FITTED:
+    if kinds == {"spike"} and (kept := beam_readings(record)[0]).size >= MIN_FITTED_READINGS:
         return Split((record.select(kept),), tuple(events)), False
     moving = [name for name, steps in _setting_steps(record).items() if steps.any()]
     if moving or "short" not in kinds:
         changes = f"changes of {', '.join(moving)} by more than {100 * SETTING_STEP:g} %"
         found = ", ".join(sorted(kinds)) or changes
-        expected = f"at least {FEWEST} readings in a row of a stored beam"
+        expected = f"at least {MIN_READINGS} readings in a row of a stored beam"
         expected += "; leave out a setting that only scatters with --ignore" if moving else ""
         raise InputError(f"no decay between {found}", expected, record.name, column="current")
     return Split((), tuple(events)), False
@@ -530,10 +538,10 @@ def _fit_piece(piece: DecayRecord, law: Law, undivided: bool) -> tuple[list[Deca
         # Thinned readings are means of neighbours: the change is anywhere within one of them.
         margin += float(np.median(np.diff(segment.time))) * (len(segment) < len(piece))
         sides = piece.time < at - margin, piece.time > at + margin
-        sides_to_fit = [piece.select(rows) for rows in sides if np.sum(rows) >= FEWEST]
+        sides_to_fit = [piece.select(rows) for rows in sides if np.sum(rows) >= MIN_READINGS]
         if sides_to_fit and max(map(len, sides_to_fit)) < len(piece):
             decays, events = _fit_each(sides_to_fit, law, undivided)
-            short = [rows for rows in sides if 0 < np.sum(rows) < FEWEST]
+            short = [rows for rows in sides if 0 < np.sum(rows) < MIN_READINGS]
             short = [event_of(piece, "short", *np.flatnonzero(rows)[[0, -1]]) for rows in short]
             short = [one._replace(time=piece.start + one.time) for one in short]
             return decays, [*events, *short, event._replace(time=piece.start + at)]

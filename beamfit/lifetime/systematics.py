@@ -17,11 +17,11 @@ from beamfit.lifetime.expansion import (
     LOSS,
     POWER,
     Pieces,
+    fit_law,
     further_columns,
     lifetime_of,
-    solved,
 )
-from beamfit.lifetime.fit import FEWEST, DecayFit, bare, fit_decay
+from beamfit.lifetime.fit import MIN_FITTED_READINGS, DecayFit, bare, fit_decay
 from beamfit.lifetime.free_law import Law
 from beamfit.lifetime.record import DecayRecord
 from beamfit.quantity import HOUR, Quantity, Status
@@ -101,8 +101,8 @@ def systematics(fit: DecayFit) -> tuple[Systematic, ...]:
     record, other_law = fit.readings, fit.shaped or fit.first is not None
     if other_law or fit.status is Status.infeasible or fit.a.error is None:
         return ()
-    expansion = fit.about
-    errors, share = expansion.pieces.over, record.time / record.span
+    expansion = fit.expansion
+    errors, share = expansion.pieces.divisor, record.time / record.span
     rise = further_columns(expansion, "drift", np.zeros(1))[:, 0] * errors * record.span
     rises = f"pressure rises by {100 * PRESSURE_RISE:g} % over the record"
     bends = f"a goes as I^{EXPONENT:g}, as of a bunch that lengthens"
@@ -113,7 +113,7 @@ def systematics(fit: DecayFit) -> tuple[Systematic, ...]:
         causes = {cause: change for cause, change in causes.items() if cause not in contained}
     rate, rows = a * fit.mean_current + b, []
     for cause, change in causes.items():
-        moved = expansion.moved(change / errors)
+        moved = expansion.value_shifts(change / errors)
         lifetime = -moved.rate_mean / rate**2 / HOUR
         rows.append(Systematic(cause, moved.a, moved.b, lifetime))
     gas = max(b, 0.0) * FOLLOWING_SHARE / (1 - FOLLOWING_SHARE)
@@ -192,10 +192,10 @@ def single_exponential(record: DecayRecord, fit: DecayFit | None = None) -> OneL
     >>> print(single_exponential(DecayRecord(t, 500 / (1 + t / 36000))).lifetime.value > 10)
     True
     """
-    found = solved(Pieces.of(record), (LOSS,))
-    moments = found.memory((LEVEL, LOSS), True).moments(np.eye(2)[1:], found.given)
+    found = fit_law(Pieces.of(record), (LOSS,))
+    moments = found.memory((LEVEL, LOSS), True).moments(np.eye(2)[1:], found.min_factor)
     error = float(moments.error[0]) / record.span
-    return _one_lifetime(float(found.values.b), error, found.off, record, fit)
+    return _one_lifetime(float(found.values.b), error, found.current_residuals, record, fit)
 
 
 def log_linear(record: DecayRecord, fit: DecayFit | None = None) -> OneLifetime:
@@ -288,9 +288,11 @@ def moving_lifetime(record: DecayRecord, window: float) -> LifetimeTrace:
     centres = np.flatnonzero((time >= window / 2) & (time <= record.span - window / 2))
     first = np.searchsorted(time, time[centres] - window / 2, side="left")
     last = np.searchsorted(time, time[centres] + window / 2, side="right")
-    full = last - first >= FEWEST
+    full = last - first >= MIN_FITTED_READINGS
     if not full.any():
-        expected = f"one that holds {FEWEST} readings and fits into {record.span:.6g} s"
+        expected = (
+            f"one that holds {MIN_FITTED_READINGS} readings and fits into {record.span:.6g} s"
+        )
         raise InputError(f"a window of {window:.6g} s", expected, path=record.name)
     rows = []
     for start, end in zip(first[full], last[full], strict=True):

@@ -17,12 +17,12 @@ from beamfit.answer import json_of
 from beamfit.errors import InputError
 from beamfit.lifetime import alarm
 from beamfit.lifetime.course import MIN_RELATIVE_NOISE, normalised_lifetime, reference_of
-from beamfit.lifetime.cycles import alike, joined
+from beamfit.lifetime.cycles import group_by_settings, join_cycles
 from beamfit.lifetime.evidence import UNITS
 from beamfit.lifetime.fit import DecayFit, bare, fit_decay, fit_pieces
 from beamfit.lifetime.free_law import Law
 from beamfit.lifetime.mechanisms import loss_coefficients, losses_from_terms, mechanism_terms
-from beamfit.lifetime.pieces import DROPOUT, FEWEST, split_record
+from beamfit.lifetime.pieces import DROPOUT, MIN_READINGS, split_record
 from beamfit.lifetime.record import PLAUSIBLE, Conditions, DecayRecord
 from beamfit.lifetime.study import (
     SETTING_STEP,
@@ -168,11 +168,13 @@ def fit_window(rows: Sequence[WindowRow], name: str, law: Law = Law.free) -> Win
         for decay in split_record(section).segments
     ]
     if not decays:
-        return Window(None, None, 0, f"fewer than {FEWEST} readings in a row of a stored beam")
+        return Window(
+            None, None, 0, f"fewer than {MIN_READINGS} readings in a row of a stored beam"
+        )
     group = _at_last_settings(decays)
     alone = len(group) == 1
-    one = replace(group[0], name=name) if alone else joined(group, name)
-    if len(one) < FEWEST:
+    one = replace(group[0], name=name) if alone else join_cycles(group, name)
+    if len(one) < MIN_READINGS:
         return Window(None, one, len(group), f"{len(one)} readings since the last change")
     try:
         if alone:
@@ -201,17 +203,19 @@ def _records(rows: Sequence[WindowRow], name: str) -> list[DecayRecord]:
             time[part], current[part], None, name, time[part[0]],
             Conditions(*(None if column is None else column[part] for column in filled)),
         )
-        for part in parts if part.size >= FEWEST
+        for part in parts if part.size >= MIN_READINGS
     ]  # fmt: skip
 
 
 def _at_last_settings(decays: list[DecayRecord]) -> list[DecayRecord]:
     """Select decays at the settings of the last, and its pressure unless that follows the beam."""
     compared = decays
-    if joined(decays, "").gauge is None:
+    if join_cycles(decays, "").gauge is None:
         compared = [replace(d, conditions=d.conditions._replace(pressure=None)) for d in decays]
     starts = next(
-        {decay.start for decay in group} for group in alike(compared) if compared[-1] in group
+        {decay.start for decay in group}
+        for group in group_by_settings(compared)
+        if compared[-1] in group
     )
     return [decay for decay in decays if decay.start in starts]
 
