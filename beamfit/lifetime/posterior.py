@@ -70,8 +70,8 @@ PRIOR_WORDS = {
     "exponent": f"normal about 0, {EXPONENT_SD_BELOW} below and {EXPONENT_SD_ABOVE} above",
     "drift": f"normal, 0 ± {DRIFT}, or that of gas that is pumped away",
 }
-# Law to which a noise applies: any, or, for a noise that includes a settling monitor, only the free
-# law or only constant a and b.
+# Law to which a noise applies: any. A noise that includes a disturbed monitor applies only to the
+# free law or only to constant a and b.
 ANY_LAW, FREE_LAW, CONSTANT_LAW = range(3)
 # Quantile at which the 95 % interval of a or b ends where all of the loss may be of that kind.
 BOUND_QUANTILE = 0.999
@@ -322,7 +322,7 @@ def _observed(fit) -> dict[str, np.ndarray]:
     return found if error is None else found | {"decay error": error}
 
 
-def sampled(
+def sample_decay(
     fit,
     priors: Mapping[str, Distribution] | None = None,
     *,

@@ -448,7 +448,7 @@ def _pool_cycles(
             continue
         group_name = name if pooled_groups == 1 else f"{name}@{len(pooled) + 1}"
         group = _edges_of_cycles(group)
-        # Edges of digits (`mean` is set) show a missed refill only as a step: do not search them.
+        # With edges of digits (`mean` is set) no refill is missed: it would show as a step.
         fit = fit_cycles(group, group_name, law, found=group[0].mean is None)
         segment = join_cycles(group, group_name)
         separable = separable_cycles(group, segment, fit)
