@@ -81,7 +81,7 @@ MIN_EFFECTIVE = 200.0
 WALKERS, STEPS, MAX_STEPS = 16, 1024, 16384
 
 
-class DecayParameters(NamedTuple):
+class DecayNumbers(NamedTuple):
     """Parameters of a decay.
 
     dI/dt = -a I² (I/mean)^exponent - b (1 + drift f(t)) I - (a mean + b) walk(t) I.
@@ -144,17 +144,17 @@ class _Data(NamedTuple):
     monitor_shifts: Array
 
 
-def _read_parameters(data: _Data, theta: Array) -> DecayParameters:
+def _read_parameters(data: _Data, theta: Array) -> DecayNumbers:
     """Parameters as the monitor reads them; theta ends with its errors in standard deviations."""
     errors = data.monitor_shifts.shape[0]
     parameters, shifts = theta[: theta.size - errors], theta[theta.size - errors :]
     last = len(UNITS)
     walk = parameters[last:] if parameters.size > last else jnp.zeros(NODES)
     law = jnp.append(parameters[3:last], jnp.zeros(last - parameters[:last].size))
-    return DecayParameters(*(parameters[:3] - shifts @ data.monitor_shifts), *law, walk)
+    return DecayNumbers(*(parameters[:3] - shifts @ data.monitor_shifts), *law, walk)
 
 
-def _nodes(data: _Data, numbers: DecayParameters) -> Array:
+def _nodes(data: _Data, numbers: DecayNumbers) -> Array:
     """Current at the nodes over the mean current, shape (nodes, 1)."""
     quadratic, linear = numbers.a * data.mean * data.span, numbers.b * data.span
     lost = linear * (data.gas[:, None] + numbers.drift * gas_change_integral(numbers.pace))
@@ -216,8 +216,8 @@ def _no_residual(data: _Data, theta: Array) -> tuple[Array]:
     return (jnp.zeros(0),)
 
 
-def _parameters(data: _Data, theta: Array) -> DecayParameters:
-    return DecayParameters(*theta[:3], *_read_parameters(data, theta)[3:])
+def _parameters(data: _Data, theta: Array) -> DecayNumbers:
+    return DecayNumbers(*theta[:3], *_read_parameters(data, theta)[3:])
 
 
 DENSITY = PosteriorLaw(_no_residual, _log_density, _derived, _parameters)
