@@ -24,7 +24,7 @@ LENGTHS = np.repeat([4.0, 8.0, 16.0, 32.0, 64.0, 128.0], 4) * MINUTE
 PHASES = LENGTHS * np.tile([0.0, 0.25, 0.5, 0.75], 6)
 # Standard deviation of the prior of the relative changes of a and b after an alarm: chosen wide, so
 # that it matters only where the readings determine nothing.
-PRIOR_WIDTH = 0.3
+CHANGE_PRIOR_WIDTH = 0.3
 # Relative standard deviation of a and of b on an ordinary day, and from fill to fill where that is
 # not known: changes of this size raise no alarm.
 WANDER = 0.005
@@ -195,7 +195,7 @@ def estimate_change(
     covariance does not.
     """
     products = window_products(state, slice(-1, None))[..., 0, :, :]
-    products = products + PRIOR_WIDTH**-2 * np.eye(2, 3)
+    products = products + CHANGE_PRIOR_WIDTH**-2 * np.eye(2, 3)
     information, score = products[..., :2], products[..., 2]
     information_alone = np.diagonal(information, axis1=-2, axis2=-1)
     share, covariance = information / information_alone[..., None], np.linalg.inv(information)

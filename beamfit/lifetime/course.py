@@ -35,10 +35,10 @@ RATIO_ERROR = 0.3
 MIN_RELATIVE_NOISE = 1e-7
 # Largest number of points into which records of top-up are divided: chosen, one each half hour
 # of a day.
-MAX_PARTS = 48
+MAX_TREND_POINTS = 48
 # Largest number of readings that are watched, chosen for speed; of more only every second, third,
 # ... one.
-MAX_READINGS = 50_000
+MAX_WATCHED_READINGS = 50_000
 
 
 class CoursePoint(NamedTuple):
@@ -237,7 +237,7 @@ def trend_of(studies: Sequence[RecordStudy], machine: Machine | None = None) -> 
         ((study.record.start or 0.0) + decay.offset, decay)
         for study in studies
         for each in study.decays or study.pooled
-        for decay in each.parts(max(MAX_PARTS // len(studies), 1), machine)
+        for decay in each.parts(max(MAX_TREND_POINTS // len(studies), 1), machine)
         if decay.fit.lifetime_mean.error is not None
     ]
     if not dated_decays:
@@ -451,7 +451,7 @@ def _alarms(
     ]
     rows = np.concatenate(rows)
     rows = rows[rows[:, 0] >= times[0]]
-    rows = rows[:: math.ceil(len(rows) / MAX_READINGS)]
+    rows = rows[:: math.ceil(len(rows) / MAX_WATCHED_READINGS)]
     place = np.searchsorted(times, rows[:, 0], side="right") - 1
     return alarms_of(reference, *rows.T, a[place], b[place])
 

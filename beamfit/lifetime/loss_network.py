@@ -174,7 +174,7 @@ CORRECTION = 0.3
 MAX_WEIGHT = 10.0
 # Smallest half range by which an input is scaled, 0.1 MV or 10 %: a setting that hardly moves
 # determines nothing.
-MIN_HALF_RANGE = 0.1
+MIN_INPUT_SCALE = 0.1
 # Correlation length of the model error, in half ranges: chosen on simulated shifts.
 CORRELATION_LENGTH = 0.8
 # Number of RF voltages in a search for the maximum of the lifetime: chosen, 1/64 of the range.
@@ -341,7 +341,7 @@ def fit_loss_network(
     inputs = np.stack([_inputs(*setting) for setting in settings])
     if not np.isfinite(inputs).all():
         raise InputError("a setting that is not finite", "RF voltage, scraper, pressure, bunches")
-    half = np.maximum(np.ptp(inputs, axis=0) / 2, MIN_HALF_RANGE)
+    half = np.maximum(np.ptp(inputs, axis=0) / 2, MIN_INPUT_SCALE)
     low, high = (inputs.min(0), inputs.max(0)) if box is None else box.corners()
     entries = zip(INPUTS, half, inputs.mean(0), low, high, strict=True)
     ports = [Port(name, "", 0, *scale) for name, *scale in entries]
