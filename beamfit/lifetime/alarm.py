@@ -24,7 +24,7 @@ LENGTHS = np.repeat([4.0, 8.0, 16.0, 32.0, 64.0, 128.0], 4) * MINUTE
 PHASES = LENGTHS * np.tile([0.0, 0.25, 0.5, 0.75], 6)
 # Standard deviation of the prior of the relative changes of a and b after an alarm: chosen wide, so
 # that it matters only where the readings determine nothing.
-PRIOR_WIDTH = 0.3
+CHANGE_PRIOR_WIDTH = 0.3
 # Relative standard deviation of a and of b on an ordinary day, and from fill to fill where that is
 # not known: changes of this size raise no alarm.
 WANDER = 0.005
@@ -195,7 +195,7 @@ def estimate_change(
     covariance does not.
     """
     products = window_products(state, slice(-1, None))[..., 0, :, :]
-    products = products + PRIOR_WIDTH**-2 * np.eye(2, 3)
+    products = products + CHANGE_PRIOR_WIDTH**-2 * np.eye(2, 3)
     information, score = products[..., :2], products[..., 2]
     information_alone = np.diagonal(information, axis1=-2, axis2=-1)
     share, covariance = information / information_alone[..., None], np.linalg.inv(information)
@@ -391,9 +391,9 @@ def watched(
     >>> for second in range(1800):
     ...     worse = 1.1 if second > 600 else 1.0
     ...     beam *= 1 - worse * usual.a * beam - usual.b
-    ...     state, told = watched(usual, state, Reading(second, beam))
-    ...     if told.raised or told.moved:
-    ...         print(second, NAMES[told.moved] or "raised", f"{100 * told.change[0]:.0f} % in a")
+    ...     state, step = watched(usual, state, Reading(second, beam))
+    ...     if step.raised or step.moved:
+    ...         print(second, NAMES[step.moved] or "raised", f"{100 * step.change[0]:.0f} % in a")
     618 raised 0 % in a
     1055 a 10 % in a
     """
@@ -409,11 +409,11 @@ def is_gap(seconds: np.ndarray | float, interval: float) -> np.ndarray | bool:
     return seconds > max(GAP * interval, MINUTE)
 
 
-def _compare(usual: Reference, state: AlarmState, reading: Reading) -> tuple[np.ndarray, ...]:
-    """Compare a reading with the previous one.
+class _Increment(NamedTuple):
+    """Difference of a reading from the previous one.
 
-    Returns
-    -------
+    Attributes
+    ----------
     seconds : array
         Time between them, s; 1 across a gap.
     continues, ended : array of bool
@@ -426,23 +426,35 @@ def _compare(usual: Reference, state: AlarmState, reading: Reading) -> tuple[np.
         Relative noise of a reading, its correlation with the previous reading, and the standard
         deviation of the difference of the two.
     """
+
+    seconds: np.ndarray
+    continues: np.ndarray
+    ended: np.ndarray
+    moved: np.ndarray
+    expected: np.ndarray
+    noise: np.ndarray
+    memory: np.ndarray
+    change: np.ndarray
+
+
+def _increment(reference: Reference, state: AlarmState, reading: Reading) -> _Increment:
     with np.errstate(invalid="ignore", divide="ignore"):
         seconds = np.asarray(reading.time - state.time)
-        going = (seconds > 0) & ~is_gap(seconds, usual.interval)
+        going = (seconds > 0) & ~is_gap(seconds, reference.interval)
         seconds = np.where(going, seconds, 1.0)
         middle = (reading.current + state.current) / 2
-        by_a, by_b = usual.rates(middle)
+        by_a, by_b = reference.rates(middle)
         a_part = by_a * state.factor[..., 0] * reading.a_factor * seconds
         b_part = by_b * state.factor[..., 1] * reading.b_factor * seconds
         excess = np.log(reading.current / state.current) + a_part + b_part
-        noise = usual.noise / reading.current * np.sqrt(state.noise)
+        noise = reference.noise / reading.current * np.sqrt(state.noise)
         memory = np.zeros_like(seconds)
-        if usual.correlation_time:
-            memory = np.exp(-seconds / usual.correlation_time)
+        if reference.correlation_time:
+            memory = np.exp(-seconds / reference.correlation_time)
         # The excess expected from the rate in the last interval, over at most its length.
         extrapolated = np.where(state.interval > 0, np.minimum(seconds, state.interval), 0.0)
         ratio = extrapolated / np.where(state.interval > 0, state.interval, 1.0)
-        change = noise * np.sqrt(2 * (1 - (1 - usual.white) * memory))
+        change = noise * np.sqrt(2 * (1 - (1 - reference.white) * memory))
         sigma = change * np.sqrt(1 + ratio + ratio**2)
         deviation = np.abs(excess - state.excess_rate * extrapolated)
         continues = deviation <= STEP_ERRORS * sigma + STEP_SHARE * (a_part + b_part)
@@ -450,51 +462,49 @@ def _compare(usual: Reference, state: AlarmState, reading: Reading) -> tuple[np.
         expected = np.stack(np.broadcast_arrays(reading.a_factor, reading.b_factor, noise)[:2], -1)
         continues &= (np.abs(expected / state.expected - 1) <= EXPECTATION_STEP).all(-1)
     moved = np.stack([excess, -a_part, -b_part], axis=-1)
-    return seconds, going & continues, going & ~continues, moved, expected, noise, memory, change
+    ended = going & ~continues
+    return _Increment(seconds, going & continues, ended, moved, expected, noise, memory, change)
 
 
-def _advance(usual: Reference, state: AlarmState, reading: Reading) -> AlarmState:
+def _advance(reference: Reference, state: AlarmState, reading: Reading) -> AlarmState:
     """Advance path, noise and windows by one reading."""
-    seconds, going, cut, moved, expected, noise, memory, change = _compare(usual, state, reading)
-    between = np.where(going, seconds, 0.0)
-    wait = np.where(cut, SETTLING_TIME, np.maximum(state.wait - between, 0.0))
-    path = np.where(going[..., None], state.path + np.where(going[..., None], moved, 0.0), 0.0)
-    begins = ~going | (state.wait > 0)
-    alone, weight, noise_estimate, estimate_variance = _whiten(
-        usual, state, path, np.where(begins, 0.0, memory)
-    )
-    weight = np.where(wait > 0, 0.0, weight / noise**2)
+    step = _increment(reference, state, reading)
+    elapsed = np.where(step.continues, step.seconds, 0.0)
+    wait = np.where(step.ended, SETTLING_TIME, np.maximum(state.wait - elapsed, 0.0))
+    path = np.where(step.continues[..., None], state.path + step.moved, 0.0)
+    begins = ~step.continues | (state.wait > 0)
+    memory = np.where(begins, 0.0, step.memory)
+    whitened, weight, noise_estimate, estimate_variance = _whiten(reference, state, path, memory)
+    weight = np.where(wait > 0, 0.0, weight / step.noise**2)
     if begins.any():
         # A new piece begins: add the finished one to the past of each window.
         past_products = choose(begins, window_products(state), state.past_products)
-        state = state._replace(
-            past_products=past_products, products=choose(begins, 0.0, state.products)
-        )
-    windows = update_windows(
-        state, np.where(begins[..., None], 0.0, state.weight), alone, weight, between
-    )
-    same_clock = going | cut
-    square = moved[..., 0] ** 2 / change**2
-    trend = np.where(going, np.minimum(square, STEP_ERRORS**2) * state.noise - state.noise, 0.0)
+        products = choose(begins, 0.0, state.products)
+        state = state._replace(past_products=past_products, products=products)
+    weight_before = np.where(begins[..., None], 0.0, state.weight)
+    windows = update_windows(state, weight_before, whitened, weight, elapsed)
+    no_gap = step.continues | step.ended
+    square = np.minimum(step.moved[..., 0] ** 2 / step.change**2, STEP_ERRORS**2)
+    trend = np.where(step.continues, square * state.noise - state.noise, 0.0)
     return state._replace(
         time=np.broadcast_to(reading.time, state.time.shape).astype(float),
         current=np.broadcast_to(reading.current, state.time.shape).astype(float),
-        interval=np.where(same_clock, seconds, 0.0),
-        excess_rate=np.where(same_clock, moved[..., 0] / seconds, 0.0),
-        expected=expected,
-        clock=state.clock + between,
+        interval=np.where(no_gap, step.seconds, 0.0),
+        excess_rate=np.where(no_gap, step.moved[..., 0] / step.seconds, 0.0),
+        expected=step.expected,
+        clock=state.clock + elapsed,
         wait=wait,
         path=path,
         noise_estimate=noise_estimate,
         estimate_variance=estimate_variance,
         noise=np.maximum(state.noise + trend / NOISE_READINGS, 1.0),
-        raised=state.raised + between,
+        raised=state.raised + elapsed,
         **windows,
     )
 
 
 def _whiten(
-    usual: Reference, state: AlarmState, path: np.ndarray, memory: np.ndarray
+    reference: Reference, state: AlarmState, path: np.ndarray, memory: np.ndarray
 ) -> tuple[np.ndarray, ...]:
     """Whiten a reading: subtract the correlated noise predicted by a Kalman filter.
 
@@ -511,18 +521,22 @@ def _whiten(
         Estimated noise and its variance after this reading.
     """
     predicted = memory[..., None] * state.noise_estimate
-    estimate_variance = memory**2 * state.estimate_variance + (1 - usual.white) * (1 - memory**2)
+    estimate_variance = memory**2 * state.estimate_variance + (1 - reference.white) * (
+        1 - memory**2
+    )
     innovation = np.concatenate([path, np.ones_like(path[..., :1])], axis=-1) - predicted
-    gain = estimate_variance / (estimate_variance + usual.white)
-    weight = innovation[..., 3] ** 2 / (estimate_variance + usual.white)
+    gain = estimate_variance / (estimate_variance + reference.white)
+    weight = innovation[..., 3] ** 2 / (estimate_variance + reference.white)
     whitened = innovation[..., :3] / innovation[..., 3:]
     noise_estimate = predicted + gain[..., None] * innovation
     return whitened, weight, noise_estimate, (1 - gain) * estimate_variance
 
 
-def _judge(usual: Reference, state: AlarmState, usable: np.ndarray) -> tuple[AlarmState, AlarmStep]:
+def _judge(
+    reference: Reference, state: AlarmState, usable: np.ndarray
+) -> tuple[AlarmState, AlarmStep]:
     quiet = np.isnan(state.raised)
-    raised, best = _detect(usual, state)
+    raised, best = _detect(reference, state)
     raised &= quiet & usable
     if raised.any():
         state = raise_alarm(state, raised, best)
@@ -541,7 +555,7 @@ def _judge(usual: Reference, state: AlarmState, usable: np.ndarray) -> tuple[Ala
         nothing = np.zeros_like(state.factor)
         return state, AlarmStep(raised, moved, nothing, nothing, state.time)
     change, error, covariance = estimate_change(state, moved)
-    step = AlarmStep(raised, moved, change, error, _change_start(usual, state, change))
+    step = AlarmStep(raised, moved, change, error, _change_start(reference, state, change))
     return _adopt(state, moved > 0, change, covariance), step
 
 
@@ -554,13 +568,13 @@ def _may_be_loss(state: AlarmState, moved: int) -> np.ndarray:
     return (1 + change + OPEN * error)[..., moved - 1] > 0
 
 
-def _detect(usual: Reference, state: AlarmState) -> tuple[np.ndarray, np.ndarray]:
+def _detect(reference: Reference, state: AlarmState) -> tuple[np.ndarray, np.ndarray]:
     """Return whether a window shows a change of a or b, and the index of the clearest one.
 
     Without a change the evidence ratio of a window ever exceeds c with probability 1/c at most, so
     the threshold is the number of windows that begin in `READINGS_PER_FALSE_ALARM` readings.
     """
-    threshold = math.log(READINGS_PER_FALSE_ALARM * usual.interval * np.sum(1 / LENGTHS))
+    threshold = math.log(READINGS_PER_FALSE_ALARM * reference.interval * np.sum(1 / LENGTHS))
     statistics = change_statistics(state, slice(None, -1))
     old_enough = state.age[..., :-1] >= MINUTE
     largest = np.where(old_enough, np.maximum(*statistics.squares[:2]), 0.0)
@@ -571,12 +585,12 @@ def _detect(usual: Reference, state: AlarmState) -> tuple[np.ndarray, np.ndarray
     return evidence.max(-1) > threshold, np.argmax(evidence, axis=-1)
 
 
-def _change_start(usual: Reference, state: AlarmState, change: np.ndarray) -> np.ndarray:
+def _change_start(reference: Reference, state: AlarmState, change: np.ndarray) -> np.ndarray:
     """Time at which the change began: the new loss made the excess at the alarm since then.
 
     It lies within the window that raised the alarm.
     """
-    rates = np.stack(usual.rates(state.current), axis=-1)
+    rates = np.stack(reference.rates(state.current), axis=-1)
     excess_rate = -np.sum(rates * state.factor * change, axis=-1)
     with np.errstate(invalid="ignore", divide="ignore"):
         duration = np.clip(np.nan_to_num(state.excess / excess_rate), 0.0, state.window_age)

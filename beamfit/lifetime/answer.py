@@ -178,7 +178,7 @@ NOT_GAS = (
     "the loss rate falls faster than the current, as no gas and no bunch length does: look for a "
     "vacuum that changes, as after a fill"
 )
-RISING = "the loss rate rises as the current falls: look for a changing vacuum or setting"
+RISING_RATE = "the loss rate rises as the current falls: look for a changing vacuum or setting"
 
 
 def _explanation(e: Evidence | TableEvidence) -> str | None:
@@ -367,7 +367,7 @@ def _interval_words(e: Evidence, name: str) -> str | None:
     return f"{name} lies between {low:.2g} and {high:.2g} {UNITS[name]} at 95 %"
 
 
-NEGATIVE = (partial(_negative, "b", NOT_GAS), partial(_negative, "a", RISING))
+NEGATIVE = (partial(_negative, "b", NOT_GAS), partial(_negative, "a", RISING_RATE))
 LOOK = ": look for steps with split_record, or test constant_a_test"
 RULES = (
     _search_failed,
@@ -497,9 +497,7 @@ def finding_of_cycles(
     found, current = judge(evidence, CYCLE_RULES), evidence.expansion.pieces.current
     between = f"between {current.min():.4g} and {current.max():.4g} mA"
     first = f"One answer from {evidence.cycles} cycles {between}"
-    remarks = [
-        remark(evidence) for remark in (_course, _inferred_noise, _correlation, _odd_lifetime)
-    ]
+    remarks = [remark(evidence) for remark in CYCLE_REMARKS]
     remarks += [] if monitor is None else [_stated_stability(monitor)]
     remarks += [text[0].upper() + text[1:] for text in left_out]
     return _with_remarks(found._replace(cause=f"{first}. {found.cause}"), remarks)

@@ -35,10 +35,10 @@ RATIO_ERROR = 0.3
 MIN_RELATIVE_NOISE = 1e-7
 # Largest number of points into which records of top-up are divided: chosen, one each half hour
 # of a day.
-MAX_PARTS = 48
+MAX_TREND_POINTS = 48
 # Largest number of readings that are watched, chosen for speed; of more only every second, third,
 # ... one.
-MAX_READINGS = 50_000
+MAX_WATCHED_READINGS = 50_000
 
 
 class CoursePoint(NamedTuple):
@@ -164,9 +164,11 @@ class Trend(Judged):
 
     def to_json(self) -> dict[str, Any]:
         """Points, control limits, reference and alarms as JSON's types."""
-        usual = self.reference
-        reference = usual and {"a": bare(usual.a, "1/(mA s)"), "b": bare(usual.b, "1/s"),
-                           "exponent": bare(usual.power, "1")}  # fmt: skip
+        reference = self.reference and {
+            "a": bare(self.reference.a, "1/(mA s)"),
+            "b": bare(self.reference.b, "1/s"),
+            "exponent": bare(self.reference.power, "1"),
+        }
         named = ("status", "message", "points", "drift", "alarms")
         rest = {
             "current": bare(self.current, "mA"),
@@ -231,36 +233,46 @@ def trend_of(studies: Sequence[RecordStudy], machine: Machine | None = None) -> 
         raise InputError("times without a date", "dated records, to put them in order", path=name)
     dated = all(study.record.start is not None for study in studies)
     studies = sorted(studies, key=lambda study: study.record.start or 0.0)
-    placed = [
+    dated_decays = [
         ((study.record.start or 0.0) + decay.offset, decay)
         for study in studies
         for each in study.decays or study.pooled
-        for decay in each.parts(max(MAX_PARTS // len(studies), 1), machine)
+        for decay in each.parts(max(MAX_TREND_POINTS // len(studies), 1), machine)
         if decay.fit.lifetime_mean.error is not None
     ]
-    if not placed:
+    if not dated_decays:
         expected = "one decay at least whose lifetime is determined"
         raise InputError("no lifetime", expected, path=studies[0].record.name)
-    times, decays = zip(*placed, strict=True)
+    times, decays = zip(*dated_decays, strict=True)
     current, ring = float(np.median([decay.fit.mean_current for decay in decays])), None
     a = b = np.ones(len(decays))
     if machine is not None:
         ring = loss_coefficients(*machine, current)
         losses = [decay.budget.losses for decay in decays]
-        a, b = np.array([(own.a / ring.a, own.b / ring.b) for own in losses], float).T
+        a, b = np.array(
+            [
+                (losses_of_decay.a / ring.a, losses_of_decay.b / ring.b)
+                for losses_of_decay in losses
+            ],
+            float,
+        ).T
     first = baseline(len(decays))
     watched = len(decays) > first
-    usual = reference_of(decays[:first], a[:first], b[:first]) if watched else None
+    reference = reference_of(decays[:first], a[:first], b[:first]) if watched else None
     values = [normalised_lifetime(decay, ring, current) for decay in decays]
     centre, limit = control_limits(np.array([value.value for value in values[:first]]))
     points = tuple(
-        _point(*of_decay, usual, (centre, limit))
+        _point(*of_decay, reference, (centre, limit))
         for of_decay in zip(decays, times, a, b, values, strict=True)
     )
     drift = _drift(np.array(times), values, centre)
-    alarms = () if usual is None else _alarms(studies, usual, times[first:], a[first:], b[first:])
+    alarms = (
+        ()
+        if reference is None
+        else _alarms(studies, reference, times[first:], a[first:], b[first:])
+    )
     scaled = machine is not None
-    return Trend(points, current, scaled, centre, limit, drift, usual, alarms, dated)
+    return Trend(points, current, scaled, centre, limit, drift, reference, alarms, dated)
 
 
 def normalised_lifetime(decay: Decay, ring: Losses | None, current: float) -> Quantity:
@@ -273,7 +285,13 @@ def normalised_lifetime(decay: Decay, ring: Losses | None, current: float) -> Qu
 
 
 def _point(
-    decay: Decay, time: float, a: float, b: float, value: Quantity, usual: Reference | None, limits
+    decay: Decay,
+    time: float,
+    a: float,
+    b: float,
+    value: Quantity,
+    reference: Reference | None,
+    limits,
 ) -> CoursePoint:
     centre, limit = limits
     deviation = value.value - centre
@@ -281,13 +299,13 @@ def _point(
     fit = decay.fit
     relative: list[Quantity | None] = [None, None]
     law = fit.free_law
-    comparable = usual is not None and not usual.power and fit.status is not Status.poor_fit
+    comparable = reference is not None and not reference.power and fit.status is not Status.poor_fit
     if comparable and (law is None or law.addition is None):
         relative = [
             None if q.error is None else Quantity(q.value / expected, q.error / expected, "1")
             for q, expected in (
-                (fit.if_constant("a"), usual.a * a),
-                (fit.if_constant("b"), usual.b * b),
+                (fit.if_constant("a"), reference.a * a),
+                (fit.if_constant("b"), reference.b * b),
             )
         ]
     return CoursePoint(
@@ -364,14 +382,14 @@ def reference_of(
 
 
 def _fit_loss(
-    rows: np.ndarray, parts: np.ndarray, root: np.ndarray, known: np.ndarray
+    rows: np.ndarray, parts: np.ndarray, root: np.ndarray, constraint: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Fit a and b of all decays by least squares; also return the relative Jacobian.
 
-    `rows` are the slopes of the decays' parts by a and b, and `known` is a further row, whose
+    `rows` are the slopes of the decays' parts by a and b, and `constraint` is a further row, whose
     product with (a, b) is 0 ± 1. The Jacobian is whitened, by relative changes of a and b.
     """
-    weighted = np.vstack([(root @ rows).reshape(-1, 2), known])
+    weighted = np.vstack([(root @ rows).reshape(-1, 2), constraint])
     values = np.append(np.einsum("nij,nj->ni", root, parts), 0.0)
     scale = np.linalg.norm(weighted, axis=0)
     found = np.linalg.lstsq(weighted / scale, values, rcond=None)[0] / scale
@@ -418,7 +436,7 @@ def _noise(fit: DecayFit, power: float) -> tuple[float, float, float, float]:
 
 def _alarms(
     studies: Sequence[RecordStudy],
-    usual: Reference,
+    reference: Reference,
     times: Sequence[float],
     a: np.ndarray,
     b: np.ndarray,
@@ -433,9 +451,9 @@ def _alarms(
     ]
     rows = np.concatenate(rows)
     rows = rows[rows[:, 0] >= times[0]]
-    rows = rows[:: math.ceil(len(rows) / MAX_READINGS)]
+    rows = rows[:: math.ceil(len(rows) / MAX_WATCHED_READINGS)]
     place = np.searchsorted(times, rows[:, 0], side="right") - 1
-    return alarms_of(usual, *rows.T, a[place], b[place])
+    return alarms_of(reference, *rows.T, a[place], b[place])
 
 
 def _is_significant(errors: float, dof: int) -> bool:

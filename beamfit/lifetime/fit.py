@@ -164,7 +164,7 @@ class DecayFit:
             On ``i0``, ``a``, ``b``, ``exponent`` or ``drift``: `Normal`, `LogNormal`, `Uniform`,
             `HalfNormal` of `beamfit.sampling.priors`, or a frozen one of scipy.stats.
         **options
-            ``seed, target_ess, store, provenance`` of `beamfit.lifetime.posterior.sampled`.
+            ``seed, target_ess, store, provenance`` of `beamfit.lifetime.posterior.sample_decay`.
 
         Returns
         -------
@@ -174,7 +174,7 @@ class DecayFit:
         Raises
         ------
         InputError
-            As `beamfit.lifetime.posterior.sampled`, and for many cycles.
+            As `beamfit.lifetime.posterior.sample_decay`, and for many cycles.
 
         Examples
         --------
@@ -185,12 +185,12 @@ class DecayFit:
         >>> posterior.status.value, bool(posterior.values("b").min() >= 0)
         ('converged', True)
         """
-        from beamfit.lifetime.posterior import sampled
+        from beamfit.lifetime.posterior import sample_decay
 
         if self.first is not None:
             expected = "one decay; the errors of cycles fitted together are those of the fit"
             raise InputError("samples of many cycles", expected, path=self.record)
-        return sampled(self, priors, **options)
+        return sample_decay(self, priors, **options)
 
     def _alternative(self, kind: type) -> Any:
         return self.alternative if isinstance(self.alternative, kind) else None

@@ -109,10 +109,10 @@ class Discrepancy(NamedTuple):
     length: np.ndarray
     rows: np.ndarray
 
-    def kernel(self, at: np.ndarray) -> np.ndarray:
+    def kernel(self, inputs: np.ndarray) -> np.ndarray:
         """Covariance of ln a and ln b at inputs (m, k) with those at the decays, (2m, 2n)."""
-        off = (at[:, None] - self.inputs) / self.length
-        return np.kron(np.exp(-0.5 * np.sum(off**2, -1)), np.diag(np.square(self.size)))
+        distance = (inputs[:, None] - self.inputs) / self.length
+        return np.kron(np.exp(-0.5 * np.sum(distance**2, -1)), np.diag(np.square(self.size)))
 
     @property
     def root(self) -> np.ndarray:
@@ -174,7 +174,7 @@ CORRECTION = 0.3
 MAX_WEIGHT = 10.0
 # Smallest half range by which an input is scaled, 0.1 MV or 10 %: a setting that hardly moves
 # determines nothing.
-MIN_HALF_RANGE = 0.1
+MIN_INPUT_SCALE = 0.1
 # Correlation length of the model error, in half ranges: chosen on simulated shifts.
 CORRELATION_LENGTH = 0.8
 # Number of RF voltages in a search for the maximum of the lifetime: chosen, 1/64 of the range.
@@ -341,7 +341,7 @@ def fit_loss_network(
     inputs = np.stack([_inputs(*setting) for setting in settings])
     if not np.isfinite(inputs).all():
         raise InputError("a setting that is not finite", "RF voltage, scraper, pressure, bunches")
-    half = np.maximum(np.ptp(inputs, axis=0) / 2, MIN_HALF_RANGE)
+    half = np.maximum(np.ptp(inputs, axis=0) / 2, MIN_INPUT_SCALE)
     low, high = (inputs.min(0), inputs.max(0)) if box is None else box.corners()
     entries = zip(INPUTS, half, inputs.mean(0), low, high, strict=True)
     ports = [Port(name, "", 0, *scale) for name, *scale in entries]
@@ -350,12 +350,12 @@ def fit_loss_network(
     terms, measured = corrected.decays.terms, corrected.decays.measured
     weight, _, _, change = corrected.linearise(corrected.decays)
     losses = np.array(scaled_losses(jnp.asarray(corrected.vector), terms), float)
-    base, whole = jnp.log(losses.T), block_diag(*weight)
-    target = whole @ np.asarray(measured.parts).ravel()
+    base, whitening = jnp.log(losses.T), block_diag(*weight)
+    target = whitening @ np.asarray(measured.parts).ravel()
 
     def fit_with(discrepancy: Discrepancy) -> tuple[Fit, np.ndarray]:
         whiten = np.linalg.inv(discrepancy.root)
-        data = (jnp.asarray(inputs), base, measured.current, jnp.asarray(whiten @ whole))
+        data = (jnp.asarray(inputs), base, measured.current, jnp.asarray(whiten @ whitening))
         problem = Problem(
             model={"map": net},
             free=free,
@@ -363,7 +363,7 @@ def fit_loss_network(
             priors=[Prior("map", 0.0, 1.0)],
         )
         fit = solve(problem, starts=starts, seed=seed, iterations=300)
-        return fit, target - np.asarray(_predict(fit.model, (*data[:3], jnp.asarray(whole))))
+        return fit, target - np.asarray(_predict(fit.model, (*data[:3], jnp.asarray(whitening))))
 
     middle = MODEL_ERRORS[len(MODEL_ERRORS) // 2]
     trial = Discrepancy((middle, middle), inputs, CORRELATION_LENGTH * half, block_diag(*change))

@@ -70,8 +70,8 @@ PRIOR_WORDS = {
     "exponent": f"normal about 0, {EXPONENT_SD_BELOW} below and {EXPONENT_SD_ABOVE} above",
     "drift": f"normal, 0 ± {DRIFT}, or that of gas that is pumped away",
 }
-# Law to which a noise applies: any, or, for a noise that includes a settling monitor, only the free
-# law or only constant a and b.
+# Law to which a noise applies: any. A noise that includes a disturbed monitor applies only to the
+# free law or only to constant a and b.
 ANY_LAW, FREE_LAW, CONSTANT_LAW = range(3)
 # Quantile at which the 95 % interval of a or b ends where all of the loss may be of that kind.
 BOUND_QUANTILE = 0.999
@@ -81,7 +81,7 @@ MIN_EFFECTIVE = 200.0
 WALKERS, STEPS, MAX_STEPS = 16, 1024, 16384
 
 
-class DecayParameters(NamedTuple):
+class DecayNumbers(NamedTuple):
     """Parameters of a decay.
 
     dI/dt = -a I² (I/mean)^exponent - b (1 + drift f(t)) I - (a mean + b) walk(t) I.
@@ -125,7 +125,7 @@ class _Data(NamedTuple):
         Interpolation from nodes to the first reading, `middle` and the last reading.
     mean, span : float
         Mean current, mA, and span, s.
-    moved : array, shape (m, 3)
+    monitor_shifts : array, shape (m, 3)
         Shifts of I0, a and b by one standard deviation of each stated error of the monitor.
     """
 
@@ -141,20 +141,20 @@ class _Data(NamedTuple):
     moments: Array
     mean: Array
     span: Array
-    moved: Array
+    monitor_shifts: Array
 
 
-def _read_parameters(data: _Data, theta: Array) -> DecayParameters:
+def _read_parameters(data: _Data, theta: Array) -> DecayNumbers:
     """Parameters as the monitor reads them; theta ends with its errors in standard deviations."""
-    errors = data.moved.shape[0]
-    own, shifts = theta[: theta.size - errors], theta[theta.size - errors :]
+    errors = data.monitor_shifts.shape[0]
+    parameters, shifts = theta[: theta.size - errors], theta[theta.size - errors :]
     last = len(UNITS)
-    walk = own[last:] if own.size > last else jnp.zeros(NODES)
-    law = jnp.append(own[3:last], jnp.zeros(last - own[:last].size))
-    return DecayParameters(*(own[:3] - shifts @ data.moved), *law, walk)
+    walk = parameters[last:] if parameters.size > last else jnp.zeros(NODES)
+    law = jnp.append(parameters[3:last], jnp.zeros(last - parameters[:last].size))
+    return DecayNumbers(*(parameters[:3] - shifts @ data.monitor_shifts), *law, walk)
 
 
-def _nodes(data: _Data, numbers: DecayParameters) -> Array:
+def _nodes(data: _Data, numbers: DecayNumbers) -> Array:
     """Current at the nodes over the mean current, shape (nodes, 1)."""
     quadratic, linear = numbers.a * data.mean * data.span, numbers.b * data.span
     lost = linear * (data.gas[:, None] + numbers.drift * gas_change_integral(numbers.pace))
@@ -192,7 +192,7 @@ def _log_density(data: _Data, theta: Array) -> Array:
     smooth = log_exponent_prior(p.exponent)[0] + log_drift_prior(p.drift)
     smooth = smooth + _log_walk(p.walk)
     law = jnp.where(p.pace > 0, pumped, jnp.where(constant, 0.0, smooth))
-    shifts = theta[theta.size - data.moved.shape[0] :]
+    shifts = theta[theta.size - data.monitor_shifts.shape[0] :]
     inside = (p.a >= 0) & (p.b >= 0)
     log_density = jax.scipy.special.logsumexp(noises) + law
     log_density = log_density - jnp.log(rate) - 0.5 * jnp.sum(shifts**2)
@@ -216,8 +216,8 @@ def _no_residual(data: _Data, theta: Array) -> tuple[Array]:
     return (jnp.zeros(0),)
 
 
-def _parameters(data: _Data, theta: Array) -> DecayParameters:
-    return DecayParameters(*theta[:3], *_read_parameters(data, theta)[3:])
+def _parameters(data: _Data, theta: Array) -> DecayNumbers:
+    return DecayNumbers(*theta[:3], *_read_parameters(data, theta)[3:])
 
 
 DENSITY = PosteriorLaw(_no_residual, _log_density, _derived, _parameters)
@@ -229,7 +229,7 @@ class _Prepared(NamedTuple):
     fit: Any
     seen: ReducedDecay
     laws: list[LawProposal]
-    moved: np.ndarray
+    monitor_shifts: np.ndarray
 
     @classmethod
     def of(cls, fit) -> _Prepared:
@@ -249,7 +249,7 @@ class _Prepared(NamedTuple):
         """Names of the sampled parameters."""
         law = max(max(one.free) for one in self.laws) + 1
         walk = NODES * any(one.disturbance is LOSS_WANDERS for one in self.laws)
-        hidden = [("walk", walk), ("monitor", len(self.moved))]
+        hidden = [("walk", walk), ("monitor", len(self.monitor_shifts))]
         return *list(UNITS)[:law], *(f"{n}_{k + 1}" for n, count in hidden for k in range(count))
 
     def draws(self, number: int, seed: int = 0) -> Draws:
@@ -261,10 +261,10 @@ class _Prepared(NamedTuple):
         found, span, mean = draws.numbers, self.fit.readings.span, self.fit.readings.mean_current
         a, b = found.share * found.rate / mean / span, (1 - found.share) * found.rate / span
         law = [found.level * mean, a, b, found.power, found.drift, found.pace]
-        own = np.column_stack([*law, draws.walk.T])
-        shifts = rng.normal(size=(len(own), len(self.moved)))
-        own[:, :3] += shifts @ self.moved
-        return np.hstack([own[:, : len(self.names) - len(self.moved)], shifts])
+        parameters = np.column_stack([*law, draws.walk.T])
+        shifts = rng.normal(size=(len(parameters), len(self.monitor_shifts)))
+        parameters[:, :3] += shifts @ self.monitor_shifts
+        return np.hstack([parameters[:, : len(self.names) - len(self.monitor_shifts)], shifts])
 
     def target(self, priors: Mapping[str, Distribution]) -> SamplingTarget:
         """Target of the sampler: the posterior with its data, bounds and priors."""
@@ -287,7 +287,7 @@ class _Prepared(NamedTuple):
             matrix, log_prior, applies_to, seen.products.count, seen.products.known,
             seen.origin[:, 0], seen.gas, np.array(seen.ends),
             middle, from_nodes(np.array([0.0, middle, 1.0])),
-            record.mean_current, record.span, self.moved,
+            record.mean_current, record.span, self.monitor_shifts,
         )  # fmt: skip
         lower, upper = np.array([BOUNDS.get(name, (-np.inf, np.inf)) for name in self.names]).T
         separable = fit.identifiability.separable or {"a", "b"} & set(priors)
@@ -322,7 +322,7 @@ def _observed(fit) -> dict[str, np.ndarray]:
     return found if error is None else found | {"decay error": error}
 
 
-def sampled(
+def sample_decay(
     fit,
     priors: Mapping[str, Distribution] | None = None,
     *,

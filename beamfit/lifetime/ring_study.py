@@ -446,8 +446,10 @@ def best_operating_point(
     if high <= loss:
         expected = f"more than the loss of {loss:.6g} V a turn, or no beam is stored"
         raise InputError(f"at most {high:.6g} V", expected, column="rf_voltage")
-    usual = fit.machine.operation
-    open_settings = usual._replace(scraper_y=limits.scraper_y[1], bunches=float(limits.bunches[1]))
+    operation = fit.machine.operation
+    open_settings = operation._replace(
+        scraper_y=limits.scraper_y[1], bunches=float(limits.bunches[1])
+    )
     low, draws = max(low, 1.01 * loss), sample.thinned()
     # The search is over true voltages; the setting is a reading.
     ratio = np.ones(len(draws)) if fit.voltages is None else draws[:, len(SCALES)]
@@ -476,7 +478,7 @@ def best_operating_point(
         scraper_y=limits.scraper_y[1],
         bunches=limits.bunches[1],
         lifetime=lifetime,
-        usual=_lifetime(fit, sample, usual, current),
+        usual=_lifetime(fit, sample, operation, current),
         message=message,
     )
 

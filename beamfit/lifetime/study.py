@@ -448,7 +448,7 @@ def _pool_cycles(
             continue
         group_name = name if pooled_groups == 1 else f"{name}@{len(pooled) + 1}"
         group = _edges_of_cycles(group)
-        # Edges of digits (`mean` is set) show a missed refill only as a step: do not search them.
+        # With edges of digits (`mean` is set) no refill is missed: it would show as a step.
         fit = fit_cycles(group, group_name, law, found=group[0].mean is None)
         segment = join_cycles(group, group_name)
         separable = separable_cycles(group, segment, fit)
@@ -509,13 +509,13 @@ def _has_unresolved_refills(split: Split) -> bool:
 
 
 def _fit_each(
-    pieces: Sequence[DecayRecord], law: Law, whole: bool
+    pieces: Sequence[DecayRecord], law: Law, undivided: bool
 ) -> tuple[list[Decay], list[Event]]:
     """Fit every piece; list a piece that cannot be fitted as a slow refill."""
     decays, events = [], []
     for piece in pieces:
         try:
-            found, lost = _fit_piece(piece, law, whole)
+            found, lost = _fit_piece(piece, law, undivided)
         except InputError:
             change = float(piece.current[-1] - piece.current[0])
             found, lost = [], [Event("slow refill", piece.start, piece.span, change)]
@@ -524,27 +524,27 @@ def _fit_each(
     return decays, events
 
 
-def _fit_piece(piece: DecayRecord, law: Law, whole: bool) -> tuple[list[Decay], list[Event]]:
-    """Fit a piece; unless `whole`, split it where the fit finds a change, and fit its parts.
+def _fit_piece(piece: DecayRecord, law: Law, undivided: bool) -> tuple[list[Decay], list[Event]]:
+    """Fit a piece; unless `undivided`, split it where the fit finds a change, and fit its parts.
 
     A change is a sudden loss of current, another loss rate, or the end of outgassing after a fill:
     the fit finds changes that no single reading shows.
     """
     segment = thinned(on_edges(piece))
     fit = fit_decay(segment, law=law)
-    if not whole and (cut := _dividing_event(segment, fit)) is not None:
+    if not undivided and (cut := _dividing_event(segment, fit)) is not None:
         event, margin = cut
         at = segment.start - piece.start + event.time
         # Thinned readings are means of neighbours: the change is anywhere within one of them.
         margin += float(np.median(np.diff(segment.time))) * (len(segment) < len(piece))
         sides = piece.time < at - margin, piece.time > at + margin
-        long = [piece.select(rows) for rows in sides if np.sum(rows) >= MIN_READINGS]
-        if long and max(map(len, long)) < len(piece):
-            decays, events = _fit_each(long, law, whole)
-            short = [event_of(piece, "short", *np.flatnonzero(rows)[[0, -1]]) for rows in sides
-                     if 0 < np.sum(rows) < MIN_READINGS]  # fmt: skip
-            here = [one._replace(time=piece.start + one.time) for one in short]
-            return decays, [*events, *here, event._replace(time=piece.start + at)]
+        sides_to_fit = [piece.select(rows) for rows in sides if np.sum(rows) >= MIN_READINGS]
+        if sides_to_fit and max(map(len, sides_to_fit)) < len(piece):
+            decays, events = _fit_each(sides_to_fit, law, undivided)
+            short = [rows for rows in sides if 0 < np.sum(rows) < MIN_READINGS]
+            short = [event_of(piece, "short", *np.flatnonzero(rows)[[0, -1]]) for rows in short]
+            short = [one._replace(time=piece.start + one.time) for one in short]
+            return decays, [*events, *short, event._replace(time=piece.start + at)]
     return [Decay(segment, segment.start, fit, None)], []
 
 

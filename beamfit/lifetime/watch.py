@@ -221,7 +221,7 @@ def _at_last_settings(decays: list[DecayRecord]) -> list[DecayRecord]:
 
 
 # Largest relative error of a and b that become the reference of the alarm: chosen.
-MAX_RELATIVE_ERROR = 0.05
+MAX_REFERENCE_ERROR = 0.05
 # Time, s, over which the expected loss follows the settings, chosen; steps are followed at once.
 SMOOTHING_TIME = 300.0
 
@@ -323,7 +323,7 @@ def _reference(window: Window, machine: Machine | None) -> alarm.Reference | Non
             ring = window.decay(machine).budget.losses
         except InputError:
             return None
-    if not all(one.error and abs(one.relative) < MAX_RELATIVE_ERROR for one in quantities):
+    if not all(one.error and abs(one.relative) < MAX_REFERENCE_ERROR for one in quantities):
         return None
     return reference_of((window.decay(None),), np.ones(1), np.ones(1), ring)
 
@@ -380,7 +380,7 @@ CURRENT = "beam_current"
 # fewer are bad readings.
 CONFIRMING_READINGS = 5
 # Number of rows of a window: readings are averaged over this part of its length.
-MAX_ROWS = 4096
+WINDOW_ROWS = 4096
 # Largest valid value of a setting (its range is checked apart) and of the current, mA, more than
 # any ring stores; latest valid time, s, more than any clock shows.
 MAX_VALUE, MAX_TIME = (math.inf, 1e6), 1e11
@@ -609,7 +609,7 @@ def _add_to_row(plan: Plan, state: State, clock: float, value: float) -> State:
         return _count(state._replace(spikes=state.spikes + 1), bad=1)
     count, begin, times, currents = state.sums
     refilled = count and value - currents / count > alarm.STEP_ERRORS * state.noise
-    if count and (refilled or clock - begin >= plan.window / MAX_ROWS):
+    if count and (refilled or clock - begin >= plan.window / WINDOW_ROWS):
         state = _close_row(plan, state)
         count, times, currents = 0, 0.0, 0.0
     begin = begin if count else clock
@@ -623,7 +623,7 @@ def _close_row(plan: Plan, state: State) -> State:
     if not count:
         return state
     row = WindowRow(state.piece, begin + times / count, currents / count, state.settings)
-    state = state._replace(rows=(*state.rows[1 - 2 * MAX_ROWS :], row), sums=(0, 0.0, 0.0, 0.0))
+    state = state._replace(rows=(*state.rows[1 - 2 * WINDOW_ROWS :], row), sums=(0, 0.0, 0.0, 0.0))
     return state if state.alarm is None else _watch_row(plan, state, state.alarm, row)
 
 
@@ -665,7 +665,7 @@ def _refit(plan: Plan, state: State) -> State:
 
 def _noise_of_reading(plan: Plan, state: State, noise: float) -> float:
     """Noise of a reading, mA, from that of a row."""
-    readings = plan.window / MAX_ROWS / max(state.interval, 1e-6)
+    readings = plan.window / WINDOW_ROWS / max(state.interval, 1e-6)
     return max(noise * math.sqrt(max(readings, 1.0)), MIN_RELATIVE_NOISE * state.highest)
 
 

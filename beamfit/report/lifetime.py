@@ -16,7 +16,7 @@ from beamfit.answer import Table, labelled
 from beamfit.errors import InputError
 from beamfit.lifetime import tables
 from beamfit.lifetime.alarm import time_label
-from beamfit.lifetime.course import MAX_PARTS, Trend
+from beamfit.lifetime.course import MAX_TREND_POINTS, Trend
 from beamfit.lifetime.fit import DecayFit
 from beamfit.lifetime.ring_study import Shift
 from beamfit.lifetime.study import Decay, RecordStudy
@@ -336,7 +336,9 @@ def _cycle_lifetimes(fit: DecayFit) -> tuple[np.ndarray, np.ndarray, np.ndarray]
     columns = np.column_stack([record.time, fit.residuals])
     mean = np.add.reduceat(columns, first) / lengths[:, None]
     since, residual = (columns - np.repeat(mean, lengths, axis=0)).T
-    part = first[np.linspace(0, first.size, min(first.size, MAX_PARTS), endpoint=False).astype(int)]
+    part = first[
+        np.linspace(0, first.size, min(first.size, MAX_TREND_POINTS), endpoint=False).astype(int)
+    ]
     count = np.diff(part, append=len(record))
     at, level = (np.add.reduceat(v, part) / count for v in (record.time, record.current))
     squares = np.add.reduceat(since**2, part)
