@@ -70,6 +70,8 @@ class TableEvidence(NamedTuple):
         Names of the points that were left out.
     noise : float or None
         Scatter of the points, h, if the table gives no errors.
+    explained, changed, free
+        Alternatives in time and the free law, which a table does not have.
     """
 
     numbers: Mapping[str, tuple[float, float]]
