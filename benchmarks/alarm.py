@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from beamfit.lifetime.alarm import NAMES, Reading, Reference, started, watched
+from beamfit.lifetime.alarm import NAMES, Reading, Reference, initial_state, watched
 from beamfit.quantity import HOUR
 
 STARTS, BEFORE = 500.0, 1800
@@ -83,7 +83,7 @@ def simulated(case: Case, beams: int, readings: int, seed: int, worse=(1.0, 1.0)
 
 def told_of(case: Case, beams: int, readings: int, seed: int, worse=(1.0, 1.0)):
     """When each beam's alarms were raised, and what was told of them."""
-    state = started(case.reference, (beams,))
+    state = initial_state(case.reference, (beams,))
     raised, named = [], []
     for time, clock, read in simulated(case, beams, readings, seed, worse):
         state, told = watched(case.reference, state, Reading(clock, read))

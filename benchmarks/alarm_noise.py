@@ -12,8 +12,8 @@ import sys
 import numpy as np
 from scipy.signal import lfilter
 
-from beamfit.lifetime.alarm import Reading, started, watched
-from beamfit.lifetime.watch import State, WindowRow, fit_window, learnt
+from beamfit.lifetime.alarm import Reading, initial_state, watched
+from beamfit.lifetime.watch import State, WindowRow, fit_window, learn_reference
 
 A, B, FULL, APART = 3.7e-8, 9.26e-6, 500.0, 2.0
 BEAMS, READINGS, LEARNT, SEEDS = 40, 14_000, 3600, 3
@@ -80,13 +80,13 @@ def alarms(random, parts, digit):
     unread = State().settings
     pairs = zip(time[:LEARNT], read[:LEARNT, 0], strict=True)
     rows = [WindowRow(0, float(t), float(current), unread) for t, current in pairs]
-    known = learnt(None, fit_window(rows, "ring"), rows, None)
+    known = learn_reference(None, fit_window(rows, "ring"), rows, None)
     if known is None:
         return None
-    state, count = started(known.usual, (BEAMS,)), 0
+    state, count = initial_state(known.reference, (BEAMS,)), 0
     read[:LEARNT, 0] = np.nan
     for now, row in zip(time, read, strict=True):
-        state, told = watched(known.usual, state, Reading(np.full(BEAMS, now), row))
+        state, told = watched(known.reference, state, Reading(np.full(BEAMS, now), row))
         count += int(told.raised.sum())
     return count
 

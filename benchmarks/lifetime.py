@@ -26,7 +26,7 @@ from rich.table import Table
 from scipy.optimize import curve_fit
 
 from beamfit.io.ring import ring_from_pyat
-from beamfit.lifetime.expansion import Pieces, solved
+from beamfit.lifetime.expansion import Pieces, fit_law
 from beamfit.lifetime.fit import fit_decay, fit_decays
 from beamfit.lifetime.mechanisms import piwinski_rate
 from beamfit.lifetime.record import DecayRecord
@@ -90,7 +90,7 @@ def fit(table: Table) -> None:
     noise = 1e-3 * np.random.default_rng(1).normal(size=1000)
     measured = law(t, 500.0, 2.0, 1.0) + noise
     record = DecayRecord(t, measured, np.full(1000, 1e-3))
-    ours, least = seconds(lambda: solved(Pieces.of(record)), 300)
+    ours, least = seconds(lambda: fit_law(Pieces.of(record)), 300)
     whole, whole_least = seconds(lambda: fit_decay(record), 300)
     peer, _ = seconds(lambda: curve_fit(law, t, measured, [490, 5, 5], record.error, True), 20)
     best, _ = curve_fit(law, t, measured, [490, 5, 5], record.error, True)

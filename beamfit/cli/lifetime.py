@@ -220,9 +220,9 @@ def _show_record(terminal: Terminal, study: RecordStudy) -> None:
     terminal.line(str(study.record), style="bold")
     for note in study.record.notes:
         terminal.line(f"Note: {note}")
-    many = len(study.decays) > tables.FEW
+    many = len(study.decays) > tables.MAX_FULL_DECAYS
     if study.pooled or (many and not terminal.full):
-        terminal.line(f"Cut at or left out: {tables.counted(study.events)}")
+        terminal.line(f"Cut at or left out: {tables.event_summary(study.events)}")
     elif study.events:
         said = "; ".join(str(event) for event in study.events[:8])
         left = len(study.events) - 8
@@ -253,7 +253,7 @@ def _show_many(terminal: Terminal, study: RecordStudy) -> None:
     from beamfit.answer import cell
     from beamfit.lifetime import tables
 
-    verdicts = tables.alike(study.decays)
+    verdicts = tables.distinct_verdicts(study.decays)
     told = verdicts if terminal.full else verdicts[:MOST_VERDICTS]
     for status, names, message in told:
         terminal.verdict(names, status, message)

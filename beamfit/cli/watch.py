@@ -128,7 +128,7 @@ def _table(told: WatchView) -> Table:
         ("at", f"{fit.mean_current:.4g} mA, the mean of the window" if fit else "-"),
         *((name, cell(answer and getattr(answer, name))) for name in ("a", "b", "normalised")),
         ("fit", answer.message if answer else "-"),
-        ("alarm", state.said()),
+        ("alarm", state.alarm_text()),
         ("readings", left_out),
     ]
     return Table(told.plan.name, [], rows)
@@ -136,10 +136,10 @@ def _table(told: WatchView) -> Table:
 
 def _results(told: WatchView) -> list[dict[str, Any]]:
     """Results in the form of `beamfit lifetime --json`, with alarms and counts."""
-    from beamfit.lifetime.watch import nothing_yet
+    from beamfit.lifetime.watch import empty_answer
 
     state = told.state
-    answer = state.answer or nothing_yet(state)
-    more = {"alarm": {"moved": state.alarmed, "text": state.said()}, "alarms": state.alarms}
+    answer = state.answer or empty_answer(state)
+    more = {"alarm": {"moved": state.alarmed, "text": state.alarm_text()}, "alarms": state.alarms}
     more |= {"events": state.events, "counts": state.counts, "lost": told.lost}
     return [{"record": told.plan.name} | answer.to_json() | more]

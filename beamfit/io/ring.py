@@ -211,14 +211,14 @@ def read_operation(path: str | PathLike[str]) -> Operation:
     if values["bunch_length"] is not None and ring["impedance"] > 0:
         expected = "one of them: a given bunch length is taken as it is"
         raise section.error("a bunch length beside impedance_ohm", expected, "bunch_length_mm")
-    from beamfit.lifetime.ring import Operation, gas_mixture, unstored  # JAX from here on
+    from beamfit.lifetime.ring import Operation, gas_mixture, required_voltage  # JAX from here on
 
     try:
         gas = gas_mixture(**values.pop("gas"))
     except (TypeError, ValueError) as error:
         raise section.error(str(error), "partial pressures by molecule", "gas") from error
     operation = Operation(**values, gas=gas)
-    if amiss := unstored(operation, ring["energy_loss"], ring["energy"]):
+    if amiss := required_voltage(operation, ring["energy_loss"], ring["energy"]):
         found = f"{operation.rf_voltage / 1e3:.6g} kV"
         raise section.error(found, amiss, "rf_voltage_kV")
     return operation

@@ -1,5 +1,5 @@
-"""The cycles of a record with many refills, as of top-up: cleaned for one law, and how their loss
-rate changes.
+"""Preparation of the cycles of a record with many refills, such as top-up, for one law, and the
+course of their loss rate.
 """
 
 from __future__ import annotations
@@ -19,29 +19,33 @@ from beamfit.lifetime.expansion import (
     Parts,
     Physical,
     Pieces,
+    fit_law,
     least_squares_step,
-    solved,
 )
-from beamfit.lifetime.free_law import BELOW
-from beamfit.lifetime.pieces import FEWEST_CYCLES, FEWEST_READINGS
+from beamfit.lifetime.free_law import EXPONENT_SD_BELOW
+from beamfit.lifetime.pieces import MIN_CYCLE_READINGS, MIN_CYCLES
 from beamfit.lifetime.record import Conditions, DecayRecord
 from beamfit.statistics import CLEAR_ODDS, log_evidence_of_change
 
 # Cycles whose settings and pressure agree to this share have one a and one b.
-SAME = 0.02
-# Noise over the height of a sawtooth that is looked at.
-NOISES = (0.01, 0.03, 0.1, 0.2)
-# Refills of top-up come every 3 min, within a factor 3, those of fills hours apart; lifetimes are
-# 15 h within a factor 3, the rest within seconds to years:
-# middle, s, width of the logarithm, and its whole range about that.
+SETTING_TOLERANCE = 0.02
+# Noise levels of a sawtooth, over its height, that are compared.
+SAWTOOTH_NOISES = (0.01, 0.03, 0.1, 0.2)
+# Priors of the period of refills and of the lifetime: median, s, standard deviation of the
+# logarithm, and range of the logarithm of the flat part. Top-up refills come every 3 min within a
+# factor 3, fills hours apart; usual lifetimes are 15 h within a factor 3, others seconds to years.
 PERIOD, LIFETIME = (180.0, 1.2, 12.0), (15 * 3600.0, 1.2, 17.0)
-# Of these so many are usual; and records without a decay so often have refills that none shows.
-USUAL, HELD = 0.8, 0.1
+# Share of the normal part of these priors; the rest is flat.
+USUAL = 0.8
+# Prior probability that a record without a decay has refills hidden by the noise.
+HIDDEN_REFILLS_PRIOR = 0.1
 
 
 def is_sawtooth(residuals: np.ndarray) -> bool:
-    """Compare an even distribution between two currents, as of refills that an archive is too slow
-    to resolve, with one about a single value, by likelihood under normal noise.
+    """Tell if residuals are spread evenly between two currents, by likelihood under normal noise.
+
+    So are the readings of an archive that is too slow to resolve the refills. The rival is a normal
+    distribution about one current.
 
     Examples
     --------
@@ -52,31 +56,31 @@ def is_sawtooth(residuals: np.ndarray) -> bool:
     off = residuals - residuals.mean()
     normal = -off.size * (math.log(max(off.std(), 1e-300)) + 0.5 * math.log(2 * math.pi * math.e))
     best = -math.inf
-    for share in NOISES:
+    for share in SAWTOOTH_NOISES:
         width = math.sqrt(12) * off.std() / math.sqrt(1 + 12 * share**2)
-        ends = ((off + sign * width / 2) / (share * width) for sign in (1, -1))
-        inside = np.subtract(*map(ndtr, ends)) / width
-        best = max(best, float(np.sum(np.log(np.maximum(inside, 1e-300)))))
+        bounds = ((off + sign * width / 2) / (share * width) for sign in (1, -1))
+        density = np.subtract(*map(ndtr, bounds)) / width
+        best = max(best, float(np.sum(np.log(np.maximum(density, 1e-300)))))
     return best - normal > CLEAR_ODDS
 
 
 def unresolved(usual: float, interval: float, lifetime: float) -> float:
-    """Probability that refills faster than a record is read look like slower ones.
+    """Probability that refills faster than the sampling look like slower ones.
 
     Parameters
     ----------
     usual : float
-        Readings from one refill that is seen to the next.
+        Readings from one visible refill to the next.
     interval : float
         Time between readings, s.
     lifetime : float
-        Of the cycles as they look, s.
+        Apparent lifetime of the cycles, s.
 
     Notes
     -----
-    A sawtooth that is read every interval looks the same for all its periods that differ by whole
-    phases: of those shorter than two intervals one in usual² has so many readings a cycle. Both
-    kinds are weighed by priors of the period of refills and of the lifetime.
+    A sawtooth sampled at an interval looks the same for all periods that differ by whole phases: of
+    the periods below two intervals one in usual² looks like this many readings a cycle. Both kinds
+    are weighted by priors of the period of refills and of the lifetime.
 
     Examples
     --------
@@ -84,247 +88,279 @@ def unresolved(usual: float, interval: float, lifetime: float) -> float:
     >>> f"{found[0]:.3f}, {found[1]:.2f}"
     '0.002, 0.98'
     """
-    lost = usual * interval / lifetime
+    loss = usual * interval / lifetime
 
     def chance(period: np.ndarray) -> np.ndarray:
-        return _prior(period, *PERIOD) * _prior(period / lost, *LIFETIME)
+        return _prior(period, *PERIOD) * _prior(period / loss, *LIFETIME)
 
     fast = np.geomspace(1e-3 * interval, 2 * interval, 200)
     others = float(np.trapezoid(chance(fast), np.log(fast))) / usual**2
-    same = float(chance(np.array(usual * interval))) / usual
-    return others / max(others + same, 1e-300)
+    visible = float(chance(np.array(usual * interval))) / usual
+    return others / max(others + visible, 1e-300)
 
 
 def lives_longer(lifetime: float) -> float:
-    """Prior probability of lifetimes beyond one, s.
+    """Prior probability of a lifetime longer than this one, s.
 
     Examples
     --------
     >>> f"{lives_longer(15 * 3600.0):.2f}, {lives_longer(1000 * 3600.0):.2f}"
     '0.50, 0.05'
     """
-    middle, width, wide = LIFETIME
-    far = math.log(lifetime / middle)
-    return USUAL * float(ndtr(-far / width)) + (1 - USUAL) * max(0.5 - far / wide, 0.0)
+    middle, width, flat_range = LIFETIME
+    log_ratio = math.log(lifetime / middle)
+    normal, flat = float(ndtr(-log_ratio / width)), max(0.5 - log_ratio / flat_range, 0.0)
+    return USUAL * normal + (1 - USUAL) * flat
 
 
-def _prior(value: np.ndarray, middle: float, width: float, wide: float) -> np.ndarray:
-    """Density in the logarithm: normal about the middle, a part of it flat over a wide range."""
+def _prior(value: np.ndarray, middle: float, width: float, flat_range: float) -> np.ndarray:
+    """Density in the logarithm: normal about the middle, with a part that is flat over a wide
+    range.
+    """
     normal = np.exp(-0.5 * (np.log(value / middle) / width) ** 2) / math.sqrt(2 * math.pi) / width
-    return USUAL * normal + (1 - USUAL) / wide
+    return USUAL * normal + (1 - USUAL) / flat_range
 
 
 def usual_cycle(cycles: Sequence[DecayRecord]) -> tuple[float, float]:
-    """Median number of readings of cycles, and time between them, s."""
+    """Median number of readings in a cycle, and time between them, s."""
     count = float(np.median([len(cycle) for cycle in cycles]))
     return count, float(np.median([cycle.span / (len(cycle) - 1) for cycle in cycles]))
 
 
-def alike(cycles: Sequence[DecayRecord]) -> list[list[DecayRecord]]:
-    """Cycles by their settings and their pressure."""
+def group_by_settings(cycles: Sequence[DecayRecord]) -> list[list[DecayRecord]]:
+    """Group cycles with the same settings and pressure."""
     groups: list[tuple[np.ndarray, list[DecayRecord]]] = []
     for cycle in cycles:
-        at = np.array([0.0 if v is None else np.median(v) for v in cycle.conditions])
+        settings = np.array([0.0 if v is None else np.median(v) for v in cycle.conditions])
         for other, group in groups:
-            if np.all(np.abs(at - other) <= SAME * np.maximum(at, other)):
+            if np.all(np.abs(settings - other) <= SETTING_TOLERANCE * np.maximum(settings, other)):
                 group.append(cycle)
                 break
         else:
-            groups.append((at, [cycle]))
+            groups.append((settings, [cycle]))
     return [group for _, group in groups]
 
 
-def joined(cycles: Sequence[DecayRecord], name: str) -> DecayRecord:
-    """The readings of many cycles as one record."""
+def join_cycles(cycles: Sequence[DecayRecord], name: str) -> DecayRecord:
+    """Join the readings of many cycles to one record."""
 
-    def all_of(parts: Sequence[np.ndarray | None]) -> np.ndarray | None:
+    def concatenated(parts: Sequence[np.ndarray | None]) -> np.ndarray | None:
         if parts[0] is None:
             return None
-        whole = np.concatenate(parts)
-        whole.flags.writeable = False  # so that the record need not copy it
-        return whole
+        values = np.concatenate(parts)
+        values.flags.writeable = False  # so that the record need not copy it
+        return values
 
     begin, time = cycles[0].start, np.concatenate([cycle.time for cycle in cycles])
     ends = np.cumsum([len(cycle) for cycle in cycles[:-1]])
     for part, cycle in zip(np.split(time, ends), cycles, strict=True):
         part += cycle.start - begin
     time.flags.writeable = False
-    stands = cycles[0].mean and float(np.mean([cycle.mean_current for cycle in cycles]))
+    mean = cycles[0].mean and float(np.mean([cycle.mean_current for cycle in cycles]))
     return DecayRecord(
-        time, all_of([cycle.current for cycle in cycles]),
-        all_of([cycle.error for cycle in cycles]), name, begin,
-        Conditions(*map(all_of, zip(*(c.conditions for c in cycles), strict=True))),
-        notes=cycles[0].notes, mean=stands,
+        time, concatenated([cycle.current for cycle in cycles]),
+        concatenated([cycle.error for cycle in cycles]), name, begin,
+        Conditions(*map(concatenated, zip(*(c.conditions for c in cycles), strict=True))),
+        notes=cycles[0].notes, mean=mean,
     )  # fmt: skip
 
 
-# Readings beyond which neighbours are averaged, in blocks within a cycle.
-MOST = 16384
-# Robust standard deviations off which a reading or a cycle is left out; at most this share of them.
-OUTLIER, SHARE = 7.0, 0.2
-# Errors of the mean by which readings at the edges of cycles lie off the law where they are of an
-# injection: what stays below is in the errors (`beamfit.lifetime.expansion.SHIFTS`).
-EDGE, WITHIN = 2.5, "they lie within injections"
+# Above this many readings neighbours are averaged, in blocks within a cycle.
+MAX_READINGS = 16384
+# Readings or cycles this many robust standard deviations off are left out, if they are at most this
+# share of all.
+OUTLIER, MAX_OUTLIER_SHARE = 7.0, 0.2
+# Edge readings of cycles are left out if their mean over cycles is this many standard errors off
+# the law; smaller shifts are in the errors (`beamfit.lifetime.expansion.SHIFTS`).
+EDGE_THRESHOLD = 2.5
+# Reasons for readings off the law at the edges of cycles.
+WITHIN = "they lie within injections"
 FRESH, SETTLES = "fresh beam decays faster", f"{WITHIN}, or the monitor settles"
-# Neighbours that tell where a cycle, or a reading at the edge of one, should lie.
-NEXT = 9
-# Time constants of fresh beam that are looked for, and the part of its error to which it has faded.
-TAILS, FADED = 12, 0.1
+# Neighbours with which a cycle, or a reading at the edge of one, is compared.
+REFERENCE_NEIGHBOURS = 9
+# Number of time constants of fresh beam that are tried; readings are left out until its excess has
+# fallen to this share of its error.
+TIME_CONSTANTS, FADED = 12, 0.1
 
 
-def averaged(cycles: Sequence[DecayRecord]) -> Pieces:
-    """All readings, in time; of very many the means of neighbours within a cycle."""
-    size = -(-sum(map(len, cycles)) // MOST)
-    begin, place, parts = 0.0, 0, []
-    known = all(cycle.start is not None for cycle in cycles)
+def collect_cycles(cycles: Sequence[DecayRecord]) -> Pieces:
+    """Collect the readings of cycles in time, averaged over neighbours within a cycle if there are
+    very many.
+    """
+    size = -(-sum(map(len, cycles)) // MAX_READINGS)
+    begin, row, parts = 0.0, 0, []
+    starts_known = all(cycle.start is not None for cycle in cycles)
     for cycle in cycles:
-        begin = cycle.start if known else begin
-        time, current, error = cycle.means(min(size, len(cycle) // FEWEST_READINGS))
-        parts.append((begin + time, time - time[0], current, error, place))
-        place += time.size
-        begin += 2 * cycle.span  # nobody said when: as if a cycle were missing in between
+        begin = cycle.start if starts_known else begin
+        time, current, error = cycle.means(min(size, len(cycle) // MIN_CYCLE_READINGS))
+        parts.append((begin + time, time - time[0], current, error, row))
+        row += time.size
+        begin += 2 * cycle.span  # unknown start: as if one cycle were missing in between
     time, since, current, errors, first = zip(*parts, strict=True)
-    given = all(error is not None for error in errors)
+    errors_given = all(error is not None for error in errors)
     return Pieces(
         *map(np.concatenate, (time, since, current)),
-        np.concatenate(errors) if given else None, np.array(first), None, cycles[0].monitor,
+        np.concatenate(errors) if errors_given else None, np.array(first), None, cycles[0].monitor,
     )  # fmt: skip
 
 
-def _far(values: np.ndarray) -> np.ndarray:
-    """Which values lie off the others, unless these are too many to be outliers."""
+def _outliers(values: np.ndarray) -> np.ndarray:
+    """Flag outliers, unless they are too many."""
     off = np.abs(values - np.median(values))
     spread = 1.4826 * np.median(off)
-    far = off > OUTLIER * spread
-    return far if spread > 0 and far.mean() <= SHARE else np.zeros(values.size, bool)
+    outliers = off > OUTLIER * spread
+    if spread > 0 and outliers.mean() <= MAX_OUTLIER_SHARE:
+        return outliers
+    return np.zeros(values.size, bool)
 
 
-def _odd_cycles(about: Expansion) -> np.ndarray:
-    """Which cycles have a loss rate far off what is usual near them, and none beside them that is
-    alike: two cycles may be a part of a course.
+def _odd_cycles(expansion: Expansion) -> np.ndarray:
+    """Flag cycles whose loss rate is far off that of the cycles near them, unless a neighbour has
+    the same.
+
+    Two cycles with the same rate may be a part of a course.
     """
-    first, slope, residual = about.pieces.first, about.left[:, LOSS], about.left[:, -1]
+    first, reduced = expansion.pieces.first, expansion.reduced
+    slope, residual = reduced[:, LOSS], reduced[:, -1]
     squares = np.add.reduceat(slope**2, first)
     rate = -np.add.reduceat(slope * residual, first) / squares
-    near = sliding_window_view(np.pad(rate, NEXT // 2, mode="reflect"), NEXT)
-    off = rate - np.median(np.delete(near, NEXT // 2, axis=1), axis=1)  # not of itself
-    apart = np.pad(np.abs(np.diff(rate)), 1, constant_values=np.inf)
-    alone = np.minimum(apart[:-1], apart[1:]) > 0.5 * np.abs(off)
-    return _far(off * np.sqrt(squares)) & alone
+    windows = sliding_window_view(
+        np.pad(rate, REFERENCE_NEIGHBOURS // 2, mode="reflect"), REFERENCE_NEIGHBOURS
+    )
+    others = np.delete(windows, REFERENCE_NEIGHBOURS // 2, axis=1)
+    off = rate - np.median(others, axis=1)
+    differences = np.pad(np.abs(np.diff(rate)), 1, constant_values=np.inf)
+    isolated = np.minimum(differences[:-1], differences[1:]) > 0.5 * np.abs(off)
+    return _outliers(off * np.sqrt(squares)) & isolated
 
 
-def _edges(about: Expansion) -> np.ndarray:
-    """Excess of the first and the last readings of all cycles over the law, beside those next to
-    them, in errors: fresh beam decays faster, and of readings within an injection the first lies
-    below, the last above.
+def _edge_excess(expansion: Expansion) -> np.ndarray:
+    """Mean excess of the first and of the last readings of all cycles over their neighbours in the
+    cycle, in standard errors.
+
+    Fresh beam decays faster: the first reading lies above. Within an injection the first reading
+    lies below, the last above.
     """
-    first, lengths = about.pieces.first, about.pieces.lengths
-    long = lengths > NEXT
-    ends = np.array([first[long], (first + lengths - 1)[long]])
-    if ends.shape[1] < FEWEST_CYCLES:
+    first, lengths = expansion.pieces.first, expansion.pieces.lengths
+    is_long = lengths > REFERENCE_NEIGHBOURS
+    edges = np.array([first[is_long], (first + lengths - 1)[is_long]])
+    if edges.shape[1] < MIN_CYCLES:
         return np.zeros(2)
-    off = -about.left[:, -1]
-    scatter = max(1.4826 * float(np.median(np.abs(off))), 1e-300)
-    inward = np.array([[1], [-1]])[..., None] * np.arange(1, NEXT)
-    beside = off[ends] - off[ends[..., None] + inward].mean(axis=2)
-    beside = np.clip(beside / scatter, -OUTLIER, OUTLIER)
-    return beside.mean(axis=1) * math.sqrt(ends.shape[1] / (1 + 1 / (NEXT - 1)))
+    excess = -expansion.reduced[:, -1]
+    scatter = max(1.4826 * float(np.median(np.abs(excess))), 1e-300)
+    inward = np.array([[1], [-1]])[..., None] * np.arange(1, REFERENCE_NEIGHBOURS)
+    differences = excess[edges] - excess[edges[..., None] + inward].mean(axis=2)
+    differences = np.clip(differences / scatter, -OUTLIER, OUTLIER)
+    return differences.mean(axis=1) * math.sqrt(
+        edges.shape[1] / (1 + 1 / (REFERENCE_NEIGHBOURS - 1))
+    )
 
 
-def _settles(about: Expansion, most: int) -> tuple[int, bool]:
-    """Readings at the start of a cycle until fresh beam, which decays faster, or the monitor has
-    settled, at most so many; and whether they are high. How its size differs from cycle to cycle
-    tells the error: noise may have a memory.
+def _settling_readings(expansion: Expansion, most: int) -> tuple[int, bool]:
+    """Number of readings at the start of a cycle, at most `most`, until fresh beam or the monitor
+    has settled, and whether they are high.
+
+    Exponential tails are fitted; the error of their size is taken from its scatter between cycles,
+    because the noise may have a memory.
     """
-    pieces, first = about.pieces, about.pieces.first
-    times = np.geomspace(1.0, max(most / math.log(EDGE / FADED), 1.0), TAILS)
-    columns = about.beside(np.exp(-pieces.place[:, None] / times) * pieces.weight[:, None])
-    law = np.linalg.qr(about.left[:, about.columns(POWER)])[0]
+    pieces, first = expansion.pieces, expansion.pieces.first
+    times = np.geomspace(1.0, max(most / math.log(EDGE_THRESHOLD / FADED), 1.0), TIME_CONSTANTS)
+    tails = np.exp(-pieces.index_in_piece[:, None] / times)
+    columns = expansion.without_levels(tails * pieces.weight[:, None])
+    law = np.linalg.qr(expansion.reduced[:, expansion.columns(POWER)])[0]
     columns -= law @ (law.T @ columns)
-    above = np.add.reduceat(-about.left[:, [-1]] * columns, first)
+    sums = np.add.reduceat(-expansion.reduced[:, [-1]] * columns, first)
     squares = np.add.reduceat(columns**2, first)
-    off = above - above.sum(axis=0) / squares.sum(axis=0) * squares
+    off = sums - sums.sum(axis=0) / squares.sum(axis=0) * squares
     cycles = first.size
     error = np.sqrt(np.sum(off**2, axis=0) * cycles / (cycles - 1))
-    excess = above.sum(axis=0) / np.maximum(error, 1e-300)
+    excess = sums.sum(axis=0) / np.maximum(error, 1e-300)
     best = int(np.argmax(np.abs(excess)))
     size, high = abs(excess[best]), bool(excess[best] > 0)
-    if not 2 * stdtr(cycles - 1, -size) * times.size < ndtr(-EDGE):
+    if not 2 * stdtr(cycles - 1, -size) * times.size < ndtr(-EDGE_THRESHOLD):
         return 0, high
     return min(math.ceil(math.log(size / FADED) * times[best]), most), high
 
 
-def _trimmed(about: Expansion) -> tuple[Expansion, list[str]]:
-    """The fit without readings at the edges of cycles that are not of the decay."""
+def _trim_edges(expansion: Expansion) -> tuple[Expansion, list[str]]:
+    """Fit without readings at the edges of cycles that do not belong to the decay; sentences say
+    which.
+    """
     cut, high = np.zeros(2, int), 0
-    most = int(np.median(about.pieces.lengths)) // 3
+    most = int(np.median(expansion.pieces.lengths)) // 3
     while cut.max() < most:
-        first_off, last_off = _edges(about)
-        settled, above = _settles(about, most - cut[0])
-        far = np.array([max(abs(first_off) > EDGE, settled), last_off > EDGE], int)
-        if not far.any():
+        first_off, last_off = _edge_excess(expansion)
+        settling, settles_high = _settling_readings(expansion, most - cut[0])
+        head = max(abs(first_off) > EDGE_THRESHOLD, settling)
+        cut_now = np.array([head, last_off > EDGE_THRESHOLD], int)
+        if not cut_now.any():
             break
-        high += max(int(first_off > EDGE), settled * above)
-        place, lengths = about.pieces.place, about.pieces.lengths
-        whole = np.repeat(lengths, lengths)
-        keep = (place >= far[0]) & (place < whole - far[1]) | (whole <= NEXT)
-        about = with_course(solved(about.pieces.kept(keep, FEWEST_READINGS)))
-        cut = cut + far
-    said = []
-    for side, why in enumerate((FRESH if 2 * high >= cut[0] else SETTLES, WITHIN)):
+        high += max(int(first_off > EDGE_THRESHOLD), settling * settles_high)
+        index, lengths = expansion.pieces.index_in_piece, expansion.pieces.lengths
+        length = np.repeat(lengths, lengths)
+        keep = (index >= cut_now[0]) & (index < length - cut_now[1]) | (
+            length <= REFERENCE_NEIGHBOURS
+        )
+        expansion = with_course(fit_law(expansion.pieces.select(keep, MIN_CYCLE_READINGS)))
+        cut = cut + cut_now
+    sentences = []
+    for side, reason in enumerate((FRESH if 2 * high >= cut[0] else SETTLES, WITHIN)):
         if cut[side]:
             which = f"{('first', 'last')[side]} {cut[side]}"
             of_each = (
                 "reading of each cycle was" if cut[side] == 1 else "readings of each cycle were"
             )
-            said.append(f"the {which} {of_each} left out: {why}")
-    return about, said
+            sentences.append(f"the {which} {of_each} left out: {reason}")
+    return expansion, sentences
 
 
-def cleaned(cycles: Pieces) -> tuple[Expansion, tuple[str, ...]]:
-    """The fit without readings, edges of cycles and cycles that are not of the decay."""
-    plain = solved(cycles)
-    about, said = _trimmed(with_course(plain))
-    before = about.pieces
-    plain = plain if before is cycles else solved(before)
+def clean_cycles(cycles: Pieces) -> tuple[Expansion, tuple[str, ...]]:
+    """Fit without readings, edges of cycles and cycles that do not belong to the decay; sentences
+    say which.
+    """
+    plain = fit_law(cycles)
+    expansion, sentences = _trim_edges(with_course(plain))
+    before = expansion.pieces
+    plain = plain if before is cycles else fit_law(before)
     cut = np.repeat(_odd_cycles(plain), before.lengths)
     if cut.any():
-        about = with_course(solved(before.kept(~cut, FEWEST_READINGS)))
-        left = before.first.size - about.pieces.first.size
-        were = "cycle was" if left == 1 else "cycles were"
-        said.append(f"{left} {were} left out, whose loss rate lies far off the others'")
-    if (lone := _far(about.left[:, -1])).any():
-        said.append(f"{int(lone.sum())} readings were left out as outliers")
-        about = with_course(solved(about.pieces.kept(~lone, FEWEST_READINGS)))
-    return about, tuple(said)
+        expansion = with_course(fit_law(before.select(~cut, MIN_CYCLE_READINGS)))
+        omitted = before.first.size - expansion.pieces.first.size
+        were = "cycle was" if omitted == 1 else "cycles were"
+        sentences.append(f"{omitted} {were} left out, whose loss rate lies far off the others'")
+    if (outliers := _outliers(expansion.reduced[:, -1])).any():
+        sentences.append(f"{int(outliers.sum())} readings were left out as outliers")
+        expansion = with_course(fit_law(expansion.pieces.select(~outliers, MIN_CYCLE_READINGS)))
+    return expansion, tuple(sentences)
 
 
-# Prior probability that the loss rate changes within a part, as of a machine that is left alone.
-CHANGES = 0.05
-# Cycles of a part at least, and parts at most: so many draw any course.
-PART, MOST_PARTS = 2, 64
-# Steps of Gauss and Newton for them: each leaves the square of what the last one left.
+# Prior probability that the loss rate changes within a part, as in a machine left alone.
+CHANGE_PRIOR = 0.05
+# Smallest number of cycles in a part, and largest number of parts, enough for any course.
+MIN_PART_CYCLES, MAX_PARTS = 2, 64
+# Gauss-Newton steps for the departures of the parts; they converge quadratically.
 COURSE_STEPS = 3
 
 
-def with_course(about: Expansion) -> Expansion:
-    """The law with as many parts, each with a loss rate of its own, as the cycles tell apart.
+def with_course(expansion: Expansion) -> Expansion:
+    """Divide cycles into parts with different loss rates, as far as the readings support it.
 
     Parameters
     ----------
-    about : Expansion
-        Of many cycles, with one a and one b.
+    expansion : Expansion
+        Fit of many cycles with one a and one b.
 
     Returns
     -------
     Expansion
-        The same where one loss rate does; else about the mean rate and the departures of the parts.
+        The same if one loss rate suffices; else the expansion about the mean rate and the
+        departures of the parts.
 
     Notes
     -----
-    A part is divided where that is likelier than not: by the probability of its cycles' own rates
-    with one mean and with two, the place and the size of the change averaged over, in noise whose
-    size the differences of neighbours tell.
+    A part is divided if that is more probable than not, given the rates of its cycles with one mean
+    and with two. Place and size of the change are averaged over, and the noise level follows from
+    the differences of neighbouring cycles.
 
     Examples
     --------
@@ -332,96 +368,100 @@ def with_course(about: Expansion) -> Expansion:
     >>> lives = np.where(np.arange(40) < 20, 36000.0, 30000.0)
     >>> pairs = zip(lives, noise, strict=True)
     >>> beam = [DecayRecord(t, 500 * np.exp(-t / life) + 1e-3 * row) for life, row in pairs]
-    >>> with_course(solved(averaged(beam))).parts.first.size
+    >>> with_course(fit_law(collect_cycles(beam))).parts.first.size
     2
     """
-    if not about.rested or about.level.size < 2 * PART:
-        return about
-    rate, error = _cycle_rates(about)
-    apart = np.abs(np.diff(rate)) / np.hypot(error[1:], error[:-1])
-    error = error * max(1.4826 * float(np.median(apart)), 1e-12)
-    begins = _part_begins(rate, error, abs(float(about.numbers[0])))
-    return _with_parts(about, np.array([0, *begins])) if begins else about
+    if not expansion.converged or expansion.level.size < 2 * MIN_PART_CYCLES:
+        return expansion
+    rate, error = _cycle_rates(expansion)
+    differences = np.abs(np.diff(rate)) / np.hypot(error[1:], error[:-1])
+    error = error * max(1.4826 * float(np.median(differences)), 1e-12)
+    begins = _part_begins(rate, error, abs(float(expansion.numbers[0])))
+    return _with_parts(expansion, np.array([0, *begins])) if begins else expansion
 
 
-def _cycle_rates(about: Expansion) -> tuple[np.ndarray, np.ndarray]:
-    """Departure of the loss of each cycle, in units of the search, and its error in noise of 1.
+def _cycle_rates(expansion: Expansion) -> tuple[np.ndarray, np.ndarray]:
+    """Departure of the loss of each cycle from the mean, in units of the search, and its error for
+    unit noise.
 
-    What a power of a, within its prior, makes of cycles at other currents is taken off.
+    The effect of a power of a, within its prior, on cycles at different currents is subtracted.
     """
-    first, slope = about.pieces.first, about.left[:, LOSS]
+    first, slope = expansion.pieces.first, expansion.reduced[:, LOSS]
     squares = np.add.reduceat(slope**2, first)
-    columns = about.left[:, [POWER, -1]]
+    columns = expansion.reduced[:, [POWER, -1]]
     power, rate = np.add.reduceat(slope[:, None] * columns, first).T / squares
     power, rate = (part - np.average(part, weights=squares) for part in (power, -rate))
     variance = max(float(squares @ rate**2) / rate.size, 1e-300)
-    found = float(squares @ (power * rate)) / (squares @ power**2 + variance / BELOW**2)
-    return rate - found * power, 1 / np.sqrt(squares)
+    exponent = float(squares @ (power * rate)) / (
+        squares @ power**2 + variance / EXPONENT_SD_BELOW**2
+    )
+    return rate - exponent * power, 1 / np.sqrt(squares)
 
 
 def _part_begins(rate: np.ndarray, error: np.ndarray, mean: float) -> list[int]:
-    """Cycles with which a part begins after the first; the likeliest changes first."""
+    """First cycles of all parts but the first; the most probable changes are taken first."""
 
     def with_change(begin: int, end: int) -> tuple[float, int, int, int]:
         odds, cut = _change(rate[begin:end], error[begin:end], mean)
         return odds, begin, begin + cut, end
 
     parts = [with_change(0, rate.size)]
-    while len(parts) < MOST_PARTS and max(parts)[0] > 0:
+    while len(parts) < MAX_PARTS and max(parts)[0] > 0:
         _, begin, cut, end = parts.pop(parts.index(max(parts)))
         parts += [with_change(begin, cut), with_change(cut, end)]
     return sorted(begin for _, begin, *_ in parts if begin)
 
 
 def _change(rate: np.ndarray, error: np.ndarray, mean: float) -> tuple[float, int]:
-    """Log odds that a rate changes among some cycles, and the likeliest first cycle after it."""
-    if rate.size < 2 * PART:
+    """Log odds that the rate changes among some cycles, and the most probable cycle after it."""
+    if rate.size < 2 * MIN_PART_CYCLES:
         return -np.inf, 0
     weight = 1 / error**2
     before, sums = np.cumsum(weight)[:-1], np.cumsum(weight * rate)[:-1]
     after = weight.sum() - before
     change = (weight @ rate - sums) / after - sums / before
     variance = 1 / before + 1 / after
-    place = slice(PART - 1, rate.size - PART)
-    change, variance = change[place], variance[place]
-    few = rate.size - 1  # neighbours tell the noise
-    log = log_evidence_of_change(change**2 / variance, mean**2 / variance, few)
-    odds = logsumexp(log) - np.log(log.size) + np.log(CHANGES / (1 - CHANGES))
-    return float(odds), int(np.argmax(log)) + PART
+    inner = slice(MIN_PART_CYCLES - 1, rate.size - MIN_PART_CYCLES)
+    change, variance = change[inner], variance[inner]
+    dof = rate.size - 1  # of the noise, from the differences of neighbours
+    log = log_evidence_of_change(change**2 / variance, mean**2 / variance, dof)
+    odds = logsumexp(log) - np.log(log.size) + np.log(CHANGE_PRIOR / (1 - CHANGE_PRIOR))
+    return float(odds), int(np.argmax(log)) + MIN_PART_CYCLES
 
 
-def _with_parts(about: Expansion, begins: np.ndarray) -> Expansion:
-    """The law about the mean loss rate and the departures of parts that begin with these cycles.
+def _with_parts(expansion: Expansion, begins: np.ndarray) -> Expansion:
+    """Expand the law about the mean loss rate and the departures of parts that begin with these
+    cycles.
 
-    The last departure follows from the others: weighed by time they add up to none. A cycle stands
-    for the time until the next one, also where one between them was left out, but for no gap; of
-    one that was left out between two parts each has a half. What was found with one loss rate may
-    be far off, so that rows are taken anew, `COURSE_STEPS` times.
+    Departures weighted by time add up to zero, so that the last one follows from the others. A
+    cycle counts for the time until the next one, including an omitted cycle but not a gap; an
+    omitted cycle between two parts is shared equally. Departures may be large, so that the
+    expansion is repeated `COURSE_STEPS` times.
     """
-    first, time = about.pieces.first[begins], about.pieces.time
+    first, time = expansion.pieces.first[begins], expansion.pieces.time
     count = np.diff(first, append=time.size)
-    apart = np.diff(time[about.pieces.first], append=time[-1])
-    usual = float(np.median(apart))
-    apart = np.minimum(apart, 2 * usual)
-    half = 0.5 * np.maximum(apart[begins[1:] - 1] - usual, 0.0)
-    lasts = np.add.reduceat(apart, begins) + np.append(0.0, half) - np.append(half, 0.0)
-    shares = np.vstack([np.eye(begins.size - 1), -lasts[:-1] / lasts[-1]])
-    numbers, departure = about.numbers, np.zeros(begins.size)
+    durations = np.diff(time[expansion.pieces.first], append=time[-1])
+    usual_duration = float(np.median(durations))
+    durations = np.minimum(durations, 2 * usual_duration)
+    shared = 0.5 * np.maximum(durations[begins[1:] - 1] - usual_duration, 0.0)
+    part_time = np.add.reduceat(durations, begins) + np.append(0.0, shared) - np.append(shared, 0.0)
+    shares = np.vstack([np.eye(begins.size - 1), -part_time[:-1] / part_time[-1]])
+    numbers, departure = expansion.numbers, np.zeros(begins.size)
     for _ in range(COURSE_STEPS):
         found = Expansion.of(
-            about.pieces, numbers, about.level, departure=np.repeat(departure, count)
+            expansion.pieces, numbers, expansion.level, departure=np.repeat(departure, count)
         )
         rows = np.column_stack([found.rows, found.rows[:, [LOSS]] * np.repeat(shares, count, 0)])
         slopes = np.pad(found.slopes, ((0, 0), (0, begins.size - 1)))
         parts = Parts(first, shares, departure)
-        found = replace(found, rows=rows, slopes=slopes, parts=parts, prior=about.prior)
-        if not found.rested:  # a course with which the law has no value
-            return about
+        found = replace(found, rows=rows, slopes=slopes, parts=parts, prior=expansion.prior)
+        if not found.converged:  # the law has no value for such a course
+            return expansion
         columns = found.columns()
-        step = least_squares_step(found.left[:, [*columns, -1]], np.zeros((0, len(columns) + 1)))
+        step = least_squares_step(found.reduced[:, [*columns, -1]], np.zeros((0, len(columns) + 1)))
         numbers, departure = numbers + np.append(step[:2], 0.0), departure + shares @ step[2:]
     return replace(
-        found, numbers=numbers, residuals=found.left[:, -1] + found.left[:, columns] @ step,
+        found, numbers=numbers, residuals=found.reduced[:, -1] + found.reduced[:, columns] @ step,
         values=Physical(*(np.array(found.values) + slopes[:, columns] @ step)),
         parts=Parts(first, shares, departure),
     )  # fmt: skip

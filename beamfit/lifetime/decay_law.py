@@ -1,4 +1,4 @@
-"""The law of a decay, dI/dt = -a I² (I/mean)^s - b(t) I: its closed form, lifetimes, loss rates."""
+"""Decay law dI/dt = -a I² (I/mean)^s - b(t) I: closed form, lifetimes, loss rates."""
 
 from __future__ import annotations
 
@@ -17,13 +17,14 @@ from beamfit.compile_cache import prepare_jax
 
 prepare_jax()
 
-# Mean of exp(-x) over [0, x]: below this x the series is exact to rounding, above it the quotient.
+# (1 - exp(-x))/x is computed by a series below this x, by the quotient above it; both are exact to
+# rounding there.
 SERIES_BELOW = 0.1
-# Gauss's nodes and weights for an interval of 1.
+# Nodes and weights of Gauss quadrature on [0, 1], three points.
 NODES = 0.5 + np.array([-0.5, 0.0, 0.5]) * math.sqrt(0.6)
 WEIGHTS = np.array([5.0, 8.0, 5.0]) / 18
-# Below this a current has no logarithm: its share of the mean.
-LEAST = 1e-12
+# Smallest current over the mean of which powers and logarithms are taken.
+MIN_CURRENT = 1e-12
 
 
 def mean_exponential(x):
@@ -37,7 +38,7 @@ def mean_exponential(x):
     Returns
     -------
     float or array
-        The mean of exp(-u) for u between 0 and x; 1 at zero.
+        Mean of exp(-u) for u between 0 and x; 1 at zero.
 
     Examples
     --------
@@ -92,9 +93,9 @@ class Moments(NamedTuple):
     Attributes
     ----------
     time : array, shape (n,)
-        Since the first reading of a piece, in a unit of time.
+        Times since the first reading of a piece, in any unit.
     gas : array, shape (n,), or None
-        Integral of the pressure over its mean, in the same unit; None where it is constant.
+        Integral of the pressure over its mean, in the same unit; None if the pressure is constant.
     """
 
     time: np.ndarray
@@ -102,10 +103,10 @@ class Moments(NamedTuple):
 
 
 def closed_form(level, quadratic, power, lost, whole):
-    """Solve dx/dt = -A x^(1 + c) - b(t) x by Bernoulli's substitution, c = 1 + power.
+    """Solve dx/dt = -A x^(1 + c) - b(t) x by Bernoulli's substitution, with c = 1 + power.
 
-    x = x0 exp(-B) (1 + c A x0^c W)^(-1/c) with B, `lost`, the integral of b and W, `whole`, that of
-    exp(-c B).
+    x = x0 exp(-B) (1 + c A x0^c W)^(-1/c), where B (`lost`) is the integral of b, and W (`whole`)
+    that of exp(-c B). NaN where a negative loss has no finite solution.
 
     Examples
     --------
@@ -113,17 +114,17 @@ def closed_form(level, quadratic, power, lost, whole):
     0.500
     """
     xp, c = array_module(level, quadratic, power, lost, whole), 1.0 + power
-    left = 1.0 + c * quadratic * level**c * whole
-    some = xp.real(left) > 0  # a negative loss without end has no value
-    kept = xp.where(some, left, 1.0) ** (-1.0 / c)
-    return level * xp.exp(-lost) * xp.where(some, kept, np.nan)
+    base = 1.0 + c * quadratic * level**c * whole
+    physical = xp.real(base) > 0
+    factor = xp.where(physical, base, 1.0) ** (-1.0 / c)
+    return level * xp.exp(-lost) * xp.where(physical, factor, np.nan)
 
 
 def course(kind: str, time: np.ndarray, when: complex) -> np.ndarray:
-    """Integral from zero of a further loss of 1.
+    """Integral from 0 to `time` of a further loss rate of unit size.
 
-    One that is "relaxing" within a time, a "step" at a time, a "drift" about zero in time 1, or
-    "sudden", all of it at a time.
+    Kinds: "relaxing" (exp(-t/when)), a "step" at the time `when`, a "drift" (t - 1/2), or "sudden"
+    (all of it at the time `when`).
     """
     if kind == "step":
         return np.where(time > np.real(when), time - when, 0.0)
@@ -146,17 +147,18 @@ def beam_current(
     Parameters
     ----------
     level : float or array, shape (n,)
-        Current at the first reading, of each reading's piece.
+        Current over the mean at the first reading of each reading's piece.
     numbers : sequence, of length 3 or 3 + 2 k
         Loss rate at the mean current, its quadratic part, the power by which a departs from its
-        shape, and k times a further loss and its time; complex where slopes are wanted.
+        shape, and k times a further loss and its time; complex for slopes by imaginary steps.
     at : Moments
-        When; with a gauge or further losses of a single piece.
+        Times; with a gauge or further losses those of a single piece.
     kind : {"relaxing", "step", "drift", "sudden", "step of a"}, optional
-        The further losses, as of `course`, or of a, which go with the current; not with a gauge.
+        Kind of the further losses, as for `course`, or a step of a, proportional to the current;
+        not with a gauge.
     shape : callable, optional
-        Dependence of a on the current over its mean, up to a factor, where it is no power; the rate
-        equation of a single piece is integrated then, without further losses.
+        Dependence of a on the current over its mean, up to a factor, if it is no power. The rate
+        equation of a single piece is then integrated, without further losses.
 
     Returns
     -------
@@ -164,8 +166,8 @@ def beam_current(
 
     Notes
     -----
-    Between readings B of `closed_form` is integrated by Gauss's rule with three nodes; where b is
-    constant the integral has a closed form. Report equations 42 and 44.
+    The integral of exp(-c B) in `closed_form` is taken between readings by three-point Gauss
+    quadrature; for constant b it has a closed form. Report equations 42 and 44.
 
     Examples
     --------
@@ -176,42 +178,45 @@ def beam_current(
     loss, quadratic, power, *further = numbers
     linear = loss - quadratic
     if shape is not None:
-        return np.asarray(_shaped(at.time, level, quadratic, linear, power, shape))
+        return np.asarray(_integrate_shape(at.time, level, quadratic, linear, power, shape))
     if at.gas is None and kind in (None, "step of a"):
         lost = linear * at.time
 
         def whole(time: np.ndarray) -> np.ndarray:
             return time * mean_exponential((1.0 + power) * linear * time)
 
-        every = whole(at.time)
-        bent, pairs = quadratic * every, zip(further[::2], further[1::2], strict=True)
-        for more, when in pairs:
-            bent = bent + more * np.where(at.time > np.real(when), every - whole(when), 0)
-        return closed_form(level, 1.0, power, lost, bent)
+        at_readings = whole(at.time)
+        total = quadratic * at_readings  # A W, with steps of A
+        for size, when in zip(further[::2], further[1::2], strict=True):
+            after = np.where(at.time > np.real(when), at_readings - whole(when), 0)
+            total = total + size * after
+        return closed_form(level, 1.0, power, lost, total)
 
-    def gone(time: np.ndarray, gas: np.ndarray) -> np.ndarray:
+    def lost_until(time: np.ndarray, gas: np.ndarray) -> np.ndarray:
         pairs = zip(further[::2], further[1::2], strict=True)
         return linear * gas + sum(f * course(kind, time, w) for f, w in pairs)
 
     gas = at.time if at.gas is None else at.gas
-    inside, more = np.diff(at.time, prepend=0.0), np.diff(gas, prepend=0.0)
-    node = at.time[:, None] + inside[:, None] * (NODES - 1)
-    node_gas = gas[:, None] + more[:, None] * (NODES - 1)
-    whole = np.cumsum(inside * (np.exp(-(1.0 + power) * gone(node, node_gas)) @ WEIGHTS))
-    return closed_form(level, quadratic, power, gone(at.time, gas), whole)
+    interval, gas_interval = np.diff(at.time, prepend=0.0), np.diff(gas, prepend=0.0)
+    node = at.time[:, None] + interval[:, None] * (NODES - 1)
+    node_gas = gas[:, None] + gas_interval[:, None] * (NODES - 1)
+    whole = np.cumsum(interval * (np.exp(-(1.0 + power) * lost_until(node, node_gas)) @ WEIGHTS))
+    return closed_form(level, quadratic, power, lost_until(at.time, gas), whole)
 
 
 @partial(jax.jit, static_argnames="shape")
-def _shaped(time: Array, level: Array, quadratic: Array, linear: Array, power: Array, shape):
+def _integrate_shape(
+    time: Array, level: Array, quadratic: Array, linear: Array, power: Array, shape
+):
     def rate(x: Array) -> Array:
-        x = jnp.maximum(x, LEAST)
+        x = jnp.maximum(x, MIN_CURRENT)
         return quadratic * shape(x) / shape(1.0) * x ** (1.0 + power) + linear
 
     return current_by_rate(time, level, rate)
 
 
 def lifetime(beam_current: Array, a: Array, b: Array) -> Array:
-    """Momentary lifetime -I/(dI/dt) at a current.
+    """Lifetime -I/(dI/dt) at a current.
 
     Parameters
     ----------
@@ -236,10 +241,10 @@ def lifetime(beam_current: Array, a: Array, b: Array) -> Array:
 def current_by_rate(
     time: Array, i0: Array, rate: Callable[[Array], Array], steps: int = 4
 ) -> Array:
-    """Beam current for any loss rate that depends on the current: report equation 42 integrated.
+    """Beam current for any loss rate that depends on the current: report equation 42, integrated.
 
-    The model to use when a is not constant, as when the bunch lengthens with its current. A
-    constant a fitted to such a decay puts the difference into b, a gas loss that is not there.
+    It is the model for an a that is not constant, such as that of a bunch that lengthens with its
+    current. A constant a fitted to such a decay shows up as a false gas loss in b.
 
     Parameters
     ----------
@@ -259,8 +264,8 @@ def current_by_rate(
 
     Notes
     -----
-    Fourth-order Runge-Kutta for ln I, which varies slowly: a step over a tenth of the lifetime
-    is exact to 1e-8. Differentiable in `i0` and in whatever `rate` closes over.
+    Fourth-order Runge-Kutta for ln I, which varies slowly: a step over a tenth of the lifetime is
+    exact to 1e-8. Differentiable in `i0` and in whatever `rate` closes over.
 
     Examples
     --------

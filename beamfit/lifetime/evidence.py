@@ -1,4 +1,6 @@
-"""Evidence of a fitted law: values and errors of one decay or many cycles, with their noise."""
+"""Values and errors of one decay or many cycles, with the noise and the other explanations of the
+readings.
+"""
 
 from __future__ import annotations
 
@@ -13,59 +15,60 @@ from scipy.special import stdtr
 from beamfit.answer import json_of, shown
 from beamfit.errors import Status
 from beamfit.lifetime.alternatives import (
+    BestAlternative,
     ConstantA,
     LifetimeLaw,
     Outgassing,
-    Rival,
+    best_alternative,
     constant_a,
     lifetime_law,
-    rival_of,
 )
 from beamfit.lifetime.cycles import unresolved
 from beamfit.lifetime.expansion import (
-    DETERMINED,
     LOSS,
+    MAX_RELATIVE_ERROR,
     POWER,
     Expansion,
     Physical,
     Pieces,
+    fit_law,
     further_columns,
     lifetime_of,
-    solved,
 )
 from beamfit.lifetime.free_law import (
-    BELOW,
-    DOUBLING,
     ENDS,
-    PACES,
+    EXPONENT_SD_BELOW,
+    OUTGASSING_PACES,
+    PACES_PER_OCTAVE,
     UNITS,
     FreeLaw,
     Law,
     free_law,
     from_nodes,
-    settling,
+    settling_shapes,
 )
-from beamfit.lifetime.pieces import DIGITS, LONE
+from beamfit.lifetime.pieces import MAX_SPIKE, MIN_STEP_DIGITS
 from beamfit.lifetime.record import DecayRecord
 from beamfit.noise.correlated import AveragedMoments, Memory
 from beamfit.noise.memory import CLOSE, Products
 from beamfit.quantity import HOUR, Quantity
 from beamfit.statistics import POOR_FIT
 
-# The share of a in the loss lies between 0 and 1: known to 0.2, the record tells pure Touschek
-# from pure gas at five standard deviations; known worse, a and b are one number.
+# a and b are separable if the error of the share of a, which lies between 0 and 1, is below this:
+# pure Touschek and pure gas losses are then five standard errors apart.
 SEPARABLE = 0.2
-# How many errors below zero an unphysical a or b, or a rising current, is believed.
+# A negative a or b, or a rising current, is believed only beyond this many standard errors.
 BELIEVED = 5.0
-# A share of a so many errors outside 0 to 1 is of no longer record.
+# A share of a beyond this many standard errors outside 0 to 1 is physically impossible: a longer
+# record would not change that.
 OUTSIDE = 3.0
-# Probability of refills faster than the record is read from which cycles tell no lifetime.
-UNSURE = 0.05
-# Refills of so many standard deviations of the means beside them are none of them missed.
-SEEN = 6.0
-# Standard deviations that hold 95 % of a normal distribution.
+# Largest probability of refills faster than the sampling for which cycles determine a lifetime.
+MAX_ALIASING = 0.05
+# Refills larger than this many standard errors (of the means before and after) are all found.
+FOUND_REFILL = 6.0
+# Half-width of the 95 % interval of a normal distribution, in standard deviations.
 NORMAL = 1.96
-# Below this share of the current differences are those of the arithmetic, not of the beam.
+# Relative rounding error of the arithmetic: smaller residuals are not of the beam.
 EXACT = 1e-12
 
 
@@ -77,18 +80,18 @@ class Separability:
     Parameters
     ----------
     separable : bool
-        Whether the share of a in the loss is known to better than 0.2 by constant a and b, and may
-        not as well be all as none by the free law.
+        True if the error of the share of a in the loss is below 0.2 with constant a and b, and the
+        free law excludes shares of 0 and 1.
     share, share_error : float or None
-        Share of a in the loss at the mean current (0: all gas-like, 1: all Touschek-like), and
-        its standard deviation.
+        Share of a in the loss at the mean current (0: all gas-like, 1: all Touschek-like), and its
+        standard deviation.
     correlation : float or None
         Correlation of a and b; near -1 on every record, also where both are well determined.
     residual_correlation : float or None
         Correlation of the errors of neighbouring readings; zero where none is seen.
     error_inflation : float or None
-        By how much that makes the errors, which contain it, larger than independent readings
-        would; None where the lifetime is not determined.
+        Factor by which this correlation enlarges the errors (they contain it); None where the
+        lifetime is not determined.
     """
 
     separable: bool
@@ -105,9 +108,9 @@ class RatePart(NamedTuple):
     Attributes
     ----------
     start, end : float
-        Since the first reading, s.
+        Begin and end, s from the first reading.
     lifetime : Quantity
-        At the mean current of the record, h.
+        Lifetime at the mean current of the record, h.
     """
 
     start: float
@@ -123,491 +126,530 @@ class RatePart(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """A fitted law with the noise that it leaves, and what else may explain the readings.
+    """A fitted law with its noise, and the other explanations of the readings.
 
     Parameters
     ----------
-    about : Expansion
-        The law with constant a and b, or a given dependence of a.
+    expansion : Expansion
+        The law with constant a and b, or with a given dependence of a.
     law : Law
-        Whether an exponent of a and a drift of b are left open.
+        Assumption on the law: an exponent of a and a drift of b are free, or constant.
     shaped : bool
-        Whether the dependence of a was given.
+        True if the dependence of a was given.
     record : DecayRecord or None
         The readings of a single decay.
     usual : tuple of float or None
-        Readings of a cycle, and the time between them, s, of cycles that were found in a record.
+        Readings of a usual cycle, and the time between them, s, if the cycles were found in a
+        record.
     """
 
-    about: Expansion
+    expansion: Expansion
     law: Law = Law.constant
     shaped: bool = False
     record: DecayRecord | None = None
-    usual: tuple[float, float] | None = None
+    usual_cycle: tuple[float, float] | None = None
 
     @property
     def cycles(self) -> int:
         """Number of pieces."""
-        return self.about.level.size
+        return self.expansion.level.size
 
     @property
     def time(self) -> np.ndarray:
         """Times of the readings, s."""
-        return self.about.pieces.time
+        return self.expansion.pieces.time
 
     @property
     def noise_inferred(self) -> bool:
         """True if the noise is taken from the residuals."""
-        return self.about.pieces.error is None
+        return self.expansion.pieces.error is None
 
     @cached_property
     def changed(self) -> bool:
-        """True if something else than noise correlates the residuals of a decay."""
-        return self.cycles == 1 and self.about.wanders and self.rival is not None
+        """True if an alternative, not noise, correlates the residuals of a decay."""
+        return self.cycles == 1 and self.expansion.has_memory and self.alternative is not None
 
     @cached_property
     def independent(self) -> bool:
-        """True if errors of neighbouring readings are taken for independent; those of many cycles
-        are averaged over what the readings leave open.
+        """True if errors of neighbouring readings are taken as independent; never for many cycles,
+        whose noise is averaged over its memory.
         """
-        return self.cycles == 1 and (not self.about.wanders or self.changed)
+        return self.cycles == 1 and (not self.expansion.has_memory or self.changed)
 
     @property
-    def remembers(self) -> bool:
-        """True if residuals are seen to have a memory."""
-        return self.about.wanders and not self.independent
+    def has_memory(self) -> bool:
+        """True if the residuals are correlated by noise."""
+        return self.expansion.has_memory and not self.independent
 
     def _memory(self, independent: bool, *more: int) -> Memory:
-        return self.about.memory(self.about.columns(*more), independent)
+        return self.expansion.memory(self.expansion.columns(*more), independent)
 
     @cached_property
     def memory(self) -> Memory:
-        """The noise, a and b being constant."""
+        """Posterior over noises, with constant a and b."""
         return self._memory(self.independent)
 
     @cached_property
-    def plain(self) -> Memory:
-        """The same for independent errors."""
+    def white_memory(self) -> Memory:
+        """Posterior over noises, with constant a and b and independent errors."""
         return self.memory if self.independent else self._memory(True)
 
+    @property
+    def _white_noise(self) -> float:
+        """Noise level for independent errors: a factor on stated errors, or in mA."""
+        return math.sqrt(self.white_memory.squares[0] / self.white_memory.dof)
+
     @cached_property
-    def power(self) -> Memory:
-        """The noise beside a power of the current."""
+    def power_memory(self) -> Memory:
+        """Posterior over noises, with a power of the current in a."""
         memory = self._memory(self.independent, POWER)
         # Differences of an exact curve are those of the arithmetic.
-        floor = np.sum((EXACT * self.about.pieces.current / self.about.pieces.over) ** 2)
+        floor = np.sum((EXACT * self.expansion.pieces.current / self.expansion.pieces.divisor) ** 2)
         return memory._replace(squares=np.maximum(memory.squares, floor))
 
     @cached_property
     def exponent(self) -> AveragedMoments:
-        """The power of the current as which a goes, beside the other numbers."""
-        place = np.eye(self.about.rows.shape[1])[[POWER]][:, self.about.columns(POWER)]
-        return self.power.moments(place, self.about.given)
+        """Power of the current in a, fitted together with the other parameters."""
+        place = np.eye(self.expansion.rows.shape[1])[[POWER]][:, self.expansion.columns(POWER)]
+        return self.power_memory.moments(place, self.expansion.min_factor)
 
     @cached_property
     def moments(self) -> AveragedMoments:
-        """Shifts of the values by the noise, their errors and the reach of 95 %."""
-        slopes = self.about.slopes[:, self.about.columns()]
-        found = self.memory.moments(slopes, self.about.given)
+        """Shifts of the values by the memory of the noise, with their errors and 95 % reaches."""
+        slopes = self.expansion.slopes[:, self.expansion.columns()]
+        found = self.memory.moments(slopes, self.expansion.min_factor)
         if not self.independent:
             return found
-        # The weak prior stays where the noise is that of the search.
+        # The values are those of the search, which has the weak prior.
         return found._replace(shift=np.zeros_like(found.shift))
 
     @cached_property
-    def drifted(self) -> np.ndarray:
+    def monitor_shifts(self) -> np.ndarray:
         """Shifts of the values by the stated instability of the monitor."""
-        moved = [self.about.moved(change) for change in self.monitor_changes]
-        return np.linalg.norm(moved, axis=0) if moved else np.zeros(len(Physical._fields))
+        shifts = [self.expansion.value_shifts(change) for change in self.monitor_changes]
+        return np.linalg.norm(shifts, axis=0) if shifts else np.zeros(len(Physical._fields))
 
     @property
     def monitor_changes(self) -> list[np.ndarray]:
         """Stated instabilities of the monitor, over the errors of readings."""
-        return self.about.pieces.monitor_changes if self.about.rested else []
+        return self.expansion.pieces.monitor_changes if self.expansion.converged else []
 
     @cached_property
     def values(self) -> Physical:
         """Values of the law with constant a and b."""
-        return Physical(*(np.array(self.about.values) + self.moments.shift))
+        return Physical(*(np.array(self.expansion.values) + self.moments.shift))
 
     @cached_property
-    def displaced(self) -> np.ndarray:
-        """Errors of the values by changes of the loss rate somewhere within a cycle."""
-        about = self.about
-        if about.parts is None:
+    def part_shifts(self) -> np.ndarray:
+        """Errors of the values because a change of the loss rate may lie anywhere in a cycle."""
+        expansion = self.expansion
+        if expansion.parts is None:
             return np.zeros(len(Physical._fields))
-        first, lengths = about.pieces.first, about.pieces.lengths
-        share = lengths[np.isin(first, about.parts.first[1:])] / lengths.sum()
-        # Evenly anywhere in it.
-        moved = np.linalg.norm(np.diff(about.parts.departure) * share) / math.sqrt(12)
-        return np.abs(about.slopes[:, LOSS]) * moved
+        first, lengths = expansion.pieces.first, expansion.pieces.lengths
+        share = lengths[np.isin(first, expansion.parts.first[1:])] / lengths.sum()
+        # Standard deviation of a uniform distribution.
+        shift = np.linalg.norm(np.diff(expansion.parts.departure) * share) / math.sqrt(12)
+        return np.abs(expansion.slopes[:, LOSS]) * shift
 
     @cached_property
     def errors(self) -> Physical:
-        """Half of the central 68 %."""
-        return Physical(*np.hypot(np.hypot(self.moments.error, self.drifted), self.displaced))
+        """Errors of the values: half of the central 68 %."""
+        return Physical(
+            *np.hypot(np.hypot(self.moments.error, self.monitor_shifts), self.part_shifts)
+        )
 
     @cached_property
     def reach(self) -> Physical:
-        """Reach of 95 % about the values."""
-        more = NORMAL * np.hypot(self.drifted, self.displaced)
+        """Half-widths of the 95 % intervals of the values."""
+        more = NORMAL * np.hypot(self.monitor_shifts, self.part_shifts)
         return Physical(*np.hypot(self.moments.reach, more))
 
     @cached_property
     def raw(self) -> Physical:
-        """Standard deviations for errors as stated, and independent."""
-        slopes = self.about.slopes[:, self.about.columns()]
-        size = 1.0 if self.about.given else math.sqrt(self.plain.squares[0] / self.plain.dof)
-        return Physical(*(size * np.linalg.norm(slopes @ self.plain.half[0], axis=1)))
+        """Standard deviations by independent errors, as stated."""
+        slopes = self.expansion.slopes[:, self.expansion.columns()]
+        size = 1.0 if self.expansion.min_factor else self._white_noise
+        return Physical(*(size * np.linalg.norm(slopes @ self.white_memory.half[0], axis=1)))
 
     @cached_property
     def constant_a(self) -> ConstantA:
-        """Test of a constant a by an exponent beside the other numbers."""
+        """Test of a constant a, by an exponent fitted together with the other parameters."""
         if self.cycles > 1 and not self.separability.separable:
             return constant_a(math.nan, math.inf, math.inf, math.nan)
         found, error = self.exponent, float(self.exponent.error[0])
         test = constant_a(float(found.shift[0]), error, error, float(found.chance[0]))
-        return test.widened(float(self.drifted[-1])) if self.monitor_changes else test
+        return test.widened(float(self.monitor_shifts[-1])) if self.monitor_changes else test
 
     @property
     def dof(self) -> int:
-        """Readings less numbers."""
+        """Degrees of freedom: readings less parameters."""
         return self.memory.dof
 
     @cached_property
     def residuals(self) -> np.ndarray:
-        """Model less reading, mA; of the law whose values are quoted."""
-        if self.freed:
-            return self.free.curve(self.time) - self.about.pieces.current
-        after = self.about.residuals
+        """Model less reading, mA, for the law whose values are quoted."""
+        if self.quotes_free_law:
+            return self.free.curve(self.time) - self.expansion.pieces.current
+        residuals = self.expansion.residuals
         if self.cycles == 1 and not self.independent:
-            after = after + self.about.rows[:, self.about.columns()] @ self.memory.mean_step
-        return after * self.about.pieces.over
+            rows = self.expansion.rows[:, self.expansion.columns()]
+            residuals = residuals + rows @ self.memory.mean_step
+        return residuals * self.expansion.pieces.divisor
 
     @property
     def rms(self) -> float:
-        """Root mean square of the residuals, mA, beside a current for each cycle."""
-        after = (
-            self.about.left[:, -1] * self.about.pieces.over if self.cycles > 1 else self.residuals
-        )
-        return float(np.sqrt(np.mean(after**2)))
+        """Root mean square of the residuals, mA, with a starting current for each cycle."""
+        if self.cycles > 1:
+            residuals = self.expansion.reduced[:, -1] * self.expansion.pieces.divisor
+        else:
+            residuals = self.residuals
+        return float(np.sqrt(np.mean(residuals**2)))
 
     @cached_property
     def squares(self) -> float:
-        """Sum of squares of the residuals over their errors, whitened.
+        """Sum of squares of the whitened residuals over their errors.
 
-        How far a drift under white noise gets in the end says nothing of the errors.
+        With white noise and a slow drift they are not whitened: the range of a drift says nothing
+        of the errors.
         """
         likely = self.memory.likely
-        if self.freed or self.memory.white[likely]:
-            return float(np.sum((self.residuals / self.about.pieces.over) ** 2))
+        if self.quotes_free_law or self.memory.white[likely]:
+            return float(np.sum((self.residuals / self.expansion.pieces.divisor) ** 2))
         return float(self.memory.squares[likely])
 
     @property
     def chi2(self) -> float:
-        """The same; equal to `dof` where there are no errors."""
+        """Sum of squares of the residuals over their errors; equal to `dof` if no errors are
+        stated.
+        """
         return float(self.dof) if self.noise_inferred else self.squares
 
     @property
     def noise(self) -> float:
-        """Factor on errors that were given (at least 1), or the noise in mA."""
-        return max(math.sqrt(self.squares / self.dof), self.about.given)
+        """Factor on stated errors (at least 1), or the noise level in mA."""
+        return max(math.sqrt(self.squares / self.dof), self.expansion.min_factor)
 
     @property
     def correlation(self) -> float:
         """Correlation of a and b."""
-        a, b = self.about.slopes[1:3, self.about.columns()] @ self.plain.half[0]
+        a, b = self.expansion.slopes[1:3, self.expansion.columns()] @ self.white_memory.half[0]
         return float(a @ b / np.linalg.norm(a) / np.linalg.norm(b))
 
     @property
     def correlation_time(self) -> float | None:
         """Correlation time of the noise, s; None where errors are independent."""
-        return self.memory.noise.time if self.remembers else None
+        return self.memory.noise.time if self.has_memory else None
 
     @property
     def white(self) -> float:
-        """The share of their variance that has none."""
-        return self.memory.noise.white if self.remembers else 0.0
+        """Share of the variance of the noise that is uncorrelated."""
+        return self.memory.noise.white if self.has_memory else 0.0
 
     @property
     def inflation(self) -> float:
         """Factor by which the memory of the noise enlarges errors."""
-        if not self.remembers:
+        if not self.has_memory:
             return 1.0
-        # Of a loss rate that is not clear of zero the share of a says nothing.
+        # The share of a means nothing if the loss rate is not clear of zero.
         names = ("rate_mean", "share")[: 1 + (self.cycles == 1 and self.is_clear("rate_mean"))]
-        size = max(math.sqrt(self.plain.squares[0] / self.plain.dof), self.about.given)
-        size = size if self.about.given else 1.0  # raw errors have the size of the noise else
+        # Without stated errors the raw errors have the noise level already.
+        size = max(self._white_noise, 1.0) if self.expansion.min_factor else 1.0
         return max(1.0, *(getattr(self.errors, n) / getattr(self.raw, n) / size for n in names))
 
-    def sure(self, name: str) -> tuple[float, float]:
-        """A value, and the error of a normal number that reaches as far: few residuals count."""
+    def normal_equivalent(self, name: str) -> tuple[float, float]:
+        """A value, and the standard deviation of a normal distribution with the same 95 % reach.
+
+        It exceeds the error if few degrees of freedom determine the noise.
+        """
         return float(getattr(self.values, name)), float(getattr(self.reach, name)) / NORMAL
 
-    def scaled(self, name: str) -> tuple[float, float]:
+    def value_and_error(self, name: str) -> tuple[float, float]:
         """A value and its error."""
         return float(getattr(self.values, name)), float(getattr(self.errors, name))
 
     def is_clear(self, name: str) -> bool:
-        """Test if a value is clear of zero."""
-        value, error = self.sure(name)
-        return error < DETERMINED * value
+        """True if a value is clear of zero."""
+        value, error = self.normal_equivalent(name)
+        return error < MAX_RELATIVE_ERROR * value
 
     def _parts(self, name: str) -> tuple[float, ...]:
-        every = (self.values, self.errors, self.raw, self.reach)
-        return tuple(float(getattr(part, name)) for part in every)
+        fields = (self.values, self.errors, self.raw, self.reach)
+        return tuple(float(getattr(part, name)) for part in fields)
 
-    def quantity(self, name: str, known: bool) -> Quantity:
-        """I0, a or b; without an error where it is not determined."""
+    def quantity(self, name: str, determined: bool) -> Quantity:
+        """I0, a or b; without an error unless it is `determined`."""
         value, error, raw, reach = self._parts(name)
-        if not (known and math.isfinite(value) and math.isfinite(error)):
+        if not (determined and math.isfinite(value) and math.isfinite(error)):
             return Quantity(value, None, UNITS[name])
         return Quantity.reaching(value, error, UNITS[name], raw, reach)
 
-    def lifetime(self, name: str, known: bool) -> Quantity:
-        """Lifetime in hours from a loss rate; no error where the rate is not clear of zero."""
+    def lifetime(self, name: str, determined: bool) -> Quantity:
+        """Lifetime, h, from a loss rate; without an error unless it is `determined` and the rate
+        clear of zero.
+        """
         rate, error, raw, reach = self._parts(name)
         if not rate > 0:
             return Quantity(math.nan, None, "h")
-        if not (known and self.is_clear(name)):
+        if not (determined and self.is_clear(name)):
             return Quantity(1 / rate / HOUR, None, "h")
         interval = tuple(1 / max(rate + sign * reach, 1e-300) / HOUR for sign in (1, -1))
         error, raw = (part / rate**2 / HOUR for part in (error, raw))
         return Quantity(1 / rate / HOUR, error, "h", raw, interval)
 
     @cached_property
-    def apart(self) -> bool:
-        """True if the law with constant a and b tells them apart."""
-        share, error = self.scaled("share")
-        return math.isfinite(share) and math.isfinite(error) and self.sure("share")[1] < SEPARABLE
+    def is_separable(self) -> bool:
+        """True if the law with constant a and b separates the two."""
+        share, error = self.value_and_error("share")
+        finite = math.isfinite(share) and math.isfinite(error)
+        return finite and self.normal_equivalent("share")[1] < SEPARABLE
 
     @cached_property
     def separability(self) -> Separability:
-        """Separability of a and b, by the law that knows less of their share: by its bounds alone
-        the free one may know more.
+        """Separability of a and b, by the law that leaves their share less certain.
+
+        Through its bounds alone the free law may have the smaller error.
         """
-        share, error = self.scaled("share")
+        share, error = self.value_and_error("share")
         finite = math.isfinite(share) and math.isfinite(error)
         if finite and self.free is not None and self.free.share.error > error:
             share, error = self.free.share.value, self.free.share.error
-        length, usual = self.correlation_time, float(np.median(np.diff(self.time)))
-        told = length is None or self.is_clear("rate_mean")
-        alike = 0.0 if length is None else (1.0 - self.white) * math.exp(-usual / length)
+        correlation, interval = 0.0, float(np.median(np.diff(self.time)))
+        if self.correlation_time is not None:
+            correlation = (1.0 - self.white) * math.exp(-interval / self.correlation_time)
+        determined = self.correlation_time is None or self.is_clear("rate_mean")
         return Separability(
-            separable=self.apart and (self.free is None or self.free.tells_share),
+            separable=self.is_separable and (self.free is None or self.free.determines_share),
             share=share if finite else None,
             share_error=error if finite else None,
             correlation=self.correlation if math.isfinite(self.correlation) else None,
-            residual_correlation=alike,
-            error_inflation=self.inflation if told else None,
+            residual_correlation=correlation,
+            error_inflation=self.inflation if determined else None,
         )
 
     @property
     def outside(self) -> float:
         """Errors by which the share of a in the loss lies outside 0 to 1; nan if unknown."""
-        share, error = self.sure("share")
+        share, error = self.normal_equivalent("share")
         return max(-share, share - 1.0) / error if error > 0 else math.nan
 
     @property
-    def bends(self) -> bool:
-        """True if cycles bend as no loss does, and the monitor is not stated to drift so."""
+    def bends_impossibly(self) -> bool:
+        """True if cycles bend as no loss does, and the monitor is not stated to drift."""
         return self.cycles > 1 and not self.monitor_changes and self.outside > OUTSIDE
 
     @cached_property
-    def aliased(self) -> bool:
-        """True if refills faster than the record is read may look like those that were found."""
+    def may_be_aliased(self) -> bool:
+        """True if refills faster than the sampling may look like those that were found."""
         rate = float(self.values.rate_mean)
-        return self.usual is not None and rate > 0 and unresolved(*self.usual, 1 / rate) > UNSURE
+        if self.usual_cycle is None or not rate > 0:
+            return False
+        return unresolved(*self.usual_cycle, 1 / rate) > MAX_ALIASING
 
     @cached_property
-    def hidden(self) -> tuple[float, float] | None:
-        """Loss of a cycle and the least refill that the noise does not hide, mA, if that is more,
-        of cycles that were found.
+    def hidden_refill(self) -> tuple[float, float] | None:
+        """Loss in a cycle, and the smallest refill that the noise does not hide, mA, if the loss is
+        smaller.
 
-        The refill that holds the current gives back what a cycle loses. It is told from the noise
-        by the means of half a cycle before and after.
+        Only for cycles that were found in the readings. A refill that holds the current gives back
+        the loss of a cycle. It is found if the means of half a cycle before and after it differ
+        enough.
         """
         rate = float(self.values.rate_mean)
-        if self.usual is None or not rate > 0:
+        if self.usual_cycle is None or not rate > 0:
             return None
         memory = self.separability.residual_correlation
-        half = max(self.time.size / self.cycles / 2, 1.0)
-        mean = (1 + memory) / (1 - memory) / half
-        least = SEEN * self.rms * math.sqrt(2 * min(mean, 1.0))
-        lasts = 2 * half * float(np.median(np.diff(self.time)))
-        lost = self.about.pieces.units[1] * rate * lasts
-        return None if lost >= least else (lost, least)
+        half_cycle = max(self.time.size / self.cycles / 2, 1.0)
+        mean_variance = (1 + memory) / (1 - memory) / half_cycle
+        smallest = FOUND_REFILL * self.rms * math.sqrt(2 * min(mean_variance, 1.0))
+        cycle_time = 2 * half_cycle * float(np.median(np.diff(self.time)))
+        loss = self.expansion.pieces.units[1] * rate * cycle_time
+        return None if loss >= smallest else (loss, smallest)
 
     @property
-    def tells_lifetime(self) -> bool:
-        """True if cycles are of a decay, and none of their refills may have been missed."""
-        return not self.bends and not self.aliased and self.hidden is None
+    def determines_lifetime(self) -> bool:
+        """True if cycles bend like a decay, and no refill may have been missed."""
+        return not self.bends_impossibly and not self.may_be_aliased and self.hidden_refill is None
 
     @property
     def refuted(self) -> bool:
         """True if the readings contradict constant a and b, or show values that no beam has."""
         if self.changed or self.constant_a.status is Status.poor_fit:
             return True
-        if self.ends_oddly and self.rival is not None:
+        if self.has_odd_end and self.alternative is not None:
             return True
         return self.cycles == 1 and any(
-            value < -BELIEVED * error for value, error in map(self.sure, "ab")
+            value < -BELIEVED * error for value, error in map(self.normal_equivalent, "ab")
         )
 
     @cached_property
-    def ends_oddly(self) -> bool:
-        """True if a reading at an end of a decay lies off what the others say of it, by a power of
-        the current and by more than chance: it alone tells the current there.
+    def has_odd_end(self) -> bool:
+        """True if a reading at an end of a decay lies off the law with a power of the current,
+        fitted to the others, by more than chance.
+
+        Such a reading alone determines the current there, and hides in the residuals.
         """
-        if self.cycles > 1 or not self.about.rested:
+        if self.cycles > 1 or not self.expansion.converged:
             return False
-        columns = np.linalg.qr(self.about.left[:, self.about.columns(POWER)])[0]
-        after, dof = self.about.left[:, -1], len(columns) - columns.shape[1] - 1
+        columns = np.linalg.qr(self.expansion.reduced[:, self.expansion.columns(POWER)])[0]
+        residuals, dof = self.expansion.reduced[:, -1], len(columns) - columns.shape[1] - 1
         if dof < 1:
             return False
-        after = after - columns @ (columns.T @ after)
-        own = after**2 / np.maximum(1.0 - np.sum(columns**2, axis=1), EXACT)
-        ratio = dof * own / np.maximum(after @ after - own, 1e-300)
-        ends = np.sqrt(np.append(ratio[:LONE], ratio[-LONE:]))
-        return bool(2 * LONE * 2 * stdtr(dof, -ends.max()) < POOR_FIT)
+        residuals = residuals - columns @ (columns.T @ residuals)
+        deleted = residuals**2 / np.maximum(1.0 - np.sum(columns**2, axis=1), EXACT)
+        ratio = dof * deleted / np.maximum(residuals @ residuals - deleted, 1e-300)
+        ends = np.sqrt(np.append(ratio[:MAX_SPIKE], ratio[-MAX_SPIKE:]))
+        return bool(2 * MAX_SPIKE * 2 * stdtr(dof, -ends.max()) < POOR_FIT)
 
     @cached_property
-    def rival(self) -> Rival | None:
+    def alternative(self) -> BestAlternative | None:
         """Alternative that explains a single decay better than any smooth law."""
-        if self.cycles > 1 or self.shaped or not self.about.rested or self.within_digits:
+        if self.cycles > 1 or self.shaped or not self.expansion.converged or self.within_digits:
             return None
-        return rival_of(self.about)
+        return best_alternative(self.expansion)
 
     @property
     def within_digits(self) -> bool:
-        """True if no reading lies farther off the law than half of the least step that digits show:
-        rounding to them may be all that departs from it.
+        """True if no residual exceeds half of the smallest step that the digits show.
+
+        Rounding alone may then explain all residuals.
         """
         digit = None if self.record is None else self.record.resolution
-        off = np.max(np.abs(self.about.off))
-        return digit is not None and bool(off <= DIGITS / 2 * digit)
+        largest = np.max(np.abs(self.expansion.current_residuals))
+        return digit is not None and bool(largest <= MIN_STEP_DIGITS / 2 * digit)
 
     @property
-    def explained(self) -> Rival | None:
+    def explained(self) -> BestAlternative | None:
         """Alternative that explains a refuted law better than a power of the current."""
-        return self.rival if self.refuted else None
+        return self.alternative if self.refuted else None
 
     @cached_property
     def free(self) -> FreeLaw | None:
-        """Posterior of the free law; None where the law is known, an alternative that is no part of
-        it explains the record better, or the decay is within its noise.
+        """Posterior of the free law.
+
+        None if the law is given, if an alternative that the free law does not contain explains the
+        record better, or if the decay is within its noise.
         """
-        known = self.law is Law.constant or self.shaped or self.cycles > 1
-        if known or not self.is_clear("rate_mean") or not (self.explained is None or self.by_gas):
+        if self.law is Law.constant or self.shaped or self.cycles > 1:
+            return None
+        if not self.is_clear("rate_mean") or not (self.explained is None or self.has_slow_gas):
             return None
         return free_law(self.record, self.values)
 
     @property
-    def freed(self) -> bool:
-        """True if departures of a and b are likelier than none: their values are quoted then."""
-        return self.free is not None and self.free.likelier
+    def quotes_free_law(self) -> bool:
+        """True if varying a and b are more probable than constant ones: their values are quoted
+        then.
+        """
+        return self.free is not None and self.free.is_preferred
 
     @property
-    def by_gas(self) -> bool:
-        """True if gas explains a refuted law that is not gone before the free law can follow it."""
+    def has_slow_gas(self) -> bool:
+        """True if gas explains a refuted law, and lasts long enough for the free law to describe
+        it.
+        """
         if self.outgassing is None:
             return False
-        return self.record.span <= PACES[1] * self.outgassing.time_constant.value * HOUR
+        return self.record.span <= OUTGASSING_PACES[1] * self.outgassing.time_constant.value * HOUR
 
     @property
     def outgassing(self) -> Outgassing | None:
         """Gas that explains a refuted law."""
-        found = self.explained and self.explained.found
+        found = self.explained and self.explained.explanation
         return found if isinstance(found, Outgassing) else None
 
     @property
-    def beside(self) -> str | None:
-        """Name of what is likely to go by itself beside the law, as of `FreeLaw`."""
-        return self.free and self.free.beside
+    def addition(self) -> str | None:
+        """Name of the probable variation in addition to the law, as of `FreeLaw`."""
+        return self.free and self.free.addition
 
     @cached_property
-    def bending(self) -> Physical | None:
-        """Shifts of the values by an exponent of a within its prior, beside what cycles tell of
-        it; None where the law is known, or a and b are one number.
+    def exponent_shifts(self) -> Physical | None:
+        """Shifts of the values of many cycles by an exponent of a, within its prior and its error.
 
-        The exponent is normal, `BELOW` wide to either side, and its error beside the other numbers
-        is combined with that.
+        None if the law is given, or a and b are not separable. The prior is normal, of width
+        `EXPONENT_SD_BELOW` to either side.
         """
         if self.law is Law.constant or self.cycles == 1 or not self.separability.separable:
             return None
-        columns, seen = self.about.columns(POWER), self.exponent.error[0]
-        size = 1 / math.hypot(1 / BELOW, 1 / seen)
-        rows, plain = self.about.left[:, columns], self.about.columns()
-        step = np.linalg.lstsq(rows[:, : len(plain)], -size * rows[:, -1], rcond=None)[0]
-        return Physical(*np.abs(self.about.slopes[:, columns] @ np.append(step, size)))
+        columns, error = self.expansion.columns(POWER), self.exponent.error[0]
+        posterior_sd = 1 / math.hypot(1 / EXPONENT_SD_BELOW, 1 / error)
+        rows, plain = self.expansion.reduced[:, columns], self.expansion.columns()
+        step = np.linalg.lstsq(rows[:, : len(plain)], -posterior_sd * rows[:, -1], rcond=None)[0]
+        return Physical(*np.abs(self.expansion.slopes[:, columns] @ np.append(step, posterior_sd)))
 
     @cached_property
-    def freely_drifted(self) -> dict[str, float]:
-        """Shifts of what the free law says by a stated instability of the monitor: it follows that
-        otherwise than constant a and b do.
+    def free_monitor_shifts(self) -> dict[str, float]:
+        """Shifts of the quantities of the free law by a stated instability of the monitor.
+
+        They differ from those with constant a and b, because the free law follows a drift.
         """
-        names, every, record = tuple(self.free.quantities), [], self.record
+        quantities, shifts, record = self.free.quantities, [], self.record
         for change in self.monitor_changes:
-            current = record.current + change * self.about.pieces.over
-            read = replace(record, current=current, mean=record.mean_current)
-            found = free_law(read, solved(Pieces.of(read)).values) or self.free
-            every.append([found.quantities[n].value - self.free.quantities[n].value for n in names])
-        moved = np.linalg.norm(every, axis=0) if every else np.zeros(len(names))
-        return dict(zip(names, moved.tolist(), strict=True))
+            current = record.current + change * self.expansion.pieces.divisor
+            shifted = replace(record, current=current, mean=record.mean_current)
+            found = free_law(shifted, fit_law(Pieces.of(shifted)).values) or self.free
+            shifts.append([found.quantities[n].value - q.value for n, q in quantities.items()])
+        total = np.linalg.norm(shifts, axis=0) if shifts else np.zeros(len(quantities))
+        return dict(zip(quantities, total.tolist(), strict=True))
 
-    def widely(self, name: str, exact: Quantity) -> Quantity:
-        """A quantity with the exponent and the drift of b that the readings leave open.
+    def with_free_law(self, name: str, exact: Quantity) -> Quantity:
+        """Include the exponent and the drift of b, which the readings leave open, in a quantity.
 
-        The value is that of constant a and b where they are likelier, else the median. What is not
-        determined keeps its interval.
+        The value is that of constant a and b if these are more probable, else the median. A
+        quantity that is not determined keeps its interval.
         """
         if not math.isfinite(exact.value):
             return exact
-        if self.bending is not None and exact.error is not None and not self.refuted:
+        if self.exponent_shifts is not None and exact.error is not None and not self.refuted:
             value, error, interval = exact.value, exact.error, exact.interval_95
             rate = name.replace("lifetime", "rate")
             unit = HOUR * value**2 if rate != name else 1.0
-            moved = unit * float(getattr(self.bending, rate))
+            shift = unit * float(getattr(self.exponent_shifts, rate))
         elif self.free is not None:
-            found, moved = self.free.quantities[name], self.freely_drifted[name]
+            found, shift = self.free.quantities[name], self.free_monitor_shifts[name]
             error, interval = found.error, found.interval_95
-            value = found.value if self.freed else exact.value
+            value = found.value if self.quotes_free_law else exact.value
             value = float(np.clip(value, *interval))
         else:
             return exact
-        low, high = (float(np.hypot(value - end, NORMAL * moved)) for end in interval)
-        known = exact.error is not None and (name not in ("a", "b") or self.separability.separable)
-        error = math.hypot(error, moved) if known else None
+        low, high = (float(np.hypot(value - end, NORMAL * shift)) for end in interval)
+        determined = exact.error is not None and (
+            name not in ("a", "b") or self.separability.separable
+        )
+        error = math.hypot(error, shift) if determined else None
         return Quantity(value, error, exact.unit, exact.error_raw, (value - low, value + high))
 
-    def quoted(self, known: bool = True) -> dict[str, Any]:
+    def fit_fields(self, determined: bool = True) -> dict[str, Any]:
         """Fields of a `DecayFit`, by name."""
-        # A law that the readings refute has no errors, but for a and b of one that is stated; I0
-        # and lifetimes are those of what explains them. The mean of many cycles is of no law.
-        same = ("chi2", "dof", "noise_inferred", "constant_a", "correlation_time", "lifetimes")
+        # A refuted law has no errors, except a and b if the law was given; I0 and lifetimes are
+        # those of the alternative that explains the readings. The mean lifetime of many cycles
+        # holds without a law.
+        copied = ("chi2", "dof", "noise_inferred", "constant_a", "correlation_time", "lifetimes",
+                  "inflation", "residuals", "course")  # fmt: skip
         refuted = self.refuted and self.free is None
-        one, told = self.cycles == 1, not (refuted and self.law is Law.free)
-        exact = {"i0": self.quantity("i0", known and one and not refuted)}
-        exact |= {name: self.quantity(name, known and self.apart and told) for name in "ab"}
-        sure = known and not (refuted and one)
-        exact |= {f"lifetime_{at}": self.lifetime(f"rate_{at}", sure) for at in ENDS}
-        found = {name: self.widely(name, quantity) for name, quantity in exact.items()}
+        is_single, errors_known = self.cycles == 1, not (refuted and self.law is Law.free)
+        exact = {"i0": self.quantity("i0", determined and is_single and not refuted)}
+        separable = determined and self.is_separable and errors_known
+        exact |= {name: self.quantity(name, separable) for name in "ab"}
+        rates_determined = determined and not (refuted and is_single)
+        exact |= {f"lifetime_{at}": self.lifetime(f"rate_{at}", rates_determined) for at in ENDS}
+        found = {name: self.with_free_law(name, quantity) for name, quantity in exact.items()}
         found |= self.explained.quantities if refuted and self.explained is not None else {}
         found |= {"exact": exact, "free_law": self.free, "shaped": self.shaped}
-        found |= {name: getattr(self, name) for name in (*same, "inflation", "residuals", "course")}
-        found["alternative"] = self.explained and self.explained.found
+        found |= {name: getattr(self, name) for name in copied}
+        found["alternative"] = self.explained and self.explained.explanation
         return found | {"identifiability": self.separability}
 
     @cached_property
     def stated_odds(self) -> float:
-        """Log odds that the stated errors are right, whatever memory the noise has."""
-        columns = np.column_stack([self.about.residuals, self.about.rows[:, : POWER + 1]])
-        if self.beside == "pumped":
-            gas = further_columns(self.about, "relaxing", 1 / np.array(PACES))
+        """Log odds that the stated errors are right, averaged over the memory of the noise."""
+        columns = np.column_stack([self.expansion.residuals, self.expansion.rows[:, : POWER + 1]])
+        if self.addition == "pumped":
+            gas = further_columns(self.expansion, "relaxing", 1 / np.array(OUTGASSING_PACES))
             columns = np.column_stack([columns, gas])
-        if self.beside == "settles":
-            model = self.record.current / self.about.pieces.over + self.about.residuals
-            settles = np.hstack([*settling()[::DOUBLING]])
+        if self.addition == "settles":
+            model = self.record.current / self.expansion.pieces.divisor + self.expansion.residuals
+            settles = np.hstack([*settling_shapes()[::PACES_PER_OCTAVE]])
             shapes = from_nodes(self.record.time / self.record.span) @ settles
             columns = np.column_stack([columns, model[:, None] * shapes])
         products = Products.of(columns, self.time, stated=True, times=CLOSE)
@@ -615,40 +657,42 @@ class Evidence:
 
     @cached_property
     def course(self) -> tuple[RatePart, ...]:
-        """Lifetimes of the parts of many cycles whose loss rate is not the same all along; without
-        errors where that of all has none.
+        """Lifetimes of the parts of many cycles with different loss rates.
+
+        They have no errors if the mean lifetime has none.
         """
-        parts, (span, _) = self.about.parts, self.about.pieces.units
+        parts, (span, _) = self.expansion.parts, self.expansion.pieces.units
         if parts is None:
             return ()
         slopes = np.hstack([np.tile([1.0, 0.0], (parts.first.size, 1)), parts.shares]) / span
-        found = self.memory.moments(slopes, self.about.given)
+        found = self.memory.moments(slopes, self.expansion.min_factor)
         shift = 0.0 if self.independent else found.shift
-        rates = (self.about.numbers[LOSS - 1] + parts.departure) / span + shift
+        rates = (self.expansion.numbers[LOSS - 1] + parts.departure) / span + shift
         since = self.time - self.time[0]
         ends = np.append(since[parts.first[1:]], since[-1])
         lifetimes = (lifetime_of(*pair, clear=True) for pair in
                      zip(rates, found.error, strict=True))  # fmt: skip
-        if not self.tells_lifetime:
+        if not self.determines_lifetime:
             lifetimes = (one.open() for one in lifetimes)
         return tuple(map(RatePart, since[parts.first].tolist(), ends.tolist(), lifetimes))
 
     @cached_property
     def lifetimes(self) -> LifetimeLaw | None:
-        """The lifetime by current: of a decay where a constant a is refuted and it is the current's
-        doing, of many cycles where the currents are wide enough apart.
+        """Lifetime by current: for a decay if a constant a is refuted and the current is the cause,
+        for many cycles if their currents differ enough.
         """
         refuted = self.constant_a.status is Status.poor_fit
         if self.cycles > 1:
-            # The search for a power knows no parts.
-            known = self.separability.separable and not (refuted and self.course)
+            # The fit of a power has no parts.
+            offered = self.separability.separable and not (refuted and self.course)
         else:
-            plain = not self.shaped and self.about.pieces.gauge is None
-            known = plain and refuted and self.outgassing is None and self.beside is None
-        return lifetime_law(self.about, self.independent, refuted) if known else None
+            plain = not self.shaped and self.expansion.pieces.gauge is None
+            offered = plain and refuted and self.outgassing is None and self.addition is None
+        return lifetime_law(self.expansion, self.independent, refuted) if offered else None
 
     def drift_of_one_error(self, name: str) -> float:
-        """Straight drift of the monitor over the record, mA, that moves a value by its error."""
-        by_one = self.about.moved(self.time / self.time[-1] / self.about.pieces.over)
-        moved = abs(float(getattr(by_one, name)))
-        return float(getattr(self.errors, name)) / moved if moved > 0 else math.inf
+        """Linear drift of the monitor over the record, mA, that shifts a value by its error."""
+        drift = self.time / self.time[-1] / self.expansion.pieces.divisor
+        shifts = self.expansion.value_shifts(drift)
+        shift = abs(float(getattr(shifts, name)))
+        return float(getattr(self.errors, name)) / shift if shift > 0 else math.inf

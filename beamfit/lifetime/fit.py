@@ -1,4 +1,4 @@
-"""Lifetime from a decay record: I0, a and b, and what the record could not tell."""
+"""Fit of a decay record: I0, a, b and lifetimes, and what the record does not determine."""
 
 from __future__ import annotations
 
@@ -13,10 +13,16 @@ from beamfit.answer import Table, answer, cell, json_of, labelled, plain_name, q
 from beamfit.errors import InputError, expect
 from beamfit.lifetime.alternatives import Change, ConstantA, LifetimeLaw, Outgassing, SuddenLoss
 from beamfit.lifetime.answer import finding_of, finding_of_cycles
-from beamfit.lifetime.cycles import FEWEST_CYCLES, FEWEST_READINGS, averaged, cleaned, usual_cycle
+from beamfit.lifetime.cycles import (
+    MIN_CYCLE_READINGS,
+    MIN_CYCLES,
+    clean_cycles,
+    collect_cycles,
+    usual_cycle,
+)
 from beamfit.lifetime.decay_law import current
 from beamfit.lifetime.evidence import BELIEVED, UNITS, Evidence, RatePart, Separability
-from beamfit.lifetime.expansion import Expansion, Pieces, solved
+from beamfit.lifetime.expansion import Expansion, Pieces, fit_law
 from beamfit.lifetime.free_law import FreeLaw, Law
 from beamfit.lifetime.readings import rounding_of, with_common_errors, with_rounding
 from beamfit.lifetime.record import DecayRecord, Monitor
@@ -28,26 +34,27 @@ if TYPE_CHECKING:
     from beamfit.sampling.posterior import Posterior
     from beamfit.sampling.priors import Distribution
 
-FEWEST = 5
+# Smallest number of readings in a fit: three parameters, and two degrees of freedom for the noise.
+MIN_FITTED_READINGS = 5
 
 
 def bare(value: float | None, unit: str) -> dict[str, Any]:
-    """A number that has no error, as JSON."""
+    """Write a number without an error as JSON."""
     return {"value": value, "error": None, "unit": unit}
 
 
 def headline_of(fit: Any) -> str:
-    """The record, the status and the lifetime of a decay or a table of lifetimes in a line."""
+    """Record, status and lifetime of a decay or a table of lifetimes in a line."""
     return f"{fit.record} {cell(fit.status)}: mean lifetime {fit.lifetime_mean}"
 
 
 def loss_json(fit: Any) -> dict[str, Any]:
-    """Say in JSON what the fits of a decay and of a table of lifetimes have alike."""
+    """Write the fields that fits of a decay and of a table of lifetimes share as JSON."""
     first, last = ("record", "status", "message"), ("chi2", "dof", "noise_inferred")
     last = (*last, "identifiability", "constant_a")
     found = {name: getattr(fit, name) for name in (*first, *fit.quantities, *last)}
-    more = {"mean_current": bare(fit.mean_current, "mA"), "lifetime_by_current": fit.lifetimes}
-    return json_of(found | more)
+    further = {"mean_current": bare(fit.mean_current, "mA"), "lifetime_by_current": fit.lifetimes}
+    return json_of(found | further)
 
 
 @answer
@@ -61,10 +68,10 @@ class DecayFit:
         Name of the record.
     status : Status
         `converged`; `poor_fit` if chi² is improbable (below 1e-3) or the record refutes constant a
-        and b; `infeasible` if a or b is negative by more than its error allows; `unidentified` if
-        a and b, or the lifetime itself, are not determined; `not_finite` if the search failed.
+        and b; `infeasible` if a or b is negative by more than its error allows; `unidentified` if a
+        and b, or the lifetime itself, are not determined; `not_finite` if the search failed.
     message : str
-        One sentence or two of cause and remedy.
+        One or two sentences with the cause and the remedy.
     i0, a, b : Quantity
         Current at the first reading, mA, and the coefficients of dI/dt = -a I² - b I.
     lifetime_start, lifetime_end, lifetime_mean : Quantity
@@ -79,34 +86,36 @@ class DecayFit:
     rms_residual : float
         Root mean square of the residuals, mA.
     noise_inferred : bool
-        Whether the record came without errors.
+        True if the record has no errors.
     residuals : array, shape (n,)
         Model minus reading, mA.
     identifiability : Separability
-        Whether the record tells a from b.
+        Separability of a and b.
     readings : DecayRecord
-        What was fitted.
+        The fitted readings.
     constant_a : ConstantA or None
-        Whether the record contradicts a constant a; None where nothing decays.
+        Test of a constant a; None where nothing decays.
     correlation_time : float or None
-        Of the part of the errors that has one, s; None where they are independent.
+        Correlation time of the errors, s; None where they are independent.
     inflation : float
-        By how much the memory of the noise enlarges the error of the loss rate, determined or not.
+        Factor by which the memory of the noise enlarges the error of the loss rate, determined or
+        not.
     lifetimes : LifetimeLaw or None
-        The lifetime by current, where a constant a is refuted.
+        Lifetime by current, where a constant a is refuted.
     alternative : Change, Outgassing, SuddenLoss or None
         A change of the loss rate, a gas loss that relaxes, or current lost at once, where that
         explains a refuted law; also as `change`, `outgassing` or `loss`.
     shaped : bool
-        Whether a was given a dependence on the current.
+        True if the dependence of a on the current was given.
     first : array of int, optional
-        Where each cycle begins, of a fit to many cycles.
+        Index of the first reading of each cycle, in a fit to many cycles.
     exact : mapping of str to Quantity
         The same quantities if a and b are constant.
     free_law : FreeLaw or None
-        The exponent of a and the drift of b that the errors contain; None where the law is known.
+        Posterior of the exponent of a and the drift of b, which the errors contain; None where the
+        law is given.
     course : tuple of RatePart
-        Lifetimes by part of the record, of many cycles whose loss rate is not the same in all.
+        Lifetimes by part of the record, for many cycles with different loss rates.
 
     Examples
     --------
@@ -147,7 +156,7 @@ class DecayFit:
     def sample(
         self, *, priors: Mapping[str, Distribution] | None = None, **options: Any
     ) -> Posterior:
-        """Draw from the posterior that the fit quotes: of the free law or the constant one.
+        """Draw from the posterior that the fit quotes: that of the free law or of the constant one.
 
         Parameters
         ----------
@@ -155,17 +164,17 @@ class DecayFit:
             On ``i0``, ``a``, ``b``, ``exponent`` or ``drift``: `Normal`, `LogNormal`, `Uniform`,
             `HalfNormal` of `beamfit.sampling.priors`, or a frozen one of scipy.stats.
         **options
-            ``seed, target_ess, store, provenance`` of `beamfit.lifetime.posterior.sampled`.
+            ``seed, target_ess, store, provenance`` of `beamfit.lifetime.posterior.sample_decay`.
 
         Returns
         -------
         Posterior
-            Lifetimes are derived.
+            It contains the lifetimes, too.
 
         Raises
         ------
         InputError
-            As `beamfit.lifetime.posterior.sampled`, and for many cycles.
+            As `beamfit.lifetime.posterior.sample_decay`, and for many cycles.
 
         Examples
         --------
@@ -176,52 +185,56 @@ class DecayFit:
         >>> posterior.status.value, bool(posterior.values("b").min() >= 0)
         ('converged', True)
         """
-        from beamfit.lifetime.posterior import sampled
+        from beamfit.lifetime.posterior import sample_decay
 
         if self.first is not None:
             expected = "one decay; the errors of cycles fitted together are those of the fit"
             raise InputError("samples of many cycles", expected, path=self.record)
-        return sampled(self, priors, **options)
+        return sample_decay(self, priors, **options)
 
     def _alternative(self, kind: type) -> Any:
         return self.alternative if isinstance(self.alternative, kind) else None
 
     @property
     def change(self) -> Change | None:
-        """A change of the loss rate that explains a refuted law."""
+        """Change of the loss rate that explains a refuted law."""
         return self._alternative(Change)
 
     @property
     def outgassing(self) -> Outgassing | None:
-        """A gas loss that relaxes, where that explains a refuted law."""
+        """Gas loss that relaxes and explains a refuted law."""
         return self._alternative(Outgassing)
 
     @property
     def loss(self) -> SuddenLoss | None:
-        """Current lost at once, too little for single readings to show, where that explains it."""
+        """Current lost at once that explains a refuted law, too small to be seen in single
+        readings.
+        """
         return self._alternative(SuddenLoss)
 
     def if_constant(self, name: str) -> Quantity:
-        """A quantity of the law with constant a and b, as the curve through the readings has it."""
+        """Return a quantity of the law with constant a and b."""
         return self.exact.get(name, getattr(self, name))
 
     def curve(self, time: np.ndarray) -> np.ndarray:
-        """Current of the law that is quoted, mA, at times since the first reading, s."""
-        if self.free_law is not None and self.free_law.likelier:
+        """Current by the quoted law, mA, at times since the first reading, s."""
+        if self.free_law is not None and self.free_law.is_preferred:
             return self.free_law.curve(time)
         numbers = (self.if_constant(name).value for name in ("i0", "a", "b"))
         return np.asarray(current(time, *numbers))
 
     @property
-    def about(self) -> Expansion:
-        """The law with constant a and b about this fit of a single decay."""
+    def expansion(self) -> Expansion:
+        """Expansion of the law with constant a and b, about this fit of a single decay."""
         numbers = (self.if_constant(name).value for name in ("i0", "a", "b"))
         return Expansion.at(self.readings, *numbers)
 
     def with_power(self, power: float) -> Expansion:
-        """The law with a as a power of the current, best for the readings of this single decay."""
-        about = self.about
-        return about if not power else solved(about.pieces, start=[*about.numbers[:2], power])
+        """Fit the law with a power of the current in a to the readings of this single decay."""
+        expansion = self.expansion
+        if not power:
+            return expansion
+        return fit_law(expansion.pieces, start=[*expansion.numbers[:2], power])
 
     @property
     def quantities(self) -> dict[str, Quantity]:
@@ -235,11 +248,11 @@ class DecayFit:
 
     @property
     def noise(self) -> float:
-        """Standard deviation of a reading that the residuals show, mA."""
+        """Standard deviation of a reading, from the residuals, mA."""
         return self.rms_residual * math.sqrt(self.residuals.size / self.dof)
 
     def tables(self) -> tuple[Table, ...]:
-        """The numbers, to be shown."""
+        """Build the tables that show the fit."""
         rows = [(plain_name(name), [value]) for name, value in self.quantities.items()]
         rows.append(("chi2/dof", [f"{self.chi2:.4g}/{self.dof}"]))
         rows.append(("rms residual", [f"{self.rms_residual:.3g} mA"]))
@@ -292,22 +305,21 @@ def fit_decay(
     record : DecayRecord
         One decay, without refills or steps: cut others with `split_record` first.
     shape : callable, optional
-        How a depends on the current in mA, up to a factor, where it is not constant; for
-        example `beamfit.lifetime.mechanisms.touschek_shape(ring, operation)`. The rate equation is
-        then integrated, and `a` is the value at the mean current.
+        Dependence of a on the current in mA, up to a factor, if it is not constant; for example
+        `beamfit.lifetime.mechanisms.touschek_shape(ring, operation)`. The rate equation is then
+        integrated, and `a` is the value at the mean current.
     monitor : Monitor, optional
-        Stability of the current monitor, instead of what the record says of it; the errors contain
-        it.
+        Stability of the current monitor, in place of that of the record; the errors contain it.
     law : {"free", "constant"}
-        Whether a may depend on the current by a power and b drift in the record, with the priors
-        of `beamfit.lifetime.free_law`, which the errors then contain; or both are constant.
-        With a `shape` the law is known.
+        With "free", a may depend on the current by a power and b may drift in the record, with the
+        priors of `beamfit.lifetime.free_law`; the errors contain both. With "constant", or with a
+        `shape`, the law is given.
 
     Returns
     -------
     DecayFit
-        Values, errors, and a verdict. A record from which nothing can be learned is a result
-        with the status `unidentified`, not an error.
+        Values, errors, and a verdict. A record from which nothing can be learned is a result with
+        the status `unidentified`, not an error.
 
     Raises
     ------
@@ -316,8 +328,8 @@ def fit_decay(
 
     Notes
     -----
-    Least squares with report equation 44, or with equation 42 if `shape` is given. With constant
-    a and b errors are those of the linearised problem, else those of the posterior of
+    Least squares with report equation 44, or with equation 42 if `shape` is given. With constant a
+    and b errors are those of the linearised problem, else those of the posterior of
     `beamfit.lifetime.free_law.free_law`.
 
     Examples
@@ -333,16 +345,17 @@ def fit_decay(
     """
     expect(record, DecayRecord, "beamfit.read_decay_record(path)")
     record = record if monitor is None else replace(record, monitor=monitor)
-    if len(record) < FEWEST:
-        expected = f"{FEWEST} or more for a decay"
+    if len(record) < MIN_FITTED_READINGS:
+        expected = f"{MIN_FITTED_READINGS} or more for a decay"
         raise InputError(f"{len(record)} readings", expected, path=record.name)
     if np.ptp(record.current) == 0:
         return _constant(record, f"All {len(record)} readings are {record.current[0]:.6g} mA")
-    about = solved(Pieces.of(record), shape=shape)
-    even = with_rounding(with_common_errors(record, about.off), about.off)
-    about = about if even is record else solved(Pieces.of(even), shape=shape)
-    evidence = Evidence(about, Law(law), shape is not None, even)
-    rate, error = evidence.sure("rate_mean")
+    expansion = fit_law(Pieces.of(record), shape=shape)
+    residuals = expansion.current_residuals
+    prepared = with_rounding(with_common_errors(record, residuals), residuals)
+    expansion = expansion if prepared is record else fit_law(Pieces.of(prepared), shape=shape)
+    evidence = Evidence(expansion, Law(law), shape is not None, prepared)
+    rate, error = evidence.normal_equivalent("rate_mean")
     if rate < -BELIEVED * error:
         first, last = record.current[0], record.current[-1]
         expected = "a decay; cut out refills with split_record"
@@ -353,10 +366,10 @@ def fit_decay(
         record=record.name,
         status=finding.status,
         message=finding.message,
-        **evidence.quoted(about.rested),
+        **evidence.fit_fields(expansion.converged),
         mean_current=record.mean_current,
         rms_residual=evidence.rms,
-        readings=even,
+        readings=prepared,
     )
 
 
@@ -392,7 +405,7 @@ def fit_decays(records: Sequence[DecayRecord], law: Law | str = Law.free) -> tup
 
 
 def _constant(record: DecayRecord, found: str) -> DecayFit:
-    """The result for readings that are all equal: no decay is seen, and no noise either."""
+    """Build the result for equal readings, which show neither decay nor noise."""
     level = record.mean_current
     unknown = {name: Quantity(math.nan, None, unit) for name, unit in UNITS.items()}
     if level:
@@ -423,29 +436,30 @@ def fit_cycles(
     *,
     found: bool = True,
 ) -> DecayFit:
-    """Fit one a and one b to many cycles, as of top-up, each with an own current at its start.
+    """Fit one a and one b to many cycles, such as top-up, each with a starting current of its own.
 
     Parameters
     ----------
     cycles : sequence of DecayRecord
-        Three or more, of three readings or more, in order of time; as of `split_record`. Their
-        `start`, where all have it, says how far apart they lie.
+        Three or more, of three readings or more, in order of time, as from `split_record`. Their
+        `start`, if all have it, gives the time between them.
     name : str, optional
-        What to call them together.
+        Name of the result.
     law : {"free", "constant"}
-        Whether a may go as a power of the current, which errors of a and b then contain.
+        With "free", a may be proportional to a power of the current; errors of a and b contain
+        that.
     found : bool, optional
-        Whether the cycles were found in the readings. Where the noise may have hidden refills, or
-        they come faster than the readings, there is no lifetime then. False where the times of the
+        True if the cycles were found in the readings. There is no lifetime then if the noise may
+        have hidden refills, or they may come faster than the readings. False if the times of the
         refills are known.
 
     Returns
     -------
     DecayFit
-        Of all cycles: `lifetime_start` and `lifetime_end` are at the highest and the lowest
-        current, `i0` is the mean of the cycles' own, without an error, and `lifetimes` has the
-        lifetime by current where the currents are wide enough apart. Where a and b are not
-        separable the lifetime at the mean current is the answer.
+        Result for all cycles. `lifetime_start` and `lifetime_end` are at the highest and the lowest
+        current, `i0` is the mean of the starting currents, without an error, and `lifetimes` has
+        the lifetime by current if the currents differ enough. If a and b are not separable the
+        lifetime at the mean current is the answer.
 
     Raises
     ------
@@ -455,12 +469,13 @@ def fit_cycles(
 
     Notes
     -----
-    Least squares; the currents at the starts are eliminated, so that time and memory grow with the
-    readings alone. Noise with a memory goes on from cycle to cycle, 1/f noise within each
-    (`beamfit.noise.correlated`).
-    Readings, cycles and heads of cycles that lie far off are left out and counted. Where the loss
-    rate is not the same in all cycles the answer is that of the mean rate, and `course` has the
-    lifetimes of parts (`beamfit.lifetime.cycles`).
+    Least squares. The starting currents are eliminated, so that time and memory grow only with the
+    number of readings. Correlated noise continues from cycle to cycle, 1/f noise is that within
+    each (`beamfit.noise.correlated`).
+
+    Outlying readings, cycles and heads of cycles are left out and counted. If the loss rate differs
+    between cycles the answer is that of the mean rate, and `course` has the lifetimes of parts
+    (`beamfit.lifetime.cycles`).
 
     Examples
     --------
@@ -470,11 +485,11 @@ def fit_cycles(
     >>> print(fit_cycles(cycles).lifetime_mean)
     10.00002 ± 0.00049 h
     """
-    if len(cycles) < FEWEST_CYCLES:
-        raise InputError(f"{len(cycles)} cycles", f"{FEWEST_CYCLES} or more", path=name)
+    if len(cycles) < MIN_CYCLES:
+        raise InputError(f"{len(cycles)} cycles", f"{MIN_CYCLES} or more", path=name)
     for cycle in cycles:
-        if len(cycle) < FEWEST_READINGS:
-            found, expected = f"{len(cycle)} readings", f"{FEWEST_READINGS} or more in a cycle"
+        if len(cycle) < MIN_CYCLE_READINGS:
+            found, expected = f"{len(cycle)} readings", f"{MIN_CYCLE_READINGS} or more in a cycle"
             raise InputError(found, expected, path=cycle.name)
     return fit_pieces(cycles, name, Law(law), found=found)
 
@@ -482,28 +497,31 @@ def fit_cycles(
 def fit_pieces(
     cycles: Sequence[DecayRecord], name: str, law: Law = Law.constant, *, found: bool = False
 ) -> DecayFit:
-    """As `fit_cycles`, also of two, such as before and after a refill or a gap."""
-    gathered = averaged(cycles)
-    if np.any(np.diff(gathered.time) <= 0):
+    """Fit cycles as `fit_cycles`, also only two of them, such as before and after a refill or a
+    gap.
+    """
+    collected = collect_cycles(cycles)
+    if np.any(np.diff(collected.time) <= 0):
         raise InputError("a cycle before the end of the one before", "an order in time", path=name)
     if not any(np.ptp(cycle.current) for cycle in cycles):
-        said = f"The readings of each of {len(cycles)} cycles are equal"
-        return replace(_constant(_readings(gathered, name, None), said), first=gathered.first)
-    about, left_out = cleaned(gathered)
+        sentence = f"The readings of each of {len(cycles)} cycles are equal"
+        fit = _constant(_readings(collected, name, None), sentence)
+        return replace(fit, first=collected.first)
+    expansion, left_out = clean_cycles(collected)
     digit, span = cycles[0].resolution, float(np.median([cycle.span for cycle in cycles]))
-    rounding = rounding_of(digit, about.off, span, gathered.monitor)
-    if gathered.error is None and rounding is not None:
-        least, monitor = rounding
-        error = np.full(gathered.time.size, least)
-        about, left_out = cleaned(replace(gathered, error=error, monitor=monitor))
-    usual = usual_cycle(cycles) if found else None
-    evidence, pieces = Evidence(about, law, usual=usual), about.pieces
+    rounding = rounding_of(digit, expansion.current_residuals, span, collected.monitor)
+    if collected.error is None and rounding is not None:
+        rounding_error, monitor = rounding
+        error = np.full(collected.time.size, rounding_error)
+        expansion, left_out = clean_cycles(replace(collected, error=error, monitor=monitor))
+    cycle = usual_cycle(cycles) if found else None
+    evidence, pieces = Evidence(expansion, law, usual_cycle=cycle), expansion.pieces
     finding = finding_of_cycles(evidence, pieces.monitor, left_out)
     return DecayFit(
         record=name,
         status=finding.status,
         message=finding.message,
-        **evidence.quoted(evidence.tells_lifetime),
+        **evidence.fit_fields(evidence.determines_lifetime),
         mean_current=pieces.units[1],
         rms_residual=evidence.rms,
         readings=_readings(pieces, name, digit),
@@ -512,6 +530,6 @@ def fit_pieces(
 
 
 def _readings(pieces: Pieces, name: str, digit: float | None) -> DecayRecord:
-    """Readings of many pieces as one record."""
+    """Join the readings of many pieces to one record."""
     start = float(pieces.time[0])
     return DecayRecord(pieces.time, pieces.current, pieces.error, name, start, digit=digit)

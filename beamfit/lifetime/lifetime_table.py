@@ -20,43 +20,46 @@ from beamfit.lifetime.evidence import EXACT, UNITS
 from beamfit.lifetime.fit import bare, headline_of, loss_json
 from beamfit.lifetime.free_law import (
     DRIFT,
-    FAR,
-    LEAST,
-    MOST,
-    NO_BEAM,
-    QUIET,
-    UNPHYSICAL,
+    MAX_EXPONENT,
+    MIN_EXPONENT,
+    MIN_NOISE,
+    NEGLIGIBLE_LOG,
+    UNPHYSICAL_ODDS,
+    UNPHYSICAL_SHARES,
     FreeLaw,
     Law,
     at_bounds,
-    log_prior,
-    quantity_of,
-    share_of,
+    log_exponent_prior,
+    partial_loss,
+    weighted_quantity,
 )
 from beamfit.lifetime.record import LifetimeTable
 from beamfit.noise.memory import STATED, WRONG
 from beamfit.quantity import HOUR, Quantity, Status
 from beamfit.statistics import POOR_FIT, chi2_probability, reach_of
 
-# Prior probability that a point of a table is bad. It is then off by anything between an error and
-# so many errors, flat in the logarithm. At most this share of the points is left out.
-BAD, BAD_RANGE, MOST_LEFT_OUT = 0.03, 1000.0, 0.2
-# Neighbours whose median lifetime gives a point its weight where bad points are looked for.
-MEDIAN = 5
-# A point nearer to the law of the others than this many errors is not bad.
-NEAR_LAW = 3.0
-# Exponents with which the law of the others is looked for.
-POWERS = np.linspace(LEAST, MOST, 30)
-# Prior probability that stated errors are wrong by a common factor.
-WRONG_ERRORS = 0.2
-# Smallest loss rate of a trial law, over that of the median lifetime: it stays positive.
-SLOWEST = 1e-6
+# Prior probability that a point of a table is bad; it is then off by 1 to MAX_BAD_ERRORS errors,
+# flat in the logarithm.
+P_BAD, MAX_BAD_ERRORS = 0.03, 1000.0
+# Largest share of the points that is left out.
+MAX_LEFT_OUT = 0.2
+# Points closer to the law of the others than this many errors are good without a comparison.
+MIN_BAD_ERRORS = 3.0
+# Exponents of a with which that law is looked for.
+TRIAL_EXPONENTS = np.linspace(MIN_EXPONENT, MAX_EXPONENT, 30)
+# Points of the running median that replaces a slip of the unit or a digit in the weights.
+MEDIAN_POINTS = 5
+# Prior probability that stated errors are wrong by a common factor (chosen: one table in five).
+P_WRONG_ERRORS = 0.2
+# Smallest loss rate of a trial law, over that of the median lifetime.
+MIN_RATE = 1e-6
 # Ratio of singular values below which points do not determine a combination of a and b.
-RANK = 1e-10
-# Nodes of the integral over the share of a, the exponent and the change of b, how often the range
-# of exponents narrows to the posterior, the standard deviations that shares
-# reach to, and steps of the search of the most probable share.
-SHARES, EXPONENTS, CHANGES, ZOOMS, REACH, STEPS = 9, 33, 24, 4, 5.0, 12
+RANK_TOLERANCE = 1e-10
+# Nodes of the integral over the share of a, the exponent and the change of b.
+SHARE_NODES, EXPONENT_NODES, CHANGE_NODES = 9, 33, 24
+# Refinements of the range of exponents, iterations for the most probable share, and standard
+# deviations about it that the nodes reach to.
+REFINEMENTS, ITERATIONS, SHARE_REACH = 4, 12, 5.0
 
 
 @answer
@@ -166,12 +169,12 @@ class _Points(NamedTuple):
         x, lifetime = table.current[kept] / table.current.mean(), table.lifetime[kept] / unit
         some = -math.log(4 * WRONG)  # of a factor within 1/30 to 30
         if table.error is not None:
-            error = np.maximum(table.error[kept] / unit, QUIET * lifetime)
-            near = STATED / 2 * math.log(STATED) - gammaln(STATED / 2) + math.log1p(-WRONG_ERRORS)
+            error = np.maximum(table.error[kept] / unit, MIN_NOISE * lifetime)
+            near = STATED / 2 * math.log(STATED) - gammaln(STATED / 2) + math.log1p(-P_WRONG_ERRORS)
             right = cls(x, lifetime, error, STATED, near)
-            return right, right._replace(known=0.0, log_prior=some + math.log(WRONG_ERRORS))
+            return right, right._replace(known=0.0, log_prior=some + math.log(P_WRONG_ERRORS))
         equal = cls(x, lifetime, np.ones(x.size), 0.0, some)
-        curve = np.maximum(lifetime + _least_squares(equal).residuals, SLOWEST)
+        curve = np.maximum(lifetime + _least_squares(equal).residuals, MIN_RATE)
         models = equal, equal._replace(error=curve)
         return tuple(sorted(models, key=lambda one: -_integral([one], Law.constant).log))
 
@@ -204,9 +207,13 @@ class _LeastSquares(NamedTuple):
     def quantity(self, value: float, slopes: Sequence[float], unit: str, size: float) -> Quantity:
         """A value in a unit of this size; `slopes` are its derivatives by the numbers."""
         _, scales, axes = np.linalg.svd(self.slopes, full_matrices=False)
-        along, lost = axes @ slopes[: self.numbers.size], scales <= RANK * scales[0]
+        along, lost = axes @ slopes[: self.numbers.size], scales <= RANK_TOLERANCE * scales[0]
         raw = float(np.linalg.norm(along[~lost] / scales[~lost]))
-        raw = math.inf if np.any(np.abs(along[lost]) > RANK) else max(raw, EXACT * abs(value))
+        raw = (
+            math.inf
+            if np.any(np.abs(along[lost]) > RANK_TOLERANCE)
+            else max(raw, EXACT * abs(value))
+        )
         raw, reach = raw * size, reach_of(math.inf if self.stated else self.dof)
         return Quantity.reaching(
             float(value) * size, self.scale * raw, unit, raw, reach * self.scale * raw
@@ -220,7 +227,7 @@ def _least_squares(points: _Points, exponent: bool = False) -> _LeastSquares:
     def rates(numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         power = x ** (1 + (numbers[2] if exponent else 0.0))
         slopes = [power, np.ones_like(x), numbers[0] * power * np.log(x)]
-        rate = np.maximum(numbers[0] * power + numbers[1], SLOWEST)
+        rate = np.maximum(numbers[0] * power + numbers[1], MIN_RATE)
         return rate, np.column_stack(slopes[: 2 + exponent])
 
     def residuals(numbers: np.ndarray) -> np.ndarray:
@@ -232,7 +239,7 @@ def _least_squares(points: _Points, exponent: bool = False) -> _LeastSquares:
 
     weight = (lifetime**2 / error)[:, None]
     columns = np.column_stack([x, np.ones_like(x)])
-    start = np.linalg.lstsq(weight * columns, lifetime / error, rcond=RANK)[0]
+    start = np.linalg.lstsq(weight * columns, lifetime / error, rcond=RANK_TOLERANCE)[0]
     ends = np.array([np.inf, np.inf, 3.0])[: 2 + exponent]
     found = least_squares(
         residuals, np.append(start, [0.0] * exponent), slopes, (-ends, ends),
@@ -272,7 +279,7 @@ def _along_share(
     points: _Points, power: np.ndarray, change: np.ndarray, bounds: tuple[float, float]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Nodes of the share of a at exponents and changes of b, (m,), the most probable lifetime at
-    the mean current with its standard deviation, and log weights, each of shape (m, SHARES).
+    the mean current with its standard deviation, and log weights, each of shape (m, SHARE_NODES).
 
     The lifetime at the mean current is a factor on all lifetimes: at each share the integral over
     it has a closed form, as has that over the noise level.
@@ -286,45 +293,45 @@ def _along_share(
         """Lifetimes over that at the mean current and over their errors, the sum of their squares,
         the most probable factor and the residual sum of squares.
         """
-        shape = 1 / np.maximum(gas + share[..., None] * bend, SLOWEST) / error
+        shape = 1 / np.maximum(gas + share[..., None] * bend, MIN_RATE) / error
         norm = np.sum(shape**2, axis=-1)
         best = shape @ read / norm
         squares = np.sum((read - best[..., None] * shape) ** 2, axis=-1)
         return shape, norm, best, known + np.maximum(squares, x.size * EXACT**2)
 
     share = np.full((power.size, 1), 0.5)
-    for _ in range(STEPS):
+    for _ in range(ITERATIONS):
         shape, norm, best, squares = profile(share)
         slope = -best[..., None] * shape**2 * error * bend
         slope -= shape * (np.sum(shape * slope, axis=-1) / norm)[..., None]
         whole = np.maximum(np.sum(slope**2, axis=-1), EXACT**2)
         step = np.sum(slope * (read - best[..., None] * shape), axis=-1) / whole
-        share = np.clip(share + step, *NO_BEAM)
-    far, near = REACH * np.sqrt(squares / dof / whole), np.clip(share, *bounds)
+        share = np.clip(share + step, *UNPHYSICAL_SHARES)
+    far, near = SHARE_REACH * np.sqrt(squares / dof / whole), np.clip(share, *bounds)
     low, high = np.maximum(near - far, bounds[0]), np.minimum(near + far, bounds[1])
-    nodes = _places(low[:, 0], high[:, 0], SHARES)
+    nodes = _places(low[:, 0], high[:, 0], SHARE_NODES)
     _, norm, best, squares = profile(nodes)
     density = 1 / np.sqrt(norm) / best / (bounds[1] - bounds[0])
-    log = np.log(density * (high - low) / SHARES) - dof / 2 * np.log(squares)
+    log = np.log(density * (high - low) / SHARE_NODES) - dof / 2 * np.log(squares)
     return nodes, best, np.sqrt(squares / dof / norm), log
 
 
 def _exponents(points: _Points, change: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Exponents for each change of b, (m, EXPONENTS), in the range that the points allow, and the
-    log prior probability of each.
+    """Exponents for each change of b in the range that the points allow, and the log prior
+    probability of each, (m, EXPONENT_NODES).
     """
-    low, high = np.full(change.size, LEAST), np.full(change.size, MOST)
-    for _ in range(ZOOMS):
-        power = np.linspace(low, high, EXPONENTS, axis=1)
-        every = np.repeat(change, EXPONENTS)
+    low, high = np.full(change.size, MIN_EXPONENT), np.full(change.size, MAX_EXPONENT)
+    for _ in range(REFINEMENTS):
+        power = np.linspace(low, high, EXPONENT_NODES, axis=1)
+        every = np.repeat(change, EXPONENT_NODES)
         log = logsumexp(_along_share(points, power.ravel(), every, (0.0, 1.0))[-1], axis=1)
-        log = log.reshape(power.shape) + log_prior(power)[0]
-        held = log > log.max(axis=1, keepdims=True) - FAR
+        log = log.reshape(power.shape) + log_exponent_prior(power)[0]
+        held = log > log.max(axis=1, keepdims=True) - NEGLIGIBLE_LOG
         first, last = held.argmax(axis=1), held.shape[1] - 1 - held[:, ::-1].argmax(axis=1)
-        ends = np.maximum(first - 1, 0), np.minimum(last + 1, EXPONENTS - 1)
+        ends = np.maximum(first - 1, 0), np.minimum(last + 1, EXPONENT_NODES - 1)
         low, high = (np.take_along_axis(power, end[:, None], axis=1)[:, 0] for end in ends)
-    power = _places(low, high, EXPONENTS)
-    return power, log_prior(power)[0] + np.log((high - low) / EXPONENTS)[:, None]
+    power = _places(low, high, EXPONENT_NODES)
+    return power, log_exponent_prior(power)[0] + np.log((high - low) / EXPONENT_NODES)[:, None]
 
 
 def _integral(
@@ -342,7 +349,7 @@ def _of_errors(points: _Points, law: Law, bounds: tuple[float, float]) -> _Integ
     """Posterior of the free or of the constant law with one error model."""
     change, power, prior = np.zeros(1), np.zeros((1, 1)), np.zeros((1, 1))
     if law is Law.free:
-        change = DRIFT * ndtri((np.arange(CHANGES) + 0.5) / CHANGES)
+        change = DRIFT * ndtri((np.arange(CHANGE_NODES) + 0.5) / CHANGE_NODES)
         power, prior = _exponents(points, change)
     every = np.repeat(change, power.shape[1])
     share, best, spread, log = _along_share(points, power.ravel(), every, bounds)
@@ -353,7 +360,7 @@ def _of_errors(points: _Points, law: Law, bounds: tuple[float, float]) -> _Integ
     half = (points.current.size + points.known - 1) / 2
     whole = float(logsumexp(log) - np.sum(np.log(points.error)) + gammaln(half)) + points.log_prior
     whole -= (points.current.size - 1) / 2 * math.log(math.pi)
-    numbers = (share, power.ravel()[:, None], every[:, None], np.maximum(drawn, SLOWEST))
+    numbers = (share, power.ravel()[:, None], every[:, None], np.maximum(drawn, MIN_RATE))
     flat = (np.broadcast_to(number, log.shape).ravel() for number in numbers)
     return _Integral(*flat, np.exp(log - logsumexp(log)).ravel(), whole)
 
@@ -382,21 +389,21 @@ def _farthest_off(table: LifetimeTable, kept: np.ndarray, exponents: np.ndarray)
     rows = np.flatnonzero(kept)
     current, lifetime, given = table.current[rows], table.lifetime[rows], table.error is not None
     order = np.argsort(current)
-    near = median_filter(lifetime[order], min(MEDIAN, rows.size))[np.argsort(order)]
+    near = median_filter(lifetime[order], min(MEDIAN_POINTS, rows.size))[np.argsort(order)]
     usual = np.clip(lifetime, near / 2, 2 * near)  # a slip has the weight of its neighbours
     error = table.error[rows] if given else usual
     power, weight = (current / current.mean()) ** (1 + exponents[:, None]), usual**2 / error
     columns = np.stack([power, np.ones_like(power)], axis=-1) * weight[:, None]
     basis, rates = np.linalg.qr(columns)[0], weight / lifetime
     left = rates - (basis @ (np.swapaxes(basis, 1, 2) @ rates)[..., None])[..., 0]
-    free = np.maximum(1 - np.sum(basis**2, axis=2), RANK)
+    free = np.maximum(1 - np.sum(basis**2, axis=2), RANK_TOLERANCE)
     whole = np.sum(left**2, axis=1)
     without = np.maximum(whole[:, None] - left**2 / free, 0.0)
     law, worst = np.unravel_index(np.argmin(without), without.shape)
     distance = abs(float(left[law, worst] / free[law, worst] * error[worst]))
     rest, dof = float(without[law, worst]), rows.size - 3 - (exponents.size > 1)
     known = STATED if given else 0.0
-    variance = max(known + rest, rows.size * QUIET**2) / max(known + dof, 1.0)
+    variance = max(known + rest, rows.size * MIN_NOISE**2) / max(known + dof, 1.0)
     errors = math.sqrt(max(whole.min() - rest, 0.0) / variance)
     return _Departure(int(rows[worst]), distance, errors, rest, dof)
 
@@ -404,15 +411,15 @@ def _farthest_off(table: LifetimeTable, kept: np.ndarray, exponents: np.ndarray)
 def _outliers(table: LifetimeTable) -> np.ndarray:
     """Points that are more probably bad than good, one at a time."""
     kept = np.ones(len(table), bool)
-    for _ in range(int(MOST_LEFT_OUT * len(table))):
-        worst = _farthest_off(table, kept, POWERS)
-        if worst.errors < NEAR_LAW:
+    for _ in range(int(MAX_LEFT_OUT * len(table))):
+        worst = _farthest_off(table, kept, TRIAL_EXPONENTS)
+        if worst.errors < MIN_BAD_ERRORS:
             break
         others = kept & (np.arange(len(table)) != worst.point)
         good, rest = (_log_evidence(_Points.of(table, rows)) for rows in (kept, others))
         off = worst.distance / float(np.median(table.lifetime))
-        bad = rest + math.log(BAD) - math.log(2 * math.log(BAD_RANGE) * off)
-        if good + math.log1p(-BAD) > bad:
+        bad = rest + math.log(P_BAD) - math.log(2 * math.log(MAX_BAD_ERRORS) * off)
+        if good + math.log1p(-P_BAD) > bad:
             break
         kept = others
     return ~kept
@@ -441,7 +448,7 @@ def _lifetime(found: _LeastSquares, x: float, unit: float) -> Quantity:
     """Lifetime at a current over the mean, h."""
     a, b, *power = found.numbers
     part = x ** (1 + sum(power))
-    rate = max(a * part + b, SLOWEST)
+    rate = max(a * part + b, MIN_RATE)
     slopes = np.array([part, 1.0, a * part * math.log(x)]) / -(rate**2)
     return found.quantity(1 / rate, slopes, "h", unit)
 
@@ -476,22 +483,22 @@ def _free_law(
     """
     found, constant = (_integral(every, law) for law in (Law.free, Law.constant))
     if not np.all(plain.numbers[:2] >= 0):
-        rival = _integral(every, Law.constant, NO_BEAM)
-        if rival.log + math.log(UNPHYSICAL) > found.log:
+        rival = _integral(every, Law.constant, UNPHYSICAL_SHARES)
+        if rival.log + math.log(UNPHYSICAL_ODDS) > found.log:
             return None
     (mean, unit, ends), weight = _units(table), found.weight
     width = float(np.ptp(every[0].current)) or 1.0
     b, bounds = 1 / (found.lifetime * unit * HOUR), at_bounds(found.share, weight)
     quoted = {
-        "a": share_of(found.share * b / mean, weight, UNITS["a"], *bounds, b / mean),
-        "b": share_of((1 - found.share) * b, weight, UNITS["b"], *bounds[::-1], b),
-        "share": quantity_of(found.share, weight, "1"),
+        "a": partial_loss(found.share * b / mean, weight, UNITS["a"], *bounds, b / mean),
+        "b": partial_loss((1 - found.share) * b, weight, UNITS["b"], *bounds[::-1], b),
+        "share": weighted_quantity(found.share, weight, "1"),
     }
     for name, x in ends.items():
-        quoted[name] = quantity_of(unit / found.rate(x, width), weight, "h")
-    usual, odd = log_prior(found.power)
+        quoted[name] = weighted_quantity(unit / found.rate(x, width), weight, "h")
+    usual, odd = log_exponent_prior(found.power)
     chances = float(expit(constant.log - found.log)), float(weight @ np.exp(odd - usual))
-    exponent = quantity_of(found.power, weight, "1")
+    exponent = weighted_quantity(found.power, weight, "1")
     return FreeLaw(quoted, quoted["share"], exponent, None, *chances)
 
 
@@ -556,10 +563,10 @@ def fit_lifetimes(table: LifetimeTable, law: Law | str = Law.free) -> LifetimeFi
     points = every[0]
     plain, power = (_least_squares(points, exponent) for exponent in (False, True))
     test, exact = _tested(points, plain, power), _by_least_squares(table, plain)
-    quiet = table.error is None and plain.scale < QUIET
+    quiet = table.error is None and plain.scale < MIN_NOISE
     known = quiet or Law(law) is Law.constant
     free = None if known else _free_law(table, every, plain)
-    refuted, freed = test.status is Status.poor_fit, free is not None and free.likelier
+    refuted, freed = test.status is Status.poor_fit, free is not None and free.is_preferred
     best = power if freed else plain
     given, unit = table.error is not None, float(np.median(table.lifetime))
     evidence = TableEvidence(

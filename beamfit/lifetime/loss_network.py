@@ -1,7 +1,7 @@
-"""A network that corrects first principles: ln a and ln b at any setting (report 3.4.2).
+"""Network that corrects first principles: ln a and ln b at any setting (report 3.4.2).
 
-Signs of its weights make a and b fall with bunches and scraper opening and rise with pressure, at
-every point and not only at data; first principles do so themselves, and so does the product.
+The signs of its weights make the correction fall with bunches and scraper opening and rise with
+pressure everywhere, not only at the data. First principles do so too, hence also the product.
 """
 
 from __future__ import annotations
@@ -24,32 +24,36 @@ from beamfit.greybox.mlp import MLP, Port
 from beamfit.greybox.problem import Prior, Problem, Record
 from beamfit.greybox.signed_network import GainCertificate, certificate_of, signed_network
 from beamfit.greybox.solve import solve
-from beamfit.lifetime.mechanisms import SCALES, scaled_losses, terms_along
+from beamfit.lifetime.mechanisms import SCALES, scaled_losses, terms_at_voltages
 from beamfit.lifetime.ring import Operation
 from beamfit.lifetime.scales import ScaleFit, loss_parts
 from beamfit.lifetime.study import Decay, settings_of
 from beamfit.quantity import HOUR, Quantity, percent
 
+# Inputs and outputs of the network.
 INPUTS = ("rf_voltage", "scraper_y", "pressure", "bunches")
-# How the loss moves with each input; nothing is known of the sign for the RF voltage.
-SIGNS = {"scraper_y": -1, "pressure": 1, "bunches": -1}
 OUTPUTS = ("log_a", "log_b")
+# Sign of the slope of the loss by each input; that by the RF voltage is not known.
+SIGNS = {"scraper_y": -1, "pressure": 1, "bunches": -1}
+# The same as a matrix, shape (outputs, inputs), 0 for unknown.
 RISING = np.array([[SIGNS.get(name, 0) for name in INPUTS]] * len(OUTPUTS))
 
 
-def scaled(rf_voltage: float, scraper_y: float, pressure: float, bunches: float) -> np.ndarray:
-    """Inputs of a network from V, m, Pa, number: MV, logarithms of mm, nPa and number."""
+def network_inputs(
+    rf_voltage: float, scraper_y: float, pressure: float, bunches: float
+) -> np.ndarray:
+    """Network inputs, MV and logarithms of mm, nPa and number, from V, m, Pa and number."""
     values = np.array([1e3 * scraper_y, 1e9 * pressure, bunches], float)
     return np.array([1e-6 * float(rf_voltage), *np.log(values)])
 
 
 class Box(NamedTuple):
-    """A range of operation, the ends in SI: what a network is asked to hold over.
+    """Operating box: ranges of the settings, in SI units, over which a network is certified.
 
     Parameters
     ----------
     rf_voltage, scraper_y, pressure, bunches : (float, float)
-        V, m, Pa at the mean current, and number.
+        Ranges in V, m, Pa at the mean current, and number.
 
     Raises
     ------
@@ -69,35 +73,35 @@ class Box(NamedTuple):
     bunches: tuple[float, float]
 
     def corners(self) -> tuple[np.ndarray, np.ndarray]:
-        """Both corners in the network's inputs."""
+        """Lower and upper corner in network inputs."""
         for name, (low, high) in zip(self._fields, self, strict=True):
             if not 0 < low <= high < np.inf:
                 expected = "0 < lower <= upper, finite"
                 raise InputError(f"range {low:g} to {high:g}", expected, column=name)
         low, high = np.array(self, float).T
-        return scaled(*low), scaled(*high)
+        return network_inputs(*low), network_inputs(*high)
 
 
-# Sizes that are weighed, as relative errors of a and of b.
-SIZES = tuple(0.005 * 2 ** (k / 2) for k in range(13))
-# Prior of a size: half a normal of this width. Smooth decays tell a network that bends hardly from
-# a flat one with a large error, and what a network of losses leaves is a few per cent.
-USUAL = 0.05
+# Grid of model errors, relative errors of a and of b: 0.5 to 32 %.
+MODEL_ERRORS = tuple(0.005 * 2 ** (k / 2) for k in range(13))
+# Width of the half-normal prior of a model error: such networks leave a few per cent. It is needed
+# because smooth data hardly distinguish a curved network from a flat one with a large model error.
+MODEL_ERROR_PRIOR = 0.05
 
 
 class Discrepancy(NamedTuple):
-    """Smooth errors of a model of decays.
+    """Model error of a network: a smooth random error of ln a and ln b.
 
     Attributes
     ----------
     size : (float, float)
         Standard deviation of ln a and of ln b about the network.
     inputs : array, shape (n, k)
-        Of the decays.
+        Network inputs of the decays.
     length : array, shape (k,)
-        Correlation lengths.
+        Correlation lengths of the inputs.
     rows : array, shape (2n, 2n)
-        Slopes of what the decays say, in their errors, by ln a and ln b of each decay.
+        Slopes of the pulls of the decays by ln a and ln b of each decay.
     """
 
     size: tuple[float, float]
@@ -105,94 +109,99 @@ class Discrepancy(NamedTuple):
     length: np.ndarray
     rows: np.ndarray
 
-    def kernel(self, at: np.ndarray) -> np.ndarray:
-        """Covariance of (ln a, ln b) at inputs (m, k) with those at the decays, (2m, 2n)."""
-        off = (at[:, None] - self.inputs) / self.length
-        return np.kron(np.exp(-0.5 * np.sum(off**2, -1)), np.diag(np.square(self.size)))
+    def kernel(self, inputs: np.ndarray) -> np.ndarray:
+        """Covariance of ln a and ln b at inputs (m, k) with those at the decays, (2m, 2n)."""
+        distance = (inputs[:, None] - self.inputs) / self.length
+        return np.kron(np.exp(-0.5 * np.sum(distance**2, -1)), np.diag(np.square(self.size)))
 
     @property
     def root(self) -> np.ndarray:
-        """Lower triangle of the covariance of the decays, in their own errors, (2n, 2n)."""
+        """Cholesky factor of the covariance of the pulls with model error, (2n, 2n)."""
         covariance = self.rows @ self.kernel(self.inputs) @ self.rows.T
         return cholesky(np.eye(len(covariance)) + covariance, lower=True)
 
     def spread(
-        self, at: np.ndarray, slopes: np.ndarray, left: np.ndarray, fit: Fit
+        self, at: np.ndarray, slopes: np.ndarray, residuals: np.ndarray, fit: Fit
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Model error of the network at inputs (m, k): mean (2m,), covariance (2m, 2m).
+        """Model error of ln a and ln b at inputs (m, k): mean (2m,) and covariance (2m, 2m).
 
-        `slopes` of ln a and ln b by the network's free numbers, (2m, p); `left` of the decays'
-        residuals, in their errors, (2n,). Weights and errors of the model are not told apart.
+        `slopes`, (2m, p), are those of ln a and ln b by the free parameters of the network;
+        `residuals`, (2n,), are the pulls of the decays. The covariance includes that of the
+        parameters.
         """
         root = self.root
-        reach = cho_solve((root, True), self.rows @ self.kernel(at).T)
-        jacobian = root @ fit.dense_jacobian[: left.size]
-        total = slopes - reach.T @ jacobian
-        own = self._replace(inputs=at).kernel(at)
-        rest = own - reach.T @ self.rows @ self.kernel(at).T
-        return reach.T @ left, rest + total @ fit.covariance_raw @ total.T
+        gain = cho_solve((root, True), self.rows @ self.kernel(at).T)
+        jacobian = root @ fit.dense_jacobian[: residuals.size]
+        net_slopes = slopes - gain.T @ jacobian
+        prior_covariance = self._replace(inputs=at).kernel(at)
+        covariance = prior_covariance - gain.T @ self.rows @ self.kernel(at).T
+        return gain.T @ residuals, covariance + net_slopes @ fit.covariance_raw @ net_slopes.T
 
 
-def sized(trial: Discrepancy, fit: Fit, left: np.ndarray) -> Discrepancy:
-    """The size by restricted likelihood and its prior: weights integrated out about a fit made with
-    a trial size.
+def estimate_model_error(trial: Discrepancy, fit: Fit, residuals: np.ndarray) -> Discrepancy:
+    """Estimate the model error: maximum of restricted likelihood times prior.
 
-    `left` are the decays' residuals, in their errors.
+    The network's weights are integrated out in linear approximation about a fit with a trial size;
+    `residuals` are the pulls of the decays.
     """
     free = [k for k, variable in enumerate(fit.variables) if variable.state == "free"]
     jacobian = fit.dense_jacobian[:, free]
-    seen, known = trial.root @ jacobian[: left.size], jacobian[left.size :]
+    data_slopes, prior_slopes = trial.root @ jacobian[: residuals.size], jacobian[residuals.size :]
     start = fit.theta[free]
 
     def likelihood(size: tuple[float, float]) -> float:
         root = trial._replace(size=size).root
-        rows = solve_triangular(root, seen, lower=True)
-        off = solve_triangular(root, left, lower=True)
-        # Priors are normal about zero: their residuals are their rows times the weights.
-        information = rows.T @ rows + known.T @ known
-        pull = rows.T @ off - known.T @ (known @ start)
-        rest = off @ off - pull @ np.linalg.solve(information, pull)
-        return -np.log(np.diag(root)).sum() - 0.5 * (np.linalg.slogdet(information)[1] + rest)
+        rows = solve_triangular(root, data_slopes, lower=True)
+        white = solve_triangular(root, residuals, lower=True)
+        # Priors are normal about zero, so their residuals are their rows times the weights.
+        information = rows.T @ rows + prior_slopes.T @ prior_slopes
+        score = rows.T @ white - prior_slopes.T @ (prior_slopes @ start)
+        chi2 = white @ white - score @ np.linalg.solve(information, score)
+        return -np.log(np.diag(root)).sum() - 0.5 * (np.linalg.slogdet(information)[1] + chi2)
 
     def posterior(size: tuple[float, float]) -> float:
-        return likelihood(size) - 0.5 * float(np.sum(np.square(size))) / USUAL**2
+        return likelihood(size) - 0.5 * float(np.sum(np.square(size))) / MODEL_ERROR_PRIOR**2
 
-    return trial._replace(size=max(itertools.product(SIZES, SIZES), key=posterior))
+    return trial._replace(size=max(itertools.product(MODEL_ERRORS, MODEL_ERRORS), key=posterior))
 
 
 # Units of a, b and the lifetime.
-LOSSES = ("1/(mA s)", "1/s", "h")
-# Size of a correction of ln a and ln b by weights of one, the standard deviation of the prior on
-# them, which is the usual for inputs and outputs of size one; none exceeds ten.
-CORRECTION, MOST = 0.3, 10.0
-# An input counts by half its range, 0.1 MV or 10 % at least: what hardly moved tells nothing. The
-# model's error is correlated over so much of that, chosen on simulated shifts.
-SHORTEST, LENGTH = 0.1, 0.8
-# Voltages that are looked at, for a maximum or for the longest lifetime.
-VOLTAGES = 65
+LOSS_UNITS = ("1/(mA s)", "1/s", "h")
+# Scale of the outputs: correction of ln a and ln b by weights of one, the standard deviation of
+# their prior.
+CORRECTION = 0.3
+# Largest weight: ten standard deviations of the prior.
+MAX_WEIGHT = 10.0
+# Smallest half range by which an input is scaled, 0.1 MV or 10 %: a setting that hardly moves
+# determines nothing.
+MIN_INPUT_SCALE = 0.1
+# Correlation length of the model error, in half ranges: chosen on simulated shifts.
+CORRELATION_LENGTH = 0.8
+# Number of RF voltages in a search for the maximum of the lifetime: chosen, 1/64 of the range.
+N_VOLTAGES = 65
 
 
 @shown
 @dataclass(frozen=True, eq=False)
 class NetworkFit:
-    """A fitted network of losses.
+    """Fitted network that corrects first principles.
 
     Parameters
     ----------
     fit : Fit
-        Of the grey-box core, with its status, message and covariance.
+        Grey-box fit, with status, message and covariance.
     certificate : GainCertificate
-        Enclosures of the slopes of the network's ln a and ln b by the four inputs, which are RF
-        voltage MV, logarithms of scraper mm, pressure nPa and bunches; and the operating box.
+        Enclosures of the slopes of the network's ln a and ln b by the four inputs (RF voltage in
+        MV, logarithms of scraper in mm, pressure in nPa, and bunches) over the operating box.
     single_maximum : bool
-        Whether the lifetime has a single maximum in the RF voltage at points along the edges of
-        the box: first principles have no enclosure.
+        Whether the lifetime has a single maximum in the RF voltage, tested at points along the
+        edges of the box: for first principles there is no enclosure.
     corrected : ScaleFit
-        The first principles that the network corrects.
+        First principles that the network corrects.
     discrepancy : Discrepancy
-        What it may be wrong by.
-    left : array, shape (2n,)
-        What it leaves of the decays, in their errors.
+        Model error.
+    residuals : array, shape (2n,)
+        Residuals of the decays in standard errors.
     """
 
     fit: Fit
@@ -200,11 +209,11 @@ class NetworkFit:
     single_maximum: bool
     corrected: ScaleFit
     discrepancy: Discrepancy
-    left: np.ndarray
+    residuals: np.ndarray
 
     @property
     def usual(self) -> Operation:
-        """The machine's usual settings and vacuum."""
+        """Usual settings and vacuum of the machine."""
         return self.corrected.machine.operation
 
     def predict(self, operation: Operation, current: float) -> tuple[Quantity, ...]:
@@ -213,63 +222,63 @@ class NetworkFit:
         Parameters
         ----------
         operation : Operation
-            Settings and vacuum, with the P1/P0 of the ring file, which a scale is on.
+            Settings and vacuum, with the P1/P0 of the ring file; the fit has a scale on it.
         current : float
             Mean current, mA.
 
         Returns
         -------
         tuple of Quantity
-            a, 1/(mA s), b, 1/s, and the lifetime, h. Outside the operating box the network is not
-            to be believed, and the errors are None.
+            a, 1/(mA s), b, 1/s, and the lifetime, h. Outside the operating box the errors are None:
+            the prediction is an extrapolation.
         """
-        at = _inputs(operation, current)[None]
-        base = np.log(np.array(self.corrected.losses_at(operation, current), float))
-        logs = self.fit.derive(_logs, (at, base[None]))
-        mean, covariance = self.discrepancy.spread(at, logs.slope[0], self.left, self.fit)
+        inputs = _inputs(operation, current)[None]
+        log_losses = np.log(np.array(self.corrected.losses_at(operation, current), float))
+        logs = self.fit.derive(_logs, (inputs, log_losses[None]))
+        mean, covariance = self.discrepancy.spread(inputs, logs.slope[0], self.residuals, self.fit)
         a, b = np.exp(logs.value[0])
         rate = a * current + b
-        # By ln a and ln b: of themselves, and of the logarithm of the lifetime.
+        # Slopes of ln a, ln b and the logarithm of the lifetime by ln a and ln b.
         rows = np.array([[1, 0], [0, 1], [-a * current / rate, -b / rate]])
         spread = np.sum(rows @ covariance * rows, axis=1) + (rows @ mean) ** 2
-        inside = self.certificate.holds_at(at[0])
-        named = zip((a, b, 1 / rate / HOUR), np.sqrt(spread), LOSSES, strict=True)
-        return tuple(Quantity(float(v), float(e * v) if inside else None, u) for v, e, u in named)
+        in_box = self.certificate.holds_at(inputs[0])
+        named = zip((a, b, 1 / rate / HOUR), np.sqrt(spread), LOSS_UNITS, strict=True)
+        return tuple(Quantity(float(v), float(e * v) if in_box else None, u) for v, e, u in named)
 
     def rows(self, current: float) -> list[Row]:
-        """Label and value of what it says at a current, and of what it obeys."""
-        held, wrong = self.certificate, self.discrepancy.size
+        """Table rows: predictions at a current, model error and certified properties."""
+        certificate, model_error = self.certificate, self.discrepancy.size
         at = f"at the usual settings, {current:.4g} mA"
         names = (f"a {at}", f"b {at}", f"lifetime {at}")
         numbers = zip(names, self.predict(self.usual, current), strict=True)
         rows = [
             ("status", self.fit.status),
             ("chi2/dof", f"{self.fit.chi2:.4g}/{self.fit.dof}"),
-            ("what it may be wrong by, a and b", " and ".join(map(percent, wrong))),
+            ("what it may be wrong by, a and b", " and ".join(map(percent, model_error))),
             *numbers,
-            ("falls with scraper and bunches, rises with pressure", held.holds),
+            ("falls with scraper and bunches, rises with pressure", certificate.holds),
             ("single maximum of the lifetime in the RF voltage", self.single_maximum),
         ]
         return [Row(label, [value], quoted=True) for label, value in rows]
 
     def to_json(self, current: float) -> dict[str, Any]:
-        """Return the verdict, and a, b and lifetime at the usual settings, as JSON's types."""
+        """Verdict, and a, b and lifetime at the usual settings, as JSON's types."""
         found = {name: getattr(self.fit, name) for name in ("status", "message", "chi2", "dof")}
         a, b, lifetime = self.predict(self.usual, current)
-        told = {"a": a, "b": b, "lifetime": lifetime, "certificate": self.certificate}
-        told["single_maximum"] = self.single_maximum
-        told["model_error"] = dict(zip("ab", self.discrepancy.size, strict=True))
-        return json_of(found | told)
+        predicted = {"a": a, "b": b, "lifetime": lifetime, "certificate": self.certificate}
+        predicted["single_maximum"] = self.single_maximum
+        predicted["model_error"] = dict(zip("ab", self.discrepancy.size, strict=True))
+        return json_of(found | predicted)
 
 
-# The network's inputs, ln a and ln b of first principles, mean currents, weights of the two rates.
+# Inputs of the network, ln a and ln b of first principles, mean currents, whitening matrix.
 Data = tuple[Array, Array, Array, Array]
 
 
 def _inputs(operation: Operation, current: float) -> np.ndarray:
-    """Inputs in units near one; logarithms where the losses go as powers."""
+    """Network inputs at a setting; logarithms where the losses go as powers."""
     pressure = operation.pressure_base + operation.pressure_slope * current
-    return scaled(operation.rf_voltage, operation.scraper_y, pressure, operation.bunches)
+    return network_inputs(operation.rf_voltage, operation.scraper_y, pressure, operation.bunches)
 
 
 def _logs(model: Mapping[str, MLP], data: tuple[Array, Array]) -> Array:
@@ -293,26 +302,26 @@ def fit_loss_network(
     starts: int = 3,
     seed: int = 0,
 ) -> NetworkFit:
-    """Fit a network that multiplies a and b of first principles, to decays at different settings.
+    """Fit a network that multiplies a and b of first principles to decays at different settings.
 
     Parameters
     ----------
     decays : sequence of Decay
         Fitted decays whose records carry their settings.
     corrected : ScaleFit
-        First principles fitted to them: a = a_fp exp(network), and b alike.
+        First principles fitted to the decays: a = a_fp exp(network), and likewise b.
     hidden : int, optional
-        Nodes of the network.
+        Number of nodes of the network.
     box : Box, optional
-        The operating box of the certificate, outside which nothing is predicted; what the decays
-        span by default. Where it is wider than that, errors are those of an extrapolation.
+        Operating box of the certificate, outside which predictions have no error; default: the
+        range of the decays. In a wider box errors are those of an extrapolation.
     starts, seed : int, optional
-        Of the search.
+        Number of starts of the search, and seed of the random numbers.
 
     Returns
     -------
     NetworkFit
-        With a certificate of its signs over the box.
+        Network with a certificate of its signs over the box.
 
     Raises
     ------
@@ -321,10 +330,10 @@ def fit_loss_network(
 
     Notes
     -----
-    Weights are regularised by a normal prior of width 0.3, so that a correction the data do not ask
-    for stays zero. What the network cannot follow is a smooth random error in its likelihood, whose
-    size the decays themselves tell (`discrepancy`); errors of predictions contain it, and grow away
-    from the decays.
+    A normal prior regularises the weights: where the data show no correction it stays zero. The
+    model error is a smooth random error in the likelihood (M. C. Kennedy and A. O'Hagan, J. R.
+    Stat. Soc. B 63 (2001) 425), whose size is estimated from the decays (`discrepancy`). Errors of
+    predictions contain it, and grow away from the decays.
     """
     if len(decays) < 4:
         raise InputError(f"{len(decays)} decays", "4 or more at different settings")
@@ -332,45 +341,45 @@ def fit_loss_network(
     inputs = np.stack([_inputs(*setting) for setting in settings])
     if not np.isfinite(inputs).all():
         raise InputError("a setting that is not finite", "RF voltage, scraper, pressure, bunches")
-    half = np.maximum(np.ptp(inputs, axis=0) / 2, SHORTEST)
+    half = np.maximum(np.ptp(inputs, axis=0) / 2, MIN_INPUT_SCALE)
     low, high = (inputs.min(0), inputs.max(0)) if box is None else box.corners()
     entries = zip(INPUTS, half, inputs.mean(0), low, high, strict=True)
     ports = [Port(name, "", 0, *scale) for name, *scale in entries]
     outputs = [Port(name, "", scale=CORRECTION) for name in OUTPUTS]
-    net, free = signed_network("map", ports, outputs, RISING, hidden, seed, MOST)
+    net, free = signed_network("map", ports, outputs, RISING, hidden, seed, MAX_WEIGHT)
     terms, measured = corrected.decays.terms, corrected.decays.measured
-    weight, _, _, change = corrected.about(corrected.decays)
+    weight, _, _, change = corrected.linearise(corrected.decays)
     losses = np.array(scaled_losses(jnp.asarray(corrected.vector), terms), float)
-    base, whole = jnp.log(losses.T), block_diag(*weight)
-    seen = whole @ np.asarray(measured.parts).ravel()
+    base, whitening = jnp.log(losses.T), block_diag(*weight)
+    target = whitening @ np.asarray(measured.parts).ravel()
 
-    def fitted(wrong: Discrepancy) -> tuple[Fit, np.ndarray]:
-        whiten = np.linalg.inv(wrong.root)
-        data = (jnp.asarray(inputs), base, measured.current, jnp.asarray(whiten @ whole))
+    def fit_with(discrepancy: Discrepancy) -> tuple[Fit, np.ndarray]:
+        whiten = np.linalg.inv(discrepancy.root)
+        data = (jnp.asarray(inputs), base, measured.current, jnp.asarray(whiten @ whitening))
         problem = Problem(
             model={"map": net},
             free=free,
-            records=[Record("decays", _predict, data, jnp.asarray(whiten @ seen), error=1.0)],
+            records=[Record("decays", _predict, data, jnp.asarray(whiten @ target), error=1.0)],
             priors=[Prior("map", 0.0, 1.0)],
         )
         fit = solve(problem, starts=starts, seed=seed, iterations=300)
-        return fit, seen - np.asarray(_predict(fit.model, (*data[:3], jnp.asarray(whole))))
+        return fit, target - np.asarray(_predict(fit.model, (*data[:3], jnp.asarray(whitening))))
 
-    middle = SIZES[len(SIZES) // 2]
-    trial = Discrepancy((middle, middle), inputs, LENGTH * half, block_diag(*change))
-    wrong = sized(trial, *fitted(trial))
-    fit, left = fitted(wrong)
-    held = certificate_of(fit.problem, fit.model["map"])
+    middle = MODEL_ERRORS[len(MODEL_ERRORS) // 2]
+    trial = Discrepancy((middle, middle), inputs, CORRELATION_LENGTH * half, block_diag(*change))
+    discrepancy = estimate_model_error(trial, *fit_with(trial))
+    fit, residuals = fit_with(discrepancy)
+    certificate = certificate_of(fit.problem, fit.model["map"])
     single = _single_maximum(fit, corrected, low, high, float(measured.current.max()))
-    return NetworkFit(fit, held, single, corrected, wrong, left)
+    return NetworkFit(fit, certificate, single, corrected, discrepancy, residuals)
 
 
 def _single_maximum(
     fit: Fit, corrected: ScaleFit, low: np.ndarray, high: np.ndarray, current: float
 ) -> bool:
-    """Look along the voltage at every corner of the other settings."""
+    """Search for maxima along the voltage at every corner of the other settings."""
     corners = itertools.product(*zip(low[1:], high[1:], strict=True))
-    voltages, scales = np.linspace(low[0], high[0], VOLTAGES), corrected.vector
+    voltages, scales = np.linspace(low[0], high[0], N_VOLTAGES), corrected.vector
     true = 1e6 * voltages * (1.0 if corrected.voltages is None else scales[len(SCALES)])
     for scraper, pressure, bunches in corners:
         operation = corrected.machine.operation._replace(
@@ -379,12 +388,12 @@ def _single_maximum(
             pressure_slope=0.0,
             bunches=np.exp(bunches),
         )
-        terms = terms_along(corrected.machine.ring, operation, current, true)
+        terms = terms_at_voltages(corrected.machine.ring, operation, current, true)
         base = jnp.log(jnp.stack(scaled_losses(scales, terms), axis=1))
-        rest = np.tile([scraper, pressure, bunches], (VOLTAGES, 1))
-        inputs = jnp.asarray(np.column_stack([voltages, rest]))
+        others = np.tile([scraper, pressure, bunches], (N_VOLTAGES, 1))
+        inputs = jnp.asarray(np.column_stack([voltages, others]))
         a, b = np.exp(np.asarray(_logs(fit.model, (inputs, base)))).T
-        turns = np.diff(np.sign(np.diff(a * current + b)))
-        if np.count_nonzero(turns) > 1 or turns.min(initial=0) < 0:
+        extrema = np.diff(np.sign(np.diff(a * current + b)))
+        if np.count_nonzero(extrema) > 1 or extrema.min(initial=0) < 0:
             return False
     return True

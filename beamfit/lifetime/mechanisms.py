@@ -1,4 +1,4 @@
-"""The loss mechanisms of a ring: Touschek, the gas, and the a and b of the decay they make."""
+"""Loss mechanisms of a ring, Touschek scattering and gas, and the coefficients a and b."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from beamfit.lifetime.ring import (
     Operation,
     Optics,
     Ring,
+    acceptance_by_sign,
     population,
     quantum_loss,
+    required_voltage,
     stored_bunch,
-    unstored,
-    up_and_down,
     vertical_acceptance,
 )
 
@@ -44,27 +44,26 @@ def _spectrum(log_kappa: Array, floor: Array) -> Array:
     ) * jnp.sqrt(1 + t)
 
 
-def _both(ring: Ring, optics: Optics) -> tuple[Array, ...]:
-    """Emittance, beta, alpha, dispersion and its slope at one point, (x, y) each."""
+def _plane_optics(ring: Ring, optics: Optics) -> tuple[Array, ...]:
+    """Emittance, beta, alpha, dispersion and its slope at one point, each an array (x, y)."""
     emittance = jnp.stack([ring.emittance_x, ring.emittance_y])
     return emittance, *jnp.reshape(jnp.stack(optics[1:]), (4, 2))
 
 
 def _width_coefficients(ring: Ring, optics: Optics) -> tuple[Array, Array]:
     """B1 and B1² - B2² of Piwinski's equations 33 and 34, at one point of the ring."""
-    emittance, beta, alpha, dispersion, slope = _both(ring, optics)
+    emittance, beta, alpha, dispersion, slope = _plane_optics(ring, optics)
     tilt, size2 = alpha * dispersion + beta * slope, emittance * beta
     spread2 = 1 / (ring.energy_spread**-2 + jnp.sum((dispersion**2 + tilt**2) / size2))
     x, y = beta / emittance * (1 - tilt**2 * spread2 / size2)
     coupled = spread2 * tilt[0] * tilt[1] / (emittance[0] * emittance[1])
     scale = ring.relativistic_gamma**2 - 1
-    # B1² - B2² from the product: the difference of two near-equal squares loses all digits
-    # in a flat beam.
+    # B1² - B2² as a product: in a flat beam the difference of the squares loses all digits.
     return (x + y) / (2 * scale), (x * y - coupled**2) / scale**2
 
 
 def piwinski_shape(floor: Array, b1: Array, gap: Array, nodes: int = 64) -> Array:
-    """Piwinski's F(tau_m, B1, B2): the momentum-transfer integral at one point of the ring.
+    """Piwinski's F(tau_m, B1, B2), the momentum-transfer integral at one point of the ring.
 
     Parameters
     ----------
@@ -75,7 +74,8 @@ def piwinski_shape(floor: Array, b1: Array, gap: Array, nodes: int = 64) -> Arra
     gap : float
         B1² - B2², positive.
     nodes : int, optional
-        Gauss-Legendre nodes in ln kappa: 32 give 1e-5, 64 give 2e-9.
+        Number of Gauss-Legendre nodes in ln kappa; the relative error is 1e-5 with 32 and 2e-9
+        with 64.
 
     Returns
     -------
@@ -84,7 +84,7 @@ def piwinski_shape(floor: Array, b1: Array, gap: Array, nodes: int = 64) -> Arra
 
     Notes
     -----
-    A. Piwinski, DESY 98-179 (1998), equation 42, without the factor ln 2 that some codes put in.
+    A. Piwinski, DESY 98-179 (1998), equation 42, without the factor ln 2 that some codes have.
 
     Examples
     --------
@@ -95,20 +95,20 @@ def piwinski_shape(floor: Array, b1: Array, gap: Array, nodes: int = 64) -> Arra
     lower, upper = jnp.log(jnp.arctan(jnp.sqrt(floor))), jnp.log(jnp.pi / 2)
     log_kappa = lower + (upper - lower) * (roots + 1) / 2
     t = jnp.tan(jnp.exp(log_kappa)) ** 2
-    # B2 = 0 in a round beam, where the square root has no derivative but the integral,
-    # even in B2, has a zero one.
+    # In a round beam B2 = 0: the square root has no derivative there, but the integral, even in
+    # B2, has derivative zero.
     squared = jnp.maximum(b1**2 - gap, (1e-8 * b1) ** 2)
     b2 = jnp.sqrt(squared)
     decay = jnp.exp(-gap / (b1 + b2) * t) * i0e(b2 * t)
     integrand = _spectrum(log_kappa, floor) * decay * jnp.exp(log_kappa)
     integral = (upper - lower) / 2 * jnp.sum(weights * integrand)
-    # Far beyond the bunch's momenta the integrals of both signs cancel to rounding.
+    # For acceptances far beyond the momenta of the bunch only rounding errors are left.
     return 2 * jnp.sqrt(jnp.pi * gap) * jnp.maximum(integral, 0.0)
 
 
-def _volume(ring: Ring, optics: Optics) -> Array:
-    """sqrt(sigma_x² sigma_y² - sigma_delta⁴ D_x² D_y²): the bunch's transverse area, m²."""
-    emittance, beta, _, dispersion, _ = _both(ring, optics)
+def _transverse_area(ring: Ring, optics: Optics) -> Array:
+    """Transverse area of the bunch sqrt(sigma_x² sigma_y² - sigma_delta⁴ D_x² D_y²), m²."""
+    emittance, beta, _, dispersion, _ = _plane_optics(ring, optics)
     spread = ring.energy_spread * dispersion
     x, y = emittance * beta + spread**2
     return jnp.sqrt(x * y - (spread[0] * spread[1]) ** 2)
@@ -123,22 +123,22 @@ def piwinski_rate(
     Parameters
     ----------
     ring : Ring
-        The ring; its `momentum_acceptance` is not used here.
+        The ring; its `momentum_acceptance` is not used.
     population : float
         Electrons in the bunch.
     length : float
         Rms bunch length, m.
     acceptance : float or array, shape (n,) or (2, n)
-        Momentum acceptance, at each point of the ring's optics if it is an array; up and down if
-        it is two.
+        Relative momentum acceptance, at each point of the optics if it is an array, and for
+        positive and negative deviations if it has two rows.
     nodes : int, optional
-        Quadrature nodes.
+        Number of quadrature nodes.
 
     Returns
     -------
     float
-        1/tau_T at this population: the relative loss rate, half of which is due to each of the
-        two electrons that scatter, one up and one down: the mean of both sides where they differ.
+        1/tau_T, the relative loss rate at this population. One of two scattered electrons gains
+        momentum and one loses it, so the rate is the mean over both signs of the deviation.
 
     Notes
     -----
@@ -164,7 +164,7 @@ def piwinski_rate(
     def local(optics: Optics, acceptance: Array) -> Array:
         b1, gap = _width_coefficients(ring, optics)
         floor = (1 - lorentz**-2) * acceptance**2
-        return piwinski_shape(floor, b1, gap, nodes) / _volume(ring, optics)
+        return piwinski_shape(floor, b1, gap, nodes) / _transverse_area(ring, optics)
 
     density = jax.vmap(local)(ring.optics, acceptance)
     scale = ELECTRON_RADIUS**2 * constants.c * population / (8 * jnp.pi * lorentz**2 * length)
@@ -174,7 +174,7 @@ def piwinski_rate(
 def touschek_loss(ring: Ring, operation: Operation, current: Array) -> Array:
     """Touschek part of a, 1/(mA s)."""
     bunch = stored_bunch(ring, operation, current)
-    # The rate is proportional to the population, so one milliampere in the ring gives a itself.
+    # The rate goes with the population: at one milliampere in the ring it equals a.
     single = population(ring, 1 / operation.bunches)
     return piwinski_rate(ring, single, bunch.length, bunch.acceptance)
 
@@ -187,12 +187,13 @@ def touschek_shape(ring: Ring, operation: Operation) -> Callable[[Array], Array]
     ring : Ring
         The ring, with its impedance.
     operation : Operation
-        RF voltage, bunches, and what else is known of their length.
+        RF voltage, bunches, and what determines their length.
 
     Returns
     -------
     callable
-        Current in mA to a_T relative to that at zero current; for `fit_decay`'s `shape`.
+        Function of the current, mA: a_T relative to that at zero current. For the `shape` of
+        `fit_decay`.
 
     Examples
     --------
@@ -218,7 +219,7 @@ def elastic_cross_section(
     beta_x: Array = 0.0,
     acceptance_x: Array = jnp.inf,
 ) -> Array:
-    """Cross section for an elastic deflection out of the transverse acceptance, m² an atom.
+    """Cross section for an elastic deflection out of the transverse acceptance, m² per atom.
 
     Parameters
     ----------
@@ -227,23 +228,22 @@ def elastic_cross_section(
     lorentz : float
         Energy over rest energy.
     beta_y, acceptance_y : float or array
-        Twiss beta where the atom is, m, and acceptance, m rad, of the vertical plane.
+        Vertical Twiss beta at the atom, m, and acceptance, m rad.
     beta_x, acceptance_x : float or array, optional
-        Those of the horizontal plane; it has no limit by default.
+        Horizontal beta and acceptance; default: no limit.
 
     Returns
     -------
     float or array
         4 r_e² Z²/gamma² (x phi + y (pi/2 - phi) + sqrt(x y)) with x = beta_x/A_x, y = beta_y/A_y
-        and tan² phi = x/y. Of one plane alone: 2 pi r_e² Z²/gamma² beta/A.
+        and tan² phi = x/y. For a single plane this is 2 pi r_e² Z²/gamma² beta/A.
 
     Notes
     -----
     Rutherford scattering at small angles: A. Wrulich, CERN 94-01 (1994), p. 409, for one plane.
-    An electron is lost if it leaves either acceptance: the larger of x cos² and y sin² of the
-    azimuth, integrated over it. The sum of both planes counts twice what leaves both: 22 %
-    too much for equal planes, less for others. Screening by the electrons is negligible at these
-    angles.
+    An electron is lost if it leaves either acceptance: the larger of x cos² and y sin² is
+    integrated over the azimuth. The sum of both planes would count deflections that exceed both
+    twice, 22 % too much for equal planes. Screening by the electrons is negligible at these angles.
 
     Examples
     --------
@@ -251,19 +251,19 @@ def elastic_cross_section(
     6.9233e-28
     """
     x, y = beta_x / acceptance_x, beta_y / acceptance_y
-    turn = jnp.arctan2(_root(x), _root(y))
-    azimuths = x * turn + y * (jnp.pi / 2 - turn) + _root(x) * _root(y)
+    turn = jnp.arctan2(_square_root(x), _square_root(y))
+    azimuths = x * turn + y * (jnp.pi / 2 - turn) + _square_root(x) * _square_root(y)
     return 4 * (ELECTRON_RADIUS * charge / lorentz) ** 2 * azimuths
 
 
-def _root(ratio: Array) -> Array:
+def _square_root(ratio: Array) -> Array:
     """Square root with a zero derivative at zero, where a plane has no limit."""
     limited = jnp.asarray(ratio) > 0
     return jnp.where(limited, jnp.sqrt(jnp.where(limited, ratio, 1.0)), 0.0)
 
 
 def bremsstrahlung_cross_section(charge: Array, acceptance: Array) -> Array:
-    """Cross section for losing more than the momentum acceptance to a photon, m² an atom.
+    """Cross section for losing more than the momentum acceptance to a photon, m² per atom.
 
     Parameters
     ----------
@@ -309,22 +309,21 @@ def bremsstrahlung_cross_section(charge: Array, acceptance: Array) -> Array:
 
 
 def gas_rate_coefficient(cross_section: Array, gas: Gas, temperature: Array) -> Array:
-    """Loss rate for each pascal of residual gas, 1/(s Pa).
+    """Loss rate per pressure of residual gas, 1/(s Pa).
 
     Parameters
     ----------
     cross_section : array, shape (k,)
-        Cross section of each element, m² an atom.
+        Cross section of each element, m² per atom.
     gas : Gas
-        Elements and their atoms for each molecule.
+        Elements, with their atoms per molecule.
     temperature : float
         Gas temperature, K.
 
     Returns
     -------
     float
-        c sum(atoms sigma)/(k_B T): with P = P0 + P1 I the loss rate is b = P0 and a = P1 times
-        this number.
+        K = c sum(atoms sigma)/(k_B T): with P = P0 + P1 I it gives b = K P0 and a = K P1.
 
     Examples
     --------
@@ -338,7 +337,7 @@ def gas_rate_coefficient(cross_section: Array, gas: Gas, temperature: Array) -> 
 
 
 def elastic_loss(ring: Ring, operation: Operation, current: Array) -> Array:
-    """Loss rate by elastic scattering for each pascal, 1/(s Pa)."""
+    """Loss rate of elastic scattering per pressure, averaged over the ring, 1/(s Pa)."""
     aperture = vertical_acceptance(ring.acceptance_y, operation.scraper_y, ring.scraper_beta_y)
     optics, charge = ring.optics, operation.gas.charge[:, None]
     both = (optics.beta_y, aperture, optics.beta_x, ring.acceptance_x)
@@ -347,9 +346,9 @@ def elastic_loss(ring: Ring, operation: Operation, current: Array) -> Array:
 
 
 def bremsstrahlung_loss(ring: Ring, operation: Operation, current: Array) -> Array:
-    """Loss rate by bremsstrahlung for each pascal, averaged over the ring, 1/(s Pa)."""
-    # A photon takes energy: the acceptance downward counts.
-    _, points = up_and_down(ring, stored_bunch(ring, operation, current).acceptance)
+    """Loss rate of bremsstrahlung per pressure, averaged over the ring, 1/(s Pa)."""
+    # A photon takes energy: the acceptance for negative deviations counts.
+    _, points = acceptance_by_sign(ring, stored_bunch(ring, operation, current).acceptance)
     charge = operation.gas.charge
     sections = jax.vmap(lambda point: bremsstrahlung_cross_section(charge, point))(points)
     section = ring.optics.weight @ sections
@@ -357,20 +356,20 @@ def bremsstrahlung_loss(ring: Ring, operation: Operation, current: Array) -> Arr
 
 
 class Mechanism(NamedTuple):
-    """A mechanism of beam loss.
+    """Mechanism of beam loss.
 
     Attributes
     ----------
     name, label : str
-        For results, and for people.
+        Name in results, and label in tables.
     term : callable
-        ``term(ring, operation, current)``: the part of a, 1/(mA s), of what is quadratic in the
-        current alone; the part of b, 1/s, of what is linear alone; the rate for each pascal,
-        1/(s Pa), of what goes with the pressure P0 + P1 I and is therefore both.
+        ``term(ring, operation, current)``. For a loss that goes with I² only it is the part of a,
+        1/(mA s); for one that goes with I only the part of b, 1/s. A gas loss goes with the
+        pressure P0 + P1 I and has both parts: its term is the rate per pressure, 1/(s Pa).
     quadratic, linear : bool
         Whether the loss -dI/dt has a part that goes with I², and one that goes with I.
     vary : str
-        What to vary to tell it from others, where its size is fitted; empty where it is not.
+        Setting to vary to separate it from the others if its size is fitted; else empty.
     """
 
     name: str
@@ -381,6 +380,7 @@ class Mechanism(NamedTuple):
     vary: str
 
 
+# Advice on what to vary.
 BUNCH, SCRAPER = "the RF voltage or the number of bunches", "the scraper at constant pressure"
 MECHANISMS = (
     Mechanism("touschek", "Touschek", touschek_loss, True, False, BUNCH),
@@ -390,7 +390,8 @@ MECHANISMS = (
 )
 QUADRATIC = tuple(m for m in MECHANISMS if m.quadratic)
 LINEAR = tuple(m for m in MECHANISMS if m.linear)
-# Every mechanism whose size is fitted, and P1/P0: what each is called, and what to vary for it.
+# Names of the fitted scales, one for each mechanism that can be varied and one for P1/P0, with what
+# to vary to determine each.
 SCALES = {m.name: m.vary for m in MECHANISMS if m.vary} | {
     "desorption": "the current at constant settings"
 }
@@ -400,12 +401,12 @@ SCALES = {m.name: m.vary for m in MECHANISMS if m.vary} | {
 class Losses(
     namedtuple("_Parts", [f"a_{m.name}" for m in QUADRATIC] + [f"b_{m.name}" for m in LINEAR])
 ):
-    """Loss coefficients of dI/dt = -a I² - b I, mechanism by mechanism.
+    """Loss coefficients of dI/dt = -a I² - b I by mechanism.
 
     Attributes
     ----------
     a_touschek, a_bremsstrahlung, a_elastic : float
-        Parts of a, 1/(mA s); the gas parts come from the pressure that the beam itself desorbs.
+        Parts of a, 1/(mA s); the gas parts come from the pressure rise by beam-induced desorption.
     b_bremsstrahlung, b_elastic, b_quantum : float
         Parts of b, 1/s.
     """
@@ -414,12 +415,12 @@ class Losses(
 
     @property
     def a(self) -> Array:
-        """All that grows with the square of the current, 1/(mA s)."""
+        """Sum of the parts of a, 1/(mA s)."""
         return sum(self[: len(QUADRATIC)])
 
     @property
     def b(self) -> Array:
-        """All that is proportional to the current, 1/s."""
+        """Sum of the parts of b, 1/s."""
         return sum(self[len(QUADRATIC) :])
 
     @property
@@ -437,22 +438,22 @@ class Losses(
 
 
 @jax.jit
-def _terms(ring: Ring, operation: Operation, current: Array) -> tuple[Array, ...]:
+def _compute_terms(ring: Ring, operation: Operation, current: Array) -> tuple[Array, ...]:
     return tuple(m.term(ring, operation, current) for m in MECHANISMS)
 
 
-def terms_of(ring: Ring, operation: Operation, current: float | Array) -> tuple[Array, ...]:
-    """The term of each mechanism; `InputError` where the RF voltage is known to store no beam."""
-    given = operation.rf_voltage, ring.energy_loss, ring.energy
-    known = not any(isinstance(value, jax.core.Tracer) for value in given)
-    if known and (expected := unstored(operation, *given[1:])) is not None:
-        found = f"RF voltage {float(np.min(given[0])) / 1e3:.6g} kV"
+def mechanism_terms(ring: Ring, operation: Operation, current: float | Array) -> tuple[Array, ...]:
+    """Term of each mechanism; `InputError` if the RF voltage stores no beam."""
+    rf = operation.rf_voltage, ring.energy_loss, ring.energy
+    concrete = not any(isinstance(value, jax.core.Tracer) for value in rf)
+    if concrete and (expected := required_voltage(operation, *rf[1:])) is not None:
+        found = f"RF voltage {float(np.min(rf[0])) / 1e3:.6g} kV"
         raise InputError(found, expected, column="rf_voltage_kV")
-    return _terms(ring, operation, jnp.asarray(current, float))
+    return _compute_terms(ring, operation, jnp.asarray(current, float))
 
 
-def added(parts: tuple[Array, ...], base: Array, slope: Array) -> Losses:
-    """Coefficients at a base pressure, Pa, and its rise with current, Pa/mA."""
+def losses_from_terms(parts: tuple[Array, ...], base: Array, slope: Array) -> Losses:
+    """Loss coefficients from terms, base pressure, Pa, and its rise with current, Pa/mA."""
     terms = list(zip(MECHANISMS, parts, strict=True))
     return Losses(
         *(term * slope if m.linear else term for m, term in terms if m.quadratic),
@@ -470,8 +471,7 @@ def loss_coefficients(ring: Ring, operation: Operation, current: float | Array) 
     operation : Operation
         Settings and vacuum.
     current : float
-        Beam current, mA. It matters only through bunch lengthening: without it the coefficients
-        do not depend on it.
+        Beam current, mA. The coefficients depend on it only through bunch lengthening.
 
     Returns
     -------
@@ -496,8 +496,8 @@ def loss_coefficients(ring: Ring, operation: Operation, current: float | Array) 
     >>> print(f"Touschek alone: {1 / (losses.a_touschek * 500 * 3600):.1f} h")
     Touschek alone: 30.4 h
     """
-    parts = terms_of(ring, operation, current)
-    return added(parts, operation.pressure_base, operation.pressure_slope)
+    parts = mechanism_terms(ring, operation, current)
+    return losses_from_terms(parts, operation.pressure_base, operation.pressure_slope)
 
 
 class LossTerms(NamedTuple):
@@ -506,14 +506,14 @@ class LossTerms(NamedTuple):
     Attributes
     ----------
     parts : tuple of float
-        The term of each of `MECHANISMS`.
+        Term of each of `MECHANISMS`.
     base, slope : float
         Pressure without beam, Pa, and its rise with current, Pa/mA.
     current : float
         Mean current, mA.
     voltages : array, shape (k,), or None
-        True over stated RF voltage where the parts, then of shape (k,), were computed: evenly
-        spaced. None where the voltage is taken as stated.
+        Ratios of true to stated RF voltage, equidistant, at which the parts were computed; these
+        then have shape (k,). None if the voltage is taken as stated.
     """
 
     parts: tuple[Array, ...]
@@ -523,7 +523,7 @@ class LossTerms(NamedTuple):
     voltages: Array | None = None
 
     def at_voltage(self, scale: Array) -> tuple[Array, ...]:
-        """The parts at a true over stated RF voltage, linear in between."""
+        """Parts at a ratio of true to stated RF voltage, by linear interpolation."""
         spacing = self.voltages[..., 1:2] - self.voltages[..., :1]
         share = jnp.maximum(1 - jnp.abs(scale - self.voltages) / spacing, 0.0)
         return tuple(jnp.sum(part * share, axis=-1) for part in self.parts)
@@ -532,7 +532,7 @@ class LossTerms(NamedTuple):
 def loss_terms(
     ring: Ring, operation: Operation, current: Array, voltages: Array | None = None
 ) -> LossTerms:
-    """Compute the terms of one setting.
+    """Compute the loss terms of one setting.
 
     Parameters
     ----------
@@ -543,12 +543,12 @@ def loss_terms(
     current : float
         Mean current, mA.
     voltages : array, shape (k,), optional
-        As of `LossTerms`, where the RF voltage has a scale of its own.
+        As in `LossTerms`, if the scale of the RF voltage is fitted.
 
     Returns
     -------
     LossTerms
-        Differentiable in every argument.
+        Terms, differentiable in every argument.
 
     Raises
     ------
@@ -564,10 +564,10 @@ def loss_terms(
     2.0e-08 Pa, P1/P0 = 0.008 /mA
     """
     if voltages is None:
-        parts = terms_of(ring, operation, current)
+        parts = mechanism_terms(ring, operation, current)
     else:
         true = operation.rf_voltage * jnp.asarray(voltages, float)
-        parts = terms_along(ring, operation, current, true).parts
+        parts = terms_at_voltages(ring, operation, current, true).parts
     return LossTerms(
         parts,
         base=jnp.asarray(operation.pressure_base, float),
@@ -578,8 +578,10 @@ def loss_terms(
 
 
 @jax.jit
-def terms_along(ring: Ring, operation: Operation, current: Array, voltages: Array) -> LossTerms:
-    """Terms at some RF voltages, V: each has an axis of them."""
+def terms_at_voltages(
+    ring: Ring, operation: Operation, current: Array, voltages: Array
+) -> LossTerms:
+    """Compute the terms at several RF voltages, V; each part has shape (k,)."""
 
     def one(voltage: Array) -> LossTerms:
         return loss_terms(ring, operation._replace(rf_voltage=voltage), current)
@@ -595,9 +597,9 @@ def scaled_losses(
     Parameters
     ----------
     scales : array, shape (4,) or (5,)
-        A factor for each of `SCALES`: on Touschek, bremsstrahlung, elastic scattering, and on
-        P1/P0 (desorption); 1 is the ring file. What is not fitted keeps its size. A fifth is the
-        true over the stated RF voltage, for terms with `voltages`.
+        Factor for each of `SCALES`: Touschek, bremsstrahlung, elastic scattering, and P1/P0
+        (desorption); 1 is the ring file. Other mechanisms are not scaled. For terms with
+        `voltages` a fifth is the ratio of true to stated RF voltage.
     terms : LossTerms
         First principles at one setting.
     pressure_factor : float, optional
@@ -628,14 +630,13 @@ def scaled_losses(
 
 
 def scaled_parts(scales: Array, terms: LossTerms, pressure_factor: Array = 1.0) -> Losses:
-    """The parts that `scaled_losses` adds up."""
-    *sizes, desorption = jnp.asarray(scales, float)[: len(SCALES)]
+    """Loss coefficients by mechanism, scaled as in `scaled_losses`."""
+    *factors, desorption = jnp.asarray(scales, float)[: len(SCALES)]
     parts = terms.parts if terms.voltages is None else terms.at_voltage(scales[len(SCALES)])
-    factors = iter(sizes)
-    parts = tuple(
-        term * next(factors) if m.vary else term for m, term in zip(MECHANISMS, parts, strict=True)
-    )
+    remaining = iter(factors)
+    pairs = zip(MECHANISMS, parts, strict=True)
+    parts = tuple(term * next(remaining) if m.vary else term for m, term in pairs)
     base, slope = terms.base, desorption * terms.slope
-    made, read = (base + rise * terms.current for rise in (slope, terms.slope))
-    factor = pressure_factor * read / jnp.where(made > 0, made, 1.0)
-    return added(parts, factor * base, factor * slope)
+    scaled_pressure, pressure = (base + rise * terms.current for rise in (slope, terms.slope))
+    factor = pressure_factor * pressure / jnp.where(scaled_pressure > 0, scaled_pressure, 1.0)
+    return losses_from_terms(parts, factor * base, factor * slope)

@@ -1,4 +1,4 @@
-"""Clean decays of a record: cut at refills, losses and gaps, without dropouts and spikes."""
+"""Cut a record into clean decays at refills, losses and gaps, without dropouts and spikes."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from scipy.special import logsumexp
 from beamfit.answer import shown
 from beamfit.errors import expect
 from beamfit.lifetime.readings import (
-    FEWEST,
     GAP,
+    MIN_READINGS,
     NEIGHBOURS,
     THRESHOLD,
     WINDOW,
-    by_stretches,
+    by_chunks,
     noise_of,
 )
 from beamfit.lifetime.record import DecayRecord
@@ -27,51 +27,59 @@ from beamfit.statistics import POOR_FIT
 
 # Readings below this share of the largest one near them are dropouts of the monitor.
 DROPOUT = 0.02
-# A record shows the beam in a hundredth of its readings at least.
-SEEN = 0.99
-# Error of the median of `WINDOW` over the noise of what it is of.
-OF_MEDIAN = 0.42
-# Share of changes that equal the usual one near them to the numbers' own accuracy, beyond which
-# digits are larger than the noise; the usual one is one of nine, and the median of these.
-REPEATS, EXACT, TINY = 1 / 3, 1e-11, 1e-300
-# Readings of a spike at most.
-LONE = 3
-# Readings whose means are looked at for a ramp at the head, the share of its rise by which a fall
-# ends it, and by how much it exceeds any later rise.
-SMOOTH, FALL, RISE = 5, 0.1, 3.0
-# Readings that are looked through for one at first.
-BLOCK = 4096
-# Means of neighbours in which steps of many readings are sought, at least; at the end of a record,
-# where what comes after is not known, they change so many times as much as usual.
-COARSE, FASTER = 24, 4.0
-# Standard deviations by which two levels must differ to be two: a false step costs no more than an
-# own current for the rest.
-LIKELY = 5.0
-# Places that tell the scatter, at least.
-PLACES = 20
-# Least step in units of the last digit of the readings.
-DIGITS = 1.5
-# Readings that have one law, and how many beside them are looked at; readings beyond which the
-# scatter of their mean is followed no farther.
-ONE_LAW, BESIDE, LONG = 1 << 16, 1 << 11, 4096
-# Degree of the smooth curve by which a piece may depart from a law: an exponent of a, gas that
-# changes.
-CURVED = 6
-# Levels whose steps are weighed together, groups of them at most, means of readings by which, and
-# correlation times of the noise that are looked at.
-LEVELS, GROUPS, ROWS, NOISES = 20, 8, 512, 7
-# A step is placed to the reading within so many of where it was seen, by so many on either side.
-NEAR, WIDEST = 8, 64
-# How often steps are sought with the law that those found leave.
-ROUNDS = 20
-# Share of the usual length below which a piece is the head of a cycle, as of fresh beam.
+# Quantile of the positive readings that is taken for the beam current: at least a hundredth of the
+# readings must show the beam.
+BEAM_QUANTILE = 0.99
+# Standard error of the median of `WINDOW` values, over their standard deviation.
+MEDIAN_ERROR = 0.42
+# Share of changes that equal the local median change exactly above which digits are coarser than
+# the noise. One of the nine values of the median always equals it.
+MAX_EQUAL_SHARE = 1 / 3
+# Relative rounding error of readings; a number against division by zero.
+EXACT, TINY = 1e-11, 1e-300
+# Largest number of readings in a spike.
+MAX_SPIKE = 3
+# A ramp at the head of a piece: length of the moving average, share of the rise by which a fall
+# ends it, and factor by which it exceeds any later rise.
+RAMP_WINDOW, RAMP_FALL, RAMP_RISE = 5, 0.1, 3.0
+# Readings of the first block in a search for the return of the beam; each further block doubles.
+FIRST_BLOCK = 4096
+# Slow steps are sought in means of neighbours as long as there are at least this many means.
+MIN_MEANS = 24
+# At the end of a record, where the readings after it are unknown, a slow step must exceed the
+# median change of the means by this factor.
+END_FACTOR = 4.0
+# Standard deviations by which two levels must differ. Lower than `THRESHOLD`: a false step only
+# costs one more starting current.
+LEVEL_THRESHOLD = 5.0
+# Smallest number of changes that determines their scatter.
+MIN_CHANGES = 20
+# Smallest step, in units of the last digit.
+MIN_STEP_DIGITS = 1.5
+# Readings over which one law is assumed, and overlap of such chunks.
+LAW_CHUNK, LAW_OVERLAP = 1 << 16, 1 << 11
+# Longest mean for which the variance is computed; longer ones keep that of this length.
+MAX_MEAN_LENGTH = 4096
+# Degree of the smooth curve that stands for departures of a piece from the law: an exponent of a,
+# gas that changes.
+CURVE_DEGREE = 6
+# Odds of steps are computed for groups of levels: levels in a group, largest numbers of groups and
+# of means of readings in each, and number of correlation times of the noise.
+GROUP_LEVELS, MAX_GROUPS, MAX_MEANS, CORRELATION_TIMES = 20, 8, 512, 7
+# The position of a step is refined within this many readings of the first guess, by means over at
+# most this many readings on either side.
+POSITION_RANGE, POSITION_WINDOW = 8, 64
+# Largest number of iterations between the steps and the law that they leave.
+MAX_ITERATIONS = 20
+# Pieces shorter than this share of the usual length are omitted, as the head of a cycle.
 SHORT = 0.25
-# Refills by the clock are so far apart to this share of it.
-REGULAR = 0.1
-# Share of what cycles lose that refills give back at least, and of steps that are to be refills.
-RETURNED = 0.5
-# Cycles that tell a law together, and readings of each.
-FEWEST_CYCLES, FEWEST_READINGS = 3, 3
+# Cycles are regular if their lengths agree to this share.
+PERIOD_TOLERANCE = 0.1
+# Smallest share of the lost current that refills must give back, and smallest share of the steps
+# that must be refills.
+MIN_RETURNED = 0.5
+# Smallest number of cycles that are fitted together, and of readings in each.
+MIN_CYCLES, MIN_CYCLE_READINGS = 3, 3
 
 
 class Event(NamedTuple):
@@ -81,13 +89,13 @@ class Event(NamedTuple):
     ----------
     kind : str
         `refill`, `loss`, `dropout`, `spike`, `saturated`, `stuck` (a monitor that repeats one
-        reading), `gap`, `ramp` (a refill of many readings,
-        or the end of one at the head of a decay), `short` (a piece too short to keep), `loss rate
-        changes` or `gas is pumped away` (until then).
+        reading), `gap`, `ramp` (a refill of many readings, or the end of one at the head of a
+        decay), `short` (a piece too short to keep), `loss rate changes` or `gas is pumped away`
+        (until then).
     time : float
-        When it begins, s from the record's start.
+        Begin, s from the record's start.
     duration : float
-        How long it lasts, s.
+        Duration, s.
     change : float
         Change of the current, mA.
     """
@@ -104,14 +112,14 @@ class Event(NamedTuple):
 
 @shown
 class Split(NamedTuple):
-    """A record's clean decays, and what lies between them.
+    """Clean decays of a record, and the events between them.
 
     Attributes
     ----------
     segments : tuple of DecayRecord
         Decays without steps; named after the record, with #1, #2, ... if there is more than one.
     events : tuple of Event
-        What was cut away or noted, in order of time.
+        Parts that were cut away or noted, in order of time.
     """
 
     segments: tuple[DecayRecord, ...]
@@ -119,12 +127,14 @@ class Split(NamedTuple):
 
 
 def _dropouts(current: np.ndarray) -> tuple[np.ndarray, int]:
-    """Readings near zero although the beam comes back, and where it is gone for good."""
+    """Flag readings near zero before the beam comes back, and find the reading at which it is lost
+    for good (their number if it is not).
+    """
     flagged = np.zeros(current.size, bool)
-    # Readings before the beam is seen have no reading before them to compare with.
-    beam = np.quantile(current[current > 0], SEEN) if np.any(current > 0) else 0.0
+    # Readings before the first beam have nothing before them to compare with.
+    beam = np.quantile(current[current > 0], BEAM_QUANTILE) if np.any(current > 0) else 0.0
     flagged[: int(np.argmax(current > DROPOUT * beam))] = True
-    # A beam may be dumped over some readings.
+    # A dump may take a few readings.
     before = maximum_filter1d(current, WINDOW, origin=WINDOW // 2)[:-1]
     for start in np.flatnonzero(current[1:] < DROPOUT * before) + 1:
         if flagged[start]:
@@ -137,64 +147,69 @@ def _dropouts(current: np.ndarray) -> tuple[np.ndarray, int]:
 
 
 def _first_above(current: np.ndarray, start: int, least: float) -> int:
-    """The first reading from one on that is as large as this; their number if none is."""
-    width = BLOCK
+    """Index of the first reading from `start` on of at least `least`; their number if none is."""
+    block = FIRST_BLOCK
     while start < current.size:
-        above = np.flatnonzero(current[start : start + width] >= least)
+        above = np.flatnonzero(current[start : start + block] >= least)
         if above.size:
             return int(start + above[0])
-        start, width = start + width, 2 * width
+        start, block = start + block, 2 * block
     return current.size
 
 
 def _saturated(current: np.ndarray) -> np.ndarray:
-    """A run of identical largest readings, far longer than any other run of equal ones."""
+    """Flag a run of identical largest readings far longer than any other run of equal ones."""
     starts = np.flatnonzero(np.diff(current, prepend=np.nan) != 0)
     lengths = np.diff(starts, append=current.size)
-    top = current[starts] == current.max()
-    usual = current.size if top.all() else lengths[~top].max()
-    return np.repeat(top & (lengths >= 5) & (lengths > 5 * usual), lengths)
+    highest = current[starts] == current.max()
+    other = current.size if highest.all() else lengths[~highest].max()
+    return np.repeat(highest & (lengths >= 5) & (lengths > 5 * other), lengths)
 
 
 def _stuck(current: np.ndarray) -> np.ndarray:
-    """Readings that repeat the one before, of runs so long that by the readings on either side
-    (Laplace's rule of succession) they are no chance.
+    """Flag readings that repeat the one before in runs too long for chance.
+
+    The chance of a repeat is that among the neighbouring readings (Laplace's rule of succession).
     """
     repeats = np.append(False, np.diff(current) == 0)
     first, end = np.array(_runs(repeats), int).reshape(-1, 2).T
     before, after = np.maximum(first - NEIGHBOURS, 0), np.minimum(end + NEIGHBOURS, current.size)
     total = np.append(0, np.cumsum(repeats))
-    sides = [(total[b] - total[a] + 1) / (b - a + 2) for a, b in ((before, first), (end, after))]
+    chances = [(total[b] - total[a] + 1) / (b - a + 2) for a, b in ((before, first), (end, after))]
     found = np.zeros(current.size, bool)
-    for k in np.flatnonzero(current.size * np.max(sides, axis=0) ** (end - first) < POOR_FIT):
+    for k in np.flatnonzero(current.size * np.max(chances, axis=0) ** (end - first) < POOR_FIT):
         found[first[k] : end[k]] = True
     return found
 
 
-def _noise_near(off: np.ndarray) -> np.ndarray:
-    """Noise about each of some departures; where it changes the greater one counts."""
-    return maximum_filter1d(1.4826 * median_filter(off, NEIGHBOURS, mode="mirror"), NEIGHBOURS)
+def _local_noise(departures: np.ndarray) -> np.ndarray:
+    """Robust noise near each departure; where it changes the larger value counts."""
+    noise = 1.4826 * median_filter(departures, NEIGHBOURS, mode="mirror")
+    return maximum_filter1d(noise, NEIGHBOURS)
 
 
-def _usual_rate(time: np.ndarray, current: np.ndarray) -> np.ndarray:
-    """Rate of change near each reading, which a step does not move."""
+def _local_rate(time: np.ndarray, current: np.ndarray) -> np.ndarray:
+    """Median rate of change near each reading, which a single step does not move."""
     return median_filter(np.diff(current) / np.diff(time), WINDOW, mode="mirror")
 
 
 def _spikes(time: np.ndarray, current: np.ndarray, noise: float) -> np.ndarray:
-    """Up to three readings off the running median of what is level but for noise and steps; more
-    than a decay whose rate changes there, as at a refill.
+    """Flag up to three readings off the running median of the current, corrected for the local loss
+    rate.
+
+    They must exceed the change that a varying loss rate makes there, as at a refill.
     """
-    lost = _usual_rate(time, current) * np.diff(time)
-    changes = maximum_filter1d(lost, WINDOW) - minimum_filter1d(lost, WINDOW)
-    level = current - np.append(0.0, np.cumsum(lost))
-    # The first reading by those after it; what falls at the end is a loss.
-    beside = np.concatenate([level[LONE:0:-1], level, np.repeat(level[-1:], LONE)])
-    off = np.abs(level - median_filter(beside, 2 * LONE + 1)[LONE:-LONE])
-    off -= LONE * np.append(changes[0], changes)
-    digits = _digits_near(current, np.diff(current) - lost)
+    loss = _local_rate(time, current) * np.diff(time)
+    rate_range = maximum_filter1d(loss, WINDOW) - minimum_filter1d(loss, WINDOW)
+    level = current - np.append(0.0, np.cumsum(loss))
+    # The head is mirrored; the end is repeated, since a fall there is a loss, not a spike.
+    padded = np.concatenate([level[MAX_SPIKE:0:-1], level, np.repeat(level[-1:], MAX_SPIKE)])
+    median = median_filter(padded, 2 * MAX_SPIKE + 1)[MAX_SPIKE:-MAX_SPIKE]
+    departure = np.abs(level - median)
+    departure -= MAX_SPIKE * np.append(rate_range[0], rate_range)
+    digits = _local_digits(current, np.diff(current) - loss)
     noise = np.maximum(noise, np.append(digits[0], digits) / 2)
-    return off > THRESHOLD * np.maximum(noise, _noise_near(off))
+    return departure > THRESHOLD * np.maximum(noise, _local_noise(departure))
 
 
 def _runs(flags: np.ndarray) -> list[tuple[int, int]]:
@@ -204,34 +219,34 @@ def _runs(flags: np.ndarray) -> list[tuple[int, int]]:
 
 
 def event_of(record: DecayRecord, kind: str, first: int, last: int, sudden: bool = False) -> Event:
-    """An event from reading `first` to `last`; the change of a sudden one is that at its begin."""
+    """Make the event from reading `first` to `last`; the change of a sudden one is that at its
+    begin.
+    """
     begin, end = (first - 1, first) if sudden and first else (first, last)
-    lasts, change = (
-        record.time[last] - record.time[first],
-        record.current[end] - record.current[begin],
-    )
-    return Event(kind, float(record.time[first]), float(lasts), float(change))
+    duration = record.time[last] - record.time[first]
+    change = record.current[end] - record.current[begin]
+    return Event(kind, float(record.time[first]), float(duration), float(change))
 
 
 def beam_readings(record: DecayRecord) -> tuple[np.ndarray, list[Event]]:
-    """Indices of the readings that show the beam, and what the others are."""
-    dropped, end_of_beam = _dropouts(record.current)
-    found = {"dropout": dropped, "saturated": _saturated(record.current)}
-    kept = np.flatnonzero(~dropped & ~found["saturated"] & (np.arange(len(record)) < end_of_beam))
-    if kept.size >= FEWEST:
+    """Find the readings that show the beam (indices), and the events that explain the others."""
+    dropouts, end_of_beam = _dropouts(record.current)
+    found = {"dropout": dropouts, "saturated": _saturated(record.current)}
+    kept = np.flatnonzero(~dropouts & ~found["saturated"] & (np.arange(len(record)) < end_of_beam))
+    if kept.size >= MIN_READINGS:
         for kind in ("stuck", "spike"):
             found[kind] = np.zeros(len(record), bool)
         time, current = record.time[kept], record.current[kept]
         digit = record.resolution or 0.0
-        if np.median(np.abs(np.diff(current))) > digit:  # else equal readings are of one digit
+        if np.median(np.abs(np.diff(current))) > digit:  # else equal readings are usual
             repeats = _stuck(current)
             found["stuck"][kept[repeats]] = True
             kept = kept[~repeats]
             time, current = record.time[kept], record.current[kept]
         noise = max(noise_of(time, current), digit / 2)
-        lone = by_stretches(lambda t, i: _spikes(t, i, noise), time, current)
-        found["spike"][kept[lone]] = True
-        kept = kept[~lone]
+        spikes = by_chunks(lambda t, i: _spikes(t, i, noise), time, current)
+        found["spike"][kept[spikes]] = True
+        kept = kept[~spikes]
     events = [
         event_of(record, kind, first, end - 1, sudden=True)
         for kind, flags in found.items()
@@ -242,84 +257,102 @@ def beam_readings(record: DecayRecord) -> tuple[np.ndarray, list[Event]]:
     return kept, events
 
 
-def _digits_near(current: np.ndarray, excess: np.ndarray) -> np.ndarray:
-    """The last digit near each change; 0 where few departures are zero. It is the usual size of
-    those that are not, or of changes if that is less, as of a beam that loses one digit at each
-    reading: only its refills depart. A record may be of several detectors.
+def _local_digits(current: np.ndarray, excess: np.ndarray) -> np.ndarray:
+    """Last digit near each change; 0 where the noise is larger than the digits.
+
+    It is the median nonzero departure or, if that is smaller, the median nonzero change: in a beam
+    that loses one digit at each reading only refills depart. A record may come from several
+    detectors.
     """
-    least = EXACT * np.max(current)
-    still = uniform_filter1d((np.abs(excess) <= least).astype(float), NEIGHBOURS) > REPEATS
-    if not still.any():
+    rounding = EXACT * np.max(current)
+    equal = (np.abs(excess) <= rounding).astype(float)
+    quantised = uniform_filter1d(equal, NEIGHBOURS) > MAX_EQUAL_SHARE
+    if not quantised.any():
         return np.zeros(excess.size)
 
-    def usual(size: np.ndarray) -> np.ndarray:
-        place = np.flatnonzero(size > least)
-        if not place.size:
+    def running_median(size: np.ndarray) -> np.ndarray:
+        nonzero = np.flatnonzero(size > rounding)
+        if not nonzero.size:
             return np.zeros(size.size)
-        near = median_filter(size[place], NEIGHBOURS, mode="mirror")
-        return near[np.minimum(np.searchsorted(place, np.arange(size.size)), place.size - 1)]
+        near = median_filter(size[nonzero], NEIGHBOURS, mode="mirror")
+        return near[np.minimum(np.searchsorted(nonzero, np.arange(size.size)), nonzero.size - 1)]
 
-    near = np.minimum(usual(np.abs(excess)), usual(np.abs(np.diff(current))))
-    return maximum_filter1d(np.where(still, near, 0.0), NEIGHBOURS)
+    near = np.minimum(running_median(np.abs(excess)), running_median(np.abs(np.diff(current))))
+    return maximum_filter1d(np.where(quantised, near, 0.0), NEIGHBOURS)
 
 
-def _departures(time: np.ndarray, current: np.ndarray) -> np.ndarray:
-    """Change from each reading to the next less what the decay around it explains; by how many
-    standard deviations of such changes near it that exceeds half of what is lost; and the digit
-    near it, shape (n - 1, 3).
+def _step_scores(time: np.ndarray, current: np.ndarray) -> np.ndarray:
+    """Steps between neighbouring readings, shape (n - 1, 3).
+
+    Columns are the change less that of the decay around it, its size beyond half of the usual loss
+    in local standard deviations, and the last digit near it.
     """
 
-    def near(time: np.ndarray, current: np.ndarray) -> np.ndarray:
-        interval, change, usual = np.diff(time), np.diff(current), _usual_rate(time, current)
-        error = OF_MEDIAN * interval * _noise_near(np.abs(change / interval - usual))
-        lost = usual * interval
-        excess = change - lost
-        least = max(_scatter(excess), EXACT * np.max(current))
-        scatter = np.maximum(least, _noise_near(np.abs(excess)))
-        score = (np.abs(excess) - 0.5 * np.abs(lost)) / (np.hypot(scatter, error) + TINY)
-        found = np.column_stack([excess, score, _digits_near(current, excess)])
-        return np.vstack([np.zeros(3), found]).astype(np.float32)  # of 1e7 readings 120 MB
+    def scores_of_chunk(time: np.ndarray, current: np.ndarray) -> np.ndarray:
+        interval, change, local_rate = np.diff(time), np.diff(current), _local_rate(time, current)
+        error = MEDIAN_ERROR * interval * _local_noise(np.abs(change / interval - local_rate))
+        loss = local_rate * interval
+        excess = change - loss
+        min_scatter = max(_scatter(excess), EXACT * np.max(current))
+        scatter = np.maximum(min_scatter, _local_noise(np.abs(excess)))
+        score = (np.abs(excess) - 0.5 * np.abs(loss)) / (np.hypot(scatter, error) + TINY)
+        found = np.column_stack([excess, score, _local_digits(current, excess)])
+        return np.vstack([np.zeros(3), found]).astype(np.float32)  # 120 MB for 1e7 readings
 
-    return by_stretches(near, time, current)[1:]
+    return by_chunks(scores_of_chunk, time, current)[1:]
 
 
-def _highest(smooth: np.ndarray, low: float, noise: float) -> int:
-    """End of a rise from a low current: it falls again by more than noise and a tenth of it."""
+def _ramp_end(smooth: np.ndarray, low: float, noise: float) -> int:
+    """Index of the end of a rise: the current falls again by more than noise and a tenth of the
+    rise.
+    """
     top = np.maximum.accumulate(smooth)
-    falls = np.flatnonzero(top - smooth > np.maximum(5 * noise, FALL * (top - low)))
+    falls = np.flatnonzero(top - smooth > np.maximum(5 * noise, RAMP_FALL * (top - low)))
     return int(np.argmax(smooth[: falls[0] if falls.size else None]))
 
 
-def _ramp(current: np.ndarray, noise: float) -> int:
-    """Count the readings of injection at the head of a piece: the current still rises, by more
-    than noise and three times more than anywhere later. Half as many again are cut, where a ramp
-    that ends smoothly still counts.
+def _ramp_length(current: np.ndarray, noise: float) -> int:
+    """Count the readings of injection at the head of a piece.
+
+    The current rises by more than the noise and three times more than anywhere later. Half as many
+    readings again are cut, since the last part of a smooth ramp is below that.
     """
-    if current.size < 3 * FEWEST or np.max(current) - np.min(current[:SMOOTH]) <= 6 * noise:
+    rise = np.max(current) - np.min(current[:RAMP_WINDOW])
+    if current.size < 3 * MIN_READINGS or rise <= 6 * noise:
         return 0
-    smooth = np.convolve(current, np.full(SMOOTH, 1 / SMOOTH), "valid")
-    highest = _highest(smooth, smooth[0], noise)
-    after = smooth[highest:]
-    later = float(np.max(after - np.minimum.accumulate(after)))
-    if smooth[highest] - smooth[0] <= max(6 * noise, RISE * later):
+    smooth = np.convolve(current, np.full(RAMP_WINDOW, 1 / RAMP_WINDOW), "valid")
+    highest = _ramp_end(smooth, smooth[0], noise)
+    rest = smooth[highest:]
+    later = float(np.max(rest - np.minimum.accumulate(rest)))
+    if smooth[highest] - smooth[0] <= max(6 * noise, RAMP_RISE * later):
         return 0
-    cut = int(1.5 * (highest + SMOOTH // 2)) + 1
-    return cut if current.size - cut >= FEWEST else 0
+    cut = int(1.5 * (highest + RAMP_WINDOW // 2)) + 1
+    return cut if current.size - cut >= MIN_READINGS else 0
 
 
-def _is_slow_step(beyond: np.ndarray, change: np.ndarray) -> np.ndarray:
-    """Which changes from mean to mean are more than the law: not at the head, where what rises is a
-    ramp; at the end, where nothing comes after, much more.
+def _flag_slow_steps(significant: np.ndarray, change: np.ndarray) -> np.ndarray:
+    """Flag changes between means that exceed the law.
+
+    At the head rises are left to `_ramp_length`; at the end, where the readings after it are
+    unknown, a change must be much larger.
     """
-    seen, ends = (beyond < 0) | (beyond > 0) & (change > 0), WINDOW // 2
-    seen[:ends] = False
-    seen[-ends:] &= np.abs(change[-ends:]) > FASTER * np.median(np.abs(change))
-    return seen
+    slow, edge = (significant < 0) | (significant > 0) & (change > 0), WINDOW // 2
+    slow[:edge] = False
+    slow[-edge:] &= np.abs(change[-edge:]) > END_FACTOR * np.median(np.abs(change))
+    return slow
 
 
 class Step(NamedTuple):
-    """A fall or a rise: the first reading of it, the first one after it, which is the same where it
-    is sudden, and if it is a rise.
+    """A fall or a rise of the current.
+
+    Attributes
+    ----------
+    first : int
+        Index of its first reading.
+    end : int
+        Index of the first reading after it; the same if the step is sudden.
+    rises : bool
+        True if it is a rise.
     """
 
     first: int
@@ -327,10 +360,11 @@ class Step(NamedTuple):
     rises: bool
 
 
-def _bounds(first: int, last: int, size: int, cuts: np.ndarray) -> tuple[int, int]:
-    """Readings of a step from one mean of so many to another, up to one that was found before if
-    that is near: beside it none was sought. Half as many again are left out, where a step that ends
-    smoothly still counts.
+def _slow_step_bounds(first: int, last: int, size: int, cuts: np.ndarray) -> tuple[int, int]:
+    """First reading of a step between means of `size` readings, and the first one after it.
+
+    They extend to a neighbouring step of `cuts` if that is near. Half as many readings again are
+    left out, since the last part of a smooth step is below the threshold.
     """
     begin, end = first * size, (last + 1) * size + (last + 1 - first) * size // 2
     place = np.searchsorted(cuts, begin, "right")
@@ -338,40 +372,51 @@ def _bounds(first: int, last: int, size: int, cuts: np.ndarray) -> tuple[int, in
     return before if begin - before < 2 * size else begin, after if after - end < 2 * size else end
 
 
-def _search(
+def _find_clear_steps(
     time: np.ndarray, current: np.ndarray, digit_of_all: float
 ) -> tuple[list[Step], np.ndarray, np.ndarray]:
-    """Clear steps of readings and of the means of 2, 4, 8, ... neighbours, in order; readings about
-    which there may be others; and the last digit near each reading, at least that of all.
+    """Find clear steps of single readings and of the means of 2, 4, 8, ... neighbours.
+
+    Returns
+    -------
+    steps : list of Step
+        In order of time.
+    candidates : array of bool, shape (n,)
+        Readings near which there may be further steps.
+    digits : array, shape (n,)
+        Last digit near each reading, at least `digit_of_all`.
     """
     size, steps, level = 1, [], current.copy()
-    known, likely = np.zeros(level.size, bool), np.zeros(level.size, bool)
-    while level.size // size >= (COARSE if size > 1 else 2):
-        for late in range(0, size, max(size // 2, 1)):
-            count = (level.size - late) // size
-            columns = (v[late : late + count * size] for v in (time, level, known, likely))
-            t, x, old, seen = (v.reshape(count, size) for v in columns)
-            t, x, old, seen = t.mean(axis=1), x.mean(axis=1), old.any(axis=1), seen.any(axis=1)
-            excess, score, digit = _departures(t, x).T
+    flagged, candidates = np.zeros(level.size, bool), np.zeros(level.size, bool)
+    while level.size // size >= (MIN_MEANS if size > 1 else 2):
+        for shift in range(0, size, max(size // 2, 1)):
+            count = (level.size - shift) // size
+            columns = (v[shift : shift + count * size] for v in (time, level, flagged, candidates))
+            t, x, in_step, tried = (v.reshape(count, size) for v in columns)
+            t, x = t.mean(axis=1), x.mean(axis=1)
+            in_step, tried = in_step.any(axis=1), tried.any(axis=1)
+            excess, score, digit = _step_scores(t, x).T
             if size == 1:
                 digits = np.maximum(np.append(np.float32(0), digit), np.float32(digit_of_all))
-                least = THRESHOLD * np.maximum(_scatter(excess), digits * 2**-0.5)
-            coarse = digits[late + size :: size][: count - 1]
-            clear = (score > THRESHOLD) & (np.abs(excess) > least[late + size :: size][: count - 1])
-            beyond = np.where(clear & ~old[1:] & ~old[:-1], excess, np.float32(0))
+                min_step = THRESHOLD * np.maximum(_scatter(excess), digits * 2**-0.5)
+            mean_digits = digits[shift + size :: size][: count - 1]
+            limit = min_step[shift + size :: size][: count - 1]
+            clear = (score > THRESHOLD) & (np.abs(excess) > limit)
+            significant = np.where(clear & ~in_step[1:] & ~in_step[:-1], excess, np.float32(0))
             if size == 1:
-                steps += [Step(k + 1, k + 1, beyond[k] > 0) for k in np.flatnonzero(beyond)]
-                known[1:] = clear
-                level[1:] -= np.cumsum(beyond, dtype=float)
-            elif not late:
-                steps += (more := _slow_steps(steps, beyond, level, size, least))
-                for step in more:
-                    known[step.first : max(step.end, step.first + 1)] = True
-            free = ~seen[1:] & ~seen[:-1]
-            peaks = _peaks(np.abs(excess), free, DIGITS * coarse)
-            likely[late + (peaks + 1) * size] = True
+                found = np.flatnonzero(significant)
+                steps += [Step(k + 1, k + 1, significant[k] > 0) for k in found]
+                flagged[1:] = clear
+                level[1:] -= np.cumsum(significant, dtype=float)
+            elif not shift:
+                steps += (slow_steps := _slow_steps(steps, significant, level, size, min_step))
+                for step in slow_steps:
+                    flagged[step.first : max(step.end, step.first + 1)] = True
+            free = ~tried[1:] & ~tried[:-1]
+            peak_rows = _peaks(np.abs(excess), free, MIN_STEP_DIGITS * mean_digits)
+            candidates[shift + (peak_rows + 1) * size] = True
         size *= 2
-    return _joined(steps), likely, digits
+    return _merge_overlapping(steps), candidates, digits
 
 
 def _scatter(values: np.ndarray) -> float:
@@ -379,51 +424,57 @@ def _scatter(values: np.ndarray) -> float:
     return float(1.4826 * np.median(np.abs(values)))
 
 
-def _peaks(size: np.ndarray, free: np.ndarray, grain: np.ndarray) -> np.ndarray:
-    """Changes that stand out among those that are free of what was found before, and of these."""
+def _peaks(size: np.ndarray, free: np.ndarray, min_size: np.ndarray) -> np.ndarray:
+    """Find changes that stand out among the free ones, and then among the rest of these."""
     found = np.zeros(size.size, bool)
     for _ in range(2):
-        if free.sum() < PLACES:
+        if free.sum() < MIN_CHANGES:
             break
         high = np.where(free, size, 0.0)
-        found |= high > np.maximum(LIKELY * _scatter(high[free]), grain)
+        found |= high > np.maximum(LEVEL_THRESHOLD * _scatter(high[free]), min_size)
         found &= high >= maximum_filter1d(high, 3)
         free = free & ~maximum_filter1d(found, 3)
     return np.flatnonzero(found)
 
 
 def _slow_steps(
-    before: Sequence[Step], beyond: np.ndarray, level: np.ndarray, size: int, least: np.ndarray
+    before: Sequence[Step],
+    significant: np.ndarray,
+    level: np.ndarray,
+    size: int,
+    min_step: np.ndarray,
 ) -> list[Step]:
-    """Steps from mean to mean of so many readings besides others, those sudden that a single change
-    makes. Fresh beam, as after a rise, may fall fast by itself.
+    """Find steps between means of `size` readings that are not in `before`.
+
+    A step that one single change explains is sudden. Falls soon after a rise are left out: fresh
+    beam may decay fast.
     """
     fresh = np.sort([0, *(step.end for step in before if step.rises)])
     ends = (end for step in before for end in step[:2])
     cuts, found = np.sort([-level.size, *ends, 2 * level.size]), []
     change = np.diff(level[: level.size // size * size].reshape(-1, size).mean(axis=1))
-    for first, last in _runs(_is_slow_step(beyond, change)):
-        since = first * size - fresh[np.searchsorted(fresh, first * size, "right") - 1]
-        if beyond[first] < 0 and since < WINDOW // 2 * size:
+    for first, last in _runs(_flag_slow_steps(significant, change)):
+        age = first * size - fresh[np.searchsorted(fresh, first * size, "right") - 1]
+        if significant[first] < 0 and age < WINDOW // 2 * size:
             continue
-        begin, end = _bounds(first, last, size, cuts)
+        begin, end = _slow_step_bounds(first, last, size, cuts)
         single = np.diff(level[max(begin - 1, 0) : end])
         largest = int(np.argmax(np.abs(single)))
-        if abs(beyond[first:last].sum() - single[largest]) < 0.5 * least[begin]:
+        if abs(significant[first:last].sum() - single[largest]) < 0.5 * min_step[begin]:
             begin = end = max(begin, 1) + largest
-        found.append(Step(begin, min(end, level.size), bool(beyond[first] > 0)))
+        found.append(Step(begin, min(end, level.size), bool(significant[first] > 0)))
     return found
 
 
-def _joined(steps: list[Step]) -> list[Step]:
-    """Steps in order, those that overlap as one."""
-    apart: list[Step] = []
+def _merge_overlapping(steps: list[Step]) -> list[Step]:
+    """Sort steps and merge those that overlap."""
+    merged: list[Step] = []
     for step in sorted(steps):
-        if apart and step.first < apart[-1].end:
-            before = apart.pop()
+        if merged and step.first < merged[-1].end:
+            before = merged.pop()
             step = before._replace(end=max(step.end, before.end))
-        apart.append(step)
-    return apart
+        merged.append(step)
+    return merged
 
 
 def split_record(record: DecayRecord) -> Split:
@@ -441,17 +492,17 @@ def split_record(record: DecayRecord) -> Split:
 
     Notes
     -----
-    A step must exceed ten robust standard deviations of the changes near it, and of what is lost
-    meanwhile, as in a gap. Losses and refills of many readings, up to a twentieth of the record,
-    are steps of the means of 2, 4, 8, ... neighbours; slower changes stay in. A gap alone does not
-    end a decay; a step across it does.
+    A step must exceed ten robust standard deviations of the changes near it, and half of the usual
+    loss meanwhile, as in a gap. Losses and refills of many readings, up to a twentieth of the
+    record, are steps of the means of 2, 4, 8, ... neighbours; slower changes stay in the decay. A
+    gap alone does not end a decay; a step across it does.
 
-    Where refills hold the beam smaller ones are sought, too. One law -a I² - b I for all pieces
-    puts the loss back, and two levels are tested against one by their likelihood ratio, in noise
-    whose memory the differences of neighbours show; what is found improves the law, and so on.
-    Steps of three standard deviations of the noise are found in cycles of 60 readings and more, of
-    ten always. Most of them must raise the current, as refills do: what a wrong law or the noise
-    makes of a decay goes both ways.
+    Where refills hold the beam, smaller refills are sought, too. The loss is added back by one law
+    -a I² - b I for all pieces. Two levels are then tested against one by their likelihood ratio,
+    in noise whose correlation follows from the differences of neighbours. The law is fitted again
+    with the steps found, until both agree. Steps of three standard deviations of the noise are
+    found in cycles of 60 readings and more, steps of ten always. Most steps must raise the current,
+    as refills do: those that a wrong law or the noise imitates go both ways.
 
     Examples
     --------
@@ -464,16 +515,16 @@ def split_record(record: DecayRecord) -> Split:
     """
     expect(record, DecayRecord, "beamfit.read_decay_record(path)")
     kept, events = beam_readings(record)
-    if kept.size < FEWEST:
+    if kept.size < MIN_READINGS:
         return Split((), tuple(events))
     interval = np.diff(record.time)
     for before in np.flatnonzero(interval > GAP * np.median(interval)):
         events.append(event_of(record, "gap", before, before + 1))
-    del interval  # of 1e7 readings 80 MB
-    clear = _clear_steps(record, kept)
-    pieces, steps, fewest = clear.pieces, [], FEWEST
-    if (finer := _cycles(record, clear)) is not None:
-        (pieces, steps), fewest = finer, FEWEST_READINGS
+    del interval  # 80 MB for 1e7 readings
+    clear = _divide_at_clear_steps(record, kept)
+    pieces, steps, fewest = clear.pieces, [], MIN_READINGS
+    if (finer := _divide_at_small_refills(record, clear)) is not None:
+        (pieces, steps), fewest = finer, MIN_CYCLE_READINGS
     events += [*clear.steps, *steps]
     short = [piece for piece in pieces if piece.size < fewest]
     events += [event_of(record, "short", piece[0], piece[-1]) for piece in short]
@@ -484,123 +535,141 @@ def split_record(record: DecayRecord) -> Split:
 
 
 class ClearSteps(NamedTuple):
-    """Readings between clear steps, as their places in the record, and these steps; of each reading
-    whether it may be the first after another step, and the last digit near it.
+    """A record divided at clear steps.
+
+    Attributes
+    ----------
+    pieces : list of array of int
+        Indices of the readings between the steps.
+    steps : list of Event
+        The steps.
+    candidates : array of bool, shape (n,)
+        Readings that may be the first after a further step.
+    digits : array, shape (n,)
+        Last digit near each reading.
     """
 
     pieces: list[np.ndarray]
     steps: list[Event]
-    likely: np.ndarray
+    candidates: np.ndarray
     digits: np.ndarray
 
 
-def _clear_steps(record: DecayRecord, kept: np.ndarray) -> ClearSteps:
+def _divide_at_clear_steps(record: DecayRecord, kept: np.ndarray) -> ClearSteps:
+    """Divide the readings at clear steps and cut ramps at the head of the pieces."""
     columns = record.time[kept], record.current[kept]
-    steps, likely, digits = _search(*columns, record.resolution or 0.0)
-    ends, within, events = [], set(), []
+    steps, candidates, digits = _find_clear_steps(*columns, record.resolution or 0.0)
+    ends, slow_starts, events = [], set(), []
     for first, end, rises in steps:
         if end > first:
             kind = "ramp" if rises else "loss"
             events.append(event_of(record, kind, kept[first], kept[end - 1]))
-            within.add(kept[first])
+            slow_starts.add(kept[first])
         else:
             change = float(np.subtract(*record.current[kept[[first, first - 1]]]))
             kind = "refill" if rises else "loss"
             events.append(Event(kind, float(record.time[kept[first]]), 0.0, change))
         ends += [first, end]
-    pieces = [p for p in np.split(kept, ends) if p.size and p[0] not in within]
+    pieces = [p for p in np.split(kept, ends) if p.size and p[0] not in slow_starts]
     columns = np.zeros(len(record), bool), np.zeros(len(record), np.float32)
-    for column, values in zip(columns, (likely, digits), strict=True):
+    for column, values in zip(columns, (candidates, digits), strict=True):
         column[kept] = values
     noise = noise_of(record.time[kept], record.current[kept])
     for k, piece in enumerate(pieces):
-        if cut := _ramp(record.current[piece], max(noise, columns[1][piece].max() / 2)):
+        if cut := _ramp_length(record.current[piece], max(noise, columns[1][piece].max() / 2)):
             events.append(event_of(record, "ramp", piece[0], piece[cut - 1]))
             pieces[k] = piece[cut:]
     return ClearSteps(pieces, events, *columns)
 
 
-def _cycles(record: DecayRecord, clear: ClearSteps) -> tuple[list[np.ndarray], list[Event]] | None:
-    """Pieces divided at refills that are too small to be clear, and these; None if refills do not
-    hold the beam, or there are no more of them.
+def _divide_at_small_refills(
+    record: DecayRecord, clear: ClearSteps
+) -> tuple[list[np.ndarray], list[Event]] | None:
+    """Divide pieces further, at refills too small to be clear, and list these as events; None if
+    refills do not hold the beam, or if no cycle is gained.
 
-    Parts of less than three readings or a quarter of the usual length, as of spikes, injection
-    ramps and fresh beam, are left out, and the rest is looked at anew.
+    Parts of less than three readings or a quarter of the usual length, such as spikes, injection
+    ramps and fresh beam, are left out, and the search is repeated on the rest.
     """
-    whole = clear.pieces
-    rows, number = np.concatenate(whole), np.repeat(np.arange(len(whole)), [*map(len, whole)])
-    guess = clear.likely[rows]
+    rows = np.concatenate(clear.pieces)
+    number = np.repeat(np.arange(len(clear.pieces)), [*map(len, clear.pieces)])
+    candidates = clear.candidates[rows]
     for _ in range(2):
-        if rows.size < PLACES:
+        if rows.size < MIN_CHANGES:
             return None
-        begins, level = _steps_by_law(record, rows, number, guess, clear.digits[rows])
+        begins, level = _steps_by_law(record, rows, number, candidates, clear.digits[rows])
         lengths = np.diff(begins, append=rows.size)
-        short = _is_short(number, begins, lengths)
+        short = _flag_short_parts(number, begins, lengths)
         keep, lengths = np.repeat(~short, lengths), lengths[~short]
         rows, number, level = rows[keep], number[keep], level[keep]
         if not short.any():
             break
-        guess = np.zeros(rows.size, bool)
-        guess[np.cumsum(lengths) - lengths] = True
-    parts, owner = _restored(record, whole, rows, number, lengths)
-    count = _by_the_clock(np.array([*map(len, parts)]))
+        candidates = np.zeros(rows.size, bool)
+        candidates[np.cumsum(lengths) - lengths] = True
+    parts, owner = _undo_divisions(record, clear.pieces, rows, number, lengths)
+    count = _count_regular_cycles(np.array([*map(len, parts)]))
     pieces = [p for part, n in zip(parts, count, strict=True) for p in np.array_split(part, n)]
     owner, events, levels = np.repeat(owner, count), [], np.full(len(record), np.nan)
     levels[rows] = level
     for k in np.flatnonzero(np.diff(owner) == 0) + 1:
-        beside = levels[pieces[k][:NEAR]], levels[pieces[k - 1][-NEAR:]]
-        known = [side[~np.isnan(side)] for side in beside]
-        change = float(np.subtract(*map(np.median, known))) if all(map(len, known)) else 0.0
+        sides = levels[pieces[k][:POSITION_RANGE]], levels[pieces[k - 1][-POSITION_RANGE:]]
+        near = [side[~np.isnan(side)] for side in sides]
+        change = float(np.subtract(*map(np.median, near))) if all(map(len, near)) else 0.0
         kind = "refill" if change > 0 else "loss"
         events.append(Event(kind, float(record.time[pieces[k][0]]), 0.0, change))
-    cycles = sum(piece.size >= FEWEST_READINGS for piece in pieces)
-    if cycles <= sum(piece.size >= FEWEST for piece in whole):
+    cycles = sum(piece.size >= MIN_CYCLE_READINGS for piece in pieces)
+    if cycles <= sum(piece.size >= MIN_READINGS for piece in clear.pieces):
         return None
     found = np.array([event.change for event in events])
-    raised = found.sum() >= RETURNED * np.abs(found).sum()
-    held = _hold([record.current[piece] for piece in pieces], [*clear.steps, *events])
-    return (pieces, [*events, *_left_out(record, whole, pieces)]) if raised and held else None
+    rises = found.sum() >= MIN_RETURNED * np.abs(found).sum()
+    currents = [record.current[piece] for piece in pieces]
+    if not (rises and _is_held_by_refills(currents, [*clear.steps, *events])):
+        return None
+    return pieces, [*events, *_omitted_events(record, clear.pieces, pieces)]
 
 
-def _left_out(
+def _omitted_events(
     record: DecayRecord, clear: Sequence[np.ndarray], pieces: Sequence[np.ndarray]
 ) -> list[Event]:
-    """Readings of the clear pieces that are in none of others."""
-    left = np.zeros(len(record), bool)
-    left[np.concatenate(clear)] = True
-    left[np.concatenate(pieces)] = False
-    return [event_of(record, "short", first, end - 1) for first, end in _runs(left)]
+    """List the readings of clear pieces that are in none of the new pieces."""
+    omitted = np.zeros(len(record), bool)
+    omitted[np.concatenate(clear)] = True
+    omitted[np.concatenate(pieces)] = False
+    return [event_of(record, "short", first, end - 1) for first, end in _runs(omitted)]
 
 
-def _restored(
+def _undo_divisions(
     record: DecayRecord,
     clear: Sequence[np.ndarray],
     rows: np.ndarray,
     number: np.ndarray,
     lengths: np.ndarray,
 ) -> tuple[list[np.ndarray], list[int]]:
-    """Parts, and of which clear piece each is; one whose steps explain no more than their sizes and
-    places cost, beside a law of its own and a smooth curve, is whole again but for gaps.
+    """Undo divisions that the record does not support; return the parts and the clear piece of
+    each.
+
+    A piece whose steps explain less than their sizes and positions cost, given a law of its own, a
+    smooth curve and correlated noise, is made whole again, except at gaps.
     """
     begins = np.cumsum(lengths) - lengths
     pieces = np.flatnonzero(np.diff(number, prepend=-1)).tolist()
-    found, owner, missing = [], [], GAP * np.median(np.diff(record.time))
+    parts_found, owner, gap_time = [], [], GAP * np.median(np.diff(record.time))
     for low, high in itertools.pairwise([*pieces, rows.size]):
         piece, kept = number[low], rows[low:high]
         first = begins[slice(*np.searchsorted(begins, (low, high)))] - low
-        parts, every = np.split(kept, first[1:]), clear[piece]
+        parts, all_rows = np.split(kept, first[1:]), clear[piece]
         if len(parts) > 1:
-            after = every[1:][np.diff(record.time[every]) > missing]
-            gap = np.diff(np.searchsorted(after, kept, "right"), prepend=0)[first] > 0
+            after_gap = all_rows[1:][np.diff(record.time[all_rows]) > gap_time]
+            gap = np.diff(np.searchsorted(after_gap, kept, "right"), prepend=0)[first] > 0
             if _log_odds_of_steps(record.time[kept], record.current[kept], first, gap) < 0:
-                parts = np.split(every, np.searchsorted(every, kept[first[gap]]))
-        found += parts
+                parts = np.split(all_rows, np.searchsorted(all_rows, kept[first[gap]]))
+        parts_found += parts
         owner += [piece] * len(parts)
-    return found, owner
+    return parts_found, owner
 
 
-def _without_means(columns: np.ndarray, first: np.ndarray) -> np.ndarray:
-    """Columns less their means in parts that begin with these rows."""
+def _demeaned(columns: np.ndarray, first: np.ndarray) -> np.ndarray:
+    """Columns less their mean in each part; `first` are the first rows of the parts."""
     lengths = np.diff(first, append=len(columns))
     means = np.add.reduceat(columns, first) / lengths[:, None]
     return columns - np.repeat(means, lengths, axis=0)
@@ -609,199 +678,221 @@ def _without_means(columns: np.ndarray, first: np.ndarray) -> np.ndarray:
 def _log_odds_of_steps(
     time: np.ndarray, current: np.ndarray, first: np.ndarray, gap: np.ndarray
 ) -> float:
-    """Log odds of levels that begin at these readings against those that begin after a gap, each
-    beside a law and a smooth curve, averaged over the noise: a slow one makes levels by itself. Of
-    many levels some tell it.
+    """Log odds of all levels, which begin at `first`, against those alone that begin after a gap.
+
+    Both have one law and a smooth curve in addition, and are averaged over the noise, because slow
+    noise imitates levels. Of many levels only some groups are used.
     """
     from beamfit.noise.memory import Products  # JAX, for steps alone
 
-    level = _levelled(time, current, np.zeros(1, int))
-    ends, odds, told = np.append(first, time.size), 0.0, 0
-    groups = np.array_split(np.arange(first.size), -(-first.size // LEVELS))
-    for k in np.unique(np.linspace(0, len(groups) - 1, GROUPS).astype(int)):
-        some = ends[groups[k][0] : groups[k][-1] + 2]
-        size = -(-(some[-1] - some[0]) // ROWS)
-        begin = np.concatenate([np.arange(*pair, size) for pair in itertools.pairwise(some)])
-        lengths = np.diff(begin, append=some[-1])
-        at, of = (np.add.reduceat(v[: some[-1]], begin) / lengths for v in (time, level))
-        sure = gap[groups[k][1:]]
-        steps = np.greater_equal.outer(begin, some[1:-1][np.argsort(~sure, kind="stable")])
-        # By number: the readings on both sides of a gap have a slope.
-        curve = chebvander(np.interp(begin, begin[[0, -1]], [-1.0, 1.0]), CURVED)
-        products = Products.of(np.column_stack([of, curve, steps]), at, False, NOISES)
-        free = max(at.size - CURVED - some.size + 1, 1)
-        for sign, columns in ((1, None), (-1, CURVED + 2 + sure.sum())):
-            left = np.log(products.left(columns) + TINY)
-            odds += sign * logsumexp(products.log_prior - 0.5 * free * left)
-        told += np.sum(~sure)
-    return odds - told / (first.size - 1) * _log_cost(np.diff(ends))
+    level = _add_back_loss(time, current, np.zeros(1, int))
+    ends, odds, tested = np.append(first, time.size), 0.0, 0
+    groups = np.array_split(np.arange(first.size), -(-first.size // GROUP_LEVELS))
+    for k in np.unique(np.linspace(0, len(groups) - 1, MAX_GROUPS).astype(int)):
+        edges = ends[groups[k][0] : groups[k][-1] + 2]
+        size = -(-(edges[-1] - edges[0]) // MAX_MEANS)
+        begin = np.concatenate([np.arange(*pair, size) for pair in itertools.pairwise(edges)])
+        lengths = np.diff(begin, append=edges[-1])
+        t, x = (np.add.reduceat(v[: edges[-1]], begin) / lengths for v in (time, level))
+        at_gap = gap[groups[k][1:]]
+        steps = np.greater_equal.outer(begin, edges[1:-1][np.argsort(~at_gap, kind="stable")])
+        # In the index, not in time: across a gap the curve goes on smoothly.
+        curve = chebvander(np.interp(begin, begin[[0, -1]], [-1.0, 1.0]), CURVE_DEGREE)
+        columns = np.column_stack([x, curve, steps])
+        products = Products.of(columns, t, False, CORRELATION_TIMES)
+        dof = max(t.size - CURVE_DEGREE - edges.size + 1, 1)
+        for sign, count in ((1, None), (-1, CURVE_DEGREE + 2 + at_gap.sum())):
+            log_squares = np.log(products.left(count) + TINY)
+            odds += sign * logsumexp(products.log_prior - 0.5 * dof * log_squares)
+        tested += np.sum(~at_gap)
+    return odds - tested / (first.size - 1) * _log_step_cost(np.diff(ends))
 
 
-def _log_cost(lengths: np.ndarray) -> float:
-    """Log evidence that the steps between levels of so many readings cost: for a place log n, or
-    what the lengths differ by from the usual one; for a size half the log of the readings that
-    tell it (G. Schwarz, Ann. Stat. 6 (1978) 461).
+def _log_step_cost(lengths: np.ndarray) -> float:
+    """Log evidence that the steps between levels of these lengths cost.
+
+    A position costs log n, or, for regular cycles, the scatter of the lengths about the usual one.
+    A size costs half the logarithm of the readings that determine it (G. Schwarz, Ann. Stat. 6
+    (1978) 461).
     """
     steps, count = lengths.size - 1, lengths.sum()
-    differ = np.mean(np.abs(lengths - np.median(lengths)))
-    by_the_clock = np.log(count) + steps * (1.0 + np.log1p(2 * differ))
+    deviation = np.mean(np.abs(lengths - np.median(lengths)))
+    regular = np.log(count) + steps * (1.0 + np.log1p(2 * deviation))
     size = 0.5 * np.log(count / lengths.size)
-    return float(min(steps * np.log(count), by_the_clock) + steps * size)
+    return float(min(steps * np.log(count), regular) + steps * size)
 
 
-def _is_short(number: np.ndarray, begins: np.ndarray, lengths: np.ndarray) -> np.ndarray:
-    """Which parts are too short, of the clear pieces with these numbers: not one of eight readings,
-    and not all parts of one.
+def _flag_short_parts(number: np.ndarray, begins: np.ndarray, lengths: np.ndarray) -> np.ndarray:
+    """Flag parts that are too short.
+
+    A clear piece of eight readings or more is not left out altogether.
     """
     piece, sizes = number[begins], np.bincount(number)
-    usual = np.median(np.repeat(lengths, lengths))  # of most readings
-    short = lengths < max(FEWEST_READINGS, SHORT * usual)
-    lost = np.bincount(piece, weights=~short) == 0
-    return short & ~(lost & (sizes >= FEWEST))[piece]
+    usual = np.median(np.repeat(lengths, lengths))  # length of the part of a typical reading
+    short = lengths < max(MIN_CYCLE_READINGS, SHORT * usual)
+    emptied = np.bincount(piece, weights=~short) == 0
+    return short & ~(emptied & (sizes >= MIN_READINGS))[piece]
 
 
-def _by_the_clock(lengths: np.ndarray) -> np.ndarray:
-    """Count the cycles in each piece, where most readings are in those of one usual length: a
-    refill may be too small to be found. One that is missed bends a long piece, which tells most.
+def _count_regular_cycles(lengths: np.ndarray) -> np.ndarray:
+    """Count the cycles in each piece, if most readings are in cycles of one usual length.
+
+    A missed refill, too small to be found, would bend the long piece, which has most weight.
     """
     usual = np.median(np.repeat(lengths, lengths))
-    regular = np.abs(lengths - usual) <= max(REGULAR * usual, 1.0)
+    regular = np.abs(lengths - usual) <= max(PERIOD_TOLERANCE * usual, 1.0)
     if lengths @ regular < 0.5 * lengths.sum():
         return np.ones(lengths.size, int)
     return np.maximum(np.round(lengths / usual).astype(int), 1)
 
 
 def is_refilled(split: Split) -> bool:
-    """Tell three or more cycles held by refills from a decay with odd steps.
+    """Tell three or more cycles held by refills from a decay with occasional steps.
 
     Refills give back at least half of what the cycles lose.
     """
-    return _hold([cycle.current for cycle in split.segments], split.events)
+    return _is_held_by_refills([cycle.current for cycle in split.segments], split.events)
 
 
-def _hold(pieces: Sequence[np.ndarray], steps: Sequence[Event]) -> bool:
+def _is_held_by_refills(pieces: Sequence[np.ndarray], steps: Sequence[Event]) -> bool:
+    """Tell if there are enough cycles and refills give back at least half of what these lose."""
     refills = [event.change for event in steps if event.kind in ("refill", "ramp")]
     lost = sum(float(current[0] - current[-1]) for current in pieces)
-    many = min(len(pieces), len(refills) + 1) >= FEWEST_CYCLES
-    return many and sum(refills) > RETURNED * lost > 0
+    enough = min(len(pieces), len(refills) + 1) >= MIN_CYCLES
+    return enough and sum(refills) > MIN_RETURNED * lost > 0
 
 
 def _steps_by_law(
-    record: DecayRecord, rows: np.ndarray, number: np.ndarray, guess: np.ndarray,
+    record: DecayRecord, rows: np.ndarray, number: np.ndarray, candidates: np.ndarray,
     digits: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
-    """Places at which the level steps, with 0, and the level: the current with the loss put back.
-    Some of them are known, where the number of the piece changes.
+    """Find the first readings of all levels, beginning with 0, and the current with the loss added
+    back.
+
+    Steps between the given pieces (`number`) are certain.
     """
 
-    def near(*columns: np.ndarray) -> np.ndarray:
-        time, current, edge, maybe, grain = columns
+    def steps_of_chunk(*columns: np.ndarray) -> np.ndarray:
+        time, current, edge, candidate, digit = columns
         clear, found = np.flatnonzero(edge[1:]) + 1, np.zeros(time.size, bool)
-        both = np.flatnonzero((edge | maybe)[1:]) + 1
-        steps, level, firm = _settled(time, current, clear, both, grain)
-        found[steps[firm]] = True
-        lost = np.diff(level - current, prepend=0.0)
-        return np.column_stack([found, lost]).astype(np.float32)
+        first_rows = np.flatnonzero((edge | candidate)[1:]) + 1
+        steps, level, certain = _iterate_steps(time, current, clear, first_rows, digit)
+        found[steps[certain]] = True
+        loss = np.diff(level - current, prepend=0.0)
+        return np.column_stack([found, loss]).astype(np.float32)
 
     edge, current = np.diff(number, prepend=number[0]) != 0, record.current[rows]
-    columns = record.time[rows], current, edge, guess, digits
-    found, lost = by_stretches(near, *columns, stretch=ONE_LAW, overlap=BESIDE).T
-    return np.append(0, np.flatnonzero(found)), current + np.cumsum(lost, dtype=float)
+    columns = record.time[rows], current, edge, candidates, digits
+    found, loss = by_chunks(steps_of_chunk, *columns, chunk=LAW_CHUNK, overlap=LAW_OVERLAP).T
+    return np.append(0, np.flatnonzero(found)), current + np.cumsum(loss, dtype=float)
 
 
-def _settled(
-    time: np.ndarray, current: np.ndarray, clear: np.ndarray, guess: np.ndarray, grain: np.ndarray
+def _iterate_steps(
+    time: np.ndarray,
+    current: np.ndarray,
+    clear: np.ndarray,
+    candidates: np.ndarray,
+    digits: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Steps besides some, when the law that they leave shows no others; the level, and which of
-    the steps are clear or what two levels differ by beside them.
+    """Iterate between steps and the law that they leave, until both agree.
+
+    Returns the steps, the current with the loss added back, and which steps are certain: clear
+    ones, and those between levels that differ significantly.
     """
-    interval, steps = np.diff(time), guess
+    interval, steps = np.diff(time), candidates
     gaps = np.flatnonzero(interval > GAP * np.median(interval)) + 1
-    for _ in range(ROUNDS):
-        # A refill in a gap would be a part of the law.
-        level = _levelled(time, current, np.union1d(np.append(0, steps), gaps))
+    for _ in range(MAX_ITERATIONS):
+        # Each gap begins a level: a refill within it would be taken for the law.
+        level = _add_back_loss(time, current, np.union1d(np.append(0, steps), gaps))
         total = np.append(0.0, np.cumsum(level))
         change = np.delete(np.diff(level), steps - 1)
-        change = change if change.size >= PLACES else np.diff(level)
-        variance = _mean_variance(change, min(level.size, LONG))
-        more = _divided(total, clear, variance, grain)
-        more = _placed(total, more, clear)
-        if np.array_equal(more, steps):
+        change = change if change.size >= MIN_CHANGES else np.diff(level)
+        variance = _mean_variance(change, min(level.size, MAX_MEAN_LENGTH))
+        found = _divide(total, clear, variance, digits)
+        found = _refine_positions(total, found, clear)
+        if np.array_equal(found, steps):
             break
-        steps = more
+        steps = found
     ends = np.concatenate([[0], steps, [level.size]])
     lengths = np.diff(ends)
     scatter = np.sqrt(variance(lengths[1:]) + variance(lengths[:-1]))
-    firm = np.abs(np.diff(np.diff(total[ends]) / lengths)) > LIKELY * scatter
-    return steps, level, firm | np.isin(steps, clear)
+    significant = np.abs(np.diff(np.diff(total[ends]) / lengths)) > LEVEL_THRESHOLD * scatter
+    return steps, level, significant | np.isin(steps, clear)
 
 
-def _levelled(time: np.ndarray, current: np.ndarray, first: np.ndarray) -> np.ndarray:
-    """Currents with the loss put back, by one a and one b for all pieces; by one number where two
-    are not likelier.
+def _add_back_loss(time: np.ndarray, current: np.ndarray, first: np.ndarray) -> np.ndarray:
+    """Currents with the loss added back, by one a and one b for all pieces.
+
+    One coefficient is left out unless it improves the fit by more than its cost (Schwarz
+    criterion).
     """
     columns = np.array([current, current**2])
     parts = 0.5 * np.diff(time) * (columns[:, :-1] + columns[:, 1:])
     columns = np.vstack([np.zeros(2), np.cumsum(parts, axis=1).T])
-    both = _without_means(np.column_stack([columns, current]), first)
-    scale = np.linalg.norm(both[:, :2], axis=0) + TINY
-    left, known = both[:, 2], both[:, :2] / scale
-    squares, ways = np.linalg.eigh(known.T @ known)
-    # Readings that are equal but for rounding make both columns one.
-    numbers = ways.T @ (known.T @ left) / np.maximum(squares, EXACT)
-    explained = squares * numbers**2
-    rest = max(left @ left - explained[1], 0.0) + TINY
-    fewer = max(rest - explained[0], EXACT * rest)
-    if time.size * np.log(rest / fewer) < 2 * np.log(time.size):
-        numbers[0] = 0.0
-    return current - columns @ (ways @ numbers / scale)
+    demeaned = _demeaned(np.column_stack([columns, current]), first)
+    scale = np.linalg.norm(demeaned[:, :2], axis=0) + TINY
+    residual, design = demeaned[:, 2], demeaned[:, :2] / scale
+    eigenvalues, eigenvectors = np.linalg.eigh(design.T @ design)
+    # The two columns are nearly parallel for a short decay: diagonalise.
+    coefficients = eigenvectors.T @ (design.T @ residual) / np.maximum(eigenvalues, EXACT)
+    explained = eigenvalues * coefficients**2
+    reduced = max(residual @ residual - explained[1], 0.0) + TINY
+    full = max(reduced - explained[0], EXACT * reduced)
+    if time.size * np.log(reduced / full) < 2 * np.log(time.size):
+        coefficients[0] = 0.0
+    return current - columns @ (eigenvectors @ coefficients / scale)
 
 
-def _divided(
+def _divide(
     total: np.ndarray, steps: np.ndarray, variance: Callable[[np.ndarray], np.ndarray],
-    grain: np.ndarray,
+    digits: np.ndarray,
 ) -> np.ndarray:  # fmt: skip
-    """Divide pieces in two as long as two levels explain them better than one."""
+    """Divide pieces in two as long as two levels explain them significantly better than one."""
     ends = [0, *steps.tolist(), total.size - 1]
     waiting, found = list(itertools.pairwise(ends)), steps.tolist()
     count = np.arange(1, total.size)
-    each = variance(count)
+    variances = variance(count)
     while waiting:
         low, high = waiting.pop()
         if high - low < 2:
             continue
-        at, before, own = total[low + 1 : high], count[: high - low - 1], each[: high - low - 1]
-        step = (total[high] - at) / before[::-1] - (at - total[low]) / before
+        size, sums = high - low - 1, total[low + 1 : high]
+        left, own = count[:size], variances[:size]
+        step = (total[high] - sums) / left[::-1] - (sums - total[low]) / left
         scatter = np.sqrt(own + own[::-1])
         best = int((np.abs(step) / scatter).argmax())
-        if abs(step[best]) > max(LIKELY * scatter[best], DIGITS * grain[low:high].max()):
+        least = MIN_STEP_DIGITS * digits[low:high].max()
+        if abs(step[best]) > max(LEVEL_THRESHOLD * scatter[best], least):
             found.append(low + 1 + best)
             waiting += [(low, found[-1]), (found[-1], high)]
     return np.sort(np.array(found, int))
 
 
 def _mean_variance(change: np.ndarray, longest: int) -> Callable[[np.ndarray], np.ndarray]:
-    """Variance of the mean of so many readings in autoregressive noise, by its differences.
+    """Variance of the mean of a number of readings in autoregressive noise, from the readings'
+    changes.
 
-    Those over two intervals have 1 + c times the variance of those over one, c being the
-    correlation of neighbours; medians, for the steps among them.
+    Changes over two intervals have 1 + c times the variance of those over one, where c is the
+    correlation of neighbours. Medians are used because of the steps.
     """
-    change = change - np.median(change)  # what the law does not put back
+    change = change - np.median(change)  # loss that the law left over
     one, two = (np.median(np.abs(values)) for values in (change, change[1:] + change[:-1]))
-    kept = float(np.clip((two / max(one, EXACT * two, TINY)) ** 2 - 1, 0.0, 0.99))
-    many = np.arange(1, longest + 1)
+    c = float(np.clip((two / max(one, EXACT * two, TINY)) ** 2 - 1, 0.0, 0.99))
+    n = np.arange(1, longest + 1)
     # The sum of many readings: n + 2 sum (n - k) c^k.
-    sums = many + 2 * (kept * many / (1 - kept) - kept * (1 - kept**many) / (1 - kept) ** 2)
-    table = (1.4826 * one) ** 2 / 2 / (1 - kept) * sums / many**2 + TINY
+    sums = n + 2 * (c * n / (1 - c) - c * (1 - c**n) / (1 - c) ** 2)
+    table = (1.4826 * one) ** 2 / 2 / (1 - c) * sums / n**2 + TINY
     return lambda count: table[np.minimum(count, longest) - 1]
 
 
-def _placed(total: np.ndarray, steps: np.ndarray, clear: np.ndarray) -> np.ndarray:
-    """Each step that is not clear where two levels between its neighbours explain most."""
-    ends, count = [0, *steps.tolist(), total.size - 1], np.arange(2 * WIDEST)
+def _refine_positions(total: np.ndarray, steps: np.ndarray, clear: np.ndarray) -> np.ndarray:
+    """Move each step that is not clear to where two levels between its neighbours explain most."""
+    ends, count = [0, *steps.tolist(), total.size - 1], np.arange(2 * POSITION_WINDOW)
     for k in (np.flatnonzero(~np.isin(steps, clear)) + 1).tolist():
-        low, high = max(ends[k - 1], ends[k] - WIDEST), min(ends[k + 1], ends[k] + WIDEST)
-        first, last = max(low + 1, ends[k] - NEAR), min(high, ends[k] + NEAR + 1)
+        low = max(ends[k - 1], ends[k] - POSITION_WINDOW)
+        high = min(ends[k + 1], ends[k] + POSITION_WINDOW)
+        first = max(low + 1, ends[k] - POSITION_RANGE)
+        last = min(high, ends[k] + POSITION_RANGE + 1)
         at = total[first:last]
         before, after = count[first - low : last - low], count[high - last + 1 : high - first + 1]
         after = after[::-1]

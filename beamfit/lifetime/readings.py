@@ -1,4 +1,6 @@
-"""Readings of a current monitor and of its clock: noise, errors, repeats, digits, means."""
+"""Preparation of the readings of a current monitor and its clock: noise, errors, repeats, digits,
+means.
+"""
 
 from __future__ import annotations
 
@@ -15,16 +17,17 @@ from beamfit.statistics import POOR_FIT
 
 # Robust z-score at which a step or spike is an event: one false alarm in 1e20 Gaussian readings.
 THRESHOLD = 10.0
-# Readings whose median is that of a level, and fewest readings of a decay.
-WINDOW, FEWEST = 9, 8
-# Readings that tell the noise near one.
+# Readings in a running median of level or rate; smallest number of readings of a decay.
+WINDOW, MIN_READINGS = 9, 8
+# Readings in a running median of the noise.
 NEIGHBOURS = 21
-# Readings that are looked through at once, and how many of their neighbours.
-STRETCH, OVERLAP = 1 << 18, 64
+# Readings processed at a time, and their overlap: a long record at once would take gigabytes.
+CHUNK, OVERLAP = 1 << 18, 64
 
 
 def noise_of(time: np.ndarray, current: np.ndarray) -> float:
-    """Noise of single readings, from how far each lies off the line through its neighbours.
+    """Estimate the noise of single readings from their distance to the line through both
+    neighbours.
 
     Parameters
     ----------
@@ -45,39 +48,41 @@ def noise_of(time: np.ndarray, current: np.ndarray) -> float:
     '0.010'
     """
     share = (time[1:-1] - time[:-2]) / (time[2:] - time[:-2])
-    off = current[1:-1] - (1 - share) * current[:-2] - share * current[2:]
-    off /= np.sqrt(1 + share**2 + (1 - share) ** 2)
-    return float(1.4826 * np.median(np.abs(off, out=off), overwrite_input=True))
+    residual = current[1:-1] - (1 - share) * current[:-2] - share * current[2:]
+    residual /= np.sqrt(1 + share**2 + (1 - share) ** 2)
+    return float(1.4826 * np.median(np.abs(residual, out=residual), overwrite_input=True))
 
 
-def by_stretches(
+def by_chunks(
     function: Callable[..., np.ndarray],
     *columns: np.ndarray,
-    stretch: int = STRETCH,
+    chunk: int = CHUNK,
     overlap: int = OVERLAP,
 ) -> np.ndarray:
-    """Values of a function of near neighbours for each reading: of a long record by stretches,
-    since all at once takes gigabytes.
+    """Apply a function of near neighbours to a record in overlapping chunks.
+
+    All at once would take gigabytes for a long record.
 
     Examples
     --------
-    >>> by_stretches(lambda x: np.gradient(x), np.arange(6.0) ** 2, stretch=3, overlap=1).tolist()
+    >>> by_chunks(lambda x: np.gradient(x), np.arange(6.0) ** 2, chunk=3, overlap=1).tolist()
     [1.0, 2.0, 4.0, 6.0, 8.0, 9.0]
     """
     found, size = [], columns[0].size
-    for start in range(0, size, stretch):
-        low, stop = max(start - overlap, 0), min(start + stretch, size)
-        some = function(*(column[low : stop + overlap] for column in columns))
-        found.append(some[start - low : stop - low])
+    for start in range(0, size, chunk):
+        low, stop = max(start - overlap, 0), min(start + chunk, size)
+        values = function(*(column[low : stop + overlap] for column in columns))
+        found.append(values[start - low : stop - low])
     return np.concatenate(found)
 
 
 def with_common_errors(record: DecayRecord, residuals: np.ndarray) -> DecayRecord:
-    """Take the rms of the errors near each reading for its error where they differ by chance.
+    """Replace errors that differ only by chance by the rms of the errors near each reading.
 
-    An error of three readings is known to a half, and the root of a number of counts goes with
-    that number: as weights both prefer readings by their own noise. Errors that differ for a reason
-    make how far residuals lie off those beside them much likelier, and stay.
+    An error estimated from three readings is uncertain by a half, and the square root of a number
+    of counts depends on that number: as weights both prefer readings by their own noise. Errors
+    that differ for a reason make the scatter of the residuals about their neighbours much more
+    probable; these stay.
 
     Examples
     --------
@@ -90,16 +95,23 @@ def with_common_errors(record: DecayRecord, residuals: np.ndarray) -> DecayRecor
     '0.06 to 1.20, 0.43 to 0.61'
     """
     error = record.error
-    if error is None or len(record) < FEWEST or not np.ptp(error):
+    if error is None or len(record) < MIN_READINGS or not np.ptp(error):
         return record
     near = np.sqrt(uniform_filter1d(error**2, min(NEIGHBOURS, len(record)), mode="mirror"))
-    times, off = (sliding_window_view(v, 5) for v in (record.time, residuals))
-    since, off = np.delete(times - times[:, 2:3], 2, 1), np.delete(off - off[:, 2:3], 2, 1)
+    window_times, offsets = (sliding_window_view(v, 5) for v in (record.time, residuals))
+    since, offsets = (
+        np.delete(window_times - window_times[:, 2:3], 2, 1),
+        np.delete(offsets - offsets[:, 2:3], 2, 1),
+    )
 
     def misfit(error: np.ndarray) -> float:
-        """-2 ln of their probability, whatever factor all errors are wrong by."""
+        """-2 ln likelihood of the residuals about lines through four neighbours, with these errors
+        times the best common factor.
+        """
         weight = np.delete(1 / sliding_window_view(error, 5) ** 2, 2, 1)
-        sums = (np.sum(weight * part, axis=1) for part in (1, since, since**2, off, off * since))
+        sums = (
+            np.sum(weight * part, axis=1) for part in (1, since, since**2, offsets, offsets * since)
+        )
         count, first, second, level, slope = sums
         spread = count * second - first**2
         line = (second * level - first * slope) / spread
@@ -116,13 +128,13 @@ def with_common_errors(record: DecayRecord, residuals: np.ndarray) -> DecayRecor
 def rounding_of(
     digit: float | None, residuals: np.ndarray, span: float, monitor: Monitor | None
 ) -> tuple[float, Monitor | None] | None:
-    """Error of rounding, and the monitor with a drift beside its own, where readings scatter about
-    a law by less: a beam that loses a digit at each reading lies on a line, whose slope is not
-    known the better.
+    """Return the error of rounding, and the monitor with a drift added, if readings scatter by less
+    than their digits allow.
 
-    What residuals lack of the variance of rounding, beyond two standard deviations of a mean
-    square, moves both ends of the record, or of all its cycles alike, of this span in s, each end
-    by itself.
+    Readings of a beam that loses a digit at each reading lie on a line, but its slope is no better
+    known for that. The missing variance (that of rounding less that of the residuals, beyond two
+    standard deviations of a mean square) is taken as independent shifts of both ends of the record,
+    or of all cycles alike. `span` is its length, s.
 
     Examples
     --------
@@ -132,57 +144,60 @@ def rounding_of(
     >>> print(f"{error:.3f} mA, {moved.drift:.3f} mA/h")
     0.289 mA, 0.394 mA/h
     """
-    least, squared = (digit or 0.0) / 12**0.5, float(np.mean(residuals**2))
-    if squared >= least**2:
+    rounding, mean_square = (digit or 0.0) / 12**0.5, float(np.mean(residuals**2))
+    if mean_square >= rounding**2:
         return None
-    lacks = least**2 * (1 - 2 / len(residuals) ** 0.5) - squared
-    if lacks > 0:
-        monitor = Monitor(drift=(2 * lacks) ** 0.5 * HOUR / span).beside(monitor)
-    return least, monitor
+    missing_variance = rounding**2 * (1 - 2 / len(residuals) ** 0.5) - mean_square
+    if missing_variance > 0:
+        monitor = Monitor(drift=(2 * missing_variance) ** 0.5 * HOUR / span).beside(monitor)
+    return rounding, monitor
 
 
 def with_rounding(record: DecayRecord, residuals: np.ndarray) -> DecayRecord:
-    """State the error of rounding where it is needed."""
+    """State the error of rounding if readings scatter by less."""
     found = rounding_of(record.resolution, residuals, record.span, record.monitor)
     if record.error is not None or found is None:
         return record
-    least, monitor = found
+    rounding, monitor = found
     note = "Readings scatter by less than the rounding of their digits: errors contain that."
     notes = (*record.notes, note)
-    return replace(record, error=np.full(len(record), least), monitor=monitor, notes=notes)
+    return replace(record, error=np.full(len(record), rounding), monitor=monitor, notes=notes)
 
 
-# An hour is skipped to such a share of the usual interval.
-SAME = 0.1
-# A gap is this many usual sampling intervals.
+# Tolerance, in usual intervals, to which a skipped hour must be an hour.
+HOUR_TOLERANCE = 0.1
+# Shortest gap, in usual sampling intervals.
 GAP = 10.0
-# Readings beyond which neighbours are averaged.
-MOST_READINGS = 1 << 16
-# Repeats are of a monitor slower than its archive if half of the readings are, and nearly all come
-# by equal numbers, or what changes, changes by more than so many digits. Runs so much longer than
-# usual are of a monitor that stands.
-EQUAL, DIGITS, STANDS = 0.95, 3.0, 5
-# Readings that a step of a staircase lasts at least, and by how much of a digit steps may differ.
-STAIR, ROUNDING = 3, 1e-6
+# Above this many readings neighbours are averaged.
+MAX_READINGS = 1 << 16
+# Repeats come from a monitor that is slower than its archive if they are half of the readings and
+# this share of the runs are multiples of one length, or if the usual change exceeds this many
+# digits.
+MIN_EQUAL_RUNS, MAX_CHANGE_DIGITS = 0.95, 3.0
+# Runs longer than usual by this factor are kept: there the monitor is stuck.
+LONG_RUN_FACTOR = 5
+# Shortest step of a staircase, in readings; tolerance, in digits, to which steps are equal.
+MIN_STAIR_READINGS, DIGIT_TOLERANCE = 3, 1e-6
 
 
 def without_repeats(record: DecayRecord) -> DecayRecord:
-    """Leave out readings that repeat the one before where the monitor is slower than its archive:
-    they are late, and a curve through them lies half a step too high.
+    """Leave out readings that repeat the one before if the monitor is slower than its archive.
+
+    Repeats are late: a curve through them lies half a step too high.
     """
     fresh = np.diff(record.current, prepend=np.nan) != 0
     first = np.flatnonzero(fresh)
     runs = np.diff(first, append=fresh.size)
-    usual = int(np.median(runs))
-    if not FEWEST <= first.size <= len(record) / 2 or usual < 2:
+    usual_run = int(np.median(runs))
+    if not MIN_READINGS <= first.size <= len(record) / 2 or usual_run < 2:
         return record
     change = float(np.median(np.abs(np.diff(record.current[first]))))
-    kept = fresh | np.repeat(runs > STANDS * usual, runs)
+    kept = fresh | np.repeat(runs > LONG_RUN_FACTOR * usual_run, runs)
     period = int(np.bincount(runs).argmax())
-    if period > 1 and np.mean(runs % period == 0) > EQUAL:
-        # Two values in a row may be equal by themselves.
+    if period > 1 and np.mean(runs % period == 0) > MIN_EQUAL_RUNS:
+        # Two fresh values in a row may be equal: keep one reading in each period.
         kept |= (np.arange(fresh.size) - np.repeat(first, runs)) % period == 0
-    elif record.resolution is not None and change <= DIGITS * record.resolution:
+    elif record.resolution is not None and change <= MAX_CHANGE_DIGITS * record.resolution:
         return record
     note = (
         f"{np.sum(~kept)} of {len(record)} readings repeat the one before to the last digit, as of "
@@ -192,9 +207,11 @@ def without_repeats(record: DecayRecord) -> DecayRecord:
 
 
 def without_summer_time(record: DecayRecord) -> DecayRecord:
-    """Take out the hour that a local clock skips in spring: between two readings an hour passes
-    besides the usual interval, and the current goes on as if it had not. Refills may hold a beam
-    over an hour that was not recorded: with them nothing is taken out.
+    """Take out the hour that a local clock skips in spring.
+
+    It is the one interval longer than usual by an hour, while the current goes on as if it had not
+    passed. A record with refills is left as it is: a refill in an hour without readings looks the
+    same.
 
     Examples
     --------
@@ -205,10 +222,10 @@ def without_summer_time(record: DecayRecord) -> DecayRecord:
     """
     interval = np.diff(record.time)
     usual = float(np.median(interval))
-    found = np.flatnonzero(np.abs(interval - usual - HOUR) < SAME * usual) + 1
-    if found.size != 1 or not WINDOW <= found[0] <= len(record) - WINDOW:
+    skips = np.flatnonzero(np.abs(interval - usual - HOUR) < HOUR_TOLERANCE * usual) + 1
+    if skips.size != 1 or not WINDOW <= skips[0] <= len(record) - WINDOW:
         return record
-    after, at = int(found[0]), float(record.time[found[0] - 1])
+    after, at = int(skips[0]), float(record.time[skips[0] - 1])
     since = np.where(record.time > at, record.time - HOUR, record.time)
     sides = slice(after - WINDOW, after), slice(after, after + WINDOW)
     lines = [np.polyfit(since[side] - at, record.current[side], 1) for side in sides]
@@ -224,22 +241,24 @@ def without_summer_time(record: DecayRecord) -> DecayRecord:
     return replace(record, time=since, notes=(*record.notes, note))
 
 
-def on_edges(record: DecayRecord, fewest: int = FEWEST, lasting: int = STAIR) -> DecayRecord:
-    """Take the edges between the digits of a monitor that has less noise than a digit.
+def on_edges(
+    record: DecayRecord, fewest: int = MIN_READINGS, lasting: int = MIN_STAIR_READINGS
+) -> DecayRecord:
+    """Reduce the staircase of a monitor with coarse digits and low noise to the edges of its steps.
 
     Parameters
     ----------
     record : DecayRecord
-        One decay. One that is no staircase of single digits, or has errors, is given back.
+        One decay. It is returned unchanged if it is no staircase of single digits, or has errors.
     fewest, lasting : int
-        Steps that it has at least, and readings that one lasts.
+        Smallest number of steps, and smallest median length of a step in readings.
 
     Returns
     -------
     DecayRecord
-        Half a digit between both readings of each step. The readings themselves are off by up to
-        half a digit for as long as a step lasts, as of noise with a memory; the edges are off by
-        what the beam loses between two readings.
+        One reading for each step: in time between its two readings, in current between the two
+        digits. The readings themselves are wrong by up to half a digit for as long as a step lasts,
+        like correlated noise; the edges are wrong by the loss between two readings.
 
     Examples
     --------
@@ -253,42 +272,43 @@ def on_edges(record: DecayRecord, fewest: int = FEWEST, lasting: int = STAIR) ->
     edge = np.flatnonzero(np.diff(falling))
     if edge.size < fewest:
         return record
-    # Readings that go to and fro at an edge are as many above it as if they did not.
-    apart = np.abs(np.concatenate([np.diff(record.current), record.current - falling]))
-    single = np.abs(np.diff(falling)[edge] + digit) < ROUNDING * digit
-    steady = apart.max() <= (1 + ROUNDING) * digit and single.all()
-    lasts = np.diff(edge)
-    if not steady or np.median(lasts) < lasting:
+    # Sorting undoes readings that go to and fro at an edge: their number above it is the same.
+    departures = np.abs(np.concatenate([np.diff(record.current), record.current - falling]))
+    single = np.abs(np.diff(falling)[edge] + digit) < DIGIT_TOLERANCE * digit
+    steady = departures.max() <= (1 + DIGIT_TOLERANCE) * digit and single.all()
+    lengths = np.diff(edge)
+    if not steady or np.median(lengths) < lasting:
         return record
     note = f"Steps of {digit:.3g} mA with little noise: the edges between them were fitted."
-    at = record.select(edge)
+    edges = record.select(edge)
     middle = (record.time[edge] + record.time[edge + 1]) / 2
     return replace(
-        at, time=middle, current=(falling[edge] + falling[edge + 1]) / 2,
+        edges, time=middle, current=(falling[edge] + falling[edge + 1]) / 2,
         start=None if record.start is None else record.start + float(middle[0]),
-        notes=(*record.notes, note), mean=record.mean_current, digit=digit / np.median(lasts),
+        notes=(*record.notes, note), mean=record.mean_current, digit=digit / np.median(lengths),
     )  # fmt: skip
 
 
 def thinned(record: DecayRecord) -> DecayRecord:
-    """Average neighbours of a long decay in equal blocks, up to 65536.
+    """Average neighbours of a long decay in equal blocks, at most 65536 of them.
 
     Parameters
     ----------
     record : DecayRecord
-        One decay: means across a refill are of neither side. A short one is given back.
+        One decay without refills. A short one is returned unchanged.
 
     Returns
     -------
     DecayRecord
         Means of time, current and conditions of each block; errors are those of a mean of
-        independent readings. Single readings far off, as of spikes and dropouts, and blocks across
-        a gap do not enter. `notes` says how many were averaged.
+        independent readings. Single outliers, such as spikes and dropouts, and blocks across a gap
+        are left out. `notes` says how many readings were averaged.
 
     Notes
     -----
-    Over a block of length d a decay of lifetime T bends by (d/T)²/24 of the current, 1e-9 for the
-    8 s of a week's blocks at 15 h. Noise of a memory shorter than a block is white in the means.
+    Over a block of length d a decay of lifetime T bends by (d/T)²/24 of the current, 1e-9 for the 8
+    s of a week's blocks at 15 h. Noise with a correlation time below the block length is white in
+    the means.
 
     Examples
     --------
@@ -296,27 +316,27 @@ def thinned(record: DecayRecord) -> DecayRecord:
     >>> thinned(DecayRecord(t, 500 - t / 1e4)).notes
     ('The means of 4 readings each were fitted, of 200000 in all.',)
     """
-    size = -(-len(record) // MOST_READINGS)
+    size = -(-len(record) // MAX_READINGS)
     if size == 1:
         return record
     first = np.arange(0, len(record), size)
     count = np.diff(first, append=len(record))
     whole = len(record) // size * size
-    # In parts: all at once takes gigabytes.
-    blocks = np.array_split(record.current[:whole].reshape(-1, size), -(-whole // STRETCH))
-    off = [np.abs(part - np.median(part, axis=1, keepdims=True)) for part in blocks]
-    spread = [1.4826 * np.median(part, axis=1) for part in off]
+    # In chunks: all at once would take gigabytes.
+    blocks = np.array_split(record.current[:whole].reshape(-1, size), -(-whole // CHUNK))
+    departures = [np.abs(part - np.median(part, axis=1, keepdims=True)) for part in blocks]
+    spread = [1.4826 * np.median(part, axis=1) for part in departures]
     kept = np.ones(len(record), bool)
     limit = THRESHOLD * max(float(np.median(np.concatenate(spread))), record.resolution or 0.0)
-    pairs = zip(off, spread, strict=True)
-    within = [part <= np.maximum(THRESHOLD * own, limit)[:, None] for part, own in pairs]
-    kept[:whole] = np.concatenate(within).ravel()
+    pairs = zip(departures, spread, strict=True)
+    near = [part <= np.maximum(THRESHOLD * own, limit)[:, None] for part, own in pairs]
+    kept[:whole] = np.concatenate(near).ravel()
     spans = record.time[first + count - 1] - record.time[first]
-    even = spans <= GAP * np.median(spans)  # means across a gap are on no curve
+    compact = spans <= GAP * np.median(spans)  # means across a gap lie on no curve
     count = np.maximum(np.add.reduceat(kept.astype(int), first), 1)
 
     def mean(values: np.ndarray) -> np.ndarray:
-        return (np.add.reduceat(values * kept, first) / count)[even]
+        return (np.add.reduceat(values * kept, first) / count)[compact]
 
     error = record.error
     conditions = {name: mean(values) for name, values in record.conditions.given.items()}
@@ -324,7 +344,7 @@ def thinned(record: DecayRecord) -> DecayRecord:
     time = mean(record.time)
     return replace(
         record, time=time, current=mean(record.current), digit=None,
-        error=None if error is None else np.sqrt(mean(error**2) / count[even]),
+        error=None if error is None else np.sqrt(mean(error**2) / count[compact]),
         start=None if record.start is None else record.start + float(time[0]),
         conditions=Conditions(**conditions), notes=(*record.notes, note),
     )  # fmt: skip

@@ -17,10 +17,12 @@ from beamfit.quantity import HOUR
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-# mA. The ISR of CERN stored 57 A of protons, more than any ring before or since.
-MOST_CURRENT = 1e5
-# Beyond these a column is in another unit than its name says: RF voltages up to LEP's 3.6 GV, a
-# scraper from 0.1 mm, a vacuum in which a beam can be stored.
+# Largest beam current, mA. The ISR of CERN stored 57 A of protons, more than any ring before or
+# since.
+MAX_CURRENT = 1e5
+# Plausible ranges of the conditions; outside them a column is in another unit than its name says.
+# RF voltages reach 3.6 GV (LEP), scrapers stand 0.1 mm or more from the beam, and the pressures are
+# those at which a beam can be stored.
 PLAUSIBLE = {
     "rf_voltage": (1e3, 4e9, "V"),
     "scraper_y": (1e-4, 0.5, "m"),
@@ -60,21 +62,21 @@ class Conditions(NamedTuple):
 
     @property
     def given(self) -> dict[str, np.ndarray]:
-        """Columns of the file, by name."""
+        """Columns that the file gives, by name."""
         return {name: values for name, values in self._asdict().items() if values is not None}
 
 
 class Fault(NamedTuple):
-    """The first thing wrong with a record's numbers.
+    """The first fault in a record's numbers.
 
     Attributes
     ----------
     row : int
         Index of the reading.
     quantity : str
-        Which of `time`, `current`, `error`, or a name in `Conditions`.
+        `time`, `current`, `error`, or a name in `Conditions`.
     found, expected : str
-        For the error message.
+        Text for the error message.
     """
 
     row: int
@@ -84,11 +86,15 @@ class Fault(NamedTuple):
 
 
 def _first(bad: np.ndarray) -> int | None:
+    """Index of the first true value, None if there is none."""
     return int(np.argmax(bad)) if bad.any() else None
 
 
 def _unit_change(current: np.ndarray) -> int | None:
-    """Row at which the unit switches between A and mA: by 1000, and the decay goes on there."""
+    """Row at which the unit switches between A and mA.
+
+    The current jumps by a factor of 1000, and the decay continues from there.
+    """
     low, high = 2.99, 3.01
     if np.max(current) < 10**low * np.min(current):
         return None
@@ -97,16 +103,16 @@ def _unit_change(current: np.ndarray) -> int | None:
         np.abs(np.log10(decades, out=decades), out=decades)
     for row in np.flatnonzero((decades > low) & (decades < high)) + 1:
         before, after = np.median(current[max(row - 3, 0) : row]), current[row : row + 3]
-        # The noise after a dump is by chance a thousandth once, not again and again.
+        # After a dump a single noisy reading may be a thousandth by chance, not several.
         with np.errstate(divide="ignore", invalid="ignore"):
-            stays = np.abs(np.abs(np.log10(after / before)) - 3) < 0.05
-        if stays.size > 1 and stays.all():
+            stays_there = np.abs(np.abs(np.log10(after / before)) - 3) < 0.05
+        if stays_there.size > 1 and stays_there.all():
             return int(row)
     return None
 
 
 def _odd_setting(conditions: Conditions) -> Fault | None:
-    """A setting that is negative, or no machine has in the unit of its column."""
+    """Find a setting that is negative, or implausible in the unit of its column."""
     for name, values in conditions.given.items():
         low, high, unit = PLAUSIBLE[name]
         if (row := _first(values < 0)) is not None:
@@ -124,7 +130,7 @@ def _odd_setting(conditions: Conditions) -> Fault | None:
 def first_fault(
     time: np.ndarray, current: np.ndarray, error: np.ndarray | None, conditions: Conditions
 ) -> Fault | None:
-    """Find the first number that no record of a stored beam can hold.
+    """Find the first number that no record of a stored beam can contain.
 
     Parameters
     ----------
@@ -146,8 +152,8 @@ def first_fault(
     >>> first_fault(np.array([0.0, 1.0, 1.0]), np.ones(3), None, Conditions()).found
     'time 1 s after 1 s'
     """
-    named = {"time": time, "current": current} | ({} if error is None else {"error": error})
-    for name, values in (named | conditions.given).items():
+    columns = {"time": time, "current": current} | ({} if error is None else {"error": error})
+    for name, values in (columns | conditions.given).items():
         if (row := _first(~np.isfinite(values))) is not None:
             return Fault(row, name, f"{values[row]}", "a finite number")
     if (row := _first(np.append(False, time[1:] <= time[:-1]))) is not None:
@@ -156,7 +162,7 @@ def first_fault(
     if (row := _first(current < 0)) is not None:
         found = f"a negative current, {current[row]:.6g} mA"
         return Fault(row, "current", found, NOT_NEGATIVE)
-    if (row := _first(current > MOST_CURRENT)) is not None:
+    if (row := _first(current > MAX_CURRENT)) is not None:
         found = f"a current of {1e-3 * current[row]:.6g} A, more than any ring has stored"
         return Fault(row, "current", found, "mA: are these readings in mA or µA?")
     if error is not None and (row := _first(error <= 0)) is not None:
@@ -171,14 +177,14 @@ def first_fault(
 
 @shown
 class Monitor(NamedTuple):
-    """One standard deviation of what moves all readings of a record together.
+    """Stability of a current monitor: standard deviations of errors common to all readings.
 
     Attributes
     ----------
     drift : float
-        Of a straight drift, mA/h.
+        Linear drift, mA/h.
     offset : float
-        Of the reading without beam, mA.
+        Reading without beam, mA.
 
     Examples
     --------
@@ -190,17 +196,17 @@ class Monitor(NamedTuple):
     offset: float = 0.0
 
     def check(self) -> None:
-        """Refuse what is no stability; `InputError`."""
+        """Raise `InputError` unless both values are finite and not negative."""
         for name, value in self._asdict().items():
             if not 0 <= value < np.inf:
                 raise InputError(f"monitor {name} {value}", "zero or more", column=name)
 
     def beside(self, other: Monitor | None) -> Monitor:
-        """Add the knowledge of one monitor from two sources in quadrature."""
+        """Combine two independent statements on one monitor, in quadrature."""
         return self if other is None else Monitor(*map(float, np.hypot(self, other)))
 
     def changes(self, time: np.ndarray) -> dict[str, np.ndarray]:
-        """Change of the readings at times in s, mA, by its cause in words."""
+        """Changes of the readings at times in s, mA, by their cause in words."""
         found = {}
         if self.drift:
             found[f"drifts by {1e3 * self.drift:.4g} µA/h"] = self.drift / HOUR * time
@@ -210,20 +216,21 @@ class Monitor(NamedTuple):
 
     def __str__(self) -> str:
         drift, offset = (f"{1e3 * value:.4g} µA" for value in self)
-        said = [f"drifts by {drift}/h"] if self.drift else []
-        said += [f"is off by {offset}"] if self.offset else []
-        return " and ".join(said) or "neither drifts nor is off"
+        parts = [f"drifts by {drift}/h"] if self.drift else []
+        parts += [f"is off by {offset}"] if self.offset else []
+        return " and ".join(parts) or "neither drifts nor is off"
 
 
+# Smallest number of points in a table of lifetimes.
 FEWEST_LIFETIMES = 4
-# A pressure that departs from P0 + P1 I by less than this share of the record's mean, on average
-# up to any time, follows the current.
+# A pressure follows the current if the integral of its departure from P0 + P1 I never exceeds this
+# share of the mean pressure times the span.
 FOLLOWS = 2e-3
 
 
 def _frozen(values: object, rows: int, quantity: str) -> np.ndarray:
     if isinstance(values, np.ndarray) and values.base is None and not values.flags.writeable:
-        array = np.asarray(values, float)  # that of another record
+        array = np.asarray(values, float)  # shared with another record
     else:
         array = np.array(values, float)
     if array.shape != (rows,):
@@ -247,7 +254,7 @@ class DecayRecord:
     error : array, shape (n,), optional
         Standard deviation of each reading, mA. Without it the noise is inferred from the fit.
     name : str, optional
-        What to call the record in results: the file's name.
+        Name of the record in results: that of the file.
     start : float, optional
         Unix time of the first reading, s.
     conditions : Conditions, optional
@@ -255,13 +262,13 @@ class DecayRecord:
     comments : tuple of str, optional
         Provenance, as written in the file.
     notes : tuple of str, optional
-        What was done to its numbers, such as rows left out.
+        Changes made to its numbers, such as rows left out.
     monitor : Monitor, optional
         Stability of the current monitor, which errors of results then contain.
     mean : float, optional
-        Mean current, mA, where these readings stand for others; their own if not given.
+        Mean current, mA, if these readings stand for others; that of the readings by default.
     digit : float, optional
-        Step of the readings that these are a part of, mA, where these alone show none.
+        Step of the full record, mA, if these are too few of its readings to show it.
 
     Raises
     ------
@@ -318,7 +325,7 @@ class DecayRecord:
         )
 
     def to_frame(self) -> DataFrame:
-        """Give a pandas data frame, its columns named as in a file; `read_decay_record` takes it.
+        """Return a pandas data frame with the columns of a file; `read_decay_record` takes it.
 
         Raises
         ------
@@ -339,11 +346,11 @@ class DecayRecord:
         return str(self)
 
     def tables(self) -> tuple[Table, ...]:
-        """The first readings, to be shown."""
-        few = range(min(len(self), MOST_ROWS))
-        rows = [[f"{self.time[i]:.6g}", f"{self.current[i]:.6g}"] for i in few]
-        more = f"the first {len(few)} of {len(self)} readings" if len(few) < len(self) else ""
-        return (Table(str(self), ["time s", "beam current mA"], rows, more, numeric=True),)
+        """Build the table of the first readings."""
+        count = min(len(self), MOST_ROWS)
+        rows = [[f"{self.time[i]:.6g}", f"{self.current[i]:.6g}"] for i in range(count)]
+        caption = f"the first {count} of {len(self)} readings" if count < len(self) else ""
+        return (Table(str(self), ["time s", "beam current mA"], rows, caption, numeric=True),)
 
     @property
     def span(self) -> float:
@@ -352,28 +359,28 @@ class DecayRecord:
 
     @property
     def mean_current(self) -> float:
-        """The current that a mean lifetime is quoted at, mA."""
+        """Current at which the mean lifetime is quoted, mA."""
         return float(self.current.mean()) if self.mean is None else self.mean
 
     @cached_property
     def resolution(self) -> float | None:
-        """Step of a quantised reading, mA; None where readings lie at no multiples of one."""
+        """Step of a quantised reading, mA; None if the readings are not multiples of one."""
         return digit_of(self.current) or self.digit
 
     @cached_property
     def gauge(self) -> np.ndarray | None:
-        """Integral of the pressure over its mean, s, where it does not follow the current.
+        """Integral of the pressure over its mean, s, if the pressure does not follow the current.
 
-        None where no pressure is given, or it is P0 + P1 I with positive P0 to within `FOLLOWS`
-        or the last digit of the gauge: the beam's own gas is part of a, as in the report.
+        None if no pressure is given, or if it is P0 + P1 I with positive P0 to within `FOLLOWS` or
+        the last digit of the gauge: the beam's own gas is then part of a, as in the report.
         """
         pressure = self.conditions.pressure
         if pressure is None or not pressure.mean() > 0:
             return None
         slope, base = np.polyfit(self.current, pressure, 1)
-        off = pressure - base - slope * self.current
-        follows = np.abs(self.integral(off)).max() < FOLLOWS * pressure.mean() * self.span
-        if base > 0 and (follows or np.abs(off).max() < (digit_of(pressure) or 0.0)):
+        departure = pressure - base - slope * self.current
+        follows = np.abs(self.integral(departure)).max() < FOLLOWS * pressure.mean() * self.span
+        if base > 0 and (follows or np.abs(departure).max() < (digit_of(pressure) or 0.0)):
             return None
         return self.integral(pressure / self.integral(pressure)[-1] * self.span)
 
@@ -392,8 +399,10 @@ class DecayRecord:
     def means(
         self, size: int, law: Callable[[np.ndarray], np.ndarray] | None = None
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-        """Time, current and its error as means of so many neighbours; readings that do not fill a
-        last block are left out. A law takes out by how much it bends within a block, as over a gap.
+        """Average time, current and its error over blocks of `size` neighbours.
+
+        Readings that do not fill the last block are left out. A `law` corrects for its own bend
+        within a block, which matters for a block with a gap.
 
         Examples
         --------
@@ -438,7 +447,7 @@ class DecayRecord:
         1000000060.0
         """
         time = self.time[rows]
-        moved = None if self.start is None or not time.size else self.start + float(time[0])
+        start = None if self.start is None or not time.size else self.start + float(time[0])
         return replace(
             self,
             mean=None,
@@ -447,7 +456,7 @@ class DecayRecord:
             current=self.current[rows],
             error=None if self.error is None else self.error[rows],
             name=self.name if name is None else name,
-            start=moved,
+            start=start,
             conditions=Conditions(**{n: v[rows] for n, v in self.conditions.given.items()}),
         )
 
@@ -462,13 +471,13 @@ class LifetimeTable:
     current : array, shape (n,)
         Beam current, mA.
     lifetime : array, shape (n,)
-        Lifetime there, h.
+        Lifetime at each current, h.
     error : array, shape (n,), optional
         Standard deviation of each lifetime, h.
     name : str, optional
-        What to call it.
+        Name of the table in results.
     comments, notes : tuple of str, optional
-        Provenance, and what was done to its numbers.
+        Provenance, and changes made to its numbers.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""A storage ring, its settings, and the bunch that its RF holds: plain values, pytrees for JAX."""
+"""Storage ring, its settings, and the bunch in its RF bucket: plain values, pytrees for JAX."""
 
 from __future__ import annotations
 
@@ -17,10 +17,11 @@ from beamfit.particles import REST_ENERGY
 prepare_jax()
 
 # Largest relative momentum acceptance: an electron cannot lose more than its momentum.
-MOST = 0.99
+MAX_ACCEPTANCE = 0.99
+# Classical electron radius, m.
 ELECTRON_RADIUS = constants.physical_constants["classical electron radius"][0]
 
-# Atoms in a molecule: the gases of an electron ring's residual-gas spectra.
+# Molecules of residual-gas spectra of electron rings: number of atoms by atomic number.
 MOLECULES = {
     "H2": {1: 2},
     "He": {2: 1},
@@ -37,9 +38,9 @@ MOLECULES = {
 
 @shown
 class Optics(NamedTuple):
-    """Optical functions at points along the ring, and the share of the ring each stands for.
+    """Optical functions at points along the ring, each with its share of the circumference.
 
-    One point with ring averages is as good a value as thousands of slices.
+    A single point with ring averages is valid, as are thousands of slices.
 
     Attributes
     ----------
@@ -66,13 +67,13 @@ class Optics(NamedTuple):
     slope_y: jax.Array
 
     def average(self, values: jax.Array) -> jax.Array:
-        """Average over the ring of a quantity given at each point."""
+        """Average of a quantity over the ring, from its value at each point."""
         return jnp.sum(self.weight * values)
 
 
 @shown
 class Ring(NamedTuple):
-    """A storage ring as the loss mechanisms see it.
+    """Parameters of a storage ring that determine its beam losses.
 
     Attributes
     ----------
@@ -91,10 +92,10 @@ class Ring(NamedTuple):
     emittance_x, emittance_y : float
         Emittances, m rad.
     momentum_acceptance : float or array, shape (n,) or (2, n)
-        Momentum acceptance of the lattice without RF, relative, up and down where they differ;
-        infinite if the RF alone limits.
+        Relative momentum acceptance of the lattice without RF, for positive and negative
+        deviations if they differ; infinite if only the RF limits it.
     acceptance_y : float
-        Vertical acceptance of the chamber, m rad; infinite if the scraper alone limits.
+        Vertical acceptance of the chamber, m rad; infinite if only the scraper limits it.
     scraper_beta_y : float
         Vertical Twiss beta at the scraper, m.
     damping_time_y, damping_time_z : float
@@ -137,14 +138,14 @@ class Ring(NamedTuple):
 
 @shown
 class Gas(NamedTuple):
-    """Atoms of the residual gas, element by element.
+    """Composition of the residual gas by element.
 
     Attributes
     ----------
     charge : array, shape (k,)
         Atomic number.
     atoms : array, shape (k,)
-        Atoms of the element for each molecule of the mixture.
+        Number of atoms of the element per molecule of the mixture.
     """
 
     charge: jax.Array
@@ -153,17 +154,18 @@ class Gas(NamedTuple):
 
 @shown
 class HarmonicCavity(NamedTuple):
-    """A cavity at a harmonic of the main RF.
+    """Cavity at a harmonic of the main RF.
 
     Attributes
     ----------
     number : float
-        Its frequency over that of the main RF.
+        Frequency over that of the main RF.
     voltage : float
         Peak voltage, V.
     phase : float
-        Phase at the bunch, rad: it gains voltage sin(phase). 0 is the crossing that lengthens the
-        bunch, pi the one that shortens it; a cavity without generator loses, its sine is negative.
+        Phase at the bunch, rad: the bunch gains voltage sin(phase). 0 is the zero crossing that
+        lengthens the bunch, pi the one that shortens it. In a cavity without generator the bunch
+        loses energy: the sine is negative.
     """
 
     number: jax.Array
@@ -173,7 +175,7 @@ class HarmonicCavity(NamedTuple):
 
 @shown
 class MeasuredLength(NamedTuple):
-    """A bunch length that is known, and taken as it is.
+    """Measured bunch length, which is used as it is.
 
     Attributes
     ----------
@@ -182,9 +184,10 @@ class MeasuredLength(NamedTuple):
     length : array, shape (k,)
         Rms length at each, m; linear in between and constant below.
     exponent : float
-        Power of the current with which it grows above the last of them.
+        Exponent of the growth with current above the last of them.
     voltage : float
-        RF voltage at which it holds, V; at others it changes as the length at zero current.
+        RF voltage of the measurement, V; at other voltages the length scales as that at zero
+        current.
     """
 
     current: jax.Array
@@ -195,7 +198,7 @@ class MeasuredLength(NamedTuple):
 
 @shown
 class Operation(NamedTuple):
-    """The settings an operator can change, and the vacuum that results.
+    """Settings of an operator, and the vacuum.
 
     Attributes
     ----------
@@ -204,7 +207,7 @@ class Operation(NamedTuple):
     scraper_y : float
         Distance from the beam to the nearer vertical scraper jaw, m; infinite if there is none.
     bunches : float
-        Number of equally filled bunches, or of those that would lose as much.
+        Number of equal bunches, or of equal bunches with the same Touschek loss.
     pressure_base : float
         Pressure without beam, Pa.
     pressure_slope : float
@@ -214,14 +217,14 @@ class Operation(NamedTuple):
     gas : Gas
         Composition of the residual gas.
     fill : array, shape (k,)
-        Charge of each bunch over that of one of `bunches` equal ones, so that their mean, weighted
-        with the charge, is 1.
+        Charge of each bunch in units of one of `bunches` equal bunches; their charge-weighted mean
+        is 1.
     bunch_length : MeasuredLength or None
-        The length where it is known; None to compute it.
+        Measured length; None to compute it.
     harmonic_cavity : HarmonicCavity or None
-        A second RF system.
+        Second RF system.
     stretch : float
-        By how much such a system lengthens the bunch, where only that is known.
+        Factor by which a second RF system lengthens the bunch, where only that is known.
     """
 
     rf_voltage: jax.Array
@@ -237,12 +240,11 @@ class Operation(NamedTuple):
     stretch: jax.Array = 1.0
 
 
-def unstored(operation: Operation, energy_loss: float, energy: float) -> str | None:
-    """Expected RF voltage, in words, if this one stores no beam of that loss and energy; or None.
+def required_voltage(operation: Operation, energy_loss: float, energy: float) -> str | None:
+    """Requirement on the RF voltage, in words, if it stores no beam; None if it does.
 
-    Loss and energy are in eV.
-
-    The main RF gives what a turn loses, less what the beam gains in a harmonic cavity.
+    The main RF must give the energy loss per turn, less the gain in a harmonic cavity. Energy loss
+    and energy are in eV.
     """
     cavity, voltage = operation.harmonic_cavity, np.asarray(operation.rf_voltage)
     gain = 0.0 if cavity is None else cavity.voltage * np.sin(cavity.phase)
@@ -255,7 +257,7 @@ def unstored(operation: Operation, energy_loss: float, energy: float) -> str | N
 
 
 def gas_mixture(**fractions: float) -> Gas:
-    """Residual gas from the share of each molecule in the pressure.
+    """Residual gas from partial pressures of molecules.
 
     Parameters
     ----------
@@ -265,7 +267,7 @@ def gas_mixture(**fractions: float) -> Gas:
     Returns
     -------
     Gas
-        Elements with their atoms for each molecule of the mixture.
+        Elements, with the number of their atoms per molecule of the mixture.
 
     Raises
     ------
@@ -293,14 +295,15 @@ def gas_mixture(**fractions: float) -> Gas:
 
 
 class Bunch(NamedTuple):
-    """The bunch that a bucket holds.
+    """Bunch in an RF bucket.
 
     Attributes
     ----------
     length : float
         Rms length, m.
     acceptance : float or array, shape (n,) or (2, n)
-        Momentum acceptance of bucket and lattice together, relative; up and down if they differ.
+        Relative momentum acceptance of bucket and lattice together, for positive and negative
+        deviations if they differ.
     """
 
     length: jax.Array
@@ -422,8 +425,8 @@ def lengthening(strength: Array) -> Array:
     >>> [round(float(lengthening(s)), 6) for s in (0.0, 6.0)]
     [1.0, 2.0]
     """
-    # Both bounds lie above the root, from where Newton's method falls to it without overshoot.
-    # Cut off from differentiation, or the cube root's infinite slope at zero would enter.
+    # Both upper bounds lie above the root, from where Newton's method converges monotonically.
+    # They are not differentiated: the cube root has an infinite slope at zero.
     fixed = jax.lax.stop_gradient(strength)
     ratio = jnp.minimum(1 + fixed / 2, 1 + jnp.cbrt(fixed))
     for _ in range(8):
@@ -454,7 +457,7 @@ def quantum_rate(acceptance: Array, emittance: Array, damping_time: Array) -> Ar
     >>> f"{1 / quantum_rate(30.0, 1.0, 5e-3):.0f}"
     '545'
     """
-    # Beyond this, as without any aperture, nothing is lost that a number could hold.
+    # Limited against overflow, as without an aperture; the loss is zero in floating point.
     xi = jnp.minimum(acceptance / (2 * emittance), 700.0)
     return 2 * xi * jnp.exp(-xi) / damping_time
 
@@ -470,18 +473,18 @@ def equal_bunches(bunch_currents: Array) -> Array:
     Returns
     -------
     float
-        (sum I)² / sum I²: between one and the number of filled buckets. It is what `bunches` of a
-        ring, a record or an operating point stands for.
+        (sum I)² / sum I²: between one and the number of filled buckets. This is the meaning of
+        `bunches` in a ring, a record or an operating point.
 
     Notes
     -----
-    A bunch loses in proportion to the square of its current (report equation 42), so the ring
-    loses (sum I²) / (sum I) of its current where equal bunches would lose I / M. Exact as long as
-    the bunches do not lengthen with their current.
+    The Touschek loss of a bunch goes with the square of its current (report equation 42), so the
+    ring loses in proportion to sum I², and M equal bunches to (sum I)²/M. Exact as long as the
+    bunches do not lengthen with their current.
 
     Examples
     --------
-    One camshaft bunch of 20 mA beside 240 bunches of 2 mA counts as much as 184 equal ones.
+    One camshaft bunch of 20 mA and 240 bunches of 2 mA lose as much as 184 equal bunches.
 
     >>> print(f"{equal_bunches([2.0] * 240 + [20.0]):.1f}")
     183.8
@@ -491,7 +494,7 @@ def equal_bunches(bunch_currents: Array) -> Array:
 
 
 def population(ring: Ring, bunch_current: Array) -> Array:
-    """Electrons in a bunch of the given current, mA.
+    """Number of electrons in a bunch.
 
     Parameters
     ----------
@@ -528,8 +531,8 @@ def bunch_in_bucket(
     bunch_current : float
         Current of one bunch, mA; it lengthens the bunch if the ring has an impedance.
     stretch : float, optional
-        By how much a second RF system lengthens the bunch. The impedance then acts in a linear
-        bucket of that length, more weakly by as much.
+        Factor by which a second RF system lengthens the bunch. The effect of the impedance is that
+        in a linear bucket of this length, which is weaker by the same factor.
 
     Returns
     -------
@@ -551,38 +554,41 @@ def bunch_in_bucket(
     strength = jnp.sqrt(jnp.pi) / 2 * bunch_current * 1e-3 * ring.impedance
     ratio = lengthening(strength / (ring.harmonic * slope * phase_spread**3 * stretch))
     length = natural * stretch * ratio
-    return Bunch(length, within_lattice(ring, rf_acceptance(*bucket)))
+    return Bunch(length, limit_acceptance(ring, rf_acceptance(*bucket)))
 
 
-def within_lattice(ring: Ring, height: Array) -> Array:
-    """The momentum acceptance that bucket and lattice leave; no electron loses more than it has."""
-    return jnp.minimum(jnp.minimum(height, MOST), ring.momentum_acceptance)
+def limit_acceptance(ring: Ring, height: Array) -> Array:
+    """Momentum acceptance of a bucket of this height and of the lattice together."""
+    return jnp.minimum(jnp.minimum(height, MAX_ACCEPTANCE), ring.momentum_acceptance)
 
 
 def stored_bunch(ring: Ring, operation: Operation, current: Array) -> Bunch:
-    """The bunches of a beam of a current in mA, any shape: the length is that of equal bunches
-    which lose as much, the loss of each being its charge squared over its length.
+    """Bunch that represents all bunches of a beam.
+
+    Its length is that of equal bunches with the same Touschek loss, which goes with charge squared
+    over length. The current, mA, may be an array.
     """
     voltage, charge = operation.rf_voltage, jnp.asarray(operation.fill, float)
-    each = jnp.asarray(current, float)[..., None] * charge / operation.bunches
-    plain = bunch_in_bucket(ring, voltage, 0.0)
-    acceptance, stretch = plain.acceptance, operation.stretch
+    bunch_current = jnp.asarray(current, float)[..., None] * charge / operation.bunches
+    natural = bunch_in_bucket(ring, voltage, 0.0)
+    acceptance, stretch = natural.acceptance, operation.stretch
     if operation.harmonic_cavity is not None:
         length, height = length_and_height(ring, voltage, operation.harmonic_cavity)
-        acceptance = within_lattice(ring, height)
-        stretch = length / plain.length
-    if (known := operation.bunch_length) is None:
-        lengths = bunch_in_bucket(ring, voltage, each, stretch).length
+        acceptance = limit_acceptance(ring, height)
+        stretch = length / natural.length
+    if (measured := operation.bunch_length) is None:
+        lengths = bunch_in_bucket(ring, voltage, bunch_current, stretch).length
     else:
-        there = bunch_in_bucket(ring, known.voltage, 0.0).length
-        above = jnp.maximum(each / known.current[-1], 1.0) ** known.exponent
-        lengths = jnp.interp(each, known.current, known.length) * above * plain.length / there
+        natural_then = bunch_in_bucket(ring, measured.voltage, 0.0).length
+        growth = jnp.maximum(bunch_current / measured.current[-1], 1.0) ** measured.exponent
+        lengths = jnp.interp(bunch_current, measured.current, measured.length) * growth
+        lengths = lengths * natural.length / natural_then
     weight = charge**2 / jnp.sum(charge)
     return Bunch(1 / jnp.sum(weight / lengths, axis=-1), acceptance)
 
 
-def up_and_down(ring: Ring, acceptance: Array) -> Array:
-    """A momentum acceptance at every point, up and down in momentum, shape (2, n)."""
+def acceptance_by_sign(ring: Ring, acceptance: Array) -> Array:
+    """Momentum acceptance at every point for positive and negative deviations, shape (2, n)."""
     return jnp.broadcast_to(acceptance, (2, ring.optics.weight.size))
 
 
@@ -614,7 +620,7 @@ def vertical_acceptance(chamber: Array, scraper: Array, scraper_beta_y: Array) -
 def quantum_loss(ring: Ring, operation: Operation, current: Array) -> Array:
     """Loss rate from quantum fluctuations in the vertical plane and in energy, 1/s."""
     aperture = vertical_acceptance(ring.acceptance_y, operation.scraper_y, ring.scraper_beta_y)
-    sides = up_and_down(ring, stored_bunch(ring, operation, current).acceptance)
+    sides = acceptance_by_sign(ring, stored_bunch(ring, operation, current).acceptance)
     energy = ring.optics.average(jnp.min(sides, axis=0)) ** 2
     return quantum_rate(aperture, ring.emittance_y, ring.damping_time_y) + quantum_rate(
         energy, ring.energy_spread**2, ring.damping_time_z
@@ -627,11 +633,11 @@ def length_and_height(ring: Ring, voltage: Array, cavity: HarmonicCavity) -> tup
     Parameters
     ----------
     ring : Ring
-        The ring; its `momentum_acceptance` and impedance are not used here.
+        The ring; its `momentum_acceptance` and impedance are not used.
     voltage : float
         Peak voltage of the main RF, V.
     cavity : HarmonicCavity
-        The second system.
+        Second RF system.
 
     Returns
     -------
@@ -643,8 +649,8 @@ def length_and_height(ring: Ring, voltage: Array, cavity: HarmonicCavity) -> tup
     The energy spread is Gaussian, whatever the potential well, so the density along the bunch is
     exp(W/(2 pi h alpha_c sigma_delta² E0)) with W the integral of V1 sin(phi_1 + phi) +
     V_h sin(phi_h + n phi) - U0 over the RF phase phi: J. Haissinski, Nuovo Cimento 18B (1973) 72;
-    A. Hofmann and S. Myers, CERN ISR-TH-RF/80-26 (1980). The bucket ends at the higher of the
-    lowest densities on both sides.
+    A. Hofmann and S. Myers, CERN ISR-TH-RF/80-26 (1980). The density has a minimum on either side
+    of the bunch; the bucket ends at the higher minimum.
 
     Examples
     --------
@@ -657,10 +663,10 @@ def length_and_height(ring: Ring, voltage: Array, cavity: HarmonicCavity) -> tup
     >>> print(f"{1e3 * length:.1f} mm")
     16.7 mm
     """
-    # The main RF's bucket and a quarter more, in halves of its width, fifty times closer at the
-    # bunch than on average; with the spacing there.
-    even = np.linspace(-1.0, 1.0, 4097)
-    phases, spacing = 1.25 * even * (0.02 + 0.98 * even**2), 0.02 + 3 * 0.98 * even**2
+    # Phases in half widths of the main RF's bucket, a quarter beyond it, fifty times denser at the
+    # bunch than on average; `spacing` is the quadrature weight.
+    uniform = np.linspace(-1.0, 1.0, 4097)
+    phases, spacing = 1.25 * uniform * (0.02 + 0.98 * uniform**2), 0.02 + 3 * 0.98 * uniform**2
     number, loss = cavity.number, ring.energy_loss
     main = jnp.pi - jnp.arcsin((loss - cavity.voltage * jnp.sin(cavity.phase)) / voltage)
     phase = phases * (2 * main - jnp.pi)
@@ -673,11 +679,11 @@ def length_and_height(ring: Ring, voltage: Array, cavity: HarmonicCavity) -> tup
     log = work / (2 * jnp.pi * ring.harmonic * spread)
     middle = phases.size // 2
     ends = jnp.argmin(log[:middle]), middle + jnp.argmin(log[middle:])
-    inside = (jnp.arange(phases.size) >= ends[0]) & (jnp.arange(phases.size) <= ends[1])
-    top = jnp.max(jnp.where(inside, log, -jnp.inf))
-    density = spacing * jnp.where(inside, jnp.exp(jnp.where(inside, log - top, 0.0)), 0.0)
+    in_bucket = (jnp.arange(phases.size) >= ends[0]) & (jnp.arange(phases.size) <= ends[1])
+    highest = jnp.max(jnp.where(in_bucket, log, -jnp.inf))
+    density = spacing * jnp.where(in_bucket, jnp.exp(jnp.where(in_bucket, log - highest, 0.0)), 0.0)
     mean = jnp.average(phase, weights=density)
     rms = jnp.sqrt(jnp.average((phase - mean) ** 2, weights=density))
-    depth = top - jnp.maximum(log[ends[0]], log[ends[1]])
+    depth = highest - jnp.maximum(log[ends[0]], log[ends[1]])
     length = rms * ring.circumference / (2 * jnp.pi * ring.harmonic)
     return length, ring.energy_spread * jnp.sqrt(2 * depth)

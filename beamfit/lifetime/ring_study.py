@@ -1,4 +1,4 @@
-"""A shift as one answer: scales, loss budget, best point, next decay, and what has changed."""
+"""Study of the decays of a shift: scales, loss budget, best settings, next decay, changes."""
 
 from __future__ import annotations
 
@@ -20,36 +20,37 @@ from beamfit.answer import Row, Table, answer, cell, json_of, labelled
 from beamfit.errors import Finding, InputError, Judged
 from beamfit.greybox.design import Information, scores
 from beamfit.lifetime.decay_law import current as beam_at
-from beamfit.lifetime.expansion import DETERMINED, Expansion, lifetime_of
+from beamfit.lifetime.expansion import MAX_RELATIVE_ERROR, Expansion, lifetime_of
 from beamfit.lifetime.fill_noise import quantiles
 from beamfit.lifetime.fit import bare
-from beamfit.lifetime.loss_network import VOLTAGES, NetworkFit, fit_loss_network
+from beamfit.lifetime.loss_network import N_VOLTAGES, NetworkFit, fit_loss_network
 from beamfit.lifetime.mechanisms import (
     MECHANISMS,
     SCALES,
     LossTerms,
     scaled_losses,
     scaled_parts,
-    terms_along,
+    terms_at_voltages,
 )
 from beamfit.lifetime.record import DecayRecord
 from beamfit.lifetime.ring import Operation
 from beamfit.lifetime.scales import (
-    LIKELY,
+    MENTION_PROBABILITY,
     VOLTAGE,
     DecaySet,
     ScaleFit,
     Summaries,
+    add_errors,
     fit_scales,
     information_root,
     loss_parts,
-    widened,
 )
 from beamfit.lifetime.study import Decay, Machine, settings_json, settings_of
 from beamfit.quantity import HOUR, Quantity, Status, percent
 from beamfit.sampling.posterior import Interval, Posterior
 from beamfit.statistics import CENTRAL, POOR_FIT, quantity_of_draws
 
+# Likely causes of a change of a, b, or both.
 CAUSES = {
     "a": "the bunch or the momentum acceptance changed, or the beam-induced pressure",
     "b": "a gas loss that the gauge does not see: a leak away from it, heavier gas, aperture",
@@ -58,22 +59,22 @@ CAUSES = {
 
 
 class Anomaly(NamedTuple):
-    """Mechanism that moved, and since when.
+    """Lasting change of a or b, and its start.
 
     Attributes
     ----------
     status : Status
-        `converged` if the decays follow the model, `poor_fit` if something moved.
+        `converged` if the decays follow the model, `poor_fit` if a or b changed.
     message : str
-        The verdict in a sentence.
+        Verdict in a sentence.
     since : str or None
         Name of the first decay after the change.
     moved : tuple of str
         "a", "b", both or none.
     a, b : Quantity
-        Relative change of a and b since then, in units of 1.
+        Relative change of a and b since then.
     probability : float
-        Chance of so large a change, at any time, if nothing moved.
+        Probability of a change as large, at any time, by chance.
     """
 
     status: Status
@@ -85,29 +86,38 @@ class Anomaly(NamedTuple):
     probability: float
 
 
-def _linearised(fit: ScaleFit, decays: Sequence[Decay]) -> tuple[np.ndarray, np.ndarray]:
-    """Later decays beside each of the noises that earlier ones may have, whitened with the errors
-    of scales and pressures: readings minus model, (k, 2n), and their slopes by relative changes of
-    a and of b of each decay, (k, 2n, n, 2).
+def _whitened_residuals(fit: ScaleFit, decays: Sequence[Decay]) -> tuple[np.ndarray, np.ndarray]:
+    """Residuals of later decays against the fit, whitened under each noise of the fit.
+
+    The errors of scales and pressures and the scatter are part of the covariance.
+
+    Returns
+    -------
+    residuals : array, shape (k, 2n)
+        Measurement minus model.
+    slopes : array, shape (k, 2n, n, 2)
+        Slopes by relative changes of a and of b of each decay.
     """
-    together = DecaySet.of(decays, fit.machine, fit.decays.pressure_error, fit.voltages)
-    _, off, rows, change = fit.about(together)
+    later = DecaySet.of(decays, fit.machine, fit.decays.pressure_error, fit.voltages)
+    _, residuals, rows, change = fit.linearise(later)
     count, noise, found = 2 * len(decays), fit.noise, []
-    whole = block_diag(*change).reshape(count, -1, 2)
+    loss_slopes = block_diag(*change).reshape(count, -1, 2)
     for k in range(noise.weight.size):
-        by_scales = (rows @ noise.half[k]).reshape(count, -1)
-        scattered = (whole * noise.scatter[k]).reshape(count, -1)
-        moved = (off + rows @ (noise.shift[k] - noise.centre)).ravel()
-        whiten = np.asarray(widened(np.eye(count), np.hstack([by_scales, scattered])))
-        found.append((-whiten @ moved, np.tensordot(whiten, whole, 1)))
+        by_scales = (rows @ noise.covariance_root[k]).reshape(count, -1)
+        scattered = (loss_slopes * noise.scatter[k]).reshape(count, -1)
+        shifted = (residuals + rows @ (noise.shift[k] - noise.centre)).ravel()
+        whiten = np.asarray(add_errors(np.eye(count), np.hstack([by_scales, scattered])))
+        found.append((-whiten @ shifted, np.tensordot(whiten, loss_slopes, 1)))
     return tuple(map(np.array, zip(*found, strict=True)))
 
 
-def _fitted(off: np.ndarray, change: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Fall of chi², the changes that bring it, and their covariance, by noise."""
-    turned = np.swapaxes(change, 1, 2)
-    covariance = np.linalg.pinv(turned @ change)
-    score = np.einsum("kij,kj->ki", turned, off)
+def _fit_changes(
+    residuals: np.ndarray, slopes: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Reduction of chi², best changes, and their covariance, for each noise."""
+    transposed = np.swapaxes(slopes, 1, 2)
+    covariance = np.linalg.pinv(transposed @ slopes)
+    score = np.einsum("kij,kj->ki", transposed, residuals)
     found = np.einsum("kij,kj->ki", covariance, score)
     return np.sum(found * score, axis=1), found, covariance
 
@@ -118,14 +128,14 @@ def find_anomaly(fit: ScaleFit, decays: Sequence[Decay]) -> Anomaly:
     Parameters
     ----------
     fit : ScaleFit
-        Model fitted to earlier decays, taken to be in order.
+        Model fitted to earlier decays, which are taken as normal.
     decays : sequence of Decay
         Later decays, in order of time.
 
     Returns
     -------
     Anomaly
-        The change and its start that explain the decays best, if chance does not.
+        Most probable change and its start, if chance does not explain the decays.
 
     Raises
     ------
@@ -134,49 +144,49 @@ def find_anomaly(fit: ScaleFit, decays: Sequence[Decay]) -> Anomaly:
 
     Notes
     -----
-    For each possible start, the relative changes of a and b from there on are fitted by linear
-    least squares with the covariance of readings, scatter, pressure gauge and scales. The fall of
-    chi² has two degrees of freedom; its probability, averaged over the noise that the earlier
-    decays leave open, is multiplied by the number of starts. A pressure
-    rise that the gauge shows is part of the model and no anomaly.
+    For each possible start, relative changes of a and b from there on are fitted by linear least
+    squares with the covariance of readings, scatter, pressure gauge and scales. The reduction of
+    chi² has two degrees of freedom; its probability, averaged over the noises of the fit, is
+    multiplied by the number of starts. A pressure rise that the gauge shows is part of the model.
     """
     if not decays:
         raise InputError("no decay", "one or more to compare with the model")
-    # A fall of chi² by two numbers has the probability exp(-fall/2), averaged over the noise.
-    (off, change), weight = _linearised(fit, decays), fit.noise.weight
-    since = [change[:, :, first:].sum(axis=2) for first in range(len(decays))]
-    trials = [_fitted(off, one) for one in since]
-    logs = [logsumexp(np.log(weight) - fall / 2) for fall, *_ in trials]
+    # A reduction of chi² by two parameters has the probability exp(-reduction/2).
+    (residuals, slopes), weight = _whitened_residuals(fit, decays), fit.noise.weight
+    since = [slopes[:, :, first:].sum(axis=2) for first in range(len(decays))]
+    trials = [_fit_changes(residuals, step) for step in since]
+    logs = [logsumexp(np.log(weight) - reduction / 2) for reduction, *_ in trials]
     best = int(np.argmin(logs))
-    chance = min(1.0, len(decays) * math.exp(logs[best]))
-    falls, found, covariance = trials[best]
-    middle = weight @ found
-    spread = np.diagonal(covariance, axis1=1, axis2=2) + (found - middle) ** 2
+    probability = min(1.0, len(decays) * math.exp(logs[best]))
+    reductions, found, covariance = trials[best]
+    mean = weight @ found
+    spread = np.diagonal(covariance, axis1=1, axis2=2) + (found - mean) ** 2
     error = np.sqrt(weight @ spread)
-    a, b = (Quantity(float(v), float(e), "1") for v, e in zip(middle, error, strict=True))
-    if chance > POOR_FIT:
-        message = f"{len(decays)} decays follow the model (p = {chance:.2g})."
-        return Anomaly(Status.converged, message, None, (), a, b, chance)
-    moved, begun = _moved(off, since[best], falls, weight), decays[best].fit.record
+    a, b = (Quantity(float(v), float(e), "1") for v, e in zip(mean, error, strict=True))
+    if probability > POOR_FIT:
+        message = f"{len(decays)} decays follow the model (p = {probability:.2g})."
+        return Anomaly(Status.converged, message, None, (), a, b, probability)
+    moved = _changed_names(residuals, since[best], reductions, weight)
+    start = decays[best].fit.record
     names = " and ".join(moved)
     changes = ", ".join(
         f"{name} by {100 * q.value:+.3g} ± {100 * q.error:.2g} %"
         for name, q in (("a", a), ("b", b))
         if name in moved
     )
-    message = f"{names} moved since {begun} ({changes}; p = {chance:.2g}): {CAUSES[names]}."
-    return Anomaly(Status.poor_fit, message, begun, moved, a, b, chance)
+    message = f"{names} moved since {start} ({changes}; p = {probability:.2g}): {CAUSES[names]}."
+    return Anomaly(Status.poor_fit, message, start, moved, a, b, probability)
 
 
-def _moved(
-    off: np.ndarray, change: np.ndarray, falls: np.ndarray, weight: np.ndarray
+def _changed_names(
+    residuals: np.ndarray, slopes: np.ndarray, reductions: np.ndarray, weight: np.ndarray
 ) -> tuple[str, ...]:
-    """Test if one of the two explains as much as both."""
-    alone = {name: _fitted(off, change[:, :, [k]])[0] for k, name in enumerate("ab")}
-    falls = {name: np.maximum(falls - own, 0.0) for name, own in alone.items()}
-    chance = {name: weight @ chdtrc(1.0, fall) for name, fall in falls.items()}
-    best = max(chance, key=chance.get)
-    return (best,) if chance[best] > POOR_FIT else ("a", "b")
+    """Names of what changed: a or b alone, if that explains the decays as well as both."""
+    alone = {name: _fit_changes(residuals, slopes[:, :, [k]])[0] for k, name in enumerate("ab")}
+    reductions = {name: np.maximum(reductions - own, 0.0) for name, own in alone.items()}
+    probability = {name: weight @ chdtrc(1.0, reduction) for name, reduction in reductions.items()}
+    best = max(probability, key=probability.get)
+    return (best,) if probability[best] > POOR_FIT else ("a", "b")
 
 
 def budget_intervals(
@@ -186,26 +196,26 @@ def budget_intervals(
     current: float,
     probability: float = 0.68,
 ) -> tuple[Interval, ...]:
-    """The loss budget at a setting, with credible intervals.
+    """Loss budget at a setting, with credible intervals.
 
     Parameters
     ----------
     fit : ScaleFit
-        The fit.
+        Fitted scales.
     sample : Posterior
-        Its draws.
+        Their draws.
     operation : Operation
         Settings and vacuum.
     current : float
         Beam current, mA.
     probability : float, optional
-        Of the intervals.
+        Probability of the intervals.
 
     Returns
     -------
     tuple of Interval
-        Loss rates 1/h by mechanism, a, b, and the lifetime h; NaN where only the limits of the
-        scales decide.
+        Loss rate of each mechanism, 1/h, a, b, and the lifetime, h; NaN where only the limits of
+        the scales determine them.
     """
     units = {m.name: "1/h" for m in MECHANISMS if m.vary}
     units |= {"a": "1/(mA s)", "b": "1/s", "lifetime": "h"}
@@ -217,13 +227,13 @@ def budget_intervals(
         parts = [HOUR * rates[name] for name in units if name in rates]
         return jnp.stack([*parts, losses.a, losses.b, 1 / _rate(scales, terms) / HOUR])
 
-    values = np.asarray(jax.vmap(rows)(jnp.asarray(sample.draws)))
-    ends = np.percentile(values, [50, 50 - 50 * probability, 50 + 50 * probability], axis=0)
-    told = fit.determines(rows)
-    found = np.where(told, ends, np.nan).T
+    draws = np.asarray(jax.vmap(rows)(jnp.asarray(sample.draws)))
+    ends = np.percentile(draws, [50, 50 - 50 * probability, 50 + 50 * probability], axis=0)
+    determined = fit.determines(rows)
+    found = np.where(determined, ends, np.nan).T
     return tuple(
-        Interval(name, *map(float, of), unit, bool(known))
-        for (name, unit), of, known in zip(units.items(), found, told, strict=True)
+        Interval(name, *map(float, values), unit, bool(known))
+        for (name, unit), values, known in zip(units.items(), found, determined, strict=True)
     )
 
 
@@ -233,23 +243,24 @@ def _rate(scales: Array, terms: LossTerms) -> Array:
     return a * terms.current + b
 
 
-# Means of neighbouring readings that stand for a decay that could be recorded.
-READINGS = 64
+# Number of readings, means of neighbours, that represent a possible decay: chosen, enough for its
+# curvature.
+CANDIDATE_READINGS = 64
 
 
 class DecayCandidate(NamedTuple):
-    """A decay that could be recorded.
+    """Decay that could be recorded next.
 
     Attributes
     ----------
     operation : Operation
         Settings and vacuum.
     current : float
-        Current at the start, mA.
+        Initial current, mA.
     duration : float
-        s.
+        Duration, s.
     noise : float
-        Standard deviation of the mean of what is read in 1/64 of the duration, mA.
+        Standard deviation of the mean of the readings in 1/64 of the duration, mA.
     """
 
     operation: Operation
@@ -259,7 +270,7 @@ class DecayCandidate(NamedTuple):
 
 
 class Proposal(NamedTuple):
-    """A candidate and what it would bring.
+    """Possible decay with the information it would bring.
 
     Attributes
     ----------
@@ -268,7 +279,8 @@ class Proposal(NamedTuple):
     information : float
         Logarithm of the factor by which the volume of the scales' error ellipsoid shrinks.
     errors : array, shape (4,)
-        Expected standard deviations of Touschek, bremsstrahlung, elastic, desorption afterwards.
+        Expected standard deviations of the scales Touschek, bremsstrahlung, elastic, desorption
+        with this decay.
     """
 
     candidate: DecayCandidate
@@ -276,38 +288,38 @@ class Proposal(NamedTuple):
     errors: np.ndarray
 
 
-def _rows(fit: ScaleFit, candidate: DecayCandidate) -> np.ndarray:
-    """Readings of the candidate predicted by the scales, over its errors, shape (2, scales)."""
+def _candidate_rows(fit: ScaleFit, candidate: DecayCandidate) -> np.ndarray:
+    """Slopes of the candidate's parts by the scales, in standard errors, shape (2, scales)."""
     terms = fit.terms_at(candidate.operation, candidate.current)
     a, b = map(float, scaled_losses(jnp.asarray(fit.vector), terms))
-    time = np.linspace(0.0, candidate.duration, READINGS)
+    time = np.linspace(0.0, candidate.duration, CANDIDATE_READINGS)
     beam = np.asarray(beam_at(time, candidate.current, a, b))
-    record = DecayRecord(time, beam, np.full(READINGS, candidate.noise))
+    record = DecayRecord(time, beam, np.full(CANDIDATE_READINGS, candidate.noise))
     mean, root = beam.mean(), information_root(Expansion.at(record, candidate.current, a, b))
     summary = Summaries(mean, loss_parts(a, b, mean), root)
-    one = terms._replace(current=mean), summary
-    alone = jax.tree.map(lambda part: jnp.asarray(part)[None], one)
-    one = DecaySet(*alone, fit.decays.pressure_error)
-    *_, [rows], [change] = fit.about(one)
-    # A new decay scatters as the likeliest noise says.
-    scattered = change * fit.noise.scatter[fit.noise.likeliest]
-    return np.asarray(widened(np.eye(2), scattered)) @ rows
+    candidate_set = terms._replace(current=mean), summary
+    batch = jax.tree.map(lambda part: jnp.asarray(part)[None], candidate_set)
+    candidate_set = DecaySet(*batch, fit.decays.pressure_error)
+    *_, [rows], [change] = fit.linearise(candidate_set)
+    # Scatter of a new decay: that of the most probable noise.
+    scattered = change * fit.noise.scatter[fit.noise.most_probable]
+    return np.asarray(add_errors(np.eye(2), scattered)) @ rows
 
 
 def next_decays(fit: ScaleFit, candidates: Sequence[DecayCandidate]) -> tuple[Proposal, ...]:
-    """Rank decays by what they would tell about the scales.
+    """Rank possible decays by the information on the scales that they would bring.
 
     Parameters
     ----------
     fit : ScaleFit
-        What is known so far.
+        Fit to the decays so far.
     candidates : sequence of DecayCandidate
-        What could be recorded.
+        Possible decays.
 
     Returns
     -------
     tuple of Proposal
-        The most informative first (D-optimality, in linear approximation).
+        Most informative decay first (D-optimality, in linear approximation).
 
     Raises
     ------
@@ -319,32 +331,32 @@ def next_decays(fit: ScaleFit, candidates: Sequence[DecayCandidate]) -> tuple[Pr
     for candidate in candidates:
         if not min(candidate.current, candidate.duration, candidate.noise) > 0:
             raise InputError(f"{candidate[1:]}", "current, duration and noise above zero")
-    # Of what is known of the scales so far their limits are a part, as a wide prior.
-    problem, one = fit.fit.problem, np.eye(fit.vector.size)
+    # The limits of the scales count as a wide prior.
+    problem, identity = fit.fit.problem, np.eye(fit.vector.size)
     with_prior = np.isin(problem.names, [prior.name for prior in problem.priors])
-    known = Information(
-        fit.fit.dense_jacobian, np.ones(1), one, np.ones(len(one), bool), problem.lower,
+    information = Information(
+        fit.fit.dense_jacobian, np.ones(1), identity, np.ones(len(identity), bool), problem.lower,
         problem.upper, with_prior=with_prior,
     )  # fmt: skip
-    rows = np.array([_rows(fit, candidate) for candidate in candidates])
-    [before] = scores(known, np.zeros((1, *rows.shape[1:])), volume=True)
-    gains = 0.5 * (before - scores(known, rows, volume=True))
+    rows = np.array([_candidate_rows(fit, candidate) for candidate in candidates])
+    [before] = scores(information, np.zeros((1, *rows.shape[1:])), volume=True)
+    gains = 0.5 * (before - scores(information, rows, volume=True))
     proposals = [
-        Proposal(candidate, float(gain), known.with_rows(own).error)
-        for candidate, own, gain in zip(candidates, rows, gains, strict=True)
+        Proposal(candidate, float(gain), information.with_rows(candidate_rows).error)
+        for candidate, candidate_rows, gain in zip(candidates, rows, gains, strict=True)
     ]
     return tuple(sorted(proposals, key=lambda proposal: -proposal.information))
 
 
 class Limits(NamedTuple):
-    """Lowest and highest value allowed of each setting.
+    """Lower and upper limit of each setting.
 
     Attributes
     ----------
     rf_voltage : (float, float)
-        V.
+        RF voltage, V.
     scraper_y : (float, float)
-        Distance from the beam, m.
+        Distance of the scraper from the beam, m.
     bunches : (float, float)
         Number of bunches.
     """
@@ -355,20 +367,21 @@ class Limits(NamedTuple):
 
 
 class BestPoint(NamedTuple):
-    """The settings of the longest lifetime.
+    """Settings of the longest lifetime.
 
     Attributes
     ----------
     rf_voltage : Quantity
-        V; its error is the spread of the best voltage over the posterior, at least the search's.
+        Best RF voltage, V. Its error is the spread of the best voltage over the posterior, and
+        contains the step of the search.
     scraper_y, bunches : float
-        m, and number: always the upper limits.
+        Distance of the scraper, m, and number of bunches: always the upper limits.
     lifetime : Quantity
-        Lifetime there, h; NaN where the decays do not tell it.
+        Lifetime at these settings, h; NaN where the decays do not determine it.
     usual : Quantity
-        Lifetime at the machine's usual settings, h; NaN where the decays do not tell it.
+        Lifetime at the machine's usual settings, h; NaN where the decays do not determine it.
     message : str
-        What limits it.
+        Sentence on what limits the voltage.
     """
 
     rf_voltage: Quantity
@@ -380,7 +393,7 @@ class BestPoint(NamedTuple):
 
     @property
     def status(self) -> Status:
-        """`unidentified` where the decays do not tell the lifetime there."""
+        """`unidentified` where the decays do not determine the lifetime there."""
         return Status.unidentified if self.lifetime.error is None else Status.converged
 
 
@@ -404,14 +417,14 @@ def best_operating_point(
     sample : Posterior
         Their draws.
     limits : Limits
-        What may be set.
+        Limits of the settings.
     current : float
-        Beam current to run at, mA.
+        Beam current, mA.
 
     Returns
     -------
     BestPoint
-        With the spread over the posterior.
+        Best settings, with the spread of the voltage over the posterior.
 
     Raises
     ------
@@ -433,54 +446,57 @@ def best_operating_point(
     if high <= loss:
         expected = f"more than the loss of {loss:.6g} V a turn, or no beam is stored"
         raise InputError(f"at most {high:.6g} V", expected, column="rf_voltage")
-    usual = fit.machine.operation
-    wide = usual._replace(scraper_y=limits.scraper_y[1], bunches=float(limits.bunches[1]))
+    operation = fit.machine.operation
+    open_settings = operation._replace(
+        scraper_y=limits.scraper_y[1], bunches=float(limits.bunches[1])
+    )
     low, draws = max(low, 1.01 * loss), sample.thinned()
-    # True voltages are looked at; what is set is a reading.
-    by = np.ones(len(draws)) if fit.voltages is None else draws[:, len(SCALES)]
-    ends = max(low * by.min(), 1.01 * loss), max(high, low) * by.max()
+    # The search is over true voltages; the setting is a reading.
+    ratio = np.ones(len(draws)) if fit.voltages is None else draws[:, len(SCALES)]
+    ends = max(low * ratio.min(), 1.01 * loss), max(high, low) * ratio.max()
     for _ in range(2):
-        at = np.linspace(*ends, VOLTAGES)
-        terms = terms_along(fit.machine.ring, wide, current, jnp.asarray(at))
-        true = at[np.argmin(jax.vmap(_rate, (0, None))(jnp.asarray(draws), terms), axis=1)]
-        step = at[1] - at[0]
-        ends = max(at[0], true.min() - step), min(at[-1], true.max() + step)
-    found = np.clip(true / by, low, max(high, low))
+        voltages = np.linspace(*ends, N_VOLTAGES)
+        terms = terms_at_voltages(fit.machine.ring, open_settings, current, jnp.asarray(voltages))
+        true = voltages[np.argmin(jax.vmap(_rate, (0, None))(jnp.asarray(draws), terms), axis=1)]
+        step = voltages[1] - voltages[0]
+        ends = max(voltages[0], true.min() - step), min(voltages[-1], true.max() + step)
+    found = np.clip(true / ratio, low, max(high, low))
     spread = quantity_of_draws(found, "V")
     best, error = spread.value, math.hypot(spread.error, step / math.sqrt(12))
-    inside = low + step < best < high - step
-    reached = _lifetime(fit, sample, wide._replace(rf_voltage=best), current)
+    is_inside = low + step < best < high - step
+    lifetime = _lifetime(fit, sample, open_settings._replace(rf_voltage=best), current)
     message = (
         "The best RF voltage lies within its limits, where bucket and lattice acceptance meet."
-        if inside
+        if is_inside
         else "The best RF voltage is at its limit: more range would help."
     )
-    if reached.error is None:
-        message, inside = "The decays do not tell the lifetime at other settings: vary them.", False
+    if lifetime.error is None:
+        message = "The decays do not tell the lifetime at other settings: vary them."
+        is_inside = False
     return BestPoint(
-        rf_voltage=Quantity(best, error if inside else None, "V"),
+        rf_voltage=Quantity(best, error if is_inside else None, "V"),
         scraper_y=limits.scraper_y[1],
         bunches=limits.bunches[1],
-        lifetime=reached,
-        usual=_lifetime(fit, sample, usual, current),
+        lifetime=lifetime,
+        usual=_lifetime(fit, sample, operation, current),
         message=message,
     )
 
 
-class HeldBack(NamedTuple):
-    """A decay as the others predict it.
+class LeaveOneOut(NamedTuple):
+    """Leave-one-out prediction of a decay.
 
     Attributes
     ----------
     name : str
-        Of the decay.
+        Name of the decay.
     predicted : Quantity
-        Lifetime at its mean current, h, from a fit to the other decays; the error is that of the
-        scales, of this decay's pressure reading, and of its scatter.
+        Lifetime at its mean current, h, from a fit to the other decays. The error contains those of
+        the scales, of the decay's pressure reading, and its scatter.
     measured : Quantity
-        What the decay itself says, h.
+        Measured lifetime, h.
     pull : float
-        Predicted less measured loss rate, in standard errors of both.
+        Predicted minus measured loss rate, in standard errors of the difference.
     """
 
     name: str
@@ -489,26 +505,26 @@ class HeldBack(NamedTuple):
     pull: float
 
 
-def predict_held_back(fit: ScaleFit) -> tuple[HeldBack, ...]:
+def predict_held_back(fit: ScaleFit) -> tuple[LeaveOneOut, ...]:
     """Predict the lifetime of each decay by a fit to all the others.
 
     Parameters
     ----------
     fit : ScaleFit
-        Of all decays.
+        Fit to all decays.
 
     Returns
     -------
-    tuple of HeldBack
-        In the order of the decays. Those that say nothing of the loss, and those without which the
-        scales do not predict them, are left out.
+    tuple of LeaveOneOut
+        Predictions in the order of the decays, without decays that have no information on the loss
+        and those that the other decays do not predict.
 
     Notes
     -----
-    Least squares linear about the fit, averaged over the noise: with H = J (JᵀJ)⁻¹ Jᵀ of one
-    decay's whitened rows J and its residuals r, those of the fit without it are (1 - H)⁻¹ r, with
-    the covariance (1 - H)⁻¹: R. D. Cook and S. Weisberg, Residuals and Influence in Regression
-    (1982), section 2.2.
+    Least squares linearised about the fit, averaged over the noises. With the hat matrix
+    H = J (JᵀJ)⁻¹ Jᵀ of one decay's whitened rows and its residuals r, the residuals of the fit
+    without it are (1 - H)⁻¹ r, with covariance (1 - H)⁻¹: R. D. Cook and S. Weisberg, Residuals and
+    Influence in Regression (1982), section 2.2.
 
     Examples
     --------
@@ -523,54 +539,61 @@ def predict_held_back(fit: ScaleFit) -> tuple[HeldBack, ...]:
     9.82 ± 0.14 h predicted, 9.730669 ± 0.000098 h measured
     """
     measured, noise, found = fit.decays.measured, fit.noise, []
-    weight, left, rows, change = fit.about(fit.decays)
+    weight, residuals, rows, change = fit.linearise(fit.decays)
     for k, name in enumerate(fit.names):
         root = np.asarray(measured.root[k])
         if not np.any(root):
             continue
-        back = np.linalg.inv(weight[k])
+        inverse = np.linalg.inv(weight[k])
         each = [
-            _left_out(
-                left[k] + rows[k] @ (noise.shift[i] - noise.centre),
-                rows[k] @ noise.half[i],
+            _predict_without(
+                residuals[k] + rows[k] @ (noise.shift[i] - noise.centre),
+                rows[k] @ noise.covariance_root[i],
                 change[k] * noise.sizes(i, len(fit.names))[k],
                 change[k] * noise.scatter[i],
             )
             for i in range(noise.weight.size)
         ]
-        off = np.array([(back @ one)[1] for one, _ in each])
-        square = np.array([back[1] @ spread @ back[1] for _, spread in each])
+        difference = np.array([(inverse @ one)[1] for one, _ in each])
+        variance = np.array([inverse[1] @ spread @ inverse[1] for _, spread in each])
         reading = np.linalg.inv(root)[1]
         rate, error = measured.parts[k, 1], np.linalg.norm(reading)
-        # By some noises a decay may alone tell of something.
-        told = square - error**2 < (DETERMINED * rate) ** 2
-        weight_told = noise.weight * told
-        if not weight_told.sum() > LIKELY:
+        # Under some noises a decay alone determines a scale, and is not predicted by the others.
+        predicted = variance - error**2 < (MAX_RELATIVE_ERROR * rate) ** 2
+        noise_weight = noise.weight * predicted
+        if not noise_weight.sum() > MENTION_PROBABILITY:
             continue
-        low, high = quantiles(weight_told / weight_told.sum(), off, np.sqrt(square), CENTRAL)
+        noise_weight = noise_weight / noise_weight.sum()
+        low, high = quantiles(noise_weight, difference, np.sqrt(variance), CENTRAL)
         middle, spread = (low + high) / 2, (high - low) / 2
         by_others = np.sqrt(max(spread**2 - error**2, 0.0))
-        both = lifetime_of(rate + middle, by_others), lifetime_of(rate, error)
-        found.append(HeldBack(name, *both, middle / spread))
+        lifetimes = lifetime_of(rate + middle, by_others), lifetime_of(rate, error)
+        found.append(LeaveOneOut(name, *lifetimes, middle / spread))
     return tuple(found)
 
 
-def _left_out(
-    off: np.ndarray, own: np.ndarray, here: np.ndarray, usual: np.ndarray
+def _predict_without(
+    residuals: np.ndarray, slopes: np.ndarray, scatter: np.ndarray, usual_scatter: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Residuals (2,) of a decay by the fit to the others, and their covariance.
+    """Residuals of a decay, (2,), against the fit to the others, and their covariance.
 
-    `own` are its slopes by what the scales err by in the fit to all, `here` and `usual` its scatter
-    there and that of any decay.
+    Parameters
+    ----------
+    residuals : array, shape (2,)
+        Residuals against the fit to all decays.
+    slopes : array, shape (2, r)
+        Slopes by standard errors of the scales in the fit to all.
+    scatter, usual_scatter : array, shape (2, 2)
+        Slopes by the scatter of this decay in the fit, and of any decay.
     """
-    covariance = np.eye(2) + here @ here.T
+    covariance = np.eye(2) + scatter @ scatter.T
     root = np.linalg.cholesky(covariance)
-    white = np.linalg.solve(root, own)
-    shares, turned = np.linalg.eigh(white @ white.T)
-    # A decay that alone tells of something is predicted by nothing else: infinitely badly.
-    rest = turned / np.maximum(1 - shares, np.finfo(float).eps) @ turned.T
-    spread = root @ rest @ root.T - covariance + np.eye(2) + usual @ usual.T
-    return root @ rest @ np.linalg.solve(root, off), spread
+    white = np.linalg.solve(root, slopes)
+    shares, vectors = np.linalg.eigh(white @ white.T)
+    # A decay that alone determines a scale has a prediction with infinite error.
+    inverse = vectors / np.maximum(1 - shares, np.finfo(float).eps) @ vectors.T
+    spread = root @ inverse @ root.T - covariance + np.eye(2) + usual_scatter @ usual_scatter.T
+    return root @ inverse @ np.linalg.solve(root, residuals), spread
 
 
 NOTE = (
@@ -582,7 +605,7 @@ NOTE = (
 @answer
 @dataclass(frozen=True, eq=False)
 class Shift(Judged):
-    """Joint answer of many decays.
+    """Joint answer of the decays of a shift.
 
     Parameters
     ----------
@@ -591,18 +614,18 @@ class Shift(Judged):
     budget : tuple of Interval
         Loss budget at the machine's usual settings, 68 % credible intervals.
     current : float
-        Current for budget and best point, mA: the highest mean current of the decays.
+        Current of budget and best point, mA: the highest mean current of the decays.
     limits : Limits
-        The range of settings seen, within which the best point is sought.
+        Range of the settings in the decays, within which the best point is searched.
     best : BestPoint
-        The longest lifetime within them.
+        Settings of the longest lifetime within the limits.
     proposals : tuple of Proposal
         Decays to record next, the most informative first.
     anomaly : Anomaly or None
-        Whether the second half departs from a model fitted to the first; None if the first half
+        Change of the second half of the decays against a fit to the first; None if the first half
         does not separate the mechanisms.
     network : NetworkFit or None
-        A network that corrects first principles, where one was asked for.
+        Network that corrects first principles, if one was asked for.
     """
 
     fit: ScaleFit
@@ -631,10 +654,10 @@ class Shift(Judged):
 
     @property
     def verdicts(self) -> list[tuple[str, Status, str]]:
-        """Name, status and sentence of each verdict."""
+        """Verdicts: name, status and sentence of each."""
         found = [(f"{self._count} together", self.status, self.message)]
-        if self.untold:
-            found.append(("loss budget", Status.unidentified, self.untold))
+        if self.undetermined:
+            found.append(("loss budget", Status.unidentified, self.undetermined))
         found.append((f"best lifetime {self.best.lifetime}", self.best.status, self.best.message))
         if (moved := self.anomaly) is not None:
             found.append(("second half against the first", moved.status, moved.message))
@@ -643,8 +666,8 @@ class Shift(Judged):
         return found
 
     @property
-    def untold(self) -> str:
-        """The sentence on what the decays do not tell of the budget; empty if nothing."""
+    def undetermined(self) -> str:
+        """Sentence on the losses that the decays do not determine; empty if there are none."""
         names = [row.name for row in self.budget if not row.separable]
         if not names:
             return ""
@@ -654,12 +677,12 @@ class Shift(Judged):
         )
 
     @cached_property
-    def held_back(self) -> tuple[HeldBack, ...]:
-        """Each decay as the others predict it."""
+    def leave_one_out(self) -> tuple[LeaveOneOut, ...]:
+        """Leave-one-out predictions of the decays."""
         return predict_held_back(self.fit)
 
     def tables(self) -> tuple[Table, ...]:
-        """The scales and what follows from them, and the network."""
+        """Tables of the scales with budget and advice, and of the network."""
         rows = [Row("status", [self.status]), *self._scale_rows(), *self._advice_rows()]
         tables = [labelled("First principles fitted to", [self._count], rows, NOTE)]
         if self.network is not None:
@@ -670,44 +693,45 @@ class Shift(Judged):
     def _scale_rows(self) -> list[Row]:
         fit, rows = self.fit, []
         for name, scale in fit.scales.items():
-            of, untold = "scale on the ring file", "not separable"
+            meaning, without = "scale on the ring file", "not separable"
             if name == VOLTAGE:
-                of, untold = "true over read", "not told: its prior's"
-            rows.append(Row(f"{name}, {of}", [untold if scale.error is None else scale], True))
-        worth = f"{fit.chi2:.4g}/{fit.dof}" if fit.dof > 0 else "not testable"
-        rows.append(Row("chi2/dof without scatter", [worth], True))
+                meaning, without = "true over read", "not told: its prior's"
+            value = without if scale.error is None else scale
+            rows.append(Row(f"{name}, {meaning}", [value], True))
+        chi2 = f"{fit.chi2:.4g}/{fit.dof}" if fit.dof > 0 else "not testable"
+        rows.append(Row("chi2/dof without scatter", [chi2], True))
         for name, scatter in fit.scatter.items():
-            most = f"below {percent(scatter.interval_95[1])} at 95 %"
-            said = percent(scatter.value) if scatter.value else most
-            rows.append(Row(f"scatter of {name} from fill to fill", [said], True))
+            limit = f"below {percent(scatter.interval_95[1])} at 95 %"
+            text = percent(scatter.value) if scatter.value else limit
+            rows.append(Row(f"scatter of {name} from fill to fill", [text], True))
         for row in self.budget:
-            said = str(row).removeprefix(f"{row.name}: ") if row.separable else "not determined"
-            rows.append(Row(f"{row.name} at {self.current:.4g} mA", [said], row.name == "lifetime"))
+            text = str(row).removeprefix(f"{row.name}: ") if row.separable else "not determined"
+            rows.append(Row(f"{row.name} at {self.current:.4g} mA", [text], row.name == "lifetime"))
         return rows
 
     def _advice_rows(self) -> list[Row]:
         best, rows = self.best, []
         volts, error = best.rf_voltage.value / 1e3, best.rf_voltage.error
         limit = f"{volts:.6g} kV, at its limit"
-        told = limit if error is None else Quantity(volts, error / 1e3, "kV")
-        rows.append(Row("best RF voltage", [told], True))
+        voltage = limit if error is None else Quantity(volts, error / 1e3, "kV")
+        rows.append(Row("best RF voltage", [voltage], True))
         others = f"{1e3 * best.scraper_y:.4g} mm, {best.bunches:.6g}"
         rows.append(Row("best scraper and bunches", [others], True))
         rows.append(Row("lifetime there", [best.lifetime], True))
-        if self.held_back:
-            off = np.abs([one.pull for one in self.held_back])
-            said = f"{sum(off < 1)} of {off.size} within 1, {sum(off < 2)} within 2 errors"
-            rows.append(Row("each decay predicted by the others", [said]))
+        if self.leave_one_out:
+            pulls = np.abs([one.pull for one in self.leave_one_out])
+            text = f"{sum(pulls < 1)} of {pulls.size} within 1, {sum(pulls < 2)} within 2 errors"
+            rows.append(Row("each decay predicted by the others", [text]))
         for number, proposal in enumerate(self.proposals, 1):
-            asked = proposal.candidate
-            at, scraper, bunches = map(float, asked.operation[:3])
-            said = f"{at / 1e3:.6g} kV, {1e3 * scraper:.4g} mm, {bunches:.6g} bunches, "
-            said += f"{asked.current:.4g} mA (information {proposal.information:.3g})"
-            rows.append(Row(f"next decay, choice {number}", [said], number == 1))
+            wanted = proposal.candidate
+            at, scraper, bunches = map(float, wanted.operation[:3])
+            text = f"{at / 1e3:.6g} kV, {1e3 * scraper:.4g} mm, {bunches:.6g} bunches, "
+            text += f"{wanted.current:.4g} mA (information {proposal.information:.3g})"
+            rows.append(Row(f"next decay, choice {number}", [text], number == 1))
         return rows
 
     def to_json(self) -> dict[str, Any]:
-        """Return the answer as JSON's types, in SI, mA and h."""
+        """Answer as JSON's types, in SI units, mA and h."""
         proposals = [
             settings_json(p.candidate.operation)
             | {"current_mA": p.candidate.current, "information": p.information}
@@ -717,8 +741,8 @@ class Shift(Judged):
             "scales": self.fit,
             "current": bare(self.current, "mA"),
             "budget": self.budget,
-            "not_determined": self.untold,
-            "held_back": self.held_back,
+            "not_determined": self.undetermined,
+            "held_back": self.leave_one_out,
             "best": self.best._asdict() | {"scraper_y": bare(self.best.scraper_y, "m")},
             "next": proposals,
             "anomaly": self.anomaly,
@@ -740,20 +764,20 @@ def study_shift(
     Parameters
     ----------
     decays : sequence of Decay
-        In order of time, at different settings.
+        Decays in order of time, at different settings.
     machine : Machine
-        The ring, and what the records do not say.
+        The ring, and the settings that the records do not give.
     seed : int, optional
-        Of the random numbers.
+        Seed of the random numbers.
     network : bool, optional
         Also fit a network that corrects first principles.
     priors : mapping of str to (mean, standard deviation), optional
-        As of `fit_scales`.
+        As for `fit_scales`.
 
     Returns
     -------
     Shift
-        Also where mechanisms are not separable: the scales say so.
+        Joint answer; its scales show which mechanisms are not separable.
 
     Raises
     ------
@@ -771,8 +795,8 @@ def study_shift(
     fit = fit_scales(decays, machine, priors=priors)
     sample = fit.sample(seed=seed)
     settings, currents = zip(*settings_of(decays, machine), strict=True)
-    seen = [[float(getattr(setting, name)) for setting in settings] for name in Limits._fields]
-    limits, current = Limits(*((min(values), max(values)) for values in seen)), max(currents)
+    ranges = [[float(getattr(setting, name)) for setting in settings] for name in Limits._fields]
+    limits, current = Limits(*((min(values), max(values)) for values in ranges)), max(currents)
     return Shift(
         fit=fit,
         budget=budget_intervals(fit, sample, machine.operation, current),
@@ -788,11 +812,10 @@ def study_shift(
 def _candidates(
     decays: Sequence[Decay], machine: Machine, limits: Limits, current: float
 ) -> list[DecayCandidate]:
-    """The corners of what was seen, as long and as noisy as the decays were."""
+    """Possible decays at the corners of the range of settings, as long and noisy as the decays."""
     duration = float(np.median([d.segment.span for d in decays]))
-    noise = float(
-        np.median([d.fit.rms_residual / np.sqrt(len(d.segment) / READINGS) for d in decays])
-    )
+    means = [d.fit.rms_residual / np.sqrt(len(d.segment) / CANDIDATE_READINGS) for d in decays]
+    noise = float(np.median(means))
     lowest = min(decay.fit.mean_current for decay in decays)
     corners = itertools.product(*(sorted(set(pair)) for pair in (*limits, (lowest, current))))
     return [
@@ -813,7 +836,7 @@ def _anomaly(
     if half < 4:
         return None
     reference = fit_scales(decays[:half], machine, priors=priors)
-    # What the first half does not tell, the second cannot contradict.
+    # The second half cannot contradict scales that the first does not determine.
     if not np.isfinite(reference.spread.errors).all():
         return None
     return find_anomaly(reference, decays[half:])

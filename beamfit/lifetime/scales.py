@@ -1,4 +1,4 @@
-"""First principles fitted to many decays: how much each mechanism truly loses, and how sure."""
+"""Fit of first principles to many decays: a scale on each loss mechanism, with errors."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ from beamfit.greybox.fit import Fit
 from beamfit.greybox.posterior import Optimum, Statement, target_of
 from beamfit.greybox.problem import Free, Prior, Problem, Record
 from beamfit.greybox.solve import solve
-from beamfit.lifetime.expansion import DETERMINED, LEVEL, LOSS, QUADRATIC, Expansion
+from beamfit.lifetime.expansion import LEVEL, LOSS, MAX_RELATIVE_ERROR, QUADRATIC, Expansion
 from beamfit.lifetime.fill_noise import (
-    BY,
-    SHORTEST,
+    MIN_HALF_RANGE,
+    MODEL_SIZES,
     FillNoise,
     LinearDecays,
-    compared,
     log_likelihood,
+    weigh_noises,
 )
 from beamfit.lifetime.fit import DecayFit
 from beamfit.lifetime.mechanisms import SCALES, LossTerms, loss_terms, scaled_losses
@@ -43,18 +43,21 @@ if TYPE_CHECKING:
 
 
 class Summaries(NamedTuple):
-    """Decays by their loss rates at the mean current; exact to second order about the fit.
+    """Loss rates of decays at their mean currents, with the information matrix.
+
+    They replace the readings: exact to second order about the fit.
 
     Attributes
     ----------
     current : array, shape (n,)
         Mean current I, mA.
     parts : array, shape (n, 2)
-        Fitted a I and a I + b, 1/s. The second is well determined by any decay, the first by a
-        long one only; the two are nearly uncorrelated, unlike a and b.
+        Fitted a I and a I + b, 1/s. Every decay determines the second well, only a long one the
+        first. Unlike a and b the two are nearly uncorrelated.
     root : array, shape (n, 2, 2)
-        Upper triangle R with (R (x - parts))² summed the chi² of other values x, I0 adjusted.
-        A decay too short to tell a from b has a small entry there and takes part all the same.
+        Upper triangular square root R of the information matrix: chi² of other values x, with I0
+        adjusted, is |R (x - parts)|². A decay too short to separate a and b has a small entry
+        there and takes part all the same.
     """
 
     current: Array
@@ -63,89 +66,89 @@ class Summaries(NamedTuple):
 
 
 def loss_parts(a: Array, b: Array, mean_current: Array) -> Array:
-    """The two numbers by which a decay is compared with a model: a I and a I + b, in 1/s."""
+    """Parts a I and a I + b, 1/s, by which a decay is compared with a model."""
     quadratic = a * mean_current
     return jnp.stack([quadratic, quadratic + b], axis=-1)
 
 
-def by_losses(quadratic: np.ndarray, linear: np.ndarray) -> np.ndarray:
-    """Slopes of the two parts, a I and a I + b, by relative changes of a and b, shape (n, 2, 2)."""
+def loss_part_slopes(quadratic: np.ndarray, linear: np.ndarray) -> np.ndarray:
+    """Slopes of the parts by relative changes of a and b, shape (n, 2, 2).
+
+    `quadratic` is a I and `linear` is b, both 1/s.
+    """
     rows = np.array([[quadratic, np.zeros_like(quadratic)], [quadratic, linear]])
     return np.moveaxis(rows, -1, 0)
 
 
-def information_root(about: Expansion, scale: float = 1.0) -> np.ndarray:
-    """Root of the information that readings hold on the two parts, I0 eliminated; a triangle, s.
+def information_root(expansion: Expansion, scale: float = 1.0) -> np.ndarray:
+    """Upper triangular square root of the information on the two parts, s, with I0 eliminated.
 
-    `scale` is the size of the errors of what residuals are divided by.
+    `scale` is the standard deviation of the residuals in units of their stated errors.
     """
-    # Columns in order of elimination: the last two rows of R hold what is left beside I0.
-    rows = about.rows[:, [LEVEL, QUADRATIC, LOSS]] * (about.pieces.units[0] / scale)
+    # QR eliminates columns from the left: the last two rows of R have the information without I0.
+    rows = expansion.rows[:, [LEVEL, QUADRATIC, LOSS]] * (expansion.pieces.units[0] / scale)
     return np.linalg.qr(rows, mode="r")[1:, 1:]
 
 
-def _root(fit: DecayFit, about: Expansion) -> np.ndarray:
-    """The information that a decay holds on its parts, as of `Summaries`; what is stated of the
-    monitor is added to their covariance.
-    """
-    scale = max(np.sqrt(about.residuals @ about.residuals / fit.dof), about.given)
-    root = information_root(about, scale * fit.inflation)
-    moved = [about.moved(change) for change in about.pieces.monitor_changes]
+def _decay_root(fit: DecayFit, expansion: Expansion) -> np.ndarray:
+    """Root of the information of a decay, as in `Summaries`, with stated monitor errors added."""
+    scale = max(np.sqrt(expansion.residuals @ expansion.residuals / fit.dof), expansion.min_factor)
+    root = information_root(expansion, scale * fit.inflation)
+    moved = [expansion.value_shifts(change) for change in expansion.pieces.monitor_changes]
     if not moved:
         return root
-    changes = np.array([[m.a * about.pieces.units[1], m.rate_mean] for m in moved]).T
-    return np.linalg.qr(widened(root, changes), mode="r")
+    changes = np.array([[m.a * expansion.pieces.units[1], m.rate_mean] for m in moved]).T
+    return np.linalg.qr(add_errors(root, changes), mode="r")
 
 
-def widened(root: Array, changes: Array) -> Array:
-    """Root of the information where values also err by independent changes.
+def add_errors(root: Array, changes: Array) -> Array:
+    """Add independent errors to the square root of an information matrix.
 
     Parameters
     ----------
     root : array, shape (..., n, n)
-        As of `Summaries`, of two values; or of more.
+        Square root R of the information on n values, as in `Summaries`.
     changes : array, shape (..., n, k)
-        By how much each of k errors moves the values, one standard deviation.
+        Changes of the values by one standard deviation of each of k errors.
 
     Returns
     -------
     array, shape (..., n, n)
-        W with WᵀW = Rᵀ (1 + G Gᵀ)⁻¹ R, G = R times the changes: the errors integrated out.
+        W with WᵀW = Rᵀ (1 + G Gᵀ)⁻¹ R and G = R changes: the errors are integrated out.
     """
-    own = root @ changes
+    whitened = root @ changes
     unit = jnp.eye(root.shape[-1])
-    whole = jnp.linalg.cholesky(unit + own @ jnp.swapaxes(own, -1, -2))
-    return jnp.linalg.solve(whole, root)
+    cholesky = jnp.linalg.cholesky(unit + whitened @ jnp.swapaxes(whitened, -1, -2))
+    return jnp.linalg.solve(cholesky, root)
 
 
-def _together(fit: DecayFit, rate: float) -> np.ndarray:
-    """Many cycles, of which the share of a and the lifetime are uncorrelated."""
+def _cycles_root(fit: DecayFit, rate: float) -> np.ndarray:
+    """Root of the information of cycles fitted together: share of a and lifetime uncorrelated."""
     share, error = fit.identifiability.share_error, fit.lifetime_mean.relative or np.inf
     return np.diag(1 / (rate * np.array([np.inf if share is None else share, error])))
 
 
 def summarise(decays: Sequence[Decay], power: float = 0.0) -> Summaries:
-    """Reduce decays to what they say of the loss.
+    """Reduce decays to their loss rates and information.
 
     Parameters
     ----------
     decays : sequence of Decay
-        Fitted decays. One without a finite fit or without noise says nothing: it gets no
-        information.
+        Fitted decays. A decay without a finite fit or without noise gets no information.
     power : float
-        a goes as this power of the current, and is that at the mean current; many cycles fitted
-        together say nothing of such a law.
+        Exponent of a: a goes as this power of the current, and its value is that at the mean
+        current. With an exponent, cycles fitted together get no information.
 
     Returns
     -------
     Summaries
-        In the order of the decays.
+        One row for each decay.
 
     Notes
     -----
-    With the residuals linear in (I0, a I, a I + b) about the fit, chi² is a quadratic form whose
-    matrix is the information; eliminating I0 by QR loses nothing. Errors are the fit's, enlarged
-    where chi²/dof exceeds 1 and for correlated residuals.
+    The residuals are linearised in (I0, a I, a I + b) about the fit, so chi² is a quadratic form;
+    I0 is eliminated by QR. Errors are those of the fit, enlarged where chi²/dof exceeds 1 and for
+    correlated residuals.
 
     Examples
     --------
@@ -158,7 +161,7 @@ def summarise(decays: Sequence[Decay], power: float = 0.0) -> Summaries:
     >>> study = study_record(record, law="constant")
     >>> found = summarise(study.decays)
     >>> fit = study.decays[0].fit
-    >>> error = 1 / abs(found.root[0, 1, 1])  # of the loss rate, a I being free
+    >>> error = 1 / abs(found.root[0, 1, 1])  # of the loss rate, with a I free
     >>> print(f"{error / found.parts[0, 1]:.1e}, by the fit {fit.lifetime_mean.relative:.1e}")
     2.1e-06, by the fit 2.1e-06
     """
@@ -170,43 +173,47 @@ def summarise(decays: Sequence[Decay], power: float = 0.0) -> Summaries:
         if not (np.isfinite(a) and fit.rms_residual > 0):
             continue
         if fit.first is None:
-            about = fit.with_power(power)
-            parts[k] = loss_parts(about.values.a, about.values.b, fit.mean_current)
-            root[k] = _root(fit, about)
+            expansion = fit.with_power(power)
+            parts[k] = loss_parts(expansion.values.a, expansion.values.b, fit.mean_current)
+            root[k] = _decay_root(fit, expansion)
         elif not power:
             parts[k] = loss_parts(a, b, fit.mean_current)
-            root[k] = _together(fit, parts[k, 1])
+            root[k] = _cycles_root(fit, parts[k, 1])
     return Summaries(*map(jnp.asarray, (current, parts, root)))
 
 
+# Relative error of a pressure reading by default: that of a calibrated gauge.
 PRESSURE_ERROR = 0.05
+# Name of the decays in the grey-box problem.
 RECORD = "decays"
-LARGEST = 1e3
-# The scale of the RF voltage, fitted where a prior says how well its reading is calibrated.
+# Upper limit of a scale: far above any error of a ring file.
+MAX_SCALE = 1e3
+# Name of the scale of the RF voltage, which is free where a prior gives its calibration.
 VOLTAGE = "rf_voltage"
-# It is sought within so many errors of that prior, and losses computed at each of them.
-WIDEST = 3
-# Noises are weighed about the scales, and these fitted, in so many rounds, until they move by less.
-ROUNDS, SETTLED = 8, 1e-3
-# Scatter, or that a decay is odd, is said from this probability on.
-LIKELY = 0.95
-# Share of the RF voltage by which losses are differentiated.
-STEP = 2e-3
-# Noises that stand for all of them in the sampler.
-SAMPLED = 48
+# Range of that scale, in errors of its prior; losses are computed at each whole number of them.
+VOLTAGE_RANGE = 3
+# Largest number of iterations of fit and noise, and relative change of the scales at which they
+# have converged.
+MAX_ITERATIONS, SCALE_TOLERANCE = 8, 1e-3
+# Scatter, or an odd decay, is mentioned above this probability.
+MENTION_PROBABILITY = 0.95
+# Relative step of the RF voltage for numerical differentiation of the losses.
+VOLTAGE_STEP = 2e-3
+# Number of noises that represent the mixture in the sampler: chosen for speed.
+SAMPLED_NOISES = 48
 
 
 class DecaySet(NamedTuple):
-    """Many decays beside first principles.
+    """Measured losses of many decays, and those of first principles.
 
     Attributes
     ----------
     terms : LossTerms
-        First principles at the settings of each decay, each part of shape (n,).
+        First principles at the settings of each decay; each part has shape (n,).
     measured : Summaries
-        What each decay says.
+        Measured loss rates.
     pressure_error : float
-        Relative error of the pressure readings, of each record independently.
+        Relative error of the pressure reading, independent in each record.
     """
 
     terms: LossTerms
@@ -221,33 +228,33 @@ class DecaySet(NamedTuple):
         pressure_error: float = PRESSURE_ERROR,
         voltages: np.ndarray | None = None,
     ) -> DecaySet:
-        """Reduce decays; `voltages` as of `LossTerms`."""
+        """Reduce decays and compute their loss terms; `voltages` as in `LossTerms`."""
         settings = settings_of(decays, machine)
         rows = [loss_terms(machine.ring, *setting, voltages) for setting in settings]
         terms = jax.tree.map(lambda *parts: jnp.stack(parts), *rows)
         return cls(terms, summarise(decays), pressure_error)
 
     def parts(self, scales: Array, factor: Array) -> Array:
-        """a I and a I + b of scaled first principles, where the pressure is so many times read."""
+        """Parts a I and a I + b of scaled first principles; `factor` multiplies the pressure."""
         return loss_parts(*scaled_losses(scales, self.terms, factor), self.terms.current)
 
 
 @jax.jit
 def whitener(scales: Array, decays: DecaySet) -> Array:
-    """Roots of the information, each decay's pressure factor integrated out; shape (n, 2, 2)."""
+    """Root of the information with each pressure factor integrated out, shape (n, 2, 2)."""
     ones = jnp.ones_like(decays.terms.current)
     _, slope = jax.jvp(lambda factor: decays.parts(scales, factor), (ones,), (ones,))
-    return widened(decays.measured.root, decays.pressure_error * slope[..., None])
+    return add_errors(decays.measured.root, decays.pressure_error * slope[..., None])
 
 
 @jax.jit
 def pulls(scales: Array, decays: DecaySet, weight: Array) -> Array:
-    """Model minus measurement in standard errors, shape (n, 2); `weight` is that of `whitener`."""
-    off = decays.parts(scales, jnp.ones_like(decays.terms.current)) - decays.measured.parts
-    return jnp.einsum("nij,nj->ni", weight, off)
+    """Model minus measurement in standard errors, shape (n, 2); `weight` is from `whitener`."""
+    difference = decays.parts(scales, jnp.ones_like(decays.terms.current)) - decays.measured.parts
+    return jnp.einsum("nij,nj->ni", weight, difference)
 
 
-_by_scales = jax.jit(jax.jacfwd(pulls))
+_pull_slopes = jax.jit(jax.jacfwd(pulls))
 
 
 @shown
@@ -258,17 +265,17 @@ class ScaleFit(Judged):
     Parameters
     ----------
     fit : Fit
-        Of the core by the likeliest noise, with the priors among its parts.
+        Grey-box fit with the most probable noise; it includes the priors.
     machine : Machine
         The ring and its usual operation.
     decays : DecaySet
-        What it was fitted to.
+        Data of the fit.
     names : tuple of str
         Names of the decays.
     noise : FillNoise
-        How they scatter, and what may be wrong besides, averaged over.
+        Scatter of the decays, and other departures, over which the answer is averaged.
     as_read : float
-        Probability that the RF voltage is what is read, where its scale was freed without a prior.
+        Probability that the RF voltage equals its reading, if its scale is free without a prior.
     """
 
     fit: Fit
@@ -280,29 +287,29 @@ class ScaleFit(Judged):
 
     @cached_property
     def vector(self) -> np.ndarray:
-        """All scales, separable or not, by the likeliest model, its noise averaged over."""
+        """All scales, separable or not: mean under the most probable model."""
         problem = self.fit.problem
         return np.clip(self.fit.theta + self.noise.centre, problem.lower, problem.upper)
 
     @cached_property
     def chi2(self) -> float:
-        """Sum of squares by the decays' own errors and the pressures', without scatter."""
-        return float(np.sum(self.about(self.decays)[1] ** 2))
+        """chi² with the errors of decays and pressure readings, without scatter."""
+        return float(np.sum(self.linearise(self.decays)[1] ** 2))
 
     @property
     def dof(self) -> int:
-        """Two numbers a decay, less the scales."""
-        told = np.any(np.asarray(self.decays.measured.root) != 0, axis=-1)
-        return int(np.sum(told)) - len(SCALES)
+        """Degrees of freedom: two for each decay with information, less the scales."""
+        informative = np.any(np.asarray(self.decays.measured.root) != 0, axis=-1)
+        return int(np.sum(informative)) - len(SCALES)
 
     @cached_property
     def spread_raw(self) -> Spread:
-        """Spread of the scales by the decays' own errors and the pressures', without scatter."""
-        _, _, rows, _ = self.about(self.decays)
+        """Spread of the scales with the errors of decays and pressure readings, without scatter."""
+        _, _, rows, _ = self.linearise(self.decays)
         priors = self.fit.dense_jacobian[2 * len(rows) :]
         unbounded = np.full(self.vector.shape, np.inf)
         rows = np.vstack([rows.reshape(-1, unbounded.size), priors])
-        # Bounds stand for nothing known.
+        # The limits of the scales are no information.
         return spread_of(rows, -unbounded, unbounded)
 
     @cached_property
@@ -312,118 +319,132 @@ class ScaleFit(Judged):
 
     @cached_property
     def scatter(self) -> dict[str, Quantity]:
-        """Scatter of a and of b from fill to fill beyond what decays and pressures err by."""
+        """Relative scatter of a and of b from fill to fill, in addition to the known errors."""
         return {name: self._scatter(k) for k, name in enumerate("ab")}
 
     def _scatter(self, k: int) -> Quantity:
         sizes = self.noise.scatter[:, k]
         order = np.argsort(sizes)
-        heap = np.cumsum(self.noise.weight[order])
-        at = np.minimum(np.searchsorted(heap, (0.5, *CENTRAL, *WIDE)), len(order) - 1)
-        middle, low, high, *ends = map(float, sizes[order][at])
-        return Quantity(middle, (high - low) / 2, "1", None, tuple(ends))
+        cumulated = np.cumsum(self.noise.weight[order])
+        index = np.minimum(np.searchsorted(cumulated, (0.5, *CENTRAL, *WIDE)), len(order) - 1)
+        median, low, high, *ends = map(float, sizes[order][index])
+        return Quantity(median, (high - low) / 2, "1", None, tuple(ends))
 
     @property
     def remark(self) -> str:
-        """Sentences on scatter and an odd decay, where they are likely."""
-        noise, said = self.noise, []
+        """Sentences on a misread voltage, scatter and an odd decay, where these are probable."""
+        noise, sentences = self.noise, []
         if POOR_FIT < self.as_read < 1:
-            said.append(f"{_misread(self)} (probability {1 - self.as_read:.2g}).")
+            sentences.append(f"{_misread(self)} (probability {1 - self.as_read:.2g}).")
         scatters = noise.scatter > 0
         likely = noise.weight @ scatters > 0.5
         sizes = [
             f"{percent(self.scatter[name].value)} in {name}"
-            for name, has in zip("ab", likely, strict=True)
-            if has and noise.weight @ scatters.any(axis=1) > LIKELY
+            for name, is_likely in zip("ab", likely, strict=True)
+            if is_likely and noise.weight @ scatters.any(axis=1) > MENTION_PROBABILITY
         ]
         if sizes:
-            said.append(
+            sentences.append(
                 f"Decays scatter by {' and '.join(sizes)} beyond their errors, which the errors "
                 "contain: record more fills, with orbit, coupling and fill pattern kept the same."
             )
         odd = np.bincount(noise.odd + 1, noise.weight, len(self.names) + 1)[1:]
-        if odd.max() > LIKELY:
+        if odd.max() > MENTION_PROBABILITY:
             name = self.names[int(np.argmax(odd))]
-            said.append(f"{name} does not follow the others and hardly counts: look at its record.")
-        return " ".join(said)
+            sentences.append(
+                f"{name} does not follow the others and hardly counts: look at its record."
+            )
+        return " ".join(sentences)
 
     @cached_property
     def refuted_by(self) -> str | None:
-        """The likeliest departure from first principles where these are refuted beside scatter."""
+        """Most probable departure from first principles, if scatter alone is refuted; else None."""
         if self.as_read < POOR_FIT:
             return VOLTAGE
         return None if self.noise.probabilities[0] > POOR_FIT else self.noise.model_name
 
     @property
     def covariance(self) -> np.ndarray:
-        """Linearised, of all scales whether separable or not, shape (n, n); infinite along
-        directions that nothing determines.
+        """Covariance of all scales, separable or not, shape (n, n), in linear approximation.
+
+        Infinite for scales that the data do not determine.
         """
-        blind = ~np.isfinite(self.spread.errors)
-        return np.where(np.outer(blind, blind), np.inf, self.spread.seen)
+        undetermined = ~np.isfinite(self.spread.errors)
+        return np.where(np.outer(undetermined, undetermined), np.inf, self.spread.seen)
 
     @cached_property
     def scales(self) -> dict[str, Quantity]:
-        """Factors on the ring file's values: touschek, bremsstrahlung, elastic, desorption, also as
-        attributes; without an error where the decays do not separate the mechanism. rf_voltage,
-        true over stated, where it has a prior.
+        """Factors on the ring file's losses: touschek, bremsstrahlung, elastic, desorption.
+
+        A factor has no error where the decays do not separate the mechanism. With a prior also
+        rf_voltage, the true voltage over its reading. All are attributes of the fit, too.
         """
         priors = {prior.name: prior.sd for prior in self.fit.problem.priors}
-        names, blind, found = self.fit.problem.names, ~np.isfinite(self.spread.errors), {}
+        names, undetermined, found = self.fit.problem.names, ~np.isfinite(self.spread.errors), {}
         for k, name in enumerate(names):
             raw = float(self.spread_raw.errors[k])
             quantity = self.noise.quantity(float(self.fit.theta[k]), k, raw)
             value = quantity.value
-            # Against 1 where the value is smaller: a mechanism found absent, 0.0 ± 0.1, is
-            # separable. A voltage that its prior tells better than the decays is the prior's.
-            known = quantity.error < DETERMINED * max(value, 1.0)
+            # The error is compared with 1 where the value is smaller: an absent mechanism,
+            # 0.0 ± 0.1, is separable. The voltage must be determined better than by its prior.
+            determined = quantity.error < MAX_RELATIVE_ERROR * max(value, 1.0)
             if name == VOLTAGE:
-                known = 2 * quantity.error**2 < priors[name] ** 2
-            found[name] = quantity if known and not blind[k] else quantity.open()
+                determined = 2 * quantity.error**2 < priors[name] ** 2
+            found[name] = quantity if determined and not undetermined[k] else quantity.open()
         return found
 
     @cached_property
     def finding(self) -> Finding:
-        """Status and sentences on the scales: `converged`; `poor_fit` if decays depart from first
-        principles otherwise than by scatter; `unidentified` if a mechanism is not separable from
-        the others; `not_converged` if the search failed.
+        """Status and sentences on the scales.
+
+        `not_converged` if the search failed, `unidentified` if a mechanism is not separable,
+        `poor_fit` if decays depart from first principles by more than scatter, else `converged`.
         """
         found, voltage = judge(self, RULES), self.scales.get(VOLTAGE)
-        untold = voltage is not None and voltage.error is None
-        prior = "The decays do not tell the scale of the RF voltage: its prior does." * untold
-        return Finding(found.status, " ".join(filter(None, (found.cause, prior, self.remark))))
+        by_prior = voltage is not None and voltage.error is None
+        remark = "The decays do not tell the scale of the RF voltage: its prior does." * by_prior
+        return Finding(found.status, " ".join(filter(None, (found.cause, remark, self.remark))))
 
     @property
     def voltages(self) -> np.ndarray | None:
-        """True over stated RF voltages at which losses are computed, if its scale is free."""
-        known = self.decays.terms.voltages
-        return None if known is None else np.asarray(known)[0]
+        """Ratios of true to read RF voltage at which losses are computed, if its scale is free."""
+        ratios = self.decays.terms.voltages
+        return None if ratios is None else np.asarray(ratios)[0]
 
     def terms_at(self, operation: Operation, current: float) -> LossTerms:
-        """First principles at a setting, for these scales."""
+        """Loss terms of first principles at a setting."""
         return loss_terms(self.machine.ring, operation, current, self.voltages)
 
     def losses_at(self, operation: Operation, current: float) -> tuple[Array, Array]:
-        """a, 1/(mA s), and b, 1/s, of scaled first principles at a setting."""
+        """Scaled a, 1/(mA s), and b, 1/s, of first principles at a setting."""
         return scaled_losses(jnp.asarray(self.vector), self.terms_at(operation, current))
 
     def determines(self, quantity: Callable[[Array], Array]) -> np.ndarray:
-        """Tell if decays and priors, and not the limits of the scales alone, determine quantities.
+        """Return True for quantities that decays and priors determine.
 
-        ``quantity(scales)`` is an array in JAX; each is told if known to a third of itself, or of
-        what the ring file says where that is more.
+        ``quantity(scales)`` is a JAX array. A quantity is determined if its error is below a third
+        of its value, or of the ring file's value if that is larger; the limits of the scales do not
+        count.
         """
         vector = jnp.asarray(self.vector)
-        usual = jnp.ones_like(vector)
-        size = np.maximum(np.abs(quantity(vector)), np.abs(quantity(usual)))
+        ring_file = jnp.ones_like(vector)
+        size = np.maximum(np.abs(quantity(vector)), np.abs(quantity(ring_file)))
         error = self.spread.error(np.asarray(jax.jacfwd(quantity)(vector)))
-        return error < DETERMINED * size
+        return error < MAX_RELATIVE_ERROR * size
 
-    def about(self, decays: DecaySet) -> tuple[np.ndarray, ...]:
-        """Expand decays: their weights without scatter, their `pulls`, and the slopes of these by
-        the scales and by ln a and ln b of each decay, shape (n, 2, 2).
+    def linearise(self, decays: DecaySet) -> tuple[np.ndarray, ...]:
+        """Linearise decays about the fitted scales.
+
+        Returns
+        -------
+        weight : array, shape (n, 2, 2)
+            `whitener`, without scatter.
+        residuals : array, shape (n, 2)
+            `pulls`.
+        rows, change : array, shapes (n, 2, p), (n, 2, 2)
+            Slopes of the pulls by the scales, and by ln a and ln b of each decay.
         """
-        return _expanded(self.vector, decays)
+        return _linearise(self.vector, decays)
 
     def __str__(self) -> str:
         rows = [f"{len(self.names)} decays: {self.status}. {self.message}"]
@@ -441,20 +462,19 @@ class ScaleFit(Judged):
         Parameters
         ----------
         seed : int, optional
-            Of the random numbers.
+            Seed of the random numbers.
         **options
-            As of `beamfit.sampling.ensemble.draw`.
+            As for `beamfit.sampling.ensemble.draw`.
 
         Returns
         -------
         Posterior
-            Of Touschek, bremsstrahlung, elastic, desorption, with the priors of the fit, otherwise
-            flat from 0 to 1000. Pressure errors are integrated out and the scatter is averaged
-            over as in the fit.
+            Posterior of the scales: the priors of the fit, otherwise flat from 0 to 1000. Pressure
+            errors and scatter are integrated out as in the fit.
         """
         from beamfit.sampling.ensemble import draw
 
-        stated = Statement(
+        statement = Statement(
             data=(self.decays, SampledNoises.of(self)),
             log_volume=_log_volume,
             units=dict.fromkeys(self.scales, "1"),
@@ -463,16 +483,16 @@ class ScaleFit(Judged):
         )
         optimum = Optimum(self.vector, self.finding, [1.0], [True])
         problem = self.fit.problem
-        return draw(target_of(problem, optimum, stated), seed=seed, **options)
+        return draw(target_of(problem, optimum, statement), seed=seed, **options)
 
     def to_json(self) -> dict[str, Any]:
-        """Return the scales and the verdict as JSON's types."""
+        """Scales and verdict as JSON's types."""
         verdict = {"status": self.status, "message": self.message}
         rest = {"scatter": self.scatter, "chi2": self.chi2, "dof": self.dof, "decays": self.names}
         return json_of({**verdict, **self.scales, **rest})
 
 
-def _checked(priors: Mapping[str, tuple[float, float]]) -> list[Prior]:
+def _check_priors(priors: Mapping[str, tuple[float, float]]) -> list[Prior]:
     for name, (value, spread) in priors.items():
         if name not in (*SCALES, VOLTAGE):
             raise InputError(f"a prior on '{name}'", nearest(name, [*SCALES, VOLTAGE]))
@@ -484,16 +504,16 @@ def _checked(priors: Mapping[str, tuple[float, float]]) -> list[Prior]:
 def _voltages(
     decays: Sequence[Decay], machine: Machine, prior: tuple[float, float] | None
 ) -> np.ndarray | None:
-    """RF voltages at which losses are computed for a free scale: all must store a beam."""
+    """Ratios of true to read RF voltage at which losses are computed: all must store a beam."""
     if prior is None:
         return None
     mean, error = prior
-    found = mean + error * np.arange(-WIDEST, WIDEST + 1)
+    ratios = mean + error * np.arange(-VOLTAGE_RANGE, VOLTAGE_RANGE + 1)
     lowest = min(float(setting.rf_voltage) for setting, _ in settings_of(decays, machine))
-    if not found[0] * lowest > float(machine.ring.energy_loss):
+    if not ratios[0] * lowest > float(machine.ring.energy_loss):
         expected = "an error at three times of which every decay is still stored"
         raise InputError(f"rf_voltage = {mean:g} ± {error:g}", expected)
-    return found
+    return ratios
 
 
 def fit_scales(
@@ -508,21 +528,21 @@ def fit_scales(
     Parameters
     ----------
     decays : sequence of Decay
-        Fitted decays whose records carry RF voltage, scraper, bunches, pressure. Those too short
-        to tell a from b take part with what they say.
+        Fitted decays whose records carry RF voltage, scraper, bunches, pressure. Decays too short
+        to separate a and b take part with their information.
     machine : Machine
-        The ring, and what the records do not say.
+        The ring, and the settings that the records do not give.
     pressure_error : float, optional
-        Relative error of each record's pressure reading. A common error of the gauge is no such
-        error: it scales bremsstrahlung and elastic scattering alike.
+        Relative error of each record's pressure reading, independent from record to record. A
+        common error of the gauge scales bremsstrahlung and elastic scattering instead.
     priors : mapping of str to (mean, standard deviation), optional
-        What is known of the scales beforehand. One on rf_voltage, such as (1, 0.01), is the
-        calibration of the reading, and has the true over the read voltage fitted too.
+        Priors of the scales. A prior on rf_voltage, such as (1, 0.01), is the calibration of its
+        reading; then the ratio of true to read voltage is fitted too.
 
     Returns
     -------
     ScaleFit
-        Scales, not negative, with errors, and a verdict on which mechanisms are separable.
+        Scales of zero or more with errors, and a verdict on which mechanisms are separable.
 
     Raises
     ------
@@ -531,44 +551,44 @@ def fit_scales(
 
     Notes
     -----
-    Least squares on the pairs of `Summaries`, which is least squares on all readings to second
-    order about each decay's own fit. The pressure factor of each record is integrated out with
-    the model linearised in it. How a and b scatter from fill to fill is averaged over, and what is
-    no scatter compared with it (`FillNoise`), with all linear in the scales. Where a misread RF
-    voltage is the likeliest, its scale is free with a prior of 1 ± 2 %.
+    Least squares on the parts in `Summaries`, which is least squares on all readings to second
+    order about each decay's own fit. The pressure factor of each record is integrated out, with
+    the model linearised in it. The answer averages over the scatter of a and b from fill to fill,
+    and compares it with other departures (`FillNoise`), linear in the scales. Where a misread RF
+    voltage is the most probable, its scale is free with a prior of 1 ± 2 %.
     """
     if not decays:
         raise InputError("no decay", "one or more; several settings separate the mechanisms")
     priors = priors or {}
-    known, voltages = _checked(priors), _voltages(decays, machine, priors.get(VOLTAGE))
-    together = DecaySet.of(decays, machine, pressure_error, voltages)
-    nothing = np.zeros(together.measured.parts.shape)
-    free = [Free(name, 0.0, LARGEST) for name in SCALES]
+    prior_terms, voltages = _check_priors(priors), _voltages(decays, machine, priors.get(VOLTAGE))
+    data = DecaySet.of(decays, machine, pressure_error, voltages)
+    zeros = np.zeros(data.measured.parts.shape)
+    free = [Free(name, 0.0, MAX_SCALE) for name in SCALES]
     free += [] if voltages is None else [Free(VOLTAGE, voltages[0], voltages[-1])]
     names = (*SCALES, VOLTAGE)[: len(free)]
     vector = np.array([priors.get(name, (1.0, 0.0))[0] for name in names])
-    models = _departures(decays, machine, vector, voltages)
+    models = _departure_changes(decays, machine, vector, voltages)
     limits = np.array([(each.lower, each.upper) for each in free], float).T
-    before = None
-    for _ in range(ROUNDS):
-        linear = _linear(vector, together, known, names)
-        noise = compared(linear, models, limits - vector)
-        given = together, (whitener(vector, together), _whole(linear.change, noise))
-        record = Record(RECORD, _weighted, given, nothing.ravel(), 1.0)
-        found = solve(Problem(dict(zip(names, vector, strict=True)), free, [record], known))
+    last_best = None
+    for _ in range(MAX_ITERATIONS):
+        linear = _linear_decays(vector, data, prior_terms, names)
+        noise = weigh_noises(linear, models, limits - vector)
+        arguments = data, (whitener(vector, data), _whitening_matrix(linear.loss_slopes, noise))
+        record = Record(RECORD, _whitened_pulls, arguments, zeros.ravel(), 1.0)
+        found = solve(Problem(dict(zip(names, vector, strict=True)), free, [record], prior_terms))
         moved, vector = found.theta - vector, found.theta
         noise = replace(noise, shift=noise.shift - moved)
-        likeliest = noise.model[noise.likeliest], *noise.scatter[noise.likeliest]
-        if before == likeliest and np.all(np.abs(moved) < SETTLED * np.maximum(vector, 1.0)):
+        best = noise.model[noise.most_probable], *noise.scatter[noise.most_probable]
+        if last_best == best and np.all(np.abs(moved) < SCALE_TOLERANCE * np.maximum(vector, 1.0)):
             break
-        before = likeliest
+        last_best = best
     named = tuple(decay.fit.record for decay in decays)
-    fit = ScaleFit(found, machine, together, named, noise)
+    fit = ScaleFit(found, machine, data, named, noise)
     if noise.model_name != VOLTAGE:
         return fit
-    # What a misread voltage predicts needs its scale.
+    # Predictions with a misread voltage need its scale: fit again with it free.
     try:
-        free = {**priors, VOLTAGE: (1.0, BY[VOLTAGE])}
+        free = {**priors, VOLTAGE: (1.0, MODEL_SIZES[VOLTAGE])}
         freed = fit_scales(decays, machine, pressure_error=pressure_error, priors=free)
     except InputError:  # a decay would not be stored three errors lower
         return fit
@@ -579,50 +599,53 @@ def _vector(model: Mapping[str, Array]) -> Array:
     return jnp.stack([model[name] for name in (*SCALES, VOLTAGE) if name in model])
 
 
-def _weighted(model: Mapping[str, Array], data: tuple[DecaySet, tuple[Array, Array]]) -> Array:
-    """Model minus measurement in standard errors taken at the last scales."""
+def _whitened_pulls(
+    model: Mapping[str, Array], data: tuple[DecaySet, tuple[Array, Array]]
+) -> Array:
+    """Model minus measurement in the standard errors of the last iteration."""
     decays, (weight, whiten) = data
     return whiten @ pulls(_vector(model), decays, weight).ravel()
 
 
-def _expanded(vector: np.ndarray, decays: DecaySet) -> tuple[np.ndarray, ...]:
+def _linearise(vector: np.ndarray, decays: DecaySet) -> tuple[np.ndarray, ...]:
     weight = whitener(jnp.asarray(vector), decays)
-    given = jnp.asarray(vector), decays, weight
-    weight, off, rows = map(np.asarray, (weight, pulls(*given), _by_scales(*given)))
-    return weight, off, rows, weight @ _changes(vector, decays)
+    arguments = jnp.asarray(vector), decays, weight
+    weight, residuals, rows = map(np.asarray, (weight, pulls(*arguments), _pull_slopes(*arguments)))
+    return weight, residuals, rows, weight @ _loss_slopes(vector, decays)
 
 
-def _changes(vector: np.ndarray, decays: DecaySet) -> np.ndarray:
-    """Changes of the parts by ln a and ln b of each decay, shape (n, 2, 2)."""
+def _loss_slopes(vector: np.ndarray, decays: DecaySet) -> np.ndarray:
+    """Slopes of the parts by ln a and ln b of each decay, shape (n, 2, 2)."""
     a, b = map(np.asarray, scaled_losses(jnp.asarray(vector), decays.terms))
-    return by_losses(a * np.asarray(decays.terms.current), b)
+    return loss_part_slopes(a * np.asarray(decays.terms.current), b)
 
 
-def _linear(
+def _linear_decays(
     vector: np.ndarray, decays: DecaySet, priors: Sequence[Prior], names: Sequence[str]
 ) -> LinearDecays:
-    """Decays about some scales, and the priors of these."""
-    _, off, rows, change = _expanded(vector, decays)
-    at = [names.index(prior.name) for prior in priors]
+    """Linearise decays and priors about some scales."""
+    _, residuals, rows, change = _linearise(vector, decays)
+    index = [names.index(prior.name) for prior in priors]
     mean, sd = (np.array([getattr(p, n) for p in priors], float) for n in ("mean", "sd"))
-    known = np.eye(len(names))[at] / sd[:, None]
-    return LinearDecays(off, rows, change, (vector[at] - mean) / sd, known)
+    prior_slopes = np.eye(len(names))[index] / sd[:, None]
+    return LinearDecays(residuals, rows, change, (vector[index] - mean) / sd, prior_slopes)
 
 
-def _whole(change: np.ndarray, noise: FillNoise) -> Array:
-    """Root of the information of all decays beside the likeliest noise, (2n, 2n), over that of
-    each; `change` has their slopes by ln a and ln b.
+def _whitening_matrix(change: np.ndarray, noise: FillNoise) -> Array:
+    """Whitening matrix, (2n, 2n), of all pulls with the most probable noise.
+
+    `change` are the slopes of the pulls by ln a and ln b.
     """
-    k = noise.likeliest
+    k = noise.most_probable
     scattered = block_diag(*(change * noise.sizes(k, len(change))[:, None, :]))
     smooth = (change @ noise.columns[noise.model[k]]).reshape(len(scattered), -1)
-    return widened(np.eye(len(scattered)), np.hstack([scattered, smooth]))
+    return add_errors(np.eye(len(scattered)), np.hstack([scattered, smooth]))
 
 
-def _departures(
+def _departure_changes(
     decays: Sequence[Decay], machine: Machine, vector: np.ndarray, voltages: np.ndarray | None
 ) -> dict[str, np.ndarray]:
-    """Changes of ln a and ln b of each decay by what may be wrong besides, as of `compared`."""
+    """Changes of ln a and ln b of each decay by other departures, for `weigh_noises`."""
     settings, scales = settings_of(decays, machine), jnp.asarray(vector[: len(SCALES)])
 
     def logs(operation: Operation, current: float) -> np.ndarray:
@@ -631,34 +654,36 @@ def _departures(
 
     found = {}
     if voltages is None:
-        higher = [(o._replace(rf_voltage=(1 + STEP) * o.rf_voltage), beam) for o, beam in settings]
-        change = np.array([logs(*to) - logs(*at) for to, at in zip(higher, settings, strict=True)])
-        found[VOLTAGE] = BY[VOLTAGE] / STEP * change[..., None]
+        factor = 1 + VOLTAGE_STEP
+        raised = [(o._replace(rf_voltage=factor * o.rf_voltage), beam) for o, beam in settings]
+        change = np.array([logs(*to) - logs(*at) for to, at in zip(raised, settings, strict=True)])
+        found[VOLTAGE] = MODEL_SIZES[VOLTAGE] / VOLTAGE_STEP * change[..., None]
     inputs = np.array([
         (1e-6 * o.rf_voltage, np.log(o.scraper_y), np.log(o.bunches)) for o, _ in settings
     ], float)  # fmt: skip
     middle, half = (inputs.max(0) + inputs.min(0)) / 2, np.ptp(inputs, axis=0) / 2
-    moved = (inputs - middle)[:, half > SHORTEST] / half[half > SHORTEST]
-    bends = np.hstack([moved, moved**2 - np.mean(moved**2, axis=0)])
-    if bends.size:
-        found["settings"] = BY["settings"] * np.stack([np.kron(row, np.eye(2)) for row in bends])
+    scaled = (inputs - middle)[:, half > MIN_HALF_RANGE] / half[half > MIN_HALF_RANGE]
+    shapes = np.hstack([scaled, scaled**2 - np.mean(scaled**2, axis=0)])
+    if shapes.size:
+        shapes = np.stack([np.kron(row, np.eye(2)) for row in shapes])
+        found["settings"] = MODEL_SIZES["settings"] * shapes
     return {name: rows for name, rows in found.items() if np.any(rows)}
 
 
 class SampledNoises(NamedTuple):
-    """Noises for the sampler.
+    """Noises of the sampler.
 
     Attributes
     ----------
     prior : array, shape (k,)
-        Logarithm of their weight before the decays.
+        Logarithm of the prior weight.
     sizes : array, shape (k, n, 2)
         Scatter of ln a and ln b.
     rows : array, shape (n, 2, 2)
-        Changes of the parts by ln a and ln b. Those of the fit: a scatter that grew with the losses
+        Slopes of the parts by ln a and ln b, fixed at the fit: a scatter that grows with the losses
         would allow any loss.
     columns : array, shape (k, n, 2, m)
-        Changes of ln a and ln b by further numbers.
+        Changes of ln a and ln b by further parameters.
     """
 
     prior: Array
@@ -668,41 +693,43 @@ class SampledNoises(NamedTuple):
 
     @classmethod
     def of(cls, fit: ScaleFit) -> SampledNoises:
-        """Draw noises evenly by their weight: a few stand for many."""
+        """Choose a few noises that represent all: equidistant quantiles of their weight."""
         noise, count = fit.noise, len(fit.names)
         order = np.lexsort((*noise.scatter.T, noise.odd, noise.model))
-        at = (np.arange(SAMPLED) + 0.5) / SAMPLED
-        place = np.searchsorted(np.cumsum(noise.weight[order]), at)
-        drawn, often = np.unique(order[np.minimum(place, len(order) - 1)], return_counts=True)
-        # Compiled code is shared by a few numbers of noises.
+        quantile = (np.arange(SAMPLED_NOISES) + 0.5) / SAMPLED_NOISES
+        index = np.searchsorted(np.cumsum(noise.weight[order]), quantile)
+        drawn, counts = np.unique(order[np.minimum(index, len(order) - 1)], return_counts=True)
+        # Padded, so that few different shapes are compiled.
         drawn = np.pad(drawn, (0, padded_length(len(drawn)) - len(drawn)), mode="edge")
-        often = np.pad(often, (0, len(drawn) - len(often)))
-        own = [noise.columns[noise.model[k]] for k in drawn]
-        wide = max(one.shape[2] for one in own)
-        columns = [np.pad(one, ((0, 0), (0, 0), (0, wide - one.shape[2]))) for one in own]
+        counts = np.pad(counts, (0, len(drawn) - len(counts)))
+        drawn_columns = [noise.columns[noise.model[k]] for k in drawn]
+        width = max(one.shape[2] for one in drawn_columns)
+        columns = [
+            np.pad(one, ((0, 0), (0, 0), (0, width - one.shape[2]))) for one in drawn_columns
+        ]
         return cls(
-            prior=jnp.asarray(noise.prior[drawn] - np.log(noise.weight[drawn])) + jnp.log(often),
+            prior=jnp.asarray(noise.prior[drawn] - np.log(noise.weight[drawn])) + jnp.log(counts),
             sizes=jnp.asarray([noise.sizes(k, count) for k in drawn]),
-            rows=jnp.asarray(_changes(fit.vector, fit.decays)),
+            rows=jnp.asarray(_loss_slopes(fit.vector, fit.decays)),
             columns=jnp.asarray(columns),
         )
 
 
 def _log_volume(scales: Mapping[str, Array], data: tuple[DecaySet, SampledNoises]) -> Array:
-    """Log likelihood of the decays, the noise averaged over."""
+    """Log likelihood of the decays, averaged over the noises."""
     decays, noise = data
     vector = _vector(scales)
     weight = whitener(vector, decays)
-    off, change = pulls(vector, decays, weight), weight @ noise.rows
+    residuals, change = pulls(vector, decays, weight), weight @ noise.rows
 
-    def beside(sizes: Array, columns: Array) -> Array:
-        return log_likelihood(off, change, sizes, change @ columns)
+    def with_noise(sizes: Array, columns: Array) -> Array:
+        return log_likelihood(residuals, change, sizes, change @ columns)
 
-    # det(W)/det(R): the normalisation, which changes with the scales as the errors do.
+    # The normalisation of the likelihood changes with the scales as the errors do.
     volume = jnp.abs(jnp.linalg.det(weight))
-    known = jnp.abs(jnp.linalg.det(decays.measured.root)) > 0
-    usual = jnp.sum(jnp.where(known, jnp.log(jnp.where(known, volume, 1.0)), 0.0))
-    return usual + logsumexp(noise.prior + jax.vmap(beside)(noise.sizes, noise.columns))
+    informative = jnp.abs(jnp.linalg.det(decays.measured.root)) > 0
+    normalisation = jnp.sum(jnp.log(jnp.where(informative, volume, 1.0)))
+    return normalisation + logsumexp(noise.prior + jax.vmap(with_noise)(noise.sizes, noise.columns))
 
 
 def _search_failed(found: ScaleFit) -> Finding | None:
@@ -717,35 +744,36 @@ def _not_separable(found: ScaleFit) -> Finding | None:
     if not names:
         return None
     count = len(found.names)
-    many = "one decay" if count == 1 else f"{count} decays"
+    decays = "one decay" if count == 1 else f"{count} decays"
     advice = ", ".join(dict.fromkeys(SCALES[name] for name in names))
-    more = f" {_departure(found)}" if found.refuted_by else ""
+    departure = f" {_departure(found)}" if found.refuted_by else ""
     return Finding(
         Status.unidentified,
-        f"{' and '.join(names)} not separable by {many}: vary {advice}, or give a prior.{more}",
+        f"{' and '.join(names)} not separable by {decays}: vary {advice}, or give a prior."
+        f"{departure}",
     )
 
 
 def _departure(found: ScaleFit) -> str:
-    """Sentence on a departure from first principles beside scatter."""
-    worth = f"chi²/dof is {found.chi2 / found.dof:.3g}" if found.dof > 0 else "beside their scatter"
+    """Sentence on a departure from first principles in addition to scatter."""
+    size = f"chi²/dof is {found.chi2 / found.dof:.3g}" if found.dof > 0 else "beside their scatter"
     if found.refuted_by == "settings":
         return (
-            f"Decays depart smoothly from first principles with the settings ({worth}): correct by "
+            f"Decays depart smoothly from first principles with the settings ({size}): correct by "
             "a network."
         )
     return f"{_misread(found)}: give a prior on rf_voltage, its calibration."
 
 
 def _misread(found: ScaleFit) -> str:
-    """Words for an RF voltage that is off its reading."""
+    """Words on an RF voltage that differs from its reading."""
     if (scale := found.scales.get(VOLTAGE)) is None:
         return "The RF voltage is off its reading"
     error = "" if scale.error is None else f" ± {100 * scale.error:.1g}"
     return f"The RF voltage is {100 * (scale.value - 1):+.2g}{error} % off its reading"
 
 
-def _refuted(found: ScaleFit) -> Finding | None:
+def _refuted_principles(found: ScaleFit) -> Finding | None:
     if not found.refuted_by:
         return None
     said = f"{_departure(found)} The errors contain it."
@@ -756,4 +784,4 @@ def _separable(found: ScaleFit) -> Finding:
     return Finding(Status.converged, "Every mechanism is separable.")
 
 
-RULES = (_search_failed, _not_separable, _refuted, _separable)
+RULES = (_search_failed, _not_separable, _refuted_principles, _separable)

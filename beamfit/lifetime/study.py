@@ -1,4 +1,4 @@
-"""A record from file to verdicts: cut into decays, each fitted, with its loss budget."""
+"""Study of a record: split it into decays, fit each, compute its loss budget."""
 
 from __future__ import annotations
 
@@ -13,15 +13,21 @@ import numpy as np
 
 from beamfit.answer import answer, json_of, shown
 from beamfit.errors import InputError, expect
-from beamfit.lifetime.cycles import alike, joined
+from beamfit.lifetime.cycles import group_by_settings, join_cycles
 from beamfit.lifetime.evidence import SEPARABLE
-from beamfit.lifetime.fit import FEWEST as FEWEST_FITTED
-from beamfit.lifetime.fit import DecayFit, bare, fit_cycles, fit_decay, fit_pieces
+from beamfit.lifetime.fit import (
+    MIN_FITTED_READINGS,
+    DecayFit,
+    bare,
+    fit_cycles,
+    fit_decay,
+    fit_pieces,
+)
 from beamfit.lifetime.free_law import DRIFT, Law
 from beamfit.lifetime.mechanisms import MECHANISMS, Losses, loss_coefficients
 from beamfit.lifetime.pieces import (
-    FEWEST_CYCLES,
-    FEWEST_READINGS,
+    MIN_CYCLE_READINGS,
+    MIN_CYCLES,
     Event,
     Split,
     beam_readings,
@@ -30,8 +36,8 @@ from beamfit.lifetime.pieces import (
     split_record,
 )
 from beamfit.lifetime.readings import (
-    FEWEST,
-    STAIR,
+    MIN_READINGS,
+    MIN_STAIR_READINGS,
     noise_of,
     on_edges,
     thinned,
@@ -39,7 +45,7 @@ from beamfit.lifetime.readings import (
     without_summer_time,
 )
 from beamfit.lifetime.record import DecayRecord
-from beamfit.lifetime.ring import MeasuredLength, Operation, Ring, stored_bunch, unstored
+from beamfit.lifetime.ring import MeasuredLength, Operation, Ring, required_voltage, stored_bunch
 from beamfit.lifetime.systematics import (
     OneLifetime,
     Systematic,
@@ -49,24 +55,27 @@ from beamfit.lifetime.systematics import (
 )
 from beamfit.quantity import HOUR, Quantity, Status
 
-# A setting that moves by more than this share between two readings was changed by somebody.
-CHANGED = 0.01
+# Settings that split a record, and the relative change between two readings at which they do:
+# more than a read-back scatters, less than an operator's step.
 SETTINGS = ("rf_voltage", "scraper_y", "bunches")
-# Noise with a memory is taken for so many times what neighbouring readings scatter by.
-OWN = 3.0
-# Answers of cycles for which one law does not hold.
-REFUTED = (Status.poor_fit, Status.infeasible)
-# Errors of the time of a change within which readings are of neither side.
-NEITHER = 2.0
-# Times in which gas is pumped away to less than a hundredth.
-SETTLED = 5.0
-# Cycles that make a point of a course at least.
-FEWEST_IN_PART = 10
+SETTING_STEP = 0.01
+# Limit of the noise of pooled cycles, in units of the scatter of neighbouring readings: residuals
+# beyond it come from a law that does not hold for all cycles, not from noise.
+MAX_NOISE_RATIO = 3.0
+# Verdicts that refute one law for all cycles.
+REFUTING = (Status.poor_fit, Status.infeasible)
+# Readings within this many standard errors of the time of a change belong to neither decay.
+CHANGE_MARGIN = 2.0
+# Time constants after which gas is pumped away: less than 1 % of it is left.
+GAS_TIME_CONSTANTS = 5.0
+# Smallest number of cycles in a part of a top-up record: chosen, since fewer make a poor point
+# of a trend.
+MIN_CYCLES_IN_PART = 10
 
 
 @shown
 class Machine(NamedTuple):
-    """A ring and the settings and vacuum that hold where a record does not say otherwise.
+    """A ring with its usual settings and vacuum, which hold where a record does not give its own.
 
     Examples
     --------
@@ -81,23 +90,23 @@ class Machine(NamedTuple):
 
 
 class Budget(NamedTuple):
-    """Losses from first principles during a record.
+    """Loss budget of a record from first principles.
 
     Attributes
     ----------
     operation : Operation
-        The settings and the vacuum they were computed for.
+        Settings and vacuum of the computation.
     losses : Losses
-        Coefficients by mechanism, 1/(mA s) and 1/s, as plain numbers.
+        Coefficients of each mechanism, 1/(mA s) and 1/s, as plain numbers.
     current : float
         Mean current of the record, mA.
     bunch_length : float
-        Rms length of the bunches, m, computed or given.
+        Rms bunch length, m, computed or given.
     emittances : tuple of float
         Horizontal and vertical, m rad, as given: intrabeam scattering is not computed.
     filed_pressure : float or None
-        Pressure at the mean current by the ring file, Pa, where the record's own gauge, which the
-        losses are computed for, contradicts it by more than gauges are read to.
+        Pressure at the mean current by the ring file, Pa, if the record's gauge contradicts it by
+        more than a gauge's error; the losses are computed for the gauge's pressure.
     """
 
     operation: Operation
@@ -109,12 +118,12 @@ class Budget(NamedTuple):
 
     @property
     def pressure(self) -> float:
-        """Pressure at the mean current that the losses are computed for, Pa."""
+        """Pressure at the mean current, Pa, for which the losses are computed."""
         return pressure_at(self.operation, self.current)
 
     @property
     def rates(self) -> dict[str, float]:
-        """Loss rate at the mean current by cause, 1/h."""
+        """Loss rate of each mechanism at the mean current, 1/h."""
         rates = self.losses.rates(self.current)
         return {m.label: HOUR * rates[m.name] for m in MECHANISMS}
 
@@ -124,7 +133,7 @@ class Budget(NamedTuple):
         return 1 / sum(self.rates.values())
 
     def to_json(self) -> dict[str, Any]:
-        """Return the coefficients as quantities without errors, and the settings in SI."""
+        """Coefficients as quantities without errors, and the settings in SI units."""
         losses = self.losses
         names = (*losses._fields, "a", "b", "lifetime_mean")
         values = (*losses, losses.a, losses.b, self.lifetime)
@@ -139,7 +148,7 @@ class Budget(NamedTuple):
 
 
 def settings_json(operation: Operation) -> dict[str, float]:
-    """The settings of an operation, with their units."""
+    """Settings of an operation by name and SI unit."""
     return {
         "rf_voltage_V": float(operation.rf_voltage),
         "scraper_y_m": float(operation.scraper_y),
@@ -160,7 +169,7 @@ def pressure_at(operation: Operation, current: float) -> float:
 
 
 def operation_during(record: DecayRecord, machine: Machine) -> Operation:
-    """Settings and vacuum during a record: its own where it gives them, else the machine's.
+    """Settings and vacuum during a record: its own columns, else the machine's usual values.
 
     Parameters
     ----------
@@ -172,10 +181,10 @@ def operation_during(record: DecayRecord, machine: Machine) -> Operation:
     Returns
     -------
     Operation
-        With medians over the record. A pressure reading scales the machine's base pressure and
-        its rise with current by one factor: a single decay spans too little current to tell the
-        two apart. One that does not follow the current enters the fit as it is, and stands here
-        by its mean.
+        Medians over the record. A pressure reading scales the machine's base pressure and its
+        rise with current by one factor, since a single decay spans too little current to separate
+        the two. A pressure that does not follow the current enters the fit reading by reading;
+        here its mean over time is the base pressure.
 
     Raises
     ------
@@ -192,36 +201,37 @@ def operation_during(record: DecayRecord, machine: Machine) -> Operation:
     >>> operation_during(record, Machine(read_ring(path), read_operation(path))).rf_voltage
     2400000.0
     """
-    usual = machine.operation
-    said = {name: float(np.median(values)) for name, values in record.conditions.given.items()}
-    for name, value in said.items():
+    operation = machine.operation
+    medians = {name: float(np.median(values)) for name, values in record.conditions.given.items()}
+    for name, value in medians.items():
         if not value > 0:
             raise InputError(f"{name} {value:g}", "above zero", path=record.name, column=name)
-    if "rf_voltage" in said:
-        usual = usual._replace(rf_voltage=said["rf_voltage"])
-        expected = unstored(usual, machine.ring.energy_loss, machine.ring.energy)
+    if "rf_voltage" in medians:
+        operation = operation._replace(rf_voltage=medians["rf_voltage"])
+        expected = required_voltage(operation, machine.ring.energy_loss, machine.ring.energy)
         if expected is not None:
-            found = f"{said['rf_voltage'] / 1e3:.6g} kV"
+            found = f"{medians['rf_voltage'] / 1e3:.6g} kV"
             raise InputError(found, expected, path=record.name, column="rf_voltage_kV")
-    if "bunch_length" in said:
-        length = np.array([said.pop("bunch_length")])
-        said["bunch_length"] = MeasuredLength(np.zeros(1), length, 0.0, usual.rf_voltage)
-    if "pressure" in said:
-        read = said.pop("pressure")
+    if "bunch_length" in medians:
+        length = np.array([medians.pop("bunch_length")])
+        medians["bunch_length"] = MeasuredLength(np.zeros(1), length, 0.0, operation.rf_voltage)
+    if "pressure" in medians:
+        pressure = medians.pop("pressure")
         if record.gauge is not None:
-            # The fit has the gauge's own course: b is the gas at its mean, and a is without gas.
+            # The fit includes the pressure reading by reading: b is the gas loss at the mean
+            # pressure, and no gas loss is part of a.
             mean = record.integral(record.conditions.pressure)[-1] / record.span
-            return usual._replace(**said, pressure_base=mean, pressure_slope=0.0)
-        mean = usual.pressure_base + usual.pressure_slope * record.mean_current
+            return operation._replace(**medians, pressure_base=mean, pressure_slope=0.0)
+        mean = operation.pressure_base + operation.pressure_slope * record.mean_current
         if not mean > 0:
-            usual, mean = usual._replace(pressure_base=1.0, pressure_slope=0.0), 1.0
-        said["pressure_base"] = usual.pressure_base * read / mean
-        said["pressure_slope"] = usual.pressure_slope * read / mean
-    return usual._replace(**said)
+            operation, mean = operation._replace(pressure_base=1.0, pressure_slope=0.0), 1.0
+        medians["pressure_base"] = operation.pressure_base * pressure / mean
+        medians["pressure_slope"] = operation.pressure_slope * pressure / mean
+    return operation._replace(**medians)
 
 
 def budget(record: DecayRecord, machine: Machine) -> Budget:
-    """Compute the losses during a record from first principles.
+    """Compute the loss budget of a record from first principles.
 
     Parameters
     ----------
@@ -233,7 +243,7 @@ def budget(record: DecayRecord, machine: Machine) -> Budget:
     Returns
     -------
     Budget
-        At the record's mean current.
+        Losses at the record's mean current.
 
     Raises
     ------
@@ -260,42 +270,45 @@ def budget(record: DecayRecord, machine: Machine) -> Budget:
     return Budget(operation, parts, current, length, emittances, filed if contradicted else None)
 
 
-def standing_alone(
+def separable_cycles(
     cycles: Sequence[DecayRecord], together: DecayRecord, fit: DecayFit
 ) -> list[DecayRecord]:
-    """Cycles that by themselves would separate a and b, by the bend of their decay and the noise
-    that all cycles show together, or neighbouring readings, where one law does not hold for all.
+    """Select the cycles that are long enough to separate a and b in a fit of their own.
+
+    The curvature of the decay is compared with the noise: the residuals of the joint fit, or a
+    few times the scatter of neighbouring readings where that is less (one law does not hold then).
     """
-    # Of very many readings the fit has means of neighbours.
+    # The joint fit averages neighbouring readings where there are very many.
     intervals = (np.median(np.diff(record.time)) for record in (fit.readings, together))
-    averaged = math.sqrt(max(np.divide(*intervals), 1.0))
+    noise_reduction = math.sqrt(max(np.divide(*intervals), 1.0))
     rounding = (cycles[0].resolution or 0.0) / 12**0.5
-    own = OWN * max(noise_of(together.time, together.current), rounding)
-    own = min(fit.rms_residual * fit.inflation * averaged, own)
+    noise = MAX_NOISE_RATIO * max(noise_of(together.time, together.current), rounding)
+    noise = min(fit.rms_residual * fit.inflation * noise_reduction, noise)
 
     def separates(cycle: DecayRecord) -> bool:
         loss = math.log(cycle.current[0] / cycle.current[-1])
-        # The parabola t²/2 scatters about its line by its length squared over 24 sqrt(5).
+        # The parabola x²/2 over a length x deviates from its best straight line by
+        # x²/(24 sqrt(5)) rms.
         bend = float(cycle.current.mean()) * loss**2 / 24 * math.sqrt(len(cycle) / 5)
-        return own < SEPARABLE * bend
+        return noise < SEPARABLE * bend
 
-    return [cycle for cycle in cycles if len(cycle) >= FEWEST and separates(cycle)]
+    return [cycle for cycle in cycles if len(cycle) >= MIN_READINGS and separates(cycle)]
 
 
 @dataclass(frozen=True, eq=False)
 class Decay:
-    """One decay of a record, or many cycles of it together.
+    """One decay of a record, or many cycles fitted together.
 
     Parameters
     ----------
     segment : DecayRecord
-        Its readings.
+        Readings.
     offset : float
-        Its first reading's time in the record, s.
+        Time of the first reading in the record, s.
     fit : DecayFit
         I0, a, b, lifetimes and verdict.
     budget : Budget or None
-        Losses from first principles, where a ring was given.
+        Loss budget from first principles, if a ring was given.
     """
 
     segment: DecayRecord
@@ -307,39 +320,41 @@ class Decay:
     def of(
         cls, segment: DecayRecord, offset: float, fit: DecayFit, machine: Machine | None
     ) -> Decay:
-        """Add the losses of a ring, if there is one."""
+        """Decay with the loss budget of a ring, if there is one."""
         return cls(segment, offset, fit, None if machine is None else budget(segment, machine))
 
-    def placed(self, name: str, start: float | None, machine: Machine | None) -> Decay:
-        """The same under a name, in a record that begins at a time, with the losses of a ring."""
+    def with_name(self, name: str, start: float | None, machine: Machine | None) -> Decay:
+        """Copy with a name, a date and a loss budget; `start` is the Unix time of the record, s."""
         start = None if start is None else start + self.segment.start
         segment = replace(self.segment, name=name, start=start)
         fit = replace(self.fit, record=name, readings=segment)
         return Decay.of(segment, self.offset, fit, machine)
 
     def parts(self, number: int, machine: Machine | None) -> list[Decay]:
-        """The cycles of top-up as so many decays at most, each of some cycles and a fit of its own;
-        a single decay as it is.
+        """Divide the cycles of top-up into at most `number` parts, and fit each part.
+
+        A single decay is returned as it is.
         """
-        fit, first = self.fit, self.fit.first
-        count = 1 if first is None else min(number, first.size // FEWEST_IN_PART)
+        fit, cycle_starts = self.fit, self.fit.first
+        count = 1 if cycle_starts is None else min(number, cycle_starts.size // MIN_CYCLES_IN_PART)
         if count < 2:
             return [self]
-        ends, found = [*first, len(fit.readings)], []
-        every = [fit.readings.select(slice(*pair)) for pair in pairwise(ends)]
-        for k, group in enumerate(np.array_split(np.arange(first.size), count), 1):
-            cycles, name = [every[place] for place in group], f"{fit.record}#{k}"
+        ends, parts = [*cycle_starts, len(fit.readings)], []
+        cycles_of_decay = [fit.readings.select(slice(*pair)) for pair in pairwise(ends)]
+        for k, group in enumerate(np.array_split(np.arange(cycle_starts.size), count), 1):
+            cycles, name = [cycles_of_decay[place] for place in group], f"{fit.record}#{k}"
             rows = [cycles[0].start, cycles[-1].start + cycles[-1].span] - np.array(self.offset)
             within = slice(*np.searchsorted(self.segment.time, rows))
             segment = self.segment.select(within, name)
-            own = fit_pieces(cycles, name, found=self.segment.mean is None)
-            found.append(Decay.of(segment, cycles[0].start, own, machine))
-        return found
+            fit_of_part = fit_pieces(cycles, name, found=self.segment.mean is None)
+            parts.append(Decay.of(segment, cycles[0].start, fit_of_part, machine))
+        return parts
 
     @cached_property
     def checks(self) -> dict[str, OneLifetime | None]:
-        """Simpler analyses by name, None where a current is zero; none of them if nothing decays,
-        and for many cycles.
+        """Simpler analyses by name: ln I is None if a current is zero.
+
+        Empty if the current is constant, and for cycles fitted together.
         """
         record, fit = self.segment, self.fit
         if fit.first is not None or np.ptp(record.current) == 0:
@@ -349,11 +364,11 @@ class Decay:
 
     @cached_property
     def systematics(self) -> tuple[Systematic, ...]:
-        """Systematic errors, which no residual shows."""
+        """Systematic errors, which the residuals do not show."""
         return systematics(self.fit)
 
     def to_json(self) -> dict[str, Any]:
-        """Give one entry of the ``results`` list of the JSON contract."""
+        """Entry of the ``results`` list of the JSON contract."""
         more = {"start": bare(self.offset, "s"), **self.checks, "systematics": self.systematics}
         more |= {"notes": self.segment.notes} if self.segment.notes else {}
         more |= {} if self.budget is None else {"budget": self.budget}
@@ -361,25 +376,25 @@ class Decay:
 
 
 def settings_of(decays: Sequence[Decay], machine: Machine) -> list[tuple[Operation, float]]:
-    """Settings and vacuum of each decay, and its mean current, mA."""
+    """Settings and vacuum, and mean current in mA, of each decay."""
     return [(operation_during(d.segment, machine), d.fit.mean_current) for d in decays]
 
 
 @answer
 @dataclass(frozen=True, eq=False)
 class RecordStudy:
-    """A record with its decays and what lies between them.
+    """Decays of a record, and the events between them.
 
     Parameters
     ----------
     record : DecayRecord
         The whole record.
     decays : tuple of Decay
-        In order of time; of many cycles those that tell a from b by themselves.
+        Single decays in order of time; of many cycles, only those that separate a and b alone.
     events : tuple of Event
-        Refills, losses, dropouts and what else was cut away.
+        Refills, losses, dropouts and other readings that were cut out.
     pooled : tuple of Decay
-        Cycles at the same settings fitted together, as of top-up.
+        Cycles at the same settings fitted together, as in top-up.
     """
 
     record: DecayRecord
@@ -389,113 +404,118 @@ class RecordStudy:
 
     @property
     def answers(self) -> tuple[Decay, ...]:
-        """Quoted answers of the record: cycles together, then single decays; at least one."""
+        """Answers of the record, at least one: cycles fitted together, then single decays."""
         return self.pooled + self.decays
 
     @property
     def headline(self) -> str:
-        """Lifetimes of the first answers, and how many more there are."""
-        said = [decay.fit.headline for decay in self.answers[:3]]
-        more = len(self.answers) - len(said)
-        return "; ".join(said + [f"{more} more"] * (more > 0))
+        """Lifetimes of the first three answers, and the number of the others."""
+        headlines = [decay.fit.headline for decay in self.answers[:3]]
+        others = len(self.answers) - len(headlines)
+        return "; ".join(headlines + [f"{others} more"] * (others > 0))
 
     def to_json(self) -> list[dict[str, Any]]:
-        """Give the ``results`` list of the JSON contract."""
+        """``results`` list of the JSON contract."""
         return [decay.to_json() for decay in self.answers]
 
 
-def _steps(record: DecayRecord) -> dict[str, np.ndarray]:
-    """After which readings somebody changed each setting."""
+def _setting_steps(record: DecayRecord) -> dict[str, np.ndarray]:
+    """Mask of the readings after which each setting changes, shape (n - 1,)."""
     given = {name: v for name, v in record.conditions.given.items() if name in SETTINGS}
-    return {n: np.abs(np.diff(v)) > CHANGED * np.maximum(v[1:], v[:-1]) for n, v in given.items()}
+    return {
+        n: np.abs(np.diff(v)) > SETTING_STEP * np.maximum(v[1:], v[:-1]) for n, v in given.items()
+    }
 
 
-def at_settings(segment: DecayRecord) -> list[DecayRecord]:
-    """Cut where somebody changed a setting."""
-    moved = np.any(list(_steps(segment).values()), axis=0)
+def split_at_settings(segment: DecayRecord) -> list[DecayRecord]:
+    """Split a segment where a setting changes."""
+    moved = np.any(list(_setting_steps(segment).values()), axis=0)
     if not moved.any():
-        return [segment] if len(segment) >= FEWEST else []
+        return [segment] if len(segment) >= MIN_READINGS else []
     pieces = np.split(np.arange(len(segment)), np.flatnonzero(moved) + 1)
-    return [segment.select(rows) for rows in pieces if len(rows) >= FEWEST]
+    return [segment.select(rows) for rows in pieces if len(rows) >= MIN_READINGS]
 
 
-def _pooled(
+def _pool_cycles(
     cycles: Sequence[DecayRecord], name: str, machine: Machine | None, law: Law
 ) -> tuple[list[Decay], list[DecayRecord]]:
-    """Cycles at the same settings together, and those of them that also stand alone."""
-    groups, pooled, alone = alike(cycles), [], []
-    many = sum(len(group) >= FEWEST_CYCLES for group in groups)
+    """Fit cycles at the same settings together; also return those to be fitted alone."""
+    groups, pooled, single = group_by_settings(cycles), [], []
+    pooled_groups = sum(len(group) >= MIN_CYCLES for group in groups)
     for group in groups:
-        if len(group) < FEWEST_CYCLES:
-            alone += [cycle for cycle in group if len(cycle) >= FEWEST]
+        if len(group) < MIN_CYCLES:
+            single += [cycle for cycle in group if len(cycle) >= MIN_READINGS]
             continue
-        called = name if many == 1 else f"{name}@{len(pooled) + 1}"
-        group = _on_edges(group)
-        # A refill between the edges of a staircase would show as a step.
-        fit = fit_cycles(group, called, law, found=group[0].mean is None)
-        segment = joined(group, called)
-        own = standing_alone(group, segment, fit)
-        alone += own
-        known = fit.status not in REFUTED and fit.lifetime_mean.error is not None
-        if not known and len(own) == len(group):  # fills of no one law
+        group_name = name if pooled_groups == 1 else f"{name}@{len(pooled) + 1}"
+        group = _edges_of_cycles(group)
+        # With edges of digits (`mean` is set) no refill is missed: it would show as a step.
+        fit = fit_cycles(group, group_name, law, found=group[0].mean is None)
+        segment = join_cycles(group, group_name)
+        separable = separable_cycles(group, segment, fit)
+        single += separable
+        answered = fit.status not in REFUTING and fit.lifetime_mean.error is not None
+        if not answered and len(separable) == len(group):  # one law does not hold for these fills
             continue
         pooled.append(Decay.of(segment, segment.start, fit, machine))
-    return pooled, alone
+    return pooled, single
 
 
-def _on_edges(cycles: list[DecayRecord]) -> list[DecayRecord]:
-    """The edges of cycles, of those that have enough, where most are staircases of digits.
+def _edges_of_cycles(cycles: list[DecayRecord]) -> list[DecayRecord]:
+    """Replace cycles that are staircases of digits by their edges, if at least half of them are.
 
-    Their steps last twice as long: a few edges are off by as much again in every cycle.
+    A step must last twice as many readings as in a single decay: a cycle has few edges, so the
+    error of each counts more.
     """
-    edges = [(cycle, on_edges(cycle, FEWEST_READINGS, 2 * STAIR)) for cycle in cycles]
+    edges = [
+        (cycle, on_edges(cycle, MIN_CYCLE_READINGS, 2 * MIN_STAIR_READINGS)) for cycle in cycles
+    ]
     stairs = [found for cycle, found in edges if found is not cycle]
-    return stairs if len(stairs) >= max(FEWEST_CYCLES, len(cycles) / 2) else cycles
+    return stairs if len(stairs) >= max(MIN_CYCLES, len(cycles) / 2) else cycles
 
 
-def _decays(record: DecayRecord) -> tuple[Split, bool]:
-    """Clean decays at constant settings, the events between them, and if refills hold the beam."""
-    if len(record) < FEWEST:
+def _split_at_changes(record: DecayRecord) -> tuple[Split, bool]:
+    """Split a record into decays at constant settings; also return if refills hold the beam."""
+    if len(record) < MIN_READINGS:
         return Split((record,), ()), False
-    sections = at_settings(record)
+    sections = split_at_settings(record)
     splits = [split_record(section) for section in sections]
     placed = zip(splits, sections, strict=True)
     events = [one._replace(time=one.time + s.start) for split, s in placed for one in split.events]
     pieces = [piece for split in splits for piece in split.segments]
     refilled = any(map(is_refilled, splits))
-    if len(sections) != 1 and not refilled:  # a fill may begin where a setting is changed
+    if len(sections) != 1 and not refilled:  # a fill may begin where a setting changes
         pieces, events = split_record(record)
-        pieces = [part for piece in pieces for part in at_settings(piece)]
+        pieces = [part for piece in pieces for part in split_at_settings(piece)]
     if pieces:
         return Split(tuple(pieces), tuple(events)), refilled
     kinds = {event.kind for event in events}
-    if kinds == {"spike"} and (kept := beam_readings(record)[0]).size >= FEWEST_FITTED:
+    if kinds == {"spike"} and (kept := beam_readings(record)[0]).size >= MIN_FITTED_READINGS:
         return Split((record.select(kept),), tuple(events)), False
-    moving = [name for name, steps in _steps(record).items() if steps.any()]
+    moving = [name for name, steps in _setting_steps(record).items() if steps.any()]
     if moving or "short" not in kinds:
-        changes = f"changes of {', '.join(moving)} by more than {100 * CHANGED:g} %"
+        changes = f"changes of {', '.join(moving)} by more than {100 * SETTING_STEP:g} %"
         found = ", ".join(sorted(kinds)) or changes
-        expected = f"at least {FEWEST} readings in a row of a stored beam"
+        expected = f"at least {MIN_READINGS} readings in a row of a stored beam"
         expected += "; leave out a setting that only scatters with --ignore" if moving else ""
         raise InputError(f"no decay between {found}", expected, record.name, column="current")
     return Split((), tuple(events)), False
 
 
-def _rise_between_steps(split: Split) -> bool:
-    """True where the current rises between losses: refills that the record does not resolve."""
+def _has_unresolved_refills(split: Split) -> bool:
+    """Return True if steps up exceed the decays: refills that the record does not resolve."""
     risen = sum(event.change for event in split.events if event.kind == "short")
     lost = (float(piece.current[0] - piece.current[-1]) for piece in split.segments)
-    return risen > sum(fall for fall in lost if fall > 0)  # what rises is a slow refill
+    return risen > sum(fall for fall in lost if fall > 0)  # a rising piece is a slow refill
 
 
-def _fitted(
-    pieces: Sequence[DecayRecord], law: Law, whole: bool
+def _fit_each(
+    pieces: Sequence[DecayRecord], law: Law, undivided: bool
 ) -> tuple[list[Decay], list[Event]]:
-    """Fit every piece; one that cannot be is a slow refill between others."""
+    """Fit every piece; list a piece that cannot be fitted as a slow refill."""
     decays, events = [], []
     for piece in pieces:
         try:
-            found, lost = _parts(piece, law, whole)
+            found, lost = _fit_piece(piece, law, undivided)
         except InputError:
             change = float(piece.current[-1] - piece.current[0])
             found, lost = [], [Event("slow refill", piece.start, piece.span, change)]
@@ -504,38 +524,40 @@ def _fitted(
     return decays, events
 
 
-def _parts(piece: DecayRecord, law: Law, whole: bool) -> tuple[list[Decay], list[Event]]:
-    """Fit a decay or, unless as a whole, its parts where current was lost at once, the loss rate
-    changed, though no reading shows it, or the gas of a fill was gone.
+def _fit_piece(piece: DecayRecord, law: Law, undivided: bool) -> tuple[list[Decay], list[Event]]:
+    """Fit a piece; unless `undivided`, split it where the fit finds a change, and fit its parts.
+
+    A change is a sudden loss of current, another loss rate, or the end of outgassing after a fill:
+    the fit finds changes that no single reading shows.
     """
     segment = thinned(on_edges(piece))
     fit = fit_decay(segment, law=law)
-    if not whole and (cut := _cut(segment, fit)) is not None:
-        event, within = cut
+    if not undivided and (cut := _dividing_event(segment, fit)) is not None:
+        event, margin = cut
         at = segment.start - piece.start + event.time
-        # Of means of neighbours the time is anywhere within one.
-        within += float(np.median(np.diff(segment.time))) * (len(segment) < len(piece))
-        sides = piece.time < at - within, piece.time > at + within
-        long = [piece.select(rows) for rows in sides if np.sum(rows) >= FEWEST]
-        if long and max(map(len, long)) < len(piece):
-            decays, events = _fitted(long, law, whole)
-            short = [event_of(piece, "short", *np.flatnonzero(rows)[[0, -1]]) for rows in sides
-                     if 0 < np.sum(rows) < FEWEST]  # fmt: skip
-            here = [one._replace(time=piece.start + one.time) for one in short]
-            return decays, [*events, *here, event._replace(time=piece.start + at)]
+        # Thinned readings are means of neighbours: the change is anywhere within one of them.
+        margin += float(np.median(np.diff(segment.time))) * (len(segment) < len(piece))
+        sides = piece.time < at - margin, piece.time > at + margin
+        sides_to_fit = [piece.select(rows) for rows in sides if np.sum(rows) >= MIN_READINGS]
+        if sides_to_fit and max(map(len, sides_to_fit)) < len(piece):
+            decays, events = _fit_each(sides_to_fit, law, undivided)
+            short = [rows for rows in sides if 0 < np.sum(rows) < MIN_READINGS]
+            short = [event_of(piece, "short", *np.flatnonzero(rows)[[0, -1]]) for rows in short]
+            short = [one._replace(time=piece.start + one.time) for one in short]
+            return decays, [*events, *short, event._replace(time=piece.start + at)]
     return [Decay(segment, segment.start, fit, None)], []
 
 
-def _cut(segment: DecayRecord, fit: DecayFit) -> tuple[Event, float] | None:
-    """The event at which a decay ends within a segment, and the error of its time, s."""
+def _dividing_event(segment: DecayRecord, fit: DecayFit) -> tuple[Event, float] | None:
+    """Event that divides a segment, and the half width in s of the readings to leave out."""
     if (loss := fit.loss) is not None:
         change = -loss.current.value
         return Event("refill" if change > 0 else "loss", loss.time, 0.0, change), 0.0
-    if fit.change is not None:  # of two the larger: its parts tell if there was another
+    if fit.change is not None:  # of two the larger; the fits of the parts find the other
         change = max(filter(None, (fit.change, fit.change.then)), key=lambda one: one.size)
-        return Event("loss rate changes", change.time, 0.0, 0.0), NEITHER * change.error
+        return Event("loss rate changes", change.time, 0.0, 0.0), CHANGE_MARGIN * change.error
     if fit.outgassing is not None and fit.status is Status.poor_fit:
-        settled = SETTLED * fit.outgassing.time_constant.value * HOUR
+        settled = GAS_TIME_CONSTANTS * fit.outgassing.time_constant.value * HOUR
         return Event("gas is pumped away", settled, 0.0, 0.0), 0.0
     return None
 
@@ -543,15 +565,15 @@ def _cut(segment: DecayRecord, fit: DecayFit) -> tuple[Event, float] | None:
 def study_record(
     record: DecayRecord, machine: Machine | None = None, law: Law | str = Law.free
 ) -> RecordStudy:
-    """Cut a record into decays, fit each, and say what first principles expect.
+    """Split a record into decays, fit each, and compute its loss budget from first principles.
 
     Parameters
     ----------
     record : DecayRecord
-        Any record: one decay, fills with refills between them, or top-up. It is also cut where
+        Any record: one decay, fills with refills between them, or top-up. It is also split where
         RF voltage, scraper or bunches change by more than 1 %.
     machine : Machine, optional
-        Ring and usual operation, for the loss budget; with them a and b are constant.
+        Ring and usual operation for the loss budget. With it a and b are constant.
     law : {"free", "constant"}
         As for `fit_decay`.
 
@@ -578,25 +600,29 @@ def study_record(
     expect(record, DecayRecord, "beamfit.read_decay_record(path)")
     record = without_repeats(without_summer_time(record))
     law = Law(law) if machine is None else Law.constant
-    # Segments move `start` with them: counted from zero it is their place in the record.
-    placed = replace(record, start=0.0)
-    split, refilled = _decays(placed)
+    # Selecting rows moves `start`: with a start of zero it is the time within the record.
+    undated = replace(record, start=0.0)
+    split, refilled = _split_at_changes(undated)
     events, pieces, pooled = split.events, split.segments, []
     if refilled:
-        pooled, pieces = _pooled(pieces, record.name, machine, law)
-    elif _rise_between_steps(split):
+        pooled, pieces = _pool_cycles(pieces, record.name, machine, law)
+    elif _has_unresolved_refills(split):
         pieces = ()
-    del split  # of 1e7 readings 160 MB
-    # A record that does nothing but rise is an error; a slow refill within one is not.
-    only = len(pieces) == 1 and not pooled
-    found, more = _parts(pieces[0], law, False) if only else _fitted(pieces, law, bool(pooled))
-    if not found and not pooled:  # of refills that are not resolved pieces rise, or are short
-        events, (found, more) = (), _parts(placed, law, True)
+    del split  # frees 160 MB for 1e7 readings
+    # A record that only rises is an error; a slow refill within a record is an event.
+    if len(pieces) == 1 and not pooled:
+        single, more_events = _fit_piece(pieces[0], law, False)
+    else:
+        single, more_events = _fit_each(pieces, law, bool(pooled))
+    if not single and not pooled:  # refills are not resolved: every piece rises or is short
+        events, (single, more_events) = (), _fit_piece(undated, law, True)
+    names = [f"{record.name}#{k}" for k in range(1, len(single) + 1)]
+    names = names if len(single) > 1 else [record.name] * len(single)
     decays = [
-        decay.placed(f"{record.name}#{k}" if len(found) > 1 else record.name, record.start, machine)
-        for k, decay in enumerate(sorted(found, key=lambda decay: decay.offset), 1)
+        decay.with_name(name, record.start, machine)
+        for name, decay in zip(names, sorted(single, key=lambda d: d.offset), strict=True)
     ]
-    shown = thinned(record)
-    shown = replace(shown, notes=record.notes) if pooled else shown
-    in_order = sorted((*events, *more), key=lambda event: event.time)
-    return RecordStudy(shown, tuple(decays), tuple(in_order), tuple(pooled))
+    display = thinned(record)
+    display = replace(display, notes=record.notes) if pooled else display
+    all_events = sorted((*events, *more_events), key=lambda event: event.time)
+    return RecordStudy(display, tuple(decays), tuple(all_events), tuple(pooled))

@@ -1,4 +1,4 @@
-"""Systematics of a decay that no residual shows, and the bias of simpler analyses."""
+"""Systematic errors of a decay, which residuals do not show, and the bias of simpler analyses."""
 
 from __future__ import annotations
 
@@ -17,34 +17,40 @@ from beamfit.lifetime.expansion import (
     LOSS,
     POWER,
     Pieces,
+    fit_law,
     further_columns,
     lifetime_of,
-    solved,
 )
-from beamfit.lifetime.fit import FEWEST, DecayFit, bare, fit_decay
+from beamfit.lifetime.fit import MIN_FITTED_READINGS, DecayFit, bare, fit_decay
 from beamfit.lifetime.free_law import Law
 from beamfit.lifetime.record import DecayRecord
 from beamfit.quantity import HOUR, Quantity, Status
 
-# The size of each cause that the table assumes; those of the monitor in mA, and in proportion
-# below so many: a monitor of small currents is as good as that.
-PRESSURE, DRIFT, OFFSET, EXPONENT = 0.01, 0.01, 0.1, -0.1
-# The part of the gas that the beam makes: in electron rings the pressure with beam is often twice
-# that without (O. Gröbner, CERN 99-05, p. 127).
-FOLLOWING = 0.5
-SMALL = 10.0
+# Sizes of the causes in the table, chosen: shifts for other sizes are proportional.
+# Relative rise of the pressure over the record.
+PRESSURE_RISE = 0.01
+# Drift of the monitor over the record, and its offset, mA.
+MONITOR_DRIFT, MONITOR_OFFSET = 0.01, 0.1
+# Exponent of a, as of a bunch that lengthens.
+EXPONENT = -0.1
+# Share of the pressure that follows the current: in electron rings the pressure with beam is often
+# twice that without (O. Gröbner, CERN 99-05, p. 127).
+FOLLOWING_SHARE = 0.5
+# Below this current, mA, drift and offset of the monitor are proportional to the current: a monitor
+# for small currents is better.
+SMALL_CURRENT = 10.0
 
 
 @shown
 class Systematic(NamedTuple):
-    """A cause and by how much it moves what was fitted.
+    """Systematic error: a cause, and the shifts of the fitted values.
 
     Attributes
     ----------
     cause : str
-        In words, with its size.
+        Cause in words, with its size.
     a, b, lifetime_mean : float
-        Fitted less true value, 1/(mA s), 1/s and h.
+        Fitted minus true value, 1/(mA s), 1/s and h.
     """
 
     cause: str
@@ -53,32 +59,32 @@ class Systematic(NamedTuple):
     lifetime_mean: float
 
     def to_json(self) -> dict[str, Any]:
-        """Return the cause and the shifts as JSON's types."""
+        """Cause and shifts as JSON's types."""
         moved = {name: bare(getattr(self, name), UNITS[name]) for name in self._fields[1:]}
         return json_of({"cause": self.cause, **moved})
 
 
 def systematics(fit: DecayFit) -> tuple[Systematic, ...]:
-    """Table of systematic errors of a fitted decay, each cause by itself.
+    """Systematic errors of a fitted decay, one cause at a time.
 
     Parameters
     ----------
     fit : DecayFit
-        With its readings, of a constant a.
+        Fit with constant a, with its readings.
 
     Returns
     -------
     tuple of Systematic
-        Empty where a and b are impossible or not determined, a was given a shape, or many cycles
-        were fitted. To first order each shift is proportional to its cause. A pressure that rises
-        in the record and a bunch that lengthens are left out where the errors contain them.
+        Empty where a and b are infeasible or not determined, a has a given shape, or cycles were
+        fitted together. Each shift is proportional to its cause in first order. A rise of the
+        pressure and a bunch that lengthens are left out where the errors contain them.
 
     Notes
     -----
-    A change of the readings d moves the numbers by (JᵀWJ)⁻¹ JᵀW d. A pressure that rises by the
-    share e over the record adds -b e (t/T - 1/2) I to dI/dt: a column of the law, as an exponent
-    is. A pressure P0 + P1 I adds the part that follows the current to a exactly: no decay tells it
-    from a.
+    A change d of the readings shifts the parameters by (JᵀWJ)⁻¹ JᵀW d. A pressure that rises by
+    the share e over the record adds -b e (t/T - 1/2) I to dI/dt: a column of the law, like an
+    exponent. Of a pressure P0 + P1 I the part that follows the current adds to a exactly, so no
+    decay can separate it from a.
 
     Examples
     --------
@@ -92,36 +98,37 @@ def systematics(fit: DecayFit) -> tuple[Systematic, ...]:
     ['0.03 %', '0.00 %', '11.52 %']
     """
     a, b = fit.if_constant("a").value, fit.if_constant("b").value
-    record, another = fit.readings, fit.shaped or fit.first is not None
-    if another or fit.status is Status.infeasible or fit.a.error is None:
+    record, other_law = fit.readings, fit.shaped or fit.first is not None
+    if other_law or fit.status is Status.infeasible or fit.a.error is None:
         return ()
-    about = fit.about
-    over, share = about.pieces.over, record.time / record.span
-    grown = further_columns(about, "drift", np.zeros(1))[:, 0] * over * record.span
-    rises = f"pressure rises by {100 * PRESSURE:g} % over the record"
+    expansion = fit.expansion
+    errors, share = expansion.pieces.divisor, record.time / record.span
+    rise = further_columns(expansion, "drift", np.zeros(1))[:, 0] * errors * record.span
+    rises = f"pressure rises by {100 * PRESSURE_RISE:g} % over the record"
     bends = f"a goes as I^{EXPONENT:g}, as of a bunch that lengthens"
-    causes = {rises: b * PRESSURE * grown, **_monitor(record, share)}
-    causes |= {bends: EXPONENT * (about.rows[:, POWER] * over)}
+    causes = {rises: b * PRESSURE_RISE * rise, **_monitor(record, share)}
+    causes |= {bends: EXPONENT * (expansion.rows[:, POWER] * errors)}
     if fit.free_law is not None:
         contained = {bends} if fit.free_law.drift is None else {bends, rises}
         causes = {cause: change for cause, change in causes.items() if cause not in contained}
-    rate, found = a * fit.mean_current + b, []
+    rate, rows = a * fit.mean_current + b, []
     for cause, change in causes.items():
-        moved = about.moved(change / over)
+        moved = expansion.value_shifts(change / errors)
         lifetime = -moved.rate_mean / rate**2 / HOUR
-        found.append(Systematic(cause, moved.a, moved.b, lifetime))
-    gas = max(b, 0.0) * FOLLOWING / (1 - FOLLOWING)
-    said = f"{100 * FOLLOWING:g} % of the pressure follows the current"
-    return (*found, Systematic(said, gas / fit.mean_current, -gas, 0.0))
+        rows.append(Systematic(cause, moved.a, moved.b, lifetime))
+    gas = max(b, 0.0) * FOLLOWING_SHARE / (1 - FOLLOWING_SHARE)
+    cause_words = f"{100 * FOLLOWING_SHARE:g} % of the pressure follows the current"
+    return (*rows, Systematic(cause_words, gas / fit.mean_current, -gas, 0.0))
 
 
 def _monitor(record: DecayRecord, share: np.ndarray) -> dict[str, np.ndarray]:
-    """Instability of the monitor as stated, or else assumed."""
+    """Changes of the readings, mA, by errors of the monitor, stated or assumed."""
     if record.monitor is None:
-        size = min(float(record.current.max()) / SMALL, 1.0)
+        scale = min(float(record.current.max()) / SMALL_CURRENT, 1.0)
+        drift, offset = MONITOR_DRIFT * scale, MONITOR_OFFSET * scale
         return {
-            f"monitor drifts by {1e3 * DRIFT * size:.2g} µA over the record": DRIFT * size * share,
-            f"monitor reads {OFFSET * size:.2g} mA too much": np.full(len(record), OFFSET * size),
+            f"monitor drifts by {1e3 * drift:.2g} µA over the record": drift * share,
+            f"monitor reads {offset:.2g} mA too much": np.full(len(record), offset),
         }
     stated = record.monitor.changes(record.time)
     return {f"monitor {cause} (in the errors)": moved for cause, moved in stated.items()}
@@ -130,17 +137,17 @@ def _monitor(record: DecayRecord, share: np.ndarray) -> dict[str, np.ndarray]:
 @shown
 @dataclass(frozen=True)
 class OneLifetime:
-    """A lifetime from an analysis that takes it as constant, and its bias.
+    """Lifetime from an analysis that assumes it constant, and its bias.
 
     Parameters
     ----------
     lifetime : Quantity
-        The lifetime, h.
+        Lifetime, h.
     rms_residual : float
         Root mean square of the residuals, mA.
     bias_start, bias_mean : float
-        Relative difference from the lifetime that the (a, b) fit gives at the first reading and
-        at the mean current; NaN where that fit gives none.
+        Relative difference from the lifetime of the (a, b) fit at the first reading and at the
+        mean current; NaN where that fit has none.
     """
 
     lifetime: Quantity
@@ -149,30 +156,30 @@ class OneLifetime:
     bias_mean: float
 
     def to_json(self) -> dict[str, Any]:
-        """Return the fields as JSON's types; a bias that is not known is null."""
+        """Fields as JSON's types; an unknown bias is null."""
         return json_of(vars(self) | {"rms_residual": bare(self.rms_residual, "mA")})
 
 
 def _one_lifetime(
     rate: float, error: float, residuals: np.ndarray, record: DecayRecord, fit: DecayFit | None
 ) -> OneLifetime:
-    """A constant loss rate beside the fit of a record, which is made where there is none."""
-    found, fit = lifetime_of(rate, error), fit or fit_decay(record, law=Law.constant)
-    known = fit.lifetime_start.value, fit.lifetime_mean.value
-    bias = [found.value / value - 1 for value in known]
+    """Compare a constant loss rate with the fit of a record, which is made if not given."""
+    lifetime, fit = lifetime_of(rate, error), fit or fit_decay(record, law=Law.constant)
+    values = fit.lifetime_start.value, fit.lifetime_mean.value
+    bias = [lifetime.value / value - 1 for value in values]
     rms = float(np.sqrt(np.mean(residuals**2)))
-    return OneLifetime(replace(found, error_raw=found.error), rms, *bias)
+    return OneLifetime(replace(lifetime, error_raw=lifetime.error), rms, *bias)
 
 
 def single_exponential(record: DecayRecord, fit: DecayFit | None = None) -> OneLifetime:
-    """Fit I0 exp(-t/tau), the law of report equation 41, for comparison.
+    """Fit I0 exp(-t/tau), report equation 41, for comparison.
 
     Parameters
     ----------
     record : DecayRecord
         One decay.
     fit : DecayFit, optional
-        Of the record, where there is one.
+        Fit of the record, if there is one already.
 
     Returns
     -------
@@ -185,19 +192,19 @@ def single_exponential(record: DecayRecord, fit: DecayFit | None = None) -> OneL
     >>> print(single_exponential(DecayRecord(t, 500 / (1 + t / 36000))).lifetime.value > 10)
     True
     """
-    found = solved(Pieces.of(record), (LOSS,))
-    moments = found.memory((LEVEL, LOSS), True).moments(np.eye(2)[1:], found.given)
+    found = fit_law(Pieces.of(record), (LOSS,))
+    moments = found.memory((LEVEL, LOSS), True).moments(np.eye(2)[1:], found.min_factor)
     error = float(moments.error[0]) / record.span
-    return _one_lifetime(float(found.values.b), error, found.off, record, fit)
+    return _one_lifetime(float(found.values.b), error, found.current_residuals, record, fit)
 
 
 def log_linear(record: DecayRecord, fit: DecayFit | None = None) -> OneLifetime:
-    """Fit a straight line to ln I, as control rooms do, for comparison.
+    """Fit a straight line to ln I, as is common in control rooms, for comparison.
 
     Parameters
     ----------
     record : DecayRecord
-        One decay, all currents positive.
+        One decay with positive currents.
     fit : DecayFit, optional
         As for `single_exponential`.
 
@@ -237,9 +244,9 @@ class LifetimeTrace:
     current : array, shape (m,)
         Mean current in it, mA.
     lifetime : array, shape (m,)
-        Lifetime, h; infinite where no decay is seen, negative where the current rises.
+        Lifetime, h; infinite where the current is constant, negative where it rises.
     error : array, shape (m,)
-        Standard deviation, h, from the scatter within the window; NaN where nothing changes.
+        Standard error, h, from the scatter within the window; NaN where the current is constant.
     """
 
     time: np.ndarray
@@ -261,9 +268,9 @@ def moving_lifetime(record: DecayRecord, window: float) -> LifetimeTrace:
     Returns
     -------
     LifetimeTrace
-        One value for each reading whose window lies within the record and holds five readings.
-        Neighbouring values share readings. The lifetime is that at the window's mean current,
-        too long by a share of (window/lifetime)²/60, for a decay by gas and by Touschek alike.
+        One value for each reading whose window lies within the record and contains five readings.
+        Neighbouring values share readings. The lifetime is that at the mean current of the window,
+        too long by the relative amount (window/lifetime)²/60, for gas and Touschek losses alike.
 
     Raises
     ------
@@ -281,18 +288,21 @@ def moving_lifetime(record: DecayRecord, window: float) -> LifetimeTrace:
     centres = np.flatnonzero((time >= window / 2) & (time <= record.span - window / 2))
     first = np.searchsorted(time, time[centres] - window / 2, side="left")
     last = np.searchsorted(time, time[centres] + window / 2, side="right")
-    full = last - first >= FEWEST
+    full = last - first >= MIN_FITTED_READINGS
     if not full.any():
-        expected = f"one that holds {FEWEST} readings and fits into {record.span:.6g} s"
+        expected = (
+            f"one that holds {MIN_FITTED_READINGS} readings and fits into {record.span:.6g} s"
+        )
         raise InputError(f"a window of {window:.6g} s", expected, path=record.name)
     rows = []
     for start, end in zip(first[full], last[full], strict=True):
-        at = time[start:end].mean()
-        (slope, level), spread = np.polyfit(time[start:end] - at, current[start:end], 1, cov=True)
-        rows.append((at, level, slope, math.sqrt(max(spread[0, 0], 0.0))))
-    at, level, slope, error = np.transpose(rows)
+        middle = time[start:end].mean()
+        centred = time[start:end] - middle
+        (slope, level), spread = np.polyfit(centred, current[start:end], 1, cov=True)
+        rows.append((middle, level, slope, math.sqrt(max(spread[0, 0], 0.0))))
+    middle, level, slope, error = np.transpose(rows)
     with np.errstate(divide="ignore", invalid="ignore"):
-        return LifetimeTrace(at, level, -level / slope / HOUR, level * error / slope**2 / HOUR)
+        return LifetimeTrace(middle, level, -level / slope / HOUR, level * error / slope**2 / HOUR)
 
 
 def constant_a_test(record: DecayRecord) -> ConstantA:
@@ -306,7 +316,7 @@ def constant_a_test(record: DecayRecord) -> ConstantA:
     Returns
     -------
     ConstantA
-        Exponent, probability, and the verdict: part of every fit, as `DecayFit.constant_a`.
+        Exponent, probability, and verdict. Every fit has it as `DecayFit.constant_a`.
 
     Raises
     ------
@@ -315,11 +325,11 @@ def constant_a_test(record: DecayRecord) -> ConstantA:
 
     Notes
     -----
-    A bunch that lengthens with its current loses less at high current than a constant a says. A
-    constant a then leaves a remainder that the fit takes for a gas term: repeat the fit with
-    the bunch's own law, `fit_decay(record, shape=...)`. The exponent is estimated beside I0, a and
-    b in linear approximation about a constant a, and its error contains the noise's memory
-    (`beamfit.noise.memory`): the score test.
+    A bunch that lengthens with its current loses less at high current than with a constant a. A fit
+    with constant a then puts part of the loss into b: repeat it with the law of the bunch,
+    `fit_decay(record, shape=...)`. The exponent is estimated together with I0, a and b in linear
+    approximation about a constant a (score test), and its error includes the correlation of the
+    noise (`beamfit.noise.memory`).
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""Decays and their loss budgets as rows of text: the one list that terminal and report show."""
+"""Tables of decays and their loss budgets, for terminal and report."""
 
 from __future__ import annotations
 
@@ -13,29 +13,30 @@ from beamfit.lifetime.pieces import Event
 from beamfit.lifetime.study import Budget, Decay, RecordStudy
 from beamfit.quantity import HOUR, Quantity, Status
 
-# How many decays have every number shown; of more only the main ones, a row each.
-FEW = 4
-# Percent of the loss below which a mechanism's digits say nothing.
+# Largest number of decays of which all numbers are shown; of more only the main ones, in one row
+# for each decay. Chosen: the columns of a terminal.
+MAX_FULL_DECAYS = 4
+# Percent of the loss below which a mechanism is called negligible.
 NEGLIGIBLE = 1e-6
 # Labels and values of one decay.
 Cells = Mapping[str, object]
 
 
-def _beside(
+def _side_by_side(
     decays: Sequence[Decay], cells_of: Callable[[Decay], Cells], quoted: bool = False
 ) -> list[Row]:
-    """Rows with one cell a decay, by the labels that any of them has."""
+    """Rows with one cell per decay, for all labels that occur."""
     found = [cells_of(decay) for decay in decays]
     labels = dict.fromkeys(label for cells in found for label in cells)
     return [Row(label, [cells.get(label) for cells in found], quoted) for label in labels]
 
 
 def decay_rows(decays: Sequence[Decay]) -> list[Row]:
-    """Label and one cell per decay, for every number a fit has."""
+    """Rows of all numbers of the fits, with one cell per decay."""
     return [
-        *_beside(decays, _head),
-        *_beside(decays, _numbers, quoted=True),
-        *_beside(decays, _residuals),
+        *_side_by_side(decays, _head),
+        *_side_by_side(decays, _numbers, quoted=True),
+        *_side_by_side(decays, _residuals),
     ]
 
 
@@ -70,10 +71,10 @@ def _numbers(decay: Decay) -> Cells:
     refuted = fit.constant_a is not None and fit.constant_a.status is Status.poor_fit
     if fit.first is None and fit.free_law is not None and not refuted:
         numbers |= {f"{name} if a and b are constant": fit.if_constant(name) for name in "ab"}
-    worth = f"{fit.chi2:.4g}/{fit.dof} = {_reduced_chi2(fit)}"
+    chi2 = f"{fit.chi2:.4g}/{fit.dof} = {_reduced_chi2(fit)}"
     if fit.noise_inferred:
-        worth = f"not testable ({fit.dof} dof)"
-    return begin | numbers | {"chi2/dof": worth}
+        chi2 = f"not testable ({fit.dof} dof)"
+    return begin | numbers | {"chi2/dof": chi2}
 
 
 def _reduced_chi2(fit: DecayFit) -> str:
@@ -86,7 +87,7 @@ def _residuals(decay: Decay) -> Cells:
 
 
 def course_tables(decays: Sequence[Decay]) -> list[Table]:
-    """Lifetimes by part, of each record whose loss rate is not the same all along."""
+    """Tables of the lifetime by part, for records whose loss rate changes."""
     header = ["from, h", "to, h", "lifetime at the mean current"]
     return [
         Table(f"Course of the lifetime in {decay.fit.record}", header, [
@@ -98,11 +99,11 @@ def course_tables(decays: Sequence[Decay]) -> list[Table]:
 
 
 def separability_rows(decays: Sequence[Decay]) -> list[Row]:
-    """Label and one cell per decay for what the record tells of a and b apart."""
-    return _beside(decays, _apart)
+    """Rows on the separability of a and b, with one cell per decay."""
+    return _side_by_side(decays, _separability)
 
 
-def _apart(decay: Decay) -> Cells:
+def _separability(decay: Decay) -> Cells:
     found = decay.fit.identifiability
     share = None if found.share is None else Quantity(found.share, found.share_error, "1")
     return {
@@ -119,8 +120,8 @@ def _number(value: float | None, form: str, unit: str = "") -> str:
 
 
 def check_rows(decays: Sequence[Decay]) -> list[Row]:
-    """Label and one cell per decay for what simpler analyses say, and whether a is constant."""
-    return _beside(decays, _checks)
+    """Rows of simpler analyses and of the test of a constant a, with one cell per decay."""
+    return _side_by_side(decays, _checks)
 
 
 def _checks(decay: Decay) -> Cells:
@@ -161,7 +162,7 @@ def _constant_a(fit: DecayFit) -> str | None:
 
 
 def systematic_table(decay: Decay, title: str) -> Table:
-    """A cause in each row, and by how much it moves a, b and the lifetime at the mean current."""
+    """Table of systematic errors: shifts of a, b and the lifetime at the mean current by cause."""
     fit = decay.fit
     values = fit.a.value, fit.b.value, fit.lifetime_mean.value
     rows = [
@@ -172,18 +173,18 @@ def systematic_table(decay: Decay, title: str) -> Table:
 
 
 def _percent(moved: float, value: float) -> str:
-    if value == 0:  # no part of nothing, such as of a that is at its limit
+    if value == 0:  # no relative shift, as of an a at its limit
         return "-"
     share = moved / value
     return f"{100 * share:+.0f} %" if abs(share) > 1 - 1e-9 else f"{100 * share:+.2g} %"
 
 
 def budget_rows(decays: Sequence[Decay]) -> list[Row]:
-    """Label and one cell per decay: first principles beside the measured; empty without a ring."""
-    return _beside(decays, _budget) if _budgets_known(decays) else []
+    """Rows of computed and measured losses, with one cell per decay; empty without a ring."""
+    return _side_by_side(decays, _budget) if _have_budgets(decays) else []
 
 
-def _budgets_known(decays: Sequence[Decay]) -> bool:
+def _have_budgets(decays: Sequence[Decay]) -> bool:
     return all(decay.budget is not None for decay in decays) and len(decays) > 0
 
 
@@ -220,7 +221,7 @@ def _budget(decay: Decay) -> Cells:
 
 
 def _part(budget: Budget, kind: str, mechanism: Mechanism) -> str:
-    """A mechanism's part of a or b, with its share of the loss at the mean current."""
+    """Part of a mechanism in a or b, with its share of the loss at the mean current."""
     value = float(getattr(budget.losses, f"{kind}_{mechanism.name}"))
     rate, unit = (value * budget.current, "1/(mA s)") if kind == "a" else (value, "1/s")
     share = 100 * rate * HOUR * budget.lifetime
@@ -230,20 +231,20 @@ def _part(budget: Budget, kind: str, mechanism: Mechanism) -> str:
 
 
 def overview(decays: Sequence[Decay]) -> list[Table]:
-    """The main numbers of many decays, one row each.
+    """Tables of the main numbers of many decays, one row each.
 
     Parameters
     ----------
     decays : sequence of Decay
-        More than `FEW`.
+        More than `MAX_FULL_DECAYS` decays.
 
     Returns
     -------
     list of Table
     """
-    main = {"Result": _main, "a and b": _a_and_b}
-    main |= {"Losses from first principles": _computed} if _budgets_known(decays) else {}
-    tables, names = [], numbered(decays)
+    main = {"Result": _result, "a and b": _a_and_b}
+    main |= {"Losses from first principles": _computed} if _have_budgets(decays) else {}
+    tables, names = [], short_names(decays)
     for title, cells_of in main.items():
         found = [cells_of(decay) for decay in decays]
         rows = [
@@ -254,7 +255,7 @@ def overview(decays: Sequence[Decay]) -> list[Table]:
     return tables
 
 
-def _main(decay: Decay) -> Cells:
+def _result(decay: Decay) -> Cells:
     fit = decay.fit
     numbers = {"current at the start": fit.i0, "lifetime at the mean current": fit.lifetime_mean}
     return {"status": fit.status} | numbers
@@ -270,51 +271,52 @@ def _computed(decay: Decay) -> Cells:
     return _settings(decay.budget) | computed | {"measured": decay.fit.lifetime_mean}
 
 
-def numbered(decays: Sequence[Decay]) -> dict[str, str]:
-    """Name of each decay in a table: its number alone where all are of one record."""
+def short_names(decays: Sequence[Decay]) -> dict[str, str]:
+    """Short names of decays in a table: their number if all are of one record."""
     names = [decay.fit.record for decay in decays]
     records = {name.rpartition("#")[0] for name in names}
     whole = len(records) > 1 or "" in records
     return {name: name if whole else "#" + name.rpartition("#")[2] for name in names}
 
 
-def alike(decays: Sequence[Decay]) -> list[tuple[Status, str, str]]:
-    """Status, decays and message for each different verdict on many decays; where all is well and
-    only numbers differ, those of the first.
+def distinct_verdicts(decays: Sequence[Decay]) -> list[tuple[Status, str, str]]:
+    """Status, decays and message of each different verdict.
+
+    Verdicts `converged` that differ only in numbers are one, with the numbers of the first decay.
     """
     found: dict[tuple[Status, str], list[DecayFit]] = {}
     for decay in decays:
         fit = decay.fit
-        well = fit.status is Status.converged
-        words = re.sub(r"\d[\d.e+-]*", "#", fit.message) if well else fit.message
+        is_converged = fit.status is Status.converged
+        words = re.sub(r"\d[\d.e+-]*", "#", fit.message) if is_converged else fit.message
         found.setdefault((fit.status, words), []).append(fit)
-    told, names = [], numbered(decays)
+    verdicts, names = [], short_names(decays)
     for (status, _), fits in found.items():
-        who, said = names[fits[0].record], fits[0].message
+        who, message = names[fits[0].record], fits[0].message
         if len(fits) > 1:
             who = f"{len(fits)} decays, {who} to {names[fits[-1].record]}"
         if len({fit.message for fit in fits}) > 1:
-            said = f"{said.rstrip('.')} (numbers are the first's)."
-        told.append((status, who, said))
-    return told
+            message = f"{message.rstrip('.')} (numbers are the first's)."
+        verdicts.append((status, who, message))
+    return verdicts
 
 
-def counted(events: Sequence[Event]) -> str:
-    """Events of each kind, how many and how large."""
-    said = []
+def event_summary(events: Sequence[Event]) -> str:
+    """Sentence on the events: number and size of each kind."""
+    parts = []
     for kind in dict.fromkeys(event.kind for event in events):
         changes = [event.change for event in events if event.kind == kind]
         low, high = min(changes), max(changes)
         size = f"{low:+.3g} mA" if len(changes) == 1 else f"{low:+.3g} to {high:+.3g} mA"
-        said.append(f"{kind} {len(changes)} times" + f" ({size})" * any(changes))
-    return "; ".join(said)
+        parts.append(f"{kind} {len(changes)} times" + f" ({size})" * any(changes))
+    return "; ".join(parts)
 
 
 def event_rows(study: RecordStudy) -> list[list[str]]:
-    """Kind, time, duration and change of what was cut away; a long list is cut, and says so."""
+    """Rows of events: kind, time, duration and change; the last row counts those not shown."""
     rows = [
         [kind, f"{time:.0f} s", f"{lasts:.0f} s", f"{change:+.4g} mA" if change else ""]
         for kind, time, lasts, change in study.events[:MOST_ROWS]
     ]
-    left = len(study.events) - len(rows)
-    return rows + ([[f"{left} more", "", "", ""]] if left else [])
+    hidden = len(study.events) - len(rows)
+    return rows + ([[f"{hidden} more", "", "", ""]] if hidden else [])

@@ -1,6 +1,7 @@
-"""A stored beam watched reading by reading: its lifetime over a sliding window, and what moved.
+"""Watch of a stored beam, reading by reading: lifetime over a sliding window, and alarms.
 
-Pure: a state and a step. Memory is that of the window, whatever the time and the rate of readings.
+Pure functions: a state and a step from one state to the next. Memory is bounded by the window,
+whatever the duration and the rate of readings.
 """
 
 from __future__ import annotations
@@ -15,35 +16,35 @@ import numpy as np
 from beamfit.answer import json_of
 from beamfit.errors import InputError
 from beamfit.lifetime import alarm
-from beamfit.lifetime.course import BEST_MONITOR, normalised, reference_of
-from beamfit.lifetime.cycles import alike, joined
+from beamfit.lifetime.course import MIN_RELATIVE_NOISE, normalised_lifetime, reference_of
+from beamfit.lifetime.cycles import group_by_settings, join_cycles
 from beamfit.lifetime.evidence import UNITS
 from beamfit.lifetime.fit import DecayFit, bare, fit_decay, fit_pieces
 from beamfit.lifetime.free_law import Law
-from beamfit.lifetime.mechanisms import added, loss_coefficients, terms_of
-from beamfit.lifetime.pieces import DROPOUT, FEWEST, split_record
+from beamfit.lifetime.mechanisms import loss_coefficients, losses_from_terms, mechanism_terms
+from beamfit.lifetime.pieces import DROPOUT, MIN_READINGS, split_record
 from beamfit.lifetime.record import PLAUSIBLE, Conditions, DecayRecord
 from beamfit.lifetime.study import (
-    CHANGED,
+    SETTING_STEP,
     Decay,
     Machine,
-    at_settings,
     operation_during,
+    split_at_settings,
 )
 from beamfit.quantity import Quantity, Status
 
 
 class WindowRow(NamedTuple):
-    """The mean of some neighbouring readings.
+    """Mean of some neighbouring readings.
 
     Attributes
     ----------
     piece : int
-        Rises by one at every gap and step of the clock.
+        Number of the piece: rises by one at every gap and step of the clock.
     time, current : float
-        s and mA.
+        Means, s and mA.
     settings : Conditions
-        In SI; NaN of what has not been read yet.
+        Settings in SI units; NaN for what has not been read yet.
     """
 
     piece: int
@@ -53,44 +54,44 @@ class WindowRow(NamedTuple):
 
 
 class Window(NamedTuple):
-    """A fit to the last decays of a window.
+    """Fit to the last decays of a window.
 
     Attributes
     ----------
     fit : DecayFit or None
-        One a, one b; None where nothing can be fitted.
+        Fit with one a and one b; None where nothing can be fitted.
     readings : DecayRecord or None
-        Of those decays.
+        Readings of those decays.
     pieces : int
-        How many decays they are.
-    why : str
-        Why there is no fit.
+        Number of decays.
+    reason : str
+        Reason why there is no fit.
     """
 
     fit: DecayFit | None
     readings: DecayRecord | None
     pieces: int
-    why: str = ""
+    reason: str = ""
 
     def decay(self, machine: Machine | None) -> Decay:
-        """The decays as one, with the losses of a ring; `InputError` if it stores no beam there."""
+        """Decay with the loss budget of a ring; `InputError` if the ring stores no beam."""
         return Decay.of(self.readings, 0.0, self.fit, machine)
 
 
 class Answer(NamedTuple):
-    """Answer of the window.
+    """Answer of a watch at one time.
 
     Attributes
     ----------
     time, current : float
-        Of the last reading, s and mA.
+        Last reading, s and mA.
     window : Window
         The fit.
     status, message : Status, str
-        Of the fit, or why there is none.
+        Verdict of the fit, or the reason why there is none.
     normalised : Quantity or None
-        Current times lifetime, mA h, by the ring at the reference current and its usual settings.
-        None where the readings do not determine it.
+        Current times lifetime, mA h, scaled by the ring to the reference current and its usual
+        settings. None where the readings do not determine it.
     """
 
     time: float
@@ -102,25 +103,25 @@ class Answer(NamedTuple):
 
     @property
     def lifetime(self) -> Quantity | None:
-        """At the mean current, h; None where the readings do not determine it."""
-        return self._told("lifetime_mean")
+        """Lifetime at the mean current, h; None where the readings do not determine it."""
+        return self._if_determined("lifetime_mean")
 
     @property
     def a(self) -> Quantity | None:
-        """1/(mA s), likewise."""
-        return self._told("a")
+        """Quadratic loss coefficient, 1/(mA s); None where it is not determined."""
+        return self._if_determined("a")
 
     @property
     def b(self) -> Quantity | None:
-        """1/s, likewise."""
-        return self._told("b")
+        """Linear loss coefficient, 1/s; None where it is not determined."""
+        return self._if_determined("b")
 
-    def _told(self, name: str) -> Quantity | None:
+    def _if_determined(self, name: str) -> Quantity | None:
         found = self.window.fit and getattr(self.window.fit, name)
         return found if found and found.error is not None else None
 
     def to_json(self) -> dict[str, Any]:
-        """Return it as `beamfit lifetime --json` does a decay, with what is normalised."""
+        """Decay as in `beamfit lifetime --json`, with the normalised lifetime."""
         unknown = dict.fromkeys(("chi2", "dof", "identifiability"))
         unknown |= {name: bare(None, unit) for name, unit in UNITS.items()}
         fit = unknown if self.window.fit is None else self.window.fit.to_json()
@@ -134,22 +135,22 @@ class Answer(NamedTuple):
 
 
 def fit_window(rows: Sequence[WindowRow], name: str, law: Law = Law.free) -> Window:
-    """Cut a window at refills and changes of setting, and fit what is as it is now.
+    """Split a window at refills and changes of settings, and fit the decays at the last settings.
 
     Parameters
     ----------
     rows : sequence of WindowRow
         In order of time.
     name : str
-        What to call the result.
+        Name of the result.
     law : Law
-        As of `fit_decay`.
+        As for `fit_decay`.
 
     Returns
     -------
     Window
-        Decays at the settings of the last one together, each with a current of its own at its
-        start; a pressure that does not follow the current is a setting, too.
+        Joint fit of the decays at the settings of the last one, each with its own initial current.
+        A pressure that does not follow the current counts as a setting.
 
     Examples
     --------
@@ -162,16 +163,18 @@ def fit_window(rows: Sequence[WindowRow], name: str, law: Law = Law.free) -> Win
     """
     decays = [
         decay
-        for piece in _pieces(rows, name)
-        for section in at_settings(piece)
+        for piece in _records(rows, name)
+        for section in split_at_settings(piece)
         for decay in split_record(section).segments
     ]
     if not decays:
-        return Window(None, None, 0, f"fewer than {FEWEST} readings in a row of a stored beam")
-    group = _at_last(decays)
+        return Window(
+            None, None, 0, f"fewer than {MIN_READINGS} readings in a row of a stored beam"
+        )
+    group = _at_last_settings(decays)
     alone = len(group) == 1
-    one = replace(group[0], name=name) if alone else joined(group, name)
-    if len(one) < FEWEST:
+    one = replace(group[0], name=name) if alone else join_cycles(group, name)
+    if len(one) < MIN_READINGS:
         return Window(None, one, len(group), f"{len(one)} readings since the last change")
     try:
         if alone:
@@ -183,16 +186,16 @@ def fit_window(rows: Sequence[WindowRow], name: str, law: Law = Law.free) -> Win
     return Window(fit, one, len(group))
 
 
-def _pieces(rows: Sequence[WindowRow], name: str) -> list[DecayRecord]:
-    """Records without gaps; before it was first read a setting is taken as it was then."""
+def _records(rows: Sequence[WindowRow], name: str) -> list[DecayRecord]:
+    """Records without gaps; a setting has its first value also before it was read."""
     if not rows:
         return []
     piece, time, current = np.array([row[:3] for row in rows]).T
     settings = np.array([row.settings for row in rows])
-    known = [column[np.isfinite(column)] for column in settings.T]
+    finite = [column[np.isfinite(column)] for column in settings.T]
     filled = [
-        np.where(np.isfinite(column), column, seen[0]) if seen.size else None
-        for column, seen in zip(settings.T, known, strict=True)
+        np.where(np.isfinite(column), column, first_read[0]) if first_read.size else None
+        for column, first_read in zip(settings.T, finite, strict=True)
     ]
     parts = np.split(np.arange(len(rows)), np.flatnonzero(np.diff(piece)) + 1)
     return [
@@ -200,158 +203,189 @@ def _pieces(rows: Sequence[WindowRow], name: str) -> list[DecayRecord]:
             time[part], current[part], None, name, time[part[0]],
             Conditions(*(None if column is None else column[part] for column in filled)),
         )
-        for part in parts if part.size >= FEWEST
+        for part in parts if part.size >= MIN_READINGS
     ]  # fmt: skip
 
 
-def _at_last(decays: list[DecayRecord]) -> list[DecayRecord]:
-    """Those at the settings of the last, and its pressure if that does not follow the beam."""
+def _at_last_settings(decays: list[DecayRecord]) -> list[DecayRecord]:
+    """Select decays at the settings of the last, and its pressure unless that follows the beam."""
     compared = decays
-    if joined(decays, "").gauge is None:
+    if join_cycles(decays, "").gauge is None:
         compared = [replace(d, conditions=d.conditions._replace(pressure=None)) for d in decays]
     starts = next(
-        {decay.start for decay in group} for group in alike(compared) if compared[-1] in group
+        {decay.start for decay in group}
+        for group in group_by_settings(compared)
+        if compared[-1] in group
     )
     return [decay for decay in decays if decay.start in starts]
 
 
-# a and b so well known are the usual ones; errors half as large replace them before an alarm.
-KNOWN = 0.05
-# What the ring is expected to lose follows its settings over so long, s, and steps at once.
-SMOOTH = 300.0
+# Largest relative error of a and b that become the reference of the alarm: chosen.
+MAX_REFERENCE_ERROR = 0.05
+# Time, s, over which the expected loss follows the settings, chosen; steps are followed at once.
+SMOOTHING_TIME = 300.0
 
 
-class Terms(NamedTuple):
-    """A ring's terms, the settings they are for, and the a and b they make."""
+class RingTerms(NamedTuple):
+    """Loss terms of a ring at an operating point.
 
-    place: np.ndarray
-    parts: tuple[Any, ...]
+    Attributes
+    ----------
+    point : array
+        Current, mA, and settings for which the terms were computed.
+    terms : tuple
+        Terms of the mechanisms, from `mechanism_terms`.
+    losses : array, shape (2,)
+        a, 1/(mA s), and b, 1/s.
+    """
+
+    point: np.ndarray
+    terms: tuple[Any, ...]
     losses: np.ndarray
 
 
-class Alarmed(NamedTuple):
-    """The alarm at work: the usual loss, what the ring loses now and lost where that was found,
-    what is expected now over then, and since when an alarm is raised.
+class ActiveAlarm(NamedTuple):
+    """Alarm with its reference and what it expects now.
+
+    Attributes
+    ----------
+    reference : Reference
+        Usual loss.
+    state : AlarmState
+        State of the alarm.
+    ring : RingTerms or None
+        Losses of the ring at the present settings.
+    losses : array, shape (2,), or None
+        a and b of the ring at the settings of the reference.
+    expected : (float, float)
+        Expected a and b at the present settings over those at the reference.
+    raised : float or None
+        Time of an alarm that is not identified yet, s.
     """
 
-    usual: alarm.Reference
+    reference: alarm.Reference
     state: alarm.AlarmState
-    ring: Terms | None = None
+    ring: RingTerms | None = None
     losses: np.ndarray | None = None
     expected: tuple[float, float] = (1.0, 1.0)
     raised: float | None = None
 
 
-def learnt(
-    before: Alarmed | None, window: Window, rows: Sequence[WindowRow], machine: Machine | None
-) -> Alarmed | None:
-    """The usual loss, where a fit is the first to tell it, or tells it twice as well.
+def learn_reference(
+    before: ActiveAlarm | None, window: Window, rows: Sequence[WindowRow], machine: Machine | None
+) -> ActiveAlarm | None:
+    """Take the loss of a fit as the reference, if it is the first or its errors are half as large.
 
     Parameters
     ----------
-    before : Alarmed or None
-        What is known; an alarm that is raised keeps it.
+    before : ActiveAlarm or None
+        Present reference; a raised alarm keeps it.
     window : Window
-        The fit, of these rows.
+        Fit of the rows.
     rows : sequence of WindowRow
+        Rows of the window.
     machine : Machine or None
-        The ring: where the fit does not tell a from b, they have its shares.
+        Ring whose ratio of a to b is used where the fit does not separate them.
 
     Returns
     -------
-    Alarmed or None
-        None where nothing is learnt.
+    ActiveAlarm or None
+        Alarm with a new reference; None to keep the present one.
     """
     fit = window.fit
-    # Where the gauge does not follow the current a is without gas, and b of no moment.
+    # Where the pressure does not follow the current, a has no gas loss and b is that of the mean
+    # pressure only.
     if fit is None or window.readings.gauge is not None or (before and before.raised is not None):
         return None
-    usual = _usual(window, machine)
-    if usual is None:
+    reference = _reference(window, machine)
+    if reference is None:
         return None
-    if before and not np.trace(usual.covariance) < np.trace(before.usual.covariance) / 4:
+    if before and not np.trace(reference.covariance) < np.trace(before.reference.covariance) / 4:
         return None
-    known = Alarmed(usual, alarm.started(usual))
+    active = ActiveAlarm(reference, alarm.initial_state(reference))
     if machine is None:
-        return known
+        return active
     ring = _terms(machine, None, rows[-1])  # what the gauge shows now
-    return known._replace(ring=ring, losses=ring.losses)
+    return active._replace(ring=ring, losses=ring.losses)
 
 
-def _usual(window: Window, machine: Machine | None) -> alarm.Reference | None:
-    """The loss of a fit that knows a and b if they are constant, or the loss rate and a ring their
-    ratio.
-    """
+def _reference(window: Window, machine: Machine | None) -> alarm.Reference | None:
+    """Reference from a fit that determines constant a and b, or a loss rate and a ring's ratio."""
     fit, ring = window.fit, None
     if fit.status not in (Status.converged, Status.unidentified):
         return None
-    known = tuple(fit.if_constant(name) for name in "ab")
-    if not all(one.determined for one in known):
+    quantities = tuple(fit.if_constant(name) for name in "ab")
+    if not all(one.determined for one in quantities):
         if machine is None:
             return None
-        known = (fit.lifetime_mean,)
+        quantities = (fit.lifetime_mean,)
         try:
             ring = window.decay(machine).budget.losses
         except InputError:
             return None
-    if not all(one.error and abs(one.relative) < KNOWN for one in known):
+    if not all(one.error and abs(one.relative) < MAX_REFERENCE_ERROR for one in quantities):
         return None
     return reference_of((window.decay(None),), np.ones(1), np.ones(1), ring)
 
 
-def _terms(machine: Machine, before: Terms | None, row: WindowRow) -> Terms:
-    """Losses of the ring at the settings of a row; anew but for the pressure if they moved."""
-    at = Conditions(*(None if math.isnan(value) else [value, value] for value in row.settings))
-    moment = DecayRecord([0.0, 1.0], row.current * np.array([1.0, 1 - 1e-6]), conditions=at)
-    operation = operation_during(moment, machine)
-    place = np.array([row.current, *row.settings._replace(pressure=0.0)])
-    if before and np.allclose(place, before.place, rtol=CHANGED, atol=0.0, equal_nan=True):
-        place, parts = before.place, before.parts
+def _terms(machine: Machine, before: RingTerms | None, row: WindowRow) -> RingTerms:
+    """Losses of the ring at the settings of a row; terms are reused if only the pressure moved."""
+    settings = Conditions(*(None if math.isnan(v) else [v, v] for v in row.settings))
+    instant = DecayRecord([0.0, 1.0], row.current * np.array([1.0, 1 - 1e-6]), conditions=settings)
+    operation = operation_during(instant, machine)
+    point = np.array([row.current, *row.settings._replace(pressure=0.0)])
+    if before and np.allclose(point, before.point, rtol=SETTING_STEP, atol=0.0, equal_nan=True):
+        point, terms = before.point, before.terms
     else:
-        parts = terms_of(machine.ring, operation, row.current)
-    losses = added(parts, operation.pressure_base, operation.pressure_slope)
-    return Terms(place, parts, np.array([losses.a, losses.b], float))
+        terms = mechanism_terms(machine.ring, operation, row.current)
+    losses = losses_from_terms(terms, operation.pressure_base, operation.pressure_slope)
+    return RingTerms(point, terms, np.array([losses.a, losses.b], float))
 
 
-def followed(known: Alarmed, row: WindowRow, apart: float, machine: Machine | None) -> Alarmed:
-    """Follow the expected loss at the settings of a row, smoothed: noise of a gauge would bend it.
+def follow_settings(
+    active: ActiveAlarm, row: WindowRow, elapsed: float, machine: Machine | None
+) -> ActiveAlarm:
+    """Update the expected loss to the settings of a row, smoothed against noise of the gauge.
 
     Parameters
     ----------
-    known : Alarmed
-        As it was at the row before.
+    active : ActiveAlarm
+        Alarm after the previous row.
     row : WindowRow
-    apart : float
-        Time between the two, s.
+        New row.
+    elapsed : float
+        Time between the two rows, s.
     machine : Machine or None
-        The ring; without one the expected loss stays.
+        Ring; without it the expected loss does not change.
 
     Returns
     -------
-    Alarmed
+    ActiveAlarm
     """
     if machine is None:
-        return known
+        return active
     try:
-        ring = _terms(machine, known.ring, row)
-    except InputError:  # settings at which the ring stores no beam are none
-        return known
-    new, old = ring.losses / known.losses, np.array(known.expected)
-    share = 1.0 if np.abs(new / old - 1).max() > alarm.SET else min(apart / SMOOTH, 1.0)
+        ring = _terms(machine, active.ring, row)
+    except InputError:  # ignore settings at which the ring stores no beam
+        return active
+    new, old = ring.losses / active.losses, np.array(active.expected)
+    is_step = np.abs(new / old - 1).max() > alarm.EXPECTATION_STEP
+    share = 1.0 if is_step else min(elapsed / SMOOTHING_TIME, 1.0)
     a, b = old + share * (new - old)
-    return known._replace(ring=ring, expected=(float(a), float(b)))
+    return active._replace(ring=ring, expected=(float(a), float(b)))
 
 
 CURRENT = "beam_current"
-# Readings in a row that are believed against all before: of no beam, of a far higher one, and of
-# a clock that was set back.
-IN_A_ROW = 5
-# A window is kept as the means of readings over so many parts of it.
-ROWS = 4096
-# Beyond what a ring stores, mA, or a clock shows, s, a reading is none.
-MOST, LATEST = (math.inf, 1e6), 1e11
-# Events and points of the course that are kept.
-EVENTS, POINTS = 20, 360
+# Readings in a row that confirm a lost beam, a far higher current, or a clock that was set back:
+# fewer are bad readings.
+CONFIRMING_READINGS = 5
+# Number of rows of a window: readings are averaged over this part of its length.
+WINDOW_ROWS = 4096
+# Largest valid value of a setting (its range is checked apart) and of the current, mA, more than
+# any ring stores; latest valid time, s, more than any clock shows.
+MAX_VALUE, MAX_TIME = (math.inf, 1e6), 1e11
+# Numbers of events, and of points of the displayed course, that are kept.
+MAX_EVENTS, MAX_POINTS = 20, 360
 RULE = (
     "raised where a change of a or b is so much likelier than none that one in 1e6 readings "
     "at most is false (none in 9e6 simulated, benchmarks/alarm.py)"
@@ -364,13 +398,13 @@ class Plan(NamedTuple):
     Attributes
     ----------
     name : str
-        Of the ring.
+        Name of the ring.
     window, every : float
         Length of the sliding window, and time from fit to fit, s.
     machine : Machine or None
-        The ring, by which lifetimes are normalised and expected.
+        Ring by which lifetimes are normalised and the loss at other settings is expected.
     current : float or None
-        To which lifetimes are normalised, mA; without it that of the first fit.
+        Current to which lifetimes are normalised, mA; default: the mean current of each fit.
     """
 
     name: str = "ring"
@@ -381,7 +415,7 @@ class Plan(NamedTuple):
 
 
 class Counts(NamedTuple):
-    """Readings of all variables; those without a number, those that came late; gaps and steps."""
+    """Numbers of readings, of bad and late ones, of gaps, and of steps of the clock."""
 
     readings: int = 0
     bad: int = 0
@@ -391,7 +425,7 @@ class Counts(NamedTuple):
 
 
 class Point(NamedTuple):
-    """One fit, for a picture: time, s, current, mA, lifetime and its error, h; NaN where none."""
+    """Point of a picture: time, s, current, mA, lifetime and its error, h, NaN if there is none."""
 
     time: float
     current: float
@@ -405,24 +439,30 @@ class State(NamedTuple):
     Attributes
     ----------
     rows : tuple of WindowRow
-        The window.
+        Rows of the window.
     sums : tuple
-        Of the row that grows: readings, where it begins, sums of time since then and of current.
+        Unfinished row: number of readings, start, s, sum of times since the start, and of currents.
     last, shift, interval : float or None
-        Time of the last reading, what is added to times since the clock was set back, and the
-        usual interval, s.
-    piece, dead, spikes, late : int, int, int, tuple
-        As of `WindowRow`; readings in a row without beam or far too high, or late, and the last
-        late one.
+        Time of the last reading, correction added to time stamps since the clock was set back, and
+        usual interval of readings, s.
+    piece : int
+        Number of the present piece.
+    dead, spikes : int
+        Readings in a row without beam, and far above all before.
+    late : tuple
+        Number of late readings in a row, and the time of the last, s.
     settings : Conditions
-        Last ones read, in SI.
-    highest, zero, noise, due : float
-        Highest current of the window, farthest reading from zero without beam, and noise of a
-        reading, mA; when to fit, s.
+        Last settings read, in SI units.
+    highest, zero, noise : float
+        Highest current of the window, largest reading without beam, and noise of a reading, mA.
+    due : float
+        Time of the next fit, s.
     counts, events, course, answer
-        What happened, with its time; what was found.
-    alarm, alarms : Alarmed or None, tuple of Alarm
-        None until the usual loss is known; those within the window.
+        Counts of readings, events with their times, points of the picture, last answer.
+    alarm : ActiveAlarm or None
+        None until the usual loss is known.
+    alarms : tuple of Alarm
+        Alarms within the window.
     """
 
     rows: tuple[WindowRow, ...] = ()
@@ -443,24 +483,24 @@ class State(NamedTuple):
     events: tuple[tuple[float, str], ...] = ()
     course: tuple[Point, ...] = ()
     answer: Answer | None = None
-    alarm: Alarmed | None = None
+    alarm: ActiveAlarm | None = None
     alarms: tuple[alarm.Alarm, ...] = ()
 
     @property
     def alarmed(self) -> str:
-        """Name of what moved, "raised" where it is not told yet, "" where nothing did."""
+        """Label of what changed, "raised" until it is identified, "" if nothing changed."""
         if self.alarm is not None and self.alarm.raised is not None:
             return "raised"
         return self.alarms[-1].moved if self.alarms else ""
 
-    def said(self) -> str:
-        """The alarm in words."""
+    def alarm_text(self) -> str:
+        """Sentence on the alarm."""
         if self.alarm is None:
             return "no usual loss yet: it needs a fit that tells constant a from b, or a ring"
         if self.alarm.raised is not None:
-            raised = alarm.when(self.alarm.raised - self.shift, True)
+            raised = alarm.time_label(self.alarm.raised - self.shift, True)
             return f"the loss moved, raised {raised}; what moved is told from the readings since"
-        return self.alarms[-1].said(True) if self.alarms else "nothing moved"
+        return self.alarms[-1].text(True) if self.alarms else "nothing moved"
 
 
 def stepped(plan: Plan, state: State, variable: str, time: float, value: float) -> State:
@@ -469,27 +509,27 @@ def stepped(plan: Plan, state: State, variable: str, time: float, value: float) 
     Parameters
     ----------
     plan : Plan
-        What is watched, and how.
+        Plan of the watch.
     state : State
-        ``State()``, or that of the reading before.
+        ``State()``, or the state after the previous reading.
     variable : str
-        ``beam_current``, or a name in `Conditions`.
+        ``beam_current``, or a name of `Conditions`.
     time : float
-        Its time stamp, Unix time in s.
+        Time stamp, Unix time in s.
     value : float
-        In mA or SI; NaN where it is none.
+        Value in mA or SI units; NaN where there is none.
 
     Returns
     -------
     State
-        With a new answer where one is due.
+        Next state, with a new answer if one is due.
 
     Notes
     -----
-    A reading that is no newer than the last is dropped, but five in a row that rise are of a clock
-    set back. A gap (ten usual intervals and a minute) and a step of the clock begin a new piece,
-    with a current of its own; so does a beam that was lost. Once an alarm has told what moved,
-    what was read before that is no longer of the window.
+    A reading that is no newer than the last is dropped, but five such readings in increasing order
+    of time mean that the clock was set back. A gap (ten usual intervals and a minute), a step of
+    the clock and a lost beam begin a new piece, with its own initial current. Once an alarm is
+    identified, readings before the change leave the window.
 
     Examples
     --------
@@ -500,171 +540,175 @@ def stepped(plan: Plan, state: State, variable: str, time: float, value: float) 
     >>> print(f"{state.answer.lifetime.value:.2f} h, {state.counts.late} late")
     10.10 h, 0 late
     """
-    state = _counted(state, readings=1)
-    if not (abs(value) <= MOST[variable == CURRENT] and abs(time) < LATEST):
-        return _counted(state, bad=1)
+    state = _count(state, readings=1)
+    if not (abs(value) <= MAX_VALUE[variable == CURRENT] and abs(time) < MAX_TIME):
+        return _count(state, bad=1)
     if variable != CURRENT:
         low, high, _ = PLAUSIBLE[variable]
         if not low <= value <= high:
-            return _counted(state, bad=1)
+            return _count(state, bad=1)
         return state._replace(settings=state.settings._replace(**{variable: value}))
-    state = _current(plan, state, time, value)
-    return _answered(plan, state) if state.last >= state.due else state
+    state = _take_current(plan, state, time, value)
+    return _refit(plan, state) if state.last >= state.due else state
 
 
-def _counted(state: State, **more: int) -> State:
+def _count(state: State, **more: int) -> State:
     counts = {name: getattr(state.counts, name) + n for name, n in more.items()}
     return state._replace(counts=state.counts._replace(**counts))
 
 
-def noted(state: State, time: float, text: str) -> State:
-    """Keep what happened, for whoever looks."""
-    return state._replace(events=(*state.events[1 - EVENTS :], (time, text)))
+def add_event(state: State, time: float, text: str) -> State:
+    """Append an event to the list of the last events."""
+    return state._replace(events=(*state.events[1 - MAX_EVENTS :], (time, text)))
 
 
-def _current(plan: Plan, state: State, time: float, value: float) -> State:
-    own, last = time + state.shift, state.last
+def _take_current(plan: Plan, state: State, time: float, value: float) -> State:
+    clock, last = time + state.shift, state.last
     if last is None:
-        return _placed(plan, state._replace(due=own + plan.every), own, value)
-    if own <= last:
-        return _behind(plan, state, time, value)
-    apart, usual = own - last, state.interval
-    if usual and alarm.is_gap(apart, usual):
-        said = f"no reading for {apart:.0f} s, or the clock was set forward"
-        state = _counted(noted(_cut(plan, state), time, said), gaps=1)
-    interval = usual * (1.2 if apart > usual else 1 / 1.2) if usual else apart
-    return _placed(plan, state._replace(interval=interval, late=(0, -math.inf)), own, value)
+        return _add_to_row(plan, state._replace(due=clock + plan.every), clock, value)
+    if clock <= last:
+        return _take_late_reading(plan, state, time, value)
+    elapsed, usual = clock - last, state.interval
+    if usual and alarm.is_gap(elapsed, usual):
+        text = f"no reading for {elapsed:.0f} s, or the clock was set forward"
+        state = _count(add_event(_begin_piece(plan, state), time, text), gaps=1)
+    interval = usual * (1.2 if elapsed > usual else 1 / 1.2) if usual else elapsed
+    return _add_to_row(plan, state._replace(interval=interval, late=(0, -math.inf)), clock, value)
 
 
-def _behind(plan: Plan, state: State, time: float, value: float) -> State:
-    """A reading no newer than the last."""
+def _take_late_reading(plan: Plan, state: State, time: float, value: float) -> State:
+    """Take a reading that is no newer than the last."""
     count, latest = state.late
     count = count + 1 if time > latest else 1
-    if count < IN_A_ROW:
-        return _counted(state._replace(late=(count, time)), late=1)
-    said = f"the clock was set back by {state.last - state.shift - time:.0f} s"
-    state = _counted(noted(_cut(plan, state), time, said), clock=1)
+    if count < CONFIRMING_READINGS:
+        return _count(state._replace(late=(count, time)), late=1)
+    text = f"the clock was set back by {state.last - state.shift - time:.0f} s"
+    state = _count(add_event(_begin_piece(plan, state), time, text), clock=1)
     shift = state.last + max(state.interval, 1e-3) - time
-    return _current(plan, state._replace(shift=shift, late=(0, -math.inf)), time, value)
+    return _take_current(plan, state._replace(shift=shift, late=(0, -math.inf)), time, value)
 
 
-def _cut(plan: Plan, state: State) -> State:
-    """Begin a piece with a current of its own."""
-    state = _closed(plan, state)
+def _begin_piece(plan: Plan, state: State) -> State:
+    """Begin a new piece, with its own initial current."""
+    state = _close_row(plan, state)
     return state._replace(piece=state.piece + 1)
 
 
-def _placed(plan: Plan, state: State, own: float, value: float) -> State:
-    """A reading into its row, if there is a beam."""
-    state, time = state._replace(last=own), own - state.shift
+def _add_to_row(plan: Plan, state: State, clock: float, value: float) -> State:
+    """Add a reading to its row, if there is a beam."""
+    state, time = state._replace(last=clock), clock - state.shift
     if not value > DROPOUT * state.highest:
-        if state.dead + 1 == IN_A_ROW:
-            state = noted(_cut(plan, state), time, "the beam was lost")._replace(zero=0.0)
-        zero = max(state.zero, abs(value)) if state.dead >= IN_A_ROW else state.zero
+        if state.dead + 1 == CONFIRMING_READINGS:
+            state = add_event(_begin_piece(plan, state), time, "the beam was lost")
+            state = state._replace(zero=0.0)
+        zero = max(state.zero, abs(value)) if state.dead >= CONFIRMING_READINGS else state.zero
         return state._replace(dead=state.dead + 1, zero=zero)
-    if state.dead >= IN_A_ROW:
-        state = noted(state, time, "beam again")
-    if state.highest and DROPOUT * value > state.highest and state.spikes + 1 < IN_A_ROW:
-        return _counted(state._replace(spikes=state.spikes + 1), bad=1)
+    if state.dead >= CONFIRMING_READINGS:
+        state = add_event(state, time, "beam again")
+    if state.highest and DROPOUT * value > state.highest and state.spikes + 1 < CONFIRMING_READINGS:
+        return _count(state._replace(spikes=state.spikes + 1), bad=1)
     count, begin, times, currents = state.sums
-    refilled = count and value - currents / count > alarm.JUMP * state.noise
-    if count and (refilled or own - begin >= plan.window / ROWS):
-        state = _closed(plan, state)
+    refilled = count and value - currents / count > alarm.STEP_ERRORS * state.noise
+    if count and (refilled or clock - begin >= plan.window / WINDOW_ROWS):
+        state = _close_row(plan, state)
         count, times, currents = 0, 0.0, 0.0
-    begin = begin if count else own
-    sums = (count + 1, begin, times + own - begin, currents + value)
+    begin = begin if count else clock
+    sums = (count + 1, begin, times + clock - begin, currents + value)
     return state._replace(sums=sums, dead=0, spikes=0, highest=max(state.highest, value))
 
 
-def _closed(plan: Plan, state: State) -> State:
-    """The row that grew is one of the window, and the alarm sees it."""
+def _close_row(plan: Plan, state: State) -> State:
+    """Append the unfinished row to the window, and give it to the alarm."""
     count, begin, times, currents = state.sums
     if not count:
         return state
     row = WindowRow(state.piece, begin + times / count, currents / count, state.settings)
-    state = state._replace(rows=(*state.rows[1 - 2 * ROWS :], row), sums=(0, 0.0, 0.0, 0.0))
-    return state if state.alarm is None else _watched(plan, state, state.alarm, row)
+    state = state._replace(rows=(*state.rows[1 - 2 * WINDOW_ROWS :], row), sums=(0, 0.0, 0.0, 0.0))
+    return state if state.alarm is None else _watch_row(plan, state, state.alarm, row)
 
 
-def _kept(state: State, begin: float) -> State:
-    """Rows from a time on."""
+def _drop_before(state: State, begin: float) -> State:
+    """Drop the rows before a time."""
     return state._replace(rows=tuple(row for row in state.rows if row.time >= begin))
 
 
-def _answered(plan: Plan, state: State) -> State:
-    """Fit the window, and learn what is usual."""
+def _refit(plan: Plan, state: State) -> State:
+    """Fit the window, and update the reference of the alarm."""
     begin, shift = state.last - plan.window, state.shift
-    state = _kept(state, begin)
+    state = _drop_before(state, begin)
     none = Window(None, None, 0, "no beam")
-    law = Law.free if plan.machine is None else Law.constant  # a ring knows more of its law
-    window = fit_window(state.rows, plan.name, law) if state.dead < IN_A_ROW else none
+    # With a ring, first principles give the loss at other currents.
+    law = Law.free if plan.machine is None else Law.constant
+    window = fit_window(state.rows, plan.name, law) if state.dead < CONFIRMING_READINGS else none
     answer = _answer(plan, state, window)
     found = answer.lifetime
-    known = (found.value, found.error) if found else (math.nan, math.nan)
-    point = Point(answer.time, answer.current, *known)
+    lifetime = (found.value, found.error) if found else (math.nan, math.nan)
+    point = Point(answer.time, answer.current, *lifetime)
     course = tuple(p for p in state.course if p.time >= begin - shift)
-    if not course or point.time - course[-1].time >= plan.window / POINTS:
+    if not course or point.time - course[-1].time >= plan.window / MAX_POINTS:
         course = (*course, point)
     fit = window.fit
-    usual = None if state.alarms else learnt(state.alarm, window, state.rows, plan.machine)
+    learnt = None
+    if not state.alarms:
+        learnt = learn_reference(state.alarm, window, state.rows, plan.machine)
     return state._replace(
         answer=answer,
         course=course,
         due=state.last + plan.every,
-        alarm=usual or state.alarm,
+        alarm=learnt or state.alarm,
         alarms=tuple(a for a in state.alarms if (a.told or a.time) >= begin - shift),
-        # Without a beam in the window one must stand as far above zero as a spike above a beam.
+        # In a window without beam, a beam must exceed the zero readings as a spike exceeds a beam.
         highest=max((row.current for row in state.rows), default=state.zero / DROPOUT**2),
-        noise=state.noise if fit is None else _noise_of_one(plan, state, fit.rms_residual),
+        noise=state.noise if fit is None else _noise_of_reading(plan, state, fit.rms_residual),
     )
 
 
-def _noise_of_one(plan: Plan, state: State, noise: float) -> float:
-    """Noise of a reading, from that of a row."""
-    readings = plan.window / ROWS / max(state.interval, 1e-6)
-    return max(noise * math.sqrt(max(readings, 1.0)), BEST_MONITOR * state.highest)
+def _noise_of_reading(plan: Plan, state: State, noise: float) -> float:
+    """Noise of a reading, mA, from that of a row."""
+    readings = plan.window / WINDOW_ROWS / max(state.interval, 1e-6)
+    return max(noise * math.sqrt(max(readings, 1.0)), MIN_RELATIVE_NOISE * state.highest)
 
 
 def _answer(plan: Plan, state: State, window: Window) -> Answer:
-    current = state.rows[-1].current if state.rows and state.dead < IN_A_ROW else 0.0
+    current = state.rows[-1].current if state.rows and state.dead < CONFIRMING_READINGS else 0.0
     time, fit = state.last - state.shift, window.fit
     if fit is None:
-        return Answer(time, current, window, Status.unidentified, f"No lifetime: {window.why}.")
+        return Answer(time, current, window, Status.unidentified, f"No lifetime: {window.reason}.")
     answer = Answer(time, current, window, fit.status, fit.message)
     if answer.lifetime is None:
         return answer
     machine, at = plan.machine, plan.current or fit.mean_current
     try:
         ring = None if machine is None else loss_coefficients(*machine, at)
-        return answer._replace(normalised=normalised(window.decay(machine), ring, at))
+        return answer._replace(normalised=normalised_lifetime(window.decay(machine), ring, at))
     except InputError as error:
         return answer._replace(message=f"{fit.message} Not normalised: {error}.")
 
 
-def nothing_yet(state: State) -> Answer:
-    """The answer before the first fit."""
-    why = "No lifetime: the watch ended before its first fit."
+def empty_answer(state: State) -> Answer:
+    """Answer before the first fit."""
+    reason = "No lifetime: the watch ended before its first fit."
     time = math.nan if state.last is None else state.last - state.shift
-    return Answer(time, math.nan, Window(None, None, 0), Status.unidentified, why)
+    return Answer(time, math.nan, Window(None, None, 0), Status.unidentified, reason)
 
 
-def _watched(plan: Plan, state: State, known: Alarmed, row: WindowRow) -> State:
-    """A row seen by the alarm."""
-    apart = row.time - state.rows[-2].time if len(state.rows) > 1 else 0.0
-    known = followed(known, row, apart, plan.machine)
-    reading = alarm.Reading(row.time, row.current, *known.expected)
-    after, told = alarm.watched(known.usual, known.state, reading)
-    raised = row.time if told.raised else known.raised
-    state = state._replace(alarm=known._replace(state=after, raised=raised))
-    if told.raised:
-        state = noted(state, row.time - state.shift, "alarm: the loss moved")
-    if not told.moved:
+def _watch_row(plan: Plan, state: State, active: ActiveAlarm, row: WindowRow) -> State:
+    """Give a row to the alarm."""
+    elapsed = row.time - state.rows[-2].time if len(state.rows) > 1 else 0.0
+    active = follow_settings(active, row, elapsed, plan.machine)
+    reading = alarm.Reading(row.time, row.current, *active.expected)
+    after, step = alarm.watched(active.reference, active.state, reading)
+    raised = row.time if step.raised else active.raised
+    state = state._replace(alarm=active._replace(state=after, raised=raised))
+    if step.raised:
+        state = add_event(state, row.time - state.shift, "alarm: the loss moved")
+    if not step.moved:
         return state
-    found = alarm.alarm_of(raised, told, row.time)
-    state = _kept(state, found.since)
-    shown = {n: getattr(found, n) - state.shift for n in ("time", "since", "told")}
-    found = found._replace(**shown)
-    state = noted(state, found.told, f"alarm: {found.said(True)}")
-    alarms = (*state.alarms, found)[-EVENTS:]
-    known = state.alarm._replace(raised=None)
-    return state._replace(alarm=known, alarms=alarms, due=-math.inf)  # fit the new loss now
+    found = alarm.make_alarm(raised, step, row.time)
+    state = _drop_before(state, found.since)
+    times = {n: getattr(found, n) - state.shift for n in ("time", "since", "told")}
+    found = found._replace(**times)
+    state = add_event(state, found.told, f"alarm: {found.text(True)}")
+    alarms = (*state.alarms, found)[-MAX_EVENTS:]
+    active = state.alarm._replace(raised=None)
+    return state._replace(alarm=active, alarms=alarms, due=-math.inf)  # fit the new loss now

@@ -68,7 +68,7 @@ def values_of(told: WatchView) -> dict[str, tuple[Any, int]]:
         "STATUS": (cell(answer.status) if answer else "", max(verdict, old)),
         "MESSAGE": (told.headline[1], max(verdict, moved)),
         "ALARM": (state.alarmed, moved),
-        "ALARM:TEXT": (state.said(), moved),
+        "ALARM:TEXT": (state.alarm_text(), moved),
     }
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from beamfit.answer import cell, json_of
 from beamfit.errors import Status
 from beamfit.io.machine import Watched, WatchMachine
-from beamfit.lifetime.watch import CURRENT, RULE, Plan, State, noted, stepped
+from beamfit.lifetime.watch import CURRENT, RULE, Plan, State, add_event, stepped
 from beamfit.live.channel import Channel, LostError, PvReading, kept, open_channel
 from beamfit.live.restore import ended_by_signals
 
@@ -69,7 +69,7 @@ class WatchView:
         if gone:
             return "red", gone
         if state.alarmed:
-            return "red", f"Alarm: {state.said()}"
+            return "red", f"Alarm: {state.alarm_text()}"
         if answer is None and not state.last and state.counts.bad:
             return "red", f"{state.counts.bad} readings without a number, none of a current"
         if answer is None:
@@ -94,7 +94,7 @@ class WatchView:
             "mean_current": fit and fit.mean_current,
             "quantities": {n: q and q.to_json() | {"text": cell(q)} for n, q in found.items()},
             "alarm": {
-                "moved": state.alarmed, "text": state.said(), "rule": RULE,
+                "moved": state.alarmed, "text": state.alarm_text(), "rule": RULE,
                 "since": state.alarms[-1].since if state.alarms else None,
             },
             "lost": self.lost, "silent": self.silent, "age": self.age, "window": self.plan.window,
@@ -148,7 +148,7 @@ class _Course:
         gone = reading is None
         if self.lost.get(watched.variable, False) != gone:
             said = f"{'no' if gone else 'again a'} connection to {watched.variable}"
-            self.state = noted(self.state, time.time(), said)
+            self.state = add_event(self.state, time.time(), said)
         self.lost[watched.variable] = gone
 
     async def follow(self, watched: Watched, channel: Channel) -> None:

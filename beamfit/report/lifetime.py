@@ -15,8 +15,8 @@ from matplotlib.figure import FigureBase
 from beamfit.answer import Table, labelled
 from beamfit.errors import InputError
 from beamfit.lifetime import tables
-from beamfit.lifetime.alarm import when
-from beamfit.lifetime.course import MOST_PARTS, Trend
+from beamfit.lifetime.alarm import time_label
+from beamfit.lifetime.course import MAX_TREND_POINTS, Trend
 from beamfit.lifetime.fit import DecayFit
 from beamfit.lifetime.ring_study import Shift
 from beamfit.lifetime.study import Decay, RecordStudy
@@ -139,7 +139,7 @@ def _side_by_side(decays: Sequence[Decay]) -> list[Table]:
 
 def _single(decays: Sequence[Decay]) -> list[Table]:
     """Every number of a few decays; the main numbers of many, one row each."""
-    if len(decays) > tables.FEW:
+    if len(decays) > tables.MAX_FULL_DECAYS:
         result, *more = tables.overview(decays)
         return [result._replace(note=ERRORS), *more]
     listed = _side_by_side(decays)
@@ -150,9 +150,9 @@ def _single(decays: Sequence[Decay]) -> list[Table]:
 
 def _verdicts(decays: Sequence[Decay]) -> list[Verdict]:
     """Verdict of each decay; of many decays one for each distinct message."""
-    if len(decays) <= tables.FEW:
+    if len(decays) <= tables.MAX_FULL_DECAYS:
         return [_verdict(decay) for decay in decays]
-    return [Verdict(status, who, message) for status, who, message in tables.alike(decays)]
+    return [Verdict(*verdict) for verdict in tables.distinct_verdicts(decays)]
 
 
 def _verdict(decay: Decay) -> Verdict:
@@ -337,7 +337,7 @@ def _cycle_lifetimes(fit: DecayFit) -> tuple[np.ndarray, np.ndarray, np.ndarray]
     mean = np.add.reduceat(columns, first) / lengths[:, None]
     since, residual = (columns - np.repeat(mean, lengths, axis=0)).T
     part = first[
-        np.linspace(0, first.size, min(first.size, MOST_PARTS), endpoint=False).astype(int)
+        np.linspace(0, first.size, min(first.size, MAX_TREND_POINTS), endpoint=False).astype(int)
     ]
     count = np.diff(part, append=len(record))
     at, level = (np.add.reduceat(v, part) / count for v in (record.time, record.current))
@@ -397,7 +397,7 @@ def draw_budget(figure: FigureBase, decays: Sequence[Decay]) -> None:
             hollow = "white" if found.error is None else "black"
             axes.errorbar(1 / found.value, y, xerr=error, fmt="D", color="black", mfc=hollow, ms=5)
     axes.errorbar([], [], fmt="D", color="black", ms=5, label="measured")
-    names = tables.numbered(shown)
+    names = tables.short_names(shown)
     axes.set_yticks(place, [names[decay.fit.record] for decay in shown])
     more = f", {MOST_DRAWN} of {len(decays)} decays" if len(decays) > MOST_DRAWN else ""
     axes.set(title=f"computed losses{more}", xlabel="loss rate at the mean current, 1/h")
@@ -437,7 +437,7 @@ def _relative(trend: Trend) -> bool:
 def trend_picture(trend: Trend) -> Picture:
     """The picture of a page."""
     height = 5.4 if _relative(trend) else 2.6
-    ends = [when(point.time, trend.dated) for point in trend.points[:1] + trend.points[-1:]]
+    ends = [time_label(point.time, trend.dated) for point in trend.points[:1] + trend.points[-1:]]
     source = f"{len(trend.points)} decays, {' to '.join(ends)}"
     return Picture("course of the lifetime", height, partial(draw_trend, trend=trend), source)
 

@@ -11,8 +11,8 @@ from beamfit.lifetime.alarm import (
     Reading,
     Reference,
     alarms_of,
-    seen_in,
-    started,
+    change_statistics,
+    initial_state,
     watched,
 )
 from beamfit.lifetime.course import reference_of
@@ -33,7 +33,7 @@ def beam_after(beam, seconds, a=USUAL.a, b=USUAL.b):
 
 def watch(readings, usual=USUAL, shape=()):
     """Every reading that raised, and every one that named: time, what, change, beam."""
-    state, raised, named = started(usual, shape), [], []
+    state, raised, named = initial_state(usual, shape), [], []
     for time, current in readings:
         state, told = watched(usual, state, Reading(time, current))
         raised += [(np.max(time), *k) for k in np.argwhere(told.raised)]
@@ -63,7 +63,7 @@ def test_it_is_silent_while_nothing_moves(memory):
     assert raised == []
     # And it did look: the largest windows have seen what they should.
     assert state.age.max() == 699
-    assert max(part.max() for part in seen_in(state).squares) > 3
+    assert max(part.max() for part in change_statistics(state).squares) > 3
 
 
 @pytest.mark.parametrize(("which", "worse"), [("a", (1.1, 1.0)), ("b", (1.0, 1.1))])
@@ -87,8 +87,8 @@ def test_after_an_alarm_the_new_loss_is_the_usual_one():
     assert alarm.b is None
     assert alarm.a.value == pytest.approx(0.2, abs=3 * alarm.a.error)
     assert abs(alarm.since - 600) < 5
-    assert "a moved by +20 ± " in alarm.said(dated=False)
-    assert alarm.said(dated=True).endswith(" since 1970-01-01 00:10")
+    assert "a moved by +20 ± " in alarm.text(dated=False)
+    assert alarm.text(dated=True).endswith(" since 1970-01-01 00:10")
 
 
 def filled(every, factor):
@@ -186,12 +186,12 @@ def test_the_tests_are_those_of_generalised_least_squares(white):
     found = np.linalg.solve(information, score)
     expected = [(inverse @ found)[k] ** 2 / inverse[k, k] for k in (0, 1)]
     expected.append(found @ inverse @ found)
-    state = started(usual)
+    state = initial_state(usual)
     for row in zip(time, beam, strict=True):
         state, told = watched(usual, state, Reading(*row))
         assert not told.raised
     [begun] = np.flatnonzero(state.age[:-1] == state.age[:-1].max())[-1:]
-    a, b, beside = seen_in(state).squares
+    a, b, beside = change_statistics(state).squares
     for name, part, wanted in zip("ab2", (a, b, a + beside), expected, strict=True):
         assert part[begun] == pytest.approx(wanted, rel=5e-3), name
     assert expected[2] > 3

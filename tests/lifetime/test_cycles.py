@@ -7,8 +7,8 @@ from scipy.signal import lfilter
 from scipy.stats import binom
 
 from beamfit.errors import InputError
-from beamfit.lifetime.cycles import averaged
-from beamfit.lifetime.expansion import solved
+from beamfit.lifetime.cycles import collect_cycles
+from beamfit.lifetime.expansion import fit_law
 from beamfit.lifetime.fit import fit_cycles
 from beamfit.lifetime.pieces import is_refilled, split_record
 from beamfit.lifetime.readings import thinned
@@ -81,7 +81,7 @@ def test_the_fit_is_that_of_all_numbers_at_once():
     """By one noise; averaged over noises the answer moves by a small part of its error."""
     time, current, number = top_up(0.01, 3, hours=1.0, cycle=600.0)
     fit = fit_cycles(cut(time, current, number), found=False)
-    alone = solved(averaged(cut(time, current, number))).values
+    alone = fit_law(collect_cycles(cut(time, current, number))).values
     since = time - 600 * number
 
     def residuals(numbers):

@@ -11,7 +11,7 @@ from beamfit.errors import InputError
 from beamfit.io.decay_record import read_decay_record
 from beamfit.lifetime import alternatives
 from beamfit.lifetime.decay_law import current_by_rate
-from beamfit.lifetime.expansion import Pieces, solved
+from beamfit.lifetime.expansion import Pieces, fit_law
 from beamfit.lifetime.fit import DecayFit, fit_decay, fit_decays
 from beamfit.lifetime.record import DecayRecord
 from beamfit.lifetime.systematics import (
@@ -52,7 +52,7 @@ def test_the_aps_decay():
     fit = constant_fit(record)
     assert fit.status == "converged"
     # By plain least squares 6.996e-8 and 7.17e-7; block bootstrap gives a an error of 1.2e-9.
-    plain = solved(Pieces.of(record)).values
+    plain = fit_law(Pieces.of(record)).values
     assert plain.a == pytest.approx(6.996e-8, abs=5e-12)
     assert plain.b == pytest.approx(7.17e-7, abs=5e-10)
     assert fit.a.value == pytest.approx(6.996e-8, abs=1e-10)
@@ -326,9 +326,9 @@ def test_averaging_neighbours_costs_the_law_nothing(monkeypatch, count, enough):
     exact = current_by_rate(time, 500.0, lambda i: 4e-8 * (i / 500) ** -0.2 * i)
     noise = 0.02 * np.random.default_rng(4).normal(size=time.size)
     record = DecayRecord(time, np.asarray(exact) + noise)
-    monkeypatch.setattr(alternatives, "ENOUGH", enough)
+    monkeypatch.setattr(alternatives, "MAX_ROWS", enough)
     fit = constant_fit(record)
-    monkeypatch.setattr(alternatives, "ENOUGH", 10_000)
+    monkeypatch.setattr(alternatives, "MAX_ROWS", 10_000)
     plain = constant_fit(record)
     averaged, whole = fit.lifetimes.exponent, plain.lifetimes.exponent
     assert averaged.value == pytest.approx(whole.value, abs=whole.error)

@@ -6,7 +6,7 @@ from beamfit.greybox.problem import Free, Problem, Record
 from beamfit.greybox.solve import solve
 from beamfit.lifetime.decay_law import current, current_by_rate
 from beamfit.lifetime.evidence import Evidence
-from beamfit.lifetime.expansion import PLAIN, POWER, Pieces, solved
+from beamfit.lifetime.expansion import PLAIN, POWER, Pieces, fit_law
 from beamfit.lifetime.record import DecayRecord
 from tests.simulations import simulations, widened
 
@@ -22,7 +22,7 @@ def noisy(time, i0, a, b, noise, seed):
 def fitted(time, measured, error=None, **options):
     """The law, and what it is worth."""
     stated = None if error is None else np.full(time.size, error)
-    about = solved(Pieces.of(DecayRecord(time, measured, stated)), **options)
+    about = fit_law(Pieces.of(DecayRecord(time, measured, stated)), **options)
     return about, Evidence(about)
 
 
@@ -81,12 +81,12 @@ def test_what_a_record_of_this_length_can_tell(span, error_a, error_b, count):
         DecayRecord(time, noisy(time, 500.0, a, b, 1e-3, seed), np.full(1000, 1e-3))
         for seed in range(count)
     ]
-    fits = [Evidence(solved(Pieces.of(record))) for record in records]
-    assert all(fit.about.rested for fit in fits)
+    fits = [Evidence(fit_law(Pieces.of(record))) for record in records]
+    assert all(fit.expansion.converged for fit in fits)
     # 64 records know a standard deviation to 9 %.
     for name in ("a", "b", "rate_mean"):
         stated = np.median([getattr(fit.raw, name) for fit in fits])
-        values = [getattr(fit.about.values, name) for fit in fits]
+        values = [getattr(fit.expansion.values, name) for fit in fits]
         assert np.std(values) == pytest.approx(stated, rel=widened(0.3, 64, count))
     assert np.median([fit.raw.a for fit in fits]) / a == pytest.approx(error_a, rel=0.25)
     assert np.median([fit.raw.b for fit in fits]) / b == pytest.approx(error_b, rel=0.25)
@@ -104,8 +104,8 @@ def test_no_random_record_defeats_the_search():
     rng = np.random.default_rng(5)
     spans = np.where(np.arange(512) % 4 == 0, 60.0, 10 ** rng.uniform(1.7, 5.0, 512))
     records = [random_decay(rng, span) for span in spans]
-    fits = [solved(Pieces.of(record)) for record in records]
-    assert all(fit.rested for fit in fits)
+    fits = [fit_law(Pieces.of(record)) for record in records]
+    assert all(fit.converged for fit in fits)
     assert all(np.isfinite(fit.values).all() for fit in fits)
     reduced = np.array([fit.residuals @ fit.residuals for fit in fits]) / 61
     # Currents near the noise are folded to positive, which adds to chi²; none runs away.
@@ -131,7 +131,7 @@ def test_a_known_shape_gives_the_true_gas_term():
     assert shaped.values.b == pytest.approx(2e-7, abs=4 * shaped.raw.b)
     assert about.residuals @ about.residuals < 1.3 * 297
     # The constant-a law puts the difference into a gas loss three times too large.
-    assert plain.about.values.b > 3 * 2e-7
+    assert plain.expansion.values.b > 3 * 2e-7
     assert blind.residuals @ blind.residuals > 10 * (about.residuals @ about.residuals)
 
 
@@ -139,7 +139,7 @@ def test_the_exponent_of_a_constant_a_is_zero():
     time = np.linspace(0, 36000, 300)
     measured = noisy(time, 500.0, 3e-8, 1e-6, 1e-3, 7)
     about, fit = fitted(time, measured, 1e-3, free=(*PLAIN, POWER))
-    assert about.rested
+    assert about.converged
     error = fit.constant_a.exponent.error
     assert abs(about.values.exponent) < 4 * error
     assert error < 0.05
@@ -164,7 +164,7 @@ def test_the_search_answers_the_problem(stated):
     error = None if stated is None else np.full(200, stated)
     record = DecayRecord(time, noisy(time, 500.0, 4e-8, 2e-6, 0.01, 8), error)
     problem, units = core_problem(record)
-    fast, core = Evidence(solved(Pieces.of(record))), solve(problem)
+    fast, core = Evidence(fit_law(Pieces.of(record))), solve(problem)
     for name, unit in units.items():
         assert core[name].value * unit == pytest.approx(getattr(fast.values, name), rel=1e-9)
         assert core[name].error_raw * unit == pytest.approx(getattr(fast.raw, name), rel=1e-5)

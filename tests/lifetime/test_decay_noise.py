@@ -10,7 +10,7 @@ from scipy.signal import lfilter
 from scipy.stats import t
 
 from beamfit.lifetime.evidence import Evidence
-from beamfit.lifetime.expansion import Pieces, solved
+from beamfit.lifetime.expansion import Pieces, fit_law
 from beamfit.lifetime.fit import fit_decay, fit_decays
 from beamfit.lifetime.record import DecayRecord
 from beamfit.lifetime.study import study_record
@@ -93,7 +93,7 @@ def test_errors_that_differ_for_a_reason_stay():
 def test_independent_noise_gives_plain_least_squares():
     for seed in range(5):
         plain = record(0.0, seed=seed)
-        fit, found = constant_fit(plain), solved(Pieces.of(plain))
+        fit, found = constant_fit(plain), fit_law(Pieces.of(plain))
         assert fit.a.value == found.values.a
         rows, slope = found.rows[:, :3], found.slopes[1, :3]
         size = (found.residuals @ found.residuals / 197) ** 0.5
@@ -167,7 +167,7 @@ def test_a_drift_that_moves_a_value_by_its_error_does_so():
     plain = record(0.0, seed=7)
     fit = constant_fit(plain)
     assert "stability is not stated" in fit.message
-    evidence = Evidence(solved(Pieces.of(plain)), record=plain)
+    evidence = Evidence(fit_law(Pieces.of(plain)), record=plain)
     drift = evidence.drift_of_one_error("b")
     assert f"{drift:.2g} mA" in fit.message
     drifted = DecayRecord(plain.time, plain.current + drift * plain.time / SPAN)

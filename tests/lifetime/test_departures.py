@@ -9,7 +9,7 @@ from scipy.signal import lfilter
 
 from beamfit.lifetime import alternatives
 from beamfit.lifetime.decay_law import Moments, beam_current
-from beamfit.lifetime.expansion import Pieces, further_columns, solved
+from beamfit.lifetime.expansion import Pieces, fit_law, further_columns
 from beamfit.lifetime.fit import fit_decay
 from beamfit.lifetime.free_law import Law
 from beamfit.lifetime.record import Conditions, DecayRecord
@@ -153,7 +153,7 @@ def test_outgassing_is_named_with_its_time_constant_and_lifetimes(a, b, further,
 def test_the_curve_that_is_drawn_is_that_of_the_residuals(further):
     time, beam = integrated(lambda t, i: 1e-8 * i + 4e-6 + further * np.exp(-t / 7200))
     fit = fit_decay(noisy(time, beam))
-    assert bool(further) == (fit.free_law.beside == "pumped")
+    assert bool(further) == (fit.free_law.addition == "pumped")
     np.testing.assert_allclose(fit.curve(time), fit.readings.current + fit.residuals, rtol=1e-9)
     assert np.std(fit.curve(time) - beam) < 1e-3  # half of the noise of a reading
 
@@ -212,11 +212,11 @@ def test_a_long_record_begins_at_its_first_reading(course):
     """
     rate = lambda t, i: A * i + B * (1 + course(t / SPAN))  # noqa: E731
     time, beam = integrated(rate, count=4100)
-    rival = alternatives.rival_of(solved(Pieces.of(noisy(time, beam, noise=0.02))))
-    i0 = rival.quantities["i0"]
+    best = alternatives.best_alternative(fit_law(Pieces.of(noisy(time, beam, noise=0.02))))
+    i0 = best.quantities["i0"]
     assert abs(i0.value - 500.0) < 3 * i0.error < 0.02
-    if isinstance(rival.found, alternatives.Change):
-        assert abs(rival.found.time - SPAN / 2) < 3 * rival.found.error < 0.01 * SPAN
+    if isinstance(best.explanation, alternatives.Change):
+        assert abs(best.explanation.time - SPAN / 2) < 3 * best.explanation.error < 0.01 * SPAN
 
 
 def test_a_scraper_that_moved_in_and_out_is_dated_twice():
@@ -396,7 +396,7 @@ def test_five_readings_are_an_answer_also_where_they_refute_the_law():
 )
 def test_slopes_by_a_further_loss_are_differences_of_the_integrated_law(kind, when, course):
     time, plain = integrated(lambda t, i: A * i + B)
-    ends, about = [], solved(Pieces.of(DecayRecord(time, plain)))
+    ends, about = [], fit_law(Pieces.of(DecayRecord(time, plain)))
     for more in (0.05, -0.05):
 
         def rate(t, i, more=more):
@@ -416,14 +416,14 @@ def test_no_alternative_that_wins_is_left_out_unfitted(monkeypatch):
         steps = random.normal(size=time.size)
         noise = lfilter([0.6], [1, -0.8], steps)
         records += [DecayRecord(time, beam + 0.02 * part) for part in (steps, noise)]
-    abouts = [solved(Pieces.of(record)) for record in records]
-    likely, looked = alternatives._likely, []
+    abouts = [fit_law(Pieces.of(record)) for record in records]
+    likely, looked = alternatives._probable_alternatives, []
     noted = lambda *law: looked.append(likely(*law)) or looked[-1]  # noqa: E731
-    monkeypatch.setattr(alternatives, "_likely", noted)
-    chosen = [alternatives.rival_of(about) for about in abouts]
+    monkeypatch.setattr(alternatives, "_probable_alternatives", noted)
+    chosen = [alternatives.best_alternative(about) for about in abouts]
     left_out = sum(len(names) < 5 for names in looked)
-    monkeypatch.setattr(alternatives, "HOPELESS", -np.inf)
-    answers = [alternatives.rival_of(about) for about in abouts]
+    monkeypatch.setattr(alternatives, "SCREENING_MARGIN", -np.inf)
+    answers = [alternatives.best_alternative(about) for about in abouts]
     assert list(map(str, chosen)) == list(map(str, answers))
     assert any(answers)
     assert left_out >= 2

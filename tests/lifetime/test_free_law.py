@@ -10,23 +10,23 @@ from scipy.special import logsumexp
 
 from beamfit.errors import InputError
 from beamfit.lifetime.decay_law import current
-from beamfit.lifetime.expansion import Pieces, solved
+from beamfit.lifetime.expansion import Pieces, fit_law
 from beamfit.lifetime.fit import fit_cycles, fit_decay, fit_decays
 from beamfit.lifetime.free_law import (
     CONSTANT,
-    HALF_WALK,
     INTEGRAL,
     LOSS_WANDERS,
     NODE,
     POWER,
-    DrawnLaw,
-    Numbers,
-    SeenDecay,
+    WALK_FACTOR,
+    LawParameters,
+    LawProposal,
+    ReducedDecay,
     disturbances,
     from_nodes,
     monitor_wanders,
     quantiles,
-    settling,
+    settling_shapes,
 )
 from beamfit.lifetime.lifetime_table import fit_lifetimes
 from beamfit.lifetime.pieces import split_record
@@ -61,7 +61,7 @@ def test_the_closed_form_is_the_integrated_law(power, change, pace):
     """Gas that is pumped away falls as exp(-pace s), by `change` of the whole loss."""
     rate, level = 1.3, 1.4
     found = np.array([[np.log(level)], [np.log(rate)], [0.4], [power], [change], [pace]])
-    share = Numbers.of(found).share[0]
+    share = LawParameters.of(found).share[0]
     change *= 1.0 if pace else 1 - share
 
     def slope(s, x):
@@ -70,7 +70,7 @@ def test_the_closed_form_is_the_integrated_law(power, change, pace):
 
     true = solve_ivp(slope, (0, 1), [level], t_eval=NODE, rtol=1e-12, atol=1e-12).y[0]
     rtol = 1e-9 if pace < 5 else 5e-6  # nodes of a fast course
-    np.testing.assert_allclose(Numbers.of(found).currents(NODE)[:, 0], true, rtol=rtol)
+    np.testing.assert_allclose(LawParameters.of(found).currents(NODE)[:, 0], true, rtol=rtol)
 
 
 @simulations(4, 12)
@@ -119,11 +119,11 @@ def test_a_walk_at_the_nodes_is_a_random_walk_about_its_mean():
     steps = np.random.default_rng(0).normal(size=(40_000, 1000)) / np.sqrt(1000)
     walks = np.cumsum(steps, axis=1)
     walks = (walks - walks.mean(axis=1, keepdims=True))[:, (NODE * 999).round().astype(int)]
-    np.testing.assert_allclose(HALF_WALK @ HALF_WALK.T, walks.T @ walks / len(walks), atol=0.01)
+    np.testing.assert_allclose(WALK_FACTOR @ WALK_FACTOR.T, walks.T @ walks / len(walks), atol=0.01)
 
 
 def test_a_monitor_that_wanders_shows_what_a_loss_would_and_ends_apart():
-    shown, own = LOSS_WANDERS.shown(0.5), monitor_wanders(0.5)
+    shown, own = LOSS_WANDERS.reading_shapes(0.5), monitor_wanders(0.5)
     inner = (own.shapes @ np.swapaxes(own.shapes, 1, 2))[0]
     line = own.shapes[0][:, -1]
     loss = shown[0] - INTEGRAL[-1] @ shown[0]
@@ -135,7 +135,7 @@ def test_a_monitor_that_wanders_shows_what_a_loss_would_and_ends_apart():
 
 def test_a_monitor_that_settles_is_followed_from_node_to_node():
     time = np.linspace(0.0, 1.0, 1001)
-    for pace, shape in zip(2.0 ** np.arange(1, 6.25, 0.25), settling(), strict=True):
+    for pace, shape in zip(2.0 ** np.arange(1, 6.25, 0.25), settling_shapes(), strict=True):
         followed = from_nodes(time) @ shape[:, 0]
         np.testing.assert_allclose(followed, np.exp(-pace * time), atol=1e-9 if pace < 8 else 0.02)
         step = 1e-6
@@ -147,9 +147,9 @@ def test_a_monitor_that_settles_is_followed_from_node_to_node():
 def test_a_disturbance_is_averaged_over_in_closed_form(kind):
     """The likelihood is that of the noise's covariance with the disturbance's."""
     one = record(3, noise=3.0, count=40)
-    seen = SeenDecay.of(one, solved(Pieces.of(one)).values)
+    seen = ReducedDecay.of(one, fit_law(Pieces.of(one)).values)
     white = seen.of_noises(np.array([kind.time == kind.power == 0 for kind in seen.products.kinds]))
-    found, least = white.beside(kind), white.likely[0][0]
+    found, least = white.with_disturbance(kind), white.best_curve[0][0]
     noise = np.sqrt(least / (40 - NODE.size))
     sees = np.polynomial.chebyshev.chebvander(2 * one.time / one.span - 1, NODE.size - 1)
     sees = sees @ np.linalg.inv(np.polynomial.chebyshev.chebvander(2 * NODE - 1, NODE.size - 1))
@@ -228,7 +228,7 @@ def test_a_quiet_monitor_that_settles_is_told_beside_any_law(given, count):
         rate = own + B * (1 + drift * (at / time[-1] - 0.5))
         held += low <= 1 / rate / HOUR <= high
         told += "A monitor that settles after a fill is likely" in fit.message
-        assert "residuals are correlated" not in fit.message or fit.free_law.beside != "settles"
+        assert "residuals are correlated" not in fit.message or fit.free_law.addition != "settles"
     assert held >= count - 1
     assert told >= 0.75 * count
 
@@ -250,13 +250,13 @@ def test_the_density_of_samples_is_that_of_the_draws():
     for law in ready.laws:
         if POWER in law.free:
             continue
-        draws, products = law.weighed(32), law.seen.products
-        away = law.seen.away(draws.currents)
+        draws, products = law.weighted_draws(32), law.reduced.products
+        away = law.reduced.coefficients(draws.currents)
         squares = np.einsum("pd,kpq,qd->kd", away, products.matrix, away)
         log = logsumexp(products.log_prior[:, None] + products.log_size(squares), axis=0)
         log += law._log_prior(draws.numbers) - np.log(draws.numbers.rate)
         log += (
-            np.log1p(-draws.numbers.share) if law.beside == "pumped" else 0.0
+            np.log1p(-draws.numbers.share) if law.addition == "pumped" else 0.0
         )  # of b, not of the loss
         thetas = ready.thetas(draws, np.random.default_rng(0))
         density = np.array([float(_log_density(data, theta)) for theta in thetas])
@@ -303,8 +303,8 @@ def test_a_vacuum_that_walks_is_in_the_errors(count):
 def test_the_draws_are_those_of_the_posterior():
     """With constant a and b against a grid of the exact law in white noise."""
     one = record(3, noise=3.0)
-    values = solved(Pieces.of(one)).values
-    draws = DrawnLaw.of(SeenDecay.of(one, values), CONSTANT).weighed(6000)
+    values = fit_law(Pieces.of(one)).values
+    draws = LawProposal.of(ReducedDecay.of(one, values), CONSTANT).weighted_draws(6000)
     time, rates, shares = one.time, np.linspace(0.97, 1.03, 61), np.linspace(0.0, 1.0, 81)
     unit, mean, log = float(values.rate_mean), float(one.current.mean()), np.zeros((61, 81))
     for j, rate in enumerate(rates * unit):
@@ -414,8 +414,8 @@ def test_long_top_up_is_cut_before_it_is_averaged():
 def test_stretches_find_the_steps_of_the_whole(monkeypatch):
     one = sawtooth(10.0, 6000, 0.02)
     whole = [event.time for event in split_record(one).events if event.kind == "refill"]
-    monkeypatch.setattr("beamfit.lifetime.pieces.ONE_LAW", 1024)
-    monkeypatch.setattr("beamfit.lifetime.pieces.BESIDE", 256)
+    monkeypatch.setattr("beamfit.lifetime.pieces.LAW_CHUNK", 1024)
+    monkeypatch.setattr("beamfit.lifetime.pieces.LAW_OVERLAP", 256)
     parts = [event.time for event in split_record(one).events if event.kind == "refill"]
     assert len(set(whole) ^ set(parts)) <= 0.02 * len(whole)
 

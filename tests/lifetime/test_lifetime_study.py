@@ -21,7 +21,7 @@ from beamfit.lifetime.ring_study import (
     find_anomaly,
     next_decays,
 )
-from beamfit.lifetime.scales import fit_scales, summarise, widened
+from beamfit.lifetime.scales import add_errors, fit_scales, summarise
 from beamfit.lifetime.study import study_record
 from beamfit.quantity import Status
 from tests.simulations import simulations
@@ -85,11 +85,11 @@ def test_the_summary_is_the_information_of_the_readings(decays):
 def test_an_error_of_the_model_adds_to_the_covariance():
     random = np.random.default_rng(4)
     root, changes = np.triu(random.normal(size=(2, 2))), random.normal(size=(2, 3))
-    found = np.asarray(widened(root, changes))
+    found = np.asarray(add_errors(root, changes))
     expected = np.linalg.inv(root.T @ root) + changes @ changes.T
     np.testing.assert_allclose(np.linalg.inv(found.T @ found), expected, rtol=1e-10)
     nothing = np.array([[0.0, 0.0], [0.0, 2.0]])  # a decay that does not tell a
-    assert np.isfinite(widened(nothing, changes)).all()
+    assert np.isfinite(add_errors(nothing, changes)).all()
 
 
 def test_the_scales_of_the_shift_are_found(fit):

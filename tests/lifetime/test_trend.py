@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from beamfit.errors import InputError
-from beamfit.lifetime.course import _drift, _is_sure, trend_of
+from beamfit.lifetime.course import _drift, _is_significant, trend_of
 from beamfit.lifetime.mechanisms import loss_coefficients
 from beamfit.lifetime.record import Conditions, DecayRecord
 from beamfit.lifetime.study import study_record
@@ -123,7 +123,7 @@ def test_four_lifetimes_drift_no_oftener_than_chance_says():
         values = [Quantity(v, 0.1, "mA h") for v in 10 + 0.1 * random.normal(size=4)]
         found = _drift(time, values, 10.0)
         inside += found.interval_95[0] < 0 < found.interval_95[1]
-        sure += _is_sure(abs(found.value) / found.error, 2)
+        sure += _is_significant(abs(found.value) / found.error, 2)
     assert abs(inside / 3000 - 0.95) < 0.015
     assert sure / 3000 < 0.006
 

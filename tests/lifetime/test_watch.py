@@ -6,7 +6,15 @@ import numpy as np
 import pytest
 
 from beamfit.lifetime.mechanisms import loss_coefficients
-from beamfit.lifetime.watch import CURRENT, Plan, State, WindowRow, fit_window, learnt, stepped
+from beamfit.lifetime.watch import (
+    CURRENT,
+    Plan,
+    State,
+    WindowRow,
+    fit_window,
+    learn_reference,
+    stepped,
+)
 from tests.lifetime.test_alarm import beam_after
 
 A, B, NOISE, START = 3.7e-8, 9.26e-6, 5e-4, 1.7e9
@@ -46,7 +54,7 @@ def test_a_hidden_rise_is_named_and_the_lifetime_is_that_of_the_new_loss(which, 
     assert (alarm.moved, after.alarmed) == (which, which)
     assert abs(alarm.since - START - 5000) < 30
     assert alarm.told - alarm.since < 30 * 60
-    assert f"{which} moved by +15" in after.said()
+    assert f"{which} moved by +15" in after.alarm_text()
     # What was read before is no longer of the window.
     assert after.rows[0].time >= alarm.since
     rate = A * worse[0] * after.answer.window.fit.mean_current + B * worse[1]
@@ -177,8 +185,8 @@ def test_under_top_up_the_ring_shares_the_loss_and_without_it_nothing_is_usual(m
         rows.append(WindowRow(0, START + now, beam + NOISE * random.normal(), UNREAD))
     window = fit_window(rows, "ring")
     assert window.fit.status == "unidentified"
-    assert learnt(None, window, rows, None) is None
-    usual = learnt(None, window, rows, machine).usual
+    assert learn_reference(None, window, rows, None) is None
+    usual = learn_reference(None, window, rows, machine).reference
     rate = a * 500 + b
     assert usual.a * 500 + usual.b == pytest.approx(rate, rel=2e-3)
     assert usual.a == pytest.approx(a, rel=2e-3)
