@@ -11,7 +11,7 @@ import numpy as np
 from scipy.optimize import nnls
 
 from beamfit.greybox import assess, problem, tree
-from beamfit.greybox.assess import NEAR, SearchState
+from beamfit.greybox.assess import TEST_DISTANCE, SearchState
 from beamfit.greybox.covariance import directions
 from beamfit.greybox.descend import descend_all
 from beamfit.greybox.problem import Problem, with_slope
@@ -79,7 +79,7 @@ def diagnose(p: Problem) -> tuple[Ailment, ...]:
     start = np.clip(p.start, p.lower, p.upper)
     if wrong := contradictory(p):
         return tuple(wrong)
-    points = [start, *assess.nearby(p, p.start, np.maximum(np.abs(p.start), 1.0))]
+    points = [start, *assess.points_nearby(p, p.start, np.maximum(np.abs(p.start), 1.0))]
     first, *others = assess.slopes_at(p, np.array(points))
     # Part by part only what is known to be wrong: that is traced anew each time.
     if not first.finite and (wrong := not_finite(p, start)):
@@ -357,10 +357,10 @@ def dependence(p: Problem, s: SearchState, stationary: bool) -> Dependence | Non
 
 def _changes(p: Problem, s: SearchState) -> np.ndarray:
     """Largest change of each constraint per unit of the numbers, at random points nearby."""
-    points = assess.nearby(p, s.theta, assess.scale_of(p, s.theta, s.at).unit)
+    points = assess.points_nearby(p, s.theta, assess.scale_of(p, s.theta, s.at).unit)
     look = p.compiled(problem.constraints)
     values = np.array([look(point) for point in points])
-    change = np.abs(values - s.at.constraints) / NEAR
+    change = np.abs(values - s.at.constraints) / TEST_DISTANCE
     return np.max(np.where(np.isfinite(change), change, 0.0), axis=0, initial=0.0)
 
 

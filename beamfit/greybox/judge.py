@@ -20,7 +20,7 @@ from scipy.sparse.csgraph import connected_components
 from beamfit import errors
 from beamfit.errors import Finding, Status
 from beamfit.greybox import assess, problem
-from beamfit.greybox.assess import LOOKS, NEAR, SearchState
+from beamfit.greybox.assess import TEST_DISTANCE, TEST_POINTS, SearchState
 from beamfit.greybox.convex import convex
 from beamfit.greybox.covariance import (
     MOST_SHARE,
@@ -127,7 +127,7 @@ def known(p: Problem, s: SearchState) -> Known:
     hangs on it are those of a number that the bound only limits. Weights that nobody asks for
     stay on their bounds.
     """
-    held, on = assess.holding(p, s, 1e-9)
+    held, on = assess.active_set(p, s, 1e-9)
     equations = s.at.jacobian[on]
     ends = np.cumsum([record.measured.size for record in p.records], dtype=int)
     parts = zip([0, *ends], [*ends, None], strict=True)
@@ -255,7 +255,7 @@ def refused(p: Problem, found: Finding, seconds: float, theta=None, attempts=())
     ends, free = (p.constraint_lower, p.constraint_upper), np.full(len(none), "free")
     constraints = _rows(FittedConstraint, p.constraint_names, none, *ends, free, none)
     return Fit(
-        p, theta, found.status, found.message, nan, nan, 0, (), assess.LOST, variables,
+        p, theta, found.status, found.message, nan, nan, 0, (), assess.INFINITE_KKT, variables,
         constraints, lost, lost, np.zeros((p.size, n)), np.eye(n), nan, attempts, seconds,
     )  # fmt: skip
 
@@ -314,14 +314,14 @@ def _far(s: SearchState) -> np.ndarray:
 
 def _restless(e: FitEvidence) -> Finding | None:
     """Say that the search ended short of an optimum."""
-    bend, steps = e.state.bend, sum(a.iterations for a in e.search.attempts)
+    curvature, steps = e.state.curvature, sum(a.iterations for a in e.search.attempts)
     why = None
     if not e.state.optimal and not e.settled:
         why = e.residue.strip("()")
-    elif bend is not None and bend.direction is not None:
+    elif curvature is not None and curvature.direction is not None:
         why = "the cost still bends down there"
-    elif bend is not None and bend.newton > assess.STEP:
-        why = f"the next step is {bend.newton:.1e} of the numbers' sizes"
+    elif curvature is not None and curvature.newton > assess.MAX_NEWTON_STEP:
+        why = f"the next step is {curvature.newton:.1e} of the numbers' sizes"
     if why is None:
         return None
     cause = f"no optimum was reached from {e.search.words} ({why} after {steps} iterations);"
@@ -464,7 +464,7 @@ def _still(p: Problem, theta: np.ndarray, unseen: np.ndarray) -> np.ndarray:
     along = unseen[:, length > 0] / length[length > 0]  # numbers that are held move nowhere
     if not along.shape[1]:
         return along
-    rows = np.vstack([_made_up(p, theta, random) for _ in range(LOOKS)])
+    rows = np.vstack([_made_up(p, theta, random) for _ in range(TEST_POINTS)])
     _, sizes, turned = np.linalg.svd(rows / size @ along, full_matrices=True)
     return along @ turned[int(np.sum(sizes > STILL)) :].T
 
@@ -472,7 +472,7 @@ def _still(p: Problem, theta: np.ndarray, unseen: np.ndarray) -> np.ndarray:
 def _everywhere(p: Problem, theta: np.ndarray, at: np.ndarray, free: int) -> bool:
     """True if numbers are tied at smaller values, too: those run along a ridge are not."""
     random = np.random.default_rng(0)
-    for _ in range(LOOKS):
+    for _ in range(TEST_POINTS):
         point = np.clip(theta * random.uniform(size=len(theta)), p.lower, p.upper)
         sizes = np.linalg.svd(_made_up(p, point, random)[:, at], compute_uv=False)
         if np.sum(sizes > STILL * np.max(sizes, initial=0.0)) > len(at) - free:
@@ -505,7 +505,7 @@ def _moved(value: Any, random: np.random.Generator) -> Any:
     if not np.issubdtype(value.dtype, np.floating) or not value.size:
         return value
     spread = float(np.std(value)) or float(np.max(np.abs(value))) or 1.0
-    factor, shift = (NEAR * random.normal(size=value.shape) for _ in range(2))
+    factor, shift = (TEST_DISTANCE * random.normal(size=value.shape) for _ in range(2))
     return value * (1 + factor) + spread * shift
 
 
@@ -556,10 +556,10 @@ def _degenerate(e: FitEvidence) -> Finding | None:
 
 def _saddle(e: FitEvidence) -> Finding | None:
     """Say that the cost falls on both sides of a stationary point."""
-    bend = e.state.bend
-    if not e.state.optimal or bend is None or bend.direction is None:
+    curvature = e.state.curvature
+    if not e.state.optimal or curvature is None or curvature.direction is None:
         return None
-    part = np.abs(bend.direction / e.state.scale.unit)
+    part = np.abs(curvature.direction / e.state.scale.unit)
     along = np.array(e.problem.names)[part > 0.3 * np.max(part)]
     cause = f"a saddle: the cost bends down along {listed(along)}, and the search did not get away;"
     return Finding(Status.saddle, cause, "start elsewhere, or give more starts.")

@@ -174,7 +174,9 @@ def _drawn(p: Problem, number: int, seed: int) -> np.ndarray:
 
 def _good(s: SearchState) -> bool:
     """True if a point is an optimum to second order."""
-    bent = s.bend is not None and (s.bend.direction is not None or s.bend.newton > assess.STEP)
+    bent = s.curvature is not None and (
+        s.curvature.direction is not None or s.curvature.newton > assess.MAX_NEWTON_STEP
+    )
     return s.optimal and not bent
 
 
@@ -277,7 +279,7 @@ def _go_on(p: Problem, lanes: Descent, lane: int, limit: int, budget: SearchLimi
 def _account(p: Problem, lanes: Descent, lane: int, s: SearchState | None) -> Attempt:
     theta, steps = lanes.theta[lane].copy(), int(lanes.steps[lane])
     if not np.isfinite(lanes.cost[lane]):
-        return Attempt(METHOD, theta, np.nan, assess.LOST, steps, "cost not finite")
+        return Attempt(METHOD, theta, np.nan, assess.INFINITE_KKT, steps, "cost not finite")
     said = "came to rest" if lanes.rested[lane] else "ran out of iterations"
     s = _judged(p, lanes, lane) if s is None else s
     return Attempt(METHOD, theta, float(s.at.cost), s.kkt, steps, said)
@@ -286,7 +288,7 @@ def _account(p: Problem, lanes: Descent, lane: int, s: SearchState | None) -> At
 def _judged(p: Problem, lanes: Descent, lane: int) -> SearchState:
     """Judged end of one search."""
     theta = lanes.theta[lane].copy()
-    at = assess.of_squares(lanes.residual[lane].copy(), lanes.jacobian[lane])
+    at = assess.slopes_of_squares(lanes.residual[lane].copy(), lanes.jacobian[lane])
     return assess.state(p, theta, assess.scale_of(p, theta, at), at)
 
 
@@ -295,7 +297,7 @@ def _moved_off(p: Problem, lanes: Descent, lane: int, budget: SearchLimit) -> Se
     s = _judged(p, lanes, lane)
     for _ in range(MOVES):
         look = partial(costs, p, lanes)
-        point = assess.lower_beside(p, s, look) if s.at.finite else None
+        point = assess.find_lower_point(p, s, look) if s.at.finite else None
         if point is None or budget.left <= 0:
             break
         lanes.move(lane, point)
@@ -316,7 +318,9 @@ def _one_by_one(
             break
         at = assess.slopes(p, point)
         if not (np.isfinite(at.cost) and np.all(np.isfinite(at.constraints))):
-            attempts.append(Attempt("none", point, np.nan, assess.LOST, 0, "cost not finite"))
+            attempts.append(
+                Attempt("none", point, np.nan, assess.INFINITE_KKT, 0, "cost not finite")
+            )
             continue
         s, attempt = _program(p, point, at, budget, hessian)
         if p.objectives and outgrown(s):  # from there in the sizes it has there
