@@ -14,7 +14,7 @@ from beamfit.greybox.assess import SearchState
 from beamfit.greybox.descend import Descent, costs, descent_of
 from beamfit.greybox.diagnosis import contradictory, not_finite, relaxed
 from beamfit.greybox.fit import Attempt, Fit
-from beamfit.greybox.judge import Search, conclude, outgrown, refused, settled
+from beamfit.greybox.judge import Search, conclude, cost_outgrew_scale, has_settled, refuse
 from beamfit.greybox.problem import Problem
 from beamfit.greybox.programs import INSIDE, SOLVERS, NonlinearProgram, SearchLimit
 
@@ -98,7 +98,7 @@ def solve(
     wrong = contradictory(p)
     if wrong:
         spent = time.perf_counter() - began
-        return refused(p, Finding(Status.contradictory_bounds, wrong[0].message), spent)
+        return refuse(p, Finding(Status.contradictory_bounds, wrong[0].message), spent)
     drawn = _drawn(p, starts, seed)
     points = np.clip(drawn, p.lower, p.upper)
     moved = int(np.sum(np.any(points != drawn, axis=1)))
@@ -115,7 +115,7 @@ def solve(
         lost = Finding(Status.not_finite, said, remedy)
         if starts == 1 and (traced := not_finite(p, points[0])):
             lost = Finding(Status.not_finite, traced[0].message)
-        return refused(p, lost, spent, None, attempts)
+        return refuse(p, lost, spent, None, attempts)
     best, conflict = found[_best(p, found)], None
     if not best.feasible and p.constraints and best.at.finite and budget.left > 0:
         conflict = relaxed(p, best, starting_points(p, 6, seed))
@@ -204,7 +204,7 @@ def _best(p: Problem, found: list[SearchState]) -> int:
 
 
 def _rests(p: Problem, s: SearchState) -> bool:
-    return _good(s) or (not p.constraints and settled(p, s))
+    return _good(s) or (not p.constraints and has_settled(p, s))
 
 
 def search(
@@ -272,7 +272,7 @@ def _go_on(p: Problem, lanes: Descent, lane: int, limit: int, budget: SearchLimi
         before = lanes.cost[lane]
         lanes.go(np.array([lane]), min(limit, int(lanes.steps[lane]) + STRETCH), budget.until)
         gained = before - lanes.cost[lane]
-        if gained < NOTHING * before and settled(p, _judged(p, lanes, lane)):
+        if gained < NOTHING * before and has_settled(p, _judged(p, lanes, lane)):
             return
 
 
@@ -323,7 +323,7 @@ def _one_by_one(
             )
             continue
         s, attempt = _program(p, point, at, budget, hessian)
-        if p.objectives and outgrown(s):  # from there in the sizes it has there
+        if p.objectives and cost_outgrew_scale(s):  # from there in the sizes it has there
             s, attempt = _program(p, s.theta, assess.slopes(p, s.theta), budget, hessian)
         found.append(s)
         attempts.append(attempt)
