@@ -22,8 +22,8 @@ import numpy as np
 from scipy import sparse
 
 from beamfit.greybox import problem
-from beamfit.greybox.covariance import FEW, null_space, triangle
-from beamfit.greybox.descend import slopes_of_few
+from beamfit.greybox.covariance import MAX_DENSE, null_space, triangle
+from beamfit.greybox.descend import dense_slopes
 from beamfit.greybox.problem import Problem
 from beamfit.greybox.sparse import Rows, in_units, lengths, weakest
 
@@ -204,8 +204,8 @@ def slopes_at(p: Problem, points: np.ndarray) -> list[Slopes]:
 
     A small problem of squares alone uses the function that its search has compiled already.
     """
-    if not (p.constraints or p.objectives) and len(p.start) <= FEW:
-        return [slopes_of_squares(*each) for each in zip(*slopes_of_few(p)(points), strict=True)]
+    if not (p.constraints or p.objectives) and len(p.start) <= MAX_DENSE:
+        return [slopes_of_squares(*each) for each in zip(*dense_slopes(p)(points), strict=True)]
     call = p.compiled(first_order)
     return [Slopes(*map(np.asarray, call(point))) for point in points]
 
@@ -502,7 +502,7 @@ def _weakest_directions(p: Problem, s: SearchState) -> np.ndarray:
     """Find the directions along the active limits in which the sum of squares changes least."""
     unit = s.scale.unit
     held, on = active_set(p, s, p.tolerance)
-    if len(unit) > FEW and not on.any():
+    if len(unit) > MAX_DENSE and not on.any():
         found = np.zeros((len(unit), min(WEAK_DIRECTIONS, int(np.sum(~held)))))
         rows = in_units(s.at.residual_jacobian, 1 / unit)[:, ~held]
         found[~held] = weakest(rows, found.shape[1])

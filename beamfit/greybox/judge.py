@@ -35,7 +35,7 @@ from beamfit.greybox.covariance import (
 from beamfit.greybox.diagnosis import Conflict, dependence, listed
 from beamfit.greybox.equations import Implicit
 from beamfit.greybox.fit import Attempt, Fit, FittedConstraint, FittedVariable
-from beamfit.greybox.problem import Problem, flattened, sloped
+from beamfit.greybox.problem import Problem, flattened, residual_and_jacobian
 from beamfit.greybox.sparse import Rows
 from beamfit.statistics import POOR_FIT, chi2_probability
 
@@ -518,7 +518,7 @@ def _random_rows(p: Problem, theta: np.ndarray, random: np.random.Generator) -> 
         for r in p.core.records
     )
     core = dataclasses.replace(p.core, records=records)
-    rows = np.asarray(flattened(core)(sloped)(theta)[1]) * _scales_of(theta)
+    rows = np.asarray(flattened(core)(residual_and_jacobian)(theta)[1]) * _scales_of(theta)
     rows = rows[np.all(np.isfinite(rows), axis=1)]
     for order in (np.inf, 2):  # the maximum first: squares of huge entries overflow
         terms = np.linalg.norm(rows, order, axis=1, keepdims=True)

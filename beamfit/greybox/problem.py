@@ -279,7 +279,7 @@ def with_slope(function: Callable[[jax.Array], jax.Array], theta: jax.Array):
     return value, slope
 
 
-def sloped(core: Core, theta: jax.Array) -> tuple[jax.Array, jax.Array]:
+def residual_and_jacobian(core: Core, theta: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Residuals and their Jacobian."""
     return with_slope(partial(residual, core), theta)
 

@@ -252,7 +252,7 @@ def _lanes(
 ) -> tuple[list[SearchState], list[Attempt]]:
     k = len(points)
     lanes = descent_of(p, points)
-    lanes.go(np.arange(k), min(STEPS, budget.iterations), budget.until)
+    lanes.run(np.arange(k), min(STEPS, budget.iterations), budget.until)
     cost = lanes.cost
     found: dict[int, SearchState] = {}
     for lane in np.argsort(cost, kind="stable")[:POLISHED].tolist():
@@ -270,7 +270,7 @@ def _go_on(p: Problem, lanes: Descent, lane: int, limit: int, budget: SearchLimi
     """Polish one search until it rests, or has settled in a flat valley where it gains nothing."""
     while not lanes.done[lane] and lanes.steps[lane] < limit and budget.left > 0:
         before = lanes.cost[lane]
-        lanes.go(np.array([lane]), min(limit, int(lanes.steps[lane]) + STRETCH), budget.until)
+        lanes.run(np.array([lane]), min(limit, int(lanes.steps[lane]) + STRETCH), budget.until)
         gained = before - lanes.cost[lane]
         if gained < NOTHING * before and has_settled(p, _judged(p, lanes, lane)):
             return
@@ -300,7 +300,7 @@ def _moved_off(p: Problem, lanes: Descent, lane: int, budget: SearchLimit) -> Se
         point = assess.find_lower_point(p, s, look) if s.at.finite else None
         if point is None or budget.left <= 0:
             break
-        lanes.move(lane, point)
+        lanes.restart(lane, point)
         _go_on(p, lanes, lane, int(lanes.steps[lane]) + budget.iterations, budget)
         s = _judged(p, lanes, lane)
     return s
