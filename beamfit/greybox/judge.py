@@ -560,9 +560,9 @@ def _degenerate(e: FitEvidence) -> Finding | None:
         return None
     names, gap = listed(map(repr, found.names)), "" if e.state.optimal else f" {e.kkt_text}"
     one = "its gradient vanishes" if len(found.names) == 1 else "their gradients are dependent"
-    if found.slopeless:
+    if found.flat:
         cause = (
-            f"{listed(map(repr, found.slopeless))} has no slope where it holds (no constraint "
+            f"{listed(map(repr, found.flat))} has no slope where it holds (no constraint "
             f"qualification), so that it has no multiplier and solvers stop anywhere along it{gap};"
         )
         remedy = (
@@ -578,7 +578,7 @@ def _degenerate(e: FitEvidence) -> Finding | None:
             f"no multipliers{gap};"
         )
         remedy = "state them so that their gradients differ."
-    return Finding(Status.degenerate, cause, remedy, found.slopeless or found.names)
+    return Finding(Status.degenerate, cause, remedy, found.flat or found.names)
 
 
 def _saddle(e: FitEvidence) -> Finding | None:
