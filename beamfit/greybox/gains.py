@@ -36,7 +36,7 @@ def _restricted(m: Map, x: jax.Array, variables: tuple[str, ...]):
 
 
 def sensitivities(m: Map, x: jax.Array, variables: Sequence[str] | None = None) -> jax.Array:
-    """Compute derivatives of all outputs by chosen variables, with a forward sweep for each variable.
+    """Compute derivatives of all outputs by chosen variables, one forward sweep per variable.
 
     Parameters
     ----------
@@ -89,7 +89,7 @@ def adjoints(
     functions: Sequence[str] | None = None,
     variables: Sequence[str] | None = None,
 ) -> jax.Array:
-    """Compute derivatives of chosen outputs by the variables, with a backward sweep for each output.
+    """Compute derivatives of chosen outputs by the variables, one backward sweep per output.
 
     Parameters
     ----------
