@@ -1,4 +1,4 @@
-"""A mapping as a JAX function of its inputs, its outputs at given inputs, and their derivatives."""
+"""Compiled mappings: outputs as JAX functions of inputs, and their derivatives."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ from beamfit.language.steps import Arrays, called, defaults, scanned
 class Program:
     """A mapping that can be computed.
 
-    `constants` are tables, their columns first, and parameters; they are arguments, so that code
-    does not hang on them: programs of one order are equal, whatever is in their tables.
+    Tables and parameters are arguments of the compiled code (`constants`), so that programs with
+    the same order are equal, whatever their tables contain, and share the code.
     """
 
     order: Order
@@ -49,8 +49,8 @@ class Program:
 
     @cached_property
     def constants(self) -> Arrays:
-        """Tables, and parameters with dimensions."""
-        # Columns are read one by one: each lies in one piece of memory.
+        """Transposed tables, and parameters with dimensions."""
+        # Transposed, so that each column is contiguous: formulas read one column after the other.
         tables = {name: np.asarray(table, float) for name, table in self.tables.items()}
         found = {name: np.ascontiguousarray(table.T) for name, table in tables.items()}
         for a in self.scope.arrays.values():
@@ -66,11 +66,11 @@ class Program:
         Parameters
         ----------
         inputs : mapping of str to array
-            By name; those that the document gives values to may be left out.
+            Inputs by name; those with values in the document may be omitted.
         names : iterable of str
-            What to compute.
+            Names to compute.
         constants : dict, optional
-            `constants`, as an argument of compiled code.
+            Replaces `constants`, as a traced argument of compiled code.
 
         Returns
         -------
@@ -93,7 +93,7 @@ class Program:
         formulas: Iterable[tuple[x.Expression, tuple[x.Iterator, ...]]],
         constants: Arrays | None = None,
     ) -> list[jax.Array]:
-        """Compute formulas in the names of the mapping, with an axis for each iterator."""
+        """Compute formulas of the mapping's names, with an axis for each iterator."""
         pairs = [(e, widened(self.scope, {}, each)) for e, each in formulas]
         names = {read.array.name for e, axes in pairs for read in reads(self.scope, e, axes)}
         arrays = self._arrays(inputs, names & set(self.order.owners), constants)
@@ -106,7 +106,7 @@ class Program:
         return found
 
     def begin(self, inputs: Mapping[str, jax.Array], constants: Arrays | None = None) -> Arrays:
-        """All arrays before the first step: what is given, and zeros where steps set something."""
+        """Return all arrays before the first step: given values, and zeros for computed ones."""
         given = defaults(self.scope) | {n: jnp.asarray(v, float) for n, v in inputs.items()}
         constants = self.constants if constants is None else constants
         arrays = {n: jnp.asarray(v) for n, v in constants.items()} | given
@@ -114,14 +114,14 @@ class Program:
         return arrays | {n: jnp.zeros(self.scope.arrays[n].shape) for n in self.order.owners}
 
     def _arrays(self, inputs, names: Iterable[str], constants: Arrays | None) -> Arrays:
-        """All arrays, of which those that some names hang on are computed."""
+        """Return all arrays after computing those on which some names depend."""
         arrays = self.begin(inputs, constants)
         for group in self.order.needed(names):
             arrays |= carry_out(self.order, group, arrays)
         return arrays
 
     def as_map(self, outputs: Iterable[str] | None = None) -> Formula:
-        """Elements of the inputs to elements of outputs, as a map with sensitivities and gains.
+        """Make a map from elements of the inputs to elements of outputs, for sensitivities and gains.
 
         Examples
         --------
@@ -146,7 +146,7 @@ class Program:
 
 
 def compile_mapping(mapping: d.Mapping, tables: Mapping[str, np.ndarray] | None = None) -> Program:
-    """Compile a mapping: check names, indices and order, then trace every formula once.
+    """Compile a mapping: check names, indices and order, then trace all formulas once.
 
     Parameters
     ----------
@@ -162,7 +162,7 @@ def compile_mapping(mapping: d.Mapping, tables: Mapping[str, np.ndarray] | None 
     Raises
     ------
     InputError
-        With its place in the document, whatever is wrong with it.
+        With its place in the document, for any error in it.
     """
     tables = tables or {}
     missing = [t for t in mapping.tables if t.name not in tables]
@@ -176,7 +176,7 @@ def compile_mapping(mapping: d.Mapping, tables: Mapping[str, np.ndarray] | None 
 
 @lru_cache(maxsize=64)
 def _traced(program: Program) -> None:
-    """Trace every formula, which finds what is wrong with its shapes."""
+    """Trace all formulas, which finds errors in their shapes."""
     shapes = {n: jax.ShapeDtypeStruct(a.shape, float) for n, a in program.scope.inputs.items()}
     jax.eval_shape(lambda given: program(given, list(program.order.owners)), shapes)
 
@@ -185,7 +185,7 @@ def _traced(program: Program) -> None:
 
 
 def carry_out(order: Order, group: StepGroup, arrays: Arrays) -> Arrays:
-    """Compute the steps of a group, and give the arrays they change."""
+    """Compute the steps of a group, and return the arrays they change."""
     if group.plan is not None:
         return scanned(order.scope, group.plan, arrays, partial(_assigned, order))
     (step,) = group.steps
@@ -193,7 +193,7 @@ def carry_out(order: Order, group: StepGroup, arrays: Arrays) -> Arrays:
 
 
 def _assigned(order: Order, step: MappingStep, s: Setting) -> Arrays:
-    """The arrays that a step changes."""
+    """Compute a step, and return the arrays it changes."""
     if isinstance(step.what, d.Call):
         return called(step.what, s, lambda label: Program(order.inner[label], {}))
     target, e = step.what.target, step.what.value
@@ -209,16 +209,16 @@ GAIN = re.compile(r"\s*d(\w+)\s*/\s*d(\w+)\s*")
 @answer
 @dataclass(frozen=True, eq=False)
 class Computed:
-    """Outputs of a mapping without an objective, and the gains that were asked for.
+    """Outputs of a mapping without an objective, and requested gains.
 
     Parameters
     ----------
     name : str
-        Of the mapping.
+        Name of the mapping.
     scope : Scope
         Its names and indices.
     outputs, gains : mapping of str to array
-        Values by output; derivatives by their names, such as ``dy/dx``, the axes of the output
+        Values by output; derivatives by names such as ``dy/dx``, with the axes of the output
         before those of the input.
     """
 
@@ -228,13 +228,13 @@ class Computed:
     gains: Mapping[str, np.ndarray]
 
     def tables(self) -> list[Table]:
-        """Every element of outputs and gains, as far as a terminal shows them."""
+        """List the elements of outputs and gains, up to the largest number of rows."""
         arrays = [(self.scope.outputs[n], v) for n, v in self.outputs.items()]
         rows = [[a.element(i), f"{v:.8g}"] for a, values in arrays for i, v in _each(values)]
         return [limited(["output", "value"], rows), *gain_tables(self.scope, self.gains)]
 
     def to_json(self) -> dict[str, Any]:
-        """The result of the JSON contract."""
+        """Return the result of the JSON contract."""
         return {"name": self.name, "outputs": self.outputs, "gains": self.gains}
 
 
@@ -243,14 +243,14 @@ def _each(values: np.ndarray) -> Iterable[tuple[int, float]]:
 
 
 def limited(header: Sequence[str], rows: list[list[str]]) -> Table:
-    """A table with no more rows than a terminal shows."""
+    """Make a table with at most `MOST_ROWS` rows."""
     more, rest = len(rows) - MOST_ROWS, [""] * (len(header) - 1)
     rows = rows[:MOST_ROWS] + [[f"... and {more} more", *rest]] * (more > 0)
     return Table("", header, rows, numeric=True)
 
 
 def gain_tables(scope: Scope, gains: Mapping[str, np.ndarray]) -> list[Table]:
-    """Every element of derivatives in a table, none if none were asked for."""
+    """Make a table of all elements of derivatives; none without derivatives."""
     rows = []
     for name, values in gains.items():
         output, by = parts_of(name)
@@ -262,12 +262,12 @@ def gain_tables(scope: Scope, gains: Mapping[str, np.ndarray]) -> list[Table]:
 
 
 def parts_of(gain: str) -> tuple[str, str]:
-    """Output and input of a derivative written ``dy/dx``.
+    """Split a derivative written ``dy/dx`` into output and input.
 
     Raises
     ------
     InputError
-        If it is not written so.
+        If it has another form.
 
     Examples
     --------
@@ -281,12 +281,12 @@ def parts_of(gain: str) -> tuple[str, str]:
 
 
 def values_of(scope: Scope, given: Mapping[str, Sequence[float]]) -> dict[str, np.ndarray]:
-    """Arrays of inputs from one number each, or as many as it has elements, in C order.
+    """Make arrays of inputs from one number each, or one for each element in C order.
 
     Raises
     ------
     InputError
-        If a name is no input of the mapping, or the count is another one.
+        If a name is not an input of the mapping, or the count is wrong.
     """
     found = {}
     for name, numbers in given.items():
@@ -316,7 +316,7 @@ def _gain(program: Program, output: str, by: str, given, constants) -> jax.Array
 
 
 def outputs_at(program: Program, given: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    """All outputs at values of the inputs, compiled once for each document."""
+    """Compute all outputs at values of the inputs, compiled once for each document."""
     names = tuple(program.scope.outputs)
     found = _outputs(program, names, dict(given), program.constants)
     return dict(zip(names, map(np.asarray, found), strict=True))
@@ -325,12 +325,12 @@ def outputs_at(program: Program, given: Mapping[str, Any]) -> dict[str, np.ndarr
 def gains_at(
     program: Program, given: Mapping[str, Any], gains: Iterable[str]
 ) -> dict[str, np.ndarray]:
-    """Derivatives of outputs by inputs, written ``dy/dx``.
+    """Compute derivatives of outputs by inputs, written ``dy/dx``.
 
     Raises
     ------
     InputError
-        If one is not written so, or asks for what the mapping has not.
+        If one has another form, or a name that the mapping does not have.
     """
     found, scope = {}, program.scope
     for gain in gains:
@@ -356,11 +356,11 @@ def compute_document(
     Parameters
     ----------
     document : Document
-        Its mapping is computed.
+        The document of the mapping.
     tables : mapping of str to array, optional
         Its data tables by name.
     values : mapping of str to sequence of float, optional
-        Values of inputs in the place of the document's: one number, or all in C order.
+        Values of inputs that replace the document's: one number, or all in C order.
     gains : iterable of str, optional
         Derivatives to compute, written ``dy/dx``.
 
@@ -371,7 +371,7 @@ def compute_document(
     Raises
     ------
     InputError
-        With its place in the document, whatever is wrong with it; also if an input has no value.
+        With its place in the document, for any error in it, or an input without a value.
 
     Examples
     --------

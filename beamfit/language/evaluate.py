@@ -1,7 +1,7 @@
-"""Expressions to JAX over whole index sets: one array operation for all elements at once.
+"""Evaluation of expressions with JAX, for all elements of index sets at once.
 
-A value is an array with one axis for each iterator in force (of length 1 where it does not change
-with it), then its own dimensions. Broadcasting does the rest; a sum is a reduction over its axes.
+A value is an array with one axis for each active iterator, of length 1 if the value does not depend
+on it, followed by the dimensions of the value. Operations broadcast; a sum reduces its axes.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from beamfit.language.scope import (
 
 
 class Value(NamedTuple):
-    """An array: axes of iterators, then `rank` dimensions of its own."""
+    """An array with axes of iterators, then `rank` dimensions of the value."""
 
     array: jax.Array
     rank: int = 0
@@ -42,7 +42,8 @@ class Value(NamedTuple):
 class Setting:
     """Context in which an expression is evaluated.
 
-    `known` holds values of nodes computed elsewhere, by identity; `watch` is told every value.
+    `known` has values of nodes that are computed already, by identity. `watch` is called with each
+    value that is computed.
     """
 
     scope: Scope
@@ -53,10 +54,10 @@ class Setting:
     watch: Callable[[x.Expression, Value, Axes], None] | None = None
 
 
-# Built-in functions of elements that JAX's numpy does not have under their names.
+# Built-in functions that `jax.numpy` does not have under their names.
 OTHERS = {"erf": jax.scipy.special.erf, "sigmoid": jax.nn.sigmoid}
 MATRIX: dict[str, tuple[int, int, Callable]] = {
-    # rank of the argument, of the result
+    # ranks of the argument and of the result, and the function
     "transpose": (2, 2, lambda m: jnp.swapaxes(m, -1, -2)),
     "inverse": (2, 2, jnp.linalg.inv),
     "det": (2, 0, jnp.linalg.det),
@@ -67,7 +68,7 @@ OPERATORS = {"+": add, "-": sub, "*": mul, "/": truediv, "^": pow}
 
 
 def evaluate(e: x.Expression, s: Setting) -> Value:
-    """Compute an expression for all combinations of the iterators in force."""
+    """Compute an expression for all combinations of the active iterators."""
     found = s.known.get(id(e))
     if found is not None:
         return lifted(found, len(s.axes))
@@ -93,20 +94,20 @@ def evaluate(e: x.Expression, s: Setting) -> Value:
 
 
 def lifted(v: Value, axes: int) -> Value:
-    """A value of outer iterators, for as many iterators as are in force further in."""
+    """Add axes of length 1 for inner iterators to a value."""
     outer = v.array.ndim - v.rank
     shape = v.array.shape
     return Value(v.array.reshape(*shape[:outer], *[1] * (axes - outer), *shape[outer:]), v.rank)
 
 
 def _power(v: Value, power: float) -> Value:
-    # A whole power has derivatives everywhere, and needs no logarithm.
+    # An integer power has derivatives everywhere and needs no logarithm.
     whole = power == int(power) and abs(power) <= 64
     return Value(v.array ** (int(power) if whole else power), v.rank)
 
 
 def _spread(values: list[Value], e: x.Expression) -> tuple[list[jax.Array], int]:
-    """Arrays of one rank: numbers spread over the dimensions of the others."""
+    """Give values the same rank: numbers are broadcast over the dimensions of the others."""
     rank = max(v.rank for v in values)
     for v in values:
         if v.rank not in (0, rank):
@@ -128,7 +129,7 @@ def _operated(e: x.Expression, symbol: str, parts: list[Value]) -> Value:
 
 
 def _product(e: x.Expression, a: Value, b: Value) -> Value:
-    """A product of matrices and vectors."""
+    """Multiply matrices and vectors."""
     if not (1 <= a.rank <= 2 and 1 <= b.rank <= 2):
         raise error_at(e.at, f"'{e}' of {a.rank} and {b.rank} dimensions", "vectors or matrices")
     inner = a.array.shape[-1], b.array.shape[-1 if b.rank == 1 else -2]
@@ -149,7 +150,7 @@ def _applied(e: x.Application, s: Setting) -> Value:
     values = [evaluate(argument, s) for argument in e.arguments]
     function = s.scope.functions.get(e.function)
     if function is not None:
-        # The body sees its arguments; iterators of the caller keep their axes, not their names.
+        # The body knows only its arguments: iterators of the caller keep their axes under hidden names.
         hidden = {f"{name}{HIDDEN}": one for name, one in s.axes.items()}
         bound = dict(zip(function.arguments, values, strict=True))
         return evaluate(function.body, replace(s, axes=hidden, bound=bound))
@@ -185,7 +186,7 @@ def _reduced(e: x.Reduction, s: Setting) -> Value:
     axes = widened(s.scope, s.axes, e.iterators)
     body = evaluate(e.body, replace(s, axes=axes))
     over = tuple(range(len(s.axes), len(axes)))
-    # What does not change with an iterator has one element along it and counts for all.
+    # A body that does not depend on an iterator has one element along it, which counts for all.
     lengths = [len(one) for one in list(axes.values())[len(s.axes) :]]
     same = np.prod([n for n, i in zip(lengths, over, strict=True) if body.array.shape[i] == 1])
     found = getattr(jnp, e.kind)(body.array, axis=over)
@@ -214,14 +215,14 @@ def _named(e: x.Name, s: Setting) -> Value:
 
 
 class _View(NamedTuple):
-    """Indices as slices: what to take of each dimension, and the axis that each kept one is."""
+    """Indices as slices of each dimension, and the result's axis of each dimension that remains."""
 
     slices: tuple[int | slice, ...]
     axes: list[int]
 
 
 def _view(indices: list[np.ndarray]) -> _View | None:
-    """Indices as slices, if each runs evenly along an axis of its own; None otherwise."""
+    """Convert indices to slices if each varies evenly along an axis of its own, else None."""
     slices: list[int | slice] = []
     axes: list[int] = []
     for index in indices:
@@ -241,7 +242,7 @@ def _view(indices: list[np.ndarray]) -> _View | None:
 
 
 def picked(array: jax.Array, indices: list[np.ndarray], rank: int) -> jax.Array:
-    """Elements of an array by an index for each dimension, each of the same number of axes."""
+    """Take elements of an array by an index for each dimension, all of the same rank."""
     if not indices:
         return jnp.reshape(array, (1,) * rank)
     view = _view(indices)
@@ -256,16 +257,16 @@ def picked(array: jax.Array, indices: list[np.ndarray], rank: int) -> jax.Array:
 
 
 def _placed(array: jax.Array, indices: list[np.ndarray], value: jax.Array, lengths: list[int]):
-    """The array with elements set, by an index for each dimension as in `picked`.
+    """Set elements of an array by an index for each dimension, as in `picked`.
 
-    `value` has the axes of the indices, of length 1 where it is the same along one of `lengths`.
+    `value` has the axes of the indices, with `lengths`, or length 1 where it is constant.
     """
     if not indices:
         return jnp.reshape(value, ())
     view = _view(indices)
     if view is None:
         return array.at[tuple(indices)].set(jnp.broadcast_to(value, lengths))
-    # Axes along which no index runs have one element.
+    # Axes along which no index varies have one element.
     shape = [n if k in view.axes else 1 for k, n in enumerate(lengths)]
     value = jnp.broadcast_to(value, shape).reshape([shape[k] for k in sorted(view.axes)])
     value = jnp.transpose(value, np.argsort(np.argsort(view.axes)))
@@ -275,7 +276,7 @@ def _placed(array: jax.Array, indices: list[np.ndarray], value: jax.Array, lengt
 
 
 def check_rank(scope: Scope, target: x.Name, array: Array, value: Value, e: x.Expression) -> None:
-    """Refuse a value of other dimensions than its target, and name what brings them in."""
+    """Raise an error for a value with other dimensions than its target, naming their origin."""
     wanted = len(whole_of(target, array))
     if value.rank in (0, wanted):
         return
@@ -307,7 +308,7 @@ def _is_whole(scope: Scope, node: x.Name) -> bool:
 def stored(
     old: jax.Array, scope: Scope, array: Array, target: x.Name, axes: Axes, value: Value, e
 ) -> jax.Array:
-    """An array with a value, that of the expression e, where a target says."""
+    """Assign the value of expression e to the elements of an array that a target names."""
     indices = located(scope, target, array, axes)
     whole = whole_of(target, array)
     lengths = [*map(len, axes.values()), *map(len, whole)]

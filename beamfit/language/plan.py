@@ -1,6 +1,7 @@
-"""Order in which the steps of a mapping are computed, from the elements each defines and needs.
+"""Order of computation of a mapping's steps, from the elements that each defines and needs.
 
-Statements that need their own earlier values advance together along an index.
+Statements that need earlier values of themselves are computed together, step by step along an
+index called time (a recurrence).
 """
 
 from __future__ import annotations
@@ -37,20 +38,22 @@ from beamfit.language.scope import (
 
 # Owner of an element that no statement defines.
 NOBODY = -1
-# Most names shown in the message about a loop.
+# Largest number of names in the message about a loop.
 MOST_NAMED = 8
-# Limits of a mapping: elements of all statements together, and statements.
-MOST_WORK, MOST_STEPS = 60_000_000, 5_000
-# Most combinations of time indices, one for each statement of a loop, that are tried; and
-# statements from which its cycle is sought.
+# Largest number of elements of all statements of a mapping: about a minute of checks.
+MOST_WORK = 60_000_000
+# Largest number of statements of a mapping.
+MOST_STEPS = 5_000
+# Largest number of combinations of time indices that are tried for the statements of a recurrence,
+# and of statements from which the cycle of a loop is sought.
 MOST_TRIED = 64
 
 
-# ---- what steps write, read and call
+# ---- arrays that steps write and read, mappings that they call
 
 
 def callee_of(scope: Scope, call: d.Call) -> Scope | Net:
-    """Find what a call calls, and check the names on both sides."""
+    """Find the mapping or network of a call, and check the names of its inputs and outputs."""
     callee = scope.callees.get(call.mapping)
     if callee is None:
         known = nearest(call.mapping, list(scope.callees))
@@ -77,7 +80,7 @@ def callee_of(scope: Scope, call: d.Call) -> Scope | Net:
 def gains_of(
     wire: d.Assignment, callee: Scope | Net, label: str
 ) -> tuple[x.Name, tuple[x.Name, ...]]:
-    """The output behind a wire, and the inputs by which it is differentiated: `gain(y, x)`."""
+    """Return the output of a call's wire, and the inputs of its derivative `gain(y, x)`."""
     names = (wire.value,)
     if isinstance(wire.value, x.Application) and wire.value.function == "gain":
         names = wire.value.arguments
@@ -94,21 +97,21 @@ def gains_of(
 
 
 def targets(scope: Scope, step: MappingStep) -> list[tuple[x.Name, Axes]]:
-    """Names that a step writes, with the iterators in force there."""
+    """Return the names that a step writes, with the iterators active there."""
     if isinstance(step.what, d.Assignment):
         return [(step.what.target, step.axes)]
     return [(w.target, widened(scope, step.axes, w.each)) for w in step.what.outputs]
 
 
 def sources(scope: Scope, step: MappingStep) -> list[tuple[x.Expression, Axes]]:
-    """Expressions that a step reads, with the iterators in force there."""
+    """Return the expressions that a step reads, with the iterators active there."""
     if isinstance(step.what, d.Assignment):
         return [(step.what.value, step.axes)]
     return [(w.value, widened(scope, step.axes, w.each)) for w in step.what.inputs]
 
 
 def written(scope: Scope, node: x.Name, axes: Axes) -> Read:
-    """The elements a target writes; it must be an output or a local variable."""
+    """Find the elements that a target writes; it must be an output or a local variable."""
     found = scope.arrays.get(node.name)
     if found is None or found.role not in ("output", "real"):
         free = [a.name for a in scope.arrays.values() if a.role in ("output", "real")]
@@ -119,18 +122,18 @@ def written(scope: Scope, node: x.Name, axes: Axes) -> Read:
     return Read(found, node, axes, located(scope, node, found, axes))
 
 
-# ---- statements that need their own earlier values
+# ---- recurrences: statements that need earlier values of themselves
 
 
 class Written(NamedTuple):
-    """Dimension along which an array advances, and its first index there."""
+    """Time dimension of an array, and the first position that is computed in it."""
 
     dim: int
     start: int
 
 
 class Lagged(NamedTuple):
-    """A read of what the group itself computes: how many steps back, and which element there."""
+    """A read of an array of the recurrence itself: time lag, and positions in the other dimensions."""
 
     name: str
     lag: np.ndarray
@@ -139,9 +142,9 @@ class Lagged(NamedTuple):
 
 
 class RecurrencePlan(NamedTuple):
-    """Steps in their order at one time, their time iterators, and what each reads of the past.
+    """Plan of a recurrence: steps in their order at one time, their time iterators and reads.
 
-    `reads` are by identity of the node, `depth` is the longest way back.
+    `reads` has the lagged reads by the identity of their nodes, `depth` is the largest lag.
     """
 
     steps: tuple[MappingStep, ...]
@@ -155,7 +158,7 @@ class RecurrencePlan(NamedTuple):
 def plan_of(
     scope: Scope, steps: tuple[MappingStep, ...], owners: dict[str, np.ndarray]
 ) -> RecurrencePlan | None:
-    """Find how steps that need one another advance in time; None if they form a true loop."""
+    """Plan steps that need one another as a recurrence; None if they form an algebraic loop."""
     choices = [list(_advances(scope, step)) for step in steps]
     for chosen in islice(product(*choices), MOST_TRIED):
         plan = _planned(scope, steps, owners, chosen)
@@ -165,7 +168,7 @@ def plan_of(
 
 
 def _advances(scope: Scope, step: MappingStep) -> Iterator[tuple[str, dict[str, Written], int]]:
-    """The iterators along which all that a step writes advances by one."""
+    """Yield the iterators along which all arrays that a step writes advance by one."""
     for k, (axis, over) in enumerate(step.axes.items()):
         found: dict[str, Written] = {}
         for node, axes in targets(scope, step):
@@ -185,7 +188,7 @@ def _advances(scope: Scope, step: MappingStep) -> Iterator[tuple[str, dict[str, 
 
 
 def _planned(scope, steps, owners, chosen) -> RecurrencePlan | None:
-    """The plan for one choice of time iterators, if every read lies at this time or before."""
+    """Make the plan for one choice of time iterators; None if a read lies in the future."""
     if len({n for _, _, n in chosen}) > 1:
         return None
     written: dict[str, Written] = {}
@@ -221,7 +224,7 @@ def _planned(scope, steps, owners, chosen) -> RecurrencePlan | None:
 
 
 def _lag(read: Read, written: Written | None, k: int, length: int) -> Lagged | None:
-    """Lag of a read along the time axis k; None if it changes or is negative."""
+    """Find the lag of a read along the time axis k; None if it is not constant or negative."""
     if written is None:
         return None
     rank = read.indices[0].ndim
@@ -239,7 +242,7 @@ def _lag(read: Read, written: Written | None, k: int, length: int) -> Lagged | N
 
 
 class StepGroup(NamedTuple):
-    """Steps that are computed together; those with a plan need their own earlier values."""
+    """Steps that are computed together; a plan if they are a recurrence."""
 
     steps: tuple[MappingStep, ...]
     plan: RecurrencePlan | None
@@ -249,9 +252,9 @@ class StepGroup(NamedTuple):
 class Order:
     """Steps of a mapping in an order of computation.
 
-    `owners` tells for each element of an array which step defines it, `needs` the steps before each
-    step, `given` the inputs, parameters and tables that each reads; `inner` are the orders of the
-    mappings it calls.
+    `owners` has the number of the step that defines each element of an array. For each step,
+    `needs` has the steps it depends on, and `given` the inputs, parameters and tables it reads.
+    `inner` has the orders of the inner mappings.
     """
 
     scope: Scope
@@ -263,12 +266,12 @@ class Order:
 
     @cached_property
     def setters(self) -> dict[str, list[int]]:
-        """The steps that set each array."""
+        """Steps that set elements of each array."""
         found = {name: owner[owner != NOBODY] for name, owner in self.owners.items()}
         return {name: np.flatnonzero(np.bincount(owner)).tolist() for name, owner in found.items()}
 
     def closure(self, names: Iterable[str]) -> tuple[set[int], set[str]]:
-        """The steps, and the names given, that some names hang on."""
+        """Return all steps and given names on which some names depend."""
         todo = {n for name in names for n in self.setters.get(name, ())}
         found: set[int] = set()
         while todo := todo - found:
@@ -278,13 +281,13 @@ class Order:
         return found, direct.union(*(self.given[n] for n in found))
 
     def needed(self, names: Iterable[str]) -> Iterator[StepGroup]:
-        """Groups that some names hang on, each after what it needs."""
+        """Yield the groups on which some names depend, in the order of computation."""
         wanted, _ = self.closure(names)
         return (g for g in self.groups if not wanted.isdisjoint(step.number for step in g.steps))
 
 
 def order_of(scope: Scope) -> Order:
-    """Sort the steps of a mapping and of all mappings in it.
+    """Sort the steps of a mapping and of its inner mappings.
 
     Parameters
     ----------
@@ -298,8 +301,8 @@ def order_of(scope: Scope) -> Order:
     Raises
     ------
     InputError
-        With its place: a name that is unknown, an element that is defined twice or never, an index
-        outside, an algebraic loop with its cycle.
+        With its place: an unknown name, an element that is defined twice or never, an index
+        outside its set, an algebraic loop with its cycle.
     """
     inner = {name: order_of(c) for name, c in scope.callees.items() if isinstance(c, Scope)}
     owners: dict[str, np.ndarray] = {}
@@ -325,7 +328,7 @@ def order_of(scope: Scope) -> Order:
 
 
 def _check_work(scope: Scope) -> None:
-    """Refuse more than any computer would go through in a minute."""
+    """Raise an error for a mapping that is too large."""
     total = sum(a.size for a in scope.arrays.values())
     for step in scope.steps:
         combined = int(np.prod([len(s) for s in step.axes.values()], dtype=np.int64))
@@ -350,7 +353,7 @@ def _group(scope, numbers: list[int], needs, owners) -> StepGroup:
 
 
 def _own(scope: Scope, owners: dict[str, np.ndarray], step: MappingStep, write: Read) -> None:
-    """Note which elements a step defines."""
+    """Record the elements that a step defines."""
     array, node = write.array, write.node
     owner = owners.setdefault(array.name, np.full(max(array.size, 1), NOBODY))
     shape = [len(s) for s in write.axes.values()]
@@ -378,7 +381,7 @@ def _names(e: x.Expression) -> set[str]:
 
 
 def _owners_of(owners: dict[str, np.ndarray], read: Read) -> np.ndarray:
-    """The steps that define what is read there."""
+    """Find the steps that define the elements of a read."""
     owner = owners.get(read.array.name)
     if owner is None:
         found = f"'{read.array.name}' is used, and no statement sets it"
@@ -402,7 +405,7 @@ def _check_defined(array: Array, owners: dict[str, np.ndarray]) -> None:
 
 
 def _check_wires(scope: Scope, step: MappingStep, call: d.Call) -> None:
-    """Check indices on the side of what is called, and that each input is given whole."""
+    """Check the indices of the called mapping's arrays, and that all its inputs are given."""
     callee = callee_of(scope, call)
     given: dict[str, np.ndarray] = {}
     for wire in call.inputs:
@@ -431,7 +434,7 @@ def _check_wires(scope: Scope, step: MappingStep, call: d.Call) -> None:
 
 
 def _components(needs: dict[int, set[int]]) -> list[list[int]]:
-    """Steps that need one another, each by itself where none does; needed ones first."""
+    """Group steps that depend on one another; the groups are in the order of computation."""
     pairs = [(a, b) for a, before in needs.items() for b in before]
     ends = np.array(pairs, int).reshape(-1, 2).T
     graph = csr_matrix((np.ones(len(pairs)), ends), shape=(len(needs), len(needs)))
@@ -446,7 +449,7 @@ def _components(needs: dict[int, set[int]]) -> list[list[int]]:
 
 
 def _loop(scope: Scope, steps: tuple[MappingStep, ...], needs, owners) -> InputError:
-    """An algebraic loop, with the names along a cycle that no time takes apart."""
+    """Make the error for an algebraic loop, with the names along a cycle that is no recurrence."""
     members = {s.number for s in steps}
     cycles = (_cycle(n, needs, members) for n in sorted(members)[:MOST_TRIED])
     found = sorted((c for c in cycles if c), key=len)
@@ -464,7 +467,7 @@ def _few(words: list[str]) -> list[str]:
 
 
 def _cycle(start: int, needs: dict[int, set[int]], members: set[int]) -> list[int]:
-    """The shortest way from a step to itself, what is needed first; empty if there is none."""
+    """Find the shortest cycle from a step to itself, in the order of need; empty if none."""
     came: dict[int, int | None] = {start: None}
     todo = [start]
     for at in todo:
@@ -483,7 +486,7 @@ def _cycle(start: int, needs: dict[int, set[int]], members: set[int]) -> list[in
 
 
 class _Same(NamedTuple):
-    """A mapping as itself: an equal one may stand at other lines."""
+    """A mapping compared by identity: an equal one may have other line numbers."""
 
     mapping: d.Mapping
 
@@ -495,9 +498,10 @@ class _Same(NamedTuple):
 
 
 def checked(mapping: d.Mapping, shapes=None) -> Order:
-    """Names, indices and order of a mapping, checked without computing anything.
+    """Check a mapping and return its order, without computing anything.
 
-    Kept for the mappings seen last: what is compiled for one order serves when it is solved again.
+    Results of the last mappings are cached, so that compiled code is reused when a document is
+    solved again.
     """
     return _ordered(_Same(mapping), tuple(sorted((shapes or {}).items())))
 
@@ -519,9 +523,9 @@ def check_document(
     document : Document
         From a file.
     shapes : mapping of str to (int, int), optional
-        Rows and columns of its tables, where they have been read.
+        Rows and columns of its tables, if these have been read.
     given : iterable of str, optional
-        Inputs whose values come from elsewhere.
+        Inputs whose values do not come from the document.
 
     Raises
     ------

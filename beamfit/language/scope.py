@@ -1,7 +1,7 @@
-"""Scope of a mapping: the sets, arrays, functions and mappings it declares; and its steps.
+"""Scope of a mapping: its sets, arrays, functions, inner mappings and steps.
 
-All of it is known before anything is computed: elements of sets are whole numbers, so that every
-index is checked, and every statement's reach known, without JAX.
+Elements of sets are whole numbers. Every index is therefore checked, and the elements that each
+statement reads and writes are determined, before anything is computed and without JAX.
 """
 
 from __future__ import annotations
@@ -19,18 +19,21 @@ from beamfit.language import document as d
 from beamfit.language import expression as x
 from beamfit.language.expression import FUNCTIONS, REDUCTIONS, Place, error_at
 
-# Most elements of a set, and most combinations of indices in a statement.
-MOST_ELEMENTS, MOST_COMBINED = 2_000_000, 5_000_000
-# Most operations in one use of a function, nested functions included.
+# Limits on the size of documents, chosen so that none takes all memory or minutes of time.
+# Largest number of elements of a set.
+MOST_ELEMENTS = 2_000_000
+# Largest number of combinations of indices in a statement.
+MOST_COMBINED = 5_000_000
+# Largest number of operations in one use of a function, nested functions included.
 MOST_WORK = 20_000
-# Behind the names of iterators that a function's body does not see.
+# Suffix that hides the names of a caller's iterators from a function's body.
 HIDDEN = "'"
 CONSTANTS = {"pi": float(np.pi)}
 
 
 @dataclass(frozen=True, eq=False)
 class IndexSet:
-    """Whole numbers in order, and where each of them stands."""
+    """Ordered set of whole numbers, with a lookup of positions."""
 
     name: str
     elements: np.ndarray
@@ -43,7 +46,7 @@ class IndexSet:
         return np.argsort(self.elements, kind="stable")
 
     def positions(self, values: np.ndarray) -> np.ndarray:
-        """Positions of values in the set; -1 for values that are no elements."""
+        """Return the positions of values in the set; -1 for values that are not elements."""
         order = self._sorted
         at = np.minimum(np.searchsorted(self.elements, values, sorter=order), len(self) - 1)
         found = order[at]
@@ -55,11 +58,11 @@ class IndexSet:
 
 
 Axes = Mapping[str, IndexSet]
-"""Iterators in force, outermost first."""
+"""Sets of the active iterators by name, outermost first."""
 
 
 class Array(NamedTuple):
-    """A number or an array of a mapping."""
+    """A number or an array of a mapping, with its role (input, output, ...) and dimensions."""
 
     name: str
     role: str
@@ -79,12 +82,12 @@ class Array(NamedTuple):
 
     @property
     def said(self) -> str:
-        """Name with dimensions."""
+        """Name with dimensions, for messages."""
         inner = ", ".join(dim.name or str(len(dim)) for dim in self.dims)
         return f"{self.name}[{inner}]" if self.dims else self.name
 
     def element(self, position: int) -> str:
-        """Name with the index of an element, in C order."""
+        """Return the name with the index of an element, in C order."""
         if not self.dims:
             return self.name
         at = np.unravel_index(position, self.shape)
@@ -93,7 +96,7 @@ class Array(NamedTuple):
 
 
 class MappingStep(NamedTuple):
-    """An assignment or a call, with everything it runs over; `number` counts steps of a mapping."""
+    """An assignment or a call with its iterators; `number` is its index in the mapping."""
 
     number: int
     axes: dict[str, IndexSet]
@@ -106,7 +109,7 @@ class MappingStep(NamedTuple):
 
 
 class Read(NamedTuple):
-    """A place where an array is read or written: the node, its axes, an index a dimension."""
+    """A place where an array is read or written: node, iterators, positions in each dimension."""
 
     array: Array
     node: x.Name
@@ -123,9 +126,9 @@ class Read(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Scope:
-    """The names of one mapping.
+    """Names of one mapping.
 
-    `callees` are the scopes of mappings inside, and networks; `inputs` and `outputs` its face.
+    `callees` has the scopes of inner mappings, and networks, by name.
     """
 
     name: str
@@ -146,7 +149,7 @@ class Scope:
         return {k: a for k, a in self.arrays.items() if a.role == "output"}
 
     def constant(self, name: str) -> float | None:
-        """The value of a name that is the same for ever, or None."""
+        """Return the value of a scalar parameter or built-in constant, else None."""
         found = self.arrays.get(name)
         if found is not None and found.role == "parameter" and not found.dims:
             return found.values[0]
@@ -154,7 +157,7 @@ class Scope:
 
 
 class Net(NamedTuple):
-    """A network as it is called: its numbers and its face."""
+    """A network in a call: the network with its inputs and outputs as arrays."""
 
     mlp: Any
     inputs: dict[str, Array]
@@ -165,7 +168,7 @@ class Net(NamedTuple):
 
 
 def check_size(lengths: list[int], at: Place, most: int = MOST_COMBINED) -> None:
-    """Refuse lengths that are empty, or too long together."""
+    """Raise an error if a length is zero or their product too large."""
     total = 1
     for length in lengths:
         total *= length
@@ -175,7 +178,7 @@ def check_size(lengths: list[int], at: Place, most: int = MOST_COMBINED) -> None
 
 
 def set_of(scope: Scope, over: x.Elements, name: str = "") -> IndexSet:
-    """The elements of a set, whole numbers made of numbers and parameters."""
+    """Compute the elements of a set from its numbers and parameters."""
     ends = [int(index_of(scope, part, {})) for part in over.parts]
     if not over.ranged:
         found = np.array(ends)
@@ -191,7 +194,7 @@ def set_of(scope: Scope, over: x.Elements, name: str = "") -> IndexSet:
 
 
 def widened(scope: Scope, axes: Axes, each: tuple[x.Iterator, ...]) -> dict[str, IndexSet]:
-    """Axes with further iterators inside."""
+    """Add iterators to the active ones, as the innermost."""
     found = dict(axes)
     for it in each:
         if it.name in found:
@@ -214,7 +217,7 @@ def widened(scope: Scope, axes: Axes, each: tuple[x.Iterator, ...]) -> dict[str,
 
 
 def index_of(scope: Scope, e: x.Expression, axes: Axes) -> np.ndarray:
-    """The values of an index for all combinations of iterators, one axis each."""
+    """Compute the values of an index, with one axis for each iterator."""
     match e:
         case x.Literal():
             if e.value != int(min(e.value, 2**53)):
@@ -244,7 +247,7 @@ def _iterators(name: str, known: list[str]) -> str:
 
 
 def located(scope: Scope, node: x.Name, array: Array, axes: Axes) -> list[np.ndarray]:
-    """Positions along each dimension of an array, by iterators and then by whole dimensions."""
+    """Find positions in each dimension of an array, with axes of iterators and whole dimensions."""
     given = node.indices or (x.Whole(),) * len(array.dims)
     if len(given) != len(array.dims):
         count = len(given)
@@ -270,7 +273,7 @@ def located(scope: Scope, node: x.Name, array: Array, axes: Axes) -> list[np.nda
 
 
 def whole_of(node: x.Name, array: Array) -> list[IndexSet]:
-    """The dimensions of an array that a name takes whole."""
+    """Return the dimensions of an array that a name takes whole."""
     if not node.indices:
         return list(array.dims)
     pairs = zip(node.indices, array.dims, strict=True)
@@ -278,7 +281,7 @@ def whole_of(node: x.Name, array: Array) -> list[IndexSet]:
 
 
 def _outside(node, index, dim, axes, values, at) -> InputError:
-    """Say which index lies outside its set, and when."""
+    """Make the error for an index outside its set, with the values of the iterators."""
     first = np.argwhere(np.atleast_1d(at) < 0)[0]
     value = np.atleast_1d(values)[tuple(first)]
     said = f"index {index} = {value}" if str(index) != str(value) else f"index {value}"
@@ -287,7 +290,7 @@ def _outside(node, index, dim, axes, values, at) -> InputError:
 
 
 def said_at(axes: Axes, at: Sequence[int], lengths: Sequence[int], word: str) -> str:
-    """Values of the iterators, after a word; empty if none of them matters."""
+    """Write the values of iterators after a word; empty if none has several elements."""
     found = [
         f"{name.rstrip(HIDDEN)} = {s.elements[i]}"
         for (name, s), i, n in zip(axes.items(), at, lengths, strict=False)
@@ -296,11 +299,11 @@ def said_at(axes: Axes, at: Sequence[int], lengths: Sequence[int], word: str) ->
     return f"{word}{', '.join(found)}" if found else ""
 
 
-# ---- what an expression reads, with every name checked
+# ---- arrays that an expression reads, with all names checked
 
 
 def reads(scope: Scope, e: x.Expression, axes: Axes) -> Iterator[Read]:
-    """Walk an expression: check every name, and give every place where an array is read."""
+    """Check all names in an expression and yield every place where an array is read."""
     match e:
         case x.Name(name):
             found = scope.arrays.get(name)
@@ -347,18 +350,18 @@ def _check_arguments(scope: Scope, e: x.Application) -> None:
         raise error_at(e.at, f"{len(e.arguments)} arguments in '{e}'", wanted)
 
 
-# ---- what a mapping declares
+# ---- declarations of a mapping
 
 
 def scope_of(m: d.Mapping, shapes: Mapping[str, tuple[int, int]] | None = None) -> Scope:
-    """Give the names of a mapping their meaning.
+    """Build the scope of a mapping and check its names.
 
     Parameters
     ----------
     m : Mapping
         From a document.
     shapes : mapping of str to (int, int), optional
-        Rows and columns of its tables, where they have been read.
+        Rows and columns of its tables, if these have been read.
 
     Returns
     -------
@@ -367,8 +370,8 @@ def scope_of(m: d.Mapping, shapes: Mapping[str, tuple[int, int]] | None = None) 
     Raises
     ------
     InputError
-        With the place in the document: a name given twice, unknown or used as what it is not, a
-        set that is empty, an index outside.
+        With the place in the document: a name that is declared twice, unknown or of the wrong
+        kind, an empty set, an index outside its set.
     """
     scope = Scope(m.name)
     _declare_numbers(scope, m)
@@ -404,14 +407,14 @@ def _net(network: d.NetworkDefinition) -> Net:
 
 
 def _new(scope: Scope, name: str, at: Place) -> None:
-    """Refuse a name that means something already."""
+    """Raise an error for a name that is already declared."""
     for kind in (scope.sets, scope.arrays, scope.functions, scope.callees):
         if name in kind:
             raise error_at(at, f"'{name}' declared twice", "each name once in a mapping")
 
 
 def _declare_numbers(scope: Scope, m: d.Mapping) -> None:
-    """Parameters that are numbers come first: ranges of sets may use them."""
+    """Declare scalar parameters, which ranges of sets may use."""
     for one in m.parameters:
         if not one.dimensions:
             if one.values is None or len(one.values) != 1:
@@ -475,7 +478,7 @@ def _declare_tables(scope: Scope, m: d.Mapping, shapes: Mapping[str, tuple[int, 
 def _declare_statements(
     scope: Scope, statements: tuple[d.Statement, ...], axes: dict[str, IndexSet]
 ) -> None:
-    """Declare what statements declare, then number the steps, blocks spread out."""
+    """Declare local variables and functions, then number the steps; blocks are expanded."""
     for s in _flat(statements) if not axes else ():
         if isinstance(s, d.Real):
             _declare(scope, s, "real")
@@ -499,7 +502,7 @@ def _declare_statements(
 
 
 def _check_function(scope: Scope, f: d.Function) -> None:
-    """Check the names of a function's body, and that using it ends."""
+    """Check the names in a function's body, and that it does not call itself."""
     twice = [a for a in f.arguments if f.arguments.count(a) > 1]
     if twice:
         raise error_at(f.at, f"argument '{twice[0]}' twice", "each once")
@@ -535,7 +538,7 @@ def _work(scope: Scope, f: d.Function, stack: tuple[str, ...], seen: dict | None
 
 
 def check_problem(document: d.Document, given: Iterable[str] = ()) -> None:
-    """Refuse names that the mapping has not, bounds that contradict, and inputs without a value."""
+    """Raise an error for unknown names, contradictory bounds and inputs without a value."""
     p, m = document.problem, document.mapping
     faces = (p.variables, m.inputs, "input"), ((*p.goals, *p.limits), m.outputs, "output")
     for group, face, what in faces:

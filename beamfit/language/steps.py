@@ -1,7 +1,7 @@
-"""Steps that are more than an assignment: calls of mappings and networks, and recurrences.
+"""Steps other than assignments: calls of mappings and networks, and recurrences.
 
-Calls are wired by name and computed for all points at once, with gains. Statements with earlier
-values of themselves are one `lax.scan` over their time.
+Inputs and outputs of calls are connected by name. Calls are computed for all points at once, with
+gains. A recurrence is one `lax.scan` over its time.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ ONE = IndexSet("", np.arange(1))
 
 
 def called(statement: d.Call, s: Setting, inner: Callable[[str], Callable]) -> Arrays:
-    """The arrays that a call changes; `inner` gives a mapping inside by name as it is computed."""
+    """Compute the arrays that a call changes; `inner` returns the function of an inner mapping."""
     callee = callee_of(s.scope, statement)
     given, count = given_to(statement, callee, s), len(s.axes)
     names = [gains_of(w, callee, statement.mapping) for w in statement.outputs]
     run = partial(_network, callee) if isinstance(callee, Net) else inner(statement.mapping)
     function = _function(s, callee, run, names)
-    # All points at once: along each iterator that an input changes with.
+    # Compute all points at once, along each iterator on which an input depends.
     lead = [max((a.shape[k] for a in given.values()), default=1) for k in range(count)]
     many = [k for k, n in enumerate(lead) if n > 1]
     for k in reversed(many):
@@ -56,7 +56,7 @@ def called(statement: d.Call, s: Setting, inner: Callable[[str], Callable]) -> A
 
 
 def given_to(statement: d.Call, callee: Scope | Net, s: Setting) -> Arrays:
-    """Inputs of a call: one axis for each of its iterators, then the dimensions of the input."""
+    """Compute the inputs of a call: one axis for each iterator, then the input's dimensions."""
     given = {}
     for name, array in callee.inputs.items():
         wires = [w for w in statement.inputs if w.target.name == name]
@@ -66,7 +66,7 @@ def given_to(statement: d.Call, callee: Scope | Net, s: Setting) -> Arrays:
 
 
 def _wired(s: Setting, array: Array, wires: list[d.Assignment]) -> jax.Array:
-    """An input of what is called: one axis for each iterator of the call, then its dimensions."""
+    """Compute one input: one axis for each iterator of the call, then the input's dimensions."""
     count = len(s.axes)
     found = jnp.zeros((*[1] * count, *array.shape))
     if array.values is not None:
@@ -88,7 +88,7 @@ def _wired(s: Setting, array: Array, wires: list[d.Assignment]) -> jax.Array:
 
 
 def _output(s: Setting, v: Value, output: x.Name, callee, axes: Axes, count: int) -> Value:
-    """The elements of an output that a wire takes."""
+    """Take the elements of an output that a wire names."""
     array = callee.outputs[output.name]
     if v.rank == 0 or not output.indices:
         return lifted(v, len(axes))
@@ -103,7 +103,7 @@ def _output(s: Setting, v: Value, output: x.Name, callee, axes: Axes, count: int
 
 
 def _function(s: Setting, callee: Scope | Net, run: Callable, wanted) -> Callable:
-    """The called mapping as a function of its inputs; it returns outputs and gains in order."""
+    """Make the called mapping a function of its inputs that returns outputs and gains in order."""
     names = sorted({output.name for output, _ in wanted})
 
     def outputs(given: Arrays) -> Arrays:
@@ -121,7 +121,7 @@ def _function(s: Setting, callee: Scope | Net, run: Callable, wanted) -> Callabl
 
 
 def defaults(callee: Scope | Net) -> Arrays:
-    """Inputs that the document gives values to."""
+    """Return the inputs that have values in the document."""
     given = {n: a for n, a in callee.inputs.items() if a.values is not None}
     return {n: jnp.asarray(np.reshape(a.values, a.shape), float) for n, a in given.items()}
 
@@ -136,7 +136,7 @@ def _network(callee: Net, given: Arrays, names: list[str]) -> Arrays:
 
 
 def _gain(s: Setting, callee, outputs, given: Arrays, output: x.Name, by: tuple[x.Name, ...]):
-    """A gain of an output by inputs, one after the other, by forward derivatives."""
+    """Compute the derivative of an output by one input after the other, in forward mode."""
 
     def derivative(function, e: x.Name):
         array = callee.inputs[e.name]
@@ -159,18 +159,18 @@ def _gain(s: Setting, callee, outputs, given: Arrays, output: x.Name, by: tuple[
 
 
 def scanned(scope: Scope, plan: RecurrencePlan, arrays: Arrays, assigned) -> Arrays:
-    """Compute the arrays that the steps of a plan advance.
+    """Compute the arrays of a recurrence.
 
     Parameters
     ----------
     scope : Scope
-        The names of the mapping.
+        Names of the mapping.
     plan : RecurrencePlan
-        The steps, and how far back each reads.
+        Steps of the recurrence and their lagged reads.
     arrays : dict of str to array
-        Everything that is known before, first values of what advances included.
+        All arrays computed so far, including first values of the recurrence.
     assigned : callable
-        ``assigned(step, setting)`` gives the arrays that a step changes.
+        ``assigned(step, setting)`` returns the arrays that a step changes.
 
     Returns
     -------
@@ -208,9 +208,9 @@ def scanned(scope: Scope, plan: RecurrencePlan, arrays: Arrays, assigned) -> Arr
 
 
 def _apart(scope: Scope, plan: RecurrencePlan, arrays: Arrays):
-    """Values of all that does not hang on what advances: fixed ones, and those that run with time.
+    """Compute all parts that do not depend on the recurrence, constant or changing with time.
 
-    The latter are the axis of time, the rank, and the array with time in front.
+    The latter are returned as the axis of time, the rank, and the array with time in front.
     """
     fixed: dict[int, Value] = {}
     moving: dict[int, tuple[int, int, jax.Array]] = {}
@@ -229,7 +229,7 @@ def _apart(scope: Scope, plan: RecurrencePlan, arrays: Arrays):
 def _independent(
     scope: Scope, e: x.Expression, axes: Axes, plan: RecurrencePlan
 ) -> Iterator[tuple[x.Expression, Axes]]:
-    """The largest parts of an expression that read nothing that advances."""
+    """Yield the largest parts of an expression that do not depend on the recurrence."""
     if id(e) in plan.reads or isinstance(e, x.Literal):
         return
     if not _advancing(e, plan):
@@ -246,7 +246,7 @@ def _advancing(e: x.Expression, plan: RecurrencePlan) -> bool:
 
 
 def _history(full: jax.Array, start: int, depth: int) -> jax.Array:
-    """Values before the start, last one first; zeros, which nobody reads, before all."""
+    """Return the values before the start, the last first; missing ones are zero and never read."""
     before = full[max(start - depth, 0) : start][::-1]
     return jnp.pad(before, [(0, depth - len(before)), *[(0, 0)] * (full.ndim - 1)])
 
@@ -258,7 +258,7 @@ def _looked_up(lagged: Lagged, fresh: Arrays, history: Arrays) -> Value:
 
 
 def _without_time(scope: Scope, plan: RecurrencePlan) -> Scope:
-    """The names as they are at one time."""
+    """Make the scope at one time: arrays of the recurrence lose their time dimension."""
     small: dict[str, Array] = {}
     for name, w in plan.written.items():
         array = scope.arrays[name]
@@ -267,7 +267,7 @@ def _without_time(scope: Scope, plan: RecurrencePlan) -> Scope:
 
 
 def _timeless(step: MappingStep, plan: RecurrencePlan) -> MappingStep:
-    """A step whose targets have no index of time."""
+    """Remove the time index from the targets of a step."""
 
     def target(node: x.Name) -> x.Name:
         at = plan.written[node.name].dim

@@ -1,4 +1,4 @@
-"""Trace of a document's first formula part that is not finite, with its place."""
+"""Search for the first part of a document's formulas that is not finite, with its place."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from beamfit.language.steps import Arrays, given_to
 
 
 class _FoundError(Exception):
-    """Ends the walk at the first part that is not finite."""
+    """Raised at the first part that is not finite, to end the search."""
 
 
 def cause_of(
@@ -27,25 +27,25 @@ def cause_of(
     inside: str = "",
     slopes: bool = False,
 ) -> str | None:
-    """Say why some outputs are not finite.
+    """Explain why some outputs are not finite.
 
     Parameters
     ----------
     program : Program
         A compiled mapping.
     inputs : mapping of str to array
-        Where.
+        Values of the inputs.
     names : iterable of str
         The outputs.
     inside : str
-        What the mapping is called, where it stands in another.
+        Beginning of the message for an inner mapping.
     slopes : bool
-        Say instead where a derivative is infinite: at a root or a fractional power of zero.
+        True to search for an infinite derivative, at a root or a fractional power of zero.
 
     Returns
     -------
     str or None
-        The part of a formula, its place, the index and the numbers in it; None if all is finite.
+        The part of a formula with its place, index and numbers; None if all is finite.
 
     Examples
     --------
@@ -63,7 +63,7 @@ def cause_of(
 
 
 def _look(program: Program, inputs: Mapping, names: Iterable[str], slopes: bool) -> None:
-    """Go from group to group, and into those of which something is not finite."""
+    """Compute group after group, and search those with a value that is not finite."""
     arrays = program.begin(inputs)
     for name, value in arrays.items():
         if not np.all(np.isfinite(value)):
@@ -76,7 +76,7 @@ def _look(program: Program, inputs: Mapping, names: Iterable[str], slopes: bool)
 
 
 class _Watch:
-    """Looks at every value; keeps them, to say what went into one that is not finite."""
+    """Check every value that is computed, and keep all for the message."""
 
     def __init__(self, slopes: bool = False) -> None:
         self.seen: dict[int, Value] = {}
@@ -117,7 +117,7 @@ def _may_be_steep(e: x.Expression) -> bool:
 def _look_into(
     program: Program, group: StepGroup, arrays: Arrays, changed: Arrays, slopes: bool
 ) -> None:
-    """Compute a group part by part: in a call, or up to the first bad time."""
+    """Compute a group part by part: inside a call, or up to the first time that is not finite."""
     scope = program.scope
     for step in group.steps if group.plan is None else group.plan.steps:
         axes = step.axes
@@ -137,7 +137,7 @@ def _look_into(
 
 
 def _bad_time(plan: RecurrencePlan, changed: Arrays) -> int:
-    """The first time at which what advances is not finite; the last one if all is."""
+    """Find the first time at which a recurrence is not finite; the last if all are."""
     bad = np.zeros(plan.length, bool)
     bad[-1] = True
     for name, w in plan.written.items():
@@ -147,7 +147,7 @@ def _bad_time(plan: RecurrencePlan, changed: Arrays) -> int:
 
 
 def _look_behind(program: Program, step: MappingStep, s: Setting) -> None:
-    """Go through a called mapping point by point."""
+    """Search a called mapping, point by point."""
     callee = callee_of(s.scope, step.what)
     if not isinstance(callee, Scope):
         return
