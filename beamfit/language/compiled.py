@@ -18,11 +18,11 @@ from beamfit.errors import InputError, nearest
 from beamfit.greybox.maps import Formula
 from beamfit.language import document as d
 from beamfit.language import expression as x
-from beamfit.language.evaluate import Setting, check_rank, evaluate, stored
+from beamfit.language.evaluate import Context, assign, check_rank, evaluate
 from beamfit.language.expression import error_at
-from beamfit.language.plan import Order, StepGroup, checked
-from beamfit.language.scope import MappingStep, Scope, reads, widened
-from beamfit.language.steps import Arrays, called, defaults, scanned
+from beamfit.language.plan import Order, StepGroup, check_mapping
+from beamfit.language.scope import MappingStep, Scope, add_iterators, reads
+from beamfit.language.steps import Arrays, defaults, run_call, scan_recurrence
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,12 +94,12 @@ class Program:
         constants: Arrays | None = None,
     ) -> list[jax.Array]:
         """Compute formulas of the mapping's names, with an axis for each iterator."""
-        pairs = [(e, widened(self.scope, {}, each)) for e, each in formulas]
+        pairs = [(e, add_iterators(self.scope, {}, each)) for e, each in formulas]
         names = {read.array.name for e, axes in pairs for read in reads(self.scope, e, axes)}
         arrays = self._arrays(inputs, names & set(self.order.owners), constants)
         found = []
         for e, axes in pairs:
-            value = evaluate(e, Setting(self.scope, arrays, axes))
+            value = evaluate(e, Context(self.scope, arrays, axes))
             lengths = [len(one) for one in axes.values()]
             own = value.array.shape[len(axes) :]
             found.append(jnp.broadcast_to(value.array, (*lengths, *own)))
@@ -117,11 +117,11 @@ class Program:
         """Return all arrays after computing those on which some names depend."""
         arrays = self.begin(inputs, constants)
         for group in self.order.needed(names):
-            arrays |= carry_out(self.order, group, arrays)
+            arrays |= run_group(self.order, group, arrays)
         return arrays
 
     def as_map(self, outputs: Iterable[str] | None = None) -> Formula:
-        """Make a map from elements of the inputs to elements of outputs, for sensitivities and gains.
+        """Make a map from elements of inputs to elements of outputs, with sensitivities and gains.
 
         Examples
         --------
@@ -141,8 +141,8 @@ class Program:
             found = self(given, [a.name for a in chosen])
             return jnp.concatenate([jnp.ravel(found[a.name]) for a in chosen])
 
-        faces = ([a.element(i) for a in group for i in range(a.size)] for group in (inputs, chosen))
-        return Formula(*faces, function)
+        names = ([a.element(i) for a in group for i in range(a.size)] for group in (inputs, chosen))
+        return Formula(*names, function)
 
 
 def compile_mapping(mapping: d.Mapping, tables: Mapping[str, np.ndarray] | None = None) -> Program:
@@ -169,13 +169,13 @@ def compile_mapping(mapping: d.Mapping, tables: Mapping[str, np.ndarray] | None 
     if missing:
         raise error_at(missing[0].at, f"no data for table '{missing[0].name}'",
                        f"--data {missing[0].name}=FILE")  # fmt: skip
-    program = Program(checked(mapping, {n: np.shape(t) for n, t in tables.items()}), tables)
-    _traced(program)
+    program = Program(check_mapping(mapping, {n: np.shape(t) for n, t in tables.items()}), tables)
+    _check_shapes(program)
     return program
 
 
 @lru_cache(maxsize=64)
-def _traced(program: Program) -> None:
+def _check_shapes(program: Program) -> None:
     """Trace all formulas, which finds errors in their shapes."""
     shapes = {n: jax.ShapeDtypeStruct(a.shape, float) for n, a in program.scope.inputs.items()}
     jax.eval_shape(lambda given: program(given, list(program.order.owners)), shapes)
@@ -184,23 +184,23 @@ def _traced(program: Program) -> None:
 # ---- running
 
 
-def carry_out(order: Order, group: StepGroup, arrays: Arrays) -> Arrays:
+def run_group(order: Order, group: StepGroup, arrays: Arrays) -> Arrays:
     """Compute the steps of a group, and return the arrays they change."""
     if group.plan is not None:
-        return scanned(order.scope, group.plan, arrays, partial(_assigned, order))
+        return scan_recurrence(order.scope, group.plan, arrays, partial(_run_step, order))
     (step,) = group.steps
-    return _assigned(order, step, Setting(order.scope, arrays, step.axes))
+    return _run_step(order, step, Context(order.scope, arrays, step.axes))
 
 
-def _assigned(order: Order, step: MappingStep, s: Setting) -> Arrays:
+def _run_step(order: Order, step: MappingStep, s: Context) -> Arrays:
     """Compute a step, and return the arrays it changes."""
-    if isinstance(step.what, d.Call):
-        return called(step.what, s, lambda label: Program(order.inner[label], {}))
-    target, e = step.what.target, step.what.value
+    if isinstance(step.statement, d.Call):
+        return run_call(step.statement, s, lambda label: Program(order.inner[label], {}))
+    target, e = step.statement.target, step.statement.value
     array, old = s.scope.arrays[target.name], s.arrays[target.name]
     value = evaluate(e, s)
     check_rank(s.scope, target, array, value, e)
-    return {target.name: stored(old, s.scope, array, target, s.axes, value, e)}
+    return {target.name: assign(old, s.scope, array, target, s.axes, value, e)}
 
 
 GAIN = re.compile(r"\s*d(\w+)\s*/\s*d(\w+)\s*")
@@ -230,19 +230,19 @@ class Computed:
     def tables(self) -> list[Table]:
         """List the elements of outputs and gains, up to the largest number of rows."""
         arrays = [(self.scope.outputs[n], v) for n, v in self.outputs.items()]
-        rows = [[a.element(i), f"{v:.8g}"] for a, values in arrays for i, v in _each(values)]
-        return [limited(["output", "value"], rows), *gain_tables(self.scope, self.gains)]
+        rows = [[a.element(i), f"{v:.8g}"] for a, values in arrays for i, v in _numbered(values)]
+        return [limit_rows(["output", "value"], rows), *gain_tables(self.scope, self.gains)]
 
     def to_json(self) -> dict[str, Any]:
         """Return the result of the JSON contract."""
         return {"name": self.name, "outputs": self.outputs, "gains": self.gains}
 
 
-def _each(values: np.ndarray) -> Iterable[tuple[int, float]]:
+def _numbered(values: np.ndarray) -> Iterable[tuple[int, float]]:
     return enumerate(np.ravel(values).tolist())
 
 
-def limited(header: Sequence[str], rows: list[list[str]]) -> Table:
+def limit_rows(header: Sequence[str], rows: list[list[str]]) -> Table:
     """Make a table with at most `MOST_ROWS` rows."""
     more, rest = len(rows) - MOST_ROWS, [""] * (len(header) - 1)
     rows = rows[:MOST_ROWS] + [[f"... and {more} more", *rest]] * (more > 0)
@@ -253,15 +253,15 @@ def gain_tables(scope: Scope, gains: Mapping[str, np.ndarray]) -> list[Table]:
     """Make a table of all elements of derivatives; none without derivatives."""
     rows = []
     for name, values in gains.items():
-        output, by = parts_of(name)
+        output, by = gain_parts(name)
         y, x = scope.outputs[output], scope.inputs[by]
-        for i, v in _each(values):
+        for i, v in _numbered(values):
             at = divmod(i, x.size)
             rows.append([f"d{y.element(at[0])}/d{x.element(at[1])}", f"{v:.8g}"])
-    return [limited(["gain", "value"], rows)] if rows else []
+    return [limit_rows(["gain", "value"], rows)] if rows else []
 
 
-def parts_of(gain: str) -> tuple[str, str]:
+def gain_parts(gain: str) -> tuple[str, str]:
     """Split a derivative written ``dy/dx`` into output and input.
 
     Raises
@@ -271,7 +271,7 @@ def parts_of(gain: str) -> tuple[str, str]:
 
     Examples
     --------
-    >>> parts_of("dobj/dx1")
+    >>> gain_parts("dobj/dx1")
     ('obj', 'x1')
     """
     found = GAIN.fullmatch(gain)
@@ -295,7 +295,7 @@ def values_of(scope: Scope, given: Mapping[str, Sequence[float]]) -> dict[str, n
             raise InputError(f"--set {name}=...", expected)
         a = scope.inputs[name]
         if len(numbers) not in (1, a.size):
-            expected = f"one, or {a.size} for {a.said}"
+            expected = f"one, or {a.size} for {a.text}"
             raise InputError(f"{len(numbers)} numbers in --set {name}=...", expected)
         found[name] = np.broadcast_to(np.asarray(numbers, float), (a.size,)).reshape(a.shape)
     return found
@@ -334,7 +334,7 @@ def gains_at(
     """
     found, scope = {}, program.scope
     for gain in gains:
-        output, by = parts_of(gain)
+        output, by = gain_parts(gain)
         for name, face, what in ((output, scope.outputs, "output"), (by, scope.inputs, "input")):
             if name not in face:
                 expected = f"an {what} of the document: {nearest(name, list(face))}"
@@ -387,7 +387,7 @@ def compute_document(
         if a.values is None and a.name not in given:
             several = f", or {a.size} numbers with commas" * (a.size > 1)
             expected = f"--set {a.name}=NUMBER{several}"
-            raise error_at(a.at, f"input '{a.said}' without a value", expected)
+            raise error_at(a.at, f"input '{a.text}' without a value", expected)
     outputs = outputs_at(program, given)
     gains = gains_at(program, given, gains)
     return Computed(document.mapping.name, program.scope, outputs, gains)

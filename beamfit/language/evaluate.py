@@ -19,15 +19,15 @@ import numpy as np
 from beamfit.language import expression as x
 from beamfit.language.expression import error_at
 from beamfit.language.scope import (
-    HIDDEN,
+    HIDDEN_SUFFIX,
     Array,
     Axes,
     Scope,
+    add_iterators,
     check_size,
-    index_of,
-    located,
-    whole_of,
-    widened,
+    find_positions,
+    index_values,
+    whole_dimensions,
 )
 
 
@@ -39,23 +39,23 @@ class Value(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Setting:
+class Context:
     """Context in which an expression is evaluated.
 
-    `known` has values of nodes that are computed already, by identity. `watch` is called with each
-    value that is computed.
+    `computed` has values of nodes that are computed already, by identity. `watch` is called with
+    each further value.
     """
 
     scope: Scope
     arrays: Mapping[str, jax.Array]
     axes: Axes
     bound: Mapping[str, Value] = field(default_factory=dict)
-    known: Mapping[int, Value] = field(default_factory=dict)
+    computed: Mapping[int, Value] = field(default_factory=dict)
     watch: Callable[[x.Expression, Value, Axes], None] | None = None
 
 
 # Built-in functions that `jax.numpy` does not have under their names.
-OTHERS = {"erf": jax.scipy.special.erf, "sigmoid": jax.nn.sigmoid}
+SPECIAL_FUNCTIONS = {"erf": jax.scipy.special.erf, "sigmoid": jax.nn.sigmoid}
 MATRIX: dict[str, tuple[int, int, Callable]] = {
     # ranks of the argument and of the result, and the function
     "transpose": (2, 2, lambda m: jnp.swapaxes(m, -1, -2)),
@@ -67,33 +67,33 @@ MATRIX: dict[str, tuple[int, int, Callable]] = {
 OPERATORS = {"+": add, "-": sub, "*": mul, "/": truediv, "^": pow}
 
 
-def evaluate(e: x.Expression, s: Setting) -> Value:
+def evaluate(e: x.Expression, s: Context) -> Value:
     """Compute an expression for all combinations of the active iterators."""
-    found = s.known.get(id(e))
+    found = s.computed.get(id(e))
     if found is not None:
-        return lifted(found, len(s.axes))
+        return add_axes(found, len(s.axes))
     match e:
         case x.Literal():
             found = Value(jnp.full((1,) * len(s.axes), e.value))
         case x.Name():
-            found = _named(e, s)
+            found = _read_name(e, s)
         case x.Arithmetic(_, (one,)):
             inner = evaluate(one, s)
             found = Value(-inner.array, inner.rank)
         case x.Arithmetic("^", (base, x.Literal() as power)):
             found = _power(evaluate(base, s), power.value)
         case x.Arithmetic(symbol, parts):
-            found = _operated(e, symbol, [evaluate(part, s) for part in parts])
+            found = _operate(e, symbol, [evaluate(part, s) for part in parts])
         case x.Application():
-            found = _applied(e, s)
+            found = _apply(e, s)
         case x.Reduction():
-            found = _reduced(e, s)
+            found = _reduce(e, s)
     if s.watch is not None:
         s.watch(e, found, s.axes)
     return found
 
 
-def lifted(v: Value, axes: int) -> Value:
+def add_axes(v: Value, axes: int) -> Value:
     """Add axes of length 1 for inner iterators to a value."""
     outer = v.array.ndim - v.rank
     shape = v.array.shape
@@ -106,7 +106,7 @@ def _power(v: Value, power: float) -> Value:
     return Value(v.array ** (int(power) if whole else power), v.rank)
 
 
-def _spread(values: list[Value], e: x.Expression) -> tuple[list[jax.Array], int]:
+def _match_ranks(values: list[Value], e: x.Expression) -> tuple[list[jax.Array], int]:
     """Give values the same rank: numbers are broadcast over the dimensions of the others."""
     rank = max(v.rank for v in values)
     for v in values:
@@ -121,14 +121,14 @@ def _spread(values: list[Value], e: x.Expression) -> tuple[list[jax.Array], int]
     return arrays, rank
 
 
-def _operated(e: x.Expression, symbol: str, parts: list[Value]) -> Value:
+def _operate(e: x.Expression, symbol: str, parts: list[Value]) -> Value:
     if symbol == "@":
-        return _product(e, *parts)
-    (a, b), rank = _spread(parts, e)
+        return _multiply(e, *parts)
+    (a, b), rank = _match_ranks(parts, e)
     return Value(OPERATORS[symbol](a, b), rank)
 
 
-def _product(e: x.Expression, a: Value, b: Value) -> Value:
+def _multiply(e: x.Expression, a: Value, b: Value) -> Value:
     """Multiply matrices and vectors."""
     if not (1 <= a.rank <= 2 and 1 <= b.rank <= 2):
         raise error_at(e.at, f"'{e}' of {a.rank} and {b.rank} dimensions", "vectors or matrices")
@@ -146,28 +146,29 @@ def _product(e: x.Expression, a: Value, b: Value) -> Value:
     return Value(found, a.rank + b.rank - 2)
 
 
-def _applied(e: x.Application, s: Setting) -> Value:
+def _apply(e: x.Application, s: Context) -> Value:
     values = [evaluate(argument, s) for argument in e.arguments]
     function = s.scope.functions.get(e.function)
     if function is not None:
-        # The body knows only its arguments: iterators of the caller keep their axes under hidden names.
-        hidden = {f"{name}{HIDDEN}": one for name, one in s.axes.items()}
+        # The body knows only its arguments: the caller's iterators keep their axes, under hidden
+        # names.
+        hidden = {f"{name}{HIDDEN_SUFFIX}": one for name, one in s.axes.items()}
         bound = dict(zip(function.arguments, values, strict=True))
         return evaluate(function.body, replace(s, axes=hidden, bound=bound))
     name = e.function
     if name in MATRIX:
         return _matrix(e, *MATRIX[name], values[0])
     if name == "dot":
-        return _product(e, *values)
+        return _multiply(e, *values)
     if name in ("sum", "min", "max") and len(values) == 1:
         own = tuple(range(-values[0].rank, 0))
         return Value(getattr(jnp, name)(values[0].array, axis=own))
     if name == "pow":
-        return _operated(e, "^", values)
-    arrays, rank = _spread(values, e)
+        return _operate(e, "^", values)
+    arrays, rank = _match_ranks(values, e)
     if name in ("min", "max"):
         return Value(reduce(jnp.minimum if name == "min" else jnp.maximum, arrays), rank)
-    elementwise = OTHERS.get(name) or getattr(jnp, name)
+    elementwise = SPECIAL_FUNCTIONS.get(name) or getattr(jnp, name)
     return Value(elementwise(*arrays), rank)
 
 
@@ -182,46 +183,46 @@ def _matrix(e: x.Application, wanted: int, given: int, function: Callable, v: Va
     return Value(function(v.array), given)
 
 
-def _reduced(e: x.Reduction, s: Setting) -> Value:
-    axes = widened(s.scope, s.axes, e.iterators)
+def _reduce(e: x.Reduction, s: Context) -> Value:
+    axes = add_iterators(s.scope, s.axes, e.iterators)
     body = evaluate(e.body, replace(s, axes=axes))
     over = tuple(range(len(s.axes), len(axes)))
     # A body that does not depend on an iterator has one element along it, which counts for all.
     lengths = [len(one) for one in list(axes.values())[len(s.axes) :]]
-    same = np.prod([n for n, i in zip(lengths, over, strict=True) if body.array.shape[i] == 1])
+    repeats = np.prod([n for n, i in zip(lengths, over, strict=True) if body.array.shape[i] == 1])
     found = getattr(jnp, e.kind)(body.array, axis=over)
-    if same != 1 and e.kind in ("sum", "prod"):
-        found = found * same if e.kind == "sum" else found ** int(same)
+    if repeats != 1 and e.kind in ("sum", "prod"):
+        found = found * repeats if e.kind == "sum" else found ** int(repeats)
     return Value(found, body.rank)
 
 
 # ---- elements of arrays
 
 
-def _named(e: x.Name, s: Setting) -> Value:
+def _read_name(e: x.Name, s: Context) -> Value:
     if e.name in s.bound:
         if e.indices:
             raise error_at(e.at, f"'{e}', an index of an argument", "the argument as a whole")
-        return lifted(s.bound[e.name], len(s.axes))
+        return add_axes(s.bound[e.name], len(s.axes))
     array = s.scope.arrays.get(e.name)
     if array is None or (array.role == "parameter" and not array.dims):
         value = s.scope.constant(e.name)
         if value is None:
-            return Value(jnp.asarray(index_of(s.scope, e, s.axes), float))
+            return Value(jnp.asarray(index_values(s.scope, e, s.axes), float))
         return Value(jnp.full((1,) * len(s.axes), value))
-    indices = located(s.scope, e, array, s.axes)
+    indices = find_positions(s.scope, e, array, s.axes)
     rank = sum(isinstance(i, x.Whole) for i in e.indices) if e.indices else len(array.dims)
-    return Value(picked(s.arrays[e.name], indices, len(s.axes) + rank), rank)
+    return Value(take_elements(s.arrays[e.name], indices, len(s.axes) + rank), rank)
 
 
-class _View(NamedTuple):
+class _Slices(NamedTuple):
     """Indices as slices of each dimension, and the result's axis of each dimension that remains."""
 
     slices: tuple[int | slice, ...]
     axes: list[int]
 
 
-def _view(indices: list[np.ndarray]) -> _View | None:
+def _as_slices(indices: list[np.ndarray]) -> _Slices | None:
     """Convert indices to slices if each varies evenly along an axis of its own, else None."""
     slices: list[int | slice] = []
     axes: list[int] = []
@@ -238,14 +239,14 @@ def _view(indices: list[np.ndarray]) -> _View | None:
             return None
         slices.append(slice(int(values[0]), int(values[-1]) + 1, step))
         axes.append(along[0])
-    return _View(tuple(slices), axes)
+    return _Slices(tuple(slices), axes)
 
 
-def picked(array: jax.Array, indices: list[np.ndarray], rank: int) -> jax.Array:
+def take_elements(array: jax.Array, indices: list[np.ndarray], rank: int) -> jax.Array:
     """Take elements of an array by an index for each dimension, all of the same rank."""
     if not indices:
         return jnp.reshape(array, (1,) * rank)
-    view = _view(indices)
+    view = _as_slices(indices)
     if view is None:
         return array[tuple(indices)]
     found = array[view.slices]
@@ -256,14 +257,16 @@ def picked(array: jax.Array, indices: list[np.ndarray], rank: int) -> jax.Array:
     return found.reshape(shape)
 
 
-def _placed(array: jax.Array, indices: list[np.ndarray], value: jax.Array, lengths: list[int]):
-    """Set elements of an array by an index for each dimension, as in `picked`.
+def _set_elements(
+    array: jax.Array, indices: list[np.ndarray], value: jax.Array, lengths: list[int]
+):
+    """Set elements of an array by an index for each dimension, as in `take_elements`.
 
     `value` has the axes of the indices, with `lengths`, or length 1 where it is constant.
     """
     if not indices:
         return jnp.reshape(value, ())
-    view = _view(indices)
+    view = _as_slices(indices)
     if view is None:
         return array.at[tuple(indices)].set(jnp.broadcast_to(value, lengths))
     # Axes along which no index varies have one element.
@@ -277,7 +280,7 @@ def _placed(array: jax.Array, indices: list[np.ndarray], value: jax.Array, lengt
 
 def check_rank(scope: Scope, target: x.Name, array: Array, value: Value, e: x.Expression) -> None:
     """Raise an error for a value with other dimensions than its target, naming their origin."""
-    wanted = len(whole_of(target, array))
+    wanted = len(whole_dimensions(target, array))
     if value.rank in (0, wanted):
         return
     said = f"{value.rank} dimension{'s' * (value.rank != 1)}"
@@ -287,8 +290,8 @@ def check_rank(scope: Scope, target: x.Name, array: Array, value: Value, e: x.Ex
         raise error_at(e.at, f"'{e}' of {said}", expected)
     array = scope.arrays[whole.name]
     where = "" if whole is e else f" in a formula of {said}"
-    expected = f"a number for '{target}', such as an element of {array.said}"
-    count = len(whole_of(whole, array))
+    expected = f"a number for '{target}', such as an element of {array.text}"
+    count = len(whole_dimensions(whole, array))
     found = f"'{whole}' of {count} dimension{'s' * (count != 1)}{where}"
     raise error_at(whole.at, found, expected)
 
@@ -302,18 +305,18 @@ def _names(e: x.Expression) -> Iterator[x.Name]:
 
 
 def _is_whole(scope: Scope, node: x.Name) -> bool:
-    return node.name in scope.arrays and bool(whole_of(node, scope.arrays[node.name]))
+    return node.name in scope.arrays and bool(whole_dimensions(node, scope.arrays[node.name]))
 
 
-def stored(
+def assign(
     old: jax.Array, scope: Scope, array: Array, target: x.Name, axes: Axes, value: Value, e
 ) -> jax.Array:
     """Assign the value of expression e to the elements of an array that a target names."""
-    indices = located(scope, target, array, axes)
-    whole = whole_of(target, array)
+    indices = find_positions(scope, target, array, axes)
+    whole = whole_dimensions(target, array)
     lengths = [*map(len, axes.values()), *map(len, whole)]
     if value.rank and value.array.shape[-value.rank :] != tuple(map(len, whole)):
         size = " x ".join(map(str, value.array.shape[-value.rank :]))
-        raise error_at(e.at, f"'{e}' of {size}", f"the size of {array.said}")
+        raise error_at(e.at, f"'{e}' of {size}", f"the size of {array.text}")
     filled = value.array.reshape(*value.array.shape, *[1] * (len(whole) - value.rank))
-    return _placed(old, indices, filled, lengths)
+    return _set_elements(old, indices, filled, lengths)

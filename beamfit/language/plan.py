@@ -24,35 +24,35 @@ from beamfit.language.expression import error_at
 from beamfit.language.scope import (
     Array,
     Axes,
+    CalledNetwork,
     MappingStep,
-    Net,
     Read,
     Scope,
+    add_iterators,
     check_problem,
-    located,
+    find_positions,
     reads,
     scope_of,
-    whole_of,
-    widened,
+    whole_dimensions,
 )
 
 # Owner of an element that no statement defines.
-NOBODY = -1
+NO_OWNER = -1
 # Largest number of names in the message about a loop.
-MOST_NAMED = 8
+MAX_NAMED = 8
 # Largest number of elements of all statements of a mapping: about a minute of checks.
-MOST_WORK = 60_000_000
+MAX_TOTAL_ELEMENTS = 60_000_000
 # Largest number of statements of a mapping.
-MOST_STEPS = 5_000
+MAX_STEPS = 5_000
 # Largest number of combinations of time indices that are tried for the statements of a recurrence,
 # and of statements from which the cycle of a loop is sought.
-MOST_TRIED = 64
+MAX_TRIED = 64
 
 
 # ---- arrays that steps write and read, mappings that they call
 
 
-def callee_of(scope: Scope, call: d.Call) -> Scope | Net:
+def callee_of(scope: Scope, call: d.Call) -> Scope | CalledNetwork:
     """Find the mapping or network of a call, and check the names of its inputs and outputs."""
     callee = scope.callees.get(call.mapping)
     if callee is None:
@@ -78,7 +78,7 @@ def callee_of(scope: Scope, call: d.Call) -> Scope | Net:
 
 
 def gains_of(
-    wire: d.Assignment, callee: Scope | Net, label: str
+    wire: d.Assignment, callee: Scope | CalledNetwork, label: str
 ) -> tuple[x.Name, tuple[x.Name, ...]]:
     """Return the output of a call's wire, and the inputs of its derivative `gain(y, x)`."""
     names = (wire.value,)
@@ -98,19 +98,19 @@ def gains_of(
 
 def targets(scope: Scope, step: MappingStep) -> list[tuple[x.Name, Axes]]:
     """Return the names that a step writes, with the iterators active there."""
-    if isinstance(step.what, d.Assignment):
-        return [(step.what.target, step.axes)]
-    return [(w.target, widened(scope, step.axes, w.each)) for w in step.what.outputs]
+    if isinstance(step.statement, d.Assignment):
+        return [(step.statement.target, step.axes)]
+    return [(w.target, add_iterators(scope, step.axes, w.each)) for w in step.statement.outputs]
 
 
 def sources(scope: Scope, step: MappingStep) -> list[tuple[x.Expression, Axes]]:
     """Return the expressions that a step reads, with the iterators active there."""
-    if isinstance(step.what, d.Assignment):
-        return [(step.what.value, step.axes)]
-    return [(w.value, widened(scope, step.axes, w.each)) for w in step.what.inputs]
+    if isinstance(step.statement, d.Assignment):
+        return [(step.statement.value, step.axes)]
+    return [(w.value, add_iterators(scope, step.axes, w.each)) for w in step.statement.inputs]
 
 
-def written(scope: Scope, node: x.Name, axes: Axes) -> Read:
+def target_elements(scope: Scope, node: x.Name, axes: Axes) -> Read:
     """Find the elements that a target writes; it must be an output or a local variable."""
     found = scope.arrays.get(node.name)
     if found is None or found.role not in ("output", "real"):
@@ -119,21 +119,21 @@ def written(scope: Scope, node: x.Name, axes: Axes) -> Read:
         if found is None:
             raise error_at(node.at, f"unknown name '{node.name}'", f"{known}, or real {node.name};")
         raise error_at(node.at, f"{found.role} '{node.name}' set by a statement", known)
-    return Read(found, node, axes, located(scope, node, found, axes))
+    return Read(found, node, axes, find_positions(scope, node, found, axes))
 
 
 # ---- recurrences: statements that need earlier values of themselves
 
 
-class Written(NamedTuple):
+class TimeAxis(NamedTuple):
     """Time dimension of an array, and the first position that is computed in it."""
 
     dim: int
     start: int
 
 
-class Lagged(NamedTuple):
-    """A read of an array of the recurrence itself: time lag, and positions in the other dimensions."""
+class LaggedRead(NamedTuple):
+    """A read of the recurrence's own arrays: time lag, and positions in the other dimensions."""
 
     name: str
     lag: np.ndarray
@@ -148,10 +148,10 @@ class RecurrencePlan(NamedTuple):
     """
 
     steps: tuple[MappingStep, ...]
-    time: dict[int, str]
-    written: dict[str, Written]
+    time_iterators: dict[int, str]
+    time_axes: dict[str, TimeAxis]
     length: int
-    reads: dict[int, Lagged]
+    reads: dict[int, LaggedRead]
     depth: int
 
 
@@ -159,45 +159,47 @@ def plan_of(
     scope: Scope, steps: tuple[MappingStep, ...], owners: dict[str, np.ndarray]
 ) -> RecurrencePlan | None:
     """Plan steps that need one another as a recurrence; None if they form an algebraic loop."""
-    choices = [list(_advances(scope, step)) for step in steps]
-    for chosen in islice(product(*choices), MOST_TRIED):
-        plan = _planned(scope, steps, owners, chosen)
+    choices = [list(_time_choices(scope, step)) for step in steps]
+    for chosen in islice(product(*choices), MAX_TRIED):
+        plan = _try_plan(scope, steps, owners, chosen)
         if plan is not None:
             return plan
     return None
 
 
-def _advances(scope: Scope, step: MappingStep) -> Iterator[tuple[str, dict[str, Written], int]]:
+def _time_choices(
+    scope: Scope, step: MappingStep
+) -> Iterator[tuple[str, dict[str, TimeAxis], int]]:
     """Yield the iterators along which all arrays that a step writes advance by one."""
     for k, (axis, over) in enumerate(step.axes.items()):
-        found: dict[str, Written] = {}
+        found: dict[str, TimeAxis] = {}
         for node, axes in targets(scope, step):
             array = scope.arrays[node.name]
-            indices = located(scope, node, array, axes)
+            indices = find_positions(scope, node, array, axes)
             moving = [i for i, index in enumerate(indices) if index.shape[k] > 1]
             if len(moving) != 1 or indices[moving[0]].size != len(over):
                 break
             values = indices[moving[0]].ravel()
             if np.any(np.diff(values) != 1):
                 break
-            here = Written(moving[0], int(values[0]))
+            here = TimeAxis(moving[0], int(values[0]))
             if found.setdefault(node.name, here) != here:
                 break
         else:
             yield axis, found, len(over)
 
 
-def _planned(scope, steps, owners, chosen) -> RecurrencePlan | None:
+def _try_plan(scope, steps, owners, chosen) -> RecurrencePlan | None:
     """Make the plan for one choice of time iterators; None if a read lies in the future."""
     if len({n for _, _, n in chosen}) > 1:
         return None
-    written: dict[str, Written] = {}
+    time_axes: dict[str, TimeAxis] = {}
     for _, found, _ in chosen:
         for name, here in found.items():
-            if written.setdefault(name, here) != here:
+            if time_axes.setdefault(name, here) != here:
                 return None
     numbers = np.array([step.number for step in steps])
-    lagged: dict[int, Lagged] = {}
+    lagged: dict[int, LaggedRead] = {}
     now: dict[int, set[int]] = {step.number: set() for step in steps}
     for step, (axis, _, length) in zip(steps, chosen, strict=True):
         k = list(step.axes).index(axis)
@@ -205,7 +207,7 @@ def _planned(scope, steps, owners, chosen) -> RecurrencePlan | None:
             owner = owners.get(read.array.name)
             if owner is None or not np.isin(owner[read.flat], numbers).any():
                 continue
-            found = _lag(read, written.get(read.array.name), k, length)
+            found = _lagged_read(read, time_axes.get(read.array.name), k, length)
             if found is None:
                 return None
             lagged[id(read.node)] = found
@@ -220,22 +222,22 @@ def _planned(scope, steps, owners, chosen) -> RecurrencePlan | None:
     time = {step.number: axis for step, (axis, _, _) in zip(steps, chosen, strict=True)}
     depth = max((int(np.max(r.lag)) for r in lagged.values()), default=0)
     ordered = tuple(by_number[n] for n in order)
-    return RecurrencePlan(ordered, time, written, chosen[0][2], lagged, depth)
+    return RecurrencePlan(ordered, time, time_axes, chosen[0][2], lagged, depth)
 
 
-def _lag(read: Read, written: Written | None, k: int, length: int) -> Lagged | None:
+def _lagged_read(read: Read, time_axis: TimeAxis | None, k: int, length: int) -> LaggedRead | None:
     """Find the lag of a read along the time axis k; None if it is not constant or negative."""
-    if written is None:
+    if time_axis is None:
         return None
     rank = read.indices[0].ndim
-    times = written.start + np.arange(length).reshape([-1 if i == k else 1 for i in range(rank)])
-    lag = times - read.indices[written.dim]
-    rest = [index for i, index in enumerate(read.indices) if i != written.dim]
+    times = time_axis.start + np.arange(length).reshape([-1 if i == k else 1 for i in range(rank)])
+    lag = times - read.indices[time_axis.dim]
+    rest = [index for i, index in enumerate(read.indices) if i != time_axis.dim]
     first = np.take(lag, [0], axis=k)
     if np.any(lag != first) or np.any(first < 0) or any(index.shape[k] > 1 for index in rest):
         return None
     whole = sum(isinstance(i, x.Whole) for i in read.node.indices)
-    return Lagged(read.array.name, first, rest, whole)
+    return LaggedRead(read.array.name, first, rest, whole)
 
 
 # ---- the order
@@ -267,7 +269,7 @@ class Order:
     @cached_property
     def setters(self) -> dict[str, list[int]]:
         """Steps that set elements of each array."""
-        found = {name: owner[owner != NOBODY] for name, owner in self.owners.items()}
+        found = {name: owner[owner != NO_OWNER] for name, owner in self.owners.items()}
         return {name: np.flatnonzero(np.bincount(owner)).tolist() for name, owner in found.items()}
 
     def closure(self, names: Iterable[str]) -> tuple[set[int], set[str]]:
@@ -308,10 +310,10 @@ def order_of(scope: Scope) -> Order:
     owners: dict[str, np.ndarray] = {}
     _check_work(scope)
     for step in scope.steps:
-        if isinstance(step.what, d.Call):
-            _check_wires(scope, step, step.what)
+        if isinstance(step.statement, d.Call):
+            _check_wires(scope, step, step.statement)
         for node, axes in targets(scope, step):
-            _own(scope, owners, step, written(scope, node, axes))
+            _set_owner(scope, owners, step, target_elements(scope, node, axes))
     needs: dict[int, set[int]] = {step.number: set() for step in scope.steps}
     given: dict[int, set[str]] = {step.number: set() for step in scope.steps}
     for step in scope.steps:
@@ -323,7 +325,7 @@ def order_of(scope: Scope) -> Order:
                     given[step.number].add(read.array.name)
     for array in scope.outputs.values():
         _check_defined(array, owners)
-    groups = tuple(_group(scope, sorted(c), needs, owners) for c in _components(needs))
+    groups = tuple(_make_group(scope, sorted(c), needs, owners) for c in _dependent_groups(needs))
     return Order(scope, groups, owners, needs, given, inner)
 
 
@@ -332,33 +334,35 @@ def _check_work(scope: Scope) -> None:
     total = sum(a.size for a in scope.arrays.values())
     for step in scope.steps:
         combined = int(np.prod([len(s) for s in step.axes.values()], dtype=np.int64))
-        if isinstance(step.what, d.Call):
-            callee = scope.callees.get(step.what.mapping)
+        if isinstance(step.statement, d.Call):
+            callee = scope.callees.get(step.statement.mapping)
             if isinstance(callee, Scope):
                 combined *= sum(a.size for a in callee.arrays.values())
         total += combined
-        if total > MOST_WORK or step.number > MOST_STEPS:
-            found = f"more than {MOST_WORK} elements or {MOST_STEPS} statements in a mapping"
+        if total > MAX_TOTAL_ELEMENTS or step.number > MAX_STEPS:
+            found = (
+                f"more than {MAX_TOTAL_ELEMENTS} elements or {MAX_STEPS} statements in a mapping"
+            )
             raise error_at(step.at, found, "fewer")
 
 
-def _group(scope, numbers: list[int], needs, owners) -> StepGroup:
+def _make_group(scope, numbers: list[int], needs, owners) -> StepGroup:
     steps = tuple(scope.steps[n] for n in numbers)
     if len(steps) == 1 and numbers[0] not in needs[numbers[0]]:
         return StepGroup(steps, None)
     plan = plan_of(scope, steps, owners)
     if plan is None:
-        raise _loop(scope, steps, needs, owners)
+        raise _loop_error(scope, steps, needs, owners)
     return StepGroup(steps, plan)
 
 
-def _own(scope: Scope, owners: dict[str, np.ndarray], step: MappingStep, write: Read) -> None:
+def _set_owner(scope: Scope, owners: dict[str, np.ndarray], step: MappingStep, write: Read) -> None:
     """Record the elements that a step defines."""
     array, node = write.array, write.node
-    owner = owners.setdefault(array.name, np.full(max(array.size, 1), NOBODY))
+    owner = owners.setdefault(array.name, np.full(max(array.size, 1), NO_OWNER))
     shape = [len(s) for s in write.axes.values()]
     combined = int(np.prod(shape, dtype=np.int64))
-    whole = np.prod([len(dim) for dim in whole_of(node, array)], dtype=np.int64)
+    whole = np.prod([len(dim) for dim in whole_dimensions(node, array)], dtype=np.int64)
     mark = np.zeros(owner.size, bool)
     mark[write.flat] = True
     flat = np.flatnonzero(mark)
@@ -367,7 +371,7 @@ def _own(scope: Scope, owners: dict[str, np.ndarray], step: MappingStep, write: 
         said = f"'{node}' has no index {', '.join(unused)}" if unused else "its index repeats"
         found = f"'{node}' set more than once by one statement ({said})"
         raise error_at(node.at, found, "each element once")
-    taken = flat[owner[flat] != NOBODY]
+    taken = flat[owner[flat] != NO_OWNER]
     if taken.size:
         other = scope.steps[owner[taken[0]]]
         found = f"'{array.element(taken[0])}' set twice (also in line {other.at.line})"
@@ -386,10 +390,10 @@ def _owners_of(owners: dict[str, np.ndarray], read: Read) -> np.ndarray:
     if owner is None:
         found = f"'{read.array.name}' is used, and no statement sets it"
         raise error_at(read.node.at, found, f"a statement {read.array.name} = ...")
-    if owner[0] != NOBODY and np.all(owner == owner[0]):
+    if owner[0] != NO_OWNER and np.all(owner == owner[0]):
         return owner[:1]
     flat = read.flat
-    missing = flat[owner[flat] == NOBODY]
+    missing = flat[owner[flat] == NO_OWNER]
     if missing.size:
         said = f"'{read.array.element(missing[0])}', used in '{read.node}', which no statement sets"
         raise error_at(read.node.at, said, "a statement that sets this element")
@@ -398,8 +402,8 @@ def _owners_of(owners: dict[str, np.ndarray], read: Read) -> np.ndarray:
 
 def _check_defined(array: Array, owners: dict[str, np.ndarray]) -> None:
     owner = owners.get(array.name)
-    if owner is None or np.any(owner == NOBODY):
-        at = 0 if owner is None else int(np.argmax(owner == NOBODY))
+    if owner is None or np.any(owner == NO_OWNER):
+        at = 0 if owner is None else int(np.argmax(owner == NO_OWNER))
         name = array.name if owner is None else array.element(at)
         raise error_at(array.at, f"output '{name}' that no statement sets", f"{name} = ...;")
 
@@ -410,30 +414,30 @@ def _check_wires(scope: Scope, step: MappingStep, call: d.Call) -> None:
     given: dict[str, np.ndarray] = {}
     for wire in call.inputs:
         array = callee.inputs[wire.target.name]
-        axes = widened(scope, {}, wire.each)
-        found = Read(array, wire.target, axes, located(scope, wire.target, array, axes))
+        axes = add_iterators(scope, {}, wire.each)
+        found = Read(array, wire.target, axes, find_positions(scope, wire.target, array, axes))
         given.setdefault(array.name, np.zeros(max(array.size, 1), bool))[found.flat] = True
     for name, hit in given.items():
         array = callee.inputs[name]
         if not hit.all() and array.values is None:
             missing = array.element(int(np.argmin(hit)))
             found = f"'{missing}' of {call.mapping} is not given"
-            raise error_at(call.at, found, f"all of {array.said}")
+            raise error_at(call.at, found, f"all of {array.text}")
     for wire in call.outputs:
-        axes = widened(scope, step.axes, wire.each)
+        axes = add_iterators(scope, step.axes, wire.each)
         output, inputs = gains_of(wire, callee, call.mapping)
-        located(scope, output, callee.outputs[output.name], axes)
+        find_positions(scope, output, callee.outputs[output.name], axes)
         for e in inputs:
             array = callee.inputs[e.name]
             if len(e.indices) != len(array.dims):
                 found = f"'{e}' in '{wire.value}'"
                 raise error_at(
-                    e.at, found, f"one number of {array.said} such as {array.element(0)}"
+                    e.at, found, f"one number of {array.text} such as {array.element(0)}"
                 )
-            located(scope, e, array, axes)
+            find_positions(scope, e, array, axes)
 
 
-def _components(needs: dict[int, set[int]]) -> list[list[int]]:
+def _dependent_groups(needs: dict[int, set[int]]) -> list[list[int]]:
     """Group steps that depend on one another; the groups are in the order of computation."""
     pairs = [(a, b) for a, before in needs.items() for b in before]
     ends = np.array(pairs, int).reshape(-1, 2).T
@@ -448,44 +452,44 @@ def _components(needs: dict[int, set[int]]) -> list[list[int]]:
     return [members[at] for at in TopologicalSorter(before).static_order()]
 
 
-def _loop(scope: Scope, steps: tuple[MappingStep, ...], needs, owners) -> InputError:
+def _loop_error(scope: Scope, steps: tuple[MappingStep, ...], needs, owners) -> InputError:
     """Make the error for an algebraic loop, with the names along a cycle that is no recurrence."""
     members = {s.number for s in steps}
-    cycles = (_cycle(n, needs, members) for n in sorted(members)[:MOST_TRIED])
+    cycles = (_cycle(n, needs, members) for n in sorted(members)[:MAX_TRIED])
     found = sorted((c for c in cycles if c), key=len)
     parts = ((c, tuple(scope.steps[n] for n in sorted(set(c)))) for c in found)
     cycle = next((c for c, part in parts if plan_of(scope, part, owners) is None), found[0])
     names = [str(targets(scope, scope.steps[n])[0][0]) for n in cycle]
     lines = [str(n) for n in sorted({scope.steps[n].at.line for n in cycle})]
-    said = f"an algebraic loop: {' -> '.join(_few(names))} (line {', '.join(_few(lines))})"
+    said = f"an algebraic loop: {' -> '.join(_shorten(names))} (line {', '.join(_shorten(lines))})"
     expected = "statements of which each needs earlier ones only, or earlier times such as y[t-1]"
     return error_at(scope.steps[min(cycle)].at, said, expected)
 
 
-def _few(words: list[str]) -> list[str]:
-    return words if len(words) <= MOST_NAMED else [*words[: MOST_NAMED - 2], "...", words[-1]]
+def _shorten(words: list[str]) -> list[str]:
+    return words if len(words) <= MAX_NAMED else [*words[: MAX_NAMED - 2], "...", words[-1]]
 
 
 def _cycle(start: int, needs: dict[int, set[int]], members: set[int]) -> list[int]:
     """Find the shortest cycle from a step to itself, in the order of need; empty if none."""
-    came: dict[int, int | None] = {start: None}
+    previous: dict[int, int | None] = {start: None}
     todo = [start]
     for at in todo:
         for before in sorted(needs[at] & members):
             if before == start:
-                way: list[int] = [start]
+                cycle: list[int] = [start]
                 back: int | None = at
                 while back is not None:
-                    way.append(back)
-                    back = came[back]
-                return way
-            if before not in came:
-                came[before] = at
+                    cycle.append(back)
+                    back = previous[back]
+                return cycle
+            if before not in previous:
+                previous[before] = at
                 todo.append(before)
     return []
 
 
-class _Same(NamedTuple):
+class _ById(NamedTuple):
     """A mapping compared by identity: an equal one may have other line numbers."""
 
     mapping: d.Mapping
@@ -494,20 +498,20 @@ class _Same(NamedTuple):
         return id(self.mapping)
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Same) and self.mapping is other.mapping
+        return isinstance(other, _ById) and self.mapping is other.mapping
 
 
-def checked(mapping: d.Mapping, shapes=None) -> Order:
+def check_mapping(mapping: d.Mapping, shapes=None) -> Order:
     """Check a mapping and return its order, without computing anything.
 
     Results of the last mappings are cached, so that compiled code is reused when a document is
     solved again.
     """
-    return _ordered(_Same(mapping), tuple(sorted((shapes or {}).items())))
+    return _cached_order(_ById(mapping), tuple(sorted((shapes or {}).items())))
 
 
 @lru_cache(maxsize=64)
-def _ordered(same: _Same, shapes: tuple[tuple[str, tuple[int, ...]], ...]) -> Order:
+def _cached_order(same: _ById, shapes: tuple[tuple[str, tuple[int, ...]], ...]) -> Order:
     return order_of(scope_of(same.mapping, dict(shapes)))
 
 
@@ -532,6 +536,6 @@ def check_document(
     InputError
         With the place in the document.
     """
-    checked(document.mapping, shapes)
+    check_mapping(document.mapping, shapes)
     if document.problem is not None:
         check_problem(document, given)

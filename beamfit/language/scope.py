@@ -21,13 +21,13 @@ from beamfit.language.expression import FUNCTIONS, REDUCTIONS, Place, error_at
 
 # Limits on the size of documents, chosen so that none takes all memory or minutes of time.
 # Largest number of elements of a set.
-MOST_ELEMENTS = 2_000_000
+MAX_ELEMENTS = 2_000_000
 # Largest number of combinations of indices in a statement.
-MOST_COMBINED = 5_000_000
+MAX_COMBINATIONS = 5_000_000
 # Largest number of operations in one use of a function, nested functions included.
-MOST_WORK = 20_000
+MAX_OPERATIONS = 20_000
 # Suffix that hides the names of a caller's iterators from a function's body.
-HIDDEN = "'"
+HIDDEN_SUFFIX = "'"
 CONSTANTS = {"pi": float(np.pi)}
 
 
@@ -81,7 +81,7 @@ class Array(NamedTuple):
         return int(np.prod(self.shape, dtype=np.int64))
 
     @property
-    def said(self) -> str:
+    def text(self) -> str:
         """Name with dimensions, for messages."""
         inner = ", ".join(dim.name or str(len(dim)) for dim in self.dims)
         return f"{self.name}[{inner}]" if self.dims else self.name
@@ -100,12 +100,12 @@ class MappingStep(NamedTuple):
 
     number: int
     axes: dict[str, IndexSet]
-    what: d.Assignment | d.Call
+    statement: d.Assignment | d.Call
 
     @property
     def at(self) -> Place:
         """Place in the document."""
-        return self.what.at
+        return self.statement.at
 
 
 class Read(NamedTuple):
@@ -156,7 +156,7 @@ class Scope:
         return CONSTANTS.get(name) if found is None else None
 
 
-class Net(NamedTuple):
+class CalledNetwork(NamedTuple):
     """A network in a call: the network with its inputs and outputs as arrays."""
 
     mlp: Any
@@ -167,7 +167,7 @@ class Net(NamedTuple):
 # ---- sets and iterators
 
 
-def check_size(lengths: list[int], at: Place, most: int = MOST_COMBINED) -> None:
+def check_size(lengths: list[int], at: Place, most: int = MAX_COMBINATIONS) -> None:
     """Raise an error if a length is zero or their product too large."""
     total = 1
     for length in lengths:
@@ -179,7 +179,7 @@ def check_size(lengths: list[int], at: Place, most: int = MOST_COMBINED) -> None
 
 def set_of(scope: Scope, over: x.Elements, name: str = "") -> IndexSet:
     """Compute the elements of a set from its numbers and parameters."""
-    ends = [int(index_of(scope, part, {})) for part in over.parts]
+    ends = [int(index_values(scope, part, {})) for part in over.parts]
     if not over.ranged:
         found = np.array(ends)
         if len(np.unique(found)) < len(found):
@@ -189,11 +189,11 @@ def set_of(scope: Scope, over: x.Elements, name: str = "") -> IndexSet:
     if step == 0 or (stop - start) * step < 0:
         said = f"set {name} = {over}" if name else f"{over}"
         raise error_at(over.at, f"{said}, an empty set", "a start before the stop")
-    check_size([abs((stop - start) // step) + 1], over.at, MOST_ELEMENTS)
+    check_size([abs((stop - start) // step) + 1], over.at, MAX_ELEMENTS)
     return IndexSet(name, np.arange(start, stop + np.sign(step), step))
 
 
-def widened(scope: Scope, axes: Axes, each: tuple[x.Iterator, ...]) -> dict[str, IndexSet]:
+def add_iterators(scope: Scope, axes: Axes, each: tuple[x.Iterator, ...]) -> dict[str, IndexSet]:
     """Add iterators to the active ones, as the innermost."""
     found = dict(axes)
     for it in each:
@@ -216,7 +216,7 @@ def widened(scope: Scope, axes: Axes, each: tuple[x.Iterator, ...]) -> dict[str,
 # ---- indices
 
 
-def index_of(scope: Scope, e: x.Expression, axes: Axes) -> np.ndarray:
+def index_values(scope: Scope, e: x.Expression, axes: Axes) -> np.ndarray:
     """Compute the values of an index, with one axis for each iterator."""
     match e:
         case x.Literal():
@@ -227,9 +227,9 @@ def index_of(scope: Scope, e: x.Expression, axes: Axes) -> np.ndarray:
             place = list(axes).index(name)
             return axes[name].elements.reshape([-1 if i == place else 1 for i in range(len(axes))])
         case x.Name(name, ()) if (value := scope.constant(name)) is not None:
-            return index_of(scope, x.Literal(repr(value), at=e.at), axes)
+            return index_values(scope, x.Literal(repr(value), at=e.at), axes)
         case x.Arithmetic(symbol, parts) if symbol in "+-*":
-            found = [index_of(scope, part, axes) for part in parts]
+            found = [index_values(scope, part, axes) for part in parts]
             if max(float(np.max(np.abs(f))) for f in found) > 2**31:
                 raise error_at(e.at, f"'{e}' as an index", "numbers below 2e9")
             if len(found) == 1:
@@ -237,42 +237,46 @@ def index_of(scope: Scope, e: x.Expression, axes: Axes) -> np.ndarray:
             return {"+": np.add, "-": np.subtract, "*": np.multiply}[symbol](*found)
     known = [*axes, *(n for n in scope.arrays if scope.constant(n) is not None)]
     if isinstance(e, x.Name) and not e.indices and e.name not in scope.arrays:
-        raise error_at(e.at, f"index '{e}', which is no iterator here", _iterators(e.name, known))
+        raise error_at(
+            e.at, f"index '{e}', which is no iterator here", _iterator_hint(e.name, known)
+        )
     raise error_at(e.at, f"'{e}' as an index", "iterators and whole numbers with + - *")
 
 
-def _iterators(name: str, known: list[str]) -> str:
+def _iterator_hint(name: str, known: list[str]) -> str:
     behind = f"'foreach {name} in SET' behind the statement, or sum({name} in SET | ...)"
     return f"{behind}, or {nearest(name, known)}" if known else behind
 
 
-def located(scope: Scope, node: x.Name, array: Array, axes: Axes) -> list[np.ndarray]:
+def find_positions(scope: Scope, node: x.Name, array: Array, axes: Axes) -> list[np.ndarray]:
     """Find positions in each dimension of an array, with axes of iterators and whole dimensions."""
     given = node.indices or (x.Whole(),) * len(array.dims)
     if len(given) != len(array.dims):
         count = len(given)
         found = f"{count} {'index' if count == 1 else 'indices'} in '{node}'"
-        wanted = f"{len(array.dims)}: {array.said}" if array.dims else "none: it is a number"
+        wanted = f"{len(array.dims)}: {array.text}" if array.dims else "none: it is a number"
         raise error_at(node.at, found, wanted)
-    whole = len(whole_of(node, array))
+    whole = len(whole_dimensions(node, array))
     rank, indices = len(axes) + whole, []
-    opened = len(axes)
+    whole_axis = len(axes)
     for i, dim in zip(given, array.dims, strict=True):
         if isinstance(i, x.Whole):
-            values = np.arange(len(dim)).reshape([-1 if k == opened else 1 for k in range(rank)])
+            values = np.arange(len(dim)).reshape(
+                [-1 if k == whole_axis else 1 for k in range(rank)]
+            )
             indices.append(values)
-            opened += 1
+            whole_axis += 1
             continue
-        values = index_of(scope, i, axes)
+        values = index_values(scope, i, axes)
         at = dim.positions(values)
         if np.any(at < 0):
-            raise _outside(node, i, dim, axes, np.broadcast_to(values, at.shape), at)
+            raise _outside_error(node, i, dim, axes, np.broadcast_to(values, at.shape), at)
         shape = np.shape(at) or [1] * len(axes)
         indices.append(np.reshape(at, [*shape, *[1] * whole]))
     return indices
 
 
-def whole_of(node: x.Name, array: Array) -> list[IndexSet]:
+def whole_dimensions(node: x.Name, array: Array) -> list[IndexSet]:
     """Return the dimensions of an array that a name takes whole."""
     if not node.indices:
         return list(array.dims)
@@ -280,19 +284,19 @@ def whole_of(node: x.Name, array: Array) -> list[IndexSet]:
     return [dim for i, dim in pairs if isinstance(i, x.Whole)]
 
 
-def _outside(node, index, dim, axes, values, at) -> InputError:
+def _outside_error(node, index, dim, axes, values, at) -> InputError:
     """Make the error for an index outside its set, with the values of the iterators."""
     first = np.argwhere(np.atleast_1d(at) < 0)[0]
     value = np.atleast_1d(values)[tuple(first)]
     said = f"index {index} = {value}" if str(index) != str(value) else f"index {value}"
-    found = f"{said} in '{node}'{said_at(axes, first, np.shape(at), ' at ')}"
+    found = f"{said} in '{node}'{iterator_text(axes, first, np.shape(at), ' at ')}"
     return error_at(index.at, found, f"an element of {dim}")
 
 
-def said_at(axes: Axes, at: Sequence[int], lengths: Sequence[int], word: str) -> str:
+def iterator_text(axes: Axes, at: Sequence[int], lengths: Sequence[int], word: str) -> str:
     """Write the values of iterators after a word; empty if none has several elements."""
     found = [
-        f"{name.rstrip(HIDDEN)} = {s.elements[i]}"
+        f"{name.rstrip(HIDDEN_SUFFIX)} = {s.elements[i]}"
         for (name, s), i, n in zip(axes.items(), at, lengths, strict=False)
         if n > 1
     ]
@@ -308,11 +312,11 @@ def reads(scope: Scope, e: x.Expression, axes: Axes) -> Iterator[Read]:
         case x.Name(name):
             found = scope.arrays.get(name)
             if found is not None:
-                yield Read(found, e, axes, located(scope, e, found, axes))
+                yield Read(found, e, axes, find_positions(scope, e, found, axes))
             elif not (name in axes or name in CONSTANTS) or e.indices:
-                raise _unknown(scope, e, axes)
+                raise _unknown_error(scope, e, axes)
         case x.Reduction():
-            yield from reads(scope, e.body, widened(scope, axes, e.iterators))
+            yield from reads(scope, e.body, add_iterators(scope, axes, e.iterators))
         case x.Application() | x.Arithmetic():
             if isinstance(e, x.Application):
                 _check_arguments(scope, e)
@@ -321,7 +325,7 @@ def reads(scope: Scope, e: x.Expression, axes: Axes) -> Iterator[Read]:
             raise error_at(e.at, "':'", "an expression")
 
 
-def _unknown(scope: Scope, e: x.Name, axes: Axes) -> InputError:
+def _unknown_error(scope: Scope, e: x.Name, axes: Axes) -> InputError:
     if e.name in axes:
         return error_at(e.at, f"'{e}', an index of the iterator {e.name}", "an array")
     if e.name in scope.sets:
@@ -382,9 +386,9 @@ def scope_of(m: d.Mapping, shapes: Mapping[str, tuple[int, int]] | None = None) 
                 _declare(scope, one, role)
     _declare_tables(scope, m, shapes or {})
     for inner in m.mappings:
-        _new(scope, inner.name, inner.at)
+        _check_new(scope, inner.name, inner.at)
         if isinstance(inner, d.NetworkDefinition):
-            scope.callees[inner.name] = _net(inner)
+            scope.callees[inner.name] = _network(inner)
         else:
             scope.callees[inner.name] = scope_of(inner)
     _declare_statements(scope, m.statements, {})
@@ -393,20 +397,22 @@ def scope_of(m: d.Mapping, shapes: Mapping[str, tuple[int, int]] | None = None) 
     return scope
 
 
-def _net(network: d.NetworkDefinition) -> Net:
+def _network(network: d.NetworkDefinition) -> CalledNetwork:
     from beamfit.greybox import tree  # JAX from here on
     from beamfit.language.network_xml import network_of, weight_leaves
 
     mlp = network_of(network)
     values = tuple(tree.read(mlp, weight_leaves(mlp)).tolist())
-    known = any(part.values is not None for part in network.parts)
+    has_values = any(part.values is not None for part in network.parts)
     count = IndexSet("", np.arange(len(values)))
     ports = {name: Array(name, "input", (), network.at) for name in mlp.inputs}
-    ports["weights"] = Array("weights", "input", (count,), network.at, values if known else None)
-    return Net(mlp, ports, {n: Array(n, "output", (), network.at) for n in mlp.outputs})
+    ports["weights"] = Array(
+        "weights", "input", (count,), network.at, values if has_values else None
+    )
+    return CalledNetwork(mlp, ports, {n: Array(n, "output", (), network.at) for n in mlp.outputs})
 
 
-def _new(scope: Scope, name: str, at: Place) -> None:
+def _check_new(scope: Scope, name: str, at: Place) -> None:
     """Raise an error for a name that is already declared."""
     for kind in (scope.sets, scope.arrays, scope.functions, scope.callees):
         if name in kind:
@@ -423,22 +429,22 @@ def _declare_numbers(scope: Scope, m: d.Mapping) -> None:
 
 
 def _declare(scope: Scope, one: d.Declared | d.Real, role: str) -> None:
-    _new(scope, one.name, one.at)
+    _check_new(scope, one.name, one.at)
     dims = tuple(_dimension(scope, dim, one) for dim in one.dimensions)
     values = one.values if isinstance(one, d.Declared) else None
-    made = Array(one.name, role, dims, one.at, values)
-    check_size([*made.shape], one.at)
+    array = Array(one.name, role, dims, one.at, values)
+    check_size([*array.shape], one.at)
     if role == "parameter" and values is None:
-        raise error_at(one.at, f"parameter '{one.name}' without values", f"{made.size} numbers")
-    if values is not None and len(values) != made.size:
-        found = f"{len(values)} values for {made.said}"
-        raise error_at(one.at, found, f"{made.size}")
-    scope.arrays[one.name] = made
+        raise error_at(one.at, f"parameter '{one.name}' without values", f"{array.size} numbers")
+    if values is not None and len(values) != array.size:
+        found = f"{len(values)} values for {array.text}"
+        raise error_at(one.at, found, f"{array.size}")
+    scope.arrays[one.name] = array
 
 
 def _dimension(scope: Scope, dim: str | int, one: d.Declared | d.Real) -> IndexSet:
     if isinstance(dim, int):
-        check_size([dim], one.at, MOST_ELEMENTS)
+        check_size([dim], one.at, MAX_ELEMENTS)
         return IndexSet("", np.arange(dim))
     if dim not in scope.sets:
         raise error_at(one.at, f"no set '{dim}' for '{one.name}'", nearest(dim, list(scope.sets)))
@@ -446,23 +452,23 @@ def _dimension(scope: Scope, dim: str | int, one: d.Declared | d.Real) -> IndexS
 
 
 def _declare_sets(scope: Scope, m: d.Mapping) -> None:
-    for statement in _flat(m.statements):
+    for statement in _flatten(m.statements):
         if isinstance(statement, d.IndexedSet):
-            _new(scope, statement.name, statement.at)
+            _check_new(scope, statement.name, statement.at)
             scope.sets[statement.name] = set_of(scope, statement.elements, statement.name)
 
 
-def _flat(statements: tuple[d.Statement, ...]) -> Iterator[d.Statement]:
+def _flatten(statements: tuple[d.Statement, ...]) -> Iterator[d.Statement]:
     for statement in statements:
         if isinstance(statement, d.Block):
-            yield from _flat(statement.statements)
+            yield from _flatten(statement.statements)
         else:
             yield statement
 
 
 def _declare_tables(scope: Scope, m: d.Mapping, shapes: Mapping[str, tuple[int, int]]) -> None:
     for table in m.tables:
-        _new(scope, table.name, table.at)
+        _check_new(scope, table.name, table.at)
         shape = shapes.get(table.name, (table.rows, table.columns))
         if None in shape:
             found = f"table '{table.name}' of unknown size"
@@ -479,22 +485,22 @@ def _declare_statements(
     scope: Scope, statements: tuple[d.Statement, ...], axes: dict[str, IndexSet]
 ) -> None:
     """Declare local variables and functions, then number the steps; blocks are expanded."""
-    for s in _flat(statements) if not axes else ():
+    for s in _flatten(statements) if not axes else ():
         if isinstance(s, d.Real):
             _declare(scope, s, "real")
         elif isinstance(s, d.Function):
-            _new(scope, s.name, s.at)
+            _check_new(scope, s.name, s.at)
             if s.name in FUNCTIONS or s.name in REDUCTIONS:
                 raise error_at(s.at, f"a function '{s.name}'", "a name that is not built in")
             scope.functions[s.name] = s
     for s in statements:
         if isinstance(s, d.Block):
-            _declare_statements(scope, s.statements, widened(scope, axes, s.each))
+            _declare_statements(scope, s.statements, add_iterators(scope, axes, s.each))
         elif isinstance(s, d.Real) and s.value is not None:
             what = d.Assignment(x.Name(s.name, at=s.at), s.value, at=s.at)
             scope.steps.append(MappingStep(len(scope.steps), {}, what))
         elif isinstance(s, d.Assignment | d.Call):
-            inner = widened(scope, axes, s.each)
+            inner = add_iterators(scope, axes, s.each)
             scope.steps.append(MappingStep(len(scope.steps), inner, s))
 
 
@@ -506,7 +512,7 @@ def _check_function(scope: Scope, f: d.Function) -> None:
     twice = [a for a in f.arguments if f.arguments.count(a) > 1]
     if twice:
         raise error_at(f.at, f"argument '{twice[0]}' twice", "each once")
-    _work(scope, f, ())
+    _count_operations(scope, f, ())
     constants = {n: a for n, a in scope.arrays.items() if scope.constant(n) is not None}
     arguments = {name: Array(name, "argument", (), f.at) for name in f.arguments}
     inside = Scope(f.name, scope.sets, constants | arguments, scope.functions)
@@ -514,7 +520,9 @@ def _check_function(scope: Scope, f: d.Function) -> None:
         pass
 
 
-def _work(scope: Scope, f: d.Function, stack: tuple[str, ...], seen: dict | None = None) -> int:
+def _count_operations(
+    scope: Scope, f: d.Function, stack: tuple[str, ...], seen: dict | None = None
+) -> int:
     seen = {} if seen is None else seen
     if f.name in stack:
         loop = " -> ".join([*stack[stack.index(f.name) :], f.name])
@@ -526,9 +534,11 @@ def _work(scope: Scope, f: d.Function, stack: tuple[str, ...], seen: dict | None
             todo += x.children(e)
             total += 1
             if isinstance(e, x.Application) and e.function in scope.functions:
-                total += _work(scope, scope.functions[e.function], (*stack, f.name), seen)
-        if total > MOST_WORK:
-            raise error_at(f.at, f"a function '{f.name}' of more than {MOST_WORK} operations",
+                total += _count_operations(
+                    scope, scope.functions[e.function], (*stack, f.name), seen
+                )
+        if total > MAX_OPERATIONS:
+            raise error_at(f.at, f"a function '{f.name}' of more than {MAX_OPERATIONS} operations",
                            "smaller functions")  # fmt: skip
         seen[f.name] = total
     return seen[f.name]
@@ -540,9 +550,9 @@ def _work(scope: Scope, f: d.Function, stack: tuple[str, ...], seen: dict | None
 def check_problem(document: d.Document, given: Iterable[str] = ()) -> None:
     """Raise an error for unknown names, contradictory bounds and inputs without a value."""
     p, m = document.problem, document.mapping
-    faces = (p.variables, m.inputs, "input"), ((*p.goals, *p.limits), m.outputs, "output")
-    for group, face, what in faces:
-        known = [one.name for one in face]
+    groups = (p.variables, m.inputs, "input"), ((*p.goals, *p.limits), m.outputs, "output")
+    for group, declared, what in groups:
+        known = [one.name for one in declared]
         for one in group:
             if one.model not in known:
                 found = f"no {what} '{one.model}' in the mapping"
