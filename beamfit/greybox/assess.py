@@ -83,26 +83,29 @@ class Scale(NamedTuple):
 
 
 class LimitedValues(NamedTuple):
-    """Values with limits, their scales, the distance that counts as reached, and multipliers."""
+    """Values with their limits, scales and multipliers.
+
+    A limit counts as reached within `tolerance` of it.
+    """
 
     value: np.ndarray
     lower: np.ndarray
     upper: np.ndarray
-    size: np.ndarray
-    near: np.ndarray
+    scale: np.ndarray
+    tolerance: np.ndarray
     multiplier: np.ndarray | float = 0.0
 
     @property
     def violation(self) -> np.ndarray:
         """Violation of each limit, in units of the value's scale."""
         return (
-            np.maximum(np.maximum(self.lower - self.value, self.value - self.upper), 0) / self.size
+            np.maximum(np.maximum(self.lower - self.value, self.value - self.upper), 0) / self.scale
         )
 
     @property
     def reached(self) -> tuple[np.ndarray, np.ndarray]:
         """True for each lower and each upper limit that is reached."""
-        return self.value - self.lower <= self.near, self.upper - self.value <= self.near
+        return self.value - self.lower <= self.tolerance, self.upper - self.value <= self.tolerance
 
     @property
     def distance(self) -> np.ndarray:
@@ -174,8 +177,8 @@ class SearchState(NamedTuple):
     @property
     def lagrangian_gradient(self) -> np.ndarray:
         """Gradient of the Lagrangian, shape (n,)."""
-        pull = self.at.jacobian.T @ self.limits.multiplier
-        return self.at.gradient - self.bounds.multiplier - pull
+        constraint_gradient = self.at.jacobian.T @ self.limits.multiplier
+        return self.at.gradient - self.bounds.multiplier - constraint_gradient
 
     @property
     def optimal(self) -> bool:
@@ -186,12 +189,12 @@ class SearchState(NamedTuple):
 def first_order(core, theta):
     """Compute the fields of `Slopes`; compiled once for each structure of problem."""
     r, j = problem.with_slope(partial(problem.residual, core), theta)
-    further, pull = jax.value_and_grad(problem.further, 1)(core, theta)
+    further, gradient = jax.value_and_grad(problem.further, 1)(core, theta)
     c = problem.constraints(core, theta)
     # Reverse mode takes a sweep for each constraint, forward mode one for each variable.
     few = jax.eval_shape(problem.constraints, core, theta).shape < theta.shape
     slopes = (jax.jacrev if few else jax.jacfwd)(problem.constraints, 1)(core, theta)
-    return r, j, 0.5 * r @ r + further, r @ j + pull, c, slopes
+    return r, j, 0.5 * r @ r + further, r @ j + gradient, c, slopes
 
 
 def slopes(p: Problem, theta: np.ndarray) -> Slopes:
@@ -234,10 +237,10 @@ def scale_of(p: Problem, start: np.ndarray, at: Slopes) -> Scale:
     scale. The scale of the cost is the latter change, else the cost itself, else 1.
     """
     width = p.upper - p.lower
-    length, pull = lengths(at.residual_jacobian), np.abs(at.gradient)
+    length, slope = lengths(at.residual_jacobian), np.abs(at.gradient)
     unit = np.maximum(np.abs(start), np.where(np.isfinite(width), 0.1 * width, 0.0))
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        for other in (1.0 / length, abs(at.cost) / pull):
+        for other in (1.0 / length, abs(at.cost) / slope):
             usable = (unit == 0) & np.isfinite(other) & (other > 0)
             unit = np.where(usable, other, unit)
     unit = np.where(unit > 0, unit, 1.0)
@@ -246,7 +249,7 @@ def scale_of(p: Problem, start: np.ndarray, at: Slopes) -> Scale:
     ]
     moved = np.max(np.abs(at.jacobian) * unit, axis=1, initial=0.0)
     limit = np.max([*ends, np.abs(at.constraints), moved], axis=0, initial=0.0)
-    sizes = [float(np.max(pull * unit, initial=0.0)), abs(float(at.cost)), 1.0]
+    sizes = [float(np.max(slope * unit, initial=0.0)), abs(float(at.cost)), 1.0]
     return Scale(unit, np.where(limit > 0, limit, 1.0), next(v for v in sizes if v > 0))
 
 
@@ -268,8 +271,8 @@ def active_set(p: Problem, s: SearchState, least: float) -> tuple[np.ndarray, np
     """Find which numbers are held and which constraints are active, by their multipliers."""
     size = gradient_size(p, s.at, s.scale)
     held = ~p.moving | (np.abs(s.bounds.multiplier) > least * size)
-    pulls = np.abs(s.limits.multiplier) * np.linalg.norm(s.at.jacobian / size, axis=1)
-    return held, p.equations | (pulls > least)
+    forces = np.abs(s.limits.multiplier) * np.linalg.norm(s.at.jacobian / size, axis=1)
+    return held, p.equations | (forces > least)
 
 
 def state(p: Problem, theta: np.ndarray, scale: Scale, at: Slopes | None = None) -> SearchState:
@@ -294,27 +297,31 @@ def state(p: Problem, theta: np.ndarray, scale: Scale, at: Slopes | None = None)
     at = slopes(p, theta) if at is None else at
     size = gradient_size(p, at, scale) if at.finite else 1.0 / scale.unit
     cost = scale.cost if p.objectives else max(float(at.cost), 0.5 * p.least_residual**2)
-    near = p.tolerance * np.minimum(np.maximum(np.abs(theta), np.abs(p.start)), p.upper - p.lower)
+    margin = p.tolerance * np.minimum(np.maximum(np.abs(theta), np.abs(p.start)), p.upper - p.lower)
     with np.errstate(divide="ignore", invalid="ignore"):
         # If the gradient pushes towards a bound, it counts as reached when moving there hardly
         # changes the cost.
         pushed = np.abs(at.gradient) > p.tolerance * size
-        near = np.where(
-            pushed, np.maximum(near, NEGLIGIBLE_COST * cost / np.abs(at.gradient)), near
-        )
-    near = np.where(np.isfinite(near), near, 0.0)
-    bounds = LimitedValues(theta, p.lower, p.upper, scale.unit, near, np.zeros(len(theta)))
+        harmless = NEGLIGIBLE_COST * cost / np.abs(at.gradient)
+        margin = np.where(pushed, np.maximum(margin, harmless), margin)
+    margin = np.where(np.isfinite(margin), margin, 0.0)
+    bounds = LimitedValues(theta, p.lower, p.upper, scale.unit, margin, np.zeros(len(theta)))
     # A number that ends at zero must not reduce the scales of the constraints to zero.
     largest = np.maximum(np.abs(theta), scale.unit)
-    here = scale_of(p, largest, at) if p.constraints else scale
-    size_here = np.fmin(scale.limit, MAX_SCALE_GROWTH * here.limit)
-    ends, near = (p.constraint_lower, p.constraint_upper), p.tolerance * size_here
-    limits = LimitedValues(at.constraints, *ends, size_here, near, np.zeros(len(near)))
+    local_scale = scale_of(p, largest, at) if p.constraints else scale
+    limit_scale = np.fmin(scale.limit, MAX_SCALE_GROWTH * local_scale.limit)
+    ends, margin = (p.constraint_lower, p.constraint_upper), p.tolerance * limit_scale
+    limits = LimitedValues(at.constraints, *ends, limit_scale, margin, np.zeros(len(margin)))
     s = SearchState(theta, at, bounds, limits, INFINITE_KKT, scale, p.tolerance)
     if not at.finite:
         return s
-    pulls, forces = multipliers(at.gradient, at.jacobian, bounds, limits, size)
-    bounds, limits = bounds._replace(multiplier=pulls), limits._replace(multiplier=forces)
+    bound_multipliers, limit_multipliers = multipliers(
+        at.gradient, at.jacobian, bounds, limits, size
+    )
+    bounds, limits = (
+        bounds._replace(multiplier=bound_multipliers),
+        limits._replace(multiplier=limit_multipliers),
+    )
     return _with_kkt(s._replace(bounds=bounds, limits=limits), size, cost)
 
 
@@ -462,19 +469,19 @@ def find_lower_point(p: Problem, s: SearchState, lagrangian: Lagrangian) -> np.n
         return None
     low, high = s.bounds.reached
     inward = np.flatnonzero((low ^ high) & ~p.nuisance & p.moving)[:OTHER_PROBES]
-    pushes = np.zeros((len(inward), len(unit)))
-    pushes[np.arange(len(inward)), inward] = np.where(low, unit, -unit)[inward]
-    sides = np.repeat(weak.T, 2, axis=0)
-    sides[1::2] *= -1.0
+    inward_steps = np.zeros((len(inward), len(unit)))
+    inward_steps[np.arange(len(inward)), inward] = np.where(low, unit, -unit)[inward]
+    weak_steps = np.repeat(weak.T, 2, axis=0)
+    weak_steps[1::2] *= -1.0
     # Steps inward over which the gradient predicts a change by the cost, or by a share of it.
     size = max(float(s.at.cost), 0.5 * p.least_residual**2)
     slope = np.maximum(np.abs(s.at.gradient * unit)[inward], 1e-300)
-    short = pushes * np.minimum(size / slope, PROBE_DISTANCE)[:, None]
+    short = inward_steps * np.minimum(size / slope, PROBE_DISTANCE)[:, None]
     steps = np.vstack(
         [
             0 * unit,
-            PROBE_DISTANCE * sides,
-            PROBE_DISTANCE * pushes,
+            PROBE_DISTANCE * weak_steps,
+            PROBE_DISTANCE * inward_steps,
             *(t * short for t in PREDICTED_SHARES),
         ]
     )
@@ -483,26 +490,28 @@ def find_lower_point(p: Problem, s: SearchState, lagrangian: Lagrangian) -> np.n
     gain = cost[0] - cost
     gain = np.where(np.isfinite(gain), gain, -np.inf)
     least = 1e-9 * abs(cost[0]) + 1e-12 * p.least_residual**2
-    for i in range(1, len(sides), 2):
+    for i in range(1, len(weak_steps), 2):
         if gain[i] + gain[i + 1] > least:
-            return _lowest_along(p, s, sides[i - 1 if gain[i] > gain[i + 1] else i], lagrangian)
-    for k, i in enumerate(range(1 + len(sides), 1 + len(sides) + len(pushes))):
+            return _lowest_along(
+                p, s, weak_steps[i - 1 if gain[i] > gain[i + 1] else i], lagrangian
+            )
+    for k, i in enumerate(range(1 + len(weak_steps), 1 + len(weak_steps) + len(inward_steps))):
         if gain[i] > least:
-            return _lowest_along(p, s, pushes[k], lagrangian)
+            return _lowest_along(p, s, inward_steps[k], lagrangian)
         for at, t in enumerate(PREDICTED_SHARES, 1):
             if (
                 PROBE_DISTANCE * slope[k] > size
-                and gain[i + at * len(pushes)] > -MIN_OCCURRED * t * size
+                and gain[i + at * len(inward_steps)] > -MIN_OCCURRED * t * size
             ):
-                return points[i + at * len(pushes)]
+                return points[i + at * len(inward_steps)]
     return None
 
 
 def _weakest_directions(p: Problem, s: SearchState) -> np.ndarray:
     """Find the directions along the active limits in which the sum of squares changes least."""
     unit = s.scale.unit
-    held, on = active_set(p, s, p.tolerance)
-    if len(unit) > MAX_DENSE and not on.any():
+    held, active = active_set(p, s, p.tolerance)
+    if len(unit) > MAX_DENSE and not active.any():
         found = np.zeros((len(unit), min(WEAK_DIRECTIONS, int(np.sum(~held)))))
         rows = in_units(s.at.residual_jacobian, 1 / unit)[:, ~held]
         found[~held] = weakest(rows, found.shape[1])
@@ -547,15 +556,15 @@ def _restore_constraints(p: Problem, s: SearchState, point: np.ndarray) -> np.nd
     A straight step leaves curved constraints. The cost outside may be lower without there being a
     lower feasible point. Returns None if Newton's method does not get there.
     """
-    held, on = active_set(p, s, p.tolerance)
+    held, active = active_set(p, s, p.tolerance)
     unit = np.where(held, 0.0, s.scale.unit)
     for _ in range(10):  # Newton steps
         at = slopes(p, point)
         if not at.finite:
             return None
         inside = np.clip(at.constraints, p.constraint_lower, p.constraint_upper)
-        gap = at.constraints - np.where(on, s.at.constraints, inside)
-        if np.all(np.abs(gap) <= 1e-10 * s.limits.size):
+        gap = at.constraints - np.where(active, s.at.constraints, inside)
+        if np.all(np.abs(gap) <= 1e-10 * s.limits.scale):
             return point
         violated = gap != 0
         step = np.linalg.lstsq(at.jacobian[violated] * unit, gap[violated], rcond=None)[0]
@@ -592,5 +601,5 @@ def _test_curvature(p: Problem, s: SearchState) -> CurvatureTest:
 def _tangent_basis(p: Problem, s: SearchState) -> np.ndarray:
     """Return a basis of the directions along the active limits, in scales of the numbers."""
     unit = s.scale.unit
-    held, on = active_set(p, s, p.tolerance)
-    return null_space(np.vstack([np.eye(len(unit))[held], s.at.jacobian[on] * unit]))
+    held, active = active_set(p, s, p.tolerance)
+    return null_space(np.vstack([np.eye(len(unit))[held], s.at.jacobian[active] * unit]))

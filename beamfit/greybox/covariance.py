@@ -335,10 +335,10 @@ def spread_of(
         jacobian = jacobian.toarray()
     rows = np.vstack([triangle(jacobian), np.diag(np.sqrt(information))])[:, free]
     found = directions(rows, None if equations is None else equations[:, free])
-    whole = [np.zeros((n, *part.shape[1:])) for part in found]
-    for out, part in zip(whole, found, strict=True):
+    parts = [np.zeros((n, *part.shape[1:])) for part in found]
+    for out, part in zip(parts, found, strict=True):
         out[free] = part
-    return Spread(*whole, information)
+    return Spread(*parts, information)
 
 
 def _factored(jacobian: Rows, information: np.ndarray, free: np.ndarray) -> FactoredSpread | None:
@@ -360,7 +360,7 @@ def groups_of(
     records: Sequence[Record],
     residuals: Sequence[np.ndarray],
     blocks: Sequence[np.ndarray],
-    seen: Spread | FactoredSpread,
+    spread: Spread | FactoredSpread,
 ) -> tuple[Group, ...]:
     """Compute chi-square, degrees of freedom and noise of each record.
 
@@ -372,7 +372,7 @@ def groups_of(
         Residuals of each record in units of their errors, zero where the weight is zero.
     blocks : sequence of ndarray
         `triangle` of each record's rows of the Jacobian, and of those of the priors.
-    seen : Spread
+    spread : Spread
         Spread from all rows together.
 
     Returns
@@ -389,7 +389,7 @@ def groups_of(
     for record, r, block in zip(records, residuals, blocks, strict=False):
         chi2, count = float(r @ r), int(record.used.sum())
         # The trace of the whole hat matrix is the rank.
-        hat = seen.rank if block.shape[0] == row_count else seen.trace(block)
+        hat = spread.rank if block.shape[0] == row_count else spread.trace(block)
         dof = round(count - hat, 9)
         guess = record.prior_freedom
         scale = math.sqrt((guess + chi2) / (guess + dof)) if dof > 0 else math.nan

@@ -413,8 +413,8 @@ def descent_of(p: Problem, points: np.ndarray) -> Descent:
 
 def costs(p: Problem, d: Descent, points: np.ndarray) -> np.ndarray:
     """Half the sum of squares at points; a small problem uses its compiled Jacobian."""
-    look = p.compiled(residual)
-    found = map(look, points) if d.large else d.slopes(np.zeros(len(points), int), points)[0]
+    evaluate = p.compiled(residual)
+    found = map(evaluate, points) if d.large else d.slopes(np.zeros(len(points), int), points)[0]
     with np.errstate(over="ignore"):  # of a model with huge values
         return np.array([0.5 * float(r @ r) for r in map(np.asarray, found)])
 
@@ -441,23 +441,23 @@ def _slopes_of_batch(core, thetas):
 def _sparse_slopes(p: Problem) -> Slopes:
     """Make the same function for many numbers: one point after the other, sparse if possible."""
     shape = p.residual_count, len(p.start)
-    sweep, whole = p.compiled(_products), p.compiled(residual_and_jacobian)
+    sweep, dense = p.compiled(_products), p.compiled(residual_and_jacobian)
     pattern: Pattern | None = None
     sparse = True
 
     def one(theta: np.ndarray) -> tuple[np.ndarray, Rows]:
         nonlocal pattern, sparse
-        there = partial(sweep, theta)
+        sweep_here = partial(sweep, theta)
         # If an entry is nonzero for the first time, the sparsity pattern is determined again.
         for again in (False, True):
             if sparse and (again or pattern is None):
-                pattern = pattern_at(there, shape, pattern)
+                pattern = pattern_at(sweep_here, shape, pattern)
                 sparse = pattern is not None
             if sparse:
-                r, found = pattern.jacobian(there)
+                r, found = pattern.jacobian(sweep_here)
                 if found is not None:
                     return r, found
-        r, found = whole(theta)
+        r, found = dense(theta)
         return np.asarray(r), np.asarray(found)
 
     def slopes(_: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

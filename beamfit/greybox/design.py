@@ -96,12 +96,12 @@ def rows_of(covariance: np.ndarray) -> np.ndarray:
     return (vectors / np.sqrt(np.maximum(sizes, 1e-14 * sizes[-1]))).T / unit
 
 
-def scores(known: Information, candidates: np.ndarray, volume: bool = False) -> np.ndarray:
+def scores(information: Information, candidates: np.ndarray, volume: bool = False) -> np.ndarray:
     """Score each candidate alone by the expected error with it; smaller is better.
 
     Parameters
     ----------
-    known : Information
+    information : Information
         Information so far.
     candidates : ndarray
         Shape (candidates, rows, n); rows of zeros are padding.
@@ -124,27 +124,29 @@ def scores(known: Information, candidates: np.ndarray, volume: bool = False) -> 
     >>> scores(one, np.array([[[0.0, 9.0]], [[np.sqrt(3.0), 0.0]]])).round(6).tolist()
     [1.0, 0.5]
     """
-    covariance = known.spread.covariance
+    covariance = information.spread.covariance
     moved = candidates @ covariance
     inner = np.eye(candidates.shape[1]) + moved @ np.swapaxes(candidates, 1, 2)
     if volume:
-        at = np.flatnonzero(known.asked)
+        at = np.flatnonzero(information.asked)
         unit = np.sqrt(np.diagonal(covariance)[at])
         gain = np.swapaxes(moved[..., at], 1, 2) @ np.linalg.solve(inner, moved[..., at])
         return np.linalg.slogdet((covariance[np.ix_(at, at)] - gain) / np.outer(unit, unit))[1]
-    slope = known.slope / known.value[:, None]
+    slope = information.slope / information.value[:, None]
     change = moved @ slope.T
     before = np.einsum("ij,jk,ik->", slope, covariance, slope)
     gain = np.einsum("cij,cij->c", change, np.linalg.solve(inner, change))
     return np.sqrt(np.maximum(before - gain, 0.0))
 
 
-def greedy(known: Information, candidates: np.ndarray, volume: bool = False) -> Iterator[Choice]:
+def greedy(
+    information: Information, candidates: np.ndarray, volume: bool = False
+) -> Iterator[Choice]:
     """Yield candidates without end, each the best one after those chosen before.
 
     Parameters
     ----------
-    known, candidates, volume
+    information, candidates, volume
         As for `scores`.
 
     Yields
@@ -166,8 +168,8 @@ def greedy(known: Information, candidates: np.ndarray, volume: bool = False) -> 
     """
     none = np.zeros((1, *candidates.shape[1:]))
     while True:
-        [before] = scores(known, none, volume)
-        after = scores(known, candidates, volume)
+        [before] = scores(information, none, volume)
+        after = scores(information, candidates, volume)
         best = int(np.argmin(after))
-        known = known.with_rows(candidates[best])
-        yield Choice(best, float(1.0 - after[best] / before), known)
+        information = information.with_rows(candidates[best])
+        yield Choice(best, float(1.0 - after[best] / before), information)

@@ -81,13 +81,13 @@ def diagnose(p: Problem) -> tuple[Ailment, ...]:
     undetermined ('a', 'b')
     """
     start = np.clip(p.start, p.lower, p.upper)
-    if wrong := contradictory(p):
-        return tuple(wrong)
+    if errors := contradictory(p):
+        return tuple(errors)
     points = [start, *assess.points_nearby(p, p.start, np.maximum(np.abs(p.start), 1.0))]
     first, *others = assess.slopes_at(p, np.array(points))
     # Test part by part only if something is wrong: each part must be traced anew.
-    if not first.finite and (wrong := not_finite(p, start)):
-        return tuple(wrong)
+    if not first.finite and (errors := not_finite(p, start)):
+        return tuple(errors)
     samples = [at for at in (first, *others) if at.finite]
     if not samples:  # no point nearby has finite derivatives
         return ()
@@ -168,9 +168,9 @@ def _error_about(
 
 def _unused(p: Problem, samples: list[assess.Slopes]) -> Iterator[Ailment]:
     every = [np.vstack([a.residual_jacobian, a.gradient[None], a.jacobian]) for a in samples]
-    loose = p.moving & ~_depends(every).any(axis=0)
+    unused = p.moving & ~_depends(every).any(axis=0)
     message = "nothing depends on {}; fix or remove what is not needed."
-    yield from _error_about("unused", p.names, loose, message)
+    yield from _error_about("unused", p.names, unused, message)
     idle = ~_depends([at.jacobian for at in samples])[:, p.moving].any(axis=1)
     message = "{} depends on no free number; free what it limits, or remove it."
     yield from _error_about("constant", p.constraint_names, idle, message)
@@ -186,8 +186,8 @@ def _undetermined(p: Problem, samples: list[assess.Slopes]) -> Iterator[Ailment]
         f"{len(every[0])} rows do not determine {{}} each: only combinations of them; fix some, or "
         "add data or priors."
     )
-    loose = used[_undetermined_columns([rows[:, used] for rows in every])]
-    yield from _error_about("undetermined", p.names, loose, message)
+    undetermined = used[_undetermined_columns([rows[:, used] for rows in every])]
+    yield from _error_about("undetermined", p.names, undetermined, message)
 
 
 def _undetermined_columns(samples: list[np.ndarray]) -> np.ndarray:
@@ -206,9 +206,9 @@ def _dependent(p: Problem, samples: list[assess.Slopes]) -> Iterator[Ailment]:
     equal = np.flatnonzero(p.equations)
     if not len(equal):
         return
-    loose = equal[_undetermined_columns([at.jacobian[equal][:, p.moving].T for at in samples])]
+    dependent = equal[_undetermined_columns([at.jacobian[equal][:, p.moving].T for at in samples])]
     message = "the equations {} are not independent; remove what follows from others."
-    yield from _error_about("dependent_equations", p.constraint_names, loose, message)
+    yield from _error_about("dependent_equations", p.constraint_names, dependent, message)
 
 
 def _scaled(p: Problem, samples: list[assess.Slopes]) -> Iterator[Ailment]:
@@ -277,13 +277,13 @@ def find_conflict(p: Problem, s: SearchState, starts: Iterable[np.ndarray]) -> C
     points = np.array([s.theta, *starts])
 
     def nearest_point(weight, low, high):
-        data = (p.core, p.constraint_lower, p.constraint_upper, s.limits.size, weight)
+        data = (p.core, p.constraint_lower, p.constraint_upper, s.limits.scale, weight)
         found = descend_all(excess, data, np.clip(points, low, high), low, high)
         cost = np.where(np.isfinite(found.cost), found.cost, np.inf)
         theta = np.asarray(found.theta[int(np.argmin(cost))])
         return theta, np.asarray(excess(data, theta))
 
-    theta, violation = nearest_point(np.ones(len(s.limits.size)), p.lower, p.upper)
+    theta, violation = nearest_point(np.ones(len(s.limits.scale)), p.lower, p.upper)
     if not np.max(violation) > p.tolerance:
         return Conflict(theta, ())
     weight = (violation > p.tolerance).astype(float)
@@ -348,24 +348,24 @@ def dependence(p: Problem, s: SearchState, stationary: bool) -> Dependence | Non
     low, high = (
         np.concatenate(pair) for pair in zip(s.bounds.reached, s.limits.reached, strict=True)
     )
-    on = (low | high) & np.concatenate([moving, np.ones(len(s.limits.size), bool)])
+    active = (low | high) & np.concatenate([moving, np.ones(len(s.limits.scale), bool)])
     # Coefficients of either sign are allowed for equations, and for multipliers that are not zero.
     equal = low & high
     force = np.concatenate([s.bounds.multiplier, s.limits.multiplier])
-    pull = np.concatenate([unit, np.linalg.norm(s.at.jacobian * unit, axis=1)])
+    gradient_length = np.concatenate([unit, np.linalg.norm(s.at.jacobian * unit, axis=1)])
     strength = np.max(assess.gradient_size(p, s.at, s.scale) * unit)
-    free = equal | (stationary & (np.abs(force) * pull > p.tolerance * strength))
+    free = equal | (stationary & (np.abs(force) * gradient_length > p.tolerance * strength))
     outward = np.where(low, 1.0, -1.0)[:, None] * gradients
     length = np.linalg.norm(gradients, axis=1)
     steep = length > VANISHING_GRADIENT * size
-    rows = np.where(steep[:, None], outward / np.where(steep, length, 1.0)[:, None], 0.0)[on]
+    rows = np.where(steep[:, None], outward / np.where(steep, length, 1.0)[:, None], 0.0)[active]
     part = _vanishing_combination(
-        rows, free[on], DEPENDENT_AT_OPTIMUM if stationary else DEPENDENT_ELSEWHERE
+        rows, free[active], DEPENDENT_AT_OPTIMUM if stationary else DEPENDENT_ELSEWHERE
     )
     if part is None:
         return None
     names = np.array([*p.names, *p.constraint_names])
-    involved = np.flatnonzero(on)[np.abs(part) > MIN_COEFFICIENT * np.max(np.abs(part))]
+    involved = np.flatnonzero(active)[np.abs(part) > MIN_COEFFICIENT * np.max(np.abs(part))]
     flat = involved[~steep[involved]]
     return Dependence(tuple(names[involved].tolist()), tuple(names[flat].tolist()))
 
@@ -373,8 +373,8 @@ def dependence(p: Problem, s: SearchState, stationary: bool) -> Dependence | Non
 def _changes_nearby(p: Problem, s: SearchState) -> np.ndarray:
     """Compute the largest change of each constraint, per unit step, at random points nearby."""
     points = assess.points_nearby(p, s.theta, assess.scale_of(p, s.theta, s.at).unit)
-    look = p.compiled(problem.constraints)
-    values = np.array([look(point) for point in points])
+    evaluate = p.compiled(problem.constraints)
+    values = np.array([evaluate(point) for point in points])
     change = np.abs(values - s.at.constraints) / TEST_DISTANCE
     return np.max(np.where(np.isfinite(change), change, 0.0), axis=0, initial=0.0)
 
@@ -397,9 +397,9 @@ def _vanishing_combination(rows: np.ndarray, free: np.ndarray, cut: float) -> np
             return v
     if not free.any():
         return None
-    left, sizes, _ = np.linalg.svd(rows[free], full_matrices=True)
+    vectors, sizes, _ = np.linalg.svd(rows[free], full_matrices=True)
     rank = int(np.sum(sizes > cut * max(1.0, np.max(sizes))))
     if rank == free.sum():
         return None
-    v[free] = left[:, rank]
+    v[free] = vectors[:, rank]
     return v

@@ -309,10 +309,10 @@ class Fit:
         """A table of the verdict, the numbers and the active constraints."""
         per = f", chi2/dof = {self.chi2 / self.dof:.3g}" if self.dof > 0 else ""
         fits = self.problem.has_data
-        worth = (
+        quality = (
             f"chi2 = {self.chi2:.6g}, dof = {self.dof}{per}" if fits else f"cost = {self.cost:.6g}"
         )
-        lines = [f"{self.status}: {self.message}", f"{worth}, KKT = {self.kkt.worst:.1e}"]
+        lines = [f"{self.status}: {self.message}", f"{quality}, KKT = {self.kkt.worst:.1e}"]
         shown = [v for v, n in zip(self.variables, self.problem.nuisance, strict=True) if not n]
         width = max((len(row.name) for row in (*shown, *self.constraints)), default=4)
         for v in shown:

@@ -132,8 +132,8 @@ def residual_information(p: Problem, s: SearchState) -> ResidualInformation:
     For the degrees of freedom a number at an active bound is held. For its error, and for errors
     that depend on it, it is free within its bounds. Nuisance numbers stay on their bounds.
     """
-    held, on = assess.active_set(p, s, 1e-9)
-    equations = s.at.jacobian[on]
+    held, active = assess.active_set(p, s, 1e-9)
+    equations = s.at.jacobian[active]
     ends = np.cumsum([record.measured.size for record in p.records], dtype=int)
     parts = zip([0, *ends], [*ends, None], strict=True)
     blocks = [triangle(s.at.residual_jacobian[first:last]) for first, last in parts]
@@ -183,10 +183,10 @@ def has_settled(p: Problem, s: SearchState) -> bool:
     weight = np.ones(len(s.at.residual))
     for group in found.groups:
         weight[group.rows] = 1.0 if group.errors_given else group.factor**-2
-    pull = s.at.residual_jacobian.T @ (weight * s.at.residual)
-    outward = np.where(s.bounds.reached[0], pull > 0, s.bounds.reached[1] & (pull < 0))
-    pull = np.where(outward | found.held, 0.0, pull)
-    return bool(found.spread_raw.size(pull) ** 2 < SETTLED_DECREASE)
+    gradient = s.at.residual_jacobian.T @ (weight * s.at.residual)
+    outward = np.where(s.bounds.reached[0], gradient > 0, s.bounds.reached[1] & (gradient < 0))
+    gradient = np.where(outward | found.held, 0.0, gradient)
+    return bool(found.spread_raw.size(gradient) ** 2 < SETTLED_DECREASE)
 
 
 # ---- the answer
@@ -231,9 +231,9 @@ def _inner_failure(p: Problem, theta: np.ndarray) -> str | None:
     parts = jax.tree.leaves(p.core, is_leaf=lambda part: isinstance(part, Implicit))
     if not any(isinstance(part, Implicit) for part in parts):
         return None
-    look = checkify.checkify(jax.jit(problem.values), errors=checkify.user_checks)
-    said = look(p.core, jnp.asarray(theta, float))[0].get()
-    return None if said is None else said.removesuffix(" (`check` failed)")
+    check = checkify.checkify(jax.jit(problem.values), errors=checkify.user_checks)
+    message = check(p.core, jnp.asarray(theta, float))[0].get()
+    return None if message is None else message.removesuffix(" (`check` failed)")
 
 
 def _variables(
@@ -304,14 +304,14 @@ def _infeasible(e: FitEvidence) -> Finding | None:
 
 def _unbounded(e: FitEvidence) -> Finding | None:
     """Rule: the cost has no minimum."""
-    cost, far = float(e.state.at.cost), _runaway_numbers(e.state)
+    cost, runaway = float(e.state.at.cost), _runaway_numbers(e.state)
     if (
         not e.problem.objectives
         or cost >= UNBOUNDED_COST * e.state.scale.cost
         or cost_outgrew_scale(e.state)
     ):
         return None
-    about = tuple(np.array(e.problem.names)[far].tolist())
+    about = tuple(np.array(e.problem.names)[runaway].tolist())
     along = f" as {listed(about)} grows" if about else ""
     remedy = "bound the free numbers, or check the sign of the objective."
     cause = f"the cost falls without end{along} (down to {cost:.3g});"
@@ -429,7 +429,7 @@ class Gauge(NamedTuple):
     free: int
 
 
-def gauges(p: Problem, theta: np.ndarray, unseen: np.ndarray) -> tuple[Gauge, ...]:
+def gauges(p: Problem, theta: np.ndarray, directions: np.ndarray) -> tuple[Gauge, ...]:
     """Find symmetries of the model among the directions that the data do not determine.
 
     A direction along which residuals do not change at randomly chosen settings either could not be
@@ -441,7 +441,7 @@ def gauges(p: Problem, theta: np.ndarray, unseen: np.ndarray) -> tuple[Gauge, ..
         The problem.
     theta : array, shape (n,)
         The point.
-    unseen : array, shape (n, k)
+    directions : array, shape (n, k)
         Directions along which the residuals do not change there.
 
     Returns
@@ -460,7 +460,7 @@ def gauges(p: Problem, theta: np.ndarray, unseen: np.ndarray) -> tuple[Gauge, ..
     >>> gauges(p, at, np.array([[2.0], [-3.0]]))[0].names
     ('first', 'second')
     """
-    freedoms = _model_freedoms(p, theta, unseen)
+    freedoms = _model_freedoms(p, theta, directions)
     if not freedoms.shape[1]:
         return ()
     basis = np.linalg.qr(freedoms)[0]
@@ -484,11 +484,11 @@ def gauges(p: Problem, theta: np.ndarray, unseen: np.ndarray) -> tuple[Gauge, ..
     return tuple(found)
 
 
-def _model_freedoms(p: Problem, theta: np.ndarray, unseen: np.ndarray) -> np.ndarray:
+def _model_freedoms(p: Problem, theta: np.ndarray, directions: np.ndarray) -> np.ndarray:
     """Find combinations of directions along which no prediction changes at random settings."""
     random, size = np.random.default_rng(0), _scales_of(theta)
-    length = np.linalg.norm(unseen / size[:, None], axis=0)
-    along = unseen[:, length > 0] / length[length > 0]  # numbers that are held do not move
+    length = np.linalg.norm(directions / size[:, None], axis=0)
+    along = directions[:, length > 0] / length[length > 0]  # numbers that are held do not move
     if not along.shape[1]:
         return along
     rows = np.vstack([_random_rows(p, theta, random) for _ in range(TEST_POINTS)])
@@ -538,12 +538,14 @@ def _random_settings(value: Any, random: np.random.Generator) -> Any:
 
 def together(found: list[Gauge]) -> Finding:
     """Name the numbers that can move together for any data."""
-    said = []
+    sentences = []
     for g in found:
         parts = [f"{n} {c:+.3g} %" for n, c in zip(g.names, g.changes, strict=True)]
         along = f" ({', '.join(parts[:4])})" if g.free == 1 else ""
-        said.append(f"{listed(g.names)} move together{along}")
-    cause = f"{'; '.join(said)}: no prediction changes, whatever the data, a freedom of the model;"
+        sentences.append(f"{listed(g.names)} move together{along}")
+    cause = (
+        f"{'; '.join(sentences)}: no prediction changes, whatever the data, a freedom of the model;"
+    )
     count = sum(g.free for g in found)
     few = "one of them" if count == 1 else f"{count} of them"
     names = tuple(name for g in found for name in g.names)
@@ -603,8 +605,8 @@ def _optimum(e: FitEvidence) -> Finding:
             f"cost of {e.state.at.cost:.6g} {e.kkt_text}; others at {listed(costs)}.",
         )
     if e.search.exact and convex(e.problem):
-        said = f"the optimum was reached: the problem is convex {e.kkt_text}."
-        return Finding(Status.optimal, said)
+        cause = f"the optimum was reached: the problem is convex {e.kkt_text}."
+        return Finding(Status.optimal, cause)
     text = f"a local optimum was reached from 1 start {e.kkt_text};"
     if len(e.search.attempts) > 1:
         text = (

@@ -33,7 +33,7 @@ class Map(Protocol):
         """Compute the outputs at one point, shape (len(inputs),) to (len(outputs),)."""
 
 
-def positions(chosen: Sequence[str], names: Sequence[str], what: str = "name") -> list[int]:
+def positions(chosen: Sequence[str], names: Sequence[str], kind: str = "name") -> list[int]:
     """Find the positions of chosen names in a list of names.
 
     Parameters
@@ -42,7 +42,7 @@ def positions(chosen: Sequence[str], names: Sequence[str], what: str = "name") -
         Names to find.
     names : sequence of str
         All names.
-    what : str
+    kind : str
         Kind of thing that they name, for the error message.
 
     Returns
@@ -61,7 +61,7 @@ def positions(chosen: Sequence[str], names: Sequence[str], what: str = "name") -
     """
     for name in chosen:
         if name not in names:
-            raise InputError(f"no {what} '{name}'", nearest(name, list(names)))
+            raise InputError(f"no {kind} '{name}'", nearest(name, list(names)))
     return [list(names).index(name) for name in chosen]
 
 

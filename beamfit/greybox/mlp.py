@@ -260,16 +260,16 @@ def _check_gains(net: MLP) -> None:
             )
 
 
-def _arrays(given, shapes: Mapping[str, tuple[int, ...]], what: str) -> dict[str, jax.Array]:
+def _arrays(given, shapes: Mapping[str, tuple[int, ...]], kind: str) -> dict[str, jax.Array]:
     """Collect arrays by name, zero where none is given."""
     given = dict(given or {})
-    positions(list(given), list(shapes), what)
+    positions(list(given), list(shapes), kind)
     found = {}
     for name, shape in shapes.items():
         found[name] = jnp.asarray(given.get(name, np.zeros(shape)), float)
         if found[name].shape != shape:
             raise InputError(
-                f"values of shape {found[name].shape} for {what} '{name}'", f"shape {shape}"
+                f"values of shape {found[name].shape} for {kind} '{name}'", f"shape {shape}"
             )
     return found
 

@@ -174,8 +174,8 @@ def _make_law(own, log_volume, derive, build) -> tuple[PosteriorLaw, Callable]:
         theta = tree.read(model, core.chosen)
         inside = jnp.all((theta >= data.ends[0]) & (theta <= data.ends[1]))
         for constraint in core.constraints:
-            held = constraint.function(model, constraint.data)
-            inside &= jnp.all((held >= constraint.lower) & (held <= constraint.upper))
+            limited = constraint.function(model, constraint.data)
+            inside &= jnp.all((limited >= constraint.lower) & (limited <= constraint.upper))
         return jnp.where(inside, value, -jnp.inf)
 
     law = PosteriorLaw(
@@ -280,8 +280,10 @@ def _remark(
 ) -> str:
     """Join the study's remark and a warning of other optima that the sampler does not reach."""
     steps = [derivative @ (other - optimum.theta) for other in optimum.others]
-    far = any(np.any(np.abs(step) > MAX_DISTANCE * np.sqrt(np.diag(covariance))) for step in steps)
-    return " ".join(filter(None, (stated.remark, OTHER_OPTIMUM if far else "")))
+    too_far = any(
+        np.any(np.abs(step) > MAX_DISTANCE * np.sqrt(np.diag(covariance))) for step in steps
+    )
+    return " ".join(filter(None, (stated.remark, OTHER_OPTIMUM if too_far else "")))
 
 
 class Predicted(NamedTuple):
@@ -369,11 +371,11 @@ def _groups(
 def _observed(p: Problem) -> dict[str, np.ndarray]:
     found = {}
     for record in p.records:
-        for what in ("measured", "error"):
-            values = getattr(record, what)
+        for field in ("measured", "error"):
+            values = getattr(record, field)
             if values is not None:
                 every = np.broadcast_to(values, record.measured.shape).ravel()
-                found[f"{record.name} {what}"] = every[record.used]
+                found[f"{record.name} {field}"] = every[record.used]
     return found
 
 

@@ -326,11 +326,11 @@ def minimum(program: Quadratic, start: jax.Array) -> tuple[jax.Array, jax.Array]
     slack, multiplier, violation = (
         jnp.maximum(jnp.abs(v + d), 1.0) for v, d in zip(first[1:], step[1:], strict=True)
     )
-    begin = _Point(start, slack, jnp.minimum(multiplier, half), soft * violation)
+    initial = _Point(start, slack, jnp.minimum(multiplier, half), soft * violation)
     end, _, _ = jax.lax.while_loop(
         lambda now: (now[1] > CONVERGED) & (now[2] < MAX_STEPS),
         lambda now: _iterate(program, now[0], now[2]),
-        (begin, jnp.asarray(jnp.inf), jnp.asarray(0)),
+        (initial, jnp.asarray(jnp.inf), jnp.asarray(0)),
     )
     return end.z, end.multiplier
 

@@ -99,10 +99,10 @@ def solve(
     if starts < 1 or iterations < 1:
         raise InputError(f"{starts} starts of {iterations} iterations", "at least one of each")
     _check_options(hessian, seconds, solver, squares)
-    wrong = contradictory(p)
-    if wrong:
+    contradictions = contradictory(p)
+    if contradictions:
         spent = time.perf_counter() - began
-        return refuse(p, Finding(Status.contradictory_bounds, wrong[0].message), spent)
+        return refuse(p, Finding(Status.contradictory_bounds, contradictions[0].message), spent)
     drawn = _draw_starts(p, starts, seed)
     points = np.clip(drawn, p.lower, p.upper)
     moved = int(np.sum(np.any(points != drawn, axis=1)))
@@ -124,8 +124,8 @@ def solve(
     if not best.feasible and p.constraints and best.at.finite and budget.seconds_left > 0:
         conflict = find_conflict(p, best, starting_points(p, 6, seed))
         if conflict.feasible:
-            more, again = _search_constrained(p, conflict.theta[None], budget, hessian)
-            found, attempts = found + more, attempts + again
+            further, again = _search_constrained(p, conflict.theta[None], budget, hessian)
+            found, attempts = found + further, attempts + again
             best = found[_best(p, found)]
     exact = hessian == "exact"
     done = Search(attempts, moved, seconds, budget.seconds_left <= 0, exact, conflict)
@@ -194,7 +194,7 @@ def _best(p: Problem, found: list[SearchState]) -> int:
 
     def rank(s: SearchState) -> tuple:
         feasible = s.feasible
-        saved = np.abs(s.limits.multiplier) @ (s.limits.violation * s.limits.size)
+        saved = np.abs(s.limits.multiplier) @ (s.limits.violation * s.limits.scale)
         return (not feasible, s.at.cost + saved if feasible else s.kkt.feasibility)
 
     order = sorted(range(len(found)), key=lambda i: rank(found[i]))

@@ -200,8 +200,8 @@ class Pattern:
         r, products = _products(sweep, self.seeds)
         found = _from_products(self.places, self.colours, products)
         size = abs(found) @ self.seeds[-1]
-        wrong = np.abs(found @ self.seeds[-1] - products[-1])
-        complete = not np.any(wrong > PATTERN_TOLERANCE * (size + np.max(size, initial=0.0)))
+        difference = np.abs(found @ self.seeds[-1] - products[-1])
+        complete = not np.any(difference > PATTERN_TOLERANCE * (size + np.max(size, initial=0.0)))
         return r, found if complete else None
 
 

@@ -335,9 +335,9 @@ def gains_at(
     found, scope = {}, program.scope
     for gain in gains:
         output, by = gain_parts(gain)
-        for name, face, what in ((output, scope.outputs, "output"), (by, scope.inputs, "input")):
+        for name, face, kind in ((output, scope.outputs, "output"), (by, scope.inputs, "input")):
             if name not in face:
-                expected = f"an {what} of the document: {nearest(name, list(face))}"
+                expected = f"an {kind} of the document: {nearest(name, list(face))}"
                 raise InputError(f"'{name}' in --derivative {gain}", expected)
         key = f"d{output}/d{by}"
         at = defaults(scope) | dict(given)

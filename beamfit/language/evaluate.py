@@ -174,8 +174,8 @@ def _apply(e: x.Application, s: Context) -> Value:
 
 def _matrix(e: x.Application, wanted: int, given: int, function: Callable, v: Value) -> Value:
     if v.rank != wanted:
-        what = "a matrix" if wanted == 2 else "a vector"
-        raise error_at(e.arguments[0].at, f"'{e.arguments[0]}' of {v.rank} dimensions", what)
+        kind = "a matrix" if wanted == 2 else "a vector"
+        raise error_at(e.arguments[0].at, f"'{e.arguments[0]}' of {v.rank} dimensions", kind)
     square = v.array.shape[-2:]
     if e.function in ("inverse", "det", "trace") and square[0] != square[1]:
         found = f"'{e.arguments[0]}' of {square[0]} x {square[1]}"
@@ -283,13 +283,13 @@ def check_rank(scope: Scope, target: x.Name, array: Array, value: Value, e: x.Ex
     wanted = len(whole_dimensions(target, array))
     if value.rank in (0, wanted):
         return
-    said = f"{value.rank} dimension{'s' * (value.rank != 1)}"
+    dimensions = f"{value.rank} dimension{'s' * (value.rank != 1)}"
     whole = next((n for n in _names(e) if _is_whole(scope, n)), None)
     if wanted or whole is None:
         expected = f"{wanted or 'no'} dimension{'s' * (wanted != 1)} as in '{target}'"
-        raise error_at(e.at, f"'{e}' of {said}", expected)
+        raise error_at(e.at, f"'{e}' of {dimensions}", expected)
     array = scope.arrays[whole.name]
-    where = "" if whole is e else f" in a formula of {said}"
+    where = "" if whole is e else f" in a formula of {dimensions}"
     expected = f"a number for '{target}', such as an element of {array.text}"
     count = len(whole_dimensions(whole, array))
     found = f"'{whole}' of {count} dimension{'s' * (count != 1)}{where}"

@@ -106,9 +106,9 @@ def _at(text: str, position: int) -> Place:
 
 def explain(error: UnexpectedCharacters | UnexpectedToken, text: str) -> InputError:
     """Make the error for a text that does not parse: place, wrong word and what is expected."""
-    at, odd_at = Place(error.line, error.column), error.pos_in_stream or 0
-    if known := _foreign_sign(text, odd_at) or _foreign_sum(text, odd_at):
-        return known
+    at, position = Place(error.line, error.column), error.pos_in_stream or 0
+    if error_found := _foreign_sign(text, position) or _foreign_sum(text, position):
+        return error_found
     if isinstance(error, UnexpectedCharacters):
         # The parser allows all tokens of any such place: reduce them to the useful ones.
         names = {TOKEN_TEXT.get(name) for name in error.allowed or ()}
@@ -116,7 +116,7 @@ def explain(error: UnexpectedCharacters | UnexpectedToken, text: str) -> InputEr
         if "an operator" in names:
             ends = "a number, a name, '(' or a function"
             expected = ends if "a number" in names else "an operator, or the end of the formula"
-        return error_at(at, f"{text[odd_at]!r}", expected)
+        return error_at(at, f"{text[position]!r}", expected)
     word, accepted = str(error.token), set(error.accepts or error.expected)
     before = error.token_history[-1] if error.token_history else None
     if hint := _misspelling(before, error.token, accepted):
@@ -125,36 +125,40 @@ def explain(error: UnexpectedCharacters | UnexpectedToken, text: str) -> InputEr
     if "SEMICOLON" in accepted and ended:
         end = _at(text, len(text.rstrip()))
         end = end if before is None else Place(before.end_line, before.end_column)
-        said = "" if before is None else f" behind '{shorten(before)}'"
-        return error_at(end, f"no ';'{said}", "';' at the end of a statement")
+        where = "" if before is None else f" behind '{shorten(before)}'"
+        return error_at(end, f"no ';'{where}", "';' at the end of a statement")
     if error.token.type == "$END":
         at = Place(before.end_line, before.end_column) if before is not None else at
         return error_at(at, "the end of the text", _choices(accepted))
-    known = _foreign_habit(before, error.token, accepted, text) if before is not None else None
-    return known or error_at(at, f"'{shorten(word)}'", _choices(accepted))
+    error_found = (
+        _foreign_habit(before, error.token, accepted, text) if before is not None else None
+    )
+    return error_found or error_at(at, f"'{shorten(word)}'", _choices(accepted))
 
 
-def _foreign_sign(text: str, odd_at: int) -> InputError | None:
+def _foreign_sign(text: str, position: int) -> InputError | None:
     """Make the error for a sign of another language at a position or the one before, or None."""
-    for start in (odd_at, max(odd_at - 1, 0)):
+    for start in (position, max(position - 1, 0)):
         for sign, wanted in SIGNS.items():
             if found := re.compile(sign).match(text, start):
                 return error_at(_at(text, start), f"'{found[0]}'", wanted)
     return None
 
 
-def _foreign_sum(text: str, odd_at: int) -> InputError | None:
+def _foreign_sum(text: str, position: int) -> InputError | None:
     """Make the error for a sum written as in another language, or None."""
-    before = text[:odd_at]
+    before = text[:position]
     named = r"\b(sum|prod|min|max|mean)\s*\(\s*\w+\s+in\s+\w+\s*"
-    comma = re.search(named + r"(?:(,)\s*\w*\s*[^\w\s|;][^|;]*|(:))$", text[: odd_at + 1])
+    comma = re.search(named + r"(?:(,)\s*\w*\s*[^\w\s|;][^|;]*|(:))$", text[: position + 1])
     if comma:
         wanted = f"'|' behind the set: {comma[1]}(k in K | ...)"
         sign = 2 if comma[2] else 3
         return error_at(_at(text, comma.start(sign)), f"'{comma[sign]}'", wanted)
     opened = before.rfind(";") + 1
-    if re.match(r"for\b", text[odd_at:]) and re.search(r"\b(sum|prod|mean)\s*\(", before[opened:]):
-        return error_at(_at(text, odd_at), "'for'", "the iterator first: sum(k in K | ...)")
+    if re.match(r"for\b", text[position:]) and re.search(
+        r"\b(sum|prod|mean)\s*\(", before[opened:]
+    ):
+        return error_at(_at(text, position), "'for'", "the iterator first: sum(k in K | ...)")
     return None
 
 
@@ -215,10 +219,10 @@ def _foreign_habit(before: Token, token: Token, accepted: set[str], text: str) -
     """Make the error for a habit of other languages (formulas as limits, |x|, units), or None."""
     for is_one, wanted, earlier in HABITS:
         if is_one(before, token, accepted):
-            odd = before if earlier else token
+            wrong = before if earlier else token
             pair = " between them" in wanted
-            found = f"'{shorten(odd)}'" + (f" behind '{shorten(before)}'" if pair else "")
-            return error_at(Place(odd.line, odd.column), found, wanted)
+            found = f"'{shorten(wrong)}'" + (f" behind '{shorten(before)}'" if pair else "")
+            return error_at(Place(wrong.line, wrong.column), found, wanted)
     return None
 
 
@@ -251,10 +255,10 @@ def _closest_keyword(word: str, keywords: Iterable[str]) -> str | None:
 
 def _choices(accepted: Any) -> str:
     """Describe the accepted tokens."""
-    said = {TOKEN_TEXT.get(name, name.lower()) for name in accepted}
-    if {"real", "set", "a name"} <= said:
+    texts = {TOKEN_TEXT.get(name, name.lower()) for name in accepted}
+    if {"real", "set", "a name"} <= texts:
         return "a statement"
-    return " or ".join(filter(None, [", ".join(sorted(said)[:-1]), *sorted(said)[-1:]]))
+    return " or ".join(filter(None, [", ".join(sorted(texts)[:-1]), *sorted(texts)[-1:]]))
 
 
 def shorten(word: str) -> str:

@@ -130,10 +130,10 @@ def format_network(net: MLP, name: str = "mlp") -> str:
             for field, default in NUMBERS.items():
                 if (value := getattr(port, field)) != default:
                     e.set(field, repr(float(value)))
-    for asked in net.gains:
-        by = dict(zip(("da", "db", "dc"), asked.by, strict=False))
-        e = Plain.SubElement(root, "gain", name=asked.name, order=str(len(asked.by)))
-        e.attrib |= {"type": asked.kind, "dy": asked.output, **by, "cells": str(asked.cells)}
+    for gain in net.gains:
+        by = dict(zip(("da", "db", "dc"), gain.by, strict=False))
+        e = Plain.SubElement(root, "gain", name=gain.name, order=str(len(gain.by)))
+        e.attrib |= {"type": gain.kind, "dy": gain.output, **by, "cells": str(gain.cells)}
     for layer in net.layers:
         bias = str(layer.bias).lower()
         e = Plain.SubElement(

@@ -284,8 +284,8 @@ def _group(items: list[Any]) -> dict[str, list[Any]]:
     """Group members by kind, in order; those without a kind are statements."""
     found: dict[str, list[Any]] = defaultdict(list)
     for item in items:
-        kind, what = item if isinstance(item, tuple) else ("statements", item)
-        found[kind] += what if isinstance(what, list) else [what]
+        kind, member = item if isinstance(item, tuple) else ("statements", item)
+        found[kind] += member if isinstance(member, list) else [member]
     return found
 
 

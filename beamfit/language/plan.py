@@ -56,13 +56,13 @@ def callee_of(scope: Scope, call: d.Call) -> Scope | CalledNetwork:
     """Find the mapping or network of a call, and check the names of its inputs and outputs."""
     callee = scope.callees.get(call.mapping)
     if callee is None:
-        known = nearest(call.mapping, list(scope.callees))
-        raise error_at(call.at, f"unknown mapping '{call.mapping}'", known)
+        suggestion = nearest(call.mapping, list(scope.callees))
+        raise error_at(call.at, f"unknown mapping '{call.mapping}'", suggestion)
     for wire in call.inputs:
         if wire.target.name not in callee.inputs:
-            known = nearest(wire.target.name, list(callee.inputs))
+            suggestion = nearest(wire.target.name, list(callee.inputs))
             found = f"unknown input '{wire.target.name}' of {call.mapping}"
-            raise error_at(wire.target.at, found, known)
+            raise error_at(wire.target.at, found, suggestion)
     given = [w.target.name for w in call.inputs if not w.target.indices]
     for name, wanted in callee.inputs.items():
         if wanted.values is None and name not in [w.target.name for w in call.inputs]:
@@ -89,10 +89,10 @@ def gains_of(
         at = (wrong or [wire.value])[0].at
         raise error_at(at, f"'{wire.value}'", f"an output of {label}, or gain(output, input)")
     faces = [callee.outputs, *[callee.inputs] * (len(names) - 1)]
-    for e, face, what in zip(names, faces, ["output", *["input"] * (len(names) - 1)], strict=True):
+    for e, face, kind in zip(names, faces, ["output", *["input"] * (len(names) - 1)], strict=True):
         if e.name not in face:
-            known = nearest(e.name, list(face))
-            raise error_at(e.at, f"unknown {what} '{e.name}' of {label}", known)
+            suggestion = nearest(e.name, list(face))
+            raise error_at(e.at, f"unknown {kind} '{e.name}' of {label}", suggestion)
     return names[0], names[1:]
 
 
@@ -115,10 +115,12 @@ def target_elements(scope: Scope, node: x.Name, axes: Axes) -> Read:
     found = scope.arrays.get(node.name)
     if found is None or found.role not in ("output", "real"):
         free = [a.name for a in scope.arrays.values() if a.role in ("output", "real")]
-        known = nearest(node.name, free)
+        suggestion = nearest(node.name, free)
         if found is None:
-            raise error_at(node.at, f"unknown name '{node.name}'", f"{known}, or real {node.name};")
-        raise error_at(node.at, f"{found.role} '{node.name}' set by a statement", known)
+            raise error_at(
+                node.at, f"unknown name '{node.name}'", f"{suggestion}, or real {node.name};"
+            )
+        raise error_at(node.at, f"{found.role} '{node.name}' set by a statement", suggestion)
     return Read(found, node, axes, find_positions(scope, node, found, axes))
 
 
@@ -182,8 +184,8 @@ def _time_choices(
             values = indices[moving[0]].ravel()
             if np.any(np.diff(values) != 1):
                 break
-            here = TimeAxis(moving[0], int(values[0]))
-            if found.setdefault(node.name, here) != here:
+            time_axis = TimeAxis(moving[0], int(values[0]))
+            if found.setdefault(node.name, time_axis) != time_axis:
                 break
         else:
             yield axis, found, len(over)
@@ -368,8 +370,8 @@ def _set_owner(scope: Scope, owners: dict[str, np.ndarray], step: MappingStep, w
     flat = np.flatnonzero(mark)
     if flat.size < combined * whole:
         unused = [n for n in write.axes if n not in _names(node)]
-        said = f"'{node}' has no index {', '.join(unused)}" if unused else "its index repeats"
-        found = f"'{node}' set more than once by one statement ({said})"
+        reason = f"'{node}' has no index {', '.join(unused)}" if unused else "its index repeats"
+        found = f"'{node}' set more than once by one statement ({reason})"
         raise error_at(node.at, found, "each element once")
     taken = flat[owner[flat] != NO_OWNER]
     if taken.size:
@@ -395,8 +397,8 @@ def _owners_of(owners: dict[str, np.ndarray], read: Read) -> np.ndarray:
     flat = read.flat
     missing = flat[owner[flat] == NO_OWNER]
     if missing.size:
-        said = f"'{read.array.element(missing[0])}', used in '{read.node}', which no statement sets"
-        raise error_at(read.node.at, said, "a statement that sets this element")
+        text = f"'{read.array.element(missing[0])}', used in '{read.node}', which no statement sets"
+        raise error_at(read.node.at, text, "a statement that sets this element")
     return np.flatnonzero(np.bincount(owner[flat]))
 
 
@@ -461,9 +463,9 @@ def _loop_error(scope: Scope, steps: tuple[MappingStep, ...], needs, owners) -> 
     cycle = next((c for c, part in parts if plan_of(scope, part, owners) is None), found[0])
     names = [str(targets(scope, scope.steps[n])[0][0]) for n in cycle]
     lines = [str(n) for n in sorted({scope.steps[n].at.line for n in cycle})]
-    said = f"an algebraic loop: {' -> '.join(_shorten(names))} (line {', '.join(_shorten(lines))})"
+    text = f"an algebraic loop: {' -> '.join(_shorten(names))} (line {', '.join(_shorten(lines))})"
     expected = "statements of which each needs earlier ones only, or earlier times such as y[t-1]"
-    return error_at(scope.steps[min(cycle)].at, said, expected)
+    return error_at(scope.steps[min(cycle)].at, text, expected)
 
 
 def _shorten(words: list[str]) -> list[str]:

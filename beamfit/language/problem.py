@@ -32,21 +32,21 @@ def squares_of(m: d.Mapping, name: str, weight: float = 1.0) -> list[Square] | N
     set_by = {s.target.name: s.value for s in m.statements
               if isinstance(s, d.Assignment) and not s.each and not s.target.indices}  # fmt: skip
 
-    def terms(e: x.Expression, factor: float, seen: tuple[str, ...]) -> list[Square] | None:
+    def terms(e: x.Expression, factor: float, visited: tuple[str, ...]) -> list[Square] | None:
         match e:
-            case x.Name(n, ()) if n in set_by and n not in seen:
-                return terms(set_by[n], factor, (*seen, n))
+            case x.Name(n, ()) if n in set_by and n not in visited:
+                return terms(set_by[n], factor, (*visited, n))
             case x.Arithmetic("^", (body, x.Literal() as two)) if two.value == 2.0 and factor > 0:
                 return [Square(factor, body)]
             case x.Arithmetic("+", (left, right)):
-                both = terms(left, factor, seen), terms(right, factor, seen)
+                both = terms(left, factor, visited), terms(right, factor, visited)
                 return None if None in both else both[0] + both[1]
             case x.Arithmetic("*", (x.Literal() as n, inner)):
-                return terms(inner, factor * n.value, seen)
+                return terms(inner, factor * n.value, visited)
             case x.Arithmetic("/", (inner, x.Literal() as n)) if n.value != 0:
-                return terms(inner, factor / n.value, seen)
+                return terms(inner, factor / n.value, visited)
             case x.Reduction("sum", each, inner):
-                found = terms(inner, factor, seen)
+                found = terms(inner, factor, visited)
                 return found and [s._replace(each=(*each, *s.each)) for s in found]
         return None
 
@@ -214,14 +214,14 @@ def _free_numbers(
 
 def _warn_outside(v: d.FreeInput, given: Sequence[float] | None) -> list[str]:
     """Warn of a variable whose start lies outside its bounds."""
-    begin = v.random or ((v.value,) if v.value is not None else given or (v.lower, v.upper))
-    wrong = next((x for x in begin if not v.lower <= x <= v.upper), None)
-    if wrong is None:
+    starts = v.random or ((v.value,) if v.value is not None else given or (v.lower, v.upper))
+    bad = next((x for x in starts if not v.lower <= x <= v.upper), None)
+    if bad is None:
         return []
-    low, high = v.random or (wrong, wrong)
-    what = f"random starts in [{low:g}, {high:g}]" if v.random else f"start {wrong:g}"
+    low, high = v.random or (bad, bad)
+    text = f"random starts in [{low:g}, {high:g}]" if v.random else f"start {bad:g}"
     return [
-        f"At {v.at}: '{v.label}' has the {what} outside its bounds [{v.lower:g}, {v.upper:g}]; the "
+        f"At {v.at}: '{v.label}' has the {text} outside its bounds [{v.lower:g}, {v.upper:g}]; the "
         "search begins on the bound. State a start within them, or widen them."
     ]
 

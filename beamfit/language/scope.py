@@ -187,8 +187,8 @@ def set_of(scope: Scope, over: x.Elements, name: str = "") -> IndexSet:
         return IndexSet(name, found)
     start, stop, step = (*ends, 1)[:3]
     if step == 0 or (stop - start) * step < 0:
-        said = f"set {name} = {over}" if name else f"{over}"
-        raise error_at(over.at, f"{said}, an empty set", "a start before the stop")
+        text = f"set {name} = {over}" if name else f"{over}"
+        raise error_at(over.at, f"{text}, an empty set", "a start before the stop")
     check_size([abs((stop - start) // step) + 1], over.at, MAX_ELEMENTS)
     return IndexSet(name, np.arange(start, stop + np.sign(step), step))
 
@@ -200,15 +200,15 @@ def add_iterators(scope: Scope, axes: Axes, each: tuple[x.Iterator, ...]) -> dic
         if it.name in found:
             raise error_at(it.at, f"'{it.name}' runs already", "another name for this iterator")
         if it.name in scope.arrays or it.name in scope.sets:
-            what = "an array or a set" if it.name in scope.sets else "a variable"
-            raise error_at(it.at, f"'{it.name}', which is {what}", "a new name for the iterator")
+            kind = "an array or a set" if it.name in scope.sets else "a variable"
+            raise error_at(it.at, f"'{it.name}', which is {kind}", "a new name for the iterator")
         if isinstance(it.over, x.Elements):
             found[it.name] = set_of(scope, it.over)
         elif it.over in scope.sets:
             found[it.name] = scope.sets[it.over]
         else:
-            known = nearest(it.over, list(scope.sets))
-            raise error_at(it.at, f"no set '{it.over}' in '{it}'", known)
+            suggestion = nearest(it.over, list(scope.sets))
+            raise error_at(it.at, f"no set '{it.over}' in '{it}'", suggestion)
     check_size([len(s) for s in found.values()], each[0].at if each else x.NOWHERE)
     return found
 
@@ -244,8 +244,8 @@ def index_values(scope: Scope, e: x.Expression, axes: Axes) -> np.ndarray:
 
 
 def _iterator_hint(name: str, known: list[str]) -> str:
-    behind = f"'foreach {name} in SET' behind the statement, or sum({name} in SET | ...)"
-    return f"{behind}, or {nearest(name, known)}" if known else behind
+    usage = f"'foreach {name} in SET' behind the statement, or sum({name} in SET | ...)"
+    return f"{usage}, or {nearest(name, known)}" if known else usage
 
 
 def find_positions(scope: Scope, node: x.Name, array: Array, axes: Axes) -> list[np.ndarray]:
@@ -288,8 +288,8 @@ def _outside_error(node, index, dim, axes, values, at) -> InputError:
     """Make the error for an index outside its set, with the values of the iterators."""
     first = np.argwhere(np.atleast_1d(at) < 0)[0]
     value = np.atleast_1d(values)[tuple(first)]
-    said = f"index {index} = {value}" if str(index) != str(value) else f"index {value}"
-    found = f"{said} in '{node}'{iterator_text(axes, first, np.shape(at), ' at ')}"
+    text = f"index {index} = {value}" if str(index) != str(value) else f"index {value}"
+    found = f"{text} in '{node}'{iterator_text(axes, first, np.shape(at), ' at ')}"
     return error_at(index.at, found, f"an element of {dim}")
 
 
@@ -340,17 +340,17 @@ def _unknown_error(scope: Scope, e: x.Name, axes: Axes) -> InputError:
 
 def _check_arguments(scope: Scope, e: x.Application) -> None:
     if e.function in scope.functions:
-        least = most = len(scope.functions[e.function].arguments)
+        min_count = max_count = len(scope.functions[e.function].arguments)
     elif e.function in FUNCTIONS:
-        least, most = FUNCTIONS[e.function]
+        min_count, max_count = FUNCTIONS[e.function]
     else:
         meant = {"ln": "log", "lg": "log10"}.get(e.function, e.function)
-        known = nearest(meant, [*scope.functions, *FUNCTIONS, *REDUCTIONS])
+        suggestion = nearest(meant, [*scope.functions, *FUNCTIONS, *REDUCTIONS])
         if e.function in scope.arrays:
-            known = f"{e.function}[...] for an element, or an operator before the parenthesis"
-        raise error_at(e.at, f"unknown function '{e.function}'", known)
-    if not least <= len(e.arguments) <= most:
-        wanted = f"{least}" if least == most else f"at least {least}"
+            suggestion = f"{e.function}[...] for an element, or an operator before the parenthesis"
+        raise error_at(e.at, f"unknown function '{e.function}'", suggestion)
+    if not min_count <= len(e.arguments) <= max_count:
+        wanted = f"{min_count}" if min_count == max_count else f"at least {min_count}"
         raise error_at(e.at, f"{len(e.arguments)} arguments in '{e}'", wanted)
 
 
@@ -475,8 +475,8 @@ def _declare_tables(scope: Scope, m: d.Mapping, shapes: Mapping[str, tuple[int, 
             raise error_at(table.at, found, "its file, or its rows and columns")
         check_size([*shape], table.at)
         dims = tuple(
-            IndexSet(f"{what} of {table.name}", np.arange(1, n + 1))
-            for what, n in zip(("rows", "columns"), shape, strict=True)
+            IndexSet(f"{kind} of {table.name}", np.arange(1, n + 1))
+            for kind, n in zip(("rows", "columns"), shape, strict=True)
         )
         scope.arrays[table.name] = Array(table.name, "table", dims, table.at)
 
@@ -497,8 +497,8 @@ def _declare_statements(
         if isinstance(s, d.Block):
             _declare_statements(scope, s.statements, add_iterators(scope, axes, s.each))
         elif isinstance(s, d.Real) and s.value is not None:
-            what = d.Assignment(x.Name(s.name, at=s.at), s.value, at=s.at)
-            scope.steps.append(MappingStep(len(scope.steps), {}, what))
+            assignment = d.Assignment(x.Name(s.name, at=s.at), s.value, at=s.at)
+            scope.steps.append(MappingStep(len(scope.steps), {}, assignment))
         elif isinstance(s, d.Assignment | d.Call):
             inner = add_iterators(scope, axes, s.each)
             scope.steps.append(MappingStep(len(scope.steps), inner, s))
@@ -521,13 +521,13 @@ def _check_function(scope: Scope, f: d.Function) -> None:
 
 
 def _count_operations(
-    scope: Scope, f: d.Function, stack: tuple[str, ...], seen: dict | None = None
+    scope: Scope, f: d.Function, stack: tuple[str, ...], counted: dict | None = None
 ) -> int:
-    seen = {} if seen is None else seen
+    counted = {} if counted is None else counted
     if f.name in stack:
         loop = " -> ".join([*stack[stack.index(f.name) :], f.name])
         raise error_at(f.at, f"a function that needs itself: {loop}", "functions that end")
-    if f.name not in seen:
+    if f.name not in counted:
         total, todo = 0, [f.body]
         while todo:
             e = todo.pop()
@@ -535,13 +535,13 @@ def _count_operations(
             total += 1
             if isinstance(e, x.Application) and e.function in scope.functions:
                 total += _count_operations(
-                    scope, scope.functions[e.function], (*stack, f.name), seen
+                    scope, scope.functions[e.function], (*stack, f.name), counted
                 )
         if total > MAX_OPERATIONS:
             raise error_at(f.at, f"a function '{f.name}' of more than {MAX_OPERATIONS} operations",
                            "smaller functions")  # fmt: skip
-        seen[f.name] = total
-    return seen[f.name]
+        counted[f.name] = total
+    return counted[f.name]
 
 
 # ---- the problem
@@ -551,11 +551,11 @@ def check_problem(document: d.Document, given: Iterable[str] = ()) -> None:
     """Raise an error for unknown names, contradictory bounds and inputs without a value."""
     p, m = document.problem, document.mapping
     groups = (p.variables, m.inputs, "input"), ((*p.goals, *p.limits), m.outputs, "output")
-    for group, declared, what in groups:
+    for group, declared, kind in groups:
         known = [one.name for one in declared]
         for one in group:
             if one.model not in known:
-                found = f"no {what} '{one.model}' in the mapping"
+                found = f"no {kind} '{one.model}' in the mapping"
                 raise error_at(one.at, found, nearest(one.model, known))
     sizes = {one.name: one.dimensions for one in m.outputs}
     for one in p.goals:

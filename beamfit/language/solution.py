@@ -213,18 +213,18 @@ def solve_document(
     y = 1, optimal upper
     """
     began = time.perf_counter()
-    told, warnings = _solve_options(document.solver)
-    told |= {name: value for name, value in options.items() if value is not None}
-    tolerance = told.pop("tolerance", TOLERANCE)
+    options_used, warnings = _solve_options(document.solver)
+    options_used |= {name: value for name, value in options.items() if value is not None}
+    tolerance = options_used.pop("tolerance", TOLERANCE)
     made, notes = _with_finite_start(formulate(document, tables, values, tolerance))
-    fit = solve(made.problem, starts=starts, began=began, **told)
+    fit = solve(made.problem, starts=starts, began=began, **options_used)
     notes = (*made.notes, *notes, *_defects(made, fit), *warnings)
     if places := _places(made, fit.about):
         notes = (*notes, f"The verdict is about {places}.")
     if fit.status is Status.not_finite:
         cause = _cause(made, fit.model)
-        told = cause is None or any(cause in note for note in notes)
-        notes = notes if told else (*notes, f"Where it ended, {cause}.")
+        options_used = cause is None or any(cause in note for note in notes)
+        notes = notes if options_used else (*notes, f"Where it ended, {cause}.")
     if made.squares and math.isfinite(fit.scale):
         notes = (*notes, NOISE)
     outputs, gained = outputs_at(made.program, fit.model), gains_at(made.program, fit.model, gains)
@@ -242,9 +242,9 @@ def _with_finite_start(made: Formulation) -> tuple[Formulation, tuple[str, ...]]
     for draws, model in enumerate(islice(starts_of(made), 1, 100 if drawn else 1), 1):
         if slopes(p, np.concatenate([np.ravel(model[v.model]) for v in variables])).finite:
             times = "once" if draws == 1 else f"{draws} times"
-            said = f"At the start of the seeds {cause}"
-            begun = replace(made, problem=replace(made.problem, model=model))
-            return begun, (f"{said}; drawn again from the same seeds, {times}.",)
+            start_text = f"At the start of the seeds {cause}"
+            moved = replace(made, problem=replace(made.problem, model=model))
+            return moved, (f"{start_text}; drawn again from the same seeds, {times}.",)
     return made, (f"At the start {cause}.",) if cause else ()
 
 

@@ -67,12 +67,12 @@ def run_call(statement: d.Call, s: Context, inner: Callable[[str], Callable]) ->
     for wire, value, (output, _) in zip(statement.outputs, found, names, strict=True):
         own = value.shape[len(varying) :]
         whole = Value(value.reshape(*lead, *own), len(own))
-        axes, to = add_iterators(s.scope, s.axes, wire.each), wire.target
+        axes, target = add_iterators(s.scope, s.axes, wire.each), wire.target
         part = _take_output(s, whole, output, callee, axes, count)
-        array = s.scope.arrays[to.name]
-        check_rank(s.scope, to, array, part, wire.value)
-        old = changed.get(to.name, s.arrays[to.name])
-        changed[to.name] = assign(old, s.scope, array, to, axes, part, wire.value)
+        array = s.scope.arrays[target.name]
+        check_rank(s.scope, target, array, part, wire.value)
+        old = changed.get(target.name, s.arrays[target.name])
+        changed[target.name] = assign(old, s.scope, array, target, axes, part, wire.value)
     return changed
 
 

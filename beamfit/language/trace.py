@@ -90,9 +90,9 @@ class _Monitor:
         if not bad.any():
             return
         at = np.argwhere(bad)[0][: len(axes)]
-        what = "infinite" if np.any(np.isinf(array)) else "not a number"
-        what = "zero and has an infinite derivative" if np.all(np.isfinite(array)) else what
-        message = f"{e} is {what}{iterator_text(axes, at, array.shape, ' for ')} ({e.at})"
+        problem = "infinite" if np.any(np.isinf(array)) else "not a number"
+        problem = "zero and has an infinite derivative" if np.all(np.isfinite(array)) else problem
+        message = f"{e} is {problem}{iterator_text(axes, at, array.shape, ' for ')} ({e.at})"
         inner = ", ".join(self._text_of(part, at) for part in x.children(e) if self._is_shown(part))
         raise _FoundError(message + (f": {inner}" if inner else ""))
 
@@ -161,8 +161,10 @@ def _search_call(program: Program, step: MappingStep, s: Context) -> None:
             n: a[tuple(min(i, m - 1) for i, m in zip(at, a.shape, strict=False))]
             for n, a in given.items()
         }
-        when = [f"{n} = {one.elements[i]}" for (n, one), i in zip(s.axes.items(), at, strict=True)]
-        where = f" for {', '.join(when)}" if when else ""
+        iterators = [
+            f"{n} = {one.elements[i]}" for (n, one), i in zip(s.axes.items(), at, strict=True)
+        ]
+        where = f" for {', '.join(iterators)}" if iterators else ""
         inside = f"in {step.statement.mapping}{where}: "
         if found := cause_of(inner, point, names, inside, s.watch.slopes):
             raise _FoundError(found)

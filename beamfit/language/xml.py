@@ -95,8 +95,8 @@ class Node(NamedTuple):
         except (ValueError, OverflowError):
             value = math.nan
         if value != value:
-            said = "a whole number" if kind is int else "a number"
-            raise self.error(f"{key}='{self.attributes[key]}' in <{self.tag}>", said, key)
+            kind_text = "a whole number" if kind is int else "a number"
+            raise self.error(f"{key}='{self.attributes[key]}' in <{self.tag}>", kind_text, key)
         return value
 
     def numbers(self) -> tuple[float, ...]:
@@ -156,16 +156,16 @@ class _ElementReader(ContentHandler):
         self.open[-1].text.append(content)
 
 
-def _syntax_error(said: str, at: Place, reader: _ElementReader) -> tuple[str, str]:
+def _syntax_error(message: str, at: Place, reader: _ElementReader) -> tuple[str, str]:
     """Describe the error in a text that is not well-formed XML, and what is expected."""
     line = reader.lines[at.line - 1] if at.line <= len(reader.lines) else ""
     closing = re.search(r"</\s*([^\s>]*)", line[max(0, at.column - 3) :])
     inner = reader.open[-1]
-    if said == "mismatched tag" and closing and len(reader.open) > 1:
+    if message == "mismatched tag" and closing and len(reader.open) > 1:
         found = f"</{closing[1]}> where <{inner.tag}> of line {inner.places[''].line} is open"
         return found, f"</{inner.tag}>, or <{closing[1]}> in line {inner.places[''].line}"
     remedy = "well-formed XML: values in quotes, < written as &lt;, & as &amp;"
-    return f"{said} in <{inner.tag}>" if inner.tag else said, remedy
+    return f"{message} in <{inner.tag}>" if inner.tag else message, remedy
 
 
 def read_elements(text: str) -> Node:
@@ -244,8 +244,8 @@ def _check(node: Node) -> None:
     children = NETWORK_PARTS if network else children
     for child in node.children:
         if child.tag not in children:
-            known = nearest(child.tag, children) if children else "no elements"
-            raise child.error(f"<{child.tag}> in <{node.tag}>", known)
+            suggestion = nearest(child.tag, children) if children else "no elements"
+            raise child.error(f"<{child.tag}> in <{node.tag}>", suggestion)
     if node.tag in WITHOUT_TEXT and "".join(node.text).strip():
         raise node.error(f"text in <{node.tag}>", "elements only")
     for key, value in node.attributes.items():

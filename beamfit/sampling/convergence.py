@@ -124,8 +124,8 @@ def diagnose(chain: np.ndarray) -> Diagnostics:
     """
     steps, walkers, n = chain.shape
     if steps < 4:
-        nothing = np.full(n, np.inf)
-        return Diagnostics(nothing, np.zeros(n), nothing, steps, walkers)
+        infinite = np.full(n, np.inf)
+        return Diagnostics(infinite, np.zeros(n), infinite, steps, walkers)
     times = autocorrelation_times(chain)
     return Diagnostics(times, steps * walkers / times, split_rhat(chain), steps, walkers)
 
@@ -159,11 +159,11 @@ def held_by_priors(target: SamplingTarget, draws: np.ndarray) -> tuple[str, ...]
         Numbers with a standard deviation above 0.8 of their prior's, or of a flat prior's between
         their bounds.
     """
-    before = (target.upper - target.lower) / np.sqrt(12.0)
+    prior_width = (target.upper - target.lower) / np.sqrt(12.0)
     for name, prior in target.priors.items():
         i = target.names.index(name)
-        before[i] = min(float(prior.std()), before[i])
-    wide = np.isfinite(before) & (np.std(draws, axis=0) > MAX_WIDTH_SHARE * before)
+        prior_width[i] = min(float(prior.std()), prior_width[i])
+    wide = np.isfinite(prior_width) & (np.std(draws, axis=0) > MAX_WIDTH_SHARE * prior_width)
     # The fraction of outliers is a nuisance number with a prior of the sampler.
     return tuple(
         name

@@ -195,10 +195,10 @@ def _diagnose(state: Checkpoint) -> Diagnostics | None:
     length = len(state.counting)
     if length < 2 * BLOCK_STEPS:
         return None
-    look = 2 * BLOCK_STEPS
-    while look < length:
-        look = BLOCK_STEPS * int(np.ceil(1.25 * look / BLOCK_STEPS))
-    return diagnose(state.counting) if look == length else None
+    next_length = 2 * BLOCK_STEPS
+    while next_length < length:
+        next_length = BLOCK_STEPS * int(np.ceil(1.25 * next_length / BLOCK_STEPS))
+    return diagnose(state.counting) if next_length == length else None
 
 
 def _sample_block(
@@ -259,10 +259,10 @@ def _set_share(
 def _refuse(target: SamplingTarget, seed: int, status: Status, text: str) -> Posterior:
     """Make a posterior that was not sampled, with the reason."""
     chain = np.zeros((0, 0, len(target.names)))
-    every, nothing = (*target.derived_names, *target.names), diagnose(chain)
+    names, diagnostics = (*target.derived_names, *target.names), diagnose(chain)
     message = f"Not sampled: {text}."
     return Posterior(
-        target, chain, chain[..., 0], status, message, nothing, float("nan"), 0, seed, every
+        target, chain, chain[..., 0], status, message, diagnostics, float("nan"), 0, seed, names
     )
 
 

@@ -92,12 +92,12 @@ def noise_words(groups: Sequence[NoiseGroup]) -> str:
     >>> noise_words((NoiseGroup("x", "inferred"), NoiseGroup("y")))
     'x inferred from the residuals; y as stated'
     """
-    said = [
+    texts = [
         NOISE_TEXT[group.noise] + (", with outliers" if group.outliers else "") for group in groups
     ]
-    if len(set(said)) == 1:
-        return said[0]
-    return "; ".join(f"{g.label} {words}" for g, words in zip(groups, said, strict=True))
+    if len(set(texts)) == 1:
+        return texts[0]
+    return "; ".join(f"{g.label} {words}" for g, words in zip(groups, texts, strict=True))
 
 
 def outlier_density(residual: Array) -> Array:
@@ -147,8 +147,8 @@ def _group_likelihood(
         tiny = jnp.finfo(float).tiny
         wild = jnp.log(jnp.maximum(safe, tiny)) + jnp.log(outlier_density(scaled) + tiny)
         each = jnp.logaddexp(good, wild)
-    before = -group.freedom * (log_scale + 0.5 * jnp.exp(-2.0 * log_scale))
-    value = before + jnp.sum(jnp.where(counts, each - log_scale, 0.0))
+    log_prior = -group.freedom * (log_scale + 0.5 * jnp.exp(-2.0 * log_scale))
+    value = log_prior + jnp.sum(jnp.where(counts, each - log_scale, 0.0))
     return jnp.where(inside, value, -jnp.inf)
 
 

@@ -242,9 +242,9 @@ def long_move_share(
         several steps.
     """
     take = np.linspace(0, len(points) - 1, len(drawn)).astype(int)
-    now = log_prob[take] - proposal.log_density(points[take])
-    then = found - proposal.log_density(drawn)
-    accepted = float(np.mean(np.exp(np.minimum(then - now, 0.0))))
+    log_ratio_now = log_prob[take] - proposal.log_density(points[take])
+    log_ratio_new = found - proposal.log_density(drawn)
+    accepted = float(np.mean(np.exp(np.minimum(log_ratio_new - log_ratio_now, 0.0))))
     return 0.9 if accepted > 0.15 else (0.5 if accepted > 0.03 else 0.1)
 
 
