@@ -315,13 +315,8 @@ def state(p: Problem, theta: np.ndarray, scale: Scale, at: Slopes | None = None)
     s = SearchState(theta, at, bounds, limits, INFINITE_KKT, scale, p.tolerance)
     if not at.finite:
         return s
-    bound_multipliers, limit_multipliers = multipliers(
-        at.gradient, at.jacobian, bounds, limits, size
-    )
-    bounds, limits = (
-        bounds._replace(multiplier=bound_multipliers),
-        limits._replace(multiplier=limit_multipliers),
-    )
+    of_bounds, of_limits = multipliers(at.gradient, at.jacobian, bounds, limits, size)
+    bounds, limits = bounds._replace(multiplier=of_bounds), limits._replace(multiplier=of_limits)
     return _with_kkt(s._replace(bounds=bounds, limits=limits), size, cost)
 
 
@@ -435,9 +430,8 @@ def second_order(p: Problem, s: SearchState, exact: bool) -> tuple[SearchState, 
 
     if not (p.objectives and exact):
         point = find_lower_point(p, s, lagrangian)
-        return s._replace(
-            curvature=CurvatureTest(None if point is None else point - s.theta)
-        ), point
+        down = None if point is None else point - s.theta
+        return s._replace(curvature=CurvatureTest(down)), point
     test = _test_curvature(p, s)
     directions = [] if test.direction is None else [test.direction]
     if test.flat:
@@ -477,33 +471,25 @@ def find_lower_point(p: Problem, s: SearchState, lagrangian: Lagrangian) -> np.n
     size = max(float(s.at.cost), 0.5 * p.least_residual**2)
     slope = np.maximum(np.abs(s.at.gradient * unit)[inward], 1e-300)
     short = inward_steps * np.minimum(size / slope, PROBE_DISTANCE)[:, None]
-    steps = np.vstack(
-        [
-            0 * unit,
-            PROBE_DISTANCE * weak_steps,
-            PROBE_DISTANCE * inward_steps,
-            *(t * short for t in PREDICTED_SHARES),
-        ]
-    )
+    probes = PROBE_DISTANCE * np.vstack([weak_steps, inward_steps])
+    steps = np.vstack([0 * unit, probes, *(t * short for t in PREDICTED_SHARES)])
     points = np.clip(s.theta + steps, p.lower, p.upper)
     cost = lagrangian(points)
     gain = cost[0] - cost
     gain = np.where(np.isfinite(gain), gain, -np.inf)
     least = 1e-9 * abs(cost[0]) + 1e-12 * p.least_residual**2
-    for i in range(1, len(weak_steps), 2):
-        if gain[i] + gain[i + 1] > least:
-            return _lowest_along(
-                p, s, weak_steps[i - 1 if gain[i] > gain[i + 1] else i], lagrangian
-            )
-    for k, i in enumerate(range(1 + len(weak_steps), 1 + len(weak_steps) + len(inward_steps))):
+    for i in range(0, len(weak_steps), 2):
+        forth, back = gain[1 + i], gain[2 + i]
+        if forth + back > least:
+            return _lowest_along(p, s, weak_steps[i if forth > back else i + 1], lagrangian)
+    for k, step in enumerate(inward_steps):
+        i = 1 + len(weak_steps) + k
         if gain[i] > least:
-            return _lowest_along(p, s, inward_steps[k], lagrangian)
-        for at, t in enumerate(PREDICTED_SHARES, 1):
-            if (
-                PROBE_DISTANCE * slope[k] > size
-                and gain[i + at * len(inward_steps)] > -MIN_OCCURRED * t * size
-            ):
-                return points[i + at * len(inward_steps)]
+            return _lowest_along(p, s, step, lagrangian)
+        for t in PREDICTED_SHARES if PROBE_DISTANCE * slope[k] > size else ():
+            i += len(inward_steps)
+            if gain[i] > -MIN_OCCURRED * t * size:
+                return points[i]
     return None
 
 
@@ -526,11 +512,8 @@ def _lowest_along(
     p: Problem, s: SearchState, direction: np.ndarray, lagrangian: Lagrangian
 ) -> np.ndarray | None:
     """Return the lowest of some points along a direction, None if none is clearly lower."""
-    steps = [
-        sign * step
-        for step in (PROBE_DISTANCE, 10 * PROBE_DISTANCE, 100 * PROBE_DISTANCE, 0.5)
-        for sign in (1.0, -1.0)
-    ]
+    distances = (PROBE_DISTANCE, 10 * PROBE_DISTANCE, 100 * PROBE_DISTANCE, 0.5)
+    steps = [sign * distance for distance in distances for sign in (1.0, -1.0)]
     points = [s.theta, *(np.clip(s.theta + t * direction, p.lower, p.upper) for t in steps)]
     if p.constraints:
         restored = (_restore_constraints(p, s, point) for point in points[1:])
@@ -587,11 +570,8 @@ def _test_curvature(p: Problem, s: SearchState) -> CurvatureTest:
     terms = np.abs(s.at.gradient) + np.abs(s.limits.multiplier) @ np.abs(s.at.jacobian)
     significant = steep & (np.abs(slope) > GRADIENT_ROUNDING * np.max(terms * unit / cost))
     newton = np.max(np.abs(slope[significant] / values[significant]), initial=0.0)
-    down = (
-        tangent @ vectors[:, 0] * unit
-        if values[0] < -CURVATURE_ROUNDING * max(largest, CURVATURE_ROUNDING)
-        else None
-    )
+    negative = values[0] < -CURVATURE_ROUNDING * max(largest, CURVATURE_ROUNDING)
+    down = tangent @ vectors[:, 0] * unit if negative else None
     clear = values[0] < -SADDLE_CURVATURE * max(largest, 1.0) and np.all(
         np.abs(PROBE_DISTANCE * down) < np.minimum(s.theta - p.lower, p.upper - s.theta)
     )

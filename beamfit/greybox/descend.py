@@ -248,9 +248,8 @@ class Descent:
         reduced = self._reduce(tried.residual[good], tried.jacobian[good])
         self.right[taken], self.rows[taken] = reduced
         ratio = ratio[good].clip(-1.0, 1.0)
-        self.damping[taken] *= np.maximum(
-            np.clip(curvature, MIN_DAMPING_FACTOR, MAX_DAMPING_FACTOR), 1 - (2 * ratio - 1) ** 3
-        )
+        factor = np.clip(curvature, MIN_DAMPING_FACTOR, MAX_DAMPING_FACTOR)
+        self.damping[taken] *= np.maximum(factor, 1 - (2 * ratio - 1) ** 3)
         self.growth[taken] = 2.0
         self.damping[rejected] *= self.growth[rejected]
         self.growth[rejected] *= 2.0

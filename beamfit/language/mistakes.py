@@ -61,9 +61,8 @@ WORDS = {
     "objective": "minimize", "let": "real", "double": "real", "float": "real", "int": "real",
     "import": "table", "data": "table", "model": "mapping", "range": "set",
 }  # fmt: skip
-KEYWORD_TEXT = """minimize maximize variable constraint solver mapping table network input output
-parameter set real function foreach forall layer connection gain in random seed weight"""
-KEYWORDS = KEYWORD_TEXT.split()
+KEYWORDS = """minimize maximize variable constraint solver mapping table network input output
+parameter set real function foreach forall layer connection gain in random seed weight""".split()  # noqa: SIM905
 CLOSING = {"(": ")", "[": "]", "{": "}"}
 TOKEN_TEXT = {
     "NAME": "a name", "NUMBER": "a number", "SIGNED": "a number", "STRING": "a text in quotes",
