@@ -104,6 +104,7 @@ def _propagate(program: Jaxpr, constants, arguments: list[Any]) -> list[Any]:
 
 
 def _results(step, operands: list[Any]) -> list[Any]:
+    """Find the results of one operation, arrays or curvatures."""
     name = step.primitive.name
     if not any(isinstance(v, Curvature) for v in operands):
         found = step.primitive.bind(*operands, **step.params)
@@ -153,6 +154,7 @@ def _add(numbers: list[Curvature]) -> Curvature:
 
 
 def _apply_rule(step, operands: list[Any]) -> Curvature:
+    """Find the curvature of an operation's result from those of its operands."""
     name = step.primitive.name
     numbers = [v for v in operands if isinstance(v, Curvature)]
     first, degree = numbers[0], max(v.degree for v in numbers)
@@ -196,6 +198,7 @@ def _power(v: Curvature, power: int) -> Curvature:
 
 
 def _compose(name: str, numbers: list[Curvature]) -> int | None:
+    """Find the sign of the curvature of a function of convex or concave arguments, or None."""
     signs = {v.sign for v in numbers}
     if name in RISING_CONVEX | {"max", "reduce_max"} and signs <= {0, 1}:
         return 1

@@ -200,6 +200,7 @@ class Descent:
     def _try_steps(
         self, lanes: np.ndarray, points: np.ndarray, predicted: np.ndarray
     ) -> TrialSteps:
+        """Evaluate the ends of steps, and compare the decrease of the cost with the prediction."""
         old = self.residual[lanes]
         new, slope = self.slopes(lanes, points)
         self.steps[lanes] += 1
@@ -357,6 +358,7 @@ def _step_large(theta, residual, rows, scale, damping, lower, upper) -> np.ndarr
 
 
 def _step_seminormal(theta, residual, normal, scale, damping, lower, upper) -> np.ndarray:
+    """Solve the damped normal equations of one search, with numbers pinned at their bounds."""
     unit = np.where(scale > 0, scale, 1.0)
     low, high = (lower - theta) * unit, (upper - theta) * unit
     rows = normal.in_units(unit)

@@ -239,6 +239,7 @@ def _inner_failure(p: Problem, theta: np.ndarray) -> str | None:
 def _variables(
     p: Problem, s: SearchState, found: ResidualInformation
 ) -> tuple[FittedVariable, ...]:
+    """Make the table of the free numbers; an undetermined number has no error."""
     undetermined = (found.spread.shares >= MOST_SHARE) | found.held
     undetermined |= any(group.unknown for group in found.groups)
     errors = (

@@ -369,6 +369,7 @@ def _groups(
 
 
 def _observed(p: Problem) -> dict[str, np.ndarray]:
+    """Collect measured values and errors of all records by name, without padding."""
     found = {}
     for record in p.records:
         for field in ("measured", "error"):

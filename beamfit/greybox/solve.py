@@ -162,6 +162,7 @@ def starting_points(p: Problem, number: int, seed: int) -> list[np.ndarray]:
 
 
 def _draw_starts(p: Problem, number: int, seed: int) -> np.ndarray:
+    """Draw starts within their ranges, else within finite bounds, else about the model's values."""
     random = np.random.default_rng(seed)
     width = np.maximum(np.abs(p.start), 1.0)
     boxed = np.isfinite(p.lower) & np.isfinite(p.upper)
@@ -178,10 +179,10 @@ def _draw_starts(p: Problem, number: int, seed: int) -> np.ndarray:
 
 def _is_optimum(s: SearchState) -> bool:
     """True if a point meets the first- and second-order conditions of an optimum."""
-    bent = s.curvature is not None and (
-        s.curvature.direction is not None or s.curvature.newton > assess.MAX_NEWTON_STEP
-    )
-    return s.optimal and not bent
+    test = s.curvature
+    if test is not None and (test.direction is not None or test.newton > assess.MAX_NEWTON_STEP):
+        return False
+    return s.optimal
 
 
 def _best(p: Problem, found: list[SearchState]) -> int:
@@ -208,6 +209,7 @@ def _best(p: Problem, found: list[SearchState]) -> int:
 
 
 def _is_acceptable(p: Problem, s: SearchState) -> bool:
+    """True if a search may end at a point: an optimum, or settled within the data's accuracy."""
     return _is_optimum(s) or (not p.constraints and has_settled(p, s))
 
 
@@ -254,61 +256,61 @@ def _search_squares(
 def _search_group(
     p: Problem, points: np.ndarray, budget: SearchLimit
 ) -> tuple[list[SearchState], list[Attempt]]:
+    """Search from starts together; refine the best ends, until one is acceptable."""
     k = len(points)
-    lanes = descent_of(p, points)
-    lanes.run(np.arange(k), min(FIRST_STEPS, budget.iterations), budget.until)
-    cost = lanes.cost
+    searches = descent_of(p, points)
+    searches.run(np.arange(k), min(FIRST_STEPS, budget.iterations), budget.until)
+    cost = searches.cost
     found: dict[int, SearchState] = {}
     for lane in np.argsort(cost, kind="stable")[:MAX_REFINED].tolist():
         if not np.isfinite(cost[lane]):
             break
-        _refine(p, lanes, lane, budget.iterations, budget)
-        found[lane] = _escape_saddles(p, lanes, lane, budget)
+        _refine(p, searches, lane, budget.iterations, budget)
+        found[lane] = _escape_saddles(p, searches, lane, budget)
         if _is_acceptable(p, found[lane]):
             break
-    accounts = [_attempt_of(p, lanes, lane, found.get(lane)) for lane in range(k)]
-    return list(found.values()), accounts
+    records = [_attempt_of(p, searches, lane, found.get(lane)) for lane in range(k)]
+    return list(found.values()), records
 
 
-def _refine(p: Problem, lanes: Descent, lane: int, limit: int, budget: SearchLimit) -> None:
+def _refine(p: Problem, searches: Descent, lane: int, limit: int, budget: SearchLimit) -> None:
     """Continue one search until it rests, or has settled in a flat valley without progress."""
-    while not lanes.done[lane] and lanes.steps[lane] < limit and budget.seconds_left > 0:
-        before = lanes.cost[lane]
-        lanes.run(
-            np.array([lane]), min(limit, int(lanes.steps[lane]) + TEST_INTERVAL), budget.until
-        )
-        gained = before - lanes.cost[lane]
-        if gained < NEGLIGIBLE_GAIN * before and has_settled(p, _state_of(p, lanes, lane)):
+    while not searches.done[lane] and searches.steps[lane] < limit and budget.seconds_left > 0:
+        before = searches.cost[lane]
+        steps = min(limit, int(searches.steps[lane]) + TEST_INTERVAL)
+        searches.run(np.array([lane]), steps, budget.until)
+        gained = before - searches.cost[lane]
+        if gained < NEGLIGIBLE_GAIN * before and has_settled(p, _state_of(p, searches, lane)):
             return
 
 
-def _attempt_of(p: Problem, lanes: Descent, lane: int, s: SearchState | None) -> Attempt:
-    theta, steps = lanes.theta[lane].copy(), int(lanes.steps[lane])
-    if not np.isfinite(lanes.cost[lane]):
+def _attempt_of(p: Problem, searches: Descent, lane: int, s: SearchState | None) -> Attempt:
+    theta, steps = searches.theta[lane].copy(), int(searches.steps[lane])
+    if not np.isfinite(searches.cost[lane]):
         return Attempt(METHOD, theta, np.nan, assess.INFINITE_KKT, steps, "cost not finite")
-    message = "came to rest" if lanes.rested[lane] else "ran out of iterations"
-    s = _state_of(p, lanes, lane) if s is None else s
+    message = "came to rest" if searches.rested[lane] else "ran out of iterations"
+    s = _state_of(p, searches, lane) if s is None else s
     return Attempt(METHOD, theta, float(s.at.cost), s.kkt, steps, message)
 
 
-def _state_of(p: Problem, lanes: Descent, lane: int) -> SearchState:
+def _state_of(p: Problem, searches: Descent, lane: int) -> SearchState:
     """Compute the KKT residuals at the present point of one search."""
-    theta = lanes.theta[lane].copy()
-    at = assess.slopes_of_squares(lanes.residual[lane].copy(), lanes.jacobian[lane])
+    theta = searches.theta[lane].copy()
+    at = assess.slopes_of_squares(searches.residual[lane].copy(), searches.jacobian[lane])
     return assess.state(p, theta, assess.scale_of(p, theta, at), at)
 
 
-def _escape_saddles(p: Problem, lanes: Descent, lane: int, budget: SearchLimit) -> SearchState:
+def _escape_saddles(p: Problem, searches: Descent, lane: int, budget: SearchLimit) -> SearchState:
     """Test the end of one search; leave it and continue as long as it is a saddle."""
-    s = _state_of(p, lanes, lane)
+    s = _state_of(p, searches, lane)
     for _ in range(MAX_ESCAPES):
-        cost_at = partial(costs, p, lanes)
+        cost_at = partial(costs, p, searches)
         point = assess.find_lower_point(p, s, cost_at) if s.at.finite else None
         if point is None or budget.seconds_left <= 0:
             break
-        lanes.restart(lane, point)
-        _refine(p, lanes, lane, int(lanes.steps[lane]) + budget.iterations, budget)
-        s = _state_of(p, lanes, lane)
+        searches.restart(lane, point)
+        _refine(p, searches, lane, int(searches.steps[lane]) + budget.iterations, budget)
+        s = _state_of(p, searches, lane)
     return s
 
 
@@ -318,15 +320,15 @@ def _escape_saddles(p: Problem, lanes: Descent, lane: int, budget: SearchLimit) 
 def _search_constrained(
     p: Problem, points: Iterable[np.ndarray], budget: SearchLimit, hessian: str
 ) -> tuple[list[SearchState], tuple[Attempt, ...]]:
+    """Search from one start after the other, until the time is up."""
     found, attempts = [], []
     for point in points:
         if found and budget.seconds_left <= 0:
             break
         at = assess.slopes(p, point)
         if not (np.isfinite(at.cost) and np.all(np.isfinite(at.constraints))):
-            attempts.append(
-                Attempt("none", point, np.nan, assess.INFINITE_KKT, 0, "cost not finite")
-            )
+            lost = assess.INFINITE_KKT
+            attempts.append(Attempt("none", point, np.nan, lost, 0, "cost not finite"))
             continue
         s, attempt = _search_from(p, point, at, budget, hessian)
         if p.objectives and cost_outgrew_scale(s):  # again from there, with the scales there

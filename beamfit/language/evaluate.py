@@ -147,6 +147,7 @@ def _multiply(e: x.Expression, a: Value, b: Value) -> Value:
 
 
 def _apply(e: x.Application, s: Context) -> Value:
+    """Compute a function of its arguments: declared in the mapping, of matrices, or elementwise."""
     values = [evaluate(argument, s) for argument in e.arguments]
     function = s.scope.functions.get(e.function)
     if function is not None:
@@ -173,6 +174,7 @@ def _apply(e: x.Application, s: Context) -> Value:
 
 
 def _matrix(e: x.Application, wanted: int, given: int, function: Callable, v: Value) -> Value:
+    """Compute a function of a matrix or vector, after a check of its dimensions."""
     if v.rank != wanted:
         kind = "a matrix" if wanted == 2 else "a vector"
         raise error_at(e.arguments[0].at, f"'{e.arguments[0]}' of {v.rank} dimensions", kind)
@@ -184,6 +186,7 @@ def _matrix(e: x.Application, wanted: int, given: int, function: Callable, v: Va
 
 
 def _reduce(e: x.Reduction, s: Context) -> Value:
+    """Compute a sum, product, minimum, maximum or mean over iterators."""
     axes = add_iterators(s.scope, s.axes, e.iterators)
     body = evaluate(e.body, replace(s, axes=axes))
     over = tuple(range(len(s.axes), len(axes)))
@@ -200,6 +203,7 @@ def _reduce(e: x.Reduction, s: Context) -> Value:
 
 
 def _read_name(e: x.Name, s: Context) -> Value:
+    """Compute a name: an argument, a constant, an iterator, or elements of an array."""
     if e.name in s.bound:
         if e.indices:
             raise error_at(e.at, f"'{e}', an index of an argument", "the argument as a whole")

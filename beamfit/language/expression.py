@@ -179,6 +179,7 @@ def text_of(e: Expression) -> str:
 
 
 def _operation_text(e: Arithmetic) -> str:
+    """Print an operation; ^ binds to the right, the others to the left."""
     if len(e.parts) == 1:
         return e.symbol + _part_text(e.parts[0], SIGN)
     left, right = e.parts

@@ -326,6 +326,7 @@ def reads(scope: Scope, e: x.Expression, axes: Axes) -> Iterator[Read]:
 
 
 def _unknown_error(scope: Scope, e: x.Name, axes: Axes) -> InputError:
+    """Make the error for a name that is unknown or of the wrong kind."""
     if e.name in axes:
         return error_at(e.at, f"'{e}', an index of the iterator {e.name}", "an array")
     if e.name in scope.sets:
@@ -339,6 +340,7 @@ def _unknown_error(scope: Scope, e: x.Name, axes: Axes) -> InputError:
 
 
 def _check_arguments(scope: Scope, e: x.Application) -> None:
+    """Raise an error for an unknown function or a wrong number of arguments."""
     if e.function in scope.functions:
         min_count = max_count = len(scope.functions[e.function].arguments)
     elif e.function in FUNCTIONS:
@@ -398,6 +400,7 @@ def scope_of(m: d.Mapping, shapes: Mapping[str, tuple[int, int]] | None = None) 
 
 
 def _network(network: d.NetworkDefinition) -> CalledNetwork:
+    """Build a network and the arrays of its inputs, weights and outputs."""
     from beamfit.greybox import tree  # JAX from here on
     from beamfit.language.network_xml import network_of, weight_leaves
 
@@ -429,6 +432,7 @@ def _declare_numbers(scope: Scope, m: d.Mapping) -> None:
 
 
 def _declare(scope: Scope, one: d.Declared | d.Real, role: str) -> None:
+    """Declare an array with its dimensions and values."""
     _check_new(scope, one.name, one.at)
     dims = tuple(_dimension(scope, dim, one) for dim in one.dimensions)
     values = one.values if isinstance(one, d.Declared) else None
@@ -467,6 +471,7 @@ def _flatten(statements: tuple[d.Statement, ...]) -> Iterator[d.Statement]:
 
 
 def _declare_tables(scope: Scope, m: d.Mapping, shapes: Mapping[str, tuple[int, int]]) -> None:
+    """Declare tables; rows and columns are counted from 1."""
     for table in m.tables:
         _check_new(scope, table.name, table.at)
         shape = shapes.get(table.name, (table.rows, table.columns))
@@ -523,6 +528,7 @@ def _check_function(scope: Scope, f: d.Function) -> None:
 def _count_operations(
     scope: Scope, f: d.Function, stack: tuple[str, ...], counted: dict | None = None
 ) -> int:
+    """Count the operations in one use of a function, nested functions included."""
     counted = {} if counted is None else counted
     if f.name in stack:
         loop = " -> ".join([*stack[stack.index(f.name) :], f.name])
@@ -571,6 +577,7 @@ def check_problem(document: d.Document, given: Iterable[str] = ()) -> None:
 
 
 def _check_variables(p: d.ProblemStatement) -> None:
+    """Raise an error for contradictory bounds, repeated variables and wrong random ranges."""
     for one in (*p.variables, *p.limits):
         if not one.lower <= one.upper:
             found = f"bounds of '{one.label}' from {one.lower:g} up to {one.upper:g}"

@@ -77,6 +77,7 @@ def _pair(low: float, high: float) -> str:
 
 
 def _problem(p: d.ProblemStatement | None) -> Iterable[str]:
+    """Yield the lines of goals, variables and constraints."""
     if p is None:
         return
     for goal in p.goals:
@@ -115,6 +116,7 @@ def _solver(s: d.Solver | None) -> Iterable[str]:
 
 
 def _members(m: d.Mapping) -> list[str]:
+    """List the lines of tables, inner mappings, declarations and statements."""
     lines = [_table(t) for t in m.tables]
     for inner in m.mappings:
         mapping = isinstance(inner, d.Mapping)
@@ -177,6 +179,7 @@ def _connections(wires: Sequence[d.Assignment]) -> str:
 
 
 def _statements(statements: Sequence[d.Statement]) -> list[str]:
+    """List the lines of statements; local variables are joined on a line."""
     lines: list[str] = []
     for kind, group in groupby(statements, type):
         if kind is d.Real:
@@ -190,6 +193,7 @@ def _statements(statements: Sequence[d.Statement]) -> list[str]:
 
 
 def _statement(s: d.Statement) -> list[str]:
+    """List the lines of one statement."""
     match s:
         case d.IndexedSet():
             return [f"set {s.name} = {s.elements};"]

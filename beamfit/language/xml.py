@@ -263,6 +263,7 @@ def _single_child(node: Node, tag: str) -> Node | None:
 
 
 def _problem(node: Node) -> d.ProblemStatement:
+    """Read the problem with its goals, variables and limits."""
     direction = node.attributes.get("direction", "minimize").strip().lower()
     if direction not in ("minimize", "maximize"):
         found = f"direction='{direction}'"
@@ -285,6 +286,7 @@ def _bounds(e: Node) -> tuple[float, float]:
 
 
 def _variable(e: Node) -> d.FreeInput:
+    """Read a free input."""
     low, high = _bounds(e)
     random = None
     if e.attributes.get("useRandomInitial", "false").strip().lower() == "true":
@@ -304,6 +306,7 @@ def _solver(node: Node) -> d.Solver:
 
 
 def _mapping(node: Node) -> d.Mapping:
+    """Read a mapping with its tables, inner mappings, declarations and statements."""
     kind = node.attributes.get("classname", EXPRESSIONS)
     if kind != EXPRESSIONS:
         found = f"classname='{kind}'"
@@ -330,6 +333,7 @@ def _table(e: Node) -> d.DataTable:
 
 
 def _declared(e: Node) -> d.Declared:
+    """Read an input, output or parameter."""
     dimensions: list[str | int] = []
     for dim in e.all("dimension"):
         if "set" in dim.attributes:
@@ -345,6 +349,7 @@ def _declared(e: Node) -> d.Declared:
 
 
 def _set(e: Node) -> d.IndexedSet:
+    """Read a set."""
     inner = _single_child(e, "elements")
     if inner is None:
         raise e.error("<set> without <elements>", "<elements type='range' start='1' stop='9'/>")
@@ -360,6 +365,7 @@ def _set(e: Node) -> d.IndexedSet:
 
 
 def _network(node: Node) -> d.NetworkDefinition:
+    """Read the parts of a network without building it."""
     parts = []
     for e in node.children:
         heads = ("srcName", "dstName") if e.tag == "connection" else ("name",)
@@ -401,6 +407,7 @@ def format_xml(document: d.Document) -> str:
 
 
 def _problem_elements(p: d.ProblemStatement | None) -> list[Plain.Element]:
+    """Make the element of the problem; an empty list without a problem."""
     if p is None:
         return []
     e = Plain.Element("problem", classname=NLP, direction="maximize" if p.maximize else "minimize")
@@ -431,6 +438,7 @@ def _label_attributes(declared: d.FreeInput | d.Limit | d.Goal) -> dict[str, str
 
 
 def _mapping_element(m: d.Mapping) -> Plain.Element:
+    """Make the element of a mapping."""
     e = Plain.Element("mapping", {"classname": EXPRESSIONS} | ({"name": m.name} if m.name else {}))
     for t in m.tables:
         size = {"rowCount": t.rows, "columnCount": t.columns}
@@ -449,6 +457,7 @@ def _mapping_element(m: d.Mapping) -> Plain.Element:
 
 
 def _declare(e: Plain.Element, declared: d.Declared) -> None:
+    """Write dimensions and values to the element of an input, output or parameter."""
     if declared.dimensions:
         e.set("isScalar", "false")
     for dim in declared.dimensions:

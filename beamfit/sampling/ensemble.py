@@ -119,6 +119,7 @@ def draw(
 
 
 def _check_options(n: int, seed: int, target_ess: float, budget: int, walkers: int) -> None:
+    """Raise an error for options of `draw` that have no meaning."""
     if walkers < 2 * n or walkers % 2:
         raise InputError(f"{walkers} walkers for {n} numbers", f"an even number from {2 * n} on")
     if not target_ess > 0:

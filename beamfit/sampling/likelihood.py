@@ -133,6 +133,7 @@ def outlier_density(residual: Array) -> Array:
 def _group_likelihood(
     residual: Array, counts: Array, group: NoiseGroup, extra: list[Array]
 ) -> Array:
+    """Compute the log likelihood of one group, taking its parameters from the front of `extra`."""
     if group.noise == "averaged":
         return jnp.zeros(())
     log_scale = extra.pop(0) if group.inferred else 0.0

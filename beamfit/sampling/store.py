@@ -293,6 +293,7 @@ def _difference(
 
 
 def _checkpoint(file: h5py.File) -> Checkpoint:
+    """Read a checkpoint from an open store."""
     group = file["mcmc"]
     kind, keys, *rest = (group.attrs[f"random_state_{i}"] for i in range(5))
     return Checkpoint(

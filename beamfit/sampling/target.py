@@ -53,6 +53,7 @@ class PosteriorLaw(NamedTuple):
 def _log_densities(
     data: Any, counts: Any, thetas: Array, law: PosteriorLaw, groups: tuple[NoiseGroup, ...]
 ) -> Array:
+    """Compute log prior plus log likelihood at points, shape (m, n), without further priors."""
     count = thetas.shape[1] - sum(len(group.parameters()) for group in groups)
 
     def one(theta: Array) -> Array:
