@@ -44,7 +44,7 @@ from beamfit.statistics import POOR_FIT, chi2_probability
 SETTLED_DECREASE = 0.01
 # A row of the Jacobian vanishes along a direction if less than this share of its terms remains.
 VANISHING_ROW = 1e-7
-# Numbers are tied if the product of their parts in the undetermined directions exceeds this share.
+# Numbers are tied if the cosine between their rows in a basis of the directions exceeds this.
 TIED_SHARE = 1e-3
 # A cost below this, in units of its scale, counts as unbounded.
 UNBOUNDED_COST = -1e15

@@ -139,7 +139,7 @@ class LaggedRead(NamedTuple):
 
     name: str
     lag: np.ndarray
-    rest: list[np.ndarray]
+    other_indices: list[np.ndarray]
     whole: int
 
 
@@ -234,12 +234,16 @@ def _lagged_read(read: Read, time_axis: TimeAxis | None, k: int, length: int) ->
     rank = read.indices[0].ndim
     times = time_axis.start + np.arange(length).reshape([-1 if i == k else 1 for i in range(rank)])
     lag = times - read.indices[time_axis.dim]
-    rest = [index for i, index in enumerate(read.indices) if i != time_axis.dim]
+    other_indices = [index for i, index in enumerate(read.indices) if i != time_axis.dim]
     first = np.take(lag, [0], axis=k)
-    if np.any(lag != first) or np.any(first < 0) or any(index.shape[k] > 1 for index in rest):
+    if (
+        np.any(lag != first)
+        or np.any(first < 0)
+        or any(index.shape[k] > 1 for index in other_indices)
+    ):
         return None
     whole = sum(isinstance(i, x.Whole) for i in read.node.indices)
-    return LaggedRead(read.array.name, first, rest, whole)
+    return LaggedRead(read.array.name, first, other_indices, whole)
 
 
 # ---- the order

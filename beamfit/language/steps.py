@@ -275,7 +275,7 @@ def _history(full: jax.Array, start: int, depth: int) -> jax.Array:
 def _lagged_value(lagged: LaggedRead, fresh: Arrays, history: Arrays) -> Value:
     stack = jnp.concatenate([fresh[lagged.name][None], history[lagged.name]])
     rank = lagged.lag.ndim
-    return Value(take_elements(stack, [lagged.lag, *lagged.rest], rank), lagged.whole)
+    return Value(take_elements(stack, [lagged.lag, *lagged.other_indices], rank), lagged.whole)
 
 
 def _scope_without_time(scope: Scope, plan: RecurrencePlan) -> Scope:

@@ -21,17 +21,17 @@ class Widening(NamedTuple):
     ----------
     centre : array, shape (n,)
         Origin of the distances, the logarithm of the noise included.
-    source : array of int, shape (n,)
+    noise_index : array of int, shape (n,)
         Index of the logarithm of the noise that widens each number; -1 for none.
     """
 
     centre: np.ndarray
-    source: np.ndarray
+    noise_index: np.ndarray
 
     def log_factors(self, points: np.ndarray) -> np.ndarray:
         """Compute the log of each number's width relative to that at the centre, shape (m, n)."""
-        logs = points[:, self.source] - self.centre[self.source]
-        return np.where(self.source < 0, 0.0, logs)
+        logs = points[:, self.noise_index] - self.centre[self.noise_index]
+        return np.where(self.noise_index < 0, 0.0, logs)
 
     def to_scaled(self, points: np.ndarray) -> np.ndarray:
         """Convert points to distances divided by their widening, shape (m, n)."""
@@ -39,7 +39,7 @@ class Widening(NamedTuple):
 
     def from_scaled(self, scaled: np.ndarray) -> np.ndarray:
         """Invert `to_scaled`; the logarithms of the noise themselves are not widened."""
-        logs = np.where(self.source < 0, 0.0, scaled[:, self.source])
+        logs = np.where(self.noise_index < 0, 0.0, scaled[:, self.noise_index])
         return self.centre + scaled * np.exp(logs)
 
 

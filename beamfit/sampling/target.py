@@ -222,9 +222,9 @@ class SamplingTarget:
         """Widening of the law's numbers with the inferred noise."""
         noises = [group.prefix + LOG_NOISE for group in self.groups]
         places = np.array([self.names.index(n) if n in self.names else -1 for n in noises])
-        source = np.full(len(self.names), -1)
-        source[: self._count] = places[list(self.group_of or (0,) * self._count)]
-        return Widening(self.mode, source)
+        noise_index = np.full(len(self.names), -1)
+        noise_index[: self._count] = places[list(self.group_of or (0,) * self._count)]
+        return Widening(self.mode, noise_index)
 
     @cached_property
     def blocks(self) -> tuple[np.ndarray, ...]:
