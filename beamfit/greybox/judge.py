@@ -114,12 +114,12 @@ class FitEvidence(NamedTuple):
     @property
     def optima(self) -> tuple[int, list[tuple[float, int]]]:
         """Number of starts that found the answer; cost of each other optimum and its starts."""
-        least = COST_TOLERANCE * max(self.state.scale.cost, abs(self.state.at.cost))
+        tolerance = COST_TOLERANCE * max(self.state.scale.cost, abs(self.state.at.cost))
         ends = [a.cost for a in self.search.attempts if a.kkt.worst <= self.problem.tolerance]
-        agreed = sum(abs(cost - self.state.at.cost) <= least for cost in ends)
+        agreed = sum(abs(cost - self.state.at.cost) <= tolerance for cost in ends)
         others: list[tuple[float, int]] = []
-        for cost in (c for c in sorted(ends) if c - self.state.at.cost > least):
-            if others and cost - others[-1][0] <= least:
+        for cost in (c for c in sorted(ends) if c - self.state.at.cost > tolerance):
+            if others and cost - others[-1][0] <= tolerance:
                 others[-1] = (others[-1][0], others[-1][1] + 1)
             else:
                 others.append((cost, 1))
@@ -138,29 +138,28 @@ def residual_information(p: Problem, s: SearchState) -> ResidualInformation:
     parts = zip([0, *ends], [*ends, None], strict=True)
     blocks = [triangle(s.at.residual_jacobian[first:last]) for first, last in parts]
     unbounded = np.full(len(held), np.inf)
-    determined = spread_of(_stacked(blocks), -unbounded, unbounded, held, None, equations)
-    groups = groups_of(p.records, np.split(s.at.residual, ends)[:-1], blocks, determined)
+    from_residuals = spread_of(_stacked(blocks), -unbounded, unbounded, held, None, equations)
+    groups = groups_of(p.records, np.split(s.at.residual, ends)[:-1], blocks, from_residuals)
     fixed = (np.isin(s.bounds.states, BOUND_STATES) & p.nuisance) | ~p.moving
     limited = np.isfinite(p.upper - p.lower) & p.moving & ~p.with_prior
     same_spread = np.array_equal(fixed, held) and not limited.any()
 
     def spread(factors, fixed):
         if same_spread and len({*factors, *[1.0] * bool(p.priors)}) <= 1:
-            return determined.times(factors[0] if factors else 1.0)
+            return from_residuals.times(factors[0] if factors else 1.0)
         parts = [block / f for block, f in zip(blocks, [*factors, 1.0], strict=True)]
         return spread_of(_stacked(parts), p.lower, p.upper, fixed, p.with_prior, equations)
 
     factors = [group.factor for group in groups]
-    scaled = spread(factors, fixed)
-    plain = [1.0 if group.errors_given else group.factor for group in groups]
-    spread_raw = scaled if plain == factors else spread(plain, fixed)
-    given_bounds = scaled if np.array_equal(fixed, held) else spread(factors, held)
+    spread_scaled = spread(factors, fixed)
+    raw_factors = [1.0 if group.errors_given else group.factor for group in groups]
+    spread_raw = spread_scaled if raw_factors == factors else spread(raw_factors, fixed)
+    given_bounds = spread_scaled if np.array_equal(fixed, held) else spread(factors, held)
     open_numbers = (given_bounds.shares >= MOST_SHARE) & ~held
-    undetermined = determined.open / np.where(
-        (n := np.linalg.norm(determined.open, axis=0)) > 0, n, 1.0
-    )
+    length = np.linalg.norm(from_residuals.open, axis=0)
+    undetermined = from_residuals.open / np.where(length > 0, length, 1.0)
     return ResidualInformation(
-        groups, scaled, spread_raw, undetermined, determined.rank, open_numbers, held
+        groups, spread_scaled, spread_raw, undetermined, from_residuals.rank, open_numbers, held
     )
 
 

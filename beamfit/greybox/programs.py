@@ -335,81 +335,83 @@ def minimum(program: Quadratic, start: jax.Array) -> tuple[jax.Array, jax.Array]
     return end.z, end.multiplier
 
 
-def _residuals(program: Quadratic, now: _Point) -> tuple[jax.Array, jax.Array]:
-    dual = program.matrix @ now.z + program.slope + program.rows.T @ now.multiplier
-    return dual, program.rows @ now.z + now.slack - now.violation - program.limits
+def _residuals(program: Quadratic, point: _Point) -> tuple[jax.Array, jax.Array]:
+    dual = program.matrix @ point.z + program.slope + program.rows.T @ point.multiplier
+    return dual, program.rows @ point.z + point.slack - point.violation - program.limits
 
 
-def _soft_multiplier(program: Quadratic, now: _Point) -> jax.Array:
+def _soft_multiplier(program: Quadratic, point: _Point) -> jax.Array:
     """Compute the multipliers of s >= 0 for soft rows; 1 for hard rows, which have none."""
-    return jnp.where(jnp.isfinite(program.cost), program.cost - now.multiplier, 1.0)
+    return jnp.where(jnp.isfinite(program.cost), program.cost - point.multiplier, 1.0)
 
 
-def _newton_step(program: Quadratic, now: _Point) -> Callable[[jax.Array, jax.Array], _Point]:
+def _newton_step(program: Quadratic, point: _Point) -> Callable[[jax.Array, jax.Array], _Point]:
     """Make the Newton step as a function of the decreases of the complementarities.
 
     These are `inner` for slack * multiplier and `outer` for violation * soft; residuals go to 0.
     """
-    rows, soft, (dual, primal) = (
-        program.rows,
-        _soft_multiplier(program, now),
-        _residuals(program, now),
-    )
-    weight = 1.0 / (now.slack / now.multiplier + now.violation / soft)
+    rows, soft = program.rows, _soft_multiplier(program, point)
+    dual, primal = _residuals(program, point)
+    weight = 1.0 / (point.slack / point.multiplier + point.violation / soft)
     factor = cho_factor(program.matrix + rows.T @ (rows * weight[:, None]))
 
     def step(inner, outer):
-        lack = primal - inner / now.multiplier + outer / soft
+        lack = primal - inner / point.multiplier + outer / soft
         dz = -cho_solve(factor, dual + rows.T @ (weight * lack))
-        d_force = weight * (rows @ dz + lack)
-        d_passed = (now.violation * d_force - outer) / soft
-        return _Point(dz, (-inner - now.slack * d_force) / now.multiplier, d_force, d_passed)
+        d_multiplier = weight * (rows @ dz + lack)
+        d_violation = (point.violation * d_multiplier - outer) / soft
+        return _Point(
+            dz, (-inner - point.slack * d_multiplier) / point.multiplier, d_multiplier, d_violation
+        )
 
     return step
 
 
 def _iterate(
-    program: Quadratic, now: _Point, steps: jax.Array
+    program: Quadratic, point: _Point, steps: jax.Array
 ) -> tuple[_Point, jax.Array, jax.Array]:
     """Take a predictor and corrector step; also return the remaining error and the step count."""
-    soft, step = jnp.isfinite(program.cost), _newton_step(program, now)
-    inner, outer = now.slack * now.multiplier, now.violation * _soft_multiplier(program, now)
-    predictor = step(inner, outer)
-    length = _max_step(program, now, predictor)
-    gap, after = (
-        _complementarity(program, now),
-        _complementarity(program, _move(now, predictor, length)),
+    is_soft, step = jnp.isfinite(program.cost), _newton_step(program, point)
+    inner, outer = (
+        point.slack * point.multiplier,
+        point.violation * _soft_multiplier(program, point),
     )
+    predictor = step(inner, outer)
+    length = _max_step(program, point, predictor)
+    gap = _complementarity(program, point)
+    after = _complementarity(program, _move(point, predictor, length))
     centre = gap * (after / gap) ** 3
-    corrected = soft * (outer - predictor.violation * predictor.multiplier - centre)
+    corrected = is_soft * (outer - predictor.violation * predictor.multiplier - centre)
     corrector = step(inner + predictor.slack * predictor.multiplier - centre, corrected)
-    new = _move(now, corrector, STEP_SHARE * _max_step(program, now, corrector))
+    new = _move(point, corrector, STEP_SHARE * _max_step(program, point, corrector))
     dual, primal = _residuals(program, new)
     dual = jnp.max(jnp.abs(dual)) / (1.0 + jnp.max(jnp.abs(program.slope)))
     error = jnp.maximum(jnp.maximum(dual, jnp.max(jnp.abs(primal))), _complementarity(program, new))
     good = jnp.isfinite(error)
-    kept = (jnp.where(good, a, b) for a, b in zip(new, now, strict=True))
+    kept = (jnp.where(good, a, b) for a, b in zip(new, point, strict=True))
     # A point that is not finite ends the search: no further accuracy can be reached.
     return _Point(*kept), jnp.where(good, error, 0.0), steps + 1
 
 
-def _move(now: _Point, step: _Point, length: jax.Array) -> _Point:
-    return _Point(*(v + length * d for v, d in zip(now, step, strict=True)))
+def _move(point: _Point, step: _Point, length: jax.Array) -> _Point:
+    return _Point(*(v + length * d for v, d in zip(point, step, strict=True)))
 
 
-def _complementarity(program: Quadratic, now: _Point) -> jax.Array:
+def _complementarity(program: Quadratic, point: _Point) -> jax.Array:
     """Compute the mean complementarity: multipliers times their slacks."""
-    count = now.slack.size + jnp.sum(jnp.isfinite(program.cost))
-    return (now.slack @ now.multiplier + now.violation @ _soft_multiplier(program, now)) / count
+    count = point.slack.size + jnp.sum(jnp.isfinite(program.cost))
+    return (
+        point.slack @ point.multiplier + point.violation @ _soft_multiplier(program, point)
+    ) / count
 
 
-def _max_step(program: Quadratic, now: _Point, step: _Point) -> jax.Array:
+def _max_step(program: Quadratic, point: _Point, step: _Point) -> jax.Array:
     """Compute the longest step, at most 1, that keeps all slacks and multipliers positive."""
-    soft = jnp.isfinite(program.cost)
+    is_soft = jnp.isfinite(program.cost)
     values = jnp.concatenate(
-        [now.slack, now.multiplier, now.violation, _soft_multiplier(program, now)]
+        [point.slack, point.multiplier, point.violation, _soft_multiplier(program, point)]
     )
     changes = jnp.concatenate(
-        [step.slack, step.multiplier, step.violation, -1.0 * soft * step.multiplier]
+        [step.slack, step.multiplier, step.violation, -1.0 * is_soft * step.multiplier]
     )
     return jnp.min(jnp.where(changes < 0, -values / changes, 1.0), initial=1.0)

@@ -202,7 +202,7 @@ def _try_plan(scope, steps, owners, chosen) -> RecurrencePlan | None:
                 return None
     numbers = np.array([step.number for step in steps])
     lagged: dict[int, LaggedRead] = {}
-    now: dict[int, set[int]] = {step.number: set() for step in steps}
+    same_time: dict[int, set[int]] = {step.number: set() for step in steps}
     for step, (axis, _, length) in zip(steps, chosen, strict=True):
         k = list(step.axes).index(axis)
         for read in (r for e, axes in sources(scope, step) for r in reads(scope, e, axes)):
@@ -215,9 +215,9 @@ def _try_plan(scope, steps, owners, chosen) -> RecurrencePlan | None:
             lagged[id(read.node)] = found
             shape = np.broadcast_shapes(*(i.shape for i in read.indices))
             here = np.broadcast_to(found.lag == 0, shape).ravel()
-            now[step.number] |= set(owner[read.flat[here]].tolist()) & set(numbers.tolist())
+            same_time[step.number] |= set(owner[read.flat[here]].tolist()) & set(numbers.tolist())
     try:
-        order = list(TopologicalSorter(now).static_order())
+        order = list(TopologicalSorter(same_time).static_order())
     except CycleError:
         return None
     by_number = {step.number: step for step in steps}
@@ -236,11 +236,8 @@ def _lagged_read(read: Read, time_axis: TimeAxis | None, k: int, length: int) ->
     lag = times - read.indices[time_axis.dim]
     other_indices = [index for i, index in enumerate(read.indices) if i != time_axis.dim]
     first = np.take(lag, [0], axis=k)
-    if (
-        np.any(lag != first)
-        or np.any(first < 0)
-        or any(index.shape[k] > 1 for index in other_indices)
-    ):
+    constant = np.all(lag == first) and all(index.shape[k] == 1 for index in other_indices)
+    if not constant or np.any(first < 0):
         return None
     whole = sum(isinstance(i, x.Whole) for i in read.node.indices)
     return LaggedRead(read.array.name, first, other_indices, whole)
