@@ -108,7 +108,8 @@ class SamplingTarget:
     priors_own : tuple of str
         Numbers, derived ones included, that the prior or the bounds determine and not the data.
     open_directions : str
-        Names of what neither data, priors nor bounds limit; if not empty, nothing is sampled.
+        Sentence on numbers that neither data, priors nor bounds limit; if there is one, nothing is
+        sampled.
     verdict : Finding
         Verdict on the fit.
     hidden : tuple of str
