@@ -1,14 +1,14 @@
-"""Optimality of a point and multipliers of its limits, judged here and not by a solver.
+"""Optimality conditions at a point and multipliers of its limits, independent of any solver.
 
-At an optimum of cost f within limits on c(theta) and bounds on theta there are multipliers y, z
-with grad f = J_c^T y + z (stationarity), y and z zero where a limit is not reached, not negative at
-a lower and not positive at an upper limit (Nocedal & Wright, Numerical Optimization, 2nd ed.,
-section 12.1). So a multiplier is d(cost)/d(limit), with cost = chi-square/2. All is judged in the
-problem's own sizes, so that no answer hangs on units.
+At an optimum of the cost f, with limits on c(theta) and bounds on theta, there are multipliers y
+and z with grad f = J_c^T y + z (stationarity). They are zero where a limit is not reached, not
+negative at a lower and not positive at an upper limit (Nocedal & Wright, Numerical Optimization,
+2nd ed., section 12.1). A multiplier is therefore d(cost)/d(limit), with cost = chi-square/2. All
+conditions are measured in scales taken from the problem, so that no verdict depends on units.
 
-Nor does an optimum's Lagrangian bend downward along the limits that hold (section 12.5). Objectives
-are tested with exact derivatives, squares by looking at points beside the end: what their residuals
-bend is not in their Jacobian.
+The Lagrangian of an optimum has no negative curvature along the active limits (section 12.5).
+Objectives are tested with exact second derivatives. Sums of squares are tested by the cost at
+nearby points, because their Jacobian does not contain the curvature of the residuals.
 """
 
 from __future__ import annotations
@@ -22,32 +22,39 @@ import numpy as np
 from scipy import sparse
 
 from beamfit.greybox import problem
-from beamfit.greybox.covariance import FEW, null_space, triangle
-from beamfit.greybox.descend import slopes_of_few
+from beamfit.greybox.covariance import MAX_DENSE, null_space, triangle
+from beamfit.greybox.descend import dense_slopes
 from beamfit.greybox.problem import Problem
 from beamfit.greybox.sparse import Rows, in_units, lengths, weakest
 
 # A bound also counts as reached if moving onto it changes the cost by less than this share.
-CLOSE = 1e-8
-# The size of a limited value is at most this many times the one at the end: a start at which it was
-# exp(100) must not make every end feasible.
-GROWN = 1e3
-# Random test points about a point, and their distance in sizes of the numbers.
-LOOKS, NEAR = 4, 0.3
-# A search has not ended while the next Newton step exceeds this, in sizes of the numbers.
-STEP = 1e-3
+NEGLIGIBLE_COST = 1e-8
+# The scale of a constraint is at most this many times its scale at the end of the search. Without
+# this limit, a start at which the constraint was exp(100) would make every end feasible.
+MAX_SCALE_GROWTH = 1e3
+# Number of random test points about a point.
+TEST_POINTS = 4
+# Standard deviation of their displacement, in scales of the free numbers.
+TEST_DISTANCE = 0.3
+# A search has not converged while the next Newton step exceeds this, in scales of the numbers.
+MAX_NEWTON_STEP = 1e-3
 # Negative curvature below this share of the strongest curvature is rounding.
-FLAT = 1e-6
+CURVATURE_ROUNDING = 1e-6
 # Negative curvature above this share is a saddle even if no lower point was found nearby.
-PLAIN = 2e-3
-# Slopes below this share of the terms that cancel in them are rounding.
-ROUNDING = 1e-13
-# A slope at a bound is rounding where it predicts these parts of the cost as a change and less than
-# this share of that happens: b/(1 - exp(-b t)) has lost its figures at b = 1e-18.
-SHARE, PARTS = 1e-2, (1.0, 1e-2)
-# Test points: distance in sizes of the numbers, count along the weakest directions of a sum of
-# squares, and count at random or inward from bounds.
-BESIDE, WEAKEST, AROUND = 1e-3, 2, 4
+SADDLE_CURVATURE = 2e-3
+# A gradient below this share of the terms that cancel in it is rounding.
+GRADIENT_ROUNDING = 1e-13
+# Test for a gradient at a bound that is only rounding, as b/(1 - exp(-b t)) has at b = 1e-18. Steps
+# inward are as long as the gradient says is needed to change the cost by these shares of itself.
+PREDICTED_SHARES = (1.0, 1e-2)
+# The gradient is rounding if less than this share of the predicted increase occurs.
+MIN_OCCURRED = 1e-2
+# Distance of probe points, in scales of the numbers.
+PROBE_DISTANCE = 1e-3
+# Number of probe directions: those in which a sum of squares is weakest ...
+WEAK_DIRECTIONS = 2
+# ... and those taken at random or inward from bounds.
+OTHER_PROBES = 4
 
 
 class Slopes(NamedTuple):
@@ -68,7 +75,7 @@ class Slopes(NamedTuple):
 
 
 class Scale(NamedTuple):
-    """Sizes taken from the problem itself: of the free numbers, constraint values and the cost."""
+    """Scales taken from the problem itself: of the free numbers, the constraints and the cost."""
 
     unit: np.ndarray
     limit: np.ndarray
@@ -76,30 +83,33 @@ class Scale(NamedTuple):
 
 
 class LimitedValues(NamedTuple):
-    """Values with limits, their sizes, how near counts as reached, and the limits' multipliers."""
+    """Values with their limits, scales and multipliers.
+
+    A limit counts as reached within `tolerance` of it.
+    """
 
     value: np.ndarray
     lower: np.ndarray
     upper: np.ndarray
-    size: np.ndarray
-    near: np.ndarray
+    scale: np.ndarray
+    tolerance: np.ndarray
     multiplier: np.ndarray | float = 0.0
 
     @property
     def violation(self) -> np.ndarray:
-        """Violation of each limit, in units of the limited value's size."""
+        """Violation of each limit, in units of the value's scale."""
         return (
-            np.maximum(np.maximum(self.lower - self.value, self.value - self.upper), 0) / self.size
+            np.maximum(np.maximum(self.lower - self.value, self.value - self.upper), 0) / self.scale
         )
 
     @property
     def reached(self) -> tuple[np.ndarray, np.ndarray]:
         """True for each lower and each upper limit that is reached."""
-        return self.value - self.lower <= self.near, self.upper - self.value <= self.near
+        return self.value - self.lower <= self.tolerance, self.upper - self.value <= self.tolerance
 
     @property
     def distance(self) -> np.ndarray:
-        """Distance from the limit a multiplier belongs to; zero where there is none."""
+        """Distance of each value from the limit of its multiplier; zero without a multiplier."""
         low, high = self.value - self.lower, self.upper - self.value
         return np.where(self.multiplier > 0, low, np.where(self.multiplier < 0, high, 0.0))
 
@@ -112,11 +122,12 @@ class LimitedValues(NamedTuple):
 
 
 class KKT(NamedTuple):
-    """Residuals of the conditions of Karush, Kuhn and Tucker; all three are zero at an optimum.
+    """Residuals of the Karush-Kuhn-Tucker conditions; all three are zero at an optimum.
 
-    `stationarity` is the largest component of the Lagrangian's gradient in units of its terms,
-    `feasibility` the largest violation in the size of what is limited, `complementarity` the
-    largest multiplier times distance from its limit, in units of the cost.
+    `stationarity` is the largest component of the Lagrangian's gradient, relative to its terms.
+    `feasibility` is the largest violation of a limit, in the scale of the limited value.
+    `complementarity` is the largest product of a multiplier and the distance from its limit, in
+    units of the cost.
     """
 
     stationarity: float
@@ -129,14 +140,15 @@ class KKT(NamedTuple):
         return max(self)
 
 
-LOST = KKT(np.inf, np.inf, np.inf)
+INFINITE_KKT = KKT(np.inf, np.inf, np.inf)
 
 
-class Bend(NamedTuple):
-    """The second-order test: the lowest curvature, the direction down, the Newton step.
+class CurvatureTest(NamedTuple):
+    """Result of the second-order test at a stationary point.
 
-    `direction` (n,) leads to lower cost, None where there is none; `clear` tells that the curvature
-    alone says so.
+    `direction` (n,) leads to lower cost, None where there is none. `newton` is the length of the
+    next Newton step in scales of the numbers. `flat` is true if some curvature is not
+    distinguishable from zero, `clear` if the curvature alone proves a saddle.
     """
 
     direction: np.ndarray | None
@@ -146,7 +158,7 @@ class Bend(NamedTuple):
 
 
 class SearchState(NamedTuple):
-    """A point with its limits, their multipliers and its distance from an optimum."""
+    """A point with its derivatives `at` it, its limits, their multipliers and its KKT residuals."""
 
     theta: np.ndarray
     at: Slopes
@@ -155,7 +167,7 @@ class SearchState(NamedTuple):
     kkt: KKT
     scale: Scale
     tolerance: float
-    bend: Bend | None = None
+    curvature: CurvatureTest | None = None
 
     @property
     def feasible(self) -> bool:
@@ -163,26 +175,26 @@ class SearchState(NamedTuple):
         return self.kkt.feasibility <= self.tolerance
 
     @property
-    def left(self) -> np.ndarray:
-        """Gradient of the Lagrangian: what multipliers leave of that of the cost."""
-        pull = self.at.jacobian.T @ self.limits.multiplier
-        return self.at.gradient - self.bounds.multiplier - pull
+    def lagrangian_gradient(self) -> np.ndarray:
+        """Gradient of the Lagrangian, shape (n,)."""
+        constraint_gradient = self.at.jacobian.T @ self.limits.multiplier
+        return self.at.gradient - self.bounds.multiplier - constraint_gradient
 
     @property
     def optimal(self) -> bool:
-        """True if the conditions of first order hold within the tolerance."""
+        """True if the first-order conditions hold within the tolerance."""
         return self.kkt.worst <= self.tolerance
 
 
 def first_order(core, theta):
-    """The parts of `Slopes`, compiled once for each structure of problem."""
+    """Compute the fields of `Slopes`; compiled once for each structure of problem."""
     r, j = problem.with_slope(partial(problem.residual, core), theta)
-    further, pull = jax.value_and_grad(problem.further, 1)(core, theta)
+    further, gradient = jax.value_and_grad(problem.further, 1)(core, theta)
     c = problem.constraints(core, theta)
-    # By as few sweeps as there are variables or constraints.
+    # Reverse mode takes a sweep for each constraint, forward mode one for each variable.
     few = jax.eval_shape(problem.constraints, core, theta).shape < theta.shape
     slopes = (jax.jacrev if few else jax.jacfwd)(problem.constraints, 1)(core, theta)
-    return r, j, 0.5 * r @ r + further, r @ j + pull, c, slopes
+    return r, j, 0.5 * r @ r + further, r @ j + gradient, c, slopes
 
 
 def slopes(p: Problem, theta: np.ndarray) -> Slopes:
@@ -191,21 +203,24 @@ def slopes(p: Problem, theta: np.ndarray) -> Slopes:
 
 
 def slopes_at(p: Problem, points: np.ndarray) -> list[Slopes]:
-    """The same at points, shape (k, n); of few squares alone by what their search compiles."""
-    if not (p.constraints or p.objectives) and len(p.start) <= FEW:
-        return [of_squares(*each) for each in zip(*slopes_of_few(p)(points), strict=True)]
+    """Evaluate values and first derivatives at points, shape (k, n).
+
+    A small problem of squares alone uses the function that its search has compiled already.
+    """
+    if not (p.constraints or p.objectives) and len(p.start) <= MAX_DENSE:
+        return [slopes_of_squares(*each) for each in zip(*dense_slopes(p)(points), strict=True)]
     call = p.compiled(first_order)
     return [Slopes(*map(np.asarray, call(point))) for point in points]
 
 
-def nearby(p: Problem, theta: np.ndarray, unit: np.ndarray) -> np.ndarray:
-    """Test points about a point, within the bounds, shape (`LOOKS`, n)."""
-    steps = np.random.default_rng(0).normal(size=(LOOKS, len(unit)))
-    return np.clip(theta + NEAR * steps * unit, p.lower, p.upper)
+def points_nearby(p: Problem, theta: np.ndarray, unit: np.ndarray) -> np.ndarray:
+    """Draw random test points about a point, within the bounds, shape (`TEST_POINTS`, n)."""
+    steps = np.random.default_rng(0).normal(size=(TEST_POINTS, len(unit)))
+    return np.clip(theta + TEST_DISTANCE * steps * unit, p.lower, p.upper)
 
 
-def of_squares(residual: np.ndarray, jacobian: Rows) -> Slopes:
-    """The slopes of a problem of squares alone, from residuals and Jacobian."""
+def slopes_of_squares(residual: np.ndarray, jacobian: Rows) -> Slopes:
+    """Make the `Slopes` of a problem of squares alone from residuals and Jacobian."""
     none = np.zeros(0)
     cost = 0.5 * residual @ residual
     with np.errstate(invalid="ignore"):
@@ -214,17 +229,18 @@ def of_squares(residual: np.ndarray, jacobian: Rows) -> Slopes:
 
 
 def scale_of(p: Problem, start: np.ndarray, at: Slopes) -> Scale:
-    """The sizes of a problem, from a start, the bounds and the slopes there.
+    """Choose the scales of a problem from a start, the bounds and the derivatives there.
 
-    A number is as large as its start or a tenth of its range, else as the change that moves the
-    residuals by one or doubles the cost; what is limited as its limits, its value at the start and
-    the change along the numbers; a further objective as its change along them.
+    The scale of a number is its start or a tenth of its range, whichever is larger; without both,
+    the change that moves the residuals by one or doubles the cost. The scale of a constraint is
+    the largest of its limits, its value at the start, and its change when a number changes by its
+    scale. The scale of the cost is the latter change, else the cost itself, else 1.
     """
     width = p.upper - p.lower
-    length, pull = lengths(at.residual_jacobian), np.abs(at.gradient)
+    length, slope = lengths(at.residual_jacobian), np.abs(at.gradient)
     unit = np.maximum(np.abs(start), np.where(np.isfinite(width), 0.1 * width, 0.0))
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        for other in (1.0 / length, abs(at.cost) / pull):
+        for other in (1.0 / length, abs(at.cost) / slope):
             usable = (unit == 0) & np.isfinite(other) & (other > 0)
             unit = np.where(usable, other, unit)
     unit = np.where(unit > 0, unit, 1.0)
@@ -233,15 +249,15 @@ def scale_of(p: Problem, start: np.ndarray, at: Slopes) -> Scale:
     ]
     moved = np.max(np.abs(at.jacobian) * unit, axis=1, initial=0.0)
     limit = np.max([*ends, np.abs(at.constraints), moved], axis=0, initial=0.0)
-    sizes = [float(np.max(pull * unit, initial=0.0)), abs(float(at.cost)), 1.0]
+    sizes = [float(np.max(slope * unit, initial=0.0)), abs(float(at.cost)), 1.0]
     return Scale(unit, np.where(limit > 0, limit, 1.0), next(v for v in sizes if v > 0))
 
 
 def gradient_size(p: Problem, at: Slopes, scale: Scale) -> np.ndarray:
-    """Size of a gradient component that matters, per unit of each number.
+    """Compute the size relative to which a component of the gradient counts as zero, shape (n,).
 
-    A residual vector as long as `Problem.least_residual` is the least that counts; for further
-    objectives, the scale of the cost.
+    It is the length of the Jacobian's column times that of the residuals, at least
+    `Problem.least_residual`; with further objectives, the scale of the cost is added.
     """
     size = max(np.linalg.norm(at.residual), p.least_residual)
     found = lengths(at.residual_jacobian) * size
@@ -251,16 +267,16 @@ def gradient_size(p: Problem, at: Slopes, scale: Scale) -> np.ndarray:
     return np.maximum(found, max(1e-12 * largest, 1e-100) / scale.unit)
 
 
-def holding(p: Problem, s: SearchState, least: float) -> tuple[np.ndarray, np.ndarray]:
-    """Numbers that do not move and constraints that hold, by forces above a share."""
+def active_set(p: Problem, s: SearchState, least: float) -> tuple[np.ndarray, np.ndarray]:
+    """Find which numbers are held and which constraints are active, by their multipliers."""
     size = gradient_size(p, s.at, s.scale)
     held = ~p.moving | (np.abs(s.bounds.multiplier) > least * size)
-    pulls = np.abs(s.limits.multiplier) * np.linalg.norm(s.at.jacobian / size, axis=1)
-    return held, p.equations | (pulls > least)
+    forces = np.abs(s.limits.multiplier) * np.linalg.norm(s.at.jacobian / size, axis=1)
+    return held, p.equations | (forces > least)
 
 
 def state(p: Problem, theta: np.ndarray, scale: Scale, at: Slopes | None = None) -> SearchState:
-    """Find the multipliers at a point and measure how far it is from an optimum.
+    """Find the multipliers at a point and its KKT residuals.
 
     Parameters
     ----------
@@ -269,37 +285,39 @@ def state(p: Problem, theta: np.ndarray, scale: Scale, at: Slopes | None = None)
     theta : array, shape (n,)
         The point.
     scale : Scale
-        Of the problem.
+        Scales of the problem.
     at : Slopes, optional
-        At the point, where they are known.
+        Values and derivatives at the point; computed by default.
 
     Returns
     -------
     SearchState
-        With an infinite residual where something is not finite.
+        Its KKT residuals are infinite where a value or derivative is not finite.
     """
     at = slopes(p, theta) if at is None else at
     size = gradient_size(p, at, scale) if at.finite else 1.0 / scale.unit
     cost = scale.cost if p.objectives else max(float(at.cost), 0.5 * p.least_residual**2)
-    near = p.tolerance * np.minimum(np.maximum(np.abs(theta), np.abs(p.start)), p.upper - p.lower)
+    margin = p.tolerance * np.minimum(np.maximum(np.abs(theta), np.abs(p.start)), p.upper - p.lower)
     with np.errstate(divide="ignore", invalid="ignore"):
-        # A bound to which the gradient pushes counts when moving there gains nothing.
+        # If the gradient pushes towards a bound, it counts as reached when moving there hardly
+        # changes the cost.
         pushed = np.abs(at.gradient) > p.tolerance * size
-        near = np.where(pushed, np.maximum(near, CLOSE * cost / np.abs(at.gradient)), near)
-    near = np.where(np.isfinite(near), near, 0.0)
-    bounds = LimitedValues(theta, p.lower, p.upper, scale.unit, near, np.zeros(len(theta)))
-    # A number that ends at zero does not make what it limits small.
+        harmless = NEGLIGIBLE_COST * cost / np.abs(at.gradient)
+        margin = np.where(pushed, np.maximum(margin, harmless), margin)
+    margin = np.where(np.isfinite(margin), margin, 0.0)
+    bounds = LimitedValues(theta, p.lower, p.upper, scale.unit, margin, np.zeros(len(theta)))
+    # A number that ends at zero must not reduce the scales of the constraints to zero.
     largest = np.maximum(np.abs(theta), scale.unit)
-    here = scale_of(p, largest, at) if p.constraints else scale
-    size_here = np.fmin(scale.limit, GROWN * here.limit)
-    ends, near = (p.constraint_lower, p.constraint_upper), p.tolerance * size_here
-    limits = LimitedValues(at.constraints, *ends, size_here, near, np.zeros(len(near)))
-    s = SearchState(theta, at, bounds, limits, LOST, scale, p.tolerance)
+    local_scale = scale_of(p, largest, at) if p.constraints else scale
+    limit_scale = np.fmin(scale.limit, MAX_SCALE_GROWTH * local_scale.limit)
+    ends, margin = (p.constraint_lower, p.constraint_upper), p.tolerance * limit_scale
+    limits = LimitedValues(at.constraints, *ends, limit_scale, margin, np.zeros(len(margin)))
+    s = SearchState(theta, at, bounds, limits, INFINITE_KKT, scale, p.tolerance)
     if not at.finite:
         return s
-    pulls, forces = multipliers(at.gradient, at.jacobian, bounds, limits, size)
-    bounds, limits = bounds._replace(multiplier=pulls), limits._replace(multiplier=forces)
-    return _at_distance(s._replace(bounds=bounds, limits=limits), size, cost)
+    of_bounds, of_limits = multipliers(at.gradient, at.jacobian, bounds, limits, size)
+    bounds, limits = bounds._replace(multiplier=of_bounds), limits._replace(multiplier=of_limits)
+    return _with_kkt(s._replace(bounds=bounds, limits=limits), size, cost)
 
 
 def multipliers(
@@ -309,27 +327,27 @@ def multipliers(
     limits: LimitedValues,
     scale: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Find the multipliers of the right signs that come nearest to stationarity.
+    """Find the multipliers of correct sign that come nearest to stationarity.
 
     Parameters
     ----------
     gradient : array, shape (n,)
-        Of the cost.
+        Gradient of the cost.
     jacobian : array, shape (m, n)
-        Of the constraints.
+        Jacobian of the constraints.
     bounds, limits : LimitedValues
-        Of the n free numbers and of the m constraints.
+        The n free numbers and the m constraints.
     scale : array, shape (n,)
-        Size of a component of the gradient that matters.
+        Result of `gradient_size`.
 
     Returns
     -------
     (array, shape (n,); array, shape (m,))
-        Of the bounds (reduced gradients) and of the constraints.
+        Multipliers of the bounds (reduced gradients) and of the constraints.
 
     Examples
     --------
-    Minimise (x-3)^2/2 with x <= 1: the cost falls by 2 for each unit the bound gives way.
+    Minimise (x-3)^2/2 with x <= 1: the cost falls by 2 per unit by which the bound is raised.
 
     >>> one, none = np.ones(1), np.zeros(0)
     >>> at = LimitedValues(one, np.array([-np.inf]), one, one, 1e-6 * one)
@@ -350,31 +368,31 @@ def multipliers(
     size = np.linalg.norm(columns, axis=0)
     columns = columns / np.where(size > 0, size, 1.0)
     right = gradient / scale
-    from scipy.optimize import nnls  # a third of a second that only limits should cost
+    from scipy.optimize import nnls  # takes a third of a second, needed only here
 
     guess, _ = nnls(columns, right, maxiter=50 * columns.shape[1])
     used = guess > 0
-    # One plain least-squares solution on the support: nnls stops at a tolerance.
+    # Solve once more by least squares on the support: nnls stops at a tolerance.
     sharp = np.linalg.lstsq(columns[:, used], right, rcond=None)[0]
     guess[used] = np.where(sharp > 0, sharp, guess[used])
     np.add.at(found, chosen, sign * guess / np.where(size > 0, size, 1.0))
     return found[:n], found[n:]
 
 
-def _at_distance(s: SearchState, scale: np.ndarray, cost: float) -> SearchState:
-    """Measure how far a point with multipliers is from an optimum, `cost` being a size of it."""
+def _with_kkt(s: SearchState, scale: np.ndarray, cost: float) -> SearchState:
+    """Compute the KKT residuals of a point with multipliers, `cost` being the scale of its cost."""
     size = scale + np.abs(s.limits.multiplier) @ np.abs(s.at.jacobian)
     products = [np.abs(part.multiplier * part.distance) for part in (s.bounds, s.limits)]
     crossed = np.concatenate([s.bounds.violation, s.limits.violation, [0.0]])
-    stationarity = np.max(np.abs(s.left) / size, initial=0.0)
+    stationarity = np.max(np.abs(s.lagrangian_gradient) / size, initial=0.0)
     complementarity = np.max(np.concatenate(products), initial=0.0) / cost
     return s._replace(kkt=KKT(*map(float, (stationarity, np.max(crossed), complementarity))))
 
 
 # ---- second order
 
-# Lagrangian at points, shape (k, n) to (k,).
-Look = Callable[[np.ndarray], np.ndarray]
+# Values of the Lagrangian at points, shape (k, n) to (k,).
+Lagrangian = Callable[[np.ndarray], np.ndarray]
 
 
 def lagrangian_hessian(core, theta, sigma, y):
@@ -387,23 +405,23 @@ def lagrangian_hessian(core, theta, sigma, y):
 
 
 def second_order(p: Problem, s: SearchState, exact: bool) -> tuple[SearchState, np.ndarray | None]:
-    """The second-order test of a point that is an optimum to first order.
+    """Test the second-order conditions at a point that meets those of first order.
 
     Parameters
     ----------
     p : Problem
         The problem.
-    s : State
+    s : SearchState
         The point.
     exact : bool
-        Whether second derivatives may be asked for.
+        True if the model has second derivatives.
 
     Returns
     -------
     SearchState
-        With its `Bend`.
+        The point with its `CurvatureTest`.
     array, shape (n,), or None
-        Another point, from where to go on, if the cost falls beside this one.
+        A point nearby with a lower cost, from which the search continues.
     """
 
     def lagrangian(points):
@@ -411,98 +429,103 @@ def second_order(p: Problem, s: SearchState, exact: bool) -> tuple[SearchState, 
         return np.array([float(c) - s.limits.multiplier @ np.asarray(held) for c, held in found])
 
     if not (p.objectives and exact):
-        point = lower_beside(p, s, lagrangian)
-        return s._replace(bend=Bend(None if point is None else point - s.theta)), point
-    bent = _bend(p, s)
-    directions = [] if bent.direction is None else [bent.direction]
-    if bent.flat:
-        # Nothing of second order tells: look around, always at the same points.
-        random = np.random.default_rng(0).normal(size=(AROUND, len(s.theta)))
-        tangent = _tangent(p, s)
+        point = find_lower_point(p, s, lagrangian)
+        down = None if point is None else point - s.theta
+        return s._replace(curvature=CurvatureTest(down)), point
+    test = _test_curvature(p, s)
+    directions = [] if test.direction is None else [test.direction]
+    if test.flat:
+        # The second-order test is undecided: probe around, always in the same directions.
+        random = np.random.default_rng(0).normal(size=(OTHER_PROBES, len(s.theta)))
+        tangent = _tangent_basis(p, s)
         around = random @ tangent @ tangent.T * s.scale.unit
-        # From a bound that nothing pushes to there is one way only.
+        # From a reached bound without a multiplier only the inward direction is allowed.
         low, high = s.bounds.reached
         directions += list(np.where(low, np.abs(around), np.where(high, -np.abs(around), around)))
     for direction in directions:
-        point = _along(p, s, direction, lagrangian)
+        point = _lowest_along(p, s, direction, lagrangian)
         if point is not None:
-            return s._replace(bend=bent._replace(direction=direction)), point
-    if not bent.clear:
-        bent = bent._replace(direction=None)
-    return s._replace(bend=bent), None
+            return s._replace(curvature=test._replace(direction=direction)), point
+    if not test.clear:
+        test = test._replace(direction=None)
+    return s._replace(curvature=test), None
 
 
-def lower_beside(p: Problem, s: SearchState, lagrangian: Look) -> np.ndarray | None:
-    """A lower point beside one where squares end, if the cost bends down there.
+def find_lower_point(p: Problem, s: SearchState, lagrangian: Lagrangian) -> np.ndarray | None:
+    """Look for a point of lower cost near the end of a least-squares search.
 
-    The squares' own curvature never does; what their residuals bend shows first where that is
-    weakest. Numbers at a bound are tried inward, whatever the force that holds them.
+    The Gauss-Newton part JᵀJ of the Hessian is never negative, so curvature of the residuals
+    prevails first in the directions where JᵀJ is weakest. Numbers at a bound are also moved inward,
+    whatever their multiplier.
     """
-    unit, weak = s.scale.unit, _weakest(p, s)
+    unit, weak = s.scale.unit, _weakest_directions(p, s)
     if not weak.shape[1]:
         return None
     low, high = s.bounds.reached
-    inward = np.flatnonzero((low ^ high) & ~p.nuisance & p.moving)[:AROUND]
-    pushes = np.zeros((len(inward), len(unit)))
-    pushes[np.arange(len(inward)), inward] = np.where(low, unit, -unit)[inward]
-    sides = np.repeat(weak.T, 2, axis=0)
-    sides[1::2] *= -1.0
-    # Steps inward over which the slope predicts a change as large as the cost, and a part of it.
+    inward = np.flatnonzero((low ^ high) & ~p.nuisance & p.moving)[:OTHER_PROBES]
+    inward_steps = np.zeros((len(inward), len(unit)))
+    inward_steps[np.arange(len(inward)), inward] = np.where(low, unit, -unit)[inward]
+    weak_steps = np.repeat(weak.T, 2, axis=0)
+    weak_steps[1::2] *= -1.0
+    # Steps inward over which the gradient predicts a change by the cost, or by a share of it.
     size = max(float(s.at.cost), 0.5 * p.least_residual**2)
     slope = np.maximum(np.abs(s.at.gradient * unit)[inward], 1e-300)
-    short = pushes * np.minimum(size / slope, BESIDE)[:, None]
-    steps = np.vstack([0 * unit, BESIDE * sides, BESIDE * pushes, *(t * short for t in PARTS)])
+    short = inward_steps * np.minimum(size / slope, PROBE_DISTANCE)[:, None]
+    probes = PROBE_DISTANCE * np.vstack([weak_steps, inward_steps])
+    steps = np.vstack([0 * unit, probes, *(t * short for t in PREDICTED_SHARES)])
     points = np.clip(s.theta + steps, p.lower, p.upper)
     cost = lagrangian(points)
     gain = cost[0] - cost
     gain = np.where(np.isfinite(gain), gain, -np.inf)
     least = 1e-9 * abs(cost[0]) + 1e-12 * p.least_residual**2
-    for i in range(1, len(sides), 2):
-        if gain[i] + gain[i + 1] > least:
-            return _along(p, s, sides[i - 1 if gain[i] > gain[i + 1] else i], lagrangian)
-    for k, i in enumerate(range(1 + len(sides), 1 + len(sides) + len(pushes))):
+    for i in range(0, len(weak_steps), 2):
+        forth, back = gain[1 + i], gain[2 + i]
+        if forth + back > least:
+            return _lowest_along(p, s, weak_steps[i if forth > back else i + 1], lagrangian)
+    for k, step in enumerate(inward_steps):
+        i = 1 + len(weak_steps) + k
         if gain[i] > least:
-            return _along(p, s, pushes[k], lagrangian)
-        for at, t in enumerate(PARTS, 1):
-            if BESIDE * slope[k] > size and gain[i + at * len(pushes)] > -SHARE * t * size:
-                return points[i + at * len(pushes)]
+            return _lowest_along(p, s, step, lagrangian)
+        for t in PREDICTED_SHARES if PROBE_DISTANCE * slope[k] > size else ():
+            i += len(inward_steps)
+            if gain[i] > -MIN_OCCURRED * t * size:
+                return points[i]
     return None
 
 
-def _weakest(p: Problem, s: SearchState) -> np.ndarray:
-    """The weakest directions of squares that keep to the limits held by a force."""
+def _weakest_directions(p: Problem, s: SearchState) -> np.ndarray:
+    """Find the directions along the active limits in which the sum of squares changes least."""
     unit = s.scale.unit
-    held, on = holding(p, s, p.tolerance)
-    if len(unit) > FEW and not on.any():
-        found = np.zeros((len(unit), min(WEAKEST, int(np.sum(~held)))))
+    held, active = active_set(p, s, p.tolerance)
+    if len(unit) > MAX_DENSE and not active.any():
+        found = np.zeros((len(unit), min(WEAK_DIRECTIONS, int(np.sum(~held)))))
         rows = in_units(s.at.residual_jacobian, 1 / unit)[:, ~held]
         found[~held] = weakest(rows, found.shape[1])
     else:
-        tangent = _tangent(p, s)
+        tangent = _tangent_basis(p, s)
         rows = triangle(s.at.residual_jacobian * unit) @ tangent
-        found = tangent @ np.linalg.svd(rows, full_matrices=True)[2][-WEAKEST:].T
+        found = tangent @ np.linalg.svd(rows, full_matrices=True)[2][-WEAK_DIRECTIONS:].T
     return found * unit[:, None]
 
 
-def _along(
-    p: Problem, s: SearchState, direction: np.ndarray, lagrangian: Look
+def _lowest_along(
+    p: Problem, s: SearchState, direction: np.ndarray, lagrangian: Lagrangian
 ) -> np.ndarray | None:
-    """The best of some points along a direction, None if none is better by what counts."""
-    steps = [
-        sign * step for step in (BESIDE, 10 * BESIDE, 100 * BESIDE, 0.5) for sign in (1.0, -1.0)
-    ]
+    """Return the lowest of some points along a direction, None if none is clearly lower."""
+    distances = (PROBE_DISTANCE, 10 * PROBE_DISTANCE, 100 * PROBE_DISTANCE, 0.5)
+    steps = [sign * distance for distance in distances for sign in (1.0, -1.0)]
     points = [s.theta, *(np.clip(s.theta + t * direction, p.lower, p.upper) for t in steps)]
     if p.constraints:
-        restored = (_restored(p, s, point) for point in points[1:])
+        restored = (_restore_constraints(p, s, point) for point in points[1:])
         points = [s.theta, *(point for point in restored if point is not None)]
     cost = lagrangian(np.array(points))
     cost = np.where(np.isfinite(cost), cost, np.inf)
     best = int(np.argmin(cost))
-    return points[best] if cost[0] - cost[best] > _worth(p, s) else None
+    return points[best] if cost[0] - cost[best] > _min_decrease(p, s) else None
 
 
-def _worth(p: Problem, s: SearchState) -> float:
-    """The decrease of the cost from which on a point is lower."""
+def _min_decrease(p: Problem, s: SearchState) -> float:
+    """Return the smallest decrease of the cost that counts as one."""
     if p.objectives:
         return 1e-9 * s.scale.cost
     count = max(len(s.at.residual) - len(s.theta), 1)
@@ -510,52 +533,53 @@ def _worth(p: Problem, s: SearchState) -> float:
     return max(1e-3 * noise, 1e-6 * s.at.cost)
 
 
-def _restored(p: Problem, s: SearchState, point: np.ndarray) -> np.ndarray | None:
-    """A point moved onto the constraints that hold at another one, and inside all; None if not.
+def _restore_constraints(p: Problem, s: SearchState, point: np.ndarray) -> np.ndarray | None:
+    """Move a point onto the constraints that are active at the state, and inside all others.
 
-    Beside curved constraints a straight step leaves them, and a cost that is lower there is no
-    lower cost: along a ridge of equal costs it would be taken for a way down.
+    A straight step leaves curved constraints. The cost outside may be lower without there being a
+    lower feasible point. Returns None if Newton's method does not get there.
     """
-    held, on = holding(p, s, p.tolerance)
+    held, active = active_set(p, s, p.tolerance)
     unit = np.where(held, 0.0, s.scale.unit)
     for _ in range(10):  # Newton steps
         at = slopes(p, point)
         if not at.finite:
             return None
         inside = np.clip(at.constraints, p.constraint_lower, p.constraint_upper)
-        gap = at.constraints - np.where(on, s.at.constraints, inside)
-        if np.all(np.abs(gap) <= 1e-10 * s.limits.size):
+        gap = at.constraints - np.where(active, s.at.constraints, inside)
+        if np.all(np.abs(gap) <= 1e-10 * s.limits.scale):
             return point
-        left = gap != 0
-        step = np.linalg.lstsq(at.jacobian[left] * unit, gap[left], rcond=None)[0]
+        violated = gap != 0
+        step = np.linalg.lstsq(at.jacobian[violated] * unit, gap[violated], rcond=None)[0]
         point = np.clip(point - unit * step, p.lower, p.upper)
     return None
 
 
-def _bend(p: Problem, s: SearchState) -> Bend:
-    """Curvature on the directions that active limits leave, from exact derivatives."""
+def _test_curvature(p: Problem, s: SearchState) -> CurvatureTest:
+    """Compute the curvature of the Lagrangian along the active limits, from exact derivatives."""
     unit, cost = s.scale.unit, s.scale.cost
     h = np.asarray(p.compiled(lagrangian_hessian)(s.theta, 1.0, s.limits.multiplier))
     h = h * np.outer(unit, unit) / cost
-    tangent = _tangent(p, s)
+    tangent = _tangent_basis(p, s)
     if not tangent.shape[1] or not np.all(np.isfinite(h)):
-        return Bend(None)
+        return CurvatureTest(None)
     values, vectors = np.linalg.eigh(tangent.T @ h @ tangent)
-    slope = vectors.T @ (tangent.T @ (s.left * unit / cost))
+    slope = vectors.T @ (tangent.T @ (s.lagrangian_gradient * unit / cost))
     largest = np.max(np.abs(values))
-    steep = values > FLAT * largest
+    steep = values > CURVATURE_ROUNDING * largest
     terms = np.abs(s.at.gradient) + np.abs(s.limits.multiplier) @ np.abs(s.at.jacobian)
-    told = steep & (np.abs(slope) > ROUNDING * np.max(terms * unit / cost))
-    newton = np.max(np.abs(slope[told] / values[told]), initial=0.0)
-    down = tangent @ vectors[:, 0] * unit if values[0] < -FLAT * max(largest, FLAT) else None
-    clear = values[0] < -PLAIN * max(largest, 1.0) and np.all(
-        np.abs(BESIDE * down) < np.minimum(s.theta - p.lower, p.upper - s.theta)
+    significant = steep & (np.abs(slope) > GRADIENT_ROUNDING * np.max(terms * unit / cost))
+    newton = np.max(np.abs(slope[significant] / values[significant]), initial=0.0)
+    negative = values[0] < -CURVATURE_ROUNDING * max(largest, CURVATURE_ROUNDING)
+    down = tangent @ vectors[:, 0] * unit if negative else None
+    clear = values[0] < -SADDLE_CURVATURE * max(largest, 1.0) and np.all(
+        np.abs(PROBE_DISTANCE * down) < np.minimum(s.theta - p.lower, p.upper - s.theta)
     )
-    return Bend(down, float(newton), not steep.all() or largest < p.tolerance, clear)
+    return CurvatureTest(down, float(newton), not steep.all() or largest < p.tolerance, clear)
 
 
-def _tangent(p: Problem, s: SearchState) -> np.ndarray:
-    """Directions, in the sizes of the numbers, that keep to the limits held by a force."""
+def _tangent_basis(p: Problem, s: SearchState) -> np.ndarray:
+    """Return a basis of the directions along the active limits, in scales of the numbers."""
     unit = s.scale.unit
-    held, on = holding(p, s, p.tolerance)
-    return null_space(np.vstack([np.eye(len(unit))[held], s.at.jacobian[on] * unit]))
+    held, active = active_set(p, s, p.tolerance)
+    return null_space(np.vstack([np.eye(len(unit))[held], s.at.jacobian[active] * unit]))

@@ -1,10 +1,10 @@
 """Node functions of a network, and certified bounds of its gains over boxes (report 3.1.3).
 
 The derivatives of order 1 to 3 are enclosed over the box by interval arithmetic with outward
-rounding (physics.md 5). The gains are then tightened by Taylor's theorem about the box's centre c,
-g(c + d) = g(c) + H(c) d + d T(box) d / 2, whose excess falls with the cube of the box's size; so a
-range is split into cells. Everything is JAX: a bound is differentiable by the weights and can be a
-constraint.
+rounding (physics.md 5). The enclosure of a gain g is then tightened by Taylor's theorem about the
+box's centre c, g(c + d) = g(c) + H(c) d + d T(box) d / 2. Its excess falls with the cube of the
+box's size, so that a range is split into cells. All is written in JAX: a bound is differentiable by
+the weights and can be a constraint.
 """
 
 from __future__ import annotations
@@ -21,17 +21,17 @@ from beamfit.errors import InputError
 
 
 class Activation(NamedTuple):
-    """A node function and where its derivatives turn.
+    """A node function and the turning points of its derivatives.
 
     Parameters
     ----------
     function : callable
         The node function of a scalar.
     turns : tuple of tuple of float
-        For the function and its derivatives of order 1 to 3: the points between which it is
-        monotonic.
+        Turning points of the function and of its derivatives of order 1 to 3; each is monotonic
+        between them.
     monotonic : bool
-        Whether the function never falls.
+        True if the function never falls.
     """
 
     function: Callable[[jax.Array], jax.Array]
@@ -39,7 +39,7 @@ class Activation(NamedTuple):
     monotonic: bool
 
     def derivative(self, order: int) -> Callable[[jax.Array], jax.Array]:
-        """The derivative of an order, as JAX makes it."""
+        """Return the derivative of an order, computed by JAX."""
         function = self.function
         for _ in range(order):
             function = jax.grad(function)
@@ -54,9 +54,9 @@ def _logcosh(s):
 # JAX's own derivative of logaddexp loses digits in proportion to |s|; d log cosh(s)/ds = tanh(s).
 _logcosh.defjvps(lambda t, _, s: jnp.tanh(s) * t)
 
-# Zeros of the next derivative. With t = tanh(s), the third derivative of tanh is
+# Turning points: zeros of the next derivative. With t = tanh(s), the third derivative of tanh is
 # -2 (1-t^2) (1-3t^2), the fourth 8 t (1-t^2) (2-3t^2); sigmoid(s) = (1 + tanh(s/2))/2; those of
-# exp(-s^2) are zeros of the Hermite polynomials of order 1 to 4.
+# exp(-s^2) are the zeros of the Hermite polynomials of order 1 to 4.
 _T2, _T3 = math.atanh(math.sqrt(1 / 3)), math.atanh(math.sqrt(2 / 3))
 _G1, _G2 = math.sqrt(1 / 2), math.sqrt(3 / 2)
 _G3, _G4 = (math.sqrt((3 + sign * math.sqrt(6)) / 2) for sign in (-1, 1))
@@ -81,27 +81,27 @@ KINDS: dict[str, Activation] = {
 
 
 class Range(NamedTuple):
-    """An enclosure: everything lies between `lower` and `upper`."""
+    """An enclosure by two ends: all values lie between `lower` and `upper`."""
 
     lower: jax.Array
     upper: jax.Array
 
     def widened(self, error: jax.Array) -> Range:
-        """Move both ends outward by a rounding error, which no derivative sees."""
+        """Move both ends outward by a rounding error, which is not differentiated."""
         error = jax.lax.stop_gradient(error)
         return Range(self.lower - error, self.upper + error)
 
 
-# The error of one evaluation is at most 64 roundings of 1 + |value|: tests compare every derivative
-# with 50-digit arithmetic. XLA's tanh and exp are good to a few roundings.
+# Largest error of one evaluation in units of 1 + |value|: 64 roundings. Tests compare all
+# derivatives with 50-digit arithmetic; XLA's tanh and exp are accurate to a few roundings.
 _ERROR = 64 * 2.0**-53
 
 
 def range_of(kind: str, order: int, s: Range) -> Range:
     """Enclose the derivative of a node function over ranges of its argument.
 
-    Between the turning points the derivative is monotonic, so its range is spanned by its values
-    at the ends and at the turning points inside; rounding is added outward.
+    Between its turning points the derivative is monotonic, so that its range is spanned by its
+    values at the ends and at the turning points inside. Rounding widens it.
 
     Parameters
     ----------
@@ -110,12 +110,12 @@ def range_of(kind: str, order: int, s: Range) -> Range:
     order : int
         0 to 3.
     s : Range
-        The argument, of any shape.
+        Range of the argument, of any shape.
 
     Returns
     -------
     Range
-        Of the same shape.
+        Of the same shape as `s`.
 
     Examples
     --------
@@ -130,32 +130,34 @@ def range_of(kind: str, order: int, s: Range) -> Range:
     return found.widened(_ERROR * (1 + jnp.max(jnp.abs(values), axis=0)))
 
 
-# Relative error of one operation in double precision, half the distance between neighbours.
+# Relative error of one operation in double precision: half the distance between neighbours.
 _ROUNDING = 2.0**-53
-_TINY = 1e-300  # covers underflow, which a relative error does not
+# Added to errors to cover underflow, which a relative error does not.
+_TINY = 1e-300
 
 
 class _Ball(NamedTuple):
-    """An enclosure of finite numbers: within `radius` of `middle`.
+    """An enclosure of finite numbers by a centre and a radius.
 
-    Cheaper than two ends, and for narrow ranges as tight; products never compare signs.
+    It is faster than two ends and as tight for narrow ranges, as products need no comparison of
+    signs.
     """
 
-    middle: jax.Array
+    centre: jax.Array
     radius: jax.Array
 
     def __getitem__(self, at) -> _Ball:
         """Index both parts alike."""
-        return _Ball(self.middle[at], self.radius[at])
+        return _Ball(self.centre[at], self.radius[at])
 
     @property
     def largest(self) -> jax.Array:
-        """The largest magnitude inside."""
-        return jnp.abs(self.middle) + self.radius
+        """Largest magnitude in the ball."""
+        return jnp.abs(self.centre) + self.radius
 
 
 class _Nodes(NamedTuple):
-    """Enclosures for the n nodes of a layer; each derivative adds one axis of inputs."""
+    """Enclosures of the n nodes of a layer and their derivatives, each with one more input axis."""
 
     value: Range
     first: _Ball
@@ -163,75 +165,75 @@ class _Nodes(NamedTuple):
     third: _Ball
 
 
-def _rounded(found: _Ball, size: jax.Array, operations: int) -> _Ball:
-    """Widen a ball by the rounding of some operations on numbers of a size."""
+def _widen(found: _Ball, size: jax.Array, operations: int) -> _Ball:
+    """Widen a ball by the rounding of some operations on numbers of a given size."""
     error = 2 * operations * _ROUNDING * jax.lax.stop_gradient(size) + _TINY
-    return _Ball(found.middle, found.radius + error)
+    return _Ball(found.centre, found.radius + error)
 
 
-def _times(a: _Ball, b: _Ball) -> _Ball:
+def _multiply(a: _Ball, b: _Ball) -> _Ball:
     """Enclose a product."""
-    radius = jnp.abs(a.middle) * b.radius + a.radius * b.largest
-    return _rounded(_Ball(a.middle * b.middle, radius), a.largest * b.largest, 4)
+    radius = jnp.abs(a.centre) * b.radius + a.radius * b.largest
+    return _widen(_Ball(a.centre * b.centre, radius), a.largest * b.largest, 4)
 
 
-def _plus(*parts: _Ball) -> _Ball:
+def _add(*parts: _Ball) -> _Ball:
     """Enclose a sum."""
-    found = _Ball(sum(p.middle for p in parts), sum(p.radius for p in parts))
-    return _rounded(found, sum(p.largest for p in parts), 2 * len(parts))
+    found = _Ball(sum(p.centre for p in parts), sum(p.radius for p in parts))
+    return _widen(found, sum(p.largest for p in parts), 2 * len(parts))
 
 
-def _weighted(a: _Ball, weight: jax.Array) -> _Ball:
+def _weighted_sum(a: _Ball, weight: jax.Array) -> _Ball:
     """Enclose the sum over nodes of weight * a, for a of shape (nodes, ...)."""
     size = jnp.abs(weight)
     found = _Ball(*(jnp.tensordot(w, p, (0, 0)) for w, p in zip((weight, size), a, strict=True)))
-    return _rounded(found, jnp.tensordot(size, a.largest, (0, 0)), 2 * weight.shape[0] + 4)
+    return _widen(found, jnp.tensordot(size, a.largest, (0, 0)), 2 * weight.shape[0] + 4)
 
 
-def _weighted_values(a: Range, weight: jax.Array) -> Range:
-    """Enclose the sum over nodes of weight * a by its ends, which may be infinite."""
+def _weighted_range(a: Range, weight: jax.Array) -> Range:
+    """Enclose the sum over nodes of weight * a, with ends that may be infinite."""
     low, high = (jnp.where(weight == 0, 0.0, weight * end[:, None]) for end in a)
     found = Range(jnp.sum(jnp.minimum(low, high), axis=0), jnp.sum(jnp.maximum(low, high), axis=0))
     size = jnp.sum(jnp.maximum(jnp.abs(low), jnp.abs(high)), axis=0)
     return found.widened(2 * (weight.shape[0] + 2) * _ROUNDING * size + _TINY)
 
 
-def _joined(a: Range, b: Range) -> Range:
+def _add_ranges(a: Range, b: Range) -> Range:
     """Enclose the sum of two ranges."""
     found = Range(a.lower + b.lower, a.upper + b.upper)
     return found.widened(4 * _ROUNDING * (jnp.abs(found.lower) + jnp.abs(found.upper)) + _TINY)
 
 
 def _ball(a: Range) -> _Ball:
-    """The ball around a range."""
-    middle = 0.5 * (a.lower + a.upper)
+    """Make the ball around a range."""
+    centre = 0.5 * (a.lower + a.upper)
     radius = 0.5 * (a.upper - a.lower)
-    return _rounded(_Ball(middle, radius), jnp.abs(a.lower) + jnp.abs(a.upper), 2)
+    return _widen(_Ball(centre, radius), jnp.abs(a.lower) + jnp.abs(a.upper), 2)
 
 
-def _activated(s: _Nodes, kind: str) -> _Nodes:
-    """Enclose a layer's nodes from its arguments: the chain rule, to third order, for balls."""
+def _apply_function(s: _Nodes, kind: str) -> _Nodes:
+    """Enclose a layer's nodes from their arguments by the chain rule to third order."""
     if kind in ("identity", "linear"):
         return s
     new, n = np.newaxis, slice(None)
     d1, d2, d3 = (_ball(range_of(kind, order, s.value)) for order in (1, 2, 3))
     i, j, k = s.first[n, n, new, new], s.first[n, new, n, new], s.first[n, new, new, n]
-    pairs = _times(s.first[n, n, new], s.first[n, new, n])
-    mixed = _plus(
-        _times(s.second[n, n, n, new], k),
-        _times(s.second[n, n, new, n], j),
-        _times(s.second[n, new, n, n], i),
+    pairs = _multiply(s.first[n, n, new], s.first[n, new, n])
+    mixed = _add(
+        _multiply(s.second[n, n, n, new], k),
+        _multiply(s.second[n, n, new, n], j),
+        _multiply(s.second[n, new, n, n], i),
     )
-    second = _plus(_times(d2[n, new, new], pairs), _times(d1[n, new, new], s.second))
-    third = _plus(
-        _times(d3[n, new, new, new], _times(pairs[n, n, n, new], k)),
-        _times(d2[n, new, new, new], mixed),
-        _times(d1[n, new, new, new], s.third),
+    second = _add(_multiply(d2[n, new, new], pairs), _multiply(d1[n, new, new], s.second))
+    third = _add(
+        _multiply(d3[n, new, new, new], _multiply(pairs[n, n, n, new], k)),
+        _multiply(d2[n, new, new, new], mixed),
+        _multiply(d1[n, new, new, new], s.third),
     )
-    return _Nodes(range_of(kind, 0, s.value), _times(d1[n, new], s.first), second, third)
+    return _Nodes(range_of(kind, 0, s.value), _multiply(d1[n, new], s.first), second, third)
 
 
-def _entered(s: _Nodes, net: Any, layer: str, box: Range) -> _Nodes:
+def _add_inputs(s: _Nodes, net: Any, layer: str, box: Range) -> _Nodes:
     """Add the inputs that enter a layer."""
     value, first = s.value, s.first
     for i, port in enumerate(net.input_ports):
@@ -242,16 +244,16 @@ def _entered(s: _Nodes, net: Any, layer: str, box: Range) -> _Nodes:
         size = jnp.maximum(*(jnp.abs(end) for end in side)) + abs(port.bias)
         x = Range(jnp.minimum(*ends), jnp.maximum(*ends))
         x = x.widened(4 * _ROUNDING * size / abs(port.scale) + _TINY)
-        joined = _joined(Range(*(v[port.node] for v in value)), x)
+        joined = _add_ranges(Range(*(v[port.node] for v in value)), x)
         value = Range(*(v.at[port.node].set(e) for v, e in zip(value, joined, strict=True)))
-        unit = _rounded(_Ball(jnp.asarray(1 / port.scale), 0.0), 1 / abs(port.scale), 1)
-        joined = _plus(first[port.node, i], unit)
+        unit = _widen(_Ball(jnp.asarray(1 / port.scale), 0.0), 1 / abs(port.scale), 1)
+        joined = _add(first[port.node, i], unit)
         first = _Ball(*(f.at[port.node, i].set(e) for f, e in zip(first, joined, strict=True)))
     return s._replace(value=value, first=first)
 
 
 def _enclose(net: Any, box: Range) -> _Nodes:
-    """Enclose the derivatives of every output over a box (values keep their node's scale)."""
+    """Enclose all outputs' derivatives over a box; values stay in the scale of the nodes."""
     inputs = len(net.input_ports)
     done: dict[str, _Nodes] = {}
     for layer in net.order:
@@ -261,12 +263,13 @@ def _enclose(net: Any, box: Range) -> _Nodes:
         for source, target in net.connections:
             if target == layer.name:
                 weight, before = net.weights[f"{source}->{target}"], done[source]
-                value = _joined(s.value, _weighted_values(before.value, weight))
+                value = _add_ranges(s.value, _weighted_range(before.value, weight))
                 rest = (
-                    _plus(a, _weighted(b, weight)) for a, b in zip(s[1:], before[1:], strict=True)
+                    _add(a, _weighted_sum(b, weight))
+                    for a, b in zip(s[1:], before[1:], strict=True)
                 )
                 s = _Nodes(value, *rest)
-        done[layer.name] = _activated(_entered(s, net, layer.name, box), layer.kind)
+        done[layer.name] = _apply_function(_add_inputs(s, net, layer.name, box), layer.kind)
     rows = [
         jax.tree_util.tree_map(lambda part, p=port: part[p.node], done[port.layer])
         for port in net.output_ports
@@ -274,51 +277,54 @@ def _enclose(net: Any, box: Range) -> _Nodes:
     stacked = jax.tree_util.tree_map(lambda *parts: jnp.stack(parts), *rows)
     scale = jnp.array([port.scale for port in net.output_ports])
     scales = (jnp.reshape(scale, (-1, *(1,) * order)) for order in (1, 2, 3))
-    rest = (_times(b, _Ball(c, 0.0)) for b, c in zip(stacked[1:], scales, strict=True))
+    rest = (_multiply(b, _Ball(c, 0.0)) for b, c in zip(stacked[1:], scales, strict=True))
     return _Nodes(stacked.value, *rest)
 
 
-def _highest(slope: jax.Array, bend: jax.Array, radius: jax.Array) -> jax.Array:
-    """Largest value of slope*d + bend*d^2/2 over |d| <= radius, for slope >= 0, rounded up."""
-    inside = (bend < 0) & (slope < -bend * radius)
-    at_edge = slope * radius + 0.5 * bend * radius**2
-    peak = 0.5 * slope**2 / jnp.where(inside, -bend, 1.0)
-    error = 16 * _ROUNDING * (slope * radius + jnp.abs(bend) * radius**2) + _TINY
+def _maximum(slope: jax.Array, curvature: jax.Array, radius: jax.Array) -> jax.Array:
+    """Maximise slope*d + curvature*d^2/2 over |d| <= radius for slope >= 0, rounded up."""
+    inside = (curvature < 0) & (slope < -curvature * radius)
+    at_edge = slope * radius + 0.5 * curvature * radius**2
+    peak = 0.5 * slope**2 / jnp.where(inside, -curvature, 1.0)
+    error = 16 * _ROUNDING * (slope * radius + jnp.abs(curvature) * radius**2) + _TINY
     return jnp.where(inside, peak, at_edge) + jax.lax.stop_gradient(error)
 
 
-def _taylor(middle: _Nodes, whole: _Nodes, radius: jax.Array) -> Range:
+def _taylor(at_centre: _Nodes, over_box: _Nodes, radius: jax.Array) -> Range:
     """Enclose the gains over a finite box by Taylor's theorem about its centre."""
     n = len(radius)
-    bend = _Ball(*(jnp.diagonal(part, axis1=-2, axis2=-1) for part in whole.third))
-    cross = whole.third.largest * (1 - jnp.eye(n))
+    curvature = _Ball(*(jnp.diagonal(part, axis1=-2, axis2=-1) for part in over_box.third))
+    cross = over_box.third.largest * (1 - jnp.eye(n))
     mixed = 0.5 * jnp.einsum("oijk,j,k->oi", cross, radius, radius)
-    slope = middle.second.largest
+    slope = at_centre.second.largest
     up, down = (
-        (jnp.sum(_highest(slope, sign * bend.middle + bend.radius, radius), axis=-1) + mixed)
+        (
+            jnp.sum(_maximum(slope, sign * curvature.centre + curvature.radius, radius), axis=-1)
+            + mixed
+        )
         for sign in (1, -1)
     )
-    size = jnp.abs(up) + jnp.abs(down) + mixed + middle.first.largest
-    reach = middle.first.radius + 8 * (n**2 + 2) * _ROUNDING * jax.lax.stop_gradient(size)
-    return Range(middle.first.middle - down - reach, middle.first.middle + up + reach)
+    size = jnp.abs(up) + jnp.abs(down) + mixed + at_centre.first.largest
+    reach = at_centre.first.radius + 8 * (n**2 + 2) * _ROUNDING * jax.lax.stop_gradient(size)
+    return Range(at_centre.first.centre - down - reach, at_centre.first.centre + up + reach)
 
 
 @jax.jit
 def gain_bounds(net: Any, lower: jax.Array, upper: jax.Array) -> Range:
-    """Enclose every first-order gain of a network over one box.
+    """Enclose all first-order gains of a network over one box.
 
     Parameters
     ----------
     net : MLP
-        The network; its own gain outputs play no part.
+        The network; its gain outputs have no effect.
     lower, upper : array, shape (inputs,)
         Corners of the box; infinite sides are allowed.
 
     Returns
     -------
     Range
-        `lower` and `upper`, each of shape (output ports, inputs): no input in the box has a gain
-        outside, rounding included.
+        `lower` and `upper`, each of shape (output ports, inputs). No input in the box has a gain
+        outside them, rounding included.
 
     Examples
     --------
@@ -336,12 +342,12 @@ def gain_bounds(net: Any, lower: jax.Array, upper: jax.Array) -> Range:
     radius = radius + 4 * _ROUNDING * (jnp.abs(low) + jnp.abs(high))
     boxes = Range(jnp.stack([lower, centre]), jnp.stack([upper, centre]))
     both = jax.vmap(lambda box: _enclose(net, box))(boxes)
-    whole, middle = (jax.tree_util.tree_map(lambda part, i=i: part[i], both) for i in (0, 1))
-    tight = _taylor(middle, whole, radius)
-    # An infinite slope has no ball: its middle is not a number, and nothing is known of the gain.
-    known = jnp.isfinite(whole.first.radius)
-    reach = jnp.where(known, whole.first.radius, jnp.inf)
-    around = jnp.where(known, whole.first.middle, 0.0)
+    over_box, at_centre = (jax.tree_util.tree_map(lambda part, i=i: part[i], both) for i in (0, 1))
+    tight = _taylor(at_centre, over_box, radius)
+    # An infinite slope has no ball: its centre is NaN, and the gain is not limited.
+    finite_slope = jnp.isfinite(over_box.first.radius)
+    reach = jnp.where(finite_slope, over_box.first.radius, jnp.inf)
+    around = jnp.where(finite_slope, over_box.first.centre, 0.0)
     return Range(
         jnp.where(finite, jnp.maximum(around - reach, tight.lower), around - reach),
         jnp.where(finite, jnp.minimum(around + reach, tight.upper), around + reach),
@@ -356,12 +362,12 @@ def cells(lower, upper, number: int) -> tuple[np.ndarray, np.ndarray]:
     lower, upper : array, shape (inputs,)
         Corners of the box, finite.
     number : int
-        Cells along each input.
+        Number of cells along each input.
 
     Returns
     -------
     tuple of numpy.ndarray, shape (cells, inputs)
-        Lower and upper corners; neighbours share their faces exactly.
+        Lower and upper corners; neighbouring cells share their faces exactly.
 
     Raises
     ------
@@ -387,7 +393,7 @@ def cells(lower, upper, number: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def over_cells(net: Any, lower: jax.Array, upper: jax.Array) -> Range:
-    """Enclose every first-order gain over each of some boxes.
+    """Enclose all first-order gains of a network over several boxes.
 
     Parameters
     ----------
@@ -399,8 +405,8 @@ def over_cells(net: Any, lower: jax.Array, upper: jax.Array) -> Range:
     Returns
     -------
     Range
-        `lower` and `upper`, each of shape (cells, output ports, inputs). A constraint on all of
-        them holds everywhere in the boxes.
+        `lower` and `upper`, each of shape (cells, output ports, inputs). Limits that hold for all
+        of them hold everywhere in the boxes.
 
     Examples
     --------

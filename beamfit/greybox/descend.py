@@ -1,17 +1,17 @@
-"""Bounded least squares from many starts at once: the one method of the package.
+"""Bounded least squares from many starts at once; used by every fit of the package.
 
-Levenberg-Marquardt with Moré's column scaling (Moré 1978, Numerical Analysis, LNM 630, 105) and
-Nielsen's damping (IMM-REP-1999-05). A step solves the damped linear problem by QR, not by normal
-equations, and pins the numbers that would leave their bounds, so iterates end exactly on them;
-scipy's bounded methods stay strictly inside, which blurs the verdict "at its bound". All starts
-take their steps together: only residuals and slopes are compiled, the steps are batched NumPy. A
-point's triangle of (J, r) serves every damping tried there, by LAPACK's QR of two triangles. Where
-residuals bend along a step, a second one follows their curve, as the end of the first tells it
-(M. K. Transtrum & J. P. Sethna, arXiv:1201.5885, without a further derivative).
+The method is Levenberg-Marquardt with Moré's column scaling (Moré 1978, Numerical Analysis, LNM
+630, 105) and Nielsen's damping (IMM-REP-1999-05). A step solves the damped linear problem by QR and
+pins the numbers that would leave their bounds, so that iterates end exactly on a bound; scipy's
+bounded methods stay strictly inside, which blurs the verdict "at its bound". All starts take their
+steps together: residuals and Jacobians are compiled, the steps are batched NumPy. The triangular
+factor of (J, r) at a point serves every damping tried there, by LAPACK's QR of two triangles. Where
+the residuals are curved along a step, a second step corrects for this curvature, estimated from the
+end of the first (M. K. Transtrum & J. P. Sethna, arXiv:1201.5885, without a further derivative).
 
-Of many free numbers steps solve normal equations, sparse where the problem is, and are corrected by
-the residual that they leave (corrected seminormal equations: Å. Björck, Linear Algebra Appl. 88/89
-(1987) 31). It proposes points; whether one is an optimum is for `beamfit.greybox.assess` to say.
+For many free numbers a step solves normal equations, sparse where the problem is, with one
+refinement (corrected seminormal equations: Å. Björck, Linear Algebra Appl. 88/89 (1987) 31).
+This module only proposes points; `beamfit.greybox.assess` decides which of them are optima.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ import numpy as np
 from jax import Array
 from scipy.linalg import lapack
 
-from beamfit.greybox.covariance import FEW
-from beamfit.greybox.problem import Problem, residual, sloped, with_slope
+from beamfit.greybox.covariance import MAX_DENSE
+from beamfit.greybox.problem import Problem, residual, residual_and_jacobian, with_slope
 from beamfit.greybox.sparse import (
     RIDGE,
     Factor,
@@ -39,36 +39,43 @@ from beamfit.greybox.sparse import (
     with_diagonal,
 )
 
-# Damping of the first step; the Jacobian's columns have unit length.
-DAMPING = 1e-3
-# A search rests at a step below this share of the numbers, both in units of the Jacobian's columns.
-TOLERANCE = 1e-13
-# Damping falls to these shares after a step along which residuals were straight (D. W. Marquardt,
-# J. SIAM 11 (1963) 431), and after one along which they bent but which kept its promise (Nielsen).
-STRAIGHT, CURVED = 1 / 10, 1 / 3
-# Damping beyond which no step, however short, lowers the cost; below the least it is rounding.
-STUCK, LEAST = 1e30, 1e-30
-# A promised decrease below this share of the sum of squares is rounding.
-ROUNDING = 1e-16
-# A step that promises less than this share, and is hardly damped, is the last: it moves the numbers
-# by 1e-7 of their errors, and what it brings cannot be told from rounding.
-FINISHED = 1e-14
-# A step that lowers the cost by less than this share of its promise is followed along the curve of
-# the residuals, if that should bring this share of what was missed within this part of its length.
-BENT, MISSED, NEAR = 0.75, 0.5, 0.375
-# Rounds in which a step pins numbers to bounds; the rest is clipped.
-PINNED = 3
-# Columns that LAPACK's QR of two triangles takes at once: of 3 to 400 numbers the quickest.
-BLOCK = 8
-# Starts looked at in one compiled call, if their Jacobians have at most this many entries.
-WIDTH, LARGE = 4, 2**15
+# Damping of the first step, relative to the Jacobian's columns scaled to unit length.
+FIRST_DAMPING = 1e-3
+# A search has come to rest at a step below this share of the numbers, both weighted with the
+# lengths of the Jacobian's columns.
+STEP_TOLERANCE = 1e-13
+# Factor on the damping after an accepted step: from the first after a step along which the
+# residuals were linear (D. W. Marquardt, J. SIAM 11 (1963) 431) to the second after one along which
+# they were curved and the cost fell as predicted (Nielsen).
+MIN_DAMPING_FACTOR, MAX_DAMPING_FACTOR = 1 / 10, 1 / 3
+# A damping below the first is rounding; above the second no step, however short, lowers the cost.
+MIN_DAMPING, MAX_DAMPING = 1e-30, 1e30
+# A predicted decrease below this share of the sum of squares is rounding.
+DECREASE_ROUNDING = 1e-16
+# A hardly damped step with a predicted decrease below this share of the sum of squares is the last:
+# it moves the numbers by 1e-7 of their errors, and its effect is hardly more than rounding.
+LAST_DECREASE = 1e-14
+# A step is corrected for the curvature of the residuals if the actual decrease is less than this
+# share of the predicted one,
+MAX_CORRECTED_RATIO = 0.75
+# if the correction should regain this share of the difference,
+MIN_REGAINED = 0.5
+# and if its length is at most this share of the step's (Transtrum and Sethna's condition).
+MAX_CORRECTION = 0.375
+# Rounds in which a step pins numbers to their bounds; afterwards it is clipped.
+MAX_PINNING_ROUNDS = 3
+# Block size for LAPACK's QR of two triangles: the fastest for 3 to 400 numbers.
+QR_BLOCK = 8
+# Points evaluated in one compiled call, if a Jacobian has at most this many entries; else one.
+POINTS_PER_CALL, MAX_BATCHED_ENTRIES = 4, 2**15
 
-# Residuals (k, m) and their Jacobians (k, m, n), or k sparse ones, at points (k, n) of some starts.
+# Function of the indices of some starts and a point of each, (k, n), that returns residuals (k, m)
+# and their Jacobians: an array (k, m, n), or k sparse matrices.
 Slopes = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 
 class Found(NamedTuple):
-    """Ends of searches: numbers, half the sums of squares, steps, and if they came to rest."""
+    """Ends of searches: numbers, half the sums of squares, steps taken, true if at rest."""
 
     theta: np.ndarray
     cost: np.ndarray
@@ -76,10 +83,11 @@ class Found(NamedTuple):
     rested: np.ndarray
 
 
-class Tried(NamedTuple):
-    """Ends of steps: points, residuals and Jacobians there, decrease of the cost over promised.
+class TrialSteps(NamedTuple):
+    """Ends of trial steps.
 
-    `finite` tells of each end if all is.
+    `ratio` is the actual decrease of the cost over the predicted one, `finite` is true where
+    residuals and Jacobian are finite.
     """
 
     theta: np.ndarray
@@ -90,40 +98,41 @@ class Tried(NamedTuple):
 
 
 class Descent:
-    """Searches side by side; arrays with one row for each start.
+    """Searches from several starts, advanced together; arrays have one row for each start.
 
-    `stuck` tells that no step from there lowers the cost; `steps` counts refused ones too.
+    `stuck` is true where no step lowers the cost. `steps` counts rejected steps as well.
 
     Parameters
     ----------
     slopes : callable
         ``slopes(lanes, points)``: residuals and Jacobians at a point of each of some starts.
     points : array, shape (k, n)
-        Where to start.
+        Starting points.
     lower, upper : array, shape (n,)
         Bounds; equal ends hold a number fixed.
     tolerance : float
-        On the length of a step relative to the numbers, both in units of the Jacobian's columns.
-    many : bool
-        Whether steps are those of many free numbers.
+        Length of a step, relative to the numbers, at which a search rests; both are weighted with
+        the lengths of the Jacobian's columns.
+    large : bool
+        True to solve normal equations instead of QR, for many free numbers.
     """
 
-    def __init__(self, slopes: Slopes, points, lower, upper, tolerance=TOLERANCE, many=False):
+    def __init__(self, slopes: Slopes, points, lower, upper, tolerance=STEP_TOLERANCE, large=False):
         self.slopes, self.lower, self.upper = slopes, np.asarray(lower), np.asarray(upper)
-        self.tolerance, self.many = tolerance, many
-        self.above = np.tri(self.lower.size + 1).T
+        self.tolerance, self.large = tolerance, large
+        self.upper_triangle = np.tri(self.lower.size + 1).T
         self.theta = np.clip(np.asarray(points, float), lower, upper)
         k = len(self.theta)
         self.residual, self.jacobian = slopes(np.arange(k), self.theta)
-        self.right, self.rows = self._reduced(self.residual, self.jacobian)
+        self.right, self.rows = self._reduce(self.residual, self.jacobian)
         self.scale = np.zeros_like(self.theta)
-        self.damping, self.growth = np.full(k, DAMPING), np.full(k, 2.0)
+        self.damping, self.growth = np.full(k, FIRST_DAMPING), np.full(k, 2.0)
         self.steps, self.rested = np.zeros(k, int), np.zeros(k, bool)
         self.stuck = ~_finite(self.residual, self.jacobian)
 
     @property
     def done(self) -> np.ndarray:
-        """True for each start that has come to rest or cannot move."""
+        """True for each search that is at rest or stuck."""
         return self.rested | self.stuck
 
     def _squares(self, lanes: np.ndarray) -> np.ndarray:
@@ -132,12 +141,12 @@ class Descent:
 
     @property
     def cost(self) -> np.ndarray:
-        """Half the sum of squares of each; infinite where something is not finite."""
+        """Half the sum of squares of each search; infinite where a residual is not finite."""
         cost = 0.5 * _dot(self.residual, self.residual)
         return np.where(np.isfinite(cost), cost, np.inf)
 
-    def go(self, lanes: np.ndarray, limit: int, until: float | None = None) -> None:
-        """Move some searches on to a number of steps, or until a moment on the clock."""
+    def run(self, lanes: np.ndarray, limit: int, until: float | None = None) -> None:
+        """Advance some searches up to a number of steps or a time of `time.perf_counter`."""
         with np.errstate(all="ignore"):
             while until is None or time.perf_counter() < until:
                 moving = lanes[~self.done[lanes] & (self.steps[lanes] < limit)]
@@ -145,9 +154,9 @@ class Descent:
                     return
                 self._advance(moving)
 
-    def _reduced(self, residuals: np.ndarray, jacobians: np.ndarray):
-        """Right sides and rows with the same squares: of few numbers the triangles of (J, r)."""
-        if self.many:
+    def _reduce(self, residuals: np.ndarray, jacobians: np.ndarray):
+        """Reduce (J, r) to a triangle with the same normal equations, or set these up if many."""
+        if self.large:
             rows = np.empty(len(residuals), object)
             rows[:] = [NormalEquations(one) for one in jacobians]
             return residuals, rows
@@ -156,101 +165,105 @@ class Descent:
         rows = np.empty((k, min(m, n + 1), n + 1))
         for lane, one in enumerate(wide):
             rows[lane] = lapack.dgeqrf(one)[0][: n + 1]
-        rows *= self.above[:m]
+        rows *= self.upper_triangle[:m]
         return rows[..., n], rows[..., :n]
 
     def _advance(self, lanes: np.ndarray) -> None:
-        """Try a step of each, take or refuse it."""
+        """Try a step of each search; accept or reject it."""
         rows = self.rows[lanes]
         self.scale[lanes] = scale = np.maximum(self.scale[lanes], _lengths(rows))
-        points = self._proposed(lanes, self.right[lanes], rows)
+        points = self._propose(lanes, self.right[lanes], rows)
         theta = self.theta[lanes]
         step = points - theta
         moved = _times(rows, step)
-        promised = -_dot(moved, self.right[lanes] + 0.5 * moved)
+        predicted = -_dot(moved, self.right[lanes] + 0.5 * moved)
         small = _length(scale * step) <= self.tolerance * _length(scale * theta)
         self.rested[lanes] = small
         if small.any():
-            lanes, points, promised = lanes[~small], points[~small], promised[~small]
+            lanes, points, predicted = lanes[~small], points[~small], predicted[~small]
         if not len(lanes):
             return
-        tried = self._tried(lanes, points, promised)
-        bent, points = self._bent(lanes, tried, promised)
-        if len(bent):
-            second = self._tried(lanes[bent], points, promised[bent])
-            better = second.ratio > tried.ratio[bent]
+        tried = self._try_steps(lanes, points, predicted)
+        curved, points = self._corrections(lanes, tried, predicted)
+        if len(curved):
+            second = self._try_steps(lanes[curved], points, predicted[curved])
+            better = second.ratio > tried.ratio[curved]
             for first, other in zip(tried, second, strict=True):
-                first[bent[better]] = other[better]
-        self._take(lanes, tried, promised)
+                first[curved[better]] = other[better]
+        self._accept(lanes, tried, predicted)
 
-    def _proposed(self, lanes: np.ndarray, right: np.ndarray, rows: np.ndarray) -> np.ndarray:
-        step = _next_of_many if self.many else _next
+    def _propose(self, lanes: np.ndarray, right: np.ndarray, rows: np.ndarray) -> np.ndarray:
+        step = _step_large if self.large else _step_dense
         at = (self.scale[lanes], self.damping[lanes], self.lower, self.upper)
         return step(self.theta[lanes], right, rows, *at)
 
-    def _tried(self, lanes: np.ndarray, points: np.ndarray, promised: np.ndarray) -> Tried:
+    def _try_steps(
+        self, lanes: np.ndarray, points: np.ndarray, predicted: np.ndarray
+    ) -> TrialSteps:
+        """Evaluate the ends of steps, and compare the decrease of the cost with the prediction."""
         old = self.residual[lanes]
         new, slope = self.slopes(lanes, points)
         self.steps[lanes] += 1
-        ratio = 0.5 * _dot(old - new, old + new) / promised
+        ratio = 0.5 * _dot(old - new, old + new) / predicted
         finite = _finite(new, slope)
-        ratio = np.where(finite & (promised > 0), ratio, -np.inf)
-        return Tried(points, new, slope, ratio, finite)
+        ratio = np.where(finite & (predicted > 0), ratio, -np.inf)
+        return TrialSteps(points, new, slope, ratio, finite)
 
-    def _bent(self, lanes: np.ndarray, tried: Tried, promised: np.ndarray):
-        """Find the searches whose residuals bend along their step, and the steps that follow.
+    def _corrections(self, lanes: np.ndarray, tried: TrialSteps, predicted: np.ndarray):
+        """Find the steps along which residuals are curved, and correct them for the curvature.
 
-        What the residuals at the end of a step have beyond its straight line is added to those that
-        the step was solved for: a little further step along their curve, where it is expected to
-        bring most of what the straight one missed.
+        The difference between the residuals at the end of a step and their linear prediction is
+        added to the right side of the step's equations. Returns the indices of the searches for
+        which the correction is expected to help, and their corrected points.
         """
-        poor = (tried.ratio < BENT) & np.isfinite(tried.ratio)
-        at = np.flatnonzero(poor & (promised > FINISHED * self._squares(lanes)))
+        poor = (tried.ratio < MAX_CORRECTED_RATIO) & np.isfinite(tried.ratio)
+        at = np.flatnonzero(poor & (predicted > LAST_DECREASE * self._squares(lanes)))
         if not len(at):
             return at, tried.theta[at]
         jacobian, new, ends = self.jacobian[lanes[at]], tried.residual[at], tried.theta[at]
-        change = ends - self.theta[lanes[at]]
-        right = new - _times(jacobian, change)
-        curved = (right, self.rows[lanes[at]]) if self.many else self._reduced(right, jacobian)
-        points = self._proposed(lanes[at], *curved)
-        more, scale = points - ends, self.scale[lanes[at]]
-        left = new + _times(jacobian, more)
-        gain = 0.5 * _dot(new - left, new + left)
-        worth = gain > MISSED * (1.0 - tried.ratio[at]) * promised[at]
-        worth &= _length(scale * more) <= NEAR * _length(scale * change)
-        return at[worth], points[worth]
+        step = ends - self.theta[lanes[at]]
+        right = new - _times(jacobian, step)
+        curved = (right, self.rows[lanes[at]]) if self.large else self._reduce(right, jacobian)
+        points = self._propose(lanes[at], *curved)
+        correction, scale = points - ends, self.scale[lanes[at]]
+        remaining = new + _times(jacobian, correction)
+        gain = 0.5 * _dot(new - remaining, new + remaining)
+        promising = gain > MIN_REGAINED * (1.0 - tried.ratio[at]) * predicted[at]
+        promising &= _length(scale * correction) <= MAX_CORRECTION * _length(scale * step)
+        return at[promising], points[promising]
 
-    def _take(self, lanes: np.ndarray, tried: Tried, promised: np.ndarray) -> None:
-        """Take the steps that lower the cost; damp less after those, more after the others.
+    def _accept(self, lanes: np.ndarray, tried: TrialSteps, predicted: np.ndarray) -> None:
+        """Accept the steps that lower the cost; damp less after those, more after the others.
 
-        Damping is for residuals that bend: it falls with the share of their change that did.
+        The less the residuals were curved along an accepted step, the more the damping is reduced.
         """
-        squares, ratio, plain = self._squares(lanes), tried.ratio, promised >= 0
-        last = tried.finite & (self.damping[lanes] <= DAMPING) & plain
-        last &= promised <= FINISHED * squares
+        squares, ratio, defined = self._squares(lanes), tried.ratio, predicted >= 0
+        last = tried.finite & (self.damping[lanes] <= FIRST_DAMPING) & defined
+        last &= predicted <= LAST_DECREASE * squares
         good = (ratio > 1e-4) | last
-        taken, refused = lanes[good], lanes[~good]
+        taken, rejected = lanes[good], lanes[~good]
         line = _times(self.jacobian[taken], tried.theta[good] - self.theta[taken])
-        bend = _length(tried.residual[good] - self.residual[taken] - line) / _length(line)
+        curvature = _length(tried.residual[good] - self.residual[taken] - line) / _length(line)
         self.theta[taken], self.residual[taken] = tried.theta[good], tried.residual[good]
         self.jacobian[taken] = tried.jacobian[good]
-        reduced = self._reduced(tried.residual[good], tried.jacobian[good])
+        reduced = self._reduce(tried.residual[good], tried.jacobian[good])
         self.right[taken], self.rows[taken] = reduced
         ratio = ratio[good].clip(-1.0, 1.0)
-        self.damping[taken] *= np.maximum(np.clip(bend, STRAIGHT, CURVED), 1 - (2 * ratio - 1) ** 3)
+        factor = np.clip(curvature, MIN_DAMPING_FACTOR, MAX_DAMPING_FACTOR)
+        self.damping[taken] *= np.maximum(factor, 1 - (2 * ratio - 1) ** 3)
         self.growth[taken] = 2.0
-        self.damping[refused] *= self.growth[refused]
-        self.growth[refused] *= 2.0
-        self.rested[lanes] = last | (~good & plain & (promised <= ROUNDING * squares))
-        self.stuck[lanes] = self.damping[lanes] > STUCK
+        self.damping[rejected] *= self.growth[rejected]
+        self.growth[rejected] *= 2.0
+        self.rested[lanes] = last | (~good & defined & (predicted <= DECREASE_ROUNDING * squares))
+        self.stuck[lanes] = self.damping[lanes] > MAX_DAMPING
 
-    def move(self, lane: int, point: np.ndarray) -> None:
-        """Begin one search anew."""
+    def restart(self, lane: int, point: np.ndarray) -> None:
+        """Restart one search at a point."""
         at = np.array([lane])
         self.theta[at] = point
         self.residual[at], self.jacobian[at] = self.slopes(at, self.theta[at])
-        self.right[at], self.rows[at] = self._reduced(self.residual[at], self.jacobian[at])
-        self.scale[lane], self.damping[lane], self.growth[lane] = 0.0, DAMPING, 2.0
+        self.right[at], self.rows[at] = self._reduce(self.residual[at], self.jacobian[at])
+        self.scale[lane], self.damping[lane], self.growth[lane] = 0.0, FIRST_DAMPING, 2.0
         self.rested[lane] = self.stuck[lane] = False
 
 
@@ -263,7 +276,7 @@ def _length(rows: np.ndarray) -> np.ndarray:
 
 
 def _lengths(jacobians: np.ndarray) -> np.ndarray:
-    """Lengths of the columns of each; of many numbers they are an array of normal equations."""
+    """Column lengths of each Jacobian; an array of objects holds normal equations."""
     if jacobians.dtype == object:
         return np.stack([one.lengths for one in jacobians])
     return np.sqrt(np.einsum("kmn,kmn->kn", jacobians, jacobians))
@@ -276,94 +289,97 @@ def _times(jacobians: np.ndarray, steps: np.ndarray) -> np.ndarray:
 
 
 def _finite(residuals: np.ndarray, jacobians: np.ndarray) -> np.ndarray:
-    """True for each start where all is finite."""
-    many = jacobians.dtype == object
-    sums = np.array([one.sum() for one in jacobians]) if many else jacobians.sum(axis=(1, 2))
+    """True for each search with finite residuals and Jacobian."""
+    large = jacobians.dtype == object
+    sums = np.array([one.sum() for one in jacobians]) if large else jacobians.sum(axis=(1, 2))
     return np.isfinite(residuals.sum(axis=1) + sums)
 
 
-def _pinned(g: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """True for each number on a bound towards which the cost falls, and for fixed ones."""
+def _find_pinned(g: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """True for each number that is fixed, or at a bound beyond which the cost would fall."""
     return ((low >= 0) & (g > 0)) | ((high <= 0) & (g < 0)) | (low >= high)
 
 
-def _placed(theta, held, unit, low, high, lower, upper) -> np.ndarray:
-    """The next point: exactly on a bound, or the number is not known to be there."""
-    inside = (theta + held / unit).clip(lower, upper)
-    return np.where(held <= low, lower, np.where(held >= high, upper, inside))
+def _place(theta, step, unit, low, high, lower, upper) -> np.ndarray:
+    """Add a step to a point; numbers that reach a bound take exactly its value."""
+    inside = (theta + step / unit).clip(lower, upper)
+    return np.where(step <= low, lower, np.where(step >= high, upper, inside))
 
 
-def _next(theta, right, rows, scale, damping, lower, upper) -> np.ndarray:
-    """Solve the damped linear problems inside the bounds, pinning what would leave.
+def _step_dense(theta, right, rows, scale, damping, lower, upper) -> np.ndarray:
+    """Solve the damped linear problems, with numbers that would leave their bounds pinned.
 
-    In units of the columns' lengths.
+    Columns are scaled to unit length.
     """
     unit = np.where(scale > 0, scale, 1.0)
     low, high = (lower - theta) * unit, (upper - theta) * unit
     rows = rows / unit[:, None]
-    pinned = _pinned(np.einsum("kmn,km->kn", rows, right), low, high)
-    held, root = np.zeros_like(theta), np.sqrt(np.maximum(damping, LEAST))[:, None]
-    for _ in range(PINNED):
-        # A pinned number stands alone in its row; the others are solved beside it.
-        at = np.where(pinned, held, 0.0)
-        loose = np.where(pinned[:, None], 0.0, rows)
-        tried = _damped(loose, -right - _times(rows, at), np.where(pinned, 1.0, root), at)
-        held = tried.clip(low, high)
-        left = held != tried
-        if not (left & ~pinned).any():
+    pinned = _find_pinned(np.einsum("kmn,km->kn", rows, right), low, high)
+    step, root = np.zeros_like(theta), np.sqrt(np.maximum(damping, MIN_DAMPING))[:, None]
+    for _ in range(MAX_PINNING_ROUNDS):
+        # The row of a pinned number sets its value; the other rows have no part of it.
+        at = np.where(pinned, step, 0.0)
+        free = np.where(pinned[:, None], 0.0, rows)
+        tried = _solve_damped(free, -right - _times(rows, at), np.where(pinned, 1.0, root), at)
+        step = tried.clip(low, high)
+        clipped = step != tried
+        if not (clipped & ~pinned).any():
             break
-        pinned |= left
-    found = _placed(theta, held, unit, low, high, lower, upper)
-    return np.where(np.isfinite(held).all(axis=1, keepdims=True), found, theta)
+        pinned |= clipped
+    found = _place(theta, step, unit, low, high, lower, upper)
+    return np.where(np.isfinite(step).all(axis=1, keepdims=True), found, theta)
 
 
-def _damped(rows: np.ndarray, right: np.ndarray, alone: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """Least squares x of rows x = right, of at most n + 1 rows, and of alone x = at, one by one."""
+def _solve_damped(
+    rows: np.ndarray, right: np.ndarray, alone: np.ndarray, at: np.ndarray
+) -> np.ndarray:
+    """Solve rows x = right, of at most n + 1 rows, with alone * x = at, in least squares."""
     k, n = at.shape
-    # Transposed, as LAPACK has them.
+    # Transposed: LAPACK's matrices are stored by columns.
     upper, below = np.zeros((k, n + 1, n + 1)), np.zeros((k, n + 1, n))
     upper[:, :n, : rows.shape[1]], upper[:, n, : rows.shape[1]] = rows.swapaxes(1, 2), right
     below.reshape(k, -1)[:, : n * n : n + 1], below[:, n] = alone, at
-    found, block = np.empty((k, n)), min(BLOCK, n)
+    found, block = np.empty((k, n)), min(QR_BLOCK, n)
     for r, other, x in zip(upper, below, found, strict=True):
         lapack.dtpqrt(n, block, r.T, other.T, overwrite_a=1, overwrite_b=1)
         x[:] = lapack.dtrtrs(r[:n, :n], r[n, :n], lower=1, trans=1)[0]
     return found
 
 
-def _next_of_many(theta, residual, rows, scale, damping, lower, upper) -> np.ndarray:
-    """`_next` of each start, by normal equations of the numbers that are not pinned."""
+def _step_large(theta, residual, rows, scale, damping, lower, upper) -> np.ndarray:
+    """Do the same as `_step_dense` by normal equations, one search after the other."""
     found = np.full_like(theta, np.nan)
     for lane, at in enumerate(zip(theta, residual, rows, scale, damping, strict=True)):
         try:
-            found[lane] = _seminormal(*at, lower, upper)
-        except np.linalg.LinAlgError:  # refused, and damped more
+            found[lane] = _step_seminormal(*at, lower, upper)
+        except np.linalg.LinAlgError:  # the step is rejected and the damping increased
             continue
     return found
 
 
-def _seminormal(theta, residual, normal, scale, damping, lower, upper) -> np.ndarray:
+def _step_seminormal(theta, residual, normal, scale, damping, lower, upper) -> np.ndarray:
+    """Solve the damped normal equations of one search, with numbers pinned at their bounds."""
     unit = np.where(scale > 0, scale, 1.0)
     low, high = (lower - theta) * unit, (upper - theta) * unit
     rows = normal.in_units(unit)
-    pinned = _pinned(rows.T @ residual, low, high)
-    held, more = np.zeros(len(theta)), max(damping, RIDGE)
-    for _ in range(PINNED):
-        loose, held = ~pinned, np.where(pinned, held, 0.0)
-        factor = normal.factor(more, loose)
-        for _ in range(2):  # the second corrects the rounding of the first
-            left = rows.T @ (residual + rows @ held) + damping * held
-            held[loose] -= factor.solve(left[loose])
-        clipped = np.clip(held, low, high)
-        more_pinned = pinned | (clipped != held)
-        held, done, pinned = clipped, np.array_equal(pinned, more_pinned), more_pinned
+    pinned = _find_pinned(rows.T @ residual, low, high)
+    step, ridge = np.zeros(len(theta)), max(damping, RIDGE)
+    for _ in range(MAX_PINNING_ROUNDS):
+        free, step = ~pinned, np.where(pinned, step, 0.0)
+        factor = normal.factor(ridge, free)
+        for _ in range(2):  # the second pass corrects the rounding of the first
+            gradient = rows.T @ (residual + rows @ step) + damping * step
+            step[free] -= factor.solve(gradient[free])
+        clipped = np.clip(step, low, high)
+        now_pinned = pinned | (clipped != step)
+        step, done, pinned = clipped, np.array_equal(pinned, now_pinned), now_pinned
         if done:
             break
-    return _placed(theta, held, unit, low, high, lower, upper)
+    return _place(theta, step, unit, low, high, lower, upper)
 
 
 class NormalEquations:
-    """Normal equations of a Jacobian, its columns in units that stay; the last factor is kept."""
+    """Normal equations of a Jacobian with scaled columns; the last factorization is kept."""
 
     def __init__(self, jacobian: Rows):
         self.jacobian, self.lengths = jacobian, lengths(jacobian)
@@ -374,44 +390,44 @@ class NormalEquations:
         return self.jacobian @ step
 
     def in_units(self, unit: np.ndarray) -> Rows:
-        """The Jacobian with its columns in units, those of the first call."""
+        """The Jacobian with scaled columns; the scales of the first call stay."""
         if self.rows is None:
             self.rows = in_units(self.jacobian, unit)
             self.matrix = self.rows.T @ self.rows
         return self.rows
 
-    def factor(self, damping: float, loose: np.ndarray) -> Factor:
-        """Factor of the damped equations of the numbers that are loose."""
-        if self.kept is None or self.kept[0] != damping or not np.array_equal(self.kept[1], loose):
-            part = self.matrix if loose.all() else self.matrix[loose][:, loose]
-            self.kept = damping, loose, Factor(with_diagonal(part, damping))
+    def factor(self, damping: float, free: np.ndarray) -> Factor:
+        """Factorize the damped equations of the numbers that are not pinned."""
+        if self.kept is None or self.kept[0] != damping or not np.array_equal(self.kept[1], free):
+            part = self.matrix if free.all() else self.matrix[free][:, free]
+            self.kept = damping, free, Factor(with_diagonal(part, damping))
         return self.kept[2]
 
 
 def descent_of(p: Problem, points: np.ndarray) -> Descent:
-    """Searches of a problem, by the method for as many free numbers as it has."""
-    many = len(p.start) > FEW
-    few = slopes_of_few(p)
-    slopes = _slopes_of_many(p) if many else lambda _, points: few(points)
-    return Descent(slopes, points, p.lower, p.upper, many=many)
+    """Start the searches of a problem, dense or by normal equations as its size suggests."""
+    large = len(p.start) > MAX_DENSE
+    few = dense_slopes(p)
+    slopes = _sparse_slopes(p) if large else lambda _, points: few(points)
+    return Descent(slopes, points, p.lower, p.upper, large=large)
 
 
 def costs(p: Problem, d: Descent, points: np.ndarray) -> np.ndarray:
-    """Half the sum of squares at points; of few numbers by the call that is compiled already."""
-    look = p.compiled(residual)
-    found = map(look, points) if d.many else d.slopes(np.zeros(len(points), int), points)[0]
-    with np.errstate(over="ignore"):  # of a model that went astray
+    """Half the sum of squares at points; a small problem uses its compiled Jacobian."""
+    evaluate = p.compiled(residual)
+    found = map(evaluate, points) if d.large else d.slopes(np.zeros(len(points), int), points)[0]
+    with np.errstate(over="ignore"):  # of a model with huge values
         return np.array([0.5 * float(r @ r) for r in map(np.asarray, found)])
 
 
-def slopes_of_few(p: Problem) -> Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]:
-    """Residuals and Jacobians, a few points in each compiled call: one width for all counts."""
-    width = WIDTH if len(p.start) * p.size <= LARGE else 1
-    call = p.compiled(_sloped_each)
+def dense_slopes(p: Problem) -> Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]:
+    """Make a function of points to residuals and Jacobians, a few points in each compiled call."""
+    width = POINTS_PER_CALL if len(p.start) * p.size <= MAX_BATCHED_ENTRIES else 1
+    call = p.compiled(_slopes_of_batch)
 
     def slopes(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         firsts = range(0, len(points), width)
-        # The last part is filled with its last point.
+        # All calls have the same number of points: the last is padded with its last point.
         found = [call(points.take(range(i, i + width), 0, mode="clip")) for i in firsts]
         r, j = (np.concatenate(every)[: len(points)] for every in zip(*found, strict=True))
         return r, j
@@ -419,30 +435,30 @@ def slopes_of_few(p: Problem) -> Callable[[np.ndarray], tuple[np.ndarray, np.nda
     return slopes
 
 
-def _sloped_each(core, thetas):
-    return jax.vmap(partial(sloped, core))(thetas)
+def _slopes_of_batch(core, thetas):
+    return jax.vmap(partial(residual_and_jacobian, core))(thetas)
 
 
-def _slopes_of_many(p: Problem) -> Slopes:
-    """One point after the other, in as few sweeps as the pattern of the Jacobian allows."""
+def _sparse_slopes(p: Problem) -> Slopes:
+    """Make the same function for many numbers: one point after the other, sparse if possible."""
     shape = p.residual_count, len(p.start)
-    sweep, whole = p.compiled(_swept), p.compiled(sloped)
+    sweep, dense = p.compiled(_products), p.compiled(residual_and_jacobian)
     pattern: Pattern | None = None
     sparse = True
 
     def one(theta: np.ndarray) -> tuple[np.ndarray, Rows]:
         nonlocal pattern, sparse
-        there = partial(sweep, theta)
-        # A place that was zero at all points before is found by looking once more.
+        sweep_here = partial(sweep, theta)
+        # If an entry is nonzero for the first time, the sparsity pattern is determined again.
         for again in (False, True):
             if sparse and (again or pattern is None):
-                pattern = pattern_at(there, shape, pattern)
+                pattern = pattern_at(sweep_here, shape, pattern)
                 sparse = pattern is not None
             if sparse:
-                r, found = pattern.jacobian(there)
+                r, found = pattern.jacobian(sweep_here)
                 if found is not None:
                     return r, found
-        r, found = whole(theta)
+        r, found = dense(theta)
         return np.asarray(r), np.asarray(found)
 
     def slopes(_: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -454,14 +470,14 @@ def _slopes_of_many(p: Problem) -> Slopes:
     return slopes
 
 
-def _swept(core, theta, directions):
-    """Residuals, and the products of their Jacobian with some directions."""
+def _products(core, theta, directions):
+    """Compute residuals, and the products of their Jacobian with some directions."""
     r, along = jax.linearize(partial(residual, core), theta)
     return r, jax.vmap(along)(directions)
 
 
 @partial(jax.jit, static_argnums=(0, 3))
-def _sloped_all(residual, data, points, own: bool):
+def _slopes_at_starts(residual, data, points, own: bool):
     def one(data, theta):
         return with_slope(partial(residual, data), theta)
 
@@ -475,7 +491,7 @@ def descend_all(
     lower: Array,
     upper: Array,
     iterations: int = 300,
-    tolerance: float = TOLERANCE,
+    tolerance: float = STEP_TOLERANCE,
     own: bool = False,
 ) -> Found:
     """Minimise half the sum of squares within bounds, from every start.
@@ -486,17 +502,18 @@ def descend_all(
         ``residual(data, theta)``, shape (m,), in JAX; defined at the top of a module, so that it
         is compiled once.
     data : pytree
-        What it needs.
+        First argument of ``residual``.
     starts : array, shape (k, n)
-        Where to start; the residual is finite there.
+        Starting points; the residual is finite there.
     lower, upper : array, shape (n,)
         Bounds; equal ends hold a number fixed.
     iterations : int
-        Most steps, refused ones too.
+        Largest number of steps, rejected ones included.
     tolerance : float
-        On the length of a step relative to theta, both in units of the Jacobian's columns.
+        Length of a step, relative to theta, at which a search rests; both are weighted with the
+        lengths of the Jacobian's columns.
     own : bool
-        Whether every start has data of its own, along the first axis of each leaf.
+        True if every start has data of its own, along the first axis of each leaf.
 
     Returns
     -------
@@ -516,9 +533,9 @@ def descend_all(
 
     def slopes(lanes: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         every[lanes] = points
-        r, j = map(np.asarray, _sloped_all(residual, data, every, own))
+        r, j = map(np.asarray, _slopes_at_starts(residual, data, every, own))
         return r[lanes], j[lanes]
 
     search = Descent(slopes, every, np.asarray(lower), np.asarray(upper), tolerance)
-    search.go(np.arange(len(every)), iterations)
+    search.run(np.arange(len(every)), iterations)
     return Found(search.theta, search.cost, search.steps, search.rested)

@@ -1,6 +1,7 @@
-"""Advice on what to measure next: gain by further rows of the Jacobian, in linear approximation.
+"""Optimal design: the next measurement that reduces errors most, in linear approximation.
 
-A candidate is the derivatives of what it would measure by the free numbers, over its own errors.
+A candidate measurement is given by rows of the Jacobian: derivatives of its predicted values by the
+free numbers, divided by its errors.
 """
 
 from __future__ import annotations
@@ -14,20 +15,20 @@ from beamfit.greybox.covariance import Spread, spread_of
 
 
 class Information(NamedTuple):
-    """Present information on some quantities, to which candidates add.
+    """Information on some quantities from the present data, to which candidates add.
 
     Attributes
     ----------
     jacobian : ndarray
-        Shape (m, n), residuals by free numbers, in units of their errors, priors among them.
+        Shape (m, n), Jacobian of residuals in units of their errors, priors among them.
     value, slope : ndarray
         The quantities, shape (k,), and their derivatives by the free numbers, (k, n).
     asked : ndarray of bool
-        Which numbers are asked for, shape (n,): those whose error ellipsoid "volume" means.
+        Shape (n,), numbers whose error ellipsoid counts for the score `volume`.
     lower, upper : ndarray
         Bounds, shape (n,).
     held, with_prior : ndarray of bool, optional
-        What does not move, and what has a prior of its own.
+        Numbers that do not move, and numbers with a prior on themselves.
 
     Examples
     --------
@@ -48,12 +49,12 @@ class Information(NamedTuple):
 
     @property
     def spread(self) -> Spread:
-        """Spread of the numbers, bounds counted as information."""
+        """Errors of the numbers, with bounds as information."""
         return spread_of(self.jacobian, self.lower, self.upper, self.held, self.with_prior)
 
     @property
     def share(self) -> np.ndarray:
-        """Share of each quantity's variance that rests on bounds, shape (k,)."""
+        """Share of each quantity's variance that comes from bounds, shape (k,)."""
         return self.spread.share(self.slope)
 
     @property
@@ -72,7 +73,7 @@ class Information(NamedTuple):
 
 
 class Choice(NamedTuple):
-    """The best candidate given those before it: its place, its gain, and what is known with it.
+    """The best candidate after those chosen before: its index, gain, and the information with it.
 
     `gain` is the relative decrease of the score.
     """
@@ -83,7 +84,7 @@ class Choice(NamedTuple):
 
 
 def rows_of(covariance: np.ndarray) -> np.ndarray:
-    """Rows of a Jacobian whose information is the inverse of a covariance, shape (n, n).
+    """Make rows of a Jacobian whose information is the inverse of a covariance, shape (n, n).
 
     Examples
     --------
@@ -91,22 +92,22 @@ def rows_of(covariance: np.ndarray) -> np.ndarray:
     [[0.5, 0.0], [0.0, 2.0]]
     """
     unit = np.sqrt(np.diagonal(covariance))
-    sizes, turned = np.linalg.eigh(covariance / np.outer(unit, unit))
-    return (turned / np.sqrt(np.maximum(sizes, 1e-14 * sizes[-1]))).T / unit
+    sizes, vectors = np.linalg.eigh(covariance / np.outer(unit, unit))
+    return (vectors / np.sqrt(np.maximum(sizes, 1e-14 * sizes[-1]))).T / unit
 
 
-def scores(known: Information, candidates: np.ndarray, volume: bool = False) -> np.ndarray:
-    """Score of each candidate alone: the expected error with it; smaller is better.
+def scores(information: Information, candidates: np.ndarray, volume: bool = False) -> np.ndarray:
+    """Score each candidate alone by the expected error with it; smaller is better.
 
     Parameters
     ----------
-    known : Information
-        What is known so far.
+    information : Information
+        Information so far.
     candidates : ndarray
-        Shape (candidates, rows, n); rows of zeros for none.
+        Shape (candidates, rows, n); rows of zeros are padding.
     volume : bool
-        Score the logarithm of the determinant of the covariance of what is asked for
-        (D-optimality), not the root of the summed squares of the relative errors.
+        True to score the logarithm of the determinant of the covariance of the numbers `asked`
+        (D-optimality) instead of the root of the summed squares of the relative errors.
 
     Returns
     -------
@@ -114,7 +115,7 @@ def scores(known: Information, candidates: np.ndarray, volume: bool = False) -> 
 
     Notes
     -----
-    Rows G turn the covariance C into C - C Gᵀ (1 + G C Gᵀ)⁻¹ G C (Woodbury).
+    Rows G change the covariance C to C - C Gᵀ (1 + G C Gᵀ)⁻¹ G C (Woodbury).
 
     Examples
     --------
@@ -123,27 +124,29 @@ def scores(known: Information, candidates: np.ndarray, volume: bool = False) -> 
     >>> scores(one, np.array([[[0.0, 9.0]], [[np.sqrt(3.0), 0.0]]])).round(6).tolist()
     [1.0, 0.5]
     """
-    covariance = known.spread.covariance
+    covariance = information.spread.covariance
     moved = candidates @ covariance
     inner = np.eye(candidates.shape[1]) + moved @ np.swapaxes(candidates, 1, 2)
     if volume:
-        at = np.flatnonzero(known.asked)
+        at = np.flatnonzero(information.asked)
         unit = np.sqrt(np.diagonal(covariance)[at])
         gain = np.swapaxes(moved[..., at], 1, 2) @ np.linalg.solve(inner, moved[..., at])
         return np.linalg.slogdet((covariance[np.ix_(at, at)] - gain) / np.outer(unit, unit))[1]
-    slope = known.slope / known.value[:, None]
-    told = moved @ slope.T
+    slope = information.slope / information.value[:, None]
+    change = moved @ slope.T
     before = np.einsum("ij,jk,ik->", slope, covariance, slope)
-    gain = np.einsum("cij,cij->c", told, np.linalg.solve(inner, told))
+    gain = np.einsum("cij,cij->c", change, np.linalg.solve(inner, change))
     return np.sqrt(np.maximum(before - gain, 0.0))
 
 
-def greedy(known: Information, candidates: np.ndarray, volume: bool = False) -> Iterator[Choice]:
-    """Choose candidates one after the other, each the best given those before, without end.
+def greedy(
+    information: Information, candidates: np.ndarray, volume: bool = False
+) -> Iterator[Choice]:
+    """Yield candidates without end, each the best one after those chosen before.
 
     Parameters
     ----------
-    known, candidates, volume
+    information, candidates, volume
         As for `scores`.
 
     Yields
@@ -165,8 +168,8 @@ def greedy(known: Information, candidates: np.ndarray, volume: bool = False) -> 
     """
     none = np.zeros((1, *candidates.shape[1:]))
     while True:
-        [before] = scores(known, none, volume)
-        after = scores(known, candidates, volume)
+        [before] = scores(information, none, volume)
+        after = scores(information, candidates, volume)
         best = int(np.argmin(after))
-        known = known.with_rows(candidates[best])
-        yield Choice(best, float(1.0 - after[best] / before), known)
+        information = information.with_rows(candidates[best])
+        yield Choice(best, float(1.0 - after[best] / before), information)

@@ -1,4 +1,4 @@
-"""Mistakes in a problem as it is stated, and limits that conflict or depend on one another."""
+"""Errors in the statement of a problem, conflicting constraints and dependent constraints."""
 
 from __future__ import annotations
 
@@ -11,32 +11,33 @@ import numpy as np
 from scipy.optimize import nnls
 
 from beamfit.greybox import assess, problem, tree
-from beamfit.greybox.assess import NEAR, SearchState
+from beamfit.greybox.assess import TEST_DISTANCE, SearchState
 from beamfit.greybox.covariance import directions
 from beamfit.greybox.descend import descend_all
 from beamfit.greybox.problem import Problem, with_slope
 from beamfit.noise.correlated import CUT
 
-# Rows are badly scaled if their sizes differ by more than this: half the digits are lost.
-APART = 1e8
-# Gradients are dependent below this singular value: the first at an optimum; the second elsewhere,
-# since solvers only approach a point without multipliers.
-DEPENDENT, NEARLY = 1e-8, 1e-2
-# A constraint has no slope if that is below this share of its change nearby: a squared violation
-# that a solver keeps below 1e-9 has a slope of 6e-5.
-SLOPELESS = 1e-3
-# Entries of a combination below this share of its largest are rounding.
-PART = 1e-3
+# Constraints are badly scaled if their changes differ by more than this: half the digits are lost.
+MAX_SCALE_RATIO = 1e8
+# Gradients of active constraints are dependent below this singular value: at an optimum ...
+DEPENDENT_AT_OPTIMUM = 1e-8
+# ... and elsewhere, since solvers only approach a point without multipliers.
+DEPENDENT_ELSEWHERE = 1e-2
+# The gradient of a constraint vanishes if it is below this share of the constraint's change nearby:
+# a squared violation that a solver keeps below 1e-9 has a gradient of 6e-5.
+VANISHING_GRADIENT = 1e-3
+# Coefficients of a linear combination below this share of the largest are rounding.
+MIN_COEFFICIENT = 1e-3
 
 
 def listed(names: Iterable[str]) -> str:
-    """A few names for a sentence."""
+    """Join the first four names for a sentence, and count the others."""
     names = list(names)
     return ", ".join(names[:4]) + (f" and {len(names) - 4} more" if len(names) > 4 else "")
 
 
 class Ailment(NamedTuple):
-    """A finding: its kind, the numbers, rows or constraints concerned, cause and remedy in words.
+    """An error in a problem: its kind, the names concerned, and a message with cause and remedy.
 
     Kinds are ``contradictory_bounds, not_finite, unused, constant, undetermined,
     dependent_equations, badly_scaled``.
@@ -48,21 +49,24 @@ class Ailment(NamedTuple):
 
 
 def diagnose(p: Problem) -> tuple[Ailment, ...]:
-    """Look for what makes a problem unsolvable or its answer meaningless, without solving it.
+    """Look for errors that make a problem unsolvable or its answer meaningless, without solving it.
 
     Parameters
     ----------
     p : Problem
-        The problem, as stated.
+        The problem.
 
     Returns
     -------
     tuple of Ailment
-        Empty where nothing was found; what stands first is graver. Structure is read off the
-        derivatives at the start and a few points beside it, in exact arithmetic of zeros: a number
-        on which nothing depends at any of them is unused. Numbers are undetermined where residuals,
-        priors and equations have a lower rank at every point than there are numbers, which is their
-        structural rank at points at random; an objective may determine any.
+        The gravest first; empty if no error was found.
+
+    Notes
+    -----
+    The structure follows from the derivatives at the start and at a few random points nearby. A
+    number is unused if all derivatives by it are exactly zero at all points. Numbers are
+    undetermined if residuals, priors and equations have a rank below the number of free numbers at
+    every point (their structural rank). A problem with an objective is not tested for this.
 
     Examples
     --------
@@ -77,21 +81,26 @@ def diagnose(p: Problem) -> tuple[Ailment, ...]:
     undetermined ('a', 'b')
     """
     start = np.clip(p.start, p.lower, p.upper)
-    if wrong := contradictory(p):
-        return tuple(wrong)
-    points = [start, *assess.nearby(p, p.start, np.maximum(np.abs(p.start), 1.0))]
+    if errors := contradictory(p):
+        return tuple(errors)
+    points = [start, *assess.points_nearby(p, p.start, np.maximum(np.abs(p.start), 1.0))]
     first, *others = assess.slopes_at(p, np.array(points))
-    # Part by part only what is known to be wrong: that is traced anew each time.
-    if not first.finite and (wrong := not_finite(p, start)):
-        return tuple(wrong)
-    looks = [at for at in (first, *others) if at.finite]
-    if not looks:  # a slope is not finite anywhere near: nothing to read off
+    # Test part by part only if something is wrong: each part must be traced anew.
+    if not first.finite and (errors := not_finite(p, start)):
+        return tuple(errors)
+    samples = [at for at in (first, *others) if at.finite]
+    if not samples:  # no point nearby has finite derivatives
         return ()
-    return (*_unused(p, looks), *_undetermined(p, looks), *_dependent(p, looks), *_scaled(p, looks))
+    return (
+        *_unused(p, samples),
+        *_undetermined(p, samples),
+        *_dependent(p, samples),
+        *_scaled(p, samples),
+    )
 
 
 def contradictory(p: Problem) -> list[Ailment]:
-    """Bounds and limits of which the lower lies above the upper."""
+    """Find bounds and limits whose lower end lies above the upper."""
     names = (*p.names, *p.constraint_names)
     low, high = np.append(p.lower, p.constraint_lower), np.append(p.upper, p.constraint_upper)
     return [
@@ -105,9 +114,9 @@ def contradictory(p: Problem) -> list[Ailment]:
 
 
 def not_finite(p: Problem, theta: np.ndarray) -> list[Ailment]:
-    """Rows that are NaN or infinite at a point, or whose derivative is, by name."""
+    """Find records, priors, objectives and constraints with a value or derivative not finite."""
     found = []
-    for what, name, function in _parts(p):
+    for kind, name, function in _parts(p):
 
         def flat(t, function=function):
             return jnp.ravel(function(tree.replace(p.core.model, p.core.chosen, t)))
@@ -116,111 +125,114 @@ def not_finite(p: Problem, theta: np.ndarray) -> list[Ailment]:
         bad = np.flatnonzero(~np.isfinite(value))
         steep = np.argwhere(~np.isfinite(slope))
         if bad.size:
-            told = f"{what} '{name}' is {value[bad[0]]}"
-            told += f" in {bad.size} of {value.size} values, the first [{bad[0]}]" * (
+            text = f"{kind} '{name}' is {value[bad[0]]}"
+            text += f" in {bad.size} of {value.size} values, the first [{bad[0]}]" * (
                 value.size > 1
             )
         elif len(steep):
             row, column = steep[0]
-            told = f"the derivative of {what} '{name}'" + f"[{row}]" * (value.size > 1)
-            told += f" by {p.names[column]} is {slope[row, column]}"
+            text = f"the derivative of {kind} '{name}'" + f"[{row}]" * (value.size > 1)
+            text += f" by {p.names[column]} is {slope[row, column]}"
         else:
             continue
         remedy = (
             "start elsewhere, bound the numbers, or use a parametrisation that is defined there."
         )
-        found.append(Ailment("not_finite", (name,), f"not finite at the start: {told}; {remedy}"))
+        found.append(Ailment("not_finite", (name,), f"not finite at the start: {text}; {remedy}"))
     return found
 
 
 def _parts(p: Problem) -> Iterator[tuple[str, str, Callable[[Any], jax.Array]]]:
-    """Every function of the model in the problem: what it is, its name, and it."""
-    for what, group in (("record", p.records), ("prior", p.priors)):
+    """Yield kind, name and function of each record, prior, objective and constraint."""
+    for kind, group in (("record", p.records), ("prior", p.priors)):
         for part in group:
-            yield what, part.name, part.residual
-    for what, group in (("objective", p.objectives), ("constraint", p.constraints)):
+            yield kind, part.name, part.residual
+    for kind, group in (("objective", p.objectives), ("constraint", p.constraints)):
         for part in group:
-            yield what, part.name, lambda model, part=part: part.function(model, part.data)
+            yield kind, part.name, lambda model, part=part: part.function(model, part.data)
 
 
-def _depends(looks: list[np.ndarray]) -> np.ndarray:
-    """True for each row and number that it depends on, at any of the points."""
-    return np.any([rows != 0 for rows in looks], axis=0)
+def _depends(samples: list[np.ndarray]) -> np.ndarray:
+    """True for each row and number if the row depends on the number at any of the points."""
+    return np.any([rows != 0 for rows in samples], axis=0)
 
 
-def _named(kind: str, names: Sequence[str], which: np.ndarray, said: str) -> Iterator[Ailment]:
-    """An ailment of some names, if there are any; they stand in the place of {} in what is said."""
-    found = tuple(np.array(names)[which].tolist())
+def _error_about(
+    kind: str, names: Sequence[str], selected: np.ndarray, message: str
+) -> Iterator[Ailment]:
+    """Yield an error about the selected names, if any; {} in the message stands for them."""
+    found = tuple(np.array(names)[selected].tolist())
     if found:
-        yield Ailment(kind, found, said.format(listed(found)))
+        yield Ailment(kind, found, message.format(listed(found)))
 
 
-def _unused(p: Problem, looks: list[assess.Slopes]) -> Iterator[Ailment]:
-    every = [np.vstack([a.residual_jacobian, a.gradient[None], a.jacobian]) for a in looks]
-    loose = p.moving & ~_depends(every).any(axis=0)
-    said = "nothing depends on {}; fix or remove what is not needed."
-    yield from _named("unused", p.names, loose, said)
-    idle = ~_depends([at.jacobian for at in looks])[:, p.moving].any(axis=1)
-    said = "{} depends on no free number; free what it limits, or remove it."
-    yield from _named("constant", p.constraint_names, idle, said)
+def _unused(p: Problem, samples: list[assess.Slopes]) -> Iterator[Ailment]:
+    every = [np.vstack([a.residual_jacobian, a.gradient[None], a.jacobian]) for a in samples]
+    unused = p.moving & ~_depends(every).any(axis=0)
+    message = "nothing depends on {}; fix or remove what is not needed."
+    yield from _error_about("unused", p.names, unused, message)
+    idle = ~_depends([at.jacobian for at in samples])[:, p.moving].any(axis=1)
+    message = "{} depends on no free number; free what it limits, or remove it."
+    yield from _error_about("constant", p.constraint_names, idle, message)
 
 
-def _undetermined(p: Problem, looks: list[assess.Slopes]) -> Iterator[Ailment]:
-    """Numbers of which rows, priors and equations see fewer combinations than there are."""
+def _undetermined(p: Problem, samples: list[assess.Slopes]) -> Iterator[Ailment]:
+    """Find numbers of which residuals, priors and equations determine only combinations."""
     if p.objectives:
         return
-    every = [np.vstack([at.residual_jacobian, at.jacobian[p.equations]]) for at in looks]
+    every = [np.vstack([at.residual_jacobian, at.jacobian[p.equations]]) for at in samples]
     used = np.flatnonzero(_depends(every).any(axis=0) & p.moving)
-    said = (
+    message = (
         f"{len(every[0])} rows do not determine {{}} each: only combinations of them; fix some, or "
         "add data or priors."
     )
-    loose = used[_open([rows[:, used] for rows in every])]
-    yield from _named("undetermined", p.names, loose, said)
+    undetermined = used[_undetermined_columns([rows[:, used] for rows in every])]
+    yield from _error_about("undetermined", p.names, undetermined, message)
 
 
-def _open(looks: list[np.ndarray]) -> np.ndarray:
-    """Columns along which the rows see nothing at any point."""
-    every = np.ones(looks[0].shape[1], bool)
-    for rows in looks:
-        _, unseen, reach = directions(rows)
-        every &= np.max(np.abs(unseen), axis=1, initial=0.0) > CUT**0.5 * reach
+def _undetermined_columns(samples: list[np.ndarray]) -> np.ndarray:
+    """True for each column that the rows do not determine at any of the points."""
+    every = np.ones(samples[0].shape[1], bool)
+    for rows in samples:
+        _, undetermined, reach = directions(rows)
+        every &= np.max(np.abs(undetermined), axis=1, initial=0.0) > CUT**0.5 * reach
         if not every.any():
             break
     return every
 
 
-def _dependent(p: Problem, looks: list[assess.Slopes]) -> Iterator[Ailment]:
-    """Equations among which one follows from the others or contradicts them."""
+def _dependent(p: Problem, samples: list[assess.Slopes]) -> Iterator[Ailment]:
+    """Find equations of which one follows from the others or contradicts them."""
     equal = np.flatnonzero(p.equations)
     if not len(equal):
         return
-    loose = equal[_open([at.jacobian[equal][:, p.moving].T for at in looks])]
-    said = "the equations {} are not independent; remove what follows from others."
-    yield from _named("dependent_equations", p.constraint_names, loose, said)
+    dependent = equal[_undetermined_columns([at.jacobian[equal][:, p.moving].T for at in samples])]
+    message = "the equations {} are not independent; remove what follows from others."
+    yield from _error_about("dependent_equations", p.constraint_names, dependent, message)
 
 
-def _scaled(p: Problem, looks: list[assess.Slopes]) -> Iterator[Ailment]:
-    """Constraints that change far less, or far more, than the others when numbers do."""
-    unit = assess.scale_of(p, p.start, looks[0]).unit
-    size = np.max([np.max(np.abs(at.jacobian) * unit, axis=1, initial=0) for at in looks], axis=0)
-    usual = np.median(size[size > 0]) if (size > 0).any() else 1.0
-    off = (size > 0) & ((size > APART * usual) | (size < usual / APART))
-    worst = size[off][np.argmax(np.abs(np.log(size[off] / usual)))] if off.any() else usual
-    said = (
-        f"{{}} changes by {worst:.1e} where others change by {usual:.1e}; state it in units in "
+def _scaled(p: Problem, samples: list[assess.Slopes]) -> Iterator[Ailment]:
+    """Find constraints that change far less or far more with the numbers than the others."""
+    unit = assess.scale_of(p, p.start, samples[0]).unit
+    size = np.max([np.max(np.abs(at.jacobian) * unit, axis=1, initial=0) for at in samples], axis=0)
+    typical = np.median(size[size > 0]) if (size > 0).any() else 1.0
+    off = (size > 0) & ((size > MAX_SCALE_RATIO * typical) | (size < typical / MAX_SCALE_RATIO))
+    worst = size[off][np.argmax(np.abs(np.log(size[off] / typical)))] if off.any() else typical
+    message = (
+        f"{{}} changes by {worst:.1e} where others change by {typical:.1e}; state it in units in "
         "which it is of their size."
     )
-    yield from _named("badly_scaled", p.constraint_names, off, said)
+    yield from _error_about("badly_scaled", p.constraint_names, off, message)
 
 
-# ---- limits that conflict
+# ---- conflicting constraints
 
 
 class Conflict(NamedTuple):
-    """The point nearest to all constraints, and names of those that conflict, if any do.
+    """The point nearest to all constraints, and the names of a minimal set that conflicts.
 
-    `bounds` says which bounds take part, `numbers` names the numbers they bound.
+    `constraints` is empty if all hold at the point. `bounds` are the bounds that take part, written
+    as inequalities, and `numbers` the names of the numbers they bound.
     """
 
     theta: np.ndarray
@@ -230,7 +242,7 @@ class Conflict(NamedTuple):
 
     @property
     def about(self) -> tuple[str, ...]:
-        """Names of everything that takes part."""
+        """Names of all constraints and numbers that take part."""
         return (*self.constraints, *self.numbers)
 
     @property
@@ -240,23 +252,23 @@ class Conflict(NamedTuple):
 
 
 def excess(data, theta):
-    """Violation of each constraint in units of its size, times its weight."""
+    """Compute the violation of each constraint in units of its scale, times its weight."""
     core, lower, upper, size, weight = data
     c = problem.constraints(core, theta)
     return weight * (jnp.maximum(lower - c, 0) + jnp.maximum(c - upper, 0)) / size
 
 
-def relaxed(p: Problem, s: SearchState, starts: Iterable[np.ndarray]) -> Conflict:
-    """Come as near to the constraints as the bounds allow, and name what conflicts.
+def find_conflict(p: Problem, s: SearchState, starts: Iterable[np.ndarray]) -> Conflict:
+    """Find the point within the bounds nearest to all constraints, and name those that conflict.
 
     Parameters
     ----------
     p : Problem
-        Of which no feasible point was found.
+        A problem for which no feasible point was found.
     s : SearchState
-        The nearest one.
+        The point nearest to feasibility so far.
     starts : iterable of array, shape (n,)
-        From where to try besides.
+        Further starting points.
 
     Returns
     -------
@@ -264,28 +276,28 @@ def relaxed(p: Problem, s: SearchState, starts: Iterable[np.ndarray]) -> Conflic
     """
     points = np.array([s.theta, *starts])
 
-    def least(weight, low, high):
-        data = (p.core, p.constraint_lower, p.constraint_upper, s.limits.size, weight)
+    def nearest_point(weight, low, high):
+        data = (p.core, p.constraint_lower, p.constraint_upper, s.limits.scale, weight)
         found = descend_all(excess, data, np.clip(points, low, high), low, high)
         cost = np.where(np.isfinite(found.cost), found.cost, np.inf)
         theta = np.asarray(found.theta[int(np.argmin(cost))])
         return theta, np.asarray(excess(data, theta))
 
-    theta, over = least(np.ones(len(s.limits.size)), p.lower, p.upper)
-    if not np.max(over) > p.tolerance:
+    theta, violation = nearest_point(np.ones(len(s.limits.scale)), p.lower, p.upper)
+    if not np.max(violation) > p.tolerance:
         return Conflict(theta, ())
-    weight = (over > p.tolerance).astype(float)
+    weight = (violation > p.tolerance).astype(float)
     for i in np.flatnonzero(weight):
         without = weight * (np.arange(len(weight)) != i)
-        if np.max(least(without, p.lower, p.upper)[1]) > p.tolerance:
+        if np.max(nearest_point(without, p.lower, p.upper)[1]) > p.tolerance:
             weight = without
     low, high = np.array(p.lower), np.array(p.upper)
-    nearest = least(weight, low, high)[0]
+    nearest = nearest_point(weight, low, high)[0]
     needed, numbers = [], []
-    for i, at_low in _held(p, nearest):
+    for i, at_low in _at_bounds(p, nearest):
         freed = [edge.copy() for edge in (low, high)]
         freed[0 if at_low else 1][i] = -np.inf if at_low else np.inf
-        if np.max(least(weight, *freed)[1]) > p.tolerance:
+        if np.max(nearest_point(weight, *freed)[1]) > p.tolerance:
             low, high = freed
         else:
             numbers.append(p.names[i])
@@ -294,80 +306,84 @@ def relaxed(p: Problem, s: SearchState, starts: Iterable[np.ndarray]) -> Conflic
     return Conflict(theta, tuple(names.tolist()), tuple(needed), tuple(numbers))
 
 
-def _held(p: Problem, theta: np.ndarray) -> list[tuple[int, bool]]:
-    """Numbers on a bound, and whether it is the lower one; fixed ones apart."""
+def _at_bounds(p: Problem, theta: np.ndarray) -> list[tuple[int, bool]]:
+    """List the free numbers at a bound, with True for the lower one."""
     sides = ((p.lower, True), (p.upper, False))
     return [(i, low) for edge, low in sides for i in np.flatnonzero((theta == edge) & p.moving)]
 
 
-# ---- limits that depend on one another
+# ---- dependent constraints
 
 
 class Dependence(NamedTuple):
-    """Names of what depends on one another where it holds, and of what has no slope there."""
+    """Names of active limits with dependent gradients, and of those whose gradient vanishes."""
 
     names: tuple[str, ...]
-    slopeless: tuple[str, ...]
+    flat: tuple[str, ...]
 
 
 def dependence(p: Problem, s: SearchState, stationary: bool) -> Dependence | None:
-    """Find what is wrong with the limits that hold at a feasible point, if anything is.
+    """Test the constraint qualification: find active limits whose gradients are dependent.
 
     Parameters
     ----------
     p : Problem
         The problem.
     s : SearchState
-        The point.
+        A feasible point.
     stationary : bool
-        Whether the point has multipliers. If so they must be unique; if not, a combination of
-        gradients that all but vanishes tells why.
+        True if the point has multipliers, which must then be unique. Otherwise a combination of
+        gradients that nearly vanishes is the reason for their absence.
 
     Returns
     -------
     Dependence or None
+        None if the gradients of the active limits are independent.
     """
     moving, unit = p.moving, s.scale.unit
     if not s.at.finite or not moving.any():
         return None
     gradients = np.vstack([np.diag(unit), s.at.jacobian * unit])[:, moving]
-    size = np.concatenate([unit, _changes(p, s)])
+    size = np.concatenate([unit, _changes_nearby(p, s)])
     low, high = (
         np.concatenate(pair) for pair in zip(s.bounds.reached, s.limits.reached, strict=True)
     )
-    on = (low | high) & np.concatenate([moving, np.ones(len(s.limits.size), bool)])
-    # Free in sign: equalities, and multipliers that may become smaller.
+    active = (low | high) & np.concatenate([moving, np.ones(len(s.limits.scale), bool)])
+    # Coefficients of either sign are allowed for equations, and for multipliers that are not zero.
     equal = low & high
     force = np.concatenate([s.bounds.multiplier, s.limits.multiplier])
-    pull = np.concatenate([unit, np.linalg.norm(s.at.jacobian * unit, axis=1)])
+    gradient_length = np.concatenate([unit, np.linalg.norm(s.at.jacobian * unit, axis=1)])
     strength = np.max(assess.gradient_size(p, s.at, s.scale) * unit)
-    free = equal | (stationary & (np.abs(force) * pull > p.tolerance * strength))
+    free = equal | (stationary & (np.abs(force) * gradient_length > p.tolerance * strength))
     outward = np.where(low, 1.0, -1.0)[:, None] * gradients
     length = np.linalg.norm(gradients, axis=1)
-    steep = length > SLOPELESS * size
-    rows = np.where(steep[:, None], outward / np.where(steep, length, 1.0)[:, None], 0.0)[on]
-    part = _combination(rows, free[on], DEPENDENT if stationary else NEARLY)
+    steep = length > VANISHING_GRADIENT * size
+    rows = np.where(steep[:, None], outward / np.where(steep, length, 1.0)[:, None], 0.0)[active]
+    part = _vanishing_combination(
+        rows, free[active], DEPENDENT_AT_OPTIMUM if stationary else DEPENDENT_ELSEWHERE
+    )
     if part is None:
         return None
     names = np.array([*p.names, *p.constraint_names])
-    told = np.flatnonzero(on)[np.abs(part) > PART * np.max(np.abs(part))]
-    flat = told[~steep[told]]
-    return Dependence(tuple(names[told].tolist()), tuple(names[flat].tolist()))
+    involved = np.flatnonzero(active)[np.abs(part) > MIN_COEFFICIENT * np.max(np.abs(part))]
+    flat = involved[~steep[involved]]
+    return Dependence(tuple(names[involved].tolist()), tuple(names[flat].tolist()))
 
 
-def _changes(p: Problem, s: SearchState) -> np.ndarray:
-    """Largest change of each constraint per unit of the numbers, at random points nearby."""
-    points = assess.nearby(p, s.theta, assess.scale_of(p, s.theta, s.at).unit)
-    look = p.compiled(problem.constraints)
-    values = np.array([look(point) for point in points])
-    change = np.abs(values - s.at.constraints) / NEAR
+def _changes_nearby(p: Problem, s: SearchState) -> np.ndarray:
+    """Compute the largest change of each constraint, per unit step, at random points nearby."""
+    points = assess.points_nearby(p, s.theta, assess.scale_of(p, s.theta, s.at).unit)
+    evaluate = p.compiled(problem.constraints)
+    values = np.array([evaluate(point) for point in points])
+    change = np.abs(values - s.at.constraints) / TEST_DISTANCE
     return np.max(np.where(np.isfinite(change), change, 0.0), axis=0, initial=0.0)
 
 
-def _combination(rows: np.ndarray, free: np.ndarray, cut: float) -> np.ndarray | None:
-    """A combination of rows that vanishes, not negative where it is not free to be.
+def _vanishing_combination(rows: np.ndarray, free: np.ndarray, cut: float) -> np.ndarray | None:
+    """Find a linear combination of rows that vanishes; None if there is none.
 
-    Prefer one with rows that are not free; otherwise take one of the free rows alone.
+    Coefficients may be negative only where `free`. A combination with rows that are not free is
+    preferred to one of free rows alone.
     """
     held, v = ~free, np.zeros(len(rows))
     if held.any():
@@ -381,9 +397,9 @@ def _combination(rows: np.ndarray, free: np.ndarray, cut: float) -> np.ndarray |
             return v
     if not free.any():
         return None
-    left, sizes, _ = np.linalg.svd(rows[free], full_matrices=True)
+    vectors, sizes, _ = np.linalg.svd(rows[free], full_matrices=True)
     rank = int(np.sum(sizes > cut * max(1.0, np.max(sizes))))
     if rank == free.sum():
         return None
-    v[free] = left[:, rank]
+    v[free] = vectors[:, rank]
     return v

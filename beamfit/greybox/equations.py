@@ -1,8 +1,9 @@
-"""Maps that are equations: f(x, y) = 0 with its solver inside, and the Taylor difference equation.
+"""Maps defined by equations: f(x, y) = 0 with a solver inside, and the Taylor difference equation.
 
-The difference equation (report eqs 2-4) is the default parametric model where no physics is known:
-the next output is a polynomial in the deviations of past outputs and inputs from an operating
-point, and its coefficients are the parameters p that a map gives as functions of the inputs.
+The difference equation (report eqs 2-4) is the default parametric model where the physics is
+unknown. The next output is a polynomial in the deviations of past outputs and inputs from an
+operating point. Its coefficients are the parameters p, which another map gives as functions of the
+inputs.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from beamfit.greybox import tree
 
 
 class Root(NamedTuple):
-    """Result of the inner solver at one point.
+    """Result of the inner Newton solver at one point.
 
     ``defect`` is ``max |f(x, y)|``; ``converged`` is 1 where it is within the tolerance, else 0.
     """
@@ -36,10 +37,10 @@ class Root(NamedTuple):
 class Implicit:
     """The map y(x) defined by equation(parameters, x, y) = 0.
 
-    Damped Newton steps from `start`; the derivatives of y are those of the implicit function
-    theorem, dy/dx = -(df/dy)^-1 df/dx, at any order, forward or backward. Where Newton does not
-    converge, the map gives its last finite iterate; `root` says so, and a fit that ends on such a
-    point has the status ``not_converged``.
+    It is solved by damped Newton steps from `start`. The derivatives of y follow from the implicit
+    function theorem, dy/dx = -(df/dy)^-1 df/dx, at any order, forward or backward. Where Newton's
+    method does not converge, the map returns the last finite iterate; `root` reports this, and a
+    fit that ends at such a point has the status ``not_converged``.
 
     Parameters
     ----------
@@ -48,13 +49,13 @@ class Implicit:
     equation : callable
         ``equation(parameters, x, y)``, shape (outputs,), in JAX.
     start : array, shape (outputs,)
-        Where Newton starts.
+        Start of Newton's method.
     parameters : pytree, optional
-        The numbers the equation holds; any of them can be free in a fit.
+        Numbers in the equation; any of them can be free in a fit.
     tolerance : float
-        On ``max |equation|``.
+        Largest ``max |equation|`` that counts as converged.
     iterations : int
-        Most Newton steps.
+        Largest number of Newton steps.
 
     Examples
     --------
@@ -79,9 +80,9 @@ class Implicit:
         object.__setattr__(self, "start", jnp.asarray(self.start, float))
 
     def __call__(self, x: jax.Array) -> jax.Array:
-        """Outputs at one point."""
+        """Compute the outputs at one point."""
         found = self.root(x)
-        # Only seen by a caller who looks (checkify), so that a fit can name the failure.
+        # Only has an effect under `checkify`, by which a fit names the failure.
         checkify.debug_check(
             found.converged > 0.5,
             f"the equation of {', '.join(self.outputs)} was left with max |f| = {{defect}} "
@@ -91,7 +92,7 @@ class Implicit:
         return found.y
 
     def root(self, x: jax.Array) -> Root:
-        """Solve at one point and tell how it went.
+        """Solve at one point and report convergence.
 
         Parameters
         ----------
@@ -117,7 +118,7 @@ class Implicit:
         return Root(y, defect, steps, jax.lax.stop_gradient(converged))
 
     def _newton(self, f, start):
-        """Damped Newton: halve the step until the defect falls (a scan: checkify enters it)."""
+        """Take damped Newton steps, halved until the defect falls (a scan, as checkify needs)."""
         halvings = 0.5 ** jnp.arange(8)
 
         def norm(y):
@@ -129,8 +130,8 @@ class Implicit:
             tries = jax.vmap(lambda t: norm(y + t * direction))(halvings)
             falls = tries < norm(y)
             moved = y + halvings[jnp.argmax(falls)] * direction
-            go = jnp.any(falls) & (norm(y) > 0.01 * self.tolerance)
-            return (jnp.where(go, moved, y), used + go), None
+            move = jnp.any(falls) & (norm(y) > 0.01 * self.tolerance)
+            return (jnp.where(move, moved, y), used + move), None
 
         (y, used), _ = jax.lax.scan(step, (start, jnp.zeros(())), length=self.iterations)
         return y, used
@@ -138,11 +139,11 @@ class Implicit:
 
 @tree.node("process_inputs", "process_outputs", "y_past", "u_past", "degree")
 class TaylorDifference:
-    """Next output y_k = init + sum A_i y_(k-i) + sum B_i u_(k-i) (+ all products), eqs 2 and 4.
+    """The map y_k = init + sum A_i y_(k-i) + sum B_i u_(k-i) (+ all products), eqs 2 and 4.
 
-    All y and u are deviations from the operating point. As a map, its inputs are the coefficients
-    followed by the past (``y[k-1]``, ..., ``u[k]``, ``u[k-1]``, ...), so that it is the second map
-    of a `Series` whose first map gives the coefficients.
+    All y and u are deviations from the operating point. Its inputs are the coefficients followed by
+    the past (``y[k-1]``, ..., ``u[k]``, ``u[k-1]``, ...). It can thus be the second map of a
+    `Series` whose first map gives the coefficients.
 
     Parameters
     ----------
@@ -151,9 +152,9 @@ class TaylorDifference:
     y_past : int
         Number of past outputs, i = 1 ... y_past.
     u_past : int
-        Number of past inputs besides the present one, i = 0 ... u_past.
+        Number of past inputs in addition to the present one, i = 0 ... u_past.
     degree : int
-        1 for eq 4; 2 adds every product of two deviations (the second-order terms of eq 2).
+        1 for eq 4; 2 adds all products of two deviations (the second-order terms of eq 2).
 
     Raises
     ------
@@ -186,7 +187,7 @@ class TaylorDifference:
 
     @property
     def past(self) -> tuple[str, ...]:
-        """Names of the deviations the next output depends on."""
+        """Names of the deviations on which the next output depends."""
         steps = ["k", *(f"k-{i}" for i in range(1, 1 + max(self.y_past, self.u_past)))]
         outputs = product(steps[1 : 1 + self.y_past], self.process_outputs)
         inputs = product(steps[: 1 + self.u_past], self.process_inputs)
@@ -194,7 +195,7 @@ class TaylorDifference:
 
     @property
     def terms(self) -> tuple[tuple[int, ...], ...]:
-        """The monomials, as positions in `past`; the empty one is the constant."""
+        """Monomials as tuples of positions in `past`; the empty tuple is the constant."""
         every = range(len(self.past))
         return tuple(
             term for n in range(self.degree + 1) for term in combinations_with_replacement(every, n)
@@ -208,20 +209,20 @@ class TaylorDifference:
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        """The coefficients, then the past."""
+        """Names of the coefficients, then of the past."""
         return self.coefficients + self.past
 
     @property
     def outputs(self) -> tuple[str, ...]:
-        """The next outputs."""
+        """Names of the outputs."""
         return self.process_outputs
 
     def __call__(self, x: jax.Array) -> jax.Array:
-        """Next outputs at one point: coefficients and past in one vector."""
+        """Compute the next outputs from one vector of coefficients and past."""
         return self.step(x[: len(self.coefficients)], x[len(self.coefficients) :])
 
     def step(self, p: jax.Array, past: jax.Array) -> jax.Array:
-        """Next outputs from coefficients and past deviations.
+        """Compute the next outputs from coefficients and past deviations.
 
         Parameters
         ----------
@@ -238,14 +239,14 @@ class TaylorDifference:
         return jnp.reshape(p, (len(self.process_outputs), -1)) @ monomials
 
     def simulate(self, p: jax.Array, u: jax.Array, y0: jax.Array) -> jax.Array:
-        """Run the equation on its own outputs (output error).
+        """Simulate the equation with its own past outputs (output error).
 
         Parameters
         ----------
         p : array, shape (coefficients,) or (samples, coefficients)
             Constant parameters, or those of each sample.
         u : array, shape (samples, process inputs)
-            Input deviations; before the first sample the input is taken as its first value.
+            Input deviations; the input before the first sample equals the first value.
         y0 : array, shape (y_past, process outputs)
             Output deviations before the first sample, the latest first.
 

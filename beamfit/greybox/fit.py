@@ -1,4 +1,4 @@
-"""The answer of a fit: values, what they are worth, and what held them."""
+"""Result of a fit: values with errors, bounds and multipliers, and the verdict."""
 
 from __future__ import annotations
 
@@ -25,16 +25,17 @@ if TYPE_CHECKING:
     from beamfit.sampling.posterior import Posterior
     from beamfit.sampling.priors import Distribution
 
-# Cost above the best (half of a chi-square of 6) up to which another optimum starts the sampler.
+# Another optimum also starts the sampler if its cost exceeds the best by less than this: a
+# difference of 6 in chi-square, which makes it 20 times less probable.
 NEAR_COST = 3.0
 
 
 class FittedVariable(NamedTuple):
     """A free number: value, error, bounds, state and reduced gradient d(cost)/d(bound).
 
-    `error` is one standard deviation, NaN where the data do not determine the value; `error_raw`
-    takes errors that were given as they are (`Fit.covariance_raw`). `state` is ``free``,
-    ``lower``, ``upper`` or ``fixed``.
+    `error` is one standard deviation, NaN where the data do not determine the value. `error_raw` is
+    the error without a factor on the given errors of the data (`Fit.covariance_raw`). `state` is
+    ``free``, ``lower``, ``upper`` or ``fixed``.
     """
 
     name: str
@@ -59,11 +60,11 @@ class FittedConstraint(NamedTuple):
 
 
 class Derived(NamedTuple):
-    """Numbers computed from a fit, all of the shape of `value`.
+    """Quantities computed from a fit, all of the shape of `value`.
 
-    `error` and `error_raw` are NaN where the data do not determine the value: where `share`, the
-    part of its variance that rests on bounds or on nothing, is `MOST_SHARE` or more. `slope` has
-    the derivatives by the free numbers along one more axis.
+    `share` is the share of the variance that comes from bounds, 1 for an undetermined quantity.
+    `error` and `error_raw` are NaN where it is `MOST_SHARE` or more. `slope` has the derivatives by
+    the free numbers along one more axis.
     """
 
     value: np.ndarray
@@ -81,14 +82,14 @@ def _with_slope(function, chosen, model, theta, data):
 def value_and_slope(
     p: Problem, function: Callable[[Any, Any], Any], theta: np.ndarray, data: Any = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """``function(model, data)`` of a problem, with its derivatives by the free numbers."""
+    """Compute ``function(model, data)`` of a problem and its derivatives by the free numbers."""
     core = p.core
     value, slope = _with_slope(function, core.chosen, core.model, jnp.asarray(theta), data)
     return np.asarray(value), np.asarray(slope)
 
 
 class Attempt(NamedTuple):
-    """One start of a search: which solver ended where, at what cost, how near to an optimum."""
+    """Search from one start: solvers, end point, cost, KKT residuals, iterations, message."""
 
     solver: str
     theta: np.ndarray
@@ -105,7 +106,7 @@ class Fit:
     Parameters
     ----------
     problem : Problem
-        What was fitted.
+        The problem that was solved.
     theta : array, shape (n,)
         The free numbers.
     status : Status
@@ -115,29 +116,30 @@ class Fit:
     cost, chi2 : float
         Cost, and sum of squared residuals, priors included.
     dof : int
-        Residuals less the directions they determine.
+        Number of residuals less that of the directions they determine.
     groups : tuple of Group
         The noise of each record.
     kkt : KKT
-        How far from an optimum, computed here and not by a solver.
+        KKT residuals of the answer, computed independently of the solver.
     variables, constraints : tuple
         The free numbers and the constraint elements, with bounds, states and multipliers.
     spread, spread_raw : Spread
-        Errors in linear approximation along the active limits, bounds counted as information:
-        each record's residuals divided by the scale of its group, or by 1 where errors were given.
+        Errors in linear approximation along the active limits, with bounds as information. In
+        `spread` each record's residuals are divided by the scale of its group; in `spread_raw` only
+        where no errors were given.
     jacobian : array, shape (m, n)
-        Derivatives of the residuals, in units of their errors, priors last; sparse where the
-        problem is, of many numbers.
+        Derivatives of the residuals, in units of their errors, priors last; a sparse array for
+        large sparse problems.
     undetermined : array, shape (n, k)
-        Directions in theta that the residuals do not see.
+        Directions in theta that the residuals do not determine.
     scale : float
-        sqrt(chi2/dof) of all residuals where above 1, or wherever all noise is inferred.
+        sqrt(chi2/dof) of all residuals; at least 1 if any record has given errors.
     attempts : tuple of Attempt
-        Every start; the best one is the answer.
+        One for each start; the best one is the answer.
     seconds : float
         Time taken, compilation included.
     about : tuple of str
-        Names of the numbers and constraints that the verdict speaks of.
+        Names of the numbers and constraints that the verdict is about.
     """
 
     problem: Problem
@@ -172,16 +174,16 @@ class Fit:
 
     @property
     def covariance(self) -> np.ndarray:
-        """Covariance of the free numbers, shape (n, n), zero along open directions."""
+        """Covariance of the free numbers, shape (n, n), zero along undetermined directions."""
         return self.spread.seen
 
     @property
     def covariance_raw(self) -> np.ndarray:
-        """The same with errors that were given taken as they are."""
+        """Covariance without a factor on the given errors of the data, shape (n, n)."""
         return self.spread_raw.seen
 
     def group(self, name: str) -> Group:
-        """The noise of the record of a name."""
+        """Return the noise of a record by its name."""
         known = {group.name: group for group in self.groups}
         if name not in known:
             raise InputError(f"no record '{name}'", nearest(name, list(known)))
@@ -189,12 +191,12 @@ class Fit:
 
     @property
     def iterations(self) -> int:
-        """Iterations over all starts."""
+        """Number of iterations over all starts."""
         return sum(attempt.iterations for attempt in self.attempts)
 
     @property
     def active(self) -> tuple[str, ...]:
-        """Names of the bounds and constraints that hold the answer."""
+        """Names of the active bounds and constraints."""
         rows = (*self.variables, *self.constraints)
         return tuple(row.name for row in rows if row.state in ("lower", "upper"))
 
@@ -203,13 +205,13 @@ class Fit:
         return {row.name: row for row in (*self.constraints, *self.variables)}
 
     def __getitem__(self, name: str) -> FittedVariable | FittedConstraint:
-        """The free number or constraint element of a name."""
+        """Return a free number or constraint element by its name."""
         if name not in self._rows:
             raise InputError(f"no result '{name}'", nearest(name, list(self._rows)))
         return self._rows[name]
 
     def derive(self, function: Callable[[Any, Any], Any], data: Any = None) -> Derived:
-        """Compute quantities from the fitted model with their errors, in linear approximation.
+        """Compute quantities of the fitted model and their errors, in linear approximation.
 
         Parameters
         ----------
@@ -217,7 +219,7 @@ class Fit:
             ``function(model, data)``, an array of any shape, in JAX. Defined at the top of a
             module, it is compiled once for all fits of one structure.
         data : pytree, optional
-            What it needs besides the model.
+            Second argument of the function.
 
         Returns
         -------
@@ -259,13 +261,14 @@ class Fit:
         Parameters
         ----------
         noise : {"known", "inferred"}, optional
-            Whether the errors are right, or right up to a common factor that is inferred. By
-            default they are inferred where no record has any or the fit enlarged them.
+            ``known``: the given errors are right. ``inferred``: they are right up to a factor,
+            which is inferred. By default, the noise of a record is inferred if it has no errors or
+            the fit enlarged them.
         outliers : bool
-            Let an unknown fraction of the points be outliers.
+            True to allow an unknown fraction of outliers among the points.
         priors : mapping of str to distribution, optional
-            By name of a free number, besides the problem's own: `Normal`, `LogNormal`, `Uniform`,
-            `HalfNormal` of `beamfit.sampling.priors`, or a frozen one of scipy.stats.
+            Further priors by the name of a free number: `Normal`, `LogNormal`, `Uniform`,
+            `HalfNormal` of `beamfit.sampling.priors`, or a frozen distribution of scipy.stats.
         **options
             ``seed, target_ess, budget, walkers, store, provenance, progress`` of
             `beamfit.sampling.ensemble.draw`.
@@ -273,7 +276,8 @@ class Fit:
         Returns
         -------
         Posterior
-            A direction that nothing holds is named in its message, and nothing is sampled.
+            If neither data, priors nor bounds limit some numbers, its message names them and
+            nothing is sampled.
 
         Raises
         ------
@@ -283,32 +287,32 @@ class Fit:
         from beamfit.greybox.posterior import target_of
         from beamfit.sampling.ensemble import draw
 
-        told = {"noise": noise, "outliers": outliers, "priors": priors}
-        return draw(target_of(self.problem, self.optimum, **told), **options)
+        noise_options = {"noise": noise, "outliers": outliers, "priors": priors}
+        return draw(target_of(self.problem, self.optimum, **noise_options), **options)
 
     @property
     def optimum(self) -> Optimum:
         """This fit as a start for the sampler."""
         from beamfit.greybox.posterior import Optimum
 
-        near = [a for a in self.attempts if a.kkt.worst <= self.problem.tolerance]
+        converged = [a for a in self.attempts if a.kkt.worst <= self.problem.tolerance]
         return Optimum(
             self.theta,
             Finding(self.status, self.message),
             [group.scale for group in self.groups],
             [group.errors_given for group in self.groups],
             self.undetermined,
-            [a.theta for a in near if a.cost - self.cost < NEAR_COST],
+            [a.theta for a in converged if a.cost - self.cost < NEAR_COST],
         )
 
     def __str__(self) -> str:
         """A table of the verdict, the numbers and the active constraints."""
         per = f", chi2/dof = {self.chi2 / self.dof:.3g}" if self.dof > 0 else ""
         fits = self.problem.has_data
-        worth = (
+        quality = (
             f"chi2 = {self.chi2:.6g}, dof = {self.dof}{per}" if fits else f"cost = {self.cost:.6g}"
         )
-        lines = [f"{self.status}: {self.message}", f"{worth}, KKT = {self.kkt.worst:.1e}"]
+        lines = [f"{self.status}: {self.message}", f"{quality}, KKT = {self.kkt.worst:.1e}"]
         shown = [v for v, n in zip(self.variables, self.problem.nuisance, strict=True) if not n]
         width = max((len(row.name) for row in (*shown, *self.constraints)), default=4)
         for v in shown:

@@ -1,7 +1,7 @@
-"""Derivatives of maps and rules on them (report 3.1, eqs 38-39).
+"""Derivatives of maps and constraints on them (report 3.1, eqs 38-39).
 
-Forward sensitivities, adjoints, gains of order 1 to 3; constraints on gains at points or certified
-everywhere in a box.
+Forward sensitivities, adjoints and gains of order 1 to 3; constraints on gains at points, or
+certified everywhere in a box.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from beamfit.greybox.problem import Constraint
 
 
 def _restricted(m: Map, x: jax.Array, variables: tuple[str, ...]):
-    """The map as a function of chosen inputs and leaves: the function and where it stands."""
+    """Make the map a function of chosen inputs and leaves; return it and their present values."""
     at = positions([v for v in variables if v in m.inputs], m.inputs, "input")
     found = [leaf for v in variables if v not in m.inputs for leaf in tree.find_leaves(m, v)]
     start = jnp.concatenate([x[jnp.array(at, int)], tree.read(m, found)])
@@ -36,7 +36,7 @@ def _restricted(m: Map, x: jax.Array, variables: tuple[str, ...]):
 
 
 def sensitivities(m: Map, x: jax.Array, variables: Sequence[str] | None = None) -> jax.Array:
-    """Derivatives of every output by chosen variables, one forward sweep for each variable.
+    """Compute derivatives of all outputs by chosen variables, one forward sweep per variable.
 
     Parameters
     ----------
@@ -46,7 +46,7 @@ def sensitivities(m: Map, x: jax.Array, variables: Sequence[str] | None = None) 
         The point.
     variables : sequence of str, optional
         Names of inputs, or paths of the map's own numbers; an array's elements follow in C order.
-        Inputs come first. All inputs if not given.
+        Inputs come first. Default: all inputs.
 
     Returns
     -------
@@ -64,17 +64,21 @@ def sensitivities(m: Map, x: jax.Array, variables: Sequence[str] | None = None) 
     >>> sensitivities(m, jnp.array([5.0, 7.0]), ["v", "matrix"]).tolist()
     [[3.0, 5.0, 7.0]]
     """
-    return _swept(jax.jacfwd, m, x, m.outputs, m.inputs if variables is None else variables)
+    return _sweep_jacobian(
+        jax.jacfwd, m, x, m.outputs, m.inputs if variables is None else variables
+    )
 
 
-def _swept(sweep, m: Map, x, functions: Sequence[str], variables: Sequence[str]) -> jax.Array:
+def _sweep_jacobian(
+    sweep, m: Map, x, functions: Sequence[str], variables: Sequence[str]
+) -> jax.Array:
     rows = tuple(positions(functions, m.outputs, "output"))
     return _jacobian(sweep, rows, tuple(variables), m, jnp.asarray(x, float))
 
 
 @partial(jax.jit, static_argnums=(0, 1, 2))
 def _jacobian(sweep, rows: tuple[int, ...], variables: tuple[str, ...], m: Map, x: jax.Array):
-    """Forward or backward sweeps, compiled once for each structure of map."""
+    """Compute the Jacobian by forward or backward sweeps, compiled once per structure of map."""
     function, start = _restricted(m, x, variables)
     return sweep(lambda v: function(v)[jnp.array(rows)])(start)
 
@@ -85,7 +89,7 @@ def adjoints(
     functions: Sequence[str] | None = None,
     variables: Sequence[str] | None = None,
 ) -> jax.Array:
-    """Derivatives of chosen outputs by the variables, one backward sweep for each output.
+    """Compute derivatives of chosen outputs by the variables, one backward sweep per output.
 
     Parameters
     ----------
@@ -94,7 +98,7 @@ def adjoints(
     x : array, shape (inputs,)
         The point.
     functions : sequence of str, optional
-        Names of outputs; all if not given.
+        Names of outputs. Default: all.
     variables : sequence of str, optional
         As in `sensitivities`.
 
@@ -115,11 +119,11 @@ def adjoints(
     [[3.0]]
     """
     chosen = m.inputs if variables is None else variables
-    return _swept(jax.jacrev, m, x, m.outputs if functions is None else functions, chosen)
+    return _sweep_jacobian(jax.jacrev, m, x, m.outputs if functions is None else functions, chosen)
 
 
 def gain(m: Map, x: jax.Array, output: str, by: Sequence[str]) -> jax.Array:
-    """The gain dⁿy/du1...dun at one point, by nested forward derivatives (report 3.1.3).
+    """Compute the gain dⁿy/du1...dun at a point, by nested forward derivatives (report 3.1.3).
 
     Parameters
     ----------
@@ -161,7 +165,7 @@ def gain(m: Map, x: jax.Array, output: str, by: Sequence[str]) -> jax.Array:
 
 
 def part(model: Any, path: str) -> Any:
-    """Walk to a part of the model.
+    """Return the part of a model at a path.
 
     Parameters
     ----------
@@ -199,7 +203,7 @@ def part(model: Any, path: str) -> Any:
 
 @dataclass(frozen=True)
 class _GainAt:
-    """The function of a point constraint; equal ones share their compiled code."""
+    """Function of a constraint at points; equal ones share their compiled code."""
 
     path: str
     output: str
@@ -212,7 +216,7 @@ class _GainAt:
 
 @dataclass(frozen=True)
 class _CertifiedGain:
-    """The function of a certified constraint: one end of the enclosure in every cell."""
+    """Function of a certified constraint: one end of the gain's enclosure in every cell."""
 
     path: str
     output: str
@@ -230,18 +234,18 @@ class _CertifiedGain:
 def gain_at(
     path: str, output: str, by: Sequence[str], points, lower: float = -np.inf, upper: float = np.inf
 ) -> Constraint:
-    """Constrain a gain of order 1 to 3 at points; between them it stays free.
+    """Constrain a gain of order 1 to 3 at points; between the points it is not limited.
 
     Parameters
     ----------
     path : str
-        Where the map is in the model.
+        Path of the map in the model.
     output : str
         Output of the gain.
     by : sequence of str
         Inputs of the gain.
     points : array, shape (points, inputs)
-        Where it must hold.
+        Points at which the limits hold.
     lower, upper : float
         Limits.
 
@@ -262,7 +266,7 @@ def gain_at(
 
 @lru_cache(maxsize=64)
 def _corners(low: tuple[float, ...], high: tuple[float, ...], number: int):
-    """Corners of cells; the same arrays for all limits over a box, whose enclosures are shared."""
+    """Make the corners of cells, cached so that all limits over a box share the enclosures."""
     return tuple(map(jnp.asarray, cells(low, high, number)))
 
 
@@ -280,15 +284,15 @@ def certified_gain(
     Parameters
     ----------
     path : str
-        Where the network is in the model.
+        Path of the network in the model.
     output, by : str
         Output and input of the gain.
     box : (lower corner, upper corner)
         The box, each of shape (inputs,).
     number : int
-        Cells along each input. More cells cost time and give away less.
+        Cells along each input. More cells cost time and tighten the enclosure.
     lower, upper : float
-        Limits the gain must keep to.
+        Limits of the gain.
 
     Returns
     -------

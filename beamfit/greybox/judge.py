@@ -1,8 +1,9 @@
 """Verdict on the end of a search: the gravest rule that applies, and what the data determine.
 
-Residuals, multipliers, curvature and proofs speak, and no solver. A problem that is not proved
-convex has the best of its starts for an answer. Numbers that move together without a change of any
-prediction, whatever the data, are told as a freedom of the model.
+The verdict rests on residuals, multipliers, curvature and proofs of convexity, not on a solver's
+message. Unless a problem is proved convex, its answer is the best of several starts. Numbers that
+can move together without changing any prediction, for any data, are reported as a freedom of the
+model.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from scipy.sparse.csgraph import connected_components
 from beamfit import errors
 from beamfit.errors import Finding, Status
 from beamfit.greybox import assess, problem
-from beamfit.greybox.assess import LOOKS, NEAR, SearchState
+from beamfit.greybox.assess import TEST_DISTANCE, TEST_POINTS, SearchState
 from beamfit.greybox.convex import convex
 from beamfit.greybox.covariance import (
     MOST_SHARE,
@@ -34,31 +35,33 @@ from beamfit.greybox.covariance import (
 from beamfit.greybox.diagnosis import Conflict, dependence, listed
 from beamfit.greybox.equations import Implicit
 from beamfit.greybox.fit import Attempt, Fit, FittedConstraint, FittedVariable
-from beamfit.greybox.problem import Problem, flattened, sloped
+from beamfit.greybox.problem import Problem, flattened, residual_and_jacobian
 from beamfit.greybox.sparse import Rows
 from beamfit.statistics import POOR_FIT, chi2_probability
 
-# A search is settled if a further step lowers chi-square by less: a tenth of a standard error.
-SETTLED = 0.01
-# A row is constant along a direction if it changes by less than this share of its terms.
-STILL = 1e-7
-# Numbers are tied if their part of the open directions exceeds this share of the largest.
-TIED = 1e-3
-# A cost below this, in units of its size, counts as unbounded.
-ENDLESS = -1e15
-# A number beyond this many of its sizes runs away; at a pole the cost's slope per size of a number
-# exceeds the cost by this factor.
-AWAY = 1e6
+# A search has settled if a further step would lower chi-square by less than this: the step is then
+# shorter than a tenth of a standard error.
+SETTLED_DECREASE = 0.01
+# A row of the Jacobian vanishes along a direction if less than this share of its terms remains.
+VANISHING_ROW = 1e-7
+# Numbers are tied if the cosine between their rows in a basis of the directions exceeds this.
+TIED_SHARE = 1e-3
+# A cost below this, in units of its scale, counts as unbounded.
+UNBOUNDED_COST = -1e15
+# A number runs away beyond this many of its scales. At a pole, the change of the cost when a number
+# changes by its scale exceeds the cost by this factor.
+RUNAWAY = 1e6
 # Relative difference in cost up to which two starts ended on the same optimum.
-ALIKE = 1e-4
-EDGES = ("lower", "upper")
+COST_TOLERANCE = 1e-4
+BOUND_STATES = ("lower", "upper")
 
 
 class Search(NamedTuple):
-    """Record of a search: its starts, those moved onto bounds, the time limit if it cut.
+    """Record of a search.
 
-    `exact` tells whether second derivatives could be asked for, `conflict` what kept the search
-    from a feasible point.
+    `attempts` has an entry for each start, `moved` is the number of starts moved onto their bounds.
+    `seconds` is the time limit and `cut` is true if it ended the search. `exact` is true if second
+    derivatives were available. `conflict` names the constraints that exclude a feasible point.
     """
 
     attempts: tuple[Attempt, ...]
@@ -69,23 +72,26 @@ class Search(NamedTuple):
     conflict: Conflict | None = None
 
     @property
-    def words(self) -> str:
-        """Number of starts, in words."""
+    def starts(self) -> str:
+        """Number of starts, for a message."""
         return f"{len(self.attempts)} start{'s' if len(self.attempts) != 1 else ''}"
 
 
-class Known(NamedTuple):
-    """Information of a point's residuals: noise groups, spreads, undetermined directions, rank.
+class ResidualInformation(NamedTuple):
+    """Information in the residuals at a point.
 
-    `blind` tells which numbers would be open even if what is at a bound truly were there.
+    `groups` has the noise of each record. `spread` and `spread_raw` have the errors of the numbers
+    with scaled and with given errors of the data. The columns of `undetermined` are directions that
+    the data do not determine, `rank` is the number of those they do. `held` marks numbers held by a
+    bound, `open_numbers` those that stay undetermined even if the bounds are the true values.
     """
 
     groups: tuple[Group, ...]
     spread: Spread | FactoredSpread
-    raw: Spread | FactoredSpread
-    unseen: np.ndarray
+    spread_raw: Spread | FactoredSpread
+    undetermined: np.ndarray
     rank: int
-    blind: np.ndarray
+    open_numbers: np.ndarray
     held: np.ndarray
 
 
@@ -95,64 +101,66 @@ class FitEvidence(NamedTuple):
     problem: Problem
     state: SearchState
     search: Search
-    known: Known
+    information: ResidualInformation
     settled: bool
     variables: tuple[FittedVariable, ...]
     constraints: tuple[FittedConstraint, ...]
 
     @property
-    def residue(self) -> str:
-        """The KKT residual in words."""
+    def kkt_text(self) -> str:
+        """The KKT residual, for a message."""
         return f"(KKT residual {self.state.kkt.worst:.1e})"
 
     @property
     def optima(self) -> tuple[int, list[tuple[float, int]]]:
-        """Number of starts on the answer; costs of other optima, and the number on each."""
-        least = ALIKE * max(self.state.scale.cost, abs(self.state.at.cost))
+        """Number of starts that found the answer; cost of each other optimum and its starts."""
+        tolerance = COST_TOLERANCE * max(self.state.scale.cost, abs(self.state.at.cost))
         ends = [a.cost for a in self.search.attempts if a.kkt.worst <= self.problem.tolerance]
-        agreed = sum(abs(cost - self.state.at.cost) <= least for cost in ends)
-        seen: list[tuple[float, int]] = []
-        for cost in (c for c in sorted(ends) if c - self.state.at.cost > least):
-            if seen and cost - seen[-1][0] <= least:
-                seen[-1] = (seen[-1][0], seen[-1][1] + 1)
+        agreed = sum(abs(cost - self.state.at.cost) <= tolerance for cost in ends)
+        others: list[tuple[float, int]] = []
+        for cost in (c for c in sorted(ends) if c - self.state.at.cost > tolerance):
+            if others and cost - others[-1][0] <= tolerance:
+                others[-1] = (others[-1][0], others[-1][1] + 1)
             else:
-                seen.append((cost, 1))
-        return agreed, seen
+                others.append((cost, 1))
+        return agreed, others
 
 
-def known(p: Problem, s: SearchState) -> Known:
-    """Tell what the residuals know, along the limits that hold.
+def residual_information(p: Problem, s: SearchState) -> ResidualInformation:
+    """Compute the information in the residuals along the active limits.
 
-    For the degrees of freedom a number at an active bound is held; its error and that of what
-    hangs on it are those of a number that the bound only limits. Weights that nobody asks for
-    stay on their bounds.
+    For the degrees of freedom a number at an active bound is held. For its error, and for errors
+    that depend on it, it is free within its bounds. Nuisance numbers stay on their bounds.
     """
-    held, on = assess.holding(p, s, 1e-9)
-    equations = s.at.jacobian[on]
+    held, active = assess.active_set(p, s, 1e-9)
+    equations = s.at.jacobian[active]
     ends = np.cumsum([record.measured.size for record in p.records], dtype=int)
     parts = zip([0, *ends], [*ends, None], strict=True)
     blocks = [triangle(s.at.residual_jacobian[first:last]) for first, last in parts]
-    nowhere = np.full(len(held), np.inf)
-    seen = spread_of(_stacked(blocks), -nowhere, nowhere, held, None, equations)
-    groups = groups_of(p.records, np.split(s.at.residual, ends)[:-1], blocks, seen)
-    still = (np.isin(s.bounds.states, EDGES) & p.nuisance) | ~p.moving
+    unbounded = np.full(len(held), np.inf)
+    from_residuals = spread_of(_stacked(blocks), -unbounded, unbounded, held, None, equations)
+    groups = groups_of(p.records, np.split(s.at.residual, ends)[:-1], blocks, from_residuals)
+    fixed = (np.isin(s.bounds.states, BOUND_STATES) & p.nuisance) | ~p.moving
     limited = np.isfinite(p.upper - p.lower) & p.moving & ~p.with_prior
-    alike = np.array_equal(still, held) and not limited.any()
+    same_spread = np.array_equal(fixed, held) and not limited.any()
 
-    def spread(factors, still):
-        if alike and len({*factors, *[1.0] * bool(p.priors)}) <= 1:
-            return seen.times(factors[0] if factors else 1.0)
+    def spread(factors, fixed):
+        if same_spread and len({*factors, *[1.0] * bool(p.priors)}) <= 1:
+            return from_residuals.times(factors[0] if factors else 1.0)
         parts = [block / f for block, f in zip(blocks, [*factors, 1.0], strict=True)]
-        return spread_of(_stacked(parts), p.lower, p.upper, still, p.with_prior, equations)
+        return spread_of(_stacked(parts), p.lower, p.upper, fixed, p.with_prior, equations)
 
     factors = [group.factor for group in groups]
-    scaled = spread(factors, still)
-    plain = [1.0 if group.errors_given else group.factor for group in groups]
-    raw = scaled if plain == factors else spread(plain, still)
-    given_bounds = scaled if np.array_equal(still, held) else spread(factors, held)
-    blind = (given_bounds.shares >= MOST_SHARE) & ~held
-    unseen = seen.open / np.where((n := np.linalg.norm(seen.open, axis=0)) > 0, n, 1.0)
-    return Known(groups, scaled, raw, unseen, seen.rank, blind, held)
+    spread_scaled = spread(factors, fixed)
+    raw_factors = [1.0 if group.errors_given else group.factor for group in groups]
+    spread_raw = spread_scaled if raw_factors == factors else spread(raw_factors, fixed)
+    given_bounds = spread_scaled if np.array_equal(fixed, held) else spread(factors, held)
+    open_numbers = (given_bounds.shares >= MOST_SHARE) & ~held
+    length = np.linalg.norm(from_residuals.open, axis=0)
+    undetermined = from_residuals.open / np.where(length > 0, length, 1.0)
+    return ResidualInformation(
+        groups, spread_scaled, spread_raw, undetermined, from_residuals.rank, open_numbers, held
+    )
 
 
 def _stacked(blocks: list[Rows]) -> Rows:
@@ -161,30 +169,30 @@ def _stacked(blocks: list[Rows]) -> Rows:
     return np.vstack(blocks)
 
 
-def settled(p: Problem, s: SearchState) -> bool:
-    """True if the search ended at an optimum as far as the data can tell.
+def has_settled(p: Problem, s: SearchState) -> bool:
+    """True if the search ended at an optimum within the accuracy of the data.
 
-    The decrease of chi-square that a further Gauss-Newton step promises, noise being what the
-    scatter says where no errors were given, is below `SETTLED`. Networks have flat valleys in which
-    a strict optimum is never reached and nothing changes any more.
+    A further Gauss-Newton step would lower chi-square by less than `SETTLED_DECREASE`; the noise is
+    inferred from the residuals where no errors were given. Networks have flat valleys in which no
+    strict optimum is ever reached.
     """
     if p.objectives or not s.at.finite or not s.feasible:
         return False
-    found = known(p, s)
+    found = residual_information(p, s)
     weight = np.ones(len(s.at.residual))
     for group in found.groups:
         weight[group.rows] = 1.0 if group.errors_given else group.factor**-2
-    pull = s.at.residual_jacobian.T @ (weight * s.at.residual)
-    outward = np.where(s.bounds.reached[0], pull > 0, s.bounds.reached[1] & (pull < 0))
-    pull = np.where(outward | found.held, 0.0, pull)
-    return bool(found.raw.size(pull) ** 2 < SETTLED)
+    gradient = s.at.residual_jacobian.T @ (weight * s.at.residual)
+    outward = np.where(s.bounds.reached[0], gradient > 0, s.bounds.reached[1] & (gradient < 0))
+    gradient = np.where(outward | found.held, 0.0, gradient)
+    return bool(found.spread_raw.size(gradient) ** 2 < SETTLED_DECREASE)
 
 
 # ---- the answer
 
 
 def conclude(p: Problem, s: SearchState, search: Search, seconds: float) -> Fit:
-    """Judge the best point of a search, `seconds` being the time taken."""
+    """Make the `Fit` from the best point of a search, `seconds` being the time taken."""
     failure = _inner_failure(p, s.theta)
     if failure or not s.at.finite:
         lost = Finding(
@@ -197,74 +205,79 @@ def conclude(p: Problem, s: SearchState, search: Search, seconds: float) -> Fit:
                 "start it nearer to its root, or bound the free numbers to where a root exists."
             )
             lost = Finding(Status.not_converged, f"{failure} at the end of the search;", remedy)
-        return refused(p, lost, seconds, s.theta, search.attempts)
-    found = known(p, s)
+        return refuse(p, lost, seconds, s.theta, search.attempts)
+    found = residual_information(p, s)
     variables, constraints = _variables(p, s, found), _constraints(p, s)
     chi2 = float(s.at.residual @ s.at.residual)
     priors = len(s.at.residual) - p.size
     dof = sum(group.count for group in found.groups) + priors - found.rank
     ratio = chi2 / dof if dof > 0 else np.nan
-    judged = p.errors_known or not p.records
-    scale = (np.sqrt(max(1.0, ratio)) if dof > 0 else 1.0) if judged else np.sqrt(ratio)
-    rest = not s.optimal and settled(p, s)
-    evidence = FitEvidence(p, s, search, found, rest, variables, constraints)
-    finding = errors.judge(evidence, RULES if p.has_data else WITHOUT_DATA)
+    test_errors = p.errors_known or not p.records
+    scale = (np.sqrt(max(1.0, ratio)) if dof > 0 else 1.0) if test_errors else np.sqrt(ratio)
+    at_rest = not s.optimal and has_settled(p, s)
+    evidence = FitEvidence(p, s, search, found, at_rest, variables, constraints)
+    finding = errors.judge(evidence, RULES if p.has_data else RULES_WITHOUT_DATA)
     message = " ".join([finding.message, *_remarks(evidence)])
     return Fit(
         p, s.theta, finding.status, message, float(s.at.cost), chi2, dof, found.groups, s.kkt,
-        variables, constraints, found.spread, found.raw, s.at.residual_jacobian, found.unseen,
-        float(scale), search.attempts, seconds, finding.about,
+        variables, constraints, found.spread, found.spread_raw, s.at.residual_jacobian,
+        found.undetermined, float(scale), search.attempts, seconds, finding.about,
     )  # fmt: skip
 
 
 def _inner_failure(p: Problem, theta: np.ndarray) -> str | None:
-    """Failure of an implicit map in the model to converge at the answer, or None."""
+    """Describe the implicit map that does not converge at the answer; None if all do."""
     parts = jax.tree.leaves(p.core, is_leaf=lambda part: isinstance(part, Implicit))
     if not any(isinstance(part, Implicit) for part in parts):
         return None
-    look = checkify.checkify(jax.jit(problem.values), errors=checkify.user_checks)
-    said = look(p.core, jnp.asarray(theta, float))[0].get()
-    return None if said is None else said.removesuffix(" (`check` failed)")
+    check = checkify.checkify(jax.jit(problem.values), errors=checkify.user_checks)
+    message = check(p.core, jnp.asarray(theta, float))[0].get()
+    return None if message is None else message.removesuffix(" (`check` failed)")
 
 
-def _variables(p: Problem, s: SearchState, found: Known) -> tuple[FittedVariable, ...]:
-    nothing = (found.spread.shares >= MOST_SHARE) | found.held
-    nothing |= any(group.unknown for group in found.groups)
-    errors = (np.where(nothing, np.nan, part.errors) for part in (found.spread, found.raw))
+def _variables(
+    p: Problem, s: SearchState, found: ResidualInformation
+) -> tuple[FittedVariable, ...]:
+    """Make the table of the free numbers; an undetermined number has no error."""
+    undetermined = (found.spread.shares >= MOST_SHARE) | found.held
+    undetermined |= any(group.unknown for group in found.groups)
+    errors = (
+        np.where(undetermined, np.nan, part.errors) for part in (found.spread, found.spread_raw)
+    )
     columns = (s.theta, *errors, p.lower, p.upper, s.bounds.states, s.bounds.multiplier)
-    return _rows(FittedVariable, p.names, *columns)
+    return _table(FittedVariable, p.names, *columns)
 
 
 def _constraints(p: Problem, s: SearchState) -> tuple[FittedConstraint, ...]:
     columns = (*s.limits[:3], s.limits.states, s.limits.multiplier)
-    return _rows(FittedConstraint, p.constraint_names, *columns)
+    return _table(FittedConstraint, p.constraint_names, *columns)
 
 
-def _rows(kind: type, names: tuple[str, ...], *columns: np.ndarray) -> tuple:
+def _table(kind: type, names: tuple[str, ...], *columns: np.ndarray) -> tuple:
     return tuple(map(kind, names, *(column.tolist() for column in columns)))
 
 
-def refused(p: Problem, found: Finding, seconds: float, theta=None, attempts=()) -> Fit:
-    """A fit without an answer: where it stopped, and nothing determined."""
+def refuse(p: Problem, found: Finding, seconds: float, theta=None, attempts=()) -> Fit:
+    """Make a fit without an answer: the point where it stopped, and no number determined."""
     theta = p.start if theta is None else theta
     n, nan = len(theta), np.nan
     lost = Spread(np.full((n, n), nan), np.eye(n), np.ones(n), np.zeros(n))
     none, free = np.full(n, nan), np.full(n, "free")
-    variables = _rows(FittedVariable, p.names, theta, none, none, p.lower, p.upper, free, none)
+    variables = _table(FittedVariable, p.names, theta, none, none, p.lower, p.upper, free, none)
     none = np.full(len(p.constraint_names), nan)
     ends, free = (p.constraint_lower, p.constraint_upper), np.full(len(none), "free")
-    constraints = _rows(FittedConstraint, p.constraint_names, none, *ends, free, none)
+    constraints = _table(FittedConstraint, p.constraint_names, none, *ends, free, none)
     return Fit(
-        p, theta, found.status, found.message, nan, nan, 0, (), assess.LOST, variables,
+        p, theta, found.status, found.message, nan, nan, 0, (), assess.INFINITE_KKT, variables,
         constraints, lost, lost, np.zeros((p.size, n)), np.eye(n), nan, attempts, seconds,
     )  # fmt: skip
 
 
-# ---- rules of every problem
+# ---- rules for every problem
 
 
-def _crossed(e: FitEvidence) -> Finding | None:
-    """Say which limits cannot be kept together."""
+def _infeasible(e: FitEvidence) -> Finding | None:
+    """Rule: the constraints do not hold at the best point."""
     if e.state.feasible:
         return None
     place, about = " bounds: outside;", ()
@@ -285,59 +298,69 @@ def _crossed(e: FitEvidence) -> Finding | None:
         place += f" within {listed(conflict.bounds)}" if conflict.bounds else ""
         place += ";" if alone else ", without any one of them it can;"
         remedy = f"relax {'it' if one else 'one of them'}, free more numbers, or start elsewhere."
-    cause = f"no point within all constraints was found from {e.search.words}:{place}"
+    cause = f"no point within all constraints was found from {e.search.starts}:{place}"
     return Finding(Status.infeasible, cause, remedy, about)
 
 
-def _endless(e: FitEvidence) -> Finding | None:
-    """Say that the cost has no least value."""
-    cost, far = float(e.state.at.cost), _far(e.state)
-    if not e.problem.objectives or cost >= ENDLESS * e.state.scale.cost or outgrown(e.state):
+def _unbounded(e: FitEvidence) -> Finding | None:
+    """Rule: the cost has no minimum."""
+    cost, runaway = float(e.state.at.cost), _runaway_numbers(e.state)
+    if (
+        not e.problem.objectives
+        or cost >= UNBOUNDED_COST * e.state.scale.cost
+        or cost_outgrew_scale(e.state)
+    ):
         return None
-    about = tuple(np.array(e.problem.names)[far].tolist())
+    about = tuple(np.array(e.problem.names)[runaway].tolist())
     along = f" as {listed(about)} grows" if about else ""
     remedy = "bound the free numbers, or check the sign of the objective."
     cause = f"the cost falls without end{along} (down to {cost:.3g});"
     return Finding(Status.unbounded, cause, remedy, about)
 
 
-def outgrown(s: SearchState) -> bool:
-    """True if the start's cost is too small to serve as the scale of the final cost."""
+def cost_outgrew_scale(s: SearchState) -> bool:
+    """True if the cost at the start is too small to serve as the scale of the final cost."""
     cost, scale = s.at.cost, s.scale
-    pole = np.any(np.abs(s.at.gradient) * scale.unit > AWAY * abs(cost))
-    return bool(cost < ENDLESS * scale.cost and np.isfinite(cost) and not (pole or _far(s).any()))
+    pole = np.any(np.abs(s.at.gradient) * scale.unit > RUNAWAY * abs(cost))
+    return bool(
+        cost < UNBOUNDED_COST * scale.cost
+        and np.isfinite(cost)
+        and not (pole or _runaway_numbers(s).any())
+    )
 
 
-def _far(s: SearchState) -> np.ndarray:
-    return np.abs(s.theta) > AWAY * s.scale.unit
+def _runaway_numbers(s: SearchState) -> np.ndarray:
+    return np.abs(s.theta) > RUNAWAY * s.scale.unit
 
 
-def _restless(e: FitEvidence) -> Finding | None:
-    """Say that the search ended short of an optimum."""
-    bend, steps = e.state.bend, sum(a.iterations for a in e.search.attempts)
-    why = None
+def _not_converged(e: FitEvidence) -> Finding | None:
+    """Rule: the search ended before it reached an optimum."""
+    curvature, steps = e.state.curvature, sum(a.iterations for a in e.search.attempts)
+    reason = None
     if not e.state.optimal and not e.settled:
-        why = e.residue.strip("()")
-    elif bend is not None and bend.direction is not None:
-        why = "the cost still bends down there"
-    elif bend is not None and bend.newton > assess.STEP:
-        why = f"the next step is {bend.newton:.1e} of the numbers' sizes"
-    if why is None:
+        reason = e.kkt_text.strip("()")
+    elif curvature is not None and curvature.direction is not None:
+        reason = "the cost still bends down there"
+    elif curvature is not None and curvature.newton > assess.MAX_NEWTON_STEP:
+        reason = f"the next step is {curvature.newton:.1e} of the numbers' sizes"
+    if reason is None:
         return None
-    cause = f"no optimum was reached from {e.search.words} ({why} after {steps} iterations);"
+    cause = f"no optimum was reached from {e.search.starts} ({reason} after {steps} iterations);"
     remedy = "give more starts or iterations, or a better start."
     return Finding(Status.not_converged, cause, remedy)
 
 
-# ---- rules of fits to data
+# ---- rules for fits to data
 
 
-def _undetermined(e: FitEvidence) -> Finding | None:
-    """Say what the data do not determine, of what is asked for."""
-    names = tuple(np.array(e.problem.names)[e.known.blind & ~e.problem.nuisance].tolist())
+def _unidentified(e: FitEvidence) -> Finding | None:
+    """Rule: the data do not determine all numbers that are not nuisance numbers."""
+    names = tuple(
+        np.array(e.problem.names)[e.information.open_numbers & ~e.problem.nuisance].tolist()
+    )
     if not names:
         return None
-    found = gauges(e.problem, e.state.theta, e.known.unseen)
+    found = gauges(e.problem, e.state.theta, e.information.undetermined)
     tied = [g for g in found if set(names) & set(g.names)]
     if tied:
         return together(tied)
@@ -346,14 +369,14 @@ def _undetermined(e: FitEvidence) -> Finding | None:
     return Finding(Status.unidentified, cause, remedy, names)
 
 
-def _poor(e: FitEvidence) -> Finding | None:
-    """Say that residuals with errors are larger than these allow."""
-    # Records without errors cannot speak for or against the model.
-    silent = [group for group in e.known.groups if not group.errors_given]
+def _poor_fit(e: FitEvidence) -> Finding | None:
+    """Rule: residuals of records with errors are larger than these errors allow."""
+    # Records without errors cannot test the model.
+    without_errors = [group for group in e.information.groups if not group.errors_given]
     r = e.state.at.residual
-    counted = sum(group.count for group in e.known.groups) + len(r) - e.problem.size
-    chi2 = float(r @ r) - sum(g.chi2 for g in silent)
-    dof = counted - e.known.rank - sum(g.dof for g in silent)
+    count = sum(group.count for group in e.information.groups) + len(r) - e.problem.size
+    chi2 = float(r @ r) - sum(g.chi2 for g in without_errors)
+    dof = count - e.information.rank - sum(g.dof for g in without_errors)
     chance = chi2_probability(chi2, dof) if dof > 0 else 1.0
     if not e.problem.errors_known or chance >= POOR_FIT:
         return None
@@ -365,10 +388,10 @@ def _poor(e: FitEvidence) -> Finding | None:
     return Finding(Status.poor_fit, cause, remedy)
 
 
-def _held(e: FitEvidence) -> Finding | None:
-    """Say which numbers a bound decided, where data were to."""
+def _at_limit(e: FitEvidence) -> Finding | None:
+    """Rule: a number that the data should determine lies at its bound."""
     pairs = zip(e.variables, e.problem.nuisance, strict=True)
-    held = [v for v, nuisance in pairs if not nuisance and v.state in EDGES]
+    held = [v for v, nuisance in pairs if not nuisance and v.state in BOUND_STATES]
     if not held:
         return None
     cause = f"the best value lies at a bound: {listed(f'{v.name} ({v.state})' for v in held)};"
@@ -378,26 +401,27 @@ def _held(e: FitEvidence) -> Finding | None:
 
 
 def _converged(e: FitEvidence) -> Finding:
-    """Say that nothing is wrong, and what kind of optimum it is."""
-    start = f"an optimum was reached from {e.search.words} {e.residue}."
+    """Rule: no other applies; describe the optimum."""
+    start = f"an optimum was reached from {e.search.starts} {e.kkt_text}."
     higher = sum(count for _, count in e.optima[1]) if e.problem.objectives else 0
     if e.settled:
         start = (
-            f"the search from {e.search.words} has settled where nothing that matters to the data "
-            f"changes any more {e.residue}."
+            f"the search from {e.search.starts} has settled where nothing that matters to the data "
+            f"changes any more {e.kkt_text}."
         )
     elif higher:
         start = (
-            f"the best of several local optima was reached from {e.search.words} {e.residue}; "
+            f"the best of several local optima was reached from {e.search.starts} {e.kkt_text}; "
             f"{higher} of them ended on others of higher cost."
         )
     return Finding(Status.converged, start)
 
 
 class Gauge(NamedTuple):
-    """Names of numbers that move together, and relative changes along one direction they may take.
+    """Numbers that can move together without changing a prediction.
 
-    `free` tells in how many directions: as many of them must be fixed.
+    `changes` are their relative changes along one such direction. `free` is the number of
+    independent directions: as many of the numbers must be fixed.
     """
 
     names: tuple[str, ...]
@@ -405,11 +429,11 @@ class Gauge(NamedTuple):
     free: int
 
 
-def gauges(p: Problem, theta: np.ndarray, unseen: np.ndarray) -> tuple[Gauge, ...]:
-    """Find symmetries among directions that the data do not see.
+def gauges(p: Problem, theta: np.ndarray, directions: np.ndarray) -> tuple[Gauge, ...]:
+    """Find symmetries of the model among the directions that the data do not determine.
 
-    A direction that residuals do not see at other settings either, made up at random, is none that
-    further data could tell: it belongs to the model.
+    A direction along which residuals do not change at randomly chosen settings either could not be
+    determined by further data: it is a symmetry of the model.
 
     Parameters
     ----------
@@ -417,13 +441,13 @@ def gauges(p: Problem, theta: np.ndarray, unseen: np.ndarray) -> tuple[Gauge, ..
         The problem.
     theta : array, shape (n,)
         The point.
-    unseen : array, shape (n, k)
-        Directions that its residuals do not see there.
+    directions : array, shape (n, k)
+        Directions along which the residuals do not change there.
 
     Returns
     -------
     tuple of Gauge
-        One for each set of at least two numbers that are tied.
+        One for each set of two or more numbers that are tied.
 
     Examples
     --------
@@ -436,106 +460,111 @@ def gauges(p: Problem, theta: np.ndarray, unseen: np.ndarray) -> tuple[Gauge, ..
     >>> gauges(p, at, np.array([[2.0], [-3.0]]))[0].names
     ('first', 'second')
     """
-    open_ones = _still(p, theta, unseen)
-    if not open_ones.shape[1]:
+    freedoms = _model_freedoms(p, theta, directions)
+    if not freedoms.shape[1]:
         return ()
-    basis = np.linalg.qr(open_ones)[0]
-    size = _size(theta)
+    basis = np.linalg.qr(freedoms)[0]
+    size = _scales_of(theta)
     part = np.linalg.norm(basis, axis=1)
-    moved = np.flatnonzero(part > TIED**2)
-    tied = np.abs(basis[moved] @ basis[moved].T) > TIED * np.outer(part[moved], part[moved]) + 1e-12
+    moved = np.flatnonzero(part > TIED_SHARE**2)
+    tied = (
+        np.abs(basis[moved] @ basis[moved].T)
+        > TIED_SHARE * np.outer(part[moved], part[moved]) + 1e-12
+    )
     group, found = connected_components(tied, directed=False)[1], []
-    for one in dict.fromkeys(group.tolist()):
-        at = moved[group == one]
-        _, sizes, turned = np.linalg.svd(basis[at].T)
-        free = int(np.sum(sizes > TIED * sizes[0]))
-        change = turned[0] / size[at]
-        if len(at) > 1 and free < len(at) and _everywhere(p, theta, at, free):
+    for label in dict.fromkeys(group.tolist()):
+        at = moved[group == label]
+        _, sizes, right = np.linalg.svd(basis[at].T)
+        free = int(np.sum(sizes > TIED_SHARE * sizes[0]))
+        change = right[0] / size[at]
+        if len(at) > 1 and free < len(at) and _tied_elsewhere(p, theta, at, free):
             shares = change / np.max(np.abs(change)) * np.sign(change[0])
             names = tuple(p.names[i] for i in at)
             found.append(Gauge(names, tuple(shares.tolist()), free))
     return tuple(found)
 
 
-def _still(p: Problem, theta: np.ndarray, unseen: np.ndarray) -> np.ndarray:
-    """Combinations of directions along which rows change at no made-up settings."""
-    random, size = np.random.default_rng(0), _size(theta)
-    length = np.linalg.norm(unseen / size[:, None], axis=0)
-    along = unseen[:, length > 0] / length[length > 0]  # numbers that are held move nowhere
+def _model_freedoms(p: Problem, theta: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """Find combinations of directions along which no prediction changes at random settings."""
+    random, size = np.random.default_rng(0), _scales_of(theta)
+    length = np.linalg.norm(directions / size[:, None], axis=0)
+    along = directions[:, length > 0] / length[length > 0]  # numbers that are held do not move
     if not along.shape[1]:
         return along
-    rows = np.vstack([_made_up(p, theta, random) for _ in range(LOOKS)])
-    _, sizes, turned = np.linalg.svd(rows / size @ along, full_matrices=True)
-    return along @ turned[int(np.sum(sizes > STILL)) :].T
+    rows = np.vstack([_random_rows(p, theta, random) for _ in range(TEST_POINTS)])
+    _, sizes, right = np.linalg.svd(rows / size @ along, full_matrices=True)
+    return along @ right[int(np.sum(sizes > VANISHING_ROW)) :].T
 
 
-def _everywhere(p: Problem, theta: np.ndarray, at: np.ndarray, free: int) -> bool:
-    """True if numbers are tied at smaller values, too: those run along a ridge are not."""
+def _tied_elsewhere(p: Problem, theta: np.ndarray, at: np.ndarray, free: int) -> bool:
+    """True if numbers are tied at smaller values as well, unlike those on a ridge of the cost."""
     random = np.random.default_rng(0)
-    for _ in range(LOOKS):
+    for _ in range(TEST_POINTS):
         point = np.clip(theta * random.uniform(size=len(theta)), p.lower, p.upper)
-        sizes = np.linalg.svd(_made_up(p, point, random)[:, at], compute_uv=False)
-        if np.sum(sizes > STILL * np.max(sizes, initial=0.0)) > len(at) - free:
+        sizes = np.linalg.svd(_random_rows(p, point, random)[:, at], compute_uv=False)
+        if np.sum(sizes > VANISHING_ROW * np.max(sizes, initial=0.0)) > len(at) - free:
             return False
     return True
 
 
-def _size(theta: np.ndarray) -> np.ndarray:
+def _scales_of(theta: np.ndarray) -> np.ndarray:
     return np.where(theta != 0, np.abs(theta), 1.0)
 
 
-def _made_up(p: Problem, theta: np.ndarray, random: np.random.Generator) -> np.ndarray:
-    """Rows at made-up settings, of unit length in the sizes of the numbers."""
+def _random_rows(p: Problem, theta: np.ndarray, random: np.random.Generator) -> np.ndarray:
+    """Rows of the Jacobian at random settings, of unit length in the scales of the numbers."""
     records = tuple(
-        dataclasses.replace(r, data=jax.tree.map(lambda v: _moved(v, random), r.data))
+        dataclasses.replace(r, data=jax.tree.map(lambda v: _random_settings(v, random), r.data))
         for r in p.core.records
     )
     core = dataclasses.replace(p.core, records=records)
-    rows = np.asarray(flattened(core)(sloped)(theta)[1]) * _size(theta)
+    rows = np.asarray(flattened(core)(residual_and_jacobian)(theta)[1]) * _scales_of(theta)
     rows = rows[np.all(np.isfinite(rows), axis=1)]
-    for order in (np.inf, 2):  # the square of what grows without end has no number
+    for order in (np.inf, 2):  # the maximum first: squares of huge entries overflow
         terms = np.linalg.norm(rows, order, axis=1, keepdims=True)
         rows = rows / np.where(terms > 0, terms, 1.0)
     return rows
 
 
-def _moved(value: Any, random: np.random.Generator) -> Any:
-    """Settings that are other ones, whole numbers apart."""
+def _random_settings(value: Any, random: np.random.Generator) -> Any:
+    """Change settings at random; integers stay."""
     value = np.asarray(value)
     if not np.issubdtype(value.dtype, np.floating) or not value.size:
         return value
     spread = float(np.std(value)) or float(np.max(np.abs(value))) or 1.0
-    factor, shift = (NEAR * random.normal(size=value.shape) for _ in range(2))
+    factor, shift = (TEST_DISTANCE * random.normal(size=value.shape) for _ in range(2))
     return value * (1 + factor) + spread * shift
 
 
 def together(found: list[Gauge]) -> Finding:
-    """Say which numbers move together whatever the data."""
-    said = []
+    """Name the numbers that can move together for any data."""
+    sentences = []
     for g in found:
         parts = [f"{n} {c:+.3g} %" for n, c in zip(g.names, g.changes, strict=True)]
         along = f" ({', '.join(parts[:4])})" if g.free == 1 else ""
-        said.append(f"{listed(g.names)} move together{along}")
-    cause = f"{'; '.join(said)}: no prediction changes, whatever the data, a freedom of the model;"
+        sentences.append(f"{listed(g.names)} move together{along}")
+    cause = (
+        f"{'; '.join(sentences)}: no prediction changes, whatever the data, a freedom of the model;"
+    )
     count = sum(g.free for g in found)
     few = "one of them" if count == 1 else f"{count} of them"
     names = tuple(name for g in found for name in g.names)
     return Finding(Status.unidentified, cause, f"fix {few}, or give a prior.", names)
 
 
-# ---- rules of an objective alone
+# ---- rules for an objective alone
 
 
 def _degenerate(e: FitEvidence) -> Finding | None:
-    """Say that multipliers are not unique, or that there are none."""
+    """Rule: multipliers are not unique, or there are none."""
     found = dependence(e.problem, e.state, e.state.optimal)
     if found is None:
         return None
-    names, gap = listed(map(repr, found.names)), "" if e.state.optimal else f" {e.residue}"
+    names, gap = listed(map(repr, found.names)), "" if e.state.optimal else f" {e.kkt_text}"
     one = "its gradient vanishes" if len(found.names) == 1 else "their gradients are dependent"
-    if found.slopeless:
+    if found.flat:
         cause = (
-            f"{listed(map(repr, found.slopeless))} has no slope where it holds (no constraint "
+            f"{listed(map(repr, found.flat))} has no slope where it holds (no constraint "
             f"qualification), so that it has no multiplier and solvers stop anywhere along it{gap};"
         )
         remedy = (
@@ -551,61 +580,61 @@ def _degenerate(e: FitEvidence) -> Finding | None:
             f"no multipliers{gap};"
         )
         remedy = "state them so that their gradients differ."
-    return Finding(Status.degenerate, cause, remedy, found.slopeless or found.names)
+    return Finding(Status.degenerate, cause, remedy, found.flat or found.names)
 
 
 def _saddle(e: FitEvidence) -> Finding | None:
-    """Say that the cost falls on both sides of a stationary point."""
-    bend = e.state.bend
-    if not e.state.optimal or bend is None or bend.direction is None:
+    """Rule: the cost falls on both sides of a stationary point."""
+    curvature = e.state.curvature
+    if not e.state.optimal or curvature is None or curvature.direction is None:
         return None
-    part = np.abs(bend.direction / e.state.scale.unit)
+    part = np.abs(curvature.direction / e.state.scale.unit)
     along = np.array(e.problem.names)[part > 0.3 * np.max(part)]
     cause = f"a saddle: the cost bends down along {listed(along)}, and the search did not get away;"
     return Finding(Status.saddle, cause, "start elsewhere, or give more starts.")
 
 
 def _optimum(e: FitEvidence) -> Finding:
-    """Say that it is the optimum, or the best of its starts, and what else they found."""
+    """Rule: no other applies; name the optimum proved or local, and other optima found."""
     agreed, others = e.optima
     if others:
         costs = [f"{cost:.6g} ({count})" for cost, count in others]
         return Finding(
             Status.local_optimum,
-            f"the lowest of {1 + len(others)} local optima reached from {e.search.words}, at a "
-            f"cost of {e.state.at.cost:.6g} {e.residue}; others at {listed(costs)}.",
+            f"the lowest of {1 + len(others)} local optima reached from {e.search.starts}, at a "
+            f"cost of {e.state.at.cost:.6g} {e.kkt_text}; others at {listed(costs)}.",
         )
     if e.search.exact and convex(e.problem):
-        said = f"the optimum was reached: the problem is convex {e.residue}."
-        return Finding(Status.optimal, said)
-    told = f"a local optimum was reached from 1 start {e.residue};"
+        cause = f"the optimum was reached: the problem is convex {e.kkt_text}."
+        return Finding(Status.optimal, cause)
+    text = f"a local optimum was reached from 1 start {e.kkt_text};"
     if len(e.search.attempts) > 1:
-        told = (
-            f"a local optimum, the best of {e.search.words}, of which {agreed} ended on it "
-            f"{e.residue};"
+        text = (
+            f"a local optimum, the best of {e.search.starts}, of which {agreed} ended on it "
+            f"{e.kkt_text};"
         )
     remedy = "it is not proved to be the lowest, and more starts search further."
-    return Finding(Status.local_optimum, told, remedy)
+    return Finding(Status.local_optimum, text, remedy)
 
 
-RULES = (_crossed, _endless, _restless, _undetermined, _poor, _held, _converged)
-"""In order of gravity, for fits to data."""
+RULES = (_infeasible, _unbounded, _not_converged, _unidentified, _poor_fit, _at_limit, _converged)
+"""Rules for fits to data; the gravest first."""
 
-WITHOUT_DATA = (_crossed, _endless, _degenerate, _saddle, _restless, _optimum)
-"""The same for an objective alone."""
+RULES_WITHOUT_DATA = (_infeasible, _unbounded, _degenerate, _saddle, _not_converged, _optimum)
+"""Rules for an objective alone; the gravest first."""
 
 
 def _remarks(e: FitEvidence) -> list[str]:
-    """Remarks on the starts and on the time limit."""
-    search, said = e.search, []
+    """Collect remarks on the starts and on the time limit."""
+    search, remarks = e.search, []
     count, dropped = len(search.attempts), sum(np.isnan(a.cost) for a in search.attempts)
     if dropped:
-        said.append(f"{dropped} of {count} starts dropped: cost not finite there.")
+        remarks.append(f"{dropped} of {count} starts dropped: cost not finite there.")
     if search.moved:
-        said.append(f"{search.moved} of {count} starts moved onto their bounds.")
+        remarks.append(f"{search.moved} of {count} starts moved onto their bounds.")
     if search.cut:
-        said.append(f"The limit of {search.seconds:g} s cut the search.")
-    lost = e.problem.has_data and not e.state.optimal and not e.settled
-    if lost and e.state.feasible and (found := _degenerate(e)):
-        said.append(found.message)
-    return said
+        remarks.append(f"The limit of {search.seconds:g} s cut the search.")
+    unexplained = e.problem.has_data and not e.state.optimal and not e.settled
+    if unexplained and e.state.feasible and (found := _degenerate(e)):
+        remarks.append(found.message)
+    return remarks

@@ -1,7 +1,7 @@
 """Named mappings y = f(x) with values, forward sensitivities and adjoints (report 3.1.1).
 
-A map is a function of one point: a vector of named inputs to a vector of named outputs. Many
-points are ``jax.vmap(m)(points)``. Maps are JAX trees, so their own numbers (weights, calibration
+A map takes one point, a vector of named inputs, to a vector of named outputs. For many points use
+``jax.vmap(m)(points)``. Maps are JAX trees, so their own numbers (weights, calibration
 constants) can be free in a fit and are differentiated by JAX like the inputs.
 """
 
@@ -30,20 +30,20 @@ class Map(Protocol):
         """Names of the outputs."""
 
     def __call__(self, x: jax.Array) -> jax.Array:
-        """Outputs at one point, shape (len(inputs),) to (len(outputs),)."""
+        """Compute the outputs at one point, shape (len(inputs),) to (len(outputs),)."""
 
 
-def positions(chosen: Sequence[str], names: Sequence[str], what: str = "name") -> list[int]:
-    """Find where names stand in a list of names.
+def positions(chosen: Sequence[str], names: Sequence[str], kind: str = "name") -> list[int]:
+    """Find the positions of chosen names in a list of names.
 
     Parameters
     ----------
     chosen : sequence of str
-        The names looked for.
+        Names to find.
     names : sequence of str
-        The names there are.
-    what : str
-        What they name, for the message.
+        All names.
+    kind : str
+        Kind of thing that they name, for the error message.
 
     Returns
     -------
@@ -52,7 +52,7 @@ def positions(chosen: Sequence[str], names: Sequence[str], what: str = "name") -
     Raises
     ------
     InputError
-        If a name is not there.
+        If a name is not in the list.
 
     Examples
     --------
@@ -61,12 +61,12 @@ def positions(chosen: Sequence[str], names: Sequence[str], what: str = "name") -
     """
     for name in chosen:
         if name not in names:
-            raise InputError(f"no {what} '{name}'", nearest(name, list(names)))
+            raise InputError(f"no {kind} '{name}'", nearest(name, list(names)))
     return [list(names).index(name) for name in chosen]
 
 
-def _named(m: Map) -> None:
-    """Have the names of a map as tuples; each may stand there once."""
+def _check_names(m: Map) -> None:
+    """Convert the names of a map to tuples and check that each occurs once."""
     for side in ("inputs", "outputs"):
         names = tuple(getattr(m, side))
         if len(set(names)) < len(names):
@@ -113,12 +113,12 @@ class Affine:
                 f"a matrix of shape {matrix.shape} and an offset of shape {offset.shape}",
                 f"shapes {shape} and {shape[:1]}, one row for each output",
             )
-        _named(self)
+        _check_names(self)
         object.__setattr__(self, "matrix", matrix)
         object.__setattr__(self, "offset", offset)
 
     def __call__(self, x: jax.Array) -> jax.Array:
-        """Outputs at one point."""
+        """Compute the outputs at one point."""
         return self.matrix @ x + self.offset
 
 
@@ -149,10 +149,10 @@ class Formula:
     parameters: Any = None
 
     def __post_init__(self):
-        _named(self)
+        _check_names(self)
 
     def __call__(self, x: jax.Array) -> jax.Array:
-        """Outputs at one point."""
+        """Compute the outputs at one point."""
         return self.function(self.parameters, x)
 
 
@@ -160,9 +160,9 @@ class Formula:
 class Series:
     """One map after another (report fig 2b): u -> p, then (p, x) -> y.
 
-    The second map takes each input from the first map's outputs where one has that name, and from
-    outside otherwise. So the inputs of the whole are those of the first map followed by those of
-    the second that nobody provides.
+    An input of the second map is an output of the first if one has that name, else an input of the
+    whole. The inputs of the whole are those of the first map, followed by the remaining ones of the
+    second.
 
     Parameters
     ----------
@@ -184,8 +184,8 @@ class Series:
     @property
     def inputs(self) -> tuple[str, ...]:
         """Inputs of the first map, then those of the second that come from outside."""
-        known = {*self.first.inputs, *self.first.outputs}
-        return self.first.inputs + tuple(n for n in self.second.inputs if n not in known)
+        provided = {*self.first.inputs, *self.first.outputs}
+        return self.first.inputs + tuple(n for n in self.second.inputs if n not in provided)
 
     @property
     def outputs(self) -> tuple[str, ...]:
@@ -193,7 +193,7 @@ class Series:
         return self.second.outputs
 
     def __call__(self, x: jax.Array) -> jax.Array:
-        """Outputs at one point."""
+        """Compute the outputs at one point."""
         middle = self.first(x[: len(self.first.inputs)])
         every = jnp.concatenate([middle, x])
         names = self.first.outputs + self.inputs
@@ -241,7 +241,7 @@ class Parallel:
         return self.parts[0].outputs
 
     def __call__(self, x: jax.Array) -> jax.Array:
-        """Outputs at one point."""
+        """Compute the outputs at one point."""
         names = self.inputs
         values = [part(x[jnp.array(positions(part.inputs, names))]) for part in self.parts]
         return jnp.sum(jnp.stack(values), axis=0)
@@ -249,7 +249,7 @@ class Parallel:
 
 @tree.node("inputs", "outputs", "function", "jacobian", "hessian")
 class Foreign:
-    """A door for code JAX cannot see through, which brings its own derivatives.
+    """A map computed by code outside JAX, which supplies its own derivatives.
 
     Parameters
     ----------
@@ -277,14 +277,14 @@ class Foreign:
     hessian: Callable[[np.ndarray], np.ndarray] | None = None
 
     def __post_init__(self):
-        _named(self)
+        _check_names(self)
 
     def __call__(self, x: jax.Array) -> jax.Array:
-        """Outputs at one point."""
+        """Compute the outputs at one point."""
         return _foreign(self, 0, jnp.asarray(x, float))
 
     def derivative(self, order: int) -> Callable[[np.ndarray], np.ndarray]:
-        """The user's code for the derivative of an order, 0 being the value."""
+        """Return the user's function for the derivative of an order, 0 for the value."""
         codes = (self.function, self.jacobian, self.hessian)
         if order >= len(codes) or codes[order] is None:
             raise InputError(
@@ -295,10 +295,10 @@ class Foreign:
         return codes[order]
 
 
-def _call_out(door: Foreign, order: int, x: jax.Array) -> jax.Array:
-    """Run the user's code for one derivative order on the host."""
-    shape = (len(door.outputs),) + (len(door.inputs),) * order
-    code = door.derivative(order)
+def _call_user(m: Foreign, order: int, x: jax.Array) -> jax.Array:
+    """Call the user's function for one derivative order from JAX."""
+    shape = (len(m.outputs),) + (len(m.inputs),) * order
+    code = m.derivative(order)
 
     def host(point):
         return np.asarray(code(np.asarray(point)), float).reshape(shape)
@@ -307,11 +307,11 @@ def _call_out(door: Foreign, order: int, x: jax.Array) -> jax.Array:
     return jax.pure_callback(host, spec, x, vmap_method="sequential")
 
 
-_foreign = jax.custom_jvp(_call_out, nondiff_argnums=(0, 1))
+_foreign = jax.custom_jvp(_call_user, nondiff_argnums=(0, 1))
 
 
 @_foreign.defjvp
-def _foreign_jvp(door, order, primals, tangents):
-    """Contract the next derivative, which is again the door's own, with the direction."""
+def _foreign_jvp(m, order, primals, tangents):
+    """Multiply the next derivative, also supplied by the user, by the direction."""
     (x,), (direction,) = primals, tangents
-    return _foreign(door, order, x), _foreign(door, order + 1, x) @ direction
+    return _foreign(m, order, x), _foreign(m, order + 1, x) @ direction

@@ -31,9 +31,9 @@ class Layer(NamedTuple):
 class Port(NamedTuple):
     """Input or output of a network: outside value = scale * node value + bias.
 
-    The report does not say which way its scale and bias work; this reading makes both ends alike,
-    and its example values look like standard deviations and means. `lower` and `upper` tell the
-    range over which certified gains hold.
+    The report does not define the direction of scale and bias. This definition is the same for
+    inputs and outputs, and the report's example values look like standard deviations and means.
+    `lower` and `upper` are the range over which certified gains hold.
     """
 
     name: str
@@ -46,7 +46,7 @@ class Port(NamedTuple):
 
 
 class NetworkGain(NamedTuple):
-    """A gain as a further output: d(output)/d(by[0])..., of order len(by), 1 to 3.
+    """A gain as an additional output: d(output)/d(by[0])..., of order len(by), 1 to 3.
 
     `kind` is ``local`` (at the point), ``lower`` or ``upper`` (a certified bound over the whole
     input range, split into `cells` along each input; first order only).
@@ -72,7 +72,7 @@ def connection(source: str, target: str) -> str:
 
 @tree.node("layers", "connections", "input_ports", "output_ports", "gains")
 class MLP:
-    """A network of layers with any connections between them, skips included.
+    """A network of layers with arbitrary connections without loops; they may skip layers.
 
     A node's argument is its bias plus the weighted nodes of all layers connected to it plus, at an
     input's node, (x - port.bias) / port.scale.
@@ -90,7 +90,7 @@ class MLP:
     biases : mapping of str to array, optional
         Layer name to shape (size,); zero if absent.
     gains : sequence of NetworkGain, optional
-        Gains that follow the outputs.
+        Gains, computed as outputs after the output ports.
 
     Raises
     ------
@@ -150,11 +150,11 @@ class MLP:
             ) from None
 
     def __call__(self, x: jax.Array) -> jax.Array:
-        """Outputs and gains at one point."""
+        """Compute outputs and gains at one point."""
         return jnp.concatenate([self.values(x), *(g[None] for g in self._gains(x))])
 
     def values(self, x: jax.Array) -> jax.Array:
-        """Outputs without the gains.
+        """Compute the outputs without the gains.
 
         Parameters
         ----------
@@ -178,7 +178,7 @@ class MLP:
         return jnp.stack([p.scale * nodes[p.layer][p.node] + p.bias for p in self.output_ports])
 
     def _gains(self, x: jax.Array) -> list[jax.Array]:
-        """Values of the gains asked for."""
+        """Compute the gains."""
         plain = replace(self, gains=())
         return [
             gain(plain, x, g.output, g.by) if g.kind == "local" else _certified(plain, g)
@@ -186,22 +186,22 @@ class MLP:
         ]
 
 
-def _certified(net: MLP, asked: NetworkGain) -> jax.Array:
-    """The certified bound of a gain over the range of the input ports."""
-    (row,) = positions([asked.output], net.outputs)
-    (column,) = positions(asked.by, net.inputs)
+def _certified(net: MLP, wanted: NetworkGain) -> jax.Array:
+    """Compute the certified bound of a gain over the range of the input ports."""
+    (row,) = positions([wanted.output], net.outputs)
+    (column,) = positions(wanted.by, net.inputs)
     low = np.array([port.lower for port in net.input_ports])
     high = np.array([port.upper for port in net.input_ports])
     finite = np.all(np.isfinite(high - low))
-    corners = cells(low, high, asked.cells) if finite else (low[None], high[None])
+    corners = cells(low, high, wanted.cells) if finite else (low[None], high[None])
     bound = over_cells(net, *corners)
-    if asked.kind == "lower":
+    if wanted.kind == "lower":
         return jnp.min(bound.lower[:, row, column])
     return jnp.max(bound.upper[:, row, column])
 
 
 def _check_layers(net: MLP) -> None:
-    """Refuse unknown node functions, doubled names and connections that lead nowhere."""
+    """Raise an error for unknown node functions, repeated names and wrong connections."""
     names = [layer.name for layer in net.layers]
     for layer in net.layers:
         if names.count(layer.name) > 1:
@@ -216,15 +216,15 @@ def _check_layers(net: MLP) -> None:
         positions(pair, names, "layer")
         if net.connections.count(pair) > 1:
             raise InputError(f"two connections {connection(*pair)}", "each connection once")
-    led = {target for _, target in net.connections} | {port.layer for port in net.input_ports}
+    fed = {target for _, target in net.connections} | {port.layer for port in net.input_ports}
     for name in names:
-        if name not in led:
+        if name not in fed:
             raise InputError(f"layer '{name}' with nothing before it", "a connection or an input")
-    _ = net.order  # which has no loop
+    _ = net.order  # raises an error for a loop
 
 
 def _check_ports(net: MLP) -> None:
-    """Refuse ports on nodes that do not exist and scales that lose the value."""
+    """Raise an error for ports on nodes that do not exist, and scales that are zero."""
     sizes = {layer.name: layer.size for layer in net.layers}
     for port in (*net.input_ports, *net.output_ports):
         positions([port.layer], list(sizes), "layer")
@@ -243,33 +243,33 @@ def _check_ports(net: MLP) -> None:
 
 
 def _check_gains(net: MLP) -> None:
-    """Refuse gains of orders or kinds that do not exist."""
-    for asked in net.gains:
-        positions([asked.output], [port.name for port in net.output_ports], "output")
-        positions(asked.by, net.inputs, "input")
-        if not 1 <= len(asked.by) <= 3:
-            raise InputError(f"gain '{asked.name}' of order {len(asked.by)}", "order 1, 2 or 3")
-        if asked.kind not in ("local", "lower", "upper"):
+    """Raise an error for gains of a wrong order or kind."""
+    for wanted in net.gains:
+        positions([wanted.output], [port.name for port in net.output_ports], "output")
+        positions(wanted.by, net.inputs, "input")
+        if not 1 <= len(wanted.by) <= 3:
+            raise InputError(f"gain '{wanted.name}' of order {len(wanted.by)}", "order 1, 2 or 3")
+        if wanted.kind not in ("local", "lower", "upper"):
             raise InputError(
-                f"gain type '{asked.kind}'", nearest(asked.kind, ["local", "lower", "upper"])
+                f"gain type '{wanted.kind}'", nearest(wanted.kind, ["local", "lower", "upper"])
             )
-        if asked.kind != "local" and len(asked.by) > 1:
+        if wanted.kind != "local" and len(wanted.by) > 1:
             raise InputError(
-                f"a {asked.kind} bound on the gain '{asked.name}' of order {len(asked.by)}",
+                f"a {wanted.kind} bound on the gain '{wanted.name}' of order {len(wanted.by)}",
                 "order 1: bounds are certified for first-order gains",
             )
 
 
-def _arrays(given, shapes: Mapping[str, tuple[int, ...]], what: str) -> dict[str, jax.Array]:
-    """Arrays by name, zero where none is given."""
+def _arrays(given, shapes: Mapping[str, tuple[int, ...]], kind: str) -> dict[str, jax.Array]:
+    """Collect arrays by name, zero where none is given."""
     given = dict(given or {})
-    positions(list(given), list(shapes), what)
+    positions(list(given), list(shapes), kind)
     found = {}
     for name, shape in shapes.items():
         found[name] = jnp.asarray(given.get(name, np.zeros(shape)), float)
         if found[name].shape != shape:
             raise InputError(
-                f"values of shape {found[name].shape} for {what} '{name}'", f"shape {shape}"
+                f"values of shape {found[name].shape} for {kind} '{name}'", f"shape {shape}"
             )
     return found
 
@@ -294,7 +294,7 @@ def dense(
     kind : str
         Node function of the hidden layers; the last layer is linear with a bias.
     seed : int
-        Of the random weights.
+        Seed of the random weights.
     spread : float
         Weights are normal with standard deviation spread / sqrt(source size), biases with spread.
     gains : sequence of NetworkGain
@@ -337,6 +337,6 @@ def dense(
 
 
 def _ports(given: Sequence[str | Port], layer: str) -> list[Port]:
-    """Ports on the nodes of one layer, in order."""
+    """Make ports on the nodes of one layer, in order."""
     ports = [p if isinstance(p, Port) else Port(p, layer) for p in given]
     return [port._replace(layer=layer, node=i) for i, port in enumerate(ports)]

@@ -1,4 +1,4 @@
-"""The posterior of a problem about its optimum, for the sampler: one statement for every study."""
+"""Posterior of a problem about its optimum, as a target for the sampler; used by all studies."""
 
 from __future__ import annotations
 
@@ -21,31 +21,31 @@ from beamfit.sampling.posterior import Posterior
 from beamfit.sampling.priors import Distribution, checked
 from beamfit.sampling.target import PosteriorLaw, SamplingTarget, covariance_of, slopes_of
 
-# Smallest share of an undetermined direction at which a number belongs to it.
-PART = 0.05
-# Standard errors beyond which a further optimum is another one.
-FAR = 6.0
-ELSEWHERE = (
+# A number belongs to an undetermined direction if its part exceeds this share of the largest.
+MIN_PART = 0.05
+# A further optimum is too far for the sampler to reach beyond this many standard errors.
+MAX_DISTANCE = 6.0
+OTHER_OPTIMUM = (
     "The search met another optimum of nearly the same cost far from this one: the intervals are "
     "those about one of them."
 )
 
 
 class Optimum(NamedTuple):
-    """An optimum and what the fit found there: the start of a sampler.
+    """An optimum with results of the fit that the sampler starts from.
 
     Attributes
     ----------
     theta : array, shape (n,)
         The problem's free numbers.
     verdict : Finding
-        On the fit.
+        Verdict on the fit.
     scales : sequence of float
-        Factor on the errors of each record that its residuals show; NaN where they show nothing.
+        Factor on the errors of each record from its residuals; NaN where they do not determine it.
     given : sequence of bool
-        Whether each record came with errors.
+        True for each record with given errors.
     undetermined : array, shape (n, k), optional
-        Directions that neither records nor priors see.
+        Directions that neither records nor priors determine.
     others : sequence of array
         Further optima of nearly the same cost.
     """
@@ -59,7 +59,7 @@ class Optimum(NamedTuple):
 
 
 def unchanged(model: Any) -> Any:
-    """The numbers of a problem as they are."""
+    """Return the model itself: no change of variables."""
     return model
 
 
@@ -74,45 +74,45 @@ def _model_itself(model: Any, data: Any) -> Any:
 class Statement(NamedTuple):
     """A study's additions to its problem for the sampler; by default none.
 
-    The functions stand at the top of modules, so that they are compiled once.
+    The functions are defined at the top of modules, so that they are compiled once.
 
     Attributes
     ----------
     derived : mapping of str to str
-        Names and units of the numbers that `derive` gives.
+        Names and units of the numbers that `derive` returns.
     derive : callable
         ``derive(model, data)``, shape (len(derived),).
     build : callable
-        ``build(model, data)``: what a user's functions of a draw are given.
+        ``build(model, data)``, the argument of a user's functions of a draw.
     data : pytree
-        Of these functions.
+        Second argument of these functions.
     quoted, own : callable
-        A change of variables to those in which the prior is flat and which are sampled:
-        ``quoted(model)`` puts them in the place of the problem's own, ``own(model)`` is the inverse
-        and NaN outside its domain.
+        Change of variables to the numbers that are sampled, in which the prior is flat:
+        ``quoted(model)`` replaces the problem's numbers by them, ``own(model)`` is the inverse, NaN
+        outside its domain.
     renamed : mapping of str to str
-        How users call numbers of the problem.
+        Names of the problem's numbers for users.
     log_volume : callable
-        ``log_volume(model, data)``, added to the log density: of a prior that is flat in something
-        else than the sampled numbers.
+        ``log_volume(model, data)``, added to the log density for a prior that is flat in other
+        quantities than the sampled numbers.
     units : mapping of str to str
-        Of sampled numbers.
+        Units of sampled numbers.
     lower : mapping of str to float
-        Lower bounds of sampled numbers instead of the problem's own.
+        Lower bounds of sampled numbers that replace the problem's.
     labels : mapping of str to str
-        What stands for a record before the names of its noise; by default nothing if there is one
+        Label of a record in the names of its noise parameters. Default: empty if there is one
         record, else its name.
     averaged : sequence of str
-        Records whose noise `log_volume` averages over, so that their residuals count only for the
-        first shape of the proposals.
+        Records whose noise is averaged over in `log_volume`, so that their residuals are used only
+        for the first shape of the proposals.
     trusted : sequence of str
-        Records whose errors are right, whatever the residuals show: anchors of a model.
+        Records whose errors are right whatever the residuals are: anchors of a model.
     priors_own, hidden : sequence of str
-        Numbers that the prior decides, and those nobody asks for.
+        Numbers that the prior determines, and nuisance numbers.
     remark : str
-        A further sentence.
+        A further sentence for the result.
     nothing : str
-        Why there is no posterior; empty where there is one.
+        Reason for which there is no posterior; empty if there is one.
     """
 
     derived: Mapping[str, str] = {}
@@ -136,7 +136,7 @@ class Statement(NamedTuple):
 
 @tree.node()
 class Sampled:
-    """A problem for the sampler: its core, all numbers, which move, bounds, a study's data."""
+    """Data of the posterior's law: core, free numbers, indices sampled, bounds, a study's data."""
 
     core: Core
     theta: Any
@@ -146,15 +146,15 @@ class Sampled:
 
 
 @lru_cache(maxsize=64)
-def _law(own, log_volume, derive, build) -> tuple[PosteriorLaw, Callable]:
-    """The law of a study's functions, and its residuals with the problem's priors at their end."""
+def _make_law(own, log_volume, derive, build) -> tuple[PosteriorLaw, Callable]:
+    """Make the law from a study's functions, and residuals that end with those of the priors."""
 
     def model_of(data: Sampled, moved: jax.Array) -> Any:
         theta = data.theta.at[data.moving].set(moved)
         return own(tree.replace(data.core.model, data.core.chosen, theta))
 
     def residual(data: Sampled, moved: jax.Array) -> tuple[jax.Array, ...]:
-        """Residuals of the records, without priors: these share no noise with measurements."""
+        """Residuals of the records without those of the priors, which have no noise factor."""
         model = model_of(data, moved)
         return tuple(record.residual(model) for record in data.core.records) or (jnp.zeros(0),)
 
@@ -164,7 +164,7 @@ def _law(own, log_volume, derive, build) -> tuple[PosteriorLaw, Callable]:
         return *residual(data, moved), jnp.concatenate([jnp.zeros(0), *priors])
 
     def log_prior(data: Sampled, moved: jax.Array) -> jax.Array:
-        """Priors and further objectives, and -inf where a bound or constraint is broken."""
+        """Log density of priors and further objectives, -inf outside bounds and constraints."""
         model, core = model_of(data, moved), data.core
         value = log_volume(model, data.more)
         for prior in core.priors:
@@ -174,8 +174,8 @@ def _law(own, log_volume, derive, build) -> tuple[PosteriorLaw, Callable]:
         theta = tree.read(model, core.chosen)
         inside = jnp.all((theta >= data.ends[0]) & (theta <= data.ends[1]))
         for constraint in core.constraints:
-            held = constraint.function(model, constraint.data)
-            inside &= jnp.all((held >= constraint.lower) & (held <= constraint.upper))
+            limited = constraint.function(model, constraint.data)
+            inside &= jnp.all((limited >= constraint.lower) & (limited <= constraint.upper))
         return jnp.where(inside, value, -jnp.inf)
 
     law = PosteriorLaw(
@@ -201,22 +201,22 @@ def target_of(
     Parameters
     ----------
     problem : Problem
-        What was fitted.
+        The problem that was fitted.
     optimum : Optimum
-        Where the sampler begins.
+        Start of the sampler.
     stated : Statement, optional
-        What a study adds.
+        Additions of a study.
     noise : {"known", "inferred"} or None
-        None: of each record inferred where it has no errors or the fit enlarged them, else known.
+        None: the noise of a record is inferred if it has no errors or the fit enlarged them.
     outliers : bool
-        Whether some points may be outliers.
+        True if some points may be outliers.
     priors : mapping of str to distribution, or None
-        In addition to the problem's own.
+        Priors in addition to the problem's.
 
     Returns
     -------
     SamplingTarget
-        Flat in the numbers that are sampled but for the problem's own priors and `priors`.
+        Its prior is flat in the sampled numbers, apart from the problem's priors and `priors`.
 
     Raises
     ------
@@ -234,19 +234,21 @@ def target_of(
     priors = checked(priors, names)
     lower, upper = p.lower[moving], p.upper[moving]
     lower = np.array([stated.lower.get(n, low) for n, low in zip(names, lower, strict=True)])
-    theta, turn = _changed(p, stated, optimum.theta)
-    law, with_priors = _law(stated.own, stated.log_volume, stated.derive, stated.build)
+    theta, derivative = _to_sampled(p, stated, optimum.theta)
+    law, with_priors = _make_law(stated.own, stated.log_volume, stated.derive, stated.build)
     data = _data(p, theta, moving, stated)
     slopes = slopes_of(law._replace(residual=with_priors), data, theta[moving])
     noise_found = tuple(scale if scale > 0 else 1.0 for scale in optimum.scales) or (1.0,)
-    # Largest distance of each number from the optimum where the data do not determine it.
+    # Half-width of the proposals for numbers that the data do not determine.
     box = np.where(np.isfinite(upper - lower), 0.5 * (upper - lower), np.inf)
     width = np.minimum(box, [float(priors[n].std()) if n in priors else np.inf for n in names])
     covariance = covariance_of(slopes, (*noise_found, 1.0), width)
-    unseen = np.zeros((len(theta), 0)) if optimum.undetermined is None else optimum.undetermined
+    undetermined = (
+        np.zeros((len(theta), 0)) if optimum.undetermined is None else optimum.undetermined
+    )
     with_prior = np.array([name in priors for name in names])
-    held, loose = _open((turn @ unseen)[moving], names, with_prior, width)
-    group_of, block_of = _belonging(slopes, bool(p.constraints))
+    held, unlimited = _unlimited((derivative @ undetermined)[moving], names, with_prior, width)
+    group_of, block_of = _connections(slopes, bool(p.constraints))
     return SamplingTarget(
         law=law,
         data=data,
@@ -262,10 +264,10 @@ def target_of(
         priors=priors,
         derived=stated.derived,
         observed=_observed(p),
-        remark=_remark(optimum, stated, turn[moving], covariance),
-        stated={prior.name: _words(prior) for prior in p.priors},
+        remark=_remark(optimum, stated, derivative[moving], covariance),
+        stated={prior.name: _describe(prior) for prior in p.priors},
         priors_own=(*held, *stated.priors_own),
-        open_directions=stated.nothing or loose,
+        open_directions=stated.nothing or unlimited,
         verdict=optimum.verdict,
         hidden=(*(names[i] for i in np.flatnonzero(p.nuisance[moving])), *stated.hidden),
         group_of=group_of,
@@ -273,15 +275,19 @@ def target_of(
     )
 
 
-def _remark(optimum: Optimum, stated: Statement, turn: np.ndarray, covariance: np.ndarray) -> str:
-    """The study's remark, and that other optima lie too far away to be reached."""
-    steps = [turn @ (other - optimum.theta) for other in optimum.others]
-    far = any(np.any(np.abs(step) > FAR * np.sqrt(np.diag(covariance))) for step in steps)
-    return " ".join(filter(None, (stated.remark, ELSEWHERE if far else "")))
+def _remark(
+    optimum: Optimum, stated: Statement, derivative: np.ndarray, covariance: np.ndarray
+) -> str:
+    """Join the study's remark and a warning of other optima that the sampler does not reach."""
+    steps = [derivative @ (other - optimum.theta) for other in optimum.others]
+    too_far = any(
+        np.any(np.abs(step) > MAX_DISTANCE * np.sqrt(np.diag(covariance))) for step in steps
+    )
+    return " ".join(filter(None, (stated.remark, OTHER_OPTIMUM if too_far else "")))
 
 
 class Predicted(NamedTuple):
-    """A record's values that count: what draws predict, (m, n); measured and error, (n,)."""
+    """Values of a record that have weight: draws of the prediction (m, n), data and errors (n,)."""
 
     draws: np.ndarray
     measured: np.ndarray
@@ -289,19 +295,19 @@ class Predicted(NamedTuple):
 
 
 def predicted(posterior: Posterior, name: str) -> Predicted:
-    """Predictions of a record by draws from the posterior of its problem.
+    """Predict a record by draws from the posterior of its problem.
 
     Parameters
     ----------
     posterior : Posterior
-        Of a target by `target_of`.
+        Posterior of a target made by `target_of`.
     name : str
-        The record's.
+        Name of the record.
 
     Returns
     -------
     Predicted
-        Errors of 1 where the record came without.
+        With errors of 1 if the record has none.
     """
     target = posterior.target
     records = target.data.core.records
@@ -316,12 +322,12 @@ def predicted(posterior: Posterior, name: str) -> Predicted:
     return Predicted(measured + residual * error / np.sqrt(weight), measured, error)
 
 
-def _changed(p: Problem, stated: Statement, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The optimum in the numbers that are sampled, and their derivatives by the problem's own."""
+def _to_sampled(p: Problem, stated: Statement, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Convert the optimum to the sampled numbers, with derivatives by the problem's numbers."""
     if stated.quoted is unchanged:
         return np.array(theta), np.eye(len(theta))
-    found, turn = _with_slope(stated.quoted, p.core, jnp.asarray(theta))
-    return np.array(found), np.asarray(turn)
+    found, derivative = _with_slope(stated.quoted, p.core, jnp.asarray(theta))
+    return np.array(found), np.asarray(derivative)
 
 
 @partial(jax.jit, static_argnums=0)
@@ -335,19 +341,19 @@ def _with_slope(
 
 
 def _data(p: Problem, theta: np.ndarray, moving: np.ndarray, stated: Statement) -> Sampled:
-    """Data of the posterior's law; numbers that move are zeroed, so that equal problems compare."""
+    """Make the law's data; sampled numbers are zeroed, so that equal problems compare equal."""
     fixed = np.array(theta)
     fixed[moving] = 0.0
     core = replace(p.core, model=tree.replace(p.core.model, p.core.chosen, jnp.asarray(fixed)))
-    loose = p.lower == p.upper
-    ends = np.where(loose, -np.inf, p.lower), np.where(loose, np.inf, p.upper)
+    equal = p.lower == p.upper
+    ends = np.where(equal, -np.inf, p.lower), np.where(equal, np.inf, p.upper)
     return jax.tree.map(jnp.asarray, Sampled(core, fixed, moving, ends, stated.data))
 
 
 def _groups(
     p: Problem, optimum: Optimum, stated: Statement, noise: str | None, outliers: bool
 ) -> tuple[NoiseGroup, ...]:
-    """Noise model of each record; a factor on its errors is free only if the data can show it."""
+    """Choose the noise model of each record; a noise factor is free only if data determine it."""
     groups = []
     for record, scale, given in zip(p.records, optimum.scales, optimum.given, strict=True):
         label = stated.labels.get(record.name, record.name if len(p.records) > 1 else "")
@@ -357,26 +363,28 @@ def _groups(
             kind = "known"
         if record.name in stated.averaged:
             kind = "averaged"
-        doubted = outliers and not trusted and kind != "averaged"
-        groups.append(NoiseGroup(label, kind, doubted, record.prior_freedom))
+        may_have_outliers = outliers and not trusted and kind != "averaged"
+        groups.append(NoiseGroup(label, kind, may_have_outliers, record.prior_freedom))
     return tuple(groups) or (NoiseGroup("", noise or "known", outliers),)
 
 
 def _observed(p: Problem) -> dict[str, np.ndarray]:
+    """Collect measured values and errors of all records by name, without padding."""
     found = {}
     for record in p.records:
-        for what in ("measured", "error"):
-            values = getattr(record, what)
+        for field in ("measured", "error"):
+            values = getattr(record, field)
             if values is not None:
                 every = np.broadcast_to(values, record.measured.shape).ravel()
-                found[f"{record.name} {what}"] = every[record.used]
+                found[f"{record.name} {field}"] = every[record.used]
     return found
 
 
-def _belonging(slopes: Sequence[np.ndarray], joined: bool) -> tuple[tuple[int, ...], ...]:
-    """Record that says most of each number, and groups of numbers joined by a record or prior.
+def _connections(slopes: Sequence[np.ndarray], joined: bool) -> tuple[tuple[int, ...], ...]:
+    """Find the record that determines each number best, and groups of numbers that are connected.
 
-    Constraints are not looked into: where there are any, all numbers belong together.
+    Numbers are connected if they occur in the same record or prior; if the problem has constraints
+    (`joined`), all are.
     """
     sizes = np.array([np.linalg.norm(part, axis=0) for part in slopes])
     together = (sizes.T @ sizes > 0) | joined
@@ -384,41 +392,41 @@ def _belonging(slopes: Sequence[np.ndarray], joined: bool) -> tuple[tuple[int, .
     return tuple(map(int, np.argmax(sizes[:-1], axis=0))), tuple(map(int, blocks))
 
 
-def _words(prior: Prior) -> str:
-    """A normal prior in words; of many numbers only that it is one."""
+def _describe(prior: Prior) -> str:
+    """Describe a normal prior; for several numbers only as normal."""
     if np.size(prior.mean) == np.size(prior.sd) == 1:
         return f"normal, {float(prior.mean):.6g} ± {float(prior.sd):.3g}"
     return "normal"
 
 
-def _open(
-    unseen: np.ndarray, names: tuple[str, ...], with_prior: np.ndarray, width: np.ndarray
+def _unlimited(
+    undetermined: np.ndarray, names: tuple[str, ...], with_prior: np.ndarray, width: np.ndarray
 ) -> tuple[tuple[str, ...], str]:
-    """Numbers that bounds alone hold, and a sentence if nothing at all holds some of them.
+    """Find numbers that only bounds limit, and a message if nothing limits some of them.
 
-    A prior on one number holds every direction along which it moves.
+    A prior on a number limits every direction in which the number takes part.
     """
-    beyond_priors = _not_moving(unseen, with_prior)
-    beyond_bounds = _not_moving(beyond_priors, np.isfinite(width))
-    held, loose = (_along(part, names) for part in (beyond_priors, beyond_bounds))
-    if not loose:
+    beyond_priors = _unchanged_directions(undetermined, with_prior)
+    beyond_bounds = _unchanged_directions(beyond_priors, np.isfinite(width))
+    held, unlimited = (_names_along(part, names) for part in (beyond_priors, beyond_bounds))
+    if not unlimited:
         return held, ""
-    shown = ", ".join(loose[:6]) + (", ..." if len(loose) > 6 else "")
+    shown = ", ".join(unlimited[:6]) + (", ..." if len(unlimited) > 6 else "")
     return held, (
         f"the data do not determine {shown}, and neither bounds nor priors hold them, so that "
         "there is no posterior; bound them, give priors, or measure what tells them apart"
     )
 
 
-def _not_moving(directions: np.ndarray, chosen: np.ndarray) -> np.ndarray:
-    """The directions, combined, along which the chosen numbers stay where they are."""
+def _unchanged_directions(directions: np.ndarray, chosen: np.ndarray) -> np.ndarray:
+    """Combine directions to those along which the chosen numbers do not change."""
     if not directions.shape[1] or not chosen.any():
         return directions
-    return directions @ null_space(directions[chosen], rcond=PART)
+    return directions @ null_space(directions[chosen], rcond=MIN_PART)
 
 
-def _along(directions: np.ndarray, names: tuple[str, ...]) -> tuple[str, ...]:
-    """Numbers that move along some direction by more than a small part of the largest."""
+def _names_along(directions: np.ndarray, names: tuple[str, ...]) -> tuple[str, ...]:
+    """Name the numbers with more than a small part in some direction."""
     size = np.abs(directions)
-    moved = np.any(size > PART * np.max(size, axis=0, initial=1e-300), axis=1)
+    moved = np.any(size > MIN_PART * np.max(size, axis=0, initial=1e-300), axis=1)
     return tuple(name for name, m in zip(names, moved, strict=True) if m)

@@ -1,9 +1,8 @@
-"""A problem: a model, its free numbers, what was measured, and what is known beforehand.
+"""A problem: a model, its free numbers, measured data, priors and constraints.
 
-A problem is stated with functions of ``(model, data)``, where the model is any JAX tree and its
-numbers are addressed by path. It offers them as functions of one flat vector ``theta`` of the free
-numbers, pure and in JAX: residuals, cost, constraints, log-probability. Fits, samplers and studies
-stand on these.
+A problem is made of functions of ``(model, data)``, where the model is any JAX tree whose numbers
+are addressed by path. It offers residuals, cost, constraints and log-probability as pure JAX
+functions of one flat vector ``theta`` of the free numbers. Fits, samplers and studies use these.
 """
 
 from __future__ import annotations
@@ -20,27 +19,27 @@ import numpy as np
 from beamfit.errors import InputError
 from beamfit.greybox import tree
 
-# Default tolerance on limits and on the conditions of an optimum, in sizes.
+# Default tolerance on limits and on the conditions of an optimum, in scales of the problem.
 TOLERANCE = 1e-6
 
 
 class Free(NamedTuple):
-    """Numbers of the model that are free.
+    """Free numbers of the model.
 
     Parameters
     ----------
     path : str
-        A leaf, or a part of the model whose leaves are all meant.
+        Path of a leaf, or of a part of the model; all its leaves are then free.
     lower, upper : float or array
         Bounds; equal bounds hold a number fixed. Arrays have the shape of the leaf.
     start : (float, float), optional
-        Range of random starts. Without it the bounds serve if both are finite, else a normal
-        around the model's value, as wide as the value and at least 1.
+        Range of random starts. By default the bounds if both are finite, else a normal distribution
+        about the model's value with a standard deviation of its magnitude, at least 1.
     nuisance : bool
-        True for numbers nobody asks for, such as weights: they may stay undetermined or end on a
-        bound without that being the verdict on the fit.
+        True for numbers that are not results, such as weights: they may stay undetermined or end at
+        a bound without effect on the verdict.
     labels : tuple of str, optional
-        Names of the numbers of a leaf in C order, in the place of ``path[i]``.
+        Names of the numbers of a leaf in C order, instead of ``path[i]``.
     """
 
     path: str
@@ -58,24 +57,24 @@ class Record:
     Parameters
     ----------
     name : str
-        Of the record.
+        Name of the record.
     predict : callable
         ``predict(model, data)``, of the shape of `measured`, in JAX. A function defined at the top
         of a module is compiled once for all records of one shape.
     data : pytree
-        What the prediction needs besides the model: settings, times.
+        Settings, times and whatever else the prediction needs besides the model.
     measured : array
-        What was measured.
+        Measured values.
     error : float or array, optional
-        One standard deviation of it. Without, the record's noise is inferred from its residuals,
-        which then cannot speak against the model; records of both kinds may stand together.
+        Standard deviation of each value. Without it, the noise is inferred from the residuals,
+        which then cannot test the model. A problem may have records of both kinds.
     weight : float or array
         Weight of the record's chi-square among several objectives, or of each value. Values of
-        weight 0 are padding and count nowhere, so that records of a few lengths
-        (`beamfit.arrays.padded_length`) share compiled code.
+        weight 0 are padding and have no effect: records of similar lengths are padded to one length
+        (`beamfit.arrays.padded_length`) so that they share compiled code.
     worth : float
-        Degrees of freedom that `error` is worth: infinite where it is known; a few where it rests
-        on a guess, which the residuals correct.
+        Degrees of freedom of `error`: infinite if it is known, a few if it is a guess that the
+        residuals correct.
 
     Raises
     ------
@@ -113,24 +112,24 @@ class Record:
         object.__setattr__(self, "error", error)
 
     def residual(self, model: Any) -> jax.Array:
-        """Weighted residuals (predicted - measured)/error as a flat vector."""
+        """Compute the weighted residuals (predicted - measured)/error as a flat vector."""
         scale = 1.0 if self.error is None else self.error
         difference = (self.predict(model, self.data) - self.measured) / scale
         return jnp.ravel(jnp.where(self.weight > 0, jnp.sqrt(self.weight) * difference, 0.0))
 
     @property
     def errors_given(self) -> bool:
-        """True if its errors are known, so that residuals can refute the model."""
+        """True if the errors are known, so that the residuals can refute the model."""
         return self.error is not None and np.isinf(self.worth)
 
     @property
     def prior_freedom(self) -> float:
-        """Degrees of freedom that a guess at the errors is worth; 0 where they are known."""
+        """Degrees of freedom of guessed errors; 0 if the errors are known or not given."""
         return 0.0 if self.error is None or self.errors_given else self.worth
 
     @property
     def used(self) -> np.ndarray:
-        """True for each value that counts, shape (values,)."""
+        """True for each value with a weight above zero, shape (values,)."""
         return np.broadcast_to(np.asarray(self.weight) > 0, self.measured.shape).ravel()
 
 
@@ -141,7 +140,7 @@ class Prior:
     Parameters
     ----------
     name : str
-        Path of the numbers, or a name for the function's value.
+        Path of the numbers, or the name of the function's value.
     mean, sd : float or array
         Mean and standard deviation.
     function : callable, optional
@@ -163,7 +162,7 @@ class Prior:
             raise InputError(f"standard deviation {self.sd} of the prior '{self.name}'", "above 0")
 
     def residual(self, model: Any) -> jax.Array:
-        """(value - mean)/sd as a flat vector."""
+        """Compute (value - mean)/sd as a flat vector."""
         if self.function is None:
             value = tree.read(model, tree.find_leaves(model, self.name))
         else:
@@ -178,15 +177,15 @@ class Constraint:
     Parameters
     ----------
     name : str
-        Of the constraint; elements of an array are called ``name[i]``.
+        Name of the constraint; elements of an array are called ``name[i]``.
     function : callable
         ``function(model, data)``, of any shape, in JAX.
     data : pytree
-        What it needs: any subset of the measured data, points, cells.
+        Second argument of the function: measured data, points, cells of a box.
     lower, upper : float or array
         Limits.
     labels : tuple of str, optional
-        Names of its elements in C order, in the place of ``name[i]``.
+        Names of its elements in C order, instead of ``name[i]``.
     """
 
     name: str
@@ -199,7 +198,7 @@ class Constraint:
 
 @tree.node("name", "function")
 class Objective:
-    """A further term of the cost, weight * function(model, data), that is no sum of squares."""
+    """A further term of the cost, weight * function(model, data), that is not a sum of squares."""
 
     name: str
     function: Callable[[Any, Any], jax.Array]
@@ -209,7 +208,7 @@ class Objective:
 
 @tree.node("chosen")
 class Core:
-    """The part of a problem JAX sees: arrays to trace, structure to compile for."""
+    """The part of a problem that JAX compiles: arrays to trace and static structure."""
 
     chosen: tuple[tree.Leaf, ...]
     model: Any
@@ -220,16 +219,16 @@ class Core:
 
 
 def flattened(core: Core) -> Callable[[Callable], Callable]:
-    """Compiler of functions of (core, theta, ...) to functions of (theta, ...) at this core.
+    """Return a function that compiles f(core, theta, ...) to f(theta, ...) at this core.
 
-    Its arrays are handed over once each: what two parts compute of the same arrays, a compiled
-    function computes once.
+    An array that occurs twice in the core is passed once, so that equal computations on it are
+    merged by the compiler.
     """
     leaves, structure = jax.tree_util.tree_flatten(core)
     keys = [id(x) if np.ndim(x) else -i for i, x in enumerate(leaves)]
     once = dict(zip(keys, leaves, strict=True))
     order = {key: i for i, key in enumerate(once)}
-    # Small arrays are handed over with every call: JAX takes longer to make them its own.
+    # Small arrays are passed as NumPy arrays: converting them to JAX's takes longer.
     arrays = [jnp.asarray(x) if np.size(x) > 1000 else np.asarray(x) for x in once.values()]
     places = tuple(order[key] for key in keys)
     return lambda function: partial(_compiled(function, places, structure), arrays)
@@ -249,7 +248,7 @@ def _model_at(core: Core, theta: jax.Array) -> Any:
 
 @jax.jit
 def residual(core: Core, theta: jax.Array) -> jax.Array:
-    """Residuals of every record, then of every prior, as one vector."""
+    """Compute the residuals of all records, then of all priors, as one vector."""
     model = _model_at(core, theta)
     parts = [part.residual(model) for part in (*core.records, *core.priors)]
     return jnp.concatenate(parts) if parts else jnp.zeros(0)
@@ -257,19 +256,19 @@ def residual(core: Core, theta: jax.Array) -> jax.Array:
 
 @jax.jit
 def cost(core: Core, theta: jax.Array) -> jax.Array:
-    """Half the sum of squared residuals plus the further objectives."""
+    """Compute half the sum of squared residuals plus the further objectives."""
     r = residual(core, theta)
     return 0.5 * r @ r + further(core, theta)
 
 
 def further(core: Core, theta: jax.Array) -> jax.Array:
-    """The sum of the further objectives."""
+    """Compute the sum of the further objectives."""
     model = _model_at(core, theta)
     return sum((jnp.sum(o.weight * o.function(model, o.data)) for o in core.objectives), 0.0)
 
 
 def with_slope(function: Callable[[jax.Array], jax.Array], theta: jax.Array):
-    """A function's value and its derivatives, of one evaluation: half the code to compile."""
+    """Compute a function's value and derivatives in one evaluation: half the code to compile."""
 
     def twice(t):
         value = function(t)
@@ -279,41 +278,42 @@ def with_slope(function: Callable[[jax.Array], jax.Array], theta: jax.Array):
     return value, slope
 
 
-def sloped(core: Core, theta: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Residuals and their Jacobian."""
+def residual_and_jacobian(core: Core, theta: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Compute the residuals and their Jacobian."""
     return with_slope(partial(residual, core), theta)
 
 
 @jax.jit
 def constraints(core: Core, theta: jax.Array) -> jax.Array:
-    """Values of every constraint as one vector."""
+    """Compute the values of all constraints as one vector."""
     model = _model_at(core, theta)
     parts = [jnp.ravel(c.function(model, c.data)) for c in core.constraints]
     return jnp.concatenate(parts) if parts else jnp.zeros(0)
 
 
 def values(core: Core, theta: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Cost and constraints."""
+    """Compute cost and constraints."""
     return cost(core, theta), constraints(core, theta)
 
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """A fit to be done.
+    """A fit or optimisation to be done.
 
     Parameters
     ----------
     model : pytree
         Holds every number, free or not; free numbers start from its values.
     free : sequence of Free
-        Which are free, within which bounds. Each number at most once.
+        Free numbers with their bounds, each at most once.
     records : sequence of Record
-        Measured data. Several records share the model's numbers.
+        Measured data, which may depend on the same numbers.
     priors : sequence of Prior
     constraints : sequence of Constraint
     objectives : sequence of Objective
     tolerance : float
-        Within which a limit counts as reached and a point as an optimum, in the problem's sizes.
+        Tolerance within which a limit is reached and a point is an optimum, in the problem's
+        scales.
 
     Raises
     ------
@@ -344,10 +344,10 @@ class Problem:
     core: Core = field(init=False, repr=False)
 
     def __post_init__(self):
-        # Floats of NumPy: JAX takes longer to make a small array its own than to take it.
+        # NumPy arrays: converting small arrays to JAX's takes longer than passing them.
         model = jax.tree.map(partial(np.array, dtype=float), self.model)
-        spread = [(leaf, f) for f in self.free for leaf in tree.find_leaves(model, f.path)]
-        paths = [leaf.path for leaf, _ in spread]
+        free_leaves = [(leaf, f) for f in self.free for leaf in tree.find_leaves(model, f.path)]
+        paths = [leaf.path for leaf, _ in free_leaves]
         twice = sorted({path for path in paths if paths.count(path) > 1})
         if twice:
             raise InputError(f"'{twice[0]}' free twice", "each number free at most once")
@@ -358,31 +358,33 @@ class Problem:
         for name in ("free", "records", "priors", "constraints", "objectives"):
             object.__setattr__(self, name, tuple(getattr(self, name)))
         groups = self.records, self.priors, self.constraints, self.objectives
-        object.__setattr__(self, "core", Core(tuple(leaf for leaf, _ in spread), model, *groups))
-        object.__setattr__(self, "_spread", tuple(spread))
+        object.__setattr__(
+            self, "core", Core(tuple(leaf for leaf, _ in free_leaves), model, *groups)
+        )
+        object.__setattr__(self, "_free_leaves", tuple(free_leaves))
         _check_shapes(self)
 
     @cached_property
     def names(self) -> tuple[str, ...]:
         """Name of each free number."""
-        named = (f.labels or tree.element_names(leaf) for leaf, f in self._spread)
+        named = (f.labels or tree.element_names(leaf) for leaf, f in self._free_leaves)
         return tuple(name for names in named for name in names)
 
     @cached_property
     def start(self) -> np.ndarray:
-        """The model's own values of the free numbers."""
+        """Values of the free numbers in the model."""
         values = jax.tree_util.tree_leaves(self.core.model)
         return np.concatenate([np.asarray(values[leaf.index]).ravel() for leaf in self.core.chosen])
 
     @cached_property
     def lower(self) -> np.ndarray:
         """Lower bound of each free number."""
-        return _spread_out("lower", self._free_shapes)
+        return _broadcast("lower", self._free_shapes)
 
     @cached_property
     def upper(self) -> np.ndarray:
         """Upper bound of each free number."""
-        return _spread_out("upper", self._free_shapes)
+        return _broadcast("upper", self._free_shapes)
 
     @cached_property
     def moving(self) -> np.ndarray:
@@ -396,15 +398,15 @@ class Problem:
 
     @cached_property
     def nuisance(self) -> np.ndarray:
-        """True for each free number that no result quotes."""
-        return _spread_out("nuisance", self._free_shapes).astype(bool)
+        """True for each free number that is a nuisance number."""
+        return _broadcast("nuisance", self._free_shapes).astype(bool)
 
     @cached_property
     def with_prior(self) -> np.ndarray:
-        """True for each free number with a prior of its own."""
+        """True for each free number with a prior on itself."""
         own = [prior.name for prior in self.priors if prior.function is None]
-        told = {leaf.path for name in own for leaf in tree.find_leaves(self.core.model, name)}
-        parts = [np.full(leaf.size, leaf.path in told) for leaf in self.core.chosen]
+        paths = {leaf.path for name in own for leaf in tree.find_leaves(self.core.model, name)}
+        parts = [np.full(leaf.size, leaf.path in paths) for leaf in self.core.chosen]
         return np.concatenate(parts)
 
     @cached_property
@@ -412,7 +414,7 @@ class Problem:
         """Range of random starts, shape (2, free); NaN where none was given."""
         ends = [
             np.tile((np.nan, np.nan) if f.start is None else f.start, (leaf.size, 1))
-            for leaf, f in self._spread
+            for leaf, f in self._free_leaves
         ]
         return np.concatenate(ends).T
 
@@ -428,16 +430,16 @@ class Problem:
     @cached_property
     def constraint_lower(self) -> np.ndarray:
         """Lower limit of each constraint element."""
-        return _spread_out("lower", self._constraint_shapes)
+        return _broadcast("lower", self._constraint_shapes)
 
     @cached_property
     def constraint_upper(self) -> np.ndarray:
         """Upper limit of each constraint element."""
-        return _spread_out("upper", self._constraint_shapes)
+        return _broadcast("upper", self._constraint_shapes)
 
     @property
     def has_data(self) -> bool:
-        """True if there are records or priors: a fit, not an optimisation alone."""
+        """True if there are records or priors: a fit, not only an optimisation."""
         return bool(self.records or self.priors)
 
     @property
@@ -457,9 +459,9 @@ class Problem:
 
     @cached_property
     def least_residual(self) -> float:
-        """The least length of the residuals that counts: one standard deviation.
+        """Length of the residual vector that is not distinguished from zero: one standard error.
 
-        Where no record has errors it is 1e-6 of the measured values.
+        If no record has errors, it is 1e-6 of the measured values.
         """
         if self.errors_known or not self.records:
             return 1.0
@@ -468,33 +470,34 @@ class Problem:
 
     @cached_property
     def compiled(self) -> Callable[[Callable], Callable]:
-        """A function of (core, theta, ...) as a compiled function of (theta, ...) at this core.
+        """Compiler of functions of (core, theta, ...) to functions of (theta, ...) at this core.
 
-        Compiled once for each structure of problem. A search calls it a thousand times, and walking
-        the tree of the core for every call takes longer than the numbers of a small network.
+        They are compiled once for each structure of problem. The core is flattened only once: doing
+        so in each of thousands of calls takes longer than evaluating a small network.
         """
         return flattened(self.core)
 
     def model_at(self, theta) -> Any:
-        """The model with the free numbers set to theta, all of them JAX's arrays."""
+        """Return the model with the free numbers set to theta, all leaves as JAX arrays."""
         return jax.tree.map(jnp.asarray, _model_at(self.core, np.asarray(theta, float)))
 
     def residual(self, theta) -> jax.Array:
-        """Residuals in units of their errors, priors last, shape (values,)."""
+        """Compute residuals in units of their errors, priors last, shape (values,)."""
         return residual(self.core, jnp.asarray(theta, float))
 
     def cost(self, theta) -> jax.Array:
-        """Half of chi-square (priors included) plus the weighted objectives."""
+        """Compute half of chi-square (priors included) plus the weighted objectives."""
         return cost(self.core, jnp.asarray(theta, float))
 
     def constraint_values(self, theta) -> jax.Array:
-        """Values of the constraint elements."""
+        """Compute the values of the constraint elements."""
         return constraints(self.core, jnp.asarray(theta, float))
 
     def log_probability(self, theta) -> jax.Array:
-        """Log of the posterior density up to a constant: -cost, and -inf outside bounds and limits.
+        """Compute the log of the posterior density up to a constant.
 
-        A record without errors counts with errors of 1; set its noise before sampling.
+        It is -cost, and -inf outside bounds and limits. Records without errors count with errors of
+        1; set their noise before sampling.
         """
         theta = jnp.asarray(theta, float)
         inside = jnp.all((theta >= self.lower) & (theta <= self.upper))
@@ -506,31 +509,31 @@ class Problem:
 
     @property
     def _free_shapes(self) -> list[tuple[str, tuple[int, ...], Free]]:
-        """Each leaf that is free: path, shape, and how."""
-        return [(leaf.path, leaf.shape, f) for leaf, f in self._spread]
+        """Path, shape and `Free` of each free leaf."""
+        return [(leaf.path, leaf.shape, f) for leaf, f in self._free_leaves]
 
     @cached_property
     def _constraint_shapes(self) -> list[tuple[str, tuple[int, ...], Constraint]]:
-        """Each constraint with its name and the shape of its values."""
+        """Name, shape of the values and `Constraint` of each constraint."""
         model = self.core.model
         return [(c.name, shape_of(c.function, model, c.data), c) for c in self.constraints]
 
 
-def _spread_out(what: str, parts: Sequence[tuple[str, tuple[int, ...], Any]]) -> np.ndarray:
-    """One property of what is free or limited, spread over the elements."""
+def _broadcast(attribute: str, parts: Sequence[tuple[str, tuple[int, ...], Any]]) -> np.ndarray:
+    """Broadcast one attribute of free numbers or constraints to all their elements."""
     found = [np.zeros(0)]
-    for name, shape, of in parts:
-        value = np.asarray(getattr(of, what), float)
+    for name, shape, part in parts:
+        value = np.asarray(getattr(part, attribute), float)
         try:
             found.append(np.broadcast_to(value, shape).ravel())
         except ValueError:
             wanted = f"a number or an array of shape {shape}"
-            raise InputError(f"{what} of shape {value.shape} for '{name}'", wanted) from None
+            raise InputError(f"{attribute} of shape {value.shape} for '{name}'", wanted) from None
     return np.concatenate(found)
 
 
 def shape_of(function: Callable, *arguments: Any) -> tuple[int, ...]:
-    """Shape of what a function gives, traced once for each structure and shape of arguments."""
+    """Find the shape of a function's result, traced once for each structure of arguments."""
     leaves, structure = jax.tree_util.tree_flatten(arguments)
     kinds = tuple((np.shape(leaf), getattr(leaf, "dtype", np.dtype(float))) for leaf in leaves)
     return _traced_shape(function, structure, kinds)
@@ -543,7 +546,7 @@ def _traced_shape(function, structure, kinds) -> tuple[int, ...]:
 
 
 def _check_shapes(problem: Problem) -> None:
-    """Refuse predictions, priors and limits whose shapes do not fit, before anything runs."""
+    """Raise an error for predictions, priors and limits whose shapes do not fit."""
     for record in problem.records:
         found = shape_of(record.predict, problem.core.model, record.data)
         if found != record.measured.shape:

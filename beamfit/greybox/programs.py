@@ -1,7 +1,8 @@
-"""Programs: solvers for fits with constraints, and small quadratic programs inside JAX.
+"""Solvers for fits with constraints, and a solver of small quadratic programs in JAX.
 
-Uno comes first, scipy where it fails. They only propose points: whether one is an optimum is
-decided in `assess`. Quadratic programs are limits of a plan, solved again at every step.
+Uno is tried first, then scipy. Solvers only propose points; `assess` decides which of them are
+optima. The quadratic programs are the control steps of `beamfit.dynamics` within their limits,
+solved anew at every step.
 """
 
 from __future__ import annotations
@@ -21,9 +22,9 @@ from beamfit.greybox.problem import Problem
 
 
 class SearchLimit(NamedTuple):
-    """Limit of a search: iterations from one start, and a time on the clock or None.
+    """Limits of a search: iterations from one start, and the time at which it must end, or None.
 
-    `solver` is the one asked for, if any, `tolerance` that of the problem.
+    `solver` is the only solver to use, if given; `tolerance` is the tolerance of the problem.
     """
 
     iterations: int
@@ -32,31 +33,33 @@ class SearchLimit(NamedTuple):
     tolerance: float = problem.TOLERANCE
 
     @property
-    def left(self) -> float:
+    def seconds_left(self) -> float:
         """Seconds left."""
         return np.inf if self.until is None else self.until - time.perf_counter()
 
 
-def _tame(size: np.ndarray) -> np.ndarray:
-    """Sizes near 1 are left alone: solvers' own steps and tolerances are made for those."""
+def _rounded_scale(size: np.ndarray) -> np.ndarray:
+    """Replace scales between 0.01 and 100 by 1, for which the solvers' tolerances are made."""
     return np.where((size > 1e2) | (size < 1e-2), size, 1.0)
 
 
 class NonlinearProgram:
-    """A problem for a solver in functions of x: moving numbers, cost and limits in their sizes.
+    """A problem as functions of x, the free numbers in their scales, for a solver.
+
+    Cost and constraints are scaled as well.
 
     Parameters
     ----------
     p : Problem
         The problem.
     start : array, shape (n,)
-        Holds the numbers that do not move.
+        Values of the numbers; those that are fixed stay.
     at : Slopes
-        At the start.
+        Values and derivatives at the start.
     scale : Scale
-        Of the problem.
+        Scales of the problem.
     hessian : str
-        ``gauss_newton`` or anything else for the exact one.
+        ``gauss_newton``; the exact Hessian is used for any other value.
     """
 
     def __init__(
@@ -64,63 +67,64 @@ class NonlinearProgram:
     ):
         self.problem, self.start, self.gauss_newton = p, start, hessian == "gauss_newton"
         self.moving = np.flatnonzero(p.moving)
-        self.unit, self.limit = _tame(scale.unit)[self.moving], _tame(scale.limit)
+        self.unit, self.limit = _rounded_scale(scale.unit)[self.moving], _rounded_scale(scale.limit)
         steepest = max(np.max(np.abs(at.gradient * scale.unit)), 1e-300)
-        # Squares are counted in their errors; a steep cost is flattened, as IPOPT does.
-        self.flat = 1.0 / scale.cost if p.objectives else min(1.0, 100.0 / steepest)
+        # Sums of squares keep their unit of one standard error, but a steep cost is scaled down, as
+        # IPOPT does.
+        self.cost_scale = 1.0 / scale.cost if p.objectives else min(1.0, 100.0 / steepest)
         self.lower, self.upper = (self.point(end) for end in (p.lower, p.upper))
         self.c_lower, self.c_upper = (
             p.constraint_lower / self.limit,
             p.constraint_upper / self.limit,
         )
-        # A solver asks for cost and limits of one point after the other: the last are remembered.
-        self._parts = lru_cache(maxsize=8)(self._computed)
+        # Solvers evaluate cost and constraints of a point in separate calls: keep the last results.
+        self._cached = lru_cache(maxsize=8)(self._evaluate)
 
     def point(self, theta: np.ndarray) -> np.ndarray:
-        """X of the problem's own numbers."""
+        """Convert the problem's numbers to x."""
         return theta[self.moving] / self.unit
 
     def numbers(self, x: np.ndarray) -> np.ndarray:
-        """The problem's own numbers."""
+        """Convert x to the problem's numbers."""
         theta = self.start.copy()
         theta[self.moving] = x * self.unit
         return theta
 
-    def _computed(self, function: Callable, x: bytes) -> list[np.ndarray]:
+    def _evaluate(self, function: Callable, x: bytes) -> list[np.ndarray]:
         theta = self.numbers(np.frombuffer(x))
         return [np.asarray(part) for part in self.problem.compiled(function)(theta)]
 
     def values(self, x: np.ndarray) -> tuple[float, np.ndarray]:
-        """Cost and constraints."""
-        cost, c = self._parts(problem.values, x.tobytes())
-        return self.flat * float(cost), c / self.limit
+        """Compute cost and constraints."""
+        cost, c = self._cached(problem.values, x.tobytes())
+        return self.cost_scale * float(cost), c / self.limit
 
     def slopes(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Gradient of the cost and Jacobian of the constraints."""
-        s = assess.Slopes(*self._parts(assess.first_order, x.tobytes()))
+        """Compute the gradient of the cost and the Jacobian of the constraints."""
+        s = assess.Slopes(*self._cached(assess.first_order, x.tobytes()))
         jacobian = s.jacobian[:, self.moving] * self.unit / self.limit[:, None]
-        return self.flat * s.gradient[self.moving] * self.unit, jacobian
+        return self.cost_scale * s.gradient[self.moving] * self.unit, jacobian
 
     def hessian(self, x: np.ndarray, sigma: float, y: np.ndarray) -> np.ndarray:
-        """Hessian of sigma * cost - y @ constraints."""
+        """Compute the Hessian of sigma * cost - y @ constraints."""
         if self.gauss_newton:
-            rows = self._parts(assess.first_order, x.tobytes())[1][:, self.moving] * self.unit
-            return sigma * self.flat * rows.T @ rows
+            rows = self._cached(assess.first_order, x.tobytes())[1][:, self.moving] * self.unit
+            return sigma * self.cost_scale * rows.T @ rows
         exact = self.problem.compiled(assess.lagrangian_hessian)
-        h = np.asarray(exact(self.numbers(x), sigma * self.flat, y / self.limit))
+        h = np.asarray(exact(self.numbers(x), sigma * self.cost_scale, y / self.limit))
         return h[np.ix_(self.moving, self.moving)] * np.outer(self.unit, self.unit)
 
 
 class SolverEnd(NamedTuple):
-    """End of a solver's search: point, number of iterations, the solver's own message."""
+    """End of a solver's search: point, number of iterations, message of the solver."""
 
     x: np.ndarray
     iterations: int
-    said: str
+    message: str
 
 
 def _uno(preset: str, **more: float) -> Callable[[NonlinearProgram, np.ndarray, int], SolverEnd]:
-    """A solver by Uno with one of its presets, and options of its own."""
+    """Make a solver that runs Uno with a preset and further options."""
 
     def solve(
         program: NonlinearProgram, x: np.ndarray, iterations: int, budget: SearchLimit
@@ -133,19 +137,19 @@ def _uno(preset: str, **more: float) -> Callable[[NonlinearProgram, np.ndarray, 
         solver.set_option("max_iterations", iterations)
         solver.set_option("primal_tolerance", min(1e-9, 1e-3 * budget.tolerance))
         solver.set_option("dual_tolerance", min(1e-8, 1e-2 * budget.tolerance))
-        solver.set_option("time_limit", float(min(120.0, max(budget.left, 0.01))))
+        solver.set_option("time_limit", float(min(120.0, max(budget.seconds_left, 0.01))))
         for name, value in more.items():
             solver.set_option(name, value)
         found = solver.optimize(_uno_model(unopy, program, x))
         # Uno reports an infeasible problem as an optimisation status of success.
-        said = f"{found.solution_status.name}, {found.optimization_status.name}"
-        return SolverEnd(np.array(found.primal_solution), int(found.number_iterations), said)
+        message = f"{found.solution_status.name}, {found.optimization_status.name}"
+        return SolverEnd(np.array(found.primal_solution), int(found.number_iterations), message)
 
     return solve
 
 
 def _uno_model(unopy, program: NonlinearProgram, x: np.ndarray):
-    """State the program to Uno with dense derivatives."""
+    """Make the Uno model of a program, with dense derivatives."""
     n, m = len(x), len(program.c_lower)
     ends = program.lower.tolist(), program.upper.tolist()
     model = unopy.Model(unopy.PROBLEM_NONLINEAR, n, *ends, unopy.ZERO_BASED_INDEXING)
@@ -194,8 +198,8 @@ def _slsqp(
     ]
     last = [x]
 
-    def in_time(at):
-        if budget.left <= 0:
+    def check_time(at):
+        if budget.seconds_left <= 0:
             raise TimeoutError
         last[0] = at.copy()
 
@@ -207,7 +211,7 @@ def _slsqp(
             bounds=optimize.Bounds(program.lower, program.upper),
             constraints=limits,
             method="SLSQP",
-            callback=in_time,
+            callback=check_time,
             options={"maxiter": iterations, "ftol": 1e-15},
         )
     except TimeoutError:
@@ -216,9 +220,9 @@ def _slsqp(
 
 
 class Stage(NamedTuple):
-    """A solver, the name it is asked for by, the Hessian it wants, and its steps in one go.
+    """A solver: name, the preset users select it by, kind of Hessian, iterations, function.
 
-    The Hessian is gauss_newton, exact or none.
+    `hessian` is ``gauss_newton``, ``exact`` or ``none``.
     """
 
     name: str
@@ -228,33 +232,40 @@ class Stage(NamedTuple):
     solve: Callable[[NonlinearProgram, np.ndarray, int, SearchLimit], SolverEnd]
 
 
-# Squares of fewer residuals than numbers vanish in many places, and a method of active sets ends in
-# a corner of the limits before it finds one: a barrier, at first as strong as one standard
-# deviation of the residuals, keeps it away from these.
-INSIDE = Stage("Uno ipopt", "ipopt", "exact", 250, _uno("ipopt", barrier_initial_parameter=1.0))
-_SHARP = Stage("Uno filtersqp", "filtersqp", "exact", 300, _uno("filtersqp"))
-# Solvers in the order they are tried.
+# First stage for least squares with fewer residuals than numbers. Their sum vanishes at many
+# points, and an active-set method ends in a corner of the limits before it finds one. This is
+# prevented by the barrier of an interior-point method, at first as strong as one standard error.
+INTERIOR_POINT = Stage(
+    "Uno ipopt", "ipopt", "exact", 250, _uno("ipopt", barrier_initial_parameter=1.0)
+)
+_REFINEMENT = Stage("Uno filtersqp", "filtersqp", "exact", 300, _uno("filtersqp"))
+# Solvers in the order of trying. The second run of filtersqp refines the result of ipopt, which
+# stops short of the limits.
 SOLVERS: tuple[Stage, ...] = (
     Stage("Uno filtersqp with Gauss-Newton", "filtersqp", "gauss_newton", 3000, _uno("filtersqp")),
-    _SHARP,
+    _REFINEMENT,
     Stage("Uno ipopt", "ipopt", "exact", 1000, _uno("ipopt")),
-    _SHARP,
+    _REFINEMENT,
     Stage("scipy SLSQP", "slsqp", "none", 300, _slsqp),
 )
-"""In the order of trying; what an interior point leaves short of its limits is sharpened."""
 
 
 # ---- quadratic programs
 
-# Most steps; mean complementarity and residuals that end them; share of the step to a limit.
-STEPS, CLOSE, SHARE = 40, 1e-9, 0.99
+# Largest number of interior-point steps.
+MAX_STEPS = 40
+# The steps end when mean complementarity and residuals are below this.
+CONVERGED = 1e-9
+# Share of the distance to the nearest limit that a step may go.
+STEP_SHARE = 0.99
 
 
 class Quadratic(NamedTuple):
-    """Find the least z'Hz/2 + g'z + cost's with G z <= h + s, s >= 0.
+    """Minimise z'Hz/2 + g'z + cost's subject to G z <= h + s, s >= 0.
 
-    Shapes (n, n), (n,), (rows, n), (rows,), (rows,). A row of infinite cost is hard; another is
-    kept wherever its multiplier is below its cost. H must be positive.
+    The fields H, g, G, h and cost have shapes (n, n), (n,), (rows, n), (rows,) and (rows,). A row
+    of infinite cost is a hard limit, the others are soft: s is zero as long as the multiplier is
+    below the cost. H must be positive definite.
     """
 
     matrix: jax.Array
@@ -265,12 +276,12 @@ class Quadratic(NamedTuple):
 
 
 class _Point(NamedTuple):
-    """Variables, room left in each row, its multiplier, and by how much it is passed."""
+    """Variables z, slack of each row, its multiplier, and its violation s."""
 
     z: jax.Array
-    room: jax.Array
-    force: jax.Array
-    passed: jax.Array
+    slack: jax.Array
+    multiplier: jax.Array
+    violation: jax.Array
 
 
 def minimum(program: Quadratic, start: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -279,7 +290,7 @@ def minimum(program: Quadratic, start: jax.Array) -> tuple[jax.Array, jax.Array]
     Parameters
     ----------
     program : Quadratic
-        Well scaled; it must have a point that keeps the hard rows.
+        Well scaled, and feasible for the hard rows.
     start : array, shape (n,)
         Any point.
 
@@ -292,8 +303,8 @@ def minimum(program: Quadratic, start: jax.Array) -> tuple[jax.Array, jax.Array]
     -----
     Predictor and corrector of S. Mehrotra, SIAM J. Optim. 2 (1992) 575; for quadratic programs
     J. Nocedal and S. Wright, Numerical Optimization (2006), algorithm 16.4. The multiplier of a
-    soft row and that of its s add to its cost, so both are eliminated. At most 40 steps, each with
-    one factorisation; it can be mapped and compiled.
+    soft row and that of its s add up to its cost, so both are eliminated. There are at most 40
+    steps, each with one factorisation. The function can be used under `jax.vmap` and `jax.jit`.
 
     Examples
     --------
@@ -308,81 +319,99 @@ def minimum(program: Quadratic, start: jax.Array) -> tuple[jax.Array, jax.Array]
     if program.rows.shape[0] == 0:
         return jnp.linalg.solve(program.matrix, -program.slope), program.limits
     soft, half = jnp.isfinite(program.cost), 0.5 * program.cost
-    room = jnp.maximum(program.limits - program.rows @ start, 1.0)
-    first = _Point(start, room, jnp.minimum(1.0, half), 1.0 * soft)
-    # Multipliers of the size that the problem's have (Nocedal and Wright, section 16.6).
-    step = _towards(program, first)(room * first.force, 0.0 * room)
-    room, force, passed = (
+    slack = jnp.maximum(program.limits - program.rows @ start, 1.0)
+    first = _Point(start, slack, jnp.minimum(1.0, half), 1.0 * soft)
+    # Start with multipliers of the size of the problem's (Nocedal and Wright, section 16.6).
+    step = _newton_step(program, first)(slack * first.multiplier, 0.0 * slack)
+    slack, multiplier, violation = (
         jnp.maximum(jnp.abs(v + d), 1.0) for v, d in zip(first[1:], step[1:], strict=True)
     )
-    begin = _Point(start, room, jnp.minimum(force, half), soft * passed)
+    initial = _Point(start, slack, jnp.minimum(multiplier, half), soft * violation)
     end, _, _ = jax.lax.while_loop(
-        lambda now: (now[1] > CLOSE) & (now[2] < STEPS),
-        lambda now: _next(program, now[0], now[2]),
-        (begin, jnp.asarray(jnp.inf), jnp.asarray(0)),
+        lambda now: (now[1] > CONVERGED) & (now[2] < MAX_STEPS),
+        lambda now: _iterate(program, now[0], now[2]),
+        (initial, jnp.asarray(jnp.inf), jnp.asarray(0)),
     )
-    return end.z, end.force
+    return end.z, end.multiplier
 
 
-def _residuals(program: Quadratic, now: _Point) -> tuple[jax.Array, jax.Array]:
-    dual = program.matrix @ now.z + program.slope + program.rows.T @ now.force
-    return dual, program.rows @ now.z + now.room - now.passed - program.limits
+def _residuals(program: Quadratic, point: _Point) -> tuple[jax.Array, jax.Array]:
+    dual = program.matrix @ point.z + program.slope + program.rows.T @ point.multiplier
+    return dual, program.rows @ point.z + point.slack - point.violation - program.limits
 
 
-def _other(program: Quadratic, now: _Point) -> jax.Array:
-    """Multipliers of the s of soft rows; 1 of hard ones, which have none."""
-    return jnp.where(jnp.isfinite(program.cost), program.cost - now.force, 1.0)
+def _soft_multiplier(program: Quadratic, point: _Point) -> jax.Array:
+    """Compute the multipliers of s >= 0 for soft rows; 1 for hard rows, which have none."""
+    return jnp.where(jnp.isfinite(program.cost), program.cost - point.multiplier, 1.0)
 
 
-def _towards(program: Quadratic, now: _Point) -> Callable[[jax.Array, jax.Array], _Point]:
-    """Steps on which room * force and passed * other fall by so much, the residuals to nothing."""
-    rows, other, (dual, primal) = program.rows, _other(program, now), _residuals(program, now)
-    weight = 1.0 / (now.room / now.force + now.passed / other)
+def _newton_step(program: Quadratic, point: _Point) -> Callable[[jax.Array, jax.Array], _Point]:
+    """Make the Newton step as a function of the decreases of the complementarities.
+
+    These are `inner` for slack * multiplier and `outer` for violation * soft; residuals go to 0.
+    """
+    rows, soft = program.rows, _soft_multiplier(program, point)
+    dual, primal = _residuals(program, point)
+    weight = 1.0 / (point.slack / point.multiplier + point.violation / soft)
     factor = cho_factor(program.matrix + rows.T @ (rows * weight[:, None]))
 
     def step(inner, outer):
-        lack = primal - inner / now.force + outer / other
+        lack = primal - inner / point.multiplier + outer / soft
         dz = -cho_solve(factor, dual + rows.T @ (weight * lack))
-        d_force = weight * (rows @ dz + lack)
-        d_passed = (now.passed * d_force - outer) / other
-        return _Point(dz, (-inner - now.room * d_force) / now.force, d_force, d_passed)
+        d_multiplier = weight * (rows @ dz + lack)
+        d_violation = (point.violation * d_multiplier - outer) / soft
+        return _Point(
+            dz, (-inner - point.slack * d_multiplier) / point.multiplier, d_multiplier, d_violation
+        )
 
     return step
 
 
-def _next(program: Quadratic, now: _Point, steps: jax.Array) -> tuple[_Point, jax.Array, jax.Array]:
-    """Predict, correct, and say how far the point is from the minimum."""
-    soft, towards = jnp.isfinite(program.cost), _towards(program, now)
-    inner, outer = now.room * now.force, now.passed * _other(program, now)
-    far = towards(inner, outer)
-    reach = _reach(program, now, far)
-    gap, after = _gap(program, now), _gap(program, _along(now, far, reach))
+def _iterate(
+    program: Quadratic, point: _Point, steps: jax.Array
+) -> tuple[_Point, jax.Array, jax.Array]:
+    """Take a predictor and corrector step; also return the remaining error and the step count."""
+    is_soft, step = jnp.isfinite(program.cost), _newton_step(program, point)
+    inner, outer = (
+        point.slack * point.multiplier,
+        point.violation * _soft_multiplier(program, point),
+    )
+    predictor = step(inner, outer)
+    length = _max_step(program, point, predictor)
+    gap = _complementarity(program, point)
+    after = _complementarity(program, _move(point, predictor, length))
     centre = gap * (after / gap) ** 3
-    corrected = soft * (outer - far.passed * far.force - centre)
-    way = towards(inner + far.room * far.force - centre, corrected)
-    new = _along(now, way, SHARE * _reach(program, now, way))
+    corrected = is_soft * (outer - predictor.violation * predictor.multiplier - centre)
+    corrector = step(inner + predictor.slack * predictor.multiplier - centre, corrected)
+    new = _move(point, corrector, STEP_SHARE * _max_step(program, point, corrector))
     dual, primal = _residuals(program, new)
     dual = jnp.max(jnp.abs(dual)) / (1.0 + jnp.max(jnp.abs(program.slope)))
-    left = jnp.maximum(jnp.maximum(dual, jnp.max(jnp.abs(primal))), _gap(program, new))
-    good = jnp.isfinite(left)
-    kept = (jnp.where(good, a, b) for a, b in zip(new, now, strict=True))
-    # A point that is not finite ends the search: rounding leaves nothing to gain.
-    return _Point(*kept), jnp.where(good, left, 0.0), steps + 1
+    error = jnp.maximum(jnp.maximum(dual, jnp.max(jnp.abs(primal))), _complementarity(program, new))
+    good = jnp.isfinite(error)
+    kept = (jnp.where(good, a, b) for a, b in zip(new, point, strict=True))
+    # A point that is not finite ends the search: no further accuracy can be reached.
+    return _Point(*kept), jnp.where(good, error, 0.0), steps + 1
 
 
-def _along(now: _Point, way: _Point, reach: jax.Array) -> _Point:
-    return _Point(*(v + reach * d for v, d in zip(now, way, strict=True)))
+def _move(point: _Point, step: _Point, length: jax.Array) -> _Point:
+    return _Point(*(v + length * d for v, d in zip(point, step, strict=True)))
 
 
-def _gap(program: Quadratic, now: _Point) -> jax.Array:
-    """Mean of multipliers times what they guard."""
-    count = now.room.size + jnp.sum(jnp.isfinite(program.cost))
-    return (now.room @ now.force + now.passed @ _other(program, now)) / count
+def _complementarity(program: Quadratic, point: _Point) -> jax.Array:
+    """Compute the mean complementarity: multipliers times their slacks."""
+    count = point.slack.size + jnp.sum(jnp.isfinite(program.cost))
+    return (
+        point.slack @ point.multiplier + point.violation @ _soft_multiplier(program, point)
+    ) / count
 
 
-def _reach(program: Quadratic, now: _Point, way: _Point) -> jax.Array:
-    """Longest step, at most 1, that keeps all slacks and multipliers positive."""
-    soft = jnp.isfinite(program.cost)
-    values = jnp.concatenate([now.room, now.force, now.passed, _other(program, now)])
-    changes = jnp.concatenate([way.room, way.force, way.passed, -1.0 * soft * way.force])
+def _max_step(program: Quadratic, point: _Point, step: _Point) -> jax.Array:
+    """Compute the longest step, at most 1, that keeps all slacks and multipliers positive."""
+    is_soft = jnp.isfinite(program.cost)
+    values = jnp.concatenate(
+        [point.slack, point.multiplier, point.violation, _soft_multiplier(program, point)]
+    )
+    changes = jnp.concatenate(
+        [step.slack, step.multiplier, step.violation, -1.0 * is_soft * step.multiplier]
+    )
     return jnp.min(jnp.where(changes < 0, -values / changes, 1.0), initial=1.0)

@@ -1,7 +1,7 @@
-"""Networks that are monotonic by the signs of their weights, at every point and not only at data.
+"""Networks that are monotonic everywhere, because their weights have suitable signs.
 
-With weights of these signs each path from an input to an output is a product of rising node
-functions and weights of one overall sign, so that the gain has that sign everywhere.
+Each path from an input to an output is then a product of rising node functions and weights with one
+overall sign, so that the gain has that sign at every point, not only at the data.
 """
 
 from __future__ import annotations
@@ -20,30 +20,31 @@ from beamfit.greybox.maps import positions
 from beamfit.greybox.mlp import MLP, Port, connection, dense
 from beamfit.greybox.problem import Free, Problem
 
-# Largest threshold of a node and random start of a weight: a network's range is -1 to 1.
-WIDE = 1.5
-# A point is in a box within so much.
-ROUNDING = 1e-9
+# Largest magnitude of a node's threshold and of a random start of a weight. The inputs have the
+# range -1 to 1, so that thresholds cover somewhat more than it.
+MAX_THRESHOLD = 1.5
+# Tolerance within which a point counts as in a box, in the unit of the input.
+BOX_TOLERANCE = 1e-9
 
 
 def monotone_signs(net: MLP, signs: Mapping[str, int]) -> dict[str, np.ndarray]:
-    """Signs of the weights that make every output monotonic in chosen inputs by construction.
+    """Find signs of the weights that make every output monotonic in chosen inputs.
 
     With weights of these signs (0: free) each path from such an input to an output is a product of
-    rising node functions and weights of one overall sign, so the gain has that sign everywhere,
-    not only where it was looked at.
+    rising node functions and weights with one overall sign, so that the gain has that sign
+    everywhere.
 
     Parameters
     ----------
     net : MLP
-        All its node functions between input and output must rise: identity, linear, sigmoid, tanh.
+        All its node functions must rise: identity, linear, sigmoid, tanh.
     signs : mapping of str to int
         Input name to +1 (outputs rise) or -1 (outputs fall); other inputs stay free.
 
     Returns
     -------
     dict of str to array
-        Connection name to signs, of the shape of its weights.
+        Name of each connection to an array of signs, of the shape of its weights.
 
     Raises
     ------
@@ -87,21 +88,21 @@ def signed_network(
     seed: int,
     most: float,
 ) -> tuple[MLP, list[Free]]:
-    """Make a network that starts as a straight line, with bounds that keep it monotonic.
+    """Make a network that starts as a straight line, with bounds on its weights for monotonicity.
 
     Parameters
     ----------
     path : str
-        Where the network is in the model.
+        Path of the network in the model.
     inputs, outputs : list of Port
-        Scaled so that the range of interest is -1 to 1 on both sides.
+        Ports whose scales map the range of interest to -1 to 1.
     rising : ndarray
         Shape (outputs, inputs): +1 where an output must rise with an input, -1 where it must
-        fall, 0 where it is free. A row of zeros asks nothing of its output. An input with a
-        zero elsewhere is free for all outputs, and so is one that asks of the outputs another
-        pattern of signs than the first does.
+        fall, 0 where it is free. An output with a row of zeros is not constrained. An input with
+        a zero for another output is free for all outputs. So is an input whose pattern of signs
+        differs from that of the first constrained input by more than an overall sign.
     hidden, seed : int
-        Hidden tanh nodes, and the seed of their thresholds.
+        Number of hidden tanh nodes, and the seed of the network.
     most : float
         Largest magnitude of a weight.
 
@@ -112,50 +113,55 @@ def signed_network(
 
     Notes
     -----
-    Each hidden node moves one way with an input and each output one way with the node, so each
-    gain is a sum of terms of one sign; no point of the range has to be asked. A rising
-    function of one input can be approximated by such a sum as well as one likes.
+    Each hidden node is monotonic in an input and each output in the node, so that each gain is a
+    sum of terms of one sign at every point. Such a sum can approximate any rising function of one
+    input to any accuracy.
     """
-    node, out = _pattern(rising)
+    node, out = _weight_signs(rising)
     net = dense(inputs, outputs, [hidden], seed=seed)
     first, last = "layer0->layer1", "layer1->layer2"
-    thresholds = np.linspace(-WIDE, WIDE, hidden) if hidden > 1 else np.zeros(1)
+    thresholds = np.linspace(-MAX_THRESHOLD, MAX_THRESHOLD, hidden) if hidden > 1 else np.zeros(1)
     start = {first: np.zeros((len(inputs), hidden)), last: np.zeros((hidden, len(outputs)))}
     lead = int(np.argmax(node != 0)) if node.any() else 0
-    way = node[lead] or 1.0
-    start[first][lead] = way
-    towards = np.where(out != 0, out, 1.0)
-    # Weights, none negative, with which the nodes add up to a straight line from -1 to 1.
+    sign_of_lead = node[lead] or 1.0
+    start[first][lead] = sign_of_lead
+    out_signs = np.where(out != 0, out, 1.0)
+    # Nonnegative weights with which the nodes add up to a straight line from -1 to 1.
     x = np.linspace(-1.0, 1.0, 41)
-    start[last] += nnls(np.tanh(x[:, None] + thresholds), x)[0][:, None] * towards
-    biases = {"layer1": way * thresholds, "layer2": np.zeros(len(outputs))}
+    start[last] += nnls(np.tanh(x[:, None] + thresholds), x)[0][:, None] * out_signs
+    biases = {"layer1": sign_of_lead * thresholds, "layer2": np.zeros(len(outputs))}
     net = replace(net, weights=start, biases=biases)
     free = []
     for name, sign in ((first, node[:, None]), (last, out)):
         sign = np.broadcast_to(sign, start[name].shape)
         ends = np.where(sign > 0, 0.0, -most), np.where(sign < 0, 0.0, most)
-        free.append(Free(f"{path}.weights.{name}", *ends, (-WIDE, WIDE), nuisance=True))
-    return net, [*free, Free(f"{path}.biases", -most, most, (-WIDE, WIDE), nuisance=True)]
+        free.append(
+            Free(f"{path}.weights.{name}", *ends, (-MAX_THRESHOLD, MAX_THRESHOLD), nuisance=True)
+        )
+    return net, [
+        *free,
+        Free(f"{path}.biases", -most, most, (-MAX_THRESHOLD, MAX_THRESHOLD), nuisance=True),
+    ]
 
 
-def _pattern(rising: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Signs of input to node and of node to output that give the gains their signs."""
+def _weight_signs(rising: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Find the signs of the weights before and after the nodes from those of the gains."""
     node, out = np.zeros(rising.shape[1]), np.zeros(rising.shape[0])
-    asked = rising.any(axis=1)
+    constrained = rising.any(axis=1)
     for i in range(rising.shape[1]):
         column = rising[:, i]
-        if not asked.any() or not column[asked].all():
+        if not constrained.any() or not column[constrained].all():
             continue
         if not out.any():
             out, node[i] = -column, -1.0
         elif np.array_equal(column, -out) or np.array_equal(column, out):
-            lead = int(np.argmax(asked))
+            lead = int(np.argmax(constrained))
             node[i] = column[lead] * out[lead]
     return node, out
 
 
 class Gain(NamedTuple):
-    """A gain of a network over a box: its enclosure, and the sign that it must have."""
+    """Enclosure of a network's gain over a box, and the sign that the gain must have."""
 
     name: str
     lower: float
@@ -164,8 +170,8 @@ class Gain(NamedTuple):
 
     @property
     def holds(self) -> bool:
-        """True if the enclosure keeps to the sign; rounding is part of the enclosure."""
-        # Rounded outward, a gain of zero is one of 1e-300 to either side.
+        """True if all gains in the enclosure have the sign, apart from rounding."""
+        # Outward rounding changes a gain of zero to ±1e-300.
         reach = max(1e-12 * max(abs(self.lower), abs(self.upper)), 1e-200)
         if self.sign == 0:
             return True
@@ -173,20 +179,20 @@ class Gain(NamedTuple):
 
 
 class GainCertificate(NamedTuple):
-    """Certified gains of a fitted network, and the box they hold over."""
+    """Certified gains of a fitted network, and the box for which they hold."""
 
     gains: tuple[Gain, ...]
     box: dict[str, tuple[float, float]]
 
     @property
     def holds(self) -> bool:
-        """True if every gain keeps to its sign everywhere in the box."""
+        """True if every gain has its sign everywhere in the box."""
         return all(gain.holds for gain in self.gains)
 
     def holds_at(self, inputs: np.ndarray) -> bool:
         """Test if a point is in the box, within rounding."""
         low, high = np.array([*self.box.values()]).T
-        return bool(np.all((inputs >= low - ROUNDING) & (inputs <= high + ROUNDING)))
+        return bool(np.all((inputs >= low - BOX_TOLERANCE) & (inputs <= high + BOX_TOLERANCE)))
 
     def to_json(self) -> dict[str, Any]:
         """Return the verdict, the enclosures and the box as JSON's types."""
@@ -194,7 +200,7 @@ class GainCertificate(NamedTuple):
 
 
 def cells_along(inputs: int) -> int:
-    """Cells along each of some inputs in which gains are enclosed."""
+    """Return the number of cells along each input in which gains are enclosed."""
     return 32 if inputs == 1 else 8
 
 
@@ -204,24 +210,24 @@ def certificate_of(problem: Problem, net: MLP) -> GainCertificate:
     Parameters
     ----------
     problem : Problem
-        With `signed_network`; its bounds tell which sign each gain must have. A limit that was
-        given for a gain is a constraint of the problem, and asks for no sign here.
+        Problem with a `signed_network`. The bounds of the weights determine the sign of each gain.
+        A limit that was given for a gain is a constraint of the problem and requires no sign here.
     net : MLP
         The fitted network.
 
     Returns
     -------
     GainCertificate
-        For every input in the box, not only the measured ones, outward rounding included.
+        It holds for every input in the box, not only the measured ones, with outward rounding.
     """
     ports = net.input_ports
-    # A network that is scaled to its box has it in the scales.
+    # The box is given by the ports' limits, else by their scales.
     scaled = [(p.bias - p.scale, p.bias + p.scale) for p in ports]
     given = [(p.lower, p.upper) for p in ports]
     low, high = np.where(np.isfinite(given), given, scaled).T
     bound = over_cells(net, *cells(low, high, cells_along(len(ports))))
     lower, upper = np.asarray(bound.lower).min(axis=0), np.asarray(bound.upper).max(axis=0)
-    sign = _asked(problem, net)
+    sign = _required_signs(problem, net)
     gains = tuple(
         Gain(f"d{out.name}/d{port.name}", float(lower[o, i]), float(upper[o, i]), int(sign[o, i]))
         for o, out in enumerate(net.output_ports)
@@ -231,14 +237,14 @@ def certificate_of(problem: Problem, net: MLP) -> GainCertificate:
     return GainCertificate(gains, box)
 
 
-def _asked(problem: Problem, net: MLP) -> np.ndarray:
-    """Signs the bounds of the weights ask of the gains, shape (outputs, inputs)."""
+def _required_signs(problem: Problem, net: MLP) -> np.ndarray:
+    """Find the signs of the gains that the weights' bounds require, shape (outputs, inputs)."""
     ends = {
         f.path.rsplit(".", 1)[-1]: np.sign(np.asarray(f.lower) + np.asarray(f.upper))
         for f in problem.free
         if ".weights." in f.path
     }
-    if not ends:  # limits, and no signs
+    if not ends:  # only limits are required
         return np.zeros((len(net.output_ports), len(net.input_ports)))
     first, last = (ends[f"layer{i}->layer{i + 1}"][...] for i in (0, 1))
     return last[0][:, None] * first[:, 0][None, :]

@@ -1,4 +1,4 @@
-"""Solve a problem: propose points, keep the best, judge it ourselves."""
+"""Solve a problem: let solvers propose points, keep the best, test whether it is an optimum."""
 
 from __future__ import annotations
 
@@ -12,19 +12,23 @@ from beamfit.errors import Finding, InputError, Status
 from beamfit.greybox import assess
 from beamfit.greybox.assess import SearchState
 from beamfit.greybox.descend import Descent, costs, descent_of
-from beamfit.greybox.diagnosis import contradictory, not_finite, relaxed
+from beamfit.greybox.diagnosis import contradictory, find_conflict, not_finite
 from beamfit.greybox.fit import Attempt, Fit
-from beamfit.greybox.judge import Search, conclude, outgrown, refused, settled
+from beamfit.greybox.judge import Search, conclude, cost_outgrew_scale, has_settled, refuse
 from beamfit.greybox.problem import Problem
-from beamfit.greybox.programs import INSIDE, SOLVERS, NonlinearProgram, SearchLimit
+from beamfit.greybox.programs import INTERIOR_POINT, SOLVERS, NonlinearProgram, SearchLimit
 
 METHOD, SQUARES = "Levenberg-Marquardt", "levenberg-marquardt"
-# Steps from each of many starts, and number of cheapest ends that are polished.
-STEPS, POLISHED = 300, 4
-# A search stops if its cost falls by less than this share in this many steps.
-NOTHING, STRETCH = 1e-7, 100
-# Most moves of a search off a saddle.
-MOVES = 3
+# Number of steps from each of many starts, before the best ends are refined.
+FIRST_STEPS = 300
+# Largest number of ends that are refined, beginning with the lowest cost.
+MAX_REFINED = 4
+# Steps after which a refined search is tested for progress.
+TEST_INTERVAL = 100
+# It stops if its cost fell by less than this share in that interval and it has settled.
+NEGLIGIBLE_GAIN = 1e-7
+# Largest number of times that a search leaves a saddle.
+MAX_ESCAPES = 3
 
 
 def solve(
@@ -39,46 +43,46 @@ def solve(
 ) -> Fit:
     """Minimise the cost of a problem within its bounds and constraints.
 
-    Least squares with bounds alone go to `beamfit.greybox.descend`, from all starts at once.
-    Problems with constraints or further objectives go to Uno's sequential quadratic programming,
-    with the Gauss-Newton Hessian first (networks fitted to few data have flat valleys in which the
-    exact one crawls), then with the exact Hessian, then to scipy where Uno ends without an optimum.
-    Squares of fewer residuals than free numbers begin with its interior point.
-    Whether a point is an optimum is decided by our own KKT residual and second-order test, in the
-    problem's own sizes; where the cost bends down, the search moves off and goes on. The best
-    feasible point is the answer, whatever its status.
+    Least squares with bounds alone are solved by `beamfit.greybox.descend`, from all starts at
+    once. Problems with constraints or further objectives are solved by Uno's sequential quadratic
+    programming, first with the Gauss-Newton Hessian (networks fitted to few data have flat valleys
+    in which the exact one is slow), then with the exact Hessian, then by scipy if Uno finds no
+    optimum. Least squares with fewer residuals than free numbers begin with Uno's interior-point
+    method. KKT residuals and a second-order test of this package, in scales of the problem, decide
+    if a point is an optimum. From a saddle the search moves away and continues. The best feasible
+    point is the answer, whatever its status.
 
     Parameters
     ----------
     p : Problem
-        What to fit.
+        The problem to solve.
     starts : int
         Number of starts: the model's own values first, then random ones.
     seed : int
-        Of the random starts.
+        Seed of the random starts.
     iterations : int
-        Most iterations of a solver from one start.
+        Largest number of iterations of a solver from one start.
     hessian : str
-        ``"exact"``, or ``"gauss_newton"`` to keep to first derivatives, for models that bring no
-        second ones (foreign code).
+        ``"exact"``, or ``"gauss_newton"`` to use first derivatives only, for models without second
+        ones (foreign code).
     seconds : float, optional
-        For all starts and stages together, compilation included: looked at between them, so that
-        what is being compiled is finished first.
+        Time limit for all starts and stages together, compilation included. It is tested between
+        steps, so that a compilation is not interrupted.
     solver : {"levenberg-marquardt", "filtersqp", "ipopt", "slsqp"}, optional
-        The one to use, in the place of all that suit the problem in turn. The first is for least
-        squares within bounds.
+        The only solver to use. By default all that suit the problem are tried in turn. The first is
+        for least squares within bounds.
     began : float, optional
-        Moment of `time.perf_counter` from which `seconds` count; that of the call by default.
+        Value of `time.perf_counter` from which `seconds` count; the time of the call by default.
 
     Returns
     -------
     Fit
-        Never raises for a search that fails: `Fit.status` says so.
+        A search that fails raises nothing: `Fit.status` states it.
 
     Raises
     ------
     InputError
-        If an option is not understood, or foreign code lacks a derivative it was asked for.
+        If an option is not understood, or foreign code lacks a derivative that is needed.
 
     Examples
     --------
@@ -94,70 +98,71 @@ def solve(
     squares = not (p.constraints or p.objectives)
     if starts < 1 or iterations < 1:
         raise InputError(f"{starts} starts of {iterations} iterations", "at least one of each")
-    _check(hessian, seconds, solver, squares)
-    wrong = contradictory(p)
-    if wrong:
+    _check_options(hessian, seconds, solver, squares)
+    contradictions = contradictory(p)
+    if contradictions:
         spent = time.perf_counter() - began
-        return refused(p, Finding(Status.contradictory_bounds, wrong[0].message), spent)
-    drawn = _drawn(p, starts, seed)
+        return refuse(p, Finding(Status.contradictory_bounds, contradictions[0].message), spent)
+    drawn = _draw_starts(p, starts, seed)
     points = np.clip(drawn, p.lower, p.upper)
     moved = int(np.sum(np.any(points != drawn, axis=1)))
     until = None if seconds is None else began + seconds
     budget = SearchLimit(iterations, until, solver, p.tolerance)
     if not squares or solver not in (None, SQUARES):
-        found, attempts = _one_by_one(p, points, budget, hessian)
+        found, attempts = _search_constrained(p, points, budget, hessian)
     else:
-        found, attempts = _together(p, points, budget)
+        found, attempts = _search_squares(p, points, budget)
     spent = time.perf_counter() - began
     if not found:
-        said = "the cost or a constraint is not finite at any start;"
+        message = "the cost or a constraint is not finite at any start;"
         remedy = "start elsewhere, or use a parametrisation that is defined there."
-        lost = Finding(Status.not_finite, said, remedy)
+        lost = Finding(Status.not_finite, message, remedy)
         if starts == 1 and (traced := not_finite(p, points[0])):
             lost = Finding(Status.not_finite, traced[0].message)
-        return refused(p, lost, spent, None, attempts)
+        return refuse(p, lost, spent, None, attempts)
     best, conflict = found[_best(p, found)], None
-    if not best.feasible and p.constraints and best.at.finite and budget.left > 0:
-        conflict = relaxed(p, best, starting_points(p, 6, seed))
+    if not best.feasible and p.constraints and best.at.finite and budget.seconds_left > 0:
+        conflict = find_conflict(p, best, starting_points(p, 6, seed))
         if conflict.feasible:
-            more, again = _one_by_one(p, conflict.theta[None], budget, hessian)
-            found, attempts = found + more, attempts + again
+            further, again = _search_constrained(p, conflict.theta[None], budget, hessian)
+            found, attempts = found + further, attempts + again
             best = found[_best(p, found)]
     exact = hessian == "exact"
-    done = Search(attempts, moved, seconds, budget.left <= 0, exact, conflict)
+    done = Search(attempts, moved, seconds, budget.seconds_left <= 0, exact, conflict)
     return conclude(p, best, done, time.perf_counter() - began)
 
 
-def _check(hessian: str, seconds: float | None, solver: str | None, squares: bool) -> None:
+def _check_options(hessian: str, seconds: float | None, solver: str | None, squares: bool) -> None:
     if hessian not in ("exact", "gauss_newton"):
         raise InputError(f"hessian '{hessian}'", "one of exact, gauss_newton")
     if seconds is not None and not seconds > 0:
         raise InputError(f"{seconds} seconds", "a time above 0, or none")
-    known = [SQUARES] * squares + list(dict.fromkeys(stage.preset for stage in SOLVERS))
-    if solver is not None and solver not in known:
-        raise InputError(f"solver '{solver}' for this problem", f"one of {', '.join(known)}")
+    solvers = [SQUARES] * squares + list(dict.fromkeys(stage.preset for stage in SOLVERS))
+    if solver is not None and solver not in solvers:
+        raise InputError(f"solver '{solver}' for this problem", f"one of {', '.join(solvers)}")
 
 
 def starting_points(p: Problem, number: int, seed: int) -> list[np.ndarray]:
-    """Draw starts: the model's own values inside the bounds, then random ones.
+    """Draw starts: the model's values moved inside the bounds, then random ones.
 
     Parameters
     ----------
     p : Problem
         The problem.
     number : int
-        How many.
+        Number of starts.
     seed : int
-        Of the random generator.
+        Seed of the random generator.
 
     Returns
     -------
     list of array, shape (n,)
     """
-    return list(np.clip(_drawn(p, number, seed), p.lower, p.upper))
+    return list(np.clip(_draw_starts(p, number, seed), p.lower, p.upper))
 
 
-def _drawn(p: Problem, number: int, seed: int) -> np.ndarray:
+def _draw_starts(p: Problem, number: int, seed: int) -> np.ndarray:
+    """Draw starts within their ranges, else within finite bounds, else about the model's values."""
     random = np.random.default_rng(seed)
     width = np.maximum(np.abs(p.start), 1.0)
     boxed = np.isfinite(p.lower) & np.isfinite(p.upper)
@@ -172,37 +177,40 @@ def _drawn(p: Problem, number: int, seed: int) -> np.ndarray:
     return np.array(points)
 
 
-def _good(s: SearchState) -> bool:
-    """True if a point is an optimum to second order."""
-    bent = s.bend is not None and (s.bend.direction is not None or s.bend.newton > assess.STEP)
-    return s.optimal and not bent
+def _is_optimum(s: SearchState) -> bool:
+    """True if a point meets the first- and second-order conditions of an optimum."""
+    test = s.curvature
+    if test is not None and (test.direction is not None or test.newton > assess.MAX_NEWTON_STEP):
+        return False
+    return s.optimal
 
 
 def _best(p: Problem, found: list[SearchState]) -> int:
-    """The cheapest feasible point, or the least infeasible; of equally cheap ones an optimum.
+    """Return the index of the feasible point with the lowest cost, or of the least infeasible one.
 
-    Equally cheap are those within one standard deviation, or 1e-6 of the cost's scale
-    at the first start. What a point
-    saves by lying a little outside its limits is no merit: their multipliers tell how much that is.
+    An optimum is preferred among points of equal cost: within one standard deviation, or within the
+    problem's tolerance times the scale of the cost at the first start. The cost that a point saves
+    by a small violation of its limits is added again; their multipliers determine it.
     """
 
     def rank(s: SearchState) -> tuple:
         feasible = s.feasible
-        saved = np.abs(s.limits.multiplier) @ (s.limits.violation * s.limits.size)
+        saved = np.abs(s.limits.multiplier) @ (s.limits.violation * s.limits.scale)
         return (not feasible, s.at.cost + saved if feasible else s.kkt.feasibility)
 
     order = sorted(range(len(found)), key=lambda i: rank(found[i]))
     first = found[order[0]]
     if not first.feasible:
         return order[0]
-    # The first start is the problem's own; one far out may lie where all costs are tiny.
-    near = p.tolerance * found[0].scale.cost if p.objectives else 0.5 * p.least_residual**2
-    alike = [i for i in order if rank(found[i]) <= (False, rank(first)[1] + near)]
-    return next((i for i in alike if _rests(p, found[i])), order[0])
+    # The scale at the first start, which is the problem's: far away all costs may be tiny.
+    tolerance = p.tolerance * found[0].scale.cost if p.objectives else 0.5 * p.least_residual**2
+    equal = [i for i in order if rank(found[i]) <= (False, rank(first)[1] + tolerance)]
+    return next((i for i in equal if _is_acceptable(p, found[i])), order[0])
 
 
-def _rests(p: Problem, s: SearchState) -> bool:
-    return _good(s) or (not p.constraints and settled(p, s))
+def _is_acceptable(p: Problem, s: SearchState) -> bool:
+    """True if a search may end at a point: an optimum, or settled within the data's accuracy."""
+    return _is_optimum(s) or (not p.constraints and has_settled(p, s))
 
 
 def search(
@@ -215,149 +223,155 @@ def search(
     p, iterations, hessian
         As for `solve`.
     start : array, shape (n,)
-        Where to start; cost and constraints are finite there.
+        Starting point; cost and constraints are finite there.
 
     Returns
     -------
     tuple of SearchState and Attempt
-        The end point, judged, and the account of it.
+        The end point with its KKT residuals, and the record of the search.
     """
     start, budget = np.asarray(start, float), SearchLimit(iterations, None, None, p.tolerance)
     if p.constraints or p.objectives:
-        return _program(p, start, assess.slopes(p, start), budget, hessian)
-    found, attempts = _together(p, start[None], budget)
+        return _search_from(p, start, assess.slopes(p, start), budget, hessian)
+    found, attempts = _search_squares(p, start[None], budget)
     return found[0], attempts[0]
 
 
 # ---- least squares within bounds: all starts at once
 
 
-def _together(
+def _search_squares(
     p: Problem, points: np.ndarray, budget: SearchLimit
 ) -> tuple[list[SearchState], tuple[Attempt, ...]]:
-    """Search from all starts, in parts that fit the memory, and polish the cheapest ends."""
-    part = max(1, 2**21 // ((p.size + 1) * len(p.names)))  # Jacobians of 16 MB
+    """Search from all starts, in groups that fit the memory, and refine the best ends."""
+    group_size = max(1, 2**21 // ((p.size + 1) * len(p.names)))  # at most 16 MB of Jacobians
     found: list[SearchState] = []
     attempts: list[Attempt] = []
-    for some in np.split(points, range(part, len(points), part)):
-        states, accounts = _lanes(p, some, budget)
-        found, attempts = found + states, attempts + accounts
+    for group in np.split(points, range(group_size, len(points), group_size)):
+        states, records = _search_group(p, group, budget)
+        found, attempts = found + states, attempts + records
     return found, tuple(attempts)
 
 
-def _lanes(
+def _search_group(
     p: Problem, points: np.ndarray, budget: SearchLimit
 ) -> tuple[list[SearchState], list[Attempt]]:
+    """Search from starts together; refine the best ends, until one is acceptable."""
     k = len(points)
-    lanes = descent_of(p, points)
-    lanes.go(np.arange(k), min(STEPS, budget.iterations), budget.until)
-    cost = lanes.cost
+    searches = descent_of(p, points)
+    searches.run(np.arange(k), min(FIRST_STEPS, budget.iterations), budget.until)
+    cost = searches.cost
     found: dict[int, SearchState] = {}
-    for lane in np.argsort(cost, kind="stable")[:POLISHED].tolist():
+    for lane in np.argsort(cost, kind="stable")[:MAX_REFINED].tolist():
         if not np.isfinite(cost[lane]):
             break
-        _go_on(p, lanes, lane, budget.iterations, budget)
-        found[lane] = _moved_off(p, lanes, lane, budget)
-        if _rests(p, found[lane]):
+        _refine(p, searches, lane, budget.iterations, budget)
+        found[lane] = _escape_saddles(p, searches, lane, budget)
+        if _is_acceptable(p, found[lane]):
             break
-    accounts = [_account(p, lanes, lane, found.get(lane)) for lane in range(k)]
-    return list(found.values()), accounts
+    records = [_attempt_of(p, searches, lane, found.get(lane)) for lane in range(k)]
+    return list(found.values()), records
 
 
-def _go_on(p: Problem, lanes: Descent, lane: int, limit: int, budget: SearchLimit) -> None:
-    """Polish one search until it rests, or has settled in a flat valley where it gains nothing."""
-    while not lanes.done[lane] and lanes.steps[lane] < limit and budget.left > 0:
-        before = lanes.cost[lane]
-        lanes.go(np.array([lane]), min(limit, int(lanes.steps[lane]) + STRETCH), budget.until)
-        gained = before - lanes.cost[lane]
-        if gained < NOTHING * before and settled(p, _judged(p, lanes, lane)):
+def _refine(p: Problem, searches: Descent, lane: int, limit: int, budget: SearchLimit) -> None:
+    """Continue one search until it rests, or has settled in a flat valley without progress."""
+    while not searches.done[lane] and searches.steps[lane] < limit and budget.seconds_left > 0:
+        before = searches.cost[lane]
+        steps = min(limit, int(searches.steps[lane]) + TEST_INTERVAL)
+        searches.run(np.array([lane]), steps, budget.until)
+        gained = before - searches.cost[lane]
+        if gained < NEGLIGIBLE_GAIN * before and has_settled(p, _state_of(p, searches, lane)):
             return
 
 
-def _account(p: Problem, lanes: Descent, lane: int, s: SearchState | None) -> Attempt:
-    theta, steps = lanes.theta[lane].copy(), int(lanes.steps[lane])
-    if not np.isfinite(lanes.cost[lane]):
-        return Attempt(METHOD, theta, np.nan, assess.LOST, steps, "cost not finite")
-    said = "came to rest" if lanes.rested[lane] else "ran out of iterations"
-    s = _judged(p, lanes, lane) if s is None else s
-    return Attempt(METHOD, theta, float(s.at.cost), s.kkt, steps, said)
+def _attempt_of(p: Problem, searches: Descent, lane: int, s: SearchState | None) -> Attempt:
+    theta, steps = searches.theta[lane].copy(), int(searches.steps[lane])
+    if not np.isfinite(searches.cost[lane]):
+        return Attempt(METHOD, theta, np.nan, assess.INFINITE_KKT, steps, "cost not finite")
+    message = "came to rest" if searches.rested[lane] else "ran out of iterations"
+    s = _state_of(p, searches, lane) if s is None else s
+    return Attempt(METHOD, theta, float(s.at.cost), s.kkt, steps, message)
 
 
-def _judged(p: Problem, lanes: Descent, lane: int) -> SearchState:
-    """Judged end of one search."""
-    theta = lanes.theta[lane].copy()
-    at = assess.of_squares(lanes.residual[lane].copy(), lanes.jacobian[lane])
+def _state_of(p: Problem, searches: Descent, lane: int) -> SearchState:
+    """Compute the KKT residuals at the present point of one search."""
+    theta = searches.theta[lane].copy()
+    at = assess.slopes_of_squares(searches.residual[lane].copy(), searches.jacobian[lane])
     return assess.state(p, theta, assess.scale_of(p, theta, at), at)
 
 
-def _moved_off(p: Problem, lanes: Descent, lane: int, budget: SearchLimit) -> SearchState:
-    """Judge one end; where the cost bends down there, move off and go on."""
-    s = _judged(p, lanes, lane)
-    for _ in range(MOVES):
-        look = partial(costs, p, lanes)
-        point = assess.lower_beside(p, s, look) if s.at.finite else None
-        if point is None or budget.left <= 0:
+def _escape_saddles(p: Problem, searches: Descent, lane: int, budget: SearchLimit) -> SearchState:
+    """Test the end of one search; leave it and continue as long as it is a saddle."""
+    s = _state_of(p, searches, lane)
+    for _ in range(MAX_ESCAPES):
+        cost_at = partial(costs, p, searches)
+        point = assess.find_lower_point(p, s, cost_at) if s.at.finite else None
+        if point is None or budget.seconds_left <= 0:
             break
-        lanes.move(lane, point)
-        _go_on(p, lanes, lane, int(lanes.steps[lane]) + budget.iterations, budget)
-        s = _judged(p, lanes, lane)
+        searches.restart(lane, point)
+        _refine(p, searches, lane, int(searches.steps[lane]) + budget.iterations, budget)
+        s = _state_of(p, searches, lane)
     return s
 
 
 # ---- constraints and further objectives: one start after the other
 
 
-def _one_by_one(
+def _search_constrained(
     p: Problem, points: Iterable[np.ndarray], budget: SearchLimit, hessian: str
 ) -> tuple[list[SearchState], tuple[Attempt, ...]]:
+    """Search from one start after the other, until the time is up."""
     found, attempts = [], []
     for point in points:
-        if found and budget.left <= 0:
+        if found and budget.seconds_left <= 0:
             break
         at = assess.slopes(p, point)
         if not (np.isfinite(at.cost) and np.all(np.isfinite(at.constraints))):
-            attempts.append(Attempt("none", point, np.nan, assess.LOST, 0, "cost not finite"))
+            lost = assess.INFINITE_KKT
+            attempts.append(Attempt("none", point, np.nan, lost, 0, "cost not finite"))
             continue
-        s, attempt = _program(p, point, at, budget, hessian)
-        if p.objectives and outgrown(s):  # from there in the sizes it has there
-            s, attempt = _program(p, s.theta, assess.slopes(p, s.theta), budget, hessian)
+        s, attempt = _search_from(p, point, at, budget, hessian)
+        if p.objectives and cost_outgrew_scale(s):  # again from there, with the scales there
+            s, attempt = _search_from(p, s.theta, assess.slopes(p, s.theta), budget, hessian)
         found.append(s)
         attempts.append(attempt)
     return found, tuple(attempts)
 
 
-def _program(
+def _search_from(
     p: Problem, start: np.ndarray, at: assess.Slopes, budget: SearchLimit, hessian: str
 ) -> tuple[SearchState, Attempt]:
-    """Search with the solvers for constraints, until one ends on an optimum."""
+    """Search with one solver for constraints after the other, until one ends on an optimum."""
     scale = assess.scale_of(p, start, at)
-    # Squares say nothing of further objectives; foreign code may have first derivatives only.
+    # Gauss-Newton ignores further objectives; foreign code may lack second derivatives.
     usable = {"none", hessian} if p.objectives else {"none", "gauss_newton", hessian}
-    loose = p.residual_count + int(np.sum(p.equations)) < int(np.sum(p.moving))
-    order = (INSIDE, *SOLVERS) if loose and not p.objectives else SOLVERS
+    underdetermined = p.residual_count + int(np.sum(p.equations)) < int(np.sum(p.moving))
+    order = (INTERIOR_POINT, *SOLVERS) if underdetermined and not p.objectives else SOLVERS
     stages = [s for s in order if s.hessian in usable and budget.solver in (None, s.preset)]
     exact = hessian == "exact"
-    best, tried, steps, said = None, [], 0, ""
+    best, tried, steps, message = None, [], 0, ""
     for stage in stages:
         program = NonlinearProgram(p, start, at, scale, stage.hessian)
-        near = best is not None and best.feasible
-        begin = best.theta if near else start
-        if not near and stage.name in tried:
+        feasible = best is not None and best.feasible
+        current = best.theta if feasible else start
+        if not feasible and stage.name in tried:
             continue
-        for _ in range(1 + MOVES):
+        for _ in range(1 + MAX_ESCAPES):
             most = min(stage.steps, budget.iterations)
-            end = stage.solve(program, program.point(begin), most, budget)
+            end = stage.solve(program, program.point(current), most, budget)
             s = assess.state(p, np.clip(program.numbers(end.x), p.lower, p.upper), scale)
-            steps, said = steps + end.iterations, end.said
+            steps, message = steps + end.iterations, end.message
             point = None
             if s.optimal:
                 s, point = assess.second_order(p, s, exact)
             if best is None or _best(p, [best, s]) == 1:
                 best = s
-            if point is None or budget.left <= 0:
+            if point is None or budget.seconds_left <= 0:
                 break
-            begin = point
+            current = point
         tried.append(stage.name)
-        if _good(best) or budget.left <= 0:
+        if _is_optimum(best) or budget.seconds_left <= 0:
             break
-    return best, Attempt(", ".join(tried), best.theta, float(best.at.cost), best.kkt, steps, said)
+    return best, Attempt(
+        ", ".join(tried), best.theta, float(best.at.cost), best.kkt, steps, message
+    )

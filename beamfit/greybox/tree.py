@@ -1,4 +1,4 @@
-"""Models as trees of numbers: dataclasses JAX can walk, and leaves addressed by path."""
+"""Models as trees of numbers: dataclasses known to JAX, and leaves addressed by path."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ C = TypeVar("C", bound=type)
 
 @dataclass_transform(frozen_default=True)
 def node(*static: str):
-    """Make a class a frozen dataclass that JAX walks: `static` fields are structure, the rest data.
+    """Make a class a frozen dataclass and a JAX tree: `static` fields are structure, others data.
 
     Parameters
     ----------
@@ -84,7 +84,7 @@ def leaves(tree: Any) -> tuple[Leaf, ...]:
 
 @lru_cache(maxsize=256)
 def _leaves(structure: jax.tree_util.PyTreeDef, shapes: tuple[tuple[int, ...], ...]):
-    """Leaves of all trees of a structure: a problem finds each of its numbers among them."""
+    """List the leaves of a tree structure, cached: a problem looks up each of its numbers."""
     found = jax.tree_util.tree_leaves_with_path(structure.unflatten(range(len(shapes))))
     named = partial(jax.tree_util.keystr, simple=True, separator=".")
     return tuple(Leaf(i, named(path), shapes[i]) for path, i in found)
@@ -108,7 +108,7 @@ def find_leaves(tree: Any, path: str) -> tuple[Leaf, ...]:
     Raises
     ------
     InputError
-        If nothing lies at that path.
+        If there is no leaf at that path.
 
     Examples
     --------
@@ -155,7 +155,7 @@ def read(tree: Any, chosen: Sequence[Leaf]) -> jax.Array:
     tree : pytree
         The model.
     chosen : sequence of Leaf
-        Which leaves, in this order.
+        The leaves, in the order of the vector.
 
     Returns
     -------
@@ -181,7 +181,7 @@ def replace(tree: Any, chosen: Sequence[Leaf], vector: jax.Array) -> Any:
     tree : pytree
         The model.
     chosen : sequence of Leaf
-        Which leaves, in the order of the vector.
+        The leaves, in the order of the vector.
     vector : array, shape (n,)
         Their new elements.
 
@@ -200,7 +200,7 @@ def replace(tree: Any, chosen: Sequence[Leaf], vector: jax.Array) -> Any:
     values, structure = jax.tree_util.tree_flatten(tree)
     start = 0
     for leaf in chosen:
-        # Untraced numbers are taken by numpy, so that nothing is compiled.
+        # NumPy slices a vector that is not traced, so that nothing is compiled.
         values[leaf.index] = jnp.asarray(vector[start : start + leaf.size].reshape(leaf.shape))
         start += leaf.size
     return jax.tree_util.tree_unflatten(structure, values)

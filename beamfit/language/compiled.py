@@ -1,4 +1,4 @@
-"""A mapping as a JAX function of its inputs, its outputs at given inputs, and their derivatives."""
+"""Compiled mappings: outputs as JAX functions of inputs, and their derivatives."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ from beamfit.errors import InputError, nearest
 from beamfit.greybox.maps import Formula
 from beamfit.language import document as d
 from beamfit.language import expression as x
-from beamfit.language.evaluate import Setting, check_rank, evaluate, stored
+from beamfit.language.evaluate import Context, assign, check_rank, evaluate
 from beamfit.language.expression import error_at
-from beamfit.language.plan import Order, StepGroup, checked
-from beamfit.language.scope import MappingStep, Scope, reads, widened
-from beamfit.language.steps import Arrays, called, defaults, scanned
+from beamfit.language.plan import Order, StepGroup, check_mapping
+from beamfit.language.scope import MappingStep, Scope, add_iterators, reads
+from beamfit.language.steps import Arrays, defaults, run_call, scan_recurrence
 
 
 @dataclass(frozen=True, eq=False)
 class Program:
     """A mapping that can be computed.
 
-    `constants` are tables, their columns first, and parameters; they are arguments, so that code
-    does not hang on them: programs of one order are equal, whatever is in their tables.
+    Tables and parameters are arguments of the compiled code (`constants`), so that programs with
+    the same order are equal, whatever their tables contain, and share the code.
     """
 
     order: Order
@@ -49,8 +49,8 @@ class Program:
 
     @cached_property
     def constants(self) -> Arrays:
-        """Tables, and parameters with dimensions."""
-        # Columns are read one by one: each lies in one piece of memory.
+        """Transposed tables, and parameters with dimensions."""
+        # Transposed, so that each column is contiguous: formulas read one column after the other.
         tables = {name: np.asarray(table, float) for name, table in self.tables.items()}
         found = {name: np.ascontiguousarray(table.T) for name, table in tables.items()}
         for a in self.scope.arrays.values():
@@ -66,11 +66,11 @@ class Program:
         Parameters
         ----------
         inputs : mapping of str to array
-            By name; those that the document gives values to may be left out.
+            Inputs by name; those with values in the document may be omitted.
         names : iterable of str
-            What to compute.
+            Names to compute.
         constants : dict, optional
-            `constants`, as an argument of compiled code.
+            Replaces `constants`, as a traced argument of compiled code.
 
         Returns
         -------
@@ -93,20 +93,20 @@ class Program:
         formulas: Iterable[tuple[x.Expression, tuple[x.Iterator, ...]]],
         constants: Arrays | None = None,
     ) -> list[jax.Array]:
-        """Compute formulas in the names of the mapping, with an axis for each iterator."""
-        pairs = [(e, widened(self.scope, {}, each)) for e, each in formulas]
+        """Compute formulas of the mapping's names, with an axis for each iterator."""
+        pairs = [(e, add_iterators(self.scope, {}, each)) for e, each in formulas]
         names = {read.array.name for e, axes in pairs for read in reads(self.scope, e, axes)}
         arrays = self._arrays(inputs, names & set(self.order.owners), constants)
         found = []
         for e, axes in pairs:
-            value = evaluate(e, Setting(self.scope, arrays, axes))
+            value = evaluate(e, Context(self.scope, arrays, axes))
             lengths = [len(one) for one in axes.values()]
             own = value.array.shape[len(axes) :]
             found.append(jnp.broadcast_to(value.array, (*lengths, *own)))
         return found
 
     def begin(self, inputs: Mapping[str, jax.Array], constants: Arrays | None = None) -> Arrays:
-        """All arrays before the first step: what is given, and zeros where steps set something."""
+        """Return all arrays before the first step: given values, and zeros for computed ones."""
         given = defaults(self.scope) | {n: jnp.asarray(v, float) for n, v in inputs.items()}
         constants = self.constants if constants is None else constants
         arrays = {n: jnp.asarray(v) for n, v in constants.items()} | given
@@ -114,14 +114,14 @@ class Program:
         return arrays | {n: jnp.zeros(self.scope.arrays[n].shape) for n in self.order.owners}
 
     def _arrays(self, inputs, names: Iterable[str], constants: Arrays | None) -> Arrays:
-        """All arrays, of which those that some names hang on are computed."""
+        """Return all arrays after computing those on which some names depend."""
         arrays = self.begin(inputs, constants)
         for group in self.order.needed(names):
-            arrays |= carry_out(self.order, group, arrays)
+            arrays |= run_group(self.order, group, arrays)
         return arrays
 
     def as_map(self, outputs: Iterable[str] | None = None) -> Formula:
-        """Elements of the inputs to elements of outputs, as a map with sensitivities and gains.
+        """Make a map from elements of inputs to elements of outputs, with sensitivities and gains.
 
         Examples
         --------
@@ -141,12 +141,12 @@ class Program:
             found = self(given, [a.name for a in chosen])
             return jnp.concatenate([jnp.ravel(found[a.name]) for a in chosen])
 
-        faces = ([a.element(i) for a in group for i in range(a.size)] for group in (inputs, chosen))
-        return Formula(*faces, function)
+        names = ([a.element(i) for a in group for i in range(a.size)] for group in (inputs, chosen))
+        return Formula(*names, function)
 
 
 def compile_mapping(mapping: d.Mapping, tables: Mapping[str, np.ndarray] | None = None) -> Program:
-    """Compile a mapping: check names, indices and order, then trace every formula once.
+    """Compile a mapping: check names, indices and order, then trace all formulas once.
 
     Parameters
     ----------
@@ -162,21 +162,21 @@ def compile_mapping(mapping: d.Mapping, tables: Mapping[str, np.ndarray] | None 
     Raises
     ------
     InputError
-        With its place in the document, whatever is wrong with it.
+        With its place in the document, for any error in it.
     """
     tables = tables or {}
     missing = [t for t in mapping.tables if t.name not in tables]
     if missing:
         raise error_at(missing[0].at, f"no data for table '{missing[0].name}'",
                        f"--data {missing[0].name}=FILE")  # fmt: skip
-    program = Program(checked(mapping, {n: np.shape(t) for n, t in tables.items()}), tables)
-    _traced(program)
+    program = Program(check_mapping(mapping, {n: np.shape(t) for n, t in tables.items()}), tables)
+    _check_shapes(program)
     return program
 
 
 @lru_cache(maxsize=64)
-def _traced(program: Program) -> None:
-    """Trace every formula, which finds what is wrong with its shapes."""
+def _check_shapes(program: Program) -> None:
+    """Trace all formulas, which finds errors in their shapes."""
     shapes = {n: jax.ShapeDtypeStruct(a.shape, float) for n, a in program.scope.inputs.items()}
     jax.eval_shape(lambda given: program(given, list(program.order.owners)), shapes)
 
@@ -184,23 +184,23 @@ def _traced(program: Program) -> None:
 # ---- running
 
 
-def carry_out(order: Order, group: StepGroup, arrays: Arrays) -> Arrays:
-    """Compute the steps of a group, and give the arrays they change."""
+def run_group(order: Order, group: StepGroup, arrays: Arrays) -> Arrays:
+    """Compute the steps of a group, and return the arrays they change."""
     if group.plan is not None:
-        return scanned(order.scope, group.plan, arrays, partial(_assigned, order))
+        return scan_recurrence(order.scope, group.plan, arrays, partial(_run_step, order))
     (step,) = group.steps
-    return _assigned(order, step, Setting(order.scope, arrays, step.axes))
+    return _run_step(order, step, Context(order.scope, arrays, step.axes))
 
 
-def _assigned(order: Order, step: MappingStep, s: Setting) -> Arrays:
-    """The arrays that a step changes."""
-    if isinstance(step.what, d.Call):
-        return called(step.what, s, lambda label: Program(order.inner[label], {}))
-    target, e = step.what.target, step.what.value
+def _run_step(order: Order, step: MappingStep, s: Context) -> Arrays:
+    """Compute a step, and return the arrays it changes."""
+    if isinstance(step.statement, d.Call):
+        return run_call(step.statement, s, lambda label: Program(order.inner[label], {}))
+    target, e = step.statement.target, step.statement.value
     array, old = s.scope.arrays[target.name], s.arrays[target.name]
     value = evaluate(e, s)
     check_rank(s.scope, target, array, value, e)
-    return {target.name: stored(old, s.scope, array, target, s.axes, value, e)}
+    return {target.name: assign(old, s.scope, array, target, s.axes, value, e)}
 
 
 GAIN = re.compile(r"\s*d(\w+)\s*/\s*d(\w+)\s*")
@@ -209,16 +209,16 @@ GAIN = re.compile(r"\s*d(\w+)\s*/\s*d(\w+)\s*")
 @answer
 @dataclass(frozen=True, eq=False)
 class Computed:
-    """Outputs of a mapping without an objective, and the gains that were asked for.
+    """Outputs of a mapping without an objective, and requested gains.
 
     Parameters
     ----------
     name : str
-        Of the mapping.
+        Name of the mapping.
     scope : Scope
         Its names and indices.
     outputs, gains : mapping of str to array
-        Values by output; derivatives by their names, such as ``dy/dx``, the axes of the output
+        Values by output; derivatives by names such as ``dy/dx``, with the axes of the output
         before those of the input.
     """
 
@@ -228,50 +228,50 @@ class Computed:
     gains: Mapping[str, np.ndarray]
 
     def tables(self) -> list[Table]:
-        """Every element of outputs and gains, as far as a terminal shows them."""
+        """List the elements of outputs and gains, up to the largest number of rows."""
         arrays = [(self.scope.outputs[n], v) for n, v in self.outputs.items()]
-        rows = [[a.element(i), f"{v:.8g}"] for a, values in arrays for i, v in _each(values)]
-        return [limited(["output", "value"], rows), *gain_tables(self.scope, self.gains)]
+        rows = [[a.element(i), f"{v:.8g}"] for a, values in arrays for i, v in _numbered(values)]
+        return [limit_rows(["output", "value"], rows), *gain_tables(self.scope, self.gains)]
 
     def to_json(self) -> dict[str, Any]:
-        """The result of the JSON contract."""
+        """Return the result of the JSON contract."""
         return {"name": self.name, "outputs": self.outputs, "gains": self.gains}
 
 
-def _each(values: np.ndarray) -> Iterable[tuple[int, float]]:
+def _numbered(values: np.ndarray) -> Iterable[tuple[int, float]]:
     return enumerate(np.ravel(values).tolist())
 
 
-def limited(header: Sequence[str], rows: list[list[str]]) -> Table:
-    """A table with no more rows than a terminal shows."""
+def limit_rows(header: Sequence[str], rows: list[list[str]]) -> Table:
+    """Make a table with at most `MOST_ROWS` rows."""
     more, rest = len(rows) - MOST_ROWS, [""] * (len(header) - 1)
     rows = rows[:MOST_ROWS] + [[f"... and {more} more", *rest]] * (more > 0)
     return Table("", header, rows, numeric=True)
 
 
 def gain_tables(scope: Scope, gains: Mapping[str, np.ndarray]) -> list[Table]:
-    """Every element of derivatives in a table, none if none were asked for."""
+    """Make a table of all elements of derivatives; none without derivatives."""
     rows = []
     for name, values in gains.items():
-        output, by = parts_of(name)
+        output, by = gain_parts(name)
         y, x = scope.outputs[output], scope.inputs[by]
-        for i, v in _each(values):
+        for i, v in _numbered(values):
             at = divmod(i, x.size)
             rows.append([f"d{y.element(at[0])}/d{x.element(at[1])}", f"{v:.8g}"])
-    return [limited(["gain", "value"], rows)] if rows else []
+    return [limit_rows(["gain", "value"], rows)] if rows else []
 
 
-def parts_of(gain: str) -> tuple[str, str]:
-    """Output and input of a derivative written ``dy/dx``.
+def gain_parts(gain: str) -> tuple[str, str]:
+    """Split a derivative written ``dy/dx`` into output and input.
 
     Raises
     ------
     InputError
-        If it is not written so.
+        If it has another form.
 
     Examples
     --------
-    >>> parts_of("dobj/dx1")
+    >>> gain_parts("dobj/dx1")
     ('obj', 'x1')
     """
     found = GAIN.fullmatch(gain)
@@ -281,12 +281,12 @@ def parts_of(gain: str) -> tuple[str, str]:
 
 
 def values_of(scope: Scope, given: Mapping[str, Sequence[float]]) -> dict[str, np.ndarray]:
-    """Arrays of inputs from one number each, or as many as it has elements, in C order.
+    """Make arrays of inputs from one number each, or one for each element in C order.
 
     Raises
     ------
     InputError
-        If a name is no input of the mapping, or the count is another one.
+        If a name is not an input of the mapping, or the count is wrong.
     """
     found = {}
     for name, numbers in given.items():
@@ -295,7 +295,7 @@ def values_of(scope: Scope, given: Mapping[str, Sequence[float]]) -> dict[str, n
             raise InputError(f"--set {name}=...", expected)
         a = scope.inputs[name]
         if len(numbers) not in (1, a.size):
-            expected = f"one, or {a.size} for {a.said}"
+            expected = f"one, or {a.size} for {a.text}"
             raise InputError(f"{len(numbers)} numbers in --set {name}=...", expected)
         found[name] = np.broadcast_to(np.asarray(numbers, float), (a.size,)).reshape(a.shape)
     return found
@@ -316,7 +316,7 @@ def _gain(program: Program, output: str, by: str, given, constants) -> jax.Array
 
 
 def outputs_at(program: Program, given: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    """All outputs at values of the inputs, compiled once for each document."""
+    """Compute all outputs at values of the inputs, compiled once for each document."""
     names = tuple(program.scope.outputs)
     found = _outputs(program, names, dict(given), program.constants)
     return dict(zip(names, map(np.asarray, found), strict=True))
@@ -325,19 +325,19 @@ def outputs_at(program: Program, given: Mapping[str, Any]) -> dict[str, np.ndarr
 def gains_at(
     program: Program, given: Mapping[str, Any], gains: Iterable[str]
 ) -> dict[str, np.ndarray]:
-    """Derivatives of outputs by inputs, written ``dy/dx``.
+    """Compute derivatives of outputs by inputs, written ``dy/dx``.
 
     Raises
     ------
     InputError
-        If one is not written so, or asks for what the mapping has not.
+        If one has another form, or a name that the mapping does not have.
     """
     found, scope = {}, program.scope
     for gain in gains:
-        output, by = parts_of(gain)
-        for name, face, what in ((output, scope.outputs, "output"), (by, scope.inputs, "input")):
+        output, by = gain_parts(gain)
+        for name, face, kind in ((output, scope.outputs, "output"), (by, scope.inputs, "input")):
             if name not in face:
-                expected = f"an {what} of the document: {nearest(name, list(face))}"
+                expected = f"an {kind} of the document: {nearest(name, list(face))}"
                 raise InputError(f"'{name}' in --derivative {gain}", expected)
         key = f"d{output}/d{by}"
         at = defaults(scope) | dict(given)
@@ -356,11 +356,11 @@ def compute_document(
     Parameters
     ----------
     document : Document
-        Its mapping is computed.
+        The document of the mapping.
     tables : mapping of str to array, optional
         Its data tables by name.
     values : mapping of str to sequence of float, optional
-        Values of inputs in the place of the document's: one number, or all in C order.
+        Values of inputs that replace the document's: one number, or all in C order.
     gains : iterable of str, optional
         Derivatives to compute, written ``dy/dx``.
 
@@ -371,7 +371,7 @@ def compute_document(
     Raises
     ------
     InputError
-        With its place in the document, whatever is wrong with it; also if an input has no value.
+        With its place in the document, for any error in it, or an input without a value.
 
     Examples
     --------
@@ -387,7 +387,7 @@ def compute_document(
         if a.values is None and a.name not in given:
             several = f", or {a.size} numbers with commas" * (a.size > 1)
             expected = f"--set {a.name}=NUMBER{several}"
-            raise error_at(a.at, f"input '{a.said}' without a value", expected)
+            raise error_at(a.at, f"input '{a.text}' without a value", expected)
     outputs = outputs_at(program, given)
     gains = gains_at(program, given, gains)
     return Computed(document.mapping.name, program.scope, outputs, gains)

@@ -1,4 +1,4 @@
-"""A document: a mapping of statements, what is to be optimised with it, and by which solver."""
+"""Data classes of a document: mapping with its statements, optimisation problem, solver."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class IndexedSet(Placed):
 
 @dataclass(frozen=True)
 class Real(Placed):
-    """``real A[K];``, with a value if one follows: a dimension is a set or a size."""
+    """``real A[K];`` or ``real a = 2*b;``; a dimension is a set or a size."""
 
     name: str
     dimensions: tuple[str | int, ...] = ()
@@ -40,7 +40,7 @@ class Function(Placed):
 class Assignment(Placed):
     """``y[k] = 2*x[k] foreach k in K;``
 
-    In a call: an input and its value, or a variable and an output.
+    In a call: an input and its value, or a variable and the output it receives.
     """
 
     target: Name
@@ -74,7 +74,7 @@ Statement = IndexedSet | Real | Function | Assignment | Call | Block
 
 @dataclass(frozen=True)
 class Declared(Placed):
-    """An input, an output or a parameter: name, dimensions, and values in C order if given."""
+    """An input, an output or a parameter: name, dimensions, and any values in C order."""
 
     name: str
     dimensions: tuple[str | int, ...] = ()
@@ -83,7 +83,7 @@ class Declared(Placed):
 
 @dataclass(frozen=True)
 class DataTable(Placed):
-    """A table of numbers in a file, with the rows and columns it should have."""
+    """A table of numbers in a file, with the expected numbers of rows and columns."""
 
     name: str
     file: str
@@ -93,7 +93,7 @@ class DataTable(Placed):
 
 @dataclass(frozen=True)
 class NetworkElement(Placed):
-    """A layer, connection, input, output or gain of a network, as the report writes it."""
+    """A layer, connection, input, output or gain of a network, with the report's attributes."""
 
     kind: str
     attributes: tuple[tuple[str, str], ...]
@@ -110,7 +110,7 @@ class NetworkDefinition(Placed):
 
 @dataclass(frozen=True)
 class Mapping(Placed):
-    """Inputs to outputs by expressions; other mappings and networks inside are called by name."""
+    """A mapping of inputs to outputs by expressions, with inner mappings and networks."""
 
     name: str = ""
     tables: tuple[DataTable, ...] = ()
@@ -126,9 +126,10 @@ class Mapping(Placed):
 
 @dataclass(frozen=True)
 class FreeInput(Placed):
-    """An input that is free: bounds, and where searches start.
+    """A free input with its bounds and start.
 
-    `random` is the range of a start drawn with `seed`; without it the start is `value`.
+    `random` is the range from which the start is drawn with `seed`; without it the start is
+    `value`.
     """
 
     label: str
@@ -142,7 +143,7 @@ class FreeInput(Placed):
 
 @dataclass(frozen=True)
 class Limit(Placed):
-    """An output that is limited."""
+    """Limits on an output."""
 
     label: str
     model: str
@@ -152,7 +153,7 @@ class Limit(Placed):
 
 @dataclass(frozen=True)
 class Goal(Placed):
-    """An output that counts in the objective, times its weight."""
+    """A term of the objective: an output times a weight."""
 
     label: str
     model: str
@@ -171,7 +172,7 @@ class ProblemStatement:
 
 @dataclass(frozen=True)
 class Solver(Placed):
-    """The solver asked for and its parameters, as they were written."""
+    """The requested solver and its parameters, as written."""
 
     name: str
     settings: tuple[tuple[str, str], ...] = ()
@@ -179,7 +180,7 @@ class Solver(Placed):
 
 @dataclass(frozen=True)
 class Document:
-    """A formulation; a mapping alone has no problem."""
+    """A whole document; a mapping alone has no problem."""
 
     mapping: Mapping
     problem: ProblemStatement | None = None

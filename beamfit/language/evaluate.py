@@ -1,7 +1,7 @@
-"""Expressions to JAX over whole index sets: one array operation for all elements at once.
+"""Evaluation of expressions with JAX, for all elements of index sets at once.
 
-A value is an array with one axis for each iterator in force (of length 1 where it does not change
-with it), then its own dimensions. Broadcasting does the rest; a sum is a reduction over its axes.
+A value is an array with one axis for each active iterator, of length 1 if the value does not depend
+on it, followed by the dimensions of the value. Operations broadcast; a sum reduces its axes.
 """
 
 from __future__ import annotations
@@ -19,44 +19,45 @@ import numpy as np
 from beamfit.language import expression as x
 from beamfit.language.expression import error_at
 from beamfit.language.scope import (
-    HIDDEN,
+    HIDDEN_SUFFIX,
     Array,
     Axes,
     Scope,
+    add_iterators,
     check_size,
-    index_of,
-    located,
-    whole_of,
-    widened,
+    find_positions,
+    index_values,
+    whole_dimensions,
 )
 
 
 class Value(NamedTuple):
-    """An array: axes of iterators, then `rank` dimensions of its own."""
+    """An array with axes of iterators, then `rank` dimensions of the value."""
 
     array: jax.Array
     rank: int = 0
 
 
 @dataclass(frozen=True)
-class Setting:
+class Context:
     """Context in which an expression is evaluated.
 
-    `known` holds values of nodes computed elsewhere, by identity; `watch` is told every value.
+    `computed` has values of nodes that are computed already, by identity. `watch` is called with
+    each further value.
     """
 
     scope: Scope
     arrays: Mapping[str, jax.Array]
     axes: Axes
     bound: Mapping[str, Value] = field(default_factory=dict)
-    known: Mapping[int, Value] = field(default_factory=dict)
+    computed: Mapping[int, Value] = field(default_factory=dict)
     watch: Callable[[x.Expression, Value, Axes], None] | None = None
 
 
-# Built-in functions of elements that JAX's numpy does not have under their names.
-OTHERS = {"erf": jax.scipy.special.erf, "sigmoid": jax.nn.sigmoid}
+# Built-in functions that `jax.numpy` does not have under their names.
+SPECIAL_FUNCTIONS = {"erf": jax.scipy.special.erf, "sigmoid": jax.nn.sigmoid}
 MATRIX: dict[str, tuple[int, int, Callable]] = {
-    # rank of the argument, of the result
+    # ranks of the argument and of the result, and the function
     "transpose": (2, 2, lambda m: jnp.swapaxes(m, -1, -2)),
     "inverse": (2, 2, jnp.linalg.inv),
     "det": (2, 0, jnp.linalg.det),
@@ -66,47 +67,47 @@ MATRIX: dict[str, tuple[int, int, Callable]] = {
 OPERATORS = {"+": add, "-": sub, "*": mul, "/": truediv, "^": pow}
 
 
-def evaluate(e: x.Expression, s: Setting) -> Value:
-    """Compute an expression for all combinations of the iterators in force."""
-    found = s.known.get(id(e))
+def evaluate(e: x.Expression, s: Context) -> Value:
+    """Compute an expression for all combinations of the active iterators."""
+    found = s.computed.get(id(e))
     if found is not None:
-        return lifted(found, len(s.axes))
+        return add_axes(found, len(s.axes))
     match e:
         case x.Literal():
             found = Value(jnp.full((1,) * len(s.axes), e.value))
         case x.Name():
-            found = _named(e, s)
+            found = _read_name(e, s)
         case x.Arithmetic(_, (one,)):
             inner = evaluate(one, s)
             found = Value(-inner.array, inner.rank)
         case x.Arithmetic("^", (base, x.Literal() as power)):
             found = _power(evaluate(base, s), power.value)
         case x.Arithmetic(symbol, parts):
-            found = _operated(e, symbol, [evaluate(part, s) for part in parts])
+            found = _operate(e, symbol, [evaluate(part, s) for part in parts])
         case x.Application():
-            found = _applied(e, s)
+            found = _apply(e, s)
         case x.Reduction():
-            found = _reduced(e, s)
+            found = _reduce(e, s)
     if s.watch is not None:
         s.watch(e, found, s.axes)
     return found
 
 
-def lifted(v: Value, axes: int) -> Value:
-    """A value of outer iterators, for as many iterators as are in force further in."""
+def add_axes(v: Value, axes: int) -> Value:
+    """Add axes of length 1 for inner iterators to a value."""
     outer = v.array.ndim - v.rank
     shape = v.array.shape
     return Value(v.array.reshape(*shape[:outer], *[1] * (axes - outer), *shape[outer:]), v.rank)
 
 
 def _power(v: Value, power: float) -> Value:
-    # A whole power has derivatives everywhere, and needs no logarithm.
+    # An integer power has derivatives everywhere and needs no logarithm.
     whole = power == int(power) and abs(power) <= 64
     return Value(v.array ** (int(power) if whole else power), v.rank)
 
 
-def _spread(values: list[Value], e: x.Expression) -> tuple[list[jax.Array], int]:
-    """Arrays of one rank: numbers spread over the dimensions of the others."""
+def _match_ranks(values: list[Value], e: x.Expression) -> tuple[list[jax.Array], int]:
+    """Give values the same rank: numbers are broadcast over the dimensions of the others."""
     rank = max(v.rank for v in values)
     for v in values:
         if v.rank not in (0, rank):
@@ -120,15 +121,15 @@ def _spread(values: list[Value], e: x.Expression) -> tuple[list[jax.Array], int]
     return arrays, rank
 
 
-def _operated(e: x.Expression, symbol: str, parts: list[Value]) -> Value:
+def _operate(e: x.Expression, symbol: str, parts: list[Value]) -> Value:
     if symbol == "@":
-        return _product(e, *parts)
-    (a, b), rank = _spread(parts, e)
+        return _multiply(e, *parts)
+    (a, b), rank = _match_ranks(parts, e)
     return Value(OPERATORS[symbol](a, b), rank)
 
 
-def _product(e: x.Expression, a: Value, b: Value) -> Value:
-    """A product of matrices and vectors."""
+def _multiply(e: x.Expression, a: Value, b: Value) -> Value:
+    """Multiply matrices and vectors."""
     if not (1 <= a.rank <= 2 and 1 <= b.rank <= 2):
         raise error_at(e.at, f"'{e}' of {a.rank} and {b.rank} dimensions", "vectors or matrices")
     inner = a.array.shape[-1], b.array.shape[-1 if b.rank == 1 else -2]
@@ -145,35 +146,38 @@ def _product(e: x.Expression, a: Value, b: Value) -> Value:
     return Value(found, a.rank + b.rank - 2)
 
 
-def _applied(e: x.Application, s: Setting) -> Value:
+def _apply(e: x.Application, s: Context) -> Value:
+    """Compute a function of its arguments: declared in the mapping, of matrices, or elementwise."""
     values = [evaluate(argument, s) for argument in e.arguments]
     function = s.scope.functions.get(e.function)
     if function is not None:
-        # The body sees its arguments; iterators of the caller keep their axes, not their names.
-        hidden = {f"{name}{HIDDEN}": one for name, one in s.axes.items()}
+        # The body knows only its arguments: the caller's iterators keep their axes, under hidden
+        # names.
+        hidden = {f"{name}{HIDDEN_SUFFIX}": one for name, one in s.axes.items()}
         bound = dict(zip(function.arguments, values, strict=True))
         return evaluate(function.body, replace(s, axes=hidden, bound=bound))
     name = e.function
     if name in MATRIX:
         return _matrix(e, *MATRIX[name], values[0])
     if name == "dot":
-        return _product(e, *values)
+        return _multiply(e, *values)
     if name in ("sum", "min", "max") and len(values) == 1:
         own = tuple(range(-values[0].rank, 0))
         return Value(getattr(jnp, name)(values[0].array, axis=own))
     if name == "pow":
-        return _operated(e, "^", values)
-    arrays, rank = _spread(values, e)
+        return _operate(e, "^", values)
+    arrays, rank = _match_ranks(values, e)
     if name in ("min", "max"):
         return Value(reduce(jnp.minimum if name == "min" else jnp.maximum, arrays), rank)
-    elementwise = OTHERS.get(name) or getattr(jnp, name)
+    elementwise = SPECIAL_FUNCTIONS.get(name) or getattr(jnp, name)
     return Value(elementwise(*arrays), rank)
 
 
 def _matrix(e: x.Application, wanted: int, given: int, function: Callable, v: Value) -> Value:
+    """Compute a function of a matrix or vector, after a check of its dimensions."""
     if v.rank != wanted:
-        what = "a matrix" if wanted == 2 else "a vector"
-        raise error_at(e.arguments[0].at, f"'{e.arguments[0]}' of {v.rank} dimensions", what)
+        kind = "a matrix" if wanted == 2 else "a vector"
+        raise error_at(e.arguments[0].at, f"'{e.arguments[0]}' of {v.rank} dimensions", kind)
     square = v.array.shape[-2:]
     if e.function in ("inverse", "det", "trace") and square[0] != square[1]:
         found = f"'{e.arguments[0]}' of {square[0]} x {square[1]}"
@@ -181,47 +185,49 @@ def _matrix(e: x.Application, wanted: int, given: int, function: Callable, v: Va
     return Value(function(v.array), given)
 
 
-def _reduced(e: x.Reduction, s: Setting) -> Value:
-    axes = widened(s.scope, s.axes, e.iterators)
+def _reduce(e: x.Reduction, s: Context) -> Value:
+    """Compute a sum, product, minimum, maximum or mean over iterators."""
+    axes = add_iterators(s.scope, s.axes, e.iterators)
     body = evaluate(e.body, replace(s, axes=axes))
     over = tuple(range(len(s.axes), len(axes)))
-    # What does not change with an iterator has one element along it and counts for all.
+    # A body that does not depend on an iterator has one element along it, which counts for all.
     lengths = [len(one) for one in list(axes.values())[len(s.axes) :]]
-    same = np.prod([n for n, i in zip(lengths, over, strict=True) if body.array.shape[i] == 1])
+    repeats = np.prod([n for n, i in zip(lengths, over, strict=True) if body.array.shape[i] == 1])
     found = getattr(jnp, e.kind)(body.array, axis=over)
-    if same != 1 and e.kind in ("sum", "prod"):
-        found = found * same if e.kind == "sum" else found ** int(same)
+    if repeats != 1 and e.kind in ("sum", "prod"):
+        found = found * repeats if e.kind == "sum" else found ** int(repeats)
     return Value(found, body.rank)
 
 
 # ---- elements of arrays
 
 
-def _named(e: x.Name, s: Setting) -> Value:
+def _read_name(e: x.Name, s: Context) -> Value:
+    """Compute a name: an argument, a constant, an iterator, or elements of an array."""
     if e.name in s.bound:
         if e.indices:
             raise error_at(e.at, f"'{e}', an index of an argument", "the argument as a whole")
-        return lifted(s.bound[e.name], len(s.axes))
+        return add_axes(s.bound[e.name], len(s.axes))
     array = s.scope.arrays.get(e.name)
     if array is None or (array.role == "parameter" and not array.dims):
         value = s.scope.constant(e.name)
         if value is None:
-            return Value(jnp.asarray(index_of(s.scope, e, s.axes), float))
+            return Value(jnp.asarray(index_values(s.scope, e, s.axes), float))
         return Value(jnp.full((1,) * len(s.axes), value))
-    indices = located(s.scope, e, array, s.axes)
+    indices = find_positions(s.scope, e, array, s.axes)
     rank = sum(isinstance(i, x.Whole) for i in e.indices) if e.indices else len(array.dims)
-    return Value(picked(s.arrays[e.name], indices, len(s.axes) + rank), rank)
+    return Value(take_elements(s.arrays[e.name], indices, len(s.axes) + rank), rank)
 
 
-class _View(NamedTuple):
-    """Indices as slices: what to take of each dimension, and the axis that each kept one is."""
+class _Slices(NamedTuple):
+    """Indices as slices of each dimension, and the result's axis of each dimension that remains."""
 
     slices: tuple[int | slice, ...]
     axes: list[int]
 
 
-def _view(indices: list[np.ndarray]) -> _View | None:
-    """Indices as slices, if each runs evenly along an axis of its own; None otherwise."""
+def _as_slices(indices: list[np.ndarray]) -> _Slices | None:
+    """Convert indices to slices if each varies evenly along an axis of its own, else None."""
     slices: list[int | slice] = []
     axes: list[int] = []
     for index in indices:
@@ -237,14 +243,14 @@ def _view(indices: list[np.ndarray]) -> _View | None:
             return None
         slices.append(slice(int(values[0]), int(values[-1]) + 1, step))
         axes.append(along[0])
-    return _View(tuple(slices), axes)
+    return _Slices(tuple(slices), axes)
 
 
-def picked(array: jax.Array, indices: list[np.ndarray], rank: int) -> jax.Array:
-    """Elements of an array by an index for each dimension, each of the same number of axes."""
+def take_elements(array: jax.Array, indices: list[np.ndarray], rank: int) -> jax.Array:
+    """Take elements of an array by an index for each dimension, all of the same rank."""
     if not indices:
         return jnp.reshape(array, (1,) * rank)
-    view = _view(indices)
+    view = _as_slices(indices)
     if view is None:
         return array[tuple(indices)]
     found = array[view.slices]
@@ -255,17 +261,19 @@ def picked(array: jax.Array, indices: list[np.ndarray], rank: int) -> jax.Array:
     return found.reshape(shape)
 
 
-def _placed(array: jax.Array, indices: list[np.ndarray], value: jax.Array, lengths: list[int]):
-    """The array with elements set, by an index for each dimension as in `picked`.
+def _set_elements(
+    array: jax.Array, indices: list[np.ndarray], value: jax.Array, lengths: list[int]
+):
+    """Set elements of an array by an index for each dimension, as in `take_elements`.
 
-    `value` has the axes of the indices, of length 1 where it is the same along one of `lengths`.
+    `value` has the axes of the indices, with `lengths`, or length 1 where it is constant.
     """
     if not indices:
         return jnp.reshape(value, ())
-    view = _view(indices)
+    view = _as_slices(indices)
     if view is None:
         return array.at[tuple(indices)].set(jnp.broadcast_to(value, lengths))
-    # Axes along which no index runs have one element.
+    # Axes along which no index varies have one element.
     shape = [n if k in view.axes else 1 for k, n in enumerate(lengths)]
     value = jnp.broadcast_to(value, shape).reshape([shape[k] for k in sorted(view.axes)])
     value = jnp.transpose(value, np.argsort(np.argsort(view.axes)))
@@ -275,19 +283,19 @@ def _placed(array: jax.Array, indices: list[np.ndarray], value: jax.Array, lengt
 
 
 def check_rank(scope: Scope, target: x.Name, array: Array, value: Value, e: x.Expression) -> None:
-    """Refuse a value of other dimensions than its target, and name what brings them in."""
-    wanted = len(whole_of(target, array))
+    """Raise an error for a value with other dimensions than its target, naming their origin."""
+    wanted = len(whole_dimensions(target, array))
     if value.rank in (0, wanted):
         return
-    said = f"{value.rank} dimension{'s' * (value.rank != 1)}"
+    dimensions = f"{value.rank} dimension{'s' * (value.rank != 1)}"
     whole = next((n for n in _names(e) if _is_whole(scope, n)), None)
     if wanted or whole is None:
         expected = f"{wanted or 'no'} dimension{'s' * (wanted != 1)} as in '{target}'"
-        raise error_at(e.at, f"'{e}' of {said}", expected)
+        raise error_at(e.at, f"'{e}' of {dimensions}", expected)
     array = scope.arrays[whole.name]
-    where = "" if whole is e else f" in a formula of {said}"
-    expected = f"a number for '{target}', such as an element of {array.said}"
-    count = len(whole_of(whole, array))
+    where = "" if whole is e else f" in a formula of {dimensions}"
+    expected = f"a number for '{target}', such as an element of {array.text}"
+    count = len(whole_dimensions(whole, array))
     found = f"'{whole}' of {count} dimension{'s' * (count != 1)}{where}"
     raise error_at(whole.at, found, expected)
 
@@ -301,18 +309,18 @@ def _names(e: x.Expression) -> Iterator[x.Name]:
 
 
 def _is_whole(scope: Scope, node: x.Name) -> bool:
-    return node.name in scope.arrays and bool(whole_of(node, scope.arrays[node.name]))
+    return node.name in scope.arrays and bool(whole_dimensions(node, scope.arrays[node.name]))
 
 
-def stored(
+def assign(
     old: jax.Array, scope: Scope, array: Array, target: x.Name, axes: Axes, value: Value, e
 ) -> jax.Array:
-    """An array with a value, that of the expression e, where a target says."""
-    indices = located(scope, target, array, axes)
-    whole = whole_of(target, array)
+    """Assign the value of expression e to the elements of an array that a target names."""
+    indices = find_positions(scope, target, array, axes)
+    whole = whole_dimensions(target, array)
     lengths = [*map(len, axes.values()), *map(len, whole)]
     if value.rank and value.array.shape[-value.rank :] != tuple(map(len, whole)):
         size = " x ".join(map(str, value.array.shape[-value.rank :]))
-        raise error_at(e.at, f"'{e}' of {size}", f"the size of {array.said}")
+        raise error_at(e.at, f"'{e}' of {size}", f"the size of {array.text}")
     filled = value.array.reshape(*value.array.shape, *[1] * (len(whole) - value.rank))
-    return _placed(old, indices, filled, lengths)
+    return _set_elements(old, indices, filled, lengths)

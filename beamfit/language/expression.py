@@ -1,4 +1,4 @@
-"""Expressions as data: what a formula says, where it stands, and how it is printed back."""
+"""Data classes of expressions, with their places in the document, and their text form."""
 
 from __future__ import annotations
 
@@ -8,18 +8,18 @@ from typing import NamedTuple
 
 from beamfit.errors import InputError
 
-# Most levels of a formula, which is walked by recursion; people write ten.
-MOST_LEVELS = 120
+# Largest depth of a formula, which is evaluated by recursion; those written by hand have about ten.
+MAX_LEVELS = 120
 REDUCTIONS = ("sum", "prod", "min", "max", "mean")
-ONE = """sin cos tan asin acos atan sinh cosh tanh asinh acosh atanh exp log log10 sqrt abs sign erf
-sigmoid transpose inverse det trace norm sum"""
-FUNCTIONS: dict[str, tuple[int, int]] = {name: (1, 1) for name in ONE.split()}
+UNARY = """sin cos tan asin acos atan sinh cosh tanh asinh acosh atanh exp log log10 sqrt abs sign
+erf sigmoid transpose inverse det trace norm sum"""
+FUNCTIONS: dict[str, tuple[int, int]] = {name: (1, 1) for name in UNARY.split()}
 FUNCTIONS |= {"atan2": (2, 2), "pow": (2, 2), "dot": (2, 2), "min": (1, 99), "max": (1, 99)}
-"""Built-in functions: least and most number of arguments."""
+"""Built-in functions with their smallest and largest numbers of arguments."""
 
 
 class Place(NamedTuple):
-    """Line and column, counted from 1."""
+    """Place in a document: line and column, counted from 1."""
 
     line: int | None = None
     column: int | None = None
@@ -27,8 +27,8 @@ class Place(NamedTuple):
     def __str__(self) -> str:
         return f"line {self.line}, column {self.column}"
 
-    def behind(self, text: str) -> Place:
-        """The place behind a text that begins here."""
+    def after(self, text: str) -> Place:
+        """Return the place after a text that begins here."""
         more = text.count("\n")
         column = len(text) - text.rfind("\n") if more else self.column + len(text)
         return Place(self.line + more, column)
@@ -39,13 +39,13 @@ NOWHERE = Place()
 
 @dataclass(frozen=True)
 class Placed:
-    """A part of a document: it stands somewhere, which does not make it another thing."""
+    """A part of a document with its place, which does not count in comparisons."""
 
     at: Place = field(default=NOWHERE, compare=False, repr=False, kw_only=True)
 
 
 def error_at(at: Place, found: str, expected: str) -> InputError:
-    """An error with its place in the document; who opened the file adds its name."""
+    """Make an error with its place in the document; the reader of the file adds its name."""
     return InputError(found, expected, line=at.line, column=at.column)
 
 
@@ -58,24 +58,24 @@ class Expression(Placed):
 
 @dataclass(frozen=True)
 class Literal(Expression):
-    """A number, kept as it was written."""
+    """A number, with the text as written."""
 
     text: str
 
     @property
     def value(self) -> float:
-        """The number."""
+        """Value of the number."""
         return float(self.text)
 
 
 @dataclass(frozen=True)
 class Whole(Expression):
-    """All elements along a dimension, written ``:`` in the place of an index."""
+    """All elements along a dimension, written ``:`` instead of an index."""
 
 
 @dataclass(frozen=True)
 class Name(Expression):
-    """A number, an array, or an element ``A[k, 9]`` of one; an iterator by its name."""
+    """Name of a number, array, or iterator, or an element ``A[k, 9]`` of an array."""
 
     name: str
     indices: tuple[Expression, ...] = ()
@@ -83,7 +83,7 @@ class Name(Expression):
 
 @dataclass(frozen=True)
 class Arithmetic(Expression):
-    """``+ - * / @ ^`` of two parts, or a sign of one."""
+    """Operation ``+ - * / @ ^`` on two parts, or the sign of one."""
 
     symbol: str
     parts: tuple[Expression, ...]
@@ -91,7 +91,7 @@ class Arithmetic(Expression):
 
 @dataclass(frozen=True)
 class Application(Expression):
-    """A function of arguments by position."""
+    """Application of a function to its arguments."""
 
     function: str
     arguments: tuple[Expression, ...]
@@ -99,7 +99,7 @@ class Application(Expression):
 
 @dataclass(frozen=True)
 class Elements(Expression):
-    """Elements of a set: start, stop and maybe step of a range, or one by one."""
+    """Elements of a set: start, stop and an optional step of a range, or a list."""
 
     parts: tuple[Expression, ...]
     ranged: bool = True
@@ -115,7 +115,7 @@ class Iterator(Expression):
 
 @dataclass(frozen=True)
 class Reduction(Expression):
-    """``sum(k in K | body)``, and prod, min, max, mean."""
+    """Reduction ``sum(k in K | body)``, likewise prod, min, max, mean."""
 
     kind: str
     iterators: tuple[Iterator, ...]
@@ -123,41 +123,41 @@ class Reduction(Expression):
 
 
 def children(e: Expression) -> tuple[Expression, ...]:
-    """The parts of an expression."""
+    """Return the parts of an expression."""
     values = (getattr(e, name) for name in e.__match_args__)
     each = (v if isinstance(v, tuple) else (v,) for v in values)
     return tuple(part for parts in each for part in parts if isinstance(part, Expression))
 
 
 def check_depth(e: Expression) -> Expression:
-    """Refuse an expression too deep to walk by recursion."""
+    """Raise an error for an expression that is too deep for recursion."""
     level: Walk | list = [e]
-    for _ in range(MOST_LEVELS):
+    for _ in range(MAX_LEVELS):
         level = [part for one in level for part in children(one)]
         if not level:
             return e
-    expected = f"at most {MOST_LEVELS}; split it with local variables, or write sum(k in K | ...)"
-    raise error_at(e.at, f"an expression of more than {MOST_LEVELS} levels", expected)
+    expected = f"at most {MAX_LEVELS}; split it with local variables, or write sum(k in K | ...)"
+    raise error_at(e.at, f"an expression of more than {MAX_LEVELS} levels", expected)
 
 
-LEVELS = {"+": 1, "-": 1, "*": 2, "/": 2, "@": 2, "^": 4}
-# Binding strength of a sign and of an atom, between those of the operators.
+PRECEDENCE = {"+": 1, "-": 1, "*": 2, "/": 2, "@": 2, "^": 4}
+# Precedence of a sign and of an atom, on the scale of the operators' in `PRECEDENCE`.
 SIGN, ATOM = 3, 5
 
 
-def _level(e: Expression) -> int:
+def _precedence(e: Expression) -> int:
     if not isinstance(e, Arithmetic):
         return ATOM
-    return SIGN if len(e.parts) == 1 else LEVELS[e.symbol]
+    return SIGN if len(e.parts) == 1 else PRECEDENCE[e.symbol]
 
 
-def _inside(e: Expression, least: int) -> str:
-    """The text of a part, in parentheses where it binds less than so much."""
-    return text_of(e) if _level(e) >= least else f"({text_of(e)})"
+def _part_text(e: Expression, least: int) -> str:
+    """Print a part, in parentheses if its precedence is below `least`."""
+    return text_of(e) if _precedence(e) >= least else f"({text_of(e)})"
 
 
 def text_of(e: Expression) -> str:
-    """Print an expression, with the parentheses it needs."""
+    """Print an expression with the necessary parentheses."""
     match e:
         case Literal():
             return e.text
@@ -179,16 +179,17 @@ def text_of(e: Expression) -> str:
 
 
 def _operation_text(e: Arithmetic) -> str:
+    """Print an operation; ^ binds to the right, the others to the left."""
     if len(e.parts) == 1:
-        return e.symbol + _inside(e.parts[0], SIGN)
+        return e.symbol + _part_text(e.parts[0], SIGN)
     left, right = e.parts
     if e.symbol == "^":
-        return f"{_inside(left, ATOM)}^{_inside(right, SIGN)}"
-    own = LEVELS[e.symbol]
+        return f"{_part_text(left, ATOM)}^{_part_text(right, SIGN)}"
+    own = PRECEDENCE[e.symbol]
     space = " " if own == 1 else ""
-    return f"{_inside(left, own)}{space}{e.symbol}{space}{_inside(right, own + 1)}"
+    return f"{_part_text(left, own)}{space}{e.symbol}{space}{_part_text(right, own + 1)}"
 
 
 def iterators_text(iterators: tuple[Iterator, ...]) -> str:
-    """Print iterators as they stand after foreach."""
+    """Print iterators as written after foreach."""
     return ", ".join(map(text_of, iterators))

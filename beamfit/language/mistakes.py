@@ -1,4 +1,4 @@
-"""Mistakes in the text of a document, in words: place, culprit, remedy."""
+"""Error messages for mistakes in the text of a document: place, wrong word, remedy."""
 
 from __future__ import annotations
 
@@ -13,14 +13,18 @@ from lark.exceptions import UnexpectedCharacters, UnexpectedToken
 from beamfit.errors import InputError
 from beamfit.language.expression import FUNCTIONS, Place, error_at
 
-# Most open brackets, and most letters of a wrong word in a message.
-MOST_OPEN, LONGEST = 60, 30
+# Largest number of nested brackets.
+MAX_OPEN = 60
+# Largest number of letters of a wrong word in a message.
+MAX_LETTERS = 30
+# Comments and quoted texts, or an opening bracket, a closing one, a comment that does not end.
 BRACKET = re.compile(
     r"#[^\n]*|//[^\n]*|/\*.*?\*/|\"(?:\\.|[^\"\\\n])*\"|([(\[{])|([)\]}])|(/\*)", re.DOTALL
 )
-# Signs of other languages, of mathematics and of units, and this one's.
+# Superscript digits.
 POWERS = "²³¹⁰⁴-⁹"
 CONDITIONS = "no conditions; abs, sign, min(a, b) and max(a, b) are there"
+# Patterns of signs of other languages, mathematics and units, with the remedy in this language.
 SIGNS = {
     r"(?<=\d),(?=\d)": "a point before decimals",
     r"\*\*": "'^' for powers",
@@ -49,7 +53,7 @@ SIGNS = {
     "'": "a name without an apostrophe, or transpose(...)",
     "[“”„‘’]": 'straight quotes, "..."',
 }
-# Words of other languages, and what this one begins so.
+# Words of other languages, and the keyword of this one.
 WORDS = {
     "for": "foreach", "while": "foreach", "loop": "foreach", "subject": "constraint",
     "st": "constraint", "limit": "constraint", "var": "variable", "param": "parameter",
@@ -57,11 +61,10 @@ WORDS = {
     "objective": "minimize", "let": "real", "double": "real", "float": "real", "int": "real",
     "import": "table", "data": "table", "model": "mapping", "range": "set",
 }  # fmt: skip
-STARTS = """minimize maximize variable constraint solver mapping table network input output
-parameter set real function foreach forall layer connection gain in random seed weight"""
-KEYWORDS = STARTS.split()
+KEYWORDS = """minimize maximize variable constraint solver mapping table network input output
+parameter set real function foreach forall layer connection gain in random seed weight""".split()  # noqa: SIM905
 CLOSING = {"(": ")", "[": "]", "{": "}"}
-SAID = {
+TOKEN_TEXT = {
     "NAME": "a name", "NUMBER": "a number", "SIGNED": "a number", "STRING": "a text in quotes",
     "ADD": "an operator", "MULTIPLY": "an operator", "POWER": "an operator", "SEMICOLON": "';'",
     "COLON": "':'", "COMMA": "','", "LPAR": "'('", "RPAR": "')'", "LSQB": "'['", "RSQB": "']'",
@@ -72,7 +75,7 @@ SAID = {
 
 
 def check_brackets(text: str) -> None:
-    """Refuse brackets that a parser could not follow, and name the one that is not closed."""
+    """Raise an error for brackets that do not match or are nested too deep."""
     opened = []
     for match in BRACKET.finditer(text):
         if match[1]:
@@ -88,8 +91,8 @@ def check_brackets(text: str) -> None:
         elif match[3]:
             at = _at(text, match.start())
             raise error_at(at, "'/*', a comment that does not end", "'*/' behind it")
-        if len(opened) > MOST_OPEN:
-            found = f"more than {MOST_OPEN} brackets within each other"
+        if len(opened) > MAX_OPEN:
+            found = f"more than {MAX_OPEN} brackets within each other"
             raise error_at(_at(text, match.start()), found, "fewer")
     if opened:
         at, last = _at(text, opened[-1].start()), opened[-1][0]
@@ -97,73 +100,77 @@ def check_brackets(text: str) -> None:
 
 
 def _at(text: str, position: int) -> Place:
-    return Place(1, 1).behind(text[:position])
+    return Place(1, 1).after(text[:position])
 
 
-def explained(error: UnexpectedCharacters | UnexpectedToken, text: str) -> InputError:
-    """Say where the text stops making sense, what stands there, and what could."""
-    at, odd_at = Place(error.line, error.column), error.pos_in_stream or 0
-    if known := _sign(text, odd_at) or _reduction(text, odd_at):
-        return known
+def explain(error: UnexpectedCharacters | UnexpectedToken, text: str) -> InputError:
+    """Make the error for a text that does not parse: place, wrong word and what is expected."""
+    at, position = Place(error.line, error.column), error.pos_in_stream or 0
+    if error_found := _foreign_sign(text, position) or _foreign_sum(text, position):
+        return error_found
     if isinstance(error, UnexpectedCharacters):
-        # What is allowed is of any place where a word of that kind may stand.
-        names = {SAID.get(name) for name in error.allowed or ()}
+        # The parser allows all tokens of any such place: reduce them to the useful ones.
+        names = {TOKEN_TEXT.get(name) for name in error.allowed or ()}
         expected = _choices(error.allowed or ())
         if "an operator" in names:
             ends = "a number, a name, '(' or a function"
             expected = ends if "a number" in names else "an operator, or the end of the formula"
-        return error_at(at, f"{text[odd_at]!r}", expected)
+        return error_at(at, f"{text[position]!r}", expected)
     word, accepted = str(error.token), set(error.accepts or error.expected)
     before = error.token_history[-1] if error.token_history else None
-    if hint := _misspelt(before, error.token, accepted):
+    if hint := _misspelling(before, error.token, accepted):
         return hint
     ended = error.token.type == "$END" or (before is not None and before.line < error.token.line)
     if "SEMICOLON" in accepted and ended:
-        behind = _at(text, len(text.rstrip()))
-        behind = behind if before is None else Place(before.end_line, before.end_column)
-        said = "" if before is None else f" behind '{short(before)}'"
-        return error_at(behind, f"no ';'{said}", "';' at the end of a statement")
+        end = _at(text, len(text.rstrip()))
+        end = end if before is None else Place(before.end_line, before.end_column)
+        where = "" if before is None else f" behind '{shorten(before)}'"
+        return error_at(end, f"no ';'{where}", "';' at the end of a statement")
     if error.token.type == "$END":
         at = Place(before.end_line, before.end_column) if before is not None else at
         return error_at(at, "the end of the text", _choices(accepted))
-    known = _habit(before, error.token, accepted, text) if before is not None else None
-    return known or error_at(at, f"'{short(word)}'", _choices(accepted))
+    error_found = (
+        _foreign_habit(before, error.token, accepted, text) if before is not None else None
+    )
+    return error_found or error_at(at, f"'{shorten(word)}'", _choices(accepted))
 
 
-def _sign(text: str, odd_at: int) -> InputError | None:
-    """Error for a sign of another language at a place or from the letter before it; or None."""
-    for start in (odd_at, max(odd_at - 1, 0)):
+def _foreign_sign(text: str, position: int) -> InputError | None:
+    """Make the error for a sign of another language at a position or the one before, or None."""
+    for start in (position, max(position - 1, 0)):
         for sign, wanted in SIGNS.items():
             if found := re.compile(sign).match(text, start):
                 return error_at(_at(text, start), f"'{found[0]}'", wanted)
     return None
 
 
-def _reduction(text: str, odd_at: int) -> InputError | None:
-    """Error for a sum that is written as in another language, or None."""
-    before = text[:odd_at]
+def _foreign_sum(text: str, position: int) -> InputError | None:
+    """Make the error for a sum written as in another language, or None."""
+    before = text[:position]
     named = r"\b(sum|prod|min|max|mean)\s*\(\s*\w+\s+in\s+\w+\s*"
-    comma = re.search(named + r"(?:(,)\s*\w*\s*[^\w\s|;][^|;]*|(:))$", text[: odd_at + 1])
+    comma = re.search(named + r"(?:(,)\s*\w*\s*[^\w\s|;][^|;]*|(:))$", text[: position + 1])
     if comma:
         wanted = f"'|' behind the set: {comma[1]}(k in K | ...)"
         sign = 2 if comma[2] else 3
         return error_at(_at(text, comma.start(sign)), f"'{comma[sign]}'", wanted)
     opened = before.rfind(";") + 1
-    if re.match(r"for\b", text[odd_at:]) and re.search(r"\b(sum|prod|mean)\s*\(", before[opened:]):
-        return error_at(_at(text, odd_at), "'for'", "the iterator first: sum(k in K | ...)")
+    if re.match(r"for\b", text[position:]) and re.search(
+        r"\b(sum|prod|mean)\s*\(", before[opened:]
+    ):
+        return error_at(_at(text, position), "'for'", "the iterator first: sum(k in K | ...)")
     return None
 
 
 STARTING = {"LPAR", "EQUAL", "LSQB"}
 OPERATORS = ("ADD", "MULTIPLY", "POWER")
-PLAIN = "a number; a formula needs a statement of its own, NAME = FORMULA;"
-# Habits of other languages: whether a token, behind another, is one where these are accepted; what
-# is expected then. The culprit is the token, or the one before it where so marked.
+NUMBER_ONLY = "a number; a formula needs a statement of its own, NAME = FORMULA;"
+# Habits of other languages. Each has a condition on the token before, the token, and the accepted
+# kinds of token; the text of what is expected; True if the wrong token is the one before.
 HABITS: tuple[tuple[Callable[[Token, Token, set[str]], Any], str, bool], ...] = (
     (lambda b, t, a: b in ("if", "not"), CONDITIONS, True),
     (lambda b, t, a: t in ("and", "or", "then", "else"), CONDITIONS, False),
-    (lambda b, t, a: b.type == "SIGNED" and t.type in OPERATORS, PLAIN, False),
-    (lambda b, t, a: "SIGNED" in a and t.type == "NAME", PLAIN, False),
+    (lambda b, t, a: b.type == "SIGNED" and t.type in OPERATORS, NUMBER_ONLY, False),
+    (lambda b, t, a: "SIGNED" in a and t.type == "NAME", NUMBER_ONLY, False),
     (lambda b, t, a: b in ("constraint", "minimize", "maximize") and t.type == "COLON",
      "a name right behind it", False),
     (lambda b, t, a: b in ("constraint", "minimize", "maximize")
@@ -207,37 +214,37 @@ HABITS: tuple[tuple[Callable[[Token, Token, set[str]], Any], str, bool], ...] = 
 )  # fmt: skip
 
 
-def _habit(before: Token, token: Token, accepted: set[str], text: str) -> InputError | None:
-    """Error for a habit of other languages: formulas as limits, |x|, units, products; or None."""
+def _foreign_habit(before: Token, token: Token, accepted: set[str], text: str) -> InputError | None:
+    """Make the error for a habit of other languages (formulas as limits, |x|, units), or None."""
     for is_one, wanted, earlier in HABITS:
         if is_one(before, token, accepted):
-            odd = before if earlier else token
+            wrong = before if earlier else token
             pair = " between them" in wanted
-            found = f"'{short(odd)}'" + (f" behind '{short(before)}'" if pair else "")
-            return error_at(Place(odd.line, odd.column), found, wanted)
+            found = f"'{shorten(wrong)}'" + (f" behind '{shorten(before)}'" if pair else "")
+            return error_at(Place(wrong.line, wrong.column), found, wanted)
     return None
 
 
-def _misspelt(before: Token | None, token: Token, accepted: set[str]) -> InputError | None:
-    """A word that is nearly a keyword: the one that surprises, or the one before it."""
+def _misspelling(before: Token | None, token: Token, accepted: set[str]) -> InputError | None:
+    """Make the error for a misspelt keyword: the unexpected word or the one before it, or None."""
     words = {name.lower().lstrip("_") for name in accepted} & set(KEYWORDS)
-    close = _near(token, words)
+    close = _closest_keyword(token, words)
     if token.type == "NAME" and close:
-        return error_at(Place(token.line, token.column), f"'{short(token)}'",
+        return error_at(Place(token.line, token.column), f"'{shorten(token)}'",
                         f"{_choices(accepted)} (did you mean {close}?)")  # fmt: skip
     if before is None or before.type != "NAME" or str(before) in KEYWORDS:
         return None
     at = Place(before.line, before.column)
     if token.type == "_IN" or (token.type == "NAME" and "_IN" in accepted):
         return None
-    close = _near(before, KEYWORDS)
+    close = _closest_keyword(before, KEYWORDS)
     if token.type in ("NAME", "STRING") and close:
-        return error_at(at, f"'{short(before)}'", f"a statement (did you mean {close}?)")
+        return error_at(at, f"'{shorten(before)}'", f"a statement (did you mean {close}?)")
     return None
 
 
-def _near(word: str, keywords: Iterable[str]) -> str | None:
-    """The keyword that another language's word or a mistyped one stands for, if there is one."""
+def _closest_keyword(word: str, keywords: Iterable[str]) -> str | None:
+    """Find the keyword meant by a misspelt word or one of another language, or None."""
     word = str(word).lower()
     if WORDS.get(word) in keywords:
         return WORDS[word]
@@ -246,13 +253,13 @@ def _near(word: str, keywords: Iterable[str]) -> str | None:
 
 
 def _choices(accepted: Any) -> str:
-    """Accepted tokens in words."""
-    said = {SAID.get(name, name.lower()) for name in accepted}
-    if {"real", "set", "a name"} <= said:
+    """Describe the accepted tokens."""
+    texts = {TOKEN_TEXT.get(name, name.lower()) for name in accepted}
+    if {"real", "set", "a name"} <= texts:
         return "a statement"
-    return " or ".join(filter(None, [", ".join(sorted(said)[:-1]), *sorted(said)[-1:]]))
+    return " or ".join(filter(None, [", ".join(sorted(texts)[:-1]), *sorted(texts)[-1:]]))
 
 
-def short(word: str) -> str:
-    """A word as a message shows it."""
-    return word if len(word) <= LONGEST else word[:LONGEST] + "..."
+def shorten(word: str) -> str:
+    """Shorten a long word for a message."""
+    return word if len(word) <= MAX_LETTERS else word[:MAX_LETTERS] + "..."

@@ -1,7 +1,7 @@
-"""The report's XML form of a multi-layer perceptron (report 3.1.3): text to network and back.
+"""Reader and writer of the report's XML form of a multi-layer perceptron (report 3.1.3).
 
-Attributes of the report are kept. Three are beamfit's own: ``lower`` and ``upper`` on an input (the
-range over which certified gains hold) and ``cells`` on a gain.
+Attributes are those of the report and three extensions: ``lower`` and ``upper`` of an input (the
+range over which certified gains hold) and ``cells`` of a gain.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from beamfit.language import document as d
 from beamfit.language.expression import error_at
 from beamfit.language.xml import MLP_CLASS, Node, read_elements
 
-# Attributes of a port that are numbers, and what they are where nothing is said.
+# Numeric attributes of a port, with their defaults.
 NUMBERS = {name: value for name, value in Port._field_defaults.items() if name != "node"}
 
 
@@ -31,7 +31,7 @@ def parse_network(text: str, path: str | os.PathLike[str] | None = None) -> MLP:
     text : str
         A ``<mapping>`` element with layers, connections, inputs, outputs and gains.
     path : path, optional
-        Where the text comes from, for messages.
+        File of the text, for messages.
 
     Returns
     -------
@@ -40,7 +40,7 @@ def parse_network(text: str, path: str | os.PathLike[str] | None = None) -> MLP:
     Raises
     ------
     InputError
-        If it is not such a document, with the line where the XML itself breaks.
+        If it is not such a document; with the line of an error in the XML.
 
     Examples
     --------
@@ -64,11 +64,11 @@ def parse_network(text: str, path: str | os.PathLike[str] | None = None) -> MLP:
 
 
 def network_from(element: Node) -> MLP:
-    """Read a network from its ``<mapping>`` element, as when it stands inside another document.
+    """Read a network from its ``<mapping>`` element, which may be part of another document.
 
-    A layer without a ``bias`` attribute has biases unless it is an identity: Appendix B's 22
-    weights for 1-5-2 need them, and its layers do not say. Inputs and outputs without ``node`` take
-    the nodes of their layer in turn.
+    A layer without a ``bias`` attribute has biases unless it is an identity: the 22 weights of the
+    1-5-2 network of Appendix B include biases, but its layers have no such attribute. Inputs and
+    outputs without ``node`` take the nodes of their layer in turn.
 
     Parameters
     ----------
@@ -104,14 +104,14 @@ def network_from(element: Node) -> MLP:
 
 
 def format_network(net: MLP, name: str = "mlp") -> str:
-    """Write a network as XML text; numbers survive exactly.
+    """Write a network as XML text; numbers are kept exactly.
 
     Parameters
     ----------
     net : MLP
         The network.
     name : str
-        The mapping's name.
+        Name of the mapping.
 
     Returns
     -------
@@ -130,10 +130,10 @@ def format_network(net: MLP, name: str = "mlp") -> str:
             for field, default in NUMBERS.items():
                 if (value := getattr(port, field)) != default:
                     e.set(field, repr(float(value)))
-    for asked in net.gains:
-        by = dict(zip(("da", "db", "dc"), asked.by, strict=False))
-        e = Plain.SubElement(root, "gain", name=asked.name, order=str(len(asked.by)))
-        e.attrib |= {"type": asked.kind, "dy": asked.output, **by, "cells": str(asked.cells)}
+    for gain in net.gains:
+        by = dict(zip(("da", "db", "dc"), gain.by, strict=False))
+        e = Plain.SubElement(root, "gain", name=gain.name, order=str(len(gain.by)))
+        e.attrib |= {"type": gain.kind, "dy": gain.output, **by, "cells": str(gain.cells)}
     for layer in net.layers:
         bias = str(layer.bias).lower()
         e = Plain.SubElement(
@@ -169,9 +169,9 @@ def network_of(n: d.NetworkDefinition) -> MLP:
 
 
 def weight_leaves(net: MLP) -> tuple[tree.Leaf, ...]:
-    """The numbers of a network: weights of each connection, row by row, then biases.
+    """Return the numbers of a network: weights of each connection, row by row, then biases.
 
-    Connections and layers stand in the order of the document.
+    Connections and layers are in the order of the document.
     """
     paths = [f"weights.{connection(*pair)}" for pair in net.connections]
     paths += [f"biases.{layer.name}" for layer in net.layers if layer.bias]
@@ -179,16 +179,16 @@ def weight_leaves(net: MLP) -> tuple[tree.Leaf, ...]:
 
 
 def _layer(e: Node) -> Layer:
-    """A layer from its element."""
+    """Read a layer."""
     kind = e.need("type")
-    bias = e.given.get("bias", "false" if kind == "identity" else "true").strip().lower()
+    bias = e.attributes.get("bias", "false" if kind == "identity" else "true").strip().lower()
     if bias not in ("true", "false"):
         raise e.error(f"bias='{bias}' in <layer>", "true or false", "bias")
     return Layer(e.need("name"), kind, e.number("size", 1, int), bias == "true")
 
 
 def _ports(elements: list[Node]) -> list[Port]:
-    """Ports in the order of their elements; without ``node`` they take the nodes in turn."""
+    """Read ports; those without ``node`` take the nodes in turn."""
     used: Counter[str] = Counter()
     ports = []
     for e in elements:
@@ -201,16 +201,16 @@ def _ports(elements: list[Node]) -> list[Port]:
 
 
 def _gain(e: Node) -> NetworkGain:
-    """A gain from its element."""
+    """Read a gain."""
     order = e.number("order", 1, int)
     if not 1 <= order <= 3:
-        raise e.error(f"order {order} of the gain '{e.given.get('name', '')}'", "1, 2 or 3")
+        raise e.error(f"order {order} of the gain '{e.attributes.get('name', '')}'", "1, 2 or 3")
     by = tuple(e.need(key) for key in ("da", "db", "dc")[:order])
-    kind = e.given.get("type", "local")
+    kind = e.attributes.get("type", "local")
     return NetworkGain(e.need("name"), e.need("dy"), by, kind, e.number("cells", 64, int))
 
 
 def _text(values) -> str:
-    """Numbers as text that reads back to the same floats, one row a line."""
+    """Write numbers that read back to the same floats, one row a line."""
     rows = np.atleast_2d(np.asarray(values))
     return ",\n".join(", ".join(repr(float(v)) for v in row) for row in rows)

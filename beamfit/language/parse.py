@@ -1,4 +1,4 @@
-"""Text to documents and statements, and what is wrong with a text in words."""
+"""Parser of the text form of documents and statements."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from beamfit.errors import nearest
 from beamfit.language import document as d
 from beamfit.language import expression as x
 from beamfit.language.expression import Place, error_at
-from beamfit.language.mistakes import check_brackets, explained, short
+from beamfit.language.mistakes import check_brackets, explain, shorten
 
 
 @lru_cache(maxsize=64)
@@ -26,7 +26,7 @@ def parse_document(text: str) -> d.Document:
     Parameters
     ----------
     text : str
-        As a ``.bf`` file has it.
+        Content of a ``.bf`` file.
 
     Returns
     -------
@@ -35,7 +35,7 @@ def parse_document(text: str) -> d.Document:
     Raises
     ------
     InputError
-        With line and column, if it is not in the language.
+        With line and column, if the text is not in the language.
 
     Examples
     --------
@@ -43,7 +43,7 @@ def parse_document(text: str) -> d.Document:
     >>> found.problem.variables[0].upper, str(found.mapping.statements[0].value)
     (1.0, 'x^2')
     """
-    return _parsed(text, "document")
+    return _parse(text, "document")
 
 
 def parse_statements(text: str) -> tuple[d.Statement, ...]:
@@ -52,14 +52,14 @@ def parse_statements(text: str) -> tuple[d.Statement, ...]:
     Raises
     ------
     InputError
-        With line and column, if they are not in the language.
+        With line and column, if the text is not in the language.
 
     Examples
     --------
     >>> [type(s).__name__ for s in parse_statements("set K = |1:3|; real A[K];")]
     ['IndexedSet', 'Real']
     """
-    return tuple(_parsed(text, "statements"))
+    return tuple(_parse(text, "statements"))
 
 
 @lru_cache
@@ -69,16 +69,16 @@ def _grammar() -> Lark:
                 maybe_placeholders=True)  # fmt: skip
 
 
-def _parsed(text: str, start: str) -> Any:
+def _parse(text: str, start: str) -> Any:
     check_brackets(text)
     try:
         return _grammar().parse(text, start)
     except UnexpectedInput as error:
-        raise explained(error, text) from None
+        raise explain(error, text) from None
 
 
 def _place(children: list[Any]) -> Place:
-    """Place of the first of some parts."""
+    """Return the place of the first part that has one."""
     first = next(c for c in children if isinstance(c, Token) or getattr(c, "at", None))
     return Place(first.line, first.column) if isinstance(first, Token) else first.at
 
@@ -86,29 +86,33 @@ def _place(children: list[Any]) -> Place:
 def _number(token: Token) -> float:
     value = float(token)
     if math.isinf(value) and "inf" not in token:
-        raise error_at(Place(token.line, token.column), f"'{short(token)}'", "a number below 1e308")
+        raise error_at(
+            Place(token.line, token.column), f"'{shorten(token)}'", "a number below 1e308"
+        )
     return value
 
 
-def _count(token: Token | None, least: int = 0) -> int | None:
+def _whole_number(token: Token | None, least: int = 0) -> int | None:
     if token is None:
         return None
     if not token.isdigit() or not least <= (value := int(token[:12])) < 10**9:
         expected = f"a whole number from {least} to a thousand million"
-        raise error_at(Place(token.line, token.column), f"'{short(token)}'", expected)
+        raise error_at(Place(token.line, token.column), f"'{shorten(token)}'", expected)
     return value
 
 
 class _Builder(Transformer):
-    """Rules of the grammar to the values they stand for."""
+    """Builds the document from the rules of the grammar, one method for each."""
 
     def STRING(self, token):
-        """Content of a quoted text, with its place."""
+        """Return the content of a quoted text, with its place."""
         try:
             return token.update(value=json.loads(token))
         except ValueError:
             at = Place(token.line, token.column)
-            raise error_at(at, f"{short(token)}", 'a text; a backslash is written "\\\\"') from None
+            raise error_at(
+                at, f"{shorten(token)}", 'a text; a backslash is written "\\\\"'
+            ) from None
 
     # expressions
 
@@ -156,7 +160,7 @@ class _Builder(Transformer):
         return [d.IndexedSet(str(c[1]), c[2], at=_place(c[1:]))]
 
     def dimensions(self, c):
-        return tuple(_count(t, 1) if t.type == "NUMBER" else str(t) for t in c)
+        return tuple(_whole_number(t, 1) if t.type == "NUMBER" else str(t) for t in c)
 
     def real(self, c):
         if c[2] is not None:
@@ -203,7 +207,7 @@ class _Builder(Transformer):
         return tuple(_number(t) for t in c if t is not None)
 
     def table(self, c):
-        size = _count(c[3], 1), _count(c[4], 1)
+        size = _whole_number(c[3], 1), _whole_number(c[4], 1)
         return "tables", d.DataTable(str(c[1]), str(c[2]), *size, at=_place(c[1:]))
 
     def attribute(self, c):
@@ -229,7 +233,7 @@ class _Builder(Transformer):
         return "titles", str(c[1])
 
     def mapping(self, c):
-        return "mappings", _mapping(str(c[1]), _gathered(c[2:]), at=_place(c[1:]))
+        return "mappings", _mapping(str(c[1]), _group(c[2:]), at=_place(c[1:]))
 
     # the problem
 
@@ -249,7 +253,7 @@ class _Builder(Transformer):
         _, name, value, bounds, _, random, _, seed = c
         value = None if value is None else _number(value)
         low, high = bounds or (-math.inf, math.inf)
-        start = value, random, _count(seed) or 0
+        start = value, random, _whole_number(seed) or 0
         return "variables", d.FreeInput(name.label, name.model, low, high, *start, at=name.at)
 
     def limit(self, c):
@@ -260,7 +264,7 @@ class _Builder(Transformer):
         return "solvers", d.Solver(c[1], tuple(s for s in c[2:] if s is not None), at=_place(c))
 
     def document(self, c):
-        found = _gathered(c)
+        found = _group(c)
         words = {word.lower() for word, _ in found["goals"]}
         if len(words) > 1:
             at = found["goals"][1][1].at
@@ -276,12 +280,12 @@ class _Builder(Transformer):
         return d.Document(mapping, problem, (found["solvers"] or [None])[0])
 
 
-def _gathered(items: list[Any]) -> dict[str, list[Any]]:
-    """Members by their kind, in order; those without one are statements."""
+def _group(items: list[Any]) -> dict[str, list[Any]]:
+    """Group members by kind, in order; those without a kind are statements."""
     found: dict[str, list[Any]] = defaultdict(list)
     for item in items:
-        kind, what = item if isinstance(item, tuple) else ("statements", item)
-        found[kind] += what if isinstance(what, list) else [what]
+        kind, member = item if isinstance(item, tuple) else ("statements", item)
+        found[kind] += member if isinstance(member, list) else [member]
     return found
 
 

@@ -1,6 +1,7 @@
-"""Order in which the steps of a mapping are computed, from the elements each defines and needs.
+"""Order of computation of a mapping's steps, from the elements that each defines and needs.
 
-Statements that need their own earlier values advance together along an index.
+Statements that need earlier values of themselves are computed together, step by step along an
+index called time (a recurrence).
 """
 
 from __future__ import annotations
@@ -23,43 +24,45 @@ from beamfit.language.expression import error_at
 from beamfit.language.scope import (
     Array,
     Axes,
+    CalledNetwork,
     MappingStep,
-    Net,
     Read,
     Scope,
+    add_iterators,
     check_problem,
-    located,
+    find_positions,
     reads,
     scope_of,
-    whole_of,
-    widened,
+    whole_dimensions,
 )
 
 # Owner of an element that no statement defines.
-NOBODY = -1
-# Most names shown in the message about a loop.
-MOST_NAMED = 8
-# Limits of a mapping: elements of all statements together, and statements.
-MOST_WORK, MOST_STEPS = 60_000_000, 5_000
-# Most combinations of time indices, one for each statement of a loop, that are tried; and
-# statements from which its cycle is sought.
-MOST_TRIED = 64
+NO_OWNER = -1
+# Largest number of names in the message about a loop.
+MAX_NAMED = 8
+# Largest number of elements of all statements of a mapping: about a minute of checks.
+MAX_TOTAL_ELEMENTS = 60_000_000
+# Largest number of statements of a mapping.
+MAX_STEPS = 5_000
+# Largest number of combinations of time indices that are tried for the statements of a recurrence,
+# and of statements from which the cycle of a loop is sought.
+MAX_TRIED = 64
 
 
-# ---- what steps write, read and call
+# ---- arrays that steps write and read, mappings that they call
 
 
-def callee_of(scope: Scope, call: d.Call) -> Scope | Net:
-    """Find what a call calls, and check the names on both sides."""
+def callee_of(scope: Scope, call: d.Call) -> Scope | CalledNetwork:
+    """Find the mapping or network of a call, and check the names of its inputs and outputs."""
     callee = scope.callees.get(call.mapping)
     if callee is None:
-        known = nearest(call.mapping, list(scope.callees))
-        raise error_at(call.at, f"unknown mapping '{call.mapping}'", known)
+        suggestion = nearest(call.mapping, list(scope.callees))
+        raise error_at(call.at, f"unknown mapping '{call.mapping}'", suggestion)
     for wire in call.inputs:
         if wire.target.name not in callee.inputs:
-            known = nearest(wire.target.name, list(callee.inputs))
+            suggestion = nearest(wire.target.name, list(callee.inputs))
             found = f"unknown input '{wire.target.name}' of {call.mapping}"
-            raise error_at(wire.target.at, found, known)
+            raise error_at(wire.target.at, found, suggestion)
     given = [w.target.name for w in call.inputs if not w.target.indices]
     for name, wanted in callee.inputs.items():
         if wanted.values is None and name not in [w.target.name for w in call.inputs]:
@@ -75,9 +78,9 @@ def callee_of(scope: Scope, call: d.Call) -> Scope | Net:
 
 
 def gains_of(
-    wire: d.Assignment, callee: Scope | Net, label: str
+    wire: d.Assignment, callee: Scope | CalledNetwork, label: str
 ) -> tuple[x.Name, tuple[x.Name, ...]]:
-    """The output behind a wire, and the inputs by which it is differentiated: `gain(y, x)`."""
+    """Return the output of a call's wire, and the inputs of its derivative `gain(y, x)`."""
     names = (wire.value,)
     if isinstance(wire.value, x.Application) and wire.value.function == "gain":
         names = wire.value.arguments
@@ -86,160 +89,165 @@ def gains_of(
         at = (wrong or [wire.value])[0].at
         raise error_at(at, f"'{wire.value}'", f"an output of {label}, or gain(output, input)")
     faces = [callee.outputs, *[callee.inputs] * (len(names) - 1)]
-    for e, face, what in zip(names, faces, ["output", *["input"] * (len(names) - 1)], strict=True):
+    for e, face, kind in zip(names, faces, ["output", *["input"] * (len(names) - 1)], strict=True):
         if e.name not in face:
-            known = nearest(e.name, list(face))
-            raise error_at(e.at, f"unknown {what} '{e.name}' of {label}", known)
+            suggestion = nearest(e.name, list(face))
+            raise error_at(e.at, f"unknown {kind} '{e.name}' of {label}", suggestion)
     return names[0], names[1:]
 
 
 def targets(scope: Scope, step: MappingStep) -> list[tuple[x.Name, Axes]]:
-    """Names that a step writes, with the iterators in force there."""
-    if isinstance(step.what, d.Assignment):
-        return [(step.what.target, step.axes)]
-    return [(w.target, widened(scope, step.axes, w.each)) for w in step.what.outputs]
+    """Return the names that a step writes, with the iterators active there."""
+    if isinstance(step.statement, d.Assignment):
+        return [(step.statement.target, step.axes)]
+    return [(w.target, add_iterators(scope, step.axes, w.each)) for w in step.statement.outputs]
 
 
 def sources(scope: Scope, step: MappingStep) -> list[tuple[x.Expression, Axes]]:
-    """Expressions that a step reads, with the iterators in force there."""
-    if isinstance(step.what, d.Assignment):
-        return [(step.what.value, step.axes)]
-    return [(w.value, widened(scope, step.axes, w.each)) for w in step.what.inputs]
+    """Return the expressions that a step reads, with the iterators active there."""
+    if isinstance(step.statement, d.Assignment):
+        return [(step.statement.value, step.axes)]
+    return [(w.value, add_iterators(scope, step.axes, w.each)) for w in step.statement.inputs]
 
 
-def written(scope: Scope, node: x.Name, axes: Axes) -> Read:
-    """The elements a target writes; it must be an output or a local variable."""
+def target_elements(scope: Scope, node: x.Name, axes: Axes) -> Read:
+    """Find the elements that a target writes; it must be an output or a local variable."""
     found = scope.arrays.get(node.name)
     if found is None or found.role not in ("output", "real"):
         free = [a.name for a in scope.arrays.values() if a.role in ("output", "real")]
-        known = nearest(node.name, free)
+        suggestion = nearest(node.name, free)
         if found is None:
-            raise error_at(node.at, f"unknown name '{node.name}'", f"{known}, or real {node.name};")
-        raise error_at(node.at, f"{found.role} '{node.name}' set by a statement", known)
-    return Read(found, node, axes, located(scope, node, found, axes))
+            raise error_at(
+                node.at, f"unknown name '{node.name}'", f"{suggestion}, or real {node.name};"
+            )
+        raise error_at(node.at, f"{found.role} '{node.name}' set by a statement", suggestion)
+    return Read(found, node, axes, find_positions(scope, node, found, axes))
 
 
-# ---- statements that need their own earlier values
+# ---- recurrences: statements that need earlier values of themselves
 
 
-class Written(NamedTuple):
-    """Dimension along which an array advances, and its first index there."""
+class TimeAxis(NamedTuple):
+    """Time dimension of an array, and the first position that is computed in it."""
 
     dim: int
     start: int
 
 
-class Lagged(NamedTuple):
-    """A read of what the group itself computes: how many steps back, and which element there."""
+class LaggedRead(NamedTuple):
+    """A read of the recurrence's own arrays: time lag, and positions in the other dimensions."""
 
     name: str
     lag: np.ndarray
-    rest: list[np.ndarray]
+    other_indices: list[np.ndarray]
     whole: int
 
 
 class RecurrencePlan(NamedTuple):
-    """Steps in their order at one time, their time iterators, and what each reads of the past.
+    """Plan of a recurrence: steps in their order at one time, their time iterators and reads.
 
-    `reads` are by identity of the node, `depth` is the longest way back.
+    `reads` has the lagged reads by the identity of their nodes, `depth` is the largest lag.
     """
 
     steps: tuple[MappingStep, ...]
-    time: dict[int, str]
-    written: dict[str, Written]
+    time_iterators: dict[int, str]
+    time_axes: dict[str, TimeAxis]
     length: int
-    reads: dict[int, Lagged]
+    reads: dict[int, LaggedRead]
     depth: int
 
 
 def plan_of(
     scope: Scope, steps: tuple[MappingStep, ...], owners: dict[str, np.ndarray]
 ) -> RecurrencePlan | None:
-    """Find how steps that need one another advance in time; None if they form a true loop."""
-    choices = [list(_advances(scope, step)) for step in steps]
-    for chosen in islice(product(*choices), MOST_TRIED):
-        plan = _planned(scope, steps, owners, chosen)
+    """Plan steps that need one another as a recurrence; None if they form an algebraic loop."""
+    choices = [list(_time_choices(scope, step)) for step in steps]
+    for chosen in islice(product(*choices), MAX_TRIED):
+        plan = _try_plan(scope, steps, owners, chosen)
         if plan is not None:
             return plan
     return None
 
 
-def _advances(scope: Scope, step: MappingStep) -> Iterator[tuple[str, dict[str, Written], int]]:
-    """The iterators along which all that a step writes advances by one."""
+def _time_choices(
+    scope: Scope, step: MappingStep
+) -> Iterator[tuple[str, dict[str, TimeAxis], int]]:
+    """Yield the iterators along which all arrays that a step writes advance by one."""
     for k, (axis, over) in enumerate(step.axes.items()):
-        found: dict[str, Written] = {}
+        found: dict[str, TimeAxis] = {}
         for node, axes in targets(scope, step):
             array = scope.arrays[node.name]
-            indices = located(scope, node, array, axes)
+            indices = find_positions(scope, node, array, axes)
             moving = [i for i, index in enumerate(indices) if index.shape[k] > 1]
             if len(moving) != 1 or indices[moving[0]].size != len(over):
                 break
             values = indices[moving[0]].ravel()
             if np.any(np.diff(values) != 1):
                 break
-            here = Written(moving[0], int(values[0]))
-            if found.setdefault(node.name, here) != here:
+            time_axis = TimeAxis(moving[0], int(values[0]))
+            if found.setdefault(node.name, time_axis) != time_axis:
                 break
         else:
             yield axis, found, len(over)
 
 
-def _planned(scope, steps, owners, chosen) -> RecurrencePlan | None:
-    """The plan for one choice of time iterators, if every read lies at this time or before."""
+def _try_plan(scope, steps, owners, chosen) -> RecurrencePlan | None:
+    """Make the plan for one choice of time iterators; None if a read lies in the future."""
     if len({n for _, _, n in chosen}) > 1:
         return None
-    written: dict[str, Written] = {}
+    time_axes: dict[str, TimeAxis] = {}
     for _, found, _ in chosen:
         for name, here in found.items():
-            if written.setdefault(name, here) != here:
+            if time_axes.setdefault(name, here) != here:
                 return None
     numbers = np.array([step.number for step in steps])
-    lagged: dict[int, Lagged] = {}
-    now: dict[int, set[int]] = {step.number: set() for step in steps}
+    lagged: dict[int, LaggedRead] = {}
+    same_time: dict[int, set[int]] = {step.number: set() for step in steps}
     for step, (axis, _, length) in zip(steps, chosen, strict=True):
         k = list(step.axes).index(axis)
         for read in (r for e, axes in sources(scope, step) for r in reads(scope, e, axes)):
             owner = owners.get(read.array.name)
             if owner is None or not np.isin(owner[read.flat], numbers).any():
                 continue
-            found = _lag(read, written.get(read.array.name), k, length)
+            found = _lagged_read(read, time_axes.get(read.array.name), k, length)
             if found is None:
                 return None
             lagged[id(read.node)] = found
             shape = np.broadcast_shapes(*(i.shape for i in read.indices))
             here = np.broadcast_to(found.lag == 0, shape).ravel()
-            now[step.number] |= set(owner[read.flat[here]].tolist()) & set(numbers.tolist())
+            same_time[step.number] |= set(owner[read.flat[here]].tolist()) & set(numbers.tolist())
     try:
-        order = list(TopologicalSorter(now).static_order())
+        order = list(TopologicalSorter(same_time).static_order())
     except CycleError:
         return None
     by_number = {step.number: step for step in steps}
     time = {step.number: axis for step, (axis, _, _) in zip(steps, chosen, strict=True)}
     depth = max((int(np.max(r.lag)) for r in lagged.values()), default=0)
     ordered = tuple(by_number[n] for n in order)
-    return RecurrencePlan(ordered, time, written, chosen[0][2], lagged, depth)
+    return RecurrencePlan(ordered, time, time_axes, chosen[0][2], lagged, depth)
 
 
-def _lag(read: Read, written: Written | None, k: int, length: int) -> Lagged | None:
-    """Lag of a read along the time axis k; None if it changes or is negative."""
-    if written is None:
+def _lagged_read(read: Read, time_axis: TimeAxis | None, k: int, length: int) -> LaggedRead | None:
+    """Find the lag of a read along the time axis k; None if it is not constant or negative."""
+    if time_axis is None:
         return None
     rank = read.indices[0].ndim
-    times = written.start + np.arange(length).reshape([-1 if i == k else 1 for i in range(rank)])
-    lag = times - read.indices[written.dim]
-    rest = [index for i, index in enumerate(read.indices) if i != written.dim]
+    times = time_axis.start + np.arange(length).reshape([-1 if i == k else 1 for i in range(rank)])
+    lag = times - read.indices[time_axis.dim]
+    other_indices = [index for i, index in enumerate(read.indices) if i != time_axis.dim]
     first = np.take(lag, [0], axis=k)
-    if np.any(lag != first) or np.any(first < 0) or any(index.shape[k] > 1 for index in rest):
+    constant = np.all(lag == first) and all(index.shape[k] == 1 for index in other_indices)
+    if not constant or np.any(first < 0):
         return None
     whole = sum(isinstance(i, x.Whole) for i in read.node.indices)
-    return Lagged(read.array.name, first, rest, whole)
+    return LaggedRead(read.array.name, first, other_indices, whole)
 
 
 # ---- the order
 
 
 class StepGroup(NamedTuple):
-    """Steps that are computed together; those with a plan need their own earlier values."""
+    """Steps that are computed together; a plan if they are a recurrence."""
 
     steps: tuple[MappingStep, ...]
     plan: RecurrencePlan | None
@@ -249,9 +257,9 @@ class StepGroup(NamedTuple):
 class Order:
     """Steps of a mapping in an order of computation.
 
-    `owners` tells for each element of an array which step defines it, `needs` the steps before each
-    step, `given` the inputs, parameters and tables that each reads; `inner` are the orders of the
-    mappings it calls.
+    `owners` has the number of the step that defines each element of an array. For each step,
+    `needs` has the steps it depends on, and `given` the inputs, parameters and tables it reads.
+    `inner` has the orders of the inner mappings.
     """
 
     scope: Scope
@@ -263,12 +271,12 @@ class Order:
 
     @cached_property
     def setters(self) -> dict[str, list[int]]:
-        """The steps that set each array."""
-        found = {name: owner[owner != NOBODY] for name, owner in self.owners.items()}
+        """Steps that set elements of each array."""
+        found = {name: owner[owner != NO_OWNER] for name, owner in self.owners.items()}
         return {name: np.flatnonzero(np.bincount(owner)).tolist() for name, owner in found.items()}
 
     def closure(self, names: Iterable[str]) -> tuple[set[int], set[str]]:
-        """The steps, and the names given, that some names hang on."""
+        """Return all steps and given names on which some names depend."""
         todo = {n for name in names for n in self.setters.get(name, ())}
         found: set[int] = set()
         while todo := todo - found:
@@ -278,13 +286,13 @@ class Order:
         return found, direct.union(*(self.given[n] for n in found))
 
     def needed(self, names: Iterable[str]) -> Iterator[StepGroup]:
-        """Groups that some names hang on, each after what it needs."""
+        """Yield the groups on which some names depend, in the order of computation."""
         wanted, _ = self.closure(names)
         return (g for g in self.groups if not wanted.isdisjoint(step.number for step in g.steps))
 
 
 def order_of(scope: Scope) -> Order:
-    """Sort the steps of a mapping and of all mappings in it.
+    """Sort the steps of a mapping and of its inner mappings.
 
     Parameters
     ----------
@@ -298,17 +306,17 @@ def order_of(scope: Scope) -> Order:
     Raises
     ------
     InputError
-        With its place: a name that is unknown, an element that is defined twice or never, an index
-        outside, an algebraic loop with its cycle.
+        With its place: an unknown name, an element that is defined twice or never, an index
+        outside its set, an algebraic loop with its cycle.
     """
     inner = {name: order_of(c) for name, c in scope.callees.items() if isinstance(c, Scope)}
     owners: dict[str, np.ndarray] = {}
     _check_work(scope)
     for step in scope.steps:
-        if isinstance(step.what, d.Call):
-            _check_wires(scope, step, step.what)
+        if isinstance(step.statement, d.Call):
+            _check_wires(scope, step, step.statement)
         for node, axes in targets(scope, step):
-            _own(scope, owners, step, written(scope, node, axes))
+            _set_owner(scope, owners, step, target_elements(scope, node, axes))
     needs: dict[int, set[int]] = {step.number: set() for step in scope.steps}
     given: dict[int, set[str]] = {step.number: set() for step in scope.steps}
     for step in scope.steps:
@@ -320,51 +328,53 @@ def order_of(scope: Scope) -> Order:
                     given[step.number].add(read.array.name)
     for array in scope.outputs.values():
         _check_defined(array, owners)
-    groups = tuple(_group(scope, sorted(c), needs, owners) for c in _components(needs))
+    groups = tuple(_make_group(scope, sorted(c), needs, owners) for c in _dependent_groups(needs))
     return Order(scope, groups, owners, needs, given, inner)
 
 
 def _check_work(scope: Scope) -> None:
-    """Refuse more than any computer would go through in a minute."""
+    """Raise an error for a mapping that is too large."""
     total = sum(a.size for a in scope.arrays.values())
     for step in scope.steps:
         combined = int(np.prod([len(s) for s in step.axes.values()], dtype=np.int64))
-        if isinstance(step.what, d.Call):
-            callee = scope.callees.get(step.what.mapping)
+        if isinstance(step.statement, d.Call):
+            callee = scope.callees.get(step.statement.mapping)
             if isinstance(callee, Scope):
                 combined *= sum(a.size for a in callee.arrays.values())
         total += combined
-        if total > MOST_WORK or step.number > MOST_STEPS:
-            found = f"more than {MOST_WORK} elements or {MOST_STEPS} statements in a mapping"
+        if total > MAX_TOTAL_ELEMENTS or step.number > MAX_STEPS:
+            found = (
+                f"more than {MAX_TOTAL_ELEMENTS} elements or {MAX_STEPS} statements in a mapping"
+            )
             raise error_at(step.at, found, "fewer")
 
 
-def _group(scope, numbers: list[int], needs, owners) -> StepGroup:
+def _make_group(scope, numbers: list[int], needs, owners) -> StepGroup:
     steps = tuple(scope.steps[n] for n in numbers)
     if len(steps) == 1 and numbers[0] not in needs[numbers[0]]:
         return StepGroup(steps, None)
     plan = plan_of(scope, steps, owners)
     if plan is None:
-        raise _loop(scope, steps, needs, owners)
+        raise _loop_error(scope, steps, needs, owners)
     return StepGroup(steps, plan)
 
 
-def _own(scope: Scope, owners: dict[str, np.ndarray], step: MappingStep, write: Read) -> None:
-    """Note which elements a step defines."""
+def _set_owner(scope: Scope, owners: dict[str, np.ndarray], step: MappingStep, write: Read) -> None:
+    """Record the elements that a step defines."""
     array, node = write.array, write.node
-    owner = owners.setdefault(array.name, np.full(max(array.size, 1), NOBODY))
+    owner = owners.setdefault(array.name, np.full(max(array.size, 1), NO_OWNER))
     shape = [len(s) for s in write.axes.values()]
     combined = int(np.prod(shape, dtype=np.int64))
-    whole = np.prod([len(dim) for dim in whole_of(node, array)], dtype=np.int64)
+    whole = np.prod([len(dim) for dim in whole_dimensions(node, array)], dtype=np.int64)
     mark = np.zeros(owner.size, bool)
     mark[write.flat] = True
     flat = np.flatnonzero(mark)
     if flat.size < combined * whole:
         unused = [n for n in write.axes if n not in _names(node)]
-        said = f"'{node}' has no index {', '.join(unused)}" if unused else "its index repeats"
-        found = f"'{node}' set more than once by one statement ({said})"
+        reason = f"'{node}' has no index {', '.join(unused)}" if unused else "its index repeats"
+        found = f"'{node}' set more than once by one statement ({reason})"
         raise error_at(node.at, found, "each element once")
-    taken = flat[owner[flat] != NOBODY]
+    taken = flat[owner[flat] != NO_OWNER]
     if taken.size:
         other = scope.steps[owner[taken[0]]]
         found = f"'{array.element(taken[0])}' set twice (also in line {other.at.line})"
@@ -378,60 +388,60 @@ def _names(e: x.Expression) -> set[str]:
 
 
 def _owners_of(owners: dict[str, np.ndarray], read: Read) -> np.ndarray:
-    """The steps that define what is read there."""
+    """Find the steps that define the elements of a read."""
     owner = owners.get(read.array.name)
     if owner is None:
         found = f"'{read.array.name}' is used, and no statement sets it"
         raise error_at(read.node.at, found, f"a statement {read.array.name} = ...")
-    if owner[0] != NOBODY and np.all(owner == owner[0]):
+    if owner[0] != NO_OWNER and np.all(owner == owner[0]):
         return owner[:1]
     flat = read.flat
-    missing = flat[owner[flat] == NOBODY]
+    missing = flat[owner[flat] == NO_OWNER]
     if missing.size:
-        said = f"'{read.array.element(missing[0])}', used in '{read.node}', which no statement sets"
-        raise error_at(read.node.at, said, "a statement that sets this element")
+        text = f"'{read.array.element(missing[0])}', used in '{read.node}', which no statement sets"
+        raise error_at(read.node.at, text, "a statement that sets this element")
     return np.flatnonzero(np.bincount(owner[flat]))
 
 
 def _check_defined(array: Array, owners: dict[str, np.ndarray]) -> None:
     owner = owners.get(array.name)
-    if owner is None or np.any(owner == NOBODY):
-        at = 0 if owner is None else int(np.argmax(owner == NOBODY))
+    if owner is None or np.any(owner == NO_OWNER):
+        at = 0 if owner is None else int(np.argmax(owner == NO_OWNER))
         name = array.name if owner is None else array.element(at)
         raise error_at(array.at, f"output '{name}' that no statement sets", f"{name} = ...;")
 
 
 def _check_wires(scope: Scope, step: MappingStep, call: d.Call) -> None:
-    """Check indices on the side of what is called, and that each input is given whole."""
+    """Check the indices of the called mapping's arrays, and that all its inputs are given."""
     callee = callee_of(scope, call)
     given: dict[str, np.ndarray] = {}
     for wire in call.inputs:
         array = callee.inputs[wire.target.name]
-        axes = widened(scope, {}, wire.each)
-        found = Read(array, wire.target, axes, located(scope, wire.target, array, axes))
+        axes = add_iterators(scope, {}, wire.each)
+        found = Read(array, wire.target, axes, find_positions(scope, wire.target, array, axes))
         given.setdefault(array.name, np.zeros(max(array.size, 1), bool))[found.flat] = True
     for name, hit in given.items():
         array = callee.inputs[name]
         if not hit.all() and array.values is None:
             missing = array.element(int(np.argmin(hit)))
             found = f"'{missing}' of {call.mapping} is not given"
-            raise error_at(call.at, found, f"all of {array.said}")
+            raise error_at(call.at, found, f"all of {array.text}")
     for wire in call.outputs:
-        axes = widened(scope, step.axes, wire.each)
+        axes = add_iterators(scope, step.axes, wire.each)
         output, inputs = gains_of(wire, callee, call.mapping)
-        located(scope, output, callee.outputs[output.name], axes)
+        find_positions(scope, output, callee.outputs[output.name], axes)
         for e in inputs:
             array = callee.inputs[e.name]
             if len(e.indices) != len(array.dims):
                 found = f"'{e}' in '{wire.value}'"
                 raise error_at(
-                    e.at, found, f"one number of {array.said} such as {array.element(0)}"
+                    e.at, found, f"one number of {array.text} such as {array.element(0)}"
                 )
-            located(scope, e, array, axes)
+            find_positions(scope, e, array, axes)
 
 
-def _components(needs: dict[int, set[int]]) -> list[list[int]]:
-    """Steps that need one another, each by itself where none does; needed ones first."""
+def _dependent_groups(needs: dict[int, set[int]]) -> list[list[int]]:
+    """Group steps that depend on one another; the groups are in the order of computation."""
     pairs = [(a, b) for a, before in needs.items() for b in before]
     ends = np.array(pairs, int).reshape(-1, 2).T
     graph = csr_matrix((np.ones(len(pairs)), ends), shape=(len(needs), len(needs)))
@@ -445,45 +455,45 @@ def _components(needs: dict[int, set[int]]) -> list[list[int]]:
     return [members[at] for at in TopologicalSorter(before).static_order()]
 
 
-def _loop(scope: Scope, steps: tuple[MappingStep, ...], needs, owners) -> InputError:
-    """An algebraic loop, with the names along a cycle that no time takes apart."""
+def _loop_error(scope: Scope, steps: tuple[MappingStep, ...], needs, owners) -> InputError:
+    """Make the error for an algebraic loop, with the names along a cycle that is no recurrence."""
     members = {s.number for s in steps}
-    cycles = (_cycle(n, needs, members) for n in sorted(members)[:MOST_TRIED])
+    cycles = (_cycle(n, needs, members) for n in sorted(members)[:MAX_TRIED])
     found = sorted((c for c in cycles if c), key=len)
     parts = ((c, tuple(scope.steps[n] for n in sorted(set(c)))) for c in found)
     cycle = next((c for c, part in parts if plan_of(scope, part, owners) is None), found[0])
     names = [str(targets(scope, scope.steps[n])[0][0]) for n in cycle]
     lines = [str(n) for n in sorted({scope.steps[n].at.line for n in cycle})]
-    said = f"an algebraic loop: {' -> '.join(_few(names))} (line {', '.join(_few(lines))})"
+    text = f"an algebraic loop: {' -> '.join(_shorten(names))} (line {', '.join(_shorten(lines))})"
     expected = "statements of which each needs earlier ones only, or earlier times such as y[t-1]"
-    return error_at(scope.steps[min(cycle)].at, said, expected)
+    return error_at(scope.steps[min(cycle)].at, text, expected)
 
 
-def _few(words: list[str]) -> list[str]:
-    return words if len(words) <= MOST_NAMED else [*words[: MOST_NAMED - 2], "...", words[-1]]
+def _shorten(words: list[str]) -> list[str]:
+    return words if len(words) <= MAX_NAMED else [*words[: MAX_NAMED - 2], "...", words[-1]]
 
 
 def _cycle(start: int, needs: dict[int, set[int]], members: set[int]) -> list[int]:
-    """The shortest way from a step to itself, what is needed first; empty if there is none."""
-    came: dict[int, int | None] = {start: None}
+    """Find the shortest cycle from a step to itself, in the order of need; empty if none."""
+    previous: dict[int, int | None] = {start: None}
     todo = [start]
     for at in todo:
         for before in sorted(needs[at] & members):
             if before == start:
-                way: list[int] = [start]
+                cycle: list[int] = [start]
                 back: int | None = at
                 while back is not None:
-                    way.append(back)
-                    back = came[back]
-                return way
-            if before not in came:
-                came[before] = at
+                    cycle.append(back)
+                    back = previous[back]
+                return cycle
+            if before not in previous:
+                previous[before] = at
                 todo.append(before)
     return []
 
 
-class _Same(NamedTuple):
-    """A mapping as itself: an equal one may stand at other lines."""
+class _ById(NamedTuple):
+    """A mapping compared by identity: an equal one may have other line numbers."""
 
     mapping: d.Mapping
 
@@ -491,19 +501,20 @@ class _Same(NamedTuple):
         return id(self.mapping)
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Same) and self.mapping is other.mapping
+        return isinstance(other, _ById) and self.mapping is other.mapping
 
 
-def checked(mapping: d.Mapping, shapes=None) -> Order:
-    """Names, indices and order of a mapping, checked without computing anything.
+def check_mapping(mapping: d.Mapping, shapes=None) -> Order:
+    """Check a mapping and return its order, without computing anything.
 
-    Kept for the mappings seen last: what is compiled for one order serves when it is solved again.
+    Results of the last mappings are cached, so that compiled code is reused when a document is
+    solved again.
     """
-    return _ordered(_Same(mapping), tuple(sorted((shapes or {}).items())))
+    return _cached_order(_ById(mapping), tuple(sorted((shapes or {}).items())))
 
 
 @lru_cache(maxsize=64)
-def _ordered(same: _Same, shapes: tuple[tuple[str, tuple[int, ...]], ...]) -> Order:
+def _cached_order(same: _ById, shapes: tuple[tuple[str, tuple[int, ...]], ...]) -> Order:
     return order_of(scope_of(same.mapping, dict(shapes)))
 
 
@@ -519,15 +530,15 @@ def check_document(
     document : Document
         From a file.
     shapes : mapping of str to (int, int), optional
-        Rows and columns of its tables, where they have been read.
+        Rows and columns of its tables, if these have been read.
     given : iterable of str, optional
-        Inputs whose values come from elsewhere.
+        Inputs whose values do not come from the document.
 
     Raises
     ------
     InputError
         With the place in the document.
     """
-    checked(document.mapping, shapes)
+    check_mapping(document.mapping, shapes)
     if document.problem is not None:
         check_problem(document, given)

@@ -1,4 +1,4 @@
-"""A document as a problem to be solved: what is free, limited, and least squares."""
+"""Translation of a document to a `beamfit.greybox.problem.Problem`."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from beamfit.language.scope import check_problem
 
 
 class Square(NamedTuple):
-    """A term of a sum of squares: weight times (body for all iterators) squared."""
+    """Terms of a sum of squares: weight times body squared, for all values of the iterators."""
 
     weight: float
     body: x.Expression
@@ -28,25 +28,25 @@ class Square(NamedTuple):
 
 
 def squares_of(m: d.Mapping, name: str, weight: float = 1.0) -> list[Square] | None:
-    """The terms of an output that is a sum of squares, None for any other."""
+    """Split an output that is a sum of squares into its terms; None for any other output."""
     set_by = {s.target.name: s.value for s in m.statements
               if isinstance(s, d.Assignment) and not s.each and not s.target.indices}  # fmt: skip
 
-    def terms(e: x.Expression, factor: float, seen: tuple[str, ...]) -> list[Square] | None:
+    def terms(e: x.Expression, factor: float, visited: tuple[str, ...]) -> list[Square] | None:
         match e:
-            case x.Name(n, ()) if n in set_by and n not in seen:
-                return terms(set_by[n], factor, (*seen, n))
+            case x.Name(n, ()) if n in set_by and n not in visited:
+                return terms(set_by[n], factor, (*visited, n))
             case x.Arithmetic("^", (body, x.Literal() as two)) if two.value == 2.0 and factor > 0:
                 return [Square(factor, body)]
             case x.Arithmetic("+", (left, right)):
-                both = terms(left, factor, seen), terms(right, factor, seen)
+                both = terms(left, factor, visited), terms(right, factor, visited)
                 return None if None in both else both[0] + both[1]
             case x.Arithmetic("*", (x.Literal() as n, inner)):
-                return terms(inner, factor * n.value, seen)
+                return terms(inner, factor * n.value, visited)
             case x.Arithmetic("/", (inner, x.Literal() as n)) if n.value != 0:
-                return terms(inner, factor / n.value, seen)
+                return terms(inner, factor / n.value, visited)
             case x.Reduction("sum", each, inner):
-                found = terms(inner, factor, seen)
+                found = terms(inner, factor, visited)
                 return found and [s._replace(each=(*each, *s.each)) for s in found]
         return None
 
@@ -57,9 +57,9 @@ def squares_of(m: d.Mapping, name: str, weight: float = 1.0) -> list[Square] | N
 class Formulation:
     """A document with its problem.
 
-    `squares` says whether the whole objective is a sum of squares, which is then a record of
-    residuals: the objective is `factor` times the cost of the problem. `program` computes the
-    mapping; `notes` tell what was made of the document.
+    `program` computes the mapping. `squares` is true if the whole objective is a sum of squares,
+    which is then a record of residuals. The objective is `factor` times the cost of the problem.
+    `notes` has remarks on the translation.
     """
 
     document: d.Document
@@ -72,7 +72,7 @@ class Formulation:
 
 @dataclass(frozen=True)
 class _Residuals:
-    """The square roots of the terms of a sum of squares, as one vector."""
+    """Function of (model, constants) to the residuals of a sum of squares, as one vector."""
 
     program: Program
     squares: tuple[Square, ...]
@@ -87,7 +87,7 @@ class _Residuals:
 
 @dataclass(frozen=True)
 class _Output:
-    """A function of (model, constants) that gives one array of a program."""
+    """Function of (model, constants) to one array of a program."""
 
     program: Program
     name: str
@@ -102,22 +102,22 @@ def formulate(
     values: Mapping[str, Sequence[float]] | None = None,
     tolerance: float = core.TOLERANCE,
 ) -> Formulation:
-    """State the problem of a document.
+    """Translate a document to a problem.
 
-    An objective that is a sum of squares over a set becomes a record of residuals without errors,
-    so that least squares are used and the noise is inferred from them; else it is an objective.
+    An objective that is a sum of squares over a set becomes a record of residuals without errors.
+    It is solved by least squares, and the noise is inferred from the residuals.
 
     Parameters
     ----------
     document : Document
-        With a problem.
+        A document with a problem.
     tables : mapping of str to array, optional
         Its data tables by name, shape (rows, columns).
     values : mapping of str to sequence of float, optional
-        Values of inputs in the place of the document's: one number, or all in C order. Of a
-        variable it is where the search starts.
+        Values of inputs that replace the document's: one number, or all in C order. For a variable
+        it is the start of the search.
     tolerance : float
-        Of the problem.
+        Tolerance of the problem.
 
     Returns
     -------
@@ -126,7 +126,7 @@ def formulate(
     Raises
     ------
     InputError
-        With its place in the document, whatever is wrong with it.
+        With its place in the document, for any error in it.
 
     Examples
     --------
@@ -143,18 +143,18 @@ def formulate(
         raise error_at(at, "a document without an objective", "minimize NAME; or maximize NAME;")
     values = values or {}
     check_problem(document, values)
-    document = _begun(document, values)
+    document = _with_given_starts(document, values)
     weights = {goal.model: goal.weight * (-1 if p.maximize else 1) for goal in p.goals}
     parts = {name: squares_of(document.mapping, name, weight) for name, weight in weights.items()}
-    # A few squares by themselves are a wish, not data: errors would mean nothing.
-    least = all(parts.values()) and any(s.each for part in parts.values() for s in part)
+    # Single squares are penalties, not data: errors inferred from them would have no meaning.
+    squares = all(parts.values()) and any(s.each for part in parts.values() for s in part)
     program = compile_mapping(document.mapping, tables)
-    free, model, notes = _free(document, program)
+    free, model, notes = _free_numbers(document, program)
     model |= values_of(program.scope, values)
     constants = program.constants
     records, objectives = [], []
     for name, weight in weights.items():
-        if least:
+        if squares:
             predict = _Residuals(program, tuple(parts[name]))
             length = core.shape_of(predict, model, constants)
             records.append(core.Record(name, predict, constants, np.zeros(length)))
@@ -166,12 +166,12 @@ def formulate(
         limits.append(core.Constraint(c.label, limited, constants, c.lower, c.upper, names))
     problem = core.Problem(model, free, records, (), limits, objectives, tolerance)
     sign = -1.0 if p.maximize else 1.0
-    notes += tuple(_unqualified(document))
-    return Formulation(document, program, problem, least, 2.0 if least else sign, notes)
+    notes += tuple(_warn_degenerate(document))
+    return Formulation(document, program, problem, squares, 2.0 if squares else sign, notes)
 
 
-def _begun(document: d.Document, values: Mapping[str, Sequence[float]]) -> d.Document:
-    """The document with what is given of its variables as their start."""
+def _with_given_starts(document: d.Document, values: Mapping[str, Sequence[float]]) -> d.Document:
+    """Replace the starts of variables by given values."""
     if values.keys().isdisjoint(v.model for v in document.problem.variables):
         return document
     variables = tuple(
@@ -184,14 +184,16 @@ def _begun(document: d.Document, values: Mapping[str, Sequence[float]]) -> d.Doc
 # ---- variables
 
 
-def _names(asked: d.FreeInput | d.Limit, array: Any) -> tuple[str, ...]:
-    """A name for each element of what is free or limited, in the document's indices."""
-    elements = (array.element(i).removeprefix(asked.model) for i in range(array.size))
-    return tuple(asked.label + element for element in elements)
+def _names(declared: d.FreeInput | d.Limit, array: Any) -> tuple[str, ...]:
+    """Name each element of a variable or limited output, with the document's indices."""
+    elements = (array.element(i).removeprefix(declared.model) for i in range(array.size))
+    return tuple(declared.label + element for element in elements)
 
 
-def _free(document: d.Document, program: Program) -> tuple[list, dict[str, np.ndarray], tuple]:
-    """Free numbers, the model they start from, and what there is to say about them."""
+def _free_numbers(
+    document: d.Document, program: Program
+) -> tuple[list, dict[str, np.ndarray], tuple]:
+    """Collect the free numbers, the model with their starts, and remarks."""
     arrays = program.scope.inputs
     model = {n: np.reshape(np.asarray(a.values, float), a.shape) for n, a in arrays.items()
              if a.values is not None}  # fmt: skip
@@ -202,7 +204,7 @@ def _free(document: d.Document, program: Program) -> tuple[list, dict[str, np.nd
         shape = arrays[v.model].shape
         model[v.model] = next(_starts(v, shape, model.get(v.model)))
         names = _names(v, arrays[v.model])
-        notes += _outside(v, arrays[v.model].values)
+        notes += _warn_outside(v, arrays[v.model].values)
         free.append(core.Free(v.model, v.lower, v.upper, v.random, labels=names))
         if v.model not in used:
             notes.append(f"At {v.at}: nothing asked for hangs on the variable '{v.label}', "
@@ -210,22 +212,22 @@ def _free(document: d.Document, program: Program) -> tuple[list, dict[str, np.nd
     return free, model, tuple(notes)
 
 
-def _outside(v: d.FreeInput, given: Sequence[float] | None) -> list[str]:
-    """A warning if a variable's start lies outside its bounds."""
-    begin = v.random or ((v.value,) if v.value is not None else given or (v.lower, v.upper))
-    wrong = next((x for x in begin if not v.lower <= x <= v.upper), None)
-    if wrong is None:
+def _warn_outside(v: d.FreeInput, given: Sequence[float] | None) -> list[str]:
+    """Warn of a variable whose start lies outside its bounds."""
+    starts = v.random or ((v.value,) if v.value is not None else given or (v.lower, v.upper))
+    bad = next((x for x in starts if not v.lower <= x <= v.upper), None)
+    if bad is None:
         return []
-    low, high = v.random or (wrong, wrong)
-    what = f"random starts in [{low:g}, {high:g}]" if v.random else f"start {wrong:g}"
+    low, high = v.random or (bad, bad)
+    text = f"random starts in [{low:g}, {high:g}]" if v.random else f"start {bad:g}"
     return [
-        f"At {v.at}: '{v.label}' has the {what} outside its bounds [{v.lower:g}, {v.upper:g}]; the "
+        f"At {v.at}: '{v.label}' has the {text} outside its bounds [{v.lower:g}, {v.upper:g}]; the "
         "search begins on the bound. State a start within them, or widen them."
     ]
 
 
 def _starts(v: d.FreeInput, shape, given) -> Iterator[np.ndarray]:
-    """Starts of the search: drawn with the seed, or the value, or the middle of the bounds."""
+    """Yield starts: drawn with the seed, else the value, else the middle of the bounds."""
     random = np.random.default_rng(v.seed)
     while v.random is not None:
         yield np.clip(random.uniform(*v.random, size=shape), v.lower, v.upper)
@@ -240,7 +242,7 @@ def _starts(v: d.FreeInput, shape, given) -> Iterator[np.ndarray]:
 
 
 def starts_of(made: Formulation) -> Iterator[dict[str, np.ndarray]]:
-    """The model at the first start, then at further draws of the same seeds, without end."""
+    """Yield the model at the first start, then at further draws with its seeds, without end."""
     arrays, model = made.program.scope.inputs, dict(made.problem.core.model)
     draws = {}
     for v in made.document.problem.variables:
@@ -251,8 +253,8 @@ def starts_of(made: Formulation) -> Iterator[dict[str, np.ndarray]]:
         yield model | {name: next(draw) for name, draw in draws.items()}
 
 
-def _unqualified(document: d.Document) -> Iterator[str]:
-    """Limits on sums of squares that only zero meets: where they hold, they have no gradient."""
+def _warn_degenerate(document: d.Document) -> Iterator[str]:
+    """Warn of sums of squares limited to zero: their gradient vanishes where the limit holds."""
     for c in document.problem.limits:
         squares = squares_of(document.mapping, c.model)
         if squares is not None and c.upper == 0.0:

@@ -1,7 +1,7 @@
-"""Scope of a mapping: the sets, arrays, functions and mappings it declares; and its steps.
+"""Scope of a mapping: its sets, arrays, functions, inner mappings and steps.
 
-All of it is known before anything is computed: elements of sets are whole numbers, so that every
-index is checked, and every statement's reach known, without JAX.
+Elements of sets are whole numbers. Every index is therefore checked, and the elements that each
+statement reads and writes are determined, before anything is computed and without JAX.
 """
 
 from __future__ import annotations
@@ -19,18 +19,21 @@ from beamfit.language import document as d
 from beamfit.language import expression as x
 from beamfit.language.expression import FUNCTIONS, REDUCTIONS, Place, error_at
 
-# Most elements of a set, and most combinations of indices in a statement.
-MOST_ELEMENTS, MOST_COMBINED = 2_000_000, 5_000_000
-# Most operations in one use of a function, nested functions included.
-MOST_WORK = 20_000
-# Behind the names of iterators that a function's body does not see.
-HIDDEN = "'"
+# Limits on the size of documents, chosen so that none takes all memory or minutes of time.
+# Largest number of elements of a set.
+MAX_ELEMENTS = 2_000_000
+# Largest number of combinations of indices in a statement.
+MAX_COMBINATIONS = 5_000_000
+# Largest number of operations in one use of a function, nested functions included.
+MAX_OPERATIONS = 20_000
+# Suffix that hides the names of a caller's iterators from a function's body.
+HIDDEN_SUFFIX = "'"
 CONSTANTS = {"pi": float(np.pi)}
 
 
 @dataclass(frozen=True, eq=False)
 class IndexSet:
-    """Whole numbers in order, and where each of them stands."""
+    """Ordered set of whole numbers, with a lookup of positions."""
 
     name: str
     elements: np.ndarray
@@ -43,7 +46,7 @@ class IndexSet:
         return np.argsort(self.elements, kind="stable")
 
     def positions(self, values: np.ndarray) -> np.ndarray:
-        """Positions of values in the set; -1 for values that are no elements."""
+        """Return the positions of values in the set; -1 for values that are not elements."""
         order = self._sorted
         at = np.minimum(np.searchsorted(self.elements, values, sorter=order), len(self) - 1)
         found = order[at]
@@ -55,11 +58,11 @@ class IndexSet:
 
 
 Axes = Mapping[str, IndexSet]
-"""Iterators in force, outermost first."""
+"""Sets of the active iterators by name, outermost first."""
 
 
 class Array(NamedTuple):
-    """A number or an array of a mapping."""
+    """A number or an array of a mapping, with its role (input, output, ...) and dimensions."""
 
     name: str
     role: str
@@ -78,13 +81,13 @@ class Array(NamedTuple):
         return int(np.prod(self.shape, dtype=np.int64))
 
     @property
-    def said(self) -> str:
-        """Name with dimensions."""
+    def text(self) -> str:
+        """Name with dimensions, for messages."""
         inner = ", ".join(dim.name or str(len(dim)) for dim in self.dims)
         return f"{self.name}[{inner}]" if self.dims else self.name
 
     def element(self, position: int) -> str:
-        """Name with the index of an element, in C order."""
+        """Return the name with the index of an element, in C order."""
         if not self.dims:
             return self.name
         at = np.unravel_index(position, self.shape)
@@ -93,20 +96,20 @@ class Array(NamedTuple):
 
 
 class MappingStep(NamedTuple):
-    """An assignment or a call, with everything it runs over; `number` counts steps of a mapping."""
+    """An assignment or a call with its iterators; `number` is its index in the mapping."""
 
     number: int
     axes: dict[str, IndexSet]
-    what: d.Assignment | d.Call
+    statement: d.Assignment | d.Call
 
     @property
     def at(self) -> Place:
         """Place in the document."""
-        return self.what.at
+        return self.statement.at
 
 
 class Read(NamedTuple):
-    """A place where an array is read or written: the node, its axes, an index a dimension."""
+    """A place where an array is read or written: node, iterators, positions in each dimension."""
 
     array: Array
     node: x.Name
@@ -123,9 +126,9 @@ class Read(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Scope:
-    """The names of one mapping.
+    """Names of one mapping.
 
-    `callees` are the scopes of mappings inside, and networks; `inputs` and `outputs` its face.
+    `callees` has the scopes of inner mappings, and networks, by name.
     """
 
     name: str
@@ -146,15 +149,15 @@ class Scope:
         return {k: a for k, a in self.arrays.items() if a.role == "output"}
 
     def constant(self, name: str) -> float | None:
-        """The value of a name that is the same for ever, or None."""
+        """Return the value of a scalar parameter or built-in constant, else None."""
         found = self.arrays.get(name)
         if found is not None and found.role == "parameter" and not found.dims:
             return found.values[0]
         return CONSTANTS.get(name) if found is None else None
 
 
-class Net(NamedTuple):
-    """A network as it is called: its numbers and its face."""
+class CalledNetwork(NamedTuple):
+    """A network in a call: the network with its inputs and outputs as arrays."""
 
     mlp: Any
     inputs: dict[str, Array]
@@ -164,8 +167,8 @@ class Net(NamedTuple):
 # ---- sets and iterators
 
 
-def check_size(lengths: list[int], at: Place, most: int = MOST_COMBINED) -> None:
-    """Refuse lengths that are empty, or too long together."""
+def check_size(lengths: list[int], at: Place, most: int = MAX_COMBINATIONS) -> None:
+    """Raise an error if a length is zero or their product too large."""
     total = 1
     for length in lengths:
         total *= length
@@ -175,8 +178,8 @@ def check_size(lengths: list[int], at: Place, most: int = MOST_COMBINED) -> None
 
 
 def set_of(scope: Scope, over: x.Elements, name: str = "") -> IndexSet:
-    """The elements of a set, whole numbers made of numbers and parameters."""
-    ends = [int(index_of(scope, part, {})) for part in over.parts]
+    """Compute the elements of a set from its numbers and parameters."""
+    ends = [int(index_values(scope, part, {})) for part in over.parts]
     if not over.ranged:
         found = np.array(ends)
         if len(np.unique(found)) < len(found):
@@ -184,28 +187,28 @@ def set_of(scope: Scope, over: x.Elements, name: str = "") -> IndexSet:
         return IndexSet(name, found)
     start, stop, step = (*ends, 1)[:3]
     if step == 0 or (stop - start) * step < 0:
-        said = f"set {name} = {over}" if name else f"{over}"
-        raise error_at(over.at, f"{said}, an empty set", "a start before the stop")
-    check_size([abs((stop - start) // step) + 1], over.at, MOST_ELEMENTS)
+        text = f"set {name} = {over}" if name else f"{over}"
+        raise error_at(over.at, f"{text}, an empty set", "a start before the stop")
+    check_size([abs((stop - start) // step) + 1], over.at, MAX_ELEMENTS)
     return IndexSet(name, np.arange(start, stop + np.sign(step), step))
 
 
-def widened(scope: Scope, axes: Axes, each: tuple[x.Iterator, ...]) -> dict[str, IndexSet]:
-    """Axes with further iterators inside."""
+def add_iterators(scope: Scope, axes: Axes, each: tuple[x.Iterator, ...]) -> dict[str, IndexSet]:
+    """Add iterators to the active ones, as the innermost."""
     found = dict(axes)
     for it in each:
         if it.name in found:
             raise error_at(it.at, f"'{it.name}' runs already", "another name for this iterator")
         if it.name in scope.arrays or it.name in scope.sets:
-            what = "an array or a set" if it.name in scope.sets else "a variable"
-            raise error_at(it.at, f"'{it.name}', which is {what}", "a new name for the iterator")
+            kind = "an array or a set" if it.name in scope.sets else "a variable"
+            raise error_at(it.at, f"'{it.name}', which is {kind}", "a new name for the iterator")
         if isinstance(it.over, x.Elements):
             found[it.name] = set_of(scope, it.over)
         elif it.over in scope.sets:
             found[it.name] = scope.sets[it.over]
         else:
-            known = nearest(it.over, list(scope.sets))
-            raise error_at(it.at, f"no set '{it.over}' in '{it}'", known)
+            suggestion = nearest(it.over, list(scope.sets))
+            raise error_at(it.at, f"no set '{it.over}' in '{it}'", suggestion)
     check_size([len(s) for s in found.values()], each[0].at if each else x.NOWHERE)
     return found
 
@@ -213,8 +216,8 @@ def widened(scope: Scope, axes: Axes, each: tuple[x.Iterator, ...]) -> dict[str,
 # ---- indices
 
 
-def index_of(scope: Scope, e: x.Expression, axes: Axes) -> np.ndarray:
-    """The values of an index for all combinations of iterators, one axis each."""
+def index_values(scope: Scope, e: x.Expression, axes: Axes) -> np.ndarray:
+    """Compute the values of an index, with one axis for each iterator."""
     match e:
         case x.Literal():
             if e.value != int(min(e.value, 2**53)):
@@ -224,9 +227,9 @@ def index_of(scope: Scope, e: x.Expression, axes: Axes) -> np.ndarray:
             place = list(axes).index(name)
             return axes[name].elements.reshape([-1 if i == place else 1 for i in range(len(axes))])
         case x.Name(name, ()) if (value := scope.constant(name)) is not None:
-            return index_of(scope, x.Literal(repr(value), at=e.at), axes)
+            return index_values(scope, x.Literal(repr(value), at=e.at), axes)
         case x.Arithmetic(symbol, parts) if symbol in "+-*":
-            found = [index_of(scope, part, axes) for part in parts]
+            found = [index_values(scope, part, axes) for part in parts]
             if max(float(np.max(np.abs(f))) for f in found) > 2**31:
                 raise error_at(e.at, f"'{e}' as an index", "numbers below 2e9")
             if len(found) == 1:
@@ -234,82 +237,86 @@ def index_of(scope: Scope, e: x.Expression, axes: Axes) -> np.ndarray:
             return {"+": np.add, "-": np.subtract, "*": np.multiply}[symbol](*found)
     known = [*axes, *(n for n in scope.arrays if scope.constant(n) is not None)]
     if isinstance(e, x.Name) and not e.indices and e.name not in scope.arrays:
-        raise error_at(e.at, f"index '{e}', which is no iterator here", _iterators(e.name, known))
+        raise error_at(
+            e.at, f"index '{e}', which is no iterator here", _iterator_hint(e.name, known)
+        )
     raise error_at(e.at, f"'{e}' as an index", "iterators and whole numbers with + - *")
 
 
-def _iterators(name: str, known: list[str]) -> str:
-    behind = f"'foreach {name} in SET' behind the statement, or sum({name} in SET | ...)"
-    return f"{behind}, or {nearest(name, known)}" if known else behind
+def _iterator_hint(name: str, known: list[str]) -> str:
+    usage = f"'foreach {name} in SET' behind the statement, or sum({name} in SET | ...)"
+    return f"{usage}, or {nearest(name, known)}" if known else usage
 
 
-def located(scope: Scope, node: x.Name, array: Array, axes: Axes) -> list[np.ndarray]:
-    """Positions along each dimension of an array, by iterators and then by whole dimensions."""
+def find_positions(scope: Scope, node: x.Name, array: Array, axes: Axes) -> list[np.ndarray]:
+    """Find positions in each dimension of an array, with axes of iterators and whole dimensions."""
     given = node.indices or (x.Whole(),) * len(array.dims)
     if len(given) != len(array.dims):
         count = len(given)
         found = f"{count} {'index' if count == 1 else 'indices'} in '{node}'"
-        wanted = f"{len(array.dims)}: {array.said}" if array.dims else "none: it is a number"
+        wanted = f"{len(array.dims)}: {array.text}" if array.dims else "none: it is a number"
         raise error_at(node.at, found, wanted)
-    whole = len(whole_of(node, array))
+    whole = len(whole_dimensions(node, array))
     rank, indices = len(axes) + whole, []
-    opened = len(axes)
+    whole_axis = len(axes)
     for i, dim in zip(given, array.dims, strict=True):
         if isinstance(i, x.Whole):
-            values = np.arange(len(dim)).reshape([-1 if k == opened else 1 for k in range(rank)])
+            values = np.arange(len(dim)).reshape(
+                [-1 if k == whole_axis else 1 for k in range(rank)]
+            )
             indices.append(values)
-            opened += 1
+            whole_axis += 1
             continue
-        values = index_of(scope, i, axes)
+        values = index_values(scope, i, axes)
         at = dim.positions(values)
         if np.any(at < 0):
-            raise _outside(node, i, dim, axes, np.broadcast_to(values, at.shape), at)
+            raise _outside_error(node, i, dim, axes, np.broadcast_to(values, at.shape), at)
         shape = np.shape(at) or [1] * len(axes)
         indices.append(np.reshape(at, [*shape, *[1] * whole]))
     return indices
 
 
-def whole_of(node: x.Name, array: Array) -> list[IndexSet]:
-    """The dimensions of an array that a name takes whole."""
+def whole_dimensions(node: x.Name, array: Array) -> list[IndexSet]:
+    """Return the dimensions of an array that a name takes whole."""
     if not node.indices:
         return list(array.dims)
     pairs = zip(node.indices, array.dims, strict=True)
     return [dim for i, dim in pairs if isinstance(i, x.Whole)]
 
 
-def _outside(node, index, dim, axes, values, at) -> InputError:
-    """Say which index lies outside its set, and when."""
+def _outside_error(node, index, dim, axes, values, at) -> InputError:
+    """Make the error for an index outside its set, with the values of the iterators."""
     first = np.argwhere(np.atleast_1d(at) < 0)[0]
     value = np.atleast_1d(values)[tuple(first)]
-    said = f"index {index} = {value}" if str(index) != str(value) else f"index {value}"
-    found = f"{said} in '{node}'{said_at(axes, first, np.shape(at), ' at ')}"
+    text = f"index {index} = {value}" if str(index) != str(value) else f"index {value}"
+    found = f"{text} in '{node}'{iterator_text(axes, first, np.shape(at), ' at ')}"
     return error_at(index.at, found, f"an element of {dim}")
 
 
-def said_at(axes: Axes, at: Sequence[int], lengths: Sequence[int], word: str) -> str:
-    """Values of the iterators, after a word; empty if none of them matters."""
+def iterator_text(axes: Axes, at: Sequence[int], lengths: Sequence[int], word: str) -> str:
+    """Write the values of iterators after a word; empty if none has several elements."""
     found = [
-        f"{name.rstrip(HIDDEN)} = {s.elements[i]}"
+        f"{name.rstrip(HIDDEN_SUFFIX)} = {s.elements[i]}"
         for (name, s), i, n in zip(axes.items(), at, lengths, strict=False)
         if n > 1
     ]
     return f"{word}{', '.join(found)}" if found else ""
 
 
-# ---- what an expression reads, with every name checked
+# ---- arrays that an expression reads, with all names checked
 
 
 def reads(scope: Scope, e: x.Expression, axes: Axes) -> Iterator[Read]:
-    """Walk an expression: check every name, and give every place where an array is read."""
+    """Check all names in an expression and yield every place where an array is read."""
     match e:
         case x.Name(name):
             found = scope.arrays.get(name)
             if found is not None:
-                yield Read(found, e, axes, located(scope, e, found, axes))
+                yield Read(found, e, axes, find_positions(scope, e, found, axes))
             elif not (name in axes or name in CONSTANTS) or e.indices:
-                raise _unknown(scope, e, axes)
+                raise _unknown_error(scope, e, axes)
         case x.Reduction():
-            yield from reads(scope, e.body, widened(scope, axes, e.iterators))
+            yield from reads(scope, e.body, add_iterators(scope, axes, e.iterators))
         case x.Application() | x.Arithmetic():
             if isinstance(e, x.Application):
                 _check_arguments(scope, e)
@@ -318,7 +325,8 @@ def reads(scope: Scope, e: x.Expression, axes: Axes) -> Iterator[Read]:
             raise error_at(e.at, "':'", "an expression")
 
 
-def _unknown(scope: Scope, e: x.Name, axes: Axes) -> InputError:
+def _unknown_error(scope: Scope, e: x.Name, axes: Axes) -> InputError:
+    """Make the error for a name that is unknown or of the wrong kind."""
     if e.name in axes:
         return error_at(e.at, f"'{e}', an index of the iterator {e.name}", "an array")
     if e.name in scope.sets:
@@ -332,33 +340,34 @@ def _unknown(scope: Scope, e: x.Name, axes: Axes) -> InputError:
 
 
 def _check_arguments(scope: Scope, e: x.Application) -> None:
+    """Raise an error for an unknown function or a wrong number of arguments."""
     if e.function in scope.functions:
-        least = most = len(scope.functions[e.function].arguments)
+        min_count = max_count = len(scope.functions[e.function].arguments)
     elif e.function in FUNCTIONS:
-        least, most = FUNCTIONS[e.function]
+        min_count, max_count = FUNCTIONS[e.function]
     else:
         meant = {"ln": "log", "lg": "log10"}.get(e.function, e.function)
-        known = nearest(meant, [*scope.functions, *FUNCTIONS, *REDUCTIONS])
+        suggestion = nearest(meant, [*scope.functions, *FUNCTIONS, *REDUCTIONS])
         if e.function in scope.arrays:
-            known = f"{e.function}[...] for an element, or an operator before the parenthesis"
-        raise error_at(e.at, f"unknown function '{e.function}'", known)
-    if not least <= len(e.arguments) <= most:
-        wanted = f"{least}" if least == most else f"at least {least}"
+            suggestion = f"{e.function}[...] for an element, or an operator before the parenthesis"
+        raise error_at(e.at, f"unknown function '{e.function}'", suggestion)
+    if not min_count <= len(e.arguments) <= max_count:
+        wanted = f"{min_count}" if min_count == max_count else f"at least {min_count}"
         raise error_at(e.at, f"{len(e.arguments)} arguments in '{e}'", wanted)
 
 
-# ---- what a mapping declares
+# ---- declarations of a mapping
 
 
 def scope_of(m: d.Mapping, shapes: Mapping[str, tuple[int, int]] | None = None) -> Scope:
-    """Give the names of a mapping their meaning.
+    """Build the scope of a mapping and check its names.
 
     Parameters
     ----------
     m : Mapping
         From a document.
     shapes : mapping of str to (int, int), optional
-        Rows and columns of its tables, where they have been read.
+        Rows and columns of its tables, if these have been read.
 
     Returns
     -------
@@ -367,8 +376,8 @@ def scope_of(m: d.Mapping, shapes: Mapping[str, tuple[int, int]] | None = None) 
     Raises
     ------
     InputError
-        With the place in the document: a name given twice, unknown or used as what it is not, a
-        set that is empty, an index outside.
+        With the place in the document: a name that is declared twice, unknown or of the wrong
+        kind, an empty set, an index outside its set.
     """
     scope = Scope(m.name)
     _declare_numbers(scope, m)
@@ -379,9 +388,9 @@ def scope_of(m: d.Mapping, shapes: Mapping[str, tuple[int, int]] | None = None) 
                 _declare(scope, one, role)
     _declare_tables(scope, m, shapes or {})
     for inner in m.mappings:
-        _new(scope, inner.name, inner.at)
+        _check_new(scope, inner.name, inner.at)
         if isinstance(inner, d.NetworkDefinition):
-            scope.callees[inner.name] = _net(inner)
+            scope.callees[inner.name] = _network(inner)
         else:
             scope.callees[inner.name] = scope_of(inner)
     _declare_statements(scope, m.statements, {})
@@ -390,28 +399,31 @@ def scope_of(m: d.Mapping, shapes: Mapping[str, tuple[int, int]] | None = None) 
     return scope
 
 
-def _net(network: d.NetworkDefinition) -> Net:
+def _network(network: d.NetworkDefinition) -> CalledNetwork:
+    """Build a network and the arrays of its inputs, weights and outputs."""
     from beamfit.greybox import tree  # JAX from here on
     from beamfit.language.network_xml import network_of, weight_leaves
 
     mlp = network_of(network)
     values = tuple(tree.read(mlp, weight_leaves(mlp)).tolist())
-    known = any(part.values is not None for part in network.parts)
+    has_values = any(part.values is not None for part in network.parts)
     count = IndexSet("", np.arange(len(values)))
     ports = {name: Array(name, "input", (), network.at) for name in mlp.inputs}
-    ports["weights"] = Array("weights", "input", (count,), network.at, values if known else None)
-    return Net(mlp, ports, {n: Array(n, "output", (), network.at) for n in mlp.outputs})
+    ports["weights"] = Array(
+        "weights", "input", (count,), network.at, values if has_values else None
+    )
+    return CalledNetwork(mlp, ports, {n: Array(n, "output", (), network.at) for n in mlp.outputs})
 
 
-def _new(scope: Scope, name: str, at: Place) -> None:
-    """Refuse a name that means something already."""
+def _check_new(scope: Scope, name: str, at: Place) -> None:
+    """Raise an error for a name that is already declared."""
     for kind in (scope.sets, scope.arrays, scope.functions, scope.callees):
         if name in kind:
             raise error_at(at, f"'{name}' declared twice", "each name once in a mapping")
 
 
 def _declare_numbers(scope: Scope, m: d.Mapping) -> None:
-    """Parameters that are numbers come first: ranges of sets may use them."""
+    """Declare scalar parameters, which ranges of sets may use."""
     for one in m.parameters:
         if not one.dimensions:
             if one.values is None or len(one.values) != 1:
@@ -420,22 +432,23 @@ def _declare_numbers(scope: Scope, m: d.Mapping) -> None:
 
 
 def _declare(scope: Scope, one: d.Declared | d.Real, role: str) -> None:
-    _new(scope, one.name, one.at)
+    """Declare an array with its dimensions and values."""
+    _check_new(scope, one.name, one.at)
     dims = tuple(_dimension(scope, dim, one) for dim in one.dimensions)
     values = one.values if isinstance(one, d.Declared) else None
-    made = Array(one.name, role, dims, one.at, values)
-    check_size([*made.shape], one.at)
+    array = Array(one.name, role, dims, one.at, values)
+    check_size([*array.shape], one.at)
     if role == "parameter" and values is None:
-        raise error_at(one.at, f"parameter '{one.name}' without values", f"{made.size} numbers")
-    if values is not None and len(values) != made.size:
-        found = f"{len(values)} values for {made.said}"
-        raise error_at(one.at, found, f"{made.size}")
-    scope.arrays[one.name] = made
+        raise error_at(one.at, f"parameter '{one.name}' without values", f"{array.size} numbers")
+    if values is not None and len(values) != array.size:
+        found = f"{len(values)} values for {array.text}"
+        raise error_at(one.at, found, f"{array.size}")
+    scope.arrays[one.name] = array
 
 
 def _dimension(scope: Scope, dim: str | int, one: d.Declared | d.Real) -> IndexSet:
     if isinstance(dim, int):
-        check_size([dim], one.at, MOST_ELEMENTS)
+        check_size([dim], one.at, MAX_ELEMENTS)
         return IndexSet("", np.arange(dim))
     if dim not in scope.sets:
         raise error_at(one.at, f"no set '{dim}' for '{one.name}'", nearest(dim, list(scope.sets)))
@@ -443,31 +456,32 @@ def _dimension(scope: Scope, dim: str | int, one: d.Declared | d.Real) -> IndexS
 
 
 def _declare_sets(scope: Scope, m: d.Mapping) -> None:
-    for statement in _flat(m.statements):
+    for statement in _flatten(m.statements):
         if isinstance(statement, d.IndexedSet):
-            _new(scope, statement.name, statement.at)
+            _check_new(scope, statement.name, statement.at)
             scope.sets[statement.name] = set_of(scope, statement.elements, statement.name)
 
 
-def _flat(statements: tuple[d.Statement, ...]) -> Iterator[d.Statement]:
+def _flatten(statements: tuple[d.Statement, ...]) -> Iterator[d.Statement]:
     for statement in statements:
         if isinstance(statement, d.Block):
-            yield from _flat(statement.statements)
+            yield from _flatten(statement.statements)
         else:
             yield statement
 
 
 def _declare_tables(scope: Scope, m: d.Mapping, shapes: Mapping[str, tuple[int, int]]) -> None:
+    """Declare tables; rows and columns are counted from 1."""
     for table in m.tables:
-        _new(scope, table.name, table.at)
+        _check_new(scope, table.name, table.at)
         shape = shapes.get(table.name, (table.rows, table.columns))
         if None in shape:
             found = f"table '{table.name}' of unknown size"
             raise error_at(table.at, found, "its file, or its rows and columns")
         check_size([*shape], table.at)
         dims = tuple(
-            IndexSet(f"{what} of {table.name}", np.arange(1, n + 1))
-            for what, n in zip(("rows", "columns"), shape, strict=True)
+            IndexSet(f"{kind} of {table.name}", np.arange(1, n + 1))
+            for kind, n in zip(("rows", "columns"), shape, strict=True)
         )
         scope.arrays[table.name] = Array(table.name, "table", dims, table.at)
 
@@ -475,23 +489,23 @@ def _declare_tables(scope: Scope, m: d.Mapping, shapes: Mapping[str, tuple[int, 
 def _declare_statements(
     scope: Scope, statements: tuple[d.Statement, ...], axes: dict[str, IndexSet]
 ) -> None:
-    """Declare what statements declare, then number the steps, blocks spread out."""
-    for s in _flat(statements) if not axes else ():
+    """Declare local variables and functions, then number the steps; blocks are expanded."""
+    for s in _flatten(statements) if not axes else ():
         if isinstance(s, d.Real):
             _declare(scope, s, "real")
         elif isinstance(s, d.Function):
-            _new(scope, s.name, s.at)
+            _check_new(scope, s.name, s.at)
             if s.name in FUNCTIONS or s.name in REDUCTIONS:
                 raise error_at(s.at, f"a function '{s.name}'", "a name that is not built in")
             scope.functions[s.name] = s
     for s in statements:
         if isinstance(s, d.Block):
-            _declare_statements(scope, s.statements, widened(scope, axes, s.each))
+            _declare_statements(scope, s.statements, add_iterators(scope, axes, s.each))
         elif isinstance(s, d.Real) and s.value is not None:
-            what = d.Assignment(x.Name(s.name, at=s.at), s.value, at=s.at)
-            scope.steps.append(MappingStep(len(scope.steps), {}, what))
+            assignment = d.Assignment(x.Name(s.name, at=s.at), s.value, at=s.at)
+            scope.steps.append(MappingStep(len(scope.steps), {}, assignment))
         elif isinstance(s, d.Assignment | d.Call):
-            inner = widened(scope, axes, s.each)
+            inner = add_iterators(scope, axes, s.each)
             scope.steps.append(MappingStep(len(scope.steps), inner, s))
 
 
@@ -499,11 +513,11 @@ def _declare_statements(
 
 
 def _check_function(scope: Scope, f: d.Function) -> None:
-    """Check the names of a function's body, and that using it ends."""
+    """Check the names in a function's body, and that it does not call itself."""
     twice = [a for a in f.arguments if f.arguments.count(a) > 1]
     if twice:
         raise error_at(f.at, f"argument '{twice[0]}' twice", "each once")
-    _work(scope, f, ())
+    _count_operations(scope, f, ())
     constants = {n: a for n, a in scope.arrays.items() if scope.constant(n) is not None}
     arguments = {name: Array(name, "argument", (), f.at) for name in f.arguments}
     inside = Scope(f.name, scope.sets, constants | arguments, scope.functions)
@@ -511,38 +525,43 @@ def _check_function(scope: Scope, f: d.Function) -> None:
         pass
 
 
-def _work(scope: Scope, f: d.Function, stack: tuple[str, ...], seen: dict | None = None) -> int:
-    seen = {} if seen is None else seen
+def _count_operations(
+    scope: Scope, f: d.Function, stack: tuple[str, ...], counted: dict | None = None
+) -> int:
+    """Count the operations in one use of a function, nested functions included."""
+    counted = {} if counted is None else counted
     if f.name in stack:
         loop = " -> ".join([*stack[stack.index(f.name) :], f.name])
         raise error_at(f.at, f"a function that needs itself: {loop}", "functions that end")
-    if f.name not in seen:
+    if f.name not in counted:
         total, todo = 0, [f.body]
         while todo:
             e = todo.pop()
             todo += x.children(e)
             total += 1
             if isinstance(e, x.Application) and e.function in scope.functions:
-                total += _work(scope, scope.functions[e.function], (*stack, f.name), seen)
-        if total > MOST_WORK:
-            raise error_at(f.at, f"a function '{f.name}' of more than {MOST_WORK} operations",
+                total += _count_operations(
+                    scope, scope.functions[e.function], (*stack, f.name), counted
+                )
+        if total > MAX_OPERATIONS:
+            raise error_at(f.at, f"a function '{f.name}' of more than {MAX_OPERATIONS} operations",
                            "smaller functions")  # fmt: skip
-        seen[f.name] = total
-    return seen[f.name]
+        counted[f.name] = total
+    return counted[f.name]
 
 
 # ---- the problem
 
 
 def check_problem(document: d.Document, given: Iterable[str] = ()) -> None:
-    """Refuse names that the mapping has not, bounds that contradict, and inputs without a value."""
+    """Raise an error for unknown names, contradictory bounds and inputs without a value."""
     p, m = document.problem, document.mapping
-    faces = (p.variables, m.inputs, "input"), ((*p.goals, *p.limits), m.outputs, "output")
-    for group, face, what in faces:
-        known = [one.name for one in face]
+    groups = (p.variables, m.inputs, "input"), ((*p.goals, *p.limits), m.outputs, "output")
+    for group, declared, kind in groups:
+        known = [one.name for one in declared]
         for one in group:
             if one.model not in known:
-                found = f"no {what} '{one.model}' in the mapping"
+                found = f"no {kind} '{one.model}' in the mapping"
                 raise error_at(one.at, found, nearest(one.model, known))
     sizes = {one.name: one.dimensions for one in m.outputs}
     for one in p.goals:
@@ -558,6 +577,7 @@ def check_problem(document: d.Document, given: Iterable[str] = ()) -> None:
 
 
 def _check_variables(p: d.ProblemStatement) -> None:
+    """Raise an error for contradictory bounds, repeated variables and wrong random ranges."""
     for one in (*p.variables, *p.limits):
         if not one.lower <= one.upper:
             found = f"bounds of '{one.label}' from {one.lower:g} up to {one.upper:g}"

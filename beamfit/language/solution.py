@@ -1,4 +1,4 @@
-"""A document solved: where searches start, what the solver was told, and what came out."""
+"""Solution of a document: starts, solver options, and the result."""
 
 from __future__ import annotations
 
@@ -19,36 +19,36 @@ from beamfit.greybox.fit import Fit, FittedConstraint, FittedVariable
 from beamfit.greybox.problem import TOLERANCE
 from beamfit.greybox.solve import solve
 from beamfit.language import document as d
-from beamfit.language.compiled import gain_tables, gains_at, limited, outputs_at
+from beamfit.language.compiled import gain_tables, gains_at, limit_rows, outputs_at
 from beamfit.language.problem import Formulation, formulate, starts_of
 from beamfit.language.trace import cause_of
 from beamfit.quantity import Quantity
 from beamfit.statistics import reach_of
 
-# Solver options that are used, with the argument of `solve` that each sets.
-TOLD = dict.fromkeys(("major iterations limit", "iterations limit"), "iterations")
-TOLD["time limit"] = "seconds"
+# Solver options of documents, with the argument of `solve` that each sets.
+SOLVER_OPTIONS = dict.fromkeys(("major iterations limit", "iterations limit"), "iterations")
+SOLVER_OPTIONS["time limit"] = "seconds"
 NOISE = "Errors treat squared terms as data residuals, with the noise inferred from their scatter."
-# Kinds of defects that are reported elsewhere, with their place in the document.
-TOLD_ELSEWHERE = {"contradictory_bounds", "not_finite", "unused"}
+# Kinds of defects that are reported elsewhere with their place in the document.
+REPORTED_ELSEWHERE = {"contradictory_bounds", "not_finite", "unused"}
 TOLERANCES = {"major feasibility tolerance", "major optimality tolerance"}
 
 
 @answer
 @dataclass(frozen=True, eq=False)
 class ProblemSolution:
-    """Answer of the solver, in the names of the document.
+    """Solution of a document, with the names of the document.
 
     Parameters
     ----------
     name : str
-        What is minimised or maximised.
+        The objective that is minimised or maximised.
     fit : Fit
-        What was found.
+        Result of the solver.
     outputs, gains : mapping of str to array
-        Values at the answer, and the derivatives that were asked for.
+        Outputs and requested derivatives at the answer.
     notes : tuple of str
-        What was made of the document, its starts and its solver parameters.
+        Remarks on the document, its starts and its solver parameters.
     made : Formulation
         The document and its problem.
     """
@@ -62,7 +62,7 @@ class ProblemSolution:
 
     @property
     def status(self) -> Status:
-        """The verdict."""
+        """Verdict on the answer."""
         return self.fit.status
 
     @property
@@ -72,7 +72,7 @@ class ProblemSolution:
 
     @property
     def objective(self) -> float:
-        """The objective in the terms of the document."""
+        """Value of the document's objective."""
         return self.made.factor * self.fit.cost
 
     @property
@@ -82,20 +82,20 @@ class ProblemSolution:
         return (used or [a.solver for a in self.fit.attempts] or ["none"])[0]
 
     def variables(self) -> list[FittedVariable]:
-        """Free numbers by their labels, with d(objective)/d(bound)."""
+        """Return the free numbers by their labels, with d(objective)/d(bound)."""
         return [
             v._replace(reduced_gradient=self.made.factor * v.reduced_gradient)
             for v in self.fit.variables
         ]
 
     def constraints(self) -> list[FittedConstraint]:
-        """Limited outputs by their labels, with d(objective)/d(limit)."""
+        """Return the limited outputs by their labels, with d(objective)/d(limit)."""
         return [
             c._replace(multiplier=self.made.factor * c.multiplier) for c in self.fit.constraints
         ]
 
     def quantity(self, v: FittedVariable) -> Quantity:
-        """A free number with its error; its interval is that of Student's t."""
+        """Return a free number with its error, and its interval from Student's t distribution."""
         if not math.isfinite(v.error):
             return Quantity(v.value, None, "1")
         reach = reach_of(self.fit.dof) * v.error if self.fit.dof > 0 else math.inf
@@ -107,7 +107,7 @@ class ProblemSolution:
         return f"{self.name} = {self.objective:.10g}, {cell(self.status)}"
 
     def tables(self) -> list[Table]:
-        """Objective, variables, constraints and outputs as tables."""
+        """Make tables of the objective, variables, constraints and outputs."""
         tables = [_table("variable", self.variables(), "reduced gradient", self.made.squares)]
         if self.fit.constraints:
             tables.append(_table("constraint", self.constraints(), "multiplier", False))
@@ -120,7 +120,7 @@ class ProblemSolution:
         return {key: getattr(v, key) for key in kept} | {"value": self.quantity(v)}
 
     def to_json(self) -> dict[str, Any]:
-        """The result of the JSON contract."""
+        """Return the result of the JSON contract."""
         return {
             "name": self.name,
             "status": self.status,
@@ -143,7 +143,7 @@ class ProblemSolution:
         }
 
 
-def _goals(document: d.Document) -> str:
+def _objective_name(document: d.Document) -> str:
     goals = document.problem.goals
     return " + ".join(g.label if g.weight == 1 else f"{g.weight:g} {g.label}" for g in goals)
 
@@ -154,7 +154,7 @@ def _range(values: np.ndarray) -> str:
 
 def _table(name: str, rows: Sequence, last: str, errors: bool) -> Table:
     header = [name, "value", *["error"] * errors, "lower", "upper", "state", last]
-    return limited(header, [_cells(row, errors) for row in rows])
+    return limit_rows(header, [_cells(row, errors) for row in rows])
 
 
 def _cells(row: FittedVariable | FittedConstraint, errors: bool) -> list[str]:
@@ -179,29 +179,29 @@ def solve_document(
     Parameters
     ----------
     document : Document
-        With a problem.
+        A document with a problem.
     tables : mapping of str to array, optional
         Its data tables by name.
     starts : int
-        How many searches: the first from the numbers drawn with the seeds of the document (or given
-        in it), the others from numbers drawn within the random ranges or the bounds.
+        Number of searches. The first starts from the numbers that the document gives or draws with
+        its seeds, the others from numbers drawn within the random ranges or the bounds.
     values : mapping of str to sequence of float, optional
-        Values of inputs, and starts of variables, in the place of the document's.
+        Values of inputs, and starts of variables, that replace the document's.
     gains : iterable of str, optional
         Derivatives to compute at the answer, written ``dy/dx``.
     **options
         `solver`, `seconds` and `iterations` of `beamfit.greybox.solve.solve`, and `tolerance` of
-        the problem, in the place of the document's solver parameters; None leaves those.
+        the problem, which replace the document's solver parameters unless they are None.
 
     Returns
     -------
     ProblemSolution
-        Never raises for a search that fails: its status says so.
+        A search that fails raises nothing: the status states it.
 
     Raises
     ------
     InputError
-        With its place, if something in the document is wrong.
+        With its place, for an error in the document.
 
     Examples
     --------
@@ -213,27 +213,27 @@ def solve_document(
     y = 1, optimal upper
     """
     began = time.perf_counter()
-    told, warnings = _told(document.solver)
-    told |= {name: value for name, value in options.items() if value is not None}
-    tolerance = told.pop("tolerance", TOLERANCE)
-    made, notes = _started(formulate(document, tables, values, tolerance))
-    fit = solve(made.problem, starts=starts, began=began, **told)
-    notes = (*made.notes, *notes, *_ailments(made, fit), *warnings)
-    if places := _where(made, fit.about):
+    options_used, warnings = _solve_options(document.solver)
+    options_used |= {name: value for name, value in options.items() if value is not None}
+    tolerance = options_used.pop("tolerance", TOLERANCE)
+    made, notes = _with_finite_start(formulate(document, tables, values, tolerance))
+    fit = solve(made.problem, starts=starts, began=began, **options_used)
+    notes = (*made.notes, *notes, *_defects(made, fit), *warnings)
+    if places := _places(made, fit.about):
         notes = (*notes, f"The verdict is about {places}.")
     if fit.status is Status.not_finite:
         cause = _cause(made, fit.model)
-        told = cause is None or any(cause in note for note in notes)
-        notes = notes if told else (*notes, f"Where it ended, {cause}.")
+        options_used = cause is None or any(cause in note for note in notes)
+        notes = notes if options_used else (*notes, f"Where it ended, {cause}.")
     if made.squares and math.isfinite(fit.scale):
         notes = (*notes, NOISE)
     outputs, gained = outputs_at(made.program, fit.model), gains_at(made.program, fit.model, gains)
-    name = _goals(made.document)
+    name = _objective_name(made.document)
     return ProblemSolution(name, fit, outputs, gained, notes, made)
 
 
-def _started(made: Formulation) -> tuple[Formulation, tuple[str, ...]]:
-    """The problem at its first start that is finite, drawn again from the same seeds if need be."""
+def _with_finite_start(made: Formulation) -> tuple[Formulation, tuple[str, ...]]:
+    """Find a start with finite values, drawn again with the same seeds if necessary."""
     p, variables = made.problem, made.document.problem.variables
     if slopes(p, p.start).finite:
         return made, ()
@@ -242,40 +242,40 @@ def _started(made: Formulation) -> tuple[Formulation, tuple[str, ...]]:
     for draws, model in enumerate(islice(starts_of(made), 1, 100 if drawn else 1), 1):
         if slopes(p, np.concatenate([np.ravel(model[v.model]) for v in variables])).finite:
             times = "once" if draws == 1 else f"{draws} times"
-            said = f"At the start of the seeds {cause}"
-            begun = replace(made, problem=replace(made.problem, model=model))
-            return begun, (f"{said}; drawn again from the same seeds, {times}.",)
+            start_text = f"At the start of the seeds {cause}"
+            moved = replace(made, problem=replace(made.problem, model=model))
+            return moved, (f"{start_text}; drawn again from the same seeds, {times}.",)
     return made, (f"At the start {cause}.",) if cause else ()
 
 
 def _cause(made: Formulation, model: Mapping[str, np.ndarray]) -> str | None:
-    """Cause of an objective, limit or derivative that is not finite."""
+    """Find the cause of an objective, limit or derivative that is not finite."""
     problem = made.document.problem
     names = [one.model for one in (*problem.goals, *problem.limits)]
     found = cause_of(made.program, model, names)
     return found or cause_of(made.program, model, names, slopes=True)
 
 
-def _ailments(made: Formulation, fit: Fit) -> list[str]:
-    """Defects that `diagnose` finds, except those reported elsewhere with their place."""
-    # More data are no remedy for what the verdict may have found to be a freedom of the model.
-    told = set(fit.about) if fit.status is Status.unidentified else set()
-    found = (one for one in diagnose(made.problem) if one.kind not in TOLD_ELSEWHERE)
-    new = (one for one in found if one.kind != "undetermined" or not told.issuperset(one.names))
-    return [f"{one.message[:-1]} ({_where(made, one.names)})." for one in new]
+def _defects(made: Formulation, fit: Fit) -> list[str]:
+    """List the errors that `diagnose` finds, except those reported elsewhere with their place."""
+    # If the verdict names a freedom of the model, more data would be a wrong remedy.
+    named = set(fit.about) if fit.status is Status.unidentified else set()
+    found = (one for one in diagnose(made.problem) if one.kind not in REPORTED_ELSEWHERE)
+    new = (one for one in found if one.kind != "undetermined" or not named.issuperset(one.names))
+    return [f"{one.message[:-1]} ({_places(made, one.names)})." for one in new]
 
 
-def _where(made: Formulation, names: Iterable[str]) -> str:
-    """The places in the document of numbers and limits, '' if there are none."""
+def _places(made: Formulation, names: Iterable[str]) -> str:
+    """Write the places in the document of numbers and limits; empty if there are none."""
     problem = made.document.problem
     labels = {one.label: one.at for one in (*problem.variables, *problem.limits)}
-    told = dict.fromkeys(name.partition("[")[0] for name in names)
-    return ", ".join(f"'{name}' at {labels[name]}" for name in told if name in labels)
+    labels_named = dict.fromkeys(name.partition("[")[0] for name in names)
+    return ", ".join(f"'{name}' at {labels[name]}" for name in labels_named if name in labels)
 
 
-def _told(solver: d.Solver | None) -> tuple[dict[str, Any], list[str]]:
-    """Options of `solve` from the parameters of a solver, and what could not be used."""
-    told: dict[str, Any] = {}
+def _solve_options(solver: d.Solver | None) -> tuple[dict[str, Any], list[str]]:
+    """Convert solver parameters to options of `solve`, with a remark on ignored ones."""
+    options: dict[str, Any] = {}
     unused, tight = [], []
     for name, value in solver.settings if solver else ():
         key = " ".join(name.lower().split())
@@ -283,13 +283,15 @@ def _told(solver: d.Solver | None) -> tuple[dict[str, Any], list[str]]:
             number = float(value)
         except ValueError:
             number = math.nan
-        if key in TOLD and number > 0:
-            told[TOLD[key]] = int(number) if TOLD[key] == "iterations" else number
+        if key in SOLVER_OPTIONS and number > 0:
+            options[SOLVER_OPTIONS[key]] = (
+                int(number) if SOLVER_OPTIONS[key] == "iterations" else number
+            )
         elif key in TOLERANCES and number > 0:
             tight.append(number)
         else:
             unused.append(name)
-    said = [f"Ignored solver options: {', '.join(unused)}."] if unused else []
+    notes = [f"Ignored solver options: {', '.join(unused)}."] if unused else []
     if tight:
-        told["tolerance"] = min(tight)
-    return told, said
+        options["tolerance"] = min(tight)
+    return options, notes

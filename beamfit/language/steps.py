@@ -1,7 +1,7 @@
-"""Steps that are more than an assignment: calls of mappings and networks, and recurrences.
+"""Steps other than assignments: calls of mappings and networks, and recurrences.
 
-Calls are wired by name and computed for all points at once, with gains. Statements with earlier
-values of themselves are one `lax.scan` over their time.
+Inputs and outputs of calls are connected by name. Calls are computed for all points at once, with
+gains. A recurrence is one `lax.scan` over its time.
 """
 
 from __future__ import annotations
@@ -17,67 +17,88 @@ import numpy as np
 from beamfit.greybox import tree
 from beamfit.language import document as d
 from beamfit.language import expression as x
-from beamfit.language.evaluate import Setting, Value, check_rank, evaluate, lifted, picked, stored
+from beamfit.language.evaluate import (
+    Context,
+    Value,
+    add_axes,
+    assign,
+    check_rank,
+    evaluate,
+    take_elements,
+)
 from beamfit.language.network_xml import weight_leaves
-from beamfit.language.plan import Lagged, RecurrencePlan, callee_of, gains_of, sources
-from beamfit.language.scope import Array, Axes, IndexSet, MappingStep, Net, Scope, located, widened
+from beamfit.language.plan import LaggedRead, RecurrencePlan, callee_of, gains_of, sources
+from beamfit.language.scope import (
+    Array,
+    Axes,
+    CalledNetwork,
+    IndexSet,
+    MappingStep,
+    Scope,
+    add_iterators,
+    find_positions,
+)
 
 Arrays = dict[str, jax.Array]
 ONE = IndexSet("", np.arange(1))
 
 
-def called(statement: d.Call, s: Setting, inner: Callable[[str], Callable]) -> Arrays:
-    """The arrays that a call changes; `inner` gives a mapping inside by name as it is computed."""
+def run_call(statement: d.Call, s: Context, inner: Callable[[str], Callable]) -> Arrays:
+    """Compute the arrays that a call changes; `inner` returns the function of an inner mapping."""
     callee = callee_of(s.scope, statement)
-    given, count = given_to(statement, callee, s), len(s.axes)
+    given, count = call_inputs(statement, callee, s), len(s.axes)
     names = [gains_of(w, callee, statement.mapping) for w in statement.outputs]
-    run = partial(_network, callee) if isinstance(callee, Net) else inner(statement.mapping)
-    function = _function(s, callee, run, names)
-    # All points at once: along each iterator that an input changes with.
+    run = (
+        partial(_run_network, callee)
+        if isinstance(callee, CalledNetwork)
+        else inner(statement.mapping)
+    )
+    function = _call_function(s, callee, run, names)
+    # Compute all points at once, along each iterator on which an input depends.
     lead = [max((a.shape[k] for a in given.values()), default=1) for k in range(count)]
-    many = [k for k, n in enumerate(lead) if n > 1]
-    for k in reversed(many):
+    varying = [k for k, n in enumerate(lead) if n > 1]
+    for k in reversed(varying):
         function = jax.vmap(
             function, ({n: 0 if a.shape[k] > 1 else None for n, a in given.items()},)
         )
     found = function({n: a.reshape([m for m in a.shape[:count] if m > 1] + [*a.shape[count:]])
                       for n, a in given.items()})  # fmt: skip
-    made: Arrays = {}
+    changed: Arrays = {}
     for wire, value, (output, _) in zip(statement.outputs, found, names, strict=True):
-        own = value.shape[len(many) :]
+        own = value.shape[len(varying) :]
         whole = Value(value.reshape(*lead, *own), len(own))
-        axes, to = widened(s.scope, s.axes, wire.each), wire.target
-        part = _output(s, whole, output, callee, axes, count)
-        array = s.scope.arrays[to.name]
-        check_rank(s.scope, to, array, part, wire.value)
-        old = made.get(to.name, s.arrays[to.name])
-        made[to.name] = stored(old, s.scope, array, to, axes, part, wire.value)
-    return made
+        axes, target = add_iterators(s.scope, s.axes, wire.each), wire.target
+        part = _take_output(s, whole, output, callee, axes, count)
+        array = s.scope.arrays[target.name]
+        check_rank(s.scope, target, array, part, wire.value)
+        old = changed.get(target.name, s.arrays[target.name])
+        changed[target.name] = assign(old, s.scope, array, target, axes, part, wire.value)
+    return changed
 
 
-def given_to(statement: d.Call, callee: Scope | Net, s: Setting) -> Arrays:
-    """Inputs of a call: one axis for each of its iterators, then the dimensions of the input."""
+def call_inputs(statement: d.Call, callee: Scope | CalledNetwork, s: Context) -> Arrays:
+    """Compute the inputs of a call: one axis for each iterator, then the input's dimensions."""
     given = {}
     for name, array in callee.inputs.items():
         wires = [w for w in statement.inputs if w.target.name == name]
         if wires:
-            given[name] = _wired(s, array, wires)
+            given[name] = _connect_input(s, array, wires)
     return given
 
 
-def _wired(s: Setting, array: Array, wires: list[d.Assignment]) -> jax.Array:
-    """An input of what is called: one axis for each iterator of the call, then its dimensions."""
+def _connect_input(s: Context, array: Array, wires: list[d.Assignment]) -> jax.Array:
+    """Compute one input: one axis for each iterator of the call, then the input's dimensions."""
     count = len(s.axes)
     found = jnp.zeros((*[1] * count, *array.shape))
     if array.values is not None:
         found = found + jnp.asarray(array.values, float).reshape(array.shape)
     for wire in wires:
-        value = evaluate(wire.value, replace(s, axes=widened(s.scope, s.axes, wire.each)))
+        value = evaluate(wire.value, replace(s, axes=add_iterators(s.scope, s.axes, wire.each)))
         check_rank(s.scope, wire.target, array, value, wire.value)
-        own = widened(s.scope, {}, wire.each)
+        own = add_iterators(s.scope, {}, wire.each)
 
         def put(old, v, wire=wire, own=own, rank=value.rank):
-            return stored(old, s.scope, array, wire.target, own, Value(v, rank), wire.value)
+            return assign(old, s.scope, array, wire.target, own, Value(v, rank), wire.value)
 
         for _ in range(count):
             put = jax.vmap(put)
@@ -87,23 +108,23 @@ def _wired(s: Setting, array: Array, wires: list[d.Assignment]) -> jax.Array:
     return found
 
 
-def _output(s: Setting, v: Value, output: x.Name, callee, axes: Axes, count: int) -> Value:
-    """The elements of an output that a wire takes."""
+def _take_output(s: Context, v: Value, output: x.Name, callee, axes: Axes, count: int) -> Value:
+    """Take the elements of an output that a wire names."""
     array = callee.outputs[output.name]
     if v.rank == 0 or not output.indices:
-        return lifted(v, len(axes))
-    indices = located(s.scope, output, array, axes)
+        return add_axes(v, len(axes))
+    indices = find_positions(s.scope, output, array, axes)
     whole = sum(isinstance(i, x.Whole) for i in output.indices)
     lead = []
     for k, n in enumerate(v.array.shape[:count]):
         shape = [1] * (len(axes) + whole)
         shape[k] = n
         lead.append(np.arange(n).reshape(shape))
-    return Value(picked(v.array, [*lead, *indices], len(axes) + whole), whole)
+    return Value(take_elements(v.array, [*lead, *indices], len(axes) + whole), whole)
 
 
-def _function(s: Setting, callee: Scope | Net, run: Callable, wanted) -> Callable:
-    """The called mapping as a function of its inputs; it returns outputs and gains in order."""
+def _call_function(s: Context, callee: Scope | CalledNetwork, run: Callable, wanted) -> Callable:
+    """Make the called mapping a function of its inputs that returns outputs and gains in order."""
     names = sorted({output.name for output, _ in wanted})
 
     def outputs(given: Arrays) -> Arrays:
@@ -120,13 +141,13 @@ def _function(s: Setting, callee: Scope | Net, run: Callable, wanted) -> Callabl
     return function
 
 
-def defaults(callee: Scope | Net) -> Arrays:
-    """Inputs that the document gives values to."""
+def defaults(callee: Scope | CalledNetwork) -> Arrays:
+    """Return the inputs that have values in the document."""
     given = {n: a for n, a in callee.inputs.items() if a.values is not None}
     return {n: jnp.asarray(np.reshape(a.values, a.shape), float) for n, a in given.items()}
 
 
-def _network(callee: Net, given: Arrays, names: list[str]) -> Arrays:
+def _run_network(callee: CalledNetwork, given: Arrays, names: list[str]) -> Arrays:
     net = callee.mlp
     if "weights" in given:
         net = tree.replace(net, weight_leaves(net), given["weights"])
@@ -135,12 +156,12 @@ def _network(callee: Net, given: Arrays, names: list[str]) -> Arrays:
     return {name: every[name] for name in names}
 
 
-def _gain(s: Setting, callee, outputs, given: Arrays, output: x.Name, by: tuple[x.Name, ...]):
-    """A gain of an output by inputs, one after the other, by forward derivatives."""
+def _gain(s: Context, callee, outputs, given: Arrays, output: x.Name, by: tuple[x.Name, ...]):
+    """Compute the derivative of an output by one input after the other, in forward mode."""
 
     def derivative(function, e: x.Name):
         array = callee.inputs[e.name]
-        at = tuple(int(i.ravel()[0]) for i in located(s.scope, e, array, s.axes))
+        at = tuple(int(i.ravel()[0]) for i in find_positions(s.scope, e, array, s.axes))
 
         def slope(values):
             zero = jax.tree.map(jnp.zeros_like, values)
@@ -158,43 +179,43 @@ def _gain(s: Setting, callee, outputs, given: Arrays, output: x.Name, by: tuple[
 # ---- recurrences
 
 
-def scanned(scope: Scope, plan: RecurrencePlan, arrays: Arrays, assigned) -> Arrays:
-    """Compute the arrays that the steps of a plan advance.
+def scan_recurrence(scope: Scope, plan: RecurrencePlan, arrays: Arrays, run_step) -> Arrays:
+    """Compute the arrays of a recurrence.
 
     Parameters
     ----------
     scope : Scope
-        The names of the mapping.
+        Names of the mapping.
     plan : RecurrencePlan
-        The steps, and how far back each reads.
+        Steps of the recurrence and their lagged reads.
     arrays : dict of str to array
-        Everything that is known before, first values of what advances included.
-    assigned : callable
-        ``assigned(step, setting)`` gives the arrays that a step changes.
+        All arrays computed so far, including first values of the recurrence.
+    run_step : callable
+        ``run_step(step, context)`` returns the arrays that a step changes.
 
     Returns
     -------
     dict of str to array
     """
-    fixed, moving = _apart(scope, plan, arrays)
-    small = _without_time(scope, plan)
-    full = {n: jnp.moveaxis(arrays[n], w.dim, 0) for n, w in plan.written.items()}
-    ends = {n: w.start + plan.length for n, w in plan.written.items()}
-    begin = {n: full[n][w.start : ends[n]] for n, w in plan.written.items()}
-    past = {n: _history(full[n], w.start, plan.depth) for n, w in plan.written.items()}
+    fixed, moving = _precompute(scope, plan, arrays)
+    small = _scope_without_time(scope, plan)
+    full = {n: jnp.moveaxis(arrays[n], w.dim, 0) for n, w in plan.time_axes.items()}
+    ends = {n: w.start + plan.length for n, w in plan.time_axes.items()}
+    begin = {n: full[n][w.start : ends[n]] for n, w in plan.time_axes.items()}
+    past = {n: _history(full[n], w.start, plan.depth) for n, w in plan.time_axes.items()}
 
     def advance(history: Arrays, at):
         fresh, outside = at
         for step in plan.steps:
-            k = list(step.axes).index(plan.time[step.number])
-            known = fixed | {
+            k = list(step.axes).index(plan.time_iterators[step.number])
+            computed = fixed | {
                 i: Value(jnp.expand_dims(v, moving[i][0]), moving[i][1]) for i, v in outside.items()
             }
             for i, lagged in plan.reads.items():
-                known[i] = _looked_up(lagged, fresh, history)
+                computed[i] = _lagged_value(lagged, fresh, history)
             axes = {n: ONE if i == k else s for i, (n, s) in enumerate(step.axes.items())}
-            setting = Setting(small, arrays | fresh, axes, known=known)
-            fresh = fresh | assigned(_timeless(step, plan), setting)
+            context = Context(small, arrays | fresh, axes, computed=computed)
+            fresh = fresh | run_step(_step_without_time(step, plan), context)
         if plan.depth:
             history = {n: jnp.concatenate([fresh[n][None], h[:-1]]) for n, h in history.items()}
         return history, fresh
@@ -203,22 +224,22 @@ def scanned(scope: Scope, plan: RecurrencePlan, arrays: Arrays, assigned) -> Arr
     _, found = jax.lax.scan(advance, past, (begin, values))
     return {
         n: jnp.moveaxis(full[n].at[w.start : ends[n]].set(found[n]), 0, w.dim)
-        for n, w in plan.written.items()
+        for n, w in plan.time_axes.items()
     }
 
 
-def _apart(scope: Scope, plan: RecurrencePlan, arrays: Arrays):
-    """Values of all that does not hang on what advances: fixed ones, and those that run with time.
+def _precompute(scope: Scope, plan: RecurrencePlan, arrays: Arrays):
+    """Compute all parts that do not depend on the recurrence, constant or changing with time.
 
-    The latter are the axis of time, the rank, and the array with time in front.
+    The latter are returned as the axis of time, the rank, and the array with time in front.
     """
     fixed: dict[int, Value] = {}
     moving: dict[int, tuple[int, int, jax.Array]] = {}
     for step in plan.steps:
-        k = list(step.axes).index(plan.time[step.number])
+        k = list(step.axes).index(plan.time_iterators[step.number])
         for e, axes in sources(scope, step):
-            for part, inner in _independent(scope, e, axes, plan):
-                value = evaluate(part, Setting(scope, arrays, inner))
+            for part, inner in _independent_parts(scope, e, axes, plan):
+                value = evaluate(part, Context(scope, arrays, inner))
                 if value.array.shape[k] > 1:
                     moving[id(part)] = k, value.rank, jnp.moveaxis(value.array, k, 0)
                 else:
@@ -226,55 +247,55 @@ def _apart(scope: Scope, plan: RecurrencePlan, arrays: Arrays):
     return fixed, moving
 
 
-def _independent(
+def _independent_parts(
     scope: Scope, e: x.Expression, axes: Axes, plan: RecurrencePlan
 ) -> Iterator[tuple[x.Expression, Axes]]:
-    """The largest parts of an expression that read nothing that advances."""
+    """Yield the largest parts of an expression that do not depend on the recurrence."""
     if id(e) in plan.reads or isinstance(e, x.Literal):
         return
-    if not _advancing(e, plan):
+    if not _is_recurrent(e, plan):
         yield e, axes
     elif isinstance(e, x.Reduction):
-        yield from _independent(scope, e.body, widened(scope, axes, e.iterators), plan)
+        yield from _independent_parts(scope, e.body, add_iterators(scope, axes, e.iterators), plan)
     else:
         for part in x.children(e):
-            yield from _independent(scope, part, axes, plan)
+            yield from _independent_parts(scope, part, axes, plan)
 
 
-def _advancing(e: x.Expression, plan: RecurrencePlan) -> bool:
-    return id(e) in plan.reads or any(_advancing(part, plan) for part in x.children(e))
+def _is_recurrent(e: x.Expression, plan: RecurrencePlan) -> bool:
+    return id(e) in plan.reads or any(_is_recurrent(part, plan) for part in x.children(e))
 
 
 def _history(full: jax.Array, start: int, depth: int) -> jax.Array:
-    """Values before the start, last one first; zeros, which nobody reads, before all."""
+    """Return the values before the start, the last first; missing ones are zero and never read."""
     before = full[max(start - depth, 0) : start][::-1]
     return jnp.pad(before, [(0, depth - len(before)), *[(0, 0)] * (full.ndim - 1)])
 
 
-def _looked_up(lagged: Lagged, fresh: Arrays, history: Arrays) -> Value:
+def _lagged_value(lagged: LaggedRead, fresh: Arrays, history: Arrays) -> Value:
     stack = jnp.concatenate([fresh[lagged.name][None], history[lagged.name]])
     rank = lagged.lag.ndim
-    return Value(picked(stack, [lagged.lag, *lagged.rest], rank), lagged.whole)
+    return Value(take_elements(stack, [lagged.lag, *lagged.other_indices], rank), lagged.whole)
 
 
-def _without_time(scope: Scope, plan: RecurrencePlan) -> Scope:
-    """The names as they are at one time."""
+def _scope_without_time(scope: Scope, plan: RecurrencePlan) -> Scope:
+    """Make the scope at one time: arrays of the recurrence lose their time dimension."""
     small: dict[str, Array] = {}
-    for name, w in plan.written.items():
+    for name, w in plan.time_axes.items():
         array = scope.arrays[name]
         small[name] = array._replace(dims=array.dims[: w.dim] + array.dims[w.dim + 1 :])
     return replace(scope, arrays=scope.arrays | small)
 
 
-def _timeless(step: MappingStep, plan: RecurrencePlan) -> MappingStep:
-    """A step whose targets have no index of time."""
+def _step_without_time(step: MappingStep, plan: RecurrencePlan) -> MappingStep:
+    """Remove the time index from the targets of a step."""
 
     def target(node: x.Name) -> x.Name:
-        at = plan.written[node.name].dim
+        at = plan.time_axes[node.name].dim
         return replace(node, indices=node.indices[:at] + node.indices[at + 1 :])
 
-    what = step.what
-    if isinstance(what, d.Assignment):
-        return step._replace(what=replace(what, target=target(what.target)))
-    outputs = tuple(replace(w, target=target(w.target)) for w in what.outputs)
-    return step._replace(what=replace(what, outputs=outputs))
+    statement = step.statement
+    if isinstance(statement, d.Assignment):
+        return step._replace(statement=replace(statement, target=target(statement.target)))
+    outputs = tuple(replace(w, target=target(w.target)) for w in statement.outputs)
+    return step._replace(statement=replace(statement, outputs=outputs))

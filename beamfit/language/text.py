@@ -1,6 +1,6 @@
-"""Text form of documents as it is written.
+"""Writer of the text form of documents.
 
-`parse_document` reads what `format_document` writes back to the same document.
+`parse_document` reads the text of `format_document` as the same document.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from textwrap import indent, wrap
 from beamfit.language import document as d
 from beamfit.language.expression import iterators_text
 
-# Superscripts and fractions are letters to Python, not here.
+# Superscripts and fractions count as letters in Python's regular expressions, but not in names.
 NAME = re.compile(r"[^\W\d²³¹⁰⁴-⁹½¼¾][^\W²³¹⁰⁴-⁹½¼¾]*")
 NUMBER = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?")
 
@@ -26,7 +26,7 @@ def format_document(document: d.Document) -> str:
     Parameters
     ----------
     document : Document
-        What to write.
+        The document to write.
 
     Returns
     -------
@@ -52,12 +52,12 @@ def format_document(document: d.Document) -> str:
 
 
 def format_statements(statements: Sequence[d.Statement]) -> str:
-    """Write statements as they stand in ``<expressions>``."""
+    """Write statements as the text of ``<expressions>``."""
     return "\n".join(_statements(statements))
 
 
 def number_text(value: float) -> str:
-    """Write a number so that it reads back the same, whole ones without a point."""
+    """Write a number that reads back the same; whole numbers have no decimal point."""
     value = float(value)
     signed = value == 0 and math.copysign(1.0, value) < 0
     whole = value.is_integer() and abs(value) < 1e15 and not signed
@@ -77,6 +77,7 @@ def _pair(low: float, high: float) -> str:
 
 
 def _problem(p: d.ProblemStatement | None) -> Iterable[str]:
+    """Yield the lines of goals, variables and constraints."""
     if p is None:
         return
     for goal in p.goals:
@@ -115,23 +116,24 @@ def _solver(s: d.Solver | None) -> Iterable[str]:
 
 
 def _members(m: d.Mapping) -> list[str]:
+    """List the lines of tables, inner mappings, declarations and statements."""
     lines = [_table(t) for t in m.tables]
     for inner in m.mappings:
         mapping = isinstance(inner, d.Mapping)
-        body = _members(inner) if mapping else [_part(p) for p in inner.parts]
+        body = _members(inner) if mapping else [_network_part(p) for p in inner.parts]
         kind = "mapping" if mapping else "network"
         lines += [f"{kind} {inner.name} {{", *(indent(line, "  ") for line in body), "}"]
     groups = (("input", m.inputs), ("output", m.outputs), ("parameter", m.parameters))
     for word, names in groups:
-        lines += _listed(word, [_declared(n) for n in names])
+        lines += _wrap_declarations(word, [_declared(n) for n in names])
     return lines + _statements(m.statements)
 
 
-def _listed(word: str, names: list[str]) -> list[str]:
-    """Several declarations on a line, and as many lines as they need."""
+def _wrap_declarations(word: str, names: list[str]) -> list[str]:
+    """Write declarations, several on a line, in as many lines as needed."""
     if not names:
         return []
-    # Blanks within one declaration must not be broken.
+    # Lines must not be broken within one declaration.
     joined = ", ".join(name.replace(" ", "\0") for name in names) + ";"
     lines = wrap(joined, 96, initial_indent=f"{word} ", subsequent_indent="  ",
                  break_long_words=False, break_on_hyphens=False)  # fmt: skip
@@ -148,7 +150,7 @@ def _dims(dimensions: Sequence[str | int]) -> str:
 
 
 def values_text(values: Sequence[float]) -> str:
-    """Write numbers as they stand behind a name."""
+    """Write the values of an array."""
     return f"[{', '.join(map(number_text, values))}]"
 
 
@@ -160,7 +162,7 @@ def _declared(n: d.Declared) -> str:
     return f"{n.name}{_dims(n.dimensions)}{value}"
 
 
-def _part(p: d.NetworkElement) -> str:
+def _network_part(p: d.NetworkElement) -> str:
     heads = 2 if p.kind == "connection" else 1
     name = " -> ".join(value for _, value in p.attributes[:heads])
     rest = ", ".join(f"{k} = {_word(v)}" for k, v in p.attributes[heads:])
@@ -168,19 +170,20 @@ def _part(p: d.NetworkElement) -> str:
     return f"{p.kind} {name}{f' ({rest})' if rest else ''}{values};"
 
 
-def _each(each: Sequence) -> str:
+def _iterators(each: Sequence) -> str:
     return f" foreach {iterators_text(tuple(each))}" if each else ""
 
 
-def _wires(wires: Sequence[d.Assignment]) -> str:
-    return "; ".join(f"{w.target} = {w.value}{_each(w.each)}" for w in wires)
+def _connections(wires: Sequence[d.Assignment]) -> str:
+    return "; ".join(f"{w.target} = {w.value}{_iterators(w.each)}" for w in wires)
 
 
 def _statements(statements: Sequence[d.Statement]) -> list[str]:
+    """List the lines of statements; local variables are joined on a line."""
     lines: list[str] = []
     for kind, group in groupby(statements, type):
         if kind is d.Real:
-            lines += _listed("real", [
+            lines += _wrap_declarations("real", [
                 f"{r.name}{_dims(r.dimensions)}{'' if r.value is None else f' = {r.value}'}"
                 for r in group
             ])  # fmt: skip
@@ -190,16 +193,17 @@ def _statements(statements: Sequence[d.Statement]) -> list[str]:
 
 
 def _statement(s: d.Statement) -> list[str]:
+    """List the lines of one statement."""
     match s:
         case d.IndexedSet():
             return [f"set {s.name} = {s.elements};"]
         case d.Function():
             return [f"function {s.name}({', '.join(s.arguments)}) = {s.body};"]
         case d.Assignment():
-            return [f"{s.target} = {s.value}{_each(s.each)};"]
+            return [f"{s.target} = {s.value}{_iterators(s.each)};"]
         case d.Call():
-            inner = f"{_wires(s.inputs)} :: {_wires(s.outputs)}".strip()
-            return [f"{s.mapping}({inner}){_each(s.each)};"]
+            inner = f"{_connections(s.inputs)} :: {_connections(s.outputs)}".strip()
+            return [f"{s.mapping}({inner}){_iterators(s.each)};"]
         case d.Block():
             body = [indent(line, "  ") for line in _statements(s.statements)]
-            return [_each(s.each).strip() + " {", *body, "}"]
+            return [_iterators(s.each).strip() + " {", *body, "}"]

@@ -1,8 +1,8 @@
-"""The report's XML form of a document (its Figure 3 and Appendices A to D), read and written.
+"""Reader and writer of the report's XML form of a document (Figure 3 and Appendices A to D).
 
-Elements know the places of their attributes and text; what attacks is refused. Dimensions, ranges
-and attributes are those of the report; `lower` and `upper` of a network's input and `cells` of a
-gain are beamfit's own (`beamfit.language.network_xml`).
+Elements have the places of their attributes and text. Malicious XML (entities, document types, deep
+nesting) is rejected. Dimensions, ranges and attributes are those of the report; `lower` and `upper`
+of a network's input and `cells` of a gain are extensions (`beamfit.language.network_xml`).
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ from beamfit.language.expression import Elements, Place, error_at
 from beamfit.language.parse import parse_statements
 from beamfit.language.text import NAME, format_statements, number_text, values_text
 
-# Most nested elements.
-MOST_DEEP = 40
+# Largest depth of nested elements.
+MAX_DEPTH = 40
 MLP_CLASS = "com.pav.pdas.model.mlp.MlpMapping"
 EXPRESSIONS = "com.pav.pdas.model.expression.ExpressionMapping"
 NLP = "com.pav.pdas.optimization.common.NLPProblem"
-# Children and attributes of each element; a misspelt one would be lost without a word.
+# Allowed children and attributes of each element; a misspelt one would otherwise be ignored.
 PARTS = {
     "formulation": ("problem mapping solver", ""),
     "problem": ("variable constraint objective", "classname direction"),
@@ -46,60 +46,61 @@ PARTS = {
     "dimension": ("", "type set size"), "values": ("", ""), "expressions": ("", ""),
 }  # fmt: skip
 NETWORK_PARTS = ["input", "output", "gain", "layer", "connection"]
-SILENT = {"formulation", "problem", "mapping", "solver", "set", "output"}  # elements without text
+# Elements that have no text.
+WITHOUT_TEXT = {"formulation", "problem", "mapping", "solver", "set", "output"}
 
 
 class Node(NamedTuple):
-    """An element: its text begins where it stands in the file, so that places in it are right."""
+    """An element with the places of its attributes; its text is padded to its place in the file."""
 
     tag: str
-    given: dict[str, str]
+    attributes: dict[str, str]
     children: list[Node]
     text: list[str]
     places: dict[str, Place]
 
     @property
     def at(self) -> Place:
-        """Place of the name it declares, or else of its beginning."""
+        """Place of the declared name, else of the element."""
         keys = ("modelVariable", "label", "name", "")
         return next(self.places[key] for key in keys if key in self.places)
 
     def all(self, tag: str) -> list[Node]:
-        """Children of a name."""
+        """Return the children of a tag."""
         return [child for child in self.children if child.tag == tag]
 
     def error(self, found: str, expected: str, key: str = "") -> InputError:
-        """An error at its place, or at the place of an attribute."""
+        """Make an error at the place of the element or one of its attributes."""
         return error_at(self.places[key], found, expected)
 
     def need(self, key: str) -> str:
-        """An attribute that must be there."""
-        if key not in self.given:
+        """Return a required attribute."""
+        if key not in self.attributes:
             raise self.error(f"<{self.tag}> without {key}", f"an attribute {key}='...'")
-        return self.given[key]
+        return self.attributes[key]
 
     def name(self, key: str = "name") -> str:
-        """An attribute that names something in expressions."""
+        """Return a required attribute that must be a valid name."""
         if not NAME.fullmatch(self.need(key)):
-            found = f"{key}='{self.given[key]}'"
+            found = f"{key}='{self.attributes[key]}'"
             raise self.error(found, "a name of letters, digits and _", key)
-        return self.given[key]
+        return self.attributes[key]
 
     def number(self, key: str, default: Any, kind: Callable[[str], Any] = float) -> Any:
-        """A numeric attribute."""
-        if key not in self.given:
+        """Return a numeric attribute."""
+        if key not in self.attributes:
             return default
         try:
-            value = kind(self.given[key].strip())
+            value = kind(self.attributes[key].strip())
         except (ValueError, OverflowError):
             value = math.nan
         if value != value:
-            said = "a whole number" if kind is int else "a number"
-            raise self.error(f"{key}='{self.given[key]}' in <{self.tag}>", said, key)
+            kind_text = "a whole number" if kind is int else "a number"
+            raise self.error(f"{key}='{self.attributes[key]}' in <{self.tag}>", kind_text, key)
         return value
 
     def numbers(self) -> tuple[float, ...]:
-        """The numbers of its text, with brackets around them or without."""
+        """Return the numbers of the text, with or without brackets around them."""
         text = "".join(self.text).strip().removeprefix("[").removesuffix("]")
         try:
             return tuple(map(float, text.replace(",", " ").split()))
@@ -109,7 +110,7 @@ class Node(NamedTuple):
 
 
 class _ElementReader(ContentHandler):
-    """Builds nodes; text is padded to the line and column where it stands in the file."""
+    """Builds nodes; the text of expressions is padded to its line and column in the file."""
 
     def __init__(self, source: str) -> None:
         super().__init__()
@@ -124,21 +125,21 @@ class _ElementReader(ContentHandler):
     def startElement(self, name, attrs):
         given = dict(attrs.items())
         node = Node(name, given, [], [], self._places(given))
-        if len(self.open) > MOST_DEEP:
-            raise node.error(f"elements within {MOST_DEEP} others", "fewer")
+        if len(self.open) > MAX_DEPTH:
+            raise node.error(f"elements within {MAX_DEPTH} others", "fewer")
         self.open[-1].children.append(node)
         self.open.append(node)
         self.end = Place(1, 1)
 
     def _places(self, given: dict[str, str]) -> dict[str, Place]:
-        """Places of an element's attribute values; its own under the empty key."""
+        """Find the places of an element's attribute values; the empty key is its own place."""
         here = self._here()
-        # An opening tag of more than a dozen lines has its attributes where it begins.
+        # Attributes beyond the twelfth line of a tag get the place where the tag begins.
         first = "".join(self.lines[here.line - 1 : here.line + 12])[here.column - 1 :]
         found = {"": here}
         for key in given:
             match = re.search(rf"\s{re.escape(key)}\s*=\s*['\"]", first)
-            found[key] = here.behind(first[: match.end()]) if match else here
+            found[key] = here.after(first[: match.end()]) if match else here
         return found
 
     def endElement(self, name):
@@ -151,20 +152,20 @@ class _ElementReader(ContentHandler):
             lines = here.line - self.end.line
             blanks = here.column - (1 if lines else self.end.column)
             self.open[-1].text.append("\n" * lines + " " * blanks)
-            self.end = here.behind(content)
+            self.end = here.after(content)
         self.open[-1].text.append(content)
 
 
-def _ill_formed(said: str, at: Place, reader: _ElementReader) -> tuple[str, str]:
-    """Error in a text that is not well-formed XML, and what was expected."""
+def _syntax_error(message: str, at: Place, reader: _ElementReader) -> tuple[str, str]:
+    """Describe the error in a text that is not well-formed XML, and what is expected."""
     line = reader.lines[at.line - 1] if at.line <= len(reader.lines) else ""
     closing = re.search(r"</\s*([^\s>]*)", line[max(0, at.column - 3) :])
     inner = reader.open[-1]
-    if said == "mismatched tag" and closing and len(reader.open) > 1:
+    if message == "mismatched tag" and closing and len(reader.open) > 1:
         found = f"</{closing[1]}> where <{inner.tag}> of line {inner.places[''].line} is open"
         return found, f"</{inner.tag}>, or <{closing[1]}> in line {inner.places[''].line}"
     remedy = "well-formed XML: values in quotes, < written as &lt;, & as &amp;"
-    return f"{said} in <{inner.tag}>" if inner.tag else said, remedy
+    return f"{message} in <{inner.tag}>" if inner.tag else message, remedy
 
 
 def read_elements(text: str) -> Node:
@@ -173,14 +174,14 @@ def read_elements(text: str) -> Node:
     Raises
     ------
     InputError
-        With its place, if it is not XML, or has entities, a document type, or nests too deep.
+        With its place, if it is not XML, has entities or a document type, or is nested too deep.
     """
     reader = _ElementReader(text)
     try:
         parseString(text.encode(), reader, forbid_dtd=True)
     except SAXParseException as error:
         at = Place(error.getLineNumber(), error.getColumnNumber() + 1)
-        raise error_at(at, *_ill_formed(error.getMessage(), at, reader)) from None
+        raise error_at(at, *_syntax_error(error.getMessage(), at, reader)) from None
     except DefusedXmlException as error:
         raise InputError(f"{error}", "XML without entities or a document type") from None
     except InputError:
@@ -200,7 +201,7 @@ def parse_xml(text: str) -> d.Document:
     Parameters
     ----------
     text : str
-        With root element ``<formulation>``, or ``<mapping>`` for a mapping without a problem.
+        XML with the root element ``<formulation>``, or ``<mapping>`` for a mapping alone.
 
     Returns
     -------
@@ -209,8 +210,8 @@ def parse_xml(text: str) -> d.Document:
     Raises
     ------
     InputError
-        With line and column, if it is no such document. Entities, document types and deep nesting
-        are refused.
+        With line and column, if it is not such a document or has entities, a document type or deep
+        nesting.
 
     Examples
     --------
@@ -224,7 +225,9 @@ def parse_xml(text: str) -> d.Document:
     _check(root)
     if root.tag == "mapping":
         return d.Document(_mapping(root))
-    mapping, problem, solver = (_one(root, tag) for tag in ("mapping", "problem", "solver"))
+    mapping, problem, solver = (
+        _single_child(root, tag) for tag in ("mapping", "problem", "solver")
+    )
     if mapping is None:
         raise root.error("<formulation> without <mapping>", "a mapping to optimise")
     return d.Document(
@@ -235,24 +238,24 @@ def parse_xml(text: str) -> d.Document:
 
 
 def _check(node: Node) -> None:
-    """Refuse children, attributes and text that mean nothing; a network has its own attributes."""
-    network = node.given.get("classname") == MLP_CLASS
+    """Raise an error for unknown children, attributes and text; networks are checked later."""
+    network = node.attributes.get("classname") == MLP_CLASS
     children, attributes = (part.split() for part in PARTS[node.tag])
     children = NETWORK_PARTS if network else children
     for child in node.children:
         if child.tag not in children:
-            known = nearest(child.tag, children) if children else "no elements"
-            raise child.error(f"<{child.tag}> in <{node.tag}>", known)
-    if node.tag in SILENT and "".join(node.text).strip():
+            suggestion = nearest(child.tag, children) if children else "no elements"
+            raise child.error(f"<{child.tag}> in <{node.tag}>", suggestion)
+    if node.tag in WITHOUT_TEXT and "".join(node.text).strip():
         raise node.error(f"text in <{node.tag}>", "elements only")
-    for key, value in node.given.items():
+    for key, value in node.attributes.items():
         if key not in attributes:
             raise node.error(f"{key}='{value}' in <{node.tag}>", nearest(key, attributes), key)
     for child in () if network else node.children:
         _check(child)
 
 
-def _one(node: Node, tag: str) -> Node | None:
+def _single_child(node: Node, tag: str) -> Node | None:
     found = node.all(tag)
     if len(found) > 1:
         raise found[1].error(f"a second <{tag}>", "one")
@@ -260,7 +263,8 @@ def _one(node: Node, tag: str) -> Node | None:
 
 
 def _problem(node: Node) -> d.ProblemStatement:
-    direction = node.given.get("direction", "minimize").strip().lower()
+    """Read the problem with its goals, variables and limits."""
+    direction = node.attributes.get("direction", "minimize").strip().lower()
     if direction not in ("minimize", "maximize"):
         found = f"direction='{direction}'"
         raise node.error(found, nearest(direction, ["minimize", "maximize"]), "direction")
@@ -273,8 +277,8 @@ def _problem(node: Node) -> d.ProblemStatement:
 
 
 def _labels(e: Node) -> tuple[str, str]:
-    key = "modelVariable" if "modelVariable" in e.given else "label"
-    return e.given.get("label", e.name(key)), e.name(key)
+    key = "modelVariable" if "modelVariable" in e.attributes else "label"
+    return e.attributes.get("label", e.name(key)), e.name(key)
 
 
 def _bounds(e: Node) -> tuple[float, float]:
@@ -282,9 +286,10 @@ def _bounds(e: Node) -> tuple[float, float]:
 
 
 def _variable(e: Node) -> d.FreeInput:
+    """Read a free input."""
     low, high = _bounds(e)
     random = None
-    if e.given.get("useRandomInitial", "false").strip().lower() == "true":
+    if e.attributes.get("useRandomInitial", "false").strip().lower() == "true":
         random = e.number("randomLower", low), e.number("randomUpper", high)
     seed = e.number("randomSeed", 0, int)
     if seed < 0:
@@ -294,28 +299,29 @@ def _variable(e: Node) -> d.FreeInput:
 
 def _solver(node: Node) -> d.Solver:
     settings = tuple((e.need("name"), e.need("value")) for e in node.all("parameter"))
-    return d.Solver(node.given.get("classname", "default"), settings, at=node.at)
+    return d.Solver(node.attributes.get("classname", "default"), settings, at=node.at)
 
 
 # ---- mappings
 
 
 def _mapping(node: Node) -> d.Mapping:
-    kind = node.given.get("classname", EXPRESSIONS)
+    """Read a mapping with its tables, inner mappings, declarations and statements."""
+    kind = node.attributes.get("classname", EXPRESSIONS)
     if kind != EXPRESSIONS:
         found = f"classname='{kind}'"
         raise node.error(found, nearest(kind, [EXPRESSIONS, MLP_CLASS]), "classname")
     tables = tuple(map(_table, node.all("data")))
-    inner = tuple(_network(e) if e.given.get("classname") == MLP_CLASS else _mapping(e)
+    inner = tuple(_network(e) if e.attributes.get("classname") == MLP_CLASS else _mapping(e)
                   for e in node.all("mapping"))  # fmt: skip
     for e in node.all("mapping"):
         e.name()
     groups = (tuple(map(_declared, node.all(tag))) for tag in ("input", "output", "parameter"))
     sets = tuple(map(_set, node.all("set")))
-    text = _one(node, "expressions")
+    text = _single_child(node, "expressions")
     statements = parse_statements("".join(text.text)) if text else ()
     return d.Mapping(
-        node.given.get("name", ""), tables, inner, *groups, (*sets, *statements), at=node.at
+        node.attributes.get("name", ""), tables, inner, *groups, (*sets, *statements), at=node.at
     )
 
 
@@ -327,40 +333,43 @@ def _table(e: Node) -> d.DataTable:
 
 
 def _declared(e: Node) -> d.Declared:
+    """Read an input, output or parameter."""
     dimensions: list[str | int] = []
     for dim in e.all("dimension"):
-        if "set" in dim.given:
+        if "set" in dim.attributes:
             dimensions.append(dim.name("set"))
         else:
             dim.need("size")
             dimensions.append(dim.number("size", 1, int))
-    values = _one(e, "values")
+    values = _single_child(e, "values")
     if values is not None:
         return d.Declared(e.name(), tuple(dimensions), values.numbers(), at=e.at)
-    given = (e.number("value", 0.0),) if "value" in e.given else None
+    given = (e.number("value", 0.0),) if "value" in e.attributes else None
     return d.Declared(e.name(), tuple(dimensions), given, at=e.at)
 
 
 def _set(e: Node) -> d.IndexedSet:
-    inner = _one(e, "elements")
+    """Read a set."""
+    inner = _single_child(e, "elements")
     if inner is None:
         raise e.error("<set> without <elements>", "<elements type='range' start='1' stop='9'/>")
-    kind = inner.given.get("type", "range")
+    kind = inner.attributes.get("type", "range")
     if kind not in ("range", "list"):
         raise inner.error(f"type='{kind}'", nearest(kind, ["range", "list"]), "type")
     numbers = "".join(inner.text).replace(",", " ").split()
     if kind == "range":
-        keys = ("start", "stop", *(["step"] if "step" in inner.given else []))
+        keys = ("start", "stop", *(["step"] if "step" in inner.attributes else []))
         numbers = [str(inner.number(key, inner.need(key), int)) for key in keys]
     parts = parse_statements(f"set s = |{', '.join(numbers)}|;")[0].elements.parts
     return d.IndexedSet(e.name(), Elements(parts, kind == "range", at=e.at), at=e.at)
 
 
 def _network(node: Node) -> d.NetworkDefinition:
+    """Read the parts of a network without building it."""
     parts = []
     for e in node.children:
         heads = ("srcName", "dstName") if e.tag == "connection" else ("name",)
-        rest = [(k, v) for k, v in e.given.items() if k not in heads]
+        rest = [(k, v) for k, v in e.attributes.items() if k not in heads]
         values = e.numbers() if "".join(e.text).strip() else None
         head = [(k, e.name(k)) for k in heads]
         parts.append(d.NetworkElement(e.tag, (*head, *rest), values, at=e.at))
@@ -376,7 +385,7 @@ def format_xml(document: d.Document) -> str:
     Parameters
     ----------
     document : Document
-        What to write.
+        The document to write.
 
     Returns
     -------
@@ -398,11 +407,12 @@ def format_xml(document: d.Document) -> str:
 
 
 def _problem_elements(p: d.ProblemStatement | None) -> list[Plain.Element]:
+    """Make the element of the problem; an empty list without a problem."""
     if p is None:
         return []
     e = Plain.Element("problem", classname=NLP, direction="maximize" if p.maximize else "minimize")
     for v in p.variables:
-        given = _labelled(v)
+        given = _label_attributes(v)
         if v.value is not None:
             given["value"] = number_text(v.value)
         if v.random is not None:
@@ -412,22 +422,23 @@ def _problem_elements(p: d.ProblemStatement | None) -> list[Plain.Element]:
             given["randomSeed"] = str(v.seed)
         Plain.SubElement(e, "variable", given)
     for limit in p.limits:
-        Plain.SubElement(e, "constraint", _labelled(limit))
+        Plain.SubElement(e, "constraint", _label_attributes(limit))
     for goal in p.goals:
         weight = {} if goal.weight == 1.0 else {"coefficient": number_text(goal.weight)}
-        Plain.SubElement(e, "objective", _labelled(goal) | weight)
+        Plain.SubElement(e, "objective", _label_attributes(goal) | weight)
     return [e]
 
 
-def _labelled(of: d.FreeInput | d.Limit | d.Goal) -> dict[str, str]:
-    given = {"label": of.label, "modelVariable": of.model}
-    for key, usual in (("lower", -math.inf), ("upper", math.inf)):
-        if (value := getattr(of, key, usual)) != usual:
+def _label_attributes(declared: d.FreeInput | d.Limit | d.Goal) -> dict[str, str]:
+    given = {"label": declared.label, "modelVariable": declared.model}
+    for key, default in (("lower", -math.inf), ("upper", math.inf)):
+        if (value := getattr(declared, key, default)) != default:
             given[key] = number_text(value)
     return given
 
 
 def _mapping_element(m: d.Mapping) -> Plain.Element:
+    """Make the element of a mapping."""
     e = Plain.Element("mapping", {"classname": EXPRESSIONS} | ({"name": m.name} if m.name else {}))
     for t in m.tables:
         size = {"rowCount": t.rows, "columnCount": t.columns}
@@ -445,16 +456,17 @@ def _mapping_element(m: d.Mapping) -> Plain.Element:
     return e
 
 
-def _declare(e: Plain.Element, of: d.Declared) -> None:
-    if of.dimensions:
+def _declare(e: Plain.Element, declared: d.Declared) -> None:
+    """Write dimensions and values to the element of an input, output or parameter."""
+    if declared.dimensions:
         e.set("isScalar", "false")
-    for dim in of.dimensions:
+    for dim in declared.dimensions:
         given = {"type": "ID", "set": dim} if isinstance(dim, str) else None
         Plain.SubElement(e, "dimension", given or {"type": "size", "size": str(dim)})
-    if of.values is not None and (of.dimensions or len(of.values) != 1):
-        Plain.SubElement(e, "values").text = values_text(of.values)
-    elif of.values is not None:
-        e.set("value", number_text(of.values[0]))
+    if declared.values is not None and (declared.dimensions or len(declared.values) != 1):
+        Plain.SubElement(e, "values").text = values_text(declared.values)
+    elif declared.values is not None:
+        e.set("value", number_text(declared.values[0]))
 
 
 def _network_element(n: d.NetworkDefinition) -> Plain.Element:

@@ -1,4 +1,4 @@
-"""Convergence of a chain, its effective size, and the rules of its verdict."""
+"""Convergence of a chain, effective sample size, and the rules of the verdict."""
 
 from __future__ import annotations
 
@@ -12,27 +12,28 @@ from beamfit.sampling.likelihood import FRACTION, noise_words
 from beamfit.sampling.target import SamplingTarget
 
 # R-hat below which chains agree: Vehtari et al., Bayesian Analysis 16, 667 (2021).
-AGREED = 1.01
-# Autocorrelation times in a chain from which on their estimate is reliable (emcee's advice).
-LONG = 50
-# Posterior width, as a share of the prior's, above which the prior decides the answer: the data
-# then weigh about half as much as the prior.
-LITTLE = 0.8
+MAX_RHAT = 1.01
+# Length of a chain, in autocorrelation times, from which on their estimate is reliable (emcee's
+# documentation).
+MIN_TIMES = 50
+# The prior determines a number if its posterior is wider than this share of the prior's width: the
+# data then have about half the weight of the prior.
+MAX_WIDTH_SHARE = 0.8
 
 
 class Diagnostics(NamedTuple):
-    """Judgement of a chain, number by number.
+    """Diagnostics of a chain for each number.
 
     Attributes
     ----------
     autocorrelation : array, shape (n,)
-        Integrated autocorrelation time, steps; never below 1.
+        Integrated autocorrelation time in steps, at least 1.
     effective : array, shape (n,)
-        Effective sample size: draws over that time.
+        Effective sample size: draws divided by the autocorrelation time.
     rhat : array, shape (n,)
         Split R-hat.
     steps, walkers : int
-        Size of the chain judged.
+        Size of the chain.
     """
 
     autocorrelation: np.ndarray
@@ -43,13 +44,13 @@ class Diagnostics(NamedTuple):
 
     @property
     def settled(self) -> bool:
-        """True if the walkers agree and the chain is many autocorrelation times long."""
-        agreed = bool(np.max(self.rhat) < AGREED)
-        return agreed and self.steps >= LONG * float(np.max(self.autocorrelation))
+        """True if the walkers agree and the chain has enough autocorrelation times."""
+        agreed = bool(np.max(self.rhat) < MAX_RHAT)
+        return agreed and self.steps >= MIN_TIMES * float(np.max(self.autocorrelation))
 
 
 def split_rhat(chain: np.ndarray) -> np.ndarray:
-    """Compare walkers with each other, and each one's first half with its second.
+    """Compute split R-hat: compare walkers with each other, and each one's halves.
 
     Parameters
     ----------
@@ -59,8 +60,8 @@ def split_rhat(chain: np.ndarray) -> np.ndarray:
     Returns
     -------
     array, shape (n,)
-        sqrt of the pooled variance over the variance within, 1 where all agree, infinite where a
-        number never moved: A. Gelman et al., Bayesian Data Analysis, 3rd edition, equation 11.4.
+        Square root of the pooled variance over the variance within; 1 if all agree, infinite if a
+        number never moved (A. Gelman et al., Bayesian Data Analysis, 3rd edition, equation 11.4).
 
     Examples
     --------
@@ -78,7 +79,7 @@ def split_rhat(chain: np.ndarray) -> np.ndarray:
 
 
 def autocorrelation_times(chain: np.ndarray) -> np.ndarray:
-    """Integrated autocorrelation time by emcee's estimator (A. Sokal's window), in steps.
+    """Compute integrated autocorrelation times in steps, with emcee's estimator (Sokal's window).
 
     Parameters
     ----------
@@ -88,7 +89,7 @@ def autocorrelation_times(chain: np.ndarray) -> np.ndarray:
     Returns
     -------
     array, shape (n,)
-        At least 1; infinite where a walker never moved.
+        At least 1; infinite if a walker never moved.
 
     Examples
     --------
@@ -98,7 +99,7 @@ def autocorrelation_times(chain: np.ndarray) -> np.ndarray:
     """
     from emcee.autocorr import integrated_time
 
-    # Numbers as small as 1e-16 are as good as any other for the estimator if they are scaled.
+    # Scaled, because the estimator fails for numbers as small as 1e-16.
     spread = np.std(chain, axis=(0, 1))
     moved = np.all(np.ptp(chain, axis=0) > 0, axis=0)
     times = np.full(chain.shape[2], np.inf)
@@ -109,30 +110,30 @@ def autocorrelation_times(chain: np.ndarray) -> np.ndarray:
 
 
 def diagnose(chain: np.ndarray) -> Diagnostics:
-    """Judge a chain.
+    """Compute the diagnostics of a chain.
 
     Parameters
     ----------
     chain : array, shape (steps, walkers, n)
-        Without its warm-up.
+        The chain without its warm-up.
 
     Returns
     -------
     Diagnostics
-        Of a chain too short for any judgement: no effective samples, infinite R-hat.
+        For fewer than four steps, no effective draws and an infinite R-hat.
     """
     steps, walkers, n = chain.shape
     if steps < 4:
-        nothing = np.full(n, np.inf)
-        return Diagnostics(nothing, np.zeros(n), nothing, steps, walkers)
+        infinite = np.full(n, np.inf)
+        return Diagnostics(infinite, np.zeros(n), infinite, steps, walkers)
     times = autocorrelation_times(chain)
     return Diagnostics(times, steps * walkers / times, split_rhat(chain), steps, walkers)
 
 
 class ChainEvidence(NamedTuple):
-    """Input of the rules: the chain's diagnostics, the target, and the requested draws.
+    """Input of the rules: diagnostics, target, requested effective draws and budget.
 
-    `held` names the numbers asked for that the prior or the bounds decide.
+    `held` names the shown numbers that the prior or the bounds determine.
     """
 
     diagnostics: Diagnostics
@@ -143,26 +144,27 @@ class ChainEvidence(NamedTuple):
 
 
 def held_by_priors(target: SamplingTarget, draws: np.ndarray) -> tuple[str, ...]:
-    """Name the numbers whose posterior is about as wide as what held them beforehand.
+    """Name the numbers whose posterior is about as wide as their prior.
 
     Parameters
     ----------
     target : SamplingTarget
-        The problem.
+        The target.
     draws : array, shape (m, n)
-        Its draws.
+        Draws of its numbers.
 
     Returns
     -------
     tuple of str
-        Numbers spread by 0.8 or more of their prior, or of a flat one between their bounds.
+        Numbers with a standard deviation above 0.8 of their prior's, or of a flat prior's between
+        their bounds.
     """
-    before = (target.upper - target.lower) / np.sqrt(12.0)
+    prior_width = (target.upper - target.lower) / np.sqrt(12.0)
     for name, prior in target.priors.items():
         i = target.names.index(name)
-        before[i] = min(float(prior.std()), before[i])
-    wide = np.isfinite(before) & (np.std(draws, axis=0) > LITTLE * before)
-    # The share of outliers is a by-product; its prior is the sampler's own.
+        prior_width[i] = min(float(prior.std()), prior_width[i])
+    wide = np.isfinite(prior_width) & (np.std(draws, axis=0) > MAX_WIDTH_SHARE * prior_width)
+    # The fraction of outliers is a nuisance number with a prior of the sampler.
     return tuple(
         name
         for name, held in zip(target.names, wide, strict=True)
@@ -170,11 +172,11 @@ def held_by_priors(target: SamplingTarget, draws: np.ndarray) -> tuple[str, ...]
     )
 
 
-def _never_settled(e: ChainEvidence) -> Finding | None:
+def _not_warmed_up(e: ChainEvidence) -> Finding | None:
     if e.diagnostics.steps:
         return None
-    said = f"The walkers did not settle within the budget of {e.budget} steps: raise it."
-    return Finding(Status.not_converged, said)
+    message = f"The walkers did not settle within the budget of {e.budget} steps: raise it."
+    return Finding(Status.not_converged, message)
 
 
 def _walkers_disagree(e: ChainEvidence) -> Finding | None:
@@ -183,19 +185,19 @@ def _walkers_disagree(e: ChainEvidence) -> Finding | None:
     allowed = 1 + 1 / np.maximum(e.diagnostics.effective, 1.0)
     worst = e.target.names[int(np.argmax(e.diagnostics.rhat / allowed))]
     cause = f"The budget of {e.budget} steps ended before the walkers agreed"
-    said = f"{cause} (slowest: {plain_name(worst)}): raise it, and distrust the intervals."
-    return Finding(Status.not_converged, said)
+    message = f"{cause} (slowest: {plain_name(worst)}): raise it, and distrust the intervals."
+    return Finding(Status.not_converged, message)
 
 
 def _too_few_draws(e: ChainEvidence) -> Finding | None:
     if np.min(e.diagnostics.effective) >= e.target_ess:
         return None
     cause = f"The walkers agree, but the budget of {e.budget} steps ended before"
-    said = f"{cause} {e.target_ess:.0f} effective draws: raise it for smoother intervals."
-    return Finding(Status.not_converged, said)
+    message = f"{cause} {e.target_ess:.0f} effective draws: raise it for smoother intervals."
+    return Finding(Status.not_converged, message)
 
 
-def _priors_decide(e: ChainEvidence) -> Finding | None:
+def _not_separable(e: ChainEvidence) -> Finding | None:
     if not e.held:
         return None
     named = ", ".join(plain_name(name) for name in e.held)
@@ -213,8 +215,8 @@ def _poor_model(e: ChainEvidence) -> Finding | None:
     return Finding(Status.poor_fit, f"{cause} mend the model, or infer the noise.")
 
 
-def _agreed(e: ChainEvidence) -> Finding:
+def _converged(e: ChainEvidence) -> Finding:
     return Finding(Status.converged, f"The walkers agree; errors {noise_words(e.target.groups)}.")
 
 
-RULES = (_never_settled, _walkers_disagree, _too_few_draws, _priors_decide, _poor_model, _agreed)
+RULES = (_not_warmed_up, _walkers_disagree, _too_few_draws, _not_separable, _poor_model, _converged)

@@ -1,4 +1,4 @@
-"""Likelihoods of residuals: errors known, noise inferred, outliers among the points."""
+"""Likelihoods of residuals with known errors, inferred noise, or outliers."""
 
 from __future__ import annotations
 
@@ -13,19 +13,20 @@ from jax import Array
 from beamfit.errors import InputError
 
 LOG_NOISE, FRACTION = "log_noise", "outlier_fraction"
-# Range of an outlier's own error, in units of the stated one; the prior is flat in its logarithm.
-NARROWEST, WIDEST = 3.0, 1e5
-# Half-range of the logarithm of the noise about the fit's value.
+# Range of an outlier's standard deviation in units of the given error; the prior is flat in its
+# logarithm. Chosen: from clearly wider than the noise to any wild reading.
+MIN_OUTLIER_WIDTH, MAX_OUTLIER_WIDTH = 3.0, 1e5
+# Half-width of the range of the logarithm of the noise about the fit's value: no limit in practice.
 NOISE_REACH = 10.0
-WORDS = {
+NOISE_TEXT = {
     "known": "as stated",
     "inferred": "inferred from the residuals",
     "averaged": "averaged over",
 }
 
 
-class Own(NamedTuple):
-    """A number of the likelihood's own: where it may lie, begins, and how far it spreads."""
+class NoiseParameter(NamedTuple):
+    """A parameter of the noise: bounds, start, and standard deviation of the first walkers."""
 
     name: str
     lower: float
@@ -40,16 +41,16 @@ class NoiseGroup(NamedTuple):
     Attributes
     ----------
     label : str
-        Of the group, before the names of its numbers; empty where there is one group only.
+        Label of the group in the names of its parameters; empty if there is only one group.
     noise : str
         ``known``: the errors are right. ``inferred``: they are right up to a common factor, whose
-        logarithm is free with a flat prior. ``averaged``: the law's own prior has their likelihood,
-        averaged over the noise, and the residuals count nowhere.
+        logarithm is free with a flat prior. ``averaged``: the law's prior includes the likelihood,
+        averaged over the noise, and the residuals are not used.
     outliers : bool
-        Whether an unknown fraction of the points, flat from 0 to 1/2, are outliers.
+        True if an unknown fraction of the points are outliers; its prior is flat from 0 to 1/2.
     freedom : float
-        Degrees of freedom that stated errors are worth where the noise is inferred: a scaled
-        inverse χ² prior about 1 on the square of the factor.
+        Degrees of freedom of the given errors if the noise is inferred: a scaled inverse χ² prior
+        about 1 on the square of the factor.
     """
 
     label: str = ""
@@ -59,16 +60,16 @@ class NoiseGroup(NamedTuple):
 
     @property
     def prefix(self) -> str:
-        """Prefix of the names of its numbers."""
+        """Prefix of the names of its parameters."""
         return f"{self.label}." if self.label else ""
 
     @property
     def inferred(self) -> bool:
-        """True if the factor on its errors is free."""
+        """True if the factor on the errors is free."""
         return self.noise == "inferred"
 
-    def own(self, factor: float = 1.0) -> tuple[Own, ...]:
-        """The numbers it adds to those of the model, where the errors seem so much too small.
+    def parameters(self, factor: float = 1.0) -> tuple[NoiseParameter, ...]:
+        """Return the parameters of the noise; `factor` is the start of the factor on the errors.
 
         Raises
         ------
@@ -78,39 +79,41 @@ class NoiseGroup(NamedTuple):
         if self.noise not in ("known", "inferred", "averaged"):
             raise InputError(f"noise '{self.noise}'", "known or inferred")
         at = math.log(max(factor, 1e-300))
-        noise = Own(self.prefix + LOG_NOISE, at - NOISE_REACH, at + NOISE_REACH, at, 0.1)
-        fraction = Own(self.prefix + FRACTION, 0.0, 0.5, 0.1, 0.07)
+        noise = NoiseParameter(self.prefix + LOG_NOISE, at - NOISE_REACH, at + NOISE_REACH, at, 0.1)
+        fraction = NoiseParameter(self.prefix + FRACTION, 0.0, 0.5, 0.1, 0.07)
         return (noise,) * self.inferred + (fraction,) * self.outliers
 
 
 def noise_words(groups: Sequence[NoiseGroup]) -> str:
-    """Say of each group of points what is taken of its errors.
+    """Describe the noise model of each group.
 
     Examples
     --------
     >>> noise_words((NoiseGroup("x", "inferred"), NoiseGroup("y")))
     'x inferred from the residuals; y as stated'
     """
-    said = [WORDS[group.noise] + (", with outliers" if group.outliers else "") for group in groups]
-    if len(set(said)) == 1:
-        return said[0]
-    return "; ".join(f"{g.label} {words}" for g, words in zip(groups, said, strict=True))
+    texts = [
+        NOISE_TEXT[group.noise] + (", with outliers" if group.outliers else "") for group in groups
+    ]
+    if len(set(texts)) == 1:
+        return texts[0]
+    return "; ".join(f"{g.label} {words}" for g, words in zip(groups, texts, strict=True))
 
 
 def outlier_density(residual: Array) -> Array:
-    """Density of an outlier's residual in units of the stated errors.
+    """Compute the density of an outlier's residual in units of the given errors.
 
     Parameters
     ----------
     residual : array
-        Of any shape.
+        Residuals, of any shape.
 
     Returns
     -------
     array
-        A normal distribution of unknown width w, averaged over ln w from ln 3 to ln 1e5:
+        Density of a normal distribution of unknown width w, averaged over ln w from ln 3 to ln 1e5:
         [Φ(r/3) - Φ(r/1e5)]/(r ln(1e5/3)), where Φ is the normal distribution function. It falls
-        as 1/r, so that a wild point pulls at nothing.
+        as 1/r, so that a wild point has no effect on the fit.
 
     Examples
     --------
@@ -121,13 +124,16 @@ def outlier_density(residual: Array) -> Array:
     r = jnp.abs(residual)
     near = r < 1e-3
     safe = jnp.where(near, 1.0, r)
-    far = jax.scipy.special.erfc(safe / WIDEST / math.sqrt(2.0))
-    between = 0.5 * (far - jax.scipy.special.erfc(safe / NARROWEST / math.sqrt(2.0))) / safe
-    limit = (1 / NARROWEST - 1 / WIDEST) / math.sqrt(2 * math.pi)
-    return jnp.where(near, limit, between) / math.log(WIDEST / NARROWEST)
+    far = jax.scipy.special.erfc(safe / MAX_OUTLIER_WIDTH / math.sqrt(2.0))
+    between = 0.5 * (far - jax.scipy.special.erfc(safe / MIN_OUTLIER_WIDTH / math.sqrt(2.0))) / safe
+    limit = (1 / MIN_OUTLIER_WIDTH - 1 / MAX_OUTLIER_WIDTH) / math.sqrt(2 * math.pi)
+    return jnp.where(near, limit, between) / math.log(MAX_OUTLIER_WIDTH / MIN_OUTLIER_WIDTH)
 
 
-def _of_group(residual: Array, counts: Array, group: NoiseGroup, extra: list[Array]) -> Array:
+def _group_likelihood(
+    residual: Array, counts: Array, group: NoiseGroup, extra: list[Array]
+) -> Array:
+    """Compute the log likelihood of one group, taking its parameters from the front of `extra`."""
     if group.noise == "averaged":
         return jnp.zeros(())
     log_scale = extra.pop(0) if group.inferred else 0.0
@@ -142,26 +148,26 @@ def _of_group(residual: Array, counts: Array, group: NoiseGroup, extra: list[Arr
         tiny = jnp.finfo(float).tiny
         wild = jnp.log(jnp.maximum(safe, tiny)) + jnp.log(outlier_density(scaled) + tiny)
         each = jnp.logaddexp(good, wild)
-    before = -group.freedom * (log_scale + 0.5 * jnp.exp(-2.0 * log_scale))
-    value = before + jnp.sum(jnp.where(counts, each - log_scale, 0.0))
+    log_prior = -group.freedom * (log_scale + 0.5 * jnp.exp(-2.0 * log_scale))
+    value = log_prior + jnp.sum(jnp.where(counts, each - log_scale, 0.0))
     return jnp.where(inside, value, -jnp.inf)
 
 
 def log_likelihood(
     residuals: Sequence[Array], counts: Sequence[Array], groups: Sequence[NoiseGroup], extra: Array
 ) -> Array:
-    """Log likelihood of residuals, up to a constant.
+    """Compute the log likelihood of residuals, up to a constant.
 
     Parameters
     ----------
     residuals : sequence of array
-        One vector a group, in units of the stated errors.
+        Residuals of each group, in units of the given errors.
     counts : sequence of bool or array of bool
-        Which of them count; the others fill a vector up to its length.
+        True for the residuals that count; the others are padding.
     groups : sequence of NoiseGroup
-        How they scatter.
+        Noise models.
     extra : array, shape (k,)
-        The groups' own numbers, in order.
+        Parameters of the noise of all groups, in order.
 
     Returns
     -------
@@ -175,6 +181,6 @@ def log_likelihood(
     >>> print(log_likelihood([jnp.array([1.0, 2.0])], [True], [NoiseGroup()], jnp.zeros(0)))
     -2.5
     """
-    own = list(extra)
+    parameters = list(extra)
     parts = zip(residuals, counts, groups, strict=True)
-    return sum((_of_group(*part, own) for part in parts), jnp.zeros(()))
+    return sum((_group_likelihood(*part, parameters) for part in parts), jnp.zeros(()))

@@ -1,4 +1,4 @@
-"""Moves of walkers: leaps informed by the fit, steps along differences between walkers."""
+"""Moves of walkers: long moves from a fitted proposal, steps along differences of walkers."""
 
 from __future__ import annotations
 
@@ -10,37 +10,37 @@ import numpy as np
 from scipy.linalg import solve_triangular
 from scipy.special import gammaln
 
-# Degrees of freedom that are tried, from heavy tails to nearly normal.
+# Degrees of freedom that are tried for a proposal, from heavy tails to nearly normal.
 DEGREES = (4.0, 6.0, 10.0, 30.0)
 
 
 class Widening(NamedTuple):
-    """Widening of the numbers with an inferred noise: twice the noise, twice as wide.
+    """Widening of numbers in proportion to an inferred noise: twice the noise, twice as wide.
 
     Attributes
     ----------
     centre : array, shape (n,)
-        From where distances are measured, the logarithm of the noise included.
-    source : array of int, shape (n,)
-        Place of the logarithm that widens each number; -1 for none.
+        Origin of the distances, the logarithm of the noise included.
+    noise_index : array of int, shape (n,)
+        Index of the logarithm of the noise that widens each number; -1 for none.
     """
 
     centre: np.ndarray
-    source: np.ndarray
+    noise_index: np.ndarray
 
     def log_factors(self, points: np.ndarray) -> np.ndarray:
-        """Log of how much wider than at the centre each number is, shape (m, n)."""
-        logs = points[:, self.source] - self.centre[self.source]
-        return np.where(self.source < 0, 0.0, logs)
+        """Compute the log of each number's width relative to that at the centre, shape (m, n)."""
+        logs = points[:, self.noise_index] - self.centre[self.noise_index]
+        return np.where(self.noise_index < 0, 0.0, logs)
 
-    def evened(self, points: np.ndarray) -> np.ndarray:
-        """Points in distances that do not widen, shape (m, n)."""
+    def to_scaled(self, points: np.ndarray) -> np.ndarray:
+        """Convert points to distances divided by their widening, shape (m, n)."""
         return (points - self.centre) * np.exp(-self.log_factors(points))
 
-    def widened(self, evened: np.ndarray) -> np.ndarray:
-        """The inverse: a source is widened by nothing, so its own distance is at hand."""
-        logs = np.where(self.source < 0, 0.0, evened[:, self.source])
-        return self.centre + evened * np.exp(logs)
+    def from_scaled(self, scaled: np.ndarray) -> np.ndarray:
+        """Invert `to_scaled`; the logarithms of the noise themselves are not widened."""
+        logs = np.where(self.noise_index < 0, 0.0, scaled[:, self.noise_index])
+        return self.centre + scaled * np.exp(logs)
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,9 +52,9 @@ class Student:
     location : array, shape (n,)
         Centre.
     root : array, shape (n, n)
-        Lower triangle L; the scale matrix is L Lᵀ.
+        Cholesky factor L (lower triangle); the scale matrix is L Lᵀ.
     degrees : float
-        Of freedom.
+        Degrees of freedom.
 
     Examples
     --------
@@ -84,9 +84,9 @@ class Student:
         return norm - float(np.sum(np.log(np.diag(self.root))))
 
     def log_density(self, points: np.ndarray) -> np.ndarray:
-        """Log density at points of shape (m, n)."""
-        off = (points - self.location) @ self._inverse.T
-        squares = np.einsum("ij,ij->i", off, off)
+        """Compute the log density at points of shape (m, n)."""
+        distance = (points - self.location) @ self._inverse.T
+        squares = np.einsum("ij,ij->i", distance, distance)
         power = 0.5 * (self.degrees + len(self.location))
         return self._norm - power * np.log1p(squares / self.degrees)
 
@@ -95,25 +95,24 @@ class Student:
 class IndependenceProposal:
     """Proposal of long moves, independent of the walker's present place.
 
-    As a proposal of `emcee.moves.MHMove` it makes an independence sampler (L. Tierney, Annals of
-    Statistics 22, 1701 (1994), section 2.3): exact whatever the proposal, fast where it is near
-    the posterior.
+    With `emcee.moves.MHMove` it makes an independence sampler (L. Tierney, Annals of Statistics 22,
+    1701 (1994), section 2.3): exact for any proposal, and fast if this is close to the posterior.
 
     Parameters
     ----------
     widening : Widening
-        In which distances the parts are Student distributions.
+        Scaling of the distances in which the parts are Student distributions.
     blocks : tuple of array of int
-        Which numbers each part is for; together all of them, each once.
+        Indices of the numbers of each part; each number is in one block.
     parts : tuple of Student
-        Independent of each other: one heavy tail should not make all of them heavy.
+        Independent distributions, so that one heavy tail does not make all tails heavy.
 
     Examples
     --------
     >>> plain = Widening(np.zeros(2), np.array([-1, -1]))
-    >>> leap = about(np.eye(2), plain, (np.array([0, 1]),))
+    >>> leap = proposal_about(np.eye(2), plain, (np.array([0, 1]),))
     >>> new, log_ratio = leap(np.zeros((4, 2)), np.random.RandomState(0))
-    >>> new.shape, bool((log_ratio > 0).all())  # from the centre one only leaps outwards
+    >>> new.shape, bool((log_ratio > 0).all())  # all moves from the centre go outwards
     ((4, 2), True)
     """
 
@@ -123,29 +122,29 @@ class IndependenceProposal:
 
     def draw(self, random: np.random.RandomState, number: int) -> np.ndarray:
         """Draw points, shape (number, n)."""
-        evened = np.empty((number, len(self.widening.centre)))
+        scaled = np.empty((number, len(self.widening.centre)))
         for block, part in zip(self.blocks, self.parts, strict=True):
-            evened[:, block] = part.draw(random, number)
-        return self.widening.widened(evened)
+            scaled[:, block] = part.draw(random, number)
+        return self.widening.from_scaled(scaled)
 
     def log_density(self, points: np.ndarray) -> np.ndarray:
-        """Log density at points of shape (m, n)."""
+        """Compute the log density at points of shape (m, n)."""
         logs = self.widening.log_factors(points)
-        evened = (points - self.widening.centre) * np.exp(-logs)
+        scaled = (points - self.widening.centre) * np.exp(-logs)
         pairs = zip(self.blocks, self.parts, strict=True)
-        found = sum(part.log_density(evened[:, block]) for block, part in pairs)
+        found = sum(part.log_density(scaled[:, block]) for block, part in pairs)
         return found - logs.sum(axis=1)
 
     def __call__(
         self, coords: np.ndarray, random: np.random.RandomState
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Propose new points, and the log of q(old)/q(new) of Metropolis and Hastings."""
+        """Propose new points; also return log q(old)/q(new) for Metropolis-Hastings."""
         new = self.draw(random, len(coords))
         return new, self.log_density(coords) - self.log_density(new)
 
 
 def _root(covariance: np.ndarray) -> np.ndarray:
-    """Lower triangle of a covariance, of unit columns first: its numbers differ by 1e20."""
+    """Compute the Cholesky factor, of the correlations first: variances differ by up to 1e20."""
     scale = np.sqrt(np.diag(covariance))
     scale = np.where(scale > 0, scale, 1.0)
     inner = covariance / scale / scale[:, None]
@@ -158,19 +157,19 @@ def _root(covariance: np.ndarray) -> np.ndarray:
     return np.diag(scale)
 
 
-def about(
+def proposal_about(
     covariance: np.ndarray, widening: Widening, blocks: tuple[np.ndarray, ...], degrees: float = 5.0
 ) -> IndependenceProposal:
-    """Leap about a centre with the covariance of a fit.
+    """Make a proposal about a centre with the covariance of a fit.
 
     Parameters
     ----------
     covariance : array, shape (n, n)
-        Of which each block is used.
+        Covariance; the diagonal blocks are used.
     widening, blocks
-        As of `IndependenceProposal`.
+        As for `IndependenceProposal`.
     degrees : float
-        Of freedom.
+        Degrees of freedom.
 
     Returns
     -------
@@ -183,7 +182,7 @@ def about(
     return IndependenceProposal(widening, blocks, tuple(parts))
 
 
-def fitted(points: np.ndarray, before: IndependenceProposal) -> IndependenceProposal:
+def fit_proposal(points: np.ndarray, before: IndependenceProposal) -> IndependenceProposal:
     """Fit a proposal to draws from a posterior.
 
     Parameters
@@ -191,82 +190,83 @@ def fitted(points: np.ndarray, before: IndependenceProposal) -> IndependenceProp
     points : array, shape (m, n)
         Draws.
     before : IndependenceProposal
-        Whose widening and blocks to keep.
+        Proposal with the widening and the blocks, which are kept.
 
     Returns
     -------
     IndependenceProposal
-        Each part with the draws' mean and covariance and, of a few degrees of freedom, those of
-        the highest likelihood.
+        Each part has the draws' mean and covariance, and the degrees of freedom of the highest
+        likelihood among `DEGREES`.
 
     Examples
     --------
     >>> draws = np.random.RandomState(0).standard_normal((4000, 2))
     >>> plain = Widening(np.zeros(2), np.array([-1, -1]))
-    >>> fitted(draws, about(np.eye(2), plain, (np.array([0, 1]),))).parts[0].degrees
+    >>> fit_proposal(draws, proposal_about(np.eye(2), plain, (np.array([0, 1]),))).parts[0].degrees
     30.0
     """
-    evened = before.widening.evened(points)
-    parts = tuple(_student(evened[:, block]) for block in before.blocks)
+    scaled = before.widening.to_scaled(points)
+    parts = tuple(_fit_student(scaled[:, block]) for block in before.blocks)
     return IndependenceProposal(before.widening, before.blocks, parts)
 
 
-def _student(points: np.ndarray) -> Student:
+def _fit_student(points: np.ndarray) -> Student:
     location, covariance = points.mean(axis=0), np.atleast_2d(np.cov(points, rowvar=False))
-    # A Student distribution is wider than its scale matrix by dof/(dof - 2).
+    # The covariance of a Student distribution is dof/(dof - 2) times its scale matrix.
     tried = [Student(location, _root(covariance * (dof - 2) / dof), dof) for dof in DEGREES]
     return max(tried, key=lambda part: float(np.mean(part.log_density(points))))
 
 
-def share_of(
+def long_move_share(
     proposal: IndependenceProposal,
     points: np.ndarray,
     log_prob: np.ndarray,
     drawn: np.ndarray,
     found: np.ndarray,
 ) -> float:
-    """Share of steps to leap: the more leaps are accepted, the more are tried.
+    """Choose the share of long moves from the share that would be accepted.
 
     Parameters
     ----------
     proposal : IndependenceProposal
-        To be used.
+        The proposal to use.
     points, log_prob : array, shape (m, n) and (m,)
-        Draws from the posterior.
+        Draws from the posterior and their log density.
     drawn, found : array, shape (k, n) and (k,)
         Draws from the proposal, and their posterior log density.
 
     Returns
     -------
     float
-        0.9, 0.5 or 0.1: a leap that is taken once in seven times is still worth more than steps.
+        0.9, 0.5 or 0.1. A long move that is accepted once in seven times is still worth more than
+        several steps.
     """
     take = np.linspace(0, len(points) - 1, len(drawn)).astype(int)
-    now = log_prob[take] - proposal.log_density(points[take])
-    then = found - proposal.log_density(drawn)
-    accepted = float(np.mean(np.exp(np.minimum(then - now, 0.0))))
+    log_ratio_now = log_prob[take] - proposal.log_density(points[take])
+    log_ratio_new = found - proposal.log_density(drawn)
+    accepted = float(np.mean(np.exp(np.minimum(log_ratio_new - log_ratio_now, 0.0))))
     return 0.9 if accepted > 0.15 else (0.5 if accepted > 0.03 else 0.1)
 
 
-def moves_of(proposal: IndependenceProposal, share: float) -> list[tuple[Any, float]]:
-    """Mix moves for emcee.
+def mix_moves(proposal: IndependenceProposal, share: float) -> list[tuple[Any, float]]:
+    """List the moves of emcee with their shares.
 
     Parameters
     ----------
     proposal : IndependenceProposal
-        For the leaps.
+        Proposal of the long moves.
     share : float
-        Of steps that leap.
+        Share of long moves.
 
     Returns
     -------
     list of (move, float)
-        The leaps; differential evolution (B. Nelson, E. Ford and M. Payne, ApJS 210, 11 (2014)),
-        some of it by whole distances between walkers, for separate peaks; and the stretch move
-        (J. Goodman and J. Weare, CAMCoS 5, 65 (2010)). The last two need no fit, and keep bananas
-        and edges right where the leaps would seldom land.
+        The long moves; differential evolution (B. Nelson, E. Ford and M. Payne, ApJS 210, 11
+        (2014)), partly by whole distances between walkers, for separate peaks; and the stretch move
+        (J. Goodman and J. Weare, CAMCoS 5, 65 (2010)). The last two need no fitted proposal and
+        explore curved ridges and edges, where long moves rarely land.
     """
-    from emcee import moves  # half a second that only sampling should cost
+    from emcee import moves  # takes half a second, needed only here
 
     rest = 1.0 - share
     return [

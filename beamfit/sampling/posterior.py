@@ -1,4 +1,4 @@
-"""A sampled posterior: draws, their intervals, correlations and bands, and a verdict on them."""
+"""A sampled posterior: draws, intervals, correlations, bands, and the verdict."""
 
 from __future__ import annotations
 
@@ -26,19 +26,20 @@ from beamfit.errors import InputError, Status, nearest
 from beamfit.quantity import Quantity, display_unit
 from beamfit.sampling.convergence import Diagnostics
 from beamfit.sampling.likelihood import LOG_NOISE
-from beamfit.sampling.priors import in_words
+from beamfit.sampling.priors import describe_prior
 from beamfit.sampling.target import SamplingTarget
 
 if TYPE_CHECKING:
     from arviz import InferenceData
     from pandas import DataFrame
 
-# One standard deviation of a normal distribution to each side.
+# Probability within one standard deviation of a normal distribution.
 ONE_SIGMA = math.erf(math.sqrt(0.5))
-# Default number of draws at which a user's function is computed.
+# Default number of draws for which a user's function is computed: the ends of 68 % intervals then
+# scatter by a few hundredths of an error.
 ENOUGH_DRAWS = 4000
-# R-hat above which walkers are separated and intervals mean nothing.
-APART = 1.2
+# R-hat above which walkers are in separate peaks, and intervals have no meaning.
+SEPARATED_RHAT = 1.2
 # Default quantiles: median, central 68 % and 95 %.
 QUANTILES = (0.025, 0.16, 0.5, 0.84, 0.975)
 
@@ -47,19 +48,19 @@ HEADER = ("", "median", "68 % interval", "95 % interval")
 
 
 class Interval(NamedTuple):
-    """A number's median and central credible interval.
+    """Median and central credible interval of a number.
 
     Attributes
     ----------
     name : str
-        What it is.
+        Name of the number.
     median, lower, upper : float
-        In `unit`.
+        Median and ends of the interval, in `unit`.
     unit : str
         Unit.
     separable : bool
-        Whether the data decide it; if not, the interval is the prior's or the bounds' and is not
-        to be quoted.
+        True if the data determine it. Otherwise the interval comes from the prior or the bounds
+        and must not be quoted.
     """
 
     name: str
@@ -77,9 +78,9 @@ class Interval(NamedTuple):
 
 
 class Summary(NamedTuple):
-    """A number with the ends of its 95 and 68 % and its median, in order.
+    """A number with its quantiles: ends of the 95 and 68 % intervals and median, in order.
 
-    `doubt` says in a word or two why no interval may be quoted; empty where one may.
+    `doubt` is the reason for which no interval may be quoted; empty if there is none.
     """
 
     name: str
@@ -88,7 +89,7 @@ class Summary(NamedTuple):
     doubt: str = ""
 
     def to_json(self) -> dict[str, Any]:
-        """Give one of ``quantities`` of the JSON contract; intervals are null where in doubt."""
+        """Return an entry of ``quantities`` of the JSON contract; doubtful intervals are null."""
         low, one, middle, other, high = map(float, self.quantiles)
         return {
             "name": self.name,
@@ -101,7 +102,7 @@ class Summary(NamedTuple):
         }
 
     def row(self) -> list[str]:
-        """Label, median and intervals, with the digits that their width allows."""
+        """Return label, median and intervals, with the digits that their width determines."""
         label = plain_name(self.name)
         if not np.isfinite(self.quantiles).all():
             return [label, "not determined", "-", "-"]
@@ -116,7 +117,7 @@ class Summary(NamedTuple):
 
 
 def interval_table(rows: Sequence[Summary], title: str = "", note: str = "") -> Table:
-    """Table with a row for each number: median and intervals."""
+    """Make a table with median and intervals of each number."""
     cells = [row.row() for row in rows[:MOST_ROWS]]
     left = len(rows) - MOST_ROWS
     return Table(title, HEADER, [*cells, *([[f"and {left} more"]] if left > 0 else [])], note)
@@ -124,18 +125,18 @@ def interval_table(rows: Sequence[Summary], title: str = "", note: str = "") -> 
 
 @shown
 class Correlations(NamedTuple):
-    """Correlation coefficients of numbers, one row and column a name."""
+    """Matrix of correlation coefficients of some numbers."""
 
     names: tuple[str, ...]
     values: np.ndarray
 
     @property
     def headline(self) -> str:
-        """Names of the quantities, in a line."""
+        """Names of the quantities on one line."""
         return f"of {', '.join(self.names)}"
 
     def tables(self) -> tuple[Table, ...]:
-        """The coefficients, to be shown."""
+        """Make the table of the coefficients."""
         rows = [
             [plain_name(name), *(f"{value:.3f}" for value in row)]
             for name, row in zip(self.names, self.values, strict=True)
@@ -145,7 +146,7 @@ class Correlations(NamedTuple):
 
 
 class Band(NamedTuple):
-    """Median and ends of a credible interval, point by point."""
+    """Median and credible interval of a curve, point by point."""
 
     lower: np.ndarray
     median: np.ndarray
@@ -158,11 +159,11 @@ class Expected(NamedTuple):
     Attributes
     ----------
     median : array, shape (n,)
-        Of the model.
+        Median of the model.
     model : array, shape (2, n)
-        Ends of the 68 % interval of the model: how well the curve is known.
+        Ends of the 68 % interval of the model.
     reading : array, shape (2, n)
-        Ends of the 95 % interval of a further reading, its noise included: where points should lie.
+        Ends of the 95 % interval of a further reading, with its noise.
     """
 
     median: np.ndarray
@@ -171,7 +172,7 @@ class Expected(NamedTuple):
 
 
 def in_unit(values: np.ndarray, unit: str) -> tuple[np.ndarray, str]:
-    """Values in a unit in which they are easily read, and that unit.
+    """Convert values to a unit in which they are easily read; return them and the unit.
 
     Examples
     --------
@@ -189,32 +190,32 @@ def in_unit(values: np.ndarray, unit: str) -> tuple[np.ndarray, str]:
 @answer
 @dataclass(frozen=True, eq=False)
 class Posterior:
-    """Draws from a posterior, with a verdict on them. Prints as a table.
+    """Draws from a posterior, with the verdict. Prints as a table.
 
     Parameters
     ----------
     target : SamplingTarget
-        What was sampled.
+        The posterior that was sampled.
     chain : array, shape (steps, walkers, n)
         The draws, without the warm-up.
     log_prob : array, shape (steps, walkers)
         Log of their posterior density, up to a constant.
     status : Status
-        ``converged``; ``not_converged`` if the budget ended first; ``unidentified`` if a number is
-        held by nothing, or by the prior alone; ``poor_fit`` as the fit's; ``infeasible`` if no
-        point is allowed.
+        ``converged``; ``not_converged`` if the budget was spent first; ``unidentified`` if a number
+        is determined by nothing, or only by the prior; ``poor_fit`` from the fit; ``infeasible`` if
+        no point meets the constraints.
     message : str
         Cause and remedy.
     diagnostics : Diagnostics
         Autocorrelation, effective sample size and R-hat of each number in `names`.
     acceptance : float
-        Share of proposals that were taken.
+        Share of accepted proposals.
     warmup : int
-        Steps left out.
+        Number of warm-up steps, which are left out.
     seed : int
-        Of the random numbers.
+        Seed of the random numbers.
     held : tuple of str
-        Numbers, derived ones too, that are the prior's or the bounds', not the data's.
+        Numbers, derived ones included, that the prior or the bounds determine, not the data.
 
     Examples
     --------
@@ -245,14 +246,14 @@ class Posterior:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the sampled numbers, those of the likelihood last."""
+        """Names of the sampled numbers, parameters of the noise last."""
         return self.target.names
 
     @property
     def shown(self) -> tuple[str, ...]:
-        """Names of what is asked for: derived numbers, then sampled ones but for hidden ones."""
+        """Names of the results: derived numbers, then sampled ones without nuisance numbers."""
         every = (*self.target.derived_names, *self.names)
-        # The factor on the errors is shown, not its logarithm.
+        # The factor on the errors is a derived number; its logarithm is hidden.
         hidden = [name for name in self.names if name.endswith(LOG_NOISE)]
         return tuple(name for name in every if name not in (*hidden, *self.target.hidden))
 
@@ -263,7 +264,7 @@ class Posterior:
 
     @cached_property
     def _numbers(self) -> dict[str, tuple[str, np.ndarray]]:
-        """Unit and draws of every number, the derived ones first."""
+        """Unit and draws of all numbers, derived ones first."""
         t = self.target
         columns = np.concatenate([t.derive(self.draws), self.draws], axis=1).T
         units = zip((*t.derived_units, *t.units), columns, strict=True)
@@ -275,15 +276,15 @@ class Posterior:
         return self._numbers[name]
 
     def unit(self, name: str) -> str:
-        """Unit of a number."""
+        """Return the unit of a number."""
         return self._number(name)[0]
 
     def values(self, name: str) -> np.ndarray:
-        """All draws of one number, sampled or derived, shape (steps x walkers,)."""
+        """Return all draws of a sampled or derived number, shape (steps x walkers,)."""
         return self._number(name)[1]
 
     def __getitem__(self, name: str) -> Quantity:
-        """Median of a number and half of its central 68 %; no error if the data do not decide."""
+        """Return the median and half the 68 % interval; no error if data do not determine it."""
         low, one, middle, other, high = map(float, self.quantiles(name))
         unit = self.unit(name)
         if not self.values(name).size or name in self.held or self.apart:
@@ -291,8 +292,10 @@ class Posterior:
         return Quantity(middle, 0.5 * (other - one), unit, interval_95=(low, high))
 
     def quantiles(self, name: str, probabilities: Sequence[float] | None = None) -> np.ndarray:
-        """Quantiles of a number; NaN where nothing was sampled. By default the median and the ends
-        of 68 and 95 %, which reach to a bound that is not excluded.
+        """Compute quantiles of a number; NaN if nothing was sampled.
+
+        By default the median and the ends of the 68 and 95 % intervals; the latter extends to a
+        bound that is not excluded.
         """
         values, ends = self.values(name), (QUANTILES[0], QUANTILES[-1])
         if probabilities is None:
@@ -306,13 +309,13 @@ class Posterior:
         return found
 
     def interval(self, name: str, probability: float = ONE_SIGMA) -> Interval:
-        """Median and central credible interval of a number."""
+        """Return the median and central credible interval of a number."""
         ends = (0.5, 0.5 - 0.5 * probability, 0.5 + 0.5 * probability)
         found = (float(v) for v in self.quantiles(name, ends))
         return Interval(name, *found, self.unit(name), name not in self.held)
 
     def correlations(self, names: Sequence[str] | None = None) -> Correlations:
-        """Correlation coefficients of numbers, of all that are shown by default."""
+        """Compute the correlation coefficients of numbers, by default of all results."""
         names = tuple(names or self.shown)
         columns = np.array([self.values(name) for name in names])
         if not columns.size:
@@ -321,7 +324,7 @@ class Posterior:
             return Correlations(names, np.corrcoef(columns).reshape((len(names),) * 2))
 
     def thinned(self, number: int = ENOUGH_DRAWS) -> np.ndarray:
-        """`count` draws, evenly spaced along the chain, or all if there are fewer."""
+        """Return `number` draws evenly spaced along the chain, or all if there are fewer."""
         draws = self.draws
         if len(draws) <= number:
             return draws
@@ -330,20 +333,20 @@ class Posterior:
     def derive(
         self, function: Callable[[Any], Any], number: int = ENOUGH_DRAWS
     ) -> np.ndarray | Any:
-        """Draws of any quantity.
+        """Compute draws of any quantity.
 
         Parameters
         ----------
         function : callable
-            Of the study's own object, in JAX: the model of a `Problem`, a dictionary from plane to
-            `BeamMatrix` for an emittance, `DecayNumbers` for a decay.
+            A function, in JAX, of the study's object: the model of a `Problem`, a dictionary of
+            plane to `BeamMatrix` for an emittance, `DecayNumbers` for a decay.
         number : int, optional
-            How many draws at most.
+            Largest number of draws.
 
         Returns
         -------
         array, shape (draws, ...)
-            One row a draw.
+            One row for each draw.
         """
         build = self.target.law.build
         return self.target.each(
@@ -351,21 +354,21 @@ class Posterior:
         )
 
     def band(self, function: Callable[[Any], Any], probability: float = ONE_SIGMA) -> Band:
-        """Median and credible interval of a curve, point by point; `function` as for `derive`."""
+        """Compute the credible interval of a curve; `function` as for `derive`."""
         ends = (0.5 - 0.5 * probability, 0.5, 0.5 + 0.5 * probability)
         return Band(*np.quantile(self.derive(function), ends, axis=0))
 
     def expected(self, draws: np.ndarray, error: np.ndarray, label: str = "") -> Expected:
-        """Expect readings such as were measured, and further ones like them.
+        """Predict the model and further readings at measured points.
 
         Parameters
         ----------
         draws : array, shape (m, n)
-            What `thinned` draws predict at each point.
+            Predictions at each point of the draws of `thinned`.
         error : array, shape (n,)
-            Stated errors.
+            Given errors.
         label : str
-            Of the group of points, whose noise goes with them.
+            Label of the group of points, for its noise.
 
         Returns
         -------
@@ -382,34 +385,34 @@ class Posterior:
 
     @property
     def priors(self) -> Mapping[str, str]:
-        """The priors, the problem's own and those given to `sample`, in words."""
-        given = {name: in_words(prior) for name, prior in self.target.priors.items()}
+        """Descriptions of the priors: the problem's, and those given to `sample`."""
+        given = {name: describe_prior(prior) for name, prior in self.target.priors.items()}
         return {**self.target.stated, **given}
 
     @property
     def apart(self) -> bool:
-        """True if the walkers disagree so much that their intervals mean nothing."""
+        """True if the walkers disagree so much that intervals have no meaning."""
         rhat = self.diagnostics.rhat
-        return bool(rhat.size and np.max(rhat) > APART)
+        return bool(rhat.size and np.max(rhat) > SEPARATED_RHAT)
 
     @property
     def headline(self) -> str:
-        """Status, numbers and draws in a line."""
+        """Status, numbers and draws on one line."""
         draws = self.chain.shape[0] * self.chain.shape[1]
         return f"{self.status}: {draws} draws of {brief(self.names)}"
 
     def summary(self, name: str) -> Summary:
-        """A number's median and quantiles, and whether they may be quoted."""
+        """Return a number with its quantiles, and the doubt about quoting them."""
         doubt = "walkers disagree" if self.apart else ""
         doubt = "the prior's" if name in self.held else doubt
         return Summary(name, self[name], self.quantiles(name), doubt)
 
     def table(self, title: str = "", note: str = "") -> Table:
-        """Medians and intervals of all numbers that are asked for."""
+        """Make the table of medians and intervals of the results."""
         return interval_table([self.summary(name) for name in self.shown], title, note)
 
     def to_json(self) -> dict[str, Any]:
-        """Give the ``posterior`` object of the JSON contract; intervals are null where held."""
+        """Return the ``posterior`` object of the JSON contract; doubtful intervals are null."""
         d = self.diagnostics
         document = {
             "status": self.status,
@@ -433,7 +436,7 @@ class Posterior:
         return json_of(document)
 
     def to_frame(self) -> DataFrame:
-        """Give a pandas data frame of all draws, one column a number, sampled or derived.
+        """Return a pandas data frame of all draws, with a column for each number.
 
         Raises
         ------
@@ -443,7 +446,7 @@ class Posterior:
         return frame_of({name: values for name, (_, values) in self._numbers.items()})
 
     def to_arviz(self) -> InferenceData:
-        """Convert to ArviZ, for its plots and diagnostics: walkers as chains.
+        """Convert to ArviZ, for its plots and diagnostics; walkers become chains.
 
         Returns
         -------

@@ -1,4 +1,4 @@
-"""Priors of a number: four distributions, or any frozen one of scipy."""
+"""Prior distributions of numbers: four classes, or any frozen distribution of scipy."""
 
 from __future__ import annotations
 
@@ -15,26 +15,26 @@ from beamfit.errors import InputError, nearest
 
 @runtime_checkable
 class Distribution(Protocol):
-    """A prior's distribution; frozen distributions of scipy.stats have these methods."""
+    """Methods of a prior distribution; frozen distributions of scipy.stats have them."""
 
     def logpdf(self, x: np.ndarray) -> np.ndarray:
-        """Log density; -inf outside the support."""
+        """Compute the log density; -inf outside the support."""
 
     def std(self) -> float:
-        """Standard deviation; may be infinite."""
+        """Return the standard deviation; it may be infinite."""
 
     def mean(self) -> float:
-        """Mean."""
+        """Return the mean."""
 
     def support(self) -> tuple[float, float]:
-        """Ends of the support."""
+        """Return the ends of the support."""
 
 
 @dataclass(frozen=True)
-class _OfScipy:
-    """A prior with names of its own for what scipy's distribution of it takes."""
+class _ScipyPrior:
+    """Base class of priors that are distributions of scipy.stats with other parameter names."""
 
-    # Fields that must be above zero.
+    # Names of fields that must be above zero.
     _positive: ClassVar[tuple[str, ...]] = ()
 
     def __post_init__(self) -> None:
@@ -46,36 +46,36 @@ class _OfScipy:
                 words = field.name.replace("_", " ")
                 raise InputError(f"{type(self).__name__} with {words} {value}", kind)
 
-    def _of(self, stats: Any) -> Any:
-        """The distribution of scipy.stats."""
+    def _distribution(self, stats: Any) -> Any:
+        """Return the frozen distribution of scipy.stats."""
         raise NotImplementedError
 
     @cached_property
     def _frozen(self) -> Any:
-        from scipy import stats  # half a second that only sampling should cost
+        from scipy import stats  # takes half a second, needed only here
 
-        return self._of(stats)
+        return self._distribution(stats)
 
     def logpdf(self, x: np.ndarray) -> np.ndarray:
-        """Log density at x; -inf outside the support."""
+        """Compute the log density at x; -inf outside the support."""
         return self._frozen.logpdf(x)
 
     def mean(self) -> float:
-        """Mean."""
+        """Return the mean."""
         return float(self._frozen.mean())
 
     def std(self) -> float:
-        """Standard deviation."""
+        """Return the standard deviation."""
         return float(self._frozen.std())
 
     def support(self) -> tuple[float, float]:
-        """Ends of the support."""
+        """Return the ends of the support."""
         low, high = self._frozen.support()
         return float(low), float(high)
 
 
 @dataclass(frozen=True)
-class Normal(_OfScipy):
+class Normal(_ScipyPrior):
     """A normal prior.
 
     Parameters
@@ -98,13 +98,13 @@ class Normal(_OfScipy):
     centre: float
     sd: float
 
-    def _of(self, stats: Any) -> Any:
+    def _distribution(self, stats: Any) -> Any:
         return stats.norm(self.centre, self.sd)
 
 
 @dataclass(frozen=True)
-class LogNormal(_OfScipy):
-    """A normal prior on the logarithm: for a number known up to a factor.
+class LogNormal(_ScipyPrior):
+    """A normal prior on the logarithm, for a number that is known up to a factor.
 
     Parameters
     ----------
@@ -129,12 +129,12 @@ class LogNormal(_OfScipy):
     median: float
     log_sd: float
 
-    def _of(self, stats: Any) -> Any:
+    def _distribution(self, stats: Any) -> Any:
         return stats.lognorm(self.log_sd, scale=self.median)
 
 
 @dataclass(frozen=True)
-class Uniform(_OfScipy):
+class Uniform(_ScipyPrior):
     """A flat prior between two ends.
 
     Parameters
@@ -161,13 +161,13 @@ class Uniform(_OfScipy):
         if not self.low < self.high:
             raise InputError(f"a uniform prior from {self.low} to {self.high}", "two ends in order")
 
-    def _of(self, stats: Any) -> Any:
+    def _distribution(self, stats: Any) -> Any:
         return stats.uniform(self.low, self.high - self.low)
 
 
 @dataclass(frozen=True)
-class HalfNormal(_OfScipy):
-    """The positive half of a normal prior about zero: small rather than large, never negative.
+class HalfNormal(_ScipyPrior):
+    """The positive half of a normal prior about zero, for a number that is small and not negative.
 
     Parameters
     ----------
@@ -188,7 +188,7 @@ class HalfNormal(_OfScipy):
     _positive = ("scale",)
     scale: float
 
-    def _of(self, stats: Any) -> Any:
+    def _distribution(self, stats: Any) -> Any:
         return stats.halfnorm(scale=self.scale)
 
 
@@ -200,9 +200,9 @@ def checked(
     Parameters
     ----------
     priors : mapping of str to distribution, or None
-        One a number, independent of each other.
+        Independent priors by the names of numbers.
     names : sequence of str
-        The numbers there are.
+        Names of all numbers.
 
     Returns
     -------
@@ -211,7 +211,7 @@ def checked(
     Raises
     ------
     InputError
-        If a name is not among them, or a prior is no continuous frozen distribution.
+        If a name is unknown, or a prior is not a continuous frozen distribution.
 
     Examples
     --------
@@ -221,7 +221,7 @@ def checked(
     for name, prior in (priors or {}).items():
         if name not in names:
             raise InputError(f"a prior on '{name}'", nearest(name, list(names)))
-        # scipy.stats.norm has the methods too; norm(0, 1) is frozen and carries its `dist`.
+        # scipy.stats.norm, which is not frozen, has the same methods; norm(0, 1) is frozen.
         unfrozen = isinstance(prior, type) or hasattr(prior, "freeze")
         if unfrozen or not isinstance(prior, Distribution):
             expected = "Normal, LogNormal, Uniform, HalfNormal or a frozen scipy.stats distribution"
@@ -229,12 +229,12 @@ def checked(
     return dict(priors or {})
 
 
-def in_words(prior: Distribution) -> str:
-    """Write a prior with its parameters, the same for equal ones.
+def describe_prior(prior: Distribution) -> str:
+    """Write a prior with its parameters; equal priors give equal texts.
 
     Examples
     --------
-    >>> in_words(HalfNormal(2.0))
+    >>> describe_prior(HalfNormal(2.0))
     'HalfNormal(scale=2.0)'
     """
     frozen = getattr(prior, "dist", None)

@@ -1,4 +1,4 @@
-"""Posteriors on disk, in emcee's own layout: the one file of this package that opens files."""
+"""Posteriors on disk, in the layout of emcee's HDF5 backend."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ if TYPE_CHECKING:
 
     from beamfit.sampling.target import SamplingTarget
 
-# To be changed with every change of a store's content or of the digest of a problem.
+# Kind of file, and version, which changes with the contents of a store or the digest of a problem.
 KIND, FORMAT = "beamfit-posterior", "3"
-# Bytes of the HDF5 user block, which holds the file's digest.
-SEAL = 512
-# Steps whose stored density is recomputed to recognise the model.
-RECOMPUTED = 8
-# Relative difference in the log density of one model between two versions of a compiler.
-SAME = 1e-6
+# Bytes of the HDF5 user block, which holds the file's digest; the smallest size that HDF5 allows.
+SEAL_BYTES = 512
+# Number of steps whose log density is recomputed to test that the model is the same.
+CHECKED_STEPS = 8
+# Relative tolerance on these log densities: compilers of different versions round differently.
+DENSITY_TOLERANCE = 1e-6
 PACKAGES = ("emcee", "h5py", "jax", "numpy", "scipy")
 REMEDY = "; name another file, or move this one away"
 
@@ -43,7 +43,7 @@ class Provenance(NamedTuple):
     Attributes
     ----------
     command : str
-        That made it.
+        Command that made it.
     inputs : mapping of str to str
         Input files and their SHA-256.
     """
@@ -56,22 +56,22 @@ FROM_PYTHON = Provenance()
 
 
 class Checkpoint(NamedTuple):
-    """All that is needed to go on as if nothing had happened.
+    """State of a run, sufficient to continue as if it had not been interrupted.
 
     Attributes
     ----------
     chain, log_prob : array, shape (steps, walkers, n) and (steps, walkers)
-        Every step, the warm-up included.
+        All steps, the warm-up included.
     random_state : tuple
-        Of numpy's Mersenne twister, after the last step.
+        State of NumPy's Mersenne twister after the last step.
     share : float
-        Of steps that leap.
+        Share of long moves.
     began : int
-        Step at which the present proposal came into use; it follows from the chain before.
+        Step at which the present proposal, which depends on the chain before, came into use.
     producing : bool
-        Whether the warm-up is over, so that the chain from `began` on counts.
+        True if the warm-up is over, so that the chain from `began` on counts.
     seed : int
-        The chain began with.
+        Seed of the chain.
     """
 
     chain: np.ndarray
@@ -84,17 +84,17 @@ class Checkpoint(NamedTuple):
 
     @property
     def counting(self) -> np.ndarray:
-        """The part of the chain that counts."""
+        """The chain after the warm-up."""
         return self.chain[self.began if self.producing else len(self.chain) :]
 
     @property
     def acceptance(self) -> float:
-        """Share of proposals taken in the part that counts; of all before there is one."""
+        """Share of accepted proposals after the warm-up; of all proposals during it."""
         first = max(self.began - 1, 0) if len(self.counting) else 0
-        return float(np.mean(_moved(self.chain[first:])))
+        return float(np.mean(_accepted(self.chain[first:])))
 
 
-def _moved(chain: np.ndarray) -> np.ndarray:
+def _accepted(chain: np.ndarray) -> np.ndarray:
     """True for each walker and step in which it moved, shape (steps - 1, walkers)."""
     return np.any(np.diff(chain, axis=0) != 0, axis=2)
 
@@ -105,7 +105,7 @@ def _contents(
     provenance: Provenance,
     summary: Mapping[str, Any] | None,
 ) -> dict[str, tuple[Mapping[str, Any], Mapping[str, Any]]]:
-    """Attributes and arrays of each group of a store."""
+    """Collect the attributes and arrays of each group of a store."""
     from beamfit import __version__
 
     _, walkers, n = state.chain.shape
@@ -119,7 +119,7 @@ def _contents(
     }
     own = {"names": list(target.names), "units": list(target.units), "share": state.share}
     own |= {"began": state.began, "producing": state.producing}
-    accepted = _moved(state.chain).sum(axis=0)
+    accepted = _accepted(state.chain).sum(axis=0)
     chain = {"accepted": accepted, "chain": state.chain, "log_prob": state.log_prob}
     fit = {"status": target.verdict.status.value, "message": target.verdict.message}
     places = {name: getattr(target, name) for name in ("mode", "covariance", "lower", "upper")}
@@ -153,35 +153,35 @@ def save(
     provenance: Provenance,
     summary: Mapping[str, Any] | None = None,
 ) -> float:
-    """Write a checkpoint so that the file is the old one or the whole new one at any moment.
+    """Write a checkpoint; at any moment the file is the old one or the complete new one.
 
     Parameters
     ----------
     path : str or path
-        Where to.
+        File to write.
     target : SamplingTarget
-        What is sampled.
+        The posterior that is sampled.
     state : Checkpoint
-        How far it came.
+        State of the run.
     provenance : Provenance
-        Where it comes from.
+        Origin of the posterior.
     summary : mapping, optional
-        The result as JSON's types, once the chain is finished.
+        Result in JSON types, once the chain is finished.
 
     Returns
     -------
     float
-        Seconds it took.
+        Time taken, s.
 
     Raises
     ------
     InputError
-        If the place cannot be written.
+        If the file cannot be written.
     """
     import h5py
 
     began = time.perf_counter()
-    # In memory: where a disk is full, the HDF5 library ends the process with a segmentation fault.
+    # The file is made in memory: on a full disk the HDF5 library crashes the process.
     with h5py.File("store", "w", driver="core", backing_store=False) as file:
         file.attrs["format"], file.attrs["problem"] = f"{KIND}-{FORMAT}", target.digest
         for name, parts in _contents(target, state, provenance, summary).items():
@@ -190,28 +190,28 @@ def save(
             for key, values in parts[1].items():
                 group.create_dataset(key, data=values)
         file.flush()
-        content = sealed(file.id.get_file_image())
+        content = add_seal(file.id.get_file_image())
     write_atomically(path, content, f".{Path(path).name}.partial")
     return time.perf_counter() - began
 
 
-def sealed(content: bytes) -> bytes:
-    """An HDF5 file with its digest before it, so that a changed bit is known before it is opened.
+def add_seal(content: bytes) -> bytes:
+    """Put an HDF5 file's digest in front of it, so that damage is detected before it is opened.
 
-    HDF5 passes over what stands there (its user block), and so does whoever reads the file.
+    The digest is in the HDF5 user block, which readers of the file ignore.
     """
-    said = f"{KIND}-{FORMAT} sha256 {hashlib.sha256(content).hexdigest()}\n"
-    return said.encode().ljust(SEAL, b"\0") + content
+    seal = f"{KIND}-{FORMAT} sha256 {hashlib.sha256(content).hexdigest()}\n"
+    return seal.encode().ljust(SEAL_BYTES, b"\0") + content
 
 
-def _unsealed(content: bytes, path: str | PathLike[str]) -> bytes:
-    """The HDF5 file behind its digest, if that is what it says."""
-    body, told = content[SEAL:], re.match(rf"{KIND}-(\d{{1,9}}) ".encode(), content)
+def _remove_seal(content: bytes, path: str | PathLike[str]) -> bytes:
+    """Return the HDF5 file after its digest, if the digest is right."""
+    body, header = content[SEAL_BYTES:], re.match(rf"{KIND}-(\d{{1,9}}) ".encode(), content)
     if content.startswith(b"\x89HDF"):
         found = "an HDF5 file that beamfit did not write, or an earlier version did"
-    elif told and told[1].decode() != FORMAT:
-        found = f"a posterior store of format {told[1].decode()}, of another version of beamfit"
-    elif content != sealed(body):
+    elif header and header[1].decode() != FORMAT:
+        found = f"a posterior store of format {header[1].decode()}, of another version of beamfit"
+    elif content != add_seal(body):
         found = "a file that is no store, is damaged, or was changed since"
     else:
         return body
@@ -221,16 +221,16 @@ def _unsealed(content: bytes, path: str | PathLike[str]) -> bytes:
 def load(
     path: str | PathLike[str], target: SamplingTarget, seed: int, walkers: int
 ) -> Checkpoint | None:
-    """Read a checkpoint of the same problem; the file is opened for reading only.
+    """Read a checkpoint of the same problem; the file is not changed.
 
     Parameters
     ----------
     path : str or path
         The store.
     target : SamplingTarget
-        What is to be sampled.
+        The posterior to sample.
     seed, walkers : int
-        As of the run that began it.
+        Seed and number of walkers of the run to continue.
 
     Returns
     -------
@@ -240,8 +240,8 @@ def load(
     Raises
     ------
     InputError
-        If the file is damaged, not a store of beamfit's, or of another problem, seed or number of
-        walkers. It is left as it is.
+        If the file is damaged, not a store of beamfit, or of another problem, seed or number of
+        walkers.
     """
     if not os.path.exists(path):
         return None
@@ -252,8 +252,8 @@ def load(
     except OSError:
         found = "a store that cannot be read"
         raise InputError(found, f"a posterior store{REMEDY}", path=path) from None
-    # What is sealed was written whole by this format: nothing in it can be missing.
-    with h5py.File(io.BytesIO(_unsealed(content, path)), "r") as file:
+    # A file with the right digest was written completely in this format.
+    with h5py.File(io.BytesIO(_remove_seal(content, path)), "r") as file:
         state = _checkpoint(file)
         names = tuple(str(name) for name in file["mcmc"].attrs["names"])
         digest = file.attrs["problem"]
@@ -271,7 +271,7 @@ def _difference(
     seed: int,
     walkers: int,
 ) -> tuple[str, str] | None:
-    """Difference of a store from the run to continue, and what was expected; None if equal."""
+    """Describe a store's difference from the run to continue, and what is expected, or None."""
     if names != target.names:
         found = f"the posterior of other numbers, {', '.join(names)}"
         return found, f"one of {', '.join(target.names)}"
@@ -282,15 +282,18 @@ def _difference(
         return f"a chain begun with seed {state.seed}", f"seed {seed}"
     if state.chain.shape[1] != walkers:
         return f"a chain of {state.chain.shape[1]} walkers", f"{walkers}"
-    # Models are functions, which no digest can compare: their values at the walkers can be.
-    for step in range(len(state.chain) - 1, -1, -max(1, len(state.chain) // RECOMPUTED)):
+    # The digest does not contain the model's functions: compare their values at the walkers.
+    for step in range(len(state.chain) - 1, -1, -max(1, len(state.chain) // CHECKED_STEPS)):
         now = target.log_probability(state.chain[step])
-        if not np.allclose(now, state.log_prob[step], rtol=SAME, atol=1e3 * SAME):
+        if not np.allclose(
+            now, state.log_prob[step], rtol=DENSITY_TOLERANCE, atol=1e3 * DENSITY_TOLERANCE
+        ):
             return "the posterior of another model (other density)", "one of the present problem"
     return None
 
 
 def _checkpoint(file: h5py.File) -> Checkpoint:
+    """Read a checkpoint from an open store."""
     group = file["mcmc"]
     kind, keys, *rest = (group.attrs[f"random_state_{i}"] for i in range(5))
     return Checkpoint(

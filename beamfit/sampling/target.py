@@ -1,4 +1,4 @@
-"""Target of a sampler: residuals and a prior in JAX, the optimum, open directions."""
+"""Target of the sampler: residuals and prior in JAX, optimum and covariance of the fit."""
 
 from __future__ import annotations
 
@@ -18,28 +18,29 @@ from beamfit.compile_cache import prepare_jax
 from beamfit.errors import Finding, Status
 from beamfit.sampling.likelihood import LOG_NOISE, NoiseGroup, log_likelihood
 from beamfit.sampling.moves import Widening
-from beamfit.sampling.priors import Distribution, in_words
+from beamfit.sampling.priors import Distribution, describe_prior
 
-# Not in the package: priors and the place of a store are looked at before JAX is loaded.
+# Called here and not in `beamfit.sampling`, so that priors and the place of a store can be checked
+# before JAX is loaded.
 prepare_jax()
 
-GOOD = Finding(Status.converged, "")
+NO_FINDING = Finding(Status.converged, "")
 
 
 class PosteriorLaw(NamedTuple):
-    """The functions of a problem, at the top of modules so that they are compiled once.
+    """Functions of a posterior; defined at the top of modules, so that they are compiled once.
 
     Attributes
     ----------
     residual : callable
         ``residual(data, theta)``: a tuple of vectors, one for each group of points, in units of
-        the stated errors.
+        the given errors.
     log_prior : callable
-        ``log_prior(data, theta)``: -inf outside what is allowed, never NaN.
+        ``log_prior(data, theta)``: -inf outside bounds and constraints, never NaN.
     derive : callable
         ``derive(data, theta)``, shape (derived numbers,).
     build : callable
-        ``build(data, theta)``: the study's own object, for functions of the user's.
+        ``build(data, theta)``: the study's object that a user's functions take.
     """
 
     residual: Callable[[Any, Array], tuple[Array, ...]]
@@ -52,7 +53,8 @@ class PosteriorLaw(NamedTuple):
 def _log_densities(
     data: Any, counts: Any, thetas: Array, law: PosteriorLaw, groups: tuple[NoiseGroup, ...]
 ) -> Array:
-    count = thetas.shape[1] - sum(len(group.own()) for group in groups)
+    """Compute log prior plus log likelihood at points, shape (m, n), without further priors."""
+    count = thetas.shape[1] - sum(len(group.parameters()) for group in groups)
 
     def one(theta: Array) -> Array:
         own, extra = theta[:count], theta[count:]
@@ -69,56 +71,57 @@ def _jacobian(data: Any, theta: Array, law: PosteriorLaw) -> list[Array]:
 
 
 @partial(jax.jit, static_argnames=("function",))
-def _each(data: Any, thetas: Array, function: Callable[[Any, Array], Any]) -> Any:
+def _map_points(data: Any, thetas: Array, function: Callable[[Any, Array], Any]) -> Any:
     return jax.vmap(function, (None, 0))(data, thetas)
 
 
 @dataclass(frozen=True, eq=False)
 class SamplingTarget:
-    """A posterior to draw from.
+    """A posterior to sample.
 
     Parameters
     ----------
     law : PosteriorLaw
         Residuals, prior, derived numbers.
     data : pytree
-        What the law needs.
+        First argument of the law's functions.
     names, units : tuple of str
-        Of the law's numbers.
+        Names and units of the law's numbers.
     lower, upper : array, shape (n,)
         Bounds.
     mode : array, shape (n,)
-        Where a fit found the optimum.
+        Optimum of the fit.
     covariance : array, shape (n, n)
-        Of the fit: the spread of the first walkers and the shape of the first proposals.
+        Covariance of the fit: the spread of the first walkers and the shape of the first proposals.
     groups : tuple of NoiseGroup
-        How the points scatter, one for each of the law's vectors of residuals.
+        Noise models, one for each of the law's vectors of residuals.
     noise : tuple of float
-        Factor on the stated errors that the fit's residuals show, one a group.
+        Factor on the given errors of each group, from the fit's residuals.
     counts : tuple of array of bool
-        Which residuals of each group count; all if empty.
+        True for the residuals of each group that count; all if empty.
     priors : mapping of str to distribution
-        In addition to the law's own.
+        Priors in addition to the law's.
     derived : mapping of str to str
-        Names and units of what ``PosteriorLaw.derive`` gives.
+        Names and units of the results of ``PosteriorLaw.derive``.
     observed : mapping of str to array
-        The data, for the store, and to tell one problem from another.
+        The data, for the store and the digest of the problem.
     priors_own : tuple of str
-        Numbers, derived ones too, that the prior or the bounds decide and not the data.
+        Numbers, derived ones included, that the prior or the bounds determine and not the data.
     open_directions : str
-        In words, what neither data nor priors nor bounds hold; if not empty, nothing is sampled.
+        Sentence on numbers that neither data, priors nor bounds limit; if there is one, nothing is
+        sampled.
     verdict : Finding
-        On the fit.
+        Verdict on the fit.
     hidden : tuple of str
-        Numbers nobody asks for.
+        Nuisance numbers, which are not shown.
     remark : str
-        A further sentence on what was left out.
+        A further sentence for the result.
     stated : mapping of str to str
-        Priors that are part of the law, in words.
+        Descriptions of the priors that are part of the law.
     group_of : tuple of int
-        Which group's noise widens each of the law's numbers; the first if empty.
+        Group whose noise widens the posterior of each of the law's numbers; the first if empty.
     block_of : tuple of int
-        Which of the law's numbers are proposed together; all if empty.
+        Block of each of the law's numbers; a block is proposed together. One block if empty.
     reaching : mapping of str to (float, float)
         Probabilities at the ends of the 95 % interval of numbers whose bounds are not excluded; a
         probability of 0 stands for the lower bound.
@@ -152,7 +155,7 @@ class SamplingTarget:
     observed: Mapping[str, np.ndarray] = field(default_factory=dict)
     priors_own: tuple[str, ...] = ()
     open_directions: str = ""
-    verdict: Finding = GOOD
+    verdict: Finding = NO_FINDING
     hidden: tuple[str, ...] = ()
     remark: str = ""
     stated: Mapping[str, str] = field(default_factory=dict)
@@ -162,7 +165,7 @@ class SamplingTarget:
 
     def __post_init__(self) -> None:
         pairs = zip(self.groups, self.noise, strict=True)
-        own = [number for group, factor in pairs for number in group.own(factor)]
+        own = [number for group, factor in pairs for number in group.parameters(factor)]
         low, high, start, spread = np.array([number[1:] for number in own]).reshape(-1, 4).T
         names = (*self.names, *(number.name for number in own))
         lower, upper, mode = (
@@ -172,7 +175,7 @@ class SamplingTarget:
         for name, prior in self.priors.items():
             i, (first, last) = names.index(name), prior.support()
             lower[i], upper[i] = max(lower[i], first), min(upper[i], last)
-            # A prior may leave out where the fit ended: begin well inside it.
+            # If a prior excludes the optimum of the fit, start well inside its support.
             if not first < mode[i] < last:
                 mean = float(prior.mean())
                 mode[i] = mean if first < mean < last else 0.5 * (first + last)
@@ -191,7 +194,7 @@ class SamplingTarget:
             object.__setattr__(self, key, value)
 
     def log_probability(self, thetas: np.ndarray) -> np.ndarray:
-        """Log of the posterior density up to a constant, at many points.
+        """Compute the log of the posterior density, up to a constant, at many points.
 
         Parameters
         ----------
@@ -213,27 +216,27 @@ class SamplingTarget:
     def each(self, function: Callable[[Any, Array], Any], thetas: np.ndarray) -> Any:
         """Evaluate ``function(data, theta)`` at many points, compiled."""
         own = thetas[..., : self._count]
-        return jax.tree.map(np.asarray, _each(self.data, own, function))
+        return jax.tree.map(np.asarray, _map_points(self.data, own, function))
 
     @cached_property
     def widening(self) -> Widening:
-        """Widening of the law's numbers by each inferred noise."""
+        """Widening of the law's numbers with the inferred noise."""
         noises = [group.prefix + LOG_NOISE for group in self.groups]
         places = np.array([self.names.index(n) if n in self.names else -1 for n in noises])
-        source = np.full(len(self.names), -1)
-        source[: self._count] = places[list(self.group_of or (0,) * self._count)]
-        return Widening(self.mode, source)
+        noise_index = np.full(len(self.names), -1)
+        noise_index[: self._count] = places[list(self.group_of or (0,) * self._count)]
+        return Widening(self.mode, noise_index)
 
     @cached_property
     def blocks(self) -> tuple[np.ndarray, ...]:
-        """Numbers that are proposed together; each of the likelihood's own is by itself."""
+        """Blocks of numbers that are proposed together; each noise parameter is a block."""
         block_of = np.array(self.block_of or (0,) * self._count, int)
         blocks = [np.flatnonzero(block_of == block) for block in np.unique(block_of)]
         return (*blocks, *(np.array([i]) for i in range(self._count, len(self.names))))
 
     @cached_property
     def derived_names(self) -> tuple[str, ...]:
-        """Names of the derived numbers, the noise included where it is inferred."""
+        """Names of the derived numbers, factors on the errors included."""
         return (*self.derived, *(g.prefix + "error_factor" for g in self.groups if g.inferred))
 
     @cached_property
@@ -242,29 +245,31 @@ class SamplingTarget:
         return (*self.derived.values(), *("1" for g in self.groups if g.inferred))
 
     def derive(self, thetas: np.ndarray) -> np.ndarray:
-        """The derived numbers at many points, shape (m, k)."""
+        """Compute the derived numbers at many points, shape (m, k)."""
         parts = [self.each(self.law.derive, thetas)] if self.derived else []
         noises = [self.names.index(g.prefix + LOG_NOISE) for g in self.groups if g.inferred]
         return np.concatenate([*parts, np.exp(thetas[:, noises])], axis=1)
 
     @cached_property
     def digest(self) -> str:
-        """Tells one problem from another: data, names, bounds, priors, groups."""
-        found = hashlib.sha256()
+        """Digest of data, names, bounds, priors and groups, equal for equal problems."""
+        digest = hashlib.sha256()
         for name, values in sorted(self.observed.items()):
-            found.update(name.encode() + _digits(values))
-        # Bounds of the noise follow the fit and are not compared.
+            digest.update(name.encode() + _rounded_bytes(values))
+        # Bounds of the noise depend on the fit and are left out.
         ends = self.lower[: self._count], self.upper[: self._count]
         for values in (*jax.tree.leaves(self.data), *ends):
-            found.update(_digits(values))
-        words = [repr(self.names), *(repr(tuple(group)) for group in self.groups)]
-        words += [f"{name}~{in_words(prior)}" for name, prior in sorted(self.priors.items())]
-        found.update("|".join(words).encode())
-        return found.hexdigest()
+            digest.update(_rounded_bytes(values))
+        descriptions = [repr(self.names), *(repr(tuple(group)) for group in self.groups)]
+        descriptions += [
+            f"{name}~{describe_prior(prior)}" for name, prior in sorted(self.priors.items())
+        ]
+        digest.update("|".join(descriptions).encode())
+        return digest.hexdigest()
 
 
-def _digits(values: Any) -> bytes:
-    """Shape and values, numbers to nine digits: the last ones depend on how code was compiled."""
+def _rounded_bytes(values: Any) -> bytes:
+    """Encode shape and values, to nine digits: further ones depend on the compiler."""
     values = np.asarray(values)
     if values.dtype.kind not in "fiub":
         return repr(values.tolist()).encode()
@@ -278,23 +283,23 @@ def _digits(values: Any) -> bytes:
 
 
 def slopes_of(law: PosteriorLaw, data: Any, theta: np.ndarray) -> list[np.ndarray]:
-    """Derivatives of a law's vectors of residuals by its numbers, each of shape (rows, n)."""
+    """Compute the Jacobian of each of a law's vectors of residuals, shape (rows, n)."""
     return [np.asarray(part) for part in _jacobian(data, jnp.asarray(theta), law)]
 
 
 def covariance_of(
     slopes: Sequence[np.ndarray], noise: Sequence[float], width: np.ndarray
 ) -> np.ndarray:
-    """Covariance of a linearised fit, held by weak normal priors where the data say little.
+    """Compute the covariance of a linearised fit with weak normal priors.
 
     Parameters
     ----------
     slopes : sequence of array
-        From `slopes_of`.
+        Result of `slopes_of`.
     noise : sequence of float
-        Factor on the stated errors of each.
+        Factor on the given errors of each vector of residuals.
     width : array, shape (n,)
-        Width of the prior on each number; infinite for none.
+        Standard deviation of the prior on each number; infinite for none.
 
     Returns
     -------
@@ -310,6 +315,6 @@ def covariance_of(
     rows = np.concatenate([*parts, np.diag(1.0 / np.asarray(width, float))])
     scale = np.linalg.norm(rows, axis=0)
     scale = np.where(scale > 0, scale, 1.0)
-    # A direction that nothing holds is left as wide as the number itself.
+    # The pseudo-inverse gives undetermined directions a variance of zero.
     inverse = np.linalg.pinv(rows / scale, rcond=1e-12)
     return inverse @ inverse.T / scale / scale[:, None]

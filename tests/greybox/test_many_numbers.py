@@ -50,7 +50,7 @@ FUNCTIONS = {
 @pytest.mark.parametrize("name", FUNCTIONS)
 def test_a_pattern_misses_nothing(name, monkeypatch):
     """Beside the dense Jacobian at three points; where it misses a place, that is noticed."""
-    monkeypatch.setattr(sparse_parts, "FULL", 2.0)
+    monkeypatch.setattr(sparse_parts, "MAX_FILL", 2.0)
 
     def function(x):
         return jnp.ravel(FUNCTIONS[name](x))
@@ -135,7 +135,7 @@ def both_ways(problem, monkeypatch):
     many = solve(problem)
     assert sparse.issparse(many.jacobian)
     for module in (descend, covariance, assess):
-        monkeypatch.setattr(module, "FEW", 10**9)
+        monkeypatch.setattr(module, "MAX_DENSE", 10**9)
     return many, solve(problem)
 
 

@@ -90,7 +90,7 @@ def test_the_outlier_density_is_a_mean_over_widths():
 
 def test_groups_have_noises_of_their_own():
     groups = (NoiseGroup("x", "inferred"), NoiseGroup("y", "known"))
-    assert [number.name for group in groups for number in group.own()] == ["x.log_noise"]
+    assert [number.name for group in groups for number in group.parameters()] == ["x.log_noise"]
     parts = (jnp.array([2.0, 4.0]), jnp.array([3.0]))
     value = log_likelihood(parts, (True, True), groups, jnp.array([np.log(2.0)]))
     assert float(value) == pytest.approx(-0.5 * (1 + 4) - 2 * np.log(2) - 4.5)

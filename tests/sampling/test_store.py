@@ -21,7 +21,7 @@ from beamfit.errors import InputError
 from beamfit.sampling import ensemble
 from beamfit.sampling.ensemble import draw
 from beamfit.sampling.priors import Normal
-from beamfit.sampling.store import SEAL, Provenance, load, save, sealed
+from beamfit.sampling.store import SEAL_BYTES, Provenance, add_seal, load, save
 from beamfit.writing import alone
 from tests.sampling.targets import banana, half_normal, target
 
@@ -97,15 +97,15 @@ from tests.sampling.test_store import OPTIONS
 from tests.sampling.targets import half_normal, target
 from beamfit.sampling import ensemble
 from beamfit.sampling.ensemble import draw
-ensemble.WRITING = 1e9  # a checkpoint after every block: as many moments to be killed at
-advance = ensemble._block
+ensemble.MAX_WRITING_SHARE = 1e9  # a checkpoint after every block: as many moments to be killed at
+advance = ensemble._sample_block
 
 def asked(*arguments):
     print("block", flush=True)
     sys.stdin.readline()
     return advance(*arguments)
 
-ensemble._block = asked
+ensemble._sample_block = asked
 draw(target(half_normal), store=sys.argv[1], **OPTIONS)
 print("finished", flush=True)
 """
@@ -219,7 +219,7 @@ def test_another_problem_is_refused_and_left(store):
 
 
 def test_a_place_that_cannot_be_written_is_known_before_sampling(tmp_path, monkeypatch):
-    monkeypatch.setattr(ensemble, "_blocks", None)
+    monkeypatch.setattr(ensemble, "_sample_blocks", None)
     with pytest.raises(InputError, match="folder that exists"):
         draw(target(half_normal), store=tmp_path / "no" / "chain.h5")
     with pytest.raises(InputError, match="the name of a file"):
@@ -238,7 +238,7 @@ def test_checkpoints_are_spaced_by_what_they_cost(tmp_path, monkeypatch):
     monkeypatch.setattr(ensemble, "time", clock)
     monkeypatch.setattr(ensemble.disk, "save", save)
     draw(target(banana), store=tmp_path / "chain.h5", seed=1, target_ess=1e9, budget=6000)
-    assert ensemble.WRITING == 0.05
+    assert ensemble.MAX_WRITING_SHARE == 0.05
     assert np.all(np.diff(saved[:-1]) >= 2.0 / 0.05)  # the last one is the finished chain
     assert len(saved) >= 3
 
@@ -252,13 +252,13 @@ def test_stores_of_another_format_or_model_are_refused(store):
         half = len(file["mcmc/log_prob"]) // 2
         file["mcmc/log_prob"][half - half // 4 : half] += 0.1
     assert "was changed since" in refused(store)
-    store.write_bytes(sealed(store.read_bytes()[SEAL:]))
+    store.write_bytes(add_seal(store.read_bytes()[SEAL_BYTES:]))
     assert "another model" in refused(store)
 
 
 def test_a_flipped_bit_anywhere_is_found_before_the_file_is_opened(store):
     whole, random = store.read_bytes(), np.random.default_rng(2)
-    for place in [0, 40, SEAL - 1, SEAL, *random.integers(0, len(whole), 30)]:
+    for place in [0, 40, SEAL_BYTES - 1, SEAL_BYTES, *random.integers(0, len(whole), 30)]:
         damaged = bytearray(whole)
         damaged[place] ^= 1 << int(random.integers(8))
         store.write_bytes(damaged)
