@@ -31,7 +31,7 @@ import beamfit.io.decay_record
 from beamfit.errors import InputError
 from beamfit.greybox.mlp import dense
 from beamfit.io import isolated
-from beamfit.io.columns import SHIPPED, layout_of
+from beamfit.io.columns import LAYOUT_FOLDER, layout_of
 from beamfit.io.emittance_gui import read_emittance_gui
 from beamfit.io.files import read_text
 from beamfit.io.formulation import read_formulation, read_numbers
@@ -115,7 +115,7 @@ def readers(folder: Path, with_store: bool) -> dict[str, Reader]:
     store = [path.read_bytes() for path in folder.glob("store.h5")]
     lattice = [of("lattices/gtf_two_screens.toml"), of("lattices/lcls_otr2.toml")]
     scan = [CSV.encode(), of("measurements/lcls_otr2.csv")]
-    layouts = [path.read_bytes() for path in sorted(SHIPPED.glob("*.toml"))]
+    layouts = [path.read_bytes() for path in sorted(LAYOUT_FOLDER.glob("*.toml"))]
     (folder / "line.toml").write_text(LINE)
     machine = MACHINE.format(scheme="", more="degauss = [-5.0, 2.0]")
     decay = [of("measurements/aps_1999_decay.csv"), DATES.encode(), LIFETIMES.encode()]

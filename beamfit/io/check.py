@@ -17,7 +17,7 @@ from beamfit.answer import Table
 from beamfit.dynamics.record import Run
 from beamfit.emittance.scan import QuadScan
 from beamfit.errors import InputError
-from beamfit.io.columns import Columns, Layout, layout_of, proposal
+from beamfit.io.columns import Columns, Layout, layout_of, layout_text
 from beamfit.io.decay_record import is_current, known, likely_record_name, read_lifetime_input
 from beamfit.io.emittance_gui import is_emittance_gui, read_emittance_gui
 from beamfit.io.files import digest
@@ -156,7 +156,7 @@ def proposed_layout(path: str | PathLike[str], columns: Columns = None) -> str |
         if not (is_known(name, sheet) or known(sheet, name))
         for cell in [next(iter(cells), "")]
     }
-    return proposal(unknown) if unknown else None
+    return layout_text(unknown) if unknown else None
 
 
 def with_lattice(scan: Understood, lattice: Understood) -> Understood:

@@ -19,10 +19,10 @@ from beamfit.io.columns import (
     Columns,
     Sheet,
     columns_of,
-    ignored,
-    left_out,
+    ignored_note,
     number_and_unit,
-    spelled,
+    sheet_notes,
+    standard_header,
     unit_at_end,
 )
 from beamfit.io.files import name_of
@@ -103,7 +103,9 @@ def read_lifetime_input(
 ) -> DecayRecord | LifetimeTable:
     """Read what `beamfit lifetime` takes, by its header: as one of the other two readers."""
     sheet = read_columns(path, EXAMPLE, columns, ignore, skip_bad)
-    lifetimes = any(spelled(n).lower().startswith(("tau_", "lifetime_")) for n in sheet.names)
+    lifetimes = any(
+        standard_header(n).lower().startswith(("tau_", "lifetime_")) for n in sheet.names
+    )
     moments = any((c := known(sheet, name)) and c.key == "time" for name in sheet.names)
     if lifetimes and not moments:
         return _lifetimes(sheet)
@@ -199,7 +201,7 @@ def read_decay_record(
 
 
 def _record(sheet: Sheet, offset: str | None) -> DecayRecord:
-    if any(map(is_size, sheet.names)) and not sheet.arranged:
+    if any(map(is_size, sheet.names)) and not sheet.has_layout:
         found, expected = "a column of beam sizes", "a record of beam current; `beamfit emittance`"
         raise sheet.header_error(found, f"{expected} reads scans")
     sheet = dated(sheet)
@@ -210,14 +212,14 @@ def _record(sheet: Sheet, offset: str | None) -> DecayRecord:
             found = f"no column of {quantity} among {', '.join(sheet.names)}"
             raise sheet.header_error(found, option)
     notes = taken_for_current(columns)
-    sheet = sheet.good(lambda rows: [rows.values(column) for column in columns.values()])
+    sheet = sheet.drop_bad_rows(lambda rows: [rows.values(column) for column in columns.values()])
     if sheet.skip_bad and offset is None:
         sheet, below = _not_negative(sheet, columns["current"])
         notes += below
     moment = _moments(sheet, columns)
     if moment.size > 2 and moment[0] > moment[-1] and np.all(np.diff(moment) <= 0):
         notes += ("The rows stand newest first, and were read in order of time.",)
-        sheet, moment = sheet.rows(list(range(len(sheet)))[::-1]), moment[::-1]
+        sheet, moment = sheet.take(list(range(len(sheet)))[::-1]), moment[::-1]
     if sheet.skip_bad:
         sheet, moment = _forward(sheet, columns, moment)
     rest = {key: column for key, column in columns.items() if key not in ("time", "nanos")}
@@ -243,7 +245,7 @@ def _record(sheet: Sheet, offset: str | None) -> DecayRecord:
         start=float(moment[0]) if absolute else None,
         conditions=conditions,
         comments=sheet.comments,
-        notes=notes + left_out(sheet) + ignored(sheet, columns) + found.notes,
+        notes=notes + sheet_notes(sheet) + ignored_note(sheet, columns) + found.notes,
         monitor=Monitor(offset=found.error) if found.error else None,
     )
 
@@ -276,7 +278,7 @@ def _refused(
     if column.unit == DATE and fault.row:
         return _goes_back(sheet, columns, row, sheet[column.header][int(rows[fault.row - 1])])
     expected = fault.expected
-    sheet = sheet if fault.quantity == "time" else replace(sheet, skip="")
+    sheet = sheet if fault.quantity == "time" else replace(sheet, row_hint="")
     if fault.quantity == "current" and negative:
         expected = "the other sign: most readings are negative"
         if offset > 0:
@@ -296,7 +298,7 @@ def _not_negative(sheet: Sheet, column: Column) -> tuple[Sheet, tuple[str, ...]]
     ]
     if below.size == values.size:
         raise bad[0]
-    sheet = sheet.without_rows(np.flatnonzero(values >= 0).tolist(), bad)
+    sheet = sheet.keep_rows(np.flatnonzero(values >= 0).tolist(), bad)
     if below.size < FEWEST:
         return sheet, ()
     return sheet, (
@@ -316,7 +318,7 @@ def _forward(
     last = keep[np.searchsorted(keep, np.arange(moment.size)) - 1]
     wrong = np.flatnonzero(moment <= late)
     bad = [_goes_back(sheet, columns, int(k), cells[last[k]]) for k in wrong]
-    return sheet.without_rows(keep.tolist(), bad), moment[keep]
+    return sheet.keep_rows(keep.tolist(), bad), moment[keep]
 
 
 def _check_base(sheet: Sheet, column: Column, moment: np.ndarray) -> None:
@@ -331,9 +333,9 @@ def _check_base(sheet: Sheet, column: Column, moment: np.ndarray) -> None:
     if latest >= MILLISECONDS and not julian:
         found = f"{latest:.6g} s, after the year 5000"
         finer = (u for u in ("ms", "us") if UNITS["time"][u] * said < MILLISECONDS)
-        header = sheet.called.get(column.header, column.header)
+        header = sheet.file_headers.get(column.header, column.header)
         expected = f"the unit of the time: --columns '{header}=time_{next(finer, 'ns')}'"
-    raise replace(sheet, skip="").error(found, expected, int(np.argmax(moment)), column.header)
+    raise replace(sheet, row_hint="").error(found, expected, int(np.argmax(moment)), column.header)
 
 
 def _lifetimes(sheet: Sheet) -> LifetimeTable:
@@ -346,10 +348,12 @@ def _lifetimes(sheet: Sheet) -> LifetimeTable:
     wanted = {"current": columns["beam_current"], "lifetime": columns[kinds[0]]}
     if (error := columns.get(f"{kinds[0]}_error")) is not None:
         wanted["error"] = error
-    sheet = sheet.good(lambda rows: [_positive(rows, column) for column in wanted.values()])
+    sheet = sheet.drop_bad_rows(
+        lambda rows: [_positive(rows, column) for column in wanted.values()]
+    )
     values = {key: _positive(sheet, column) for key, column in wanted.items()}
     hours = {key: values[key] / 3600 for key in ("lifetime", "error") if key in values}
-    said = {"comments": sheet.comments, "notes": left_out(sheet)}
+    said = {"comments": sheet.comments, "notes": sheet_notes(sheet)}
     return LifetimeTable(values["current"], **hours, name=name_of(sheet.path), **said)
 
 
@@ -522,7 +526,7 @@ def record_columns(sheet: Sheet) -> dict[str, Column]:
 def known(sheet: Sheet, name: str) -> Column | None:
     """Meaning of a header by itself; None if it has none."""
     try:
-        found = columns_of(sheet.only([name]), QUANTITIES, _other(sheet))
+        found = columns_of(sheet.select([name]), QUANTITIES, _other(sheet))
         return next(iter(found.values()), None)
     except InputError:
         return None
@@ -536,7 +540,7 @@ def is_current(header: str) -> bool:
     >>> [is_current(name) for name in ("beam_current_mA", "I (A)", "Q2 current (A)", "SR:I")]
     [True, True, False, False]
     """
-    said = spelled(header)
+    said = standard_header(header)
     return said.lower().startswith("beam_current") or _current(said) is not None
 
 
@@ -580,13 +584,13 @@ def dated(sheet: Sheet) -> Sheet:
 def taken_for_current(columns: Mapping[str, Column]) -> tuple[str, ...]:
     """Say which column was taken for the beam current, where its name leaves a choice."""
     header = columns["current"].header
-    plain = spelled(header).lower().startswith(("beam_current", "val"))
+    plain = standard_header(header).lower().startswith(("beam_current", "val"))
     return () if plain else (f"Column '{header}' is taken for the beam current.",)
 
 
 def _other(sheet: Sheet):
     """Understand headers of archives, and looser ones of a current where none has its own."""
-    strict = any(spelled(name).lower().startswith("beam_current_") for name in sheet.names)
+    strict = any(standard_header(name).lower().startswith("beam_current_") for name in sheet.names)
     first = {UTC.sub("", name.lower()): next(iter(sheet[name]), "") for name in sheet.names}
     # A number without a unit is no date, and is not to be taken for seconds.
     moments = {"time"} | {name for name in MOMENTS & set(first) if not is_number(first[name])}

@@ -27,7 +27,7 @@ import numpy as np
 
 from beamfit.errors import InputError, plain
 from beamfit.io.cells import check_length
-from beamfit.io.columns import SETTINGS, known_unit, named, spelled, unit_at_end
+from beamfit.io.columns import SETTINGS, known_unit, name_with_unit, standard_header, unit_at_end
 from beamfit.io.files import digest_now, read_bytes
 from beamfit.particles import LIGHT
 
@@ -193,10 +193,10 @@ def _with_units(
     found = {}
     for header, values in columns.items():
         name, unit = plain(header), units.get(header, "")
-        own, known = unit_at_end(spelled(name)), known_unit(unit)
+        own, known = unit_at_end(standard_header(name)), known_unit(unit)
         said = unit.strip() not in ("", "1", "none", "dimensionless")
         if said and own is None:
-            name = named(name, known or unit)
+            name = name_with_unit(name, known or unit)
         elif said and known != own:
             expected = f"one unit, {own} or the attribute's"
             raise InputError(f"the attribute units = '{unit}'", expected, path, column=name)

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from beamfit.errors import InputError, nearest, plain
-from beamfit.io.columns import ALSO, SETTINGS, UNITS, known_unit
+from beamfit.io.columns import SETTINGS, UNIT_SPELLINGS, UNITS, known_unit
 from beamfit.io.decay_record import QUANTITIES
 from beamfit.io.lattice import LatticeFile
 from beamfit.io.line import part_of, read_lattice
@@ -23,7 +23,7 @@ POINTS, ROWS = 15, 60
 APPROACHES = ("either", "below", "above")
 # Units of settings as control systems write them, in capitals or small letters.
 SPELLINGS = {u.lower(): u for u in SETTINGS}
-SPELLINGS |= {word.lower(): unit for word, unit in ALSO.items() if unit in SETTINGS}
+SPELLINGS |= {word.lower(): unit for word, unit in UNIT_SPELLINGS.items() if unit in SETTINGS}
 LENGTHS = {"um": 1e-6, "mm": 1e-3, "m": 1.0}
 # Bounds that several keys share.
 WAIT = {"low": 0.0, "said": "a time above zero"}

@@ -18,10 +18,10 @@ from beamfit.io.columns import (
     Layout,
     Sheet,
     columns_of,
-    ignored,
+    ignored_note,
     layout_of,
-    left_out,
-    spelled,
+    sheet_notes,
+    standard_header,
 )
 from beamfit.io.files import name_of
 from beamfit.io.table import read_columns
@@ -81,8 +81,8 @@ def read_run(
     >>> print(read_run(file))
     run.csv: 10 rows over 9 s, inputs valve, outputs level
     """
-    named = [(name, f"u_{spelled(name)}") for name in inputs]
-    named += [(name, f"y_{spelled(name)}") for name in outputs]
+    named = [(name, f"u_{standard_header(name)}") for name in inputs]
+    named += [(name, f"y_{standard_header(name)}") for name in outputs]
     layout = layout_of(columns) + Layout(tuple(named), tuple(name for name, _ in named))
     sheet = read_columns(path, EXAMPLE, layout, ignore, skip_bad)
     columns = columns_of(sheet, {TIME: "time"}, lambda header: _other(header, sheet, bool(named)))
@@ -92,7 +92,7 @@ def read_run(
     for kind, word in (("u", "input"), ("y", "output")):
         if not any(key.startswith(f"{kind}_") for key in columns):
             raise sheet.header_error(f"no {word}", f"a column {kind}_…, or --{word} COLUMN")
-    sheet = sheet.good(lambda rows: _values(rows, columns))
+    sheet = sheet.drop_bad_rows(lambda rows: _values(rows, columns))
     values = _values(sheet, columns)
     u, y = ({k[2:]: v for k, v in values.items() if k.startswith(f"{kind}_")} for kind in "uy")
     if (time := values.get(TIME)) is None:
@@ -103,11 +103,11 @@ def read_run(
     if late.size:
         row = int(late[0]) + 1
         found = f"time {time[row]:.10g} s after {time[row - 1]:.10g} s"
-        whole = replace(sheet, skip="")
+        whole = replace(sheet, row_hint="")
         raise whole.error(found, "times that increase", row, columns[TIME].header)
     said = {
         "provenance": sheet.comments,
-        "notes": (*ignored(sheet, columns), *left_out(sheet)),
+        "notes": (*ignored_note(sheet, columns), *sheet_notes(sheet)),
         "sha256": sheet.sha256,
     }
     return Run(time, u, y, name=name_of(sheet.path), path=str(sheet.path), **said)
@@ -117,7 +117,11 @@ def _other(header: str, sheet: Sheet, named: bool) -> Column | None:
     """An input or an output; where some are named, no others are read."""
     if header.lower() == TIME:
         return Column(header, TIME, DATE)
-    if header[:2] in ("u_", "y_") and len(header) > 2 and (header in sheet.called or not named):
+    if (
+        header[:2] in ("u_", "y_")
+        and len(header) > 2
+        and (header in sheet.file_headers or not named)
+    ):
         return Column(header, header)
     return Column(header, f"{ASIDE} {header}") if header.startswith("note_") else None
 

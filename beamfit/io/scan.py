@@ -24,12 +24,12 @@ from beamfit.io.columns import (
     Columns,
     Sheet,
     columns_of,
-    examples,
-    ignored,
+    example_headers,
+    ignored_note,
     known_unit,
-    left_out,
     number_and_unit,
-    spelled,
+    sheet_notes,
+    standard_header,
 )
 from beamfit.io.emittance_gui import is_emittance_gui, read_emittance_gui
 from beamfit.io.files import name_of, text_lines
@@ -137,17 +137,17 @@ def scan_columns(
     >>> list(columns), round(2.3548 * columns["size_x"].factor, 7)
     (['setting Q', 'size_x'], 0.001)
     """
-    current = any(spelled(name).lower().startswith("beam_current") for name in sheet.names)
+    current = any(standard_header(name).lower().startswith("beam_current") for name in sheet.names)
     if current and not any(map(is_size, sheet.names)):
         expected = "a quadrupole scan; `beamfit lifetime` reads it"
         raise sheet.header_error("a record of beam current", expected)
     knob_headers = {column.header for column in knobs.values()}
     other_headers = [name for name in sheet.names if name not in knob_headers]
-    if "plane" in map(str.lower, other_headers) and not sheet.arranged:
+    if "plane" in map(str.lower, other_headers) and not sheet.has_layout:
         expected = "a column for each plane, size_x_um and size_y_um, and a row for each setting"
         raise sheet.header_error("rows of two planes", expected)
     columns = dict(knobs) | columns_of(
-        sheet.only(other_headers) if knobs else sheet,
+        sheet.select(other_headers) if knobs else sheet,
         QUANTITIES,
         lambda header: _scan_column(header, sheet),
     )
@@ -171,7 +171,7 @@ def is_known(name: str, sheet: Sheet) -> bool:
     """True if a header is one of a scan."""
     try:
         return bool(
-            columns_of(sheet.only([name]), QUANTITIES, lambda header: _scan_column(header, sheet))
+            columns_of(sheet.select([name]), QUANTITIES, lambda header: _scan_column(header, sheet))
         )
     except InputError:
         return False
@@ -220,7 +220,7 @@ def _scan_column(header: str, sheet: Sheet) -> Column:
         name = stripped
     if name and not re.match(r"(size|sigma|rms|fwhm)_[xy](_|$)", name):
         return Column(header, f"{SETTING_PREFIX}{name}", unit)
-    nearest_names = nearest(header, examples(QUANTITIES))
+    nearest_names = nearest(header, example_headers(QUANTITIES))
     expected = f"a magnet with _A, _kG, _T_per_m or _k1 at the end, {nearest_names}"
     raise sheet.header_error(_unknown_reason(header), expected, header)
 
@@ -243,7 +243,7 @@ def likely_scan_name(header: str, cell: object = "") -> str | None:
     size = _size_column(f"{header}_um") or _bare_error_column(f"{header}_um")
     if size is not None:
         return f"{size.key}_{cell_unit if cell_unit in UNITS['length'] else 'um'}"
-    if (error := _bare_error_column(spelled(header))) is not None:
+    if (error := _bare_error_column(standard_header(header))) is not None:
         return f"{error.key}_{error.unit}"
     stripped, unit = DEVICE_ATTRIBUTE.sub("", header), cell_unit or "kG"
     if stripped == header or unit not in SETTINGS:
@@ -272,7 +272,7 @@ def _unknown_reason(header: str) -> str:
 
 def is_size(header: str) -> bool:
     """True if a header names a beam size or its error, with or without a unit."""
-    name = spelled(header)
+    name = standard_header(header)
     return any(_size_column(header) is not None for header in (name, f"{name}_um"))
 
 
@@ -546,15 +546,15 @@ def scan_of_sheet(sheet: Sheet, knobs: Mapping[str, Column] = MappingProxyType({
     """Make the scan of a sheet; columns of knobs are settings in addition to the magnets."""
     profiles: tuple[Profile, ...] = ()
     if IMAGE in sheet.names:
-        sheet = of_images(replace(sheet, skip=""))
+        sheet = of_images(replace(sheet, row_hint=""))
     if {"counts_x", "counts_y"} & set(sheet.names):
-        sheet, profiles = of_profiles(replace(sheet, skip=""))
+        sheet, profiles = of_profiles(replace(sheet, row_hint=""))
     columns = scan_columns(sheet, knobs)
     sheet = _blank_dark_shots(sheet, columns) if "shot" in columns else sheet
     if sheet.skip_bad:
-        sheet = sheet.good(lambda rows: _scan_values(rows, columns))
+        sheet = sheet.drop_bad_rows(lambda rows: _scan_values(rows, columns))
         median_sizes = _median_sizes(_scan_values(sheet, columns))
-        sheet = sheet.good(
+        sheet = sheet.drop_bad_rows(
             lambda rows: _check_outlying_sizes(
                 rows, columns, _scan_values(rows, columns), median_sizes
             )
@@ -562,7 +562,7 @@ def scan_of_sheet(sheet: Sheet, knobs: Mapping[str, Column] = MappingProxyType({
     values = _scan_values(sheet, columns)
     size_notes = _check_sizes(sheet, columns, values)
     notes = [*column_notes(columns), *comment_notes(sheet, columns), *size_notes]
-    notes += [*ignored(sheet, columns), *left_out(sheet)]
+    notes += [*ignored_note(sheet, columns), *sheet_notes(sheet)]
     with located(sheet.path):
         scan = _make_scan(sheet, columns, values, notes=tuple(notes), profiles=profiles)
         return of_settings(scan, marked="shot" in columns)
@@ -600,7 +600,7 @@ def _make_scan(
     }
     energies = [(values[key], kind) for key, kind in ENERGIES.items() if key in values]
     energy, kind = energies[0] if energies else (None, "total")
-    headers = {key: sheet.called.get(c.header, c.header) for key, c in columns.items()}
+    headers = {key: sheet.file_headers.get(c.header, c.header) for key, c in columns.items()}
     texts = {
         key: tuple(map(str, sheet[columns[key].header]))
         for key in ("screen", "slice")
@@ -792,12 +792,12 @@ def read_tuning_scan(
     """
     sheet = read_columns(path, "Q2_A,knob,size_x_um", columns, ignore, skip_bad, MAX_ROWS)
     knob_names = {knob: _knob_header(knob, sheet) for knob in dict.fromkeys(knobs)}
-    file_headers = {knob: sheet.called.get(name, name) for knob, name in knob_names.items()}
+    file_headers = {knob: sheet.file_headers.get(name, name) for knob, name in knob_names.items()}
     if any(EMITTANCE_HEADER.match(name) for name in sheet.names):
-        return _emittance_table(replace(sheet, skip=""), knob_names, file_headers)
+        return _emittance_table(replace(sheet, row_hint=""), knob_names, file_headers)
     units = {knob: _knob_unit(knob, header) for knob, header in file_headers.items()}
     knobs = {f"setting {k}": Column(n, f"setting {k}", units[k]) for k, n in knob_names.items()}
-    scan = scan_of_sheet(replace(sheet, arranged=True), knobs)
+    scan = scan_of_sheet(replace(sheet, has_layout=True), knobs)
     return replace(scan, columns=scan.columns | file_headers)
 
 
@@ -814,7 +814,7 @@ def _emittance_table(
         )
     prefix = "normalized_emittance_" if is_normalized.pop() else "emittance_"
     quantities = {f"{prefix}{end}": "length" for end in ("x", "y", "x_error", "y_error")}
-    found = columns_of(sheet.only(emittance_headers), quantities)
+    found = columns_of(sheet.select(emittance_headers), quantities)
     values = {k.removeprefix(prefix): sheet.values(c, blank=True) for k, c in found.items()}
     for column, column_values in zip(found.values(), values.values(), strict=True):
         sheet.refuse(column.header, column_values <= 0.0, "a positive number")
@@ -827,7 +827,7 @@ def _emittance_table(
         path=sheet.path,
         sha256=sheet.sha256,
         provenance=sheet.comments,
-        notes=left_out(sheet),
+        notes=sheet_notes(sheet),
         columns=file_headers
         | {k.replace(prefix, "emittance "): c.header for k, c in found.items()},
     )
@@ -837,9 +837,9 @@ def _knob_header(knob: str, sheet: Sheet) -> str:
     """Header of a knob's column: its name, or its name with a unit."""
     if knob in sheet.names:
         return knob
-    found = [name for name in sheet.names if spelled(name).rpartition("_")[0] == knob]
+    found = [name for name in sheet.names if standard_header(name).rpartition("_")[0] == knob]
     if not found:
-        raise sheet.no_column(knob)
+        raise sheet.missing_column(knob)
     if len(found) > 1:
         expected = "its header as it stands: " + " or ".join(found)
         raise sheet.header_error(f"a knob '{knob}' of several columns", expected)
@@ -848,5 +848,5 @@ def _knob_header(knob: str, sheet: Sheet) -> str:
 
 def _knob_unit(knob: str, header: str) -> str:
     """Unit of a knob: that of its header if it is one of a magnet, otherwise "knob"."""
-    unit = spelled(header).removeprefix(f"{knob}_")
+    unit = standard_header(header).removeprefix(f"{knob}_")
     return unit if unit in SETTINGS else KNOB

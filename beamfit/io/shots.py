@@ -12,7 +12,7 @@ import numpy as np
 from beamfit.density.profiles import FEWEST_BINS, profile_size
 from beamfit.emittance.scan import PLANES, Profile
 from beamfit.errors import InputError
-from beamfit.io.columns import Sheet, columns_of, spelled
+from beamfit.io.columns import Sheet, columns_of, standard_header
 from beamfit.io.files import LARGEST, read_bytes
 from beamfit.io.isolated import PIXEL, columns_of_images, isolated, projections
 
@@ -55,8 +55,8 @@ def of_images(sheet: Sheet) -> Sheet:
     found = isolated("an image", sheet.path, PICTURES, image_projections, content)
     seen, pixel = [found[name] for name in files], sheet.numbers(PIXEL)
     added = columns_of_images(seen, pixel)
-    kept = sheet.only([n for n in sheet.names if n not in (IMAGE, PIXEL, SHOT)])
-    kept = kept.rows(added[SHOT].tolist())
+    kept = sheet.select([n for n in sheet.names if n not in (IMAGE, PIXEL, SHOT)])
+    kept = kept.take(added[SHOT].tolist())
     return replace(kept, names=(*kept.names, *added), cells=[*kept.cells, *added.values()])
 
 
@@ -102,11 +102,11 @@ def of_profiles(sheet: Sheet) -> tuple[Sheet, tuple[Profile, ...]]:
     """
     planes = [p for p in PLANES if f"{COUNTS}_{p}" in sheet.names]
     bins = {f"{kind}_{p}" for kind in (COUNTS, BACKGROUND) for p in planes}
-    places = [n for n in sheet.names if spelled(n).startswith(POSITION)]
+    places = [n for n in sheet.names if standard_header(n).startswith(POSITION)]
     rest = [n for n in sheet.names if n not in bins and n not in places]
     starts, ends = _shots(sheet, rest)
     keys = [POSITION, *(f"{POSITION}_{p}" for p in PLANES)]
-    position = columns_of(sheet.only(places), dict.fromkeys(keys, "length"))
+    position = columns_of(sheet.select(places), dict.fromkeys(keys, "length"))
     found, sizes = {}, {}
     for plane in planes:
         column = position.get(f"{POSITION}_{plane}") or position.get(POSITION)
@@ -129,7 +129,7 @@ def of_profiles(sheet: Sheet) -> tuple[Sheet, tuple[Profile, ...]]:
                 expected = "bins at positions of their own, a pixel above zero, and a column shot"
                 raise sheet.error("a profile with a position twice", expected, int(starts[row]))
         sizes[plane], found[plane] = np.array([profile_size(s) for s in shots]), shots
-    kept = sheet.only(rest).rows(list(starts))
+    kept = sheet.select(rest).take(list(starts))
     seen, notes = _settings_with_beam(kept, sizes), list(kept.notes)
     for plane in [p for p in planes if seen[p] < min(FEWEST_SETTINGS, max(seen.values()))]:
         notes.append(f"Left out: {plane}, whose profiles show a beam at {seen[plane]} settings.")
@@ -142,7 +142,7 @@ def of_profiles(sheet: Sheet) -> tuple[Sheet, tuple[Profile, ...]]:
 
 def _settings_with_beam(sheet: Sheet, sizes: Mapping[str, np.ndarray]) -> dict[str, int]:
     """Count the settings at which a plane has a size."""
-    columns = [sheet[name] for name in sheet.names if spelled(name) != "shot"]
+    columns = [sheet[name] for name in sheet.names if standard_header(name) != "shot"]
     settings = list(zip(*(map(str, cells) for cells in columns), strict=True))
     seen = {
         plane: len({where for where, size in zip(settings, own, strict=True) if np.isfinite(size)})

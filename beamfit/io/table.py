@@ -17,12 +17,12 @@ from beamfit.io.columns import (
     UNITS,
     Columns,
     Sheet,
-    arranged,
+    apply_layout,
     has_unit,
+    headers_with_units,
     is_header,
     layout_of,
-    units_below,
-    with_units,
+    unit_row,
 )
 from beamfit.io.files import Numbered, digest, first_bytes, laid_out, read_json, text_lines
 from beamfit.io.isolated import library_columns, matlab_variables
@@ -86,8 +86,8 @@ def read_columns(
     """
     layout = layout_of(columns)
     sheet = read_sheet(path, example, most, skip_bad=skip_bad, names=layout.header or None)
-    sheet = replace(sheet, skip="" if skip_bad else SKIP, skip_bad=skip_bad)
-    return arranged(sheet.without(ignore), layout)
+    sheet = replace(sheet, row_hint="" if skip_bad else SKIP, skip_bad=skip_bad)
+    return apply_layout(sheet.drop(ignore), layout)
 
 
 def read_sheet(
@@ -164,7 +164,7 @@ def _read_text(
             comments.append(bare(text))
         elif text.strip().strip(",;\t "):
             cells, wrong = _row(text, separator, path, line, len(names), rest)
-            units = None if rows or wrong else with_units(names, cells, path, line)
+            units = None if rows or wrong else headers_with_units(names, cells, path, line)
             names = units or names
             if units or (rows and _is_again(cells, title, path, line)):
                 continue
@@ -185,7 +185,7 @@ def _read_text(
         rows, notes = with_points(rows, separator)
         columns = zip(*rows, strict=True) if rows else [()] * len(names)
     said = (tuple(comments), digest(path), tuple(bad), notes)
-    return Sheet(path, tuple(names), list(columns), lines, header, *said).named()
+    return Sheet(path, tuple(names), list(columns), lines, header, *said).drop_unnamed()
 
 
 def _head(
@@ -440,7 +440,7 @@ def is_value(cell: str) -> bool:
 
 def _has_rows(cells: Sequence[str], below: list[list[str]]) -> bool:
     """Tell a line of words that rows of as many cells follow, below its units perhaps."""
-    below = below[1:] if below and units_below(below[0]) else below
+    below = below[1:] if below and unit_row(below[0]) else below
     alike = all(len(row) == len(cells) and is_value(row[0]) for row in below[:2])
     return bool(below) and alike and len(cells) > 1 and not any(map(is_value, cells))
 

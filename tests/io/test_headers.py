@@ -5,7 +5,7 @@ import pytest
 
 from beamfit.errors import InputError
 from beamfit.io.check import proposed_layout, understand
-from beamfit.io.columns import spelled
+from beamfit.io.columns import standard_header
 from beamfit.io.decay_record import read_decay_record
 from beamfit.io.scan import read_quad_scan
 
@@ -78,7 +78,7 @@ def test_scans_and_records_in_each_others_place_are_told_so(tmp_path):
 
 def test_units_that_could_mean_another_are_left_as_they_stand():
     same = ("rf_voltage_mv", "Q_a", "Q552_mA2", "size_x", "SR:DCCT:CURRENT", "note_by hand")
-    assert [spelled(header) for header in same] == list(same)
+    assert [standard_header(header) for header in same] == list(same)
 
 
 def test_an_index_without_a_name_is_ignored(tmp_path):
