@@ -18,7 +18,12 @@ from beamfit.dynamics.record import Run
 from beamfit.emittance.scan import QuadScan
 from beamfit.errors import InputError
 from beamfit.io.columns import Columns, Layout, layout_of, layout_text
-from beamfit.io.decay_record import is_current, known, likely_record_name, read_lifetime_input
+from beamfit.io.decay_record import (
+    is_current,
+    likely_record_name,
+    read_lifetime_input,
+    record_column,
+)
 from beamfit.io.emittance_gui import is_emittance_gui, read_emittance_gui
 from beamfit.io.files import digest
 from beamfit.io.lattice import CALIBRATIONS, STRENGTHS, LatticeFile
@@ -153,7 +158,7 @@ def proposed_layout(path: str | PathLike[str], columns: Columns = None) -> str |
     unknown = {
         name: (likely[0](name, cell) or likely[1](name, cell), cell)
         for name, cells in zip(sheet.names, sheet.cells, strict=True)
-        if not (is_known(name, sheet) or known(sheet, name))
+        if not (is_known(name, sheet) or record_column(sheet, name))
         for cell in [next(iter(cells), "")]
     }
     return layout_text(unknown) if unknown else None

@@ -143,7 +143,7 @@ def unit_row(cells: Sequence[str]) -> list[str | None] | None:
 
     Examples
     --------
-    >>> units_below(["A", "[um]", ""]), units_below(["A", "5"])
+    >>> unit_row(["A", "[um]", ""]), unit_row(["A", "5"])
     (['A', 'um', None], None)
     """
     units = [known_unit(cell) for cell in cells]
@@ -163,7 +163,7 @@ def headers_with_units(
 
     Examples
     --------
-    >>> with_units(["Q2", "size_x", "shot"], ["A", "[um]", ""], "a.csv", 2)
+    >>> headers_with_units(["Q2", "size_x", "shot"], ["A", "[um]", ""], "a.csv", 2)
     ['Q2_A', 'size_x_um', 'shot']
     """
     if (units := unit_row(cells)) is None:
@@ -777,7 +777,7 @@ def layout_text(unknown: Mapping[str, tuple[str | None, Any]]) -> str:
 
     Examples
     --------
-    >>> print(proposal({"xrms": ("size_x_um", 0.1), "n": (None, 7)}))
+    >>> print(layout_text({"xrms": ("size_x_um", 0.1), "n": (None, 7)}))
     format = "beamfit-layout-1"
     ignore = []  # headers to leave unread
     <BLANKLINE>
