@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from beamfit.optics.elements import Element
 
 # A line has no more elements: what claims more is a mistake, or wants to fill the memory.
-MOST = 50_000
+MAX_ELEMENTS = 50_000
 FORMAT = "beamfit-lattice-1"
 # Settings a magnet may be given, one of them; the key says the unit.
 STRENGTHS = {
@@ -196,8 +196,10 @@ def read_toml_lattice(path: str | PathLike[str]) -> LatticeFile:
     top = read_toml(path, "a lattice", FORMAT)
     said = top.values(TOP)
     energy = _energy(top, said["particle"])
-    if len(top.table["element"]) > MOST:
-        raise top.error(f"more than {MOST} elements", "a line that a machine has", "element")
+    if len(top.table["element"]) > MAX_ELEMENTS:
+        raise top.error(
+            f"more than {MAX_ELEMENTS} elements", "a line that a machine has", "element"
+        )
     sections = top.sections("element")
     elements = tuple(_element(section, i) for i, section in enumerate(sections, 1))
     _check_names(elements, sections)
