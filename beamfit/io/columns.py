@@ -583,9 +583,9 @@ NAME_LIST = "a list of names in quotes"
 ITEM_EXAMPLE = "'xrms=size_x_um, QUAD:BACT=Q525_kG', or a layout (.toml)"
 LAYOUT_KEYS = {
     "columns": Key("columns", kind=TABLE, default={}),
-    "ignore": Key("ignore", kind=LIST, default=[], said=NAME_LIST, each=str),
+    "ignore": Key("ignore", kind=LIST, default=[], expected=NAME_LIST, each=str),
     "dates": Key("dates", kind=TEXT, default="", among=DATE_ORDERS),
-    "header": Key("header", kind=LIST, default=[], said=NAME_LIST, each=str),
+    "header": Key("header", kind=LIST, default=[], expected=NAME_LIST, each=str),
 }
 
 

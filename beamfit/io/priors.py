@@ -61,7 +61,9 @@ def read_noise(path: str | PathLike[str]) -> Noise:
     """
     top = read_toml(path, "priors of noise", NOISE, needed=False)
     schema = {name: Key(name, default=None) for name in SINGLE}
-    schema |= {name: Key(name, kind=LIST, default=None, said=PAIR, each=NUMBER) for name in PAIRS}
+    schema |= {
+        name: Key(name, kind=LIST, default=None, expected=PAIR, each=NUMBER) for name in PAIRS
+    }
     said = top.values(schema | {"source": Key("source", kind=TEXT, default=str(path))})
     told: dict[str, Any] = {name: value for name, value in said.items() if value is not None}
     for name, value in told.items():
