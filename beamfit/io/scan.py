@@ -167,7 +167,7 @@ def scan_columns(
     return columns
 
 
-def is_known(name: str, sheet: Sheet) -> bool:
+def is_scan_header(name: str, sheet: Sheet) -> bool:
     """True if a header is one of a scan."""
     try:
         return bool(
