@@ -27,7 +27,7 @@ from beamfit.io.decay_record import (
 from beamfit.io.emittance_gui import is_emittance_gui, read_emittance_gui
 from beamfit.io.files import digest
 from beamfit.io.lattice import CALIBRATIONS, STRENGTHS, LatticeFile
-from beamfit.io.line import FOREIGN, build_line, read_lattice
+from beamfit.io.line import PROGRAM_SUFFIXES, build_line, read_lattice
 from beamfit.io.ring import read_operation, read_ring
 from beamfit.io.run import read_run
 from beamfit.io.scan import is_scan_header, is_size, likely_scan_name, read_quad_scan
@@ -116,7 +116,7 @@ def file_summary(
     kind = _file_kind(path, layout)
     reading = {"columns": layout or None, "ignore": ignore, "skip_bad": skip_bad}
     reading = reading if kind in ("scan", "record", "run") else {}
-    if Path(path).suffix.lower() in FOREIGN:
+    if Path(path).suffix.lower() in PROGRAM_SUFFIXES:
         reading = {"use": use, "energy": energy}
     read, facts_of = {
         "scan": (read_quad_scan, scan_facts),
@@ -188,7 +188,7 @@ def with_lattice(scan: FileSummary, lattice: FileSummary) -> FileSummary:
 def _file_kind(path: str | PathLike[str], layout: Layout) -> str:
     """Determine the kind of a file from its name and header."""
     suffix = Path(path).suffix.lower()
-    if suffix in FOREIGN:
+    if suffix in PROGRAM_SUFFIXES:
         return "lattice"
     if suffix == ".toml":
         tables = read_toml(path, "a lattice or a ring").table

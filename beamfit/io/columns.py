@@ -20,7 +20,7 @@ from beamfit.io.cells import (
     DAY_FIRST,
     HOUR_OR_MINUTE,
     MONTH_FIRST,
-    NUMBERS,
+    NUMERIC_DATE,
     dates_in_order,
     is_number,
     number,
@@ -435,7 +435,7 @@ class Sheet:
 def _expected_date(cells: Sequence[Any], header: str) -> str:
     """Expected form of a date, for the message about a column with this first cell."""
     first = str(next(iter(cells), ""))
-    if NUMBERS.match(first):
+    if NUMERIC_DATE.match(first):
         expected = "a date whose day and month cannot be exchanged, such as 2024-03-01, "
         return expected + "or --columns day-month-year (or month-day-year)"
     if HOUR_OR_MINUTE.fullmatch(first):

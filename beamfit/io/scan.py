@@ -33,7 +33,7 @@ from beamfit.io.columns import (
 )
 from beamfit.io.emittance_gui import is_emittance_gui, read_emittance_gui
 from beamfit.io.files import name_of, text_lines
-from beamfit.io.shots import IMAGE, of_images, of_profiles
+from beamfit.io.shots import IMAGE, profiles_from_images, sizes_from_profiles
 from beamfit.io.table import read_columns
 from beamfit.particles import ENERGY_KEYS
 from beamfit.tuning.knobs import EmittanceTable
@@ -546,9 +546,9 @@ def scan_of_sheet(sheet: Sheet, knobs: Mapping[str, Column] = MappingProxyType({
     """Make the scan of a sheet; columns of knobs are settings in addition to the magnets."""
     profiles: tuple[Profile, ...] = ()
     if IMAGE in sheet.names:
-        sheet = of_images(replace(sheet, row_hint=""))
+        sheet = profiles_from_images(replace(sheet, row_hint=""))
     if {"counts_x", "counts_y"} & set(sheet.names):
-        sheet, profiles = of_profiles(replace(sheet, row_hint=""))
+        sheet, profiles = sizes_from_profiles(replace(sheet, row_hint=""))
     columns = scan_columns(sheet, knobs)
     sheet = _blank_dark_shots(sheet, columns) if "shot" in columns else sheet
     if sheet.skip_bad:
