@@ -1,4 +1,4 @@
-"""Job of a batch: hundreds of files at a time, wherever they run, a row for each."""
+"""Job of a batch: the fit of each file, and its rows in the table of answers."""
 
 from __future__ import annotations
 
@@ -8,7 +8,14 @@ from functools import lru_cache
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import beamfit
-from beamfit.batch.columns import COLUMNS, UNUSABLE, decay_row, emittance_rows, lifetime_rows, lines
+from beamfit.batch.columns import (
+    COLUMNS,
+    UNUSABLE,
+    csv_lines,
+    decay_row,
+    emittance_rows,
+    lifetime_rows,
+)
 from beamfit.errors import InputError
 from beamfit.io.decay_record import read_lifetime_input
 from beamfit.io.files import digest
@@ -28,7 +35,7 @@ class _Lattice(NamedTuple):
     line: Beamline
 
 
-@lru_cache(maxsize=4)  # scans of one line share what it is made into
+@lru_cache(maxsize=4)  # scans of one line share the built line
 def _lattice(path: str, sha256: str, part: tuple[tuple[str, Any], ...]) -> _Lattice:
     file = read_lattice(path, **dict(part))
     if file.sha256 != sha256:
@@ -38,22 +45,22 @@ def _lattice(path: str, sha256: str, part: tuple[tuple[str, Any], ...]) -> _Latt
 
 @dataclass(frozen=True)
 class Job:
-    """The question a batch puts to every file: kind of fit, line, options.
+    """Fit that a batch applies to every file: kind, line, options.
 
     Parameters
     ----------
     kind : {"emittance", "lifetime"}
-        What the files hold.
+        Kind of files.
     lattice : str, optional
-        The line of the scans; rows with matrices of their own need none.
+        Lattice file of the scans; not needed for rows with their own matrices.
     part : mapping
         ``use, energy, particle, first, last, screen`` of `beamfit.io.line.read_inputs`.
     reading : mapping
-        How files are read: ``columns, ignore, skip_bad``.
+        Options of the readers: ``columns, ignore, skip_bad``.
     weights : {"model", "measured"}
         As for `beamfit.fit_emittance`.
     noise : str, optional
-        File of priors on the noise of sizes; beamfit's own without.
+        File of priors on the noise of sizes; default: beamfit's own.
 
     Raises
     ------
@@ -77,41 +84,41 @@ class Job:
 
     def __post_init__(self) -> None:
         for name in ("part", "reading"):
-            told = {k: v for k, v in getattr(self, name).items() if v not in (None, (), False)}
-            object.__setattr__(self, name, told)
+            given = {k: v for k, v in getattr(self, name).items() if v not in (None, (), False)}
+            object.__setattr__(self, name, given)
         if self.lattice is not None and not self.lattice_sha256:
             found = read_lattice(self.lattice, **self.part).sha256
             object.__setattr__(self, "lattice_sha256", found)
 
     @property
     def key(self) -> tuple[str, str, str]:
-        """Inputs of an answer besides the file: lattice, options, version."""
-        said = {**self.part, **self.reading, "weights": self.weights}
-        said |= {} if self.noise is None else {"noise": digest(self.noise)}
-        words = (f"{k}={' '.join(v) if isinstance(v, tuple) else v}" for k, v in said.items())
-        return self.lattice_sha256, ", ".join(words), self.version
+        """Inputs of an answer in addition to the file: lattice, options, version."""
+        options = {**self.part, **self.reading, "weights": self.weights}
+        options |= {} if self.noise is None else {"noise": digest(self.noise)}
+        texts = (f"{k}={' '.join(v) if isinstance(v, tuple) else v}" for k, v in options.items())
+        return self.lattice_sha256, ", ".join(texts), self.version
 
     def answer(self, files: Sequence[str]) -> str:
-        """Answer for some files, in lines of CSV; what goes wrong with one is a row of its own."""
+        """Fit files, and return lines of CSV; a file that fails has a row with the reason."""
         if beamfit.__version__ != self.version:
             raise InputError(f"beamfit {beamfit.__version__} on a worker", f"{self.version} there")
         try:
             found = self._emittances(files) if self.kind == "emittance" else self._decays(files)
             key = dict(zip(("lattice_sha256", "options", "beamfit"), self.key, strict=True))
-            return lines((row | key for row in found), COLUMNS[self.kind])
+            return csv_lines((row | key for row in found), COLUMNS[self.kind])
         except Exception as error:
             if len(files) > 1:
                 return "".join(self.answer([file]) for file in files)
-            said = f"an error in beamfit, please report it: {type(error).__name__}: {error}"
-            return self.refused(files[0], said)
+            reason = f"an error in beamfit, please report it: {type(error).__name__}: {error}"
+            return self.refused(files[0], reason)
 
     def refused(self, file: str, reason: str) -> str:
-        """The line of a file that has no answer."""
+        """Line of CSV for a file without an answer."""
         key = dict(zip(("lattice_sha256", "options", "beamfit"), self.key, strict=True))
-        return lines([_refused(file, reason) | key], COLUMNS[self.kind])
+        return csv_lines([_unusable_row(file, reason) | key], COLUMNS[self.kind])
 
     def read(self, file: str) -> Inputs:
-        """A scan and its lattice."""
+        """Read a scan and its lattice."""
         if self.lattice is None:
             return read_inputs(file, **self.part, **self.reading)
         return read_inputs(file, self._line().file, **self.reading)
@@ -119,29 +126,29 @@ class Job:
     def _line(self) -> _Lattice:
         return _lattice(self.lattice, self.lattice_sha256, tuple(self.part.items()))
 
-    def line_of(self, found: Inputs) -> Beamline:
-        """The line of a scan."""
-        own = self.lattice is not None and found.lattice is self._line().file
-        return self._line().line if own else build_line(found.lattice)
+    def line_of(self, inputs: Inputs) -> Beamline:
+        """Beam line of a scan, built only once if all scans share it."""
+        is_shared = self.lattice is not None and inputs.lattice is self._line().file
+        return self._line().line if is_shared else build_line(inputs.lattice)
 
     def fit(self, file: str) -> Any:
-        """Result of one file, as `beamfit.write_report` takes it."""
+        """Fit one file, and return the result for `beamfit.write_report`."""
         if self.kind == "lifetime":
             from beamfit.lifetime.study import study_record
 
             return (study_record(read_lifetime_input(file, **self.reading)),)
         from beamfit.emittance.slices import fit_slices
 
-        found = self.read(file)
-        fit = fit_slices if len(found.scan.slices) > 1 else beamfit.fit_emittance
-        return fit(found.scan, self.line_of(found), weights=self.weights, noise=self._priors)
+        inputs = self.read(file)
+        fit = fit_slices if len(inputs.scan.slices) > 1 else beamfit.fit_emittance
+        return fit(inputs.scan, self.line_of(inputs), weights=self.weights, noise=self._priors)
 
     @property
     def _priors(self) -> Noise:
         return Noise() if self.noise is None else read_noise(self.noise)
 
     def learned_noise(self, files: Sequence[str]) -> Learned:
-        """Learn the noise of all scans that are surely a beam's.
+        """Learn priors on the noise from all scans that certainly show a beam.
 
         Raises
         ------
@@ -150,45 +157,53 @@ class Job:
         """
         from beamfit.emittance.fit import noise_samples
 
-        read = (found for file in files if isinstance(found := _tried(self.read, file), Inputs))
-        pairs = [(found.scan, self.line_of(found)) for found in read if len(found.scan.slices) < 2]
+        all_inputs = (
+            inputs
+            for file in files
+            if isinstance(inputs := _result_or_error(self.read, file), Inputs)
+        )
+        pairs = [
+            (inputs.scan, self.line_of(inputs))
+            for inputs in all_inputs
+            if len(inputs.scan.slices) < 2
+        ]
         source = f"learned from {len(pairs)} scans by beamfit {self.version}"
         return learn_noise(list(noise_samples(pairs, self._priors)), self._priors, source)
 
     def _emittances(self, files: Iterable[str]) -> Iterator[dict[str, Any]]:
         from beamfit.emittance.fit import fit_many
 
-        read = [_tried(self.read, file) for file in files]
+        results = [_result_or_error(self.read, file) for file in files]
         parts = []
-        for i, found in enumerate(read):
-            if isinstance(found, Inputs):
-                scan, line = found.scan, self.line_of(found)
-                several = len(scan.slices) > 1
-                own = [scan.of_slice(name) for name in scan.slices] if several else [scan]
-                parts += [(i, (each, line)) for each in own]
-        fits: list[list[Any]] = [[] for _ in read]
+        for i, inputs in enumerate(results):
+            if isinstance(inputs, Inputs):
+                scan, line = inputs.scan, self.line_of(inputs)
+                has_slices = len(scan.slices) > 1
+                scans = [scan.of_slice(name) for name in scan.slices] if has_slices else [scan]
+                parts += [(i, (part, line)) for part in scans]
+        fits: list[list[Any]] = [[] for _ in results]
         for (i, (scan, _)), fit in zip(
-            parts, fit_many((p for _, p in parts), self.weights, self._priors), strict=True
+            parts, fit_many((pair for _, pair in parts), self.weights, self._priors), strict=True
         ):
             fits[i].append((scan.slices[0] if scan.slice else "", fit))
-        for file, found, own in zip(files, read, fits, strict=True):
-            if isinstance(found, InputError):
-                yield _refused(file, str(found))
-            for name, fit in own:
-                about = {"file": file, "sha256": found.scan.sha256, "slice": name}
+        for file, inputs, scans in zip(files, results, fits, strict=True):
+            if isinstance(inputs, InputError):
+                yield _unusable_row(file, str(inputs))
+            for name, fit in scans:
+                common = {"file": file, "sha256": inputs.scan.sha256, "slice": name}
                 if isinstance(fit, InputError):
-                    yield about | {"status": UNUSABLE, "message": str(fit)}
+                    yield common | {"status": UNUSABLE, "message": str(fit)}
                 else:
-                    yield from (row | about for row in emittance_rows(fit))
+                    yield from (row | common for row in emittance_rows(fit))
 
     def _decays(self, files: Iterable[str]) -> Iterator[dict[str, Any]]:
         for file in files:
-            found = _tried(self._decay_rows, file)
-            if isinstance(found, InputError):
-                yield _refused(file, str(found))
+            rows = _result_or_error(self._decay_rows, file)
+            if isinstance(rows, InputError):
+                yield _unusable_row(file, str(rows))
                 continue
-            about = {"file": file, "sha256": digest(file)}
-            yield from (row | about for row in found)
+            common = {"file": file, "sha256": digest(file)}
+            yield from (row | common for row in rows)
 
     def _decay_rows(self, file: str) -> list[dict[str, Any]]:
         from beamfit.lifetime.lifetime_table import fit_lifetimes
@@ -200,16 +215,16 @@ class Job:
         return list(lifetime_rows(study_record(record)))
 
 
-def _tried(read: Callable[[str], Any], file: str) -> Any:
+def _result_or_error(read: Callable[[str], Any], file: str) -> Any:
     try:
         return read(file)
     except InputError as error:
         return error
 
 
-def _refused(file: str, reason: str) -> dict[str, Any]:
+def _unusable_row(file: str, reason: str) -> dict[str, Any]:
     try:
         sha256 = digest(file)
-    except InputError:  # what cannot be read is tried again by the next run
+    except InputError:  # the next run tries an unreadable file again
         sha256 = ""
     return {"file": file, "sha256": sha256, "status": UNUSABLE, "message": reason}
