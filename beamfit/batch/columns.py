@@ -25,15 +25,13 @@ UNUSABLE = "unusable"
 # Units at the end of a column name.
 UNIT_ENDINGS = {"1": "", "m^2": "_m2", "m rad": "_m_rad", "rad^2": "_rad2", "1/s": "_per_s"}
 UNIT_ENDINGS |= {"1/(mA s)": "_per_mA_s"}
-VALUE_ENDINGS = ("", "_error", "_error_raw", "_low_95", "_high_95")
+ENDINGS = ("", "_error", "_error_raw", "_low_95", "_high_95")
 # Columns that identify an answer: the file, and everything else that determines the answer.
 KEY_COLUMNS = ("file", "sha256", "lattice_sha256", "options", "beamfit")
 
 
 @lru_cache(maxsize=256)
-def quantity_columns(
-    name: str, unit: str, ends: tuple[str, ...] = VALUE_ENDINGS
-) -> tuple[str, ...]:
+def quantity_columns(name: str, unit: str, ends: tuple[str, ...] = ENDINGS) -> tuple[str, ...]:
     """Columns of a quantity.
 
     Examples
@@ -75,17 +73,15 @@ def emittance_rows(fit: EmittanceFit) -> Iterator[dict[str, Any]]:
     """Make a row for each plane."""
     notes = " ".join(fit.notes)
     for p in fit.planes:
-        identifiability = p.identifiability
+        ident = p.identifiability
         quantities = p.quantities | ({} if p.mismatch is None else {"mismatch": p.mismatch})
-        row = _quantity_cells(quantities) | vars(identifiability)
+        row = _quantity_cells(quantities) | vars(ident)
         row |= {name: getattr(p, name) for name in ("plane", "status", "message", "chi2", "dof")}
         row |= {name: getattr(p, name) for name in ("error_scale", "noise", "method", "weights")}
-        row |= {
-            f"singular_value_{i}": v for i, v in enumerate(identifiability.singular_values, start=1)
-        }
-        row["beam_probability"] = identifiability.probability["beam"]
-        row["phase_coverage_deg"] = identifiability.phase_coverage
-        yield row | {"undetermined": "; ".join(identifiability.undetermined), "notes": notes}
+        row |= {f"singular_value_{i}": v for i, v in enumerate(ident.singular_values, start=1)}
+        row["beam_probability"] = ident.probability["beam"]
+        row["phase_coverage_deg"] = ident.phase_coverage
+        yield row | {"undetermined": "; ".join(ident.undetermined), "notes": notes}
 
 
 def lifetime_rows(study: RecordStudy) -> Iterator[dict[str, Any]]:
@@ -112,12 +108,12 @@ def _quantity_cells(quantities: Mapping[str, Quantity | Mapping[str, Any]]) -> d
     return row
 
 
-def csv_lines(rows: Iterable[Mapping[str, Any]], columns: Iterable[str]) -> str:
+def csv_text(rows: Iterable[Mapping[str, Any]], columns: Iterable[str]) -> str:
     """Write rows as CSV; numbers have all digits.
 
     Examples
     --------
-    >>> csv_lines([{"a": 0.1, "b": "x,\\ny", "c": math.nan, "d": True}], "abcde")
+    >>> csv_text([{"a": 0.1, "b": "x,\\ny", "c": math.nan, "d": True}], "abcde")
     '0.1,"x, y",,1,\\n'
     """
     text = io.StringIO()

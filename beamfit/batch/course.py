@@ -148,13 +148,11 @@ def courses_of(batch: Batch, name: str | None = None) -> list[ControlChart]:
 def _points(
     batch: Batch, columns: tuple[str, ...]
 ) -> Iterator[tuple[int, tuple[str, str, float, float]]]:
-    columns_of_kind = COLUMNS[batch.ledger.job.kind]
-    value, error = (columns_of_kind.index(column) for column in columns[:2])
-    plane_columns = [
-        columns_of_kind.index(name) for name in ("slice", "plane") if name in columns_of_kind
-    ]
+    names = COLUMNS[batch.ledger.job.kind]
+    value, error = (names.index(column) for column in columns[:2])
+    words = [names.index(name) for name in ("slice", "plane") if name in names]
     positions = {file: i for i, file in enumerate(batch.files, start=1)}
     for row in csv.reader(raw.decode() for raw in batch.ledger.rows(batch.files)):
         if row[value] and row[error]:
-            plane = " ".join(row[i] for i in plane_columns if row[i])
+            plane = " ".join(row[i] for i in words if row[i])
             yield positions[row[0]], (plane, row[0], float(row[value]), float(row[error]))

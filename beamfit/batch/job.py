@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import beamfit
 from beamfit.batch.columns import (
     COLUMNS,
+    KEY_COLUMNS,
     UNUSABLE,
-    csv_lines,
+    csv_text,
     decay_row,
     emittance_rows,
     lifetime_rows,
@@ -27,6 +28,7 @@ from beamfit.noise.learn import Learned, learn_noise
 from beamfit.noise.model import Noise
 
 if TYPE_CHECKING:
+    from beamfit.emittance.scan import QuadScan
     from beamfit.optics.beamline import Beamline
 
 
@@ -104,8 +106,7 @@ class Job:
             raise InputError(f"beamfit {beamfit.__version__} on a worker", f"{self.version} there")
         try:
             found = self._emittances(files) if self.kind == "emittance" else self._decays(files)
-            key = dict(zip(("lattice_sha256", "options", "beamfit"), self.key, strict=True))
-            return csv_lines((row | key for row in found), COLUMNS[self.kind])
+            return self._csv(found)
         except Exception as error:
             if len(files) > 1:
                 return "".join(self.answer([file]) for file in files)
@@ -114,8 +115,12 @@ class Job:
 
     def refused(self, file: str, reason: str) -> str:
         """Line of CSV for a file without an answer."""
-        key = dict(zip(("lattice_sha256", "options", "beamfit"), self.key, strict=True))
-        return csv_lines([_unusable_row(file, reason) | key], COLUMNS[self.kind])
+        return self._csv([_unusable_row(file, reason)])
+
+    def _csv(self, rows: Iterable[dict[str, Any]]) -> str:
+        """Write rows, with the key of the job, as lines of CSV."""
+        key = dict(zip(KEY_COLUMNS[2:], self.key, strict=True))
+        return csv_text((row | key for row in rows), COLUMNS[self.kind])
 
     def read(self, file: str) -> Inputs:
         """Read a scan and its lattice."""
@@ -157,40 +162,28 @@ class Job:
         """
         from beamfit.emittance.fit import noise_samples
 
-        all_inputs = (
-            inputs
-            for file in files
-            if isinstance(inputs := _result_or_error(self.read, file), Inputs)
-        )
-        pairs = [
-            (inputs.scan, self.line_of(inputs))
-            for inputs in all_inputs
-            if len(inputs.scan.slices) < 2
-        ]
+        read = (_result_or_error(self.read, file) for file in files)
+        whole = (r for r in read if isinstance(r, Inputs) and len(r.scan.slices) < 2)
+        pairs = [(inputs.scan, self.line_of(inputs)) for inputs in whole]
         source = f"learned from {len(pairs)} scans by beamfit {self.version}"
         return learn_noise(list(noise_samples(pairs, self._priors)), self._priors, source)
 
     def _emittances(self, files: Iterable[str]) -> Iterator[dict[str, Any]]:
         from beamfit.emittance.fit import fit_many
 
-        results = [_result_or_error(self.read, file) for file in files]
-        parts = []
-        for i, inputs in enumerate(results):
-            if isinstance(inputs, Inputs):
-                scan, line = inputs.scan, self.line_of(inputs)
-                has_slices = len(scan.slices) > 1
-                scans = [scan.of_slice(name) for name in scan.slices] if has_slices else [scan]
-                parts += [(i, (part, line)) for part in scans]
-        fits: list[list[Any]] = [[] for _ in results]
-        for (i, (scan, _)), fit in zip(
-            parts, fit_many((pair for _, pair in parts), self.weights, self._priors), strict=True
-        ):
-            fits[i].append((scan.slices[0] if scan.slice else "", fit))
-        for file, inputs, scans in zip(files, results, fits, strict=True):
-            if isinstance(inputs, InputError):
-                yield _unusable_row(file, str(inputs))
-            for name, fit in scans:
-                common = {"file": file, "sha256": inputs.scan.sha256, "slice": name}
+        read = [_result_or_error(self.read, file) for file in files]
+        scans = [_slices(found.scan) if isinstance(found, Inputs) else [] for found in read]
+        pairs = []
+        for found, own in zip(read, scans, strict=True):
+            line = self.line_of(found) if own else None
+            pairs += [(scan, line) for scan in own]
+        fits = iter(fit_many(pairs, self.weights, self._priors))
+        for file, found, own in zip(files, read, scans, strict=True):
+            if isinstance(found, InputError):
+                yield _unusable_row(file, str(found))
+            for scan in own:
+                fit, name = next(fits), scan.slices[0] if scan.slice else ""
+                common = {"file": file, "sha256": found.scan.sha256, "slice": name}
                 if isinstance(fit, InputError):
                     yield common | {"status": UNUSABLE, "message": str(fit)}
                 else:
@@ -213,6 +206,11 @@ class Job:
         if isinstance(record, LifetimeTable):
             return [decay_row(fit_lifetimes(record).to_json())]
         return list(lifetime_rows(study_record(record)))
+
+
+def _slices(scan: QuadScan) -> list[QuadScan]:
+    """Scan of each slice, or the scan itself without slices."""
+    return [scan.of_slice(name) for name in scan.slices] if len(scan.slices) > 1 else [scan]
 
 
 def _result_or_error(read: Callable[[str], Any], file: str) -> Any:

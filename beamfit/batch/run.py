@@ -65,10 +65,10 @@ def find_files(paths: Iterable[str], kind: str) -> tuple[str, ...]:
     found: dict[str, None] = {}
     for path in paths:
         if Path(path).is_dir():
-            found_files = sorted(
+            inside = sorted(
                 p for p in Path(path).rglob("*") if p.suffix.lower() in FILE_SUFFIXES[kind]
             )
-            found |= dict.fromkeys(str(p) for p in found_files if _is_input(p.relative_to(path)))
+            found |= dict.fromkeys(str(p) for p in inside if _is_input(p.relative_to(path)))
         else:
             found[path] = None
     if not any(Path(file).exists() for file in found):

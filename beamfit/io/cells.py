@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import itertools
 import math
 import os
 import re
@@ -97,10 +98,8 @@ DATE_FORMATS = (
     "%b %d, %Y",
     "%a %d %b %Y",
 )
-DATE_TIME_FORMATS = tuple(
-    f"{day} {clock}" for day in DATE_FORMATS for clock in ("%H:%M:%S", "%H:%M")
-)
-DATE_TIME_FORMATS += ("%a %b %d %H:%M:%S %Y",)
+TIME_FORMATS = tuple(f"{day} {clock}" for day in DATE_FORMATS for clock in ("%H:%M:%S", "%H:%M"))
+TIME_FORMATS += ("%a %b %d %H:%M:%S %Y",)
 # Numeric date; its order is unambiguous only if one of the two numbers exceeds 12.
 NUMERIC_DATE = re.compile(r"(\d{1,2})([/-])(\d{1,2})\2(\d{4})\b")
 AM_PM = re.compile(r"(.*\d) ?([AP])\.?M\.?", re.IGNORECASE)
@@ -148,10 +147,8 @@ def unix_time(text: str, *, fold: int = 0, order: str = "") -> float:
             zone = ZoneInfo(match[2])
         except (ZoneInfoNotFoundError, ValueError, OSError):
             raise ValueError(f"zone {match[2]}") from None
-    moment = (
-        _parse_datetime(NUMERIC_DATE.sub(lambda found: _iso_date(found, order), date_text, count=1))
-        + shift
-    )
+    iso_text = NUMERIC_DATE.sub(lambda found: _iso_date(found, order), date_text, count=1)
+    moment = _parse_datetime(iso_text) + shift
     return (moment if moment.tzinfo else moment.replace(tzinfo=zone, fold=fold)).timestamp()
 
 
@@ -214,7 +211,7 @@ def _parse_datetime(text: str) -> datetime:
         fraction = FRACTION.search(text)
         without_fraction = text[: fraction.start()] if fraction else text
         microsecond = round(1e6 * float(f"0.{fraction[1]}")) if fraction else 0
-        for pattern in DATE_TIME_FORMATS:
+        for pattern in TIME_FORMATS:
             try:
                 moment = datetime.strptime(without_fraction, pattern)
             except ValueError:
@@ -306,8 +303,8 @@ def check_length(
 
 
 # Number with a decimal comma, also with thousands separators; its translation.
-DECIMAL_COMMA = re.compile(r"[-+]?(\d+|\d{1,3}(?:[.'’\xa0\u202f]\d{3})+),\d+([eEdD][-+]?\d+)?")
-COMMA_TO_POINT = str.maketrans({",": "."} | dict.fromkeys(".'’\xa0\u202f"))
+WITH_COMMA = re.compile(r"[-+]?(\d+|\d{1,3}(?:[.'’\xa0\u202f]\d{3})+),\d+([eEdD][-+]?\d+)?")
+TO_POINT = str.maketrans({",": "."} | dict.fromkeys(".'’\xa0\u202f"))
 # Number whose comma may separate thousands. Between semicolons it is decimal: spreadsheets use them
 # only with decimal commas, but tabs always.
 THOUSANDS = re.compile(r"[-+]?[1-9]\d{0,2},\d{3}")
@@ -338,19 +335,17 @@ def convert_decimal_commas(
     >>> convert_decimal_commas([["0,5", "1"], ["1,5", "2"], ["2,5", "3"]], ";")[0]
     [['0.5', '1'], ['1.5', '2'], ['2.5', '3']]
     """
-    if separator not in (";", "\t") or not any(
-        "," in cell for row in rows[:MIN_COMMAS] for cell in row
-    ):
+    first_cells = itertools.chain.from_iterable(rows[:MIN_COMMAS])
+    if separator not in (";", "\t") or not any("," in c for c in first_cells):
         return rows, ()
-    commas = [cell for row in rows for cell in row if DECIMAL_COMMA.fullmatch(cell)]
-    has_points = any("." in cell and is_number(cell) for row in rows for cell in row)
+    commas = [c for row in rows for c in row if WITH_COMMA.fullmatch(c)]
+    has_points = any("." in c and is_number(c) for row in rows for c in row)
     ambiguous = separator == "\t" and all(map(THOUSANDS.fullmatch, commas))
     if len(commas) < MIN_COMMAS or has_points or ambiguous:
         return rows, ()
     converted = [
-        [cell.translate(COMMA_TO_POINT) if DECIMAL_COMMA.fullmatch(cell) else cell for cell in row]
-        for row in rows
+        [c.translate(TO_POINT) if WITH_COMMA.fullmatch(c) else c for c in row] for row in rows
     ]
     return converted, (
-        f"Numbers have a decimal comma: '{commas[0]}' is {commas[0].translate(COMMA_TO_POINT)}.",
+        f"Numbers have a decimal comma: '{commas[0]}' is {commas[0].translate(TO_POINT)}.",
     )

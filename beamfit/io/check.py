@@ -170,10 +170,9 @@ def with_lattice(scan: FileSummary, lattice: FileSummary) -> FileSummary:
     try:
         lattice.content.check_scan(scan.content)
     except InputError as error:
-        message = str(replace(error, path=None))
-        return replace(
-            scan, facts=(*scan.facts, Fact(label, message, {"fits": False, "why": message}))
-        )
+        reason = str(replace(error, path=None))
+        fact = Fact(label, reason, {"fits": False, "why": reason})
+        return replace(scan, facts=(*scan.facts, fact))
     # JAX from here on
     from beamfit.emittance.transport import scanned_line, unit_warnings
 
@@ -344,12 +343,8 @@ def record_facts(record: DecayRecord | LifetimeTable) -> Iterator[Fact]:
     value = {"count": len(record), "span_h": hours}
     yield Fact("readings", f"{len(record)} over {hours:.3g} h", value)
     yield _range_fact("beam current", record.current, "mA")
-    no_errors = record.error is None
-    yield (
-        Fact("errors", NO_ERRORS_TEXT, None)
-        if no_errors
-        else _range_fact("errors", record.error, "mA")
-    )
+    without = Fact("errors", NO_ERRORS_TEXT, None)
+    yield without if record.error is None else _range_fact("errors", record.error, "mA")
     if record.start is not None:
         began = datetime.fromtimestamp(record.start, UTC).isoformat(timespec="seconds")
         yield Fact("began", began, began)
@@ -357,8 +352,8 @@ def record_facts(record: DecayRecord | LifetimeTable) -> Iterator[Fact]:
     yield from _range_facts(zip(conditions, conditions.values(), units, strict=True))
     split = split_record(record)
     kinds, count = Counter(event.kind for event in split.events), len(split.segments)
-    events_text = _count_fact("", kinds, "{1} × {0}").words or "nothing cut away"
-    yield Fact("decays", f"{count} ({events_text})", {"count": count, "events": dict(kinds)})
+    cut = _count_fact("", kinds, "{1} × {0}").words or "nothing cut away"
+    yield Fact("decays", f"{count} ({cut})", {"count": count, "events": dict(kinds)})
 
 
 def _number_facts(*numbers: tuple[str, float, str]) -> list[Fact]:

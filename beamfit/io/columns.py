@@ -170,13 +170,11 @@ def headers_with_units(
         return None
     headers = []
     for name, unit in zip(names, units, strict=True):
-        header_unit = unit_at_end(standard_header(name))
-        if header_unit and unit and header_unit != unit:
+        given = unit_at_end(standard_header(name))
+        if given and unit and given != unit:
             expected = "one unit, in the header or below it"
-            raise InputError(
-                f"'{unit}' below a header in {header_unit}", expected, path, line, name
-            )
-        headers.append(name if header_unit or unit is None else name_with_unit(name, unit))
+            raise InputError(f"'{unit}' below a header in {given}", expected, path, line, name)
+        headers.append(name if given or unit is None else name_with_unit(name, unit))
     return headers
 
 
@@ -406,10 +404,8 @@ class Sheet:
             return cells.astype(float)
         values, row = numbers_of(cells, read, blank)
         if row is not None and unit and number_and_unit(str(cells[row])):
-            split_cells = ((cell, number_and_unit(str(cell))) for cell in cells)
-            cells = [
-                split[0] if split and split[1] == unit else cell for cell, split in split_cells
-            ]
+            parts = ((cell, number_and_unit(str(cell))) for cell in cells)
+            cells = [p[0] if p and p[1] == unit else cell for cell, p in parts]
             values, row = numbers_of(cells, read, blank)
         if row is None:
             return values
@@ -519,14 +515,12 @@ def _duplicate_error(sheet: Sheet, key: str, first: str, header: str) -> InputEr
 
 def _unknown_columns_error(errors: Sequence[InputError]) -> InputError:
     """Error of all unknown columns, with the options that resolve it."""
-    first, ignore_options = errors[0], [f"--ignore '{error.column}'" for error in errors]
+    first, ignoring = errors[0], [f"--ignore '{error.column}'" for error in errors]
     columns_option = f"--columns '{first.column}=NAME' says what it is"
     expected = f"{first.expected}; {columns_option}, --ignore leaves it unread"
     if len(errors) > 1:
         expected = f"names with units, such as size_x_um or time_s; {columns_option} (`beamfit "
-        expected += (
-            f"check` proposes a layout), or to leave them unread: {' '.join(ignore_options)}"
-        )
+        expected += f"check` proposes a layout), or to leave them unread: {' '.join(ignoring)}"
     return replace(first, expected=expected)
 
 
@@ -569,10 +563,8 @@ def sheet_notes(sheet: Sheet) -> tuple[str, ...]:
     listed += [f"{more} more"] if more else []
     were = "was" if len(sheet.bad_rows) == 1 else "were"
     total = len(sheet) + len(sheet.bad_rows)
-    return (
-        *sheet.notes,
-        f"{len(sheet.bad_rows)} of {total} rows {were} left out: {'; '.join(listed)}.",
-    )
+    note = f"{len(sheet.bad_rows)} of {total} rows {were} left out: {'; '.join(listed)}."
+    return (*sheet.notes, note)
 
 
 LAYOUT_FORMAT = "beamfit-layout-1"

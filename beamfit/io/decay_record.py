@@ -72,18 +72,17 @@ QUANTITIES = {
 # Names in `DecayRecord` of columns that are named otherwise.
 RECORD_NAMES = {"beam_current": "current", "beam_current_error": "error"}
 RECORD_KEYS = {"time", "nanos", "current", "error", *Conditions._fields}
-# Headers of columns of dates; of days; and of times of day, if a column of days is present.
+# Headers of columns of dates.
 DATE_HEADERS = {
     "time", "timestamp", "time_stamp", "datetime", "date_time", "date/time", "data_time", "date",
 }  # fmt: skip
-DAY_HEADERS, CLOCK_HEADERS = {"date", "day"}, {"time"}
 # Time zone at the end of such a header.
 UTC_SUFFIX = re.compile(r"[ _]?[\[(]?(utc|gmt)[\])]?$")
 TIME_OF_DAY = re.compile(r"\d{1,2}:\d{2}(:\d{2}([.,]\d*)?)?( ?[AaPp][Mm])?")
 # Names of times with a unit, besides time: epoch_s.
 TIME_NAMES = {"t", "timestamp", "time_stamp", "epoch", "elapsed", "elapsed_time", "unix_time"}
 # Columns of an archive: Unix seconds, nanoseconds, and attributes of values that are not used.
-SECOND_HEADERS = {"secs": "s", "seconds": "s", "epochseconds": "s", "epoch": "s"}
+SECOND_HEADERS = {"secs", "seconds", "epochseconds", "epoch"}
 NANOSECOND_HEADERS = {"nanos", "nanoseconds"}
 UNUSED_HEADERS = {"severity", "status", "val", "value", "index", "no", "no.", "nr", "row"}
 # Words that mark a header with a unit of current as the beam current: "current" only alone or with
@@ -108,9 +107,8 @@ def read_lifetime_input(
 ) -> DecayRecord | LifetimeTable:
     """Read a decay record or a lifetime table, whichever the header is of."""
     sheet = read_columns(path, EXAMPLE_HEADER, columns, ignore, skip_bad)
-    has_lifetimes = any(
-        standard_header(n).lower().startswith(("tau_", "lifetime_")) for n in sheet.names
-    )
+    headers = [standard_header(name).lower() for name in sheet.names]
+    has_lifetimes = any(header.startswith(("tau_", "lifetime_")) for header in headers)
     has_times = any((c := record_column(sheet, name)) and c.key == "time" for name in sheet.names)
     if has_lifetimes and not has_times:
         return _lifetime_table(sheet)
@@ -207,18 +205,15 @@ def read_decay_record(
 
 def _make_record(sheet: Sheet, offset: str | None) -> DecayRecord:
     if any(map(is_size, sheet.names)) and not sheet.has_layout:
-        monitor_offset, expected = (
-            "a column of beam sizes",
-            "a record of beam current; `beamfit emittance`",
-        )
-        raise sheet.header_error(monitor_offset, f"{expected} reads scans")
+        expected = "a record of beam current; `beamfit emittance` reads scans"
+        raise sheet.header_error("a column of beam sizes", expected)
     sheet = join_date_and_time(sheet)
     columns = record_columns(sheet)
     for quantity, example in (("time", "time_s"), ("current", "beam_current_mA")):
         if quantity not in columns:
             option = f"'{example}' in the header, or --columns 'HEADER={example}'"
-            monitor_offset = f"no column of {quantity} among {', '.join(sheet.names)}"
-            raise sheet.header_error(monitor_offset, option)
+            found = f"no column of {quantity} among {', '.join(sheet.names)}"
+            raise sheet.header_error(found, option)
     notes = current_column_note(columns)
     sheet = sheet.drop_bad_rows(lambda rows: [rows.values(column) for column in columns.values()])
     if sheet.skip_bad and offset is None:
@@ -230,31 +225,28 @@ def _make_record(sheet: Sheet, offset: str | None) -> DecayRecord:
         sheet, time = sheet.take(list(range(len(sheet)))[::-1]), time[::-1]
     if sheet.skip_bad:
         sheet, time = _drop_backward(sheet, columns, time)
-    others = {key: column for key, column in columns.items() if key not in ("time", "nanos")}
-    values = {key: sheet.values(column) for key, column in others.items()}
+    values = {k: sheet.values(c) for k, c in columns.items() if k not in ("time", "nanos")}
     if len(time) < 2:
         raise InputError(f"{len(time)} readings", "two or more", sheet.path)
     _check_time_origin(sheet, columns["time"], time)
-    monitor_offset = offset_of(offset, values["current"], sheet.path)
-    values["current"] = values["current"] - monitor_offset.value
-    time, *others = (column[monitor_offset.beam] for column in (time, *values.values()))
-    values = dict(zip(values, others, strict=True))
-    beam, error = values.pop("current"), values.pop("error", None)
+    baseline = offset_of(offset, values["current"], sheet.path)
+    rows = np.flatnonzero(baseline.beam)
+    time, values = time[rows], {key: column[rows] for key, column in values.items()}
+    current, error = values.pop("current") - baseline.value, values.pop("error", None)
     conditions = Conditions(**values)
-    if (fault := first_fault(time, beam, error, conditions)) is not None:
-        rows = np.flatnonzero(monitor_offset.beam)
-        raise _fault_error(sheet, columns, fault, rows, np.median(beam) < 0, monitor_offset.value)
+    if (fault := first_fault(time, current, error, conditions)) is not None:
+        raise _fault_error(sheet, columns, fault, rows, np.median(current) < 0, baseline.value)
     absolute = time[0] > UNIX_TIME or (columns["time"].unit == DATE and time[0] > DAY)
     return DecayRecord(
         time=time,
-        current=beam,
+        current=current,
         error=error,
         name=name_of(sheet.path),
         start=float(time[0]) if absolute else None,
         conditions=conditions,
         comments=sheet.comments,
-        notes=notes + sheet_notes(sheet) + ignored_note(sheet, columns) + monitor_offset.notes,
-        monitor=Monitor(offset=monitor_offset.error) if monitor_offset.error else None,
+        notes=notes + sheet_notes(sheet) + ignored_note(sheet, columns) + baseline.notes,
+        monitor=Monitor(offset=baseline.error) if baseline.error else None,
     )
 
 
@@ -264,12 +256,10 @@ def _row_times(sheet: Sheet, columns: Mapping[str, Column]) -> np.ndarray:
     return time + sheet.values(columns["nanos"]) if "nanos" in columns else time
 
 
-def _time_error(
-    sheet: Sheet, columns: Mapping[str, Column], row: int, latest: object
-) -> InputError:
+def _time_error(sheet: Sheet, columns: Mapping[str, Column], row: int, last: object) -> InputError:
     """Error of a row whose time is not later than that of an earlier row."""
     column = columns["time"]
-    found, expected = f"time {sheet[column.header][row]} after {latest}", INCREASING_TIMES
+    found, expected = f"time {sheet[column.header][row]} after {last}", INCREASING_TIMES
     if column.unit == DATE:
         expected += "; local times that go back in autumn need their zone, such as Europe/Berlin"
     return sheet.error(found, expected, row, column.header)
@@ -300,10 +290,9 @@ def _drop_negative(sheet: Sheet, column: Column) -> tuple[Sheet, tuple[str, ...]
     """Drop negative readings; if there are many, note that the monitor has an offset."""
     values = sheet.values(column)
     negative = np.flatnonzero(values < 0)
+    found = "a negative current, {:.6g} mA"
     errors = [
-        sheet.error(
-            f"a negative current, {values[k]:.6g} mA", "zero or more", int(k), column.header
-        )
+        sheet.error(found.format(values[k]), "zero or more", int(k), column.header)
         for k in negative
     ]
     if negative.size == values.size:
@@ -355,13 +344,13 @@ def _lifetime_table(sheet: Sheet) -> LifetimeTable:
         raise sheet.header_error(
             f"columns {', '.join(sheet.names)}", "lifetime and current: tau_h, beam_current_mA"
         )
-    table_columns = {"current": columns["beam_current"], "lifetime": columns[kinds[0]]}
+    wanted = {"current": columns["beam_current"], "lifetime": columns[kinds[0]]}
     if (error := columns.get(f"{kinds[0]}_error")) is not None:
-        table_columns["error"] = error
+        wanted["error"] = error
     sheet = sheet.drop_bad_rows(
-        lambda rows: [_positive_values(rows, column) for column in table_columns.values()]
+        lambda rows: [_positive_values(rows, column) for column in wanted.values()]
     )
-    values = {key: _positive_values(sheet, column) for key, column in table_columns.items()}
+    values = {key: _positive_values(sheet, column) for key, column in wanted.items()}
     hours = {key: values[key] / 3600 for key in ("lifetime", "error") if key in values}
     provenance = {"comments": sheet.comments, "notes": sheet_notes(sheet)}
     return LifetimeTable(values["current"], **hours, name=name_of(sheet.path), **provenance)
@@ -405,7 +394,7 @@ def offset_of(
 
     Parameters
     ----------
-    said : str or None
+    option : str or None
         ``zero-beam``, or a current such as ``0.12mA`` or ``-30:uA``. None: no offset, and all
         readings are kept.
     current : array, shape (n,)
@@ -495,13 +484,13 @@ def monitor_of(drift: str | None, offset: str | None) -> Monitor | None:
     drifts by 10 µA/h
     """
     found = (
-        _monitor_stability("drift", drift, "10uA/h"),
-        _monitor_stability("offset", offset, "50uA"),
+        _stability("drift", drift, "10uA/h"),
+        _stability("offset", offset, "50uA"),
     )
     return Monitor(*found) if any(found) else None
 
 
-def _monitor_stability(name: str, text: str | None, example: str) -> float:
+def _stability(name: str, text: str | None, example: str) -> float:
     """Current in mA, or in mA/h if the example has a time."""
     if text is None:
         return 0.0
@@ -590,10 +579,7 @@ def join_date_and_time(sheet: Sheet) -> Sheet:
     ['2024-03-01 12:00:05']
     """
     headers = {name.lower(): name for name in sheet.names}
-    day, clock = (
-        next((headers[n] for n in candidates if n in headers), None)
-        for candidates in (DAY_HEADERS, CLOCK_HEADERS)
-    )
+    day, clock = headers.get("date", headers.get("day")), headers.get("time")
     if day is None or clock is None or not all(TIME_OF_DAY.fullmatch(str(c)) for c in sheet[clock]):
         return sheet
     joined = [f"{d} {c}" for d, c in zip(sheet[day], sheet[clock], strict=True)]
@@ -614,20 +600,14 @@ def _header_reader(sheet: Sheet):
 
     A beam current is guessed only if no header is named beam_current.
     """
-    has_own_current = any(
-        standard_header(name).lower().startswith("beam_current_") for name in sheet.names
-    )
-    first_cells = {
-        UTC_SUFFIX.sub("", name.lower()): next(iter(sheet[name]), "") for name in sheet.names
-    }
+    has_current = any(standard_header(n).lower().startswith("beam_current_") for n in sheet.names)
+    first = {UTC_SUFFIX.sub("", n.lower()): next(iter(sheet[n]), "") for n in sheet.names}
     # A column `time` has dates; one of another such name only if its first cell is no number.
-    date_headers = {"time"} | {
-        name for name in DATE_HEADERS & set(first_cells) if not is_number(first_cells[name])
-    }
+    dates = {name for name in DATE_HEADERS & set(first) if not is_number(first[name])} | {"time"}
 
     def read_header(header: str) -> Column | None:
         lower, unit = header.lower(), header.removeprefix("val_")
-        if UTC_SUFFIX.sub("", lower) in date_headers:
+        if UTC_SUFFIX.sub("", lower) in dates:
             return Column(header, "time", DATE)
         if lower in SECOND_HEADERS:
             return Column(header, "time", "s")
@@ -640,7 +620,7 @@ def _header_reader(sheet: Sheet):
             return Column(header, "current", unit, UNITS["current"][unit])
         if lower in UNUSED_HEADERS or LIFETIME_HEADER.fullmatch(header):
             return Column(header, header)
-        return None if has_own_current else _current_column(header)
+        return None if has_current else _current_column(header)
 
     return read_header
 
@@ -650,10 +630,8 @@ def _current_column(header: str) -> Column | None:
     name, _, unit = header.rpartition("_")
     words = set(re.findall(r"[a-z]+", name.lower()))
     # Beside unknown words only a monitor's name counts: the current may be a magnet's.
-    current_words = (
-        MONITOR_WORDS if words - CURRENT_WORDS - RING_WORDS else CURRENT_WORDS | {"beam"}
-    )
+    needed = MONITOR_WORDS if words - CURRENT_WORDS - RING_WORDS else CURRENT_WORDS | {"beam"}
     is_other = words & OTHER_WORDS or unit_at_end(name) in UNITS["current"]
-    if unit not in UNITS["current"] or not words & current_words or is_other:
+    if unit not in UNITS["current"] or not words & needed or is_other:
         return None
     return Column(header, "beam_current", unit, UNITS["current"][unit])

@@ -73,9 +73,8 @@ class EmittanceGuiFile:
             If there is no such method, or it gives no scan.
         """
         names = list(self.scans)
-        wanted = (
-            (DEFAULT_METHOD if DEFAULT_METHOD in names else names[0]) if method is None else method
-        )
+        default = DEFAULT_METHOD if DEFAULT_METHOD in names else names[0]
+        wanted = default if method is None else method
         if wanted in self.left_out:
             expected = f"a size method with three settings or more: {', '.join(names)}"
             raise InputError(
@@ -127,9 +126,8 @@ def read_emittance_gui(path: str | PathLike[str]) -> EmittanceGuiFile:
         )
         raise InputError(f"no variable '{VARIABLE}'", expected, path)
     source = _Struct(path, found[VARIABLE])
-    with structure_errors(
-        path, "a struct 'data' that is laid out otherwise", EXPECTED, with_cause=True
-    ):
+    unlike = "a struct 'data' that is laid out otherwise"
+    with structure_errors(path, unlike, EXPECTED, with_cause=True):
         return _read_struct(source)
 
 
@@ -223,7 +221,7 @@ def _shot_records(source: _Struct) -> np.ndarray:
 
 def _used_settings(source: _Struct, n_taken: int) -> tuple[np.ndarray, int]:
     """Indices of the settings that were taken and selected, and the number planned."""
-    noun = "monitors" if _is_multi_monitor(source) else "settings"
+    noun = "monitors" if _has_monitors(source) else "settings"
     marks = [field for field in ("status", "use") if field in source]
     n = max(n_taken, *(source[field].size for field in marks), 0)
     used = np.arange(n) < n_taken
@@ -261,7 +259,7 @@ def _settings(source: _Struct, used: np.ndarray, n: int, lattice: LatticeFile) -
         "energy": np.full(len(used), lattice.energy),
         "transfer": {"x": r[:, 0, [0, 1, 5]], "y": r[:, 2, [2, 3, 5]]},
     }
-    if _is_multi_monitor(source):
+    if _has_monitors(source):
         names = _monitors(source, n)
         labels = [names[i] for i in used]
         columns["screen"] = tuple(labels)
@@ -284,7 +282,7 @@ def _settings(source: _Struct, used: np.ndarray, n: int, lattice: LatticeFile) -
     return _Settings(columns, labels, about, tuple(notes))
 
 
-def _is_multi_monitor(source: _Struct) -> bool:
+def _has_monitors(source: _Struct) -> bool:
     """True for a measurement with several monitors at one setting."""
     return source.text("type") == "multi"
 
@@ -292,9 +290,9 @@ def _is_multi_monitor(source: _Struct) -> bool:
 def _monitors(source: _Struct, n: int) -> list[str]:
     """Name of the monitor of each of n sizes; of a scan, one name."""
     names = source.texts("name") or [""]
-    if _is_multi_monitor(source) and len(names) != n:
+    if _has_monitors(source) and len(names) != n:
         return [f"monitor {i + 1}" for i in range(n)]
-    return [name or "screen" for name in (names if _is_multi_monitor(source) else names[:1])]
+    return [name or "screen" for name in (names if _has_monitors(source) else names[:1])]
 
 
 def _provenance(source: _Struct) -> list[str]:
@@ -338,9 +336,7 @@ def _dark_shots(source: _Struct, beams: np.ndarray) -> np.ndarray:
     Light is the median over size methods; it is compared separately for each monitor.
     """
     light = np.median(np.nan_to_num(_statistic(beams, "sum")), axis=2)
-    typical = (
-        np.median(light, axis=1, keepdims=True) if _is_multi_monitor(source) else np.median(light)
-    )
+    typical = np.median(light, axis=1, keepdims=True) if _has_monitors(source) else np.median(light)
     return light < MIN_LIGHT * typical
 
 
@@ -351,10 +347,8 @@ def _stored_sizes(source: _Struct, field: str, used: np.ndarray, k: int) -> dict
         return {}
     if beams.shape[0] <= used.max() or beams.shape[1] <= k:
         return {}
-    records = beams[used, k, None]
-    return {
-        p: _sizes(records, p) if field == "beam" else 1e-6 * _statistic(records, p) for p in PLANES
-    }
+    own = beams[used, k, None]
+    return {p: _sizes(own, p) if field == "beam" else 1e-6 * _statistic(own, p) for p in PLANES}
 
 
 def _make_scan(
@@ -425,12 +419,10 @@ def _omission_notes(
         count = np.maximum((~np.isnan(plane_sizes)).sum(axis=1), 1)
         mean = np.nansum(plane_sizes, axis=1) / count
         stored = means[plane][:, 0] if plane in means else np.full(len(mean), np.nan)
-        differing = np.flatnonzero((np.abs(stored - mean) > MEAN_TOLERANCE * stored) & (mean > 0.0))
-        differences = [
-            f"{1e6 * stored[i]:.4g} for {1e6 * mean[i]:.4g} µm at {labels[i]}" for i in differing
-        ]
-        if differences:
-            listed = _short_list(differences)
+        others = np.flatnonzero((np.abs(stored - mean) > MEAN_TOLERANCE * stored) & (mean > 0.0))
+        found = [f"{1e6 * stored[i]:.4g} for {1e6 * mean[i]:.4g} µm at {labels[i]}" for i in others]
+        if found:
+            listed = _short_list(found)
             yield f"The file's means in {plane} are not those of these shots: {listed}."
 
 
@@ -471,7 +463,7 @@ def _lattice(source: _Struct, n: int) -> LatticeFile:
     if not 1.0 < energy < 1e6:
         raise source.error(f"an energy of {1e-3 * energy:g} GeV", "energy")
     # The matrices start upstream of several monitors, and at the only monitor of a scan.
-    places = [*dict.fromkeys(_monitors(source, n)), *["start"] * _is_multi_monitor(source)]
+    places = [*dict.fromkeys(_monitors(source, n)), *["start"] * _has_monitors(source)]
     design = None
     twiss = source.get("twiss0")
     if twiss is not None and twiss.shape == (3, 2) and twiss.dtype.kind in "iuf":

@@ -40,14 +40,7 @@ MAX_TEXT_BYTES, MAX_BYTES = 4_000_000, 256_000_000
 # A pipe without data is given up after this many seconds.
 MAX_SILENCE = 30.0
 # Exceptions raised by values of unexpected types or structure.
-STRUCTURE_EXCEPTIONS = (
-    ArithmeticError,
-    AttributeError,
-    LookupError,
-    RecursionError,
-    TypeError,
-    ValueError,
-)
+UNLIKE = (ArithmeticError, AttributeError, LookupError, RecursionError, TypeError, ValueError)
 # SHA-256 of the content last read, by path: the file may change afterwards.
 _DIGESTS: dict[str, str] = {}
 # Largest number of digests kept: enough for a large batch, at 200 bytes each.
@@ -246,7 +239,7 @@ def structure_errors(
     except InputError as error:
         error.path = path  # the value may name the file it came from originally
         raise
-    except STRUCTURE_EXCEPTIONS as error:
+    except UNLIKE as error:
         cause = f" ({type(error).__name__})" if with_cause else ""
         raise InputError(found + cause, expected, path) from None
 

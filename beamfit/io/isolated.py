@@ -50,8 +50,8 @@ MATLAB_TEXT = (
 )
 HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
 # Numeric classes of MATLAB.
-MATLAB_NUMBERS = {f"{u}int{n}" for u in ("", "u") for n in (8, 16, 32, 64)}
-MATLAB_NUMBERS |= {"double", "single", "logical"}
+NUMERIC = {f"{u}int{n}" for u in ("", "u") for n in (8, 16, 32, 64)}
+NUMERIC |= {"double", "single", "logical"}
 SDDS_HEAD = re.compile(rb"&data\b.*?&end[^\n]*\n", re.DOTALL)
 # Endings of the names of magnet settings.
 SETTING_SUFFIXES = tuple(f"_{unit}" for unit in SETTINGS)
@@ -60,11 +60,7 @@ Columns = tuple[dict[str, Sequence[Any]], dict[str, str], list[str]]
 
 
 def run_isolated(
-    library: str,
-    path: str | PathLike[str],
-    expected: str,
-    read: Callable[..., Any],
-    *arguments: Any,
+    library: str, path: str | PathLike[str], expected: str, read: Callable[..., Any], *given: Any
 ) -> Any:
     """Call a function in a child process with limits of time and memory.
 
@@ -78,7 +74,7 @@ def run_isolated(
         Expected kind of file, for messages.
     read : callable
         A module-level function.
-    *arguments
+    *given
         Its arguments, such as the content of the file.
 
     Returns
@@ -96,18 +92,15 @@ def run_isolated(
     >>> run_isolated("Python", "a.txt", "a number", float, "2.5")
     2.5
     """
-    request = pickle.dumps((read, arguments))
+    request = pickle.dumps((read, given))
     # No HDF5 filters from plugin folders; the same import path as here.
-    environment = {
-        "HDF5_PLUGIN_PRELOAD": "::",
-        "PYTHONPATH": os.pathsep.join(filter(None, sys.path)),
-    }
+    own = {"HDF5_PLUGIN_PRELOAD": "::", "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
     try:
         child = subprocess.run(
             [sys.executable, "-P", "-c", CHILD_CODE],
             input=request,
             capture_output=True,
-            env=os.environ | environment | {"OPENBLAS_NUM_THREADS": "1"},
+            env=os.environ | own | {"OPENBLAS_NUM_THREADS": "1"},
             timeout=MAX_SECONDS + len(request) / BYTES_PER_SECOND,
             start_new_session=True,
             check=True,
@@ -141,10 +134,8 @@ def child_main(stdin: int, stdout: int) -> None:
 def run_limited(read: Callable[..., Any], arguments: tuple[Any, ...], output: BinaryIO) -> None:
     """Call a function within the limits, and write its result or error."""
     pages = Path("/proc/self/statm")
-    memory_used = (
-        int(pages.read_text().split()[0]) * resource.getpagesize() if pages.exists() else 0
-    )
-    resource.setrlimit(resource.RLIMIT_AS, (memory_used + MAX_MEMORY, memory_used + MAX_MEMORY))
+    used = int(pages.read_text().split()[0]) * resource.getpagesize() if pages.exists() else 0
+    resource.setrlimit(resource.RLIMIT_AS, (used + MAX_MEMORY, used + MAX_MEMORY))
     resource.setrlimit(resource.RLIMIT_CPU, (MAX_SECONDS, MAX_SECONDS))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     try:
@@ -189,12 +180,10 @@ def library_columns(
         raise InputError("an SDDS file, which needs soliday-sdds to read", expected, path)
     read, expected = LIBRARIES[library]
     content = read_bytes(path, f"{expected.partition(';')[0]} of readings; fewer of them")
-    return _headers_with_units(
-        path, *run_isolated(library, path, expected, read, content, rows, texts)
-    )
+    return _add_units(path, *run_isolated(library, path, expected, read, content, rows, texts))
 
 
-def _headers_with_units(
+def _add_units(
     path: str | PathLike[str],
     columns: Mapping[str, Sequence[Any]],
     units: Mapping[str, str],
@@ -244,16 +233,14 @@ def _projections(
         raise InputError(f"images and no dataset {PIXEL}", "the width of a pixel", column=IMAGES)
     count, bins = data.shape[0], max(data.shape[1:])
     check_length(count * bins, rows, column=IMAGES)
-    other_columns = {n: _column(group, n, rows, texts) for n in names if n not in (IMAGES, PIXEL)}
-    for name, values in other_columns.items():
+    others = {n: _column(group, n, rows, texts) for n in names if n not in (IMAGES, PIXEL)}
+    for name, values in others.items():
         if len(values) != count:
             raise InputError(f"{len(values)} values", f"{count}, one an image", column=name)
     pixel = np.full(count, float(np.ravel(group[PIXEL][()])[0]))
     columns = columns_of_images([projections(np.asarray(image, float)) for image in data], pixel)
-    shot_of_row = columns["shot"]
-    return columns | {
-        name: [values[i] for i in shot_of_row] for name, values in other_columns.items()
-    }
+    shots = columns["shot"]
+    return columns | {name: [values[i] for i in shots] for name, values in others.items()}
 
 
 def projections(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -427,9 +414,7 @@ def matlab_content(content: bytes, name: str) -> dict[str, np.ndarray]:
     from scipy.io import loadmat, whosmat
 
     shapes = {
-        n: shape
-        for n, shape, kind in whosmat(io.BytesIO(content))
-        if kind in MATLAB_NUMBERS or n == name
+        n: shape for n, shape, kind in whosmat(io.BytesIO(content)) if kind in NUMERIC or n == name
     }
     wanted = [n for n, shape in shapes.items() if n == name or math.prod(shape) == max(shape) > 1]
     wanted = [name] if name in wanted else wanted
@@ -448,24 +433,15 @@ def sdds_content(content: bytes, rows: int, texts: int) -> Columns:
     data = _sdds_loaded(content)
     # The library stops silently at a page that it cannot read. Appending the data once more doubles
     # the number of pages only if all were read.
-    header_end = SDDS_HEAD.search(content).end()
-    complete, separator = content, b""
+    head = SDDS_HEAD.search(content).end()
+    whole, gap = content, b""
     if data.mode == data.SDDS_ASCII:
-        complete, separator = (
-            content.rstrip() + b"\n",
-            b"\n" * (b"no_row_counts=1" in content[:header_end]),
-        )
-    if (
-        _sdds_loaded(complete + separator + complete[header_end:]).loaded_pages
-        != 2 * data.loaded_pages
-    ):
+        whole, gap = content.rstrip() + b"\n", b"\n" * (b"no_row_counts=1" in content[:head])
+    if _sdds_loaded(whole + gap + whole[head:]).loaded_pages != 2 * data.loaded_pages:
         expected = "as many rows as it announces: sddscheck and sddsconvert -recover mend it"
         raise InputError("an SDDS file with another number of rows than it announces", expected)
     parameters, columns = (
-        {
-            name: (_sdds_unit(definition[1]), pages)
-            for name, definition, pages in zip(*held, strict=True)
-        }
+        {name: (_sdds_unit(about[1]), pages) for name, about, pages in zip(*held, strict=True)}
         for held in (
             (data.parameterName, data.parameterDefinition, data.parameterData),
             (data.columnName, data.columnDefinition, data.columnData),

@@ -200,9 +200,8 @@ def read_toml_lattice(path: str | PathLike[str]) -> LatticeFile:
     values = top.values(TOP_KEYS)
     energy = _total_energy(top, values["particle"])
     if len(top.table["element"]) > MAX_ELEMENTS:
-        raise top.error(
-            f"more than {MAX_ELEMENTS} elements", "a line that a machine has", "element"
-        )
+        found = f"more than {MAX_ELEMENTS} elements"
+        raise top.error(found, "a line that a machine has", "element")
     sections = top.sections("element")
     elements = tuple(_read_element(section, i) for i, section in enumerate(sections, 1))
     _check_names(elements, sections)
@@ -282,11 +281,10 @@ def _check_names(elements: tuple[Mapping[str, Any], ...], sections: list[Section
             continue
         if supply in first_use:
             raise section.error(f"supply '{supply}'", "another name: an element has it", "supply")
-        own_settings = {key: element[key] for key in STRENGTHS if key in element}
-        if (first := settings.setdefault(supply, own_settings)) != own_settings:
+        own = {key: element[key] for key in STRENGTHS if key in element}
+        if (first := settings.setdefault(supply, own)) != own:
             found, expected = (
-                ", ".join(f"{key} = {v:g}" for key, v in each.items())
-                for each in (own_settings, first)
+                ", ".join(f"{key} = {v:g}" for key, v in each.items()) for each in (own, first)
             )
             raise section.error(f"{found} on supply '{supply}'", f"{expected}, as above", "supply")
 
@@ -378,10 +376,8 @@ def _strength(table: Mapping[str, Any], mass: float) -> tuple[float, Calibration
         currents, gradients = zip(*table["gradient_table"], strict=True)
         return setting, calibration.CurrentTable(currents, gradients, mass=mass)
     coefficients = tuple(map(float, table["gradient_polynomial_T_per_m"]))
-    signed_intercept = table.get("signed_intercept", False)
-    return setting, calibration.CurrentPolynomial(
-        coefficients, signed_intercept=signed_intercept, mass=mass
-    )
+    signed = table.get("signed_intercept", False)
+    return setting, calibration.CurrentPolynomial(coefficients, signed_intercept=signed, mass=mass)
 
 
 TABLE_EXAMPLE = "current_A,gradient_T_per_m"

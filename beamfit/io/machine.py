@@ -201,10 +201,10 @@ def read_scan_machine(path: str | PathLike[str]) -> ScanMachine:
     InputError
         If the file cannot be used, naming line and key.
     """
-    top, top_values = read_machine(path)
-    if top_values["lattice"] is None:
+    top, top_level = read_machine(path)
+    if top_level["lattice"] is None:
         raise top.error("no lattice", 'lattice = "FILE"', "lattice")
-    lattice = read_lattice(Path(path).parent / top_values.pop("lattice"))
+    lattice = read_lattice(Path(path).parent / top_level.pop("lattice"))
     if not top.table.get("magnet"):
         raise top.error("no magnet to scan", "tables [[magnet]]", "magnet")
     scanned = tuple(_read_magnet(section, lattice) for section in top.sections("magnet"))
@@ -220,10 +220,8 @@ def read_scan_machine(path: str | PathLike[str]) -> ScanMachine:
     plan["points"] = plan["points"] or (MAX_TUNING_ROWS if knobs else MAX_POINTS)
     screen, guard = _read_screen(top.section("screen"), lattice), _read_guard(top.section("beam"))
     lattice = part_of(lattice, screen=screen.name)
-    screen_index = [e["name"] for e in lattice.elements].index(screen.name)
-    upstream = {
-        name for e in lattice.elements[:screen_index] for name in (e["name"], e.get("supply"))
-    }
+    at = [e["name"] for e in lattice.elements].index(screen.name)
+    upstream = {name for e in lattice.elements[:at] for name in (e["name"], e.get("supply"))}
     for magnet, section in zip(scanned, top.sections("magnet"), strict=True):
         if magnet.name not in upstream:
             found = f"{magnet.name} behind the screen {screen.name}"
@@ -231,18 +229,10 @@ def read_scan_machine(path: str | PathLike[str]) -> ScanMachine:
     for name in (screen.name, *(m.name for m in magnets)):
         if not name.isprintable():
             raise top.error(f"the name {name!r}", "one of letters that can be shown")
-    name, parts = top_values.pop("name"), (magnets, screen, guard)
-    knob_names = tuple(knob.name for knob in knobs)
+    name, own = top_level.pop("name"), (magnets, screen, guard)
+    tuned = tuple(knob.name for knob in knobs)
     return ScanMachine(
-        name,
-        str(path),
-        top.sha256,
-        lattice,
-        *parts,
-        first=first,
-        knobs=knob_names,
-        **plan,
-        **top_values,
+        name, str(path), top.sha256, lattice, *own, first=first, knobs=tuned, **plan, **top_level
     )
 
 
@@ -353,13 +343,13 @@ def check_setting(magnet: Magnet, value: float) -> float:
 # Quantities of a watch, their units, and the keys of [ring]: named as columns of a decay record.
 WATCHED_QUANTITIES = ("beam_current", *Conditions._fields)
 QUANTITY_UNITS = {name: UNITS.get(QUANTITIES[name], {"": 1.0}) for name in WATCHED_QUANTITIES}
-VARIABLE_KEYS = {
+RING_VARIABLES = {
     f"{name}_{unit}".rstrip("_"): (name, unit, factor)
     for name, units in QUANTITY_UNITS.items()
     for unit, factor in units.items()
 }
 RING_KEYS = {"file": Key("file", kind=TEXT, default=None)} | {
-    key: Key(key, kind=TEXT, default=None) for key in VARIABLE_KEYS
+    key: Key(key, kind=TEXT, default=None) for key in RING_VARIABLES
 }
 WINDOW_RANGE = "a time of 60 s to a week"
 WATCH_KEYS = {
@@ -510,13 +500,13 @@ def read_watch_machine(path: str | PathLike[str]) -> WatchMachine:
 
 def _watched_variables(ring: Section) -> tuple[Watched, ...]:
     """Variables of [ring], the beam current first."""
-    variables = {key: name for key, name in ring.table.items() if key in VARIABLE_KEYS}
-    watched = [
-        Watched(VARIABLE_KEYS[key][0], text, *VARIABLE_KEYS[key][1:])
-        for key, text in variables.items()
-    ]
+    variables = {key: name for key, name in ring.table.items() if key in RING_VARIABLES}
+    watched = []
+    for key, text in variables.items():
+        quantity, unit, factor = RING_VARIABLES[key]
+        watched.append(Watched(quantity, text, unit, factor))
     for v in watched:
-        keys = [key for key in variables if VARIABLE_KEYS[key][0] == v.quantity]
+        keys = [key for key in variables if RING_VARIABLES[key][0] == v.quantity]
         if len(keys) > 1:
             raise ring.error(f"{' and '.join(keys)}", f"one {v.quantity}", keys[1])
     if not any(v.quantity == WATCHED_QUANTITIES[0] for v in watched):

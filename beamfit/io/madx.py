@@ -31,7 +31,7 @@ ASSIGNMENT = re.compile(
     rf"(?:((?:real|int)\s+const|const|real|int)\s+)?({NAME})\s*(:?=)\s*(.+)", re.I | re.DOTALL
 )
 ELEMENT_ASSIGNMENT = re.compile(rf"({NAME})->({NAME})\s*:?=\s*(.+)", re.I | re.DOTALL)
-DEFINITION = re.compile(
+LABELLED = re.compile(
     rf"[\"']?({NAME})[\"']?\s*(\([^)]*\))?\s*:\s*({NAME})\s*(.*)", re.I | re.DOTALL
 )
 COMMAND = re.compile(rf"[\"']?({NAME})[\"']?\s*(.*)", re.I | re.DOTALL)
@@ -293,7 +293,7 @@ class Interpreter:
             given = self._parameter(statement, False, found[3].strip())
             self.number(given)
             self._set_parameters(statement, found[1].lower(), {found[2].lower(): given})
-        elif found := DEFINITION.fullmatch(text):
+        elif found := LABELLED.fullmatch(text):
             self._define(statement, *found.groups())
         elif found := COMMAND.fullmatch(text):
             self._command(statement, found[1].lower(), found[2])
@@ -312,46 +312,38 @@ class Interpreter:
     def _define(
         self, statement: MadxStatement, label: str, arguments: str, kind: str, rest: str
     ) -> None:
-        name, class_name = label.lower(), kind.lower()
-        kind = (
-            class_name
-            if class_name in self.elements
-            else self.dialect.classes.get(class_name, class_name)
-        )
-        display_name = decode_name(label) if self.dialect is ELEGANT else label
-        definition = Definition(
-            display_name, kind, statement.path, statement.line, type=class_name.upper()
-        )
+        name, word = label.lower(), kind.lower()
+        kind = word if word in self.elements else self.dialect.classes.get(word, word)
+        shown = decode_name(label) if self.dialect is ELEGANT else label
+        new = Definition(shown, kind, statement.path, statement.line, type=word.upper())
         if kind in IGNORED_CLASSES:
             return
         if arguments:
             raise statement.error()
         if kind == "line" and self._open_sequence is None:
-            definition.members = re.sub(r"^\s*:?=\s*", "", rest)
+            new.members = re.sub(r"^\s*:?=\s*", "", rest)
             self.elements.pop(name, None)
-            self.lines[name] = definition
+            self.lines[name] = new
         elif kind == "sequence" and self._open_sequence is None:
-            definition.parameters = self._parameters(statement, rest)
+            new.parameters = self._parameters(statement, rest)
             self.elements.pop(name, None)
-            self.lines[name] = self._open_sequence = definition
+            self.lines[name] = self._open_sequence = new
         elif kind in self.lines:
             raise statement.error()
         else:
-            self._define_element(name, definition, self._parameters(statement, rest))
+            self._define_element(name, new, self._parameters(statement, rest))
 
-    def _define_element(
-        self, name: str, definition: Definition, given: dict[str, Attribute]
-    ) -> None:
+    def _define_element(self, name: str, new: Definition, given: dict[str, Attribute]) -> None:
         place = {key: given.pop(key) for key in ("at", "from") if key in given}
-        parent = self.elements.get(definition.kind)
+        parent = self.elements.get(new.kind)
         if parent is not None:
-            definition.kind, definition.type = parent.kind, parent.type
-            definition.parameters = dict(parent.parameters)
-        definition.parameters |= given
+            new.kind, new.type = parent.kind, parent.type
+            new.parameters = dict(parent.parameters)
+        new.parameters |= given
         previous = self.elements.get(name) or self.lines.get(name)
-        definition.name = previous.name if previous else definition.name
+        new.name = previous.name if previous else new.name
         self.lines.pop(name, None)
-        self.elements[name] = definition
+        self.elements[name] = new
         self.values.invalidate()
         if self._open_sequence is not None:
             self._open_sequence.placements.append((name, place))

@@ -15,11 +15,11 @@ if TYPE_CHECKING:
 
 NOISE_FORMAT, SYSTEMATICS_FORMAT = "beamfit-noise-1", "beamfit-systematics-1"
 # Fields of `Noise` with a median and a spread, and those with one number.
-PAIR_FIELDS = ("factor", "unstated", "scatter")
+PAIRS = ("factor", "unstated", "scatter")
 NUMBER_FIELDS = ("right", "share", "even", "bad", "width", "bad_shot")
 PAIR_TEXT = "two numbers: the middle and the standard deviation of the logarithm"
 # Key of the file -> name of the number, and SI value of one unit.
-SYSTEMATIC_KEYS = {
+TERMS = {
     "size_scale": ("size_scale", 1.0),
     "resolution_um": ("resolution", 1e-6),
     "wire_diameter_um": ("wire", 1e-6),
@@ -28,7 +28,7 @@ SYSTEMATIC_KEYS = {
     "dispersion_slope": ("dispersion_slope", 1.0),
 }
 # Table with elements as keys -> quantity, and SI value of one unit.
-ELEMENT_TABLES = {"gradient": ("gradient", 1.0), "length_mm": ("length", 1e-3)}
+TABLES = {"gradient": ("gradient", 1.0), "length_mm": ("length", 1e-3)}
 PRIOR_TEXT = "a standard deviation, or a list of mean and standard deviation"
 
 
@@ -62,13 +62,12 @@ def read_noise(path: str | PathLike[str]) -> Noise:
     top = read_toml(path, "priors of noise", NOISE_FORMAT, needed=False)
     schema = {name: Key(name, default=None) for name in NUMBER_FIELDS}
     schema |= {
-        name: Key(name, kind=LIST, default=None, expected=PAIR_TEXT, each=NUMBER)
-        for name in PAIR_FIELDS
+        name: Key(name, kind=LIST, default=None, expected=PAIR_TEXT, each=NUMBER) for name in PAIRS
     }
     values = top.values(schema | {"source": Key("source", kind=TEXT, default=str(path))})
     given: dict[str, Any] = {name: value for name, value in values.items() if value is not None}
     for name, value in given.items():
-        if name in PAIR_FIELDS and len(value) != 2:
+        if name in PAIRS and len(value) != 2:
             raise top.error(f"{name} = {value}", PAIR_TEXT, name)
         try:
             Noise(**{name: value})
@@ -92,9 +91,9 @@ def write_noise(path: str | PathLike[str], learned: Learned) -> None:
         f'source = "{learned.noise.source}"',
         "# What was learned, with standard errors; the rest is beamfit's own.",
     ]
-    for name in (*NUMBER_FIELDS, *PAIR_FIELDS):
+    for name in (*NUMBER_FIELDS, *PAIRS):
         value = getattr(learned.noise, name)
-        text = f"[{value[0]:.4g}, {value[1]:.4g}]" if name in PAIR_FIELDS else f"{value:.4g}"
+        text = f"[{value[0]:.4g}, {value[1]:.4g}]" if name in PAIRS else f"{value:.4g}"
         comment = f"  # {learned.errors[name]}" if name in learned.errors else ""
         lines.append(f"{name} = {text}{comment}")
     write_atomically(path, ("\n".join(lines) + "\n").encode())
@@ -130,22 +129,18 @@ def read_systematics(path: str | PathLike[str]) -> dict[str, tuple[float | None,
     {'energy': (None, 0.02), 'dispersion': (0.1, 0.02), 'Q.gradient': (None, 0.01)}
     """
     top = read_toml(path, "systematics", SYSTEMATICS_FORMAT, needed=False)
-    schema = {name: Key(default=None, kind=NUMBERS) for name in SYSTEMATIC_KEYS}
-    schema |= {name: Key(kind=TABLE, default=None) for name in ELEMENT_TABLES}
+    schema = {name: Key(default=None, kind=NUMBERS) for name in TERMS}
+    schema |= {name: Key(kind=TABLE, default=None) for name in TABLES}
     top.values(schema)
     found = {
-        name: _prior(top, key, factor)
-        for key, (name, factor) in SYSTEMATIC_KEYS.items()
-        if key in top.table
+        name: _prior(top, key, factor) for key, (name, factor) in TERMS.items() if key in top.table
     }
-    for key, (quantity, factor) in ELEMENT_TABLES.items():
+    for key, (quantity, factor) in TABLES.items():
         if key in top.table:
             section = top.section(key)
             found |= {f"{name}.{quantity}": _prior(section, name, factor) for name in section.table}
     if not found:
-        raise top.error(
-            "a file that says nothing", f"one of {', '.join((*SYSTEMATIC_KEYS, *ELEMENT_TABLES))}"
-        )
+        raise top.error("a file that says nothing", f"one of {', '.join((*TERMS, *TABLES))}")
     return found
 
 

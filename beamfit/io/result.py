@@ -110,10 +110,8 @@ def read_fitted_beams(
         found = {entry["plane"]: _beam(entry, rest_energy) for entry in entries}
         names_line = all("line" in entry for entry in entries) or "inputs" not in document
         if lattice is not None and not names_line and lattice not in document["inputs"].values():
-            found_text = (
-                "a beam that was fitted with another lattice, or with another version of it"
-            )
-            raise InputError(found_text, "a fit with this lattice")
+            other = "a beam that was fitted with another lattice, or with another version of it"
+            raise InputError(other, "a fit with this lattice")
         if not found:
             raise InputError("no result of the whole beam in the file", SOURCE_TEXT)
     return found
@@ -331,21 +329,11 @@ def _decode_fit(kind: str, content: Any) -> EmittanceFit | DecayFit:
     from beamfit.emittance.fit import EmittanceFit, scenario_of
     from beamfit.emittance.statement import prepare
 
-    fields = {name: _decode(content[name]) for name in FIT_FIELDS}
+    own = {name: _decode(content[name]) for name in FIT_FIELDS}
     line, statement = _decode(content["line"]), scenario_of("known")
-    planes = tuple(p.plane for p in fields["planes"])
-    prepared = prepare(
-        fields["scan"], line, planes, *(_decode(content[name]) for name in PREPARE_OPTIONS)
-    )
-    return EmittanceFit(
-        fields.pop("planes"),
-        fields.pop("scan"),
-        line,
-        statement,
-        fields.pop("told"),
-        prepared,
-        **fields,
-    )
+    planes = tuple(p.plane for p in own["planes"])
+    seen = prepare(own["scan"], line, planes, *(_decode(content[name]) for name in PREPARE_OPTIONS))
+    return EmittanceFit(line=line, statement=statement, seen=seen, **own)
 
 
 def _encode(value: Any) -> Any:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
+from functools import partial
 from os import PathLike
 from typing import TYPE_CHECKING
 
@@ -81,13 +82,12 @@ def read_run(
     >>> print(read_run(file))
     run.csv: 10 rows over 9 s, inputs valve, outputs level
     """
-    names = [(name, f"u_{standard_header(name)}") for name in inputs]
-    names += [(name, f"y_{standard_header(name)}") for name in outputs]
-    layout = layout_of(columns) + Layout(tuple(names), tuple(name for name, _ in names))
+    named = [(name, f"u_{standard_header(name)}") for name in inputs]
+    named += [(name, f"y_{standard_header(name)}") for name in outputs]
+    layout = layout_of(columns) + Layout(tuple(named), tuple(name for name, _ in named))
     sheet = read_columns(path, EXAMPLE_HEADER, layout, ignore, skip_bad)
-    columns = columns_of(
-        sheet, {TIME: "time"}, lambda header: _run_column(header, sheet, bool(names))
-    )
+    read_header = partial(_run_column, sheet=sheet, named=bool(named))
+    columns = columns_of(sheet, {TIME: "time"}, read_header)
     columns = {key: column for key, column in columns.items() if not key.startswith(UNUSED)}
     if TIME not in columns and step is None:
         raise sheet.header_error("no column of time", "time_s, or --step SECONDS")
@@ -115,15 +115,12 @@ def read_run(
     return Run(time, u, y, name=name_of(sheet.path), path=str(sheet.path), **provenance)
 
 
-def _run_column(header: str, sheet: Sheet, only_named: bool) -> Column | None:
+def _run_column(header: str, sheet: Sheet, named: bool) -> Column | None:
     """Column of time, input or output; if some are named, others are not read."""
     if header.lower() == TIME:
         return Column(header, TIME, DATE)
-    if (
-        header[:2] in ("u_", "y_")
-        and len(header) > 2
-        and (header in sheet.file_headers or not only_named)
-    ):
+    is_read = header in sheet.file_headers or not named
+    if is_read and len(header) > 2 and header[:2] in ("u_", "y_"):
         return Column(header, header)
     return Column(header, f"{UNUSED} {header}") if header.startswith("note_") else None
 

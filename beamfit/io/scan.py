@@ -6,6 +6,7 @@ import math
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
+from functools import partial
 from os import PathLike
 from pathlib import Path
 from types import MappingProxyType
@@ -56,14 +57,11 @@ QUANTITIES = {
     "slice": "",
 }
 # Prefix of the keys of magnet settings.
-SETTING_PREFIX = "setting "
+SETTING = "setting "
 # Columns that a scan needs: name for the message, pattern of the keys, one of which must be there.
 SIZE_COLUMN = "a beam size column, such as size_x_um"
 SETTING_COLUMN = "a magnet setting column, such as Q2_A, Q2_kG or Q2_k1, or a column screen"
-REQUIRED_COLUMNS = {
-    SIZE_COLUMN: "size_[xy]",
-    SETTING_COLUMN: rf"{SETTING_PREFIX}.*|screen|r11_[xy]",
-}
+REQUIRED_COLUMNS = {SIZE_COLUMN: "size_[xy]", SETTING_COLUMN: "setting .*|screen|r11_[xy]"}
 # Headers of columns that are accepted but not used: notes, charge, row numbers, times.
 UNUSED_HEADER = re.compile(
     r"note_.*|comments?|charge[ _]?[\[(]?[np]C[\])]?|index|n[or]\.?|point|row|seq"
@@ -79,6 +77,7 @@ PERCENT = "%"
 PLANE_WORDS = {"x": "x", "horizontal": "x", "hor": "x", "h": "x"}
 PLANE_WORDS |= {"y": "y", "vertical": "y", "vert": "y", "ver": "y", "v": "y"}
 FILLER_WORDS = {"beam", "spot", "fit", "gauss", "gaussian"}
+SIZE_WORDS = {*WIDTH_WORDS, *ERROR_WORDS, *PLANE_WORDS, *FILLER_WORDS}
 # A width of several sigma: 4sigma, D4Sigma (ISO 11146), 2 rms.
 MULTIPLE_SIGMA = re.compile(r"(?:^|(?<=_))d?([2-6])_?(?=(?:sigma|sig|rms)(?:_|$))", re.IGNORECASE)
 # Affixes that control systems add to a magnet's name: QUAD:525:BACT, Q5 current, Q5_rbv.
@@ -89,8 +88,6 @@ DEVICE_ATTRIBUTE = re.compile(
 )
 # Words in an error's header that mean the standard deviation of the shots.
 SCATTER_WORD = re.compile(r"(?:^|[_\W])(std|sd|stdev)(?:[_\W]|$)", re.IGNORECASE)
-# Further names of the column of the number of shots.
-SHOT_COUNTS = {"n_shots": "shots", "nshots": "shots"}
 # Columns of transfer matrix elements, from the reference point to the row's screen: R11, R12 in m,
 # R16 in m; for y also as R33, R34, R36.
 MATRIX_HEADER = re.compile(r"r(1[126])(?:_([xy]))?(?:_m)?|r(3[346])(?:_m)?", re.IGNORECASE)
@@ -142,26 +139,21 @@ def scan_columns(
         expected = "a quadrupole scan; `beamfit lifetime` reads it"
         raise sheet.header_error("a record of beam current", expected)
     knob_headers = {column.header for column in knobs.values()}
-    other_headers = [name for name in sheet.names if name not in knob_headers]
-    if "plane" in map(str.lower, other_headers) and not sheet.has_layout:
+    others = [name for name in sheet.names if name not in knob_headers]
+    if "plane" in map(str.lower, others) and not sheet.has_layout:
         expected = "a column for each plane, size_x_um and size_y_um, and a row for each setting"
         raise sheet.header_error("rows of two planes", expected)
-    columns = dict(knobs) | columns_of(
-        sheet.select(other_headers) if knobs else sheet,
-        QUANTITIES,
-        lambda header: _scan_column(header, sheet),
-    )
+    read = columns_of(sheet.select(others), QUANTITIES, partial(_scan_column, sheet=sheet))
+    columns = dict(knobs) | read
     for needed, keys in REQUIRED_COLUMNS.items():
         if not any(re.fullmatch(keys, key) for key in columns):
             raise sheet.header_error("columns " + ", ".join(sheet.names), needed)
     for plane in "xy":
         _check_error(sheet, columns, plane)
         _check_elements(sheet, columns, plane)
-    energy_headers = [columns[e].header for e in ENERGIES if e in columns]
-    if len(energy_headers) > 1:
-        raise sheet.header_error(
-            "columns " + " and ".join(energy_headers), "one of them", energy_headers[1]
-        )
+    energies = [columns[e].header for e in ENERGIES if e in columns]
+    if len(energies) > 1:
+        raise sheet.header_error("columns " + " and ".join(energies), "one of them", energies[1])
     if not len(sheet):
         raise sheet.header_error("a header and no rows", "at least three settings")
     return columns
@@ -171,7 +163,7 @@ def is_scan_header(name: str, sheet: Sheet) -> bool:
     """True if a header is one of a scan."""
     try:
         return bool(
-            columns_of(sheet.select([name]), QUANTITIES, lambda header: _scan_column(header, sheet))
+            columns_of(sheet.select([name]), QUANTITIES, partial(_scan_column, sheet=sheet))
         )
     except InputError:
         return False
@@ -204,8 +196,8 @@ def _scan_column(header: str, sheet: Sheet) -> Column:
     """Column of a header outside `QUANTITIES`: size, matrix element, magnet setting, or unused."""
     if UNUSED_HEADER.fullmatch(header):
         return Column(header, header)
-    if header.lower() in SHOT_COUNTS:
-        return Column(header, SHOT_COUNTS[header.lower()])
+    if header.lower() in ("n_shots", "nshots"):
+        return Column(header, "shots")
     if (column := _size_column(header)) is not None:
         return column
     if (named := MATRIX_HEADER.fullmatch(header)) is not None:
@@ -219,7 +211,7 @@ def _scan_column(header: str, sheet: Sheet) -> Column:
     while (stripped := DEVICE_ATTRIBUTE.sub("", name)) != name:
         name = stripped
     if name and not re.match(r"(size|sigma|rms|fwhm)_[xy](_|$)", name):
-        return Column(header, f"{SETTING_PREFIX}{name}", unit)
+        return Column(header, f"{SETTING}{name}", unit)
     nearest_names = nearest(header, example_headers(QUANTITIES))
     expected = f"a magnet with _A, _kG, _T_per_m or _k1 at the end, {nearest_names}"
     raise sheet.header_error(_unknown_reason(header), expected, header)
@@ -295,16 +287,11 @@ def _size_column(header: str) -> Column | None:
     for word in filter(None, map(str.lower, words)):
         joined = JOINED_WORD.fullmatch(word)
         parts += [part for part in joined.groups() if part] if joined else [word]
-    planes, widths, errors = (
-        [w for w in parts if w in vocabulary]
-        for vocabulary in (PLANE_WORDS, WIDTH_WORDS, ERROR_WORDS)
-    )
-    all_known = len(planes) + len(widths) + len(errors) == len(parts) - sum(
-        map(parts.count, FILLER_WORDS)
-    )
+    kinds = (PLANE_WORDS, WIDTH_WORDS, ERROR_WORDS)
+    planes, widths, errors = ([w for w in parts if w in kind] for kind in kinds)
     # "rms_size" and "size_fwhm" are one width in two words; "sigma_size" may be an error.
     one_width = len(widths) == 1 or sorted(widths) in (["rms", "size"], ["fwhm", "size"])
-    if not (all_known and one_width and len(planes) == 1 and len(errors) <= 1):
+    if not (SIZE_WORDS.issuperset(parts) and one_width and len(planes) == 1 and len(errors) <= 1):
         return None
     if unit == PERCENT and not errors:
         return None
@@ -364,14 +351,10 @@ OTHER_WIDTH = re.compile(
 )
 # A comment that states the width or unit of all sizes: "all sizes are given in mm", "FWHM beam
 # widths"; its subject, and the words between the subject and the statement.
-SIZE_SUBJECT = (
-    r"(?:^|[.;,:])(?:\s|\b(?:all|beam|both|rms|spot|the|transverse)\b)*\b(?:sizes?|widths?)\b"
-)
-STATEMENT_FILLER = (
-    r"(?:[\s:=()\[\]]|\b(?:all|and|are|as|given|in|is|measured|rms|the|units?|x|y)\b)*"
-)
+SUBJECT = r"(?:^|[.;,:])(?:\s|\b(?:all|beam|both|rms|spot|the|transverse)\b)*\b(?:sizes?|widths?)\b"
+LINK = r"(?:[\s:=()\[\]]|\b(?:all|and|are|as|given|in|is|measured|rms|the|units?|x|y)\b)*"
 SIZE_STATEMENT = re.compile(
-    rf"{SIZE_SUBJECT}{STATEMENT_FILLER}(?:(?P<full>(?:{FULL_WIDTH})\b)"
+    rf"{SUBJECT}{LINK}(?:(?P<full>(?:{FULL_WIDTH})\b)"
     r"|(?P<several>[2-6])[ -]?(?:sigma|σ|rms)"
     r"|(?P<rms>rms|1[ -]?sigma)\b|(?P<unit>pixels?|px|mm|microns?|[uµμn]m|cm)\b)"
     rf"|^\W*(?P<full_first>(?:{FULL_WIDTH}))(?: beam| spot)? (?:sizes?|widths?)\W*$",
@@ -446,11 +429,9 @@ def _check_statement(
     """Raise if no size column has the width or unit that a comment states."""
     unit, multiple = statement["unit"], statement["several"]
     if unit:
-        unit_name = known_unit(unit)
+        name = known_unit(unit)
         agreeing = [c for c in sizes if _length_factor(unit) == UNITS["length"][c.unit]]
-        remedy = (
-            f"rename the column {sizes[0].key}_{unit_name}" if unit_name else "give lengths, in um"
-        )
+        remedy = f"rename the column {sizes[0].key}_{name}" if name else "give lengths, in um"
     else:
         factor = 1.0 if statement["rms"] else 1 / int(multiple) if multiple else FWHM
         agreeing = [c for c in sizes if math.isclose(rms_factor(c), factor)]
@@ -460,11 +441,10 @@ def _check_statement(
         return
     lines = enumerate([] if sheet.lines is None else text_lines(sheet.path), start=1)
     line = next((number for number, text_line in lines if text in text_line), None)
-    expected = (
-        f"one that agrees with the header: {remedy} if the comment is right, else delete the "
-    )
     found = f"the comment '{short(text, 80)}'"
-    raise InputError(found, expected + "comment", sheet.path, line, sizes[0].header)
+    expected = f"one that agrees with the header: {remedy} if the comment is right, "
+    expected += "else delete the comment"
+    raise InputError(found, expected, sheet.path, line, sizes[0].header)
 
 
 # Largest number of rows: a longer file is a log, and is refused before it fills the memory.
@@ -476,8 +456,6 @@ OUTLIER_FACTOR = 100.0
 # Relative error of a size below which its unit is questioned: no beam size was ever measured
 # better, and errors in mm read as um are smaller by 1e-3.
 MIN_ERROR_RATIO = 1e-4
-# Transfer matrix elements that a row may bring.
-MATRIX_ELEMENTS = ("r11", "r12", "r16")
 # Ranges of other quantities: low (excluded), high (included), and words for the message.
 RANGES = {
     "energy": (0.511, 1e7, "a total energy between 0.511 MeV and 10 TeV; is it in GeV or eV?"),
@@ -553,11 +531,9 @@ def scan_of_sheet(sheet: Sheet, knobs: Mapping[str, Column] = MappingProxyType({
     sheet = _blank_dark_shots(sheet, columns) if "shot" in columns else sheet
     if sheet.skip_bad:
         sheet = sheet.drop_bad_rows(lambda rows: _scan_values(rows, columns))
-        median_sizes = _median_sizes(_scan_values(sheet, columns))
+        typical = _median_sizes(_scan_values(sheet, columns))
         sheet = sheet.drop_bad_rows(
-            lambda rows: _check_outlying_sizes(
-                rows, columns, _scan_values(rows, columns), median_sizes
-            )
+            lambda rows: _check_outlying_sizes(rows, columns, _scan_values(rows, columns), typical)
         )
     values = _scan_values(sheet, columns)
     size_notes = _check_sizes(sheet, columns, values)
@@ -577,9 +553,7 @@ def _blank_dark_shots(sheet: Sheet, columns: Mapping[str, Column]) -> Sheet:
         count += sum(dark)
         for key in {f"size_{plane}", f"size_{plane}_error"} & set(columns):
             header = columns[key].header
-            cells[header] = [
-                "" if is_dark else cell for is_dark, cell in zip(dark, cells[header], strict=True)
-            ]
+            cells[header] = ["" if d else cell for d, cell in zip(dark, cells[header], strict=True)]
     verb = "shows no beam and is" if count == 1 else "show no beam and are"
     note = f"{count} shot{'s' * (count > 1)} of size 0 {verb} left out."
     notes = (*sheet.notes, note) if count else sheet.notes
@@ -590,14 +564,10 @@ def _make_scan(
     sheet: Sheet,
     columns: Mapping[str, Column],
     values: Mapping[str, np.ndarray],
-    **other_fields: Any,
+    **extra: Any,
 ) -> QuadScan:
     """Build the scan, one row for each line of the file."""
-    magnets = {
-        k.removeprefix(SETTING_PREFIX): c
-        for k, c in columns.items()
-        if k.startswith(SETTING_PREFIX)
-    }
+    magnets = {k.removeprefix(SETTING): c for k, c in columns.items() if k.startswith(SETTING)}
     energies = [(values[key], kind) for key, kind in ENERGIES.items() if key in values]
     energy, kind = energies[0] if energies else (None, "total")
     headers = {key: sheet.file_headers.get(c.header, c.header) for key, c in columns.items()}
@@ -608,10 +578,9 @@ def _make_scan(
     }
     planes = [p for p in "xy" if f"size_{p}" in values]
     error = {p: values[f"size_{p}_error"] for p in planes if f"size_{p}_error" in values}
+    zeros = np.zeros(len(sheet))
     matrices = {
-        p: np.stack(
-            [values.get(f"{name}_{p}", np.zeros(len(sheet))) for name in MATRIX_ELEMENTS], axis=-1
-        )
+        p: np.stack([values.get(f"{r}_{p}", zeros) for r in ("r11", "r12", "r16")], axis=-1)
         for p in planes
         if f"r11_{p}" in values
     }
@@ -633,18 +602,15 @@ def _make_scan(
         columns={name: headers[c.key] for name, c in magnets.items()}
         | headers
         | {header: header for header in headers.values()},
-        **other_fields,
+        **extra,
     )
 
 
 def _scan_values(sheet: Sheet, columns: Mapping[str, Column]) -> dict[str, np.ndarray]:
     """Checked numbers of a scan in SI, by quantity; raises at the first row that cannot be used."""
-    size_keys = [key for p in "xy" for key in (f"size_{p}", f"size_{p}_error") if key in columns]
-    other_keys = [key for key in columns if key in RANGES or key.startswith((SETTING_PREFIX, "r1"))]
-    values = {
-        key: _quantity_values(sheet, columns[key], key in size_keys)
-        for key in size_keys + other_keys
-    }
+    sizes = [key for p in "xy" for key in (f"size_{p}", f"size_{p}_error") if key in columns]
+    others = [key for key in columns if key in RANGES or key.startswith((SETTING, "r1"))]
+    values = {key: _read_quantity(sheet, columns[key], key in sizes) for key in sizes + others}
     for plane in "xy":
         size, error = f"size_{plane}", f"size_{plane}_error"
         if error not in columns:
@@ -668,13 +634,11 @@ def _scan_values(sheet: Sheet, columns: Mapping[str, Column]) -> dict[str, np.nd
     return values
 
 
-def _quantity_values(sheet: Sheet, column: Column, is_length: bool) -> np.ndarray:
+def _read_quantity(sheet: Sheet, column: Column, is_length: bool) -> np.ndarray:
     """A column in SI within the range of its quantity; blank lengths are NaN."""
     values = sheet.values(column, blank=is_length)
-    wanted = (
-        f"a positive {'error' if column.key.endswith('error') else 'beam size'} in {column.unit}"
-    )
-    default_range = (0.0, np.inf, wanted) if is_length else (-np.inf, np.inf, "")
+    text = f"a positive {'error' if column.key.endswith('error') else 'beam size'} in {column.unit}"
+    default_range = (0.0, np.inf, text) if is_length else (-np.inf, np.inf, "")
     low, high, expected = RANGES.get(column.key, default_range)
     if (wrong := (values <= low) | (values > high)).any():
         if column.key.endswith("error") and not np.any(values > 0):
@@ -699,10 +663,8 @@ def _check_outlying_sizes(
     """Refuse sizes that differ from the median by `OUTLIER_FACTOR` and are unusual for beams."""
     for plane, median in medians.items():
         column, size = columns[f"size_{plane}"], values[f"size_{plane}"]
-        upper, lower = (
-            max(USUAL[1], OUTLIER_FACTOR * median),
-            min(USUAL[0], median / OUTLIER_FACTOR),
-        )
+        upper = max(USUAL[1], OUTLIER_FACTOR * median)
+        lower = min(USUAL[0], median / OUTLIER_FACTOR)
         if (outlying := (size > upper) | (size < lower)).any():
             typical = f"{median / column.factor:.3g}"
             found = f"{{:g}} {column.unit}, where the others are around {typical}"
@@ -802,19 +764,17 @@ def read_tuning_scan(
 
 
 def _emittance_table(
-    sheet: Sheet, knob_names: Mapping[str, str], file_headers: dict[str, str]
+    sheet: Sheet, knob_names: Mapping[str, str], knob_headers: dict[str, str]
 ) -> EmittanceTable:
     """Emittances at settings of knobs; other columns are ignored."""
-    emittance_headers = [n for n in sheet.names if EMITTANCE_HEADER.match(n)]
-    is_normalized = {n.startswith("normalized_") for n in emittance_headers}
+    headers = [n for n in sheet.names if EMITTANCE_HEADER.match(n)]
+    is_normalized = {n.startswith("normalized_") for n in headers}
     if len(is_normalized) > 1:
         expected = "columns of one of them"
-        raise sheet.header_error(
-            "emittances, and normalized emittances", expected, emittance_headers[-1]
-        )
+        raise sheet.header_error("emittances, and normalized emittances", expected, headers[-1])
     prefix = "normalized_emittance_" if is_normalized.pop() else "emittance_"
     quantities = {f"{prefix}{end}": "length" for end in ("x", "y", "x_error", "y_error")}
-    found = columns_of(sheet.select(emittance_headers), quantities)
+    found = columns_of(sheet.select(headers), quantities)
     values = {k.removeprefix(prefix): sheet.values(c, blank=True) for k, c in found.items()}
     for column, column_values in zip(found.values(), values.values(), strict=True):
         sheet.refuse(column.header, column_values <= 0.0, "a positive number")
@@ -828,7 +788,7 @@ def _emittance_table(
         sha256=sheet.sha256,
         provenance=sheet.comments,
         notes=sheet_notes(sheet),
-        columns=file_headers
+        columns=knob_headers
         | {k.replace(prefix, "emittance "): c.header for k, c in found.items()},
     )
 

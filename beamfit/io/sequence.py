@@ -60,9 +60,8 @@ IDENTITY_AT_ZERO = {
 # elegant's switches of the edges of a bend.
 EDGE_SWITCHES = ("edge1_effects", "edge2_effects")
 # Kind of element of each class.
-ELEMENT_KINDS = dict.fromkeys(SCREEN_CLASSES, "screen") | dict.fromkeys(
-    (*DRIFT_CLASSES, *IDENTITY_AT_ZERO), "space"
-)
+ELEMENT_KINDS = dict.fromkeys(SCREEN_CLASSES, "screen") | dict.fromkeys(DRIFT_CLASSES, "space")
+ELEMENT_KINDS |= dict.fromkeys(IDENTITY_AT_ZERO, "space")
 ELEMENT_KINDS |= {"marker": "marker", "quadrupole": "quadrupole", "multipole": "thin"}
 ELEMENT_KINDS |= {"sbend": "dipole", "rbend": "dipole", "nothing": "nothing"}
 
@@ -183,9 +182,8 @@ class _Line:
         if element.kind == "multipole" and self.program.dialect is not ELEGANT:
             return 0.0
         if length < 0.0 or (element.kind == "marker" and length):
-            raise element.error(
-                f"'{element.name}' of length {length:g} m", "a length that MAD-X takes"
-            )
+            found = f"'{element.name}' of length {length:g} m"
+            raise element.error(found, "a length that MAD-X takes")
         half = 0.5 * self._number(element, "angle") if element.kind == "rbend" else 0.0
         return length * half / math.sin(half) if half and self.program.rbarc else length
 
@@ -295,29 +293,23 @@ class _Line:
 class _Element:
     """Element of a file, converted to the table of a TOML lattice or refused."""
 
-    def __init__(
-        self, program: Interpreter, definition: Definition, kind: str, length: float
-    ) -> None:
-        self.definition, self.kind, self.length = definition, kind, length
+    def __init__(self, program: Interpreter, element: Definition, kind: str, length: float) -> None:
+        self.definition, self.kind, self.length = element, kind, length
         self.elegant = program.dialect is ELEGANT
         understood = {*UNDERSTOOD_PARAMETERS, *program.dialect.parameters}
-        unknown = [
-            k for k in definition.parameters if k not in understood and k not in IGNORED_PARAMETERS
-        ]
+        accepted = understood.union(IGNORED_PARAMETERS)
+        unknown = [key for key in element.parameters if key not in accepted]
         if unknown and not self.elegant:  # elegant has many without effect on the matrix
-            found = (
-                f"'{unknown[0]}' of element '{definition.name}', which MAD-X or beamfit does not "
-            )
+            found = f"'{unknown[0]}' of element '{element.name}', which MAD-X or beamfit does not "
             found += "know"
-            raise definition.error(
+            raise element.error(
                 found, nearest(unknown[0], ["l", "k1", "angle", "e1", "e2", "tilt", "knl"])
             )
-        if "tilt" in definition.parameters and not definition.parameters["tilt"].text:
-            raise definition.error("'tilt' without a value", "tilt = ...")
+        if "tilt" in element.parameters and not element.parameters["tilt"].text:
+            raise element.error("'tilt' without a value", "tilt = ...")
         understood |= {"e1", "e2"} if kind == "dipole" else set()
-        self.values = {
-            k: program.number(p) for k, p in definition.parameters.items() if k in understood
-        }
+        given = element.parameters
+        self.values = {k: program.number(p) for k, p in given.items() if k in understood}
 
     def table(self, reflect: bool) -> dict[str, Any]:
         """Table of a TOML lattice; reflection exchanges the pole faces of a dipole."""
@@ -365,9 +357,8 @@ class _Element:
                 raise self._unmodelled(f"with multipole components of its own ({key.upper()})")
 
     def _check_length(self) -> None:
-        if self.kind == "dipole" and (
-            missing := [k for k in ("angle", "l") if k not in self.values]
-        ):
+        missing = [key for key in ("angle", "l") if key not in self.values]
+        if self.kind == "dipole" and missing:
             found = f"'{self.definition.name}' without '{missing[0]}'"
             raise self.definition.error(found, f"{missing[0].upper()} = ...")
         if self.length <= 0.0:
@@ -405,9 +396,8 @@ class _Element:
         else:
             normal = self._number("k0l"), self._number("k1l")
         if self._number("angle"):
-            raise self.definition.error(
-                f"'{self.definition.name}' with a bend in a thin element", "ANGLE = 0"
-            )
+            found = f"'{self.definition.name}' with a bend in a thin element"
+            raise self.definition.error(found, "ANGLE = 0")
         if normal[0] or any(self._multipole("ksl")):
             raise self._unmodelled("with a dipole or skew component of its own")
         if not normal[1]:
@@ -516,21 +506,15 @@ def _particle(beam: dict[str, Attribute], program: Interpreter, path: str | Path
     )
     if name_given is None and mass is None:
         name_given = program.dialect.particle
-    is_named = name_given in MADX_PARTICLES
-    for name in [name_given] if is_named else REST_ENERGY:
-        same_mass = mass is None or abs(1e3 * mass / REST_ENERGY[name] - 1.0) < MASS_TOLERANCE
-        default_charge = NEGATIVE_CHARGES.get(name, 1.0) if is_named else 1.0
-        particle_charge = NEGATIVE_CHARGES.get(name, 1.0)
-        if (
-            same_mass
-            and (is_named or mass is not None)
-            and particle_charge == (default_charge if charge is None else charge)
-        ):
+    named = name_given in MADX_PARTICLES
+    for name in [name_given] if named else REST_ENERGY:
+        mass_agrees = mass is None or abs(1e3 * mass / REST_ENERGY[name] - 1.0) < MASS_TOLERANCE
+        sign = NEGATIVE_CHARGES.get(name, 1.0)
+        charge_agrees = (named or sign > 0) if charge is None else sign == charge
+        if mass_agrees and charge_agrees and (named or mass is not None):
             return name
     found = f"particle '{name_given}'" if name_given else "a particle"
     found += "" if mass is None else f" of mass {mass:g} GeV"
     found += "" if charge is None else f" and charge {charge:g}"
-    nearest_names = nearest(str(name_given), list(MADX_PARTICLES if is_named else REST_ENERGY))
-    raise InputError(
-        found, f"{nearest_names}, by a name that MAD-X knows or by mass and charge", path
-    )
+    near = nearest(str(name_given), list(MADX_PARTICLES if named else REST_ENERGY))
+    raise InputError(found, f"{near}, by a name that MAD-X knows or by mass and charge", path)

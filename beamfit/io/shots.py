@@ -54,14 +54,10 @@ def profiles_from_images(sheet: Sheet) -> Sheet:
             raise sheet.error(f"{name}: {error.found}", error.expected, row, IMAGE) from None
     found = run_isolated("an image", sheet.path, PICTURES, image_projections, content)
     projected, pixel = [found[name] for name in files], sheet.numbers(PIXEL)
-    new_columns = columns_of_images(projected, pixel)
-    other_columns = sheet.select([n for n in sheet.names if n not in (IMAGE, PIXEL, SHOT)])
-    other_columns = other_columns.take(new_columns[SHOT].tolist())
-    return replace(
-        other_columns,
-        names=(*other_columns.names, *new_columns),
-        cells=[*other_columns.cells, *new_columns.values()],
-    )
+    added = columns_of_images(projected, pixel)
+    kept = sheet.select([n for n in sheet.names if n not in (IMAGE, PIXEL, SHOT)])
+    kept = kept.take(added[SHOT].tolist())
+    return replace(kept, names=(*kept.names, *added), cells=[*kept.cells, *added.values()])
 
 
 def image_projections(content: Mapping[str, bytes]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
@@ -134,10 +130,10 @@ def sizes_from_profiles(sheet: Sheet) -> tuple[Sheet, tuple[Profile, ...]]:
                 raise sheet.error("a profile with a position twice", expected, int(starts[row]))
         sizes[plane], found[plane] = np.array([profile_size(s) for s in shots]), shots
     shot_sheet = sheet.select(others).take(list(starts))
-    n_settings, notes = _settings_with_beam(shot_sheet, sizes), list(shot_sheet.notes)
-    for plane in [p for p in planes if n_settings[p] < min(MIN_SETTINGS, max(n_settings.values()))]:
+    settings, notes = _settings_with_beam(shot_sheet, sizes), list(shot_sheet.notes)
+    for plane in [p for p in planes if settings[p] < min(MIN_SETTINGS, max(settings.values()))]:
         notes.append(
-            f"Left out: {plane}, whose profiles show a beam at {n_settings[plane]} settings."
+            f"Left out: {plane}, whose profiles show a beam at {settings[plane]} settings."
         )
         del sizes[plane], found[plane]
     cells = [*shot_sheet.cells, *(list(map(str, v)) for v in sizes.values())]
@@ -150,20 +146,14 @@ def _settings_with_beam(sheet: Sheet, sizes: Mapping[str, np.ndarray]) -> dict[s
     """Number of settings at which each plane has a size."""
     columns = [sheet[name] for name in sheet.names if standard_header(name) != "shot"]
     settings = list(zip(*(map(str, cells) for cells in columns), strict=True))
-    n_settings = {
-        plane: len(
-            {
-                setting
-                for setting, size in zip(settings, plane_sizes, strict=True)
-                if np.isfinite(size)
-            }
-        )
-        for plane, plane_sizes in sizes.items()
+    counts = {
+        plane: len({setting for setting, s in zip(settings, own, strict=True) if np.isfinite(s)})
+        for plane, own in sizes.items()
     }
-    if not any(n_settings.values()):
+    if not any(counts.values()):
         expected = "counts that rise above the noise of their bins, with background at both ends"
         raise sheet.header_error("no profile that shows a beam", expected)
-    return n_settings
+    return counts
 
 
 def _shot_rows(sheet: Sheet, others: list[str]) -> tuple[np.ndarray, np.ndarray]:

@@ -173,14 +173,10 @@ def _read_text(
             cells, error = _read_row(text, separator, path, line, len(names), has_further)
             units = None if rows or error else headers_with_units(names, cells, path, line)
             names = units or names
-            if units or (rows and _is_repeated_header(cells, file_header, path, line)):
+            if units or (rows and _is_header_again(cells, file_header, path, line)):
                 continue
-            may_be_numeric = not (rows or errors or "time" in names)  # a column `time` has dates
-            columns = (
-                numeric_rows(path, line, separator, len(names), max_rows)
-                if may_be_numeric
-                else None
-            )
+            fast = not (rows or errors or "time" in names)  # a column `time` has dates
+            columns = numeric_rows(path, line, separator, len(names), max_rows) if fast else None
             if columns is not None:
                 lines = range(line, line + columns.shape[1])
                 break
@@ -206,23 +202,15 @@ def _read_header(
     names: Sequence[str] | None = None,
 ) -> tuple[Sequence[str], int | None, str, NumberedLines]:
     """Names of the columns, their line, the separator, and the numbered lines below."""
-    lines_below = text_lines(path)
-    head = list(itertools.islice(lines_below, MAX_HEADER_LINES))
-    first_line = next((text for text in head if text.strip()), "")
-    if names is None and ARCHIVER_ROW.fullmatch(first_line):
+    rest = text_lines(path)
+    head = list(itertools.islice(rest, MAX_HEADER_LINES))
+    first = next((text for text in head if text.strip()), "")
+    if names is None and ARCHIVER_ROW.fullmatch(first):
         names = ARCHIVER_COLUMNS
     if names is not None:
-        return (
-            names,
-            None,
-            separator_of(first_line),
-            enumerate(itertools.chain(head, lines_below), start=1),
-        )
+        return names, None, separator_of(first), enumerate(itertools.chain(head, rest), start=1)
     head = uncomment_header(head)
-    header_line, numbered = (
-        header_index(head),
-        enumerate(itertools.chain(head, lines_below), start=1),
-    )
+    title, numbered = header_index(head), enumerate(itertools.chain(head, rest), start=1)
     for line, text in numbered:
         if text.lstrip().startswith(COMMENT_MARKS + TFS_LINES):
             comments.append(comment_text(text))
@@ -231,7 +219,7 @@ def _read_header(
             return names, line, " ", numbered
         elif not text.strip().strip(",;\t ") or SEPARATOR_LINE.match(text):
             continue
-        elif line <= header_line:
+        elif line <= title:
             comments.append(text.strip(",;\t "))
         else:
             separator = separator_of(text)
@@ -286,7 +274,7 @@ def _read_row(
     return cells, InputError(f"{len(cells)} cells", expected, path=path, line=line)
 
 
-def _is_repeated_header(
+def _is_header_again(
     cells: list[str], header: list[str], path: str | PathLike[str], line: int
 ) -> bool:
     """True for a repeated header, as in concatenated files; another header is refused."""
@@ -449,9 +437,9 @@ def header_index(lines: Sequence[str]) -> int:
     return rows[0][0] if rows else 0
 
 
-def _is_comment(text: str) -> bool:
+def _is_comment(text: str, marks: tuple[str, ...] = COMMENT_MARKS + TFS_MARKS) -> bool:
     """True if a line is blank, a comment, or in the header of a TFS file."""
-    return not text.strip(",;\t ") or text.lstrip().startswith(COMMENT_MARKS + TFS_MARKS)
+    return not text.strip(",;\t ") or text.lstrip().startswith(marks)
 
 
 def is_value(cell: str) -> bool:
@@ -475,12 +463,7 @@ def uncomment_header(lines: Sequence[str]) -> list[str]:
     ['# noon', 'time_s,beam_current_mA', '0,1']
     """
     found = list(lines)
-    rows = (
-        i
-        for i, t in enumerate(found)
-        if t.strip(" ,;\t") and not t.lstrip().startswith(COMMENT_MARKS)
-    )
-    first = next(rows, 0)
+    first = next((i for i, text in enumerate(found) if not _is_comment(text, COMMENT_MARKS)), 0)
     line_above = found[first - 1].strip() if first else ""
     if line_above.startswith(COMMENT_MARKS):
         comment = comment_text(line_above)
