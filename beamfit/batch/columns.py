@@ -43,6 +43,7 @@ def quantity_columns(name: str, unit: str, ends: tuple[str, ...] = ENDINGS) -> t
 
 
 def _all_columns(quantities: Mapping[str, str]) -> list[str]:
+    """Columns of all quantities."""
     return [column for item in quantities.items() for column in quantity_columns(*item)]
 
 
@@ -99,6 +100,7 @@ def decay_row(entry: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _quantity_cells(quantities: Mapping[str, Quantity | Mapping[str, Any]]) -> dict[str, Any]:
+    """Cells of quantities: value, error, raw error and ends of the 95 % interval."""
     row = {}
     for name, q in quantities.items():
         entry = q.to_json() if isinstance(q, Quantity) else q
@@ -124,6 +126,7 @@ def csv_text(rows: Iterable[Mapping[str, Any]], columns: Iterable[str]) -> str:
 
 
 def _cell(value: Any) -> Any:
+    """Text or number of a cell: NaN and infinities are empty, a flag is 0 or 1."""
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     if isinstance(value, str):

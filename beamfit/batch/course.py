@@ -22,10 +22,7 @@ from beamfit.statistics import baseline, control_limits
 # fewer than five points, where Student's quantile is large.
 MAX_LIMIT = 6.0
 # Quantities of each kind of fit, and the default one.
-CHART_QUANTITIES = {
-    "emittance": (QUANTITIES, "normalized_emittance"),
-    "lifetime": (UNITS, "lifetime_mean"),
-}
+CHARTED = {"emittance": (QUANTITIES, "normalized_emittance"), "lifetime": (UNITS, "lifetime_mean")}
 
 
 class ControlChart(NamedTuple):
@@ -104,7 +101,7 @@ def chart_quantity(kind: str, name: str | None = None) -> tuple[str, str]:
     >>> chart_quantity("lifetime")
     ('lifetime_mean', 'h')
     """
-    quantities, default = CHART_QUANTITIES[kind]
+    quantities, default = CHARTED[kind]
     name = name or default
     if name not in quantities:
         raise InputError(f"--quantity {name}", nearest(name, list(quantities)))
@@ -148,6 +145,7 @@ def courses_of(batch: Batch, name: str | None = None) -> list[ControlChart]:
 def _points(
     batch: Batch, columns: tuple[str, ...]
 ) -> Iterator[tuple[int, tuple[str, str, float, float]]]:
+    """Points of all planes: position of the file; plane, file, value and error."""
     names = COLUMNS[batch.ledger.job.kind]
     value, error = (names.index(column) for column in columns[:2])
     words = [names.index(name) for name in ("slice", "plane") if name in names]

@@ -33,12 +33,15 @@ if TYPE_CHECKING:
 
 
 class _Lattice(NamedTuple):
+    """Lattice file, and the beam line built from it."""
+
     file: LatticeFile
     line: Beamline
 
 
 @lru_cache(maxsize=4)  # scans of one line share the built line
 def _lattice(path: str, sha256: str, part: tuple[tuple[str, Any], ...]) -> _Lattice:
+    """Read and build a lattice; raise if the file has changed since the start of the batch."""
     file = read_lattice(path, **dict(part))
     if file.sha256 != sha256:
         raise InputError("a lattice that was changed meanwhile", "the one of the start", path=path)
@@ -169,6 +172,7 @@ class Job:
         return learn_noise(list(noise_samples(pairs, self._priors)), self._priors, source)
 
     def _emittances(self, files: Iterable[str]) -> Iterator[dict[str, Any]]:
+        """Rows of scans; all of them are fitted together."""
         from beamfit.emittance.fit import fit_many
 
         read = [_result_or_error(self.read, file) for file in files]
@@ -190,6 +194,7 @@ class Job:
                     yield from (row | common for row in emittance_rows(fit))
 
     def _decays(self, files: Iterable[str]) -> Iterator[dict[str, Any]]:
+        """Rows of decay records and lifetime tables."""
         for file in files:
             rows = _result_or_error(self._decay_rows, file)
             if isinstance(rows, InputError):
@@ -199,6 +204,7 @@ class Job:
             yield from (row | common for row in rows)
 
     def _decay_rows(self, file: str) -> list[dict[str, Any]]:
+        """Rows of one decay record or lifetime table."""
         from beamfit.lifetime.lifetime_table import fit_lifetimes
         from beamfit.lifetime.study import study_record
 
@@ -214,6 +220,7 @@ def _slices(scan: QuadScan) -> list[QuadScan]:
 
 
 def _result_or_error(read: Callable[[str], Any], file: str) -> Any:
+    """Result of a reader, or the `InputError` it raises."""
     try:
         return read(file)
     except InputError as error:
@@ -221,6 +228,7 @@ def _result_or_error(read: Callable[[str], Any], file: str) -> Any:
 
 
 def _unusable_row(file: str, reason: str) -> dict[str, Any]:
+    """Row of a file that cannot be used."""
     try:
         sha256 = digest(file)
     except InputError:  # the next run tries an unreadable file again

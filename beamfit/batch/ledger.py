@@ -78,6 +78,7 @@ class Ledger:
         self._index_part(part, content)
 
     def _index_part(self, part: Path, content: bytes) -> None:
+        """Record where the rows of each file are in a part, if they belong to this job."""
         if not content.startswith(self.header):
             return
         ranges: dict[str, RowRange] = {}
@@ -111,17 +112,20 @@ class Ledger:
 
 
 def _blocks(found: Iterator[bytes]) -> Iterator[bytes]:
+    """Join rows to blocks of `BLOCK_ROWS`."""
     while block := b"".join(islice(found, BLOCK_ROWS)):
         yield block
 
 
 def _csv(stream: BinaryIO, kind: str, blocks: Iterator[bytes]) -> None:
+    """Write blocks of rows as CSV."""
     stream.write((",".join(COLUMNS[kind]) + "\n").encode())
     for block in blocks:
         stream.write(block)
 
 
 def _parquet(stream: BinaryIO, kind: str, blocks: Iterator[bytes]) -> None:
+    """Write blocks of rows as Parquet."""
     import pyarrow as arrow
     from pyarrow import csv as arrow_csv
     from pyarrow import parquet
@@ -136,6 +140,7 @@ def _parquet(stream: BinaryIO, kind: str, blocks: Iterator[bytes]) -> None:
 
 
 def _hdf5(stream: BinaryIO, kind: str, blocks: Iterator[bytes]) -> None:
+    """Write blocks of rows as HDF5, one dataset for each column."""
     import h5py
 
     with h5py.File(stream, "w") as store:
@@ -149,6 +154,7 @@ def _hdf5(stream: BinaryIO, kind: str, blocks: Iterator[bytes]) -> None:
 
 
 def _append_cells(data: Any, cells: tuple[str, ...]) -> None:
+    """Append cells to a dataset; empty numbers are NaN."""
     before = len(data)
     data.resize((before + len(cells),))
     numbers = data.dtype == float

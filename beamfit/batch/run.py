@@ -168,6 +168,7 @@ def _check_request(out: Path, workers: int | None, scheduler: str | None) -> Non
 def _answers(
     job: Job, tasks: Sequence[list[str]], workers: int | None, scheduler: str | None
 ) -> Iterator[tuple[list[str], str]]:
+    """Fit tasks, in this process or on a cluster; yield each with its rows when it is completed."""
     if not tasks or (workers is None and scheduler is None):
         yield from ((task, job.answer(task)) for task in tasks)
         return

@@ -188,6 +188,7 @@ def dates_in_order(order: str = "") -> Callable[[str], float]:
 
 
 def _time_of_day(hours: str, minutes: str, seconds: str) -> float:
+    """Seconds since midnight; ValueError if it is no time of day."""
     fields = int(hours), int(minutes), float(seconds.replace(",", "."))
     if fields[0] > 23 or fields[1] > 59 or fields[2] >= 61:
         raise ValueError("no time of day")
@@ -205,6 +206,7 @@ def _iso_date(found: re.Match[str], order: str) -> str:
 
 
 def _parse_datetime(text: str) -> datetime:
+    """Parse a date and time, in ISO 8601 or one of `TIME_FORMATS`."""
     try:
         return datetime.fromisoformat(text)
     except ValueError:

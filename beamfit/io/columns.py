@@ -696,6 +696,7 @@ def layout_of(columns: str | PathLike[str] | Mapping[str, str] | Layout | None) 
 
 
 def _parse_item(item: str) -> Layout:
+    """Layout of one item: HEADER=NAME, an order of dates, or the name or path of a layout."""
     header, has_name, name = (part.strip() for part in item.rpartition("="))
     if has_name:
         if not header or not name:
@@ -713,6 +714,7 @@ def _parse_item(item: str) -> Layout:
 
 
 def _read_layout(path: str | PathLike[str]) -> Layout:
+    """Read a layout file."""
     section = read_toml(path, "a layout", LAYOUT_FORMAT)
     values = section.values(LAYOUT_KEYS)
     for header, name in values["columns"].items():

@@ -204,6 +204,7 @@ def read_decay_record(
 
 
 def _make_record(sheet: Sheet, offset: str | None) -> DecayRecord:
+    """Make a decay record from the columns of a sheet."""
     if any(map(is_size, sheet.names)) and not sheet.has_layout:
         expected = "a record of beam current; `beamfit emittance` reads scans"
         raise sheet.header_error("a column of beam sizes", expected)
@@ -321,6 +322,7 @@ def _drop_backward(
 
 
 def _check_time_origin(sheet: Sheet, column: Column, time: np.ndarray) -> None:
+    """Raise if times are of another origin or unit than supposed: after the year 2050."""
     if (latest := np.max(time)) <= MAX_UNIX_TIME:
         return
     written = latest / column.factor
@@ -338,6 +340,7 @@ def _check_time_origin(sheet: Sheet, column: Column, time: np.ndarray) -> None:
 
 
 def _lifetime_table(sheet: Sheet) -> LifetimeTable:
+    """Make a lifetime table from the columns of a sheet."""
     columns = columns_of(sheet, LIFETIME_QUANTITIES)
     kinds = [kind for kind in ("tau", "lifetime") if kind in columns]
     if len(kinds) != 1 or "beam_current" not in columns:
@@ -357,6 +360,7 @@ def _lifetime_table(sheet: Sheet) -> LifetimeTable:
 
 
 def _positive_values(sheet: Sheet, column: Column) -> np.ndarray:
+    """Read a column of positive numbers."""
     values = sheet.values(column)
     found, written = f"{{:.6g}} {column.unit}", values / column.factor
     sheet.refuse(column.header, values <= 0, "above zero", found, written)
@@ -483,10 +487,7 @@ def monitor_of(drift: str | None, offset: str | None) -> Monitor | None:
     >>> print(monitor_of("0.24 mA/d", None))
     drifts by 10 µA/h
     """
-    found = (
-        _stability("drift", drift, "10uA/h"),
-        _stability("offset", offset, "50uA"),
-    )
+    found = _stability("drift", drift, "10uA/h"), _stability("offset", offset, "50uA")
     return Monitor(*found) if any(found) else None
 
 

@@ -176,6 +176,7 @@ def _text(value: Any) -> str:
 
 
 def _read_struct(source: _Struct) -> EmittanceGuiFile:
+    """Read the struct: scans of all size methods, stored results, and the lattice."""
     beams = _shot_records(source)
     used, n = _used_settings(source, len(beams))
     beams, lattice = beams[used], _lattice(source, n)
@@ -246,6 +247,7 @@ class _Settings(NamedTuple):
 
 
 def _settings(source: _Struct, used: np.ndarray, n: int, lattice: LatticeFile) -> _Settings:
+    """Settings or monitors in use, with their transfer matrices."""
     cells = source.need("rMatrix").ravel()
     if len(cells) <= used.max():
         raise source.error(f"{len(cells)} matrices for {n} settings", "rMatrix")
@@ -296,6 +298,7 @@ def _monitors(source: _Struct, n: int) -> list[str]:
 
 
 def _provenance(source: _Struct) -> list[str]:
+    """Provenance lines: program, monitor, quadrupole, date, charge."""
     lines = [f"emittance_gui, {source.text('type', 'scan')}"]
     for word, name in (("monitor", "name"), ("quadrupole", "quadName")):
         if text := ", ".join(source.texts(name)):
@@ -395,6 +398,7 @@ def _shot_list(marked: np.ndarray, labels: list[str]) -> str:
 
 
 def _short_list(items: list[str]) -> str:
+    """Join the first items of a list, and count the others."""
     n_more = len(items) - MAX_LISTED
     return ", ".join(items[:MAX_LISTED]) + f" and {n_more} more" * (n_more > 0)
 

@@ -273,10 +273,12 @@ def _openpmd(store: Any, rows: int) -> dict[str, Sequence[Any]]:
 
 
 def _is_beam(node: Any) -> bool:
+    """True if a node of a file is an openPMD particle group."""
     return hasattr(node, "keys") and {"position", "momentum"} <= set(node)
 
 
 def _beam_row(beam: Any, rows: int) -> dict[str, Any]:
+    """Row of one openPMD particle group."""
     place, momentum = beam["position"], [_openpmd_values(beam["momentum"], k, rows) for k in "xyz"]
     weight = _openpmd_values(beam, "weight", rows) if "weight" in beam else np.ones(1)
     attributes = {**beam.parent.attrs, **beam.attrs}
@@ -401,6 +403,7 @@ def matlab_variables(path: str | PathLike[str], name: str = "") -> dict[str, np.
 
 @lru_cache(maxsize=1)  # a file of emittance_gui is read several times
 def _cached_variables(path: str, name: str, sha256: str) -> dict[str, np.ndarray]:
+    """Read variables of a MATLAB file; cached by the digest of the file."""
     content = read_bytes(path, MATLAB_TEXT)
     if HDF5_SIGNATURE in (content[:8], content[512:520]):
         raise InputError("a MATLAB file of version 7.3", MATLAB_TEXT, path)
@@ -466,6 +469,7 @@ def _sdds_loaded(content: bytes) -> Any:
 
 
 def _sdds_values(name: str, values: list[Any], rows: int, texts: int) -> Sequence[Any]:
+    """Values of a column or parameter: texts, or numbers as an array."""
     is_text = bool(values) and isinstance(values[0], str)
     check_length(len(values), texts if is_text else rows, column=name)
     return values if is_text else np.array(values, float)

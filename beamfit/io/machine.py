@@ -296,6 +296,7 @@ def _settings_within(
 
 
 def _read_screen(section: Section, lattice: LatticeFile) -> Profiler:
+    """Read and check [screen]."""
     screen = section.read(Profiler)
     if bool(screen.sizes) == bool(screen.profiles):
         found = "sizes and projections" if screen.sizes else "no sizes"
@@ -310,6 +311,7 @@ def _read_screen(section: Section, lattice: LatticeFile) -> Profiler:
 
 
 def _read_guard(section: Section) -> Guard:
+    """Read and check [beam]: each variable needs its limit."""
     guard = section.read(Guard)
     for variable, limit in (("present", "present_above"), ("loss", "loss_below")):
         name, value = getattr(guard, variable), getattr(guard, limit)

@@ -242,6 +242,7 @@ class Interpreter:
         return Attribute(text, later, value, statement.path, statement.line)
 
     def _parameters(self, statement: MadxStatement, text: str) -> dict[str, Attribute]:
+        """Parse the parameters after the first comma of a statement."""
         found: dict[str, Attribute] = {}
         text = text.strip()
         if not text:
@@ -268,6 +269,7 @@ class Interpreter:
         return 0.0 if parameter is None else float(self.number(parameter))
 
     def _execute_block(self, statement: MadxStatement, word: str, taken: bool | None) -> None:
+        """Execute the block of an IF; a WHILE is refused."""
         if word in ("if", "elseif", "else"):
             if word == "if":
                 taken = False
@@ -283,6 +285,7 @@ class Interpreter:
             raise statement.error()
 
     def _execute(self, statement: MadxStatement) -> None:
+        """Execute a statement without a block."""
         text = statement.text
         if found := ASSIGNMENT.fullmatch(text):
             kind, name, equals, value = found.groups(default="")
@@ -312,6 +315,7 @@ class Interpreter:
     def _define(
         self, statement: MadxStatement, label: str, arguments: str, kind: str, rest: str
     ) -> None:
+        """Execute LABEL: CLASS, ...: define an element, line or sequence."""
         name, word = label.lower(), kind.lower()
         kind = word if word in self.elements else self.dialect.classes.get(word, word)
         shown = decode_name(label) if self.dialect is ELEGANT else label
@@ -334,6 +338,7 @@ class Interpreter:
             self._define_element(name, new, self._parameters(statement, rest))
 
     def _define_element(self, name: str, new: Definition, given: dict[str, Attribute]) -> None:
+        """Add an element, derived from its class, and place it if a sequence is open."""
         place = {key: given.pop(key) for key in ("at", "from") if key in given}
         parent = self.elements.get(new.kind)
         if parent is not None:
@@ -349,6 +354,7 @@ class Interpreter:
             self._open_sequence.placements.append((name, place))
 
     def _command(self, statement: MadxStatement, name: str, rest: str) -> None:
+        """Execute a command, by its method if it has one."""
         if self._open_sequence is not None:
             self._execute_in_sequence(statement, name, rest)
         elif name in IGNORED_COMMANDS or name.startswith("ptc_"):
@@ -379,6 +385,7 @@ class Interpreter:
         self._open_sequence.placements.append((name, given))
 
     def _use_command(self, statement: MadxStatement, given: Mapping[str, Attribute]) -> None:
+        """USE: select the line."""
         for key in given:
             if key not in ("sequence", "period"):
                 raise statement.error(
@@ -387,6 +394,7 @@ class Interpreter:
         self.used_line = next((word_of(p).lower() for p in given.values()), self.used_line)
 
     def _call_command(self, statement: MadxStatement, given: Mapping[str, Attribute]) -> None:
+        """CALL: execute another file."""
         if "file" not in given or self._call_count >= MAX_CALLS:
             found = f"more than {MAX_CALLS} files called" if "file" in given else ""
             raise statement.error(found, "CALL, FILE = ..., of files that do not call one another")
@@ -399,6 +407,7 @@ class Interpreter:
         self.run(text, path)
 
     def _option_command(self, statement: MadxStatement, given: Mapping[str, Attribute]) -> None:
+        """OPTION: only RBARC has an effect."""
         for key, parameter in given.items():
             on = word_of(parameter).lower() not in ("false", "no", "0") and parameter.value != 0.0
             if key in ("rbarc", "reset"):
@@ -409,6 +418,7 @@ class Interpreter:
                 )
 
     def _beam_command(self, statement: MadxStatement, given: dict[str, Attribute]) -> None:
+        """BEAM: set the parameters of a beam."""
         sequence = word_of(given.pop("sequence", None)).lower()
         if "bv" in given and self.number(given["bv"]) != 1.0:
             raise statement.error("a beam with BV = -1, which runs the other way", "BV = 1")
@@ -420,6 +430,7 @@ class Interpreter:
         beam |= values
 
     def _resbeam_command(self, statement: MadxStatement, given: Mapping[str, Attribute]) -> None:
+        """RESBEAM: reset a beam."""
         self.beams[word_of(given.get("sequence")).lower()] = {}
 
 

@@ -61,6 +61,7 @@ FUNCTIONS |= {
 
 
 def _power(base: float, exponent: float) -> float:
+    """Power; ArithmeticError for a complex result."""
     value = base**exponent
     if isinstance(value, complex):
         raise ArithmeticError("a root of a negative number")
@@ -234,6 +235,7 @@ class Values:
         return value
 
     def _value(self, tree: Tree) -> float:
+        """Evaluate a parsed expression."""
         first, *steps = tree.children
         match tree.data:
             case "number":
@@ -253,6 +255,7 @@ class Values:
         return value
 
     def _variable(self, name: str) -> float:
+        """Value of a variable or constant, evaluated once until a variable changes."""
         if name in CONSTANTS:
             return CONSTANTS[name]
         if name not in self._cache:

@@ -145,6 +145,7 @@ def read_systematics(path: str | PathLike[str]) -> dict[str, tuple[float | None,
 
 
 def _prior(section: Section, key: str, factor: float) -> tuple[float | None, float]:
+    """Mean (None if not given) and standard deviation of a prior, in SI."""
     given: Any = section.table[key]
     numbers = given if isinstance(given, list) else [None, given]
     is_pair = len(numbers) == 2 and all(n is None or is_number(n) for n in numbers)

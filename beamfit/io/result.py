@@ -118,6 +118,7 @@ def read_fitted_beams(
 
 
 def _beam(entry: Mapping[str, Any], rest_energy: float) -> Beam:
+    """Fitted beam of an entry of ``results``."""
     _check_optics(entry)
     where = f"of plane {entry['plane']}"
     sigma = [_checked_number(entry[name]["value"], f"{name} {where}") for name in SIGMA_KEYS]
@@ -168,6 +169,7 @@ def _check_optics(entry: Mapping[str, Any]) -> None:
 
 
 def _checked_number(value: object, name: str) -> float:
+    """A finite number, or an error that names it."""
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
         raise InputError(f"{name} = {json.dumps(value)}", f"a finite number, as in {SOURCE_TEXT}")
     return float(value)
@@ -209,11 +211,7 @@ def _doubt(entry: Mapping[str, Any]) -> str | None:
 FORMAT = "beamfit-fit-2"
 SAVED_FIT_TEXT = "a file that beamfit.save_fit wrote"
 # Classes that a file may contain, by module. No others are imported from a file.
-SCAN, DECAY, OPTICS = (
-    "beamfit.emittance",
-    "beamfit.lifetime",
-    "beamfit.optics",
-)
+SCAN, DECAY, OPTICS = "beamfit.emittance", "beamfit.lifetime", "beamfit.optics"
 CLASSES_BY_MODULE = {
     "beamfit.quantity": "Quantity",
     "beamfit.errors": "Status",
@@ -322,6 +320,7 @@ def load_fit(path: str | PathLike[str]) -> EmittanceFit | DecayFit:
 
 
 def _decode_fit(kind: str, content: Any) -> EmittanceFit | DecayFit:
+    """Decode a fit; one of a scan needs its prepared scan again, which is computed."""
     if kind == "DecayFit":
         return _decode(content)
     if kind != "EmittanceFit":
@@ -366,6 +365,7 @@ def _encode(value: Any) -> Any:
 
 
 def _class_name(value: Any) -> str:
+    """Name of a value's class, which must be among those a file may contain."""
     name = type(value).__name__
     if MODULE_OF_CLASS.get(name) != type(value).__module__:
         raise InputError(f"a {name}, which no file of fits holds", "a fit of beamfit's own values")

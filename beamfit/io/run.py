@@ -30,7 +30,7 @@ from beamfit.io.table import read_columns
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-UNUSED, TIME = "aside", "time"
+UNUSED, TIME = "unused", "time"
 EXAMPLE_HEADER = "time_s,u_valve,y_level"
 
 

@@ -402,9 +402,8 @@ def comment_notes(sheet: Sheet, columns: Mapping[str, Column]) -> list[str]:
             _check_statement(sheet, sizes, text, statement)
     for text in sheet.comments:
         listed = UNIT_LIST.search(text)
-        if listed and all(
-            _length_factor(listed[1]) != UNITS["length"][column.unit] for column in sizes
-        ):
+        factor = _length_factor(listed[1]) if listed else None
+        if listed and all(factor != UNITS["length"][column.unit] for column in sizes):
             return [
                 f"A comment says '{short(text, 80)}', and the sizes are taken in {sizes[0].unit}, "
                 f"as the header {sizes[0].header} says: is that so?"
@@ -571,11 +570,8 @@ def _make_scan(
     energies = [(values[key], kind) for key, kind in ENERGIES.items() if key in values]
     energy, kind = energies[0] if energies else (None, "total")
     headers = {key: sheet.file_headers.get(c.header, c.header) for key, c in columns.items()}
-    texts = {
-        key: tuple(map(str, sheet[columns[key].header]))
-        for key in ("screen", "slice")
-        if key in columns
-    }
+    words = [key for key in ("screen", "slice") if key in columns]
+    texts = {key: tuple(map(str, sheet[columns[key].header])) for key in words}
     planes = [p for p in "xy" if f"size_{p}" in values]
     error = {p: values[f"size_{p}_error"] for p in planes if f"size_{p}_error" in values}
     zeros = np.zeros(len(sheet))

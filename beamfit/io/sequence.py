@@ -118,6 +118,7 @@ def read_sequence(
 
 
 def _select_line(program: Interpreter, path: str | PathLike[str], use: str | None) -> Definition:
+    """The line or sequence that ``use`` or a USE names, or the only one."""
     names = [line.name for line in program.lines.values()]
     if not names:
         expected = f"a valid {program.dialect.name} file with one of them"
@@ -200,6 +201,7 @@ class _Line:
                 yield _Position(element, first, self._length(element), (at.path, at.line))
 
     def _element_of(self, sequence: Definition, name: str) -> Definition:
+        """Element or sequence of a name; a LINE within a sequence is refused."""
         element = self.program.elements.get(name) or self.program.lines[name]
         if element.kind == "line":
             found = f"line '{element.name}' within a sequence"
@@ -258,6 +260,7 @@ class _Line:
         return members
 
     def _named_members(self, line: Definition, label: str) -> list[tuple[str, bool]]:
+        """Element of a name, or the members of a LINE of that name."""
         name = label.lower()
         if name in self.program.elements:
             return [(name, False)]
@@ -269,6 +272,7 @@ class _Line:
         return self._members(lines[name])
 
     def _count(self, element: Definition, number: int = 1) -> None:
+        """Count elements, against lines that multiply without end."""
         self.element_count += number
         if self.element_count > MAX_ELEMENTS:
             raise element.error(f"more than {MAX_ELEMENTS} elements", "a line that a machine has")
@@ -329,6 +333,7 @@ class _Element:
         return common | self._drift()
 
     def _unmodelled(self, what: str, expected: str = "") -> InputError:
+        """Make the error of a feature that beamfit does not model."""
         found = f"element '{self.definition.name}' of type '{self.definition.type}' {what}"
         expected = expected or "a line without it: cut the line after it, or set it to zero"
         return self.definition.error(f"{found}, which beamfit does not model", expected)
@@ -345,6 +350,7 @@ class _Element:
         return (*(value if isinstance(value, tuple) else (value,)), 0.0, 0.0)[:2]
 
     def _check_unmodelled(self) -> None:
+        """Refuse parameters that are not modelled, unless they are zero."""
         for key in (*UNMODELLED, *IDENTITY_AT_ZERO.get(self.definition.type.lower(), ())):
             if self._number(key) != 0.0:
                 raise self._unmodelled(f"with {key.upper()} = {self._number(key):g}")
@@ -357,6 +363,7 @@ class _Element:
                 raise self._unmodelled(f"with multipole components of its own ({key.upper()})")
 
     def _check_length(self) -> None:
+        """Refuse a quadrupole or dipole without a positive length, or a dipole without angle."""
         missing = [key for key in ("angle", "l") if key not in self.values]
         if self.kind == "dipole" and missing:
             found = f"'{self.definition.name}' without '{missing[0]}'"
@@ -388,6 +395,7 @@ class _Element:
         return {"type": "quadrupole", "length_m": self.length, "k1_per_m2": k1}
 
     def _thin_lens(self) -> dict[str, Any]:
+        """Table of a thin multipole: a thin lens, or a marker without a quadrupole component."""
         if self.elegant:
             order = self.values.get("order", 1)
             normal = tuple(self._number("knl") * (order == n) for n in range(2))
@@ -405,6 +413,7 @@ class _Element:
         return {"type": "thin_lens", "k1l_per_m": self._upright(normal[1])}
 
     def _dipole(self, reflect: bool) -> dict[str, Any]:
+        """Table of a dipole; one without angle is a quadrupole or drift."""
         angle, turns = self._number("angle"), self._quarter_turns()
         self._check_dipole(angle)
         edge = 0.5 * angle if self.definition.kind == "rbend" else 0.0
@@ -426,6 +435,7 @@ class _Element:
         }
 
     def _check_dipole(self, angle: float) -> None:
+        """Refuse dipoles that are not hard-edge sector or rectangular bends."""
         if self.elegant and "RB" in self.definition.type:
             raise self._unmodelled(
                 "(rectangular, whose length programs read differently)",
@@ -460,6 +470,7 @@ def number_repeated(elements: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def _single_number(program: Interpreter, parameter: Attribute) -> float:
+    """Value of a parameter that must be one number."""
     value = program.number(parameter)
     if isinstance(value, tuple):
         raise InputError("several numbers", "one", parameter.path, parameter.line)

@@ -162,6 +162,7 @@ def _read_text(
     skip_bad: bool | None,
     names: Sequence[str] | None,
 ) -> Sheet:
+    """Read a text file line by line, or quickly from the first row on if all is numeric."""
     comments, rows, lines, errors, columns, notes = [], [], [], [], None, ()
     names, header, separator, numbered = _read_header(path, example, comments, names)
     names, has_further = [name for name in names if name != FURTHER_CELLS], FURTHER_CELLS in names
@@ -408,6 +409,7 @@ def separator_of(header: str) -> str:
 
 
 def _split_words(text: str) -> list[str]:
+    """Split a line at its separator, without quotes."""
     separator = separator_of(text)
     return [word.strip(' "') for word in text.split(None if separator == " " else separator)]
 
