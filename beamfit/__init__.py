@@ -40,7 +40,7 @@ _HOME = {
     "Target": "beamfit.emittance.targets",
     "ThinLens": "beamfit.optics.elements",
     "TuningFit": "beamfit.tuning.fit",
-    "check": "beamfit.io.check:understand",
+    "check": "beamfit.io.check:file_summary",
     "constant_a_test": "beamfit.lifetime.systematics",
     "control": "beamfit.commands",
     "design": "beamfit.emittance.design:plan_measurements",

@@ -367,16 +367,16 @@ def solve(
     >>> print(beamfit.solve("formulations/appendix_d.bf").headline)
     obj = 2.113778016, local optimum
     """
-    from beamfit.io.formulation import read_formulation, read_tables, solved_formulation
+    from beamfit.io.formulation import read_formulation, read_tables, solve_formulation
 
     if not is_path(document):
         found = data or {}
-        return solved_formulation(document, None, found, starts, values, derivatives, **options)
+        return solve_formulation(document, None, found, starts, values, derivatives, **options)
     read, given = read_formulation(document), dict(data or {})
     files = {name: str(one) for name, one in given.items() if is_path(one)}
     tables, _ = read_tables(read, document, files)
     tables |= {name: one for name, one in given.items() if name not in files}
-    return solved_formulation(read, document, tables, starts, values, derivatives, **options)
+    return solve_formulation(read, document, tables, starts, values, derivatives, **options)
 
 
 def scan_machine(

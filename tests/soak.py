@@ -31,14 +31,14 @@ import beamfit.io.decay_record
 from beamfit.errors import InputError
 from beamfit.greybox.mlp import dense
 from beamfit.io import isolated
-from beamfit.io.columns import SHIPPED, layout_of
+from beamfit.io.columns import LAYOUT_FOLDER, layout_of
 from beamfit.io.emittance_gui import read_emittance_gui
 from beamfit.io.files import read_text
 from beamfit.io.formulation import read_formulation, read_numbers
 from beamfit.io.line import read_lattice
 from beamfit.io.machine import read_scan_machine
 from beamfit.io.result import load_fit, read_fitted_beams, save_fit
-from beamfit.io.ring import read_along, read_ring
+from beamfit.io.ring import read_ring, read_ring_tables
 from beamfit.io.run import read_run
 from beamfit.io.scan import read_quad_scan
 from beamfit.language.network_xml import format_network, parse_network
@@ -115,7 +115,7 @@ def readers(folder: Path, with_store: bool) -> dict[str, Reader]:
     store = [path.read_bytes() for path in folder.glob("store.h5")]
     lattice = [of("lattices/gtf_two_screens.toml"), of("lattices/lcls_otr2.toml")]
     scan = [CSV.encode(), of("measurements/lcls_otr2.csv")]
-    layouts = [path.read_bytes() for path in sorted(SHIPPED.glob("*.toml"))]
+    layouts = [path.read_bytes() for path in sorted(LAYOUT_FOLDER.glob("*.toml"))]
     (folder / "line.toml").write_text(LINE)
     machine = MACHINE.format(scheme="", more="degauss = [-5.0, 2.0]")
     decay = [of("measurements/aps_1999_decay.csv"), DATES.encode(), LIFETIMES.encode()]
@@ -145,8 +145,10 @@ def readers(folder: Path, with_store: bool) -> dict[str, Reader]:
         "layout .toml": Reader(".toml", layouts, layout_of),
         "machine .toml": Reader(".toml", [machine.encode()], read_scan_machine),
         "ring .toml": Reader(".toml", [of("lattices/spear3_2003.toml")], read_ring),
-        "optics .csv": Reader(".csv", [ring], lambda p: read_along(234.144, Path(p), None)[0]),
-        "optics .tfs": Reader(".tfs", [twiss], lambda p: read_along(10.0, Path(p), None)[0]),
+        "optics .csv": Reader(
+            ".csv", [ring], lambda p: read_ring_tables(234.144, Path(p), None)[0]
+        ),
+        "optics .tfs": Reader(".tfs", [twiss], lambda p: read_ring_tables(10.0, Path(p), None)[0]),
         "MAD-X": Reader(".madx", [MADX.encode()], read_lattice),
         "MAD-8": Reader(".mad8", [MAD8.encode()], read_lattice),
         "elegant": Reader(".lte", [ELEGANT.encode()], lambda p: read_lattice(p, energy=135.0)),

@@ -1,7 +1,7 @@
 """Columns and rows of the table of answers.
 
-A number keeps the name it has in JSON, with its unit at the end; its error, its error before
-scaling and the ends of its 95 % interval stand beside it. An empty cell is null.
+A number has its name in JSON with the unit at the end. Further columns have its error, its error
+before scaling, and the ends of its 95 % interval. An empty cell is null.
 """
 
 from __future__ import annotations
@@ -22,39 +22,40 @@ if TYPE_CHECKING:
     from beamfit.lifetime.study import RecordStudy
 
 UNUSABLE = "unusable"
-# How a unit is written at the end of a name.
-WRITTEN = {"1": "", "m^2": "_m2", "m rad": "_m_rad", "rad^2": "_rad2", "1/s": "_per_s"}
-WRITTEN |= {"1/(mA s)": "_per_mA_s"}
-ENDS = ("", "_error", "_error_raw", "_low_95", "_high_95")
-# The file an answer is of, and what makes the same answer of the same file.
-KEY = ("file", "sha256", "lattice_sha256", "options", "beamfit")
+# Units at the end of a column name.
+UNIT_ENDINGS = {"1": "", "m^2": "_m2", "m rad": "_m_rad", "rad^2": "_rad2", "1/s": "_per_s"}
+UNIT_ENDINGS |= {"1/(mA s)": "_per_mA_s"}
+ENDINGS = ("", "_error", "_error_raw", "_low_95", "_high_95")
+# Columns that identify an answer: the file, and everything else that determines the answer.
+KEY_COLUMNS = ("file", "sha256", "lattice_sha256", "options", "beamfit")
 
 
 @lru_cache(maxsize=256)
-def named(name: str, unit: str, ends: tuple[str, ...] = ENDS) -> tuple[str, ...]:
-    """The columns of a quantity.
+def quantity_columns(name: str, unit: str, ends: tuple[str, ...] = ENDINGS) -> tuple[str, ...]:
+    """Columns of a quantity.
 
     Examples
     --------
-    >>> named("beta", "m", ("", "_error"))
+    >>> quantity_columns("beta", "m", ("", "_error"))
     ('beta_m', 'beta_error_m')
     """
-    return tuple(f"{name}{end}{WRITTEN.get(unit, f'_{unit}')}" for end in ends)
+    return tuple(f"{name}{end}{UNIT_ENDINGS.get(unit, f'_{unit}')}" for end in ends)
 
 
-def _every(quantities: Mapping[str, str]) -> list[str]:
-    return [column for item in quantities.items() for column in named(*item)]
+def _all_columns(quantities: Mapping[str, str]) -> list[str]:
+    """Columns of all quantities."""
+    return [column for item in quantities.items() for column in quantity_columns(*item)]
 
 
 NUMBERS = {
     "emittance": (
-        *_every(QUANTITIES),
+        *_all_columns(QUANTITIES),
         *("rms_residual_m", "chi2", "dof", "error_scale", "determined", "waist_bracketed"),
         *("beam_probability", "phase_coverage_deg", "condition"),
         *(f"singular_value_{i}" for i in (1, 2, 3)),
     ),
     "lifetime": (
-        *_every(UNITS),
+        *_all_columns(UNITS),
         *("mean_current_mA", "rms_residual_mA", "chi2", "dof", "noise_inferred", "start_s"),
         *("separable", "share", "share_error", "correlation", "residual_correlation"),
         *("error_inflation", "cycles"),
@@ -62,58 +63,59 @@ NUMBERS = {
 }
 COLUMNS = {
     "emittance": (
-        *(*KEY, "slice", "plane", "status", "message", *NUMBERS["emittance"]),
+        *(*KEY_COLUMNS, "slice", "plane", "status", "message", *NUMBERS["emittance"]),
         *("noise", "method", "weights", "undetermined", "next_measurement", "notes"),
     ),
-    "lifetime": (*KEY, "record", "status", "message", *NUMBERS["lifetime"], "notes"),
+    "lifetime": (*KEY_COLUMNS, "record", "status", "message", *NUMBERS["lifetime"], "notes"),
 }
 
 
 def emittance_rows(fit: EmittanceFit) -> Iterator[dict[str, Any]]:
-    """A row a plane."""
+    """Make a row for each plane."""
     notes = " ".join(fit.notes)
     for p in fit.planes:
-        known = p.identifiability
+        ident = p.identifiability
         quantities = p.quantities | ({} if p.mismatch is None else {"mismatch": p.mismatch})
-        row = _cells(quantities) | vars(known)
+        row = _quantity_cells(quantities) | vars(ident)
         row |= {name: getattr(p, name) for name in ("plane", "status", "message", "chi2", "dof")}
         row |= {name: getattr(p, name) for name in ("error_scale", "noise", "method", "weights")}
-        row |= {f"singular_value_{i}": v for i, v in enumerate(known.singular_values, start=1)}
-        row["beam_probability"] = known.probability["beam"]
-        row["phase_coverage_deg"] = known.phase_coverage
-        yield row | {"undetermined": "; ".join(known.undetermined), "notes": notes}
+        row |= {f"singular_value_{i}": v for i, v in enumerate(ident.singular_values, start=1)}
+        row["beam_probability"] = ident.probability["beam"]
+        row["phase_coverage_deg"] = ident.phase_coverage
+        yield row | {"undetermined": "; ".join(ident.undetermined), "notes": notes}
 
 
 def lifetime_rows(study: RecordStudy) -> Iterator[dict[str, Any]]:
-    """A row a decay, and one of cycles that were fitted together."""
+    """Make a row for each decay, and one for cycles fitted together."""
     notes = " ".join(study.record.notes)
     for decay in study.answers:
         yield decay_row(decay.fit.to_json()) | {"start_s": decay.offset, "notes": notes}
 
 
 def decay_row(entry: Mapping[str, Any]) -> dict[str, Any]:
-    """The row of an entry of ``results`` of `beamfit lifetime --json`."""
+    """Make the row of an entry of ``results`` of `beamfit lifetime --json`."""
     quantities = {k: v for k, v in entry.items() if isinstance(v, Mapping) and "unit" in v}
-    plain = {k: v for k, v in entry.items() if not isinstance(v, Mapping)}
-    return _cells(quantities) | plain | entry["identifiability"]
+    scalars = {k: v for k, v in entry.items() if not isinstance(v, Mapping)}
+    return _quantity_cells(quantities) | scalars | entry["identifiability"]
 
 
-def _cells(quantities: Mapping[str, Quantity | Mapping[str, Any]]) -> dict[str, Any]:
+def _quantity_cells(quantities: Mapping[str, Quantity | Mapping[str, Any]]) -> dict[str, Any]:
+    """Cells of quantities: value, error, raw error and ends of the 95 % interval."""
     row = {}
     for name, q in quantities.items():
-        found = q.to_json() if isinstance(q, Quantity) else q
-        low, high = found.get("interval_95") or (None, None)
-        values = (found["value"], found["error"], found.get("error_raw"), low, high)
-        row |= zip(named(name, found["unit"]), values, strict=True)
+        entry = q.to_json() if isinstance(q, Quantity) else q
+        low, high = entry.get("interval_95") or (None, None)
+        values = (entry["value"], entry["error"], entry.get("error_raw"), low, high)
+        row |= zip(quantity_columns(name, entry["unit"]), values, strict=True)
     return row
 
 
-def lines(rows: Iterable[Mapping[str, Any]], columns: Iterable[str]) -> str:
-    """Rows as lines of CSV; a number can be read back to its last digit.
+def csv_text(rows: Iterable[Mapping[str, Any]], columns: Iterable[str]) -> str:
+    """Write rows as CSV; numbers have all digits.
 
     Examples
     --------
-    >>> lines([{"a": 0.1, "b": "x,\\ny", "c": math.nan, "d": True}], "abcde")
+    >>> csv_text([{"a": 0.1, "b": "x,\\ny", "c": math.nan, "d": True}], "abcde")
     '0.1,"x, y",,1,\\n'
     """
     text = io.StringIO()
@@ -124,6 +126,7 @@ def lines(rows: Iterable[Mapping[str, Any]], columns: Iterable[str]) -> str:
 
 
 def _cell(value: Any) -> Any:
+    """Text or number of a cell: NaN and infinities are empty, a flag is 0 or 1."""
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     if isinstance(value, str):

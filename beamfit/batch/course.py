@@ -1,4 +1,4 @@
-"""The course of a quantity through a batch, in the order of its files, with control limits."""
+"""Control charts: a quantity through a batch, in the order of its files, with control limits."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from beamfit.answer import Table, labelled, plain_name
-from beamfit.batch.columns import COLUMNS, named
+from beamfit.batch.columns import COLUMNS, quantity_columns
 from beamfit.batch.run import Batch
 from beamfit.emittance.model import QUANTITIES
 from beamfit.errors import InputError, nearest
@@ -18,30 +18,30 @@ from beamfit.lifetime.evidence import UNITS
 from beamfit.quantity import display_unit
 from beamfit.statistics import baseline, control_limits
 
-# Standard deviations of all points; limits that are wider rest on fewer than five points, whose
-# Student's quantile they show.
-WIDEST = 6.0
-# Quantities of each kind, and the default one.
-FOLLOWED = {"emittance": (QUANTITIES, "normalized_emittance"), "lifetime": (UNITS, "lifetime_mean")}
+# Control limits wider than this many standard deviations of all points are not used: they come from
+# fewer than five points, where Student's quantile is large.
+MAX_LIMIT = 6.0
+# Quantities of each kind of fit, and the default one.
+CHARTED = {"emittance": (QUANTITIES, "normalized_emittance"), "lifetime": (UNITS, "lifetime_mean")}
 
 
 class ControlChart(NamedTuple):
-    """A quantity through a batch.
+    """Control chart of a quantity through a batch.
 
     Attributes
     ----------
     name, unit : str
-        Which, and its SI unit.
+        Quantity and its unit.
     of : str
-        The plane, and the slice if there are any; empty for lifetimes.
+        Plane, with the slice if there are any; empty for lifetimes.
     files : list of str
-        The file of each point.
+        File of each point.
     at : ndarray
-        Shape (n,): the place of that file in the batch, from 1.
+        Shape (n,): position of that file in the batch, from 1.
     value, error : ndarray
         Shape (n,).
     centre, limit : float
-        The usual value, and how far from it the control limits are.
+        Centre line, and distance of the control limits from it.
     """
 
     name: str
@@ -61,24 +61,22 @@ class ControlChart(NamedTuple):
 
     @property
     def label(self) -> str:
-        """The quantity and its plane, as people read them."""
+        """Name of the quantity and its plane."""
         return f"{plain_name(self.name)} {self.of}".strip()
 
     @property
     def reach(self) -> float:
-        """Reach of the control limits; infinite where too few points make them to say
-        anything.
-        """
-        return self.limit if self.limit < WIDEST * np.std(self.value) else math.inf
+        """Distance of the control limits from the centre; infinite if too few points give them."""
+        return self.limit if self.limit < MAX_LIMIT * np.std(self.value) else math.inf
 
     def shown(self, value: float) -> str:
-        """Write a value of it in the unit in which its usual value is read."""
+        """Format a value in the display unit of the centre line."""
         factor, unit = display_unit(abs(self.centre), self.unit)
         return f"{value / factor:#.4g} {unit}".strip()
 
 
 def summary_of(courses: Sequence[ControlChart]) -> Table:
-    """The spread of each quantity through the files."""
+    """Table of the distribution of each quantity over the files."""
     rows = [("answers", [f"{len(c.value)}" for c in courses])]
     for label, number in (("median", np.median), ("lowest", np.min), ("highest", np.max)):
         rows.append((label, [c.shown(float(number(c.value))) for c in courses]))
@@ -90,8 +88,8 @@ def summary_of(courses: Sequence[ControlChart]) -> Table:
     return labelled("Result", [c.label for c in courses], rows)
 
 
-def followed(kind: str, name: str | None = None) -> tuple[str, str]:
-    """A quantity of a kind and its unit; by default the first choice of the kind.
+def chart_quantity(kind: str, name: str | None = None) -> tuple[str, str]:
+    """Check a quantity of a kind of fit, and return it with its unit.
 
     Raises
     ------
@@ -100,58 +98,59 @@ def followed(kind: str, name: str | None = None) -> tuple[str, str]:
 
     Examples
     --------
-    >>> followed("lifetime")
+    >>> chart_quantity("lifetime")
     ('lifetime_mean', 'h')
     """
-    known, usual = FOLLOWED[kind]
-    name = name or usual
-    if name not in known:
-        raise InputError(f"--quantity {name}", nearest(name, list(known)))
-    return name, known[name]
+    quantities, default = CHARTED[kind]
+    name = name or default
+    if name not in quantities:
+        raise InputError(f"--quantity {name}", nearest(name, list(quantities)))
+    return name, quantities[name]
 
 
 def courses_of(batch: Batch, name: str | None = None) -> list[ControlChart]:
-    """Follow a quantity wherever the data determine it.
+    """Make the control charts of a quantity from all answers that determine it.
 
     Parameters
     ----------
     batch : Batch
-        Files in the order in which they are followed.
+        The batch; points are in the order of its files.
     name : str, optional
         Default: the normalised emittance or the mean lifetime.
 
     Returns
     -------
     list of ControlChart
-        One a plane and slice; limits are `control_limits` of the first 20 points, or of half of
-        them.
+        One for each plane and slice; limits are `control_limits` of the first 20 points, or of
+        half of them.
 
     Raises
     ------
     InputError
-        As `followed`.
+        As `chart_quantity`.
     """
-    name, unit = followed(batch.ledger.job.kind, name)
+    name, unit = chart_quantity(batch.ledger.job.kind, name)
     points: dict[str, list[tuple[str, int, float, float]]] = {}
-    for at, (of, file, value, error) in _points(batch, named(name, unit)):
-        points.setdefault(of, []).append((file, at, value, error))
+    for at, (plane, file, value, error) in _points(batch, quantity_columns(name, unit)):
+        points.setdefault(plane, []).append((file, at, value, error))
     found = []
-    for of, own in sorted(points.items()):
-        files, *numbers = zip(*own, strict=True)
+    for plane, plane_points in sorted(points.items()):
+        files, *numbers = zip(*plane_points, strict=True)
         at, value, error = map(np.array, numbers)
         limits = control_limits(value[: baseline(len(value))])
-        found.append(ControlChart(name, unit, of, list(files), at, value, error, *limits))
+        found.append(ControlChart(name, unit, plane, list(files), at, value, error, *limits))
     return found
 
 
 def _points(
     batch: Batch, columns: tuple[str, ...]
 ) -> Iterator[tuple[int, tuple[str, str, float, float]]]:
-    own = COLUMNS[batch.ledger.job.kind]
-    value, error = (own.index(column) for column in columns[:2])
-    words = [own.index(name) for name in ("slice", "plane") if name in own]
-    place = {file: i for i, file in enumerate(batch.files, start=1)}
+    """Points of all planes: position of the file; plane, file, value and error."""
+    names = COLUMNS[batch.ledger.job.kind]
+    value, error = (names.index(column) for column in columns[:2])
+    words = [names.index(name) for name in ("slice", "plane") if name in names]
+    positions = {file: i for i, file in enumerate(batch.files, start=1)}
     for row in csv.reader(raw.decode() for raw in batch.ledger.rows(batch.files)):
         if row[value] and row[error]:
-            of = " ".join(row[i] for i in words if row[i])
-            yield place[row[0]], (of, row[0], float(row[value]), float(row[error]))
+            plane = " ".join(row[i] for i in words if row[i])
+            yield positions[row[0]], (plane, row[0], float(row[value]), float(row[error]))

@@ -1,4 +1,4 @@
-"""Ledger of answered files: parts written whole beside the table, and the table made of them."""
+"""Ledger of answered files: parts, each written atomically, and the table made from them."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 
-from beamfit.batch.columns import COLUMNS, KEY, NUMBERS, UNUSABLE
+from beamfit.batch.columns import COLUMNS, KEY_COLUMNS, NUMBERS, UNUSABLE
 from beamfit.batch.job import Job
 from beamfit.errors import InputError
 from beamfit.io.files import digest_now
 from beamfit.writing import replacing, write_atomically
 
-# Rows converted from text to a table at a time, to bound the memory.
-BLOCK = 4096
+# Rows converted from text to a table at a time, to limit the memory.
+BLOCK_ROWS = 4096
 
 
 class RowRange(NamedTuple):
-    """Place of a file's rows (bytes of a part), their statuses, and the reason if refused."""
+    """Rows of a file: bytes in a part, statuses, and the reason if it is unusable."""
 
     part: Path
     start: int
@@ -35,14 +35,14 @@ class RowRange(NamedTuple):
 
 
 class Ledger:
-    """The answers to a job, in the folder beside the table they are for.
+    """Answers of a job, kept in a folder next to the table.
 
     Parameters
     ----------
     out : Path
-        The table; parts are in ``OUT.parts``, one a task, and never changed.
+        The table. Parts are in ``OUT.parts``, one for each task, and are never changed.
     job : Job
-        What is asked. Parts of other jobs are passed over.
+        The job; parts of other jobs are ignored.
     """
 
     def __init__(self, out: Path, job: Job) -> None:
@@ -51,50 +51,51 @@ class Ledger:
         self.columns = COLUMNS[job.kind]
         self.header = (",".join(self.columns) + "\n").encode()
         self.places: dict[str, RowRange] = {}
-        self._next = 0
+        self._next_number = 0
         try:
             self.folder.mkdir(exist_ok=True)
         except OSError as error:
             found = f"a place that cannot be written ({error.strerror})"
             raise InputError(found, "a folder for parts", path=self.folder) from None
         for part in sorted(self.folder.glob("[0-9]*.csv")):
-            self._next = int(part.name.split("-")[0]) + 1
-            self._learn(part, part.read_bytes())
+            self._next_number = int(part.name.split("-")[0]) + 1
+            self._index_part(part, part.read_bytes())
 
-    def answered(self, file: str) -> bool:
-        """True if this job has answered the same file before."""
+    def has_answer(self, file: str) -> bool:
+        """True if the job has an answer for a file with the present content."""
         place = self.places.get(file)
         try:
             return place is not None and place.sha256 == digest_now(file)
         except InputError:
             return False
 
-    def keep(self, text: str) -> None:
-        """Write a part."""
+    def add_part(self, text: str) -> None:
+        """Write a part, and index it."""
         content = self.header + text.encode("utf-8", "replace")
-        name = f"{self._next:08d}-{hashlib.sha256(content).hexdigest()[:16]}.csv"
-        part, self._next = self.folder / name, self._next + 1
+        name = f"{self._next_number:08d}-{hashlib.sha256(content).hexdigest()[:16]}.csv"
+        part, self._next_number = self.folder / name, self._next_number + 1
         write_atomically(part, content)
-        self._learn(part, content)
+        self._index_part(part, content)
 
-    def _learn(self, part: Path, content: bytes) -> None:
+    def _index_part(self, part: Path, content: bytes) -> None:
+        """Record where the rows of each file are in a part, if they belong to this job."""
         if not content.startswith(self.header):
             return
-        found: dict[str, RowRange] = {}
-        status, at = self.columns.index("status"), len(self.header)
-        for raw in content[at:].splitlines(keepends=True):
+        ranges: dict[str, RowRange] = {}
+        status, position = self.columns.index("status"), len(self.header)
+        for raw in content[position:].splitlines(keepends=True):
             row = next(csv.reader([raw.decode()]))
-            end = at + len(raw)
-            if tuple(row[2 : len(KEY)]) == self.job.key:
-                before = found.get(row[0], RowRange(part, at, at, row[1], ()))
-                reason = row[status + 1] if row[status] == UNUSABLE else before.reason
-                statuses = (*before.statuses, sys.intern(row[status]))
-                found[row[0]] = before._replace(end=end, statuses=statuses, reason=reason)
-            at = end
-        self.places |= found
+            end = position + len(raw)
+            if tuple(row[2 : len(KEY_COLUMNS)]) == self.job.key:
+                row_range = ranges.get(row[0], RowRange(part, position, position, row[1], ()))
+                reason = row[status + 1] if row[status] == UNUSABLE else row_range.reason
+                statuses = (*row_range.statuses, sys.intern(row[status]))
+                ranges[row[0]] = row_range._replace(end=end, statuses=statuses, reason=reason)
+            position = end
+        self.places |= ranges
 
     def rows(self, files: Iterable[str]) -> Iterator[bytes]:
-        """The lines of some files, in their order."""
+        """Lines of CSV of files, in their order."""
         part, stream = None, io.BytesIO()
         for file in files:
             place = self.places[file]
@@ -104,24 +105,27 @@ class Ledger:
             yield from stream.read(place.end - place.start).splitlines(keepends=True)
 
     def write(self, files: Iterable[str]) -> None:
-        """Write the table of some files, in their order."""
+        """Write the table of files, in their order."""
         blocks = _blocks(self.rows(files))
         with replacing(self.out) as stream:
             WRITERS[self.out.suffix.lower()](stream, self.job.kind, blocks)
 
 
 def _blocks(found: Iterator[bytes]) -> Iterator[bytes]:
-    while block := b"".join(islice(found, BLOCK)):
+    """Join rows to blocks of `BLOCK_ROWS`."""
+    while block := b"".join(islice(found, BLOCK_ROWS)):
         yield block
 
 
 def _csv(stream: BinaryIO, kind: str, blocks: Iterator[bytes]) -> None:
+    """Write blocks of rows as CSV."""
     stream.write((",".join(COLUMNS[kind]) + "\n").encode())
     for block in blocks:
         stream.write(block)
 
 
 def _parquet(stream: BinaryIO, kind: str, blocks: Iterator[bytes]) -> None:
+    """Write blocks of rows as Parquet."""
     import pyarrow as arrow
     from pyarrow import csv as arrow_csv
     from pyarrow import parquet
@@ -136,19 +140,21 @@ def _parquet(stream: BinaryIO, kind: str, blocks: Iterator[bytes]) -> None:
 
 
 def _hdf5(stream: BinaryIO, kind: str, blocks: Iterator[bytes]) -> None:
+    """Write blocks of rows as HDF5, one dataset for each column."""
     import h5py
 
     with h5py.File(stream, "w") as store:
         for name in COLUMNS[kind]:
             dtype = float if name in NUMBERS[kind] else h5py.string_dtype()
-            store.create_dataset(name, (0,), dtype, maxshape=(None,), chunks=(BLOCK,))
+            store.create_dataset(name, (0,), dtype, maxshape=(None,), chunks=(BLOCK_ROWS,))
         for block in blocks:
             columns = zip(*csv.reader(io.StringIO(block.decode())), strict=True)
             for name, cells in zip(COLUMNS[kind], columns, strict=True):
-                _append(store[name], cells)
+                _append_cells(store[name], cells)
 
 
-def _append(data: Any, cells: tuple[str, ...]) -> None:
+def _append_cells(data: Any, cells: tuple[str, ...]) -> None:
+    """Append cells to a dataset; empty numbers are NaN."""
     before = len(data)
     data.resize((before + len(cells),))
     numbers = data.dtype == float

@@ -1,4 +1,4 @@
-"""A batch: files in, a table of answers out, in this process or on a Dask cluster."""
+"""Run a batch: fit many files, here or on a Dask cluster, and write the table of answers."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from beamfit.writing import alone, check_place
 if TYPE_CHECKING:
     from distributed import Client
 
-# Files in a task: handing out a task costs milliseconds, about as much as fitting a file.
-TASK = 256
-# Seconds to wait for an answer.
-PATIENCE = 10.0
-SUFFIXES = {
+# Files per task: submitting a task takes milliseconds, about as long as fitting a file.
+FILES_PER_TASK = 256
+# Timeout for the scheduler and for results, s.
+TIMEOUT = 10.0
+FILE_SUFFIXES = {
     "emittance": (".csv", ".txt", ".h5", ".hdf5", ".mat", ".tfs"),
     "lifetime": (".csv", ".txt", ".h5", ".hdf5", ".json"),
 }
-INSTALL = "the extra: pip install 'beamfit[batch]'"
+INSTALL_HINT = "the extra: pip install 'beamfit[batch]'"
 
 
 class Batch(NamedTuple):
@@ -36,15 +36,15 @@ class Batch(NamedTuple):
     Attributes
     ----------
     files : tuple of str
-        All, in the order of the table.
+        All files, in the order of the table.
     new : int
-        How many were answered now; the others had been before.
+        Number of files fitted in this run; the others were answered before.
     statuses : dict of str to int
-        How many answers have each status.
+        Number of answers with each status.
     refused : dict of str to str
-        Why a file has none.
+        Reason for each file without an answer.
     ledger : Ledger
-        Where the rows are.
+        The rows.
     """
 
     files: tuple[str, ...]
@@ -54,30 +54,32 @@ class Batch(NamedTuple):
     ledger: Ledger
 
 
-def files_of(paths: Iterable[str], kind: str) -> tuple[str, ...]:
-    """Files, and those of a kind in folders and their folders, by name; each once.
+def find_files(paths: Iterable[str], kind: str) -> tuple[str, ...]:
+    """List files, and files of a kind in folders and their sub-folders, each once.
 
     Raises
     ------
     InputError
-        If there are none. One that is missing beside others is answered as `unusable`.
+        If there are none. A single missing file among others is answered as `unusable`.
     """
     found: dict[str, None] = {}
     for path in paths:
         if Path(path).is_dir():
-            inside = sorted(p for p in Path(path).rglob("*") if p.suffix.lower() in SUFFIXES[kind])
+            inside = sorted(
+                p for p in Path(path).rglob("*") if p.suffix.lower() in FILE_SUFFIXES[kind]
+            )
             found |= dict.fromkeys(str(p) for p in inside if _is_input(p.relative_to(path)))
         else:
             found[path] = None
     if not any(Path(file).exists() for file in found):
-        expected = f"files ending in {', '.join(SUFFIXES[kind])}"
+        expected = f"files ending in {', '.join(FILE_SUFFIXES[kind])}"
         raise InputError("no files", expected, path=next(iter(paths), None))
     return tuple(found)
 
 
-def _is_input(inside: Path) -> bool:
-    """True if a file in a folder is neither hidden nor a part of an earlier batch."""
-    return not any(part.startswith(".") or part.endswith(".parts") for part in inside.parts)
+def _is_input(path: Path) -> bool:
+    """True if a path in a folder is neither hidden nor a part of an earlier batch."""
+    return not any(part.startswith(".") or part.endswith(".parts") for part in path.parts)
 
 
 def run_batch(
@@ -89,23 +91,23 @@ def run_batch(
     scheduler: str | None = None,
     progress: Callable[[int, int], None] = lambda done, of: None,
 ) -> Batch:
-    """Answer for many files, and write a table of the answers.
+    """Fit many files, and write a table of the answers.
 
     Parameters
     ----------
     paths : sequence of str
-        Files, and folders of files.
+        Files and folders.
     out : str
-        The table: ``.csv``, ``.h5`` or ``.parquet``. Parts of it are kept in ``OUT.parts`` as they
-        are answered: a run that was stopped goes on from there, and so does one with new files.
+        The table: ``.csv``, ``.h5`` or ``.parquet``. Answers are kept in ``OUT.parts``, from which
+        a run that was stopped, or one with new files, continues.
     job : Job
-        What is asked.
+        The fit of each file.
     workers : int, optional
         Processes of a Dask cluster on this machine; None answers in this process.
     scheduler : str, optional
         Address of a Dask scheduler, such as "tcp://host:8786", whose workers see the files.
     progress : callable
-        Is told how many files are answered, and of how many.
+        Called with the number of answered files and the number of all files.
 
     Returns
     -------
@@ -114,7 +116,7 @@ def run_batch(
     Raises
     ------
     InputError
-        If there are no files, the place cannot be written, another run writes there, or a package
+        If there are no files, the table cannot be written, another run is writing it, or a package
         or the scheduler is missing.
 
     Examples
@@ -128,27 +130,27 @@ def run_batch(
     (2, {'unusable': 2})
     """
     target = Path(out)
-    _check(target, workers, scheduler)
-    files = tuple(f for f in files_of(paths, job.kind) if Path(f) != target)
+    _check_request(target, workers, scheduler)
+    files = tuple(f for f in find_files(paths, job.kind) if Path(f) != target)
     with alone(target):
         ledger = Ledger(target, job)
-        left = [file for file in files if not ledger.answered(file)]
-        progress(len(files) - len(left), len(files))
-        tasks = [left[i : i + TASK] for i in range(0, len(left), TASK)]
-        done = len(files) - len(left)
+        pending = [file for file in files if not ledger.has_answer(file)]
+        progress(len(files) - len(pending), len(files))
+        tasks = [pending[i : i + FILES_PER_TASK] for i in range(0, len(pending), FILES_PER_TASK)]
+        done = len(files) - len(pending)
         for task, text in _answers(job, tasks, workers, scheduler):
-            ledger.keep(text)
+            ledger.add_part(text)
             done += len(task)
             progress(done, len(files))
         ledger.write(files)
     places = [ledger.places[file] for file in files]
     statuses = Counter(status for place in places for status in place.statuses)
     refused = {f: p.reason for f, p in zip(files, places, strict=True) if p.reason}
-    return Batch(files, len(left), dict(statuses.most_common()), refused, ledger)
+    return Batch(files, len(pending), dict(statuses.most_common()), refused, ledger)
 
 
-def _check(out: Path, workers: int | None, scheduler: str | None) -> None:
-    """Find out before anything is computed whether it can be done."""
+def _check_request(out: Path, workers: int | None, scheduler: str | None) -> None:
+    """Check the request before anything is computed."""
     check_place(out)
     if out.suffix.lower() not in WRITERS:
         raise InputError(f"a table '{out}'", f"a name ending in {', '.join(WRITERS)}")
@@ -160,83 +162,84 @@ def _check(out: Path, workers: int | None, scheduler: str | None) -> None:
         if workers is not None or scheduler is not None:
             import distributed  # noqa: F401
     except ImportError as error:
-        raise InputError(f"no package {error.name}", INSTALL) from None
+        raise InputError(f"no package {error.name}", INSTALL_HINT) from None
 
 
 def _answers(
     job: Job, tasks: Sequence[list[str]], workers: int | None, scheduler: str | None
 ) -> Iterator[tuple[list[str], str]]:
+    """Fit tasks, in this process or on a cluster; yield each with its rows when it is completed."""
     if not tasks or (workers is None and scheduler is None):
         yield from ((task, job.answer(task)) for task in tasks)
         return
     import dask
     from distributed import Client, LocalCluster
 
-    # A task that waits at a worker is held for its death, too.
-    one_each = {
+    # One task per worker: a task queued at a worker counts as lost, too, when the worker dies.
+    dask_config = {
         "distributed.scheduler.worker-saturation": 1.0,
-        "distributed.worker.profile.enabled": False,  # 100 looks a second at each worker
+        "distributed.worker.profile.enabled": False,  # it samples each worker 100 times per second
         "distributed.admin.tick.interval": "1s",
         "distributed.admin.system-monitor.interval": "10s",
         "distributed.worker.memory.monitor-interval": "5s",
     }
-    own = {"threads_per_worker": 1, "dashboard_address": None, "processes": True}
-    own["silence_logs"] = logging.CRITICAL  # what a worker died of is told by its file
+    cluster_options = {"threads_per_worker": 1, "dashboard_address": None, "processes": True}
+    cluster_options["silence_logs"] = logging.CRITICAL  # a worker that dies is reported by its file
     with ExitStack() as stack:
-        stack.enter_context(dask.config.set(one_each))
+        stack.enter_context(dask.config.set(dask_config))
         cluster = scheduler
         if workers is not None:
-            cluster = stack.enter_context(LocalCluster(n_workers=workers, **own))
+            cluster = stack.enter_context(LocalCluster(n_workers=workers, **cluster_options))
         try:
-            client = stack.enter_context(Client(cluster, timeout=PATIENCE))
+            client = stack.enter_context(Client(cluster, timeout=TIMEOUT))
         except OSError:
             raise InputError(f"no scheduler at {scheduler}", "tcp://HOST:PORT of one") from None
         try:
-            yield from _spread(client, job, iter(tasks), workers)
+            yield from _distribute(client, job, iter(tasks), workers)
         except CancelledError:
             expected = "one that stays; the same command goes on from here"
             raise InputError("a scheduler that went away", expected) from None
 
 
-def _spread(
+def _distribute(
     client: Client, job: Job, tasks: Iterator[list[str]], workers: int | None
 ) -> Iterator[tuple[list[str], str]]:
-    """Hand out tasks, some ahead of the workers, and give what comes back as it does.
+    """Submit tasks, some in advance, and yield the results as they are completed.
 
-    A task that several workers died of is cut in two, until a file is alone; such files are tried
-    once more with nothing beside them, at the end.
+    A task that killed several workers is split in two, down to single files; these are tried once
+    more at the end, with nothing else running.
     """
     from distributed import KilledWorker, wait
 
-    given: dict[Any, list[str]] = {}
+    running: dict[Any, list[str]] = {}
     suspects: list[list[str]] = []
-    waited = 0
+    timeouts = 0
 
-    def hand_out(few: Iterable[list[str]]) -> bool:
-        given.update((client.submit(job.answer, task, pure=False), task) for task in few)
-        return bool(given)
+    def hand_out(new_tasks: Iterable[list[str]]) -> bool:
+        running.update((client.submit(job.answer, task, pure=False), task) for task in new_tasks)
+        return bool(running)
 
     # Three tasks for each worker, so that none waits for the scheduler.
     hand_out(islice(tasks, 3 * max(len(client.ncores()), 1)))
-    while given or hand_out([suspects.pop()] if suspects else []):
+    while running or hand_out([suspects.pop()] if suspects else []):
         try:
-            future = next(iter(wait(list(given), PATIENCE, "FIRST_COMPLETED").done))
-            text = future.result(PATIENCE)
-        except TimeoutError:  # also where what was found died with its worker
-            waited = waited + 1 if workers and len(client.ncores()) < workers else 0
-            if waited == 3:  # one that dies as it starts is not started again
+            future = next(iter(wait(list(running), TIMEOUT, "FIRST_COMPLETED").done))
+            text = future.result(TIMEOUT)
+        except TimeoutError:  # also if the result was lost with its worker
+            timeouts = timeouts + 1 if workers and len(client.ncores()) < workers else 0
+            if timeouts == 3:  # a worker that dies at its start is not restarted
                 client.cluster.scale(len(client.cluster.workers) + 1)
-                waited = 0
+                timeouts = 0
             continue
         except KilledWorker:
-            task = given.pop(future)
+            task = running.pop(future)
             half = len(task) // 2
-            if half or given:
+            if half or running:
                 hand_out([task[:half], task[half:]] if half else [])
                 suspects += [] if half else [task]
                 continue
             text = job.refused(task[0], "ended the process that read it")
         else:
-            task = given.pop(future)
+            task = running.pop(future)
         yield task, text
         hand_out(islice(tasks, 1))

@@ -74,9 +74,9 @@ def batch(
     part = {n: told[n] for n in ("use", "energy", "particle", "first", "last", "screen")}
     reading = {n: told[n] for n in ("columns", "ignore", "skip_bad")}
     _check_kind(kind, {"lattice": lattice, "noise": noise, "learn-noise": learned} | part)
-    from beamfit.batch.course import courses_of, followed, summary_of
+    from beamfit.batch.course import chart_quantity, courses_of, summary_of
 
-    followed(kind, quantity)  # says so before hours of work if there is none
+    chart_quantity(kind, quantity)  # says so before hours of work if there is none
     if learned is not None:
         check_place(learned)
     job = beamfit.Job(kind, lattice, part, reading, weights, noise=noise)

@@ -11,7 +11,7 @@ import beamfit
 from beamfit.answer import text_of
 from beamfit.cli.options import Command, Output, command_line, options
 from beamfit.errors import InputError
-from beamfit.io.check import Understood, proposed_layout, with_lattice
+from beamfit.io.check import FileSummary, proposed_layout, with_lattice
 from beamfit.io.columns import Layout
 from beamfit.io.result import results_text
 
@@ -33,7 +33,7 @@ def check(files: tuple[str, ...], output: Output, **reading: Any) -> None:
     given beside it has what it names. All files are gone through; one that cannot be used gives
     its line, and exit status 2; where columns are not understood, a layout for them is proposed.
     """
-    found: list[Understood] = []
+    found: list[FileSummary] = []
     wrong: list[tuple[str, InputError]] = []
     layouts: list[str] = []
     for path in dict.fromkeys(files):
@@ -66,13 +66,13 @@ def _proposed(path: str, columns: Layout | None) -> str | None:
         return None
 
 
-def _on_all(scan: Understood, lattices: list[Understood]) -> Understood:
+def _on_all(scan: FileSummary, lattices: list[FileSummary]) -> FileSummary:
     for lattice in lattices:
         scan = with_lattice(scan, lattice)
     return scan
 
 
-def _show(found: list[Understood]) -> None:
+def _show(found: list[FileSummary]) -> None:
     """Print a table for each file, and its oddities below."""
     for each in found:
         click.echo("\n".join([text_of(each.table()), *(f"Note: {n}" for n in each.notes), ""]))

@@ -1,4 +1,4 @@
-"""Files of SLAC's emittance_gui: a scan or several monitors, with its matrices and size methods."""
+"""Read MATLAB files of SLAC's emittance_gui: quadrupole scans and multi-monitor measurements."""
 
 from __future__ import annotations
 
@@ -16,25 +16,25 @@ import numpy as np
 from beamfit.emittance.scan import PLANES, POSSIBLE, Profile, QuadScan, at_rows
 from beamfit.emittance.shots import average_shots
 from beamfit.errors import InputError, nearest
-from beamfit.io.files import digest, laid_out, name_of
+from beamfit.io.files import digest, name_of, structure_errors
 from beamfit.io.isolated import matlab_variables
 from beamfit.io.lattice import LatticeFile
-from beamfit.io.shots import FEWEST_SETTINGS
+from beamfit.io.shots import MIN_SETTINGS
 from beamfit.quantity import Quantity
 
-# GeV, of files that have none; the electron's is the only particle there.
-USUAL_ENERGY = 0.135
-# The size method that answers unless another is asked for.
-USUAL_METHOD = "RMS"
-# Numbers in `stats`: of the planes in µm, and the sum of the counts.
+# Energy of files that give none, GeV: that of the program. Its particle is always the electron.
+DEFAULT_ENERGY = 0.135
+# Default size method.
+DEFAULT_METHOD = "RMS"
+# Order of the numbers in `stats`: positions, sizes (µm), correlation, sum of the counts.
 STATS = ("middle x", "middle y", "x", "y", "correlation", "sum")
-# A shot with less of the usual light than this shows no beam: light follows the charge, and a pulse
-# of a tenth of the charge is not the beam whose emittance is asked for. Missed pulses have 1e-3.
-LEAST_LIGHT = 0.1
-# Relative: a mean that differs by more is another one, and not rounded otherwise.
-ROUNDED = 1e-6
-# Shots and sizes that are odd, of which so many are named.
-MOST_NAMED = 4
+# A shot with less than this share of the median light has no beam: light is proportional to charge,
+# and a pulse of a tenth of the charge is another beam. Missed pulses have about 1e-3.
+MIN_LIGHT = 0.1
+# Relative difference of mean sizes above which they are not the same mean but for rounding.
+MEAN_TOLERANCE = 1e-6
+# Omitted shots that a note lists; more are counted.
+MAX_LISTED = 4
 MATLAB, VARIABLE = ".mat", "data"
 EXPECTED = "a file saved by emittance_gui"
 
@@ -46,16 +46,16 @@ class EmittanceGuiFile:
     Attributes
     ----------
     scans : dict of str to QuadScan
-        Size method to the scan that its shots give, with the rows' own matrices.
+        Scan made from the shots, by size method; rows have their own matrices.
     means : dict of str to QuadScan
-        Size method to the scan by the file's own mean sizes and their standard errors, from which
-        its emittances were computed.
+        Scan made from the stored mean sizes and standard errors, by size method. The program
+        computed its emittances from these.
     stored : dict of str to dict of str to Quantity
-        Method and plane to the normalised emittance that the program found, m.
+        Normalised emittance of the program, m, by method and plane.
     lattice : LatticeFile
-        The energy, the monitor, and the design Twiss parameters where the matrices begin.
+        Energy, monitors, and design Twiss parameters at the start of the matrices.
     left_out : dict of str to str
-        Size methods that give no scan, and why.
+        Reason why a size method gives no scan.
     """
 
     scans: Mapping[str, QuadScan]
@@ -65,7 +65,7 @@ class EmittanceGuiFile:
     left_out: Mapping[str, str] = field(default_factory=dict)
 
     def scan(self, method: str | None = None) -> QuadScan:
-        """The scan of a size method: "RMS" or, where there is none, the first.
+        """Scan of a size method; by default "RMS" or, without it, the first.
 
         Raises
         ------
@@ -73,7 +73,8 @@ class EmittanceGuiFile:
             If there is no such method, or it gives no scan.
         """
         names = list(self.scans)
-        wanted = (USUAL_METHOD if USUAL_METHOD in names else names[0]) if method is None else method
+        default = DEFAULT_METHOD if DEFAULT_METHOD in names else names[0]
+        wanted = default if method is None else method
         if wanted in self.left_out:
             expected = f"a size method with three settings or more: {', '.join(names)}"
             raise InputError(
@@ -86,7 +87,7 @@ class EmittanceGuiFile:
 
 
 def is_emittance_gui(path: str | PathLike[str]) -> bool:
-    """Tell a file of emittance_gui from others: MATLAB's by its name, and no table of vectors."""
+    """True if a file is a MATLAB file by its name, and no table of vectors."""
     if Path(path).suffix.lower() != MATLAB:
         return False
     return set(matlab_variables(path, VARIABLE)) <= {VARIABLE}
@@ -103,15 +104,15 @@ def read_emittance_gui(path: str | PathLike[str]) -> EmittanceGuiFile:
     Returns
     -------
     EmittanceGuiFile
-        Errors of the sizes are standard errors over the shots. The notes of each scan name what
-        was left out: settings that failed, were taken out (``status``, ``use``) or never taken,
-        shots without beam or size, and planes and methods that then have too few settings.
+        Errors of the sizes are standard errors over the shots. The notes of each scan list
+        omissions: settings that failed, were deselected (``status``, ``use``) or not taken, shots
+        without beam or size, and planes and methods with too few settings.
 
     Raises
     ------
     InputError
-        If it is another file, is damaged, lacks sizes or matrices, or no size method has three
-        settings.
+        If the file is of another kind or damaged, lacks sizes or matrices, or no size method has
+        three settings.
 
     Examples
     --------
@@ -124,13 +125,14 @@ def read_emittance_gui(path: str | PathLike[str]) -> EmittanceGuiFile:
             f"a struct '{VARIABLE}' of emittance_gui, or vectors Q2_A, size_x_um, one a column"
         )
         raise InputError(f"no variable '{VARIABLE}'", expected, path)
-    source = _Fields(path, found[VARIABLE])
-    with laid_out(path, "a struct 'data' that is laid out otherwise", EXPECTED, named=True):
-        return _read(source)
+    source = _Struct(path, found[VARIABLE])
+    unlike = "a struct 'data' that is laid out otherwise"
+    with structure_errors(path, unlike, EXPECTED, with_cause=True):
+        return _read_struct(source)
 
 
-class _Fields(dict[str, np.ndarray]):
-    """The fields of the struct that are not empty, each as the array it is."""
+class _Struct(dict[str, np.ndarray]):
+    """Non-empty fields of the struct, as arrays."""
 
     def __init__(self, path: str | PathLike[str], data: Any) -> None:
         if data.dtype.names is None or data.size != 1:
@@ -148,7 +150,7 @@ class _Fields(dict[str, np.ndarray]):
         return self[field]
 
     def numbers(self, field: str, n: int | None = None) -> np.ndarray:
-        """A field of finite numbers, flat; of n of them if that is said."""
+        """Field of finite numbers, flat; of n numbers if n is given."""
         value = self.need(field)
         if value.dtype.kind not in "iuf" or not np.isfinite(value).all():
             raise self.error("something else than finite numbers", field)
@@ -156,85 +158,86 @@ class _Fields(dict[str, np.ndarray]):
             raise self.error(f"{value.size} numbers for {n} settings", field)
         return value.ravel().astype(float)
 
-    def number(self, field: str, usual: float) -> float:
-        return float(self.numbers(field, 1)[0]) if field in self else usual
+    def number(self, field: str, default: float) -> float:
+        return float(self.numbers(field, 1)[0]) if field in self else default
 
     def texts(self, field: str) -> list[str]:
         return [_text(value) for value in self[field].ravel()] if field in self else []
 
-    def text(self, field: str, usual: str = "") -> str:
-        return _text(self.get(field)) or usual
+    def text(self, field: str, default: str = "") -> str:
+        return _text(self.get(field)) or default
 
 
 def _text(value: Any) -> str:
-    """A text out of the arrays of one that MATLAB makes of it."""
+    """Text inside nested arrays of one element, as MATLAB stores it."""
     while isinstance(value, np.ndarray) and value.size == 1:
         value = value.ravel()[0]
     return str(value).strip() if isinstance(value, str) else ""
 
 
-def _read(source: _Fields) -> EmittanceGuiFile:
-    beams = _beams(source)
-    used, n = _used(source, len(beams))
+def _read_struct(source: _Struct) -> EmittanceGuiFile:
+    """Read the struct: scans of all size methods, stored results, and the lattice."""
+    beams = _shot_records(source)
+    used, n = _used_settings(source, len(beams))
     beams, lattice = beams[used], _lattice(source, n)
-    settings, dark = _settings(source, used, n, lattice), _without_beam(source, beams)
+    settings, dark = _settings(source, used, n, lattice), _dark_shots(source, beams)
     notes = [*settings.notes]
     if dark.any():
-        named = _shots(dark, settings.labels)
-        notes.append(f"Left out for less than a tenth of the usual light, so no beam: {named}.")
+        dark_list = _shot_list(dark, settings.labels)
+        notes.append(f"Left out for less than a tenth of the usual light, so no beam: {dark_list}.")
     scans, means, left_out = {}, {}, {}
-    names = [_method(beams[:, :, k], k) for k in range(beams.shape[2])]
+    names = [_method_name(beams[:, :, k], k) for k in range(beams.shape[2])]
     for k, name in enumerate(names):
-        each = {p: np.where(dark, np.nan, _sizes(beams[:, :, k], p)) for p in PLANES}
-        own, error = (_own(source, part, used, k) for part in ("beam", "beamStd"))
-        called = f"{Path(name_of(source.path)).stem}, {name} sizes"
-        if (mean := _scan(settings, own, error, called)) is not None:
+        sizes = {p: np.where(dark, np.nan, _sizes(beams[:, :, k], p)) for p in PLANES}
+        mean_sizes, error = (_stored_sizes(source, part, used, k) for part in ("beam", "beamStd"))
+        scan_name = f"{Path(name_of(source.path)).stem}, {name} sizes"
+        if (mean := _make_scan(settings, mean_sizes, error, scan_name)) is not None:
             means[name] = replace(mean, error_source="the file")
-        alone = error if beams.shape[1] == 1 else {}
+        shot_errors = error if beams.shape[1] == 1 else {}
         profiles = _profiles(beams, k)
-        if (scan := _scan(settings, each, alone, called, profiles)) is None:
-            left_out[name] = _counted(each, settings.labels)
+        if (scan := _make_scan(settings, sizes, shot_errors, scan_name, profiles)) is None:
+            left_out[name] = _settings_text(sizes, settings.labels)
             continue
-        said = (*notes, *_notes(each, dark, own, settings.labels))
-        scans[name] = replace(average_shots(scan, marked=True), notes=said)
+        scan_notes = (*notes, *_omission_notes(sizes, dark, mean_sizes, settings.labels))
+        scans[name] = replace(average_shots(scan, marked=True), notes=scan_notes)
     if not scans:
         raise source.error(f"sizes with {next(iter(left_out.values()))}", "beamList")
-    gone = tuple(f"No {name} sizes: {why}." for name, why in left_out.items())
-    scans = {name: replace(scan, notes=scan.notes + gone) for name, scan in scans.items()}
-    return EmittanceGuiFile(scans, means, _stored(source, names), lattice, left_out)
+    method_notes = tuple(f"No {name} sizes: {why}." for name, why in left_out.items())
+    scans = {name: replace(scan, notes=scan.notes + method_notes) for name, scan in scans.items()}
+    return EmittanceGuiFile(scans, means, _stored_emittances(source, names), lattice, left_out)
 
 
-def _beams(source: _Fields) -> np.ndarray:
-    """Records of the beam by setting, shot and method."""
-    field, usual = ("beamList", 3) if "beamList" in source else ("beam", 2)
+def _shot_records(source: _Struct) -> np.ndarray:
+    """Records of the beam: shape (settings, shots, methods)."""
+    field, dimensions = ("beamList", 3) if "beamList" in source else ("beam", 2)
     beams = source.need(field)
     if beams.dtype.names is None or "stats" not in beams.dtype.names:
         raise source.error("no sizes", field)
-    if beams.ndim != usual:
+    if beams.ndim != dimensions:
         found = f"sizes of shape {beams.shape}, as of slices"
         expected = "a scan of the whole beam; write the sizes of a slice as CSV, with r11_x, ..."
         raise InputError(found, expected, source.path, column=field)
-    return beams if usual == 3 else beams[:, None, :]
+    return beams if dimensions == 3 else beams[:, None, :]
 
 
-def _used(source: _Fields, taken: int) -> tuple[np.ndarray, int]:
-    """Numbers of the settings that were taken and count, and how many there were to be."""
-    word = "monitors" if _of_several(source) else "settings"
+def _used_settings(source: _Struct, n_taken: int) -> tuple[np.ndarray, int]:
+    """Indices of the settings that were taken and selected, and the number planned."""
+    noun = "monitors" if _has_monitors(source) else "settings"
     marks = [field for field in ("status", "use") if field in source]
-    n = max(taken, *(source[field].size for field in marks), 0)
-    used = np.arange(n) < taken
+    n = max(n_taken, *(source[field].size for field in marks), 0)
+    used = np.arange(n) < n_taken
     for mark in marks:
         used &= source.numbers(mark, n) > 0
-    if used.sum() < FEWEST_SETTINGS:
-        found = f"{used.sum()} of {n} {word} taken and in use"
+    if used.sum() < MIN_SETTINGS:
+        found = f"{used.sum()} of {n} {noun} taken and in use"
         raise InputError(found, "at least three: the beam matrix has three numbers", source.path)
     return np.flatnonzero(used), n
 
 
 class _Settings(NamedTuple):
-    """Settings, or monitors, that count: columns of a `QuadScan` with a row each, and their names.
+    """Settings or monitors in use: columns of a `QuadScan` with one row each, and their labels.
 
-    ``about`` is what a `QuadScan` has but once.
+    ``about`` has the other fields of a `QuadScan`.
     """
 
     columns: dict[str, Any]
@@ -243,7 +246,8 @@ class _Settings(NamedTuple):
     notes: tuple[str, ...]
 
 
-def _settings(source: _Fields, used: np.ndarray, n: int, lattice: LatticeFile) -> _Settings:
+def _settings(source: _Struct, used: np.ndarray, n: int, lattice: LatticeFile) -> _Settings:
+    """Settings or monitors in use, with their transfer matrices."""
     cells = source.need("rMatrix").ravel()
     if len(cells) <= used.max():
         raise source.error(f"{len(cells)} matrices for {n} settings", "rMatrix")
@@ -257,7 +261,7 @@ def _settings(source: _Fields, used: np.ndarray, n: int, lattice: LatticeFile) -
         "energy": np.full(len(used), lattice.energy),
         "transfer": {"x": r[:, 0, [0, 1, 5]], "y": r[:, 2, [2, 3, 5]]},
     }
-    if _of_several(source):
+    if _has_monitors(source):
         names = _monitors(source, n)
         labels = [names[i] for i in used]
         columns["screen"] = tuple(labels)
@@ -265,10 +269,12 @@ def _settings(source: _Fields, used: np.ndarray, n: int, lattice: LatticeFile) -
         magnet = source.text("quadName", "quadrupole")
         columns["settings"] = {magnet: source.numbers("quadVal", n)[used]}
         labels = [f"{kg:.5g} kG" for kg in columns["settings"][magnet]]
-    left = n - len(used)
-    notes = [f"{left} of {n} settings failed or were not taken or used (status, use)."] * (left > 0)
+    n_omitted = n - len(used)
+    notes = []
+    if n_omitted:
+        notes.append(f"{n_omitted} of {n} settings failed or were not taken or used (status, use).")
     if "energy" not in source:
-        notes.append(f"The file has no energy; {1e3 * USUAL_ENERGY:g} MeV is taken, as there.")
+        notes.append(f"The file has no energy; {1e3 * DEFAULT_ENERGY:g} MeV is taken, as there.")
     about = {
         "units": dict.fromkeys(columns["settings"], "kG"),
         "path": source.path,
@@ -278,151 +284,154 @@ def _settings(source: _Fields, used: np.ndarray, n: int, lattice: LatticeFile) -
     return _Settings(columns, labels, about, tuple(notes))
 
 
-def _of_several(source: _Fields) -> bool:
-    """Tell a file of several monitors at one setting from a scan."""
+def _has_monitors(source: _Struct) -> bool:
+    """True for a measurement with several monitors at one setting."""
     return source.text("type") == "multi"
 
 
-def _monitors(source: _Fields, n: int) -> list[str]:
-    """The monitor of each of n sizes, or the one of all."""
-    named = source.texts("name") or [""]
-    if _of_several(source) and len(named) != n:
+def _monitors(source: _Struct, n: int) -> list[str]:
+    """Name of the monitor of each of n sizes; of a scan, one name."""
+    names = source.texts("name") or [""]
+    if _has_monitors(source) and len(names) != n:
         return [f"monitor {i + 1}" for i in range(n)]
-    return [name or "screen" for name in (named if _of_several(source) else named[:1])]
+    return [name or "screen" for name in (names if _has_monitors(source) else names[:1])]
 
 
-def _provenance(source: _Fields) -> list[str]:
-    said = [f"emittance_gui, {source.text('type', 'scan')}"]
+def _provenance(source: _Struct) -> list[str]:
+    """Provenance lines: program, monitor, quadrupole, date, charge."""
+    lines = [f"emittance_gui, {source.text('type', 'scan')}"]
     for word, name in (("monitor", "name"), ("quadrupole", "quadName")):
-        if named := ", ".join(source.texts(name)):
-            said.append(f"{word} {named}")
+        if text := ", ".join(source.texts(name)):
+            lines.append(f"{word} {text}")
     if 366 < (days := source.number("ts", 0.0)) < 1e6:  # MATLAB counts days from the year 0
-        said.append(f"{datetime(1, 1, 1) + timedelta(days=days - 367):%Y-%m-%d %H:%M:%S}")
+        lines.append(f"{datetime(1, 1, 1) + timedelta(days=days - 367):%Y-%m-%d %H:%M:%S}")
     if "charge" in source:
-        said.append(f"charge {source.number('charge', 0.0):.3g} nC")
-    return said
+        lines.append(f"charge {source.number('charge', 0.0):.3g} nC")
+    return lines
 
 
-def _method(beams: np.ndarray, k: int) -> str:
-    """The name of a size method, from any shot that has it."""
-    named = (_text(v) for v in beams["method"].ravel()) if "method" in beams.dtype.names else ()
-    return next((name for name in named if name), f"method {k + 1}")
+def _method_name(beams: np.ndarray, k: int) -> str:
+    """Name of a size method, from the first shot that has one."""
+    names = (_text(v) for v in beams["method"].ravel()) if "method" in beams.dtype.names else ()
+    return next((name for name in names if name), f"method {k + 1}")
 
 
-def _stat(beams: np.ndarray, name: str) -> np.ndarray:
-    """One of the numbers in `stats` of each record, NaN where it is missing or not finite."""
-    found, place = np.full(beams.shape, np.nan), STATS.index(name)
+def _statistic(beams: np.ndarray, name: str) -> np.ndarray:
+    """Number in `stats` of each record by name; NaN if missing or not finite."""
+    found, index = np.full(beams.shape, np.nan), STATS.index(name)
     for at, stats in np.ndenumerate(beams["stats"]):
         values = np.asarray(stats)
-        if values.dtype.kind in "iuf" and values.size > place:
-            value = float(values.ravel()[place])
+        if values.dtype.kind in "iuf" and values.size > index:
+            value = float(values.ravel()[index])
             found[at] = value if math.isfinite(value) else np.nan
     return found
 
 
 def _sizes(beams: np.ndarray, plane: str) -> np.ndarray:
-    """Sizes in m; NaN where there is none that a beam can have."""
-    size = 1e-6 * _stat(beams, plane)
+    """Sizes in m; NaN if missing or outside the possible range."""
+    size = 1e-6 * _statistic(beams, plane)
     return np.where((size >= POSSIBLE[0]) & (size <= POSSIBLE[1]), size, np.nan)
 
 
-def _without_beam(source: _Fields, beams: np.ndarray) -> np.ndarray:
-    """Mark the shots, by setting, that show no beam: far less light than is usual.
+def _dark_shots(source: _Struct, beams: np.ndarray) -> np.ndarray:
+    """True for shots, by setting, without beam: with much less light than the median.
 
-    The light is the median over size methods. Monitors differ, and have a usual light each.
+    Light is the median over size methods; it is compared separately for each monitor.
     """
-    light = np.median(np.nan_to_num(_stat(beams, "sum")), axis=2)
-    usual = np.median(light, axis=1, keepdims=True) if _of_several(source) else np.median(light)
-    return light < LEAST_LIGHT * usual
+    light = np.median(np.nan_to_num(_statistic(beams, "sum")), axis=2)
+    typical = np.median(light, axis=1, keepdims=True) if _has_monitors(source) else np.median(light)
+    return light < MIN_LIGHT * typical
 
 
-def _own(source: _Fields, field: str, used: np.ndarray, k: int) -> dict[str, np.ndarray]:
-    """Mean sizes of a method in m, or their standard errors, as the file has them: shape (n, 1)."""
+def _stored_sizes(source: _Struct, field: str, used: np.ndarray, k: int) -> dict[str, np.ndarray]:
+    """Stored mean sizes of a method in m, or their standard errors; shape (n, 1)."""
     beams = source.get(field)
     if beams is None or "stats" not in (beams.dtype.names or ()) or beams.ndim != 2:
         return {}
     if beams.shape[0] <= used.max() or beams.shape[1] <= k:
         return {}
     own = beams[used, k, None]
-    return {p: _sizes(own, p) if field == "beam" else 1e-6 * _stat(own, p) for p in PLANES}
+    return {p: _sizes(own, p) if field == "beam" else 1e-6 * _statistic(own, p) for p in PLANES}
 
 
-def _scan(
+def _make_scan(
     settings: _Settings,
     sizes: Mapping[str, np.ndarray],
     errors: Mapping[str, np.ndarray],
     name: str,
     profiles: Iterable[Profile] = (),
 ) -> QuadScan | None:
-    """The scan of sizes by setting and shot, a row each; None if no plane has enough settings.
+    """Make a scan with a row for each setting and shot; None if no plane has enough settings.
 
-    A plane has errors where each of its sizes has one.
+    A plane has errors only if each of its sizes has one.
     """
-    kept = {p: v for p, v in sizes.items() if _distinct(v, settings.labels) >= FEWEST_SETTINGS}
-    if not kept:
+    planes = {p: v for p, v in sizes.items() if _count_settings(v, settings.labels) >= MIN_SETTINGS}
+    if not planes:
         return None
-    at = np.flatnonzero(~np.isnan(list(kept.values())).all(axis=0))
-    size = {p: v.ravel()[at] for p, v in kept.items()}
-    error = {p: errors[p].ravel()[at] for p in kept if p in errors}
+    rows = np.flatnonzero(~np.isnan(list(planes.values())).all(axis=0))
+    size = {p: v.ravel()[rows] for p, v in planes.items()}
+    error = {p: errors[p].ravel()[rows] for p in planes if p in errors}
     error = {p: v for p, v in error.items() if (v[~np.isnan(size[p])] > 0.0).all()}
-    own = at // next(iter(kept.values())).shape[1]
-    seen = tuple(
-        p._replace(row=int(np.argmax(own == p.row)))
+    setting = rows // next(iter(planes.values())).shape[1]
+    profiles_kept = tuple(
+        p._replace(row=int(np.argmax(setting == p.row)))
         for p in profiles
-        if p.row in own and p.plane in kept
+        if p.row in setting and p.plane in planes
     )
-    part = at_rows(settings.columns, own) | settings.about
-    return QuadScan(**part, size=size, error=error, name=name, profiles=seen)
+    fields = at_rows(settings.columns, setting) | settings.about
+    return QuadScan(**fields, size=size, error=error, name=name, profiles=profiles_kept)
 
 
-def _distinct(sizes: np.ndarray, labels: list[str]) -> int:
-    """Count the settings that have a size."""
+def _count_settings(sizes: np.ndarray, labels: list[str]) -> int:
+    """Number of settings with a size."""
     return len({labels[i] for i in np.flatnonzero(~np.isnan(sizes).all(axis=1))})
 
 
-def _counted(sizes: Mapping[str, np.ndarray], labels: list[str]) -> str:
-    """Say how many settings each plane of a method has."""
-    return " and ".join(f"{_distinct(v, labels)} settings in {p}" for p, v in sizes.items())
+def _settings_text(sizes: Mapping[str, np.ndarray], labels: list[str]) -> str:
+    """Number of settings of each plane, in words."""
+    return " and ".join(f"{_count_settings(v, labels)} settings in {p}" for p, v in sizes.items())
 
 
-def _shots(marked: np.ndarray, labels: list[str]) -> str:
-    """Shots in words, by number and setting."""
-    return _first([f"shot {j + 1} at {labels[i]}" for i, j in np.argwhere(marked)])
+def _shot_list(marked: np.ndarray, labels: list[str]) -> str:
+    """List of shots, in words."""
+    return _short_list([f"shot {j + 1} at {labels[i]}" for i, j in np.argwhere(marked)])
 
 
-def _first(found: list[str]) -> str:
-    more = len(found) - MOST_NAMED
-    return ", ".join(found[:MOST_NAMED]) + f" and {more} more" * (more > 0)
+def _short_list(items: list[str]) -> str:
+    """Join the first items of a list, and count the others."""
+    n_more = len(items) - MAX_LISTED
+    return ", ".join(items[:MAX_LISTED]) + f" and {n_more} more" * (n_more > 0)
 
 
-def _notes(
+def _omission_notes(
     sizes: Mapping[str, np.ndarray],
     dark: np.ndarray,
-    own: Mapping[str, np.ndarray],
+    means: Mapping[str, np.ndarray],
     labels: list[str],
 ) -> Iterator[str]:
-    """Name what was left out of the sizes of one method, and means that differ."""
-    lost: dict[str, list[str]] = {}
-    for plane, each in sizes.items():
-        if named := _shots(np.isnan(each) & ~dark, labels):
-            lost.setdefault(named, []).append(plane)
-    for named, planes in lost.items():
-        yield f"Left out in {' and '.join(planes)}, without a size a beam can have: {named}."
-    for plane, each in sizes.items():
-        if (n := _distinct(each, labels)) < FEWEST_SETTINGS:
+    """Notes on omitted sizes of one method, and on stored means that differ."""
+    planes_by_shots: dict[str, list[str]] = {}
+    for plane, plane_sizes in sizes.items():
+        if shots := _shot_list(np.isnan(plane_sizes) & ~dark, labels):
+            planes_by_shots.setdefault(shots, []).append(plane)
+    for shots, planes in planes_by_shots.items():
+        yield f"Left out in {' and '.join(planes)}, without a size a beam can have: {shots}."
+    for plane, plane_sizes in sizes.items():
+        if (n := _count_settings(plane_sizes, labels)) < MIN_SETTINGS:
             yield f"Left out: plane {plane}, with sizes at {n} of {len(labels)} settings."
             continue
-        number = np.maximum((~np.isnan(each)).sum(axis=1), 1)
-        mean = np.nansum(each, axis=1) / number
-        said = own[plane][:, 0] if plane in own else np.full(len(mean), np.nan)
-        other = np.flatnonzero((np.abs(said - mean) > ROUNDED * said) & (mean > 0.0))
-        places = [f"{1e6 * said[i]:.4g} for {1e6 * mean[i]:.4g} µm at {labels[i]}" for i in other]
-        if places:
-            yield f"The file's means in {plane} are not those of these shots: {_first(places)}."
+        count = np.maximum((~np.isnan(plane_sizes)).sum(axis=1), 1)
+        mean = np.nansum(plane_sizes, axis=1) / count
+        stored = means[plane][:, 0] if plane in means else np.full(len(mean), np.nan)
+        others = np.flatnonzero((np.abs(stored - mean) > MEAN_TOLERANCE * stored) & (mean > 0.0))
+        found = [f"{1e6 * stored[i]:.4g} for {1e6 * mean[i]:.4g} µm at {labels[i]}" for i in others]
+        if found:
+            listed = _short_list(found)
+            yield f"The file's means in {plane} are not those of these shots: {listed}."
 
 
 def _profiles(beams: np.ndarray, k: int) -> tuple[Profile, ...]:
-    """Projected profiles of the shots of one method, as far as the file has them."""
+    """Projected profiles of the shots of one method."""
     found = []
     for (row, shot), plane in product(np.ndindex(beams.shape[:2]), PLANES):
         field = f"prof{plane}"
@@ -435,8 +444,8 @@ def _profiles(beams: np.ndarray, k: int) -> tuple[Profile, ...]:
     return tuple(found)
 
 
-def _stored(source: _Fields, methods: list[str]) -> dict[str, dict[str, Quantity]]:
-    """The program's own normalised emittances and their errors, m; 0 there means no beam found."""
+def _stored_emittances(source: _Struct, methods: list[str]) -> dict[str, dict[str, Quantity]]:
+    """Normalised emittances and errors stored by the program, m; it writes 0 if no beam fits."""
     values, errors = source.get("twiss"), source.get("twissstd")
     if values is None or errors is None:
         return {}
@@ -452,13 +461,13 @@ def _stored(source: _Fields, methods: list[str]) -> dict[str, dict[str, Quantity
     return found
 
 
-def _lattice(source: _Fields, n: int) -> LatticeFile:
-    """Energy, monitors and design Twiss parameters, as of a line."""
-    energy = 1e3 * source.number("energy", USUAL_ENERGY)
+def _lattice(source: _Struct, n: int) -> LatticeFile:
+    """Lattice of the matrices: energy, monitors and design Twiss parameters."""
+    energy = 1e3 * source.number("energy", DEFAULT_ENERGY)
     if not 1.0 < energy < 1e6:
         raise source.error(f"an energy of {1e-3 * energy:g} GeV", "energy")
-    # Of several monitors the matrices begin somewhere before; of one, at it.
-    places = [*dict.fromkeys(_monitors(source, n)), *["start"] * _of_several(source)]
+    # The matrices start upstream of several monitors, and at the only monitor of a scan.
+    places = [*dict.fromkeys(_monitors(source, n)), *["start"] * _has_monitors(source)]
     design = None
     twiss = source.get("twiss0")
     if twiss is not None and twiss.shape == (3, 2) and twiss.dtype.kind in "iuf":

@@ -1,4 +1,4 @@
-"""Formulations and the tables of numbers they use, from files."""
+"""Read, write and solve formulation files, and read the tables of numbers they use."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ if TYPE_CHECKING:
     from beamfit.language.compiled import Computed
     from beamfit.language.solution import ProblemSolution
 
-# 32 MB as numbers; a table that a formulation uses is far smaller.
-MOST_NUMBERS = 4_000_000
+# Largest number of numbers in a table: 32 MB, far more than a formulation needs.
+MAX_NUMBERS = 4_000_000
 
 
 def read_formulation(path: str | PathLike[str]) -> Document:
-    """Read a document in either form: XML where it begins with ``<``, else text.
+    """Read a document: XML if it begins with ``<``, otherwise text.
 
     Parameters
     ----------
@@ -42,7 +42,7 @@ def read_formulation(path: str | PathLike[str]) -> Document:
     Raises
     ------
     InputError
-        With file, line and column, if it cannot be read or is not in the language.
+        With file, line and column, if it cannot be read or parsed.
 
     Examples
     --------
@@ -58,7 +58,7 @@ def read_formulation(path: str | PathLike[str]) -> Document:
 
 
 def write_formulation(path: str | PathLike[str], document: Document) -> None:
-    """Write a document, in XML where the name ends in ``.xml``, else as text; whole or not at all.
+    """Write a document atomically, as XML if the name ends in ``.xml``, otherwise as text.
 
     Parameters
     ----------
@@ -101,7 +101,7 @@ def read_numbers(path: str | PathLike[str]) -> np.ndarray:
     Raises
     ------
     InputError
-        With file and line, if a line holds no numbers or another count of them.
+        With file and line, if a line has something else than numbers, or another count of them.
     """
     rows: list[np.ndarray] = []
     header = None
@@ -121,16 +121,16 @@ def read_numbers(path: str | PathLike[str]) -> np.ndarray:
         if rows and len(row) != len(rows[0]):
             raise InputError(f"{len(row)} numbers", f"{len(rows[0])} as above", path, number)
         rows.append(row)
-        check_length(len(rows) * len(row), MOST_NUMBERS, path, number)
+        check_length(len(rows) * len(row), MAX_NUMBERS, path, number)
     if not rows:
         raise InputError("no numbers", "rows of numbers", path)
     return np.array(rows)
 
 
 def read_tables(
-    document: Document, path: str | PathLike[str], given: Mapping[str, str]
+    document: Document, path: str | PathLike[str], data_files: Mapping[str, str]
 ) -> tuple[dict[str, np.ndarray], dict[str, str]]:
-    """Read the tables of a document: files that are given, or those it names, beside it.
+    """Read the tables of a document, from given files or those it names.
 
     Parameters
     ----------
@@ -138,44 +138,46 @@ def read_tables(
         From `read_formulation`.
     path : str or path
         Its file.
-    given : mapping of str to str
+    data_files : mapping of str to str
         Files by the name of the table.
 
     Returns
     -------
     (dict of str to array, dict of str to str)
-        Tables and their files by name.
+        Tables and their files, by name.
 
     Raises
     ------
     InputError
-        If a name is not that of a table, a file cannot be read, or a table has another size than
-        the document says.
+        If a name is not that of a table, a file cannot be read, or a table has another shape than
+        the document declares.
     """
     tables = {table.name: table for table in document.mapping.tables}
-    for name in given:
+    for name in data_files:
         if name not in tables:
             raise InputError(f"--data {name}=...", f"a table of it: {', '.join(tables) or 'none'}")
     found, files = {}, {}
     for name, table in tables.items():
-        file = files[name] = given.get(name, str(Path(path).parent / table.file))
+        file = files[name] = data_files.get(name, str(Path(path).parent / table.file))
         try:
             found[name] = read_numbers(file)
         except InputError as error:
-            if name in given or error.found != "no such file":
+            if name in data_files or error.found != "no such file":
                 raise
-            at = table.at
-            said = f"table '{name}' in the file '{table.file}', which is not there"
-            raise InputError(said, f"--data {name}=FILE", path, at.line, at.column) from None
-        wanted = (table.rows, table.columns)
-        if None not in wanted and found[name].shape != wanted:
+            position = table.at
+            missing = f"table '{name}' in the file '{table.file}', which is not there"
+            raise InputError(
+                missing, f"--data {name}=FILE", path, position.line, position.column
+            ) from None
+        shape = (table.rows, table.columns)
+        if None not in shape and found[name].shape != shape:
             size = " x ".join(map(str, found[name].shape))
             expected = f"{table.rows} x {table.columns} as line {table.at.line} of {path} says"
             raise InputError(f"{size} numbers", expected, file)
     return found, files
 
 
-def solved_formulation(
+def solve_formulation(
     document: Document,
     path: str | PathLike[str],
     tables: Mapping[str, np.ndarray] | None = None,
@@ -184,9 +186,7 @@ def solved_formulation(
     gains: Iterable[str] = (),
     **options: Any,
 ) -> ProblemSolution | Computed:
-    """Solve a document, or compute its mapping if it has no objective.
-
-    What is wrong with it is said with its file.
+    """Solve a document, or compute its mapping if it has no objective; errors name its file.
 
     Parameters
     ----------

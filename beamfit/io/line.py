@@ -1,4 +1,4 @@
-"""Beam lines from files of any kind, and the scan of a command with it: read, then build."""
+"""Read lattices of any format, build beam lines, and read the inputs of a command."""
 
 from __future__ import annotations
 
@@ -21,9 +21,10 @@ from beamfit.particles import REST_ENERGY, expected_energy
 if TYPE_CHECKING:
     from beamfit.optics.beamline import Beamline
 
-# What the place is called where matrices of rows begin.
-START = "start"
-FOREIGN = {".ele", *DIALECTS}
+# Name of the place at which matrices in rows of a scan start.
+MATRIX_START = "start"
+# Suffixes of files of MAD-X, MAD-8 and elegant.
+PROGRAM_SUFFIXES = {".ele", *DIALECTS}
 
 
 def load_lattice(
@@ -43,9 +44,9 @@ def load_lattice(
         A TOML lattice (docs/files.md), or a MAD-X (``.madx``, ``.seq``), MAD-8 (``.mad8``)
         or elegant (``.lte``) file.
     use : str, optional
-        Which line or sequence of a MAD-X or elegant file.
+        Line or sequence of a MAD-X or elegant file.
     energy : float, optional
-        Total energy in MeV of an elegant file, which carries none; overrides a MAD-X beam.
+        Total energy in MeV, for an elegant file, which has none; overrides a BEAM of MAD-X.
     first, last, screen
         As for `part_of`.
 
@@ -84,26 +85,26 @@ def load_lattice(
 def part_of(
     file: LatticeFile, first: str | None = None, last: str | None = None, screen: str | None = None
 ) -> LatticeFile:
-    """Cut a lattice, and say where sizes are measured unless a scan says.
+    """Take a part of a lattice, and set the default screen.
 
     Parameters
     ----------
     file : LatticeFile
         The lattice.
     first, last : str, optional
-        Elements with which the part begins and ends, both in it, as in a RANGE of MAD-X.
+        First and last element of the part, both included, as in a RANGE of MAD-X.
     screen : str, optional
         Screen or marker at which sizes are measured. Screens after it remain as markers.
 
     Returns
     -------
     LatticeFile
-        Without the design Twiss parameters where their place is cut away.
+        Without design Twiss parameters if their place is not in the part.
 
     Raises
     ------
     InputError
-        If there is no such element, or the last stands before the first.
+        If there is no such element, or the last is upstream of the first.
 
     Examples
     --------
@@ -119,8 +120,8 @@ def part_of(
         if name is not None and name not in names:
             raise InputError(f"{option} {name}: no such element", nearest(name, names), file.path)
     if screen is not None and screen not in file.places:
-        known = nearest(screen, file.places) + ", a screen or marker"
-        raise InputError(f"--screen {screen}: no such place", known, file.path)
+        nearest_places = nearest(screen, file.places) + ", a screen or marker"
+        raise InputError(f"--screen {screen}: no such place", nearest_places, file.path)
     start = 0 if first is None else names.index(first)
     end = len(names) if last is None else len(names) - names[::-1].index(last)
     if start >= end:
@@ -128,26 +129,26 @@ def part_of(
         raise InputError(f"--to {last}, which stands before --from {first}", expected, file.path)
     elements = file.elements[start:end]
     if screen is not None:
-        elements = _with_screen(elements, screen)
-    left = {e["name"] for e in elements} | {e.get("supply") for e in elements}
-    if screen is not None and screen not in left:
+        elements = _move_screen(elements, screen)
+    remaining = {e["name"] for e in elements} | {e.get("supply") for e in elements}
+    if screen is not None and screen not in remaining:
         raise InputError(f"--screen {screen}, which is cut away", "a place within", file.path)
-    design = file.design if file.design and file.design["at"] in left else None
+    design = file.design if file.design and file.design["at"] in remaining else None
     return replace(file, elements=elements, design=design)
 
 
-def _with_screen(
+def _move_screen(
     elements: tuple[Mapping[str, Any], ...], screen: str
 ) -> tuple[Mapping[str, Any], ...]:
-    """Make a place the last screen."""
-    found, passed = [], False
+    """Make a screen or marker the last screen."""
+    changed, is_after = [], False
     for e in elements:
         if e["name"] == screen and e["type"] in ("screen", "marker"):
-            e, passed = dict(e) | {"type": "screen"}, True
-        elif passed and e["type"] == "screen":
+            e, is_after = dict(e) | {"type": "screen"}, True
+        elif is_after and e["type"] == "screen":
             e = {"type": "marker", "name": e["name"]}
-        found.append(e)
-    return tuple(found)
+        changed.append(e)
+    return tuple(changed)
 
 
 def read_lattice(
@@ -157,16 +158,16 @@ def read_lattice(
     energy: float | None = None,
     **part: str | None,
 ) -> LatticeFile:
-    """Read and check a lattice file of any kind without building it; see `load_lattice`."""
+    """Read and check a lattice file of any format without building it; see `load_lattice`."""
     expect(path, str | PathLike, "'line.toml'")
-    if Path(path).suffix.lower() in FOREIGN:
+    if Path(path).suffix.lower() in PROGRAM_SUFFIXES:
         from beamfit.io.sequence import read_sequence
 
         return part_of(read_sequence(path, use=use, energy=energy), **part)
-    for option, value, instead in (("use", use, "one line"), ("energy", energy, "energy_MeV")):
+    for option, value, source in (("use", use, "one line"), ("energy", energy, "energy_MeV")):
         if value is not None:
             raise InputError(
-                f"--{option} for a TOML lattice", f"none: the file has {instead}", path=path
+                f"--{option} for a TOML lattice", f"none: the file has {source}", path=path
             )
     return part_of(read_toml_lattice(path), **part)
 
@@ -179,29 +180,29 @@ def lattice_of(
     particle: str | None = None,
     **part: str | None,
 ) -> LatticeFile:
-    """Read the lattice of a scan, or make that of rows which have matrices of their own.
+    """Read the lattice of a scan, or make one for rows with their own transfer matrices.
 
     Parameters
     ----------
     scan : QuadScan
         The scan.
     path : str or LatticeFile, optional
-        The lattice, read already or not; None where the rows have matrices.
+        The lattice or its path; None if the rows have matrices.
     energy, **part
-        Options of `load_lattice`; the energy in MeV also of rows without a lattice.
+        Options of `load_lattice`; the energy in MeV also applies to rows with matrices.
     particle : str, optional
-        Of rows without a lattice, electrons if None.
+        Particle of rows with matrices; default: electron.
 
     Returns
     -------
     LatticeFile
-        Checked to have what the scan names.
+        Checked to have the magnets and screens of the scan.
 
     Raises
     ------
     InputError
         As `read_lattice` and `LatticeFile.check_scan`; if both or neither of matrices and lattice
-        are given, or rows without a lattice have no energy.
+        are given, or rows with matrices have no energy.
     """
     if scan.transfer is None:
         if path is None:
@@ -209,38 +210,38 @@ def lattice_of(
             raise scan.unusable("a scan and no lattice", expected)
         if particle is not None:
             raise InputError("--particle with a lattice", "none: the lattice says it", path=path)
-        read = isinstance(path, LatticeFile)
-        file = path if read else read_lattice(path, energy=energy, **part)
+        is_read = isinstance(path, LatticeFile)
+        file = path if is_read else read_lattice(path, energy=energy, **part)
         file.check_scan(scan)
         return file
-    if any(told is not None for told in (path, *part.values())):
+    if any(option is not None for option in (path, *part.values())):
         found = "rows with matrices of their own, and a lattice or a part of one"
         raise scan.unusable(found, "no --lattice, --use, --from, --to and --screen")
-    return _rows_lattice(scan, energy, particle or "electron")
+    return _matrix_lattice(scan, energy, particle or "electron")
 
 
-def _rows_lattice(scan: QuadScan, energy: float | None, particle: str) -> LatticeFile:
-    """The lattice of rows with matrices of their own: their screens, and where these begin."""
-    rest = REST_ENERGY[particle]
-    total = scan.of_particle(rest).energy
-    if energy is None and total is None:
+def _matrix_lattice(scan: QuadScan, energy: float | None, particle: str) -> LatticeFile:
+    """Lattice of rows with their own matrices: their screens, and the start of the matrices."""
+    rest_energy = REST_ENERGY[particle]
+    energies = scan.of_particle(rest_energy).energy
+    if energy is None and energies is None:
         raise scan.unusable("no beam energy", "a column energy_MeV, or --energy in MeV")
-    own = float(total.mean()) if energy is None else energy
-    if expected := expected_energy(own, particle):
-        raise scan.unusable(f"an energy of {own:g} MeV", expected, "energy")
-    names = [name for name in dict.fromkeys(scan.screen or ()) if name != START]
+    beam_energy = float(energies.mean()) if energy is None else energy
+    if expected := expected_energy(beam_energy, particle):
+        raise scan.unusable(f"an energy of {beam_energy:g} MeV", expected, "energy")
+    names = [name for name in dict.fromkeys(scan.screen or ()) if name != MATRIX_START]
     return LatticeFile(
         path=scan.path or scan.name,
         sha256=scan.sha256 or "",
         name="matrices of the rows",
-        energy=own,
+        energy=beam_energy,
         particle=particle,
-        elements=tuple({"type": "screen", "name": name} for name in (*names, START)),
+        elements=tuple({"type": "screen", "name": name} for name in (*names, MATRIX_START)),
     )
 
 
 def build_line(file: LatticeFile) -> Beamline:
-    """Build the line a checked lattice file describes.
+    """Build the beam line of a checked lattice file.
 
     Examples
     --------
@@ -270,16 +271,16 @@ def build_line(file: LatticeFile) -> Beamline:
 
 
 class Inputs(NamedTuple):
-    """A scan and its lattice, checked to fit together.
+    """Scan and its lattice, checked against each other.
 
     Attributes
     ----------
     scan : QuadScan
         The scan.
     lattice : LatticeFile
-        Its lattice; of rows with matrices of their own the place where these begin.
+        Its lattice; see `lattice_of`.
     gui : EmittanceGuiFile or None
-        The file of emittance_gui, where the scan is one.
+        The emittance_gui file, if the scan is from one.
     """
 
     scan: QuadScan
@@ -288,7 +289,7 @@ class Inputs(NamedTuple):
 
     @property
     def digests(self) -> dict[str, str | None]:
-        """The files and their SHA-256."""
+        """SHA-256 of the files."""
         return {str(each.path): each.sha256 for each in (self.scan, self.lattice)}
 
 
@@ -302,18 +303,18 @@ def read_inputs(
     size_method: str | None = None,
     **part: Any,
 ) -> Inputs:
-    """Read a scan of any kind, and its lattice.
+    """Read a scan of any format, and its lattice.
 
     Parameters
     ----------
     scan : str
         CSV, HDF5, or a file of emittance_gui (``.mat``).
     lattice : str or LatticeFile, optional
-        As for `lattice_of`. A file of emittance_gui has its own matrices, which it replaces.
+        As for `lattice_of`. It replaces the matrices in a file of emittance_gui.
     columns, ignore, skip_bad
         As for `beamfit.read_quad_scan`.
     size_method : str, optional
-        Which sizes of a file of emittance_gui; RMS if None.
+        Size method of a file of emittance_gui; default: RMS.
     **part
         Options of `lattice_of`.
 
@@ -330,18 +331,18 @@ def read_inputs(
         if size_method is not None:
             expected = "none: only a .mat file of emittance_gui has several"
             raise InputError(f"--size-method {size_method}", expected, path=scan)
-        measured = read_quad_scan(scan, columns=columns, ignore=ignore, skip_bad=skip_bad)
-        return Inputs(measured, lattice_of(measured, lattice, **part))
+        quad_scan = read_quad_scan(scan, columns=columns, ignore=ignore, skip_bad=skip_bad)
+        return Inputs(quad_scan, lattice_of(quad_scan, lattice, **part))
     if skip_bad or tuple(ignore) or columns is not None:
         expected = "none: the file says its columns, and marks failed settings"
         raise InputError("--columns, --ignore or --skip-bad for a MATLAB file", expected, path=scan)
     gui = read_emittance_gui(scan)
-    measured = gui.scan(size_method)
+    quad_scan = gui.scan(size_method)
     if lattice is None:
-        if told := next((name for name, value in part.items() if value is not None), None):
-            said = {"first": "from", "last": "to"}.get(told, told)
-            raise InputError(f"--{said} for a MATLAB file", "none: the file says it", path=scan)
-        return Inputs(measured, gui.lattice, gui)
+        if name := next((name for name, value in part.items() if value is not None), None):
+            option = {"first": "from", "last": "to"}.get(name, name)
+            raise InputError(f"--{option} for a MATLAB file", "none: the file says it", path=scan)
+        return Inputs(quad_scan, gui.lattice, gui)
     note = "The lattice's matrices are used, and not those of the file."
-    measured = replace(measured, transfer=None, energy=None, notes=(*measured.notes, note))
-    return Inputs(measured, lattice_of(measured, lattice, **part))
+    quad_scan = replace(quad_scan, transfer=None, energy=None, notes=(*quad_scan.notes, note))
+    return Inputs(quad_scan, lattice_of(quad_scan, lattice, **part))

@@ -1,4 +1,4 @@
-"""Machine files: the variables of a control system for a scan or a watch, checked TOML."""
+"""Machine files (TOML): variables of a control system for a scan or a watch."""
 
 from __future__ import annotations
 
@@ -10,34 +10,35 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from beamfit.errors import InputError, nearest, plain
-from beamfit.io.columns import ALSO, SETTINGS, UNITS, known_unit
+from beamfit.io.columns import SETTINGS, UNIT_SPELLINGS, UNITS, known_unit
 from beamfit.io.decay_record import QUANTITIES
 from beamfit.io.lattice import LatticeFile
 from beamfit.io.line import part_of, read_lattice
-from beamfit.io.toml import LIST, TABLE, TEXT, WHOLE, Key, Section, is_number, keyed, read_toml
+from beamfit.io.toml import LIST, TABLE, TEXT, WHOLE, Key, Section, is_number, key_field, read_toml
 from beamfit.lifetime.record import Conditions
 
 FORMAT = "beamfit-machine-1"
-# Most settings of a scan, and rows of a tuning.
-POINTS, ROWS = 15, 60
+# Default limits: settings of a scan, rows of a tuning.
+MAX_POINTS, MAX_TUNING_ROWS = 15, 60
 APPROACHES = ("either", "below", "above")
-# Units of settings as control systems write them, in capitals or small letters.
-SPELLINGS = {u.lower(): u for u in SETTINGS}
-SPELLINGS |= {word.lower(): unit for word, unit in ALSO.items() if unit in SETTINGS}
+# Spelling of a unit in lower case, as control systems write it -> unit of a setting.
+SETTING_UNITS = {u.lower(): u for u in SETTINGS}
+SETTING_UNITS |= {word.lower(): unit for word, unit in UNIT_SPELLINGS.items() if unit in SETTINGS}
+# Units of beam sizes, to m.
 LENGTHS = {"um": 1e-6, "mm": 1e-3, "m": 1.0}
-# Bounds that several keys share.
-WAIT = {"low": 0.0, "said": "a time above zero"}
-POSITIVE = {"low": 0.0, "said": "a positive number"}
-SCAN = {
-    "goal_percent": Key("goal", 1e-2, default=0.03, low=0.0, high=100.0, said="0 to 100 %"),
-    "points": Key("points", kind=WHOLE, default=None, low=3, high=201, said="4 to 200 points"),
+# Ranges that several keys share.
+POSITIVE_TIME = {"low": 0.0, "expected": "a time above zero"}
+POSITIVE = {"low": 0.0, "expected": "a positive number"}
+SCAN_KEYS = {
+    "goal_percent": Key("goal", 1e-2, default=0.03, low=0.0, high=100.0, expected="0 to 100 %"),
+    "points": Key("points", kind=WHOLE, default=None, low=3, high=201, expected="4 to 200 points"),
     "first": Key("first", kind=LIST, default=()),
-    "restore_s": Key("restore", default=60.0, **WAIT),
+    "restore_s": Key("restore", default=60.0, **POSITIVE_TIME),
 }
-TOP = {
+TOP_KEYS = {
     "name": Key("name", kind=TEXT, default=""),
     "lattice": Key("lattice", kind=TEXT, default=None),
-    "timeout_s": Key("timeout", default=5.0, **WAIT),
+    "timeout_s": Key("timeout", default=5.0, **POSITIVE_TIME),
     **{name: Key(kind=LIST, default=()) for name in ("magnet", "knob")},
     **{name: Key(kind=TABLE, default=None) for name in ("screen", "beam", "scan", "ring", "watch")},
 }
@@ -45,39 +46,40 @@ TOP = {
 
 @dataclass(frozen=True)
 class Magnet:
-    """A magnet of a machine file, in the unit of the lattice's settings.
+    """Magnet of a machine file, in the unit of the lattice's settings.
 
     Attributes
     ----------
     name, set, read, unit : str
-        Its name in the lattice, its variables, and the unit of both.
+        Name in the lattice, variables of setting and read-back, and their unit.
     low, high, tolerance : float
-        Limits of what may be written, and how far the read-back may be off, either way.
+        Limits of settings, and largest deviation of the read-back, in either direction.
     settle, timeout : float
-        How long the read-back has to stay there, and after how long it is given up, s.
+        Time for which the read-back must stay within the tolerance, and time after which the
+        magnet is given up, s.
     approach : {"either", "below", "above"}
-        From which side a setting is reached, by passing it by ``approach_by``, which is within
-        the limits too.
+        Side from which a setting is approached. The magnet first goes beyond it by
+        ``approach_by``, within the limits.
     degauss : tuple of float
-        Settings gone through before a scan.
+        Settings visited before a scan.
     """
 
-    name: str = keyed("name", kind=TEXT)
-    set: str = keyed("set", kind=TEXT)
-    read: str = keyed("read", kind=TEXT)
-    unit: str = keyed("unit", kind=TEXT)
-    low: float = keyed("low")
-    high: float = keyed("high")
-    tolerance: float = keyed("tolerance", **POSITIVE)
-    settle: float = keyed("settle_s", low=-1e-9, high=3600.0, said="a time of zero or more")
-    timeout: float = keyed("timeout_s", 60.0, **WAIT)
-    approach: str = keyed("approach", "either", kind=TEXT, among=APPROACHES)
-    approach_by: float = keyed("approach_by", 0.0, low=-1e-12, said="zero or more")
-    degauss: tuple[float, ...] = keyed("degauss", (), kind=LIST)
+    name: str = key_field("name", kind=TEXT)
+    set: str = key_field("set", kind=TEXT)
+    read: str = key_field("read", kind=TEXT)
+    unit: str = key_field("unit", kind=TEXT)
+    low: float = key_field("low")
+    high: float = key_field("high")
+    tolerance: float = key_field("tolerance", **POSITIVE)
+    settle: float = key_field("settle_s", low=-1e-9, high=3600.0, expected="a time of zero or more")
+    timeout: float = key_field("timeout_s", 60.0, **POSITIVE_TIME)
+    approach: str = key_field("approach", "either", kind=TEXT, among=APPROACHES)
+    approach_by: float = key_field("approach_by", 0.0, low=-1e-12, expected="zero or more")
+    degauss: tuple[float, ...] = key_field("degauss", (), kind=LIST)
 
     @property
     def span(self) -> tuple[float, float]:
-        """Lowest and highest setting that can be reached from the side that is asked for.
+        """Lowest and highest setting that can be approached from the required side.
 
         Examples
         --------
@@ -90,81 +92,81 @@ class Magnet:
 
 @dataclass(frozen=True)
 class Profiler:
-    """The screen of a machine file: variables of rms sizes, or of projections, by plane.
+    """Screen of a machine file: variables of rms sizes or of projections.
 
     Attributes
     ----------
     name : str
-        Its name in the lattice.
+        Name in the lattice.
     x, y, profile_x, profile_y : str or None
-        The variables; `sizes` and `profiles` have them by plane, one of the two is empty.
+        Variables; `sizes` and `profiles` give them by plane, and one of the two is empty.
     unit : str
-        Of the sizes.
+        Unit of the sizes.
     pixel : float or None
-        Of the projections, m.
+        Pixel width of the projections, m.
     shots : int
-        Of each setting.
+        Number of shots at each setting.
     timeout : float
-        How long a new time stamp is waited for, s.
+        Longest wait for a new time stamp, s.
     """
 
-    name: str | None = keyed("name", None, kind=TEXT)
-    x: str | None = keyed("x", None, kind=TEXT)
-    y: str | None = keyed("y", None, kind=TEXT)
-    profile_x: str | None = keyed("profile_x", None, kind=TEXT)
-    profile_y: str | None = keyed("profile_y", None, kind=TEXT)
-    unit: str = keyed("unit", "um", kind=TEXT, among=tuple(LENGTHS))
-    pixel: float | None = keyed("pixel_um", None, factor=1e-6, **POSITIVE)
-    shots: int = keyed("shots", 5, kind=WHOLE, low=1, high=1001, said="2 to 1000 shots")
-    timeout: float = keyed("timeout_s", 10.0, **WAIT)
+    name: str | None = key_field("name", None, kind=TEXT)
+    x: str | None = key_field("x", None, kind=TEXT)
+    y: str | None = key_field("y", None, kind=TEXT)
+    profile_x: str | None = key_field("profile_x", None, kind=TEXT)
+    profile_y: str | None = key_field("profile_y", None, kind=TEXT)
+    unit: str = key_field("unit", "um", kind=TEXT, among=tuple(LENGTHS))
+    pixel: float | None = key_field("pixel_um", None, factor=1e-6, **POSITIVE)
+    shots: int = key_field("shots", 5, kind=WHOLE, low=1, high=1001, expected="2 to 1000 shots")
+    timeout: float = key_field("timeout_s", 10.0, **POSITIVE_TIME)
 
     @property
     def sizes(self) -> dict[str, str]:
-        """Plane to the variable of its rms size."""
+        """Variable of the rms size, by plane."""
         return {p: v for p, v in zip("xy", (self.x, self.y), strict=True) if v}
 
     @property
     def profiles(self) -> dict[str, str]:
-        """Plane to the variable of its projection."""
+        """Variable of the projection, by plane."""
         return {p: v for p, v in zip("xy", (self.profile_x, self.profile_y), strict=True) if v}
 
 
 @dataclass(frozen=True)
 class Guard:
-    """Conditions of a shot that counts: beam above, loss below. Limits are None without one."""
+    """Conditions for a valid shot: beam above, loss below a limit; None without a condition."""
 
-    present: str | None = keyed("present", None, kind=TEXT)
-    present_above: float | None = keyed("present_above", None)
-    loss: str | None = keyed("loss", None, kind=TEXT)
-    loss_below: float | None = keyed("loss_below", None)
-    wait: float = keyed("wait_s", 60.0, **WAIT)
+    present: str | None = key_field("present", None, kind=TEXT)
+    present_above: float | None = key_field("present_above", None)
+    loss: str | None = key_field("loss", None, kind=TEXT)
+    loss_below: float | None = key_field("loss_below", None)
+    wait: float = key_field("wait_s", 60.0, **POSITIVE_TIME)
 
 
 @dataclass(frozen=True)
 class ScanMachine:
-    """Machine as `beamfit scan` needs it.
+    """Machine for `beamfit scan`.
 
     Attributes
     ----------
     name, path, sha256 : str
-        Of the machine and its file.
+        Name of the machine, its file, and the digest of the file.
     lattice : LatticeFile
         The line.
     magnets : tuple of Magnet
-        Those to be scanned, and behind them the knobs.
+        Magnets to be scanned, then the knobs.
     screen : Profiler
     guard : Guard
     goal : float
-        Relative error of the emittances at which to stop.
+        Relative error of the emittances at which the scan stops.
     points : int
-        Most settings.
+        Largest number of settings.
     first : tuple of float
-        Settings of the first magnet to begin with; chosen over its limits if empty.
+        First settings of the first magnet; if empty, spread over its limits.
     restore, timeout : float
-        For how long an IOC that does not answer is asked again to restore, and within which a
-        variable has to answer, s.
+        Time for which restoring is retried if an IOC does not answer, and time within which a
+        variable must answer, s.
     knobs : tuple of str
-        Names of the knobs to be tuned; a scan for the emittance has none.
+        Names of the knobs to be tuned; empty in a scan for the emittance.
     """
 
     name: str
@@ -183,12 +185,12 @@ class ScanMachine:
 
 
 def read_scan_machine(path: str | PathLike[str]) -> ScanMachine:
-    """Read what a scan needs of a machine file, and its lattice.
+    """Read a machine file for a scan, and its lattice.
 
     Parameters
     ----------
     path : str or path
-        TOML, format "beamfit-machine-1" (docs/live.md); paths in it are beside it.
+        TOML, format "beamfit-machine-1" (docs/live.md); paths in it are relative to its folder.
 
     Returns
     -------
@@ -197,77 +199,77 @@ def read_scan_machine(path: str | PathLike[str]) -> ScanMachine:
     Raises
     ------
     InputError
-        If it cannot be used, naming line and key.
+        If the file cannot be used, naming line and key.
     """
-    top, said = read_machine(path)
-    if said["lattice"] is None:
+    top, top_level = read_machine(path)
+    if top_level["lattice"] is None:
         raise top.error("no lattice", 'lattice = "FILE"', "lattice")
-    lattice = read_lattice(Path(path).parent / said.pop("lattice"))
+    lattice = read_lattice(Path(path).parent / top_level.pop("lattice"))
     if not top.table.get("magnet"):
         raise top.error("no magnet to scan", "tables [[magnet]]", "magnet")
-    scanned = tuple(_magnet(section, lattice) for section in top.sections("magnet"))
-    knobs = tuple(map(_magnet, top.sections("knob"))) if "knob" in top.table else ()
+    scanned = tuple(_read_magnet(section, lattice) for section in top.sections("magnet"))
+    knobs = tuple(map(_read_magnet, top.sections("knob"))) if "knob" in top.table else ()
     magnets = scanned + knobs
-    for said_once in ({m.name for m in magnets}, {m.set.rpartition("://")[2] for m in magnets}):
-        if len(said_once) < len(magnets):
+    for unique in ({m.name for m in magnets}, {m.set.rpartition("://")[2] for m in magnets}):
+        if len(unique) < len(magnets):
             found = "a magnet or the variable that sets it twice"
             raise top.error(found, "one [[magnet]] or [[knob]] for each", "magnet")
-    wanted = top.section("scan")
-    plan = wanted.values(SCAN)
-    first = _numbers(wanted, "first", plan.pop("first"), magnets[0].span)
-    plan["points"] = plan["points"] or (ROWS if knobs else POINTS)
-    screen, guard = _screen(top.section("screen"), lattice), _guard(top.section("beam"))
+    scan_section = top.section("scan")
+    plan = scan_section.values(SCAN_KEYS)
+    first = _settings_within(scan_section, "first", plan.pop("first"), magnets[0].span)
+    plan["points"] = plan["points"] or (MAX_TUNING_ROWS if knobs else MAX_POINTS)
+    screen, guard = _read_screen(top.section("screen"), lattice), _read_guard(top.section("beam"))
     lattice = part_of(lattice, screen=screen.name)
     at = [e["name"] for e in lattice.elements].index(screen.name)
-    before = {name for e in lattice.elements[:at] for name in (e["name"], e.get("supply"))}
+    upstream = {name for e in lattice.elements[:at] for name in (e["name"], e.get("supply"))}
     for magnet, section in zip(scanned, top.sections("magnet"), strict=True):
-        if magnet.name not in before:
+        if magnet.name not in upstream:
             found = f"{magnet.name} behind the screen {screen.name}"
             raise section.error(found, "a magnet that the beam passes before it", "name")
     for name in (screen.name, *(m.name for m in magnets)):
         if not name.isprintable():
             raise top.error(f"the name {name!r}", "one of letters that can be shown")
-    name, own = said.pop("name"), (magnets, screen, guard)
+    name, own = top_level.pop("name"), (magnets, screen, guard)
     tuned = tuple(knob.name for knob in knobs)
     return ScanMachine(
-        name, str(path), top.sha256, lattice, *own, first=first, knobs=tuned, **plan, **said
+        name, str(path), top.sha256, lattice, *own, first=first, knobs=tuned, **plan, **top_level
     )
 
 
 def read_machine(path: str | PathLike[str]) -> tuple[Section, dict[str, Any]]:
-    """A machine file, and what stands at its top; a name is that of the file unless it is given."""
+    """Read a machine file and its top-level keys; the default name is that of the file."""
     top = read_toml(path, "a machine", FORMAT)
-    said = top.values(TOP)
-    return top, said | {"name": plain(said["name"] or Path(path).stem)}
+    values = top.values(TOP_KEYS)
+    return top, values | {"name": plain(values["name"] or Path(path).stem)}
 
 
 def unit_of(word: str) -> str | None:
-    """The unit of settings that a word means, None if it means none.
+    """Unit of settings that a word means; None if it is not one.
 
     Examples
     --------
     >>> unit_of("T/m"), unit_of("Amps"), unit_of("furlong")
     ('T_per_m', 'A', None)
     """
-    return SPELLINGS.get(word.strip().lower())
+    return SETTING_UNITS.get(word.strip().lower())
 
 
-def _magnet(section: Section, lattice: LatticeFile | None = None) -> Magnet:
-    """A magnet of the lattice; or without one a knob of the machine, in whatever unit it has."""
+def _read_magnet(section: Section, lattice: LatticeFile | None = None) -> Magnet:
+    """Read a magnet of the lattice; without a lattice, a knob, which may have any unit."""
     magnet = section.read(Magnet)
     unit = unit_of(magnet.unit)
     if lattice is not None and magnet.name not in lattice.calibrations:
         expected = nearest(magnet.name, list(lattice.calibrations)) + f", of {lattice.path}"
         raise section.error(f"no magnet '{magnet.name}'", expected, "name")
-    if lattice is not None and unit != (wanted := lattice.calibrations[magnet.name]):
-        raise section.error(f"unit '{magnet.unit}'", f"{wanted}, as in the lattice", "unit")
+    if lattice is not None and unit != (lattice_unit := lattice.calibrations[magnet.name]):
+        raise section.error(f"unit '{magnet.unit}'", f"{lattice_unit}, as in the lattice", "unit")
     _check_movable(section, magnet)
-    degauss = _numbers(section, "degauss", magnet.degauss, (magnet.low, magnet.high))
+    degauss = _settings_within(section, "degauss", magnet.degauss, (magnet.low, magnet.high))
     return replace(magnet, unit=unit or magnet.unit, degauss=degauss)
 
 
 def _check_movable(section: Section, magnet: Magnet) -> None:
-    """Check that the limits leave room to move a magnet or a knob."""
+    """Check limits, tolerance and approach of a magnet or knob."""
     if not (is_number(magnet.low) and is_number(magnet.high) and magnet.low < magnet.high):
         found = f"limits {magnet.low:g} to {magnet.high:g}"
         raise section.error(found, "low below high, both numbers", "low")
@@ -282,10 +284,10 @@ def _check_movable(section: Section, magnet: Magnet) -> None:
         raise section.error(found, "room to scan besides", "approach_by")
 
 
-def _numbers(
+def _settings_within(
     section: Section, key: str, values: Any, span: tuple[float, float]
 ) -> tuple[float, ...]:
-    """Settings that a magnet can have."""
+    """Check that settings are numbers within a range."""
     for value in values:
         if not is_number(value) or not span[0] <= value <= span[1]:
             expected = f"numbers within {span[0]:g} and {span[1]:g}"
@@ -293,7 +295,8 @@ def _numbers(
     return tuple(map(float, values))
 
 
-def _screen(section: Section, lattice: LatticeFile) -> Profiler:
+def _read_screen(section: Section, lattice: LatticeFile) -> Profiler:
+    """Read and check [screen]."""
     screen = section.read(Profiler)
     if bool(screen.sizes) == bool(screen.profiles):
         found = "sizes and projections" if screen.sizes else "no sizes"
@@ -307,7 +310,8 @@ def _screen(section: Section, lattice: LatticeFile) -> Profiler:
     return screen
 
 
-def _guard(section: Section) -> Guard:
+def _read_guard(section: Section) -> Guard:
+    """Read and check [beam]: each variable needs its limit."""
     guard = section.read(Guard)
     for variable, limit in (("present", "present_above"), ("loss", "loss_below")):
         name, value = getattr(guard, variable), getattr(guard, limit)
@@ -317,17 +321,17 @@ def _guard(section: Section) -> Guard:
     return guard
 
 
-def moved(magnet: Magnet, value: float) -> float:
-    """A setting that may be written to a magnet, or none.
+def check_setting(magnet: Magnet, value: float) -> float:
+    """Check a setting before it is written to a magnet.
 
     Raises
     ------
     InputError
-        If it is no number or lies outside the limits: nothing is ever written there.
+        If it is not a number within the limits: such a value is never written.
 
     Examples
     --------
-    >>> moved(Magnet("Q", "Q:SET", "Q:READ", "A", -1.0, 1.0, 0.01, 0.1), 1.5)
+    >>> check_setting(Magnet("Q", "Q:SET", "Q:READ", "A", -1.0, 1.0, 0.01, 0.1), 1.5)
     Traceback (most recent call last):
         ...
     beamfit.errors.InputError: a setting of 1.5 for Q; expected within its limits, -1 to 1
@@ -338,28 +342,28 @@ def moved(magnet: Magnet, value: float) -> float:
     return float(value)
 
 
-# Keys are named as the columns of a decay record are.
-NAMES = ("beam_current", *Conditions._fields)
-UNITS_OF = {name: UNITS.get(QUANTITIES[name], {"": 1.0}) for name in NAMES}
-KEYS = {
+# Quantities of a watch, their units, and the keys of [ring]: named as columns of a decay record.
+WATCHED_QUANTITIES = ("beam_current", *Conditions._fields)
+QUANTITY_UNITS = {name: UNITS.get(QUANTITIES[name], {"": 1.0}) for name in WATCHED_QUANTITIES}
+RING_VARIABLES = {
     f"{name}_{unit}".rstrip("_"): (name, unit, factor)
-    for name, units in UNITS_OF.items()
+    for name, units in QUANTITY_UNITS.items()
     for unit, factor in units.items()
 }
-RING = {"file": Key("file", kind=TEXT, default=None)} | {
-    key: Key(key, kind=TEXT, default=None) for key in KEYS
+RING_KEYS = {"file": Key("file", kind=TEXT, default=None)} | {
+    key: Key(key, kind=TEXT, default=None) for key in RING_VARIABLES
 }
-LONG = "a time of 60 s to a week"
-WATCH = {
-    "window_s": Key("window", default=7200.0, low=59.9, high=604801.0, said=LONG),
-    "interval_s": Key("interval", default=10.0, low=0.99, high=3601.0, said="1 s to an hour"),
+WINDOW_RANGE = "a time of 60 s to a week"
+WATCH_KEYS = {
+    "window_s": Key("window", default=7200.0, low=59.9, high=604801.0, expected=WINDOW_RANGE),
+    "interval_s": Key("interval", default=10.0, low=0.99, high=3601.0, expected="1 s to an hour"),
     "reference_current_mA": Key("current", default=None, **POSITIVE),
     "prefix": Key("prefix", kind=TEXT, default=None),
 }
 
 
 class Watched(NamedTuple):
-    """A variable that is watched: what it is, its name in the control system, its unit to SI."""
+    """Watched quantity: its variable in the control system, unit, and factor to SI."""
 
     quantity: str
     variable: str
@@ -367,12 +371,12 @@ class Watched(NamedTuple):
     factor: float
 
     def check(self, given: str) -> str | None:
-        """Compare with the unit that the control system gives; a note if nobody knows that one.
+        """Compare the unit with that of the control system; return a note if that is unknown.
 
         Raises
         ------
         InputError
-            If it is another one.
+            If the units differ.
 
         Examples
         --------
@@ -381,64 +385,64 @@ class Watched(NamedTuple):
             ...
         beamfit.errors.InputError: unit 'A' of 'SR:I'; expected mA, as in the machine file
         """
-        return check_unit(given, self.variable, self.unit, UNITS_OF[self.quantity])
+        return check_unit(given, self.variable, self.unit, QUANTITY_UNITS[self.quantity])
 
 
-def check_unit(given: str, variable: str, unit: str, known: Mapping[str, float]) -> str | None:
-    """Compare the unit that the control system gives with that of the machine file.
+def check_unit(given: str, variable: str, unit: str, factors: Mapping[str, float]) -> str | None:
+    """Compare the unit of a variable in the control system with that of the machine file.
 
     Parameters
     ----------
     given, variable, unit : str
-        Unit that the control system gives to a variable, its name, and the unit of the file.
-    known : mapping of str to float
-        Factors of all units that there are.
+        Unit in the control system, name of the variable, and unit in the file.
+    factors : mapping of str to float
+        Factor of each possible unit.
 
     Returns
     -------
     str or None
-        A note if nobody knows the unit that is given.
+        A note if the unit in the control system is unknown.
 
     Raises
     ------
     InputError
-        If it is another one.
+        If the units differ.
 
     Examples
     --------
     >>> check_unit("lp", "SCREEN:X", "um", {"um": 1e-6, "mm": 1e-3})
     "unit 'lp' of 'SCREEN:X' is not understood: taken as um"
     """
-    if not given or not unit or (found := known_unit(given)) == unit:
+    if not given or not unit or (given_unit := known_unit(given)) == unit:
         return None
-    if known.get(found or "") == known[unit]:
+    if factors.get(given_unit or "") == factors[unit]:
         return None
-    said = f"unit '{plain(given)}' of '{plain(variable)}'"
-    if found in known:
-        raise InputError(said, f"{unit}, as in the machine file")
-    return f"{said} is not understood: taken as {unit}"
+    found = f"unit '{plain(given)}' of '{plain(variable)}'"
+    if given_unit in factors:
+        raise InputError(found, f"{unit}, as in the machine file")
+    return f"{found} is not understood: taken as {unit}"
 
 
 @dataclass(frozen=True)
 class WatchMachine:
-    """Machine as `beamfit watch` needs it.
+    """Machine for `beamfit watch`.
 
     Attributes
     ----------
     name, path, sha256 : str
-        Of the machine and its file.
+        Name of the machine, its file, and the digest of the file.
     variables : tuple of Watched
-        The current first.
+        Watched variables, the beam current first.
     ring : Path or None
-        The ring's own file.
+        Ring file.
     window, interval : float
-        Of the sliding window, and from fit to fit, s.
+        Length of the sliding window, and time between fits, s.
     current : float or None
         Reference current, mA; never None with a ring.
     prefix : str or None
-        Of the variables that are served; None serves none.
+        Prefix of the served variables; None serves none.
     timeout : float
-        Within which a variable has to answer, s.
+        Time within which a variable must answer, s.
     """
 
     name: str
@@ -454,12 +458,12 @@ class WatchMachine:
 
 
 def read_watch_machine(path: str | PathLike[str]) -> WatchMachine:
-    """Read what a watch needs of a machine file (docs/watch.md).
+    """Read a machine file for a watch (docs/watch.md).
 
     Parameters
     ----------
     path : str or path
-        Of TOML as `read_scan_machine` takes it.
+        TOML, as for `read_scan_machine`.
 
     Returns
     -------
@@ -468,7 +472,7 @@ def read_watch_machine(path: str | PathLike[str]) -> WatchMachine:
     Raises
     ------
     InputError
-        As by `read_scan_machine`.
+        As `read_scan_machine`.
 
     Examples
     --------
@@ -479,32 +483,35 @@ def read_watch_machine(path: str | PathLike[str]) -> WatchMachine:
     >>> read_watch_machine(file).variables[0].variable
     'pva://SR:CURRENT'
     """
-    top, said = read_machine(path)
+    top, top_values = read_machine(path)
     ring = top.section("ring")
-    file = ring.values(RING)["file"]
-    variables = _variables(ring)
+    file = ring.values(RING_KEYS)["file"]
+    variables = _watched_variables(ring)
     section = top.section("watch")
-    watch = section.values(WATCH)
+    watch = section.values(WATCH_KEYS)
     if file is not None and watch["current"] is None:
         expected = "reference_current_mA = ..., to which the ring scales lifetimes"
         raise section.error("a ring file without it", expected, "reference_current_mA")
     if watch["interval"] > watch["window"] / 3:
         found = f"interval {watch['interval']:g} s in a window of {watch['window']:g} s"
         raise section.error(found, "a third of the window, or less", "interval_s")
-    beside = None if file is None else Path(path).parent / file
-    name, timeout = said["name"], said["timeout"]
-    return WatchMachine(name, str(path), top.sha256, variables, beside, timeout=timeout, **watch)
+    ring_path = None if file is None else Path(path).parent / file
+    name, timeout = top_values["name"], top_values["timeout"]
+    return WatchMachine(name, str(path), top.sha256, variables, ring_path, timeout=timeout, **watch)
 
 
-def _variables(ring: Section) -> tuple[Watched, ...]:
-    """The current, and the others by what they are."""
-    given = {key: name for key, name in ring.table.items() if key in KEYS}
-    found = [Watched(KEYS[key][0], text, *KEYS[key][1:]) for key, text in given.items()]
-    for one in found:
-        twice = [key for key in given if KEYS[key][0] == one.quantity]
-        if len(twice) > 1:
-            raise ring.error(f"{' and '.join(twice)}", f"one {one.quantity}", twice[1])
-    if not any(one.quantity == NAMES[0] for one in found):
+def _watched_variables(ring: Section) -> tuple[Watched, ...]:
+    """Variables of [ring], the beam current first."""
+    variables = {key: name for key, name in ring.table.items() if key in RING_VARIABLES}
+    watched = []
+    for key, text in variables.items():
+        quantity, unit, factor = RING_VARIABLES[key]
+        watched.append(Watched(quantity, text, unit, factor))
+    for v in watched:
+        keys = [key for key in variables if RING_VARIABLES[key][0] == v.quantity]
+        if len(keys) > 1:
+            raise ring.error(f"{' and '.join(keys)}", f"one {v.quantity}", keys[1])
+    if not any(v.quantity == WATCHED_QUANTITIES[0] for v in watched):
         expected = 'beam_current_mA = "VARIABLE", or _A or _uA, in [ring]'
         raise ring.error("no beam current", expected, "beam_current_mA")
-    return tuple(sorted(found, key=lambda one: NAMES.index(one.quantity)))
+    return tuple(sorted(watched, key=lambda v: WATCHED_QUANTITIES.index(v.quantity)))

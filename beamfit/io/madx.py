@@ -1,7 +1,7 @@
-"""MAD-X files, and others in its words: their statements, carried out as MAD-X does.
+"""Interpreter of MAD-X files, and of others translated to MAD-X.
 
-A statement that changes an element, a line or the beam is carried out or refused with its line.
-The rules are those of MAD-X 5.09, found by experiment where its manual is silent
+A statement that changes an element, a line or the beam is executed as in MAD-X, or refused with its
+line. The rules are those of MAD-X 5.09, found by experiment where its manual is silent
 (tests/io/test_madx.py holds 300 generated files against it).
 """
 
@@ -17,49 +17,51 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from beamfit.errors import InputError, nearest
-from beamfit.io.dialects import ELEGANT, MADX, Dialect, blanked, decoded
+from beamfit.io.dialects import ELEGANT, MADX, Dialect, blank_comment, decode_name
 from beamfit.io.files import read_text
-from beamfit.io.madx_values import NAME, Values, shown, words
+from beamfit.io.madx_values import NAME, Values, abbreviate, words
 
-# Files that call one another.
-MOST_CALLS = 50
+# Largest number of CALLs, against files that call one another.
+MAX_CALLS = 50
 COMMENT = re.compile(r"\"[^\"]*\"|'[^'\n]*'|![^\n]*|//[^\n]*|/\*.*?(?:\*/|\Z)", re.DOTALL)
-PART = re.compile(r"\"[^\"]*\"|'[^'\n]*'|[;{}]")
-# Heads of statements that end with their block, and not with a semicolon.
-BLOCK = re.compile(r"(if|elseif|else|while)\b|[\w.$]+\s*(\([^)]*\))?\s*:\s*macro\b", re.I)
+DELIMITER = re.compile(r"\"[^\"]*\"|'[^'\n]*'|[;{}]")
+# Heads of statements that end with a block in braces, not with a semicolon.
+BLOCK_HEAD = re.compile(r"(if|elseif|else|while)\b|[\w.$]+\s*(\([^)]*\))?\s*:\s*macro\b", re.I)
 ASSIGNMENT = re.compile(
     rf"(?:((?:real|int)\s+const|const|real|int)\s+)?({NAME})\s*(:?=)\s*(.+)", re.I | re.DOTALL
 )
-ARROW = re.compile(rf"({NAME})->({NAME})\s*:?=\s*(.+)", re.I | re.DOTALL)
-LABEL = re.compile(rf"[\"']?({NAME})[\"']?\s*(\([^)]*\))?\s*:\s*({NAME})\s*(.*)", re.I | re.DOTALL)
+ELEMENT_ASSIGNMENT = re.compile(rf"({NAME})->({NAME})\s*:?=\s*(.+)", re.I | re.DOTALL)
+LABELLED = re.compile(
+    rf"[\"']?({NAME})[\"']?\s*(\([^)]*\))?\s*:\s*({NAME})\s*(.*)", re.I | re.DOTALL
+)
 COMMAND = re.compile(rf"[\"']?({NAME})[\"']?\s*(.*)", re.I | re.DOTALL)
 PARAMETER = re.compile(rf"([-+]?)\s*({NAME})\s*(?:(:?=)\s*(.*))?", re.I | re.DOTALL)
-# Commands that leave elements, lines and beam as they are.
-HARMLESS = words(
+# Commands that do not change elements, lines or the beam.
+IGNORED_COMMANDS = words(
     "assign aperture coguess correct create csave dumpsequ dynap emit endtrack eoption "
     "eprint esave fill getorbit help ibs observe plot print printf putorbit readmytable "
     "readtable run save savebeta select set setplot show sodd start survey sxfwrite system "
     "tabstring title touschek track twiss usekick usemonitor value write "
 )
-# Parameters that change no matrix of a line without bends in thin elements.
-NO_MATTER = words(
+# Parameters without effect on the transfer matrix of a line without bends in thin elements.
+IGNORED_PARAMETERS = words(
     "at from type apertype aperture aper_offset aper_tol aper_vx aper_vy slot_id assembly_id "
     "mech_sep v_pos magnet model method nst exact kmax kmin calib polarity lrad comments kick "
     "hkick vkick k2 k2s k3 k3s h1 h2 thick fringe bend_fringe freq lag harmon n_bessel shunt "
     "tfill betrf pg sinkick sinpeak sintune sinphase file_td ramp1 ramp2 ramp3 ramp4 e1 e2"
 )
-# Definitions of what is no element.
-HARMLESS_CLASSES = ("beta0", "macro")
-# Options that change no matrix of a line without thin dipoles.
-HARMLESS_OPTIONS = words(
+# Classes that are not elements.
+IGNORED_CLASSES = ("beta0", "macro")
+# Options without effect on the transfer matrix of a line without thin dipoles.
+IGNORED_OPTIONS = words(
     "echo echomacro info warn debug verify trace tell thin_foc thin_cf bborbit twiss_print "
     "no_fatal_stop "
 )
-ENDS = ("stop", "exit", "quit")
+END_COMMANDS = ("stop", "exit", "quit")
 
 
 class Attribute(NamedTuple):
-    """The value of a parameter, or why it has none; an expression where it is evaluated later."""
+    """Parameter: its text, and its value or the error of evaluating it unless that is deferred."""
 
     text: str
     later: bool
@@ -70,9 +72,10 @@ class Attribute(NamedTuple):
 
 @dataclass
 class Definition:
-    """An element, line or sequence: its class, its parameters, and where it is defined.
+    """Element, line or sequence: class, parameters, and place of its definition.
 
-    ``type`` is the class as the file has it.
+    ``type`` is the class as written in the file, ``members`` the list of a LINE, ``placements`` the
+    names in a sequence, each with its AT and FROM.
     """
 
     name: str
@@ -81,16 +84,16 @@ class Definition:
     line: int
     parameters: dict[str, Attribute] = field(default_factory=dict)
     members: str = ""
-    placed: list[tuple[str, dict[str, Attribute]]] = field(default_factory=list)
+    placements: list[tuple[str, dict[str, Attribute]]] = field(default_factory=list)
     type: str = ""
 
     def error(self, found: str, expected: str) -> InputError:
-        """Make the error that names the place of the definition."""
+        """Make an error at the definition."""
         return InputError(found, expected, self.path, self.line)
 
 
 class MadxStatement(NamedTuple):
-    """A statement, its block where it has one, and where it begins."""
+    """Statement, its block if it has one, and where it begins."""
 
     text: str
     block: str | None
@@ -98,14 +101,14 @@ class MadxStatement(NamedTuple):
     line: int
 
     def error(self, found: str = "", expected: str = "") -> InputError:
-        """Make the error that names the statement's place."""
+        """Make an error at the statement."""
         expected = expected or "a file without it: run it in MAD-X, and SAVE the sequence"
-        found = found or f"'{shown(self.text)}', which beamfit does not carry out"
+        found = found or f"'{abbreviate(self.text)}', which beamfit does not carry out"
         return InputError(found, expected, self.path, self.line)
 
     @contextmanager
     def read(self, expected: str) -> Iterator[None]:
-        """Name the statement's place where an expression in it has no value."""
+        """Turn a ValueError of an expression into an error at the statement."""
         try:
             yield
         except ValueError as error:
@@ -113,44 +116,44 @@ class MadxStatement(NamedTuple):
 
 
 def statements(text: str, path: str | PathLike[str], line: int = 1) -> Iterator[MadxStatement]:
-    """Split a file at its semicolons and blocks; comments are left out.
+    """Split a file into statements, without comments.
 
     Examples
     --------
     >>> [s.text for s in statements("a = 1; ! one; two\\nif (a > 0) {b = 2;}", "a.madx")]
     ['a = 1', 'if (a > 0)']
     """
-    text = COMMENT.sub(blanked, text)
-    begin, depth, opened = 0, 0, None
+    text = COMMENT.sub(blank_comment, text)
+    begin, depth, block_start = 0, 0, None
     ends = [found.start() for found in re.finditer("\n", text)]
 
-    def made(end: int, block: str | None = None) -> MadxStatement:
-        said = text[begin:end]
-        at = line + bisect(ends, begin + len(said) - len(said.lstrip()))
-        return MadxStatement(said.strip(), block, path, at)
+    def make_statement(end: int, block: str | None = None) -> MadxStatement:
+        piece = text[begin:end]
+        at = line + bisect(ends, begin + len(piece) - len(piece.lstrip()))
+        return MadxStatement(piece.strip(), block, path, at)
 
-    for found in PART.finditer(text):
-        mark, place = found[0], found.start()
-        depth += (mark == "{") - (mark == "}")
+    for found in DELIMITER.finditer(text):
+        delimiter, place = found[0], found.start()
+        depth += (delimiter == "{") - (delimiter == "}")
         if depth < 0:
-            raise made(place).error("'}' without '{'", "braces that match")
-        if mark == "{" and depth == 1 and BLOCK.match(text[begin:place].strip()):
-            opened = place
-        elif mark == "}" and depth == 0 and opened is not None:
-            yield made(opened, text[opened + 1 : place])
-            begin, opened = found.end(), None
-        elif mark == ";" and depth == 0:
+            raise make_statement(place).error("'}' without '{'", "braces that match")
+        if delimiter == "{" and depth == 1 and BLOCK_HEAD.match(text[begin:place].strip()):
+            block_start = place
+        elif delimiter == "}" and depth == 0 and block_start is not None:
+            yield make_statement(block_start, text[block_start + 1 : place])
+            begin, block_start = found.end(), None
+        elif delimiter == ";" and depth == 0:
             if text[begin:place].strip():
-                yield made(place)
+                yield make_statement(place)
             begin = found.end()
     if text[begin:].strip():
-        rest = made(len(text))
+        rest = make_statement(len(text))
         found = f"'{rest.text[:40]}' without an end"
         raise rest.error(found, "';' at the end of a statement, and quotes and braces that match")
 
 
 def split_parameters(text: str) -> list[str]:
-    """Cut a list at the commas that stand in no bracket and no quotes.
+    """Split a list at commas outside brackets and quotes.
 
     Examples
     --------
@@ -170,73 +173,76 @@ def split_parameters(text: str) -> list[str]:
 
 
 class Interpreter:
-    """The state after a file's statements: variables, elements, sequences, lines and beams."""
+    """Executes statements; holds variables, elements, lines, sequences and beams."""
 
     def __init__(self, dialect: Dialect = MADX) -> None:
         self.dialect, self.values = dialect, Values(self._attribute)
         self.elements: dict[str, Definition] = {}
         self.lines: dict[str, Definition] = {}
         self.beams: dict[str, dict[str, Attribute]] = {"": {}}
-        self.rbarc, self.used = True, None
-        self._open: Definition | None = None
-        self._taken: bool | None = None  # whether a branch of the last IF was, if one may follow
-        self._calls, self._ended = 0, False
-        self._main: str | PathLike[str] | None = None
+        self.rbarc, self.used_line = True, None
+        self._open_sequence: Definition | None = None
+        self._branch_taken: bool | None = None  # in the last IF; None if no ELSE may follow
+        self._call_count, self._ended = 0, False
+        self._main_file: str | PathLike[str] | None = None
 
     def run(
         self, text: str, path: str | PathLike[str], line: int = 1, *, block: bool = False
     ) -> None:
-        """Carry out the statements of a file, or of a block of one."""
-        self._main = path if self._main is None else self._main
+        """Execute the statements of a file or of a block."""
+        self._main_file = path if self._main_file is None else self._main_file
         for statement in statements(self.dialect.translate(text), path, line):
             if self._ended:
                 return
-            taken, self._taken = self._taken, None
+            taken, self._branch_taken = self._branch_taken, None
             word = re.match(r"\w*", statement.text)[0].lower()
             if statement.block is not None:
-                self._block(statement, word, taken)
+                self._execute_block(statement, word, taken)
             elif word == "return":
                 if block:
                     raise statement.error()
-                if path != self._main or self.dialect is not MADX:  # which passes over it there
+                if path != self._main_file or self.dialect is not MADX:  # MAD-X ignores it there
                     return
             else:
-                self._one(statement)
+                self._execute(statement)
 
     def finish(self, path: str | PathLike[str]) -> None:
-        """Refuse a sequence that is left open."""
-        if self._open is not None:
-            raise self._open.error(f"sequence '{self._open.name}' without an end", "ENDSEQUENCE")
+        """Raise if a sequence has no ENDSEQUENCE."""
+        if self._open_sequence is not None:
+            raise self._open_sequence.error(
+                f"sequence '{self._open_sequence.name}' without an end", "ENDSEQUENCE"
+            )
 
     def number(self, parameter: Attribute) -> float:
-        """The value of a parameter now.
+        """Evaluate a parameter with the present variables.
 
         Raises
         ------
         InputError
-            If it is none, with its place.
+            If it has no value.
         """
         value = parameter.value
         if parameter.later:
-            value = self._evaluated(parameter.text)
+            value = self._evaluate(parameter.text)
         if isinstance(value, Exception):
             raise InputError(str(value), "a number", parameter.path, parameter.line)
         return value
 
-    def _evaluated(self, text: str) -> float | tuple[float, ...] | ValueError:
-        """A number, or several in braces; what is wrong with it as a value."""
+    def _evaluate(self, text: str) -> float | tuple[float, ...] | ValueError:
+        """Number, or numbers in braces; an error is returned, not raised."""
         try:
             if text.startswith("{") and text.endswith("}"):
-                return tuple(self.values.of(part) for part in split_parameters(text[1:-1]))
-            return self.values.of(text)
+                return tuple(self.values.evaluate(part) for part in split_parameters(text[1:-1]))
+            return self.values.evaluate(text)
         except ValueError as error:
             return error
 
     def _parameter(self, statement: MadxStatement, later: bool, text: str) -> Attribute:
-        value = None if later else self._evaluated(text)
+        value = None if later else self._evaluate(text)
         return Attribute(text, later, value, statement.path, statement.line)
 
     def _parameters(self, statement: MadxStatement, text: str) -> dict[str, Attribute]:
+        """Parse the parameters after the first comma of a statement."""
         found: dict[str, Attribute] = {}
         text = text.strip()
         if not text:
@@ -244,25 +250,26 @@ class Interpreter:
         if not text.startswith(","):
             raise statement.error(f"'{text[:20]}' where a comma belongs", "NAME: CLASS, L = ...;")
         for part in split_parameters(text[1:]):
-            if (one := PARAMETER.fullmatch(part)) is None:
+            if (match := PARAMETER.fullmatch(part)) is None:
                 raise statement.error(f"'{part[:40]}'", "NAME = value")
-            sign, name, equals, value = one.groups()
+            sign, name, equals, value = match.groups()
             if value is None:
                 value = "0" if sign == "-" else "1"
             elif sign:
                 raise statement.error(f"'{part[:40]}'", "NAME = value")
-            own = self._parameter(statement, equals == ":=", value.strip())
-            found[name.lower()] = own if equals else own._replace(text="")
+            attribute = self._parameter(statement, equals == ":=", value.strip())
+            found[name.lower()] = attribute if equals else attribute._replace(text="")
         return found
 
     def _attribute(self, name: str, key: str) -> float:
-        """The value of ``name->key`` in an expression."""
+        """Value of ``name->key`` in an expression."""
         if name not in self.elements:
             raise ValueError(f"'{name}->{key}' of no element")
         parameter = self.elements[name].parameters.get(key)
         return 0.0 if parameter is None else float(self.number(parameter))
 
-    def _block(self, statement: MadxStatement, word: str, taken: bool | None) -> None:
+    def _execute_block(self, statement: MadxStatement, word: str, taken: bool | None) -> None:
+        """Execute the block of an IF; a WHILE is refused."""
         if word in ("if", "elseif", "else"):
             if word == "if":
                 taken = False
@@ -273,118 +280,126 @@ class Interpreter:
                     taken = word == "else" or self.values.holds(statement.text[len(word) :].strip())
                 if taken:
                     self.run(statement.block, statement.path, statement.line, block=True)
-            self._taken = None if word == "else" else taken
+            self._branch_taken = None if word == "else" else taken
         elif word == "while":
             raise statement.error()
 
-    def _one(self, statement: MadxStatement) -> None:
+    def _execute(self, statement: MadxStatement) -> None:
+        """Execute a statement without a block."""
         text = statement.text
         if found := ASSIGNMENT.fullmatch(text):
             kind, name, equals, value = found.groups(default="")
             with statement.read("an expression that MAD-X reads"):
                 self.values.assign(kind.lower(), name.lower(), equals == ":=", value.strip())
-        elif found := ARROW.fullmatch(text):
-            # Evaluated at once, as MAD-X does even after :=
+        elif found := ELEMENT_ASSIGNMENT.fullmatch(text):
+            # Evaluated immediately, even after :=, as in MAD-X.
             given = self._parameter(statement, False, found[3].strip())
             self.number(given)
-            self._set(statement, found[1].lower(), {found[2].lower(): given})
-        elif found := LABEL.fullmatch(text):
+            self._set_parameters(statement, found[1].lower(), {found[2].lower(): given})
+        elif found := LABELLED.fullmatch(text):
             self._define(statement, *found.groups())
         elif found := COMMAND.fullmatch(text):
             self._command(statement, found[1].lower(), found[2])
         else:
             raise statement.error()
 
-    def _set(self, statement: MadxStatement, name: str, given: Mapping[str, Attribute]) -> None:
-        """Change parameters of an element; as in MAD-X, not of those derived from it."""
+    def _set_parameters(
+        self, statement: MadxStatement, name: str, given: Mapping[str, Attribute]
+    ) -> None:
+        """Change parameters of an element; elements derived from it keep theirs, as in MAD-X."""
         if name not in self.elements or {"at", "from"} & given.keys():
             raise statement.error()
         self.elements[name].parameters |= given
-        self.values.changed()
+        self.values.invalidate()
 
     def _define(
         self, statement: MadxStatement, label: str, arguments: str, kind: str, rest: str
     ) -> None:
-        name, said = label.lower(), kind.lower()
-        kind = said if said in self.elements else self.dialect.classes.get(said, said)
-        shown = decoded(label) if self.dialect is ELEGANT else label
-        own = Definition(shown, kind, statement.path, statement.line, type=said.upper())
-        if kind in HARMLESS_CLASSES:
+        """Execute LABEL: CLASS, ...: define an element, line or sequence."""
+        name, word = label.lower(), kind.lower()
+        kind = word if word in self.elements else self.dialect.classes.get(word, word)
+        shown = decode_name(label) if self.dialect is ELEGANT else label
+        new = Definition(shown, kind, statement.path, statement.line, type=word.upper())
+        if kind in IGNORED_CLASSES:
             return
         if arguments:
             raise statement.error()
-        if kind == "line" and self._open is None:
-            own.members = re.sub(r"^\s*:?=\s*", "", rest)
+        if kind == "line" and self._open_sequence is None:
+            new.members = re.sub(r"^\s*:?=\s*", "", rest)
             self.elements.pop(name, None)
-            self.lines[name] = own
-        elif kind == "sequence" and self._open is None:
-            own.parameters = self._parameters(statement, rest)
+            self.lines[name] = new
+        elif kind == "sequence" and self._open_sequence is None:
+            new.parameters = self._parameters(statement, rest)
             self.elements.pop(name, None)
-            self.lines[name] = self._open = own
+            self.lines[name] = self._open_sequence = new
         elif kind in self.lines:
             raise statement.error()
         else:
-            self._element(name, own, self._parameters(statement, rest))
+            self._define_element(name, new, self._parameters(statement, rest))
 
-    def _element(self, name: str, own: Definition, given: dict[str, Attribute]) -> None:
+    def _define_element(self, name: str, new: Definition, given: dict[str, Attribute]) -> None:
+        """Add an element, derived from its class, and place it if a sequence is open."""
         place = {key: given.pop(key) for key in ("at", "from") if key in given}
-        parent = self.elements.get(own.kind)
+        parent = self.elements.get(new.kind)
         if parent is not None:
-            own.kind, own.type = parent.kind, parent.type
-            own.parameters = dict(parent.parameters)
-        own.parameters |= given
-        known = self.elements.get(name) or self.lines.get(name)
-        own.name = known.name if known else own.name
+            new.kind, new.type = parent.kind, parent.type
+            new.parameters = dict(parent.parameters)
+        new.parameters |= given
+        previous = self.elements.get(name) or self.lines.get(name)
+        new.name = previous.name if previous else new.name
         self.lines.pop(name, None)
-        self.elements[name] = own
-        self.values.changed()
-        if self._open is not None:
-            self._open.placed.append((name, place))
+        self.elements[name] = new
+        self.values.invalidate()
+        if self._open_sequence is not None:
+            self._open_sequence.placements.append((name, place))
 
     def _command(self, statement: MadxStatement, name: str, rest: str) -> None:
-        if self._open is not None:
-            self._within(statement, name, rest)
-        elif name in HARMLESS or name.startswith("ptc_"):
+        """Execute a command, by its method if it has one."""
+        if self._open_sequence is not None:
+            self._execute_in_sequence(statement, name, rest)
+        elif name in IGNORED_COMMANDS or name.startswith("ptc_"):
             return
-        elif name in ENDS:
+        elif name in END_COMMANDS:
             self._ended = True
         elif name in self.elements:
-            self._set(statement, name, self._parameters(statement, rest))
-        elif own := getattr(self, f"_{name}_command", None):
-            own(statement, self._parameters(statement, rest))
+            self._set_parameters(statement, name, self._parameters(statement, rest))
+        elif method := getattr(self, f"_{name}_command", None):
+            method(statement, self._parameters(statement, rest))
         else:
             raise statement.error()
 
-    def _within(self, statement: MadxStatement, name: str, rest: str) -> None:
-        """A statement between SEQUENCE and ENDSEQUENCE."""
+    def _execute_in_sequence(self, statement: MadxStatement, name: str, rest: str) -> None:
+        """Execute a statement between SEQUENCE and ENDSEQUENCE."""
         if name == "endsequence":
-            self._open = None
+            self._open_sequence = None
             return
         given = self._parameters(statement, rest)
         if name not in self.elements and name not in self.lines:
-            known = [d.name for d in (*self.elements.values(), *self.lines.values())]
+            names = [d.name for d in (*self.elements.values(), *self.lines.values())]
             raise statement.error(
-                f"'{name}', which nothing defines before it", nearest(name, known)
+                f"'{name}', which nothing defines before it", nearest(name, names)
             )
-        if further := [key for key in given if key not in NO_MATTER]:
-            found = f"'{further[0]}' where an element is placed, which MAD-X passes over"
+        if other_keys := [key for key in given if key not in IGNORED_PARAMETERS]:
+            found = f"'{other_keys[0]}' where an element is placed, which MAD-X passes over"
             raise statement.error(found, "AT and FROM; give it where the element is defined")
-        self._open.placed.append((name, given))
+        self._open_sequence.placements.append((name, given))
 
     def _use_command(self, statement: MadxStatement, given: Mapping[str, Attribute]) -> None:
+        """USE: select the line."""
         for key in given:
             if key not in ("sequence", "period"):
                 raise statement.error(
                     f"USE with {key.upper()}", "the whole line, and --from and --to"
                 )
-        self.used = next((word_of(p).lower() for p in given.values()), self.used)
+        self.used_line = next((word_of(p).lower() for p in given.values()), self.used_line)
 
     def _call_command(self, statement: MadxStatement, given: Mapping[str, Attribute]) -> None:
-        if "file" not in given or self._calls >= MOST_CALLS:
-            most = f"more than {MOST_CALLS} files called" if "file" in given else ""
-            raise statement.error(most, "CALL, FILE = ..., of files that do not call one another")
+        """CALL: execute another file."""
+        if "file" not in given or self._call_count >= MAX_CALLS:
+            found = f"more than {MAX_CALLS} files called" if "file" in given else ""
+            raise statement.error(found, "CALL, FILE = ..., of files that do not call one another")
         path = Path(statement.path).resolve().parent / word_of(given["file"])
-        self._calls += 1
+        self._call_count += 1
         try:
             text = read_text(path)
         except InputError as error:
@@ -392,33 +407,37 @@ class Interpreter:
         self.run(text, path)
 
     def _option_command(self, statement: MadxStatement, given: Mapping[str, Attribute]) -> None:
+        """OPTION: only RBARC has an effect."""
         for key, parameter in given.items():
             on = word_of(parameter).lower() not in ("false", "no", "0") and parameter.value != 0.0
             if key in ("rbarc", "reset"):
                 self.rbarc = on or key == "reset"
-            elif key not in HARMLESS_OPTIONS:
+            elif key not in IGNORED_OPTIONS:
                 raise statement.error(
                     f"option '{key}', which beamfit does not know", "RBARC or none"
                 )
 
     def _beam_command(self, statement: MadxStatement, given: dict[str, Attribute]) -> None:
+        """BEAM: set the parameters of a beam."""
         sequence = word_of(given.pop("sequence", None)).lower()
         if "bv" in given and self.number(given["bv"]) != 1.0:
             raise statement.error("a beam with BV = -1, which runs the other way", "BV = 1")
         beam = self.beams.setdefault(sequence, {})
-        own = {k: self._parameter(statement, False, p.text) for k, p in given.items() if p.text}
-        if ENERGIES & own.keys():  # the last command that says the energy does, in this order
-            for key in ENERGIES & beam.keys():
+        values = {k: self._parameter(statement, False, p.text) for k, p in given.items() if p.text}
+        if BEAM_ENERGIES & values.keys():  # the last BEAM with an energy counts
+            for key in BEAM_ENERGIES & beam.keys():
                 del beam[key]
-        beam |= own
+        beam |= values
 
     def _resbeam_command(self, statement: MadxStatement, given: Mapping[str, Attribute]) -> None:
+        """RESBEAM: reset a beam."""
         self.beams[word_of(given.get("sequence")).lower()] = {}
 
 
-ENERGIES = {"energy", "pc", "gamma", "beta", "brho"}
+# Parameters of BEAM that determine the energy.
+BEAM_ENERGIES = {"energy", "pc", "gamma", "beta", "brho"}
 
 
 def word_of(parameter: Attribute | None, default: str = "") -> str:
-    """The text of a parameter that is a word, without its quotes, if it is there."""
+    """Text of a parameter without quotes; the default if it is missing."""
     return default if parameter is None else parameter.text.strip().strip("\"'").strip()

@@ -1,4 +1,4 @@
-"""Numbers of a MAD-X file: variables, now or later, and expressions as MAD-X evaluates them."""
+"""Variables of a MAD-X file, immediate or deferred, and expressions evaluated as in MAD-X."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from beamfit.errors import short
 
 
 def words(text: str) -> tuple[str, ...]:
-    """Make a list of words.
+    """Split a text into words.
 
     Examples
     --------
@@ -26,7 +26,7 @@ def words(text: str) -> tuple[str, ...]:
 
 
 NAME = r"[A-Za-z_][\w.$]*"
-# The constants of MAD-X 5.09: GeV, m, s, as it has them.
+# Constants of MAD-X 5.09, with its values and units (GeV, m, s).
 CONSTANTS = {
     "pi": math.pi,
     "twopi": 2 * math.pi,
@@ -61,12 +61,14 @@ FUNCTIONS |= {
 
 
 def _power(base: float, exponent: float) -> float:
+    """Power; ArithmeticError for a complex result."""
     value = base**exponent
     if isinstance(value, complex):
         raise ArithmeticError("a root of a negative number")
     return value
 
 
+# Binary operators and comparisons.
 OPERATORS: dict[str, Callable[[float, float], Any]] = {
     "+": operator.add,
     "-": operator.sub,
@@ -80,8 +82,8 @@ OPERATORS: dict[str, Callable[[float, float], Any]] = {
     "<": operator.lt,
     ">": operator.gt,
 }
-# Expressions, conditions of IF and lists of LINE. Powers too are taken from left to right, and a
-# sign stands only in front of a sum.
+# Grammar of expressions, conditions of IF and lists of LINE. As in MAD-X, powers associate to the
+# left, and a sign is allowed only at the start of a sum.
 GRAMMAR = rf"""
 condition: "(" both ("||" both)* ")"
 both: comparison ("&&" comparison)*
@@ -113,17 +115,17 @@ def _grammar() -> Lark:
 
 
 @lru_cache(maxsize=10_000)
-def parsed(text: str, kind: str = "sum") -> Tree:
+def parse(text: str, kind: str = "sum") -> Tree:
     """Parse an expression, the condition of an IF ("condition") or the list of a LINE ("list").
 
     Raises
     ------
     ValueError
-        If it is none.
+        At a syntax error.
 
     Examples
     --------
-    >>> len(parsed("(a, -2*b)", "list").children)
+    >>> len(parse("(a, -2*b)", "list").children)
     2
     """
     try:
@@ -131,70 +133,75 @@ def parsed(text: str, kind: str = "sum") -> Tree:
     except UnexpectedCharacters as error:
         cause = f"'{error.char}' in it"
     except UnexpectedInput as error:
-        said = str(getattr(error, "token", ""))
-        cause = f"'{short(said, 20)}' where it cannot stand" if said else "it ends early"
-    raise ValueError(f"'{shown(text)}' ({cause})")
+        token = str(getattr(error, "token", ""))
+        cause = f"'{short(token, 20)}' where it cannot stand" if token else "it ends early"
+    raise ValueError(f"'{abbreviate(text)}' ({cause})")
 
 
 class Values:
-    """The variables of a file; ``attribute`` gives the number of an element's parameter.
+    """Variables of a file.
+
+    Parameters
+    ----------
+    attribute : callable
+        Value of ``element->parameter`` by the two names.
 
     Examples
     --------
     >>> values = Values(lambda name, key: 0.0)
     >>> values.assign("", "x", True, "2*y")
     >>> values.assign("", "y", False, "-3^2")
-    >>> values.of("x + 1")
+    >>> values.evaluate("x + 1")
     -17.0
     """
 
     def __init__(self, attribute: Callable[[str, str], float]) -> None:
         self._attribute = attribute
-        self._said: dict[str, float | str | ValueError] = {}
-        self._known: dict[str, float] = {}
-        self._fixed: set[str] = set()
+        self._definitions: dict[str, float | str | ValueError] = {}
+        self._cache: dict[str, float] = {}
+        self._fixed_names: set[str] = set()
         self._pending: list[str] = []
 
-    def changed(self) -> None:
-        """Forget what was computed from variables or elements that changed."""
-        self._known.clear()
+    def invalidate(self) -> None:
+        """Discard cached values after a variable or element has changed."""
+        self._cache.clear()
 
     def assign(self, kind: str, name: str, later: bool, text: str) -> None:
-        """Give a variable a number, or an expression that is evaluated whenever it is asked for.
+        """Define a variable by an expression, evaluated now or (``later``) at each use.
 
         Raises
         ------
         ValueError
-            If it is a constant, or the text is no expression. A name that nothing defines is told
-            when the number is asked for.
+            If the name is a constant of MAD-X, or the text is no expression. An undefined name in
+            it raises only when the variable is used.
         """
         if name in CONSTANTS:
             raise ValueError(f"'{name}', a constant of MAD-X that stays as it is")
-        if name in self._fixed:
-            return  # as MAD-X does
-        parsed(text)
+        if name in self._fixed_names:
+            return  # MAD-X ignores it, too
+        parse(text)
         value: float | str | ValueError = text
         if not later or "const" in kind:
             try:
-                value = self.of(text)
+                value = self.evaluate(text)
             except ValueError as error:
                 value = error
         if "int" in kind and isinstance(value, float):
             value = float(math.trunc(value))
         if "const" in kind:
-            self._fixed.add(name)
-        self._said[name] = value
-        self.changed()
+            self._fixed_names.add(name)
+        self._definitions[name] = value
+        self.invalidate()
 
-    def of(self, text: str) -> float:
+    def evaluate(self, text: str) -> float:
         """Evaluate an expression.
 
         Raises
         ------
         ValueError
-            If it is none, names what nothing defines, or has no finite value.
+            At a syntax error, an undefined name, or a value that is not finite.
         """
-        return self._finite(parsed(text), text)
+        return self._finite(parse(text), text)
 
     def holds(self, text: str) -> bool:
         """Evaluate the condition of an IF: comparisons joined by && and ||.
@@ -202,7 +209,7 @@ class Values:
         Raises
         ------
         ValueError
-            As `of`.
+            As `evaluate`.
 
         Examples
         --------
@@ -214,20 +221,21 @@ class Values:
                 OPERATORS[sign](self._finite(left, text), self._finite(right, text))
                 for left, sign, right in (comparison.children for comparison in both.children)
             )
-            for both in parsed(text, "condition").children
+            for both in parse(text, "condition").children
         )
 
     def _finite(self, tree: Tree, text: str) -> float:
-        """The value of a part of a text."""
+        """Value of a parsed expression; `text` is for messages."""
         try:
             value = self._value(tree)
         except (ArithmeticError, RecursionError) as error:
-            raise ValueError(f"'{shown(text)}' without a value ({error})") from None
+            raise ValueError(f"'{abbreviate(text)}' without a value ({error})") from None
         if not math.isfinite(value):
-            raise ValueError(f"'{shown(text)}' without a finite value")
+            raise ValueError(f"'{abbreviate(text)}' without a finite value")
         return value
 
     def _value(self, tree: Tree) -> float:
+        """Evaluate a parsed expression."""
         first, *steps = tree.children
         match tree.data:
             case "number":
@@ -247,24 +255,27 @@ class Values:
         return value
 
     def _variable(self, name: str) -> float:
+        """Value of a variable or constant, evaluated once until a variable changes."""
         if name in CONSTANTS:
             return CONSTANTS[name]
-        if name not in self._known:
-            if name not in self._said:
+        if name not in self._cache:
+            if name not in self._definitions:
                 raise ValueError(f"the undefined '{name}'")
             if name in self._pending:
                 raise ValueError(f"'{name}', which is defined by itself")
-            said = self._said[name]
-            if isinstance(said, ValueError):
-                raise said
+            definition = self._definitions[name]
+            if isinstance(definition, ValueError):
+                raise definition
             self._pending.append(name)
             try:
-                self._known[name] = self.of(said) if isinstance(said, str) else said
+                self._cache[name] = (
+                    self.evaluate(definition) if isinstance(definition, str) else definition
+                )
             finally:
                 self._pending.pop()
-        return self._known[name]
+        return self._cache[name]
 
 
-def shown(text: str) -> str:
-    """A text on one line, its middle left out where it is long."""
+def abbreviate(text: str) -> str:
+    """Put a text on one line, without its middle if it is long."""
     return short(" ".join(text.split()), 40)

@@ -1,4 +1,4 @@
-"""A laboratory's own priors as TOML files: on the noise of sizes, and on screen, beam and line."""
+"""Priors of a laboratory as TOML files: on the noise of sizes, and on screen, beam and line."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from beamfit.writing import write_atomically
 if TYPE_CHECKING:
     from beamfit.noise.learn import Learned
 
-NOISE, SYSTEMATICS = "beamfit-noise-1", "beamfit-systematics-1"
-# Fields of `Noise` that are a middle and a spread, and those that are one number.
+NOISE_FORMAT, SYSTEMATICS_FORMAT = "beamfit-noise-1", "beamfit-systematics-1"
+# Fields of `Noise` with a median and a spread, and those with one number.
 PAIRS = ("factor", "unstated", "scatter")
-SINGLE = ("right", "share", "even", "bad", "width", "bad_shot")
-PAIR = "two numbers: the middle and the standard deviation of the logarithm"
-# Key of the file: the number's name, and the SI value of one unit.
+NUMBER_FIELDS = ("right", "share", "even", "bad", "width", "bad_shot")
+PAIR_TEXT = "two numbers: the middle and the standard deviation of the logarithm"
+# Key of the file -> name of the number, and SI value of one unit.
 TERMS = {
     "size_scale": ("size_scale", 1.0),
     "resolution_um": ("resolution", 1e-6),
@@ -27,9 +27,9 @@ TERMS = {
     "dispersion_m": ("dispersion", 1.0),
     "dispersion_slope": ("dispersion_slope", 1.0),
 }
-# Tables, one key an element: what of it, and the SI value of one unit.
+# Table with elements as keys -> quantity, and SI value of one unit.
 TABLES = {"gradient": ("gradient", 1.0), "length_mm": ("length", 1e-3)}
-SHAPE = "a standard deviation, or a list of mean and standard deviation"
+PRIOR_TEXT = "a standard deviation, or a list of mean and standard deviation"
 
 
 def read_noise(path: str | PathLike[str]) -> Noise:
@@ -44,7 +44,7 @@ def read_noise(path: str | PathLike[str]) -> Noise:
     Returns
     -------
     Noise
-        beamfit's own where the file is silent.
+        With beamfit's defaults for missing fields.
 
     Raises
     ------
@@ -59,19 +59,21 @@ def read_noise(path: str | PathLike[str]) -> Noise:
     >>> read_noise(file).scatter.middle
     0.03
     """
-    top = read_toml(path, "priors of noise", NOISE, needed=False)
-    schema = {name: Key(name, default=None) for name in SINGLE}
-    schema |= {name: Key(name, kind=LIST, default=None, said=PAIR, each=NUMBER) for name in PAIRS}
-    said = top.values(schema | {"source": Key("source", kind=TEXT, default=str(path))})
-    told: dict[str, Any] = {name: value for name, value in said.items() if value is not None}
-    for name, value in told.items():
+    top = read_toml(path, "priors of noise", NOISE_FORMAT, needed=False)
+    schema = {name: Key(name, default=None) for name in NUMBER_FIELDS}
+    schema |= {
+        name: Key(name, kind=LIST, default=None, expected=PAIR_TEXT, each=NUMBER) for name in PAIRS
+    }
+    values = top.values(schema | {"source": Key("source", kind=TEXT, default=str(path))})
+    given: dict[str, Any] = {name: value for name, value in values.items() if value is not None}
+    for name, value in given.items():
         if name in PAIRS and len(value) != 2:
-            raise top.error(f"{name} = {value}", PAIR, name)
+            raise top.error(f"{name} = {value}", PAIR_TEXT, name)
         try:
             Noise(**{name: value})
         except InputError as error:
             raise top.error(error.found, error.expected, name) from None
-    return Noise(**told)
+    return Noise(**given)
 
 
 def write_noise(path: str | PathLike[str], learned: Learned) -> None:
@@ -80,20 +82,20 @@ def write_noise(path: str | PathLike[str], learned: Learned) -> None:
     Parameters
     ----------
     path : str or path
-        Where to; an existing file is replaced whole.
+        The file; an existing one is replaced atomically.
     learned : Learned
-        From `beamfit.noise.learn.learn_noise`.
+        Result of `beamfit.noise.learn.learn_noise`.
     """
     lines = [
-        f'format = "{NOISE}"',
+        f'format = "{NOISE_FORMAT}"',
         f'source = "{learned.noise.source}"',
         "# What was learned, with standard errors; the rest is beamfit's own.",
     ]
-    for name in (*SINGLE, *PAIRS):
+    for name in (*NUMBER_FIELDS, *PAIRS):
         value = getattr(learned.noise, name)
         text = f"[{value[0]:.4g}, {value[1]:.4g}]" if name in PAIRS else f"{value:.4g}"
-        said = f"  # {learned.errors[name]}" if name in learned.errors else ""
-        lines.append(f"{name} = {text}{said}")
+        comment = f"  # {learned.errors[name]}" if name in learned.errors else ""
+        lines.append(f"{name} = {text}{comment}")
     write_atomically(path, ("\n".join(lines) + "\n").encode())
 
 
@@ -105,13 +107,13 @@ def read_systematics(path: str | PathLike[str]) -> dict[str, tuple[float | None,
     path : str or path
         A TOML file with any of ``size_scale``, ``resolution_um``, ``wire_diameter_um``,
         ``energy``, ``dispersion_m``, ``dispersion_slope``, and the tables ``gradient`` and
-        ``length_mm`` with an element a key. Each has a standard deviation, or a list of mean and
-        standard deviation. Scales and gradients are relative: 0.02 is 2 %.
+        ``length_mm`` with elements as keys. Each value is a standard deviation, or a list of mean
+        and standard deviation. Scales and gradients are relative: 0.02 is 2 %.
 
     Returns
     -------
     dict of str to (float or None, float)
-        As ``priors`` of `beamfit.fit_emittance`; a mean of None is what the line says.
+        As ``priors`` of `beamfit.fit_emittance`; a mean of None is the value of the line.
 
     Raises
     ------
@@ -126,27 +128,28 @@ def read_systematics(path: str | PathLike[str]) -> dict[str, tuple[float | None,
     >>> read_systematics(file)
     {'energy': (None, 0.02), 'dispersion': (0.1, 0.02), 'Q.gradient': (None, 0.01)}
     """
-    top = read_toml(path, "systematics", SYSTEMATICS, needed=False)
+    top = read_toml(path, "systematics", SYSTEMATICS_FORMAT, needed=False)
     schema = {name: Key(default=None, kind=NUMBERS) for name in TERMS}
     schema |= {name: Key(kind=TABLE, default=None) for name in TABLES}
     top.values(schema)
     found = {
         name: _prior(top, key, factor) for key, (name, factor) in TERMS.items() if key in top.table
     }
-    for key, (what, factor) in TABLES.items():
+    for key, (quantity, factor) in TABLES.items():
         if key in top.table:
-            part = top.section(key)
-            found |= {f"{name}.{what}": _prior(part, name, factor) for name in part.table}
+            section = top.section(key)
+            found |= {f"{name}.{quantity}": _prior(section, name, factor) for name in section.table}
     if not found:
         raise top.error("a file that says nothing", f"one of {', '.join((*TERMS, *TABLES))}")
     return found
 
 
-def _prior(part: Section, key: str, factor: float) -> tuple[float | None, float]:
-    given: Any = part.table[key]
+def _prior(section: Section, key: str, factor: float) -> tuple[float | None, float]:
+    """Mean (None if not given) and standard deviation of a prior, in SI."""
+    given: Any = section.table[key]
     numbers = given if isinstance(given, list) else [None, given]
-    usable = len(numbers) == 2 and all(n is None or is_number(n) for n in numbers)
-    if not usable or not numbers[1] > 0:
-        raise part.error(f"{key} = {given}", SHAPE, key)
+    is_pair = len(numbers) == 2 and all(n is None or is_number(n) for n in numbers)
+    if not is_pair or not numbers[1] > 0:
+        raise section.error(f"{key} = {given}", PRIOR_TEXT, key)
     mean, sd = numbers
     return None if mean is None else factor * mean, factor * sd

@@ -1,4 +1,4 @@
-"""Results as one JSON object, the fitted beams of such an object, and fits kept in a file."""
+"""Write results as JSON, read fitted beams from them, and save and load fits."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ from beamfit.answer import json_of
 from beamfit.emittance.scan import PROJECTED
 from beamfit.emittance.targets import Beam
 from beamfit.errors import InputError
-from beamfit.io.files import laid_out, read_json
+from beamfit.io.files import read_json, structure_errors
 from beamfit.writing import write_atomically
 
 if TYPE_CHECKING:
     from beamfit.emittance.fit import EmittanceFit
     from beamfit.lifetime.fit import DecayFit
 
-HOW = "the output of beamfit emittance --json"
-NUMBERS = ("sigma11", "sigma12", "sigma22")
-# Correlations rounded by a fit of nearly dependent numbers may have eigenvalues below zero by this.
-ROUNDED = 1e-9
+SOURCE_TEXT = "the output of beamfit emittance --json"
+SIGMA_KEYS = ("sigma11", "sigma12", "sigma22")
+# Eigenvalues of a correlation matrix may be negative by this much, from rounding.
+EIGENVALUE_TOLERANCE = 1e-9
 
 
 def results_text(
@@ -37,23 +37,23 @@ def results_text(
     command: str = "",
     **further: Any,
 ) -> str:
-    """Write the one JSON object of a command, or of a script that answers as one.
+    """Write the JSON object of a command.
 
     Parameters
     ----------
     results : sequence
-        Results, or what they give as JSON; one entry each.
+        Results, or their JSON values; one entry each.
     inputs : mapping of str to str
         Input files and their SHA-256, as `QuadScan.sha256` or `beamfit.io.files.digest`.
     command : str
         The command line.
     **further
-        What concerns all results together, after them.
+        Further entries, after the results.
 
     Returns
     -------
     str
-        JSON text; numbers that JSON cannot hold are null.
+        JSON text; NaN and infinities are null.
 
     Examples
     --------
@@ -74,10 +74,11 @@ def read_fitted_beams(
     path : str or path
         A file with the JSON object of ``beamfit emittance --json``.
     rest_energy : float
-        Of the particle, MeV: a file may hold no energy but both emittances, whose ratio is βγ.
+        Rest energy of the particle, MeV, for files without energy: the ratio of the two
+        emittances is βγ.
     lattice : str, optional
-        SHA-256 of the lattice file that the beam is for. A result that does not say in which line
-        it was fitted must name it among its inputs.
+        SHA-256 of the lattice file for which the beam is used. A result without its line must name
+        this file among its inputs.
 
     Returns
     -------
@@ -87,9 +88,9 @@ def read_fitted_beams(
     Raises
     ------
     InputError
-        If the file cannot be read or is something else, if a number in it is missing or cannot
-        be, if the beam was fitted with another lattice, or together with a network: it belongs to
-        the network's optics, which the file does not hold.
+        If the file cannot be read or is of another kind, a number is missing or impossible, or the
+        beam was fitted with another lattice or together with a network: it then belongs to the
+        network's optics, which the file does not contain.
 
     Examples
     --------
@@ -103,29 +104,30 @@ def read_fitted_beams(
     >>> beam.sigma.tolist(), beam.doubt
     ([1e-08, 1e-08, 1e-08], 'sigma11, sigma12, sigma22 have no error (converged: Good.)')
     """
-    document = read_json(path, "no fitted beams", HOW)
-    with laid_out(path, "no fitted beams", HOW):
+    document = read_json(path, "no fitted beams", SOURCE_TEXT)
+    with structure_errors(path, "no fitted beams", SOURCE_TEXT):
         entries = [e for e in document["results"] if e.get("slice", PROJECTED) == PROJECTED]
         found = {entry["plane"]: _beam(entry, rest_energy) for entry in entries}
-        told = all("line" in entry for entry in entries) or "inputs" not in document
-        if lattice is not None and not told and lattice not in document["inputs"].values():
-            said = "a beam that was fitted with another lattice, or with another version of it"
-            raise InputError(said, "a fit with this lattice")
+        names_line = all("line" in entry for entry in entries) or "inputs" not in document
+        if lattice is not None and not names_line and lattice not in document["inputs"].values():
+            other = "a beam that was fitted with another lattice, or with another version of it"
+            raise InputError(other, "a fit with this lattice")
         if not found:
-            raise InputError("no result of the whole beam in the file", HOW)
+            raise InputError("no result of the whole beam in the file", SOURCE_TEXT)
     return found
 
 
 def _beam(entry: Mapping[str, Any], rest_energy: float) -> Beam:
+    """Fitted beam of an entry of ``results``."""
     _check_optics(entry)
     where = f"of plane {entry['plane']}"
-    sigma = [_number(entry[name]["value"], f"{name} {where}") for name in NUMBERS]
+    sigma = [_checked_number(entry[name]["value"], f"{name} {where}") for name in SIGMA_KEYS]
     covariance = entry.get("covariance")
     if covariance is not None:
-        scale = _number(entry.get("error_scale", 1.0), f"error_scale {where}")
+        scale = _checked_number(entry.get("error_scale", 1.0), f"error_scale {where}")
         covariance = _covariance(covariance, where) * scale**2
     numbers = {
-        p["name"]: _number(p["value"]["value"], p["name"])
+        p["name"]: _checked_number(p["value"]["value"], p["name"])
         for p in entry.get("parameters", ())
         if entry.get("scenario") == "calibration"
     }
@@ -135,19 +137,19 @@ def _beam(entry: Mapping[str, Any], rest_energy: float) -> Beam:
 
 
 def _energy(entry: Mapping[str, Any], rest_energy: float, where: str) -> float | None:
-    """Total energy in MeV, E² = m²(1 + (βγ)²) where only the emittances say it."""
+    """Total energy in MeV; without one in the file, from E² = m²(1 + (βγ)²) and the emittances."""
     if "energy" in entry:
-        energy = _number(entry["energy"]["value"], f"energy {where}")
+        energy = _checked_number(entry["energy"]["value"], f"energy {where}")
         if not energy > rest_energy:
             raise InputError(f"energy {where} = {energy:g} MeV", f"more than {rest_energy:g} MeV")
         return energy
-    geometric, normalised = (
+    emittance, normalized = (
         (entry.get(name) or {}).get("value") for name in ("emittance", "normalized_emittance")
     )
-    if not geometric or normalised is None:
+    if not emittance or normalized is None:
         return None
-    ratio = _number(normalised, f"normalized_emittance {where}") / _number(
-        geometric, f"emittance {where}"
+    ratio = _checked_number(normalized, f"normalized_emittance {where}") / _checked_number(
+        emittance, f"emittance {where}"
     )
     return rest_energy * math.hypot(1.0, ratio)
 
@@ -155,9 +157,9 @@ def _energy(entry: Mapping[str, Any], rest_energy: float, where: str) -> float |
 def _check_optics(entry: Mapping[str, Any]) -> None:
     """Refuse a beam that belongs to optics other than the lattice's."""
     scenario, anchor = entry.get("scenario", "known"), str(entry.get("anchor", "none"))
-    # An anchor at single settings is "first principles at ..." and leaves the scale open.
-    tied = scenario == "transport-network" and anchor.startswith("first principles to ")
-    if scenario not in ("known", "calibration") and not tied:
+    # An anchor at single settings is "first principles at ...": it leaves the scale undetermined.
+    is_anchored = scenario == "transport-network" and anchor.startswith("first principles to ")
+    if scenario not in ("known", "calibration") and not is_anchored:
         raise InputError(
             f"a beam of scenario {scenario} with anchor {anchor}, which belongs to the optics of "
             "that network and not to the lattice's",
@@ -166,14 +168,15 @@ def _check_optics(entry: Mapping[str, Any]) -> None:
         )
 
 
-def _number(value: object, name: str) -> float:
+def _checked_number(value: object, name: str) -> float:
+    """A finite number, or an error that names it."""
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise InputError(f"{name} = {json.dumps(value)}", f"a finite number, as in {HOW}")
+        raise InputError(f"{name} = {json.dumps(value)}", f"a finite number, as in {SOURCE_TEXT}")
     return float(value)
 
 
 def _covariance(rows: object, where: str) -> np.ndarray:
-    """Check a covariance by its correlations, which have no unit."""
+    """Check a covariance matrix by its correlations, which are dimensionless."""
     name, found = f"covariance {where}", np.array(rows)
     if found.shape != (3, 3) or found.dtype.kind not in "if" or not np.isfinite(found).all():
         raise InputError(
@@ -186,7 +189,7 @@ def _covariance(rows: object, where: str) -> np.ndarray:
         variance.min() < 0
         or found[variance == 0].any()
         or not np.allclose(correlation, correlation.T, rtol=0.0, atol=1e-6)
-        or np.linalg.eigvalsh(correlation).min() < -ROUNDED
+        or np.linalg.eigvalsh(correlation).min() < -EIGENVALUE_TOLERANCE
     ):
         raise InputError(
             f"{name} that no numbers have", "a symmetric matrix without negative eigenvalues"
@@ -195,21 +198,21 @@ def _covariance(rows: object, where: str) -> np.ndarray:
 
 
 def _doubt(entry: Mapping[str, Any]) -> str | None:
-    """Why the fit does not determine the beam, in its own words."""
-    open_ones = [name for name in NUMBERS if entry[name].get("error") is None]
-    why = f"({entry['status']}: {entry.get('message', 'without a reason')})"
-    if open_ones:
-        return f"{', '.join(open_ones)} have no error {why}"
+    """Reason why the fit does not determine the beam, with its message; None if it does."""
+    undetermined = [name for name in SIGMA_KEYS if entry[name].get("error") is None]
+    reason = f"({entry['status']}: {entry.get('message', 'without a reason')})"
+    if undetermined:
+        return f"{', '.join(undetermined)} have no error {reason}"
     if entry.get("covariance") is None:
-        return f"no covariance of sigma11, sigma12, sigma22 {why}"
-    return f"the emittance is open {why}" if entry["status"] == "unidentified" else None
+        return f"no covariance of sigma11, sigma12, sigma22 {reason}"
+    return f"the emittance is open {reason}" if entry["status"] == "unidentified" else None
 
 
 FORMAT = "beamfit-fit-2"
-KEPT = "a file that beamfit.save_fit wrote"
-# What a file may hold, by where it is defined. A file names these and nothing else.
+SAVED_FIT_TEXT = "a file that beamfit.save_fit wrote"
+# Classes that a file may contain, by module. No others are imported from a file.
 SCAN, DECAY, OPTICS = "beamfit.emittance", "beamfit.lifetime", "beamfit.optics"
-HELD = {
+CLASSES_BY_MODULE = {
     "beamfit.quantity": "Quantity",
     "beamfit.errors": "Status",
     "beamfit.noise.model": "Noise Lognormal",
@@ -228,27 +231,28 @@ HELD = {
     f"{OPTICS}.calibration": "SlopeIntercept CurrentPolynomial CurrentTable Gradient "
     "IntegratedGradient FocusingStrength IntegratedStrength",
 }
-HOMES = {name: home for home, names in HELD.items() for name in names.split()}
-OWN = ("planes", "scan", "told", "parameters", "null_directions")
-HOW_SEEN = ("method", "noise", "weights")
+MODULE_OF_CLASS = {
+    name: home for home, names in CLASSES_BY_MODULE.items() for name in names.split()
+}
+FIT_FIELDS = ("planes", "scan", "told", "parameters", "null_directions")
+PREPARE_OPTIONS = ("method", "noise", "weights")
 
 
 def save_fit(path: str | PathLike[str], fit: EmittanceFit | DecayFit) -> None:
-    """Keep a fit in a file, to be loaded by `load_fit`.
+    """Save a fit in a file, to be loaded by `load_fit`.
 
     Parameters
     ----------
     path : str or path
-        Where to; an existing file is replaced whole. The file is JSON, every number with all
-        its digits.
+        The file (JSON, numbers with all digits); an existing one is replaced atomically.
     fit : EmittanceFit or DecayFit
-        Of known transport, or a decay. What a scenario fitted besides the beam has its search in
-        memory, which a file does not hold: sample it with ``store=``.
+        Of known transport, or a decay. Fits of other scenarios cannot be saved, as their search is
+        needed later: sample them with ``store=``.
 
     Raises
     ------
     InputError
-        If it is the fit of another scenario, or the place cannot be written.
+        If the fit is of another scenario, or the file cannot be written.
 
     Examples
     --------
@@ -264,14 +268,14 @@ def save_fit(path: str | PathLike[str], fit: EmittanceFit | DecayFit) -> None:
     from beamfit.lifetime.fit import DecayFit  # JAX from here on
 
     if isinstance(fit, DecayFit):
-        content = _plain(fit)
+        content = _encode(fit)
     elif not isinstance(fit, EmittanceFit):
         found = f"a {type(fit).__name__}"
         raise InputError(found, "one fit of an emittance or a decay", path=path)
     elif fit.statement.closed:
-        content = {name: _plain(getattr(fit, name)) for name in OWN}
-        content["line"] = _plain(fit.seen.line)
-        content |= {name: _plain(getattr(fit.seen, name)) for name in HOW_SEEN}
+        content = {name: _encode(getattr(fit, name)) for name in FIT_FIELDS}
+        content["line"] = _encode(fit.seen.line)
+        content |= {name: _encode(getattr(fit.seen, name)) for name in PREPARE_OPTIONS}
     else:
         found = f"a fit of scenario {fit.scenario}"
         raise InputError(found, "a fit of scenario known, or of a decay", path=path)
@@ -281,7 +285,7 @@ def save_fit(path: str | PathLike[str], fit: EmittanceFit | DecayFit) -> None:
 
 
 def load_fit(path: str | PathLike[str]) -> EmittanceFit | DecayFit:
-    """Load a fit that `save_fit` kept.
+    """Load a fit that `save_fit` wrote.
 
     Parameters
     ----------
@@ -291,12 +295,12 @@ def load_fit(path: str | PathLike[str]) -> EmittanceFit | DecayFit:
     Returns
     -------
     EmittanceFit or DecayFit
-        As it was saved: nothing is fitted again, all numbers and sentences are those of the file.
+        The saved fit; nothing is fitted again.
 
     Raises
     ------
     InputError
-        If the file cannot be read, is something else, or has the format of another version.
+        If the file cannot be read, is of another kind, or has the format of another version.
 
     Examples
     --------
@@ -304,95 +308,98 @@ def load_fit(path: str | PathLike[str]) -> EmittanceFit | DecayFit:
     Traceback (most recent call last):
     beamfit.errors.InputError: fit.json: no such file; expected a readable file
     """
-    document = read_json(path, "no saved fit", KEPT)
-    with laid_out(path, "no saved fit", KEPT):
-        form, version = document["format"], f"beamfit {str(document['beamfit'])[:20]}"
-    if form != FORMAT:
+    document = read_json(path, "no saved fit", SAVED_FIT_TEXT)
+    with structure_errors(path, "no saved fit", SAVED_FIT_TEXT):
+        format_name, version = document["format"], f"beamfit {str(document['beamfit'])[:20]}"
+    if format_name != FORMAT:
         expected = f"format {FORMAT}; load it with that version, or fit again"
-        raise InputError(f"format {str(form)[:40]}, of {version}", expected, path=path)
+        raise InputError(f"format {str(format_name)[:40]}, of {version}", expected, path=path)
     found = f"a fit saved by {version} that cannot be read here"
-    with laid_out(path, found, KEPT, named=True):
-        return _fit(document["kind"], document["fit"])
+    with structure_errors(path, found, SAVED_FIT_TEXT, with_cause=True):
+        return _decode_fit(document["kind"], document["fit"])
 
 
-def _fit(kind: str, content: Any) -> EmittanceFit | DecayFit:
+def _decode_fit(kind: str, content: Any) -> EmittanceFit | DecayFit:
+    """Decode a fit; one of a scan needs its prepared scan again, which is computed."""
     if kind == "DecayFit":
-        return _value(content)
+        return _decode(content)
     if kind != "EmittanceFit":
         raise InputError(f"a fit of kind {str(kind)[:40]}", "EmittanceFit or DecayFit")
     from beamfit.emittance.fit import EmittanceFit, scenario_of
     from beamfit.emittance.statement import prepare
 
-    own = {name: _value(content[name]) for name in OWN}
-    line, statement = _value(content["line"]), scenario_of("known")
+    own = {name: _decode(content[name]) for name in FIT_FIELDS}
+    line, statement = _decode(content["line"]), scenario_of("known")
     planes = tuple(p.plane for p in own["planes"])
-    seen = prepare(own["scan"], line, planes, *(_value(content[name]) for name in HOW_SEEN))
-    return EmittanceFit(
-        own.pop("planes"), own.pop("scan"), line, statement, own.pop("told"), seen, **own
-    )
+    seen = prepare(own["scan"], line, planes, *(_decode(content[name]) for name in PREPARE_OPTIONS))
+    return EmittanceFit(line=line, statement=statement, seen=seen, **own)
 
 
-def _plain(value: Any) -> Any:
-    """A value as JSON that tells what it was: {"is": name, ...} where JSON has no word for it."""
+def _encode(value: Any) -> Any:
+    """Encode a value as JSON; types that JSON lacks become {"is": name, ...}."""
     if isinstance(value, Enum):
         return {"is": type(value).__name__, "value": value.value}
     if dataclasses.is_dataclass(value):
         fields = {f.name: getattr(value, f.name) for f in dataclasses.fields(value) if f.init}
-        return {"is": _named(value), "with": {k: _plain(v) for k, v in fields.items()}}
+        return {"is": _class_name(value), "with": {k: _encode(v) for k, v in fields.items()}}
     if hasattr(value, "_asdict"):
-        return {"is": _named(value), "with": {k: _plain(v) for k, v in value._asdict().items()}}
+        return {
+            "is": _class_name(value),
+            "with": {k: _encode(v) for k, v in value._asdict().items()},
+        }
     if isinstance(value, Mapping):
-        return {"is": "dict", "of": [[k, _plain(v)] for k, v in value.items()]}
+        return {"is": "dict", "of": [[k, _encode(v)] for k, v in value.items()]}
     if isinstance(value, tuple):
-        return {"is": "tuple", "of": [_plain(v) for v in value]}
+        return {"is": "tuple", "of": [_encode(v) for v in value]}
     if isinstance(value, list):
-        return [_plain(v) for v in value]
+        return [_encode(v) for v in value]
     if hasattr(value, "shape") and hasattr(value, "dtype"):
         array = np.asarray(value)
         if array.ndim == 0:
-            return _plain(array.item())
-        numbers = [_plain(v) for v in array.ravel().tolist()]
+            return _encode(array.item())
+        numbers = [_encode(v) for v in array.ravel().tolist()]
         return {"is": "array", "type": array.dtype.str, "shape": array.shape, "of": numbers}
     if isinstance(value, float) and not np.isfinite(value):
         return {"is": "float", "value": str(value)}
     return str(value) if isinstance(value, PathLike) else value
 
 
-def _named(value: Any) -> str:
+def _class_name(value: Any) -> str:
+    """Name of a value's class, which must be among those a file may contain."""
     name = type(value).__name__
-    if HOMES.get(name) != type(value).__module__:
+    if MODULE_OF_CLASS.get(name) != type(value).__module__:
         raise InputError(f"a {name}, which no file of fits holds", "a fit of beamfit's own values")
     return name
 
 
-def _type(said: str) -> np.dtype:
-    """The type of an array that a fit may hold: a number, or a short text."""
-    found = np.dtype(said)
+def _array_type(dtype_text: str) -> np.dtype:
+    """Type of an array: numbers or short texts; others are refused."""
+    found = np.dtype(dtype_text)
     if found.kind not in "biufU" or found.itemsize > 4000:
-        raise ValueError(said)
+        raise ValueError(dtype_text)
     return found
 
 
-def _value(plain: Any) -> Any:
-    """The value that `_plain` made this of."""
-    if isinstance(plain, list):
-        return [_value(v) for v in plain]
-    if not isinstance(plain, dict):
-        return plain
-    match plain["is"]:
+def _decode(encoded: Any) -> Any:
+    """Decode a value encoded by `_encode`."""
+    if isinstance(encoded, list):
+        return [_decode(v) for v in encoded]
+    if not isinstance(encoded, dict):
+        return encoded
+    match encoded["is"]:
         case "dict":
-            return {k: _value(v) for k, v in plain["of"]}
+            return {k: _decode(v) for k, v in encoded["of"]}
         case "tuple":
-            return tuple(_value(v) for v in plain["of"])
+            return tuple(_decode(v) for v in encoded["of"])
         case "array":
-            numbers = np.array([_value(v) for v in plain["of"]], _type(plain["type"]))
-            return numbers.reshape(plain["shape"])
+            numbers = np.array([_decode(v) for v in encoded["of"]], _array_type(encoded["type"]))
+            return numbers.reshape(encoded["shape"])
         case "float":
-            return float(plain["value"])
-    name = plain["is"]
-    if name not in HOMES:
-        raise InputError(f"a value of kind {str(name)[:40]}", KEPT)
-    cls = getattr(import_module(HOMES[name]), name)
-    if "value" in plain:
-        return cls(plain["value"])
-    return cls(**{k: _value(v) for k, v in plain["with"].items()})
+            return float(encoded["value"])
+    name = encoded["is"]
+    if name not in MODULE_OF_CLASS:
+        raise InputError(f"a value of kind {str(name)[:40]}", SAVED_FIT_TEXT)
+    cls = getattr(import_module(MODULE_OF_CLASS[name]), name)
+    if "value" in encoded:
+        return cls(encoded["value"])
+    return cls(**{k: _decode(v) for k, v in encoded["with"].items()})

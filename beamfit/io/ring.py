@@ -1,6 +1,6 @@
-"""Rings from a TOML file, a Twiss table (CSV or TFS) or a pyAT lattice.
+"""Read rings from a TOML file, a Twiss table (CSV or TFS) or a pyAT lattice.
 
-A file is checked before the values are built, for which alone JAX is imported.
+Files are checked before JAX is imported.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
     from beamfit.lifetime.ring import MeasuredLength, Operation, Optics, Ring
 
-# column here, and in a TFS file; the vertical dispersion may be missing
+# Columns of the optics -> names in a TFS file. The vertical dispersion is optional.
 COLUMNS = {
     "s_m": "S",
     "beta_x_m": "BETX",
@@ -35,9 +35,9 @@ COLUMNS = {
     "dispersion_slope_x": "DPX",
     "dispersion_slope_y": "DPY",
 }
-MAY_BE_MISSING = {"dispersion_y_m", "dispersion_slope_y"}
-SIDES = ("delta_plus", "delta_minus")
-# What no ring has, by the first word of a column.
+OPTIONAL_COLUMNS = {"dispersion_y_m", "dispersion_slope_y"}
+ACCEPTANCE_COLUMNS = ("delta_plus", "delta_minus")
+# Ranges of the columns, by the first word of their name.
 RANGES = {
     "beta": (1e-6, 1e6, "a positive beta function"),
     "alpha": (-1e4, 1e4, "a Twiss alpha"),
@@ -45,74 +45,76 @@ RANGES = {
     "s": (-1e6, 1e6, "a position in m"),
 }
 INFINITE = math.inf
-SHARE = "a positive number that is a share: up to 1, 0.03 for 3 %"
-FILL = "the number of equal bunches, or a list with the charge of each, in any unit"
-LENGTHS = "a number, or one for each of rising bunch currents: bunch_length_mm, bunch_current_mA"
-PRESSURE = "a positive number, or zero, below 1 Pa"
+SHARE_TEXT = "a positive number that is a share: up to 1, 0.03 for 3 %"
+FILL_TEXT = "the number of equal bunches, or a list with the charge of each, in any unit"
+LENGTH_TEXT = (
+    "a number, or one for each of rising bunch currents: bunch_length_mm, bunch_current_mA"
+)
+PRESSURE_TEXT = "a positive number, or zero, below 1 Pa"
 TABLES = {
     name: Key(kind=TABLE, default=None) for name in ("ring", "acceptance", "optics", "operation")
 }
 
 
-def _within(
+def _positive_key(
     field: str, low: float, high: float, factor: float = 1.0, default: Any = REQUIRED
 ) -> Key:
-    """A number that no ring has beyond these ends, which are in the file's unit and no values."""
-    ends = f"below {high:.6g}" if low == 0 else f"between {low:.6g} and {high:.6g}"
-    return Key(field, factor, default, low, high, f"a positive number {ends}")
+    """Key of a positive number in an open interval, in the unit of the file."""
+    interval = f"below {high:.6g}" if low == 0 else f"between {low:.6g} and {high:.6g}"
+    return Key(field, factor, default, low, high, f"a positive number {interval}")
 
 
-RING = {
+RING_KEYS = {
     "name": Key(kind=TEXT, default=""),
-    "energy_GeV": _within("energy", 0.01, 1e4, 1e9),
-    "circumference_m": _within("circumference", 1.0, 1e6),
-    "harmonic_number": _within("harmonic", 0.99, 1e7),
-    "momentum_compaction": _within("momentum_compaction", 1e-9, 1.0),
-    "energy_loss_keV": _within("energy_loss", 1e-9, 1e8, 1e3),
-    "energy_spread": _within("energy_spread", 1e-7, 0.1),
-    "emittance_x_nm": _within("emittance_x", 1e-9, 1e6, 1e-9),
-    "emittance_y_nm": _within("emittance_y", 1e-9, 1e6, 1e-9, None),
-    "coupling": Key("coupling", 1.0, None, 1e-9, np.nextafter(1.0, 2.0), SHARE),
-    "damping_time_y_ms": _within("damping_time_y", 1e-6, 1e9, 1e-3, INFINITE),
-    "damping_time_z_ms": _within("damping_time_z", 1e-6, 1e9, 1e-3, INFINITE),
-    "impedance_ohm": _within("impedance", 0.0, 1e4, 1.0, 0.0),
+    "energy_GeV": _positive_key("energy", 0.01, 1e4, 1e9),
+    "circumference_m": _positive_key("circumference", 1.0, 1e6),
+    "harmonic_number": _positive_key("harmonic", 0.99, 1e7),
+    "momentum_compaction": _positive_key("momentum_compaction", 1e-9, 1.0),
+    "energy_loss_keV": _positive_key("energy_loss", 1e-9, 1e8, 1e3),
+    "energy_spread": _positive_key("energy_spread", 1e-7, 0.1),
+    "emittance_x_nm": _positive_key("emittance_x", 1e-9, 1e6, 1e-9),
+    "emittance_y_nm": _positive_key("emittance_y", 1e-9, 1e6, 1e-9, None),
+    "coupling": Key("coupling", 1.0, None, 1e-9, np.nextafter(1.0, 2.0), SHARE_TEXT),
+    "damping_time_y_ms": _positive_key("damping_time_y", 1e-6, 1e9, 1e-3, INFINITE),
+    "damping_time_z_ms": _positive_key("damping_time_z", 1e-6, 1e9, 1e-3, INFINITE),
+    "impedance_ohm": _positive_key("impedance", 0.0, 1e4, 1.0, 0.0),
 }
-ACCEPTANCE = {
-    "momentum": Key("momentum_acceptance", 1.0, INFINITE, 1e-9, 1.0, SHARE),
+ACCEPTANCE_KEYS = {
+    "momentum": Key("momentum_acceptance", 1.0, INFINITE, 1e-9, 1.0, SHARE_TEXT),
     "momentum_table": Key(kind=TEXT, default=None),
-    "vertical_mm_mrad": _within("acceptance_y", 1e-9, 1e9, 1e-6, INFINITE),
-    "horizontal_mm_mrad": _within("acceptance_x", 1e-9, 1e9, 1e-6, INFINITE),
-    "scraper_beta_y_m": _within("scraper_beta_y", 1e-6, 1e6, 1.0, 1.0),
+    "vertical_mm_mrad": _positive_key("acceptance_y", 1e-9, 1e9, 1e-6, INFINITE),
+    "horizontal_mm_mrad": _positive_key("acceptance_x", 1e-9, 1e9, 1e-6, INFINITE),
+    "scraper_beta_y_m": _positive_key("scraper_beta_y", 1e-6, 1e6, 1.0, 1.0),
 }
 
 
-def _optical(name: str) -> Key:
-    """An average of what a table along the ring has under the same name."""
+def _average_key(name: str) -> Key:
+    """Key of a ring average, of the same name as its column in a table."""
     field = name.removesuffix("_m").replace("dispersion_slope", "slope")
     kind = name.split("_")[0]
     return Key(field, 1.0, REQUIRED if kind == "beta" else 0.0, *RANGES[kind])
 
 
-OPTICS = {name: _optical(name) for name in COLUMNS if name != "s_m"}
-OPERATION = {
-    "rf_voltage_kV": _within("rf_voltage", 1e-3, 1e8, 1e3),
-    "bunches": Key("bunches", kind=NUMBERS, low=-1e-300, high=1e9, said=FILL),
-    "bunch_length_mm": Key("length", 1e-3, None, 1e-3, 1e4, LENGTHS, NUMBERS),
-    "bunch_current_mA": Key("current", 1.0, 0.0, -1e-300, 1e4, LENGTHS, NUMBERS),
+OPTICS_KEYS = {name: _average_key(name) for name in COLUMNS if name != "s_m"}
+OPERATION_KEYS = {
+    "rf_voltage_kV": _positive_key("rf_voltage", 1e-3, 1e8, 1e3),
+    "bunches": Key("bunches", kind=NUMBERS, low=-1e-300, high=1e9, expected=FILL_TEXT),
+    "bunch_length_mm": Key("length", 1e-3, None, 1e-3, 1e4, LENGTH_TEXT, NUMBERS),
+    "bunch_current_mA": Key("current", 1.0, 0.0, -1e-300, 1e4, LENGTH_TEXT, NUMBERS),
     "bunch_length_exponent": Key("exponent", 1.0, 0.0, -1e-300, 1.0, "a power between 0 and 1"),
     "harmonic_cavity": Key(kind=TABLE, default=None),
-    "scraper_y_mm": _within("scraper_y", 1e-3, 1e4, 1e-3, INFINITE),
-    "pressure_base_Pa": Key("pressure_base", 1.0, REQUIRED, -1e-300, 1.0, PRESSURE),
-    "pressure_slope_Pa_per_mA": Key("pressure_slope", 1.0, 0.0, -1e-300, 1.0, PRESSURE),
-    "temperature_K": _within("temperature", 1.0, 1e4, 1.0, 300.0),
+    "scraper_y_mm": _positive_key("scraper_y", 1e-3, 1e4, 1e-3, INFINITE),
+    "pressure_base_Pa": Key("pressure_base", 1.0, REQUIRED, -1e-300, 1.0, PRESSURE_TEXT),
+    "pressure_slope_Pa_per_mA": Key("pressure_slope", 1.0, 0.0, -1e-300, 1.0, PRESSURE_TEXT),
+    "temperature_K": _positive_key("temperature", 1.0, 1e4, 1.0, 300.0),
     "gas": Key("gas", kind=TABLE, default={"N2": 1.0}),
 }
-CAVITY = {
-    "number": _within("number", 1.0, 100.0),
+CAVITY_KEYS = {
+    "number": _positive_key("number", 1.0, 100.0),
     "voltage_kV": Key("voltage", 1e3, REQUIRED, -1e-300, 1e8, "a voltage of zero or more"),
     "phase_deg": Key("phase", math.pi / 180, REQUIRED, -361.0, 361.0, "an angle in degrees"),
 }
-STRETCH = {"stretch": _within("stretch", 0.1, 100.0)}
+STRETCH_KEYS = {"stretch": _positive_key("stretch", 0.1, 100.0)}
 
 
 def read_ring(path: str | PathLike[str]) -> Ring:
@@ -122,8 +124,8 @@ def read_ring(path: str | PathLike[str]) -> Ring:
     ----------
     path : str or path
         TOML file with the tables `[ring]`, `[acceptance]` and `[optics]`; see docs/lifetime.md.
-        `[optics]` holds ring averages, or `twiss`, a CSV or TFS file beside it; `momentum_table`
-        of `[acceptance]` is one of the momentum acceptance.
+        `[optics]` holds ring averages, or `twiss`, the path of a CSV or TFS file; `momentum_table`
+        of `[acceptance]` is the path of a table of the momentum acceptance.
 
     Returns
     -------
@@ -133,7 +135,7 @@ def read_ring(path: str | PathLike[str]) -> Ring:
     Raises
     ------
     InputError
-        If a key is missing, unknown or a number that no ring has, or a table is not usable.
+        If a key is missing, unknown or out of range, or a table is not usable.
 
     Examples
     --------
@@ -141,38 +143,38 @@ def read_ring(path: str | PathLike[str]) -> Ring:
     >>> print(f"{ring.emittance_y:.3e} m rad at {ring.optics.beta_y.size} points")
     3.610e-11 m rad at 761 points
     """
-    top = _top(path)
-    section, apertures = top.section("ring"), top.section("acceptance")
-    machine = section.values(RING)
+    top = _read_ring_file(path)
+    section, acceptance = top.section("ring"), top.section("acceptance")
+    ring_values = section.values(RING_KEYS)
     section.one_of(("emittance_y_nm", "coupling"))
-    if (coupling := machine.pop("coupling")) is not None:
-        machine["emittance_y"] = machine["emittance_x"] * coupling
-    if machine["energy_loss"] >= machine["energy"]:
-        found = f"{machine['energy_loss'] / 1e3:.6g} keV a turn"
-        expected = f"less than the energy of {machine['energy'] / 1e9:.6g} GeV"
+    if (coupling := ring_values.pop("coupling")) is not None:
+        ring_values["emittance_y"] = ring_values["emittance_x"] * coupling
+    if ring_values["energy_loss"] >= ring_values["energy"]:
+        found = f"{ring_values['energy_loss'] / 1e3:.6g} keV a turn"
+        expected = f"less than the energy of {ring_values['energy'] / 1e9:.6g} GeV"
         raise section.error(found, expected, "energy_loss_keV")
-    aperture, table = apertures.values(ACCEPTANCE), apertures.table.get("momentum_table")
+    aperture, table = acceptance.values(ACCEPTANCE_KEYS), acceptance.table.get("momentum_table")
     if table is not None:
-        apertures.one_of(("momentum", "momentum_table"))
+        acceptance.one_of(("momentum", "momentum_table"))
         table = Path(path).parent / table
-    averages = _optics(top.section("optics"))
-    optics, sides = read_along(machine["circumference"], averages, table)
-    aperture |= {} if sides is None else {"momentum_acceptance": sides}
+    averages = _optics_source(top.section("optics"))
+    optics, acceptance_sides = read_ring_tables(ring_values["circumference"], averages, table)
+    aperture |= {} if acceptance_sides is None else {"momentum_acceptance": acceptance_sides}
     from beamfit.lifetime.ring import Ring
 
-    return Ring(**machine, **aperture, optics=optics)
+    return Ring(**ring_values, **aperture, optics=optics)
 
 
-def _top(path: str | PathLike[str]) -> Section:
+def _read_ring_file(path: str | PathLike[str]) -> Section:
     top = read_toml(path, "a ring")
     top.values(TABLES)
     return top
 
 
-def _optics(section: Section) -> dict[str, float] | Path:
-    """Averages, or the table beside the file."""
+def _optics_source(section: Section) -> dict[str, float] | Path:
+    """Ring averages, or the path of the Twiss table."""
     if "twiss" not in section.table:
-        return section.values(OPTICS)
+        return section.values(OPTICS_KEYS)
     if len(section.table) > 1:
         raise section.error("averages beside a table", "one of them", "twiss")
     section.values({"twiss": Key(kind=TEXT)})
@@ -180,7 +182,7 @@ def _optics(section: Section) -> dict[str, float] | Path:
 
 
 def read_operation(path: str | PathLike[str]) -> Operation:
-    """Read the settings and the vacuum from the `[operation]` table of a ring file.
+    """Read settings and vacuum from the `[operation]` table of a ring file.
 
     Parameters
     ----------
@@ -190,24 +192,24 @@ def read_operation(path: str | PathLike[str]) -> Operation:
     Returns
     -------
     Operation
-        In SI units, pressure rise for each milliampere.
+        In SI units, the pressure rise per mA.
 
     Raises
     ------
     InputError
-        If a key is missing, unknown or a number that no ring has, the gas is unknown, or the RF
-        voltage in the file does not exceed the energy loss per turn given there.
+        If a key is missing, unknown or out of range, the gas is unknown, or the RF voltage does
+        not exceed the energy loss per turn.
 
     Examples
     --------
     >>> read_operation("lattices/spear3_2003.toml").rf_voltage
     3200000.0
     """
-    top = _top(path)
-    section, ring = top.section("operation"), top.section("ring").values(RING)
-    values = section.values(OPERATION)
-    values |= _bunches(section, values["bunches"], ring["harmonic"]) | _cavity(section)
-    values["bunch_length"] = _length(section, values)
+    top = _read_ring_file(path)
+    section, ring = top.section("operation"), top.section("ring").values(RING_KEYS)
+    values = section.values(OPERATION_KEYS)
+    values |= _equal_bunches(section, values["bunches"], ring["harmonic"]) | _cavity(section)
+    values["bunch_length"] = _bunch_length(section, values)
     if values["bunch_length"] is not None and ring["impedance"] > 0:
         expected = "one of them: a given bunch length is taken as it is"
         raise section.error("a bunch length beside impedance_ohm", expected, "bunch_length_mm")
@@ -218,65 +220,65 @@ def read_operation(path: str | PathLike[str]) -> Operation:
     except (TypeError, ValueError) as error:
         raise section.error(str(error), "partial pressures by molecule", "gas") from error
     operation = Operation(**values, gas=gas)
-    if amiss := required_voltage(operation, ring["energy_loss"], ring["energy"]):
+    if expected := required_voltage(operation, ring["energy_loss"], ring["energy"]):
         found = f"{operation.rf_voltage / 1e3:.6g} kV"
-        raise section.error(found, amiss, "rf_voltage_kV")
+        raise section.error(found, expected, "rf_voltage_kV")
     return operation
 
 
-def _bunches(section: Section, given: float | list[float], buckets: float) -> dict[str, Any]:
-    """Number of equal bunches that lose as much, and the charges over one of theirs."""
+def _equal_bunches(section: Section, given: float | list[float], buckets: float) -> dict[str, Any]:
+    """Number of equal bunches with the same loss, and the charges relative to one of them."""
     charge = np.array(given, float, ndmin=1)
     if isinstance(given, list):
         charge = charge[charge > 0]
         found = f"{len(given)} bunches, {charge.size} filled"
-        many = len(given)
+        count = len(given)
     else:
-        found, many = f"{given:g} bunches", given
-    if not (charge.size and 1 <= many <= buckets):
+        found, count = f"{given:g} bunches", given
+    if not (charge.size and 1 <= count <= buckets):
         expected = f"1 to {buckets:g}, the harmonic number"
         raise section.error(found, expected, "bunches")
     if not isinstance(given, list):
         return {"bunches": given}
     from beamfit.lifetime.ring import equal_bunches
 
-    equal = float(equal_bunches(charge))
-    return {"bunches": equal, "fill": charge / charge.sum() * equal}
+    bunches = float(equal_bunches(charge))
+    return {"bunches": bunches, "fill": charge / charge.sum() * bunches}
 
 
 def _cavity(section: Section) -> dict[str, Any]:
-    """The second RF system, or what it does to the bunch."""
+    """Harmonic cavity, or the bunch lengthening it causes."""
     if "harmonic_cavity" not in section.table:
         return {}
     cavity = section.section("harmonic_cavity")
     if "stretch" in cavity.table:
-        return cavity.values(STRETCH)
+        return cavity.values(STRETCH_KEYS)
     from beamfit.lifetime.ring import HarmonicCavity
 
-    return {"harmonic_cavity": HarmonicCavity(**cavity.values(CAVITY))}
+    return {"harmonic_cavity": HarmonicCavity(**cavity.values(CAVITY_KEYS))}
 
 
-def _length(section: Section, values: dict[str, Any]) -> MeasuredLength | None:
-    """The bunch length that is given, by bunch current."""
-    given = {key: values.pop(key) for key in ("length", "current", "exponent")}
-    if given["length"] is None:
+def _bunch_length(section: Section, values: dict[str, Any]) -> MeasuredLength | None:
+    """Measured bunch length by bunch current; None if it is not given."""
+    measured = {key: values.pop(key) for key in ("length", "current", "exponent")}
+    if measured["length"] is None:
         for key in ("bunch_current_mA", "bunch_length_exponent"):
             if key in section.table:
-                raise section.error(f"{key} without bunch_length_mm", LENGTHS, key)
+                raise section.error(f"{key} without bunch_length_mm", LENGTH_TEXT, key)
         return None
     if "stretch" in values:
         expected = "one of them: the length is taken as is"
         raise section.error("a bunch length beside a stretch", expected, "bunch_length_mm")
-    current, length = (np.array(given[key], float, ndmin=1) for key in ("current", "length"))
+    current, length = (np.array(measured[key], float, ndmin=1) for key in ("current", "length"))
     if current.shape != length.shape or (np.diff(current) <= 0).any():
         found = f"{length.size} lengths at {current.size} bunch currents"
-        raise section.error(found, f"{LENGTHS}, as many", "bunch_length_mm")
-    if given["exponent"] > 0 and not current[-1] > 0:
+        raise section.error(found, f"{LENGTH_TEXT}, as many", "bunch_length_mm")
+    if measured["exponent"] > 0 and not current[-1] > 0:
         expected = "bunch_current_mA, above which the bunch grows with that power"
         raise section.error("an exponent without a current", expected, "bunch_length_exponent")
     from beamfit.lifetime.ring import MeasuredLength
 
-    return MeasuredLength(current, length, given["exponent"], values["rf_voltage"])
+    return MeasuredLength(current, length, measured["exponent"], values["rf_voltage"])
 
 
 def ring_from_pyat(
@@ -288,7 +290,7 @@ def ring_from_pyat(
     impedance: float = 0.0,
     acceptance_x: float = INFINITE,
 ) -> Ring:
-    """Take a ring from a pyAT lattice: its optics at every element and its equilibrium beam.
+    """Make a ring from a pyAT lattice: optics at every element, and equilibrium beam.
 
     Parameters
     ----------
@@ -357,79 +359,78 @@ def ring_from_pyat(
     )
 
 
-def read_along(
+def read_ring_tables(
     circumference: float, optics: Mapping[str, float] | Path, apertures: Path | None
 ) -> tuple[Optics, np.ndarray | None]:
-    """Read what a ring file says along the ring.
+    """Read optics and momentum acceptance along the ring.
 
     Parameters
     ----------
     circumference : float
         Circumference of the ring, m.
     optics : mapping of str to float, or path
-        Ring averages by their fields in `Optics`, in that order; or CSV with the columns `s_m,
-        beta_x_m, beta_y_m, alpha_x, alpha_y, dispersion_x_m, dispersion_slope_x` (and optionally
-        the vertical dispersion), or MAD-X TFS. The table covers the whole ring, or one of its equal
-        (or mirror-symmetric) parts. Points close together, inside magnets too: averages are taken
+        Ring averages by field of `Optics`, in that order; or CSV with the columns `s_m, beta_x_m,
+        beta_y_m, alpha_x, alpha_y, dispersion_x_m, dispersion_slope_x` (and optionally the
+        vertical dispersion), or MAD-X TFS. The table covers the whole ring, or one of its equal
+        (or mirror-symmetric) parts. Points should be close, also inside magnets: averages are taken
         by the trapezoidal rule.
     apertures : path or None
-        A table with `s_m, delta_plus, delta_minus`: momentum acceptance of the lattice up and down
-        (with either sign), relative, over the same part of the ring as the optics.
+        A table with `s_m, delta_plus, delta_minus`: relative momentum acceptance of the lattice
+        (with either sign), over the same part of the ring as the optics.
 
     Returns
     -------
     Optics
-        At the points of its table, of averages at those of the apertures.
+        At the points of its table; averages at those of the acceptance.
     array, shape (2, n), or None
-        Momentum acceptance up and down there, linear between the points of its table.
+        Momentum acceptance, positive and negative, at these points by linear interpolation.
 
     Raises
     ------
     InputError
         With file, line and column, if a column is missing, a cell is not a number, a Twiss beta
-        is not positive, an aperture is no share between 0 and 1, or a table does not cover the
-        ring.
+        is not positive, an acceptance is not between 0 and 1, or a table does not cover the ring.
 
     Examples
     --------
-    >>> optics, _ = read_along(234.144, Path("lattices/spear3_2003_twiss.csv"), None)
+    >>> optics, _ = read_ring_tables(234.144, Path("lattices/spear3_2003_twiss.csv"), None)
     >>> print(f"mean beta_y {optics.average(optics.beta_y):.3f} m")
     mean beta_y 8.785 m
     """
     if isinstance(optics, Path):
         sheet = read_sheet(optics, "s_m,beta_x_m,beta_y_m")
         s, *values = (_column(sheet, name) for name in COLUMNS)
-        weight = _weights(sheet, s, circumference)
+        weight = _ring_shares(sheet, s, circumference)
     else:
         s, weight, values = None, np.ones(1), np.array(list(optics.values()))[:, None]
-    sides = None
+    acceptance = None
     if apertures is not None:
         sheet = read_sheet(apertures, "s_m,delta_plus,delta_minus")
-        at, *sides = (_column(sheet, name) for name in ("s_m", *SIDES))
-        own = _weights(sheet, at, circumference)
+        positions, *acceptance = (_column(sheet, name) for name in ("s_m", *ACCEPTANCE_COLUMNS))
+        shares = _ring_shares(sheet, positions, circumference)
         if s is None:
-            weight, values = own, np.broadcast_to(values, (len(values), at.size))
-        elif max(abs(at[0] - s[0]), abs(at[-1] - s[-1])) > 1e-3 * circumference:
-            ends = f"s from {at[0]:.6g} to {at[-1]:.6g} m"
+            weight, values = shares, np.broadcast_to(values, (len(values), positions.size))
+        elif max(abs(positions[0] - s[0]), abs(positions[-1] - s[-1])) > 1e-3 * circumference:
+            found = f"s from {positions[0]:.6g} to {positions[-1]:.6g} m"
             expected = f"that of the optics, {s[0]:.6g} to {s[-1]:.6g} m"
-            raise sheet.header_error(ends, expected, "s_m")
+            raise sheet.header_error(found, expected, "s_m")
         else:
-            sides = [np.interp(s, at, side) for side in sides]
+            acceptance = [np.interp(s, positions, side) for side in acceptance]
     from beamfit.lifetime.ring import Optics  # JAX from here on: the tables are in order
 
-    return Optics(weight, *values), None if sides is None else np.stack(sides)
+    return Optics(weight, *values), None if acceptance is None else np.stack(acceptance)
 
 
 def _column(sheet: Sheet, name: str) -> np.ndarray:
-    """A column under its own name or that of a TFS file."""
+    """Checked column, under its own name or that of a TFS file; optional ones default to 0."""
     header = next((h for h in (name, COLUMNS.get(name)) if h in sheet.names), None)
     if header is None:
-        if name in MAY_BE_MISSING:
+        if name in OPTIONAL_COLUMNS:
             return np.zeros(len(sheet))
-        known = nearest(name, list(sheet.names))
-        raise sheet.header_error(f"no column '{name}', but {known}", f"'{name}'")
+        nearest_names = nearest(name, list(sheet.names))
+        raise sheet.header_error(f"no column '{name}', but {nearest_names}", f"'{name}'")
     values = sheet.numbers(header)
-    if name in SIDES:
+    if name in ACCEPTANCE_COLUMNS:
         values = np.abs(values)
         wrong, expected = (values == 0) | (values >= 1), "a share between 0 and 1, 0.03 for 3 %"
     else:
@@ -439,8 +440,8 @@ def _column(sheet: Sheet, name: str) -> np.ndarray:
     return values
 
 
-def _weights(sheet: Sheet, s: np.ndarray, circumference: float) -> np.ndarray:
-    """Share of the ring for each point (trapezoid); the table covers the ring or a part 1/k."""
+def _ring_shares(sheet: Sheet, s: np.ndarray, circumference: float) -> np.ndarray:
+    """Share of the ring at each point (trapezoidal rule); a table covers the ring or 1/k of it."""
     steps = np.diff(s)
     if np.any(steps < 0):
         raise sheet.error("s falls", "positions that rise", int(np.argmin(steps)) + 1, "s_m")

@@ -1,9 +1,10 @@
-"""Records of runs: time, inputs u_… and outputs y_… in the columns of a file."""
+"""Read runs of a process: time, inputs u_… and outputs y_… in the columns of a file."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
+from functools import partial
 from os import PathLike
 from typing import TYPE_CHECKING
 
@@ -18,10 +19,10 @@ from beamfit.io.columns import (
     Layout,
     Sheet,
     columns_of,
-    ignored,
+    ignored_note,
     layout_of,
-    left_out,
-    spelled,
+    sheet_notes,
+    standard_header,
 )
 from beamfit.io.files import name_of
 from beamfit.io.table import read_columns
@@ -29,8 +30,8 @@ from beamfit.io.table import read_columns
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-ASIDE, TIME = "aside", "time"
-EXAMPLE = "time_s,u_valve,y_level"
+UNUSED, TIME = "unused", "time"
+EXAMPLE_HEADER = "time_s,u_valve,y_level"
 
 
 def read_run(
@@ -49,18 +50,18 @@ def read_run(
     ----------
     path : str, path or pandas.DataFrame
         A frame, CSV or HDF5 with ``time_s`` (_min, _h, _ms; or ``time`` with dates), inputs ``u_…``
-        and outputs ``y_…``. A blank output was not read.
+        and outputs ``y_…``. A blank output is a missing reading.
     columns : str, path, mapping or Layout, optional
-        What columns are: ``{"valve position": "u_valve"}``, or as `beamfit.io.columns.layout_of`
-        reads it. Other columns of unknown names are ignored.
+        Meaning of columns: ``{"valve position": "u_valve"}``, or any layout of
+        `beamfit.io.columns.layout_of`. Other columns with unknown names are then ignored.
     inputs, outputs : iterable of str
-        Columns of other names that are inputs or outputs; the others are then ignored.
+        Headers of inputs or outputs with other names; all other columns are then ignored.
     step : float, optional
-        Distance of the rows in s, of a file without a time.
+        Time between rows in s, for a file without time.
     ignore : iterable of str
-        Columns to leave unread; * and ? stand for any letters.
+        Columns to leave unread; * and ? are wildcards.
     skip_bad : bool
-        Leave out rows with something wrong in them; ``notes`` counts and names them.
+        Leave out rows that cannot be used; ``notes`` counts and names them.
 
     Returns
     -------
@@ -81,46 +82,48 @@ def read_run(
     >>> print(read_run(file))
     run.csv: 10 rows over 9 s, inputs valve, outputs level
     """
-    named = [(name, f"u_{spelled(name)}") for name in inputs]
-    named += [(name, f"y_{spelled(name)}") for name in outputs]
+    named = [(name, f"u_{standard_header(name)}") for name in inputs]
+    named += [(name, f"y_{standard_header(name)}") for name in outputs]
     layout = layout_of(columns) + Layout(tuple(named), tuple(name for name, _ in named))
-    sheet = read_columns(path, EXAMPLE, layout, ignore, skip_bad)
-    columns = columns_of(sheet, {TIME: "time"}, lambda header: _other(header, sheet, bool(named)))
-    columns = {key: column for key, column in columns.items() if not key.startswith(ASIDE)}
+    sheet = read_columns(path, EXAMPLE_HEADER, layout, ignore, skip_bad)
+    read_header = partial(_run_column, sheet=sheet, named=bool(named))
+    columns = columns_of(sheet, {TIME: "time"}, read_header)
+    columns = {key: column for key, column in columns.items() if not key.startswith(UNUSED)}
     if TIME not in columns and step is None:
         raise sheet.header_error("no column of time", "time_s, or --step SECONDS")
     for kind, word in (("u", "input"), ("y", "output")):
         if not any(key.startswith(f"{kind}_") for key in columns):
             raise sheet.header_error(f"no {word}", f"a column {kind}_…, or --{word} COLUMN")
-    sheet = sheet.good(lambda rows: _values(rows, columns))
-    values = _values(sheet, columns)
+    sheet = sheet.drop_bad_rows(lambda rows: _run_values(rows, columns))
+    values = _run_values(sheet, columns)
     u, y = ({k[2:]: v for k, v in values.items() if k.startswith(f"{kind}_")} for kind in "uy")
     if (time := values.get(TIME)) is None:
         if not step > 0:
             raise InputError(f"--step {step}", "seconds between the rows, above 0")
         time = float(step) * np.arange(len(sheet))
-    late = np.flatnonzero(~(np.diff(time) > 0))
-    if late.size:
-        row = int(late[0]) + 1
+    not_later = np.flatnonzero(~(np.diff(time) > 0))
+    if not_later.size:
+        row = int(not_later[0]) + 1
         found = f"time {time[row]:.10g} s after {time[row - 1]:.10g} s"
-        whole = replace(sheet, skip="")
-        raise whole.error(found, "times that increase", row, columns[TIME].header)
-    said = {
+        without_hint = replace(sheet, row_hint="")
+        raise without_hint.error(found, "times that increase", row, columns[TIME].header)
+    provenance = {
         "provenance": sheet.comments,
-        "notes": (*ignored(sheet, columns), *left_out(sheet)),
+        "notes": (*ignored_note(sheet, columns), *sheet_notes(sheet)),
         "sha256": sheet.sha256,
     }
-    return Run(time, u, y, name=name_of(sheet.path), path=str(sheet.path), **said)
+    return Run(time, u, y, name=name_of(sheet.path), path=str(sheet.path), **provenance)
 
 
-def _other(header: str, sheet: Sheet, named: bool) -> Column | None:
-    """An input or an output; where some are named, no others are read."""
+def _run_column(header: str, sheet: Sheet, named: bool) -> Column | None:
+    """Column of time, input or output; if some are named, others are not read."""
     if header.lower() == TIME:
         return Column(header, TIME, DATE)
-    if header[:2] in ("u_", "y_") and len(header) > 2 and (header in sheet.called or not named):
+    is_read = header in sheet.file_headers or not named
+    if is_read and len(header) > 2 and header[:2] in ("u_", "y_"):
         return Column(header, header)
-    return Column(header, f"{ASIDE} {header}") if header.startswith("note_") else None
+    return Column(header, f"{UNUSED} {header}") if header.startswith("note_") else None
 
 
-def _values(sheet: Sheet, columns: Mapping[str, Column]) -> dict[str, np.ndarray]:
+def _run_values(sheet: Sheet, columns: Mapping[str, Column]) -> dict[str, np.ndarray]:
     return {key: sheet.values(c, blank=key.startswith("y_")) for key, c in columns.items()}

@@ -1,4 +1,4 @@
-"""TOML files checked against a schema: which keys a table may have, of what kind, in what range."""
+"""TOML files checked against a schema of keys: type, unit and range of each value."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from typing import Any, NamedTuple
 from beamfit.errors import InputError, nearest
 from beamfit.io.files import digest, read_text
 
-# A key whose parts between dots take tomllib minutes; a whole number that no other program reads,
-# and whose decimal digits Python does not write.
-ENDLESS = {
+# Texts that are refused before parsing: a dotted key of many parts takes tomllib minutes; integers
+# of 250 hexadecimal digits are beyond floats, and Python does not print longer ones in decimal.
+UNREADABLE = {
     re.compile(r"(?:[\w\"'-]+[ \t]*\.[ \t]*){20}"): "a key of more than 20 parts",
     re.compile(r"\b0[xob][0-9A-Fa-f_]{250,}"): "an integer of {} digits",
 }
-# Words of which all are named, and not the nearest.
-MOST_LISTED = 3
+# A message lists up to this many choices; of more it gives the nearest.
+MAX_LISTED = 3
 REQUIRED: Any = object()
 TEXT, LIST, FLAG, TABLE = str, list, bool, dict
 NUMBER, WHOLE, NUMBERS = (int, float), (float, int), (int, float, list)
@@ -37,26 +37,26 @@ KINDS = {
 
 
 class Key(NamedTuple):
-    """Kind, unit and range of the value of a key.
+    """Type, unit and range of the value of a key.
 
     Attributes
     ----------
     field : str
-        Name of the value it gives; "" for what is only checked.
+        Name of the value in the result; "" if the key is only checked.
     factor : float
         SI value of one unit.
     default : object
-        Value where the key is missing, in SI; `REQUIRED` if it must be there.
+        Value in SI if the key is missing; `REQUIRED` if it must be there.
     low, high : float
-        Numbers lie between the two and are neither.
-    said : str
-        That range in words.
+        Open interval of numbers.
+    expected : str
+        The range in words, for messages.
     kind : type
-        Of the value.
+        Type of the value.
     among : sequence of str
-        Words of which a text is one.
+        Allowed texts.
     each : type
-        Of the values of a list.
+        Type of the items of a list.
     """
 
     field: str = ""
@@ -64,44 +64,44 @@ class Key(NamedTuple):
     default: Any = REQUIRED
     low: float = -math.inf
     high: float = math.inf
-    said: str = ""
+    expected: str = ""
     kind: Any = NUMBER
     among: Sequence[str] = ()
     each: Any = object
 
-    def amiss(self, value: object) -> str | None:
-        """Say what should stand there instead of a value, or None if the value is good.
+    def correction(self, value: object) -> str | None:
+        """Expected content if a value is wrong; None if it is right.
 
         Examples
         --------
-        >>> Key(low=0.0, said="a positive number").amiss(-1.0)
+        >>> Key(low=0.0, expected="a positive number").correction(-1.0)
         'a positive number'
         """
-        usual = KINDS[self.kind]
+        kind_text = KINDS[self.kind]
         if not isinstance(value, self.kind) or (isinstance(value, bool) and self.kind is not FLAG):
-            return usual
+            return kind_text
         if self.kind is TEXT:
-            known = not self.among or value in self.among
-            return None if known and value.strip() else self._words(value)
+            allowed = not self.among or value in self.among
+            return None if allowed and value.strip() else self._choices(value)
         if self.kind is LIST and not all(map(self._fits, value)):
-            return self.said
+            return self.expected
         if self.kind not in (WHOLE, NUMBER, NUMBERS) or value == self.default:
             return None
         numbers = value if isinstance(value, list) else [value]
         whole = self.kind is not WHOLE or value % 1 == 0
         if not (numbers and whole and all(map(is_number, numbers))):
-            return usual
-        return None if all(self.low < number < self.high for number in numbers) else self.said
+            return kind_text
+        return None if all(self.low < number < self.high for number in numbers) else self.expected
 
-    def _words(self, value: str) -> str:
-        few = " or ".join(self.among) or "a name"
-        return nearest(value, list(self.among)) if len(self.among) > MOST_LISTED else few
+    def _choices(self, value: str) -> str:
+        choices = " or ".join(self.among) or "a name"
+        return nearest(value, list(self.among)) if len(self.among) > MAX_LISTED else choices
 
     def _fits(self, value: object) -> bool:
         return is_number(value) if self.each is NUMBER else isinstance(value, self.each)
 
     def in_si(self, value: Any) -> Any:
-        """A good value in SI; what is neither number nor list of numbers as it is."""
+        """Convert a number or list of numbers to SI; other values stay."""
         if self.kind is NUMBERS and isinstance(value, list):
             return [number * self.factor for number in value]
         if self.kind is WHOLE:
@@ -109,20 +109,20 @@ class Key(NamedTuple):
         return value * self.factor if self.kind in (NUMBER, NUMBERS) else value
 
 
-def keyed(name: str, default: Any = REQUIRED, **how: Any) -> Any:
-    """A field of a dataclass with the key of a table that gives it; see `Section.read`."""
-    given = {} if default is REQUIRED else {"default": default}
-    return field(**given, metadata={name: Key(default=default, **how)})
+def key_field(name: str, default: Any = REQUIRED, **options: Any) -> Any:
+    """Field of a dataclass, read from the key `name` of a table; see `Section.read`."""
+    field_default = {} if default is REQUIRED else {"default": default}
+    return field(**field_default, metadata={name: Key(default=default, **options)})
 
 
 def is_number(value: object) -> bool:
-    """Tell a value that is a finite number (an integer of 400 digits is none)."""
+    """True if a value is a finite number (integers beyond the range of float are not)."""
     return isinstance(value, NUMBER) and not isinstance(value, bool) and abs(value) < 1e300
 
 
 @dataclass(frozen=True)
 class Section:
-    """A table of a file, and where in the text it begins.
+    """Table of a file, with its place in the text.
 
     Attributes
     ----------
@@ -135,11 +135,11 @@ class Section:
     start : int
         Line at which the table begins, counted from 0.
     words : str
-        Where that is, for messages.
+        That place in words, for messages.
     prefix : str
-        What stands before the names of its own tables.
+        Prefix of the names of its sub-tables.
     sha256 : str
-        Digest of the file.
+        SHA-256 of the file.
     """
 
     path: str | PathLike[str]
@@ -151,12 +151,12 @@ class Section:
     sha256: str = ""
 
     def error(self, found: str, expected: str, key: str | None = None) -> InputError:
-        """Make the error that names the line on which the key (or the table) stands."""
-        line = self.start + 1 if key is None else self._line(key) + 1
+        """Make an error at the line of a key, or of the table."""
+        line = self.start + 1 if key is None else self._find_line(key) + 1
         return InputError(found, expected, path=self.path, line=line, column=key)
 
-    def _line(self, key: str) -> int:
-        """Find the line of `key =` before the next table, or of a table of that name."""
+    def _find_line(self, key: str) -> int:
+        """Find the line of `key =` in this table, or of a sub-table of that name."""
         value = re.compile(rf"\s*['\"]?{re.escape(key)}['\"]?\s*[=.]")
         head = re.compile(rf"\s*\[\[?\s*{re.escape(self.prefix + key)}\s*\]")
         inside = True
@@ -167,26 +167,26 @@ class Section:
         return self.start
 
     def section(self, name: str) -> Section:
-        """A table of this one, empty where there is none.
+        """Sub-table of this table; empty if it is missing.
 
         Raises
         ------
         InputError
-            If something else stands under its name.
+            If its name has a value that is no table.
         """
         table = self.table.get(name, {})
         if not isinstance(table, dict):
             raise self.error(f"{name} = {table!r}"[:80], f"a table [{name}]", name)
-        start = self._line(name)
+        start = self._find_line(name)
         return Section(self.path, self.lines, table, start, f"in [{name}]", f"{name}.")
 
     def sections(self, name: str) -> list[Section]:
-        """The tables of a list of tables [[name]].
+        """Tables of a list of tables [[name]].
 
         Raises
         ------
         InputError
-            If there is none, or one of them is no table.
+            If the list is empty, or an item is no table.
         """
         head = re.compile(rf"\s*\[\[\s*{re.escape(name)}\s*\]\]")
         heads = [n for n, text in enumerate(self.lines) if head.match(text)]
@@ -202,17 +202,17 @@ class Section:
         ]
 
     def values(self, keys: Mapping[str, Key]) -> dict[str, Any]:
-        """Check every key, and give the values in SI by field.
+        """Check all keys, and return their values in SI by field.
 
         Raises
         ------
         InputError
-            If a key is missing, unknown, of another kind or out of its range.
+            If a key is missing or unknown, or its value has the wrong type or range.
         """
         for name, value in self.table.items():
             if name not in keys:
                 raise self.error("an unknown key", nearest(name, list(keys)), name)
-            if expected := keys[name].amiss(value):
+            if expected := keys[name].correction(value):
                 raise self.error(f"{value!r}"[:80], expected, name)
         for name, key in keys.items():
             if name not in self.table and key.default is REQUIRED:
@@ -224,28 +224,30 @@ class Section:
         }
 
     def read(self, kind: type[Any]) -> Any:
-        """Make a dataclass whose fields are `keyed`; checked as by `values`.
+        """Make a dataclass whose fields are made by `key_field`; checked as by `values`.
 
         Examples
         --------
         >>> @dataclass
         ... class Shot:
-        ...     wait: float = keyed("wait_s", low=0.0, said="a time above zero")
+        ...     wait: float = key_field("wait_s", low=0.0, expected="a time above zero")
         >>> Section("a.toml", (), {"wait_s": 2.5}).read(Shot)
         Shot(wait=2.5)
         """
-        own = [
-            (name, k._replace(field=f.name)) for f in fields(kind) for name, k in f.metadata.items()
+        keys = [
+            (name, key._replace(field=f.name))
+            for f in fields(kind)
+            for name, key in f.metadata.items()
         ]
-        return kind(**self.values(dict(own)))
+        return kind(**self.values(dict(keys)))
 
     def one_of(self, names: Iterable[str], hint: str = "") -> str:
-        """The one of some keys that is given; a hint says what may stand for none.
+        """The one key of several that is present; a hint is for the message if there is none.
 
         Raises
         ------
         InputError
-            If there is none, or more than one.
+            If none or more than one is present.
         """
         names = list(names)
         given = [name for name in names if name in self.table]
@@ -267,21 +269,21 @@ def read_toml(
     path : str or path
         The file.
     what : str
-        What it should be, such as "a lattice".
+        Kind of file for messages, such as "a lattice".
     form : str, optional
-        What its key ``format`` says.
+        Required value of the key ``format``.
     needed : bool
-        Whether it has to say that.
+        False if the key ``format`` may be missing.
 
     Returns
     -------
     Section
-        Its top level, without the format.
+        The top level, without the key ``format``.
 
     Raises
     ------
     InputError
-        If it cannot be read or does not parse, with the line, or has another format.
+        If the file cannot be read or parsed (with the line), or has another format.
 
     Examples
     --------
@@ -294,17 +296,17 @@ def read_toml(
     text = read_text(path)
     lines = tuple(text.splitlines())
     try:
-        for endless, said in ENDLESS.items():
-            if found := endless.search(text):
+        for pattern, description in UNREADABLE.items():
+            if found := pattern.search(text):
                 line = text.count("\n", 0, found.start()) + 1
-                raise ValueError(f"{said.format(len(found[0]) - 2)} (at line {line})")
+                raise ValueError(f"{description.format(len(found[0]) - 2)} (at line {line})")
         table = tomllib.loads(text)
     except (ValueError, RecursionError) as error:  # integers too long, nesting too deep
         if re.search(r"^[^#=\n]*\bsize_[xy]_", text, re.MULTILINE):
             expected = "the scan first and the lattice after --lattice; are they swapped?"
             raise InputError(f"a scan where {what} should be", expected, path) from None
-        told = re.search(r"at line (\d+)", str(error))
-        line = int(told[1]) if told else len(lines)
+        position = re.search(r"at line (\d+)", str(error))
+        line = int(position[1]) if position else len(lines)
         found = "TOML that does not parse ({})".format(re.sub(r"\s*\(at .*\)", "", str(error)))
         raise InputError(found, f"{what} file in TOML", path, line) from None
     top = Section(path, lines, table, sha256=digest(path))

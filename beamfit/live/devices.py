@@ -26,8 +26,8 @@ from beamfit.io.machine import (
     Magnet,
     Profiler,
     ScanMachine,
+    check_setting,
     check_unit,
-    moved,
     unit_of,
 )
 from beamfit.live.channel import Channel, LostError, PvReading, SilentError, open_channel
@@ -134,7 +134,7 @@ class Supply:
         """As `Device.put`; nothing outside the limits is ever written."""
         magnet = self.magnet
         try:
-            await self.setting.put(moved(magnet, value))
+            await self.setting.put(check_setting(magnet, value))
         except SilentError:
             await self.setting.get()  # or its IOC is what does not answer
             found = f"{magnet.name} not at {value:.6g} {magnet.unit} within {magnet.timeout:g} s"
@@ -184,7 +184,7 @@ class Supply:
 
     async def standing(self) -> float:
         """Its setting, if that is within the limits and is what is read back."""
-        value = moved(self.magnet, await self.get())
+        value = check_setting(self.magnet, await self.get())
         await self.settled(value)
         return value
 
@@ -453,7 +453,7 @@ async def checked(supply: Supply) -> tuple[Supply, list[str]]:
         found = f"tolerance {magnet.tolerance:g} of {magnet.name} within {low:g} to {high:g}"
         raise InputError(found, "less than a tenth of what the control system lets it move")
     for value in magnet.degauss:
-        moved(magnet, value)
+        check_setting(magnet, value)
     said = f"Limits of {magnet.name}: {low:g} to {high:g} {magnet.unit}, of the control system."
     return replace(supply, magnet=magnet), [said]
 

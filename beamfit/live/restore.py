@@ -20,7 +20,7 @@ from pathlib import Path
 from beamfit.compile_cache import own_folder
 from beamfit.errors import InputError, plain
 from beamfit.io.files import read_json
-from beamfit.io.machine import APPROACHES, Magnet, ScanMachine, moved
+from beamfit.io.machine import APPROACHES, Magnet, ScanMachine, check_setting
 from beamfit.io.toml import is_number
 from beamfit.live.devices import Device, NotSettledError
 from beamfit.writing import alone, write_atomically
@@ -230,7 +230,7 @@ async def reach(
     InputError
         If the setting is outside the limits (nothing is written then), or is not reached.
     """
-    value, by = moved(magnet, value), magnet.approach_by
+    value, by = check_setting(magnet, value), magnet.approach_by
     present = await device.get() if present is None else present
     if magnet.approach == "below" and not present <= value:
         await _put(device, max(value - by, magnet.low))

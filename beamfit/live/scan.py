@@ -17,7 +17,7 @@ import numpy as np
 
 from beamfit.emittance.fit import EmittanceFit
 from beamfit.errors import InputError
-from beamfit.io.machine import ScanMachine, moved
+from beamfit.io.machine import ScanMachine, check_setting
 from beamfit.live.aims import Aim, Next, aim_of
 from beamfit.live.devices import Connected, NoSizesError, Shots
 from beamfit.live.points import MeasuredPoint
@@ -149,7 +149,7 @@ async def scan(
     with alone_with(journal, at.machine.magnets):
         check_none_left(journal)
         magnets = at.machine.magnets  # what could not be put back is not moved
-        before = {m.name: moved(m, await at.magnets[m.name].get()) for m in magnets}
+        before = {m.name: check_setting(m, await at.magnets[m.name].get()) for m in magnets}
         log = _journal_for(journal, at.machine, before)
         run = Running(at, aim, before, keep, tell, ready)
         measuring = asyncio.ensure_future(_begun(run, log))

@@ -111,7 +111,7 @@ def test_a_second_run_answers_what_is_new_and_tables_of_all_kinds_agree(answered
     [found] = json.loads(said)["results"]
     assert (code, found["new"], found["files"]) == (0, 1, len(FACTORS) + 3)
     with_other_options = Job("emittance", job.lattice, weights="measured")
-    assert not any(map(type(again.ledger)(out, with_other_options).answered, again.files))
+    assert not any(map(type(again.ledger)(out, with_other_options).has_answer, again.files))
 
     rows = table(out)
     for suffix in (".h5", ".parquet"):
@@ -199,7 +199,7 @@ from beamfit import writing
 from beamfit.batch import run
 from beamfit.batch.job import Job
 
-run.TASK, left, replace = 2, [int(sys.argv[1])], os.replace
+run.FILES_PER_TASK, left, replace = 2, [int(sys.argv[1])], os.replace
 
 
 def last(*paths):
@@ -242,8 +242,8 @@ def test_workers_that_die_lose_and_double_nothing(unusable, tmp_path, monkeypatc
     import dask
     import distributed  # its settings, before they are changed  # noqa: F401
 
-    monkeypatch.setattr(running, "TASK", 2)
-    monkeypatch.setattr(running, "PATIENCE", 3.0)
+    monkeypatch.setattr(running, "FILES_PER_TASK", 2)
+    monkeypatch.setattr(running, "TIMEOUT", 3.0)
     out, job = tmp_path / "a.csv", Deadly("emittance", reading={"mark": str(tmp_path / "mark")})
     with dask.config.set({"distributed.scheduler.allowed-failures": 1}):
         found = run_batch([str(unusable)], str(out), job, workers=1)
@@ -254,7 +254,7 @@ def test_workers_that_die_lose_and_double_nothing(unusable, tmp_path, monkeypatc
 
 
 def test_no_scheduler_is_one_line(unusable, tmp_path, monkeypatch):
-    monkeypatch.setattr(running, "PATIENCE", 1.0)
+    monkeypatch.setattr(running, "TIMEOUT", 1.0)
     with pytest.raises(InputError, match="no scheduler at tcp"):
         run_batch(
             [str(unusable)],

@@ -6,7 +6,7 @@ import h5py
 import numpy as np
 import pytest
 
-from beamfit.io.check import understand, with_lattice
+from beamfit.io.check import file_summary, with_lattice
 
 SCAN = """Q2_A,fwhm_x_mm,size_y_um,size_y_error_um,energy_MeV,screen
 0,0.2,200,4,30,PRE
@@ -55,7 +55,7 @@ def facts(found):
 
 
 def test_a_scan(files):
-    found = facts(understand(files / "scan.csv"))
+    found = facts(file_summary(files / "scan.csv"))
     assert (found["rows"], found["planes"]) == (4, {"x": 4, "y": 3})
     assert found["magnet Q2"] == {"low": 0, "high": 3, "unit": "A", "settings": 4}
     rms = 1e-3 / np.sqrt(8 * np.log(2))
@@ -69,30 +69,30 @@ def test_a_scan(files):
 
 def test_a_scan_is_held_against_each_lattice(files):
     (files / "other.toml").write_text(LATTICE.replace('"Q2"', '"Q3"'))
-    scan, good = understand(files / "scan.csv"), understand(files / "line.toml")
-    said = with_lattice(with_lattice(scan, good), understand(files / "other.toml"))
+    scan, good = file_summary(files / "scan.csv"), file_summary(files / "line.toml")
+    said = with_lattice(with_lattice(scan, good), file_summary(files / "other.toml"))
     assert facts(said)["on line.toml"] == {"fits": True}
     assert "did you mean Q3?" in facts(said)["on other.toml"]["why"]
 
 
 def test_sizes_and_settings_in_another_unit_are_asked_about(files):
     (files / "scan.csv").write_text(SCAN.replace("fwhm_x_mm", "size_x_m").replace(",0.", ",0.02"))
-    wide = understand(files / "scan.csv")
+    wide = file_summary(files / "scan.csv")
     assert any("unusually large" in note for note in wide.notes)
     strong = SCAN.replace("Q2_A", "Q2_T_per_m").replace("\n3,", "\n3000,")
     (files / "scan.csv").write_text(strong)
-    said = with_lattice(understand(files / "scan.csv"), understand(files / "line.toml"))
+    said = with_lattice(file_summary(files / "scan.csv"), file_summary(files / "line.toml"))
     assert any("3e+03 T/m" in note for note in said.notes)
 
 
 def test_a_file_of_emittance_gui(shared):
-    found = facts(understand(shared / "data/lcls_otr2/test_scan2.mat"))
+    found = facts(file_summary(shared / "data/lcls_otr2/test_scan2.mat"))
     assert len(found["size methods"]) == 7
     assert (found["matrices"], found["shots"]["high"]) == (True, 5)
 
 
 def test_a_lattice(files):
-    found = understand(files / "line.toml")
+    found = file_summary(files / "line.toml")
     said = facts(found)
     assert said["energy"] == {"value": 30.5, "unit": "MeV", "particle": "electron"}
     assert said["length"] == pytest.approx(0.1 + 0.4 * np.pi / 2)
@@ -103,7 +103,7 @@ def test_a_lattice(files):
 
 
 def test_a_record(files):
-    found = facts(understand(files / "fill.h5"))
+    found = facts(file_summary(files / "fill.h5"))
     assert found["readings"] == {"count": 30, "span_h": pytest.approx(29 / 60)}
     assert found["beam current"]["high"] == pytest.approx(100.0)
     assert found["errors"]["low"] == pytest.approx(0.01)
@@ -113,7 +113,7 @@ def test_a_record(files):
 
 
 def test_a_ring(root):
-    found = facts(understand(root / "lattices/spear3_2003.toml"))
+    found = facts(file_summary(root / "lattices/spear3_2003.toml"))
     assert found["circumference"]["value"] == pytest.approx(234.144012)
     assert (found["bunches"]["value"], found["RF voltage"]["value"]) == (280, 3200)
 

@@ -192,7 +192,7 @@ def test_a_document_solved_again_compiles_nothing(root, tmp_path, caplog):
     """Neither the document read again nor another value of an input is traced again."""
     import jax
 
-    from beamfit.io.formulation import read_formulation, solved_formulation
+    from beamfit.io.formulation import read_formulation, solve_formulation
 
     path = tmp_path / "again.bf"
     path.write_text((root / "formulations/appendix_d.bf").read_text() + "# solved again")
@@ -200,7 +200,7 @@ def test_a_document_solved_again_compiles_nothing(root, tmp_path, caplog):
     def solved(**given):
         caplog.clear()
         with jax.log_compiles():
-            found = solved_formulation(read_formulation(path), path, **given)
+            found = solve_formulation(read_formulation(path), path, **given)
         return found.objective, "Compiling" in caplog.text
 
     first, compiled = solved()

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from beamfit.errors import InputError
-from beamfit.io.check import understand
+from beamfit.io.check import file_summary
 from beamfit.io.decay_record import read_decay_record, read_lifetime_input, read_lifetimes
 from beamfit.io.scan import read_quad_scan
 from beamfit.lifetime.record import LifetimeTable
@@ -259,7 +259,7 @@ ROWS = {
 def test_json_of_scripts(form, tmp_path):
     (tmp_path / "a.json").write_text(json.dumps(ROWS[form]))
     assert read_decay_record(tmp_path / "a.json").current.tolist() == CURRENT
-    assert understand(tmp_path / "a.json").kind == "record"
+    assert file_summary(tmp_path / "a.json").kind == "record"
 
 
 def test_json_of_a_scan_and_of_nothing(tmp_path):
@@ -267,7 +267,7 @@ def test_json_of_a_scan_and_of_nothing(tmp_path):
     columns["size_y_um"] = [None, 70, 80, 90]
     (tmp_path / "a.json").write_text(json.dumps(columns))
     assert len(read_quad_scan(tmp_path / "a.json").rows("y").size) == 3
-    assert understand(tmp_path / "a.json").kind == "scan"
+    assert file_summary(tmp_path / "a.json").kind == "scan"
     for wrong in ({"Q_A": [0, 1], "size_x_um": [1]}, {"Q_A": 1}, [], 3, "text"):
         (tmp_path / "a.json").write_text(json.dumps(wrong))
         with pytest.raises(InputError, match="another JSON file"):

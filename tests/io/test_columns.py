@@ -9,7 +9,7 @@ import pytest
 import beamfit
 from beamfit.cli import main
 from beamfit.errors import InputError
-from beamfit.io.columns import layout_of, spelled
+from beamfit.io.columns import layout_of, standard_header
 from beamfit.io.decay_record import read_lifetimes
 from beamfit.io.run import read_run
 
@@ -257,5 +257,5 @@ def test_every_command_takes_it(file, root, monkeypatch, capsys):
 
 
 def test_a_slash_within_brackets_is_of_the_unit():
-    assert spelled("Q1 [G/cm]") == "Q1 [G/cm]"
-    assert spelled("Q1 [T/m]") == "Q1_T_per_m"
+    assert standard_header("Q1 [G/cm]") == "Q1 [G/cm]"
+    assert standard_header("Q1 [T/m]") == "Q1_T_per_m"

@@ -4,7 +4,7 @@ import pytest
 
 from beamfit.errors import InputError
 from beamfit.io.cells import BLANK
-from beamfit.io.check import understand
+from beamfit.io.check import file_summary
 from beamfit.io.decay_record import read_decay_record
 from beamfit.io.scan import read_quad_scan
 
@@ -127,4 +127,4 @@ def test_one_record_in_every_style(style, tmp_path):
     record = read_decay_record(path)
     assert (record.time - record.time[0]).tolist() == [0, 60, 120]
     assert record.current.tolist() == [200.5, 199.5, 198.5]
-    assert understand(path).kind == "record"
+    assert file_summary(path).kind == "record"

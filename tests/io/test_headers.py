@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from beamfit.errors import InputError
-from beamfit.io.check import proposed_layout, understand
-from beamfit.io.columns import spelled
+from beamfit.io.check import file_summary, proposed_layout
+from beamfit.io.columns import standard_header
 from beamfit.io.decay_record import read_decay_record
 from beamfit.io.scan import read_quad_scan
 
@@ -37,7 +37,7 @@ def test_a_scan_is_the_same_under_every_header(head, code, tmp_path):
     assert found.units == {"Q525": "kG"}
     np.testing.assert_array_equal(found.rows("x").size, plain.rows("x").size)
     np.testing.assert_array_equal(found.error["x"], plain.error["x"])
-    assert understand(tmp_path / "a.csv").kind == "scan"
+    assert file_summary(tmp_path / "a.csv").kind == "scan"
 
 
 def test_what_stands_above_a_header_is_kept_as_comments(tmp_path):
@@ -63,7 +63,7 @@ def test_a_record_of_a_logger_is_read(tmp_path):
     found, plain = (read_decay_record(tmp_path / name) for name in ("a.csv", "b.csv"))
     np.testing.assert_array_equal(found.time, plain.time)
     np.testing.assert_array_equal(found.current, plain.current)
-    assert understand(tmp_path / "a.csv").kind == "record"
+    assert file_summary(tmp_path / "a.csv").kind == "record"
 
 
 def test_scans_and_records_in_each_others_place_are_told_so(tmp_path):
@@ -78,7 +78,7 @@ def test_scans_and_records_in_each_others_place_are_told_so(tmp_path):
 
 def test_units_that_could_mean_another_are_left_as_they_stand():
     same = ("rf_voltage_mv", "Q_a", "Q552_mA2", "size_x", "SR:DCCT:CURRENT", "note_by hand")
-    assert [spelled(header) for header in same] == list(same)
+    assert [standard_header(header) for header in same] == list(same)
 
 
 def test_an_index_without_a_name_is_ignored(tmp_path):
@@ -87,7 +87,7 @@ def test_an_index_without_a_name_is_ignored(tmp_path):
     scan = read_quad_scan(tmp_path / "a.csv")
     assert scan.settings["Q525"].tolist() == [-4.2, -3, 2]
     np.testing.assert_allclose(scan.size["x"], [111.4e-6, 63e-6, 98e-6])
-    assert understand(tmp_path / "a.csv").kind == "scan"
+    assert file_summary(tmp_path / "a.csv").kind == "scan"
 
 
 def test_a_header_behind_a_mark_may_stand_above_dates(tmp_path):

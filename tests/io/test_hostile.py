@@ -47,7 +47,7 @@ def test_what_is_no_file_is_refused(tmp_path, monkeypatch):
         one.bind(str(place))
         for path in (place, "/dev/zero", "/dev/null"):
             assert "a device or a socket" in refused(beamfit.read_decay_record, path)
-    monkeypatch.setattr(files, "SILENCE", 0.05)
+    monkeypatch.setattr(files, "MAX_SILENCE", 0.05)
     assert "a pipe that gives nothing" in refused(beamfit.read_decay_record, pipe)
 
 
@@ -113,9 +113,9 @@ def test_a_process_that_crashes_or_never_ends_is_one_line(tmp_path, monkeypatch)
         store["a"], store["b"], store["word"] = NUMBERS, np.float32(NUMBERS), ["x"] * 4
     sheet = read_sheet(path, "")
     assert (sheet["b"].tolist(), sheet["word"]) == ([0, 1, 2, 3], ["x"] * 4)
-    monkeypatch.setattr(isolated, "PATIENCE", 0.01)
+    monkeypatch.setattr(isolated, "MAX_SECONDS", 0.01)
     assert "does not read within 0.01 s" in refused(lambda p: read_sheet(p, ""), path)
-    monkeypatch.setattr(isolated, "PATIENCE", 10)
+    monkeypatch.setattr(isolated, "MAX_SECONDS", 10)
     monkeypatch.setattr(sys, "executable", "/bin/false")
     assert "is damaged" in refused(lambda p: read_sheet(p, ""), path)
 

@@ -61,7 +61,7 @@ def outcome(path):
 
 def both(path, monkeypatch):
     slow = outcome(path)
-    monkeypatch.setattr(cells, "LARGE", 0)
+    monkeypatch.setattr(cells, "MIN_FAST_BYTES", 0)
     calls = []
 
     def watched(*arguments):
@@ -88,7 +88,7 @@ def test_odd_tables_are_the_same_either_way(name, tmp_path, monkeypatch):
 
 
 def test_blocks_are_joined_at_lines(tmp_path, monkeypatch):
-    monkeypatch.setattr(cells, "BLOCK", 1000)
+    monkeypatch.setattr(cells, "BLOCK_BYTES", 1000)
     values = np.random.default_rng(1).normal(size=(500, 2)).round(6)
     path = tmp_path / "a.csv"
     path.write_text(HEAD + "\n".join(f"{a},{b}" for a, b in values))

@@ -10,7 +10,7 @@ import pytest
 import scipy.io
 
 from beamfit.errors import InputError
-from beamfit.io.check import understand
+from beamfit.io.check import file_summary
 from beamfit.io.decay_record import read_decay_record
 from beamfit.io.scan import read_quad_scan
 from beamfit.io.table import read_sheet
@@ -63,7 +63,7 @@ def test_sdds(binary, tmp_path):
     np.testing.assert_allclose(scan.error["x"], [1e-6 * e for _, _, e in ROWS])
     assert scan.screen == ("OTR2",) * 4
     assert scan.provenance == ("Energy: 135.0 MeV", "By: me, at noon")
-    assert understand(path).kind == "scan"
+    assert file_summary(path).kind == "scan"
 
 
 def test_the_final_properties_of_elegant(tmp_path):
@@ -154,10 +154,10 @@ def test_vectors_of_matlab(tmp_path):
         scan = read_quad_scan(path)
         np.testing.assert_array_equal(scan.settings["Q525"], q)
         np.testing.assert_allclose(scan.error["x"], 1e-6 * e)
-        assert understand(path).kind == "scan"
+        assert file_summary(path).kind == "scan"
     scipy.io.savemat(path, {"time_s": np.arange(4), "beam_current_mA": 200.0 - np.arange(4)})
     assert read_decay_record(path).current.tolist() == [200, 199, 198, 197]
-    assert understand(path).kind == "record"
+    assert file_summary(path).kind == "record"
     scipy.io.savemat(path, columns | {"size_x_um": x[1:]})
     with pytest.raises(InputError, match="column 'size_x_um': 3 readings; expected 4"):
         read_quad_scan(path)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from beamfit.errors import InputError
-from beamfit.io.check import understand
+from beamfit.io.check import file_summary
 from beamfit.io.decay_record import read_decay_record, read_lifetime_input
 from beamfit.lifetime.record import DecayRecord
 
@@ -37,7 +37,7 @@ def test_a_current_by_its_word_and_unit(name, time, tmp_path):
     record = read_decay_record(path)
     np.testing.assert_allclose(record.current, CURRENT)
     assert record.notes == (f"Column '{name}' is taken for the beam current.",)
-    assert understand(path).kind == "record"
+    assert file_summary(path).kind == "record"
 
 
 @pytest.mark.parametrize(

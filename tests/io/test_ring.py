@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from beamfit.errors import InputError
-from beamfit.io.ring import read_along, read_operation, read_ring, ring_from_pyat
+from beamfit.io.ring import read_operation, read_ring, read_ring_tables, ring_from_pyat
 from beamfit.lifetime.mechanisms import loss_coefficients
 
 SPEAR3 = Path("lattices/spear3_2003.toml")
@@ -82,13 +82,13 @@ def test_a_missing_ring_file(tmp_path):
 
 
 def test_csv_and_tfs_hold_the_same_optics(tmp_path):
-    optics = read_along(CIRCUMFERENCE, Path("lattices/spear3_2003_twiss.csv"), None)[0]
+    optics = read_ring_tables(CIRCUMFERENCE, Path("lattices/spear3_2003_twiss.csv"), None)[0]
     table = np.loadtxt("lattices/spear3_2003_twiss.csv", delimiter=",", skiprows=3)
     names = "S BETX BETY ALFX ALFY DX DPX"
     rows = "\n".join('"D" ' + " ".join(f"{value:.9e}" for value in row) for row in table)
     tfs = tmp_path / "ring.tfs"
     tfs.write_text(f'@ NAME %05s "TWISS"\n* NAME {names}\n$ %s{" %le" * 7}\n{rows}\n')
-    for ours, other in zip(optics, read_along(CIRCUMFERENCE, tfs, None)[0], strict=True):
+    for ours, other in zip(optics, read_ring_tables(CIRCUMFERENCE, tfs, None)[0], strict=True):
         np.testing.assert_allclose(other, ours, rtol=1e-8, atol=1e-15)
 
 
@@ -106,7 +106,7 @@ def test_bad_tables_are_named_by_line(tmp_path, row, value, line, words):
     path = tmp_path / "twiss.csv"
     path.write_text("\n".join(text))
     with pytest.raises(InputError) as caught:
-        read_along(CIRCUMFERENCE, path, None)
+        read_ring_tables(CIRCUMFERENCE, path, None)
     assert words in str(caught.value)
     assert caught.value.line == line
 
@@ -115,7 +115,7 @@ def test_a_table_without_a_column(tmp_path):
     path = tmp_path / "twiss.csv"
     path.write_text("s_m,beta_x_m\n0,1\n")
     with pytest.raises(InputError, match="'beta_y_m'"):
-        read_along(CIRCUMFERENCE, path, None)
+        read_ring_tables(CIRCUMFERENCE, path, None)
 
 
 def test_a_pyat_lattice_without_enough_voltage():

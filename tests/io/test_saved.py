@@ -12,7 +12,7 @@ import beamfit
 from beamfit.answer import json_of
 from beamfit.emittance.results import PlaneFit
 from beamfit.errors import InputError
-from beamfit.io.result import HOMES
+from beamfit.io.result import MODULE_OF_CLASS
 from beamfit.lifetime.fit import DecayFit
 
 
@@ -150,7 +150,7 @@ def test_mutated_files_load_or_are_refused(every, tmp_path):
 
 
 def test_every_kind_of_value_is_where_the_list_says():
-    for name, home in HOMES.items():
+    for name, home in MODULE_OF_CLASS.items():
         assert getattr(import_module(home), name).__module__ == home
 
 
@@ -158,4 +158,4 @@ def test_every_kind_of_value_is_where_the_list_says():
 def test_whatever_a_fit_may_hold_can_be_kept(cls):
     """A decay with a relaxing gas loss could not: that kind of value was not on the list."""
     held = {name for kind in cls.__annotations__.values() for name in re.findall(r"[A-Z]\w+", kind)}
-    assert held - {"Mapping", "PathLike", "None"} <= HOMES.keys()
+    assert held - {"Mapping", "PathLike", "None"} <= MODULE_OF_CLASS.keys()
