@@ -25,7 +25,7 @@ from beamfit.cli.setpoint import setpoint
 from beamfit.cli.solve import solve
 from beamfit.cli.tune import tune
 from beamfit.cli.watch import watch
-from beamfit.errors import LONGEST, InputError, plain, short
+from beamfit.errors import MAX_MESSAGE, InputError, plain, short
 
 
 class _Commands(click.Group):
@@ -103,5 +103,5 @@ def _show_marks() -> None:
 
 def _fail(message: str) -> None:
     """Say it on one line of standard error."""
-    click.echo("beamfit: " + short(plain(" ".join(message.split())), LONGEST), err=True)
+    click.echo("beamfit: " + short(plain(" ".join(message.split())), MAX_MESSAGE), err=True)
     sys.exit(2)

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from beamfit.answer import MOST_ROWS, Table, answer
+from beamfit.answer import MAX_ROWS_SHOWN, Table, answer
 from beamfit.compile_cache import SELDOM
 from beamfit.errors import InputError, nearest
 from beamfit.greybox.maps import Formula
@@ -244,8 +244,8 @@ def _each(values: np.ndarray) -> Iterable[tuple[int, float]]:
 
 def limited(header: Sequence[str], rows: list[list[str]]) -> Table:
     """A table with no more rows than a terminal shows."""
-    more, rest = len(rows) - MOST_ROWS, [""] * (len(header) - 1)
-    rows = rows[:MOST_ROWS] + [[f"... and {more} more", *rest]] * (more > 0)
+    more, rest = len(rows) - MAX_ROWS_SHOWN, [""] * (len(header) - 1)
+    rows = rows[:MAX_ROWS_SHOWN] + [[f"... and {more} more", *rest]] * (more > 0)
     return Table("", header, rows, numeric=True)
 
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from beamfit.lifetime.pieces import GAP
 from beamfit.quantity import HOUR, Quantity, relative_change
-from beamfit.statistics import CLEAR_ODDS, OPEN, log_evidence_of_change
+from beamfit.statistics import CLEAR_ODDS, MIN_SINGULAR_VALUE, log_evidence_of_change
 
 MINUTE = 60.0
 # Windows, s: four begin in turn in each length, so that one of nearly any age is at hand.
@@ -490,7 +490,7 @@ def _is_loss(state: AlarmState, moved: int) -> np.ndarray:
     of a monitor that stands still, has lost both.
     """
     change, error, _ = change_since(state, np.full(state.raised.shape, moved))
-    return (1 + change + OPEN * error)[..., moved - 1] > 0
+    return (1 + change + MIN_SINGULAR_VALUE * error)[..., moved - 1] > 0
 
 
 def _shown(usual: Reference, state: AlarmState) -> tuple[np.ndarray, np.ndarray]:

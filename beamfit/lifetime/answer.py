@@ -27,7 +27,7 @@ from beamfit.lifetime.readings import noise_of
 from beamfit.lifetime.record import Monitor
 from beamfit.noise.memory import remembers
 from beamfit.quantity import HOUR, percent
-from beamfit.statistics import MANY, POOR_FIT, chi2_probability, few_words, of_use
+from beamfit.statistics import FEW_DOF, POOR_FIT, chi2_probability, few_dof_words, of_use
 
 # Lifetimes, s, that stored beams seldom have, but times in a wrong unit often give.
 SHORTEST, LONGEST = 20.0, 3000 * HOUR
@@ -128,7 +128,7 @@ def _stepped(e: Evidence) -> Finding | None:
     """A step or spike in the record, whether or not its errors are known."""
     record, change = e.record, np.diff(e.residuals)
     # Of fewer residuals the middle one is small by chance in several records of a hundred.
-    if e.noise_inferred and e.dof < MANY:
+    if e.noise_inferred and e.dof < FEW_DOF:
         return None
     usual = 1.4826 * float(np.median(np.abs(change)))
     floor = max(record.resolution or 0.0, 1e-12 * float(record.current.max()))
@@ -473,7 +473,7 @@ def _noise_inferred(e: Evidence) -> str | None:
 
 def _few(e: Evidence) -> str | None:
     """Sentence on the reach of errors that few residuals tell."""
-    said = few_words(e.dof) if e.noise_inferred and e.independent else ""
+    said = few_dof_words(e.dof) if e.noise_inferred and e.independent else ""
     return said.removeprefix("; ").capitalize() or None
 
 

@@ -31,7 +31,7 @@ from beamfit.lifetime.expansion import Physical, Pieces
 from beamfit.lifetime.record import DecayRecord
 from beamfit.noise.memory import Products
 from beamfit.quantity import HOUR, Quantity
-from beamfit.statistics import CENTRAL, LEAST_WORTH, WIDE
+from beamfit.statistics import CENTRAL, MIN_EFFECTIVE_DRAWS, WIDE
 
 # Standard deviations of the exponent below and above zero. Bunches lengthen with the current, in
 # the potential well by x³ - x ∝ I (`beamfit.lifetime.ring`), so that a goes as I^0 to I^-1/3; that
@@ -999,7 +999,7 @@ def free_law(record: DecayRecord, values: Physical) -> FreeLaw | None:
     draws = mixed([own for _, own in laws])
     freed = mixed([own for law, own in laws if POWER in law.free])
     # Few draws are enough: constant a and b in their place would be too sure.
-    if not (np.isfinite(freed.log) and draws.worth >= LEAST_WORTH):
+    if not (np.isfinite(freed.log) and draws.worth >= MIN_EFFECTIVE_DRAWS):
         return None
     plain = DrawnLaw.of(seen, CONSTANT).weighed(FEW)
     if not 0 <= values.share <= 1:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from beamfit.answer import MOST_ROWS, Table, frame_of, shown
+from beamfit.answer import MAX_ROWS_SHOWN, Table, frame_of, shown
 from beamfit.errors import InputError
 from beamfit.noise.digits import digit_of
 from beamfit.quantity import HOUR
@@ -340,7 +340,7 @@ class DecayRecord:
 
     def tables(self) -> tuple[Table, ...]:
         """The first readings, to be shown."""
-        few = range(min(len(self), MOST_ROWS))
+        few = range(min(len(self), MAX_ROWS_SHOWN))
         rows = [[f"{self.time[i]:.6g}", f"{self.current[i]:.6g}"] for i in few]
         more = f"the first {len(few)} of {len(self)} readings" if len(few) < len(self) else ""
         return (Table(str(self), ["time s", "beam current mA"], rows, more, numeric=True),)

@@ -6,7 +6,7 @@ import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 
-from beamfit.answer import MOST_ROWS, Row, Table, cell
+from beamfit.answer import MAX_ROWS_SHOWN, Row, Table, cell
 from beamfit.lifetime.fit import DecayFit
 from beamfit.lifetime.mechanisms import LINEAR, QUADRATIC, Mechanism
 from beamfit.lifetime.pieces import Event
@@ -314,7 +314,7 @@ def event_rows(study: RecordStudy) -> list[list[str]]:
     """Kind, time, duration and change of what was cut away; a long list is cut, and says so."""
     rows = [
         [kind, f"{time:.0f} s", f"{lasts:.0f} s", f"{change:+.4g} mA" if change else ""]
-        for kind, time, lasts, change in study.events[:MOST_ROWS]
+        for kind, time, lasts, change in study.events[:MAX_ROWS_SHOWN]
     ]
     left = len(study.events) - len(rows)
     return rows + ([[f"{left} more", "", "", ""]] if left else [])

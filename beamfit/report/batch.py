@@ -14,7 +14,7 @@ import numpy as np
 from matplotlib import rc_context
 from matplotlib.figure import FigureBase
 
-from beamfit.answer import MOST_ROWS, Table, plain_name
+from beamfit.answer import MAX_ROWS_SHOWN, Table, plain_name
 from beamfit.batch.course import ControlChart, summary_of
 from beamfit.batch.run import Batch
 from beamfit.errors import Status
@@ -31,7 +31,7 @@ from beamfit.report.document import (
     moments,
 )
 from beamfit.report.page import write_page, write_report
-from beamfit.statistics import BEYOND
+from beamfit.statistics import THREE_SIGMA
 
 NOTHING = Verdict(
     Status.unidentified,
@@ -46,7 +46,7 @@ RULE = (
 
 
 # Points within the limits for each that noise alone puts beyond: 370.
-NOISE_PASSES = 1 / (2 * (1 - BEYOND))
+NOISE_PASSES = 1 / (2 * (1 - THREE_SIGMA))
 
 
 def write_batch_report(
@@ -80,7 +80,7 @@ def write_batch_report(
     )
     folder = target.with_name(f"{target.stem}_reports")
     links = []
-    for i, file in enumerate(islice(beyond, MOST_ROWS), start=1):
+    for i, file in enumerate(islice(beyond, MAX_ROWS_SHOWN), start=1):
         folder.mkdir(exist_ok=True)
         single = folder / f"{i:02d}_{Path(file).stem}.html"
         write_report(single, batch.ledger.job.fit(file))
@@ -128,8 +128,10 @@ def _page(
 def _first(table: Table) -> list[Table]:
     """The first rows of a table, if it has any; the file of answers has all."""
     count = len(table.rows)
-    note = f"the first {MOST_ROWS} of {count}; all are in the table of answers"
-    shown = table._replace(rows=table.rows[:MOST_ROWS], note=note if count > MOST_ROWS else "")
+    note = f"the first {MAX_ROWS_SHOWN} of {count}; all are in the table of answers"
+    shown = table._replace(
+        rows=table.rows[:MAX_ROWS_SHOWN], note=note if count > MAX_ROWS_SHOWN else ""
+    )
     return [shown] if count else []
 
 

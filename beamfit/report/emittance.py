@@ -42,7 +42,7 @@ METHODS = (
     "has the spread of the methods in it, as a systematic."
 )
 # Most rows in a table of points.
-MOST_ROWS = 500
+MAX_ROWS_SHOWN = 500
 
 
 def emittance_page(fit: EmittanceFit, methods: tuple[SizeMethods, ...] = ()) -> ReportPage:
@@ -167,7 +167,7 @@ def point_rows(plane: PlaneFit) -> tuple[list[str], list[list[str]]]:
     columns["pull"] = map("{:+.2f}".format, p.pull)
     if (p.outlier_probability > 0.05).any():
         columns["P(bad)"] = map("{:.2f}".format, p.outlier_probability)
-    rows = [list(row) for row in islice(zip(*columns.values(), strict=True), MOST_ROWS)]
+    rows = [list(row) for row in islice(zip(*columns.values(), strict=True), MAX_ROWS_SHOWN)]
     left = len(p.size) - len(rows)
     if left > 0:
         rows.append([f"{left} more"] + [""] * (len(columns) - 1))

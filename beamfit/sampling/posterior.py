@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from beamfit.answer import (
-    MOST_ROWS,
+    MAX_ROWS_SHOWN,
     Table,
     answer,
     brief,
@@ -117,8 +117,8 @@ class Summary(NamedTuple):
 
 def interval_table(rows: Sequence[Summary], title: str = "", note: str = "") -> Table:
     """Table with a row for each number: median and intervals."""
-    cells = [row.row() for row in rows[:MOST_ROWS]]
-    left = len(rows) - MOST_ROWS
+    cells = [row.row() for row in rows[:MAX_ROWS_SHOWN]]
+    left = len(rows) - MAX_ROWS_SHOWN
     return Table(title, HEADER, [*cells, *([[f"and {left} more"]] if left > 0 else [])], note)
 
 

@@ -12,15 +12,16 @@ from scipy.stats import t
 
 DEFINITION = """\
 A tool **answers** if it gives a finite value with a finite error, without a warning and without a
-status or flag against the answer. A tool without errors answers, but has no coverage. Intervals of 68
-and 95 % are those of the tool; a standard deviation inferred from few residuals is multiplied by
+status or flag against the answer. A tool without errors answers, but has no coverage. Intervals of
+68 and 95 % are those of the tool; a standard deviation inferred from few residuals is multiplied by
 Student's factor.
 
-An answer is **wrong** if it is more than 3 errors from the truth; the error is the length of the 95 %
-interval towards the truth, divided by 1.96. Without an error, an answer more than 10 % off is wrong.
-If there is no emittance to find, one more than 3 errors from zero is wrong.
+An answer is **wrong** if it is more than 3 errors from the truth; the error is the length of the 95
+% interval towards the truth, divided by 1.96. Without an error, an answer more than 10 % off is
+wrong. If there is no emittance to find, one more than 3 errors from zero is wrong.
 
-Brackets give binomial limits of 95 %. Bias is the median of value / truth - 1; the error is the median
+Brackets give binomial limits of 95 %. Bias is the median of value / truth - 1; the error is the
+median
 of half of the 68 % interval, divided by the truth."""
 FAR, SHARE = 3.0, 0.1
 

@@ -16,18 +16,19 @@ HEAD = f"""\
 # The league
 
 The league compares beamfit with other programs on the same SIMULATED data: [quadrupole
-scans](league_scans.md) and [decays and top-up](league_decays.md). `make league` simulates, measures and
-writes these pages; [speed](speed.md) is a separate page.
+scans](league_scans.md) and [decays and top-up](league_decays.md). `make league` simulates, measures
+and writes these pages; [speed](speed.md) is a separate page.
 
-Every row is a family: line, beam, law, number of readings, noise and the size of the defect are drawn
-at random for each record in each run, within the ranges of `benchmarks/league/scans.py` and
-`decays.py`; the page gives the seed. All tools get the same records, in the form that their users give;
-emcee, which is slow, gets the first tenth.
+Every row is a family: line, beam, law, number of readings, noise and the size of the defect are
+drawn at random for each record in each run, within the ranges of `benchmarks/league/scans.py` and
+`decays.py`; the page gives the seed. All tools get the same records, in the form that their users
+give; emcee, which is slow, gets the first tenth.
 
 pyemittance analyses scans; curve_fit, lmfit and emcee stand for scripts that users write (emcee: 32
-walkers, 300 steps, no convergence test). lcls-tools and elegant's sddsemitproc are not on PyPI; their
-methods were reimplemented from the descriptions. In top-up the scripts are told the refills: they fit
-the longest piece, straight lines every piece. A program that is not installed stops the run.
+walkers, 300 steps, no convergence test). lcls-tools and elegant's sddsemitproc are not on PyPI;
+their methods were reimplemented from the descriptions. In top-up the scripts are told the refills:
+they fit the longest piece, straight lines every piece. A program that is not installed stops the
+run.
 
 ## What is counted
 
