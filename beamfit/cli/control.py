@@ -1,4 +1,4 @@
-"""`beamfit control`: records of runs and targets in, a controller in a simulated loop out."""
+"""`beamfit control`: a controller from records of runs, in a simulated loop."""
 
 from __future__ import annotations
 
@@ -68,9 +68,9 @@ def control(
 ) -> None:
     """Control a process: identify it, plan its inputs within limits, and simulate the loop.
 
-    RECORD is a run as `beamfit identify` reads it. The loop runs on the fitted model with the noise
-    of its residuals. Inputs and their rates keep their limits always, outputs wherever any inputs
-    can keep them; what cannot be kept is named.
+    RECORD is a run in the format of `beamfit identify`. The loop is simulated with the fitted model
+    and the noise of its residuals. Inputs and their rates always keep their limits, outputs if any
+    inputs can achieve that; limits that cannot be kept are named.
     """
     targets, loads = _steps(targets, "set"), _steps(disturb, "disturb")
     told |= {

@@ -1,4 +1,4 @@
-"""`beamfit design`: a scan and a lattice in, the measurements to make next out."""
+"""`beamfit design`: the measurements to make next, from a scan and a lattice."""
 
 from __future__ import annotations
 
@@ -18,8 +18,18 @@ if TYPE_CHECKING:
     from beamfit.cli.show import Terminal
     from beamfit.emittance.design import Advice
 
-# What `read_inputs` takes besides the scan.
-GIVEN = ["lattice", "use", "first", "last", "screen", "energy", "columns", "ignore", "skip_bad"]
+# Options passed to `read_inputs` with the scan.
+INPUT_OPTIONS = [
+    "lattice",
+    "use",
+    "first",
+    "last",
+    "screen",
+    "energy",
+    "columns",
+    "ignore",
+    "skip_bad",
+]
 EXAMPLE = """\b
 Examples:
   beamfit design scan.csv --lattice line.toml --vary Q2=0:5 --goal 0.8%
@@ -32,15 +42,15 @@ Examples:
     "scan columns ignore skip-bad lattice use from to screen energy noise scenario prior bounds "
     "gain anchor vary"
 )
-@option("--energies MEV,MEV", "Further energies the beam can be had at.", default="")
+@option("--energies MEV,MEV", "Other possible energies of the beam.", default="")
 @option(
     "--criterion",
-    "Make small the error of the emittance, or the volume of the error ellipsoid.",
+    "Minimise the error of the emittance, or the volume of the error ellipsoid.",
     choices=["emittance", "D"],
     default="emittance",
 )
 @options("goal")
-@option("--count", "Most measurements.", default=5)
+@option("--count", "Largest number of measurements.", default=5)
 @options("json")
 def design(
     scan: str,
@@ -54,16 +64,16 @@ def design(
     output: Output,
     **told: Any,
 ) -> None:
-    """Say which settings to measure next, given what is measured, and when to stop.
+    """Propose the settings to measure next, given the present data, and when to stop.
 
-    Magnets move between the limits of --vary, or half the scanned range beyond it. For a
-    scenario that the data do not identify it says which kind of measurement would.
+    Magnets move between the limits of --vary, or up to half the scanned range beyond it. For a
+    scenario that the data do not identify it names the kind of measurement that would.
     """
     others = energies_of(energies)
-    given = {name: told.pop(name) for name in GIVEN}
+    input_options = {name: told.pop(name) for name in INPUT_OPTIONS}
     Assumptions(**told).check_scenario(scenario)
     told["noise"] = None if noise is None else read_noise(noise)
-    read = read_inputs(scan, **given)
+    read = read_inputs(scan, **input_options)
     measured, described, _ = read
     described.check_magnets(limits)
     described.check_energies(others)
