@@ -47,12 +47,14 @@ def watch(machine: str, seconds: float | None, port: int, bind: str, output: Out
     optionally RF voltage, pressure, bunches, scraper and bunch length. Nothing is written to it.
     The answer is shown here, on a page (--port), and served by PV Access. Needs beamfit[live].
     """
-    view = read_watch_machine(machine)
+    described = read_watch_machine(machine)
 
     from beamfit.live.channel import run
 
-    last, number = run(_run_watch(view, seconds, bind, port, output.as_json))
-    inputs = {str(path): digest(path) for path in (view.path, view.ring) if path is not None}
+    last, number = run(_run_watch(described, seconds, bind, port, output.as_json))
+    inputs = {
+        str(path): digest(path) for path in (described.path, described.ring) if path is not None
+    }
     output.answer(_results(last), inputs, lambda terminal: terminal.table(_table(last)))
     if number:
         click.echo("beamfit: interrupted", err=True)

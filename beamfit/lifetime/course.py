@@ -20,8 +20,8 @@ from beamfit.lifetime.scales import by_losses, summarise, widened
 from beamfit.lifetime.study import Decay, Machine, RecordStudy
 from beamfit.quantity import HOUR, Quantity, Status, percent, relative_change
 from beamfit.statistics import (
-    BEYOND,
-    FEWEST,
+    MIN_BASELINE,
+    THREE_SIGMA,
     baseline,
     control_limits,
     one_sided_probability,
@@ -113,7 +113,7 @@ class Trend(Judged):
         many = f"{count} lifetime" + "s" * (count > 1)
         usual = f"{many}; current times lifetime is usually {centre:.4g} mA h"
         if not math.isfinite(self.limit):
-            more = f"{FEWEST + 1} or more decays are needed to say what is usual."
+            more = f"{MIN_BASELINE + 1} or more decays are needed to say what is usual."
             return Finding(Status.unidentified, f"{usual}; {more}")
         beyond = sum(point.beyond != 0 for point in self.points)
         said = f"{usual} ± {percent(self.limit / centre)}, {beyond} beyond that."
@@ -281,7 +281,7 @@ def _point(
 
 def _drift(time: np.ndarray, values: Sequence[Quantity], centre: float) -> Quantity:
     """Relative slope by least squares, its error from the residuals."""
-    if len(values) < FEWEST + 1 or np.ptp(time) < 24 * HOUR:
+    if len(values) < MIN_BASELINE + 1 or np.ptp(time) < 24 * HOUR:
         return Quantity(math.nan, None, "1")
     level = np.array([value.value for value in values]) / centre
     weeks = (time - time.mean()) / (7 * 24 * HOUR)
@@ -399,4 +399,4 @@ def _alarms(
 
 def _is_sure(errors: float, dof: int) -> bool:
     """Tell if a change is as rare by chance as a point beyond the control limits."""
-    return one_sided_probability(errors, dof) < 1 - BEYOND
+    return one_sided_probability(errors, dof) < 1 - THREE_SIGMA

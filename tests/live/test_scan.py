@@ -11,7 +11,7 @@ import pytest
 
 import beamfit
 from beamfit.cli import cli
-from beamfit.cli.scan import _Lines
+from beamfit.cli.scan import _ProgressLines
 from beamfit.errors import InputError
 from beamfit.io.line import build_line, read_inputs
 from beamfit.io.machine import Guard, read_scan_machine
@@ -345,7 +345,7 @@ def test_a_reader_that_goes_ends_no_scan(monkeypatch, capsys):
 
         flush = write
 
-    say = _Lines(err=False)
+    say = _ProgressLines(err=False)
     say("one")
     monkeypatch.setattr("sys.stdout", Gone())
     say("two")
