@@ -172,9 +172,9 @@ def pairs(posterior: Posterior, names: Sequence[str] | None = None) -> Figure:
     InputError
         If nothing was sampled, or a name is unknown.
     """
-    from beamfit.report.posterior import MOST_NUMBERS, pairs_picture
+    from beamfit.report.posterior import MAX_NUMBERS, pairs_picture
 
-    names = tuple(names or posterior.shown[:MOST_NUMBERS])
+    names = tuple(names or posterior.shown[:MAX_NUMBERS])
     if not posterior.chain.size:
         raise InputError("a posterior without draws", posterior.message)
     return _render(pairs_picture(posterior, names))

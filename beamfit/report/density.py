@@ -1,4 +1,4 @@
-"""The report of a density in phase space: its contours, its profiles, emittance against charge."""
+"""Report of a density in phase space: contours, profiles, emittance against charge."""
 
 from __future__ import annotations
 
@@ -17,17 +17,21 @@ from beamfit.quantity import Quantity
 from beamfit.report.document import BLUE, RED, Picture, ReportPage, Verdict, contour_levels
 from beamfit.report.emittance import about_input, about_scan
 
-# Profiles in a row of the picture; shares of the charge inside the contours; reach in rms sizes.
-ABREAST, CONTOURS, REACH = 4, (0.95, 0.9, 0.68, 0.5), 4.0
+# Profiles in a row of the picture.
+PROFILES_PER_ROW = 4
+# Shares of the charge inside the contours.
+CONTOURS = (0.95, 0.9, 0.68, 0.5)
+# Half-width of the drawn phase space, in rms sizes.
+HALF_WIDTH = 4.0
 
 
 def density_page(fit: DensityFit) -> ReportPage:
-    """Lay out a density fit.
+    """Make the page of a density fit.
 
     Parameters
     ----------
     fit : DensityFit
-        From `beamfit.fit_density`.
+        Result of `beamfit.fit_density`.
 
     Returns
     -------
@@ -37,7 +41,7 @@ def density_page(fit: DensityFit) -> ReportPage:
     for p in fit.planes:
         if p.densities is None:
             continue
-        rows = math.ceil(len(p.profiles) / ABREAST)
+        rows = math.ceil(len(p.profiles) / PROFILES_PER_ROW)
         methods = [said[p.plane] for said in fit.stored.values() if p.plane in said]
         draw = partial(draw_density, plane=p, methods=methods)
         seen = partial(draw_profiles, plane=p)
@@ -51,7 +55,12 @@ def density_page(fit: DensityFit) -> ReportPage:
             Verdict(p.status, f"{p.plane}: 90 % of the charge {p.emittance['90 %']}", p.message)
             for p in fit.planes
         ],
-        tables=[*fit.tables(), *map(_seen, fit.planes), *_methods(fit), *about_input(fit.notes)],
+        tables=[
+            *fit.tables(),
+            *map(_profile_table, fit.planes),
+            *_method_table(fit),
+            *about_input(fit.notes),
+        ],
         pictures=pictures,
         pictures_title="Phase space and profiles",
         leading=len(fit.planes),
@@ -59,8 +68,8 @@ def density_page(fit: DensityFit) -> ReportPage:
     )
 
 
-def _seen(plane: PlaneDensity) -> Table:
-    """Profiles beside the density."""
+def _profile_table(plane: PlaneDensity) -> Table:
+    """Make the table of profiles compared with the density."""
     d = plane.densities
     rows = []
     for k, (label, p) in enumerate(zip(plane.labels, plane.profiles, strict=True)):
@@ -72,8 +81,8 @@ def _seen(plane: PlaneDensity) -> Table:
     return Table(f"Profiles in {plane.plane}", head, rows)
 
 
-def _methods(fit: DensityFit) -> list[Table]:
-    """Emittances that the file states, by size method."""
+def _method_table(fit: DensityFit) -> list[Table]:
+    """Make the table of emittances stated in the file, by size method."""
     rows = [
         [name, *(cell(said.get(p.plane)) for p in fit.planes)] for name, said in fit.stored.items()
     ]
@@ -89,7 +98,7 @@ def draw_density(figure: FigureBase, plane: PlaneDensity, methods: Sequence[Quan
     figure : Figure or SubFigure
         The figure to draw on.
     plane : PlaneDensity
-        With a density.
+        Plane with a density.
     methods : sequence of Quantity
         Emittances by size methods, marked at the right edge.
     """
@@ -101,7 +110,7 @@ def draw_density(figure: FigureBase, plane: PlaneDensity, methods: Sequence[Quan
     axes.pcolormesh(x, angle, density, cmap="viridis", shading="gouraud", rasterized=True)
     axes.set_facecolor(colormaps["viridis"](0.0))
     axes.contour(x, angle, density, levels=levels, colors="w", linewidths=0.7)
-    wide, high = 1e3 * REACH * np.hypot(*d.frame.T)
+    wide, high = 1e3 * HALF_WIDTH * np.hypot(*d.frame.T)
     axes.set(xlabel=f"{plane.plane}, mm", ylabel=f"{plane.plane}′, mrad")
     axes.set(xlim=(-wide, wide), ylim=(-high, high))
     axes.set_title("contours of 50, 68, 90 and 95 % of the charge", fontsize=7)
@@ -124,7 +133,7 @@ def draw_density(figure: FigureBase, plane: PlaneDensity, methods: Sequence[Quan
 
 
 def _band(every: list, part: str) -> tuple[np.ndarray, np.ndarray]:
-    """Ends of an interval of each emittance, µm; the value where there is none."""
+    """Return the ends of an interval of each emittance in µm; the value if there is none."""
     ends = []
     for q in every:
         if q.error is None:
@@ -137,17 +146,17 @@ def _band(every: list, part: str) -> tuple[np.ndarray, np.ndarray]:
 
 
 def draw_profiles(figure: FigureBase, plane: PlaneDensity) -> None:
-    """Draw each profile with the density seen from its side, and the pulls beneath.
+    """Draw each profile with the projection of the density, and the pulls below.
 
     Parameters
     ----------
     figure : Figure or SubFigure
         The figure to draw on.
     plane : PlaneDensity
-        With a density.
+        Plane with a density.
     """
     d, bins = plane.densities, plane.densities.bins
-    across = min(ABREAST, len(plane.profiles))
+    across = min(PROFILES_PER_ROW, len(plane.profiles))
     down = math.ceil(len(plane.profiles) / across)
     grid = figure.subplots(2 * down, across, squeeze=False, height_ratios=[3, 1] * down,
                            sharex=True)  # fmt: skip
