@@ -95,7 +95,7 @@ class _ProgressLines:
 
     def progress(self, now: ScanProgress) -> None:
         """Print a new point with the present result, or another event."""
-        from beamfit.live.aims import FEWEST
+        from beamfit.live.aims import MIN_POINTS
 
         if not now.measured:
             self(now.news)
@@ -104,7 +104,7 @@ class _ProgressLines:
         last = now.points[-1]
         at = ", ".join(f"{name} {value:.4g}" for name, value in last.settings.items())
         sizes = ", ".join(f"{p} {1e6 * median(s):.1f} um" for p, s in last.shots.items())
-        result = ", ".join(_result_words(fit)) if fit and count >= FEWEST else ""
+        result = ", ".join(_result_words(fit)) if fit and count >= MIN_POINTS else ""
         self(f"{count:3d}  {at:<12}  {sizes:<26}  {result}".rstrip())
 
 
@@ -127,7 +127,7 @@ async def _show_plan(machine: ScanMachine, journal: Path, as_json: bool) -> int:
     """Check that the machine answers, and print the plan of the scan."""
     from beamfit.live.aims import first_settings
     from beamfit.live.devices import connect
-    from beamfit.live.restore import named
+    from beamfit.live.restore import settings_words
 
     at = await connect(machine)
     before = [(m, await at.magnets[m.name].get()) for m in at.machine.magnets]
@@ -166,7 +166,7 @@ async def _show_plan(machine: ScanMachine, journal: Path, as_json: bool) -> int:
         f"{machine.screen.shots} shots on {machine.screen.name} at each, at most {machine.points} "
         f"settings, or until {until}."
     )
-    click.echo(f"At the end back to {named(before)}; until then that stands in {journal}.")
+    click.echo(f"At the end back to {settings_words(before)}; until then that stands in {journal}.")
     for line in (*at.notes, *([f"Now: {plan['amiss']}."] if plan["amiss"] else [])):
         click.echo(plain(line))
     click.echo("Nothing was moved.")
@@ -215,7 +215,7 @@ def _recover(journal: str, say: _ProgressLines, as_json: bool) -> int:
     """Restore the magnets of a journal."""
     from beamfit.live.channel import run
     from beamfit.live.devices import supply_of
-    from beamfit.live.restore import alone_with, named, read_journal, restore
+    from beamfit.live.restore import alone_with, read_journal, restore, settings_words
 
     left = read_journal(journal)
     found = digest(journal)
@@ -231,7 +231,7 @@ def _recover(journal: str, say: _ProgressLines, as_json: bool) -> int:
         settings = {m.name: {"value": v, "unit": m.unit} for m, v in left.before}
         click.echo(results_text([{"restored": settings}], {journal: found}, command_line()))
     else:
-        say(f"Restored and read back: {named(left.before)}. {journal} is removed.")
+        say(f"Restored and read back: {settings_words(left.before)}. {journal} is removed.")
     return 0
 
 
