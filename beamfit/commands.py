@@ -390,7 +390,7 @@ def scan_machine(
     journal: str | None = None,
     goal: float | None = None,
     points: int | None = None,
-    tell: Callable[[ScanProgress], None] = lambda told: None,
+    tell: Callable[[ScanProgress], None] = lambda progress: None,
     note: Callable[[str], None] = lambda text: None,
 ) -> Outcome:
     """Scan the quadrupoles of a running machine, and restore the magnets in every case.
@@ -470,7 +470,7 @@ def watch(
     machine: WatchMachine | str | PathLike[str],
     seconds: float | None = None,
     *,
-    show: Callable[[WatchView], None] = lambda told: None,
+    show: Callable[[WatchView], None] = lambda view: None,
 ) -> WatchView:
     """Follow the lifetime of a stored beam; nothing is written to the machine.
 

@@ -63,7 +63,7 @@ def batch(
     weights: str,
     lattice: str | None,
     output: Output,
-    **told: Any,
+    **input_options: Any,
 ) -> None:
     """Fit many scans or records, each on its own, and write one row per answer.
 
@@ -71,8 +71,8 @@ def batch(
     the reason, and stops nothing. Answers in FILE.parts for the same file, lattice, options and
     version are kept.
     """
-    part = {n: told[n] for n in ("use", "energy", "particle", "first", "last", "screen")}
-    reading = {n: told[n] for n in ("columns", "ignore", "skip_bad")}
+    part = {n: input_options[n] for n in ("use", "energy", "particle", "first", "last", "screen")}
+    reading = {n: input_options[n] for n in ("columns", "ignore", "skip_bad")}
     _check_kind(kind, {"lattice": lattice, "noise": noise, "learn-noise": learned} | part)
     from beamfit.batch.course import courses_of, followed, summary_of
 

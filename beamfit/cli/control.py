@@ -64,7 +64,7 @@ def control(
     rate: tuple[str, ...],
     disturb: tuple[str, ...],
     output: Output,
-    **told: Any,
+    **arguments: Any,
 ) -> None:
     """Control a process: identify it, plan its inputs within limits, and simulate the loop.
 
@@ -73,14 +73,14 @@ def control(
     inputs can achieve that; limits that cannot be kept are named.
     """
     targets, loads = _steps(targets, "set"), _steps(disturb, "disturb")
-    told |= {
+    arguments |= {
         "limits": gains_of(limit, "limit", LIMIT),
         "rates": named_of(rate, "rate", RATE, float),
     }
-    reading = {n: told.pop(n) for n in READING}
+    reading = {n: arguments.pop(n) for n in READING}
     runs = [read_run(path, **reading) for path in record]
-    told |= {"offset": not no_offset, "disturbances": loads}
-    loop = beamfit.control(runs, targets, **told)  # JAX from here on
+    arguments |= {"offset": not no_offset, "disturbances": loads}
+    loop = beamfit.control(runs, targets, **arguments)  # JAX from here on
     digests = {path: digest(path) for path in record}
     output.write(loop, digests)
     output.answer([loop], digests, lambda terminal: _show(terminal, loop))

@@ -62,7 +62,7 @@ def design(
     goal: float | None,
     count: int,
     output: Output,
-    **told: Any,
+    **fit_options: Any,
 ) -> None:
     """Propose the settings to measure next, given the present data, and when to stop.
 
@@ -70,18 +70,18 @@ def design(
     scenario that the data do not identify it names the kind of measurement that would.
     """
     others = energies_of(energies)
-    input_options = {name: told.pop(name) for name in INPUT_OPTIONS}
-    Assumptions(**told).check_scenario(scenario)
-    told["noise"] = None if noise is None else read_noise(noise)
+    input_options = {name: fit_options.pop(name) for name in INPUT_OPTIONS}
+    Assumptions(**fit_options).check_scenario(scenario)
+    fit_options["noise"] = None if noise is None else read_noise(noise)
     read = read_inputs(scan, **input_options)
     measured, described, _ = read
     described.check_magnets(limits)
     described.check_energies(others)
 
     # JAX from here on
-    fit = beamfit.fit_emittance(measured, build_line(described), scenario=scenario, **told)
-    wanted = {"criterion": criterion, "goal": goal, "count": count, "energies": others}
-    advice = beamfit.design(fit, limits=limits or None, **wanted)
+    fit = beamfit.fit_emittance(measured, build_line(described), scenario=scenario, **fit_options)
+    design_options = {"criterion": criterion, "goal": goal, "count": count, "energies": others}
+    advice = beamfit.design(fit, limits=limits or None, **design_options)
     title = f"{fit.scan.name} on {fit.line.name}"
     output.answer([advice], read.digests, lambda terminal: _show(terminal, advice, title))
 

@@ -82,7 +82,7 @@ def emittance(
     sample: bool,
     store: str | None,
     output: Output,
-    **told: Any,
+    **fit_options: Any,
 ) -> None:
     """Fit the emittance to a quadrupole scan and say whether to believe it.
 
@@ -92,12 +92,12 @@ def emittance(
 
     Rows that have their own r11_x, r12_x, ... need no lattice, and so do files of emittance_gui.
     """
-    sampling = Sampling(sample, store, told["seed"])
+    sampling = Sampling(sample, store, fit_options["seed"])
     sampling.check()
-    input_options = {name: told.pop(name) for name in INPUT_OPTIONS}
+    input_options = {name: fit_options.pop(name) for name in INPUT_OPTIONS}
     if known is not None:
-        told["priors"] = read_systematics(known) | told["priors"]
-    Assumptions(**told).check_scenario(scenario)
+        fit_options["priors"] = read_systematics(known) | fit_options["priors"]
+    Assumptions(**fit_options).check_scenario(scenario)
     own = None if noise is None else read_noise(noise)
     read = read_inputs(scan, **input_options)
     measured, described, gui = read
@@ -110,18 +110,18 @@ def emittance(
         raise InputError(found, "the rows of one slice, or no --sample", path=measured.path)
 
     line = build_line(described)  # JAX from here on
-    told |= {"planes": planes, "method": method.replace("-", "_"), "robust": robust}
-    told |= {"weights": weights, "scenario": scenario, "noise": own}
+    fit_options |= {"planes": planes, "method": method.replace("-", "_"), "robust": robust}
+    fit_options |= {"weights": weights, "scenario": scenario, "noise": own}
     inputs = read.digests
     if len(measured.slices) > 1:
         from beamfit.emittance.slices import fit_slices
 
-        fits = fit_slices(measured, line, **told)
+        fits = fit_slices(measured, line, **fit_options)
         output.write(fits, inputs)
         results = (entry for fit in fits for entry in results_of(fit))
         output.answer(results, inputs, lambda terminal: _show_slices(terminal, fits))
         return
-    fit = beamfit.fit_emittance(measured, line, **told)
+    fit = beamfit.fit_emittance(measured, line, **fit_options)
     methods = () if gui is None else compare_methods(gui, line, planes)
     (posterior,) = sampling.sample_all([fit], inputs, quiet=output.as_json)
     output.write(fit, inputs, posterior=posterior, methods=methods)

@@ -252,10 +252,10 @@ def _show_many(terminal: Terminal, study: RecordStudy) -> None:
     from beamfit.lifetime import tables
 
     verdicts = tables.alike(study.decays)
-    told = verdicts if terminal.full else verdicts[:MAX_VERDICTS_BRIEF]
-    for status, names, message in told:
+    listed = verdicts if terminal.full else verdicts[:MAX_VERDICTS_BRIEF]
+    for status, names, message in listed:
         terminal.verdict(names, status, message)
-    if left := verdicts[len(told) :]:
+    if left := verdicts[len(listed) :]:
         others = ", ".join(dict.fromkeys(cell(status) for status, *_ in left))
         terminal.line(f"\n{len(left)} more kinds of verdict ({others}): --full.")
     for table in tables.overview(study.decays)[: None if terminal.full else 1]:

@@ -67,7 +67,7 @@ def solve(
     derivatives: tuple[str, ...],
     start: str,
     output: Output,
-    **told: Any,
+    **arguments: Any,
 ) -> None:
     """Solve a formulation: a constrained problem as text (.bf) or the report's XML.
 
@@ -77,9 +77,9 @@ def solve(
     if start != "seeds" and not COUNT.fullmatch(start):
         raise InputError(f"--start '{start}'", "seeds, or a number of starts from 1 to 999999")
     for name in ("tolerance", "within"):
-        if told[name] is not None and not 0 < told[name] < math.inf:
-            raise InputError(f"--{name} {told[name]:g}", "a number above 0")
-    told["seconds"] = told.pop("within")
+        if arguments[name] is not None and not 0 < arguments[name] < math.inf:
+            raise InputError(f"--{name} {arguments[name]:g}", "a number above 0")
+    arguments["seconds"] = arguments.pop("within")
     tables = named_of(data, "data", "NAME=FILE")
     numbers = {
         name: _numbers(name, text) for name, text in named_of(values, "set", "NAME=NUMBER").items()
@@ -89,9 +89,9 @@ def solve(
 
     formulation = read_formulation(document)
     numbers_of, files = read_tables(formulation, document, tables)
-    told |= {"starts": starts, "values": numbers, "derivatives": derivatives}
+    arguments |= {"starts": starts, "values": numbers, "derivatives": derivatives}
     with located(document):
-        found = beamfit.solve(formulation, numbers_of, **told)
+        found = beamfit.solve(formulation, numbers_of, **arguments)
     inputs = {path: digest(path) for path in (document, *files.values())}
     output.write(found, inputs)
     output.answer([found], inputs, lambda terminal: _show(terminal, found))
@@ -117,6 +117,6 @@ def _show(terminal: Terminal, found: ProblemSolution | Computed) -> None:
         terminal.line()
     terminal.tables(found.tables())
     if isinstance(found, ProblemSolution):
-        asked = found.made.document.solver
-        said = f"Solver: {found.solver}" + (f" (asked for: {asked.name})" if asked else "")
+        requested = found.made.document.solver
+        said = f"Solver: {found.solver}" + (f" (asked for: {requested.name})" if requested else "")
         terminal.line(said, style="dim")

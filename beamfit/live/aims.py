@@ -179,8 +179,8 @@ class EmittanceAim:
 
         def moved(magnet: Magnet) -> int:
             settings = [p.settings[magnet.name] for p in points]
-            usual = float(np.median(settings))
-            return sum(abs(value - usual) > 2 * magnet.tolerance for value in settings)
+            typical = float(np.median(settings))
+            return sum(abs(value - typical) > 2 * magnet.tolerance for value in settings)
 
         return [m.name for m in self.machine.magnets[1:] if moved(m) < MIN_POINTS_PER_MAGNET]
 
@@ -335,8 +335,8 @@ def _size_differences(
     """Return squared differences of ln(predicted size); 0 far outside the measured sizes."""
     one, two = (each.predict(settings, plane).size for each in (fit, other))
     sizes = [p.shots[plane].mean() for p in points]
-    seen = (0.5 * min(sizes) < one) & (one < 2.0 * max(sizes))
-    return np.where(seen, np.log(one / two) ** 2, 0.0)
+    measurable = (0.5 * min(sizes) < one) & (one < 2.0 * max(sizes))
+    return np.where(measurable, np.log(one / two) ** 2, 0.0)
 
 
 @dataclass

@@ -32,7 +32,7 @@ def emittance_scan(
     line: Beamline,
     *,
     journal: str | None = None,
-    tell: Callable[[ScanProgress], None] = lambda told: None,
+    tell: Callable[[ScanProgress], None] = lambda progress: None,
     md: Mapping[str, Any] | None = None,
 ) -> MsgGenerator[Outcome]:
     """Scan magnets until the emittances are known to the goal, and restore the magnets.
@@ -80,14 +80,14 @@ def emittance_scan(
         steps.put_nowait(_release(turn))
         await turn.acquire()
 
-    def told(now: ScanProgress) -> None:
+    def report(now: ScanProgress) -> None:
         tell(now)
         if now.measured:
             steps.put_nowait(_shot_events(machine, now.points[-1]))
 
     async def scanned() -> Outcome:
         at, place = await connect(machine), journal_of(machine, journal)
-        return await scan(at, line, place, tell=told, ready=ready)
+        return await scan(at, line, place, tell=report, ready=ready)
 
     def measured() -> MsgGenerator[Outcome]:
         while step := (yield from _await_result(steps.get())):

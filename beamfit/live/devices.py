@@ -153,17 +153,17 @@ class Supply:
     async def settled(self, value: float) -> float:
         """As `Device.settled`: returns the mean read-back over the settle time."""
         magnet, clock = self.magnet, time.monotonic
-        began, seen, within = clock(), [], None
+        began, readings, within = clock(), [], None
         pause = min(max(magnet.settle / POLLS, MIN_POLL_INTERVAL), MAX_POLL_INTERVAL)
         while True:
             read = _valid(await self.readback.get(), magnet.read).value
             if abs(read - value) <= magnet.tolerance:
                 within = clock() if within is None else within
-                seen.append(read)
+                readings.append(read)
                 if clock() - within >= magnet.settle:
                     break
             else:
-                within, seen = None, []
+                within, readings = None, []
             if clock() - began > magnet.timeout + magnet.settle:
                 raise NotSettledError(*_unsettled_words(magnet, value, read))
             await asyncio.sleep(pause)
@@ -171,7 +171,7 @@ class Supply:
         if not np.all(np.abs((await self.setting.get()).value - value) <= magnet.tolerance):
             found = f"{magnet.name} set by someone else while it was scanned"
             raise NotSettledError(found, "nobody else who sets it")
-        return float(np.mean(seen))
+        return float(np.mean(readings))
 
     def followed(self, value: float) -> AbstractAsyncContextManager[Left]:
         """As `Device.followed`: monitors set point and read-back."""
@@ -409,14 +409,14 @@ async def connect(machine: ScanMachine) -> Connected:
         notes += said
         await supply.standing()
     machine = replace(machine, magnets=tuple(magnets))
-    wanted, guard = machine.screen, machine.guard
-    names = wanted.sizes or wanted.profiles
+    profiler, guard = machine.screen, machine.guard
+    names = profiler.sizes or profiler.profiles
     screen = {plane: open_channel(name, machine.timeout) for plane, name in names.items()}
     for channel in screen.values():
         await channel.get()
-        if wanted.sizes:
+        if profiler.sizes:
             given = (await channel.describe()).unit
-            note = check_unit(given, channel.name, wanted.unit, UNITS["length"])
+            note = check_unit(given, channel.name, profiler.unit, UNITS["length"])
             notes += [note] * bool(note)
     watchmen = [
         None if name is None else open_channel(name, machine.timeout)
@@ -424,7 +424,7 @@ async def connect(machine: ScanMachine) -> Connected:
     ]
     ready = BeamGuard(guard, *watchmen)
     await ready.amiss()
-    return Connected(supplies, ScreenShots(wanted, screen), ready, machine, tuple(notes))
+    return Connected(supplies, ScreenShots(profiler, screen), ready, machine, tuple(notes))
 
 
 def supply_of(magnet: Magnet, timeout: float) -> Supply:

@@ -174,8 +174,8 @@ def _magnet(table: dict[str, object]) -> tuple[Magnet, float]:
     """
     setting = table.pop("setting")
     table["degauss"] = tuple(table["degauss"])
-    known = {field.name for field in fields(Magnet)}
-    m = Magnet(**{name: value for name, value in table.items() if name in known})
+    field_names = {field.name for field in fields(Magnet)}
+    m = Magnet(**{name: value for name, value in table.items() if name in field_names})
     numbers = (setting, m.low, m.high, m.tolerance, m.settle, m.timeout, m.approach_by)
     _require(all(isinstance(word, str) and word for word in (m.name, m.set, m.read, m.unit)))
     _require(all(map(is_number, numbers)) and m.approach in APPROACHES)

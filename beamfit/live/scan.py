@@ -104,7 +104,7 @@ async def scan(
     journal: Path,
     *,
     keep: Callable[[Sequence[MeasuredPoint], Mapping[str, float]], None] = lambda *given: None,
-    tell: Callable[[ScanProgress], None] = lambda told: None,
+    tell: Callable[[ScanProgress], None] = lambda progress: None,
     ready: Callable[[], Awaitable[None]] = lambda: asyncio.sleep(0),
 ) -> Outcome:
     """Scan magnets until the emittances are known to the goal, and restore the magnets.

@@ -46,13 +46,13 @@ def values_of(view: WatchView) -> dict[str, tuple[Any, int]]:
     out_of_date = NONE if view.sound and not view.lost else INVALID
     found: dict[str, tuple[Any, int]] = {}
     for name, (quantity, _) in NUMBERS.items():
-        known = getattr(answer, quantity, None)
-        low, high = (known and known.interval_95) or (math.nan, math.nan)
+        q = getattr(answer, quantity, None)
+        low, high = (q and q.interval_95) or (math.nan, math.nan)
         parts = {
-            "": known.value if known else math.nan, ":ERROR": known.error if known else math.nan,
+            "": q.value if q else math.nan, ":ERROR": q.error if q else math.nan,
             ":LOW": low, ":HIGH": high,
         }  # fmt: skip
-        severity = out_of_date if known else INVALID
+        severity = out_of_date if q else INVALID
         found |= {name + part: (value, severity) for part, value in parts.items()}
     moved = max(MAJOR if state.alarmed else NONE, out_of_date)
     verdict = {"green": NONE, "yellow": MINOR, "red": MAJOR}[

@@ -44,10 +44,10 @@ def density_page(fit: DensityFit) -> ReportPage:
         rows = math.ceil(len(p.profiles) / PROFILES_PER_ROW)
         methods = [said[p.plane] for said in fit.stored.values() if p.plane in said]
         draw = partial(draw_density, plane=p, methods=methods)
-        seen = partial(draw_profiles, plane=p)
+        draw_all = partial(draw_profiles, plane=p)
         pictures.append(Picture(f"density in {p.plane}, emittance against charge", 3.2, draw,
                                 source))  # fmt: skip
-        pictures.append(Picture(f"profiles in {p.plane}", 0.6 + 1.9 * rows, seen, source))
+        pictures.append(Picture(f"profiles in {p.plane}", 0.6 + 1.9 * rows, draw_all, source))
     return ReportPage(
         title=f"Phase-space density of {fit.scan.name}",
         subtitle=f"{len(fit.scan)} settings, {len(fit.scan.profiles)} profiles",
@@ -73,10 +73,11 @@ def _profile_table(plane: PlaneDensity) -> Table:
     d = plane.densities
     rows = []
     for k, (label, p) in enumerate(zip(plane.labels, plane.profiles, strict=True)):
-        told = ["-", "-"]
+        numbers = ["-", "-"]
         if d is not None:
-            told = [f"{100.0 * d.stretch[k]:+.1f} %", f"{100.0 * max(plane.beyond[k], 0.0):.1f} %"]
-        rows.append([label, str(p.shots), f"{1e6 * p.size:.4g}", *told])
+            stretch, beyond = 100.0 * d.stretch[k], 100.0 * max(plane.beyond[k], 0.0)
+            numbers = [f"{stretch:+.1f} %", f"{beyond:.1f} %"]
+        rows.append([label, str(p.shots), f"{1e6 * p.size:.4g}", *numbers])
     head = ["setting", "shots", "rms, µm", "wider than the density", "beyond the window"]
     return Table(f"Profiles in {plane.plane}", head, rows)
 
@@ -102,7 +103,7 @@ def draw_density(figure: FigureBase, plane: PlaneDensity, methods: Sequence[Quan
     methods : sequence of Quantity
         Emittances by size methods, marked at the right edge.
     """
-    axes, beside = figure.subplots(1, 2)
+    axes, right = figure.subplots(1, 2)
     d, density = plane.densities, np.maximum(plane.density, 0.0)
     levels = contour_levels(density, CONTOURS)
     u = np.stack(np.meshgrid(FINE_AXIS, FINE_AXIS, indexing="ij"), -1) @ d.frame.T
@@ -116,20 +117,20 @@ def draw_density(figure: FigureBase, plane: PlaneDensity, methods: Sequence[Quan
     axes.set_title("contours of 50, 68, 90 and 95 % of the charge", fontsize=7)
     share = 100.0 * np.array(SHARES)
     every = list(plane.emittance.values())
-    known = [q.error is not None for q in every]
+    has_error = [q.error is not None for q in every]
     value = 1e6 * np.array([q.value for q in every])
     for part, alpha in (("95", 0.15), ("68", 0.3)):
         low, high = _band(every, part)
-        beside.fill_between(share, low, high, where=known, color=BLUE, alpha=alpha, lw=0)
-    beside.plot(share, value, "o-", color=BLUE, ms=4, lw=1.0)
-    open_ = [not k for k in known]
-    beside.plot(share[open_], value[open_], "o", color=RED, ms=5, mfc="w")
+        right.fill_between(share, low, high, where=has_error, color=BLUE, alpha=alpha, lw=0)
+    right.plot(share, value, "o-", color=BLUE, ms=4, lw=1.0)
+    open_ = [not k for k in has_error]
+    right.plot(share[open_], value[open_], "o", color=RED, ms=5, mfc="w")
     said = ["○ not determined"] * any(open_) + ["– size methods"] * bool(methods)
-    beside.set(xlabel="share of the charge, %", ylabel="normalised emittance, µm")
-    beside.set_title("   ".join(said), fontsize=7)
+    right.set(xlabel="share of the charge, %", ylabel="normalised emittance, µm")
+    right.set_title("   ".join(said), fontsize=7)
     for q in methods:
-        beside.plot(101.5, 1e6 * q.value, marker="_", color="0.4", ms=7)
-    beside.set_ylim(bottom=0.0)
+        right.plot(101.5, 1e6 * q.value, marker="_", color="0.4", ms=7)
+    right.set_ylim(bottom=0.0)
 
 
 def _band(every: list, part: str) -> tuple[np.ndarray, np.ndarray]:

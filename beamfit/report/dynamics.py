@@ -50,8 +50,8 @@ def _tables(fit: ResponseFit | StatesFit) -> list[Table]:
     first, *others = fit.tables()
     ranges = []
     for curve in (c for part in fit.parts for c in part.curves if c.visited.any()):
-        seen = curve.value[curve.visited]
-        words = f"{seen.min():.4g} to {seen.max():.4g} {curve.unit}, by {curve.input}"
+        visited = curve.value[curve.visited]
+        words = f"{visited.min():.4g} to {visited.max():.4g} {curve.unit}, by {curve.input}"
         ranges.append([curve.parameter, words])
     return [first._replace(rows=[*ranges, *first.rows]), *others]
 
@@ -127,15 +127,15 @@ def _draw_run(fit: ResponseFit | StateSpaceOutput, i: int, figure: FigureBase) -
 def draw_curve(c: Curve, figure: FigureBase) -> None:
     """Draw a parameter against the operating point, dashed outside the visited range."""
     axes = figure.subplots()
-    known = c.visited & np.isfinite(c.error)
+    has_band = c.visited & np.isfinite(c.error)
     axes.plot(c.at, c.value, "--", color="0.6", linewidth=1)
     axes.plot(c.at, np.where(c.visited, c.value, np.nan), color=BLUE)
-    low, high = (np.where(known, c.value + s * c.error, np.nan) for s in (-1, 1))
+    low, high = (np.where(has_band, c.value + s * c.error, np.nan) for s in (-1, 1))
     axes.fill_between(c.at, low, high, color=BLUE, alpha=0.25, linewidth=0)
     axes.set(title=f"{c.parameter} by {c.input}", xlabel=unitless(c.input))
     axes.set_ylabel(f"{c.parameter}, {c.unit}")
     if c.visited.any():  # limit the axis to the band in the visited range
-        inside = np.concatenate([low[known], high[known], c.value[c.visited]])
+        inside = np.concatenate([low[has_band], high[has_band], c.value[c.visited]])
         edge = 0.15 * max(float(np.ptp(inside)), 1e-12)
         axes.set_ylim(inside.min() - edge, inside.max() + edge)
 

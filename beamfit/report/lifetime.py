@@ -316,14 +316,14 @@ def draw_lifetime(figure: FigureBase, study: RecordStudy) -> None:
         # A rate of zero or less has no lifetime: leave a gap in the curve.
         inverse = 1 / np.where(rate > 0, rate, np.nan)
         axes.plot((decay.offset + grid) / scale, inverse, color=RED, lw=1.5, zorder=3)
-    seen = (
+    label = (
         "single cycles, or some together" if study.pooled else "straight lines over 1/8 of a decay"
     )
-    axes.errorbar([], [], [], fmt="o", ms=3, color=BLUE, label=seen)
+    axes.errorbar([], [], [], fmt="o", ms=3, color=BLUE, label=label)
     axes.plot([], [], color=RED, label="fit")
-    known = [top for top in tops if np.isfinite(top)]
-    if known:
-        axes.set_ylim(0.6 * min(known), 1.4 * max(known))
+    finite = [top for top in tops if np.isfinite(top)]
+    if finite:
+        axes.set_ylim(0.6 * min(finite), 1.4 * max(finite))
     axes.set(title="momentary lifetime", xlabel=f"time, {unit}", ylabel="lifetime, h")
     legend_below(figure, axes, 2)
 
@@ -345,28 +345,28 @@ def _cycle_lifetimes(fit: DecayFit) -> tuple[np.ndarray, np.ndarray, np.ndarray]
     at, level = (np.add.reduceat(v, part) / count for v in (record.time, record.current))
     squares = np.add.reduceat(since**2, part)
     rate = np.add.reduceat(since * residual, part) / squares / level
-    usual = np.array([of.lifetime.value for of in fit.course] or [fit.lifetime_mean.value])
+    lifetimes = np.array([of.lifetime.value for of in fit.course] or [fit.lifetime_mean.value])
     which = np.searchsorted([of.start for of in fit.course][1:], at - record.time[0])
-    rate += fit.a.value * (level - fit.mean_current) + 1 / usual[which] / HOUR
+    rate += fit.a.value * (level - fit.mean_current) + 1 / lifetimes[which] / HOUR
     error = fit.rms_residual / np.sqrt(squares) / level
-    seen = rate > 0
-    return at[seen], 1 / rate[seen] / HOUR, (error / rate**2)[seen] / HOUR
+    positive = rate > 0
+    return at[positive], 1 / rate[positive] / HOUR, (error / rate**2)[positive] / HOUR
 
 
 def _draw_windows(axes: Axes, decay: Decay, scale: float) -> float:
     """Draw about forty windows of one decay; return the median lifetime, for the axis."""
     segment = decay.segment
-    usual = float(np.median(np.diff(segment.time)))
+    interval = float(np.median(np.diff(segment.time)))
     try:
-        trace = moving_lifetime(segment, max(segment.span / 8, 6 * usual))
+        trace = moving_lifetime(segment, max(segment.span / 8, 6 * interval))
     except InputError:
         return np.nan  # too few readings for any window
     every = slice(None, None, max(1, trace.time.size // 40))
-    seen = np.isfinite(trace.lifetime[every]) & (trace.lifetime[every] > 0)
-    if not seen.any():
+    valid = np.isfinite(trace.lifetime[every]) & (trace.lifetime[every] > 0)
+    if not valid.any():
         return np.nan
     time, lifetime, error = (
-        part[every][seen] for part in (trace.time, trace.lifetime, trace.error)
+        part[every][valid] for part in (trace.time, trace.lifetime, trace.error)
     )
     at = (decay.offset + time) / scale
     axes.errorbar(at, lifetime, error, fmt="o", ms=3, lw=0.8, color=BLUE, zorder=2)
@@ -412,8 +412,8 @@ def _overall_pictures(
 ) -> list[Picture]:
     """Make the pictures of all decays together."""
     listed = [] if trend is None else [trend_picture(trend)]
-    known = shift is not None and shift.network is not None
-    return listed + (network_pictures(shift, decays) if known else [])
+    has_network = shift is not None and shift.network is not None
+    return listed + (network_pictures(shift, decays) if has_network else [])
 
 
 def _pictures(studies: Sequence[RecordStudy]) -> list[Picture]:
@@ -462,9 +462,9 @@ def draw_trend(figure: FigureBase, trend: Trend) -> None:
     _lifetimes(panels[0], trend, at)
     for axes, name in zip(panels[1:], RELATIVE_LOSSES, strict=False):
         found = [getattr(point, name) for point in trend.points]
-        known = [(t, q.value, q.error) for t, q in zip(at, found, strict=True) if q is not None]
-        if known:
-            time, value, error = map(np.array, zip(*known, strict=True))
+        points = [(t, q.value, q.error) for t, q in zip(at, found, strict=True) if q is not None]
+        if points:
+            time, value, error = map(np.array, zip(*points, strict=True))
             axes.errorbar(time, value, error, fmt="o", ms=4, color=BLUE)
         axes.axhline(1.0, color="0.6", lw=0.8)
         axes.set(ylabel=f"{name} over usual")

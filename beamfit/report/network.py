@@ -105,8 +105,8 @@ def draw_by_setting(figure: FigureBase, shift: Shift, decays: Sequence[Decay], n
     network = shift.network
     scale, label = SETTINGS[name]
     at = np.linspace(*getattr(shift.limits, name), CURVE_POINTS)
-    usual = _settings_at_their_pressure(shift, decays)
-    settings = [usual._replace(**{name: float(value)}) for value in at]
+    reference = _settings_at_their_pressure(shift, decays)
+    settings = [reference._replace(**{name: float(value)}) for value in at]
     predicted = [network.predict(one, shift.current) for one in settings]
     first = np.array([shift.fit.losses_at(one, shift.current) for one in settings])
     first = np.column_stack([first, 1 / (first @ [shift.current, 1.0]) / HOUR])
@@ -128,15 +128,15 @@ def draw_by_setting(figure: FigureBase, shift: Shift, decays: Sequence[Decay], n
 def _settings_at_their_pressure(shift: Shift, decays: Sequence[Decay]) -> Operation:
     """Return the reference settings with the pressure of the decays near the current."""
     machine, current = shift.fit.machine, shift.current
-    usual = machine.operation
+    reference = machine.operation
     read = [
         pressure_at(operation_during(decay.segment, machine), current)
         for decay in decays
         if _is_near(decay, current)
     ]
-    share = float(np.median(read)) / pressure_at(usual, current)
-    base, slope = share * usual.pressure_base, share * usual.pressure_slope
-    return usual._replace(pressure_base=base, pressure_slope=slope)
+    share = float(np.median(read)) / pressure_at(reference, current)
+    base, slope = share * reference.pressure_base, share * reference.pressure_slope
+    return reference._replace(pressure_base=base, pressure_slope=slope)
 
 
 def _is_near(decay: Decay, current: float) -> bool:
@@ -144,21 +144,22 @@ def _is_near(decay: Decay, current: float) -> bool:
 
 
 def _points(axes: Axes, points: list[tuple[float, list]], k: int, scale: float) -> None:
-    known = [(at, q[k]) for at, q in points if q[k].error is not None]
-    if known:
-        at, value, error = zip(*((at / scale, q.value, q.error) for at, q in known), strict=True)
+    measured = [(at, q[k]) for at, q in points if q[k].error is not None]
+    if measured:
+        at, value, error = zip(*((at / scale, q.value, q.error) for at, q in measured), strict=True)
         axes.errorbar(at, value, error, fmt="o", ms=4, color=BLUE, label="decays")
 
 
 def _measured(shift: Shift, decays: Sequence[Decay], name: str) -> list[tuple[float, list]]:
     """Return value of one setting, a, b and lifetime of decays near the current and reference."""
     machine, found = shift.fit.machine, []
-    usual = machine.operation
+    reference = machine.operation
     others = [setting for setting in SETTINGS if setting != name]
     for decay in decays:
         at = operation_during(decay.segment, machine)
         near = _is_near(decay, shift.current)
-        if near and all(np.isclose(getattr(at, o), getattr(usual, o), rtol=0.01) for o in others):
+        pairs = ((getattr(at, other), getattr(reference, other)) for other in others)
+        if near and all(np.isclose(*pair, rtol=0.01) for pair in pairs):
             fit = decay.fit
             found.append((float(getattr(at, name)), [fit.a, fit.b, fit.lifetime_mean]))
     return found

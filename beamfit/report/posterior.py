@@ -278,8 +278,8 @@ def of_scan(fit: EmittanceFit, posterior: Posterior) -> ReportedPosterior:
 
 
 def _of_plane(posterior: Posterior, plane: str) -> list[str]:
-    wanted = ["normalized_emittance", "beta", "alpha", "error_factor", "outlier_fraction"]
-    names = [f"{plane}.{name}" for name in wanted]
+    candidates = ["normalized_emittance", "beta", "alpha", "error_factor", "outlier_fraction"]
+    names = [f"{plane}.{name}" for name in candidates]
     # Other parameters of a scenario.
     names += [name for name in posterior.names if not name.startswith(("x.", "y."))]
     return [name for name in names if name in posterior.shown][:MAX_NUMBERS]
@@ -289,8 +289,8 @@ def of_decay(fit: DecayFit, posterior: Posterior, label: str = "") -> ReportedPo
     """Report the posterior of a decay, with two pictures if it was sampled."""
     if not posterior.chain.size:
         return ReportedPosterior(label, posterior, [])
-    wanted = ("lifetime_mean", "a", "b", "noise", "error_factor", "outlier_fraction")
-    names = [name for name in wanted if name in posterior.shown][:MAX_NUMBERS]
+    candidates = ("lifetime_mean", "a", "b", "noise", "error_factor", "outlier_fraction")
+    names = [name for name in candidates if name in posterior.shown][:MAX_NUMBERS]
     draw = partial(
         _expectations,
         title=fit.readings.name,

@@ -209,8 +209,8 @@ def draw_profiles(figure: FigureBase, profiles: list[Profile], fit: EmittanceFit
 def has_ellipses(p: PlaneFit) -> bool:
     """Return True if the data determine β and α, at the start and at the screen."""
     numbers = (p.emittance, p.beta, p.alpha, p.screen.beta, p.screen.alpha)
-    known = all(q.error is not None and math.isfinite(q.value) for q in numbers)
-    return known and p.emittance.value > 0
+    determined = all(q.error is not None and math.isfinite(q.value) for q in numbers)
+    return determined and p.emittance.value > 0
 
 
 def draw_ellipses(figure: FigureBase, fit: EmittanceFit) -> None:

@@ -190,7 +190,7 @@ def test_beam_is_followed_to_the_last_shot_and_a_silent_variable_is_lost(monkeyp
     assert asyncio.run(shots(there, lost)) == "beam loss ('LOSS' reads 5.0)"
     assert asyncio.run(shots(there, None)) == ""
     assert asyncio.run(shots(None, None)) == ""
-    monkeypatch.setattr(devices, "FIRST", 0.01)
+    monkeypatch.setattr(devices, "FIRST_READING_WAIT", 0.01)
     with pytest.raises(LostError, match="no reading of 'FEED' within"):
         asyncio.run(shots(Feed(), None))
 
