@@ -159,14 +159,14 @@ async def _show_plan(machine: ScanMachine, journal: Path, as_json: bool) -> int:
     begin = f"{machine.magnets[0].name} at {values}"
     until = f"the emittances are known to {goal}"
     if machine.knobs:
-        begin = f"rows that fill the limits of {', '.join(m.name for m in machine.magnets)}"
+        begin = f"rows spread over the limits of {', '.join(m.name for m in machine.magnets)}"
         until = f"the best setting of {', '.join(machine.knobs)} is within {goal} of the minimum"
-    click.echo(f"First {begin}; then where it tells most.")
+    click.echo(f"First {begin}; then the most informative settings.")
     click.echo(
         f"{machine.screen.shots} shots on {machine.screen.name} at each, at most {machine.points} "
         f"settings, or until {until}."
     )
-    click.echo(f"At the end back to {settings_words(before)}; until then that stands in {journal}.")
+    click.echo(f"Restored at the end: {settings_words(before)}. Until then it is in {journal}.")
     for line in (*at.notes, *([f"Now: {plan['amiss']}."] if plan["amiss"] else [])):
         click.echo(plain(line))
     click.echo("Nothing was moved.")

@@ -166,7 +166,7 @@ class EmittanceAim:
             aim = "D" if new else "emittance"  # a new magnet is moved whatever it gains
             steps, stop = best_steps(fit, adviser_of(fit), new or limits, aim)
             if steps:
-                return chosen(steps[0].candidate.settings, "where it tells most")
+                return chosen(steps[0].candidate.settings, "most informative")
             if len(points) >= MIN_POINTS:
                 return stop.removeprefix("Stop: ").rstrip(".")
         gaps = np.sort([low, high, *(p.settings[first.name] for p in points)])
@@ -375,12 +375,12 @@ class TuningAim:
             quadrupoles = {n: ends for n, ends in limits.items() if n not in machine.knobs}
             row = next_row(fit, quadrupoles).settings
             settings = clip_settings(dict(before) | row, limits)
-            return Next(settings, "where it tells most of the minimum")
+            return Next(settings, "most informative about the minimum")
         at = settings_within(len(limits), POWER)[(len(points) + len(barred)) % 2**POWER]
         low, high = np.array(list(limits.values())).T
         values = 0.5 * (low + high + at * (high - low))
         row = dict(zip(limits, map(float, values), strict=True))
-        return Next(clip_settings(row, limits), "rows that fill the limits")
+        return Next(clip_settings(row, limits), "rows spread over the limits")
 
     def doubt(self, points: Sequence[MeasuredPoint], fit: TuningFit | None) -> str:
         """As `Aim.doubt`: always "", since a tuning fit itself reports sizes of no beam."""
