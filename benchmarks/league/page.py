@@ -26,7 +26,7 @@ give; emcee, which is slow, gets the first tenth.
 
 pyemittance analyses scans; curve_fit, lmfit and emcee stand for scripts that users write (emcee: 32
 walkers, 300 steps, no convergence test). lcls-tools and elegant's sddsemitproc are not on PyPI;
-their methods were reimplemented from the descriptions. In top-up the scripts are told the refills:
+their methods were reimplemented from the descriptions. In top-up the scripts get the refills:
 they fit the longest piece, straight lines every piece. A program that is not installed stops the
 run.
 
