@@ -32,7 +32,7 @@ MAX_REFUSALS = 10
 @click.argument("path", nargs=-1, required=True)
 @option(
     "--kind",
-    "What the files hold: quadrupole scans, or records of beam current.",
+    "Content of the files: quadrupole scans, or records of beam current.",
     choices=["emittance", "lifetime"],
     required=True,
 )
@@ -43,7 +43,7 @@ MAX_REFUSALS = 10
 )
 @option("--workers", "Processes on this machine (Dask).", type=click.IntRange(1))
 @option("--scheduler tcp://HOST:PORT", "A Dask scheduler to join.")
-@option("--quantity NAME", "What the report follows, such as beta or lifetime_mean.")
+@option("--quantity NAME", "Quantity of the report, such as beta or lifetime_mean.")
 @option(
     "--learn-noise FILE.toml",
     "Learn the noise of these scans, with its error, and write it for --noise.",

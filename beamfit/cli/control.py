@@ -51,10 +51,10 @@ LIMIT = "NAME=LOW:HIGH, one of them may be left out, such as level=:3"
     "Added to an output in the simulation, from a time on.",
     multiple=True,
 )
-@option("--horizon STEPS", "Steps of a plan.", type=click.IntRange(2))
-@option("--every SAMPLES", "Samples of the runs in a step of control.", type=click.IntRange(1))
+@option("--horizon STEPS", "Number of steps of a plan.", type=click.IntRange(2))
+@option("--every SAMPLES", "Samples of the runs per control step.", type=click.IntRange(1))
 @option("--smooth", "Cost of input changes against errors.", type=float, default=0.1)
-@option("--for SECONDS", "Time simulated.", name="duration", type=float)
+@option("--for SECONDS", "Simulated time.", name="duration", type=float)
 @options("hidden columns ignore skip-bad seed report json")
 def control(
     record: tuple[str, ...],

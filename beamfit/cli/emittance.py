@@ -46,12 +46,10 @@ Examples:
 @options(
     "scan columns ignore skip-bad size-method maybe-lattice use from to screen energy particle"
 )
-@option(
-    "--plane", "Which plane to fit; all that were measured by default.", choices=["x", "y", "both"]
-)
+@option("--plane", "Plane to fit; default: all measured planes.", choices=["x", "y", "both"])
 @option(
     "--method",
-    "What the fit compares: size² (linear) or size.",
+    "Fitted quantity: size² (linear) or size.",
     choices=["size-squared", "size"],
     default="size-squared",
 )
@@ -59,7 +57,7 @@ Examples:
 @options("noise weights scenario prior bounds gain anchor")
 @option(
     "--systematics FILE",
-    "TOML file of what is known of screen, energy, drifts, magnets: part of the error then.",
+    "TOML file with uncertainties of screen, energy, drifts, magnets; they enter the error.",
     name="known",
 )
 @option(
@@ -68,7 +66,7 @@ Examples:
     is_flag=True,
 )
 @options("hidden")
-@option("--starts", "Networks: starts of the training.", default=20)
+@option("--starts", "Networks: number of starts of the training.", default=20)
 @options("sample store seed report full json")
 def emittance(
     scan: str,

@@ -140,12 +140,12 @@ def _check_report(path: str) -> str:
 
 # Headings of the help text by option.
 HEADINGS = {
-    **dict.fromkeys(("--columns", "--ignore", "--skip-bad", "--size-method"), "What is read"),
-    **dict.fromkeys(("--lattice", "--use", "--from", "--to", "--screen", "--energy"), "The line"),
-    **dict.fromkeys(("--particle", "--ring"), "The line"),
+    **dict.fromkeys(("--columns", "--ignore", "--skip-bad", "--size-method"), "Input"),
+    **dict.fromkeys(("--lattice", "--use", "--from", "--to", "--screen", "--energy"), "Lattice"),
+    **dict.fromkeys(("--particle", "--ring"), "Lattice"),
     **dict.fromkeys(("--noise", "--robust", "--weights", "--method"), "Noise and residual"),
-    **dict.fromkeys(("--scenario", "--prior", "--bounds", "--gain", "--anchor"), "What is unknown"),
-    **dict.fromkeys(("--hidden", "--starts", "--hysteresis", "--systematics"), "What is unknown"),
+    **dict.fromkeys(("--scenario", "--prior", "--bounds", "--gain", "--anchor"), "Unknowns"),
+    **dict.fromkeys(("--hidden", "--starts", "--hysteresis", "--systematics"), "Unknowns"),
     **dict.fromkeys(("--sample", "--store", "--seed"), "Posterior"),
     **dict.fromkeys(("--report", "--full", "--json"), "Output"),
 }
@@ -154,9 +154,9 @@ SHARED: dict[str, Callable[..., Any]] = {
     "scan": click.argument("scan"),
     "columns": option(
         "--columns HEADER=NAME,...|LAYOUT.toml",
-        "Meaning of columns whose headers do not say it, such as 'xrms=size_x_um, "
-        "QUAD:BACT=Q525_kG'; or a file of such a layout; or day-month-year, for numeric dates. "
-        "Other columns of unknown names are ignored.",
+        "Meaning of columns with other headers, such as 'xrms=size_x_um, QUAD:BACT=Q525_kG'; or a "
+        "file of such a layout; or day-month-year, for numeric dates. Other columns with unknown "
+        "names are ignored.",
         callback=_parser(layout_of),
     ),
     "ignore": option(
@@ -166,7 +166,7 @@ SHARED: dict[str, Callable[..., Any]] = {
     ),
     "skip-bad": option(
         "--skip-bad",
-        "Leave out rows of the scan with something wrong in them; they are counted and named.",
+        "Leave out rows with an error; they are counted and named.",
         is_flag=True,
     ),
     "lattice": option("--lattice FILE", LATTICE, required=True),
@@ -176,12 +176,12 @@ SHARED: dict[str, Callable[..., Any]] = {
     ),
     "noise": option(
         "--noise FILE",
-        "TOML file of the laboratory's own priors on the noise of sizes; `beamfit batch "
-        "--learn-noise` writes one.",
+        "TOML file of your own priors on the noise of sizes; `beamfit batch --learn-noise` writes "
+        "one.",
     ),
     "weights": option(
         "--weights",
-        "Take the error of size squared at the model's or the measured size; the latter is biased.",
+        "Error of size squared from the model or the measured size; the latter is biased.",
         choices=["model", "measured"],
         default="model",
     ),
@@ -199,37 +199,36 @@ SHARED: dict[str, Callable[..., Any]] = {
     ),
     "energy": option(
         "--energy MEV",
-        "Total energy, instead of the lattice's own; elegant files and scans without a "
-        "lattice have none.",
+        "Total energy, instead of that of the lattice; elegant files and scans without a lattice "
+        "have none.",
         type=float,
     ),
     "scenario": option(
         "--scenario",
-        "Unknown besides the beam: nothing, R11 and R12, the magnets' calibration, "
+        "Unknown in addition to the beam: nothing, R11 and R12, the calibration of the magnets, "
         "or k1 as a function of the current.",
         choices=list(SCENARIOS),
         default="known",
     ),
     "prior": option(
         "--prior NAME=MEAN+-SD",
-        "What is known of a number: of a calibration, Q2.slope=167.23+-3.3446 (or ±); of screen, "
-        "beam and line, size_scale=1+-2%.",
+        "Prior of a parameter: of a calibration, Q2.slope=167.23+-3.3446 (or ±); of screen, beam "
+        "and line, size_scale=1+-2%.",
         name="priors",
         multiple=True,
         callback=_parser(priors_of),
     ),
     "scale-prior": option(
         "--prior NAME=MEAN+-SD",
-        "With --study: what is known of a scale, or rf_voltage=1+-1% for the calibration of that "
-        "reading.",
+        "With --study: prior of a scale, or rf_voltage=1+-1% for the calibration of that reading.",
         name="priors",
         multiple=True,
         callback=_parser(priors_of),
     ),
     "bounds": option(
         "--bounds NAME=LOW:HIGH",
-        "Calibration: bounds of a number; default: ± 12 % of the slope. Transport "
-        "network: of the beam, x.sigma11=2e-8:3e-8 (SI), or of a setting the gains are held over.",
+        "Calibration: bounds of a parameter; default: ± 12 % of the slope. Transport network: "
+        "bounds of the beam, x.sigma11=2e-8:3e-8 (SI), or range of a setting for limits of gains.",
         multiple=True,
         callback=_parser(bounds_of),
     ),
@@ -242,8 +241,8 @@ SHARED: dict[str, Callable[..., Any]] = {
     ),
     "anchor": option(
         "--anchor ANCHOR",
-        "Networks: their tie to the lattice: first-principles=2%, a setting such as "
-        "Q2=0, or determinant.",
+        "Networks: prior from the lattice: first-principles=2%, a setting such as Q2=0, or "
+        "determinant.",
         multiple=True,
         callback=_parser(anchor_of),
     ),
@@ -270,16 +269,18 @@ SHARED: dict[str, Callable[..., Any]] = {
     ),
     "map": option(
         "--map",
-        "Parameters are numbers, or change with the inputs by a network.",
+        "Parameters are constants, or functions of the inputs given by a network.",
         choices=["constant", "network"],
         default="constant",
     ),
-    "input": option("--input COLUMN", "An input of any name.", name="inputs", multiple=True),
-    "output": option("--output COLUMN", "An output of any name.", name="outputs", multiple=True),
-    "step": option("--step SECONDS", "Distance of rows without a time.", type=float),
+    "input": option("--input COLUMN", "Column of an input.", name="inputs", multiple=True),
+    "output": option("--output COLUMN", "Column of an output.", name="outputs", multiple=True),
+    "step": option("--step SECONDS", "Time between rows of a file without times.", type=float),
     "delay": option("--delay SAMPLES", "Known delay; default: fitted.", type=float),
-    "no-offset": option("--no-offset", "The output at rest is 0, and not estimated.", is_flag=True),
-    "goal": option("--goal PERCENT", "Emittance error to stop at.", callback=_parser(goal_of)),
+    "no-offset": option("--no-offset", "Set the output at rest to 0.", is_flag=True),
+    "goal": option(
+        "--goal PERCENT", "Emittance error at which to stop.", callback=_parser(goal_of)
+    ),
     "close": option(
         "--close PERCENT",
         "Stop when the best setting is this close to the minimum with 95 % probability.",
@@ -298,15 +299,15 @@ SHARED: dict[str, Callable[..., Any]] = {
     ),
     "store": option(
         "--store FILE.h5",
-        "Keep the draws of --sample (emcee's HDF5 layout); goes on from an earlier run.",
+        "Keep the draws of --sample (HDF5 layout of emcee); continues an earlier run.",
     ),
     "seed": option(
         "--seed",
-        "Of all random numbers: draws, starts of networks.",
+        "Seed of all random numbers: draws, starts of networks.",
         type=click.IntRange(0, 2**32 - 1),
         default=1,
     ),
-    "full": option("--full", "Show every table, not the first screen alone.", is_flag=True),
+    "full": option("--full", "Show every table, not only the first screen.", is_flag=True),
     "json": option(
         "--json", "Print one JSON object and nothing else.", name="as_json", is_flag=True
     ),
