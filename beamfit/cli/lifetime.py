@@ -62,8 +62,8 @@ Examples:
 )
 @option(
     "--trend",
-    "Follow the lifetime through all decays: current times lifetime with control limits, by "
-    "--ring to one current and the settings of the ring file; alarms if a or b change.",
+    "Follow the lifetime through all decays: current times lifetime with control limits, scaled "
+    "with --ring to one current and the settings of the ring file; alarms if a or b change.",
     is_flag=True,
 )
 @option(
