@@ -11,8 +11,8 @@ from pkgutil import resolve_name
 
 __version__ = "0.1.0"
 
-# Public name -> module, and its name there where it is another one. Loaded on first use, so that
-# `beamfit --help` and a bad file are answered before JAX has been imported.
+# Public name -> module, or module:name if the name differs there. Loaded on first use, so that
+# `beamfit --help` and a bad file are answered before JAX is imported.
 _HOME = {
     "Anchor": "beamfit.emittance.assumptions",
     "Beam": "beamfit.emittance.targets",
@@ -78,8 +78,8 @@ _HOME = {
     "watch": "beamfit.commands",
     "write_report": "beamfit.report.page",
 }
-# Functions that take paths in the place of what is read from them.
-_OPENING = {
+# Functions that accept paths in place of objects read from them.
+_WITH_PATHS = {
     "check",
     "constant_a_test",
     "control",
@@ -107,14 +107,16 @@ __all__ = ["__version__", *_HOME]
 def __getattr__(name: str) -> object:
     if name not in _HOME:
         raise AttributeError(f"module 'beamfit' has no attribute '{name}'")
-    return _found(name)
+    return _resolve(name)
 
 
-@cache  # one object a name, or the functions could not be pickled
-def _found(name: str) -> object:
+@cache  # one object per name, so that functions can be pickled
+def _resolve(name: str) -> object:
     home = _HOME[name]
     found = resolve_name(home if ":" in home else f"{home}:{name}")
-    return resolve_name("beamfit.commands:opening")(found, name) if name in _OPENING else found
+    if name not in _WITH_PATHS:
+        return found
+    return resolve_name("beamfit.commands:with_paths")(found, name)
 
 
 def __dir__() -> list[str]:

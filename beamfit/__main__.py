@@ -1,4 +1,4 @@
-"""The command `beamfit`, also as `python -m beamfit`: what holds before anything is loaded."""
+"""The command `beamfit`, also as `python -m beamfit`: handlers installed before other imports."""
 
 import os
 import signal
@@ -9,14 +9,14 @@ from typing import Any
 SHOW_CURSOR = b"\x1b[?25h"
 
 
-def _stopped(number: int, frame: Any) -> None:
-    """End at once: an exception would be lost, or be told, in code that others wrote."""
+def _exit_on_signal(number: int, frame: Any) -> None:
+    """Exit at once, since foreign code could swallow or print an exception."""
     writing = sys.modules.get("beamfit.writing")
     for path in tuple(getattr(writing, "UNFINISHED", ())):
         with suppress(OSError):
             os.unlink(path)
     screen = 2
-    with suppress(AttributeError, OSError, ValueError):  # live, it is not where libraries print
+    with suppress(AttributeError, OSError, ValueError):  # in live commands it is not descriptor 2
         screen = sys.stderr.fileno()
     with suppress(OSError):
         os.write(screen, (SHOW_CURSOR if os.isatty(screen) else b"") + b"beamfit: interrupted\n")
@@ -24,11 +24,11 @@ def _stopped(number: int, frame: Any) -> None:
 
 
 def main() -> None:
-    """Run the command line; stopped by Ctrl-C at any moment, it says so in one line."""
+    """Run the command line; Ctrl-C at any moment ends it with one line."""
     for number in (signal.SIGINT, signal.SIGTERM):
         if signal.getsignal(number) != signal.SIG_IGN:
-            signal.signal(number, _stopped)
-    for descriptor in range(3):  # a file that takes the place of a closed one would be written to
+            signal.signal(number, _exit_on_signal)
+    for descriptor in range(3):  # a later file must not get the number of a closed standard stream
         try:
             os.fstat(descriptor)
         except OSError:

@@ -1,4 +1,4 @@
-"""Answers: a result in every form that is asked for, from its quantities, tables and JSON."""
+"""Output forms of every result: text, tables, JSON, data frame, picture and notebook cell."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from pandas import DataFrame
 
-# Rows shown of a long table; JSON has all.
-MOST_ROWS = 40
+# Largest number of rows shown of a long table; JSON has all.
+MAX_ROWS_SHOWN = 40
 
 
 class Table(NamedTuple):
     """Rows of cells under a heading; an empty header leaves the head row out.
 
-    `numeric` sets all cells but the first column's flush right; `marked` are the numbers of the
-    rows that people quote.
+    `numeric` right-aligns all columns except the first; `marked` are the indices of the rows that
+    people quote.
 
     Examples
     --------
@@ -42,7 +42,7 @@ class Table(NamedTuple):
     marked: tuple[int, ...] = ()
 
     def quoted(self) -> Table:
-        """Table of the rows that people quote, for a first screen.
+        """Give the table of the marked rows alone, for the first screen.
 
         Examples
         --------
@@ -54,7 +54,7 @@ class Table(NamedTuple):
 
 
 class Row(NamedTuple):
-    """A label and its values, one a result; `quoted` rows stand on the first screen."""
+    """A label and its values, one per result; `quoted` rows appear on the first screen."""
 
     label: str
     values: Sequence[object]
@@ -68,21 +68,21 @@ def labelled(
     note: str = "",
     numeric: bool = False,
 ) -> Table:
-    """Make a table of labelled rows with one column a result.
+    """Make a table of labelled rows with one column per result.
 
     Parameters
     ----------
     title : str
         Heading.
     names : sequence of str
-        One a result.
+        Names of the results, the column headers.
     rows : sequence of Row or (str, sequence)
-        Label and values: numbers with errors, statuses, words. A quoted row of which no value is
-        determined is not marked.
+        Label and values: numbers with errors, statuses, words. A quoted row without a determined
+        value is not marked.
     note : str
         A sentence between heading and table.
     numeric : bool
-        Whether cells are set flush right.
+        Right-align the cells.
 
     Returns
     -------
@@ -90,12 +90,14 @@ def labelled(
     """
     rows = [Row(*row) for row in rows]
     cells = [[row.label, *map(cell, row.values)] for row in rows]
-    marked = tuple(i for i, row in enumerate(rows) if row.quoted and any(map(_known, row.values)))
+    marked = tuple(
+        i for i, row in enumerate(rows) if row.quoted and any(map(_has_value, row.values))
+    )
     return Table(title, ["", *names] if any(names) else [], cells, note, numeric, marked)
 
 
 def determined(rows: Sequence[Row]) -> list[Row]:
-    """Leave out rows of which no value is determined.
+    """Leave out rows without a determined value.
 
     Examples
     --------
@@ -103,15 +105,15 @@ def determined(rows: Sequence[Row]) -> list[Row]:
     >>> [row.label for row in determined([Row("beta", [open_one]), Row("size", [known])])]
     ['size']
     """
-    return [row for row in rows if any(map(_known, row.values))]
+    return [row for row in rows if any(map(_has_value, row.values))]
 
 
-def _known(value: object) -> bool:
+def _has_value(value: object) -> bool:
     return value.determined if isinstance(value, Quantity) else value is not None
 
 
 def cell(value: object) -> str:
-    """Write a value for a person to read.
+    """Write a value as the text of a table cell.
 
     Examples
     --------
@@ -134,23 +136,23 @@ def cell(value: object) -> str:
 
 
 def text_of(table: Table) -> str:
-    """Lay a table out for a terminal, columns aligned."""
+    """Format a table for a terminal, with aligned columns."""
     rows = [list(row) for row in (*([table.header] if table.header else []), *table.rows)]
     columns = max((len(row) for row in rows), default=0)
     rows = [row + [""] * (columns - len(row)) for row in rows]
     widths = [max(len(row[i]) for row in rows) for i in range(columns)]
     lines = [line for line in (table.title, table.note) if line]
     for row in rows:
-        turned = [
+        aligned = [
             c.rjust(w) if table.numeric and i else c.ljust(w)
             for i, (c, w) in enumerate(zip(row, widths, strict=True))
         ]
-        lines.append("  ".join(turned).rstrip())
+        lines.append("  ".join(aligned).rstrip())
     return plain("\n".join(lines))
 
 
 def html_of(table: Table) -> str:
-    """Lay a table out for a notebook."""
+    """Format a table as HTML for a notebook."""
     side = "right" if table.numeric else "left"
 
     def row_of(cells: Sequence[str], kind: str) -> str:
@@ -166,10 +168,9 @@ def html_of(table: Table) -> str:
 
 
 def json_of(value: Any) -> Any:
-    """Turn a result into what JSON holds; numbers that are not finite are null.
+    """Convert a result to dictionaries, lists and numbers for JSON; non-finite numbers become null.
 
-    A value with a ``to_json`` method says itself what it gives; other dataclasses and named
-    tuples give their fields.
+    A ``to_json`` method takes precedence; other dataclasses and named tuples give their fields.
 
     Examples
     --------
@@ -206,17 +207,19 @@ def plain_name(name: str) -> str:
 
 
 C = TypeVar("C", bound=type)
-# Letters of a text inside another value, and entries of a collection, that are displayed.
-LONGEST, MOST = 60, 6
-# Numbers of an array that are displayed, and letters of a line.
-FEW, WIDTH = 4, 150
+# Limits of one-line representations: characters of a nested text, entries of a collection, numbers
+# of an array, characters of the line. Chosen to fit two lines of a terminal.
+MAX_TEXT = 60
+MAX_ENTRIES = 6
+MAX_NUMBERS = 4
+LINE_WIDTH = 150
 
 
 def shown(cls: C) -> C:
-    """Have a class show itself in one line, and in a notebook as tables.
+    """Give a class a one-line ``repr`` and a notebook representation as tables.
 
-    A property ``headline`` is its one line, a method ``tables`` its tables; without them it is
-    its fields, arrays by their shape and range.
+    They use its property ``headline`` and its method ``tables``, or else its fields, with arrays
+    shown by shape and range.
 
     Examples
     --------
@@ -228,14 +231,14 @@ def shown(cls: C) -> C:
     >>> Readings("fill", [3.0, 1.0, 2.0])
     <Readings name=fill, current=(3, 1, 2)>
     """
-    cls.__repr__ = _line
+    cls.__repr__ = _repr_line
     if not hasattr(cls, "_repr_html_"):
-        cls._repr_html_ = _html
+        cls._repr_html_ = _repr_tables
     return cls
 
 
 def brief(value: Any) -> str:
-    """Say in a few words what a value is, whatever its size.
+    """Describe a value of any size in a few words.
 
     Examples
     --------
@@ -252,29 +255,29 @@ def brief(value: Any) -> str:
             return str(value.value)
         case str():
             words = " ".join(value.split())
-            return words if len(words) <= LONGEST else words[: LONGEST - 4] + " ..."
+            return words if len(words) <= MAX_TEXT else words[: MAX_TEXT - 4] + " ..."
         case Mapping():
-            return f"{{{_few([f'{name}: {brief(one)}' for name, one in value.items()])}}}"
+            return f"{{{_listed([f'{name}: {brief(one)}' for name, one in value.items()])}}}"
         case tuple() | list() if not hasattr(value, "_fields"):
-            return f"({_few([brief(one) for one in value])})"
+            return f"({_listed([brief(one) for one in value])})"
     if hasattr(value, "shape"):
-        return _array(value)
+        return _array_words(value)
     if (headline := getattr(value, "headline", None)) is not None:
         return brief(headline)
     if not _is_record(value):
         return cell(value)
-    name, words = type(value).__name__, ", ".join(words for _, words in _fields(value))
-    return f"{name}({words})" if len(words) <= LONGEST else name
+    name, words = type(value).__name__, ", ".join(words for _, words in _field_words(value))
+    return f"{name}({words})" if len(words) <= MAX_TEXT else name
 
 
-def _few(words: list[str]) -> str:
-    if len(words) > MOST:
+def _listed(words: list[str]) -> str:
+    if len(words) > MAX_ENTRIES:
         return f"{len(words)} of {words[0]}, ..."
     return ", ".join(words)
 
 
-def _array(values: Any) -> str:
-    """The number, or the shape and range; what JAX only traces has no numbers yet."""
+def _array_words(values: Any) -> str:
+    """Describe an array by its numbers or its shape and range; a traced array has no numbers."""
     import numpy as np
 
     try:
@@ -283,7 +286,7 @@ def _array(values: Any) -> str:
         return "traced"
     if numbers.ndim == 0:
         return f"{numbers:.6g}" if numbers.dtype.kind == "f" else str(numbers)
-    if numbers.size <= FEW and numbers.ndim == 1:
+    if numbers.size <= MAX_NUMBERS and numbers.ndim == 1:
         return f"({', '.join(map(brief, numbers.tolist()))})"
     shape = " x ".join(map(str, numbers.shape))
     if numbers.dtype.kind not in "fiu" or not np.isfinite(numbers).any():
@@ -296,37 +299,37 @@ def _is_record(value: Any) -> bool:
     return dataclasses.is_dataclass(value) or hasattr(value, "_fields")
 
 
-def _fields(value: Any) -> list[list[str]]:
+def _field_words(value: Any) -> list[list[str]]:
     if hasattr(value, "_fields"):
         return [[name, brief(one)] for name, one in value._asdict().items()]
     return [[f.name, brief(getattr(value, f.name))] for f in dataclasses.fields(value)]
 
 
-def _line(value: Any) -> str:
+def _repr_line(value: Any) -> str:
     words = getattr(value, "headline", None)
-    words = ", ".join("=".join(field) for field in _fields(value)) if words is None else words
+    words = ", ".join("=".join(field) for field in _field_words(value)) if words is None else words
     words = " ".join(words.split())
-    words = words if len(words) <= WIDTH else words[: WIDTH - 4] + " ..."
+    words = words if len(words) <= LINE_WIDTH else words[: LINE_WIDTH - 4] + " ..."
     return f"<{type(value).__name__} {words}>"
 
 
-def _html(value: Any) -> str:
+def _repr_tables(value: Any) -> str:
     if not hasattr(value, "tables"):
-        return html_of(Table(type(value).__name__, [], _fields(value)))
+        return html_of(Table(type(value).__name__, [], _field_words(value)))
     said = getattr(value, "message", "")
     return "".join(map(html_of, value.tables())) + (f"<p>{escape(said)}</p>" if said else "")
 
 
-# Words that name an entry of a list in JSON, where it has one of them.
-NAMES = ("name", "plane", "output", "record")
+# Keys of a JSON object that can name it within a list, in order of preference.
+ENTRY_NAMES = ("name", "plane", "output", "record")
 
 
 def answer(cls: C) -> C:
-    """Have a result answer in every form; what a class says itself is left as it is.
+    """Add the output methods of `METHODS` to a result; methods of the class itself are kept.
 
-    A result has a ``headline``, a ``status``, a ``message`` and ``tables()``, and ``to_json()``
-    gives what the JSON contract wants of it. From these follow its line at a prompt, its page in
-    a notebook, ``print``, ``to_dict``, ``to_frame``, ``plot``, and quantities by their names.
+    A result has a ``headline``, a ``status``, a ``message`` and ``tables()``; ``to_json()`` gives
+    the fields of the JSON contract. From these follow ``repr``, the notebook cell, ``print``,
+    ``to_dict``, ``to_frame``, ``plot``, and quantities by name.
 
     Examples
     --------
@@ -342,14 +345,14 @@ def answer(cls: C) -> C:
     >>> print(found)
     a rod. It was measured once.
     """
-    for name, form in FORMS.items():
+    for name, form in METHODS.items():
         if name not in vars(cls):
             setattr(cls, name, form)
     return shown(cls)
 
 
 def quantities_of(result: Any) -> dict[str, Quantity]:
-    """Find every quantity of a result, by the name it has there or by its path in the JSON.
+    """Find every quantity of a result, by its name in the result or its path in the JSON.
 
     Examples
     --------
@@ -357,10 +360,10 @@ def quantities_of(result: Any) -> dict[str, Quantity]:
     {'screen.beta': <Quantity 1.20 ± 0.10 m>}
     """
     own = getattr(result, "quantities", None)
-    return dict(own) if isinstance(own, Mapping) else dict(_found(json_of(result), ()))
+    return dict(own) if isinstance(own, Mapping) else dict(_find_quantities(json_of(result), ()))
 
 
-def _found(value: Any, path: tuple[str, ...]) -> Iterator[tuple[str, Quantity]]:
+def _find_quantities(value: Any, path: tuple[str, ...]) -> Iterator[tuple[str, Quantity]]:
     match value:
         case {"value": int() | float() as number, "error": error, "unit": str() as unit}:
             ends = value.get("interval_95")
@@ -368,22 +371,22 @@ def _found(value: Any, path: tuple[str, ...]) -> Iterator[tuple[str, Quantity]]:
             yield ".".join(path), Quantity(number, error, unit, value.get("error_raw"), ends)
         case dict():
             for name, one in value.items():
-                yield from _found(one, path if name == "value" else (*path, name))
+                yield from _find_quantities(one, path if name == "value" else (*path, name))
         case list() if value and isinstance(value[0], dict):
             for i, one in enumerate(value):
-                name = next((one[n] for n in NAMES if isinstance(one.get(n), str)), str(i))
-                yield from _found(one, (*path, name))
+                name = next((one[n] for n in ENTRY_NAMES if isinstance(one.get(n), str)), str(i))
+                yield from _find_quantities(one, (*path, name))
 
 
-def _dict(self: Any) -> Any:
-    """Give what ``--json`` prints of it, as Python's dicts, lists and numbers."""
+def _to_dict(self: Any) -> Any:
+    """Give the content of ``--json`` as dictionaries, lists and numbers."""
     return json_of(self)
 
 
-def _frame(self: Any) -> DataFrame:
-    """Give a pandas data frame: one row a quantity, or its first table where it has none.
+def _to_frame(self: Any) -> DataFrame:
+    """Give a pandas data frame with one row per quantity, or the first table if there is none.
 
-    Columns of quantities are value, error, error_raw, low_95, high_95 and unit.
+    The columns are value, error, error_raw, low_95, high_95 and unit.
 
     Raises
     ------
@@ -398,21 +401,21 @@ def _frame(self: Any) -> DataFrame:
     return frame_of(dict(zip(names, columns, strict=True)))
 
 
-def _item(self: Any, name: str) -> Quantity:
-    """Give a quantity by its name."""
+def _getitem(self: Any, name: str) -> Quantity:
+    """Return a quantity by its name."""
     found = quantities_of(self)
     if name not in found:
         raise InputError(f"no quantity '{name}'", nearest(str(name), list(found)))
     return found[name]
 
 
-def _names(self: Any) -> Iterator[str]:
-    """Go through the names of the quantities."""
+def _iter_names(self: Any) -> Iterator[str]:
+    """Iterate over the names of the quantities."""
     return iter(quantities_of(self))
 
 
-def _spoken(self: Any) -> tuple[list[str], Sequence[Table]]:
-    """The verdict and what is odd, line by line, and every table."""
+def _lines_and_tables(self: Any) -> tuple[list[str], Sequence[Table]]:
+    """Return the lines of verdict and notes, and all tables."""
     headline, message = self.headline, getattr(self, "message", "")
     begin = f"{headline}.\n" if "\n" in message else f"{headline}. "
     said = headline if message in ("", headline) else begin + message
@@ -420,40 +423,40 @@ def _spoken(self: Any) -> tuple[list[str], Sequence[Table]]:
     return [*said.split("\n"), *remarks], self.tables() if hasattr(self, "tables") else ()
 
 
-def _text(self: Any) -> str:
-    """Write the verdict, what is odd, and every table."""
+def _str(self: Any) -> str:
+    """Format the verdict, the notes and all tables as text."""
     if not hasattr(self, "headline"):
         return repr(self)
-    lines, tables = _spoken(self)
+    lines, tables = _lines_and_tables(self)
     return "\n\n".join(["\n".join(lines), *map(text_of, tables)])
 
 
-def _page(self: Any) -> str:
-    """Lay out the same for a notebook."""
+def _repr_html(self: Any) -> str:
+    """Format the verdict, the notes and all tables for a notebook."""
     if not hasattr(self, "headline"):
-        return _html(self)
-    lines, tables = _spoken(self)
+        return _repr_tables(self)
+    lines, tables = _lines_and_tables(self)
     return "".join(f"<p>{escape(line)}</p>" for line in lines) + "".join(map(html_of, tables))
 
 
-def _plot(self: Any, **options: Any) -> Figure:
-    """Draw it, as the first picture of its report: a matplotlib Figure."""
+def _first_picture(self: Any, **options: Any) -> Figure:
+    """Draw the first picture of the report as a matplotlib Figure."""
     return import_module("beamfit.figures").picture(self, **options)
 
 
-FORMS = {
-    "__getitem__": _item,
-    "__iter__": _names,
-    "__str__": _text,
-    "_repr_html_": _page,
-    "plot": _plot,
-    "to_dict": _dict,
-    "to_frame": _frame,
+METHODS = {
+    "__getitem__": _getitem,
+    "__iter__": _iter_names,
+    "__str__": _str,
+    "_repr_html_": _repr_html,
+    "plot": _first_picture,
+    "to_dict": _to_dict,
+    "to_frame": _to_frame,
 }
 
 
 def frame_of(columns: Mapping[str, Sequence[Any]], index: Sequence[str] = ()) -> DataFrame:
-    """Make a data frame of columns, some of them its index.
+    """Make a data frame from columns, some of which form its index.
 
     Raises
     ------
@@ -470,7 +473,7 @@ def frame_of(columns: Mapping[str, Sequence[Any]], index: Sequence[str] = ()) ->
 
 
 def quantity_frame(rows: Mapping[tuple[str, ...], Quantity], names: Sequence[str]) -> DataFrame:
-    """Make a data frame of quantities: value, errors, ends of the 95 % interval, and unit."""
+    """Make a data frame of quantities with value, errors, ends of the 95 % interval, and unit."""
     keys, found = list(rows), list(rows.values())
     ends = [q.interval_95 or (None, None) for q in found]
     columns = {name: [key[i] for key in keys] for i, name in enumerate(names)}

@@ -1,4 +1,4 @@
-"""Arrays of NumPy or JAX behind one type, and dataclasses that JAX walks."""
+"""Arrays of NumPy or JAX, and dataclasses registered as JAX pytrees."""
 
 from __future__ import annotations
 
@@ -16,17 +16,19 @@ from jax.typing import ArrayLike
 from beamfit.answer import shown
 
 C = TypeVar("C", bound=type)
-# Shortest padded record; lengths are powers of two, so that records share compiled code.
-SHORTEST = 8
+# Smallest padded length of a record; lengths are powers of two, so that records share compiled
+# code.
+MIN_PADDED_LENGTH = 8
 
 
 def registered(cls: C, static: Sequence[str]) -> C:
-    """Have JAX walk a dataclass: `static` fields are structure (hashable), the rest data.
+    """Register a dataclass as a pytree: `static` fields are structure (hashable), the rest data.
 
-    `jax.tree_util.register_dataclass` will not do: in JAX 0.10 the structures of two classes with
-    fields of the same names are equal and differ in their hash alone, so that now and then one
-    class runs the program compiled for the other: settings in T/m were taken for kG. Rebuilding
-    does not run ``__post_init__``, so a class can check its input and still hold traced arrays.
+    `jax.tree_util.register_dataclass` is not used, because in JAX 0.10 the structures of two
+    classes with equal field names compare equal and differ only in their hash. Occasionally one
+    class then runs the program compiled for the other: settings in T/m were taken for kG.
+    Unflattening does not run ``__post_init__``, so a class can check its input and still hold
+    traced arrays.
 
     Examples
     --------
@@ -42,7 +44,8 @@ def registered(cls: C, static: Sequence[str]) -> C:
     data = [name for name in names if name not in static]
 
     def flatten(value):
-        # A line has hundreds of elements: reading the dictionary is a third of the time.
+        # Reading the dictionary takes a third of the time of attribute access; a line has hundreds
+        # of elements.
         own = vars(value)
         return [own[name] for name in data], tuple([own[name] for name in static])
 
@@ -63,7 +66,7 @@ def registered(cls: C, static: Sequence[str]) -> C:
 
 @dataclass_transform(frozen_default=True)
 def value(*structure: str) -> Callable[[C], C]:
-    """Make a class a frozen dataclass whose fields are JAX's data, but for those of structure.
+    """Make a class a frozen dataclass and pytree; the fields in `structure` are static.
 
     Examples
     --------
@@ -82,7 +85,7 @@ def value(*structure: str) -> Callable[[C], C]:
 
 
 def array_module(*values: Any) -> Any:
-    """JAX's numpy where a value is JAX's, else numpy: plain numbers need no compiling.
+    """Return `jax.numpy` if a value is a JAX array, otherwise `numpy`, which compiles nothing.
 
     Examples
     --------
@@ -93,7 +96,7 @@ def array_module(*values: Any) -> Any:
 
 
 def floats(number: ArrayLike) -> Array:
-    """Return an array of floats, numpy's or JAX's as the number is.
+    """Convert to an array of floats, of NumPy or JAX like the argument.
 
     Examples
     --------
@@ -104,11 +107,11 @@ def floats(number: ArrayLike) -> Array:
 
 
 def padded_length(n: int) -> int:
-    """The length to pad a record of n values to, so that a growing one is not compiled anew.
+    """Return the padded length of a record of n values; a growing record is rarely recompiled.
 
     Examples
     --------
     >>> [padded_length(n) for n in (3, 8, 9, 100)]
     [8, 8, 16, 128]
     """
-    return max(SHORTEST, 1 << max(n - 1, 0).bit_length())
+    return max(MIN_PADDED_LENGTH, 1 << max(n - 1, 0).bit_length())

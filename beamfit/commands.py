@@ -1,4 +1,4 @@
-"""Public functions that take files: paths in calls, and commands of more than one step."""
+"""Public functions of commands with several steps, and the reading of paths in calls."""
 
 from __future__ import annotations
 
@@ -32,9 +32,9 @@ if TYPE_CHECKING:
 F = TypeVar("F", bound=Callable[..., Any])
 Limits = Mapping[str, tuple[float, float]]
 Steps = Sequence[tuple[str, float, float]]
-# Models of all outputs together; the others are of one output at a time.
+# Models of all outputs together; the other models have one output each.
 STATES, FED_BATCH = "state-space", "fed-batch"
-# Arguments that may be files, and what reads them.
+# Arguments that may be paths, and the functions that read them.
 READERS = {
     "record": "beamfit.io.decay_record:read_decay_record",
     "records": "beamfit.io.decay_record:read_decay_record",
@@ -48,12 +48,12 @@ READERS = {
 
 
 def is_path(value: object) -> bool:
-    """Tell a path from what is read from it."""
+    """Return True for a path, False for an object that was already read."""
     return isinstance(value, str | PathLike)
 
 
-def opening(function: F, name: str) -> F:
-    """Have a function take paths in the place of a scan, a line, a record, runs or a ring.
+def with_paths(function: F, name: str) -> F:
+    """Make a function accept paths in place of a scan, a line, a record, runs or a ring.
 
     Parameters
     ----------
@@ -66,12 +66,12 @@ def opening(function: F, name: str) -> F:
     Returns
     -------
     callable
-        The same function; what is no path it takes as before.
+        The same function, which reads arguments that are paths.
 
     Examples
     --------
     >>> def rows(record): return len(record.time)
-    >>> opening(rows, "rows")("measurements/aps_1999_decay.csv")
+    >>> with_paths(rows, "rows")("measurements/aps_1999_decay.csv")
     27
     """
     given = signature(function)
@@ -79,7 +79,7 @@ def opening(function: F, name: str) -> F:
     @wraps(function)
     def opened(*args: Any, **named: Any) -> Any:
         bound = given.bind(*args, **named)
-        bound.arguments |= _read(bound.arguments)
+        bound.arguments |= _read_paths(bound.arguments)
         return function(*bound.args, **bound.kwargs)
 
     opened.__module__, opened.__name__, opened.__qualname__ = "beamfit", name, name
@@ -87,7 +87,7 @@ def opening(function: F, name: str) -> F:
 
 
 def machine_of(path: str | PathLike[str]) -> Any:
-    """Read a ring and its usual operation from one file."""
+    """Read a ring and its operating point from one file."""
     from beamfit.io.ring import read_operation, read_ring
 
     ring, operation = read_ring(path), read_operation(path)
@@ -97,10 +97,13 @@ def machine_of(path: str | PathLike[str]) -> Any:
     return Machine(ring, operation)
 
 
-def _read(arguments: Mapping[str, Any]) -> dict[str, Any]:
+def _read_paths(arguments: Mapping[str, Any]) -> dict[str, Any]:
     """Read the arguments that are paths."""
-    given = arguments.get("scan"), arguments.get("line")
-    found = _tuning(*given, arguments["knobs"]) if "knobs" in arguments else _scan_and_line(*given)
+    scan, line = arguments.get("scan"), arguments.get("line")
+    if "knobs" in arguments:
+        found = _knobs_and_line(scan, line, arguments["knobs"])
+    else:
+        found = _scan_and_line(scan, line)
     for name in arguments.keys() & READERS.keys():
         value, read = arguments[name], resolve_name(READERS[name])
         if is_path(value):
@@ -111,9 +114,9 @@ def _read(arguments: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _scan_and_line(scan: Any, line: Any) -> dict[str, Any]:
-    """A scan and its line, read together where both are files: each is checked against the other.
+    """Read a scan and its line; if both are files, each is checked against the other.
 
-    A file of emittance_gui, or rows with matrices of their own, need no lattice beside them.
+    A file of emittance_gui, or rows with their own matrices, need no lattice.
     """
     if not (is_path(scan) or is_path(line)):
         return {}
@@ -128,8 +131,8 @@ def _scan_and_line(scan: Any, line: Any) -> dict[str, Any]:
     return {"line": load_lattice(line) if scan is None else build_line(lattice_of(scan, line))}
 
 
-def _tuning(scan: Any, line: Any, knobs: Mapping[str, Any]) -> dict[str, Any]:
-    """A table of knobs, and the line that it is checked against without them."""
+def _knobs_and_line(scan: Any, line: Any, knobs: Mapping[str, Any]) -> dict[str, Any]:
+    """Read a table of knobs and its line, and check the other settings against the line."""
     found = {}
     if is_path(scan):
         from beamfit.io.scan import read_tuning_scan
@@ -170,10 +173,10 @@ def identify(
     order : int, optional
         States of a state space; chosen by an information criterion if None.
     delay : float, optional
-        Samples by which outputs follow late, whole ones for a state space; fitted if None. Below 0
-        where the clocks of inputs and outputs differ.
+        Delay of the outputs in samples, a whole number for a state space; fitted if None. Negative
+        if the clocks of inputs and outputs differ.
     offset : bool
-        The output at rest is estimated; else it is 0.
+        Estimate the output at rest; otherwise it is 0.
     hidden, seed : int
         Hidden nodes of a network, seed of its weights.
     held : sequence of Run or path
@@ -182,12 +185,12 @@ def identify(
     Returns
     -------
     tuple
-        A fit for each output; one of all outputs for a state space or a fed-batch process.
+        A fit for each output; one fit of all outputs for a state space or a fed-batch process.
 
     Raises
     ------
     InputError
-        If runs do not fit together, or an option does not belong to the model.
+        If the runs do not match, or an option does not belong to the model.
 
     Examples
     --------
@@ -222,12 +225,12 @@ def check_model(
     delay: float | None = None,
     offset: bool = True,
 ) -> None:
-    """Refuse options that do not belong to a model, in the words of the command line.
+    """Refuse options that do not belong to a model, named as on the command line.
 
     Raises
     ------
     InputError
-        If one does not.
+        If an option does not belong to the model.
     """
     if order is not None and model != STATES:
         raise InputError(f"--order {order} with --model {model}", f"--model {STATES}")
@@ -263,11 +266,11 @@ def control(
     runs : Run, path, or sequence of them
         Records with the same inputs and outputs.
     targets, disturbances : sequence of (str, float, float)
-        Output, value, and the time in s from which it is wanted, or added.
+        Output, value, and the time in s from which it is the target, or is added.
     limits : mapping of str to (float, float), optional
-        Of inputs, which keep to the range of the runs otherwise, and of outputs.
+        Limits of inputs (default: the range of the runs) and of outputs.
     rates : mapping of str to float, optional
-        Largest change of an input in a second.
+        Largest change of an input per second.
     horizon, every, smooth
         As for `beamfit.dynamics.control.controller`.
     model, map, delay, offset, hidden
@@ -275,7 +278,7 @@ def control(
     duration : float, optional
         Time simulated, s; four horizons after the last change if None.
     seed : int
-        Of the networks and the noise.
+        Seed of the networks and the noise.
 
     Returns
     -------
@@ -285,7 +288,7 @@ def control(
     Raises
     ------
     InputError
-        If a name is neither input nor output, or as `identify` and `controller`.
+        If a name is neither input nor output, and as for `identify` and `controller`.
 
     Examples
     --------
@@ -296,10 +299,10 @@ def control(
     """
     runs = [runs] if not isinstance(runs, list | tuple) else runs
     limits, inputs, outputs = dict(limits or {}), list(runs[0].inputs), list(runs[0].outputs)
-    _check("limit", limits, inputs + outputs)
-    _check("rate", rates or (), inputs)
-    _check("set", [t[0] for t in targets], outputs)
-    _check("disturb", [t[0] for t in disturbances], outputs)
+    _check_names("limit", limits, inputs + outputs)
+    _check_names("rate", rates or (), inputs)
+    _check_names("set", [t[0] for t in targets], outputs)
+    _check_names("disturb", [t[0] for t in disturbances], outputs)
 
     from beamfit.dynamics.control import controller, simulate_loop
     from beamfit.dynamics.fit import identify as respond
@@ -316,11 +319,12 @@ def control(
         every=every,
         smooth=smooth,
     )
-    told = {"disturbances": disturbances, "duration": duration, "seed": seed}
-    return simulate_loop(fits, made, targets, **told)
+    return simulate_loop(
+        fits, made, targets, disturbances=disturbances, duration=duration, seed=seed
+    )
 
 
-def _check(option: str, names: Iterable[str], known: list[str]) -> None:
+def _check_names(option: str, names: Iterable[str], known: list[str]) -> None:
     for name in names:
         if name not in known:
             raise InputError(f"--{option} of '{name}'", nearest(name, known))
@@ -335,20 +339,20 @@ def solve(
     derivatives: Iterable[str] = (),
     **options: Any,
 ) -> ProblemSolution | Computed:
-    """Solve a formulation, or compute its outputs where it has no objective.
+    """Solve a formulation, or evaluate its outputs if it has no objective.
 
     Parameters
     ----------
     document : Document or path
-        Of `read_formulation`, or its file; a file finds its tables of data beside it.
+        Result of `read_formulation`, or a file; data tables are searched next to the file.
     data : mapping of str to array, optional
-        Tables by name; of a file also paths, in the place of those that it names.
+        Tables by name; for a file also paths, which replace those named in it.
     starts : int
-        Searches: 1 from the document's seeds, more also from random numbers.
+        Number of searches: the first from the seeds of the document, others from random points.
     values : mapping of str to sequence of float, optional
-        Inputs; of a variable where the search starts.
+        Values of inputs; for a variable the start of the search.
     derivatives : iterable of str
-        Gains to give too, such as "dy/dx".
+        Gains to calculate, such as "dy/dx".
     **options
         ``solver``, ``tolerance`` and ``seconds`` of `beamfit.language.solution.solve_document`.
 
@@ -386,10 +390,10 @@ def scan_machine(
     journal: str | None = None,
     goal: float | None = None,
     points: int | None = None,
-    tell: Callable[[ScanProgress], None] = lambda told: None,
+    tell: Callable[[ScanProgress], None] = lambda progress: None,
     note: Callable[[str], None] = lambda text: None,
 ) -> Outcome:
-    """Scan a running machine's quadrupoles, and put the magnets back whatever ends it.
+    """Scan the quadrupoles of a running machine, and restore the magnets in every case.
 
     Parameters
     ----------
@@ -398,23 +402,23 @@ def scan_machine(
     save : str or path
         File of the scan, written after every point; it must not exist.
     journal : str, optional
-        File with what is to be restored; beside the machine's if None.
+        File with the settings to restore; next to the machine file if None.
     goal : float, optional
-        Relative error of the emittances at which to stop; the machine file's if None.
+        Relative error of the emittances at which to stop; from the machine file if None.
     points : int, optional
-        Most settings; the machine file's if None.
+        Largest number of settings; from the machine file if None.
     tell, note : callable
-        Told how the scan stands after each point, and what is odd about the machine.
+        Called with the progress after each point, and with notes about the machine.
 
     Returns
     -------
     Outcome
-        Points, fit, what ended it, and what went wrong.
+        Points, fit, the reason for the end, and errors.
 
     Raises
     ------
     InputError
-        If nothing was begun: the file exists, a variable does not answer, a journal is left.
+        If the scan could not begin: the file exists, a variable does not answer, a journal is left.
 
     Examples
     --------
@@ -428,17 +432,17 @@ def scan_machine(
     from beamfit.live.restore import journal_of
     from beamfit.writing import check_place
 
-    wanted = {k: v for k, v in {"goal": goal, "points": points}.items() if v}
-    told = replace(read_scan_machine(machine) if is_path(machine) else machine, **wanted)
-    place, target = journal_of(told, journal), Path(save)
-    for each in (target, place):
-        check_place(each)
+    options = {k: v for k, v in {"goal": goal, "points": points}.items() if v}
+    plan = replace(read_scan_machine(machine) if is_path(machine) else machine, **options)
+    journal_path, target = journal_of(plan, journal), Path(save)
+    for path in (target, journal_path):
+        check_place(path)
     if target.exists():
         raise InputError("a file that exists", "another name; no scan is written over", target)
-    return run(_scanned(told, place, target, tell, note))
+    return run(_scan(plan, journal_path, target, tell, note))
 
 
-async def _scanned(
+async def _scan(
     machine: ScanMachine,
     journal: Path,
     out: Path,
@@ -466,23 +470,23 @@ def watch(
     machine: WatchMachine | str | PathLike[str],
     seconds: float | None = None,
     *,
-    show: Callable[[WatchView], None] = lambda told: None,
+    show: Callable[[WatchView], None] = lambda view: None,
 ) -> WatchView:
-    """Watch the lifetime of a stored beam; nothing is written to the machine.
+    """Follow the lifetime of a stored beam; nothing is written to the machine.
 
     Parameters
     ----------
     machine : WatchMachine or path
         The TOML file of docs/live.md, read or not.
     seconds : float, optional
-        How long; until Ctrl-C if None.
+        Duration; until Ctrl-C if None.
     show : callable
-        Given what is known, every second.
+        Called every second with the present view.
 
     Returns
     -------
     WatchView
-        What is known at the end.
+        View at the end.
 
     Raises
     ------
@@ -501,17 +505,17 @@ def watch(
     from beamfit.live.watch import connect
     from beamfit.live.watch import watch as follow
 
-    told = read_watch_machine(machine) if is_path(machine) else machine
+    plan = read_watch_machine(machine) if is_path(machine) else machine
 
-    async def followed() -> tuple[WatchView, int]:
-        await connect(told)
-        return await follow(told, watch_plan(told), show, seconds)
+    async def connect_and_follow() -> tuple[WatchView, int]:
+        await connect(plan)
+        return await follow(plan, watch_plan(plan), show, seconds)
 
-    return run(followed())[0]
+    return run(connect_and_follow())[0]
 
 
 def watch_plan(machine: WatchMachine) -> Plan:
-    """Window, interval and ring of a watch."""
+    """Make the plan of a watch: window, interval, ring and reference current."""
     from beamfit.lifetime.watch import Plan
 
     ring = machine.ring and machine_of(machine.ring)

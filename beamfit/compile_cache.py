@@ -1,7 +1,6 @@
-"""Compiled code kept from one process to the next: compiling is most of a first answer's time.
+"""Settings of JAX, and a cache of compiled code, since compiling dominates the first answer's time.
 
-Every package that computes with JAX calls `prepare_jax` when it is imported. This module itself
-imports no JAX.
+Every package that uses JAX calls `prepare_jax` on import. This module itself does not import JAX.
 """
 
 from __future__ import annotations
@@ -10,38 +9,39 @@ import os
 import warnings
 from pathlib import Path
 
-# JAX's own names; in the environment they have capitals. Everything is kept: a command compiles
-# hundreds of small functions in milliseconds each.
-FOLDER = "jax_compilation_cache_dir"
-KEEP = {
-    # name: (JAX's default, ours)
+# Option names of JAX; the environment variables have capitals. All code is cached, because a
+# command compiles hundreds of small functions in milliseconds each.
+CACHE_FOLDER = "jax_compilation_cache_dir"
+SETTINGS = {
+    # name: (default of JAX, setting of beamfit)
     "jax_persistent_cache_min_compile_time_secs": (1.0, 0.0),
     "jax_persistent_cache_min_entry_size_bytes": (0, -1),
-    # Small programs whose results are waited for: handing them to a thread takes a tenth of a fit.
+    # Synchronous calls: handing small programs to a thread takes a tenth of the time of a fit.
     "jax_cpu_enable_async_dispatch": (True, False),
 }
 
-# XLA's older way to emit fused loops compiles in half the time, and what it makes is as quick but
-# for thousands of searches in one call, 15 % slower (docs/design.md). XLA ends a process that names
-# a flag it does not know: only where it was tried.
-QUICK, TRIED = "xla_cpu_use_fusion_emitters", "0.10."
+# XLA's older emitter of fused loops compiles in half the time. Its code is equally fast, except 15
+# % slower for thousands of searches in one call (docs/design.md). XLA aborts on an unknown flag, so
+# the flag is set only for the versions of JAX with which it was tested.
+FUSION_FLAG = "xla_cpu_use_fusion_emitters"
+TESTED_JAX = "0.10."
 
-# For `jax.jit` of a program that runs a few times on small arrays, where it is no slower: it is
-# compiled in half the time. No other compiled function can call such a one.
+# Compiler options of `jax.jit` for a program that runs a few times on small arrays: compiled in
+# half the time, and not slower there. No other compiled function can call such a program.
 SELDOM = {"xla_backend_optimization_level": 0}
 
-# For a loop over thousands of readings: optimised, whatever XLA_FLAGS say of all other programs.
-LONG = {"xla_backend_optimization_level": 3}
+# Compiler options for a loop over thousands of readings: optimised, whatever XLA_FLAGS say.
+OPTIMISED = {"xla_backend_optimization_level": 3}
 
 
 def prepare_jax() -> None:
-    """Import JAX with 64 bits, a compile cache, quick compilation and calls that wait.
+    """Import JAX with 64 bits, a compile cache, fast compilation and synchronous calls.
 
-    All of it by JAX's public settings, for the whole process. The cache is
-    ``$XDG_CACHE_HOME/beamfit/jax`` (or ``~/.cache/…``); where nobody can write there, or others
-    can, code is compiled anew. So is what is damaged, with JAX's warning until the folder is
-    emptied. What the user has set, in the environment or in ``jax.config``, stands, but for
-    64 bits. Calling it again does nothing.
+    Uses public settings of JAX, for the whole process. The cache is ``$XDG_CACHE_HOME/beamfit/jax``
+    (or ``~/.cache/…``). Without a writable folder, or if others can write to it, code is compiled
+    each time. Damaged code is recompiled, with a warning of JAX until the folder is emptied.
+    Settings of the user, in the environment or in ``jax.config``, take precedence, except for 64
+    bits. Further calls do nothing.
 
     Examples
     --------
@@ -53,23 +53,23 @@ def prepare_jax() -> None:
     import jax
 
     flags = os.environ.get("XLA_FLAGS", "")
-    if jax.__version__.startswith(TRIED) and QUICK not in flags:
-        os.environ["XLA_FLAGS"] = f"{flags} --{QUICK}=false".strip()
-    # Emittances are differences of products of order 1e-8: single precision has no digits left.
+    if jax.__version__.startswith(TESTED_JAX) and FUSION_FLAG not in flags:
+        os.environ["XLA_FLAGS"] = f"{flags} --{FUSION_FLAG}=false".strip()
+    # Emittances are differences of products of order 1e-8: single precision loses all digits.
     jax.config.update("jax_enable_x64", True)
-    for name, (usual, ours) in KEEP.items():
-        if name.upper() not in os.environ and jax.config.values[name] == usual:
+    for name, (default, ours) in SETTINGS.items():
+        if name.upper() not in os.environ and jax.config.values[name] == default:
             jax.config.update(name, ours)
-    if FOLDER.upper() not in os.environ and jax.config.jax_compilation_cache_dir is None:
+    if CACHE_FOLDER.upper() not in os.environ and jax.config.jax_compilation_cache_dir is None:
         place = own_folder()
         code = None if place is None else Path(place, "jax")
-        if code is not None:  # apart from locks of magnets, so that it can be emptied
+        if code is not None:  # a subfolder that can be emptied without the locks of magnets
             code.mkdir(mode=0o700, exist_ok=True)
-        jax.config.update(FOLDER, None if code is None else str(code))
+        jax.config.update(CACHE_FOLDER, None if code is None else str(code))
 
 
 def own_folder() -> str | None:
-    """Cache folder of this user alone, or None; code compiled into it is executed.
+    """Return the private cache folder of the user, or None; its content is executed as code.
 
     Examples
     --------

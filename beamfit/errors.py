@@ -1,4 +1,4 @@
-"""Input that cannot be used, and verdicts: statuses and rules, each with its sentence."""
+"""The exception for unusable input, and verdicts: statuses, findings and rules."""
 
 from __future__ import annotations
 
@@ -11,23 +11,26 @@ from enum import StrEnum
 from os import PathLike
 from typing import Any, NamedTuple, TypeVar
 
-# What no person wrote as a word: of a damaged file, say. Its beginning tells enough.
-ENDLESS = re.compile(r"(\S{60})\S{60,}")
+# A word of 120 or more characters, for example from a damaged file; only its beginning is shown.
+LONG_WORD = re.compile(r"(\S{60})\S{60,}")
 
-# Controls but for tab and line feed, letters that turn the direction, bytes that are not UTF-8.
-UNSHOWN = re.compile(
+# Control characters except tab and line feed, characters that change the writing direction, and
+# bytes that are not UTF-8.
+UNPRINTABLE = re.compile(
     "[\0-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]"
 )
-# Letters of a message (four lines of a terminal), and of the end of a path shown in it.
-LONGEST, LONGEST_PATH = 390, 120
+# Longest message in characters: four lines of a terminal.
+MAX_MESSAGE = 390
+# Longest part of a path, or of a column name, shown in a message.
+MAX_PATH = 120
 
 
 @dataclass(eq=False)
 class InputError(ValueError):
-    """Input that cannot be used: where it is, what was found, what was expected.
+    """Unusable input: its place, what was found, and what was expected.
 
-    Only unusable input raises in beamfit; a fit that cannot be trusted is a value with a
-    status. The command line prints this on one line and exits with status 2.
+    Only unusable input raises in beamfit; a fit that cannot be trusted is a result with a
+    status. The command line prints this error on one line and exits with status 2.
 
     Parameters
     ----------
@@ -40,7 +43,8 @@ class InputError(ValueError):
     line : int, optional
         Line in the file, counted from 1.
     column : str or int, optional
-        The column's name, or the key's in a TOML file; in a text the place in its line, from 1.
+        Name of the column, or of the key in a TOML file; an integer is the position in the line,
+        counted from 1.
 
     Examples
     --------
@@ -56,14 +60,14 @@ class InputError(ValueError):
 
     def __str__(self) -> str:
         path = "" if self.path is None else plain(str(self.path))
-        place = path if len(path) <= LONGEST_PATH else "..." + path[-LONGEST_PATH:]
+        place = path if len(path) <= MAX_PATH else "..." + path[-MAX_PATH:]
         place += "" if self.line is None else f":{self.line}"
         named = isinstance(self.column, str)
         place += f":{self.column}" if place and self.column is not None and not named else ""
         place += ": " if place else ""
-        said = f"column '{short(self.column, LONGEST_PATH)}': " if named else ""
-        said, found, expected = (_worded(part) for part in (said, self.found, self.expected))
-        room = LONGEST - len(f"{place}{said} ; expected ")
+        said = f"column '{short(self.column, MAX_PATH)}': " if named else ""
+        said, found, expected = (_clean(part) for part in (said, self.found, self.expected))
+        room = MAX_MESSAGE - len(f"{place}{said} ; expected ")
         found = short(found, max(room // 3, room - len(expected)))
         expected = short(expected, room - len(found))
         return " ".join(f"{place}{said} {found}; expected {expected}".split())
@@ -71,7 +75,7 @@ class InputError(ValueError):
 
 @contextmanager
 def located(path: str | PathLike[str] | None, line: int | None = None) -> Iterator[None]:
-    """Name a file, and a line, in what is raised here by code that knows of none.
+    """Add a file and a line to an `InputError` raised inside the context without them.
 
     Examples
     --------
@@ -88,12 +92,12 @@ def located(path: str | PathLike[str] | None, line: int | None = None) -> Iterat
         raise
 
 
-def _worded(text: str) -> str:
-    return ENDLESS.sub(r"\1...", plain(" ".join(text.split())))
+def _clean(text: str) -> str:
+    return LONG_WORD.sub(r"\1...", plain(" ".join(text.split())))
 
 
 def short(text: str, most: int) -> str:
-    """Leave out the middle of what is too long: an end often says what to do.
+    """Shorten a text by leaving out its middle; its end often says what to do.
 
     Examples
     --------
@@ -105,7 +109,7 @@ def short(text: str, most: int) -> str:
 
 
 def expect(value: object, kind: Any, instead: str) -> None:
-    """Refuse a value of another type where one of beamfit's own is meant.
+    """Raise an `InputError` if a value does not have the expected type.
 
     Examples
     --------
@@ -115,40 +119,42 @@ def expect(value: object, kind: Any, instead: str) -> None:
     """
     if not isinstance(value, kind):
         said = f", '{value}'" if isinstance(value, str | PathLike) else ""
-        found, expected = (_article(getattr(k, "__name__", "path")) for k in (type(value), kind))
+        found, expected = (
+            _with_article(getattr(k, "__name__", "path")) for k in (type(value), kind)
+        )
         raise InputError(found + said, f"{expected}, such as {instead}")
 
 
-def _article(name: str) -> str:
+def _with_article(name: str) -> str:
     return f"{'an' if name[0] in 'AEIOaeio' else 'a'} {name}"
 
 
 def plain(text: str) -> str:
-    r"""Write what a terminal would obey or turn round, and bytes that are no text, as escapes.
+    r"""Write control characters, direction marks and invalid bytes as escapes.
 
     Examples
     --------
     >>> print(plain("Q1\x1b[2J \udcff"))
     Q1\x1b[2J \xff
     """
-    return UNSHOWN.sub(_escaped, text)
+    return UNPRINTABLE.sub(_escape, text)
 
 
-def _escaped(found: re.Match[str]) -> str:
+def _escape(found: re.Match[str]) -> str:
     code = ord(found[0])
     code -= 0xDC00 if 0xDC80 <= code <= 0xDCFF else 0  # a byte of a name that is not UTF-8
     return f"\\x{code:02x}" if code < 0x100 else f"\\u{code:04x}"
 
 
 def nearest(word: str, known: list[str]) -> str:
-    """Offer the nearest known name, for the end of an error message.
+    """List the known names and suggest the nearest one, for the end of an error message.
 
     Parameters
     ----------
     word : str
-        The name that was not understood.
+        The unknown name.
     known : list of str
-        The names that would have been.
+        The accepted names.
 
     Returns
     -------
@@ -171,12 +177,12 @@ Evidence = TypeVar("Evidence")
 
 
 class Status(StrEnum):
-    """Outcome of a fit or of a search for an optimum, always with a sentence beside it.
+    """Outcome of a fit or of a search for an optimum, always given with a sentence.
 
-    Of a fit to data anything but ``converged`` is a warning. An objective without data is never
-    ``converged``, ``unidentified``, ``at_limit`` or ``poor_fit``: it is ``optimal``,
-    ``local_optimum`` (others were seen, or nobody looked), ``degenerate``, ``saddle``, or has no
-    answer as a fit may have none.
+    For a fit to data every status except ``converged`` is a warning. An objective without data is
+    never ``converged``, ``unidentified``, ``at_limit`` or ``poor_fit``; instead it is ``optimal``,
+    ``local_optimum`` (not proved to be the lowest), ``degenerate`` or ``saddle``, or it has no
+    answer, like a fit.
 
     Examples
     --------
@@ -200,7 +206,7 @@ class Status(StrEnum):
 
     @property
     def colour(self) -> str:
-        """Colour on screen: green; yellow where what is told holds but some is open; red else."""
+        """Colour on screen: green; yellow if something is not determined; red: do not use."""
         good = (Status.converged, Status.optimal)
         open_ = (Status.unidentified, Status.at_limit, Status.local_optimum)
         return "green" if self in good else "yellow" if self in open_ else "red"
@@ -209,7 +215,7 @@ class Status(StrEnum):
 class Finding(NamedTuple):
     """Finding of a rule: a status, the cause in words, and the remedy.
 
-    `about` names what the finding speaks of.
+    `about` lists the names of the parameters or constraints concerned.
     """
 
     status: Status
@@ -224,7 +230,7 @@ class Finding(NamedTuple):
 
 
 class Judged:
-    """A result with a ``finding``: its status, and its message of cause and remedy."""
+    """Base of results with a ``finding``, which gives their status and message."""
 
     finding: Finding
 
@@ -243,14 +249,14 @@ Rule = Callable[[Evidence], Finding | None]
 
 
 def judge(evidence: Evidence, rules: Sequence[Rule[Evidence]]) -> Finding:
-    """Give the finding of the first rule that has one: rules stand in order of gravity.
+    """Return the finding of the first rule that applies; rules are in order of severity.
 
     Parameters
     ----------
     evidence
-        What the rules look at.
+        Argument of the rules.
     rules : sequence of callable
-        Each takes the evidence and gives a `Finding` or None; the last one always finds something.
+        Each takes the evidence and returns a `Finding` or None; the last one always returns one.
 
     Returns
     -------

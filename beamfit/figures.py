@@ -1,6 +1,6 @@
 """Figures of results, each a matplotlib Figure: the pictures of the report, one by one.
 
-A figure belongs to no window: save it by ``figure.savefig``, or show it in a notebook.
+A figure has no window: save it with ``figure.savefig``, or show it in a notebook.
 
 >>> import beamfit, beamfit.figures
 >>> record = beamfit.read_decay_record("measurements/aps_1999_decay.csv")
@@ -46,9 +46,9 @@ def picture(result: Any, **options: Any) -> Figure:
     Parameters
     ----------
     result : EmittanceFit, DecayFit, RecordStudy, Trend, Posterior, or another result with a report
-        What is drawn.
+        Result to draw.
     **options
-        As for the function of this module that draws it, such as ``plane="y"`` of a scan.
+        Options of the drawing function of this module, such as ``plane="y"`` for a scan.
 
     Returns
     -------
@@ -74,7 +74,7 @@ def picture(result: Any, **options: Any) -> Figure:
     if not drawn:
         expected = "a result whose report has one, such as a fit"
         raise InputError(f"no picture of a {type(result).__name__}", expected)
-    return _drawn(drawn[0])
+    return _render(drawn[0])
 
 
 def scan(fit: EmittanceFit, plane: str | None = None) -> Figure:
@@ -93,14 +93,14 @@ def scan(fit: EmittanceFit, plane: str | None = None) -> Figure:
     """
     from beamfit.report.scan_pictures import scan_picture
 
-    return _drawn(scan_picture(fit, _plane(fit, plane)))
+    return _render(scan_picture(fit, _plane(fit, plane)))
 
 
 def residuals(fit: EmittanceFit, plane: str | None = None) -> Figure:
-    """Draw the residuals of one plane in standard errors; arguments as of `scan`."""
+    """Draw the residuals of one plane in standard errors; arguments as for `scan`."""
     from beamfit.report.scan_pictures import residual_picture
 
-    return _drawn(residual_picture(fit, _plane(fit, plane)))
+    return _render(residual_picture(fit, _plane(fit, plane)))
 
 
 def phase_space(fit: EmittanceFit) -> Figure:
@@ -126,7 +126,7 @@ def phase_space(fit: EmittanceFit) -> Figure:
     if not any(has_ellipses(p) for p in fit.planes):
         expected = "a plane whose beta and alpha the data determine"
         raise InputError("a fit without phase ellipses", expected, path=fit.scan.path)
-    return _drawn(ellipse_picture(fit))
+    return _render(ellipse_picture(fit))
 
 
 def decay(result: DecayFit | RecordStudy) -> Figure:
@@ -135,7 +135,7 @@ def decay(result: DecayFit | RecordStudy) -> Figure:
     Parameters
     ----------
     result : DecayFit or RecordStudy
-        Of one decay, or of a whole record.
+        Fit of one decay, or of a whole record.
 
     Returns
     -------
@@ -143,14 +143,14 @@ def decay(result: DecayFit | RecordStudy) -> Figure:
     """
     from beamfit.report.lifetime import record_picture, study_of
 
-    return _drawn(record_picture(study_of(result)))
+    return _render(record_picture(study_of(result)))
 
 
 def lifetime(result: DecayFit | RecordStudy) -> Figure:
-    """Draw the momentary lifetime along a record beside that of the fit; argument as of `decay`."""
+    """Draw the momentary lifetime along a record and that of the fit; argument as for `decay`."""
     from beamfit.report.lifetime import lifetime_picture, study_of
 
-    return _drawn(lifetime_picture(study_of(result)))
+    return _render(lifetime_picture(study_of(result)))
 
 
 def pairs(posterior: Posterior, names: Sequence[str] | None = None) -> Figure:
@@ -161,7 +161,7 @@ def pairs(posterior: Posterior, names: Sequence[str] | None = None) -> Figure:
     posterior : Posterior
         With draws.
     names : sequence of str, optional
-        Which, such as ``x.emittance``; the first five that are shown if None.
+        Numbers to draw, such as ``x.emittance``; the first five shown ones if None.
 
     Returns
     -------
@@ -172,21 +172,21 @@ def pairs(posterior: Posterior, names: Sequence[str] | None = None) -> Figure:
     InputError
         If nothing was sampled, or a name is unknown.
     """
-    from beamfit.report.posterior import MOST_NUMBERS, pairs_picture
+    from beamfit.report.posterior import MAX_NUMBERS, pairs_picture
 
-    names = tuple(names or posterior.shown[:MOST_NUMBERS])
+    names = tuple(names or posterior.shown[:MAX_NUMBERS])
     if not posterior.chain.size:
         raise InputError("a posterior without draws", posterior.message)
-    return _drawn(pairs_picture(posterior, names))
+    return _render(pairs_picture(posterior, names))
 
 
 def trend(result: Trend) -> Figure:
-    """Draw normalised lifetimes with control limits and alarms; a and b over the usual ones below.
+    """Draw normalised lifetimes with control limits and alarms; a and b over their reference below.
 
     Parameters
     ----------
     result : Trend
-        Of `beamfit.lifetime.course.trend_of`.
+        Result of `beamfit.lifetime.course.trend_of`.
 
     Returns
     -------
@@ -194,18 +194,18 @@ def trend(result: Trend) -> Figure:
     """
     from beamfit.report.lifetime import trend_picture
 
-    return _drawn(trend_picture(result))
+    return _render(trend_picture(result))
 
 
 def network(shift: Shift, decays: Sequence[Decay], setting: str | None = None) -> Figure:
-    """Draw what corrected first principles say beside decays, or by one setting.
+    """Draw predictions of corrected first principles with decays, or against one setting.
 
     Parameters
     ----------
     shift : Shift
         A study with a network.
     decays : sequence of Decay
-        What it was made from.
+        Decays of the study.
     setting : str, optional
         "rf_voltage", "scraper_y" or "bunches": a, b and lifetime against it. Otherwise four decays.
 
@@ -223,21 +223,21 @@ def network(shift: Shift, decays: Sequence[Decay], setting: str | None = None) -
     if shift.network is None:
         raise InputError("a study without a network", "study_shift(..., network=True)")
     if setting is None:
-        return _drawn(decays_picture(shift, decays))
+        return _render(decays_picture(shift, decays))
     if setting not in SETTINGS:
         raise InputError(f"a setting '{setting}'", " or ".join(SETTINGS))
-    return _drawn(setting_picture(shift, decays, setting))
+    return _render(setting_picture(shift, decays, setting))
 
 
 def _plane(fit: EmittanceFit, plane: str | None) -> str:
-    """The plane asked for, or the first."""
+    """Return the requested plane, or the first."""
     fitted = [p.plane for p in fit.planes]
     if plane is not None and plane not in fitted:
         raise InputError(f"no fit of plane '{plane}'", " or ".join(fitted))
     return plane or fitted[0]
 
 
-def _drawn(picture: Picture) -> Figure:
+def _render(picture: Picture) -> Figure:
     """Draw a picture of the report, in its style."""
     from matplotlib import rc_context
 

@@ -1,4 +1,4 @@
-"""Particles a lattice may carry: rest energies, momentum and rigidity, for files and optics."""
+"""Particles of a lattice: rest energies, momentum and rigidity."""
 
 from __future__ import annotations
 
@@ -8,19 +8,19 @@ REST_ENERGY = {"electron": 0.51099895069, "positron": 0.51099895069, "proton": 9
 REST_ENERGY |= {"antiproton": REST_ENERGY["proton"], "H-": 939.294073, "deuteron": 1875.612945}
 """MeV, CODATA 2022 (NIST), all of one charge; H- is a proton and two electrons, less 14.35 eV."""
 ENERGY_KEYS = {"energy_MeV": "total", "kinetic_energy_MeV": "kinetic", "momentum_MeV": "momentum"}
-"""Energy of a beam as files give it; a momentum is p c."""
-# MeV
+"""Keys for the energy of a beam in files; a momentum is p c."""
+# Rest energies in MeV.
 ELECTRON_MASS = REST_ENERGY["electron"]
 PROTON_MASS = REST_ENERGY["proton"]
 # Speed of light in m/s, exact by definition; in MeV/(T m) it turns p c into B rho.
 LIGHT = 299792458.0
 _LIGHT = LIGHT / 1e6
-# MeV, above the energy of every machine: a larger number is in another unit.
-_HIGHEST = 1e7
+# Largest total energy in MeV, above that of every machine: a larger number is in another unit.
+_MAX_ENERGY = 1e7
 
 
 def expected_energy(energy: float, particle: str) -> str | None:
-    """Say which total energies in MeV a particle can have, or None if this is one of them.
+    """Return None for a possible total energy in MeV, otherwise a text with the possible range.
 
     Examples
     --------
@@ -28,7 +28,7 @@ def expected_energy(energy: float, particle: str) -> str | None:
     "a total energy between the electron's rest energy of 0.510999 MeV"
     """
     rest = REST_ENERGY[particle]
-    if rest < energy <= _HIGHEST:
+    if rest < energy <= _MAX_ENERGY:
         return None
     return (
         f"a total energy between the {particle}'s rest energy of {rest:.6g} MeV and 10 TeV; "
@@ -37,14 +37,14 @@ def expected_energy(energy: float, particle: str) -> str | None:
 
 
 def total_energy(number: Any, kind: str, rest: float) -> Any:
-    """Total energy in MeV, E = T + m or E² = (pc)² + m², from what a file says.
+    """Total energy in MeV, E = T + m or E² = (pc)² + m².
 
     Parameters
     ----------
     number : float or array
-        MeV.
+        Total or kinetic energy, or p c, in MeV.
     kind : {"total", "kinetic", "momentum"}
-        What it is.
+        Meaning of ``number``.
     rest : float
         Rest energy in MeV.
 
@@ -64,7 +64,7 @@ def total_energy(number: Any, kind: str, rest: float) -> Any:
 
 
 def beta_gamma(energy: Any, mass: float = ELECTRON_MASS) -> Any:
-    """Momentum over rest mass, p/(m c) = βγ, which turns geometric emittance into normalised.
+    """Ratio of momentum to rest mass, p/(m c) = βγ: normalised over geometric emittance.
 
     Parameters
     ----------

@@ -14,10 +14,11 @@ NORMAL_REACH = 1.96
 HOUR = 3600.0  # s
 # Factors and letters of the unit prefixes.
 _PREFIXES = ((1.0, ""), (1e-3, "m"), (1e-6, "µ"), (1e-9, "n"), (1e-12, "p"))
-# An error of more digits than this before the point is written with a power of ten.
-MOST_DIGITS = 4
-# Units that `Quantity.to` knows, with their dimension and size in SI; those of the second line
-# take prefixes.
+# A value and error are written with a power of ten if the error has more digits than this before
+# the decimal point.
+MAX_DIGITS = 4
+# Units of `Quantity.to`, with their dimension and size in SI; those of the second line take
+# prefixes.
 _SIZES = {"min": ("s", 60.0), "h": ("s", HOUR), "d": ("s", 24 * HOUR), "G": ("T", 1e-4)}
 _SIZES |= {u: (u, 1.0) for u in ("m", "s", "A", "eV", "V", "Pa", "rad", "T")}
 _SCALES = {"p": 1e-12, "n": 1e-9, "µ": 1e-6, "u": 1e-6, "m": 1e-3, "k": 1e3, "M": 1e6, "G": 1e9}
@@ -32,15 +33,14 @@ class Quantity:
     value : float
         In SI.
     error : float or None
-        Half of the central 68 % of what the data leave open; None where they do not determine
-        the value.
+        Half of the central 68 % interval; None if the data do not determine the value.
     unit : str
         SI unit, "1" for a pure number.
     error_raw : float or None
-        The error by the stated errors of the data alone.
+        Error propagated from the stated errors of the data alone.
     interval_95 : tuple of float, or None
-        What holds the truth in 95 % of cases. Left out, it is the value ± 1.96 errors, as of a
-        normal distribution; None without an error. A value that the data do not determine may
+        Central 95 % interval. If omitted, it is the value ± 1.96 errors, as for a normal
+        distribution, or None without an error. A value that the data do not determine may still
         have a limit here.
 
     Examples
@@ -73,7 +73,7 @@ class Quantity:
     def reaching(
         cls, value: float, error: float, unit: str, raw: float | None, reach: float
     ) -> Quantity:
-        """A quantity whose 95 % interval reaches so far to either side of the value.
+        """Make a quantity whose 95 % interval is the value ± `reach`.
 
         Examples
         --------
@@ -87,19 +87,18 @@ class Quantity:
 
     @property
     def nominal_value(self) -> float:
-        """The value, by the name it has in the package uncertainties: ``ufloat(q.nominal_value,
-        q.std_dev)`` goes on with errors. Quantities of one fit are correlated, which that does not
-        know.
+        """The value, under its name in the package uncertainties, for
+        ``ufloat(q.nominal_value, q.std_dev)``. This ignores correlations of quantities of one fit.
         """
         return float(self.value)
 
     @property
     def std_dev(self) -> float:
-        """The error, by the name it has in the package uncertainties; NaN where there is none."""
+        """The error, under its name in the package uncertainties; NaN if there is none."""
         return math.nan if self.error is None else float(self.error)
 
     def to(self, unit: str) -> Quantity:
-        """Give the same in another unit.
+        """Convert to another unit.
 
         Parameters
         ----------
@@ -109,7 +108,7 @@ class Quantity:
         Raises
         ------
         InputError
-            If it measures something else.
+            If the unit has another dimension.
 
         Examples
         --------
@@ -127,7 +126,7 @@ class Quantity:
         return Quantity(self.value * factor, error, unit, raw, ends)
 
     def open(self) -> Quantity:
-        """The same of which nothing is known: without an error and an interval.
+        """Return the value without error and interval.
 
         Examples
         --------
@@ -138,7 +137,7 @@ class Quantity:
 
     @property
     def determined(self) -> bool:
-        """The data give it an error."""
+        """True if value and error are finite."""
         return self.error is not None and math.isfinite(self.error) and math.isfinite(self.value)
 
     @property
@@ -148,7 +147,7 @@ class Quantity:
 
     @property
     def interval_words(self) -> str | None:
-        """The interval of 95 % in the unit that the value is written in; None without one.
+        """The 95 % interval as text, in the unit of the printed value; None without one.
 
         Examples
         --------
@@ -179,7 +178,7 @@ class Quantity:
             return f"{value + 0.0:.3g}{end} (not determined)"
         error = self.error / factor
         places, power = 3 if error == 0 else 1 - math.floor(math.log10(error)), 0
-        if max(abs(value), error) < 1e-3 or abs(value) >= 1e5 or error >= 10**MOST_DIGITS:
+        if max(abs(value), error) < 1e-3 or abs(value) >= 1e5 or error >= 10**MAX_DIGITS:
             power = math.floor(math.log10(max(abs(value), error) or 1.0))
             value, error, places = value / 10**power, error / 10**power, places + power
         value, digits = round(value, max(places, 0)) + 0.0, f".{max(places, 0)}f"  # no -0.0
@@ -199,7 +198,7 @@ class Quantity:
 
 
 def _size(unit: str) -> tuple[float, dict[str, int]]:
-    """Size of a unit in SI, and its dimensions with their powers."""
+    """Return the size of a unit in SI, and its dimensions with their powers."""
     above, _, below = unit.replace("²", "^2").partition("/")
     factor, powers = 1.0, dict[str, int]()
     for part, sign in ((above, 1), (below, -1)):
@@ -215,7 +214,7 @@ def _size(unit: str) -> tuple[float, dict[str, int]]:
 
 
 def _named(name: str) -> tuple[str, float]:
-    """Dimension and size of a single unit; one that is not known is a dimension of its own."""
+    """Return dimension and size of a single unit; an unknown unit is its own dimension."""
     if name in _SIZES:
         return _SIZES[name]
     scale, base = _SCALES.get(name[:1]), _SIZES.get(name[1:])
@@ -249,20 +248,19 @@ def relative_change(share: Quantity) -> str:
 
 
 def display_unit(size: float, unit: str) -> tuple[float, str]:
-    """Choose nm, µm, mm for lengths of a size, and s for times below a minute in hours; leave other
-    units alone.
+    """Choose nm, µm, mm or m for a length, and s for a time in hours below a minute.
 
     Parameters
     ----------
     size : float
-        In the SI unit.
+        Magnitude in the SI unit.
     unit : str
         The SI unit, "1" for a pure number.
 
     Returns
     -------
     (float, str)
-        What to divide by, and the unit to write.
+        Divisor, and the unit to write.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""Identifiability of parameters from data, by singular values."""
+"""Identifiability, probabilities, intervals of draws, and control limits."""
 
 from __future__ import annotations
 
@@ -10,42 +10,46 @@ from scipy.special import chdtrc, fdtrc, gammaln, logsumexp, ndtr, stdtr, stdtri
 
 from beamfit.quantity import NORMAL_REACH, Quantity
 
-# Probability of the residuals below which a fit is poor: the contract of the JSON output.
+# χ² probability below which a fit is poor, as defined in the contract of the JSON output.
 POOR_FIT = 1e-3
-# Logarithm of the odds from which something is taken for so: one in a thousand is wrong then
+# Log odds above which a statement counts as certain: one in a thousand is then wrong
 # (A. Wald, Sequential Analysis, 1947).
 CLEAR_ODDS = -math.log(POOR_FIT)
-# A direction is undetermined if its value is below this many standard errors.
-OPEN = 3.0
-# A value is of use where its 95 % interval spans less than this factor.
+# A direction is undetermined if its singular value is below this: a relative error above a third.
+MIN_SINGULAR_VALUE = 3.0
+# A positive value is useful if its 95 % interval spans less than this factor.
 USEFUL = 2.5
-# Points of a baseline at most (the first ones; at most half of all), and at least.
-BASELINE, FEWEST = 20, 3
+# Baseline of a series: largest and smallest number of its first points (at most half of all).
+MAX_BASELINE = 20
+MIN_BASELINE = 3
 # Degrees of freedom below which the message gives the 95 % interval of Student's distribution.
-MANY = 8
-# Ends of the central 68 and 95 % of draws.
-CENTRAL, WIDE = (0.16, 0.84), (0.025, 0.975)
-# Draws that are worth fewer independent ones tell no error.
-LEAST_WORTH = 10.0
-# Widths of a change as a share of what changes: smaller ones are not seen, larger ones seldom.
-CHANGED = np.geomspace(1e-4, 0.5, 16)
-# Mean range of two normal numbers in standard deviations; degrees of freedom of a moving range.
-RANGE, RANGE_DOF = 1.128, 0.62
-# Probability below 3 standard deviations; one point in 370 lies beyond them to either side.
-BEYOND = float(ndtr(3.0))
+FEW_DOF = 8
+# Ends of the central 68 % and 95 % intervals of draws.
+CENTRAL = (0.16, 0.84)
+WIDE = (0.025, 0.975)
+# Effective sample size below which draws give no error.
+MIN_EFFECTIVE_DRAWS = 10.0
+# Prior widths of a relative change: smaller ones are undetectable, larger ones rare.
+CHANGE_WIDTHS = np.geomspace(1e-4, 0.5, 16)
+# Mean range of two normal numbers in standard deviations (d2 of control charts).
+MEAN_RANGE = 1.128
+# Degrees of freedom of a moving range, per range.
+RANGE_DOF = 0.62
+# Probability below 3 standard deviations; one point in 370 lies outside ±3.
+THREE_SIGMA = float(ndtr(3.0))
 
 
 class Directions(NamedTuple):
-    """Singular values of a scaled Jacobian and the directions the data leave open.
+    """Singular values of a scaled Jacobian, and the directions that the data do not determine.
 
     Attributes
     ----------
     singular_values : ndarray
-        Descending; each is one over the relative error along its direction.
+        In descending order; each is the inverse of the relative error along its direction.
     condition : float
-        Largest over smallest; infinite if the smallest is zero.
+        Largest divided by smallest; infinite if the smallest is zero.
     undetermined : tuple of str
-        The directions whose relative error exceeds a third, in words.
+        Directions with a relative error above a third, as texts such as ``a - b``.
     """
 
     singular_values: np.ndarray
@@ -54,21 +58,20 @@ class Directions(NamedTuple):
 
 
 def scaled_directions(jacobian: np.ndarray, scale: np.ndarray, names: list[str]) -> Directions:
-    """Decompose J · diag(scale): which combinations of parameters the residuals see.
+    """Find the parameter combinations that residuals determine, by the SVD of J · diag(scale).
 
     Parameters
     ----------
     jacobian : ndarray
-        Shape (points, parameters): derivative of (model/error) by the parameters.
+        Shape (points, parameters): derivative of model/error with respect to the parameters.
     scale : ndarray
-        Shape (parameters,): the size of each parameter, so that a unit step means 100 %.
+        Shape (parameters,): magnitude of each parameter, so that a unit step means 100 %.
     names : list of str
-        Parameter names, for the words.
+        Parameter names.
 
     Returns
     -------
     Directions
-        Singular values and open directions.
 
     Notes
     -----
@@ -84,11 +87,11 @@ def scaled_directions(jacobian: np.ndarray, scale: np.ndarray, names: list[str])
     scaled = np.asarray(jacobian) * scale
     if not np.isfinite(scaled).all():
         return Directions(np.zeros(len(names)), np.inf, tuple(names))
-    # All right-hand directions, also those that fewer points than parameters leave out.
+    # Full V also for fewer points than parameters, to include the null space.
     _, values, rows = np.linalg.svd(scaled, full_matrices=scaled.shape[0] < scaled.shape[1])
     values = np.concatenate([values, np.zeros(len(names) - len(values))])
     smallest = values[-1] if values[-1] > 1e-13 * values[0] else 0.0
-    open_rows = [row for value, row in zip(values, rows, strict=True) if value < OPEN]
+    open_rows = [row for value, row in zip(values, rows, strict=True) if value < MIN_SINGULAR_VALUE]
     return Directions(
         singular_values=values,
         condition=float(values[0] / smallest) if smallest else np.inf,
@@ -97,7 +100,7 @@ def scaled_directions(jacobian: np.ndarray, scale: np.ndarray, names: list[str])
 
 
 def _in_words(row: np.ndarray, names: list[str]) -> str:
-    """Write a direction as a sum of its larger components."""
+    """Write a direction as the sum of its larger components."""
     row = row / row[np.argmax(np.abs(row))]
     terms = [(c, n) for c, n in zip(row, names, strict=True) if abs(c) >= 0.1]
     words = ""
@@ -109,15 +112,15 @@ def _in_words(row: np.ndarray, names: list[str]) -> str:
 
 
 def chi2_probability(chi2: float, dof: float, error_dof: float = math.inf) -> float | None:
-    """Probability of a χ² at least this large if the errors are right; None without freedom.
+    """Probability of a χ² at least this large if the errors are right; None if ``dof`` is zero.
 
     Parameters
     ----------
     chi2, dof : float
         χ² and its degrees of freedom.
     error_dof : float
-        Degrees of freedom that the errors themselves were taken from: χ²/dof is then distributed
-        as Fisher's F.
+        Degrees of freedom from which the errors were estimated: χ²/dof then follows Fisher's F
+        distribution.
 
     Examples
     --------
@@ -132,7 +135,7 @@ def chi2_probability(chi2: float, dof: float, error_dof: float = math.inf) -> fl
 
 
 def log_student(t: np.ndarray, dof: np.ndarray | float) -> np.ndarray:
-    """Log density of Student's t.
+    """Log density of Student's t distribution.
 
     Examples
     --------
@@ -146,16 +149,16 @@ def log_student(t: np.ndarray, dof: np.ndarray | float) -> np.ndarray:
 def log_evidence_of_change(
     squares: np.ndarray, information: np.ndarray, dof: float = math.inf
 ) -> np.ndarray:
-    """Logarithm of how many times likelier a change is than none.
+    """Log evidence ratio of a change against no change.
 
     Parameters
     ----------
     squares : array
-        Squares of changes over their errors.
+        Squared changes divided by their variances.
     information : array
-        One over the squares of the errors of relative changes.
+        Inverse variances of the relative changes.
     dof : float, optional
-        Readings that tell the size of the noise, less numbers; by default it is known.
+        Degrees of freedom from which the noise level was estimated; known if infinite (default).
 
     Returns
     -------
@@ -163,43 +166,44 @@ def log_evidence_of_change(
 
     Notes
     -----
-    The ratio of two normal densities of what is seen, of variance V + W and V, the size of the
-    noise integrated over where readings tell it. The change is normal about none, its width flat in
-    the logarithm (`CHANGED`). In time the ratio is a martingale while nothing changes, so that it
-    ever exceeds c with a probability of 1/c at most (G. Shafer et al., Statist. Sci. 26 (2011) 84).
+    The ratio of two normal densities of the observed change, with variances V + W and V, integrated
+    over the noise level if that was estimated. The prior of the change is normal about zero, with a
+    width W flat in the logarithm (`CHANGE_WIDTHS`). Without a change the ratio is a martingale in
+    time, so that the probability that it ever exceeds c is at most 1/c (G. Shafer et al., Statist.
+    Sci. 26 (2011) 84).
 
     Examples
     --------
     >>> log_evidence_of_change(np.array([0.0, 36.0]), np.array([1e4, 1e4])).round(1).tolist()
     [-0.5, 14.2]
     """
-    sizes = CHANGED.reshape(-1, *(1,) * np.ndim(squares))
+    sizes = CHANGE_WIDTHS.reshape(-1, *(1,) * np.ndim(squares))
     worth = information * sizes**2
     if math.isinf(dof):
         log = 0.5 * squares * (worth / (1 + worth))
     else:
         log = np.log1p(squares / dof) - np.log1p(squares / (1 + worth) / dof)
         log = 0.5 * (dof + 1) * log
-    return logsumexp(log - 0.5 * np.log1p(worth), axis=0) - math.log(CHANGED.size)
+    return logsumexp(log - 0.5 * np.log1p(worth), axis=0) - math.log(CHANGE_WIDTHS.size)
 
 
 def quantity_of_draws(draws: np.ndarray, unit: str, value: float | None = None) -> Quantity:
-    """Make the quantity that draws of a posterior say.
+    """Make a quantity from posterior draws.
 
     Parameters
     ----------
     draws : ndarray
-        Shape (d,); those that are not finite are left out.
+        Shape (d,); non-finite draws are left out.
     unit : str
-        Its unit.
+        Unit of the draws.
     value : float, optional
-        The median if None.
+        Quoted value; the median if None.
 
     Returns
     -------
     Quantity
-        Its error is half of the central 68 %, its interval the central 95 %; none where more draws
-        have no value than lie beyond an end of it.
+        Its error is half of the central 68 % interval, its interval the central 95 %. It has
+        neither if 2.5 % or more of the draws are not finite.
 
     Examples
     --------
@@ -221,7 +225,7 @@ def quantity_of_draws(draws: np.ndarray, unit: str, value: float | None = None) 
 
 
 def of_use(interval_95: tuple[float, float] | None) -> bool:
-    """Tell whether a positive value is known well enough to be of use.
+    """Check that the 95 % interval of a positive value spans less than a factor `USEFUL`.
 
     Examples
     --------
@@ -233,15 +237,15 @@ def of_use(interval_95: tuple[float, float] | None) -> bool:
 
 
 def one_sided_probability(deviations: float, dof: float) -> float:
-    """Chance that noise alone lifts a quantity this many standard errors above zero.
+    """Probability that noise alone gives a value this many standard errors above zero.
 
     Parameters
     ----------
     deviations : float
-        Value over its standard error.
+        Value divided by its standard error.
     dof : float
-        Degrees of freedom from which the error was taken, for Student's distribution; infinite
-        where the errors were known beforehand, for the normal one.
+        Degrees of freedom from which the error was estimated (Student's distribution); infinite for
+        a known error (normal distribution).
 
     Examples
     --------
@@ -256,7 +260,7 @@ def one_sided_probability(deviations: float, dof: float) -> float:
 
 
 def reach_of(dof: float) -> float:
-    """Half-width of the 95 % interval in standard errors, by Student's distribution.
+    """Half-width of the 95 % interval of Student's distribution, in standard errors.
 
     Examples
     --------
@@ -266,18 +270,18 @@ def reach_of(dof: float) -> float:
     return float(stdtrit(dof, 0.975)) if 0 < dof < math.inf else NORMAL_REACH
 
 
-def few_words(rests_on: float) -> str:
-    """Sentence part on the 95 % interval, if it rests on few degrees of freedom.
+def few_dof_words(dof: float) -> str:
+    """Sentence part with the 95 % interval in σ, if there are few degrees of freedom.
 
     Examples
     --------
-    >>> few_words(2.0)
+    >>> few_dof_words(2.0)
     '; 2 degrees of freedom: the 95 % interval is ±4.3 σ'
     """
-    if not 0 < rests_on < MANY:
+    if not 0 < dof < FEW_DOF:
         return ""
-    reach = f"±{reach_of(rests_on):.1f} σ"
-    return f"; {rests_on:.3g} degrees of freedom: the 95 % interval is {reach}"
+    reach = f"±{reach_of(dof):.1f} σ"
+    return f"; {dof:.3g} degrees of freedom: the 95 % interval is {reach}"
 
 
 def baseline(count: int) -> int:
@@ -288,16 +292,16 @@ def baseline(count: int) -> int:
     >>> [baseline(n) for n in (4, 10, 1000)]
     [3, 5, 20]
     """
-    return min(BASELINE, max(count // 2, FEWEST))
+    return min(MAX_BASELINE, max(count // 2, MIN_BASELINE))
 
 
 def control_limits(values: np.ndarray) -> tuple[float, float]:
-    """Mean of some points, and how far from it a further one lies in one case of 370.
+    """Mean of some points, and the distance from it that a further one exceeds in one case of 370.
 
-    Of an individuals chart (D. C. Montgomery, Introduction to Statistical Quality Control, 7th
-    ed., section 6.4): 3 standard deviations, these from the mean moving range over 1.128, which a
-    slow drift does not widen; Student's quantile, since they come from few points. Infinite for
-    fewer than three.
+    Control limits of an individuals chart (D. C. Montgomery, Introduction to Statistical Quality
+    Control, 7th ed., section 6.4). The standard deviation is the mean moving range divided by
+    1.128, which a slow drift does not increase; the quantile is Student's, because the points are
+    few. The limit is infinite for fewer than three points.
 
     Examples
     --------
@@ -305,8 +309,8 @@ def control_limits(values: np.ndarray) -> tuple[float, float]:
     >>> round(centre, 3), round(limit, 2)
     (1.0, 0.48)
     """
-    if values.size < FEWEST:
+    if values.size < MIN_BASELINE:
         return float(values.mean()), math.inf
-    spread = float(np.abs(np.diff(values)).mean()) / RANGE
-    reach = stdtrit(RANGE_DOF * (values.size - 1), BEYOND) * math.sqrt(1 + 1 / values.size)
+    spread = float(np.abs(np.diff(values)).mean()) / MEAN_RANGE
+    reach = stdtrit(RANGE_DOF * (values.size - 1), THREE_SIGMA) * math.sqrt(1 + 1 / values.size)
     return float(values.mean()), float(reach) * spread

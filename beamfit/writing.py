@@ -1,4 +1,4 @@
-"""Files written so that a reader sees the old one or the whole new one; one writer at a time."""
+"""Atomic writing of files, so that a reader sees the old or the complete new one, and locks."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from typing import BinaryIO
 
 from beamfit.errors import InputError
 
-# Files that a process which is stopped has to remove.
+# Temporary files to remove if the process is interrupted.
 UNFINISHED: set[str] = set()
-FRESH = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW
+NEW_FILE = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW
 
 
 def check_place(path: str | PathLike[str]) -> None:
-    """Find out before anything is computed whether a file could be written.
+    """Check before a calculation that a file can be written.
 
     Raises
     ------
@@ -39,22 +39,22 @@ def check_place(path: str | PathLike[str]) -> None:
 
 
 def write_atomically(path: str | PathLike[str], content: bytes, partial: str | None = None) -> None:
-    """Write a file so that a reader sees the old one or the whole new one, never a part.
+    """Write a file so that a reader sees the old or the complete new one, never a part.
 
     Parameters
     ----------
     path : str or path
-        Where to. A symbolic link there is replaced and not followed.
+        Target. A symbolic link there is replaced and not followed.
     content : bytes
-        What.
+        New content.
     partial : str, optional
-        Name beside it under which it is written first; for who holds `alone`. One name for all
-        attempts: what a killed process left is overwritten, not collected.
+        Name of the temporary file in the same folder; only for callers that hold the `alone` lock.
+        All attempts use one name, so that remains of a killed process are overwritten.
 
     Raises
     ------
     InputError
-        If the place cannot be written.
+        If the target cannot be written.
 
     Examples
     --------
@@ -70,7 +70,7 @@ def write_atomically(path: str | PathLike[str], content: bytes, partial: str | N
 
 @contextmanager
 def replacing(path: str | PathLike[str], partial: str | None = None) -> Iterator[BinaryIO]:
-    """Stream that replaces a file once it is completely written; as `write_atomically`."""
+    """Open a stream that replaces a file once it is completely written; see `write_atomically`."""
     check_place(path)
     target = Path(path)
     temporary = None
@@ -78,9 +78,9 @@ def replacing(path: str | PathLike[str], partial: str | None = None) -> Iterator
         if partial is None:
             handle, temporary = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name[:99]}.")
         else:
-            beside = target.with_name(partial)
-            beside.unlink(missing_ok=True)
-            handle, temporary = os.open(beside, FRESH, 0o600), str(beside)
+            temporary_path = target.with_name(partial)
+            temporary_path.unlink(missing_ok=True)
+            handle, temporary = os.open(temporary_path, NEW_FILE, 0o600), str(temporary_path)
         UNFINISHED.add(temporary)
         with os.fdopen(handle, "w+b") as stream:
             yield stream
@@ -104,12 +104,12 @@ def replacing(path: str | PathLike[str], partial: str | None = None) -> Iterator
 
 @contextmanager
 def alone(path: str | PathLike[str]) -> Iterator[None]:
-    """Keep other runs from a file; the lock ends with the process, however that ends.
+    """Lock a file against other runs; the lock ends with the process, however that ends.
 
     Raises
     ------
     InputError
-        If another run has it, or there is no place for the lock beside it.
+        If another run has the lock, or it cannot be created next to the file.
 
     Examples
     --------
@@ -128,7 +128,7 @@ def alone(path: str | PathLike[str]) -> Iterator[None]:
             f"no place for '{lock.name}' ({error.strerror})", "a writable path", path
         ) from None
     try:
-        _take(handle, lock, path)
+        _lock(handle, lock, path)
         UNFINISHED.add(str(lock))
         try:
             yield
@@ -139,14 +139,14 @@ def alone(path: str | PathLike[str]) -> Iterator[None]:
         os.close(handle)
 
 
-def _take(handle: int, lock: Path, path: str | PathLike[str]) -> None:
+def _lock(handle: int, lock: Path, path: str | PathLike[str]) -> None:
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        # What the run before has just removed protects nobody.
+        # A lock file that the previous run has just removed does not protect.
         taken = os.stat(lock).st_ino == os.fstat(handle).st_ino
     except (BlockingIOError, FileNotFoundError):
         taken = False
-    except OSError:  # a file system without locks does without
+    except OSError:  # a file system without locks: continue unlocked
         taken = True
     if not taken:
         expected = "another name, or wait until that run has ended"

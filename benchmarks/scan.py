@@ -21,7 +21,7 @@ import numpy as np
 import beamfit
 from beamfit.io.line import build_line
 from beamfit.io.machine import ScanMachine, read_scan_machine
-from beamfit.live.aims import FEWEST, fit_of, sharp
+from beamfit.live.aims import MIN_POINTS, fit_of, sharp
 from beamfit.live.devices import Connected, Left, Shots
 from beamfit.live.points import MeasuredPoint
 from beamfit.live.scan import scan
@@ -143,7 +143,7 @@ def chosen(
 def uniform(machine: ScanMachine, beam: Beam, seed: int, goal: float) -> int:
     """The fewest equally spaced settings whose scan reaches the goal."""
     magnet = machine.magnets[0]
-    for count in range(FEWEST, 10 * MOST):
+    for count in range(MIN_POINTS, 10 * MOST):
         device, points = Simulated(beam, np.random.default_rng(seed + count)), []
         for setting in np.linspace(magnet.low, magnet.high, count):
             device.setting = float(setting)

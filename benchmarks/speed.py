@@ -52,18 +52,17 @@ PEERS = ("pyemittance", "lmfit", "emcee", "casadi", "do_mpc", "at", "cpymad", "j
 HEAD = """\
 # Speed
 
-Made by `make bench`, never by hand: beamfit and its peers one after the other in one run.
-Numbers are processor time of all threads, the least of several repeats, with one BLAS thread.
-Ratios are the peer's time over beamfit's: above 1 beamfit is faster. Warm: nothing compiles.
-Where beamfit gives more than the peer (verdicts, correlated noise, errors) the line above a
-table says so.
+Written by `make bench`, which runs beamfit and other programs one after the other. Numbers are
+processor time of all threads, the smallest of several repeats, with one BLAS thread. Ratios are the
+other program's time divided by that of beamfit: above 1 beamfit is faster. Warm means that nothing
+compiles. The line above a table says if beamfit gives more (verdicts, correlated noise, errors).
 """
 BUSY = "Others were at work: processor times are up to a half too long, ratios are good to that."
 FIRST = """\
 ## First answers
 
-A whole command or script in a fresh process, seconds of processor time, and that over the time of
-`import jax, scipy.optimize` alone. "Kept" is with the code that an earlier run compiled; "cold"
+A whole command or script in a fresh process, in seconds of processor time, and relative to the time
+of `import jax, scipy.optimize` alone. "Kept" means with code compiled by an earlier run, "cold"
 with nothing compiled.
 """
 
@@ -72,13 +71,13 @@ MANY = f"""\
 ## Files of a batch
 
 What one more file of two planes costs `beamfit batch`, from runs of {FILES[0]} and {FILES[1]}
-files. On the clock only a machine that does nothing else tells two workers from one.
+files. Elapsed time compares two workers with one only on an otherwise idle machine.
 """
 AIMED = """\
 ## Targets
 
-What this page was to show, and what it does. Files on two cores, and two workers over one, are by
-processor time: two cores that do nothing else.
+Targets and measured values. Files on two cores, and two workers over one, are calculated from
+processor time, as on two idle cores.
 """
 
 

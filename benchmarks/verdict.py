@@ -286,15 +286,15 @@ def main(draws: int = 200, seed: int | None = None, page: str = str(PAGE)) -> No
     command = f"python benchmarks/verdict.py {draws} {seed}"
     said = [
         MARKS[0],
-        f"Made by `{command}`: {draws} simulated scans a cell, drawn anew with each seed.",
+        f"Made by `{command}`: {draws} simulated scans per cell, new ones for each seed.",
         "",
         "Beams. In each cell, in %: answered / **of the answers** within one error / with the "
         "truth in `interval_95` (binomial 95 % limits) / beyond 4 errors.",
         "",
         *table(rng, BEAMS, beam_cell, draws),
         "",
-        "No beams. In %: called an emittance (binomial 95 % limits) / given an interval all the "
-        "same.",
+        "No beams. In %: called an emittance (binomial 95 % limits) / given an interval "
+        "nevertheless.",
         "",
         *table(rng, OTHERS, other_cell, draws),
         "",

@@ -42,7 +42,7 @@ from beamfit.report.document import (
     ReportPage,
     Verdict,
     html_of,
-    written_now,
+    with_provenance,
 )
 from beamfit.writing import write_atomically
 
@@ -175,7 +175,7 @@ def reproduction_page(
         pictures_title="Figures 19 to 25, on the simulated scan",
         notes=found.known.scan.provenance,
     )
-    return written_now(page, command, inputs)
+    return with_provenance(page, command, inputs)
 
 
 def _verdicts(found: Reproduction) -> list[Verdict]:

@@ -10,14 +10,14 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
-from beamfit.compile_cache import QUICK, TRIED
+from beamfit.compile_cache import FUSION_FLAG, TESTED_JAX
 
 # Compiling is most of the tests' time: do it without optimisation, in one part, and by the older of
 # XLA's two ways to emit fused loops, which takes a third of the time, and keep it for the next run.
 # A flag that XLA does not know ends the process.
-_QUICK = f"--xla_backend_optimization_level=0 --{QUICK}=false"
+_QUICK = f"--xla_backend_optimization_level=0 --{FUSION_FLAG}=false"
 _QUICK += " --xla_llvm_disable_expensive_passes=true --xla_cpu_parallel_codegen_split_count=1"
-if version("jax").startswith(TRIED):
+if version("jax").startswith(TESTED_JAX):
     os.environ.setdefault("XLA_FLAGS", _QUICK)
 # No test reads which line of Python an instruction of a compiled program came from.
 os.environ.setdefault("JAX_TRACEBACK_IN_LOCATIONS_LIMIT", "0")

@@ -9,7 +9,7 @@ from importlib.metadata import version
 import pytest
 
 from beamfit import compile_cache
-from beamfit.compile_cache import TRIED
+from beamfit.compile_cache import TESTED_JAX
 
 # Says where code is kept and how often it was found there; runs one of the package's functions.
 SCRIPT = """
@@ -138,6 +138,6 @@ def test_compilation_is_quick_unless_the_user_says_otherwise():
         "prepare_jax(); print(os.environ['XLA_FLAGS'] == own)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    tried = version("jax").startswith(TRIED)
+    tried = version("jax").startswith(TESTED_JAX)
     flag = "--xla_cpu_use_fusion_emitters=false" if tried else "untried"
     assert done.stdout.split() == [flag, "0.0", "True"]

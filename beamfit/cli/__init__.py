@@ -25,14 +25,14 @@ from beamfit.cli.setpoint import setpoint
 from beamfit.cli.solve import solve
 from beamfit.cli.tune import tune
 from beamfit.cli.watch import watch
-from beamfit.errors import LONGEST, InputError, plain, short
+from beamfit.errors import MAX_MESSAGE, InputError, plain, short
 
 
 class _Commands(click.Group):
-    """Commands whose descriptions are listed whole."""
+    """Command group that lists the descriptions of commands without truncation."""
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """Write a paragraph a command."""
+        """Write one paragraph per command."""
         rows = [(name, self.commands[name].get_short_help_str(500)) for name in self.commands]
         with formatter.section("Commands"):
             formatter.write_dl(rows)
@@ -56,14 +56,14 @@ for command in (solve, identify, control, batch, watch, scan):
 
 def main() -> None:
     """Run the command line: exit 0 when answered, 2 with one line on unusable input."""
-    _show_marks()
-    _hush_libraries()
+    _replace_unknown_characters()
+    _silence_libraries()
     try:
         status = cli.main(prog_name="beamfit", standalone_mode=False) or 0
         if sys.stdout is not None:  # None where it was closed before we began
             sys.stdout.flush()
         sys.exit(status)
-    except SystemExit as stop:  # with 1 where the reader, `head` say, has seen enough
+    except SystemExit as stop:  # 1 if the reader of a pipe, such as `head`, has closed it
         sys.exit(0 if stop.code == 1 else stop.code)
     except click.exceptions.NoArgsIsHelpError as error:
         click.echo(error.format_message())
@@ -75,18 +75,18 @@ def main() -> None:
         sys.exit(130)
     except InputError as error:
         _fail(str(error))
-    except BrokenPipeError:  # the same
+    except BrokenPipeError:  # a closed pipe, too
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(0)
     except OSError as error:
-        sys.stdout = None  # what is left in its buffer has nowhere to go
+        sys.stdout = None  # drop the rest of its buffer
         _fail(f"output that cannot be written ({error.strerror}); expected room for it")
 
 
-def _hush_libraries() -> None:
-    """Keep what libraries warn of off the screen, here and in processes that are begun from here.
+def _silence_libraries() -> None:
+    """Suppress warnings of libraries in this process and its children; ``python -W`` shows them.
 
-    What is wrong with input or answer is beamfit's to say; ``python -W`` shows all.
+    Problems of input or answer are reported by beamfit itself.
     """
     logging.getLogger().addHandler(logging.NullHandler())
     if not sys.warnoptions:
@@ -95,13 +95,14 @@ def _hush_libraries() -> None:
         os.environ.setdefault("PYTHONWARNINGS", "ignore")
 
 
-def _show_marks() -> None:
+def _replace_unknown_characters() -> None:
+    """Print a replacement for characters that the terminal does not have, such as µ."""
     for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):  # a terminal without µ shows a mark instead
+        if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")
 
 
 def _fail(message: str) -> None:
-    """Say it on one line of standard error."""
-    click.echo("beamfit: " + short(plain(" ".join(message.split())), LONGEST), err=True)
+    """Print one line on standard error and exit with status 2."""
+    click.echo("beamfit: " + short(plain(" ".join(message.split())), MAX_MESSAGE), err=True)
     sys.exit(2)

@@ -1,4 +1,4 @@
-"""`beamfit batch`: a year's files in, one row an answer out."""
+"""`beamfit batch`: answer for many files, with one row per answer."""
 
 from __future__ import annotations
 
@@ -24,26 +24,26 @@ Examples:
   beamfit batch fills/ --kind lifetime --out fills.csv --workers 2
   beamfit batch scans/ --kind emittance --lattice line.toml --out year.h5 --scheduler tcp://host:8786
 """
-# Refusals printed on the terminal; the table has all.
-NAMED = 10
+# Largest number of refusals printed on the terminal; the table has all.
+MAX_REFUSALS = 10
 
 
 @click.command(cls=Command, epilog=EXAMPLE)
 @click.argument("path", nargs=-1, required=True)
 @option(
     "--kind",
-    "What the files hold: quadrupole scans, or records of beam current.",
+    "Content of the files: quadrupole scans, or records of beam current.",
     choices=["emittance", "lifetime"],
     required=True,
 )
 @option(
     "--out FILE.parquet|FILE.h5|FILE.csv",
-    "The table of answers. A run that was stopped goes on from FILE.parts.",
+    "The table of answers. An interrupted run continues from FILE.parts.",
     required=True,
 )
 @option("--workers", "Processes on this machine (Dask).", type=click.IntRange(1))
 @option("--scheduler tcp://HOST:PORT", "A Dask scheduler to join.")
-@option("--quantity NAME", "What the report follows, such as beta or lifetime_mean.")
+@option("--quantity NAME", "Quantity of the report, such as beta or lifetime_mean.")
 @option(
     "--learn-noise FILE.toml",
     "Learn the noise of these scans, with its error, and write it for --noise.",
@@ -63,20 +63,20 @@ def batch(
     weights: str,
     lattice: str | None,
     output: Output,
-    **told: Any,
+    **input_options: Any,
 ) -> None:
-    """Answer for many scans or records, each as by itself, in one row an answer.
+    """Fit many scans or records, each on its own, and write one row per answer.
 
-    PATH is a file, or a folder of files. What cannot be used is a row of status "unusable" with its
-    reason, and stops nothing. Answers that stand in FILE.parts for the same file, lattice, options
-    and version are kept.
+    PATH is a file, or a folder of files. An unusable file gives a row with status "unusable" and
+    the reason, and stops nothing. Answers in FILE.parts for the same file, lattice, options and
+    version are kept.
     """
-    part = {n: told[n] for n in ("use", "energy", "particle", "first", "last", "screen")}
-    reading = {n: told[n] for n in ("columns", "ignore", "skip_bad")}
+    part = {n: input_options[n] for n in ("use", "energy", "particle", "first", "last", "screen")}
+    reading = {n: input_options[n] for n in ("columns", "ignore", "skip_bad")}
     _check_kind(kind, {"lattice": lattice, "noise": noise, "learn-noise": learned} | part)
     from beamfit.batch.course import chart_quantity, courses_of, summary_of
 
-    chart_quantity(kind, quantity)  # says so before hours of work if there is none
+    chart_quantity(kind, quantity)  # raises before hours of work if there is no such quantity
     if learned is not None:
         check_place(learned)
     job = beamfit.Job(kind, lattice, part, reading, weights, noise=noise)
@@ -88,7 +88,7 @@ def batch(
         from beamfit.io.priors import write_noise
 
         write_noise(learned, job.learned_noise(found.files))
-    # The table is read again only where somebody looks at it.
+    # The table is read again only if its summary is shown.
     courses = [] if output.as_json and output.report is None else courses_of(found, quantity)
     if output.report is not None:
         from beamfit.report.batch import write_batch_report
@@ -110,7 +110,7 @@ def _check_kind(kind: str, of_scans: dict[str, Any]) -> None:
 
 @contextmanager
 def _progress(shown: bool) -> Iterator[Callable[[int, int], None]]:
-    """Files done, and the time left, on one line of a terminal."""
+    """Show finished files and the remaining time on one line of a terminal."""
     from rich.console import Console
     from rich.progress import MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
@@ -130,7 +130,7 @@ def _show(terminal: Terminal, found: Batch, out: str, summary: Table | None) -> 
     if summary is not None:
         terminal.line()
         terminal.table(summary._replace(title=""))
-    for reason in list(found.refused.values())[:NAMED]:
+    for reason in list(found.refused.values())[:MAX_REFUSALS]:
         terminal.line(reason)
-    if (more := len(found.refused) - NAMED) > 0:
+    if (more := len(found.refused) - MAX_REFUSALS) > 0:
         terminal.line(f"{more} more files without an answer are in the table.")

@@ -1,4 +1,4 @@
-"""`beamfit check`: what was understood of files, before anything is fitted."""
+"""`beamfit check`: show how files are read, before anything is fitted."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ Examples:
 @click.argument("files", nargs=-1, required=True, metavar="FILE...")
 @options("columns ignore skip-bad use energy json")
 def check(files: tuple[str, ...], output: Output, **reading: Any) -> None:
-    """Say what is understood of scans, lattices, records, rings, runs and formulations.
+    """Show how scans, lattices, records, rings, runs and formulations are read.
 
-    Of each FILE the kind, the rows, the magnets and their units, the range of the sizes and where
-    their errors are from, the energy, and what is odd about it; of a scan also whether each lattice
-    given beside it has what it names. All files are gone through; one that cannot be used gives
-    its line, and exit status 2; where columns are not understood, a layout for them is proposed.
+    For each FILE it shows the kind, the rows, the magnets and their units, the range of the sizes
+    and the source of their errors, the energy, and anything odd; for a scan also whether each given
+    lattice has its magnets and screens. All files are checked. An unusable file gives its error
+    line and exit status 2; for unknown columns a layout is proposed.
     """
     found: list[FileSummary] = []
     wrong: list[tuple[str, InputError]] = []
@@ -41,9 +41,9 @@ def check(files: tuple[str, ...], output: Output, **reading: Any) -> None:
             found.append(beamfit.check(path, **reading))
         except InputError as error:
             wrong.append((path, error))
-            layouts += filter(None, [_proposed(path, reading["columns"])])
+            layouts += filter(None, [_propose_layout(path, reading["columns"])])
     lattices = [each for each in found if each.kind == "lattice"]
-    found = [_on_all(each, lattices) if each.kind == "scan" else each for each in found]
+    found = [_with_lattices(each, lattices) if each.kind == "scan" else each for each in found]
     if output.as_json:
         said: list[Any] = [*found]
         said += [{"file": path, "kind": None, "error": str(error)} for path, error in wrong]
@@ -58,21 +58,21 @@ def check(files: tuple[str, ...], output: Output, **reading: Any) -> None:
     sys.exit(2 if wrong else 0)
 
 
-def _proposed(path: str, columns: Layout | None) -> str | None:
-    """A layout for what is not understood of a file; None where that is no matter of columns."""
+def _propose_layout(path: str, columns: Layout | None) -> str | None:
+    """Propose a layout for unknown columns; None if the problem is not one of columns."""
     try:
         return proposed_layout(path, columns)
     except InputError:
         return None
 
 
-def _on_all(scan: FileSummary, lattices: list[FileSummary]) -> FileSummary:
+def _with_lattices(scan: FileSummary, lattices: list[FileSummary]) -> FileSummary:
     for lattice in lattices:
         scan = with_lattice(scan, lattice)
     return scan
 
 
 def _show(found: list[FileSummary]) -> None:
-    """Print a table for each file, and its oddities below."""
+    """Print a table for each file, with its notes below."""
     for each in found:
         click.echo("\n".join([text_of(each.table()), *(f"Note: {n}" for n in each.notes), ""]))

@@ -1,4 +1,4 @@
-"""`beamfit control`: records of runs and targets in, a controller in a simulated loop out."""
+"""`beamfit control`: a controller from records of runs, in a simulated loop."""
 
 from __future__ import annotations
 
@@ -51,10 +51,10 @@ LIMIT = "NAME=LOW:HIGH, one of them may be left out, such as level=:3"
     "Added to an output in the simulation, from a time on.",
     multiple=True,
 )
-@option("--horizon STEPS", "Steps of a plan.", type=click.IntRange(2))
-@option("--every SAMPLES", "Samples of the runs in a step of control.", type=click.IntRange(1))
+@option("--horizon STEPS", "Number of steps of a plan.", type=click.IntRange(2))
+@option("--every SAMPLES", "Samples of the runs per control step.", type=click.IntRange(1))
 @option("--smooth", "Cost of input changes against errors.", type=float, default=0.1)
-@option("--for SECONDS", "Time simulated.", name="duration", type=float)
+@option("--for SECONDS", "Simulated time.", name="duration", type=float)
 @options("hidden columns ignore skip-bad seed report json")
 def control(
     record: tuple[str, ...],
@@ -64,23 +64,23 @@ def control(
     rate: tuple[str, ...],
     disturb: tuple[str, ...],
     output: Output,
-    **told: Any,
+    **arguments: Any,
 ) -> None:
     """Control a process: identify it, plan its inputs within limits, and simulate the loop.
 
-    RECORD is a run as `beamfit identify` reads it. The loop runs on the fitted model with the noise
-    of its residuals. Inputs and their rates keep their limits always, outputs wherever any inputs
-    can keep them; what cannot be kept is named.
+    RECORD is a run in the format of `beamfit identify`. The loop is simulated with the fitted model
+    and the noise of its residuals. Inputs and their rates always keep their limits, outputs if any
+    inputs can achieve that; limits that cannot be kept are named.
     """
     targets, loads = _steps(targets, "set"), _steps(disturb, "disturb")
-    told |= {
+    arguments |= {
         "limits": gains_of(limit, "limit", LIMIT),
         "rates": named_of(rate, "rate", RATE, float),
     }
-    reading = {n: told.pop(n) for n in READING}
+    reading = {n: arguments.pop(n) for n in READING}
     runs = [read_run(path, **reading) for path in record]
-    told |= {"offset": not no_offset, "disturbances": loads}
-    loop = beamfit.control(runs, targets, **told)  # JAX from here on
+    arguments |= {"offset": not no_offset, "disturbances": loads}
+    loop = beamfit.control(runs, targets, **arguments)  # JAX from here on
     digests = {path: digest(path) for path in record}
     output.write(loop, digests)
     output.answer([loop], digests, lambda terminal: _show(terminal, loop))

@@ -1,4 +1,4 @@
-"""`beamfit density`: profiles of a scan in, emittance against charge out."""
+"""`beamfit density`: emittance against charge from the profiles of a scan."""
 
 from __future__ import annotations
 

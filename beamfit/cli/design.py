@@ -1,4 +1,4 @@
-"""`beamfit design`: a scan and a lattice in, the measurements to make next out."""
+"""`beamfit design`: the measurements to make next, from a scan and a lattice."""
 
 from __future__ import annotations
 
@@ -18,8 +18,18 @@ if TYPE_CHECKING:
     from beamfit.cli.show import Terminal
     from beamfit.emittance.design import Advice
 
-# What `read_inputs` takes besides the scan.
-GIVEN = ["lattice", "use", "first", "last", "screen", "energy", "columns", "ignore", "skip_bad"]
+# Options passed to `read_inputs` with the scan.
+INPUT_OPTIONS = [
+    "lattice",
+    "use",
+    "first",
+    "last",
+    "screen",
+    "energy",
+    "columns",
+    "ignore",
+    "skip_bad",
+]
 EXAMPLE = """\b
 Examples:
   beamfit design scan.csv --lattice line.toml --vary Q2=0:5 --goal 0.8%
@@ -32,15 +42,15 @@ Examples:
     "scan columns ignore skip-bad lattice use from to screen energy noise scenario prior bounds "
     "gain anchor vary"
 )
-@option("--energies MEV,MEV", "Further energies the beam can be had at.", default="")
+@option("--energies MEV,MEV", "Other possible energies of the beam.", default="")
 @option(
     "--criterion",
-    "Make small the error of the emittance, or the volume of the error ellipsoid.",
+    "Minimise the error of the emittance, or the volume of the error ellipsoid.",
     choices=["emittance", "D"],
     default="emittance",
 )
 @options("goal")
-@option("--count", "Most measurements.", default=5)
+@option("--count", "Largest number of measurements.", default=5)
 @options("json")
 def design(
     scan: str,
@@ -52,26 +62,26 @@ def design(
     goal: float | None,
     count: int,
     output: Output,
-    **told: Any,
+    **fit_options: Any,
 ) -> None:
-    """Say which settings to measure next, given what is measured, and when to stop.
+    """Propose the settings to measure next, given the present data, and when to stop.
 
-    Magnets move between the limits of --vary, or half the scanned range beyond it. For a
-    scenario that the data do not identify it says which kind of measurement would.
+    Magnets move between the limits of --vary, or up to half the scanned range beyond it. For a
+    scenario that the data do not identify it names the kind of measurement that would.
     """
     others = energies_of(energies)
-    given = {name: told.pop(name) for name in GIVEN}
-    Assumptions(**told).check_scenario(scenario)
-    told["noise"] = None if noise is None else read_noise(noise)
-    read = read_inputs(scan, **given)
+    input_options = {name: fit_options.pop(name) for name in INPUT_OPTIONS}
+    Assumptions(**fit_options).check_scenario(scenario)
+    fit_options["noise"] = None if noise is None else read_noise(noise)
+    read = read_inputs(scan, **input_options)
     measured, described, _ = read
     described.check_magnets(limits)
     described.check_energies(others)
 
     # JAX from here on
-    fit = beamfit.fit_emittance(measured, build_line(described), scenario=scenario, **told)
-    wanted = {"criterion": criterion, "goal": goal, "count": count, "energies": others}
-    advice = beamfit.design(fit, limits=limits or None, **wanted)
+    fit = beamfit.fit_emittance(measured, build_line(described), scenario=scenario, **fit_options)
+    design_options = {"criterion": criterion, "goal": goal, "count": count, "energies": others}
+    advice = beamfit.design(fit, limits=limits or None, **design_options)
     title = f"{fit.scan.name} on {fit.line.name}"
     output.answer([advice], read.digests, lambda terminal: _show(terminal, advice, title))
 

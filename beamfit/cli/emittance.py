@@ -1,4 +1,4 @@
-"""`beamfit emittance`: a scan and a lattice in, a judged emittance out."""
+"""`beamfit emittance`: fit an emittance, with a verdict, to a scan and a lattice."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ if TYPE_CHECKING:
     from beamfit.optics.beamline import Beamline
     from beamfit.sampling.posterior import Posterior
 
-# What `read_inputs` takes besides the scan.
-GIVEN = ["lattice", "use", "first", "last", "screen", "energy", "particle"]
-GIVEN += ["columns", "ignore", "skip_bad", "size_method"]
+# Options passed to `read_inputs` with the scan.
+INPUT_OPTIONS = ["lattice", "use", "first", "last", "screen", "energy", "particle"]
+INPUT_OPTIONS += ["columns", "ignore", "skip_bad", "size_method"]
 EXAMPLE = """\b
 Examples:
   beamfit emittance measurements/lcls_otr2.csv --lattice lattices/lcls_otr2.toml
@@ -46,12 +46,10 @@ Examples:
 @options(
     "scan columns ignore skip-bad size-method maybe-lattice use from to screen energy particle"
 )
-@option(
-    "--plane", "Which plane to fit; all that were measured by default.", choices=["x", "y", "both"]
-)
+@option("--plane", "Plane to fit; default: all measured planes.", choices=["x", "y", "both"])
 @option(
     "--method",
-    "What the fit compares: size² (linear) or size.",
+    "Fitted quantity: size² (linear) or size.",
     choices=["size-squared", "size"],
     default="size-squared",
 )
@@ -59,7 +57,7 @@ Examples:
 @options("noise weights scenario prior bounds gain anchor")
 @option(
     "--systematics FILE",
-    "TOML file of what is known of screen, energy, drifts, magnets: part of the error then.",
+    "TOML file with uncertainties of screen, energy, drifts, magnets; they enter the error.",
     name="known",
 )
 @option(
@@ -68,7 +66,7 @@ Examples:
     is_flag=True,
 )
 @options("hidden")
-@option("--starts", "Networks: starts of the training.", default=20)
+@option("--starts", "Networks: number of starts of the training.", default=20)
 @options("sample store seed report full json")
 def emittance(
     scan: str,
@@ -82,7 +80,7 @@ def emittance(
     sample: bool,
     store: str | None,
     output: Output,
-    **told: Any,
+    **fit_options: Any,
 ) -> None:
     """Fit the emittance to a quadrupole scan and say whether to believe it.
 
@@ -92,39 +90,38 @@ def emittance(
 
     Rows that have their own r11_x, r12_x, ... need no lattice, and so do files of emittance_gui.
     """
-    sampling = Sampling(sample, store, told["seed"])
+    sampling = Sampling(sample, store, fit_options["seed"])
     sampling.check()
-    given = {name: told.pop(name) for name in GIVEN}
+    input_options = {name: fit_options.pop(name) for name in INPUT_OPTIONS}
     if known is not None:
-        told["priors"] = read_systematics(known) | told["priors"]
-    Assumptions(**told).check_scenario(scenario)
+        fit_options["priors"] = read_systematics(known) | fit_options["priors"]
+    Assumptions(**fit_options).check_scenario(scenario)
     own = None if noise is None else read_noise(noise)
-    read = read_inputs(scan, **given)
+    read = read_inputs(scan, **input_options)
     measured, described, gui = read
     planes = {None: measured.planes, "both": ("x", "y")}.get(plane, (plane,))
     for each in planes:
-        measured.rows(each)  # says so if it was not measured
+        measured.rows(each)  # raises if the plane was not measured
 
     if sample and len(measured.slices) > 1:
         found = f"--sample for {len(measured.slices)} slices"
         raise InputError(found, "the rows of one slice, or no --sample", path=measured.path)
 
     line = build_line(described)  # JAX from here on
-    told |= {"planes": planes, "method": method.replace("-", "_"), "robust": robust}
-    told |= {"weights": weights, "scenario": scenario}
-    told |= {"noise": own}
+    fit_options |= {"planes": planes, "method": method.replace("-", "_"), "robust": robust}
+    fit_options |= {"weights": weights, "scenario": scenario, "noise": own}
     inputs = read.digests
     if len(measured.slices) > 1:
         from beamfit.emittance.slices import fit_slices
 
-        fits = fit_slices(measured, line, **told)
+        fits = fit_slices(measured, line, **fit_options)
         output.write(fits, inputs)
         results = (entry for fit in fits for entry in results_of(fit))
         output.answer(results, inputs, lambda terminal: _show_slices(terminal, fits))
         return
-    fit = beamfit.fit_emittance(measured, line, **told)
-    methods = () if gui is None else compared(gui, line, planes)
-    (posterior,) = sampling.drawn([fit], inputs, quiet=output.as_json)
+    fit = beamfit.fit_emittance(measured, line, **fit_options)
+    methods = () if gui is None else compare_methods(gui, line, planes)
+    (posterior,) = sampling.sample_all([fit], inputs, quiet=output.as_json)
     output.write(fit, inputs, posterior=posterior, methods=methods)
     output.answer(
         results_of(fit, methods),
@@ -135,7 +132,7 @@ def emittance(
 
 
 def _show_slices(terminal: Terminal, fits: SliceFits) -> None:
-    """Show a row a slice, and what is said of each."""
+    """Show the verdicts and one row per slice."""
     terminal.line(f"{fits.scan.name} on {fits.fits[0].line.name}", style="bold")
     for (plane, status, message), names in fits.alike().items():
         which = f"slice{'s' * (len(names) > 1)} {', '.join(names)}"
@@ -150,16 +147,16 @@ def _show_slices(terminal: Terminal, fits: SliceFits) -> None:
 
 
 def _without(table: Table, names: tuple[str, ...]) -> Table:
-    """Leave out the columns of these headers."""
+    """Remove the columns with these headers."""
     kept = [i for i, name in enumerate(table.header) if name not in names]
     rows = [[row[i] for i in kept] for row in table.rows]
     return table._replace(header=[table.header[i] for i in kept], rows=rows)
 
 
-def compared(
+def compare_methods(
     gui: EmittanceGuiFile, line: Beamline, planes: tuple[str, ...]
 ) -> tuple[SizeMethods, ...]:
-    """Results by the size methods of an emittance_gui file, for these planes."""
+    """Compare the size methods of an emittance_gui file in the given planes."""
     from beamfit.emittance.size_methods import compare_size_methods
 
     found = compare_size_methods(gui.scans, line, gui.stored, gui.means)
@@ -169,7 +166,7 @@ def compared(
 def results_of(
     fit: EmittanceFit, methods: tuple[SizeMethods, ...] = ()
 ) -> Iterator[dict[str, Any]]:
-    """JSON entry of each plane: the fit, its systematics and its sensitivity to the range."""
+    """Make the JSON entry of each plane: fit, systematics and sensitivity to the fit range."""
     from beamfit.emittance.systematics import range_sensitivity, systematics
 
     ways = {m.plane: {"size_methods": m} for m in methods}
@@ -186,11 +183,11 @@ def show(
     posterior: Posterior | None = None,
     methods: tuple[SizeMethods, ...] = (),
 ) -> None:
-    """Say the verdict first, then show what is quoted, or all tables."""
+    """Show the verdicts, then the quoted numbers or all tables."""
     terminal.line(f"{fit.scan.name} on {fit.line.name}", style="bold")
     for p in fit.planes:
         terminal.answer(p.headline, p.status, p.message)
-    for note in fit.notes:  # what is odd about the file belongs to the answer
+    for note in fit.notes:
         terminal.line(note)
     terminal.line()
     if terminal.full:
@@ -202,7 +199,7 @@ def show(
 
 
 def _show_fully(terminal: Terminal, fit: EmittanceFit, methods: tuple[SizeMethods, ...]) -> None:
-    """Show every number, the systematics budget and the range of the scan."""
+    """Show all numbers, the systematics budget and the refits with fewer points."""
     from beamfit.emittance.results import result_rows
     from beamfit.emittance.systematics import budget_rows, range_rows
 
@@ -229,7 +226,7 @@ def _show_fully(terminal: Terminal, fit: EmittanceFit, methods: tuple[SizeMethod
 
 
 def _show_briefly(terminal: Terminal, fit: EmittanceFit) -> None:
-    """Show what is quoted, the largest systematic of each plane, and where the rest is."""
+    """Show the quoted numbers, the largest systematic of each plane, and a hint to `--full`."""
     from beamfit.emittance.results import result_rows
     from beamfit.emittance.systematics import systematics
 
@@ -252,7 +249,7 @@ def _show_briefly(terminal: Terminal, fit: EmittanceFit) -> None:
 def _about_the_input(
     terminal: Terminal, fit: EmittanceFit | SliceFits, methods: tuple[SizeMethods, ...]
 ) -> None:
-    """Say what other sizes give, and where the errors are from."""
+    """Show the comparison of size methods, and the source of the errors."""
     terminal.tables(way.table() for way in methods)
     errors = fit.scan.error_source if fit.scan.error else "inferred from the residuals"
     terminal.line(f"Errors of the sizes: {errors}.", style="dim")

@@ -34,12 +34,12 @@ def example(folder: str) -> None:
 
 
 def write_example(folder: str | PathLike[str]) -> tuple[Path, ...]:
-    """Write the example files into a folder, which is made if it is not there.
+    """Write the example files into a folder, which is created if necessary.
 
     Parameters
     ----------
     folder : str or path
-        Where to.
+        Target folder.
 
     Returns
     -------
@@ -49,8 +49,7 @@ def write_example(folder: str | PathLike[str]) -> tuple[Path, ...]:
     Raises
     ------
     InputError
-        If one of the files is there already (nothing is written then), or the folder cannot be
-        written.
+        If one of the files exists (then nothing is written), or the folder cannot be written.
 
     Examples
     --------

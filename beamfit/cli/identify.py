@@ -1,4 +1,4 @@
-"""`beamfit identify`: records of runs in, judged responses out."""
+"""`beamfit identify`: responses with verdicts, from records of runs."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ if TYPE_CHECKING:
     from beamfit.dynamics.state_fit import StatesFit
 
 
-# A table of more rows is shown by three of them; --full has all.
-MOST_SHOWN = 4
+# Longest table shown whole without --full; of longer ones three rows are shown.
+MAX_ROWS_BRIEF = 4
 EXAMPLE = """\b
 Examples:
   beamfit identify run.csv --model first-order
@@ -53,11 +53,11 @@ def identify(
 ) -> None:
     """Identify how the outputs of a process respond to its inputs.
 
-    RECORD is a CSV or HDF5 file with time_s, inputs u_… that hold from row to row, and outputs y_…;
-    several runs are identified together. Each output gives its parameters with errors (as curves of
-    the operating point with --map network), tests of the residuals, and a verdict; a state space is
-    one of all outputs, with its time constants and gains; a fed-batch process the rates of its
-    balances.
+    RECORD is a CSV or HDF5 file with time_s, inputs u_… that are held from row to row, and outputs
+    y_…; several runs are identified together. Each output gets its parameters with errors (as
+    curves of the operating point with --map network), tests of the residuals, and a verdict. A
+    state space is one model of all outputs, with time constants and gains; a fed-batch process has
+    the rates of its balances.
     """
     settings = {"order": order, "delay": delay, "offset": not no_offset}
     check_model(model, map, **settings)
@@ -89,5 +89,5 @@ def _show(terminal: Terminal, fits: tuple[ResponseFit | StatesFit | FedBatchFit,
 def _ends(curve: Table) -> Table:
     """Keep the first, middle and last row of a long table."""
     rows = curve.rows
-    few = [rows[0], rows[len(rows) // 2], rows[-1]] if len(rows) > MOST_SHOWN else rows
+    few = [rows[0], rows[len(rows) // 2], rows[-1]] if len(rows) > MAX_ROWS_BRIEF else rows
     return curve._replace(rows=few)

@@ -1,4 +1,4 @@
-"""`beamfit lifetime`: records in, judged lifetimes and loss budgets out."""
+"""`beamfit lifetime`: lifetimes with verdicts, and loss budgets, from records of current."""
 
 from __future__ import annotations
 
@@ -23,8 +23,9 @@ if TYPE_CHECKING:
     from beamfit.lifetime.study import RecordStudy
     from beamfit.sampling.posterior import Posterior
 
-# Decays, and kinds of verdict on many of them, that the first screen lists; --full has every one.
-MOST_SHOWN, MOST_VERDICTS = 3, 2
+# Decays, and kinds of verdict on many decays, listed without --full.
+MAX_DECAYS_BRIEF = 3
+MAX_VERDICTS_BRIEF = 2
 EXAMPLE = """\b
 Examples:
   beamfit lifetime measurements/aps_1999_decay.csv
@@ -45,7 +46,7 @@ Examples:
 @click.argument("record", nargs=-1, required=True)
 @option(
     "--ring FILE.toml",
-    "Ring, for the loss budget from first principles beside the measured a and b.",
+    "Ring, for the loss budget from first principles in addition to the measured a and b.",
 )
 @option(
     "--study",
@@ -61,30 +62,29 @@ Examples:
 )
 @option(
     "--trend",
-    "Follow the lifetime through all decays: current times lifetime with control limits, by "
-    "the ring to one current and its usual settings if --ring is given; alarms where a or b moved.",
+    "Follow the lifetime through all decays: current times lifetime with control limits, scaled "
+    "with --ring to one current and the settings of the ring file; alarms if a or b change.",
     is_flag=True,
 )
 @option(
     "--law free|constant",
-    "Whether a may go as a power of the current and b drift in a record, which errors then "
-    "contain; with --ring both are constant.",
+    "Free: a may vary as a power of the current and b may drift in a record, and errors include "
+    "this. With --ring both are constant.",
     choices=["free", "constant"],
     default="free",
 )
 @option(
     "--offset zero-beam|CURRENT",
-    "What the current monitor reads without beam, taken off: a current such as 0.12mA, or "
-    "from the record's own readings before injection or after the dump.",
+    "Reading of the current monitor without beam, to be subtracted: a current such as 0.12mA, or "
+    "from readings of the record before injection or after the dump.",
 )
 @option(
     "--monitor-drift CURRENT/TIME",
-    "How far the current monitor drifts (one standard deviation), such as 10uA/h; part of the "
-    "errors then.",
+    "Drift of the current monitor (one standard deviation), such as 10uA/h; enters the errors.",
 )
 @option(
     "--monitor-offset CURRENT",
-    "How far it is off without beam (one standard deviation), such as 50uA.",
+    "Offset of the current monitor (one standard deviation), such as 50uA; enters the errors.",
 )
 @options("scale-prior columns ignore skip-bad sample store seed report full json")
 def lifetime(
@@ -103,7 +103,7 @@ def lifetime(
     output: Output,
     **reading: Any,
 ) -> None:
-    """Fit the lifetime to decay records and say what they cannot tell.
+    """Fit the lifetime to decay records and state what they do not determine.
 
     RECORD is a CSV or HDF5 file with columns such as time_s (or ISO time), beam_current_mA,
     beam_current_error_mA, and optionally rf_voltage_kV, scraper_y_mm, pressure_Pa, bunches,
@@ -114,7 +114,7 @@ def lifetime(
     """
     sampling = Sampling(sample, store, seed)
     sampling.check()
-    _check_study(study, ring, network, priors)
+    _check_study_options(study, ring, network, priors)
     monitor = monitor_of(monitor_drift, monitor_offset)
     records = [read_lifetime_input(path, **reading) for path in dict.fromkeys(record)]
     if len(records) < len(record):
@@ -129,7 +129,7 @@ def lifetime(
         expected = "tables of lifetimes by themselves, with no option but --law and --json"
         raise InputError("a table of lifetimes", expected, path=tables[0].name)
     if tables:
-        _lifetimes(tables, law, inputs, output)
+        _answer_tables(tables, law, inputs, output)
         return
 
     if monitor is not None:
@@ -139,7 +139,7 @@ def lifetime(
     single = [decay for each in studies for decay in each.decays or each.pooled]
     shift = beamfit.study_shift(single, machine, 0, network, priors) if study else None
     course = beamfit.trend(studies, machine) if trend else None
-    drawn = sampling.drawn([decay.fit for decay in decays], inputs, quiet=output.as_json)
+    drawn = sampling.sample_all([decay.fit for decay in decays], inputs, quiet=output.as_json)
     posteriors = drawn if sample else None
     output.write(studies, inputs, posterior=posteriors, shift=shift, trend=course)
     output.answer(
@@ -154,7 +154,7 @@ def lifetime(
     )
 
 
-def _lifetimes(
+def _answer_tables(
     tables: list[LifetimeTable], law: str, inputs: dict[str, str], output: Output
 ) -> None:
     """Fit and show tables of lifetimes."""
@@ -174,7 +174,7 @@ def _show_lifetimes(terminal: Terminal, fits: list[LifetimeFit]) -> None:
         terminal.line()
 
 
-def _check_study(study: bool, ring: str | None, network: bool, priors: dict | None) -> None:
+def _check_study_options(study: bool, ring: str | None, network: bool, priors: dict | None) -> None:
     if study and ring is None:
         raise InputError("--study without a ring", "--ring FILE.toml")
     if network and not study:
@@ -190,7 +190,7 @@ def _show(
     shift: Shift | None,
     trend: Trend | None,
 ) -> None:
-    """Show every record, and what was drawn and found of all together."""
+    """Show every record, and posteriors, study and trend."""
     verdicts = [] if shift is None else shift.verdicts
     verdicts += [] if trend is None else [("trend", trend.status, trend.message)]
     for verdict in verdicts:
@@ -213,7 +213,7 @@ def _show(
 
 
 def _show_record(terminal: Terminal, study: RecordStudy) -> None:
-    """Lay out a record: what was cut away, and every decay with its verdict and budget."""
+    """Show a record: its cuts, and every decay with its verdict and budget."""
     from beamfit.answer import determined, labelled
     from beamfit.lifetime import tables
 
@@ -249,20 +249,20 @@ def _show_record(terminal: Terminal, study: RecordStudy) -> None:
 
 
 def _show_many(terminal: Terminal, study: RecordStudy) -> None:
-    """Say each verdict once, then print a table with a row for each decay."""
+    """Show each verdict once, then a table with one row per decay."""
     from beamfit.answer import cell
     from beamfit.lifetime import tables
 
     verdicts = tables.distinct_verdicts(study.decays)
-    told = verdicts if terminal.full else verdicts[:MOST_VERDICTS]
-    for status, names, message in told:
+    listed = verdicts if terminal.full else verdicts[:MAX_VERDICTS_BRIEF]
+    for status, names, message in listed:
         terminal.verdict(names, status, message)
-    if left := verdicts[len(told) :]:
+    if left := verdicts[len(listed) :]:
         others = ", ".join(dict.fromkeys(cell(status) for status, *_ in left))
         terminal.line(f"\n{len(left)} more kinds of verdict ({others}): --full.")
     for table in tables.overview(study.decays)[: None if terminal.full else 1]:
         rows = table.rows
-        if not terminal.full and (left := len(rows) - MOST_SHOWN) > 0:
-            rows = [*rows[:MOST_SHOWN], [f"{left} more", *[""] * (len(table.header) - 1)]]
+        if not terminal.full and (left := len(rows) - MAX_DECAYS_BRIEF) > 0:
+            rows = [*rows[:MAX_DECAYS_BRIEF], [f"{left} more", *[""] * (len(table.header) - 1)]]
         terminal.table(table._replace(title=f"\n{table.title}", rows=rows))
     terminal.line()

@@ -1,6 +1,6 @@
-"""Priors, bounds, limits, anchors and targets from text such as people type; no JAX.
+"""Parsing of option texts: priors, bounds, limits, anchors and targets; without JAX.
 
-Messages name the option of the command line that takes such text.
+Messages name the option of the command line.
 """
 
 from __future__ import annotations
@@ -23,8 +23,9 @@ UNITS = {
     "size": {"nm": 1e-9, "um": 1e-6, "µm": 1e-6, "mm": 1e-3, "m": 1.0},
     "divergence": {"nrad": 1e-9, "urad": 1e-6, "µrad": 1e-6, "mrad": 1e-3, "rad": 1.0},
 }
-# A network may miss first principles by this; more is a per cent sign left out.
-LOOSEST = 0.5
+# Largest relative deviation of a network from first principles; a larger number lacks a per cent
+# sign.
+MAX_DEVIATION = 0.5
 
 
 def _fraction(text: str) -> float:
@@ -80,7 +81,7 @@ def _pairs(
 
 
 def priors_of(texts: Iterable[str]) -> dict[str, tuple[float, float]]:
-    """Read what is known of numbers before the fit.
+    """Read priors of parameters.
 
     Parameters
     ----------
@@ -106,7 +107,7 @@ def priors_of(texts: Iterable[str]) -> dict[str, tuple[float, float]]:
 
 
 def bounds_of(texts: Iterable[str]) -> dict[str, tuple[float, float]]:
-    """Read bounds of numbers, ``NAME=LOWER:UPPER``.
+    """Read bounds of parameters, ``NAME=LOWER:UPPER``.
 
     Raises
     ------
@@ -124,7 +125,7 @@ def bounds_of(texts: Iterable[str]) -> dict[str, tuple[float, float]]:
 def gains_of(
     texts: Iterable[str], option: str = "gain", form: str = GAINS
 ) -> dict[str, tuple[float, float]]:
-    """Read limits ``NAME=LOWER:UPPER`` of what `option` names; one left out is none.
+    """Read limits ``NAME=LOWER:UPPER`` of an option; a missing end is infinite.
 
     Raises
     ------
@@ -157,7 +158,7 @@ def limits_of(texts: Iterable[str]) -> dict[str, tuple[float, float]]:
 
 
 def anchor_of(texts: Iterable[str]) -> Anchor:
-    """Read what ties a network to first principles.
+    """Read the anchors of a network to first principles.
 
     Parameters
     ----------
@@ -194,7 +195,7 @@ def anchor_of(texts: Iterable[str]) -> Anchor:
             raise InputError(f"--anchor '{text}'", ANCHOR) from None
         if deviation is not None:
             raise InputError(f"--anchor '{text}' beside another", "first-principles once")
-        if found > LOOSEST and "%" not in value:
+        if found > MAX_DEVIATION and "%" not in value:
             found_words = f"--anchor '{text}', a deviation of {100 * found:g} %"
             raise InputError(found_words, f"{ANCHOR}; was {value.strip()}% meant?")
         deviation = found
@@ -202,15 +203,15 @@ def anchor_of(texts: Iterable[str]) -> Anchor:
 
 
 def target_of(text: str, plane: str = "x") -> Target:
-    """Read what is wanted at the screen.
+    """Read a target at the screen.
 
     Parameters
     ----------
     text : str
-        ``size=200um``, ``divergence=140urad``, ``match`` to the lattice's own design Twiss, or
-        ``match=BETA_M:ALPHA``; ``size_y`` and so on for a plane by name.
+        ``size=200um``, ``divergence=140urad``, ``match`` to the design Twiss parameters of the
+        lattice, or ``match=BETA_M:ALPHA``; ``size_y`` and so on name the plane.
     plane : str
-        The plane where the text names none.
+        Default plane.
 
     Returns
     -------
@@ -228,20 +229,20 @@ def target_of(text: str, plane: str = "x") -> Target:
     Target(kind='size', plane='y', value=0.002)
     """
     name, _, rest = text.partition("=")
-    kind, _, own = name.strip().partition("_")
-    if kind not in (*UNITS, "match") or own not in ("", "x", "y"):
+    kind, _, own_plane = name.strip().partition("_")
+    if kind not in (*UNITS, "match") or own_plane not in ("", "x", "y"):
         raise InputError(f"--target '{text}'", TARGET)
-    own = own or plane
+    own_plane = own_plane or plane
     if kind == "match":
         try:
             beta, alpha = (float(part) for part in rest.split(":")) if rest else (None, None)
         except ValueError:
             raise InputError(f"--target '{text}'", TARGET) from None
-        return Target(kind, own, (beta, alpha) if rest else None)
+        return Target(kind, own_plane, (beta, alpha) if rest else None)
     # The Greek letter mu and the micro sign look alike.
     parts = re.fullmatch(r"\s*([-+0-9.eE]+)\s*([a-zµ]+)\s*", rest.replace("\u03bc", "\u00b5"))
     try:
-        return Target(kind, own, float(parts[1]) * UNITS[kind][parts[2]])
+        return Target(kind, own_plane, float(parts[1]) * UNITS[kind][parts[2]])
     except (TypeError, ValueError, KeyError):
         expected = f"a number with a unit: {', '.join(UNITS[kind])}"
         raise InputError(f"--target '{text}'", expected) from None

@@ -1,4 +1,4 @@
-"""Options of several commands, declared once, and the way a command reports and answers."""
+"""Shared options of the commands, and the output of reports and answers."""
 
 from __future__ import annotations
 
@@ -26,16 +26,18 @@ if TYPE_CHECKING:
     from beamfit.sampling.posterior import Posterior
 
 
-# Commands that say themselves how they stand, or answer at once.
-TALKING = ("batch", "check", "scan", "watch")
-# Seconds after which a reader wonders if anything goes on, and between two looks at the clock.
-QUIET, EVERY = 3.0, 0.5
+# Commands that show their own progress, or answer at once.
+WITH_PROGRESS = ("batch", "check", "scan", "watch")
+# Seconds before the elapsed time is shown, and between its updates: chosen to be noticed by a user
+# who would otherwise wonder whether the command still runs.
+SHOW_AFTER = 3.0
+UPDATE_EVERY = 0.5
 
 
-class Waiting:
-    """A line on standard error that counts seconds, until `end`; none where nobody looks.
+class ElapsedTime:
+    """Line on standard error that counts seconds until `end`; only on a terminal.
 
-    A step of JAX or a search tells no share of its work: what can be told honestly is the time.
+    Compilation and searches do not report their progress, so only the elapsed time is shown.
     """
 
     def __init__(self, name: str) -> None:
@@ -46,29 +48,29 @@ class Waiting:
 
     def _count(self) -> None:
         began, shown = time.monotonic(), False
-        while not self.over.wait(EVERY):
-            if (seconds := time.monotonic() - began) > QUIET:
+        while not self.over.wait(UPDATE_EVERY):
+            if (seconds := time.monotonic() - began) > SHOW_AFTER:
                 click.echo(f"\r{self.name}: {seconds:.0f} s ...\033[K", err=True, nl=False)
                 shown = True
         if shown:
             click.echo("\r\033[K", err=True, nl=False)
 
     def end(self) -> None:
-        """Take the line away: an answer, an error or another progress bar comes."""
+        """Remove the line before an answer, an error or another progress bar."""
         self.over.set()
         if self.thread is not None:
             self.thread.join()
 
 
-def ended() -> None:
-    """End the wait of the running command, if it has one."""
+def end_elapsed_time() -> None:
+    """Remove the line with the elapsed time of the running command, if there is one."""
     context = click.get_current_context(silent=True)
-    if context is not None and isinstance(context.obj, Waiting):
+    if context is not None and isinstance(context.obj, ElapsedTime):
         context.obj.end()
 
 
 class _Option(click.Option):
-    """An option that is listed under a heading of the help text."""
+    """Option listed under a heading of the help text."""
 
     def __init__(self, *names: Any, heading: str = "", **further: Any) -> None:
         super().__init__(*names, **further)
@@ -76,23 +78,23 @@ class _Option(click.Option):
 
 
 class Command(click.Command):
-    """A command whose help lists options under headings, in the order in which these come.
+    """Command whose help lists options under headings, in their order of appearance.
 
-    Its function takes --json, --report and --full as one ``output``, an `Output`.
+    Its function receives --json, --report and --full as one argument ``output``, an `Output`.
     """
 
     def invoke(self, ctx: click.Context) -> Any:
-        """Run the command; where it is silent for long, count the seconds."""
+        """Run the command and show the elapsed time if it takes long."""
         given = {n: ctx.params.pop(n) for n in Output._fields if n in ctx.params}
         ctx.params["output"] = Output(**given)
-        ctx.obj = None if self.name in TALKING else Waiting(f"beamfit {self.name}")
+        ctx.obj = None if self.name in WITH_PROGRESS else ElapsedTime(f"beamfit {self.name}")
         try:
             return super().invoke(ctx)
         finally:
-            ended()
+            end_elapsed_time()
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """Write a section for every heading."""
+        """Write one section per heading."""
         sections: dict[str, list[tuple[str, str]]] = {}
         for each in self.get_params(ctx):
             record = each.get_help_record(ctx)
@@ -112,10 +114,10 @@ def option(
     heading: str = "",
     **further: Any,
 ) -> Callable[..., Any]:
-    """An option as it is typed, with what stands behind it, and what it means; defaults are shown.
+    """Make an option from its text such as ``--store FILE.h5`` and its help; defaults are shown.
 
-    `name` is that of the command's argument where it is another one than the option's, `heading`
-    what the help text lists it under.
+    `name` is the argument name of the command if it differs from the option, `heading` the section
+    of the help text.
     """
     flag, _, metavar = spelled.partition(" ")
     further |= {"cls": _Option, "heading": heading or HEADINGS.get(flag, "")}
@@ -124,26 +126,26 @@ def option(
     return click.option(*filter(None, (flag, name)), help=said, **further)
 
 
-def _parsed(read: Callable[[Any], Any]) -> Callable[..., Any]:
-    """Have click give a command what a reader of the library makes of the text."""
+def _parser(read: Callable[[Any], Any]) -> Callable[..., Any]:
+    """Make a click callback that parses the text of an option with a function of the library."""
     return lambda context, parameter, value: None if value is None else read(value)
 
 
-def _report(path: str) -> str:
-    """Find out before anything is computed whether the report could be written."""
+def _check_report(path: str) -> str:
+    """Check before a calculation that the report can be written."""
     kind_of(path)
     check_place(path)
     return path
 
 
-# What the help text lists shared options under.
+# Headings of the help text by option.
 HEADINGS = {
-    **dict.fromkeys(("--columns", "--ignore", "--skip-bad", "--size-method"), "What is read"),
-    **dict.fromkeys(("--lattice", "--use", "--from", "--to", "--screen", "--energy"), "The line"),
-    **dict.fromkeys(("--particle", "--ring"), "The line"),
+    **dict.fromkeys(("--columns", "--ignore", "--skip-bad", "--size-method"), "Input"),
+    **dict.fromkeys(("--lattice", "--use", "--from", "--to", "--screen", "--energy"), "Lattice"),
+    **dict.fromkeys(("--particle", "--ring"), "Lattice"),
     **dict.fromkeys(("--noise", "--robust", "--weights", "--method"), "Noise and residual"),
-    **dict.fromkeys(("--scenario", "--prior", "--bounds", "--gain", "--anchor"), "What is unknown"),
-    **dict.fromkeys(("--hidden", "--starts", "--hysteresis", "--systematics"), "What is unknown"),
+    **dict.fromkeys(("--scenario", "--prior", "--bounds", "--gain", "--anchor"), "Unknowns"),
+    **dict.fromkeys(("--hidden", "--starts", "--hysteresis", "--systematics"), "Unknowns"),
     **dict.fromkeys(("--sample", "--store", "--seed"), "Posterior"),
     **dict.fromkeys(("--report", "--full", "--json"), "Output"),
 }
@@ -152,10 +154,10 @@ SHARED: dict[str, Callable[..., Any]] = {
     "scan": click.argument("scan"),
     "columns": option(
         "--columns HEADER=NAME,...|LAYOUT.toml",
-        "Meaning of columns whose headers do not say it, such as 'xrms=size_x_um, "
-        "QUAD:BACT=Q525_kG'; or a file of such a layout; or day-month-year, for numeric dates. "
-        "Other columns of unknown names are ignored.",
-        callback=_parsed(layout_of),
+        "Meaning of columns with other headers, such as 'xrms=size_x_um, QUAD:BACT=Q525_kG'; or a "
+        "file of such a layout; or day-month-year, for numeric dates. Other columns with unknown "
+        "names are ignored.",
+        callback=_parser(layout_of),
     ),
     "ignore": option(
         "--ignore COLUMN",
@@ -164,7 +166,7 @@ SHARED: dict[str, Callable[..., Any]] = {
     ),
     "skip-bad": option(
         "--skip-bad",
-        "Leave out rows of the scan with something wrong in them; they are counted and named.",
+        "Leave out rows with an error; they are counted and named.",
         is_flag=True,
     ),
     "lattice": option("--lattice FILE", LATTICE, required=True),
@@ -174,12 +176,12 @@ SHARED: dict[str, Callable[..., Any]] = {
     ),
     "noise": option(
         "--noise FILE",
-        "TOML file of the laboratory's own priors on the noise of sizes; `beamfit batch "
-        "--learn-noise` writes one.",
+        "TOML file of your own priors on the noise of sizes; `beamfit batch --learn-noise` writes "
+        "one.",
     ),
     "weights": option(
         "--weights",
-        "Take the error of size squared at the model's or the measured size; the latter is biased.",
+        "Error of size squared from the model or the measured size; the latter is biased.",
         choices=["model", "measured"],
         default="model",
     ),
@@ -197,53 +199,52 @@ SHARED: dict[str, Callable[..., Any]] = {
     ),
     "energy": option(
         "--energy MEV",
-        "Total energy, instead of the lattice's own; elegant files and scans without a "
-        "lattice have none.",
+        "Total energy, instead of that of the lattice; elegant files and scans without a lattice "
+        "have none.",
         type=float,
     ),
     "scenario": option(
         "--scenario",
-        "Unknown besides the beam: nothing, R11 and R12, the magnets' calibration, "
+        "Unknown in addition to the beam: nothing, R11 and R12, the calibration of the magnets, "
         "or k1 as a function of the current.",
         choices=list(SCENARIOS),
         default="known",
     ),
     "prior": option(
         "--prior NAME=MEAN+-SD",
-        "What is known of a number: of a calibration, Q2.slope=167.23+-3.3446 (or ±); of screen, "
-        "beam and line, size_scale=1+-2%.",
+        "Prior of a parameter: of a calibration, Q2.slope=167.23+-3.3446 (or ±); of screen, beam "
+        "and line, size_scale=1+-2%.",
         name="priors",
         multiple=True,
-        callback=_parsed(priors_of),
+        callback=_parser(priors_of),
     ),
     "scale-prior": option(
         "--prior NAME=MEAN+-SD",
-        "With --study: what is known of a scale, or rf_voltage=1+-1% for the calibration of that "
-        "reading.",
+        "With --study: prior of a scale, or rf_voltage=1+-1% for the calibration of that reading.",
         name="priors",
         multiple=True,
-        callback=_parsed(priors_of),
+        callback=_parser(priors_of),
     ),
     "bounds": option(
         "--bounds NAME=LOW:HIGH",
-        "Calibration: bounds of a number; default: ± 12 % of the slope. Transport "
-        "network: of the beam, x.sigma11=2e-8:3e-8 (SI), or of a setting the gains are held over.",
+        "Calibration: bounds of a parameter; default: ± 12 % of the slope. Transport network: "
+        "bounds of the beam, x.sigma11=2e-8:3e-8 (SI), or range of a setting for limits of gains.",
         multiple=True,
-        callback=_parsed(bounds_of),
+        callback=_parser(bounds_of),
     ),
     "gain": option(
         "--gain NAME=LOW:HIGH",
         "Transport network: limits of a gain such as dA_x/dQ2=:-0.0083, in place of signs.",
         name="gains",
         multiple=True,
-        callback=_parsed(gains_of),
+        callback=_parser(gains_of),
     ),
     "anchor": option(
         "--anchor ANCHOR",
-        "Networks: their tie to the lattice: first-principles=2%, a setting such as "
-        "Q2=0, or determinant.",
+        "Networks: prior from the lattice: first-principles=2%, a setting such as Q2=0, or "
+        "determinant.",
         multiple=True,
-        callback=_parsed(anchor_of),
+        callback=_parser(anchor_of),
     ),
     "hidden": option("--hidden", "Networks: hidden nodes.", default=5),
     "vary": option(
@@ -251,7 +252,7 @@ SHARED: dict[str, Callable[..., Any]] = {
         "A magnet or a knob and its limits, in the unit of its calibration or column.",
         name="limits",
         multiple=True,
-        callback=_parsed(limits_of),
+        callback=_parser(limits_of),
     ),
     "model": option(
         "--model",
@@ -268,26 +269,28 @@ SHARED: dict[str, Callable[..., Any]] = {
     ),
     "map": option(
         "--map",
-        "Parameters are numbers, or change with the inputs by a network.",
+        "Parameters are constants, or functions of the inputs given by a network.",
         choices=["constant", "network"],
         default="constant",
     ),
-    "input": option("--input COLUMN", "An input of any name.", name="inputs", multiple=True),
-    "output": option("--output COLUMN", "An output of any name.", name="outputs", multiple=True),
-    "step": option("--step SECONDS", "Distance of rows without a time.", type=float),
+    "input": option("--input COLUMN", "Column of an input.", name="inputs", multiple=True),
+    "output": option("--output COLUMN", "Column of an output.", name="outputs", multiple=True),
+    "step": option("--step SECONDS", "Time between rows of a file without times.", type=float),
     "delay": option("--delay SAMPLES", "Known delay; default: fitted.", type=float),
-    "no-offset": option("--no-offset", "The output at rest is 0, and not estimated.", is_flag=True),
-    "goal": option("--goal PERCENT", "Emittance error to stop at.", callback=_parsed(goal_of)),
+    "no-offset": option("--no-offset", "Set the output at rest to 0.", is_flag=True),
+    "goal": option(
+        "--goal PERCENT", "Emittance error at which to stop.", callback=_parser(goal_of)
+    ),
     "close": option(
         "--close PERCENT",
         "Stop when the best setting is this close to the minimum with 95 % probability.",
-        callback=_parsed(goal_of),
+        callback=_parser(goal_of),
         default="5%",
     ),
     "report": option(
         "--report FILE.html|.pdf|.png|.svg",
         "Write a report page, or (.png, .svg) its pictures one by one.",
-        callback=_parsed(_report),
+        callback=_parser(_check_report),
     ),
     "sample": option(
         "--sample",
@@ -296,15 +299,15 @@ SHARED: dict[str, Callable[..., Any]] = {
     ),
     "store": option(
         "--store FILE.h5",
-        "Keep the draws of --sample (emcee's HDF5 layout); goes on from an earlier run.",
+        "Keep the draws of --sample (HDF5 layout of emcee); continues an earlier run.",
     ),
     "seed": option(
         "--seed",
-        "Of all random numbers: draws, starts of networks.",
+        "Seed of all random numbers: draws, starts of networks.",
         type=click.IntRange(0, 2**32 - 1),
         default=1,
     ),
-    "full": option("--full", "Show every table, not the first screen alone.", is_flag=True),
+    "full": option("--full", "Show every table, not only the first screen.", is_flag=True),
     "json": option(
         "--json", "Print one JSON object and nothing else.", name="as_json", is_flag=True
     ),
@@ -312,7 +315,7 @@ SHARED: dict[str, Callable[..., Any]] = {
 
 
 def options(names: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Add shared options to a command, in the order of their names."""
+    """Add shared options to a command, in the given order."""
 
     def add(command: Callable[..., Any]) -> Callable[..., Any]:
         for name in reversed(names.split()):
@@ -330,16 +333,16 @@ class Sampling(NamedTuple):
     seed: int
 
     def check(self) -> None:
-        """Find out before anything is computed whether the store could be written."""
+        """Check before a calculation that the store can be written."""
         if self.store is not None:
             if not self.wanted:
                 raise InputError("--store without --sample", "--sample, which fills the store")
             check_place(self.store)
 
-    def drawn(
+    def sample_all(
         self, fits: Sequence[Any], inputs: Mapping[str, str | None], *, quiet: bool
     ) -> list[Posterior | None]:
-        """The posterior of each fit; None of each where none is wanted."""
+        """Sample the posterior of each fit; None for each without ``--sample``."""
         if not self.wanted:
             return [None for _ in fits]
         if self.store is not None and len(fits) > 1:
@@ -347,22 +350,22 @@ class Sampling(NamedTuple):
             raise InputError(found, "a record of one decay, or no --store")
         from beamfit.sampling.store import Provenance
 
-        ended()  # it has a progress bar of its own
+        end_elapsed_time()  # sampling has its own progress bar
 
         source = Provenance(command_line(), dict(inputs))
-        told = {"seed": self.seed, "store": self.store, "provenance": source}
-        return [fit.sample(**told, progress=not quiet) for fit in fits]
+        arguments = {"seed": self.seed, "store": self.store, "provenance": source}
+        return [fit.sample(**arguments, progress=not quiet) for fit in fits]
 
 
 class Output(NamedTuple):
-    """Values of --json, --report and --full: where an answer goes."""
+    """Values of --json, --report and --full, the destinations of an answer."""
 
     as_json: bool
     report: str | None = None
     full: bool = True
 
     def write(self, result: Any, inputs: Mapping[str, str | None], **further: Any) -> None:
-        """Write the report of a result, if one is wanted."""
+        """Write the report of a result if ``--report`` was given."""
         if self.report is not None:
             further |= {"command": command_line(), "inputs": inputs}
             beamfit.write_report(self.report, result, **further)
@@ -374,12 +377,12 @@ class Output(NamedTuple):
         show: Callable[[Terminal], None] | None = None,
         **further: Any,
     ) -> None:
-        """Print the one JSON object of a command, or show the answer, and where its report is.
+        """Print the JSON object of a command, or show the answer and the path of its report.
 
-        Without ``show`` each result shows itself. Results are asked for if they are printed; what
-        there is ``further`` is named beside them.
+        Without ``show`` each result is shown by its own tables. `results` is evaluated only for
+        JSON or without ``show``; ``further`` entries are added to the JSON object.
         """
-        ended()
+        end_elapsed_time()
         if self.as_json:
             further = {name: found for name, found in further.items() if found is not None}
             click.echo(results_text(list(results), inputs, command_line(), **further))
@@ -396,5 +399,5 @@ class Output(NamedTuple):
 
 
 def command_line() -> str:
-    """The command as it was typed, quoted for a shell."""
+    """Return the command as typed, quoted for a shell."""
     return shlex.join(["beamfit", *sys.argv[1:]])

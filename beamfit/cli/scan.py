@@ -1,4 +1,4 @@
-"""`beamfit scan`: a machine in, a scan measured and a beam out; the magnets as they were."""
+"""`beamfit scan`: measure a scan on a running machine, fit the emittance, restore the magnets."""
 
 from __future__ import annotations
 
@@ -38,11 +38,11 @@ Examples:
 @click.command(cls=Command, epilog=EXAMPLE)
 @click.argument("machine", required=False)
 @option("--dry-run", "Check the machine, print the plan, move nothing.", is_flag=True)
-@option("--recover JOURNAL", "Restore what a scan that was killed has left, and move nothing else.")
+@option("--recover JOURNAL", "Restore the magnets after a killed scan, and move nothing else.")
 @option("--save FILE.csv", "File of the scan; default: NAME_DATE_TIME.csv.")
-@option("--journal FILE", "Where what is to be restored stands; beside MACHINE unless.")
+@option("--journal FILE", "File with the settings to restore; default: next to MACHINE.")
 @options("goal")
-@option("--points", "Most settings.", type=click.IntRange(4, 200))
+@option("--points", "Largest number of settings.", type=click.IntRange(4, 200))
 @options("report json")
 def scan(
     machine: str | None,
@@ -54,34 +54,33 @@ def scan(
     points: int | None,
     output: Output,
 ) -> int:
-    """Scan a machine's quadrupoles and fit the emittance, choosing each setting by what it tells.
+    """Scan the quadrupoles of a machine, choosing the most informative settings, and fit.
 
     MACHINE is a TOML file (docs/live.md) that names the variables of the magnets and the screen,
-    and their limits. With knobs in it, the setting of the lowest emittance is searched. The magnets
-    are put back whatever ends the scan. Needs beamfit[live].
+    and their limits. If it has knobs, the setting of the lowest emittance is searched. The magnets
+    are restored in every case. Needs beamfit[live].
     """
     if (machine is None) == (recover is None):
         raise InputError("both or neither of MACHINE and --recover", "one of them")
-    say = _Lines(err=output.as_json)
+    say = _ProgressLines(err=output.as_json)
     if recover is not None:
         if dry_run or save or journal or goal or points or output.report:
             raise InputError("--recover with an option of a scan", "--recover JOURNAL alone")
-        return _recovered(recover, say, output.as_json)
-    wanted = {"goal": goal, "points": points}
-    told = replace(read_scan_machine(machine), **{k: v for k, v in wanted.items() if v})
+        return _recover(recover, say, output.as_json)
+    given = {"goal": goal, "points": points}
+    plan = replace(read_scan_machine(machine), **{k: v for k, v in given.items() if v})
 
     from beamfit.live.channel import run
     from beamfit.live.restore import journal_of
 
-    place = journal_of(told, journal)
     if dry_run:
-        return run(_planned(told, place, output.as_json))
-    target = Path(save or time.strftime(f"{_word(told.name)}_%Y%m%d_%H%M%S.csv"))
-    found = beamfit.scan_machine(told, target, journal=journal, tell=say.told, note=say)
-    return _answered(found, told, target, output)
+        return run(_show_plan(plan, journal_of(plan, journal), output.as_json))
+    target = Path(save or time.strftime(f"{_file_name(plan.name)}_%Y%m%d_%H%M%S.csv"))
+    found = beamfit.scan_machine(plan, target, journal=journal, tell=say.progress, note=say)
+    return _answer(found, plan, target, output)
 
 
-class _Lines:
+class _ProgressLines:
     """Progress of a scan: a line for each point, with normalised emittances."""
 
     def __init__(self, err: bool) -> None:
@@ -89,14 +88,14 @@ class _Lines:
 
     def __call__(self, text: str) -> None:
         for err in dict.fromkeys((self.err, True)):
-            with suppress(OSError):  # nobody reads it any more, which ends no scan
+            with suppress(OSError):  # a closed output does not end a scan
                 click.echo(plain(text), err=err)
                 return
             self.err = True
 
-    def told(self, now: ScanProgress) -> None:
-        """A new point with what is known after it, or what else is new."""
-        from beamfit.live.aims import FEWEST
+    def progress(self, now: ScanProgress) -> None:
+        """Print a new point with the present result, or another event."""
+        from beamfit.live.aims import MIN_POINTS
 
         if not now.measured:
             self(now.news)
@@ -105,12 +104,12 @@ class _Lines:
         last = now.points[-1]
         at = ", ".join(f"{name} {value:.4g}" for name, value in last.settings.items())
         sizes = ", ".join(f"{p} {1e6 * median(s):.1f} um" for p, s in last.shots.items())
-        known = ", ".join(_known(fit)) if fit and count >= FEWEST else ""
-        self(f"{count:3d}  {at:<12}  {sizes:<26}  {known}".rstrip())
+        result = ", ".join(_result_words(fit)) if fit and count >= MIN_POINTS else ""
+        self(f"{count:3d}  {at:<12}  {sizes:<26}  {result}".rstrip())
 
 
-def _known(fit: EmittanceFit | TuningFit) -> Iterator[str]:
-    """Present knowledge of each plane's emittance, or of the best setting, in a few words."""
+def _result_words(fit: EmittanceFit | TuningFit) -> Iterator[str]:
+    """Describe the emittance of each plane, or the best setting, in a few words."""
     from beamfit.emittance.fit import EmittanceFit
 
     if not isinstance(fit, EmittanceFit):
@@ -124,11 +123,11 @@ def _known(fit: EmittanceFit | TuningFit) -> Iterator[str]:
             yield f"{plane.plane}: {plane.normalized_emittance}{sure}"
 
 
-async def _planned(machine: ScanMachine, journal: Path, as_json: bool) -> int:
-    """Check that the machine answers, and say what a scan would do."""
+async def _show_plan(machine: ScanMachine, journal: Path, as_json: bool) -> int:
+    """Check that the machine answers, and print the plan of the scan."""
     from beamfit.live.aims import first_settings
     from beamfit.live.devices import connect
-    from beamfit.live.restore import named
+    from beamfit.live.restore import settings_words
 
     at = await connect(machine)
     before = [(m, await at.magnets[m.name].get()) for m in at.machine.magnets]
@@ -160,22 +159,22 @@ async def _planned(machine: ScanMachine, journal: Path, as_json: bool) -> int:
     begin = f"{machine.magnets[0].name} at {values}"
     until = f"the emittances are known to {goal}"
     if machine.knobs:
-        begin = f"rows that fill the limits of {', '.join(m.name for m in machine.magnets)}"
+        begin = f"rows spread over the limits of {', '.join(m.name for m in machine.magnets)}"
         until = f"the best setting of {', '.join(machine.knobs)} is within {goal} of the minimum"
-    click.echo(f"First {begin}; then where it tells most.")
+    click.echo(f"First {begin}; then the most informative settings.")
     click.echo(
         f"{machine.screen.shots} shots on {machine.screen.name} at each, at most {machine.points} "
         f"settings, or until {until}."
     )
-    click.echo(f"At the end back to {named(before)}; until then that stands in {journal}.")
+    click.echo(f"Restored at the end: {settings_words(before)}. Until then it is in {journal}.")
     for line in (*at.notes, *([f"Now: {plan['amiss']}."] if plan["amiss"] else [])):
         click.echo(plain(line))
     click.echo("Nothing was moved.")
     return 0
 
 
-def _answered(found: Outcome, machine: ScanMachine, out: Path, output: Output) -> int:
-    """Answer as `beamfit emittance` would for the file, and say how the scan ended."""
+def _answer(found: Outcome, machine: ScanMachine, out: Path, output: Output) -> int:
+    """Print the answer of `beamfit emittance` for the file, and how the scan ended."""
     from beamfit.cli.emittance import results_of, show
     from beamfit.cli.tune import show_tuning
 
@@ -212,10 +211,11 @@ def _answered(found: Outcome, machine: ScanMachine, out: Path, output: Output) -
     return 128 + found.signal if found.signal else 0
 
 
-def _recovered(journal: str, say: _Lines, as_json: bool) -> int:
+def _recover(journal: str, say: _ProgressLines, as_json: bool) -> int:
+    """Restore the magnets of a journal."""
     from beamfit.live.channel import run
     from beamfit.live.devices import supply_of
-    from beamfit.live.restore import alone_with, named, read_journal, restore
+    from beamfit.live.restore import alone_with, read_journal, restore, settings_words
 
     left = read_journal(journal)
     found = digest(journal)
@@ -231,7 +231,7 @@ def _recovered(journal: str, say: _Lines, as_json: bool) -> int:
         settings = {m.name: {"value": v, "unit": m.unit} for m, v in left.before}
         click.echo(results_text([{"restored": settings}], {journal: found}, command_line()))
     else:
-        say(f"Restored and read back: {named(left.before)}. {journal} is removed.")
+        say(f"Restored and read back: {settings_words(left.before)}. {journal} is removed.")
     return 0
 
 
@@ -239,6 +239,6 @@ def _inputs(machine: ScanMachine) -> dict[str, str | None]:
     return {machine.path: machine.sha256, str(machine.lattice.path): machine.lattice.sha256}
 
 
-def _word(name: str) -> str:
-    """A name that a file can have."""
+def _file_name(name: str) -> str:
+    """Make a name valid as a file name."""
     return "".join(c if c.isalnum() else "_" for c in name)[:40]

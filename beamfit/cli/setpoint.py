@@ -1,4 +1,4 @@
-"""`beamfit setpoint`: a beam, a lattice and targets in, the best magnet settings out."""
+"""`beamfit setpoint`: the best magnet settings for a beam, a lattice and targets."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ Examples:
     multiple=True,
 )
 @option(
-    "--plane", "Plane of --sigma and of targets that name none.", choices=["x", "y"], default="x"
+    "--plane", "Plane of --sigma and of targets without a plane.", choices=["x", "y"], default="x"
 )
 @options("json")
 def setpoint(
@@ -62,9 +62,9 @@ def setpoint(
     output: Output,
     **part: Any,
 ) -> None:
-    """Find the magnet settings that bring the beam nearest to a wanted size and divergence.
+    """Find the magnet settings that bring the beam closest to a wanted size and divergence.
 
-    The search is global within the limits: local minima are listed, not mistaken for the answer.
+    The search is global within the limits; local minima are listed.
     """
     if (sigma is None) == (fitted is None):
         said = "neither --sigma nor --fit" if sigma is None else "both --sigma and --fit"
@@ -75,16 +75,16 @@ def setpoint(
     described = read_lattice(lattice, **part)
     described.check_magnets(limits)
     if fitted is None:
-        beams = _given(sigma, plane)
+        beams = _beam_of_sigma(sigma, plane)
     else:
-        beams = _fitted(fitted, described, targets, part["energy"])
+        beams = _beams_of_fit(fitted, described, targets, part["energy"])
     line = build_line(described)  # JAX from here on
     found = beamfit.find_setpoint(line, beams, limits, targets, screen=part["screen"])
     inputs = {path: digest(path) for path in (lattice, fitted) if path is not None}
     output.answer([found], inputs, lambda terminal: _show(terminal, found))
 
 
-def _given(sigma: str | None, plane: str) -> dict[str, Beam]:
+def _beam_of_sigma(sigma: str | None, plane: str) -> dict[str, Beam]:
     """Read --sigma."""
     try:
         numbers = [float(part) for part in (sigma or "").split(",")]
@@ -95,10 +95,10 @@ def _given(sigma: str | None, plane: str) -> dict[str, Beam]:
     return {plane: Beam(np.array(numbers))}
 
 
-def _fitted(
+def _beams_of_fit(
     path: str, lattice: LatticeFile, targets: Sequence[Target], energy: float | None
 ) -> dict[str, Beam]:
-    """Read --fit, and refuse before JAX is loaded what was measured at another energy."""
+    """Read --fit, and refuse a beam measured at another energy before JAX is loaded."""
     beams = read_fitted_beams(path, lattice.rest_energy, lattice.sha256)
     asked_for = {t.plane for t in targets}
     with located(path):

@@ -1,4 +1,4 @@
-"""Results on a terminal: tables with coloured statuses, verdicts, posteriors. Loaded with rich."""
+"""Results on a terminal: tables with coloured statuses, verdicts, posteriors. Imports rich."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ def _style(status: Status) -> str:
     return f"bold {status.colour}"
 
 
-def laid_out(table: Table, statuses: Sequence[Status] = ()) -> RichTable:
-    """A table as rich has it."""
+def rich_table(table: Table, statuses: Sequence[Status] = ()) -> RichTable:
+    """Convert a table to one of rich; the first row is coloured by the statuses."""
     rich = RichTable(
         title=table.title,
         title_justify="left",
@@ -32,7 +32,7 @@ def laid_out(table: Table, statuses: Sequence[Status] = ()) -> RichTable:
         pad_edge=False,
         header_style="bold",
     )
-    # Nothing is cut short: what is too wide goes on in the next line, labels before numbers.
+    # Nothing is truncated: wide cells are folded, labels before numbers.
     for i, name in enumerate(table.header):
         side = "right" if table.numeric and i else "left"
         rich.add_column(name, overflow="fold", justify=side)
@@ -44,7 +44,7 @@ def laid_out(table: Table, statuses: Sequence[Status] = ()) -> RichTable:
 
 
 class _Console(Console):
-    """Obeys nothing that a file says; where the reader has seen enough, the command says so."""
+    """Console that escapes control characters from files, and raises on a closed pipe."""
 
     def render(self, *arguments: Any, **options: Any) -> Iterator[Segment]:
         for each in super().render(*arguments, **options):
@@ -55,33 +55,33 @@ class _Console(Console):
 
 
 class Terminal:
-    """The screen a command answers on: all of the answer, or its first screen."""
+    """Terminal output of a command: the whole answer, or its first screen."""
 
     def __init__(self, full: bool = True) -> None:
         self.full = full
-        # Names are shown as they are: a bracket in one is not a style.
+        # No markup: a bracket in a name is not a style.
         self.console = _Console(highlight=False, markup=False)
 
     def line(self, text: str = "", style: str = "") -> None:
-        """Say a line."""
+        """Print a line."""
         self.console.print(text, style=style or None)
 
     def table(self, table: Table, statuses: Sequence[Status] = ()) -> None:
-        """Lay out a table; its first row has a colour where it is the results' statuses."""
-        self.console.print(laid_out(table, statuses))
+        """Print a table, with its first row coloured by the statuses."""
+        self.console.print(rich_table(table, statuses))
 
     def verdict(self, name: str, status: Status, message: str) -> None:
-        """Say a verdict in its colour."""
+        """Print a verdict in its colour."""
         text = Text(f"\n{name}: ", style=_style(status))
         self.console.print(text.append(message, style="default not bold"))
 
     def answer(self, headline: str, status: Status, message: str) -> None:
-        """Say what was found, in the colour of its status, and how far to believe it."""
+        """Print a headline in the colour of its status, and the message."""
         text = Text(f"\n{headline}. ", style=_style(status))
         self.console.print(text.append(message, style="default not bold"))
 
     def result(self, found: Any) -> None:
-        """Say a result: its verdict, what is odd about its input, and every table."""
+        """Print a result: verdict, notes and all tables."""
         self.answer(found.headline, found.status, found.message)
         for note in found.notes:
             self.line(note)
@@ -90,24 +90,24 @@ class Terminal:
             self.table(table)
 
     def posterior(self, title: str, posterior: Posterior) -> None:
-        """Show intervals, verdict and diagnostics."""
+        """Print intervals, verdict and diagnostics of a posterior."""
         self.table(posterior.table()._replace(title=f"\n{title}"))
         self.verdict("posterior", posterior.status, posterior.message)
 
     def tables(self, tables: Iterable[Table]) -> None:
-        """Lay out tables, a blank line behind each."""
+        """Print tables, each followed by a blank line."""
         for table in tables:
             self.table(table)
             self.line()
 
     def rest(self, columns: str = "tables") -> None:
-        """Say how to see what the first screen leaves out, where it is one."""
+        """Print a hint to `--full` and `--report` after a first screen."""
         if not self.full:
             page = "A page with pictures: --report FILE.html."
             self.line(f"All {columns}: --full. {page}", style="dim")
 
     def report(self, path: str | None) -> None:
-        """Say where the report is, if there is one."""
+        """Print the path of the report, if there is one."""
         if path is not None:
             several = f"Pictures written: {Path(path).stem}*{Path(path).suffix}"
             page = f"Report written to {path}"

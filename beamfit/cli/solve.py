@@ -1,4 +1,4 @@
-"""`beamfit solve`: a formulation as text in, its solution explained."""
+"""`beamfit solve`: solve a formulation given as text."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ Examples:
   beamfit solve formulations/figure_3.xml --set x1=0.5 --set x2=2 --set x3=1 --set x4=1 \\
       --derivative dy5/dx4
 """
-# As `beamfit.greybox.solve.solve` calls them; told here so that help needs no JAX.
+# Names of `beamfit.greybox.solve.solve`, repeated here so that help does not import JAX.
 SOLVERS = ["levenberg-marquardt", "filtersqp", "ipopt", "slsqp"]
 COUNT = re.compile(r"[1-9]\d{0,5}")
 
@@ -35,32 +35,30 @@ COUNT = re.compile(r"[1-9]\d{0,5}")
 @click.argument("document")
 @option(
     "--data NAME=FILE",
-    "File of a data table; the document's own, beside it by default.",
+    "File of a data table; default: the file named in the document, next to it.",
     multiple=True,
 )
 @option(
     "--set NAME=NUMBERS",
-    "Value of an input: one number, or all of an array with commas, row by row. Of a variable it "
-    "is where the search starts.",
+    "Value of an input: one number, or a whole array with commas, row by row. For a variable it is "
+    "the start of the search.",
     "values",
     multiple=True,
 )
 @option(
     "--derivative dY/dX",
-    "A gain to print too: the derivative of an output by an input.",
+    "A gain to print: the derivative of an output with respect to an input.",
     "derivatives",
     multiple=True,
 )
 @option(
     "--start seeds|N",
-    "One search from the document's seeds, or N: from there and from random numbers.",
+    "One search from the seeds of the document, or N: further ones from random points.",
     default="seeds",
 )
-@option("--solver", "The solver to use; by default all that suit, in turn.", choices=SOLVERS)
-@option("--tolerance X", "Within which a limit is reached and a point an optimum.", type=float)
-@option(
-    "--within S", "Seconds at most: limit of time of the search, compilation included.", type=float
-)
+@option("--solver", "The solver to use; default: all suitable ones in turn.", choices=SOLVERS)
+@option("--tolerance X", "Tolerance of limits and of optimality.", type=float)
+@option("--within S", "Time limit of the search in seconds, including compilation.", type=float)
 @options("report json")
 def solve(
     document: str,
@@ -69,19 +67,19 @@ def solve(
     derivatives: tuple[str, ...],
     start: str,
     output: Output,
-    **told: Any,
+    **arguments: Any,
 ) -> None:
     """Solve a formulation: a constrained problem as text (.bf) or the report's XML.
 
-    Variables come with bounds, states and reduced gradients, constraints with multipliers; errors
-    where the objective is a sum of squares. A mapping without an objective is computed.
+    Variables have bounds, states and reduced gradients, constraints have multipliers; there are
+    errors if the objective is a sum of squares. A mapping without an objective is evaluated.
     """
     if start != "seeds" and not COUNT.fullmatch(start):
         raise InputError(f"--start '{start}'", "seeds, or a number of starts from 1 to 999999")
     for name in ("tolerance", "within"):
-        if told[name] is not None and not 0 < told[name] < math.inf:
-            raise InputError(f"--{name} {told[name]:g}", "a number above 0")
-    told["seconds"] = told.pop("within")
+        if arguments[name] is not None and not 0 < arguments[name] < math.inf:
+            raise InputError(f"--{name} {arguments[name]:g}", "a number above 0")
+    arguments["seconds"] = arguments.pop("within")
     tables = named_of(data, "data", "NAME=FILE")
     numbers = {
         name: _numbers(name, text) for name, text in named_of(values, "set", "NAME=NUMBER").items()
@@ -91,9 +89,9 @@ def solve(
 
     formulation = read_formulation(document)
     numbers_of, files = read_tables(formulation, document, tables)
-    told |= {"starts": starts, "values": numbers, "derivatives": derivatives}
+    arguments |= {"starts": starts, "values": numbers, "derivatives": derivatives}
     with located(document):
-        found = beamfit.solve(formulation, numbers_of, **told)
+        found = beamfit.solve(formulation, numbers_of, **arguments)
     inputs = {path: digest(path) for path in (document, *files.values())}
     output.write(found, inputs)
     output.answer([found], inputs, lambda terminal: _show(terminal, found))
@@ -119,6 +117,6 @@ def _show(terminal: Terminal, found: ProblemSolution | Computed) -> None:
         terminal.line()
     terminal.tables(found.tables())
     if isinstance(found, ProblemSolution):
-        asked = found.made.document.solver
-        said = f"Solver: {found.solver}" + (f" (asked for: {asked.name})" if asked else "")
+        requested = found.made.document.solver
+        said = f"Solver: {found.solver}" + (f" (asked for: {requested.name})" if requested else "")
         terminal.line(said, style="dim")

@@ -1,4 +1,4 @@
-"""`beamfit tune`: sizes at settings of knobs in, the setting of the lowest emittance out."""
+"""`beamfit tune`: the knob setting of the lowest emittance, from sizes at settings of knobs."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ Examples:
 @click.command(cls=Command, epilog=EXAMPLE)
 @click.argument("table")
 @options("columns ignore skip-bad maybe-lattice use from to screen energy particle vary")
-@option("--goal", "What is to be low; emittance is the mean of x and y.", choices=GOALS,
+@option("--goal", "Quantity to minimise; emittance is the mean of x and y.", choices=GOALS,
         default=GOALS[0])  # fmt: skip
 @options("close noise seed report json")
 def tune(
@@ -44,11 +44,11 @@ def tune(
     skip_bad: bool,
     **part: Any,
 ) -> None:
-    """Find the setting of the knobs at which the emittance is lowest, and the next row to measure.
+    """Find the knob setting with the lowest emittance, and the next row to measure.
 
-    TABLE is a scan with columns of knobs beside quadrupoles and sizes: Q2_A, SOL_A, phase_deg,
-    size_x_um, ... Rows stand in any order; no setting of the knobs needs a whole scan. Or it has
-    finished emittances, emittance_x_um and emittance_x_error_um: these need no lattice.
+    TABLE is a scan with columns of knobs in addition to quadrupoles and sizes: Q2_A, SOL_A,
+    phase_deg, size_x_um, ... Rows may be in any order; no knob setting needs a whole scan. Or it
+    has finished emittances, emittance_x_um and emittance_x_error_um: these need no lattice.
     """
     if not limits:
         raise InputError("no --vary", "NAME=LOW:HIGH such as SOL=190:210")
@@ -74,7 +74,7 @@ def tune(
 
 
 def show_tuning(terminal: Terminal, fit: TuningFit) -> None:
-    """Say the verdict first, then the best setting and the next row."""
+    """Show the verdict, the best setting and the next row."""
     terminal.result(fit)
     terminal.line()
     terminal.line(fit.next_words)

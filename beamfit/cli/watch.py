@@ -1,4 +1,4 @@
-"""`beamfit watch`: a machine in, a lifetime watched; shown, served, and nothing written."""
+"""`beamfit watch`: follow the lifetime of a running machine, without writing to it."""
 
 from __future__ import annotations
 
@@ -31,38 +31,40 @@ Examples:
 @click.argument("machine")
 @option("--seconds", "Duration; default: until Ctrl-C.", type=click.FloatRange(0.0))
 @option(
-    "--port", "Of the page; 0 for any that is free.", type=click.IntRange(0, 65535), default=8050
+    "--port", "Port of the page; 0 for any free one.", type=click.IntRange(0, 65535), default=8050
 )
 @option(
     "--bind ADDRESS",
-    "Address to listen on; beyond this computer anybody there can read the page and the "
-    "served variables.",
+    "Address to listen on; on an address other than this computer anybody can read the page and "
+    "the served variables.",
     default="127.0.0.1",
 )
 @options("json")
 def watch(machine: str, seconds: float | None, port: int, bind: str, output: Output) -> int:
-    """Watch the lifetime of a stored beam: how long, a and b, what moved and since when.
+    """Follow the lifetime of a stored beam: its value, a and b, and what changed since when.
 
     MACHINE is a TOML file (docs/live.md) that names the variables of the ring: its current, and
     optionally RF voltage, pressure, bunches, scraper and bunch length. Nothing is written to it.
     The answer is shown here, on a page (--port), and served by PV Access. Needs beamfit[live].
     """
-    told = read_watch_machine(machine)
+    described = read_watch_machine(machine)
 
     from beamfit.live.channel import run
 
-    last, number = run(_watched(told, seconds, bind, port, output.as_json))
-    inputs = {str(path): digest(path) for path in (told.path, told.ring) if path is not None}
+    last, number = run(_run_watch(described, seconds, bind, port, output.as_json))
+    inputs = {
+        str(path): digest(path) for path in (described.path, described.ring) if path is not None
+    }
     output.answer(_results(last), inputs, lambda terminal: terminal.table(_table(last)))
     if number:
         click.echo("beamfit: interrupted", err=True)
     return 128 + number if number else 0
 
 
-async def _watched(
+async def _run_watch(
     machine: WatchMachine, seconds: float | None, bind: str, port: int, quiet: bool
 ) -> tuple[WatchView, int]:
-    """See that the variables answer, serve, and watch."""
+    """Check that the variables answer, then serve and watch."""
     from beamfit.live.page import page
     from beamfit.live.served import check_unserved, served
     from beamfit.live.watch import connect, watch
@@ -80,28 +82,28 @@ async def _watched(
         if machine.prefix is not None:
             sinks.append(stack.enter_context(served(machine.prefix, bind)))
         if not quiet:
-            sinks.append(stack.enter_context(_terminal()))
-        return await watch(machine, plan, lambda told: [sink(told) for sink in sinks], seconds)
+            sinks.append(stack.enter_context(_live_table()))
+        return await watch(machine, plan, lambda view: [sink(view) for sink in sinks], seconds)
 
 
 @contextmanager
-def _terminal() -> Iterator[Callable[[WatchView], None]]:
-    """A table that lives, or where nobody looks a line for every fit."""
+def _live_table() -> Iterator[Callable[[WatchView], None]]:
+    """Yield a function that updates a live table, or prints one line per fit without a terminal."""
     from rich.live import Live
 
-    from beamfit.cli.show import Terminal, laid_out
+    from beamfit.cli.show import Terminal, rich_table
 
-    terminal, seen = Terminal(), [0.0]
+    terminal, last_fit = Terminal(), [0.0]
     if terminal.console.is_terminal:
         with Live(console=terminal.console, auto_refresh=False, transient=True) as live:
-            yield lambda told: live.update(laid_out(_table(told)), refresh=True)
+            yield lambda view: live.update(rich_table(_table(view)), refresh=True)
         return
 
-    def line(told: WatchView) -> None:
-        answer = told.state.answer
-        if answer is not None and answer.time != seen[0]:
-            seen[0] = answer.time
-            terminal.line(f"{_clock(answer.time)}  {cell(answer.lifetime)}  {told.headline[1]}")
+    def line(view: WatchView) -> None:
+        answer = view.state.answer
+        if answer is not None and answer.time != last_fit[0]:
+            last_fit[0] = answer.time
+            terminal.line(f"{_clock(answer.time)}  {cell(answer.lifetime)}  {view.headline[1]}")
 
     yield line
 
@@ -110,9 +112,9 @@ def _clock(time: float) -> str:
     return datetime.fromtimestamp(time, UTC).strftime("%Y-%m-%d %H:%M:%S")
 
 
-def _table(told: WatchView) -> Table:
-    """Present state of the watch, a line for each quantity."""
-    state, answer = told.state, told.state.answer
+def _table(view: WatchView) -> Table:
+    """Make a table of the present state of the watch."""
+    state, answer = view.state, view.state.answer
     fit = answer and answer.window.fit
     counts = state.counts
     left_out = (
@@ -120,9 +122,9 @@ def _table(told: WatchView) -> Table:
         f"repeated; {counts.gaps} gaps, {counts.clock} times the clock was set back"
     )
     rows = [
-        ("now", told.headline[1]),
+        ("now", view.headline[1]),
         ("last reading", f"{_clock(state.last - state.shift)} UTC" if state.last else "-"),
-        ("newest fitted", "-" if told.age is None else f"{told.age:.0f} s ago"),
+        ("newest fitted", "-" if view.age is None else f"{view.age:.0f} s ago"),
         ("current", f"{state.rows[-1].current:.6g} mA" if state.rows else "-"),
         ("lifetime", cell(answer and answer.lifetime)),
         ("at", f"{fit.mean_current:.4g} mA, the mean of the window" if fit else "-"),
@@ -131,15 +133,15 @@ def _table(told: WatchView) -> Table:
         ("alarm", state.alarm_text()),
         ("readings", left_out),
     ]
-    return Table(told.plan.name, [], rows)
+    return Table(view.plan.name, [], rows)
 
 
-def _results(told: WatchView) -> list[dict[str, Any]]:
-    """Results in the form of `beamfit lifetime --json`, with alarms and counts."""
+def _results(view: WatchView) -> list[dict[str, Any]]:
+    """Make results in the form of `beamfit lifetime --json`, with alarms and counts."""
     from beamfit.lifetime.watch import empty_answer
 
-    state = told.state
+    state = view.state
     answer = state.answer or empty_answer(state)
     more = {"alarm": {"moved": state.alarmed, "text": state.alarm_text()}, "alarms": state.alarms}
-    more |= {"events": state.events, "counts": state.counts, "lost": told.lost}
-    return [{"record": told.plan.name} | answer.to_json() | more]
+    more |= {"events": state.events, "counts": state.counts, "lost": view.lost}
+    return [{"record": view.plan.name} | answer.to_json() | more]

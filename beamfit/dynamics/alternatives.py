@@ -31,7 +31,7 @@ from beamfit.greybox import tree
 from beamfit.greybox.problem import with_slope
 from beamfit.noise.correlated import Whitened, roots_by_each
 from beamfit.noise.memory import CorrelatedNoise
-from beamfit.statistics import OPEN
+from beamfit.statistics import MIN_SINGULAR_VALUE
 
 # Correlation times and white variances of the noises that each is fitted with, and most readings.
 CORRELATION_TIMES, WHITE, MOST = 6, (0.0, 1.0, 10.0, 100.0), 2048
@@ -453,7 +453,9 @@ def _laws_of(runs: Sequence[Run], name: str, way: Way) -> list[InputLaw]:
     same = basis @ (basis.T @ at)
     gain = np.linalg.norm(same, axis=0) / np.linalg.norm(plain - plain.mean())
     # Beside its gain a law hands errors on as they are, outside a dead zone.
-    least = np.maximum(SAME * np.linalg.norm(at, axis=0), OPEN * np.maximum(gain, 1.0) * unsure)
+    least = np.maximum(
+        SAME * np.linalg.norm(at, axis=0), MIN_SINGULAR_VALUE * np.maximum(gain, 1.0) * unsure
+    )
     bends = np.linalg.norm(at - same, axis=0) > least
     return [law for law, own in zip(laws, bends, strict=True) if own]
 

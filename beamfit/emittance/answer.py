@@ -33,7 +33,7 @@ from beamfit.emittance.verdict import (
 from beamfit.errors import Finding, Status
 from beamfit.optics.beamline import Beamline
 from beamfit.quantity import Quantity
-from beamfit.statistics import LEAST_WORTH, Directions, chi2_probability, scaled_directions
+from beamfit.statistics import MIN_EFFECTIVE_DRAWS, Directions, chi2_probability, scaled_directions
 
 SIGMA = slice(4, 7)
 # Normalised emittances in m beyond which only a wrong unit leads: rings and linacs have 1e-9 and
@@ -295,7 +295,7 @@ def _evidence(seen: PreparedScan, plane: str, n: PlaneNumbers, b: BestFit) -> Pl
     e = PlaneEvidence(work.posterior, work.sizes, low, high, waist, *told)
     emittance = float(n.value[1])
     worth = work.posterior.worth
-    if e.determined and worth < LEAST_WORTH and not b.scenario:
+    if e.determined and worth < MIN_EFFECTIVE_DRAWS and not b.scenario:
         opened = f"draws from its posterior are worth no more than {worth:.0f} independent ones"
         return replace(e, opened=opened)
     if not e.determined or LEAST <= emittance <= MOST:

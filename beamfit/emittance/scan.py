@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from beamfit.answer import MOST_ROWS, Table, frame_of, shown
+from beamfit.answer import MAX_ROWS_SHOWN, Table, frame_of, shown
 from beamfit.errors import InputError, expect, nearest
 from beamfit.particles import ENERGY_KEYS, total_energy
 
@@ -251,7 +251,7 @@ class QuadScan:
         for p in self.planes:
             columns[f"size {p} µm"] = 1e6 * self.size[p]
             columns |= {f"error {p} µm": 1e6 * self.error[p]} if p in self.error else {}
-        few = range(min(len(self), MOST_ROWS))
+        few = range(min(len(self), MAX_ROWS_SHOWN))
         rows = [[f"{values[i]:.5g}" for values in columns.values()] for i in few]
         more = f"the first {len(few)} of {len(self)} rows" if len(few) < len(self) else ""
         return (Table(self.headline, list(columns), rows, more, numeric=True),)

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from beamfit.answer import MOST_ROWS, Table, answer
+from beamfit.answer import MAX_ROWS_SHOWN, Table, answer
 from beamfit.compile_cache import SELDOM
 from beamfit.errors import InputError, nearest
 from beamfit.greybox.maps import Formula
@@ -243,9 +243,9 @@ def _numbered(values: np.ndarray) -> Iterable[tuple[int, float]]:
 
 
 def limit_rows(header: Sequence[str], rows: list[list[str]]) -> Table:
-    """Make a table with at most `MOST_ROWS` rows."""
-    more, rest = len(rows) - MOST_ROWS, [""] * (len(header) - 1)
-    rows = rows[:MOST_ROWS] + [[f"... and {more} more", *rest]] * (more > 0)
+    """Make a table with at most `MAX_ROWS_SHOWN` rows."""
+    more, rest = len(rows) - MAX_ROWS_SHOWN, [""] * (len(header) - 1)
+    rows = rows[:MAX_ROWS_SHOWN] + [[f"... and {more} more", *rest]] * (more > 0)
     return Table("", header, rows, numeric=True)
 
 

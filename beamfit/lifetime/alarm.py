@@ -15,7 +15,7 @@ import numpy as np
 
 from beamfit.lifetime.pieces import GAP
 from beamfit.quantity import HOUR, Quantity, relative_change
-from beamfit.statistics import CLEAR_ODDS, OPEN, log_evidence_of_change
+from beamfit.statistics import CLEAR_ODDS, MIN_SINGULAR_VALUE, log_evidence_of_change
 
 MINUTE = 60.0
 # Longest age of each window, s, and the offset of its start: four windows of each length start in
@@ -565,7 +565,7 @@ def _may_be_loss(state: AlarmState, moved: int) -> np.ndarray:
     A current that no longer falls, as of a monitor that is stuck, has lost both.
     """
     change, error, _ = estimate_change(state, np.full(state.raised.shape, moved))
-    return (1 + change + OPEN * error)[..., moved - 1] > 0
+    return (1 + change + MIN_SINGULAR_VALUE * error)[..., moved - 1] > 0
 
 
 def _detect(reference: Reference, state: AlarmState) -> tuple[np.ndarray, np.ndarray]:

@@ -31,7 +31,7 @@ from beamfit.lifetime.readings import noise_of
 from beamfit.lifetime.record import Monitor
 from beamfit.noise.memory import remembers
 from beamfit.quantity import HOUR, Quantity, percent
-from beamfit.statistics import MANY, POOR_FIT, chi2_probability, few_words, of_use
+from beamfit.statistics import FEW_DOF, POOR_FIT, chi2_probability, few_dof_words, of_use
 
 # Range of plausible lifetimes, s: outside it the unit of the time is probably wrong.
 MIN_LIFETIME, MAX_LIFETIME = 20.0, 3000 * HOUR
@@ -154,7 +154,7 @@ def _step_or_spike(e: Evidence) -> Finding | None:
     """Step or spike in the residuals, with or without stated errors."""
     record, change = e.record, np.diff(e.residuals)
     # With fewer residuals the median change is too small by chance in several % of records.
-    if e.noise_inferred and e.dof < MANY:
+    if e.noise_inferred and e.dof < FEW_DOF:
         return None
     median_change = 1.4826 * float(np.median(np.abs(change)))
     floor = max(record.resolution or 0.0, 1e-12 * float(record.current.max()))
@@ -542,7 +542,7 @@ def _inferred_noise(e: Evidence) -> str | None:
 
 def _few_residuals(e: Evidence) -> str | None:
     """Remark on errors that few degrees of freedom determine."""
-    words = few_words(e.dof) if e.noise_inferred and e.independent else ""
+    words = few_dof_words(e.dof) if e.noise_inferred and e.independent else ""
     return words.removeprefix("; ").capitalize() or None
 
 

@@ -20,8 +20,8 @@ from beamfit.lifetime.scales import add_errors, loss_part_slopes, summarise
 from beamfit.lifetime.study import Decay, Machine, RecordStudy
 from beamfit.quantity import HOUR, Quantity, Status, percent, relative_change
 from beamfit.statistics import (
-    BEYOND,
-    FEWEST,
+    MIN_BASELINE,
+    THREE_SIGMA,
     baseline,
     control_limits,
     one_sided_probability,
@@ -117,7 +117,7 @@ class Trend(Judged):
         lifetimes = f"{count} lifetime" + "s" * (count > 1)
         text = f"{lifetimes}; current times lifetime is usually {centre:.4g} mA h"
         if not math.isfinite(self.limit):
-            missing = f"{FEWEST + 1} or more decays are needed to say what is usual."
+            missing = f"{MIN_BASELINE + 1} or more decays are needed to say what is usual."
             return Finding(Status.unidentified, f"{text}; {missing}")
         beyond = sum(point.beyond != 0 for point in self.points)
         text = f"{text} ± {percent(self.limit / centre)}, {beyond} beyond that."
@@ -315,7 +315,7 @@ def _point(
 
 def _drift(time: np.ndarray, values: Sequence[Quantity], centre: float) -> Quantity:
     """Relative slope by least squares, with an error from the residuals, per week."""
-    if len(values) < FEWEST + 1 or np.ptp(time) < 24 * HOUR:
+    if len(values) < MIN_BASELINE + 1 or np.ptp(time) < 24 * HOUR:
         return Quantity(math.nan, None, "1")
     level = np.array([value.value for value in values]) / centre
     weeks = (time - time.mean()) / (7 * 24 * HOUR)
@@ -458,4 +458,4 @@ def _alarms(
 
 def _is_significant(errors: float, dof: int) -> bool:
     """Return True if a change is as improbable by chance as a point beyond the control limits."""
-    return one_sided_probability(errors, dof) < 1 - BEYOND
+    return one_sided_probability(errors, dof) < 1 - THREE_SIGMA

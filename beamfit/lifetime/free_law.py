@@ -33,7 +33,7 @@ from beamfit.lifetime.expansion import Physical, Pieces
 from beamfit.lifetime.record import DecayRecord
 from beamfit.noise.memory import Products
 from beamfit.quantity import HOUR, Quantity
-from beamfit.statistics import CENTRAL, LEAST_WORTH, WIDE
+from beamfit.statistics import CENTRAL, MIN_EFFECTIVE_DRAWS, WIDE
 
 # Prior of the exponent g of a ∝ I^g: standard deviations below and above zero. Bunches lengthen
 # with the current (potential well: x³ - x ∝ I, `beamfit.lifetime.ring`), so that g lies between
@@ -1163,7 +1163,7 @@ def free_law(record: DecayRecord, values: Physical) -> FreeLaw | None:
     draws = mixture([own for _, own in laws])
     free = mixture([own for law, own in laws if POWER in law.free])
     # A few effective draws suffice: constant a and b instead would have too small errors.
-    if not (np.isfinite(free.log) and draws.effective_size >= LEAST_WORTH):
+    if not (np.isfinite(free.log) and draws.effective_size >= MIN_EFFECTIVE_DRAWS):
         return None
     constant_law = LawProposal.of(reduced, CONSTANT).weighted_draws(FIRST_DRAWS)
     if not 0 <= values.share <= 1:

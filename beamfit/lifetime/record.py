@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from beamfit.answer import MOST_ROWS, Table, frame_of, shown
+from beamfit.answer import MAX_ROWS_SHOWN, Table, frame_of, shown
 from beamfit.errors import InputError
 from beamfit.noise.digits import digit_of
 from beamfit.quantity import HOUR
@@ -347,7 +347,7 @@ class DecayRecord:
 
     def tables(self) -> tuple[Table, ...]:
         """Build the table of the first readings."""
-        count = min(len(self), MOST_ROWS)
+        count = min(len(self), MAX_ROWS_SHOWN)
         rows = [[f"{self.time[i]:.6g}", f"{self.current[i]:.6g}"] for i in range(count)]
         caption = f"the first {count} of {len(self)} readings" if count < len(self) else ""
         return (Table(str(self), ["time s", "beam current mA"], rows, caption, numeric=True),)

@@ -6,7 +6,7 @@ import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 
-from beamfit.answer import MOST_ROWS, Row, Table, cell
+from beamfit.answer import MAX_ROWS_SHOWN, Row, Table, cell
 from beamfit.lifetime.fit import DecayFit
 from beamfit.lifetime.mechanisms import LINEAR, QUADRATIC, Mechanism
 from beamfit.lifetime.pieces import Event
@@ -316,7 +316,7 @@ def event_rows(study: RecordStudy) -> list[list[str]]:
     """Rows of events: kind, time, duration and change; the last row counts those not shown."""
     rows = [
         [kind, f"{time:.0f} s", f"{lasts:.0f} s", f"{change:+.4g} mA" if change else ""]
-        for kind, time, lasts, change in study.events[:MOST_ROWS]
+        for kind, time, lasts, change in study.events[:MAX_ROWS_SHOWN]
     ]
     hidden = len(study.events) - len(rows)
     return rows + ([[f"{hidden} more", "", "", ""]] if hidden else [])

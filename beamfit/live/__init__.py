@@ -1,1 +1,1 @@
-"""A machine that runs: scans that restore what they moved, and a beam's lifetime watched."""
+"""Running machines: scans that restore their magnets, and watches of a beam lifetime."""

@@ -1,4 +1,4 @@
-"""The scan of a machine as a plan of bluesky: the one loop, told as documents."""
+"""Scan of a machine as a bluesky plan: the loop of `beamfit.live.scan`, with documents."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from beamfit.live.scan import Outcome, ScanProgress, scan
 from beamfit.optics.beamline import Beamline
 
 # Quantities of each plane in the event of a fit.
-QUOTED = ("emittance", "normalized_emittance", "beta", "alpha")
+FIT_QUANTITIES = ("emittance", "normalized_emittance", "beta", "alpha")
 
 
 def emittance_scan(
@@ -32,85 +32,85 @@ def emittance_scan(
     line: Beamline,
     *,
     journal: str | None = None,
-    tell: Callable[[ScanProgress], None] = lambda told: None,
+    tell: Callable[[ScanProgress], None] = lambda progress: None,
     md: Mapping[str, Any] | None = None,
 ) -> MsgGenerator[Outcome]:
-    """Scan magnets until the emittances are known as well as is wanted, and put them back.
+    """Scan magnets until the emittances are known to the goal, and restore the magnets.
 
     Parameters
     ----------
     machine : ScanMachine
-        Variables, limits, goal, settings to begin with.
+        Variables, limits, goal, first settings.
     line : Beamline
         Its optics.
     journal : str, optional
-        File of the settings to restore, written before anything moves; default: beside the
-        machine's file.
+        File of the settings to restore, written before anything moves; default: next to the
+        machine file.
     tell : callable
-        Is told how the scan stands.
+        Called with the progress.
     md : mapping, optional
         Metadata of the run.
 
     Yields
     ------
     Msg
-        One run: each shot an event of the stream "primary", the fit one of the stream "fit".
+        One run: an event of the stream "primary" per shot, one event of the stream "fit".
 
     Returns
     -------
     Outcome
-        As of `beamfit.live.scan.scan`.
+        As for `beamfit.live.scan.scan`.
 
     Raises
     ------
     NotRestoredError
-        If a magnet is not seen to be back; the journal stays then.
+        If the read-back of a magnet does not confirm its restoring; the journal stays then.
     InputError
-        If a magnet cannot be moved, nothing can be measured, or nothing was begun.
+        If a magnet cannot be moved, nothing can be measured, or the scan could not begin.
 
     Examples
     --------
-    See docs/live_adapters.md, which is run as it stands.
+    See docs/live_adapters.md, whose code the tests run.
     """
     _check_no_knobs(machine)
     steps: asyncio.Queue[MsgGenerator[None] | None] = asyncio.Queue()
     turn = asyncio.Semaphore(0)
 
-    async def ready() -> None:  # a plan that is paused gives no turn
-        steps.put_nowait(_given(turn))
+    async def ready() -> None:  # a paused plan does not release the semaphore
+        steps.put_nowait(_release(turn))
         await turn.acquire()
 
-    def told(now: ScanProgress) -> None:
+    def report(now: ScanProgress) -> None:
         tell(now)
         if now.measured:
-            steps.put_nowait(_shots(machine, now.points[-1]))
+            steps.put_nowait(_shot_events(machine, now.points[-1]))
 
     async def scanned() -> Outcome:
         at, place = await connect(machine), journal_of(machine, journal)
-        return await scan(at, line, place, tell=told, ready=ready)
+        return await scan(at, line, place, tell=report, ready=ready)
 
     def measured() -> MsgGenerator[Outcome]:
-        while step := (yield from _answer(steps.get())):
+        while step := (yield from _await_result(steps.get())):
             yield from step
         found = task.result()
         if found.problem is not None:
             raise found.problem
         if found.fit is not None:
-            yield from _event("fit", _quoted(found.fit), time.time())
+            yield from _event("fit", _fit_values(found.fit), time.time())
         yield from bps.close_run("success", f"{found.reason}. {found.doubt}".removesuffix(". "))
         return found
 
     def closed(error: Exception) -> MsgGenerator[None]:
         yield from bps.close_run(getattr(error, "exit_status", "fail"), str(error))
 
-    yield from bps.open_run(_said(machine, md or {}))
+    yield from bps.open_run(_metadata(machine, md or {}))
     yield from bps.checkpoint()
     task = asyncio.ensure_future(scanned())
     task.add_done_callback(lambda _: steps.put_nowait(None))
     try:
-        plan = bpp.finalize_wrapper(measured(), lambda: _over(task))
+        plan = bpp.finalize_wrapper(measured(), lambda: _end_scan(task))
         return (yield from bpp.contingency_wrapper(plan, except_plan=closed))
-    finally:  # after a halt too: the loop restores, with nobody who waits for it
+    finally:  # also after a halt: the loop restores in the background
         task.cancel()
 
 
@@ -119,8 +119,8 @@ def _check_no_knobs(machine: ScanMachine) -> None:
         raise InputError("knobs in a plan of bluesky", "beamfit scan for them", machine.path)
 
 
-def _said(machine: ScanMachine, md: Mapping[str, Any]) -> dict[str, Any]:
-    """Metadata of the run."""
+def _metadata(machine: ScanMachine, md: Mapping[str, Any]) -> dict[str, Any]:
+    """Make the metadata of the run."""
     names = [m.name for m in machine.magnets]
     return {
         "plan_name": "emittance_scan", "detectors": [machine.screen.name], "motors": names,
@@ -130,20 +130,20 @@ def _said(machine: ScanMachine, md: Mapping[str, Any]) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _given(turn: asyncio.Semaphore) -> MsgGenerator[None]:
+def _release(turn: asyncio.Semaphore) -> MsgGenerator[None]:
     yield from bps.checkpoint()
     turn.release()
 
 
-def _answer(work: Coroutine[Any, Any, Any]) -> MsgGenerator[Any]:
-    """Wait for what a coroutine returns, through pauses too."""
+def _await_result(work: Coroutine[Any, Any, Any]) -> MsgGenerator[Any]:
+    """Wait for the return value of a coroutine, also through pauses."""
     task = asyncio.ensure_future(work)
     yield from bps.wait_for([lambda: asyncio.wait([task])])
     return task.result()
 
 
-def _over(task: asyncio.Future[Outcome]) -> MsgGenerator[None]:
-    """End a scan, which restores first, whatever becomes of these messages."""
+def _end_scan(task: asyncio.Future[Outcome]) -> MsgGenerator[None]:
+    """Cancel a scan and wait until it has restored, also if these messages fail."""
     task.cancel()
     while not task.done():
         with suppress(FailedStatus):
@@ -153,8 +153,8 @@ def _over(task: asyncio.Future[Outcome]) -> MsgGenerator[None]:
         task.result()
 
 
-def _shots(machine: ScanMachine, point: MeasuredPoint) -> MsgGenerator[None]:
-    """Each shot of a point as an event."""
+def _shot_events(machine: ScanMachine, point: MeasuredPoint) -> MsgGenerator[None]:
+    """Emit an event for each shot of a point."""
     settings = {m.name: (point.settings[m.name], m.unit) for m in machine.magnets}
     sizes = {f"{machine.screen.name}-{p}": 1e6 * each for p, each in point.shots.items()}
     for shot in zip(*sizes.values(), strict=True):
@@ -162,12 +162,12 @@ def _shots(machine: ScanMachine, point: MeasuredPoint) -> MsgGenerator[None]:
         yield from _event("primary", settings | here, point.time)
 
 
-def _quoted(fit: EmittanceFit) -> dict[str, tuple[Any, str]]:
-    """Status and quantities of each plane; NaN for an error that the data leave open."""
+def _fit_values(fit: EmittanceFit) -> dict[str, tuple[Any, str]]:
+    """Return status and quantities of each plane; NaN for an error that is not determined."""
     found: dict[str, tuple[Any, str]] = {}
     for fitted in fit.planes:
         found[f"{fitted.plane}-status"] = str(fitted.status), ""
-        for name in QUOTED:
+        for name in FIT_QUANTITIES:
             one, key = getattr(fitted, name), f"{fitted.plane}-{name}"
             error = float("nan") if one.error is None else one.error
             found |= {key: (one.value, one.unit), f"{key}-error": (error, one.unit)}
@@ -182,7 +182,7 @@ def _event(stream: str, data: Mapping[str, tuple[Any, str]], at: float) -> MsgGe
 
 @dataclass(frozen=True)
 class _Reading:
-    """Values with their units, as bluesky reads a device; one stream has one device."""
+    """Device of bluesky that returns given values with their units; one per stream."""
 
     name: str
     data: Mapping[str, tuple[Any, str]] = field(compare=False)

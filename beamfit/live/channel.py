@@ -1,8 +1,8 @@
-"""A variable of a control system: what it reads, and writing to it. EPICS, by CA or PVA.
+"""Variables of a control system, read and written through EPICS (CA or PVA).
 
-Channel Access is spoken by aioca, PV Access by p4p; both come with ``beamfit[live]`` and are
-imported by the first channel that needs them. Addresses and ports are those of EPICS's own
-environment variables (EPICS_CA_ADDR_LIST, EPICS_PVA_ADDR_LIST, ...).
+aioca provides Channel Access, p4p PV Access; both come with ``beamfit[live]`` and are imported by
+the first channel that needs them. Addresses and ports come from the environment variables of EPICS
+(EPICS_CA_ADDR_LIST, EPICS_PVA_ADDR_LIST, ...).
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ import numpy as np
 from beamfit.errors import InputError, plain
 
 T = TypeVar("T")
-# From this severity on a reading is none: EPICS's INVALID_ALARM.
+# Severity from which a reading is invalid: INVALID_ALARM of EPICS.
 INVALID = 3
-# Readings of a variable that wait to be taken; the oldest is dropped for the next.
-WAITING = 100_000
-# Connections by PV Access of each event loop.
+# Largest number of queued readings of a variable; then the oldest is dropped.
+MAX_QUEUE = 100_000
+# PV Access contexts by event loop.
 CONTEXTS: dict[asyncio.AbstractEventLoop, Any] = {}
 
 
@@ -36,11 +36,11 @@ class PvReading(NamedTuple):
     Attributes
     ----------
     value : float or array
-        A number, NaN where the variable has none; an array of those of a waveform.
+        A number, NaN if the variable has none; an array for a waveform.
     time : float
-        The time stamp of the control system, Unix time in s.
+        Time stamp of the control system, Unix time in s.
     severity : int
-        Of its alarm: 0 none, 1 minor, 2 major, 3 invalid.
+        Severity of its alarm: 0 none, 1 minor, 2 major, 3 invalid.
     """
 
     value: Any
@@ -49,15 +49,12 @@ class PvReading(NamedTuple):
 
     @property
     def good(self) -> bool:
-        """Tell a finite number (or some) that the control system vouches for."""
+        """True for finite values without an INVALID alarm."""
         return self.severity < INVALID and bool(np.all(np.isfinite(self.value)))
 
 
 class Described(NamedTuple):
-    """The unit of a variable as the control system names it, and the limits of writing to it.
-
-    Limits are infinite where it has none.
-    """
+    """Unit of a variable in the control system, and its control limits (infinite if none)."""
 
     unit: str = ""
     low: float = -math.inf
@@ -65,50 +62,50 @@ class Described(NamedTuple):
 
 
 class LostError(InputError):
-    """A variable that does not answer, or refuses what is written to it."""
+    """Error of a variable that does not answer, or refuses a value."""
 
 
 class SilentError(LostError):
-    """A variable that does not answer in time."""
+    """Error of a variable that does not answer in time."""
 
 
 class Channel(Protocol):
-    """A variable that can be read, written and followed."""
+    """Variable that can be read, written and monitored."""
 
     name: str
 
     async def get(self) -> PvReading:
-        """Read it."""
+        """Read the variable."""
 
     async def put(self, value: float) -> None:
-        """Write it, and return when the control system says that it is done."""
+        """Write the variable, and return when the control system reports completion."""
 
     async def describe(self) -> Described:
-        """Ask for its unit and limits."""
+        """Return unit and limits."""
 
     def monitor(self) -> AsyncIterator[PvReading | None]:
-        """Each reading as it comes; None where the connection was lost."""
+        """Yield each reading as it arrives, and None when the connection is lost."""
 
 
 def open_channel(name: str, timeout: float = 5.0) -> Channel:
-    """Open a variable by its name; ``pva://NAME`` is asked by PV Access, others by Channel Access.
+    """Open a variable by name; ``pva://NAME`` uses PV Access, other names Channel Access.
 
     Parameters
     ----------
     name : str
-        Of the process variable.
+        Name of the process variable.
     timeout : float
-        Time within which it has to answer, s.
+        Longest time to an answer, s.
 
     Returns
     -------
     Channel
-        Nothing is connected before its first use.
+        It connects on first use.
 
     Raises
     ------
     InputError
-        If the packages that speak to a control system are not installed.
+        If the packages of EPICS are not installed.
 
     Examples
     --------
@@ -129,17 +126,17 @@ def open_channel(name: str, timeout: float = 5.0) -> Channel:
 
 
 def run(work: Coroutine[Any, Any, T]) -> T:
-    """Run to its end what uses channels, then close their connections.
+    """Run a coroutine that uses channels, then close their connections.
 
     Parameters
     ----------
     work : coroutine
-        What to run.
+        Coroutine to run.
 
     Returns
     -------
     object
-        What it returns.
+        Its return value.
 
     Examples
     --------
@@ -153,19 +150,19 @@ def run(work: Coroutine[Any, Any, T]) -> T:
         try:
             return await work
         finally:
-            _closed()
+            _close_connections()
 
-    with _own_screen():
+    with _hide_library_output():
         return asyncio.run(closed_after())
 
 
 @contextmanager
-def _own_screen() -> Iterator[None]:
-    """Leave standard error to what Python says: EPICS's libraries print there by themselves."""
-    before, kept = sys.stderr, os.dup(2)
+def _hide_library_output() -> Iterator[None]:
+    """Redirect file descriptor 2, where the EPICS libraries print, but keep `sys.stderr`."""
+    before, saved = sys.stderr, os.dup(2)
     nowhere = os.open(os.devnull, os.O_WRONLY)
-    with open(os.dup(kept), "w", 1, "utf-8", "backslashreplace") as screen:
-        with suppress(AttributeError, OSError, ValueError):  # a stream of somebody's own stays
+    with open(os.dup(saved), "w", 1, "utf-8", "backslashreplace") as screen:
+        with suppress(AttributeError, OSError, ValueError):  # keep a replaced stream
             if before.fileno() == 2:
                 before.flush()
                 sys.stderr = screen
@@ -175,12 +172,12 @@ def _own_screen() -> Iterator[None]:
             yield
         finally:
             sys.stderr = before
-            os.dup2(kept, 2)
-            os.close(kept)
+            os.dup2(saved, 2)
+            os.close(saved)
 
 
-def _closed() -> None:
-    """Close what this event loop has opened; aioca and p4p do not notice that a loop ends."""
+def _close_connections() -> None:
+    """Close the connections of this event loop; aioca and p4p do not notice its end."""
     if aioca := sys.modules.get("aioca"):
         aioca.purge_channel_caches()
     if context := CONTEXTS.pop(asyncio.get_running_loop(), None):
@@ -188,7 +185,7 @@ def _closed() -> None:
 
 
 class Protocols(NamedTuple):
-    """Protocol: its calls to read, write, describe and follow a variable."""
+    """Functions of a protocol to read, write, describe and monitor a variable."""
 
     get: Callable[[str], Awaitable[PvReading]]
     put: Callable[[str, float], Awaitable[Any]]
@@ -198,7 +195,7 @@ class Protocols(NamedTuple):
 
 @dataclass(frozen=True)
 class Variable:
-    """A variable of EPICS, by either protocol."""
+    """Variable of EPICS, by either protocol."""
 
     name: str
     timeout: float
@@ -206,33 +203,33 @@ class Variable:
 
     async def get(self) -> PvReading:
         """As `Channel.get`."""
-        return await self._asked(self.speech.get(self.name))
+        return await self._await_answer(self.speech.get(self.name))
 
     async def put(self, value: float) -> None:
         """As `Channel.put`."""
-        await self._asked(self.speech.put(self.name, value))
+        await self._await_answer(self.speech.put(self.name, value))
 
     async def describe(self) -> Described:
         """As `Channel.describe`."""
-        return await self._asked(self.speech.describe(self.name))
+        return await self._await_answer(self.speech.describe(self.name))
 
     async def monitor(self) -> AsyncIterator[PvReading | None]:
         """As `Channel.monitor`."""
-        queue: asyncio.Queue[PvReading | None] = asyncio.Queue(WAITING)
+        queue: asyncio.Queue[PvReading | None] = asyncio.Queue(MAX_QUEUE)
 
-        subscription = self.speech.follow(self.name, lambda reading: kept(queue, reading))
+        subscription = self.speech.follow(self.name, lambda reading: put_latest(queue, reading))
         before = None
         try:
             while True:
                 reading = await queue.get()
-                # A connection that is not there yet is not lost.
+                # None before the first reading is no lost connection.
                 if reading is not None or before is not None:
                     yield reading
                 before = reading
         finally:
             subscription.close()
 
-    async def _asked(self, answer: Awaitable[Any]) -> Any:
+    async def _await_answer(self, answer: Awaitable[Any]) -> Any:
         try:
             async with asyncio.timeout(self.timeout):  # wait_for of 3.11 may lose a cancel
                 return await answer
@@ -240,21 +237,21 @@ class Variable:
             found = f"no answer from '{plain(self.name)}' within {self.timeout:g} s"
             expected = "a variable within reach; is its IOC up, and EPICS_CA_ADDR_LIST right?"
             raise SilentError(found, expected) from None
-        except Exception as error:  # a refusal, a lost connection, a record without a value
+        except Exception as error:  # refused, connection lost, or a record without a value
             said = plain(str(error) or type(error).__name__)[:150]
             found = f"'{plain(self.name)}' refuses: {said}"
             raise LostError(found, "a variable that does what it is asked") from None
 
 
-def kept(queue: asyncio.Queue[T], one: T) -> None:
-    """Put one into a queue; where it is full, the oldest goes."""
+def put_latest(queue: asyncio.Queue[T], one: T) -> None:
+    """Put an item into a queue; a full queue drops its oldest item."""
     if queue.full():
         queue.get_nowait()
     queue.put_nowait(one)
 
 
 def _reading(found: Any) -> PvReading:
-    """NaN for what is no number."""
+    """Convert a reading of a library; values that are not numbers become NaN."""
     value: Any = math.nan
     with suppress(TypeError, ValueError):
         value = np.asarray(found, float)
@@ -263,7 +260,7 @@ def _reading(found: Any) -> PvReading:
 
 
 def _described(unit: object, low: float, high: float) -> Described:
-    """Limits that are equal, as EPICS writes where there are none, are none."""
+    """Make unit and limits; equal limits mean none, as in EPICS."""
     low, high = (float(low), float(high)) if low < high else (-math.inf, math.inf)
     return Described(str(unit or "").strip(), low, high)
 

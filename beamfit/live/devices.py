@@ -1,4 +1,4 @@
-"""Devices of a scan by EPICS: magnets, a screen and a guard."""
+"""EPICS devices of a scan: magnets, a screen and a guard."""
 
 from __future__ import annotations
 
@@ -32,65 +32,70 @@ from beamfit.io.machine import (
 )
 from beamfit.live.channel import Channel, LostError, PvReading, SilentError, open_channel
 
-# Of the time a read-back has to stay, between two looks at it; not shorter, not longer, s.
-LOOKS, SHORTEST, LONGEST = 8, 0.02, 0.25
-# Seconds for which a reading of the beam as new as the last shot is waited for: a variable that
-# does not change may send none. Seconds for the first reading of a variable that is followed.
-AFTER, FIRST = 1.0, 5.0
-# Bad shots of a plane, over those wanted, after which there is no beam on the screen.
-BAD = 2
-# Heights over the scatter of the background below which a projection shows no beam.
-SEEN = 5.0
-# A Gaussian is within 1 % of its height over 0.28 of its size: a top wider than this, and some
-# pixels, is cut off by the camera.
-FLAT, PIXELS = 0.6, 2
-# Share of the projection at either end that is background, to begin with.
-ENDS = 0.1
+# Polls of a read-back per settle time, and the limits of their interval, s.
+POLLS = 8
+MIN_POLL_INTERVAL = 0.02
+MAX_POLL_INTERVAL = 0.25
+# Longest wait for a reading of the beam as new as the last shot, s; a variable that does not change
+# may send none.
+LAST_READING_WAIT = 1.0
+# Longest wait for the first reading of a monitored variable, s.
+FIRST_READING_WAIT = 5.0
+# Ratio of bad to required shots of a plane above which there is no beam on the screen.
+MAX_BAD_RATIO = 2
+# Smallest height of a projection over the scatter of its background that counts as a beam.
+MIN_SIGNAL = 5.0
+# A Gaussian is within 1 % of its height over 0.28 of its size. A top wider than FLAT_WIDTH sizes
+# plus FLAT_PIXELS pixels is cut off by the camera.
+FLAT_WIDTH = 0.6
+FLAT_PIXELS = 2
+# Fraction of the projection at either end used for the initial background.
+BACKGROUND_FRACTION = 0.1
 
 
 class NotSettledError(InputError):
-    """A magnet whose read-back does not come to its setting, or does not stay there."""
+    """Error of a magnet whose read-back does not reach its setting or does not stay there."""
 
 
 class NoSizesError(InputError):
-    """A screen that shows no new sizes, or none that are numbers."""
+    """Error of a screen without new valid sizes."""
 
 
 class Shots(NamedTuple):
-    """New shots: rms sizes by plane, m, and the time stamp of the last one, Unix time in s."""
+    """New shots: rms sizes by plane in m, and the time stamp of the last one, Unix time in s."""
 
     sizes: Mapping[str, np.ndarray]
     time: float
 
 
-# Asked with the time stamp of the last shot: how something left what it had to be, "" if it stayed.
+# Function of the time stamp of the last shot: how a device deviated, or "" if it stayed.
 Left = Callable[[float], Awaitable[str]]
 
 
 class Device(Protocol):
-    """Magnet that can be moved, of any control system or of a simulation."""
+    """Magnet of any control system or of a simulation."""
 
     async def put(self, value: float) -> None:
-        """Begin to move it to a setting, and return when it says that it is there."""
+        """Move to a setting, and return when the device reports completion."""
 
     async def get(self) -> float:
-        """Its setting, as `put` would restore it."""
+        """Return the setting, as `put` would restore it."""
 
     async def settled(self, value: float) -> float:
-        """Wait until it has arrived and stays, and give what is read back.
+        """Wait until the magnet has settled, and return the read-back.
 
         Raises
         ------
         NotSettledError
-            If it does not.
+            If it does not settle.
         """
 
     def followed(self, value: float) -> AbstractAsyncContextManager[Left]:
-        """Follow it while the block lasts, and say in the end how it left a setting."""
+        """Monitor the magnet inside the context; yields a function that reports deviations."""
 
 
 class SizeMonitor(Protocol):
-    """Screen that measures the beam at a setting."""
+    """Screen that measures the beam size."""
 
     async def shots(self) -> Shots:
         """Take new shots.
@@ -103,17 +108,17 @@ class SizeMonitor(Protocol):
 
 
 class Watchman(Protocol):
-    """Guard that tells whether there is beam, and none of it is lost."""
+    """Guard that reports a missing beam or beam losses."""
 
     async def amiss(self) -> str:
-        """Fault in words; "" if there is none."""
+        """Return the fault, or "" if there is none."""
 
     def followed(self) -> AbstractAsyncContextManager[Left]:
-        """Follow the beam while the block lasts, and say in the end how it was lost."""
+        """Monitor the beam inside the context; yields a function that reports its loss."""
 
 
 class Connected(NamedTuple):
-    """A machine at hand: magnets by name, screen, guard, and what was found besides."""
+    """Connected machine: magnets by name, screen, guard, machine file, and notes."""
 
     magnets: Mapping[str, Device]
     screen: SizeMonitor
@@ -124,7 +129,7 @@ class Connected(NamedTuple):
 
 @dataclass(frozen=True)
 class Supply:
-    """A magnet by EPICS: one variable to set it, one to read it back."""
+    """Magnet controlled through EPICS: a set-point and a read-back variable."""
 
     magnet: Magnet
     setting: Channel
@@ -136,40 +141,40 @@ class Supply:
         try:
             await self.setting.put(check_setting(magnet, value))
         except SilentError:
-            await self.setting.get()  # or its IOC is what does not answer
+            await self.setting.get()  # raises if the IOC does not answer
             found = f"{magnet.name} not at {value:.6g} {magnet.unit} within {magnet.timeout:g} s"
             expected = "a supply that is on; its IOC answers, but does not say that it is done"
             raise NotSettledError(found, expected) from None
 
     async def get(self) -> float:
         """As `Device.get`."""
-        return _sound(await self.setting.get(), self.magnet.set).value
+        return _valid(await self.setting.get(), self.magnet.set).value
 
     async def settled(self, value: float) -> float:
-        """As `Device.settled`: the mean over the time for which it has to stay."""
+        """As `Device.settled`: returns the mean read-back over the settle time."""
         magnet, clock = self.magnet, time.monotonic
-        began, seen, within = clock(), [], None
-        pause = min(max(magnet.settle / LOOKS, SHORTEST), LONGEST)
+        began, readings, within = clock(), [], None
+        pause = min(max(magnet.settle / POLLS, MIN_POLL_INTERVAL), MAX_POLL_INTERVAL)
         while True:
-            read = _sound(await self.readback.get(), magnet.read).value
+            read = _valid(await self.readback.get(), magnet.read).value
             if abs(read - value) <= magnet.tolerance:
                 within = clock() if within is None else within
-                seen.append(read)
+                readings.append(read)
                 if clock() - within >= magnet.settle:
                     break
             else:
-                within, seen = None, []
+                within, readings = None, []
             if clock() - began > magnet.timeout + magnet.settle:
-                raise NotSettledError(*_unsettled(magnet, value, read))
+                raise NotSettledError(*_unsettled_words(magnet, value, read))
             await asyncio.sleep(pause)
-        # Its alarm may outlive the write that defined it: the number and the read-back count.
+        # The alarm of an undefined set point may remain after the write, so only the value counts.
         if not np.all(np.abs((await self.setting.get()).value - value) <= magnet.tolerance):
             found = f"{magnet.name} set by someone else while it was scanned"
             raise NotSettledError(found, "nobody else who sets it")
-        return float(np.mean(seen))
+        return float(np.mean(readings))
 
     def followed(self, value: float) -> AbstractAsyncContextManager[Left]:
-        """As `Device.followed`: by set point and read-back."""
+        """As `Device.followed`: monitors set point and read-back."""
         magnet = self.magnet
 
         def wrong(name: str, found: PvReading) -> str:
@@ -183,13 +188,13 @@ class Supply:
         )
 
     async def standing(self) -> float:
-        """Its setting, if that is within the limits and is what is read back."""
+        """Return the setting after checking it against the limits and the read-back."""
         value = check_setting(self.magnet, await self.get())
         await self.settled(value)
         return value
 
 
-def _sound(reading: PvReading, name: str) -> PvReading:
+def _valid(reading: PvReading, name: str) -> PvReading:
     if np.ndim(reading.value):
         raise LostError(f"'{plain(name)}' with {np.size(reading.value)} numbers", "one number")
     if not reading.good:
@@ -198,8 +203,8 @@ def _sound(reading: PvReading, name: str) -> PvReading:
     return reading
 
 
-def _unsettled(magnet: Magnet, value: float, read: float) -> tuple[str, str]:
-    """Behaviour of a read-back that does not arrive, and where to look."""
+def _unsettled_words(magnet: Magnet, value: float, read: float) -> tuple[str, str]:
+    """Describe a read-back that does not reach the setting, and the possible cause."""
     found = (
         f"{magnet.name} set to {value:.6g} {magnet.unit}, read back {read:.6g} after "
         f"{magnet.timeout:g} s"
@@ -213,13 +218,13 @@ def _unsettled(magnet: Magnet, value: float, read: float) -> tuple[str, str]:
 
 @dataclass(frozen=True)
 class ScreenShots:
-    """A screen by EPICS: rms sizes, or projections whose rms is taken, with new time stamps."""
+    """Screen read through EPICS: rms sizes, or projections, with new time stamps."""
 
     profiler: Profiler
     channels: Mapping[str, Channel]
 
     async def shots(self) -> Shots:
-        """As `SizeMonitor.shots`; the planes at the same time."""
+        """As `SizeMonitor.shots`; the planes are read in parallel."""
         found = await asyncio.gather(*map(self._of_plane, self.channels))
         each = dict(zip(self.channels, map(np.array, found), strict=True))
         sizes = {plane: shots[:, 1] for plane, shots in each.items()}
@@ -255,7 +260,7 @@ class ScreenShots:
                 kept.append((last, size))
             if len(kept) == self.profiler.shots:
                 return
-            if bad > BAD * self.profiler.shots:
+            if bad > MAX_BAD_RATIO * self.profiler.shots:
                 found = f"{bad} shots of '{plain(channel.name)}' without a size"
                 raise NoSizesError(found, "a beam that fits on the screen")
 
@@ -270,7 +275,7 @@ class ScreenShots:
 
 @dataclass(frozen=True)
 class BeamGuard:
-    """Beam-present and beam-loss variables by EPICS."""
+    """Beam-present and beam-loss variables of EPICS."""
 
     guard: Guard
     present: Channel | None
@@ -290,7 +295,9 @@ class BeamGuard:
     @property
     def _each(self) -> list[tuple[Channel, Callable[[PvReading], str], float]]:
         each = ((self.present, self._no_beam), (self.loss, self._loss))
-        return [(channel, wrong, AFTER) for channel, wrong in each if channel is not None]
+        return [
+            (channel, wrong, LAST_READING_WAIT) for channel, wrong in each if channel is not None
+        ]
 
     def _no_beam(self, found: PvReading) -> str:
         there = found.good and np.all(found.value > self.guard.present_above)
@@ -305,26 +312,26 @@ class BeamGuard:
 async def followed(
     *each: tuple[Channel, Callable[[PvReading], str], float],
 ) -> AsyncIterator[Left]:
-    """Follow variables while the block lasts.
+    """Monitor variables inside the context.
 
     Parameters
     ----------
     each : tuple of (Channel, callable, float)
-        A variable, what is wrong with a reading of it in words, and how long at most, in s, a
-        reading as new as the last shot is waited for in the end.
+        A variable, a function that describes the fault of a reading ("" if none), and the longest
+        wait in s for a reading as new as the last shot.
 
     Yields
     ------
     callable
-        Says what was wrong first, asked with the time stamp of the last shot.
+        Function of the time stamp of the last shot that returns the first fault.
 
     Raises
     ------
     LostError
-        If one does not answer.
+        If a variable does not answer.
     """
     async with AsyncExitStack() as stack:
-        all_left = [await stack.enter_async_context(_followed(*one)) for one in each]
+        all_left = [await stack.enter_async_context(_follow_channel(*one)) for one in each]
 
         async def left(last: float) -> str:
             return next(filter(None, [await one(last) for one in all_left]), "")
@@ -333,7 +340,7 @@ async def followed(
 
 
 @asynccontextmanager
-async def _followed(
+async def _follow_channel(
     channel: Channel, wrong: Callable[[PvReading], str], patience: float
 ) -> AsyncIterator[Left]:
     said: list[str] = []
@@ -345,28 +352,28 @@ async def _followed(
             said.extend([words] * bool(words))
             begun.set()
 
-    def ended(task: asyncio.Task) -> None:  # whatever ends it sees no more
+    def ended(task: asyncio.Task) -> None:  # nothing is monitored after the end of the task
         said.append(f"'{plain(channel.name)}' is followed no more")
 
     async def left(last: float) -> str:
         until = time.monotonic() + patience
-        while not said:  # an answer comes behind whatever the monitor sent before it
+        while not said:  # the answer to `get` arrives after earlier readings of the monitor
             reading = await channel.get()
             if words := wrong(reading):
                 return words
             if reading.time >= last or time.monotonic() >= until:
                 break
-            await asyncio.sleep(SHORTEST)
+            await asyncio.sleep(MIN_POLL_INTERVAL)
         return "".join(said[:1])
 
     task = asyncio.create_task(follow())
     task.add_done_callback(ended)
     try:
         with suppress(TimeoutError):
-            async with asyncio.timeout(FIRST):
+            async with asyncio.timeout(FIRST_READING_WAIT):
                 await begun.wait()
         if not begun.is_set():
-            found = f"no reading of '{plain(channel.name)}' within {FIRST:g} s"
+            found = f"no reading of '{plain(channel.name)}' within {FIRST_READING_WAIT:g} s"
             raise LostError(found, "a variable that can be followed")
         yield left
     finally:
@@ -375,41 +382,41 @@ async def _followed(
 
 
 async def connect(machine: ScanMachine) -> Connected:
-    """Connect to a machine, and check units, limits and that every variable answers.
+    """Connect to a machine; check units, limits and the answer of every variable.
 
     Parameters
     ----------
     machine : ScanMachine
-        As read from its file.
+        Content of the machine file.
 
     Returns
     -------
     Connected
-        Limits are those of the file or the control system, whichever are tighter.
+        With the tighter limits of the file and the control system.
 
     Raises
     ------
     InputError
-        If a variable does not answer, has another unit than the file says, a read-back does not
-        agree with its setting, or a magnet is outside the limits already.
+        If a variable does not answer, its unit differs from the file, a read-back does not agree
+        with its setting, or a magnet is outside the limits.
     """
     notes: list[str] = []
     magnets, supplies = [], {}
     for magnet in machine.magnets:
-        supply, said = await checked(supply_of(magnet, machine.timeout))
+        supply, said = await check_supply(supply_of(magnet, machine.timeout))
         supplies[magnet.name] = supply
         magnets.append(supply.magnet)
         notes += said
         await supply.standing()
     machine = replace(machine, magnets=tuple(magnets))
-    wanted, guard = machine.screen, machine.guard
-    names = wanted.sizes or wanted.profiles
+    profiler, guard = machine.screen, machine.guard
+    names = profiler.sizes or profiler.profiles
     screen = {plane: open_channel(name, machine.timeout) for plane, name in names.items()}
     for channel in screen.values():
         await channel.get()
-        if wanted.sizes:
+        if profiler.sizes:
             given = (await channel.describe()).unit
-            note = check_unit(given, channel.name, wanted.unit, UNITS["length"])
+            note = check_unit(given, channel.name, profiler.unit, UNITS["length"])
             notes += [note] * bool(note)
     watchmen = [
         None if name is None else open_channel(name, machine.timeout)
@@ -417,23 +424,23 @@ async def connect(machine: ScanMachine) -> Connected:
     ]
     ready = BeamGuard(guard, *watchmen)
     await ready.amiss()
-    return Connected(supplies, ScreenShots(wanted, screen), ready, machine, tuple(notes))
+    return Connected(supplies, ScreenShots(profiler, screen), ready, machine, tuple(notes))
 
 
 def supply_of(magnet: Magnet, timeout: float) -> Supply:
-    """A magnet's variables; writing may take as long as the magnet needs to arrive."""
+    """Open the variables of a magnet; writing may take as long as the magnet needs to settle."""
     return Supply(
         magnet, open_channel(magnet.set, magnet.timeout), open_channel(magnet.read, timeout)
     )
 
 
-async def checked(supply: Supply) -> tuple[Supply, list[str]]:
-    """A magnet with the tighter limits, and what to say of them.
+async def check_supply(supply: Supply) -> tuple[Supply, list[str]]:
+    """Check unit and limits of a magnet; return it with the tighter limits, and notes.
 
     Raises
     ------
     InputError
-        If it has another unit or other limits than the file says.
+        If unit or limits contradict the file.
     """
     magnet = supply.magnet
     setting = await supply.setting.describe()
@@ -459,7 +466,7 @@ async def checked(supply: Supply) -> tuple[Supply, list[str]]:
 
 
 def rms_of(counts: np.ndarray, pixel: float) -> float | None:
-    """Rms size of a projection: that of a Gaussian on a level background.
+    """Rms size of a projection from a Gaussian on a constant background.
 
     Parameters
     ----------
@@ -471,12 +478,12 @@ def rms_of(counts: np.ndarray, pixel: float) -> float | None:
     Returns
     -------
     float or None
-        m; None where there is no beam, its spot does not fit on the screen, or its top is cut off.
+        Size in m; None without a beam, for a spot too large for the screen, or for a saturated one.
 
     Notes
     -----
     Least squares of h exp(-(x - x0)²/(2 s²)) + c, the size most laboratories quote; moments depend
-    on where the background is cut.
+    on the cut of the background.
 
     Examples
     --------
@@ -487,22 +494,22 @@ def rms_of(counts: np.ndarray, pixel: float) -> float | None:
     n = counts.size
     if n < 8 or not np.isfinite(counts).all():
         return None
-    place, few = np.arange(n, dtype=float), max(int(ENDS * n), 2)
+    place, few = np.arange(n, dtype=float), max(int(BACKGROUND_FRACTION * n), 2)
     ends = np.concatenate([counts[:few], counts[-few:]])
     level, scatter = float(np.median(ends)), float(np.std(ends))
     height = float(counts.max() - level)
-    if height <= SEEN * scatter or height <= 0:
+    if height <= MIN_SIGNAL * scatter or height <= 0:
         return None
     above = counts - level > 0.5 * height
     width = max(above.sum() / 2.355, 1.0)
     start = (height, float(place[above].mean()), width, level)
     try:
         found, _ = curve_fit(_gaussian, place, counts, start, maxfev=400)
-    except RuntimeError:  # which has no minimum within 400 steps
+    except RuntimeError:  # no minimum within 400 evaluations
         return None
     size = abs(float(found[2]))
     inside = 0 < found[1] < n - 1 and found[0] > 0 and 0.3 < size < n / 4
-    flat = np.count_nonzero(counts - level > 0.99 * height) > PIXELS + FLAT * size
+    flat = np.count_nonzero(counts - level > 0.99 * height) > FLAT_PIXELS + FLAT_WIDTH * size
     return size * pixel if inside and not flat else None
 
 

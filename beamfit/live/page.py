@@ -1,6 +1,6 @@
-"""A watch as one web page: this computer alone unless asked, nothing but GET, nothing from outside.
+"""Web page of a watch: local by default, GET only, without external content.
 
-The page asks for its events (server-sent) and shows every text as text.
+The page subscribes to server-sent events and shows every text as plain text.
 """
 
 from __future__ import annotations
@@ -18,15 +18,18 @@ from importlib.resources import files
 from beamfit.errors import InputError
 from beamfit.live.watch import WatchView
 
-# Readers at a time, bytes of a request, and s within which it has to come and an event to go.
-MOST, LONGEST, WAIT = 16, 8192, 5.0
+# Largest number of simultaneous readers, and largest request in bytes.
+MAX_READERS = 16
+MAX_REQUEST = 8192
+# Longest time to receive a request or to send an event, s.
+TIMEOUT = 5.0
 TYPES = {"/": "text/html; charset=utf-8", "/state": "application/json"}
-SAID = {200: "OK", 400: "Bad Request", 403: "Forbidden", 404: "Not Found"}
-SAID |= {405: "Method Not Allowed", 503: "Service Unavailable"}
+STATUS_TEXTS = {200: "OK", 400: "Bad Request", 403: "Forbidden", 404: "Not Found"}
+STATUS_TEXTS |= {405: "Method Not Allowed", 503: "Service Unavailable"}
 
 
 def _policy(page: str) -> str:
-    """Security policy of the page: its own script, its own style, its own server."""
+    """Make the security policy of the page, which allows only its own script, style and server."""
 
     def digest(tag: str) -> str:
         [inside] = re.findall(rf"<{tag}>(.*?)</{tag}>", page, re.DOTALL)
@@ -41,8 +44,9 @@ def _policy(page: str) -> str:
 
 def _head(status: int, kind: str, length: int | None, policy: str) -> bytes:
     lines = [
-        f"HTTP/1.1 {status} {SAID[status]}", f"Content-Type: {kind}", "Cache-Control: no-store",
-        "X-Content-Type-Options: nosniff", "Referrer-Policy: no-referrer", "Connection: close",
+        f"HTTP/1.1 {status} {STATUS_TEXTS[status]}", f"Content-Type: {kind}",
+        "Cache-Control: no-store", "X-Content-Type-Options: nosniff",
+        "Referrer-Policy: no-referrer", "Connection: close",
         "Cross-Origin-Resource-Policy: same-origin", f"Content-Security-Policy: {policy}",
     ]  # fmt: skip
     lines += [] if length is None else [f"Content-Length: {length}"]
@@ -51,7 +55,7 @@ def _head(status: int, kind: str, length: int | None, policy: str) -> bytes:
 
 
 class Page:
-    """The page, its readers, and the last event."""
+    """Page of a watch, with its readers and the last event."""
 
     def __init__(self, address: str) -> None:
         self.text = files("beamfit.live").joinpath("watch.html").read_text("utf-8")
@@ -59,46 +63,46 @@ class Page:
         self.last = b"{}"
         self.news = asyncio.Event()
         self.readers = 0
-        # A page of another site that has its own name point here does not know this one's.
-        self.here = ipaddress.ip_address(address).is_loopback
+        # On a loopback address only such host names are accepted, against DNS rebinding.
+        self.is_local = ipaddress.ip_address(address).is_loopback
 
-    def show(self, told: WatchView) -> None:
-        """Tell every reader."""
-        self.last = json.dumps(told.to_json(), allow_nan=False).encode()
+    def show(self, view: WatchView) -> None:
+        """Send a view to every reader."""
+        self.last = json.dumps(view.to_json(), allow_nan=False).encode()
         self.news.set()
         self.news = asyncio.Event()
 
     async def answer(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        """One request."""
-        if self.readers > 4 * MOST:
+        """Answer one request."""
+        if self.readers > 4 * MAX_READERS:
             writer.close()
             return
         self.readers += 1
         try:
-            async with asyncio.timeout(WAIT):
+            async with asyncio.timeout(TIMEOUT):
                 head = await reader.readuntil(b"\r\n\r\n")
-            status, path = self._asked(head.decode("latin-1"))
+            status, path = self._status_and_path(head.decode("latin-1"))
             if status == 200 and path == "/events":
                 await self._events(writer)
                 return
             body = {"/": self.text.encode(), "/state": self.last}.get(path, b"")
-            body = body if status == 200 else f"{status} {SAID[status]}\n".encode()
+            body = body if status == 200 else f"{status} {STATUS_TEXTS[status]}\n".encode()
             kind = TYPES[path] if status == 200 else "text/plain"
             writer.write(_head(status, kind, len(body), self.policy) + body)
-            async with asyncio.timeout(WAIT):
+            async with asyncio.timeout(TIMEOUT):
                 await writer.drain()
         except (OSError, TimeoutError, asyncio.IncompleteReadError, asyncio.LimitOverrunError):
-            pass  # a reader that went, or is too slow
+            pass  # the reader is gone or too slow
         except asyncio.CancelledError:
-            pass  # the watch ends; streams of Python 3.11 tell of a task that says so itself
+            pass  # the watch ends; Python 3.11 would report the cancelled stream task
         finally:
             self.readers -= 1
             writer.close()
             with suppress(OSError):
                 await writer.wait_closed()
 
-    def _asked(self, head: str) -> tuple[int, str]:
-        """Answer to a request: a status, and the path."""
+    def _status_and_path(self, head: str) -> tuple[int, str]:
+        """Return status and path of a request."""
         first, *rest = head.split("\r\n")
         named = [line[5:].strip() for line in rest if line.lower().startswith("host:")]
         words = first.split(" ")
@@ -107,18 +111,18 @@ class Page:
         if words[0] != "GET":
             return 405, ""
         host = re.sub(r":\d+$", "", named[0]).strip("[]")
-        if self.here and host != "localhost" and not _loopback(host):
+        if self.is_local and host != "localhost" and not _loopback(host):
             return 403, ""
         if words[1] not in (*TYPES, "/events"):
             return 404, ""
-        return (503 if self.readers > MOST else 200), words[1]
+        return (503 if self.readers > MAX_READERS else 200), words[1]
 
     async def _events(self, writer: asyncio.StreamWriter) -> None:
         writer.write(_head(200, "text/event-stream", None, self.policy))
         while not writer.is_closing():
             news = self.news
             writer.write(b"data: " + self.last + b"\n\n")
-            async with asyncio.timeout(WAIT):
+            async with asyncio.timeout(TIMEOUT):
                 await writer.drain()
             await news.wait()
 
@@ -132,28 +136,28 @@ def _loopback(host: str) -> bool:
 
 @asynccontextmanager
 async def page(address: str, port: int) -> AsyncIterator[tuple[str, Callable[[WatchView], None]]]:
-    """Serve the page while the block lasts.
+    """Serve the page inside the context.
 
     Parameters
     ----------
     address : str
-        Of the network interface that is listened on; 127.0.0.1 is this computer alone.
+        Address of the network interface to listen on; 127.0.0.1 is this computer only.
     port : int
-        0 for any that is free.
+        Port; 0 for any free one.
 
     Yields
     ------
     str, callable
-        Where the page is, and what is to be given what is known.
+        Address of the page, and a function that takes the present view.
 
     Raises
     ------
     InputError
-        If nobody can listen there.
+        If address or port cannot be used.
     """
     try:
         one = Page(address)
-        server = await asyncio.start_server(one.answer, address, port, limit=LONGEST)
+        server = await asyncio.start_server(one.answer, address, port, limit=MAX_REQUEST)
     except (OSError, ValueError) as error:
         found = f"a page that cannot be served on {address}, port {port} ({error})"
         raise InputError(found, "a free --port, and an address of this computer") from None

@@ -1,4 +1,4 @@
-"""The points of a scan, settings within its limits, and the file they make."""
+"""Points of a live scan, limits of its settings, and its file."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from beamfit.io.machine import ScanMachine
 
 
 class MeasuredPoint(NamedTuple):
-    """A setting as it was read back, the shots of each plane, m, and when, Unix time."""
+    """Measured point: settings as read back, shots of each plane in m, and the Unix time."""
 
     settings: dict[str, float]
     shots: dict[str, np.ndarray]
@@ -28,7 +28,7 @@ class MeasuredPoint(NamedTuple):
 
 
 def standard_errors(shots: Sequence[np.ndarray]) -> list[float]:
-    """Standard errors of the means of some shots; none where a setting has no scatter.
+    """Standard errors of the means of shots; an empty list if a setting has no scatter.
 
     Examples
     --------
@@ -40,14 +40,14 @@ def standard_errors(shots: Sequence[np.ndarray]) -> list[float]:
 
 
 def scan_of(points: Sequence[MeasuredPoint], machine: ScanMachine) -> QuadScan:
-    """The points as a scan, with the shots themselves where they scatter.
+    """Make a scan from the points, with individual shots if they scatter.
 
     Parameters
     ----------
     points : sequence of MeasuredPoint
-        At three different settings at least.
+        At least three different settings.
     machine : ScanMachine
-        Whose magnets they are of.
+        The scanned machine.
 
     Returns
     -------
@@ -56,7 +56,7 @@ def scan_of(points: Sequence[MeasuredPoint], machine: ScanMachine) -> QuadScan:
     Raises
     ------
     InputError
-        If they are no scan yet.
+        If the points are not sufficient for a scan.
     """
     settings = {m.name: np.array([p.settings[m.name] for p in points]) for m in machine.magnets}
     shots = {plane: [p.shots[plane] for p in points] for plane in points[0].shots}
@@ -64,7 +64,7 @@ def scan_of(points: Sequence[MeasuredPoint], machine: ScanMachine) -> QuadScan:
     found = {plane: standard_errors(each) for plane, each in shots.items()}
     error = {plane: np.array(each) for plane, each in found.items() if each}
     count = np.array([min(map(len, p.shots.values())) for p in points])
-    single = {plane: _padded(shots[plane]) for plane in error}
+    single = {plane: _shot_table(shots[plane]) for plane in error}
     units = {m.name: m.unit if m.unit in SETTINGS else KNOB for m in machine.magnets}
     return QuadScan(
         settings, units, size, error, shots=count if error else None, name=machine.name,
@@ -73,8 +73,8 @@ def scan_of(points: Sequence[MeasuredPoint], machine: ScanMachine) -> QuadScan:
     )  # fmt: skip
 
 
-def _padded(shots: Sequence[np.ndarray]) -> np.ndarray:
-    """Shots of all settings in one table, NaN where there are fewer."""
+def _shot_table(shots: Sequence[np.ndarray]) -> np.ndarray:
+    """Make one table of the shots of all settings, padded with NaN."""
     table = np.full((len(shots), max(map(len, shots))), np.nan)
     for row, own in zip(table, shots, strict=True):
         row[: len(own)] = own
@@ -85,7 +85,7 @@ def limits_within(
     name: str, low: float, high: float, barred: Sequence[Mapping[str, float]],
     before: Mapping[str, float],
 ) -> tuple[float, float]:  # fmt: skip
-    """Limits drawn in, half way from a barred setting to where the magnet was."""
+    """Narrow the limits to half way between each barred setting and the initial setting."""
     for settings in barred:
         middle = 0.5 * (settings[name] + before[name])
         if settings[name] > before[name]:
@@ -95,10 +95,10 @@ def limits_within(
     return low, high
 
 
-def clipped(
+def clip_settings(
     settings: Mapping[str, float], limits: Mapping[str, tuple[float, float]]
 ) -> dict[str, float]:
-    """Settings within the limits, of as many digits as a person would type."""
+    """Restrict settings to the limits, and round them to six digits."""
     return {name: float(np.clip(float(f"{settings[name]:.6g}"), *limits[name])) for name in limits}
 
 
@@ -112,37 +112,37 @@ def scan_text(
     points : sequence of MeasuredPoint
         At least one.
     machine : ScanMachine
-        Whose magnets and screen they are of.
+        The scanned machine.
     before : mapping of str to float
         Settings before the scan.
 
     Returns
     -------
     str
-        A row a shot: sizes in um, settings those read back. A shot that lies off makes no mean.
+        One row per shot with sizes in um and settings as read back.
     """
     planes = list(points[0].shots)
     names = [f"{m.name}_{m.unit}" for m in machine.magnets] + [f"size_{p}_um" for p in planes]
     rows = [[*names, "shot", "screen", "time"]]
     for point in points:
         settings = [point.settings[m.name] for m in machine.magnets]
-        last = [machine.screen.name, _written(point.time)]
+        last = [machine.screen.name, _time_text(point.time)]
         sizes = zip_longest(*(1e6 * point.shots[plane] for plane in planes), fillvalue=math.nan)
         for number, shot in enumerate(sizes, 1):
             rows.append([*(f"{value:.9g}" for value in (*settings, *shot)), str(number), *last])
     table = StringIO()
     csv.writer(table, lineterminator="\n").writerows(rows)
-    head = (plain(" ".join(line.split())) for line in _head(machine, before))
+    head = (plain(" ".join(line.split())) for line in _comments(machine, before))
     return "\n".join([*head, table.getvalue()])
 
 
-def _head(machine: ScanMachine, before: Mapping[str, float]) -> list[str]:
-    """Comments of the file on how it was measured."""
+def _comments(machine: ScanMachine, before: Mapping[str, float]) -> list[str]:
+    """Return the comments of the file about the measurement."""
     screen = machine.screen
     variables = ", ".join((screen.sizes or screen.profiles).values())
     measured = "sizes" if screen.sizes else "Gaussian fits to projections"
     return [
-        f"# {machine.name}: scan by beamfit {beamfit.__version__}, {_written(None)}",
+        f"# {machine.name}: scan by beamfit {beamfit.__version__}, {_time_text(None)}",
         f"# machine file {machine.path}, sha256 {machine.sha256}",
         f"# lattice {machine.lattice.path}, sha256 {machine.lattice.sha256}",
         *(
@@ -154,6 +154,6 @@ def _head(machine: ScanMachine, before: Mapping[str, float]) -> list[str]:
     ]
 
 
-def _written(time: float | None) -> str:
+def _time_text(time: float | None) -> str:
     at = datetime.now(UTC) if time is None else datetime.fromtimestamp(time, UTC)
     return at.isoformat(timespec="milliseconds" if time else "seconds")

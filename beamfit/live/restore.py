@@ -1,4 +1,4 @@
-"""Restoring a machine after a scan: on disk before anything moves, put back whatever happens."""
+"""Restoring of a machine after a scan, with a journal written before anything moves."""
 
 from __future__ import annotations
 
@@ -26,12 +26,14 @@ from beamfit.live.devices import Device, NotSettledError
 from beamfit.writing import alone, write_atomically
 
 FORMAT = "beamfit-journal-1"
-# Ends of the names by which EPICS is told where variables are looked for.
-LOOKED_FOR = ("_ADDR_LIST", "_NAME_SERVERS", "_SERVER_PORT", "_BROADCAST_PORT")
-# Signals that end a scan; what they find is restored.
+# Ends of the names of the environment variables that tell EPICS where to search for variables.
+SEARCH_VARIABLES = ("_ADDR_LIST", "_NAME_SERVERS", "_SERVER_PORT", "_BROADCAST_PORT")
+# Signals that end a scan, with restoring.
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-# Seconds between two attempts to reach an IOC, and attempts to settle a magnet.
-PAUSE, ATTEMPTS = 0.5, 2
+# Time between attempts to reach an IOC, s.
+RETRY_INTERVAL = 0.5
+# Number of attempts to settle a magnet.
+MAX_ATTEMPTS = 2
 
 
 @dataclass(frozen=True)
@@ -41,13 +43,13 @@ class Journal:
     Attributes
     ----------
     path : Path
-        Where it is written.
+        File of the journal.
     machine : str
-        The machine file, for whoever finds the journal.
+        The machine file, as information for a person.
     before : tuple of (Magnet, float)
-        Each magnet, with limits and variables of its own, and its setting.
+        Each magnet, with its limits and variables, and its setting.
     timeout, patience : float
-        Within which a variable has to answer, and for how long it is asked again, s.
+        Longest time to an answer of a variable, and time for which it is retried, s.
     """
 
     path: Path
@@ -57,12 +59,12 @@ class Journal:
     patience: float = 60.0
 
     def write(self) -> None:
-        """Have it on disk, whole, its folder too.
+        """Write the journal atomically, and flush its folder to disk.
 
         Raises
         ------
         InputError
-            If the place cannot be written.
+            If the file cannot be written.
         """
         said = {
             "format": FORMAT,
@@ -82,17 +84,17 @@ class Journal:
             os.close(folder)
 
     def done(self) -> None:
-        """Remove it: all is restored."""
+        """Remove the journal after everything is restored."""
         self.path.unlink(missing_ok=True)
 
 
 def check_none_left(path: Path) -> None:
-    """Refuse to begin where an earlier scan has something to restore.
+    """Refuse to begin while a journal of an earlier scan exists.
 
     Raises
     ------
     InputError
-        Naming the journal.
+        With the name of the journal.
     """
     if path.exists():
         found = "what a scan before this one has not restored"
@@ -101,20 +103,20 @@ def check_none_left(path: Path) -> None:
 
 @contextmanager
 def alone_with(path: Path, magnets: Iterable[Magnet]) -> Iterator[None]:
-    """Keep other scans from a journal and from its magnets, in whatever file these are named.
+    """Lock a journal and its magnets against other scans, whatever machine file names them.
 
-    The locks of magnets are in this user's folder of beamfit; without a home there are none.
+    The locks of magnets are in the beamfit folder of this user; without a home there are none.
 
     Raises
     ------
     InputError
-        Naming the journal or the magnet that another scan has.
+        With the name of the journal or of the magnet that another scan uses.
     """
     folder = own_folder()
     with ExitStack() as stack:
         stack.enter_context(alone(path))
         for magnet in magnets if folder else ():
-            lock = Path(folder, f"magnet-{_found_as(magnet.set)}")
+            lock = Path(folder, f"magnet-{_lock_name(magnet.set)}")
             try:
                 stack.enter_context(alone(lock))
             except InputError:
@@ -125,9 +127,9 @@ def alone_with(path: Path, magnets: Iterable[Magnet]) -> Iterator[None]:
         yield
 
 
-def _found_as(variable: str) -> str:
-    """A word for a variable and where it is looked for: a simulation may have the same name."""
-    where = sorted(f"{k}={v}" for k, v in os.environ.items() if k.endswith(LOOKED_FOR))
+def _lock_name(variable: str) -> str:
+    """Hash a variable with its search path, because a simulation may use the same name."""
+    where = sorted(f"{k}={v}" for k, v in os.environ.items() if k.endswith(SEARCH_VARIABLES))
     said = "\n".join([variable.rpartition("://")[2], *where])
     return hashlib.sha256(said.encode()).hexdigest()[:16]
 
@@ -138,7 +140,7 @@ def read_journal(path: str | PathLike[str]) -> Journal:
     Raises
     ------
     InputError
-        If the file is none.
+        If the file is not a valid journal.
 
     Examples
     --------
@@ -157,8 +159,8 @@ def read_journal(path: str | PathLike[str]) -> Journal:
         before = tuple(_magnet(dict(table)) for table in found["magnets"])
         times = found["timeout"], found["patience"]
         for named_once in ({m.name for m, _ in before}, {m.set for m, _ in before}):
-            _demand(0 < len(before) == len(named_once))
-        _demand(all(is_number(time) and time > 0 for time in times))
+            _require(0 < len(before) == len(named_once))
+        _require(all(is_number(time) and time > 0 for time in times))
         return Journal(Path(path), str(found["machine"]), before, *times)
     except (KeyError, TypeError, ValueError):
         expected = "it as the scan wrote it; put back by hand what can be read of it"
@@ -166,69 +168,72 @@ def read_journal(path: str | PathLike[str]) -> Journal:
 
 
 def _magnet(table: dict[str, object]) -> tuple[Magnet, float]:
-    """Checked as a machine file is: a tolerance without end would call anything restored."""
+    """Read a magnet and its setting with the checks of a machine file.
+
+    An infinite tolerance, for example, would accept any read-back as restored.
+    """
     setting = table.pop("setting")
     table["degauss"] = tuple(table["degauss"])
-    known = {field.name for field in fields(Magnet)}
-    m = Magnet(**{name: value for name, value in table.items() if name in known})
+    field_names = {field.name for field in fields(Magnet)}
+    m = Magnet(**{name: value for name, value in table.items() if name in field_names})
     numbers = (setting, m.low, m.high, m.tolerance, m.settle, m.timeout, m.approach_by)
-    _demand(all(isinstance(word, str) and word for word in (m.name, m.set, m.read, m.unit)))
-    _demand(all(map(is_number, numbers)) and m.approach in APPROACHES)
-    _demand(0 < m.tolerance < 0.1 * (m.high - m.low) and m.settle >= 0 and m.timeout > 0)
-    _demand(m.low <= setting <= m.high)
+    _require(all(isinstance(word, str) and word for word in (m.name, m.set, m.read, m.unit)))
+    _require(all(map(is_number, numbers)) and m.approach in APPROACHES)
+    _require(0 < m.tolerance < 0.1 * (m.high - m.low) and m.settle >= 0 and m.timeout > 0)
+    _require(m.low <= setting <= m.high)
     return m, float(setting)
 
 
-def _demand(holds: bool) -> None:
+def _require(holds: bool) -> None:
     if not holds:
         raise ValueError
 
 
 def journal_of(machine: ScanMachine, path: str | None) -> Path:
-    """Path of a machine's journal unless it is given: beside the machine's file."""
+    """Return the path of the journal; by default next to the machine file."""
     return Path(path or Path(machine.path).with_suffix(".journal")).absolute()
 
 
-def named(before: Iterable[tuple[Magnet, float]]) -> str:
-    """Magnets and their settings in words.
+def settings_words(before: Iterable[tuple[Magnet, float]]) -> str:
+    """Write magnets and their settings as text.
 
     Examples
     --------
-    >>> named([(Magnet("Q", "Q:SET", "Q:READ", "T_per_m", -1.0, 1.0, 0.01, 0.1), 0.5)])
+    >>> settings_words([(Magnet("Q", "Q:SET", "Q:READ", "T_per_m", -1.0, 1.0, 0.01, 0.1), 0.5)])
     'Q 0.5 T_per_m'
     """
     return ", ".join(f"{magnet.name} {value:.6g} {magnet.unit}" for magnet, value in before)
 
 
 class NotRestoredError(InputError):
-    """A magnet that could not be put back, or is not seen to be back."""
+    """Error of a magnet that was not restored, or whose read-back does not confirm it."""
 
 
 async def reach(
     magnet: Magnet, device: Device, value: float, present: float | None = None
 ) -> float:
-    """Move a magnet to a setting, from below or above where that is asked for.
+    """Move a magnet to a setting, approaching from the requested side.
 
     Parameters
     ----------
     magnet : Magnet
         Its limits and the side.
     device : Device
-        What moves it.
+        Device of the magnet.
     value : float
-        The setting, in the magnet's unit.
+        The setting, in the unit of the magnet.
     present : float, optional
-        The setting it comes from; asked unless given. From NaN it passes by whichever side it is.
+        The present setting; read if None. With NaN the approach is always made.
 
     Returns
     -------
     float
-        What is read back.
+        The read-back.
 
     Raises
     ------
     InputError
-        If the setting is outside the limits (nothing is written then), or is not reached.
+        If the setting is outside the limits (then nothing is written), or is not reached.
     """
     value, by = check_setting(magnet, value), magnet.approach_by
     present = await device.get() if present is None else present
@@ -245,23 +250,23 @@ async def _put(device: Device, value: float) -> float:
 
 
 async def restore(journal: Journal, magnets: Mapping[str, Device]) -> None:
-    """Put every magnet of a journal back, see that it is there, and remove the journal.
+    """Restore every magnet of a journal, verify the read-backs, and remove the journal.
 
     Parameters
     ----------
     journal : Journal
-        What to restore.
+        Settings to restore.
     magnets : mapping of str to Device
-        By name.
+        Devices by name.
 
     Raises
     ------
     NotRestoredError
-        If one is not back. All others are, and the journal stays.
+        If a magnet is not restored. All others are, and the journal stays.
     """
     until = time.monotonic() + journal.patience
-    errors = await asyncio.gather(  # no magnet waits for another's IOC
-        *(_restored(magnet, magnets[magnet.name], value, until) for magnet, value in journal.before)
+    errors = await asyncio.gather(  # in parallel: no magnet waits for the IOC of another
+        *(_restore_magnet(m, magnets[m.name], value, until) for m, value in journal.before)
     )
     first = next(filter(None, errors), None)
     if first is None:
@@ -269,28 +274,30 @@ async def restore(journal: Journal, magnets: Mapping[str, Device]) -> None:
         return
     left = (one for one, error in zip(journal.before, errors, strict=True) if error)
     said = getattr(first, "found", plain(f"{type(first).__name__}: {first}")[:150])
-    found = f"{named(left)} not seen to be restored ({said})"
+    found = f"{settings_words(left)} not seen to be restored ({said})"
     expected = f"beamfit scan --recover {journal.path}, or by hand"
-    with suppress(InputError, OSError):  # somebody may have removed it
+    with suppress(InputError, OSError):  # the journal may have been removed
         journal.write()
     raise NotRestoredError(found, expected)
 
 
-async def _restored(magnet: Magnet, device: Device, value: float, until: float) -> Exception | None:
-    """Put a magnet back, again and again; the last error where that fails."""
+async def _restore_magnet(
+    magnet: Magnet, device: Device, value: float, until: float
+) -> Exception | None:
+    """Restore a magnet with retries; return the last error if that fails."""
     unsettled = 0
     while True:
         try:
             return await _put_back(magnet, device, value)
-        except Exception as error:  # of whatever kind, of a library too: it may pass
+        except Exception as error:  # any error, also of a library, may be temporary
             unsettled += isinstance(error, NotSettledError)
-            if unsettled >= ATTEMPTS or time.monotonic() > until:
+            if unsettled >= MAX_ATTEMPTS or time.monotonic() > until:
                 return error
-        await asyncio.sleep(PAUSE)
+        await asyncio.sleep(RETRY_INTERVAL)
 
 
 async def _put_back(magnet: Magnet, device: Device, value: float) -> None:
-    """Move a magnet back, also where its set point is undefined: an IOC may return like that."""
+    """Restore a magnet, also if its set point is undefined after a restart of the IOC."""
     present = math.nan
     with suppress(Exception):
         present = await device.get()
@@ -299,9 +306,9 @@ async def _put_back(magnet: Magnet, device: Device, value: float) -> None:
 
 @contextmanager
 def ended_by_signals(task: asyncio.Future, tell: Callable[[str], None]) -> Iterator[list[int]]:
-    """Have the first signal cancel something, and any more only say that all is being restored.
+    """Cancel a task at the first signal; further ones only print that magnets are being restored.
 
-    Outside the main thread signals are left to whoever runs it.
+    Outside the main thread no handlers are installed.
     """
     loop, came, before = asyncio.get_running_loop(), [], {}
 

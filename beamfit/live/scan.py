@@ -1,4 +1,4 @@
-"""A scan that chooses its settings: fitted after every point, ended by a goal, restored always."""
+"""Live scans: settings chosen after every fit, an end at the goal, and restored magnets."""
 
 from __future__ import annotations
 
@@ -26,23 +26,23 @@ from beamfit.live.restore import (
     alone_with,
     check_none_left,
     ended_by_signals,
-    named,
     reach,
     restore,
+    settings_words,
 )
 from beamfit.optics.beamline import Beamline
 from beamfit.tuning.fit import TuningFit
 
-# Settings in a row at which nothing can be measured, after which a scan ends.
-BARREN = 3
-# Seconds between two looks at whether the beam is back.
-LOOK = 0.2
+# Number of consecutive settings without a measurement after which a scan ends.
+MAX_FAILURES = 3
+# Time between checks for the return of the beam, s.
+CHECK_INTERVAL = 0.2
 
 
 class ScanProgress(NamedTuple):
-    """Progress of a scan: its points, the fit to them where there is one, and what is new.
+    """Progress of a scan: its points, the fit to them if there is one, and the last event.
 
-    ``measured`` says whether that is the last of the points; ``news`` is then why it was chosen.
+    If ``measured`` is true, the event is the last of the points and ``news`` the reason for it.
     """
 
     points: tuple[MeasuredPoint, ...]
@@ -52,22 +52,22 @@ class ScanProgress(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """End of a scan.
+    """Result of a scan.
 
     Attributes
     ----------
     points : tuple of MeasuredPoint
-        What was measured.
+        The measured points.
     fit : EmittanceFit, TuningFit or None
-        The fit to them; the latter if the machine has knobs.
+        The fit to them; a TuningFit if the machine has knobs.
     reason : str
-        Why it ended.
+        Reason of the end.
     problem : Exception or None
-        What went wrong, if something did. The magnets are restored all the same.
+        Exception that ended the scan, if any. The magnets are restored nevertheless.
     signal : int
         Number of the signal that ended it; 0 if none.
     doubt : str
-        Why the line may be wrong, in words; "" where the sizes follow it.
+        Why the line may be wrong; "" if the sizes follow it.
     """
 
     points: tuple[MeasuredPoint, ...]
@@ -80,7 +80,7 @@ class Outcome(NamedTuple):
 
 @dataclass
 class Running:
-    """State of a scan; the one thing that changes as it goes on."""
+    """State of a running scan, the only object that changes."""
 
     at: Connected
     aim: Aim
@@ -94,7 +94,7 @@ class Running:
     armed: bool = False
 
     def say(self, news: str, measured: bool = False) -> None:
-        """Tell how it stands."""
+        """Report the progress."""
         self.tell(ScanProgress(tuple(self.points), self.fit, news, measured))
 
 
@@ -104,88 +104,88 @@ async def scan(
     journal: Path,
     *,
     keep: Callable[[Sequence[MeasuredPoint], Mapping[str, float]], None] = lambda *given: None,
-    tell: Callable[[ScanProgress], None] = lambda told: None,
+    tell: Callable[[ScanProgress], None] = lambda progress: None,
     ready: Callable[[], Awaitable[None]] = lambda: asyncio.sleep(0),
 ) -> Outcome:
-    """Scan magnets until the emittances are known as well as is wanted, and put them back.
+    """Scan magnets until the emittances are known to the goal, and restore the magnets.
 
-    Of a machine with knobs: tune until the best setting is as near to the minimum as is wanted.
+    A machine with knobs is tuned until the best setting is close enough to the minimum.
 
     Parameters
     ----------
     at : Connected
         The machine: magnets, screen and guard with the methods of `beamfit.live.devices`, and
-        what the machine file says.
+        the content of the machine file.
     line : Beamline
         Its optics.
     journal : Path
-        Where the settings to restore are written before anything moves.
+        File for the settings to restore, written before anything moves.
     keep : callable
-        Is given all points after each new one, to write them, and the settings before the scan.
+        Called after each new point with all points and the settings before the scan, to save them.
     tell : callable
-        Is told how the scan stands.
+        Called with the progress.
     ready : callable
-        Is awaited before each setting: the scan stands still as long as that takes.
+        Awaited before each setting; the scan pauses until it returns.
 
     Returns
     -------
     Outcome
-        Whatever ended it: goal, stop rule, signal or fault.
+        Result, also after a signal or a fault.
 
     Raises
     ------
     NotRestoredError
-        If a magnet is not seen to be back; the journal stays then.
+        If the read-back of a magnet does not confirm its restoring; the journal stays then.
     InputError
-        If nothing was begun: a journal is left from before, another scan has it or a magnet, or
-        it cannot be written.
+        If the scan could not begin: a journal remains from before, another scan uses it or a
+        magnet, or it cannot be written.
 
     Examples
     --------
-    See docs/live.md, where a simulation takes the place of a control system.
+    See docs/live_adapters.md, where a simulation replaces a control system.
     """
     aim = aim_of(at.machine, line)
     aim.warm()
     with alone_with(journal, at.machine.magnets):
         check_none_left(journal)
-        magnets = at.machine.magnets  # what could not be put back is not moved
+        magnets = at.machine.magnets  # `check_setting` refuses magnets that could not be restored
         before = {m.name: check_setting(m, await at.magnets[m.name].get()) for m in magnets}
         log = _journal_for(journal, at.machine, before)
         run = Running(at, aim, before, keep, tell, ready)
-        measuring = asyncio.ensure_future(_begun(run, log))
+        measuring = asyncio.ensure_future(_run(run, log))
         reason, problem = "", None
         with ended_by_signals(measuring, run.say) as came:
             try:
                 reason = await measuring
             except asyncio.CancelledError:
-                if not came:  # whoever runs this one wants it to end: restored before it does
-                    await _to_the_end(_back(run, log))
+                if not came:  # cancelled by the caller: restore first
+                    await _shielded(_restore(run, log))
                     raise
                 reason = f"stopped by {signal.Signals(came[0]).name}"
-            except Exception as error:  # of whatever kind: the magnets are put back first
+            except Exception as error:  # any error: the magnets are restored first
                 problem, reason = error, str(error)
-            await _to_the_end(_back(run, log))
+            await _shielded(_restore(run, log))
         number, doubt = came[0] if came else 0, aim.doubt(run.points, run.fit)
         return Outcome(tuple(run.points), run.fit, reason, problem, number, doubt)
 
 
 def _journal_for(path: Path, machine: ScanMachine, before: Mapping[str, float]) -> Journal:
-    """The journal of a scan, not written yet."""
+    """Make the journal of a scan without writing it."""
     settings = tuple((m, before[m.name]) for m in machine.magnets)
     whose = os.path.abspath(machine.path)
     return Journal(path, whose, settings, machine.timeout, machine.restore)
 
 
-async def _begun(run: Running, log: Journal) -> str:
-    """Write the journal, measure, and say why that ended."""
+async def _run(run: Running, log: Journal) -> str:
+    """Write the journal, measure, and return the reason of the end."""
     log.write()
-    run.armed = True  # from here on something may have moved
-    run.say(f"Restored at the end: {named(log.before)}. Until then it is in {log.path}")
-    return await _measured(run)
+    run.armed = True  # from here on magnets may have moved
+    run.say(f"Restored at the end: {settings_words(log.before)}. Until then it is in {log.path}")
+    return await _measure_all(run)
 
 
-async def _to_the_end(work: Coroutine[Any, Any, None]) -> None:
-    """Wait until something is done, whoever cancels that; be cancelled only then."""
+async def _shielded(work: Coroutine[Any, Any, None]) -> None:
+    """Wait for the end of `work` despite cancellations, and re-raise them only then."""
     task, cancelled = asyncio.ensure_future(work), None
     while not task.done():
         try:
@@ -197,32 +197,32 @@ async def _to_the_end(work: Coroutine[Any, Any, None]) -> None:
         raise cancelled
 
 
-async def _back(run: Running, log: Journal) -> None:
-    """Restore what may have been moved."""
+async def _restore(run: Running, log: Journal) -> None:
+    """Restore the magnets if they may have been moved."""
     if run.armed:
         await restore(log, run.at.magnets)
-        run.say(f"Restored and read back: {named(log.before)}")
+        run.say(f"Restored and read back: {settings_words(log.before)}")
 
 
-async def _measured(run: Running) -> str:
-    """Measure setting after setting, and say why it ends."""
-    machine, barren = run.at.machine, 0
+async def _measure_all(run: Running) -> str:
+    """Measure setting after setting, and return the reason of the end."""
+    machine, failures = run.at.machine, 0
     for magnet in machine.magnets:
         for value in magnet.degauss:
             await reach(magnet, run.at.magnets[magnet.name], value)
     while isinstance(chosen := run.aim.next(run.points, run.fit, run.barred, run.before), Next):
         await run.ready()
-        point, why = await _point(run, chosen.settings)
+        point, why = await _measure_point(run, chosen.settings)
         if point is None:
             run.barred.append(chosen.settings)
-            barren += 1
+            failures += 1
             words = ", ".join(f"{name} {value:.6g}" for name, value in chosen.settings.items())
             run.say(f"Left out: {words} ({why})")
-            if barren == BARREN:
-                found = f"no sizes at {BARREN} settings in a row ({why})"
+            if failures == MAX_FAILURES:
+                found = f"no sizes at {MAX_FAILURES} settings in a row ({why})"
                 raise NoSizesError(found, "a beam on the screen")
             continue
-        barren = 0
+        failures = 0
         run.keep([*run.points, point], run.before)
         run.points.append(point)
         run.fit = run.aim.fit(run.points) or run.fit
@@ -230,35 +230,39 @@ async def _measured(run: Running) -> str:
     return chosen
 
 
-async def _point(run: Running, settings: Mapping[str, float]) -> tuple[MeasuredPoint | None, str]:
-    """Measure at a setting; None, and why, where that cannot be done.
+async def _measure_point(
+    run: Running, settings: Mapping[str, float]
+) -> tuple[MeasuredPoint | None, str]:
+    """Measure at a setting; return None and the reason if that fails.
 
-    Once more is tried where a magnet left it or the beam was lost during the shots; for a lost beam
-    the magnets go back until it has returned.
+    The measurement is repeated once if a magnet left the setting or the beam was lost during the
+    shots. After a beam loss the magnets return to their initial settings until the beam is back.
     """
     lost = left = ""
     for _ in range(2):
-        await _well(run, lost)
-        reads = await _moved(run, settings, math.nan if left else None)
-        shots, none, lost, left = await _taken(run, settings)
+        await _wait_for_beam(run, lost)
+        reads = await _move(run, settings, math.nan if left else None)
+        shots, none, lost, left = await _take_shots(run, settings)
         if lost:
             run.say(f"Paused: {lost}")
-            await _moved(run, run.before)
+            await _move(run, run.before)
         elif left:
             run.say(f"Measured again: {left}")
         elif shots is None:
             return None, none
-        elif plane := _stuck(run, reads, shots.sizes):
+        elif plane := _stuck_plane(run, reads, shots.sizes):
             return None, f"{plane} as before the magnets moved, to the last digit: is it stuck?"
         else:
             return MeasuredPoint(reads, dict(shots.sizes), shots.time), ""
     return None, lost or left
 
 
-async def _taken(run: Running, settings: Mapping[str, float]) -> tuple[Shots | None, str, str, str]:
-    """Shots at a setting, else why there are none; how the beam was lost, how a magnet moved.
+async def _take_shots(
+    run: Running, settings: Mapping[str, float]
+) -> tuple[Shots | None, str, str, str]:
+    """Take shots at a setting; return them or the reason for none, beam loss and magnet motion.
 
-    Magnets and beam are followed from before the first shot to the time stamp of the last one.
+    Magnets and beam are monitored from before the first shot to the time stamp of the last one.
     """
     async with AsyncExitStack() as stack:
         devices = [run.at.magnets[name].followed(value) for name, value in settings.items()]
@@ -274,8 +278,8 @@ async def _taken(run: Running, settings: Mapping[str, float]) -> tuple[Shots | N
         return shots, none, lost, "; ".join(filter(None, [await one(last) for one in magnets]))
 
 
-def _stuck(run: Running, reads: Mapping[str, float], shots: Mapping[str, np.ndarray]) -> str:
-    """A plane that still shows what it showed at the point before; a dead camera has no scatter."""
+def _stuck_plane(run: Running, reads: Mapping[str, float], shots: Mapping[str, np.ndarray]) -> str:
+    """Return a plane whose sizes equal those of the previous point: a stuck camera; else ""."""
     if not run.points or not shots:
         return ""
     last, magnets = run.points[-1], run.at.machine.magnets
@@ -284,17 +288,17 @@ def _stuck(run: Running, reads: Mapping[str, float], shots: Mapping[str, np.ndar
     return next((p for p, each in shots.items() if np.all(each == last.shots[p][-1])), "")
 
 
-async def _moved(
+async def _move(
     run: Running, settings: Mapping[str, float], present: float | None = None
 ) -> dict[str, float]:
-    """Move magnets; from NaN each passes its setting, from wherever somebody has moved it."""
+    """Move magnets; with `present` NaN their approach passes the setting from either side."""
     magnets = {m.name: m for m in run.at.machine.magnets if m.name in settings}
     devices = run.at.magnets
     return {n: await reach(m, devices[n], settings[n], present) for n, m in magnets.items()}
 
 
-async def _well(run: Running, lost: str) -> None:
-    """Wait until there is beam and none is lost.
+async def _wait_for_beam(run: Running, lost: str) -> None:
+    """Wait until there is beam without losses.
 
     Raises
     ------
@@ -306,6 +310,6 @@ async def _well(run: Running, lost: str) -> None:
         if time.monotonic() > until:
             expected = f"it to be over within {run.at.machine.guard.wait:g} s"
             raise InputError(f"{wrong}", expected)
-        await asyncio.sleep(LOOK)
+        await asyncio.sleep(CHECK_INTERVAL)
     if lost:
         run.say("Going on")

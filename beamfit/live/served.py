@@ -1,4 +1,4 @@
-"""Results of a watch as read-only variables of the control system, by PV Access."""
+"""Results of a watch as read-only PV Access variables."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from beamfit.errors import InputError, plain
 from beamfit.live.channel import LostError, open_channel
 from beamfit.live.watch import WatchView
 
-# Severities of EPICS.
+# Alarm severities of EPICS.
 NONE, MINOR, MAJOR, INVALID = range(4)
 NUMBERS = {
     "LIFETIME": ("lifetime", "h"), "A": ("a", "1/(mA s)"), "B": ("b", "1/s"),
@@ -25,65 +25,65 @@ PLAIN = {"CURRENT": "mA", "SINCE": "s", "AGE": "s", "READINGS": ""}
 UNITS = {
     n + part: u for n, (_, u) in NUMBERS.items() for part in ("", ":ERROR", ":LOW", ":HIGH")
 } | PLAIN
-# Within which somebody else who serves a variable answers, s.
-ANSWERED = 1.0
+# Longest time to an answer of another server of a variable, s.
+ANSWER_WAIT = 1.0
 
 
-def values_of(told: WatchView) -> dict[str, tuple[Any, int]]:
-    """The value and the severity of each variable; NaN of what the readings do not determine.
+def values_of(view: WatchView) -> dict[str, tuple[Any, int]]:
+    """Return value and severity of each variable; NaN if the readings do not determine it.
 
     Parameters
     ----------
-    told : WatchView
-        What is known.
+    view : WatchView
+        Present view of the watch.
 
     Returns
     -------
     dict of str to (value, int)
-        Names without the prefix.
+        By name without the prefix.
     """
-    state, answer = told.state, told.state.answer
-    old = NONE if told.sound and not told.lost else INVALID
+    state, answer = view.state, view.state.answer
+    out_of_date = NONE if view.sound and not view.lost else INVALID
     found: dict[str, tuple[Any, int]] = {}
     for name, (quantity, _) in NUMBERS.items():
-        known = getattr(answer, quantity, None)
-        low, high = (known and known.interval_95) or (math.nan, math.nan)
+        q = getattr(answer, quantity, None)
+        low, high = (q and q.interval_95) or (math.nan, math.nan)
         parts = {
-            "": known.value if known else math.nan, ":ERROR": known.error if known else math.nan,
+            "": q.value if q else math.nan, ":ERROR": q.error if q else math.nan,
             ":LOW": low, ":HIGH": high,
         }  # fmt: skip
-        severity = old if known else INVALID
+        severity = out_of_date if q else INVALID
         found |= {name + part: (value, severity) for part, value in parts.items()}
-    moved = max(MAJOR if state.alarmed else NONE, old)
+    moved = max(MAJOR if state.alarmed else NONE, out_of_date)
     verdict = {"green": NONE, "yellow": MINOR, "red": MAJOR}[
         answer.status.colour if answer else "red"
     ]
     since = state.alarms[-1].since if state.alarms else math.nan
     current = state.rows[-1].current if state.rows else math.nan
     return found | {
-        "CURRENT": (current, old if state.rows else INVALID),
+        "CURRENT": (current, out_of_date if state.rows else INVALID),
         "SINCE": (since, moved if state.alarms else INVALID),
-        "AGE": (math.nan if told.age is None else told.age, old),
-        "READINGS": (float(state.counts.readings), old),
-        "STATUS": (cell(answer.status) if answer else "", max(verdict, old)),
-        "MESSAGE": (told.headline[1], max(verdict, moved)),
+        "AGE": (math.nan if view.age is None else view.age, out_of_date),
+        "READINGS": (float(state.counts.readings), out_of_date),
+        "STATUS": (cell(answer.status) if answer else "", max(verdict, out_of_date)),
+        "MESSAGE": (view.headline[1], max(verdict, moved)),
         "ALARM": (state.alarmed, moved),
         "ALARM:TEXT": (state.alarm_text(), moved),
     }
 
 
 async def check_unserved(prefix: str) -> None:
-    """See that nobody serves such variables: clients would read from one or the other.
+    """Check that nobody else serves such variables; clients would read either of them.
 
     Raises
     ------
     InputError
-        If somebody does, the machine itself it may be.
+        If another server, possibly the machine itself, has one of them.
     """
 
     async def answering(name: str) -> str:
         with suppress(LostError):
-            await open_channel(f"pva://{prefix}{name}", ANSWERED).get()
+            await open_channel(f"pva://{prefix}{name}", ANSWER_WAIT).get()
             return name
         return ""
 
@@ -94,24 +94,24 @@ async def check_unserved(prefix: str) -> None:
 
 @contextmanager
 def served(prefix: str, address: str) -> Iterator[Callable[[WatchView], None]]:
-    """Serve variables while the block lasts.
+    """Serve variables inside the context.
 
     Parameters
     ----------
     prefix : str
-        Of their names.
+        Prefix of their names.
     address : str
-        Of the network interface that is listened on; 127.0.0.1 is this computer alone.
+        Address of the network interface to listen on; 127.0.0.1 is this computer only.
 
     Yields
     ------
     callable
-        To be given what is known. The ports are those of EPICS_PVAS_SERVER_PORT and so on.
+        Function that takes the present view. The ports are those of EPICS_PVAS_SERVER_PORT etc.
 
     Raises
     ------
     InputError
-        If nobody can listen there, or p4p is not installed.
+        If the address cannot be used, or p4p is not installed.
     """
     try:
         from p4p.nt import NTScalar
@@ -126,10 +126,10 @@ def served(prefix: str, address: str) -> Iterator[Callable[[WatchView], None]]:
     start |= {name: {"value": ""} for name in TEXTS}
     variables = {name: SharedPV(nt=kinds[name], initial=start[name]) for name in kinds}
 
-    def show(told: WatchView) -> None:
-        state = told.state
+    def show(view: WatchView) -> None:
+        state = view.state
         time = state.last - state.shift if state.last else 0.0
-        for name, (value, severity) in values_of(told).items():
+        for name, (value, severity) in values_of(view).items():
             variables[name].post(value, timestamp=time, severity=severity)
 
     ports = {

@@ -1,4 +1,4 @@
-"""Following a beam: readings as they come, given to a watch. Nothing is ever written."""
+"""Watch of a beam: readings of the control system, passed to `beamfit.lifetime.watch`."""
 
 from __future__ import annotations
 
@@ -15,33 +15,36 @@ from beamfit.answer import cell, json_of
 from beamfit.errors import Status
 from beamfit.io.machine import Watched, WatchMachine
 from beamfit.lifetime.watch import CURRENT, RULE, Plan, State, add_event, stepped
-from beamfit.live.channel import Channel, LostError, PvReading, kept, open_channel
+from beamfit.live.channel import Channel, LostError, PvReading, open_channel, put_latest
 from beamfit.live.restore import ended_by_signals
 
-# Without a reading for so long, or so many usual intervals, what is shown is old, s.
-STALE, INTERVALS = 10.0, 5.0
-# Readings are taken together every so often, and shown, s.
-TAKEN, SHOWN = 0.2, 1.0
-# Readings that wait for a fit to end.
-WAITING = 100_000
+# Time without a reading after which the view is out of date: this many seconds, or this many
+# typical intervals.
+STALE_AFTER = 10.0
+STALE_INTERVALS = 5.0
+# Longest wait for a batch of readings, and time between updates of the view, s.
+BATCH_WAIT = 0.2
+SHOW_EVERY = 1.0
+# Largest number of readings queued during a fit.
+MAX_QUEUE = 100_000
 
 
 @dataclass(frozen=True)
 class WatchView:
-    """Knowledge at a moment.
+    """State of a watch at one moment.
 
     Attributes
     ----------
     plan, state
-        What is watched, and what the readings say.
+        Plan of the watch, and its state after the readings.
     lost : tuple of str
         Variables that do not answer.
     silent : float or None
-        For how long there has been no reading of the current, s; None while there are.
+        Time since the last reading of the current in s, if it is too long; otherwise None.
     age : float or None
-        How long ago the newest reading that is fitted came, s; None before the first fit.
+        Age of the newest fitted reading in s; None before the first fit.
     old : bool
-        Whether that is longer than fits are apart, and readings may be silent.
+        True if the age exceeds the fit interval plus the allowed time without readings.
     """
 
     plan: Plan
@@ -53,12 +56,12 @@ class WatchView:
 
     @property
     def sound(self) -> bool:
-        """Tell numbers that are of now."""
+        """True if the numbers are up to date."""
         return self.silent is None and not self.old and self.state.answer is not None
 
     @property
     def headline(self) -> tuple[str, str]:
-        """Its colour, and what to look at first."""
+        """Colour, and the most important message."""
         state, answer = self.state, self.state.answer
         gone = f"No connection to {', '.join(self.lost)}" if self.lost else ""
         if self.silent is not None:
@@ -79,7 +82,7 @@ class WatchView:
         return answer.status.colour, f"{cell(answer.status)}, {moved}"
 
     def to_json(self) -> dict[str, Any]:
-        """Return what the page shows."""
+        """Return the content of the page."""
         state, answer = self.state, self.state.answer
         colour, headline = self.headline
         names = ("lifetime", "a", "b", "normalised")
@@ -104,7 +107,7 @@ class WatchView:
 
 
 class Arrived(NamedTuple):
-    """A reading of a variable, None where its connection was lost, and when it came, s."""
+    """Reading of a variable (None for a lost connection), and its time of arrival in s."""
 
     watched: Watched
     reading: PvReading | None
@@ -112,8 +115,8 @@ class Arrived(NamedTuple):
 
 
 @dataclass
-class _Course:
-    """A watch that goes on."""
+class _RunningWatch:
+    """State of a running watch."""
 
     plan: Plan
     queue: asyncio.Queue[Arrived]
@@ -123,9 +126,9 @@ class _Course:
     apart: float = 0.0
     fitted: float | None = None
 
-    def told(self) -> WatchView:
-        """Knowledge now."""
-        now, patience = time.monotonic(), max(STALE, INTERVALS * self.apart)
+    def view(self) -> WatchView:
+        """Return the present view."""
+        now, patience = time.monotonic(), max(STALE_AFTER, STALE_INTERVALS * self.apart)
         silent = now - self.arrived if now - self.arrived > patience else None
         age = None if self.fitted is None else now - self.fitted
         old = age is not None and age > self.plan.every + patience
@@ -133,18 +136,18 @@ class _Course:
         return WatchView(self.plan, self.state, lost, silent, age, old)
 
     async def take(self) -> None:
-        """All readings that wait; a fit leaves the page and the served variables alive."""
+        """Process all queued readings in a thread, so that the page stays responsive."""
         batch: list[Arrived] = []
         with suppress(TimeoutError):
-            batch.append(await asyncio.wait_for(self.queue.get(), TAKEN))
+            batch.append(await asyncio.wait_for(self.queue.get(), BATCH_WAIT))
         while not self.queue.empty():
             batch.append(self.queue.get_nowait())
         for one in batch:
-            self._seen(one.watched, one.reading)
+            self._note_connection(one.watched, one.reading)
         self.state, fitted = await asyncio.to_thread(_stepped, self.plan, self.state, batch)
         self.fitted = fitted or self.fitted
 
-    def _seen(self, watched: Watched, reading: PvReading | None) -> None:
+    def _note_connection(self, watched: Watched, reading: PvReading | None) -> None:
         gone = reading is None
         if self.lost.get(watched.variable, False) != gone:
             said = f"{'no' if gone else 'again a'} connection to {watched.variable}"
@@ -152,11 +155,11 @@ class _Course:
         self.lost[watched.variable] = gone
 
     async def follow(self, watched: Watched, channel: Channel) -> None:
-        """Have readings wait as they come; that fits take long is no silence of the current."""
+        """Queue the readings of a variable as they arrive, also during long fits."""
         lost = False
         async for reading in channel.monitor():
             lost = lost or reading is None
-            if lost and reading is not None:  # an IOC may come back with another unit
+            if lost and reading is not None:  # an IOC may return with another unit
                 with suppress(LostError):
                     watched.check((await channel.describe()).unit)
                     lost = False
@@ -164,11 +167,11 @@ class _Course:
             if watched.quantity == CURRENT and reading is not None:
                 self.apart += 0.1 * (now - self.arrived - self.apart)
                 self.arrived = now
-            kept(self.queue, Arrived(watched, reading, now))
+            put_latest(self.queue, Arrived(watched, reading, now))
 
 
 def _stepped(plan: Plan, state: State, batch: Sequence[Arrived]) -> tuple[State, float | None]:
-    """The state after some readings, and when the newest that was fitted came."""
+    """Return the state after some readings, and the arrival time of the newest fitted one."""
     fitted = None
     for watched, reading, arrived in batch:
         if reading is None:
@@ -181,22 +184,22 @@ def _stepped(plan: Plan, state: State, batch: Sequence[Arrived]) -> tuple[State,
 
 
 async def connect(machine: WatchMachine) -> list[str]:
-    """See that every variable answers, in the unit of the machine file.
+    """Check that every variable answers, in the unit of the machine file.
 
     Parameters
     ----------
     machine : WatchMachine
-        What to watch.
+        Machine to watch.
 
     Returns
     -------
     list of str
-        Notes on units that nobody knows.
+        Notes on unknown units.
 
     Raises
     ------
     InputError
-        If one does not answer, or has another unit.
+        If a variable does not answer, or has another unit.
     """
     channels = [open_channel(one.variable, machine.timeout) for one in machine.variables]
     described = await asyncio.gather(*(channel.describe() for channel in channels))
@@ -210,42 +213,42 @@ async def watch(
     show: Callable[[WatchView], None],
     seconds: float | None = None,
 ) -> tuple[WatchView, int]:
-    """Watch until the time is over, or somebody ends it.
+    """Watch until the time is over, or a signal ends it.
 
     Parameters
     ----------
     machine : WatchMachine
-        What to watch.
+        Machine to watch.
     plan : Plan
-        How.
+        Plan of the watch.
     show : callable
-        Is given what is known, every second.
+        Called every second with the present view.
     seconds : float, optional
         Duration; default: without end.
 
     Returns
     -------
     WatchView, int
-        What is known at the end, and the signal that ended it, 0 for none.
+        View at the end, and the signal that ended it, 0 for none.
     """
-    queue: asyncio.Queue[Arrived] = asyncio.Queue(WAITING)
-    course = _Course(plan, queue)
+    queue: asyncio.Queue[Arrived] = asyncio.Queue(MAX_QUEUE)
+    running = _RunningWatch(plan, queue)
     followers = [
-        asyncio.create_task(course.follow(one, open_channel(one.variable, machine.timeout)))
+        asyncio.create_task(running.follow(one, open_channel(one.variable, machine.timeout)))
         for one in machine.variables
     ]
-    begun, shown, over = time.monotonic(), -SHOWN, asyncio.get_running_loop().create_future()
+    begun, shown, over = time.monotonic(), -SHOW_EVERY, asyncio.get_running_loop().create_future()
     try:
         with ended_by_signals(over, lambda text: None) as came:
             while not came and (seconds is None or time.monotonic() - begun < seconds):
-                await course.take()
+                await running.take()
                 for task in followers:
                     if task.done():
                         task.result()
-                if (now := time.monotonic()) - shown >= SHOWN:
-                    show(course.told())
+                if (now := time.monotonic()) - shown >= SHOW_EVERY:
+                    show(running.view())
                     shown = now
-            return course.told(), came[0] if came else 0
+            return running.view(), came[0] if came else 0
     finally:
         for task in followers:
             task.cancel()

@@ -20,7 +20,7 @@ from scipy.fft import irfft, next_fast_len, rfft
 from scipy.linalg.lapack import dpttrf, dpttrs, dtbtrs
 from scipy.special import logsumexp
 
-from beamfit.compile_cache import LONG, prepare_jax
+from beamfit.compile_cache import OPTIMISED, prepare_jax
 
 prepare_jax()
 # Correlation of neighbouring residuals, in standard errors of that of independent ones, from which
@@ -295,7 +295,7 @@ class Levels(NamedTuple):
         return rows
 
 
-@partial(jax.jit, compiler_options=LONG)
+@partial(jax.jit, compiler_options=OPTIMISED)
 def levelled_products(
     noises: CorrelatedNoise, rows: jax.Array, time: jax.Array, begins: jax.Array, slope: jax.Array
 ) -> tuple[jax.Array, jax.Array]:

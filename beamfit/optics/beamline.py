@@ -15,7 +15,7 @@ import numpy as np
 from jax import Array
 from jax.typing import ArrayLike
 
-from beamfit.answer import MOST_ROWS, Table, brief, shown
+from beamfit.answer import MAX_ROWS_SHOWN, Table, brief, shown
 from beamfit.arrays import value
 from beamfit.errors import InputError, nearest
 from beamfit.optics.calibration import FocusingStrength, IntegratedStrength
@@ -106,7 +106,7 @@ class Beamline:
 
     def tables(self) -> tuple[Table, ...]:
         """The first elements, to be shown."""
-        few = self.elements[:MOST_ROWS]
+        few = self.elements[:MAX_ROWS_SHOWN]
         rows = [[e.name, type(e).__name__, brief(e.length), brief(e.setting)] for e in few]
         more = f"the first {len(few)} of {len(self)}" if len(few) < len(self) else ""
         return (Table(self.headline, ["element", "kind", "length m", "setting"], rows, more),)

@@ -11,7 +11,7 @@ PAGES, PICTURES = (".html", ".pdf"), (".png", ".svg")
 
 
 def kind_of(path: str | PathLike[str]) -> str:
-    """The suffix of a report's name, if it is one of a page or of pictures."""
+    """Return the suffix of the name of a report, which must be that of a page or of pictures."""
     suffix = Path(path).suffix.lower()
     if suffix not in PAGES + PICTURES:
         expected = "a name ending in .html or .pdf, or in .png or .svg for its pictures"

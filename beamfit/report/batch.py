@@ -1,4 +1,4 @@
-"""The page of a batch: what came of its files, and the course of a quantity through them."""
+"""Page of a batch: the outcome of its files, and a quantity against time."""
 
 from __future__ import annotations
 
@@ -14,24 +14,24 @@ import numpy as np
 from matplotlib import rc_context
 from matplotlib.figure import FigureBase
 
-from beamfit.answer import MOST_ROWS, Table, plain_name
+from beamfit.answer import MAX_ROWS_SHOWN, Table, plain_name
 from beamfit.batch.course import ControlChart, summary_of
 from beamfit.batch.run import Batch
 from beamfit.errors import Status
 from beamfit.quantity import Quantity, display_unit
 from beamfit.report.document import (
-    MANY,
+    RASTER_POINTS,
     STYLE,
     Picture,
     ReportPage,
     Verdict,
     control_chart,
     date_axis,
+    dates_in,
     legend_below,
-    moments,
 )
 from beamfit.report.page import write_page, write_report
-from beamfit.statistics import BEYOND
+from beamfit.statistics import THREE_SIGMA
 
 NOTHING = Verdict(
     Status.unidentified,
@@ -45,8 +45,8 @@ RULE = (
 )
 
 
-# Points within the limits for each that noise alone puts beyond: 370.
-NOISE_PASSES = 1 / (2 * (1 - BEYOND))
+# Number of points per point that noise alone puts beyond the limits: 370.
+POINTS_PER_FALSE_ALARM = 1 / (2 * (1 - THREE_SIGMA))
 
 
 def write_batch_report(
@@ -60,19 +60,19 @@ def write_batch_report(
     Parameters
     ----------
     path : str or path
-        As for `write_report`. Single reports are written to a folder beside it, named
-        after it; at most 40.
+        As for `write_report`. At most 40 single reports are written to a folder next to it, named
+        after it.
     batch : Batch
         The batch.
     courses : sequence of ControlChart
-        From `beamfit.batch.course.courses_of`.
+        Results of `beamfit.batch.course.courses_of`.
     command : str, optional
         The command that made it.
 
     Raises
     ------
     InputError
-        If a place cannot be written.
+        If a file cannot be written.
     """
     target = Path(path)
     beyond = dict.fromkeys(
@@ -80,7 +80,7 @@ def write_batch_report(
     )
     folder = target.with_name(f"{target.stem}_reports")
     links = []
-    for i, file in enumerate(islice(beyond, MOST_ROWS), start=1):
+    for i, file in enumerate(islice(beyond, MAX_ROWS_SHOWN), start=1):
         folder.mkdir(exist_ok=True)
         single = folder / f"{i:02d}_{Path(file).stem}.html"
         write_report(single, batch.ledger.job.fit(file))
@@ -126,10 +126,12 @@ def _page(
 
 
 def _first(table: Table) -> list[Table]:
-    """The first rows of a table, if it has any; the file of answers has all."""
+    """Return the first rows of a table, if it has any; the file of answers has all."""
     count = len(table.rows)
-    note = f"the first {MOST_ROWS} of {count}; all are in the table of answers"
-    shown = table._replace(rows=table.rows[:MOST_ROWS], note=note if count > MOST_ROWS else "")
+    note = f"the first {MAX_ROWS_SHOWN} of {count}; all are in the table of answers"
+    shown = table._replace(
+        rows=table.rows[:MAX_ROWS_SHOWN], note=note if count > MAX_ROWS_SHOWN else ""
+    )
     return [shown] if count else []
 
 
@@ -151,14 +153,14 @@ def _verdict(c: ControlChart) -> Verdict:
         return Verdict(Status.converged, f"{c.label}: median {c.shown(middle)}", few)
     usual = f"{c.centre / factor:#.4g} ± {c.limit / factor:.2g} {unit}".strip()
     message = f"{beyond} of {points} points lie beyond the control limits"
-    message += f"; noise alone passes them in one point of {NOISE_PASSES:.0f}."
+    message += f"; noise alone passes them in one point of {POINTS_PER_FALSE_ALARM:.0f}."
     return Verdict(status, f"{c.label}: usually {usual}", message)
 
 
 def draw_course(figure: FigureBase, course: ControlChart) -> None:
-    """Draw a quantity against the time in the names of its files, with control limits.
+    """Draw a quantity against the time in the file names, with control limits.
 
-    Without a time in each name, against the number of the file.
+    Without a time in each name it is drawn against the number of the file.
 
     Parameters
     ----------
@@ -167,9 +169,9 @@ def draw_course(figure: FigureBase, course: ControlChart) -> None:
     course : ControlChart
         The quantity through the batch.
     """
-    axes, many = figure.subplots(), len(course.value) > MANY
+    axes, many = figure.subplots(), len(course.value) > RASTER_POINTS
     factor, unit = display_unit(abs(course.centre), course.unit)
-    days = [moments(Path(file).name) for file in course.files]
+    days = [dates_in(Path(file).name) for file in course.files]
     dated = all(days)
     at = np.array([d[0] for d in days], "datetime64[s]") if dated else course.at
     points = at, course.value / factor, None if many else course.error / factor

@@ -1,4 +1,4 @@
-"""The report of a density in phase space: its contours, its profiles, emittance against charge."""
+"""Report of a density in phase space: contours, profiles, emittance against charge."""
 
 from __future__ import annotations
 
@@ -17,17 +17,21 @@ from beamfit.quantity import Quantity
 from beamfit.report.document import BLUE, RED, Picture, ReportPage, Verdict, contour_levels
 from beamfit.report.emittance import about_input, about_scan
 
-# Profiles in a row of the picture; shares of the charge inside the contours; reach in rms sizes.
-ABREAST, CONTOURS, REACH = 4, (0.95, 0.9, 0.68, 0.5), 4.0
+# Profiles in a row of the picture.
+PROFILES_PER_ROW = 4
+# Shares of the charge inside the contours.
+CONTOURS = (0.95, 0.9, 0.68, 0.5)
+# Half-width of the drawn phase space, in rms sizes.
+HALF_WIDTH = 4.0
 
 
 def density_page(fit: DensityFit) -> ReportPage:
-    """Lay out a density fit.
+    """Make the page of a density fit.
 
     Parameters
     ----------
     fit : DensityFit
-        From `beamfit.fit_density`.
+        Result of `beamfit.fit_density`.
 
     Returns
     -------
@@ -37,13 +41,13 @@ def density_page(fit: DensityFit) -> ReportPage:
     for p in fit.planes:
         if p.densities is None:
             continue
-        rows = math.ceil(len(p.profiles) / ABREAST)
+        rows = math.ceil(len(p.profiles) / PROFILES_PER_ROW)
         methods = [said[p.plane] for said in fit.stored.values() if p.plane in said]
         draw = partial(draw_density, plane=p, methods=methods)
-        seen = partial(draw_profiles, plane=p)
+        draw_all = partial(draw_profiles, plane=p)
         pictures.append(Picture(f"density in {p.plane}, emittance against charge", 3.2, draw,
                                 source))  # fmt: skip
-        pictures.append(Picture(f"profiles in {p.plane}", 0.6 + 1.9 * rows, seen, source))
+        pictures.append(Picture(f"profiles in {p.plane}", 0.6 + 1.9 * rows, draw_all, source))
     return ReportPage(
         title=f"Phase-space density of {fit.scan.name}",
         subtitle=f"{len(fit.scan)} settings, {len(fit.scan.profiles)} profiles",
@@ -51,7 +55,12 @@ def density_page(fit: DensityFit) -> ReportPage:
             Verdict(p.status, f"{p.plane}: 90 % of the charge {p.emittance['90 %']}", p.message)
             for p in fit.planes
         ],
-        tables=[*fit.tables(), *map(_seen, fit.planes), *_methods(fit), *about_input(fit.notes)],
+        tables=[
+            *fit.tables(),
+            *map(_profile_table, fit.planes),
+            *_method_table(fit),
+            *about_input(fit.notes),
+        ],
         pictures=pictures,
         pictures_title="Phase space and profiles",
         leading=len(fit.planes),
@@ -59,21 +68,22 @@ def density_page(fit: DensityFit) -> ReportPage:
     )
 
 
-def _seen(plane: PlaneDensity) -> Table:
-    """Profiles beside the density."""
+def _profile_table(plane: PlaneDensity) -> Table:
+    """Make the table of profiles compared with the density."""
     d = plane.densities
     rows = []
     for k, (label, p) in enumerate(zip(plane.labels, plane.profiles, strict=True)):
-        told = ["-", "-"]
+        numbers = ["-", "-"]
         if d is not None:
-            told = [f"{100.0 * d.stretch[k]:+.1f} %", f"{100.0 * max(plane.beyond[k], 0.0):.1f} %"]
-        rows.append([label, str(p.shots), f"{1e6 * p.size:.4g}", *told])
+            stretch, beyond = 100.0 * d.stretch[k], 100.0 * max(plane.beyond[k], 0.0)
+            numbers = [f"{stretch:+.1f} %", f"{beyond:.1f} %"]
+        rows.append([label, str(p.shots), f"{1e6 * p.size:.4g}", *numbers])
     head = ["setting", "shots", "rms, µm", "wider than the density", "beyond the window"]
     return Table(f"Profiles in {plane.plane}", head, rows)
 
 
-def _methods(fit: DensityFit) -> list[Table]:
-    """Emittances that the file states, by size method."""
+def _method_table(fit: DensityFit) -> list[Table]:
+    """Make the table of emittances stated in the file, by size method."""
     rows = [
         [name, *(cell(said.get(p.plane)) for p in fit.planes)] for name, said in fit.stored.items()
     ]
@@ -89,11 +99,11 @@ def draw_density(figure: FigureBase, plane: PlaneDensity, methods: Sequence[Quan
     figure : Figure or SubFigure
         The figure to draw on.
     plane : PlaneDensity
-        With a density.
+        Plane with a density.
     methods : sequence of Quantity
         Emittances by size methods, marked at the right edge.
     """
-    axes, beside = figure.subplots(1, 2)
+    axes, right = figure.subplots(1, 2)
     d, density = plane.densities, np.maximum(plane.density, 0.0)
     levels = contour_levels(density, CONTOURS)
     u = np.stack(np.meshgrid(FINE_AXIS, FINE_AXIS, indexing="ij"), -1) @ d.frame.T
@@ -101,30 +111,30 @@ def draw_density(figure: FigureBase, plane: PlaneDensity, methods: Sequence[Quan
     axes.pcolormesh(x, angle, density, cmap="viridis", shading="gouraud", rasterized=True)
     axes.set_facecolor(colormaps["viridis"](0.0))
     axes.contour(x, angle, density, levels=levels, colors="w", linewidths=0.7)
-    wide, high = 1e3 * REACH * np.hypot(*d.frame.T)
+    wide, high = 1e3 * HALF_WIDTH * np.hypot(*d.frame.T)
     axes.set(xlabel=f"{plane.plane}, mm", ylabel=f"{plane.plane}′, mrad")
     axes.set(xlim=(-wide, wide), ylim=(-high, high))
     axes.set_title("contours of 50, 68, 90 and 95 % of the charge", fontsize=7)
     share = 100.0 * np.array(SHARES)
     every = list(plane.emittance.values())
-    known = [q.error is not None for q in every]
+    has_error = [q.error is not None for q in every]
     value = 1e6 * np.array([q.value for q in every])
     for part, alpha in (("95", 0.15), ("68", 0.3)):
         low, high = _band(every, part)
-        beside.fill_between(share, low, high, where=known, color=BLUE, alpha=alpha, lw=0)
-    beside.plot(share, value, "o-", color=BLUE, ms=4, lw=1.0)
-    open_ = [not k for k in known]
-    beside.plot(share[open_], value[open_], "o", color=RED, ms=5, mfc="w")
+        right.fill_between(share, low, high, where=has_error, color=BLUE, alpha=alpha, lw=0)
+    right.plot(share, value, "o-", color=BLUE, ms=4, lw=1.0)
+    open_ = [not k for k in has_error]
+    right.plot(share[open_], value[open_], "o", color=RED, ms=5, mfc="w")
     said = ["○ not determined"] * any(open_) + ["– size methods"] * bool(methods)
-    beside.set(xlabel="share of the charge, %", ylabel="normalised emittance, µm")
-    beside.set_title("   ".join(said), fontsize=7)
+    right.set(xlabel="share of the charge, %", ylabel="normalised emittance, µm")
+    right.set_title("   ".join(said), fontsize=7)
     for q in methods:
-        beside.plot(101.5, 1e6 * q.value, marker="_", color="0.4", ms=7)
-    beside.set_ylim(bottom=0.0)
+        right.plot(101.5, 1e6 * q.value, marker="_", color="0.4", ms=7)
+    right.set_ylim(bottom=0.0)
 
 
 def _band(every: list, part: str) -> tuple[np.ndarray, np.ndarray]:
-    """Ends of an interval of each emittance, µm; the value where there is none."""
+    """Return the ends of an interval of each emittance in µm; the value if there is none."""
     ends = []
     for q in every:
         if q.error is None:
@@ -137,17 +147,17 @@ def _band(every: list, part: str) -> tuple[np.ndarray, np.ndarray]:
 
 
 def draw_profiles(figure: FigureBase, plane: PlaneDensity) -> None:
-    """Draw each profile with the density seen from its side, and the pulls beneath.
+    """Draw each profile with the projection of the density, and the pulls below.
 
     Parameters
     ----------
     figure : Figure or SubFigure
         The figure to draw on.
     plane : PlaneDensity
-        With a density.
+        Plane with a density.
     """
     d, bins = plane.densities, plane.densities.bins
-    across = min(ABREAST, len(plane.profiles))
+    across = min(PROFILES_PER_ROW, len(plane.profiles))
     down = math.ceil(len(plane.profiles) / across)
     grid = figure.subplots(2 * down, across, squeeze=False, height_ratios=[3, 1] * down,
                            sharex=True)  # fmt: skip

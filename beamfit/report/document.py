@@ -1,4 +1,4 @@
-"""Parts of every report page, and its HTML form."""
+"""Parts common to all report pages, and their HTML form."""
 
 from __future__ import annotations
 
@@ -32,18 +32,18 @@ STYLE = {
     "axes.titlesize": 11,
     "axes.titlelocation": "left",
     "figure.dpi": 110,
-    "axes.formatter.useoffset": False,  # 9.99 h is no -0.01 and +1e1
-    "text.parse_math": False,  # a $ in a name is a $
+    "axes.formatter.useoffset": False,  # no offsets such as "+1e1" on an axis
+    "text.parse_math": False,  # a $ in a name is not mathematics
 }
-# Blue and red of the page; those of the planes.
+# Colours of the page, also of the planes x and y.
 BLUE, RED = "#1f5fa8", "#b5421f"
-# Points above which a curve is drawn as an image, to keep the page small.
-MANY = 500
-# Most curves, bars or profiles in a picture; the tables have all.
-MOST_DRAWN = 12
+# Number of points above which a curve is rasterised, to keep the page small.
+RASTER_POINTS = 500
+# Largest number of curves, bars or profiles in a picture; the tables have all.
+MAX_DRAWN = 12
 
 
-# A day as files and their names write it: 2021-02-18, perhaps with a time, or 22 June 2020.
+# A day in files and their names: 2021-02-18, optionally with a time, or 22 June 2020.
 DAY = re.compile(
     r"(?<!\d)((?:19|20)\d\d-\d\d-\d\d)(?:[-T _](\d\d)[:-]?(\d\d)[:-]?(\d\d))?(?!\d)"
     r"|(?<!\d)(\d{1,2} (?:January|February|March|April|May|June|July|August|September|October"
@@ -52,7 +52,7 @@ DAY = re.compile(
 
 
 class Verdict(NamedTuple):
-    """A status with its headline and its sentence."""
+    """Status of a result with its headline and its sentence."""
 
     status: Status
     headline: str
@@ -60,15 +60,15 @@ class Verdict(NamedTuple):
 
     @classmethod
     def of(cls, result: Any) -> Verdict:
-        """Status, headline and message of a result."""
+        """Take status, headline and message from a result."""
         return cls(result.status, result.headline, result.message)
 
 
 class Picture(NamedTuple):
-    """A picture: alternative text, height in inches, and a function that draws it.
+    """Picture of a report: alternative text, height in inches, and a function that draws it.
 
-    ``source`` names file, date, line and quality of the fit, in small letters above the picture,
-    so that it can stand alone in a logbook. ``width`` is that of the picture by itself.
+    ``source`` gives file, date, line and quality of the fit, in small letters above the picture,
+    so that it can be used alone in a logbook. ``width`` is its width in inches as a single file.
     """
 
     alt: str
@@ -86,13 +86,13 @@ class Picture(NamedTuple):
 
 
 class ReportPage(NamedTuple):
-    """A report: verdicts, the numbers people quote beside the leading pictures, then all else.
+    """Content of a report: verdicts, the quoted numbers with the leading pictures, all else.
 
-    The first table has these numbers; the others are folded on a screen. ``leading`` is how many
-    pictures stand beside it.
+    The first table has the quoted numbers; the others are folded on a screen. ``leading`` is the
+    number of pictures next to the first table.
 
-    ``links`` are names and addresses of further pages. Files and their SHA-256 in ``inputs``, and
-    ``remarks`` on them, are part of the ``provenance`` when it is `written_now`.
+    ``links`` are names and addresses of further pages. `with_provenance` adds the files and their
+    SHA-256 in ``inputs``, and the ``remarks`` on them, to the ``provenance``.
     """
 
     title: str
@@ -109,10 +109,10 @@ class ReportPage(NamedTuple):
     leading: int = 1
 
 
-def written_now(
+def with_provenance(
     page: ReportPage, command: str | None = None, inputs: Mapping[str, str | None] | None = None
 ) -> ReportPage:
-    """Say on a page when it is written and where it comes from: its own inputs unless given."""
+    """Add the time of writing and the provenance to a page; `inputs` replace those of the page."""
     packages = ", ".join(f"{n} {version(n)}" for n in ("jax", "numpy", "scipy", "matplotlib"))
     digests = inputs or page.inputs or {}
     made = [
@@ -126,12 +126,12 @@ def written_now(
     return page._replace(subtitle="; ".join(filter(None, (page.subtitle, now))), provenance=made)
 
 
-def moments(words: str) -> list[datetime]:
-    """Days, with the time where there is one, that stand in a text; those that exist.
+def dates_in(words: str) -> list[datetime]:
+    """Find the valid dates in a text, with the time if there is one.
 
     Examples
     --------
-    >>> [f"{day:%Y-%m-%d %H:%M}" for day in moments("OTR2-2021-02-18-124043.mat, 5 May 2020")]
+    >>> [f"{day:%Y-%m-%d %H:%M}" for day in dates_in("OTR2-2021-02-18-124043.mat, 5 May 2020")]
     ['2021-02-18 12:40', '2020-05-05 00:00']
     """
     found = []
@@ -147,19 +147,19 @@ def moments(words: str) -> list[datetime]:
 
 
 def day_of(name: str, comments: Sequence[str]) -> str:
-    """The one day that a file's name or its comments state, or nothing."""
-    days = {f"{moment:%Y-%m-%d}" for moment in moments(name)}
-    days = days or {f"{moment:%Y-%m-%d}" for line in comments for moment in moments(line)}
+    """Return the day in the name of a file, or in its comments, if there is exactly one."""
+    days = {f"{date:%Y-%m-%d}" for date in dates_in(name)}
+    days = days or {f"{date:%Y-%m-%d}" for line in comments for date in dates_in(line)}
     return days.pop() if len(days) == 1 else ""
 
 
 def quality(chi2: float | None, dof: int) -> str:
-    """The χ² of a fit for the source of a picture."""
+    """Write the χ² of a fit for the source line of a picture."""
     return "χ² not testable" if chi2 is None or not dof else f"χ²/dof {chi2:.3g}/{dof}"
 
 
-def from_head(lines: Sequence[str]) -> tuple[str, ...]:
-    """Comment lines at the head of a file, as notes of a page."""
+def comment_notes(lines: Sequence[str]) -> tuple[str, ...]:
+    """Make notes of a page from the comment lines at the head of a file."""
     return ("From the head of the file:", *lines) if lines else ()
 
 
@@ -171,9 +171,9 @@ def control_chart(
     names: tuple[str, str],
     **style: Any,
 ) -> None:
-    """Draw points (at, value, error) that lie within and beyond limits (centre, reach), and these.
+    """Draw points (at, value, error) within and beyond control limits (centre, reach).
 
-    `names` are those of the two kinds of points; an infinite reach is none.
+    `names` are the labels of the two kinds of points; limits with an infinite reach are not drawn.
     """
     for chosen, colour, name in zip((~beyond, beyond), (BLUE, RED), names, strict=True):
         if chosen.any():
@@ -187,7 +187,7 @@ def control_chart(
 
 
 def contour_levels(density: np.ndarray, shares: Sequence[float]) -> list[float]:
-    """Values of a density above which these shares of it lie, the largest share first.
+    """Return the density levels above which the given shares lie, the largest share first.
 
     Examples
     --------
@@ -207,22 +207,24 @@ def date_axis(axes: Axes) -> None:
 
 
 def legend_below(figure: FigureBase, axes: Axes, columns: int) -> None:
-    """Put the legend of some axes below their figure, in so many columns."""
+    """Put the legend of some axes below their figure, in `columns` columns."""
     shown = axes.get_legend_handles_labels()
     figure.legend(*shown, frameon=False, loc="outside lower center", ncols=columns)
 
 
-# A value with its error and unit, or a short word with a hyphen, a sign or an exponent.
-WHOLE = re.compile(r"\(?[-+]?\d\S* ± \d\S*(?: (?=[^\s\d(])\S+)?|(?<!\S)(?=\S{1,24}(?!\S))\S*-\S*")
+# Text without line breaks: a value with error and unit, or a short word with a hyphen.
+UNBREAKABLE = re.compile(
+    r"\(?[-+]?\d\S* ± \d\S*(?: (?=[^\s\d(])\S+)?|(?<!\S)(?=\S{1,24}(?!\S))\S*-\S*"
+)
 
 
 def unbroken(text: str) -> Markup:
-    """Mark in a text what no line may break: numbers with errors and units, words with a hyphen."""
-    return Markup(WHOLE.sub(r"<span>\g<0></span>", str(escape(text))))
+    """Mark numbers with errors and units, and words with a hyphen, against line breaks."""
+    return Markup(UNBREAKABLE.sub(r"<span>\g<0></span>", str(escape(text))))
 
 
 def html_of(page: ReportPage) -> bytes:
-    """Make the HTML form of a report, pictures inside.
+    """Make the HTML form of a report, with embedded pictures.
 
     Parameters
     ----------
@@ -242,7 +244,7 @@ def html_of(page: ReportPage) -> bytes:
     )
     environment.filters["unbroken"] = unbroken
     pictures = [
-        {"alt": p.alt, "data": base64.b64encode(drawn(p, "svg", clear=True)).decode()}
+        {"alt": p.alt, "data": base64.b64encode(image_of(p, "svg", transparent=True)).decode()}
         for p in page.pictures
     ]
     content = page._asdict() | {"pictures": pictures}
@@ -250,7 +252,7 @@ def html_of(page: ReportPage) -> bytes:
 
 
 class ShownFigure(Figure):
-    """A matplotlib Figure that a notebook shows, also where nobody has imported pyplot."""
+    """Matplotlib Figure that a notebook shows without an import of pyplot."""
 
     def _repr_png_(self) -> bytes:
         buffer = io.BytesIO()
@@ -259,15 +261,15 @@ class ShownFigure(Figure):
 
 
 def figure_of(picture: Picture) -> Figure:
-    """Draw a picture by itself."""
+    """Draw a picture as a figure."""
     figure = ShownFigure(figsize=(picture.width, picture.height), layout="constrained")
     picture.on(figure)
     return figure
 
 
-def drawn(picture: Picture, kind: str, clear: bool = False) -> bytes:
-    """A picture by itself as the bytes of a file, png or svg, on white or on nothing."""
+def image_of(picture: Picture, kind: str, transparent: bool = False) -> bytes:
+    """Render a picture as the bytes of a png or svg file."""
     buffer = io.BytesIO()
     dpi = 200 if kind == "png" else "figure"
-    figure_of(picture).savefig(buffer, format=kind, dpi=dpi, transparent=clear)
+    figure_of(picture).savefig(buffer, format=kind, dpi=dpi, transparent=transparent)
     return buffer.getvalue()

@@ -1,4 +1,4 @@
-"""The reports of processes: an identified response, a fed-batch process and its feed, a loop."""
+"""Reports of processes: identified responses, fed-batch processes and feeds, control loops."""
 
 from __future__ import annotations
 
@@ -25,12 +25,13 @@ RESPONSE = (
     "outputs enter through their residuals only. Bands are one standard deviation; where they are "
     "missing the data put none on the curve, or were never there.",
 )
-# Most points drawn of a run, and most runs drawn.
-MOST, RUNS = 4000, 6
+# Largest number of points drawn of a run, and of runs drawn.
+MAX_POINTS = 4000
+MAX_RUNS = 6
 
 
 def response_page(fits: Sequence[ResponseFit | StatesFit]) -> ReportPage:
-    """Lay out the responses of some outputs."""
+    """Make the page of the responses of some outputs."""
     runs = fits[0].runs
     return ReportPage(
         title=f"Response of {', '.join(fit.output for fit in fits)}",
@@ -45,30 +46,30 @@ def response_page(fits: Sequence[ResponseFit | StatesFit]) -> ReportPage:
 
 
 def _tables(fit: ResponseFit | StatesFit) -> list[Table]:
-    """Those of a fit, the range of each parameter curve in the first."""
+    """Return the tables of a fit, with the range of each parameter curve added to the first."""
     first, *others = fit.tables()
     ranges = []
     for curve in (c for part in fit.parts for c in part.curves if c.visited.any()):
-        seen = curve.value[curve.visited]
-        words = f"{seen.min():.4g} to {seen.max():.4g} {curve.unit}, by {curve.input}"
+        visited = curve.value[curve.visited]
+        words = f"{visited.min():.4g} to {visited.max():.4g} {curve.unit}, by {curve.input}"
         ranges.append([curve.parameter, words])
     return [first._replace(rows=[*ranges, *first.rows]), *others]
 
 
 def source_of(run: Run, fit: ResponseFit | StateSpaceOutput) -> str:
-    """File, day and quality of a fitted run."""
+    """Return file, day and quality of a fitted run."""
     parts = [run.name, day_of(run.name, run.provenance)]
     parts.append(f"free run explains {fit.checks.free_run_percent:.4g} %")
     return ", ".join(part for part in parts if part)
 
 
 def unitless(name: str) -> str:
-    """A label of a column whose unit the file leaves open."""
+    """Label a column whose unit the file does not give."""
     return f"{name}, as in the file"
 
 
 def about_runs(runs: Sequence[Run]) -> dict[str, Any]:
-    """The inputs of a page on some runs, and the remarks on them."""
+    """Return the inputs of a page on some runs, and the remarks on them."""
     return {
         "inputs": {run.path or run.name: run.sha256 or None for run in runs},
         "remarks": [(f"said in {run.name}", line) for run in runs for line in run.provenance],
@@ -76,7 +77,7 @@ def about_runs(runs: Sequence[Run]) -> dict[str, Any]:
 
 
 def _pictures(fit: ResponseFit | StateSpaceOutput) -> list[Picture]:
-    runs = range(min(len(fit.runs), RUNS))
+    runs = range(min(len(fit.runs), MAX_RUNS))
     found = [
         Picture(f"{fit.output} measured and simulated in {fit.runs[i].name}", 4.2,
                 partial(_draw_run, fit, i), source_of(fit.runs[i], fit))
@@ -91,7 +92,7 @@ def _pictures(fit: ResponseFit | StateSpaceOutput) -> list[Picture]:
 def _curves(
     fit: ResponseFit | StateSpaceOutput | FedBatchFit, by: str, source: str
 ) -> list[Picture]:
-    """The picture of each parameter curve."""
+    """Make the picture of each parameter curve."""
     return [
         Picture(f"{c.parameter} {by} {c.input} with its band", 2.8, partial(draw_curve, c), source)
         for c in fit.curves
@@ -99,10 +100,10 @@ def _curves(
 
 
 def _draw_run(fit: ResponseFit | StateSpaceOutput, i: int, figure: FigureBase) -> None:
-    """Measured and simulated output, their difference, and the inputs."""
+    """Draw measured and simulated output, their difference, and the inputs."""
     run, time, y = fit.runs[i], fit.seen.time[i], fit.seen.measured[i]
     simulated = fit.fitted[i]
-    thin = slice(None, None, max(1, len(time) // MOST))
+    thin = slice(None, None, max(1, len(time) // MAX_POINTS))
     above, middle, below = figure.subplots(3, 1, sharex=True, height_ratios=(3, 1, 1))
     above.plot(time[thin], y[thin], ".", color="0.6", markersize=3, label="measured")
     above.plot(time[thin], simulated[thin], color=BLUE, label="simulated")
@@ -124,23 +125,23 @@ def _draw_run(fit: ResponseFit | StateSpaceOutput, i: int, figure: FigureBase) -
 
 
 def draw_curve(c: Curve, figure: FigureBase) -> None:
-    """A parameter against the operating point, dashed where the runs never were."""
+    """Draw a parameter against the operating point, dashed outside the visited range."""
     axes = figure.subplots()
-    known = c.visited & np.isfinite(c.error)
+    has_band = c.visited & np.isfinite(c.error)
     axes.plot(c.at, c.value, "--", color="0.6", linewidth=1)
     axes.plot(c.at, np.where(c.visited, c.value, np.nan), color=BLUE)
-    low, high = (np.where(known, c.value + s * c.error, np.nan) for s in (-1, 1))
+    low, high = (np.where(has_band, c.value + s * c.error, np.nan) for s in (-1, 1))
     axes.fill_between(c.at, low, high, color=BLUE, alpha=0.25, linewidth=0)
     axes.set(title=f"{c.parameter} by {c.input}", xlabel=unitless(c.input))
     axes.set_ylabel(f"{c.parameter}, {c.unit}")
-    if c.visited.any():  # the band where data were; a wild end elsewhere is cut off
-        inside = np.concatenate([low[known], high[known], c.value[c.visited]])
+    if c.visited.any():  # limit the axis to the band in the visited range
+        inside = np.concatenate([low[has_band], high[has_band], c.value[c.visited]])
         edge = 0.15 * max(float(np.ptp(inside)), 1e-12)
         axes.set_ylim(inside.min() - edge, inside.max() + edge)
 
 
 def _draw_correlations(fit: ResponseFit | StateSpaceOutput, figure: FigureBase) -> None:
-    """Correlation of residuals with themselves and with past inputs, with the 99 % band of none."""
+    """Draw correlations of residuals with themselves and with past inputs, with a 99 % band."""
     own, others = figure.subplots(1, 2)
     rest = [y - s for y, s in zip(fit.seen.measured, fit.fitted, strict=True)]
     count, lags = sum(map(len, rest)), np.arange(1, 21)
@@ -167,7 +168,7 @@ UNITS = {"biomass": "g/L", "substrate": "g/L", "volume": "L", "titre": "g/L"}
 
 
 def fedbatch_page(rates: FedBatchFit) -> ReportPage:
-    """Lay out batches and rates."""
+    """Make the page of batches and rates."""
     pictures = [
         Picture(
             f"Measured and predicted in {run.name}", 6.8, partial(draw_batch, rates, i), run.name
@@ -189,7 +190,7 @@ def fedbatch_page(rates: FedBatchFit) -> ReportPage:
 
 
 def feed_page(plan: FeedPlan) -> ReportPage:
-    """Lay out a planned feed."""
+    """Make the page of a planned feed."""
     return ReportPage(
         title="Feed profile",
         subtitle="planned on the identified process",
@@ -202,7 +203,7 @@ def feed_page(plan: FeedPlan) -> ReportPage:
 
 
 def draw_batch(fit: FedBatchFit, i: int, figure: FigureBase) -> None:
-    """Measured and predicted outputs of a batch, and its inputs below."""
+    """Draw measured and predicted outputs of a batch, and its inputs below."""
     run, names = fit.runs[i], list(fit.noise)
     hours = (run.time - run.time[0]) / HOUR
     axes = figure.subplots(len(names) + 1, 1, sharex=True)
@@ -233,7 +234,7 @@ def draw_course(course: FeedCourse, figure: FigureBase) -> None:
     figure.align_ylabels(axes)
 
 
-DISTURBED = "#7b4fa3"
+DISTURBANCE_COLOUR = "#7b4fa3"
 
 SIMULATED = (
     "SIMULATED: the process is the fitted model, with the noise of its residuals. Limits of inputs "
@@ -243,7 +244,7 @@ SIMULATED = (
 
 
 def control_page(loop: Loop) -> ReportPage:
-    """Lay out a loop."""
+    """Make the page of a control loop."""
     runs = loop.fits[0].runs
     tables = [*loop.tables(), *(table for fit in loop.fits for table in fit.tables()[:1])]
     return ReportPage(
@@ -266,7 +267,7 @@ def control_page(loop: Loop) -> ReportPage:
 
 
 def _draw(loop: Loop, figure: FigureBase) -> None:
-    """A row for each output and each input, with their limits."""
+    """Draw each output and each input with its limits."""
     c, trace = loop.control, loop.trace
     outputs, inputs = len(c.responses), len(c.inputs)
     axes = figure.subplots(outputs + inputs, 1, sharex=True, squeeze=False,
@@ -281,7 +282,7 @@ def _draw(loop: Loop, figure: FigureBase) -> None:
     for change in loop.changes:
         if change.disturbed:
             row = axes[[r.name for r in c.responses].index(change.output)]
-            row.axvline(change.time, color=DISTURBED, linewidth=1, linestyle=":",
+            row.axvline(change.time, color=DISTURBANCE_COLOUR, linewidth=1, linestyle=":",
                         label=f"disturbed by {change.disturbed:.3g}")  # fmt: skip
     for row in axes[:outputs]:
         row.margins(y=0.25)

@@ -1,4 +1,4 @@
-"""The report of an emittance fit, and of the slices of a beam: tables and pictures."""
+"""Reports of an emittance fit, and of the slices of a beam."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from beamfit.emittance.size_methods import SizeMethods
 from beamfit.emittance.slices import SliceFits
 from beamfit.emittance.systematics import budget_rows, range_rows
 from beamfit.errors import Status
-from beamfit.report.document import MOST_DRAWN, Picture, ReportPage, Verdict, from_head
+from beamfit.report.document import MAX_DRAWN, Picture, ReportPage, Verdict, comment_notes
 from beamfit.report.scan_pictures import (
-    ABREAST,
-    ALONE,
     COLOUR,
-    PROFILES_ABREAST,
+    FULL_WIDTH,
+    PAIR_WIDTH,
+    PROFILES_PER_ROW,
     draw_profiles,
     ellipse_picture,
     has_ellipses,
@@ -41,19 +41,19 @@ METHODS = (
     "“Measured weights” is emittance_gui's own method, computed here. The error over all methods "
     "has the spread of the methods in it, as a systematic."
 )
-# Most rows in a table of points.
-MOST_ROWS = 500
+# Largest number of rows in a table of points.
+MAX_ROWS_SHOWN = 500
 
 
 def emittance_page(fit: EmittanceFit, methods: tuple[SizeMethods, ...] = ()) -> ReportPage:
-    """Lay out an emittance fit.
+    """Make the page of an emittance fit.
 
     Parameters
     ----------
     fit : EmittanceFit
         The fit.
     methods : tuple of SizeMethods
-        What other ways of taking the sizes say.
+        Results with other size methods.
 
     Returns
     -------
@@ -85,22 +85,22 @@ def emittance_page(fit: EmittanceFit, methods: tuple[SizeMethods, ...] = ()) -> 
 
 
 def about_input(notes: Sequence[str]) -> list[Table]:
-    """Table of notes about the input: oddities, and changes made to its numbers."""
+    """Make a table of notes about the input: oddities, and changes made to its numbers."""
     return [Table("About the input", [], [[note] for note in notes])] if notes else []
 
 
 def about_scan(scan: QuadScan) -> dict[str, Any]:
-    """The inputs of a page on a scan, remarks on them, and what the head of the file says."""
+    """Return the inputs of a page on a scan, remarks on them, and the comments of the file."""
     source = scan.error_source if scan.error else "none in the file; inferred"
     return {
         "inputs": {str(scan.path): scan.sha256} if scan.path else {},
         "remarks": [("errors of the sizes", source)],
-        "notes": from_head(scan.provenance),
+        "notes": comment_notes(scan.provenance),
     }
 
 
 def _budgets(fit: EmittanceFit, names: list[str]) -> list[Table]:
-    """Tables of the emittance with another line and with fewer points."""
+    """Make tables of the emittance with a changed line and with fewer points."""
     changed = "Relative change of the normalised emittance, from exact derivatives."
     shifted = "Normalised emittance, and its shift in standard errors of the full fit."
     title, other = "If the line were a little different", "If some points were left out"
@@ -111,12 +111,12 @@ def _budgets(fit: EmittanceFit, names: list[str]) -> list[Table]:
 
 
 def _pictures(fit: EmittanceFit) -> list[Picture]:
-    width = ALONE if len(fit.planes) == 1 else ABREAST
+    width = FULL_WIDTH if len(fit.planes) == 1 else PAIR_WIDTH
     listed = [scan_picture(fit, p.plane, width) for p in fit.planes]
     for p in fit.planes:
         first = {f.row: f for f in reversed(fit.scan.profiles) if f.plane == p.plane}
-        if shown := [first[row] for row in sorted(first)][:MOST_DRAWN]:
-            height = 0.6 + 1.3 * math.ceil(len(shown) / PROFILES_ABREAST)
+        if shown := [first[row] for row in sorted(first)][:MAX_DRAWN]:
+            height = 0.6 + 1.3 * math.ceil(len(shown) / PROFILES_PER_ROW)
             draw = partial(draw_profiles, profiles=shown, fit=fit)
             words, source = f"profiles of the {p.plane} plane", source_of(fit)
             listed.append(Picture(words, height, draw, source))
@@ -126,7 +126,7 @@ def _pictures(fit: EmittanceFit) -> list[Picture]:
 
 
 def identifiability_rows(planes: tuple[PlaneFit, ...]) -> list[tuple[str, list[str]]]:
-    """Label and one cell per plane for what the data determine."""
+    """Return rows, with one cell per plane, on what the data determine."""
     rows: list[tuple[str, Callable[[PlaneFit], object]]] = [
         ("emittance", lambda p: "determined" if p.identifiability.determined else "not determined"),
         ("not determined", lambda p: ", ".join(p.identifiability.undetermined) or "nothing"),
@@ -147,7 +147,7 @@ def _condition(value: float | None) -> str:
 
 
 def point_rows(plane: PlaneFit) -> tuple[list[str], list[list[str]]]:
-    """Header and rows of the point-by-point table of one plane.
+    """Return header and rows of the table of points of one plane.
 
     Parameters
     ----------
@@ -157,7 +157,7 @@ def point_rows(plane: PlaneFit) -> tuple[list[str], list[list[str]]]:
     Returns
     -------
     tuple
-        Column names, and one list of cells a point.
+        Column names, and one list of cells per point.
     """
     p = plane.points
     columns = {"screen": p.screen} if len(set(p.screen)) > 1 else {}
@@ -167,7 +167,7 @@ def point_rows(plane: PlaneFit) -> tuple[list[str], list[list[str]]]:
     columns["pull"] = map("{:+.2f}".format, p.pull)
     if (p.outlier_probability > 0.05).any():
         columns["P(bad)"] = map("{:.2f}".format, p.outlier_probability)
-    rows = [list(row) for row in islice(zip(*columns.values(), strict=True), MOST_ROWS)]
+    rows = [list(row) for row in islice(zip(*columns.values(), strict=True), MAX_ROWS_SHOWN)]
     left = len(p.size) - len(rows)
     if left > 0:
         rows.append([f"{left} more"] + [""] * (len(columns) - 1))
@@ -181,12 +181,12 @@ FIXED = (
 
 
 def slices_page(fits: SliceFits) -> ReportPage:
-    """Lay out the fits of the slices of a beam.
+    """Make the page of the slices of a beam.
 
     Parameters
     ----------
     fits : SliceFits
-        From `fit_slices`.
+        Result of `fit_slices`.
 
     Returns
     -------
@@ -207,7 +207,7 @@ def slices_page(fits: SliceFits) -> ReportPage:
     pictures = [Picture("emittance of each slice", 3.1, draw, source)]
     pictures += [
         scan_picture(fit, p.plane)._replace(alt=f"scan of slice {name}")
-        for name, fit, p in found[:MOST_DRAWN]
+        for name, fit, p in found[:MAX_DRAWN]
     ]
     return ReportPage(
         title=f"Slice emittances of {scan.name}",
@@ -222,7 +222,7 @@ def slices_page(fits: SliceFits) -> ReportPage:
 
 
 def _verdicts(fits: SliceFits) -> Iterator[Verdict]:
-    """Verdict of each slice, those that say the same together."""
+    """Yield the verdicts of the slices, with equal ones combined."""
     for (plane, status, message), same in fits.alike().items():
         answers = list(same.values())
         words = answers[0].words
@@ -239,7 +239,7 @@ def _verdicts(fits: SliceFits) -> Iterator[Verdict]:
 def draw_slices(figure: FigureBase, fits: SliceFits) -> None:
     """Draw the normalised emittance of each slice, and the projected one as a band.
 
-    Slices whose emittance the data do not determine are left out.
+    Slices without a determined emittance are left out.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""The report of a solved formulation: verdict, tables, and outputs against their index."""
+"""Report of a solved formulation: verdict, tables, and outputs against their index."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from beamfit.answer import Table
 from beamfit.language.compiled import Computed
 from beamfit.language.solution import ProblemSolution
 from beamfit.language.text import format_document
-from beamfit.report.document import BLUE, MOST_DRAWN, Picture, ReportPage, Verdict
+from beamfit.report.document import BLUE, MAX_DRAWN, Picture, ReportPage, Verdict
 
 
 def formulation_page(found: ProblemSolution) -> ReportPage:
-    """Lay out a solution.
+    """Make the page of a solution.
 
     Parameters
     ----------
     found : ProblemSolution
-        From `beamfit.language.solution.solve_document`.
+        Result of `beamfit.language.solution.solve_document`.
 
     Returns
     -------
@@ -59,7 +59,7 @@ def formulation_page(found: ProblemSolution) -> ReportPage:
 
 
 def computed_page(found: Computed) -> ReportPage:
-    """Lay out a mapping computed."""
+    """Make the page of an evaluated mapping."""
     titles = ["Outputs"] + ["Gains"] * bool(found.gains)
     tables = [t._replace(title=name) for name, t in zip(titles, found.tables(), strict=True)]
     counts = f"{len(found.outputs)} outputs"
@@ -74,14 +74,14 @@ def computed_page(found: Computed) -> ReportPage:
 
 
 def _drawn(found: ProblemSolution):
-    """Outputs with one dimension: name, elements of its set, values."""
+    """Return the outputs with one dimension: name, elements of the set, values."""
     arrays = found.made.program.scope.outputs
     lines = [(n, arrays[n].dims[0], v) for n, v in found.outputs.items() if v.ndim == 1]
-    return lines[:MOST_DRAWN]
+    return lines[:MAX_DRAWN]
 
 
 def draw_outputs(figure: FigureBase, found: ProblemSolution) -> None:
-    """Draw every output that runs over one set, each in axes of its own.
+    """Draw every output with one dimension, each in its own axes.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""The page of each result that is neither of a scan nor of decays; imports every study."""
+"""Pages of all results other than scans and decays; imports every study."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from beamfit.report.formulation import computed_page, formulation_page
 from beamfit.report.tuning import tuning_page
 from beamfit.tuning.fit import TuningFit
 
-# A result by itself, and several beside one another.
+# Functions that make the page of one result, and of several results.
 OF_ONE = {
     ProblemSolution: formulation_page,
     Computed: computed_page,
@@ -38,7 +38,7 @@ OF_SEVERAL = dict.fromkeys((ResponseFit, StatesFit), response_page)
 
 
 def page_of(several: Sequence[Any]) -> ReportPage:
-    """The page of such a result, or of several."""
+    """Make the page of a result, or of several."""
     kind = type(several[0])
     if kind not in OF_ONE and kind not in OF_SEVERAL:
         raise InputError(f"a report of a {kind.__name__}", "a fit, or another result that has one")

@@ -1,4 +1,4 @@
-"""The report of decay records, and of the course of their lifetimes."""
+"""Report of decay records, and of the trend of their lifetimes."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ from beamfit.lifetime.systematics import moving_lifetime
 from beamfit.quantity import HOUR
 from beamfit.report.document import (
     BLUE,
-    MANY,
-    MOST_DRAWN,
+    MAX_DRAWN,
+    RASTER_POINTS,
     RED,
     Picture,
     ReportPage,
     Verdict,
+    comment_notes,
     control_chart,
     date_axis,
     day_of,
-    from_head,
     legend_below,
     quality,
 )
@@ -54,15 +54,16 @@ BUDGET = (
     "shares of the computed loss at the mean current."
 )
 # Columns of a table of decays that fit the page.
-ABREAST = 2
-# Most cycles of which each is drawn, and how many of more are.
-MOST_CYCLES, SOME = 60, 12
+TABLE_COLUMNS = 2
+# Largest number of cycles that are all drawn, and number drawn of more.
+MAX_CYCLES = 60
+CYCLES_DRAWN = 12
 
 
 def decay_page(
     studies: Sequence[RecordStudy], shift: Shift | None = None, trend: Trend | None = None
 ) -> ReportPage:
-    """Lay out decay records.
+    """Make the page of decay records.
 
     Parameters
     ----------
@@ -71,7 +72,7 @@ def decay_page(
     shift : Shift, optional
         The study of all decays together.
     trend : Trend, optional
-        The course of their lifetimes.
+        The trend of their lifetimes.
 
     Returns
     -------
@@ -84,7 +85,7 @@ def decay_page(
         listed += [found[0].quoted()._replace(title="Result", note="", header=[]), *found]
     listed += [] if trend is None else trend.tables()
     pooled = [decay for study in studies for decay in study.pooled]
-    listed += _side_by_side(pooled) + tables.course_tables(pooled) + _single(decays)
+    listed += _column_tables(pooled) + tables.course_tables(pooled) + _single_tables(decays)
     header = ["what", "at", "for", "change"]
     listed += [
         Table(f"Cut at or left out of {study.record.name}", header, tables.event_rows(study))
@@ -99,16 +100,16 @@ def decay_page(
     return ReportPage(
         title=f"Beam lifetime of {title}",
         subtitle=f"{count} in {hours:.3g} h of record",
-        verdicts=[*_together(shift, trend), *map(_verdict, pooled), *_verdicts(decays)],
-        tables=_distinct(listed),
-        pictures=_of_all(decays, shift, trend) + _pictures(studies),
+        verdicts=[*_overall_verdicts(shift, trend), *map(_verdict, pooled), *_verdicts(decays)],
+        tables=_unique_headings(listed),
+        pictures=_overall_pictures(decays, shift, trend) + _pictures(studies),
         pictures_title="Lifetime along the record" if len(studies) == 1 else "Records and fits",
-        notes=from_head([note for study in studies for note in study.record.comments]),
+        notes=comment_notes([note for study in studies for note in study.record.comments]),
     )
 
 
-def _distinct(listed: Sequence[Table]) -> list[Table]:
-    """Add the names of its columns to a heading that several tables have."""
+def _unique_headings(listed: Sequence[Table]) -> list[Table]:
+    """Add the column names to headings that occur more than once."""
     count = Counter(table.title for table in listed)
     return [
         t._replace(title=f"{t.title}: {', '.join(t.header[1:])}") if count[t.title] > 1 else t
@@ -116,9 +117,9 @@ def _distinct(listed: Sequence[Table]) -> list[Table]:
     ]
 
 
-def _side_by_side(decays: Sequence[Decay]) -> list[Table]:
-    """Every number of a few decays, one column each."""
-    groups = [decays[k : k + ABREAST] for k in range(0, len(decays), ABREAST)]
+def _column_tables(decays: Sequence[Decay]) -> list[Table]:
+    """Make tables with every number of a few decays, one column per decay."""
+    groups = [decays[k : k + TABLE_COLUMNS] for k in range(0, len(decays), TABLE_COLUMNS)]
     parts = [
         ("All numbers", ERRORS, tables.decay_rows),
         ("What the records determine", "", tables.separability_rows),
@@ -137,19 +138,19 @@ def _side_by_side(decays: Sequence[Decay]) -> list[Table]:
     return [*first, *every]
 
 
-def _single(decays: Sequence[Decay]) -> list[Table]:
-    """Every number of a few decays; the main numbers of many, one row each."""
+def _single_tables(decays: Sequence[Decay]) -> list[Table]:
+    """Make tables of all numbers of a few decays, or of the main numbers of many."""
     if len(decays) > tables.MAX_FULL_DECAYS:
         result, *more = tables.overview(decays)
         return [result._replace(note=ERRORS), *more]
-    listed = _side_by_side(decays)
+    listed = _column_tables(decays)
     for d in (d for d in decays if d.systematics):
         listed.append(tables.systematic_table(d, f"Systematics of {d.fit.record}"))
     return listed
 
 
 def _verdicts(decays: Sequence[Decay]) -> list[Verdict]:
-    """Verdict of each decay; of many decays one for each distinct message."""
+    """Return the verdict of each decay; for many decays one for each distinct message."""
     if len(decays) <= tables.MAX_FULL_DECAYS:
         return [_verdict(decay) for decay in decays]
     return [Verdict(*verdict) for verdict in tables.distinct_verdicts(decays)]
@@ -162,8 +163,8 @@ def _verdict(decay: Decay) -> Verdict:
     return Verdict(fit.status, f"{fit.record}: {headline}", fit.message)
 
 
-def _together(shift: Shift | None, trend: Trend | None) -> Iterator[Verdict]:
-    """Verdicts on all decays together."""
+def _overall_verdicts(shift: Shift | None, trend: Trend | None) -> Iterator[Verdict]:
+    """Yield the verdicts on all decays together."""
     if shift is not None:
         yield from (Verdict(status, name, said) for name, status, said in shift.verdicts)
     if trend is not None:
@@ -171,12 +172,12 @@ def _together(shift: Shift | None, trend: Trend | None) -> Iterator[Verdict]:
 
 
 def study_of(result: DecayFit | RecordStudy) -> RecordStudy:
-    """A fit by itself as the study of its record.
+    """Wrap a single fit as the study of its record.
 
     Raises
     ------
     InputError
-        If the fit does not hold what it was fitted to.
+        If the fit does not contain its readings.
     """
     if isinstance(result, RecordStudy):
         return result
@@ -186,19 +187,19 @@ def study_of(result: DecayFit | RecordStudy) -> RecordStudy:
 
 
 def record_picture(study: RecordStudy) -> Picture:
-    """The picture of a record with its fits."""
+    """Make the picture of a record with its fits."""
     draw = partial(draw_record, study=study)
     return Picture(f"current of {study.record.name}", 4.4, draw, _source(study))
 
 
 def lifetime_picture(study: RecordStudy) -> Picture:
-    """The picture of the momentary lifetime along a record."""
+    """Make the picture of the momentary lifetime along a record."""
     draw = partial(draw_lifetime, study=study)
     return Picture(f"lifetime of {study.record.name}", 3.0, draw, _source(study))
 
 
 def _source(study: RecordStudy) -> str:
-    """File, day and the quality of the fit of a record."""
+    """Return file, day and quality of the fit of a record."""
     record, answers = study.record, study.answers
     day = day_of(record.name, record.comments)
     if record.start is not None:
@@ -213,8 +214,9 @@ def _source(study: RecordStudy) -> str:
 
 
 def draw_record(figure: FigureBase, study: RecordStudy) -> None:
-    """Draw a record with the fit of each decay, and the residuals below; of very many cycles some
-    with their fits, and the residuals of all.
+    """Draw a record with the fit of each decay, and the residuals below.
+
+    Of very many cycles, some are drawn with their fits, and the residuals of all.
 
     Parameters
     ----------
@@ -226,7 +228,7 @@ def draw_record(figure: FigureBase, study: RecordStudy) -> None:
     some = _some_cycles(study)
     above, below = figure.subplots(2, 1, sharex=some is None, height_ratios=(3, 1))
     record, scale, unit = study.record, *_time_unit(study.record.span)
-    many = len(record) > MANY
+    many = len(record) > RASTER_POINTS
     dots = partial(dict, marker="o", ls="", ms=2 if many else 5, rasterized=many)
     above.plot(record.time / scale, record.current, **dots(color="0.65", zorder=1))
     for decay in study.pooled:
@@ -244,9 +246,9 @@ def draw_record(figure: FigureBase, study: RecordStudy) -> None:
     shown, title = np.concatenate(fitted), "beam current"
     if some is not None:
         shown = record.current[(record.time >= some[0]) & (record.time <= some[1])]
-        title += f", {SOME} of {study.pooled[0].fit.first.size} cycles"
+        title += f", {CYCLES_DRAWN} of {study.pooled[0].fit.first.size} cycles"
         above.set_xlim(some / scale)
-    # Spikes, dumps and injections would make a straight line of the decay.
+    # The axis excludes spikes, dumps and injections, which would flatten the decay to a line.
     more = 0.1 * float(np.ptp(shown)) or 1.0
     low, high = float(shown.min()) - more, float(shown.max()) + more
     above.set(title=title, ylabel="beam current, mA", ylim=(low, high))
@@ -260,18 +262,18 @@ def draw_record(figure: FigureBase, study: RecordStudy) -> None:
 
 
 def _some_cycles(study: RecordStudy) -> np.ndarray | None:
-    """From when to when cycles are drawn where all of them would be a block of colour, s."""
+    """Return the time range of the drawn cycles in s if there are too many to draw all."""
     if study.decays or len(study.pooled) != 1:
         return None
     readings, first = study.pooled[0].fit.readings, study.pooled[0].fit.first
-    if first.size <= MOST_CYCLES:
+    if first.size <= MAX_CYCLES:
         return None
-    middle = first[first.size // 2 + np.array([0, SOME])]
+    middle = first[first.size // 2 + np.array([0, CYCLES_DRAWN])]
     return readings.start + readings.time[middle]
 
 
 def _draw_cycles(above: Axes, below: Axes, fit: DecayFit, scale: float, dots: Callable) -> None:
-    """Draw cycles that were fitted together, the law broken between them."""
+    """Draw cycles that were fitted together, with a gap in the curve between them."""
     at = (fit.readings.start + fit.readings.time) / scale
     above.plot(at, fit.readings.current, **dots(color=BLUE, zorder=2))
     law = np.insert(fit.readings.current + fit.residuals, fit.first, np.nan)
@@ -286,7 +288,7 @@ def _time_unit(span: float) -> tuple[float, str]:
 
 
 def draw_lifetime(figure: FigureBase, study: RecordStudy) -> None:
-    """Draw the momentary lifetime over a moving window beside that of the fit.
+    """Draw the momentary lifetime in a moving window and that of the fit.
 
     Parameters
     ----------
@@ -308,28 +310,28 @@ def draw_lifetime(figure: FigureBase, study: RecordStudy) -> None:
             ends = np.array([begin + start, begin + end]) / scale
             axes.plot(ends, 2 * [mean.value], color=RED, lw=1.5, zorder=3)
     for decay in study.decays:
-        tops.append(_momentary(axes, decay, scale))
+        tops.append(_draw_windows(axes, decay, scale))
         grid = np.linspace(0, decay.segment.span, 100)
         rate = -np.gradient(np.log(decay.fit.curve(grid)), grid, edge_order=2) * HOUR
-        # A rate of zero or less is no lifetime: leave a hole in the curve.
+        # A rate of zero or less has no lifetime: leave a gap in the curve.
         inverse = 1 / np.where(rate > 0, rate, np.nan)
         axes.plot((decay.offset + grid) / scale, inverse, color=RED, lw=1.5, zorder=3)
-    seen = (
+    label = (
         "single cycles, or some together" if study.pooled else "straight lines over 1/8 of a decay"
     )
-    axes.errorbar([], [], [], fmt="o", ms=3, color=BLUE, label=seen)
+    axes.errorbar([], [], [], fmt="o", ms=3, color=BLUE, label=label)
     axes.plot([], [], color=RED, label="fit")
-    known = [top for top in tops if np.isfinite(top)]
-    if known:
-        axes.set_ylim(0.6 * min(known), 1.4 * max(known))
+    finite = [top for top in tops if np.isfinite(top)]
+    if finite:
+        axes.set_ylim(0.6 * min(finite), 1.4 * max(finite))
     axes.set(title="momentary lifetime", xlabel=f"time, {unit}", ylabel="lifetime, h")
     legend_below(figure, axes, 2)
 
 
 def _cycle_lifetimes(fit: DecayFit) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Time, s, lifetime and its error, h, of up to 48 parts of a pooled fit.
+    """Return time in s, lifetime and its error in h of up to 48 parts of a pooled fit.
 
-    The slope of the residuals of its cycles is what the loss rate of a part departs by.
+    The deviation of the loss rate of a part is the slope of the residuals of its cycles.
     """
     record, first = fit.readings, fit.first
     lengths = np.diff(first, append=len(record))
@@ -343,28 +345,28 @@ def _cycle_lifetimes(fit: DecayFit) -> tuple[np.ndarray, np.ndarray, np.ndarray]
     at, level = (np.add.reduceat(v, part) / count for v in (record.time, record.current))
     squares = np.add.reduceat(since**2, part)
     rate = np.add.reduceat(since * residual, part) / squares / level
-    usual = np.array([of.lifetime.value for of in fit.course] or [fit.lifetime_mean.value])
+    lifetimes = np.array([of.lifetime.value for of in fit.course] or [fit.lifetime_mean.value])
     which = np.searchsorted([of.start for of in fit.course][1:], at - record.time[0])
-    rate += fit.a.value * (level - fit.mean_current) + 1 / usual[which] / HOUR
+    rate += fit.a.value * (level - fit.mean_current) + 1 / lifetimes[which] / HOUR
     error = fit.rms_residual / np.sqrt(squares) / level
-    seen = rate > 0
-    return at[seen], 1 / rate[seen] / HOUR, (error / rate**2)[seen] / HOUR
+    positive = rate > 0
+    return at[positive], 1 / rate[positive] / HOUR, (error / rate**2)[positive] / HOUR
 
 
-def _momentary(axes: Axes, decay: Decay, scale: float) -> float:
-    """Draw about forty windows of one decay; its usual lifetime, for the axis."""
+def _draw_windows(axes: Axes, decay: Decay, scale: float) -> float:
+    """Draw about forty windows of one decay; return the median lifetime, for the axis."""
     segment = decay.segment
-    usual = float(np.median(np.diff(segment.time)))
+    interval = float(np.median(np.diff(segment.time)))
     try:
-        trace = moving_lifetime(segment, max(segment.span / 8, 6 * usual))
+        trace = moving_lifetime(segment, max(segment.span / 8, 6 * interval))
     except InputError:
-        return np.nan  # too few readings for any window: there is nothing to draw
+        return np.nan  # too few readings for any window
     every = slice(None, None, max(1, trace.time.size // 40))
-    seen = np.isfinite(trace.lifetime[every]) & (trace.lifetime[every] > 0)
-    if not seen.any():
+    valid = np.isfinite(trace.lifetime[every]) & (trace.lifetime[every] > 0)
+    if not valid.any():
         return np.nan
     time, lifetime, error = (
-        part[every][seen] for part in (trace.time, trace.lifetime, trace.error)
+        part[every][valid] for part in (trace.time, trace.lifetime, trace.error)
     )
     at = (decay.offset + time) / scale
     axes.errorbar(at, lifetime, error, fmt="o", ms=3, lw=0.8, color=BLUE, zorder=2)
@@ -372,17 +374,17 @@ def _momentary(axes: Axes, decay: Decay, scale: float) -> float:
 
 
 def draw_budget(figure: FigureBase, decays: Sequence[Decay]) -> None:
-    """Draw the loss rate of each decay by mechanism, with the measured rate beside it.
+    """Draw the loss rate of each decay by mechanism, and the measured rate.
 
     Parameters
     ----------
     figure : Figure or SubFigure
         The figure to draw on.
     decays : sequence of Decay
-        With budgets.
+        Decays with budgets.
     """
     axes: Axes = figure.subplots()
-    shown = decays[:MOST_DRAWN]
+    shown = decays[:MAX_DRAWN]
     place = np.arange(len(shown))[::-1]
     left = np.zeros(len(shown))
     for cause, colour in zip(decays[0].budget.rates, cycle(COLOURS), strict=False):
@@ -399,68 +401,70 @@ def draw_budget(figure: FigureBase, decays: Sequence[Decay]) -> None:
     axes.errorbar([], [], fmt="D", color="black", ms=5, label="measured")
     names = tables.short_names(shown)
     axes.set_yticks(place, [names[decay.fit.record] for decay in shown])
-    more = f", {MOST_DRAWN} of {len(decays)} decays" if len(decays) > MOST_DRAWN else ""
+    more = f", {MAX_DRAWN} of {len(decays)} decays" if len(decays) > MAX_DRAWN else ""
     axes.set(title=f"computed losses{more}", xlabel="loss rate at the mean current, 1/h")
     axes.set(xlim=(0, None), ylim=(-0.6, len(shown) - 0.4))
     legend_below(figure, axes, 5)
 
 
-def _of_all(decays: Sequence[Decay], shift: Shift | None, trend: Trend | None) -> list[Picture]:
-    """Pictures of all decays together."""
+def _overall_pictures(
+    decays: Sequence[Decay], shift: Shift | None, trend: Trend | None
+) -> list[Picture]:
+    """Make the pictures of all decays together."""
     listed = [] if trend is None else [trend_picture(trend)]
-    known = shift is not None and shift.network is not None
-    return listed + (network_pictures(shift, decays) if known else [])
+    has_network = shift is not None and shift.network is not None
+    return listed + (network_pictures(shift, decays) if has_network else [])
 
 
 def _pictures(studies: Sequence[RecordStudy]) -> list[Picture]:
-    """Two for each record, and the loss budget where a ring was given."""
+    """Make two pictures for each record, and the loss budget if a ring was given."""
     listed = []
     for study in studies:
         listed += [record_picture(study), lifetime_picture(study)]
     decays = [decay for study in studies for decay in study.answers]
     if all(decay.budget is not None for decay in decays):
-        height = 1.5 + 0.3 * min(len(decays), MOST_DRAWN)
+        height = 1.5 + 0.3 * min(len(decays), MAX_DRAWN)
         draw = partial(draw_budget, decays=decays)
         names = ", ".join(study.record.name for study in studies)
         listed.append(Picture("loss budget", height, draw, names))
     return listed
 
 
-RELATIVE = ("a", "b")
+RELATIVE_LOSSES = ("a", "b")
 
 
-def _relative(trend: Trend) -> bool:
-    """True if some decay has an a or b over the usual ones."""
+def _has_relative(trend: Trend) -> bool:
+    """Return True if some decay has an a or b relative to the reference."""
     return any(point.a is not None or point.b is not None for point in trend.points)
 
 
 def trend_picture(trend: Trend) -> Picture:
-    """The picture of a page."""
-    height = 5.4 if _relative(trend) else 2.6
+    """Make the picture of a trend."""
+    height = 5.4 if _has_relative(trend) else 2.6
     ends = [time_label(point.time, trend.dated) for point in trend.points[:1] + trend.points[-1:]]
     source = f"{len(trend.points)} decays, {' to '.join(ends)}"
     return Picture("course of the lifetime", height, partial(draw_trend, trend=trend), source)
 
 
 def draw_trend(figure: FigureBase, trend: Trend) -> None:
-    """Draw normalised lifetimes with control limits; a and b over the usual ones below.
+    """Draw normalised lifetimes with control limits, and a and b over the reference below.
 
     Parameters
     ----------
     figure : Figure or SubFigure
         The figure to draw on.
     trend : Trend
-        The lifetimes. Hours of the record where they have no dates.
+        The lifetimes; drawn against hours of the record if they have no dates.
     """
-    rows = 3 if _relative(trend) else 1
+    rows = 3 if _has_relative(trend) else 1
     panels = figure.subplots(rows, 1, sharex=True, squeeze=False)[:, 0]
     at = np.array([_at(trend, point.time) for point in trend.points])
     _lifetimes(panels[0], trend, at)
-    for axes, name in zip(panels[1:], RELATIVE, strict=False):
+    for axes, name in zip(panels[1:], RELATIVE_LOSSES, strict=False):
         found = [getattr(point, name) for point in trend.points]
-        known = [(t, q.value, q.error) for t, q in zip(at, found, strict=True) if q is not None]
-        if known:
-            time, value, error = map(np.array, zip(*known, strict=True))
+        points = [(t, q.value, q.error) for t, q in zip(at, found, strict=True) if q is not None]
+        if points:
+            time, value, error = map(np.array, zip(*points, strict=True))
             axes.errorbar(time, value, error, fmt="o", ms=4, color=BLUE)
         axes.axhline(1.0, color="0.6", lw=0.8)
         axes.set(ylabel=f"{name} over usual")
@@ -473,7 +477,7 @@ def draw_trend(figure: FigureBase, trend: Trend) -> None:
 
 
 def _at(trend: Trend, time: float) -> np.datetime64 | float:
-    """Time on the axis: a date, or hours."""
+    """Return the time on the axis: a date, or hours."""
     return np.datetime64(round(1000 * time), "ms") if trend.dated else time / HOUR
 
 

@@ -1,4 +1,4 @@
-"""A report: one self-contained HTML page, or the same as PDF."""
+"""Writing of reports: one self-contained HTML page, the same as PDF, or the pictures alone."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from beamfit.errors import InputError
 from beamfit.lifetime.fit import DecayFit
 from beamfit.lifetime.study import RecordStudy
 from beamfit.report import kind_of
-from beamfit.report.document import STYLE, Picture, ReportPage, drawn, html_of, written_now
+from beamfit.report.document import STYLE, Picture, ReportPage, html_of, image_of, with_provenance
 from beamfit.report.emittance import emittance_page
 from beamfit.report.posterior import ReportedPosterior, of_decay, of_scan, with_posteriors
 from beamfit.sampling.posterior import Posterior
@@ -54,30 +54,30 @@ def write_report(
     Parameters
     ----------
     path : str or path
-        Ends in ``.html`` (self-contained) or ``.pdf``; in ``.png`` or ``.svg`` its pictures are
-        written one by one, the first under this name. An existing file is replaced whole.
+        File name: ``.html`` (self-contained) or ``.pdf`` for a page; ``.png`` or ``.svg`` for the
+        pictures, the first under this name. An existing file is replaced atomically.
     result : EmittanceFit, SliceFits, DecayFit, ProblemSolution, ResponseFit, Loop, or sequence
-        The emittance of a scan or of the slices of a beam, the lifetime of a decay, a formulation
-        solved, the response of a process, a simulated loop; or a sequence of RecordStudy (the
-        lifetimes of whole records) or of ResponseFit (several outputs); a fed-batch process,
-        or its planned feed.
+        The emittance of a scan or of the slices of a beam, the lifetime of a decay, a solved
+        formulation, the response of a process, a simulated loop, a fed-batch process or its planned
+        feed; or a sequence of RecordStudy (lifetimes of whole records) or of ResponseFit (several
+        outputs).
     posterior : Posterior or sequence of Posterior, optional
-        What `sample` of the fit gave; of records one for each decay.
+        Result of ``fit.sample``; for records one for each decay.
     command : str, optional
         The command that made it.
     inputs : mapping of str to str, optional
-        Input files and their SHA-256; a scan's own if None.
+        Input files and their SHA-256; those of the result if None.
     shift : Shift, optional
-        The study of all decays together, to go before them.
+        The study of all decays together, shown first.
     trend : Trend, optional
-        The course of their lifetimes, likewise.
+        The trend of their lifetimes, shown first.
     methods : tuple of SizeMethods
-        What other ways of taking the sizes of a scan say.
+        Results with other size methods of a scan.
 
     Raises
     ------
     InputError
-        If the suffix is another one, there is no picture, or the place cannot be written.
+        If the suffix is unknown, there is no picture, or the file cannot be written.
 
     Examples
     --------
@@ -92,7 +92,7 @@ def write_report(
     >>> page.read_text().startswith("<!DOCTYPE html>")
     True
     """
-    kind_of(path)  # says so if it is none
+    kind_of(path)  # raises for an unknown suffix
     with rc_context(STYLE):
         several = tuple(result) if isinstance(result, list | tuple) else (result,)
         sampled: list[ReportedPosterior] = []
@@ -119,8 +119,8 @@ def write_page(
     command: str | None = None,
     inputs: Mapping[str, str | None] | None = None,
 ) -> None:
-    """Write a page as the end of the name says; as `write_report`."""
-    page = written_now(page, command, inputs)
+    """Write a page in the format given by the suffix; see `write_report`."""
+    page = with_provenance(page, command, inputs)
     match kind_of(path):
         case ".html":
             made = {Path(path): html_of(page)}
@@ -135,14 +135,14 @@ def write_page(
 
 
 def _pictures(path: Path, pictures: Sequence[Picture]) -> dict[Path, bytes]:
-    """The first picture under the name itself, others with their number and what they show."""
+    """Render the pictures: the first under the given name, others with number and content."""
     if not pictures:
         raise InputError(f"report '{path}' without a picture", "a name ending in .html or .pdf")
     made = {}
     for number, picture in enumerate(pictures, 1):
         shows = re.sub(r"\W+", "-", picture.alt.lower())
         place = path if number == 1 else path.with_stem(f"{path.stem}-{number}-{shows}")
-        made[place] = drawn(picture, path.suffix.lower().removeprefix("."))
+        made[place] = image_of(picture, path.suffix.lower().removeprefix("."))
     return made
 
 

@@ -1,4 +1,4 @@
-"""The report as PDF: the same tables and pictures on A4 pages, drawn by matplotlib."""
+"""PDF form of a report: the tables and pictures on A4 pages, drawn by matplotlib."""
 
 from __future__ import annotations
 
@@ -20,15 +20,18 @@ from beamfit.report.document import Picture, ReportPage
 WIDTH, HEIGHT, MARGIN = 8.27, 11.69, 0.75  # A4, inches
 # Height of a line of text, inches.
 LINE = 0.185
-# Gap between columns of a table, inches; size of its letters, usual and smallest, points.
-GAP, USUAL, SMALLEST = 0.22, 8.5, 6.0
+# Gap between columns of a table, inches.
+GAP = 0.22
+# Font size of tables, and the smallest one for wide tables, points.
+FONT_SIZE = 8.5
+MIN_FONT_SIZE = 6.0
 # Smallest factor by which a picture shrinks to fit on a page.
-LEAST = 0.7
+MIN_SHRINK = 0.7
 COLOUR = {"green": "#2c7a3f", "yellow": "#c98a00", "red": "#b3261e"}
 
 
 class _Pages:
-    """Text and tables flowing down A4 pages."""
+    """A4 pages, filled with text, tables and pictures from top to bottom."""
 
     def __init__(self) -> None:
         self.pages: list[Figure] = []
@@ -41,8 +44,8 @@ class _Pages:
         self.y = HEIGHT - MARGIN
 
     def numbers(self, title: str) -> None:
-        """Write title and number at the foot of every page."""
-        short = wrapped(title, WIDTH - 2 * MARGIN - 1.0, 8)[0]
+        """Write title and page number at the foot of every page."""
+        short = wrap_text(title, WIDTH - 2 * MARGIN - 1.0, 8)[0]
         style = {"y": 0.5 * MARGIN / HEIGHT, "fontsize": 8, "color": "0.35"}
         for number, page in enumerate(self.pages, 1):
             page.text(MARGIN / WIDTH, s=short, **style)
@@ -51,22 +54,22 @@ class _Pages:
             )
 
     def room(self, lines: float) -> None:
-        """Begin a new page unless this many lines still fit."""
+        """Begin a new page unless `lines` lines still fit."""
         if self.y - lines * LINE < MARGIN:
             self.new_page()
 
     def text(
         self, words: str, *, x: float = 0.0, below: float = 0.0, size: float = 9.5, **style: Any
     ) -> None:
-        """Write one line, or so far below the present height, without moving down."""
+        """Write one line at the present height, or `below` inches lower, without moving down."""
         place = (MARGIN + x) / WIDTH, (self.y - below) / HEIGHT
         self.pages[-1].text(*place, words, fontsize=size, va="top", **style)
 
     def paragraph(
         self, words: str, size: float = 9.5, weight: str = "normal", step: float = 1.0, **style: Any
     ) -> None:
-        """Write wrapped text, each line so many usual ones high."""
-        for line in wrapped(words, WIDTH - 2 * MARGIN, size, weight):
+        """Write wrap_text text with a line height of `step` lines."""
+        for line in wrap_text(words, WIDTH - 2 * MARGIN, size, weight):
             self.room(step)
             self.text(line, size=size, weight=weight, **style)
             self.y -= step * LINE
@@ -78,17 +81,17 @@ class _Pages:
         self.y -= 1.5 * LINE
 
     def table(self, table: Table) -> None:
-        """Write a table; a cell that its column has no room for goes on in the next line."""
+        """Write a table; cells too wide for their column are wrap_text."""
         lines = [*([table.header] if table.header else []), *table.rows]
         widths, size = _columns(lines)
         for number, cells in enumerate(lines):
             head = bool(table.header) and number == 0
             weight = "bold" if head else "normal"
-            written = [wrapped(c, w, size, weight) for c, w in zip(cells, widths, strict=False)]
+            written = [wrap_text(c, w, size, weight) for c, w in zip(cells, widths, strict=False)]
             height = max(map(len, written))
             if self.y - height * LINE < MARGIN:
                 self.new_page()
-                if table.header and not head:  # the names of the columns again
+                if table.header and not head:  # repeat the header
                     self._row([[c] for c in table.header], widths, size, table.numeric, True)
             self._row(written, widths, size, table.numeric, head)
         self.y -= 0.3 * LINE
@@ -106,9 +109,9 @@ class _Pages:
         self.y -= LINE * max(map(len, cells))
 
     def picture(self, picture: Picture) -> None:
-        """Draw a picture where there is room for it, a little smaller if that keeps the page."""
+        """Draw a picture, slightly smaller if it then fits on the page, otherwise on a new one."""
         left = self.y - MARGIN
-        if left < LEAST * picture.height:
+        if left < MIN_SHRINK * picture.height:
             self.new_page()
             left = self.y - MARGIN
         height = min(picture.height, left)
@@ -122,15 +125,15 @@ class _Pages:
 
 
 def width_of(words: str, size: float, weight: str = "normal") -> float:
-    """Width of a line of text, inches."""
+    """Return the width of a line of text in inches."""
     font = FontProperties(size=size, weight=weight)
     return text_to_path.get_text_width_height_descent(words, font, ismath=False)[0] / 72
 
 
-def wrapped(words: str, room: float, size: float, weight: str = "normal") -> list[str]:
-    """Break a text into lines that fit into so many inches; within a word where that is longer."""
+def wrap_text(words: str, room: float, size: float, weight: str = "normal") -> list[str]:
+    """Break a text into lines of at most `room` inches, also within long words."""
     lines = [""]
-    # A blank that does not break is part of an indentation.
+    # ASCII blanks only: a non-breaking blank is part of an indentation.
     for word in re.split(r"\s+", plain(words), flags=re.ASCII):
         longer = f"{lines[-1]} {word}" if lines[-1] else word
         if width_of(longer, size, weight) <= room:
@@ -145,19 +148,19 @@ def wrapped(words: str, room: float, size: float, weight: str = "normal") -> lis
 
 
 def _columns(lines: Sequence[Sequence[str]]) -> tuple[np.ndarray, float]:
-    """Widths of a table's columns in inches and the size of its letters, to fit the page.
+    """Return column widths in inches and the font size with which a table fits the page.
 
-    Wide tables have smaller letters, down to a limit; then the widest columns give way.
+    Wide tables get a smaller font, down to a limit; then the widest columns are narrowed.
     """
     count = max(map(len, lines))
-    usual = np.zeros(count)
+    natural = np.zeros(count)
     for number, cells in enumerate(lines):
         weight = "bold" if number == 0 else "normal"
         for i, cell in enumerate(cells):
-            usual[i] = max(usual[i], width_of(cell, USUAL, weight))
+            natural[i] = max(natural[i], width_of(cell, FONT_SIZE, weight))
     room = WIDTH - 2 * MARGIN - (count - 1) * GAP
-    size = min(USUAL, max(SMALLEST, USUAL * room / max(usual.sum(), 1e-9)))
-    widths = (usual + 0.01) * size / USUAL
+    size = min(FONT_SIZE, max(MIN_FONT_SIZE, FONT_SIZE * room / max(natural.sum(), 1e-9)))
+    widths = (natural + 0.01) * size / FONT_SIZE
     while widths.sum() > room * 1.001:
         order = np.sort(widths)[::-1]
         widest = widths >= order[0] - 1e-9
@@ -170,7 +173,7 @@ def _columns(lines: Sequence[Sequence[str]]) -> tuple[np.ndarray, float]:
 
 
 def pages_of(page: ReportPage) -> list[Figure]:
-    """Lay a report out on pages: verdicts, the first table, the pictures, what remains."""
+    """Arrange a report on pages: verdicts, the first table, the pictures, everything else."""
     pages = _Pages()
     pages.paragraph(page.title, size=16, weight="bold", step=1.6)
     pages.y -= 0.4 * LINE

@@ -1,4 +1,4 @@
-"""A sampled posterior in a report: verdict, intervals, correlations, diagnostics."""
+"""Sampled posteriors in a report: verdict, intervals, correlations, diagnostics."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from beamfit.lifetime.posterior import expected_current
 from beamfit.quantity import HOUR
 from beamfit.report.document import (
     BLUE,
-    MANY,
+    RASTER_POINTS,
     Picture,
     ReportPage,
     Verdict,
@@ -34,23 +34,23 @@ from beamfit.sampling.likelihood import noise_words
 from beamfit.sampling.posterior import Expected, Posterior, in_unit
 
 # Shares of the draws inside the contours of one and two standard deviations in two dimensions.
-INSIDE = tuple(1 - math.exp(-0.5 * r**2) for r in (1, 2))
-# Most numbers in a corner plot; more are too small to read.
-MOST_NUMBERS = 5
+CONTOUR_SHARES = tuple(1 - math.exp(-0.5 * r**2) for r in (1, 2))
+# Largest number of parameters in a corner plot; more would be too small to read.
+MAX_NUMBERS = 5
 # Quantile of the draws at which the axes end.
-EDGE = 0.01
-# Correlation above which the bins of a histogram are wider than the distribution.
-ON_A_LINE = 0.95
+AXIS_QUANTILE = 0.01
+# Correlation above which dots replace contours, because the bins are wider than the distribution.
+MAX_CORRELATION = 0.95
 INTERVALS = (
     "Central credible intervals of the sampled posterior. Where the prior or the bounds decide a "
     "number and not the data, none is given."
 )
-# Most numbers in the table of correlations.
-MOST_CORRELATED = 8
+# Largest number of parameters in the table of correlations.
+MAX_CORRELATED = 8
 
 
 class ReportedPosterior(NamedTuple):
-    """A posterior in a report: its label if there are several, and its pictures."""
+    """Posterior in a report: a label if there are several, and its pictures."""
 
     label: str
     posterior: Posterior
@@ -58,14 +58,14 @@ class ReportedPosterior(NamedTuple):
 
 
 def with_posteriors(page: ReportPage, sampled: Sequence[ReportedPosterior]) -> ReportPage:
-    """Add posteriors to a page: intervals after its first table, the rest at its end.
+    """Add posteriors to a page: intervals after the first table, the rest at the end.
 
     Parameters
     ----------
     page : ReportPage
-        Of the fits.
+        Page of the fits.
     sampled : sequence of ReportedPosterior
-        From `of_scan` or `of_decay`.
+        Results of `of_scan` or `of_decay`.
 
     Returns
     -------
@@ -78,7 +78,7 @@ def with_posteriors(page: ReportPage, sampled: Sequence[ReportedPosterior]) -> R
         intervals.append(found.table(f"{label}Posterior", INTERVALS))
         if found.chain.size:
             further.append(_correlations(f"{label}Correlations of the posterior", found))
-            further.append(_how_sampled(f"{label}How the posterior was sampled", found))
+            further.append(_sampling_table(f"{label}How the posterior was sampled", found))
     return page._replace(
         verdicts=page.verdicts + verdicts,
         tables=page.tables[:1] + intervals + page.tables[1:] + further,
@@ -88,7 +88,7 @@ def with_posteriors(page: ReportPage, sampled: Sequence[ReportedPosterior]) -> R
 
 def _correlations(title: str, found: Posterior) -> Table:
     names = [each for each in found.shown if not each.endswith(".emittance")]
-    names = [each for each in names if "sigma" not in each][:MOST_CORRELATED] or names
+    names = [each for each in names if "sigma" not in each][:MAX_CORRELATED] or names
     rows = []
     for i, row in enumerate(found.correlations(names).values):
         rows.append([f"{i + 1} {plain_name(names[i])}", *map(_coefficient, row[: i + 1])])
@@ -96,13 +96,13 @@ def _correlations(title: str, found: Posterior) -> Table:
 
 
 def _coefficient(value: float) -> str:
-    """Two digits, and more where one and nearly one would look the same."""
+    """Write two digits, or four for a coefficient that would round to one."""
     nearly_one = 0.99 < abs(value) < 0.99995
     return f"{value:.4f}" if nearly_one else f"{value:.2f}".replace("-0.00", "0.00")
 
 
-def _how_sampled(title: str, found: Posterior) -> Table:
-    """Table of the sampling: noise, priors, draws, convergence."""
+def _sampling_table(title: str, found: Posterior) -> Table:
+    """Make a table of the sampling: noise, priors, draws, convergence."""
     d = found.diagnostics
     rows = [
         ["status", found.status.value.replace("_", " ")],
@@ -136,13 +136,13 @@ def draw_pairs(
     figure : Figure or SubFigure
         The figure to draw on.
     posterior : Posterior
-        With draws.
+        Posterior with draws.
     names : sequence of str
-        Numbers.
+        Parameters to draw.
     title : str
-        Of the whole.
+        Title of the figure.
     colour : str
-        Of the draws.
+        Colour of the draws.
     """
     scaled = [in_unit(posterior.values(name), posterior.unit(name)) for name in names]
     labels = [_label(name, unit) for name, (_, unit) in zip(names, scaled, strict=True)]
@@ -156,11 +156,11 @@ def draw_pairs(
             axes.set_axis_off()
             continue
         if column == row:
-            _single(axes, values[row], colour)
+            _histogram(axes, values[row], colour)
         else:
             _pair(axes, values[column], values[row], colour)
             axes.yaxis.set_major_locator(MaxNLocator(3, prune="both"))
-        axes.set_xlim(*_ends(values[column]))
+        axes.set_xlim(*_axis_limits(values[column]))
         axes.xaxis.set_major_locator(MaxNLocator(3, prune="both"))
         axes.ticklabel_format(useOffset=False)
         axes.tick_params(labelsize=7, labelleft=column == 0)
@@ -180,14 +180,14 @@ def _label(name: str, unit: str) -> str:
     return f"{short}\n{unit}".strip()
 
 
-def _ends(values: np.ndarray) -> tuple[float, float]:
-    low, high = np.quantile(values, (EDGE, 1 - EDGE))
+def _axis_limits(values: np.ndarray) -> tuple[float, float]:
+    low, high = np.quantile(values, (AXIS_QUANTILE, 1 - AXIS_QUANTILE))
     margin = 0.05 * (high - low) or 1.0
     return float(low - margin), float(high + margin)
 
 
-def _single(axes: Axes, values: np.ndarray, colour: str) -> None:
-    low, high = _ends(values)
+def _histogram(axes: Axes, values: np.ndarray, colour: str) -> None:
+    low, high = _axis_limits(values)
     axes.hist(values, np.linspace(low, high, 41), color=colour, alpha=0.35, histtype="stepfilled")
     for place, style in zip(np.quantile(values, (0.16, 0.5, 0.84)), (":", "-", ":"), strict=True):
         axes.axvline(place, color=colour, lw=1.1, ls=style)
@@ -196,17 +196,17 @@ def _single(axes: Axes, values: np.ndarray, colour: str) -> None:
 
 
 def _pair(axes: Axes, x: np.ndarray, y: np.ndarray, colour: str) -> None:
-    """Contours that hold 39 and 86 % of the draws; dots where they lie on a line."""
-    if abs(np.corrcoef(x, y)[0, 1]) > ON_A_LINE:
+    """Draw contours that contain 39 and 86 % of the draws, or dots if they lie on a line."""
+    if abs(np.corrcoef(x, y)[0, 1]) > MAX_CORRELATION:
         axes.plot(x[:2000], y[:2000], "o", ms=1, color=colour, alpha=0.4, rasterized=True)
-        axes.set_ylim(*_ends(y))
+        axes.set_ylim(*_axis_limits(y))
         return
-    (low, high), (bottom, top) = _ends(x), _ends(y)
+    (low, high), (bottom, top) = _axis_limits(x), _axis_limits(y)
     edges = np.linspace(low, high, 36), np.linspace(bottom, top, 36)
     count, _, _ = np.histogram2d(x, y, edges)
-    # Contours follow the shape and not the counting noise of the bins.
+    # Smoothed, so that contours do not follow the counting noise of the bins.
     smooth = gaussian_filter(count, 1.0, mode="constant")
-    levels = contour_levels(smooth, INSIDE)
+    levels = contour_levels(smooth, CONTOUR_SHARES)
     middles = [0.5 * (edge[1:] + edge[:-1]) for edge in edges]
     if len(levels) == 2 and levels[0] > 0:
         filled = [*levels, 1.01 * smooth.max()]
@@ -228,9 +228,12 @@ def _expectations(
     unit: float,
     colour: str,
 ) -> None:
-    """Readings less the median model, in the posterior's bands; `unit` is that of `expect`."""
+    """Draw readings minus the median model with the bands of the posterior.
+
+    `unit` converts the values of `expect` to those of the axis.
+    """
     axes, order, found = figure.subplots(), np.argsort(at, kind="stable"), expect()
-    middle, many = unit * found.median, len(at) > MANY
+    middle, many = unit * found.median, len(at) > RASTER_POINTS
     for ends, alpha, label in (
         (found.reading, 0.12, "95 % of further readings"),
         (found.model, 0.35, "68 % of models"),
@@ -247,7 +250,7 @@ def _expectations(
 
 
 def of_scan(fit: EmittanceFit, posterior: Posterior) -> ReportedPosterior:
-    """The posterior of a scan, with two pictures a sampled plane."""
+    """Report the posterior of a scan, with two pictures per sampled plane."""
     expected, pairs = [], []
     for p in fit.planes:
         names = _of_plane(posterior, p.plane)
@@ -275,19 +278,19 @@ def of_scan(fit: EmittanceFit, posterior: Posterior) -> ReportedPosterior:
 
 
 def _of_plane(posterior: Posterior, plane: str) -> list[str]:
-    wanted = ["normalized_emittance", "beta", "alpha", "error_factor", "outlier_fraction"]
-    names = [f"{plane}.{name}" for name in wanted]
-    # What was fitted besides the beam, in a scenario.
+    candidates = ["normalized_emittance", "beta", "alpha", "error_factor", "outlier_fraction"]
+    names = [f"{plane}.{name}" for name in candidates]
+    # Other parameters of a scenario.
     names += [name for name in posterior.names if not name.startswith(("x.", "y."))]
-    return [name for name in names if name in posterior.shown][:MOST_NUMBERS]
+    return [name for name in names if name in posterior.shown][:MAX_NUMBERS]
 
 
 def of_decay(fit: DecayFit, posterior: Posterior, label: str = "") -> ReportedPosterior:
-    """The posterior of a decay, with two pictures if it was sampled."""
+    """Report the posterior of a decay, with two pictures if it was sampled."""
     if not posterior.chain.size:
         return ReportedPosterior(label, posterior, [])
-    wanted = ("lifetime_mean", "a", "b", "noise", "error_factor", "outlier_fraction")
-    names = [name for name in wanted if name in posterior.shown][:MOST_NUMBERS]
+    candidates = ("lifetime_mean", "a", "b", "noise", "error_factor", "outlier_fraction")
+    names = [name for name in candidates if name in posterior.shown][:MAX_NUMBERS]
     draw = partial(
         _expectations,
         title=fit.readings.name,
@@ -310,6 +313,6 @@ def of_decay(fit: DecayFit, posterior: Posterior, label: str = "") -> ReportedPo
 def pairs_picture(
     posterior: Posterior, names: Sequence[str], title: str = "posterior", colour: str = BLUE
 ) -> Picture:
-    """The picture of some numbers of a posterior and of their pairs."""
+    """Make the picture of some parameters of a posterior and of their pairs."""
     draw = partial(draw_pairs, posterior=posterior, names=names, title=title, colour=colour)
     return Picture("numbers in pairs", 1.0 + 1.15 * len(names), draw)

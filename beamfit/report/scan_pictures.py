@@ -15,52 +15,54 @@ from matplotlib.figure import FigureBase
 from beamfit.emittance.fit import EmittanceFit
 from beamfit.emittance.results import PlaneFit
 from beamfit.emittance.scan import Profile
-from beamfit.report.document import BLUE, MANY, RED, Picture, day_of, legend_below, quality
+from beamfit.report.document import BLUE, RASTER_POINTS, RED, Picture, day_of, legend_below, quality
 
 # Profiles in a row of the picture.
-PROFILES_ABREAST = 3
+PROFILES_PER_ROW = 3
 COLOUR = {"x": BLUE, "y": RED}
-# Of further screens: each has a colour, a marker and a line of its own.
-FURTHER = {"x": ("#0f8b8d", "#7b4fa3", "#5a6570"), "y": ("#c98a00", "#8a3b6b", "#5a6570")}
+# Colours of further screens; each screen also has its own marker and line style.
+MORE_COLOURS = {"x": ("#0f8b8d", "#7b4fa3", "#5a6570"), "y": ("#c98a00", "#8a3b6b", "#5a6570")}
 MARKERS, LINES = "os^D", ("-", "--", ":", "-.")
-DOUBTED = "probably bad"
+PROBABLY_BAD = "probably bad"
 
 
-# The picture of a scan where two stand side by side: narrow, so that its letters can be read.
-ABREAST, ALONE = 4.6, 6.4
+# Width of the picture of a scan in inches: one of two side by side (narrow, so that its text stays
+# legible), and alone.
+PAIR_WIDTH = 4.6
+FULL_WIDTH = 6.4
 
 
-def scan_picture(fit: EmittanceFit, plane: str, width: float = ALONE) -> Picture:
-    """The picture of one plane's scan."""
+def scan_picture(fit: EmittanceFit, plane: str, width: float = FULL_WIDTH) -> Picture:
+    """Make the picture of the scan of one plane."""
     words = f"scan of the {plane} plane"
     draw = partial(draw_scan, fit=fit, plane=plane, letters=round(10 * width))
     return Picture(words, 0.54 * width + 1.15, draw, source_of(fit, plane), width)
 
 
 def residual_picture(fit: EmittanceFit, plane: str) -> Picture:
-    """The picture of one plane's residuals."""
+    """Make the picture of the residuals of one plane."""
     draw = partial(draw_residuals, fit=fit, plane=plane)
     return Picture(f"residuals of the {plane} plane", 2.6, draw, source_of(fit, plane))
 
 
 def ellipse_picture(fit: EmittanceFit) -> Picture:
-    """The picture of the phase ellipses."""
+    """Make the picture of the phase ellipses."""
     return Picture("phase ellipses", 3.4, partial(draw_ellipses, fit=fit), source_of(fit))
 
 
 def source_of(fit: EmittanceFit, *planes: str) -> str:
-    """File, slice, date, line, and the quality of the fit of some planes."""
+    """Return file, slice, date, line, and the quality of the fit of some planes."""
     scan = fit.scan
-    parts = [scan.name]  # that of a slice names it
+    parts = [scan.name]  # includes the slice
     parts += [day_of(f"{scan.name} {scan.path or ''}", scan.provenance), f"line {fit.line.name}"]
     parts += [f"{p}: {quality(fit[p].chi2, fit[p].dof)}" for p in planes]
     return ", ".join(part for part in parts if part)
 
 
 def draw_scan(figure: FigureBase, fit: EmittanceFit, plane: str, letters: int = 62) -> None:
-    """Draw one plane's sizes with the fit, and the residuals in standard errors below.
+    """Draw the sizes of one plane with the fit, and the residuals in standard errors below.
 
-    One varied magnet gives a curve against its setting; several give the points in order.
+    With one varied magnet the fit is a curve against its setting; with several, points in order.
 
     Parameters
     ----------
@@ -71,7 +73,7 @@ def draw_scan(figure: FigureBase, fit: EmittanceFit, plane: str, letters: int = 
     plane : str
         "x" or "y".
     letters : int
-        Letters after which a line of the title breaks.
+        Characters per line of the title.
     """
     p = fit[plane]
     above, below = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1))
@@ -80,7 +82,7 @@ def draw_scan(figure: FigureBase, fit: EmittanceFit, plane: str, letters: int = 
     _points(above, p, at)
     if len(one) == 1 and not fit.told.hysteresis:
         _curves(above, fit, p, one[0])
-    else:  # known at the measured settings alone
+    else:  # the fit is defined only at the measured settings
         style = {"ms": 14, "mew": 2, "color": COLOUR[plane], "alpha": 0.6}
         above.plot(at, 1e6 * p.points.model, "_", label="fit", **style)
     above.legend(frameon=False, loc="best", fontsize=8)
@@ -91,7 +93,7 @@ def draw_scan(figure: FigureBase, fit: EmittanceFit, plane: str, letters: int = 
 
 
 def draw_residuals(figure: FigureBase, fit: EmittanceFit, plane: str) -> None:
-    """Draw one plane's residuals in standard errors.
+    """Draw the residuals of one plane in standard errors.
 
     Parameters
     ----------
@@ -123,7 +125,7 @@ def _varied(p: PlaneFit) -> list[str]:
 
 
 def setting_axis(p: PlaneFit) -> tuple[np.ndarray, str]:
-    """Horizontal axis of a scan: setting of the one varied magnet, or the number of the point."""
+    """Return the axis of a scan: the setting of the only varied magnet, or the point number."""
     varied = _varied(p)
     if len(varied) != 1:
         return np.arange(1, len(p.points.size) + 1), "measurement"
@@ -131,8 +133,8 @@ def setting_axis(p: PlaneFit) -> tuple[np.ndarray, str]:
 
 
 def _screens(p: PlaneFit) -> list[tuple[np.ndarray, str, str, str]]:
-    """Rows of each screen, and its colour, marker and name."""
-    colours = (COLOUR[p.plane], *FURTHER[p.plane])
+    """Return the rows of each screen, and its colour, marker and name."""
+    colours = (COLOUR[p.plane], *MORE_COLOURS[p.plane])
     return [
         (np.array([s == name for s in p.points.screen]), colours[i % 4], MARKERS[i % 4], name)
         for i, name in enumerate(dict.fromkeys(p.points.screen))
@@ -140,7 +142,7 @@ def _screens(p: PlaneFit) -> list[tuple[np.ndarray, str, str, str]]:
 
 
 def _curves(axes: Axes, fit: EmittanceFit, p: PlaneFit, magnet: str) -> None:
-    """One fitted curve for each screen, with the band of one standard error where it has one."""
+    """Draw one fitted curve per screen, with a band of one standard error if it has errors."""
     values = p.points.settings[magnet]
     margin = 0.04 * np.ptp(values)
     grid = np.linspace(values.min() - margin, values.max() + margin, 201)
@@ -158,22 +160,22 @@ def _curves(axes: Axes, fit: EmittanceFit, p: PlaneFit, magnet: str) -> None:
 
 
 def _points(axes: Axes, p: PlaneFit, at: np.ndarray) -> None:
-    """Measured points; those that are probably bad are hollow, and their errors nobody knows."""
+    """Draw measured points; those that are probably bad are hollow and without error bars."""
     error, size = np.nan_to_num(1e6 * p.points.error), 1e6 * p.points.size
     for rows, label, style in _groups(p):
-        bar = None if label == DOUBTED else error[rows]
+        bar = None if label == PROBABLY_BAD else error[rows]
         axes.errorbar(at[rows], size[rows], bar, capsize=3, label=label, **style)
 
 
 def _groups(p: PlaneFit) -> Iterator[tuple[np.ndarray, str, dict[str, Any]]]:
-    """Rows of each screen, those that are probably bad by themselves; their label and style."""
+    """Yield rows, label and style of the good and the probably bad points of each screen."""
     screens, bad = _screens(p), p.points.outlier_probability >= 0.5
     for rows, colour, marker, screen in screens:
         name = "measured" if len(screens) == 1 else f"measured at {screen}"
-        for keep, face, label in ((rows & ~bad, colour, name), (rows & bad, "white", DOUBTED)):
+        for keep, face, label in ((rows & ~bad, colour, name), (rows & bad, "white", PROBABLY_BAD)):
             style = {"fmt": marker, "ms": 5, "color": colour, "mfc": face}
             if keep.any():
-                yield keep, label, style | {"rasterized": len(rows) > MANY}
+                yield keep, label, style | {"rasterized": len(rows) > RASTER_POINTS}
 
 
 def draw_profiles(figure: FigureBase, profiles: list[Profile], fit: EmittanceFit) -> None:
@@ -184,11 +186,11 @@ def draw_profiles(figure: FigureBase, profiles: list[Profile], fit: EmittanceFit
     figure : Figure or SubFigure
         The figure to draw on.
     profiles : list of Profile
-        Of one plane.
+        Profiles of one plane.
     fit : EmittanceFit
-        For the settings of their rows.
+        Fit with the settings of their rows.
     """
-    across = min(PROFILES_ABREAST, len(profiles))
+    across = min(PROFILES_PER_ROW, len(profiles))
     every = figure.subplots(math.ceil(len(profiles) / across), across, squeeze=False).ravel()
     for axes, p in zip(every, profiles, strict=False):
         position = 1e3 * (p.position - np.average(p.position, weights=np.maximum(p.counts, 1e-300)))
@@ -205,10 +207,10 @@ def draw_profiles(figure: FigureBase, profiles: list[Profile], fit: EmittanceFit
 
 
 def has_ellipses(p: PlaneFit) -> bool:
-    """True if the data determine β and α, at the start and at the screen."""
+    """Return True if the data determine β and α, at the start and at the screen."""
     numbers = (p.emittance, p.beta, p.alpha, p.screen.beta, p.screen.alpha)
-    known = all(q.error is not None and math.isfinite(q.value) for q in numbers)
-    return known and p.emittance.value > 0
+    determined = all(q.error is not None and math.isfinite(q.value) for q in numbers)
+    return determined and p.emittance.value > 0
 
 
 def draw_ellipses(figure: FigureBase, fit: EmittanceFit) -> None:
@@ -236,7 +238,7 @@ def draw_ellipses(figure: FigureBase, fit: EmittanceFit) -> None:
 
 
 def _ellipse(axes: Axes, p: PlaneFit, beta: float, alpha: float) -> None:
-    """The points (u, u') of one sigma: u = sqrt(εβ) cos φ, u' = -sqrt(ε/β)(α cos φ + sin φ)."""
+    """Draw the one-sigma ellipse u = sqrt(εβ) cos φ, u' = -sqrt(ε/β)(α cos φ + sin φ)."""
     turn = np.linspace(0.0, 2.0 * np.pi, 181)
     e = p.emittance.value
     u = np.sqrt(e * beta) * np.cos(turn)

@@ -1,4 +1,4 @@
-"""The report of a tuned machine: maps of two knobs at a time, and the course of the best."""
+"""Report of a tuned machine: maps of pairs of knobs, and the progress of the best emittance."""
 
 from __future__ import annotations
 
@@ -17,19 +17,21 @@ from beamfit.report.document import BLUE, RED, Picture, ReportPage, Verdict
 from beamfit.report.emittance import about_input, about_scan
 from beamfit.tuning.fit import TuningFit, fit_tuning
 
-# Points along each axis of a map, and most maps that are drawn.
-FINE, MOST_MAPS = 25, 6
-# Parts of a table whose course is shown, and rows of the first.
-POINTS, FIRST = 5, 6
+# Points along each axis of a map, and largest number of maps drawn.
+MAP_POINTS = 25
+MAX_MAPS = 6
+# Numbers of rows for which the progress is shown, and the smallest of them.
+COURSE_POINTS = 5
+FIRST_ROWS = 6
 
 
 def tuning_page(fit: TuningFit) -> ReportPage:
-    """Lay out a tuning fit.
+    """Make the page of a tuning fit.
 
     Parameters
     ----------
     fit : TuningFit
-        From `beamfit.fit_tuning`.
+        Result of `beamfit.fit_tuning`.
 
     Returns
     -------
@@ -38,7 +40,7 @@ def tuning_page(fit: TuningFit) -> ReportPage:
     line = f" on line {fit.seen.line.name}, {float(fit.seen.energy):g} MeV" if fit.seen else ""
     source = f"{fit.scan.name}, {len(fit.scan)} rows{line}"
     names = fit.knobs.names
-    pairs = list(combinations(range(len(names)), 2))[:MOST_MAPS] or [(0, 0)]
+    pairs = list(combinations(range(len(names)), 2))[:MAX_MAPS] or [(0, 0)]
     pictures = [
         Picture(f"map of {names[i]} and {names[j]}", 3.2, partial(draw_map, fit=fit, i=i, j=j),
                 source)
@@ -46,7 +48,7 @@ def tuning_page(fit: TuningFit) -> ReportPage:
     ]  # fmt: skip
     draw = partial(draw_course, fit=fit)
     pictures.append(Picture("course of the best emittance", 2.8, draw, source))
-    tables = [*fit.tables(), *_planes(fit), *about_input(fit.notes)]
+    tables = [*fit.tables(), *_beam_table(fit), *about_input(fit.notes)]
     return ReportPage(
         title=f"Tuning by {fit.scan.name}",
         subtitle=f"{len(fit.scan)} rows of {', '.join(names)}{line}",
@@ -58,8 +60,8 @@ def tuning_page(fit: TuningFit) -> ReportPage:
     )
 
 
-def _planes(fit: TuningFit) -> list[Table]:
-    """The beam at the best setting, and the noise that was found."""
+def _beam_table(fit: TuningFit) -> list[Table]:
+    """Make the table of the beam at the best setting, with the fitted noise."""
     rows = []
     for plane, found in fit.beam(fit.settings).items():
         for name, band in found.items() if plane != "goal" else ():
@@ -69,7 +71,8 @@ def _planes(fit: TuningFit) -> list[Table]:
             label = f"{name.replace('_', ' ')} {plane}"
             ends = f"{each[3]:.3g} to {each[4]:.3g}{unit}"
             rows.append([label, f"{each[0]:.4g}{unit}", ends])
-    what, factor = ("a size", 1.0) if fit.seen else ("an emittance", 2.0)  # its root is fitted
+    # For finished emittances the root is fitted, so that relative errors double.
+    what, factor = ("a size", 1.0) if fit.seen else ("an emittance", 2.0)
     noise = [
         [f"relative error of {what} in {plane}", percent(factor * m.noise), ""]
         for plane, m in fit.maps.items()
@@ -79,7 +82,7 @@ def _planes(fit: TuningFit) -> list[Table]:
 
 
 def draw_map(figure: FigureBase, fit: TuningFit, i: int, j: int) -> None:
-    """Draw the emittance over two knobs, the others at their best, and its relative error.
+    """Draw the emittance over two knobs, the others at the best setting, and its relative error.
 
     Parameters
     ----------
@@ -88,18 +91,18 @@ def draw_map(figure: FigureBase, fit: TuningFit, i: int, j: int) -> None:
     fit : TuningFit
         The fit.
     i, j : int
-        Numbers of the knobs; of a single one the curve with its bands is drawn.
+        Indices of the knobs; for i = j a curve with its bands is drawn.
     """
     names, low, high = fit.knobs.names, fit.knobs.low, fit.knobs.high
-    along = [np.linspace(low[k], high[k], FINE) for k in (i, j)]
+    along = [np.linspace(low[k], high[k], MAP_POINTS) for k in (i, j)]
     if i == j:
         _draw_curve(figure, fit, along[0])
         return
     first, second = np.meshgrid(*along, indexing="ij")
     settings = fit.settings | {names[i]: first.ravel(), names[j]: second.ravel()}
     band = fit.beam(settings)["goal"][fit.kind]
-    value = 1e6 * band.value.reshape(FINE, FINE)
-    error = 50.0 * ((band.high - band.low) / band.value).reshape(FINE, FINE)
+    value = 1e6 * band.value.reshape(MAP_POINTS, MAP_POINTS)
+    error = 50.0 * ((band.high - band.low) / band.value).reshape(MAP_POINTS, MAP_POINTS)
     titles = (_axis(fit), "its standard error, %")
     for axes, part, title in zip(figure.subplots(1, 2), (value, error), titles, strict=True):
         drawn = axes.contourf(*along, part.T, levels=12, cmap="viridis")
@@ -113,7 +116,7 @@ def draw_map(figure: FigureBase, fit: TuningFit, i: int, j: int) -> None:
 
 
 def _draw_curve(figure: FigureBase, fit: TuningFit, at: np.ndarray) -> None:
-    """The emittance over a single knob with its 68 and 95 % bands."""
+    """Draw the emittance over a single knob with its 68 and 95 % bands."""
     axes, name = figure.subplots(), fit.knobs.names[0]
     band = fit.beam({name: at})["goal"][fit.kind]
     axes.fill_between(at, 1e6 * band.low_95, 1e6 * band.high_95, color=BLUE, alpha=0.15, lw=0)
@@ -126,7 +129,7 @@ def _draw_curve(figure: FigureBase, fit: TuningFit, at: np.ndarray) -> None:
 
 
 def draw_course(figure: FigureBase, fit: TuningFit) -> None:
-    """Draw the emittance at the best setting against the number of rows that it was found from.
+    """Draw the emittance at the best setting against the number of rows used.
 
     Parameters
     ----------
@@ -149,17 +152,17 @@ def _axis(fit: TuningFit) -> str:
     return f"{fit.kind.replace('ized_', 'ised ')}, µm"
 
 
-def course_of(fit: TuningFit, points: int = POINTS) -> list[tuple[int, Quantity]]:
-    """Emittance at the best setting, as the first rows of a table said it, and all of them.
+def course_of(fit: TuningFit, points: int = COURSE_POINTS) -> list[tuple[int, Quantity]]:
+    """Return the emittance at the best setting from the first rows of a table, and from all.
 
     Returns
     -------
     list of (int, Quantity)
-        Number of rows, and the normalised emittance at the setting that they say is best. Parts in
-        which too few magnet settings or no row within the limits stand are left out.
+        Number of rows, and the normalised emittance at the best setting from these rows. Numbers of
+        rows with too few magnet settings, or without a row within the limits, are left out.
     """
     scan, found, line = fit.scan, [], fit.seen.line if fit.seen else None
-    for count in np.unique(np.linspace(FIRST, len(scan), points).astype(int))[:-1]:
+    for count in np.unique(np.linspace(FIRST_ROWS, len(scan), points).astype(int))[:-1]:
         limits = dict(zip(fit.knobs.names, np.stack(fit.knobs[1:3], -1), strict=True))
         with suppress(InputError):
             part = replace(scan, **scan.columns_at(range(count)))

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from beamfit.answer import (
-    MOST_ROWS,
+    MAX_ROWS_SHOWN,
     Table,
     answer,
     brief,
@@ -118,8 +118,8 @@ class Summary(NamedTuple):
 
 def interval_table(rows: Sequence[Summary], title: str = "", note: str = "") -> Table:
     """Make a table with median and intervals of each number."""
-    cells = [row.row() for row in rows[:MOST_ROWS]]
-    left = len(rows) - MOST_ROWS
+    cells = [row.row() for row in rows[:MAX_ROWS_SHOWN]]
+    left = len(rows) - MAX_ROWS_SHOWN
     return Table(title, HEADER, [*cells, *([[f"and {left} more"]] if left > 0 else [])], note)
 
 

@@ -11,18 +11,18 @@ import numpy as np
 from scipy.stats import t
 
 DEFINITION = """\
-A tool **answers** if it gives a finite value with a finite error, says no warning, and has no
-status or flag of its own that speaks against the answer. A tool that gives no error answers, but
-has no cover. Intervals of 68 and 95 % are the tool's own; one that gives a standard deviation
-inferred from few residuals is given Student's factor for them.
+A tool **answers** if it gives a finite value with a finite error, without a warning and without a
+status or flag against the answer. A tool without errors answers, but has no coverage. Intervals of
+68 and 95 % are those of the tool; a standard deviation inferred from few residuals is multiplied by
+Student's factor.
 
-An answer is **wrong** if it
-lies more than 3 errors from the truth, whatever the size of both: an error is what the 95 %
-interval reaches towards the truth, over 1.96. Without an error, an answer beyond 10 % is wrong.
-Where nothing is there to be found, an emittance more than 3 errors from zero is wrong.
+An answer is **wrong** if it is more than 3 errors from the truth; the error is the length of the 95
+% interval towards the truth, divided by 1.96. Without an error, an answer more than 10 % off is
+wrong. If there is no emittance to find, one more than 3 errors from zero is wrong.
 
-In brackets stand binomial limits of 95 %. Bias is the median of value over truth, less one; the
-error is the median of half of the 68 % interval, over the truth."""
+Brackets give binomial limits of 95 %. Bias is the median of value / truth - 1; the error is the
+median
+of half of the 68 % interval, divided by the truth."""
 FAR, SHARE = 3.0, 0.1
 
 

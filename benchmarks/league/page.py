@@ -15,20 +15,20 @@ PLACE = Path(__file__).resolve().parents[2] / "docs"
 HEAD = f"""\
 # The league
 
-beamfit and what else can be had, on the same SIMULATED data: [quadrupole scans](league_scans.md)
-and [decays and top-up](league_decays.md). `make league` draws them anew, measures and writes these
-pages; speed stands on [a page of its own](speed.md).
+The league compares beamfit with other programs on the same SIMULATED data: [quadrupole
+scans](league_scans.md) and [decays and top-up](league_decays.md). `make league` simulates, measures
+and writes these pages; [speed](speed.md) is a separate page.
 
-Every row is a family: line, beam, law, number of readings, noise and the strength of what is wrong
-are drawn anew for each record and in each run, within the ranges of `benchmarks/league/scans.py`
-and `decays.py`; the seed stands on the page. All tools get the same records, as their users give
-them; emcee, which is slow, gets the first tenth.
+Every row is a family: line, beam, law, number of readings, noise and the size of the defect are
+drawn at random for each record in each run, within the ranges of `benchmarks/league/scans.py` and
+`decays.py`; the page gives the seed. All tools get the same records, in the form that their users
+give; emcee, which is slow, gets the first tenth.
 
-Of the peers pyemittance analyses scans; curve_fit, lmfit and emcee are the scripts that one writes
-(emcee: 32 walkers, 300 steps, no look at whether they have settled). lcls-tools and elegant's
-sddsemitproc are not on PyPI: what runs is their method, written from its description. In top-up,
-whose writer knows of the refills, scripts fit the longest piece, straight lines every piece. A peer
-that is not installed stops the run.
+pyemittance analyses scans; curve_fit, lmfit and emcee stand for scripts that users write (emcee: 32
+walkers, 300 steps, no convergence test). lcls-tools and elegant's sddsemitproc are not on PyPI;
+their methods were reimplemented from the descriptions. In top-up the scripts get the refills:
+they fit the longest piece, straight lines every piece. A program that is not installed stops the
+run.
 
 ## What is counted
 

@@ -72,7 +72,7 @@ def test_what_is_half_written_goes_with_the_process(tmp_path, monkeypatch, capfd
     half.write_text("<")
     monkeypatch.setattr(writing, "UNFINISHED", {str(half), str(tmp_path / "gone")})
     monkeypatch.setattr(os, "_exit", lambda status: None)
-    command._stopped(signal.SIGTERM, None)
+    command._exit_on_signal(signal.SIGTERM, None)
     assert not half.exists()
     assert capfd.readouterr().err == "beamfit: interrupted\n"
 

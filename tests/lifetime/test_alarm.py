@@ -19,7 +19,7 @@ from beamfit.lifetime.course import reference_of
 from beamfit.lifetime.fit import fit_decay
 from beamfit.lifetime.record import DecayRecord
 from beamfit.lifetime.study import Decay
-from beamfit.statistics import CHANGED, log_evidence_of_change
+from beamfit.statistics import CHANGE_WIDTHS, log_evidence_of_change
 
 # Ten hours at 500 mA, two thirds of the loss from a; 1 µA a second.
 USUAL = Reference(a=3.7e-8, b=9.26e-6, noise=1e-3)
@@ -236,7 +236,7 @@ def test_many_beams_at_once_are_each_as_alone():
 def test_the_evidence_of_a_change_is_an_integral_over_its_sizes(squares, information):
     error = information**-0.5
     seen, parts = math.sqrt(squares) * error, []
-    for width in CHANGED:
+    for width in CHANGE_WIDTHS:
         spread = np.linspace(-12, 12, 20001) / math.hypot(1 / width, 1 / error)
         middle = seen * width**2 / (width**2 + error**2)
         sizes = middle + spread

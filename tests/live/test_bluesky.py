@@ -17,7 +17,7 @@ from beamfit.errors import InputError
 from beamfit.io.line import build_line
 from beamfit.io.machine import ScanMachine, read_scan_machine
 from beamfit.live.bluesky import emittance_scan
-from beamfit.live.channel import _closed
+from beamfit.live.channel import _close_connections
 from beamfit.live.devices import NoSizesError
 from tests.live.faulty import Injector
 from tests.live.simulated import written
@@ -37,7 +37,7 @@ def closed(engine):
         for task in left:
             task.cancel()
         await asyncio.gather(*left, return_exceptions=True)
-        _closed()
+        _close_connections()
 
     asyncio.run_coroutine_threadsafe(ended(), engine.loop).result(5)
     engine.loop.call_soon_threadsafe(engine.loop.stop)

@@ -11,7 +11,7 @@ import pytest
 
 import beamfit
 from beamfit.cli import cli
-from beamfit.cli.scan import _Lines
+from beamfit.cli.scan import _ProgressLines
 from beamfit.errors import InputError
 from beamfit.io.line import build_line, read_inputs
 from beamfit.io.machine import Guard, read_scan_machine
@@ -190,7 +190,7 @@ def test_beam_is_followed_to_the_last_shot_and_a_silent_variable_is_lost(monkeyp
     assert asyncio.run(shots(there, lost)) == "beam loss ('LOSS' reads 5.0)"
     assert asyncio.run(shots(there, None)) == ""
     assert asyncio.run(shots(None, None)) == ""
-    monkeypatch.setattr(devices, "FIRST", 0.01)
+    monkeypatch.setattr(devices, "FIRST_READING_WAIT", 0.01)
     with pytest.raises(LostError, match="no reading of 'FEED' within"):
         asyncio.run(shots(Feed(), None))
 
@@ -345,7 +345,7 @@ def test_a_reader_that_goes_ends_no_scan(monkeypatch, capsys):
 
         flush = write
 
-    say = _Lines(err=False)
+    say = _ProgressLines(err=False)
     say("one")
     monkeypatch.setattr("sys.stdout", Gone())
     say("two")
@@ -523,12 +523,12 @@ def test_each_magnet_is_moved_and_a_line_that_is_wrong_is_doubted(tmp_path):
     settings = [before | {"Q1": value} for value in (-5.0, -3.0, -1.0, 1.0)]
     for _ in range(3):  # the second magnet, which no setting has moved yet
         points = points_of(line, settings)
-        assert aim.fresh(points) == ["Q2"]
+        assert aim.barely_moved(points) == ["Q2"]
         chosen = aim.next(points, aim.fit(points), (), before)
         assert chosen.settings["Q2"] != before["Q2"]
         settings.append(chosen.settings)
     points = points_of(line, settings)
-    assert aim.fresh(points) == []
+    assert aim.barely_moved(points) == []
     assert aim.doubt(points, aim.fit(points)) == ""
     points = points_of(build_line(two_magnets(tmp_path, 3.0).lattice), settings)
     said = aim.doubt(points, aim.fit(points))
@@ -572,7 +572,7 @@ class TwoMagnets(Simulated):
 def test_a_drift_between_two_magnets_a_third_off_is_said(tmp_path, factor):
     machine = replace(two_magnets(tmp_path, 2.2), points=12, goal=0.05)
     line = build_line(machine.lattice)
-    [longer, shorter] = EmittanceAim(machine, line).wrong
+    [longer, shorter] = EmittanceAim(machine, line).wrong_lines
     assert longer.words == "the drift from Q1 to Q2 times 1.33"
     assert float(longer.line.length) == pytest.approx(float(line.length) + 1 / 3)
     assert float(shorter.line.length) == pytest.approx(float(line.length) - 1 / 3)
@@ -584,7 +584,7 @@ def test_a_drift_between_two_magnets_a_third_off_is_said(tmp_path, factor):
     assert bool(found.doubt) == (factor != 1.0)
     if factor == 1.0:
         assert found.reason.startswith("the goal")
-        assert EmittanceAim(machine, line).telling(found.points, found.fit, at) is None
+        assert EmittanceAim(machine, line).line_test(found.points, found.fit, at) is None
 
 
 def test_the_setting_that_tells_a_wrong_drift_moves_what_stood_still(tmp_path):
@@ -592,11 +592,11 @@ def test_the_setting_that_tells_a_wrong_drift_moves_what_stood_still(tmp_path):
     line, before = build_line(machine.lattice), {"Q1": -1.0, "Q2": 0.5}
     points = points_of(line, [before | {"Q1": value} for value in (-5.0, -3.5, -2.0, -0.5, 1.0)])
     aim = EmittanceAim(machine, line)
-    told = aim.telling(points, aim.fit(points), before)
+    told = aim.line_test(points, aim.fit(points), before)
     assert "the drift from Q1 to Q2 times" in told.why
     assert told.settings["Q2"] != before["Q2"]
     there, elsewhere = (
-        [*points, *points_of(aim.wrong[0].line, [told.settings | more] * 2)]
+        [*points, *points_of(aim.wrong_lines[0].line, [told.settings | more] * 2)]
         for more in ({}, before)
     )
     assert aim.doubt(there, aim.fit(there))
@@ -605,7 +605,7 @@ def test_the_setting_that_tells_a_wrong_drift_moves_what_stood_still(tmp_path):
 
 def test_one_magnet_has_no_distance_to_another(tmp_path):
     machine = connected(tmp_path, Simulated()).machine
-    assert EmittanceAim(machine, build_line(machine.lattice)).wrong == []
+    assert EmittanceAim(machine, build_line(machine.lattice)).wrong_lines == []
 
 
 def test_a_projection_has_the_size_of_its_gaussian():

@@ -24,7 +24,7 @@ from beamfit.lifetime.watch import Plan, State
 from beamfit.live import watch as live_watch
 from beamfit.live.channel import Described, PvReading, open_channel, run
 from beamfit.live.served import values_of
-from beamfit.live.watch import Arrived, _Course
+from beamfit.live.watch import Arrived, _RunningWatch
 from tests.live.conftest import ROOT
 from tests.live.truth import A, B
 from tests.report.browser import NAME
@@ -234,7 +234,7 @@ def test_a_variable_that_comes_back_in_another_unit_ends_the_watch():
         async def describe(self):
             return Described("A")
 
-    course = _Course(Plan(), asyncio.Queue())
+    course = _RunningWatch(Plan(), asyncio.Queue())
     with pytest.raises(InputError, match="unit 'A' of 'I'; expected mA, as in the machine file"):
         asyncio.run(course.follow(Watched("beam_current", "I", "mA", 1.0), Changed()))
     assert course.queue.qsize() == 2  # nothing was taken for mA that is not
@@ -272,12 +272,12 @@ def arrived(begin, at):
 def test_what_is_shown_is_as_old_as_the_newest_reading_that_is_fitted(monkeypatch):
     now = 5000.0  # of a clock that stands still, however long a fit takes
     monkeypatch.setattr(live_watch, "time", SimpleNamespace(monotonic=lambda: now))
-    course = _Course(Plan(every=10.0), asyncio.Queue(), arrived=now)
+    course = _RunningWatch(Plan(every=10.0), asyncio.Queue(), arrived=now)
     for late in (40.0, 0.0):  # fits that fall behind, and that do not
         for one in arrived(1.7e9 - 100 * late, now - late):
             course.queue.put_nowait(one)
         asyncio.run(course.take())
-        told = course.told()
+        told = course.view()
         assert told.silent is None
         assert told.age == late
         assert told.old == (not told.sound) == (late > 0)

@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 import beamfit
 import beamfit.figures
 from beamfit.errors import InputError
-from beamfit.report.document import day_of, written_now
+from beamfit.report.document import day_of, with_provenance
 from beamfit.report.emittance import emittance_page
 from beamfit.report.lifetime import decay_page, study_of
 from beamfit.report.pdf import HEIGHT, pages_of
@@ -145,14 +145,14 @@ def pages(otr, two, noise, decay):
     @cache
     def of(name):
         if name == "decay":
-            found = pages_of(written_now(decay_page((study_of(decay),))))
+            found = pages_of(with_provenance(decay_page((study_of(decay),))))
         else:
             fit = {"otr": otr, "two": two, "noise": noise}[name]
             if name == "otr":  # names as long as people make them
                 scan = replace(fit.scan, name="a_scan_with_a_name_" * 9, provenance=("W" * 300,))
                 fit = replace(fit, scan=scan)
             said = "beamfit emittance " + "/a/long/path" * 30
-            found = pages_of(written_now(emittance_page(fit), said))
+            found = pages_of(with_provenance(emittance_page(fit), said))
         for page in found:
             FigureCanvasAgg(page).draw()
         return found
