@@ -180,7 +180,7 @@ def _state(seen: PreparedScan, told: Assumptions) -> Problem:
             low, high = min(low, mean - 6 * sd), max(high, mean + 6 * sd)
             priors.append(Prior(f"magnets.{name}", mean, sd))
         free.append(Free(f"magnets.{name}", *told.bounds.get(name, (low, high))))
-    seen = seen.keeping(magnets)
+    seen = seen.with_variable(magnets)
     return beam_problem(seen, model={"magnets": magnets}, free=free, priors=priors)
 
 
@@ -230,5 +230,5 @@ SCENARIO = Scenario(
     _parameters,
     _null_directions,
     _remedy,
-    aside="; the emittance is not affected",
+    consequence="; the emittance is not affected",
 )

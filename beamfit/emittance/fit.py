@@ -8,10 +8,10 @@ from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any
 
 from beamfit.answer import Table, answer, determined, json_of, labelled, quantity_frame
-from beamfit.emittance.answer import judged_beam
+from beamfit.emittance.answer import beam_answers
 from beamfit.emittance.assumptions import Anchor, Assumptions
 from beamfit.emittance.comparison import BEAM
-from beamfit.emittance.model import line_of
+from beamfit.emittance.model import line_with
 from beamfit.emittance.predicted import Prediction, correlations_of, predicted_sizes
 from beamfit.emittance.results import Parameter, PlaneFit, parameter_table, result_rows
 from beamfit.emittance.scan import QuadScan
@@ -20,11 +20,11 @@ from beamfit.emittance.statement import (
     WEIGHTS,
     PreparedScan,
     Scenario,
-    looked_through,
-    of_one_beam,
+    assemble,
     prepare,
     scenario_of,
-    unfitted,
+    single_beam,
+    with_elements,
     with_posteriors,
 )
 from beamfit.emittance.transport import of_emittances, of_priors, unit_warnings
@@ -148,7 +148,7 @@ def fit_emittance(
     told = Assumptions(priors or {}, bounds or {}, *ties, hidden, starts, seed)
     told.check_scenario(scenario)
     noise = replace(noise or Noise(), bad=ROBUST) if robust else noise
-    scan, line = of_one_beam(scan, line, scenario)
+    scan, line = single_beam(scan, line, scenario)
     statement = scenario_of(scenario)
     if told.systematics:
         from beamfit.emittance.systematics import with_systematics
@@ -156,15 +156,15 @@ def fit_emittance(
         statement = with_systematics(statement)
     seen = prepare(scan, line, planes, method, noise, weights)
     if statement.closed:
-        return EmittanceFit(judged_beam(seen), scan, line, statement, told, seen)
+        return EmittanceFit(beam_answers(seen), scan, line, statement, told, seen)
 
-    from beamfit.emittance.scenario_fit import judged_scenario, settled_fit  # loads the solvers
+    from beamfit.emittance.scenario_fit import iterated_fit, scenario_answers  # loads the solvers
 
-    fit, seen = settled_fit(seen, statement, told)
+    fit, seen = iterated_fit(seen, statement, told)
     parameters = tuple(statement.parameters(seen, told, fit))
-    found = line_of(fit.model, seen.scanned)
+    found = line_with(fit.model, seen.scanned)
     begun = EmittanceFit((), scan, found, statement, told, seen, parameters, (), fit)
-    judged = judged_scenario(begun)
+    judged = scenario_answers(begun)
     identified = all(p.identifiability.determined for p in judged)
     left = statement.null_directions(seen, parameters, identified)
     return replace(begun, planes=judged, null_directions=left)
@@ -453,7 +453,7 @@ def fit_many(
     known, told = scenario_of("known"), Assumptions()
     return [
         one if isinstance(one, InputError)
-        else EmittanceFit(judged_beam(one), one.scan, one.line, known, told, one)
+        else EmittanceFit(beam_answers(one), one.scan, one.line, known, told, one)
         for one in _seen_together(scans, weights, noise)
     ]  # fmt: skip
 
@@ -465,11 +465,11 @@ def _seen_together(
     found: list[PreparedScan | InputError] = []
     for given in scans:
         try:
-            found.append(unfitted(*of_one_beam(*given), noise=noise, weights=weights))
+            found.append(assemble(*single_beam(*given), noise=noise, weights=weights))
         except InputError as error:
             found.append(error)
     usable = [i for i, one in enumerate(found) if isinstance(one, PreparedScan)]
-    seen = with_posteriors(looked_through([found[i] for i in usable]))
+    seen = with_posteriors(with_elements([found[i] for i in usable]))
     for i, one in zip(usable, seen, strict=True):
         found[i] = one
     return found
@@ -492,7 +492,7 @@ def noise_samples(scans: Iterable[tuple[QuadScan, Beamline]], noise: Noise) -> I
         for work in seen.solutions.values():
             post = work.posterior
             if len(work.sizes.size) > 3 and post.probability[BEAM] > SURE:
-                word = work.sizes.likeness[1]
+                word = work.sizes.comparison_key[1]
                 word = "stated" if word == "share" else word
                 under = partial(work.sizes.kinds_under, post.unit)
-                yield Sample(word, under, post.kinds, post.scales, post.by_scale)
+                yield Sample(word, under, post.kinds, post.scales, post.scale_log_evidence)

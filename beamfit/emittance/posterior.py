@@ -9,24 +9,30 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from beamfit.emittance.beam_draws import BRIGHT
+from beamfit.emittance.beam_draws import LN_T_SPREAD
 from beamfit.emittance.model import (
     QUANTITIES,
     UNIT,
-    Asked,
-    asked_numbers,
+    AnswerPlaces,
+    model_quantities,
     sigma_of,
     size_squared,
-    spoken,
+    user_name,
 )
 from beamfit.emittance.results import PlaneFit
-from beamfit.emittance.statement import PreparedScan, Scanned, asked_in, factor_of, size_records
+from beamfit.emittance.statement import (
+    PreparedScan,
+    Scanned,
+    cholesky_numbers,
+    problem_places,
+    size_records,
+)
 from beamfit.errors import Finding, InputError
 from beamfit.greybox import tree
 from beamfit.greybox.posterior import Optimum, Statement, predicted, target_of
 from beamfit.greybox.problem import Problem
 from beamfit.noise.model import Noise
-from beamfit.noise.sizes import NoiseKind, Scales, averaged, log_likelihood
+from beamfit.noise.sizes import NoiseKind, Scales, log_average, log_likelihood
 from beamfit.optics.beam import BeamMatrix
 from beamfit.quantity import Status
 from beamfit.sampling.posterior import Expected, Posterior
@@ -78,17 +84,17 @@ class PlaneLikelihood:
         off, parts = self.size[None] - found, []
         for kind, nodes in zip(self.kinds, self.scales, strict=True):
             log = log_likelihood(off, found, kind, nodes.scale, self.noise)[0]
-            parts.append(averaged(log, nodes.log_weight) + kind.log_weight)
-        bright = jnp.log(jnp.maximum(self.trace @ sigma, 1e-300))
+            parts.append(log_average(log, nodes.log_weight) + kind.log_weight)
+        log_t = jnp.log(jnp.maximum(self.trace @ sigma, 1e-300))
         determinant = jnp.maximum(sigma[0] * sigma[2] - sigma[1] ** 2, 1e-300)
-        prior = -2.0 * bright - 0.5 * (bright / BRIGHT) ** 2 - 0.5 * jnp.log(determinant)
-        return averaged(jnp.stack(parts), 0.0) + prior
+        prior = -2.0 * log_t - 0.5 * (log_t / LN_T_SPREAD) ** 2 - 0.5 * jnp.log(determinant)
+        return log_average(jnp.stack(parts), 0.0) + prior
 
 
 class DensityData(NamedTuple):
     """Data of the functions of a scan's statement."""
 
-    asked: tuple[Asked, ...]
+    asked: tuple[AnswerPlaces, ...]
     sizes: tuple[PlaneLikelihood, ...]
 
 
@@ -120,7 +126,7 @@ def _beams(model: Mapping[str, Any], told: DensityData) -> dict[str, Any]:
 
 def _twiss(model: Mapping[str, Any], told: DensityData) -> Array:
     """Emittance, normalised emittance, β, α at the start and mismatch, plane after plane."""
-    return jnp.concatenate([asked_numbers(model, plane)[PLACES] for plane in told.asked])
+    return jnp.concatenate([model_quantities(model, plane)[PLACES] for plane in told.asked])
 
 
 def beam_target(
@@ -191,7 +197,7 @@ def _optimum(
         sigma = [q.value for q in p.sigma]
         if not np.isfinite(p.covariance).all() and p in given:
             sigma = [priors[f"{p.plane}.{name}"].mean() for name in SIGMA]
-        numbers = factor_of(sigma, 1e-4)
+        numbers = cholesky_numbers(sigma, 1e-4)
         begin |= {f"beam.{p.plane}.{name}": value for name, value in numbers.items()}
     theta = np.array([begin[name] for name in names])
     worst = max(chosen, key=lambda p: p.status is Status.poor_fit)
@@ -205,14 +211,14 @@ def _stated(
 ) -> Statement:
     chosen = kept or asked
     planes = [p.plane for p in chosen]
-    places = asked_in(problem, fit.seen, planes, fit.statement.whole_map)
+    places = problem_places(problem, fit.seen, planes, fit.statement.whole_map)
     shown = {(p.plane, name): getattr(p, name) for p in chosen for name in TWISS}
     lost = ", ".join(f"{p.plane} plane" for p in asked if p not in kept)
     sigmas = [f"{p.plane}.{name}" for p in chosen for name in SIGMA]
     own = [f"beam.{p.plane}.{name}" for p in chosen for name in CHOLESKY]
     labels = {f"size {p.plane}": p.plane for p in chosen}
     # As users name them in a calibration: Q2.slope.
-    renamed = {name: spoken(name) for name in problem.names}
+    renamed = {name: user_name(name) for name in problem.names}
     return Statement(
         derived={f"{plane}.{name}": QUANTITIES[name] for plane, name in shown},
         derive=_twiss,

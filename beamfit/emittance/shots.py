@@ -157,11 +157,11 @@ def _alike(shots: np.ndarray) -> bool:
 
     Shots that show no beam are none of them.
     """
-    from beamfit.noise.sizes import means_of  # scipy, which most scans are read without
+    from beamfit.noise.sizes import shot_means  # scipy, which most scans are read without
     from beamfit.statistics import POOR_FIT
 
     shots = shots[np.any(shots > 0.0, axis=1)]
-    found = means_of(shots)
+    found = shot_means(shots)
     mean, degrees, square = _scatter(
         shots if found is None else np.where(found.bad > 0.5, np.nan, shots)
     )

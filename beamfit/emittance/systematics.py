@@ -22,7 +22,7 @@ from jax import Array
 
 from beamfit.compile_cache import SELDOM
 from beamfit.emittance.assumptions import Assumptions
-from beamfit.emittance.model import coefficients, size_squared, spoken
+from beamfit.emittance.model import coefficients, size_squared, user_name
 from beamfit.emittance.results import Parameter, PlaneFit, Points, in_words
 from beamfit.emittance.sigma import error_at, weighed_size
 from beamfit.emittance.statement import WEIGHTS, PreparedScan, Scanned, Scenario, varied_magnets
@@ -99,7 +99,7 @@ def with_systematics(scenario: Scenario) -> Scenario:
     def state(seen: PreparedScan, told: Assumptions) -> Problem:
         terms = _terms(seen, told)
         magnets = [t.name.rpartition(".")[0] for t in terms if "." in t.name]
-        seen = seen.keeping(magnets, any_energy="energy" in told.systematics)
+        seen = seen.with_variable(magnets, variable_energy="energy" in told.systematics)
         problem = scenario.state(seen, told)
         return replace(
             problem,
@@ -188,7 +188,9 @@ def effect_words(fit: Fit, told: Assumptions, emittance: float, slope: np.ndarra
     what is left with all s known is the Schur complement C_εε - C_εs C_ss⁻¹ C_sε.
     """
     places = {
-        spoken(name): i for i, name in enumerate(fit.problem.names) if spoken(name) in told.priors
+        user_name(name): i
+        for i, name in enumerate(fit.problem.names)
+        if user_name(name) in told.priors
     }
     if not told.systematics or not emittance > 0:
         return ""

@@ -18,7 +18,7 @@ import numpy as np
 from jax import Array
 
 from beamfit.arrays import padded_length
-from beamfit.emittance.model import line_of
+from beamfit.emittance.model import line_with
 from beamfit.emittance.scan import USUAL, QuadScan, middle
 from beamfit.greybox import tree
 from beamfit.optics.beamline import Beamline, Same, seen_line, transfer_rows
@@ -160,7 +160,7 @@ class Rows:
     def elements(self, model: Mapping[str, Any]) -> tuple[Array, Array, Array]:
         """R11, R12, damped, and known size² (m²) of every row, shape (n,), by the model's line."""
         found = model.get("systematics", {})
-        r = self.both(line_of(model, self.line), self.energy * found.get("energy", 1.0))
+        r = self.both(line_with(model, self.line), self.energy * found.get("energy", 1.0))
         return self.known(r["xy".index(self.plane)], found)
 
     def both(self, line: Beamline, energy: Array) -> Array:
@@ -237,7 +237,7 @@ def scan_rows(
     scanned: Beamline,
     squared: bool = True,
     keep: Iterable[str] = (),
-    any_energy: bool = False,
+    variable_energy: bool = False,
 ) -> Rows:
     """The rows of a scan, of the x plane, padded.
 
@@ -274,7 +274,7 @@ def scan_rows(
     energy = column(scan.energy, scanned.energy)
     ends = (*places, scanned.design.at) if scanned.design else places
     # What is multiplied out holds for one energy, if there is but one.
-    every = np.append(energy, (1.0 + any_energy) * scanned.energy)
+    every = np.append(energy, (1.0 + variable_energy) * scanned.energy)
     settings = {} if own else scan.settings
     return Rows(
         "x",
@@ -297,7 +297,7 @@ def damping_of(energy: np.ndarray, mean: float, mass: float) -> np.ndarray:
     return np.sqrt(beta_gamma(mean, mass) / beta_gamma(energy, mass))
 
 
-def look_through(rows: Rows) -> Array:
+def row_elements(rows: Rows) -> Array:
     """Carry the rows of a scan to their screens, in both planes and one pass.
 
     Returns

@@ -201,7 +201,7 @@ def network_rows(seen: PreparedScan, lay: _Layout, plane: str) -> NetworkRows:
         seen.rows.squared,
         padded(lay.columns),
         _columns(seen, lay, plane, seen.rows.which),
-        seen.look[2, "xy".index(plane)],
+        seen.elements[2, "xy".index(plane)],
         seen.rows.damping,
     )
 
