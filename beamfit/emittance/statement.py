@@ -24,7 +24,7 @@ from beamfit.emittance.transport import (
     Rows,
     check_gradients,
     damping_of,
-    names_of,
+    lattice_names,
     padded,
     row_elements,
     rows_line,
@@ -374,7 +374,7 @@ def assemble(
     weights: str = WEIGHTS[0],
 ) -> PreparedScan:
     """Assemble a scan and its line, without transfer-matrix elements and posteriors."""
-    check_names(scan, *names_of(line))
+    check_names(scan, *lattice_names(line))
     chosen = planes or scan.planes
     for plane in chosen:
         scan.rows(plane)  # says so if it was not measured
