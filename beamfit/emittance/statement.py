@@ -19,7 +19,7 @@ from beamfit.emittance.comparison import PlanePosterior, PlaneSizes, compare
 from beamfit.emittance.model import UNIT, AnswerPlaces, predict_sizes
 from beamfit.emittance.results import Parameter, PlaneFit, Points
 from beamfit.emittance.scan import QuadScan, check_names
-from beamfit.emittance.shots import of_settings
+from beamfit.emittance.shots import group_shots
 from beamfit.emittance.transport import (
     Rows,
     check_gradients,
@@ -362,7 +362,7 @@ def single_beam(
     if scan.transfer and scenario != "known":
         expected = "scenario known, or settings and a lattice"
         raise scan.unusable(f"scenario {scenario} for {given}", expected)
-    return of_settings(scan.of_particle(line.mass)), line
+    return group_shots(scan.of_particle(line.mass)), line
 
 
 def assemble(

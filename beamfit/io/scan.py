@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from beamfit.emittance.scan import KNOB, POSSIBLE, USUAL, Profile, QuadScan, middle
-from beamfit.emittance.shots import of_settings
+from beamfit.emittance.shots import group_shots
 from beamfit.errors import InputError, located, nearest, short
 from beamfit.io.cells import is_number, number
 from beamfit.io.columns import (
@@ -531,7 +531,7 @@ def scan_of_sheet(sheet: Sheet, knobs: Mapping[str, Column] = MappingProxyType({
     notes += [*ignored(sheet, columns), *left_out(sheet)]
     with located(sheet.path):
         scan = _scan(sheet, columns, values, notes=tuple(notes), profiles=profiles)
-        return of_settings(scan, marked="shot" in columns)
+        return group_shots(scan, marked="shot" in columns)
 
 
 def _without_dark(sheet: Sheet, columns: Mapping[str, Column]) -> Sheet:
