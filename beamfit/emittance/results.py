@@ -295,7 +295,7 @@ class PlaneFit:
         """The plane, its status and its emittance in one line."""
         words = f": {self.words}" if self.words else ""
         with_error = self.status is not Status.unidentified and self.emittance.error is not None
-        return f"{self.plane} {cell(self.status)}{words}{f' ({self.holds})' if said else ''}"
+        return f"{self.plane} {cell(self.status)}{words}{f' ({self.holds})' if with_error else ''}"
 
     def tables(self) -> tuple[Table, ...]:
         """Table of all numbers."""
