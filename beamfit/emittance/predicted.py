@@ -17,7 +17,7 @@ from beamfit.emittance.results import PlaneFit
 from beamfit.emittance.statement import Scanned
 from beamfit.emittance.transport import Rows, padded
 from beamfit.errors import InputError, nearest
-from beamfit.optics.beamline import seen_line
+from beamfit.optics.beamline import reduced_line
 from beamfit.sampling.posterior import Correlations
 
 NAMES = ("sigma11", "sigma12", "sigma22", "emittance", "beta", "alpha")
@@ -116,7 +116,7 @@ def _rows(
         name: padded(given.get(name, np.full(n, float(line[name].setting)))) for name in variable
     }
     energy = padded(np.full(n, seen.energy))
-    reduced = seen_line(line, tuple(variable), energy, (place,))
+    reduced = reduced_line(line, tuple(variable), energy, (place,))
     return seen.rows_at(reduced, plane, place, table, energy)
 
 

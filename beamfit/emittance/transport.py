@@ -20,7 +20,7 @@ from beamfit.arrays import padded_length
 from beamfit.emittance.model import line_with
 from beamfit.emittance.scan import USUAL, QuadScan, middle
 from beamfit.greybox import tree
-from beamfit.optics.beamline import Beamline, Same, seen_line, transfer_rows
+from beamfit.optics.beamline import Beamline, LineIdentity, reduced_line, transfer_rows
 from beamfit.optics.calibration import SETTING_UNITS, CurrentTable, plain_meaning
 from beamfit.optics.elements import Element, Marker, Quadrupole, Screen, ThinLens
 from beamfit.particles import ELECTRON_MASS, beta_gamma, rigidity
@@ -77,11 +77,13 @@ def scanned_line(scan: QuadScan, line: Beamline) -> Beamline:
         energies = np.unique(line.energy if scan.energy is None else scan.energy)
         # Rounding may make the mean of equal numbers differ in its last digit.
         energy = float(energies[0] if len(energies) == 1 else np.mean(scan.energy))
-    return _with_units(Same(line), tuple(scan.units.items()), energy)
+    return _with_units(LineIdentity(line), tuple(scan.units.items()), energy)
 
 
 @lru_cache(maxsize=64)
-def _with_units(same: Same, units: tuple[tuple[str, str], ...], energy: float | None) -> Beamline:
+def _with_units(
+    same: LineIdentity, units: tuple[tuple[str, str], ...], energy: float | None
+) -> Beamline:
     """The line with settings in other units, and held for a beam of another energy if given."""
     line = same.line
     for member, unit in [(m, unit) for name, unit in units for m in line.members(name)]:
@@ -277,7 +279,7 @@ def scan_rows(
         "x",
         places,
         squared,
-        seen_line(scanned, (*settings, *keep), energies, targets),
+        reduced_line(scanned, (*settings, *keep), energies, targets),
         {name: padded(v) for name, v in settings.items()},
         energy,
         padded(which),
