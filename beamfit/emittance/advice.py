@@ -77,7 +77,7 @@ class Adviser(NamedTuple):
 
     Attributes
     ----------
-    seen : PreparedScan
+    prepared : PreparedScan
         The scan through its line.
     information : Information
         Information on the emittances.
@@ -87,14 +87,14 @@ class Adviser(NamedTuple):
         States which planes are determined, given the information and further measurements.
     """
 
-    seen: PreparedScan
+    prepared: PreparedScan
     information: Information
     predict: Predict
     determined: Determined
 
     def errors(self, known: Information) -> dict[str, float]:
         """Relative error of each plane's emittance."""
-        return dict(zip(self.seen.planes, map(float, known.relative_error), strict=True))
+        return dict(zip(self.prepared.planes, map(float, known.relative_error), strict=True))
 
     def candidates(
         self,
@@ -109,36 +109,41 @@ class Adviser(NamedTuple):
         and sizes of no beam do not count as measured.
         """
         found, rows, screens = [], [], tuple(screens)
-        largest = max(_largest(self.seen, plane) for plane in self.seen.planes)
-        for table in candidate_settings(self.seen.scan.settings, limits).values():
+        largest = max(_largest(self.prepared, plane) for plane in self.prepared.planes)
+        for table in candidate_settings(self.prepared.scan.settings, limits).values():
             rows_of_table = zip(*table.values(), strict=True)
             points = [dict(zip(table, map(float, row), strict=True)) for row in rows_of_table]
-            for screen, energy in product(screens, (self.seen.energy, *energies)):
+            for screen, energy in product(screens, (self.prepared.energy, *energies)):
                 further = self.predict(
-                    self.seen.scanned, table, screen, np.full(CANDIDATES, energy)
+                    self.prepared.scanned, table, screen, np.full(CANDIDATES, energy)
                 )
                 usable = (further.size <= largest).all(axis=0)
                 usable |= limits is not None or not usable.any()
                 rows += list(further.rows.swapaxes(0, 1)[usable])
                 where = f" on {screen}" if len(screens) > 1 else ""
-                where += f" at {energy:g} MeV" if energy != self.seen.energy else ""
+                where += f" at {energy:g} MeV" if energy != self.prepared.energy else ""
                 for i in np.flatnonzero(usable):
-                    words = settings_in_words(self.seen, points[i]) + where
+                    words = settings_in_words(self.prepared, points[i]) + where
                     found.append(Candidate(points[i], screen, float(energy), words))
         return found, np.array(rows)
 
 
-def _largest(seen: PreparedScan, plane: str) -> float:
+def _largest(prepared: PreparedScan, plane: str) -> float:
     """Largest good size of a plane, m; infinite if the sizes are not a beam's."""
-    p, probability = seen.solutions[plane].points, seen.solutions[plane].posterior.probability
+    p, probability = (
+        prepared.solutions[plane].points,
+        prepared.solutions[plane].posterior.probability,
+    )
     of_a_beam = probability[BEAM] + probability[ZERO_EMITTANCE] > 0.5
     good = p.size[p.outlier_probability <= 0.5]
     return float(np.max(good, initial=0.0)) if of_a_beam else np.inf
 
 
-def settings_in_words(seen: PreparedScan, settings: Mapping[str, float], digits: int = 4) -> str:
+def settings_in_words(
+    prepared: PreparedScan, settings: Mapping[str, float], digits: int = 4
+) -> str:
     """Settings with the units of the scan."""
-    return in_words(settings, setting_units(seen.scanned, settings), digits)
+    return in_words(settings, setting_units(prepared.scanned, settings), digits)
 
 
 def candidate_settings(
@@ -196,9 +201,9 @@ class BeamSpread(NamedTuple):
         return np.linalg.solve(self.covariance, covariances.T).T
 
 
-def spread_of(seen: PreparedScan, plane: str) -> BeamSpread:
+def beam_spread(prepared: PreparedScan, plane: str) -> BeamSpread:
     """Draws of a plane's beam, normalised about their mean."""
-    post = seen.solutions[plane].posterior
+    post = prepared.solutions[plane].posterior
     sigma, weight = post.sigma, post.weight
     # Each number in units of its rms, so that the covariance is well conditioned.
     unit = np.sqrt(weight @ sigma**2)
@@ -207,12 +212,12 @@ def spread_of(seen: PreparedScan, plane: str) -> BeamSpread:
     return BeamSpread(sigma, off, weight, covariance + 1e-12 * np.trace(covariance) * np.eye(3))
 
 
-def draws_adviser(seen: PreparedScan, fitted: Sequence[PlaneFit] = ()) -> Adviser:
+def draws_adviser(prepared: PreparedScan, fitted: Sequence[PlaneFit] = ()) -> Adviser:
     """Build an adviser from the draws of the beams, where nothing else is unknown.
 
     Parameters
     ----------
-    seen : PreparedScan
+    prepared : PreparedScan
         The scan through its line.
     fitted : sequence of PlaneFit
         Planes with the errors quoted; without them the errors of the draws are used.
@@ -224,7 +229,7 @@ def draws_adviser(seen: PreparedScan, fitted: Sequence[PlaneFit] = ()) -> Advise
     """
     determined_now = {p.plane: p.identifiability.determined for p in fitted}
     quoted_errors = {p.plane: p.emittance.relative for p in fitted if p.emittance.error}
-    beams = {plane: spread_of(seen, plane) for plane in seen.planes}
+    beams = {plane: beam_spread(prepared, plane) for plane in prepared.planes}
     count, roots, slopes = len(beams), [], []
     for plane, s in beams.items():
         drawn = emittances(s.sigma)
@@ -236,13 +241,13 @@ def draws_adviser(seen: PreparedScan, fitted: Sequence[PlaneFit] = ()) -> Advise
     known = block_diag(*roots), np.ones(count), block_diag(*slopes)
 
     def predict(line, table, screen, energy) -> FurtherSizes:
-        elements = elements_at(seen, line, table, screen, energy)
+        elements = elements_at(prepared, line, table, screen, energy)
         sizes, rows = [], []
         for i, (plane, s) in enumerate(beams.items()):
             r11, r12, further = (v[:, None] for v in elements["xy".index(plane)])
             drawn = np.sqrt(size_squared(s.sigma.T, r11, r12, further))
             size = drawn @ s.weight
-            error = relative_error(seen, plane) * size
+            error = relative_error(prepared, plane) * size
             plane_rows = np.zeros((len(size), count, 3))
             plane_rows[:, i] = s.slope(drawn) / error[:, None]
             sizes.append(size)
@@ -255,16 +260,18 @@ def draws_adviser(seen: PreparedScan, fitted: Sequence[PlaneFit] = ()) -> Advise
         rows = []
         for c in further:
             table = {name: np.array([v]) for name, v in c.settings.items()}
-            rows.append(elements_at(seen, seen.scanned, table, c.screen, np.array([c.energy])))
+            rows.append(
+                elements_at(prepared, prepared.scanned, table, c.screen, np.array([c.energy]))
+            )
         elements = np.concatenate(rows, axis=-1)
         plane_elements = {plane: elements["xy".index(plane)] for plane in determined_now}
         return {
-            plane: already or simulate_further(seen, plane, *plane_elements[plane])
+            plane: already or simulate_further(prepared, plane, *plane_elements[plane])
             for plane, already in determined_now.items()
         }
 
     information = Information(*known, free > 0, -free, free)
-    return Adviser(seen, information, predict, determined)
+    return Adviser(prepared, information, predict, determined)
 
 
 def emittances(sigma: np.ndarray) -> np.ndarray:
@@ -272,14 +279,14 @@ def emittances(sigma: np.ndarray) -> np.ndarray:
     return np.sqrt(np.maximum(sigma[:, 0] * sigma[:, 2] - sigma[:, 1] ** 2, 0.0))
 
 
-def relative_error(seen: PreparedScan, plane: str) -> float:
+def relative_error(prepared: PreparedScan, plane: str) -> float:
     """Relative error expected of a further size of a plane: the scan's median."""
-    p = seen.solutions[plane].points
+    p = prepared.solutions[plane].points
     return max(float(np.median(p.error / p.size)), MIN_SIZE_ERROR)
 
 
 def elements_at(
-    seen: PreparedScan,
+    prepared: PreparedScan,
     line: Beamline,
     table: Mapping[str, np.ndarray],
     screen: str,
@@ -287,50 +294,54 @@ def elements_at(
 ) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """R11, R12 and known size² of both planes at given settings, measured or not."""
     settings = {n: jnp.asarray(v) for n, v in table.items()}
-    rows = seen.rows_at(line, "x", screen, settings, energy)
-    return [rows.known(r) for r in np.asarray(rows.both(line, jnp.asarray(energy)))]
+    rows = prepared.rows_at(line, "x", screen, settings, energy)
+    return [
+        rows.screen_elements(r) for r in np.asarray(rows.both_planes(line, jnp.asarray(energy)))
+    ]
 
 
 def simulate_further(
-    seen: PreparedScan, plane: str, r11: np.ndarray, r12: np.ndarray, known: np.ndarray
+    prepared: PreparedScan, plane: str, r11: np.ndarray, r12: np.ndarray, known: np.ndarray
 ) -> bool:
     """Test whether simulated further sizes would determine the emittance of a plane.
 
     They are the sizes of the mean beam, changed by one error up and down in turn.
     """
-    solution = seen.solutions[plane]
+    solution = prepared.solutions[plane]
     old, post, n = solution.sizes, solution.posterior, len(r11)
     size = np.sqrt(size_squared(post.weight @ post.sigma, r11, r12, known))
-    off = relative_error(seen, plane) * size
+    off = relative_error(prepared, plane) * size
     size = size + off * (-1.0) ** np.arange(n)
     rows = [np.append(v, w) for v, w in zip(old[:4], (r11, r12, known, size), strict=True)]
     error = None if old.error is None else np.append(old.error, off)
     sizes = PlaneSizes(*rows, error, old.of_shots, old.moved)
-    [found] = compare([sizes], seen.noise)
+    [found] = compare([sizes], prepared.noise)
     drawn, none = emittances(found.sigma), found.zero_emittance_probability
     low, high = emittance_quantiles(drawn, found.weight, none, (QUANTILES[0], QUANTILES[-1]))
     return PlaneEvidence(found, sizes, low, high).determined
 
 
-def next_measurement(seen: PreparedScan, plane: str) -> str | None:
+def next_measurement(prepared: PreparedScan, plane: str) -> str | None:
     """Sentence on the setting that reduces the error of a plane's emittance most, if any."""
-    varied, screen = varied_magnets(seen.scan), seen.rows.places[-1]
-    if not varied or not seen.solutions[plane].posterior.separable:
+    varied, screen = varied_magnets(prepared.scan), prepared.rows.places[-1]
+    if not varied or not prepared.solutions[plane].posterior.separable:
         return None
-    adviser, i = draws_adviser(seen), seen.planes.index(plane)
+    adviser, i = draws_adviser(prepared), prepared.planes.index(plane)
     candidates, rows = adviser.candidates(None, (screen,))
     information = adviser.information
     plane_information = information._replace(
         value=information.value[[i]], slope=information.slope[[i]]
     )
     best = candidates[next(greedy(plane_information, rows)).index].settings
-    median = {name: np.median(v) for name, v in seen.scan.settings.items()}
+    median = {name: np.median(v) for name, v in prepared.scan.settings.items()}
     magnet = next((name for name in varied if best[name] != median[name]), varied[0])
-    measured = seen.scan.settings[magnet]
+    measured = prepared.scan.settings[magnet]
     inside = measured.min() <= best[magnet] <= measured.max()
-    others = settings_in_words(seen, {name: v for name, v in median.items() if name != magnet}, 3)
+    others = settings_in_words(
+        prepared, {name: v for name, v in median.items() if name != magnet}, 3
+    )
     return (
-        f"Measure next near {settings_in_words(seen, {magnet: best[magnet]}, 3)}, "
+        f"Measure next near {settings_in_words(prepared, {magnet: best[magnet]}, 3)}, "
         f"{'inside' if inside else 'beyond'} the scanned range"
         f"{f', with {others} at {screen}' if others else ''}: this single point reduces the error "
         "most."
@@ -343,13 +354,13 @@ def linear_adviser(fit: Scanned) -> Adviser:
     Where the data do not determine the parameters, their fitted values are arbitrary. The
     derivatives are then taken at the start: the given line and the closed-form beam.
     """
-    seen, solved, p = fit.seen, fit.solved, fit.solved.problem
+    prepared, solved, p = fit.seen, fit.solved, fit.solved.problem
     theta, fixed = solved.theta, p.lower == p.upper
     if all(plane.identifiability.determined for plane in fit.planes):
         edge = np.array([v.state in ("lower", "upper") for v in solved.variables])
         fixed = fixed | (edge & p.nuisance)
     else:
-        start_problem = fit.statement.state(seen, fit.told)
+        start_problem = fit.statement.state(prepared, fit.told)
         theta = np.clip(start_problem.start, start_problem.lower, start_problem.upper)
     information = Information(
         assess.slopes(p, theta).residual_jacobian,
@@ -364,20 +375,22 @@ def linear_adviser(fit: Scanned) -> Adviser:
 
     def predict(line, table, screen, energy) -> FurtherSizes:
         sizes, rows = [], []
-        for plane in seen.planes:
+        for plane in prepared.planes:
             data = rows_at_settings(fit, line, plane, table, screen, energy)
             size, slope = value_and_slope(p, predict_sizes, theta, data)
-            rows.append(slope / (relative_error(seen, plane) * size)[:, None])
+            rows.append(slope / (relative_error(prepared, plane) * size)[:, None])
             sizes.append(1e-6 * size)
         return FurtherSizes(np.array(sizes), np.array(rows))
 
-    return Adviser(seen, information, predict, lambda known, _: determined_planes(seen, known))
+    return Adviser(
+        prepared, information, predict, lambda known, _: determined_planes(prepared, known)
+    )
 
 
-def determined_planes(seen: PreparedScan, known: Information) -> dict[str, bool]:
+def determined_planes(prepared: PreparedScan, known: Information) -> dict[str, bool]:
     """State for each plane whether data and priors give its emittance to a useful precision."""
     determined = (known.relative_error <= USEFUL_ERROR) & (known.share < MOST_SHARE)
-    return dict(zip(seen.planes, map(bool, determined), strict=True))
+    return dict(zip(prepared.planes, map(bool, determined), strict=True))
 
 
 def _emittances(model, data):
@@ -399,10 +412,10 @@ def _line_rows(fit: Scanned, line, plane, table, screen, energy) -> Rows:
 
 def _network_rows(fit: Scanned, line, plane, table, screen, energy) -> NetworkRows:
     """Rows of a further size through a transport network."""
-    measured, seen, count = size_records(fit.solved.problem)[plane].data, fit.seen, len(energy)
-    place = seen.rows.places.index(screen)
-    which = next(i for i in seen.measured(plane) if seen.rows.which[i] == place)
-    inputs = [table.get(n, np.full(count, seen.energy)) for n in fit.solved.model["map"].inputs]
+    measured, prepared, count = size_records(fit.solved.problem)[plane].data, fit.seen, len(energy)
+    place = prepared.rows.places.index(screen)
+    which = next(i for i in prepared.measured(plane) if prepared.rows.which[i] == place)
+    inputs = [table.get(n, np.full(count, prepared.energy)) for n in fit.solved.model["map"].inputs]
     known = jnp.full(count, float(np.median(np.asarray(measured.known))))
     columns, damping = jnp.tile(measured.columns[which], (count, 1)), jnp.ones(count)
     return NetworkRows(plane, False, jnp.asarray(np.stack(inputs, -1)), columns, known, damping)

@@ -132,29 +132,29 @@ class PlaneNumbers(NamedTuple):
         return found
 
 
-def beam_answers(seen: PreparedScan) -> tuple[PlaneFit, ...]:
+def beam_answers(prepared: PreparedScan) -> tuple[PlaneFit, ...]:
     """Answer for each plane where only the beam is unknown; needs no compilation."""
     found = []
-    for plane in seen.planes:
-        post, p = seen.solutions[plane].posterior, seen.solutions[plane].points
-        places = place_optics({}, answer_places(seen, plane))
+    for plane in prepared.planes:
+        post, p = prepared.solutions[plane].posterior, prepared.solutions[plane].points
+        places = place_optics({}, answer_places(prepared, plane))
         covariance = (
             post.stated_covariance if np.isfinite(post.stated_covariance).all() else post.covariance
         )
         value, dof = quantities_of(post.best, *places), max(len(p.size) - 3, 0)
         b = BestFit(value, np.zeros(len(value)), covariance, _directions(p, post.best), dof)
-        found.append(plane_answer(seen, seen.line, plane, places, b))
+        found.append(plane_answer(prepared, prepared.line, plane, places, b))
     return tuple(found)
 
 
 def plane_answer(
-    seen: PreparedScan, line: Beamline, plane: str, places: Places, b: BestFit
+    prepared: PreparedScan, line: Beamline, plane: str, places: Places, b: BestFit
 ) -> PlaneFit:
     """Answer for one plane.
 
     Parameters
     ----------
-    seen : PreparedScan
+    prepared : PreparedScan
         The scan through its line, as fitted.
     line : Beamline
         The line as fitted.
@@ -170,13 +170,13 @@ def plane_answer(
     PlaneFit
         Errors, half of the central 68 % of the posterior, only for what the data determine.
     """
-    solution = seen.solutions[plane]
+    solution = prepared.solutions[plane]
     post, p = solution.posterior, solution.points
     n, carrying = _numbers(post, p, places, b)
-    e = _evidence(seen, plane, n, b)
+    e = _evidence(prepared, plane, n, b)
     needs_advice = not b.scenario and e.of_a_beam and e.ending is None and not e.determined
-    advice = next_measurement(seen, plane) if needs_advice else None
-    finding = verdict(e, _remarks(seen, plane, e, b, carrying, n), advice or "")
+    advice = next_measurement(prepared, plane) if needs_advice else None
+    finding = verdict(e, _remarks(prepared, plane, e, b, carrying, n), advice or "")
     holds = e.of_a_beam and e.ending is None
     with_error = e.determined | (LINEAR_QUANTITIES & holds & (not b.scenario))
     emittance, normalized, beta, alpha, s11, s12, s22, *screen, mismatch = n.quantities(
@@ -184,7 +184,7 @@ def plane_answer(
     )
     scale = n.scale if e.determined else 1.0
     covariance = b.covariance if with_error[SIGMA].all() else np.full((3, 3), np.nan)
-    place = seen.rows.places[-1]
+    place = prepared.rows.places[-1]
     settings = {name: float(line[name].setting) for name in line.upto(place).magnets}
     return PlaneFit(
         plane=plane,
@@ -196,15 +196,15 @@ def plane_answer(
         alpha=alpha,
         sigma=(s11, s12, s22),
         screen=ScreenTwiss(place, settings, setting_units(line, settings), *screen),
-        mismatch=None if getattr(seen.line.design, plane, None) is None else mismatch,
+        mismatch=None if getattr(prepared.line.design, plane, None) is None else mismatch,
         chi2=post.chi2 if math.isfinite(post.chi2) else None,
         dof=round(b.dof),
         rms_residual=Quantity(float(np.sqrt(np.mean((p.size - p.model) ** 2))), None, "m"),
         covariance=covariance / scale**2 if b.scenario else covariance,
         error_scale=scale,
         noise=noise_words(post.noise, post.scale, post.relative, p),
-        method=seen.method,
-        weights=seen.weights,
+        method=prepared.method,
+        weights=prepared.weights,
         identifiability=_identifiability(p, n, e, advice, b.directions),
         points=p,
         holds=b.holds,
@@ -226,11 +226,11 @@ def _numbers(
 
 
 def _remarks(
-    seen: PreparedScan, plane: str, e: PlaneEvidence, b: BestFit, carrying: Influence,
+    prepared: PreparedScan, plane: str, e: PlaneEvidence, b: BestFit, carrying: Influence,
     n: PlaneNumbers,
 ) -> str:  # fmt: skip
     """Further sentences on noise and points."""
-    solution = seen.solutions[plane]
+    solution = prepared.solutions[plane]
     post, p, remarks = solution.posterior, solution.points, [solution.shot_words]
     if e.of_a_beam:
         chance = chi2_probability(post.chi2, max(len(p.size) - 3, 0))
@@ -240,7 +240,7 @@ def _remarks(
         without = carrying.without * n.value[1] / n.value[0]
         place = "" if e.open_cause else carrying.place
         if place:
-            place += _bad_in_other_plane(seen, plane, carrying.point)
+            place += _bad_in_other_plane(prepared, plane, carrying.point)
         remarks += point_remarks(p, place, float(without))
     remarks.append(resolution_remark(p.size, p.known))
     remarks += [b.remark] * e.determined
@@ -299,18 +299,18 @@ def _extend_to_carrying(
     return low, high, half
 
 
-def _bad_in_other_plane(seen: PreparedScan, plane: str, point: int) -> str:
+def _bad_in_other_plane(prepared: PreparedScan, plane: str, point: int) -> str:
     """Name another plane in which the same row is probably bad: both planes share its setting."""
-    row = seen.measured(plane)[point]
-    for other, solution in seen.solutions.items():
-        if np.any(solution.posterior.bad[seen.measured(other) == row] > 0.5):
+    row = prepared.measured(plane)[point]
+    for other, solution in prepared.solutions.items():
+        if np.any(solution.posterior.bad[prepared.measured(other) == row] > 0.5):
             return f", which is probably bad in {other}"
     return ""
 
 
-def _evidence(seen: PreparedScan, plane: str, n: PlaneNumbers, b: BestFit) -> PlaneEvidence:
+def _evidence(prepared: PreparedScan, plane: str, n: PlaneNumbers, b: BestFit) -> PlaneEvidence:
     """Evidence for the verdict, with too few effective draws or an impossible emittance noted."""
-    solution, low, high = seen.solutions[plane], float(n.low[1]), float(n.high[1])
+    solution, low, high = prepared.solutions[plane], float(n.low[1]), float(n.high[1])
     p, causes = solution.points, (b.ending, b.scenario, b.open_cause, b.remedy)
     waist = waist_bracketed(p.settings, p.screen, p.size, p.error)
     e = PlaneEvidence(solution.posterior, solution.sizes, low, high, waist, *causes)
@@ -327,7 +327,7 @@ def _evidence(seen: PreparedScan, plane: str, n: PlaneNumbers, b: BestFit) -> Pl
     )
     real_unit, header_unit = ("mm", "um") if too_small else ("um", "mm")
     remedy = (
-        f"Check the units of '{seen.scan.columns.get(f'size_{plane}', f'size_{plane}')}', the "
+        f"Check the units of '{prepared.scan.columns.get(f'size_{plane}', f'size_{plane}')}', the "
         f"settings and the energy: sizes a thousand times too {'small' if too_small else 'large'} "
         f"(such as {real_unit} under a header that says {header_unit}) make it a million times "
         f"{'less' if too_small else 'more'}."

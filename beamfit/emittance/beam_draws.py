@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import fdtri, gammaln, ndtri
 
-from beamfit.emittance.model import transported
+from beamfit.emittance.model import transport_sigma
 from beamfit.noise.model import LN_2PI, Noise
 from beamfit.noise.sizes import (
     NoiseKind,
@@ -94,7 +94,7 @@ class Coordinates(NamedTuple):
         """Convert T, T p_1, T p_2, shape (..., d, 3), to σ11, σ12, σ22 in SI."""
         s = 0.5 * np.stack([x[..., 0] + x[..., 1], x[..., 2], x[..., 0] - x[..., 1]])
         back = np.moveaxis(self.back, (-2, -1), (0, 1))[..., None]
-        return np.stack(transported(back, s), -1) * self.unit[..., None, None] ** 2
+        return np.stack(transport_sigma(back, s), -1) * self.unit[..., None, None] ** 2
 
 
 def coordinates(

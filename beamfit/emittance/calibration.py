@@ -166,10 +166,10 @@ def with_numbers(line: Beamline, numbers: Mapping[str, float]) -> Beamline:
     return line
 
 
-def _free_numbers(seen: PreparedScan, told: Assumptions) -> dict[str, Number]:
+def _free_numbers(prepared: PreparedScan, assumptions: Assumptions) -> dict[str, Number]:
     """Slope and offset of the scanned magnets, and all parameters with priors or bounds."""
-    all_numbers, varied = numbers_of_magnets(seen.scanned), varied_magnets(seen.scan)
-    given = [*told.calibrations, *told.bounds]
+    all_numbers, varied = numbers_of_magnets(prepared.scanned), varied_magnets(prepared.scan)
+    given = [*assumptions.calibrations, *assumptions.bounds]
     for name in given:
         if name not in all_numbers:
             raise InputError(f"a prior or bounds on '{name}'", nearest(name, list(all_numbers)))
@@ -180,35 +180,35 @@ def _free_numbers(seen: PreparedScan, told: Assumptions) -> dict[str, Number]:
     }
 
 
-def _state(seen: PreparedScan, told: Assumptions) -> Problem:
+def _state(prepared: PreparedScan, assumptions: Assumptions) -> Problem:
     """Problem with free beams and calibrations, for all planes together."""
-    numbers = _free_numbers(seen, told)
-    magnets = {n.magnet: seen.scanned[n.magnet].calibration for n in numbers.values()}
+    numbers = _free_numbers(prepared, assumptions)
+    magnets = {n.magnet: prepared.scanned[n.magnet].calibration for n in numbers.values()}
     free, priors = [], []
     for name, number in numbers.items():
         low, high = number.value - number.reach, number.value + number.reach
-        if name in told.priors:
-            mean, sd = told.priors[name]
+        if name in assumptions.priors:
+            mean, sd = assumptions.priors[name]
             low, high = min(low, mean - 6 * sd), max(high, mean + 6 * sd)
             priors.append(Prior(f"magnets.{name}", mean, sd))
-        free.append(Free(f"magnets.{name}", *told.bounds.get(name, (low, high))))
-    seen = seen.with_variable(magnets)
-    return beam_problem(seen, model={"magnets": magnets}, free=free, priors=priors)
+        free.append(Free(f"magnets.{name}", *assumptions.bounds.get(name, (low, high))))
+    prepared = prepared.with_variable(magnets)
+    return beam_problem(prepared, model={"magnets": magnets}, free=free, priors=priors)
 
 
-def _parameters(seen: PreparedScan, told: Assumptions, fit: Fit) -> Iterator[Parameter]:
+def _parameters(prepared: PreparedScan, assumptions: Assumptions, fit: Fit) -> Iterator[Parameter]:
     """Fitted calibration parameters."""
     settled = fit.status is not Status.not_converged
-    for name, number in _free_numbers(seen, told).items():
-        v, prior = fit[f"magnets.{name}"], told.priors.get(name)
+    for name, number in _free_numbers(prepared, assumptions).items():
+        v, prior = fit[f"magnets.{name}"], assumptions.priors.get(name)
         yield Parameter.of(name, v, number.unit, prior, settled)
 
 
 def _null_directions(
-    seen: PreparedScan, parameters: tuple[Parameter, ...], identified: bool
+    prepared: PreparedScan, parameters: tuple[Parameter, ...], identified: bool
 ) -> tuple[str, ...]:
     """Sentences on calibration parameters that the sizes do not determine."""
-    known, sentences = numbers_of_magnets(seen.scanned), []
+    known, sentences = numbers_of_magnets(prepared.scanned), []
     for parameter in parameters:
         if parameter.status is Status.converged:
             continue
@@ -227,11 +227,11 @@ def _null_directions(
     return tuple(sentences)
 
 
-def _remedy(seen: PreparedScan, told: Assumptions) -> str:
+def _remedy(prepared: PreparedScan, assumptions: Assumptions) -> str:
     """Measurements or priors that would determine the emittance, in words."""
-    known = numbers_of_magnets(seen.scanned, varied_magnets(seen.scan))
+    known = numbers_of_magnets(prepared.scanned, varied_magnets(prepared.scan))
     slopes = [name for name, number in known.items() if number.kind is NumberKind.slope]
-    without_prior = [name for name in slopes if name not in told.priors]
+    without_prior = [name for name in slopes if name not in assumptions.priors]
     second = "a second screen (see beamfit design)"
     if without_prior:
         return f"a prior on {without_prior[0]}, or {second}"

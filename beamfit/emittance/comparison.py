@@ -202,7 +202,7 @@ def departure_odds(
     n = c.size.shape[-1]
     if n < 5:
         return np.full(c.unit.shape, -np.inf)
-    model = _model(x, c)
+    model = _fitted_sizes(x, c)
     scales = prior_scales(kind, c.unit.shape)
     root = np.sqrt(variance_of(kind, scales.scale)) * model[..., None, :] ** kind.power
     rows = c.rows[..., None, :, :] / (2.0 * model)[..., None, :, None] / root[..., None]
@@ -454,7 +454,7 @@ def _model_evidences(s: _Stack, i: int, draws: BeamDraws, noise: Noise) -> np.nd
         # Noise that is a share of a zero-emittance beam's size would vanish with it. The share is
         # taken of the best beam's size instead. A share of the measured sizes would let large slow
         # noise explain sizes that are all alike.
-        size = _model(draws.best, s.c)
+        size = _fitted_sizes(draws.best, s.c)
         noise_kind = replace(kind, power=0, floor=kind.floor * size, unit=kind.unit * size)
         zero_emittance = zero_emittance_evidence(s.c, noise_kind, noise)
     jacobian = np.log(s.c.size).sum(-1)
@@ -493,7 +493,7 @@ def _best_fit(
     x = np.array([d.best for d in draws])[first, np.arange(len(first))]
     converged = np.zeros(len(x), bool)
     for _ in range(MAX_ITERATIONS):
-        model = _model(x, c)
+        model = _fitted_sizes(x, c)
         kinds = zip(s.kinds, draws, strict=True)
         parts = [_expected_precision(model, c, kind, d, noise) for kind, d in kinds]
         precision = sum(w[:, None] * p for w, (p, _) in zip(of_kind, parts, strict=True))
@@ -514,10 +514,10 @@ def _best_fit(
         if converged.all():
             break
     bad = sum(w[:, None] * b for w, (_, b) in zip(of_kind, parts, strict=True))
-    return _BestFit(x, _model(x, c), precision, bad)
+    return _BestFit(x, _fitted_sizes(x, c), precision, bad)
 
 
-def _model(x: np.ndarray, c: Coordinates) -> np.ndarray:
+def _fitted_sizes(x: np.ndarray, c: Coordinates) -> np.ndarray:
     squared = (c.rows @ x[..., None])[..., 0] + c.known
     # No upper limit: a wrong setting may make the model a hundred times larger than any size.
     smallest = c.size.min(-1, keepdims=True)

@@ -62,10 +62,10 @@ def _screens(fit: EmittanceFit) -> tuple[str, ...]:
     return tuple(dict.fromkeys((*measured, *later)))
 
 
-def _magnet_positions(seen: PreparedScan) -> tuple[list[str], list[int]]:
+def _magnet_positions(prepared: PreparedScan) -> tuple[list[str], list[int]]:
     """Names of the elements along the line, and the indices of the scanned magnets."""
-    names = [e.name for e in seen.scanned.elements]
-    magnets = [m for name in varied_magnets(seen.scan) for m in seen.scanned.members(name)]
+    names = [e.name for e in prepared.scanned.elements]
+    magnets = [m for name in varied_magnets(prepared.scan) for m in prepared.scanned.members(name)]
     return names, [names.index(m) for m in magnets] or [-1]
 
 
@@ -98,24 +98,28 @@ def further_options(
         result = adviser.errors(after), determined_planes(fit.seen, after)
         return Prospect(words, *result, float(after.share.max()))
 
-    seen, information = fit.seen, adviser.information
-    table = {n: np.asarray(v) for n, v in seen.scan.settings.items()}
-    count = len(seen.scan)
-    energy = np.full(count, seen.energy) if seen.scan.energy is None else seen.scan.energy
+    prepared, information = fit.seen, adviser.information
+    table = {n: np.asarray(v) for n, v in prepared.scan.settings.items()}
+    count = len(prepared.scan)
+    energy = (
+        np.full(count, prepared.energy) if prepared.scan.energy is None else prepared.scan.energy
+    )
     if fit.statement.whole_map:
         for line, screen, words in _other_screens(fit):
             rows = adviser.predict(line, table, screen, energy).rows
-            best = min(range(count), key=lambda i: _worst(information.with_rows(rows[:, i])))
-            at = settings_in_words(seen, {n: float(v[best]) for n, v in table.items()})
+            best = min(
+                range(count), key=lambda i: _largest_error(information.with_rows(rows[:, i]))
+            )
+            at = settings_in_words(prepared, {n: float(v[best]) for n, v in table.items()})
             yield prospect(f"one size on {words} ({at})", rows[:, best])
             yield prospect(f"the same scan on {words}", rows)
-        screen = (seen.scan.screen or seen.rows.places)[-1]
-        for other in energies or tuple(seen.energy * f for f in USUAL_ENERGIES):
-            rows = adviser.predict(seen.scanned, table, screen, np.full(count, other)).rows
+        screen = (prepared.scan.screen or prepared.rows.places)[-1]
+        for other in energies or tuple(prepared.energy * f for f in USUAL_ENERGIES):
+            rows = adviser.predict(prepared.scanned, table, screen, np.full(count, other)).rows
             yield prospect(f"the same scan at {other:.4g} MeV", rows)
     slopes = {
         name: abs(number.value)
-        for name, number in numbers_of_magnets(seen.scanned).items()
+        for name, number in numbers_of_magnets(prepared.scanned).items()
         if number.kind is NumberKind.slope
     }
     for i, path in enumerate(fit.solved.problem.names if fit.solved else ()):
@@ -125,7 +129,7 @@ def further_options(
             yield prospect(f"a prior of 2 % on {name}", row)
 
 
-def _worst(after: Information) -> float:
+def _largest_error(after: Information) -> float:
     """Largest relative error, increased where bounds rather than data decide."""
     return float(after.relative_error.max() / max(1.0 - after.share.max(), 1e-6))
 

@@ -145,28 +145,30 @@ def fit_emittance(
         if value not in choices:
             raise InputError(f"{name} '{value}'", " or ".join(choices))
     network_options = (gains or {}, anchor or Anchor(), hysteresis)
-    told = Assumptions(priors or {}, bounds or {}, *network_options, hidden, starts, seed)
-    told.check_scenario(scenario)
+    assumptions = Assumptions(priors or {}, bounds or {}, *network_options, hidden, starts, seed)
+    assumptions.check_scenario(scenario)
     noise = replace(noise or Noise(), bad=ROBUST) if robust else noise
     scan, line = single_beam(scan, line, scenario)
     statement = scenario_of(scenario)
-    if told.systematics:
+    if assumptions.systematics:
         from beamfit.emittance.systematics import with_systematics
 
         statement = with_systematics(statement)
-    seen = prepare(scan, line, planes, method, noise, weights)
+    prepared = prepare(scan, line, planes, method, noise, weights)
     if statement.closed:
-        return EmittanceFit(beam_answers(seen), scan, line, statement, told, seen)
+        return EmittanceFit(beam_answers(prepared), scan, line, statement, assumptions, prepared)
 
     from beamfit.emittance.scenario_fit import iterated_fit, scenario_answers  # loads the solvers
 
-    fit, seen = iterated_fit(seen, statement, told)
-    parameters = tuple(statement.parameters(seen, told, fit))
-    found = line_with(fit.model, seen.scanned)
-    unanswered = EmittanceFit((), scan, found, statement, told, seen, parameters, (), fit)
+    fit, prepared = iterated_fit(prepared, statement, assumptions)
+    parameters = tuple(statement.parameters(prepared, assumptions, fit))
+    found = line_with(fit.model, prepared.scanned)
+    unanswered = EmittanceFit(
+        (), scan, found, statement, assumptions, prepared, parameters, (), fit
+    )
     answers = scenario_answers(unanswered)
     identified = all(p.identifiability.determined for p in answers)
-    open_directions = statement.null_directions(seen, parameters, identified)
+    open_directions = statement.null_directions(prepared, parameters, identified)
     return replace(unanswered, planes=answers, null_directions=open_directions)
 
 
@@ -454,10 +456,10 @@ def fit_many(
     >>> round(other.x.emittance.value / one.x.emittance.value, 9)
     4.0
     """
-    closed_form, told = scenario_of("known"), Assumptions()
+    closed_form, assumptions = scenario_of("known"), Assumptions()
     return [
         one if isinstance(one, InputError)
-        else EmittanceFit(beam_answers(one), one.scan, one.line, closed_form, told, one)
+        else EmittanceFit(beam_answers(one), one.scan, one.line, closed_form, assumptions, one)
         for one in _prepare_many(scans, weights, noise)
     ]  # fmt: skip
 
@@ -492,8 +494,8 @@ def noise_samples(scans: Iterable[tuple[QuadScan, Beamline]], noise: Noise) -> I
     from beamfit.noise.learn import Sample  # loads the minimiser
 
     prepared = _prepare_many(scans, WEIGHTS[0], noise)
-    for seen in (one for one in prepared if isinstance(one, PreparedScan)):
-        for solution in seen.solutions.values():
+    for one in (p for p in prepared if isinstance(p, PreparedScan)):
+        for solution in one.solutions.values():
             post = solution.posterior
             if len(solution.sizes.size) > 3 and post.probability[BEAM] > SURE:
                 error_kind = solution.sizes.comparison_key[1]

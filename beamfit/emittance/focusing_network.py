@@ -19,7 +19,7 @@ from jax.typing import ArrayLike
 from beamfit.emittance.assumptions import Assumptions
 from beamfit.emittance.results import Parameter
 from beamfit.emittance.statement import PreparedScan, Scenario, varied_magnets
-from beamfit.emittance.transport import padded
+from beamfit.emittance.transport import pad_rows
 from beamfit.emittance.transport_network import MAX_WEIGHT, known_record, network_problem
 from beamfit.errors import InputError, Status
 from beamfit.greybox import tree
@@ -90,9 +90,9 @@ def branch_of(settings: np.ndarray) -> np.ndarray:
     return np.where(branches == 0.0, first, branches)
 
 
-def _lattice_strength(seen: PreparedScan, magnet: str, current: np.ndarray) -> np.ndarray:
+def _lattice_strength(prepared: PreparedScan, magnet: str, current: np.ndarray) -> np.ndarray:
     """k1 · E in MeV/m² of the lattice, at settings of a magnet."""
-    element, energy = seen.scanned[magnet], float(seen.scanned.energy)
+    element, energy = prepared.scanned[magnet], float(prepared.scanned.energy)
     return np.asarray(_strengths(element.calibration, current, element.length, energy)) * energy
 
 
@@ -135,35 +135,35 @@ def _without_common_error(model: Any, currents: _Currents) -> Array:
     return _scaled_k1(model, currents) / (1.0 + model["anchor"][currents.magnet])
 
 
-def _state(seen: PreparedScan, told: Assumptions) -> Problem:
+def _state(prepared: PreparedScan, assumptions: Assumptions) -> Problem:
     """Problem of the beams and one network of k1 for each scanned magnet."""
-    varied = varied_magnets(seen.scan)
-    if shared := [name for name in varied if len(seen.scanned.members(name)) > 1]:
+    varied = varied_magnets(prepared.scan)
+    if shared := [name for name in varied if len(prepared.scanned.members(name)) > 1]:
         found = f"a network of k1 for '{shared[0]}', which feeds several magnets"
         raise InputError(found, "a scan of magnets on supplies of their own")
-    branches = _branches(seen, varied) if told.hysteresis else {}
+    branches = _branches(prepared, varied) if assumptions.hysteresis else {}
     strengths, weights, records = {}, [], []
     for name in varied:
-        if not seen.scanned[name].length:
+        if not prepared.scanned[name].length:
             raise InputError(f"a network of k1 for '{name}', which has no length", "a quadrupole")
-        strengths[name], free = _strength(seen, name, told, name in branches)
+        strengths[name], free = _strength(prepared, name, assumptions, name in branches)
         weights += free
-        records += _anchors(seen, name, told, name in branches)
-    settings = seen.rows.settings | {
-        name: np.stack([seen.rows.settings[name], padded(branch)], -1)
+        records += _anchors(prepared, name, assumptions, name in branches)
+    settings = prepared.rows.settings | {
+        name: np.stack([prepared.rows.settings[name], pad_rows(branch)], -1)
         for name, branch in branches.items()
     }
-    rows = {plane: seen.of_plane(plane, settings) for plane in seen.planes}
+    rows = {plane: prepared.of_plane(plane, settings) for plane in prepared.planes}
     model = {"magnets": strengths}
-    return network_problem(seen, told, varied, varied, rows, model, weights, records)
+    return network_problem(prepared, assumptions, varied, varied, rows, model, weights, records)
 
 
-def _branches(seen: PreparedScan, varied: tuple[str, ...]) -> dict[str, np.ndarray]:
+def _branches(prepared: PreparedScan, varied: tuple[str, ...]) -> dict[str, np.ndarray]:
     """Branch of every row; raises an error if settings only rise or only fall."""
-    branches = {name: branch_of(seen.scan.settings[name]) for name in varied}
+    branches = {name: branch_of(prepared.scan.settings[name]) for name in varied}
     single = [name for name, branch in branches.items() if np.ptp(branch) == 0]
     if single:
-        raise seen.scan.unusable(
+        raise prepared.scan.unusable(
             f"settings of '{single[0]}' that only rise or only fall, with hysteresis",
             "rows in the order of measuring, with rising and falling settings",
             single[0],
@@ -172,12 +172,12 @@ def _branches(seen: PreparedScan, varied: tuple[str, ...]) -> dict[str, np.ndarr
 
 
 def _strength(
-    seen: PreparedScan, name: str, told: Assumptions, branches: bool
+    prepared: PreparedScan, name: str, assumptions: Assumptions, branches: bool
 ) -> tuple[NetworkStrength, list[Free]]:
     """Network that starts as the straight line between the lattice's k1 at both ends."""
-    settings = seen.scan.settings[name]
+    settings = prepared.scan.settings[name]
     low, high = float(settings.min()), float(settings.max())
-    ends = _lattice_strength(seen, name, np.array([low, high]))
+    ends = _lattice_strength(prepared, name, np.array([low, high]))
     ports = [Port("I", "", 0, (high - low) / 2, (high + low) / 2)]
     rising = [np.sign(ends[1] - ends[0]) or 1.0]
     if branches:
@@ -187,44 +187,50 @@ def _strength(
     half_range = abs(float(ends[1] - ends[0])) / 2 or 1.0
     output = Port(f"{name}.k1E", "", 0, half_range, float(ends.mean()))
     path, rises = f"magnets.{name}.network", np.array([rising])
-    net, free = signed_network(path, ports, [output], rises, told.hidden, told.seed, MAX_WEIGHT)
-    return NetworkStrength(net, seen.scanned[name].calibration.unit), free
+    net, free = signed_network(
+        path, ports, [output], rises, assumptions.hidden, assumptions.seed, MAX_WEIGHT
+    )
+    return NetworkStrength(net, prepared.scanned[name].calibration.unit), free
 
 
-def _anchors(seen: PreparedScan, name: str, told: Assumptions, branches: bool) -> Iterator[Record]:
+def _anchors(
+    prepared: PreparedScan, name: str, assumptions: Assumptions, branches: bool
+) -> Iterator[Record]:
     """Records that tie k1 to the lattice, midway between the branches if there are two."""
-    settings, anchor = seen.scan.settings[name], told.anchor
-    largest = float(np.abs(_lattice_strength(seen, name, settings)).max())
+    settings, anchor = prepared.scan.settings[name], assumptions.anchor
+    largest = float(np.abs(_lattice_strength(prepared, name, settings)).max())
     places = np.array([place[name] for place in anchor.at if name in place], float)
-    element, energy = seen.scanned[name], float(seen.scanned.energy)
+    element, energy = prepared.scanned[name], float(prepared.scanned.energy)
     at_settings = np.unique(settings), anchor.deviation, _without_common_error
     for currents, sd, predict in (at_settings, (places, anchor.sd, _scaled_k1)):
         if sd is None or not len(currents):
             continue
         points = np.stack([currents, np.zeros(len(currents))], -1) if branches else currents
-        data = _Currents(name, padded(points), float(element.length), energy)
-        values = _lattice_strength(seen, name, currents)
+        data = _Currents(name, pad_rows(points), float(element.length), energy)
+        values = _lattice_strength(prepared, name, currents)
         yield known_record(f"anchor {name}", predict, data, values, sd * largest)
 
 
-def _parameters(seen: PreparedScan, told: Assumptions, fit: Fit) -> Iterator[Parameter]:
+def _parameters(prepared: PreparedScan, assumptions: Assumptions, fit: Fit) -> Iterator[Parameter]:
     """k1 at both ends and the middle of the scanned range, and the width of the loop."""
-    energy, settled = float(seen.scanned.energy), fit.status is not Status.not_converged
-    for name in varied_magnets(seen.scan):
-        low, high = (float(f(seen.scan.settings[name])) for f in (np.min, np.max))
+    energy, settled = float(prepared.scanned.energy), fit.status is not Status.not_converged
+    for name in varied_magnets(prepared.scan):
+        low, high = (float(f(prepared.scan.settings[name])) for f in (np.min, np.max))
         middle = 0.5 * (low + high)
         at = np.array([low, middle, high])
-        length = float(seen.scanned[name].length)
+        length = float(prepared.scanned[name].length)
         found = fit.derive(_k1, _Currents(name, at, length, energy))
         for i, current in enumerate(at):
-            yield _derived(f"{name}.k1 at {current:g}", found, i, settled)
-        if told.hysteresis:
+            yield _derived_parameter(f"{name}.k1 at {current:g}", found, i, settled)
+        if assumptions.hysteresis:
             branches = np.array([[middle, 1.0], [middle, -1.0]])
             found = fit.derive(_loop, _Currents(name, branches, length, energy))
-            yield _derived(f"{name}.k1 rising less falling at {middle:g}", found, 0, settled)
+            yield _derived_parameter(
+                f"{name}.k1 rising less falling at {middle:g}", found, 0, settled
+            )
 
 
-def _derived(name: str, found: Derived, i: int, settled: bool) -> Parameter:
+def _derived_parameter(name: str, found: Derived, i: int, settled: bool) -> Parameter:
     """Parameter from a derived value, with an error if the data determine it."""
     determined = settled and bool(np.isfinite(found.error[i]))
     errors = (float(found.error[i]), float(found.error_raw[i])) if determined else (None, None)
@@ -240,8 +246,10 @@ SCENARIO = Scenario(
     "focusing-network",
     _state,
     _parameters,
-    null_directions=lambda _seen, _parameters, identified: () if identified else (NULL_DIRECTION,),
-    remedy=lambda _seen, _told: (
+    null_directions=lambda _prepared, _parameters, identified: (
+        () if identified else (NULL_DIRECTION,)
+    ),
+    remedy=lambda _prepared, _assumptions: (
         "sizes at a second screen, or an anchor to the lattice's calibration "
         "(--anchor first-principles=2%)"
     ),

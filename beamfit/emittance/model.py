@@ -1,4 +1,4 @@
-"""Model of a scan: a beam matrix, transported to the screens, predicts every size.
+"""Model of a scan: a beam matrix, transport_sigma to the screens, predicts every size.
 
 The physics is report eq. 37 with the two terms that every screen adds,
 
@@ -183,8 +183,8 @@ def quantities_of(
     [6.0, 12.0, 0.6666666666666666]
     """
     emittance, beta, alpha = emittance_parts(sigma)
-    s11, s12, _ = transported(to_screen, sigma)
-    d11, d12, d22 = transported(to_design, sigma)
+    s11, s12, _ = transport_sigma(to_screen, sigma)
+    d11, d12, d22 = transport_sigma(to_design, sigma)
     gamma_d = (1.0 + design[1] ** 2) / design[0]
     # BMAG = Tr(σ σ_d⁻¹) ε_d/(2 ε), M. Sands, SLAC-AP-85 (1991).
     mismatch = 0.5 * (gamma_d * d11 + 2.0 * design[1] * d12 + design[0] * d22) / emittance
@@ -193,7 +193,7 @@ def quantities_of(
     return xp.stack([*start, s11 / emittance, -s12 / emittance, s11**0.5, mismatch])
 
 
-def transported(matrix: Any, sigma: Any) -> tuple[Any, Any, Any]:
+def transport_sigma(matrix: Any, sigma: Any) -> tuple[Any, Any, Any]:
     """Transport σ: R σ Rᵀ (report eq. 36), R of shape (2, 2, ...), σ of shape (3, ...)."""
     (a, b), (c, d) = matrix[0, :2], matrix[1, :2]
     s11, s12, s22 = sigma

@@ -109,14 +109,14 @@ def _log_volume(model: Mapping[str, Any], data: DensityData) -> Array:
 
 
 def _sizes_of(
-    problem: Problem, seen: PreparedScan, planes: Sequence[str]
+    problem: Problem, prepared: PreparedScan, planes: Sequence[str]
 ) -> tuple[PlaneLikelihood, ...]:
     """Data for the likelihood of each plane."""
     records, found = size_records(problem), []
     for plane in planes:
-        solution = seen.solutions[plane]
+        solution = prepared.solutions[plane]
         post = solution.posterior
-        at, size = seen.measured(plane), solution.sizes.size / post.unit
+        at, size = prepared.measured(plane), solution.sizes.size / post.unit
         likelihood_data = (
             records[plane].data,
             at,
@@ -126,7 +126,7 @@ def _sizes_of(
             post.kinds,
             post.scales,
         )
-        found.append(PlaneLikelihood(plane, seen.noise.of_points(len(size)), *likelihood_data))
+        found.append(PlaneLikelihood(plane, prepared.noise.of_points(len(size)), *likelihood_data))
     return tuple(found)
 
 

@@ -15,7 +15,7 @@ from beamfit.emittance.comparison import QUANTILES, PlanePosterior, weighted_qua
 from beamfit.emittance.model import coefficients, emittance_parts, predict_sizes, size_squared
 from beamfit.emittance.results import PlaneFit
 from beamfit.emittance.statement import Scanned
-from beamfit.emittance.transport import Rows, padded
+from beamfit.emittance.transport import Rows, pad_rows
 from beamfit.errors import InputError, nearest
 from beamfit.optics.beamline import reduced_line
 from beamfit.sampling.posterior import Correlations
@@ -100,11 +100,11 @@ def _rows(
     fit: Scanned, given: Mapping[str, np.ndarray], n: int, plane: str, screen: str | None
 ) -> Rows:
     """Rows of a scan at the given settings, padded."""
-    seen, line = fit.seen, fit.seen.scanned
-    if seen.scan.transfer or not fit.statement.whole_map or fit.told.hysteresis:
+    prepared, line = fit.seen, fit.seen.scanned
+    if prepared.scan.transfer or not fit.statement.whole_map or fit.told.hysteresis:
         found = "a fit that knows the transport at the measured rows alone"
         raise InputError(found, "a scan with a lattice, and a scenario that keeps its map")
-    place = screen or seen.rows.places[-1]
+    place = screen or prepared.rows.places[-1]
     for name in given:
         if name not in line.magnets:
             raise InputError(f"no magnet '{name}'", nearest(name, list(line.magnets)))
@@ -113,11 +113,11 @@ def _rows(
     model = {} if fit.statement.closed else fit.solved.model
     variable = dict.fromkeys((*given, *model.get("magnets", {})))
     table = {
-        name: padded(given.get(name, np.full(n, float(line[name].setting)))) for name in variable
+        name: pad_rows(given.get(name, np.full(n, float(line[name].setting)))) for name in variable
     }
-    energy = padded(np.full(n, seen.energy))
+    energy = pad_rows(np.full(n, prepared.energy))
     reduced = reduced_line(line, tuple(variable), energy, (place,))
-    return seen.rows_at(reduced, plane, place, table, energy)
+    return prepared.rows_at(reduced, plane, place, table, energy)
 
 
 def correlations_of(p: PlaneFit) -> Correlations:

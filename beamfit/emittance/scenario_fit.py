@@ -59,15 +59,15 @@ def _elements(model: Mapping[str, Any], rows: tuple[Any, ...]) -> Array:
 
 
 def iterated_fit(
-    seen: PreparedScan, scenario: Scenario, told: Assumptions
+    prepared: PreparedScan, scenario: Scenario, assumptions: Assumptions
 ) -> tuple[Fit, PreparedScan]:
     """Solve, and refit with errors taken at the fitted sizes until these no longer change.
 
     The fit with known transport takes its weights, its noise and its bad readings from the given
     line, which may be wrong. The returned scan has the posterior through the fitted line.
     """
-    fit = _solve(scenario.state(_with_stated_errors(seen), told), scenario, told)
-    found = _with_fitted_line(seen, fit)
+    fit = _solve(scenario.state(_with_stated_errors(prepared), assumptions), scenario, assumptions)
+    found = _with_fitted_line(prepared, fit)
     for _ in range(MAX_ITERATIONS):
         old = size_records(fit.problem)
         new = {r.name: size_record(found, plane, r.data) for plane, r in old.items()}
@@ -78,45 +78,45 @@ def iterated_fit(
         # The attempts of the first search stay on record with the few steps of the refit.
         message = fit.message if refit.status is fit.status else refit.message
         fit = replace(refit, attempts=(*fit.attempts, *refit.attempts), message=message)
-        found = _with_fitted_line(seen, fit)
+        found = _with_fitted_line(prepared, fit)
     return fit, found
 
 
-def _with_stated_errors(seen: PreparedScan) -> PreparedScan:
+def _with_stated_errors(prepared: PreparedScan) -> PreparedScan:
     """The scan with its stated errors, where there are any.
 
     Misfits of the given line are for the scenario to explain: they are not noise.
     """
     solutions = {}
-    for plane, solution in seen.solutions.items():
+    for plane, solution in prepared.solutions.items():
         error = solution.points.error if solution.sizes.error is None else solution.sizes.error
         solutions[plane] = solution._replace(points=solution.points._replace(error=error))
-    return seen._replace(solutions=solutions)
+    return prepared._replace(solutions=solutions)
 
 
-def _solve(problem: Problem, scenario: Scenario, told: Assumptions) -> Fit:
+def _solve(problem: Problem, scenario: Scenario, assumptions: Assumptions) -> Fit:
     """Solve; from many starts for a network, or if one start ended in a poor fit.
 
     A zero-emittance beam is a stationary point of every fit in its Cholesky factor. A start near
     it, such as the known-transport fit with a wrong calibration, may never leave it.
     """
-    fit = solve(problem, told.starts if scenario.network else 1, told.seed)
+    fit = solve(problem, assumptions.starts if scenario.network else 1, assumptions.seed)
     at_zero_emittance = any(
         fit[f"beam.{plane}.l22"].state == "lower" for plane in problem.model["beam"]
     )
     poor = fit.status is not Status.converged and fit.chi2 > 2.0 * max(fit.dof, 1)
     if (at_zero_emittance or poor) and not scenario.network:
-        fit = solve(problem, told.starts, told.seed)
+        fit = solve(problem, assumptions.starts, assumptions.seed)
     return fit
 
 
-def _with_fitted_line(seen: PreparedScan, fit: Fit) -> PreparedScan:
+def _with_fitted_line(prepared: PreparedScan, fit: Fit) -> PreparedScan:
     """The scan with each plane fitted in closed form through the fitted line."""
     records = size_records(fit.problem)
-    fitted = np.asarray(_elements(fit.model, tuple(records[p].data for p in seen.planes)))
-    elements = seen.elements.copy()
-    elements[:, ["xy".index(plane) for plane in seen.planes]] = np.swapaxes(fitted, 0, 1)
-    return with_posteriors([seen._replace(elements=elements)])[0]
+    fitted = np.asarray(_elements(fit.model, tuple(records[p].data for p in prepared.planes)))
+    elements = prepared.elements.copy()
+    elements[:, ["xy".index(plane) for plane in prepared.planes]] = np.swapaxes(fitted, 0, 1)
+    return with_posteriors([prepared._replace(elements=elements)])[0]
 
 
 def scenario_answers(of: Scanned) -> tuple[PlaneFit, ...]:
@@ -124,17 +124,19 @@ def scenario_answers(of: Scanned) -> tuple[PlaneFit, ...]:
 
     The posterior is that of the beam through the fitted line, widened by the other unknowns.
     """
-    fit, seen = of.solved, of.seen
-    asked = problem_places(fit.problem, seen, seen.planes, of.statement.whole_map)
+    fit, prepared = of.solved, of.seen
+    asked = problem_places(fit.problem, prepared, prepared.planes, of.statement.whole_map)
     derived = fit.derive(_numbers, asked)
     beams = []
-    for i, plane in enumerate(seen.planes):
+    for i, plane in enumerate(prepared.planes):
         own = Derived(*(part[i] for part in derived))
-        solution = seen.solutions[plane]
+        solution = prepared.solutions[plane]
         p = solution.points
         squared = size_squared(own.value[SIGMA], p.r11, p.r12, p.known)
-        p = p.with_model(np.sqrt(np.maximum(squared, 0.0)), seen.rows.squared)
-        fitted = seen._replace(solutions=seen.solutions | {plane: solution._replace(points=p)})
+        p = p.with_model(np.sqrt(np.maximum(squared, 0.0)), prepared.rows.squared)
+        fitted = prepared._replace(
+            solutions=prepared.solutions | {plane: solution._replace(points=p)}
+        )
         places = map(np.asarray, place_optics(fit.model, asked[i]))
         beams.append(plane_answer(fitted, of.line, plane, tuple(places), _best_fit(of, plane, own)))
     return tuple(beams)
@@ -142,10 +144,15 @@ def scenario_answers(of: Scanned) -> tuple[PlaneFit, ...]:
 
 def _best_fit(of: Scanned, plane: str, own: Derived) -> BestFit:
     """Best fit of a plane, with the contribution of the scenario's other unknowns."""
-    fit, told, scenario, jacobian = of.solved, of.told, of.statement, _loose_jacobian(of.solved)
+    fit, assumptions, scenario, jacobian = (
+        of.solved,
+        of.told,
+        of.statement,
+        _loose_jacobian(of.solved),
+    )
     record = size_records(fit.problem)[plane].name
     decided = bool(np.isfinite(own.error[0])) and _limit_finding(fit) is None
-    effects = effect_words(fit, told, float(own.value[1]), np.nan_to_num(own.slope[1]))
+    effects = effect_words(fit, assumptions, float(own.value[1]), np.nan_to_num(own.slope[1]))
     edges = "".join(
         f"; {p.name} ends at its {p.state} bound {p.value.value:.6g} "
         f"(d(chi2/2)/d(bound) = {p.multiplier:.2g})"
@@ -160,12 +167,13 @@ def _best_fit(of: Scanned, plane: str, own: Derived) -> BestFit:
         covariance=slopes @ fit.covariance @ slopes.T,
         directions=_directions(fit, own.value[SIGMA], slopes, jacobian),
         dof=next((g.dof for g in fit.groups if g.name == record), 0.0),
-        ending=_failure(scenario, told, fit),
+        ending=_failure(scenario, assumptions, fit),
         open_cause="" if decided else open_cause,
-        remedy=scenario.remedy(of.seen, told),
+        remedy=scenario.remedy(of.seen, assumptions),
         remark=(_remark(scenario, of.parameters) + effects).strip(),
-        scenario=scenario.name + (f" with {told.anchor.words}" if told.anchor != Anchor() else ""),
-        holds="statistics, systematics" if told.systematics else "statistics only",
+        scenario=scenario.name
+        + (f" with {assumptions.anchor.words}" if assumptions.anchor != Anchor() else ""),
+        holds="statistics, systematics" if assumptions.systematics else "statistics only",
     )
 
 
@@ -197,12 +205,12 @@ def _remark(scenario: Scenario, parameters: tuple[Parameter, ...]) -> str:
     return text
 
 
-def _failure(scenario: Scenario, told: Assumptions, fit: Fit) -> Finding | None:
+def _failure(scenario: Scenario, assumptions: Assumptions, fit: Fit) -> Finding | None:
     """Finding on a search that found no optimum, or on an answer at a given limit."""
     if fit.status is Status.not_converged and scenario.network:
         text = (
-            f"The search from {told.starts} starts came to no rest (chi2 = {fit.chi2:.4g}); give "
-            "more starts, another seed, or fewer hidden nodes."
+            f"The search from {assumptions.starts} starts came to no rest (chi2 = {fit.chi2:.4g}); "
+            "give more starts, another seed, or fewer hidden nodes."
         )
         return Finding(fit.status, text)
     if fit.status not in FAILED:

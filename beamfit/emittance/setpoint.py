@@ -283,7 +283,7 @@ def find_setpoint(
     minima, fit = _search(_problem_of(data), seed)
     units = setting_units(line, vary)
     found_minima = [Minimum(_settings(data, theta), value) for theta, value in minima]
-    predicted = _predicted(data, target_beams, fit.theta)
+    predicted = _predicted_beams(data, target_beams, fit.theta)
     misses = _relative_misses(data, targets, fit.theta)
     magnets = zip(vary, fit.variables, strict=True)
     # Magnets at a limit beyond which the objective would be lower.
@@ -361,7 +361,7 @@ def _matrices_slope(names, primals, tangents):
     return _matrices(names, line, settings), slope @ tangents[1]
 
 
-def _at_place(data: _TargetData, theta: Array) -> Array:
+def _transported_factor(data: _TargetData, theta: Array) -> Array:
     """R L of both planes, shape (2, 2, 2), with σ = L Lᵀ; rows are size and divergence."""
     matrix = _matrices_reverse if len(data.names) > MANY_MAGNETS else _matrices
     r = matrix(data.names, data.line, data.middle + data.reach * theta)
@@ -378,7 +378,7 @@ def _misses(model: Any, data: _TargetData) -> Array:
     Misses of sizes (µm) and divergences (µrad) are vectors along their row of R L. Those of matches
     are two numbers, linear in R, whose squares add up to BMAG - 1. The order is that of KINDS.
     """
-    rows = _at_place(data, model["settings"])
+    rows = _transported_factor(data, model["settings"])
 
     def miss(kind, plane, value):
         vectors, (beta, alpha) = rows[plane], value
@@ -438,7 +438,7 @@ def _numbers(data: _TargetData, theta: Array) -> tuple[Array, Array]:
     """Size, divergence, β and α of each plane, shape (planes, 4), and their derivatives by σ."""
 
     def numbers_of(sigma):
-        v = _at_place(replace(data, sigma=sigma), theta)
+        v = _transported_factor(replace(data, sigma=sigma), theta)
         s = v @ jnp.swapaxes(v, -1, -2)
         s11, s12, s22, emittance = s[:, 0, 0], s[:, 0, 1], s[:, 1, 1], jnp.linalg.det(v)
         return jnp.stack([jnp.sqrt(s11), jnp.sqrt(s22), s11 / emittance, -s12 / emittance], -1)
@@ -466,7 +466,7 @@ def _covariance(beam: Beam) -> np.ndarray | None:
     return beam.covariance if known else None
 
 
-def _predicted(
+def _predicted_beams(
     data: _TargetData, beams: Mapping[str, Beam], theta: np.ndarray
 ) -> tuple[PlaneBeam, ...]:
     """Beam at the place of the targets, with its errors."""

@@ -106,7 +106,7 @@ def average_shots(scan: QuadScan, *, marked: bool) -> QuadScan:
         visit = np.cumsum([0, *(a != b for a, b in pairwise(keys))])
         keys = list(zip(visit, keys, strict=True))
     group = np.array([rows.setdefault(key, len(rows)) for key in keys])
-    shots = {plane: _by_setting(values, group) for plane, values in scan.size.items()}
+    shots = {plane: _shot_table(values, group) for plane, values in scan.size.items()}
     no_repeats = len(rows) == len(group)
     if no_repeats or not (marked or all(map(_one_relative_scatter, shots.values()))):
         return scan if scan.error else replace(scan, error_source="none given")
@@ -117,7 +117,7 @@ def average_shots(scan: QuadScan, *, marked: bool) -> QuadScan:
         if error is not None and (repeated or plane not in scan.error):
             scatter[plane] = error
         elif plane in scan.error:  # too few repeats: the file's errors are kept
-            square = _by_setting(scan.error[plane] ** 2, group)
+            square = _shot_table(scan.error[plane] ** 2, group)
             number = np.where(np.isnan(size[plane]), np.nan, np.sum(~np.isnan(square), axis=1))
             stated[plane] = np.sqrt(np.nansum(square, axis=1)) / number
     first = np.unique(group, return_index=True)[1]
@@ -137,7 +137,7 @@ def average_shots(scan: QuadScan, *, marked: bool) -> QuadScan:
     return replace(scan, **scan.columns_at(first) | means)
 
 
-def _by_setting(values: np.ndarray, group: np.ndarray) -> np.ndarray:
+def _shot_table(values: np.ndarray, group: np.ndarray) -> np.ndarray:
     """Table of the shots, one row per setting, padded with NaN."""
     order = np.argsort(group, kind="stable")
     counts = np.bincount(group)

@@ -51,7 +51,7 @@ class SigmaFit(NamedTuple):
     positive: Array
 
 
-def weighed_size(measured: Array, squared: Array) -> Array:
+def size_for_weights(measured: Array, squared: Array) -> Array:
     """Model size for the weights, within a factor `MAX_SIZE_RATIO` of the measured size.
 
     The limits keep one outlier, or a negative size², from taking all weight.
@@ -180,7 +180,7 @@ def _fit(
         return *_least_squares(design, target), design, target
 
     def iterate(_: int, at: Array) -> Array:
-        return weighed_size(size, rows @ solve_at(at)[0] + known)
+        return size_for_weights(size, rows @ solve_at(at)[0] + known)
 
     at = jax.lax.fori_loop(0, FIT_ITERATIONS if weights == "model" else 0, iterate, size)
     sigma, covariance, full_rank, design, target = solve_at(at)

@@ -143,7 +143,7 @@ def compare_size_methods(
             rows.append(
                 MethodRow(method, stored_value, recomputed, p.normalized_emittance, p.status)
             )
-        found.append(SizeMethods(plane, tuple(rows), _covering_all(rows)))
+        found.append(SizeMethods(plane, tuple(rows), _covering_answer(rows)))
     return tuple(found)
 
 
@@ -192,7 +192,7 @@ def measured_weights(scan: QuadScan, plane: str) -> Quantity:
     return Quantity(value, value * relative * math.sqrt(float(found.chi2) / dof), "m")
 
 
-def _covering_all(rows: list[MethodRow]) -> Quantity:
+def _covering_answer(rows: list[MethodRow]) -> Quantity:
     """Mean over the methods that find a beam, with their spread as a part of its error.
 
     The standard deviation of the methods is not divided by the square root of their number: they

@@ -151,7 +151,7 @@ def fit_slices(scan: QuadScan, line: Beamline | None = None, **options: Any) -> 
         raise scan.unusable("a scan without slices", "a column slice, or fit_emittance")
     chosen = options.pop("planes", None) or scan.planes
     for plane in chosen:
-        scan.rows(plane)  # says so if it was not measured
+        scan.rows(plane)  # raises an error if the plane was not measured
     fits = []
     for name in scan.slices:
         part = scan.of_slice(name)

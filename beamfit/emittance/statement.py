@@ -25,7 +25,7 @@ from beamfit.emittance.transport import (
     check_gradients,
     damping_of,
     lattice_names,
-    padded,
+    pad_rows,
     row_elements,
     rows_line,
     scan_rows,
@@ -159,13 +159,13 @@ class Scenario:
     name : str
         Name of the option.
     state : callable
-        ``state(seen, told)``: the problem, starting from the given line.
+        ``state(prepared, assumptions)``: the problem, starting from the given line.
     parameters : callable
-        ``parameters(seen, told, fit)``: fitted parameters besides the beam.
+        ``parameters(prepared, assumptions, fit)``: fitted parameters besides the beam.
     null_directions : callable
-        ``null_directions(seen, parameters, identified)``: undetermined directions, in words.
+        ``null_directions(prepared, parameters, identified)``: undetermined directions, in words.
     remedy : callable
-        ``remedy(seen, told)``: measurements that would determine the emittance, in words.
+        ``remedy(prepared, assumptions)``: measurements that are needed for the emittance, in words.
     consequence : str
         Consequence of an undetermined parameter for the emittance, in words.
     closed : bool
@@ -222,29 +222,29 @@ def varied_magnets(scan: QuadScan) -> tuple[str, ...]:
 
 
 def answer_places(
-    seen: PreparedScan, plane: str, whole_map: bool = True, line: Beamline | None = None
+    prepared: PreparedScan, plane: str, whole_map: bool = True, line: Beamline | None = None
 ) -> AnswerPlaces:
     """Places that a plane's answer refers to, through the rows' line if none is given."""
-    design = seen.scanned.design
+    design = prepared.scanned.design
     twiss = getattr(design, plane, None)
     return AnswerPlaces(
         plane,
-        seen.rows.places[-1] if whole_map else None,
+        prepared.rows.places[-1] if whole_map else None,
         design.at if twiss else None,
-        line or seen.rows.line,
-        np.asarray(seen.energy),
+        line or prepared.rows.line,
+        np.asarray(prepared.energy),
         np.array(twiss or (np.nan, np.nan), float),
     )
 
 
-def size_record(seen: PreparedScan, plane: str, rows: Any) -> Record:
+def size_record(prepared: PreparedScan, plane: str, rows: Any) -> Record:
     """Record of a plane's measured sizes, in µm² or µm, with the errors of the posterior.
 
     Rows without a size, and padding, have weight 0.
     """
-    points, at = seen.solutions[plane].points, seen.measured(plane)
+    points, at = prepared.solutions[plane].points, prepared.measured(plane)
     columns = 1e6 * np.stack([points.size, points.error, points.weighed])
-    weight = np.zeros(len(padded(seen.scan.size[plane])))
+    weight = np.zeros(len(pad_rows(prepared.scan.size[plane])))
     padded_columns = np.repeat(columns[:, :1], len(weight), axis=1)
     weight[at], padded_columns[:, at] = 1.0, columns
     size, error, weighed = padded_columns
@@ -259,19 +259,19 @@ def size_records(problem: Problem) -> dict[str, Record]:
 
 
 def problem_places(
-    problem: Problem, seen: PreparedScan, planes: Iterable[str], whole_map: bool
+    problem: Problem, prepared: PreparedScan, planes: Iterable[str], whole_map: bool
 ) -> tuple[AnswerPlaces, ...]:
     """Places that the planes' answers refer to, through the lines of a problem."""
     records = size_records(problem)
     lines = {plane: records[plane].data.line if whole_map else None for plane in planes}
-    return tuple(answer_places(seen, plane, whole_map, line) for plane, line in lines.items())
+    return tuple(answer_places(prepared, plane, whole_map, line) for plane, line in lines.items())
 
 
-def beam_numbers(seen: PreparedScan) -> dict[str, dict[str, float]]:
+def beam_numbers(prepared: PreparedScan) -> dict[str, dict[str, float]]:
     """Cholesky factors to start from: the closed-form fit, kept away from zero emittance."""
     return {
-        plane: cholesky_numbers(seen.solutions[plane].posterior.best, 0.0025)
-        for plane in seen.planes
+        plane: cholesky_numbers(prepared.solutions[plane].posterior.best, 0.0025)
+        for plane in prepared.planes
     }
 
 
@@ -300,7 +300,7 @@ def free_beams(beams: Mapping[str, Mapping[str, float]]) -> list[Free]:
 
 
 def beam_problem(
-    seen: PreparedScan,
+    prepared: PreparedScan,
     rows: Mapping[str, Any] | None = None,
     model: Mapping[str, Any] = MappingProxyType({}),
     free: Iterable[Free] = (),
@@ -309,8 +309,8 @@ def beam_problem(
     constraints: Iterable[Constraint] = (),
 ) -> Problem:
     """Problem of the beams and the measured sizes by plane, with the parts of a scenario."""
-    beams, rows = beam_numbers(seen), rows or {p: seen.of_plane(p) for p in seen.planes}
-    sizes = [size_record(seen, plane, plane_rows) for plane, plane_rows in rows.items()]
+    beams, rows = beam_numbers(prepared), rows or {p: prepared.of_plane(p) for p in prepared.planes}
+    sizes = [size_record(prepared, plane, plane_rows) for plane, plane_rows in rows.items()]
     free, records = [*free_beams(beams), *free], [*sizes, *records]
     return Problem({"beam": beams, **model}, free, records, [*priors], [*constraints])
 
@@ -377,7 +377,7 @@ def assemble(
     check_names(scan, *lattice_names(line))
     chosen = planes or scan.planes
     for plane in chosen:
-        scan.rows(plane)  # says so if it was not measured
+        scan.rows(plane)  # raises an error if the plane was not measured
     scanned = scanned_line(scan, line)
     check_gradients(scan, scanned)
     rows = scan_rows(scan, scanned, method == METHODS[0])
@@ -389,8 +389,8 @@ def assemble(
 def with_elements(assembled: Sequence[PreparedScan]) -> list[PreparedScan]:
     """Add the transfer-matrix elements of scans; one call for scans of the same structure."""
     found, alike = list(assembled), {}
-    for i, seen in enumerate(assembled):
-        leaves, structure = jax.tree.flatten(seen.rows)
+    for i, prepared in enumerate(assembled):
+        leaves, structure = jax.tree.flatten(prepared.rows)
         alike.setdefault((structure, *map(np.shape, leaves)), []).append((i, leaves))
     for (structure, *shapes), members in alike.items():
         lanes_in_memory = max(MAX_CALL_NUMBERS // max(map(np.prod, shapes)) ** 2, 1)
@@ -416,25 +416,27 @@ def with_posteriors(assembled: Sequence[PreparedScan]) -> list[PreparedScan]:
     """Add the closed-form fit of every plane; all scans have one noise prior and one method."""
     if not assembled:
         return []
-    by_scan = [{plane: plane_sizes(seen, plane) for plane in seen.planes} for seen in assembled]
+    by_scan = [
+        {plane: plane_sizes(prepared, plane) for plane in prepared.planes} for prepared in assembled
+    ]
     sizes = [each for planes in by_scan for each, _ in planes.values()]
     found = iter(compare(sizes, assembled[0].noise, assembled[0].method, assembled[0].weights))
     solved = []
-    for seen, planes in zip(assembled, by_scan, strict=True):
+    for prepared, planes in zip(assembled, by_scan, strict=True):
         solutions = {
-            plane: _plane_solution(seen, plane, each, next(found), shots)
+            plane: _plane_solution(prepared, plane, each, next(found), shots)
             for plane, (each, shots) in planes.items()
         }
-        solved.append(seen._replace(solutions=solutions))
+        solved.append(prepared._replace(solutions=solutions))
     return solved
 
 
-def plane_sizes(seen: PreparedScan, plane: str) -> tuple[PlaneSizes, ShotMeans | None]:
+def plane_sizes(prepared: PreparedScan, plane: str) -> tuple[PlaneSizes, ShotMeans | None]:
     """Sizes of a plane with their errors, and the means of its shots."""
-    scan, at, i = seen.scan, seen.measured(plane), "xy".index(plane)
-    r11, r12, known = seen.elements[:, i, at]
+    scan, at, i = prepared.scan, prepared.measured(plane), "xy".index(plane)
+    r11, r12, known = prepared.elements[:, i, at]
     size, error, shots = scan.size[plane][at], scan.error.get(plane), None
-    if plane in scan.shot_size and (shots := shot_means(scan.shot_size[plane][at], seen.noise)):
+    if plane in scan.shot_size and (shots := shot_means(scan.shot_size[plane][at], prepared.noise)):
         size, error = shots.size, shots.error
     elif error is not None:
         error = error[at]
@@ -444,20 +446,24 @@ def plane_sizes(seen: PreparedScan, plane: str) -> tuple[PlaneSizes, ShotMeans |
             error = np.sqrt(pooled_variance(square, freedom, size) / (freedom + 1.0))
     counted = scan.shots is not None and bool((np.asarray(scan.shots) > 1).any())
     of_shots = shots is not None or (error is not None and counted)
-    screens = {seen.rows.places[j] for j in seen.rows.which[at]}
+    screens = {prepared.rows.places[j] for j in prepared.rows.which[at]}
     moved = any(np.ptp(v[at]) > 0 for v in scan.settings.values()) or len(screens) < 3
     return PlaneSizes(r11, r12, known, size, error, of_shots, moved), shots
 
 
 def _plane_solution(
-    seen: PreparedScan, plane: str, sizes: PlaneSizes, post: PlanePosterior, shots: ShotMeans | None
+    prepared: PreparedScan,
+    plane: str,
+    sizes: PlaneSizes,
+    post: PlanePosterior,
+    shots: ShotMeans | None,
 ) -> PlaneSolution:
     """Combine a plane's sizes and posterior into its fitted points."""
-    scan, at, by_model = seen.scan, seen.measured(plane), seen.weights == WEIGHTS[0]
+    scan, at, by_model = prepared.scan, prepared.measured(plane), prepared.weights == WEIGHTS[0]
     points = Points(
         settings={name: v[at] for name, v in scan.settings.items()},
         units={name: SETTING_UNITS[scan.units[name]] for name in scan.settings},
-        screen=tuple(seen.rows.places[j] for j in seen.rows.which[at]),
+        screen=tuple(prepared.rows.places[j] for j in prepared.rows.which[at]),
         size=sizes.size,
         error=post.error,
         weighed=post.model if by_model else sizes.size,
@@ -469,7 +475,7 @@ def _plane_solution(
         r12=sizes.r12,
         known=sizes.known,
     )
-    points = points.with_model(post.model, seen.rows.squared)
+    points = points.with_model(post.model, prepared.rows.squared)
     return PlaneSolution(sizes, post, points, _shot_sentences(points, shots))
 
 
@@ -491,4 +497,4 @@ def _shot_sentences(p: Points, shots: ShotMeans | None) -> str:
 
 
 # Only the beam is free. The problem is for those who need more than the posterior.
-SCENARIO = Scenario("known", lambda seen, _told: beam_problem(seen), closed=True)
+SCENARIO = Scenario("known", lambda prepared, _assumptions: beam_problem(prepared), closed=True)

@@ -23,7 +23,7 @@ from beamfit.compile_cache import SELDOM
 from beamfit.emittance.assumptions import Assumptions
 from beamfit.emittance.model import coefficients, size_squared, user_name
 from beamfit.emittance.results import Parameter, PlaneFit, Points, in_words
-from beamfit.emittance.sigma import error_at, weighed_size
+from beamfit.emittance.sigma import error_at, size_for_weights
 from beamfit.emittance.statement import WEIGHTS, PreparedScan, Scanned, Scenario, varied_magnets
 from beamfit.emittance.transport import Rows
 from beamfit.errors import InputError, nearest
@@ -96,11 +96,13 @@ def with_systematics(scenario: Scenario) -> Scenario:
         incoming beam, ``NAME.gradient`` of magnets and ``NAME.length`` of drifts.
     """
 
-    def state(seen: PreparedScan, told: Assumptions) -> Problem:
-        terms = _terms(seen, told)
+    def state(prepared: PreparedScan, assumptions: Assumptions) -> Problem:
+        terms = _terms(prepared, assumptions)
         magnets = [t.name.rpartition(".")[0] for t in terms if "." in t.name]
-        seen = seen.with_variable(magnets, variable_energy="energy" in told.systematics)
-        problem = scenario.state(seen, told)
+        prepared = prepared.with_variable(
+            magnets, variable_energy="energy" in assumptions.systematics
+        )
+        problem = scenario.state(prepared, assumptions)
         return replace(
             problem,
             model=problem.model | {"systematics": _numbers(terms)},
@@ -108,9 +110,11 @@ def with_systematics(scenario: Scenario) -> Scenario:
             priors=[*problem.priors, *(Prior(t.path, t.mean, t.sd) for t in terms)],
         )
 
-    def parameters(seen: PreparedScan, told: Assumptions, fit: Fit) -> Iterator[Parameter]:
-        yield from scenario.parameters(seen, told, fit)
-        for term in _terms(seen, told):
+    def parameters(
+        prepared: PreparedScan, assumptions: Assumptions, fit: Fit
+    ) -> Iterator[Parameter]:
+        yield from scenario.parameters(prepared, assumptions, fit)
+        for term in _terms(prepared, assumptions):
             prior = term.mean, term.sd
             yield Parameter.of(term.name, fit[term.path], term.unit, prior)
 
@@ -127,16 +131,16 @@ def _numbers(terms: list[Term]) -> dict[str, Any]:
     return model
 
 
-def _terms(seen: PreparedScan, told: Assumptions) -> list[Term]:
+def _terms(prepared: PreparedScan, assumptions: Assumptions) -> list[Term]:
     """Parameters of a scan and its line for which priors were given."""
-    return [_term(seen, name, *prior) for name, prior in told.systematics.items()]
+    return [_term(prepared, name, *prior) for name, prior in assumptions.systematics.items()]
 
 
-def _term(seen: PreparedScan, name: str, mean: float | None, sd: float) -> Term:
+def _term(prepared: PreparedScan, name: str, mean: float | None, sd: float) -> Term:
     """Parameter of a name, with the prior mean and standard deviation in its unit."""
     element, _, kind = name.rpartition(".")
     if element:
-        given_value, unit = _element_value(seen, element, kind)
+        given_value, unit = _element_value(prepared, element, kind)
         path, positive = f"systematics.{kind}.{element}", kind == "length"
     else:
         (unit, given_value), path, positive = (
@@ -145,16 +149,16 @@ def _term(seen: PreparedScan, name: str, mean: float | None, sd: float) -> Term:
             name in POSITIVE_TERMS,
         )
         if name == "resolution":
-            given_value = float(np.sqrt(np.mean(np.square(seen.rows.resolution))))
+            given_value = float(np.sqrt(np.mean(np.square(prepared.rows.resolution))))
         if name == "wire" and mean is None:
             raise InputError("a wire without its diameter", "wire=DIAMETER+-SD, in metres")
-        if name.startswith("dispersion") and not np.any(seen.rows.spread):
+        if name.startswith("dispersion") and not np.any(prepared.rows.spread):
             expected = "energy_spread in the lattice or the scan"
             raise InputError(f"a prior on {name} without a momentum spread", expected)
     mean = given_value if mean is None else mean
     if name == "energy" and not PRIOR_MEAN_RANGE[0] <= mean <= PRIOR_MEAN_RANGE[1]:
         # An energy in MeV, such as 135+-1: the parameter is relative to the scan's.
-        mean, sd = mean / seen.energy, sd / seen.energy
+        mean, sd = mean / prepared.energy, sd / prepared.energy
     if (
         unit == "1"
         and given_value == 1.0
@@ -168,23 +172,23 @@ def _term(seen: PreparedScan, name: str, mean: float | None, sd: float) -> Term:
     )
 
 
-def _element_value(seen: PreparedScan, name: str, kind: str) -> tuple[float, str]:
+def _element_value(prepared: PreparedScan, name: str, kind: str) -> tuple[float, str]:
     """Nominal value and unit of a parameter of an element: its gradient or length."""
     kinds = {"gradient": (Quadrupole, ThinLens), "length": (Drift,)}[kind]
-    known = [e.name for e in seen.scanned.elements if isinstance(e, kinds)]
+    known = [e.name for e in prepared.scanned.elements if isinstance(e, kinds)]
     if name not in known:
         raise InputError(f"a prior on {name}.{kind}", f"{nearest(name, known)}, with .{kind}")
-    return (1.0, "1") if kind == "gradient" else (float(seen.scanned[name].length), "m")
+    return (1.0, "1") if kind == "gradient" else (float(prepared.scanned[name].length), "m")
 
 
-def effect_words(fit: Fit, told: Assumptions, emittance: float, slope: np.ndarray) -> str:
+def effect_words(fit: Fit, assumptions: Assumptions, emittance: float, slope: np.ndarray) -> str:
     """Sentence on the statistical part of an emittance error and its largest systematic part.
 
     Parameters
     ----------
     fit : Fit
         Fit of a problem from `with_systematics`.
-    told : Assumptions
+    assumptions : Assumptions
         Assumptions with the priors.
     emittance, slope : float and ndarray
         The emittance and its derivatives with respect to the free parameters.
@@ -202,9 +206,9 @@ def effect_words(fit: Fit, told: Assumptions, emittance: float, slope: np.ndarra
     positions = {
         user_name(name): i
         for i, name in enumerate(fit.problem.names)
-        if user_name(name) in told.priors
+        if user_name(name) in assumptions.priors
     }
-    if not told.systematics or not emittance > 0:
+    if not assumptions.systematics or not emittance > 0:
         return ""
     covariance, indices = fit.covariance, list(positions.values())
     variance, cross_covariance = float(slope @ covariance @ slope), covariance[indices] @ slope
@@ -319,7 +323,7 @@ def systematics(fit: Scanned, plane: str) -> list[BudgetChange]:
             changes[cause] = changes.get(cause, 0.0) + step * float(slope)
     energy, mass = fit.seen.energy, fit.line.mass
     changes[energy_cause := _energy_cause(energy, mass)] = 0.01 * float(energy_slope)
-    changes |= _within_scan(rows, len(fit.seen.scan), measured_rows, *row_slopes)
+    changes |= _drift_changes(rows, len(fit.seen.scan), measured_rows, *row_slopes)
     blurred = np.asarray(rows.resolution)[measured_rows]
     changes |= _screen_changes(fit, p, blurred, np.asarray(known_slope)[measured_rows])
     changes |= _roll_changes(fit, plane, np.asarray(known_slope))
@@ -331,7 +335,7 @@ def systematics(fit: Scanned, plane: str) -> list[BudgetChange]:
     return sorted(found, key=lambda change: -abs(change.normalized_emittance))
 
 
-def _within_scan(
+def _drift_changes(
     rows: Rows,
     count: int,
     measured_rows: np.ndarray,
@@ -498,9 +502,11 @@ def _slopes(
         # Adiabatic damping: the normalised emittance of the rows is one number.
         damping = ((rows.energy**2 - mass**2) / (row_energy**2 - mass**2)) ** 0.25
         changed_rows = replace(rows, settings=settings, damping=rows.damping * damping)
-        x, y = changed_rows.both(_with_changes(rows.line, iter(changes)), row_energy * factor)
+        x, y = changed_rows.both_planes(
+            _with_changes(rows.line, iter(changes)), row_energy * factor
+        )
         # One compiled program for both planes.
-        r11, r12, known = changed_rows.known(jnp.where(upright, y, x))
+        r11, r12, known = changed_rows.screen_elements(jnp.where(upright, y, x))
         design = jnp.stack(coefficients(r11, r12), -1)
         return pulls(design @ sigma + known + further) @ design
 
@@ -509,7 +515,7 @@ def _slopes(
         used, size, error, weighed = points
         if not rows.squared:
             return used * (1.0 - size / jnp.sqrt(m2)) / error**2
-        at = weighed_size(size, m2) if by_model else weighed
+        at = size_for_weights(size, m2) if by_model else weighed
         return used * (m2 - size**2) / (at * error_at(at, weighed, error, relative)) ** 2
 
     kinds = (
@@ -556,13 +562,13 @@ def range_sensitivity(plane: PlaneFit) -> list[RangeRow]:
     full, found = plane.emittance, []
     factor = plane.normalized_emittance.value / full.value if full.value else 0.0
     for name, used in rows:
-        emittance = _without(plane, ~used)
+        emittance = _emittance_without(plane, ~used)
         shift = (emittance - full.value) / full.error if full.error else math.nan
         found.append(RangeRow(name, emittance * factor, shift))
     return found
 
 
-def _without(plane: PlaneFit, left_out: np.ndarray) -> float:
+def _emittance_without(plane: PlaneFit, left_out: np.ndarray) -> float:
     """Emittance without some points, at the weights of the fit; NaN if the others give none."""
     p = plane.points
     scale = np.where(left_out, 0.0, 0.5 / (p.weighed * p.error))

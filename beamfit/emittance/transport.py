@@ -160,17 +160,19 @@ class Rows:
     def elements(self, model: Mapping[str, Any]) -> tuple[Array, Array, Array]:
         """Damped R11 and R12, and known size² (m²), of each row, shape (n,), for a model."""
         systematics = model.get("systematics", {})
-        r = self.both(line_with(model, self.line), self.energy * systematics.get("energy", 1.0))
-        return self.known(r["xy".index(self.plane)], systematics)
+        r = self.both_planes(
+            line_with(model, self.line), self.energy * systematics.get("energy", 1.0)
+        )
+        return self.screen_elements(r["xy".index(self.plane)], systematics)
 
-    def both(self, line: Beamline, energy: Array) -> Array:
+    def both_planes(self, line: Beamline, energy: Array) -> Array:
         """R11, R12 and R16 of both planes through a line, shape (2, n, 3), unless given."""
         if self.given is not None:
             return self.given
         planes = transfer_rows(line, self.settings, energy, self.places).planes
         return jnp.moveaxis(planes[jnp.arange(len(self.energy)), :, self.which, 0], 1, 0)
 
-    def known(
+    def screen_elements(
         self, r: Array, systematics: Mapping[str, Any] = MappingProxyType({})
     ) -> tuple[Array, Array, Array]:
         """R11, R12 and known size² from R11, R12 and R16, shape (n, 3), and free systematics."""
@@ -179,10 +181,10 @@ class Rows:
         known = (dispersion * self.spread) ** 2 + systematics.get(
             "resolution", self.resolution
         ) ** 2
-        return through_screen(systematics, self.damping * r[:, 0], self.damping * r[:, 1], known)
+        return apply_screen(systematics, self.damping * r[:, 0], self.damping * r[:, 1], known)
 
 
-def through_screen(
+def apply_screen(
     systematics: Mapping[str, Any], r11: Array, r12: Array, known: Array
 ) -> tuple[Array, Array, Array]:
     """Apply scale and wire diameter (m) of the screen; the rms of a round wire is d/4."""
@@ -215,15 +217,15 @@ class NetworkRows:
         """R11, R12 and known size² (m²) of each row, shape (n,) each."""
         outputs = self.outputs(model)  # A and B first, then C and D if the network has them
         r11, r12 = self.damping * outputs[:, 0], self.damping * outputs[:, 1]
-        return through_screen(model.get("systematics", {}), r11, r12, self.known)
+        return apply_screen(model.get("systematics", {}), r11, r12, self.known)
 
 
-def padded(values: Any) -> np.ndarray:
+def pad_rows(values: Any) -> np.ndarray:
     """Repeat the last row up to the length of `padded_length`.
 
     Examples
     --------
-    >>> padded([1.0, 2.0]).tolist()
+    >>> pad_rows([1.0, 2.0]).tolist()
     [1.0, 2.0, 2.0, 2.0, 2.0, 2.0, 2.0, 2.0]
     """
     values = np.asarray(values)
@@ -268,7 +270,7 @@ def scan_rows(
     which = np.array([places.index(s) for s in screens])
 
     def column(values: Any, default: float) -> np.ndarray:
-        return padded(np.full(n, float(default)) if values is None else values)
+        return pad_rows(np.full(n, float(default)) if values is None else values)
 
     energy = column(scan.energy, scanned.energy)
     targets = (*places, scanned.design.at) if scanned.design else places
@@ -280,14 +282,14 @@ def scan_rows(
         places,
         squared,
         reduced_line(scanned, (*settings, *keep), energies, targets),
-        {name: padded(v) for name, v in settings.items()},
+        {name: pad_rows(v) for name, v in settings.items()},
         energy,
-        padded(which),
+        pad_rows(which),
         column(scan.energy_spread, scanned.energy_spread),
-        padded(np.array(resolution)[which] if scan.resolution is None else scan.resolution),
+        pad_rows(np.array(resolution)[which] if scan.resolution is None else scan.resolution),
         damping_of(energy, float(energy[:n].mean()), float(scanned.mass)),
         # A plane that was not measured has no rows; its matrices do not matter.
-        np.stack([padded(transfer.get(p, next(iter(transfer.values())))) for p in "xy"])
+        np.stack([pad_rows(transfer.get(p, next(iter(transfer.values())))) for p in "xy"])
         if transfer
         else None,
     )
@@ -306,7 +308,7 @@ def row_elements(rows: Rows) -> Array:
     Array, shape (3, 2, rows)
         R11, R12 (m) and the size² not due to the beam (m²), of x and y.
     """
-    planes = [jnp.stack(rows.known(r)) for r in rows.both(rows.line, rows.energy)]
+    planes = [jnp.stack(rows.screen_elements(r)) for r in rows.both_planes(rows.line, rows.energy)]
     return jnp.stack(planes, axis=1)
 
 

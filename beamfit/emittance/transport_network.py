@@ -18,7 +18,7 @@ import numpy as np
 from beamfit.emittance.assumptions import Assumptions
 from beamfit.emittance.model import UNIT, sigma_of
 from beamfit.emittance.statement import PreparedScan, Scenario, beam_problem, varied_magnets
-from beamfit.emittance.transport import NetworkRows, padded
+from beamfit.emittance.transport import NetworkRows, pad_rows
 from beamfit.errors import InputError, nearest
 from beamfit.greybox.gains import certified_gain
 from beamfit.greybox.mlp import MLP, Port, dense
@@ -37,8 +37,8 @@ DETERMINANT_ERROR = 1e-3
 
 
 def network_problem(
-    seen: PreparedScan,
-    told: Assumptions,
+    prepared: PreparedScan,
+    assumptions: Assumptions,
     inputs: Sequence[str],
     common: Iterable[str],
     rows: Mapping[str, Any],
@@ -53,15 +53,15 @@ def network_problem(
     errors in the deviation is unknown, so that the common error may be all of it. It applies to
     each name in `common`.
     """
-    for name in (name for place in told.anchor.at for name in place):
+    for name in (name for place in assumptions.anchor.at for name in place):
         if name not in inputs:
             raise InputError(f"an anchor at '{name}'", f"a scanned magnet: {', '.join(inputs)}")
-    sd = told.anchor.deviation
+    sd = assumptions.anchor.deviation
     shared = {} if sd is None else {"anchor": dict.fromkeys(common, 0.0)}
     names = [f"anchor.{name}" for name in shared.get("anchor", ())]
     free = [*weights, *(Free(name, -0.9, nuisance=True) for name in names)]
     priors = [Prior(name, 0.0, sd) for name in names]
-    return beam_problem(seen, rows, {**model, **shared}, free, records, priors, limits)
+    return beam_problem(prepared, rows, {**model, **shared}, free, records, priors, limits)
 
 
 def known_record(
@@ -69,11 +69,11 @@ def known_record(
 ) -> Record:
     """Record that ties a network to first principles; pads the values, but not ``data``."""
     values = np.asarray(values, float)
-    padded_values = padded(values)
+    padded_values = pad_rows(values)
     weight = np.zeros(padded_values.shape)
     weight[: len(values)] = 1.0
     return Record(
-        name, predict, data, padded_values, padded(np.broadcast_to(sd, values.shape)), weight
+        name, predict, data, padded_values, pad_rows(np.broadcast_to(sd, values.shape)), weight
     )
 
 
@@ -87,11 +87,11 @@ class _Sigma:
         return sigma_of(model["beam"][self.plane]) / UNIT**2
 
 
-def beam_box(told: Assumptions, planes: Sequence[str]) -> list[Constraint]:
+def beam_box(assumptions: Assumptions, planes: Sequence[str]) -> list[Constraint]:
     """Bounds of each plane's beam matrix, one constraint per plane with bounds."""
     found = []
     for plane in planes:
-        bounds = [told.bounds.get(f"{plane}.{name}", (-np.inf, np.inf)) for name in SIGMA]
+        bounds = [assumptions.bounds.get(f"{plane}.{name}", (-np.inf, np.inf)) for name in SIGMA]
         low, high = np.array(bounds).T / UNIT**2
         if np.isfinite(low).any():
             found.append(Constraint(f"box {plane}", _Sigma(plane), None, low, high))
@@ -99,21 +99,23 @@ def beam_box(told: Assumptions, planes: Sequence[str]) -> list[Constraint]:
 
 
 def limited_network(
-    inputs: Sequence[str], box: np.ndarray, outputs: Sequence[str], told: Assumptions
+    inputs: Sequence[str], box: np.ndarray, outputs: Sequence[str], assumptions: Assumptions
 ) -> tuple[MLP, list[Free], list[Constraint]]:
     """Network of Appendix B: no scales, weights within ± 10, gains limited in a box (2, n)."""
     low, high = box.tolist()
     ports = [Port(n, "", lower=a, upper=b) for n, a, b in zip(inputs, low, high, strict=True)]
-    net = dense(ports, outputs, [told.hidden], seed=told.seed, spread=WEIGHT_START)
+    net = dense(ports, outputs, [assumptions.hidden], seed=assumptions.seed, spread=WEIGHT_START)
     free = [Free("map", -MAX_WEIGHT, MAX_WEIGHT, (-WEIGHT_START, WEIGHT_START), nuisance=True)]
     limits, cells = [], cells_along(len(inputs))
-    for name, (lower, upper) in told.gains.items():
+    for name, (lower, upper) in assumptions.gains.items():
         output, by = (part.removeprefix("d") for part in name.split("/", 1))  # dA_x/dQ2
         limits += certified_gain("map", output, by, (low, high), cells, lower=lower, upper=upper)
     return net, free, limits
 
 
-def check_box(told: Assumptions, inputs: Sequence[str], outputs: Sequence[str], planes) -> None:
+def check_box(
+    assumptions: Assumptions, inputs: Sequence[str], outputs: Sequence[str], planes
+) -> None:
     """Raise an error for bounds and gains of unknown names.
 
     Raises
@@ -123,7 +125,10 @@ def check_box(told: Assumptions, inputs: Sequence[str], outputs: Sequence[str], 
     """
     numbers = [f"{plane}.{name}" for plane in planes for name in SIGMA] + list(inputs)
     gains = [f"d{output}/d{by}" for output in outputs for by in inputs]
-    for what, named, possible in (("bounds on", told.bounds, numbers), ("gain", told.gains, gains)):
+    for what, named, possible in (
+        ("bounds on", assumptions.bounds, numbers),
+        ("gain", assumptions.gains, gains),
+    ):
         for name in named:
             if name not in possible:
                 raise InputError(f"{what} '{name}'", nearest(name, possible))
@@ -139,41 +144,47 @@ class _Layout(NamedTuple):
     box: np.ndarray
 
 
-def _layout(seen: PreparedScan, told: Assumptions) -> _Layout:
+def _layout(prepared: PreparedScan, assumptions: Assumptions) -> _Layout:
     """Inputs and outputs of the network for a scan."""
-    scan = seen.scan
+    scan = prepared.scan
     columns = {name: scan.settings[name] for name in varied_magnets(scan)}
     with_energy = scan.energy is not None and np.ptp(scan.energy) > 0
     columns |= {"energy": scan.energy} if with_energy else {}
     if not columns:
         found = "a transport network for a scan in which no magnet and no energy changes"
         raise scan.unusable(found, "scenario known: the network maps settings to R11 and R12")
-    elements, values = 4 if told.anchor.determinant else 2, np.stack([*columns.values()], -1)
-    return _Layout(tuple(columns), values, with_energy, elements, _box(seen, told, columns))
+    elements, values = 4 if assumptions.anchor.determinant else 2, np.stack([*columns.values()], -1)
+    return _Layout(
+        tuple(columns), values, with_energy, elements, _box(prepared, assumptions, columns)
+    )
 
 
-def _box(seen: PreparedScan, told: Assumptions, columns: dict[str, np.ndarray]) -> np.ndarray:
+def _box(
+    prepared: PreparedScan, assumptions: Assumptions, columns: dict[str, np.ndarray]
+) -> np.ndarray:
     """Box of the inputs, given or else the range of the scan; shape (2, inputs)."""
     ends = []
     for name, values in columns.items():
         scanned = (values.min(), values.max())
-        low, high = told.bounds.get(name, scanned)
+        low, high = assumptions.bounds.get(name, scanned)
         if low > scanned[0] or high < scanned[1]:
             found = f"bounds {name} = {low:g}:{high:g}, and a scan from "
             found += f"{scanned[0]:g} to {scanned[1]:g}"
-            raise seen.scan.unusable(found, "bounds that hold the scan", name)
+            raise prepared.scan.unusable(found, "bounds that hold the scan", name)
         ends.append((low, high))
     return np.array(ends, float).T
 
 
-def _first_principles(seen: PreparedScan, layout: _Layout, points: np.ndarray) -> np.ndarray:
+def _first_principles(prepared: PreparedScan, layout: _Layout, points: np.ndarray) -> np.ndarray:
     """A, B, C, D of the line, shape (points, planes, places, 4)."""
-    full = padded(points)
+    full = pad_rows(points)
     columns = dict(zip(layout.names, full.T, strict=True))
-    energy = columns.pop("energy") if layout.with_energy else np.full(len(full), seen.energy)
-    settings = {k: np.full(len(full), np.median(v)) for k, v in seen.scan.settings.items()}
-    planes = transfer_rows(seen.scanned, settings | columns, energy, seen.rows.places).planes
-    r = np.asarray(planes)[: len(points), ["xy".index(p) for p in seen.planes], :, :2, :2]
+    energy = columns.pop("energy") if layout.with_energy else np.full(len(full), prepared.energy)
+    settings = {k: np.full(len(full), np.median(v)) for k, v in prepared.scan.settings.items()}
+    planes = transfer_rows(
+        prepared.scanned, settings | columns, energy, prepared.rows.places
+    ).planes
+    r = np.asarray(planes)[: len(points), ["xy".index(p) for p in prepared.planes], :, :2, :2]
     return r.reshape(*r.shape[:3], 4)
 
 
@@ -184,101 +195,109 @@ def _grid(layout: _Layout) -> np.ndarray:
     return np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, len(axes))
 
 
-def _signs(seen: PreparedScan, layout: _Layout, grid: np.ndarray) -> np.ndarray:
+def _signs(prepared: PreparedScan, layout: _Layout, grid: np.ndarray) -> np.ndarray:
     """Signs of the gains of A and B from first principles, (outputs, inputs); 0 if mixed."""
     half = 0.5 * (layout.box[1] - layout.box[0])
-    signs = np.zeros((len(seen.planes) * len(seen.rows.places) * layout.elements, len(half)))
+    signs = np.zeros(
+        (len(prepared.planes) * len(prepared.rows.places) * layout.elements, len(half))
+    )
     # Gains of the energy, and those of C and D, are not constrained.
     for i in range(len(half) - layout.with_energy):
         step = np.zeros(len(half))
         step[i] = 1e-4 * half[i]
-        up, down = (_first_principles(seen, layout, grid + s) for s in (step, -step))
+        up, down = (_first_principles(prepared, layout, grid + s) for s in (step, -step))
         sign = ((up > down).all(axis=0)).astype(int) - ((up < down).all(axis=0)).astype(int)
         sign[..., 2:] = 0
         signs[:, i] = sign[..., : layout.elements].ravel()
     return signs
 
 
-def network_rows(seen: PreparedScan, layout: _Layout, plane: str) -> NetworkRows:
+def network_rows(prepared: PreparedScan, layout: _Layout, plane: str) -> NetworkRows:
     """Inputs of the network, and positions of A and B among its outputs, for a plane's rows."""
     return NetworkRows(
         plane,
-        seen.rows.squared,
-        padded(layout.columns),
-        _columns(seen, layout, plane, seen.rows.which),
-        seen.elements[2, "xy".index(plane)],
-        seen.rows.damping,
+        prepared.rows.squared,
+        pad_rows(layout.columns),
+        _columns(prepared, layout, plane, prepared.rows.which),
+        prepared.elements[2, "xy".index(plane)],
+        prepared.rows.damping,
     )
 
 
-def _columns(seen: PreparedScan, layout: _Layout, plane: str, which: np.ndarray) -> np.ndarray:
+def _columns(prepared: PreparedScan, layout: _Layout, plane: str, which: np.ndarray) -> np.ndarray:
     """Positions of a plane's elements among the outputs, for screens given by their index."""
-    first = (seen.planes.index(plane) * len(seen.rows.places) + which) * layout.elements
+    first = (prepared.planes.index(plane) * len(prepared.rows.places) + which) * layout.elements
     return first[:, None] + np.arange(layout.elements)
 
 
-def _state(seen: PreparedScan, told: Assumptions) -> Problem:
+def _state(prepared: PreparedScan, assumptions: Assumptions) -> Problem:
     """Problem of the beams and one network for A and B of every plane and screen."""
-    layout = _layout(seen, told)
-    outputs = _names(seen, layout)
-    check_box(told, layout.names, outputs, seen.planes)
-    if told.gains:
-        net, weights, limits = limited_network(layout.names, layout.box, outputs, told)
+    layout = _layout(prepared, assumptions)
+    outputs = _names(prepared, layout)
+    check_box(assumptions, layout.names, outputs, prepared.planes)
+    if assumptions.gains:
+        net, weights, limits = limited_network(layout.names, layout.box, outputs, assumptions)
     else:
-        (net, weights), limits = _signed(seen, layout, told), []
-    limits += beam_box(told, seen.planes)
-    rows = {plane: network_rows(seen, layout, plane) for plane in seen.planes}
+        (net, weights), limits = _sign_network(prepared, layout, assumptions), []
+    limits += beam_box(assumptions, prepared.planes)
+    rows = {plane: network_rows(prepared, layout, plane) for plane in prepared.planes}
     anchors = [
         record
         for plane_rows in rows.values()
-        for record in _anchors(seen, layout, told, plane_rows)
+        for record in _anchors(prepared, layout, assumptions, plane_rows)
     ]
     model = {"map": net}
     return network_problem(
-        seen, told, layout.names, seen.planes, rows, model, weights, anchors, limits
+        prepared, assumptions, layout.names, prepared.planes, rows, model, weights, anchors, limits
     )
 
 
-def _signed(seen: PreparedScan, layout: _Layout, told: Assumptions) -> tuple[MLP, list[Free]]:
+def _sign_network(
+    prepared: PreparedScan, layout: _Layout, assumptions: Assumptions
+) -> tuple[MLP, list[Free]]:
     """Network scaled to its box, whose gains have the signs of first principles."""
     grid = _grid(layout)
-    elements = _first_principles(seen, layout, grid)[..., : layout.elements].reshape(len(grid), -1)
+    elements = _first_principles(prepared, layout, grid)[..., : layout.elements].reshape(
+        len(grid), -1
+    )
     inputs = [
         Port(n, "", 0, (b - a) / 2, (b + a) / 2)
         for n, a, b in zip(layout.names, *layout.box, strict=True)
     ]
     outputs = [
         Port(name, "", 0, np.ptp(v) / 2 or 1.0, (v.max() + v.min()) / 2)
-        for name, v in zip(_names(seen, layout), elements.T, strict=True)
+        for name, v in zip(_names(prepared, layout), elements.T, strict=True)
     ]
-    rising = _signs(seen, layout, grid)
-    return signed_network("map", inputs, outputs, rising, told.hidden, told.seed, MAX_WEIGHT)
+    rising = _signs(prepared, layout, grid)
+    return signed_network(
+        "map", inputs, outputs, rising, assumptions.hidden, assumptions.seed, MAX_WEIGHT
+    )
 
 
-def _names(seen: PreparedScan, layout: _Layout) -> list[str]:
+def _names(prepared: PreparedScan, layout: _Layout) -> list[str]:
     """Names of the network's outputs."""
-    places = seen.rows.places
+    places = prepared.rows.places
     return [
         f"{e}_{plane}" + (f"@{place}" if len(places) > 1 else "")
-        for plane in seen.planes
+        for plane in prepared.planes
         for place in places
         for e in ELEMENTS[: layout.elements]
     ]
 
 
 def _anchors(
-    seen: PreparedScan, layout: _Layout, told: Assumptions, rows: NetworkRows
+    prepared: PreparedScan, layout: _Layout, assumptions: Assumptions, rows: NetworkRows
 ) -> Iterator[Record]:
     """Records that tie the network of a plane to first principles."""
-    anchor, plane, at = told.anchor, rows.plane, seen.measured(rows.plane)
-    i, places = seen.planes.index(plane), len(seen.rows.places)
-    points, which = layout.columns[at], seen.rows.which[at]
-    line_elements = _first_principles(seen, layout, points)[np.arange(len(at)), i, which]
+    anchor, plane, at = assumptions.anchor, rows.plane, prepared.measured(rows.plane)
+    i, places = prepared.planes.index(plane), len(prepared.rows.places)
+    points, which = layout.columns[at], prepared.rows.which[at]
+    line_elements = _first_principles(prepared, layout, points)[np.arange(len(at)), i, which]
     size = np.sqrt(np.mean(line_elements**2, axis=0))[: layout.elements]
 
     def record(name, inputs, screens, values, sd, predict=_outputs, elements=layout.elements):
-        columns = _columns(seen, layout, plane, padded(screens))[:, :elements]
-        data = NetworkRows(plane, rows.squared, padded(inputs), columns, rows.known, rows.damping)
+        columns = _columns(prepared, layout, plane, pad_rows(screens))[:, :elements]
+        data = NetworkRows(plane, rows.squared, pad_rows(inputs), columns, rows.known, rows.damping)
         return known_record(name, predict, data, values, sd)
 
     if anchor.deviation is not None:
@@ -290,7 +309,7 @@ def _anchors(
     for place in anchor.at:
         middle = 0.5 * (layout.box[0] + layout.box[1])
         point = np.array([[place.get(n, m) for n, m in zip(layout.names, middle, strict=True)]])
-        at_point = _first_principles(seen, layout, point)[0, i, :, : layout.elements]
+        at_point = _first_principles(prepared, layout, point)[0, i, :, : layout.elements]
         inputs, screens = np.repeat(point, places, axis=0), np.arange(places)
         yield record(f"anchor {plane} at one setting", inputs, screens, at_point, anchor.sd * size)
     if anchor.determinant:
@@ -329,8 +348,10 @@ NULL_DIRECTIONS = (
 SCENARIO = Scenario(
     "transport-network",
     _state,
-    null_directions=lambda _seen, _parameters, identified: () if identified else NULL_DIRECTIONS,
-    remedy=lambda _seen, _told: (
+    null_directions=lambda _prepared, _parameters, identified: (
+        () if identified else NULL_DIRECTIONS
+    ),
+    remedy=lambda _prepared, _assumptions: (
         "an anchor to first principles at every setting (--anchor first-principles=2%); T known at "
         "single settings or det T = 1 with C and D free do not suffice"
     ),

@@ -207,7 +207,7 @@ class Whitened(NamedTuple):
         It is integrated over parameters and noises, with flat priors of the parameters, of the
         logarithm of the noise level and over the grid.
         """
-        return -2.0 * float(logsumexp(self._solved(None)[3]))
+        return -2.0 * float(logsumexp(self._solve(None)[3]))
 
     def memory(self, numbers: int | None = None) -> Memory:
         """Posterior over noise models with the first ``numbers`` parameters free, the others fixed.
@@ -236,17 +236,17 @@ class Whitened(NamedTuple):
 
     def weighed(self, numbers: int | None = None) -> tuple[Memory, np.ndarray]:
         """Posterior as `memory`, and the log probability of the values for each noise."""
-        half, components, squares, logs = self._solved(numbers)
+        half, components, squares, logs = self._solve(numbers)
         weight = np.exp(logs - logs.max())
         step = -(half @ components)[..., 0]
-        fitted = half.any(axis=1).sum(axis=1).max()  # numbers that are held are not fitted
+        fitted = half.any(axis=1).sum(axis=1).max()  # fixed parameters are not counted
         dof, flicker = self.count - int(fitted), np.isnan(self.noise.time)
         # 1/f noise has no correlation time: it is represented by the most probable correlated one.
         most_similar = int(np.argmax(np.where(flicker, -np.inf, logs)))
         time, white = (np.where(flicker, values[most_similar], values) for values in self.noise)
         return Memory(weight / weight.sum(), time, white, step, half, squares, dof), logs
 
-    def _solved(self, numbers: int | None) -> tuple[np.ndarray, ...]:
+    def _solve(self, numbers: int | None) -> tuple[np.ndarray, ...]:
         """Solve for each noise: square root of the covariance, components of the residuals,
         residual sum of squares, and log probability.
         """

@@ -37,7 +37,7 @@ class Lognormal(NamedTuple):
         """
         if not least > 0.0:
             return 0.0 * np.log(self.middle)
-        from scipy.special import log_ndtr  # a scan is read without scipy
+        from scipy.special import log_ndtr  # loads scipy, which reading a scan does not need
 
         return log_ndtr((np.log(self.middle) - math.log(least)) / self.spread)
 

@@ -260,7 +260,7 @@ class Beamline:
         """
         set_for = {"energy": self.energy, "mass": self.mass}
         return replace(
-            self, elements=tuple(_tied(e, set_for) for e in self.elements), energy=energy
+            self, elements=tuple(_tie_to_energy(e, set_for) for e in self.elements), energy=energy
         )
 
     def matrix(
@@ -399,7 +399,7 @@ class Beamline:
         return replace(self, elements=tuple(parts))
 
 
-def _tied(element: Any, set_for: Mapping[str, Any]) -> Any:
+def _tie_to_energy(element: Any, set_for: Mapping[str, Any]) -> Any:
     """Fix the energy and mass for which an element is set, unless they are fixed already."""
     if isinstance(element, SectorDipole):
         return replace(element, **set_for) if element.energy is None else element

@@ -80,7 +80,7 @@ def _kick(strength: ArrayLike) -> Array:
     return np.eye(3) - floats(strength)[..., None, None] * _SLOPE
 
 
-def _both(strength: ArrayLike) -> Array:
+def _both_planes(strength: ArrayLike) -> Array:
     """A strength in x and its opposite in y, along a last axis."""
     return floats(strength)[..., None] * np.array([1.0, -1.0])
 
@@ -138,7 +138,7 @@ class Quadrupole:
 
     def matrix(self, setting: ArrayLike | None = None, energy: ArrayLike = 1.0) -> TransferMatrix:
         """Transfer matrix at a setting (the element's own if None) and an energy in MeV."""
-        both = _both(self.k1(setting, energy))
+        both = _both_planes(self.k1(setting, energy))
         return TransferMatrix(_thick(both, floats(self.length)[..., None]))
 
 
@@ -169,7 +169,7 @@ class ThinLens:
     def matrix(self, setting: ArrayLike | None = None, energy: ArrayLike = 1.0) -> TransferMatrix:
         """Transfer matrix at a setting (the element's own if None) and an energy in MeV."""
         setting = self.setting if setting is None else setting
-        return TransferMatrix(_kick(_both(self.calibration.k1l(setting, 0.0, energy))))
+        return TransferMatrix(_kick(_both_planes(self.calibration.k1l(setting, 0.0, energy))))
 
 
 def hard_edge_slice(
@@ -311,7 +311,9 @@ class SectorDipole:
         sign = np.array([1.0, -1.0] if self.bend_plane == "x" else [-1.0, 1.0])
         bent = sign > 0
         body = _thick(
-            xp.where(bent, h**2, 0.0) + _both(self.k1) / ratio, length, xp.where(bent, h, 0.0)
+            xp.where(bent, h**2, 0.0) + _both_planes(self.k1) / ratio,
+            length,
+            xp.where(bent, h, 0.0),
         )
         entry, leave = (_kick(-sign * h * xp.tan(edge)) for edge in (entrance, exit_angle))
         return TransferMatrix(leave @ body @ entry)

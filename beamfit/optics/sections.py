@@ -73,7 +73,7 @@ class ElementSeries:
             return IDENTITY
         planes = [_planes(k, energy) for k in self.kinds]
         traced = [isinstance(p, jax.Array) for p in planes]
-        matrices, order = _multiplied(planes, traced, self.order)
+        matrices, order = _multiply_runs(planes, traced, self.order)
         matrices += [p for p, t in zip(planes, traced, strict=True) if t]
         return TransferMatrix(_product(array_module(*matrices).concatenate(matrices)[order]))
 
@@ -91,7 +91,7 @@ class ElementSeries:
         depends = [bool(np.isnan(p).any()) for p in planes]
         if not any(depends):
             return LineSection(self.matrix().planes, self.length)
-        products, order = _multiplied(planes, depends, self.order)
+        products, order = _multiply_runs(planes, depends, self.order)
         remaining = (k for k, f in zip(self.kinds, depends, strict=True) if f)
         return ElementSeries((*map(LineSection, products), *remaining), order, self.length)
 
@@ -135,7 +135,7 @@ def _planes(element: Any, energy: ArrayLike) -> Array:
     return element.matrix(None, energy).planes.reshape(-1, 2, 3, 3)
 
 
-def _multiplied(
+def _multiply_runs(
     planes: Sequence[Array], separate: Sequence[bool], order: np.ndarray
 ) -> tuple[list[np.ndarray], np.ndarray]:
     """Multiply the runs of elements between those of the separate kinds.
