@@ -283,7 +283,7 @@ def cholesky_numbers(sigma: Sequence[float], min_share: float) -> dict[str, floa
     return {"l11": l11, "l21": l21, "l22": math.sqrt(max(s22 - l21**2, min_share * max(s22, 1e-6)))}
 
 
-def free_beams(beams: Mapping[str, Mapping[str, float]]) -> list[Free]:
+def beam_free(beams: Mapping[str, Mapping[str, float]]) -> list[Free]:
     """Free parameters of the beams; l11 and l22 are positive."""
     free = []
     for plane, numbers in beams.items():
@@ -311,7 +311,7 @@ def beam_problem(
     """Problem of the beams and the measured sizes by plane, with the parts of a scenario."""
     beams, rows = beam_numbers(prepared), rows or {p: prepared.of_plane(p) for p in prepared.planes}
     sizes = [size_record(prepared, plane, plane_rows) for plane, plane_rows in rows.items()]
-    free, records = [*free_beams(beams), *free], [*sizes, *records]
+    free, records = [*beam_free(beams), *free], [*sizes, *records]
     return Problem({"beam": beams, **model}, free, records, [*priors], [*constraints])
 
 
