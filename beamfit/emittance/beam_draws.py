@@ -269,6 +269,7 @@ class _Proposals(NamedTuple):
 
 
 def _proposals(c: Coordinates, kind: NoiseKind, noise: Noise, zero_emittance: bool) -> _Proposals:
+    """Build the proposal from the starting fits, with a component for the best of them."""
     fitted, covariance, deviation = deletion_fits(c, kind)
     centre = _nearest_beam(fitted, covariance, zero_emittance)
 

@@ -405,6 +405,7 @@ class _Stack(NamedTuple):
 
 
 def _stack(planes: Sequence[PlaneSizes], noise: Noise, alike: bool | None = None) -> _Stack:
+    """Stack planes in normalised coordinates, with their kinds of noise."""
     r11, r12, known, size = (np.stack([p[i] for p in planes]) for i in range(4))
     c = coordinates(r11, r12, size, known)
     first, error = planes[0], None
@@ -417,6 +418,7 @@ def _stack(planes: Sequence[PlaneSizes], noise: Noise, alike: bool | None = None
 def _compare_alike(
     planes: Sequence[PlaneSizes], noise: Noise, method: str, weights: str
 ) -> list[PlanePosterior]:
+    """Compare planes that share a comparison key."""
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         s = _stack(planes, noise)
         draws = [draw_beams(s.c, kind, noise) for kind in s.kinds]
@@ -518,6 +520,7 @@ def _best_fit(
 
 
 def _fitted_sizes(x: np.ndarray, c: Coordinates) -> np.ndarray:
+    """Sizes of the best fit, kept away from zero; shape (planes, n)."""
     squared = (c.rows @ x[..., None])[..., 0] + c.known
     # No upper limit: a wrong setting may make the model a hundred times larger than any size.
     smallest = c.size.min(-1, keepdims=True)
@@ -540,6 +543,7 @@ def _plane_posterior(
     plane: PlaneSizes, i: int, s: _Stack, draws: Sequence[BeamDraws], of_kind: np.ndarray,
     probability: np.ndarray, best: _BestFit, weights: str,
 ) -> PlanePosterior:  # fmt: skip
+    """Posterior of plane ``i`` in SI, from its draws under all kinds of noise."""
     c = Coordinates(*(part[i] for part in s.c))
     log = np.concatenate([d.log_weight[i] for d in draws])
     weight = np.exp(log - log.max()) if np.isfinite(log.max()) else np.ones(len(log))

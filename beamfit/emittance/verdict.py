@@ -139,6 +139,7 @@ def verdict(e: PlaneEvidence, remarks: str = "", advice: str = "") -> Finding:
 
 
 def _determined_sentence(e: PlaneEvidence) -> str:
+    """Sentence on an emittance that is determined."""
     where = f" in scenario {e.scenario}" if e.scenario else ""
     if e.untested:
         return (

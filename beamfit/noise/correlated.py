@@ -121,6 +121,7 @@ class Memory(NamedTuple):
             )
 
         def within(reach: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            """Probability within a distance of the mean, and its derivative."""
             above, below = ((shift + sign * reach - centre) / spread for sign in (1, -1))
             slope = np.exp(log_student(above, self.dof)) + np.exp(log_student(below, self.dof))
             return self.weight @ (stdtr(self.dof, above) - stdtr(self.dof, below)), (

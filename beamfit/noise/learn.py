@@ -126,6 +126,7 @@ def _fit_prior(
     width = np.array([MIDDLE_SPREAD, SPREAD_SPREAD, LOGIT_SPREAD])
 
     def cost(values: np.ndarray) -> float:
+        """Negative log posterior of the numbers of the prior."""
         middle, spread, probability = _prior_numbers(values)
         new = replace(noise, **{scale: Lognormal(middle, spread), chance: probability})
         each = [_log_evidence(s, new) for s in samples]

@@ -128,6 +128,7 @@ class Beamline:
         return len(self.elements)
 
     def _index(self, name: str) -> int:
+        """Index of the first element of a name; raises an error for an unknown one."""
         if name not in self._first:
             known = [e.name for e in self.elements]
             raise InputError(f"no element '{name}' in line '{self.name}'", nearest(name, known))
