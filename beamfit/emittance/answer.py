@@ -136,19 +136,23 @@ def beam_answers(prepared: PreparedScan) -> tuple[PlaneFit, ...]:
     """Answer for each plane where only the beam is unknown; needs no compilation."""
     found = []
     for plane in prepared.planes:
-        post, p = prepared.solutions[plane].posterior, prepared.solutions[plane].points
+        posterior, points = prepared.solutions[plane].posterior, prepared.solutions[plane].points
         places = place_optics({}, answer_places(prepared, plane))
         covariance = (
-            post.stated_covariance if np.isfinite(post.stated_covariance).all() else post.covariance
+            posterior.stated_covariance
+            if np.isfinite(posterior.stated_covariance).all()
+            else posterior.covariance
         )
-        value, dof = quantities_of(post.best, *places), max(len(p.size) - 3, 0)
-        b = BestFit(value, np.zeros(len(value)), covariance, _directions(p, post.best), dof)
-        found.append(plane_answer(prepared, prepared.line, plane, places, b))
+        value, dof = quantities_of(posterior.best, *places), max(len(points.size) - 3, 0)
+        best = BestFit(
+            value, np.zeros(len(value)), covariance, _directions(points, posterior.best), dof
+        )
+        found.append(plane_answer(prepared, prepared.line, plane, places, best))
     return tuple(found)
 
 
 def plane_answer(
-    prepared: PreparedScan, line: Beamline, plane: str, places: Places, b: BestFit
+    prepared: PreparedScan, line: Beamline, plane: str, places: Places, best: BestFit
 ) -> PlaneFit:
     """Answer for one plane.
 
@@ -162,7 +166,7 @@ def plane_answer(
         "x" or "y".
     places : tuple
         Optics of the places that the answer refers to.
-    b : BestFit
+    best : BestFit
         Best fit, and the contribution of a scenario.
 
     Returns
@@ -171,19 +175,26 @@ def plane_answer(
         Errors, half of the central 68 % of the posterior, only for what the data determine.
     """
     solution = prepared.solutions[plane]
-    post, p = solution.posterior, solution.points
-    n, carrying = _numbers(post, p, places, b)
-    e = _evidence(prepared, plane, n, b)
-    needs_advice = not b.scenario and e.of_a_beam and e.ending is None and not e.determined
-    advice = next_measurement(prepared, plane) if needs_advice else None
-    finding = verdict(e, _remarks(prepared, plane, e, b, carrying, n), advice or "")
-    holds = e.of_a_beam and e.ending is None
-    with_error = e.determined | (LINEAR_QUANTITIES & holds & (not b.scenario))
-    emittance, normalized, beta, alpha, s11, s12, s22, *screen, mismatch = n.quantities(
-        with_error, holds and not e.open_cause
+    posterior, points = solution.posterior, solution.points
+    numbers, carrying = _numbers(posterior, points, places, best)
+    evidence = _evidence(prepared, plane, numbers, best)
+    needs_advice = (
+        not best.scenario
+        and evidence.of_a_beam
+        and evidence.ending is None
+        and not evidence.determined
     )
-    scale = n.scale if e.determined else 1.0
-    covariance = b.covariance if with_error[SIGMA].all() else np.full((3, 3), np.nan)
+    advice = next_measurement(prepared, plane) if needs_advice else None
+    finding = verdict(
+        evidence, _remarks(prepared, plane, evidence, best, carrying, numbers), advice or ""
+    )
+    holds = evidence.of_a_beam and evidence.ending is None
+    with_error = evidence.determined | (LINEAR_QUANTITIES & holds & (not best.scenario))
+    emittance, normalized, beta, alpha, s11, s12, s22, *screen, mismatch = numbers.quantities(
+        with_error, holds and not evidence.open_cause
+    )
+    scale = numbers.scale if evidence.determined else 1.0
+    covariance = best.covariance if with_error[SIGMA].all() else np.full((3, 3), np.nan)
     place = prepared.rows.places[-1]
     settings = {name: float(line[name].setting) for name in line.upto(place).magnets}
     return PlaneFit(
@@ -197,77 +208,85 @@ def plane_answer(
         sigma=(s11, s12, s22),
         screen=ScreenTwiss(place, settings, setting_units(line, settings), *screen),
         mismatch=None if getattr(prepared.line.design, plane, None) is None else mismatch,
-        chi2=post.chi2 if math.isfinite(post.chi2) else None,
-        dof=round(b.dof),
-        rms_residual=Quantity(float(np.sqrt(np.mean((p.size - p.model) ** 2))), None, "m"),
-        covariance=covariance / scale**2 if b.scenario else covariance,
+        chi2=posterior.chi2 if math.isfinite(posterior.chi2) else None,
+        dof=round(best.dof),
+        rms_residual=Quantity(
+            float(np.sqrt(np.mean((points.size - points.model) ** 2))), None, "m"
+        ),
+        covariance=covariance / scale**2 if best.scenario else covariance,
         error_scale=scale,
-        noise=noise_words(post.noise, post.scale, post.relative, p),
+        noise=noise_words(posterior.noise, posterior.scale, posterior.relative, points),
         method=prepared.method,
         weights=prepared.weights,
-        identifiability=_identifiability(p, n, e, advice, b.directions),
-        points=p,
-        holds=b.holds,
+        identifiability=_identifiability(points, numbers, evidence, advice, best.directions),
+        points=points,
+        holds=best.holds,
     )
 
 
 def _numbers(
-    post: PlanePosterior, p: Points, places: Places, b: BestFit
+    posterior: PlanePosterior, points: Points, places: Places, best: BestFit
 ) -> tuple[PlaneNumbers, Influence]:
     """Quantities of a plane, and the point that carries the emittance."""
-    low, *ends, high = _quantiles(post, places, b.spread)
+    low, *ends, high = _quantiles(posterior, places, best.spread)
     half = 0.5 * (ends[2] - ends[0])
-    testable = post.positive and len(p.size) > 3
-    carrying = _influence(p, post.best, half[0]) if testable else Influence()
+    testable = posterior.positive and len(points.size) > 3
+    carrying = _influence(points, posterior.best, half[0]) if testable else Influence()
     if carrying.place:
-        low, high, half = _extend_to_carrying(low, high, half, b.value, carrying.without)
-    raw = np.hypot(_raw_errors(post, places), b.spread)
-    return PlaneNumbers(b.value, half, low, high, raw), carrying
+        low, high, half = _extend_to_carrying(low, high, half, best.value, carrying.without)
+    raw = np.hypot(_raw_errors(posterior, places), best.spread)
+    return PlaneNumbers(best.value, half, low, high, raw), carrying
 
 
 def _remarks(
-    prepared: PreparedScan, plane: str, e: PlaneEvidence, b: BestFit, carrying: Influence,
-    n: PlaneNumbers,
+    prepared: PreparedScan, plane: str, evidence: PlaneEvidence, best: BestFit, carrying: Influence,
+    numbers: PlaneNumbers,
 ) -> str:  # fmt: skip
     """Further sentences on noise and points."""
     solution = prepared.solutions[plane]
-    post, p, remarks = solution.posterior, solution.points, [solution.shot_words]
-    if e.of_a_beam:
-        chance = chi2_probability(post.chi2, max(len(p.size) - 3, 0))
-        by_noise = e.determined and not b.scenario and not carrying.place
-        enlarged = n.scale if by_noise else 1.0
-        remarks.insert(0, noise_remark(post.noise, post.scale, chance, enlarged))
-        without = carrying.without * n.value[1] / n.value[0]
-        place = "" if e.open_cause else carrying.place
+    posterior, points, remarks = solution.posterior, solution.points, [solution.shot_words]
+    if evidence.of_a_beam:
+        chance = chi2_probability(posterior.chi2, max(len(points.size) - 3, 0))
+        by_noise = evidence.determined and not best.scenario and not carrying.place
+        enlarged = numbers.scale if by_noise else 1.0
+        remarks.insert(0, noise_remark(posterior.noise, posterior.scale, chance, enlarged))
+        without = carrying.without * numbers.value[1] / numbers.value[0]
+        place = "" if evidence.open_cause else carrying.place
         if place:
             place += _bad_in_other_plane(prepared, plane, carrying.point)
-        remarks += point_remarks(p, place, float(without))
-    remarks.append(resolution_remark(p.size, p.known))
-    remarks += [b.remark] * e.determined
+        remarks += point_remarks(points, place, float(without))
+    remarks.append(resolution_remark(points.size, points.known))
+    remarks += [best.remark] * evidence.determined
     return " ".join(filter(None, remarks))
 
 
 def _identifiability(
-    p: Points, n: PlaneNumbers, e: PlaneEvidence, advice: str | None, directions: Directions
+    points: Points,
+    numbers: PlaneNumbers,
+    evidence: PlaneEvidence,
+    advice: str | None,
+    directions: Directions,
 ) -> Identifiability:
     """Collect the evidence on how well the data determine the plane's emittance."""
     return Identifiability(
-        determined=e.determined,
-        probability=e.posterior.probability,
+        determined=evidence.determined,
+        probability=evidence.posterior.probability,
         singular_values=tuple(float(v) for v in directions.singular_values),
         condition=directions.condition if math.isfinite(directions.condition) else None,
-        waist_bracketed=e.bracketed,
-        phase_coverage=phase_coverage(p.r11, p.r12, float(n.value[2]), float(n.value[3])),
-        undetermined=(*directions.undetermined, *["emittance"] * (not e.determined)),
+        waist_bracketed=evidence.bracketed,
+        phase_coverage=phase_coverage(
+            points.r11, points.r12, float(numbers.value[2]), float(numbers.value[3])
+        ),
+        undetermined=(*directions.undetermined, *["emittance"] * (not evidence.determined)),
         next_measurement=advice,
     )
 
 
-def _quantiles(post: PlanePosterior, places: tuple, spread: np.ndarray) -> np.ndarray:
+def _quantiles(posterior: PlanePosterior, places: tuple, spread: np.ndarray) -> np.ndarray:
     """Quantiles `QUANTILES` of every quantity, shape (5, 11)."""
-    weight = post.weight
+    weight = posterior.weight
     with np.errstate(invalid="ignore", divide="ignore"):
-        numbers = quantities_of(post.sigma.T, *places)
+        numbers = quantities_of(posterior.sigma.T, *places)
     if spread.any():
         # Normal quantiles at equal steps in golden-ratio order, which is unrelated to the draws'.
         z = ndtri((0.5 + np.arange(len(weight)) * 0.6180339887498949) % 1.0)
@@ -277,7 +296,7 @@ def _quantiles(post: PlanePosterior, places: tuple, spread: np.ndarray) -> np.nd
             numbers = np.where(SIGNED_QUANTITIES[:, None], numbers + z * spread[:, None], scaled)
             numbers = np.where(np.isfinite(spread)[:, None], numbers, 0.0)
     emittances = [
-        emittance_quantiles(row, weight, post.zero_emittance_probability, QUANTILES)
+        emittance_quantiles(row, weight, posterior.zero_emittance_probability, QUANTILES)
         for row in numbers[:2]
     ]
     others = [weighted_quantiles(row, weight, QUANTILES) for row in numbers[2:]]
@@ -308,18 +327,20 @@ def _bad_in_other_plane(prepared: PreparedScan, plane: str, point: int) -> str:
     return ""
 
 
-def _evidence(prepared: PreparedScan, plane: str, n: PlaneNumbers, b: BestFit) -> PlaneEvidence:
+def _evidence(
+    prepared: PreparedScan, plane: str, numbers: PlaneNumbers, best: BestFit
+) -> PlaneEvidence:
     """Evidence for the verdict, with too few effective draws or an impossible emittance noted."""
-    solution, low, high = prepared.solutions[plane], float(n.low[1]), float(n.high[1])
-    p, causes = solution.points, (b.ending, b.scenario, b.open_cause, b.remedy)
-    waist = waist_bracketed(p.settings, p.screen, p.size, p.error)
-    e = PlaneEvidence(solution.posterior, solution.sizes, low, high, waist, *causes)
-    emittance = float(n.value[1])
+    solution, low, high = prepared.solutions[plane], float(numbers.low[1]), float(numbers.high[1])
+    points, causes = solution.points, (best.ending, best.scenario, best.open_cause, best.remedy)
+    waist = waist_bracketed(points.settings, points.screen, points.size, points.error)
+    evidence = PlaneEvidence(solution.posterior, solution.sizes, low, high, waist, *causes)
+    emittance = float(numbers.value[1])
     draws = solution.posterior.effective_draws
-    if e.determined and draws < LEAST_WORTH and not b.scenario:
-        return replace(e, open_cause=f"its posterior has only {draws:.0f} effective draws")
-    if not e.determined or MIN_EMITTANCE <= emittance <= MAX_EMITTANCE:
-        return e
+    if evidence.determined and draws < LEAST_WORTH and not best.scenario:
+        return replace(evidence, open_cause=f"its posterior has only {draws:.0f} effective draws")
+    if not evidence.determined or MIN_EMITTANCE <= emittance <= MAX_EMITTANCE:
+        return evidence
     too_small = emittance < MIN_EMITTANCE
     cause = (
         f"Not determined: a normalised emittance of {emittance:.2g} m is "
@@ -332,24 +353,27 @@ def _evidence(prepared: PreparedScan, plane: str, n: PlaneNumbers, b: BestFit) -
         f"(such as {real_unit} under a header that says {header_unit}) make it a million times "
         f"{'less' if too_small else 'more'}."
     )
-    return replace(e, ending=Finding(Status.unidentified, cause, remedy))
+    return replace(evidence, ending=Finding(Status.unidentified, cause, remedy))
 
 
-def _raw_errors(post: PlanePosterior, places: tuple) -> np.ndarray:
+def _raw_errors(posterior: PlanePosterior, places: tuple) -> np.ndarray:
     """Errors from the stated errors alone: sqrt(∇f C ∇f), with complex-step derivatives."""
-    if not np.isfinite(post.stated_covariance).all():
+    if not np.isfinite(posterior.stated_covariance).all():
         return np.full(len(QUANTITIES), np.nan)
-    unit = np.sqrt(np.diag(post.stated_covariance))
+    unit = np.sqrt(np.diag(posterior.stated_covariance))
     with np.errstate(invalid="ignore", divide="ignore"):
-        steps = np.array(post.best, complex)[:, None] + 1e-20j * np.diag(unit)
+        steps = np.array(posterior.best, complex)[:, None] + 1e-20j * np.diag(unit)
         slope = quantities_of(steps, *places).imag / 1e-20 / unit
-        return np.sqrt(np.sum((slope @ post.stated_covariance) * slope, axis=1))
+        return np.sqrt(np.sum((slope @ posterior.stated_covariance) * slope, axis=1))
 
 
-def _directions(p: Points, sigma: np.ndarray) -> Directions:
+def _directions(points: Points, sigma: np.ndarray) -> Directions:
     """Directions of σ that the sizes do not determine."""
     with np.errstate(divide="ignore", invalid="ignore"):
-        jacobian = np.stack(coefficients(p.r11, p.r12), -1) / (2.0 * p.weighed * p.error)[:, None]
+        jacobian = (
+            np.stack(coefficients(points.r11, points.r12), -1)
+            / (2.0 * points.weighed * points.error)[:, None]
+        )
     return scaled_directions(jacobian, np.array(sigma_units(sigma)), list(QUANTITIES)[SIGMA])
 
 
@@ -358,7 +382,7 @@ def sigma_units(sigma: np.ndarray) -> list[float]:
     return [float(sigma[0]), math.sqrt(max(float(sigma[0] * sigma[2]), 0.0)), float(sigma[2])]
 
 
-def _influence(p: Points, sigma: np.ndarray, error: float) -> Influence:
+def _influence(points: Points, sigma: np.ndarray, error: float) -> Influence:
     """Find the point without which the emittance moves most, at the weights of the fit.
 
     Notes
@@ -367,9 +391,9 @@ def _influence(p: Points, sigma: np.ndarray, error: float) -> Influence:
     changes σ by -(AᵀA)⁻¹ a_i r_i/(1 - h_i): R. D. Cook and S. Weisberg, Residuals and Influence in
     Regression (1982), eq. 2.2.3.
     """
-    scale = 0.5 / (p.weighed * p.error)
-    rows = np.stack(coefficients(p.r11, p.r12), -1) * scale[:, None]
-    residual = (p.size**2 - p.known) * scale - rows @ sigma
+    scale = 0.5 / (points.weighed * points.error)
+    rows = np.stack(coefficients(points.r11, points.r12), -1) * scale[:, None]
+    residual = (points.size**2 - points.known) * scale - rows @ sigma
     norm = np.linalg.norm(rows, axis=0)
     q, r = np.linalg.qr(rows / norm)
     redundancy = np.maximum(1.0 - np.sum(q**2, axis=1), 1e-12)
@@ -380,14 +404,16 @@ def _influence(p: Points, sigma: np.ndarray, error: float) -> Influence:
         without = np.sqrt(determinant)
         shifts = (without - math.sqrt(sigma[0] * sigma[2] - sigma[1] ** 2)) / error
     # A bad reading has no weight in the answer.
-    shifts = np.where(p.outlier_probability > 0.5, 0.0, shifts)
+    shifts = np.where(points.outlier_probability > 0.5, 0.0, shifts)
     largest = int(np.argmax(np.where(np.isnan(shifts), np.inf, np.abs(shifts))))
     if abs(shifts[largest]) <= CARRYING_SHIFT:
         return Influence()
-    return Influence(largest, p.where(largest), float(shifts[largest]), float(without[largest]))
+    return Influence(
+        largest, points.where(largest), float(shifts[largest]), float(without[largest])
+    )
 
 
-def noise_words(noise: str, scale: np.ndarray, relative: float, p: Points) -> str:
+def noise_words(noise: str, scale: np.ndarray, relative: float, points: Points) -> str:
     """Source of the errors, in a few words."""
     if noise in ("shots", "beyond"):
         source = "of the shots" if noise == "shots" else "given"
@@ -395,5 +421,5 @@ def noise_words(noise: str, scale: np.ndarray, relative: float, p: Points) -> st
     if noise != "none":
         return "given" if scale[1] <= 1.05 else f"given, × {scale[0]:.2f}"
     if relative < 0.5:
-        return f"inferred, {1e6 * float(np.median(p.error)):.2g} µm"
-    return f"inferred, {100 * float((p.error / p.weighed).mean()):.2g} % of size"
+        return f"inferred, {1e6 * float(np.median(points.error)):.2g} µm"
+    return f"inferred, {100 * float((points.error / points.weighed).mean()):.2g} % of size"

@@ -112,91 +112,101 @@ class PlaneEvidence:
         return self.of_a_beam and is_sure and useful
 
 
-def verdict(e: PlaneEvidence, remarks: str = "", advice: str = "") -> Finding:
+def verdict(evidence: PlaneEvidence, remarks: str = "", advice: str = "") -> Finding:
     """State whether a plane's sizes determine its emittance.
 
     Parameters
     ----------
-    e : PlaneEvidence
+    evidence : PlaneEvidence
         Evidence of the plane.
     remarks : str
         Further sentences on noise and points.
     advice : str
         Next measurement, in words.
     """
-    if e.ending is not None and (e.of_a_beam or e.ending.status is not Status.not_converged):
-        return e.ending
-    if e.determined:
-        return Finding(Status.converged, f"{_determined_sentence(e)} {remarks}".strip())
-    post, status = e.posterior, Status.unidentified
-    if post.cause == CURVE and post.probability[CURVE] > SURE:
+    if evidence.ending is not None and (
+        evidence.of_a_beam or evidence.ending.status is not Status.not_converged
+    ):
+        return evidence.ending
+    if evidence.determined:
+        return Finding(Status.converged, f"{_determined_sentence(evidence)} {remarks}".strip())
+    posterior, status = evidence.posterior, Status.unidentified
+    if posterior.cause == CURVE and posterior.probability[CURVE] > SURE:
         status = Status.poor_fit
-    where = f" in scenario {e.scenario}" if e.scenario else ""
-    said = f"Not determined{where}: {_undetermined_cause(e)}."
-    remedies = [advice or (_remedy(e) if not e.of_a_beam and post.separable else "")]
-    remedies += [f"Needed: {e.remedy}."] if e.remedy and e.of_a_beam else []
+    where = f" in scenario {evidence.scenario}" if evidence.scenario else ""
+    said = f"Not determined{where}: {_undetermined_cause(evidence)}."
+    remedies = [
+        advice or (_remedy(evidence) if not evidence.of_a_beam and posterior.separable else "")
+    ]
+    remedies += [f"Needed: {evidence.remedy}."] if evidence.remedy and evidence.of_a_beam else []
     return Finding(status, f"{said} {remarks}".strip(), " ".join(filter(None, remedies)))
 
 
-def _determined_sentence(e: PlaneEvidence) -> str:
+def _determined_sentence(evidence: PlaneEvidence) -> str:
     """Sentence on an emittance that is determined."""
-    where = f" in scenario {e.scenario}" if e.scenario else ""
-    if e.untested:
+    where = f" in scenario {evidence.scenario}" if evidence.scenario else ""
+    if evidence.untested:
         return (
             f"Determined{where}, but not testable: three monitors give three numbers exactly, and "
             "nothing is left to test line and stated errors by."
         )
     waist = {None: "", True: ", the waist is bracketed", False: ", the waist is not bracketed"}
-    sure = f"P > {SURE:g}" if e.beam > SURE else f"P = {e.beam:.2f}"
-    return f"Determined{where}: the sizes are those of a beam with {sure}{waist[e.bracketed]}."
+    sure = f"P > {SURE:g}" if evidence.beam > SURE else f"P = {evidence.beam:.2f}"
+    return (
+        f"Determined{where}: the sizes are those of a beam with {sure}{waist[evidence.bracketed]}."
+    )
 
 
-def _best_rival(e: PlaneEvidence) -> str:
+def _best_rival(evidence: PlaneEvidence) -> str:
     """The most probable model other than a beam, of zero emittance or not."""
-    rest = {k: v for k, v in e.posterior.probability.items() if k not in (BEAM, ZERO_EMITTANCE)}
+    rest = {
+        k: v for k, v in evidence.posterior.probability.items() if k not in (BEAM, ZERO_EMITTANCE)
+    }
     return max(rest, key=rest.__getitem__)
 
 
-def _remedy(e: PlaneEvidence) -> str:
+def _remedy(evidence: PlaneEvidence) -> str:
     """Checks to suggest where the sizes may be a rival's."""
-    rival = e.posterior.cause
-    return REMEDIES.get(_best_rival(e) if rival == BEAM and not e.three_points else rival, "")
+    rival = evidence.posterior.cause
+    return REMEDIES.get(
+        _best_rival(evidence) if rival == BEAM and not evidence.three_points else rival, ""
+    )
 
 
-def _undetermined_cause(e: PlaneEvidence) -> str:
+def _undetermined_cause(evidence: PlaneEvidence) -> str:
     """Reason why the emittance is not determined, in words."""
-    probability, rival = e.posterior.probability, e.posterior.cause
-    if not e.posterior.separable:
+    probability, rival = evidence.posterior.probability, evidence.posterior.cause
+    if not evidence.posterior.separable:
         return (
             "the settings do not separate the three numbers of the beam matrix, as if the "
             "scanned magnet were downstream of the screen or hardly moved"
         )
-    if e.three_points and not e.untested:
+    if evidence.three_points and not evidence.untested:
         return (
             "three points fit any three numbers exactly and leave nothing to judge them by; "
             "measure a fourth setting"
         )
-    other = _best_rival(e)
+    other = _best_rival(evidence)
     undecided = (
-        f"these sizes may be a beam's (P = {e.beam:.4g}, and {SURE:g} is needed), or else {other} "
-        f"(P = {probability[other]:.2g})"
+        f"these sizes may be a beam's (P = {evidence.beam:.4g}, and {SURE:g} is needed), or else "
+        f"{other} (P = {probability[other]:.2g})"
     )
-    if not e.of_a_beam:
+    if not evidence.of_a_beam:
         if rival in (BEAM, ZERO_EMITTANCE):
             return undecided
         return f"the sizes look like {rival} (P = {probability[rival]:.2g}), not like a beam's"
-    if e.open_cause:
-        return e.open_cause
-    if e.beam <= SURE:
+    if evidence.open_cause:
+        return evidence.open_cause
+    if evidence.beam <= SURE:
         if probability[other] > probability[ZERO_EMITTANCE]:
             return undecided
         no_emittance = probability[ZERO_EMITTANCE]
         return f"a beam of no emittance explains the sizes, too (P = {no_emittance:.2g})"
-    if not e.low > 0.0:
+    if not evidence.low > 0.0:
         return "the 95 % interval of the emittance begins at zero"
-    factor = e.high / e.low
+    factor = evidence.high / evidence.low
     said = f"{factor:.2g}" if factor < 100 else "more than 100"
-    waist = " and the waist is not bracketed" if e.bracketed is False else ""
+    waist = " and the waist is not bracketed" if evidence.bracketed is False else ""
     return f"the 95 % interval of the emittance spans a factor {said}{waist}"
 
 
@@ -249,22 +259,22 @@ def noise_remark(
     return ""
 
 
-def point_remarks(p: Points, carrying: str = "", without: float = math.nan) -> Iterator[str]:
+def point_remarks(points: Points, carrying: str = "", without: float = math.nan) -> Iterator[str]:
     """Name bad readings, and the point that carries the answer.
 
     Parameters
     ----------
-    p : Points
+    points : Points
         Points with their probability of being bad.
     carrying, without : str and float
         Point without which the emittance moves most, and the normalised emittance without it, m;
         NaN where the other points give none.
     """
-    bad = np.flatnonzero(p.outlier_probability > 0.5)
+    bad = np.flatnonzero(points.outlier_probability > 0.5)
     if len(bad):
         verb = "are" if len(bad) > 1 else "is"
-        said = f"{len(bad)} of {len(p.size)} readings {verb} probably bad"
-        yield f"{said}: {name_places([p.where(i) for i in bad])}."
+        said = f"{len(bad)} of {len(points.size)} readings {verb} probably bad"
+        yield f"{said}: {name_places([points.where(i) for i in bad])}."
     if carrying and math.isnan(without):
         yield f"It rests on the point at {carrying}: without it there is no answer."
     elif carrying:
