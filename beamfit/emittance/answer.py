@@ -18,6 +18,8 @@ from beamfit.emittance.comparison import (
 )
 from beamfit.emittance.model import (
     QUANTITIES,
+    SIGMA,
+    SIGMA_SLICE,
     coefficients,
     phase_coverage,
     place_optics,
@@ -40,13 +42,11 @@ from beamfit.optics.beamline import Beamline
 from beamfit.quantity import Quantity
 from beamfit.statistics import LEAST_WORTH, Directions, chi2_probability, scaled_directions
 
-# Position of σ11, σ12, σ22 in `QUANTITIES`.
-SIGMA = slice(4, 7)
 # Normalised emittances in m outside this range come from a wrong unit: rings and linacs have 1e-9
 # and more, muons before cooling 2e-2; sizes in the wrong unit change them by a factor of a million.
 MIN_EMITTANCE, MAX_EMITTANCE = 1e-10, 0.1
 # Quantities that have errors even where the emittance is not determined: σ and the screen size.
-LINEAR_QUANTITIES = np.isin(list(QUANTITIES), ("sigma11", "sigma12", "sigma22", "screen_size"))
+LINEAR_QUANTITIES = np.isin(list(QUANTITIES), (*SIGMA, "screen_size"))
 # Quantities of either sign. The others are positive: further unknowns spread them by a factor.
 SIGNED_QUANTITIES = np.isin(list(QUANTITIES), ("alpha", "sigma12", "screen_alpha"))
 # βγ, matrices to the screen and to the place of the design, and the design.
@@ -194,7 +194,7 @@ def plane_answer(
         with_error, holds and not evidence.open_cause
     )
     scale = numbers.scale if evidence.determined else 1.0
-    covariance = best.covariance if with_error[SIGMA].all() else np.full((3, 3), np.nan)
+    covariance = best.covariance if with_error[SIGMA_SLICE].all() else np.full((3, 3), np.nan)
     place = prepared.rows.places[-1]
     settings = {name: float(line[name].setting) for name in line.upto(place).magnets}
     return PlaneFit(
@@ -374,7 +374,7 @@ def _directions(points: Points, sigma: np.ndarray) -> Directions:
             np.stack(coefficients(points.r11, points.r12), -1)
             / (2.0 * points.weighed * points.error)[:, None]
         )
-    return scaled_directions(jacobian, np.array(sigma_units(sigma)), list(QUANTITIES)[SIGMA])
+    return scaled_directions(jacobian, np.array(sigma_units(sigma)), list(SIGMA))
 
 
 def sigma_units(sigma: np.ndarray) -> list[float]:

@@ -256,26 +256,23 @@ class EmittanceFit:
         return self.told.anchor.words
 
     @cached_property
-    def stated(self) -> Problem:
-        """Grey-box problem of all planes together, starting from the given line.
+    def fit(self) -> Fit:
+        """Grey-box fit; for a fit in closed form it is solved on first use."""
+        from beamfit.greybox.solve import solve
+
+        return solve(self.problem) if self.solved is None else self.solved
+
+    @cached_property
+    def problem(self) -> Problem:
+        """Grey-box problem of all planes together, as fitted or starting from the given line.
 
         Parameters of the beam are ``beam.x.l11``, ``beam.x.l21``, ``beam.x.l22``: the Cholesky
         factor of σ in units of 1e-4 (m, rad); those of a calibration are ``magnets.Q2.slope`` and
         so on.
         """
-        return self.statement.state(self.seen, self.told)
-
-    @cached_property
-    def fit(self) -> Fit:
-        """Grey-box fit; for a fit in closed form it is solved on first use."""
-        from beamfit.greybox.solve import solve
-
-        return solve(self.stated) if self.solved is None else self.solved
-
-    @property
-    def problem(self) -> Problem:
-        """Grey-box problem, as fitted if it was."""
-        return self.stated if self.solved is None else self.solved.problem
+        if self.solved is None:
+            return self.statement.state(self.seen, self.told)
+        return self.solved.problem
 
     def __getitem__(self, plane: str) -> PlaneFit:
         found = {p.plane: p for p in self.planes}

@@ -44,6 +44,8 @@ QUANTITIES = {
     "screen_size": "m",
     "mismatch": "1",
 }
+# Names of the beam matrix, and their positions in `QUANTITIES`.
+SIGMA, SIGMA_SLICE = ("sigma11", "sigma12", "sigma22"), slice(4, 7)
 
 
 def coefficients(r11: Any, r12: Any) -> tuple[Any, Any, Any]:

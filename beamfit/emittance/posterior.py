@@ -12,6 +12,7 @@ from jax import Array
 from beamfit.emittance.beam_draws import LN_T_SPREAD
 from beamfit.emittance.model import (
     QUANTITIES,
+    SIGMA,
     UNIT,
     AnswerPlaces,
     model_quantities,
@@ -39,8 +40,8 @@ from beamfit.sampling.posterior import Expected, Posterior
 from beamfit.sampling.priors import Distribution
 from beamfit.sampling.target import SamplingTarget
 
-# Names of the Cholesky factor in a model, of σ and of the derived quantities in a posterior.
-CHOLESKY, SIGMA = ("l11", "l21", "l22"), ("sigma11", "sigma12", "sigma22")
+# Names of the Cholesky factor in a model, and of the derived quantities in a posterior.
+CHOLESKY = ("l11", "l21", "l22")
 TWISS = ("emittance", "normalized_emittance", "beta", "alpha", "mismatch")
 TWISS_POSITIONS = np.array([list(QUANTITIES).index(name) for name in TWISS])
 UNDETERMINED = "the scan does not determine sigma11, sigma12 and sigma22"

@@ -12,7 +12,13 @@ import numpy as np
 
 from beamfit.answer import shown
 from beamfit.emittance.comparison import QUANTILES, PlanePosterior, weighted_quantiles
-from beamfit.emittance.model import coefficients, emittance_parts, predict_sizes, size_squared
+from beamfit.emittance.model import (
+    SIGMA,
+    coefficients,
+    emittance_parts,
+    predict_sizes,
+    size_squared,
+)
 from beamfit.emittance.results import PlaneFit
 from beamfit.emittance.statement import Scanned
 from beamfit.emittance.transport import Rows, pad_rows
@@ -20,7 +26,7 @@ from beamfit.errors import InputError, nearest
 from beamfit.optics.beamline import reduced_line
 from beamfit.sampling.posterior import Correlations
 
-NAMES = ("sigma11", "sigma12", "sigma22", "emittance", "beta", "alpha")
+NAMES = (*SIGMA, "emittance", "beta", "alpha")
 
 
 @shown

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from beamfit.answer import Row, Table, answer, cell, json_of, labelled, shown
+from beamfit.emittance.model import SIGMA
 from beamfit.errors import Status
 from beamfit.optics.beam import BeamMatrix
 from beamfit.quantity import Quantity, display_unit
@@ -278,7 +279,7 @@ class PlaneFit:
         """Each number with an error, by its name in JSON."""
         names = ("emittance", "normalized_emittance", "beta", "alpha")
         found = {name: getattr(self, name) for name in names}
-        found |= zip(("sigma11", "sigma12", "sigma22"), self.sigma, strict=True)
+        found |= zip(SIGMA, self.sigma, strict=True)
         at_screen = {f"screen_{n}": getattr(self.screen, n) for n in ("beta", "alpha", "size")}
         return found | at_screen | {"rms_residual": self.rms_residual}
 
@@ -319,7 +320,7 @@ class PlaneFit:
         names += ("rms_residual", "error_scale", "noise", "method", "weights", "mismatch")
         names += ("identifiability",)
         entry = {name: getattr(self, name) for name in ("plane", "status", "message", *names)}
-        entry |= zip(("sigma11", "sigma12", "sigma22"), self.sigma, strict=True)
+        entry |= zip(SIGMA, self.sigma, strict=True)
         entry["covariance"] = self.covariance if np.isfinite(self.covariance).all() else None
         points = {name: getattr(p, name) for name in ("settings", "units", "screen", "pull")}
         sizes = {f"{name}_m": getattr(p, name) for name in ("size", "error", "model")}

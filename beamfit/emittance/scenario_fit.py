@@ -13,10 +13,11 @@ import numpy as np
 from jax import Array
 
 from beamfit.compile_cache import SELDOM
-from beamfit.emittance.answer import SIGMA, BestFit, plane_answer, sigma_units
+from beamfit.emittance.answer import BestFit, plane_answer, sigma_units
 from beamfit.emittance.assumptions import Anchor, Assumptions
 from beamfit.emittance.model import (
-    QUANTITIES,
+    SIGMA,
+    SIGMA_SLICE,
     AnswerPlaces,
     model_quantities,
     place_optics,
@@ -132,7 +133,7 @@ def scenario_answers(of: Scanned) -> tuple[PlaneFit, ...]:
         own = Derived(*(part[i] for part in derived))
         solution = prepared.solutions[plane]
         p = solution.points
-        squared = size_squared(own.value[SIGMA], p.r11, p.r12, p.known)
+        squared = size_squared(own.value[SIGMA_SLICE], p.r11, p.r12, p.known)
         p = p.with_model(np.sqrt(np.maximum(squared, 0.0)), prepared.rows.squared)
         fitted = prepared._replace(
             solutions=prepared.solutions | {plane: solution._replace(points=p)}
@@ -160,12 +161,12 @@ def _best_fit(of: Scanned, plane: str, own: Derived) -> BestFit:
         if p.status is Status.at_limit
     )
     open_cause = "its value is decided by bounds and starting point, not by the data" + edges
-    slopes = np.nan_to_num(own.slope[SIGMA])
+    slopes = np.nan_to_num(own.slope[SIGMA_SLICE])
     return BestFit(
         value=own.value,
         spread=_further_spread(fit, plane, own, jacobian),
         covariance=slopes @ fit.covariance @ slopes.T,
-        directions=_directions(fit, own.value[SIGMA], slopes, jacobian),
+        directions=_directions(fit, own.value[SIGMA_SLICE], slopes, jacobian),
         dof=next((g.dof for g in fit.groups if g.name == record), 0.0),
         ending=_failure(scenario, assumptions, fit),
         open_cause="" if decided else open_cause,
@@ -244,7 +245,7 @@ def _directions(
     further = [i for i in np.flatnonzero(loose) if not p.names[i].startswith("beam.")]
     asked = np.vstack([slopes, np.eye(len(theta))[further]])
     units = np.array([*sigma_units(sigma), *(abs(theta[i]) or 1.0 for i in further)])
-    names = [*list(QUANTITIES)[SIGMA], *(user_name(p.names[i]) for i in further)]
+    names = [*SIGMA, *(user_name(p.names[i]) for i in further)]
     return scaled_directions(_marginal(jacobian, asked, units), np.ones(len(units)), names)
 
 

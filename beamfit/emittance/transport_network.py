@@ -16,7 +16,7 @@ import jax
 import numpy as np
 
 from beamfit.emittance.assumptions import Assumptions
-from beamfit.emittance.model import UNIT, sigma_of
+from beamfit.emittance.model import SIGMA, UNIT, sigma_of
 from beamfit.emittance.statement import PreparedScan, Scenario, beam_problem, varied_magnets
 from beamfit.emittance.transport import NetworkRows, pad_rows
 from beamfit.errors import InputError, nearest
@@ -30,7 +30,6 @@ from beamfit.optics.beamline import transfer_rows
 MAX_WEIGHT = 10.0
 # Range of the random start of a weight, as in the appendix.
 WEIGHT_START = 0.01
-SIGMA = ("sigma11", "sigma12", "sigma22")
 ELEMENTS = "ABCD"
 # Standard deviation of det T about 1.
 DETERMINANT_ERROR = 1e-3
