@@ -92,9 +92,9 @@ class Adviser(NamedTuple):
     predict: Predict
     determined: Determined
 
-    def errors(self, known: Information) -> dict[str, float]:
+    def errors(self, information: Information) -> dict[str, float]:
         """Relative error of each plane's emittance."""
-        return dict(zip(self.prepared.planes, map(float, known.relative_error), strict=True))
+        return dict(zip(self.prepared.planes, map(float, information.relative_error), strict=True))
 
     def candidates(
         self,
@@ -238,7 +238,7 @@ def draws_adviser(prepared: PreparedScan, fitted: Sequence[PlaneFit] = ()) -> Ad
         slopes.append(slope * quoted_errors.get(plane, draws_error) / draws_error)
         roots.append(rows_of(s.covariance))
     free = np.full(3 * count, np.inf)
-    known = block_diag(*roots), np.ones(count), block_diag(*slopes)
+    arrays = block_diag(*roots), np.ones(count), block_diag(*slopes)
 
     def predict(line, table, screen, energy) -> FurtherSizes:
         elements = elements_at(prepared, line, table, screen, energy)
@@ -270,7 +270,7 @@ def draws_adviser(prepared: PreparedScan, fitted: Sequence[PlaneFit] = ()) -> Ad
             for plane, already in determined_now.items()
         }
 
-    information = Information(*known, free > 0, -free, free)
+    information = Information(*arrays, free > 0, -free, free)
     return Adviser(prepared, information, predict, determined)
 
 
@@ -383,13 +383,13 @@ def linear_adviser(fit: Scanned) -> Adviser:
         return FurtherSizes(np.array(sizes), np.array(rows))
 
     return Adviser(
-        prepared, information, predict, lambda known, _: determined_planes(prepared, known)
+        prepared, information, predict, lambda after, _: determined_planes(prepared, after)
     )
 
 
-def determined_planes(prepared: PreparedScan, known: Information) -> dict[str, bool]:
+def determined_planes(prepared: PreparedScan, information: Information) -> dict[str, bool]:
     """State for each plane whether data and priors give its emittance to a useful precision."""
-    determined = (known.relative_error <= USEFUL_ERROR) & (known.share < MOST_SHARE)
+    determined = (information.relative_error <= USEFUL_ERROR) & (information.share < MOST_SHARE)
     return dict(zip(prepared.planes, map(bool, determined), strict=True))
 
 

@@ -224,14 +224,14 @@ def _optimum(
 
 
 def _sampling_statement(
-    problem: Problem, fit: Scanned, kept: Sequence[PlaneFit], asked: Sequence[PlaneFit]
+    problem: Problem, fit: Scanned, kept: Sequence[PlaneFit], requested: Sequence[PlaneFit]
 ) -> Statement:
     """Functions and names of the posterior, with remarks on planes left out."""
-    chosen = kept or asked
+    chosen = kept or requested
     planes = [p.plane for p in chosen]
     places = problem_places(problem, fit.seen, planes, fit.statement.whole_map)
     twiss = {(p.plane, name): getattr(p, name) for p in chosen for name in TWISS}
-    missing = ", ".join(f"{p.plane} plane" for p in asked if p not in kept)
+    missing = ", ".join(f"{p.plane} plane" for p in requested if p not in kept)
     sigmas = [f"{p.plane}.{name}" for p in chosen for name in SIGMA]
     factors = [f"beam.{p.plane}.{name}" for p in chosen for name in CHOLESKY]
     labels = {f"size {p.plane}": p.plane for p in chosen}

@@ -48,9 +48,9 @@ FAILED += (Status.contradictory_bounds,)
 MAX_ITERATIONS, ERROR_TOLERANCE = 3, 1e-2
 
 
-def _numbers(model: Mapping[str, Any], asked: tuple[AnswerPlaces, ...]) -> Array:
+def _numbers(model: Mapping[str, Any], places: tuple[AnswerPlaces, ...]) -> Array:
     """`QUANTITIES` of each plane."""
-    return jnp.stack([model_quantities(model, each) for each in asked])
+    return jnp.stack([model_quantities(model, each) for each in places])
 
 
 @partial(jax.jit, compiler_options=SELDOM)
@@ -126,24 +126,26 @@ def scenario_answers(of: Scanned) -> tuple[PlaneFit, ...]:
     The posterior is that of the beam through the fitted line, widened by the other unknowns.
     """
     fit, prepared = of.solved, of.seen
-    asked = problem_places(fit.problem, prepared, prepared.planes, of.statement.whole_map)
-    derived = fit.derive(_numbers, asked)
+    places = problem_places(fit.problem, prepared, prepared.planes, of.statement.whole_map)
+    derived = fit.derive(_numbers, places)
     beams = []
     for i, plane in enumerate(prepared.planes):
-        own = Derived(*(part[i] for part in derived))
+        plane_derived = Derived(*(part[i] for part in derived))
         solution = prepared.solutions[plane]
         p = solution.points
-        squared = size_squared(own.value[SIGMA_SLICE], p.r11, p.r12, p.known)
+        squared = size_squared(plane_derived.value[SIGMA_SLICE], p.r11, p.r12, p.known)
         p = p.with_model(np.sqrt(np.maximum(squared, 0.0)), prepared.rows.squared)
         fitted = prepared._replace(
             solutions=prepared.solutions | {plane: solution._replace(points=p)}
         )
-        places = map(np.asarray, place_optics(fit.model, asked[i]))
-        beams.append(plane_answer(fitted, of.line, plane, tuple(places), _best_fit(of, plane, own)))
+        optics = map(np.asarray, place_optics(fit.model, places[i]))
+        beams.append(
+            plane_answer(fitted, of.line, plane, tuple(optics), _best_fit(of, plane, plane_derived))
+        )
     return tuple(beams)
 
 
-def _best_fit(of: Scanned, plane: str, own: Derived) -> BestFit:
+def _best_fit(of: Scanned, plane: str, derived: Derived) -> BestFit:
     """Best fit of a plane, with the contribution of the scenario's other unknowns."""
     fit, assumptions, scenario, jacobian = (
         of.solved,
@@ -152,8 +154,10 @@ def _best_fit(of: Scanned, plane: str, own: Derived) -> BestFit:
         _loose_jacobian(of.solved),
     )
     record = size_records(fit.problem)[plane].name
-    decided = bool(np.isfinite(own.error[0])) and _limit_finding(fit) is None
-    effects = effect_words(fit, assumptions, float(own.value[1]), np.nan_to_num(own.slope[1]))
+    decided = bool(np.isfinite(derived.error[0])) and _limit_finding(fit) is None
+    effects = effect_words(
+        fit, assumptions, float(derived.value[1]), np.nan_to_num(derived.slope[1])
+    )
     edges = "".join(
         f"; {p.name} ends at its {p.state} bound {p.value.value:.6g} "
         f"(d(chi2/2)/d(bound) = {p.multiplier:.2g})"
@@ -161,12 +165,12 @@ def _best_fit(of: Scanned, plane: str, own: Derived) -> BestFit:
         if p.status is Status.at_limit
     )
     open_cause = "its value is decided by bounds and starting point, not by the data" + edges
-    slopes = np.nan_to_num(own.slope[SIGMA_SLICE])
+    slopes = np.nan_to_num(derived.slope[SIGMA_SLICE])
     return BestFit(
-        value=own.value,
-        spread=_further_spread(fit, plane, own, jacobian),
+        value=derived.value,
+        spread=_further_spread(fit, plane, derived, jacobian),
         covariance=slopes @ fit.covariance @ slopes.T,
-        directions=_directions(fit, own.value[SIGMA_SLICE], slopes, jacobian),
+        directions=_directions(fit, derived.value[SIGMA_SLICE], slopes, jacobian),
         dof=next((g.dof for g in fit.groups if g.name == record), 0.0),
         ending=_failure(scenario, assumptions, fit),
         open_cause="" if decided else open_cause,
@@ -178,7 +182,7 @@ def _best_fit(of: Scanned, plane: str, own: Derived) -> BestFit:
     )
 
 
-def _further_spread(fit: Fit, plane: str, own: Derived, jacobian: np.ndarray) -> np.ndarray:
+def _further_spread(fit: Fit, plane: str, derived: Derived, jacobian: np.ndarray) -> np.ndarray:
     """Standard deviation that the other unknowns add to each quantity of a plane, shape (11,).
 
     It is the variance with all parameters free minus that with only the plane's beam free.
@@ -187,8 +191,8 @@ def _further_spread(fit: Fit, plane: str, own: Derived, jacobian: np.ndarray) ->
         i for i, name in enumerate(fit.problem.names) if name.startswith(f"beam.{plane}.")
     ]
     inverse = np.linalg.pinv(jacobian[:, beam_columns])
-    beam_variance = np.sum((np.nan_to_num(own.slope)[:, beam_columns] @ inverse) ** 2, axis=1)
-    total = np.nan_to_num(own.error, nan=np.inf) ** 2
+    beam_variance = np.sum((np.nan_to_num(derived.slope)[:, beam_columns] @ inverse) ** 2, axis=1)
+    total = np.nan_to_num(derived.error, nan=np.inf) ** 2
     return np.sqrt(np.maximum(total - beam_variance, 0.0))
 
 
@@ -243,10 +247,10 @@ def _directions(
     p, theta = fit.problem, fit.theta
     loose = ~p.nuisance & (p.lower < p.upper)
     further = [i for i in np.flatnonzero(loose) if not p.names[i].startswith("beam.")]
-    asked = np.vstack([slopes, np.eye(len(theta))[further]])
+    quantities = np.vstack([slopes, np.eye(len(theta))[further]])
     units = np.array([*sigma_units(sigma), *(abs(theta[i]) or 1.0 for i in further)])
     names = [*SIGMA, *(user_name(p.names[i]) for i in further)]
-    return scaled_directions(_marginal(jacobian, asked, units), np.ones(len(units)), names)
+    return scaled_directions(_marginal(jacobian, quantities, units), np.ones(len(units)), names)
 
 
 def _loose_jacobian(fit: Fit) -> np.ndarray:

@@ -51,13 +51,13 @@ def steady_settings(scan: QuadScan) -> QuadScan:
     if not scan.settings:
         return scan
     values = np.stack(list(scan.settings.values()), -1)
-    held = np.ptp(values, axis=0) <= READBACK_TOLERANCE * np.abs(values).max(0)
-    held &= [scan.units[name] != KNOB for name in scan.settings]
-    if held.all():  # no magnet moved enough: the rows are no repeats
+    constant = np.ptp(values, axis=0) <= READBACK_TOLERANCE * np.abs(values).max(0)
+    constant &= [scan.units[name] != KNOB for name in scan.settings]
+    if constant.all():  # no magnet moved enough: the rows are no repeats
         return scan
     # Range of evenly spaced settings, from the median deviation: robust against one wrong cell.
     span = 4.0 * np.median(np.abs(values - np.median(values, axis=0)), axis=0)
-    tolerance = np.where(held, np.inf, READBACK_TOLERANCE * span)
+    tolerance = np.where(constant, np.inf, READBACK_TOLERANCE * span)
     step = np.abs(np.diff(values, axis=0))
     if not np.any((step <= tolerance).all(1) & (step > 0).any(1)):
         return scan

@@ -134,12 +134,12 @@ def verdict(evidence: PlaneEvidence, remarks: str = "", advice: str = "") -> Fin
     if posterior.cause == CURVE and posterior.probability[CURVE] > SURE:
         status = Status.poor_fit
     where = f" in scenario {evidence.scenario}" if evidence.scenario else ""
-    said = f"Not determined{where}: {_undetermined_cause(evidence)}."
+    sentence = f"Not determined{where}: {_undetermined_cause(evidence)}."
     remedies = [
         advice or (_remedy(evidence) if not evidence.of_a_beam and posterior.separable else "")
     ]
     remedies += [f"Needed: {evidence.remedy}."] if evidence.remedy and evidence.of_a_beam else []
-    return Finding(status, f"{said} {remarks}".strip(), " ".join(filter(None, remedies)))
+    return Finding(status, f"{sentence} {remarks}".strip(), " ".join(filter(None, remedies)))
 
 
 def _determined_sentence(evidence: PlaneEvidence) -> str:
@@ -205,9 +205,9 @@ def _undetermined_cause(evidence: PlaneEvidence) -> str:
     if not evidence.low > 0.0:
         return "the 95 % interval of the emittance begins at zero"
     factor = evidence.high / evidence.low
-    said = f"{factor:.2g}" if factor < 100 else "more than 100"
+    factor_text = f"{factor:.2g}" if factor < 100 else "more than 100"
     waist = " and the waist is not bracketed" if evidence.bracketed is False else ""
-    return f"the 95 % interval of the emittance spans a factor {said}{waist}"
+    return f"the 95 % interval of the emittance spans a factor {factor_text}{waist}"
 
 
 def noise_remark(
@@ -273,8 +273,8 @@ def point_remarks(points: Points, carrying: str = "", without: float = math.nan)
     bad = np.flatnonzero(points.outlier_probability > 0.5)
     if len(bad):
         verb = "are" if len(bad) > 1 else "is"
-        said = f"{len(bad)} of {len(points.size)} readings {verb} probably bad"
-        yield f"{said}: {name_places([points.where(i) for i in bad])}."
+        bad_count = f"{len(bad)} of {len(points.size)} readings {verb} probably bad"
+        yield f"{bad_count}: {name_places([points.where(i) for i in bad])}."
     if carrying and math.isnan(without):
         yield f"It rests on the point at {carrying}: without it there is no answer."
     elif carrying:

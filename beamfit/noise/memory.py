@@ -54,7 +54,7 @@ STATED_READINGS = 8.0
 LN_SIZE_RANGE, SIZE_NODES = np.log(30.0), 121
 
 
-def whitened(rows, apart):
+def whitened(rows, distance):
     """Transform rows with correlated errors to rows with independent errors of the same variance.
 
     Parameters
@@ -80,14 +80,14 @@ def whitened(rows, apart):
     [1.0, 1.7321, 1.1547]
     """
     shape = (-1,) + (1,) * (rows.ndim - 1)
-    memory = np.exp(-apart).reshape(shape)
-    innovation = np.sqrt(-np.expm1(-2 * apart)).reshape(shape)
+    memory = np.exp(-distance).reshape(shape)
+    innovation = np.sqrt(-np.expm1(-2 * distance)).reshape(shape)
     return np.concatenate([rows[:1], (rows[1:] - memory * rows[:-1]) / innovation])
 
 
-def log_volume(apart):
+def log_volume(distance):
     """Log determinant of the whitening matrix: -sum ln sqrt(1 - c²)."""
-    return -0.5 * np.sum(np.log(-np.expm1(-2 * apart)))
+    return -0.5 * np.sum(np.log(-np.expm1(-2 * distance)))
 
 
 def is_correlated(residuals: np.ndarray, parameters: int, seen: float = MIN_CORRELATION) -> bool:
@@ -144,19 +144,22 @@ def innovations(
     >>> innovations(np.ones(3), np.arange(3.0), CorrelatedNoise(1.0, 1.0))[0].tolist()
     [1.0, 1.0, 1.0]
     """
-    apart = np.diff(time) / noise.time
-    (size, below), whitened_rows = _factor(noise.white, *_whitening(apart)), whitened(rows, apart)
+    distance = np.diff(time) / noise.time
+    (size, below), whitened_rows = (
+        _factor(noise.white, *_whitening(distance)),
+        whitened(rows, distance),
+    )
     band = np.stack([np.ones_like(size), np.append(below, 0.0)])
     white = dtbtrs(band, whitened_rows.reshape(len(whitened_rows), -1), uplo="L", diag="U")[0]
     white = white / np.sqrt(size)[:, None]
-    volume = 0.5 * float(np.sum(np.log(size))) - float(log_volume(apart))
+    volume = 0.5 * float(np.sum(np.log(size))) - float(log_volume(distance))
     return white.reshape(whitened_rows.shape), volume
 
 
-def _whitening(apart: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _whitening(distance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Main diagonal and subdiagonal of the matrix of `whitened`."""
-    innovation = np.sqrt(-np.expm1(-2 * apart))
-    return np.append(1.0, 1.0 / innovation), np.append(0.0, -np.exp(-apart) / innovation)
+    innovation = np.sqrt(-np.expm1(-2 * distance))
+    return np.append(1.0, 1.0 / innovation), np.append(0.0, -np.exp(-distance) / innovation)
 
 
 def _factor(
@@ -189,7 +192,7 @@ def filtered(rows: jax.Array, time: jax.Array, noise: CorrelatedNoise) -> jax.Ar
     return jax.lax.scan(step, start, (rows, memory))[1]
 
 
-def white_shares(apart, ratios=BESIDE) -> np.ndarray:
+def white_shares(distance, ratios=BESIDE) -> np.ndarray:
     """Shares of white variance, from its ratio to the variance gained by the correlated part.
 
     Parameters
@@ -208,7 +211,7 @@ def white_shares(apart, ratios=BESIDE) -> np.ndarray:
     >>> white_shares([np.log(2.0)], [0.0, 1.0]).round(6).tolist()
     [[0.0, 0.428571]]
     """
-    white = np.outer(-np.expm1(-2.0 * np.asarray(apart)), ratios)
+    white = np.outer(-np.expm1(-2.0 * np.asarray(distance)), ratios)
     return white / (1.0 + white)
 
 
@@ -261,10 +264,10 @@ def products_by_each(
     matrix, volumes = [], []
     for time, same_time in groupby(noises, key=lambda noise: noise.time):
         with np.errstate(divide="ignore"):
-            apart = interval / time
-        whitened_rows = np.asfortranarray(whitened(rows, apart).reshape(len(rows), -1))
+            distance = interval / time
+        whitened_rows = np.asfortranarray(whitened(rows, distance).reshape(len(rows), -1))
         columns = whitened_rows.T.reshape(*rows.shape[1:], -1)
-        diagonals, volume = _whitening(apart), float(log_volume(apart))
+        diagonals, volume = _whitening(distance), float(log_volume(distance))
         for noise in same_time:
             size, below = _factor(noise.white, *diagonals)
             solved = dpttrs(size, below, whitened_rows)[0] if noise.white else whitened_rows

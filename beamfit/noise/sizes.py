@@ -379,39 +379,41 @@ def shot_means(shots: np.ndarray, noise: Noise = Noise()) -> ShotMeans | None:  
     >>> (found.size * 1e4).round(3).tolist(), found.bad[1].round(2).tolist()
     ([1.0, 2.02, 3.0], [0.0, 0.0, 1.0])
     """
-    there = ~np.isnan(shots)
-    value = np.where(there, shots, 0.0)
+    measured = ~np.isnan(shots)
+    value = np.where(measured, shots, 0.0)
     middle = np.nanmedian(np.where(shots > 0.0, shots, np.nan), axis=1)
-    if (there.sum(1) - 1.0).clip(0).sum() < 3 or not np.any(np.nan_to_num(shots - middle[:, None])):
+    if (measured.sum(1) - 1.0).clip(0).sum() < 3 or not np.any(
+        np.nan_to_num(shots - middle[:, None])
+    ):
         return None
     max_size = MAX_SHOT_RATIO * float(np.max(middle))
-    good, mean = there.astype(float), middle
+    good, mean = measured.astype(float), middle
     deviation = np.maximum(_initial_scatter(shots, middle), 1e-6 * middle)
     for _ in range(MAX_ITERATIONS):
         freedom = _freedom(good)
         z = (value - mean[:, None]) / deviation[:, None]
         density = log_student(z, freedom) - np.log(deviation / max_size)[:, None]
         odds = math.log(noise.bad_shot / (1.0 - noise.bad_shot)) - density
-        last, good = good, np.where(there, expit(-odds), 0.0)
+        last, good = good, np.where(measured, expit(-odds), 0.0)
         mean = _means(value, good, middle)
         deviation = _scatter(value, good, mean, (freedom + 1.0) / (freedom + z**2))
         if np.max(np.abs(good - last)) < 1e-6:
             break
     deviation = _scatter(value, good, mean)
     count = np.maximum(good.sum(1), 0.5)
-    doubtful = (good * (there - good) * (value - mean[:, None]) ** 2).sum(1) / count**2
+    doubtful = (good * (measured - good) * (value - mean[:, None]) ** 2).sum(1) / count**2
     error = np.sqrt(deviation**2 / count + doubtful)
     # Shots that all disagree: some are bad, but nothing shows which.
     ambiguous = good.sum(1) < 1.0
-    number = there.sum(1)
-    plain_mean = (value * there).sum(1) / number
-    plain_scatter = np.sqrt((there * (value - plain_mean[:, None]) ** 2).sum(1) / number)
+    number = measured.sum(1)
+    plain_mean = (value * measured).sum(1) / number
+    plain_scatter = np.sqrt((measured * (value - plain_mean[:, None]) ** 2).sum(1) / number)
     mean, error = (
         np.where(ambiguous, plain_mean, mean),
         np.where(ambiguous, np.maximum(plain_scatter, deviation), error),
     )
-    good = np.where(ambiguous[:, None], 0.5 * there, good)
-    bad = np.where(there, 1.0 - good, np.nan)
+    good = np.where(ambiguous[:, None], 0.5 * measured, good)
+    bad = np.where(measured, 1.0 - good, np.nan)
     return ShotMeans(mean, error, bad, float(np.median(deviation / mean)))
 
 
