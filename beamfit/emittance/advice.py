@@ -190,14 +190,14 @@ class BeamSpread(NamedTuple):
     """Draws of σ, shape (d, 3), normalised deviations from the mean, weights, and covariance."""
 
     sigma: np.ndarray
-    off: np.ndarray
+    deviation: np.ndarray
     weight: np.ndarray
     covariance: np.ndarray
 
     def slope(self, values: np.ndarray) -> np.ndarray:
         """Regress values of the draws, shape (..., d), on σ; slopes of shape (..., 3)."""
         middle = values @ self.weight
-        covariances = (values - middle[..., None]) * self.weight @ self.off
+        covariances = (values - middle[..., None]) * self.weight @ self.deviation
         return np.linalg.solve(self.covariance, covariances.T).T
 
 
@@ -207,9 +207,11 @@ def beam_spread(prepared: PreparedScan, plane: str) -> BeamSpread:
     sigma, weight = post.sigma, post.weight
     # Each number in units of its rms, so that the covariance is well conditioned.
     unit = np.sqrt(weight @ sigma**2)
-    off = (sigma - weight @ sigma) / unit
-    covariance = (weight[:, None] * off).T @ off
-    return BeamSpread(sigma, off, weight, covariance + 1e-12 * np.trace(covariance) * np.eye(3))
+    deviation = (sigma - weight @ sigma) / unit
+    covariance = (weight[:, None] * deviation).T @ deviation
+    return BeamSpread(
+        sigma, deviation, weight, covariance + 1e-12 * np.trace(covariance) * np.eye(3)
+    )
 
 
 def draws_adviser(prepared: PreparedScan, fitted: Sequence[PlaneFit] = ()) -> Adviser:
@@ -310,10 +312,10 @@ def simulate_further(
     solution = prepared.solutions[plane]
     old, post, n = solution.sizes, solution.posterior, len(r11)
     size = np.sqrt(size_squared(post.weight @ post.sigma, r11, r12, known))
-    off = relative_error(prepared, plane) * size
-    size = size + off * (-1.0) ** np.arange(n)
+    further_error = relative_error(prepared, plane) * size
+    size = size + further_error * (-1.0) ** np.arange(n)
     rows = [np.append(v, w) for v, w in zip(old[:4], (r11, r12, known, size), strict=True)]
-    error = None if old.error is None else np.append(old.error, off)
+    error = None if old.error is None else np.append(old.error, further_error)
     sizes = PlaneSizes(*rows, error, old.of_shots, old.moved)
     [found] = compare([sizes], prepared.noise)
     drawn, none = emittances(found.sigma), found.zero_emittance_probability

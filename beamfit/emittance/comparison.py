@@ -106,10 +106,10 @@ def curve_evidences(u: np.ndarray, c: Coordinates, kind: NoiseKind, noise: Noise
     levels = np.linspace(-4.0, 4.0, 65)
     spread = np.maximum(x.std(-1, ddof=1), 0.02)[..., None] / math.sqrt(n) * 2.5
     mu = mean[..., None] + levels * spread
-    off = x[..., None, :] - mu[..., None]
+    residual = x[..., None, :] - mu[..., None]
 
     def at_levels(scale: np.ndarray) -> np.ndarray:
-        return log_likelihood(off, off, level_kind, scale, noise)
+        return log_likelihood(residual, residual, level_kind, scale, noise)
 
     scales = posterior_scales(level_kind, c.unit.shape, at_levels)
     at_level = log_average(at_levels(scales.scale), scales.log_weight[..., None, :])
@@ -151,18 +151,20 @@ def _process_evidence(
     log_det = np.log(ratio).sum(-1) + np.log1p(oo) + np.log(variance).sum(-1)[..., None]
     log = -0.5 * (qq - qo**2 / (1.0 + oo) + log_det + n * LN_2PI)
     q, one = q / ratio @ transposed, one / ratio @ transposed
-    off = q - one * (qo / (1.0 + oo))[..., None]
+    weighted = q - one * (qo / (1.0 + oo))[..., None]
     precision = 1.0 / ratio @ transposed**2 - one**2 / (1.0 + oo)[..., None]
-    log = log_average(log + bad_reading_gain(off, precision, noise), -math.log(len(amplitudes)))
+    log = log_average(
+        log + bad_reading_gain(weighted, precision, noise), -math.log(len(amplitudes))
+    )
     return log_average(log, scales.log_weight)
 
 
-def bad_reading_gain(off: np.ndarray, precision: np.ndarray, noise: Noise) -> np.ndarray:
+def bad_reading_gain(weighted: np.ndarray, precision: np.ndarray, noise: Noise) -> np.ndarray:
     """Log of the factor by which one bad reading may raise a likelihood, shape (..., n) to (...).
 
     Parameters
     ----------
-    off, precision : ndarray
+    weighted, precision : ndarray
         Shape (..., n): K⁻¹y and the diagonal of K⁻¹, for readings y of covariance K in units of
         their noise level.
     noise : Noise
@@ -176,9 +178,11 @@ def bad_reading_gain(off: np.ndarray, precision: np.ndarray, noise: Noise) -> np
     precision = np.maximum(precision, 1e-12)
     variance = noise.width**2 + 1.0 / precision - 1.0
     bad = math.log(noise.bad / (1.0 - noise.bad)) + 0.5 * math.log(2.0 / math.pi)
-    bad = bad - 0.5 * np.log(variance * precision) - np.log1p((off / precision) ** 2 / variance)
-    bad = np.logaddexp.reduce(bad + 0.5 * off**2 / precision, axis=-1)
-    return np.logaddexp(0.0, bad) + off.shape[-1] * math.log1p(-noise.bad)
+    bad = (
+        bad - 0.5 * np.log(variance * precision) - np.log1p((weighted / precision) ** 2 / variance)
+    )
+    bad = np.logaddexp.reduce(bad + 0.5 * weighted**2 / precision, axis=-1)
+    return np.logaddexp(0.0, bad) + weighted.shape[-1] * math.log1p(-noise.bad)
 
 
 def departure_odds(

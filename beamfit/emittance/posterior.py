@@ -87,9 +87,9 @@ class PlaneLikelihood:
         sigma = sigma_of(model["beam"][self.plane])
         squared = size_squared(sigma, *(v[self.used] for v in self.rows.elements(model)))
         size = jnp.sqrt(jnp.maximum(squared, 1e-300))[None] / self.unit
-        off, parts = self.size[None] - size, []
+        residual, parts = self.size[None] - size, []
         for kind, nodes in zip(self.kinds, self.scales, strict=True):
-            log = log_likelihood(off, size, kind, nodes.scale, self.noise)[0]
+            log = log_likelihood(residual, size, kind, nodes.scale, self.noise)[0]
             parts.append(log_average(log, nodes.log_weight) + kind.log_weight)
         log_t = jnp.log(jnp.maximum(self.trace @ sigma, 1e-300))
         determinant = jnp.maximum(sigma[0] * sigma[2] - sigma[1] ** 2, 1e-300)

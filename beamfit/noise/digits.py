@@ -27,14 +27,14 @@ def digit_of(values: np.ndarray) -> float | None:
         return None
     steps = np.diff(levels)
     step, steps = float(steps.min()), steps[:MAX_DIFFERENCES]
-    off = np.abs(steps / step - np.round(steps / step))
+    remainder = np.abs(steps / step - np.round(steps / step))
     if levels.size <= values.size / 2:
-        return step if float(np.median(off)) < 0.1 else None
-    while off.max() >= MULTIPLE_TOLERANCE:  # the largest common divisor
-        step *= float(off[off >= MULTIPLE_TOLERANCE].min())
+        return step if float(np.median(remainder)) < 0.1 else None
+    while remainder.max() >= MULTIPLE_TOLERANCE:  # the largest common divisor
+        step *= float(remainder[remainder >= MULTIPLE_TOLERANCE].min())
         if step < MIN_DIGIT * np.abs(levels).max():
             return None
-        off = np.abs(steps / step - np.round(steps / step))
+        remainder = np.abs(steps / step - np.round(steps / step))
     line = levels.size == values.size and steps.max() < 1.5 * step
     return None if line else step
 

@@ -243,12 +243,12 @@ def _points_first(values: Any, xp: Any) -> Any:
     return xp.reshape(xp.reshape(points, (-1,)), points.shape)
 
 
-def log_likelihood(off: Any, model: Any, kind: NoiseKind, scale: Any, noise: Noise) -> Any:
+def log_likelihood(residual: Any, model: Any, kind: NoiseKind, scale: Any, noise: Noise) -> Any:
     """Log likelihood of sizes at each noise scale, averaged over bad readings.
 
     Parameters
     ----------
-    off, model : array
+    residual, model : array
         Shape (..., d, n): measured minus predicted sizes, and predicted sizes, of d draws.
     kind : NoiseKind
         With arrays of shape (..., n).
@@ -268,20 +268,20 @@ def log_likelihood(off: Any, model: Any, kind: NoiseKind, scale: Any, noise: Noi
     good-and-bad-data model of D. W. Hogg, J. Bovy and D. Lang, arXiv:1008.4686 (2010), eq. 17,
     with a width proportional to the noise level.
     """
-    xp = off.__array_namespace__()
-    n = off.shape[-1]
+    xp = residual.__array_namespace__()
+    n = residual.shape[-1]
     found = n * (math.log1p(-noise.bad) - 0.5 * LN_2PI)
     if kind.power:
-        off = off / model
+        residual = residual / model
         found = found - xp.sum(xp.log(model), axis=-1)[..., None]
     if kind.slow:
         whitener = whitening(slow_covariance(kind, scale))
         log_determinant = xp.sum(xp.log(xp.linalg.diagonal(whitener)), axis=-1)[..., None, :]
-        pull = (off[..., None, :, :] @ xp.swapaxes(whitener, -1, -2)) ** 2
+        pull = (residual[..., None, :, :] @ xp.swapaxes(whitener, -1, -2)) ** 2
         return found + log_determinant - 0.5 * xp.swapaxes(xp.sum(pull, axis=-1), -1, -2)
     variance = variance_of(kind, scale)
     # Points come first, so that sums over them run along memory.
-    squared = _points_first(off**2, xp)[..., None, :]
+    squared = _points_first(residual**2, xp)[..., None, :]
     density = _points_first(1.0 / variance, xp)[..., None] * squared
     density = xp.exp(-0.5 * density) + bad_density(density, noise)
     log = -0.5 * xp.sum(xp.log(variance), axis=-1)[..., None]
