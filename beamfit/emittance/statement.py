@@ -446,7 +446,7 @@ def plane_sizes(prepared: PreparedScan, plane: str) -> tuple[PlaneSizes, ShotMea
             error = np.sqrt(pooled_variance(square, freedom, size) / (freedom + 1.0))
     counted = scan.shots is not None and bool((np.asarray(scan.shots) > 1).any())
     of_shots = shots is not None or (error is not None and counted)
-    screens = {prepared.rows.places[j] for j in prepared.rows.which[at]}
+    screens = {prepared.rows.places[j] for j in prepared.rows.screen_index[at]}
     moved = any(np.ptp(v[at]) > 0 for v in scan.settings.values()) or len(screens) < 3
     return PlaneSizes(r11, r12, known, size, error, of_shots, moved), shots
 
@@ -463,7 +463,7 @@ def _plane_solution(
     points = Points(
         settings={name: v[at] for name, v in scan.settings.items()},
         units={name: SETTING_UNITS[scan.units[name]] for name in scan.settings},
-        screen=tuple(prepared.rows.places[j] for j in prepared.rows.which[at]),
+        screen=tuple(prepared.rows.places[j] for j in prepared.rows.screen_index[at]),
         size=sizes.size,
         error=post.error,
         weighed=post.model if by_model else sizes.size,

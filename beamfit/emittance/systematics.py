@@ -460,14 +460,16 @@ def _roll_changes(fit: Scanned, plane: str, known_slope: np.ndarray) -> dict[str
     for name in names if len(beams) == 2 else ():
         position = order.index(name)
         places = (*order[max(position - 1, 0) : position], name, *rows.places)
-        downstream = np.array([order.index(place) > position for place in rows.places])[rows.which]
+        downstream = np.array([order.index(place) > position for place in rows.places])[
+            rows.screen_index
+        ]
         planes = np.asarray(transfer_rows(line, rows.settings, rows.energy, places).planes)
         r = np.moveaxis(planes[..., :2, :2], 1, 0)[:: -1 if plane == "y" else 1]
         before = r[:, :, 0] if position else np.broadcast_to(np.eye(2), r[:, :, 0].shape)
         after_magnet = r[:, :, min(position, 1)]
-        to_screen = r[0, np.arange(len(rows.which)), rows.which + len(places) - len(rows.places)][
-            :, :1
-        ]
+        to_screen = r[
+            0, np.arange(len(rows.screen_index)), rows.screen_index + len(places) - len(rows.places)
+        ][:, :1]
         same_plane, other_plane = after_magnet @ np.linalg.inv(before)
         from_magnet = to_screen @ np.linalg.inv(after_magnet[0])
         sin, cos = math.sin(ROLL_ANGLE), math.cos(ROLL_ANGLE)

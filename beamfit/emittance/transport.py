@@ -136,12 +136,12 @@ class Rows:
         The line, with the calibrations of the scan's columns.
     settings : dict of str to Array
         Magnet name to settings, shape (n,), or (n, 2) with the branch.
-    energy, which, spread, resolution : Array
+    energy, screen_index, spread, resolution : Array
         MeV, index into places, relative momentum spread and point-spread rms in m, shape (n,).
     damping : Array
         sqrt(βγ/βγ_row), shape (n,): size of the beam in the row over that at the scan's mean
         energy, for one normalised emittance.
-    given : Array or None
+    transfer : Array or None
         Shape (2, n, 3): R11, R12 and R16 of both planes if the rows have matrices of their own.
     """
 
@@ -151,11 +151,11 @@ class Rows:
     line: Beamline
     settings: Any
     energy: Any
-    which: Any
+    screen_index: Any
     spread: Any
     resolution: Any
     damping: Any
-    given: Any = None
+    transfer: Any = None
 
     def elements(self, model: Mapping[str, Any]) -> tuple[Array, Array, Array]:
         """Damped R11 and R12, and known size² (m²), of each row, shape (n,), for a model."""
@@ -167,10 +167,10 @@ class Rows:
 
     def both_planes(self, line: Beamline, energy: Array) -> Array:
         """R11, R12 and R16 of both planes through a line, shape (2, n, 3), unless given."""
-        if self.given is not None:
-            return self.given
+        if self.transfer is not None:
+            return self.transfer
         planes = transfer_rows(line, self.settings, energy, self.places).planes
-        return jnp.moveaxis(planes[jnp.arange(len(self.energy)), :, self.which, 0], 1, 0)
+        return jnp.moveaxis(planes[jnp.arange(len(self.energy)), :, self.screen_index, 0], 1, 0)
 
     def screen_elements(
         self, r: Array, systematics: Mapping[str, Any] = MappingProxyType({})

@@ -217,7 +217,7 @@ def network_rows(prepared: PreparedScan, layout: _Layout, plane: str) -> Network
         plane,
         prepared.rows.squared,
         pad_rows(layout.columns),
-        _columns(prepared, layout, plane, prepared.rows.which),
+        _columns(prepared, layout, plane, prepared.rows.screen_index),
         prepared.elements[2, "xy".index(plane)],
         prepared.rows.damping,
     )
@@ -290,7 +290,7 @@ def _anchors(
     """Records that tie the network of a plane to first principles."""
     anchor, plane, at = assumptions.anchor, rows.plane, prepared.measured(rows.plane)
     i, places = prepared.planes.index(plane), len(prepared.rows.places)
-    points, which = layout.columns[at], prepared.rows.which[at]
+    points, which = layout.columns[at], prepared.rows.screen_index[at]
     line_elements = _first_principles(prepared, layout, points)[np.arange(len(at)), i, which]
     size = np.sqrt(np.mean(line_elements**2, axis=0))[: layout.elements]
 
