@@ -416,10 +416,10 @@ def _network_rows(fit: Scanned, line, plane, table, screen, energy) -> NetworkRo
     """Rows of a further size through a transport network."""
     measured, prepared, count = size_records(fit.solved.problem)[plane].data, fit.seen, len(energy)
     place = prepared.rows.places.index(screen)
-    which = next(i for i in prepared.measured(plane) if prepared.rows.screen_index[i] == place)
+    row = next(i for i in prepared.measured(plane) if prepared.rows.screen_index[i] == place)
     inputs = [table.get(n, np.full(count, prepared.energy)) for n in fit.solved.model["map"].inputs]
     known = jnp.full(count, float(np.median(np.asarray(measured.known))))
-    columns, damping = jnp.tile(measured.columns[which], (count, 1)), jnp.ones(count)
+    columns, damping = jnp.tile(measured.columns[row], (count, 1)), jnp.ones(count)
     return NetworkRows(plane, False, jnp.asarray(np.stack(inputs, -1)), columns, known, damping)
 
 

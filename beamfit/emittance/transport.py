@@ -267,7 +267,7 @@ def scan_rows(
     used = {*screens, scanned.screens[-1]} if transfer else set(screens)
     places = tuple(sorted(used, key=order.__getitem__))
     resolution = [float(getattr(scanned[s], "resolution", 0.0)) for s in places]
-    which = np.array([places.index(s) for s in screens])
+    screen_index = np.array([places.index(s) for s in screens])
 
     def column(values: Any, default: float) -> np.ndarray:
         return pad_rows(np.full(n, float(default)) if values is None else values)
@@ -284,9 +284,11 @@ def scan_rows(
         reduced_line(scanned, (*settings, *keep), energies, targets),
         {name: pad_rows(v) for name, v in settings.items()},
         energy,
-        pad_rows(which),
+        pad_rows(screen_index),
         column(scan.energy_spread, scanned.energy_spread),
-        pad_rows(np.array(resolution)[which] if scan.resolution is None else scan.resolution),
+        pad_rows(
+            np.array(resolution)[screen_index] if scan.resolution is None else scan.resolution
+        ),
         damping_of(energy, float(energy[:n].mean()), float(scanned.mass)),
         # A plane that was not measured has no rows; its matrices do not matter.
         np.stack([pad_rows(transfer.get(p, next(iter(transfer.values())))) for p in "xy"])

@@ -223,9 +223,13 @@ def network_rows(prepared: PreparedScan, layout: _Layout, plane: str) -> Network
     )
 
 
-def _columns(prepared: PreparedScan, layout: _Layout, plane: str, which: np.ndarray) -> np.ndarray:
+def _columns(
+    prepared: PreparedScan, layout: _Layout, plane: str, screen_index: np.ndarray
+) -> np.ndarray:
     """Positions of a plane's elements among the outputs, for screens given by their index."""
-    first = (prepared.planes.index(plane) * len(prepared.rows.places) + which) * layout.elements
+    first = (
+        prepared.planes.index(plane) * len(prepared.rows.places) + screen_index
+    ) * layout.elements
     return first[:, None] + np.arange(layout.elements)
 
 
@@ -290,8 +294,8 @@ def _anchors(
     """Records that tie the network of a plane to first principles."""
     anchor, plane, at = assumptions.anchor, rows.plane, prepared.measured(rows.plane)
     i, places = prepared.planes.index(plane), len(prepared.rows.places)
-    points, which = layout.columns[at], prepared.rows.screen_index[at]
-    line_elements = _first_principles(prepared, layout, points)[np.arange(len(at)), i, which]
+    points, screen_index = layout.columns[at], prepared.rows.screen_index[at]
+    line_elements = _first_principles(prepared, layout, points)[np.arange(len(at)), i, screen_index]
     size = np.sqrt(np.mean(line_elements**2, axis=0))[: layout.elements]
 
     def record(name, inputs, screens, values, sd, predict=_outputs, elements=layout.elements):
@@ -303,7 +307,13 @@ def _anchors(
         sd = anchor.deviation * size[:2]
         name = f"anchor {plane}"
         yield record(
-            name, points, which, line_elements[:, :2], sd, predict=_without_common_error, elements=2
+            name,
+            points,
+            screen_index,
+            line_elements[:, :2],
+            sd,
+            predict=_without_common_error,
+            elements=2,
         )
     for place in anchor.at:
         middle = 0.5 * (layout.box[0] + layout.box[1])
@@ -315,7 +325,7 @@ def _anchors(
         yield record(
             f"det T {plane}",
             points,
-            which,
+            screen_index,
             np.ones(len(at)),
             DETERMINANT_ERROR,
             _determinant,
