@@ -25,7 +25,7 @@ from beamfit.emittance.model import size_squared
 from beamfit.lifetime.decay_law import current
 from beamfit.lifetime.fit import fit_decay
 from beamfit.lifetime.record import DecayRecord
-from beamfit.noise.sizes import averaged, log_likelihood
+from beamfit.noise.sizes import log_average, log_likelihood
 from beamfit.sampling.posterior import Posterior
 
 WALKERS, STEPS, DISCARD, REPEATS = 32, 4000, 500, 3
@@ -127,13 +127,13 @@ def scan() -> Case:
         s11, s12, s22 = (xp.where(beam, s, t) for s, t in zip((s11, s12, s22), best, strict=True))
         model = xp.sqrt(size_squared((s11, s12, s22), p.r11, p.r12, p.known)) / post.unit
         averages = [
-            averaged(log_likelihood(size - model, model, kind, s.scale, noise), s.log_weight)
+            log_average(log_likelihood(size - model, model, kind, s.scale, noise), s.log_weight)
             + kind.log_weight
             for kind, s in kinds
         ]
         bright = xp.log(sum(t * s for t, s in zip(post.trace, (s11, s12, s22), strict=True)))
         flat = -2.0 * bright - 0.5 * bright**2 - 0.5 * xp.log(s11 * s22 - s12 * s12)
-        whole = averaged(xp.stack(averages, -1), 0.0) + flat[:, 0]
+        whole = log_average(xp.stack(averages, -1), 0.0) + flat[:, 0]
         return xp.where(beam[:, 0], whole, -xp.inf)
 
     best = [q.value for q in fit.x.sigma]

@@ -230,7 +230,7 @@ def fit_density(
     noise = noise or Noise()
     fit = fit_emittance(scan, line, noise=noise)
     scan, seen = fit.scan, fit.seen
-    r11, r12, known = seen.look
+    r11, r12, known = seen.elements
     boost, planes, lost = beta_gamma(seen.energy, seen.line.mass), [], []
     for plane in scan.planes:
         profiles, notes = mean_profiles(scan, plane)

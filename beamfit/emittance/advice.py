@@ -1,8 +1,8 @@
-"""Advice on what to measure next: one adviser for the sentence of a fit, a plan, and a live scan.
+"""Advice on the next measurement, for the message of a fit, a plan, and a live scan.
 
-Every candidate is one more measured size of each plane, with the relative error the scan has. Where
-nothing but the beam is unknown it is judged by the draws of the posterior, else by derivatives of
-the scenario's problem, so that the advice holds for calibrations and networks as well.
+A candidate is one more measured size in each plane, with the relative error of the scan. Where only
+the beam is unknown, candidates are rated by the draws of its posterior. Otherwise they are rated by
+derivatives of the scenario's problem, which covers calibrations and networks.
 """
 
 from __future__ import annotations
@@ -15,7 +15,14 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.linalg import block_diag
 
-from beamfit.emittance.comparison import AT, BEAM, FLAT, PlaneSizes, compare, emittance_quantiles
+from beamfit.emittance.comparison import (
+    BEAM,
+    QUANTILES,
+    ZERO_EMITTANCE,
+    PlaneSizes,
+    compare,
+    emittance_quantiles,
+)
 from beamfit.emittance.model import emittance_parts, predict_sizes, sigma_of, size_squared
 from beamfit.emittance.results import PlaneFit, in_words
 from beamfit.emittance.statement import PreparedScan, Scanned, size_records, varied_magnets
@@ -29,14 +36,14 @@ from beamfit.optics.beamline import Beamline
 from beamfit.quantity import NORMAL_REACH
 from beamfit.statistics import USEFUL
 
-# Candidates reach half the scanned range beyond either end.
-REACH, COUNT = 0.5, 41
-# A setting below this share of the range is the rounding of zero.
-ROUNDING = 1e-9
-# A further size is known no better than this share of itself.
-SHARPEST = 1e-4
-# The error of ln ε whose 95 % interval spans the factor within which an emittance is of use.
-NARROW = float(np.log(USEFUL)) / (2.0 * NORMAL_REACH)
+# Candidate settings: extension beyond either end as a share of the scanned range, and their number.
+MAX_EXTENSION, CANDIDATES = 0.5, 41
+# A candidate setting below this share of the range is zero but for rounding.
+SETTING_TOLERANCE = 1e-9
+# Smallest relative error assumed for a further size.
+MIN_SIZE_ERROR = 1e-4
+# Largest error of ln ε for which the 95 % interval spans no more than the useful factor.
+USEFUL_ERROR = float(np.log(USEFUL)) / (2.0 * NORMAL_REACH)
 
 
 class Candidate(NamedTuple):
@@ -48,45 +55,46 @@ class Candidate(NamedTuple):
     words: str
 
 
-class Further(NamedTuple):
-    """Further sizes of each plane: predicted, m, shape (planes, m), and their rows of a Jacobian.
+class FurtherSizes(NamedTuple):
+    """Predicted further sizes of each plane, m, shape (planes, m), and their Jacobian rows.
 
-    ``rows`` has the derivatives by the free numbers over the sizes' errors, (planes, m, n).
+    ``rows`` holds derivatives with respect to the free parameters over the errors of the sizes,
+    shape (planes, m, n).
     """
 
     size: np.ndarray
     rows: np.ndarray
 
 
-# Further sizes on a line, at settings, on a screen, at energies (MeV).
-Predict = Callable[[Beamline, Mapping[str, np.ndarray], str, np.ndarray], Further]
-# Which planes are determined, by what is known and by what is measured further.
-Judge = Callable[[Information, Sequence[Candidate]], dict[str, bool]]
+# Predicts sizes on a line, at settings, on a screen, at energies (MeV).
+Predict = Callable[[Beamline, Mapping[str, np.ndarray], str, np.ndarray], FurtherSizes]
+# States which planes are determined, given the information and further measurements.
+Determined = Callable[[Information, Sequence[Candidate]], dict[str, bool]]
 
 
 class Adviser(NamedTuple):
-    """Information on the emittances of a scan, to which further sizes add.
+    """Information on the emittances of a scan, and predictions of further sizes.
 
     Attributes
     ----------
-    seen : PreparedScan
+    prepared : PreparedScan
         The scan through its line.
     information : Information
-        Of their emittances.
+        Information on the emittances.
     predict : callable
-        Further sizes, with their rows for the information.
+        Predicts further sizes, with their rows for the information.
     determined : callable
-        Which planes are determined, by what is known and what is measured further.
+        States which planes are determined, given the information and further measurements.
     """
 
-    seen: PreparedScan
+    prepared: PreparedScan
     information: Information
     predict: Predict
-    determined: Judge
+    determined: Determined
 
-    def errors(self, known: Information) -> dict[str, float]:
+    def errors(self, information: Information) -> dict[str, float]:
         """Relative error of each plane's emittance."""
-        return dict(zip(self.seen.planes, map(float, known.relative_error), strict=True))
+        return dict(zip(self.prepared.planes, map(float, information.relative_error), strict=True))
 
     def candidates(
         self,
@@ -94,60 +102,67 @@ class Adviser(NamedTuple):
         screens: Iterable[str],
         energies: Iterable[float] = (),
     ) -> tuple[list[Candidate], np.ndarray]:
-        """List single further measurements with their rows, of shape (candidates, planes, n).
+        """List single further measurements, and their rows of shape (candidates, planes, n).
 
-        Where no limits are given, those in which no size exceeds the largest measured one of
-        either plane, if there are any: screens have edges. Bad readings, and sizes that are no
-        beam's, are none.
+        Without limits, candidates are restricted to sizes no larger than the largest measured one
+        of either plane, because screens have edges; if none remains, all are listed. Bad readings
+        and sizes of no beam do not count as measured.
         """
         found, rows, screens = [], [], tuple(screens)
-        largest = max(_largest(self.seen, plane) for plane in self.seen.planes)
-        for table in candidate_settings(self.seen.scan.settings, limits).values():
+        largest = max(_largest(self.prepared, plane) for plane in self.prepared.planes)
+        for table in candidate_settings(self.prepared.scan.settings, limits).values():
             rows_of_table = zip(*table.values(), strict=True)
             points = [dict(zip(table, map(float, row), strict=True)) for row in rows_of_table]
-            for screen, energy in product(screens, (self.seen.energy, *energies)):
-                further = self.predict(self.seen.scanned, table, screen, np.full(COUNT, energy))
+            for screen, energy in product(screens, (self.prepared.energy, *energies)):
+                further = self.predict(
+                    self.prepared.scanned, table, screen, np.full(CANDIDATES, energy)
+                )
                 usable = (further.size <= largest).all(axis=0)
                 usable |= limits is not None or not usable.any()
                 rows += list(further.rows.swapaxes(0, 1)[usable])
                 where = f" on {screen}" if len(screens) > 1 else ""
-                where += f" at {energy:g} MeV" if energy != self.seen.energy else ""
+                where += f" at {energy:g} MeV" if energy != self.prepared.energy else ""
                 for i in np.flatnonzero(usable):
-                    words = settings_in_words(self.seen, points[i]) + where
+                    words = settings_in_words(self.prepared, points[i]) + where
                     found.append(Candidate(points[i], screen, float(energy), words))
         return found, np.array(rows)
 
 
-def _largest(seen: PreparedScan, plane: str) -> float:
-    """The largest size of a plane's beam that its screens have shown, m."""
-    p, likely = seen.solutions[plane].points, seen.solutions[plane].posterior.probability
-    beams = likely[BEAM] + likely[FLAT] > 0.5
+def _largest(prepared: PreparedScan, plane: str) -> float:
+    """Largest good size of a plane, m; infinite if the sizes are not a beam's."""
+    p, probability = (
+        prepared.solutions[plane].points,
+        prepared.solutions[plane].posterior.probability,
+    )
+    of_a_beam = probability[BEAM] + probability[ZERO_EMITTANCE] > 0.5
     good = p.size[p.outlier_probability <= 0.5]
-    return float(np.max(good, initial=0.0)) if beams else np.inf
+    return float(np.max(good, initial=0.0)) if of_a_beam else np.inf
 
 
-def settings_in_words(seen: PreparedScan, settings: Mapping[str, float], digits: int = 4) -> str:
+def settings_in_words(
+    prepared: PreparedScan, settings: Mapping[str, float], digits: int = 4
+) -> str:
     """Settings with the units of the scan."""
-    return in_words(settings, setting_units(seen.scanned, settings), digits)
+    return in_words(settings, setting_units(prepared.scanned, settings), digits)
 
 
 def candidate_settings(
     settings: Mapping[str, np.ndarray],
     limits: Mapping[str, tuple[float, float]] | None = None,
 ) -> dict[str, dict[str, np.ndarray]]:
-    """Settings to consider: one magnet after the other over its range, the others held.
+    """Candidate settings: each magnet over its range in turn, the others at their median.
 
     Parameters
     ----------
     settings : mapping of str to ndarray
-        The settings already measured.
+        Measured settings.
     limits : mapping of str to (float, float), optional
-        Magnets and their ranges; each scanned one, half its range beyond either end if None.
+        Magnets and their ranges; each scanned one, extended by half its range, if None.
 
     Returns
     -------
     dict of str to dict
-        For each magnet the settings of all, each of shape (41,). The others stay at their median.
+        For each magnet the settings of all magnets, each of shape (41,).
 
     Examples
     --------
@@ -156,163 +171,179 @@ def candidate_settings(
     (['Q'], [-1.0, 3.0])
     """
     if limits is None:
-        spans = {n: (v.min(), v.max(), REACH * np.ptp(v)) for n, v in settings.items()}
-        limits = {n: (low - far, high + far) for n, (low, high, far) in spans.items() if far > 0}
-    held = {n: np.full(COUNT, np.median(v)) for n, v in settings.items()}
+        spans = {n: (v.min(), v.max(), MAX_EXTENSION * np.ptp(v)) for n, v in settings.items()}
+        limits = {
+            n: (low - extension, high + extension)
+            for n, (low, high, extension) in spans.items()
+            if extension > 0
+        }
+    fixed = {n: np.full(CANDIDATES, np.median(v)) for n, v in settings.items()}
     found = {}
     for name, (low, high) in limits.items():
-        values = np.linspace(low, high, COUNT)
-        values[np.abs(values) < ROUNDING * (high - low)] = 0.0
-        found[name] = held | {name: values}
+        values = np.linspace(low, high, CANDIDATES)
+        values[np.abs(values) < SETTING_TOLERANCE * (high - low)] = 0.0
+        found[name] = fixed | {name: values}
     return found
 
 
 class BeamSpread(NamedTuple):
-    """Draws of σ, shape (d, 3), how far off their mean in units of each, weights, covariance."""
+    """Draws of σ, shape (d, 3), normalised deviations from the mean, weights, and covariance."""
 
     sigma: np.ndarray
-    off: np.ndarray
+    deviation: np.ndarray
     weight: np.ndarray
     covariance: np.ndarray
 
     def slope(self, values: np.ndarray) -> np.ndarray:
-        """Derivatives by σ of what draws give, shape (..., d) to (..., 3): the regression on it."""
+        """Regress values of the draws, shape (..., d), on σ; slopes of shape (..., 3)."""
         middle = values @ self.weight
-        across = (values - middle[..., None]) * self.weight @ self.off
-        return np.linalg.solve(self.covariance, across.T).T
+        covariances = (values - middle[..., None]) * self.weight @ self.deviation
+        return np.linalg.solve(self.covariance, covariances.T).T
 
 
-def spread_of(seen: PreparedScan, plane: str) -> BeamSpread:
-    """Draws of a plane's beam about their mean."""
-    post = seen.solutions[plane].posterior
+def beam_spread(prepared: PreparedScan, plane: str) -> BeamSpread:
+    """Draws of a plane's beam, normalised about their mean."""
+    post = prepared.solutions[plane].posterior
     sigma, weight = post.sigma, post.weight
-    # In units of each number, so that a covariance can be solved with.
+    # Each number in units of its rms, so that the covariance is well conditioned.
     unit = np.sqrt(weight @ sigma**2)
-    off = (sigma - weight @ sigma) / unit
-    covariance = (weight[:, None] * off).T @ off
-    return BeamSpread(sigma, off, weight, covariance + 1e-12 * np.trace(covariance) * np.eye(3))
+    deviation = (sigma - weight @ sigma) / unit
+    covariance = (weight[:, None] * deviation).T @ deviation
+    return BeamSpread(
+        sigma, deviation, weight, covariance + 1e-12 * np.trace(covariance) * np.eye(3)
+    )
 
 
-def drawn_adviser(seen: PreparedScan, fitted: Sequence[PlaneFit] = ()) -> Adviser:
-    """Advise by the draws of the beams, where nothing else is unknown.
+def draws_adviser(prepared: PreparedScan, fitted: Sequence[PlaneFit] = ()) -> Adviser:
+    """Build an adviser from the draws of the beams, where nothing else is unknown.
 
     Parameters
     ----------
-    seen : PreparedScan
+    prepared : PreparedScan
         The scan through its line.
     fitted : sequence of PlaneFit
-        Its planes with the errors that are quoted; those of the draws count if none are given.
+        Planes with the errors quoted; without them the errors of the draws are used.
 
     Notes
     -----
-    A number that goes with others is known as far as its regression on them says (C. E. Rasmussen
-    and C. K. I. Williams, Gaussian Processes for Machine Learning (2006), eq. A.6): the derivatives
-    of ε and of sizes are those of the regression over the draws.
+    Derivatives of ε and of sizes are those of the linear regression over the draws (C. E. Rasmussen
+    and C. K. I. Williams, Gaussian Processes for Machine Learning (2006), eq. A.6).
     """
-    now = {p.plane: p.identifiability.determined for p in fitted}
-    quoted = {p.plane: p.emittance.relative for p in fitted if p.emittance.error}
-    beams = {plane: spread_of(seen, plane) for plane in seen.planes}
+    determined_now = {p.plane: p.identifiability.determined for p in fitted}
+    quoted_errors = {p.plane: p.emittance.relative for p in fitted if p.emittance.error}
+    beams = {plane: beam_spread(prepared, plane) for plane in prepared.planes}
     count, roots, slopes = len(beams), [], []
     for plane, s in beams.items():
         drawn = emittances(s.sigma)
         slope = s.slope(drawn / (drawn @ s.weight))
-        own = float(np.sqrt(slope @ s.covariance @ slope))
-        slopes.append(slope * quoted.get(plane, own) / own)
+        draws_error = float(np.sqrt(slope @ s.covariance @ slope))
+        slopes.append(slope * quoted_errors.get(plane, draws_error) / draws_error)
         roots.append(rows_of(s.covariance))
     free = np.full(3 * count, np.inf)
-    known = block_diag(*roots), np.ones(count), block_diag(*slopes)
+    arrays = block_diag(*roots), np.ones(count), block_diag(*slopes)
 
-    def predict(line, table, screen, energy) -> Further:
-        every = elements_at(seen, line, table, screen, energy)
+    def predict(line, table, screen, energy) -> FurtherSizes:
+        elements = elements_at(prepared, line, table, screen, energy)
         sizes, rows = [], []
         for i, (plane, s) in enumerate(beams.items()):
-            r11, r12, further = (v[:, None] for v in every["xy".index(plane)])
+            r11, r12, further = (v[:, None] for v in elements["xy".index(plane)])
             drawn = np.sqrt(size_squared(s.sigma.T, r11, r12, further))
             size = drawn @ s.weight
-            error = relative_error(seen, plane) * size
-            own = np.zeros((len(size), count, 3))
-            own[:, i] = s.slope(drawn) / error[:, None]
+            error = relative_error(prepared, plane) * size
+            plane_rows = np.zeros((len(size), count, 3))
+            plane_rows[:, i] = s.slope(drawn) / error[:, None]
             sizes.append(size)
-            rows.append(own.reshape(len(size), -1))
-        return Further(np.array(sizes), np.array(rows))
+            rows.append(plane_rows.reshape(len(size), -1))
+        return FurtherSizes(np.array(sizes), np.array(rows))
 
     def determined(_: Information, further: Sequence[Candidate]) -> dict[str, bool]:
-        if not further or all(now.values()):
-            return now
+        if not further or all(determined_now.values()):
+            return determined_now
         rows = []
         for c in further:
             table = {name: np.array([v]) for name, v in c.settings.items()}
-            rows.append(elements_at(seen, seen.scanned, table, c.screen, np.array([c.energy])))
-        every = np.concatenate(rows, axis=-1)
-        own = {plane: every["xy".index(plane)] for plane in now}
-        return {plane: sure or simulated(seen, plane, *own[plane]) for plane, sure in now.items()}
+            rows.append(
+                elements_at(prepared, prepared.scanned, table, c.screen, np.array([c.energy]))
+            )
+        elements = np.concatenate(rows, axis=-1)
+        plane_elements = {plane: elements["xy".index(plane)] for plane in determined_now}
+        return {
+            plane: already or simulate_further(prepared, plane, *plane_elements[plane])
+            for plane, already in determined_now.items()
+        }
 
-    information = Information(*known, free > 0, -free, free)
-    return Adviser(seen, information, predict, determined)
+    information = Information(*arrays, free > 0, -free, free)
+    return Adviser(prepared, information, predict, determined)
 
 
 def emittances(sigma: np.ndarray) -> np.ndarray:
-    """Emittances of σ11, σ12, σ22, shape (d, 3) to (d,); zero where they are no beam's."""
+    """Emittances of σ11, σ12, σ22, shape (d, 3) to (d,); zero if σ is not positive definite."""
     return np.sqrt(np.maximum(sigma[:, 0] * sigma[:, 2] - sigma[:, 1] ** 2, 0.0))
 
 
-def relative_error(seen: PreparedScan, plane: str) -> float:
-    """The relative error that a further size of a plane is expected to have: the scan's."""
-    p = seen.solutions[plane].points
-    return max(float(np.median(p.error / p.size)), SHARPEST)
+def relative_error(prepared: PreparedScan, plane: str) -> float:
+    """Relative error expected of a further size of a plane: the scan's median."""
+    p = prepared.solutions[plane].points
+    return max(float(np.median(p.error / p.size)), MIN_SIZE_ERROR)
 
 
 def elements_at(
-    seen: PreparedScan,
+    prepared: PreparedScan,
     line: Beamline,
     table: Mapping[str, np.ndarray],
     screen: str,
     energy: np.ndarray,
 ) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """R11, R12 and known size² of both planes at settings nobody need have measured."""
+    """R11, R12 and known size² of both planes at given settings, measured or not."""
     settings = {n: jnp.asarray(v) for n, v in table.items()}
-    rows = seen.rows_at(line, "x", screen, settings, energy)
-    return [rows.known(r) for r in np.asarray(rows.both(line, jnp.asarray(energy)))]
+    rows = prepared.rows_at(line, "x", screen, settings, energy)
+    return [
+        rows.screen_elements(r) for r in np.asarray(rows.both_planes(line, jnp.asarray(energy)))
+    ]
 
 
-def simulated(
-    seen: PreparedScan, plane: str, r11: np.ndarray, r12: np.ndarray, known: np.ndarray
+def simulate_further(
+    prepared: PreparedScan, plane: str, r11: np.ndarray, r12: np.ndarray, known: np.ndarray
 ) -> bool:
-    """Simulate further sizes, and tell if they determine the emittance of a plane.
+    """Test whether simulated further sizes would determine the emittance of a plane.
 
-    They are those that the draws predict in the mean, off by one error up and down in turn.
+    They are the sizes of the mean beam, changed by one error up and down in turn.
     """
-    work = seen.solutions[plane]
-    old, post, n = work.sizes, work.posterior, len(r11)
+    solution = prepared.solutions[plane]
+    old, post, n = solution.sizes, solution.posterior, len(r11)
     size = np.sqrt(size_squared(post.weight @ post.sigma, r11, r12, known))
-    off = relative_error(seen, plane) * size
-    size = size + off * (-1.0) ** np.arange(n)
+    further_error = relative_error(prepared, plane) * size
+    size = size + further_error * (-1.0) ** np.arange(n)
     rows = [np.append(v, w) for v, w in zip(old[:4], (r11, r12, known, size), strict=True)]
-    error = None if old.error is None else np.append(old.error, off)
+    error = None if old.error is None else np.append(old.error, further_error)
     sizes = PlaneSizes(*rows, error, old.of_shots, old.moved)
-    [found] = compare([sizes], seen.noise)
-    drawn = emittances(found.sigma)
-    low, high = emittance_quantiles(drawn, found.weight, found.flat, (AT[0], AT[-1]))
+    [found] = compare([sizes], prepared.noise)
+    drawn, none = emittances(found.sigma), found.zero_emittance_probability
+    low, high = emittance_quantiles(drawn, found.weight, none, (QUANTILES[0], QUANTILES[-1]))
     return PlaneEvidence(found, sizes, low, high).determined
 
 
-def next_measurement(seen: PreparedScan, plane: str) -> str | None:
-    """Say which further setting would help the emittance of a plane most, if one can be named."""
-    varied, screen = varied_magnets(seen.scan), seen.rows.places[-1]
-    if not varied or not seen.solutions[plane].posterior.seen:
+def next_measurement(prepared: PreparedScan, plane: str) -> str | None:
+    """Sentence on the setting that reduces the error of a plane's emittance most, if any."""
+    varied, screen = varied_magnets(prepared.scan), prepared.rows.places[-1]
+    if not varied or not prepared.solutions[plane].posterior.separable:
         return None
-    adviser, i = drawn_adviser(seen), seen.planes.index(plane)
+    adviser, i = draws_adviser(prepared), prepared.planes.index(plane)
     candidates, rows = adviser.candidates(None, (screen,))
-    every = adviser.information
-    alone = every._replace(value=every.value[[i]], slope=every.slope[[i]])
-    best = candidates[next(greedy(alone, rows)).index].settings
-    held = {name: np.median(v) for name, v in seen.scan.settings.items()}
-    magnet = next((name for name in varied if best[name] != held[name]), varied[0])
-    measured = seen.scan.settings[magnet]
+    information = adviser.information
+    plane_information = information._replace(
+        value=information.value[[i]], slope=information.slope[[i]]
+    )
+    best = candidates[next(greedy(plane_information, rows)).index].settings
+    median = {name: np.median(v) for name, v in prepared.scan.settings.items()}
+    magnet = next((name for name in varied if best[name] != median[name]), varied[0])
+    measured = prepared.scan.settings[magnet]
     inside = measured.min() <= best[magnet] <= measured.max()
-    others = settings_in_words(seen, {name: v for name, v in held.items() if name != magnet}, 3)
+    others = settings_in_words(
+        prepared, {name: v for name, v in median.items() if name != magnet}, 3
+    )
     return (
-        f"Measure next near {settings_in_words(seen, {magnet: best[magnet]}, 3)}, "
+        f"Measure next near {settings_in_words(prepared, {magnet: best[magnet]}, 3)}, "
         f"{'inside' if inside else 'beyond'} the scanned range"
         f"{f', with {others} at {screen}' if others else ''}: this single point reduces the error "
         "most."
@@ -320,56 +351,60 @@ def next_measurement(seen: PreparedScan, plane: str) -> str | None:
 
 
 def linear_adviser(fit: Scanned) -> Adviser:
-    """Advise by derivatives of a scenario's problem.
+    """Build an adviser from derivatives of a scenario's problem.
 
-    Numbers that the data do not determine end anywhere; what a measurement would tell is then
-    asked of the line and the beam one started from.
+    Where the data do not determine the parameters, their fitted values are arbitrary. The
+    derivatives are then taken at the start: the given line and the closed-form beam.
     """
-    seen, solved, p = fit.seen, fit.solved, fit.solved.problem
-    theta, held = solved.theta, p.lower == p.upper
+    prepared, solved, p = fit.seen, fit.solved, fit.solved.problem
+    theta, fixed = solved.theta, p.lower == p.upper
     if all(plane.identifiability.determined for plane in fit.planes):
         edge = np.array([v.state in ("lower", "upper") for v in solved.variables])
-        held = held | (edge & p.nuisance)
+        fixed = fixed | (edge & p.nuisance)
     else:
-        stated = fit.statement.state(seen, fit.told)
-        theta = np.clip(stated.start, stated.lower, stated.upper)
+        start_problem = fit.statement.state(prepared, fit.told)
+        theta = np.clip(start_problem.start, start_problem.lower, start_problem.upper)
     information = Information(
         assess.slopes(p, theta).residual_jacobian,
         *value_and_slope(p, _emittances, theta),
-        ~p.nuisance & ~held,
+        ~p.nuisance & ~fixed,
         p.lower,
         p.upper,
-        held,
+        fixed,
         np.isin(np.array(p.names), [prior.name for prior in p.priors]),
     )
     rows_at_settings = _line_rows if fit.statement.whole_map else _network_rows
 
-    def predict(line, table, screen, energy) -> Further:
+    def predict(line, table, screen, energy) -> FurtherSizes:
         sizes, rows = [], []
-        for plane in seen.planes:
+        for plane in prepared.planes:
             data = rows_at_settings(fit, line, plane, table, screen, energy)
             size, slope = value_and_slope(p, predict_sizes, theta, data)
-            rows.append(slope / (relative_error(seen, plane) * size)[:, None])
+            rows.append(slope / (relative_error(prepared, plane) * size)[:, None])
             sizes.append(1e-6 * size)
-        return Further(np.array(sizes), np.array(rows))
+        return FurtherSizes(np.array(sizes), np.array(rows))
 
-    return Adviser(seen, information, predict, lambda known, _: determined_by(seen, known))
+    return Adviser(
+        prepared, information, predict, lambda after, _: determined_planes(prepared, after)
+    )
 
 
-def determined_by(seen: PreparedScan, known: Information) -> dict[str, bool]:
-    """Tell of each plane if its emittance rests on data and priors, within a factor of use."""
-    clear = (known.relative_error <= NARROW) & (known.share < MOST_SHARE)
-    return dict(zip(seen.planes, map(bool, clear), strict=True))
+def determined_planes(prepared: PreparedScan, information: Information) -> dict[str, bool]:
+    """State for each plane whether data and priors give its emittance to a useful precision."""
+    determined = (information.relative_error <= USEFUL_ERROR) & (information.share < MOST_SHARE)
+    return dict(zip(prepared.planes, map(bool, determined), strict=True))
 
 
 def _emittances(model, data):
+    """Emittance of each plane of a model."""
     return jnp.stack([emittance_parts(sigma_of(beam))[0] for beam in model["beam"].values()])
 
 
 def _line_rows(fit: Scanned, line, plane, table, screen, energy) -> Rows:
+    """Rows of a further size through the line."""
     measured = size_records(fit.solved.problem)[plane].data
     shapes = {n: np.ndim(v) for n, v in measured.settings.items()}
-    # Where a magnet has branches, a further point is measured on the rising one.
+    # For a magnet with hysteresis, a further point is measured on the rising branch.
     settings = {
         n: jnp.stack([v, jnp.ones(len(v))], -1) if shapes.get(n) == 2 else jnp.asarray(v)
         for n, v in table.items()
@@ -378,15 +413,16 @@ def _line_rows(fit: Scanned, line, plane, table, screen, energy) -> Rows:
 
 
 def _network_rows(fit: Scanned, line, plane, table, screen, energy) -> NetworkRows:
-    measured, seen, count = size_records(fit.solved.problem)[plane].data, fit.seen, len(energy)
-    place = seen.rows.places.index(screen)
-    which = next(i for i in seen.measured(plane) if seen.rows.which[i] == place)
-    inputs = [table.get(n, np.full(count, seen.energy)) for n in fit.solved.model["map"].inputs]
+    """Rows of a further size through a transport network."""
+    measured, prepared, count = size_records(fit.solved.problem)[plane].data, fit.seen, len(energy)
+    place = prepared.rows.places.index(screen)
+    row = next(i for i in prepared.measured(plane) if prepared.rows.screen_index[i] == place)
+    inputs = [table.get(n, np.full(count, prepared.energy)) for n in fit.solved.model["map"].inputs]
     known = jnp.full(count, float(np.median(np.asarray(measured.known))))
-    columns, damping = jnp.tile(measured.columns[which], (count, 1)), jnp.ones(count)
+    columns, damping = jnp.tile(measured.columns[row], (count, 1)), jnp.ones(count)
     return NetworkRows(plane, False, jnp.asarray(np.stack(inputs, -1)), columns, known, damping)
 
 
 def adviser_of(fit: Scanned) -> Adviser:
-    """Give the adviser of a fit, in any scenario."""
-    return drawn_adviser(fit.seen, fit.planes) if fit.solved is None else linear_adviser(fit)
+    """Adviser of a fit, for any scenario."""
+    return draws_adviser(fit.seen, fit.planes) if fit.solved is None else linear_adviser(fit)

@@ -1,4 +1,4 @@
-"""From the posterior of a plane to its result: the one way of every scenario."""
+"""Result of a plane from its posterior, for all scenarios."""
 
 from __future__ import annotations
 
@@ -10,19 +10,26 @@ import numpy as np
 from scipy.special import ndtri
 
 from beamfit.emittance.advice import next_measurement
-from beamfit.emittance.comparison import AT, PlanePosterior, emittance_quantiles, weighted_quantiles
+from beamfit.emittance.comparison import (
+    QUANTILES,
+    PlanePosterior,
+    emittance_quantiles,
+    weighted_quantiles,
+)
 from beamfit.emittance.model import (
     QUANTITIES,
-    asked_places,
+    SIGMA,
+    SIGMA_SLICE,
     coefficients,
-    numbers_of,
     phase_coverage,
+    place_optics,
+    quantities_of,
 )
 from beamfit.emittance.results import Identifiability, PlaneFit, Points, ScreenTwiss
-from beamfit.emittance.statement import PreparedScan, asked_of
+from beamfit.emittance.statement import PreparedScan, answer_places
 from beamfit.emittance.transport import setting_units
 from beamfit.emittance.verdict import (
-    CARRIES,
+    CARRYING_SHIFT,
     PlaneEvidence,
     noise_remark,
     point_remarks,
@@ -35,36 +42,37 @@ from beamfit.optics.beamline import Beamline
 from beamfit.quantity import Quantity
 from beamfit.statistics import MIN_EFFECTIVE_DRAWS, Directions, chi2_probability, scaled_directions
 
-SIGMA = slice(4, 7)
-# Normalised emittances in m beyond which only a wrong unit leads: rings and linacs have 1e-9 and
-# more, muons before cooling 2e-2; sizes a thousand times off are a million in this.
-LEAST, MOST = 1e-10, 0.1
-# What a beam of unknown emittance may have all the same: σ, and the size at the screen.
-LINEAR = np.isin(list(QUANTITIES), ("sigma11", "sigma12", "sigma22", "screen_size"))
-# Numbers of either sign; the others are positive, and spread by a factor.
-SIGNED = np.isin(list(QUANTITIES), ("alpha", "sigma12", "screen_alpha"))
-# βγ, matrices to the screen and the design's place, and the design: see `asked_places`.
+# Normalised emittances in m outside this range come from a wrong unit: rings and linacs have 1e-9
+# and more, muons before cooling 2e-2; sizes in the wrong unit change them by a factor of a million.
+MIN_EMITTANCE, MAX_EMITTANCE = 1e-10, 0.1
+# Quantities that have errors even where the emittance is not determined: σ and the screen size.
+LINEAR_QUANTITIES = np.isin(list(QUANTITIES), (*SIGMA, "screen_size"))
+# Quantities of either sign. The others are positive: further unknowns spread them by a factor.
+SIGNED_QUANTITIES = np.isin(list(QUANTITIES), ("alpha", "sigma12", "screen_alpha"))
+# βγ, matrices to the screen and to the place of the design, and the design.
 Places = tuple[Any, Any, Any, Any]
 
 
 class BestFit(NamedTuple):
-    """The best fit of a plane, with what further unknowns of a scenario add to its answer.
+    """Best fit of a plane, with the contribution of a scenario's other unknowns.
 
     Attributes
     ----------
     value, spread : ndarray
-        Shape (11,), in the order of `QUANTITIES`: best values, and standard deviations that the
-        other unknowns add to those of known transport.
+        Shape (11,), in the order of `QUANTITIES`: best values, and standard deviations to add in
+        quadrature for the other unknowns.
     covariance : ndarray
         Shape (3, 3), of σ11, σ12, σ22; in a scenario with the errors found.
     directions : Directions
-        What the data leave open.
+        Directions that the data do not determine.
     dof : float
         Degrees of freedom of the plane's sizes.
-    ending, opened, remedy, remark, scenario
-        As of `PlaneEvidence`, and a further sentence; empty where nothing else is unknown.
+    ending, open_cause, remedy, scenario
+        As in `PlaneEvidence`; empty where nothing else is unknown.
+    remark : str
+        Further sentence.
     holds : str
-        What the error includes.
+        Contributions that the error includes.
     """
 
     value: np.ndarray
@@ -73,7 +81,7 @@ class BestFit(NamedTuple):
     directions: Directions
     dof: float
     ending: Finding | None = None
-    opened: str = ""
+    open_cause: str = ""
     remedy: str = ""
     remark: str = ""
     scenario: str = ""
@@ -81,7 +89,9 @@ class BestFit(NamedTuple):
 
 
 class Influence(NamedTuple):
-    """The point without which the emittance moves most: which, where, by how many errors."""
+    """Point without which the emittance moves most, its place, the shift in errors, and the
+    emittance without it (m).
+    """
 
     point: int = 0
     place: str = ""
@@ -90,7 +100,11 @@ class Influence(NamedTuple):
 
 
 class PlaneNumbers(NamedTuple):
-    """Numbers of a plane in the order of `QUANTITIES`, each of shape (11,)."""
+    """Quantities of a plane in the order of `QUANTITIES`, each of shape (11,).
+
+    ``half`` is half of the central 68 %, ``low`` and ``high`` are the ends of the central 95 %,
+    ``raw`` is the error from the stated errors alone.
+    """
 
     value: np.ndarray
     half: np.ndarray
@@ -100,76 +114,89 @@ class PlaneNumbers(NamedTuple):
 
     @property
     def scale(self) -> float:
-        """The error of the emittance over that by the stated errors alone; 1 without."""
+        """Error of the emittance over that from the stated errors alone; 1 without them."""
         half, raw = float(self.half[0]), float(self.raw[0])
         return half / raw if math.isfinite(raw) and raw > 0 else 1.0
 
     def quantities(self, known: np.ndarray, limits: bool) -> list[Quantity]:
-        """Quantities with errors where they are known, else with intervals if the model holds."""
+        """Quantities with errors where they are known, or with intervals if the model holds."""
         found, rows = [], zip(*(part.tolist() for part in self), strict=True)
-        for (value, half, low, high, raw), unit, own in zip(
+        for (value, half, low, high, raw), unit, has_error in zip(
             rows, QUANTITIES.values(), known, strict=True
         ):
             finite = math.isfinite(low) and math.isfinite(high)
-            error = half if own and finite else None
+            error = half if has_error and finite else None
             raw = raw if error is not None and math.isfinite(raw) else None
-            ends = (low, high) if finite and (own or limits) else None
-            found.append(Quantity(value, error, unit, raw, ends))
+            interval = (low, high) if finite and (has_error or limits) else None
+            found.append(Quantity(value, error, unit, raw, interval))
         return found
 
 
-def judged_beam(seen: PreparedScan) -> tuple[PlaneFit, ...]:
-    """Answer for each plane where nothing but the beam is unknown; no program is compiled."""
+def beam_answers(prepared: PreparedScan) -> tuple[PlaneFit, ...]:
+    """Answer for each plane where only the beam is unknown; needs no compilation."""
     found = []
-    for plane in seen.planes:
-        post, p = seen.solutions[plane].posterior, seen.solutions[plane].points
-        places = asked_places({}, asked_of(seen, plane))
-        covariance = post.stated if np.isfinite(post.stated).all() else post.covariance
-        value, dof = numbers_of(post.best, *places), max(len(p.size) - 3, 0)
-        b = BestFit(value, np.zeros(len(value)), covariance, _directions(p, post.best), dof)
-        found.append(plane_answer(seen, seen.line, plane, places, b))
+    for plane in prepared.planes:
+        posterior, points = prepared.solutions[plane].posterior, prepared.solutions[plane].points
+        places = place_optics({}, answer_places(prepared, plane))
+        covariance = (
+            posterior.stated_covariance
+            if np.isfinite(posterior.stated_covariance).all()
+            else posterior.covariance
+        )
+        value, dof = quantities_of(posterior.best, *places), max(len(points.size) - 3, 0)
+        best = BestFit(
+            value, np.zeros(len(value)), covariance, _directions(points, posterior.best), dof
+        )
+        found.append(plane_answer(prepared, prepared.line, plane, places, best))
     return tuple(found)
 
 
 def plane_answer(
-    seen: PreparedScan, line: Beamline, plane: str, places: Places, b: BestFit
+    prepared: PreparedScan, line: Beamline, plane: str, places: Places, best: BestFit
 ) -> PlaneFit:
     """Answer for one plane.
 
     Parameters
     ----------
-    seen : PreparedScan
-        The scan through its line, as found.
+    prepared : PreparedScan
+        The scan through its line, as fitted.
     line : Beamline
-        The line as found.
+        The line as fitted.
     plane : str
         "x" or "y".
     places : tuple
-        Where the beam is asked for, from `asked_places`.
-    b : BestFit
-        What fits best, and what a scenario adds.
+        Optics of the places that the answer refers to.
+    best : BestFit
+        Best fit, and the contribution of a scenario.
 
     Returns
     -------
     PlaneFit
-        Errors only for what the data determine: half of the central 68 % of the posterior.
+        Errors, half of the central 68 % of the posterior, only for what the data determine.
     """
-    work = seen.solutions[plane]
-    post, p = work.posterior, work.points
-    n, carrying = _numbers(post, p, places, b)
-    e = _evidence(seen, plane, n, b)
-    asked = not b.scenario and e.of_a_beam and e.ending is None and not e.determined
-    advice = next_measurement(seen, plane) if asked else None
-    finding = verdict(e, _remarks(seen, plane, e, b, carrying, n), advice or "")
-    holds = e.of_a_beam and e.ending is None
-    known = e.determined | (LINEAR & holds & (not b.scenario))
-    emittance, normalized, beta, alpha, s11, s12, s22, *screen, mismatch = n.quantities(
-        known, holds and not e.opened
+    solution = prepared.solutions[plane]
+    posterior, points = solution.posterior, solution.points
+    numbers, carrying = _numbers(posterior, points, places, best)
+    evidence = _evidence(prepared, plane, numbers, best)
+    needs_advice = (
+        not best.scenario
+        and evidence.of_a_beam
+        and evidence.ending is None
+        and not evidence.determined
     )
-    scale = n.scale if e.determined else 1.0
-    covariance = b.covariance if known[SIGMA].all() else np.full((3, 3), np.nan)
-    place = seen.rows.places[-1]
-    own = {name: float(line[name].setting) for name in line.upto(place).magnets}
+    advice = next_measurement(prepared, plane) if needs_advice else None
+    finding = verdict(
+        evidence, _remarks(prepared, plane, evidence, best, carrying, numbers), advice or ""
+    )
+    holds = evidence.of_a_beam and evidence.ending is None
+    with_error = evidence.determined | (LINEAR_QUANTITIES & holds & (not best.scenario))
+    emittance, normalized, beta, alpha, s11, s12, s22, *screen, mismatch = numbers.quantities(
+        with_error, holds and not evidence.open_cause
+    )
+    scale = numbers.scale if evidence.determined else 1.0
+    covariance = best.covariance if with_error[SIGMA_SLICE].all() else np.full((3, 3), np.nan)
+    place = prepared.rows.places[-1]
+    settings = {name: float(line[name].setting) for name in line.upto(place).magnets}
     return PlaneFit(
         plane=plane,
         status=finding.status,
@@ -179,195 +206,214 @@ def plane_answer(
         beta=beta,
         alpha=alpha,
         sigma=(s11, s12, s22),
-        screen=ScreenTwiss(place, own, setting_units(line, own), *screen),
-        mismatch=None if getattr(seen.line.design, plane, None) is None else mismatch,
-        chi2=post.chi2 if math.isfinite(post.chi2) else None,
-        dof=round(b.dof),
-        rms_residual=Quantity(float(np.sqrt(np.mean((p.size - p.model) ** 2))), None, "m"),
-        covariance=covariance / scale**2 if b.scenario else covariance,
+        screen=ScreenTwiss(place, settings, setting_units(line, settings), *screen),
+        mismatch=None if getattr(prepared.line.design, plane, None) is None else mismatch,
+        chi2=posterior.chi2 if math.isfinite(posterior.chi2) else None,
+        dof=round(best.dof),
+        rms_residual=Quantity(
+            float(np.sqrt(np.mean((points.size - points.model) ** 2))), None, "m"
+        ),
+        covariance=covariance / scale**2 if best.scenario else covariance,
         error_scale=scale,
-        noise=noise_words(post.noise, post.scale, post.relative, p),
-        method=seen.method,
-        weights=seen.weights,
-        identifiability=_identifiability(p, n, e, advice, b.directions),
-        points=p,
-        holds=b.holds,
+        noise=noise_words(posterior.noise, posterior.scale, posterior.relative, points),
+        method=prepared.method,
+        weights=prepared.weights,
+        identifiability=_identifiability(points, numbers, evidence, advice, best.directions),
+        points=points,
+        holds=best.holds,
     )
 
 
 def _numbers(
-    post: PlanePosterior, p: Points, places: Places, b: BestFit
+    posterior: PlanePosterior, points: Points, places: Places, best: BestFit
 ) -> tuple[PlaneNumbers, Influence]:
-    """The numbers of a plane, and the point that carries them."""
-    low, *ends, high = _quantiles(post, places, b.spread)
+    """Quantities of a plane, and the point that carries the emittance."""
+    low, *ends, high = _quantiles(posterior, places, best.spread)
     half = 0.5 * (ends[2] - ends[0])
-    alone = post.positive and len(p.size) > 3
-    carrying = _influence(p, post.best, half[0]) if alone else Influence()
+    testable = posterior.positive and len(points.size) > 3
+    carrying = _influence(points, posterior.best, half[0]) if testable else Influence()
     if carrying.place:
-        low, high, half = _reaching(low, high, half, b.value, carrying.without)
-    raw = np.hypot(_raw(post, places), b.spread)
-    return PlaneNumbers(b.value, half, low, high, raw), carrying
+        low, high, half = _extend_to_carrying(low, high, half, best.value, carrying.without)
+    raw = np.hypot(_raw_errors(posterior, places), best.spread)
+    return PlaneNumbers(best.value, half, low, high, raw), carrying
 
 
 def _remarks(
-    seen: PreparedScan, plane: str, e: PlaneEvidence, b: BestFit, carrying: Influence,
-    n: PlaneNumbers,
+    prepared: PreparedScan, plane: str, evidence: PlaneEvidence, best: BestFit, carrying: Influence,
+    numbers: PlaneNumbers,
 ) -> str:  # fmt: skip
     """Further sentences on noise and points."""
-    work = seen.solutions[plane]
-    post, p, remarks = work.posterior, work.points, [work.shot_words]
-    if e.of_a_beam:
-        likely = chi2_probability(post.chi2, max(len(p.size) - 3, 0))
-        by_noise = e.determined and not b.scenario and not carrying.place
-        enlarged = n.scale if by_noise else 1.0
-        remarks.insert(0, noise_remark(post.noise, post.scale, likely, enlarged))
-        without = carrying.without * n.value[1] / n.value[0]
-        place = "" if e.opened else carrying.place
+    solution = prepared.solutions[plane]
+    posterior, points, remarks = solution.posterior, solution.points, [solution.shot_words]
+    if evidence.of_a_beam:
+        chance = chi2_probability(posterior.chi2, max(len(points.size) - 3, 0))
+        by_noise = evidence.determined and not best.scenario and not carrying.place
+        enlarged = numbers.scale if by_noise else 1.0
+        remarks.insert(0, noise_remark(posterior.noise, posterior.scale, chance, enlarged))
+        without = carrying.without * numbers.value[1] / numbers.value[0]
+        place = "" if evidence.open_cause else carrying.place
         if place:
-            place += _bad_elsewhere(seen, plane, carrying.point)
-        remarks += point_remarks(p, place, float(without))
-    remarks.append(resolution_remark(p.size, p.known))
-    remarks += [b.remark] * e.determined
+            place += _bad_in_other_plane(prepared, plane, carrying.point)
+        remarks += point_remarks(points, place, float(without))
+    remarks.append(resolution_remark(points.size, points.known))
+    remarks += [best.remark] * evidence.determined
     return " ".join(filter(None, remarks))
 
 
 def _identifiability(
-    p: Points, n: PlaneNumbers, e: PlaneEvidence, advice: str | None, directions: Directions
+    points: Points,
+    numbers: PlaneNumbers,
+    evidence: PlaneEvidence,
+    advice: str | None,
+    directions: Directions,
 ) -> Identifiability:
+    """Collect the evidence on how well the data determine the plane's emittance."""
     return Identifiability(
-        determined=e.determined,
-        probability=e.posterior.probability,
+        determined=evidence.determined,
+        probability=evidence.posterior.probability,
         singular_values=tuple(float(v) for v in directions.singular_values),
         condition=directions.condition if math.isfinite(directions.condition) else None,
-        waist_bracketed=e.bracketed,
-        phase_coverage=phase_coverage(p.r11, p.r12, float(n.value[2]), float(n.value[3])),
-        undetermined=(*directions.undetermined, *["emittance"] * (not e.determined)),
+        waist_bracketed=evidence.bracketed,
+        phase_coverage=phase_coverage(
+            points.r11, points.r12, float(numbers.value[2]), float(numbers.value[3])
+        ),
+        undetermined=(*directions.undetermined, *["emittance"] * (not evidence.determined)),
         next_measurement=advice,
     )
 
 
-def _quantiles(post: PlanePosterior, given: tuple, spread: np.ndarray) -> np.ndarray:
-    """Quantiles `AT` of every number, shape (5, 11)."""
-    weight = post.weight
+def _quantiles(posterior: PlanePosterior, places: tuple, spread: np.ndarray) -> np.ndarray:
+    """Quantiles `QUANTILES` of every quantity, shape (5, 11)."""
+    weight = posterior.weight
     with np.errstate(invalid="ignore", divide="ignore"):
-        numbers = numbers_of(post.sigma.T, *given)
+        numbers = quantities_of(posterior.sigma.T, *places)
     if spread.any():
-        # Even steps of a normal distribution, in an order that has nothing to do with the draws'.
+        # Normal quantiles at equal steps in golden-ratio order, which is unrelated to the draws'.
         z = ndtri((0.5 + np.arange(len(weight)) * 0.6180339887498949) % 1.0)
         with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
             middle = np.abs(numbers @ (weight / weight.sum()))
-            grown = numbers * np.exp(z * (spread / middle)[:, None])
-            numbers = np.where(SIGNED[:, None], numbers + z * spread[:, None], grown)
+            scaled = numbers * np.exp(z * (spread / middle)[:, None])
+            numbers = np.where(SIGNED_QUANTITIES[:, None], numbers + z * spread[:, None], scaled)
             numbers = np.where(np.isfinite(spread)[:, None], numbers, 0.0)
-    emittances = [emittance_quantiles(row, weight, post.flat, AT) for row in numbers[:2]]
-    others = [weighted_quantiles(row, weight, AT) for row in numbers[2:]]
+    emittances = [
+        emittance_quantiles(row, weight, posterior.zero_emittance_probability, QUANTILES)
+        for row in numbers[:2]
+    ]
+    others = [weighted_quantiles(row, weight, QUANTILES) for row in numbers[2:]]
     return np.where(np.isfinite(spread), np.array([*emittances, *others]).T, np.nan)
 
 
-def _reaching(
+def _extend_to_carrying(
     low: np.ndarray, high: np.ndarray, half: np.ndarray, value: np.ndarray, without: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Intervals that reach to the emittance without the point that carries it."""
+    """Extend intervals to the emittance without the point that carries it."""
     shift = without - value[0]  # NaN where the others give no emittance
     reach = np.array([shift, shift * value[1] / value[0]])
     low, high, half = low.copy(), high.copy(), half.copy()
     low[:2] = np.fmin(low[:2], value[:2] + reach)
     high[:2] = np.fmax(high[:2], value[:2] + reach)
-    # Two answers, one of which is right: half of what lies between them, which is the error where
-    # a point begins to carry the answer.
-    half[:2] = np.fmax(half[:2], np.abs(reach) / CARRIES)
+    # One of two answers is right. Half of their distance equals the error at the threshold where a
+    # point begins to carry the answer.
+    half[:2] = np.fmax(half[:2], np.abs(reach) / CARRYING_SHIFT)
     return low, high, half
 
 
-def _bad_elsewhere(seen: PreparedScan, plane: str, point: int) -> str:
-    """Say in which other plane the row of a point is probably bad: both have its setting."""
-    row = seen.measured(plane)[point]
-    for other, work in seen.solutions.items():
-        if np.any(work.posterior.bad[seen.measured(other) == row] > 0.5):
+def _bad_in_other_plane(prepared: PreparedScan, plane: str, point: int) -> str:
+    """Name another plane in which the same row is probably bad: both planes share its setting."""
+    row = prepared.measured(plane)[point]
+    for other, solution in prepared.solutions.items():
+        if np.any(solution.posterior.bad[prepared.measured(other) == row] > 0.5):
             return f", which is probably bad in {other}"
     return ""
 
 
-def _evidence(seen: PreparedScan, plane: str, n: PlaneNumbers, b: BestFit) -> PlaneEvidence:
-    work, low, high = seen.solutions[plane], float(n.low[1]), float(n.high[1])
-    p, told = work.points, (b.ending, b.scenario, b.opened, b.remedy)
-    waist = waist_bracketed(p.settings, p.screen, p.size, p.error)
-    e = PlaneEvidence(work.posterior, work.sizes, low, high, waist, *told)
-    emittance = float(n.value[1])
-    worth = work.posterior.worth
-    if e.determined and worth < MIN_EFFECTIVE_DRAWS and not b.scenario:
-        opened = f"draws from its posterior are worth no more than {worth:.0f} independent ones"
-        return replace(e, opened=opened)
-    if not e.determined or LEAST <= emittance <= MOST:
-        return e
-    little = emittance < LEAST
+def _evidence(
+    prepared: PreparedScan, plane: str, numbers: PlaneNumbers, best: BestFit
+) -> PlaneEvidence:
+    """Evidence for the verdict, with too few effective draws or an impossible emittance noted."""
+    solution, low, high = prepared.solutions[plane], float(numbers.low[1]), float(numbers.high[1])
+    points, causes = solution.points, (best.ending, best.scenario, best.open_cause, best.remedy)
+    waist = waist_bracketed(points.settings, points.screen, points.size, points.error)
+    evidence = PlaneEvidence(solution.posterior, solution.sizes, low, high, waist, *causes)
+    emittance = float(numbers.value[1])
+    draws = solution.posterior.effective_draws
+    if evidence.determined and draws < MIN_EFFECTIVE_DRAWS and not best.scenario:
+        return replace(evidence, open_cause=f"its posterior has only {draws:.0f} effective draws")
+    if not evidence.determined or MIN_EMITTANCE <= emittance <= MAX_EMITTANCE:
+        return evidence
+    too_small = emittance < MIN_EMITTANCE
     cause = (
         f"Not determined: a normalised emittance of {emittance:.2g} m is "
-        f"{'less' if little else 'more'} than any accelerator has."
+        f"{'less' if too_small else 'more'} than any accelerator has."
     )
-    own, said = ("mm", "um") if little else ("um", "mm")
+    real_unit, header_unit = ("mm", "um") if too_small else ("um", "mm")
     remedy = (
-        f"Check the units of '{seen.scan.columns.get(f'size_{plane}', f'size_{plane}')}', the "
-        f"settings and the energy: sizes a thousand times too {'small' if little else 'large'} "
-        f"(such as {own} under a header that says {said}) make it a million times "
-        f"{'less' if little else 'more'}."
+        f"Check the units of '{prepared.scan.columns.get(f'size_{plane}', f'size_{plane}')}', the "
+        f"settings and the energy: sizes a thousand times too {'small' if too_small else 'large'} "
+        f"(such as {real_unit} under a header that says {header_unit}) make it a million times "
+        f"{'less' if too_small else 'more'}."
     )
-    return replace(e, ending=Finding(Status.unidentified, cause, remedy))
+    return replace(evidence, ending=Finding(Status.unidentified, cause, remedy))
 
 
-def _raw(post: PlanePosterior, given: tuple) -> np.ndarray:
-    """Errors by the stated errors alone: sqrt(∇f C ∇f), derivatives by complex steps."""
-    if not np.isfinite(post.stated).all():
+def _raw_errors(posterior: PlanePosterior, places: tuple) -> np.ndarray:
+    """Errors from the stated errors alone: sqrt(∇f C ∇f), with complex-step derivatives."""
+    if not np.isfinite(posterior.stated_covariance).all():
         return np.full(len(QUANTITIES), np.nan)
-    unit = np.sqrt(np.diag(post.stated))
+    unit = np.sqrt(np.diag(posterior.stated_covariance))
     with np.errstate(invalid="ignore", divide="ignore"):
-        steps = np.array(post.best, complex)[:, None] + 1e-20j * np.diag(unit)
-        slope = numbers_of(steps, *given).imag / 1e-20 / unit
-        return np.sqrt(np.sum((slope @ post.stated) * slope, axis=1))
+        steps = np.array(posterior.best, complex)[:, None] + 1e-20j * np.diag(unit)
+        slope = quantities_of(steps, *places).imag / 1e-20 / unit
+        return np.sqrt(np.sum((slope @ posterior.stated_covariance) * slope, axis=1))
 
 
-def _directions(p: Points, sigma: np.ndarray) -> Directions:
-    """Directions of σ that the sizes leave open."""
+def _directions(points: Points, sigma: np.ndarray) -> Directions:
+    """Directions of σ that the sizes do not determine."""
     with np.errstate(divide="ignore", invalid="ignore"):
-        jacobian = np.stack(coefficients(p.r11, p.r12), -1) / (2.0 * p.weighed * p.error)[:, None]
-    return scaled_directions(jacobian, np.array(units_of(sigma)), list(QUANTITIES)[SIGMA])
+        jacobian = (
+            np.stack(coefficients(points.r11, points.r12), -1)
+            / (2.0 * points.weighed * points.error)[:, None]
+        )
+    return scaled_directions(jacobian, np.array(sigma_units(sigma)), list(SIGMA))
 
 
-def units_of(sigma: np.ndarray) -> list[float]:
-    """A change of σ11, σ12 and σ22 by 100 %."""
+def sigma_units(sigma: np.ndarray) -> list[float]:
+    """Changes of σ11, σ12 and σ22 by 100 %; of σ12 by sqrt(σ11 σ22)."""
     return [float(sigma[0]), math.sqrt(max(float(sigma[0] * sigma[2]), 0.0)), float(sigma[2])]
 
 
-def _influence(p: Points, sigma: np.ndarray, error: float) -> Influence:
-    """Leave out each point in turn, at the weights of the fit.
+def _influence(points: Points, sigma: np.ndarray, error: float) -> Influence:
+    """Find the point without which the emittance moves most, at the weights of the fit.
 
     Notes
     -----
-    Of weighted rows a_i with residuals r_i and leverages h_i = a_iᵀ(AᵀA)⁻¹a_i, leaving out row i
+    For weighted rows a_i with residuals r_i and leverages h_i = a_iᵀ(AᵀA)⁻¹a_i, leaving out row i
     changes σ by -(AᵀA)⁻¹ a_i r_i/(1 - h_i): R. D. Cook and S. Weisberg, Residuals and Influence in
     Regression (1982), eq. 2.2.3.
     """
-    scale = 0.5 / (p.weighed * p.error)
-    rows = np.stack(coefficients(p.r11, p.r12), -1) * scale[:, None]
-    left = (p.size**2 - p.known) * scale - rows @ sigma
+    scale = 0.5 / (points.weighed * points.error)
+    rows = np.stack(coefficients(points.r11, points.r12), -1) * scale[:, None]
+    residual = (points.size**2 - points.known) * scale - rows @ sigma
     norm = np.linalg.norm(rows, axis=0)
     q, r = np.linalg.qr(rows / norm)
-    free = np.maximum(1.0 - np.sum(q**2, axis=1), 1e-12)
-    moves = np.linalg.solve(r, q.T).T * (left / free)[:, None] / norm
-    s11, s12, s22 = (sigma - moves).T
+    redundancy = np.maximum(1.0 - np.sum(q**2, axis=1), 1e-12)
+    changes = np.linalg.solve(r, q.T).T * (residual / redundancy)[:, None] / norm
+    s11, s12, s22 = (sigma - changes).T
     determinant = np.where((s11 > 0) & (s22 > 0), s11 * s22 - s12**2, np.nan)
     with np.errstate(invalid="ignore", divide="ignore"):
         without = np.sqrt(determinant)
         shifts = (without - math.sqrt(sigma[0] * sigma[2] - sigma[1] ** 2)) / error
-    # A reading that is bad already has no part in the answer.
-    shifts = np.where(p.outlier_probability > 0.5, 0.0, shifts)
-    most = int(np.argmax(np.where(np.isnan(shifts), np.inf, np.abs(shifts))))
-    if abs(shifts[most]) <= CARRIES:
+    # A bad reading has no weight in the answer.
+    shifts = np.where(points.outlier_probability > 0.5, 0.0, shifts)
+    largest = int(np.argmax(np.where(np.isnan(shifts), np.inf, np.abs(shifts))))
+    if abs(shifts[largest]) <= CARRYING_SHIFT:
         return Influence()
-    return Influence(most, p.where(most), float(shifts[most]), float(without[most]))
+    return Influence(
+        largest, points.where(largest), float(shifts[largest]), float(without[largest])
+    )
 
 
-def noise_words(noise: str, scale: np.ndarray, relative: float, p: Points) -> str:
+def noise_words(noise: str, scale: np.ndarray, relative: float, points: Points) -> str:
     """Source of the errors, in a few words."""
     if noise in ("shots", "beyond"):
         source = "of the shots" if noise == "shots" else "given"
@@ -375,5 +421,5 @@ def noise_words(noise: str, scale: np.ndarray, relative: float, p: Points) -> st
     if noise != "none":
         return "given" if scale[1] <= 1.05 else f"given, × {scale[0]:.2f}"
     if relative < 0.5:
-        return f"inferred, {1e6 * float(np.median(p.error)):.2g} µm"
-    return f"inferred, {100 * float((p.error / p.weighed).mean()):.2g} % of size"
+        return f"inferred, {1e6 * float(np.median(points.error)):.2g} µm"
+    return f"inferred, {100 * float((points.error / points.weighed).mean()):.2g} % of size"

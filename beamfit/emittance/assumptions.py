@@ -13,10 +13,10 @@ from beamfit.errors import InputError, expect, nearest
 
 
 class Entry(NamedTuple):
-    """A scenario as it is known before JAX is loaded: the module that has it, what it takes.
+    """A scenario's module and options, known without loading JAX.
 
-    ``map_free`` is that of a network of R11 and R12: such a map can be asked for a determinant,
-    gains and a box, and has no use for priors on beam and line.
+    ``map_free`` marks a network of R11 and R12. Such a map takes a determinant, gains and a box,
+    but no priors on beam and line.
     """
 
     module: str
@@ -26,7 +26,7 @@ class Entry(NamedTuple):
     map_free: bool = False
 
 
-# A further scenario is a module with a `SCENARIO` and a line here.
+# A new scenario is a module with a `SCENARIO` and a line here.
 SCENARIOS = {
     "known": Entry("statement"),
     "transport-network": Entry("transport_network", anchor=True, map_free=True),
@@ -35,47 +35,47 @@ SCENARIOS = {
 }
 
 
-# Numbers of the screen, of the beam and of elements that every scenario can free, with priors. A
-# network of R11 and R12 has those of the screen alone.
-ON_SCREEN, OF_BEAM = ("size_scale", "wire"), ("resolution", "energy")
-OF_BEAM += ("dispersion", "dispersion_slope")
-OF_ELEMENTS = (".gradient", ".length")
+# Parameters of screen, beam and elements with priors, in every scenario. A network of R11 and R12
+# takes those of the screen only.
+SCREEN_PRIORS, BEAM_PRIORS = ("size_scale", "wire"), ("resolution", "energy")
+BEAM_PRIORS += ("dispersion", "dispersion_slope")
+ELEMENT_PRIORS = (".gradient", ".length")
 
 
 def is_systematic(name: str) -> bool:
-    """Tell a prior on screen, beam or line from one on a calibration.
+    """Distinguish priors on screen, beam or line from priors on a calibration.
 
     Examples
     --------
     >>> is_systematic("size_scale"), is_systematic("D1.length"), is_systematic("Q2.slope")
     (True, True, False)
     """
-    return name in (*ON_SCREEN, *OF_BEAM) or name.endswith(OF_ELEMENTS)
+    return name in (*SCREEN_PRIORS, *BEAM_PRIORS) or name.endswith(ELEMENT_PRIORS)
 
 
-def _taking(what: str) -> str:
-    """The scenarios that take something."""
-    return " or ".join(name for name, entry in SCENARIOS.items() if getattr(entry, what))
+def _scenarios_with(field_name: str) -> str:
+    """Names of the scenarios with an option."""
+    return " or ".join(name for name, entry in SCENARIOS.items() if getattr(entry, field_name))
 
 
 @shown
 @dataclass(frozen=True)
 class Anchor:
-    """A tie of a network to first principles; without it a scan cannot tell scale from beam.
+    """A tie of a network to first principles; without it a scan cannot separate scale and beam.
 
     Parameters
     ----------
     deviation : float, optional
         Relative standard deviation of the network from first principles: of R11 and R12 in units
         of their rms over the scan (transport-network), of k1 at the largest current
-        (focusing-network). It counts twice, independent at each measured setting and once in
-        common at all of them, as a wrong energy would: that does not average out.
+        (focusing-network). It applies twice: independently at each measured setting, and once to
+        all of them in common, like a wrong energy, which does not average out.
     at : tuple of mapping, optional
         Settings, magnet name to value, at which first principles hold.
     sd : float
         Relative standard deviation there.
     determinant : bool
-        Ask for det T = 1 at every setting, with C and D two further free functions of the
+        Require det T = 1 at every setting, with C and D two further free functions of the
         network (transport-network).
 
     Raises
@@ -104,7 +104,7 @@ class Anchor:
 
     @property
     def words(self) -> str:
-        """The anchor in words; "none" if nothing is tied."""
+        """The anchor in words; "none" without a tie."""
         parts = []
         if self.deviation is not None:
             parts.append(f"first principles to {100 * self.deviation:.3g} %")
@@ -118,22 +118,23 @@ class Anchor:
 
 @dataclass(frozen=True)
 class Assumptions:
-    """Everything a scenario is told besides scan and line.
+    """Assumptions of a scenario besides scan and line.
 
     Parameters
     ----------
     priors : mapping of str to (float, float), optional
-        Calibration number, such as ``Q2.slope``, or number of screen, beam and line, such as
-        ``size_scale`` (see `beamfit.emittance.systematics.with_systematics`), to mean and
-        standard deviation. A mean of None is that of the line.
+        Calibration parameter, such as ``Q2.slope``, or parameter of screen, beam and line, such as
+        ``size_scale`` (see `beamfit.emittance.systematics.with_systematics`), to mean and standard
+        deviation. A mean of None is the line's value.
     bounds : mapping of str to (float, float), optional
-        The same to a lower and an upper bound. Of a transport network the box of the beam
+        The same to a lower and an upper bound. For a transport network the box of the beam
         (``x.sigma11`` in m² and so on) and that of its inputs (``Q2``).
     gains : mapping of str to (float, float), optional
         Gain of a transport network, such as ``dA_x/dQ2`` per unit of the setting, to lower and
-        upper limit, one of which may be infinite. The network is then the report's: its gains are
-        free but for these, which hold everywhere in the box of the inputs.
+        upper limit, one of which may be infinite. The network is then the report's: only these
+        gains are limited, everywhere in the box of the inputs.
     anchor : Anchor, optional
+        Tie of a network to first principles.
         For the networks.
     hysteresis : bool
         Whether k1 of a focusing network may differ between rising and falling current.
@@ -182,12 +183,13 @@ class Assumptions:
             if not low < high or (math.isinf(low) and math.isinf(high)):
                 expected = "a finite limit at least, lower first"
                 raise InputError(f"gain {name} = {low:g}:{high:g}", expected)
-        for name, least in (("hidden", 1), ("starts", 1), ("seed", 0)):
+        for name, minimum in (("hidden", 1), ("starts", 1), ("seed", 0)):
             value = getattr(self, name)
-            if not (isinstance(value, Integral) and value >= least):
-                raise InputError(f"{name} {value!r}", f"an integer of at least {least}")
+            if not (isinstance(value, Integral) and value >= minimum):
+                raise InputError(f"{name} {value!r}", f"an integer of at least {minimum}")
 
     def _check_types(self) -> None:
+        """Raise an error for values of a wrong type."""
         expect(self.anchor, Anchor, "beamfit.Anchor(determinant=True)")
         for kind in ("priors", "bounds", "gains"):
             expect(getattr(self, kind), Mapping, f"{kind}={{'Q2.slope': (160.0, 170.0)}}")
@@ -198,16 +200,16 @@ class Assumptions:
 
     @property
     def systematics(self) -> dict[str, tuple[float | None, float]]:
-        """The priors on screen, beam and line."""
+        """Priors on screen, beam and line."""
         return {name: prior for name, prior in self.priors.items() if is_systematic(name)}
 
     @property
     def calibrations(self) -> dict[str, tuple[float, float]]:
-        """The priors on calibrations."""
+        """Priors on calibrations."""
         return {name: prior for name, prior in self.priors.items() if not is_systematic(name)}
 
     def check_scenario(self, scenario: str) -> None:
-        """Refuse an unknown scenario, and what a scenario has no use for.
+        """Raise an error for an unknown scenario, or for assumptions that it does not take.
 
         Raises
         ------
@@ -217,23 +219,23 @@ class Assumptions:
         if scenario not in SCENARIOS:
             raise InputError(f"scenario '{scenario}'", nearest(str(scenario), list(SCENARIOS)))
         entry = SCENARIOS[scenario]
-        named = [*self.calibrations, *self.bounds]
-        beyond = [name for name in self.systematics if name not in ON_SCREEN]
-        if beyond and entry.map_free:
-            expected = f"{' or '.join(ON_SCREEN)}: R11 and R12 are free in it already"
-            raise InputError(f"a prior on {beyond[0]} with scenario {scenario}", expected)
+        calibration_names = [*self.calibrations, *self.bounds]
+        not_on_screen = [name for name in self.systematics if name not in SCREEN_PRIORS]
+        if not_on_screen and entry.map_free:
+            expected = f"{' or '.join(SCREEN_PRIORS)}: R11 and R12 are free in it already"
+            raise InputError(f"a prior on {not_on_screen[0]} with scenario {scenario}", expected)
         takes = entry.numbers or (entry.map_free and not self.calibrations)
-        if named and not takes:
+        if calibration_names and not takes:
             raise InputError(
-                f"a prior or bounds on {named[0]} with scenario {scenario}",
-                f"scenario {_taking('numbers')}, whose calibration numbers are free",
+                f"a prior or bounds on {calibration_names[0]} with scenario {scenario}",
+                f"scenario {_scenarios_with('numbers')}, whose calibration numbers are free",
             )
-        refused = (
+        checks = (
             ("an anchor", self.anchor != Anchor(), "anchor"),
             ("anchor determinant", self.anchor.determinant, "map_free"),
             ("hysteresis", self.hysteresis, "branches"),
             ("limits of gains", self.gains, "map_free"),
         )
-        for words, asked, what in refused:
-            if asked and not getattr(entry, what):
-                raise InputError(f"{words} with scenario {scenario}", _taking(what))
+        for words, given, field_name in checks:
+            if given and not getattr(entry, field_name):
+                raise InputError(f"{words} with scenario {scenario}", _scenarios_with(field_name))

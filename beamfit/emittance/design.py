@@ -1,4 +1,4 @@
-"""Plan of the next measurements: the best in turn, and which kind would identify a scenario."""
+"""Plan of the next measurements, and kinds of measurement that would identify a scenario."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from beamfit.emittance.advice import (
     Adviser,
     Candidate,
     adviser_of,
-    determined_by,
+    determined_planes,
     settings_in_words,
 )
 from beamfit.emittance.calibration import NumberKind, numbers_of_magnets
 from beamfit.emittance.fit import EmittanceFit
-from beamfit.emittance.model import spoken
+from beamfit.emittance.model import user_name
 from beamfit.emittance.statement import PreparedScan, varied_magnets
 from beamfit.emittance.targets import check_limits
 from beamfit.errors import InputError, Status, expect
@@ -26,17 +26,19 @@ from beamfit.greybox.design import Information, greedy
 from beamfit.optics.beamline import Beamline
 from beamfit.optics.elements import Drift, Screen
 
-# Other energies to consider where none is named: what a linac can usually do.
+# Other energies to consider where none is given, as shares of the scan's: what a linac usually has.
 USUAL_ENERGIES = (0.8, 1.25)
 CRITERIA = ("emittance", "D")
-# A further point that sharpens the emittance by less than this is not worth its shift time.
-LEAST_GAIN = 0.01
-PERHAPS = "In brackets: for the beam as it is best known, which the data do not determine."
-TIE = " Tie the network to first principles (--anchor first-principles=2%)."
+# A further point that reduces the error of the emittance by less is not worth its beam time.
+MIN_GAIN = 0.01
+UNDETERMINED_NOTE = (
+    "In brackets: for the beam as it is best known, which the data do not determine."
+)
+ANCHOR_ADVICE = " Tie the network to first principles (--anchor first-principles=2%)."
 
 
 def _check_settable(fit: EmittanceFit, limits: Mapping[str, tuple[float, float]]) -> None:
-    """Refuse a scan for which no settings can be told, and magnets that cannot be set."""
+    """Raise an error for scans that cannot be planned for, and for magnets that cannot be set."""
     scan, varied = fit.seen.scan, varied_magnets(fit.seen.scan)
     if scan.transfer:
         found = "advice on rows with matrices of their own"
@@ -51,103 +53,114 @@ def _check_settable(fit: EmittanceFit, limits: Mapping[str, tuple[float, float]]
 
 
 def _screens(fit: EmittanceFit) -> tuple[str, ...]:
-    """Screens to measure at: all of the line, downstream of a scanned magnet."""
+    """Screens for further sizes: all of the line downstream of a scanned magnet."""
     measured = fit.seen.rows.places
     if not fit.statement.whole_map:  # another screen has another network
         return measured
-    names, magnets = _along(fit.seen)
+    names, magnets = _magnet_positions(fit.seen)
     later = [s for s in fit.seen.scanned.screens if names.index(s) > min(magnets)]
     return tuple(dict.fromkeys((*measured, *later)))
 
 
-def _along(seen: PreparedScan) -> tuple[list[str], list[int]]:
-    """Names along the line, and where in them the scanned magnets stand."""
-    names = [e.name for e in seen.scanned.elements]
-    magnets = [m for name in varied_magnets(seen.scan) for m in seen.scanned.members(name)]
+def _magnet_positions(prepared: PreparedScan) -> tuple[list[str], list[int]]:
+    """Names of the elements along the line, and the indices of the scanned magnets."""
+    names = [e.name for e in prepared.scanned.elements]
+    magnets = [m for name in varied_magnets(prepared.scan) for m in prepared.scanned.members(name)]
     return names, [names.index(m) for m in magnets] or [-1]
 
 
 def further_options(
     fit: EmittanceFit, adviser: Adviser, energies: tuple[float, ...]
 ) -> Iterator[Prospect]:
-    """Kinds of measurement that might identify a scenario.
+    """List kinds of measurement that may identify a scenario.
 
-    A single size at every other screen, the same scan at it; the same scan at other energies;
-    where the line has no second screen, at screens one could put into its drifts; and a 2 %
-    measurement of each slope, as from a field map of the magnet.
+    These are a single size or the scan at every other screen, or at a new screen in a drift if the
+    line has no other; the scan at other energies; and a 2 % measurement of each calibration slope,
+    as from a field map of the magnet.
 
     Parameters
     ----------
     fit : EmittanceFit
-        What is measured already.
+        The measurements so far.
     adviser : Adviser
-        Of it.
+        The fit's adviser.
     energies : tuple of float
-        Energies to consider, MeV; 20 % below and 25 % above if empty.
+        Energies to consider, MeV; 20 % below and 25 % above the scan's if empty.
 
     Yields
+    ------
     ------
     Prospect
     """
 
     def prospect(words: str, rows: np.ndarray) -> Prospect:
         after = adviser.information.with_rows(rows.reshape(-1, rows.shape[-1]))
-        known = adviser.errors(after), determined_by(fit.seen, after)
-        return Prospect(words, *known, float(after.share.max()))
+        result = adviser.errors(after), determined_planes(fit.seen, after)
+        return Prospect(words, *result, float(after.share.max()))
 
-    seen, base = fit.seen, adviser.information
-    table = {n: np.asarray(v) for n, v in seen.scan.settings.items()}
-    count = len(seen.scan)
-    energy = np.full(count, seen.energy) if seen.scan.energy is None else seen.scan.energy
+    prepared, information = fit.seen, adviser.information
+    table = {n: np.asarray(v) for n, v in prepared.scan.settings.items()}
+    count = len(prepared.scan)
+    energy = (
+        np.full(count, prepared.energy) if prepared.scan.energy is None else prepared.scan.energy
+    )
     if fit.statement.whole_map:
         for line, screen, words in _other_screens(fit):
             rows = adviser.predict(line, table, screen, energy).rows
-            best = min(range(count), key=lambda i: _worst(base.with_rows(rows[:, i])))
-            at = settings_in_words(seen, {n: float(v[best]) for n, v in table.items()})
+            best = min(
+                range(count), key=lambda i: _largest_error(information.with_rows(rows[:, i]))
+            )
+            at = settings_in_words(prepared, {n: float(v[best]) for n, v in table.items()})
             yield prospect(f"one size on {words} ({at})", rows[:, best])
             yield prospect(f"the same scan on {words}", rows)
-        screen = (seen.scan.screen or seen.rows.places)[-1]
-        for each in energies or tuple(seen.energy * f for f in USUAL_ENERGIES):
-            rows = adviser.predict(seen.scanned, table, screen, np.full(count, each)).rows
-            yield prospect(f"the same scan at {each:.4g} MeV", rows)
+        screen = (prepared.scan.screen or prepared.rows.places)[-1]
+        for other in energies or tuple(prepared.energy * f for f in USUAL_ENERGIES):
+            rows = adviser.predict(prepared.scanned, table, screen, np.full(count, other)).rows
+            yield prospect(f"the same scan at {other:.4g} MeV", rows)
     slopes = {
         name: abs(number.value)
-        for name, number in numbers_of_magnets(seen.scanned).items()
+        for name, number in numbers_of_magnets(prepared.scanned).items()
         if number.kind is NumberKind.slope
     }
     for i, path in enumerate(fit.solved.problem.names if fit.solved else ()):
-        if (name := spoken(path)) in slopes:
-            row = np.zeros(len(base.lower))
+        if (name := user_name(path)) in slopes:
+            row = np.zeros(len(information.lower))
             row[i] = 1.0 / (0.02 * slopes[name])
             yield prospect(f"a prior of 2 % on {name}", row)
 
 
-def _worst(after: Information) -> float:
-    """Relative error that counts bounds as nothing: large while they decide."""
+def _largest_error(after: Information) -> float:
+    """Largest relative error, increased where bounds rather than data decide."""
     return float(after.relative_error.max() / max(1.0 - after.share.max(), 1e-6))
 
 
 def _other_screens(fit: EmittanceFit) -> list[tuple[Beamline, str, str]]:
-    """Screens that were not used, or else places for one in the drifts after the magnets."""
+    """Unused screens, or else new ones in the drifts after the magnets."""
     line = fit.seen.scanned
     unused = [s for s in _screens(fit) if s not in fit.seen.rows.places]
     if unused:
         return [(line, s, f"screen {s}") for s in unused]
-    _, magnets = _along(fit.seen)
+    _, magnets = _magnet_positions(fit.seen)
     found = []
     for i, element in enumerate(line.elements):
         if i > max(magnets) and isinstance(element, Drift) and element.length > 0.3:
             half = replace(element, length=0.5 * element.length)
-            elements = (*line.elements[:i], half, Screen("NEW"), half, *line.elements[i + 1 :])
+            elements = (
+                *line.elements[:i],
+                half,
+                Screen("NEW"),
+                half,
+                *line.elements[i + 1 :],
+            )
             words = f"a new screen in the middle of {element.name}"
             found.append((replace(line, elements=elements), "NEW", words))
     return found
 
 
 class Prospect(NamedTuple):
-    """A measurement, single or of some kind, and what it would make of the emittance.
+    """A further measurement, or a kind of it, and the emittance errors that it would leave.
 
-    ``candidate`` is that of a single one.
+    ``candidate`` is set for a single measurement.
     """
 
     words: str
@@ -158,7 +171,7 @@ class Prospect(NamedTuple):
 
     @property
     def identified(self) -> bool:
-        """True if every plane is determined then."""
+        """True if the measurement would determine every plane."""
         return all(self.determined.values())
 
     def to_json(self) -> dict[str, Any]:
@@ -178,19 +191,19 @@ class Advice:
     Attributes
     ----------
     scenario, criterion : str
-        For which unknowns, and what is made small.
+        Scenario of the fit, and quantity to minimise.
     determined : dict of str to bool
         Whether the data so far determine the emittance of each plane.
     now : dict of str to float
-        Relative emittance error of each plane so far; what bounds decide is not counted.
+        Relative emittance error of each plane so far; bounds are not counted as information.
     steps : tuple of Prospect
-        The best further measurement, then the best after that, ...
+        Best further measurement, best one after that, and so on.
     stop : str
-        Why the list ends there.
+        Reason why the list ends.
     options : tuple of Prospect
-        For a scenario that is not identified: which kind of measurement would identify it.
+        For a scenario that is not identified: kinds of measurement that may identify it.
     tie : str
-        What else could, in words.
+        Other means to identify it, in words.
     """
 
     scenario: str
@@ -234,7 +247,7 @@ class Advice:
 
     @property
     def status(self) -> Status:
-        """``converged`` where the data determine the emittance, ``unidentified`` where not."""
+        """``converged`` if the data determine the emittance, otherwise ``unidentified``."""
         return Status.converged if self.identified else Status.unidentified
 
     def to_json(self) -> dict[str, Any]:
@@ -253,7 +266,7 @@ class Advice:
         return json_of(found)
 
     def tables(self) -> tuple[Table, ...]:
-        """Lay out the errors after each measurement, and what would identify an open scenario."""
+        """Table of the errors after each measurement, and of options to identify a scenario."""
         rows = [["what is measured", *_cells(self.now, self.determined)]]
         if self.steps and not self.steps[-1].identified:
             words = f"{len(self.steps)} more points of the scan, at the best settings"
@@ -263,7 +276,7 @@ class Advice:
             for number, step in enumerate(self.steps, 1):
                 cells = _cells(step.relative_error, step.determined, self.determined)
                 rows.append([f"{number}. {step.words}", *cells])
-        note = "" if self.identified or not self.steps else PERHAPS
+        note = "" if self.identified or not self.steps else UNDETERMINED_NOTE
         steps = Table("", ["after", *self.now], rows, note, numeric=True)
         header = ["What would identify it", *(f"error {plane}" for plane in self.now), "identified"]
         rows = [
@@ -275,13 +288,15 @@ class Advice:
 
 
 def _cells(
-    error: Mapping[str, float], known: Mapping[str, bool], sure: Mapping[str, bool] | None = None
+    error: Mapping[str, float],
+    known: Mapping[str, bool],
+    determined: Mapping[str, bool] | None = None,
 ) -> list[str]:
-    """Errors of each plane; in brackets where only a further measurement would make it known."""
+    """Errors of each plane, in brackets where only a further measurement would determine it."""
     cells = {}
     for plane, e in error.items():
-        said = "{:.2f} %" if sure is None or sure[plane] else "({:.0f} %)"
-        cells[plane] = said.format(100 * e) if known[plane] else "not determined"
+        style = "{:.2f} %" if determined is None or determined[plane] else "({:.0f} %)"
+        cells[plane] = style.format(100 * e) if known[plane] else "not determined"
     return list(cells.values())
 
 
@@ -294,24 +309,24 @@ def plan_measurements(
     count: int = 5,
     energies: tuple[float, ...] = (),
 ) -> Advice:
-    """Choose further measurements one after the other, each the best given those before it.
+    """Choose further measurements one after another, each the best given those before it.
 
     Parameters
     ----------
     fit : EmittanceFit
-        What is measured already, in any scenario.
+        The measurements so far, in any scenario.
     limits : mapping of str to (float, float), optional
-        Machine limits of the magnets that may be set; the scanned magnets over and by half their
-        range beyond what was scanned if None.
+        Machine limits of the magnets that may be set; the scanned magnets over their range and half
+        of it beyond either end if None.
     criterion : {"emittance", "D"}
-        Make the emittance's error small, or the volume of the error ellipsoid of everything that
-        is asked for (the determinant of its covariance).
+        Minimise the error of the emittance, or the volume of the error ellipsoid of all requested
+        quantities (the determinant of their covariance).
     goal : float, optional
         Relative emittance error at which to stop.
     count : int
-        Most measurements.
+        Largest number of measurements.
     energies : tuple of float, optional
-        Further total energies, MeV, the beam could be measured at.
+        Further total energies, MeV, at which the beam could be measured.
 
     Returns
     -------
@@ -324,9 +339,9 @@ def plan_measurements(
 
     Notes
     -----
-    One more row g (derivatives of the size by the free numbers, over its error) turns the
-    covariance C into C - C gᵀ g C/(1 + g C gᵀ). The choice is greedy; D-optimality of a set is
-    at least (1 - 1/e) of the best set's gain (submodularity of the log-determinant).
+    One more row g (derivatives of the size with respect to the free parameters, over its error)
+    changes the covariance C to C - C gᵀ g C/(1 + g C gᵀ). The choice is greedy; its D-optimality
+    is at least (1 - 1/e) of the best set's gain (submodularity of the log-determinant).
 
     Examples
     --------
@@ -353,10 +368,13 @@ def plan_measurements(
     _check_energies(energies, float(fit.seen.line.mass))
     adviser = adviser_of(fit)
     steps, stop = best_steps(fit, adviser, limits, criterion, goal, count, energies)
-    # What is known so far is what the posterior of the fit says.
+    # The posterior of the fit states what is determined so far.
     now = {p.plane: p.identifiability.determined for p in fit.planes}
     options = () if all(now.values()) else tuple(further_options(fit, adviser, energies))
-    errors, tie = adviser.errors(adviser.information), TIE if fit.statement.network else ""
+    errors, tie = (
+        adviser.errors(adviser.information),
+        ANCHOR_ADVICE if fit.statement.network else "",
+    )
     return Advice(fit.statement.name, criterion, now, errors, steps, stop, options, tie)
 
 
@@ -369,38 +387,41 @@ def best_steps(
     count: int = 1,
     energies: tuple[float, ...] = (),
 ) -> tuple[tuple[Prospect, ...], str]:
-    """The best measurement, the best after that, and why the list ends."""
+    """The best measurement, the best after that and so on, and the reason why the list ends."""
     _check_settable(fit, limits or {})
     candidates, rows = adviser.candidates(limits, _screens(fit), energies)
-    aim = "" if goal is None else f"goal of {100 * goal:.3g} %"
+    goal_words = "" if goal is None else f"goal of {100 * goal:.3g} %"
     now, steps = adviser.information, []
-    sure = adviser.determined(now, ())
+    determined = adviser.determined(now, ())
 
-    def sharp() -> bool:
-        return goal is not None and all(sure.values()) and now.relative_error.max() <= goal
+    def goal_reached() -> bool:
+        return goal is not None and all(determined.values()) and now.relative_error.max() <= goal
 
     for choice in greedy(now, rows, criterion == "D"):
         if len(steps) == count:
             break
-        if sharp():
-            return tuple(steps), f"Stop: the {aim} is reached."
-        if all(sure.values()) and criterion == "emittance" and choice.gain < LEAST_GAIN:
+        if goal_reached():
+            return tuple(steps), f"Stop: the {goal_words} is reached."
+        if all(determined.values()) and criterion == "emittance" and choice.gain < MIN_GAIN:
             return tuple(steps), (
                 "Stop: the best further point sharpens the emittance by "
                 f"{100 * max(choice.gain, 0):.1g} %; repeat the scan instead, or improve the size "
                 "measurement."
             )
         now, candidate = choice.known, candidates[choice.index]
-        sure = adviser.determined(now, [*(s.candidate for s in steps), candidate])
-        steps.append(Prospect(candidate.words, adviser.errors(now), sure, candidate=candidate))
-    if sharp():
-        return tuple(steps), f"Stop after these: the {aim} is reached."
-    if goal is not None and all(sure.values()):
-        return tuple(steps), f"The {aim} needs more than these {count}."
+        determined = adviser.determined(now, [*(s.candidate for s in steps), candidate])
+        steps.append(
+            Prospect(candidate.words, adviser.errors(now), determined, candidate=candidate)
+        )
+    if goal_reached():
+        return tuple(steps), f"Stop after these: the {goal_words} is reached."
+    if goal is not None and all(determined.values()):
+        return tuple(steps), f"The {goal_words} needs more than these {count}."
     return tuple(steps), f"Listed are the best {count}."
 
 
 def _check_energies(energies: tuple[float, ...], rest: float) -> None:
+    """Raise an error for total energies (MeV) below the rest energy or above 10 TeV."""
     for energy in energies:
         if not rest < energy <= 1e7:
             expected = f"a total energy between {rest:.6g} MeV and 10 TeV"

@@ -1,4 +1,4 @@
-"""The emittance fit: a scan and a line in, a judged result out, in every scenario by one path."""
+"""The emittance fit: from a scan and a line to a result with errors and a verdict."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any
 
 from beamfit.answer import Table, answer, determined, json_of, labelled, quantity_frame
-from beamfit.emittance.answer import judged_beam
+from beamfit.emittance.answer import beam_answers
 from beamfit.emittance.assumptions import Anchor, Assumptions
 from beamfit.emittance.comparison import BEAM
-from beamfit.emittance.model import line_of
+from beamfit.emittance.model import line_with
 from beamfit.emittance.predicted import Prediction, correlations_of, predicted_sizes
 from beamfit.emittance.results import Parameter, PlaneFit, parameter_table, result_rows
 from beamfit.emittance.scan import QuadScan
@@ -20,14 +20,14 @@ from beamfit.emittance.statement import (
     WEIGHTS,
     PreparedScan,
     Scenario,
-    looked_through,
-    of_one_beam,
+    assemble,
     prepare,
     scenario_of,
-    unfitted,
+    single_beam,
+    with_elements,
     with_posteriors,
 )
-from beamfit.emittance.transport import of_emittances, of_priors, unit_warnings
+from beamfit.emittance.transport import emittance_warnings, prior_warnings, unit_warnings
 from beamfit.emittance.verdict import SURE
 from beamfit.errors import InputError, expect
 from beamfit.greybox.problem import Problem
@@ -63,52 +63,52 @@ def fit_emittance(
     starts: int = 20,
     seed: int = 0,
 ) -> EmittanceFit:
-    """Fit the beam matrix at the start of a line to a scan, and judge the result.
+    """Fit the beam matrix at the start of a line to a scan, with errors and a verdict.
 
     Parameters
     ----------
     scan : QuadScan
         The measured sizes.
     line : Beamline, optional
-        The line, from where the beam matrix is wanted to the screens. Rows with matrices of their
-        own have none; the beam is then that where the matrices begin.
+        The line from the place of the beam matrix to the screens. Rows with matrices of their own
+        need none; the beam matrix is then where these matrices begin.
     planes : tuple of str, optional
         ("x",), ("y",) or both; all planes of the scan if None.
     method : {"size_squared", "size"}
         The residual: the report's ``error_linear`` or ``error_nonlinear``.
     robust : bool
-        Expect bad readings: one in ten, where the usual prior is 3 %.
+        Expect one bad reading in ten; the prior is 3 % otherwise.
     noise : Noise, optional
         Priors of the noise of sizes; `beamfit.Noise()` if None.
     weights : {"model", "measured"}
-        Whose size the errors of size² are taken at. That of the model has no part in the noise;
-        with the measured one, as older programs have it, the emittance comes out too small, by
-        3 to 7 times the square of the relative size error.
+        Size at which the errors of size² are taken. The model's is free of noise. The measured
+        one, used by older programs, makes the emittance too small by 3 to 7 times the square of
+        the relative size error.
     scenario : {"known", "transport-network", "calibration", "focusing-network"}
-        What is unknown besides the beam: nothing; R11 and R12; slope and offset of the scanned
-        magnets' calibration; k1 as a function of the current. All planes are then fitted
-        together. See docs/scenarios.md for what each cannot know.
+        Unknowns besides the beam: none; R11 and R12; slope and offset of the scanned magnets'
+        calibration; k1 as a function of the current. All planes are then fitted together. See
+        docs/scenarios.md for the limits of each.
     priors, bounds : mapping of str to (float, float), optional
-        Calibration number, such as "Q2.slope", to mean and standard deviation, or to lower and
+        Calibration parameter, such as "Q2.slope", to mean and standard deviation, or to lower and
         upper bound ("calibration"). In any scenario also priors on screen, beam and line, which
         become part of the error: "size_scale", "resolution", "wire" (m), "energy", "dispersion"
         (m), "dispersion_slope", "NAME.gradient", "NAME.length" (m); see docs/systematics.md.
         Bounds of a "transport-network" are the box of the beam ("x.sigma11", SI) and that of the
-        network's inputs ("Q2"), over which its gains keep to their signs or limits.
+        network's inputs ("Q2"), in which the signs or limits of its gains hold.
     gains : mapping of str to (float, float), optional
-        Limits of gains in place of their signs, such as {"dA_x/dQ2": (-inf, -0.0083)}, for the
+        Limits of gains instead of their signs, such as {"dA_x/dQ2": (-inf, -0.0083)}, for the
         report's own network without scales ("transport-network").
     anchor : Anchor, optional
-        What ties a network to first principles.
+        Tie of a network to first principles.
     hysteresis : bool
-        Two branches of k1, for rising and falling currents ("focusing-network").
+        Fit two branches of k1, for rising and falling currents ("focusing-network").
     hidden, starts, seed : int
         Hidden nodes of a network, starts of its training, seed of their random numbers.
 
     Returns
     -------
     EmittanceFit
-        Values, errors, statuses and sentences; `print` it.
+        Values, errors, statuses and sentences.
 
     Raises
     ------
@@ -117,10 +117,10 @@ def fit_emittance(
 
     Notes
     -----
-    One beam matrix at the start is common to all rows. Where their energies differ it is that of
-    the mean energy, and scales with 1/βγ: the normalised emittance is common. Values are those
-    that fit best; errors are half of the central 68 % of the posterior, the noise averaged over;
-    see docs/emittance.md and docs/verdict.md.
+    One beam matrix at the start is common to all rows. If their energies differ it is that at the
+    mean energy, and scales with 1/βγ: the normalised emittance is common. Values are those of the
+    best fit; errors are half of the central 68 % of the posterior, averaged over the noise; see
+    docs/emittance.md and docs/verdict.md.
 
     Examples
     --------
@@ -141,60 +141,62 @@ def fit_emittance(
         expect(line, Beamline, "beamfit.load_lattice(path)")
     if noise is not None:
         expect(noise, Noise, "beamfit.Noise(bad=0.1)")
-    for name, given, known in (("method", method, METHODS), ("weights", weights, WEIGHTS)):
-        if given not in known:
-            raise InputError(f"{name} '{given}'", " or ".join(known))
-    ties = (gains or {}, anchor or Anchor(), hysteresis)
-    told = Assumptions(priors or {}, bounds or {}, *ties, hidden, starts, seed)
-    told.check_scenario(scenario)
+    for name, value, choices in (("method", method, METHODS), ("weights", weights, WEIGHTS)):
+        if value not in choices:
+            raise InputError(f"{name} '{value}'", " or ".join(choices))
+    network_options = (gains or {}, anchor or Anchor(), hysteresis)
+    assumptions = Assumptions(priors or {}, bounds or {}, *network_options, hidden, starts, seed)
+    assumptions.check_scenario(scenario)
     noise = replace(noise or Noise(), bad=ROBUST) if robust else noise
-    scan, line = of_one_beam(scan, line, scenario)
+    scan, line = single_beam(scan, line, scenario)
     statement = scenario_of(scenario)
-    if told.systematics:
+    if assumptions.systematics:
         from beamfit.emittance.systematics import with_systematics
 
         statement = with_systematics(statement)
-    seen = prepare(scan, line, planes, method, noise, weights)
+    prepared = prepare(scan, line, planes, method, noise, weights)
     if statement.closed:
-        return EmittanceFit(judged_beam(seen), scan, line, statement, told, seen)
+        return EmittanceFit(beam_answers(prepared), scan, line, statement, assumptions, prepared)
 
-    from beamfit.emittance.scenario_fit import judged_scenario, settled_fit  # loads the solvers
+    from beamfit.emittance.scenario_fit import iterated_fit, scenario_answers  # loads the solvers
 
-    fit, seen = settled_fit(seen, statement, told)
-    parameters = tuple(statement.parameters(seen, told, fit))
-    found = line_of(fit.model, seen.scanned)
-    begun = EmittanceFit((), scan, found, statement, told, seen, parameters, (), fit)
-    judged = judged_scenario(begun)
-    identified = all(p.identifiability.determined for p in judged)
-    left = statement.null_directions(seen, parameters, identified)
-    return replace(begun, planes=judged, null_directions=left)
+    fit, prepared = iterated_fit(prepared, statement, assumptions)
+    parameters = tuple(statement.parameters(prepared, assumptions, fit))
+    found = line_with(fit.model, prepared.scanned)
+    unanswered = EmittanceFit(
+        (), scan, found, statement, assumptions, prepared, parameters, (), fit
+    )
+    answers = scenario_answers(unanswered)
+    identified = all(p.identifiability.determined for p in answers)
+    open_directions = statement.null_directions(prepared, parameters, identified)
+    return replace(unanswered, planes=answers, null_directions=open_directions)
 
 
 @answer
 @dataclass(frozen=True, eq=False)
 class EmittanceFit:
-    """A fitted scan, printed as a table: one `PlaneFit` a plane, with the scan and its line.
+    """A fitted scan: one `PlaneFit` per plane, with the scan and its line; printed as a table.
 
     Attributes
     ----------
     planes : tuple of PlaneFit
-        One a plane.
+        One per plane.
     scan : QuadScan
         The scan.
     line : Beamline
-        The line; in a scenario with the calibration or the network of k1 as fitted.
+        The line; in a scenario with the fitted calibration or network of k1.
     statement : Scenario
-        What was unknown besides the beam.
+        Free parameters besides the beam.
     told : Assumptions
-        What was known besides the data.
+        Assumptions besides the data.
     seen : PreparedScan
-        The scan through the line as it was given.
+        The scan through the line as given.
     parameters : tuple of Parameter
-        Numbers fitted besides the beam.
+        Fitted parameters besides the beam.
     null_directions : tuple of str
-        Changes of the unknowns that leave the sizes as they are.
+        Changes of the parameters that do not change the sizes.
     solved : Fit or None
-        The grey-box fit where there was one; None where the fit is linear and in closed form.
+        The grey-box fit; None for a linear fit in closed form.
 
     Examples
     --------
@@ -220,13 +222,13 @@ class EmittanceFit:
 
     @property
     def headline(self) -> str:
-        """The scan, the line, and what was found in each plane, in a line."""
+        """The scan, the line, and the answer of each plane, in one line."""
         found = "; ".join(p.headline for p in self.planes)
         return f"{self.scan.name} on {self.line.name}: {found}"
 
     @property
     def message(self) -> str:
-        """Sentences on each plane, a line each."""
+        """Sentences on each plane, one line per plane."""
         return "\n".join(f"{p.plane}: {p.message}" for p in self.planes)
 
     @property
@@ -236,15 +238,17 @@ class EmittanceFit:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Sentences on changes to the numbers of the file, and on what is odd about them."""
+        """Sentences on changes to the numbers of the file, and on unusual numbers."""
         measured = self.seen.weights == "measured"
-        own = ("Errors of size squared are taken at the measured sizes, on request.",) * measured
-        asked = (
+        weight_note = (
+            "Errors of size squared are taken at the measured sizes, on request.",
+        ) * measured
+        warnings = (
             *unit_warnings(self.scan, self.seen.scanned),
-            *of_priors(self.told.priors, self.seen.scanned),
-            *of_emittances(self.planes),
+            *prior_warnings(self.told.priors, self.seen.scanned),
+            *emittance_warnings(self.planes),
         )
-        return (*self.scan.notes, *asked, *own)
+        return (*self.scan.notes, *warnings, *weight_note)
 
     @property
     def anchor(self) -> str:
@@ -252,25 +256,23 @@ class EmittanceFit:
         return self.told.anchor.words
 
     @cached_property
-    def stated(self) -> Problem:
-        """The grey-box problem of all planes together, starting from first principles.
-
-        Numbers of the beam are ``beam.x.l11``, ``beam.x.l21``, ``beam.x.l22``: the Cholesky factor
-        of σ in units of 1e-4 (m, rad); those of a calibration ``magnets.Q2.slope`` and so on.
-        """
-        return self.statement.state(self.seen, self.told)
-
-    @cached_property
     def fit(self) -> Fit:
-        """The grey-box fit; of a linear one solved when it is asked for, from its closed form."""
+        """Grey-box fit; for a fit in closed form it is solved on first use."""
         from beamfit.greybox.solve import solve
 
-        return solve(self.stated) if self.solved is None else self.solved
+        return solve(self.problem) if self.solved is None else self.solved
 
-    @property
+    @cached_property
     def problem(self) -> Problem:
-        """The problem as it was fitted or could be."""
-        return self.stated if self.solved is None else self.solved.problem
+        """Grey-box problem of all planes together, as fitted or starting from the given line.
+
+        Parameters of the beam are ``beam.x.l11``, ``beam.x.l21``, ``beam.x.l22``: the Cholesky
+        factor of σ in units of 1e-4 (m, rad); those of a calibration are ``magnets.Q2.slope`` and
+        so on.
+        """
+        if self.solved is None:
+            return self.statement.state(self.seen, self.told)
+        return self.solved.problem
 
     def __getitem__(self, plane: str) -> PlaneFit:
         found = {p.plane: p for p in self.planes}
@@ -298,12 +300,12 @@ class EmittanceFit:
         priors: Mapping[str, Distribution] | None = None,
         **options: Any,
     ) -> Posterior:
-        """Draw σ of the planes from the posterior that the fit quotes.
+        """Draw σ of the planes from the posterior of the fit.
 
         Parameters
         ----------
         planes : tuple of str, optional
-            Which; all that were fitted if None.
+            Planes to sample; all that were fitted if None.
         priors
             As `beamfit.emittance.posterior.beam_target`, on ``x.sigma11`` and so
             on; in a scenario also on the further names of its ``problem``.
@@ -314,8 +316,9 @@ class EmittanceFit:
         Returns
         -------
         Posterior
-            Of ``x.sigma11`` ... and what else a scenario fitted; ``x.emittance``,
-            ``x.normalized_emittance``, ``x.beta``, ``x.alpha``, ``x.mismatch`` are derived.
+            Samples of ``x.sigma11`` and so on, and of the other fitted parameters;
+            ``x.emittance``, ``x.normalized_emittance``, ``x.beta``, ``x.alpha``, ``x.mismatch`` are
+            derived.
 
         Raises
         ------
@@ -336,11 +339,11 @@ class EmittanceFit:
         ----------
         settings : mapping of str to float or array
             Magnet to settings, shape (n,) or one number for all, in the unit of the scan's column
-            (of the lattice for a magnet that was not scanned). Others are as the lattice has them.
+            (the lattice's for a magnet that was not scanned). Others keep the lattice's setting.
         plane : str, optional
             "x" or "y"; the first that was fitted if None.
         screen : str, optional
-            Where; the scan's last screen if None.
+            Screen of the sizes; the scan's last screen if None.
 
         Returns
         -------
@@ -350,8 +353,8 @@ class EmittanceFit:
         Raises
         ------
         InputError
-            If a magnet or screen is not in the line, or the fit knows the transport at the
-            measured rows alone.
+            If a magnet or screen is not in the line, or the fit knows the transport only at the
+            measured rows.
 
         Examples
         --------
@@ -399,24 +402,24 @@ class EmittanceFit:
         common |= {"line": line} | ({"notes": list(self.notes)} if self.notes else {})
         energy = Quantity(self.seen.energy, None, "MeV").to_json()
         entries = [p.to_json() | {"energy": energy} | common for p in self.planes]
-        own = {
+        scenario_parts = {
             "scenario": self.scenario,
             "anchor": self.anchor,
             "parameters": json_of(self.parameters),
             "null_directions": list(self.null_directions),
         }
-        return entries if self.statement.closed else [entry | own for entry in entries]
+        return entries if self.statement.closed else [entry | scenario_parts for entry in entries]
 
     def tables(self) -> tuple[Table, ...]:
-        """Lay out all numbers, what a scenario fitted besides, and what the data leave open."""
+        """Tables of all quantities, the other fitted parameters, and the open directions."""
         names = [p.plane for p in self.planes]
         found = [labelled("", names, determined(result_rows(self.planes)))]
         if self.parameters:
             tie = f", anchor: {self.anchor}" * self.statement.network
             found.append(parameter_table(self.parameters, f"Scenario {self.scenario}{tie}."))
         if self.null_directions:
-            listed = [[f"{words}."] for words in self.null_directions]
-            found.append(Table("Not determined by the data", [], listed))
+            rows = [[f"{words}."] for words in self.null_directions]
+            found.append(Table("Not determined by the data", [], rows))
         return tuple(found)
 
 
@@ -425,7 +428,7 @@ def fit_many(
     weights: str = WEIGHTS[0],
     noise: Noise | None = None,
 ) -> list[EmittanceFit | InputError]:
-    """Fit the emittance to each of many scans: what `fit_emittance` gives of each.
+    """Fit the emittance to each of many scans, as `fit_emittance` does.
 
     Parameters
     ----------
@@ -437,7 +440,7 @@ def fit_many(
     Returns
     -------
     list of EmittanceFit or InputError
-        One a scan, in their order: its fit, or what is wrong with it.
+        One per scan, in their order: its fit, or the reason why it cannot be fitted.
 
     Examples
     --------
@@ -450,49 +453,51 @@ def fit_many(
     >>> round(other.x.emittance.value / one.x.emittance.value, 9)
     4.0
     """
-    known, told = scenario_of("known"), Assumptions()
+    closed_form, assumptions = scenario_of("known"), Assumptions()
     return [
         one if isinstance(one, InputError)
-        else EmittanceFit(judged_beam(one), one.scan, one.line, known, told, one)
-        for one in _seen_together(scans, weights, noise)
+        else EmittanceFit(beam_answers(one), one.scan, one.line, closed_form, assumptions, one)
+        for one in _prepare_many(scans, weights, noise)
     ]  # fmt: skip
 
 
-def _seen_together(
+def _prepare_many(
     scans: Iterable[tuple[QuadScan, Beamline]], weights: str, noise: Noise | None
 ) -> list[PreparedScan | InputError]:
-    """Scans with the posteriors of their planes, or what is wrong with them, in their order."""
+    """Prepared scans in their order, or the errors of those that cannot be used."""
     found: list[PreparedScan | InputError] = []
-    for given in scans:
+    for pair in scans:
         try:
-            found.append(unfitted(*of_one_beam(*given), noise=noise, weights=weights))
+            found.append(assemble(*single_beam(*pair), noise=noise, weights=weights))
         except InputError as error:
             found.append(error)
     usable = [i for i, one in enumerate(found) if isinstance(one, PreparedScan)]
-    seen = with_posteriors(looked_through([found[i] for i in usable]))
-    for i, one in zip(usable, seen, strict=True):
+    prepared = with_posteriors(with_elements([found[i] for i in usable]))
+    for i, one in zip(usable, prepared, strict=True):
         found[i] = one
     return found
 
 
 def noise_samples(scans: Iterable[tuple[QuadScan, Beamline]], noise: Noise) -> Iterator[Sample]:
-    """Scales of the noise by the planes of many scans that are surely a beam's.
+    """Evidence for the noise priors from planes of many scans that are surely a beam's.
 
     Parameters
     ----------
     scans : iterable of (QuadScan, Beamline)
-        Scans that cannot be used are passed over.
+        The scans; those that cannot be used are skipped.
     noise : Noise
-        The priors to look at them with.
+        Priors of the fits.
     """
     from beamfit.noise.learn import Sample  # loads the minimiser
 
-    together = _seen_together(scans, WEIGHTS[0], noise)
-    for seen in (one for one in together if isinstance(one, PreparedScan)):
-        for work in seen.solutions.values():
-            post = work.posterior
-            if len(work.sizes.size) > 3 and post.probability[BEAM] > SURE:
-                word = work.sizes.likeness[1]
-                word = "stated" if word == "share" else word
-                under = partial(work.sizes.kinds_under, post.unit)
-                yield Sample(word, under, post.kinds, post.scales, post.by_scale)
+    prepared = _prepare_many(scans, WEIGHTS[0], noise)
+    for one in (p for p in prepared if isinstance(p, PreparedScan)):
+        for solution in one.solutions.values():
+            post = solution.posterior
+            if len(solution.sizes.size) > 3 and post.probability[BEAM] > SURE:
+                error_kind = solution.sizes.comparison_key[1]
+                error_kind = "stated" if error_kind == "share" else error_kind
+                kinds_under = partial(solution.sizes.kinds_under, post.unit)
+                yield Sample(
+                    error_kind, kinds_under, post.kinds, post.scales, post.scale_log_evidence
+                )

@@ -1,8 +1,8 @@
-"""The focusing-network scenario: k1 of each scanned magnet is a monotonic network of its current.
+"""Focusing-network scenario: k1 of each scanned magnet is a monotonic network of its current.
 
-Signs of the weights make k1 rise (or fall, as the lattice's own calibration does) with the current
-at every current, not only at the measured ones. With hysteresis the network has a second input, the
-branch, so that rising and falling currents have curves of their own.
+Signs of the weights make k1 rise (or fall, like the lattice's calibration) with the current at all
+currents, not only at the measured ones. With hysteresis the network has the branch as a second
+input, so that rising and falling currents have different curves.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from jax.typing import ArrayLike
 from beamfit.emittance.assumptions import Assumptions
 from beamfit.emittance.results import Parameter
 from beamfit.emittance.statement import PreparedScan, Scenario, varied_magnets
-from beamfit.emittance.transport import padded
-from beamfit.emittance.transport_network import MOST, known_record, network_problem
+from beamfit.emittance.transport import pad_rows
+from beamfit.emittance.transport_network import MAX_WEIGHT, known_record, network_problem
 from beamfit.errors import InputError, Status
 from beamfit.greybox import tree
 from beamfit.greybox.fit import Derived, Fit
@@ -34,15 +34,15 @@ from beamfit.quantity import Quantity
 class NetworkStrength:
     """A magnet whose strength is a network of its current: k1 = network(I, branch)/E.
 
-    It takes the place of a calibration in a line. A setting is the current in A, or the pair of
-    current and branch (+1 rising, -1 falling); a current alone is taken midway between branches.
+    It replaces a calibration in a line. A setting is the current in A, or the pair of current and
+    branch (+1 rising, -1 falling); a current alone is midway between the branches.
 
     Parameters
     ----------
     network : MLP
         One input (current) or two (current, branch); its output is k1 · E in MeV/m².
     unit : str
-        The word of a scan's column, as for other calibrations.
+        Unit of a scan's column, as for other calibrations.
 
     Examples
     --------
@@ -58,18 +58,24 @@ class NetworkStrength:
     inputs: ClassVar[tuple[str, ...]] = ("current", "branch")
 
     def k1l(self, setting: ArrayLike, length: ArrayLike, energy: ArrayLike) -> Array:
-        """Integrated strength in 1/m at a setting, a length in m, an energy in MeV."""
-        at = jnp.atleast_1d(jnp.asarray(setting, float))
-        missing = len(self.network.inputs) - at.shape[0]
-        at = jnp.concatenate([at, jnp.zeros(missing)]) if missing > 0 else at
-        return self.network.values(at[: len(self.network.inputs)])[0] / energy * length
+        """Integrated strength in 1/m at a setting, for a length in m and an energy in MeV."""
+        current_and_branch = jnp.atleast_1d(jnp.asarray(setting, float))
+        missing = len(self.network.inputs) - current_and_branch.shape[0]
+        current_and_branch = (
+            jnp.concatenate([current_and_branch, jnp.zeros(missing)])
+            if missing > 0
+            else current_and_branch
+        )
+        return (
+            self.network.values(current_and_branch[: len(self.network.inputs)])[0] / energy * length
+        )
 
 
 def branch_of(settings: np.ndarray) -> np.ndarray:
-    """Branch of each setting in the order of measuring: +1 reached rising, -1 falling.
+    """Branch of each setting in the order of the measurement: +1 rising, -1 falling.
 
-    A setting that repeats the one before keeps its branch; the first takes the next one's, as a
-    magnet is brought to the start of a ramp from beyond it.
+    A setting that repeats the previous one keeps its branch. The first one takes that of the next:
+    a magnet is brought to the start of a ramp from beyond it.
 
     Examples
     --------
@@ -77,16 +83,16 @@ def branch_of(settings: np.ndarray) -> np.ndarray:
     [1.0, 1.0, 1.0, 1.0, -1.0, -1.0]
     """
     steps = np.sign(np.diff(settings))
-    found = np.concatenate([[0.0], steps])
-    for i in range(1, len(found)):
-        found[i] = found[i] or found[i - 1]
-    first = next((f for f in found if f != 0.0), 1.0)
-    return np.where(found == 0.0, first, found)
+    branches = np.concatenate([[0.0], steps])
+    for i in range(1, len(branches)):
+        branches[i] = branches[i] or branches[i - 1]
+    first = next((f for f in branches if f != 0.0), 1.0)
+    return np.where(branches == 0.0, first, branches)
 
 
-def _first_strength(seen: PreparedScan, magnet: str, current: np.ndarray) -> np.ndarray:
-    """k1 · E in MeV/m² as the lattice has it, at settings of a magnet."""
-    element, energy = seen.scanned[magnet], float(seen.scanned.energy)
+def _lattice_strength(prepared: PreparedScan, magnet: str, current: np.ndarray) -> np.ndarray:
+    """k1 · E in MeV/m² of the lattice, at settings of a magnet."""
+    element, energy = prepared.scanned[magnet], float(prepared.scanned.energy)
     return np.asarray(_strengths(element.calibration, current, element.length, energy)) * energy
 
 
@@ -97,8 +103,8 @@ def _strengths(calibration: Any, settings: Array, length: float, energy: float) 
 
 
 @tree.node("magnet")
-class _Asked:
-    """Settings of a magnet at which k1 is asked for, shape (n,) or (n, 2), with length, energy."""
+class _Currents:
+    """Settings of a magnet at which k1 is derived, (n,) or (n, 2), with length and energy."""
 
     magnet: str
     settings: Any
@@ -106,55 +112,58 @@ class _Asked:
     energy: Any
 
 
-def _k1(model: Any, asked: _Asked) -> Array:
-    return _strengths(model["magnets"][asked.magnet], asked.settings, asked.length, asked.energy)
+def _k1(model: Any, currents: _Currents) -> Array:
+    """k1 in 1/m² of a model's magnet."""
+    return _strengths(
+        model["magnets"][currents.magnet], currents.settings, currents.length, currents.energy
+    )
 
 
-def _loop(model: Any, asked: _Asked) -> Array:
-    """Width of the hysteresis loop: k1 of the first setting less that of the second."""
-    up, down = _k1(model, asked)
+def _loop(model: Any, currents: _Currents) -> Array:
+    """Width of the hysteresis loop: k1 of the first setting minus that of the second."""
+    up, down = _k1(model, currents)
     return (up - down)[None]
 
 
-def _predicted(model: Any, asked: _Asked) -> Array:
-    """k1 · E, for a record of what is known beforehand."""
-    return _k1(model, asked) * asked.energy
+def _scaled_k1(model: Any, currents: _Currents) -> Array:
+    """k1 · E, for the records of an anchor."""
+    return _k1(model, currents) * currents.energy
 
 
-def _less_common(model: Any, asked: _Asked) -> Array:
-    """The same without the error that all settings share."""
-    return _predicted(model, asked) / (1.0 + model["anchor"][asked.magnet])
+def _without_common_error(model: Any, currents: _Currents) -> Array:
+    """k1 · E without the error that all settings share."""
+    return _scaled_k1(model, currents) / (1.0 + model["anchor"][currents.magnet])
 
 
-def _state(seen: PreparedScan, told: Assumptions) -> Problem:
-    """Beams and one network of k1 for each scanned magnet."""
-    varied = varied_magnets(seen.scan)
-    if several := [name for name in varied if len(seen.scanned.members(name)) > 1]:
-        found = f"a network of k1 for '{several[0]}', which feeds several magnets"
+def _state(prepared: PreparedScan, assumptions: Assumptions) -> Problem:
+    """Problem of the beams and one network of k1 for each scanned magnet."""
+    varied = varied_magnets(prepared.scan)
+    if shared := [name for name in varied if len(prepared.scanned.members(name)) > 1]:
+        found = f"a network of k1 for '{shared[0]}', which feeds several magnets"
         raise InputError(found, "a scan of magnets on supplies of their own")
-    branches = _branches(seen, varied) if told.hysteresis else {}
+    branches = _branches(prepared, varied) if assumptions.hysteresis else {}
     strengths, weights, records = {}, [], []
     for name in varied:
-        if not seen.scanned[name].length:
+        if not prepared.scanned[name].length:
             raise InputError(f"a network of k1 for '{name}', which has no length", "a quadrupole")
-        strengths[name], free = _strength(seen, name, told, name in branches)
+        strengths[name], free = _strength(prepared, name, assumptions, name in branches)
         weights += free
-        records += _anchors(seen, name, told, name in branches)
-    settings = seen.rows.settings | {
-        name: np.stack([seen.rows.settings[name], padded(branch)], -1)
+        records += _anchors(prepared, name, assumptions, name in branches)
+    settings = prepared.rows.settings | {
+        name: np.stack([prepared.rows.settings[name], pad_rows(branch)], -1)
         for name, branch in branches.items()
     }
-    rows = {plane: seen.of_plane(plane, settings) for plane in seen.planes}
-    part = {"magnets": strengths}
-    return network_problem(seen, told, varied, varied, rows, part, weights, records)
+    rows = {plane: prepared.of_plane(plane, settings) for plane in prepared.planes}
+    model = {"magnets": strengths}
+    return network_problem(prepared, assumptions, varied, varied, rows, model, weights, records)
 
 
-def _branches(seen: PreparedScan, varied: tuple[str, ...]) -> dict[str, np.ndarray]:
-    """Branch of every row, where settings both rise and fall."""
-    branches = {name: branch_of(seen.scan.settings[name]) for name in varied}
+def _branches(prepared: PreparedScan, varied: tuple[str, ...]) -> dict[str, np.ndarray]:
+    """Branch of every row; raises an error if settings only rise or only fall."""
+    branches = {name: branch_of(prepared.scan.settings[name]) for name in varied}
     single = [name for name, branch in branches.items() if np.ptp(branch) == 0]
     if single:
-        raise seen.scan.unusable(
+        raise prepared.scan.unusable(
             f"settings of '{single[0]}' that only rise or only fall, with hysteresis",
             "rows in the order of measuring, with rising and falling settings",
             single[0],
@@ -163,66 +172,73 @@ def _branches(seen: PreparedScan, varied: tuple[str, ...]) -> dict[str, np.ndarr
 
 
 def _strength(
-    seen: PreparedScan, name: str, told: Assumptions, branches: bool
+    prepared: PreparedScan, name: str, assumptions: Assumptions, branches: bool
 ) -> tuple[NetworkStrength, list[Free]]:
-    """A network that starts as the straight line between the lattice's own k1 at both ends."""
-    settings = seen.scan.settings[name]
+    """Network that starts as the straight line between the lattice's k1 at both ends."""
+    settings = prepared.scan.settings[name]
     low, high = float(settings.min()), float(settings.max())
-    ends = _first_strength(seen, name, np.array([low, high]))
+    ends = _lattice_strength(prepared, name, np.array([low, high]))
     ports = [Port("I", "", 0, (high - low) / 2, (high + low) / 2)]
     rising = [np.sign(ends[1] - ends[0]) or 1.0]
     if branches:
-        # A branch moves k1 by a few per cent of its range at most: small weights do it.
+        # A branch changes k1 by at most a few per cent of its range: small weights suffice.
         ports.append(Port("branch", "", 0, 10.0, 0.0))
         rising.append(0.0)
-    half = abs(float(ends[1] - ends[0])) / 2 or 1.0
-    output = Port(f"{name}.k1E", "", 0, half, float(ends.mean()))
+    half_range = abs(float(ends[1] - ends[0])) / 2 or 1.0
+    output = Port(f"{name}.k1E", "", 0, half_range, float(ends.mean()))
     path, rises = f"magnets.{name}.network", np.array([rising])
-    net, free = signed_network(path, ports, [output], rises, told.hidden, told.seed, MOST)
-    return NetworkStrength(net, seen.scanned[name].calibration.unit), free
+    net, free = signed_network(
+        path, ports, [output], rises, assumptions.hidden, assumptions.seed, MAX_WEIGHT
+    )
+    return NetworkStrength(net, prepared.scanned[name].calibration.unit), free
 
 
-def _anchors(seen: PreparedScan, name: str, told: Assumptions, branches: bool) -> Iterator[Record]:
-    """Prior knowledge of k1, midway between the branches where there are two."""
-    settings, anchor = seen.scan.settings[name], told.anchor
-    largest = float(np.abs(_first_strength(seen, name, settings)).max())
+def _anchors(
+    prepared: PreparedScan, name: str, assumptions: Assumptions, branches: bool
+) -> Iterator[Record]:
+    """Records that tie k1 to the lattice, midway between the branches if there are two."""
+    settings, anchor = prepared.scan.settings[name], assumptions.anchor
+    largest = float(np.abs(_lattice_strength(prepared, name, settings)).max())
     places = np.array([place[name] for place in anchor.at if name in place], float)
-    element, energy = seen.scanned[name], float(seen.scanned.energy)
-    every = np.unique(settings), anchor.deviation, _less_common
-    for at, sd, predict in (every, (places, anchor.sd, _predicted)):
-        if sd is None or not len(at):
+    element, energy = prepared.scanned[name], float(prepared.scanned.energy)
+    at_settings = np.unique(settings), anchor.deviation, _without_common_error
+    for currents, sd, predict in (at_settings, (places, anchor.sd, _scaled_k1)):
+        if sd is None or not len(currents):
             continue
-        points = np.stack([at, np.zeros(len(at))], -1) if branches else at
-        data = _Asked(name, padded(points), float(element.length), energy)
-        values = _first_strength(seen, name, at)
+        points = np.stack([currents, np.zeros(len(currents))], -1) if branches else currents
+        data = _Currents(name, pad_rows(points), float(element.length), energy)
+        values = _lattice_strength(prepared, name, currents)
         yield known_record(f"anchor {name}", predict, data, values, sd * largest)
 
 
-def _parameters(seen: PreparedScan, told: Assumptions, fit: Fit) -> Iterator[Parameter]:
+def _parameters(prepared: PreparedScan, assumptions: Assumptions, fit: Fit) -> Iterator[Parameter]:
     """k1 at both ends and the middle of the scanned range, and the width of the loop."""
-    energy, settled = float(seen.scanned.energy), fit.status is not Status.not_converged
-    for name in varied_magnets(seen.scan):
-        low, high = (float(f(seen.scan.settings[name])) for f in (np.min, np.max))
+    energy, settled = float(prepared.scanned.energy), fit.status is not Status.not_converged
+    for name in varied_magnets(prepared.scan):
+        low, high = (float(f(prepared.scan.settings[name])) for f in (np.min, np.max))
         middle = 0.5 * (low + high)
         at = np.array([low, middle, high])
-        length = float(seen.scanned[name].length)
-        found = fit.derive(_k1, _Asked(name, at, length, energy))
+        length = float(prepared.scanned[name].length)
+        found = fit.derive(_k1, _Currents(name, at, length, energy))
         for i, current in enumerate(at):
-            yield _derived(f"{name}.k1 at {current:g}", found, i, settled)
-        if told.hysteresis:
-            both = np.array([[middle, 1.0], [middle, -1.0]])
-            found = fit.derive(_loop, _Asked(name, both, length, energy))
-            yield _derived(f"{name}.k1 rising less falling at {middle:g}", found, 0, settled)
+            yield _derived_parameter(f"{name}.k1 at {current:g}", found, i, settled)
+        if assumptions.hysteresis:
+            branches = np.array([[middle, 1.0], [middle, -1.0]])
+            found = fit.derive(_loop, _Currents(name, branches, length, energy))
+            yield _derived_parameter(
+                f"{name}.k1 rising less falling at {middle:g}", found, 0, settled
+            )
 
 
-def _derived(name: str, found: Derived, i: int, settled: bool) -> Parameter:
-    known = settled and bool(np.isfinite(found.error[i]))
-    errors = (float(found.error[i]), float(found.error_raw[i])) if known else (None, None)
+def _derived_parameter(name: str, found: Derived, i: int, settled: bool) -> Parameter:
+    """Parameter from a derived value, with an error if the data determine it."""
+    determined = settled and bool(np.isfinite(found.error[i]))
+    errors = (float(found.error[i]), float(found.error_raw[i])) if determined else (None, None)
     value = Quantity(float(found.value[i]), errors[0], "1/m^2", errors[1])
-    return Parameter(name, value, Status.converged if known else Status.unidentified)
+    return Parameter(name, value, Status.converged if determined else Status.unidentified)
 
 
-OPEN = (
+NULL_DIRECTION = (
     "at each setting k1 is free to take up what the beam leaves: another beam with another curve "
     "k1(I) gives the same sizes"
 )
@@ -230,8 +246,10 @@ SCENARIO = Scenario(
     "focusing-network",
     _state,
     _parameters,
-    null_directions=lambda _seen, _parameters, identified: () if identified else (OPEN,),
-    remedy=lambda _seen, _told: (
+    null_directions=lambda _prepared, _parameters, identified: (
+        () if identified else (NULL_DIRECTION,)
+    ),
+    remedy=lambda _prepared, _assumptions: (
         "sizes at a second screen, or an anchor to the lattice's calibration "
         "(--anchor first-principles=2%)"
     ),

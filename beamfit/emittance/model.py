@@ -1,14 +1,14 @@
-"""The model of a scan: a beam matrix, seen through a map to the screens, predicts every size.
+"""Model of a scan: a beam matrix, transport_sigma to the screens, predicts every size.
 
 The physics is report eq. 37 with the two terms that every screen adds,
 
     size² = R11² σ11 + 2 R11 R12 σ12 + R12² σ22 + (R16 σ_δ)² + resolution²,
 
-linear in σ. A model is a dictionary: ``beam`` holds the Cholesky factor of each plane's σ in units
-of 1e-4 (m, rad), so that σ is in 1e-8 SI as in the report's Appendix A; ``magnets`` holds what the
-setting of a magnet means where that is free, ``map`` a network of R11 and R12, ``systematics`` what
-is free of screen, energy, drifts and incoming dispersion. Its numbers have paths such as
-``beam.x.l11`` and ``magnets.Q2.slope``.
+linear in σ. A model is a dictionary. ``beam`` holds the Cholesky factor of each plane's σ in units
+of 1e-4 (m, rad), so that σ is in 1e-8 SI as in the report's Appendix A. ``magnets`` holds free
+calibrations of magnets, ``map`` a network of R11 and R12, and ``systematics`` free parameters of
+screen, energy, drifts and incoming dispersion. Parameters have paths such as ``beam.x.l11`` and
+``magnets.Q2.slope``.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ from beamfit.optics.beamline import Beamline
 from beamfit.optics.calibration import scaled
 from beamfit.particles import beta_gamma
 
-UNIT = 1e-4  # m and rad of a beam's numbers
-# What people quote of a plane, in this order everywhere, with units.
+UNIT = 1e-4  # unit of a beam's Cholesky factor: 0.1 mm and 0.1 mrad
+# Quantities of a plane's answer, in this order everywhere, with units.
 QUANTITIES = {
     "emittance": "m",
     "normalized_emittance": "m",
@@ -44,10 +44,12 @@ QUANTITIES = {
     "screen_size": "m",
     "mismatch": "1",
 }
+# Names of the beam matrix, and their positions in `QUANTITIES`.
+SIGMA, SIGMA_SLICE = ("sigma11", "sigma12", "sigma22"), slice(4, 7)
 
 
 def coefficients(r11: Any, r12: Any) -> tuple[Any, Any, Any]:
-    """Coefficients of σ11, σ12, σ22 in size² (report eq. 37), for any shape, NumPy's or JAX's.
+    """Coefficients of σ11, σ12, σ22 in size² (report eq. 37), for NumPy or JAX arrays of any shape.
 
     Examples
     --------
@@ -67,7 +69,7 @@ def size_squared(sigma: Any, r11: Any, r12: Any, known: Any = 0.0) -> Any:
     r11, r12 : float or array
         Transfer-matrix elements from the start to the screen (R12 in m).
     known : float or array
-        What dispersion and resolution add, m².
+        Contribution of dispersion and resolution, m².
 
     Returns
     -------
@@ -79,32 +81,32 @@ def size_squared(sigma: Any, r11: Any, r12: Any, known: Any = 0.0) -> Any:
 
 
 def sigma_of(beam: Mapping[str, Any]) -> Array:
-    """σ11, σ12, σ22 in SI from the numbers of a beam, shape (3,)."""
+    """σ11, σ12, σ22 in SI from the Cholesky factor of a beam, shape (3,)."""
     l11, l21, l22 = beam["l11"], beam["l21"], beam["l22"]
     return UNIT**2 * jnp.stack([l11**2, l11 * l21, l21**2 + l22**2])
 
 
-def line_of(model: Mapping[str, Any], line: Beamline) -> Beamline:
-    """Put into a line what a model says of its magnets and drifts."""
+def line_with(model: Mapping[str, Any], line: Beamline) -> Beamline:
+    """Replace calibrations, gradients and drift lengths of a line by those of a model."""
     for name, calibration in model.get("magnets", {}).items():
         line = line.with_element(replace(line[name], calibration=calibration))
-    found = model.get("systematics", {})
-    for name, factor in found.get("gradient", {}).items():
+    systematics = model.get("systematics", {})
+    for name, factor in systematics.get("gradient", {}).items():
         for member in line.members(name):
             own = scaled(line[member].calibration, factor)
             line = line.with_element(replace(line[member], calibration=own))
-    for name, length in found.get("length", {}).items():
+    for name, length in systematics.get("length", {}).items():
         line = line.with_element(replace(line[name], length=length))
     return line
 
 
-def spoken(path: str) -> str:
-    """The path of a free number as users say it: "Q2.slope", not "magnets.Q2.slope".
+def user_name(path: str) -> str:
+    """Name of a free parameter for users: "Q2.slope", not "magnets.Q2.slope".
 
     Examples
     --------
-    >>> spoken("magnets.Q2.slope"), spoken("systematics.length.D1"), spoken("systematics.energy")
-    ('Q2.slope', 'D1.length', 'energy')
+    >>> [user_name(p) for p in ("magnets.Q2.slope", "systematics.length.D1", "systematics.energy")]
+    ['Q2.slope', 'D1.length', 'energy']
     """
     first, _, rest = path.partition(".")
     if first == "systematics":
@@ -114,12 +116,12 @@ def spoken(path: str) -> str:
 
 
 def predict_sizes(model: Mapping[str, Any], rows: Any) -> Array:
-    """Predict size² in µm², or size in µm, of rows: the one prediction of every scenario.
+    """Predict size² in µm², or size in µm, of rows: one function for all scenarios.
 
     Parameters
     ----------
     model : mapping
-        As above.
+        See the module.
     rows : Rows or NetworkRows
         With ``plane``, ``squared`` and ``elements(model)``: R11, R12 and known size² of each row.
 
@@ -155,22 +157,22 @@ def emittance_parts(sigma: ArrayLike) -> Array:
     return xp.stack([emittance, s11 / emittance, -s12 / emittance])
 
 
-def numbers_of(
+def quantities_of(
     sigma: Array, factor: ArrayLike, to_screen: Array, to_design: Array, design: Array
 ) -> Array:
-    """Everything people quote of a plane, in the order of `QUANTITIES`.
+    """Quantities of a plane's answer, in the order of `QUANTITIES`.
 
     Parameters
     ----------
     sigma : Array
-        Shape (3,), or (3, d) of d beams, at the start; NumPy's or JAX's.
+        Shape (3,), or (3, d) for d beams, at the start; NumPy or JAX.
     factor : float
         βγ.
     to_screen, to_design : Array
-        Shape (3, 3) or (2, 2), start to the last screen and to where the design holds; NaN where
-        they are not known.
+        Shape (3, 3) or (2, 2), from the start to the last screen and to the place of the design;
+        NaN if unknown.
     design : Array
-        Shape (2,), design β (m) and α; NaN where there is none.
+        Shape (2,), design β (m) and α; NaN if there is none.
 
     Returns
     -------
@@ -179,12 +181,12 @@ def numbers_of(
     Examples
     --------
     >>> one = jnp.eye(2)
-    >>> numbers_of(jnp.array([4.0, 0.0, 9.0]), 2.0, one, one, jnp.array([1.0, 0.0]))[:3].tolist()
+    >>> quantities_of(jnp.array([4.0, 0.0, 9.0]), 2.0, one, one, jnp.array([1.0, 0.0]))[:3].tolist()
     [6.0, 12.0, 0.6666666666666666]
     """
     emittance, beta, alpha = emittance_parts(sigma)
-    s11, s12, _ = carried(to_screen, sigma)
-    d11, d12, d22 = carried(to_design, sigma)
+    s11, s12, _ = transport_sigma(to_screen, sigma)
+    d11, d12, d22 = transport_sigma(to_design, sigma)
     gamma_d = (1.0 + design[1] ** 2) / design[0]
     # BMAG = Tr(σ σ_d⁻¹) ε_d/(2 ε), M. Sands, SLAC-AP-85 (1991).
     mismatch = 0.5 * (gamma_d * d11 + 2.0 * design[1] * d12 + design[0] * d22) / emittance
@@ -193,19 +195,19 @@ def numbers_of(
     return xp.stack([*start, s11 / emittance, -s12 / emittance, s11**0.5, mismatch])
 
 
-def carried(matrix: Any, sigma: Any) -> tuple[Any, Any, Any]:
-    """σ at a place: R σ Rᵀ (report eq. 36), R of shape (2, 2, ...), σ of shape (3, ...)."""
+def transport_sigma(matrix: Any, sigma: Any) -> tuple[Any, Any, Any]:
+    """Transport σ: R σ Rᵀ (report eq. 36), R of shape (2, 2, ...), σ of shape (3, ...)."""
     (a, b), (c, d) = matrix[0, :2], matrix[1, :2]
     s11, s12, s22 = sigma
-    crossed = a * c * s11 + (a * d + b * c) * s12 + b * d * s22
-    return size_squared(sigma, a, b), crossed, size_squared(sigma, c, d)
+    s12_there = a * c * s11 + (a * d + b * c) * s12 + b * d * s22
+    return size_squared(sigma, a, b), s12_there, size_squared(sigma, c, d)
 
 
 @tree.node("plane", "screen", "place")
-class Asked:
-    """Places of a plane's numbers: the last screen, and where the design holds.
+class AnswerPlaces:
+    """Places that a plane's answer refers to: the last screen, and the place of the design.
 
-    ``screen`` is None where the map beyond R11 and R12 is not known.
+    ``screen`` is None if a scenario does not know the map beyond R11 and R12.
     """
 
     plane: str
@@ -216,25 +218,25 @@ class Asked:
     design: Any
 
 
-def asked_places(model: Mapping[str, Any], asked: Asked) -> tuple[Any, Any, Any, Any]:
-    """βγ, matrices to the screen and the design's place, and the design, of a model's line."""
+def place_optics(model: Mapping[str, Any], places: AnswerPlaces) -> tuple[Any, Any, Any, Any]:
+    """βγ, matrices to the screen and to the place of the design, and the design itself."""
     to_screen = to_design = jnp.full((2, 2), jnp.nan)
-    if asked.screen is not None:
-        place = asked.place or asked.screen
-        places = tuple(dict.fromkeys((asked.screen, place)))
-        found = line_of(model, asked.line).matrices(places)
-        to_screen, to_design = (getattr(found[at], asked.plane) for at in (asked.screen, place))
-    energy = asked.energy * model.get("systematics", {}).get("energy", 1.0)
-    return beta_gamma(energy, asked.line.mass), to_screen, to_design, asked.design
+    if places.screen is not None:
+        place = places.place or places.screen
+        names = tuple(dict.fromkeys((places.screen, place)))
+        found = line_with(model, places.line).matrices(names)
+        to_screen, to_design = (getattr(found[at], places.plane) for at in (places.screen, place))
+    energy = places.energy * model.get("systematics", {}).get("energy", 1.0)
+    return beta_gamma(energy, places.line.mass), to_screen, to_design, places.design
 
 
-def asked_numbers(model: Mapping[str, Any], asked: Asked) -> Array:
-    """`numbers_of` a model's beam, through the line as the model has it."""
-    return numbers_of(sigma_of(model["beam"][asked.plane]), *asked_places(model, asked))
+def model_quantities(model: Mapping[str, Any], places: AnswerPlaces) -> Array:
+    """Compute the quantities of a model's beam, through the model's line."""
+    return quantities_of(sigma_of(model["beam"][places.plane]), *place_optics(model, places))
 
 
 def phase_coverage(r11: np.ndarray, r12: np.ndarray, beta: float, alpha: float) -> float | None:
-    """Betatron phase from which the scan saw the beam, in degrees of a half turn.
+    """Range of betatron phase covered by the scan, in degrees of 180.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""The posterior of a scan for the sampler: that of the fit, the noise averaged over."""
+"""Posterior of a scan for the sampler: the fit's, averaged over the noise."""
 
 from __future__ import annotations
 
@@ -9,45 +9,53 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from beamfit.emittance.beam_draws import BRIGHT
+from beamfit.emittance.beam_draws import LN_T_SPREAD
 from beamfit.emittance.model import (
     QUANTITIES,
+    SIGMA,
     UNIT,
-    Asked,
-    asked_numbers,
+    AnswerPlaces,
+    model_quantities,
     sigma_of,
     size_squared,
-    spoken,
+    user_name,
 )
 from beamfit.emittance.results import PlaneFit
-from beamfit.emittance.statement import PreparedScan, Scanned, asked_in, factor_of, size_records
+from beamfit.emittance.statement import (
+    PreparedScan,
+    Scanned,
+    cholesky_numbers,
+    problem_places,
+    size_records,
+)
 from beamfit.errors import Finding, InputError
 from beamfit.greybox import tree
 from beamfit.greybox.posterior import Optimum, Statement, predicted, target_of
 from beamfit.greybox.problem import Problem
 from beamfit.noise.model import Noise
-from beamfit.noise.sizes import NoiseKind, Scales, averaged, log_likelihood
+from beamfit.noise.sizes import NoiseKind, Scales, log_average, log_likelihood
 from beamfit.optics.beam import BeamMatrix
 from beamfit.quantity import Status
 from beamfit.sampling.posterior import Expected, Posterior
 from beamfit.sampling.priors import Distribution
 from beamfit.sampling.target import SamplingTarget
 
-CHOLESKY, SIGMA = ("l11", "l21", "l22"), ("sigma11", "sigma12", "sigma22")
+# Names of the Cholesky factor in a model, and of the derived quantities in a posterior.
+CHOLESKY = ("l11", "l21", "l22")
 TWISS = ("emittance", "normalized_emittance", "beta", "alpha", "mismatch")
-PLACES = np.array([list(QUANTITIES).index(name) for name in TWISS])
-OPEN = "the scan does not determine sigma11, sigma12 and sigma22"
+TWISS_POSITIONS = np.array([list(QUANTITIES).index(name) for name in TWISS])
+UNDETERMINED = "the scan does not determine sigma11, sigma12 and sigma22"
 
 
-def _quoted(model: Mapping[str, Any]) -> dict[str, Any]:
-    """σ in SI in the place of its Cholesky factor."""
+def _with_sigma(model: Mapping[str, Any]) -> dict[str, Any]:
+    """Replace the Cholesky factor of each beam by σ in SI."""
     beams = model["beam"].items()
     sigmas = {plane: dict(zip(CHOLESKY, sigma_of(beam), strict=True)) for plane, beam in beams}
     return {**model, "beam": sigmas}
 
 
-def _own(model: Mapping[str, Any]) -> dict[str, Any]:
-    """The Cholesky factor of σ again, NaN where it is not positive definite."""
+def _with_cholesky(model: Mapping[str, Any]) -> dict[str, Any]:
+    """Replace σ of each beam by its Cholesky factor; NaN if σ is not positive definite."""
     beams = {}
     for plane, sigma in model["beam"].items():
         s11, s12, s22 = (sigma[name] / UNIT**2 for name in CHOLESKY)
@@ -58,7 +66,11 @@ def _own(model: Mapping[str, Any]) -> dict[str, Any]:
 
 @tree.node("plane", "noise")
 class PlaneLikelihood:
-    """The sizes of a plane for its likelihood: where its rows are, what was measured, its noise."""
+    """Data for the likelihood of a plane: rows, measured sizes, and noise.
+
+    ``used`` are the measured rows, ``size`` is in units of ``unit`` (m), and ``trace @ sigma`` is
+    the T of the beam's prior.
+    """
 
     plane: str
     noise: Noise
@@ -71,56 +83,64 @@ class PlaneLikelihood:
     scales: tuple[Scales, ...]
 
     def log_density(self, model: Mapping[str, Any]) -> Array:
-        """Log likelihood of the sizes, the noise averaged over, with the prior of the beam."""
+        """Log likelihood of the sizes, averaged over the noise, plus the log prior of the beam."""
         sigma = sigma_of(model["beam"][self.plane])
         squared = size_squared(sigma, *(v[self.used] for v in self.rows.elements(model)))
-        found = jnp.sqrt(jnp.maximum(squared, 1e-300))[None] / self.unit
-        off, parts = self.size[None] - found, []
+        size = jnp.sqrt(jnp.maximum(squared, 1e-300))[None] / self.unit
+        residual, parts = self.size[None] - size, []
         for kind, nodes in zip(self.kinds, self.scales, strict=True):
-            log = log_likelihood(off, found, kind, nodes.scale, self.noise)[0]
-            parts.append(averaged(log, nodes.log_weight) + kind.log_weight)
-        bright = jnp.log(jnp.maximum(self.trace @ sigma, 1e-300))
+            log = log_likelihood(residual, size, kind, nodes.scale, self.noise)[0]
+            parts.append(log_average(log, nodes.log_weight) + kind.log_weight)
+        log_t = jnp.log(jnp.maximum(self.trace @ sigma, 1e-300))
         determinant = jnp.maximum(sigma[0] * sigma[2] - sigma[1] ** 2, 1e-300)
-        prior = -2.0 * bright - 0.5 * (bright / BRIGHT) ** 2 - 0.5 * jnp.log(determinant)
-        return averaged(jnp.stack(parts), 0.0) + prior
+        prior = -2.0 * log_t - 0.5 * (log_t / LN_T_SPREAD) ** 2 - 0.5 * jnp.log(determinant)
+        return log_average(jnp.stack(parts), 0.0) + prior
 
 
 class DensityData(NamedTuple):
     """Data of the functions of a scan's statement."""
 
-    asked: tuple[Asked, ...]
+    places: tuple[AnswerPlaces, ...]
     sizes: tuple[PlaneLikelihood, ...]
 
 
-def _log_volume(model: Mapping[str, Any], told: DensityData) -> Array:
-    """The density of the sizes, whose noise is averaged over, and the prior of the beams."""
-    return sum((each.log_density(model) for each in told.sizes), jnp.zeros(()))
+def _log_volume(model: Mapping[str, Any], data: DensityData) -> Array:
+    """Sum of the planes' log likelihoods, averaged over the noise, and log priors of the beams."""
+    return sum((each.log_density(model) for each in data.sizes), jnp.zeros(()))
 
 
 def _sizes_of(
-    problem: Problem, seen: PreparedScan, planes: Sequence[str]
+    problem: Problem, prepared: PreparedScan, planes: Sequence[str]
 ) -> tuple[PlaneLikelihood, ...]:
-    """Data of each plane for the likelihood."""
+    """Data for the likelihood of each plane."""
     records, found = size_records(problem), []
     for plane in planes:
-        work = seen.solutions[plane]
-        post = work.posterior
-        at, size = seen.measured(plane), work.sizes.size / post.unit
-        own = (records[plane].data, at, size, post.unit, post.trace, post.kinds, post.scales)
-        found.append(PlaneLikelihood(plane, seen.noise.of_points(len(size)), *own))
+        solution = prepared.solutions[plane]
+        post = solution.posterior
+        at, size = prepared.measured(plane), solution.sizes.size / post.unit
+        likelihood_data = (
+            records[plane].data,
+            at,
+            size,
+            post.unit,
+            post.trace,
+            post.kinds,
+            post.scales,
+        )
+        found.append(PlaneLikelihood(plane, prepared.noise.of_points(len(size)), *likelihood_data))
     return tuple(found)
 
 
-def _beams(model: Mapping[str, Any], told: DensityData) -> dict[str, Any]:
-    """The beam matrix of each plane, and the model, for functions of the user's."""
+def _beams(model: Mapping[str, Any], data: DensityData) -> dict[str, Any]:
+    """Beam matrix of each plane, and the model, for functions of users."""
     parts = model["beam"].items()
     beams = {p: BeamMatrix(**{name: UNIT * beam[name] for name in CHOLESKY}) for p, beam in parts}
     return {**beams, "model": model}
 
 
-def _twiss(model: Mapping[str, Any], told: DensityData) -> Array:
+def _twiss(model: Mapping[str, Any], data: DensityData) -> Array:
     """Emittance, normalised emittance, β, α at the start and mismatch, plane after plane."""
-    return jnp.concatenate([asked_numbers(model, plane)[PLACES] for plane in told.asked])
+    return jnp.concatenate([model_quantities(model, p)[TWISS_POSITIONS] for p in data.places])
 
 
 def beam_target(
@@ -128,16 +148,16 @@ def beam_target(
     planes: Sequence[str] | None = None,
     priors: Mapping[str, Distribution] | None = None,
 ) -> SamplingTarget:
-    """State the posterior of a fitted scan.
+    """State the posterior of a fitted scan for the sampler.
 
     Parameters
     ----------
     fit : EmittanceFit
         The fit.
     planes : sequence of str, optional
-        Which; all that were fitted if None.
+        Planes to sample; all that were fitted if None.
     priors
-        As of `beamfit.greybox.posterior.target_of`; on ``x.sigma11`` and so on, in addition to the
+        As in `beamfit.greybox.posterior.target_of`; on ``x.sigma11`` and so on, in addition to the
         fit's own.
 
     Returns
@@ -152,23 +172,26 @@ def beam_target(
 
     Notes
     -----
-    Likelihood and prior are those of the fit: noise averaged over, bad readings included.
-    Where transport is known, a plane whose scan does not determine σ11, σ12 and σ22 has no
-    posterior unless priors on all three give it one; it is left out and named.
+    Likelihood and prior are those of the fit, averaged over noise and bad readings. With known
+    transport, a plane whose scan does not determine σ11, σ12 and σ22 is left out and named, unless
+    priors on all three determine them.
     """
-    asked = _asked(fit, planes)
+    chosen = _chosen_planes(fit, planes)
     if fit.solved is not None:
-        problem, optimum, kept = fit.solved.problem, fit.solved.optimum, asked
+        problem, optimum, kept = fit.solved.problem, fit.solved.optimum, chosen
     else:
-        given = [p for p in asked if all(f"{p.plane}.{name}" in (priors or {}) for name in SIGMA)]
-        kept = [p for p in asked if np.isfinite(p.covariance).all() or p in given]
-        names = tuple(p.plane for p in kept or asked)
+        given = [p for p in chosen if all(f"{p.plane}.{name}" in (priors or {}) for name in SIGMA)]
+        kept = [p for p in chosen if np.isfinite(p.covariance).all() or p in given]
+        names = tuple(p.plane for p in kept or chosen)
         problem = fit.statement.state(fit.seen._replace(planes=names), fit.told)
-        optimum = _optimum(problem.names, kept or asked, given, priors or {})
-    return target_of(problem, optimum, _stated(problem, fit, kept, asked), priors=priors)
+        optimum = _optimum(problem.names, kept or chosen, given, priors or {})
+    return target_of(
+        problem, optimum, _sampling_statement(problem, fit, kept, chosen), priors=priors
+    )
 
 
-def _asked(fit: Scanned, planes: Sequence[str] | None) -> list[PlaneFit]:
+def _chosen_planes(fit: Scanned, planes: Sequence[str] | None) -> list[PlaneFit]:
+    """Fits of the chosen planes; raises an error for planes that were not fitted."""
     fitted = [p.plane for p in fit.planes]
     for plane in planes or ():
         if plane not in fitted:
@@ -185,62 +208,63 @@ def _optimum(
     given: Sequence[PlaneFit],
     priors: Mapping[str, Distribution],
 ) -> Optimum:
-    """Starting point: the fit, or else the priors; a little off zero emittance, an edge."""
-    begin = {}
+    """Starting point from the fit or the priors, kept away from the bound at zero emittance."""
+    start = {}
     for p in chosen:
         sigma = [q.value for q in p.sigma]
         if not np.isfinite(p.covariance).all() and p in given:
             sigma = [priors[f"{p.plane}.{name}"].mean() for name in SIGMA]
-        numbers = factor_of(sigma, 1e-4)
-        begin |= {f"beam.{p.plane}.{name}": value for name, value in numbers.items()}
-    theta = np.array([begin[name] for name in names])
+        numbers = cholesky_numbers(sigma, 1e-4)
+        start |= {f"beam.{p.plane}.{name}": value for name, value in numbers.items()}
+    theta = np.array([start[name] for name in names])
     worst = max(chosen, key=lambda p: p.status is Status.poor_fit)
     return Optimum(
         theta, Finding(worst.status, worst.message), [1.0] * len(chosen), [True] * len(chosen)
     )
 
 
-def _stated(
-    problem: Problem, fit: Scanned, kept: Sequence[PlaneFit], asked: Sequence[PlaneFit]
+def _sampling_statement(
+    problem: Problem, fit: Scanned, kept: Sequence[PlaneFit], requested: Sequence[PlaneFit]
 ) -> Statement:
-    chosen = kept or asked
+    """Functions and names of the posterior, with remarks on planes left out."""
+    chosen = kept or requested
     planes = [p.plane for p in chosen]
-    places = asked_in(problem, fit.seen, planes, fit.statement.whole_map)
-    shown = {(p.plane, name): getattr(p, name) for p in chosen for name in TWISS}
-    lost = ", ".join(f"{p.plane} plane" for p in asked if p not in kept)
+    places = problem_places(problem, fit.seen, planes, fit.statement.whole_map)
+    twiss = {(p.plane, name): getattr(p, name) for p in chosen for name in TWISS}
+    missing = ", ".join(f"{p.plane} plane" for p in requested if p not in kept)
     sigmas = [f"{p.plane}.{name}" for p in chosen for name in SIGMA]
-    own = [f"beam.{p.plane}.{name}" for p in chosen for name in CHOLESKY]
+    factors = [f"beam.{p.plane}.{name}" for p in chosen for name in CHOLESKY]
     labels = {f"size {p.plane}": p.plane for p in chosen}
-    # As users name them in a calibration: Q2.slope.
-    renamed = {name: spoken(name) for name in problem.names}
+    # Names of calibration parameters for users, such as Q2.slope.
+    renamed = {name: user_name(name) for name in problem.names}
     return Statement(
-        derived={f"{plane}.{name}": QUANTITIES[name] for plane, name in shown},
+        derived={f"{plane}.{name}": QUANTITIES[name] for plane, name in twiss},
         derive=_twiss,
         build=_beams,
         data=DensityData(places, _sizes_of(problem, fit.seen, planes)),
         log_volume=_log_volume,
         averaged=[f"size {plane}" for plane in planes],
-        quoted=_quoted,
-        own=_own,
-        renamed=renamed | dict(zip(own, sigmas, strict=True)),
+        quoted=_with_sigma,
+        own=_with_cholesky,
+        renamed=renamed | dict(zip(factors, sigmas, strict=True)),
         units={name: QUANTITIES[name.split(".")[1]] for name in sigmas},
         lower={f"{p.plane}.{name}": 0.0 for p in chosen for name in ("sigma11", "sigma22")},
         labels=labels,
         trusted=[record.name for record in problem.records if record.name not in labels],
-        priors_own=[f"{p}.{name}" for (p, name), q in shown.items() if q and q.error is None],
-        hidden=[f"{plane}.{name}" for (plane, name), q in shown.items() if q is None],
-        remark=f"Left out: the {lost}, because {OPEN}." if kept and lost else "",
-        nothing="" if kept else f"{OPEN} in the {lost}; {chosen[0].message}",
+        priors_own=[f"{p}.{name}" for (p, name), q in twiss.items() if q and q.error is None],
+        hidden=[f"{plane}.{name}" for (plane, name), q in twiss.items() if q is None],
+        remark=f"Left out: the {missing}, because {UNDETERMINED}." if kept and missing else "",
+        nothing="" if kept else f"{UNDETERMINED} in the {missing}; {chosen[0].message}",
     )
 
 
 def expected_sizes(posterior: Posterior, plane: str) -> Expected:
-    """Sizes that the posterior of a scan expects at the points of a plane, m.
+    """Expected sizes, m, at the points of a plane, from the posterior of a scan.
 
     Parameters
     ----------
     posterior : Posterior
-        Of `EmittanceFit.sample`.
+        From `EmittanceFit.sample`.
     plane : str
         "x" or "y".
     """

@@ -11,34 +11,40 @@ import jax.numpy as jnp
 import numpy as np
 
 from beamfit.answer import shown
-from beamfit.emittance.comparison import AT, PlanePosterior, weighted_quantiles
-from beamfit.emittance.model import coefficients, emittance_parts, predict_sizes, size_squared
+from beamfit.emittance.comparison import QUANTILES, PlanePosterior, weighted_quantiles
+from beamfit.emittance.model import (
+    SIGMA,
+    coefficients,
+    emittance_parts,
+    predict_sizes,
+    size_squared,
+)
 from beamfit.emittance.results import PlaneFit
 from beamfit.emittance.statement import Scanned
-from beamfit.emittance.transport import Rows, padded
+from beamfit.emittance.transport import Rows, pad_rows
 from beamfit.errors import InputError, nearest
-from beamfit.optics.beamline import seen_line
+from beamfit.optics.beamline import reduced_line
 from beamfit.sampling.posterior import Correlations
 
-NAMES = ("sigma11", "sigma12", "sigma22", "emittance", "beta", "alpha")
+NAMES = (*SIGMA, "emittance", "beta", "alpha")
 
 
 @shown
 @dataclass(frozen=True, eq=False)
 class Prediction:
-    """Sizes to be expected of a fitted beam.
+    """Predicted sizes of a fitted beam.
 
     Attributes
     ----------
     plane, screen : str
-        Which size, and where.
+        Plane of the size, and its screen.
     settings : dict of str to ndarray
-        Of the magnets that were named, shape (n,), in the units of the scan.
+        Settings of the magnets that were given, shape (n,), in the units of the scan.
     size : ndarray
         Rms size with dispersion and resolution, m, shape (n,).
     error : ndarray
-        Its standard error from the error of the beam alone, m, shape (n,); a further reading
-        scatters by its own error besides. NaN where the data do not determine the beam.
+        Standard error from the error of the beam alone, m, shape (n,); a further reading also
+        scatters by its own error. NaN where the data do not determine the beam.
     """
 
     plane: str
@@ -53,8 +59,8 @@ def predicted_sizes(
 ) -> Prediction:
     """Predict sizes; see `EmittanceFit.predict`.
 
-    size² = R11² σ11 + 2 R11 R12 σ12 + R12² σ22 + known (report eq. 37) is linear in σ, so that its
-    error is that of a sum; what a scenario fitted besides σ goes in by the core's `derive`.
+    size² = R11² σ11 + 2 R11 R12 σ12 + R12² σ22 + known (report eq. 37) is linear in σ. Other fitted
+    parameters of a scenario add their error in linear approximation.
     """
     fitted = {p.plane: p for p in fit.planes}
     if plane not in fitted:
@@ -78,50 +84,52 @@ def predicted_sizes(
         error = np.where(np.isfinite(p.covariance).all(), spread, np.nan)
     else:
         found = fit.solved.derive(predict_sizes, rows)
-        size, whole = 1e-6 * found.value[:n], 1e-6 * found.error[:n]
+        size, total_error = 1e-6 * found.value[:n], 1e-6 * found.error[:n]
         slope = np.stack(coefficients(r11, r12), -1) / (2.0 * size[:, None])
-        held = np.einsum("ij,jk,ik->i", slope, post.covariance, slope)
-        # What the other unknowns add in linear theory, beside the posterior of the beam.
-        further = np.sqrt(np.maximum(whole**2 - held, 0.0))
-        error = np.where(np.isfinite(whole), np.hypot(spread, further), whole)
+        beam_variance = np.einsum("ij,jk,ik->i", slope, post.covariance, slope)
+        # Other fitted parameters add to the posterior of the beam, in linear approximation.
+        other_error = np.sqrt(np.maximum(total_error**2 - beam_variance, 0.0))
+        error = np.where(np.isfinite(total_error), np.hypot(spread, other_error), total_error)
     return Prediction(plane, rows.places[0], given, size, error)
 
 
 def _spread(
     post: PlanePosterior, r11: np.ndarray, r12: np.ndarray, known: np.ndarray
 ) -> np.ndarray:
-    """Half of the central 68 % of the sizes that the posterior predicts."""
+    """Half of the central 68 % of predicted sizes over the posterior draws."""
     sizes = np.sqrt(size_squared(post.sigma.T, r11[:, None], r12[:, None], known[:, None]))
-    ends = [weighted_quantiles(row, post.weight, (AT[1], AT[3])) for row in sizes]
+    ends = [weighted_quantiles(row, post.weight, (QUANTILES[1], QUANTILES[3])) for row in sizes]
     return 0.5 * np.diff(ends, axis=1)[:, 0]
 
 
 def _rows(
     fit: Scanned, given: Mapping[str, np.ndarray], n: int, plane: str, screen: str | None
 ) -> Rows:
-    """The settings asked for as rows of a scan, padded."""
-    seen, line = fit.seen, fit.seen.scanned
-    if seen.scan.transfer or not fit.statement.whole_map or fit.told.hysteresis:
+    """Rows of a scan at the given settings, padded."""
+    prepared, line = fit.seen, fit.seen.scanned
+    if prepared.scan.transfer or not fit.statement.whole_map or fit.told.hysteresis:
         found = "a fit that knows the transport at the measured rows alone"
         raise InputError(found, "a scan with a lattice, and a scenario that keeps its map")
-    place = screen or seen.rows.places[-1]
+    place = screen or prepared.rows.places[-1]
     for name in given:
         if name not in line.magnets:
             raise InputError(f"no magnet '{name}'", nearest(name, list(line.magnets)))
     if place not in (known := [e.name for e in line.elements]):
         raise InputError(f"no screen '{place}'", nearest(place, known))
     model = {} if fit.statement.closed else fit.solved.model
-    keep = dict.fromkeys((*given, *model.get("magnets", {})))
-    table = {name: padded(given.get(name, np.full(n, float(line[name].setting)))) for name in keep}
-    energy = padded(np.full(n, seen.energy))
-    seen_by = seen_line(line, tuple(keep), energy, (place,))
-    return seen.rows_at(seen_by, plane, place, table, energy)
+    variable = dict.fromkeys((*given, *model.get("magnets", {})))
+    table = {
+        name: pad_rows(given.get(name, np.full(n, float(line[name].setting)))) for name in variable
+    }
+    energy = pad_rows(np.full(n, prepared.energy))
+    reduced = reduced_line(line, tuple(variable), energy, (place,))
+    return prepared.rows_at(reduced, plane, place, table, energy)
 
 
 def correlations_of(p: PlaneFit) -> Correlations:
     """Correlate the errors of σ11, σ12, σ22, emittance, β and α, in linear approximation.
 
-    Those of the last three follow by the gradients of ε = sqrt(σ11σ22 - σ12²), σ11/ε and -σ12/ε.
+    The last three follow from the gradients of ε = sqrt(σ11σ22 - σ12²), σ11/ε and -σ12/ε.
     """
     sigma = np.array([q.value for q in p.sigma])
     if not np.isfinite(p.covariance).all() or not p.emittance.value > 0:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from beamfit.answer import Row, Table, answer, cell, json_of, labelled, shown
+from beamfit.emittance.model import SIGMA
 from beamfit.errors import Status
 from beamfit.optics.beam import BeamMatrix
 from beamfit.quantity import Quantity, display_unit
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
 
 
 def in_words(settings: Mapping[str, float], units: Mapping[str, str], digits: int = 4) -> str:
-    """Write settings of magnets or knobs with their units; "" where a name says it.
+    """Write settings of magnets or knobs with their units; a unit may be "".
 
     Examples
     --------
@@ -31,7 +32,7 @@ def in_words(settings: Mapping[str, float], units: Mapping[str, str], digits: in
 
 @shown
 class Points(NamedTuple):
-    """The points of a fit, each array of shape (n,).
+    """Points of a fit, each array of shape (n,).
 
     Attributes
     ----------
@@ -40,13 +41,13 @@ class Points(NamedTuple):
     units : dict of str to str
         Magnet name to the unit of its settings.
     screen : tuple of str
-        Where each was measured.
+        Screen of each point.
     size, error, model : ndarray
         Measured rms size, its error as used, and the fitted size, m.
     weighed : ndarray
-        The size that the error of size² was taken at, m: the model's, or the measured one.
+        Size at which the error of size² is taken, m: the model's, or the measured one.
     relative : float
-        1 where errors grow with that size, 0 where they are as they stand.
+        1 where errors are a share of that size, 0 where they are fixed.
     pull : ndarray
         Residual of the fitted quantity over its error as used.
     outlier_probability : ndarray
@@ -54,7 +55,7 @@ class Points(NamedTuple):
     r11, r12 : ndarray
         Transfer-matrix elements from the start to the screen (R12 in m).
     known : ndarray
-        Size² due to dispersion and resolution, m².
+        Size² from dispersion and resolution, m².
     """
 
     settings: dict[str, np.ndarray]
@@ -72,7 +73,7 @@ class Points(NamedTuple):
     known: np.ndarray
 
     def with_model(self, model: np.ndarray, squared: bool) -> Points:
-        """The points with fitted sizes, and their pulls: of size² or of the size."""
+        """Set the fitted sizes, with the pulls of size² or of the size."""
         pull = (self.size - model) / self.error
         if squared:
             pull = (self.size**2 - model**2) / (2.0 * self.weighed * self.error)
@@ -87,24 +88,24 @@ class Points(NamedTuple):
 
 @shown
 class Parameter(NamedTuple):
-    """A number fitted besides the beam: a calibration number, or k1 of a network.
+    """A parameter fitted besides the beam: of a calibration, or k1 of a network.
 
     Attributes
     ----------
     name : str
-        Such as "Q2.slope".
+        Name for users, such as "Q2.slope".
     value : Quantity
         With an error only if data and priors determine it.
     status : Status
-        ``converged``, ``unidentified``, or ``at_limit`` for a number that ends on a bound.
+        ``converged``, ``unidentified``, or ``at_limit`` for a parameter at a bound.
     state : str
         ``free``, ``lower`` or ``upper``.
     lower, upper : float
-        Bounds; infinite where there is none.
+        Bounds; infinite if there is none.
     prior : tuple of float, or None
         Mean and standard deviation.
     multiplier : float
-        d(χ²/2)/d(bound) where it ends on one.
+        d(χ²/2)/d(bound) at a bound.
     """
 
     name: str
@@ -125,7 +126,7 @@ class Parameter(NamedTuple):
         prior: tuple[float, float] | None = None,
         settled: bool = True,
     ) -> Parameter:
-        """A free number of a fit, with its error where a fit that settled determines it."""
+        """Parameter from a fit, with its error if a converged fit determines it."""
         status = Status.unidentified if v.state == "free" else Status.at_limit
         value = Quantity(v.value, None, unit)
         if settled and v.state == "free" and math.isfinite(v.error):
@@ -140,9 +141,9 @@ class ScreenTwiss(NamedTuple):
     Attributes
     ----------
     name : str
-        The screen.
+        Name of the screen.
     settings : dict of str to float
-        The settings it holds for.
+        Settings of the magnets.
     units : dict of str to str
         Their units.
     beta, alpha : Quantity
@@ -162,26 +163,27 @@ class ScreenTwiss(NamedTuple):
 @shown
 @dataclass(frozen=True)
 class Identifiability:
-    """The verdict on what a scan determines.
+    """Evidence on what a scan determines.
 
     Attributes
     ----------
     determined : bool
-        Whether the emittance is.
+        Whether the emittance is determined.
     singular_values : tuple of float
-        Of the scaled design (σ11, σ12, σ22 in units of themselves), in standard errors.
+        Singular values of the scaled design (σ11, σ12, σ22 in units of themselves), in standard
+        errors.
     condition : float or None
         Largest over smallest; None if infinite.
     waist_bracketed : bool or None
         Whether sizes rise on both sides of the smallest; None for a scan of several magnets.
     phase_coverage : float or None
-        Betatron phase over which the scan looked at the beam, degrees of 180.
+        Betatron phase covered by the scan, degrees of 180.
     probability : dict of str to float
-        Of a beam, and of what else the sizes may be.
+        Probability of a beam, and of each rival.
     undetermined : tuple of str
-        What the data leave open, in words.
+        Directions that the data do not determine, in words.
     next_measurement : str or None
-        The measurement that would help most.
+        Single measurement that reduces the error most, in words.
     """
 
     determined: bool
@@ -217,7 +219,7 @@ class PlaneFit:
     plane : str
         "x" or "y".
     status : Status
-        How far to believe it; ``message`` says why and what to do.
+        Status of the fit; ``message`` gives the reason and what to do.
     emittance, normalized_emittance : Quantity
         Geometric and normalised emittance, m.
     beta, alpha : Quantity
@@ -229,25 +231,25 @@ class PlaneFit:
     mismatch : Quantity or None
         BMAG to the lattice's design Twiss.
     chi2 : float or None
-        χ²; None where the noise was inferred from the residuals.
+        χ²; None if the noise was inferred from the residuals.
     dof : int
-        Points less three.
+        Number of points minus three.
     rms_residual : Quantity
-        Rms of measured less fitted size, m.
+        Rms of measured minus fitted size, m.
     covariance : ndarray
         Shape (3, 3), of σ11, σ12, σ22, unscaled (``error_raw``); NaN if not determined.
     error_scale : float
-        The emittance's error over the one by the stated errors alone.
+        The emittance's error over that from the stated errors alone.
     noise : str
-        Where the errors came from, in words.
+        Source of the errors, in words.
     method, weights : str
         As for `beamfit.fit_emittance`.
     identifiability : Identifiability
-        What the data determine.
+        Evidence on what the data determine.
     points : Points
-        Point by point.
+        The points of the fit.
     holds : str
-        What the errors hold: statistics only, or also systematics that were given.
+        Contributions that the errors include: statistics only, or also given systematics.
     """
 
     plane: str
@@ -274,30 +276,30 @@ class PlaneFit:
 
     @property
     def quantities(self) -> dict[str, Quantity]:
-        """Every number with an error, by the name it has in JSON."""
+        """Each number with an error, by its name in JSON."""
         names = ("emittance", "normalized_emittance", "beta", "alpha")
         found = {name: getattr(self, name) for name in names}
-        found |= zip(("sigma11", "sigma12", "sigma22"), self.sigma, strict=True)
+        found |= zip(SIGMA, self.sigma, strict=True)
         at_screen = {f"screen_{n}": getattr(self.screen, n) for n in ("beta", "alpha", "size")}
         return found | at_screen | {"rms_residual": self.rms_residual}
 
     @property
     def words(self) -> str:
-        """The normalised emittance, or its interval where only that is known, in words."""
+        """The normalised emittance, or its interval if it is not determined, in words."""
         if self.status is not Status.unidentified:
             return f"normalised emittance {self.normalized_emittance}"
-        known = self.normalized_emittance.interval_95 is not None
-        return f"normalised emittance {_interval(self)} (95 %)" if known else ""
+        has_interval = self.normalized_emittance.interval_95 is not None
+        return f"normalised emittance {_interval(self)} (95 %)" if has_interval else ""
 
     @property
     def headline(self) -> str:
-        """The plane, its status and its emittance in a line."""
+        """The plane, its status and its emittance in one line."""
         words = f": {self.words}" if self.words else ""
-        said = self.status is not Status.unidentified and self.emittance.error is not None
-        return f"{self.plane} {cell(self.status)}{words}{f' ({self.holds})' if said else ''}"
+        with_error = self.status is not Status.unidentified and self.emittance.error is not None
+        return f"{self.plane} {cell(self.status)}{words}{f' ({self.holds})' if with_error else ''}"
 
     def tables(self) -> tuple[Table, ...]:
-        """All numbers, to be shown."""
+        """Table of all numbers."""
         return (labelled("", [self.plane], result_rows((self,))),)
 
     @property
@@ -307,7 +309,7 @@ class PlaneFit:
         Raises
         ------
         InputError
-            If the data allow no positive definite one (status ``unidentified``).
+            If no positive definite matrix fits the data (status ``unidentified``).
         """
         return BeamMatrix.from_sigma(*(q.value for q in self.sigma))
 
@@ -318,7 +320,7 @@ class PlaneFit:
         names += ("rms_residual", "error_scale", "noise", "method", "weights", "mismatch")
         names += ("identifiability",)
         entry = {name: getattr(self, name) for name in ("plane", "status", "message", *names)}
-        entry |= zip(("sigma11", "sigma12", "sigma22"), self.sigma, strict=True)
+        entry |= zip(SIGMA, self.sigma, strict=True)
         entry["covariance"] = self.covariance if np.isfinite(self.covariance).all() else None
         points = {name: getattr(p, name) for name in ("settings", "units", "screen", "pull")}
         sizes = {f"{name}_m": getattr(p, name) for name in ("size", "error", "model")}
@@ -327,12 +329,13 @@ class PlaneFit:
 
 
 def result_rows(planes: tuple[PlaneFit, ...]) -> list[Row]:
-    """Label and one value per plane of every number a result has, in the order they are read."""
-    there = planes[0].screen
-    at = f"at {there.name}"
-    own = in_words(there.settings, there.units) or "-"
-    alone = not any(p.emittance.determined for p in planes)  # the interval is all that is known
-    interval = "normalised emittance, 95 % interval" if alone else "  95 % interval"
+    """Rows of all numbers of a result, with one value per plane, in reading order."""
+    screen = planes[0].screen
+    at_screen = f"at {screen.name}"
+    settings = in_words(screen.settings, screen.units) or "-"
+    # Without a determined emittance, the interval is all that is known.
+    interval_only = not any(p.emittance.determined for p in planes)
+    interval = "normalised emittance, 95 % interval" if interval_only else "  95 % interval"
     rows: list[tuple[str, Callable[[PlaneFit], object], bool]] = [
         ("status", lambda p: p.status, False),
         ("normalised emittance", lambda p: p.normalized_emittance, True),
@@ -344,10 +347,10 @@ def result_rows(planes: tuple[PlaneFit, ...]) -> list[Row]:
         ("sigma11", lambda p: p.sigma[0], False),
         ("sigma12", lambda p: p.sigma[1], False),
         ("sigma22", lambda p: p.sigma[2], False),
-        (f"beta {at}", lambda p: p.screen.beta, False),
-        (f"alpha {at}", lambda p: p.screen.alpha, False),
-        (f"size {at}", lambda p: p.screen.size, True),
-        (f"{at}, for", lambda p: own, False),
+        (f"beta {at_screen}", lambda p: p.screen.beta, False),
+        (f"alpha {at_screen}", lambda p: p.screen.alpha, False),
+        (f"size {at_screen}", lambda p: p.screen.size, True),
+        (f"{at_screen}, for", lambda p: settings, False),
     ]
     if any(p.mismatch is not None for p in planes):
         rows.append(("mismatch BMAG", lambda p: p.mismatch, True))
@@ -363,38 +366,40 @@ def result_rows(planes: tuple[PlaneFit, ...]) -> list[Row]:
 
 
 def _interval(p: PlaneFit) -> str | None:
+    """Central 95 % of the normalised emittance, in words; None if unknown."""
     q = p.normalized_emittance
     if q.interval_95 is None:
         return None
     low, high = q.interval_95
     factor, unit = display_unit(abs(high), q.unit)
     if q.error is None:
-        begin = f"{low / factor:.3g} to" if low > 0 else "below"
-        return f"{begin} {high / factor:.3g} {unit}"
+        start = f"{low / factor:.3g} to" if low > 0 else "below"
+        return f"{start} {high / factor:.3g} {unit}"
     places = max(1 - math.floor(math.log10(0.5 * (high - low) / factor)), 0)
     return f"{low / factor:.{places}f} to {high / factor:.{places}f} {unit}"
 
 
 def _chi2(p: PlaneFit) -> str:
+    """χ² per degree of freedom, in words."""
     if p.chi2 is None or not p.dof:
         return f"not testable ({p.dof} dof)"
     return f"{p.chi2:.2f}/{p.dof} = {p.chi2 / p.dof:.2f}"
 
 
 def degrees(value: float | None) -> str:
-    """Write how much of a half turn of betatron phase was seen."""
+    """Write a phase coverage in degrees of 180."""
     return "-" if value is None else f"{value:.0f}° of 180°"
 
 
 def parameter_table(parameters: tuple[Parameter, ...], note: str = "") -> Table:
-    """Value, bounds, prior and state of every number fitted besides the beam."""
+    """Table of value, bounds, prior and state of each parameter fitted besides the beam."""
     rows = []
     for p in parameters:
         bounded = abs(p.lower) < 1e300 or abs(p.upper) < 1e300
-        said = f"{p.state} bound, multiplier {p.multiplier:.2g}" if p.state != "free" else "free"
+        state = f"{p.state} bound, multiplier {p.multiplier:.2g}" if p.state != "free" else "free"
         value = cell(p.value).replace("(not determined)", "(open)")
         prior = f"{p.prior[0]:.6g} ± {p.prior[1]:.3g}" if p.prior else "-"
         limits = f"{p.lower:.6g} to {p.upper:.6g}" if bounded else "-"
-        rows.append([p.name, value, limits, prior, said])
+        rows.append([p.name, value, limits, prior, state])
     header = ["", "value", "bounds", "prior", "state"]
     return Table("Other fitted parameters", header, rows, note)

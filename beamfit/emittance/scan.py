@@ -1,6 +1,6 @@
-"""A quadrupole scan as a value: settings, sizes and errors in SI, checked once.
+"""A quadrupole scan: settings, sizes and errors in SI, checked once.
 
-Plain numpy, so that a bad file is reported before JAX is ever loaded.
+Plain NumPy, so that a bad file is reported before JAX is loaded.
 """
 
 from __future__ import annotations
@@ -25,22 +25,22 @@ if TYPE_CHECKING:
 PLANES = ("x", "y")
 # Units of settings: current, integrated gradient, gradient, focusing strength, 1/focal length.
 SETTINGS = ("A", "kG", "T_per_m", "k1", "k1l")
-# Of a setting that is no magnet of the line: what a machine is tuned by.
+# Unit of a setting that is not a magnet of the line: a knob to tune the machine.
 KNOB = "knob"
-# What rows that look at no single slice of the beam say for one.
+# Slice name of rows that measure the whole beam.
 PROJECTED = "projected"
-# Rms sizes in m that a beam can have, and that most have: outside a unit is wrong, or questioned.
+# Rms sizes in m: beyond the first range an error, beyond the second a warning on the unit.
 POSSIBLE, USUAL = (1e-8, 0.3), (1e-6, 2e-2)
-# What a scan has for each of its rows.
-EACH_ROW = ("settings", "size", "error", "energy", "screen", "resolution", "energy_spread")
-EACH_ROW += ("shots", "shot_size", "slice", "transfer")
+# Fields with a value for each row.
+ROW_COLUMNS = ("settings", "size", "error", "energy", "screen", "resolution", "energy_spread")
+ROW_COLUMNS += ("shots", "shot_size", "slice", "transfer")
 
 
 @shown
 class PlaneRows(NamedTuple):
     """Rows of a `QuadScan` in which one plane was measured, each of shape (n,).
 
-    ``error``, ``energy``, ``screen``, ``resolution`` and ``energy_spread`` are None where it has
+    ``error``, ``energy``, ``screen``, ``resolution`` and ``energy_spread`` are None if the scan has
     none.
     """
 
@@ -54,10 +54,10 @@ class PlaneRows(NamedTuple):
 
 
 class Profile(NamedTuple):
-    """A projection of the beam from which a size was taken, to be shown.
+    """A projection of the beam from which a size was taken, for display.
 
-    ``row`` is the row of the scan; position (m), counts and, where there is one, the curve that was
-    fitted to them have shape (n,).
+    ``row`` is the row of the scan. Position (m), counts and the fitted curve, if there is one, have
+    shape (n,).
     """
 
     plane: str
@@ -68,15 +68,15 @@ class Profile(NamedTuple):
 
 
 def middle(values: np.ndarray) -> float:
-    """The median of some numbers, NaN left out; quick where there are few.
+    """Median of some numbers without NaN; fast for a few.
 
     Examples
     --------
     >>> middle(np.array([4.0, np.nan, 1.0, 2.0])), middle(np.array([3.0, 1.0]))
     (2.0, 2.0)
     """
-    kept = np.sort(values[~np.isnan(values)])
-    return float(0.5 * (kept[(len(kept) - 1) // 2] + kept[len(kept) // 2]))
+    ordered = np.sort(values[~np.isnan(values)])
+    return float(0.5 * (ordered[(len(ordered) - 1) // 2] + ordered[len(ordered) // 2]))
 
 
 def first_unusable(values: np.ndarray, *, blank: bool = False) -> tuple[int, str] | None:
@@ -87,12 +87,12 @@ def first_unusable(values: np.ndarray, *, blank: bool = False) -> tuple[int, str
     values : ndarray
         Sizes, errors or energies.
     blank : bool
-        Whether NaN stands for a cell left blank, and is passed over.
+        Whether NaN stands for an empty cell and is skipped.
 
     Returns
     -------
     tuple of int and str, or None
-        Index and what was found there; None if all are usable.
+        Index of the value, and its description; None if all are usable.
 
     Examples
     --------
@@ -113,53 +113,52 @@ def first_unusable(values: np.ndarray, *, blank: bool = False) -> tuple[int, str
 class QuadScan:
     """Beam sizes against magnet settings or at several screens, in one or both planes.
 
-    Rows that repeat a setting are its shots, where they stand together or have no errors of their
-    own: a fit takes them as ``shot_size`` of one row, as `beamfit.read_quad_scan` does.
+    Rows that repeat a setting are its shots if they follow one another or have no errors of their
+    own: a fit combines them to one row with ``shot_size``, as `beamfit.read_quad_scan` does.
 
     Parameters
     ----------
     settings : mapping of str to array
-        Magnet name to settings, each of shape (n,), in the unit ``units`` names; empty where
+        Magnet name to settings, each of shape (n,), in the unit given by ``units``; empty if
         nothing was scanned.
     units : mapping of str to str
         Magnet name to ``"A"``, ``"kG"`` (integrated gradient), ``"T_per_m"`` (gradient), ``"k1"``
         (1/m²) or ``"k1l"`` (1/m).
     size : mapping of str to array
-        Plane ("x", "y") to rms sizes in m, shape (n,); NaN where a row has none.
+        Plane ("x", "y") to rms sizes in m, shape (n,); NaN if a row has none.
     error : mapping of str to array, optional
-        Plane to standard errors in m. A plane left out has no errors: the fit infers them.
+        Plane to standard errors in m. For a plane without them the fit infers the errors.
     energy : array or float, optional
         Energy of each row in MeV, or of all; the lattice's if None.
     energy_kind : {"total", "kinetic", "momentum"}
-        What that is; a momentum is p c.
+        Kind of that energy; a momentum is p c.
     screen : sequence of str, optional
         Screen of each row; the lattice's only one if None.
     resolution, energy_spread : array or float, optional
         Point-spread rms in m and relative momentum spread of each row, or of all.
     shots : array or int, optional
-        How many shots each row is the mean of.
+        Number of shots averaged in each row.
     shot_size : mapping of str to array, optional
-        Plane to the sizes of single shots in m, shape (n, m), NaN where a row has fewer than m.
-        The fit takes these, each with a probability of showing no beam, in the place of means and
-        errors.
+        Plane to the sizes of single shots in m, shape (n, m), NaN if a row has fewer than m. The
+        fit uses these instead of means and errors, each with a probability of showing no beam.
     slice : sequence of str, optional
-        Slice of the beam each row looks at, "projected" (or blank) for all of it: see `of_slice`.
-        Magnets then stay as they are for the line's energy, whatever the energy of a row.
+        Slice of the beam measured in each row, "projected" (or blank) for the whole beam: see
+        `of_slice`. Magnets then stay as they are for the line's energy, whatever a row's energy.
     transfer : mapping of str to array, optional
-        Plane to R11, R12 (m) and, where there is dispersion, R16 (m) of each row, shape (n, 2) or
-        (n, 3): the rows' own matrices, which need no lattice. Settings then only label the rows.
+        Plane to R11, R12 (m) and, with dispersion, R16 (m) of each row, shape (n, 2) or (n, 3): the
+        rows' own matrices, which need no lattice. Settings then only label the rows.
     profiles : tuple of Profile
-        What the sizes were taken from, to be shown.
+        Profiles from which the sizes were taken, for display.
     error_source : str
-        Where the errors come from, in words, for the report.
+        Source of the errors, in words, for the report.
     name, path, sha256 : str
-        What to call the scan, and the file it came from.
+        Name of the scan, and its file.
     provenance : tuple of str
         Comment lines of the file.
     notes : tuple of str
-        What was done to the numbers of the file, for whoever reads the result.
+        Changes made to the numbers of the file, in words.
     columns : mapping of str to str
-        What the file called each thing, for error messages.
+        Name of each column in the file, for error messages.
 
     Raises
     ------
@@ -232,48 +231,52 @@ class QuadScan:
 
     @property
     def slices(self) -> tuple[str, ...]:
-        """The slices of the beam in the order of the rows, the projected beam last."""
+        """Slices of the beam in the order of the rows, the projected beam last."""
         names = dict.fromkeys(self.slice or ())
         return tuple(sorted(names, key=PROJECTED.__eq__))
 
     @property
     def headline(self) -> str:
-        """The scan in a line."""
+        """The scan in one line."""
         scanned = ", ".join(f"{name} ({self.units[name]})" for name in self.settings)
         screens = f", {len(set(self.screen))} screens" if self.screen else ""
         errors = "errors given" if self.error else "no errors"
-        seen = f"{len(self)} rows of {scanned or 'no magnet'}{screens}"
-        return f"{self.name}: {seen}, planes {', '.join(self.planes)}, {errors}"
+        rows_text = f"{len(self)} rows of {scanned or 'no magnet'}{screens}"
+        return f"{self.name}: {rows_text}, planes {', '.join(self.planes)}, {errors}"
 
     def tables(self) -> tuple[Table, ...]:
-        """The first rows, to be shown."""
+        """Table of the first rows."""
         columns = {f"{n} {self.units[n]}": v for n, v in self.settings.items()}
         for p in self.planes:
             columns[f"size {p} µm"] = 1e6 * self.size[p]
             columns |= {f"error {p} µm": 1e6 * self.error[p]} if p in self.error else {}
-        few = range(min(len(self), MAX_ROWS_SHOWN))
-        rows = [[f"{values[i]:.5g}" for values in columns.values()] for i in few]
-        more = f"the first {len(few)} of {len(self)} rows" if len(few) < len(self) else ""
-        return (Table(self.headline, list(columns), rows, more, numeric=True),)
+        first_rows = range(min(len(self), MAX_ROWS_SHOWN))
+        rows = [[f"{values[i]:.5g}" for values in columns.values()] for i in first_rows]
+        note = (
+            f"the first {len(first_rows)} of {len(self)} rows"
+            if len(first_rows) < len(self)
+            else ""
+        )
+        return (Table(self.headline, list(columns), rows, note, numeric=True),)
 
     def to_frame(self) -> DataFrame:
-        """Give a pandas data frame, its columns named as in a file; `read_quad_scan` takes it.
+        """Give a pandas data frame with columns named as in a file, for `read_quad_scan`.
 
         Raises
         ------
         InputError
             If pandas is not installed.
         """
-        named = {kind: key for key, kind in ENERGY_KEYS.items()}
+        energy_names = {kind: key for key, kind in ENERGY_KEYS.items()}
         columns = {f"{name}_{self.units[name]}": v for name, v in self.settings.items()}
         columns |= {f"size_{p}_m": v for p, v in self.size.items()}
         columns |= {f"size_{p}_error_m": v for p, v in self.error.items()}
         for p, r in (self.transfer or {}).items():
             columns |= {f"{name}_{p}": r[:, i] for i, name in enumerate(("r11", "r12", "r16"))}
-        further = {named[self.energy_kind]: self.energy, "screen": self.screen}
-        further |= {"resolution_m": self.resolution, "energy_spread": self.energy_spread}
-        further |= {"shots": self.shots, "slice": self.slice}
-        return frame_of(columns | {k: v for k, v in further.items() if v is not None})
+        optional = {energy_names[self.energy_kind]: self.energy, "screen": self.screen}
+        optional |= {"resolution_m": self.resolution, "energy_spread": self.energy_spread}
+        optional |= {"shots": self.shots, "slice": self.slice}
+        return frame_of(columns | {k: v for k, v in optional.items() if v is not None})
 
     def rows(self, plane: str) -> PlaneRows:
         """Select the rows in which one plane was measured.
@@ -286,20 +289,20 @@ class QuadScan:
         if plane not in self.size:
             raise self.unusable(f"no sizes in plane {plane}", f"a column size_{plane}_um")
         part = self.columns_at(np.flatnonzero(~np.isnan(self.size[plane])))
-        own = {"size": part["size"][plane], "error": part["error"].get(plane)}
-        return PlaneRows(**{name: (part | own)[name] for name in PlaneRows._fields})
+        plane_columns = {"size": part["size"][plane], "error": part["error"].get(plane)}
+        return PlaneRows(**{name: (part | plane_columns)[name] for name in PlaneRows._fields})
 
     def columns_at(self, rows: Sequence[int]) -> dict[str, Any]:
-        """Select some rows: arguments of `QuadScan` by name."""
-        return {name: at_rows(getattr(self, name), rows) for name in EACH_ROW}
+        """Select rows, as arguments of `QuadScan` by name."""
+        return {name: at_rows(getattr(self, name), rows) for name in ROW_COLUMNS}
 
     def of_slice(self, name: str) -> QuadScan:
-        """The rows of one slice of the beam, in the planes it was measured in.
+        """Select the rows of one slice of the beam, in the planes in which it was measured.
 
         Raises
         ------
         InputError
-            If there is none of that name; the nearest is offered.
+            If there is no slice of that name; the error offers the nearest.
 
         Examples
         --------
@@ -310,17 +313,17 @@ class QuadScan:
         """
         if name not in self.slices:
             raise self.unusable(f"no slice '{name}'", nearest(name, list(self.slices)), "slice")
-        at = [i for i, own in enumerate(self.slice) if own == name]
-        part = self.columns_at(at)
-        seen = [p for p, v in part["size"].items() if not np.isnan(v).all()]
+        rows = [i for i, row_slice in enumerate(self.slice) if row_slice == name]
+        part = self.columns_at(rows)
+        measured = [p for p, v in part["size"].items() if not np.isnan(v).all()]
         for key in ("size", "error", "shot_size", "transfer"):
-            part[key] = part[key] and {p: v for p, v in part[key].items() if p in seen}
-        profiles = tuple(p._replace(row=at.index(p.row)) for p in self.profiles if p.row in at)
+            part[key] = part[key] and {p: v for p, v in part[key].items() if p in measured}
+        profiles = tuple(p._replace(row=rows.index(p.row)) for p in self.profiles if p.row in rows)
         word = "" if name == PROJECTED else "slice "
         return replace(self, **part, profiles=profiles, name=f"{self.name}, {word}{name}")
 
     def without_settings(self, names: Iterable[str]) -> QuadScan:
-        """The same scan without some of its settings, which are no magnets of the line.
+        """Remove settings that are not magnets of the line.
 
         Examples
         --------
@@ -329,11 +332,11 @@ class QuadScan:
         >>> list(scan.without_settings(["phase"]).settings)
         ['Q']
         """
-        left = {n: v for n, v in self.settings.items() if n not in set(names)}
-        return replace(self, settings=left, units={n: self.units[n] for n in left})
+        kept = {n: v for n, v in self.settings.items() if n not in set(names)}
+        return replace(self, settings=kept, units={n: self.units[n] for n in kept})
 
     def of_particle(self, rest_energy: float) -> QuadScan:
-        """The same scan with total energies, for a particle of a rest energy in MeV.
+        """Convert energies to total energies, for a particle with a rest energy in MeV.
 
         Examples
         --------
@@ -348,11 +351,12 @@ class QuadScan:
         return replace(self, energy=total, energy_kind="total")
 
     def unusable(self, found: str, expected: str, key: str | None = None) -> InputError:
-        """Make the error that names this scan's file and the column of ``key``."""
+        """Create an error that names this scan's file and the column of ``key``."""
         column = None if key is None else self.columns.get(key, key)
         return InputError(found, expected, path=self.path, column=column)
 
     def _check_units(self) -> None:
+        """Raise an error for unknown units of settings or energy."""
         expect(self.units, Mapping, '{"Q1": "kG"}')
         for name in self.settings:
             unit = self.units.get(name)
@@ -364,6 +368,7 @@ class QuadScan:
             raise self.unusable(f"energy_kind '{self.energy_kind}'", expected, "energy")
 
     def _check_shapes(self) -> None:
+        """Raise an error for missing columns, and for columns of different lengths."""
         if not self.settings and self.screen is None and self.transfer is None:
             expected = "a column such as Q2_A, Q2_kG or Q2_k1, or several screens"
             raise self.unusable("no magnet settings", expected)
@@ -373,16 +378,19 @@ class QuadScan:
         lengths |= {f"size_{p}": len(v) for p, v in self.size.items()}
         lengths |= {f"size_{p}_error": len(v) for p, v in self.error.items()}
         lengths |= {f"shots of {p}": len(v) for p, v in self.shot_size.items()}
-        words = {"slice": self.slice, "screen": self.screen}
-        lengths |= {name: len(v) for name, v in words.items() if v is not None}
+        names = {"slice": self.slice, "screen": self.screen}
+        lengths |= {name: len(v) for name, v in names.items() if v is not None}
         lengths |= {f"R in {p}": len(v) for p, v in (self.transfer or {}).items()}
-        if apart := [p for p in self.error if p not in self.size]:
-            raise self.unusable(f"errors in {apart[0]} without sizes", f"size_{apart[0]}, too")
+        if without_sizes := [p for p in self.error if p not in self.size]:
+            raise self.unusable(
+                f"errors in {without_sizes[0]} without sizes", f"size_{without_sizes[0]}, too"
+            )
         if len(set(lengths.values())) != 1:
             raise self.unusable(f"lengths {lengths}", "one length for all columns")
 
     def _numbers(self, values: object, key: str) -> np.ndarray:
-        if isinstance(values, np.ma.MaskedArray):  # what is masked was not measured
+        """Convert a column to an array of numbers."""
+        if isinstance(values, np.ma.MaskedArray):  # masked values were not measured
             values = values.astype(float).filled(np.nan)
         try:
             found = np.asarray(values, float)
@@ -393,7 +401,7 @@ class QuadScan:
         return found
 
     def _column(self, key: str) -> np.ndarray:
-        """Numbers of each row; one number holds for all."""
+        """Array of numbers for each row, from one for each or one for all."""
         given = np.asarray(getattr(self, key))
         n = len(self)
         if given.dtype.kind not in "iuf" or given.shape not in ((), (n,)):
@@ -417,6 +425,7 @@ class QuadScan:
         return found
 
     def _check_values(self) -> None:
+        """Raise an error for settings, sizes, errors or energies that are not possible."""
         for name, values in self.settings.items():
             if not np.isfinite(values).all():
                 raise self.unusable("a setting that is not a number", "finite settings", name)
@@ -430,27 +439,28 @@ class QuadScan:
         for plane, size in self.size.items():
             if np.isnan(size).all():
                 continue
-            usual = middle(size)
-            if not (POSSIBLE[0] <= usual and np.nanmax(size) <= POSSIBLE[1]):
-                found = f"sizes around {usual:g} m, which no beam has"
+            typical = middle(size)
+            if not (POSSIBLE[0] <= typical and np.nanmax(size) <= POSSIBLE[1]):
+                found = f"sizes around {typical:g} m, which no beam has"
                 raise self.unusable(
                     found, "rms sizes in m: are these in um or mm?", f"size_{plane}"
                 )
 
     def _check_three_settings(self, plane: str) -> None:
-        distinct = "setting" if self.settings or self.transfer else "screen"
+        """Raise an error for fewer than three distinct settings in a plane."""
+        kind = "setting" if self.settings or self.transfer else "screen"
         keys = dict.fromkeys(compress(row_keys(self), ~np.isnan(self.size[plane])))
         for name, number in (Counter(key[0] for key in keys) or {"": 0}).items():
             if number < 3:
-                of = f" of slice {name}" if name else ""
+                of_slice = f" of slice {name}" if name else ""
                 raise self.unusable(
-                    f"{number} distinct {distinct}{'s' * (number != 1)}{of} in plane {plane}",
+                    f"{number} distinct {kind}{'s' * (number != 1)}{of_slice} in plane {plane}",
                     "at least three: the beam matrix has three numbers",
                 )
 
 
 def at_rows(values: Any, rows: Sequence[int]) -> Any:
-    """Some rows of a column, of each of several by name, or of words; None of none.
+    """Select rows of a column, or of each of several columns by name; None stays None.
 
     Examples
     --------
@@ -465,7 +475,7 @@ def at_rows(values: Any, rows: Sequence[int]) -> Any:
 
 
 def row_keys(scan: QuadScan) -> list[tuple]:
-    """Key of rows that are one measurement: slice, settings, energy, screen, own matrices."""
+    """Key of each row; rows with one key are one measurement, repeated."""
     columns = [scan.slice or ("",) * len(scan), *(list(v) for v in scan.settings.values())]
     columns += [list(v) for v in (scan.energy, scan.screen) if v is not None]
     columns += [list(map(tuple, v)) for v in (scan.transfer or {}).values()]
@@ -479,7 +489,7 @@ def check_names(
     default: str | None,
     rest_energy: float = 0.0,
 ) -> None:
-    """Check that a lattice has what a scan names, before anything is computed.
+    """Raise an error if a lattice lacks the magnets or screens of a scan.
 
     Parameters
     ----------
@@ -488,17 +498,17 @@ def check_names(
     calibrations : mapping of str to str
         Magnet name to the unit of its calibration in the lattice.
     places : list of str
-        Names a screen may have.
+        Names of possible screens.
     default : str or None
-        The screen used where the scan names none.
+        Screen of rows without one.
     rest_energy : float
-        Of the lattice's particle, MeV.
+        Rest energy of the lattice's particle, MeV.
 
     Raises
     ------
     InputError
-        If a magnet or screen is missing (the nearest is offered), or a current is given for
-        a magnet whose lattice entry has no current calibration.
+        If a magnet or screen is missing (the error offers the nearest), or a current is given for
+        a magnet without current calibration.
 
     Examples
     --------

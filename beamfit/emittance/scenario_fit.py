@@ -1,4 +1,4 @@
-"""The fit of a scenario, in which more than the beam is unknown, and the answer of each plane."""
+"""Fit of a scenario with unknowns besides the beam, and the answer of each plane."""
 
 from __future__ import annotations
 
@@ -13,22 +13,23 @@ import numpy as np
 from jax import Array
 
 from beamfit.compile_cache import SELDOM
-from beamfit.emittance.answer import SIGMA, BestFit, plane_answer, units_of
+from beamfit.emittance.answer import BestFit, plane_answer, sigma_units
 from beamfit.emittance.assumptions import Anchor, Assumptions
 from beamfit.emittance.model import (
-    QUANTITIES,
-    Asked,
-    asked_numbers,
-    asked_places,
+    SIGMA,
+    SIGMA_SLICE,
+    AnswerPlaces,
+    model_quantities,
+    place_optics,
     size_squared,
-    spoken,
+    user_name,
 )
 from beamfit.emittance.results import Parameter, PlaneFit
 from beamfit.emittance.statement import (
     PreparedScan,
     Scanned,
     Scenario,
-    asked_in,
+    problem_places,
     size_record,
     size_records,
     with_posteriors,
@@ -40,16 +41,16 @@ from beamfit.greybox.problem import Problem
 from beamfit.greybox.solve import solve
 from beamfit.statistics import Directions, scaled_directions
 
-# Ends of a search that are no answer.
-NO_ANSWER = (Status.not_finite, Status.infeasible, Status.not_converged)
-NO_ANSWER += (Status.contradictory_bounds,)
-# How often errors are taken anew at most, and what change of them no longer matters.
-ROUNDS, SAME = 3, 1e-2
+# Statuses of a search that gives no answer.
+FAILED = (Status.not_finite, Status.infeasible, Status.not_converged)
+FAILED += (Status.contradictory_bounds,)
+# Largest number of refits with new errors, and the relative change of errors that ends them.
+MAX_ITERATIONS, ERROR_TOLERANCE = 3, 1e-2
 
 
-def _numbers(model: Mapping[str, Any], asked: tuple[Asked, ...]) -> Array:
+def _numbers(model: Mapping[str, Any], places: tuple[AnswerPlaces, ...]) -> Array:
     """`QUANTITIES` of each plane."""
-    return jnp.stack([asked_numbers(model, each) for each in asked])
+    return jnp.stack([model_quantities(model, each) for each in places])
 
 
 @partial(jax.jit, compiler_options=SELDOM)
@@ -58,169 +59,183 @@ def _elements(model: Mapping[str, Any], rows: tuple[Any, ...]) -> Array:
     return jnp.stack([jnp.stack(each.elements(model)) for each in rows])
 
 
-def settled_fit(
-    seen: PreparedScan, scenario: Scenario, told: Assumptions
+def iterated_fit(
+    prepared: PreparedScan, scenario: Scenario, assumptions: Assumptions
 ) -> tuple[Fit, PreparedScan]:
-    """Solve, and again with errors taken at the fitted sizes, until these change no more.
+    """Solve, and refit with errors taken at the fitted sizes until these no longer change.
 
-    Where the line was wrong, so were the sizes that known transport weighed by, the noise it saw in
-    its residuals, and the points it doubted. What is seen in the end is the posterior through the
-    line as found.
+    The fit with known transport takes its weights, its noise and its bad readings from the given
+    line, which may be wrong. The returned scan has the posterior through the fitted line.
     """
-    fit = _solved(scenario.state(_as_stated(seen), told), scenario, told)
-    found = _through(seen, fit)
-    for _ in range(ROUNDS):
+    fit = _solve(scenario.state(_with_stated_errors(prepared), assumptions), scenario, assumptions)
+    found = _with_fitted_line(prepared, fit)
+    for _ in range(MAX_ITERATIONS):
         old = size_records(fit.problem)
         new = {r.name: size_record(found, plane, r.data) for plane, r in old.items()}
-        if all(np.allclose(new[r.name].error, r.error, rtol=SAME) for r in old.values()):
+        if all(np.allclose(new[r.name].error, r.error, rtol=ERROR_TOLERANCE) for r in old.values()):
             break
         records = tuple(new.get(r.name, r) for r in fit.problem.records)
-        again = solve(replace(fit.problem, model=fit.model, records=records))
-        # The search is the first one; the few steps from its end are told with it.
-        said = fit.message if again.status is fit.status else again.message
-        fit = replace(again, attempts=(*fit.attempts, *again.attempts), message=said)
-        found = _through(seen, fit)
+        refit = solve(replace(fit.problem, model=fit.model, records=records))
+        # The attempts of the first search stay on record with the few steps of the refit.
+        message = fit.message if refit.status is fit.status else refit.message
+        fit = replace(refit, attempts=(*fit.attempts, *refit.attempts), message=message)
+        found = _with_fitted_line(prepared, fit)
     return fit, found
 
 
-def _as_stated(seen: PreparedScan) -> PreparedScan:
-    """The scan with the errors that were stated, where they were.
+def _with_stated_errors(prepared: PreparedScan) -> PreparedScan:
+    """The scan with its stated errors, where there are any.
 
-    What a line misses as it is, a scenario is to explain: it is no noise yet.
+    Misfits of the given line are for the scenario to explain: they are not noise.
     """
     solutions = {}
-    for plane, work in seen.solutions.items():
-        error = work.points.error if work.sizes.error is None else work.sizes.error
-        solutions[plane] = work._replace(points=work.points._replace(error=error))
-    return seen._replace(solutions=solutions)
+    for plane, solution in prepared.solutions.items():
+        error = solution.points.error if solution.sizes.error is None else solution.sizes.error
+        solutions[plane] = solution._replace(points=solution.points._replace(error=error))
+    return prepared._replace(solutions=solutions)
 
 
-def _solved(problem: Problem, scenario: Scenario, told: Assumptions) -> Fit:
-    """Solve, a network from many starts, and so whatever one start may have led astray.
+def _solve(problem: Problem, scenario: Scenario, assumptions: Assumptions) -> Fit:
+    """Solve; from many starts for a network, or if one start ended in a poor fit.
 
-    A beam of no emittance is a stationary point of every fit in its Cholesky factor, so a start
-    near it (the known-transport fit with a wrong calibration, say) may never leave it.
+    A zero-emittance beam is a stationary point of every fit in its Cholesky factor. A start near
+    it, such as the known-transport fit with a wrong calibration, may never leave it.
     """
-    fit = solve(problem, told.starts if scenario.network else 1, told.seed)
-    flat = any(fit[f"beam.{plane}.l22"].state == "lower" for plane in problem.model["beam"])
-    lost = fit.status is not Status.converged and fit.chi2 > 2.0 * max(fit.dof, 1)
-    if (flat or lost) and not scenario.network:
-        fit = solve(problem, told.starts, told.seed)
+    fit = solve(problem, assumptions.starts if scenario.network else 1, assumptions.seed)
+    at_zero_emittance = any(
+        fit[f"beam.{plane}.l22"].state == "lower" for plane in problem.model["beam"]
+    )
+    poor = fit.status is not Status.converged and fit.chi2 > 2.0 * max(fit.dof, 1)
+    if (at_zero_emittance or poor) and not scenario.network:
+        fit = solve(problem, assumptions.starts, assumptions.seed)
     return fit
 
 
-def _through(seen: PreparedScan, fit: Fit) -> PreparedScan:
-    """See the scan through the line as a fit found it: each plane fitted in closed form."""
+def _with_fitted_line(prepared: PreparedScan, fit: Fit) -> PreparedScan:
+    """The scan with each plane fitted in closed form through the fitted line."""
     records = size_records(fit.problem)
-    elements = np.asarray(_elements(fit.model, tuple(records[p].data for p in seen.planes)))
-    look = seen.look.copy()
-    look[:, ["xy".index(plane) for plane in seen.planes]] = np.swapaxes(elements, 0, 1)
-    return with_posteriors([seen._replace(look=look)])[0]
+    fitted = np.asarray(_elements(fit.model, tuple(records[p].data for p in prepared.planes)))
+    elements = prepared.elements.copy()
+    elements[:, ["xy".index(plane) for plane in prepared.planes]] = np.swapaxes(fitted, 0, 1)
+    return with_posteriors([prepared._replace(elements=elements)])[0]
 
 
-def judged_scenario(of: Scanned) -> tuple[PlaneFit, ...]:
+def scenario_answers(of: Scanned) -> tuple[PlaneFit, ...]:
     """Answer for each plane of a scenario's fit.
 
-    The posterior is that of the beam through the line as found, spread by what the other unknowns
-    leave open.
+    The posterior is that of the beam through the fitted line, widened by the other unknowns.
     """
-    fit, seen = of.solved, of.seen
-    asked = asked_in(fit.problem, seen, seen.planes, of.statement.whole_map)
-    derived = fit.derive(_numbers, asked)
+    fit, prepared = of.solved, of.seen
+    places = problem_places(fit.problem, prepared, prepared.planes, of.statement.whole_map)
+    derived = fit.derive(_numbers, places)
     beams = []
-    for i, plane in enumerate(seen.planes):
-        own = Derived(*(part[i] for part in derived))
-        work = seen.solutions[plane]
-        p = work.points
-        squared = size_squared(own.value[SIGMA], p.r11, p.r12, p.known)
-        p = p.with_model(np.sqrt(np.maximum(squared, 0.0)), seen.rows.squared)
-        now = seen._replace(solutions=seen.solutions | {plane: work._replace(points=p)})
-        places = map(np.asarray, asked_places(fit.model, asked[i]))
-        beams.append(plane_answer(now, of.line, plane, tuple(places), _best_fit(of, plane, own)))
+    for i, plane in enumerate(prepared.planes):
+        plane_derived = Derived(*(part[i] for part in derived))
+        solution = prepared.solutions[plane]
+        p = solution.points
+        squared = size_squared(plane_derived.value[SIGMA_SLICE], p.r11, p.r12, p.known)
+        p = p.with_model(np.sqrt(np.maximum(squared, 0.0)), prepared.rows.squared)
+        fitted = prepared._replace(
+            solutions=prepared.solutions | {plane: solution._replace(points=p)}
+        )
+        optics = map(np.asarray, place_optics(fit.model, places[i]))
+        beams.append(
+            plane_answer(fitted, of.line, plane, tuple(optics), _best_fit(of, plane, plane_derived))
+        )
     return tuple(beams)
 
 
-def _best_fit(of: Scanned, plane: str, own: Derived) -> BestFit:
-    """Further unknowns of the fit, as they enter the posterior of the beam."""
-    fit, told, scenario, jacobian = of.solved, of.told, of.statement, _loose_jacobian(of.solved)
+def _best_fit(of: Scanned, plane: str, derived: Derived) -> BestFit:
+    """Best fit of a plane, with the contribution of the scenario's other unknowns."""
+    fit, assumptions, scenario, jacobian = (
+        of.solved,
+        of.told,
+        of.statement,
+        _loose_jacobian(of.solved),
+    )
     record = size_records(fit.problem)[plane].name
-    on_data = bool(np.isfinite(own.error[0])) and _held(fit) is None
-    effects = effect_words(fit, told, float(own.value[1]), np.nan_to_num(own.slope[1]))
+    decided = bool(np.isfinite(derived.error[0])) and _limit_finding(fit) is None
+    effects = effect_words(
+        fit, assumptions, float(derived.value[1]), np.nan_to_num(derived.slope[1])
+    )
     edges = "".join(
         f"; {p.name} ends at its {p.state} bound {p.value.value:.6g} "
         f"(d(chi2/2)/d(bound) = {p.multiplier:.2g})"
         for p in of.parameters
         if p.status is Status.at_limit
     )
-    opened = "its value is decided by bounds and starting point, not by the data" + edges
-    slopes = np.nan_to_num(own.slope[SIGMA])
+    open_cause = "its value is decided by bounds and starting point, not by the data" + edges
+    slopes = np.nan_to_num(derived.slope[SIGMA_SLICE])
     return BestFit(
-        value=own.value,
-        spread=_further_spread(fit, plane, own, jacobian),
+        value=derived.value,
+        spread=_further_spread(fit, plane, derived, jacobian),
         covariance=slopes @ fit.covariance @ slopes.T,
-        directions=_directions(fit, own.value[SIGMA], slopes, jacobian),
+        directions=_directions(fit, derived.value[SIGMA_SLICE], slopes, jacobian),
         dof=next((g.dof for g in fit.groups if g.name == record), 0.0),
-        ending=_ending(scenario, told, fit),
-        opened="" if on_data else opened,
-        remedy=scenario.remedy(of.seen, told),
+        ending=_failure(scenario, assumptions, fit),
+        open_cause="" if decided else open_cause,
+        remedy=scenario.remedy(of.seen, assumptions),
         remark=(_remark(scenario, of.parameters) + effects).strip(),
-        scenario=scenario.name + (f" with {told.anchor.words}" if told.anchor != Anchor() else ""),
-        holds="statistics, systematics" if told.systematics else "statistics only",
+        scenario=scenario.name
+        + (f" with {assumptions.anchor.words}" if assumptions.anchor != Anchor() else ""),
+        holds="statistics, systematics" if assumptions.systematics else "statistics only",
     )
 
 
-def _further_spread(fit: Fit, plane: str, own: Derived, jacobian: np.ndarray) -> np.ndarray:
-    """Standard deviation that the other unknowns add to each number of a plane, shape (11,).
+def _further_spread(fit: Fit, plane: str, derived: Derived, jacobian: np.ndarray) -> np.ndarray:
+    """Standard deviation that the other unknowns add to each quantity of a plane, shape (11,).
 
-    The variance of all free numbers together less that of the beam's own with the others held.
+    It is the variance with all parameters free minus that with only the plane's beam free.
     """
-    at = [i for i, name in enumerate(fit.problem.names) if name.startswith(f"beam.{plane}.")]
-    alone = np.linalg.pinv(jacobian[:, at])
-    held = np.sum((np.nan_to_num(own.slope)[:, at] @ alone) ** 2, axis=1)
-    whole = np.nan_to_num(own.error, nan=np.inf) ** 2
-    return np.sqrt(np.maximum(whole - held, 0.0))
+    beam_columns = [
+        i for i, name in enumerate(fit.problem.names) if name.startswith(f"beam.{plane}.")
+    ]
+    inverse = np.linalg.pinv(jacobian[:, beam_columns])
+    beam_variance = np.sum((np.nan_to_num(derived.slope)[:, beam_columns] @ inverse) ** 2, axis=1)
+    total = np.nan_to_num(derived.error, nan=np.inf) ** 2
+    return np.sqrt(np.maximum(total - beam_variance, 0.0))
 
 
 def _remark(scenario: Scenario, parameters: tuple[Parameter, ...]) -> str:
-    """Say what is open besides the beam, and what it rests on."""
-    left = ", ".join(p.name for p in parameters if p.status is not Status.converged)
+    """State which parameters are open, and which priors the answer rests on."""
+    open_names = ", ".join(p.name for p in parameters if p.status is not Status.converged)
     priors = ", ".join(p.name for p in parameters if p.prior is not None)
-    said = ""
-    if left:
-        said += f" {left} not determined{scenario.aside}."
+    text = ""
+    if open_names:
+        text += f" {open_names} not determined{scenario.consequence}."
     if not parameters and not scenario.network:
-        said += " Nothing is free besides the beam, so this is the fit with known transport."
+        text += " Nothing is free besides the beam, so this is the fit with known transport."
     if priors:
-        said += f" Rests on the prior of {priors}."
-    return said
+        text += f" Rests on the prior of {priors}."
+    return text
 
 
-def _ending(scenario: Scenario, told: Assumptions, fit: Fit) -> Finding | None:
-    """Finding on a search that ended at no optimum."""
+def _failure(scenario: Scenario, assumptions: Assumptions, fit: Fit) -> Finding | None:
+    """Finding on a search that found no optimum, or on an answer at a given limit."""
     if fit.status is Status.not_converged and scenario.network:
-        said = (
-            f"The search from {told.starts} starts came to no rest (chi2 = {fit.chi2:.4g}); give "
-            "more starts, another seed, or fewer hidden nodes."
+        text = (
+            f"The search from {assumptions.starts} starts came to no rest (chi2 = {fit.chi2:.4g}); "
+            "give more starts, another seed, or fewer hidden nodes."
         )
-        return Finding(fit.status, said)
-    if fit.status not in NO_ANSWER:
-        return _held(fit)
+        return Finding(fit.status, text)
+    if fit.status not in FAILED:
+        return _limit_finding(fit)
     return Finding(fit.status, fit.message[0].upper() + fit.message[1:])
 
 
-def _held(fit: Fit) -> Finding | None:
-    """Finding on an answer held by a box or limit that was given: it decides, not the data.
+def _limit_finding(fit: Fit) -> Finding | None:
+    """Finding on an answer at a given box or limit: the limit decides it, not the data.
 
-    A constraint that is active counts as exact in the covariance, and a beam in a corner of its box
-    as known to the last digit.
+    The covariance treats an active constraint as exact, so a beam in a corner of its box would have
+    no error.
     """
     active = [c.name.split("[")[0] for c in fit.constraints if c.state != "free"]
     if not active:
         return None
-    named = ", ".join(dict.fromkeys(active))
+    names = ", ".join(dict.fromkeys(active))
     return Finding(
         Status.unidentified,
-        f"The answer is held by limits that were given ({named}): they decide it, not the data.",
+        f"The answer is held by limits that were given ({names}): they decide it, not the data.",
         "Justify or widen them, or tie the network to first principles.",
     )
 
@@ -228,18 +243,18 @@ def _held(fit: Fit) -> Finding | None:
 def _directions(
     fit: Fit, sigma: np.ndarray, slopes: np.ndarray, jacobian: np.ndarray
 ) -> Directions:
-    """Directions of σ and of the other numbers asked for that the data leave open."""
+    """Directions of σ and of the other parameters that the data do not determine."""
     p, theta = fit.problem, fit.theta
     loose = ~p.nuisance & (p.lower < p.upper)
     further = [i for i in np.flatnonzero(loose) if not p.names[i].startswith("beam.")]
-    asked = np.vstack([slopes, np.eye(len(theta))[further]])
-    units = np.array([*units_of(sigma), *(abs(theta[i]) or 1.0 for i in further)])
-    names = [*list(QUANTITIES)[SIGMA], *(spoken(p.names[i]) for i in further)]
-    return scaled_directions(_marginal(jacobian, asked, units), np.ones(len(units)), names)
+    quantities = np.vstack([slopes, np.eye(len(theta))[further]])
+    units = np.array([*sigma_units(sigma), *(abs(theta[i]) or 1.0 for i in further)])
+    names = [*SIGMA, *(user_name(p.names[i]) for i in further)]
+    return scaled_directions(_marginal(jacobian, quantities, units), np.ones(len(units)), names)
 
 
 def _loose_jacobian(fit: Fit) -> np.ndarray:
-    """Residuals by free numbers, errors as scaled, without weights that bounds hold."""
+    """Jacobian of the residuals with scaled errors; columns of fixed parameters are zero."""
     p = fit.problem
     rows = fit.dense_jacobian
     for group in fit.groups:
@@ -250,16 +265,16 @@ def _loose_jacobian(fit: Fit) -> np.ndarray:
 
 
 def _marginal(jacobian: np.ndarray, slopes: np.ndarray, units: np.ndarray) -> np.ndarray:
-    """A Jacobian of asked numbers whose normal matrix is their marginal information.
+    """Jacobian of given quantities whose Gram matrix is their marginal information.
 
-    Free numbers move along the asked ones or, by the rest, along what leaves those as they are;
-    what the rest can undo in the residuals is taken out (the Schur complement, by projection).
+    The parameter space splits into directions that change the quantities and the rest. Residuals
+    that the rest can compensate are projected out (Schur complement).
     """
-    scaled = slopes / units[:, None]
-    _, sizes, turned = np.linalg.svd(scaled, full_matrices=True)
-    rest = jacobian @ turned[len(sizes) :].T
+    unit_slopes = slopes / units[:, None]
+    _, sizes, directions = np.linalg.svd(unit_slopes, full_matrices=True)
+    rest = jacobian @ directions[len(sizes) :].T
     length = np.linalg.norm(rest, axis=0)
-    undone, seen, _ = np.linalg.svd(rest / np.where(length > 0, length, 1.0), full_matrices=False)
-    undone = undone[:, seen > 1e-10 * seen.max(initial=0.0)]
-    along = jacobian @ np.linalg.pinv(scaled)
-    return along - undone @ (undone.T @ along)
+    basis, values, _ = np.linalg.svd(rest / np.where(length > 0, length, 1.0), full_matrices=False)
+    basis = basis[:, values > 1e-10 * values.max(initial=0.0)]
+    reduced = jacobian @ np.linalg.pinv(unit_slopes)
+    return reduced - basis @ (basis.T @ reduced)

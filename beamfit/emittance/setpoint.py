@@ -1,4 +1,4 @@
-"""The best magnet settings for a wanted beam at the screen (report Appendix D)."""
+"""Best magnet settings for a target beam at the screen (report Appendix D)."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ from beamfit.emittance.targets import (
     SAME_ENERGY,
     Beam,
     Target,
-    checked_place,
+    check_targets,
     common_energy,
-    resolved,
+    resolve_targets,
 )
 from beamfit.emittance.transport import setting_units
 from beamfit.errors import Finding, InputError, Status
@@ -40,25 +40,26 @@ from beamfit.greybox.solve import search, solve
 from beamfit.optics.beamline import Beamline
 from beamfit.quantity import Quantity
 
-# Starts of the search: enough for the minima that a few magnets have; no number fills the box of
-# many magnets, whose targets can usually be met in many ways.
-STARTS, FEW, MANY = 256, 64, 8
-# Of each of them, and how sharp; the lowest goes on to the end.
-STEPS, SHARP = 300, 1e-10
-# Two end points are one minimum if they differ by less than this share of the range.
-SAME = 1e-3
-MOST_MINIMA = 10
-# A target is met within the usual error of a measured size, or of the growth of a mismatch.
-MET = 0.02
-# What squares of a micrometre or a microradian, or BMAG - 1, come to by rounding.
-EXACT = 1e-9
-SHOWN = {
+# Starts of the search: enough for the minima of a few magnets. With more magnets than the last
+# number, no number of starts covers the box, but targets can usually be met in many ways.
+STARTS, MANY_MAGNET_STARTS, MANY_MAGNETS = 256, 64, 8
+# Steps of each descent at most, and its tolerance; the lowest end point is then refined.
+MAX_STEPS, STEP_TOLERANCE = 300, 1e-10
+# Two end points are one minimum if all settings differ by less than this share of their range.
+SETTING_TOLERANCE = 1e-3
+MAX_MINIMA = 10
+# A target is met within 2 %: the usual error of a measured size, or growth by a mismatch.
+MAX_MISS = 0.02
+# Objectives below this are zero but for rounding, in µm², µrad² or BMAG - 1.
+ZERO_OBJECTIVE = 1e-9
+# Factor and unit in which each predicted quantity is shown.
+DISPLAY_UNITS = {
     "size": (1e6, " µm"),
     "divergence": (1e6, " µrad"),
     "beta": (1.0, " m"),
     "alpha": (1.0, ""),
 }
-CALIBRATED = (
+CALIBRATION_NOTE = (
     "The beam was fitted together with the calibration, and only the beam's covariance is in the "
     "file: the two are correlated, and without that the errors here are too large, on the GTF line "
     "1.2 to 4.6 times."
@@ -76,7 +77,7 @@ class PlaneBeam(NamedTuple):
 
 
 class Minimum(NamedTuple):
-    """Settings at which the objective has a minimum, and its value there."""
+    """Settings at a local minimum of the objective, and its value."""
 
     settings: dict[str, float]
     objective: float
@@ -85,38 +86,38 @@ class Minimum(NamedTuple):
 @answer
 @dataclass(frozen=True)
 class Setpoint:
-    """The best settings found, what they give, and how sure that is.
+    """Best settings found, the predicted beam, and its errors.
 
     Attributes
     ----------
     status : Status
-        ``converged`` where the target is met; ``at_limit`` where a limit keeps it from being met
-        better; ``infeasible`` where no setting near by comes nearer; ``not_converged`` where the
-        search came to no optimum.
+        ``converged`` if the target is met; ``at_limit`` if a limit keeps it from being met better;
+        ``infeasible`` if no setting near by comes closer; ``not_converged`` if the search found no
+        optimum.
     message : str
-        What is reached, what holds it, and what to do.
+        The beam reached, what limits it, and what to do.
     best : Minimum
-        The best settings: always those of the lowest objective found.
+        Settings of the lowest objective found.
     others : tuple of Minimum
         Further local minima, best first.
     setting_error : dict of str to float or None
-        How far the best setting moves with one standard deviation of the beam.
+        Change of the best setting by one standard deviation of the beam.
     limits : tuple of str
-        Magnets whose setting ends on a limit.
+        Magnets whose setting is at a limit.
     screen : str
-        Where.
+        Place of the targets.
     predicted : tuple of PlaneBeam
-        The beam there, with the beam's uncertainty carried along.
+        The beam there, with the errors of the given beam propagated.
     targets : tuple of Target
-        What was wanted.
+        The targets.
     units : dict of str to str
-        Of the settings.
+        Units of the settings.
     energy : float
         Total energy of the beam, MeV.
     line : str
         Name of the line.
     notes : tuple of str
-        What to know of the beam and its errors.
+        Remarks on the beam and its errors.
     doubts : dict of str to str
         A warning for each plane whose beam the fit does not determine.
     """
@@ -138,12 +139,12 @@ class Setpoint:
 
     @property
     def headline(self) -> str:
-        """The settings found, in a line."""
+        """The settings found, in one line."""
         return f"{cell(self.status)}: {in_words(self.best.settings, self.units)}"
 
     def to_json(self) -> dict[str, Any]:
         """Give the entry of ``results`` of the JSON contract; size and so on of the first plane."""
-        planes = {p.plane: {k: getattr(p, k) for k in SHOWN} for p in self.predicted}
+        planes = {p.plane: {k: getattr(p, k) for k in DISPLAY_UNITS} for p in self.predicted}
         found = {
             "status": self.status,
             "message": " ".join([self.message, *self.notes, *self.doubts.values()]),
@@ -163,35 +164,38 @@ class Setpoint:
         return json_of(found)
 
     def tables(self) -> tuple[Table, ...]:
-        """Lay out the settings with what they give, and the other minima if there are any."""
+        """Table of the settings and the predicted beam, and one of the other minima if any."""
         rows = []
         for name, value in self.best.settings.items():
             unit, error = self.units[name], self.setting_error[name]
-            moved = "-" if error is None else f"{error:.2g} {unit}"
-            rows.append([name, f"{value:.6g} {unit}", moved])
-        rows.append(["objective", _written(self.best.objective)])
+            error_text = "-" if error is None else f"{error:.2g} {unit}"
+            rows.append([name, f"{value:.6g} {unit}", error_text])
+        rows.append(["objective", _objective_text(self.best.objective)])
         for p in self.predicted:
-            rows += [[f"{key} {p.plane}", _shown(key, getattr(p, key))] for key in SHOWN]
+            rows += [
+                [f"{key} {p.plane}", _quantity_text(key, getattr(p, key))] for key in DISPLAY_UNITS
+            ]
         title = f"Best settings of {self.line} for the beam at {self.screen}"
         best = Table(title, ["", "setting", "± from the beam"], rows)
         others = [
-            [f"  {in_words(m.settings, self.units, 5)}: objective {_written(m.objective)}"]
+            [f"  {in_words(m.settings, self.units, 5)}: objective {_objective_text(m.objective)}"]
             for m in self.others[:5]
         ]
         return (best, Table("Other minima", [], others)) if others else (best,)
 
 
-def _written(objective: float) -> str:
-    """Write an objective; below the rounding of the search all targets are met."""
-    return f"{objective:.6g}" if objective >= EXACT else "0"
+def _objective_text(objective: float) -> str:
+    """Write an objective; below the rounding error of the search it is zero."""
+    return f"{objective:.6g}" if objective >= ZERO_OBJECTIVE else "0"
 
 
 @tree.node("names")
-class _Wanted:
-    """The data of a search: magnets (by name), their line, the targets, the beams.
+class _TargetData:
+    """Data of a search: magnets, line, targets and beams.
 
-    Of the targets `kinds`, `planes`, shape (targets,), `values` (targets, 2), `weight` (targets,
-    1), padded to a length that searches share; `middle` and `reach` (magnets,), `sigma` (2, 3).
+    Targets have `kinds`, `planes`, shape (targets,), `values` (targets, 2) and `weight` (targets,
+    1), padded to a length that searches share. `middle` and `reach`, shape (magnets,), are middle
+    and half width of the limits; `sigma` is (2, 3).
     """
 
     names: tuple[str, ...]
@@ -214,47 +218,48 @@ def find_setpoint(
     screen: str | None = None,
     seed: int = 0,
 ) -> Setpoint:
-    """Find the settings that bring the beam nearest to what is wanted.
+    """Find the settings that bring the beam closest to the targets.
 
     Parameters
     ----------
     line : Beamline
-        From where the beam matrix is known to the screen.
+        The line from the place of the beam matrix to the screen.
     beams : mapping of str to Beam
-        Plane to beam at the start. A beam that says at which energy it was measured is carried at
-        that, and one that was fitted with a calibration meets it.
+        Plane to beam at the start. A beam with an energy is transported at that energy, and a beam
+        fitted with a calibration through the calibrated magnets.
     vary : mapping of str to (float, float)
-        Magnet to its limits, in the unit of its calibration. The others stay as the line has them.
+        Magnet to its limits, in the unit of its calibration. Other magnets keep their settings.
     targets : sequence of Target
-        What is wanted. The objective is the sum of (size - target)² in µm² and (divergence -
-        target)² in µrad² (Appendix D), and of BMAG - 1 for a match.
+        The targets. The objective is the sum of (size - target)² in µm² and (divergence - target)²
+        in µrad² (Appendix D), and of BMAG - 1 for a match.
     screen : str, optional
-        Where; the line's last screen if None, or the place of its design for matches to that.
+        Place of the targets; the line's last screen if None, or the place of its design for matches
+        to that.
     seed : int
-        Of the starts.
+        Seed of the starts.
 
     Returns
     -------
     Setpoint
-        The lowest of the minima found from 256 starts, of many magnets from 64. Its status says
-        whether the target is met, and if not what keeps it from being met.
+        The lowest of the minima found from 256 starts, or 64 for many magnets. Its status states
+        whether the target is met, or else what prevents it.
 
     Raises
     ------
     InputError
-        If a magnet, screen or plane is unknown, limits are reversed, nothing is wanted, or beams
-        are of different energies.
+        If a magnet, screen or plane is unknown, limits are reversed, there is no target, or beams
+        have different energies.
 
     Notes
     -----
-    The miss of a size is stated as a vector: with R the transfer matrix, σ = L Lᵀ the beam at the
-    start and v the first row of R L, the size is ``|v|`` and the miss ``(1 - target/|v|) v``. Its
-    square is (size - target)², and where the target is out of reach the linear picture of v still
-    has the curvature that that of ``|v|`` lacks, so that Gauss-Newton comes to rest there too.
+    The miss of a size is a vector: with R the transfer matrix, σ = L Lᵀ the beam at the start and v
+    the first row of R L, the size is ``|v|`` and the miss ``(1 - target/|v|) v``. Its square is
+    (size - target)². Where a target is out of reach, the linearised v still has the curvature that
+    a linearised ``|v|`` lacks, so that Gauss-Newton converges there too.
 
-    The predicted beam has the error that the beam matrix gives it at fixed settings. The best
-    setting I of a beam σ has ∂f/∂I(I, σ) = 0, so it moves by -(∂²f/∂I²)⁻¹ ∂²f/∂I∂σ dσ; that is its
-    error.
+    Errors of the predicted beam are those of the beam matrix at fixed settings. The best setting I
+    for a beam σ has ∂f/∂I(I, σ) = 0, so a change dσ moves it by -(∂²f/∂I²)⁻¹ ∂²f/∂I∂σ dσ. This
+    gives the setting errors.
 
     Examples
     --------
@@ -265,51 +270,53 @@ def find_setpoint(
     >>> round(1e6 * found.predicted[0].size.value, 3), len(found.others)
     (100.0, 1)
     """
-    targets, screen = resolved(line, targets, screen)
-    screen = checked_place(line, beams, vary, targets, screen)
-    used = {plane: beams[plane] for plane in dict.fromkeys(t.plane for t in targets)}
-    energy = common_energy(used)
-    carrying = line if energy is None else replace(line, energy=energy)
+    targets, screen = resolve_targets(line, targets, screen)
+    screen = check_targets(line, beams, vary, targets, screen)
+    target_beams = {plane: beams[plane] for plane in dict.fromkeys(t.plane for t in targets)}
+    energy = common_energy(target_beams)
+    transport_line = line if energy is None else replace(line, energy=energy)
     for beam in beams.values():
-        carrying = with_numbers(carrying, beam.calibration)
-    carrying = carrying.upto(screen)
-    short = carrying.condensed((*vary, screen), carrying.energy)
-    wanted = _wanted(short, used, vary, targets)
-    minima, fit = _search(_stated(wanted), seed)
+        transport_line = with_numbers(transport_line, beam.calibration)
+    transport_line = transport_line.upto(screen)
+    condensed = transport_line.condensed((*vary, screen), transport_line.energy)
+    data = _target_data(condensed, target_beams, vary, targets)
+    minima, fit = _search(_problem_of(data), seed)
     units = setting_units(line, vary)
-    listed = [Minimum(_settings(wanted, theta), value) for theta, value in minima]
-    predicted = _predicted(wanted, used, fit.theta)
-    misses = _relative_misses(wanted, targets, fit.theta)
-    ends = zip(vary, fit.variables, strict=True)
-    # A setting on its limit that would lower the objective by going on.
-    held = [n for n, v in ends if abs(v.value) == 1 and abs(v.reduced_gradient) > 1e-6 * fit.cost]
-    reached, optimum = _reached_words(targets, predicted, misses), fit.kkt.worst <= TOLERANCE
-    found = _verdict(reached, misses, listed[0].objective, optimum, held)
+    found_minima = [Minimum(_settings(data, theta), value) for theta, value in minima]
+    predicted = _predicted_beams(data, target_beams, fit.theta)
+    misses = _relative_misses(data, targets, fit.theta)
+    magnets = zip(vary, fit.variables, strict=True)
+    # Magnets at a limit beyond which the objective would be lower.
+    held_by_limit = [
+        n for n, v in magnets if abs(v.value) == 1 and abs(v.reduced_gradient) > 1e-6 * fit.cost
+    ]
+    reached, optimum = _reached_sentence(targets, predicted, misses), fit.kkt.worst <= TOLERANCE
+    verdict = _verdict(reached, misses, found_minima[0].objective, optimum, held_by_limit)
     return Setpoint(
-        found.status,
-        found.message + _next_words(listed, units),
-        listed[0],
-        tuple(listed[1:]),
-        _setting_errors(wanted, used, fit.theta),
+        verdict.status,
+        verdict.message + _next_sentence(found_minima, units),
+        found_minima[0],
+        tuple(found_minima[1:]),
+        _setting_errors(data, target_beams, fit.theta),
         tuple(n for n, t in zip(vary, fit.theta, strict=True) if abs(t) == 1.0),
         screen,
         predicted,
         targets,
         units,
-        float(carrying.energy),
+        float(transport_line.energy),
         line.name,
-        _notes_on(used, float(carrying.energy), float(line.energy)),
-        _doubts_on(used),
+        _notes(target_beams, float(transport_line.energy), float(line.energy)),
+        _doubts(target_beams),
     )
 
 
-def _wanted(line, beams, vary, targets) -> _Wanted:
-    """Gather the data of a search; `line` ends at the place."""
+def _target_data(line, beams, vary, targets) -> _TargetData:
+    """Collect the data of a search; `line` ends at the place of the targets."""
     low, high = np.array([*vary.values()], float).T
     size = padded_length(len(targets))
     padded = [*targets, *[targets[0]] * (size - len(targets))]
     other = next(iter(beams.values()))
-    return _Wanted(
+    return _TargetData(
         tuple(vary),
         line,
         jnp.array([KINDS.index(t.kind) for t in padded]),
@@ -322,136 +329,148 @@ def _wanted(line, beams, vary, targets) -> _Wanted:
     )
 
 
-def _stated(wanted: _Wanted) -> Problem:
-    """The search as a problem: settings from -1 to 1 between their limits, no miss "measured"."""
-    none = np.zeros(wanted.values.shape)
-    weight = np.broadcast_to(wanted.weight, none.shape)
-    record = Record("targets", _misses, wanted, none, error=1.0, weight=weight)
-    start = jnp.zeros(len(wanted.names))
+def _problem_of(data: _TargetData) -> Problem:
+    """Problem of the search: settings scaled to -1 to 1, and misses with target zero."""
+    zeros = np.zeros(data.values.shape)
+    weight = np.broadcast_to(data.weight, zeros.shape)
+    record = Record("targets", _misses, data, zeros, error=1.0, weight=weight)
+    start = jnp.zeros(len(data.names))
     return Problem({"settings": start}, [Free("settings", -1.0, 1.0)], [record])
 
 
-def _settings(wanted: _Wanted, theta) -> dict[str, float]:
-    values = np.asarray(wanted.middle + wanted.reach * theta)
-    return dict(zip(wanted.names, map(float, values), strict=True))
+def _settings(data: _TargetData, theta) -> dict[str, float]:
+    """Settings in the units of the magnets."""
+    values = np.asarray(data.middle + data.reach * theta)
+    return dict(zip(data.names, map(float, values), strict=True))
 
 
-def _plain(names: tuple[str, ...], line: Beamline, settings: Array) -> Array:
+def _matrices(names: tuple[str, ...], line: Beamline, settings: Array) -> Array:
+    """Transfer matrices of both planes, shape (2, 2, 2)."""
     return line.matrix(dict(zip(names, settings, strict=True))).planes[:, :2, :2]
 
 
-# The derivatives by many settings of these eight numbers are had backwards, and once for all
-# directions: forwards they take three to five times as long with 31 magnets.
-_through = jax.custom_jvp(_plain, nondiff_argnums=(0,))
+# Derivatives of these eight numbers are taken in reverse mode, once for all directions. In forward
+# mode they take three to five times as long with 31 magnets.
+_matrices_reverse = jax.custom_jvp(_matrices, nondiff_argnums=(0,))
 
 
-@_through.defjvp
-def _through_slope(names, primals, tangents):
+@_matrices_reverse.defjvp
+def _matrices_slope(names, primals, tangents):
     line, settings = primals
-    slope = jax.jacrev(_plain, 2)(names, line, settings)
-    return _plain(names, line, settings), slope @ tangents[1]
+    slope = jax.jacrev(_matrices, 2)(names, line, settings)
+    return _matrices(names, line, settings), slope @ tangents[1]
 
 
-def _at_place(wanted: _Wanted, theta: Array) -> Array:
-    """R L of both planes, shape (2, 2, 2), with σ = L Lᵀ: rows are size and divergence."""
-    matrix = _through if len(wanted.names) > MANY else _plain
-    r = matrix(wanted.names, wanted.line, wanted.middle + wanted.reach * theta)
-    l11 = jnp.sqrt(wanted.sigma[:, 0])
-    l21 = wanted.sigma[:, 1] / l11
-    l22 = jnp.sqrt(wanted.sigma[:, 2] - l21**2)
+def _transported_factor(data: _TargetData, theta: Array) -> Array:
+    """R L of both planes, shape (2, 2, 2), with σ = L Lᵀ; rows are size and divergence."""
+    matrix = _matrices_reverse if len(data.names) > MANY_MAGNETS else _matrices
+    r = matrix(data.names, data.line, data.middle + data.reach * theta)
+    l11 = jnp.sqrt(data.sigma[:, 0])
+    l21 = data.sigma[:, 1] / l11
+    l22 = jnp.sqrt(data.sigma[:, 2] - l21**2)
     columns = [jnp.stack([l11, l21], -1), jnp.stack([jnp.zeros_like(l22), l22], -1)]
     return r @ jnp.stack(columns, -1)
 
 
-def _misses(model: Any, wanted: _Wanted) -> Array:
-    """Miss of every target, shape (targets, 2); the objective is the sum of their squares.
+def _misses(model: Any, data: _TargetData) -> Array:
+    """Miss of each target, shape (targets, 2); the objective is the sum of their squares.
 
-    Of sizes in µm and divergences in µrad, along the vector; of matches two numbers whose squares
-    add to BMAG - 1, linear in R. In the order of KINDS.
+    Misses of sizes (µm) and divergences (µrad) are vectors along their row of R L. Those of matches
+    are two numbers, linear in R, whose squares add up to BMAG - 1. The order is that of KINDS.
     """
-    at = _at_place(wanted, model["settings"])
+    rows = _transported_factor(data, model["settings"])
 
     def miss(kind, plane, value):
-        vectors, (beta, alpha) = at[plane], value
-        far = 1e6 * (1.0 - beta / jnp.linalg.norm(vectors, axis=1))[:, None] * vectors
-        # N = D⁻¹ R L/√ε is a rotation where the beam is matched; BMAG = |N|²/2 and det N = 1.
+        vectors, (beta, alpha) = rows[plane], value
+        along = 1e6 * (1.0 - beta / jnp.linalg.norm(vectors, axis=1))[:, None] * vectors
+        # N = D⁻¹ R L/√ε is a rotation if the beam is matched; BMAG = |N|²/2 and det N = 1.
         inverse = jnp.array([[1.0, 0.0], [alpha, beta]]) / jnp.sqrt(beta)
         n = inverse @ vectors / jnp.sqrt(jnp.linalg.det(vectors))
         mismatch = jnp.stack([n[0, 0] - n[1, 1], n[0, 1] + n[1, 0]]) / math.sqrt(2.0)
-        return jnp.concatenate([far, mismatch[None]])[kind]
+        return jnp.concatenate([along, mismatch[None]])[kind]
 
-    return jax.vmap(miss)(wanted.kinds, wanted.planes, wanted.values)
+    return jax.vmap(miss)(data.kinds, data.planes, data.values)
 
 
-def _search(stated: Problem, seed: int) -> tuple[list[tuple[np.ndarray, float]], Fit]:
-    """Descend from points that fill the box, and let the core go on from the lowest and judge it.
+def _search(problem: Problem, seed: int) -> tuple[list[tuple[np.ndarray, float]], Fit]:
+    """Descend from many starts that fill the box, then refine and assess the lowest minimum.
 
-    Gives minima, best first, and the fit of the best.
+    Returns the minima, best first, and the fit of the best.
     """
-    count = len(stated.names)
-    starts = qmc.LatinHypercube(count, rng=seed).random(FEW if count > MANY else STARTS)
+    count = len(problem.names)
+    starts = qmc.LatinHypercube(count, rng=seed).random(
+        MANY_MAGNET_STARTS if count > MANY_MAGNETS else STARTS
+    )
     found = descend_all(
-        residual, stated.core, 2.0 * starts - 1.0, stated.lower, stated.upper, STEPS, SHARP
+        residual,
+        problem.core,
+        2.0 * starts - 1.0,
+        problem.lower,
+        problem.upper,
+        MAX_STEPS,
+        STEP_TOLERANCE,
     )
     found = Found(*map(np.asarray, found))
     ends, cost = found.theta, found.cost
     if not np.isfinite(cost).any():
         raise InputError("a beam that no setting within the limits can carry", "other limits")
     order = np.argsort(cost, kind="stable")
-    fit = solve(replace(stated, model={"settings": ends[order[0]]}))
+    fit = solve(replace(problem, model={"settings": ends[order[0]]}))
     minima = [(fit.theta, 2.0 * float(fit.cost))]
     for i in order[found.rested[order]]:
-        if len(minima) == MOST_MINIMA:
+        if len(minima) == MAX_MINIMA:
             break
-        if _apart(ends[i], minima):
-            _, end = search(stated, ends[i], STEPS)
-            # Where a search got stuck is no minimum, and one that it only now reaches may be known.
-            if end.kkt.worst <= TOLERANCE and _apart(end.theta, minima):
+        if _is_new(ends[i], minima):
+            _, end = search(problem, ends[i], MAX_STEPS)
+            # End points of stuck searches are no minima; refined ones may be known already.
+            if end.kkt.worst <= TOLERANCE and _is_new(end.theta, minima):
                 minima.append((end.theta, 2.0 * end.cost))
     return minima, fit
 
 
-def _apart(theta: np.ndarray, minima: Sequence[tuple[np.ndarray, float]]) -> bool:
-    """True if settings are none of those found."""
-    return all(np.abs(theta - known).max() > 2.0 * SAME for known, _ in minima)
+def _is_new(theta: np.ndarray, minima: Sequence[tuple[np.ndarray, float]]) -> bool:
+    """True if the settings differ from those of all minima found."""
+    return all(np.abs(theta - other).max() > 2.0 * SETTING_TOLERANCE for other, _ in minima)
 
 
 @partial(jax.jit, compiler_options=SELDOM)
-def _numbers(wanted: _Wanted, theta: Array) -> tuple[Array, Array]:
-    """Size, divergence, β and α of each plane, shape (planes, 4), and their slopes by σ."""
+def _numbers(data: _TargetData, theta: Array) -> tuple[Array, Array]:
+    """Size, divergence, β and α of each plane, shape (planes, 4), and their derivatives by σ."""
 
-    def of_sigma(sigma):
-        v = _at_place(replace(wanted, sigma=sigma), theta)
+    def numbers_of(sigma):
+        v = _transported_factor(replace(data, sigma=sigma), theta)
         s = v @ jnp.swapaxes(v, -1, -2)
         s11, s12, s22, emittance = s[:, 0, 0], s[:, 0, 1], s[:, 1, 1], jnp.linalg.det(v)
         return jnp.stack([jnp.sqrt(s11), jnp.sqrt(s22), s11 / emittance, -s12 / emittance], -1)
 
-    return of_sigma(wanted.sigma), jax.jacfwd(of_sigma)(wanted.sigma)
+    return numbers_of(data.sigma), jax.jacfwd(numbers_of)(data.sigma)
 
 
 @partial(jax.jit, compiler_options=SELDOM)
-def _curvature(wanted: _Wanted, theta: Array) -> Array:
-    """Second derivatives of the objective by settings and σ together."""
-    size = len(wanted.names)
+def _curvature(data: _TargetData, theta: Array) -> Array:
+    """Second derivatives of the objective with respect to settings and σ together."""
+    size = len(data.names)
 
-    def objective(both):
-        sigma = both[size:].reshape(wanted.sigma.shape)
-        misses = _misses({"settings": both[:size]}, replace(wanted, sigma=sigma))
-        return jnp.sum(wanted.weight * misses**2)
+    def objective(settings_and_sigma):
+        sigma = settings_and_sigma[size:].reshape(data.sigma.shape)
+        misses = _misses({"settings": settings_and_sigma[:size]}, replace(data, sigma=sigma))
+        return jnp.sum(data.weight * misses**2)
 
-    both = jnp.concatenate([theta, wanted.sigma.ravel()])
-    return jax.jacfwd(jax.jacfwd(objective))(both)
+    settings_and_sigma = jnp.concatenate([theta, data.sigma.ravel()])
+    return jax.jacfwd(jax.jacfwd(objective))(settings_and_sigma)
 
 
 def _covariance(beam: Beam) -> np.ndarray | None:
+    """Covariance of a beam, None if it is missing or not finite."""
     known = beam.covariance is not None and np.isfinite(beam.covariance).all()
     return beam.covariance if known else None
 
 
-def _predicted(
-    wanted: _Wanted, beams: Mapping[str, Beam], theta: np.ndarray
+def _predicted_beams(
+    data: _TargetData, beams: Mapping[str, Beam], theta: np.ndarray
 ) -> tuple[PlaneBeam, ...]:
-    values, slopes = map(np.asarray, _numbers(wanted, jnp.asarray(theta)))
+    """Beam at the place of the targets, with its errors."""
+    values, slopes = map(np.asarray, _numbers(data, jnp.asarray(theta)))
     found = []
     for plane, beam in beams.items():
         i, covariance = PLANES.index(plane), _covariance(beam)
@@ -464,37 +483,41 @@ def _predicted(
     return tuple(found)
 
 
-def _relative_misses(wanted: _Wanted, targets, theta: np.ndarray) -> tuple[float, ...]:
-    """Distance of each target over what is wanted; BMAG - 1 of a match."""
-    lengths = np.linalg.norm(_misses({"settings": jnp.asarray(theta)}, wanted), axis=1)
+def _relative_misses(data: _TargetData, targets, theta: np.ndarray) -> tuple[float, ...]:
+    """Relative miss of each target; BMAG - 1 of a match."""
+    lengths = np.linalg.norm(_misses({"settings": jnp.asarray(theta)}, data), axis=1)
     pairs = zip(targets, lengths, strict=False)  # the rest is padding
     return tuple(float(m / (1e6 * t.value) if np.ndim(t.value) == 0 else m**2) for t, m in pairs)
 
 
 def _setting_errors(
-    wanted: _Wanted, beams: Mapping[str, Beam], theta: np.ndarray
+    data: _TargetData, beams: Mapping[str, Beam], theta: np.ndarray
 ) -> dict[str, float | None]:
-    """Error of each best setting due to the beam; None at a limit or without a covariance."""
-    errors: dict[str, float | None] = dict.fromkeys(wanted.names)
+    """Error of each best setting from that of the beam; None at a limit or without covariance."""
+    errors: dict[str, float | None] = dict.fromkeys(data.names)
     covariances = [_covariance(beams[p]) if p in beams else np.zeros((3, 3)) for p in PLANES]
-    loose = np.flatnonzero(np.abs(theta) < 1.0)
-    if any(c is None for c in covariances) or not loose.size:
+    free = np.flatnonzero(np.abs(theta) < 1.0)
+    if any(c is None for c in covariances) or not free.size:
         return errors
-    rows = np.asarray(_curvature(wanted, jnp.asarray(theta)))[loose]
-    second, mixed = rows[:, loose], rows[:, len(theta) :]
+    rows = np.asarray(_curvature(data, jnp.asarray(theta)))[free]
+    second, mixed = rows[:, free], rows[:, len(theta) :]
     if np.linalg.cond(second) > 1e12:
         return errors
-    moved = np.linalg.solve(second, mixed)
-    variance = np.einsum("ij,jk,ik->i", moved, block_diag(*covariances), moved)
-    found = np.sqrt(variance.clip(0)) * np.asarray(wanted.reach)[loose]
-    return errors | {wanted.names[i]: float(e) for i, e in zip(loose, found, strict=True)}
+    slope = np.linalg.solve(second, mixed)
+    variance = np.einsum("ij,jk,ik->i", slope, block_diag(*covariances), slope)
+    found = np.sqrt(variance.clip(0)) * np.asarray(data.reach)[free]
+    return errors | {data.names[i]: float(e) for i, e in zip(free, found, strict=True)}
 
 
 def _verdict(
-    reached: str, misses: Sequence[float], objective: float, optimum: bool, held: Sequence[str]
+    reached: str,
+    misses: Sequence[float],
+    objective: float,
+    optimum: bool,
+    held_by_limit: Sequence[str],
 ) -> Finding:
-    """Judge the best point: what is reached in words, each miss, magnets that a limit holds."""
-    if objective < EXACT:
+    """Verdict from the reached beam in words, each miss, and the magnets held by a limit."""
+    if objective < ZERO_OBJECTIVE:
         return Finding(Status.converged, reached)
     if not optimum:
         return Finding(
@@ -503,10 +526,10 @@ def _verdict(
             "jumps as a magnet changes sign:",
             "narrow the limits around it, or search again with another seed.",
         )
-    if held:
-        said = f"{reached} {', '.join(held)} at a limit:"
-        return Finding(Status.at_limit, said, "a wider one would do better.")
-    if max(misses) <= MET:
+    if held_by_limit:
+        words = f"{reached} {', '.join(held_by_limit)} at a limit:"
+        return Finding(Status.at_limit, words, "a wider one would do better.")
+    if max(misses) <= MAX_MISS:
         return Finding(Status.converged, reached)
     why = "the targets contradict one another" if len(misses) > 1 else "the beam does not allow it"
     return Finding(
@@ -516,57 +539,57 @@ def _verdict(
     )
 
 
-def _next_words(minima: Sequence[Minimum], units: Mapping[str, str]) -> str:
-    """Name the next minimum, if there is one."""
+def _next_sentence(minima: Sequence[Minimum], units: Mapping[str, str]) -> str:
+    """Sentence on the next minimum, if there is one."""
     if len(minima) < 2:
         return ""
     best, other = minima[:2]
-    alike = other.objective - best.objective < 1e-6 * (1.0 + best.objective)
-    lead = "Other settings do as well, such as" if alike else "The next local minimum is"
+    equal = other.objective - best.objective < 1e-6 * (1.0 + best.objective)
+    lead = "Other settings do as well, such as" if equal else "The next local minimum is"
     at = in_words(other.settings, units)
-    return f" {lead} {at} (objective {_written(other.objective)})."
+    return f" {lead} {at} (objective {_objective_text(other.objective)})."
 
 
-def _reached_words(
+def _reached_sentence(
     targets: Sequence[Target], predicted: Sequence[PlaneBeam], misses: Sequence[float]
 ) -> str:
-    """Say what is reached of each size and divergence, and of the matches together."""
+    """Sentence on each size and divergence reached, and on all matches together."""
     by_plane = {p.plane: p for p in predicted}
-    alone = [np.ndim(t.value) == 0 for t in targets]
-    said = [
-        f"{t.kind} {t.plane} {_micro(t, getattr(by_plane[t.plane], t.kind))}"
-        for t, own in zip(targets, alone, strict=True)
-        if own
+    is_size = [np.ndim(t.value) == 0 for t in targets]
+    parts = [
+        f"{t.kind} {t.plane} {_reached_text(t, getattr(by_plane[t.plane], t.kind))}"
+        for t, single in zip(targets, is_size, strict=True)
+        if single
     ]
-    if not all(alone):
-        mismatch = sum(m for m, own in zip(misses, alone, strict=True) if not own)
-        said.append(f"BMAG - 1 = {mismatch:.3g} over the planes asked for")
-    words = "; ".join(said)
+    if not all(is_size):
+        mismatch = sum(m for m, single in zip(misses, is_size, strict=True) if not single)
+        parts.append(f"BMAG - 1 = {mismatch:.3g} over the planes asked for")
+    words = "; ".join(parts)
     return words[0].upper() + words[1:] + "."
 
 
-def _notes_on(beams: Mapping[str, Beam], energy: float, lattice: float) -> tuple[str, ...]:
-    """Say what to know of the beams, one sentence each.
+def _notes(beams: Mapping[str, Beam], energy: float, lattice: float) -> tuple[str, ...]:
+    """Remarks on the beams, one sentence each.
 
     Parameters
     ----------
     beams : mapping of str to Beam
-        Those asked for.
+        Beams of the planes with targets.
     energy, lattice : float
         The energy used, and the line's own, MeV.
     """
-    said = []
+    notes = []
     if abs(energy - lattice) > SAME_ENERGY * lattice:
-        said.append(f"At {energy:g} MeV, the energy of the scan; the lattice has {lattice:g} MeV.")
+        notes.append(f"At {energy:g} MeV, the energy of the scan; the lattice has {lattice:g} MeV.")
     if any(beam.calibration and beam.covariance is not None for beam in beams.values()):
-        said.append(CALIBRATED)
+        notes.append(CALIBRATION_NOTE)
     if all(beam.covariance is None and beam.doubt is None for beam in beams.values()):
-        said.append("No errors: pass --fit to include the beam's.")
-    return tuple(said)
+        notes.append("No errors: pass --fit to include the beam's.")
+    return tuple(notes)
 
 
-def _doubts_on(beams: Mapping[str, Beam]) -> dict[str, str]:
-    """Warn of every plane whose beam the fit does not determine."""
+def _doubts(beams: Mapping[str, Beam]) -> dict[str, str]:
+    """Warnings on planes whose beam the fit does not determine."""
     return {
         plane: f"The fit does not determine the beam of plane {plane}: {beam.doubt.rstrip('.')}. "
         "The settings are for its numbers as they stand."
@@ -575,15 +598,16 @@ def _doubts_on(beams: Mapping[str, Beam]) -> dict[str, str]:
     }
 
 
-def _micro(target: Target, got: Quantity) -> str:
-    factor, unit = SHOWN[target.kind]
-    error = "" if got.error is None else f" ± {factor * got.error:.2g}"
-    return f"{factor * got.value:.4g}{error}{unit} for {factor * target.value:.4g} wanted"
+def _reached_text(target: Target, quantity: Quantity) -> str:
+    """Reached value, with its error, and target of a size or divergence."""
+    factor, unit = DISPLAY_UNITS[target.kind]
+    error = "" if quantity.error is None else f" ± {factor * quantity.error:.2g}"
+    return f"{factor * quantity.value:.4g}{error}{unit} for {factor * target.value:.4g} wanted"
 
 
-def _shown(key: str, q: Quantity) -> str:
-    """A predicted number; one without an error is a prediction all the same."""
-    factor, unit = SHOWN[key]
+def _quantity_text(key: str, q: Quantity) -> str:
+    """A predicted quantity in its display unit, with its error if there is one."""
+    factor, unit = DISPLAY_UNITS[key]
     if q.error is None:
         return f"{factor * q.value:.5g}{unit}"
     return f"{Quantity(factor * q.value, factor * q.error, '1')}{unit}"

@@ -1,7 +1,7 @@
-"""The beam matrix of a plane from measured sizes in closed form: the fast path of the model.
+"""Closed-form fit of a plane's beam matrix to measured sizes.
 
-Size² is linear in σ (model.py). Everything here is a pure JAX function of one scan in one plane;
-many scans are a vmap of it.
+Size² is linear in σ (model.py). The functions are pure JAX functions of one scan in one plane; many
+scans are a vmap of them.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ from jax import Array
 from jax.typing import ArrayLike
 
 from beamfit.answer import shown
-from beamfit.emittance.beam_draws import FURTHEST, ROUNDS
+from beamfit.emittance.beam_draws import FIT_ITERATIONS, MAX_SIZE_RATIO
 from beamfit.emittance.model import coefficients
 
-# A direction of σ is lost when its diagonal of R is this far below the largest.
-_RANK = 1e-10
+# The settings do not separate the three numbers of σ below this ratio of the diagonal of R.
+_RANK_TOLERANCE = 1e-10
 
 
 @shown
@@ -37,7 +37,7 @@ class SigmaFit(NamedTuple):
     determinant, determinant_error : Array
         det σ, m² rad², and its standard error.
     full_rank : Array
-        Whether the settings separate the three numbers at all.
+        Whether the settings separate the three numbers.
     positive : Array
         Whether the matrix is positive definite.
     """
@@ -51,48 +51,49 @@ class SigmaFit(NamedTuple):
     positive: Array
 
 
-def weighed_size(measured: Array, squared: Array) -> Array:
-    """The model's size to weigh by, within `FURTHEST` of the measured one: one wild point, or
-    a negative size², must not take all weight.
+def size_for_weights(measured: Array, squared: Array) -> Array:
+    """Model size for the weights, within a factor `MAX_SIZE_RATIO` of the measured size.
+
+    The limits keep one outlier, or a negative size², from taking all weight.
     """
-    low, high = (measured / FURTHEST) ** 2, (measured * FURTHEST) ** 2
+    low, high = (measured / MAX_SIZE_RATIO) ** 2, (measured * MAX_SIZE_RATIO) ** 2
     return jnp.sqrt(jnp.clip(squared, low, high))
 
 
 def error_at(size: Any, measured: Any, error: Any, relative: Any) -> Any:
-    """The error of a size that differs from the measured one: one that is a share grows with it."""
+    """Error at another size than the measured one; ``relative`` errors are a share of the size."""
     return error * (1.0 + relative * (size / measured - 1.0))
 
 
 def _least_squares(design: Array, target: Array) -> tuple[Array, Array, Array]:
-    """Solve by QR with unit columns; a direction the rows do not have leaves NaN errors."""
+    """Solve by QR with unit columns; errors are NaN where the rows do not have full rank."""
     norm = jnp.linalg.norm(design, axis=0)
     norm = jnp.where(norm > 0.0, norm, 1.0)
-    q, r = _orthonormal(design / norm)
+    q, r = _gram_schmidt(design / norm)
     diagonal = jnp.abs(jnp.diagonal(r))
-    full_rank = jnp.min(diagonal) > _RANK * jnp.max(diagonal)
+    full_rank = jnp.min(diagonal) > _RANK_TOLERANCE * jnp.max(diagonal)
     r = jnp.where(full_rank, r, jnp.eye(3))
     inverse = _inverse_triangle(r) / norm[:, None]
     sigma = inverse @ (q.T @ target)
     return sigma, jnp.where(full_rank, inverse @ inverse.T, jnp.nan), full_rank
 
 
-def _orthonormal(columns: Array) -> tuple[Array, Array]:
+def _gram_schmidt(columns: Array) -> tuple[Array, Array]:
     """QR of three columns by Gram and Schmidt: a batch of 10 000 is one pass, without LAPACK.
 
-    Each is made orthogonal twice, which is enough: L. Giraud, J. Langou and M. Rozloznik, Comput.
-    Math. Appl. 50 (2005) 1069.
+    Each column is orthogonalised twice, which is enough: L. Giraud, J. Langou and M. Rozloznik,
+    Comput. Math. Appl. 50 (2005) 1069.
     """
     q: list[Array] = []
     r = [[jnp.zeros(())] * 3 for _ in range(3)]
     for k in range(3):
-        left = columns[:, k]
+        rest = columns[:, k]
         for _ in range(2):
             for j, other in enumerate(q):
-                along = jnp.sum(other * left)
-                left, r[j][k] = left - along * other, r[j][k] + along
-        r[k][k] = jnp.sqrt(jnp.sum(left**2))
-        q.append(left / jnp.where(r[k][k] > 0.0, r[k][k], 1.0))
+                overlap = jnp.sum(other * rest)
+                rest, r[j][k] = rest - overlap * other, r[j][k] + overlap
+        r[k][k] = jnp.sqrt(jnp.sum(rest**2))
+        q.append(rest / jnp.where(r[k][k] > 0.0, r[k][k], 1.0))
     return jnp.stack(q, axis=1), jnp.stack([jnp.stack(row) for row in r])
 
 
@@ -117,7 +118,7 @@ def fit_sizes(
     relative: ArrayLike = 0.0,
     weights: str = "model",
 ) -> SigmaFit:
-    """Fit one scan or many in one call, from transfer-matrix elements and sizes.
+    """Fit the beam matrix to sizes and transfer-matrix elements of one scan or of many.
 
     Parameters
     ----------
@@ -126,11 +127,11 @@ def fit_sizes(
     size, error : array
         Rms sizes and standard errors in m, shape (n,) or (scans, n).
     known : array
-        Size² in m² that dispersion and resolution contribute; broadcast.
+        Size² in m² from dispersion and resolution; broadcast.
     relative : array
-        1 where an error is a share of the size and so grows with the model's; broadcast.
+        1 where an error is a share of the size and so grows with the model size; broadcast.
     weights : {"model", "measured"}
-        Whose size the error of size² is taken at.
+        Size at which the error of size² is taken.
 
     Returns
     -------
@@ -140,10 +141,10 @@ def fit_sizes(
     Notes
     -----
     Weighted linear least squares, the report's ``error_linear``: residual (model² - size²)/(2 size
-    error), Appendix A. QR of the scaled design, so that its condition is not squared. With the
-    measured size in the weights a size that noise made small counts for more, which makes σ small
-    by 3 r² to 7 r² for a relative noise r, however many points there are; the model's size has no
-    part in the noise.
+    error), Appendix A. QR of the scaled design does not square its condition. With the measured
+    size in the weights, a size that noise made small has more weight; this bias makes σ small by
+    3 r² to 7 r² for a relative noise r, whatever the number of points. The model size is free of
+    it.
 
     Examples
     --------
@@ -173,16 +174,16 @@ def _fit(
     """Fit one scan in one plane, all arrays of shape (n,)."""
     rows = jnp.stack(coefficients(r11, r12), axis=-1)
 
-    def fitted(at: Array) -> tuple[Array, ...]:
+    def solve_at(at: Array) -> tuple[Array, ...]:
         scale = 0.5 / (at * error_at(at, size, error, relative))
         target, design = (size**2 - known) * scale, rows * scale[:, None]
         return *_least_squares(design, target), design, target
 
-    def again(_: int, at: Array) -> Array:
-        return weighed_size(size, rows @ fitted(at)[0] + known)
+    def iterate(_: int, at: Array) -> Array:
+        return size_for_weights(size, rows @ solve_at(at)[0] + known)
 
-    at = jax.lax.fori_loop(0, ROUNDS if weights == "model" else 0, again, size)
-    sigma, covariance, full_rank, design, target = fitted(at)
+    at = jax.lax.fori_loop(0, FIT_ITERATIONS if weights == "model" else 0, iterate, size)
+    sigma, covariance, full_rank, design, target = solve_at(at)
     determinant = sigma[0] * sigma[2] - sigma[1] ** 2
     gradient = jnp.stack([sigma[2], -2.0 * sigma[1], sigma[0]])
     positive = full_rank & (determinant > 0.0) & (sigma[0] > 0.0)

@@ -1,4 +1,4 @@
-"""Emittances of one scan by several ways of taking sizes from profiles."""
+"""Emittances of one scan for several methods of taking sizes from profiles."""
 
 from __future__ import annotations
 
@@ -22,21 +22,21 @@ from beamfit.statistics import reach_of
 
 
 class MethodRow(NamedTuple):
-    """The normalised emittance of one plane, for one way of taking the sizes.
+    """Normalised emittance of one plane, for one method of taking the sizes.
 
     Attributes
     ----------
     method : str
-        How the sizes were taken from the profiles.
+        Method by which the sizes were taken from the profiles.
     stored : Quantity or None
-        What the file says.
+        Value in the file.
     measured_weights : Quantity or None
-        The same, computed here by the file's own method from its own mean sizes; see
-        `measured_weights`. None where the file has none.
+        The same, recomputed by the file's own method from its mean sizes; see `measured_weights`.
+        None if the file has none.
     emittance : Quantity
-        What `beamfit.fit_emittance` says; without an error where the sizes do not determine it.
+        Value from `beamfit.fit_emittance`; without an error if the sizes do not determine it.
     status : Status
-        Of that fit.
+        Status of that fit.
     """
 
     method: str
@@ -48,17 +48,17 @@ class MethodRow(NamedTuple):
 
 @dataclass(frozen=True)
 class SizeMethods:
-    """A plane's emittance by every way of taking the sizes, and one answer that covers them.
+    """Emittances of a plane for all methods of taking the sizes, and one that covers them.
 
     Attributes
     ----------
     plane : str
         "x" or "y".
     rows : tuple of MethodRow
-        One a method.
+        One per method.
     covering : Quantity
-        Mean of the methods' normalised emittances. Its error is that of the fits and the spread of
-        the methods, as a systematic, added in square.
+        Mean of the methods' normalised emittances. Its error is that of the fits and, as a
+        systematic, the spread of the methods, added in quadrature.
     """
 
     plane: str
@@ -66,14 +66,14 @@ class SizeMethods:
     covering: Quantity
 
     def to_json(self) -> dict[str, Any]:
-        """Give rows and covering answer as JSON does."""
+        """Rows and covering emittance for the JSON output."""
         return {
             "methods": [row._asdict() for row in self.rows],
             "normalized_emittance": self.covering,
         }
 
     def table(self) -> Table:
-        """Lay out the methods."""
+        """Table of the methods."""
         header = ["size method", "in the file", "measured weights", "beamfit", "status"]
         rows = [
             [r.method, _um(r.stored), _um(r.measured_weights), _um(r.emittance), cell(r.status)]
@@ -97,7 +97,7 @@ def compare_size_methods(
     stored: Mapping[str, Mapping[str, Quantity]] | None = None,
     means: Mapping[str, QuadScan] | None = None,
 ) -> tuple[SizeMethods, ...]:
-    """Fit every way of taking the sizes of a scan.
+    """Fit a scan for each method of taking its sizes.
 
     Parameters
     ----------
@@ -106,7 +106,7 @@ def compare_size_methods(
     line : Beamline
         The line.
     stored : mapping of str to mapping of str to Quantity, optional
-        Method and plane to the normalised emittance that a file says.
+        Method and plane to the normalised emittance stored in a file.
     means : mapping of str to QuadScan, optional
         Method to the mean sizes and errors from which the file computed it, with the rows' own
         matrices.
@@ -114,7 +114,7 @@ def compare_size_methods(
     Returns
     -------
     tuple of SizeMethods
-        One a plane.
+        One per plane.
 
     Examples
     --------
@@ -138,47 +138,49 @@ def compare_size_methods(
             if plane not in fit.scan.planes:
                 continue
             p, mean = fit[plane], (means or {}).get(method)
-            said = (stored or {}).get(method, {}).get(plane)
-            own = measured_weights(mean, plane) if mean and plane in mean.planes else None
-            rows.append(MethodRow(method, said, own, p.normalized_emittance, p.status))
-        found.append(SizeMethods(plane, tuple(rows), _covering(rows)))
+            stored_value = (stored or {}).get(method, {}).get(plane)
+            recomputed = measured_weights(mean, plane) if mean and plane in mean.planes else None
+            rows.append(
+                MethodRow(method, stored_value, recomputed, p.normalized_emittance, p.status)
+            )
+        found.append(SizeMethods(plane, tuple(rows), _covering_answer(rows)))
     return tuple(found)
 
 
 def measured_weights(scan: QuadScan, plane: str) -> Quantity:
-    """Compute the normalised emittance by weights of the measured sizes, as emittance_gui does.
+    """Compute the normalised emittance with weights of the measured sizes, as emittance_gui does.
 
     Parameters
     ----------
     scan : QuadScan
-        Mean sizes of electrons, with errors, total energies and matrices of the rows' own.
+        Mean sizes of electrons, with errors, total energies and matrices of the rows.
     plane : str
         "x" or "y".
 
     Returns
     -------
     Quantity
-        In m; without an error where there is no residual, NaN where no beam is found.
+        In m; without an error if there is no residual, NaN if no beam is found.
 
     Notes
     -----
-    Linear least squares of size² with weights 1/(2 size error) of the measured sizes; the error is
-    that of linear propagation times sqrt(χ²/dof), also where that is below 1. The stored numbers of
-    ../shared/data/lcls_otr2/test_scan2.mat and of the files in ../shared/data/lcls_gui are these,
-    with βγ = E/mc².
+    Linear least squares of size² with weights 1/(2 size error) of the measured sizes. The error is
+    linear propagation times sqrt(χ²/dof), also if that is below 1. These are the stored numbers of
+    ../shared/data/lcls_otr2/test_scan2.mat and of the files in ../shared/data/lcls_gui, with
+    βγ = E/mc².
 
     Examples
     --------
-    >>> drift = [[1.0, 0.0], [1.0, 1.0], [1.0, 2.0]]  # behind a waist of 0.1 mm and 0.1 mrad
+    >>> drift = [[1.0, 0.0], [1.0, 1.0], [1.0, 2.0]]  # from a waist of 0.1 mm and 0.1 mrad
     >>> sizes = {"x": 1e-4 * np.sqrt([1.0, 2.0, 5.0])}
     >>> scan = QuadScan({}, {}, sizes, energy=[135.0] * 3, transfer={"x": drift})
     >>> print(measured_weights(scan, "x"))
     2.64 µm (not determined)
     """
-    at = ~np.isnan(scan.size[plane])
-    size = scan.size[plane][at]
-    error = scan.error[plane][at] if plane in scan.error else size
-    r11, r12 = scan.transfer[plane][at, :2].T
+    measured = ~np.isnan(scan.size[plane])
+    size = scan.size[plane][measured]
+    error = scan.error[plane][measured] if plane in scan.error else size
+    r11, r12 = scan.transfer[plane][measured, :2].T
     found, dof = fit_sizes(r11, r12, size, error, weights="measured"), len(size) - 3
     if not (bool(found.positive) and bool(found.full_rank)):
         return Quantity(math.nan, None, "m")
@@ -190,11 +192,11 @@ def measured_weights(scan: QuadScan, plane: str) -> Quantity:
     return Quantity(value, value * relative * math.sqrt(float(found.chi2) / dof), "m")
 
 
-def _covering(rows: list[MethodRow]) -> Quantity:
-    """Mean over the methods that find a beam; their spread is one of its errors.
+def _covering_answer(rows: list[MethodRow]) -> Quantity:
+    """Mean over the methods that find a beam, with their spread as a part of its error.
 
-    The spread is that of what a further method would give: the methods are no repetitions of one
-    measurement, so that it does not fall with their number.
+    The standard deviation of the methods is not divided by the square root of their number: they
+    are not repetitions of one measurement.
     """
     found = [r.emittance for r in rows if r.emittance.value > 0.0]
     values = np.array([q.value for q in found])

@@ -1,4 +1,4 @@
-"""Slices of a beam, each fitted by its own rows, with the projected beam beside them."""
+"""Slices of a beam, each fitted from its own rows, together with the projected beam."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ HEADER += ("alpha at the start", "chi2/dof")
 @answer
 @dataclass(frozen=True, eq=False)
 class SliceFits:
-    """The fits of the slices of a beam, in the order of the scan, the projected beam last.
+    """Fits of the slices of a beam, in the order of the scan, the projected beam last.
 
     Attributes
     ----------
     scan : QuadScan
         All rows.
     fits : tuple of EmittanceFit
-        One a slice.
+        One per slice.
     """
 
     scan: QuadScan
@@ -49,26 +49,26 @@ class SliceFits:
 
     @property
     def projected(self) -> EmittanceFit | None:
-        """The fit of the whole beam, if it was measured."""
+        """Fit of the whole beam, if it was measured."""
         return self[PROJECTED] if PROJECTED in self.slices else None
 
     @property
     def planes(self) -> tuple[str, ...]:
-        """The planes that some slice was fitted in."""
+        """Planes in which some slice was fitted."""
         fitted = {p.plane for fit in self.fits for p in fit.planes}
         return tuple(p for p in self.scan.planes if p in fitted)
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Sentences on what is odd about any slice, each said once."""
+        """Sentences on unusual numbers of any slice, without repetition."""
         return tuple(dict.fromkeys(note for fit in self.fits for note in fit.notes))
 
     def of_plane(self, plane: str) -> list[tuple[EmittanceFit, PlaneFit]]:
-        """The slices that were fitted in a plane, each with its fit there."""
+        """Slices fitted in a plane, each with its fit there."""
         return [(fit, p) for fit in self.fits for p in fit.planes if p.plane == plane]
 
     def alike(self) -> dict[tuple[str, Status, str], dict[str, PlaneFit]]:
-        """Fits by slice of those that share plane, status and message, which are said once."""
+        """Fits by slice, grouped by equal plane, status and message."""
         found: dict[tuple[str, Status, str], dict[str, PlaneFit]] = {}
         for plane in self.planes:
             for fit, p in self.of_plane(plane):
@@ -77,19 +77,19 @@ class SliceFits:
 
     @property
     def headline(self) -> str:
-        """The scan in a line."""
+        """The scan in one line."""
         return f"{self.scan.name}: {', '.join(self.slices)}, planes {', '.join(self.planes)}"
 
     @property
     def message(self) -> str:
-        """Sentences on the slices, each said once, a line each."""
-        alike = self.alike().items()
+        """Sentences on the slices without repetition, one line each."""
+        groups = self.alike().items()
         return "\n".join(
-            f"{', '.join(names)}, {plane}: {said}" for (plane, _, said), names in alike
+            f"{', '.join(names)}, {plane}: {message}" for (plane, _, message), names in groups
         )
 
     def tables(self) -> tuple[Table, ...]:
-        """One table a plane, one row a slice."""
+        """One table per plane, one row per slice."""
         found = []
         for plane in self.planes:
             rows = [_row(fit, p) for fit, p in self.of_plane(plane)]
@@ -102,27 +102,28 @@ class SliceFits:
 
 
 def _row(fit: EmittanceFit, p: PlaneFit) -> list[str]:
+    """Table row of a slice in one plane."""
     chi2 = "-" if p.chi2 is None else f"{p.chi2:.1f}/{p.dof}"
     quantities = (p.status, p.normalized_emittance, p.beta, p.alpha)
     return [fit.scan.slices[0], f"{fit.seen.energy:.6g} MeV", *map(cell, quantities), chi2]
 
 
 def fit_slices(scan: QuadScan, line: Beamline | None = None, **options: Any) -> SliceFits:
-    """Fit the beam matrix of every slice of a beam, and of the projected beam where measured.
+    """Fit the beam matrix of each slice of a beam, and of the projected beam if measured.
 
     Parameters
     ----------
     scan : QuadScan
-        With ``slice``, and ``energy`` where the slices differ in it.
+        With ``slice``, and ``energy`` if it differs between the slices.
     line : Beamline, optional
         As for `beamfit.fit_emittance`. Its magnets stay as they are for the line's energy.
     **options
-        As for `beamfit.fit_emittance`; ``planes`` a slice was not measured in are passed over.
+        As for `beamfit.fit_emittance`; ``planes`` in which a slice was not measured are skipped.
 
     Returns
     -------
     SliceFits
-        ``fits["3"].x.normalized_emittance``; `print` it.
+        ``fits["3"].x.normalized_emittance``, for example.
 
     Raises
     ------
@@ -131,9 +132,9 @@ def fit_slices(scan: QuadScan, line: Beamline | None = None, **options: Any) -> 
 
     Notes
     -----
-    A slice has a beam matrix of its own, and so a fit of its own rows: slices share nothing but the
-    line. A slice of another energy takes its own way through magnets that stay, and its matrix is
-    that about its own orbit (report eqs 24-28, with the corrections of docs/emittance.md).
+    Each slice has a beam matrix of its own and is fitted from its own rows: slices share only the
+    line. A slice of another energy has its own orbit through magnets that stay, and its matrix is
+    about that orbit (report eqs 24-28, with the corrections of docs/emittance.md).
 
     Examples
     --------
@@ -148,12 +149,12 @@ def fit_slices(scan: QuadScan, line: Beamline | None = None, **options: Any) -> 
     """
     if scan.slice is None:
         raise scan.unusable("a scan without slices", "a column slice, or fit_emittance")
-    asked = options.pop("planes", None) or scan.planes
-    for plane in asked:
-        scan.rows(plane)  # says so if it was not measured
+    chosen = options.pop("planes", None) or scan.planes
+    for plane in chosen:
+        scan.rows(plane)  # raises an error if the plane was not measured
     fits = []
     for name in scan.slices:
         part = scan.of_slice(name)
-        if planes := tuple(p for p in asked if p in part.planes):
+        if planes := tuple(p for p in chosen if p in part.planes):
             fits.append(fit_emittance(part, line, planes=planes, **options))
     return SliceFits(scan, tuple(fits))

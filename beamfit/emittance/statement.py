@@ -1,4 +1,4 @@
-"""A scan seen through its line, and a scenario: the value that states it as a problem."""
+"""Scans prepared for a fit, and scenarios: the choice of free parameters besides the beam."""
 
 from __future__ import annotations
 
@@ -16,55 +16,54 @@ import numpy as np
 from beamfit.compile_cache import SELDOM
 from beamfit.emittance.assumptions import SCENARIOS, Assumptions
 from beamfit.emittance.comparison import PlanePosterior, PlaneSizes, compare
-from beamfit.emittance.model import UNIT, Asked, predict_sizes
+from beamfit.emittance.model import UNIT, AnswerPlaces, predict_sizes
 from beamfit.emittance.results import Parameter, PlaneFit, Points
 from beamfit.emittance.scan import QuadScan, check_names
-from beamfit.emittance.shots import of_settings
+from beamfit.emittance.shots import group_shots
 from beamfit.emittance.transport import (
     Rows,
     check_gradients,
     damping_of,
-    look_through,
-    names_of,
-    padded,
+    lattice_names,
+    pad_rows,
+    row_elements,
     rows_line,
     scan_rows,
     scanned_line,
 )
-from beamfit.emittance.verdict import named
+from beamfit.emittance.verdict import name_places
 from beamfit.greybox.problem import Constraint, Free, Prior, Problem, Record
 from beamfit.noise.model import Noise
-from beamfit.noise.sizes import ShotMeans, evened, means_of
+from beamfit.noise.sizes import ShotMeans, pooled_variance, shot_means
 from beamfit.optics.beamline import Beamline
 from beamfit.optics.calibration import SETTING_UNITS
 
 if TYPE_CHECKING:
     from beamfit.greybox.fit import Fit
 
-# The residual: the report's ``error_linear`` or ``error_nonlinear``.
+# Residual that a fit minimises: the report's ``error_linear`` or ``error_nonlinear``.
 METHODS = ("size_squared", "size")
-# Whose size errors are taken at.
+# Size at which the error of size² is taken.
 WEIGHTS = ("model", "measured")
-# A share of the size from which on the scatter of shots is the beam's more than the screen's.
-UNSTEADY = 0.1
-# Scans that are looked at in one call at most, in powers of two (the last one fills them up), as
-# far as rows times the longest of their arrays have room.
-LANES, ROOM = 256, 1 << 20
+# Above this scatter of shots, as a share of the size, the beam itself changes from shot to shot.
+UNSTEADY_SCATTER = 0.1
+# Largest number of scans in one compiled call, a power of two, and limit on the numbers in it.
+MAX_LANES, MAX_CALL_NUMBERS = 256, 1 << 20
 
 
 class PlaneSolution(NamedTuple):
-    """One plane seen through a line: its sizes, their posterior, and the points as fitted.
+    """Fit of one plane through a line, in closed form.
 
     Attributes
     ----------
     sizes : PlaneSizes
-        What was measured.
+        Measured sizes.
     posterior : PlanePosterior
-        What it says of the beam.
+        Posterior of the beam.
     points : Points
-        Point by point, with the errors found.
+        Fitted points, with the errors found.
     shot_words : str
-        Shots that show no beam, in a sentence.
+        Sentence on shots that show no beam.
     """
 
     sizes: PlaneSizes
@@ -74,7 +73,7 @@ class PlaneSolution(NamedTuple):
 
 
 class PreparedScan(NamedTuple):
-    """A scan through its line, with the fit of known transport of each plane to start from.
+    """A scan through its line, with the closed-form fit of each plane to start from.
 
     Attributes
     ----------
@@ -83,22 +82,21 @@ class PreparedScan(NamedTuple):
     scanned : Beamline
         The line with the calibrations of the scan's columns.
     planes : tuple of str
-        Those that are asked for.
+        Planes to fit.
     method : str
         "size_squared" or "size".
     weights : str
-        "model" or "measured": whose size the errors are taken at.
+        "model" or "measured": size at which the errors are taken.
     rows : Rows
-        The scan's rows through that line, padded; what no row changes is multiplied out.
+        The scan's rows through that line, padded; elements that do not vary are combined.
     noise : Noise
         Priors of the noise of sizes.
-    look : ndarray
-        R11, R12 and known size² of both planes, shape (3, 2, rows), with every magnet as the
-        lattice has it.
+    elements : ndarray
+        R11, R12 and known size² of both planes, shape (3, 2, rows), through the line as given.
     solutions : dict of str to PlaneSolution
-        Plane to its fit; of every plane that was measured.
-    kept, any_energy : tuple of str and bool
-        Elements that may change besides the scanned magnets, and whether the energy may.
+        Fit of each plane.
+    variable, variable_energy : tuple of str and bool
+        Elements that may vary besides the scanned magnets, and whether the energy may.
     """
 
     scan: QuadScan
@@ -109,20 +107,20 @@ class PreparedScan(NamedTuple):
     weights: str
     rows: Rows
     noise: Noise
-    look: np.ndarray
+    elements: np.ndarray
     solutions: dict[str, PlaneSolution]
-    kept: tuple[str, ...] = ()
-    any_energy: bool = False
+    variable: tuple[str, ...] = ()
+    variable_energy: bool = False
 
     def of_plane(self, plane: str, settings: Mapping[str, Any] | None = None) -> Rows:
         """The rows of one plane, with other settings if any are given."""
         return replace(self.rows, plane=plane, settings=settings or self.rows.settings)
 
-    def keeping(self, names: Iterable[str], any_energy: bool = False) -> PreparedScan:
-        """The same with rows in which further elements, or the energy, may change."""
-        kept, free = (*self.kept, *names), self.any_energy or any_energy
-        rows = scan_rows(self.scan, self.scanned, self.rows.squared, kept, free)
-        return self._replace(rows=rows, kept=kept, any_energy=free)
+    def with_variable(self, names: Iterable[str], variable_energy: bool = False) -> PreparedScan:
+        """Return a copy whose rows allow further elements, or the energy, to vary."""
+        variable, vary_energy = (*self.variable, *names), self.variable_energy or variable_energy
+        rows = scan_rows(self.scan, self.scanned, self.rows.squared, variable, vary_energy)
+        return self._replace(rows=rows, variable=variable, variable_energy=vary_energy)
 
     def measured(self, plane: str) -> np.ndarray:
         """Indices of the rows in which a plane was measured."""
@@ -131,11 +129,10 @@ class PreparedScan(NamedTuple):
     def rows_at(
         self, line: Beamline, plane: str, place: str, settings: Mapping[str, Any], energy: Any
     ) -> Rows:
-        """Rows of one plane's sizes on a screen of a line, which nobody need have measured.
+        """Rows of one plane's sizes on any screen of a line, at any settings.
 
-        Settings and energies (MeV) are as of `Rows`. What the scan itself says of energy spread and
-        resolution, in the middle of its rows (of the resolution those on that screen), goes before
-        the line.
+        Settings and energies (MeV) are as in `Rows`. Energy spread and resolution are medians over
+        the scan's rows (for the resolution, those on that screen), or else the line's.
         """
         scan = self.scan
         spread = line.energy_spread if scan.energy_spread is None else np.median(scan.energy_spread)
@@ -149,34 +146,34 @@ class PreparedScan(NamedTuple):
 
     @property
     def energy(self) -> float:
-        """Mean total energy of the rows, MeV: that of the beam that is asked for."""
+        """Mean total energy of the rows, MeV, to which the answer refers."""
         return float(self.rows.energy[: len(self.scan)].mean())
 
 
 @dataclass(frozen=True)
 class Scenario:
-    """A choice of unknowns besides the beam, as a value that everybody asks and nobody compares.
+    """A choice of free parameters besides the beam.
 
     Parameters
     ----------
     name : str
-        As users call it.
+        Name of the option.
     state : callable
-        ``state(seen, told)``: the problem, starting from first principles.
+        ``state(prepared, assumptions)``: the problem, starting from the given line.
     parameters : callable
-        ``parameters(seen, told, fit)``: the numbers fitted besides the beam.
+        ``parameters(prepared, assumptions, fit)``: fitted parameters besides the beam.
     null_directions : callable
-        ``null_directions(seen, parameters, identified)``: what the data leave open, in words.
+        ``null_directions(prepared, parameters, identified)``: undetermined directions, in words.
     remedy : callable
-        ``remedy(seen, told)``: what would determine the emittance, in words.
-    aside : str
-        What an undetermined parameter means for the emittance, in words.
+        ``remedy(prepared, assumptions)``: measurements that are needed for the emittance, in words.
+    consequence : str
+        Consequence of an undetermined parameter for the emittance, in words.
     closed : bool
-        Whether the fit is linear in σ, and done in closed form.
+        Whether the fit is linear in σ, and solved in closed form.
     network : bool
-        Whether a network is trained, from many starts, which an anchor may tie.
+        Whether a network is trained, from many starts; an anchor may tie it to the line.
     whole_map : bool
-        Whether the map is the line's, so that the beam is known at every place and any setting.
+        Whether the map is the line's, so that the beam is known at all places and settings.
     """
 
     name: str
@@ -188,7 +185,7 @@ class Scenario:
         lambda *_: ()
     )
     remedy: Callable[[PreparedScan, Assumptions], str] = lambda *_: ""
-    aside: str = ""
+    consequence: str = ""
     closed: bool = False
     network: bool = False
     whole_map: bool = True
@@ -207,7 +204,7 @@ class Scanned(Protocol):
 
 
 def scenario_of(name: str) -> Scenario:
-    """The scenario of a name, from its module.
+    """Load a scenario by its name.
 
     Examples
     --------
@@ -218,89 +215,92 @@ def scenario_of(name: str) -> Scenario:
 
 
 def varied_magnets(scan: QuadScan) -> tuple[str, ...]:
-    """Magnets whose setting changes during a scan; of rows with matrices of their own none."""
+    """Magnets whose setting changes during a scan; none if rows have matrices of their own."""
     if scan.transfer:
         return ()
     return tuple(n for n, v in scan.settings.items() if np.ptp(v) > 0)
 
 
-def asked_of(
-    seen: PreparedScan, plane: str, whole_map: bool = True, line: Beamline | None = None
-) -> Asked:
-    """Places of a plane's numbers through a line: the rows' own, if none is given."""
-    design = seen.scanned.design
+def answer_places(
+    prepared: PreparedScan, plane: str, whole_map: bool = True, line: Beamline | None = None
+) -> AnswerPlaces:
+    """Places that a plane's answer refers to, through the rows' line if none is given."""
+    design = prepared.scanned.design
     twiss = getattr(design, plane, None)
-    return Asked(
+    return AnswerPlaces(
         plane,
-        seen.rows.places[-1] if whole_map else None,
+        prepared.rows.places[-1] if whole_map else None,
         design.at if twiss else None,
-        line or seen.rows.line,
-        np.asarray(seen.energy),
+        line or prepared.rows.line,
+        np.asarray(prepared.energy),
         np.array(twiss or (np.nan, np.nan), float),
     )
 
 
-def size_record(seen: PreparedScan, plane: str, rows: Any) -> Record:
-    """The measured sizes of a plane, in µm² or µm, with the errors that the posterior found.
+def size_record(prepared: PreparedScan, plane: str, rows: Any) -> Record:
+    """Record of a plane's measured sizes, in µm² or µm, with the errors of the posterior.
 
-    Rows without a size have weight 0, and so has padding.
+    Rows without a size, and padding, have weight 0.
     """
-    points, at = seen.solutions[plane].points, seen.measured(plane)
+    points, at = prepared.solutions[plane].points, prepared.measured(plane)
     columns = 1e6 * np.stack([points.size, points.error, points.weighed])
-    weight = np.zeros(len(padded(seen.scan.size[plane])))
-    every = np.repeat(columns[:, :1], len(weight), axis=1)
-    weight[at], every[:, at] = 1.0, columns
-    size, error, weighed = every
+    weight = np.zeros(len(pad_rows(prepared.scan.size[plane])))
+    padded_columns = np.repeat(columns[:, :1], len(weight), axis=1)
+    weight[at], padded_columns[:, at] = 1.0, columns
+    size, error, weighed = padded_columns
     if rows.squared:
         size, error = size**2, 2.0 * weighed * error
     return Record(f"size {plane}", predict_sizes, rows, size, error, weight)
 
 
 def size_records(problem: Problem) -> dict[str, Record]:
-    """Those of a problem's records that have the sizes of a plane, by its name."""
+    """Records of measured sizes in a problem, by plane."""
     return {r.data.plane: r for r in problem.records if r.predict is predict_sizes}
 
 
-def asked_in(
-    problem: Problem, seen: PreparedScan, planes: Iterable[str], whole_map: bool
-) -> tuple[Asked, ...]:
-    """Places of the planes' numbers, through the lines that a problem has."""
+def problem_places(
+    problem: Problem, prepared: PreparedScan, planes: Iterable[str], whole_map: bool
+) -> tuple[AnswerPlaces, ...]:
+    """Places that the planes' answers refer to, through the lines of a problem."""
     records = size_records(problem)
     lines = {plane: records[plane].data.line if whole_map else None for plane in planes}
-    return tuple(asked_of(seen, plane, whole_map, line) for plane, line in lines.items())
+    return tuple(answer_places(prepared, plane, whole_map, line) for plane, line in lines.items())
 
 
-def beam_numbers(seen: PreparedScan) -> dict[str, dict[str, float]]:
-    """Cholesky factors to start from: the known-transport fit, kept off zero emittance."""
-    return {plane: factor_of(seen.solutions[plane].posterior.best, 0.0025) for plane in seen.planes}
+def beam_numbers(prepared: PreparedScan) -> dict[str, dict[str, float]]:
+    """Cholesky factors to start from: the closed-form fit, kept away from zero emittance."""
+    return {
+        plane: cholesky_numbers(prepared.solutions[plane].posterior.best, 0.0025)
+        for plane in prepared.planes
+    }
 
 
-def factor_of(sigma: Sequence[float], least: float) -> dict[str, float]:
-    """The numbers of a beam from its σ in SI, with no less than this share of σ22 off the line."""
+def cholesky_numbers(sigma: Sequence[float], min_share: float) -> dict[str, float]:
+    """Cholesky factor of σ (SI) in units of 1e-4, with l22² at least a share of σ22."""
     s11, s12, s22 = (float(v) / UNIT**2 for v in sigma)
     l11 = math.sqrt(max(s11, 1e-6))
     l21 = s12 / l11
-    return {"l11": l11, "l21": l21, "l22": math.sqrt(max(s22 - l21**2, least * max(s22, 1e-6)))}
+    return {"l11": l11, "l21": l21, "l22": math.sqrt(max(s22 - l21**2, min_share * max(s22, 1e-6)))}
 
 
 def beam_free(beams: Mapping[str, Mapping[str, float]]) -> list[Free]:
-    """The beam's numbers as free ones: l11 and l22 positive."""
+    """Free parameters of the beams; l11 and l22 are positive."""
     free = []
     for plane, numbers in beams.items():
         angle = float(np.hypot(numbers["l21"], numbers["l22"]))
-        reach = {
+        start_range = {
             "l11": (0.5 * numbers["l11"], 1.5 * numbers["l11"]),
             "l21": (-angle, angle),
             "l22": (0.1 * angle, angle),
         }
         for name in numbers:
             low = -np.inf if name == "l21" else 1e-6
-            free.append(Free(f"beam.{plane}.{name}", low, np.inf, reach[name]))
+            free.append(Free(f"beam.{plane}.{name}", low, np.inf, start_range[name]))
     return free
 
 
 def beam_problem(
-    seen: PreparedScan,
+    prepared: PreparedScan,
     rows: Mapping[str, Any] | None = None,
     model: Mapping[str, Any] = MappingProxyType({}),
     free: Iterable[Free] = (),
@@ -308,9 +308,9 @@ def beam_problem(
     priors: Iterable[Prior] = (),
     constraints: Iterable[Constraint] = (),
 ) -> Problem:
-    """The beams and the sizes of their rows, by plane, with what else a scenario has."""
-    beams, rows = beam_numbers(seen), rows or {p: seen.of_plane(p) for p in seen.planes}
-    sizes = [size_record(seen, plane, own) for plane, own in rows.items()]
+    """Problem of the beams and the measured sizes by plane, with the parts of a scenario."""
+    beams, rows = beam_numbers(prepared), rows or {p: prepared.of_plane(p) for p in prepared.planes}
+    sizes = [size_record(prepared, plane, plane_rows) for plane, plane_rows in rows.items()]
     free, records = [*beam_free(beams), *free], [*sizes, *records]
     return Problem({"beam": beams, **model}, free, records, [*priors], [*constraints])
 
@@ -323,7 +323,7 @@ def prepare(
     noise: Noise | None = None,
     weights: str = WEIGHTS[0],
 ) -> PreparedScan:
-    """Look at a scan through its line, and at what its sizes say of a beam.
+    """Assemble a scan with its line, and fit each plane in closed form.
 
     Parameters
     ----------
@@ -339,35 +339,33 @@ def prepare(
     InputError
         If the line lacks a magnet or screen of the scan, or a plane was not measured.
     """
-    return with_posteriors(looked_through([unfitted(scan, line, planes, method, noise, weights)]))[
-        0
-    ]
+    return with_posteriors(with_elements([assemble(scan, line, planes, method, noise, weights)]))[0]
 
 
-def of_one_beam(
+def single_beam(
     scan: QuadScan, line: Beamline | None, scenario: str = "known"
 ) -> tuple[QuadScan, Beamline]:
-    """A scan of one beam with total energies, one row a setting, and its line.
+    """Reduce a scan to one beam with total energies and one row per setting, and find its line.
 
     Raises
     ------
     InputError
-        If it is of several slices, or its matrices are both given and unknown.
+        If the scan has several slices, or matrices together with a line or another scenario.
     """
     if len(scan.slices) > 1:
         found = f"a scan of {len(scan.slices)} slices of the beam"
         raise scan.unusable(found, "rows of one, as scan.of_slice(name) gives")
     line = rows_line(scan) if line is None else line
-    own = "rows with matrices of their own"
+    given = "rows with matrices of their own"
     if scan.transfer and (line.magnets or float(line.length) > 0.0):
-        raise scan.unusable(f"{own} and a line", "one of the two")
+        raise scan.unusable(f"{given} and a line", "one of the two")
     if scan.transfer and scenario != "known":
         expected = "scenario known, or settings and a lattice"
-        raise scan.unusable(f"scenario {scenario} for {own}", expected)
-    return of_settings(scan.of_particle(line.mass)), line
+        raise scan.unusable(f"scenario {scenario} for {given}", expected)
+    return group_shots(scan.of_particle(line.mass)), line
 
 
-def unfitted(
+def assemble(
     scan: QuadScan,
     line: Beamline,
     planes: tuple[str, ...] | None = None,
@@ -375,93 +373,101 @@ def unfitted(
     noise: Noise | None = None,
     weights: str = WEIGHTS[0],
 ) -> PreparedScan:
-    """The scan and its line as `prepare` has them, without the look and the posterior."""
-    check_names(scan, *names_of(line))
-    asked = planes or scan.planes
-    for plane in asked:
-        scan.rows(plane)  # says so if it was not measured
+    """Assemble a scan and its line, without transfer-matrix elements and posteriors."""
+    check_names(scan, *lattice_names(line))
+    chosen = planes or scan.planes
+    for plane in chosen:
+        scan.rows(plane)  # raises an error if the plane was not measured
     scanned = scanned_line(scan, line)
     check_gradients(scan, scanned)
     rows = scan_rows(scan, scanned, method == METHODS[0])
     return PreparedScan(
-        scan, line, scanned, asked, method, weights, rows, noise or Noise(), None, {}
+        scan, line, scanned, chosen, method, weights, rows, noise or Noise(), None, {}
     )
 
 
-def looked_through(begun: Sequence[PreparedScan]) -> list[PreparedScan]:
-    """Look at scans through their lines; those whose rows have one shape are one call."""
-    found, alike = list(begun), {}
-    for i, seen in enumerate(begun):
-        leaves, kind = jax.tree.flatten(seen.rows)
-        alike.setdefault((kind, *map(np.shape, leaves)), []).append((i, leaves))
-    for (kind, *shapes), members in alike.items():
-        room = max(ROOM // max(map(np.prod, shapes)) ** 2, 1)
-        lanes = min(int(room), LANES, 1 << (len(members) - 1).bit_length())
+def with_elements(assembled: Sequence[PreparedScan]) -> list[PreparedScan]:
+    """Add the transfer-matrix elements of scans; one call for scans of the same structure."""
+    found, alike = list(assembled), {}
+    for i, prepared in enumerate(assembled):
+        leaves, structure = jax.tree.flatten(prepared.rows)
+        alike.setdefault((structure, *map(np.shape, leaves)), []).append((i, leaves))
+    for (structure, *shapes), members in alike.items():
+        lanes_in_memory = max(MAX_CALL_NUMBERS // max(map(np.prod, shapes)) ** 2, 1)
+        lanes = min(int(lanes_in_memory), MAX_LANES, 1 << (len(members) - 1).bit_length())
         for start in range(0, len(members), lanes):
-            own = members[start : start + lanes]
+            batch = members[start : start + lanes]
             columns = zip(
-                *(leaves for _, leaves in own + own[-1:] * (lanes - len(own))), strict=True
+                *(leaves for _, leaves in batch + batch[-1:] * (lanes - len(batch))), strict=True
             )
-            looks = np.asarray(_looks([np.stack(c) for c in columns], kind))
-            for lane, (i, _) in enumerate(own):
-                found[i] = begun[i]._replace(look=looks[lane])
+            elements = np.asarray(_elements([np.stack(c) for c in columns], structure))
+            for lane, (i, _) in enumerate(batch):
+                found[i] = assembled[i]._replace(elements=elements[lane])
     return found
 
 
 @partial(jax.jit, static_argnums=1, compiler_options=SELDOM)
-def _looks(columns: list, kind: Any) -> Any:
-    return jax.vmap(lambda leaves: look_through(jax.tree.unflatten(kind, leaves)))(columns)
+def _elements(columns: list, structure: Any) -> Any:
+    """Elements of several scans of one structure, for stacked columns of their rows."""
+    return jax.vmap(lambda leaves: row_elements(jax.tree.unflatten(structure, leaves)))(columns)
 
 
-def with_posteriors(begun: Sequence[PreparedScan]) -> list[PreparedScan]:
-    """The same scans with the posterior of every plane; all with one noise and one method."""
-    if not begun:
+def with_posteriors(assembled: Sequence[PreparedScan]) -> list[PreparedScan]:
+    """Add the closed-form fit of every plane; all scans have one noise prior and one method."""
+    if not assembled:
         return []
-    own = [{plane: plane_sizes(seen, plane) for plane in seen.planes} for seen in begun]
-    sizes = [each for planes in own for each, _ in planes.values()]
-    found = iter(compare(sizes, begun[0].noise, begun[0].method, begun[0].weights))
-    every = []
-    for seen, planes in zip(begun, own, strict=True):
+    by_scan = [
+        {plane: plane_sizes(prepared, plane) for plane in prepared.planes} for prepared in assembled
+    ]
+    sizes = [each for planes in by_scan for each, _ in planes.values()]
+    found = iter(compare(sizes, assembled[0].noise, assembled[0].method, assembled[0].weights))
+    solved = []
+    for prepared, planes in zip(assembled, by_scan, strict=True):
         solutions = {
-            plane: _work(seen, plane, each, next(found), shots)
+            plane: _plane_solution(prepared, plane, each, next(found), shots)
             for plane, (each, shots) in planes.items()
         }
-        every.append(seen._replace(solutions=solutions))
-    return every
+        solved.append(prepared._replace(solutions=solutions))
+    return solved
 
 
-def plane_sizes(seen: PreparedScan, plane: str) -> tuple[PlaneSizes, ShotMeans | None]:
-    """The sizes of a plane with their errors, and what its shots say."""
-    scan, at, i = seen.scan, seen.measured(plane), "xy".index(plane)
-    r11, r12, known = seen.look[:, i, at]
+def plane_sizes(prepared: PreparedScan, plane: str) -> tuple[PlaneSizes, ShotMeans | None]:
+    """Sizes of a plane with their errors, and the means of its shots."""
+    scan, at, i = prepared.scan, prepared.measured(plane), "xy".index(plane)
+    r11, r12, known = prepared.elements[:, i, at]
     size, error, shots = scan.size[plane][at], scan.error.get(plane), None
-    if plane in scan.shot_size and (shots := means_of(scan.shot_size[plane][at], seen.noise)):
+    if plane in scan.shot_size and (shots := shot_means(scan.shot_size[plane][at], prepared.noise)):
         size, error = shots.size, shots.error
     elif error is not None:
         error = error[at]
         freedom = np.zeros(1) if scan.shots is None else np.asarray(scan.shots, float)[at] - 1.0
         if freedom.sum() > 0:
             square = error**2 * (freedom + 1.0) * freedom
-            error = np.sqrt(evened(square, freedom, size) / (freedom + 1.0))
+            error = np.sqrt(pooled_variance(square, freedom, size) / (freedom + 1.0))
     counted = scan.shots is not None and bool((np.asarray(scan.shots) > 1).any())
     of_shots = shots is not None or (error is not None and counted)
-    screens = {seen.rows.places[j] for j in seen.rows.which[at]}
+    screens = {prepared.rows.places[j] for j in prepared.rows.screen_index[at]}
     moved = any(np.ptp(v[at]) > 0 for v in scan.settings.values()) or len(screens) < 3
     return PlaneSizes(r11, r12, known, size, error, of_shots, moved), shots
 
 
-def _work(
-    seen: PreparedScan, plane: str, sizes: PlaneSizes, post: PlanePosterior, shots: ShotMeans | None
+def _plane_solution(
+    prepared: PreparedScan,
+    plane: str,
+    sizes: PlaneSizes,
+    post: PlanePosterior,
+    shots: ShotMeans | None,
 ) -> PlaneSolution:
-    scan, at, follows = seen.scan, seen.measured(plane), seen.weights == WEIGHTS[0]
+    """Combine a plane's sizes and posterior into its fitted points."""
+    scan, at, by_model = prepared.scan, prepared.measured(plane), prepared.weights == WEIGHTS[0]
     points = Points(
         settings={name: v[at] for name, v in scan.settings.items()},
         units={name: SETTING_UNITS[scan.units[name]] for name in scan.settings},
-        screen=tuple(seen.rows.places[j] for j in seen.rows.which[at]),
+        screen=tuple(prepared.rows.places[j] for j in prepared.rows.screen_index[at]),
         size=sizes.size,
         error=post.error,
-        weighed=post.model if follows else sizes.size,
-        relative=post.relative if follows else 0.0,
+        weighed=post.model if by_model else sizes.size,
+        relative=post.relative if by_model else 0.0,
         model=post.model,
         pull=np.zeros(len(at)),
         outlier_probability=post.bad,
@@ -469,26 +475,26 @@ def _work(
         r12=sizes.r12,
         known=sizes.known,
     )
-    points = points.with_model(post.model, seen.rows.squared)
-    return PlaneSolution(sizes, post, points, _shot_words(points, shots))
+    points = points.with_model(post.model, prepared.rows.squared)
+    return PlaneSolution(sizes, post, points, _shot_sentences(points, shots))
 
 
-def _shot_words(p: Points, shots: ShotMeans | None) -> str:
-    """Count and name the shots that surely show no beam."""
+def _shot_sentences(p: Points, shots: ShotMeans | None) -> str:
+    """Sentences on shots that show no beam, and on their scatter."""
     if shots is None:
         return ""
-    lost, said = np.argwhere(np.nan_to_num(shots.bad) > 0.99), []
-    if len(lost):
-        count, are = int((~np.isnan(shots.bad)).sum()), "are" if len(lost) > 1 else "is"
-        places = named([f"shot {j + 1} at {p.where(i)}" for i, j in lost])
-        said.append(f"{len(lost)} of {count} shots {are} left out, no beam there: {places}.")
-    if shots.scatter > UNSTEADY:
-        said.append(
+    bad, sentences = np.argwhere(np.nan_to_num(shots.bad) > 0.99), []
+    if len(bad):
+        count, are = int((~np.isnan(shots.bad)).sum()), "are" if len(bad) > 1 else "is"
+        places = name_places([f"shot {j + 1} at {p.where(i)}" for i, j in bad])
+        sentences.append(f"{len(bad)} of {count} shots {are} left out, no beam there: {places}.")
+    if shots.scatter > UNSTEADY_SCATTER:
+        sentences.append(
             f"Shots of one setting scatter by {100 * shots.scatter:.2g} %: the beam changes from "
             "shot to shot, and this is that of the mean sizes."
         )
-    return " ".join(said)
+    return " ".join(sentences)
 
 
-# Nothing but the beam is unknown; as a problem for those who want more than the posterior.
-SCENARIO = Scenario("known", lambda seen, _told: beam_problem(seen), closed=True)
+# Only the beam is free. The problem is for those who need more than the posterior.
+SCENARIO = Scenario("known", lambda prepared, _assumptions: beam_problem(prepared), closed=True)

@@ -1,4 +1,4 @@
-"""Targets at a screen, the beams they are for, and what a search needs of both."""
+"""Targets at a screen, the beams to reach them, and checks of both."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from beamfit.optics.beamline import Beamline
 
 KINDS = ("size", "divergence", "match")
-# Energies that differ by less than this share are one: a magnet's setting is known no better.
+# Energies within this share count as equal: settings of magnets are known no better.
 SAME_ENERGY = 1e-3
 
 
@@ -29,7 +29,7 @@ class Target(NamedTuple):
     plane : str
         "x" or "y".
     value : float, tuple of float, or None
-        The wanted value; None for a match to the lattice's own design.
+        Target value; None for a match to the lattice's own design.
 
     Examples
     --------
@@ -50,15 +50,15 @@ class Beam(NamedTuple):
     sigma : ndarray
         σ11 (m²), σ12 (m rad), σ22 (rad²).
     covariance : ndarray or None
-        Shape (3, 3), scaled as the errors are; None where there is none.
+        Shape (3, 3), with errors scaled as those of the fit; None if unknown.
     calibration : mapping of str to float
-        Calibration numbers fitted together with it, such as "Q2.slope".
+        Calibration parameters fitted together with the beam, such as "Q2.slope".
     energy : float or None
-        Total energy at which it was measured, MeV; None for the line's.
+        Total energy of the measurement, MeV; None for the line's.
     doubt : str or None
-        Why a fit does not determine it; None if it does.
+        Reason why a fit does not determine the beam; None if it does.
     line : str or None
-        Digest of the line that it was fitted in (`Beamline.digest`), to be held against another.
+        Digest of the line of the fit (`Beamline.digest`), to be compared with that of the search.
 
     Examples
     --------
@@ -74,15 +74,15 @@ class Beam(NamedTuple):
     line: str | None = None
 
 
-def common_energy(beams: Mapping[str, Beam], asked: float | None = None) -> float | None:
-    """Give the energy the beams were measured at, MeV; None where they do not say.
+def common_energy(beams: Mapping[str, Beam], energy: float | None = None) -> float | None:
+    """Energy at which the beams were measured, MeV; None if they have none.
 
-    A beam matrix in geometric units holds at its own energy only.
+    A beam matrix in geometric units is valid at its own energy only.
 
     Raises
     ------
     InputError
-        If they, or the energy asked for, differ by more than 0.1 %.
+        If they, or the given energy, differ by more than 0.1 %.
 
     Examples
     --------
@@ -90,17 +90,19 @@ def common_energy(beams: Mapping[str, Beam], asked: float | None = None) -> floa
     25.0
     """
     found = {f"plane {p}": b.energy for p, b in beams.items() if b.energy is not None}
-    given = found if asked is None else found | {"--energy": asked}
+    given = found if energy is None else found | {"--energy": energy}
     if found and max(given.values()) - min(given.values()) > SAME_ENERGY * min(given.values()):
         listed = ", ".join(f"{e:g} MeV ({name})" for name, e in given.items())
         raise InputError(f"energies {listed}", "one energy for beam and line")
     return next(iter(found.values()), None)
 
 
-def resolved(
+def resolve_targets(
     line: Beamline, targets: Sequence[Target], screen: str | None
 ) -> tuple[tuple[Target, ...], str | None]:
-    """Put the line's design into matches that name none, and its place where nothing else is asked.
+    """Replace matches without a value by the line's design, and choose the place of the targets.
+
+    The place is that of the design if all targets are such matches and no screen is given.
 
     Raises
     ------
@@ -119,6 +121,7 @@ def resolved(
 
 
 def _design(line: Beamline, plane: str) -> tuple[float, float]:
+    """Design β (m) and α of a line in one plane."""
     twiss = getattr(line.design, plane, None)
     if twiss is None:
         raise InputError(
@@ -128,19 +131,19 @@ def _design(line: Beamline, plane: str) -> tuple[float, float]:
     return twiss
 
 
-def checked_place(
+def check_targets(
     line: Beamline,
     beams: Mapping[str, Beam],
     vary: Mapping[str, tuple[float, float]],
     targets: Sequence[Target],
     screen: str | None,
 ) -> str:
-    """Refuse names and ranges that cannot be used; give the screen asked for, or the line's last.
+    """Check names, limits, targets and beams; return the given screen or the line's last.
 
     Raises
     ------
     InputError
-        If something cannot be used.
+        If one of them cannot be used.
     """
     expect(beams, Mapping, '{"x": beamfit.Beam(sigma)}')
     for beam in beams.values():
@@ -156,9 +159,11 @@ def checked_place(
     names = [e.name for e in line.elements]
     if place not in names:
         raise InputError(f"no place '{place}' in the line", nearest(place, names))
-    late = [n for n in vary if names.index(line.members(n)[0]) > names.index(place)]
-    if late:
-        raise InputError(f"{late[0]}, downstream of {place}", "magnets between start and screen")
+    downstream = [n for n in vary if names.index(line.members(n)[0]) > names.index(place)]
+    if downstream:
+        raise InputError(
+            f"{downstream[0]}, downstream of {place}", "magnets between start and screen"
+        )
     for target in targets:
         _check_target(beams, target)
     for plane, beam in beams.items():
@@ -172,7 +177,7 @@ def checked_place(
 
 
 def check_limits(line: Beamline, limits: Mapping[str, tuple[float, float]]) -> None:
-    """Refuse limits of what is no magnet of the line, and such as no setting is within."""
+    """Raise an error for unknown magnets, and for limits that are not finite or not in order."""
     for name, (low, high) in limits.items():
         if name not in line.magnets:
             raise InputError(f"no magnet '{name}' in the line", nearest(name, list(line.magnets)))
@@ -181,6 +186,7 @@ def check_limits(line: Beamline, limits: Mapping[str, tuple[float, float]]) -> N
 
 
 def _check_target(beams: Mapping[str, Beam], target: Target) -> None:
+    """Raise an error for an unknown kind or plane, and for an impossible value."""
     if target.kind not in KINDS:
         raise InputError(f"target '{target.kind}'", nearest(target.kind, list(KINDS)))
     if target.plane not in beams:
@@ -192,11 +198,12 @@ def _check_target(beams: Mapping[str, Beam], target: Target) -> None:
         expected = "a positive number; no beam gets to zero, so ask for the smallest of use"
         raise InputError(f"target {target.kind} {positive:g}", expected)
     if not np.isfinite(alpha).all():
-        said = f"target match with alpha = {alpha[0]:g} in plane {target.plane}"
-        raise InputError(said, "a finite alpha")
+        found = f"target match with alpha = {alpha[0]:g} in plane {target.plane}"
+        raise InputError(found, "a finite alpha")
 
 
 def _check_beam(plane: str, sigma: np.ndarray) -> None:
+    """Raise an error for a matrix that is not positive definite, or not in SI units."""
     s11, s12, s22 = sigma
     if not (s11 > 0 and s11 * s22 > s12**2):
         raise InputError(

@@ -1,7 +1,6 @@
-"""A scan seen through a line: from settings to R11, R12 and what is known of each size.
+"""Rows of a scan through a line: from settings to R11, R12 and the known size².
 
-Numbers that only a wrong unit explains are refused here, and those that hardly anything else does
-are asked about.
+Numbers that only a wrong unit explains raise an error; improbable ones give a warning.
 """
 
 from __future__ import annotations
@@ -18,30 +17,30 @@ import numpy as np
 from jax import Array
 
 from beamfit.arrays import padded_length
-from beamfit.emittance.model import line_of
+from beamfit.emittance.model import line_with
 from beamfit.emittance.scan import USUAL, QuadScan, middle
 from beamfit.greybox import tree
-from beamfit.optics.beamline import Beamline, Same, seen_line, transfer_rows
+from beamfit.optics.beamline import Beamline, LineIdentity, reduced_line, transfer_rows
 from beamfit.optics.calibration import SETTING_UNITS, CurrentTable, plain_meaning
 from beamfit.optics.elements import Element, Marker, Quadrupole, Screen, ThinLens
 from beamfit.particles import ELECTRON_MASS, beta_gamma, rigidity
 from beamfit.quantity import display_unit
 
-# Gradients in T/m beyond which a magnet is a plasma lens at least, and beyond any lens.
-STRONG, IMPOSSIBLE = 500.0, 1e4
-# Normalised emittances in m of most beams: electrons from the best guns, positrons from a target.
-# Sizes in mm that are called µm give 1e-12; an energy in GeV that is called MeV 1e-2 and more.
-LIKELY = (1e-9, 1e-2)
-# A prior further than this from what the line says is asked about.
-FAR = 0.2
+# Gradients in T/m above which only plasma lenses are known, and above which no lens is.
+STRONG_GRADIENT, IMPOSSIBLE_GRADIENT = 500.0, 1e4
+# Range of normalised emittances in m of most beams, from the best electron guns to positrons from a
+# target. Sizes in mm labelled µm give 1e-12; an energy in GeV labelled MeV gives 1e-2 and more.
+USUAL_EMITTANCES = (1e-9, 1e-2)
+# Relative deviation of a prior from the line's value above which a warning is given.
+MAX_PRIOR_DEVIATION = 0.2
 
 
-def names_of(line: Beamline) -> tuple[dict[str, str], list[str], str | None, float]:
-    """Calibration units by magnet, places a screen may be, the default screen, rest energy.
+def lattice_names(line: Beamline) -> tuple[dict[str, str], list[str], str | None, float]:
+    """Calibration units by magnet, places that may be a screen, the default screen, rest energy.
 
     Examples
     --------
-    >>> names_of(Beamline((Screen("S"),), energy=100.0))
+    >>> lattice_names(Beamline((Screen("S"),), energy=100.0))
     ({}, ['S'], 'S', 0.51099895069)
     """
     units = {n: line[n].calibration.unit for n in line.magnets}
@@ -50,9 +49,9 @@ def names_of(line: Beamline) -> tuple[dict[str, str], list[str], str | None, flo
 
 
 def scanned_line(scan: QuadScan, line: Beamline) -> Beamline:
-    """Give each scanned magnet the meaning its column's unit has, at the same strength.
+    """Convert the setting of each scanned magnet to the unit of its column, at the same strength.
 
-    Where the rows are of one slice of the beam, magnets stay as they are for the line's energy.
+    If the rows are of one slice of the beam, magnets are held at the line's energy.
 
     Examples
     --------
@@ -76,31 +75,32 @@ def scanned_line(scan: QuadScan, line: Beamline) -> Beamline:
     energy = None
     if scan.slice is not None:
         energies = np.unique(line.energy if scan.energy is None else scan.energy)
-        # The mean of equal numbers may be another one in its last digit.
+        # Rounding may make the mean of equal numbers differ in its last digit.
         energy = float(energies[0] if len(energies) == 1 else np.mean(scan.energy))
-    return _as_scanned(Same(line), tuple(scan.units.items()), energy)
+    return _with_units(LineIdentity(line), tuple(scan.units.items()), energy)
 
 
 @lru_cache(maxsize=64)
-def _as_scanned(same: Same, units: tuple[tuple[str, str], ...], energy: float | None) -> Beamline:
-    """The line with other units of its settings, and held for another beam if one is told."""
+def _with_units(
+    same: LineIdentity, units: tuple[tuple[str, str], ...], energy: float | None
+) -> Beamline:
+    """The line with settings in other units, and held for a beam of another energy if given."""
     line = same.line
     for member, unit in [(m, unit) for name, unit in units for m in line.members(name)]:
         magnet = line[member]
         if unit != magnet.calibration.unit:
             meaning = plain_meaning(unit, line.mass)
             strength = magnet.calibration.k1l(magnet.setting, magnet.length, line.energy)
-            # Every other meaning is proportional to its setting.
+            # All these calibrations are proportional to the setting.
             setting = float(strength / meaning.k1l(1.0, magnet.length, line.energy))
             line = line.with_element(replace(magnet, calibration=meaning, setting=setting))
     return line if energy is None else line.held(energy)
 
 
 def rows_line(scan: QuadScan) -> Beamline:
-    """The line of rows of electrons that have matrices of their own: where these begin, no more.
+    """Line for rows of electrons that have matrices of their own: it ends where these begin.
 
-    The rows' screens and the start stand in one place. Rows without matrices or without an energy
-    are an `InputError`.
+    All screens are at the start. Raises `InputError` for rows without matrices or an energy.
 
     Examples
     --------
@@ -122,7 +122,7 @@ def rows_line(scan: QuadScan) -> Beamline:
 
 @tree.node("plane", "places", "squared")
 class Rows:
-    """Rows of a scan seen through a line: what predicts their sizes besides the model.
+    """Rows of a scan through a line: the data that predict their sizes for a model.
 
     Parameters
     ----------
@@ -136,13 +136,13 @@ class Rows:
         The line, with the calibrations of the scan's columns.
     settings : dict of str to Array
         Magnet name to settings, shape (n,), or (n, 2) with the branch.
-    energy, which, spread, resolution : Array
+    energy, screen_index, spread, resolution : Array
         MeV, index into places, relative momentum spread and point-spread rms in m, shape (n,).
     damping : Array
-        sqrt(βγ/βγ_row), shape (n,): the beam that is asked for, at the scan's mean energy, has this
-        times the size at another one, since the normalised emittance is what stays.
-    given : Array or None
-        Shape (2, n, 3): R11, R12 and R16 of both planes where the rows have them from elsewhere.
+        sqrt(βγ/βγ_row), shape (n,): size of the beam in the row over that at the scan's mean
+        energy, for one normalised emittance.
+    transfer : Array or None
+        Shape (2, n, 3): R11, R12 and R16 of both planes if the rows have matrices of their own.
     """
 
     plane: str
@@ -151,43 +151,44 @@ class Rows:
     line: Beamline
     settings: Any
     energy: Any
-    which: Any
+    screen_index: Any
     spread: Any
     resolution: Any
     damping: Any
-    given: Any = None
+    transfer: Any = None
 
     def elements(self, model: Mapping[str, Any]) -> tuple[Array, Array, Array]:
-        """R11, R12, damped, and known size² (m²) of every row, shape (n,), by the model's line."""
-        found = model.get("systematics", {})
-        r = self.both(line_of(model, self.line), self.energy * found.get("energy", 1.0))
-        return self.known(r["xy".index(self.plane)], found)
+        """Damped R11 and R12, and known size² (m²), of each row, shape (n,), for a model."""
+        systematics = model.get("systematics", {})
+        r = self.both_planes(
+            line_with(model, self.line), self.energy * systematics.get("energy", 1.0)
+        )
+        return self.screen_elements(r["xy".index(self.plane)], systematics)
 
-    def both(self, line: Beamline, energy: Array) -> Array:
-        """R11, R12 and R16 of both planes, shape (2, n, 3), by a line, unless they are given."""
-        if self.given is not None:
-            return self.given
+    def both_planes(self, line: Beamline, energy: Array) -> Array:
+        """R11, R12 and R16 of both planes through a line, shape (2, n, 3), unless given."""
+        if self.transfer is not None:
+            return self.transfer
         planes = transfer_rows(line, self.settings, energy, self.places).planes
-        return jnp.moveaxis(planes[jnp.arange(len(self.energy)), :, self.which, 0], 1, 0)
+        return jnp.moveaxis(planes[jnp.arange(len(self.energy)), :, self.screen_index, 0], 1, 0)
 
-    def known(
-        self, r: Array, found: Mapping[str, Any] = MappingProxyType({})
+    def screen_elements(
+        self, r: Array, systematics: Mapping[str, Any] = MappingProxyType({})
     ) -> tuple[Array, Array, Array]:
-        """R11, R12 and known size² from R11, R12 and R16, shape (n, 3), and what was found free.
+        """R11, R12 and known size² from R11, R12 and R16, shape (n, 3), and free systematics."""
+        slopes = systematics.get("dispersion", 0.0), systematics.get("dispersion_slope", 0.0)
+        dispersion = r[:, 2] + r[:, 0] * slopes[0] + r[:, 1] * slopes[1]
+        known = (dispersion * self.spread) ** 2 + systematics.get(
+            "resolution", self.resolution
+        ) ** 2
+        return apply_screen(systematics, self.damping * r[:, 0], self.damping * r[:, 1], known)
 
-        Of a round wire of diameter d the rms is d/4, that of a uniform disc seen from the side.
-        """
-        own = found.get("dispersion", 0.0), found.get("dispersion_slope", 0.0)
-        dispersion = r[:, 2] + r[:, 0] * own[0] + r[:, 1] * own[1]
-        known = (dispersion * self.spread) ** 2 + found.get("resolution", self.resolution) ** 2
-        return through_screen(found, self.damping * r[:, 0], self.damping * r[:, 1], known)
 
-
-def through_screen(
-    found: Mapping[str, Any], r11: Array, r12: Array, known: Array
+def apply_screen(
+    systematics: Mapping[str, Any], r11: Array, r12: Array, known: Array
 ) -> tuple[Array, Array, Array]:
-    """R11, R12 and known size² as a screen or wire of some scale and thickness shows them."""
-    scale, wire = found.get("size_scale", 1.0), found.get("wire", 0.0)
+    """Apply scale and wire diameter (m) of the screen; the rms of a round wire is d/4."""
+    scale, wire = systematics.get("size_scale", 1.0), systematics.get("wire", 0.0)
     return scale * r11, scale * r12, scale**2 * (known + (wire / 4.0) ** 2)
 
 
@@ -195,9 +196,9 @@ def through_screen(
 class NetworkRows:
     """Rows of a scan whose R11 and R12 are outputs of a network of the settings.
 
-    ``inputs`` has shape (n, inputs) and ``columns`` (n, 2), the outputs that are R11 and R12 at
-    each row's screen; ``known`` (n,) is the size² that is not due to the beam, m², ``damping`` that
-    of `Rows`.
+    ``inputs`` has shape (n, inputs). ``columns``, shape (n, 2), selects the outputs that are R11
+    and R12 at each row's screen. ``known`` (n,) is the size² not due to the beam, m², and
+    ``damping`` is that of `Rows`.
     """
 
     plane: str
@@ -208,23 +209,23 @@ class NetworkRows:
     damping: Any
 
     def outputs(self, model: Mapping[str, Any]) -> Array:
-        """The outputs of the model's network that ``columns`` names, of its shape."""
-        every = jax.vmap(model["map"].values)(self.inputs)
-        return jnp.take_along_axis(every, self.columns, axis=1)
+        """Outputs of the model's network selected by ``columns``, of its shape."""
+        outputs = jax.vmap(model["map"].values)(self.inputs)
+        return jnp.take_along_axis(outputs, self.columns, axis=1)
 
     def elements(self, model: Mapping[str, Any]) -> tuple[Array, Array, Array]:
-        """R11, R12 and known size² (m²) of every row, shape (n,) each."""
-        found = self.outputs(model)  # A and B first, then C and D if the network has them
-        r11, r12 = self.damping * found[:, 0], self.damping * found[:, 1]
-        return through_screen(model.get("systematics", {}), r11, r12, self.known)
+        """R11, R12 and known size² (m²) of each row, shape (n,) each."""
+        outputs = self.outputs(model)  # A and B first, then C and D if the network has them
+        r11, r12 = self.damping * outputs[:, 0], self.damping * outputs[:, 1]
+        return apply_screen(model.get("systematics", {}), r11, r12, self.known)
 
 
-def padded(values: Any) -> np.ndarray:
-    """Repeat the last row until there are as many as `padded_length` says.
+def pad_rows(values: Any) -> np.ndarray:
+    """Repeat the last row up to the length of `padded_length`.
 
     Examples
     --------
-    >>> padded([1.0, 2.0]).tolist()
+    >>> pad_rows([1.0, 2.0]).tolist()
     [1.0, 2.0, 2.0, 2.0, 2.0, 2.0, 2.0, 2.0]
     """
     values = np.asarray(values)
@@ -237,9 +238,9 @@ def scan_rows(
     scanned: Beamline,
     squared: bool = True,
     keep: Iterable[str] = (),
-    any_energy: bool = False,
+    variable_energy: bool = False,
 ) -> Rows:
-    """The rows of a scan, of the x plane, padded.
+    """Rows of a scan, padded, for the x plane.
 
     Parameters
     ----------
@@ -250,79 +251,83 @@ def scan_rows(
     squared : bool
         As for `Rows`.
     keep : iterable of str
-        Elements that may change besides the magnets of the scan.
-    any_energy : bool
-        Whether the energy may.
+        Elements that may vary besides the magnets of the scan.
+    variable_energy : bool
+        Whether the energy may vary.
 
     Returns
     -------
     Rows
-        Places in the order of the line. All of the line that nothing changes is multiplied out.
+        Places in the order of the line. Elements that do not vary are combined.
     """
-    n, own = len(scan), scan.transfer
-    named = scan.screen or (scanned.screens[-1],) * n
+    n, transfer = len(scan), scan.transfer
+    screens = scan.screen or (scanned.screens[-1],) * n
     order = {e.name: i for i, e in enumerate(scanned.elements)}
-    # Rows with matrices of their own: the beam is asked for where those begin, the last place.
-    seen = {*named, scanned.screens[-1]} if own else set(named)
-    places = tuple(sorted(seen, key=order.__getitem__))
+    # Rows with matrices of their own: the beam matrix is where these begin, the last place.
+    used = {*screens, scanned.screens[-1]} if transfer else set(screens)
+    places = tuple(sorted(used, key=order.__getitem__))
     resolution = [float(getattr(scanned[s], "resolution", 0.0)) for s in places]
-    which = np.array([places.index(s) for s in named])
+    screen_index = np.array([places.index(s) for s in screens])
 
     def column(values: Any, default: float) -> np.ndarray:
-        return padded(np.full(n, float(default)) if values is None else values)
+        return pad_rows(np.full(n, float(default)) if values is None else values)
 
     energy = column(scan.energy, scanned.energy)
-    ends = (*places, scanned.design.at) if scanned.design else places
-    # What is multiplied out holds for one energy, if there is but one.
-    every = np.append(energy, (1.0 + any_energy) * scanned.energy)
-    settings = {} if own else scan.settings
+    targets = (*places, scanned.design.at) if scanned.design else places
+    # Combined elements hold one energy if all rows have it.
+    energies = np.append(energy, (1.0 + variable_energy) * scanned.energy)
+    settings = {} if transfer else scan.settings
     return Rows(
         "x",
         places,
         squared,
-        seen_line(scanned, (*settings, *keep), every, ends),
-        {name: padded(v) for name, v in settings.items()},
+        reduced_line(scanned, (*settings, *keep), energies, targets),
+        {name: pad_rows(v) for name, v in settings.items()},
         energy,
-        padded(which),
+        pad_rows(screen_index),
         column(scan.energy_spread, scanned.energy_spread),
-        padded(np.array(resolution)[which] if scan.resolution is None else scan.resolution),
+        pad_rows(
+            np.array(resolution)[screen_index] if scan.resolution is None else scan.resolution
+        ),
         damping_of(energy, float(energy[:n].mean()), float(scanned.mass)),
-        # A plane that was not measured has no rows, whatever stands there.
-        np.stack([padded(own.get(p, next(iter(own.values())))) for p in "xy"]) if own else None,
+        # A plane that was not measured has no rows; its matrices do not matter.
+        np.stack([pad_rows(transfer.get(p, next(iter(transfer.values())))) for p in "xy"])
+        if transfer
+        else None,
     )
 
 
 def damping_of(energy: np.ndarray, mean: float, mass: float) -> np.ndarray:
-    """Square root of the ratio of a geometric emittance to that at the mean energy."""
+    """Square root of the geometric emittance over that at the mean energy."""
     return np.sqrt(beta_gamma(mean, mass) / beta_gamma(energy, mass))
 
 
-def look_through(rows: Rows) -> Array:
-    """Carry the rows of a scan to their screens, in both planes and one pass.
+def row_elements(rows: Rows) -> Array:
+    """Compute the transfer-matrix elements of the rows of a scan, in both planes at once.
 
     Returns
     -------
     Array, shape (3, 2, rows)
-        R11, R12 (m) and the size² that is not due to the beam (m²), of x and y.
+        R11, R12 (m) and the size² not due to the beam (m²), of x and y.
     """
-    seen = [jnp.stack(rows.known(r)) for r in rows.both(rows.line, rows.energy)]
-    return jnp.stack(seen, axis=1)
+    planes = [jnp.stack(rows.screen_elements(r)) for r in rows.both_planes(rows.line, rows.energy)]
+    return jnp.stack(planes, axis=1)
 
 
 def setting_units(line: Beamline, magnets: Iterable[str]) -> dict[str, str]:
-    """The units of the settings of magnets, as they are written for people."""
+    """Units of the settings of magnets, in words."""
     return {n: SETTING_UNITS[line[n].calibration.unit] for n in magnets}
 
 
 def scanned_magnets(scan: QuadScan, scanned: Beamline) -> Iterator[tuple[str, np.ndarray, Element]]:
-    """Name and settings of each scanned magnet, and of a supply each magnet on it."""
+    """Name and settings of each scanned magnet; for a supply, of each of its magnets."""
     for name, settings in () if scan.transfer else scan.settings.items():
         for member in scanned.members(name):
             yield name, settings, scanned[member]
 
 
 def gradients(scan: QuadScan, scanned: Beamline) -> dict[str, float]:
-    """The largest gradient in T/m of each scanned quadrupole that has a length."""
+    """Largest gradient in T/m of each scanned quadrupole with a length."""
     energy = float(scanned.energy) if scan.energy is None else scan.energy
     found = {}
     for name, settings, magnet in scanned_magnets(scan, scanned):
@@ -334,7 +339,7 @@ def gradients(scan: QuadScan, scanned: Beamline) -> dict[str, float]:
 
 
 def check_gradients(scan: QuadScan, scanned: Beamline) -> None:
-    """Refuse settings that no magnet can have.
+    """Raise an error for settings that no magnet can have.
 
     Parameters
     ----------
@@ -346,21 +351,21 @@ def check_gradients(scan: QuadScan, scanned: Beamline) -> None:
     Raises
     ------
     InputError
-        Naming the magnet and its gradient.
+        The magnet and its gradient.
     """
     for name, gradient in gradients(scan, scanned).items():
-        if gradient > IMPOSSIBLE:
+        if gradient > IMPOSSIBLE_GRADIENT:
             largest = float(np.abs(scan.settings[name]).max())
             raise scan.unusable(
                 f"settings of '{name}' up to {largest:g}, which are {gradient:.3g} T/m",
-                f"a gradient below {IMPOSSIBLE:g} T/m: is the unit of the settings, the length or "
-                "calibration of the magnet, or the energy another one?",
+                f"a gradient below {IMPOSSIBLE_GRADIENT:g} T/m: is the unit of the settings, the "
+                "length or calibration of the magnet, or the energy another one?",
                 name,
             )
 
 
 def unit_warnings(scan: QuadScan, scanned: Beamline) -> tuple[str, ...]:
-    """Ask about sizes and settings that are possible, and yet more likely in a wrong unit.
+    """Warnings on sizes, settings and energies that are possible but probably in a wrong unit.
 
     Parameters
     ----------
@@ -370,14 +375,17 @@ def unit_warnings(scan: QuadScan, scanned: Beamline) -> tuple[str, ...]:
     Returns
     -------
     tuple of str
-        Sentences; nothing was changed because of them.
+        Sentences; the numbers are used as they are.
     """
-    asked = _of_energies, _of_gradients, _of_tables
-    return (*of_sizes(scan), *(said for ask in asked for said in ask(scan, scanned)))
+    checks = _energy_warnings, _gradient_warnings, _table_warnings
+    return (
+        *size_warnings(scan),
+        *(sentence for check in checks for sentence in check(scan, scanned)),
+    )
 
 
-def of_sizes(scan: QuadScan) -> Iterator[str]:
-    """Ask about the sizes alone."""
+def size_warnings(scan: QuadScan) -> Iterator[str]:
+    """Warnings on unusual sizes."""
     for plane, size in scan.size.items():
         usual = middle(size)
         if not USUAL[0] <= usual <= USUAL[1]:
@@ -389,60 +397,63 @@ def of_sizes(scan: QuadScan) -> Iterator[str]:
             )
 
 
-def _of_energies(scan: QuadScan, scanned: Beamline) -> Iterator[str]:
-    """Ask about rows whose energy is another than the line's by a factor of two."""
+def _energy_warnings(scan: QuadScan, scanned: Beamline) -> Iterator[str]:
+    """Warning on rows whose energy differs from the line's by a factor of two or more."""
     if scan.energy is None:
         return
-    given, own = middle(scan.energy), float(scanned.energy)
-    if not 0.5 < given / own < 2.0:
+    row_energy, line_energy = middle(scan.energy), float(scanned.energy)
+    if not 0.5 < row_energy / line_energy < 2.0:
         yield (
-            f"The rows have energies around {given:.4g} MeV, the line one of {own:.4g} MeV: are "
-            "both in MeV?"
+            f"The rows have energies around {row_energy:.4g} MeV, the line one of "
+            f"{line_energy:.4g} MeV: are both in MeV?"
         )
 
 
-def of_emittances(planes: Iterable[Any]) -> Iterator[str]:
-    """Ask about planes whose emittance is determined and no usual accelerator's."""
+def emittance_warnings(planes: Iterable[Any]) -> Iterator[str]:
+    """Warnings on planes whose emittance is determined but unusual."""
     for plane in planes:
         found = plane.normalized_emittance
-        likely = LIKELY[0] <= found.value <= LIKELY[1]
-        if found.error is not None and found.value > 0.0 and not likely:
+        usual = USUAL_EMITTANCES[0] <= found.value <= USUAL_EMITTANCES[1]
+        if found.error is not None and found.value > 0.0 and not usual:
             yield (
                 f"A normalised emittance of {found.value:.2g} m in {plane.plane} is "
-                f"{'less' if found.value < LIKELY[0] else 'more'} than most accelerators have: are "
-                "sizes, settings and energy in their units?"
+                f"{'less' if found.value < USUAL_EMITTANCES[0] else 'more'} than most accelerators "
+                "have: are sizes, settings and energy in their units?"
             )
 
 
-def of_priors(priors: Mapping[str, tuple[float | None, float]], scanned: Beamline) -> Iterator[str]:
-    """Ask about priors on elements whose mean is far from what the line says."""
+def prior_warnings(
+    priors: Mapping[str, tuple[float | None, float]], scanned: Beamline
+) -> Iterator[str]:
+    """Warnings on priors of elements whose mean is far from the line's value."""
     for name, (mean, _) in priors.items():
-        element, _, what = name.rpartition(".")
+        element, _, attribute = name.rpartition(".")
         if mean is None or not element or element not in {e.name for e in scanned.elements}:
             continue
         part = scanned[element]
-        own = getattr(part, "length", None) if what == "length" else None
-        own = getattr(getattr(part, "calibration", None), what, own)
-        if own is None or what == "gradient" or not float(own):
+        line_value = getattr(part, "length", None) if attribute == "length" else None
+        line_value = getattr(getattr(part, "calibration", None), attribute, line_value)
+        if line_value is None or attribute == "gradient" or not float(line_value):
             continue
-        if abs(mean / float(own) - 1.0) > FAR:
+        if abs(mean / float(line_value) - 1.0) > MAX_PRIOR_DEVIATION:
             yield (
-                f"The prior {name} = {mean:g} is more than 20 % from the line's {float(own):g}: is "
-                "it in the line's unit?"
+                f"The prior {name} = {mean:g} is more than 20 % from the line's "
+                f"{float(line_value):g}: is it in the line's unit?"
             )
 
 
-def _of_gradients(scan: QuadScan, scanned: Beamline) -> Iterator[str]:
+def _gradient_warnings(scan: QuadScan, scanned: Beamline) -> Iterator[str]:
+    """Warnings on unusually strong gradients."""
     for name, gradient in gradients(scan, scanned).items():
-        if gradient > STRONG:
+        if gradient > STRONG_GRADIENT:
             yield (
                 f"Settings of {name} are taken as they stand, but mean gradients up to "
                 f"{gradient:.3g} T/m: are its unit, length and calibration right?"
             )
 
 
-def _of_tables(scan: QuadScan, scanned: Beamline) -> Iterator[str]:
-    """Ask about currents beyond those at which a magnet was measured."""
+def _table_warnings(scan: QuadScan, scanned: Beamline) -> Iterator[str]:
+    """Warnings on currents outside the measured range of a magnet."""
     for name, settings, magnet in scanned_magnets(scan, scanned):
         table = getattr(magnet, "calibration", None)
         if not isinstance(table, CurrentTable):

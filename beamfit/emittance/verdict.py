@@ -1,4 +1,4 @@
-"""The verdict on an emittance: the comparison of models in sentences."""
+"""Verdict on a plane's emittance: the comparison of models in sentences."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from beamfit.emittance.comparison import (
     CONSTANT,
     CURVE,
     DRIFTING,
-    FLAT,
     RANDOM,
+    ZERO_EMITTANCE,
     PlanePosterior,
     PlaneSizes,
 )
@@ -24,20 +24,20 @@ from beamfit.errors import Finding, Status
 from beamfit.quantity import display_unit
 from beamfit.statistics import of_use
 
-# A beam is sure with this probability: one answer in a hundred may be another thing.
+# Probability above which a model is sure: one answer in a hundred may be wrong.
 SURE = 0.99
-# A point carries the answer if the emittance moves by so many errors without it: farther than the
-# interval, which then reaches there.
-CARRIES = 2.0
-# An error so many times that by the stated errors is explained, where nothing else explains it.
-ENLARGED = 1.5
-# Above this probability of χ² stated errors are called too large.
-OVERSTATED = 0.999
-# Points that a sentence names.
-MOST_NAMED = 5
-# What to check where a rival explains the sizes.
+# A point carries the answer if the emittance moves by more than this many errors without it, which
+# is outside the 95 % interval; the interval is then extended to that emittance.
+CARRYING_SHIFT = 2.0
+# An error above this multiple of the one from the stated errors alone is explained in a sentence.
+ENLARGED_ERROR = 1.5
+# Stated errors are called too large above this probability of a larger χ²: one scan in a thousand.
+OVERSTATED_PROBABILITY = 0.999
+# Largest number of points that a sentence names.
+MAX_NAMED = 5
+# Checks to suggest where a rival explains the sizes.
 REMEDIES = {
-    FLAT: "The smallest sizes decide: measure over the waist, and check resolution_um.",
+    ZERO_EMITTANCE: "The smallest sizes decide: measure over the waist, and check resolution_um.",
     CONSTANT: "Check that the magnet moved and that the screen shows the beam, and scan further.",
     RANDOM: "Check settings, units, energy and screen, or measure more settings.",
     DRIFTING: "Check that the beam was stable while the scan was taken.",
@@ -55,21 +55,21 @@ class PlaneEvidence:
     Attributes
     ----------
     posterior : PlanePosterior
-        Of a beam and its rivals.
+        Probabilities of a beam and its rivals.
     sizes : PlaneSizes
-        What it is from.
+        Measured sizes.
     low, high : float
         Central 95 % of the normalised emittance, m; infinite where other unknowns leave it open.
     bracketed : bool or None
-        Whether the waist is.
+        Whether the waist is bracketed.
     ending : Finding or None
-        How a search ended, where that was no answer, or what no emittance can be.
+        Result of a failed search, or of an emittance beyond any accelerator's.
     scenario : str
-        What is free besides the beam, in words; empty where nothing is.
-    opened : str
-        What leaves the emittance open in a scenario, in words.
+        Free parameters besides the beam, in words; empty if there are none.
+    open_cause : str
+        Reason why a scenario leaves the emittance open, in words.
     remedy : str
-        What would close it.
+        Measurement or input that would determine it, in words.
     """
 
     posterior: PlanePosterior
@@ -79,7 +79,7 @@ class PlaneEvidence:
     bracketed: bool | None = None
     ending: Finding | None = None
     scenario: str = ""
-    opened: str = ""
+    open_cause: str = ""
     remedy: str = ""
 
     @property
@@ -88,131 +88,143 @@ class PlaneEvidence:
         return self.posterior.probability[BEAM]
 
     @property
-    def few(self) -> bool:
-        """True if three points give three numbers, and nothing is left to compare."""
+    def three_points(self) -> bool:
+        """True if there are at most three points: no degree of freedom is left for a test."""
         return len(self.sizes.size) <= 3
 
     @property
     def untested(self) -> bool:
-        """True if these are of three monitors with stated errors."""
-        return self.few and not self.sizes.moved and self.sizes.error is not None
+        """True for three monitors with stated errors: an answer that cannot be tested."""
+        return self.three_points and not self.sizes.moved and self.sizes.error is not None
 
     @cached_property
     def of_a_beam(self) -> bool:
-        """True if the sizes are a beam's, of an emittance or none."""
-        if not self.posterior.seen or self.few:
-            return self.posterior.seen and self.untested
-        return self.beam + self.posterior.probability[FLAT] > SURE
+        """True if the sizes are a beam's, of zero emittance or not."""
+        if not self.posterior.separable or self.three_points:
+            return self.posterior.separable and self.untested
+        return self.beam + self.posterior.probability[ZERO_EMITTANCE] > SURE
 
     @cached_property
     def determined(self) -> bool:
-        """True if they are a beam's and say its emittance."""
-        sure = self.untested or self.beam > SURE
-        known = of_use((self.low, self.high)) and not self.opened and self.ending is None
-        return self.of_a_beam and sure and known
+        """True if the sizes are a beam's and determine its emittance."""
+        is_sure = self.untested or self.beam > SURE
+        useful = of_use((self.low, self.high)) and not self.open_cause and self.ending is None
+        return self.of_a_beam and is_sure and useful
 
 
-def verdict(e: PlaneEvidence, remarks: str = "", advice: str = "") -> Finding:
-    """Say whether a plane's sizes determine its emittance.
+def verdict(evidence: PlaneEvidence, remarks: str = "", advice: str = "") -> Finding:
+    """State whether a plane's sizes determine its emittance.
 
     Parameters
     ----------
-    e : PlaneEvidence
-        Of the plane.
+    evidence : PlaneEvidence
+        Evidence of the plane.
     remarks : str
         Further sentences on noise and points.
     advice : str
-        What to measure next.
+        Next measurement, in words.
     """
-    if e.ending is not None and (e.of_a_beam or e.ending.status is not Status.not_converged):
-        return e.ending
-    if e.determined:
-        return Finding(Status.converged, f"{_determined(e)} {remarks}".strip())
-    post, status = e.posterior, Status.unidentified
-    if post.cause == CURVE and post.probability[CURVE] > SURE:
+    if evidence.ending is not None and (
+        evidence.of_a_beam or evidence.ending.status is not Status.not_converged
+    ):
+        return evidence.ending
+    if evidence.determined:
+        return Finding(Status.converged, f"{_determined_sentence(evidence)} {remarks}".strip())
+    posterior, status = evidence.posterior, Status.unidentified
+    if posterior.cause == CURVE and posterior.probability[CURVE] > SURE:
         status = Status.poor_fit
-    where = f" in scenario {e.scenario}" if e.scenario else ""
-    said = f"Not determined{where}: {_open(e)}."
-    help_ = [advice or (_remedy(e) if not e.of_a_beam and post.seen else "")]
-    help_ += [f"Needed: {e.remedy}."] if e.remedy and e.of_a_beam else []
-    return Finding(status, f"{said} {remarks}".strip(), " ".join(filter(None, help_)))
+    where = f" in scenario {evidence.scenario}" if evidence.scenario else ""
+    sentence = f"Not determined{where}: {_undetermined_cause(evidence)}."
+    remedies = [
+        advice or (_remedy(evidence) if not evidence.of_a_beam and posterior.separable else "")
+    ]
+    remedies += [f"Needed: {evidence.remedy}."] if evidence.remedy and evidence.of_a_beam else []
+    return Finding(status, f"{sentence} {remarks}".strip(), " ".join(filter(None, remedies)))
 
 
-def _determined(e: PlaneEvidence) -> str:
-    where = f" in scenario {e.scenario}" if e.scenario else ""
-    if e.untested:
+def _determined_sentence(evidence: PlaneEvidence) -> str:
+    """Sentence on an emittance that is determined."""
+    where = f" in scenario {evidence.scenario}" if evidence.scenario else ""
+    if evidence.untested:
         return (
             f"Determined{where}, but not testable: three monitors give three numbers exactly, and "
             "nothing is left to test line and stated errors by."
         )
     waist = {None: "", True: ", the waist is bracketed", False: ", the waist is not bracketed"}
-    sure = f"P > {SURE:g}" if e.beam > SURE else f"P = {e.beam:.2f}"
-    return f"Determined{where}: the sizes are those of a beam with {sure}{waist[e.bracketed]}."
+    sure = f"P > {SURE:g}" if evidence.beam > SURE else f"P = {evidence.beam:.2f}"
+    return (
+        f"Determined{where}: the sizes are those of a beam with {sure}{waist[evidence.bracketed]}."
+    )
 
 
-def _rival(e: PlaneEvidence) -> str:
-    """The likeliest cause of the sizes that is no beam's, of an emittance or none."""
-    rest = {k: v for k, v in e.posterior.probability.items() if k not in (BEAM, FLAT)}
+def _best_rival(evidence: PlaneEvidence) -> str:
+    """The most probable model other than a beam, of zero emittance or not."""
+    rest = {
+        k: v for k, v in evidence.posterior.probability.items() if k not in (BEAM, ZERO_EMITTANCE)
+    }
     return max(rest, key=rest.__getitem__)
 
 
-def _remedy(e: PlaneEvidence) -> str:
-    """Say what to check where the sizes may be a rival's."""
-    rival = e.posterior.cause
-    return REMEDIES.get(_rival(e) if rival == BEAM and not e.few else rival, "")
+def _remedy(evidence: PlaneEvidence) -> str:
+    """Checks to suggest where the sizes may be a rival's."""
+    rival = evidence.posterior.cause
+    return REMEDIES.get(
+        _best_rival(evidence) if rival == BEAM and not evidence.three_points else rival, ""
+    )
 
 
-def _open(e: PlaneEvidence) -> str:
-    """Why the emittance is not determined."""
-    probability, rival = e.posterior.probability, e.posterior.cause
-    if not e.posterior.seen:
+def _undetermined_cause(evidence: PlaneEvidence) -> str:
+    """Reason why the emittance is not determined, in words."""
+    probability, rival = evidence.posterior.probability, evidence.posterior.cause
+    if not evidence.posterior.separable:
         return (
             "the settings do not separate the three numbers of the beam matrix, as if the "
             "scanned magnet were downstream of the screen or hardly moved"
         )
-    if e.few and not e.untested:
+    if evidence.three_points and not evidence.untested:
         return (
             "three points fit any three numbers exactly and leave nothing to judge them by; "
             "measure a fourth setting"
         )
-    other = _rival(e)
-    maybe = (
-        f"these sizes may be a beam's (P = {e.beam:.4g}, and {SURE:g} is needed), or else {other} "
-        f"(P = {probability[other]:.2g})"
+    other = _best_rival(evidence)
+    undecided = (
+        f"these sizes may be a beam's (P = {evidence.beam:.4g}, and {SURE:g} is needed), or else "
+        f"{other} (P = {probability[other]:.2g})"
     )
-    if not e.of_a_beam:
-        if rival in (BEAM, FLAT):
-            return maybe
+    if not evidence.of_a_beam:
+        if rival in (BEAM, ZERO_EMITTANCE):
+            return undecided
         return f"the sizes look like {rival} (P = {probability[rival]:.2g}), not like a beam's"
-    if e.opened:
-        return e.opened
-    if e.beam <= SURE:
-        if probability[other] > probability[FLAT]:
-            return maybe
-        return f"a beam of no emittance explains the sizes, too (P = {probability[FLAT]:.2g})"
-    if not e.low > 0.0:
+    if evidence.open_cause:
+        return evidence.open_cause
+    if evidence.beam <= SURE:
+        if probability[other] > probability[ZERO_EMITTANCE]:
+            return undecided
+        no_emittance = probability[ZERO_EMITTANCE]
+        return f"a beam of no emittance explains the sizes, too (P = {no_emittance:.2g})"
+    if not evidence.low > 0.0:
         return "the 95 % interval of the emittance begins at zero"
-    factor = e.high / e.low
-    said = f"{factor:.2g}" if factor < 100 else "more than 100"
-    waist = " and the waist is not bracketed" if e.bracketed is False else ""
-    return f"the 95 % interval of the emittance spans a factor {said}{waist}"
+    factor = evidence.high / evidence.low
+    factor_text = f"{factor:.2g}" if factor < 100 else "more than 100"
+    waist = " and the waist is not bracketed" if evidence.bracketed is False else ""
+    return f"the 95 % interval of the emittance spans a factor {factor_text}{waist}"
 
 
 def noise_remark(
     noise: str, scale: np.ndarray, probability: float | None = None, enlarged: float = 1.0
 ) -> str:
-    """Say what the noise turned out to be, where that differs from what was stated.
+    """Describe the noise where it differs from the stated errors.
 
     Parameters
     ----------
     noise : {"stated", "share", "beyond", "shots", "none"}
-        What was known of it, or "beyond" if settings scatter beyond their stated errors.
+        Kind of errors given, or "beyond" if settings scatter beyond their stated errors.
     scale : ndarray
-        Median and central 68 % of its scale.
+        Median and central 68 % of the noise scale.
     probability : float, optional
-        Of a χ² at least as large as that of the stated errors.
+        Probability of a χ² at least as large as that of the stated errors.
     enlarged : float
-        Error over that by the stated errors alone.
+        Ratio of the error to the one from the stated errors alone.
 
     Examples
     --------
@@ -226,43 +238,43 @@ def noise_remark(
                 f"Stated errors are too small by a factor {middle:.2g} ({low:.2g} to {high:.2g}), "
                 "which the error includes."
             )
-        if probability is not None and probability > OVERSTATED:
+        if probability is not None and probability > OVERSTATED_PROBABILITY:
             rest = 1.0 - probability
             chance = f"{rest:.1g}" if rest > 1e-6 else "below 1e-6"
             return (
                 "Stated errors seem too large, and so is the error here: the sizes scatter less "
                 f"(probability {chance})."
             )
-        if enlarged > ENLARGED:
+        if enlarged > ENLARGED_ERROR:
             return (
                 f"The error is {enlarged:.2g} times that by the stated errors alone: errors like "
                 "these are often too small, and these points do not tell."
             )
     if noise in ("shots", "beyond") and middle > 0.005:
-        than = "shots" if noise == "shots" else "stated errors"
+        baseline = "shots" if noise == "shots" else "stated errors"
         return (
             f"Settings scatter by {100 * middle:.2g} % ({round(100 * low, 2):.2g} to "
-            f"{100 * high:.2g} %) of the size beyond their {than}, which the error includes."
+            f"{100 * high:.2g} %) of the size beyond their {baseline}, which the error includes."
         )
     return ""
 
 
-def point_remarks(p: Points, carrying: str = "", without: float = math.nan) -> Iterator[str]:
+def point_remarks(points: Points, carrying: str = "", without: float = math.nan) -> Iterator[str]:
     """Name bad readings, and the point that carries the answer.
 
     Parameters
     ----------
-    p : Points
-        With the probability of each that it is bad.
+    points : Points
+        Points with their probability of being bad.
     carrying, without : str and float
-        The point without which the emittance moves most, and what it is then, normalised, m; NaN
-        where the others give none.
+        Point without which the emittance moves most, and the normalised emittance without it, m;
+        NaN where the other points give none.
     """
-    bad = np.flatnonzero(p.outlier_probability > 0.5)
+    bad = np.flatnonzero(points.outlier_probability > 0.5)
     if len(bad):
         verb = "are" if len(bad) > 1 else "is"
-        said = f"{len(bad)} of {len(p.size)} readings {verb} probably bad"
-        yield f"{said}: {named([p.where(i) for i in bad])}."
+        bad_count = f"{len(bad)} of {len(points.size)} readings {verb} probably bad"
+        yield f"{bad_count}: {name_places([points.where(i) for i in bad])}."
     if carrying and math.isnan(without):
         yield f"It rests on the point at {carrying}: without it there is no answer."
     elif carrying:
@@ -273,20 +285,20 @@ def point_remarks(p: Points, carrying: str = "", without: float = math.nan) -> I
         )
 
 
-def named(places: Sequence[str]) -> str:
-    """Name the first few places.
+def name_places(places: Sequence[str]) -> str:
+    """List the first few places.
 
     Examples
     --------
-    >>> named("abcdefg")
+    >>> name_places("abcdefg")
     'a; b; c; d; e; 2 more'
     """
-    more = len(places) - MOST_NAMED
-    return "; ".join([*places[:MOST_NAMED], *[f"{more} more"] * (more > 0)])
+    more = len(places) - MAX_NAMED
+    return "; ".join([*places[:MAX_NAMED], *[f"{more} more"] * (more > 0)])
 
 
 def resolution_remark(size: np.ndarray, known: np.ndarray) -> str:
-    """Count sizes below what resolution and dispersion alone make, size² in m², as ``known`` says.
+    """Count sizes below the contribution ``known`` of resolution and dispersion, in m².
 
     Examples
     --------
@@ -306,21 +318,21 @@ def resolution_remark(size: np.ndarray, known: np.ndarray) -> str:
 def waist_bracketed(
     settings: dict[str, np.ndarray], screens: tuple[str, ...], size: np.ndarray, error: np.ndarray
 ) -> bool | None:
-    """Tell if the sizes rise, by two standard errors, on both sides of the smallest.
+    """Test whether the sizes rise by two standard errors on both sides of the smallest.
 
     Parameters
     ----------
     settings : dict of str to ndarray
         Magnet name to settings.
     screens : tuple of str
-        The screen of each point.
+        Screen of each point.
     size, error : ndarray
         Sizes and errors, m.
 
     Returns
     -------
     bool or None
-        None if more than one magnet or screen was varied: there is no side then.
+        None if several magnets or screens were varied, so that there are no two sides.
 
     Examples
     --------

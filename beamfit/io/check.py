@@ -131,9 +131,9 @@ def file_summary(
     if kind == "ring" and "operation" in read_toml(path, "a ring").table:
         facts += operation_facts(read_operation(path))
     if kind == "scan":
-        from beamfit.emittance.transport import of_sizes
+        from beamfit.emittance.transport import size_warnings
 
-        notes += tuple(of_sizes(content))
+        notes += tuple(size_warnings(content))
         if is_emittance_gui(path):
             methods = list(read_emittance_gui(path).scans)
             facts.append(Fact("size methods", ", ".join(methods), methods))

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from beamfit.emittance.scan import KNOB, POSSIBLE, USUAL, Profile, QuadScan, middle
-from beamfit.emittance.shots import of_settings
+from beamfit.emittance.shots import group_shots
 from beamfit.errors import InputError, located, nearest, short
 from beamfit.io.cells import is_number, number
 from beamfit.io.columns import (
@@ -540,7 +540,7 @@ def scan_of_sheet(sheet: Sheet, knobs: Mapping[str, Column] = MappingProxyType({
     notes += [*ignored_note(sheet, columns), *sheet_notes(sheet)]
     with located(sheet.path):
         scan = _make_scan(sheet, columns, values, notes=tuple(notes), profiles=profiles)
-        return of_settings(scan, marked="shot" in columns)
+        return group_shots(scan, marked="shot" in columns)
 
 
 def _blank_dark_shots(sheet: Sheet, columns: Mapping[str, Column]) -> Sheet:

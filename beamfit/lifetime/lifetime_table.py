@@ -34,7 +34,7 @@ from beamfit.lifetime.free_law import (
     weighted_quantity,
 )
 from beamfit.lifetime.record import LifetimeTable
-from beamfit.noise.memory import STATED, WRONG
+from beamfit.noise.memory import LN_SIZE_RANGE, STATED_READINGS
 from beamfit.quantity import HOUR, Quantity, Status
 from beamfit.statistics import POOR_FIT, chi2_probability, reach_of
 
@@ -167,11 +167,15 @@ class _Points(NamedTuple):
         """
         unit = float(np.median(table.lifetime))
         x, lifetime = table.current[kept] / table.current.mean(), table.lifetime[kept] / unit
-        some = -math.log(4 * WRONG)  # of a factor within 1/30 to 30
+        some = -math.log(4 * LN_SIZE_RANGE)  # of a factor within 1/30 to 30
         if table.error is not None:
             error = np.maximum(table.error[kept] / unit, MIN_NOISE * lifetime)
-            near = STATED / 2 * math.log(STATED) - gammaln(STATED / 2) + math.log1p(-P_WRONG_ERRORS)
-            right = cls(x, lifetime, error, STATED, near)
+            near = (
+                STATED_READINGS / 2 * math.log(STATED_READINGS)
+                - gammaln(STATED_READINGS / 2)
+                + math.log1p(-P_WRONG_ERRORS)
+            )
+            right = cls(x, lifetime, error, STATED_READINGS, near)
             return right, right._replace(known=0.0, log_prior=some + math.log(P_WRONG_ERRORS))
         equal = cls(x, lifetime, np.ones(x.size), 0.0, some)
         curve = np.maximum(lifetime + _least_squares(equal).residuals, MIN_RATE)
@@ -402,7 +406,7 @@ def _farthest_off(table: LifetimeTable, kept: np.ndarray, exponents: np.ndarray)
     law, worst = np.unravel_index(np.argmin(without), without.shape)
     distance = abs(float(left[law, worst] / free[law, worst] * error[worst]))
     rest, dof = float(without[law, worst]), rows.size - 3 - (exponents.size > 1)
-    known = STATED if given else 0.0
+    known = STATED_READINGS if given else 0.0
     variance = max(known + rest, rows.size * MIN_NOISE**2) / max(known + dof, 1.0)
     errors = math.sqrt(max(whole.min() - rest, 0.0) / variance)
     return _Departure(int(rows[worst]), distance, errors, rest, dof)
@@ -513,7 +517,8 @@ def _widely(exact: Quantity, free: Quantity, freed: bool) -> Quantity:
 def _single_departure(table: LifetimeTable, kept: np.ndarray) -> str | None:
     """Sentence on one point that contradicts the constant law, which the others follow."""
     off = _farthest_off(table, kept, np.zeros(1))
-    given, dof = table.error is not None, off.dof + (STATED if table.error is not None else 0.0)
+    given = table.error is not None
+    dof = off.dof + (STATED_READINGS if given else 0.0)
     chance = 2 * int(kept.sum()) * float(stdtr(dof, -off.errors))
     if chance >= POOR_FIT or (given and chi2_probability(off.rest, off.dof) < POOR_FIT):
         return None

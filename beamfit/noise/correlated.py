@@ -1,7 +1,7 @@
-"""Posterior over noise models with a memory, and quantities averaged over it.
+"""Posterior over correlated noise models, and quantities averaged over it.
 
-The memory is not known either: each noise that is looked at whitens the rows once, and what is left
-of them says how likely it is and what the numbers are with it.
+The correlation is unknown: each noise of a grid whitens the rows once. The whitened residuals give
+the probability of the noise, and the rows the parameters under it.
 """
 
 from __future__ import annotations
@@ -28,22 +28,24 @@ from beamfit.noise.memory import (
 )
 from beamfit.statistics import log_student
 
-# A direction is determined if its singular value exceeds this share of the largest: 1e6 roundings.
+# Singular values above this share of the largest determine their direction: 1e6 rounding errors.
 CUT = 1e-10
-# What rounding leaves of products of rows that are nothing.
-ROUNDING = 1e-15
-# Grid of correlation times: from this share of the median interval to this many records, and count.
-SHORTEST, LONGEST, TIMES = 0.3, 5.0, 20
-# Central 68 %, one standard deviation to either side of a normal distribution, and its upper end.
-CENTRAL, HALF = 0.682689492, 0.841344746
-# Most steps to a distance of given probability, and the last step's share of its size.
-ROUNDS, ENOUGH = 50, 1e-8
+# Relative ridge of Gram matrices, of the size of rounding errors: columns may be zero.
+ROUNDING_RIDGE = 1e-15
+# Grid of correlation times: shortest in median intervals, longest in records, and their number.
+MIN_TIME, MAX_TIME, TIMES = 0.3, 5.0, 20
+# Probability within one standard deviation of a normal distribution, and below one above the mean.
+CENTRAL, UPPER = 0.682689492, 0.841344746
+# Largest number of steps to a distance of given probability; relative size of the last step.
+MAX_STEPS, STEP_TOLERANCE = 50, 1e-8
 
 
 class AveragedMoments(NamedTuple):
-    """Quantities that are linear in the numbers: how far each moves from where the rows were
-    taken, its error (68 % lie within), the reach within which 95 % lie, and the chance of a
-    larger distance from zero movement if that is the truth.
+    """Quantities that are linear in the parameters, averaged over noises.
+
+    ``shift`` is the change from the linearisation point, ``error`` half of the central 68 %,
+    ``reach`` half of the central 95 %, and ``chance`` the probability of a larger change if the
+    true one is zero.
     """
 
     shift: np.ndarray
@@ -60,15 +62,15 @@ class Memory(NamedTuple):
     weight : array, shape (g,)
         Probability of each noise.
     time, white : array, shape (g,)
-        The correlation times, and the shares of variance without memory.
+        Correlation times, and white shares of the variance.
     step : array, shape (g, p)
-        Generalised least-squares step of the numbers at each.
+        Generalised least-squares step of the parameters for each noise.
     half : array, shape (g, p, p)
-        half @ half.T is the covariance of the numbers for errors of size 1.
+        Square root of the covariance: half @ half.T, for errors of variance 1.
     squares : array, shape (g,)
-        Sum of squares of the whitened residuals after the step.
+        Residual sum of squares of the whitened rows after the step.
     dof : int
-        Values less numbers.
+        Number of values minus number of parameters.
     """
 
     weight: np.ndarray
@@ -81,30 +83,30 @@ class Memory(NamedTuple):
 
     @property
     def likely(self) -> int:
-        """Index of the median correlation time, and of the share that is likeliest with it."""
+        """Index of the median correlation time, with its most probable white share."""
         order = np.argsort(self.time, kind="stable")
         median = self.time[order[np.searchsorted(np.cumsum(self.weight[order]), 0.5)]]
         return int(np.argmax(np.where(self.time == median, self.weight, -1.0)))
 
     @property
     def noise(self) -> CorrelatedNoise:
-        """That."""
+        """Noise with the median correlation time, and its most probable white share."""
         return CorrelatedNoise(float(self.time[self.likely]), float(self.white[self.likely]))
 
     def of_last(self, numbers: int) -> Memory:
-        """The same of the last numbers, whatever the others are."""
+        """Restrict to the last parameters, marginalised over the others."""
         return self._replace(step=self.step[:, -numbers:], half=self.half[:, -numbers:])
 
     @property
     def mean_step(self) -> np.ndarray:
-        """The step, averaged over noises."""
+        """Step, averaged over noises."""
         return self.weight @ self.step
 
     def moments(self, slopes: np.ndarray, least: float = 0.0) -> AveragedMoments:
-        """Quantities by their slopes, shape (q, p), averaged over noises.
+        """Average quantities with derivatives ``slopes``, shape (q, p), over noises.
 
-        `least` is the least size of the errors: 1 where they were given and rows are in their
-        unit. Of a single noise errors that were given are normal.
+        `least` is the lower limit of the noise level: 1 if errors are given and rows are in their
+        unit. With given errors and a single noise the distribution is normal.
         """
         centre = self.step @ slopes.T
         size = np.maximum(np.sqrt(self.squares / self.dof), least)
@@ -115,10 +117,11 @@ class Memory(NamedTuple):
             [spread], dof = spread, np.inf if least else self.dof
             chance = 2 * stdtr(self.dof, -np.abs(shift) / spread)
             return AveragedMoments(
-                shift, stdtrit(dof, HALF) * spread, stdtrit(dof, 0.975) * spread, chance
+                shift, stdtrit(dof, UPPER) * spread, stdtrit(dof, 0.975) * spread, chance
             )
 
         def within(reach: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            """Probability within a distance of the mean, and its derivative."""
             above, below = ((shift + sign * reach - centre) / spread for sign in (1, -1))
             slope = np.exp(log_student(above, self.dof)) + np.exp(log_student(below, self.dof))
             return self.weight @ (stdtr(self.dof, above) - stdtr(self.dof, below)), (
@@ -132,39 +135,45 @@ class Memory(NamedTuple):
 
 
 def reach_of_probability(within, scale: np.ndarray, probability: float) -> np.ndarray:
-    """Distance within which this probability lies; `scale` is what a normal error would be.
+    """Distance within which a probability lies; `scale` is that of one standard error if normal.
 
-    By Newton steps, and halves of the bracket where one leaves it or is no shorter by half.
+    Newton steps; the bracket is halved where a step leaves it or is longer than half the last one.
     """
-    low, high, at = np.zeros_like(scale), 100.0 * scale, ndtri((1 + probability) / 2) * scale
+    low, high, distance = np.zeros_like(scale), 100.0 * scale, ndtri((1 + probability) / 2) * scale
     last = high
-    for _ in range(ROUNDS):
-        found, slope = within(at)
-        less = found < probability
-        low, high = np.where(less, at, low), np.where(less, high, at)
+    for _ in range(MAX_STEPS):
+        probability_within, slope = within(distance)
+        below = probability_within < probability
+        low, high = np.where(below, distance, low), np.where(below, high, distance)
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-            step = (probability - found) / slope
-            usable = (at + step >= low) & (at + step <= high) & (2 * np.abs(step) <= last)
-        step = np.where(usable | (np.abs(step) <= ENOUGH * at), step, 0.5 * (low + high) - at)
-        at, last = at + step, np.abs(step)
-        if np.all(last <= ENOUGH * at):
+            step = (probability - probability_within) / slope
+            usable = (
+                (distance + step >= low) & (distance + step <= high) & (2 * np.abs(step) <= last)
+            )
+        step = np.where(
+            usable | (np.abs(step) <= STEP_TOLERANCE * distance),
+            step,
+            0.5 * (low + high) - distance,
+        )
+        distance, last = distance + step, np.abs(step)
+        if np.all(last <= STEP_TOLERANCE * distance):
             break
-    return at
+    return distance
 
 
 class Whitened(NamedTuple):
-    """Slopes and, last, residuals, whitened by each noise that is looked at.
+    """Derivatives and, in the last column, residuals, whitened by each noise of a grid.
 
     Attributes
     ----------
     noise : CorrelatedNoise of array, shape (g,)
-        What is looked at.
+        The grid.
     triangle : array, shape (g, m, p + 1)
-        With the same sums of squares and products as the whitened rows.
+        Triangular factors with the Gram matrix of the whitened rows.
     volume : array, shape (g,)
-        Logarithm of the normalisation of the noise's density.
+        Log determinants of the whitening.
     count : int
-        Values, less what was eliminated.
+        Number of values minus number of eliminated levels.
     """
 
     noise: CorrelatedNoise
@@ -173,42 +182,45 @@ class Whitened(NamedTuple):
     count: int
 
     def least(self, numbers: int | None = None) -> float:
-        """-2 ln L by the likeliest noise, up to a constant."""
+        """-2 ln L of the most probable noise, up to a constant."""
         squares = self.memory(numbers).squares
         return float(np.min(self.count * np.log(squares / self.count) - 2.0 * self.volume))
 
     def with_widths(self, widths: Sequence[tuple[float, float]], numbers: int) -> Whitened:
-        """With normal priors about zero on the first `numbers`: each of some widths, over the
-        noise, with a probability.
+        """Add normal priors about zero on the first ``numbers`` parameters.
+
+        Each of the widths, with its probability, is combined with each noise.
         """
         width, chance = np.array(widths).T
-        known = np.eye(numbers, self.triangle.shape[2]) / width[:, None, None]
+        prior_rows = np.eye(numbers, self.triangle.shape[2]) / width[:, None, None]
         logs = np.log(chance) - numbers * np.log(width)
-        every = np.repeat(self.triangle, len(widths), axis=0)
-        known = np.tile(known, (len(self.triangle), 1, 1))
+        triangles = np.repeat(self.triangle, len(widths), axis=0)
+        prior_rows = np.tile(prior_rows, (len(self.triangle), 1, 1))
         return Whitened(
             CorrelatedNoise(*np.repeat(self.noise, len(widths), axis=1)),
-            np.concatenate([every, known], axis=1),
+            np.concatenate([triangles, prior_rows], axis=1),
             (self.volume[:, None] + logs).ravel(), self.count + numbers,
         )  # fmt: skip
 
     def evidence(self) -> float:
-        """-2 ln of the probability of the values, numbers and noise integrated out: up to a
-        constant, flat in the numbers, in the logarithm of the errors' size and over the noises.
+        """-2 ln of the evidence, up to a constant.
+
+        It is integrated over parameters and noises, with flat priors of the parameters, of the
+        logarithm of the noise level and over the grid.
         """
-        return -2.0 * float(logsumexp(self._solved(None)[3]))
+        return -2.0 * float(logsumexp(self._solve(None)[3]))
 
     def memory(self, numbers: int | None = None) -> Memory:
-        """Posterior over noise models with the first `numbers` free and the others held.
+        """Posterior over noise models with the first ``numbers`` parameters free, the others fixed.
 
-        Directions that the rows do not see, by a share of `CUT`, are left where they are.
+        Directions below the share `CUT` of the largest singular value stay where they are.
 
         Notes
         -----
-        By each noise generalised least squares; its probability is the density of the residuals
-        integrated over the numbers (flat) and over the size of the errors (flat in its logarithm):
-        the restricted likelihood of D. A. Harville, Biometrika 61 (1974) 383, which the fitted
-        numbers do not bias, at even odds that a part of the noise is white where that is looked at.
+        Generalised least squares for each noise. Its probability is the density of the residuals
+        integrated over the parameters (flat) and over the noise level (flat in its logarithm): the
+        restricted likelihood of D. A. Harville, Biometrika 61 (1974) 383, which is free of the bias
+        of fitted parameters. Noises with and without a white part have equal prior probability.
 
         Examples
         --------
@@ -224,37 +236,41 @@ class Whitened(NamedTuple):
         return self.weighed(numbers)[0]
 
     def weighed(self, numbers: int | None = None) -> tuple[Memory, np.ndarray]:
-        """The same and, by each noise, the logarithm of the probability of the values."""
-        half, along, squares, logs = self._solved(numbers)
+        """Posterior as `memory`, and the log probability of the values for each noise."""
+        half, components, squares, logs = self._solve(numbers)
         weight = np.exp(logs - logs.max())
-        step = -(half @ along)[..., 0]
-        seen = half.any(axis=1).sum(axis=1).max()  # numbers that are held are not fitted
-        dof, flicker = self.count - int(seen), np.isnan(self.noise.time)
-        # 1/f noise has no time: it is named by the one that is most like it.
-        like = int(np.argmax(np.where(flicker, -np.inf, logs)))
-        time, white = (np.where(flicker, own[like], own) for own in self.noise)
+        step = -(half @ components)[..., 0]
+        fitted = half.any(axis=1).sum(axis=1).max()  # fixed parameters are not counted
+        dof, flicker = self.count - int(fitted), np.isnan(self.noise.time)
+        # 1/f noise has no correlation time: it is represented by the most probable correlated one.
+        most_similar = int(np.argmax(np.where(flicker, -np.inf, logs)))
+        time, white = (np.where(flicker, values[most_similar], values) for values in self.noise)
         return Memory(weight / weight.sum(), time, white, step, half, squares, dof), logs
 
-    def _solved(self, numbers: int | None) -> tuple[np.ndarray, ...]:
-        """Root of the covariance, components of the residuals, what is left of their squares, and
-        the logarithm of each noise's probability.
+    def _solve(self, numbers: int | None) -> tuple[np.ndarray, ...]:
+        """Solve for each noise: square root of the covariance, components of the residuals,
+        residual sum of squares, and log probability.
         """
-        slopes, rest = self.triangle[..., :-1][..., :numbers], self.triangle[..., -1:]
+        slopes, residuals = self.triangle[..., :-1][..., :numbers], self.triangle[..., -1:]
         length = np.linalg.norm(slopes, axis=1)
         unit = 1.0 / np.where(length > 0, length, 1.0)
-        left, sizes, turned = np.linalg.svd(slopes * unit[:, None], full_matrices=False)
-        seen = sizes > CUT * sizes[:, :1]
-        inverse = np.where(seen, 1.0 / np.where(seen, sizes, 1.0), 0.0)
-        half = unit[..., None] * np.swapaxes(turned, 1, 2) * inverse[:, None]
-        along = np.where(seen[..., None], np.swapaxes(left, 1, 2) @ rest, 0.0)
-        squares = np.maximum(np.sum((rest - left @ along) ** 2, axis=(1, 2)), 1e-300)
-        logs = self.volume + np.sum(np.log(unit) + np.log(np.where(seen, inverse, 1.0)), axis=1)
-        logs -= 0.5 * (self.count - seen.sum(axis=1)) * np.log(squares)
-        alone = self.noise.white == 0
-        if alone.any() and not alone.all():  # even odds for a white part
-            beside = np.sum(self.noise.white > 0)
-            logs += np.where(alone, np.log(beside / alone.sum()), 0.0)
-        return half, along, squares, logs
+        basis, singular, vectors = np.linalg.svd(slopes * unit[:, None], full_matrices=False)
+        determined = singular > CUT * singular[:, :1]
+        inverse = np.where(determined, 1.0 / np.where(determined, singular, 1.0), 0.0)
+        half = unit[..., None] * np.swapaxes(vectors, 1, 2) * inverse[:, None]
+        components = np.where(determined[..., None], np.swapaxes(basis, 1, 2) @ residuals, 0.0)
+        squares = np.maximum(np.sum((residuals - basis @ components) ** 2, axis=(1, 2)), 1e-300)
+        logs = self.volume + np.sum(
+            np.log(unit) + np.log(np.where(determined, inverse, 1.0)), axis=1
+        )
+        logs -= 0.5 * (self.count - determined.sum(axis=1)) * np.log(squares)
+        without_white = self.noise.white == 0
+        if (
+            without_white.any() and not without_white.all()
+        ):  # equal prior probability with and without white part
+            with_white = np.sum(self.noise.white > 0)
+            logs += np.where(without_white, np.log(with_white / without_white.sum()), 0.0)
+        return half, components, squares, logs
 
 
 def whitened_by_each(
@@ -263,22 +279,25 @@ def whitened_by_each(
     known: np.ndarray | None = None,
     levels: Sequence[Levels] = (),
 ) -> Whitened:
-    """Whiten runs, each of rows and times, by each noise; all of them have the same.
+    """Whiten several runs, each of rows and times, by each noise, which is the same for all.
 
-    `known` are rows of priors, in units of the noise; `levels`, of each run, are eliminated, and
-    noise may be 1/f beside the grid's then.
+    `known` are rows of priors, in units of the noise level. `levels`, one for each run, are
+    projected out; 1/f noises are then added to the grid.
     """
     noise = CorrelatedNoise(*np.array(grid).T)
     if levels:
-        parts = [_levelled(grid, *run, own) for run, own in zip(runs, levels, strict=True)]
+        parts = [
+            _triangles_without_levels(grid, *run, run_levels)
+            for run, run_levels in zip(runs, levels, strict=True)
+        ]
     else:
         parts = [_triangles(grid, rows, np.diff(time)) for rows, time in runs]
     triangles, volume = [triangle for triangle, _ in parts], sum(volume for _, volume in parts)
-    if levels:  # those with a part that is white have half of what is correlated
+    if levels:  # noises with a white part have half of the probability of correlated ones
         odds = FLICKER / len(POWERS) / (CORRELATED + WALK)
         volume[len(grid) :] += np.log(2.0 * odds * np.sum(noise.white > 0.0))
         noise = CorrelatedNoise(*np.pad(noise, ((0, 0), (0, len(POWERS))), constant_values=np.nan))
-    count = sum(len(rows) for rows, _ in runs) - sum(own.first.size for own in levels)
+    count = sum(len(rows) for rows, _ in runs) - sum(run_levels.first.size for run_levels in levels)
     if known is not None:
         triangles, count = [*triangles, np.tile(known, (noise.time.size, 1, 1))], count + len(known)
     return Whitened(noise, np.concatenate(triangles, axis=1), volume, count)
@@ -287,7 +306,7 @@ def whitened_by_each(
 def _triangles(
     grid: Sequence[CorrelatedNoise], rows: np.ndarray, interval: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Triangular factors of one run's whitened rows, and log volumes, for each noise."""
+    """Triangular factors of one run's whitened rows, and log determinants, for each noise."""
     rows, triangle = np.linalg.qr(rows)
     roots, volumes = roots_by_each(grid, rows, interval)
     return roots @ triangle, volumes
@@ -296,72 +315,78 @@ def _triangles(
 def roots_by_each(
     grid: Sequence[CorrelatedNoise], rows: np.ndarray, interval: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Triangular roots of `products_by_each` of columns at right angles, of which products lose no
-    digit; columns may be nothing.
+    """Cholesky factors of `products_by_each` for orthonormal or zero columns.
+
+    Of such columns the Gram matrix loses no digits.
     """
     products, volumes = products_by_each(grid, rows, interval)
     return _roots(products), volumes
 
 
 def _roots(products: np.ndarray) -> np.ndarray:
-    least = ROUNDING * np.trace(products, axis1=-2, axis2=-1)[..., None, None]
-    roots = np.linalg.cholesky(products + least * np.eye(products.shape[-1]))
+    """Upper triangular Cholesky factors of Gram matrices."""
+    ridge = ROUNDING_RIDGE * np.trace(products, axis1=-2, axis2=-1)[..., None, None]
+    roots = np.linalg.cholesky(products + ridge * np.eye(products.shape[-1]))
     return np.swapaxes(roots, -1, -2)
 
 
-def _levelled(
+def _triangles_without_levels(
     grid: Sequence[CorrelatedNoise], rows: np.ndarray, time: np.ndarray, levels: Levels
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Triangular factors as of `_triangles` without levels, the rows padded to a few lengths; by
-    1/f noises, too.
+    """Triangular factors as `_triangles`, with levels projected out and 1/f noises added.
+
+    Rows are padded to a few lengths, so that few programs are compiled.
     """
     extra = (0, padded_length(max(time.size, 64)) - time.size)
     rows, triangle = np.linalg.qr(np.pad(levels.left(rows), (extra, (0, 0))))
-    flicker = [_by_flicker(rows[: time.size], levels, power) for power in POWERS]
+    flicker = [_flicker_products(rows[: time.size], levels, power) for power in POWERS]
     begins = np.isin(np.arange(len(rows)), levels.first)
-    time, slope = (np.pad(each, extra, mode="edge") for each in (time, levels.slope))
+    time, slope = (np.pad(values, extra, mode="edge") for values in (time, levels.slope))
     noises = CorrelatedNoise(*np.array(grid).T)
     products, volumes = map(np.asarray, levelled_products(noises, rows, time, begins, slope))
-    more, further = map(np.array, zip(*flicker, strict=True))
-    roots = _roots(np.concatenate([products, more]))
-    return roots @ triangle, np.concatenate([volumes, further])
+    flicker_products, flicker_volumes = map(np.array, zip(*flicker, strict=True))
+    roots = _roots(np.concatenate([products, flicker_products]))
+    return roots @ triangle, np.concatenate([volumes, flicker_volumes])
 
 
-def _by_flicker(rows: np.ndarray, levels: Levels, power: float) -> tuple[np.ndarray, float]:
-    """Products and log volume as of `levelled_products` in noise of the spectrum 1/f^power, of each
-    block by itself: what is slower its level takes.
+def _flicker_products(rows: np.ndarray, levels: Levels, power: float) -> tuple[np.ndarray, float]:
+    """Gram matrix and log determinant as `levelled_products`, for noise of spectrum 1/f^power.
+
+    Blocks are independent: slower noise acts like their levels.
     """
-    columns, found, volume = np.column_stack([levels.slope, rows]), 0.0, 0.0
+    columns, products, volume = np.column_stack([levels.slope, rows]), 0.0, 0.0
     lengths = np.diff(levels.first, append=len(rows))
     padded = np.array([padded_length(n) for n in lengths.tolist()])
     for size in np.unique(padded):
         first, count = levels.first[padded == size], lengths[padded == size]
         place = np.arange(size)[:, None]
-        there = (place < count)[..., None]
-        blocks = np.where(there, columns[np.minimum(first + place, len(rows) - 1)], 0.0)
+        valid = (place < count)[..., None]
+        blocks = np.where(valid, columns[np.minimum(first + place, len(rows) - 1)], 0.0)
         white = without_flicker(blocks.reshape(size, -1), power).reshape(blocks.shape)
-        own, rest = np.split(np.where(there, white, 0.0), [1], axis=2)
-        squares = np.sum(own**2, axis=0)
-        rest = (rest - own * (np.sum(own * rest, axis=0) / squares)).reshape(-1, rows.shape[1])
-        found = found + rest.T @ rest
-        # The first reading of a block says what its level is, as there.
+        level_columns, rest = np.split(np.where(valid, white, 0.0), [1], axis=2)
+        squares = np.sum(level_columns**2, axis=0)
+        rest = (rest - level_columns * (np.sum(level_columns * rest, axis=0) / squares)).reshape(
+            -1, rows.shape[1]
+        )
+        products = products + rest.T @ rest
+        # The first reading of a block determines its level, as in `levelled_products`.
         volume += float(np.sum(np.log(np.abs(levels.slope[first])) - 0.5 * np.log(squares[:, 0])))
-    return found, volume
+    return products, volume
 
 
 def range_of(time: np.ndarray) -> tuple[float, float]:
-    """Correlation times that readings at these times can tell from none and from a random walk."""
-    usual = float(np.median(np.diff(time)))
-    return SHORTEST * usual, LONGEST * float(time[-1] - time[0])
+    """Range of correlation times between white noise and a random walk, for given times."""
+    interval = float(np.median(np.diff(time)))
+    return MIN_TIME * interval, MAX_TIME * float(time[-1] - time[0])
 
 
 def usual_noises(time: np.ndarray) -> list[CorrelatedNoise]:
-    """Noises that readings at these times may have.
+    """List noises that readings at these times may have.
 
-    From 0.3 usual intervals to five times the record, flat in the logarithm. A part of the noise
-    may be white: a monitor that drifts, read by a noisy converter, would pass for a short memory
-    otherwise, and its errors come out several times too small; the ratio of both is averaged over,
-    too. Near the upper end the errors are a random walk: nothing tells its level, but slope and
-    bend the rows do tell.
+    Correlation times are from 0.3 median intervals to five records, equally spaced in the
+    logarithm, each with several white shares. Without these, a drifting monitor with a noisy
+    converter would be taken for a short memory, and errors would be several times too small. Near
+    the upper end the noise is a random walk: its level is unknown, but slope and curvature of the
+    rows are determined.
     """
     return noises(range_of(time), float(np.median(np.diff(time))), TIMES, BESIDE)

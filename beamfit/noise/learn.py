@@ -13,15 +13,16 @@ from scipy.special import log_ndtr
 
 from beamfit.errors import InputError
 from beamfit.noise.model import Lognormal, Noise
-from beamfit.noise.sizes import NoiseKind, Scales, averaged
+from beamfit.noise.sizes import NoiseKind, Scales, log_average
 
-# With fewer planes nothing is learned of a prior.
-FEWEST = 5
-# Standard deviations of what is learned about beamfit's own priors: of the ln of a middle, of the
-# ln of a spread, of the logit of a probability. A few scans move them little.
-MIDDLE, SPREAD, LOGIT = 1.5, 0.5, 2.0
-# The step of the second differences that the errors are taken from.
-STEP = 0.05
+# Smallest number of planes from which a prior is learned.
+MIN_PLANES = 5
+# Standard deviations of the prior of learned numbers about beamfit's own: of ln of a middle, of ln
+# of a spread, and of the logit of a probability. Chosen so that a few scans move them little.
+MIDDLE_SPREAD, SPREAD_SPREAD, LOGIT_SPREAD = 1.5, 0.5, 2.0
+# Step of the second differences that give the errors.
+DIFFERENCE_STEP = 0.05
+# Priors of the scale and its probability, by the kind of errors that a scan has.
 PRIORS = {
     "shots": ("scatter", "even"),
     "stated": ("factor", "right"),
@@ -30,20 +31,20 @@ PRIORS = {
 
 
 class Sample(NamedTuple):
-    """Evidence of one plane for the scale of its noise.
+    """Evidence of one plane about the scale of its noise.
 
     Attributes
     ----------
     noise : str
-        "shots", "stated" or "none": which prior it tells of.
+        "shots", "stated" or "none": the kind of errors, which selects the prior.
     kinds_under : callable
-        From priors to kinds of noise.
+        Kinds of noise under given priors.
     kinds : tuple of NoiseKind
-        Those under the priors that it was looked at with.
+        Kinds under the priors of the fit.
     scales : tuple of Scales
-        Their nodes.
+        Nodes of each kind.
     log_evidence : tuple of ndarray
-        Log evidence of the beam at every node, shape (k,).
+        Log evidence of the beam at each node, shape (k,).
     """
 
     noise: str
@@ -54,7 +55,7 @@ class Sample(NamedTuple):
 
 
 class Learned(NamedTuple):
-    """Priors that were learned, their errors in words by name, and of how many planes."""
+    """Learned priors, their errors in words by name, and the number of planes by kind of errors."""
 
     noise: Noise
     errors: dict[str, str]
@@ -62,21 +63,21 @@ class Learned(NamedTuple):
 
 
 def learn_noise(samples: Sequence[Sample], noise: Noise, source: str) -> Learned:
-    """Learn the priors of the noise from many planes whose sizes are a beam's.
+    """Learn the noise priors from many planes whose sizes are a beam's.
 
     Parameters
     ----------
     samples : sequence of Sample
-        One a plane.
+        One per plane.
     noise : Noise
-        The priors they were looked at with.
+        Priors of the fits.
     source : str
-        Where the scans are from.
+        Origin of the scans.
 
     Returns
     -------
     Learned
-        Priors of which at least five planes tell something; others are as they were.
+        Priors with at least five planes; the others are unchanged.
 
     Raises
     ------
@@ -85,19 +86,19 @@ def learn_noise(samples: Sequence[Sample], noise: Noise, source: str) -> Learned
 
     Notes
     -----
-    Empirical Bayes: the evidence of all planes, each averaged over its own noise by the prior, is
-    made as large as possible in the numbers of that prior (A. Gelman et al., Bayesian Data
-    Analysis, 3rd ed. (2013), sect. 5.3); errors are from its second differences. The present prior
-    is divided out at the nodes.
+    Empirical Bayes: the numbers of a prior maximise the product of the planes' evidences, each
+    averaged over its own noise scale under that prior (A. Gelman et al., Bayesian Data Analysis,
+    3rd ed. (2013), sect. 5.3). Errors are from second differences. At the nodes the evidence is
+    reweighted by the ratio of the new prior to that of the fit.
     """
     found, errors, planes = noise, {}, {}
     for kind, (scale, chance) in PRIORS.items():
         own = [s for s in samples if s.noise == kind]
         planes[kind] = len(own)
-        if len(own) < FEWEST:
+        if len(own) < MIN_PLANES:
             continue
-        values, spread = _learned(own, noise, scale, chance)
-        middle, width, probability = _numbers(values)
+        values, spread = _fit_prior(own, noise, scale, chance)
+        middle, width, probability = _prior_numbers(values)
         found = replace(found, **{scale: Lognormal(middle, width), chance: probability})
         errors[scale] = (
             f"± [{middle * spread[0]:.2g}, {width * spread[1]:.2g}], from {len(own)} planes"
@@ -105,24 +106,28 @@ def learn_noise(samples: Sequence[Sample], noise: Noise, source: str) -> Learned
         errors[chance] = f"± {probability * (1 - probability) * spread[2]:.2g}"
     if not errors:
         counts = ", ".join(f"{n} of {kind}" for kind, n in planes.items())
-        raise InputError(f"{counts} planes whose sizes are surely a beam's", f"{FEWEST} of a kind")
+        raise InputError(
+            f"{counts} planes whose sizes are surely a beam's", f"{MIN_PLANES} of a kind"
+        )
     return Learned(replace(found, source=source), errors, planes)
 
 
-def _numbers(values: np.ndarray) -> tuple[float, float, float]:
-    """Middle, spread and probability from ln, ln and logit."""
+def _prior_numbers(values: np.ndarray) -> tuple[float, float, float]:
+    """Convert ln middle, ln spread and logit to middle, spread and probability."""
     return math.exp(values[0]), math.exp(values[1]), 1.0 / (1.0 + math.exp(-values[2]))
 
 
-def _learned(
+def _fit_prior(
     samples: Sequence[Sample], noise: Noise, scale: str, chance: str
 ) -> tuple[np.ndarray, np.ndarray]:
+    """Maximise the evidence of planes; return ln middle, ln spread, logit, and their errors."""
     (middle, spread), odds = getattr(noise, scale), getattr(noise, chance)
     start = np.array([math.log(middle), math.log(spread), math.log(odds / (1.0 - odds))])
-    width = np.array([MIDDLE, SPREAD, LOGIT])
+    width = np.array([MIDDLE_SPREAD, SPREAD_SPREAD, LOGIT_SPREAD])
 
     def cost(values: np.ndarray) -> float:
-        middle, spread, probability = _numbers(values)
+        """Negative log posterior of the numbers of the prior."""
+        middle, spread, probability = _prior_numbers(values)
         new = replace(noise, **{scale: Lognormal(middle, spread), chance: probability})
         each = [_log_evidence(s, new) for s in samples]
         return 0.5 * float(np.sum(((values - start) / width) ** 2)) - float(np.sum(each))
@@ -132,35 +137,38 @@ def _learned(
 
 
 def _second_differences(cost: Callable[[np.ndarray], float], at: np.ndarray) -> np.ndarray:
-    steps = STEP * np.eye(len(at))
+    """Matrix of second derivatives by finite differences."""
+    steps = DIFFERENCE_STEP * np.eye(len(at))
 
-    def across(a: np.ndarray, b: np.ndarray) -> float:
-        four = cost(at + a + b) - cost(at + a - b) - cost(at - a + b) + cost(at - a - b)
-        return four / (4.0 * STEP**2)
+    def second_difference(a: np.ndarray, b: np.ndarray) -> float:
+        difference = cost(at + a + b) - cost(at + a - b) - cost(at - a + b) + cost(at - a - b)
+        return difference / (4.0 * DIFFERENCE_STEP**2)
 
-    return np.array([[across(a, b) for b in steps] for a in steps])
+    return np.array([[second_difference(a, b) for b in steps] for a in steps])
 
 
 def _log_masses(prior: Lognormal, log: np.ndarray) -> np.ndarray:
-    """Log probabilities of the cells of nodes: a density may be narrower than their distance."""
+    """Log probabilities of the cells around nodes; exact even for a prior narrower than a cell."""
     ends = np.concatenate([log[:1], 0.5 * (log[1:] + log[:-1]), log[-1:]])
     z = (ends - math.log(prior.middle)) / prior.spread
-    # In the lower of the two tails, whose small numbers are exact.
+    # Each difference is taken in the lower tail, where small probabilities keep their precision.
     low, high = np.where(z[:-1] > 0, -z[1:], z[:-1]), np.where(z[:-1] > 0, -z[:-1], z[1:])
     with np.errstate(divide="ignore"):
         return log_ndtr(high) + np.log(-np.expm1(log_ndtr(low) - log_ndtr(high)))
 
 
 def _log_evidence(s: Sample, noise: Noise) -> float:
-    """Log evidence of a plane under other priors than those of its nodes."""
+    """Log evidence of a plane under other priors than those of its fit."""
     parts = []
     kinds = s.kinds_under(noise)
     for old, new, scales, evidence in zip(s.kinds, kinds, s.scales, s.log_evidence, strict=True):
         skip = int(old.special is not None)
         log = np.log(scales.scale[skip:])
         ratio = _log_masses(new.prior, log) - _log_masses(old.prior, log)
-        ratio += new.log_range - old.log_range
+        ratio += new.log_continuous - old.log_continuous
         if skip:
-            ratio = np.append(np.log(new.chance) - np.log(old.chance), ratio)
-        parts.append(averaged(evidence + scales.log_weight + ratio + new.log_weight, 0.0))
+            ratio = np.append(
+                np.log(new.special_probability) - np.log(old.special_probability), ratio
+            )
+        parts.append(log_average(evidence + scales.log_weight + ratio + new.log_weight, 0.0))
     return float(np.logaddexp.reduce(parts))

@@ -14,9 +14,9 @@ LN_2PI = math.log(2.0 * math.pi)
 
 
 class Lognormal(NamedTuple):
-    """A positive number known within a factor: its middle, and the standard deviation of its ln.
+    """Lognormal distribution of a positive number, or of many as arrays of one shape.
 
-    Of many numbers arrays of one shape.
+    ``middle`` is its median, ``spread`` the standard deviation of its natural logarithm.
     """
 
     middle: Any
@@ -28,7 +28,7 @@ class Lognormal(NamedTuple):
         return -0.5 * pull**2 - np.log(self.spread) - 0.5 * LN_2PI
 
     def log_probability_above(self, least: float) -> np.ndarray:
-        """Log probability that the number exceeds some value.
+        """Log probability that the number exceeds ``least``.
 
         Examples
         --------
@@ -37,19 +37,19 @@ class Lognormal(NamedTuple):
         """
         if not least > 0.0:
             return 0.0 * np.log(self.middle)
-        from scipy.special import log_ndtr  # a scan is read without scipy
+        from scipy.special import log_ndtr  # loads scipy, which reading a scan does not need
 
         return log_ndtr((np.log(self.middle) - math.log(least)) / self.spread)
 
     def and_also(self, other: Lognormal) -> tuple[Lognormal, np.ndarray]:
-        """Combine two statements on one number, and the log of how well they agree.
+        """Multiply by another distribution of the same number.
 
         Returns
         -------
         Lognormal
             The product of both densities, normalised.
         ndarray
-            Log of its integral over ln of the number.
+            Log of the integral of the product over ln of the number.
 
         Examples
         --------
@@ -64,13 +64,14 @@ class Lognormal(NamedTuple):
         return both, Lognormal(self.middle, spread).log_density(np.log(other.middle))
 
 
-# The probability of a bad reading among so few that nothing is left to test them by.
-UNTESTED = 1e-12
+# Probability of a bad reading among three: too few to show one.
+UNTESTABLE_PROBABILITY = 1e-12
+# Priors of `Noise`, whose docstring has the reasons.
 FACTOR, UNSTATED, SCATTER = Lognormal(1.5, 0.8), Lognormal(0.1, 0.6), Lognormal(0.05, 0.7)
 
 
 class StatedErrors(NamedTuple):
-    """Probability that stated errors are right, and else the factor, above 1, they lack."""
+    """Probability that stated errors are right, and the factor above 1 if they are too small."""
 
     right: np.ndarray
     factor: Lognormal
@@ -83,35 +84,35 @@ class Noise:
     Parameters
     ----------
     right : float
-        Probability that stated errors are right, before their size is seen. Most are; a third to
+        Probability that stated errors are right, before their size is known. Most are; a third to
         a half of the real scans with stated errors scatter more (docs/verdict.md).
     factor : Lognormal
-        Where they are not, the factor, above 1, by which they are too small: real errors are often
-        half of the truth. As often it is ``scatter`` that they lack.
+        Factor, above 1, by which wrong stated errors are too small: real errors are often half of
+        the truth. It is equally probable that they lack the ``scatter`` instead.
     unstated : Lognormal
-        Noise that nobody stated, as a share of the size: a reading has the jitter of its shot
-        beside the 4 to 5 % that settings scatter, from 3 % for good wires to 30 % for bad screens.
+        Noise without stated errors, as a share of the size: the jitter of a shot in addition to the
+        4 to 5 % scatter of settings, from 3 % for good wires to 30 % for bad screens.
     share : float
-        Probability that such noise is a share of the size, and not the same number of µm at every
-        setting. A few points do not tell which.
+        Probability that such noise is a share of the size, rather than the same in µm at every
+        setting. A few points do not determine which.
     even : float
-        Probability that settings scatter no more than their shots say.
+        Probability that settings scatter no more than their shots show.
     slow : float
-        Probability that the noise goes on from row to row, as that of a beam that drifts within
+        Probability that the noise is correlated from row to row, as for a beam that drifts within
         its feedbacks: one scan in ten.
     scatter : Lognormal
-        What settings scatter, beyond their shots or beyond stated errors that are not right, as a
-        share of the size: 4 to 5 % in LCLS scans whose shots say 1 % (docs/verdict.md). Errors that
-        are right contain it, so that errors far below it are seldom right.
+        Scatter of settings beyond their shots, or beyond wrong stated errors, as a share of the
+        size: 4 to 5 % in LCLS scans with 1 % errors of the shots (docs/verdict.md). Right errors
+        include it, so errors far below it are rarely right.
     bad : float
-        Probability that a reading is bad: a shot that missed, a wrong cell.
+        Probability that a reading is bad: a missed shot, a wrong cell.
     width : float
-        How many times wider bad readings scatter than good ones, as a Cauchy distribution: a slip
-        of the decimal point is any number of errors off.
+        Width of the Cauchy distribution of bad readings over that of good ones: a slip of the
+        decimal point is any number of errors off.
     bad_shot : float
-        Probability that a single shot shows something else than the beam.
+        Probability that a single shot does not show the beam.
     source : str
-        Where these numbers are from.
+        Origin of these numbers.
 
     Raises
     ------
@@ -155,7 +156,7 @@ class Noise:
             raise InputError(f"noise prior width = {self.width:g}", "a width above 1")
 
     def stated(self, share: np.ndarray) -> StatedErrors:
-        """Say what stated errors are worth by their size.
+        """Posterior of stated errors, given their typical size.
 
         Parameters
         ----------
@@ -164,8 +165,8 @@ class Noise:
 
         Notes
         -----
-        Bayes' theorem. Errors that are right are as large as what settings scatter; those that are
-        not are that over a factor above 1. Either says how often errors are as large as these.
+        Bayes' theorem. Right errors have the prior distribution of ``scatter``; wrong ones are that
+        divided by a factor above 1. Either gives a density for errors of the stated size.
 
         Examples
         --------
@@ -173,22 +174,22 @@ class Noise:
         [0.01, 0.45, 0.83]
         """
         total = Lognormal(self.scatter.middle / share, np.full_like(share, self.scatter.spread))
-        factor, seldom = self.factor.and_also(total)
-        more = factor.log_probability_above(1.0) - self.factor.log_probability_above(1.0)
-        small = math.log1p(-self.right) + seldom + more
+        factor, log_agreement = self.factor.and_also(total)
+        log_above = factor.log_probability_above(1.0) - self.factor.log_probability_above(1.0)
+        log_small = math.log1p(-self.right) + log_agreement + log_above
         right = math.log(self.right) + total.log_density(0.0)
-        return StatedErrors(np.exp(right - np.logaddexp(right, small)), factor)
+        return StatedErrors(np.exp(right - np.logaddexp(right, log_small)), factor)
 
     def of_points(self, count: int) -> Noise:
-        """Take three readings as good: they leave nothing that could show one of them to be bad.
+        """Exclude bad readings among three, which are too few to show one.
 
         Examples
         --------
         >>> Noise().of_points(4).bad, Noise().of_points(3).bad < 1e-9
         (0.03, True)
         """
-        return self if count > 3 else replace(self, bad=UNTESTED)
+        return self if count > 3 else replace(self, bad=UNTESTABLE_PROBABILITY)
 
 
-# The share of bad readings that --robust expects.
+# Probability of a bad reading under the option --robust.
 ROBUST = 0.1

@@ -1,4 +1,4 @@
-"""The beam matrix of one plane, positive definite by construction, and its Twiss words."""
+"""Beam matrix of one plane, positive definite by construction, and its Twiss parameters."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class Twiss(NamedTuple):
     beta : Array
         β in m.
     alpha : Array
-        α, dimensionless; positive where the beam converges.
+        α, dimensionless; positive for a converging beam.
     gamma : Array
         γ = (1 + α²)/β in 1/m.
     """
@@ -40,15 +40,15 @@ class Twiss(NamedTuple):
 class BeamMatrix:
     """σ = L Lᵀ of one plane, stored as its Cholesky factor.
 
-    Whatever the three numbers, σ is symmetric and positive, so a fit or a sampler that moves
-    them never meets the square root of a negative number. The emittance is l11·l22, without
-    the cancellation of σ11σ22 - σ12².
+    For any three numbers σ is symmetric and positive, so that a fit or a sampler never meets the
+    square root of a negative number. The emittance is l11·l22, without the cancellation of
+    σ11σ22 - σ12².
 
     Parameters
     ----------
     l11, l21, l22 : float or Array
-        L in m, rad, rad; l11 and l22 positive. By name only: three numbers may as well be meant for
-        σ11, σ12, σ22, which `from_sigma` takes, or for ε, β, α, which `from_twiss` takes.
+        L in m, rad, rad; l11 and l22 positive. They are keyword-only, to avoid confusion with σ11,
+        σ12, σ22 (`from_sigma`) or ε, β, α (`from_twiss`).
 
     Examples
     --------
@@ -69,7 +69,7 @@ class BeamMatrix:
         Raises
         ------
         InputError
-            If the numbers are known (not traced) and σ is not positive definite.
+            If σ is not positive definite; numbers traced by JAX are not checked.
 
         Examples
         --------
@@ -77,8 +77,8 @@ class BeamMatrix:
         6.0
         """
         determinant = s11 * s22 - s12 * s12
-        known = not isinstance(determinant, jax.core.Tracer)
-        if known and not (np.all(np.asarray(s11) > 0) and np.all(np.asarray(determinant) > 0)):
+        untraced = not isinstance(determinant, jax.core.Tracer)
+        if untraced and not (np.all(np.asarray(s11) > 0) and np.all(np.asarray(determinant) > 0)):
             raise InputError(
                 f"sigma11 = {s11}, sigma12 = {s12}, sigma22 = {s22}",
                 "sigma11 > 0 and sigma11*sigma22 > sigma12**2: a positive definite matrix",
@@ -88,16 +88,16 @@ class BeamMatrix:
 
     @classmethod
     def from_twiss(cls, emittance: ArrayLike, beta: ArrayLike, alpha: ArrayLike) -> BeamMatrix:
-        """Make σ = ε [[β, -α], [-α, γ]] from ε in m, β in m, α.
+        """Compute σ = ε [[β, -α], [-α, γ]] from ε in m, β in m, α.
 
         Raises
         ------
         InputError
-            If ε or β is known and not positive.
+            If ε or β is not positive; numbers traced by JAX are not checked.
         """
-        for name, given in (("emittance", emittance), ("beta", beta)):
-            if not isinstance(given, jax.core.Tracer) and not np.all(np.asarray(given) > 0):
-                raise InputError(f"{name} = {given}", "a positive number")
+        for name, number in (("emittance", emittance), ("beta", beta)):
+            if not isinstance(number, jax.core.Tracer) and not np.all(np.asarray(number) > 0):
+                raise InputError(f"{name} = {number}", "a positive number")
         root = jnp.sqrt(emittance / beta)
         return cls(l11=beta * root, l21=-alpha * root, l22=root)
 
@@ -125,7 +125,7 @@ class BeamMatrix:
         return Twiss(beta, alpha, (1.0 + alpha**2) / beta)
 
     def mismatch(self, design: BeamMatrix) -> Array:
-        """BMAG = (β γ_d - 2 α α_d + γ β_d)/2 to a design beam; 1 where they match.
+        """BMAG = (β γ_d - 2 α α_d + γ β_d)/2 to a design beam; 1 for a matched beam.
 
         The beta mismatch parameter of M. Sands, SLAC-AP-85 (1991): the factor by which the
         emittance grows when the mismatched beam filaments. The design's emittance does not
@@ -141,7 +141,7 @@ class BeamMatrix:
         return 0.5 * (b.beta * d.gamma - 2.0 * b.alpha * d.alpha + b.gamma * d.beta)
 
     def transport(self, matrix: ArrayLike) -> BeamMatrix:
-        """Carry the beam through R: σ → R σ Rᵀ (report eq. 36).
+        """Transport the beam through R: σ → R σ Rᵀ (report eq. 36).
 
         Parameters
         ----------
@@ -151,11 +151,11 @@ class BeamMatrix:
         Returns
         -------
         BeamMatrix
-            The beam after R; its emittance is ``|det R|`` times this one's, to the last digit.
+            The beam after R; its emittance is exactly ``|det R|`` times this one's.
         """
         r = jnp.asarray(matrix)
         a, b, c, d = r[..., 0, 0], r[..., 0, 1], r[..., 1, 0], r[..., 1, 1]
-        # Rows of R L; rotating the first onto the axis is its Cholesky factor.
+        # Rows of R L; a rotation that puts the first one on the axis gives its Cholesky factor.
         p, q = a * self.l11 + b * self.l21, b * self.l22
         u, v = c * self.l11 + d * self.l21, d * self.l22
         l11 = jnp.sqrt(p * p + q * q)

@@ -23,29 +23,32 @@ from beamfit.optics.elements import IDENTITY, Element, Screen, SectorDipole, Tra
 from beamfit.optics.sections import ElementSeries, LineSection, in_series
 from beamfit.particles import ELECTRON_MASS
 
-# Most matrices in memory, elements times rows, if each row has its own energy.
-MOST_AT_ONCE = 100_000
-# Most numbers of a calibration by which the line is differentiated directly; a network has more.
-MOST_DIRECT = 3
+# Largest number of matrices in memory, elements times rows, if each row has its own energy.
+MAX_MATRICES = 100_000
+# Largest mean number of parameters in a calibration for direct differentiation; a network has more.
+MAX_DIRECT_NUMBERS = 3
 
 
-def _plain(value: Any) -> Any:
-    """A value as nested lists of class names, texts and numbers, for its digest."""
+def _digest_parts(value: Any) -> Any:
+    """Convert a value to nested lists of class names, texts and numbers, for its digest."""
     if is_dataclass(value):
-        return [type(value).__name__, *(_plain(getattr(value, f.name)) for f in fields(value))]
+        return [
+            type(value).__name__,
+            *(_digest_parts(getattr(value, f.name)) for f in fields(value)),
+        ]
     if isinstance(value, tuple | list):
-        return [_plain(v) for v in value]
+        return [_digest_parts(v) for v in value]
     return value if isinstance(value, str | bool) or value is None else np.asarray(value).tolist()
 
 
 @shown
 class Design(NamedTuple):
-    """Twiss parameters a line was designed for.
+    """Design Twiss parameters of a line.
 
     Attributes
     ----------
     at : str
-        The element at whose exit they hold.
+        Element at whose exit they apply.
     x, y : tuple of float, optional
         (β in m, α) of each plane.
     """
@@ -66,20 +69,20 @@ class Beamline:
     energy : float
         Total energy in MeV.
     name : str
-        What to call the line.
+        Name of the line.
     mass : float
         Rest energy of the particle in MeV.
     energy_spread : float
         Relative momentum spread σ_δ, which widens the beam where there is dispersion.
     design : Design, optional
-        The Twiss parameters the line was designed for, at one of its elements.
+        Design Twiss parameters, at one of the elements.
     supplies : tuple of (str, tuple of str)
-        Names of supplies and of the magnets on each: a setting of a supply sets them all, each
-        with its own length and calibration, and none of them has a setting of its own.
+        Names of supplies and of the magnets on each. A setting of a supply sets all its magnets,
+        each with its own length and calibration; these have no settings of their own.
 
     Notes
     -----
-    Magnets of one name are alike and in series: a setting of that name sets them all.
+    Magnets with one name are equal and in series: a setting of that name sets them all.
 
     Examples
     --------
@@ -99,34 +102,41 @@ class Beamline:
 
     @property
     def headline(self) -> str:
-        """The line in a line."""
+        """The line in one line of text."""
         magnets, screens = (", ".join(names[:6]) for names in (self.magnets, self.screens))
-        said = f"{len(self)} elements, {brief(self.length)} m, {brief(self.energy)} MeV"
-        return f"{self.name}: {said}; magnets {magnets or 'none'}; screens {screens or 'none'}"
+        summary = f"{len(self)} elements, {brief(self.length)} m, {brief(self.energy)} MeV"
+        return f"{self.name}: {summary}; magnets {magnets or 'none'}; screens {screens or 'none'}"
 
     def tables(self) -> tuple[Table, ...]:
-        """The first elements, to be shown."""
-        few = self.elements[:MAX_ROWS_SHOWN]
-        rows = [[e.name, type(e).__name__, brief(e.length), brief(e.setting)] for e in few]
-        more = f"the first {len(few)} of {len(self)}" if len(few) < len(self) else ""
-        return (Table(self.headline, ["element", "kind", "length m", "setting"], rows, more),)
+        """Table of the first elements."""
+        first_elements = self.elements[:MAX_ROWS_SHOWN]
+        rows = [
+            [e.name, type(e).__name__, brief(e.length), brief(e.setting)] for e in first_elements
+        ]
+        note = (
+            f"the first {len(first_elements)} of {len(self)}"
+            if len(first_elements) < len(self)
+            else ""
+        )
+        return (Table(self.headline, ["element", "kind", "length m", "setting"], rows, note),)
 
     def __getitem__(self, name: str) -> Element:
-        """The element of a name; of a supply the first magnet on it."""
+        """Element of a name; for a supply, its first magnet."""
         return self.elements[self._index(self.members(name)[0])]
 
     def __len__(self) -> int:
         return len(self.elements)
 
     def _index(self, name: str) -> int:
+        """Index of the first element of a name; raises an error for an unknown one."""
         if name not in self._first:
             known = [e.name for e in self.elements]
             raise InputError(f"no element '{name}' in line '{self.name}'", nearest(name, known))
         return self._first[name]
 
     @cached_property
-    def _set_apart(self) -> frozenset[str]:
-        """Magnets on supplies, which those who compute what a supply does may set one by one."""
+    def _supply_members(self) -> frozenset[str]:
+        """Magnets on supplies; functions that act for a supply may set them one by one."""
         return frozenset(member for _, members in self.supplies for member in members)
 
     @cached_property
@@ -136,13 +146,13 @@ class Beamline:
 
     @cached_property
     def magnets(self) -> tuple[str, ...]:
-        """Names that have a setting: of elements, and of supplies in place of their magnets."""
+        """Names with a setting: elements, and supplies in place of their magnets."""
         supply = {member: name for name, members in self.supplies for member in members}
         names = (e.name for e in self.elements if e.setting is not None)
         return tuple(dict.fromkeys(supply.get(name, name) for name in names))
 
     def members(self, name: str) -> tuple[str, ...]:
-        """The magnets of this line on a supply; of any other name itself.
+        """Magnets of this line on a supply; for any other name, that name.
 
         Examples
         --------
@@ -167,9 +177,9 @@ class Beamline:
 
     @cached_property
     def digest(self) -> str:
-        """SHA-256 of elements and supplies, not of the energy: what a fitted beam belongs to."""
-        said = repr([_plain(self.elements), list(self.supplies), float(self.mass)])
-        return hashlib.sha256(said.encode()).hexdigest()
+        """SHA-256 of elements, supplies and particle, but not energy: identifies a beam's line."""
+        content = repr([_digest_parts(self.elements), list(self.supplies), float(self.mass)])
+        return hashlib.sha256(content.encode()).hexdigest()
 
     def between(self, first: str, last: str) -> Beamline:
         """Cut out the line from the exit of ``first`` to the exit of ``last``.
@@ -222,21 +232,21 @@ class Beamline:
         >>> line.with_element(Screen("S", resolution=1e-5))["S"].resolution
         1e-05
         """
-        self._index(element.name)  # says so if there is none
+        self._index(element.name)  # raises an error if there is none
         return replace(
             self, elements=tuple(element if e.name == element.name else e for e in self.elements)
         )
 
     def held(self, energy: ArrayLike) -> Beamline:
-        """Let another beam into the line, whose magnets stay as they are for the line's own.
+        """Keep the magnets set for the line's own energy, for a beam of another energy.
 
-        Bends, and strengths given as k1, belong to the energy of the line and follow no other;
-        currents and gradients do so anyway. A line that is held already stays held.
+        Bends, and strengths given as k1, otherwise scale with the energy of the beam; currents and
+        gradients are fixed in any case. A line that is held already stays as it is.
 
         Parameters
         ----------
         energy : float
-            Total energy in MeV of the beam that comes, the line's from here on.
+            Total energy in MeV of the beam, which becomes the line's.
 
         Returns
         -------
@@ -249,8 +259,10 @@ class Beamline:
         >>> round(float(line.held(101.0)["Q"].k1(energy=101.0)), 4)
         3.9604
         """
-        own = {"energy": self.energy, "mass": self.mass}
-        return replace(self, elements=tuple(_held(e, own) for e in self.elements), energy=energy)
+        set_for = {"energy": self.energy, "mass": self.mass}
+        return replace(
+            self, elements=tuple(_tie_to_energy(e, set_for) for e in self.elements), energy=energy
+        )
 
     def matrix(
         self,
@@ -259,14 +271,14 @@ class Beamline:
     ) -> TransferMatrix:
         """Transfer matrix from the start of the line to its end.
 
-        A JAX function of the settings, the energy and every number of the line: jit, vmap,
-        and differentiate it at will.
+        It is a JAX function of the settings, the energy and all numbers of the line, for jit, vmap
+        and differentiation.
 
         Parameters
         ----------
         settings : mapping of str to float, optional
-            Magnet name to setting, in the unit of that magnet's calibration; a magnet not
-            named keeps its own setting.
+            Magnet name to setting, in the unit of that magnet's calibration; other magnets keep
+            their own setting.
         energy : float, optional
             Total energy in MeV; the line's own if None.
 
@@ -278,7 +290,7 @@ class Beamline:
         Raises
         ------
         InputError
-            If a setting names no magnet of the line, or is no single number.
+            If a setting names no magnet of the line, or is not a single number.
 
         Notes
         -----
@@ -298,19 +310,20 @@ class Beamline:
         Parameters
         ----------
         places : tuple of str
-            Element names; of elements that share a name, the last counts.
+            Element names; for elements that share a name, the last one.
         settings, energy
             As in `matrix`.
 
         Returns
         -------
         dict of str to TransferMatrix
-            One a place.
+            One per place.
 
         Raises
         ------
         InputError
-            If a setting names no magnet of the line or is no single number, or a place no element.
+            If a setting names no magnet of the line or is not a single number, or a place no
+            element.
 
         Examples
         --------
@@ -320,15 +333,15 @@ class Beamline:
         [1.0, 3.0]
         """
         settings = dict(settings or {})
-        unknown = sorted(set(settings) - set(self.magnets) - self._set_apart)
+        unknown = sorted(set(settings) - set(self.magnets) - self._supply_members)
         if unknown:
             raise InputError(
                 f"a setting for '{unknown[0]}'", nearest(unknown[0], list(self.magnets))
             )
         for name, setting in settings.items():
             if jnp.ndim(setting):
-                many = "one number; jax.vmap takes a function of it to many"
-                raise InputError(f"{jnp.size(setting)} settings of '{name}' at once", many)
+                expected = "one number; jax.vmap takes a function of it to many"
+                raise InputError(f"{jnp.size(setting)} settings of '{name}' at once", expected)
         settings = {member: v for name, v in settings.items() for member in self.members(name)}
         for place in places:
             self._index(place)
@@ -342,20 +355,20 @@ class Beamline:
         return {place: found[place] for place in places}
 
     def condensed(self, keep: Iterable[str], energy: ArrayLike | None = None) -> Beamline:
-        """Multiply out everything between some elements, before anything is traced.
+        """Multiply the matrices between some elements, before JAX traces the line.
 
         Parameters
         ----------
         keep : iterable of str
-            Names of the elements that stay: magnets that will be varied, places.
+            Names of the elements to keep: magnets that will vary, and places.
         energy : float, optional
-            The only energy in MeV the line will be asked at. If None, elements that feel the
-            energy are kept, stored by kind, and the line is right at every energy.
+            The only energy in MeV at which the line will be used. If None, elements that depend on
+            the energy are kept, stored by kind, and the line is valid at every energy.
 
         Returns
         -------
         Beamline
-            A line with the same matrices, of a few elements.
+            A line of a few elements with the same matrices.
 
         Examples
         --------
@@ -365,37 +378,39 @@ class Beamline:
         ['LineSection', 'Screen']
         """
 
-        def one(part: ElementSeries) -> LineSection | ElementSeries:
+        def combine(part: ElementSeries) -> LineSection | ElementSeries:
             if energy is None:
                 return part.multiplied()
             return LineSection(part.matrix(None, energy).planes, part.length)
 
-        return self._with_parts(keep, one)
+        return self._with_parts(keep, combine)
 
     def stored_by_kind(self, keep: Iterable[str]) -> Beamline:
-        """Return the line with everything between some elements stored by kind, as arrays.
+        """Store everything between some elements by kind, as arrays.
 
-        Its derivatives by all its numbers are then a few arrays, too.
+        The derivatives with respect to all numbers of the line are then a few arrays as well.
         """
         return self._with_parts(keep, lambda part: part)
 
-    def _with_parts(self, keep: Iterable[str], one: Callable) -> Beamline:
-        """Elements of some names stay; ``one`` says what takes the place of a series between."""
+    def _with_parts(self, keep: Iterable[str], combine: Callable) -> Beamline:
+        """Keep elements of some names, and replace each series between them by its combination."""
         keep, parts = frozenset(m for name in keep for m in self.members(name)), []
-        for kept, run in groupby(self.elements, lambda e: e.name in keep):
-            parts.extend(run if kept else [one(s) for s in [in_series(run)] if s.kinds])
+        for stays, run in groupby(self.elements, lambda e: e.name in keep):
+            parts.extend(run if stays else [combine(s) for s in [in_series(run)] if s.kinds])
         return replace(self, elements=tuple(parts))
 
 
-def _held(element: Any, own: Mapping[str, Any]) -> Any:
-    """Tie an element to the energy and mass it is set for, unless it is tied already."""
+def _tie_to_energy(element: Any, set_for: Mapping[str, Any]) -> Any:
+    """Fix the energy and mass for which an element is set, unless they are fixed already."""
     if isinstance(element, SectorDipole):
-        return replace(element, **own) if element.energy is None else element
+        return replace(element, **set_for) if element.energy is None else element
     calibration = getattr(element, "calibration", None)
     if not isinstance(calibration, FocusingStrength | IntegratedStrength):
         return element
-    tied = calibration if calibration.energy is not None else replace(calibration, **own)
-    return replace(element, calibration=tied)
+    held_calibration = (
+        calibration if calibration.energy is not None else replace(calibration, **set_for)
+    )
+    return replace(element, calibration=held_calibration)
 
 
 def transfer_rows(
@@ -406,8 +421,8 @@ def transfer_rows(
     Parameters
     ----------
     line : Beamline
-        The line, with the calibrations of the scan's columns. What no setting moves is
-        multiplied out first; a line that is traced is taken as it is (see `seen_line`).
+        The line, with the calibrations of the scan's columns. Constant parts are multiplied first,
+        except in a line that JAX traces (see `reduced_line`).
     settings : mapping of str to Array
         Magnet name to settings, shape (n,).
     energy : Array
@@ -421,23 +436,25 @@ def transfer_rows(
         ``planes`` of shape (n, 2, places, 3, 3).
     """
     if not any(isinstance(v, jax.core.Tracer) for v in jax.tree.leaves(line)):
-        line = seen_line(line, settings, energy, places)
+        line = reduced_line(line, settings, energy, places)
     return _rows(line, dict(settings), energy, places)
 
 
-def seen_line(
+def reduced_line(
     line: Beamline, settings: Iterable[str], energy: ArrayLike, places: Iterable[str]
 ) -> Beamline:
-    """A line as rows of these settings and energies see it: all else multiplied out."""
-    own = () if isinstance(energy, jax.core.Tracer) else np.unique(energy)
+    """Reduce a line for rows of given settings and energies: constant parts are multiplied."""
+    energies = () if isinstance(energy, jax.core.Tracer) else np.unique(energy)
     keep = frozenset((*settings, *places))
-    # Kept beyond a trace that this may be called in: what is known is computed, never traced.
+    # The result is cached beyond the current JAX trace, so that it must not contain tracers.
     with jax.ensure_compile_time_eval():
-        return _condensed(Same(line), keep, float(own[0]) if len(own) == 1 else None)
+        return _condensed(
+            LineIdentity(line), keep, float(energies[0]) if len(energies) == 1 else None
+        )
 
 
-class Same(NamedTuple):
-    """A line that is itself and no other: scan after scan of it shares what it is made into."""
+class LineIdentity(NamedTuple):
+    """A line compared by identity, as the key of a cache: scans of one line share its reduction."""
 
     line: Beamline
 
@@ -445,47 +462,53 @@ class Same(NamedTuple):
         return id(self.line)
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, Same) and self.line is other.line
+        return isinstance(other, LineIdentity) and self.line is other.line
 
 
 @lru_cache(maxsize=64)
-def _condensed(same: Same, keep: frozenset[str], energy: float | None) -> Beamline:
-    return same.line.condensed(keep, energy)
+def _condensed(identity: LineIdentity, keep: frozenset[str], energy: float | None) -> Beamline:
+    """Reduced line, cached by the identity of the line."""
+    return identity.line.condensed(keep, energy)
 
 
 def _from_strengths(
     places: tuple[str, ...], strengths: dict[str, Array], line: Beamline, energy: Array
 ) -> Array:
+    """Matrices of a line at places, shape (2, places, 3, 3), for given integrated strengths."""
     found = line.matrices(places, strengths, energy)
     return jnp.stack([jnp.asarray(found[p].planes) for p in places], axis=-3)
 
 
-# A row has few strengths, the weights of a network are many: so the line is differentiated by
-# strengths alone, and what those hang on is carried through one small product.
+# A row has few strengths, a network has many weights. The line is therefore differentiated with
+# respect to the strengths only, and their derivatives are multiplied in.
 _by_strengths = jax.custom_jvp(_from_strengths, nondiff_argnums=(0,))
 
 
 @partial(_by_strengths.defjvp, symbolic_zeros=True)
-def _through_strengths(places, given, changes):
-    strengths, *others = given
-    found = _from_strengths(places, *given)
-    slopes = jax.jacfwd(partial(_from_strengths, places))(*given)
-    moved = [slopes[name] * d for name, d in changes[0].items() if not _still(d)]
-    leaves, kind = jax.tree.flatten(others)
-    rest = jax.tree.leaves(changes[1:], is_leaf=_still)
-    moving = [i for i, d in enumerate(rest) if not _still(d)]
+def _strengths_derivative(places, primals, tangents):
+    """Derivative of `_from_strengths`, forward in the strengths and in whatever else varies."""
+    strengths, *others = primals
+    found = _from_strengths(places, *primals)
+    slopes = jax.jacfwd(partial(_from_strengths, places))(*primals)
+    contributions = [slopes[name] * d for name, d in tangents[0].items() if not _is_zero(d)]
+    leaves, structure = jax.tree.flatten(others)
+    other_tangents = jax.tree.leaves(tangents[1:], is_leaf=_is_zero)
+    varying = [i for i, d in enumerate(other_tangents) if not _is_zero(d)]
 
-    def by_rest(values):
-        every = dict(enumerate(leaves)) | dict(zip(moving, values, strict=True))
-        return _from_strengths(places, strengths, *jax.tree.unflatten(kind, every.values()))
+    def of_others(values):
+        all_leaves = dict(enumerate(leaves)) | dict(zip(varying, values, strict=True))
+        return _from_strengths(
+            places, strengths, *jax.tree.unflatten(structure, all_leaves.values())
+        )
 
-    if moving:
-        at, along = ([part[i] for i in moving] for part in (leaves, rest))
-        moved.append(jax.jvp(by_rest, (at,), (along,))[1])
-    return found, sum(moved, jnp.zeros_like(found))
+    if varying:
+        values, directions = ([part[i] for i in varying] for part in (leaves, other_tangents))
+        contributions.append(jax.jvp(of_others, (values,), (directions,))[1])
+    return found, sum(contributions, jnp.zeros_like(found))
 
 
-def _still(change: Any) -> bool:
+def _is_zero(change: Any) -> bool:
+    """Test whether a tangent is known to be zero."""
     return isinstance(change, jax.custom_derivatives.SymbolicZero)
 
 
@@ -493,24 +516,33 @@ def _still(change: Any) -> bool:
 def _rows(
     line: Beamline, settings: dict[str, Array], energy: Array, places: tuple[str, ...]
 ) -> TransferMatrix:
-    bare, members = line, [(m, name) for name in settings for m in line.members(name)]
-    weights = [np.size(v) for m, _ in members for v in jax.tree.leaves(line[m].calibration)]
-    through = _by_strengths if sum(weights) > MOST_DIRECT * len(members) else _from_strengths
+    """Matrices of all rows at once, or in batches if they are too many for memory."""
+    bare_line, members = line, [(m, name) for name in settings for m in line.members(name)]
+    sizes = [np.size(v) for m, _ in members for v in jax.tree.leaves(line[m].calibration)]
+    strengths_to_matrices = (
+        _by_strengths if sum(sizes) > MAX_DIRECT_NUMBERS * len(members) else _from_strengths
+    )
     for m, _ in members:
-        bare = bare.with_element(replace(line[m], calibration=IntegratedStrength(), setting=0.0))
+        bare_line = bare_line.with_element(
+            replace(line[m], calibration=IntegratedStrength(), setting=0.0)
+        )
 
-    def one(row: tuple[dict[str, Array], Array]) -> Array:
-        setting, at = row
-        at = energy if at is None else at
+    def of_row(row: tuple[dict[str, Array], Array]) -> Array:
+        setting, row_energy = row
+        row_energy = energy if row_energy is None else row_energy
         strengths = {
-            m: jnp.asarray(line[m].calibration.k1l(setting[name], line[m].length, at), float)
+            m: jnp.asarray(
+                line[m].calibration.k1l(setting[name], line[m].length, row_energy), float
+            )
             for m, name in members
         }
-        return through(places, strengths, bare, at)
+        return strengths_to_matrices(places, strengths, bare_line, row_energy)
 
     rows = (settings, None if jnp.ndim(energy) == 0 else energy)
-    long = max((e.order.size for e in line.elements if isinstance(e, ElementSeries)), default=0)
-    if jnp.size(energy) * long <= MOST_AT_ONCE:
-        return TransferMatrix(jax.vmap(one)(rows))
-    by_turns = jax.lax.map(jax.checkpoint(one), rows, batch_size=max(1, MOST_AT_ONCE // long))
-    return TransferMatrix(by_turns)
+    longest = max((e.order.size for e in line.elements if isinstance(e, ElementSeries)), default=0)
+    if jnp.size(energy) * longest <= MAX_MATRICES:
+        return TransferMatrix(jax.vmap(of_row)(rows))
+    in_batches = jax.lax.map(
+        jax.checkpoint(of_row), rows, batch_size=max(1, MAX_MATRICES // longest)
+    )
+    return TransferMatrix(in_batches)

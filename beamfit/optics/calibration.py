@@ -1,7 +1,7 @@
-"""Calibration of a magnet: from amperes, kilogauss or 1/m² to focusing strength.
+"""Calibrations of magnets: from amperes, kilogauss or 1/m² to focusing strength.
 
-Each calibration is a frozen value with ``unit`` (the word a scan's column header ends in) and
-``k1l(setting, length, energy)``, the integrated strength in 1/m, of any shape.
+Each calibration is a frozen value with ``unit`` (the ending of a scan's column header) and
+``k1l(setting, length, energy)``, the integrated strength in 1/m, for arrays of any shape.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from beamfit.arrays import array_module, value
 from beamfit.particles import ELECTRON_MASS, rigidity
 
 SETTING_UNITS = {"A": "A", "kG": "kG", "T_per_m": "T/m", "k1": "1/m²", "k1l": "1/m"}
-"""Units of settings as people write them."""
+"""Units of settings for display."""
 
 
 @value()
@@ -98,9 +98,9 @@ class CurrentTable:
     currents : tuple of float
         A, rising.
     gradients : tuple of float
-        T/m at these currents; beyond the table its first and last line go on.
+        T/m at these currents; the first and last segments are extrapolated.
     scale : float
-        Factor on the gradient; 1 trusts the table.
+        Factor on the gradient; 1 for the table as it is.
     mass : float
         Rest energy of the particle, MeV.
 
@@ -137,7 +137,7 @@ class Gradient:
     Parameters
     ----------
     scale : float
-        Factor on the setting; 1 trusts the control system.
+        Factor on the setting; 1 for the control system's value.
     mass : float
         Rest energy of the particle, MeV.
 
@@ -163,7 +163,7 @@ class IntegratedGradient:
     Parameters
     ----------
     scale : float
-        Factor on the setting; 1 trusts the control system.
+        Factor on the setting; 1 for the control system's value.
     mass : float
         Rest energy of the particle, MeV.
 
@@ -191,8 +191,8 @@ class FocusingStrength:
     scale : float
         Factor on the setting.
     energy : float, optional
-        Total energy in MeV that the magnet is set for, whatever beam comes: a stiffer one is
-        focused less, as 1/p. If None the setting is k1 of every beam.
+        Total energy in MeV for which the magnet is set; a beam of higher momentum is focused less,
+        as 1/p. If None the setting is k1 for every beam.
     mass : float
         Rest energy of the particle, MeV.
 
@@ -238,7 +238,7 @@ class IntegratedStrength:
 
 
 def _stiffness(magnet: FocusingStrength | IntegratedStrength, energy: ArrayLike) -> ArrayLike:
-    """Rigidity of the beam a magnet is set for over that of the beam that comes."""
+    """Rigidity of the beam for which a magnet is set over that of the actual beam."""
     if magnet.energy is None:
         return 1.0
     return rigidity(magnet.energy, magnet.mass) / rigidity(energy, magnet.mass)
@@ -256,14 +256,14 @@ Calibration = (
 
 
 def scaled(calibration: Calibration, factor: ArrayLike) -> Calibration:
-    """Scale what a magnet's setting means: the slope of a line, else all of the strength.
+    """Scale the strength of a calibration; for `SlopeIntercept`, the slope only.
 
     Parameters
     ----------
     calibration : Calibration
-        Of one magnet, or of several stored as arrays.
+        Calibration of one magnet, or of several stored as arrays.
     factor : float or array
-        Of their shape.
+        Factor, of their shape.
 
     Returns
     -------

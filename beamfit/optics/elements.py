@@ -1,8 +1,8 @@
-"""The elements of a beam line. Each is a frozen value with ``matrix(setting, energy)``.
+"""Elements of a beam line. Each is a frozen value with ``matrix(setting, energy)``.
 
-The mathematics is in focusing.py; here each element only says which strength, length and
-edges it has in each plane. Positive k1 focuses x. The numbers of an element may be arrays of
-one shape: it then stands for as many elements, and its matrix has that shape before (2, 3, 3).
+The mathematics is in focusing.py; an element only defines strength, length and edges in each plane.
+Positive k1 focuses x. The numbers of an element may be arrays of one shape: it then stands for as
+many elements, and its matrix has that shape before (2, 3, 3).
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ class TransferMatrix:
         return TransferMatrix(self.planes @ earlier.planes)
 
 
-# Where the focusing functions stand in a plane's matrix.
+# Positions of the focusing functions in a plane's matrix.
 _COSINE = np.diag([1.0, 1.0, 0.0])
 _SINE = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
 _SLOPE = _SINE.T
@@ -80,7 +80,7 @@ def _kick(strength: ArrayLike) -> Array:
     return np.eye(3) - floats(strength)[..., None, None] * _SLOPE
 
 
-def _both(strength: ArrayLike) -> Array:
+def _both_planes(strength: ArrayLike) -> Array:
     """A strength in x and its opposite in y, along a last axis."""
     return floats(strength)[..., None] * np.array([1.0, -1.0])
 
@@ -115,9 +115,9 @@ class Quadrupole:
     length : float
         Effective length in m.
     setting : float
-        What it is set to when a scan does not say, in the calibration's unit.
+        Default setting, in the calibration's unit.
     calibration : Calibration
-        From setting to strength; k1 in 1/m² unless given.
+        Converts settings to strength; k1 in 1/m² unless given.
 
     Examples
     --------
@@ -138,20 +138,20 @@ class Quadrupole:
 
     def matrix(self, setting: ArrayLike | None = None, energy: ArrayLike = 1.0) -> TransferMatrix:
         """Transfer matrix at a setting (the element's own if None) and an energy in MeV."""
-        both = _both(self.k1(setting, energy))
+        both = _both_planes(self.k1(setting, energy))
         return TransferMatrix(_thick(both, floats(self.length)[..., None]))
 
 
 @value("name")
 class ThinLens:
-    """A quadrupole of no length: u' changes by -k1l · u in x, +k1l · u in y.
+    """A quadrupole of zero length: u' changes by -k1l · u in x, +k1l · u in y.
 
     Parameters
     ----------
     name : str
         Its name.
     setting : float
-        Inverse focal length in 1/m, or an integrated gradient, as the calibration says.
+        Inverse focal length in 1/m, or an integrated gradient, depending on the calibration.
     calibration : Calibration
         `IntegratedStrength` or `IntegratedGradient`.
 
@@ -169,7 +169,7 @@ class ThinLens:
     def matrix(self, setting: ArrayLike | None = None, energy: ArrayLike = 1.0) -> TransferMatrix:
         """Transfer matrix at a setting (the element's own if None) and an energy in MeV."""
         setting = self.setting if setting is None else setting
-        return TransferMatrix(_kick(_both(self.calibration.k1l(setting, 0.0, energy))))
+        return TransferMatrix(_kick(_both_planes(self.calibration.k1l(setting, 0.0, energy))))
 
 
 def hard_edge_slice(
@@ -234,8 +234,8 @@ class SectorDipole:
     angle : float
         Bend angle α in rad.
     entrance_edge, exit_edge : float
-        Pole-face rotations ψ in rad; positive focuses the plane across the bend. A bend the
-        other way has a negative radius and angle, and the edges that focus are negative too.
+        Pole-face rotations ψ in rad; positive focuses the plane across the bend. A bend in the
+        opposite direction has negative radius and angle; its focusing edges are negative too.
     bend_plane : {"x", "y"}
         The plane that is bent.
     energy_offset : float
@@ -243,8 +243,8 @@ class SectorDipole:
     k1 : float
         Gradient in the magnet, 1/m², positive focuses x.
     energy : float, optional
-        Total energy in MeV that the magnet is set for, whatever beam comes: radius and angle are
-        those of E_proj = ``energy``. If None it is set anew for every beam.
+        Total energy in MeV for which the magnet is set: radius and angle are those of E_proj =
+        ``energy``. If None it is set for each beam.
     mass : float
         Rest energy of the particle in MeV.
 
@@ -252,8 +252,8 @@ class SectorDipole:
     -----
     The body solves u'' + (h² + k) u = h δ in the bend plane, u'' - k u = 0 across it; a
     rotated edge is a thin lens of strength ∓tan ψ/ρ (K. L. Brown, SLAC-75, wedge magnets).
-    Both are held against another program and against particles tracked through the field.
-    Radii are as momenta, p² = E² - m², and not as energies.
+    Both are tested against another program and against particles tracked through the field. Radii
+    scale with momenta, p² = E² - m², not with energies.
 
     Examples
     --------
@@ -280,9 +280,9 @@ class SectorDipole:
         return self.radius * self.angle
 
     def momentum_ratio(self, energy: ArrayLike = 1.0) -> Array:
-        """Momentum of the slice over the one the magnet bends by its angle, p² = E² - m².
+        """Ratio of the slice's momentum to the one the magnet is set for, p² = E² - m².
 
-        A magnet that is set anew for a beam of any energy bends that beam alike.
+        A magnet that is set for each beam bends all beams alike.
 
         Examples
         --------
@@ -290,36 +290,38 @@ class SectorDipole:
         >>> round(float(proton.momentum_ratio(988.27208943)), 3)
         1.097
         """
-        offset, own = self.energy_offset, self.energy
-        if own is None and array_module(offset) is np and not np.any(offset):
+        offset, set_for = self.energy_offset, self.energy
+        if set_for is None and array_module(offset) is np and not np.any(offset):
             return np.ones(np.shape(offset))
-        reference = floats(energy if own is None else own)
+        reference = floats(energy if set_for is None else set_for)
         return beta_gamma(floats(energy) * (1.0 + offset), self.mass) / beta_gamma(
             reference, self.mass
         )
 
     def matrix(self, setting: ArrayLike | None = None, energy: ArrayLike = 1.0) -> TransferMatrix:
-        """Transfer matrix of a beam of an energy in MeV, about the slice's own orbit."""
+        """Transfer matrix for a beam energy in MeV, about the slice's own orbit."""
         ratio = self.momentum_ratio(energy)[..., None]
         parts = (self.radius, self.angle, self.entrance_edge, self.exit_edge)
-        radius, angle, entrance, leaving = (floats(v)[..., None] for v in parts)
+        radius, angle, entrance, exit_angle = (floats(v)[..., None] for v in parts)
         xp = array_module(*parts, ratio)
-        angle, leaving = hard_edge_slice(angle, leaving, ratio)
+        angle, exit_angle = hard_edge_slice(angle, exit_angle, ratio)
         radius = radius * ratio
         h, length = 1.0 / radius, radius * angle
-        # +1 in the plane that is bent: there the body focuses by h² and an edge defocuses.
+        # +1 in the bend plane, where the body focuses by h² and an edge defocuses.
         sign = np.array([1.0, -1.0] if self.bend_plane == "x" else [-1.0, 1.0])
         bent = sign > 0
         body = _thick(
-            xp.where(bent, h**2, 0.0) + _both(self.k1) / ratio, length, xp.where(bent, h, 0.0)
+            xp.where(bent, h**2, 0.0) + _both_planes(self.k1) / ratio,
+            length,
+            xp.where(bent, h, 0.0),
         )
-        entry, leave = (_kick(-sign * h * xp.tan(edge)) for edge in (entrance, leaving))
+        entry, leave = (_kick(-sign * h * xp.tan(edge)) for edge in (entrance, exit_angle))
         return TransferMatrix(leave @ body @ entry)
 
 
 @value("name")
 class Marker:
-    """A named place of no length.
+    """A named place of zero length.
 
     Examples
     --------

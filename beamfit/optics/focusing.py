@@ -1,7 +1,7 @@
-"""The focusing functions: one solution of u'' + k u = h, smooth through k = 0.
+"""Focusing functions: one solution of u'' + k u = h, smooth through k = 0.
 
-Every element of the package is a combination of these three functions, so a limit that holds
-here (a quadrupole at zero strength is a drift) holds for all of them.
+All elements are combinations of these three functions, so that a limit that is right here (a
+quadrupole of zero strength is a drift) is right for all of them.
 """
 
 from __future__ import annotations
@@ -15,15 +15,15 @@ from jax.typing import ArrayLike
 
 from beamfit.arrays import array_module, floats
 
-# |k L²| below which the series is used; nine terms leave out less than 1e-18.
-_NEAR, _TERMS = 0.5, 9
+# |k L²| below which the series is used, and its number of terms: the remainder is below 1e-18.
+_SERIES_LIMIT, _TERMS = 0.5, 9
 _SERIES = np.array(
     [[(-1) ** n / math.factorial(2 * n + m) for m in (0, 1, 2)] for n in range(_TERMS)]
 )
 
 
 class Focusing(NamedTuple):
-    """The functions C, S and D of a length L of constant focusing k.
+    """Functions C, S and D for a length L of constant focusing k.
 
     Attributes
     ----------
@@ -54,7 +54,7 @@ def focusing(k: ArrayLike, length: ArrayLike) -> Focusing:
     Returns
     -------
     Focusing
-        C, S, D with the broadcast shape of the arguments; numpy's where the arguments are.
+        C, S, D with the broadcast shape of the arguments; NumPy arrays if the arguments are.
 
     Notes
     -----
@@ -70,9 +70,9 @@ def focusing(k: ArrayLike, length: ArrayLike) -> Focusing:
     xp = array_module(k, length)
     k, length = floats(k), floats(length)
     x = k * length**2
-    near = abs(x) < _NEAR
+    near = abs(x) < _SERIES_LIMIT
     series = _series(xp.where(near, x, 0.0))
-    with np.errstate(over="ignore"):  # of an absurd magnet: infinite, as in JAX
+    with np.errstate(over="ignore"):  # for an absurdly strong magnet: infinite, as in JAX
         c, s, d = xp.where(near, series, _closed_form(xp.where(near, 1.0, x)))
     return Focusing(cosine=c, sine=length * s, dispersion=length**2 * d)
 

@@ -1,6 +1,6 @@
-"""Parts of a line taken as one: elements of a kind are evaluated together, then multiplied.
+"""Parts of a line as one object: elements of a kind are evaluated together, then multiplied.
 
-So the cost of a line is that of its arrays: what is traced and compiled grows neither with the
+The cost of a line is that of a few arrays: what JAX traces and compiles grows neither with the
 number of elements nor with their order.
 """
 
@@ -21,7 +21,7 @@ from beamfit.optics.elements import IDENTITY, Marker, TransferMatrix
 
 @value("name")
 class LineSection:
-    """A part of a line that is known as a whole: its transfer matrix and its length in m.
+    """A part of a line as a whole: its transfer matrix and its length in m.
 
     Examples
     --------
@@ -46,12 +46,12 @@ class ElementSeries:
     Parameters
     ----------
     kinds : tuple of Element
-        One element a kind; its numbers are arrays, one entry for each element of the kind.
+        One element per kind; its numbers are arrays with one entry for each element of the kind.
     order : Array
-        Of each element, in the order of the beam: where it stands among those of all kinds,
-        counted kind after kind.
+        For each element, in the order of the beam: its index among all elements counted kind after
+        kind.
     length : float
-        Length of all of them, m.
+        Total length, m.
 
     Examples
     --------
@@ -68,17 +68,17 @@ class ElementSeries:
     setting: ClassVar[None] = None
 
     def matrix(self, setting: ArrayLike | None = None, energy: ArrayLike = 1.0) -> TransferMatrix:
-        """Transfer matrix at an energy in MeV; numpy multiplies what JAX need not trace."""
+        """Transfer matrix at an energy in MeV; NumPy multiplies the parts JAX does not trace."""
         if not self.kinds:
             return IDENTITY
         planes = [_planes(k, energy) for k in self.kinds]
         traced = [isinstance(p, jax.Array) for p in planes]
-        every, order = _multiplied(planes, traced, self.order)
-        every += [p for p, t in zip(planes, traced, strict=True) if t]
-        return TransferMatrix(_product(array_module(*every).concatenate(every)[order]))
+        matrices, order = _multiply_runs(planes, traced, self.order)
+        matrices += [p for p, t in zip(planes, traced, strict=True) if t]
+        return TransferMatrix(_product(array_module(*matrices).concatenate(matrices)[order]))
 
     def multiplied(self) -> LineSection | ElementSeries:
-        """Multiply out what does not depend on the energy: all of it, if nothing does.
+        """Multiply the parts that do not depend on the energy; all of it if nothing does.
 
         Examples
         --------
@@ -86,47 +86,48 @@ class ElementSeries:
         >>> type(in_series((Drift("A", 1.0), Drift("B", 2.0))).multiplied()).__name__
         'LineSection'
         """
-        # A kind that feels the energy is no number where the energy is none.
+        # At energy NaN, matrices that depend on the energy are NaN.
         planes = [_planes(k, np.nan) for k in self.kinds]
-        feels = [bool(np.isnan(p).any()) for p in planes]
-        if not any(feels):
+        depends = [bool(np.isnan(p).any()) for p in planes]
+        if not any(depends):
             return LineSection(self.matrix().planes, self.length)
-        products, order = _multiplied(planes, feels, self.order)
-        kept = (k for k, f in zip(self.kinds, feels, strict=True) if f)
-        return ElementSeries((*map(LineSection, products), *kept), order, self.length)
+        products, order = _multiply_runs(planes, depends, self.order)
+        remaining = (k for k, f in zip(self.kinds, depends, strict=True) if f)
+        return ElementSeries((*map(LineSection, products), *remaining), order, self.length)
 
 
 def in_series(
     elements: Iterable[Any], settings: Mapping[str, ArrayLike] | None = None
 ) -> ElementSeries:
-    """Store elements by kind, magnets at the settings given by name or else at their own.
+    """Store elements by kind, with the given settings of magnets or else their own.
 
-    Markers and screens, which are no more than places, are left out. Numbers that JAX traces
-    stay apart from those it need not see.
+    Markers and screens are left out. Elements with numbers traced by JAX form kinds of their own.
     """
     settings, groups, length = settings or {}, {}, 0.0
     elements = [e for e in elements if not isinstance(e, Marker)]
     for i, element in enumerate(elements):
         length = length + element.length
-        bare = replace(element, name="")
-        if bare.setting is not None and element.name in settings:
-            bare = replace(bare, setting=settings[element.name])
-        leaves, kind = jax.tree.flatten(bare)
+        unnamed = replace(element, name="")
+        if unnamed.setting is not None and element.name in settings:
+            unnamed = replace(unnamed, setting=settings[element.name])
+        leaves, structure = jax.tree.flatten(unnamed)
         traced = any(isinstance(v, jax.core.Tracer) for v in leaves)
-        alone = None if all(np.ndim(v) == 0 for v in leaves) else i
-        groups.setdefault((kind, traced, alone), []).append((i, bare, leaves))
-    kinds = tuple(_stacked(*key, members) for key, members in groups.items())
+        own_arrays = None if all(np.ndim(v) == 0 for v in leaves) else i
+        groups.setdefault((structure, traced, own_arrays), []).append((i, unnamed, leaves))
+    kinds = tuple(_stack_elements(*key, members) for key, members in groups.items())
     places = [i for members in groups.values() for i, _, _ in members]
     return ElementSeries(kinds, np.argsort(places), length)
 
 
-def _stacked(kind: Any, traced: bool, alone: int | None, members: Sequence[Any]) -> Any:
-    """One element whose numbers are arrays; one with arrays of its own stays as it is."""
-    if alone is not None:
+def _stack_elements(
+    structure: Any, traced: bool, own_arrays: int | None, members: Sequence[Any]
+) -> Any:
+    """Combine elements of a kind to one with arrays; one with arrays of its own stays as it is."""
+    if own_arrays is not None:
         return members[0][1]
     columns = zip(*(leaves for _, _, leaves in members), strict=True)
     xp = jax.numpy if traced else np
-    return jax.tree.unflatten(kind, [xp.array(column, float) for column in columns])
+    return jax.tree.unflatten(structure, [xp.array(column, float) for column in columns])
 
 
 def _planes(element: Any, energy: ArrayLike) -> Array:
@@ -134,30 +135,30 @@ def _planes(element: Any, energy: ArrayLike) -> Array:
     return element.matrix(None, energy).planes.reshape(-1, 2, 3, 3)
 
 
-def _multiplied(
-    planes: Sequence[Array], apart: Sequence[bool], order: np.ndarray
+def _multiply_runs(
+    planes: Sequence[Array], separate: Sequence[bool], order: np.ndarray
 ) -> tuple[list[np.ndarray], np.ndarray]:
-    """Multiply out the runs of elements between those of the kinds that stay apart.
+    """Multiply the runs of elements between those of the separate kinds.
 
-    Returns the products, and the order of products and elements apart, products counted first.
+    Returns the products, and the order of products and separate elements, products counted first.
     """
-    if all(apart):
+    if all(separate):
         return [], order
-    known = np.concatenate([p for p, a in zip(planes, apart, strict=True) if not a])
-    stays = np.repeat(apart, [len(p) for p in planes])
-    # Where an element stands among those of its sort, known or apart.
-    place = (np.where(stays, np.cumsum(stays), np.cumsum(~stays)) - 1)[order]
-    stays = stays[order]
-    first = ~stays & np.append(True, stays[:-1])  # of each run
-    runs = np.split(known[place[~stays]], np.flatnonzero(first[~stays])[1:])
-    merged = np.where(stays, len(runs) + place, np.cumsum(first) - 1)
-    return [np.stack([_product(run) for run in runs])], merged[stays | first]
+    matrices = np.concatenate([p for p, a in zip(planes, separate, strict=True) if not a])
+    is_separate = np.repeat(separate, [len(p) for p in planes])
+    # Index of each element among the separate or the other ones.
+    position = (np.where(is_separate, np.cumsum(is_separate), np.cumsum(~is_separate)) - 1)[order]
+    is_separate = is_separate[order]
+    starts = ~is_separate & np.append(True, is_separate[:-1])  # of each run
+    runs = np.split(matrices[position[~is_separate]], np.flatnonzero(starts[~is_separate])[1:])
+    merged = np.where(is_separate, len(runs) + position, np.cumsum(starts) - 1)
+    return [np.stack([_product(run) for run in runs])], merged[is_separate | starts]
 
 
 def _product(planes: Array) -> Array:
-    """Product of matrices, the first the beam meets first.
+    """Product of matrices, with the beam passing the first one first.
 
-    JAX gets a loop, whose program does not grow; numpy multiplies pairs, then pairs of pairs.
+    JAX uses a loop, whose program size is constant; NumPy multiplies pairs, then pairs of pairs.
     """
     if isinstance(planes, jax.Array):
         return jax.lax.scan(lambda total, part: (part @ total, None), planes[0], planes[1:])[0]

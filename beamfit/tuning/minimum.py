@@ -12,7 +12,7 @@ import numpy as np
 from jax import Array
 from scipy.stats.qmc import Sobol
 
-from beamfit.emittance.advice import SHARPEST, candidate_settings, elements_at
+from beamfit.emittance.advice import MIN_SIZE_ERROR, candidate_settings, elements_at
 from beamfit.emittance.statement import PreparedScan
 from beamfit.errors import InputError
 from beamfit.tuning.knob_map import (
@@ -243,7 +243,7 @@ def _told(
         readings, posterior = fit.maps[plane]
         drawn = np.asarray(_log_sizes(posterior, x, w, known))
         there = np.asarray(readings.readings.there) > 0
-        error = max(fit.maps[plane].noise, SHARPEST)
+        error = max(fit.maps[plane].noise, MIN_SIZE_ERROR)
         told += _information(drawn.reshape(len(drawn), -1), goal, error).reshape(told.shape)
         if fit.seen is not None:
             on_screen &= drawn.mean(0) <= np.asarray(readings.readings.y)[there].max()

@@ -10,14 +10,14 @@ import numpy as np
 
 from beamfit.arrays import padded_length
 from beamfit.emittance.beam_draws import Coordinates, coordinates
-from beamfit.emittance.comparison import LEVEL, STEPS
+from beamfit.emittance.comparison import AMPLITUDES, LN_SIZE_SPREAD
 from beamfit.emittance.scan import QuadScan
 from beamfit.emittance.statement import (
     PreparedScan,
-    looked_through,
-    of_one_beam,
+    assemble,
     plane_sizes,
-    unfitted,
+    single_beam,
+    with_elements,
 )
 from beamfit.noise.model import LN_2PI, Noise
 from beamfit.noise.sizes import kinds_of
@@ -35,8 +35,8 @@ def seen_without(
     scan: QuadScan, line: Beamline | None, knobs: Knobs, noise: Noise | None
 ) -> PreparedScan:
     """The scan through its line; the knobs are no magnets of it."""
-    scan, line = of_one_beam(scan.without_settings(knobs.names), line)
-    return looked_through([unfitted(scan, line, noise=noise)])[0]
+    scan, line = single_beam(scan.without_settings(knobs.names), line)
+    return with_elements([assemble(scan, line, noise=noise)])[0]
 
 
 class PlaneReadings(NamedTuple):
@@ -75,7 +75,7 @@ def plane_readings(
     """
     sizes, _ = plane_sizes(seen, plane)
     c = coordinates(sizes.r11, sizes.r12, sizes.size, sizes.known)
-    if not c.seen:
+    if not c.separable:
         raise seen.scan.unusable(
             f"sizes in {plane} that no magnet or screen tells apart",
             "rows at three or more settings of a quadrupole",
@@ -180,10 +180,10 @@ def log_no_beam(data: KnobReadings) -> float:
     y, floor, unit = data.y[here], data.floor[here], data.unit[here]
     scale = np.exp(data.noise[0] + data.noise[1] * NODES)[:, None]
     noise = floor**2 + (scale * unit) ** 2
-    variance = np.append(0.0, STEPS)[:, None, None] ** 2 + noise
-    weight, own = (1.0 / variance).sum(-1) + LEVEL**-2, (y / variance).sum(-1)
+    variance = np.append(0.0, AMPLITUDES)[:, None, None] ** 2 + noise
+    weight, own = (1.0 / variance).sum(-1) + LN_SIZE_SPREAD**-2, (y / variance).sum(-1)
     log = -0.5 * ((y**2 / variance + np.log(variance) + LN_2PI).sum(-1) - own**2 / weight)
-    log -= 0.5 * np.log(weight * LEVEL**2)
+    log -= 0.5 * np.log(weight * LN_SIZE_SPREAD**2)
     prior = -0.5 * NODES**2
     prior -= np.logaddexp.reduce(prior) + math.log(len(variance))
     return float(np.logaddexp.reduce((log + prior).ravel()))

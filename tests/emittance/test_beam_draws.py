@@ -32,7 +32,7 @@ def test_draws_are_worth_a_hundred_whatever_the_noise(noise, seed):
     """They were ten times too wide beside noise that is far below the usual: worth 4 or 5."""
     sigma = 1e-8 * np.array([[4.0, -1.0], [-1.0, 1.0]])
     _, found = posterior(noise, np.linspace(0.2, 2.2, 11), seed, sigma)
-    assert found.worth > 100
+    assert found.effective_draws > 100
 
 
 @pytest.mark.parametrize("points", [4, 5])
@@ -47,7 +47,7 @@ def test_a_peak_of_right_errors_is_drawn_beside_wide_ones(points, noise, seed):
     sizes, single = {"x": shots.mean(1)}, {"x": shots}
     scan = beamfit.QuadScan({"Q1": gradients}, {"Q1": "k1"}, sizes, shot_size=single)
     fit = beamfit.fit_emittance(scan, LINE)
-    assert fit.seen.solutions["x"].posterior.worth > 100
+    assert fit.seen.solutions["x"].posterior.effective_draws > 100
     truth, found = np.sqrt(np.linalg.det(sigma)), fit.x.emittance
     assert found.error < 5 * noise * found.value
     assert found.interval_95[0] < truth < found.interval_95[1]

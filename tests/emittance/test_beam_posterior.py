@@ -9,11 +9,11 @@ from scipy.stats import multivariate_t
 
 import beamfit
 from beamfit.emittance.comparison import (
-    BENDS,
-    LENGTHS,
+    AMPLITUDES,
+    CURVE_AMPLITUDES,
+    CURVE_LENGTHS,
+    DEPARTURE_SHARE,
     MODELS,
-    NEAR,
-    STEPS,
     weighted_quantiles,
 )
 from beamfit.noise.model import Noise
@@ -187,9 +187,11 @@ def brute_probabilities(fit, kind, noise):
     for chance, deviation, weight in noises(kind, size, error, noise):
         found = [ref.log_evidence_of_constant(size, deviation, weight, noise)]
         for kernel in (np.eye(n), walk):
-            steps = [a**2 * kernel for a in STEPS]
+            steps = [a**2 * kernel for a in AMPLITUDES]
             found.append(ref.log_process(x, steps, deviation, weight, noise))
-        bends = [a**2 * (1 + far / m) * np.exp(-far / m) for m in LENGTHS for a in BENDS]
+        bends = [
+            a**2 * (1 + far / m) * np.exp(-far / m) for m in CURVE_LENGTHS for a in CURVE_AMPLITUDES
+        ]
         curve = ref.log_process(size / mean - 1, bends, deviation * size / mean, weight, noise)
         parts.append(np.array([*found, curve + x.sum()]) + np.log(chance))
         model = p.model / mean
@@ -207,7 +209,8 @@ def brute_probabilities(fit, kind, noise):
     slow = first[-1]
     curves = ref.log_sum(np.array([*parts, np.append(first[:-1], -np.inf)]), 0)
     curves[-1] = np.logaddexp(
-        curves[-1] + np.log(1 - NEAR), ref.log_sum(np.array(near)) + np.log(NEAR)
+        curves[-1] + np.log(1 - DEPARTURE_SHARE),
+        ref.log_sum(np.array(near)) + np.log(DEPARTURE_SHARE),
     )
     curves[-1] = np.logaddexp(curves[-1], slow)
     log = np.array([beam, flat, *curves]) + np.log(list(MODELS.values()))

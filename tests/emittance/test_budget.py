@@ -10,7 +10,7 @@ from scipy.linalg import block_diag
 
 import beamfit
 from beamfit.emittance.systematics import (
-    MOST_CAUSES,
+    MAX_CAUSES,
     budget_rows,
     range_sensitivity,
     systematics,
@@ -131,8 +131,8 @@ def test_budget_of_a_drift_in_parts_is_that_of_the_whole(gtf, gtf_sizes):
     for cause, change in changes.items():
         assert change.emittance == pytest.approx(short[cause].emittance, rel=1e-9, abs=1e-15)
     *shown, others = budget_rows(fit)
-    assert len(shown) == MOST_CAUSES
-    assert others[0] == f"{len(short) + 60 - MOST_CAUSES} other causes, each"
+    assert len(shown) == MAX_CAUSES
+    assert others[0] == f"{len(short) + 60 - MAX_CAUSES} other causes, each"
     effects = [abs(float(row[0].split()[0])) for _, row in shown]
     assert effects == sorted(effects, reverse=True)
 

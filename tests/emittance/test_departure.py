@@ -6,15 +6,15 @@ from scipy.special import logsumexp
 
 from beamfit.emittance.beam_draws import coordinates
 from beamfit.emittance.comparison import (
-    DEPARTURES,
-    SMOOTH,
+    DEPARTURE_AMPLITUDES,
+    DEPARTURE_LENGTH,
     PlaneSizes,
     compare,
     departure_odds,
 )
 from beamfit.emittance.verdict import SURE
 from beamfit.noise.model import Noise
-from beamfit.noise.sizes import kinds_of, wide_scales
+from beamfit.noise.sizes import kinds_of, prior_scales
 from tests.noise.reference import log_of_one_bad
 from tests.simulations import simulations
 
@@ -25,13 +25,13 @@ def dense_odds(off, slopes, model, far, deviation, log_weight):
     """
 
     def log_of(amplitude):
-        bend = (1 + far / SMOOTH) * np.exp(-far / SMOOTH)
+        bend = (1 + far / DEPARTURE_LENGTH) * np.exp(-far / DEPARTURE_LENGTH)
         wide = amplitude**2 * bend * np.outer(model, model) + 1e4 * slopes @ slopes.T
         each = [np.diag(sd**2) + wide for sd in deviation]
         both = zip(each, deviation, strict=True)
         return logsumexp([log_of_one_bad(off, c, sd, Noise()) for c, sd in both] + log_weight)
 
-    both = [log_of(amplitude) for amplitude in DEPARTURES]
+    both = [log_of(amplitude) for amplitude in DEPARTURE_AMPLITUDES]
     return logsumexp(both) - np.log(len(both)) - log_of(0.0)
 
 
@@ -44,7 +44,7 @@ def test_odds_are_those_of_dense_covariances():
     x = np.linalg.lstsq(c.rows[0], c.size[0] ** 2, rcond=None)[0]
     model = np.sqrt(c.rows[0] @ x)
     slopes = c.rows[0] / (2 * model)[:, None]
-    scales = wide_scales(kind, (1,))
+    scales = prior_scales(kind, (1,))
     rank = np.argsort(np.argsort(c.w[0, :, 0] / c.w[0, :, 1]))
     far = np.abs(np.subtract.outer(rank, rank)) / 9
     deviation = scales.scale[0][:, None] * kind.unit[0] * model

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import beamfit
-from beamfit.emittance.model import QUANTITIES, asked_places, numbers_of
-from beamfit.emittance.statement import asked_of
+from beamfit.emittance.model import QUANTITIES, place_optics, quantities_of
+from beamfit.emittance.statement import answer_places
 from beamfit.quantity import Status
 
 
@@ -28,13 +28,15 @@ def least_squares(fit, plane, size, error):
     p = fit[plane].points
     found = beamfit.fit_sizes(p.r11, p.r12, size, error, weights="measured")
     scale = np.sqrt(float(found.chi2) / (len(size) - 3))
-    given = asked_places({}, asked_of(fit.seen, plane))
+    given = place_optics({}, answer_places(fit.seen, plane))
     sigma, covariance = np.asarray(found.sigma), np.asarray(found.covariance)
     unit = np.sqrt(np.diag(covariance))
     steps = np.array(sigma, complex)[:, None] + 1e-20j * np.diag(unit)
-    slope = numbers_of(steps, *given).imag / 1e-20 / unit
+    slope = quantities_of(steps, *given).imag / 1e-20 / unit
     errors = scale * np.sqrt(np.sum((slope @ covariance) * slope, axis=1))
-    return dict(zip(QUANTITIES, zip(numbers_of(sigma, *given), errors, strict=True), strict=True))
+    return dict(
+        zip(QUANTITIES, zip(quantities_of(sigma, *given), errors, strict=True), strict=True)
+    )
 
 
 @pytest.mark.parametrize(

@@ -10,8 +10,8 @@ import pytest
 import beamfit
 from beamfit.emittance.assumptions import Anchor, Assumptions
 from beamfit.emittance.calibration import with_numbers
-from beamfit.emittance.model import UNIT, asked_numbers
-from beamfit.emittance.statement import asked_of, prepare
+from beamfit.emittance.model import UNIT, model_quantities
+from beamfit.emittance.statement import answer_places, prepare
 from beamfit.emittance.transport_network import SCENARIO as TRANSPORT_NETWORK
 from beamfit.errors import InputError
 from beamfit.greybox.bounds import cells, over_cells
@@ -415,7 +415,7 @@ def test_the_closed_form_is_the_answer_of_the_problem(root, otr2, method):
     scan = beamfit.read_quad_scan(root / "measurements/lcls_otr2.csv")
     fast = beamfit.fit_emittance(scan, otr2, method=method)
     for plane in "xy":
-        found = fast.fit.derive(asked_numbers, asked_of(fast.seen, plane))
+        found = fast.fit.derive(model_quantities, answer_places(fast.seen, plane))
         one = fast[plane]
         quoted = [one.emittance, one.normalized_emittance, one.beta, one.alpha, *one.sigma]
         np.testing.assert_allclose(found.value[:7], [q.value for q in quoted], rtol=1e-8)

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from beamfit.errors import InputError
 from beamfit.io.scan import read_quad_scan
-from beamfit.noise.sizes import evened
+from beamfit.noise.sizes import pooled_variance
 from tests.io.forked import in_forks  # noqa: F401
 
 PLAIN = "Q_kG,size_x_um,size_x_error_um\n-4,111.5,1.5\n-3,60,0.5\n-1,104,1\n"
@@ -143,7 +143,9 @@ def test_shots_even_out_over_the_settings(read):
     together = freedom @ relative**2 / freedom.sum()
     shrunken = np.sqrt((20 * together + freedom * relative**2) / (20 + freedom))
     expected = 1e-12 * (shrunken * [102, 50, 81]) ** 2
-    found = evened(scan.error["x"] ** 2 * [2, 2, 3] * freedom, 1.0 * freedom, scan.size["x"])
+    found = pooled_variance(
+        scan.error["x"] ** 2 * [2, 2, 3] * freedom, 1.0 * freedom, scan.size["x"]
+    )
     np.testing.assert_allclose(found, expected, rtol=1e-12)
     np.testing.assert_allclose(scan.shot_size["x"][0, :2], [100e-6, 104e-6])
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from beamfit.noise.model import Noise
-from beamfit.noise.sizes import evened, means_of
+from beamfit.noise.sizes import pooled_variance, shot_means
 
 
 def shots_of(n=9, m=5, relative=0.02, seed=0):
@@ -16,7 +16,7 @@ def shots_of(n=9, m=5, relative=0.02, seed=0):
 def test_good_shots_have_their_means_and_standard_errors():
     """Of 40 shots each the scatter is known to a few percent; a share of the size at each."""
     true, shots = shots_of(m=40)
-    found = means_of(shots, Noise())
+    found = shot_means(shots, Noise())
     np.testing.assert_allclose(found.size, shots.mean(1), rtol=3e-3)
     np.testing.assert_allclose(found.error, 0.02 * true / np.sqrt(40), rtol=0.2)
     assert (found.bad > 0.5).sum() <= 2
@@ -27,7 +27,7 @@ def test_a_shot_that_shows_no_beam_is_found_and_left_out(value):
     _, shots = shots_of()
     spoilt = shots.copy()
     spoilt[4, 1] = value
-    found, clean = means_of(spoilt, Noise()), means_of(shots, Noise())
+    found, clean = shot_means(spoilt, Noise()), shot_means(shots, Noise())
     assert found.bad[4, 1] > 0.99
     others = np.delete(found.bad.ravel(), 4 * 5 + 1)
     assert others.max() < 0.9
@@ -40,7 +40,7 @@ def test_two_shots_that_differ_are_both_doubted_and_widen_the_error():
     _, shots = shots_of(m=2)
     spoilt = shots.copy()
     spoilt[3, 0] *= 1.5
-    found = means_of(spoilt, Noise())
+    found = shot_means(spoilt, Noise())
     assert found.error[3] > 0.3 * abs(spoilt[3, 0] - spoilt[3, 1])
 
 
@@ -48,7 +48,7 @@ def test_shots_that_are_missing_count_nowhere():
     _, shots = shots_of()
     short = shots.copy()
     short[2, 3:] = np.nan
-    found = means_of(short, Noise())
+    found = shot_means(short, Noise())
     assert np.isnan(found.bad[2, 3:]).all()
     assert found.size[2] == pytest.approx(shots[2, :3].mean(), rel=0.01)
     assert found.error[2] > 1.15 * found.error[1] * found.size[2] / found.size[1]
@@ -56,8 +56,8 @@ def test_shots_that_are_missing_count_nowhere():
 
 def test_too_few_repeats_say_nothing():
     _, shots = shots_of(n=2, m=2)
-    assert means_of(shots, Noise()) is None
-    assert means_of(np.repeat(np.arange(1.0, 5.0)[:, None], 3, axis=1), Noise()) is None
+    assert shot_means(shots, Noise()) is None
+    assert shot_means(np.repeat(np.arange(1.0, 5.0)[:, None], 3, axis=1), Noise()) is None
 
 
 def test_scatter_is_evened_out_towards_that_of_all_settings():
@@ -65,7 +65,9 @@ def test_scatter_is_evened_out_towards_that_of_all_settings():
     freedom, size = np.full(5, 4.0), np.ones(5)
     square = np.array([4.0, 4.0, 4.0, 4.0, 16.0])
     pooled = square.sum() / freedom.sum()
-    np.testing.assert_allclose(evened(square, freedom, size), (20 * pooled + square) / 24.0)
+    np.testing.assert_allclose(
+        pooled_variance(square, freedom, size), (20 * pooled + square) / 24.0
+    )
 
 
 @pytest.mark.parametrize("power", [0, 1])
@@ -77,11 +79,11 @@ def test_plain_shots_are_good_ones(power):
         size = np.hypot(rng.uniform(0.05, 0.6), np.linspace(-2, 2, n) - rng.uniform(-1, 1))
         scatter = 10 ** rng.uniform(-3, -0.7) * np.median(size) ** (1 - power)
         shots = size[:, None] + scatter * (size**power)[:, None] * rng.normal(size=(n, m))
-        lost += bool((means_of(np.abs(shots)).bad > 0.99).any())
+        lost += bool((shot_means(np.abs(shots)).bad > 0.99).any())
     assert lost <= 2
 
 
 def test_two_of_three_shots_without_beam_leave_the_third():
-    found = means_of(np.array([[1.0, 1.02, 0.98], [2.0, 0.0, 0.0], [3.0, 2.94, 3.06]]))
+    found = shot_means(np.array([[1.0, 1.02, 0.98], [2.0, 0.0, 0.0], [3.0, 2.94, 3.06]]))
     assert found.size[1] == pytest.approx(2.0, rel=0.01)
     assert found.bad[1, 1:].min() > 0.99

@@ -12,7 +12,7 @@ from scipy.stats import lognorm, norm
 from beamfit.compile_cache import SELDOM
 from beamfit.errors import InputError
 from beamfit.noise.model import Lognormal, Noise
-from beamfit.noise.sizes import averaged, kinds_of, log_likelihood, narrowed, wide_scales
+from beamfit.noise.sizes import kinds_of, log_average, log_likelihood, narrow_scales, prior_scales
 from tests.noise import reference as ref
 
 CASES = {"four": (4, Noise()), "seven": (7, Noise()), "twelve": (12, Noise()),
@@ -41,12 +41,12 @@ def found_and_expected(kind, size, model, error, noise):
         kinds, log = kinds_of(noise, size, error), ref.log_stated(size, model, error, noise)
     parts = []
     for each in kinds:
-        scales = wide_scales(each, ())
+        scales = prior_scales(each, ())
         for _ in range(2):
             own = log_likelihood(size - model, model, each, scales.scale, noise)
-            scales = narrowed(each, scales, own.max(0) + scales.log_weight)
+            scales = narrow_scales(each, scales, own.max(0) + scales.log_weight)
         own = log_likelihood(size - model, model, each, scales.scale, noise)
-        parts.append(averaged(own, scales.log_weight) + each.log_weight)
+        parts.append(log_average(own, scales.log_weight) + each.log_weight)
     return np.logaddexp.reduce(parts), log
 
 
@@ -99,7 +99,7 @@ def test_compiled_it_is_the_same(n, options):
     noise = Noise()
     size, model, error = data(n, "stated", noise)
     kind = kinds_of(noise, size, error)[0]
-    scale = wide_scales(kind, ()).scale
+    scale = prior_scales(kind, ()).scale
     many = np.repeat(model, 30, axis=0) * (
         1 + 0.01 * np.random.default_rng(1).normal(size=(300, n))
     )
@@ -119,7 +119,7 @@ def test_errors_of_one_share_are_the_models_own():
     assert kinds_of(Noise(), size, np.full(3, 0.05))[0].power == 0
     assert [k.power for k in kinds_of(Noise(), size, None)] == [1, 0, 1]
     shots, slow = kinds_of(Noise(), size, np.full(3, 0.05), of_shots=True)
-    assert (shots.power, shots.special, shots.chance) == (0, 0.0, Noise().even)
+    assert (shots.power, shots.special, shots.special_probability) == (0, 0.0, Noise().even)
     assert not shots.slow
     assert slow.slow
 
@@ -129,7 +129,7 @@ def test_stated_errors_are_never_too_large():
     size = np.linspace(1.0, 2.0, 12)
     model = np.repeat((size * (1 + 1e-4))[None], 2, axis=0)
     kind = kinds_of(Noise(), size, 0.05 * np.ones(12))[0]
-    scales = wide_scales(kind, ())
+    scales = prior_scales(kind, ())
     assert scales.scale.min() == 1.0
     log = log_likelihood(size - model, model, kind, scales.scale, Noise())[0] + scales.log_weight
     assert np.argmax(log) == 0

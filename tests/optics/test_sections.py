@@ -116,7 +116,7 @@ def test_rows_of_a_long_line_taken_by_turns_are_the_same(monkeypatch):
     set_to = {"F0": np.linspace(0.5, 1.5, 7)}
     energy = np.linspace(95.0, 105.0, 7)
     at_once = transfer_rows(line, set_to, energy, ("END",)).planes
-    monkeypatch.setattr(beamline, "MOST_AT_ONCE", 100)
+    monkeypatch.setattr(beamline, "MAX_MATRICES", 100)
     beamline._rows.clear_cache()
     by_turns = transfer_rows(line, set_to, energy, ("END",)).planes
     beamline._rows.clear_cache()
@@ -147,7 +147,7 @@ def test_what_is_compiled_does_not_grow_with_the_line(own_energies):
         line = cells(number, IntegratedGradient())
         set_to = {"D3": np.ones(3)}
         energy = ENERGIES if own_energies else np.full(3, 100.0)
-        short = beamline.seen_line(line, set_to, energy, ("END",))
+        short = beamline.reduced_line(line, set_to, energy, ("END",))
         program = jax.make_jaxpr(beamline._rows, static_argnums=3)(short, set_to, energy, ("END",))
         sizes.append(equations(program.jaxpr))
     assert sizes[0] == sizes[1]

@@ -7,7 +7,7 @@ import pytest
 from scipy.optimize import differential_evolution
 from scipy.stats import kstest, multivariate_normal, norm, uniform
 
-from beamfit.emittance.comparison import STEPS
+from beamfit.emittance.comparison import AMPLITUDES
 from beamfit.tuning import knob_map as of
 from beamfit.tuning.knob_map import MEAN, design, features, log_emittance, log_size, orders_of
 from beamfit.tuning.minimum import _of_draw, emittances_of, minima_of, values_at
@@ -193,7 +193,7 @@ def test_the_evidence_of_no_beam_is_the_integral_of_its_likelihood(data):
     scales = np.exp(data.noise[0] + data.noise[1] * nodes)
     weights = np.exp(-0.5 * nodes**2) / np.exp(-0.5 * nodes**2).sum()
     whole = 0.0
-    for step in [0.0, *STEPS]:
+    for step in [0.0, *AMPLITUDES]:
         for scale, weight in zip(scales, weights, strict=True):
             deviation = np.sqrt(step**2 + data.floor**2 + scale**2)
             log = norm.logpdf(data.y, levels[:, None], deviation).sum(-1)
