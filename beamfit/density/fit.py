@@ -312,8 +312,8 @@ def _few_phases(plane: PlaneDensity) -> Finding | None:
 
 
 def _wide(plane: PlaneDensity) -> Finding | None:
-    whole = quantity_of_draws(plane.parts.emittance[:, SHARES.index(0.9)], "m")
-    if of_use(whole.interval_95):
+    emittance = quantity_of_draws(plane.parts.emittance[:, SHARES.index(0.9)], "m")
+    if of_use(emittance.interval_95):
         return None
     cause = f"The profiles in {plane.plane} leave the emittance of 90 % of the charge open."
     where = f" The window cuts the beam at {plane.labels[plane.cut[0]]}." if plane.cut else ""
@@ -393,8 +393,8 @@ class DensityFit:
     @property
     def headline(self) -> str:
         """Verdict, and emittances of 90 % of the charge."""
-        said = [f"{p.plane} {p.emittance['90 %']}" for p in self.planes]
-        return f"{cell(self.status)}: normalised emittance of 90 % of the charge {', '.join(said)}"
+        emittances = ", ".join(f"{p.plane} {p.emittance['90 %']}" for p in self.planes)
+        return f"{cell(self.status)}: normalised emittance of 90 % of the charge {emittances}"
 
     @property
     def message(self) -> str:

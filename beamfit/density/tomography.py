@@ -340,8 +340,8 @@ class _Posterior(NamedTuple):
         free = np.hstack([*(membership * column[:, None] for column in each), frame])
         # Bins are at the positions of these stretches, so the remaining stretches have a mean.
         residual = bins.charge - bins.projection @ _gaussian() + stretching @ stretch
-        flat, grown = np.full_like(residual, PEAK**2), PEAK * np.maximum(expected, 0.0)
-        parts = (*(k.bin_covariance for k in kernels), flat, grown, stretching @ stretching.T)
+        flat, by_charge = np.full_like(residual, PEAK**2), PEAK * np.maximum(expected, 0.0)
+        parts = (*(k.bin_covariance for k in kernels), flat, by_charge, stretching @ stretching.T)
         return cls(bins, kernels, prior, residual, free, stretching, free @ free.T, parts)
 
     def _profile_errors(self) -> np.ndarray:
@@ -362,9 +362,9 @@ class _Posterior(NamedTuple):
 
     def bin_error(self, numbers: np.ndarray) -> np.ndarray:
         """Noise of each bin."""
-        _, _, flat, grown, _ = self.parts
+        _, _, flat, by_charge, _ = self.parts
         square = np.exp(2.0 * numbers)
-        return np.sqrt(square[2] * flat + square[3] * grown)
+        return np.sqrt(square[2] * flat + square[3] * by_charge)
 
     def _factorise(self, numbers: np.ndarray) -> tuple[np.ndarray, float]:
         """Give the Cholesky factor of the covariance, and minus ln of evidence times prior."""

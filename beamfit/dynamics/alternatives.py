@@ -174,17 +174,19 @@ def _factored_rows(chosen: Any, model: Any, run: DrivenRun, data: Any, theta: An
     with their widths. The last free number is the amount of the further term, the change of the
     law's width in steps, or the change of the delay in widths.
     """
-    y, error, term, late = data
+    y, error, term, delay = data
 
-    def one(theta, u, term, late):
+    def one(theta, u, term, delay):
         def output(t):
-            part, width = late
-            own = replace(run, u=u[..., 0] + t[-1] * u[..., 1], delay_fraction=part + t[-1] * width)
-            return predicted(tree.replace(model, chosen, t[:-1]), own) + t[-1] * term
+            fraction, width = delay
+            shifted = replace(
+                run, u=u[..., 0] + t[-1] * u[..., 1], delay_fraction=fraction + t[-1] * width
+            )
+            return predicted(tree.replace(model, chosen, t[:-1]), shifted) + t[-1] * term
 
         return with_slope(output, theta)
 
-    value, slope = jax.vmap(one)(theta, u, term, late)
+    value, slope = jax.vmap(one)(theta, u, term, delay)
     rows = jnp.concatenate([slope, (value - y)[..., None]], axis=2)
     return jnp.linalg.qr(
         jnp.clip(jnp.nan_to_num(rows, nan=MAX_RESIDUAL), -MAX_RESIDUAL, MAX_RESIDUAL)
@@ -231,24 +233,22 @@ class _Batch(NamedTuple):
         further rounds the `NOISES_PER_ROUND` noises of the best trials.
         """
         count, noises = len(begin), np.arange(len(self.comparison.grid))[::NOISE_STRIDE]
-        best, each = begin, np.arange(count)
-        step, least = np.zeros_like(best), np.full(count, np.inf)
+        best, trials = begin, np.arange(count)
+        step, lowest = np.zeros_like(best), np.full(count, np.inf)
         for _ in range(rounds):
             white = self.whiten(best + step, noises)
             memory, squares = white.memory(), np.sum(white.triangle[..., -1] ** 2, axis=1)
-            now, after = (
-                _minus_two_log_likelihood(white, s).reshape(-1, count)
-                for s in (squares, memory.squares)
-            )
-            likeliest = after.argmin(axis=0)
-            further = memory.step.reshape(-1, count, best.shape[1])[likeliest, each]
-            better = now.min(axis=0) < least
+            deviance = _deviance(white, squares).reshape(-1, count)
+            next_deviance = _deviance(white, memory.squares).reshape(-1, count)
+            best_noise = next_deviance.argmin(axis=0)
+            next_step = memory.step.reshape(-1, count, best.shape[1])[best_noise, trials]
+            better = deviance.min(axis=0) < lowest
             best = np.where(better[:, None], best + step, best)
-            least = np.minimum(least, now.min(axis=0))
-            step = np.where(better[:, None], further, 0.25 * step)
-            ranked = noises[likeliest[np.argsort(after.min(axis=0))]]
+            lowest = np.minimum(lowest, deviance.min(axis=0))
+            step = np.where(better[:, None], next_step, 0.25 * step)
+            ranked = noises[best_noise[np.argsort(next_deviance.min(axis=0))]]
             noises = np.array(list(dict.fromkeys(ranked))[:NOISES_PER_ROUND])
-        return best, np.minimum(least, after.min(axis=0))
+        return best, np.minimum(lowest, next_deviance.min(axis=0))
 
     def weigh(self, begin: np.ndarray) -> tuple[np.ndarray, ...]:
         """Give each trial's log evidence, and mean and covariance of its numbers, over all
@@ -291,7 +291,7 @@ def average_over_noises(
     return likelihood, mean, spread, memory.dof
 
 
-def _minus_two_log_likelihood(white: Whitened, squares: np.ndarray) -> np.ndarray:
+def _deviance(white: Whitened, squares: np.ndarray) -> np.ndarray:
     """Give -2 ln L up to a constant from residual sums of squares, the noise level at its best."""
     return white.count * np.log(np.maximum(squares, np.finfo(float).tiny)) - 2.0 * white.volume
 
@@ -312,9 +312,7 @@ class _TrialPosterior(NamedTuple):
     def merge(self, other: _TrialPosterior) -> _TrialPosterior:
         """Join two sets of trials."""
         parts = zip(self[1:], other[1:], strict=True)
-        return _TrialPosterior(
-            self.trials + other.trials, *(np.concatenate(pair) for pair in parts)
-        )
+        return _TrialPosterior(self.trials + other.trials, *map(np.concatenate, parts))
 
     @property
     def log_posterior(self) -> np.ndarray:
@@ -424,10 +422,8 @@ class Comparison(NamedTuple):
         """
         begin = np.tile(self.begin, (len(trials), 1))
         if len(trials) > MAX_TRIALS:
-            steps = [
-                batch.fit(each, SCREENING_ROUNDS) for batch, each in self._batches(trials, begin)
-            ]
-            parts = zip(*steps, strict=True)
+            batches = self._batches(trials, begin)
+            parts = zip(*(b.fit(each, SCREENING_ROUNDS) for b, each in batches), strict=True)
             begin, cost = (np.concatenate(part)[: len(trials)] for part in parts)
             cost -= [2.0 * t.prior if t.is_departure else np.inf for t in trials]
             kept = np.argsort(cost)[:MAX_TRIALS]
@@ -466,25 +462,27 @@ def alternatives_of(
     With `departures` False neither laws nor further terms are tried.
     """
     comparison = Comparison.prepare(runs, found, paths, slopes)
-    own = found.path._replace(delay=found.delay)
-    lawless = paths.whole_delays() + paths.fractional_delays(own.delay)
+    fitted_path = found.path._replace(delay=found.delay)
+    lawless = paths.whole_delays() + paths.fractional_delays(fitted_path.delay)
     trials = [Trial(path, paths.log_prior(path)) for path in lawless]
     if departures:
         terms = len(comparison.terms[0])
-        prior = paths.log_prior(own) - np.log(ODDS_AGAINST_TERM * terms)
-        trials += _law_trials(comparison, own, paths)
-        trials += [Trial(own, prior, k) for k in range(terms)]
+        prior = paths.log_prior(fitted_path) - np.log(ODDS_AGAINST_TERM * terms)
+        trials += _law_trials(comparison, fitted_path, paths)
+        trials += [Trial(fitted_path, prior, k) for k in range(terms)]
     posterior = comparison.weigh(trials)
     has_law = np.array([trial.path.law is not None for trial in posterior.trials])
     if posterior.probability[has_law].sum() > posterior.probability[posterior.no_departure].sum():
         posterior = _refine_laws(comparison, posterior)
-    chance, none = posterior.probability, posterior.no_departure
-    others = ~none | [not found.covers(trial.path) for trial in posterior.trials]
+    chance, no_departure = posterior.probability, posterior.no_departure
+    others = ~no_departure | [not found.covers(trial.path) for trial in posterior.trials]
     others &= chance > MIN_PROBABILITY
-    likeliest = posterior.trials[np.where(none, posterior.log_posterior, -np.inf).argmax()].path
+    best_path = posterior.trials[
+        np.where(no_departure, posterior.log_posterior, -np.inf).argmax()
+    ].path
     return Alternatives(
-        found.path if found.covers(likeliest) else likeliest,
-        *posterior.select(none).delay_moments(found.delay),
+        found.path if found.covers(best_path) else best_path,
+        *posterior.select(no_departure).delay_moments(found.delay),
         _name_departure(posterior, comparison.departures),
         chance[others],
         (posterior.numbers - comparison.begin)[others, :-1],
@@ -569,7 +567,7 @@ def _name_departure(posterior: _TrialPosterior, names: Sequence[Departure]) -> D
     kind is that of the first, the probability that of any departure.
     """
     best: dict[Any, tuple[float, Departure]] = {}
-    whole: Counter[Any] = Counter()
+    by_key: Counter[Any] = Counter()
     for trial, p, numbers in zip(
         posterior.trials, posterior.probability, posterior.numbers, strict=True
     ):
@@ -580,16 +578,14 @@ def _name_departure(posterior: _TrialPosterior, names: Sequence[Departure]) -> D
         else:
             law = trial.path.law.widened(numbers[-1])
             key, named = (law.kind, law.input), Departure(law.words(), law.kind)
-        whole[key] += float(p)
+        by_key[key] += float(p)
         best[key] = max(best.get(key, (0.0, named)), (float(p), named), key=lambda each: each[0])
-    if not whole:
+    if not by_key:
         return NO_DEPARTURE
-    total = max(sum(whole.values()), np.finfo(float).tiny)
-    ranked = [(key, p / total) for key, p in whole.most_common()]
-    above = np.cumsum([0.0, *(p for _, p in ranked)])[:-1]
-    ranked = [
-        each for each, before in zip(ranked, above, strict=True) if before < NAMED_PROBABILITY
-    ]
+    total = max(sum(by_key.values()), np.finfo(float).tiny)
+    ranked = [(key, p / total) for key, p in by_key.most_common()]
+    before = np.cumsum([0.0, *(p for _, p in ranked)])[:-1]
+    ranked = ranked[: int(np.sum(before < NAMED_PROBABILITY))]
     words = [best[key][1].words for key, _ in ranked]
     if len(words) > 1:
         words = [f"{w} (P = {p:.2f})" for w, (_, p) in zip(words, ranked, strict=True)]
@@ -610,17 +606,14 @@ def _further_terms(
     """
     prepared = found.prepared
     (lags, further), (names, changing) = _lag_terms(found), _parameter_terms(prepared, slopes)
-    fitted = (
-        y - row[0] for y, row in zip(prepared.measured, found.noise_fit.residuals, strict=True)
-    )
+    residuals = found.noise_fit.residuals
+    fitted = (y - row[0] for y, row in zip(prepared.measured, residuals, strict=True))
     growing = (growth_columns(y, t) for y, t in zip(fitted, prepared.time, strict=True))
-    each = [np.hstack(columns) for columns in zip(further, changing, growing, strict=True)]
-    drifts = (drift_columns(t / t[-1], k, len(each)) for k, t in enumerate(prepared.time))
-    drift = orthonormal_basis(
-        np.concatenate([columns.reshape(len(columns), -1) for columns in drifts])
-    )
-    whole, ends = np.concatenate(each), np.cumsum([len(columns) for columns in each])[:-1]
-    return lags + names + GROWTH_DEPARTURES, np.split(whole - drift @ (drift.T @ whole), ends)
+    by_run = [np.hstack(columns) for columns in zip(further, changing, growing, strict=True)]
+    drifts = (drift_columns(t / t[-1], k, len(by_run)) for k, t in enumerate(prepared.time))
+    drift = orthonormal_basis(np.concatenate([c.reshape(len(c), -1) for c in drifts]))
+    columns, ends = np.concatenate(by_run), np.cumsum([len(columns) for columns in by_run])[:-1]
+    return lags + names + GROWTH_DEPARTURES, np.split(columns - drift @ (drift.T @ columns), ends)
 
 
 def _lag_terms(found: PathFit) -> tuple[list[Departure], list[np.ndarray]]:
@@ -634,9 +627,7 @@ def _lag_terms(found: PathFit) -> tuple[list[Departure], list[np.ndarray]]:
              for lag in further_lags(prepared) for name in prepared.inputs]  # fmt: skip
     shape, slow = shape_parameters(prepared, model), further_responses(prepared)
     gain = 1.0 + shape.sum() if prepared.runs[0].physics is ARX else 1.0
-    late = (
-        replace(run, delay_fraction=run.delay_fraction + model["late"]) for run in prepared.runs
-    )
+    late = (replace(r, delay_fraction=r.delay_fraction + model["late"]) for r in prepared.runs)
     own = (np.tile(gain * unit_responses(run, shape[None]), FURTHER_LAGS) for run in late)
     unit = _relative_rms(slow, prepared)
     return names, [(lagged - response) / unit for lagged, response in zip(slow, own, strict=True)]

@@ -64,8 +64,10 @@ class Curve(NamedTuple):
 
     def quantity(self, i: int) -> Quantity:
         """Give the value at point i, without an error where the runs have no samples."""
-        known = self.visited[i] and np.isfinite(self.error[i])
-        return Quantity(float(self.value[i]), float(self.error[i]) if known else None, self.unit)
+        determined = self.visited[i] and np.isfinite(self.error[i])
+        return Quantity(
+            float(self.value[i]), float(self.error[i]) if determined else None, self.unit
+        )
 
     def table(self) -> Table:
         """Tabulate nine points."""
@@ -130,9 +132,7 @@ def response_quantities(
     drawn = lags.draws(gains) if physics is FIRST_ORDER and all_count else {}
     values, error = dict(zip(units, found.value, strict=True)), found.error
     drawn = {name: quantity_of_draws(draws, "", values[name]) for name, draws in drawn.items()}
-    alone = np.array(
-        [drawn[n].error if n in drawn else e for n, e in zip(units, error, strict=True)]
-    )
+    alone = [drawn[n].error if n in drawn else e for n, e in zip(units, error, strict=True)]
     error = np.where(np.isfinite(error), alone, np.nan)
     if alternatives is not None:
         error = np.append(alternatives.error(found.slope[:-1], error[:-1]), delay_error)
@@ -180,11 +180,10 @@ def widen_errors(found: Derived, digits: np.ndarray, input_errors: Any = 0.0) ->
 
 def quantity_at(found: Derived, i: Any, unit: str) -> Quantity:
     """Give number i as a quantity, without an error where the data do not determine it."""
-    error, raw = (float(e[i]) for e in (found.error, found.error_raw))
-    determined = np.isfinite(error)
-    return Quantity(
-        float(found.value[i]), error if determined else None, unit, raw if determined else None
-    )
+    value, error, raw = (float(e[i]) for e in (found.value, found.error, found.error_raw))
+    if not np.isfinite(error):
+        return Quantity(value, None, unit)
+    return Quantity(value, error, unit, raw)
 
 
 def open_undetermined(
@@ -313,13 +312,13 @@ def judge_outputs(found: Mapping[str, ResponseEvidence]) -> tuple[Status, str]:
     breaks.
     """
     for rule in RULES:
-        said = {name: f for name, e in found.items() if (f := rule(e)) is not None}
-        texts = {f.message: [n for n in said if said[n].message == f.message]
-                 for f in said.values()}  # fmt: skip
-        if said:
+        findings = {name: f for name, e in found.items() if (f := rule(e)) is not None}
+        texts = {f.message: [n for n in findings if findings[n].message == f.message]
+                 for f in findings.values()}  # fmt: skip
+        if findings:
             each = (text if len(names) == len(found) else f"{', '.join(names)}: {text}"
                     for text, names in texts.items())  # fmt: skip
-            return next(iter(said.values())).status, " ".join(each)
+            return next(iter(findings.values())).status, " ".join(each)
     raise AssertionError("the last rule always finds something")
 
 
@@ -490,7 +489,7 @@ def _remarks(c: Checks) -> str:
     """Sentences on noise, input motion, jitter, drift and possible laws that the errors contain."""
     smooth, ramping, standing = map(", ".join, c.way)
     law = c.law[:1].upper() + c.law[1:] if c.law is not None else ""
-    said = {
+    sentences = {
         "The noise has a memory, which the errors contain.": c.white_probability < POOR_FIT,
         f"Without high frequencies, {smooth} is taken to move between samples.": smooth,
         f"Between samples {ramping} is taken to move in straight lines.": ramping,
@@ -499,7 +498,7 @@ def _remarks(c: Checks) -> str:
         f"The output drifts as well (degree {c.drift} in time): errors contain it.": c.drift,
         f"{law} is likelier than none (P = {c.law_probability:.2f}): errors contain it.": law,
     }
-    return "".join(f" {sentence}" for sentence, holds in said.items() if holds)
+    return "".join(f" {sentence}" for sentence, holds in sentences.items() if holds)
 
 
 def _converged(e: ResponseEvidence) -> Finding:

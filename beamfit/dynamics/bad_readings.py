@@ -178,9 +178,9 @@ def _describe(runs: Runs, masks: Masks, what: str) -> tuple[BadReadings, ...]:
     for run, mask in zip(runs, masks, strict=True):
         for k, name in enumerate(run.outputs):
             if mask[:, k].any():
-                said = f"readings of {name}" if len(run.outputs) > 1 else "readings"
+                kind = f"readings of {name}" if len(run.outputs) > 1 else "readings"
                 first = float(run.time[mask[:, k].argmax()])
-                found.append(BadReadings(run.name, int(mask[:, k].sum()), first, f"{said} {what}"))
+                found.append(BadReadings(run.name, int(mask[:, k].sum()), first, f"{kind} {what}"))
     return tuple(found)
 
 
@@ -190,14 +190,11 @@ def _outliers(prepared: PreparedOutput, residuals: Sequence[np.ndarray]) -> list
     """
     digit = digit_of(np.concatenate(prepared.measured)) or 0.0
     floor, found = np.hypot(EXACT_TOLERANCE * prepared.output_scale, digit / np.sqrt(12.0)), []
-    each = zip(
-        prepared.measured, residuals, prepared.time, _equal_series(prepared, residuals), strict=True
-    )
-    for y, residuals_of_run, time, equal in each:
-        off = residuals_of_run - median_filter(residuals_of_run, MEDIAN_WIDTH, mode="nearest")
-        found.append(
-            (odds_of_bad(off, y - residuals_of_run, time, float(floor)) > CLEAR_ODDS) & ~equal
-        )
+    equal_series = _equal_series(prepared, residuals)
+    each = zip(prepared.measured, residuals, prepared.time, equal_series, strict=True)
+    for y, r, time, equal in each:
+        off = r - median_filter(r, MEDIAN_WIDTH, mode="nearest")
+        found.append((odds_of_bad(off, y - r, time, float(floor)) > CLEAR_ODDS) & ~equal)
     return found
 
 

@@ -120,17 +120,17 @@ def network_inputs(b: Batches, half: Any, x: Any, u: Any) -> dict[str, Any]:
     A substrate enters as the logarithm of itself plus its scale: both ends of the curves of Monod
     and Haldane are then equally smooth.
     """
-    known = dict(zip((*STATES, *b.inputs), [*x, *u], strict=True))
-    for name in known:
+    inputs = dict(zip((*STATES, *b.inputs), [*x, *u], strict=True))
+    for name in inputs:
         if name.endswith("substrate") and name not in FLOWS:
-            known[name] = jnp.log(jnp.maximum(known[name], 0.0) + half)
-    return known
+            inputs[name] = jnp.log(jnp.maximum(inputs[name], 0.0) + half)
+    return inputs
 
 
 def shares_at(b: Batches, model: Any, x: jax.Array, u: jax.Array) -> jax.Array:
     """Shares of the rates' ranges that the network gives at a state, shape (2,)."""
-    net, known = model["rates"], network_inputs(b, model["half"], x, u)
-    return jax.nn.sigmoid(net.values(jnp.stack([known[name] for name in net.inputs])))
+    net, inputs = model["rates"], network_inputs(b, model["half"], x, u)
+    return jax.nn.sigmoid(net.values(jnp.stack([inputs[name] for name in net.inputs])))
 
 
 def rates_from_shares(b: Batches, model: Any, substrate: Any, share: jax.Array) -> jax.Array:
@@ -207,9 +207,9 @@ def course(model: Any, b: Batches) -> jax.Array:
 
 def product_inputs(b: Batches, model: Any, names: Sequence[str], x: jax.Array, u: jax.Array) -> Any:
     """Inputs of the product's network, which may include the rates."""
-    known = network_inputs(b, model["half"], x, u)
-    known |= dict(zip(RATES, rates_at(b, model, x, u), strict=True))
-    return jnp.stack([known[name] for name in names])
+    inputs = network_inputs(b, model["half"], x, u)
+    inputs |= dict(zip(RATES, rates_at(b, model, x, u), strict=True))
+    return jnp.stack([inputs[name] for name in names])
 
 
 def predicted(model: Any, b: Batches) -> jax.Array:
@@ -240,7 +240,7 @@ def pad_columns(columns: Sequence[np.ndarray], n: int, last: float | None = None
 
 
 def batches_of(
-    times: Sequence[np.ndarray], known: Sequence[Mapping[str, np.ndarray]], like: Batches
+    times: Sequence[np.ndarray], columns: Sequence[Mapping[str, np.ndarray]], like: Batches
 ) -> Batches:
     """Build batches from times (h) and known columns of their rows, with the bounds of others."""
     n = padded_length(max(map(len, times)))
@@ -248,7 +248,7 @@ def batches_of(
 
     def column(name: str) -> np.ndarray:
         return pad_columns([np.broadcast_to(u.get(name, 0.0), t.shape).astype(float)
-                       for u, t in zip(known, times, strict=True)], n)  # fmt: skip
+                       for u, t in zip(columns, times, strict=True)], n)  # fmt: skip
 
     u = np.stack([column(name) for name in like.inputs], axis=-1)
     flow = Flow(*(jnp.asarray(column(name)) for name in FLOWS))

@@ -133,8 +133,8 @@ class HeldOutRun(NamedTuple):
 
 def explained_percent(residuals: np.ndarray, y: np.ndarray) -> float:
     """Explained part of y in percent: 100 (1 - |residuals| / |y - mean|)."""
-    whole = float(np.linalg.norm(y - y.mean()))
-    return 100.0 * (1.0 - float(np.linalg.norm(residuals)) / whole) if whole > 0 else 0.0
+    scatter = float(np.linalg.norm(y - y.mean()))
+    return 100.0 * (1.0 - float(np.linalg.norm(residuals)) / scatter) if scatter > 0 else 0.0
 
 
 def checks_of(
@@ -154,9 +154,8 @@ def checks_of(
     with_drift = zip(prepared.measured, case.drifts(found.fit.model), strict=True)
     y = [m - row[k] - np.mean(m - row[k]) for m, row in with_drift]
     residuals = np.concatenate(by_run)
-    (explained, explained_p), (later, later_p) = _score_tests(
-        prepared, by_run, noise, own, changing
-    )
+    tests = _score_tests(prepared, by_run, noise, own, changing)
+    (explained, explained_p), (later, later_p) = tests
     white = _ljung_box([r / error for r, error in zip(by_run, noise.errors, strict=True)])
     # Such small residuals are rounding, or the detail of a network.
     if residuals.std() <= EXACT_TOLERANCE * prepared.output_scale:
@@ -167,11 +166,11 @@ def checks_of(
         explained, explained_p = 0.0, 1.0
     if later * residuals.var() <= rounded:
         later, later_p = 0.0, 1.0
-    whole, unexplained = (float(v @ v) for v in (noise.whiten(y), noise.whiten(by_run)))
+    total, unexplained = (float(v @ v) for v in (noise.whiten(y), noise.whiten(by_run)))
     return Checks(
         explained_percent(residuals, np.concatenate(y)),
         explained_percent(noise.one_step_residuals(by_run), np.concatenate(y)),
-        _f_probability(whole - unexplained, unexplained, used, len(residuals) - used),
+        _f_probability(total - unexplained, unexplained, used, len(residuals) - used),
         white,
         explained_p,
         explained,
@@ -231,9 +230,8 @@ class RunNoises(NamedTuple):
         runs = len(self.times)
         waves = self.whiten([drift_columns(t / t[-1], i, runs).reshape(len(t), -1)
                             for i, t in enumerate(self.times)])  # fmt: skip
-        triangle = np.linalg.qr(
-            np.column_stack([orthonormal_basis(own), waves, residuals]), mode="r"
-        )
+        columns = np.column_stack([orthonormal_basis(own), waves, residuals])
+        triangle = np.linalg.qr(columns, mode="r")
         return waves[:, : runs * int(drift_bic(triangle, runs, len(residuals)).argmin())]
 
     def one_step_residuals(self, residuals: Sequence[np.ndarray]) -> np.ndarray:
@@ -277,9 +275,8 @@ def _score_tests(
         after = [u[np.clip(index + first + k, 0, len(u) - 1)] for k in range(LATER_LAGS)]
         later.append(np.concatenate(after, axis=1))
         quick.append(np.concatenate([*past, added], axis=1))
-    own, slow, quick, later = (
-        noise.whiten(part) for part in (own, further_responses(prepared), quick, later)
-    )
+    parts = own, further_responses(prepared), quick, later
+    own, slow, quick, later = map(noise.whiten, parts)
     white = noise.whiten(residuals)
     own = np.hstack([own, noise.drift(own, white)])
     basis = orthonormal_basis(own)
@@ -298,10 +295,8 @@ def further_lags(prepared: PreparedOutput) -> np.ndarray:
 
 def further_responses(prepared: PreparedOutput) -> list[np.ndarray]:
     """Outputs of further first-order paths of each input, shape (readings, paths), by run."""
-    return [
-        unit_responses(run, further_lags(prepared)[:, None])
-        for run in with_physics(prepared, FIRST_ORDER)
-    ]
+    lags = further_lags(prepared)[:, None]
+    return [unit_responses(run, lags) for run in with_physics(prepared, FIRST_ORDER)]
 
 
 def unit_responses(run: DrivenRun, shapes: np.ndarray) -> np.ndarray:
@@ -318,10 +313,10 @@ def _score_test(
     """
     new = orthonormal_basis(columns - basis @ (basis.T @ columns), np.linalg.norm(columns, axis=0))
     free = len(residuals) - basis.shape[1] - new.shape[1]
-    inside, whole = float(np.sum((new.T @ residuals) ** 2)), float(residuals @ residuals)
-    if free < 1 or not inside:
+    explained, total = float(np.sum((new.T @ residuals) ** 2)), float(residuals @ residuals)
+    if free < 1 or not explained:
         return 0.0, 1.0
-    return inside / whole, _f_probability(inside, whole - inside, new.shape[1], free)
+    return explained / total, _f_probability(explained, total - explained, new.shape[1], free)
 
 
 def digit_variance(prepared: PreparedOutput, rms: float) -> float:

@@ -278,14 +278,14 @@ def advance(
     u = jnp.clip(jnp.clip(plan[0], last - limits.rate, last + limits.rate), limits.low, limits.high)
     plan = plan.at[0].set(u)
     predicted_outputs = outputs(control, state, plan)
-    said = ControlPlan(
+    planned = ControlPlan(
         plan, predicted_outputs, jnp.max(_excess(control, predicted_outputs), axis=0)
     )
     x = tuple(advance_state(r, x, state.past, u, control.step)
               for r, x in zip(control.responses, state.x, strict=True))  # fmt: skip
     past = jnp.concatenate([state.past[1:], u[None]])
     shifted = jnp.concatenate([plan[1:], plan[-1:]])
-    return ControllerState(x, past, level, shifted), u, said
+    return ControllerState(x, past, level, shifted), u, planned
 
 
 def _excess(control: Controller, predicted_outputs: jax.Array) -> jax.Array:
@@ -597,10 +597,10 @@ def closed_loop(
         x, state = carry
         target, error, shift = now
         past, y = state.past, _present_outputs(control, x) + shift
-        state, u, said = advance(control, state, y + error, target)
+        state, u, planned = advance(control, state, y + error, target)
         x = tuple(advance_state(r, s, past, u, step, f)
                   for r, s, f in zip(responses, x, factors, strict=True))  # fmt: skip
-        return (x, state), Trace(y, y + error, u, said.beyond)
+        return (x, state), Trace(y, y + error, u, planned.beyond)
 
     state = start(control, inputs, _present_outputs(control, x) + load[0] + noise[0])
     series = tuple(jnp.asarray(v) for v in (targets, noise, load))
@@ -683,21 +683,21 @@ class Loop:
         c, rows = self.control, []
         for i, name in enumerate(c.inputs):
             ends = at_limits(self)[:, i]
-            said = _range(c.limits.low[i], c.limits.high[i])
+            limit = _range(c.limits.low[i], c.limits.high[i])
             recorded = np.concatenate([run.inputs[name] for run in self.fits[0].runs])
             if c.limits.low[i] < recorded.min() or c.limits.high[i] > recorded.max():
-                said += f" (the runs: {_range(recorded.min(), recorded.max())})"
-            rows.append([name, said, f"at it in {ends.sum()} of {len(ends)} steps"])
+                limit += f" (the runs: {_range(recorded.min(), recorded.max())})"
+            rows.append([name, limit, f"at it in {ends.sum()} of {len(ends)} steps"])
             if np.isfinite(c.limits.rate[i]):
-                said = f"{c.limits.rate[i] / c.step:.4g} a second"
+                limit = f"{c.limits.rate[i] / c.step:.4g} a second"
                 fast = at_max_rate(self)[:, i].sum()
-                rows.append([name, said, f"at it in {fast} of {len(ends)} steps"])
+                rows.append([name, limit, f"at it in {fast} of {len(ends)} steps"])
         for i, r in enumerate(c.responses):
             low, high = c.limits.below[i], c.limits.above[i]
             if np.isfinite([low, high]).any():
                 soft = int((self.trace.beyond[:, i] > LIMIT_TOLERANCE * r.size).sum())
-                said = f"{_range(low, high)}, held off by {r.margin:.2g}"
-                rows.append([r.name, said, f"soft in {soft} of {len(self.time)} steps"])
+                limit = f"{_range(low, high)}, held off by {r.margin:.2g}"
+                rows.append([r.name, limit, f"soft in {soft} of {len(self.time)} steps"])
         return ["", "limit", "used"], rows
 
     def to_json(self) -> dict[str, Any]:
@@ -721,8 +721,8 @@ def _range(low: float, high: float) -> str:
 def at_limits(loop: Loop) -> np.ndarray:
     """True for each input at one of its limits, shape (steps, m)."""
     c, u = loop.control, loop.trace.inputs
-    near = LIMIT_TOLERANCE * c.sizes
-    return (u <= c.limits.low + near) | (u >= c.limits.high - near)
+    tolerance = LIMIT_TOLERANCE * c.sizes
+    return (u <= c.limits.low + tolerance) | (u >= c.limits.high - tolerance)
 
 
 def at_max_rate(loop: Loop) -> np.ndarray:
@@ -840,8 +840,8 @@ def _changes(loop: Loop, load: np.ndarray) -> list[StepResponse]:
             error = trace.outputs[k:end, i] - wanted[k, i]
             step = float(aim[k])
             noise = float(np.mean(fit.noise))
-            near = max(SETTLING_BAND * abs(step or push[k]), noise)
-            off = np.flatnonzero(np.abs(error) > near)
+            band = max(SETTLING_BAND * abs(step or push[k]), noise)
+            off = np.flatnonzero(np.abs(error) > band)
             after = int(off[-1]) + 1 if off.size else 0
             settling = None if after >= len(error) else after * loop.control.step
             over = None
@@ -924,8 +924,10 @@ def _settles(loop: Loop) -> Finding | None:
 def _poor_model_remark(loop: Loop) -> str:
     """Sentence on models that their runs refute, for every verdict."""
     poor = [fit.output for fit in loop.fits if fit.status is Status.poor_fit]
-    said = f" But the model of {', '.join(poor)} does not explain its runs: see beamfit identify."
-    return said if poor else ""
+    sentence = (
+        f" But the model of {', '.join(poor)} does not explain its runs: see beamfit identify."
+    )
+    return sentence if poor else ""
 
 
 RULES = (_no_model, _passes_limit, _unsettled, _settles)

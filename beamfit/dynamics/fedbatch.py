@@ -263,8 +263,8 @@ def _at_bound(e: BatchEvidence) -> Finding | None:
 
 
 def _converged(e: BatchEvidence) -> Finding:
-    said = ", ".join(f"{name} {noise}" for name, noise in e.noise.items())
-    cause = f"The balances follow all batches within noise: {said}."
+    noises = ", ".join(f"{name} {noise}" for name, noise in e.noise.items())
+    cause = f"The balances follow all batches within noise: {noises}."
     never = sorted({c.input for c in e.curves if not c.visited.all()})
     more = f" Parts of the range of {', '.join(never)} were not visited." if never else ""
     return Finding(Status.converged, cause + more)
@@ -510,9 +510,8 @@ def _stretch_rates(model: Any, data: tuple[Batches, Any, Any]) -> jax.Array:
 def _match_stretches(model: Any, seen: PreparedBatches, parts: Sequence[Stretches]) -> Any:
     """Fit the rates of the model to those of the stretches."""
     x = pad_columns([x[:, :3] for x in _interpolated_readings(seen)], seen.batches.dt.shape[1])
-    weight = pad_columns(
-        [pad_columns(each.weight, x.shape[1], 0.0) for each in parts], STRETCHES, 0.0
-    )
+    weights = [pad_columns(each.weight, x.shape[1], 0.0) for each in parts]
+    weight = pad_columns(weights, STRETCHES, 0.0)
     rates = pad_columns([each.rates for each in parts], STRETCHES, 0.0)
     error = np.broadcast_to(FIRST_NOISE * rates.max(axis=(0, 1)), rates.shape)
     data = seen.batches, jnp.asarray(x), jnp.asarray(weight)
@@ -590,9 +589,8 @@ def search_rates(seen: PreparedBatches, model: Any) -> tuple[_RatesFit, bool]:
 
     # Proportional errors first: with equal errors small values would never count.
     floors = [np.percentile(y[y > 0], SCALE_PERCENTILE) for y in np.moveaxis(seen.measured, 2, 0)]
-    first = errors_of(
-        [ReadingNoise(FIRST_NOISE, FIRST_NOISE * floor) for floor in floors], seen.measured
-    )
+    noises = [ReadingNoise(FIRST_NOISE, FIRST_NOISE * floor) for floor in floors]
+    first = errors_of(noises, seen.measured)
     found, converged = repeat_search(
         search(model, first, np.full(len(names) - 1, BATCH_SPREAD)),
         lambda f: search(f.fit.model, f.error, f.spread),
@@ -633,9 +631,8 @@ def curves_of(fit: Fit, seen: PreparedBatches) -> tuple[Curve, ...]:
     for j in used:
         grid = np.tile(rows.mean(0), (CURVE_POINTS, 1))
         high = rows[:, j].max()
-        grid[:, j] = at = np.linspace(
-            max(rows[:, j].min(), MIN_SHARE_OF_END * high), high, CURVE_POINTS
-        )
+        low = max(rows[:, j].min(), MIN_SHARE_OF_END * high)
+        grid[:, j] = at = np.linspace(low, high, CURVE_POINTS)
         limits = np.where(np.arange(len(names)) == j, VISIT_DISTANCE, OTHER_DISTANCE)[used]
         distance = np.abs(rows[None, :, used] - grid[:, None, used]) / ranges[used]
         visited = np.sum(np.all(distance <= limits, axis=2), axis=1) >= MIN_VISITS

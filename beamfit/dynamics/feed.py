@@ -51,9 +51,12 @@ class FeedCourse(NamedTuple):
         above = np.flatnonzero(y >= titre)
         if not above.size or above[0] == 0:
             return Quantity(float("nan") if not above.size else float(self.time[0]), None, "h")
-        near = slice(above[0] - 1, above[0] + 1)
-        (slope,) = np.diff(y[near]) / np.diff(self.time[near])
-        at, error = (np.interp(titre, y[near], of[near]) for of in (self.time, self.error[TITRE]))
+        crossing = slice(above[0] - 1, above[0] + 1)
+        (slope,) = np.diff(y[crossing]) / np.diff(self.time[crossing])
+        at, error = (
+            np.interp(titre, y[crossing], values[crossing])
+            for values in (self.time, self.error[TITRE])
+        )
         return Quantity(float(at), float(error / slope), "h")
 
 

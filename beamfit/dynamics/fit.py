@@ -118,8 +118,8 @@ class ResponseFit:
     @property
     def headline(self) -> str:
         """The answer in one line."""
-        said = [f"{name} = {q}" for name, q in list(self.quantities.items())[:3]]
-        found = ", ".join(said) or f"{len(self.curves)} parameter curves"
+        quantities = [f"{name} = {q}" for name, q in list(self.quantities.items())[:3]]
+        found = ", ".join(quantities) or f"{len(self.curves)} parameter curves"
         return f"{self.output} {self.status}: {self.model}, {found}"
 
     @cached_property
@@ -333,9 +333,8 @@ class _Identification(NamedTuple):
         prepared, constant = found.prepared, self.map == "constant"
         _, _, paths, offset = self.search
         # A delay that was searched for counts as a number, as does a fitted fraction of one.
-        used = effective_parameters(noise_fit.fit) + (
-            not paths.given and not prepared.fraction_limits
-        )
+        used = effective_parameters(noise_fit.fit)
+        used += not paths.given and not prepared.fraction_limits
         gain = None if constant else found.noise_fit.cost - noise_fit.cost
         slopes = fuller_model_slopes(prepared, noise_fit.fit)
         checks = checks_of(found._replace(noise_fit=noise_fit), 0, slopes, used, gain)._replace(

@@ -163,10 +163,8 @@ def _weigh_shapes(
     slopes = noise_fit.slopes(path_fit.case)
     is_delay = np.array([v.name == "late" for v in noise_fit.fit.variables])
     is_delay &= np.any(np.concatenate(slopes), axis=0) & (noise_fit.errors is not None)
-    runs = [
-        replace(run, delay_fraction=run.delay_fraction + noise_fit.fit.model["late"])
-        for run in prepared.runs
-    ]
+    late = noise_fit.fit.model["late"]
+    runs = [replace(run, delay_fraction=run.delay_fraction + late) for run in prepared.runs]
     rows = []
     for i, (y, slope) in enumerate(zip(prepared.measured, slopes, strict=True)):
         own = np.column_stack([slope[:, is_delay], y])[:MAX_NOISE_READINGS]

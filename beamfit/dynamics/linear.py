@@ -191,8 +191,8 @@ def first_lag(u: list[np.ndarray], y: list[np.ndarray]) -> int:
     triangle = np.linalg.qr(np.hstack([outputs, inputs, now]), mode="r")
     # With lags of the inputs from 1, 2, … on, and without.
     used = outputs.shape[1] + m * np.arange(horizon, -1, -1)
-    missed = np.array([np.sum(triangle[n:, -k:] ** 2, axis=0) for n in used])
-    cost = len(now) * np.log(np.maximum(missed, TINY)).sum(axis=1)
+    squares = np.array([np.sum(triangle[n:, -k:] ** 2, axis=0) for n in used])
+    cost = len(now) * np.log(np.maximum(squares, TINY)).sum(axis=1)
     return 1 + int(np.argmin(cost + np.log(len(now)) * k * used)) % horizon
 
 
@@ -363,15 +363,13 @@ class StatesSearch(NamedTuple):
         delay, way = self.delay(runs), self.paths.ways[-1]
         tried = self.orders(runs, Path(None, Way(), delay))
         if delay != self.default_delay:
-            tried = self.try_path(
-                runs, tried, Path(None, Way(), self.default_delay), 2.0 * MIN_DELAY_GAIN
-            )
+            direct = Path(None, Way(), self.default_delay)
+            tried = self.try_path(runs, tried, direct, 2.0 * MIN_DELAY_GAIN)
         if way.standing:
             tried = self.try_path(runs, tried, tried[0].path_fit.path._replace(way=way), 0.0)
         constant = self.map == "constant"
-        return _OrderFits(
-            tried, [tried[0].path_fit] if constant else self.fit_networks(runs, tried[0])
-        )
+        best = tried[0]
+        return _OrderFits(tried, [best.path_fit] if constant else self.fit_networks(runs, best))
 
     def screen(self, runs: tuple[Run, ...]) -> _OrderFits:
         """Fit the given order, or a few states, with the delay of the first lag.
@@ -461,14 +459,12 @@ def criterion(tried: Sequence[PathFit], last: PathFit | None = None) -> list[flo
 def _residual_noise(case: Case, found: NoiseFit) -> CorrelatedNoise | None:
     """Correlated noise of residuals, None for white ones. Slopes are left out for speed."""
     rows = case.residual_rows(found.residuals, found.noise)
-    if not any(
-        remembers(rest / error, effective_parameters(found.fit)) for rest, error, *_ in rows
-    ):
+    used = effective_parameters(found.fit)
+    if not any(remembers(r / error, used) for r, error, *_ in rows):
         return None
-    scaled = [(rest / error)[:MAX_NOISE_READINGS, None] for rest, error, *_ in rows]
-    return noise_posterior(
-        scaled, [time[:MAX_NOISE_READINGS] for _, _, time, _ in rows], np.zeros((0, 1))
-    )[1]
+    scaled = [(r / error)[:MAX_NOISE_READINGS, None] for r, error, *_ in rows]
+    times = [time[:MAX_NOISE_READINGS] for _, _, time, _ in rows]
+    return noise_posterior(scaled, times, np.zeros((0, 1)))[1]
 
 
 def free_of(case: Case, order: int, offset: bool, direct: bool) -> tuple[Free, ...]:
@@ -733,9 +729,8 @@ def _quantities(
     step, quantities = float(course.dt[0]), {}
     inputs, outputs = list(runs[0].inputs), list(runs[0].outputs)
     numbers = _derive_jointly(fits, _quoted_values)
-    input_errors = [0.0] * (5 * n) + [
-        gain_error_share(runs, path.way, name) for name in inputs
-    ] * len(outputs)
+    shares = [gain_error_share(runs, path.way, name) for name in inputs]
+    input_errors = [0.0] * (5 * n) + shares * len(outputs)
     input_errors += [0.0] * (len(numbers.value) - len(input_errors))
     numbers = widen_errors(numbers, digit_covariance(fits[0]), np.array(input_errors))
     tau, modulus, zeta, pole, frequency = np.arange(5 * n).reshape(5, n)
@@ -817,8 +812,8 @@ def _matrices(fits: Sequence[PathFit], n: int) -> dict[str, Any]:
         read = _derive_jointly(fits, _output_state_matrices)
         ends = {"A": slice(n), "B": slice(n, None)}
         more["outputs_as_states"] = {
-            name + said: part[:, ends[name]] for name in ends
-            for said, part in (("", read.value), ("_error", read.error))
+            name + suffix: part[:, ends[name]] for name in ends
+            for suffix, part in (("", read.value), ("_error", read.error))
         }  # fmt: skip
     p = fits[0].noise_fit.fit.model["p"]
     a, b, c, d, _ = map(np.asarray, case.courses[0].system.matrices(p))

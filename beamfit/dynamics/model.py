@@ -179,8 +179,8 @@ def growth_columns(fitted: np.ndarray, time: np.ndarray) -> np.ndarray:
     2).
     """
     through = (time - time[0]) / (time[-1] - time[0]) - 0.5
-    late = -through * np.diff(fitted, prepend=fitted[0])
-    return np.stack([late, through * (fitted - fitted.mean())], axis=1)
+    delayed = -through * np.diff(fitted, prepend=fitted[0])
+    return np.stack([delayed, through * (fitted - fitted.mean())], axis=1)
 
 
 def curve_values(model: Any, data: tuple[DrivenRun, Any]) -> jax.Array:

@@ -159,9 +159,8 @@ def inputs_with_levels(runs: Sequence[Run]) -> tuple[str, ...]:
     def has_levels(u: np.ndarray) -> bool:
         levels = levels_of(u).at
         scatters = bool(np.ptp(levels) and np.any(u != levels))
-        return scatters and not is_correlated(
-            u - levels, np.unique(levels).size, SMOOTH_CORRELATION
-        )
+        used = np.unique(levels).size
+        return scatters and not is_correlated(u - levels, used, SMOOTH_CORRELATION)
 
     return tuple(
         name for name in runs[0].inputs if all(has_levels(run.inputs[name]) for run in runs)

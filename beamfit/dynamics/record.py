@@ -79,9 +79,9 @@ class Run:
         for name, values in {**self.inputs, **self.outputs}.items():
             if values.shape != (n,):
                 raise self.unusable(f"{len(values)} values of {name}", f"{n}, one a time")
-        late = np.flatnonzero(~(np.diff(self.time) > 0))
-        if late.size or not np.isfinite(self.time).all():
-            k = int(late[0]) + 1 if late.size else 0
+        bad = np.flatnonzero(~(np.diff(self.time) > 0))
+        if bad.size or not np.isfinite(self.time).all():
+            k = int(bad[0]) + 1 if bad.size else 0
             before = f" after {self.time[k - 1]:.10g} s" if k else ""
             raise self.unusable(f"time {self.time[k]:.10g} s{before}", "times that increase", k)
         for name, values in self.inputs.items():
@@ -130,8 +130,8 @@ def check_runs(
     first = runs[0]
     for run in (*runs, *held):
         if set(run.inputs) != set(first.inputs) or set(run.outputs) != set(first.outputs):
-            said = f"inputs {', '.join(run.inputs)} and outputs {', '.join(run.outputs)}"
-            raise run.unusable(said, f"those of {first.name}: {first.headline.partition(', ')[2]}")
+            found = f"inputs {', '.join(run.inputs)} and outputs {', '.join(run.outputs)}"
+            raise run.unusable(found, f"those of {first.name}: {first.headline.partition(', ')[2]}")
         if even and run.step is None:
             raise run.unusable("samples at unequal distances", "equal ones, or --model first-order")
         if even and not np.isclose(run.step, first.step, rtol=0.01):
@@ -145,8 +145,8 @@ def check_inputs(runs: tuple[Run, ...]) -> None:
     first = runs[0]
     for name in first.inputs:
         if all(np.ptp(run.inputs[name]) == 0 for run in runs):
-            said = f"input {name} at {runs[0].inputs[name][0]:g} all the time"
-            raise first.unusable(said, "an input that changes: a step at least")
+            found = f"input {name} at {runs[0].inputs[name][0]:g} all the time"
+            raise first.unusable(found, "an input that changes: a step at least")
 
 
 def band_limited(runs: Sequence[Run]) -> tuple[str, ...]:
@@ -155,12 +155,12 @@ def band_limited(runs: Sequence[Run]) -> tuple[str, ...]:
         return ()
     found = []
     for name in runs[0].inputs:
-        high = whole = 0.0
+        high = total = 0.0
         for run in runs:
             changes = np.diff(run.inputs[name])
             power = np.abs(np.fft.rfft(changes * np.hanning(len(changes)))) ** 2
-            high, whole = high + power[int(HIGH_BAND * len(power)) :].sum(), whole + power.sum()
-        found += [name] if high < MAX_HIGH_POWER * whole else []
+            high, total = high + power[int(HIGH_BAND * len(power)) :].sum(), total + power.sum()
+        found += [name] if high < MAX_HIGH_POWER * total else []
     return tuple(found)
 
 

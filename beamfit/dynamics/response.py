@@ -225,12 +225,12 @@ def response_at(
     [0.0, 1.8964, 2.594, 2.8506]
     """
     x0 = physics.begin(free, u[0])
-    late = jnp.minimum(fraction * mean_step(dt), dt)
-    first = x0 if physics.even else physics.advance(p[0], x0, u[0], late[0])
-    step = dt - late + jnp.append(late[1:], late[-1:])
+    delay = jnp.minimum(fraction * mean_step(dt), dt)
+    first = x0 if physics.even else physics.advance(p[0], x0, u[0], delay[0])
+    step = dt - delay + jnp.append(delay[1:], delay[-1:])
     x = affine_course(lambda x, p, *now: physics.advance(p, x, *now), first, p, u, step)[1]
     before = jnp.maximum(index - 1, 0)
-    y = jax.vmap(physics.advance)(p[before], x[before], u[before], (dt - late)[before])[:, 0]
+    y = jax.vmap(physics.advance)(p[before], x[before], u[before], (dt - delay)[before])[:, 0]
     return jnp.where(index == 0, x0[0], y)
 
 
@@ -272,13 +272,12 @@ def even_response(
     powers = [jnp.eye(n)]
     for _ in range(stride):
         powers.append(a @ powers[-1])
-    whole = jnp.concatenate([powers[k] @ b for k in range(stride - 1, -1, -1)], axis=1)
-    read = jnp.concatenate(
-        [*(last @ powers[k] @ b for k in range(stride - 2, -1, -1)), into], axis=1
-    )
+    to_state = jnp.concatenate([powers[k] @ b for k in range(stride - 1, -1, -1)], axis=1)
+    earlier = (last @ powers[k] @ b for k in range(stride - 2, -1, -1))
+    to_output = jnp.concatenate([*earlier, into], axis=1)
     blocks = u.reshape(-1, stride * m)
     # Drive of the state and of the next output.
-    drive = blocks @ jnp.concatenate([whole, read[:1]]).T
+    drive = blocks @ jnp.concatenate([to_state, to_output[:1]]).T
     system = Matrices(
         powers[stride],
         jnp.eye(n, n + 1),

@@ -78,11 +78,10 @@ def drift_bic(triangles: np.ndarray, runs: int, count: int, floor: float = TINY)
     `triangles` are triangular factors of the model's own columns, drifts by degree, and the `count`
     readings. The noise level is at its best, its sum of squares at least `floor`.
     """
-    used = (
-        triangles.shape[-1] - 1 - runs * MAX_DRIFT_DEGREE + runs * np.arange(MAX_DRIFT_DEGREE + 1)
-    )
-    missed = np.stack([np.sum(triangles[..., k:, -1] ** 2, axis=-1) for k in used], axis=-1)
-    return count * np.log(np.maximum(missed, floor)) + np.log(count) * used
+    own = triangles.shape[-1] - 1 - runs * MAX_DRIFT_DEGREE
+    used = own + runs * np.arange(MAX_DRIFT_DEGREE + 1)
+    squares = np.stack([np.sum(triangles[..., k:, -1] ** 2, axis=-1) for k in used], axis=-1)
+    return count * np.log(np.maximum(squares, floor)) + np.log(count) * used
 
 
 def orthonormal_basis(columns: np.ndarray, size: np.ndarray | None = None) -> np.ndarray:
@@ -145,10 +144,9 @@ class ResponseSearch(NamedTuple):
             shapes = np.exp(logarithms)
             if physics is ARX:
                 shapes = difference_coefficients(shapes, prepared.interval)
-            inputs_and_shapes = ([u[..., 0] for u in inputs], fraction), shapes
-            triangles = np.asarray(
-                _triangular_factors(drives, measured, *inputs_and_shapes, self.offset)
-            )
+            delayed = [u[..., 0] for u in inputs], fraction
+            factors = _triangular_factors(drives, measured, delayed, shapes, self.offset)
+            triangles = np.asarray(factors)
             costs = drift_bic(triangles, len(prepared.runs), count, floor)
             return costs.min(axis=2).argmin(axis=1), shapes, triangles, costs
 
@@ -199,9 +197,9 @@ class ResponseSearch(NamedTuple):
         found = min((each for each in tried if abs(each.path.delay) == shortest), key=cost)
         if fractions := self.paths.fractional_delays(found.path.delay):
             found = min([found, *self.starts(runs, physics, fractions)], key=cost)
-        return (
-            found if physics is self.physics else self.starts(runs, self.physics, [found.path])[0]
-        )
+        if physics is self.physics:
+            return found
+        return self.starts(runs, self.physics, [found.path])[0]
 
     def identify(self, runs: tuple[Run, ...]) -> PathFit:
         """Identify the response with constant parameters."""
@@ -282,10 +280,10 @@ def _triangular_factors(
     read = jnp.concatenate([jnp.arange(len(run.index)) < run.count for run in runs])[:, None]
     shared = jnp.concatenate(shared)
 
-    def one(asked):
-        (inputs, part), shapes = asked
+    def one(path):
+        (inputs, fraction), shapes = path
         delayed = [
-            replace(run, u=u, delay_fraction=part) for run, u in zip(runs, inputs, strict=True)
+            replace(run, u=u, delay_fraction=fraction) for run, u in zip(runs, inputs, strict=True)
         ]
         parts = [linear_columns(delayed, i, shapes, offset) for i in range(len(runs))]
         rows = jnp.concatenate(parts, axis=1)
@@ -529,16 +527,14 @@ class Case(NamedTuple):
         for i, course in enumerate(self.courses):
             y, data, predict = self.measured(i), course, predicted
             error = np.concatenate([each.each for each in noise[i]])
-            exact = all(
-                _is_exact(n, s.output_scale) for n, s in zip(noise[i], self.prepared, strict=True)
-            )
+            pairs = zip(noise[i], self.prepared, strict=True)
+            exact = all(_is_exact(n, s.output_scale) for n, s in pairs)
             if memory is not None:
                 y = innovations(y / error, np.asarray(course.time)[: len(y)], memory)[0]
                 data = course, jnp.asarray(pad_readings(course, error, 1.0)), jnp.asarray(memory)
                 error, predict = np.ones_like(y), _innovations_of
-            rows = [
-                pad_readings(course, *each) for each in ((y,), (error, 1.0), (np.ones_like(y),))
-            ]
+            values = (y,), (error, 1.0), (np.ones_like(y),)
+            rows = [pad_readings(course, *each) for each in values]
             if cuts:
                 gaps, predict = cuts * len(gap), _predict_with_gaps
                 gap_rows = np.zeros(gaps), np.tile(gap, cuts), np.ones(gaps)
@@ -547,9 +543,8 @@ class Case(NamedTuple):
             records.append(Record(f"run {i + 1}", predict, data, *rows, worth))
         free = [*self.free, *([Free("nodes", nuisance=True)] if cuts else [])]
         if "drift" in model:
-            end = np.where(
-                np.arange(MAX_DRIFT_DEGREE) < self.degree, np.inf, np.zeros_like(model["drift"])
-            )
+            is_free = np.arange(MAX_DRIFT_DEGREE) < self.degree
+            end = np.where(is_free, np.inf, np.zeros_like(model["drift"]))
             free.append(Free("drift", -end, end, nuisance=True))
         return Problem(model, free, records, self.priors)
 
@@ -564,11 +559,10 @@ class Case(NamedTuple):
         fit = solve(self.problem(model, noise, memory, gap), iterations=STEPS_PER_ROUND)
         residuals = self.residuals(fit.model)
         converged = fit.status not in (Status.not_finite, Status.not_converged)
-        found = NoiseFit(
-            fit, residuals, self.errors(residuals, memory), memory, None, np.inf, converged
-        )
-        minus = bic_of(self, found, memory)
-        return found._replace(cost=minus if np.isfinite(minus) else np.inf)
+        errors = self.errors(residuals, memory)
+        found = NoiseFit(fit, residuals, errors, memory, None, np.inf, converged)
+        cost = bic_of(self, found, memory)
+        return found._replace(cost=cost if np.isfinite(cost) else np.inf)
 
 
 class NoiseFit(NamedTuple):
@@ -638,9 +632,8 @@ class NoiseFit(NamedTuple):
         drift = np.array([name.startswith("drift[") for name in self.fit.problem.names])
         own, waves = rows[:, :-1][:, ~drift], rows[:, :-1][:, drift]
         without = waves @ self.fit.theta[drift] - rows[:, -1]  # readings less the response
-        waves = np.moveaxis(waves.reshape(len(rows), -1, MAX_DRIFT_DEGREE), 2, 1).reshape(
-            len(rows), -1
-        )
+        waves = np.moveaxis(waves.reshape(len(rows), -1, MAX_DRIFT_DEGREE), 2, 1)
+        waves = waves.reshape(len(rows), -1)
         columns = np.column_stack([orthonormal_basis(own), waves, without])
         more = max(0, columns.shape[1] - len(columns))
         triangle = np.linalg.qr(np.pad(columns, ((0, more), (0, 0))), mode="r")
@@ -683,10 +676,10 @@ def bic_of(
         rows = [(*(each[-n:] for each in row[:3]), row[3])
                 for row, n in zip(rows, lengths, strict=True)]  # fmt: skip
     cost = effective_parameters(found.fit) * np.log(sum(len(residuals) for residuals, *_ in rows))
-    return float(cost + sum(_minus_two_log_likelihood(*row, noise) for row in rows))
+    return float(cost + sum(_deviance(*row, noise) for row in rows))
 
 
-def _minus_two_log_likelihood(
+def _deviance(
     residuals: np.ndarray,
     error: np.ndarray,
     time: np.ndarray,
@@ -815,15 +808,14 @@ class PathFit(NamedTuple):
 
     def case_for(self, runs: Sequence[Run]) -> Case:
         """Prepare other runs for the same model and path."""
-        prepared = tuple(
-            prepare_output(runs, s.output, s.runs[0].physics, self.path) for s in self.case.prepared
-        )
-        courses = tuple(self.case.courses[0].like(prepared, i) for i in range(len(runs)))
-        return self.case._replace(prepared=prepared, courses=courses)
+        case = self.case
+        prepared = tuple(prepare_output(runs, s.output, s.runs[0].physics, self.path)
+                         for s in case.prepared)  # fmt: skip
+        courses = tuple(case.courses[0].like(prepared, i) for i in range(len(runs)))
+        return case._replace(prepared=prepared, courses=courses)
 
     def refit(self, runs: Sequence[Run]) -> PathFit:
         """Fit the same model to other runs, for one round."""
         case = self.case_for(runs)
-        return self._replace(
-            case=case, noise_fit=case.search(self.noise_fit.fit.model, case.initial_noise)
-        )
+        noise_fit = case.search(self.noise_fit.fit.model, case.initial_noise)
+        return self._replace(case=case, noise_fit=noise_fit)

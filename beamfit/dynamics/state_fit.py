@@ -144,9 +144,9 @@ def fit_with_drift(case: Case, models: Sequence[Any], path: Path = DIRECT_PATH) 
 
     All drifts are free in the first fit: a state that grows without limit could imitate a drift.
     """
-    whole = case._replace(degree=MAX_DRIFT_DEGREE)
-    first = fit_in_rounds(whole, [whole.with_best_drift(models[0])], 0)
-    case = case._replace(degree=first.drift_degree(whole))
+    drifting = case._replace(degree=MAX_DRIFT_DEGREE)
+    first = fit_in_rounds(drifting, [drifting.with_best_drift(models[0])], 0)
+    case = case._replace(degree=first.drift_degree(drifting))
     models = [case.with_best_drift(model) for model in (first.fit.model, *models)]
     return PathFit(case, path, fit_in_rounds(case, models))
 
@@ -223,8 +223,8 @@ class StatesFit:
     @property
     def headline(self) -> str:
         """The answer in one line."""
-        said = [f"{name} = {q}" for name, q in list(self.quantities.items())[:3]]
-        found = ", ".join([f"state space of order {self.order}", *said])
+        quantities = [f"{name} = {q}" for name, q in list(self.quantities.items())[:3]]
+        found = ", ".join([f"state space of order {self.order}", *quantities])
         return f"{self.output} {self.status}: {found}"
 
     @cached_property
@@ -348,9 +348,8 @@ def fit_states(
         return fit_with_drift(case, [_free_run(case, model, segments).fit.model])
 
     def answer(runs: tuple[Run, ...], found: PathFit, left_out: Any) -> StatesFit:
-        found = found._replace(
-            noise_fit=fit_correlated_noise(found.case, found.noise_fit, MAX_SQUARES_RATIO)
-        )
+        fit = fit_correlated_noise(found.case, found.noise_fit, MAX_SQUARES_RATIO)
+        found = found._replace(noise_fit=fit)
         options = {"held": held, "left_out": left_out, "map": "network" if nets else "constant"}
         return states_answer(found, runs, _parameter_quantities(found), **options)
 

@@ -210,16 +210,16 @@ def linear_outputs(system: Matrices, u: jax.Array, x0: jax.Array) -> tuple[jax.A
     a, b, c, d, offset = system
     count, (n, m), length = len(u), b.shape, min(BLOCK, max(len(u), 1))
     blocks = jnp.pad(u, ((0, -count % length), (0, 0))).reshape(-1, length * m)
-    whole, seen = jax.lax.scan(lambda q, _: (q @ a, q), jnp.eye(n), length=length)
-    into = seen @ b  # a^i b
-    late = jnp.arange(length)[:, None] - jnp.arange(length)
+    block_matrix, powers = jax.lax.scan(lambda q, _: (q @ a, q), jnp.eye(n), length=length)
+    from_input = powers @ b  # a^i b
+    lag = jnp.arange(length)[:, None] - jnp.arange(length)
     markov = jnp.where(
-        (late > 0)[..., None, None], (c @ into)[jnp.maximum(late - 1, 0)],
-        jnp.where((late == 0)[..., None, None], d, 0.0),
+        (lag > 0)[..., None, None], (c @ from_input)[jnp.maximum(lag - 1, 0)],
+        jnp.where((lag == 0)[..., None, None], d, 0.0),
     )  # fmt: skip
-    pushed = blocks @ jnp.moveaxis(into[::-1], 1, 2).reshape(length * m, n)
-    last, x = jax.lax.scan(lambda x, new: (whole @ x + new, x), x0, pushed)
+    pushed = blocks @ jnp.moveaxis(from_input[::-1], 1, 2).reshape(length * m, n)
+    last, x = jax.lax.scan(lambda x, new: (block_matrix @ x + new, x), x0, pushed)
     forced = blocks @ markov.transpose(1, 3, 0, 2).reshape(length * m, -1)
-    free = x @ (c @ seen).transpose(2, 0, 1).reshape(n, -1)
+    free = x @ (c @ powers).transpose(2, 0, 1).reshape(n, -1)
     y = (forced + free).reshape(-1, len(c))[:count] + offset
     return y, last

@@ -315,19 +315,21 @@ class TuningFit(Judged):
     @property
     def units(self) -> dict[str, str]:
         """Units of the knobs as written in messages; "" where the name contains it."""
-        known = {**SETTING_UNITS, KNOB: ""}
-        return {n: known[u] for n, u in zip(self.knobs.names, self.knobs.units, strict=True)}
+        names = {**SETTING_UNITS, KNOB: ""}
+        return {n: names[u] for n, u in zip(self.knobs.names, self.knobs.units, strict=True)}
 
     @property
     def notes(self) -> tuple[str, ...]:
         """Sentences on the file, bad readings, and rows beyond the limits."""
         outside = (np.abs(self.knobs.half_ranges(self.scan.settings)) > 1.0).any(axis=1).sum()
-        said = [f"{outside} of {len(self.scan)} rows are beyond the limits."] if outside else []
+        sentences = (
+            [f"{outside} of {len(self.scan)} rows are beyond the limits."] if outside else []
+        )
         for plane, m in self.maps.items():
             bad = np.flatnonzero(np.asarray(m.posterior.bad) > 0.5)
             rows = ", ".join(str(m.readings.rows[i] + 1) for i in bad)
-            said += [f"Bad readings in {plane}: rows {rows}."] if rows else []
-        return (*self.scan.notes, *said)
+            sentences += [f"Bad readings in {plane}: rows {rows}."] if rows else []
+        return (*self.scan.notes, *sentences)
 
     def beam(self, settings: Mapping[str, Any]) -> dict[str, dict[str, TuningBand]]:
         """Predict the beam at settings of the knobs, with its band.
