@@ -380,11 +380,10 @@ class Comparison(NamedTuple):
         )
         drives = readings.drives
         errors = [noise.each[:MAX_READINGS] for (noise,) in found.noise_fit.noise]
+        each = zip(drives, readings.measured, prepared.time, errors, strict=True)
         data = [
             (pad_readings(drive, y), time[:MAX_READINGS], pad_readings(drive, error, np.inf))
-            for drive, y, time, error in zip(
-                drives, readings.measured, prepared.time, errors, strict=True
-            )
+            for drive, y, time, error in each
         ]
         departures, columns = _further_terms(found, slopes)
         terms = [
@@ -401,18 +400,9 @@ class Comparison(NamedTuple):
         begin = np.append(fit.theta[: len(numbers)], 0.0)
         model = core.model | {"late": jnp.zeros(())}
         return cls(
-            runs,
-            readings,
-            data,
-            paths.rows_per_sample,
-            chosen,
-            model,
-            begin,
-            prior_indices,
-            grid,
-            terms,
-            departures,
-        )
+            runs, readings, data, paths.rows_per_sample, chosen, model, begin, prior_indices, grid,
+            terms, departures,
+        )  # fmt: skip
 
     def weigh(self, trials: list[Trial]) -> _TrialPosterior:
         """Weigh trials by their evidence.
@@ -504,11 +494,8 @@ def _law_trials(comparison: Comparison, own: Path, paths: Paths) -> list[Trial]:
     laws = [law for name in runs[0].inputs for law in _nonlinear_laws(runs, name, paths.movable)]
     per_kind = Counter(law.kind for law in laws)
     log_prior = {law: -np.log(len(per_kind) * per_kind[law.kind]) for law in laws}
-    return [
-        Trial(way._replace(law=law), paths.log_prior(way) + log_prior[law])
-        for law in laws
-        for way in ways
-    ]
+    return [Trial(way._replace(law=law), paths.log_prior(way) + log_prior[law])
+            for law in laws for way in ways]  # fmt: skip
 
 
 def _nonlinear_laws(runs: Sequence[Run], name: str, way: Way) -> list[InputLaw]:

@@ -215,14 +215,8 @@ def open_undetermined(
         lower_order = checks.first_order and not name.startswith(("K", "offset", "tau1", "delay"))
         # A number at the end of its range has no slope there.
         at_end = name != "delay" and q.error == 0
-        return (
-            no_response
-            or (infinite and grows)
-            or vanishes
-            or lower_order
-            or at_end
-            or name in inseparable
-        )
+        flags = no_response, infinite and grows, vanishes, lower_order, at_end, name in inseparable
+        return any(flags)
 
     kept = {n: q.open() if is_open(n, q) else q for n, q in quantities.items()
              if infinite or not n.endswith("/tau")}  # fmt: skip

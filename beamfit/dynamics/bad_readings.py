@@ -10,7 +10,7 @@ import numpy as np
 from scipy.ndimage import median_filter
 from scipy.special import expit
 
-from beamfit.dynamics.model import EXACT_TOLERANCE, PreparedOutput
+from beamfit.dynamics.model import PreparedOutput
 from beamfit.dynamics.paths import usable_rows
 from beamfit.dynamics.record import MIN_READINGS, Run
 from beamfit.dynamics.search import JITTER_PENALTY, PathFit, jitter_scales
@@ -189,7 +189,7 @@ def _outliers(prepared: PreparedOutput, residuals: Sequence[np.ndarray]) -> list
     ones.
     """
     digit = digit_of(np.concatenate(prepared.measured)) or 0.0
-    floor, found = np.hypot(EXACT_TOLERANCE * prepared.output_scale, digit / np.sqrt(12.0)), []
+    floor, found = np.hypot(prepared.floor, digit / np.sqrt(12.0)), []
     equal_series = _equal_series(prepared, residuals)
     each = zip(prepared.measured, residuals, prepared.time, equal_series, strict=True)
     for y, r, time, equal in each:

@@ -9,7 +9,6 @@ import numpy as np
 from scipy.special import chdtrc, fdtrc
 
 from beamfit.dynamics.model import (
-    EXACT_TOLERANCE,
     DrivenRun,
     PreparedOutput,
     operating_point_slopes,
@@ -18,7 +17,7 @@ from beamfit.dynamics.record import Run, Way
 from beamfit.dynamics.response import FIRST_ORDER
 from beamfit.dynamics.search import (
     PathFit,
-    drift_bic,
+    best_drift_degree,
     drift_columns,
     orthonormal_basis,
     unit_outputs,
@@ -109,11 +108,9 @@ class Checks(NamedTuple):
             ["free run explains", f"{self.free_run_percent:.2f} %"],
             ["one step ahead", f"{self.one_step_percent:.2f} %"],
             ["residuals white", f"p = {self.white_probability:.2g}"],
-            [
-                "residuals explained",
-                f"{100 * self.input_share:.1f} %, p = {self.input_probability:.2g}",
-            ],
         ]
+        explained = f"{100 * self.input_share:.1f} %, p = {self.input_probability:.2g}"
+        rows.append(["residuals explained", explained])
         if self.against_constant is not None:
             rows.append(["BIC below constant", f"{self.against_constant:.1f}"])
         return rows
@@ -158,7 +155,7 @@ def checks_of(
     (explained, explained_p), (later, later_p) = tests
     white = _ljung_box([r / error for r, error in zip(by_run, noise.errors, strict=True)])
     # Such small residuals are rounding, or the detail of a network.
-    if residuals.std() <= EXACT_TOLERANCE * prepared.output_scale:
+    if residuals.std() <= prepared.floor:
         explained, explained_p, later, later_p, white = 0.0, 1.0, 0.0, 1.0, 1.0
     # What is explained may be no more than the rounding of the readings.
     rounded = digit_variance(prepared, residuals.std())
@@ -224,15 +221,11 @@ class RunNoises(NamedTuple):
         ])  # fmt: skip
 
     def drift(self, own: np.ndarray, residuals: np.ndarray) -> np.ndarray:
-        """Choose drift columns by the information criterion, given whitened slopes and
-        residuals.
-        """
+        """Choose drift columns, given whitened slopes and residuals."""
         runs = len(self.times)
         waves = self.whiten([drift_columns(t / t[-1], i, runs).reshape(len(t), -1)
                             for i, t in enumerate(self.times)])  # fmt: skip
-        columns = np.column_stack([orthonormal_basis(own), waves, residuals])
-        triangle = np.linalg.qr(columns, mode="r")
-        return waves[:, : runs * int(drift_bic(triangle, runs, len(residuals)).argmin())]
+        return waves[:, : runs * best_drift_degree(own, waves, residuals)]
 
     def one_step_residuals(self, residuals: Sequence[np.ndarray]) -> np.ndarray:
         """Residuals of predictions from the previous readings."""
@@ -340,7 +333,7 @@ def digit_covariance(path_fit: PathFit) -> np.ndarray:
     covariance = np.zeros((own[0].shape[1],) * 2)
     if not any(variances):
         return covariance
-    noise = np.maximum(rms, [EXACT_TOLERANCE * s.output_scale for s in case.prepared])
+    noise = np.maximum(rms, [s.floor for s in case.prepared])
     weight = np.repeat(1.0 / noise, list(map(len, own)))
     inverse = np.linalg.pinv(weight[:, None] * np.concatenate(own))
     each = np.split((inverse * weight).T, np.cumsum(list(map(len, own)))[:-1])

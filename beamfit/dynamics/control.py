@@ -226,11 +226,9 @@ def delayed_inputs(response: Response, past: jax.Array, plan: jax.Array) -> jax.
     fraction, first = steps - response.delay, len(past) - steps
     inputs = jnp.concatenate([past, plan])
     delayed = inputs[first : first + len(plan)]
-    return (
-        delayed
-        if not fraction
-        else delayed + fraction * jnp.diff(inputs, axis=0)[first : first + len(plan)]
-    )
+    if not fraction:
+        return delayed
+    return delayed + fraction * jnp.diff(inputs, axis=0)[first : first + len(plan)]
 
 
 def advance_state(
@@ -321,11 +319,8 @@ def _cost(
     predicted_outputs = outputs(control, state, plan)
     change = jnp.diff(plan, axis=0, prepend=state.past[-1:]) / control.sizes
     penalty = LIMIT_PENALTY * jnp.sum(_excess(control, predicted_outputs) / size)
-    return (
-        jnp.sum(((predicted_outputs - target) / size) ** 2)
-        + control.smooth * jnp.sum(change**2)
-        + penalty
-    )
+    error = (predicted_outputs - target) / size
+    return jnp.sum(error**2) + control.smooth * jnp.sum(change**2) + penalty
 
 
 def _quadratic_plan(

@@ -351,11 +351,8 @@ class _Identification(NamedTuple):
         input_errors = [gain_error_share(runs, found.path.way, name) for name in prepared.inputs]
         lags = lag_posterior(found, offset)
         step = float(mean_step(prepared.runs[0].dt))
-        delay_error = (
-            alternatives.delay_error * prepared.rows_per_sample * step
-            if alternatives is not None
-            else 0.0
-        )
+        delay_error = 0.0 if alternatives is None else alternatives.delay_error
+        delay_error *= prepared.rows_per_sample * step
         quantities = response_quantities(
             found, alternatives, delay_error, lags, digit_covariance(found), input_errors
         )

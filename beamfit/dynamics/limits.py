@@ -141,11 +141,8 @@ def _evidence_at(
         other = np.linspace(low, high, SECOND_LAGS)
         time = np.exp(0.5 * (lag + other))
         shapes = np.stack([time, np.cosh(0.5 * (lag - other))], axis=-1).reshape(-1, 2)
-        shapes = (
-            difference_coefficients(shapes, path_fit.prepared.interval)
-            if physics is ARX
-            else shapes
-        )
+        if physics is ARX:
+            shapes = difference_coefficients(shapes, path_fit.prepared.interval)
         *each, dof = _weigh_shapes(path_fit, offset, shapes)
         each = [one.reshape(SECOND_LAGS, len(lag), *one.shape[1:]) for one in each]
         best = each[0].argmax(axis=0)

@@ -102,6 +102,11 @@ class PreparedOutput(NamedTuple):
         return np.concatenate([np.asarray(run.u)[run.read] for run in self.runs])
 
     @property
+    def floor(self) -> float:
+        """Error of a reading below which a fit counts as exact."""
+        return EXACT_TOLERANCE * self.output_scale
+
+    @property
     def interval(self) -> float:
         """Shortest median time between readings of any run, s."""
         return min(float(np.median(np.diff(t))) for t in self.time)

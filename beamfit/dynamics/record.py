@@ -282,11 +282,8 @@ def interpolate_inputs(run: Run, way: Way, rows_per_sample: int) -> np.ndarray:
             slope, rows = (u[-1] - u[0]) / (len(u) - 1), np.arange(len(u))
             swing = u - u[0] - slope * rows
             mirrored = np.concatenate([swing, -swing[-2:0:-1]])
-            fine = (
-                2
-                * rows_per_sample
-                * np.fft.irfft(np.fft.rfft(mirrored), 2 * rows_per_sample * len(mirrored))
-            )
+            factor = 2 * rows_per_sample
+            fine = factor * np.fft.irfft(np.fft.rfft(mirrored), factor * len(mirrored))
             line = u[0] + slope * np.add.outer(rows, middles).ravel()
             columns.append(line + fine[1 : 2 * rows_per_sample * len(u) : 2])
         elif name in way.ramping:

@@ -21,7 +21,6 @@ import numpy as np
 
 from beamfit.arrays import Array, array_module
 from beamfit.dynamics.model import (
-    EXACT_TOLERANCE,
     DrivenRun,
     PreparedOutput,
     pad_readings,
@@ -94,6 +93,18 @@ def orthonormal_basis(columns: np.ndarray, size: np.ndarray | None = None) -> np
     return found[:, values > 1e-6]
 
 
+def best_drift_degree(own: np.ndarray, waves: np.ndarray, target: np.ndarray) -> int:
+    """Choose the degree of drifts by the information criterion, given a model's own columns.
+
+    `waves` are the drift columns by degree, those of all runs together, `target` the data; all are
+    whitened.
+    """
+    columns = np.column_stack([orthonormal_basis(own), waves, target])
+    missing = max(0, columns.shape[1] - len(columns))
+    triangle = np.linalg.qr(np.pad(columns, ((0, missing), (0, 0))), mode="r")
+    return int(drift_bic(triangle, waves.shape[1] // MAX_DRIFT_DEGREE, len(target)).argmin())
+
+
 class Start(NamedTuple):
     """A path, the model that a search starts from, and its information criterion with the best
     drift.
@@ -136,7 +147,7 @@ class ResponseSearch(NamedTuple):
         axes += [np.log(GRID_DAMPINGS)] if physics is not FIRST_ORDER else []
         spacing = np.array([axis[1] - axis[0] for axis in axes])
         count = sum(map(len, prepared.measured))
-        floor = count * (EXACT_TOLERANCE * prepared.output_scale) ** 2
+        floor = count * prepared.floor**2
         fine = np.array([*product(*(np.linspace(-1.0, 1.0, len(axis)) for axis in axes))])
         grid = np.tile([*product(*axes)], (len(paths), 1, 1))
 
@@ -431,13 +442,8 @@ class Case(NamedTuple):
     @property
     def initial_noise(self) -> Noises:
         """Errors of the readings before the first fit: a tenth of each output's scatter."""
-        return tuple(
-            tuple(
-                ReadingErrors(np.full(len(s.measured[i]), 0.1 * s.output_scale))
-                for s in self.prepared
-            )
-            for i in range(len(self.courses))
-        )
+        return tuple(tuple(ReadingErrors(np.full(len(s.measured[i]), 0.1 * s.output_scale))
+                           for s in self.prepared) for i in range(len(self.courses)))  # fmt: skip
 
     def measured(self, i: int) -> np.ndarray:
         """Readings of a run, one output after the other."""
@@ -457,21 +463,17 @@ class Case(NamedTuple):
     def errors(self, residuals: Any, memory: CorrelatedNoise | None) -> Noises:
         """Estimate the errors of the readings from residuals."""
         return tuple(
-            tuple(
-                reading_errors(
-                    r, s.measured[i] - r, s.time[i], EXACT_TOLERANCE * s.output_scale, memory
-                )
-                for r, s in zip(row, self.prepared, strict=True)
-            )
+            tuple(reading_errors(r, s.measured[i] - r, s.time[i], s.floor, memory)
+                  for r, s in zip(row, self.prepared, strict=True))
             for i, row in enumerate(residuals)
-        )
+        )  # fmt: skip
 
     def residual_rows(
         self, residuals: Any, noise: Noises
     ) -> list[tuple[np.ndarray, np.ndarray, np.ndarray, float]]:
         """List residuals, errors, times and the floor of the errors, for each run and output."""
         return [
-            (r, n.each, s.time[i], EXACT_TOLERANCE * s.output_scale)
+            (r, n.each, s.time[i], s.floor)
             for i, row in enumerate(residuals)
             for r, n, s in zip(row, noise[i], self.prepared, strict=True)
         ]
@@ -528,7 +530,7 @@ class Case(NamedTuple):
             y, data, predict = self.measured(i), course, predicted
             error = np.concatenate([each.each for each in noise[i]])
             pairs = zip(noise[i], self.prepared, strict=True)
-            exact = all(_is_exact(n, s.output_scale) for n, s in pairs)
+            exact = all(_is_exact(n, s.floor) for n, s in pairs)
             if memory is not None:
                 y = innovations(y / error, np.asarray(course.time)[: len(y)], memory)[0]
                 data = course, jnp.asarray(pad_readings(course, error, 1.0)), jnp.asarray(memory)
@@ -617,31 +619,24 @@ class NoiseFit(NamedTuple):
         return noise_posterior(rows, time, prior_rows, noise)
 
     def drift_degree(self, case: Case) -> int:
-        """Choose the degree of the drifts by the information criterion, all drifts being free in
-        the fit.
+        """Choose the degree of the drifts, which are all free in the fit.
 
         Correlated noise counts as such: a random wander is no drift.
         """
-        memory = (
-            self.estimate_noise(case, max_readings=MAX_NOISE_READINGS)[1]
-            if self.is_correlated(case)
-            else None
-        )
+        memory = None
+        if self.is_correlated(case):
+            memory = self.estimate_noise(case, max_readings=MAX_NOISE_READINGS)[1]
         white = [whiten(*each, memory)[0] for each in self.linear_rows(case)]
         rows = np.concatenate(white)
         drift = np.array([name.startswith("drift[") for name in self.fit.problem.names])
         own, waves = rows[:, :-1][:, ~drift], rows[:, :-1][:, drift]
         without = waves @ self.fit.theta[drift] - rows[:, -1]  # readings less the response
         waves = np.moveaxis(waves.reshape(len(rows), -1, MAX_DRIFT_DEGREE), 2, 1)
-        waves = waves.reshape(len(rows), -1)
-        columns = np.column_stack([orthonormal_basis(own), waves, without])
-        more = max(0, columns.shape[1] - len(columns))
-        triangle = np.linalg.qr(np.pad(columns, ((0, more), (0, 0))), mode="r")
-        return int(drift_bic(triangle, waves.shape[1] // MAX_DRIFT_DEGREE, len(rows)).argmin())
+        return best_drift_degree(own, waves.reshape(len(rows), -1), without)
 
     def is_exact(self, case: Case) -> bool:
         """True if the model explains all outputs up to rounding."""
-        return all(_is_exact(n, s.output_scale) for row in self.noise
+        return all(_is_exact(n, s.floor) for row in self.noise
                    for n, s in zip(row, case.prepared, strict=True))  # fmt: skip
 
     def is_correlated(self, case: Case) -> bool:
@@ -655,8 +650,8 @@ class NoiseFit(NamedTuple):
         return np.array([[float(np.sqrt(np.mean(r**2))) for r in row] for row in self.residuals])
 
 
-def _is_exact(noise: ReadingErrors, output_scale: float) -> bool:
-    return bool(noise.each.max() <= 1.001 * EXACT_TOLERANCE * output_scale)
+def _is_exact(noise: ReadingErrors, floor: float) -> bool:
+    return bool(noise.each.max() <= 1.001 * floor)
 
 
 def effective_parameters(fit: Fit) -> int:

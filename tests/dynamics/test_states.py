@@ -205,7 +205,7 @@ def test_an_order_is_worth_what_it_adds_to_what_readings_before_foretell():
     """Three orders miss by as much; misses of the second are told from those before, mostly."""
     n = 400
     time = np.arange(n, dtype=float)
-    case = Case((SimpleNamespace(time=(time,), output_scale=1.0, measured=(time,)),), (), (), ())
+    case = Case((SimpleNamespace(time=(time,), floor=2e-4, measured=(time,)),), (), (), ())
 
     def missed(share, used):
         rest = lfilter([1.0], [1.0, -share], np.random.default_rng(1).normal(size=n))
