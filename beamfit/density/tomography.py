@@ -374,8 +374,8 @@ class _Posterior(NamedTuple):
         return root, float(0.5 * white @ white + np.log(np.diag(root)).sum() + 0.5 * z @ z)
 
     def _loss(self, numbers: np.ndarray) -> tuple[float, np.ndarray]:
-        """Give minus ln of evidence times prior, and its gradient (Rasmussen and Williams, 2006,
-        eq. 5.9).
+        """Minus ln of evidence times prior, and its gradient (Rasmussen and Williams, 2006, eq.
+        5.9).
         """
         try:
             root, loss = self._factorise(numbers)

@@ -34,7 +34,7 @@ from beamfit.dynamics.paths import Path, Paths, PreparedReadings, inputs_by_path
 from beamfit.dynamics.record import Run, Way
 from beamfit.dynamics.response import ARX
 from beamfit.dynamics.search import (
-    PathFit,
+    RunsFit,
     drift_columns,
     noise_grid,
     orthonormal_basis,
@@ -112,9 +112,7 @@ GROWTH_DEPARTURES = [Departure("a delay", GROWTH), Departure("a gain", GROWTH)]
 
 
 class Trial(NamedTuple):
-    """A path, the logarithm of its prior, and the index of a further term of the response if
-    any.
-    """
+    """A path, its log prior, and the index of a further term of the response if any."""
 
     path: Path
     prior: float
@@ -251,9 +249,7 @@ class _Batch(NamedTuple):
         return best, np.minimum(lowest, next_deviance.min(axis=0))
 
     def weigh(self, begin: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Give each trial's log evidence, and mean and covariance of its numbers, over all
-        noises.
-        """
+        """Log evidence of each trial, and mean and covariance of its numbers, over all noises."""
         (at, _), grid = self.fit(begin, FINAL_ROUNDS), len(self.comparison.grid)
         likelihood, mean, spread, _ = average_over_noises(self.whiten(at, range(grid)), grid)
         return likelihood, at + mean, spread
@@ -262,9 +258,7 @@ class _Batch(NamedTuple):
 def repeat_for_noises(
     noises: Sequence[CorrelatedNoise], triangles: np.ndarray, volume: np.ndarray, count: int
 ) -> Whitened:
-    """Flatten triangles of shape (noises, trials, rows, columns) to one axis, with the noise of
-    each.
-    """
+    """Flatten triangles of shape (noises, trials, rows, columns) to one axis."""
     trials = triangles.shape[1]
     noise = CorrelatedNoise(*np.repeat(np.array(noises).T, trials, axis=1))
     each = triangles.reshape(-1, *triangles.shape[2:])
@@ -330,9 +324,7 @@ class _TrialPosterior(NamedTuple):
         return np.array([not trial.is_departure for trial in self.trials])
 
     def delay_moments(self, about: float) -> tuple[float, float]:
-        """Give the rms of the delay about a value, in samples, and the probability that it is
-        negative.
-        """
+        """Rms of the delay about a value, in samples, and probability that it is negative."""
         paths = [trial.path for trial in self.trials]
         delays, width = np.array([(path.delay, path.width) for path in paths]).T
         shift = delays + width * self.numbers[:, -1] - about
@@ -370,16 +362,16 @@ class Comparison(NamedTuple):
 
     @classmethod
     def prepare(
-        cls, runs: tuple[Run, ...], found: PathFit, paths: Paths, slopes: Sequence[np.ndarray]
+        cls, runs: tuple[Run, ...], found: RunsFit, paths: Paths, slopes: Sequence[np.ndarray]
     ) -> Comparison:
         """Prepare a fit; `slopes` are those of `fuller_model_slopes`."""
-        prepared, fit = found.prepared, found.noise_fit.fit
+        prepared, fit = found.prepared, found.fit
         physics, delay = prepared.runs[0].physics, found.path.delay
         readings = prepare_readings(
             runs, prepared.output, physics, paths.rows_per_sample, delay, MAX_READINGS
         )
         drives = readings.drives
-        errors = [noise.each[:MAX_READINGS] for (noise,) in found.noise_fit.noise]
+        errors = [noise.each[:MAX_READINGS] for (noise,) in found.noise]
         each = zip(drives, readings.measured, prepared.time, errors, strict=True)
         data = [
             (pad_readings(drive, y), time[:MAX_READINGS], pad_readings(drive, error, np.inf))
@@ -425,9 +417,7 @@ class Comparison(NamedTuple):
     def _batches(
         self, trials: list[Trial], begin: np.ndarray
     ) -> Iterator[tuple[_Batch, np.ndarray]]:
-        """Split trials and their start numbers into full batches; the last trial fills the last
-        batch.
-        """
+        """Split trials and their start numbers into batches; the last trial fills the last one."""
         more = -len(trials) % TRIALS_PER_BATCH
         trials, begin = trials + trials[-1:] * more, np.pad(begin, ((0, more), (0, 0)), mode="edge")
         for k in range(0, len(trials), TRIALS_PER_BATCH):
@@ -442,7 +432,7 @@ class Comparison(NamedTuple):
 
 def alternatives_of(
     runs: tuple[Run, ...],
-    found: PathFit,
+    found: RunsFit,
     paths: Paths,
     slopes: Sequence[np.ndarray],
     departures: bool,
@@ -531,9 +521,7 @@ def _nonlinear_laws(runs: Sequence[Run], name: str, way: Way) -> list[InputLaw]:
 
 
 def _refine_laws(comparison: Comparison, posterior: _TrialPosterior) -> _TrialPosterior:
-    """Replace the most probable static laws by ones in finer steps of width and place,
-    `REFINEMENTS` times.
-    """
+    """Replace the most probable static laws by ones in finer steps, `REFINEMENTS` times."""
     for _ in range(REFINEMENTS):
         best, kept = posterior.best_static_laws().values(), np.ones(len(posterior.trials), bool)
         trials: list[Trial] = []
@@ -582,7 +570,7 @@ def _name_departure(posterior: _TrialPosterior, names: Sequence[Departure]) -> D
 
 
 def _further_terms(
-    found: PathFit, slopes: Sequence[np.ndarray]
+    found: RunsFit, slopes: Sequence[np.ndarray]
 ) -> tuple[list[Departure], list[np.ndarray]]:
     """Further terms that a fuller response may have, and their columns by run.
 
@@ -593,7 +581,7 @@ def _further_terms(
     """
     prepared = found.prepared
     (lags, further), (names, changing) = _lag_terms(found), _parameter_terms(prepared, slopes)
-    residuals = found.noise_fit.residuals
+    residuals = found.residuals
     fitted = (y - row[0] for y, row in zip(prepared.measured, residuals, strict=True))
     growing = (growth_columns(y, t) for y, t in zip(fitted, prepared.time, strict=True))
     by_run = [np.hstack(columns) for columns in zip(further, changing, growing, strict=True)]
@@ -603,13 +591,13 @@ def _further_terms(
     return lags + names + GROWTH_DEPARTURES, np.split(columns - drift @ (drift.T @ columns), ends)
 
 
-def _lag_terms(found: PathFit) -> tuple[list[Departure], list[np.ndarray]]:
+def _lag_terms(found: RunsFit) -> tuple[list[Departure], list[np.ndarray]]:
     """Further lags of the inputs, and their columns by run.
 
     A part of the gain follows the further lag instead of the response, so that the output at rest
     stays the same.
     """
-    prepared, model = found.prepared, found.noise_fit.fit.model
+    prepared, model = found.prepared, found.fit.model
     names = [Departure(f"a further lag of about {lag:.2g} s of {name}", FURTHER)
              for lag in further_lags(prepared) for name in prepared.inputs]  # fmt: skip
     shape, slow = shape_parameters(prepared, model), further_responses(prepared)

@@ -18,7 +18,7 @@ from beamfit.dynamics.input_laws import STATIC
 from beamfit.dynamics.limits import LagPosterior
 from beamfit.dynamics.model import PreparedOutput, curve_values
 from beamfit.dynamics.response import ARX, FIRST_ORDER, SECOND_ORDER, Physics, mean_step
-from beamfit.dynamics.search import MAX_NOISE_READINGS, PathFit
+from beamfit.dynamics.search import MAX_NOISE_READINGS, RunsFit
 from beamfit.errors import Finding, Status
 from beamfit.greybox.fit import Derived, Fit
 from beamfit.greybox.judge import gauges, together
@@ -104,7 +104,7 @@ def _quoted_values(model: Any, data: tuple[Any, float]) -> jax.Array:
 
 
 def response_quantities(
-    path_fit: PathFit,
+    runs_fit: RunsFit,
     alternatives: Alternatives | None,
     delay_error: float,
     lags: LagPosterior,
@@ -118,7 +118,7 @@ def response_quantities(
     free numbers by the digits of the output; `input_errors` the relative error of each input's gain
     from the errors of its levels.
     """
-    prepared, fit, noise = path_fit.prepared, path_fit.noise_fit.fit, path_fit.noise_fit.errors
+    prepared, fit, noise = runs_fit.prepared, runs_fit.fit, runs_fit.errors
     physics, m = prepared.runs[0].physics, len(prepared.inputs)
     found = derive_quantities(fit, noise, _quoted_values, (prepared.runs[0], prepared.delay))
     gains = FIRST_ORDER.parameters(prepared.inputs)[1:]
@@ -302,9 +302,7 @@ class ResponseEvidence(NamedTuple):
 
 
 def judge_outputs(found: Mapping[str, ResponseEvidence]) -> tuple[Status, str]:
-    """Judge several outputs of one model: status and sentences of the first rule that any
-    breaks.
-    """
+    """Judge several outputs of one model by the first rule that any of them breaks."""
     for rule in RULES:
         findings = {name: f for name, e in found.items() if (f := rule(e)) is not None}
         texts = {f.message: [n for n in findings if findings[n].message == f.message]

@@ -13,7 +13,7 @@ from scipy.special import expit
 from beamfit.dynamics.model import PreparedOutput
 from beamfit.dynamics.paths import usable_rows
 from beamfit.dynamics.record import MIN_READINGS, Run
-from beamfit.dynamics.search import JITTER_PENALTY, PathFit, jitter_scales
+from beamfit.dynamics.search import JITTER_PENALTY, RunsFit, jitter_scales
 from beamfit.errors import Status
 from beamfit.noise.digits import digit_of
 from beamfit.noise.model import Noise
@@ -56,7 +56,7 @@ Masks = tuple[np.ndarray, ...]
 def answer_without_bad_readings(
     runs: Runs,
     searches: Sequence[Callable[[Runs], F]],
-    fit_of: Callable[[F], PathFit],
+    fit_of: Callable[[F], RunsFit],
     answer: Callable[[Runs, F, tuple[BadReadings, ...]], A],
 ) -> A:
     """Answer from runs without bad readings.
@@ -73,11 +73,9 @@ def answer_without_bad_readings(
 
 
 def _exclude_bad_readings(
-    runs: Runs, searches: Sequence[Callable[[Runs], F]], fit_of: Callable[[F], PathFit]
+    runs: Runs, searches: Sequence[Callable[[Runs], F]], fit_of: Callable[[F], RunsFit]
 ) -> tuple[Runs, F, tuple[BadReadings, ...]]:
-    """Remove bad readings; return the runs, the fit of the others, and descriptions of the bad
-    ones.
-    """
+    """Remove bad readings; return the runs, their fit, and descriptions of the bad readings."""
     kept, masks = runs, _empty_masks(runs)
     for search in searches:
         fit = search(kept)
@@ -99,7 +97,7 @@ def _exclude_bad_readings(
     return kept, fit, left_out
 
 
-def _exclude_outliers(runs: Runs, fit: PathFit, masks: Masks) -> tuple[Runs | None, Masks]:
+def _exclude_outliers(runs: Runs, fit: RunsFit, masks: Masks) -> tuple[Runs | None, Masks]:
     """Remove readings far off a fit of the others; return the runs and the masks.
 
     Each round judges all readings, so that one missed by a worse fit returns.
@@ -144,12 +142,12 @@ def _same_masks(one: Masks, other: Masks) -> bool:
 
 def _mask_readings(
     runs: Runs,
-    fit: PathFit,
+    fit: RunsFit,
     judge: Callable[[PreparedOutput, Sequence[np.ndarray]], list[np.ndarray]],
 ) -> Masks:
     """Judge the readings of runs against a fit of some of them."""
-    case, masks = fit.case_for(runs), _empty_masks(runs)
-    residuals = case.residuals(fit.noise_fit.fit.model)
+    case, masks = fit.case.for_runs(runs), _empty_masks(runs)
+    residuals = case.residuals(fit.fit.model)
     for k, prepared in enumerate(case.prepared):
         for i, mask in enumerate(judge(prepared, [row[k] for row in residuals])):
             masks[i][usable_rows(runs[i], prepared.output, fit.path.delay), k] = mask
@@ -185,9 +183,7 @@ def _describe(runs: Runs, masks: Masks, what: str) -> tuple[BadReadings, ...]:
 
 
 def _outliers(prepared: PreparedOutput, residuals: Sequence[np.ndarray]) -> list[np.ndarray]:
-    """Mark readings that are off beyond the noise by clear odds and not in a series of equal
-    ones.
-    """
+    """Mark readings that are off by clear odds and not in a series of equal ones."""
     digit = digit_of(np.concatenate(prepared.measured)) or 0.0
     floor, found = np.hypot(prepared.floor, digit / np.sqrt(12.0)), []
     equal_series = _equal_series(prepared, residuals)

@@ -104,9 +104,7 @@ class Batches:
 
 
 class PreparedBatches(NamedTuple):
-    """Batches with readings `measured` and mask `read`, shape (batches, rows, outputs), and times,
-    h.
-    """
+    """Batches with readings and their mask, shape (batches, rows, outputs), and times, h."""
 
     batches: Batches
     measured: np.ndarray

@@ -16,7 +16,7 @@ from beamfit.dynamics.model import (
 from beamfit.dynamics.record import Run, Way
 from beamfit.dynamics.response import FIRST_ORDER
 from beamfit.dynamics.search import (
-    PathFit,
+    RunsFit,
     best_drift_degree,
     drift_columns,
     orthonormal_basis,
@@ -135,16 +135,16 @@ def explained_percent(residuals: np.ndarray, y: np.ndarray) -> float:
 
 
 def checks_of(
-    path_fit: PathFit, k: int, changing: Sequence[np.ndarray], used: int, gain: float | None = None
+    found: RunsFit, k: int, changing: Sequence[np.ndarray], used: int, gain: float | None = None
 ) -> Checks:
     """Test the residuals of output k in all runs together.
 
     `changing` are the slopes of each run's output by the terms of fuller models, `used` is the
     number of fitted numbers, `gain` the fall of the information criterion from constant parameters.
     """
-    (case, path, found), prepared = path_fit, path_fit.case.prepared[k]
+    case, prepared = found.case, found.case.prepared[k]
     by_run = tuple(row[k] for row in found.residuals)
-    own = [case.split(i, slopes)[k] for i, slopes in enumerate(found.slopes(case))]
+    own = [case.split(i, slopes)[k] for i, slopes in enumerate(found.slopes())]
     jitter, memory = max(row[k].jitter for row in found.noise), found.errors and found.errors.noise
     errors = [row[k].each for row in found.noise]
     noise = RunNoises(prepared.time, errors, memory, prepared.rows_per_sample if jitter else 0)
@@ -175,7 +175,7 @@ def checks_of(
         later,
         gain,
         _inseparable_inputs(prepared),
-        way=path.way,
+        way=found.path.way,
         jitter=jitter,
         drift=case.degree,
     )
@@ -301,9 +301,7 @@ def unit_responses(run: DrivenRun, shapes: np.ndarray) -> np.ndarray:
 def _score_test(
     residuals: np.ndarray, basis: np.ndarray, columns: np.ndarray
 ) -> tuple[float, float]:
-    """Share of the sum of squares that columns explain beyond a basis, and its probability (F
-    test).
-    """
+    """Share of the sum of squares that columns explain beyond a basis, and its probability."""
     new = orthonormal_basis(columns - basis @ (basis.T @ columns), np.linalg.norm(columns, axis=0))
     free = len(residuals) - basis.shape[1] - new.shape[1]
     explained, total = float(np.sum((new.T @ residuals) ** 2)), float(residuals @ residuals)
@@ -320,15 +318,15 @@ def digit_variance(prepared: PreparedOutput, rms: float) -> float:
     return rounding_variance(digit, max(rms**2 - digit**2 / 12, 0.0) ** 0.5)
 
 
-def digit_covariance(path_fit: PathFit) -> np.ndarray:
+def digit_covariance(found: RunsFit) -> np.ndarray:
     """Covariance of a fit's free numbers by the digits of its outputs.
 
     Readings of one value have the same rounding error, so that many are worth no more than one.
     """
-    case, slopes = path_fit.case, path_fit.noise_fit.slopes(path_fit.case)
+    case, slopes = found.case, found.slopes()
     parts = zip(*(case.split(i, each) for i, each in enumerate(slopes)), strict=True)
     own = [np.concatenate(part) for part in parts]  # by output
-    rms = np.sqrt(np.mean(path_fit.noise_fit.rms**2, axis=0))
+    rms = np.sqrt(np.mean(found.rms**2, axis=0))
     variances = [digit_variance(s, float(r)) for s, r in zip(case.prepared, rms, strict=True)]
     covariance = np.zeros((own[0].shape[1],) * 2)
     if not any(variances):
@@ -345,20 +343,15 @@ def digit_covariance(path_fit: PathFit) -> np.ndarray:
     return covariance
 
 
-def predict_runs(path_fit: PathFit, runs: Sequence[Run]) -> dict[str, tuple[HeldOutRun, ...]]:
+def predict_runs(found: RunsFit, runs: Sequence[Run]) -> dict[str, tuple[HeldOutRun, ...]]:
     """Predict held-out runs, by output."""
-    predictions: dict[str, list[HeldOutRun]] = {
-        prepared.output: [] for prepared in path_fit.case.prepared
-    }
+    predictions: dict[str, list[HeldOutRun]] = {s.output: [] for s in found.case.prepared}
     for run in runs:
-        case = path_fit.case_for((run,))
-        for prepared, residuals in zip(
-            case.prepared, case.predict_held_out(path_fit.noise_fit), strict=True
-        ):
+        case = found.case.for_runs((run,))
+        for prepared, residuals in zip(case.prepared, case.predict_held_out(found), strict=True):
+            percent = explained_percent(residuals, prepared.measured[0])
             rms = float(np.sqrt(np.mean(residuals**2)))
-            predictions[prepared.output].append(
-                HeldOutRun(run.name, explained_percent(residuals, prepared.measured[0]), rms)
-            )
+            predictions[prepared.output].append(HeldOutRun(run.name, percent, rms))
     return {name: tuple(each) for name, each in predictions.items()}
 
 

@@ -118,9 +118,7 @@ def problem_of(
 def network_of(
     names: Sequence[str], points: np.ndarray, outputs: Sequence[str], hidden: int, seed: int
 ) -> MLP:
-    """Make a network of points (n, names) with small random weights that starts at typical
-    rates.
-    """
+    """Make a network of points (n, names) with small random weights and typical rates."""
     ports = [Port(n, "", 0, float(s) or 1.0, float(m))
              for n, s, m in zip(names, points.std(0), points.mean(0), strict=True)]  # fmt: skip
     outputs = [Port(name, "", 0, 1.0, float(logit(0.5 / BOUND_FACTOR))) for name in outputs]
@@ -158,9 +156,7 @@ def predict_batch(model: Any, data: tuple[Batches, Mapping[str, Any]]) -> jax.Ar
 def forecast(
     fit: Fit, b: Batches, start: Mapping[str, Any], spread: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Predict a typical batch, and the errors of a batch that differs from it, shape (1, rows,
-    outputs).
-    """
+    """Predict a typical batch, with errors of one that differs, shape (1, rows, outputs)."""
     typical = jnp.zeros((1, len(spread)))
     found = fit.derive(predict_batch, (b, {**start, "own": typical}))
     slope = jax.jacfwd(lambda own: predict_batch(fit.model, (b, {**start, "own": own})))(typical)

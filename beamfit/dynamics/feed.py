@@ -44,9 +44,7 @@ class FeedCourse(NamedTuple):
     error: dict[str, np.ndarray]
 
     def length(self, titre: float) -> Quantity:
-        """Give the time until a titre is reached, h, with its error; undetermined if it is never
-        reached.
-        """
+        """Time until a titre is reached, h, with its error; undetermined if it never is."""
         y = self.value[TITRE]
         above = np.flatnonzero(y >= titre)
         if not above.size or above[0] == 0:

@@ -38,9 +38,8 @@ from beamfit.dynamics.paths import Paths, max_delay, usable_rows
 from beamfit.dynamics.record import MIN_READINGS, Run, check_inputs, check_runs, gain_error_share
 from beamfit.dynamics.response import PHYSICS, mean_step
 from beamfit.dynamics.search import (
-    NoiseFit,
-    PathFit,
     ResponseSearch,
+    RunsFit,
     effective_parameters,
     fit_case,
     response_case,
@@ -220,7 +219,7 @@ def identify(
         raise InputError(f"map '{map}'", nearest(map, list(MAPS)))
     runs, held = check_runs(runs, held, PHYSICS[model].even)
     check_inputs(runs)
-    output = _output(runs[0], output)
+    output = _choose_output(runs[0], output)
     shortest = min(len(run) for run in runs)
     if (
         delay is not None
@@ -237,16 +236,14 @@ def identify(
 
 
 class _Trial(NamedTuple):
-    """Fit with constant parameters, and for a network its alternatives and the fit of the
-    network.
-    """
+    """Fit with constants, and for a network the alternatives and the network's fit."""
 
-    constant: PathFit
+    constant: RunsFit
     alternatives: Alternatives | None = None
-    network: PathFit | None = None
+    network: RunsFit | None = None
 
     @property
-    def fit(self) -> PathFit:
+    def fit(self) -> RunsFit:
         """The fit of the map that was asked for."""
         return self.network or self.constant
 
@@ -261,9 +258,7 @@ class _Identification(NamedTuple):
     held: tuple[Run, ...]
 
     def search_runs(self, runs: tuple[Run, ...]) -> _Trial:
-        """Fit the runs for the judgement of readings; constants would miss good ones of a
-        network.
-        """
+        """Fit for the judgement of readings; constants would miss good ones of a network."""
         found = self.search.identify(runs)
         if self.map == "constant":
             return _Trial(found)
@@ -279,70 +274,69 @@ class _Identification(NamedTuple):
         if network is None:
             found, alternatives = self.most_probable(runs, found)
         best = network or found
-        fit, delay = best.noise_fit, best.delay
-        checks, quantities, curves = self.evaluate(runs, found, fit, alternatives)
+        checks, quantities, curves = self.evaluate(runs, found, best, alternatives)
         predictions = predict_runs(best, self.held)[output]
-        rms = float(np.sqrt(np.mean(fit.rms**2)))
+        rms, delay = float(np.sqrt(np.mean(best.rms**2))), best.delay
         status, message = judge_outputs({output: ResponseEvidence(
-            fit.fit, fit.converged, checks, quantities, curves, predictions, self.map, rms,
+            best.fit, best.converged, checks, quantities, curves, predictions, self.map, rms,
             0.0 if paths.given else _lead(best, alternatives, quantities),
         )})  # fmt: skip
         quantities, curves = remove_errors_if_wrong(status, quantities, curves)
         message = add_remarks(message, not paths.given and delay == max_delay(runs) > 0, left_out)
         delay = int(delay) if delay == int(delay) else delay
         return ResponseFit(
-            output, status, message, physics.name, self.map, delay, runs, found.prepared, fit.fit,
-            quantities, curves, tuple(fit.rms[:, 0].tolist()), fit.memory, checks, predictions,
+            output, status, message, physics.name, self.map, delay, runs, found.prepared, best.fit,
+            quantities, curves, tuple(best.rms[:, 0].tolist()), best.memory, checks, predictions,
             left_out,
         )  # fmt: skip
 
     def most_probable(
-        self, runs: tuple[Run, ...], found: PathFit
-    ) -> tuple[PathFit, Alternatives | None]:
+        self, runs: tuple[Run, ...], found: RunsFit
+    ) -> tuple[RunsFit, Alternatives | None]:
         """Fit the most probable path without a law; return the fit and its alternatives."""
         for remaining in reversed(range(MAX_PATH_SEARCHES)):
-            if found.noise_fit.is_exact(found.case):
+            if found.is_exact():
                 return found, None
-            slopes = fuller_model_slopes(found.prepared, found.noise_fit.fit)
+            slopes = fuller_model_slopes(found.prepared, found.fit)
             departures = self.map == "constant"
             alternatives = alternatives_of(runs, found, self.search.paths, slopes, departures)
             if alternatives.path == found.path or not remaining:
                 break
-            found = self.search.identify_path(runs, alternatives.path, found.noise_fit.fit.model)
+            found = self.search.identify_path(runs, alternatives.path, found.fit.model)
         return found, alternatives
 
-    def fit_network(self, found: PathFit) -> PathFit:
+    def fit_network(self, found: RunsFit) -> RunsFit:
         """Fit a network of parameters, starting from the constant ones."""
-        prepared, first = found.prepared, found.noise_fit.fit.model
+        prepared, first = found.prepared, found.fit.model
         physics, raw = self.search.physics, np.asarray(first["map"])
         nets = (network_of(prepared, physics, raw, self.hidden, seed) for seed in self.seeds)
-        case = response_case(prepared, self.search.offset, True)
-        models = [first | {"map": net} for net in nets]
-        return found._replace(case=case, noise_fit=fit_case(case, models))
+        case = response_case(prepared, found.path, self.search.offset, True)
+        return fit_case(case, [first | {"map": net} for net in nets])
 
     def evaluate(
         self,
         runs: tuple[Run, ...],
-        found: PathFit,
-        noise_fit: NoiseFit,
+        found: RunsFit,
+        best: RunsFit,
         alternatives: Alternatives | None,
     ) -> tuple[Checks, dict[str, Quantity], tuple[Curve, ...]]:
-        """Test the residuals; give the constants or curves with errors where the runs determine
-        them.
+        """Test the residuals; give the constants or curves with errors where determined.
+
+        `found` is the fit with constants, `best` that with the map that was asked for.
         """
         prepared, constant = found.prepared, self.map == "constant"
         _, _, paths, offset = self.search
         # A delay that was searched for counts as a number, as does a fitted fraction of one.
-        used = effective_parameters(noise_fit.fit)
+        used = effective_parameters(best.fit)
         used += not paths.given and not prepared.fraction_limits
-        gain = None if constant else found.noise_fit.cost - noise_fit.cost
-        slopes = fuller_model_slopes(prepared, noise_fit.fit)
-        checks = checks_of(found._replace(noise_fit=noise_fit), 0, slopes, used, gain)._replace(
+        gain = None if constant else found.cost - best.cost
+        slopes = fuller_model_slopes(prepared, best.fit)
+        checks = checks_of(best, 0, slopes, used, gain)._replace(
             first_order=constant and self.search.is_first_order(runs, found),
             band_limited=() if found.path.way.moving else paths.movable.smooth,
         )
         if not constant:
-            curves = curves_of(noise_fit.fit, noise_fit.errors, prepared)
+            curves = curves_of(best.fit, best.errors, prepared)
             return checks, *open_undetermined({}, curves, prepared, checks)
         if alternatives is not None and alternatives.departure.probability > 0.5:
             words, kind, chance = alternatives.departure
@@ -362,7 +356,7 @@ class _Identification(NamedTuple):
 
 
 def _lead(
-    found: PathFit, alternatives: Alternatives | None, quantities: Mapping[str, Quantity]
+    found: RunsFit, alternatives: Alternatives | None, quantities: Mapping[str, Quantity]
 ) -> float:
     """Samples by which the output moves before its inputs; 0 unless that is likely.
 
@@ -380,7 +374,7 @@ def _lead(
     return max(-found.delay, 0.0) if leads else 0.0
 
 
-def _output(run: Run, output: str | None) -> str:
+def _choose_output(run: Run, output: str | None) -> str:
     names = list(run.outputs)
     if output is not None and output not in names:
         raise InputError(f"no output '{output}'", nearest(output, names))

@@ -107,9 +107,7 @@ class InputLaw(NamedTuple):
         return np.stack([at, 0.5 * (wider - closer)], axis=1)
 
     def widened(self, change: float) -> InputLaw:
-        """Widen the law by `change` steps; a dead zone that reaches an end of the range is a
-        saturation.
-        """
+        """Widen by `change` steps; a dead zone that reaches an end becomes a saturation."""
         law = self._replace(width=self.width * float(np.exp(change * self.step)))
         ends = law.place - law.width, law.place + law.width
         if law.kind == "dead zone" and ends[1] >= law.high > ends[0] > law.low:

@@ -24,7 +24,7 @@ from beamfit.dynamics.alternatives import (
 from beamfit.dynamics.response import ARX, FIRST_ORDER
 from beamfit.dynamics.search import (
     MAX_NOISE_READINGS,
-    PathFit,
+    RunsFit,
     difference_coefficients,
     linear_columns,
     noise_grid,
@@ -104,46 +104,46 @@ class LagPosterior(NamedTuple):
         return 0.0 if zero else low, np.inf if infinite else high
 
 
-def lag_posterior(path_fit: PathFit, offset: bool) -> LagPosterior:
+def lag_posterior(runs_fit: RunsFit, offset: bool) -> LagPosterior:
     """Compute the posterior over the longest lag.
 
     Further rounds add lags of a first order where the posterior lies. A higher order has its other
     lag at its best value. Linear numbers, the fraction of a sample in the delay, and the noise are
     integrated out. `MAX_NOISE_READINGS` readings of each run count.
     """
-    prepared = path_fit.prepared
+    prepared = runs_fit.prepared
     lag_limits = np.log(np.multiply(LAG_RANGE, (prepared.interval, prepared.duration)))
-    fitted = shape_parameters(prepared, path_fit.noise_fit.fit.model)
+    fitted = shape_parameters(prepared, runs_fit.fit.model)
     first_order = prepared.runs[0].physics is FIRST_ORDER
     grid = np.linspace(*lag_limits, GRID_LAGS)
     if first_order:
         grid[1:] = np.sort(np.append(grid[2:], np.clip(np.log(fitted), *lag_limits)))
-    found = LagPosterior(grid, *_evidence_at(path_fit, offset, grid, lag_limits[0]))
+    found = LagPosterior(grid, *_evidence_at(runs_fit, offset, grid, lag_limits[0]))
     for _ in range(REFINEMENTS if first_order else 0):
         grid = found.quantiles((np.arange(GRID_LAGS) + 0.5) / GRID_LAGS)
-        added = grid, *_evidence_at(path_fit, offset, grid, lag_limits[0])[:3]
+        added = grid, *_evidence_at(runs_fit, offset, grid, lag_limits[0])[:3]
         joined = [np.concatenate(pair) for pair in zip(found[:4], added, strict=True)]
         order = np.unique(joined[0], return_index=True)[1]
         found = LagPosterior(*(each[order] for each in joined), found.dof)
-    at_fit = found.log if first_order else _weigh_shapes(path_fit, offset, fitted[None])[0]
+    at_fit = found.log if first_order else _weigh_shapes(runs_fit, offset, fitted[None])[0]
     return found._replace(best=max(found.log.max(), at_fit.max()))
 
 
 def _evidence_at(
-    path_fit: PathFit, offset: bool, lag: np.ndarray, shortest: float
+    runs_fit: RunsFit, offset: bool, lag: np.ndarray, shortest: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
     """Give log evidence, gains, their errors and the degrees of freedom at logarithms of lags."""
-    physics = path_fit.prepared.runs[0].physics
+    physics = runs_fit.prepared.runs[0].physics
     if physics is FIRST_ORDER:
-        return _weigh_shapes(path_fit, offset, np.exp(lag)[:, None])
+        return _weigh_shapes(runs_fit, offset, np.exp(lag)[:, None])
     low, high, every = np.full(len(lag), shortest), lag, np.arange(len(lag))
     for _ in range(SECOND_LAG_ROUNDS):
         other = np.linspace(low, high, SECOND_LAGS)
         time = np.exp(0.5 * (lag + other))
         shapes = np.stack([time, np.cosh(0.5 * (lag - other))], axis=-1).reshape(-1, 2)
         if physics is ARX:
-            shapes = difference_coefficients(shapes, path_fit.prepared.interval)
-        *each, dof = _weigh_shapes(path_fit, offset, shapes)
+            shapes = difference_coefficients(shapes, runs_fit.prepared.interval)
+        *each, dof = _weigh_shapes(runs_fit, offset, shapes)
         each = [one.reshape(SECOND_LAGS, len(lag), *one.shape[1:]) for one in each]
         best = each[0].argmax(axis=0)
         low = other[np.maximum(best - 1, 0), every]
@@ -153,27 +153,26 @@ def _evidence_at(
 
 
 def _weigh_shapes(
-    path_fit: PathFit, offset: bool, shapes: np.ndarray
+    runs_fit: RunsFit, offset: bool, shapes: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
     """Give the same as `_evidence_at` for shapes as of `unit_outputs`."""
-    prepared, noise_fit = path_fit.prepared, path_fit.noise_fit
-    slopes = noise_fit.slopes(path_fit.case)
-    is_delay = np.array([v.name == "late" for v in noise_fit.fit.variables])
-    is_delay &= np.any(np.concatenate(slopes), axis=0) & (noise_fit.errors is not None)
-    late = noise_fit.fit.model["late"]
+    prepared, slopes = runs_fit.prepared, runs_fit.slopes()
+    is_delay = np.array([v.name == "late" for v in runs_fit.fit.variables])
+    is_delay &= np.any(np.concatenate(slopes), axis=0) & (runs_fit.errors is not None)
+    late = runs_fit.fit.model["late"]
     runs = [replace(run, delay_fraction=run.delay_fraction + late) for run in prepared.runs]
     rows = []
     for i, (y, slope) in enumerate(zip(prepared.measured, slopes, strict=True)):
         own = np.column_stack([slope[:, is_delay], y])[:MAX_NOISE_READINGS]
         columns = np.asarray(linear_columns(runs, i, jnp.asarray(shapes), offset))[:, : len(own)]
         own = np.broadcast_to(own, (len(shapes), *own.shape))
-        each = noise_fit.noise[i][0].each[:MAX_NOISE_READINGS, None]
+        each = runs_fit.noise[i][0].each[:MAX_NOISE_READINGS, None]
         rows.append(np.concatenate([columns, own], axis=2) / each)
     prior = np.zeros((0, rows[0].shape[2]))
     if is_delay.any():
         prior = np.eye(rows[0].shape[2])[-2:-1]
         prior /= np.minimum(
-            DELAY_RANGE * noise_fit.errors.moments(np.eye(len(is_delay))[is_delay]).error,
+            DELAY_RANGE * runs_fit.errors.moments(np.eye(len(is_delay))[is_delay]).error,
             ROW_DEVIATION,
         )
     rows.append(np.broadcast_to(prior, (len(shapes), *prior.shape)))

@@ -38,8 +38,7 @@ from beamfit.dynamics.search import (
     MIN_DELAY_GAIN,
     TINY,
     Case,
-    NoiseFit,
-    PathFit,
+    RunsFit,
     bic_of,
     drift_polynomials,
     effective_parameters,
@@ -48,7 +47,6 @@ from beamfit.dynamics.search import (
     noise_posterior,
 )
 from beamfit.dynamics.state_fit import (
-    DIRECT_PATH,
     MAX_SQUARES_RATIO,
     Course,
     StatesFit,
@@ -301,7 +299,7 @@ class TriedOrder(NamedTuple):
 
     order: int
     direct: bool
-    path_fit: PathFit
+    runs_fit: RunsFit
     bic: float = np.nan
 
 
@@ -322,7 +320,7 @@ class _OrderFits(NamedTuple):
     """Orders that were tried, the best first, and the probable fits."""
 
     tried: tuple[TriedOrder, ...]
-    fits: list[PathFit]
+    fits: list[RunsFit]
 
 
 class StatesSearch(NamedTuple):
@@ -346,9 +344,7 @@ class StatesSearch(NamedTuple):
         return min(self.paths.delays, key=abs)
 
     def delay(self, runs: tuple[Run, ...]) -> float:
-        """Delay in samples from the first lag of the inputs; 0 for smooth inputs, whose lags are
-        alike.
-        """
+        """Delay in samples from the first lag of the inputs; 0 for smooth inputs."""
         if self.paths.given or band_limited(runs):
             return self.default_delay
         case = states_case(runs, LINEAR, (), (), Path(None, self.paths.ways[-1], 0.0))
@@ -366,10 +362,10 @@ class StatesSearch(NamedTuple):
             direct = Path(None, Way(), self.default_delay)
             tried = self.try_path(runs, tried, direct, 2.0 * MIN_DELAY_GAIN)
         if way.standing:
-            tried = self.try_path(runs, tried, tried[0].path_fit.path._replace(way=way), 0.0)
+            tried = self.try_path(runs, tried, tried[0].runs_fit.path._replace(way=way), 0.0)
         constant = self.map == "constant"
         best = tried[0]
-        return _OrderFits(tried, [best.path_fit] if constant else self.fit_networks(runs, best))
+        return _OrderFits(tried, [best.runs_fit] if constant else self.fit_networks(runs, best))
 
     def screen(self, runs: tuple[Run, ...]) -> _OrderFits:
         """Fit the given order, or a few states, with the delay of the first lag.
@@ -379,15 +375,15 @@ class StatesSearch(NamedTuple):
         path = Path(None, Way(), self.delay(runs))
         case = states_case(runs, LINEAR, (), (), path)
         n = self.order or min(SCREENING_ORDER, largest_order(case))
-        return _OrderFits((), [_try_order(case, path, n, self.offset, True, None).path_fit])
+        return _OrderFits((), [_try_order(case, n, self.offset, True, None).runs_fit])
 
     def try_path(
         self, runs: tuple[Run, ...], tried: tuple[TriedOrder, ...], path: Path, margin: float
     ) -> tuple[TriedOrder, ...]:
         """Fit orders by another path, unless the best tried one is better by `margin`."""
         best, case = tried[0], states_case(runs, LINEAR, (), (), path)
-        rival = _try_order(case, path, best.order, self.offset, best.direct, None)
-        best_bic, other_bic = criterion([best.path_fit, rival.path_fit], best.path_fit)
+        rival = _try_order(case, best.order, self.offset, best.direct, None)
+        best_bic, other_bic = criterion([best.runs_fit, rival.runs_fit], best.runs_fit)
         return self.orders(runs, path) if other_bic < best_bic + margin else tried
 
     def orders(self, runs: tuple[Run, ...], path: Path) -> tuple[TriedOrder, ...]:
@@ -400,43 +396,39 @@ class StatesSearch(NamedTuple):
         largest = min(MAX_ORDER, largest_order(case))
         for n in [self.order] if self.order else range(1, largest + 1):
             before = tried[-1] if tried else None
-            tried.append(_try_order(case, path, n, self.offset, True, before))
-            bics = criterion([each.path_fit for each in tried])
+            tried.append(_try_order(case, n, self.offset, True, before))
+            bics = criterion([each.runs_fit for each in tried])
             if n - tried[int(np.argmin(bics))].order >= MAX_WORSE_ORDERS:
                 break
         best, last = tried[int(np.argmin(bics))], tried[-1]
-        model = best.path_fit.noise_fit.fit.model
+        model = best.runs_fit.fit.model
         p = model["p"] | {"d": model["p"]["d"].at[:, : len(case.prepared[0].inputs)].set(0.0)}
         free = free_of(case, best.order, self.offset, False)
-        bounded = best.path_fit.case._replace(free=free)
-        indirect = PathFit(bounded, path, fit_in_rounds(bounded, [model | {"p": p}]))
+        bounded = best.runs_fit.case._replace(free=free)
+        indirect = fit_in_rounds(bounded, [model | {"p": p}])
         tried.append(TriedOrder(best.order, False, indirect))
-        bics = criterion([each.path_fit for each in tried], last.path_fit)
+        bics = criterion([each.runs_fit for each in tried], last.runs_fit)
         return tuple(tried[k]._replace(bic=bics[k]) for k in np.argsort(bics, kind="stable"))
 
-    def fit_networks(self, runs: tuple[Run, ...], best: TriedOrder) -> list[PathFit]:
+    def fit_networks(self, runs: tuple[Run, ...], best: TriedOrder) -> list[RunsFit]:
         """Fit networks added to a linear system; give the probable fits."""
-        n, path = best.order, best.path_fit.path
-        free = [f for f in free_of(best.path_fit.case, n, self.offset, best.direct)
+        n, path = best.order, best.runs_fit.path
+        free = [f for f in free_of(best.runs_fit.case, n, self.offset, best.direct)
                 if f.path != "start"]  # fmt: skip
         free += [Free("start", nuisance=True), Free("p.net", nuisance=True)]
         case = states_case(runs, NETWORK, free, [Prior("p.net", 0.0, WEIGHT_PRIOR)], path)
-        case = case._replace(degree=best.path_fit.case.degree)
+        case = case._replace(degree=best.runs_fit.case.degree)
         nets = _networks(best, self.hidden, self.seeds)
-        fits = probable_fits(case, [fit_in_rounds(case, [net]) for net in nets])
-        return [PathFit(case, path, each) for each in fits]
+        return probable_fits([fit_in_rounds(case, [net]) for net in nets])
 
     def answer(self, runs: tuple[Run, ...], found: _OrderFits, left_out: Any) -> StatesFit:
         """Judge runs whose orders were tried, best first."""
         (tried, fits), gain = found, None
         if self.map == "network":
-            linear, network = criterion([tried[0].path_fit, fits[0]], tried[0].path_fit)
+            linear, network = criterion([tried[0].runs_fit, fits[0]], tried[0].runs_fit)
             gain = linear - network
         n, path = tried[0].order, fits[0].path
-        fits = [
-            fit._replace(noise_fit=fit_correlated_noise(fit.case, fit.noise_fit, MAX_SQUARES_RATIO))
-            for fit in fits
-        ]
+        fits = [fit_correlated_noise(fit, MAX_SQUARES_RATIO) for fit in fits]
         quantities, gains = _quantities(fits, n, runs, self.offset)
         rows = [{"order": t.order, "direct": t.direct, "bic": t.bic}
                 for t in sorted(tried, key=lambda t: (not t.direct, t.order))]  # fmt: skip
@@ -446,19 +438,19 @@ class StatesSearch(NamedTuple):
         return states_answer(fits[0], runs, quantities, **options)
 
 
-def criterion(tried: Sequence[PathFit], last: PathFit | None = None) -> list[float]:
+def criterion(tried: Sequence[RunsFit], last: RunsFit | None = None) -> list[float]:
     """Bayesian information criterion of fits under the noise of the last, with its correlation.
 
     Readings that all fits have count: with a longer delay they begin later.
     """
-    noise = _residual_noise((last or tried[-1]).case, (last or tried[-1]).noise_fit)
-    lengths = [[len(rest) for row in each.noise_fit.residuals for rest in row] for each in tried]
-    return [bic_of(each.case, each.noise_fit, noise, np.min(lengths, axis=0)) for each in tried]
+    noise = _residual_noise(last or tried[-1])
+    lengths = [[len(r) for row in each.residuals for r in row] for each in tried]
+    return [bic_of(each, noise, np.min(lengths, axis=0)) for each in tried]
 
 
-def _residual_noise(case: Case, found: NoiseFit) -> CorrelatedNoise | None:
+def _residual_noise(found: RunsFit) -> CorrelatedNoise | None:
     """Correlated noise of residuals, None for white ones. Slopes are left out for speed."""
-    rows = case.residual_rows(found.residuals, found.noise)
+    rows = found.case.residual_rows(found.residuals, found.noise)
     used = effective_parameters(found.fit)
     if not any(remembers(r / error, used) for r, error, *_ in rows):
         return None
@@ -479,7 +471,7 @@ def free_of(case: Case, order: int, offset: bool, direct: bool) -> tuple[Free, .
 
 
 def _try_order(
-    case: Case, path: Path, n: int, offset: bool, direct: bool, before: TriedOrder | None
+    case: Case, n: int, offset: bool, direct: bool, before: TriedOrder | None
 ) -> TriedOrder:
     """Fit an order from its best realisations and from the order before with one more state."""
     bounded = case._replace(free=free_of(case, n, offset, direct))
@@ -501,7 +493,7 @@ def _try_order(
 
     models = best([model(*found) for found in realisations(u, y, n)])[:STARTS_PER_ORDER]
     if before is not None:
-        last = before.path_fit.noise_fit.fit.model
+        last = before.runs_fit.fit.model
         a, b, c, d, _ = map(np.asarray, LINEAR.matrices(last["p"]))
         a = np.diag([*np.zeros(len(a)), NEW_POLE]) + np.pad(a, ((0, 1), (0, 1)))
         b, c = np.vstack([b, np.ones(m)]), np.hstack([c, np.full((k, 1), NEW_WEIGHT)])
@@ -510,7 +502,7 @@ def _try_order(
     if not models:  # runs too short for a regression
         a = np.diag(NEW_POLE ** np.arange(1.0, n + 1))
         models = [model(a, np.ones((n, m)), np.full((k, n), NEW_WEIGHT), np.zeros((k, m)))]
-    return TriedOrder(n, direct, fit_with_drift(bounded, models, path))
+    return TriedOrder(n, direct, fit_with_drift(bounded, models))
 
 
 def _residual_squares(case: Case, model: Any) -> float:
@@ -532,9 +524,7 @@ def _units(case: Case, offset: bool) -> dict[str, np.ndarray]:
 def _scaled(
     case: Case, units: dict[str, np.ndarray], offset: bool
 ) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """Scaled inputs (with a 1) and outputs of the runs, unpadded, with missing readings
-    interpolated.
-    """
+    """Scaled inputs (with a 1) and outputs of the runs, missing readings interpolated."""
     u, y = [], []
     for i, run in enumerate(case.prepared[0].runs):
         count = int(np.count_nonzero(np.asarray(run.dt))) + 1
@@ -627,26 +617,25 @@ def identify_states(
     return answer_without_bad_readings(runs, searches, lambda found: found.fits[0], search.answer)
 
 
-def probable_fits(case: Case, found: Sequence[NoiseFit]) -> list[NoiseFit]:
+def probable_fits(found: Sequence[RunsFit]) -> list[RunsFit]:
     """The best of several ends of a search, and those that are as probable as draws about it.
 
     Draws from the posterior about an optimum of p numbers exceed its -2 ln L by a chi-square of p
     degrees of freedom, p in the mean. An end within this distance is another part of the posterior.
     """
-    each = [PathFit(case, DIRECT_PATH, fit) for fit in found]
-    bics = np.array(criterion(each, min(each, key=lambda one: one.noise_fit.cost)))
+    bics = np.array(criterion(found, min(found, key=lambda each: each.cost)))
     best, *others = np.argsort(np.where(np.isfinite(bics), bics, np.inf))
     limit = bics[best] + effective_parameters(found[best].fit)
     return [found[best], *(found[i] for i in others if bics[i] <= limit)]
 
 
-def _derive_jointly(fits: Sequence[PathFit], function: Any) -> Derived:
+def _derive_jointly(fits: Sequence[RunsFit], function: Any) -> Derived:
     """Derive numbers from the best fit, with errors that hold 68 % of the posterior of all fits.
 
     All fits count equally: the posterior of a network is curved, and each shows a part of it.
     """
     course = fits[0].case.courses[0]
-    each = [derive_quantities(f.noise_fit.fit, f.noise_fit.errors, function, course) for f in fits]
+    each = [derive_quantities(f.fit, f.errors, function, course) for f in fits]
     if len(each) == 1:
         return each[0]
     values, errors = (np.stack([getattr(one, name) for one in each]) for name in ("value", "error"))
@@ -688,12 +677,12 @@ def joint_error(values: np.ndarray, errors: np.ndarray) -> np.ndarray:
 
 def _networks(best: TriedOrder, hidden: int, seeds: range) -> list[dict[str, Any]]:
     """Models with networks of small random weights added to the linear part."""
-    model = best.path_fit.noise_fit.fit.model
+    model = best.runs_fit.fit.model
     p, (n, m) = model["p"], model["p"]["z"].shape
     states_out = LINEAR.linear(p)._replace(c=jnp.eye(n), d=jnp.zeros((n, m)), offset=jnp.zeros(n))
     run = jax.jit(lambda u, x0: linear_outputs(states_out, u, x0)[0])
     x = [np.asarray(run(LINEAR.scaled(p, c.u), model["start"][i]))
-         for i, c in enumerate(best.path_fit.case.courses)]  # fmt: skip
+         for i, c in enumerate(best.runs_fit.case.courses)]  # fmt: skip
     sizes = {"sizes": np.concatenate(x).std(0)}
     sizes["steps"] = np.concatenate([np.diff(each, axis=0) for each in x]).std(0)
     found = []
@@ -722,7 +711,7 @@ def _quoted_values(model: Any, course: Course) -> jax.Array:
 
 
 def _quantities(
-    fits: Sequence[PathFit], n: int, runs: Sequence[Run], offset: bool
+    fits: Sequence[RunsFit], n: int, runs: Sequence[Run], offset: bool
 ) -> tuple[dict[str, Quantity], dict[str, list[str]]]:
     """Time constants from the slowest, gains and levels; and the names of each input's gains."""
     course, path = fits[0].case.courses[0], fits[0].path
@@ -765,9 +754,7 @@ def _quantities(
 
 
 def _period_quantity(found: Quantity) -> Quantity:
-    """T of a pair of poles; a limit where 1/T² may be 0 by 95 %, since gains at rest are divided by
-    it.
-    """
+    """T of a pair of poles; a limit where 1/T², which gains are divided by, may be 0."""
     if not found.determined or found.value > 2.0 * NORMAL_REACH * found.error:
         return found
     most = 1.0 + 2.0 * ndtri(ONE_SIDED) * found.error / found.value  # of 1/T²
@@ -801,7 +788,7 @@ def _output_state_matrices(model: Any, course: Course) -> jax.Array:
     return jnp.column_stack([to @ a @ jnp.linalg.inv(to), to @ b[:, : len(size_u)] / size_u])
 
 
-def _matrices(fits: Sequence[PathFit], n: int) -> dict[str, Any]:
+def _matrices(fits: Sequence[RunsFit], n: int) -> dict[str, Any]:
     """A, B, C, D in the units of the record, for inputs less their mean.
 
     With as many states as outputs, also the first terms of report eq 2 with errors: the states are
@@ -815,7 +802,7 @@ def _matrices(fits: Sequence[PathFit], n: int) -> dict[str, Any]:
             name + suffix: part[:, ends[name]] for name in ends
             for suffix, part in (("", read.value), ("_error", read.error))
         }  # fmt: skip
-    p = fits[0].noise_fit.fit.model["p"]
+    p = fits[0].fit.model["p"]
     a, b, c, d, _ = map(np.asarray, case.courses[0].system.matrices(p))
     (mean_u, size_u), (mean_y, size_y) = (np.asarray(p["units"][kind]) for kind in "uy")
     by, m = size_y[:, None], len(mean_u)

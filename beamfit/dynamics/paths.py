@@ -50,10 +50,12 @@ class Path(NamedTuple):
 
     @property
     def width(self) -> float:
-        """Standard deviation of a fractional delay within its part of a sample, in samples;
-        else 0.
-        """
+        """Standard deviation of a fractional delay within its part of a sample; else 0."""
         return 1 / (ROWS_PER_SAMPLE * np.sqrt(12)) if self.delay % 1.0 else 0.0
+
+
+# Path of inputs without delay that hold from sample to sample.
+DIRECT_PATH = Path(None, Way(), 0.0)
 
 
 class Paths(NamedTuple):
@@ -76,9 +78,7 @@ class Paths(NamedTuple):
 
     @classmethod
     def of(cls, runs: Sequence[Run], delay: float | None, even: bool) -> Paths:
-        """List the paths of runs; `even` for models that need whole samples, `delay` if one is
-        given.
-        """
+        """List the paths of runs; `even` for models that need whole samples."""
         moves = moving_inputs(runs)
         standing = tuple(name for name in inputs_with_levels(runs) if name not in sum(moves, ()))
         way = Way(*(((), ()) if even else moves), standing)
@@ -108,9 +108,7 @@ class Paths(NamedTuple):
         return [Path(None, way, delay) for delay in self.delays for way in self.ways]
 
     def fractional_delays(self, delay: float) -> list[Path]:
-        """Paths with delays less than a sample from a given one, at the middle of each part of a
-        sample.
-        """
+        """Paths with fractional delays less than a sample from a given one."""
         if not self.fractional:
             return []
         low, high = delay - 1, min(delay + 1, max(self.delays[-1], 1))

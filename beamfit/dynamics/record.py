@@ -165,9 +165,7 @@ def band_limited(runs: Sequence[Run]) -> tuple[str, ...]:
 
 
 def _split_means(values: np.ndarray, weight: np.ndarray, min_gain: float) -> np.ndarray:
-    """Piecewise means: a piece is divided in two while that lowers the sum of squares by
-    `min_gain`.
-    """
+    """Piecewise means; pieces are divided while that lowers the squares by `min_gain`."""
     weights, sums = (np.append(0.0, np.cumsum(each)) for each in (weight, weight * values))
     pending, starts = [(0, len(values))], [0]
     while pending:
@@ -256,9 +254,7 @@ class Way(NamedTuple):
 
 
 def gain_error_share(runs: Sequence[Run], way: Way, name: str) -> float:
-    """Relative error of a gain from the errors of its input's levels, as for a straight-line
-    fit.
-    """
+    """Relative error of a gain from the errors of its input's levels."""
     squares = spread = 0.0
     for run in runs:
         at, variance, rows = way.levels(run, name)

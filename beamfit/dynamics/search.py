@@ -28,7 +28,14 @@ from beamfit.dynamics.model import (
     predicted,
     weight_priors,
 )
-from beamfit.dynamics.paths import Path, Paths, inputs_by_path, prepare_output, prepare_readings
+from beamfit.dynamics.paths import (
+    DIRECT_PATH,
+    Path,
+    Paths,
+    inputs_by_path,
+    prepare_output,
+    prepare_readings,
+)
 from beamfit.dynamics.record import Run
 from beamfit.dynamics.response import ARX, FIRST_ORDER, SECOND_ORDER, Physics
 from beamfit.errors import Status
@@ -106,9 +113,7 @@ def best_drift_degree(own: np.ndarray, waves: np.ndarray, target: np.ndarray) ->
 
 
 class Start(NamedTuple):
-    """A path, the model that a search starts from, and its information criterion with the best
-    drift.
-    """
+    """A path, a start model, and its information criterion with the best drift."""
 
     path: Path
     model: dict[str, Any]
@@ -212,24 +217,25 @@ class ResponseSearch(NamedTuple):
             return found
         return self.starts(runs, self.physics, [found.path])[0]
 
-    def identify(self, runs: tuple[Run, ...]) -> PathFit:
+    def identify(self, runs: tuple[Run, ...]) -> RunsFit:
         """Identify the response with constant parameters."""
         start = self.start(runs)
         return self.identify_path(runs, start.path, start.model)
 
-    def identify_path(self, runs: tuple[Run, ...], path: Path, model: dict[str, Any]) -> PathFit:
+    def identify_path(self, runs: tuple[Run, ...], path: Path, model: dict[str, Any]) -> RunsFit:
         """Identify the response with constant parameters for one path, starting from a model."""
-        case = response_case(prepare_output(runs, self.output, self.physics, path), self.offset)
-        return PathFit(case, path, fit_case(case, [model | {"late": 0.0}]))
+        prepared = prepare_output(runs, self.output, self.physics, path)
+        case = response_case(prepared, path, self.offset)
+        return fit_case(case, [model | {"late": 0.0}])
 
-    def is_first_order(self, runs: tuple[Run, ...], found: PathFit) -> bool:
+    def is_first_order(self, runs: tuple[Run, ...], found: RunsFit) -> bool:
         """True if a first order is no worse than a higher one by the information criterion."""
         if self.physics is FIRST_ORDER:
             return False
         lower = found.prepared._replace(runs=with_physics(found.prepared, FIRST_ORDER))
         (start,) = self.starts(runs, FIRST_ORDER, [found.path])
-        fit = fit_case(response_case(lower, self.offset), [start.model])
-        return fit.cost <= found.noise_fit.cost
+        fit = fit_case(response_case(lower, found.path, self.offset), [start.model])
+        return fit.cost <= found.cost
 
 
 def difference_coefficients(shapes: np.ndarray, interval: float) -> np.ndarray:
@@ -265,9 +271,7 @@ def unit_outputs(run: DrivenRun, shapes: jax.Array) -> jax.Array:
 
 
 def linear_columns(runs: Sequence[DrivenRun], i: int, shapes: jax.Array, offset: bool) -> jax.Array:
-    """Outputs of run i by shape for unit gains, unit first states of each run, and a unit
-    offset.
-    """
+    """Outputs of run i by shape for unit gains, first states of each run, and offset."""
     columns = jnp.swapaxes(unit_outputs(runs[i], shapes), 1, 2)
     k = runs[i].physics.free_states
     others = (0, 0), (0, 0), (i * k, (len(runs) - 1 - i) * k)
@@ -402,9 +406,7 @@ def reading_errors(
 def whiten(
     rows: np.ndarray, time: np.ndarray, memory: CorrelatedNoise | None
 ) -> tuple[np.ndarray, float]:
-    """Whiten rows; return them and the sum of log errors. Rows stay as they are without a
-    memory.
-    """
+    """Whiten rows, unless the noise has no memory; also give the sum of log errors."""
     return (rows, 0.0) if memory is None else innovations(rows, time, memory)
 
 
@@ -427,7 +429,7 @@ Noises = tuple[tuple[ReadingErrors, ...], ...]
 
 
 class Case(NamedTuple):
-    """Inputs of a fit: prepared outputs, runs, free numbers and priors.
+    """Inputs of a fit: prepared outputs, runs, free numbers, priors, and the path of the inputs.
 
     A course is a run as its model sees it: `model.DrivenRun` or `state_fit.Course`. `degree` is the
     highest free degree of drifts, in models that have them.
@@ -437,7 +439,15 @@ class Case(NamedTuple):
     courses: tuple[Any, ...]
     free: tuple[Free, ...]
     priors: tuple[Prior, ...]
+    path: Path = DIRECT_PATH
     degree: int = 0
+
+    def for_runs(self, runs: Sequence[Run]) -> Case:
+        """Prepare other runs for the same model and path."""
+        prepared = tuple(prepare_output(runs, s.output, s.runs[0].physics, self.path)
+                         for s in self.prepared)  # fmt: skip
+        courses = tuple(self.courses[0].like(prepared, i) for i in range(len(runs)))
+        return self._replace(prepared=prepared, courses=courses)
 
     @property
     def initial_noise(self) -> Noises:
@@ -504,10 +514,8 @@ class Case(NamedTuple):
                    for row in residuals
                    for r, s in zip(row, self.prepared, strict=True))  # fmt: skip
 
-    def predict_held_out(self, found: NoiseFit) -> tuple[np.ndarray, ...]:
-        """Give the residuals of a held-out run, by output; only its start and its drift are
-        fitted.
-        """
+    def predict_held_out(self, found: RunsFit) -> tuple[np.ndarray, ...]:
+        """Residuals of a held-out run, by output; only its start and drift are fitted."""
         sizes = np.sqrt(np.mean(found.rms**2, axis=0))
         noise = tuple(ReadingErrors(np.full(len(s.measured[0]), size))
                       for s, size in zip(self.prepared, sizes, strict=True))  # fmt: skip
@@ -552,7 +560,7 @@ class Case(NamedTuple):
 
     def search(
         self, model: Any, noise: Noises, memory: CorrelatedNoise | None = None, gap: Any = ()
-    ) -> NoiseFit:
+    ) -> RunsFit:
         """Fit once and estimate the noise of the residuals.
 
         The fitted fraction of a sample in the delay restarts at 0.
@@ -562,19 +570,20 @@ class Case(NamedTuple):
         residuals = self.residuals(fit.model)
         converged = fit.status not in (Status.not_finite, Status.not_converged)
         errors = self.errors(residuals, memory)
-        found = NoiseFit(fit, residuals, errors, memory, None, np.inf, converged)
-        cost = bic_of(self, found, memory)
+        found = RunsFit(self, fit, residuals, errors, memory, None, np.inf, converged)
+        cost = bic_of(found, memory)
         return found._replace(cost=cost if np.isfinite(cost) else np.inf)
 
 
-class NoiseFit(NamedTuple):
-    """A fit with the noise of its own residuals.
+class RunsFit(NamedTuple):
+    """A fit of runs with the noise of its own residuals.
 
     `residuals` and `noise` are by run and output. `memory` is the correlated noise used in the fit,
     if any; `errors` averages errors over the uncertainty of the noise. `cost` is the Bayesian
     information criterion, `converged` True if a further round gains nothing.
     """
 
+    case: Case
     fit: Fit
     residuals: tuple[tuple[np.ndarray, ...], ...]
     noise: Noises
@@ -583,24 +592,51 @@ class NoiseFit(NamedTuple):
     cost: float
     converged: bool
 
-    def slopes(self, case: Case) -> list[np.ndarray]:
+    @property
+    def path(self) -> Path:
+        """Path of the inputs."""
+        return self.case.path
+
+    @property
+    def prepared(self) -> PreparedOutput:
+        """Prepared runs of the first output, which is the only one of a response."""
+        return self.case.prepared[0]
+
+    @property
+    def delay(self) -> float:
+        """Delay in samples, with the fitted fraction if there is one."""
+        late = float(self.fit.model["late"]) if self.prepared.fraction_limits else 0.0
+        rows = self.prepared.delay + late
+        return round(rows / self.prepared.rows_per_sample, 9)  # exactly 0 at a limit of 0
+
+    def covers(self, path: Path) -> bool:
+        """True if the fit has this path, or fits a fraction of a sample that covers its delay."""
+        prepared = self.prepared
+        low, high = (prepared.delay + end for end in prepared.fraction_limits or (0.0, 0.0))
+        inside = low <= path.delay * prepared.rows_per_sample <= high
+        return path.law is None and path.way == self.path.way and inside
+
+    def refit(self, runs: Sequence[Run]) -> RunsFit:
+        """Fit the same model to other runs, for one round."""
+        case = self.case.for_runs(runs)
+        return case.search(self.fit.model, case.initial_noise)
+
+    def slopes(self) -> list[np.ndarray]:
         """Derivatives of each run's outputs by the free numbers; 0 for numbers at a bound."""
         free = self.fit.problem.moving
         return [
             free * np.asarray(self.fit.derive(predicted, course).slope)[: course.count]
-            for course in case.courses
+            for course in self.case.courses
         ]
 
-    def linear_rows(
-        self, case: Case, max_readings: int | None = None
-    ) -> list[tuple[np.ndarray, ...]]:
+    def linear_rows(self, max_readings: int | None = None) -> list[tuple[np.ndarray, ...]]:
         """List slopes and, last, residuals of each run and output in units of the errors, with
         times.
 
         At most `max_readings` readings of each count.
         """
-        own = [part for i, s in enumerate(self.slopes(case)) for part in case.split(i, s)]
-        rows = case.residual_rows(self.residuals, self.noise)
+        own = [part for i, s in enumerate(self.slopes()) for part in self.case.split(i, s)]
+        rows = self.case.residual_rows(self.residuals, self.noise)
         found = []
         for slope, (residuals, error, time, _) in zip(own, rows, strict=True):
             columns = np.column_stack([slope, -residuals]) / error[:, None]
@@ -608,25 +644,23 @@ class NoiseFit(NamedTuple):
         return found
 
     def estimate_noise(
-        self, case: Case, noise: CorrelatedNoise | None = None, max_readings: int | None = None
+        self, noise: CorrelatedNoise | None = None, max_readings: int | None = None
     ) -> tuple[Memory, CorrelatedNoise, float]:
-        """Estimate the correlated noise from at most `max_readings` residuals of each run and
-        output.
-        """
-        rows, time = zip(*self.linear_rows(case, max_readings), strict=True)
+        """Estimate the correlated noise from at most `max_readings` of each run and output."""
+        rows, time = zip(*self.linear_rows(max_readings), strict=True)
         prior = np.asarray(self.fit.problem.residual(self.fit.theta))[self.fit.problem.size :]
         prior_rows = np.column_stack([self.fit.dense_jacobian[self.fit.problem.size :], prior])
         return noise_posterior(rows, time, prior_rows, noise)
 
-    def drift_degree(self, case: Case) -> int:
+    def drift_degree(self) -> int:
         """Choose the degree of the drifts, which are all free in the fit.
 
         Correlated noise counts as such: a random wander is no drift.
         """
         memory = None
-        if self.is_correlated(case):
-            memory = self.estimate_noise(case, max_readings=MAX_NOISE_READINGS)[1]
-        white = [whiten(*each, memory)[0] for each in self.linear_rows(case)]
+        if self.is_correlated():
+            memory = self.estimate_noise(max_readings=MAX_NOISE_READINGS)[1]
+        white = [whiten(*each, memory)[0] for each in self.linear_rows()]
         rows = np.concatenate(white)
         drift = np.array([name.startswith("drift[") for name in self.fit.problem.names])
         own, waves = rows[:, :-1][:, ~drift], rows[:, :-1][:, drift]
@@ -634,14 +668,15 @@ class NoiseFit(NamedTuple):
         waves = np.moveaxis(waves.reshape(len(rows), -1, MAX_DRIFT_DEGREE), 2, 1)
         return best_drift_degree(own, waves.reshape(len(rows), -1), without)
 
-    def is_exact(self, case: Case) -> bool:
+    def is_exact(self) -> bool:
         """True if the model explains all outputs up to rounding."""
         return all(_is_exact(n, s.floor) for row in self.noise
-                   for n, s in zip(row, case.prepared, strict=True))  # fmt: skip
+                   for n, s in zip(row, self.case.prepared, strict=True))  # fmt: skip
 
-    def is_correlated(self, case: Case) -> bool:
+    def is_correlated(self) -> bool:
         """True if the residuals of any output are correlated and exceed rounding."""
-        used, rows = effective_parameters(self.fit), case.residual_rows(self.residuals, self.noise)
+        used = effective_parameters(self.fit)
+        rows = self.case.residual_rows(self.residuals, self.noise)
         return any(remembers(r / error, used) and r.std() > floor for r, error, _, floor in rows)
 
     @property
@@ -660,13 +695,13 @@ def effective_parameters(fit: Fit) -> int:
 
 
 def bic_of(
-    case: Case, found: NoiseFit, noise: CorrelatedNoise | None, lengths: Sequence[int] | None = None
+    found: RunsFit, noise: CorrelatedNoise | None, lengths: Sequence[int] | None = None
 ) -> float:
     """Bayesian information criterion of a fit under a given noise.
 
     All readings count, or only the last `lengths` of each run and output.
     """
-    rows = case.residual_rows(found.residuals, found.noise)
+    rows = found.case.residual_rows(found.residuals, found.noise)
     if lengths is not None:
         rows = [(*(each[-n:] for each in row[:3]), row[3])
                 for row, n in zip(rows, lengths, strict=True)]  # fmt: skip
@@ -681,9 +716,7 @@ def _deviance(
     floor: float,
     memory: CorrelatedNoise | None,
 ) -> float:
-    """Give -2 ln L of residuals; only the ratios of the errors count, the noise level is at its
-    best.
-    """
+    """Give -2 ln L of residuals with the best noise level; only ratios of errors count."""
     scale = error / error.min()
     white, volume = whiten(residuals / scale, time, memory)
     level = max(float(np.std(white)), floor)
@@ -695,9 +728,7 @@ def _predict_with_gaps(model: Any, course: Any) -> jax.Array:
 
 
 def _innovations_of(model: Any, data: tuple[Any, jax.Array, jax.Array]) -> jax.Array:
-    """Give the innovations of a run: outputs less predictions from earlier readings, over the
-    errors.
-    """
+    """Innovations of a run: outputs less predictions from earlier readings, over errors."""
     course, error, memory = data
     return filtered(predicted(model, course) / error, course.time, CorrelatedNoise(*memory))
 
@@ -705,9 +736,7 @@ def _innovations_of(model: Any, data: tuple[Any, jax.Array, jax.Array]) -> jax.A
 def repeat_search(
     found: Any, search: Callable[[Any], Any], min_gain: float, max_rounds: int
 ) -> tuple[Any, bool]:
-    """Search again from the last result until the gain is small; return it and True if that
-    happened.
-    """
+    """Search from the last result until the gain is small; also give True if it became so."""
     for _ in range(max_rounds):
         if not np.isfinite(found.cost):
             break
@@ -717,7 +746,7 @@ def repeat_search(
     return found, False
 
 
-def fit_in_rounds(case: Case, models: Sequence[Any], max_rounds: int = MAX_ROUNDS) -> NoiseFit:
+def fit_in_rounds(case: Case, models: Sequence[Any], max_rounds: int = MAX_ROUNDS) -> RunsFit:
     """Search one round from each start, then from the best result until nothing is gained."""
     tried = (case.search(model, case.initial_noise) for model in models)
     found = min(tried, key=lambda each: each.cost)
@@ -729,88 +758,50 @@ def fit_in_rounds(case: Case, models: Sequence[Any], max_rounds: int = MAX_ROUND
     return found._replace(converged=converged or found.converged)
 
 
-def fit_correlated_noise(case: Case, white: NoiseFit, max_ratio: float = np.inf) -> NoiseFit:
+def fit_correlated_noise(white: RunsFit, max_ratio: float = np.inf) -> RunsFit:
     """Fit again with correlated noise where the residuals of a white-noise fit are correlated.
 
     The new fit is dropped if its sum of squares is larger by more than `max_ratio`. Errors average
     over the uncertainty of the noise also where residuals look white: a drift may be hidden in the
     numbers.
     """
-    if white.is_exact(case):
+    if white.is_exact():
         return white
-    if not white.is_correlated(case):
-        return white._replace(errors=white.estimate_noise(case, max_readings=MAX_NOISE_READINGS)[0])
+    if not white.is_correlated():
+        return white._replace(errors=white.estimate_noise(max_readings=MAX_NOISE_READINGS)[0])
+    case = white.case
 
-    def search(found: NoiseFit) -> NoiseFit:
-        _, memory, level = found.estimate_noise(case, max_readings=MAX_NOISE_READINGS)
+    def search(found: RunsFit) -> RunsFit:
+        _, memory, level = found.estimate_noise(max_readings=MAX_NOISE_READINGS)
         noise = tuple(tuple(n._replace(each=level * n.each) for n in row) for row in found.noise)
         return case.search(found.fit.model, noise, memory)
 
     found = repeat_search(white, search, MIN_GAIN, MAX_CORRELATED_ROUNDS)[0]
-    if case.normalised_squares(found.residuals) > max_ratio * case.normalised_squares(
-        white.residuals
-    ):
+    squares, before = (case.normalised_squares(each.residuals) for each in (found, white))
+    if squares > max_ratio * before:
         # The search took a part of the response for noise that wanders.
         found = white
-    errors = found.estimate_noise(case, max_readings=MAX_NOISE_READINGS)[0]
+    errors = found.estimate_noise(max_readings=MAX_NOISE_READINGS)[0]
     longest = max(len(r) for row in found.residuals for r in row)
     if found is not white and longest > MAX_NOISE_READINGS:
-        errors = found.estimate_noise(case, found.memory)[0]
+        errors = found.estimate_noise(found.memory)[0]
     return found._replace(converged=white.converged, errors=errors)
 
 
-def response_case(prepared: PreparedOutput, offset: bool, network: bool = False) -> Case:
+def response_case(
+    prepared: PreparedOutput, path: Path, offset: bool, network: bool = False
+) -> Case:
     """Build the case of one output, with constant raw numbers or a network of them."""
     free = [Free("start", nuisance=True), Free("map", nuisance=network)]
     free += [Free("offset")] if offset else []
     free += [Free("late", *prepared.fraction_limits)] if prepared.fraction_limits else []
-    return Case((prepared,), prepared.runs, tuple(free), weight_priors("map") if network else ())
+    priors = weight_priors("map") if network else ()
+    return Case((prepared,), prepared.runs, tuple(free), priors, path)
 
 
-def fit_case(case: Case, models: Sequence[Any]) -> NoiseFit:
+def fit_case(case: Case, models: Sequence[Any]) -> RunsFit:
     """Fit from several starts, then with correlated noise where residuals are correlated.
 
     The noise is estimated anew in every round, as it sets the weight of a network's priors.
     """
-    return fit_correlated_noise(case, fit_in_rounds(case, models))
-
-
-class PathFit(NamedTuple):
-    """Runs prepared for a path, and their fit."""
-
-    case: Case
-    path: Path
-    noise_fit: NoiseFit
-
-    @property
-    def prepared(self) -> PreparedOutput:
-        """Prepared runs of the first output, which is the only one of a response."""
-        return self.case.prepared[0]
-
-    @property
-    def delay(self) -> float:
-        """Delay in samples, with the fitted fraction if there is one."""
-        late = float(self.noise_fit.fit.model["late"]) if self.prepared.fraction_limits else 0.0
-        rows = self.prepared.delay + late
-        return round(rows / self.prepared.rows_per_sample, 9)  # exactly 0 at a limit of 0
-
-    def covers(self, path: Path) -> bool:
-        """True if the fit has this path, or fits a fraction of a sample that covers its delay."""
-        prepared = self.prepared
-        low, high = (prepared.delay + end for end in prepared.fraction_limits or (0.0, 0.0))
-        inside = low <= path.delay * prepared.rows_per_sample <= high
-        return path.law is None and path.way == self.path.way and inside
-
-    def case_for(self, runs: Sequence[Run]) -> Case:
-        """Prepare other runs for the same model and path."""
-        case = self.case
-        prepared = tuple(prepare_output(runs, s.output, s.runs[0].physics, self.path)
-                         for s in case.prepared)  # fmt: skip
-        courses = tuple(case.courses[0].like(prepared, i) for i in range(len(runs)))
-        return case._replace(prepared=prepared, courses=courses)
-
-    def refit(self, runs: Sequence[Run]) -> PathFit:
-        """Fit the same model to other runs, for one round."""
-        case = self.case_for(runs)
-        noise_fit = case.search(self.noise_fit.fit.model, case.initial_noise)
-        return self._replace(case=case, noise_fit=noise_fit)
+    return fit_correlated_noise(fit_in_rounds(case, models))

@@ -34,14 +34,13 @@ from beamfit.dynamics.checks import (
     predict_runs,
 )
 from beamfit.dynamics.model import PreparedOutput, growth_columns, padded_readings, weight_priors
-from beamfit.dynamics.paths import Path, max_delay, prepare_output
-from beamfit.dynamics.record import Run, Way, check_runs
+from beamfit.dynamics.paths import DIRECT_PATH, Path, max_delay, prepare_output
+from beamfit.dynamics.record import Run, check_runs
 from beamfit.dynamics.response import FIRST_ORDER
 from beamfit.dynamics.search import (
     MAX_DRIFT_DEGREE,
     Case,
-    NoiseFit,
-    PathFit,
+    RunsFit,
     drift_columns,
     effective_parameters,
     fit_correlated_noise,
@@ -61,8 +60,6 @@ from beamfit.statistics import POOR_FIT
 GAP_WIDTHS = (1.0, 0.1, 1e-2, 1e-3, 1e-4)
 # Time between the series of two outputs, in lengths of the run: no correlation is left.
 OUTPUT_SEPARATION = 1e6
-# Path of inputs without delay that hold from sample to sample.
-DIRECT_PATH = Path(None, Way(), 0.0)
 # A fit with correlated noise is dropped if its sum of squares exceeds that of the white-noise fit
 # by this factor: chosen.
 MAX_SQUARES_RATIO = 1.5
@@ -139,16 +136,16 @@ def close_segments(case: Case, model: Any, scatter: np.ndarray) -> Any:
     return model | {"nodes": model["nodes"][:, :0]}
 
 
-def fit_with_drift(case: Case, models: Sequence[Any], path: Path = DIRECT_PATH) -> PathFit:
+def fit_with_drift(case: Case, models: Sequence[Any]) -> RunsFit:
     """Fit from several starts, the best first, with the drift that the outputs need.
 
     All drifts are free in the first fit: a state that grows without limit could imitate a drift.
     """
     drifting = case._replace(degree=MAX_DRIFT_DEGREE)
     first = fit_in_rounds(drifting, [drifting.with_best_drift(models[0])], 0)
-    case = case._replace(degree=first.drift_degree(drifting))
+    case = case._replace(degree=first.drift_degree())
     models = [case.with_best_drift(model) for model in (first.fit.model, *models)]
-    return PathFit(case, path, fit_in_rounds(case, models))
+    return fit_in_rounds(case, models)
 
 
 # Segments are tried if the free run explains less than this percentage of an output.
@@ -342,21 +339,20 @@ def fit_states(
     free = [*free, *([] if known else [Free("start", nuisance=True)])]
     inside = [prior for net in nets for prior in weight_priors(net)]
 
-    def search(runs: tuple[Run, ...]) -> PathFit:
+    def search(runs: tuple[Run, ...]) -> RunsFit:
         case = states_case(runs, system, free, (*inside, *priors))
         _check_outputs(case, model)
         return fit_with_drift(case, [_free_run(case, model, segments).fit.model])
 
-    def answer(runs: tuple[Run, ...], found: PathFit, left_out: Any) -> StatesFit:
-        fit = fit_correlated_noise(found.case, found.noise_fit, MAX_SQUARES_RATIO)
-        found = found._replace(noise_fit=fit)
+    def answer(runs: tuple[Run, ...], found: RunsFit, left_out: Any) -> StatesFit:
+        found = fit_correlated_noise(found, MAX_SQUARES_RATIO)
         options = {"held": held, "left_out": left_out, "map": "network" if nets else "constant"}
         return states_answer(found, runs, _parameter_quantities(found), **options)
 
     return answer_without_bad_readings(runs, [search], lambda found: found, answer)
 
 
-def _free_run(case: Case, model: Any, segments: int | None) -> NoiseFit:
+def _free_run(case: Case, model: Any, segments: int | None) -> RunsFit:
     """Fit the free run, with segments if that fails."""
     found = None if segments is not None and segments > 1 else fit_in_rounds(case, [model])
     if found is None or (segments is None and not min(_explained(case, found)) > MIN_EXPLAINED):
@@ -376,7 +372,7 @@ def states_case(
     """Prepare runs for a state space."""
     prepared = tuple(prepare_output(runs, name, FIRST_ORDER, path) for name in runs[0].outputs)
     courses = tuple(course_of(system, prepared, i) for i in range(len(runs)))
-    return Case(prepared, courses, tuple(free), tuple(priors))
+    return Case(prepared, courses, tuple(free), tuple(priors), path)
 
 
 def start_model(start: np.ndarray, outputs: int) -> dict[str, np.ndarray]:
@@ -398,22 +394,20 @@ def _check_outputs(case: Case, model: Any) -> None:
         )
 
 
-def _parameter_quantities(path_fit: PathFit) -> dict[str, Quantity]:
+def _parameter_quantities(found: RunsFit) -> dict[str, Quantity]:
     """Free numbers of the equations with errors."""
-    found = path_fit.noise_fit
     value, error, raw = np.array([(v.value, v.error, v.error_raw) for v in found.fit.variables]).T
     one = np.eye(len(value))
     if found.errors is not None:
         error = np.where(np.isfinite(error), found.errors.moments(one).error, np.nan)
-    numbers = widen_errors(
-        Derived(value, error, raw, np.zeros(len(value)), one), digit_covariance(path_fit)
-    )
+    numbers = Derived(value, error, raw, np.zeros(len(value)), one)
+    numbers = widen_errors(numbers, digit_covariance(found))
     return {name.removeprefix("p."): quantity_at(numbers, i, "")
             for i, name in enumerate(found.fit.problem.names)
             if name.startswith("p.") and not found.fit.problem.nuisance[i]}  # fmt: skip
 
 
-def _explained(case: Case, found: NoiseFit) -> list[float]:
+def _explained(case: Case, found: RunsFit) -> list[float]:
     """Explained part of each output in percent, for the free run."""
     return [
         explained_percent(
@@ -445,7 +439,7 @@ def _segment_starts(case: Case, model: Any, segments: int) -> tuple[np.ndarray, 
 
 
 def states_answer(
-    path_fit: PathFit,
+    found: RunsFit,
     runs: tuple[Run, ...],
     quantities: Mapping[str, Quantity],
     *,
@@ -462,27 +456,27 @@ def states_answer(
 
     `by_input` names the quantities that belong to an input; `given` is True if the delay was given.
     """
-    (case, path, found), parts = path_fit, []
+    case, delay, parts = found.case, found.path.delay, []
     used = max(1, effective_parameters(found.fit) // len(case.prepared)) + (not given)
     for k, s in enumerate(case.prepared):
         fitted = tuple(y - row[k] for y, row in zip(s.measured, found.residuals, strict=True))
         added = [_score_columns(s, i, y) for i, y in enumerate(fitted)]
-        checks = checks_of(path_fit, k, added, used, gain)
+        checks = checks_of(found, k, added, used, gain)
         parts.append(StateSpaceOutput(s.output, runs, s, fitted, checks))
-    predictions = predict_runs(path_fit, held)
+    predictions = predict_runs(found, held)
     no_response = all(part.checks.nothing_probability >= POOR_FIT for part in parts)
     inseparable = {q for name in parts[0].checks.together for q in (by_input or {}).get(name, ())}
     kept = {n: q.open() if no_response or n in inseparable else q for n, q in quantities.items()}
     evidence = {
         part.output: ResponseEvidence(
             found.fit, found.converged, part.checks, kept, (), predictions[part.output], map,
-            float(np.sqrt(np.mean(found.rms[:, k] ** 2))), 0.0 if given else max(-path.delay, 0.0),
+            float(np.sqrt(np.mean(found.rms[:, k] ** 2))), 0.0 if given else max(-delay, 0.0),
         )
         for k, part in enumerate(parts)
     }  # fmt: skip
     status, message = judge_outputs(evidence)
     kept, _ = remove_errors_if_wrong(status, kept)
-    message = add_remarks(message, not given and path.delay == max_delay(runs) > 0, left_out)
+    message = add_remarks(message, not given and delay == max_delay(runs) > 0, left_out)
     order = order or found.fit.model["start"].shape[1]
     held_out = predictions if held else {}
     return StatesFit(

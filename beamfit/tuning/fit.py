@@ -265,9 +265,7 @@ class TuningFit(Judged):
 
     @property
     def boost(self) -> float:
-        """Ratio of the answer's emittances to those of the maps: γβ, or 1 for finished
-        emittances.
-        """
+        """Emittances of the answer over those of the maps: γβ, or 1 for finished emittances."""
         return beta_gamma(self.seen.energy, self.seen.line.mass) if self.seen else 1.0
 
     @property

@@ -278,9 +278,7 @@ def _slopes(data: KnobReadings, u: Array) -> tuple[Array, Array]:
 def _fit_coefficients(
     data: KnobReadings, state: _MapState, varies: Array, orders: np.ndarray
 ) -> Array:
-    """Fit the coefficients at given scales by Gauss-Newton steps, each with the best step
-    length.
-    """
+    """Fit the coefficients at given scales by Gauss-Newton steps of the best length."""
     scales = scales_of(state.eta, varies)
     designs = _row_designs(data, scales, orders)
     variance = _variance(data, scales.noise, state.good)
@@ -393,9 +391,7 @@ def _weigh_readings(eta: Array, by: _LinearReadings, orders: np.ndarray) -> tupl
 def _fit_map(
     data: KnobReadings, start: Array, good: Array, varies: Array, orders: np.ndarray
 ) -> tuple[_MapState, _LinearReadings, Array, Array]:
-    """Fit map and scales; give them, the linearised readings, log evidence, and factor of the
-    scales' covariance.
-    """
+    """Fit map and scales; also give linear readings, log evidence, and the scales' factor."""
     mean, spread = prior_of(data)
 
     def newton(eta: Array, by: _LinearReadings) -> Array:
@@ -528,9 +524,7 @@ def mix_draws(both: MapPosterior, constant: np.ndarray) -> MapPosterior:
 
 @jax.jit
 def numbers_at(posterior: MapPosterior, x: np.ndarray) -> Array:
-    """Give ln ε, ln β, α of every draw at settings, shape (m, knobs) to (d, m, 3), in
-    coordinates.
-    """
+    """Give ln ε, ln β, α of every draw at settings, shape (m, knobs) to (d, m, 3)."""
     orders = orders_of(x.shape[-1])
 
     def one(scales: KnobScales, v: Array) -> Array:

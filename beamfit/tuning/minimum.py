@@ -80,9 +80,7 @@ def values_at(draws: Emittances, x: Array) -> Array:
 
 
 def _descend(x: Array, value: object) -> Array:
-    """Find the lowest point near a start within the box, by damped Newton steps on the free
-    knobs.
-    """
+    """Find the lowest point near a start within the box by damped Newton steps."""
 
     def step(x: Array, _: None) -> tuple[Array, None]:
         slope, curvature = jax.grad(value)(x), jax.hessian(value)(x)
@@ -101,9 +99,7 @@ def _descend(x: Array, value: object) -> Array:
 
 
 class Minima(NamedTuple):
-    """Lowest value and its place in every draw, shape (d,) and (d, knobs), and the place for the
-    mean.
-    """
+    """Lowest value and place of every draw, shape (d,) and (d, knobs); place for the mean."""
 
     value: Array
     place: Array
