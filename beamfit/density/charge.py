@@ -1,4 +1,4 @@
-"""Emittance against charge: what densities in phase space say of the core and of the halo."""
+"""Emittance against charge, core and halo of densities in phase space."""
 
 from __future__ import annotations
 
@@ -10,12 +10,15 @@ import numpy as np
 
 from beamfit.density.tomography import AXIS, EDGE, POINT
 
-# Points of the fine grid, in rms sizes, and the rings into which squares of radii are counted.
+# Step of the fine grid, in rms sizes.
 FINE = 0.18
 FINE_AXIS = np.arange(-EDGE, EDGE + FINE / 2, FINE)
-FAR, RINGS = 100.0, 2000
-# Squared radii, in rms sizes, beyond which charge is halo, and within which it is core.
-HALO, CORE = 9.0, 1.0
+# Largest squared radius, in rms sizes, and number of rings of equal width in it.
+MAX_RADIUS2 = 100.0
+RINGS = 2000
+# Squared radii, in rms sizes, beyond which charge is halo and within which it is core.
+HALO = 9.0
+CORE = 1.0
 
 
 class ChargeParts(NamedTuple):
@@ -24,10 +27,11 @@ class ChargeParts(NamedTuple):
     Attributes
     ----------
     emittance : ndarray
-        Shape (d, f): rms emittance of the charge within the ellipse, of the shape of the rms beam
-        of all densities, that holds each share; NaN where the charge inside has no rms.
+        Rms emittance of the charge within the ellipse that holds each share, shape (d, f). The
+        ellipse has the shape of the rms beam of all densities; NaN where the charge in it has no
+        rms.
     halo, core : ndarray
-        Shape (d,): shares of the charge beyond 3 rms, and within one.
+        Shares of the charge beyond 3 rms and within one, shape (d,).
     rms : float
         Emittance of the rms beam of all densities.
     """
@@ -44,7 +48,7 @@ def charge_parts(values: np.ndarray, shares: tuple[float, ...]) -> ChargeParts:
     Parameters
     ----------
     values : ndarray
-        Shape (d, g), densities on the grid of `tomography`.
+        Densities on the grid of `tomography`, shape (d, g).
     shares : tuple of float
         Above 0, and 1 for all charge.
 
@@ -64,8 +68,8 @@ def charge_parts(values: np.ndarray, shares: tuple[float, ...]) -> ChargeParts:
     >>> parts.emittance.round(3).tolist(), parts.halo.round(3).tolist()
     ([[0.307, 0.744, 1.0]], [0.011])
     """
-    powers, fine = powers_of(FINE_AXIS), finely(values)
-    # Where windows cut the beam single densities may have no rms: noise may be negative.
+    powers, fine = powers_of(FINE_AXIS), refine(values)
+    # Where windows cut the beam, single densities may be negative and have no rms.
     radius, rms = rms_beam(fine.mean(axis=0), powers)
     found = [parts_of(density, powers, radius, shares) for density in fine]
     return ChargeParts(*map(np.array, zip(*found, strict=True)), rms)
@@ -78,7 +82,7 @@ def powers_of(axis: np.ndarray) -> np.ndarray:
 
 
 def negative_charge(values: np.ndarray) -> float:
-    """Find how many standard deviations the charge is below zero where the mean density is.
+    """Charge in the regions of negative mean density, in standard deviations below zero.
 
     Examples
     --------
@@ -89,29 +93,30 @@ def negative_charge(values: np.ndarray) -> float:
     3.7
     """
     spread, n = _spread(), len(AXIS)
-    negative = finely(values.mean(axis=0)[None])[0] < 0.0
-    below = spread.T @ negative.reshape(len(spread), -1) @ spread  # of the charge at each point
-    charge = values @ below.reshape(n * n)
+    negative = refine(values.mean(axis=0)[None])[0] < 0.0
+    # Weight of the charge at each point.
+    weight = spread.T @ negative.reshape(len(spread), -1) @ spread
+    charge = values @ weight.reshape(n * n)
     return float(-charge.mean() / charge.std()) if charge.std() > 0.0 else 0.0
 
 
 @cache
 def _spread() -> np.ndarray:
-    """Share of the charge at each point of the axis that each of the fine one has."""
+    """Share of the charge at each grid point of an axis that each fine point has."""
     spread = np.exp(-0.5 * ((FINE_AXIS[:, None] - AXIS) / POINT) ** 2)
     return spread * FINE / POINT / math.sqrt(2.0 * math.pi)
 
 
-def finely(values: np.ndarray) -> np.ndarray:
-    """Densities on the fine grid, shape (d, m²), as charge at each point."""
+def refine(values: np.ndarray) -> np.ndarray:
+    """Interpolate densities to the fine grid, shape (d, m²), as charge at each point."""
     spread, n = _spread(), len(AXIS)
     return (spread @ values.reshape(-1, n, n) @ spread.T).reshape(len(values), -1)
 
 
 def rms_beam(density: np.ndarray, powers: np.ndarray) -> tuple[np.ndarray, float]:
-    """Squares of the distances of points from the centre, in rms sizes, and the rms emittance."""
+    """Give squared distances of points from the centre, in rms sizes, and the rms emittance."""
     sums = powers @ density
-    square, (a, b, c) = _second(sums)
+    square, (a, b, c) = _second_moments(sums)
     if not (square > 0.0 and a > 0.0):
         return np.full_like(density, math.nan), math.nan
     dq, dp = powers[1] - sums[1] / sums[0], powers[2] - sums[2] / sums[0]
@@ -121,33 +126,36 @@ def rms_beam(density: np.ndarray, powers: np.ndarray) -> tuple[np.ndarray, float
 def parts_of(
     density: np.ndarray, powers: np.ndarray, radius: np.ndarray, shares: tuple[float, ...]
 ) -> tuple[list[float], float, float]:
-    """Emittances of the shares, halo and core of one density, as `ChargeParts`."""
+    """Give emittances of the shares, halo and core of one density, as in `ChargeParts`."""
     if not np.isfinite(radius).all():
         return [math.nan] * len(shares), math.nan, math.nan
-    ring = np.minimum((radius * (RINGS / FAR)).astype(int), RINGS)
+    ring = np.minimum((radius * (RINGS / MAX_RADIUS2)).astype(int), RINGS)
     inside = np.cumsum([np.bincount(ring, density * power, RINGS + 1) for power in powers], axis=1)
-    edges, held = np.linspace(FAR / RINGS, FAR, RINGS), inside[0] / inside[0, -1]
+    edges, cumulative = (
+        np.linspace(MAX_RADIUS2 / RINGS, MAX_RADIUS2, RINGS),
+        inside[0] / inside[0, -1],
+    )
     emittances = []
     for share in shares:
-        # The first ellipse that holds it: beyond, noise may be negative.
-        k = int(np.argmax(held >= share)) if share < 1.0 else RINGS
-        part = inside[:, k]
+        # The first ellipse that holds the share: further out the charge may fall again by noise.
+        k = int(np.argmax(cumulative >= share)) if share < 1.0 else RINGS
+        sums = inside[:, k]
         if 0 < k < RINGS:
-            within = (share - held[k - 1]) / (held[k] - held[k - 1])
-            part = inside[:, k - 1] + within * (part - inside[:, k - 1])
-        emittances.append(_emittance(part))
-    halo, core = (float(np.interp(at, edges, held[:RINGS])) for at in (HALO, CORE))
+            fraction = (share - cumulative[k - 1]) / (cumulative[k] - cumulative[k - 1])
+            sums = inside[:, k - 1] + fraction * (sums - inside[:, k - 1])
+        emittances.append(_emittance(sums))
+    halo, core = (float(np.interp(radius2, edges, cumulative[:RINGS])) for radius2 in (HALO, CORE))
     return emittances, 1.0 - halo, core
 
 
 def _emittance(sums: np.ndarray) -> float:
-    """Rms emittance of sums of powers; NaN where there is none."""
-    square, (a, _, _) = _second(sums)
+    """Rms emittance from sums of powers; NaN if there is none."""
+    square, (a, _, _) = _second_moments(sums)
     return math.sqrt(square) if square > 0.0 and a > 0.0 else math.nan
 
 
-def _second(sums: np.ndarray) -> tuple[float, tuple[float, float, float]]:
-    """Square of the rms emittance, and the second moments, of sums of powers."""
+def _second_moments(sums: np.ndarray) -> tuple[float, tuple[float, float, float]]:
+    """Square of the rms emittance, and second moments, from sums of powers."""
     total, q, p, qq, qp, pp = sums
     q, p = q / total, p / total
     a, b, c = qq / total - q * q, qp / total - q * p, pp / total - p * p

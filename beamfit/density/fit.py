@@ -1,4 +1,4 @@
-"""The density fit: a scan with profiles in, emittance against charge with its error out."""
+"""The density fit: from a scan with profiles to emittance against charge with its error."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 from scipy.special import ndtr
 
 from beamfit.answer import Table, answer, cell, json_of
-from beamfit.density.charge import FINE, ChargeParts, charge_parts, finely, negative_charge
+from beamfit.density.charge import FINE, ChargeParts, charge_parts, negative_charge, refine
 from beamfit.density.profiles import MeanProfile, mean_profiles
 from beamfit.density.tomography import GRID, Densities, tomography
 from beamfit.emittance.fit import fit_emittance
@@ -27,21 +27,23 @@ from beamfit.particles import beta_gamma
 from beamfit.quantity import Quantity, percent
 from beamfit.statistics import of_use, quantity_of_draws
 
-# Shares of the charge whose emittance is given, and draws of the density.
-SHARES, DRAWS = (0.5, 0.68, 0.9, 0.95, 1.0), 256
-# Phase advance, degrees, without which no density is given: three phases 30 degrees apart. The
-# whole is seen from 180.
-LEAST_PHASE = 60.0
-# No density has negative charge. Places that are told apart within 3 rms, by lengths of .6 rms, in
-# any of which chance may ask for it; and the probability of chance below which it is none.
-PLACES, CHANCE = 25, 0.01
-# A window beyond which likely more than this of the mean square lies cuts the beam: 5 % of an
-# emittance. That is so for a Gaussian within 2.5 rms.
-CUT = 0.1
-# Shares that a cut window leaves open.
+# Shares of the charge whose emittance is given, and number of draws of the density.
+SHARES = (0.5, 0.68, 0.9, 0.95, 1.0)
+DRAWS = 256
+# Smallest phase advance, degrees, for a density: three phases 30 degrees apart. The full range is
+# 180.
+MIN_PHASE = 60.0
+# No density has negative charge. Number of independent places within 3 rms, at lengths of 0.6 rms,
+# in any of which noise may ask for it; and smallest probability of that by chance.
+PLACES = 25
+MIN_CHANCE = 0.01
+# A window cuts the beam if more than this share of the mean square probably lies beyond it: 5 % of
+# an emittance. That is so for a Gaussian within 2.5 rms.
+MAX_BEYOND = 0.1
+# Smallest share of the charge that a window cutting the beam leaves undetermined.
 OPEN_WHEN_CUT = 0.95
-# Statuses of planes, the gravest last.
-GRAVER = (Status.converged, Status.poor_fit, Status.unidentified)
+# Statuses of planes, from the mildest to the most severe.
+SEVERITY = (Status.converged, Status.poor_fit, Status.unidentified)
 
 
 @answer
@@ -54,13 +56,13 @@ class PlaneDensity(Judged):
     plane : str
         "x" or "y".
     profiles : tuple of MeanProfile
-        What it is from, one a setting.
+        Fitted profiles, one for each setting.
     labels : tuple of str
-        The setting of each.
+        Settings of the profiles.
     sizes : PlaneFit
-        What the sizes of the scan say alone.
+        Fit of the sizes of the scan alone.
     densities : Densities or None
-        Its draws; None where there is no beam.
+        Draws of the density; None if no beam was found.
     boost : float
         βγ.
     phase : float
@@ -80,19 +82,19 @@ class PlaneDensity(Judged):
 
     @cached_property
     def parts(self) -> ChargeParts:
-        """Core and halo of every draw, emittances normalised, m."""
+        """Core and halo of every draw, with normalised emittances, m."""
         parts = charge_parts(self.densities.values, SHARES)
         unit = self.boost * abs(np.linalg.det(self.densities.frame)) * self.densities.growth
         return parts._replace(emittance=parts.emittance * unit[:, None], rms=parts.rms * unit)
 
     @property
     def cut(self) -> tuple[int, ...]:
-        """Profiles whose window cuts the beam."""
-        return tuple(int(k) for k in np.flatnonzero(self.beyond > CUT))
+        """Indices of profiles whose window cuts the beam."""
+        return tuple(int(k) for k in np.flatnonzero(self.beyond > MAX_BEYOND))
 
     @cached_property
     def beyond(self) -> np.ndarray:
-        """Share of the mean square that likely lies beyond each window, shape (k,)."""
+        """Share of the mean square that probably lies beyond each window, shape (k,)."""
         d = self.densities
         if d is None:
             return np.zeros(len(self.profiles))
@@ -106,7 +108,7 @@ class PlaneDensity(Judged):
 
     @cached_property
     def by_chance(self) -> float:
-        """Probability that chance has profiles of a density ask for as much negative charge."""
+        """Probability that profiles of a density ask for as much negative charge by chance."""
         if self.densities is None:
             return 1.0
         return min(1.0, PLACES * float(ndtr(-negative_charge(self.densities.values))))
@@ -120,11 +122,11 @@ class PlaneDensity(Judged):
     def emittance(self) -> dict[str, Quantity]:
         """Normalised rms emittance of 50, 68, 90, 95 and 100 % of the charge, m.
 
-        A share has no error where the profiles do not tell it: never without a density, and from
-        95 % on not where windows cut the beam.
+        A share without an error is not determined: all without a density, and 95 % and more where
+        windows cut the beam.
         """
         return {
-            percent(share): self._told(
+            percent(share): self._quantity(
                 lambda parts, k=k: parts.emittance[:, k], "m", share >= OPEN_WHEN_CUT
             )
             for k, share in enumerate(SHARES)
@@ -133,25 +135,27 @@ class PlaneDensity(Judged):
     @cached_property
     def halo(self) -> Quantity:
         """Share of the charge beyond 3 rms."""
-        return self._told(lambda parts: parts.halo, "1", True)
+        return self._quantity(lambda parts: parts.halo, "1", True)
 
     @cached_property
     def brightness(self) -> Quantity:
         """Share of the charge within one rms over its area in normalised phase space, 1/m."""
-        return self._told(lambda parts: parts.core / (math.pi * parts.rms), "1/m", False)
+        return self._quantity(lambda parts: parts.core / (math.pi * parts.rms), "1/m", False)
 
-    def _told(self, of: Callable[[ChargeParts], np.ndarray], unit: str, tail: bool) -> Quantity:
-        """A quantity of the draws, open where the profiles do not tell it."""
+    def _quantity(
+        self, function: Callable[[ChargeParts], np.ndarray], unit: str, tail: bool
+    ) -> Quantity:
+        """Quantity from the draws, without an error where the profiles do not determine it."""
         if self.densities is None:
             return Quantity(math.nan, None, unit)
-        q = quantity_of_draws(of(self.parts), unit)
-        known = self.status is Status.converged and not (tail and self.cut)
-        return q if known and of_use(q.interval_95) else q.open()
+        q = quantity_of_draws(function(self.parts), unit)
+        determined = self.status is Status.converged and not (tail and self.cut)
+        return q if determined and of_use(q.interval_95) else q.open()
 
     @cached_property
     def density(self) -> np.ndarray:
-        """The mean density on `charge.FINE_AXIS`, per area of the frame, shape (m, m)."""
-        mean = finely(self.densities.values.mean(axis=0)[None])[0] / FINE**2
+        """Mean density on `charge.FINE_AXIS`, per area of the frame, shape (m, m)."""
+        mean = refine(self.densities.values.mean(axis=0)[None])[0] / FINE**2
         return mean.reshape(round(math.sqrt(mean.size)), -1)
 
     def to_json(self) -> dict[str, Any]:
@@ -186,13 +190,13 @@ def fit_density(
     Parameters
     ----------
     scan : QuadScan or path
-        With ``profiles``: of a file of emittance_gui, or of a table of profiles.
+        A scan with ``profiles``, from a file of emittance_gui or a table of profiles.
     line : Beamline or path, optional
-        From where the density is wanted to the screens; None for rows with matrices.
+        Beamline from the point of the density to the screens; None for rows with matrices.
     noise : Noise, optional
-        Its scatter of settings stretches profiles; `beamfit.Noise()` if None.
+        Noise model, whose scatter of settings stretches profiles; `beamfit.Noise()` if None.
     draws, seed : int
-        Draws of the density, and the seed of their random numbers.
+        Number of draws of the density, and seed of their random numbers.
 
     Returns
     -------
@@ -230,22 +234,22 @@ def fit_density(
     noise = noise or Noise()
     fit = fit_emittance(scan, line, noise=noise)
     scan, seen = fit.scan, fit.seen
-    r11, r12, known = seen.elements
-    boost, planes, lost = beta_gamma(seen.energy, seen.line.mass), [], []
+    r11, r12, variance = seen.elements
+    boost, planes, excluded = beta_gamma(seen.energy, seen.line.mass), [], []
     for plane in scan.planes:
         profiles, notes = mean_profiles(scan, plane)
         if len(profiles) < 3:
-            lost += notes
+            excluded += notes
             continue
         i, at = "xy".index(plane), [p.row for p in profiles]
         rows = np.column_stack([r11[i, at], r12[i, at]])
-        resolution = np.sqrt(np.maximum(known[i, at], 0.0))
+        resolution = np.sqrt(np.maximum(variance[i, at], 0.0))
         densities, phase = _densities(profiles, rows, resolution, noise, draws, seed)
         labels = tuple(_label(scan, row) for row in at)
         planes.append(PlaneDensity(plane, tuple(profiles), labels, fit[plane], densities, boost,
                                    phase, tuple(notes)))  # fmt: skip
     if not planes:
-        found = " ".join(["profiles that show a beam at fewer than three settings.", *lost])
+        found = " ".join(["profiles that show a beam at fewer than three settings.", *excluded])
         raise scan.unusable(found.rstrip("."), "five settings with such profiles")
     return DensityFit(scan, tuple(planes))
 
@@ -258,7 +262,7 @@ def _densities(
     draws: int,
     seed: int,
 ) -> tuple[Densities | None, float]:
-    """Draws of the density, and the phase advance that was seen; None where no beam is found."""
+    """Draw densities, and give the phase advance covered; None and 0 if no beam is found."""
     size = np.sqrt(np.maximum([p.size**2 for p in profiles] - resolution**2, 1e-2 * resolution**2))
     found = fit_sizes(*rows.T, size, size)
     if not bool(found.positive):
@@ -281,10 +285,10 @@ def _label(scan: QuadScan, row: int) -> str:
 
 
 def _sizes(plane: PlaneDensity) -> Finding | None:
-    """Sizes that determine no emittance have no density, whatever their profiles say.
+    """Find that sizes determine no emittance; then no density is given either.
 
-    Its scale is theirs, and the posterior of scans knows that it is skew; that of the density
-    is linear in it.
+    The density takes its scale from the sizes, and is linear in it; the posterior of the scan
+    includes that the scale is skew.
     """
     if plane.sizes.identifiability.determined:
         return None
@@ -300,16 +304,16 @@ def _no_beam(plane: PlaneDensity) -> Finding | None:
 
 
 def _few_phases(plane: PlaneDensity) -> Finding | None:
-    if plane.phase >= LEAST_PHASE:
+    if plane.phase >= MIN_PHASE:
         return None
-    cause = f"Profiles in {plane.plane} see {plane.phase:.0f}° of phase, {LEAST_PHASE:.0f}° are "
+    cause = f"Profiles in {plane.plane} see {plane.phase:.0f}° of phase, {MIN_PHASE:.0f}° are "
     cause += "needed: what stands between them could hide any shape."
     return Finding(Status.unidentified, cause, "Scan further on both sides of the waist.")
 
 
 def _wide(plane: PlaneDensity) -> Finding | None:
-    whole = quantity_of_draws(plane.parts.emittance[:, SHARES.index(0.9)], "m")
-    if of_use(whole.interval_95):
+    emittance = quantity_of_draws(plane.parts.emittance[:, SHARES.index(0.9)], "m")
+    if of_use(emittance.interval_95):
         return None
     cause = f"The profiles in {plane.plane} leave the emittance of 90 % of the charge open."
     where = f" The window cuts the beam at {plane.labels[plane.cut[0]]}." if plane.cut else ""
@@ -317,7 +321,7 @@ def _wide(plane: PlaneDensity) -> Finding | None:
 
 
 def _contradiction(plane: PlaneDensity) -> Finding | None:
-    if plane.by_chance >= CHANCE:
+    if plane.by_chance >= MIN_CHANCE:
         return None
     cause = (
         f"No density gives these profiles in {plane.plane}: they ask for negative charge, which "
@@ -340,7 +344,7 @@ def _found(plane: PlaneDensity) -> Finding:
     return Finding(Status.converged, cause)
 
 
-# In order of gravity.
+# In order of severity.
 RULES = (_contradiction, _sizes, _no_beam, _few_phases, _wide, _found)
 
 
@@ -352,11 +356,11 @@ class DensityFit:
     Attributes
     ----------
     scan : QuadScan
-        What was fitted.
+        The fitted scan.
     planes : tuple of PlaneDensity
-        One a plane with profiles at three settings or more.
+        One for each plane with profiles at three settings or more.
     stored : dict of str to dict of str to Quantity
-        Size method and plane to the normalised emittance that a file says, to be shown beside.
+        Normalised emittance in the file, by size method and plane, for comparison.
 
     Examples
     --------
@@ -383,14 +387,14 @@ class DensityFit:
 
     @property
     def status(self) -> Status:
-        """The gravest of the planes."""
-        return max((p.status for p in self.planes), key=GRAVER.index)
+        """Most severe status of the planes."""
+        return max((p.status for p in self.planes), key=SEVERITY.index)
 
     @property
     def headline(self) -> str:
-        """Verdict, and the emittances of 90 % of the charge."""
-        said = [f"{p.plane} {p.emittance['90 %']}" for p in self.planes]
-        return f"{cell(self.status)}: normalised emittance of 90 % of the charge {', '.join(said)}"
+        """Verdict, and emittances of 90 % of the charge."""
+        emittances = ", ".join(f"{p.plane} {p.emittance['90 %']}" for p in self.planes)
+        return f"{cell(self.status)}: normalised emittance of 90 % of the charge {emittances}"
 
     @property
     def message(self) -> str:
@@ -399,11 +403,11 @@ class DensityFit:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Sentences on the file and on what was left out."""
+        """Sentences on the file and on excluded profiles."""
         return (*self.scan.notes, *(note for p in self.planes for note in p.notes))
 
     def to_json(self) -> dict[str, Any]:
-        """Give the planes as the JSON contract wants them."""
+        """Give the planes in the JSON contract."""
         return {"status": self.status, "message": self.message,
                 "planes": [p.to_json() for p in self.planes]}  # fmt: skip
 

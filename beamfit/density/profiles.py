@@ -1,4 +1,4 @@
-"""Profiles of a scan, one a setting: the mean of its shots about their own centres."""
+"""Profiles of a scan, one for each setting: the mean of its shots about their own centres."""
 
 from __future__ import annotations
 
@@ -8,34 +8,37 @@ import numpy as np
 
 from beamfit.emittance.scan import Profile, QuadScan
 
-# Bins and light (in errors of the sum) without which a profile shows no beam.
-FEWEST_BINS, LEAST_LIGHT = 12, 5.0
-# A shot with less than this of the usual light of its setting, or its inverse, shows another beam.
-USUAL_LIGHT = 0.5
-# Share of the window at each end that is taken for background to begin with, and the reach of a
-# size in sizes: the tails are the density's to tell.
-ENDS, REACH = 0.1, 4.0
-# Share of the peak above which a shot's bins tell its centre.
-CENTRE = 0.2
-# Neighbouring bins at exactly the highest count, of which a rounded peak has no more.
-FLAT = 3
-# Settings that are taken at most: time grows with the cube of their number.
-MOST = 20
+# A profile shows a beam with at least this many bins, and this much light in errors of the sum.
+MIN_BINS = 12
+MIN_LIGHT = 5.0
+# Shots with less than this share of their setting's median light, or more than its inverse, show
+# another beam.
+MIN_LIGHT_RATIO = 0.5
+# Share of the window at each end that gives the first estimate of the background.
+ENDS = 0.1
+# Range of the first estimate of a size, in sizes: the density finds the tails.
+SIZE_RANGE = 4.0
+# The centre of a shot is that of its bins above this share of the peak.
+MIN_CENTRE_SHARE = 0.2
+# Largest number of neighbouring bins at exactly the highest count of an unsaturated, rounded peak.
+MAX_FLAT_BINS = 3
+# Largest number of settings: time grows with the cube of their number.
+MAX_SETTINGS = 20
 
 
 class MeanProfile(NamedTuple):
-    """Profile of one setting, mean of its shots.
+    """Profile of one setting, the mean of its shots.
 
     Attributes
     ----------
     row : int
         Row of the scan.
     position, charge : ndarray
-        Shape (n,): m from the centre, and counts a bin less the background, of any unit.
+        Distance from the centre, m, and counts per bin less the background, any unit, shape (n,).
     size : float
-        Rms, m, to begin with.
+        First estimate of the rms size, m.
     shots : int
-        How many were averaged.
+        Number of averaged shots.
     """
 
     row: int
@@ -51,19 +54,19 @@ class MeanProfile(NamedTuple):
 
 
 def mean_profiles(scan: QuadScan, plane: str) -> tuple[list[MeanProfile], list[str]]:
-    """Average the shots of each setting, and say what was left out.
+    """Average the shots of each setting, and list what was left out.
 
     Parameters
     ----------
     scan : QuadScan
-        With ``profiles``, any number a row.
+        A scan with ``profiles``, any number for each row.
     plane : str
         "x" or "y".
 
     Returns
     -------
     list of MeanProfile, list of str
-        In the order of the rows; sentences on shots without light and on saturated ones.
+        Profiles in the order of the rows; sentences on shots without light and saturated ones.
 
     Examples
     --------
@@ -76,8 +79,8 @@ def mean_profiles(scan: QuadScan, plane: str) -> tuple[list[MeanProfile], list[s
     (2, 200, [])
     """
     rows: dict[int, list[tuple[np.ndarray, np.ndarray]]] = {}
-    own, found, dark, flat = [p for p in scan.profiles if p.plane == plane], [], 0, 0
-    for p in own:
+    of_plane, found, dark, flat = [p for p in scan.profiles if p.plane == plane], [], 0, 0
+    for p in of_plane:
         if (shot := _shot(p)) is None:
             dark += 1
         elif _saturated(p):
@@ -86,28 +89,32 @@ def mean_profiles(scan: QuadScan, plane: str) -> tuple[list[MeanProfile], list[s
             rows.setdefault(p.row, []).append(shot)
     for row, shots in sorted(rows.items()):
         light = np.array([charge.sum() for _, charge in shots])
-        usual = np.abs(np.log(light / np.median(light))) < -np.log(USUAL_LIGHT)
-        dark += int((~usual).sum())
-        found.append(_mean(row, [s for s, good in zip(shots, usual, strict=True) if good]))
-    lost = {"no beam, or another charge": dark, "saturated, flat at the top": flat}
-    few = found
-    if len(found) > MOST:
-        few = [found[i] for i in np.linspace(0, len(found) - 1, MOST).astype(int)]
-    notes = [f"Left out in {plane}: {count} of {len(own)} profiles ({why})."
-             for why, count in lost.items() if count]  # fmt: skip
-    if few is not found:
-        notes.append(f"Of {len(found)} settings in {plane} {MOST} are taken, evenly among all.")
-    return few, notes
+        good_light = np.abs(np.log(light / np.median(light))) < -np.log(MIN_LIGHT_RATIO)
+        dark += int((~good_light).sum())
+        found.append(_mean(row, [s for s, good in zip(shots, good_light, strict=True) if good]))
+    excluded = {"no beam, or another charge": dark, "saturated, flat at the top": flat}
+    kept = found
+    if len(found) > MAX_SETTINGS:
+        kept = [found[i] for i in np.linspace(0, len(found) - 1, MAX_SETTINGS).astype(int)]
+    notes = [f"Left out in {plane}: {count} of {len(of_plane)} profiles ({why})."
+             for why, count in excluded.items() if count]  # fmt: skip
+    if kept is not found:
+        notes.append(
+            f"Of {len(found)} settings in {plane} {MAX_SETTINGS} are taken, evenly among all."
+        )
+    return kept, notes
 
 
 def _saturated(profile: Profile) -> bool:
     """True if more neighbouring bins are at the highest count than a peak has."""
     top = profile.counts == np.nanmax(profile.counts)
-    return bool(np.convolve(top, np.ones(FLAT + 1), "valid").max(initial=0.0) > FLAT)
+    return bool(
+        np.convolve(top, np.ones(MAX_FLAT_BINS + 1), "valid").max(initial=0.0) > MAX_FLAT_BINS
+    )
 
 
 def profile_size(profile: Profile) -> float:
-    """Find the rms size of a profile, m, its background by the ends; NaN where it shows no beam.
+    """Rms size of a profile, m, with the background from its ends; NaN if it shows no beam.
 
     Examples
     --------
@@ -121,39 +128,41 @@ def profile_size(profile: Profile) -> float:
 
 
 def _shot(profile: Profile) -> tuple[np.ndarray, np.ndarray] | None:
-    """Position about the centre and counts less the background; None where there is no beam."""
+    """Give positions about the centre and counts less the background; None if there is no beam."""
     good = np.isfinite(profile.counts) & np.isfinite(profile.position)
     order = np.argsort(profile.position[good])
     x, counts = profile.position[good][order], profile.counts[good][order]
-    if len(x) < FEWEST_BINS:
+    if len(x) < MIN_BINS:
         return None
     n = max(3, round(ENDS * len(x)))
     ends = np.stack([counts[:n], counts[-n:]])
     level = np.median(ends, axis=1, keepdims=True)
     low, high = x[n // 2], x[-1 - n // 2]  # the middles of the ends
     charge = counts - level[0] - (level[1] - level[0]) * (x - low) / (high - low)
-    # Second differences of normal noise have sqrt(6) times its error; so have those of a beam of
-    # few bins, whose background tells the noise then.
-    jagged = np.median(np.abs(np.diff(charge, 2))) / (np.sqrt(6.0) * 0.6745)
-    noise = min(jagged, np.sqrt(np.sum((ends - level) ** 2) / (2 * n - 2)))
-    # The sum has the noise of its bins and that of the medians of both ends, off its every bin.
+    # Second differences of normal noise have sqrt(6) times its error. A beam of few bins has large
+    # ones too; its noise is that of the background.
+    roughness = np.median(np.abs(np.diff(charge, 2))) / (np.sqrt(6.0) * 0.6745)
+    noise = min(roughness, np.sqrt(np.sum((ends - level) ** 2) / (2 * n - 2)))
+    # The sum has the noise of its bins, and in every bin that of the medians of both ends.
     error = noise * np.sqrt(len(x) + len(x) ** 2 * np.pi / 2.0 / (2.0 * n))
-    if charge.sum() <= LEAST_LIGHT * error:
+    if charge.sum() <= MIN_LIGHT * error:
         return None
-    top = np.where(charge > CENTRE * charge.max(), charge, 0.0)
+    top = np.where(charge > MIN_CENTRE_SHARE * charge.max(), charge, 0.0)
     return x - np.average(x, weights=top), charge
 
 
 def _mean(row: int, shots: list[tuple[np.ndarray, np.ndarray]]) -> MeanProfile:
-    """Mean of shots of equal light on the bins that all of them have."""
+    """Average shots of equal light on the bins that all of them have."""
     step = float(np.median(np.diff(shots[0][0])))
     low, high = max(x[0] for x, _ in shots), min(x[-1] for x, _ in shots)
-    at = low + step * np.arange(int((high - low) / step) + 1)
-    charge = np.mean([np.interp(at, x, c / c.sum()) for x, c in shots], axis=0)
-    centre, size = 0.0, float(np.sqrt(np.average(at**2, weights=np.maximum(charge, 0.0))))
+    position = low + step * np.arange(int((high - low) / step) + 1)
+    charge = np.mean([np.interp(position, x, c / c.sum()) for x, c in shots], axis=0)
+    centre, size = 0.0, float(np.sqrt(np.average(position**2, weights=np.maximum(charge, 0.0))))
     for _ in range(8):
-        near = np.abs(at - centre) < REACH * size
-        light = charge[near].sum()
-        centre = float(charge[near] @ at[near] / light)
-        size = float(np.sqrt(max(charge[near] @ (at[near] - centre) ** 2 / light, step**2)))
-    return MeanProfile(row, at - centre, charge, size, len(shots))
+        inside = np.abs(position - centre) < SIZE_RANGE * size
+        light = charge[inside].sum()
+        centre = float(charge[inside] @ position[inside] / light)
+        size = float(
+            np.sqrt(max(charge[inside] @ (position[inside] - centre) ** 2 / light, step**2))
+        )
+    return MeanProfile(row, position - centre, charge, size, len(shots))

@@ -1,10 +1,11 @@
-"""Alternatives of what stands between the inputs and an output, compared by one evidence.
+"""Comparison of alternative descriptions of how the inputs act on an output.
 
-Inputs are held from sample to sample or move between, pass a law or none, and come late by whole
-samples or by a part of one; the response may have one more term. Each is fitted under every noise
-of a grid, white or wandering, and weighed by its likelihood with the numbers and the noise
-integrated out: a noise that wanders takes for its own what a law leaves, and gains are then far
-off. The likeliest is named, and what stays open goes into errors.
+Alternatives differ in the inputs between samples (held or moving), in a law of an input (or none)
+and in the delay (whole samples or fractions of one); the response may also have one further term.
+Each is fitted under every noise of a grid, white or wandering, and is weighted by its marginal
+likelihood, with the free numbers and the noise integrated out: a noise that wanders can absorb what
+a missing law leaves, and gains are then far off. The most probable departure is named, and the
+uncertainty that remains enters the errors.
 """
 
 from __future__ import annotations
@@ -20,58 +21,84 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.special import logsumexp
 
-from beamfit.dynamics.checks import SLOW, paths_by, slow_lags, slow_paths
+from beamfit.dynamics.checks import FURTHER_LAGS, further_lags, further_responses, unit_responses
 from beamfit.dynamics.input_laws import STATIC, InputLaw, laws_between
-from beamfit.dynamics.model import Driven, PreparedOutput, filled, growing_of, predicted
-from beamfit.dynamics.paths import Path, Paths, Undriven, handed_on, undriven
+from beamfit.dynamics.model import (
+    DrivenRun,
+    PreparedOutput,
+    growth_columns,
+    pad_readings,
+    predicted,
+)
+from beamfit.dynamics.paths import Path, Paths, PreparedReadings, inputs_by_path, prepare_readings
 from beamfit.dynamics.record import Run, Way
 from beamfit.dynamics.response import ARX
-from beamfit.dynamics.search import Begun, drift_columns, noises_of, shape_of, spanned
+from beamfit.dynamics.search import (
+    RunsFit,
+    drift_columns,
+    noise_grid,
+    orthonormal_basis,
+    shape_parameters,
+)
 from beamfit.greybox import tree
 from beamfit.greybox.problem import with_slope
 from beamfit.noise.correlated import Whitened, roots_by_each
 from beamfit.noise.memory import CorrelatedNoise
 from beamfit.statistics import MIN_SINGULAR_VALUE
 
-# Correlation times and white variances of the noises that each is fitted with, and most readings.
-CORRELATION_TIMES, WHITE, MOST = 6, (0.0, 1.0, 10.0, 100.0), 2048
-# Odds that a response has no more terms than the model that was asked for: a guess.
-FULLER = 10.0
-# Probability of the laws that are named, where several are possible.
-NAMED = 0.99
-# How many times a law of the value alone is looked at in finer steps.
-ZOOMS = 2
-# Share of what a law hands on that no gain and level give, below which it is none.
-SAME = 1e-6
-# Largest residual, of a step that went astray.
-VAST = 1e100
-# Gauss-Newton rounds of all, and of the `MANY` that are likeliest then; every how many-th noise of
-# the grid the first one looks at, and how many the others.
-FIRST, MANY, ROUNDS, SPREAD, FEW = 2, 128, 3, 3, 4
-# Shorter delays that a law may stand for.
-LATE = 3
-# Below this probability an alternative moves no end of a 95 % interval, however far off it is.
-LEAST = 1e-5
-# Alternatives that are fitted at once: one program is compiled for all.
-BATCH = 64
+# Noise grid of the comparison: number of correlation times, and ratios of white variance to the
+# variance that the wandering part gains in a sample. Chosen for speed: coarser than the grid of the
+# final fit.
+CORRELATION_TIMES = 6
+WHITE_RATIOS = (0.0, 1.0, 10.0, 100.0)
+# Readings of each run that the comparison uses at most: chosen, for speed.
+MAX_READINGS = 2048
+# Prior odds that the response has no term beyond those of the model asked for: a guess.
+ODDS_AGAINST_TERM = 10.0
+# Where several laws are possible, the most probable ones are named until they make up this
+# probability.
+NAMED_PROBABILITY = 0.99
+# Number of times the steps of the best static laws are made finer.
+REFINEMENTS = 2
+# A law counts as none if a gain and a level give its output to this relative accuracy.
+LINEAR_TOLERANCE = 1e-6
+# Residuals are clipped here, so that a diverged Gauss-Newton step stays finite.
+MAX_RESIDUAL = 1e100
+# Gauss-Newton rounds that screen all trials, number of the best trials that are kept, and rounds
+# that follow for these. All chosen.
+SCREENING_ROUNDS = 2
+MAX_TRIALS = 128
+FINAL_ROUNDS = 3
+# The first round uses every NOISE_STRIDE-th noise of the grid, later ones the NOISES_PER_ROUND
+# best.
+NOISE_STRIDE = 3
+NOISES_PER_ROUND = 4
+# Delays shorter than that of the fit by up to this many samples are tried with each law, since a
+# law can look like a delay.
+MAX_DELAY_REPLACED = 3
+# Alternatives below this probability are dropped: they move no end of a 95 % interval.
+MIN_PROBABILITY = 1e-5
+# Trials that are fitted together: one program is compiled for all batches.
+TRIALS_PER_BATCH = 64
 
 
-# Kinds of departures that are no laws of an input.
+# Kinds of departures that are not laws of an input.
 FURTHER, GROWTH = "further term", "growth"
 
 
 class Departure(NamedTuple):
-    """A law of an input, a term of a fuller response, or something that grows along the record,
-    beside a response. In words, by its kind, and its probability where no departure and
-    these are all that can be.
+    """A departure from the plain response: a law of an input, a further term, or a growth.
+
+    `words` describes it, `kind` is a kind of `InputLaw`, `FURTHER` or `GROWTH`. `probability` is
+    that of any departure, against none.
     """
 
     words: str
     kind: str
     probability: float = 0.0
 
-    def grown(self, share: float) -> Departure:
-        """The same with the amount by which it grows."""
+    def with_growth(self, share: float) -> Departure:
+        """Add the amount by which a growing quantity changes along the record to the words."""
         if self.kind != GROWTH:
             return self
         by, unit = (share, "samples") if self.words == "a delay" else (100.0 * share, "%")
@@ -79,157 +106,171 @@ class Departure(NamedTuple):
         return self._replace(words=f"{self.words} that {way} by about {abs(by):.2g} {unit}")
 
 
-NONE = Departure("", "")
-# Departures by the columns of `growing_of`: a delay grows by a sample, a gain by itself.
-GROWING = [Departure("a delay", GROWTH), Departure("a gain", GROWTH)]
+NO_DEPARTURE = Departure("", "")
+# Departures of the columns of `growth_columns`, in their order.
+GROWTH_DEPARTURES = [Departure("a delay", GROWTH), Departure("a gain", GROWTH)]
 
 
 class Trial(NamedTuple):
-    """A path, the logarithm of its prior, and the number of a further term of the response."""
+    """A path, its log prior, and the index of a further term of the response if any."""
 
     path: Path
     prior: float
     term: int | None = None
 
     @property
-    def lawful(self) -> bool:
-        """True for a law or a further term."""
+    def is_departure(self) -> bool:
+        """True if the trial has a law or a further term."""
         return self.path.law is not None or self.term is not None
 
 
 class Alternatives(NamedTuple):
-    """Posterior over what may stand between the inputs and an output.
+    """Posterior over the descriptions of how the inputs act on an output.
 
     Attributes
     ----------
     path : Path
-        The likeliest one without a law; that of the fit where it contains it.
-    late, ahead : float
-        Standard deviation of the delay about that of the fit, in samples, and the probability that
-        it is below zero, without a law.
+        The most probable path without a law; that of the fit where the fit covers it.
+    delay_error, early_probability : float
+        Standard deviation of the delay about that of the fit, in samples, and probability that it
+        is negative; both over the trials without a departure.
     departure : Departure
-        The likeliest law or further term, or those that make 99 % with their probabilities.
+        The most probable departure, or those that make up 99 % with their probabilities.
     weight : array, shape (a,)
-        Probability of each alternative to the answer.
+        Probability of each alternative to the fit.
     shift : array, shape (a, p)
-        The numbers of the fit with each, less those of the answer.
+        Free numbers with each alternative, less those of the fit.
     covariance : array, shape (a, p, p)
-        Of the numbers, with each.
+        Covariance of the free numbers with each alternative.
     """
 
     path: Path
-    late: float
-    ahead: float
+    delay_error: float
+    early_probability: float
     departure: Departure
     weight: np.ndarray
     shift: np.ndarray
     covariance: np.ndarray
 
     def error(self, slopes: np.ndarray, alone: np.ndarray) -> np.ndarray:
-        """Errors of quantities by their slopes, shape (..., p), about the value of the answer.
+        """Give the errors of derived quantities about their fitted values, alternatives included.
 
-        `alone` has the errors without alternatives.
+        `slopes` (..., p) are the derivatives by the free numbers, `alone` the errors without
+        alternatives.
         """
-        slopes = slopes[..., : self.shift.shape[1]]  # a delay is that of each path
+        slopes = slopes[..., : self.shift.shape[1]]  # the delay is no free number here
         spread = np.einsum("...p,apq,...q->...a", slopes, self.covariance, slopes)
         others = (spread + (slopes @ self.shift.T) ** 2) @ self.weight
         return np.sqrt(max(1.0 - self.weight.sum(), 0.0) * alone**2 + others)
 
 
 @partial(jax.jit, static_argnums=0)
-def _columns(chosen: Any, model: Any, run: Driven, data: Any, theta: Any, u: Any):
-    """Slopes and residuals of each trial: columns at right angles, and the triangle they make.
+def _factored_rows(chosen: Any, model: Any, run: DrivenRun, data: Any, theta: Any, u: Any):
+    """QR factors of slopes and residuals of each trial, in units of the reading errors.
 
-    `data` are readings, their errors, what is added, and the parts of a row in delays with their
-    widths. The last number is the share of what is added, by how much the width of a law is
-    another, or in widths the delay.
+    `data` holds readings, their errors, the further term, and the fractions of a row in the delays
+    with their widths. The last free number is the amount of the further term, the change of the
+    law's width in steps, or the change of the delay in widths.
     """
-    y, error, term, late = data
+    y, error, term, delay = data
 
-    def one(theta, u, term, late):
+    def one(theta, u, term, delay):
         def output(t):
-            part, width = late
-            own = replace(run, u=u[..., 0] + t[-1] * u[..., 1], part=part + t[-1] * width)
-            return predicted(tree.replace(model, chosen, t[:-1]), own) + t[-1] * term
+            fraction, width = delay
+            shifted = replace(
+                run, u=u[..., 0] + t[-1] * u[..., 1], delay_fraction=fraction + t[-1] * width
+            )
+            return predicted(tree.replace(model, chosen, t[:-1]), shifted) + t[-1] * term
 
         return with_slope(output, theta)
 
-    value, slope = jax.vmap(one)(theta, u, term, late)
+    value, slope = jax.vmap(one)(theta, u, term, delay)
     rows = jnp.concatenate([slope, (value - y)[..., None]], axis=2)
-    return jnp.linalg.qr(jnp.clip(jnp.nan_to_num(rows, nan=VAST), -VAST, VAST) / error[:, None])
+    return jnp.linalg.qr(
+        jnp.clip(jnp.nan_to_num(rows, nan=MAX_RESIDUAL), -MAX_RESIDUAL, MAX_RESIDUAL)
+        / error[:, None]
+    )
 
 
 class _Batch(NamedTuple):
-    """Trials to be fitted, each under every noise of a grid: their inputs and terms, by run, and
-    the parts of a row in their delays with their widths.
+    """Trials that are fitted together, under every noise of the grid.
+
+    `inputs` and `terms` are by run, `delays` has the fractions of a row in the delays and their
+    widths.
     """
 
     comparison: Comparison
     inputs: list[np.ndarray]
-    late: tuple[np.ndarray, np.ndarray]
+    delays: tuple[np.ndarray, np.ndarray]
     terms: list[np.ndarray]
 
-    def whitened(self, theta: np.ndarray, noises: Sequence[int]) -> Whitened:
-        """Rows of every trial by some noises of the grid."""
+    def whiten(self, theta: np.ndarray, noises: Sequence[int]) -> Whitened:
+        """Whiten slopes and residuals of every trial by some noises of the grid."""
         c, some = self.comparison, [self.comparison.grid[k] for k in noises]
         triangles, volume, count = [], 0.0, 0
-        for run, data, term, u in zip(c.seen.drives, c.data, self.terms, self.inputs, strict=True):
+        for run, data, term, u in zip(
+            c.prepared.drives, c.data, self.terms, self.inputs, strict=True
+        ):
             y, time, error = data
-            found = _columns(c.chosen, c.model, run, (y, error, term, self.late), theta, u)
+            found = _factored_rows(c.chosen, c.model, run, (y, error, term, self.delays), theta, u)
             columns, triangle = map(np.asarray, found)
             columns = np.swapaxes(columns[:, : len(time)], 0, 1)
             roots, each = roots_by_each(some, columns, np.diff(time))
             triangles.append(roots @ triangle)
             volume, count = volume + each, count + len(time)
-        prior = np.eye(len(c.begin))[c.near]
-        away = (theta - c.begin) @ prior.T
-        known = np.concatenate([np.tile(prior, (len(theta), 1, 1)), away[..., None]], axis=2)
-        both = np.concatenate([*triangles, np.tile(known, (len(some), 1, 1, 1))], axis=2)
-        return by_each(some, both, volume, count + len(prior))
+        prior = np.eye(len(c.begin))[c.prior_indices]
+        offset = (theta - c.begin) @ prior.T
+        prior_rows = np.concatenate([np.tile(prior, (len(theta), 1, 1)), offset[..., None]], axis=2)
+        rows = np.concatenate([*triangles, np.tile(prior_rows, (len(some), 1, 1, 1))], axis=2)
+        return repeat_for_noises(some, rows, volume, count + len(prior))
 
-    def fitted(self, begin: np.ndarray, rounds: int) -> tuple[np.ndarray, np.ndarray]:
-        """The numbers of each trial, by Gauss-Newton steps that lower -2 ln L, and its least.
+    def fit(self, begin: np.ndarray, rounds: int) -> tuple[np.ndarray, np.ndarray]:
+        """Fit the numbers of each trial by Gauss-Newton steps; return them and the lowest -2 ln L.
 
-        The first step is by the noise of a few that is likeliest with each trial, further ones by
-        the `FEW` that are so with the likeliest trials.
+        Each trial steps under its best noise. The first round tries every `NOISE_STRIDE`-th noise,
+        further rounds the `NOISES_PER_ROUND` noises of the best trials.
         """
-        count, noises = len(begin), np.arange(len(self.comparison.grid))[::SPREAD]
-        best, each = begin, np.arange(count)
-        step, least = np.zeros_like(best), np.full(count, np.inf)
+        count, noises = len(begin), np.arange(len(self.comparison.grid))[::NOISE_STRIDE]
+        best, trials = begin, np.arange(count)
+        step, lowest = np.zeros_like(best), np.full(count, np.inf)
         for _ in range(rounds):
-            white = self.whitened(best + step, noises)
+            white = self.whiten(best + step, noises)
             memory, squares = white.memory(), np.sum(white.triangle[..., -1] ** 2, axis=1)
-            now, after = (_minus(white, s).reshape(-1, count) for s in (squares, memory.squares))
-            likeliest = after.argmin(axis=0)
-            further = memory.step.reshape(-1, count, best.shape[1])[likeliest, each]
-            better = now.min(axis=0) < least
+            deviance = _deviance(white, squares).reshape(-1, count)
+            next_deviance = _deviance(white, memory.squares).reshape(-1, count)
+            best_noise = next_deviance.argmin(axis=0)
+            next_step = memory.step.reshape(-1, count, best.shape[1])[best_noise, trials]
+            better = deviance.min(axis=0) < lowest
             best = np.where(better[:, None], best + step, best)
-            least = np.minimum(least, now.min(axis=0))
-            step = np.where(better[:, None], further, 0.25 * step)
-            ranked = noises[likeliest[np.argsort(after.min(axis=0))]]
-            noises = np.array(list(dict.fromkeys(ranked))[:FEW])
-        return best, np.minimum(least, after.min(axis=0))
+            lowest = np.minimum(lowest, deviance.min(axis=0))
+            step = np.where(better[:, None], next_step, 0.25 * step)
+            ranked = noises[best_noise[np.argsort(next_deviance.min(axis=0))]]
+            noises = np.array(list(dict.fromkeys(ranked))[:NOISES_PER_ROUND])
+        return best, np.minimum(lowest, next_deviance.min(axis=0))
 
-    def weighed(self, begin: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Log evidence, numbers and covariances of each trial, numbers and noise integrated out."""
-        (at, _), grid = self.fitted(begin, ROUNDS), len(self.comparison.grid)
-        likelihood, mean, spread, _ = over_noises(self.whitened(at, range(grid)), grid)
+    def weigh(self, begin: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Log evidence of each trial, and mean and covariance of its numbers, over all noises."""
+        (at, _), grid = self.fit(begin, FINAL_ROUNDS), len(self.comparison.grid)
+        likelihood, mean, spread, _ = average_over_noises(self.whiten(at, range(grid)), grid)
         return likelihood, at + mean, spread
 
 
-def by_each(
+def repeat_for_noises(
     noises: Sequence[CorrelatedNoise], triangles: np.ndarray, volume: np.ndarray, count: int
 ) -> Whitened:
-    """Trials by each noise, shape (noises, trials, rows, columns), in one row."""
+    """Flatten triangles of shape (noises, trials, rows, columns) to one axis."""
     trials = triangles.shape[1]
     noise = CorrelatedNoise(*np.repeat(np.array(noises).T, trials, axis=1))
     each = triangles.reshape(-1, *triangles.shape[2:])
     return Whitened(noise, each, np.repeat(volume, trials), count)
 
 
-def over_noises(white: Whitened, grid: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
-    """Log evidence of each trial by so many noises in turn, its step and the covariance with the
-    noise integrated out, and the degrees of freedom.
+def average_over_noises(
+    white: Whitened, grid: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
+    """Integrate the noise out: log evidence of each trial, its step and covariance, and the dof.
+
+    The rows of `white` are those of each of the `grid` noises in turn, all trials of one together.
     """
     memory, logs = white.weighed()
     logs = logs.reshape(grid, -1)
@@ -239,231 +280,251 @@ def over_noises(white: Whitened, grid: int) -> tuple[np.ndarray, np.ndarray, np.
     size = (memory.squares / memory.dof).reshape(logs.shape)
     mean = np.einsum("ga,gap->ap", share, step)
     spread = np.einsum("ga,gapr,gaqr->apq", share * size, half, half, optimize=True)
-    away = step - mean
-    spread += np.einsum("ga,gap,gaq->apq", share, away, away, optimize=True)
+    offset = step - mean
+    spread += np.einsum("ga,gap,gaq->apq", share, offset, offset, optimize=True)
     return likelihood, mean, spread, memory.dof
 
 
-def _minus(white: Whitened, squares: np.ndarray) -> np.ndarray:
-    """-2 ln L by each noise, up to a constant, of so large sums of squares."""
+def _deviance(white: Whitened, squares: np.ndarray) -> np.ndarray:
+    """Give -2 ln L up to a constant from residual sums of squares, the noise level at its best."""
     return white.count * np.log(np.maximum(squares, np.finfo(float).tiny)) - 2.0 * white.volume
 
 
-class _Weighed(NamedTuple):
-    """Trials with the logarithms of their likelihoods, their numbers, and the covariances."""
+class _TrialPosterior(NamedTuple):
+    """Trials with the log evidence, the free numbers and the covariance of each."""
 
     trials: list[Trial]
-    log: np.ndarray
+    log_evidence: np.ndarray
     numbers: np.ndarray
     spread: np.ndarray
 
-    def where(self, kept: np.ndarray) -> _Weighed:
-        """Some of them."""
+    def select(self, kept: np.ndarray) -> _TrialPosterior:
+        """Keep the trials of a mask."""
         trials = [trial for trial, keep in zip(self.trials, kept, strict=True) if keep]
-        return _Weighed(trials, *(each[kept] for each in self[1:]))
+        return _TrialPosterior(trials, *(each[kept] for each in self[1:]))
 
-    def beside(self, other: _Weighed) -> _Weighed:
-        """These and others."""
+    def merge(self, other: _TrialPosterior) -> _TrialPosterior:
+        """Join two sets of trials."""
         parts = zip(self[1:], other[1:], strict=True)
-        return _Weighed(self.trials + other.trials, *(np.concatenate(pair) for pair in parts))
+        return _TrialPosterior(self.trials + other.trials, *map(np.concatenate, parts))
 
     @property
-    def logs(self) -> np.ndarray:
-        """Logarithm of the probability of each, up to a constant."""
-        return self.log + np.array([trial.prior for trial in self.trials])
+    def log_posterior(self) -> np.ndarray:
+        """Unnormalised log probability of each trial."""
+        return self.log_evidence + np.array([trial.prior for trial in self.trials])
 
     @property
-    def chance(self) -> np.ndarray:
-        """Probability of each."""
-        return np.exp(self.logs - logsumexp(self.logs))
+    def probability(self) -> np.ndarray:
+        """Probability of each trial."""
+        return np.exp(self.log_posterior - logsumexp(self.log_posterior))
 
     @property
-    def none(self) -> np.ndarray:
-        """True for those without a law or a further term."""
-        return np.array([not trial.lawful for trial in self.trials])
+    def no_departure(self) -> np.ndarray:
+        """True for each trial without a law or further term."""
+        return np.array([not trial.is_departure for trial in self.trials])
 
-    def late(self, about: float) -> tuple[float, float]:
-        """Standard deviation of the delay about one, and the probability that it is below zero."""
+    def delay_moments(self, about: float) -> tuple[float, float]:
+        """Rms of the delay about a value, in samples, and probability that it is negative."""
         paths = [trial.path for trial in self.trials]
         delays, width = np.array([(path.delay, path.width) for path in paths]).T
-        away = delays + width * self.numbers[:, -1] - about
-        squares = away**2 + width**2 * self.spread[:, -1, -1]
-        return float(np.sqrt(self.chance @ squares)), float(self.chance @ (delays < 0))
+        shift = delays + width * self.numbers[:, -1] - about
+        squares = shift**2 + width**2 * self.spread[:, -1, -1]
+        return float(np.sqrt(self.probability @ squares)), float(self.probability @ (delays < 0))
 
-    def best(self) -> dict[tuple[str, str], int]:
-        """The likeliest law of the value alone, by kind and input."""
-        laws = [(int(k), self.trials[k].path.law) for k in np.argsort(self.logs)]  # the last stays
+    def best_static_laws(self) -> dict[tuple[str, str], int]:
+        """Index of the most probable static law of each kind and input."""
+        # In rising order, so that the most probable one of each kind stays.
+        laws = [(int(k), self.trials[k].path.law) for k in np.argsort(self.log_posterior)]
         return {(law.kind, law.input): k for k, law in laws if law and law.kind in STATIC}
 
 
 class Comparison(NamedTuple):
-    """A fit that alternatives are compared with: its runs, readings, numbers and noises.
+    """A fit with all that its alternatives are fitted with.
 
-    `data` are readings, their times and errors, by run, readings and errors padded; `begin` the
-    numbers of the fit without its delay and, last, a share of nothing; `near` those that have a
-    prior of width 1: the logarithm of a time constant, what a damping is made of, the share of a
-    term or the change of a width. An alternative may take them to where nothing tells them.
+    `data` holds padded readings, times and padded errors of each run; `begin` the numbers of the
+    fit without its delay and, last, 0 for the number that an alternative adds. `prior_indices` are
+    the numbers with a prior of width 1 about the fit: logarithms of time constants, raw numbers of
+    a damping, and the added number; without it an alternative could take them where no data count.
+    `grid` are noises, `terms` the columns of further terms by run, `departures` their descriptions.
     """
 
     runs: tuple[Run, ...]
-    seen: Undriven
+    prepared: PreparedReadings
     data: list[tuple[np.ndarray, ...]]
-    parts: int
+    rows_per_sample: int
     chosen: tuple[Any, ...]
     model: Any
     begin: np.ndarray
-    near: list[int]
+    prior_indices: list[int]
     grid: list[CorrelatedNoise]
     terms: list[np.ndarray]
-    names: list[Departure]
+    departures: list[Departure]
 
     @classmethod
-    def of(
-        cls, runs: tuple[Run, ...], found: Begun, paths: Paths, slopes: Sequence[np.ndarray]
+    def prepare(
+        cls, runs: tuple[Run, ...], found: RunsFit, paths: Paths, slopes: Sequence[np.ndarray]
     ) -> Comparison:
-        """Prepare the fit of runs; `slopes` are those of `changing_of`."""
-        seen, fit = found.seen, found.settled.fit
-        physics, delay = seen.runs[0].physics, found.path.delay
-        whole = undriven(runs, seen.output, physics, paths.parts, delay, MOST)
-        drives = whole.drives
-        errors = [noise.each[:MOST] for (noise,) in found.settled.noise]
+        """Prepare a fit; `slopes` are those of `fuller_model_slopes`."""
+        prepared, fit = found.prepared, found.fit
+        physics, delay = prepared.runs[0].physics, found.path.delay
+        readings = prepare_readings(
+            runs, prepared.output, physics, paths.rows_per_sample, delay, MAX_READINGS
+        )
+        drives = readings.drives
+        errors = [noise.each[:MAX_READINGS] for (noise,) in found.noise]
+        each = zip(drives, readings.measured, prepared.time, errors, strict=True)
         data = [
-            (filled(drive, y), time[:MOST], filled(drive, error, np.inf))
-            for drive, y, time, error in zip(drives, whole.measured, seen.time, errors, strict=True)
+            (pad_readings(drive, y), time[:MAX_READINGS], pad_readings(drive, error, np.inf))
+            for drive, y, time, error in each
         ]
-        names, more = _terms(found, slopes)
-        terms = [filled(drive, each.T[:, :MOST]) for drive, each in zip(drives, more, strict=True)]
+        departures, columns = _further_terms(found, slopes)
+        terms = [
+            pad_readings(drive, each.T[:, :MAX_READINGS])
+            for drive, each in zip(drives, columns, strict=True)
+        ]
         numbers = [v.name for v in fit.variables if v.name != "late"]
-        powers = physics.units(len(seen.inputs))
-        near = [numbers.index(f"map[{k}]") for k, (_, gain) in enumerate(powers)
+        powers = physics.units(len(prepared.inputs))
+        prior_indices = [numbers.index(f"map[{k}]") for k, (_, gain) in enumerate(powers)
                 if not gain and f"map[{k}]" in numbers] + [len(numbers)]  # fmt: skip
         core = fit.problem.core
         chosen = tuple(leaf for leaf in core.chosen if leaf.path != "late")
-        grid = noises_of(seen.time, CORRELATION_TIMES, WHITE)
+        grid = noise_grid(prepared.time, CORRELATION_TIMES, WHITE_RATIOS)
         begin = np.append(fit.theta[: len(numbers)], 0.0)
         model = core.model | {"late": jnp.zeros(())}
-        return cls(runs, whole, data, paths.parts, chosen, model, begin, near, grid, terms, names)
+        return cls(
+            runs, readings, data, paths.rows_per_sample, chosen, model, begin, prior_indices, grid,
+            terms, departures,
+        )  # fmt: skip
 
-    def weighed(self, trials: list[Trial]) -> _Weighed:
-        """Weigh trials: those of no law, and the likeliest after a step or two from the fit."""
+    def weigh(self, trials: list[Trial]) -> _TrialPosterior:
+        """Weigh trials by their evidence.
+
+        Of more than `MAX_TRIALS` those without a departure are kept, and the best others after
+        `SCREENING_ROUNDS` rounds.
+        """
         begin = np.tile(self.begin, (len(trials), 1))
-        if len(trials) > MANY:
-            steps = [batch.fitted(each, FIRST) for batch, each in self._batches(trials, begin)]
-            parts = zip(*steps, strict=True)
+        if len(trials) > MAX_TRIALS:
+            batches = self._batches(trials, begin)
+            parts = zip(*(b.fit(each, SCREENING_ROUNDS) for b, each in batches), strict=True)
             begin, cost = (np.concatenate(part)[: len(trials)] for part in parts)
-            cost -= [2.0 * t.prior if t.lawful else np.inf for t in trials]
-            kept = np.argsort(cost)[:MANY]
+            cost -= [2.0 * t.prior if t.is_departure else np.inf for t in trials]
+            kept = np.argsort(cost)[:MAX_TRIALS]
             trials, begin = [trials[k] for k in kept], begin[kept]
-        found = [batch.weighed(each) for batch, each in self._batches(trials, begin)]
+        found = [batch.weigh(each) for batch, each in self._batches(trials, begin)]
         parts = (np.concatenate(part)[: len(trials)] for part in zip(*found, strict=True))
-        return _Weighed(trials, *parts)
+        return _TrialPosterior(trials, *parts)
 
     def _batches(
         self, trials: list[Trial], begin: np.ndarray
     ) -> Iterator[tuple[_Batch, np.ndarray]]:
-        """`BATCH` trials at once, the last ones repeated, and where they begin."""
-        more = -len(trials) % BATCH
+        """Split trials and their start numbers into batches; the last trial fills the last one."""
+        more = -len(trials) % TRIALS_PER_BATCH
         trials, begin = trials + trials[-1:] * more, np.pad(begin, ((0, more), (0, 0)), mode="edge")
-        for k in range(0, len(trials), BATCH):
-            some = trials[k : k + BATCH]
+        for k in range(0, len(trials), TRIALS_PER_BATCH):
+            some = trials[k : k + TRIALS_PER_BATCH]
             paths = [trial.path for trial in some]
-            inputs, part = handed_on(self.runs, self.seen, self.parts, paths)
+            inputs, part = inputs_by_path(self.runs, self.prepared, self.rows_per_sample, paths)
             terms = [np.stack([0.0 * each[0] if t.term is None else each[t.term] for t in some])
                      for each in self.terms]  # fmt: skip
-            width = self.parts * np.array([path.width for path in paths])
-            yield _Batch(self, inputs, (part, width), terms), begin[k : k + BATCH]
+            width = self.rows_per_sample * np.array([path.width for path in paths])
+            yield _Batch(self, inputs, (part, width), terms), begin[k : k + TRIALS_PER_BATCH]
 
 
 def alternatives_of(
-    runs: tuple[Run, ...], found: Begun, paths: Paths, slopes: Sequence[np.ndarray], lawful: bool
+    runs: tuple[Run, ...],
+    found: RunsFit,
+    paths: Paths,
+    slopes: Sequence[np.ndarray],
+    departures: bool,
 ) -> Alternatives:
-    """Weigh every path and law of the inputs against those of a fit.
+    """Weigh every path, law and further term against those of a fit.
 
-    `lawful` is False where no law, and no term of a fuller response, is looked for.
+    With `departures` False neither laws nor further terms are tried.
     """
-    comparison = Comparison.of(runs, found, paths, slopes)
-    own = found.path._replace(delay=found.exact)
-    plain = paths.plain() + paths.around(own.delay)
-    trials = [Trial(path, paths.log_prior(path)) for path in plain]
-    if lawful:
+    comparison = Comparison.prepare(runs, found, paths, slopes)
+    fitted_path = found.path._replace(delay=found.delay)
+    lawless = paths.whole_delays() + paths.fractional_delays(fitted_path.delay)
+    trials = [Trial(path, paths.log_prior(path)) for path in lawless]
+    if departures:
         terms = len(comparison.terms[0])
-        prior = paths.log_prior(own) - np.log(FULLER * terms)
-        trials += _lawful(comparison, own, paths)
-        trials += [Trial(own, prior, k) for k in range(terms)]
-    posterior = comparison.weighed(trials)
-    behind = np.array([trial.path.law is not None for trial in posterior.trials])
-    if posterior.chance[behind].sum() > posterior.chance[posterior.none].sum():
-        posterior = _finer(comparison, posterior)
-    chance, none = posterior.chance, posterior.none
-    others = ~none | [not found.contains(trial.path) for trial in posterior.trials]
-    others &= chance > LEAST
-    likeliest = posterior.trials[np.where(none, posterior.logs, -np.inf).argmax()].path
+        prior = paths.log_prior(fitted_path) - np.log(ODDS_AGAINST_TERM * terms)
+        trials += _law_trials(comparison, fitted_path, paths)
+        trials += [Trial(fitted_path, prior, k) for k in range(terms)]
+    posterior = comparison.weigh(trials)
+    has_law = np.array([trial.path.law is not None for trial in posterior.trials])
+    if posterior.probability[has_law].sum() > posterior.probability[posterior.no_departure].sum():
+        posterior = _refine_laws(comparison, posterior)
+    chance, no_departure = posterior.probability, posterior.no_departure
+    others = ~no_departure | [not found.covers(trial.path) for trial in posterior.trials]
+    others &= chance > MIN_PROBABILITY
+    best_path = posterior.trials[
+        np.where(no_departure, posterior.log_posterior, -np.inf).argmax()
+    ].path
     return Alternatives(
-        found.path if found.contains(likeliest) else likeliest,
-        *posterior.where(none).late(found.exact),
-        _named(posterior, comparison.names),
+        found.path if found.covers(best_path) else best_path,
+        *posterior.select(no_departure).delay_moments(found.delay),
+        _name_departure(posterior, comparison.departures),
         chance[others],
         (posterior.numbers - comparison.begin)[others, :-1],
         posterior.spread[others, :-1, :-1],
     )
 
 
-def _lawful(comparison: Comparison, own: Path, paths: Paths) -> list[Trial]:
-    """Every law at even odds: over its kinds, the widths of one, and the paths.
+def _law_trials(comparison: Comparison, own: Path, paths: Paths) -> list[Trial]:
+    """Trials of every law, equally probable over kinds, over the widths of a kind, and over paths.
 
-    Delays are that of the fit and, where none is given, shorter ones that a law may stand for. Laws
-    that a gain and a level stand for are none.
+    Delays are that of the fit and, where no delay is given, up to `MAX_DELAY_REPLACED` shorter
+    ones.
     """
     runs = comparison.runs
-    delays, whole = [own.delay], int(np.ceil(own.delay))
+    delays, next_whole = [own.delay], int(np.ceil(own.delay))
     if not paths.given:
-        delays += range(max(0, whole - LATE), whole)
+        delays += range(max(0, next_whole - MAX_DELAY_REPLACED), next_whole)
     ways = [Path(None, way, float(delay)) for delay in delays for way in paths.ways]
-    laws = [law for name in runs[0].inputs for law in _laws_of(runs, name, paths.most)]
-    alike = Counter(law.kind for law in laws)
-    return [
-        Trial(way._replace(law=law), paths.log_prior(way) - np.log(len(alike) * alike[law.kind]))
-        for law in laws for way in ways
-    ]  # fmt: skip
+    laws = [law for name in runs[0].inputs for law in _nonlinear_laws(runs, name, paths.movable)]
+    per_kind = Counter(law.kind for law in laws)
+    log_prior = {law: -np.log(len(per_kind) * per_kind[law.kind]) for law in laws}
+    return [Trial(way._replace(law=law), paths.log_prior(way) + log_prior[law])
+            for law in laws for way in ways]  # fmt: skip
 
 
-def _laws_of(runs: Sequence[Run], name: str, way: Way) -> list[InputLaw]:
-    """Laws of an input that a gain and a level do not stand for, from its first change on: what was
-    before is a number at the start.
+def _nonlinear_laws(runs: Sequence[Run], name: str, way: Way) -> list[InputLaw]:
+    """Laws of an input that a gain and a level cannot replace.
 
-    Of readings that may scatter about levels these are what counts, but for their errors: a narrow
-    saturation of two of them hides the scatter, and a dead zone about the middle one of three is
-    undetermined. An input that stays where it is has none.
+    They count from the first change of the input on: what was before is in the states at the start.
+    An input with readings that scatter about levels counts at these levels, and laws that change it
+    by less than the errors of the levels are dropped. An input that never changes has no law.
     """
-    levels = [way.taken(run, name) for run in runs]
+    levels = [way.levels(run, name) for run in runs]
     inputs = [each.at for each in levels]
     since = [u[int(np.argmax(u != u[0])) :] for u in inputs]
-    plain = np.concatenate(since)
-    if np.ptp(plain) == 0.0:
+    moved = np.concatenate(since)
+    if np.ptp(moved) == 0.0:
         return []
-    unsure = np.sqrt(sum(np.sum(each.variance[-len(u) :])
+    level_error = np.sqrt(sum(np.sum(each.variance[-len(u) :])
                          for each, u in zip(levels, since, strict=True)))  # fmt: skip
     laws = laws_between(name, *map(float, (min(map(np.min, inputs)), max(map(np.max, inputs)))))
     at = np.stack([
-        np.concatenate([law.behind(u)[-len(some) :, 0]
+        np.concatenate([law.output_and_slope(u)[-len(some) :, 0]
                         for u, some in zip(inputs, since, strict=True)]) for law in laws
     ], axis=1)  # fmt: skip
-    basis = np.linalg.qr(np.stack([np.ones(len(plain)), plain], axis=1))[0]
+    basis = np.linalg.qr(np.stack([np.ones(len(moved)), moved], axis=1))[0]
     at = at - at.mean(axis=0)
-    same = basis @ (basis.T @ at)
-    gain = np.linalg.norm(same, axis=0) / np.linalg.norm(plain - plain.mean())
-    # Beside its gain a law hands errors on as they are, outside a dead zone.
+    linear = basis @ (basis.T @ at)
+    gain = np.linalg.norm(linear, axis=0) / np.linalg.norm(moved - moved.mean())
+    # Errors of the levels pass through a law with its gain, at most as they are.
     least = np.maximum(
-        SAME * np.linalg.norm(at, axis=0), MIN_SINGULAR_VALUE * np.maximum(gain, 1.0) * unsure
+        LINEAR_TOLERANCE * np.linalg.norm(at, axis=0),
+        MIN_SINGULAR_VALUE * np.maximum(gain, 1.0) * level_error,
     )
-    bends = np.linalg.norm(at - same, axis=0) > least
-    return [law for law, own in zip(laws, bends, strict=True) if own]
+    nonlinear = np.linalg.norm(at - linear, axis=0) > least
+    return [law for law, own in zip(laws, nonlinear, strict=True) if own]
 
 
-def _finer(comparison: Comparison, posterior: _Weighed) -> _Weighed:
-    """The posterior with the likeliest laws of the value alone in finer steps."""
-    for _ in range(ZOOMS):
-        best, kept = posterior.best().values(), np.ones(len(posterior.trials), bool)
+def _refine_laws(comparison: Comparison, posterior: _TrialPosterior) -> _TrialPosterior:
+    """Replace the most probable static laws by ones in finer steps, `REFINEMENTS` times."""
+    for _ in range(REFINEMENTS):
+        best, kept = posterior.best_static_laws().values(), np.ones(len(posterior.trials), bool)
         trials: list[Trial] = []
         for at in best:
             path, prior, _ = posterior.trials[at]
@@ -471,87 +532,96 @@ def _finer(comparison: Comparison, posterior: _Weighed) -> _Weighed:
             trials += [Trial(path._replace(law=law), prior - np.log(len(laws))) for law in laws]
             kept[at] = False
         if trials:
-            posterior = posterior.where(kept).beside(comparison.weighed(trials))
+            posterior = posterior.select(kept).merge(comparison.weigh(trials))
     return posterior
 
 
-def _named(posterior: _Weighed, names: Sequence[Departure]) -> Departure:
-    """The likeliest law of each kind and input, or further term, in words: as many as make 99 % of
-    all, of the kind of the first, with the probability of any.
+def _name_departure(posterior: _TrialPosterior, names: Sequence[Departure]) -> Departure:
+    """Describe the most probable departures until they make up `NAMED_PROBABILITY`.
+
+    Each kind of law and input and each further term is named once, by its most probable trial. The
+    kind is that of the first, the probability that of any departure.
     """
     best: dict[Any, tuple[float, Departure]] = {}
-    whole: Counter[Any] = Counter()
+    by_key: Counter[Any] = Counter()
     for trial, p, numbers in zip(
-        posterior.trials, posterior.chance, posterior.numbers, strict=True
+        posterior.trials, posterior.probability, posterior.numbers, strict=True
     ):
-        if not trial.lawful:
+        if not trial.is_departure:
             continue
         if trial.term is not None:
-            key, named = names[trial.term], names[trial.term].grown(numbers[-1])
+            key, named = names[trial.term], names[trial.term].with_growth(numbers[-1])
         else:
-            law = trial.path.law.changed(numbers[-1])
+            law = trial.path.law.widened(numbers[-1])
             key, named = (law.kind, law.input), Departure(law.words(), law.kind)
-        whole[key] += float(p)
+        by_key[key] += float(p)
         best[key] = max(best.get(key, (0.0, named)), (float(p), named), key=lambda each: each[0])
-    if not whole:
-        return NONE
-    total = max(sum(whole.values()), np.finfo(float).tiny)
-    ranked = [(key, p / total) for key, p in whole.most_common()]
-    above = np.cumsum([0.0, *(p for _, p in ranked)])[:-1]
-    ranked = [each for each, before in zip(ranked, above, strict=True) if before < NAMED]
+    if not by_key:
+        return NO_DEPARTURE
+    total = max(sum(by_key.values()), np.finfo(float).tiny)
+    ranked = [(key, p / total) for key, p in by_key.most_common()]
+    before = np.cumsum([0.0, *(p for _, p in ranked)])[:-1]
+    ranked = ranked[: int(np.sum(before < NAMED_PROBABILITY))]
     words = [best[key][1].words for key, _ in ranked]
     if len(words) > 1:
         words = [f"{w} (P = {p:.2f})" for w, (_, p) in zip(words, ranked, strict=True)]
     first = best[ranked[0][0]][1]
-    none = float(posterior.chance[posterior.none].sum())
+    none = float(posterior.probability[posterior.no_departure].sum())
     return first._replace(words=" or ".join(words), probability=max(1.0 - none, 0.0))
 
 
-def _terms(found: Begun, slopes: Sequence[np.ndarray]) -> tuple[list[Departure], list[np.ndarray]]:
-    """Terms that a fuller response may have, and their columns by run: further lags, parameters
-    that change with an input or grow along the record, a gain or a delay that grows.
-
-    Their prior is of width 1: of the output's scatter, of the logarithm of a lag, of a sample of
-    delay. What a slow drift of the output does as well is no term.
-    """
-    seen = found.seen
-    (lags, further), (names, changing) = _further_lags(found), _changing(seen, slopes)
-    fitted = (y - row[0] for y, row in zip(seen.measured, found.settled.rest, strict=True))
-    growing = (growing_of(y, t) for y, t in zip(fitted, seen.time, strict=True))
-    each = [np.hstack(columns) for columns in zip(further, changing, growing, strict=True)]
-    drifts = (drift_columns(t / t[-1], k, len(each)) for k, t in enumerate(seen.time))
-    drift = spanned(np.concatenate([columns.reshape(len(columns), -1) for columns in drifts]))
-    whole, ends = np.concatenate(each), np.cumsum([len(columns) for columns in each])[:-1]
-    return lags + names + GROWING, np.split(whole - drift @ (drift.T @ whole), ends)
-
-
-def _further_lags(found: Begun) -> tuple[list[Departure], list[np.ndarray]]:
-    """Further lags of the inputs, and their columns by run: a part of the gain goes by each in the
-    place of the response's own way, so that what the output settles at stays the same.
-    """
-    seen, model = found.seen, found.settled.fit.model
-    names = [Departure(f"a further lag of about {lag:.2g} s of {name}", FURTHER)
-             for lag in slow_lags(seen) for name in seen.inputs]  # fmt: skip
-    shape, slow = shape_of(seen, model), slow_paths(seen)
-    gain = 1.0 + shape.sum() if seen.runs[0].physics is ARX else 1.0
-    late = (replace(run, part=run.part + model["late"]) for run in seen.runs)
-    own = (np.tile(gain * paths_by(run, shape[None]), SLOW) for run in late)
-    unit = _scatter(slow, seen)
-    return names, [(path - away) / unit for path, away in zip(slow, own, strict=True)]
-
-
-def _changing(
-    seen: PreparedOutput, slopes: Sequence[np.ndarray]
+def _further_terms(
+    found: RunsFit, slopes: Sequence[np.ndarray]
 ) -> tuple[list[Departure], list[np.ndarray]]:
-    """Parameters that change with an input or its square, and times that grow along the record;
-    their columns by run. A gain that changes with its own input is a static law, and none of these.
+    """Further terms that a fuller response may have, and their columns by run.
+
+    They are further lags, parameters that change with an input or grow along the record, and a gain
+    or delay that grows. The prior of each has width 1, in units of the output's scatter, of the
+    logarithm of a lag, or of a sample of delay. The part that a slow drift of the output also gives
+    is removed.
     """
-    physics, m = seen.runs[0].physics, len(seen.inputs)
+    prepared = found.prepared
+    (lags, further), (names, changing) = _lag_terms(found), _parameter_terms(prepared, slopes)
+    residuals = found.residuals
+    fitted = (y - row[0] for y, row in zip(prepared.measured, residuals, strict=True))
+    growing = (growth_columns(y, t) for y, t in zip(fitted, prepared.time, strict=True))
+    by_run = [np.hstack(columns) for columns in zip(further, changing, growing, strict=True)]
+    drifts = (drift_columns(t / t[-1], k, len(by_run)) for k, t in enumerate(prepared.time))
+    drift = orthonormal_basis(np.concatenate([c.reshape(len(c), -1) for c in drifts]))
+    columns, ends = np.concatenate(by_run), np.cumsum([len(columns) for columns in by_run])[:-1]
+    return lags + names + GROWTH_DEPARTURES, np.split(columns - drift @ (drift.T @ columns), ends)
+
+
+def _lag_terms(found: RunsFit) -> tuple[list[Departure], list[np.ndarray]]:
+    """Further lags of the inputs, and their columns by run.
+
+    A part of the gain follows the further lag instead of the response, so that the output at rest
+    stays the same.
+    """
+    prepared, model = found.prepared, found.fit.model
+    names = [Departure(f"a further lag of about {lag:.2g} s of {name}", FURTHER)
+             for lag in further_lags(prepared) for name in prepared.inputs]  # fmt: skip
+    shape, slow = shape_parameters(prepared, model), further_responses(prepared)
+    gain = 1.0 + shape.sum() if prepared.runs[0].physics is ARX else 1.0
+    late = (replace(r, delay_fraction=r.delay_fraction + model["late"]) for r in prepared.runs)
+    own = (np.tile(gain * unit_responses(run, shape[None]), FURTHER_LAGS) for run in late)
+    unit = _relative_rms(slow, prepared)
+    return names, [(lagged - response) / unit for lagged, response in zip(slow, own, strict=True)]
+
+
+def _parameter_terms(
+    prepared: PreparedOutput, slopes: Sequence[np.ndarray]
+) -> tuple[list[Departure], list[np.ndarray]]:
+    """Parameters that change with an input or its square, and times that grow along the record.
+
+    A gain that changes with its own input is left out: it is a static law. Columns are by run.
+    """
+    physics, m = prepared.runs[0].physics, len(prepared.inputs)
     names, kept, gains = [], [], []
-    powers = zip(physics.parameters(seen.inputs), physics.units(m), strict=True)
+    powers = zip(physics.parameters(prepared.inputs), physics.units(m), strict=True)
     number = np.cumsum([gain for _, gain in physics.units(m)]) - 1
     for i, (name, (time, gain)) in enumerate(powers):
-        for k, by in enumerate((*seen.inputs, *seen.inputs, None)):
+        for k, by in enumerate((*prepared.inputs, *prepared.inputs, None)):
             if by is None and time:
                 names.append(Departure(f"a {name}", GROWTH))
             elif by is not None and not (gain and k % m == number[i] % m):
@@ -561,11 +631,11 @@ def _changing(
             kept.append(i * (2 * m + 1) + k)
             gains.append(bool(gain))
     columns = [each[:, kept] for each in slopes]
-    unit = np.where(gains, _scatter(columns, seen), 1.0)
+    unit = np.where(gains, _relative_rms(columns, prepared), 1.0)
     return names, [each / unit for each in columns]
 
 
-def _scatter(columns: Sequence[np.ndarray], seen: PreparedOutput) -> np.ndarray:
-    """Root mean square of each column over the output's scatter; 1 of one that is zero."""
-    found = np.sqrt(np.mean(np.concatenate(columns) ** 2, axis=0)) / seen.size_y
+def _relative_rms(columns: Sequence[np.ndarray], prepared: PreparedOutput) -> np.ndarray:
+    """Give the rms of each column over the output's scatter; 1 for a column of zeros."""
+    found = np.sqrt(np.mean(np.concatenate(columns) ** 2, axis=0)) / prepared.output_scale
     return np.where(found > 0, found, 1.0)

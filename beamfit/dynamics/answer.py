@@ -1,7 +1,4 @@
-"""Quoted numbers of an identified response, and its verdict by rules in order of gravity.
-
-Constants have errors, curves bands.
-"""
+"""Quoted numbers of an identified response, and its verdict by rules in order of severity."""
 
 from __future__ import annotations
 
@@ -19,9 +16,9 @@ from beamfit.dynamics.bad_readings import BadReadings
 from beamfit.dynamics.checks import Checks, HeldOutRun
 from beamfit.dynamics.input_laws import STATIC
 from beamfit.dynamics.limits import LagPosterior
-from beamfit.dynamics.model import PreparedOutput, curves
+from beamfit.dynamics.model import PreparedOutput, curve_values
 from beamfit.dynamics.response import ARX, FIRST_ORDER, SECOND_ORDER, Physics, mean_step
-from beamfit.dynamics.search import LONGEST, Begun
+from beamfit.dynamics.search import MAX_NOISE_READINGS, RunsFit
 from beamfit.errors import Finding, Status
 from beamfit.greybox.fit import Derived, Fit
 from beamfit.greybox.judge import gauges, together
@@ -29,8 +26,11 @@ from beamfit.noise.correlated import Memory
 from beamfit.quantity import Quantity
 from beamfit.statistics import POOR_FIT, quantity_of_draws
 
-# Points of a curve; samples within a share of its range that make a point visited.
-POINTS, VISITS, NEAR = 41, 5, 0.05
+# Points of a curve. A point is visited if this many samples lie within this share of its range.
+# Chosen.
+CURVE_POINTS = 41
+MIN_VISITS = 5
+VISIT_DISTANCE = 0.05
 TIME, GAIN, PURE = "s", "output/input", "1"
 
 
@@ -40,13 +40,14 @@ class Curve(NamedTuple):
     Attributes
     ----------
     parameter, input : str
-        What, against what.
+        Names of the parameter and of the input.
     unit : str
-        Of the parameter.
+        Unit of the parameter.
     at, value, error : ndarray
-        Shape (points,); errors are NaN where the data do not determine the value.
+        Values of the input, the parameter and its error, shape (points,); errors are NaN where the
+        data do not determine the value.
     visited : ndarray of bool
-        Whether the runs were there.
+        True where the runs have samples.
     """
 
     parameter: str
@@ -58,16 +59,18 @@ class Curve(NamedTuple):
     visited: np.ndarray
 
     def open(self) -> Curve:
-        """The same of which nothing is known: without errors."""
+        """Remove the errors of a curve that is not determined."""
         return self._replace(error=np.full_like(self.error, np.nan))
 
     def quantity(self, i: int) -> Quantity:
-        """The value at one point, without an error where the runs never were."""
-        known = self.visited[i] and np.isfinite(self.error[i])
-        return Quantity(float(self.value[i]), float(self.error[i]) if known else None, self.unit)
+        """Give the value at point i, without an error where the runs have no samples."""
+        determined = self.visited[i] and np.isfinite(self.error[i])
+        return Quantity(
+            float(self.value[i]), float(self.error[i]) if determined else None, self.unit
+        )
 
     def table(self) -> Table:
-        """A few points, to be shown."""
+        """Tabulate nine points."""
         rows = [
             [f"{self.at[i]:.4g}", cell(self.quantity(i)), "" if self.visited[i] else "not visited"]
             for i in np.linspace(0, len(self.at) - 1, 9).round().astype(int)
@@ -75,7 +78,7 @@ class Curve(NamedTuple):
         return Table(f"{self.parameter} by {self.input}", [self.input, self.parameter, ""], rows)
 
     def to_json(self) -> dict[str, Any]:
-        """Arrays; no error where the runs never were."""
+        """Give the arrays, without errors where the runs have no samples."""
         return json_of(self._asdict() | {"error": np.where(self.visited, self.error, np.nan)})
 
 
@@ -83,79 +86,79 @@ def _units(physics: Physics, m: int) -> list[str]:
     return [TIME if time else GAIN if gain else PURE for time, gain in physics.units(m)]
 
 
-def _quoted(model: Any, of: tuple[Any, float]) -> jax.Array:
-    """Constant parameters, with the ratios, gains or lags that they stand for; offset; delay, s."""
-    seen, delay = of
-    p = curves(model, (seen, seen.u[:1]))[0]
+def _quoted_values(model: Any, data: tuple[Any, float]) -> jax.Array:
+    """Constant parameters, derived ratios, gains or lags, offset, and delay in seconds."""
+    run, delay = data
+    p = curve_values(model, (run, run.u[:1]))[0]
     parts = [p]
-    if seen.physics is FIRST_ORDER:
+    if run.physics is FIRST_ORDER:
         parts.append(p[1:] / p[0])
-    if seen.physics is ARX:  # settled, y = K u
-        m = seen.u.shape[1]
+    if run.physics is ARX:  # gains at rest, y = K u
+        m = run.u.shape[1]
         parts.append((p[2 : 2 + m] + p[2 + m :]) / (1.0 + p[0] + p[1]))
-    if seen.physics is SECOND_ORDER:  # both lags of eq 8 where there are two
+    if run.physics is SECOND_ORDER:  # both lags of eq 8, where they are real
         root = jnp.sqrt(jnp.maximum(p[1] ** 2 - 1.0, 1e-12))
         parts.append(p[0] * (p[1] + jnp.stack([root, -root])))
-    late = (delay + model["late"]) * mean_step(seen.dt)
-    return jnp.concatenate([*parts, jnp.stack([jnp.asarray(model["offset"]), late])])
+    seconds = (delay + model["late"]) * mean_step(run.dt)
+    return jnp.concatenate([*parts, jnp.stack([jnp.asarray(model["offset"]), seconds])])
 
 
-def quantities_of(
-    begun: Begun,
-    others: Alternatives | None,
-    late: float,
+def response_quantities(
+    runs_fit: RunsFit,
+    alternatives: Alternatives | None,
+    delay_error: float,
     lags: LagPosterior,
     digits: np.ndarray,
-    unsure: Sequence[float],
+    input_errors: Sequence[float],
 ) -> dict[str, Quantity]:
     """Constant parameters with errors, and the offset and the delay if they are free.
 
-    Of a first order the lag, gains and offset have the errors of `lags` where all readings count
-    in them. `late` is the standard deviation of the delay by others, s, `digits` the covariance of
-    the numbers by the digits of the output, `unsure` has the share by which each input's own errors
-    make its gain unsure.
+    For a first order whose readings all count in `lags`, the lag, gains and offset have its errors.
+    `delay_error` is the error of the delay from the alternatives, s; `digits` the covariance of the
+    free numbers by the digits of the output; `input_errors` the relative error of each input's gain
+    from the errors of its levels.
     """
-    seen, physics, m = begun.seen, begun.seen.runs[0].physics, len(begun.seen.inputs)
-    found = derived(begun.settled.fit, begun.settled.errors, _quoted, (seen.runs[0], seen.delay))
-    gains = FIRST_ORDER.parameters(seen.inputs)[1:]
-    units = dict(zip(physics.parameters(seen.inputs), _units(physics, m), strict=True))
+    prepared, fit, noise = runs_fit.prepared, runs_fit.fit, runs_fit.errors
+    physics, m = prepared.runs[0].physics, len(prepared.inputs)
+    found = derive_quantities(fit, noise, _quoted_values, (prepared.runs[0], prepared.delay))
+    gains = FIRST_ORDER.parameters(prepared.inputs)[1:]
+    units = dict(zip(physics.parameters(prepared.inputs), _units(physics, m), strict=True))
     units |= {
         FIRST_ORDER: {f"{name}/tau": f"{GAIN}/s" for name in gains},
         SECOND_ORDER: {"tau1": TIME, "tau2": TIME},
         ARX: dict.fromkeys(gains, GAIN),
     }[physics] | {"offset": "output", "delay": TIME}
-    whole = max(map(len, seen.measured)) <= LONGEST
-    drawn = lags.drawn(gains) if physics is FIRST_ORDER and whole else {}
+    all_count = max(map(len, prepared.measured)) <= MAX_NOISE_READINGS
+    drawn = lags.draws(gains) if physics is FIRST_ORDER and all_count else {}
     values, error = dict(zip(units, found.value, strict=True)), found.error
     drawn = {name: quantity_of_draws(draws, "", values[name]) for name, draws in drawn.items()}
-    alone = np.array(
-        [drawn[n].error if n in drawn else e for n, e in zip(units, error, strict=True)]
-    )
+    alone = [drawn[n].error if n in drawn else e for n, e in zip(units, error, strict=True)]
     error = np.where(np.isfinite(error), alone, np.nan)
-    if others is not None:
-        error = np.append(others.error(found.slope[:-1], error[:-1]), late)
+    if alternatives is not None:
+        error = np.append(alternatives.error(found.slope[:-1], error[:-1]), delay_error)
     shares = np.zeros(len(units))
-    of_inputs = np.flatnonzero([GAIN in unit for unit in units.values()])  # of all in turn
-    shares[of_inputs] = np.resize(unsure, len(of_inputs))
-    found = widened(found._replace(error=error), digits, shares)
-    said = {name: quantity(found, i, unit) for i, (name, unit) in enumerate(units.items())}
-    said |= {name: replace(said[name], interval_95=_wider(q, said[name]))
-             for name, q in drawn.items() if q.error and said[name].determined}  # fmt: skip
-    free = {v.name for v in begun.settled.fit.variables}
-    left = {name for name, leaf in (("offset", "offset"), ("delay", "late")) if leaf not in free}
-    left |= {"tau1", "tau2"} if values.get("zeta", 2.0) <= 1.0 else set()  # not two real lags
-    return {name: q for name, q in said.items() if name not in left}
+    # Numbers in units of a gain belong to the inputs in turn.
+    gain_indices = np.flatnonzero([GAIN in unit for unit in units.values()])
+    shares[gain_indices] = np.resize(input_errors, len(gain_indices))
+    found = widen_errors(found._replace(error=error), digits, shares)
+    quantities = {name: quantity_at(found, i, unit) for i, (name, unit) in enumerate(units.items())}
+    quantities |= {name: replace(quantities[name], interval_95=_widen_interval(q, quantities[name]))
+             for name, q in drawn.items() if q.error and quantities[name].determined}  # fmt: skip
+    free = {v.name for v in fit.variables}
+    dropped = {name for name, leaf in (("offset", "offset"), ("delay", "late")) if leaf not in free}
+    dropped |= {"tau1", "tau2"} if values.get("zeta", 2.0) <= 1.0 else set()  # not two real lags
+    return {name: q for name, q in quantities.items() if name not in dropped}
 
 
-def _wider(drawn: Quantity, found: Quantity) -> tuple[float, float]:
-    """The interval of a quantity as much wider as its error is, of a lag in its logarithm."""
-    more, ends, value = found.error / drawn.error, np.array(drawn.interval_95), drawn.value
-    ends = value * (ends / value) ** more if found.unit == TIME else value + more * (ends - value)
+def _widen_interval(drawn: Quantity, found: Quantity) -> tuple[float, float]:
+    """Widen an interval by the ratio of two errors; that of a time constant in its logarithm."""
+    ratio, ends, value = found.error / drawn.error, np.array(drawn.interval_95), drawn.value
+    ends = value * (ends / value) ** ratio if found.unit == TIME else value + ratio * (ends - value)
     return float(ends[0]), float(ends[1])
 
 
-def derived(fit: Fit, errors: Memory | None, function: Callable, data: Any) -> Derived:
-    """Numbers of a fit, with errors averaged over what is open of the noise."""
+def derive_quantities(fit: Fit, errors: Memory | None, function: Callable, data: Any) -> Derived:
+    """Derive numbers from a fit, with errors averaged over the uncertainty of the noise."""
     found = fit.derive(function, data)
     if errors is None:
         return found
@@ -164,149 +167,156 @@ def derived(fit: Fit, errors: Memory | None, function: Callable, data: Any) -> D
     return found._replace(error=np.where(np.isfinite(found.error), averaged, np.nan))
 
 
-def widened(found: Derived, digits: np.ndarray, unsure: Any = 0.0) -> Derived:
-    """Numbers whose errors contain the digits of outputs and the errors of inputs.
+def widen_errors(found: Derived, digits: np.ndarray, input_errors: Any = 0.0) -> Derived:
+    """Add the errors by the digits of outputs and by the errors of inputs.
 
-    `digits` is the covariance of the free numbers by digits, `unsure` the share of each number by
-    which its input's own errors make it unsure.
+    `digits` is the covariance of the free numbers by digits, `input_errors` the relative error of
+    each number by the errors of its input.
     """
-    more = np.einsum("...p,pr,...r->...", found.slope, digits, found.slope)
-    return found._replace(error=np.sqrt(found.error**2 + more + (unsure * found.value) ** 2))
+    by_digits = np.einsum("...p,pr,...r->...", found.slope, digits, found.slope)
+    variance = found.error**2 + by_digits + (input_errors * found.value) ** 2
+    return found._replace(error=np.sqrt(variance))
 
 
-def quantity(found: Derived, i: Any, unit: str) -> Quantity:
-    """A quantity; it has no error where the data do not determine it."""
-    error, raw = (float(e[i]) for e in (found.error, found.error_raw))
-    known = np.isfinite(error)
-    return Quantity(float(found.value[i]), error if known else None, unit, raw if known else None)
+def quantity_at(found: Derived, i: Any, unit: str) -> Quantity:
+    """Give number i as a quantity, without an error where the data do not determine it."""
+    value, error, raw = (float(e[i]) for e in (found.value, found.error, found.error_raw))
+    if not np.isfinite(error):
+        return Quantity(value, None, unit)
+    return Quantity(value, error, unit, raw)
 
 
-def told(
+def open_undetermined(
     quantities: Mapping[str, Quantity],
     curves: Sequence[Curve],
-    seen: PreparedOutput,
+    prepared: PreparedOutput,
     checks: Checks,
     limits: tuple[float, float] = (np.nan, np.nan),
 ) -> tuple[dict[str, Quantity], tuple[Curve, ...]]:
-    """Quantities and curves with errors only where the runs determine them.
+    """Remove the errors of quantities and curves that the runs do not determine.
 
-    No errors: of anything where the inputs explain no more than chance, of the gains of inputs that
-    move together, of lags that runs do not tell from 0 or infinity, and of what grows with them.
-    `limits` are those of the longest lag by a one-sided 95 %, 0 or infinity where it is possible.
+    These are all if the inputs explain no more than chance, gains of inputs that move together,
+    lags that the runs do not distinguish from 0 or infinity, and what grows with such a lag.
+    `limits` are the one-sided 95 % limits of the longest lag, 0 or infinite where it may be.
     """
-    nothing = checks.nothing_probability >= POOR_FIT
-    physics, inputs = seen.runs[0].physics, seen.inputs
+    no_response = checks.nothing_probability >= POOR_FIT
+    physics, inputs = prepared.runs[0].physics, prepared.inputs
     powers = zip(physics.parameters(inputs), physics.units(len(inputs)), strict=True)
     gains = [name for name, (_, gain) in powers if gain]
-    joint = {n for k, n in enumerate(gains) if inputs[k % len(inputs)] in checks.together}
-    zero, endless = limits[0] == 0.0, np.isinf(limits[1])
+    inseparable = {n for k, n in enumerate(gains) if inputs[k % len(inputs)] in checks.together}
+    zero, infinite = limits[0] == 0.0, np.isinf(limits[1])
 
     def is_open(name: str, q: Quantity) -> bool:
-        # The gain that goes with an infinite lag is infinite.
+        # The gain of an infinite lag is infinite.
         grows = name.startswith(("tau", "T", "zeta", "K", "offset")) and not name.endswith("/tau")
-        none = zero and name.startswith(("tau", "T", "zeta"))
-        none |= name != "delay" and q.unit == TIME and q.determined and q.interval_95[0] <= 0.0
+        vanishes = zero and name.startswith(("tau", "T", "zeta"))
+        vanishes |= name != "delay" and q.unit == TIME and q.determined and q.interval_95[0] <= 0.0
         # A higher order that is a first one determines only its gains and its longer lag.
-        more = checks.first_order and not name.startswith(("K", "offset", "tau1", "delay"))
-        # A number that ran to the end of its range has no slope there.
-        ended = name != "delay" and q.error == 0
-        return nothing or (endless and grows) or none or more or ended or name in joint
+        lower_order = checks.first_order and not name.startswith(("K", "offset", "tau1", "delay"))
+        # A number at the end of its range has no slope there.
+        at_end = name != "delay" and q.error == 0
+        flags = no_response, infinite and grows, vanishes, lower_order, at_end, name in inseparable
+        return any(flags)
 
-    known = {n: q.open() if is_open(n, q) else q for n, q in quantities.items()
-             if endless or not n.endswith("/tau")}  # fmt: skip
-    known |= {n: replace(known[n], interval_95=limits) for n in ("tau", "tau1")
-              if n in known and zero != endless and not nothing}  # fmt: skip
-    blank = (nothing or c.parameter in joint for c in curves)
-    return known, tuple(c.open() if b else c for c, b in zip(curves, blank, strict=True))
-
-
-# A model that the runs do not follow, or that was not found: no error contains what is wrong.
-WRONG = (Status.poor_fit, Status.not_converged, Status.not_finite)
+    kept = {n: q.open() if is_open(n, q) else q for n, q in quantities.items()
+             if infinite or not n.endswith("/tau")}  # fmt: skip
+    kept |= {n: replace(kept[n], interval_95=limits) for n in ("tau", "tau1")
+              if n in kept and zero != infinite and not no_response}  # fmt: skip
+    removed = (no_response or c.parameter in inseparable for c in curves)
+    return kept, tuple(c.open() if b else c for c, b in zip(curves, removed, strict=True))
 
 
-def quoted(
+# Verdicts of a model that the runs refute or that was not found: no error covers what is wrong.
+WRONG_MODEL = (Status.poor_fit, Status.not_converged, Status.not_finite)
+
+
+def remove_errors_if_wrong(
     status: Status, quantities: Mapping[str, Quantity], curves: Sequence[Curve] = ()
 ) -> tuple[dict[str, Quantity], tuple[Curve, ...]]:
-    """Quantities and curves as they are quoted: without errors where the verdict is `WRONG`."""
-    if status not in WRONG:
+    """Remove all errors if the verdict is `WRONG_MODEL`."""
+    if status not in WRONG_MODEL:
         return dict(quantities), tuple(curves)
     return {name: q.open() for name, q in quantities.items()}, tuple(c.open() for c in curves)
 
 
-LATEST = "The delay is the longest that was tried: say a longer one by --delay."
+MAX_DELAY_REMARK = "The delay is the longest that was tried: say a longer one by --delay."
 
 
-def remarked(message: str, longest: bool, left_out: Sequence[BadReadings]) -> str:
-    """A message that tells if the delay is the longest one, and the readings that are left out."""
-    left = (f"Left out: {each}." for each in left_out)
-    return " ".join([message, *([LATEST] if longest else []), *left])
+def add_remarks(message: str, at_longest: bool, left_out: Sequence[BadReadings]) -> str:
+    """Add to a message that the delay is the longest tried, and which readings are left out."""
+    excluded = (f"Left out: {each}." for each in left_out)
+    return " ".join([message, *([MAX_DELAY_REMARK] if at_longest else []), *excluded])
 
 
 def limit_words(q: Quantity) -> str:
-    """The limit of a quantity without an error; nothing if it has none."""
+    """Give the limit of a quantity without an error in words; empty if it has none."""
     if q.error is not None or q.interval_95 is None:
         return ""
     low, high = q.interval_95
     return f"above {low:.3g} {q.unit}" if np.isinf(high) else f"below {high:.3g} {q.unit}"
 
 
-def curves_of(fit: Fit, errors: Memory | None, seen: PreparedOutput) -> tuple[Curve, ...]:
-    """Every parameter against every input."""
-    physics, m = seen.runs[0].physics, len(seen.inputs)
-    points, made = seen.points, []
-    for j, name in enumerate(seen.inputs):
+def curves_of(fit: Fit, errors: Memory | None, prepared: PreparedOutput) -> tuple[Curve, ...]:
+    """Curves of every parameter against every input, with the other inputs at their means."""
+    physics, m = prepared.runs[0].physics, len(prepared.inputs)
+    points, found = prepared.points, []
+    for j, name in enumerate(prepared.inputs):
         low, high = points[:, j].min(), points[:, j].max()
-        grid = np.tile(seen.mean_u, (POINTS, 1))
-        grid[:, j] = at = np.linspace(low, high, POINTS)
-        apart = np.abs(points[:, j][None, :] - at[:, None])
-        visited = np.sum(apart <= NEAR * (high - low), axis=1) >= VISITS
-        found = derived(fit, errors, curves, (seen.runs[0], jnp.asarray(grid)))
-        names = physics.parameters(seen.inputs)
-        made += [
-            Curve(names[i], name, unit, at, found.value[:, i], found.error[:, i], visited)
+        grid = np.tile(prepared.mean_u, (CURVE_POINTS, 1))
+        grid[:, j] = at = np.linspace(low, high, CURVE_POINTS)
+        distance = np.abs(points[:, j][None, :] - at[:, None])
+        visited = np.sum(distance <= VISIT_DISTANCE * (high - low), axis=1) >= MIN_VISITS
+        numbers = derive_quantities(
+            fit, errors, curve_values, (prepared.runs[0], jnp.asarray(grid))
+        )
+        names = physics.parameters(prepared.inputs)
+        found += [
+            Curve(names[i], name, unit, at, numbers.value[:, i], numbers.error[:, i], visited)
             for i, unit in enumerate(_units(physics, m))
         ]
-    return tuple(made)
+    return tuple(found)
 
 
-# Share of a visited curve that must have an error for it to be determined.
-HALF = 0.5
-# Largest residual of a held-out run, in units of the fit's, at which it counts as predicted.
-WORSE = 2.0
+# A curve counts as determined if this share of its visited points has an error.
+MIN_DETERMINED_SHARE = 0.5
+# A held-out run counts as predicted if its residual is at most this many times that of the fit.
+MAX_HELD_OUT_RATIO = 2.0
 
 
 class ResponseEvidence(NamedTuple):
-    """Input of the rules; `early` is by how many samples the output moves before its inputs, if
-    that was found and not given.
+    """Input of the rules.
+
+    `lead` is the number of samples by which the output moves before its inputs, 0 if the delay was
+    given.
     """
 
     fit: Fit
-    rests: bool
+    converged: bool
     checks: Checks
     quantities: Mapping[str, Quantity]
     curves: tuple[Curve, ...]
     held: tuple[HeldOutRun, ...]
     map: str
     rms: float
-    early: float = 0.0
+    lead: float = 0.0
 
 
-def judged(found: Mapping[str, ResponseEvidence]) -> tuple[Status, str]:
-    """Status and sentences of several outputs of one model: the gravest rule that any breaks."""
+def judge_outputs(found: Mapping[str, ResponseEvidence]) -> tuple[Status, str]:
+    """Judge several outputs of one model by the first rule that any of them breaks."""
     for rule in RULES:
-        said = {name: f for name, e in found.items() if (f := rule(e)) is not None}
-        texts = {f.message: [n for n in said if said[n].message == f.message]
-                 for f in said.values()}  # fmt: skip
-        if said:
+        findings = {name: f for name, e in found.items() if (f := rule(e)) is not None}
+        texts = {f.message: [n for n in findings if findings[n].message == f.message]
+                 for f in findings.values()}  # fmt: skip
+        if findings:
             each = (text if len(names) == len(found) else f"{', '.join(names)}: {text}"
                     for text, names in texts.items())  # fmt: skip
-            return next(iter(said.values())).status, " ".join(each)
+            return next(iter(findings.values())).status, " ".join(each)
     raise AssertionError("the last rule always finds something")
 
 
 def search_failed(e: Any) -> Finding | None:
-    """Find that the search of some evidence did not end."""
-    if e.rests and e.fit.groups:
+    """Find that the search did not converge."""
+    if e.converged and e.fit.groups:
         return None
     lost = e.fit.status is Status.not_finite
     return Finding(Status.not_finite if lost else Status.not_converged, e.fit.message)
@@ -316,7 +326,7 @@ WANDERS = "The noise wanders about as slowly as the output responds."
 REPEAT = "Repeat the steps, up and down, so that a drift does not look like a response."
 
 
-def _nothing(e: ResponseEvidence) -> Finding | None:
+def _no_response(e: ResponseEvidence) -> Finding | None:
     if e.checks.nothing_probability < POOR_FIT:
         return None
     cause = "The inputs explain no more of the output than chance would."
@@ -329,7 +339,7 @@ def _nothing(e: ResponseEvidence) -> Finding | None:
     return Finding(Status.unidentified, cause, remedy)
 
 
-def _joint(e: ResponseEvidence) -> Finding | None:
+def _inseparable(e: ResponseEvidence) -> Finding | None:
     if not e.checks.together:
         return None
     inputs = ", ".join(e.checks.together)
@@ -337,7 +347,7 @@ def _joint(e: ResponseEvidence) -> Finding | None:
     return Finding(Status.unidentified, cause, "Move one at a time, or leave one out.")
 
 
-def _lower(e: ResponseEvidence) -> Finding | None:
+def _lower_order(e: ResponseEvidence) -> Finding | None:
     if not e.checks.first_order:
         return None
     cause = "A first order explains the runs as well: "
@@ -350,12 +360,12 @@ def _lower(e: ResponseEvidence) -> Finding | None:
     return Finding(Status.unidentified, cause, "Use --model first-order.")
 
 
-def _open(e: ResponseEvidence) -> Finding | None:
+def _undetermined(e: ResponseEvidence) -> Finding | None:
     left = {n: q.unit for n, q in e.quantities.items() if q.error is None}
     left |= {
         f"{c.parameter}({c.input})": c.unit
         for c in e.curves
-        if np.mean(np.isfinite(c.error) & c.visited) < HALF
+        if np.mean(np.isfinite(c.error) & c.visited) < MIN_DETERMINED_SHARE
     }
     if not left:
         return None
@@ -379,18 +389,18 @@ def _open(e: ResponseEvidence) -> Finding | None:
     return Finding(Status.unidentified, cause, remedy)
 
 
-def _ahead(e: ResponseEvidence) -> Finding | None:
-    if not e.early:
+def _output_leads(e: ResponseEvidence) -> Finding | None:
+    if not e.lead:
         return None
     cause = (
-        f"The output moves {e.early:.3g} samples before its inputs: their clocks differ by so "
+        f"The output moves {e.lead:.3g} samples before its inputs: their clocks differ by so "
         "much, or the inputs were set from the output (feedback)."
     )
-    remedy = f"If it is the clock, say so (--delay {-e.early:.3g}): the answer then stands."
+    remedy = f"If it is the clock, say so (--delay {-e.lead:.3g}): the answer then stands."
     return Finding(Status.poor_fit, cause, remedy)
 
 
-def _fed_back(e: ResponseEvidence) -> Finding | None:
+def _feedback(e: ResponseEvidence) -> Finding | None:
     c = e.checks
     if c.feedback_probability >= POOR_FIT:
         return None
@@ -412,7 +422,7 @@ def _fed_back(e: ResponseEvidence) -> Finding | None:
     return Finding(Status.poor_fit, cause, remedy)
 
 
-def _lawful(e: ResponseEvidence) -> Finding | None:
+def _departs(e: ResponseEvidence) -> Finding | None:
     c = e.checks
     if c.law is None or 1.0 - c.law_probability >= POOR_FIT:
         return None
@@ -423,7 +433,7 @@ def _lawful(e: ResponseEvidence) -> Finding | None:
         cause += " along the record."
     elif c.law_kind == FURTHER:
         cause += ": the model lacks a part of the response."
-        remedy = f"Try {_more(e)}."
+        remedy = f"Try {_fuller_model(e)}."
     elif c.law_kind in STATIC:
         cause += ": the gain then changes with the input."
         remedy = "Stay where the gain is the same, or let it change: --map network."
@@ -437,7 +447,7 @@ def _lawful(e: ResponseEvidence) -> Finding | None:
     return Finding(Status.poor_fit, cause, remedy)
 
 
-def _refuted(e: ResponseEvidence) -> Finding | None:
+def _lacks_response(e: ResponseEvidence) -> Finding | None:
     c = e.checks
     if c.input_probability >= POOR_FIT:
         return None
@@ -446,17 +456,17 @@ def _refuted(e: ResponseEvidence) -> Finding | None:
         f"the residuals (p = {c.input_probability:.1g}): the model lacks a part of the response. "
         f"The free run explains {c.free_run_percent:.1f} % of the output."
     )
-    return Finding(Status.poor_fit, cause, f"Try {_more(e)}.")
+    return Finding(Status.poor_fit, cause, f"Try {_fuller_model(e)}.")
 
 
-def _more(e: ResponseEvidence) -> str:
-    """A fuller model."""
+def _fuller_model(e: ResponseEvidence) -> str:
+    """Suggest a fuller model."""
     more = "parameters that change with the operating point (--map network), or "
     return f"{'' if e.map == 'network' else more}a higher order"
 
 
-def _worse(e: ResponseEvidence) -> Finding | None:
-    bad = [h for h in e.held if h.rms > WORSE * e.rms]
+def _fails_held_out(e: ResponseEvidence) -> Finding | None:
+    bad = [h for h in e.held if h.rms > MAX_HELD_OUT_RATIO * e.rms]
     if not bad:
         return None
     cause = (
@@ -467,11 +477,11 @@ def _worse(e: ResponseEvidence) -> Finding | None:
     return Finding(Status.poor_fit, cause, remedy)
 
 
-def _beside(c: Checks) -> str:
-    """Sentences on what stands beside the response and what its errors contain."""
+def _remarks(c: Checks) -> str:
+    """Sentences on noise, input motion, jitter, drift and possible laws that the errors contain."""
     smooth, ramping, standing = map(", ".join, c.way)
     law = c.law[:1].upper() + c.law[1:] if c.law is not None else ""
-    said = {
+    sentences = {
         "The noise has a memory, which the errors contain.": c.white_probability < POOR_FIT,
         f"Without high frequencies, {smooth} is taken to move between samples.": smooth,
         f"Between samples {ramping} is taken to move in straight lines.": ramping,
@@ -480,12 +490,12 @@ def _beside(c: Checks) -> str:
         f"The output drifts as well (degree {c.drift} in time): errors contain it.": c.drift,
         f"{law} is likelier than none (P = {c.law_probability:.2f}): errors contain it.": law,
     }
-    return "".join(f" {sentence}" for sentence, holds in said.items() if holds)
+    return "".join(f" {sentence}" for sentence, holds in sentences.items() if holds)
 
 
-def _good(e: ResponseEvidence) -> Finding:
+def _converged(e: ResponseEvidence) -> Finding:
     cause = f"The free run explains {e.checks.free_run_percent:.2f} % of the output."
-    cause += _beside(e.checks)
+    cause += _remarks(e.checks)
     gains = [q for name, q in e.quantities.items() if name.startswith("K")]
     if gains and all(q.error is not None and abs(q.value) < 2 * q.error for q in gains):
         cause += " All gains are compatible with 0: only the return of the output to rest is seen."
@@ -500,14 +510,14 @@ def _good(e: ResponseEvidence) -> Finding:
 
 RULES = (
     search_failed,
-    _nothing,
-    _joint,
-    _ahead,
-    _lawful,
-    _fed_back,
-    _lower,
-    _refuted,
-    _open,
-    _worse,
-    _good,
+    _no_response,
+    _inseparable,
+    _output_leads,
+    _departs,
+    _feedback,
+    _lower_order,
+    _lacks_response,
+    _undetermined,
+    _fails_held_out,
+    _converged,
 )

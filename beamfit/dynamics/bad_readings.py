@@ -1,4 +1,4 @@
-"""Readings that show no output: single ones far off, and a sensor that stands still."""
+"""Readings that do not show the output: single outliers, and series of a stuck sensor."""
 
 from __future__ import annotations
 
@@ -10,28 +10,33 @@ import numpy as np
 from scipy.ndimage import median_filter
 from scipy.special import expit
 
-from beamfit.dynamics.model import CLOSE, PreparedOutput
-from beamfit.dynamics.paths import heard
-from beamfit.dynamics.record import LEAST, Run
-from beamfit.dynamics.search import JITTER_COST, Begun, spread_by_jitter
+from beamfit.dynamics.model import PreparedOutput
+from beamfit.dynamics.paths import usable_rows
+from beamfit.dynamics.record import MIN_READINGS, Run
+from beamfit.dynamics.search import JITTER_PENALTY, RunsFit, jitter_scales
 from beamfit.errors import Status
 from beamfit.noise.digits import digit_of
 from beamfit.noise.model import Noise
 from beamfit.noise.sizes import bad_density
 from beamfit.statistics import CLEAR_ODDS, POOR_FIT
 
-# Of more readings than this share, or of such as follow the inputs, the model is wrong and not the
-# monitor.
-MOST = 0.2
-# A residual is judged about the running median of so many; most searches in turn.
-AROUND, ROUNDS = 7, 5
-# Number of equal readings that count as stuck, if the model moves away by AWAY times the noise.
-HELD, AWAY = 8, 3.0
-OFF, STILL = "far off their neighbours", "that stand still as the process moves"
+# If more than this share of readings is bad, or bad readings follow the inputs, the model is wrong
+# and not the monitor.
+MAX_SHARE = 0.2
+# Residuals are judged about a running median of this many readings.
+MEDIAN_WIDTH = 7
+# Largest number of searches in turn.
+MAX_ROUNDS = 5
+# This many equal readings count as stuck if the model moves away by this multiple of the noise.
+MIN_STUCK = 8
+MIN_STUCK_RATIO = 3.0
+# Descriptions of the two kinds.
+OUTLIER_WORDS = "far off their neighbours"
+STUCK_WORDS = "that stand still as the process moves"
 
 
 class BadReadings(NamedTuple):
-    """Readings of a run that are left out: how many, the first one's time, and what they are."""
+    """Readings of a run that are left out: their number, the time of the first, and their kind."""
 
     run: str
     count: int
@@ -44,157 +49,159 @@ class BadReadings(NamedTuple):
 
 F, A = TypeVar("F"), TypeVar("A")
 Runs = tuple[Run, ...]
-# True for readings of each run, shape (rows, outputs).
+# Mask of the readings of each run, shape (rows, outputs).
 Masks = tuple[np.ndarray, ...]
 
 
-def judged_without(
+def answer_without_bad_readings(
     runs: Runs,
     searches: Sequence[Callable[[Runs], F]],
-    fit_of: Callable[[F], Begun],
+    fit_of: Callable[[F], RunsFit],
     answer: Callable[[Runs, F, tuple[BadReadings, ...]], A],
 ) -> A:
-    """The answer of runs without readings that show no output.
+    """Answer from runs without bad readings.
 
-    Readings are judged beside each search's fit, which `fit_of` gives: the last search is the one
-    that is answered by, others before it are quicker. A model that is refuted misses good readings:
-    it is judged with all of them.
+    Readings are judged against the fit that `fit_of` takes from each search; the last search is the
+    one to answer with, the ones before are faster. A refuted model misses good readings, so it is
+    judged with all of them.
     """
-    fit = answer(*_sound(runs, searches, fit_of))
+    fit = answer(*_exclude_bad_readings(runs, searches, fit_of))
     if not fit.left_out or fit.status is not Status.poor_fit:
         return fit
-    again = answer(runs, searches[-1](runs), ())
-    return again if again.status is Status.poor_fit else fit
+    with_all = answer(runs, searches[-1](runs), ())
+    return with_all if with_all.status is Status.poor_fit else fit
 
 
-def _sound(
-    runs: Runs, searches: Sequence[Callable[[Runs], F]], fit_of: Callable[[F], Begun]
+def _exclude_bad_readings(
+    runs: Runs, searches: Sequence[Callable[[Runs], F]], fit_of: Callable[[F], RunsFit]
 ) -> tuple[Runs, F, tuple[BadReadings, ...]]:
-    """Runs without readings that show no output, the fit of the others, and what those were."""
-    kept, off = runs, _none(runs)
+    """Remove bad readings; return the runs, their fit, and descriptions of the bad readings."""
+    kept, masks = runs, _empty_masks(runs)
     for search in searches:
-        found = search(kept)
-        for _ in range(ROUNDS):
-            trial, now = _settled(runs, fit_of(found), off)
-            if trial is None or _same(now, off):
+        fit = search(kept)
+        for _ in range(MAX_ROUNDS):
+            trial, new_masks = _exclude_outliers(runs, fit_of(fit), masks)
+            if trial is None or _same_masks(new_masks, masks):
                 break
-            kept, off, found = trial, now, search(trial)
-    if any(np.any(mask.mean(axis=0) > MOST) for mask in off) or _follows(runs, off):
-        kept, off, found = runs, _none(runs), search(runs)
-    left_out = _named(runs, off, OFF)
-    trial = _without(kept, _judged(kept, fit_of(found), _equal))
-    if trial is not kept and trial is not None:  # the process may stand still as well: a fit tells
-        stuck = _judged(kept, fit_of(found).again(trial), _still)
-        trial = _without(kept, stuck)
+            kept, masks, fit = trial, new_masks, search(trial)
+    if any(np.any(mask.mean(axis=0) > MAX_SHARE) for mask in masks) or _follow_inputs(runs, masks):
+        kept, masks, fit = runs, _empty_masks(runs), search(runs)
+    left_out = _describe(runs, masks, OUTLIER_WORDS)
+    trial = _remove_readings(kept, _mask_readings(kept, fit_of(fit), _equal_series))
+    if trial is not kept and trial is not None:  # a fit shows if the process itself rests
+        stuck = _mask_readings(kept, fit_of(fit).refit(trial), _stuck)
+        trial = _remove_readings(kept, stuck)
         if trial is not kept and trial is not None:
-            kept, found = trial, search(trial)
-            left_out += _named(runs, stuck, STILL)
-    return kept, found, left_out
+            kept, fit = trial, search(trial)
+            left_out += _describe(runs, stuck, STUCK_WORDS)
+    return kept, fit, left_out
 
 
-def _settled(runs: Runs, fit: Begun, off: Masks) -> tuple[Runs | None, Masks]:
-    """Runs without readings that are far off a fit of the others, and which they are.
+def _exclude_outliers(runs: Runs, fit: RunsFit, masks: Masks) -> tuple[Runs | None, Masks]:
+    """Remove readings far off a fit of the others; return the runs and the masks.
 
-    Each round judges all readings: one that a worse fit missed comes back.
+    Each round judges all readings, so that one missed by a worse fit returns.
     """
-    before: list[Masks] = []
+    tried: list[Masks] = []
     while True:
-        before.append(off)
-        off = _judged(runs, fit, _lone)
-        trial = _without(runs, off)
-        if trial is None or any(_same(off, each) for each in before):
-            return trial, off
-        fit = fit.again(trial)
+        tried.append(masks)
+        masks = _mask_readings(runs, fit, _outliers)
+        trial = _remove_readings(runs, masks)
+        if trial is None or any(_same_masks(masks, each) for each in tried):
+            return trial, masks
+        fit = fit.refit(trial)
 
 
-def _follows(runs: Runs, off: Masks) -> bool:
-    """True if readings that are far off come sooner after a change of an input than others, by
-    their ranks: the model then misses how the output begins to move.
+def _follow_inputs(runs: Runs, masks: Masks) -> bool:
+    """True if outliers follow changes of an input sooner than other readings, by a rank test.
+
+    The model then misses how the output begins to move.
     """
-    late, out = [], []
-    for run, mask in zip(runs, off, strict=True):
+    since, bad = [], []
+    for run, mask in zip(runs, masks, strict=True):
         moves = np.any([np.diff(u, prepend=u[0]) != 0 for u in run.inputs.values()], axis=0)
         rows = np.arange(len(run))
-        late.append(rows - np.maximum.accumulate(np.where(moves, rows, -len(run))))
-        out.append(mask.any(axis=1))
-    late, out = np.concatenate(late), np.concatenate(out)
-    if not out.any():
+        since.append(rows - np.maximum.accumulate(np.where(moves, rows, -len(run))))
+        bad.append(mask.any(axis=1))
+    since, bad = np.concatenate(since), np.concatenate(bad)
+    if not bad.any():
         return False
-    from scipy.stats import mannwhitneyu  # half a second that only such readings should cost
+    from scipy.stats import mannwhitneyu  # slow to import
 
-    sooner = mannwhitneyu(late[out], late[~out], alternative="less")
-    return bool(sooner.pvalue < POOR_FIT)
+    test = mannwhitneyu(since[bad], since[~bad], alternative="less")
+    return bool(test.pvalue < POOR_FIT)
 
 
-def _none(runs: Runs) -> Masks:
+def _empty_masks(runs: Runs) -> Masks:
     return tuple(np.zeros((len(run), len(run.outputs)), bool) for run in runs)
 
 
-def _same(one: Masks, other: Masks) -> bool:
+def _same_masks(one: Masks, other: Masks) -> bool:
     return all(np.array_equal(*pair) for pair in zip(one, other, strict=True))
 
 
-def _judged(
+def _mask_readings(
     runs: Runs,
-    fit: Begun,
+    fit: RunsFit,
     judge: Callable[[PreparedOutput, Sequence[np.ndarray]], list[np.ndarray]],
 ) -> Masks:
-    """Readings of runs that are judged so beside a fit of some of them."""
-    case, masks = fit.on(runs), _none(runs)
-    rest = case.rest(fit.settled.fit.model)
-    for k, seen in enumerate(case.seen):
-        for i, mask in enumerate(judge(seen, [row[k] for row in rest])):
-            masks[i][heard(runs[i], seen.output, fit.path.delay), k] = mask
+    """Judge the readings of runs against a fit of some of them."""
+    case, masks = fit.case.for_runs(runs), _empty_masks(runs)
+    residuals = case.residuals(fit.fit.model)
+    for k, prepared in enumerate(case.prepared):
+        for i, mask in enumerate(judge(prepared, [row[k] for row in residuals])):
+            masks[i][usable_rows(runs[i], prepared.output, fit.path.delay), k] = mask
     return masks
 
 
-def _without(runs: Runs, masks: Masks) -> Runs | None:
-    """Runs without some readings; None if too few others are left."""
+def _remove_readings(runs: Runs, masks: Masks) -> Runs | None:
+    """Remove readings from runs; None if too few are left."""
     if not any(map(np.any, masks)):
         return runs
     kept = []
-    for run, mask in zip(runs, masks, strict=True):
+    for run, run_mask in zip(runs, masks, strict=True):
         outputs = {}
-        for (name, y), out in zip(run.outputs.items(), mask.T, strict=True):
-            outputs[name] = np.where(out, np.nan, y)
-            left, read = (int(np.isfinite(each).sum()) for each in (outputs[name], y))
-            if left < max(LEAST, read - left):
+        for (name, y), mask_of_output in zip(run.outputs.items(), run_mask.T, strict=True):
+            outputs[name] = np.where(mask_of_output, np.nan, y)
+            remaining, read = (int(np.isfinite(each).sum()) for each in (outputs[name], y))
+            if remaining < max(MIN_READINGS, read - remaining):
                 return None
         kept.append(replace(run, outputs=outputs))
     return tuple(kept)
 
 
-def _named(runs: Runs, masks: Masks, what: str) -> tuple[BadReadings, ...]:
-    """Readings that are left out, by run and output."""
+def _describe(runs: Runs, masks: Masks, what: str) -> tuple[BadReadings, ...]:
+    """Describe the readings that are left out, by run and output."""
     found = []
     for run, mask in zip(runs, masks, strict=True):
         for k, name in enumerate(run.outputs):
             if mask[:, k].any():
-                said = f"readings of {name}" if len(run.outputs) > 1 else "readings"
+                kind = f"readings of {name}" if len(run.outputs) > 1 else "readings"
                 first = float(run.time[mask[:, k].argmax()])
-                found.append(BadReadings(run.name, int(mask[:, k].sum()), first, f"{said} {what}"))
+                found.append(BadReadings(run.name, int(mask[:, k].sum()), first, f"{kind} {what}"))
     return tuple(found)
 
 
-def _lone(seen: PreparedOutput, residuals: Sequence[np.ndarray]) -> list[np.ndarray]:
-    """Readings that lie off beyond the noise by clear odds and are in no series of equal ones."""
-    digit = digit_of(np.concatenate(seen.measured)) or 0.0
-    least, found = np.hypot(CLOSE * seen.size_y, digit / np.sqrt(12.0)), []
-    each = zip(seen.measured, residuals, seen.time, _equal(seen, residuals), strict=True)
-    for y, rest, time, equal in each:
-        off = rest - median_filter(rest, AROUND, mode="nearest")
-        found.append((odds_of_bad(off, y - rest, time, float(least)) > CLEAR_ODDS) & ~equal)
+def _outliers(prepared: PreparedOutput, residuals: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """Mark readings that are off by clear odds and not in a series of equal ones."""
+    digit = digit_of(np.concatenate(prepared.measured)) or 0.0
+    floor, found = np.hypot(prepared.floor, digit / np.sqrt(12.0)), []
+    equal_series = _equal_series(prepared, residuals)
+    each = zip(prepared.measured, residuals, prepared.time, equal_series, strict=True)
+    for y, r, time, equal in each:
+        off = r - median_filter(r, MEDIAN_WIDTH, mode="nearest")
+        found.append((odds_of_bad(off, y - r, time, float(floor)) > CLEAR_ODDS) & ~equal)
     return found
 
 
-def odds_of_bad(off: np.ndarray, fitted: np.ndarray, time: np.ndarray, least: float) -> np.ndarray:
-    """Logarithm of the odds that readings are bad.
+def odds_of_bad(off: np.ndarray, fitted: np.ndarray, time: np.ndarray, floor: float) -> np.ndarray:
+    """Log odds that readings are bad.
 
     Parameters
     ----------
     off, fitted, time : array, shape (n,)
-        Residuals, the model, and when readings were taken, s.
-    least : float
+        Residuals, the model, and the times of the readings, s.
+    floor : float
         Smallest standard deviation of good readings.
 
     Returns
@@ -204,9 +211,8 @@ def odds_of_bad(off: np.ndarray, fitted: np.ndarray, time: np.ndarray, least: fl
     Notes
     -----
     The good-and-bad-data model of `beamfit.noise.sizes.bad_density`. Good readings scatter by a
-    part that is the same everywhere and one that goes with the model's slope (a jitter of the
-    clock, or a model that comes a little late), both at their likeliest by expectation and
-    maximisation.
+    constant part and a part proportional to the model's slope (jitter of the clock, or a small
+    error of the delay), both estimated by expectation and maximisation.
 
     Examples
     --------
@@ -214,40 +220,43 @@ def odds_of_bad(off: np.ndarray, fitted: np.ndarray, time: np.ndarray, least: fl
     >>> (odds_of_bad(off, np.zeros(51), np.arange(51.0), 1e-3) > 0).nonzero()[0].tolist()
     [50]
     """
-    scale, _ = spread_by_jitter(fitted, time)
+    scale, _ = jitter_scales(fitted, time)
     pulls = off / scale
-    size = np.maximum(1.4826 * np.median(np.abs(pulls), axis=1), least)[:, None]
+    level = np.maximum(1.4826 * np.median(np.abs(pulls), axis=1), floor)[:, None]
     for _ in range(50):
-        pull = (pulls / size) ** 2
+        pull = (pulls / level) ** 2
         bad = np.log(bad_density(pull, Noise()))
         good = expit(-0.5 * pull - bad)
-        size = np.sqrt(
+        level = np.sqrt(
             np.sum(good * pulls**2, axis=1, keepdims=True) / good.sum(axis=1, keepdims=True)
         )
-        size = np.maximum(size, least)
-    minus = np.log(size * scale) - np.logaddexp(-0.5 * pull, bad)
-    cost = 2.0 * minus.sum(axis=1) + JITTER_COST * (np.arange(len(scale)) > 0)
+        level = np.maximum(level, floor)
+    minus = np.log(level * scale) - np.logaddexp(-0.5 * pull, bad)
+    cost = 2.0 * minus.sum(axis=1) + JITTER_PENALTY * (np.arange(len(scale)) > 0)
     return (bad + 0.5 * pull)[cost.argmin()]
 
 
-def _equal(seen: PreparedOutput, residuals: Sequence[np.ndarray]) -> list[np.ndarray]:
-    """Readings in long series of equal ones."""
-    return [np.repeat(lengths >= HELD, lengths) for lengths in map(_lengths, seen.measured)]
+def _equal_series(prepared: PreparedOutput, residuals: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """Mark readings in long series of equal ones."""
+    return [
+        np.repeat(lengths >= MIN_STUCK, lengths)
+        for lengths in map(_series_lengths, prepared.measured)
+    ]
 
 
-def _still(seen: PreparedOutput, residuals: Sequence[np.ndarray]) -> list[np.ndarray]:
-    """Those from which a model that was fitted without them moves away."""
-    equal, masks = _equal(seen, residuals), []
+def _stuck(prepared: PreparedOutput, residuals: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """Mark series of equal readings from which a model fitted without them moves away."""
+    equal, masks = _equal_series(prepared, residuals), []
     others = np.concatenate([r[~mask] for r, mask in zip(residuals, equal, strict=True)])
     noise = 1.4826 * float(np.median(np.abs(others)))
-    for y, r, mask in zip(seen.measured, residuals, equal, strict=True):
-        lengths = _lengths(y)
+    for y, r, mask in zip(prepared.measured, residuals, equal, strict=True):
+        lengths = _series_lengths(y)
         first = np.append(0, np.cumsum(lengths)[:-1])
         off = np.sqrt(np.add.reduceat(r**2, first) / lengths)
-        masks.append(mask & np.repeat(off > AWAY * noise, lengths))
+        masks.append(mask & np.repeat(off > MIN_STUCK_RATIO * noise, lengths))
     return masks
 
 
-def _lengths(y: np.ndarray) -> np.ndarray:
+def _series_lengths(y: np.ndarray) -> np.ndarray:
     """Lengths of series of equal readings."""
     return np.diff(np.flatnonzero(np.diff(y, prepend=np.nan, append=np.nan) != 0))

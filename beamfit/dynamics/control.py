@@ -1,8 +1,8 @@
-"""Receding-horizon control with identified responses, and a loop of it with a simulated process.
+"""Receding-horizon control with identified responses, and a simulated loop of it.
 
-At every step the readings correct the state, the inputs of a horizon are planned within limits,
-and the first of them is given out. All of it is one function, compiled once. `controller` makes it
-from fits, with its horizon, margins of limits, and observer; `simulate_loop` judges it.
+At every step the readings correct the state, the inputs of a horizon are planned within limits, and
+the first of them is applied. The whole step is one compiled function. `controller` builds it from
+fits, with its horizon, margins of limits and observer; `simulate_loop` judges it.
 """
 
 from __future__ import annotations
@@ -25,24 +25,26 @@ from beamfit.dynamics.response import ARX, PHYSICS, Physics, run_from
 from beamfit.errors import Finding, InputError, Status, judge, nearest
 from beamfit.greybox.programs import Quadratic, minimum
 
-# Penalty on an output beyond its limit, per unit of its scatter: larger than any multiplier of a
+# Penalty on an output beyond its limit, in units of its scatter: larger than any multiplier of a
 # limit that can be kept, so that such a limit is kept exactly.
-PENALTY = 1e4
-# Linearisations of a response with varying parameters, and shares of a step that are tried.
-ROUNDS, SHARES = 3, (1.0, 0.5, 0.25, 0.0)
+LIMIT_PENALTY = 1e4
+# Linearisations of a response with varying parameters at each step, and step lengths that are
+# tried. Chosen.
+LINEARISATIONS = 3
+STEP_SHARES = (1.0, 0.5, 0.25, 0.0)
 
 
 class Response(NamedTuple):
     """An output as the controller knows it.
 
-    `of` is its map or raw numbers, `delay` in steps, whole or not, `size` its scatter,
-    `correction` the share of a surprise that is taken for a disturbance, `margin` what its limits
-    are held off by.
+    `map` is its parameter map or raw numbers, `delay` is in steps, whole or not, `size` its
+    scatter, `correction` the share of a prediction error that is added to the disturbance, `margin`
+    the distance kept from its limits.
     """
 
     name: str
     physics: Physics
-    of: Any
+    map: Any
     offset: float
     delay: float
     size: float
@@ -51,7 +53,7 @@ class Response(NamedTuple):
 
 
 class ControlLimits(NamedTuple):
-    """Limits of inputs (lowest, highest, change in a step) and outputs; infinite if none."""
+    """Limits of inputs (lowest, highest, change per step) and of outputs; infinite for none."""
 
     low: np.ndarray
     high: np.ndarray
@@ -68,11 +70,11 @@ class ControllerState(NamedTuple):
     x : tuple of array
         State of each response at the next reading.
     past : array, shape (longest delay or 1, m)
-        Inputs given out, the last last.
+        Applied inputs, the most recent last.
     level : array, shape (outputs,)
-        Disturbance of each output, estimated.
+        Estimated disturbance of each output.
     plan : array, shape (horizon, m)
-        Inputs of the last plan from then on.
+        Inputs of the last plan from the next step on.
     """
 
     x: tuple[jax.Array, ...]
@@ -81,15 +83,15 @@ class ControllerState(NamedTuple):
     plan: jax.Array
 
 
-class Said(NamedTuple):
+class ControlPlan(NamedTuple):
     """The plan behind an input.
 
     Attributes
     ----------
     inputs, outputs : array
-        Shapes (horizon, m), (horizon, outputs): what is planned, and what comes of it.
+        Planned inputs and predicted outputs, shapes (horizon, m), (horizon, outputs).
     beyond : array, shape (outputs,)
-        By how much the plan passes a limit less its margin: 0 unless it cannot be kept.
+        Excess of the plan over a limit less its margin: 0 unless the limit cannot be kept.
     """
 
     inputs: jax.Array
@@ -104,20 +106,20 @@ class Controller:
     Attributes
     ----------
     inputs : tuple of str
-        Their names.
+        Names of the inputs.
     responses : tuple of Response
-        One an output.
+        One response for each output.
     step : float
         Time from one input to the next, s.
     sizes : array, shape (m,)
         Scatter of the inputs.
     limits : ControlLimits
-        Those of inputs and of their changes are never broken. Those of outputs are, where they
-        cannot be kept, and `Said.beyond` tells.
+        Limits of inputs and of their changes are always kept. Those of outputs are broken where
+        they cannot be kept, as `ControlPlan.beyond` shows.
     horizon : int
         Steps of a plan.
     smooth : float
-        Cost of squared input changes, in units of the inputs' scatter, against squared errors in
+        Weight of squared input changes, in units of the inputs' scatter, against squared errors in
         units of the outputs' scatter.
     """
 
@@ -135,12 +137,12 @@ class Controller:
         Parameters
         ----------
         inputs : array, shape (m,)
-            Held so far.
+            Inputs held so far.
 
         Raises
         ------
         InputError
-            If an input lies outside its limits: no next one could keep them and its rate.
+            If an input lies outside its limits: the next one could not keep limits and rate.
         """
         u = np.asarray(inputs, float)
         for i, name in enumerate(self.inputs):
@@ -151,20 +153,20 @@ class Controller:
 
     def __call__(
         self, state: ControllerState, reading: Any, target: Any
-    ) -> tuple[ControllerState, jax.Array, Said]:
+    ) -> tuple[ControllerState, jax.Array, ControlPlan]:
         """Take a reading and give the next input.
 
         Parameters
         ----------
         state : ControllerState
-            Of `begin`, or of the step before.
+            State from `begin` or the previous step.
         reading, target : array, shape (outputs,)
-            What is read now, NaN where nothing is, and what is wanted from now on.
+            Present readings, NaN where there is none, and wanted values from now on.
 
         Returns
         -------
-        (ControllerState, array of shape (m,), Said)
-            What to hand to the next step, the input to hold until then, and the plan behind it.
+        (ControllerState, array of shape (m,), ControlPlan)
+            State for the next step, the input to hold until then, and the plan behind it.
         """
         return self._compiled(state, jnp.asarray(reading, float), jnp.asarray(target, float))
 
@@ -174,82 +176,84 @@ class Controller:
 
     @property
     def linear(self) -> bool:
-        """True if no parameter changes: a plan is then the best at once."""
-        return not any(callable(r.of) for r in self.responses)
+        """True if no parameter varies: one quadratic program then gives the best plan."""
+        return not any(callable(r.map) for r in self.responses)
 
     @property
-    def held(self) -> tuple[np.ndarray, np.ndarray]:
+    def output_limits(self) -> tuple[np.ndarray, np.ndarray]:
         """Limits of the outputs less their margins."""
         margin = np.array([r.margin for r in self.responses])
         return self.limits.below + margin, self.limits.above - margin
 
     def output(self, name: str) -> int:
-        """The place of an output; other names are refused."""
-        return _place([r.name for r in self.responses], name, "no output")
+        """Index of an output; unknown names are refused."""
+        return _index([r.name for r in self.responses], name, "no output")
 
 
 # ---- the process
 
 
-def settled(response: Response, u: jax.Array, step: float, factor: Any = 1.0) -> jax.Array:
-    """The state at rest under an input: x = A x + b of a step that is affine in x."""
-    p = parameters_at(response.physics, response.of, u[None])[0] * factor
-    like = response.physics.begin(jnp.zeros(response.physics.free_states), u)
+def state_at_rest(response: Response, u: jax.Array, step: float, factor: Any = 1.0) -> jax.Array:
+    """Solve for the state at rest under an input, x = A x + b for one step."""
+    p = parameters_at(response.physics, response.map, u[None])[0] * factor
+    template = response.physics.begin(jnp.zeros(response.physics.free_states), u)
 
     def after(x):
         return response.physics.advance(p, x, u, step)
 
-    zero = jnp.zeros_like(like)
-    return jnp.linalg.solve(jnp.eye(len(like)) - jax.jacfwd(after)(zero), after(zero))
+    zero = jnp.zeros_like(template)
+    return jnp.linalg.solve(jnp.eye(len(template)) - jax.jacfwd(after)(zero), after(zero))
 
 
 def start(control: Controller, u: jax.Array, reading: Any = None) -> ControllerState:
-    """The state at rest under u."""
-    latest = max(1, *(math.ceil(r.delay) for r in control.responses))
-    x = tuple(settled(r, u, control.step) for r in control.responses)
+    """State at rest under u, with the disturbance that a reading shows."""
+    memory = max(1, *(math.ceil(r.delay) for r in control.responses))
+    x = tuple(state_at_rest(r, u, control.step) for r in control.responses)
     level = jnp.zeros(len(x))
     if reading is not None:
-        level = jnp.asarray(reading, float) - _now(control, x)
+        level = jnp.asarray(reading, float) - _present_outputs(control, x)
     m = len(control.inputs)
-    held = jnp.broadcast_to(u, (latest, m)), jnp.broadcast_to(u, (control.horizon, m))
-    return ControllerState(x, held[0], level, held[1])
+    past, plan = jnp.broadcast_to(u, (memory, m)), jnp.broadcast_to(u, (control.horizon, m))
+    return ControllerState(x, past, level, plan)
 
 
-def late(response: Response, past: jax.Array, plan: jax.Array) -> jax.Array:
-    """The inputs as the response feels them, shape (plan, m).
+def delayed_inputs(response: Response, past: jax.Array, plan: jax.Array) -> jax.Array:
+    """Inputs as they reach the response, shape (plan, m).
 
-    In a step within which the input changes, its mean.
+    A step in which the input changes has the mean input.
     """
     steps = math.ceil(response.delay)
-    newer, first = steps - response.delay, len(past) - steps
-    given = jnp.concatenate([past, plan])
-    felt = given[first : first + len(plan)]
-    return felt if not newer else felt + newer * jnp.diff(given, axis=0)[first : first + len(plan)]
+    fraction, first = steps - response.delay, len(past) - steps
+    inputs = jnp.concatenate([past, plan])
+    delayed = inputs[first : first + len(plan)]
+    if not fraction:
+        return delayed
+    return delayed + fraction * jnp.diff(inputs, axis=0)[first : first + len(plan)]
 
 
-def moved(
+def advance_state(
     response: Response, x: jax.Array, past: jax.Array, u: jax.Array, step: float, factor: Any = 1.0
 ) -> jax.Array:
-    """The state a step later, under the input u given out now."""
-    felt = late(response, past, u[None])
-    p = parameters_at(response.physics, response.of, felt)[0] * factor
-    return response.physics.advance(p, x, felt[0], step)
+    """Give the state one step later, with the input u applied now."""
+    delayed = delayed_inputs(response, past, u[None])
+    p = parameters_at(response.physics, response.map, delayed)[0] * factor
+    return response.physics.advance(p, x, delayed[0], step)
 
 
-def _now(control: Controller, x: Sequence[jax.Array]) -> jax.Array:
+def _present_outputs(control: Controller, x: Sequence[jax.Array]) -> jax.Array:
     pairs = zip(control.responses, x, strict=True)
     return jnp.stack([r.offset + state[0] for r, state in pairs])
 
 
 def outputs(control: Controller, state: ControllerState, plan: jax.Array) -> jax.Array:
-    """Predicted outputs of a plan, shape (horizon, outputs), the first a step from now."""
+    """Predict the outputs of a plan, shape (horizon, outputs), the first one step from now."""
     found = []
     for i, (r, x) in enumerate(zip(control.responses, state.x, strict=True)):
-        felt = late(r, state.past, plan)
-        felt = jnp.concatenate([felt, felt[-1:]])  # of the last sample only the output counts
-        p = parameters_at(r.physics, r.of, felt)
-        dt = jnp.full(len(felt), control.step)
-        found.append(r.offset + state.level[i] + run_from(r.physics, p, felt, dt, x)[1:])
+        delayed = delayed_inputs(r, state.past, plan)
+        delayed = jnp.concatenate([delayed, delayed[-1:]])  # the last sample only gives an output
+        p = parameters_at(r.physics, r.map, delayed)
+        dt = jnp.full(len(delayed), control.step)
+        found.append(r.offset + state.level[i] + run_from(r.physics, p, delayed, dt, x)[1:])
     return jnp.stack(found, axis=1)
 
 
@@ -258,49 +262,51 @@ def outputs(control: Controller, state: ControllerState, plan: jax.Array) -> jax
 
 def advance(
     control: Controller, state: ControllerState, reading: jax.Array, target: jax.Array
-) -> tuple[ControllerState, jax.Array, Said]:
-    """Correct the disturbances by the reading, plan, and go on by a step."""
-    surprise = reading - _now(control, state.x) - state.level
+) -> tuple[ControllerState, jax.Array, ControlPlan]:
+    """Correct the disturbances by the reading, plan, and advance by one step."""
+    innovation = reading - _present_outputs(control, state.x) - state.level
     share = jnp.array([r.correction for r in control.responses])
-    level = state.level + jnp.where(jnp.isfinite(surprise), share * surprise, 0.0)
+    level = state.level + jnp.where(jnp.isfinite(innovation), share * innovation, 0.0)
     state = state._replace(level=level)
     plan = state.plan
-    for _ in range(1 if control.linear else ROUNDS):
-        plan = _better(control, state, target, plan)
-    # By construction, whatever the plan is worth: within the rate of the last input, within limits.
+    for _ in range(1 if control.linear else LINEARISATIONS):
+        plan = _improve_plan(control, state, target, plan)
+    # Limits and rates hold exactly, whatever the accuracy of the plan.
     last, limits = state.past[-1], control.limits
     u = jnp.clip(jnp.clip(plan[0], last - limits.rate, last + limits.rate), limits.low, limits.high)
     plan = plan.at[0].set(u)
-    ahead = outputs(control, state, plan)
-    said = Said(plan, ahead, jnp.max(_excess(control, ahead), axis=0))
-    x = tuple(moved(r, x, state.past, u, control.step)
+    predicted_outputs = outputs(control, state, plan)
+    planned = ControlPlan(
+        plan, predicted_outputs, jnp.max(_excess(control, predicted_outputs), axis=0)
+    )
+    x = tuple(advance_state(r, x, state.past, u, control.step)
               for r, x in zip(control.responses, state.x, strict=True))  # fmt: skip
     past = jnp.concatenate([state.past[1:], u[None]])
     shifted = jnp.concatenate([plan[1:], plan[-1:]])
-    return ControllerState(x, past, level, shifted), u, said
+    return ControllerState(x, past, level, shifted), u, planned
 
 
-def _excess(control: Controller, ahead: jax.Array) -> jax.Array:
-    """Excess of outputs over their limits less the margins."""
-    below, above = control.held
-    return jnp.maximum(jnp.maximum(below - ahead, ahead - above), 0.0)
+def _excess(control: Controller, predicted_outputs: jax.Array) -> jax.Array:
+    """Excess of outputs over their limits less margins."""
+    below, above = control.output_limits
+    return jnp.maximum(jnp.maximum(below - predicted_outputs, predicted_outputs - above), 0.0)
 
 
-def _better(
+def _improve_plan(
     control: Controller, state: ControllerState, target: jax.Array, plan: jax.Array
 ) -> jax.Array:
-    """The best plan of the process as it is around a plan."""
+    """Improve a plan by linearising the process about it."""
     slope = jax.jacfwd(lambda each: outputs(control, state, each))(plan)
-    best = _planned(control, state, target, plan, slope)
+    best = _quadratic_plan(control, state, target, plan, slope)
     if control.linear:
         return best
-    way = best - plan
+    direction = best - plan
     # Second-order correction (J. Nocedal & S. Wright, Numerical Optimization, 2006, section 18.3):
-    # else a full step passes a limit by the square of its length, and only shares of it are taken.
-    bent = outputs(control, state, plan + way) - outputs(control, state, plan)
-    bent = bent - jnp.tensordot(slope, way, 2)
-    corrected = _planned(control, state, target, plan, slope, bent)
-    tried = plan + jnp.array(SHARES)[:, None, None] * way
+    # without it a full step passes a limit by the square of its length, and only parts are taken.
+    curvature = outputs(control, state, plan + direction) - outputs(control, state, plan)
+    curvature = curvature - jnp.tensordot(slope, direction, 2)
+    corrected = _quadratic_plan(control, state, target, plan, slope, curvature)
+    tried = plan + jnp.array(STEP_SHARES)[:, None, None] * direction
     tried = jnp.concatenate([corrected[None], tried])
     cost = jax.vmap(lambda each: _cost(control, state, target, each))(tried)
     return tried[jnp.argmin(jnp.where(jnp.isfinite(cost), cost, jnp.inf))]
@@ -310,46 +316,48 @@ def _cost(
     control: Controller, state: ControllerState, target: jax.Array, plan: jax.Array
 ) -> jax.Array:
     size = np.array([r.size for r in control.responses])
-    ahead = outputs(control, state, plan)
+    predicted_outputs = outputs(control, state, plan)
     change = jnp.diff(plan, axis=0, prepend=state.past[-1:]) / control.sizes
-    passed = PENALTY * jnp.sum(_excess(control, ahead) / size)
-    return jnp.sum(((ahead - target) / size) ** 2) + control.smooth * jnp.sum(change**2) + passed
+    penalty = LIMIT_PENALTY * jnp.sum(_excess(control, predicted_outputs) / size)
+    error = (predicted_outputs - target) / size
+    return jnp.sum(error**2) + control.smooth * jnp.sum(change**2) + penalty
 
 
-def _planned(
+def _quadratic_plan(
     control: Controller,
     state: ControllerState,
     target: jax.Array,
     plan: jax.Array,
     slope: jax.Array,
-    bent: Any = 0.0,
+    curvature: Any = 0.0,
 ) -> jax.Array:
-    """The best plan of a process that is linear; inputs and outputs in units of their scatter.
+    """Solve for the best plan of the linearised process, inputs and outputs in units of their
+    scatter.
 
-    `bent` is added to the outputs that limits are held against.
+    `curvature` is added to the outputs that the limits apply to.
     """
     size, n = np.array([r.size for r in control.responses]), plan.size
-    wide = np.tile(control.sizes, control.horizon)
+    scales = np.tile(control.sizes, control.horizon)
     matrix = (slope / size[:, None, None] * control.sizes).reshape(-1, n)
-    inputs = plan.ravel() / wide
+    inputs = plan.ravel() / scales
     error = ((outputs(control, state, plan) - target) / size).ravel() - matrix @ inputs
     change = np.eye(n) - np.eye(n, k=-len(control.sizes))
     last = jnp.zeros(n).at[: len(control.sizes)].set(state.past[-1] / control.sizes)
     hessian = 2.0 * (matrix.T @ matrix + control.smooth * change.T @ change)
     gradient = 2.0 * (matrix.T @ error - control.smooth * change.T @ last)
     base = error + jnp.tile(target / size, control.horizon)
-    base = base + jnp.ravel((bent + jnp.zeros((control.horizon, len(size)))) / size)
+    base = base + jnp.ravel((curvature + jnp.zeros((control.horizon, len(size)))) / size)
     hard, soft = _input_rows(control, change, last), _output_rows(control, matrix, base)
-    rows, room = (jnp.concatenate(each) for each in zip(hard, soft, strict=True))
-    cost = np.repeat([np.inf, PENALTY], [len(hard[1]), len(soft[1])])
-    z, _ = minimum(Quadratic(hessian, gradient, rows, room, cost), inputs)
-    return (z * wide).reshape(plan.shape)
+    rows, bounds = (jnp.concatenate(each) for each in zip(hard, soft, strict=True))
+    cost = np.repeat([np.inf, LIMIT_PENALTY], [len(hard[1]), len(soft[1])])
+    z, _ = minimum(Quadratic(hessian, gradient, rows, bounds, cost), inputs)
+    return (z * scales).reshape(plan.shape)
 
 
 def _input_rows(
     control: Controller, change: np.ndarray, last: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """Limits of inputs and of their changes, those that there are."""
+    """Rows and bounds of the finite limits of inputs and of their changes."""
     low, high, rate = (np.tile(v / control.sizes, control.horizon) for v in control.limits[:3])
     unit, none = np.eye(len(rate)), jnp.zeros(len(rate))
     parts = ((unit, high, none), (-unit, -low, none), (change, rate, last), (-change, rate, -last))
@@ -360,24 +368,31 @@ def _input_rows(
 def _output_rows(
     control: Controller, matrix: jax.Array, base: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """Limits of outputs, less margins, those that there are."""
-    many, rows, room = len(control.responses), [matrix[:0]], [base[:0]]
-    for i, (r, below, above) in enumerate(zip(control.responses, *control.held, strict=True)):
+    """Rows and bounds of the finite limits of outputs, less margins."""
+    count, rows, bounds = len(control.responses), [matrix[:0]], [base[:0]]
+    for i, (r, below, above) in enumerate(
+        zip(control.responses, *control.output_limits, strict=True)
+    ):
         for sign, limit in ((1.0, above), (-1.0, below)):
             if np.isfinite(limit):
-                rows.append(sign * matrix[i::many])
-                room.append(sign * (limit / r.size - base[i::many]))
-    return jnp.concatenate(rows), jnp.concatenate(room)
+                rows.append(sign * matrix[i::count])
+                bounds.append(sign * (limit / r.size - base[i::count]))
+    return jnp.concatenate(rows), jnp.concatenate(bounds)
 
 
 # Safety margin of an output's limit, in standard deviations of noise and model together.
 MARGIN = 2.0
-# Fewest and most steps of a horizon; share of a transient that is left at its end.
-FEWEST, MOST, LEFT = 8, 40, 0.05
-# Steps of a plan at most, whose matrix has 8 MB then, and of a loop, which takes a minute.
-LONGEST, LOOP = 1000, 100_000
-# Drift of the disturbance in a step, as a share of white noise.
-DRIFT = 0.2
+# Shortest and longest default horizon, in steps; share of a transient that is left at its end.
+# Chosen.
+MIN_HORIZON = 8
+MAX_DEFAULT_HORIZON = 40
+TRANSIENT_LEFT = 0.05
+# Largest number of steps of a plan, whose matrix then has 8 MB, and of a loop, which then takes a
+# minute.
+MAX_HORIZON = 1000
+MAX_LOOP = 100_000
+# Drift of the disturbance per step, as a share of white noise: chosen.
+DISTURBANCE_DRIFT = 0.2
 
 
 def controller(
@@ -397,15 +412,15 @@ def controller(
     fits : ResponseFit or sequence of ResponseFit
         One an output, of the same runs.
     inputs, outputs : mapping of str to (float, float), optional
-        Limits. An input keeps to the range of the runs unless told: beyond it nothing is known.
+        Limits. The default for an input is the range of the runs: outside it the model is unknown.
     rates : mapping of str to float, optional
-        Largest change of an input in a second.
+        Largest change of an input per second.
     horizon : int, optional
-        Steps of a plan; to where 5 % of a transient is left, 8 to 40 and the delay, if None.
+        Steps of a plan; until 5 % of a transient is left, 8 to 40 plus the delay, if None.
     every : int, optional
-        Samples of the runs to a step; so many that the horizon holds the transient if None.
+        Samples of the runs per step; enough for the horizon to hold the transient if None.
     smooth : float
-        Cost of squared input changes (in units of the inputs' scatter) against squared errors
+        Weight of squared input changes (in units of the inputs' scatter) against squared errors
         (in units of the outputs').
 
     Returns
@@ -421,37 +436,40 @@ def controller(
     -----
     The inputs of the horizon minimise squared errors and changes within limits (J. Maciejowski,
     Predictive Control with Constraints, 2002, chapters 2 and 3); a response whose parameters
-    change is linearised along the last plan, three times a step. The state runs on the inputs
-    alone, and a disturbance of the output takes up what readings say besides (free of offset): the
-    Kalman filter of a level that wanders. Limits of outputs are held off by two standard deviations
-    of the residuals and of the fitted output together.
+    change is linearised along the last plan, three times a step. The state follows the inputs
+    alone, and a disturbance of the output takes up the prediction errors (no steady-state offset):
+    the Kalman filter of a level that wanders. Limits of outputs have a margin of two standard
+    deviations of the residuals and of the fitted output together.
     """
     fits = (fits,) if isinstance(fits, ResponseFit) else tuple(fits)
-    seen, names = fits[0].seen, fits[0].seen.inputs
+    prepared, names = fits[0].seen, fits[0].seen.inputs
     steps = [_transient(fit) for fit in fits]
     arx = any(PHYSICS[fit.model] is ARX for fit in fits)
     if arx and (every or 1) > 1:
         raise InputError(f"a step of {every} samples", "1: a difference equation knows no other")
-    every = every or (1 if arx else max(1, int(np.ceil(max(steps) / MOST))))
-    apart = min(float(np.median(np.diff(run.time))) for run in fits[0].runs)
-    step, responses = every * apart, tuple(_response(fit, every, every * apart) for fit in fits)
+    every = every or (1 if arx else max(1, int(np.ceil(max(steps) / MAX_DEFAULT_HORIZON))))
+    interval = min(float(np.median(np.diff(run.time))) for run in fits[0].runs)
+    step = every * interval
+    responses = tuple(_response(fit, every, step) for fit in fits)
     if horizon is None:
-        horizon = int(np.clip(np.ceil(max(steps) / every), FEWEST, MOST))
+        horizon = int(np.clip(np.ceil(max(steps) / every), MIN_HORIZON, MAX_DEFAULT_HORIZON))
         horizon += math.ceil(max(r.delay for r in responses))
-    if not (max(r.delay for r in responses) < horizon <= LONGEST and smooth > 0):
-        said = f"a horizon of {horizon} steps with smooth {smooth:g}"
-        expected = f"one longer than the delay, of at most {LONGEST} steps, and smooth above 0"
-        raise InputError(said, expected)
+    if not (max(r.delay for r in responses) < horizon <= MAX_HORIZON and smooth > 0):
+        found = f"a horizon of {horizon} steps with smooth {smooth:g}"
+        expected = f"one longer than the delay, of at most {MAX_HORIZON} steps, and smooth above 0"
+        raise InputError(found, expected)
     values = np.concatenate([np.stack(list(run.inputs.values()), axis=1) for run in fits[0].runs])
     low, high = _ranges(names, inputs or {}, np.stack([values.min(0), values.max(0)]))
-    wanted = [fit.output for fit in fits]
-    ends = _ranges(wanted, outputs or {}, np.outer([-np.inf, np.inf], np.ones(len(wanted))))
+    output_names = [fit.output for fit in fits]
+    ends = _ranges(
+        output_names, outputs or {}, np.outer([-np.inf, np.inf], np.ones(len(output_names)))
+    )
     limits = ControlLimits(low, high, step * _rates(names, rates or {}), *ends)
-    return Controller(names, responses, step, seen.wide, limits, horizon, smooth)
+    return Controller(names, responses, step, prepared.input_scale, limits, horizon, smooth)
 
 
 def _transient(fit: ResponseFit) -> float:
-    """Samples until 5 % of a transient is left, at the usual operating points."""
+    """Number of samples until 5 % of a transient is left, in the median over operating points."""
     run, physics = fit.seen.runs[0], PHYSICS[fit.model]
     points = run.u[:: max(1, len(run.u) // 50)]
     dt = float(np.median(np.diff(fit.runs[0].time)))
@@ -462,67 +480,68 @@ def _transient(fit: ResponseFit) -> float:
 
     p = parameters_at(physics, fit.fit.model["map"], points)
     fall = np.median(np.abs(np.linalg.eigvals(np.asarray(jax.vmap(step)(p)))).max(axis=1))
-    return float(np.log(LEFT) / np.log(np.clip(fall, 1e-3, 1.0 - 1e-6)))
+    return float(np.log(TRANSIENT_LEFT) / np.log(np.clip(fall, 1e-3, 1.0 - 1e-6)))
 
 
 def _response(fit: ResponseFit, every: int, step: float) -> Response:
     noise = float(np.sqrt(np.mean(np.square(fit.noise))))
     error = np.concatenate([fit.fit.derive(predicted, run).error for run in fit.seen.runs])
-    known = error[np.isfinite(error)]
-    band = float(np.sqrt(np.mean(known**2))) if known.size else 0.0
-    # A level that wanders by `drift` a step under noise of 1: the filter's gain at rest
+    finite = error[np.isfinite(error)]
+    band = float(np.sqrt(np.mean(finite**2))) if finite.size else 0.0
+    # A level that wanders by DISTURBANCE_DRIFT a step under noise of 1: the filter's gain at rest
     # (R. E. Kalman 1960; scalar Riccati equation P² = q (P + 1), gain P/(P + 1)).
-    q = DRIFT**2
-    if fit.memory is not None:  # of white noise, what the part that wanders gets anew in a step
-        wander = (1.0 - fit.memory.white) * -np.expm1(-2.0 * step / fit.memory.time)
-        q = max(q, wander / max(fit.memory.white, 1e-6))
-    ahead = 0.5 * (q + np.sqrt(q**2 + 4.0 * q))
-    model, late = fit.fit.model, max(fit.delay / every, 0.0)
+    q = DISTURBANCE_DRIFT**2
+    if fit.memory is not None:  # variance that the wandering part gains in a step, over white noise
+        wandering = (1.0 - fit.memory.white) * -np.expm1(-2.0 * step / fit.memory.time)
+        q = max(q, wandering / max(fit.memory.white, 1e-6))
+    variance = 0.5 * (q + np.sqrt(q**2 + 4.0 * q))
+    model, delay = fit.fit.model, max(fit.delay / every, 0.0)
     return Response(
-        fit.output, PHYSICS[fit.model], model["map"], float(model["offset"]), late, fit.seen.size_y,
-        ahead / (ahead + 1.0), MARGIN * float(np.hypot(noise, band)),
+        fit.output, PHYSICS[fit.model], model["map"], float(model["offset"]), delay,
+        fit.seen.output_scale, variance / (variance + 1.0), MARGIN * float(np.hypot(noise, band)),
     )  # fmt: skip
 
 
-def _place(names: Sequence[str], name: str, what: str) -> int:
-    """The place of a name; others are refused."""
+def _index(names: Sequence[str], name: str, what: str) -> int:
+    """Index of a name; unknown names are refused."""
     if name not in names:
         raise InputError(f"{what} '{name}'", nearest(name, list(names)))
     return names.index(name)
 
 
 def _ranges(
-    names: Sequence[str], said: Mapping[str, tuple[float, float]], usual: np.ndarray
+    names: Sequence[str], given: Mapping[str, tuple[float, float]], limits: np.ndarray
 ) -> np.ndarray:
-    """Lower and upper limits, the usual ones, shape (2, names), where none are said."""
-    for name, (low, high) in said.items():
-        at = _place(names, name, "a limit of")
+    """Lower and upper limits, shape (2, names); the defaults where none are given."""
+    for name, (low, high) in given.items():
+        k = _index(names, name, "a limit of")
         if not low < high:
             raise InputError(f"limits {low:g} to {high:g} of {name}", "the lower one first")
-        usual[:, at] = low, high
-    return usual
+        limits[:, k] = low, high
+    return limits
 
 
-def _rates(names: Sequence[str], said: Mapping[str, float]) -> np.ndarray:
-    """Largest changes of inputs in a second; infinite where none is said."""
+def _rates(names: Sequence[str], given: Mapping[str, float]) -> np.ndarray:
+    """Largest changes of inputs per second; infinite where none is given."""
     found = np.full(len(names), np.inf)
-    for name, rate in said.items():
-        at = _place(names, name, "a rate of")
+    for name, rate in given.items():
+        k = _index(names, name, "a rate of")
         if not rate > 0:
             raise InputError(f"rate {rate:g} of {name}", "above 0, in units a second")
-        found[at] = rate
+        found[k] = rate
     return found
 
 
 # ---- a loop with a simulated process
 
-# Band of a settled step, as a share of it (or the noise if larger); last share of the steps whose
-# mean is the remaining offset.
-SETTLED, LAST = 0.02, 0.2
-# Horizons simulated after the last change.
-HORIZONS = 4
-# Share of the scatter within which an input is at its limit, and an output still keeps its own.
-NEAR = 1e-4
+# Band within which a step counts as settled, as a share of the step (or the noise if larger); final
+# share of the steps whose mean error is the remaining offset.
+SETTLING_BAND = 0.02
+FINAL_SHARE = 0.2
+# Number of horizons simulated after the last change.
+FINAL_HORIZONS = 4
+# An input is at its limit, and an output keeps its own, within this share of the scatter.
+LIMIT_TOLERANCE = 1e-4
 
 
 class Trace(NamedTuple):
@@ -531,11 +550,11 @@ class Trace(NamedTuple):
     Attributes
     ----------
     outputs, readings : array, shape (steps, outputs)
-        As they are, and as they are read.
+        True outputs, and their readings.
     inputs : array, shape (steps, m)
-        Given out at each step.
+        Inputs applied at each step.
     beyond : array, shape (steps, outputs)
-        By how much each plan passes a limit less its margin.
+        Excess of each plan over a limit less its margin.
     """
 
     outputs: Any
@@ -547,18 +566,18 @@ class Trace(NamedTuple):
 def closed_loop(
     control: Controller, inputs: Any, targets: Any, noise: Any, load: Any, factors: Any = None
 ) -> Trace:
-    """Run a controller on its own model, perturbed; a pure function that can be mapped.
+    """Run a controller on its own perturbed model; a pure function that can be vectorised.
 
     Parameters
     ----------
     control : Controller
-        What controls.
+        The controller.
     inputs : array, shape (m,)
-        Where the process rests at first.
+        Inputs under which the process rests at first.
     targets, noise, load : array, shape (steps, outputs)
-        What is wanted, errors of the readings, disturbances of the outputs.
+        Wanted outputs, errors of the readings, disturbances of the outputs.
     factors : sequence of array, optional
-        By what the process's parameters differ from the model's, one array an output.
+        Factors of the process's parameters over the model's, one array for each output.
 
     Returns
     -------
@@ -567,28 +586,28 @@ def closed_loop(
     responses, step = control.responses, control.step
     factors = factors or [1.0] * len(responses)
     inputs = jnp.asarray(inputs, float)
-    x = tuple(settled(r, inputs, step, f) for r, f in zip(responses, factors, strict=True))
+    x = tuple(state_at_rest(r, inputs, step, f) for r, f in zip(responses, factors, strict=True))
 
     def on(carry, now):
         x, state = carry
         target, error, shift = now
-        past, y = state.past, _now(control, x) + shift
-        state, u, said = advance(control, state, y + error, target)
-        x = tuple(moved(r, s, past, u, step, f)
+        past, y = state.past, _present_outputs(control, x) + shift
+        state, u, planned = advance(control, state, y + error, target)
+        x = tuple(advance_state(r, s, past, u, step, f)
                   for r, s, f in zip(responses, x, factors, strict=True))  # fmt: skip
-        return (x, state), Trace(y, y + error, u, said.beyond)
+        return (x, state), Trace(y, y + error, u, planned.beyond)
 
-    state = start(control, inputs, _now(control, x) + load[0] + noise[0])
+    state = start(control, inputs, _present_outputs(control, x) + load[0] + noise[0])
     series = tuple(jnp.asarray(v) for v in (targets, noise, load))
     return jax.lax.scan(on, (x, state), series)[1]
 
 
 class StepResponse(NamedTuple):
-    """A step of a target or of a disturbance, and how the loop takes it.
+    """A step of a target or of a disturbance, and the answer of the loop.
 
-    `disturbed` is by how much, or 0; `settling` None where it does not settle before the next
-    one; `overshoot` a share of the target's step, None where that is within the noise; `left` the
-    mean error at the end.
+    `disturbed` is the size of a disturbance, or 0; `settling` the settling time, None if the next
+    step comes first; `overshoot` a share of the target's step, None if that is within the noise;
+    `left` the mean error at the end.
     """
 
     output: str
@@ -601,12 +620,12 @@ class StepResponse(NamedTuple):
     left: float
 
     def row(self) -> list[str]:
-        """Cells of a table."""
-        took = "not settled" if self.settling is None else f"{self.settling:.4g} s"
-        how = f"{self.before:.4g} to {self.after:.4g}"
-        how = f"disturbed by {self.disturbed:.4g}" if self.disturbed else how
-        over = "" if self.overshoot is None else f"{100 * self.overshoot:.1f} %"
-        return [self.output, f"{self.time:.4g} s", how, took, over]
+        """Cells of a table row."""
+        settling = "not settled" if self.settling is None else f"{self.settling:.4g} s"
+        change = f"{self.before:.4g} to {self.after:.4g}"
+        change = f"disturbed by {self.disturbed:.4g}" if self.disturbed else change
+        overshoot = "" if self.overshoot is None else f"{100 * self.overshoot:.1f} %"
+        return [self.output, f"{self.time:.4g} s", change, settling, overshoot]
 
 
 @answer
@@ -617,17 +636,17 @@ class Loop:
     Attributes
     ----------
     status : Status
-        How it went; ``message`` says why and what to do.
+        Verdict; ``message`` says why and what to do.
     control : Controller
-        What controlled.
+        The controller.
     fits : tuple of ResponseFit
-        Of the process.
+        Fits of the process.
     time : array, shape (steps,)
-        From the start, s.
+        Time from the start, s.
     targets : array, shape (steps, outputs)
-        What was wanted.
+        Wanted outputs.
     trace : Trace
-        What came of it.
+        Simulated steps.
     changes : tuple of StepResponse
         The steps of targets and disturbances.
     """
@@ -643,13 +662,13 @@ class Loop:
 
     @property
     def headline(self) -> str:
-        """Outputs, inputs and status in a line."""
+        """Outputs, inputs and status in one line."""
         outputs = ", ".join(r.name for r in self.control.responses)
         return f"{outputs} by {', '.join(self.control.inputs)}: {self.status}"
 
     def tables(self) -> tuple[Table, ...]:
-        """All numbers, to be shown; none of a model that is no base."""
-        if _unknown(self):
+        """Tables of all numbers; none for a model that cannot be used."""
+        if _no_model(self):
             return ()
         head = ["output", "at", "change", "settles in", "overshoot"]
         rows = [change.row() for change in self.changes]
@@ -658,22 +677,22 @@ class Loop:
     def _limits(self) -> tuple[list[str], list[list[str]]]:
         c, rows = self.control, []
         for i, name in enumerate(c.inputs):
-            ends = touched(self)[:, i]
-            said = _range(c.limits.low[i], c.limits.high[i])
-            seen = np.concatenate([run.inputs[name] for run in self.fits[0].runs])
-            if c.limits.low[i] < seen.min() or c.limits.high[i] > seen.max():
-                said += f" (the runs: {_range(seen.min(), seen.max())})"
-            rows.append([name, said, f"at it in {ends.sum()} of {len(ends)} steps"])
+            ends = at_limits(self)[:, i]
+            limit = _range(c.limits.low[i], c.limits.high[i])
+            recorded = np.concatenate([run.inputs[name] for run in self.fits[0].runs])
+            if c.limits.low[i] < recorded.min() or c.limits.high[i] > recorded.max():
+                limit += f" (the runs: {_range(recorded.min(), recorded.max())})"
+            rows.append([name, limit, f"at it in {ends.sum()} of {len(ends)} steps"])
             if np.isfinite(c.limits.rate[i]):
-                said = f"{c.limits.rate[i] / c.step:.4g} a second"
-                fast = fastest(self)[:, i].sum()
-                rows.append([name, said, f"at it in {fast} of {len(ends)} steps"])
+                limit = f"{c.limits.rate[i] / c.step:.4g} a second"
+                fast = at_max_rate(self)[:, i].sum()
+                rows.append([name, limit, f"at it in {fast} of {len(ends)} steps"])
         for i, r in enumerate(c.responses):
             low, high = c.limits.below[i], c.limits.above[i]
             if np.isfinite([low, high]).any():
-                soft = int((self.trace.beyond[:, i] > NEAR * r.size).sum())
-                said = f"{_range(low, high)}, held off by {r.margin:.2g}"
-                rows.append([r.name, said, f"soft in {soft} of {len(self.time)} steps"])
+                soft = int((self.trace.beyond[:, i] > LIMIT_TOLERANCE * r.size).sum())
+                limit = f"{_range(low, high)}, held off by {r.margin:.2g}"
+                rows.append([r.name, limit, f"soft in {soft} of {len(self.time)} steps"])
         return ["", "limit", "used"], rows
 
     def to_json(self) -> dict[str, Any]:
@@ -694,18 +713,19 @@ def _range(low: float, high: float) -> str:
     return f"at most {high:.4g}" if np.isfinite(high) else f"at least {low:.4g}"
 
 
-def touched(loop: Loop) -> np.ndarray:
+def at_limits(loop: Loop) -> np.ndarray:
     """True for each input at one of its limits, shape (steps, m)."""
     c, u = loop.control, loop.trace.inputs
-    near = NEAR * c.sizes
-    return (u <= c.limits.low + near) | (u >= c.limits.high - near)
+    tolerance = LIMIT_TOLERANCE * c.sizes
+    return (u <= c.limits.low + tolerance) | (u >= c.limits.high - tolerance)
 
 
-def fastest(loop: Loop) -> np.ndarray:
+def at_max_rate(loop: Loop) -> np.ndarray:
     """True for each input that moves at its largest rate, shape (steps - 1, m)."""
     c, rate = loop.control, loop.control.limits.rate
-    least = np.maximum(rate - NEAR * c.sizes, rate / 2)  # also where it hardly moves
-    return np.abs(np.diff(loop.trace.inputs, axis=0)) > least
+    # Half the rate at least, also for rates within the tolerance.
+    fast = np.maximum(rate - LIMIT_TOLERANCE * c.sizes, rate / 2)
+    return np.abs(np.diff(loop.trace.inputs, axis=0)) > fast
 
 
 def simulate_loop(
@@ -717,21 +737,21 @@ def simulate_loop(
     duration: float | None = None,
     seed: int = 1,
 ) -> Loop:
-    """Simulate a loop on the fitted process, with the noise that its residuals have.
+    """Simulate a loop on the fitted process, with the noise of its residuals.
 
     Parameters
     ----------
     fits : ResponseFit or sequence of ResponseFit
-        What the controller was made of; the process begins at rest under the mean inputs of the
-        runs, brought within their limits.
+        Fits that the controller was made from; the process starts at rest under the mean inputs of
+        the runs, clipped to their limits.
     control : Controller
-        Of `controller`.
+        The result of `controller`.
     targets, disturbances : sequence of (str, float, float)
-        Output, value and time, s: what is wanted from then on, and what is added from then on.
+        Output, value and time, s: wanted or added values from that time on.
     duration : float, optional
-        Time simulated, s; four horizons after the last change if None.
+        Simulated time, s; until four horizons after the last change if None.
     seed : int
-        Of the noise.
+        Seed of the noise.
 
     Returns
     -------
@@ -744,13 +764,13 @@ def simulate_loop(
     """
     fits = (fits,) if isinstance(fits, ResponseFit) else tuple(fits)
     last = max([at for _, _, at in (*targets, *disturbances)], default=0.0)
-    long = last + HORIZONS * control.horizon * control.step if duration is None else duration
-    if not control.step < long <= LOOP * control.step:
-        expected = f"more than a step, {control.step:g} s, and at most {LOOP} steps"
+    long = last + FINAL_HORIZONS * control.horizon * control.step if duration is None else duration
+    if not control.step < long <= MAX_LOOP * control.step:
+        expected = f"more than a step, {control.step:g} s, and at most {MAX_LOOP} steps"
         raise InputError(f"a loop of {long:g} s", expected)
     time = control.step * np.arange(int(np.ceil(long / control.step)))
     begin = np.clip(fits[0].seen.mean_u, control.limits.low, control.limits.high)
-    rest = np.asarray(jax.jit(lambda u: _now(control, start(control, u).x))(begin))
+    rest = np.asarray(jax.jit(lambda u: _present_outputs(control, start(control, u).x))(begin))
     wanted = _series(control, time, targets, rest, add=False)
     load = _series(control, time, disturbances, np.zeros(len(rest)), add=True)
     for name, value, _ in targets:
@@ -763,7 +783,7 @@ def simulate_loop(
     loop = Loop(Status.converged, "", control, fits, time, wanted, trace, ())
     loop = replace(loop, changes=tuple(_changes(loop, load)))
     found = judge(loop, RULES)
-    return replace(loop, status=found.status, message=found.message + _poor(loop))
+    return replace(loop, status=found.status, message=found.message + _poor_model_remark(loop))
 
 
 def _series(
@@ -773,7 +793,7 @@ def _series(
     at_first: np.ndarray,
     add: bool,
 ) -> np.ndarray:
-    """Values that step, shape (steps, outputs)."""
+    """Values that change in steps, shape (steps, outputs)."""
     found = np.tile(at_first, (len(time), 1))
     for name, value, at in sorted(steps, key=lambda each: each[2]):
         i = control.output(name)
@@ -787,22 +807,22 @@ def _series(
 
 
 def _noise(fit: ResponseFit, time: np.ndarray, seed: int) -> np.ndarray:
-    """Errors as the residuals have them, with their correlation time."""
+    """Draw reading errors with the correlation of the residuals."""
     size = float(np.sqrt(np.mean(np.square(fit.noise))))
-    new = np.random.default_rng(seed).normal(size=len(time))
+    draws = np.random.default_rng(seed).normal(size=len(time))
     if fit.memory is None:
-        return size * new
-    # From 0 on: a part that wanders far in long times has not yet done so.
-    kept = float(np.exp(-(time[1] - time[0]) / fit.memory.time))
-    wander = lfilter([np.sqrt(1.0 - kept**2)], [1.0, -kept], new)
+        return size * draws
+    # The wandering part starts at 0.
+    retained = float(np.exp(-(time[1] - time[0]) / fit.memory.time))
+    wandering = lfilter([np.sqrt(1.0 - retained**2)], [1.0, -retained], draws)
     white = np.random.default_rng([seed, 1]).normal(size=len(time))
-    return size * (np.sqrt(1.0 - fit.memory.white) * wander + np.sqrt(fit.memory.white) * white)
+    return size * (np.sqrt(1.0 - fit.memory.white) * wandering + np.sqrt(fit.memory.white) * white)
 
 
 def _changes(loop: Loop, load: np.ndarray) -> list[StepResponse]:
-    """Response of the loop to each step of a target or disturbance, until the next one."""
+    """Answer of the loop to each step of a target or disturbance, until the next one."""
     time, wanted, trace = loop.time, loop.targets, loop.trace
-    # A change of one output is felt by the others: all are followed until the next one of any.
+    # A change of one output acts on the others: each is followed until the next change of any.
     steps = np.diff(np.hstack([wanted, load]), axis=0, prepend=np.nan)
     every = np.flatnonzero((steps != 0).any(axis=1))
     found = []
@@ -815,14 +835,14 @@ def _changes(loop: Loop, load: np.ndarray) -> list[StepResponse]:
             error = trace.outputs[k:end, i] - wanted[k, i]
             step = float(aim[k])
             noise = float(np.mean(fit.noise))
-            near = max(SETTLED * abs(step or push[k]), noise)
-            off = np.flatnonzero(np.abs(error) > near)
+            band = max(SETTLING_BAND * abs(step or push[k]), noise)
+            off = np.flatnonzero(np.abs(error) > band)
             after = int(off[-1]) + 1 if off.size else 0
             settling = None if after >= len(error) else after * loop.control.step
             over = None
             if abs(step) > noise:
                 over = max(0.0, float((error * np.sign(step)).max()) / abs(step))
-            left = float(error[-max(1, int(LAST * len(error))) :].mean())
+            left = float(error[-max(1, int(FINAL_SHARE * len(error))) :].mean())
             end_at, load_step = float(wanted[k, i]), float(push[k])
             found.append(StepResponse(fit.output, float(time[k]), end_at - step, end_at, load_step,
                                       settling, over, left))  # fmt: skip
@@ -832,20 +852,20 @@ def _changes(loop: Loop, load: np.ndarray) -> list[StepResponse]:
 # ---- the verdict
 
 
-def _unknown(loop: Loop) -> Finding | None:
+def _no_model(loop: Loop) -> Finding | None:
     bad = [fit for fit in loop.fits if fit.status not in (Status.converged, Status.poor_fit)]
     if not bad:
         return None
     return Finding(bad[0].status, f"The model of {bad[0].output} is no base: {bad[0].message}")
 
 
-def _passed(loop: Loop) -> Finding | None:
+def _passes_limit(loop: Loop) -> Finding | None:
     for i, r in enumerate(loop.control.responses):
         low, high = loop.control.limits.below[i], loop.control.limits.above[i]
         y = loop.trace.outputs[:, i]
         over = np.maximum(y - high, low - y)
-        over = over[np.argmax(over <= 0) :]  # where it rests at first is not the loop's
-        if over.max() <= NEAR * r.size:
+        over = over[np.argmax(over <= 0) :]  # a start outside the limits does not count
+        if over.max() <= LIMIT_TOLERANCE * r.size:
             continue
         cause = f"{r.name} passes its limit by up to {over.max():.3g}"
         cause += f" in {int((over > 0).sum())} of {len(over)} steps."
@@ -855,21 +875,21 @@ def _passed(loop: Loop) -> Finding | None:
     return None
 
 
-def _short(loop: Loop) -> Finding | None:
+def _unsettled(loop: Loop) -> Finding | None:
     for change in loop.changes:
         if change.settling is not None:
             continue
         i = loop.control.output(change.output)
-        low, high = (ends[i] for ends in loop.control.held)
+        low, high = (ends[i] for ends in loop.control.output_limits)
         off = f"{change.output} stays {abs(change.left):.3g} off {change.after:.4g}"
         if not low <= change.after <= high:
             margin = loop.control.responses[i].margin
             cause = f"{off}: its limit has a safety margin of {margin:.3g} for noise and model."
             return Finding(Status.at_limit, cause, "Wish for less, or identify with less noise.")
-        if names := _mostly(loop, touched(loop)):
+        if names := _mostly_true(loop, at_limits(loop)):
             cause = f"{off}: {names} at its limit."
             return Finding(Status.at_limit, cause, "Wish for less, or widen the limit.")
-        if names := _mostly(loop, fastest(loop)):
+        if names := _mostly_true(loop, at_max_rate(loop)):
             cause = f"{off}: {names} moves at its largest rate."
             remedy = "Give it longer, or let inputs move faster."
             return Finding(Status.not_converged, cause, remedy)
@@ -878,29 +898,31 @@ def _short(loop: Loop) -> Finding | None:
     return None
 
 
-def _mostly(loop: Loop, at: np.ndarray) -> str:
-    """Inputs that are so in most of the last steps."""
-    often = at[-max(1, int(LAST * len(at))) :].mean(axis=0) > 0.5
+def _mostly_true(loop: Loop, at: np.ndarray) -> str:
+    """Names of inputs for which a mask is true in most of the last steps."""
+    often = at[-max(1, int(FINAL_SHARE * len(at))) :].mean(axis=0) > 0.5
     return ", ".join(n for n, each in zip(loop.control.inputs, often, strict=True) if each)
 
 
-def _kept(loop: Loop) -> Finding | None:
+def _settles(loop: Loop) -> Finding | None:
     soft = [r.name for i, r in enumerate(loop.control.responses)
-            if (loop.trace.beyond[:, i] > NEAR * r.size).any()]  # fmt: skip
+            if (loop.trace.beyond[:, i] > LIMIT_TOLERANCE * r.size).any()]  # fmt: skip
     first = loop.trace.outputs[0]
     within = (first >= loop.control.limits.below) & (first <= loop.control.limits.above)
     words = "The loop settles and keeps all limits"
     words += "." if within.all() else ", once within them."
     if soft:
         words += f" {', '.join(soft)} came within the safety margin of a limit."
-    return Finding(Status.poor_fit if _poor(loop) else Status.converged, words)
+    return Finding(Status.poor_fit if _poor_model_remark(loop) else Status.converged, words)
 
 
-def _poor(loop: Loop) -> str:
-    """Sentence about models that their runs refute, for every verdict."""
+def _poor_model_remark(loop: Loop) -> str:
+    """Sentence on models that their runs refute, for every verdict."""
     poor = [fit.output for fit in loop.fits if fit.status is Status.poor_fit]
-    said = f" But the model of {', '.join(poor)} does not explain its runs: see beamfit identify."
-    return said if poor else ""
+    sentence = (
+        f" But the model of {', '.join(poor)} does not explain its runs: see beamfit identify."
+    )
+    return sentence if poor else ""
 
 
-RULES = (_unknown, _passed, _short, _kept)
+RULES = (_no_model, _passes_limit, _unsettled, _settles)

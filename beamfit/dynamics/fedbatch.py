@@ -14,9 +14,15 @@ import numpy as np
 from scipy.special import logit, ndtri
 
 from beamfit.answer import Table, answer, json_of
-from beamfit.dynamics.answer import NEAR, POINTS, WORSE, Curve, search_failed
+from beamfit.dynamics.answer import (
+    CURVE_POINTS,
+    MAX_HELD_OUT_RATIO,
+    VISIT_DISTANCE,
+    Curve,
+    search_failed,
+)
 from beamfit.dynamics.balances import (
-    BEYOND,
+    BOUND_FACTOR,
     FLOWS,
     RATES,
     STATES,
@@ -25,21 +31,21 @@ from beamfit.dynamics.balances import (
     Batches,
     PreparedBatches,
     Stretches,
-    bounded,
+    batch_bounds,
     course,
-    filled,
-    known_at,
-    known_of,
-    padded,
-    points_at,
+    interpolate_gaps,
+    network_inputs,
+    pad_columns,
     predicted,
+    prepare_batches,
+    product_inputs,
     rates_at,
-    seen_of,
+    row_columns,
     stretches_of,
 )
 from beamfit.dynamics.model import weight_priors
-from beamfit.dynamics.record import Run, ordered
-from beamfit.dynamics.search import rounds
+from beamfit.dynamics.record import Run, reorder_inputs
+from beamfit.dynamics.search import repeat_search
 from beamfit.errors import Finding, InputError, Status, judge, nearest
 from beamfit.greybox.fit import Fit
 from beamfit.greybox.mlp import MLP, Port, dense
@@ -48,15 +54,15 @@ from beamfit.greybox.solve import solve
 from beamfit.noise.memory import is_correlated
 from beamfit.statistics import POOR_FIT
 
-# Values, in units of the largest, below which a noise that is a share of them stays the same.
+# Values, in units of the largest, below which a proportional noise becomes constant.
 FLOORS = np.geomspace(1e-4, 1.0, 13)
-# Percentile of the substrates read that is their scale, unless one is told: below it, where little
-# was read, rates fall with the substrate.
-LOW = 10.0
+# Percentile of the substrate readings that is the default scale: rates fall below it, and there are
+# few readings.
+SCALE_PERCENTILE = 10.0
 
 
 class ReadingNoise(NamedTuple):
-    """Noise of an output: a share of the value, and a floor; the share is 0 of a constant noise."""
+    """Noise of an output: a share of the value and a floor; a constant noise has share 0."""
 
     share: float
     floor: float
@@ -70,32 +76,33 @@ class ReadingNoise(NamedTuple):
         return f"{more}{self.floor:.2g}"
 
 
-def noise_of(rest: np.ndarray, fitted: np.ndarray, read: np.ndarray) -> ReadingNoise:
-    """The likeliest noise of one output."""
+def noise_of(residuals: np.ndarray, fitted: np.ndarray, read: np.ndarray) -> ReadingNoise:
+    """Estimate the noise of one output from its residuals."""
     top, found = max(float(np.max(np.abs(fitted))), 1e-12), []
     for kind in (ReadingNoise(0.0, top), *(ReadingNoise(1.0, top * floor) for floor in FLOORS)):
-        unit = kind.errors(fitted)[read]
-        size = max(float(np.sqrt(np.mean((rest[read] / unit) ** 2))), 1e-12)
-        noise = ReadingNoise(size * kind.share, size * kind.floor)
-        found.append((float(np.sum(np.log(size * unit))), noise))
+        shape = kind.errors(fitted)[read]
+        level = max(float(np.sqrt(np.mean((residuals[read] / shape) ** 2))), 1e-12)
+        noise = ReadingNoise(level * kind.share, level * kind.floor)
+        found.append((float(np.sum(np.log(level * shape))), noise))
     return min(found, key=lambda each: each[0])[1]
 
 
 def errors_of(noise: Iterable[ReadingNoise], values: np.ndarray) -> np.ndarray:
-    """Standard deviations of values, the outputs last."""
+    """Standard deviations of values, the outputs along the last axis."""
     return np.stack([each.errors(values[..., k]) for k, each in enumerate(noise)], axis=-1)
 
 
 # Parts of the model: networks, and numbers at the start of each batch.
-NETWORKS, BEGINS = ("rates", "product"), ("start", "begin")
+NETWORKS, START_NUMBERS = ("rates", "product"), ("start", "begin")
 
 
 def problem_of(
     seen: PreparedBatches, model: Any, error: np.ndarray, free: Sequence[str], spread: Any = 1.0
 ) -> Problem:
-    """State it; `error`, of the shape of the readings, is a guess that they correct.
+    """State the fit as a problem.
 
-    `spread` is by how much batches differ, in logarithms of their rates.
+    `error`, of the shape of the readings, is a first estimate that they correct; `spread` is the
+    standard deviation of the logarithms of rates between batches.
     """
     record = Record(
         "batches", predicted, seen.batches, seen.measured, error=error, weight=seen.read * 1.0,
@@ -111,18 +118,18 @@ def problem_of(
 def network_of(
     names: Sequence[str], points: np.ndarray, outputs: Sequence[str], hidden: int, seed: int
 ) -> MLP:
-    """A network of points (n, names) with small random weights, that begins at usual rates."""
+    """Make a network of points (n, names) with small random weights and typical rates."""
     ports = [Port(n, "", 0, float(s) or 1.0, float(m))
              for n, s, m in zip(names, points.std(0), points.mean(0), strict=True)]  # fmt: skip
-    outputs = [Port(name, "", 0, 1.0, float(logit(0.5 / BEYOND))) for name in outputs]
+    outputs = [Port(name, "", 0, 1.0, float(logit(0.5 / BOUND_FACTOR))) for name in outputs]
     return dense(ports, outputs, [hidden], seed=seed, spread=0.3)
 
 
 class HeldBatch(NamedTuple):
-    """A batch that is only predicted, from a start that fits it.
+    """A held-out batch, predicted from start numbers that are fitted to it.
 
-    `rms` is by output, in its units; `rest` that of all in units of their errors, of noise, model,
-    and how batches differ; `inside` the share of readings within the 95 % band, by output.
+    `rms` is by output, in its units; `rest` the rms in units of the errors, of noise, model and
+    spread of batches; `inside` the share of readings within the 95 % band, by output.
     """
 
     name: str
@@ -139,51 +146,51 @@ class HeldBatch(NamedTuple):
 _fitted = jax.jit(predicted)
 
 
-@jax.jit  # op by op, hundreds of small programs are compiled
-def ahead(model: Any, asked: tuple[Batches, Mapping[str, Any]]) -> jax.Array:
-    """Predict a batch from numbers at its start, shape (1, rows, outputs)."""
-    b, begun = asked
-    return predicted(model | begun, b)
+@jax.jit  # without it hundreds of small programs are compiled
+def predict_batch(model: Any, data: tuple[Batches, Mapping[str, Any]]) -> jax.Array:
+    """Predict a batch from start numbers, shape (1, rows, outputs)."""
+    b, start = data
+    return predicted(model | start, b)
 
 
 def forecast(
-    fit: Fit, b: Batches, begun: Mapping[str, Any], spread: np.ndarray
+    fit: Fit, b: Batches, start: Mapping[str, Any], spread: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """A usual batch, and errors of one that differs as batches do, shape (1, rows, outputs)."""
-    usual = jnp.zeros((1, len(spread)))
-    found = fit.derive(ahead, (b, {**begun, "own": usual}))
-    slope = jax.jacfwd(lambda own: ahead(fit.model, (b, {**begun, "own": own})))(usual)
-    differs = np.linalg.norm(np.asarray(slope)[..., 0, :] * spread, axis=-1)
-    return found.value, np.hypot(found.error, differs)
+    """Predict a typical batch, with errors of one that differs, shape (1, rows, outputs)."""
+    typical = jnp.zeros((1, len(spread)))
+    found = fit.derive(predict_batch, (b, {**start, "own": typical}))
+    slope = jax.jacfwd(lambda own: predict_batch(fit.model, (b, {**start, "own": own})))(typical)
+    between = np.linalg.norm(np.asarray(slope)[..., 0, :] * spread, axis=-1)
+    return found.value, np.hypot(found.error, between)
 
 
-def held_back(
+def predict_held_batch(
     run: Run, like: Batches, fit: Fit, noise: Mapping[str, ReadingNoise], spread: np.ndarray
 ) -> HeldBatch:
-    """Predict a batch of which only the numbers at the start are fitted.
+    """Predict a held-out batch, of which only the start numbers are fitted.
 
-    Substrate that ends falls by decades at once, and an hour too early or late is no noise of the
-    smaller value: the larger of what is read and predicted has the error.
+    The error belongs to the larger of reading and prediction: substrate that runs out falls by
+    decades at once, and a shift by an hour is not noise of the smaller value.
     """
-    seen = seen_of([run], like, tuple(noise))
+    seen = prepare_batches([run], like, tuple(noise))
 
-    def judged(first):
+    def with_errors(first):
         value, band = forecast(fit, seen.batches, first, spread)
         error = errors_of(noise.values(), np.maximum(value, seen.measured))
         return value, np.hypot(error, np.nan_to_num(band))
 
-    first = begun(seen)
-    problem = problem_of(seen, dict(fit.model) | first, judged(first)[1], BEGINS)
+    first = start_numbers(seen)
+    problem = problem_of(seen, dict(fit.model) | first, with_errors(first)[1], START_NUMBERS)
     end = solve(problem).model
-    value, error = judged({name: end[name] for name in first})
-    rest, rms, inside = value - seen.measured, {}, {}
-    off = np.abs(rest) / error
+    value, error = with_errors({name: end[name] for name in first})
+    residuals, rms, inside = value - seen.measured, {}, {}
+    ratio = np.abs(residuals) / error
     for k, name in enumerate(noise):
         read = seen.read[..., k]
-        rms[name] = float(np.sqrt(np.mean(rest[..., k][read] ** 2)))
-        inside[name] = float(np.mean(off[..., k][read] < -ndtri(0.025)))
-    whole = float(np.sqrt(np.mean(off[seen.read] ** 2)))
-    return HeldBatch(run.name, rms, whole, inside)
+        rms[name] = float(np.sqrt(np.mean(residuals[..., k][read] ** 2)))
+        inside[name] = float(np.mean(ratio[..., k][read] < -ndtri(0.025)))
+    total = float(np.sqrt(np.mean(ratio[seen.read] ** 2)))
+    return HeldBatch(run.name, rms, total, inside)
 
 
 # ---- the verdict
@@ -193,7 +200,7 @@ class BatchEvidence(NamedTuple):
     """Input of the rules; `fitted` has the shape of the readings."""
 
     fit: Fit
-    rests: bool
+    converged: bool
     seen: PreparedBatches
     fitted: np.ndarray
     noise: dict[str, ReadingNoise]
@@ -201,15 +208,17 @@ class BatchEvidence(NamedTuple):
     held: Mapping[str, HeldBatch] = MappingProxyType({})
 
 
-def _refuted(e: BatchEvidence) -> Finding | None:
-    """Find the output of which most is left by residuals that follow one another."""
-    lean, found = 1.0 - e.fit.groups[0].dof / int(e.seen.read.sum()), []
+def _correlated_residuals(e: BatchEvidence) -> Finding | None:
+    """Find the output with the largest correlated residuals."""
+    used_share, found = 1.0 - e.fit.groups[0].dof / int(e.seen.read.sum()), []
     for k, (name, noise) in enumerate(e.noise.items()):
         read = e.seen.read[..., k]
         fitted, top = e.fitted[..., k][read], e.seen.measured[..., k].max()
-        rest = e.seen.measured[..., k][read] - fitted
-        if is_correlated(rest / noise.errors(fitted), lean * rest.size, -ndtri(POOR_FIT)):
-            found.append((rest.std() / top, f"{name}: {rest.std():.2g} of {top:.3g}"))
+        residuals = e.seen.measured[..., k][read] - fitted
+        if is_correlated(
+            residuals / noise.errors(fitted), used_share * residuals.size, -ndtri(POOR_FIT)
+        ):
+            found.append((residuals.std() / top, f"{name}: {residuals.std():.2g} of {top:.3g}"))
     if not found:
         return None
     cause = f"Residuals follow one another and are no noise, of {max(found)[1]} is not explained: "
@@ -218,16 +227,16 @@ def _refuted(e: BatchEvidence) -> Finding | None:
     return Finding(Status.poor_fit, cause, remedy)
 
 
-def _worse(e: BatchEvidence) -> Finding | None:
-    bad = {name: held.rest for name, held in e.held.items() if held.rest > WORSE}
+def _fails_held_out(e: BatchEvidence) -> Finding | None:
+    bad = {name: held.rest for name, held in e.held.items() if held.rest > MAX_HELD_OUT_RATIO}
     if not bad:
         return None
-    name, rest = max(bad.items(), key=lambda each: each[1])
-    cause = f"Batch {name}, held back, is {rest:.1f} times its error off."
+    name, ratio = max(bad.items(), key=lambda each: each[1])
+    cause = f"Batch {name}, held back, is {ratio:.1f} times its error off."
     return Finding(Status.poor_fit, cause, "Use batches that cover its range, or fewer nodes.")
 
 
-def _open(e: BatchEvidence) -> Finding | None:
+def _undetermined(e: BatchEvidence) -> Finding | None:
     left = [
         f"{c.parameter}({c.input})"
         for c in e.curves
@@ -239,27 +248,34 @@ def _open(e: BatchEvidence) -> Finding | None:
     return Finding(Status.unidentified, cause, "Add batches that visit more, or read more often.")
 
 
-def _bounded(e: BatchEvidence) -> Finding | None:
+def _at_bound(e: BatchEvidence) -> Finding | None:
     most = dict(zip(RATES, np.asarray(e.seen.batches.ends[1]), strict=True))
     held = {c.parameter for c in e.curves
-            if np.any(c.value[c.visited] > BOUND * most[c.parameter])}  # fmt: skip
+            if np.any(c.value[c.visited] > AT_BOUND * most[c.parameter])}  # fmt: skip
     if not held:
         return None
     cause = f"{', '.join(sorted(held))} is held by its bound."
     return Finding(Status.at_limit, cause, "Give higher bounds (most=) if the physics allows.")
 
 
-def _good(e: BatchEvidence) -> Finding:
-    said = ", ".join(f"{name} {noise}" for name, noise in e.noise.items())
-    cause = f"The balances follow all batches within noise: {said}."
+def _converged(e: BatchEvidence) -> Finding:
+    noises = ", ".join(f"{name} {noise}" for name, noise in e.noise.items())
+    cause = f"The balances follow all batches within noise: {noises}."
     never = sorted({c.input for c in e.curves if not c.visited.all()})
     more = f" Parts of the range of {', '.join(never)} were not visited." if never else ""
     return Finding(Status.converged, cause + more)
 
 
 # Rates above this share of their bound count as at the bound.
-BOUND = 0.95
-RULES = (search_failed, _refuted, _worse, _open, _bounded, _good)
+AT_BOUND = 0.95
+RULES = (
+    search_failed,
+    _correlated_residuals,
+    _fails_held_out,
+    _undetermined,
+    _at_bound,
+    _converged,
+)
 
 
 @answer
@@ -274,17 +290,17 @@ class FedBatchFit:
     runs : tuple of Run
         The batches.
     seen : PreparedBatches
-        The same as the model sees them.
+        The batches as the model sees them.
     fit : Fit
         The grey-box fit.
     curves : tuple of Curve
-        mu_b and mu_s against each thing they hang on, the others at their means, 1/h.
+        mu_b and mu_s against each input of the rates, the others at their means, 1/h.
     noise : dict of str to ReadingNoise
-        Of biomass, substrate, volume, and titre where it was read.
+        Noise of biomass, substrate, volume, and titre if it was read.
     spread : dict of str to float
-        By how much batches differ in mu_b, mu_s, and the formation of product, as a share.
+        Relative spread of mu_b, mu_s and product formation between batches.
     held : dict of str to HeldBatch
-        How batches are predicted that were held back.
+        Predictions of held-out batches.
     """
 
     status: Status
@@ -299,13 +315,13 @@ class FedBatchFit:
 
     @property
     def headline(self) -> str:
-        """The answer in a line."""
+        """The answer in one line."""
         points = ", ".join(self.fit.model["rates"].inputs)
         return f"{self.output} {self.status}: of {points}, from {len(self.runs)} batches"
 
     @property
     def output(self) -> str:
-        """Names of what was identified."""
+        """Names of the identified outputs."""
         return "mu_b, mu_s" + ", titre" * (TITRE in self.noise)
 
     @cached_property
@@ -316,11 +332,11 @@ class FedBatchFit:
 
     @property
     def half(self) -> float:
-        """Scale of the substrate, g/L, below which rates fall with it."""
+        """Scale of the substrate, g/L, below which rates fall."""
         return float(self.fit.model["half"])
 
     def tables(self) -> tuple[Table, ...]:
-        """All numbers, to be shown."""
+        """Tables of all numbers."""
         rows = [[f"noise of {name}", str(noise)] for name, noise in self.noise.items()]
         rows += [
             [f"bounds of {r}", f"{low:.3g} to {high:.3g} 1/h"]
@@ -366,23 +382,21 @@ def identify_batches(
         NaN where nothing was read, and ``titre`` in g/L if all have it; inputs ``feed`` in L/h and
         ``feed_substrate`` in g/L, optionally ``outflow`` in L/h, and whatever else was set.
     points : sequence of str, optional
-        What the rates hang on, of states, inputs, outputs that were read on line, and
-        ``measured substrate``, ``measured biomass``; the substrate and all inputs that are no flow
-        if None.
+        Inputs of the rates: states, inputs, outputs that were read on line, and ``measured
+        substrate``, ``measured biomass``; the substrate and all inputs but flows if None.
     product : sequence of str
-        What the formation of product hangs on: mu_b, mu_s, and what the rates may hang on.
+        Inputs of the formation of product: mu_b, mu_s, and possible inputs of the rates.
     held : sequence of Run
-        Batches that are only predicted, from numbers at the start that fit them.
+        Held-out batches, predicted from start numbers that are fitted to them.
     hidden : int
         Nodes of the network.
     most : (float, float), optional
-        Bounds of mu_b and mu_s, 1/h; four times the largest that an eighth of a batch shows if
-        None.
+        Bounds of mu_b and mu_s, 1/h; four times the largest mean of an eighth of a batch if None.
     half : float, optional
-        Scale of the substrate, g/L, below which rates fall with it; the tenth percentile of what
-        was read if None.
+        Scale of the substrate, g/L, below which rates fall; the tenth percentile of the readings if
+        None.
     seed : int
-        Of the network's first weights.
+        Seed of the network's initial weights.
 
     Returns
     -------
@@ -398,38 +412,38 @@ def identify_batches(
     -----
     The balances (report eqs 45 and 46, `beamfit.dynamics.balances.advance`) hold exactly; a network
     gives mu = low + (high S/(S + s) - low) sigmoid(net), so that nothing grows or is consumed
-    without substrate; low is 0, for mu_b less where the batches show that cells die. On top of them
-    product is formed, q = bound sigmoid(net) of the cells, and decays (fig 34). All batches run
-    free from states that are estimated. The search begins with the rates that readings alone say of
-    stretches of the batches. The noise of each output is a share of the value and a floor, and is
-    taken from the residuals after every round. Batches differ: each has its own factors of the
-    rates, whose scatter is taken likewise.
+    without substrate; low is 0, or negative for mu_b where the batches show that cells die. Product
+    is formed in addition, q = bound sigmoid(net) of the cells, and decays (fig 34). All batches run
+    free from states that are estimated. The search starts with the rates of stretches of the
+    batches that readings alone give. The noise of each output is a share of the value and a floor,
+    estimated from the residuals after every round. Each batch has its own factors of the rates,
+    whose scatter is estimated likewise.
     """
     runs = (runs,) if isinstance(runs, Run) else tuple(runs)
     own = [n for n in runs[0].inputs if n not in FLOWS]
     names = ("substrate", *own) if points is None else tuple(points)
     for run in (*runs, *held):
         _check(run, runs[0])
-        _check_names(names, (*STATES, *known_of(run)), "rates")
-        _check_names(product, (*RATES, *STATES, *known_of(run)), "product")
+        _check_dependences(names, (*STATES, *row_columns(run)), "rates")
+        _check_dependences(product, (*RATES, *STATES, *row_columns(run)), "product")
     if half is not None and not half > 0:
         raise InputError(f"half {half:g}", "a substrate above 0, g/L")
-    titred = all(TITRE in run.outputs for run in (*runs, *held))
-    runs, held = ([ordered(run, runs[0]) for run in each] for each in (runs, held))
+    has_titre = all(TITRE in run.outputs for run in (*runs, *held))
+    runs, held = ([reorder_inputs(run, runs[0]) for run in each] for each in (runs, held))
     parts = [stretches_of(run) for run in runs]
-    like = bounded(runs, parts, most)
-    seen = seen_of(runs, like, (*STATES, TITRE) if titred else STATES)
-    first = _first(seen, names, half, hidden, seed)
-    first = _matched(first, seen, parts)
-    if titred:
-        first |= _product(first, seen, product, hidden, seed)
-    (fit, noise, _, spread, _), rests = settled(seen, first)
-    curves, y = curves_of(fit, seen), np.asarray(_fitted(fit.model, seen.batches))
-    told = {run.name: held_back(run, like, fit, noise, spread) for run in held}
-    found = judge(BatchEvidence(fit, rests, seen, y, noise, curves, told), RULES)
+    like = batch_bounds(runs, parts, most)
+    seen = prepare_batches(runs, like, (*STATES, TITRE) if has_titre else STATES)
+    first = _rates_model(seen, names, half, hidden, seed)
+    first = _match_stretches(first, seen, parts)
+    if has_titre:
+        first |= _product_model(first, seen, product, hidden, seed)
+    (fit, noise, _, spread, _), converged = search_rates(seen, first)
+    curves, fitted = curves_of(fit, seen), np.asarray(_fitted(fit.model, seen.batches))
+    predictions = {run.name: predict_held_batch(run, like, fit, noise, spread) for run in held}
+    found = judge(BatchEvidence(fit, converged, seen, fitted, noise, curves, predictions), RULES)
     spread = dict(zip((*RATES, TITRE), map(float, spread), strict=False))
     return FedBatchFit(found.status, found.message, tuple(runs), seen, fit, curves, noise, spread,
-                       told)  # fmt: skip
+                       predictions)  # fmt: skip
 
 
 def _check(run: Run, first: Run) -> None:
@@ -445,142 +459,154 @@ def _check(run: Run, first: Run) -> None:
             raise run.unusable(f"{name} of {low:g}", "values above 0")
 
 
-def _check_names(names: Sequence[str], known: Sequence[str], what: str) -> None:
-    """Refuse names of nothing that is known of a row."""
+def _check_dependences(names: Sequence[str], columns: Sequence[str], what: str) -> None:
+    """Refuse names that are no known column of a row."""
     for name in names:
-        if name not in known:
-            raise InputError(f"{what} that hang on '{name}'", nearest(name, list(known)))
+        if name not in columns:
+            raise InputError(f"{what} that hang on '{name}'", nearest(name, list(columns)))
 
 
-def _first(
+def _rates_model(
     seen: PreparedBatches, names: Sequence[str], half: float | None, hidden: int, seed: int
 ) -> dict[str, Any]:
-    """A model with a network of small random weights."""
-    whole = _whole(seen)
-    s = np.concatenate([x[:, 1] for x in whole])
-    half = half or float(np.percentile(s[s > 0], LOW))
-    points = [known_at(seen.batches, half, x.T[:3], u[: len(x)].T)
-              for x, u in zip(whole, np.asarray(seen.batches.u), strict=True)]  # fmt: skip
+    """Start model: a network of rates with small random weights."""
+    readings = _interpolated_readings(seen)
+    s = np.concatenate([x[:, 1] for x in readings])
+    half = half or float(np.percentile(s[s > 0], SCALE_PERCENTILE))
+    points = [network_inputs(seen.batches, half, x.T[:3], u[: len(x)].T)
+              for x, u in zip(readings, np.asarray(seen.batches.u), strict=True)]  # fmt: skip
     points = np.concatenate([np.stack([p[name] for name in names], axis=1) for p in points])
     net = network_of(names, points, RATES, hidden, seed)
-    return {"rates": net, "half": half} | begun(seen)
+    return {"rates": net, "half": half} | start_numbers(seen)
 
 
-def _whole(seen: PreparedBatches) -> list[np.ndarray]:
-    """Readings of each batch with straight lines over gaps, shape (rows, outputs)."""
+def _interpolated_readings(seen: PreparedBatches) -> list[np.ndarray]:
+    """Readings of each batch with gaps interpolated, shape (rows, outputs)."""
     values = np.where(seen.read, seen.measured, np.nan)
-    return [np.stack([filled(t, c) for c in x[: len(t)].T], axis=1)
+    return [np.stack([interpolate_gaps(t, c) for c in x[: len(t)].T], axis=1)
             for x, t in zip(values, seen.time, strict=True)]  # fmt: skip
 
 
-def begun(seen: PreparedBatches) -> dict[str, np.ndarray]:
-    """The numbers at the start of each batch, as first read."""
-    first = np.array([x[0] for x in _whole(seen)])
+def start_numbers(seen: PreparedBatches) -> dict[str, np.ndarray]:
+    """Numbers at the start of each batch, from the first readings."""
+    first = np.array([x[0] for x in _interpolated_readings(seen)])
     floor = 1e-3 * seen.measured.max(axis=(0, 1))
     start = {"start": np.log(np.maximum(first, floor)[:, :3])}
     start |= {"own": np.zeros((len(first), first.shape[1] - 1))}
     return start | ({"begin": first[:, 3]} if first.shape[1] > 3 else {})
 
 
-def _stretched(model: Any, asked: tuple[Batches, Any, Any]) -> jax.Array:
+def _stretch_rates(model: Any, data: tuple[Batches, Any, Any]) -> jax.Array:
     """Mean rates of stretches at the states that were read."""
-    b, x, weight = asked
+    b, x, weight = data
     rates = jax.vmap(jax.vmap(partial(rates_at, b, model)))(x, b.u)
     return jnp.einsum("bsr,brk->bsk", weight, rates)
 
 
-def _matched(model: Any, seen: PreparedBatches, parts: Sequence[Stretches]) -> Any:
-    """The model whose rates are those of the stretches, as well as it can."""
-    x = padded([x[:, :3] for x in _whole(seen)], seen.batches.dt.shape[1])
-    weight = padded([padded(each.weight, x.shape[1], 0.0) for each in parts], STRETCHES, 0.0)
-    rates = padded([each.rates for each in parts], STRETCHES, 0.0)
-    error = np.broadcast_to(FIRST * rates.max(axis=(0, 1)), rates.shape)
+def _match_stretches(model: Any, seen: PreparedBatches, parts: Sequence[Stretches]) -> Any:
+    """Fit the rates of the model to those of the stretches."""
+    x = pad_columns([x[:, :3] for x in _interpolated_readings(seen)], seen.batches.dt.shape[1])
+    weights = [pad_columns(each.weight, x.shape[1], 0.0) for each in parts]
+    weight = pad_columns(weights, STRETCHES, 0.0)
+    rates = pad_columns([each.rates for each in parts], STRETCHES, 0.0)
+    error = np.broadcast_to(FIRST_NOISE * rates.max(axis=(0, 1)), rates.shape)
     data = seen.batches, jnp.asarray(x), jnp.asarray(weight)
-    record = Record("stretches", _stretched, data, rates, error=error)
+    record = Record("stretches", _stretch_rates, data, rates, error=error)
     free = [Free("rates", nuisance=True)]
     return dict(solve(Problem(model, free, [record], weight_priors("rates"))).model)
 
 
-def _product(
+def _product_model(
     model: Any, seen: PreparedBatches, names: Sequence[str], hidden: int, seed: int
 ) -> dict[str, Any]:
-    """The product's part of the model a search begins with."""
-    b, whole = seen.batches, _whole(seen)
-    top = [(x[:, 3] * x[:, 2]).max() / np.trapezoid(x[:, 0] * x[:, 2], t)
-           for x, t in zip(whole, seen.time, strict=True)]  # fmt: skip
-    every = jax.jit(jax.vmap(jax.vmap(partial(points_at, b, model, names))))
-    points = every(padded([x[:, :3] for x in whole], b.dt.shape[1]), b.u)
+    """Product's part of the start model."""
+    b, readings = seen.batches, _interpolated_readings(seen)
+    largest_rates = [(x[:, 3] * x[:, 2]).max() / np.trapezoid(x[:, 0] * x[:, 2], t)
+           for x, t in zip(readings, seen.time, strict=True)]  # fmt: skip
+    at_all_rows = jax.jit(jax.vmap(jax.vmap(partial(product_inputs, b, model, names))))
+    points = at_all_rows(pad_columns([x[:, :3] for x in readings], b.dt.shape[1]), b.u)
     points = [p[: len(t)] for p, t in zip(np.asarray(points), seen.time, strict=True)]
-    if not max(top) > 0:
+    if not max(largest_rates) > 0:
         raise InputError("a titre that never rises", "batches that make product")
     net = network_of(names, np.concatenate(points), ["q"], hidden, seed)
-    return {"product": net, "most": BEYOND * max(top), "decay": 0.0}
+    return {"product": net, "most": BOUND_FACTOR * max(largest_rates), "decay": 0.0}
 
 
 # ---- the search
 
-# Steps of a round, after which the noise is estimated again; most rounds; gain in -2 ln L below
-# which they end.
-STEPS, ROUNDS, GAINED = 60, 20, 0.5
-# First estimate of the noise, as a share of the values; how batches of one recipe differ, as far as
-# nothing is known: cells of another inoculum grow and produce some per cent faster or slower.
-FIRST, DIFFER = 0.1, 0.05
+# Solver steps of a round, after which the noise is estimated anew; largest number of rounds; gain
+# in -2 ln L below which they end.
+STEPS_PER_ROUND = 60
+MAX_ROUNDS = 20
+MIN_GAIN = 0.5
+# First estimate of the noise, as a share of the values.
+FIRST_NOISE = 0.1
+# Prior spread between batches of one recipe: cells of another inoculum grow and produce some per
+# cent faster or slower.
+BATCH_SPREAD = 0.05
 
 
-class _Searched(NamedTuple):
+class _RatesFit(NamedTuple):
     fit: Fit
     noise: dict[str, ReadingNoise]
     error: np.ndarray
     spread: np.ndarray
-    likelihood: float
+    cost: float
 
 
-def _own(model: Any, data: Any) -> jax.Array:
+def _batch_factors(model: Any, data: Any) -> jax.Array:
     return model["own"]
 
 
-def settled(seen: PreparedBatches, model: Any) -> tuple[_Searched, bool]:
-    """Search in rounds, each with the noise of the last one's residuals, until nothing is gained.
+def search_rates(seen: PreparedBatches, model: Any) -> tuple[_RatesFit, bool]:
+    """Search in rounds, each with the noise of the last residuals, until nothing is gained.
 
-    With the noise, by how much batches differ is taken from the round before (expectation and
-    maximisation: their squares and those of their errors, with the prior's worth one batch more).
-    The last value says whether the search rests.
+    The spread between batches is updated together with the noise by expectation and maximisation:
+    the mean of squared factors and their variances, with the prior counted as one more batch. The
+    second result is True if the search converged.
     """
     names = (*STATES, TITRE)[: seen.measured.shape[2]]
 
     def search(model, error, spread):
-        free = (*NETWORKS, *BEGINS, "own", "decay")
-        fit = solve(problem_of(seen, model, error, free, spread), iterations=STEPS)
-        y, own = np.asarray(_fitted(fit.model, seen.batches)), fit.derive(_own)
-        rest, known = seen.measured - y, np.where(np.isfinite(own.error), own.error, spread)
-        noise = {name: noise_of(rest[..., k], y[..., k], seen.read[..., k])
+        free = (*NETWORKS, *START_NUMBERS, "own", "decay")
+        fit = solve(problem_of(seen, model, error, free, spread), iterations=STEPS_PER_ROUND)
+        y, own = np.asarray(_fitted(fit.model, seen.batches)), fit.derive(_batch_factors)
+        residuals = seen.measured - y
+        deviation = np.where(np.isfinite(own.error), own.error, spread)
+        noise = {name: noise_of(residuals[..., k], y[..., k], seen.read[..., k])
                  for k, name in enumerate(names)}  # fmt: skip
         error = errors_of(noise.values(), y)
-        minus = float(np.sum((rest / error)[seen.read] ** 2 + 2 * np.log(error[seen.read])))
-        each = np.vstack([own.value**2 + known**2, np.full((1, len(spread)), DIFFER**2)])
-        spread = np.sqrt(each.mean(axis=0))
-        return _Searched(fit, noise, error, spread, minus)
+        cost = float(np.sum((residuals / error)[seen.read] ** 2 + 2 * np.log(error[seen.read])))
+        squares = np.vstack(
+            [own.value**2 + deviation**2, np.full((1, len(spread)), BATCH_SPREAD**2)]
+        )
+        spread = np.sqrt(squares.mean(axis=0))
+        return _RatesFit(fit, noise, error, spread, cost)
 
-    # Begun as a share of the values: where all errors are alike, small values are never looked at.
-    low = [np.percentile(y[y > 0], LOW) for y in np.moveaxis(seen.measured, 2, 0)]
-    first = errors_of([ReadingNoise(FIRST, FIRST * each) for each in low], seen.measured)
-    found, rests = rounds(
-        search(model, first, np.full(len(names) - 1, DIFFER)),
+    # Proportional errors first: with equal errors small values would never count.
+    floors = [np.percentile(y[y > 0], SCALE_PERCENTILE) for y in np.moveaxis(seen.measured, 2, 0)]
+    noises = [ReadingNoise(FIRST_NOISE, FIRST_NOISE * floor) for floor in floors]
+    first = errors_of(noises, seen.measured)
+    found, converged = repeat_search(
+        search(model, first, np.full(len(names) - 1, BATCH_SPREAD)),
         lambda f: search(f.fit.model, f.error, f.spread),
-        GAINED, ROUNDS - 1,
+        MIN_GAIN, MAX_ROUNDS - 1,
     )  # fmt: skip
-    return found, rests or found.fit.status is Status.converged
+    return found, converged or found.fit.status is Status.converged
 
 
 # ---- curves
 
-# A point of a curve is visited if this many rows are NEAR it, and in the other inputs of the rates
-# within this share of their range. A curve begins at this share of its end.
-VISITS, BESIDE, LEAST = 3, 0.5, 1e-3
+# A point of a curve is visited if this many rows are within VISIT_DISTANCE of it, and within
+# OTHER_DISTANCE in the other inputs of the rates, as shares of their ranges. A curve begins at
+# least at this share of its end, as rates without substrate are zero without an error.
+MIN_VISITS = 3
+OTHER_DISTANCE = 0.5
+MIN_SHARE_OF_END = 1e-3
 
 
-def _rates(model: Any, asked: tuple[Any, Any, Any]) -> jax.Array:
-    b, x, u = asked
+def _rates(model: Any, data: tuple[Any, Any, Any]) -> jax.Array:
+    b, x, u = data
     return jax.vmap(partial(rates_at, b, model))(x, u)
 
 
@@ -588,36 +614,38 @@ _rated = jax.jit(_rates)
 
 
 def curves_of(fit: Fit, seen: PreparedBatches) -> tuple[Curve, ...]:
-    """Each rate against each thing it hangs on, the others at their means."""
+    """Curves of each rate against each of its inputs, the others at their means."""
     b = seen.batches
-    found = np.asarray(course(fit.model, b))
+    states = np.asarray(course(fit.model, b))
     rows = np.concatenate([
         np.concatenate([x, u], axis=1)[: len(t)]
-        for x, u, t in zip(found, np.asarray(b.u), seen.time, strict=True)
+        for x, u, t in zip(states, np.asarray(b.u), seen.time, strict=True)
     ])  # fmt: skip
-    names, made = (*STATES, *b.inputs), []
-    wide = np.where(np.ptp(rows, axis=0) > 0, np.ptp(rows, axis=0), 1.0)
-    own = [names.index(name) for name in fit.model["rates"].inputs]
-    for j in own:
-        grid = np.tile(rows.mean(0), (POINTS, 1))
-        high = rows[:, j].max()  # of no substrate rates are nothing, without an error
-        grid[:, j] = at = np.linspace(max(rows[:, j].min(), LEAST * high), high, POINTS)
-        near = np.where(np.arange(len(names)) == j, NEAR, BESIDE)[own]
-        apart = np.abs(rows[None, :, own] - grid[:, None, own]) / wide[own]
-        visited = np.sum(np.all(apart <= near, axis=2), axis=1) >= VISITS
+    names, curves = (*STATES, *b.inputs), []
+    ranges = np.where(np.ptp(rows, axis=0) > 0, np.ptp(rows, axis=0), 1.0)
+    used = [names.index(name) for name in fit.model["rates"].inputs]
+    for j in used:
+        grid = np.tile(rows.mean(0), (CURVE_POINTS, 1))
+        high = rows[:, j].max()
+        low = max(rows[:, j].min(), MIN_SHARE_OF_END * high)
+        grid[:, j] = at = np.linspace(low, high, CURVE_POINTS)
+        limits = np.where(np.arange(len(names)) == j, VISIT_DISTANCE, OTHER_DISTANCE)[used]
+        distance = np.abs(rows[None, :, used] - grid[:, None, used]) / ranges[used]
+        visited = np.sum(np.all(distance <= limits, axis=2), axis=1) >= MIN_VISITS
         value = fit.derive(_rates, (b, jnp.asarray(grid[:, :3]), jnp.asarray(grid[:, 3:])))
-        made += [Curve(rate, names[j], "1/h", at, value.value[:, i], value.error[:, i], visited)
+        curves += [Curve(rate, names[j], "1/h", at, value.value[:, i], value.error[:, i], visited)
                  for i, rate in enumerate(RATES)]  # fmt: skip
-    return tuple(made)
+    return tuple(curves)
 
 
-# ---- what an output hangs on
+# ---- dependence of an output on its inputs
 
 
 class Ranked(NamedTuple):
-    """Dependence of an output on one input: mutual information in nats, and the correlation of
-    normal variables with as much, sqrt(1 - e^(-2 I)) (E. H. Linfoot, Information and Control 1
-    (1957) 85).
+    """Dependence of an output on one input.
+
+    `information` is the mutual information in nats, `correlation` that of normal variables with as
+    much, sqrt(1 - e^(-2 I)) (E. H. Linfoot, Information and Control 1 (1957) 85).
     """
 
     name: str
@@ -626,21 +654,21 @@ class Ranked(NamedTuple):
 
 
 def rank_inputs(rates: FedBatchFit, output: str = TITRE, seed: int = 0) -> tuple[Ranked, ...]:
-    """Rank what was set, read and predicted by its mutual information with an output (fig 32).
+    """Rank inputs, readings and predictions by their mutual information with an output (fig 32).
 
     Parameters
     ----------
     rates : FedBatchFit
-        The first stage.
+        The fitted rates.
     output : str
-        Of the batches.
+        Name of the output.
     seed : int
-        Of the noise that breaks ties.
+        Seed of the noise that breaks ties.
 
     Returns
     -------
     tuple of Ranked
-        The most telling first: inputs, the total feed, other outputs as they were read, and
+        Highest information first: inputs, the total feed, other outputs as they were read, and
         ``predicted`` states and rates.
 
     Raises
@@ -651,7 +679,7 @@ def rank_inputs(rates: FedBatchFit, output: str = TITRE, seed: int = 0) -> tuple
     Notes
     -----
     The estimator of A. Kraskov, H. Stögbauer, P. Grassberger, Phys. Rev. E 69 (2004) 066138, by
-    three neighbours, as scikit-learn has it. Inputs that move with time tell an output that does.
+    three neighbours, as in scikit-learn. Inputs and outputs that both drift in time seem dependent.
     """
     try:
         from sklearn.feature_selection import mutual_info_regression
@@ -663,17 +691,17 @@ def rank_inputs(rates: FedBatchFit, output: str = TITRE, seed: int = 0) -> tuple
     b, parts = rates.seen.batches, []
     for i, (run, t, x) in enumerate(zip(rates.runs, rates.seen.time, rates.courses, strict=True)):
         total = np.append(0.0, np.cumsum(run.inputs["feed"][:-1] * np.diff(t)))
-        columns = known_of(run) | {"total feed": total}
+        columns = row_columns(run) | {"total feed": total}
         found = _rated(rates.fit.model, (b, x[:, :3], b.u[i, : len(t)]))
         for name, y in zip((*STATES, *RATES), np.column_stack([x[:, :3], found]).T, strict=True):
             columns[f"predicted {name}"] = y
         read = np.isfinite(run.outputs[output])
         parts.append({k: v[read] for k, v in columns.items()} | {None: run.outputs[output][read]})
-    whole = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-    y = whole.pop(None)
-    told = {name: v for name, v in whole.items()
+    columns_of_all = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    y = columns_of_all.pop(None)
+    candidates = {name: v for name, v in columns_of_all.items()
             if np.ptp(v) > 0 and name not in (output, f"measured {output}")}  # fmt: skip
-    found = mutual_info_regression(np.stack(list(told.values()), 1), y, random_state=seed)
+    found = mutual_info_regression(np.stack(list(candidates.values()), 1), y, random_state=seed)
     ranked = [Ranked(n, float(i), float(np.sqrt(-np.expm1(-2 * i))))
-              for n, i in zip(told, found, strict=True)]  # fmt: skip
+              for n, i in zip(candidates, found, strict=True)]  # fmt: skip
     return tuple(sorted(ranked, key=lambda each: -each.information))

@@ -11,7 +11,7 @@ import numpy as np
 
 from beamfit.answer import Table, answer
 from beamfit.dynamics.balances import STATES, TITRE, Batches, batches_of
-from beamfit.dynamics.fedbatch import FedBatchFit, ahead, forecast
+from beamfit.dynamics.fedbatch import FedBatchFit, forecast, predict_batch
 from beamfit.errors import InputError, Status
 from beamfit.greybox.fit import Fit
 from beamfit.greybox.problem import Constraint, Free, Objective, Problem
@@ -19,8 +19,9 @@ from beamfit.greybox.solve import solve
 from beamfit.quantity import Quantity
 
 OUTPUTS = (*STATES, TITRE)
-# Rows of a plan, and rounds in which its safety margins follow the errors of the plan.
-ROWS, ROUNDS = 31, 3
+# Approximate number of rows of a plan, and rounds in which its safety margins follow its errors.
+ROWS = 31
+MARGIN_ROUNDS = 3
 
 
 class FeedCourse(NamedTuple):
@@ -29,12 +30,12 @@ class FeedCourse(NamedTuple):
     Attributes
     ----------
     time : array, shape (n,)
-        h.
+        Times, h.
     feed : array, shape (n,)
-        L/h, each until the next time.
+        Feed, L/h, each until the next time.
     value, error : dict of str to array
-        Biomass, substrate, volume and titre; errors are of the model and of how batches differ,
-        without the noise of readings.
+        Biomass, substrate, volume and titre; errors are those of the model and of the spread
+        between batches, without the noise of readings.
     """
 
     time: np.ndarray
@@ -43,19 +44,22 @@ class FeedCourse(NamedTuple):
     error: dict[str, np.ndarray]
 
     def length(self, titre: float) -> Quantity:
-        """Time until a titre is reached, h, with its error; not determined if it never is."""
+        """Time until a titre is reached, h, with its error; undetermined if it never is."""
         y = self.value[TITRE]
         above = np.flatnonzero(y >= titre)
         if not above.size or above[0] == 0:
             return Quantity(float("nan") if not above.size else float(self.time[0]), None, "h")
-        near = slice(above[0] - 1, above[0] + 1)
-        (slope,) = np.diff(y[near]) / np.diff(self.time[near])
-        at, error = (np.interp(titre, y[near], of[near]) for of in (self.time, self.error[TITRE]))
+        crossing = slice(above[0] - 1, above[0] + 1)
+        (slope,) = np.diff(y[crossing]) / np.diff(self.time[crossing])
+        at, error = (
+            np.interp(titre, y[crossing], values[crossing])
+            for values in (self.time, self.error[TITRE])
+        )
         return Quantity(float(at), float(error / slope), "h")
 
 
-def _begun(start: Any) -> dict[str, Any]:
-    """Numbers at the start of one batch, as the model has them."""
+def _start_numbers(start: Any) -> dict[str, Any]:
+    """Start numbers of one batch, as the model has them."""
     return {"start": jnp.log(start[None, :3]), "begin": start[3:], "own": jnp.zeros((1, 3))}
 
 
@@ -67,11 +71,11 @@ def predict(
     Parameters
     ----------
     fit : FedBatchFit
-        With a titre.
+        A fit with a titre.
     time : array, shape (n,)
-        h, increasing.
+        Times, h, increasing.
     inputs : mapping of str to array or float
-        All that the rates and the titre hang on, and the flows.
+        Inputs of the rates and of the titre, and the flows.
     start : (float, float, float, float)
         Biomass, substrate (g/L), volume (L) and titre at the first time.
 
@@ -85,14 +89,14 @@ def predict(
         If the fit has no titre, an input is missing, or the start is not positive.
     """
     time = np.asarray(time, float)
-    b = _one(fit, time, inputs, start)
-    found = forecast(fit.fit, b, _begun(jnp.asarray(start, float)), [*fit.spread.values()])
+    b = _batch(fit, time, inputs, start)
+    found = forecast(fit.fit, b, _start_numbers(jnp.asarray(start, float)), [*fit.spread.values()])
     n = len(time)
     value, error = (dict(zip(OUTPUTS, part[0, :n].T, strict=True)) for part in found)
     return FeedCourse(time, np.asarray(b.flow.feed)[0, :n], value, error)
 
 
-def _one(
+def _batch(
     fit: FedBatchFit, time: np.ndarray, inputs: Mapping[str, Any], start: tuple[float, ...]
 ) -> Batches:
     like, model = fit.seen.batches, fit.fit.model
@@ -117,11 +121,11 @@ class FeedPlan:
     Attributes
     ----------
     status : Status
-        Of the search; ``message`` says what holds the plan.
+        Status of the search; ``message`` says what limits the plan.
     course : FeedCourse
-        What comes of it.
+        Predicted course.
     hours : Quantity
-        Its length, with the error that the titre's makes.
+        Length of the batch, with its error from that of the titre.
     product : Quantity
         Product at the end, g.
     fit : Fit
@@ -137,11 +141,11 @@ class FeedPlan:
 
     @property
     def headline(self) -> str:
-        """The answer in a line."""
+        """The answer in one line."""
         return f"feed {self.status}: {self.hours} for {self.product.value:.4g} g of product"
 
     def tables(self) -> tuple[Table, ...]:
-        """The feed of each piece, and what comes of it."""
+        """The feed of each piece, product and length."""
         feed = np.asarray(self.fit.model["feed"])
         ends = np.linspace(0.0, self.course.time[-1], len(feed) + 1)
         rows = [[f"{ends[k]:.4g} to {ends[k + 1]:.4g} h", f"{f:.4g} L/h"]
@@ -163,16 +167,16 @@ def best_feed(
     pieces: int = 8,
     margin: float = 2.0,
 ) -> FeedPlan:
-    """Find the feed profile that makes so much product soonest, within limits.
+    """Find the feed profile that makes a wanted mass of product soonest, within limits.
 
     Parameters
     ----------
     fit : FedBatchFit
-        With a titre.
+        A fit with a titre.
     start : (float, float, float, float)
-        Biomass, substrate (g/L), volume (L) and titre to begin with.
+        Biomass, substrate (g/L), volume (L) and titre at the start.
     inputs : mapping of str to float
-        All other inputs, held.
+        All other inputs, held constant.
     product : float
         Product wanted at the end, g.
     feed : (float, float)
@@ -182,9 +186,9 @@ def best_feed(
     hours : (float, float)
         Shortest and longest batch.
     pieces : int
-        Of equal length, the feed constant in each.
+        Number of pieces of equal length, each with a constant feed.
     margin : float
-        Standard errors of the model by which product and substrate are held off their limits.
+        Distance of product and substrate from their limits, in standard errors of the model.
 
     Returns
     -------
@@ -193,7 +197,7 @@ def best_feed(
     Raises
     ------
     InputError
-        If a range is none, or the start is above the cap of the substrate.
+        If a range is empty, or the start is above the limit of the substrate.
     """
     if not (0 <= feed[0] < feed[1] and 0 < hours[0] < hours[1] and pieces > 0):
         found = f"feed {feed[0]:g} to {feed[1]:g}, hours {hours[0]:g} to {hours[1]:g}"
@@ -201,34 +205,34 @@ def best_feed(
     if start[1] > substrate:
         raise InputError(f"a start at {start[1]:g} g/L", f"at most {substrate:g}, the cap")
     rows = pieces * max(ROWS // pieces, 1)
-    b = _one(fit, np.linspace(0.0, hours[1], rows + 1), dict(inputs) | {"feed": 0.0}, start)
+    b = _batch(fit, np.linspace(0.0, hours[1], rows + 1), dict(inputs) | {"feed": 0.0}, start)
     data = b, jnp.asarray(np.maximum(start, 1e-9), float), jnp.arange(1, rows + 1)
     free = [Free("feed", *feed), Free("hours", *hours)]
     middle = {"feed": np.full(pieces, 0.5 * sum(feed)), "hours": 0.5 * sum(hours)}
-    model, off = dict(fit.fit.model) | middle, (0.0, np.zeros(rows))
+    model, margins = dict(fit.fit.model) | middle, (0.0, np.zeros(rows))
     labels = ("product", "volume", *(f"substrate[{k}]" for k in range(1, rows + 1)))
-    for _ in range(ROUNDS):
-        low = np.append([product + off[0], -np.inf], np.full(rows, -np.inf))
-        high = np.append([np.inf, volume], substrate - off[1])
-        limits = [Constraint("batch", _limited, data, low, high, labels)]
-        end = solve(Problem(model, free, (), (), limits, [Objective("hours", _hours)]))
-        model = dict(end.model)
-        found = fit.fit.derive(_planned_by, (model["feed"], model["hours"], data))
+    for _ in range(MARGIN_ROUNDS):
+        low = np.append([product + margins[0], -np.inf], np.full(rows, -np.inf))
+        high = np.append([np.inf, volume], substrate - margins[1])
+        limits = [Constraint("batch", _limited_values, data, low, high, labels)]
+        optimum = solve(Problem(model, free, (), (), limits, [Objective("hours", _hours)]))
+        model = dict(optimum.model)
+        found = fit.fit.derive(_plan_outputs_of, (model["feed"], model["hours"], data))
         mass = found.error[-1, 3] * found.value[-1, 2]
-        off = margin * mass, margin * found.error[:, 1]
+        margins = margin * mass, margin * found.error[:, 1]
     time = np.linspace(0.0, float(model["hours"]), rows + 1)
-    steady = np.append(np.repeat(np.asarray(model["feed"]), rows // pieces), 0.0)
-    course = predict(fit, time, dict(inputs) | {"feed": steady}, start)
-    made = float(course.value[TITRE][-1] * course.value["volume"][-1])
-    return FeedPlan(end.status, end.message, course, course.length(float(course.value[TITRE][-1])),
-                    Quantity(made, float(mass), "g"), end)  # fmt: skip
+    profile = np.append(np.repeat(np.asarray(model["feed"]), rows // pieces), 0.0)
+    course = predict(fit, time, dict(inputs) | {"feed": profile}, start)
+    titre = float(course.value[TITRE][-1])
+    made = Quantity(float(titre * course.value["volume"][-1]), float(mass), "g")
+    return FeedPlan(optimum.status, optimum.message, course, course.length(titre), made, optimum)
 
 
 def _hours(model: Any, data: Any) -> Any:
     return model["hours"]
 
 
-def _planned(model: Any, data: Any) -> Any:
+def _plan_outputs(model: Any, data: Any) -> Any:
     """Outputs after each row of a plan, shape (rows, 4)."""
     b, start, rows = data
     piece = jnp.minimum(jnp.arange(b.dt.shape[1]) * len(model["feed"]) // len(rows),
@@ -237,15 +241,15 @@ def _planned(model: Any, data: Any) -> Any:
     dt = jnp.where(b.dt > 0, model["hours"] / len(rows), 0.0)
     u = b.u.at[..., b.inputs.index("feed")].set(feed)
     b = replace(b, u=u, flow=b.flow._replace(feed=feed), dt=dt)
-    return ahead(model, (b, _begun(start)))[0, rows]
+    return predict_batch(model, (b, _start_numbers(start)))[0, rows]
 
 
-def _planned_by(model: Any, asked: Any) -> Any:
-    feed, hours, data = asked
-    return _planned(model | {"feed": feed, "hours": hours}, data)
+def _plan_outputs_of(model: Any, data: Any) -> Any:
+    feed, hours, plan = data
+    return _plan_outputs(model | {"feed": feed, "hours": hours}, plan)
 
 
-def _limited(model: Any, data: Any) -> Any:
+def _limited_values(model: Any, data: Any) -> Any:
     """Product and volume at the end, then the substrate after each row."""
-    found = _planned(model, data)
+    found = _plan_outputs(model, data)
     return jnp.concatenate([jnp.stack([found[-1, 2] * found[-1, 3], found[-1, 2]]), found[:, 1]])

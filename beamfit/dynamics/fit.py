@@ -1,4 +1,4 @@
-"""Fit of a response to runs: start, delay, free-running fit, noise with a memory, verdict."""
+"""Identification of a response: start, delay, free-running fit, correlated noise, verdict."""
 
 from __future__ import annotations
 
@@ -15,22 +15,35 @@ from beamfit.dynamics.alternatives import FURTHER, GROWTH, Alternatives, alterna
 from beamfit.dynamics.answer import (
     Curve,
     ResponseEvidence,
+    add_remarks,
     curves_of,
-    judged,
+    judge_outputs,
     limit_words,
-    quantities_of,
-    quoted,
-    remarked,
-    told,
+    open_undetermined,
+    remove_errors_if_wrong,
+    response_quantities,
 )
-from beamfit.dynamics.bad_readings import BadReadings, judged_without
-from beamfit.dynamics.checks import Checks, HeldOutRun, changing_of, checks_of, digits_of, held_out
-from beamfit.dynamics.limits import RANGE, lag_posterior
-from beamfit.dynamics.model import PreparedOutput, network_of, output_of
-from beamfit.dynamics.paths import Paths, heard, latest
-from beamfit.dynamics.record import LEAST, Run, check_inputs, checked, unsure_gain
+from beamfit.dynamics.bad_readings import BadReadings, answer_without_bad_readings
+from beamfit.dynamics.checks import (
+    Checks,
+    HeldOutRun,
+    checks_of,
+    digit_covariance,
+    fuller_model_slopes,
+    predict_runs,
+)
+from beamfit.dynamics.limits import LAG_RANGE, lag_posterior
+from beamfit.dynamics.model import PreparedOutput, network_of, predict_readings
+from beamfit.dynamics.paths import Paths, max_delay, usable_rows
+from beamfit.dynamics.record import MIN_READINGS, Run, check_inputs, check_runs, gain_error_share
 from beamfit.dynamics.response import PHYSICS, mean_step
-from beamfit.dynamics.search import Begun, ResponseSearch, Settled, case_of, fitted, used_by
+from beamfit.dynamics.search import (
+    ResponseSearch,
+    RunsFit,
+    effective_parameters,
+    fit_case,
+    response_case,
+)
 from beamfit.errors import InputError, Status, nearest
 from beamfit.greybox.fit import Fit
 from beamfit.noise.memory import CorrelatedNoise
@@ -38,8 +51,8 @@ from beamfit.quantity import Quantity
 from beamfit.statistics import POOR_FIT
 
 MAPS = ("constant", "network")
-# Most searches by a path that was likelier than that of the search before.
-AGAIN = 3
+# Largest number of searches, each for a path that is more probable than the one before.
+MAX_PATH_SEARCHES = 3
 
 
 @answer
@@ -50,33 +63,33 @@ class ResponseFit:
     Attributes
     ----------
     output : str
-        Which.
+        Name of the output.
     status : Status
         How far to believe it; ``message`` says why and what to do.
     model, map : str
         The physics, and what gives its parameters.
     delay : float
-        Samples by which the output follows the inputs late.
+        Samples by which the output follows the inputs.
     runs : tuple of Run
-        What it was identified from.
+        Runs that it was identified from.
     seen : PreparedOutput
-        The same as the model sees it.
+        The runs as the model sees them.
     fit : Fit
         The grey-box fit.
     quantities : dict of str to Quantity
-        Constant parameters, and the offset, with errors.
+        Constant parameters and the offset, with errors.
     curves : tuple of Curve
-        Parameters against the operating point, of a network.
+        Parameters of a network against the operating point.
     noise : tuple of float
         Rms residual of each run.
     memory : CorrelatedNoise or None
-        How the noise wanders; None where it does not.
+        Correlation of the noise; None for white noise.
     checks : Checks
-        What the residuals say.
+        Tests of the residuals.
     held : tuple of HeldOutRun
-        How runs are predicted that were not used.
+        Predictions of held-out runs.
     left_out : tuple of BadReadings
-        Readings that show no output; they are missing from ``runs`` and ``seen``.
+        Readings that do not show the output; they are missing from ``runs`` and ``seen``.
     """
 
     output: str
@@ -98,23 +111,23 @@ class ResponseFit:
 
     @property
     def parts(self) -> tuple[ResponseFit]:
-        """Itself: the outputs it has pictures of."""
+        """The outputs that pictures are drawn of: this one."""
         return (self,)
 
     @property
     def headline(self) -> str:
-        """The answer in a line."""
-        said = [f"{name} = {q}" for name, q in list(self.quantities.items())[:3]]
-        found = ", ".join(said) or f"{len(self.curves)} parameter curves"
+        """The answer in one line."""
+        quantities = [f"{name} = {q}" for name, q in list(self.quantities.items())[:3]]
+        found = ", ".join(quantities) or f"{len(self.curves)} parameter curves"
         return f"{self.output} {self.status}: {self.model}, {found}"
 
     @cached_property
     def fitted(self) -> tuple[np.ndarray, ...]:
-        """The free-running output at the readings of each run."""
-        return tuple(output_of(self.fit.model, run) for run in self.seen.runs)
+        """Free-running output at the readings of each run."""
+        return tuple(predict_readings(self.fit.model, run) for run in self.seen.runs)
 
     def tables(self) -> tuple[Table, ...]:
-        """All numbers, to be shown."""
+        """Tables of all numbers."""
         rows = [[name, f"{q} {limit_words(q)}".rstrip()] for name, q in self.quantities.items()]
         rows += [["delay", f"{self.delay:.4g} samples"]]
         rows += self.checks.rows() + [each.row() for each in self.held]
@@ -157,19 +170,19 @@ def identify(
         T² = tau1 tau2 and 2 zeta T = tau1 + tau2; or the difference equation (eq 12), stable by
         construction.
     map : {"constant", "network"}
-        Whether parameters are numbers, or a network of the inputs at each moment.
+        Parameters are constants, or a network of the inputs at each moment.
     output : str, optional
-        Which output, if the runs have several.
+        Name of the output, if the runs have several.
     delay : float, optional
-        Samples by which the output follows late; found among candidates if None. What is no whole
-        number is estimated besides, with an error. Below zero where the clocks of input and output
+        Samples by which the output follows the inputs; searched for if None. A delay that is not a
+        whole number is fitted, with an error. It is negative where the clocks of input and output
         differ.
     offset : bool
-        Whether the output at rest is a free number; else it is 0.
+        True if the output at rest is a free number; else it is 0.
     hidden, starts, seed : int
         Hidden nodes of the network, starts of its training, seed of their weights.
     held : sequence of Run
-        Runs that are only predicted.
+        Held-out runs, which are only predicted.
 
     Returns
     -------
@@ -178,13 +191,13 @@ def identify(
     Raises
     ------
     InputError
-        If runs do not fit together, an option is unknown, no input ever changes, or samples of
-        ``"arx"`` are not at equal distances.
+        If runs do not fit together, an option is unknown, an input never changes, or samples for
+        ``"arx"`` are not equally spaced.
 
     Notes
     -----
     The output runs free from the start of each run (output error): predictions from measured
-    outputs are useless under noise. The first states are estimated. Noise is inferred from the
+    outputs are useless under noise. The first states are estimated. The noise is estimated from the
     residuals, with a correlation time where neighbours are correlated. Sources: report 3.2;
     L. Ljung, System Identification (1999), chapters 7 and 16.
 
@@ -204,31 +217,34 @@ def identify(
         raise InputError(f"model '{model}'", nearest(model, list(PHYSICS)))
     if map not in MAPS:
         raise InputError(f"map '{map}'", nearest(map, list(MAPS)))
-    runs, held = checked(runs, held, PHYSICS[model].even)
+    runs, held = check_runs(runs, held, PHYSICS[model].even)
     check_inputs(runs)
-    output = _output(runs[0], output)
+    output = _choose_output(runs[0], output)
     shortest = min(len(run) for run in runs)
-    if delay is not None and min(heard(run, output, delay).size for run in runs) < LEAST:
-        expected = f"less than the {shortest} rows of a run by {LEAST} readings"
+    if (
+        delay is not None
+        and min(usable_rows(run, output, delay).size for run in runs) < MIN_READINGS
+    ):
+        expected = f"less than the {shortest} rows of a run by {MIN_READINGS} readings"
         raise InputError(f"a delay of {delay:g} samples", expected)
     paths = Paths.of(runs, delay, PHYSICS[model].even)
     search = ResponseSearch(output, PHYSICS[model], paths, offset)
-    asked = _Identification(search, map, hidden, range(seed, seed + starts), held)
-    return judged_without(runs, [asked.begun], lambda trial: trial.fit, asked.answer)
+    identification = _Identification(search, map, hidden, range(seed, seed + starts), held)
+    return answer_without_bad_readings(
+        runs, [identification.search_runs], lambda trial: trial.fit, identification.answer
+    )
 
 
 class _Trial(NamedTuple):
-    """A fit with constant parameters; where a network was asked for by the likeliest path, with
-    what was compared with it, and with a network.
-    """
+    """Fit with constants, and for a network the alternatives and the network's fit."""
 
-    constant: Begun
-    others: Alternatives | None = None
-    network: Begun | None = None
+    constant: RunsFit
+    alternatives: Alternatives | None = None
+    network: RunsFit | None = None
 
     @property
-    def fit(self) -> Begun:
-        """The fit that was asked for."""
+    def fit(self) -> RunsFit:
+        """The fit of the map that was asked for."""
         return self.network or self.constant
 
 
@@ -241,109 +257,124 @@ class _Identification(NamedTuple):
     seeds: range
     held: tuple[Run, ...]
 
-    def begun(self, runs: tuple[Run, ...]) -> _Trial:
-        """The fit that readings are judged by: constants miss good ones where parameters change."""
-        found = self.search.begun(runs)
+    def search_runs(self, runs: tuple[Run, ...]) -> _Trial:
+        """Fit for the judgement of readings; constants would miss good ones of a network."""
+        found = self.search.identify(runs)
         if self.map == "constant":
             return _Trial(found)
-        found, others = self.likeliest(runs, found)
-        return _Trial(found, others, self.with_network(found))
+        found, alternatives = self.most_probable(runs, found)
+        return _Trial(found, alternatives, self.fit_network(found))
 
     def answer(
         self, runs: tuple[Run, ...], trial: _Trial, left_out: tuple[BadReadings, ...]
     ) -> ResponseFit:
         """Judge a fit of runs."""
         output, physics, paths, _ = self.search
-        found, others, network = trial
+        found, alternatives, network = trial
         if network is None:
-            found, others = self.likeliest(runs, found)
-        whole = network or found
-        answer, exact = whole.settled, whole.exact
-        checks, quantities, curves = self.known(runs, found, answer, others)
-        ahead = held_out(whole, self.held)[output]
-        rms = float(np.sqrt(np.mean(answer.rms**2)))
-        status, message = judged({output: ResponseEvidence(
-            answer.fit, answer.rests, checks, quantities, curves, ahead, self.map, rms,
-            0.0 if paths.given else _early(whole, others, quantities),
+            found, alternatives = self.most_probable(runs, found)
+        best = network or found
+        checks, quantities, curves = self.evaluate(runs, found, best, alternatives)
+        predictions = predict_runs(best, self.held)[output]
+        rms, delay = float(np.sqrt(np.mean(best.rms**2))), best.delay
+        status, message = judge_outputs({output: ResponseEvidence(
+            best.fit, best.converged, checks, quantities, curves, predictions, self.map, rms,
+            0.0 if paths.given else _lead(best, alternatives, quantities),
         )})  # fmt: skip
-        quantities, curves = quoted(status, quantities, curves)
-        message = remarked(message, not paths.given and exact == latest(runs) > 0, left_out)
+        quantities, curves = remove_errors_if_wrong(status, quantities, curves)
+        message = add_remarks(message, not paths.given and delay == max_delay(runs) > 0, left_out)
+        delay = int(delay) if delay == int(delay) else delay
         return ResponseFit(
-            output, status, message, physics.name, self.map,
-            int(exact) if exact == int(exact) else exact, runs, found.seen, answer.fit, quantities,
-            curves, tuple(answer.rms[:, 0].tolist()), answer.memory, checks, ahead, left_out,
+            output, status, message, physics.name, self.map, delay, runs, found.prepared, best.fit,
+            quantities, curves, tuple(best.rms[:, 0].tolist()), best.memory, checks, predictions,
+            left_out,
         )  # fmt: skip
 
-    def likeliest(self, runs: tuple[Run, ...], found: Begun) -> tuple[Begun, Alternatives | None]:
-        """The fit by the likeliest path without a law, and the alternatives to it."""
-        for left in reversed(range(AGAIN)):
-            if found.settled.exact(found.case):
+    def most_probable(
+        self, runs: tuple[Run, ...], found: RunsFit
+    ) -> tuple[RunsFit, Alternatives | None]:
+        """Fit the most probable path without a law; return the fit and its alternatives."""
+        for remaining in reversed(range(MAX_PATH_SEARCHES)):
+            if found.is_exact():
                 return found, None
-            slopes = changing_of(found.seen, found.settled.fit)
-            lawful = self.map == "constant"
-            others = alternatives_of(runs, found, self.search.paths, slopes, lawful)
-            if others.path == found.path or not left:
+            slopes = fuller_model_slopes(found.prepared, found.fit)
+            departures = self.map == "constant"
+            alternatives = alternatives_of(runs, found, self.search.paths, slopes, departures)
+            if alternatives.path == found.path or not remaining:
                 break
-            found = self.search.along(runs, others.path, found.settled.fit.model)
-        return found, others
+            found = self.search.identify_path(runs, alternatives.path, found.fit.model)
+        return found, alternatives
 
-    def with_network(self, found: Begun) -> Begun:
-        """The best fit with a network of parameters, from the constant ones."""
-        seen, first = found.seen, found.settled.fit.model
-        nets = (network_of(seen, self.search.physics, np.asarray(first["map"]), self.hidden, seed)
-                for seed in self.seeds)  # fmt: skip
-        case = case_of(seen, self.search.offset, True)
-        models = [first | {"map": net} for net in nets]
-        return found._replace(case=case, settled=fitted(case, models))
+    def fit_network(self, found: RunsFit) -> RunsFit:
+        """Fit a network of parameters, starting from the constant ones."""
+        prepared, first = found.prepared, found.fit.model
+        physics, raw = self.search.physics, np.asarray(first["map"])
+        nets = (network_of(prepared, physics, raw, self.hidden, seed) for seed in self.seeds)
+        case = response_case(prepared, found.path, self.search.offset, True)
+        return fit_case(case, [first | {"map": net} for net in nets])
 
-    def known(
+    def evaluate(
         self,
         runs: tuple[Run, ...],
-        found: Begun,
-        answer: Settled,
-        others: Alternatives | None,
+        found: RunsFit,
+        best: RunsFit,
+        alternatives: Alternatives | None,
     ) -> tuple[Checks, dict[str, Quantity], tuple[Curve, ...]]:
-        """Tests of the residuals, and what the runs determine of constants or curves."""
-        seen, constant = found.seen, self.map == "constant"
+        """Test the residuals; give the constants or curves with errors where determined.
+
+        `found` is the fit with constants, `best` that with the map that was asked for.
+        """
+        prepared, constant = found.prepared, self.map == "constant"
         _, _, paths, offset = self.search
-        used = used_by(answer.fit) + (not paths.given and not seen.ends)  # a delay found counts
-        gain = None if constant else found.settled.likelihood - answer.likelihood
-        whole = found._replace(settled=answer)
-        checks = checks_of(whole, 0, changing_of(seen, answer.fit), used, gain)._replace(
+        # A delay that was searched for counts as a number, as does a fitted fraction of one.
+        used = effective_parameters(best.fit)
+        used += not paths.given and not prepared.fraction_limits
+        gain = None if constant else found.cost - best.cost
+        slopes = fuller_model_slopes(prepared, best.fit)
+        checks = checks_of(best, 0, slopes, used, gain)._replace(
             first_order=constant and self.search.is_first_order(runs, found),
-            band_limited=() if found.path.way.moving else paths.most.smooth,
+            band_limited=() if found.path.way.moving else paths.movable.smooth,
         )
         if not constant:
-            curves = curves_of(answer.fit, answer.errors, seen)
-            return checks, *told({}, curves, seen, checks)
-        if others is not None and others.departure.probability > 0.5:
-            words, kind, chance = others.departure
-            if checks.input_share or kind not in (FURTHER, GROWTH):  # more than digits do
+            curves = curves_of(best.fit, best.errors, prepared)
+            return checks, *open_undetermined({}, curves, prepared, checks)
+        if alternatives is not None and alternatives.departure.probability > 0.5:
+            words, kind, chance = alternatives.departure
+            if checks.input_share or kind not in (FURTHER, GROWTH):  # more than digits
                 checks = checks._replace(law=words, law_probability=chance, law_kind=kind)
-        unsure = [unsure_gain(runs, found.path.way, name) for name in seen.inputs]
+        input_errors = [gain_error_share(runs, found.path.way, name) for name in prepared.inputs]
         lags = lag_posterior(found, offset)
-        row = float(mean_step(seen.runs[0].dt))
-        late = others.late * seen.parts * row if others is not None else 0.0
-        quantities = quantities_of(found, others, late, lags, digits_of(found), unsure)
-        return checks, *told(quantities, (), seen, checks, lags.limits(late))
+        step = float(mean_step(prepared.runs[0].dt))
+        delay_error = 0.0 if alternatives is None else alternatives.delay_error
+        delay_error *= prepared.rows_per_sample * step
+        quantities = response_quantities(
+            found, alternatives, delay_error, lags, digit_covariance(found), input_errors
+        )
+        return checks, *open_undetermined(
+            quantities, (), prepared, checks, lags.limits(delay_error)
+        )
 
 
-def _early(found: Begun, others: Alternatives | None, quantities: Mapping[str, Quantity]) -> float:
-    """Samples by which the output moves before its inputs; 0 unless that is likely, or of an exact
-    output clear of the error of the delay and of the shortest lag, which is never quite 0.
+def _lead(
+    found: RunsFit, alternatives: Alternatives | None, quantities: Mapping[str, Quantity]
+) -> float:
+    """Samples by which the output moves before its inputs; 0 unless that is likely.
+
+    For an exact output the lead must exceed the error of the delay and the shortest lag, which is
+    never quite 0.
     """
     delay = quantities.get("delay")
-    if others is not None:
-        likely = others.ahead >= 0.5
+    if alternatives is not None:
+        leads = alternatives.early_probability >= 0.5
     elif delay is None or delay.error is None:
-        likely = True
+        leads = True
     else:
-        row = float(mean_step(found.seen.runs[0].dt))
-        likely = delay.value + RANGE[0] * row < ndtri(POOR_FIT) * delay.error
-    return max(-found.exact, 0.0) if likely else 0.0
+        step = float(mean_step(found.prepared.runs[0].dt))
+        leads = delay.value + LAG_RANGE[0] * step < ndtri(POOR_FIT) * delay.error
+    return max(-found.delay, 0.0) if leads else 0.0
 
 
-def _output(run: Run, output: str | None) -> str:
+def _choose_output(run: Run, output: str | None) -> str:
     names = list(run.outputs)
     if output is not None and output not in names:
         raise InputError(f"no output '{output}'", nearest(output, names))

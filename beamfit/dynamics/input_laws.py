@@ -6,11 +6,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-# Laws, and half widths of each as shares of an input's range: prior flat in their logarithm. A stop
-# hands on other values as soon as its width passes a move. The others change smoothly with it, so
-# that it is a number to be fitted, with a prior about each of these as wide as half their distance.
-# A saturation leaves this share of the range on one side of its place, flat in the logarithm of
-# what is cut off. A square law bends up or down; as wide as the range it is a square from one end.
+# Laws, and half widths of each as shares of the input's range; the prior is flat in their
+# logarithm. A stop changes its output as soon as its width passes a step of the input, so it needs
+# a fine grid. The other laws change smoothly with the width, which is then a free number with a
+# prior as wide as half the distance of the grid points. A saturation leaves this share of the range
+# on one side of its place, on a grid even in the logarithm of the share cut off. A square law bends
+# up or down; with the width of the range it is a square from one end.
 LAWS = {law: np.geomspace(0.005, 0.4, count) for law, count in
         (("play", 8), ("hysteresis", 8), ("stop", 24), ("shift", 8), ("rate limit", 8),
          ("dead zone", 8))}  # fmt: skip
@@ -18,49 +19,54 @@ LAWS |= {
     "saturation": 1.0 - np.geomspace(0.02, 0.9, 8),
     "square law": np.outer((1.0, -1.0), np.geomspace(0.1, 50.0, 8)).ravel(),
 }
-# Places in the range about which a law lies, as shares of it: prior flat. A dead zone may lie about
-# 0 as well; a saturation about an end of the range is one of the other end.
+# Places about which a law lies, as shares of the range; the prior is flat. A dead zone may also lie
+# about 0. A saturation about one end of the range limits at the other end.
 PLACES = {
     "dead zone": (0.1, 0.3, 0.5, 0.7, 0.9),
     "saturation": (0.0, 0.5, 1.0),
     "square law": (0.5,),
 }
-# Laws of the value alone, whatever came before.
+# Laws that depend on the present value alone.
 STATIC = tuple(PLACES)
-# Parts of a law's width and of its place that are looked at between neighbours.
+# Number of new grid points of width, and of place, between neighbours in each refinement.
 FINER = 5
-# Plays of a hysteresis, as shares of the widest, which is twice its half width.
+# Widths of the plays that make up a hysteresis, in units of its half width.
 PLAYS = (0.0, 0.4, 0.8, 1.2, 1.6, 2.0)
 
 
-def _played(at: np.ndarray, now: float, width: np.ndarray) -> np.ndarray:
+def _follow_play(at: np.ndarray, now: float, width: np.ndarray) -> np.ndarray:
     return np.clip(at, now - width, now + width)
 
 
-def _stopped(at: np.ndarray, now: float, width: np.ndarray) -> np.ndarray:
+def _follow_stop(at: np.ndarray, now: float, width: np.ndarray) -> np.ndarray:
     return np.where(np.abs(now - at) > width, now, at)
 
 
-def _limited(at: np.ndarray, now: float, width: np.ndarray) -> np.ndarray:
+def _follow_rate_limit(at: np.ndarray, now: float, width: np.ndarray) -> np.ndarray:
     return np.clip(now, at - width, at + width)
 
 
-# Laws that follow an input row by row: where they are after each, by where they were, the input
-# and the width.
-FOLLOWING = {"play": _played, "hysteresis": _played, "stop": _stopped, "rate limit": _limited}
+# Laws that follow an input row by row: the new position from the last one, the input and the width.
+FOLLOWING = {
+    "play": _follow_play,
+    "hysteresis": _follow_play,
+    "stop": _follow_stop,
+    "rate limit": _follow_rate_limit,
+}
 
 
-def moved(u: np.ndarray, law: str, width: float | np.ndarray, place: float = 0.0) -> np.ndarray:
-    """One input as a law hands it on, shape (rows,), for each of several widths if given.
+def apply_law(u: np.ndarray, law: str, width: float | np.ndarray, place: float = 0.0) -> np.ndarray:
+    """Apply a law to one input, shape (rows,); for an array of widths one row for each.
 
-    A play follows when its clearance is used up; a hysteresis is the mean of plays of several
-    widths (Prandtl, Ishlinskii); a stop (Coulomb friction) goes all the way once it moves at all; a
-    shift (friction against a spring) is to the side that the input last came from. A rate limit
-    goes its width a row at most. A dead zone lies
-    about a place, a saturation leaves what is about one, and a square law bends about one.
+    A play follows once its clearance is used up. A hysteresis is the mean of plays of several
+    widths (Prandtl, Ishlinskii). A stop (Coulomb friction) jumps to the input once it moves at all.
+    A shift (friction against a spring) is an offset to the side that the input last came from. A
+    rate limit moves by its width per row at most. A dead zone removes changes about its place, a
+    saturation those away from it, and a square law bends about it.
     """
     half = np.asarray(width)[..., None]
-    if law in FOLLOWING:  # what rests with the input, but for a rate limit
+    if law in FOLLOWING:
+        # All but a rate limit rest while the input rests.
         changes = (np.diff(u, prepend=np.nan) != 0) | (law == "rate limit")
         widths = np.multiply.outer(width, PLAYS if law == "hysteresis" else (1.0,))
         at, found = u[0] + 0 * widths, []
@@ -79,10 +85,10 @@ def moved(u: np.ndarray, law: str, width: float | np.ndarray, place: float = 0.0
 
 
 class InputLaw(NamedTuple):
-    """A law of an input that goes from `low` to `high`, as wide as `width` about `place`.
+    """A law of an input with range `low` to `high`: half width `width`, about `place`.
 
-    `step` is half the distance to the next width, in the logarithm, and the width of a prior about
-    this one; `stride` half the distance to the next place.
+    `step` is half the distance to the next width, in its logarithm, and the standard deviation of
+    the prior about this width; `stride` is half the distance to the next place.
     """
 
     kind: str
@@ -94,14 +100,14 @@ class InputLaw(NamedTuple):
     low: float
     high: float
 
-    def behind(self, u: np.ndarray) -> np.ndarray:
-        """The input as it is handed on, and its change by a step of the width, shape (rows, 2)."""
+    def output_and_slope(self, u: np.ndarray) -> np.ndarray:
+        """Give the output of the law and its change by one step of the width, shape (rows, 2)."""
         widths = self.width * np.exp(self.step * np.array([0.0, 1.0, -1.0]))
-        at, wider, closer = moved(u, self.kind, widths, self.place)
+        at, wider, closer = apply_law(u, self.kind, widths, self.place)
         return np.stack([at, 0.5 * (wider - closer)], axis=1)
 
-    def changed(self, change: float) -> InputLaw:
-        """The law `change` steps wider; a dead zone to an end of the range is a saturation."""
+    def widened(self, change: float) -> InputLaw:
+        """Widen by `change` steps; a dead zone that reaches an end becomes a saturation."""
         law = self._replace(width=self.width * float(np.exp(change * self.step)))
         ends = law.place - law.width, law.place + law.width
         if law.kind == "dead zone" and ends[1] >= law.high > ends[0] > law.low:
@@ -111,7 +117,7 @@ class InputLaw(NamedTuple):
         return law
 
     def finer(self, change: float) -> list[InputLaw]:
-        """Laws between this one, `change` steps wider, and those next to it."""
+        """List laws in finer steps of width and place about this one, widened by `change` steps."""
         at = np.linspace(-1.0, 1.0, FINER + 1)
         at = 0.5 * (at[1:] + at[:-1])
         widths = self.width * np.exp(self.step * (change + at))
@@ -121,7 +127,7 @@ class InputLaw(NamedTuple):
                 for p in places for w in widths]  # fmt: skip
 
     def words(self) -> str:
-        """The law in words."""
+        """Describe the law in words."""
         width, name = self.width, self.input
         if self.kind == "saturation":
             ends = self.place - width, self.place + width
@@ -138,21 +144,21 @@ class InputLaw(NamedTuple):
 
 
 def laws_between(name: str, low: float, high: float) -> list[InputLaw]:
-    """The laws that are looked at of an input with this range."""
-    found = []
+    """List the laws that are tried for an input with this range."""
+    laws = []
     for kind, shares in LAWS.items():
         places = low + np.array(PLACES[kind]) * (high - low) if kind in PLACES else np.zeros(1)
         stride = 0.5 * (places[1] - places[0]) if len(places) > 1 else 0.0
         if kind == "dead zone" and low < 0 < high:
             places = np.append(places, 0.0)
-        apart = np.abs(np.diff(np.log(np.abs(shares))))
-        near = 0.5 * np.minimum(np.append(apart, np.inf), np.append(np.inf, apart))
+        distance = np.abs(np.diff(np.log(np.abs(shares))))
+        steps = 0.5 * np.minimum(np.append(distance, np.inf), np.append(np.inf, distance))
         for place in places:
-            ended = kind == "saturation" and place in (low, high)
-            reach = max(place - low, high - place) if kind == "saturation" else high - low
-            found += [
-                InputLaw(kind, name, w * reach, 0.0 if kind == "stop" else float(step),
-                         float(place), 0.0 if ended else float(stride), low, high)
-                for w, step in zip(shares, near, strict=True)
+            at_end = kind == "saturation" and place in (low, high)
+            span = max(place - low, high - place) if kind == "saturation" else high - low
+            laws += [
+                InputLaw(kind, name, w * span, 0.0 if kind == "stop" else float(step),
+                         float(place), 0.0 if at_end else float(stride), low, high)
+                for w, step in zip(shares, steps, strict=True)
             ]  # fmt: skip
-    return found
+    return laws

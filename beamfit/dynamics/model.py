@@ -1,4 +1,4 @@
-"""A response as a problem: runs, a map from the operating point to its parameters, its physics."""
+"""Model of a response: prepared runs, the map from operating point to parameters, the physics."""
 
 from __future__ import annotations
 
@@ -15,19 +15,22 @@ from beamfit.greybox import tree
 from beamfit.greybox.mlp import MLP, Port, dense
 from beamfit.greybox.problem import Prior
 
-# Residual, as a share of the output's scatter, below which a fit counts as exact.
-CLOSE = 2e-4
-# Standard deviation of the prior on a network's weights; inputs and outputs are of size 1.
-WEIGHT = 3.0
+# A fit counts as exact if its residuals are below this share of the output's scatter: rounding, or
+# the detail of a network.
+EXACT_TOLERANCE = 2e-4
+# Standard deviation of the normal prior on a network's weights, whose inputs and outputs have unit
+# size.
+WEIGHT_PRIOR = 3.0
 
 
-@tree.node("physics", "turn")
-class Driven:
-    """A run as the model sees it: inputs, whole rows late, and steps; when and where it was read.
+@tree.node("physics", "even_rows")
+class DrivenRun:
+    """A run as the model sees it: its delayed inputs, its time steps, and its readings.
 
-    Shapes (rows, inputs), (rows,), (readings,), (readings,), all padded: there are `count`
-    readings. `run` is its number, `part` the part of a row by which inputs come later still. `turn`
-    is the number of rows a sample where all steps are equal, 0 where they are not.
+    `u` (rows, inputs) and `dt` (rows,) are the inputs and steps; `time` and `index` (readings,) are
+    the times and rows of the readings. All are padded: `count` readings are real. `run` is the
+    number of the run, `delay_fraction` the fraction of a row by which inputs come later still.
+    `even_rows` is the number of rows per sample if all steps are equal, else 0.
     """
 
     physics: Physics
@@ -37,165 +40,174 @@ class Driven:
     index: Any
     count: Any
     run: Any
-    part: Any
-    turn: int = 0
+    delay_fraction: Any
+    even_rows: int = 0
 
     @property
     def read(self) -> np.ndarray:
-        """Rows where the output was read."""
+        """Rows of the readings."""
         return np.asarray(self.index)[: self.count]
 
     @staticmethod
-    def like(seen: Sequence[PreparedOutput], i: int) -> Driven:
-        """A run of an output that was prepared."""
-        return seen[0].runs[i]
+    def like(prepared: Sequence[PreparedOutput], i: int) -> DrivenRun:
+        """Give run i of the prepared outputs."""
+        return prepared[0].runs[i]
 
     def predicted(self, model: Any) -> jax.Array:
-        """The output where it was read, running free from the start of the run."""
-        of, start, part = model["map"], model["start"][self.run], self.part + model["late"]
-        if callable(of):
-            return model["offset"] + self.changing(
-                parameters_at(self.physics, of, self.u), start, part
-            )
-        p = self.physics.physical(of, self.u.shape[1])
-        return model["offset"] + self.constant(p, start, part)
+        """Predict the readings, running free from the start of the run."""
+        raw, start = model["map"], model["start"][self.run]
+        fraction = self.delay_fraction + model["late"]
+        if callable(raw):
+            p = parameters_at(self.physics, raw, self.u)
+            return model["offset"] + self.varying_response(p, start, fraction)
+        p = self.physics.physical(raw, self.u.shape[1])
+        return model["offset"] + self.constant_response(p, start, fraction)
 
-    def changing(self, p: jax.Array, start: jax.Array, part: Any) -> jax.Array:
-        """The response of parameters at every row where it was read, without an offset."""
-        return response_at(self.physics, p, self.u, self.dt, start, self.index, part)
+    def varying_response(self, p: jax.Array, start: jax.Array, fraction: Any) -> jax.Array:
+        """Response at the readings, without an offset, of parameters given for every row."""
+        return response_at(self.physics, p, self.u, self.dt, start, self.index, fraction)
 
-    def constant(self, p: jax.Array, start: jax.Array, part: Any) -> jax.Array:
-        """The response of constant parameters where it was read, without an offset."""
-        if self.turn:
-            y = even_response(self.physics, p, self.u, self.dt[0], start, self.turn, part)
-            return y[self.index // self.turn]
-        return self.changing(jnp.broadcast_to(p, (len(self.u), len(p))), start, part)
+    def constant_response(self, p: jax.Array, start: jax.Array, fraction: Any) -> jax.Array:
+        """Response at the readings, without an offset, of constant parameters."""
+        if self.even_rows:
+            y = even_response(self.physics, p, self.u, self.dt[0], start, self.even_rows, fraction)
+            return y[self.index // self.even_rows]
+        return self.varying_response(jnp.broadcast_to(p, (len(self.u), len(p))), start, fraction)
 
 
 class PreparedOutput(NamedTuple):
     """Runs of one output, with what the model needs of them.
 
-    `runs` by `Driven`; `measured` are the readings of each, without missing ones; `wide` and
-    `size_y` the scatter of inputs (1 where one does not change) and output; `delay` in rows, of
-    which there are `parts` a sample; `ends` between which a delay that is a number of the fit may
-    be longer.
+    `runs` are `DrivenRun`; `measured` and `time` are the readings of each, missing ones left out;
+    `input_scale` and `output_scale` the scatter of inputs (1 for one that is constant) and output;
+    `delay` is in rows, of which there are `rows_per_sample`; `fraction_limits` bound the fitted
+    fraction of a row in the delay, None if it is not fitted.
     """
 
     inputs: tuple[str, ...]
     output: str
-    runs: tuple[Driven, ...]
+    runs: tuple[DrivenRun, ...]
     measured: tuple[np.ndarray, ...]
     time: tuple[np.ndarray, ...]
     mean_u: np.ndarray
-    wide: np.ndarray
-    size_y: float
+    input_scale: np.ndarray
+    output_scale: float
     delay: float
-    parts: int
-    ends: tuple[float, float] | None
+    rows_per_sample: int
+    fraction_limits: tuple[float, float] | None
 
     @property
     def points(self) -> np.ndarray:
-        """The inputs at all readings, shape (readings, inputs)."""
+        """Inputs at all readings, shape (readings, inputs)."""
         return np.concatenate([np.asarray(run.u)[run.read] for run in self.runs])
 
     @property
-    def apart(self) -> float:
-        """Median time between readings, of the run where it is shortest."""
+    def floor(self) -> float:
+        """Error of a reading below which a fit counts as exact."""
+        return EXACT_TOLERANCE * self.output_scale
+
+    @property
+    def interval(self) -> float:
+        """Shortest median time between readings of any run, s."""
         return min(float(np.median(np.diff(t))) for t in self.time)
 
     @property
-    def span(self) -> float:
-        """Length of the longest run."""
+    def duration(self) -> float:
+        """Length of the longest run, s."""
         return max(float(np.ptp(t)) for t in self.time)
 
     def scaled(self, u: Any) -> np.ndarray:
-        """Inputs in units of their scatter."""
-        return (np.asarray(u) - self.mean_u) / self.wide
+        """Express inputs in units of their scatter about their means."""
+        return (np.asarray(u) - self.mean_u) / self.input_scale
 
 
-def parameters_at(physics: Physics, of: Any, point: jax.Array, more: Any = 0.0) -> jax.Array:
-    """Parameters p at operating points, shape (points, parameters); `of` a map, or raw numbers.
+def parameters_at(physics: Physics, raw: Any, point: jax.Array, added: Any = 0.0) -> jax.Array:
+    """Parameters p at operating points, shape (points, parameters).
 
-    `more` is added to the raw numbers.
+    `raw` is a map of the operating point or constant raw numbers; `added` is added to the raw
+    numbers.
     """
     m = point.shape[1]
-    raw = jax.vmap(of)(point) if callable(of) else jnp.broadcast_to(of, (len(point), len(of)))
-    return jax.vmap(lambda q: physics.physical(q, m))(raw + more)
+    q = jax.vmap(raw)(point) if callable(raw) else jnp.broadcast_to(raw, (len(point), len(raw)))
+    return jax.vmap(lambda each: physics.physical(each, m))(q + added)
 
 
 def predicted(model: Any, course: Any) -> jax.Array:
-    """Readings of a run that a model predicts; the course is a `Driven` or another."""
+    """Predict the readings of a course: a `DrivenRun` or a `state_fit.Course`."""
     return course.predicted(model)
 
 
-def readings_of(time: np.ndarray, index: np.ndarray) -> tuple[jax.Array, jax.Array]:
-    """When and where readings were taken, padded: a noise goes on to the end."""
-    more = (0, padded_length(len(time)) - len(time))
-    time = np.pad(time, more, "linear_ramp", end_values=2 * time[-1])
-    return jnp.asarray(time), jnp.asarray(np.pad(index, more, "edge"))
+def padded_readings(time: np.ndarray, index: np.ndarray) -> tuple[jax.Array, jax.Array]:
+    """Pad times and rows of readings; padded times go on, as correlated noise needs."""
+    padding = (0, padded_length(len(time)) - len(time))
+    time = np.pad(time, padding, "linear_ramp", end_values=2 * time[-1])
+    return jnp.asarray(time), jnp.asarray(np.pad(index, padding, "edge"))
 
 
-def filled(course: Any, values: np.ndarray, by: float = 0.0) -> np.ndarray:
-    """Values of the readings, along the last axis, as many as the course has with its padding."""
-    more = len(course.index) - values.shape[-1]
-    return np.pad(values, [(0, 0)] * (values.ndim - 1) + [(0, more)], constant_values=by)
+def pad_readings(course: Any, values: np.ndarray, by: float = 0.0) -> np.ndarray:
+    """Pad values of the readings, along the last axis, to the length of the course."""
+    missing = len(course.index) - values.shape[-1]
+    padding = [(0, 0)] * (values.ndim - 1) + [(0, missing)]
+    return np.pad(values, padding, constant_values=by)
 
 
 _predicted = jax.jit(predicted)
 
 
-def output_of(model: Any, course: Any) -> np.ndarray:
-    """Those that were taken."""
+def predict_readings(model: Any, course: Any) -> np.ndarray:
+    """Predict the readings of a course, without padding."""
     return np.asarray(_predicted(model, course))[: course.count]
 
 
 @jax.jit
-def changed_by(model: Any, seen: Driven, scaled: jax.Array) -> jax.Array:
-    """Slopes of the output by parameters that change with the operating point.
+def operating_point_slopes(model: Any, run: DrivenRun, scaled: jax.Array) -> jax.Array:
+    """Derivatives of the output by parameters that change with the operating point.
 
-    The raw numbers get S s more, where s holds the scaled inputs and their squares, shape
-    (samples, 2 m); the slopes are by S at 0, shape (readings, parameters * 2 m).
+    S s is added to the raw numbers, where s holds the scaled inputs and their squares, shape
+    (samples, 2 m). The derivatives are by S at 0, shape (readings, parameters * 2 m).
     """
-    start = model["start"][seen.run]
-    count = parameters_at(seen.physics, model["map"], seen.u[:1]).shape[1]
+    start = model["start"][run.run]
+    count = parameters_at(run.physics, model["map"], run.u[:1]).shape[1]
 
-    def output(more):
-        p = parameters_at(seen.physics, model["map"], seen.u, scaled @ more.T)
-        return seen.changing(p, start, seen.part + model["late"])
+    def output(added):
+        p = parameters_at(run.physics, model["map"], run.u, scaled @ added.T)
+        return run.varying_response(p, start, run.delay_fraction + model["late"])
 
     slopes = jax.jacfwd(output)(jnp.zeros((count, scaled.shape[1])))
     return slopes.reshape(len(slopes), -1)
 
 
-def growing_of(fitted: np.ndarray, time: np.ndarray) -> np.ndarray:
-    """Changes of an output whose delay grows by a sample along the record, and whose gain does by
-    itself, as columns.
+def growth_columns(fitted: np.ndarray, time: np.ndarray) -> np.ndarray:
+    """Changes of an output whose delay, or whose gain, grows along the record, as columns.
+
+    The delay grows by one sample, the gain by its own mean; both keep their means. Shape (readings,
+    2).
     """
     through = (time - time[0]) / (time[-1] - time[0]) - 0.5
-    late = -through * np.diff(fitted, prepend=fitted[0])
-    return np.stack([late, through * (fitted - fitted.mean())], axis=1)
+    delayed = -through * np.diff(fitted, prepend=fitted[0])
+    return np.stack([delayed, through * (fitted - fitted.mean())], axis=1)
 
 
-def curves(model: Any, asked: tuple[Driven, Any]) -> jax.Array:
+def curve_values(model: Any, data: tuple[DrivenRun, Any]) -> jax.Array:
     """Parameters at operating points, shape (points, parameters)."""
-    seen, point = asked
-    return parameters_at(seen.physics, model["map"], point)
+    run, point = data
+    return parameters_at(run.physics, model["map"], point)
 
 
 def weight_priors(path: str) -> tuple[Prior, ...]:
-    """Priors on the numbers of a network."""
-    return tuple(Prior(f"{path}.{part}", 0.0, WEIGHT) for part in ("weights", "biases"))
+    """Priors on the weights and biases of a network."""
+    return tuple(Prior(f"{path}.{part}", 0.0, WEIGHT_PRIOR) for part in ("weights", "biases"))
 
 
 def network_of(
-    seen: PreparedOutput, physics: Physics, raw: np.ndarray, hidden: int, seed: int
+    prepared: PreparedOutput, physics: Physics, raw: np.ndarray, hidden: int, seed: int
 ) -> MLP:
-    """A network that gives constant raw numbers everywhere but for small random weights."""
-    m, wide = len(seen.inputs), seen.wide
+    """Make a network that gives constant raw numbers, up to small random weights."""
+    m, scale = len(prepared.inputs), prepared.input_scale
     ports = [Port(n, "", 0, float(s), float(b))
-             for n, s, b in zip(seen.inputs, wide, seen.mean_u, strict=True)]  # fmt: skip
-    gain = seen.size_y / float(np.min(wide))
+             for n, s, b in zip(prepared.inputs, scale, prepared.mean_u, strict=True)]  # fmt: skip
+    gain = prepared.output_scale / float(np.min(scale))
     sizes = [gain if power else 1.0 for _, power in physics.units(m)]
-    names = physics.parameters(seen.inputs)
+    names = physics.parameters(prepared.inputs)
     outputs = [Port(n, "", 0, s, float(b)) for n, s, b in zip(names, sizes, raw, strict=True)]
     return dense(ports, outputs, [hidden], seed=seed, spread=0.3)

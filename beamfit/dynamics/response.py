@@ -1,8 +1,8 @@
 """Responses whose parameters may change with the operating point (report 3.2, eqs 5-19).
 
-Each physics is a value: names of its parameters, how raw numbers without limits become stable
-ones, and one step under an input that holds from one sample to the next (zero-order hold, exact).
-A step is a function of one sample; whoever uses it scans and maps it.
+Each physics is a value: names of its parameters, the transform from unbounded raw numbers to stable
+parameters, and one exact step under an input held from one sample to the next (zero-order hold). A
+step is a function of one sample; the code that uses it scans and vectorises it.
 """
 
 from __future__ import annotations
@@ -22,24 +22,24 @@ class Physics(NamedTuple):
     Attributes
     ----------
     name : str
-        As the command line has it.
+        Name on the command line.
     parameters : callable
-        ``parameters(inputs)``: names of p; of each gain one an input.
+        ``parameters(inputs)``: names of p; each gain has one value for each input.
     units : callable
         ``units(inputs)``: powers of (time, output/input) of each parameter.
     free_states : int
-        Numbers of the state at the start that nobody knows.
+        Unknown numbers in the state at the start.
     physical : callable
-        ``physical(q, m)``: stable parameters p of raw numbers q, any of which is allowed.
+        ``physical(q, m)``: stable parameters p of unbounded raw numbers q.
     raw : callable
-        Its inverse.
+        Inverse of `physical`.
     begin : callable
         ``begin(free, u0)``: the state at the first sample.
     advance : callable
         ``advance(p, x, u, dt)``: the state after dt under the input u, shape (m,), affine in x.
         The output is x[0].
     even : bool
-        Whether it needs samples at equal distances.
+        True if it needs equally spaced samples.
     """
 
     name: str
@@ -81,9 +81,9 @@ FIRST_ORDER = Physics(
 
 
 def _cosh_sinhc(square):
-    """cosh(r) and sinh(r)/r of r² = square, entire functions of it: cos and sin/r below zero.
+    """Give cosh(r) and sinh(r)/r for r² = square; cos and sin/r for negative squares.
 
-    The factor e^-|r| of positive squares is left out, so that nothing overflows.
+    For positive squares both lack the factor e^|r|, so that nothing overflows.
     """
     size = jnp.sqrt(jnp.where(jnp.abs(square) > 1e-8, jnp.abs(square), 1.0))
     fall = jnp.exp(-2.0 * size)
@@ -97,7 +97,7 @@ def _cosh_sinhc(square):
 
 
 def _advance_second(p, x, u, dt):
-    """The state (y, y') as eq 8 has it, whatever the order of its two lags.
+    """Advance the state (y, y') of eq 8; the two lags may be in any order.
 
     With s = zeta/T and r² = s² - 1/T², the deviation d from K u moves by
     e^(-s t) (cosh(rt) (d, d') + t sinh(rt)/(rt) (s d + d', -d/T² - s d')).
@@ -127,13 +127,13 @@ SECOND_ORDER = Physics(
 # ---- difference equation: y(k+1) = -a1 y(k) - a2 y(k-1) + b1 u(k) + b2 u(k-1) (eq 12)
 
 
-def _stable(q, m):
-    """Inside the stability triangle |a2| < 1, |a1| < 1 + a2 whatever q is."""
+def _stable_arx(q, m):
+    """Map raw numbers into the stability triangle |a2| < 1, |a1| < 1 + a2."""
     a2 = jnp.tanh(q[1])
     return jnp.concatenate([jnp.stack([(1.0 + a2) * jnp.tanh(q[0]), a2]), q[2:]])
 
 
-def _unstable(p, m):
+def _raw_arx(p, m):
     a2 = jnp.clip(p[1], -0.999999, 0.999999)
     a1 = jnp.clip(p[0] / (1.0 + a2), -0.999999, 0.999999)
     return jnp.concatenate([jnp.arctanh(jnp.stack([a1, a2])), p[2:]])
@@ -150,8 +150,8 @@ ARX = Physics(
     lambda inputs: ("a1", "a2", *_gains(inputs, "b1"), *_gains(inputs, "b2")),
     lambda m: ((0, 0), (0, 0)) + ((0, 1),) * (2 * m),
     2,
-    _stable,
-    _unstable,
+    _stable_arx,
+    _raw_arx,
     lambda free, u0: jnp.concatenate([free, u0]),
     _advance_arx,
     even=True,
@@ -200,9 +200,9 @@ def response_at(
     dt: jax.Array,
     free: jax.Array,
     index: jax.Array,
-    part: jax.Array,
+    fraction: jax.Array,
 ) -> jax.Array:
-    """The output at some samples, the input coming a part of the mean step late, or until the next.
+    """Output at some samples, with inputs delayed by a fraction of the mean step, at most one step.
 
     Parameters
     ----------
@@ -210,8 +210,8 @@ def response_at(
         As for `simulate`.
     index : array of int, shape (readings,)
         The samples.
-    part : float
-        The part.
+    fraction : float
+        The fraction.
 
     Returns
     -------
@@ -225,17 +225,17 @@ def response_at(
     [0.0, 1.8964, 2.594, 2.8506]
     """
     x0 = physics.begin(free, u[0])
-    late = jnp.minimum(part * mean_step(dt), dt)
-    first = x0 if physics.even else physics.advance(p[0], x0, u[0], late[0])
-    step = dt - late + jnp.append(late[1:], late[-1:])
+    delay = jnp.minimum(fraction * mean_step(dt), dt)
+    first = x0 if physics.even else physics.advance(p[0], x0, u[0], delay[0])
+    step = dt - delay + jnp.append(delay[1:], delay[-1:])
     x = affine_course(lambda x, p, *now: physics.advance(p, x, *now), first, p, u, step)[1]
     before = jnp.maximum(index - 1, 0)
-    y = jax.vmap(physics.advance)(p[before], x[before], u[before], (dt - late)[before])[:, 0]
+    y = jax.vmap(physics.advance)(p[before], x[before], u[before], (dt - delay)[before])[:, 0]
     return jnp.where(index == 0, x0[0], y)
 
 
 def mean_step(dt: jax.Array) -> jax.Array:
-    """Mean of steps, which are 0 in the padding."""
+    """Mean of the steps, leaving out padding, where they are 0."""
     return jnp.sum(dt) / jnp.maximum(jnp.sum(dt > 0), 1)
 
 
@@ -245,12 +245,12 @@ def even_response(
     u: jax.Array,
     dt: jax.Array,
     free: jax.Array,
-    turn: int,
-    part: jax.Array,
+    stride: int,
+    fraction: jax.Array,
 ) -> jax.Array:
-    """The output of constant parameters p at every `turn`-th of equal steps dt, many at once.
+    """Output of constant parameters p at every `stride`-th of equal steps dt.
 
-    The input comes a part of a step late; as many samples as a multiple of the turn.
+    Inputs are delayed by a fraction of a step. The number of samples is a multiple of the stride.
 
     Examples
     --------
@@ -263,32 +263,34 @@ def even_response(
     n = len(x0)
 
     def step(length):
-        def moved(x, felt):
-            return physics.advance(p, x, felt, length)
+        def moved(x, u):
+            return physics.advance(p, x, u, length)
 
         return jax.jacfwd(moved, (0, 1))(0.0 * x0, jnp.zeros(m))
 
-    (a, b), (last, into) = step(dt), step((1.0 - part) * dt)
+    (a, b), (last, into) = step(dt), step((1.0 - fraction) * dt)
     powers = [jnp.eye(n)]
-    for _ in range(turn):
+    for _ in range(stride):
         powers.append(a @ powers[-1])
-    whole = jnp.concatenate([powers[k] @ b for k in range(turn - 1, -1, -1)], axis=1)
-    read = jnp.concatenate([*(last @ powers[k] @ b for k in range(turn - 2, -1, -1)), into], axis=1)
-    felt = u.reshape(-1, turn * m)
-    felt = felt @ jnp.concatenate([whole, read[:1]]).T  # what moves the state, and the next output
+    to_state = jnp.concatenate([powers[k] @ b for k in range(stride - 1, -1, -1)], axis=1)
+    earlier = (last @ powers[k] @ b for k in range(stride - 2, -1, -1))
+    to_output = jnp.concatenate([*earlier, into], axis=1)
+    blocks = u.reshape(-1, stride * m)
+    # Drive of the state and of the next output.
+    drive = blocks @ jnp.concatenate([to_state, to_output[:1]]).T
     system = Matrices(
-        powers[turn],
+        powers[stride],
         jnp.eye(n, n + 1),
-        (last @ powers[turn - 1])[:1],
+        (last @ powers[stride - 1])[:1],
         jnp.zeros((1, n + 1)).at[0, n].set(1.0),
         jnp.zeros(1),
     )
-    first = x0 if physics.even else physics.advance(p, x0, u[0], part * dt)
-    return jnp.append(x0[:1], linear_outputs(system, felt, first)[0][:-1, 0])
+    first = x0 if physics.even else physics.advance(p, x0, u[0], fraction * dt)
+    return jnp.append(x0[:1], linear_outputs(system, drive, first)[0][:-1, 0])
 
 
 def run_from(
     physics: Physics, p: jax.Array, u: jax.Array, dt: jax.Array, x0: jax.Array
 ) -> jax.Array:
-    """Run a response as `simulate`, from a whole state at the first sample."""
+    """Run a response like `simulate`, from a complete state at the first sample."""
     return affine_course(lambda x, p, *now: physics.advance(p, x, *now), x0, p, u, dt)[1][:, 0]

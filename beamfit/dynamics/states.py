@@ -1,6 +1,6 @@
-"""State spaces: x' = f(x, u, p) or x+ = f(x, u, p), y = g(x, u, p), under inputs that hold.
+"""State spaces x' = f(x, u, p) or x+ = f(x, u, p), y = g(x, u, p), with held inputs.
 
-f and g are functions of one point; whoever uses them scans and maps them.
+f and g are functions of one sample; the code that uses them scans and vectorises them.
 """
 
 from __future__ import annotations
@@ -15,27 +15,27 @@ from jax.scipy.linalg import expm, solve_triangular
 from beamfit.compile_cache import prepare_jax
 
 prepare_jax()
-# Samples that `linear_outputs` computes by one matrix product.
+# Samples that `linear_outputs` computes by one matrix product: chosen, for speed.
 BLOCK = 16
 
 
 class StateSpace(NamedTuple):
-    """A process by its state: any numbers of inputs, states and outputs.
+    """A process described by its state, with any numbers of inputs, states and outputs.
 
     Attributes
     ----------
     flow : callable
         ``flow(x, u, p)``, shapes (n,), (m,) and any tree: the state's rate of change, or the next
-        state. What of p hangs on the operating point is a map (a formula, a network) that it calls;
-        a p that is a map itself is called with u beforehand.
+        state. A parameter that depends on the operating point is a map (a formula, a network) that
+        `flow` calls; if p itself is a map it is called with u first.
     output : callable
         ``output(x, u, p)``, shape (k,).
     discrete : bool
-        Whether `flow` gives the next state; samples must then be at equal distances.
+        True if `flow` gives the next state; samples must then be equally spaced.
     affine : bool
-        Whether `flow` is affine in x: steps are then exact (matrix exponential).
+        True if `flow` is affine in x: steps are then exact (matrix exponential).
     parts : int
-        Steps of the Runge-Kutta method of fourth order from one sample to the next.
+        Fourth-order Runge-Kutta steps from one sample to the next.
 
     Notes
     -----
@@ -77,13 +77,13 @@ class StateSpace(NamedTuple):
             c = rate(x + 0.5 * h * b)
             return x + h / 6.0 * (a + 2.0 * b + 2.0 * c + rate(x + h * c))
 
-        # A loop of one part is a loop inside the scan for nothing.
+        # A single step needs no loop inside the scan.
         return part(0, x) if self.parts == 1 else jax.lax.fori_loop(0, self.parts, part, x)
 
     def run(
         self, p: Any, u: jax.Array, dt: jax.Array, x0: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
-        """Run free from a state (output error).
+        """Run free from an initial state (output error).
 
         Parameters
         ----------
@@ -115,10 +115,10 @@ class StateSpace(NamedTuple):
 def affine_course(
     after: Callable[..., jax.Array], x0: jax.Array, *rows: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """The state after the last of some steps that are affine in it, and that before each.
+    """Run steps that are affine in the state; return the last state and the state before each step.
 
-    ``after(x, *row)`` is a step. What does not hang on the state is computed for all samples at
-    once, and the scan, forward and backward, is a product with a small matrix.
+    ``after(x, *row)`` is one step. All that does not depend on the state is computed for all
+    samples at once; the scan, forward and backward, is a product with a small matrix.
     """
 
     def moved(*row):
@@ -146,12 +146,12 @@ class Matrices(NamedTuple):
 
 
 def contraction(z: jax.Array, around: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Matrices a, b of a stable linear system by its n m numbers, near one known beforehand.
+    """Give matrices a, b of a stable linear system from n m numbers, near a reference system.
 
     Parameters
     ----------
     z : array, shape (n, m)
-        Any numbers; zero at the system known.
+        Any numbers; zero at the reference system.
     around : array, shape (n + m, n + m)
         Orthogonal; its first n rows are [a b] of that system, with a aᵀ + b bᵀ = 1.
 
@@ -180,7 +180,7 @@ def contraction(z: jax.Array, around: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 
 def linear_outputs(system: Matrices, u: jax.Array, x0: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Run a linear system, `BLOCK` samples at once.
+    """Run a linear system, `BLOCK` samples at a time.
 
     Parameters
     ----------
@@ -210,16 +210,16 @@ def linear_outputs(system: Matrices, u: jax.Array, x0: jax.Array) -> tuple[jax.A
     a, b, c, d, offset = system
     count, (n, m), length = len(u), b.shape, min(BLOCK, max(len(u), 1))
     blocks = jnp.pad(u, ((0, -count % length), (0, 0))).reshape(-1, length * m)
-    whole, seen = jax.lax.scan(lambda q, _: (q @ a, q), jnp.eye(n), length=length)
-    into = seen @ b  # a^i b
-    late = jnp.arange(length)[:, None] - jnp.arange(length)
+    block_matrix, powers = jax.lax.scan(lambda q, _: (q @ a, q), jnp.eye(n), length=length)
+    from_input = powers @ b  # a^i b
+    lag = jnp.arange(length)[:, None] - jnp.arange(length)
     markov = jnp.where(
-        (late > 0)[..., None, None], (c @ into)[jnp.maximum(late - 1, 0)],
-        jnp.where((late == 0)[..., None, None], d, 0.0),
+        (lag > 0)[..., None, None], (c @ from_input)[jnp.maximum(lag - 1, 0)],
+        jnp.where((lag == 0)[..., None, None], d, 0.0),
     )  # fmt: skip
-    pushed = blocks @ jnp.moveaxis(into[::-1], 1, 2).reshape(length * m, n)
-    last, x = jax.lax.scan(lambda x, new: (whole @ x + new, x), x0, pushed)
+    pushed = blocks @ jnp.moveaxis(from_input[::-1], 1, 2).reshape(length * m, n)
+    last, x = jax.lax.scan(lambda x, new: (block_matrix @ x + new, x), x0, pushed)
     forced = blocks @ markov.transpose(1, 3, 0, 2).reshape(length * m, -1)
-    free = x @ (c @ seen).transpose(2, 0, 1).reshape(n, -1)
+    free = x @ (c @ powers).transpose(2, 0, 1).reshape(n, -1)
     y = (forced + free).reshape(-1, len(c))[:count] + offset
     return y, last

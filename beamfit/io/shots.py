@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from beamfit.density.profiles import FEWEST_BINS, profile_size
+from beamfit.density.profiles import MIN_BINS, profile_size
 from beamfit.emittance.scan import PLANES, Profile
 from beamfit.errors import InputError
 from beamfit.io.columns import Sheet, columns_of, standard_header
@@ -122,8 +122,8 @@ def sizes_from_profiles(sheet: Sheet) -> tuple[Sheet, tuple[Profile, ...]]:
             for row, (a, b) in enumerate(zip(starts, ends, strict=True))
         ]
         for row, count, distinct in ((s.row, len(s.position), len(set(s.position))) for s in shots):
-            if count < FEWEST_BINS:
-                expected = f"{FEWEST_BINS} lines or more a shot"
+            if count < MIN_BINS:
+                expected = f"{MIN_BINS} lines or more a shot"
                 raise sheet.error(f"a profile of {count} bins", expected, int(starts[row]))
             if distinct < count:
                 expected = "bins at positions of their own, a pixel above zero, and a column shot"

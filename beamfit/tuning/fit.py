@@ -1,4 +1,4 @@
-"""The tuning fit: a scan of knobs and a line in, the setting of the lowest emittance out."""
+"""The tuning fit: from a scan of knobs and a line to the setting of the lowest emittance."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from beamfit.optics.calibration import SETTING_UNITS
 from beamfit.particles import beta_gamma
 from beamfit.quantity import Quantity, percent
 from beamfit.statistics import CENTRAL, WIDE, quantity_of_draws
-from beamfit.tuning.knob_map import map_posterior, mixed, numbers_at
+from beamfit.tuning.knob_map import map_posterior, mix_draws, numbers_at
 from beamfit.tuning.knobs import GOALS, EmittanceTable, Knobs, knobs_of, planes_of
 from beamfit.tuning.minimum import (
     Emittances,
@@ -38,21 +38,27 @@ from beamfit.tuning.minimum import (
     next_row,
     values_at,
 )
-from beamfit.tuning.readings import emittance_readings, log_no_beam, plane_readings, seen_without
+from beamfit.tuning.readings import (
+    emittance_readings,
+    log_no_beam,
+    plane_readings,
+    prepare_without_knobs,
+)
 
-# Draws of the map: the ends of a 95 % interval are known to a tenth of its half-width.
+# Number of draws of the map: the ends of a 95 % interval are then known to a tenth of its
+# half-width.
 DRAWS = 256
-# Probability below which an emittance is told from one that no knob changes, and a setting is
-# accepted as within the goal of the minimum.
-TOLD = 0.05
-# Odds, before the sizes are seen, that they are of no beam: as of scans.
+# Largest probability of a constant emittance for it to be excluded, and of missing the goal for a
+# setting to be accepted.
+MAX_DOUBT = 0.05
+# Prior odds that the sizes are not of a beam, as for scans.
 NO_BEAM = (MODELS[RANDOM] + MODELS[CONSTANT]) / MODELS[BEAM]
-# Half ranges within which a minimum is on the limit.
-EDGE = 1e-6
+# A minimum within this many half ranges of a limit is at the limit.
+LIMIT_TOLERANCE = 1e-6
 
 
 class TuningBand(NamedTuple):
-    """Values along settings with their central 68 and 95 %, arrays of shape (m,)."""
+    """Values along settings with their central 68 and 95 % intervals, arrays of shape (m,)."""
 
     value: np.ndarray
     low: np.ndarray
@@ -61,7 +67,7 @@ class TuningBand(NamedTuple):
     high_95: np.ndarray
 
     @classmethod
-    def of(cls, draws: np.ndarray) -> TuningBand:
+    def from_draws(cls, draws: np.ndarray) -> TuningBand:
         """Take quantiles over draws, shape (d, m)."""
         return cls(np.median(draws, 0), *np.quantile(draws, (*CENTRAL, *WIDE), axis=0))
 
@@ -78,34 +84,34 @@ def fit_tuning(
     seed: int = 1,
     room: int = 0,
 ) -> TuningFit:
-    """Find the setting of a machine's knobs at which the emittance is lowest, with its error.
+    """Find the setting of a machine's knobs with the lowest emittance, with its error.
 
     Parameters
     ----------
     scan : QuadScan, EmittanceTable or path
-        Sizes at settings of quadrupoles and knobs, in any order; no setting of the knobs needs a
-        whole scan. A knob is one of its ``settings``, in the unit "knob" if it is no magnet. Or
-        finished emittances at settings of the knobs.
+        Sizes at settings of quadrupoles and knobs, in any order; a whole scan at each setting of
+        the knobs is not needed. A knob is one of its ``settings``, in the unit "knob" if it is no
+        magnet. Or finished emittances at settings of the knobs.
     line : Beamline, path or None
-        From where the emittance is wanted to the screens; None for rows with matrices, and for
-        finished emittances.
+        Beamline from the point of the emittance to the screens; None for rows with matrices, and
+        for finished emittances.
     knobs : mapping of str to (float, float)
-        Name of a knob to its limits.
+        Limits of each knob, by name.
     goal : {"emittance", "emittance_x", "emittance_y"}
-        What is to be low; "emittance" is the geometric mean of the planes that were measured.
+        Emittance to be minimised; "emittance" is the geometric mean of the measured planes.
     within : float
-        Share of the minimum that is good enough, for the stop rule.
+        Relative distance from the minimum that is good enough, for the stop rule.
     noise : Noise, optional
         Priors of the noise of sizes; `beamfit.Noise()` if None.
     draws, seed : int
-        Draws of the map, and the seed of their random numbers.
+        Number of draws of the map, and seed of their random numbers.
     room : int
-        Rows that a table will have as it grows: one compiled program then serves all its lengths.
+        Expected number of rows of a growing table: one compiled program then serves all lengths.
 
     Returns
     -------
     TuningFit
-        The place and value of the minimum with intervals; `print` it.
+        Place and value of the minimum with intervals; `print` it.
 
     Raises
     ------
@@ -114,9 +120,9 @@ def fit_tuning(
 
     Notes
     -----
-    ε², ln β and α of each plane are Gaussian processes of the knobs; a size is that beam carried
-    through the line (report eq. 37). Lengths, amplitudes and noise are averaged over; see
-    docs/tuning.md.
+    ε², ln β and α of each plane are Gaussian processes of the knobs; a size follows from the
+    transport of that beam through the line (report eq. 37). The answer is averaged over lengths,
+    amplitudes and noise; see docs/tuning.md.
 
     Examples
     --------
@@ -131,30 +137,30 @@ def fit_tuning(
     expect(knobs, Mapping, '{"SOL": (180.0, 220.0)}')
     if not (within > 0.0 and draws > 1):
         raise InputError(f"{draws} draws, within {within:g}", "2 or more, and a positive share")
-    planes, own, noise = planes_of(scan, goal), knobs_of(scan, knobs), noise or Noise()
-    seen, none = None, [-math.inf] * len(planes)
+    planes, tuned, noise = planes_of(scan, goal), knobs_of(scan, knobs), noise or Noise()
+    seen, log_none = None, [-math.inf] * len(planes)
     if isinstance(scan, EmittanceTable):
         if line is not None:
             raise scan.unusable("a line beside finished emittances", "none: they need no optics")
-        readings = [emittance_readings(scan, plane, own, noise, room) for plane in planes]
+        readings = [emittance_readings(scan, plane, tuned, noise, room) for plane in planes]
     else:
-        seen = seen_without(scan, line, own, noise)
-        readings = [plane_readings(seen, plane, own, scan.settings, room) for plane in planes]
-        none = [log_no_beam(r.readings) + math.log(NO_BEAM) for r in readings]
-    count, both = len(own.names), []
+        seen = prepare_without_knobs(scan, line, tuned, noise)
+        readings = [plane_readings(seen, plane, tuned, scan.settings, room) for plane in planes]
+        log_none = [log_no_beam(r.readings) + math.log(NO_BEAM) for r in readings]
+    count, posteriors = len(tuned.names), []
     for i, r in enumerate(readings):
-        given = r.readings, r.start, 2 * seed + i
-        both.append(map_posterior(*given, knobs=count, draws=draws))
-    evidence = np.array([p.log_evidence for p in both])
-    of_a_beam = expit(np.logaddexp.reduce(evidence, axis=1) - math.log(2.0) - none).prod()
+        arguments = r.readings, r.start, 2 * seed + i
+        posteriors.append(map_posterior(*arguments, knobs=count, draws=draws))
+    evidence = np.array([p.log_evidence for p in posteriors])
+    of_a_beam = expit(np.logaddexp.reduce(evidence, axis=1) - math.log(2.0) - log_none).prod()
     flat = float(expit(np.diff(evidence.sum(axis=0))[0]))
-    still = np.random.default_rng(seed).permutation(draws) < round(flat * draws)
-    posteriors = [mixed(p, still) for p in both]
-    maps = dict(zip(planes, map(PlaneMap, readings, posteriors), strict=True))
-    found = emittances_of(posteriors)
+    constant = np.random.default_rng(seed).permutation(draws) < round(flat * draws)
+    mixed = [mix_draws(p, constant) for p in posteriors]
+    maps = dict(zip(planes, map(PlaneMap, readings, mixed), strict=True))
+    found = emittances_of(mixed)
     minima = jax.tree.map(np.asarray, minima_of(found, count))
-    given = scan, seen, own, goal, within, noise, maps
-    return TuningFit(*given, found, minima, flat, float(of_a_beam))
+    arguments = scan, seen, tuned, goal, within, noise, maps
+    return TuningFit(*arguments, found, minima, flat, float(of_a_beam))
 
 
 @answer
@@ -165,25 +171,25 @@ class TuningFit(Judged):
     Attributes
     ----------
     scan : QuadScan or EmittanceTable
-        The table, knobs among its settings.
+        The table, with the knobs among its settings.
     seen : PreparedScan or None
-        A scan without the knobs, through its line; None of finished emittances.
+        The prepared scan without the knobs; None for finished emittances.
     knobs : Knobs
         Names, limits and units.
     goal : str
-        What is to be low.
+        Emittance that is minimised.
     within : float
-        Share of the minimum that is good enough.
+        Relative distance from the minimum that is good enough.
     noise : Noise
         Priors of the noise.
     maps : dict of str to PlaneMap
-        Plane to its readings and its map.
+        Readings and map by plane.
     draws : Emittances
         Draws of ln of the goal.
     minima : Minima
-        Their lowest values and places, in half ranges.
+        Lowest values of the draws and their places, in half ranges.
     flat : float
-        Probability that no knob changes the emittance, of even odds before.
+        Probability that no knob changes the emittance, with even prior odds.
     of_a_beam : float
         Probability that the sizes are those of a beam through this line.
 
@@ -213,32 +219,34 @@ class TuningFit(Judged):
     def place(self) -> dict[str, Quantity]:
         """Setting of each knob at which the emittance is lowest, with errors.
 
-        A place has no error where no minimum is told from none, or it may be anywhere between the
+        A place has no error if the emittance may be constant, or the minimum anywhere between the
         limits.
         """
-        every = self.knobs.settings(self.minima.place)
+        places = self.knobs.settings(self.minima.place)
         best = self.knobs.settings(self.minima.best)
         ends = np.abs(np.quantile(self.minima.place, WIDE, axis=0)).min(axis=0)
         found = {}
         for i, (name, unit) in enumerate(self.units.items()):
-            q = self._told(quantity_of_draws(every[:, i], unit or "1", best[i]))
-            known = self.flat <= TOLD and ends[i] < 1.0 - EDGE
-            found[name] = q if known else q.open()
+            q = self._open_without_beam(quantity_of_draws(places[:, i], unit or "1", best[i]))
+            determined = self.flat <= MAX_DOUBT and ends[i] < 1.0 - LIMIT_TOLERANCE
+            found[name] = q if determined else q.open()
         return found
 
-    def _told(self, q: Quantity) -> Quantity:
-        """A quantity of the map; nothing is known of it if the sizes are of no beam."""
+    def _open_without_beam(self, q: Quantity) -> Quantity:
+        """Remove the error of a quantity if the sizes may be of no beam."""
         return q if self.of_a_beam > SURE else q.open()
 
     @property
     def settings(self) -> dict[str, float]:
-        """The best setting of the knobs."""
+        """Best setting of the knobs."""
         return {name: q.value for name, q in self.place.items()}
 
     @cached_property
     def minimum(self) -> Quantity:
-        """The lowest normalised emittance between the limits, m."""
-        return self._told(quantity_of_draws(self.unit * np.exp(self.minima.value), "m"))
+        """Lowest normalised emittance between the limits, m."""
+        return self._open_without_beam(
+            quantity_of_draws(self.unit * np.exp(self.minima.value), "m")
+        )
 
     @cached_property
     def _at_best(self) -> np.ndarray:
@@ -247,42 +255,42 @@ class TuningFit(Judged):
 
     @cached_property
     def emittance(self) -> Quantity:
-        """The normalised emittance at the best setting, m."""
-        return self._told(quantity_of_draws(self.unit * np.exp(self._at_best), "m"))
+        """Normalised emittance at the best setting, m."""
+        return self._open_without_beam(quantity_of_draws(self.unit * np.exp(self._at_best), "m"))
 
     @cached_property
     def excess(self) -> np.ndarray:
-        """Emittance at the best setting over the minimum, less one, of every draw, shape (d,)."""
+        """Emittance at the best setting over the minimum, less one, for every draw, shape (d,)."""
         return np.expm1(np.maximum(self._at_best - self.minima.value, 0.0))
 
     @property
     def boost(self) -> float:
-        """Emittances of the answer over those of the maps: γβ, and 1 of finished emittances."""
+        """Emittances of the answer over those of the maps: γβ, or 1 for finished emittances."""
         return beta_gamma(self.seen.energy, self.seen.line.mass) if self.seen else 1.0
 
     @property
     def unit(self) -> float:
-        """The emittance of which the draws have the logarithm, m."""
+        """Unit of the emittance whose logarithm the draws give, m."""
         own = np.prod([m.readings.emittance for m in self.maps.values()]) ** (1 / len(self.maps))
         return float(own * self.boost)
 
     @property
     def kind(self) -> str:
-        """The emittance that is meant: "normalized_emittance", or the "emittance" of a table."""
+        """Kind of emittance: "normalized_emittance", or the "emittance" of a table."""
         normalized = self.seen is not None or self.scan.normalized
         return "normalized_emittance" if normalized else "emittance"
 
     @cached_property
     def edge(self) -> dict[str, float]:
         """Probability that the minimum is at a limit of each knob."""
-        on = (np.abs(self.minima.place) >= 1.0 - EDGE).mean(axis=0)
+        on = (np.abs(self.minima.place) >= 1.0 - LIMIT_TOLERANCE).mean(axis=0)
         return dict(zip(self.knobs.names, map(float, on), strict=True))
 
     @property
     def done(self) -> bool:
         """The best setting is within the goal of the minimum with 95 % probability."""
-        close = float((self.excess > self.within).mean()) <= TOLD
-        return self.of_a_beam > SURE and self.flat <= TOLD and close
+        close = float((self.excess > self.within).mean()) <= MAX_DOUBT
+        return self.of_a_beam > SURE and self.flat <= MAX_DOUBT and close
 
     @cached_property
     def finding(self) -> Finding:
@@ -291,7 +299,7 @@ class TuningFit(Judged):
 
     @property
     def headline(self) -> str:
-        """The best setting and the emittance there, in a line."""
+        """The best setting and the emittance there in one line."""
         best = in_words(self.settings, self.units)
         return f"{cell(self.status)}: {self._goal} {self.emittance} at {best}"
 
@@ -304,20 +312,22 @@ class TuningFit(Judged):
 
     @property
     def units(self) -> dict[str, str]:
-        """Units of the knobs as people write them; "" where the name says it."""
-        known = {**SETTING_UNITS, KNOB: ""}
-        return {n: known[u] for n, u in zip(self.knobs.names, self.knobs.units, strict=True)}
+        """Units of the knobs as written in messages; "" where the name contains it."""
+        names = {**SETTING_UNITS, KNOB: ""}
+        return {n: names[u] for n, u in zip(self.knobs.names, self.knobs.units, strict=True)}
 
     @property
     def notes(self) -> tuple[str, ...]:
         """Sentences on the file, bad readings, and rows beyond the limits."""
         outside = (np.abs(self.knobs.half_ranges(self.scan.settings)) > 1.0).any(axis=1).sum()
-        said = [f"{outside} of {len(self.scan)} rows are beyond the limits."] if outside else []
+        sentences = (
+            [f"{outside} of {len(self.scan)} rows are beyond the limits."] if outside else []
+        )
         for plane, m in self.maps.items():
             bad = np.flatnonzero(np.asarray(m.posterior.bad) > 0.5)
             rows = ", ".join(str(m.readings.rows[i] + 1) for i in bad)
-            said += [f"Bad readings in {plane}: rows {rows}."] if rows else []
-        return (*self.scan.notes, *said)
+            sentences += [f"Bad readings in {plane}: rows {rows}."] if rows else []
+        return (*self.scan.notes, *sentences)
 
     def beam(self, settings: Mapping[str, Any]) -> dict[str, dict[str, TuningBand]]:
         """Predict the beam at settings of the knobs, with its band.
@@ -325,30 +335,30 @@ class TuningFit(Judged):
         Parameters
         ----------
         settings : mapping of str to float or array
-            Every knob to settings, shape (m,) or one number for all.
+            Settings of every knob, shape (m,) or one number for all.
 
         Returns
         -------
         dict of str to dict of str to TuningBand
-            Plane to ``normalized_emittance`` (m), ``beta`` (m) and ``alpha`` at the start of the
-            line; "goal" to the first of what is tuned. Of a table of emittances `kind` alone.
+            ``normalized_emittance`` (m), ``beta`` (m) and ``alpha`` at the start of the line by
+            plane, and the minimised emittance under "goal". A table of emittances has `kind` alone.
         """
         x = self._half_ranges(settings)
         goal = self.unit * np.exp(np.asarray(values_at(self.draws, x)))
-        found = {"goal": {self.kind: TuningBand.of(goal)}}
+        found = {"goal": {self.kind: TuningBand.from_draws(goal)}}
         for plane, m in self.maps.items():
             numbers = np.asarray(numbers_at(m.posterior, x))
             emittance = m.readings.emittance * np.exp(numbers[..., 0])
-            found[plane] = {self.kind: TuningBand.of(self.boost * emittance)}
+            found[plane] = {self.kind: TuningBand.from_draws(self.boost * emittance)}
             if m.readings.coordinates is not None:
-                sigma = m.readings.coordinates.sigma(_even(numbers))
-                found[plane]["beta"] = TuningBand.of(sigma[..., 0] / emittance)
-                found[plane]["alpha"] = TuningBand.of(-sigma[..., 1] / emittance)
+                sigma = m.readings.coordinates.sigma(_even_coordinates(numbers))
+                found[plane]["beta"] = TuningBand.from_draws(sigma[..., 0] / emittance)
+                found[plane]["alpha"] = TuningBand.from_draws(-sigma[..., 1] / emittance)
         return found
 
     @cached_property
     def next(self) -> NextRow | None:
-        """The row that tells most about the minimum; None where no quadrupole was moved."""
+        """Row with the most information about the minimum; None if no quadrupole was moved."""
         return next_row(self) if self.seen is None or varied_magnets(self.seen.scan) else None
 
     @property
@@ -379,7 +389,7 @@ class TuningFit(Judged):
             "units": self.units,
             self.kind: self.emittance,
             "minimum": self.minimum,
-            "excess_95": float(np.quantile(self.excess, 1.0 - TOLD)),
+            "excess_95": float(np.quantile(self.excess, 1.0 - MAX_DOUBT)),
             "within": self.within,
             "done": self.done,
             "at_limit": self.edge,
@@ -391,7 +401,7 @@ class TuningFit(Judged):
         return json_of(found)
 
     def tables(self) -> tuple[Table, ...]:
-        """Lay out the best setting, the emittance there, and how sure both are."""
+        """Tables of the best setting, the emittance there, and their intervals."""
         rows = [
             [name, cell(q), cell(q.interval_words), percent(self.edge[name])]
             for name, q in self.place.items()
@@ -402,8 +412,8 @@ class TuningFit(Judged):
         return (Table(f"Best setting, from {len(self.scan)} rows", head, rows),)
 
 
-def _even(numbers: jax.Array) -> np.ndarray:
-    """T, T p_1, T p_2 of the coordinates of a scan, of ln ε, ln β, α; shape (..., 3)."""
+def _even_coordinates(numbers: jax.Array) -> np.ndarray:
+    """Give T, T p_1, T p_2 of the scan's coordinates from ln ε, ln β, α; shape (..., 3)."""
     log_emittance, log_beta, alpha = np.moveaxis(np.asarray(numbers), -1, 0)
     emittance, beta = np.exp(log_emittance), np.exp(log_beta)
     s11, s22 = emittance * beta, emittance * (1.0 + alpha**2) / beta
@@ -411,7 +421,7 @@ def _even(numbers: jax.Array) -> np.ndarray:
 
 
 def _no_beam(fit: TuningFit) -> Finding | None:
-    """The sizes may be of no beam."""
+    """Find that the sizes may be of no beam."""
     if fit.of_a_beam > SURE:
         return None
     cause = f"The sizes are of no beam through this line ({percent(1.0 - fit.of_a_beam)})."
@@ -419,25 +429,25 @@ def _no_beam(fit: TuningFit) -> Finding | None:
 
 
 def _flat(fit: TuningFit) -> Finding | None:
-    """No knob is known to change the emittance."""
-    if fit.flat <= TOLD:
+    """Find that the emittance may be constant."""
+    if fit.flat <= MAX_DOUBT:
         return None
     cause = f"The emittance is compatible with one value at all settings ({percent(fit.flat)})."
     return Finding(Status.unidentified, cause, "Measure more rows, or widen the limits.")
 
 
 def _at_limit(fit: TuningFit) -> Finding | None:
-    """The minimum is rather at a limit than inside."""
+    """Find that the minimum is more probably at a limit than inside."""
     at = {name: p for name, p in fit.edge.items() if p > 0.5}
     if not at:
         return None
     where = ", ".join(f"{name} ({percent(p)})" for name, p in at.items())
-    cause = f"No minimum inside: it is at a limit of {where}. {_close(fit)}"
+    cause = f"No minimum inside: it is at a limit of {where}. {_excess_words(fit)}"
     return Finding(Status.at_limit, cause, "Widen these limits if the machine allows it.")
 
 
-def _close(fit: TuningFit) -> str:
-    worst = float(np.quantile(fit.excess, 1.0 - TOLD))
+def _excess_words(fit: TuningFit) -> str:
+    worst = float(np.quantile(fit.excess, 1.0 - MAX_DOUBT))
     end = "Stop: that is the goal." if fit.done else "Measure more rows."
     return (
         f"The best setting is within {percent(worst)} of the minimum with 95 % probability; the "
@@ -446,8 +456,8 @@ def _close(fit: TuningFit) -> str:
 
 
 def _found(fit: TuningFit) -> Finding:
-    return Finding(Status.converged, f"A minimum is found. {_close(fit)}")
+    return Finding(Status.converged, f"A minimum is found. {_excess_words(fit)}")
 
 
-# In order of gravity.
+# In order of severity.
 RULES = (_no_beam, _flat, _at_limit, _found)

@@ -1,4 +1,4 @@
-"""Knobs of a machine with their limits, and what is to be low; plain NumPy."""
+"""Knobs of a machine with their limits, and the goal of tuning; plain NumPy."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import numpy as np
 from beamfit.emittance.scan import KNOB, QuadScan, first_unusable
 from beamfit.errors import InputError, nearest
 
-# What is made small: the geometric mean of the planes' emittances, or one of them.
+# Goals: the geometric mean of the planes' emittances, or one of them.
 GOALS = ("emittance", "emittance_x", "emittance_y")
 
 
@@ -24,15 +24,15 @@ class EmittanceTable:
     Parameters
     ----------
     settings : mapping of str to array
-        Knob to settings, each of shape (n,).
+        Settings by knob, each of shape (n,).
     emittance : mapping of str to array
-        Plane ("x", "y") to emittances in m; NaN where a row has none.
+        Emittances in m by plane ("x", "y"); NaN where a row has none.
     error : mapping of str to array, optional
-        Plane to standard errors in m. A plane left out has none: the fit infers them.
+        Standard errors in m by plane; the fit estimates those of a plane left out.
     normalized : bool
-        Whether they are normalised.
+        True for normalised emittances.
     name, path, sha256, provenance, notes, columns
-        As of a `beamfit.QuadScan`.
+        The same as in a `beamfit.QuadScan`.
 
     Raises
     ------
@@ -75,7 +75,7 @@ class EmittanceTable:
 
     @property
     def planes(self) -> tuple[str, ...]:
-        """The planes that were measured."""
+        """Measured planes."""
         return tuple(p for p in "xy" if p in self.emittance)
 
     @property
@@ -103,12 +103,12 @@ class Knobs(NamedTuple):
     units: tuple[str, ...]
 
     def half_ranges(self, settings: Mapping[str, np.ndarray]) -> np.ndarray:
-        """Settings by name as numbers from -1 to 1 between the limits, shape (n, knobs)."""
+        """Scale settings by name to numbers from -1 to 1 between the limits, shape (n, knobs)."""
         values = np.stack([np.asarray(settings[n], float) for n in self.names], axis=-1)
         return (2.0 * values - self.low - self.high) / (self.high - self.low)
 
     def settings(self, x: np.ndarray) -> np.ndarray:
-        """Settings, shape (n, knobs), of numbers from -1 to 1."""
+        """Convert numbers from -1 to 1 to settings, shape (n, knobs)."""
         return 0.5 * (self.low + self.high + x * (self.high - self.low))
 
 
@@ -145,7 +145,7 @@ def knobs_of(scan: QuadScan | EmittanceTable, limits: Mapping[str, tuple[float, 
 
 
 def planes_of(scan: QuadScan | EmittanceTable, goal: str) -> tuple[str, ...]:
-    """Planes that a goal speaks of."""
+    """Planes of a goal."""
     if goal not in GOALS:
         raise InputError(f"goal '{goal}'", nearest(str(goal), list(GOALS)))
     if goal == GOALS[0]:

@@ -1,4 +1,4 @@
-"""A scan of knobs seen through its line: the sizes of each plane, ready for a map."""
+"""A scan of knobs through its line: the sizes of each plane, prepared for a map."""
 
 from __future__ import annotations
 
@@ -25,35 +25,36 @@ from beamfit.optics.beamline import Beamline
 from beamfit.tuning.knob_map import KnobReadings
 from beamfit.tuning.knobs import EmittanceTable, Knobs
 
-# A beam to begin with where no constant one fits: ln of its emittance in the coordinates.
-BEGIN = np.array([-1.0, 0.0, 0.0])
+# Start beam where no constant one fits: ln of its emittance, ln of beta, and alpha in the
+# coordinates.
+DEFAULT_BEAM = np.array([-1.0, 0.0, 0.0])
 # Nodes over ln of the scale of the noise, in standard deviations of its prior.
-NODES = np.linspace(-2.5, 2.5, 11)
+NOISE_NODES = np.linspace(-2.5, 2.5, 11)
 
 
-def seen_without(
+def prepare_without_knobs(
     scan: QuadScan, line: Beamline | None, knobs: Knobs, noise: Noise | None
 ) -> PreparedScan:
-    """The scan through its line; the knobs are no magnets of it."""
+    """Prepare the scan with its line, leaving out the knobs, which are no magnets of it."""
     scan, line = single_beam(scan.without_settings(knobs.names), line)
     return with_elements([assemble(scan, line, noise=noise)])[0]
 
 
 class PlaneReadings(NamedTuple):
-    """Readings of a plane, a beam to begin with, and what they are in.
+    """Readings of a plane, a start beam, and their units.
 
     Attributes
     ----------
     readings : KnobReadings
-        Padded.
+        Padded readings.
     start : ndarray
-        Shape (3,): numbers of a beam.
+        Numbers of the start beam, shape (3,).
     emittance : float
-        The emittance of which a map has the logarithm, m.
+        Unit of the emittance whose logarithm the map gives, m.
     rows : ndarray
         Rows of the table in which the plane was measured.
     coordinates : Coordinates or None
-        Of the beam; None of emittances.
+        Coordinates of the beam; None for emittances.
     """
 
     readings: KnobReadings
@@ -66,12 +67,12 @@ class PlaneReadings(NamedTuple):
 def plane_readings(
     seen: PreparedScan, plane: str, knobs: Knobs, settings: Mapping[str, np.ndarray], room: int = 0
 ) -> PlaneReadings:
-    """The sizes of a plane at the settings of the knobs, with the noise of scans.
+    """Prepare the sizes of a plane at the settings of the knobs, with the noise of scans.
 
     Notes
     -----
-    Sizes with the errors of means of shots scatter beyond them by a share of the size, those with
-    stated errors have errors at least as large, those without have a share of the size.
+    Sizes with errors from shots scatter beyond them by a share of the size. Stated errors are lower
+    limits. Sizes without errors have an unknown relative error.
     """
     sizes, _ = plane_sizes(seen, plane)
     c = coordinates(sizes.r11, sizes.r12, sizes.size, sizes.known)
@@ -84,7 +85,7 @@ def plane_readings(
     noise = _relative_noise(sizes.size, sizes.error, sizes.of_shots, seen.noise)
     rows = np.asarray(seen.measured(plane))
     x, w = knobs.half_ranges(settings)[rows], np.column_stack([c.w, np.zeros(len(rows))])
-    readings = _padded(x, w, c.known, np.log(c.size), noise, seen.noise, room)
+    readings = _pad(x, w, c.known, np.log(c.size), noise, seen.noise, room)
     emittance = float(abs(np.linalg.det(c.back)) * c.unit**2)
     return PlaneReadings(readings, _constant_beam(c), emittance, rows, c)
 
@@ -92,7 +93,9 @@ def plane_readings(
 def emittance_readings(
     table: EmittanceTable, plane: str, knobs: Knobs, noise: Noise, room: int = 0
 ) -> PlaneReadings:
-    """The emittances of a plane, whose roots stand for sizes; stated errors are at least as large.
+    """Prepare the emittances of a plane, whose roots stand for sizes.
+
+    Stated errors are lower limits.
 
     Examples
     --------
@@ -108,30 +111,31 @@ def emittance_readings(
         value, error if error is None else error[rows], False, noise
     )
     log, w = 0.5 * np.log(value), np.tile([0.0, 0.0, 1.0], (len(rows), 1))
-    x, own = knobs.half_ranges(table.settings)[rows], (0.5 * floor, 0.5 * unit, prior)
-    readings = _padded(x, w, np.zeros(len(rows)), log - log.mean(), own, noise, room)
+    x, halved = knobs.half_ranges(table.settings)[rows], (0.5 * floor, 0.5 * unit, prior)
+    readings = _pad(x, w, np.zeros(len(rows)), log - log.mean(), halved, noise, room)
     return PlaneReadings(readings, np.zeros(3), math.exp(2.0 * log.mean()), rows)
 
 
-def _padded(
+def _pad(
     x: np.ndarray,
     w: np.ndarray,
     known: np.ndarray,
     y: np.ndarray,
-    own: tuple[np.ndarray, np.ndarray, np.ndarray],
+    errors: tuple[np.ndarray, np.ndarray, np.ndarray],
     noise: Noise,
     room: int,
 ) -> KnobReadings:
-    """Readings with their own floor, unit and prior of the errors, of a length that others have."""
+    """Pad readings, with floor, unit and prior of their errors, to a common length."""
     n, bad = len(x), noise.of_points(len(x)).bad
 
-    def filled(values: np.ndarray, fill: float = 0.0) -> np.ndarray:
-        more = [(0, padded_length(max(n, room)) - n)] + [(0, 0)] * (values.ndim - 1)
-        return np.pad(values, more, constant_values=fill)
+    def padded(values: np.ndarray, fill: float = 0.0) -> np.ndarray:
+        padding = [(0, padded_length(max(n, room)) - n)] + [(0, 0)] * (values.ndim - 1)
+        return np.pad(values, padding, constant_values=fill)
 
     return KnobReadings(
-        filled(x), filled(w), filled(known, 1.0), filled(y), filled(own[0], 1.0), filled(own[1]),
-        filled(np.ones(n)), own[2], np.float64(bad / (1.0 - bad)), np.float64(noise.width),
+        padded(x), padded(w), padded(known, 1.0), padded(y), padded(errors[0], 1.0),
+        padded(errors[1]), padded(np.ones(n)), errors[2], np.float64(bad / (1.0 - bad)),
+        np.float64(noise.width),
     )  # fmt: skip
 
 
@@ -144,7 +148,7 @@ def _relative_noise(
     prior = noise.factor if kind.least else kind.prior
     floor, unit, middle = kind.floor / share, kind.unit / share, prior.middle
     if kind.least:
-        # Stated errors are a floor; with the scatter beside them they are larger by the factor.
+        # Stated errors are a floor; the scatter in addition makes them larger by the factor.
         floor, middle = np.hypot(floor, kind.least * unit), math.sqrt(middle**2 - kind.least**2)
     return floor, unit, np.array([math.log(middle), prior.spread])
 
@@ -156,18 +160,18 @@ def _constant_beam(c: Coordinates) -> np.ndarray:
     s11, s12, s22 = np.linalg.lstsq(rows * weight, (c.size**2 - c.known) * weight[:, 0])[0]
     square = s11 * s22 - s12**2
     if not (s11 > 0.0 and square > 0.0):
-        return BEGIN
+        return DEFAULT_BEAM
     emittance = math.sqrt(square)
     return np.array([math.log(emittance), math.log(s11 / emittance), -s12 / emittance])
 
 
 def log_no_beam(data: KnobReadings) -> float:
-    """Log evidence of sizes that are of no beam: the same at all settings, or at random.
+    """Log evidence of sizes that are not of a beam: constant or random at the settings.
 
     Notes
     -----
-    ln of a size is a level with steps of one size about it, as of scans (docs/verdict_constants.md)
-    or none; steps and noise are averaged over.
+    ln of a size is a level, with or without random steps of one size about it, as in scans
+    (docs/verdict_constants.md); the evidence is averaged over steps and noise.
 
     Examples
     --------
@@ -176,14 +180,14 @@ def log_no_beam(data: KnobReadings) -> float:
     >>> log_no_beam(data) > 0.0  # of two equal sizes, a density
     True
     """
-    here = data.there > 0
+    here = data.present > 0
     y, floor, unit = data.y[here], data.floor[here], data.unit[here]
-    scale = np.exp(data.noise[0] + data.noise[1] * NODES)[:, None]
+    scale = np.exp(data.noise[0] + data.noise[1] * NOISE_NODES)[:, None]
     noise = floor**2 + (scale * unit) ** 2
     variance = np.append(0.0, AMPLITUDES)[:, None, None] ** 2 + noise
     weight, own = (1.0 / variance).sum(-1) + LN_SIZE_SPREAD**-2, (y / variance).sum(-1)
     log = -0.5 * ((y**2 / variance + np.log(variance) + LN_2PI).sum(-1) - own**2 / weight)
     log -= 0.5 * np.log(weight * LN_SIZE_SPREAD**2)
-    prior = -0.5 * NODES**2
+    prior = -0.5 * NOISE_NODES**2
     prior -= np.logaddexp.reduce(prior) + math.log(len(variance))
     return float(np.logaddexp.reduce((log + prior).ravel()))

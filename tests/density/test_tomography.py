@@ -27,7 +27,7 @@ def bins(shape=lambda i, x: np.exp(-0.5 * x**2), **told):
 def posterior(seen, stretch=None, core=(0.9, 1.9)):
     stretch = np.zeros(4) if stretch is None else stretch
     kernels = tomography._kernels(seen, [core])[0]
-    return _Posterior.of(seen, tomography._gaussian(), stretch, kernels, PRIOR)
+    return _Posterior.build(seen, tomography._gaussian(), stretch, kernels, PRIOR)
 
 
 def test_the_reference_has_unit_rms_and_its_projection_is_a_normal_density():
@@ -38,7 +38,7 @@ def test_the_reference_has_unit_rms_and_its_projection_is_a_normal_density():
     width = seen.position[1] - seen.position[0]
     spread = 1.0 + width**2 / 16.0  # of two readings taken together, half a width apart
     expected = PEAK / np.sqrt(spread) * np.exp(-0.5 * seen.position**2 / spread)
-    assert seen.look @ reference == pytest.approx(expected, abs=2e-4)
+    assert seen.projection @ reference == pytest.approx(expected, abs=2e-4)
 
 
 def test_a_kernel_of_two_bins_is_the_integral_of_the_covariance_over_their_lines():
@@ -59,11 +59,13 @@ def test_a_kernel_of_two_bins_is_the_integral_of_the_covariance_over_their_lines
 
     expected = dblquad(covariance, -7, 7, -7, 7, epsabs=1e-8)[0]
     # Points and bins have a width, the lines of the integral have none.
-    assert kernel.of_bins[one, other] == pytest.approx(expected, rel=0.1)
+    assert kernel.bin_covariance[one, other] == pytest.approx(expected, rel=0.1)
     weight = tomography._envelope(envelope)
     apart = np.sum((GRID[:, None] - GRID) ** 2, axis=-1) / length**2
-    whole = (seen.look[one] * weight) @ np.exp(-0.5 * apart) @ (seen.look[other] * weight)
-    assert kernel.of_bins[one, other] == pytest.approx(whole, rel=1e-10)
+    whole = (
+        (seen.projection[one] * weight) @ np.exp(-0.5 * apart) @ (seen.projection[other] * weight)
+    )
+    assert kernel.bin_covariance[one, other] == pytest.approx(whole, rel=1e-10)
 
 
 def test_slopes_of_the_evidence_are_its_differences():
@@ -85,7 +87,7 @@ def test_slopes_by_a_stretch_are_differences_of_the_projection():
         given = profiles_of(lambda i, x: np.exp(-0.5 * x**2))
         there = bins_of(given, ROWS, np.eye(2), np.full(4, e), np.zeros(4))
         # The same bins, seen where another stretch puts them: their density per size grows.
-        return there.look @ reference / (1.0 + e)
+        return there.projection @ reference / (1.0 + e)
 
     change = (stretched(step) - stretched(-step)) / (2.0 * step)
     # The columns leave out that bins are narrower in sizes that grow: so much of the peak.
@@ -100,7 +102,7 @@ def test_draws_have_mean_and_covariance_of_the_conditional():
     inner = np.exp(-0.5 * np.sum(GRID**2, axis=1) / 0.5**2)
     values = densities @ inner
     square = np.exp(2.0 * numbers)
-    cross = sum(s * k.seen @ inner for s, k in zip(square, found.kernels, strict=False))
+    cross = sum(s * k.bin_grid @ inner for s, k in zip(square, found.kernels, strict=False))
     own = 0.0
     for s, k in zip(square, found.kernels, strict=False):
         weight, n = tomography._envelope(k.envelope), len(tomography.AXIS)

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from beamfit.dynamics.fit import identify
-from beamfit.dynamics.paths import heard, moving
-from beamfit.dynamics.record import Run, Way, rows_of
+from beamfit.dynamics.paths import moving_inputs, usable_rows
+from beamfit.dynamics.record import Run, Way, interpolate_inputs
 from beamfit.errors import InputError, Status
 
 TAU, GAIN = 4.0, 2.0
@@ -70,9 +70,9 @@ def test_readings_hear_the_record_from_the_delay_on():
     y = np.ones(20)
     y[5] = np.nan
     run = Run(np.arange(20.0), {"u": np.arange(20.0)}, {"y": y})
-    assert heard(run, "y", 0.0).tolist() == [*range(5), *range(6, 20)]
-    assert heard(run, "y", 2.4)[0] == 3
-    assert heard(run, "y", -1.5)[-1] == 18
+    assert usable_rows(run, "y", 0.0).tolist() == [*range(5), *range(6, 20)]
+    assert usable_rows(run, "y", 2.4)[0] == 3
+    assert usable_rows(run, "y", -1.5)[-1] == 18
 
 
 def test_what_was_before_the_record_moves_no_number():
@@ -98,7 +98,7 @@ def test_what_was_before_the_record_moves_no_number():
     ],
 )
 def test_inputs_that_rest_or_go_straight_on_may_ramp(name, u, expected):
-    assert moving([Run(np.arange(40.0), {"u": u}, {"y": u})])[1] == expected
+    assert moving_inputs([Run(np.arange(40.0), {"u": u}, {"y": u})])[1] == expected
 
 
 def test_ways_between_samples_are_lines_and_sines():
@@ -107,11 +107,11 @@ def test_ways_between_samples_are_lines_and_sines():
     middles = np.add.outer(t, (np.arange(4) + 0.5) / 4).ravel()
     u = np.random.default_rng(2).normal(size=64)
     run = Run(t, {"u": u}, {"y": t})
-    rows = rows_of(run, Way(ramping=("u",)), 4)[:, 0]
+    rows = interpolate_inputs(run, Way(ramping=("u",)), 4)[:, 0]
     assert rows[:252] == pytest.approx(np.interp(middles, t, u)[:252])
     w = 2 * np.pi / 9.0
     run = Run(t, {"u": np.sin(w * t)}, {"y": t})
-    rows = rows_of(run, Way(smooth=("u",)), 4)[:, 0]
+    rows = interpolate_inputs(run, Way(smooth=("u",)), 4)[:, 0]
     assert rows[20:220] == pytest.approx(np.sin(w * middles)[20:220], abs=2e-3)
 
 

@@ -13,7 +13,7 @@ import pytest
 import beamfit
 from beamfit.dynamics import fedbatch
 from beamfit.dynamics import feed as feeding
-from beamfit.dynamics.balances import STATES, bounded, predicted, rates_at, stretches_of
+from beamfit.dynamics.balances import STATES, batch_bounds, predicted, rates_at, stretches_of
 from beamfit.dynamics.fedbatch import (
     RULES,
     BatchEvidence,
@@ -83,7 +83,7 @@ def test_true_rates_are_found_within_their_bands_where_the_batches_were(fit, mad
 
 
 def test_rates_are_bounded_and_nothing_without_substrate(runs):
-    b = bounded(runs, [stretches_of(run) for run in runs], None)
+    b = batch_bounds(runs, [stretches_of(run) for run in runs], None)
     net = network_of(("substrate", "air"), np.array([[0.0, 0.5], [2.0, 1.0]]), "ab", 5, 0)
     model = {"rates": jax.tree_util.tree_map(lambda v: 30.0 * v, net), "half": 0.1}
     draw = np.random.default_rng(0).uniform(0, 2, (200, 3 + len(b.inputs)))

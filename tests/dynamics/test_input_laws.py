@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from beamfit.dynamics.alternatives import NONE, Alternatives
+from beamfit.dynamics.alternatives import NO_DEPARTURE, Alternatives
 from beamfit.dynamics.fit import identify
-from beamfit.dynamics.input_laws import laws_between, moved
-from beamfit.dynamics.paths import Path, Paths, stepwise
-from beamfit.dynamics.record import Run, Way, levels_of, unsure_gain
+from beamfit.dynamics.input_laws import apply_law, laws_between
+from beamfit.dynamics.paths import Path, Paths, inputs_with_levels
+from beamfit.dynamics.record import Run, Way, gain_error_share, levels_of
 from beamfit.errors import Status
 
 UP_AND_DOWN = np.array([0.0, 1.0, 2.0, 2.0, 1.5, 1.0, 0.0, -1.0])
@@ -27,12 +27,12 @@ UP_AND_DOWN = np.array([0.0, 1.0, 2.0, 2.0, 1.5, 1.0, 0.0, -1.0])
     ],
 )
 def test_what_a_law_hands_on(law, width, wanted):
-    assert moved(UP_AND_DOWN, law, width).tolist() == wanted
+    assert apply_law(UP_AND_DOWN, law, width).tolist() == wanted
 
 
 def test_a_hysteresis_is_the_mean_of_plays():
-    plays = [moved(UP_AND_DOWN, "play", share * 0.3) for share in (0, 0.4, 0.8, 1.2, 1.6, 2)]
-    np.testing.assert_allclose(moved(UP_AND_DOWN, "hysteresis", 0.3), np.mean(plays, axis=0))
+    plays = [apply_law(UP_AND_DOWN, "play", share * 0.3) for share in (0, 0.4, 0.8, 1.2, 1.6, 2)]
+    np.testing.assert_allclose(apply_law(UP_AND_DOWN, "hysteresis", 0.3), np.mean(plays, axis=0))
 
 
 def test_an_error_is_that_of_the_mixture_about_the_value_of_the_answer():
@@ -40,7 +40,7 @@ def test_an_error_is_that_of_the_mixture_about_the_value_of_the_answer():
     random = np.random.default_rng(0)
     shift, covariance = np.array([[2.0, 1.0], [0.0, -3.0]]), np.stack([np.diag([1.0, 0.5])] * 2)
     own, weight = Path(None, Way(), 0.0), np.array([0.3, 0.2])
-    found = Alternatives(own, 0.0, 0.0, NONE, weight, shift, covariance)
+    found = Alternatives(own, 0.0, 0.0, NO_DEPARTURE, weight, shift, covariance)
     slope = np.array([1.0, 0.5])
     which = random.choice(3, 200_000, p=[0.5, 0.3, 0.2])
     laws = [random.multivariate_normal(s, c, 200_000) @ slope
@@ -145,7 +145,7 @@ def test_what_is_all_but_impossible_is_in_no_error():
 
 def test_ramps_do_not_stand_at_levels():
     u = np.interp(np.arange(160), [0, 40, 70, 120, 159], [0.0, 1.0, 0.3, 0.9, 0.2])
-    most = Paths.of([Run(np.arange(160.0), {"valve": u}, {"level": u})], None, False).most
+    most = Paths.of([Run(np.arange(160.0), {"valve": u}, {"level": u})], None, False).movable
     assert most.moving == ("valve",)
     assert not most.standing
 
@@ -190,7 +190,7 @@ def test_inputs_without_steps_have_no_levels():
     smooth |= {"white": random.normal(size=300), "set": np.repeat(random.uniform(size=30), 10)}
     smooth["noisy sine"] = smooth["sine"] + 0.02 * random.normal(size=300)
     read = smooth["set"] + 0.01 * random.normal(size=300)
-    assert stepwise([Run(t, {**smooth, "read": read}, {"level": t})]) == ("read",)
+    assert inputs_with_levels([Run(t, {**smooth, "read": read}, {"level": t})]) == ("read",)
 
 
 def test_a_gain_is_unsure_by_the_errors_of_levels():
@@ -201,7 +201,7 @@ def test_a_gain_is_unsure_by_the_errors_of_levels():
     gains = [np.polyfit(levels_of(read).at, 2.0 * u, 1)[0] for read in reads]
     t, way = np.arange(100.0), Way(standing=("u",))
     own = np.mean(
-        [unsure_gain([Run(t, {"u": u_read}, {"y": u})], way, "u") for u_read in reads[:40]]
+        [gain_error_share([Run(t, {"u": u_read}, {"y": u})], way, "u") for u_read in reads[:40]]
     )
     assert np.std(gains) / 2.0 == pytest.approx(own, rel=0.25)
     assert abs(np.mean(gains) / 2.0 - 1) < 3 * np.std(gains) / 20

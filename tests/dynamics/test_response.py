@@ -251,7 +251,7 @@ def test_a_limit_of_a_lag_is_a_quantile_of_its_posterior():
     low, high = found.limits(0.0)
     assert low == 0.0
     assert np.log(high) == pytest.approx(lag[np.searchsorted(below, 0.95)], abs=0.01)
-    draws = found.drawn(["K"])
+    draws = found.draws(["K"])
     np.testing.assert_allclose(np.quantile(draws["K"], [0.025, 0.975]), [0.803, 1.197], atol=0.01)
     assert np.quantile(draws["tau"], 0.95) == pytest.approx(high, rel=0.01)
 

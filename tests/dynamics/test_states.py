@@ -10,8 +10,8 @@ from scipy.signal import cont2discrete, dlsim, lfilter
 
 from beamfit.dynamics.linear import criterion, identify_states, joint_error
 from beamfit.dynamics.record import Run
-from beamfit.dynamics.search import Begun, Case, ReadingErrors
-from beamfit.dynamics.state_fit import PLAIN, fit_states
+from beamfit.dynamics.search import Case, ReadingErrors
+from beamfit.dynamics.state_fit import fit_states
 from beamfit.dynamics.states import StateSpace
 from beamfit.errors import InputError, Status
 
@@ -205,16 +205,18 @@ def test_an_order_is_worth_what_it_adds_to_what_readings_before_foretell():
     """Three orders miss by as much; misses of the second are told from those before, mostly."""
     n = 400
     time = np.arange(n, dtype=float)
-    case = Case((SimpleNamespace(time=(time,), size_y=1.0, measured=(time,)),), (), (), ())
+    case = Case((SimpleNamespace(time=(time,), floor=2e-4, measured=(time,)),), (), (), ())
 
     def missed(share, used):
         rest = lfilter([1.0], [1.0, -share], np.random.default_rng(1).normal(size=n))
         fit = SimpleNamespace(groups=[SimpleNamespace(count=n, dof=n - used)])
         noise = ((ReadingErrors(np.full(n, 0.3)),),)
-        return SimpleNamespace(rest=((0.3 * rest / rest.std(),),), noise=noise, fit=fit)
+        return SimpleNamespace(
+            case=case, residuals=((0.3 * rest / rest.std(),),), noise=noise, fit=fit
+        )
 
     tried = [missed(0.9, 3), missed(0.99, 6), missed(0.99, 7)]
-    rough, smooth, more = criterion([Begun(case, PLAIN, each) for each in tried])
+    rough, smooth, more = criterion(tried)
     assert smooth < rough - 100.0
     assert more - smooth == pytest.approx(np.log(n))
 

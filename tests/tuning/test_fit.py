@@ -12,7 +12,7 @@ from beamfit.errors import InputError, Status
 from beamfit.noise.model import Noise
 from beamfit.particles import beta_gamma
 from beamfit.tuning.fit import fit_tuning
-from beamfit.tuning.knob_map import _covariance, _linear, log_emittance, orders_of
+from beamfit.tuning.knob_map import _covariance, _linearise, log_emittance, orders_of
 from beamfit.tuning.knobs import EmittanceTable, knobs_of
 from beamfit.tuning.minimum import _information, next_row
 from beamfit.tuning.readings import emittance_readings
@@ -141,8 +141,8 @@ def test_emittances_are_those_of_gaussian_regression():
     table = table_of(MACHINE, 2, count=16)
     readings = emittance_readings(table, "x", knobs_of(table, limits_of(MACHINE)), Noise())
     data, scales = readings.readings, np.log([1.2, 1.2, 0.5, 0.6, 0.6, 1.0])
-    by = _linear(data, np.zeros((len(data.y), 4)), jnp.ones(len(data.y)), jnp.ones(()))
-    there = data.there > 0
+    by = _linearise(data, np.zeros((len(data.y), 4)), jnp.ones(len(data.y)), jnp.ones(()))
+    there = data.present > 0
     bend = (log_emittance(0.0, 1e-5) - log_emittance(0.0, -1e-5)) / 2e-5
     assert np.allclose(by.slope[there], [0.5, bend / 2, 0.0, 0.0])
     far = ((data.x[there][:, None] - data.x[there][None]) / 1.2) ** 2

@@ -9,8 +9,15 @@ from scipy.stats import kstest, multivariate_normal, norm, uniform
 
 from beamfit.emittance.comparison import AMPLITUDES
 from beamfit.tuning import knob_map as of
-from beamfit.tuning.knob_map import MEAN, design, features, log_emittance, log_size, orders_of
-from beamfit.tuning.minimum import _of_draw, emittances_of, minima_of, values_at
+from beamfit.tuning.knob_map import (
+    MEAN_SPREAD,
+    design,
+    features,
+    log_emittance,
+    log_size,
+    orders_of,
+)
+from beamfit.tuning.minimum import _draw_value, emittances_of, minima_of, values_at
 from beamfit.tuning.readings import log_no_beam
 
 RNG = np.random.default_rng(3)
@@ -44,7 +51,7 @@ def found(data):
 
 def varying(data):
     both = of.map_posterior(data, np.array([-1.0, 0.0, 0.0]), 1, KNOBS, 256)
-    return of.mixed(both, np.zeros(256, bool))
+    return of.mix_draws(both, np.zeros(256, bool))
 
 
 def kernel(a, b, length):
@@ -76,7 +83,7 @@ def test_squares_of_emittances_add():
 
 def linear(data):
     numbers = np.insert(NUMBERS, 1, 0.3, axis=1)  # the emittance's square 1.3 times its level
-    return of._linear(data, jnp.asarray(numbers), jnp.ones(COUNT), jnp.ones(()))
+    return of._linearise(data, jnp.asarray(numbers), jnp.ones(COUNT), jnp.ones(()))
 
 
 def scales_at():
@@ -88,7 +95,7 @@ def covariance_by_kernel(eta, slope):
     same = kernel(X, X, length)
     level, *own = slope.T
     parts = [amplitude[i] ** 2 * same * np.outer(s, s) for i, s in enumerate(own)]
-    parts += [MEAN**2 * np.outer(s, s) for s in (level, *own[1:])]
+    parts += [MEAN_SPREAD**2 * np.outer(s, s) for s in (level, *own[1:])]
     return sum(parts) + (0.01**2 + noise**2) * np.eye(COUNT)
 
 
@@ -96,7 +103,7 @@ def test_the_evidence_is_that_of_a_gaussian_process(data):
     by, eta = linear(data), scales_at()
     mean, spread = map(np.asarray, of.prior_of(data))
     covariance = covariance_by_kernel(eta, np.asarray(by.slope))
-    expected = multivariate_normal.logpdf(by.off, np.zeros(COUNT), covariance)
+    expected = multivariate_normal.logpdf(by.target, np.zeros(COUNT), covariance)
     expected += norm.logpdf(eta, mean, spread).sum()
     evidence = jax.jit(lambda eta: of._log_evidence(eta, by, orders_of(2)))
     assert float(evidence(eta)) == pytest.approx(expected, abs=0.02)
@@ -114,7 +121,7 @@ def test_slope_and_curvature_of_the_evidence_are_its_differences(data):
     covariance = np.asarray(of._covariance(eta, by, orders))
     drawn = np.random.default_rng(0).multivariate_normal(np.zeros(COUNT), covariance, 4000)
     mean, spread = map(np.asarray, of.prior_of(data))
-    scores = jax.vmap(lambda off: of._scoring(eta, by._replace(off=off), orders)[0])
+    scores = jax.vmap(lambda off: of._scoring(eta, by._replace(target=off), orders)[0])
     each = jax.jit(scores)(drawn)
     each = np.asarray(each) + (eta - mean) / spread**2
     assert np.allclose(each.T @ each / 4000 + np.diag(spread**-2), curvature, rtol=0.15, atol=0.4)
@@ -123,16 +130,16 @@ def test_slope_and_curvature_of_the_evidence_are_its_differences(data):
 def test_draws_have_the_mean_and_spread_of_gaussian_regression(data):
     """Rasmussen and Williams, eq. 2.25 and 2.26, the readings linear about the best map."""
     orders, eta, one = orders_of(2), scales_at(), jnp.ones(())
-    state = of._Peak(jnp.zeros(3 * (1 + len(orders))), jnp.asarray(eta), jnp.ones(COUNT))
+    state = of._MapState(jnp.zeros(3 * (1 + len(orders))), jnp.asarray(eta), jnp.ones(COUNT))
     for _ in range(4):
-        state = state._replace(v=of._settled(data, state, one, orders))
+        state = state._replace(v=of._fit_coefficients(data, state, one, orders))
     scales = of.scales_of(jnp.asarray(eta), one)
-    rows = np.asarray(of._numbers_at(data, scales, orders))
-    by = of._linear(data, rows @ state.v, jnp.ones(COUNT), one)
+    rows = np.asarray(of._row_designs(data, scales, orders))
+    by = of._linearise(data, rows @ state.v, jnp.ones(COUNT), one)
     a = np.einsum("ij,ijk->ik", by.slope, rows)
     gain = a.T @ np.linalg.inv(np.asarray(of._covariance(eta, by, orders)))
     at = np.asarray(design(jnp.array([0.2, -0.4]), scales, orders))
-    mean, covariance = at @ gain @ by.off, at @ (np.eye(a.shape[1]) - gain @ a) @ at.T
+    mean, covariance = at @ gain @ by.target, at @ (np.eye(a.shape[1]) - gain @ a) @ at.T
     keys = jax.random.split(jax.random.key(2), 4000)
     draw = jax.vmap(lambda key: of._draw(key, data, state, one, orders))
     drawn = np.asarray(jax.jit(draw)(keys)) @ at.T
@@ -163,7 +170,7 @@ def test_the_search_finds_the_lowest_point_of_each_draw(found):
     minima = minima_of(draws, KNOBS)
     for i in range(6):
         one = jax.tree.map(lambda v, i=i: v[i], draws)
-        value = jax.jit(lambda x, one=one: _of_draw(x, one, orders))
+        value = jax.jit(lambda x, one=one: _draw_value(x, one, orders))
         best = differential_evolution(value, [(-1, 1)] * KNOBS, rng=1, tol=1e-10)
         assert float(minima.value[i]) == pytest.approx(best.fun, abs=1e-5)
 
@@ -177,13 +184,13 @@ def test_scales_have_an_amplitude_of_no_emittance_where_nothing_varies():
 def test_draws_of_a_map_that_no_knob_changes_stand_where_they_are_wanted(data):
     both = of.map_posterior(data, np.array([-1.0, 0.0, 0.0]), 1, KNOBS, 256)
     still = np.arange(256) % 4 == 0
-    found = emittances_of([of.mixed(both, still)])
+    found = emittances_of([of.mix_draws(both, still)])
     values = np.asarray(values_at(found, X))
     assert np.all(np.ptp(values[still], axis=1) < 1e-12)
     assert np.all(np.ptp(values[~still], axis=1) > 1e-3)
     place = np.asarray(minima_of(found, KNOBS).place)[still]
     assert kstest(place.ravel(), uniform(-1, 2).cdf).pvalue > 1e-3
-    level = minima_of(emittances_of([of.mixed(both, np.ones(256, bool))]), KNOBS)
+    level = minima_of(emittances_of([of.mix_draws(both, np.ones(256, bool))]), KNOBS)
     assert np.isfinite(np.asarray(level.best)).all()
 
 
