@@ -34,6 +34,7 @@ from beamfit.emittance.verdict import (
     noise_remark,
     point_remarks,
     resolution_remark,
+    suspect_remark,
     verdict,
     waist_bracketed,
 )
@@ -255,6 +256,8 @@ def _remarks(
         if place:
             place += _bad_in_other_plane(prepared, plane, carrying.point)
         remarks += point_remarks(points, place, float(without))
+    else:
+        remarks.append(suspect_remark(points, evidence.beam))
     remarks.append(resolution_remark(points.size, points.known))
     remarks += [best.remark] * evidence.determined
     return " ".join(filter(None, remarks))

@@ -285,6 +285,19 @@ def point_remarks(points: Points, carrying: str = "", without: float = math.nan)
         )
 
 
+def suspect_remark(points: Points, beam: float) -> str:
+    """Name readings that are probably bad, where the sizes are a beam's with probability `beam`."""
+    bad = np.flatnonzero(beam * points.outlier_probability > 0.5)
+    if not len(bad):
+        return ""
+    verb, object_ = ("are", "them") if len(bad) > 1 else ("is", "it")
+    places = name_places([points.where(i) for i in bad])
+    return (
+        f"If they are, {len(bad)} of {len(points.size)} readings {verb} bad: {places}. Measure "
+        f"{object_} again, or leave {object_} out."
+    )
+
+
 def name_places(places: Sequence[str]) -> str:
     """List the first few places.
 

@@ -72,6 +72,8 @@ class TableEvidence(NamedTuple):
         Scatter of the points, h, if the table gives no errors.
     free : FreeLaw or None
         Posterior with an exponent of a and a change of b; None where the law is known.
+    unphysical : bool
+        True if a loss with a negative a or b is more probable than the free law.
     explained, addition, changed
         Alternatives in time, which a table does not have.
     """
@@ -84,6 +86,7 @@ class TableEvidence(NamedTuple):
     outliers: tuple[str, ...]
     noise: float | None
     free: FreeLaw | None
+    unphysical: bool
     explained: None = None
     addition: None = None
     changed: bool = False
@@ -177,7 +180,8 @@ def _step_or_spike(e: Evidence) -> Finding | None:
 
 def _negative(name: str, cause: str, e: Evidence | TableEvidence) -> Finding | None:
     value, error = e.normal_equivalent(name)
-    if not (value < -BELIEVED * error and value < 0) or e.free is not None:
+    least = LIMIT_95 if e.unphysical else BELIEVED
+    if not (value < -least * error and value < 0) or e.free is not None:
         return None
     cause, (_, error) = _explanation(e) or cause, e.value_and_error(name)
     return Finding(Status.infeasible, f"{name} is negative by {-value / error:.1f} errors; {cause}")

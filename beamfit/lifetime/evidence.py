@@ -529,11 +529,19 @@ class Evidence:
         None if the law is given, if an alternative that the free law does not contain explains the
         record better, or if the decay is within its noise.
         """
+        return free_law(self.record, self.values) if self._law_is_free else None
+
+    @cached_property
+    def _law_is_free(self) -> bool:
+        """True if the free law is the one to be fitted."""
         if self.law is Law.constant or self.shaped or self.cycles > 1:
-            return None
-        if not self.is_clear("rate_mean") or not (self.explained is None or self.has_slow_gas):
-            return None
-        return free_law(self.record, self.values)
+            return False
+        return self.is_clear("rate_mean") and (self.explained is None or self.has_slow_gas)
+
+    @property
+    def unphysical(self) -> bool:
+        """True if a loss with a negative a or b is more probable than the free law."""
+        return self._law_is_free and self.free is None
 
     @property
     def quotes_free_law(self) -> bool:

@@ -577,6 +577,7 @@ def fit_lifetimes(table: LifetimeTable, law: Law | str = Law.free) -> LifetimeFi
     evidence = TableEvidence(
         exact, best.chi2, best.dof, test, _by_current(table, power) if refuted else None,
         _named(table, left_out), None if given else best.scale * unit, free,
+        not known and free is None,
     )  # fmt: skip
     finding = finding_of_table(evidence)
     if not quiet and (single := _single_departure(table, ~left_out)) is not None:

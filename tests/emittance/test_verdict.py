@@ -269,6 +269,22 @@ def test_a_point_that_carries_one_plane_and_is_bad_in_the_other_is_called_so():
     assert f"the point at Q = {k1[1]:.4g} 1/m², which is probably bad in x:" in fit.y.message
 
 
+def test_a_refused_scan_names_the_reading_that_is_bad_if_there_is_a_beam():
+    """A setting read half as large again: whether there is a beam is open, which row is not."""
+    line = beamfit.Beamline((Quadrupole("Q", 0.1), Drift("D", 2.0), Screen("S")), 100.0)
+    rng, named, refused = np.random.default_rng(5), 0, 0
+    for _ in range(12):
+        k1 = np.linspace(-2.0, 12.0, 7)
+        sizes = np.sqrt(design(line, {"Q": k1}) @ np.array([1e-7, -6e-8, 4e-8]))
+        sizes = sizes * (1 + 0.02 * rng.normal(size=7))
+        k1[-1] *= 1.5
+        scan = beamfit.QuadScan({"Q": k1}, {"Q": "k1"}, {"x": sizes}, {"x": 0.02 * sizes})
+        fit = beamfit.fit_emittance(scan, line).x
+        named += f"1 of 7 readings is bad: Q = {k1[-1]:.4g}" in fit.message
+        refused += "may be a beam's" in fit.message
+    assert named >= 0.7 * refused > 0
+
+
 def test_waist_needs_a_rise_on_both_sides():
     settings, screens = {"Q": np.arange(5.0)}, ("S",) * 5
     error = np.full(5, 0.1)
