@@ -93,7 +93,7 @@ CURRENT_WORDS = MONITOR_WORDS | {"current", "i"}
 RING_WORDS = {"sr", "ring", "ler", "her", "total", "average", "mean", "beam", "storage"}
 OTHER_WORDS = {"error", "err", "std", "sd", "sigma", "rms", "set", "setpoint", "target", "nominal"}
 OTHER_WORDS |= {"bunch", "injected", "log"}
-# A lifetime column of an archive, which is not used.
+# A lifetime column of a decay record, which is not used.
 LIFETIME_HEADER = re.compile(r"(.*[\W_])?(life_?time|tau)([\W_].*)?", re.IGNORECASE)
 
 
@@ -215,7 +215,7 @@ def _make_record(sheet: Sheet, offset: str | None) -> DecayRecord:
             option = f"'{example}' in the header, or --columns 'HEADER={example}'"
             found = f"no column of {quantity} among {', '.join(sheet.names)}"
             raise sheet.header_error(found, option)
-    notes = current_column_note(columns)
+    notes = current_column_note(columns) + _lifetime_column_note(sheet, columns["time"])
     sheet = sheet.drop_bad_rows(lambda rows: [rows.values(column) for column in columns.values()])
     if sheet.skip_bad and offset is None:
         sheet, negative_notes = _drop_negative(sheet, columns["current"])
@@ -594,6 +594,18 @@ def current_column_note(columns: Mapping[str, Column]) -> tuple[str, ...]:
     header = columns["current"].header
     unambiguous = standard_header(header).lower().startswith(("beam_current", "val"))
     return () if unambiguous else (f"Column '{header}' is taken for the beam current.",)
+
+
+def _lifetime_column_note(sheet: Sheet, time: Column) -> tuple[str, ...]:
+    """Note on columns of lifetimes in a decay record, which are not used."""
+    names = [f"'{name}'" for name in sheet.names if LIFETIME_HEADER.fullmatch(name)]
+    if not names:
+        return ()
+    unused = f"Columns {', '.join(names)} are" if len(names) > 1 else f"Column {names[0]} is"
+    return (
+        f"{unused} not used: the lifetime comes from the current against time. To fit it as a "
+        f"table of lifetimes against current, leave out the time: --ignore '{time.header}'.",
+    )
 
 
 def _header_reader(sheet: Sheet):
