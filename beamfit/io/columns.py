@@ -29,7 +29,7 @@ from beamfit.io.cells import (
 from beamfit.io.toml import LIST, TABLE, TEXT, Key, read_toml
 from beamfit.particles import LIGHT
 
-# Kind of unit -> unit at the end of a header -> factor to SI (stored current: to mA).
+# Kind of unit -> unit in a header -> factor to SI (stored current: to mA, energy: to MeV).
 UNITS: dict[str, dict[str, float]] = {
     "length": {"um": 1e-6, "mm": 1e-3, "m": 1.0, "nm": 1e-9, "cm": 1e-2},
     "length or duration": {"mm": 1e-3, "m": 1.0, "ps": LIGHT / 1e12},
@@ -37,9 +37,9 @@ UNITS: dict[str, dict[str, float]] = {
     "current": {"mA": 1.0, "A": 1e3, "uA": 1e-3, "nA": 1e-6},
     "voltage": {"kV": 1e3, "V": 1.0, "MV": 1e6},
     "pressure": {"Pa": 1.0, "mbar": 100.0, "Torr": 101325 / 760},
-    "energy in MeV": {"MeV": 1.0},
+    "energy": {"MeV": 1.0, "GeV": 1e3, "keV": 1e-3, "eV": 1e-6},
 }
-UNITS["length or share"] = UNITS["length"] | {"%": 0.01}
+UNITS |= {f"{kind} or share": UNITS[kind] | {"%": 0.01} for kind in ("length", "time")}
 # All units that a header may end with.
 UNIT_NAMES = {*SETTINGS, *(unit for units in UNITS.values() for unit in units)}
 UNIT_SUFFIXES = tuple(f"_{unit}" for unit in UNIT_NAMES)
@@ -58,6 +58,7 @@ UNIT_SPELLINGS = {
         "s": ("sec",),
         "h": ("hours",),
         "MeV": ("MEV", "mev"),
+        "GeV": ("GEV", "gev"),
         "mA": ("ma",),
         "Pa": ("pa", "PA"),
         "Torr": ("torr", "TORR"),
