@@ -447,6 +447,7 @@ def columns_of(
     sheet: Sheet,
     quantities: Mapping[str, str],
     other: Callable[[str], Column | None] = lambda header: None,
+    names: str = "names with units, such as size_x_um or time_s",
 ) -> dict[str, Column]:
     """Map every header of a sheet to a quantity and unit.
 
@@ -459,6 +460,8 @@ def columns_of(
         or a word.
     other : callable
         Column of any other header, in the form of `standard_header`; None if it is unknown.
+    names : str
+        Names expected instead of several unknown ones, for the message.
 
     Returns
     -------
@@ -494,7 +497,7 @@ def columns_of(
         elif not not_in_layout:
             raise _duplicate_error(sheet, column.key, found[column.key].header, header)
     if errors:
-        raise errors[0] if sheet.skip_bad is None else _unknown_columns_error(errors)
+        raise errors[0] if sheet.skip_bad is None else _unknown_columns_error(errors, names)
     return found
 
 
@@ -514,14 +517,14 @@ def _duplicate_error(sheet: Sheet, key: str, first: str, header: str) -> InputEr
     return sheet.header_error(f"{key} also in column '{file_header}'", expected, header)
 
 
-def _unknown_columns_error(errors: Sequence[InputError]) -> InputError:
+def _unknown_columns_error(errors: Sequence[InputError], names: str) -> InputError:
     """Error of all unknown columns, with the options that resolve it."""
     first, ignoring = errors[0], [f"--ignore '{error.column}'" for error in errors]
     columns_option = f"--columns '{first.column}=NAME' says what it is"
     expected = f"{first.expected}; {columns_option}, --ignore leaves it unread"
     if len(errors) > 1:
-        expected = f"names with units, such as size_x_um or time_s; {columns_option} (`beamfit "
-        expected += f"check` proposes a layout), or to leave them unread: {' '.join(ignoring)}"
+        expected = f"{names}; {columns_option} (`beamfit check` proposes a layout), or to leave "
+        expected += f"them unread: {' '.join(ignoring)}"
     return replace(first, expected=expected)
 
 

@@ -164,6 +164,15 @@ ONE: LINE=(Q, M); TWO: LINE=(M, Q, M);
     assert "2 1/m² (k1), 0.1 m long" in out
 
 
+def test_columns_that_resemble_nothing_beside_a_time_are_a_run(run, tmp_path):
+    path = tmp_path / "log.csv"
+    path.write_text("time_s,valve,level\n0,0,0.1\n1,1,0.2\n")
+    status, out, error = run("check", path)
+    assert status == 2
+    assert '# "valve" = ""  # 0: u_valve if an input, y_valve if an output' in out
+    assert "expected inputs u_... and outputs y_..., or --input COLUMN and --output" in error
+
+
 def test_runs_and_formulations_are_understood(run):
     run_of, text = "measurements/valve_level_simulated.csv", "formulations/appendix_d.bf"
     status, out, err = run("check", run_of, text, "--json")
