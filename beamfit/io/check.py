@@ -182,7 +182,7 @@ def _is_unnamed_run(sheet: Sheet) -> bool:
 
 def with_lattice(scan: FileSummary, lattice: FileSummary) -> FileSummary:
     """Add to the summary of a scan whether a lattice has its magnets and screens."""
-    label = f"on {Path(lattice.path).name}"
+    label = f"{LATTICE_LABEL}{Path(lattice.path).name}"
     try:
         lattice.content.check_scan(scan.content)
     except InputError as error:
@@ -198,6 +198,13 @@ def with_lattice(scan: FileSummary, lattice: FileSummary) -> FileSummary:
     notes = (*scan.notes, *(note for note in warnings if note not in scan.notes))
     fact = Fact(label, "has all its magnets and screens", {"fits": True})
     return replace(scan, facts=(*scan.facts, fact), notes=notes)
+
+
+def misfit(scan: FileSummary) -> str | None:
+    """Reason why a scan fits none of its lattices; None if it fits one, or has none."""
+    found = [fact.value for fact in scan.facts if fact.label.startswith(LATTICE_LABEL)]
+    reasons = [value["why"] for value in found if not value["fits"]]
+    return f"{scan.path}: {reasons[0]}" if reasons and len(reasons) == len(found) else None
 
 
 def _file_kind(path: str | PathLike[str], layout: Layout) -> str:
@@ -225,6 +232,8 @@ def _file_kind(path: str | PathLike[str], layout: Layout) -> str:
     return "record" if is_archive or has_current else "scan"
 
 
+# Beginning of the label of a fact that compares a scan with a lattice.
+LATTICE_LABEL = "on "
 # Prefixes of inputs and outputs of a run.
 RUN_PREFIXES = {"u_", "y_"}
 # Units as they are shown.

@@ -75,6 +75,17 @@ def test_a_scan_is_held_against_each_lattice(files):
     assert "did you mean Q3?" in facts(said)["on other.toml"]["why"]
 
 
+def test_a_scan_that_fits_no_lattice_is_unusable_with_them(run, files):
+    scan, good, other = (files / name for name in ("scan.csv", "line.toml", "other.toml"))
+    other.write_text(LATTICE.replace('"Q2"', '"Q3"'))
+    status, out, error = run("check", scan, other)
+    assert (status, error.count("\n")) == (2, 1)
+    assert "other.toml: a lattice" in out
+    assert f"beamfit: {scan}: " in error
+    assert "did you mean Q3?" in error
+    assert run("check", scan, good, other)[::2] == (0, "")
+
+
 def test_sizes_and_settings_in_another_unit_are_asked_about(files):
     (files / "scan.csv").write_text(SCAN.replace("fwhm_x_mm", "size_x_m").replace(",0.", ",0.02"))
     wide = file_summary(files / "scan.csv")
