@@ -457,21 +457,9 @@ OUTLIER_FACTOR = 100.0
 MIN_ERROR_RATIO = 1e-4
 # Ranges of other quantities: low (excluded), high (included), and words for the message.
 RANGES = {
-    "energy": (
-        0.511,
-        1e7,
-        "a total energy between 0.511 MeV and 10 TeV; is it in another unit, such as GeV?",
-    ),
-    "kinetic_energy": (
-        0.0,
-        1e7,
-        "a kinetic energy between 0 and 10 TeV; is it in another unit, such as GeV?",
-    ),
-    "momentum": (
-        0.0,
-        1e7,
-        "a momentum (p c) between 0 and 10 TeV; is it in another unit, such as GeV?",
-    ),
+    "energy": (0.511, 1e7, "a total energy between 0.511 MeV and 10 TeV; is it in GeV or eV?"),
+    "kinetic_energy": (0.0, 1e7, "a kinetic energy between 0 and 10 TeV; is it in GeV or eV?"),
+    "momentum": (0.0, 1e7, "a momentum (p c) between 0 and 10 TeV; is it in GeV or eV?"),
     "resolution": (-1e-300, USUAL[1], "a resolution between 0 and 20 mm"),
     "energy_spread": (-1e-300, 0.2, "a relative spread between 0 and 0.2; is it in %?"),
     "shots": (0.5, 1e9, "how many shots the row is the mean of, and its errors are taken from"),
