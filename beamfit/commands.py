@@ -200,8 +200,14 @@ def identify(
     (['tau', 'K', 'offset', 'delay'], 'poor_fit')
     """
     check_model(model, map, order=order, delay=delay, offset=offset)
-    runs = [runs] if not isinstance(runs, list | tuple) else runs
-    options: dict[str, Any] = {"hidden": hidden, "seed": seed, "held": tuple(held)}
+    from beamfit.dynamics.record import check_inputs, check_runs
+
+    runs, held = check_runs(runs, held, even=False)
+    if model != FED_BATCH:
+        check_inputs(runs)
+
+    # JAX from here on
+    options: dict[str, Any] = {"hidden": hidden, "seed": seed, "held": held}
     if model == FED_BATCH:
         from beamfit.dynamics.fedbatch import identify_batches
 

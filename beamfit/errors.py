@@ -97,15 +97,20 @@ def _clean(text: str) -> str:
 
 
 def short(text: str, most: int) -> str:
-    """Shorten a text by leaving out its middle; its end often says what to do.
+    """Shorten a text by leaving out words in its middle; its end often says what to do.
 
     Examples
     --------
     >>> short("one of Q1, Q2, Q3, Q4, Q5, Q6 (did you mean Q2?)", 40)
-    'one of Q1, Q2,  ... 6 (did you mean Q2?)'
+    'one of Q1, Q2, ... (did you mean Q2?)'
     """
+    if len(text) <= most:
+        return text
     end = min(120, most // 2)
-    return text if len(text) <= most else f"{text[: most - end - 5]} ... {text[-end:].lstrip()}"
+    begin = most - end - 5
+    first = text[: begin + 1].rpartition(" ")[0] or text[:begin]
+    last = text[-end - 1 :].partition(" ")[2] or text[-end:]
+    return f"{first} ... {last}"
 
 
 def expect(value: object, kind: Any, instead: str) -> None:

@@ -15,6 +15,7 @@ import numpy as np
 
 from beamfit.batch.columns import COLUMNS, KEY_COLUMNS, NUMBERS, UNUSABLE
 from beamfit.batch.job import Job
+from beamfit.batch.request import TABLE_SUFFIXES
 from beamfit.errors import InputError
 from beamfit.io.files import digest_now
 from beamfit.writing import replacing, write_atomically
@@ -161,4 +162,4 @@ def _append_cells(data: Any, cells: tuple[str, ...]) -> None:
     data[before:] = np.array([float(c or "nan") for c in cells]) if numbers else list(cells)
 
 
-WRITERS = {".csv": _csv, ".parquet": _parquet, ".h5": _hdf5, ".hdf5": _hdf5}
+WRITERS = dict(zip(TABLE_SUFFIXES, (_csv, _parquet, _hdf5, _hdf5), strict=True))

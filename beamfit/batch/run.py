@@ -12,9 +12,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from beamfit.batch.job import Job
-from beamfit.batch.ledger import WRITERS, Ledger
+from beamfit.batch.ledger import Ledger
+from beamfit.batch.request import check_request, find_files
 from beamfit.errors import InputError
-from beamfit.writing import alone, check_place
+from beamfit.writing import alone
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -23,11 +24,6 @@ if TYPE_CHECKING:
 FILES_PER_TASK = 256
 # Timeout for the scheduler and for results, s.
 TIMEOUT = 10.0
-FILE_SUFFIXES = {
-    "emittance": (".csv", ".txt", ".h5", ".hdf5", ".mat", ".tfs"),
-    "lifetime": (".csv", ".txt", ".h5", ".hdf5", ".json"),
-}
-INSTALL_HINT = "the extra: pip install 'beamfit[batch]'"
 
 
 class Batch(NamedTuple):
@@ -52,34 +48,6 @@ class Batch(NamedTuple):
     statuses: dict[str, int]
     refused: dict[str, str]
     ledger: Ledger
-
-
-def find_files(paths: Iterable[str], kind: str) -> tuple[str, ...]:
-    """List files, and files of a kind in folders and their sub-folders, each once.
-
-    Raises
-    ------
-    InputError
-        If there are none. A single missing file among others is answered as `unusable`.
-    """
-    found: dict[str, None] = {}
-    for path in paths:
-        if Path(path).is_dir():
-            inside = sorted(
-                p for p in Path(path).rglob("*") if p.suffix.lower() in FILE_SUFFIXES[kind]
-            )
-            found |= dict.fromkeys(str(p) for p in inside if _is_input(p.relative_to(path)))
-        else:
-            found[path] = None
-    if not any(Path(file).exists() for file in found):
-        expected = f"files ending in {', '.join(FILE_SUFFIXES[kind])}"
-        raise InputError("no files", expected, path=next(iter(paths), None))
-    return tuple(found)
-
-
-def _is_input(path: Path) -> bool:
-    """True if a path in a folder is neither hidden nor a part of an earlier batch."""
-    return not any(part.startswith(".") or part.endswith(".parts") for part in path.parts)
 
 
 def run_batch(
@@ -130,7 +98,7 @@ def run_batch(
     (2, {'unusable': 2})
     """
     target = Path(out)
-    _check_request(target, workers, scheduler)
+    check_request(target, workers, scheduler)
     files = tuple(f for f in find_files(paths, job.kind) if Path(f) != target)
     with alone(target):
         ledger = Ledger(target, job)
@@ -147,22 +115,6 @@ def run_batch(
     statuses = Counter(status for place in places for status in place.statuses)
     refused = {f: p.reason for f, p in zip(files, places, strict=True) if p.reason}
     return Batch(files, len(pending), dict(statuses.most_common()), refused, ledger)
-
-
-def _check_request(out: Path, workers: int | None, scheduler: str | None) -> None:
-    """Check the request before anything is computed."""
-    check_place(out)
-    if out.suffix.lower() not in WRITERS:
-        raise InputError(f"a table '{out}'", f"a name ending in {', '.join(WRITERS)}")
-    if workers is not None and scheduler is not None:
-        raise InputError("both workers and a scheduler", "one of them")
-    try:
-        if out.suffix.lower() == ".parquet":
-            import pyarrow.parquet  # noqa: F401
-        if workers is not None or scheduler is not None:
-            import distributed  # noqa: F401
-    except ImportError as error:
-        raise InputError(f"no package {error.name}", INSTALL_HINT) from None
 
 
 def _answers(

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
 import beamfit
 from beamfit.answer import Table
+from beamfit.batch.request import check_request, find_files
 from beamfit.cli.options import Command, Output, command_line, option, options
 from beamfit.errors import InputError
 from beamfit.writing import check_place
@@ -74,6 +76,10 @@ def batch(
     part = {n: input_options[n] for n in ("use", "energy", "particle", "first", "last", "screen")}
     reading = {n: input_options[n] for n in ("columns", "ignore", "skip_bad")}
     _check_kind(kind, {"lattice": lattice, "noise": noise, "learn-noise": learned} | part)
+    check_request(Path(out), workers, scheduler)
+    find_files(path, kind)
+
+    # JAX from here on
     from beamfit.batch.course import chart_quantity, courses_of, summary_of
 
     chart_quantity(kind, quantity)  # raises before hours of work if there is no such quantity

@@ -11,7 +11,7 @@ import beamfit
 from beamfit.answer import text_of
 from beamfit.cli.options import Command, Output, command_line, options
 from beamfit.errors import InputError
-from beamfit.io.check import FileSummary, proposed_layout, with_lattice
+from beamfit.io.check import FileSummary, misfit, proposed_layout, with_lattice
 from beamfit.io.columns import Layout
 from beamfit.io.result import results_text
 
@@ -30,8 +30,9 @@ def check(files: tuple[str, ...], output: Output, **reading: Any) -> None:
 
     For each FILE it shows the kind, the rows, the magnets and their units, the range of the sizes
     and the source of their errors, the energy, and anything odd; for a scan also whether each given
-    lattice has its magnets and screens. All files are checked. An unusable file gives its error
-    line and exit status 2; for unknown columns a layout is proposed.
+    lattice has its magnets and screens. All files are checked. An unusable file, or a scan that
+    fits none of the lattices, gives its error line and exit status 2; for unknown columns a layout
+    is proposed.
     """
     found: list[FileSummary] = []
     wrong: list[tuple[str, InputError]] = []
@@ -53,9 +54,10 @@ def check(files: tuple[str, ...], output: Output, **reading: Any) -> None:
         _show(found)
         for layout in layouts:
             click.echo(f"# Complete and save as layout.toml, for --columns layout.toml\n{layout}\n")
-    for _, error in wrong:
-        click.echo(f"beamfit: {error}", err=True)
-    sys.exit(2 if wrong else 0)
+    reasons = [*filter(None, map(misfit, found)), *(str(error) for _, error in wrong)]
+    for reason in reasons:
+        click.echo(f"beamfit: {reason}", err=True)
+    sys.exit(2 if reasons else 0)
 
 
 def _propose_layout(path: str, columns: Layout | None) -> str | None:

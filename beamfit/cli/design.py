@@ -11,6 +11,7 @@ from beamfit.answer import text_of
 from beamfit.cli.option_text import energies_of
 from beamfit.cli.options import Command, Output, option, options
 from beamfit.emittance.assumptions import Assumptions
+from beamfit.emittance.targets import check_limits
 from beamfit.io.line import build_line, read_inputs
 from beamfit.io.priors import read_noise
 
@@ -76,6 +77,7 @@ def design(
     read = read_inputs(scan, **input_options)
     measured, described, _ = read
     described.check_magnets(limits)
+    check_limits(described, limits)
     described.check_energies(others)
 
     # JAX from here on

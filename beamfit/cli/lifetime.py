@@ -124,9 +124,9 @@ def lifetime(
     inputs = {path: digest(path) for path in (*record, ring) if path is not None}
 
     tables = [each for each in records if isinstance(each, LifetimeTable)]
-    with_more = sample or study or trend or output.report or ring or monitor
+    with_more = sample or study or trend or ring or monitor
     if tables and (len(tables) < len(records) or with_more):
-        expected = "tables of lifetimes by themselves, with no option but --law and --json"
+        expected = "tables of lifetimes by themselves, with no option but --law, --report, --json"
         raise InputError("a table of lifetimes", expected, path=tables[0].name)
     if tables:
         _answer_tables(tables, law, inputs, output)
@@ -159,6 +159,7 @@ def _answer_tables(
 ) -> None:
     """Fit and show tables of lifetimes."""
     fits = [beamfit.fit_lifetimes(table, law) for table in tables]
+    output.write(fits, inputs)
     output.answer(fits, inputs, lambda terminal: _show_lifetimes(terminal, fits))
 
 

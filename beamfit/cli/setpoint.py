@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -12,7 +12,7 @@ import beamfit
 from beamfit.answer import text_of
 from beamfit.cli.option_text import target_of
 from beamfit.cli.options import Command, Output, option, options
-from beamfit.emittance.targets import Beam, Target, common_energy
+from beamfit.emittance.targets import Beam, Target, check_limits, common_energy
 from beamfit.errors import InputError, located
 from beamfit.io.files import digest
 from beamfit.io.line import build_line, read_lattice
@@ -74,14 +74,32 @@ def setpoint(
     targets = [target_of(text, plane) for text in target]
     described = read_lattice(lattice, **part)
     described.check_magnets(limits)
+    check_limits(described, limits)
     if fitted is None:
         beams = _beam_of_sigma(sigma, plane)
     else:
         beams = _beams_of_fit(fitted, described, targets, part["energy"])
+    _check_given(targets, beams, described)
     line = build_line(described)  # JAX from here on
     found = beamfit.find_setpoint(line, beams, limits, targets, screen=part["screen"])
     inputs = {path: digest(path) for path in (lattice, fitted) if path is not None}
     output.answer([found], inputs, lambda terminal: _show(terminal, found))
+
+
+def _check_given(
+    targets: Sequence[Target], beams: Mapping[str, Beam], lattice: LatticeFile
+) -> None:
+    """Refuse targets in a plane without a beam, or at a design that the lattice lacks."""
+    for target in targets:
+        plane = target.plane
+        if plane not in beams:
+            found = f"a target in plane {plane}, whose beam is not given"
+            expected = f"--sigma with --plane {plane}, or --fit of a scan in {plane}"
+            raise InputError(found, expected)
+        if target.kind == "match" and target.value is None and plane not in (lattice.design or {}):
+            found = f"--target match in plane {plane} without design Twiss"
+            expected = "match=BETA_M:ALPHA, or a table [design] in the lattice"
+            raise InputError(found, expected, lattice.path)
 
 
 def _beam_of_sigma(sigma: str | None, plane: str) -> dict[str, Beam]:

@@ -17,7 +17,7 @@ from beamfit.answer import Table
 from beamfit.dynamics.record import Run
 from beamfit.emittance.scan import QuadScan
 from beamfit.errors import InputError
-from beamfit.io.columns import Columns, Layout, layout_of, layout_text
+from beamfit.io.columns import Columns, Layout, Sheet, layout_of, layout_text
 from beamfit.io.decay_record import (
     is_current,
     likely_record_name,
@@ -150,23 +150,39 @@ def proposed_layout(path: str | PathLike[str], columns: Columns = None) -> str |
     """Write a layout for the unknown columns of a table; None if there are none."""
     layout = layout_of(columns)
     kind = _file_kind(path, layout)
-    if kind not in ("scan", "record") or is_emittance_gui(path):
+    if kind not in ("scan", "record", "run") or is_emittance_gui(path):
         return None
     guesses = [likely_scan_name, likely_record_name]
     guesses = guesses if kind == "scan" else guesses[::-1]
     sheet = read_columns(path, "", layout, skip_bad=True)
-    unknown = {
-        name: (guesses[0](name, cell) or guesses[1](name, cell), cell)
-        for name, cells in zip(sheet.names, sheet.cells, strict=True)
-        if not (is_scan_header(name, sheet) or record_column(sheet, name))
-        for cell in [next(iter(cells), "")]
-    }
+    unknown = {}
+    for name in _unknown_headers(sheet):
+        cell = next(iter(sheet[name]), "")
+        if kind != "run":
+            unknown[name] = guesses[0](name, cell) or guesses[1](name, cell), cell
+        elif name[:2] not in RUN_PREFIXES:
+            unknown[name] = None, f"{cell}: u_{name} if an input, y_{name} if an output"
     return layout_text(unknown) if unknown else None
+
+
+def _unknown_headers(sheet: Sheet) -> list[str]:
+    """Headers of a table that belong neither to a scan nor to a record."""
+    return [n for n in sheet.names if not (is_scan_header(n, sheet) or record_column(sheet, n))]
+
+
+def _is_unnamed_run(sheet: Sheet) -> bool:
+    """True for a column of time and two or more others that resemble none of a scan or record."""
+    unknown = _unknown_headers(sheet)
+    known = [record_column(sheet, name) for name in sheet.names if name not in unknown]
+    if [column and column.key for column in known] != ["time"] or len(unknown) < 2:
+        return False
+    cells = [(name, next(iter(sheet[name]), "")) for name in unknown]
+    return not any(likely_scan_name(*each) or likely_record_name(*each) for each in cells)
 
 
 def with_lattice(scan: FileSummary, lattice: FileSummary) -> FileSummary:
     """Add to the summary of a scan whether a lattice has its magnets and screens."""
-    label = f"on {Path(lattice.path).name}"
+    label = f"{LATTICE_LABEL}{Path(lattice.path).name}"
     try:
         lattice.content.check_scan(scan.content)
     except InputError as error:
@@ -184,6 +200,13 @@ def with_lattice(scan: FileSummary, lattice: FileSummary) -> FileSummary:
     return replace(scan, facts=(*scan.facts, fact), notes=notes)
 
 
+def misfit(scan: FileSummary) -> str | None:
+    """Reason why a scan fits none of its lattices; None if it fits one, or has none."""
+    found = [fact.value for fact in scan.facts if fact.label.startswith(LATTICE_LABEL)]
+    reasons = [value["why"] for value in found if not value["fits"]]
+    return f"{scan.path}: {reasons[0]}" if reasons and len(reasons) == len(found) else None
+
+
 def _file_kind(path: str | PathLike[str], layout: Layout) -> str:
     """Determine the kind of a file from its name and header."""
     suffix = Path(path).suffix.lower()
@@ -196,18 +219,23 @@ def _file_kind(path: str | PathLike[str], layout: Layout) -> str:
         return "formulation"
     if is_emittance_gui(path):
         return "scan"
-    names = read_columns(path, "Q2_A,size_x_um", layout, skip_bad=True).names
+    sheet = read_columns(path, "Q2_A,size_x_um", layout, skip_bad=True)
+    names = sheet.names
     head = ",".join(names)
     if re.search(r"\bbeta_x_m\b|\bBETX\b", head):
         found = "the optics of a ring"
         raise InputError(found, "the ring file (TOML) that names it under [optics] twiss", path)
-    if {"u_", "y_"} <= {name[:2] for name in names}:
+    if {name[:2] for name in names} >= RUN_PREFIXES or _is_unnamed_run(sheet):
         return "run"
     is_archive = {"secs", "nanos"} <= set(names)
     has_current = any(map(is_current, names)) and not any(map(is_size, names))
     return "record" if is_archive or has_current else "scan"
 
 
+# Beginning of the label of a fact that compares a scan with a lattice.
+LATTICE_LABEL = "on "
+# Prefixes of inputs and outputs of a run.
+RUN_PREFIXES = {"u_", "y_"}
 # Units as they are shown.
 UNIT_TEXT = {"A": "A", "kG": "kG integrated gradient", "T_per_m": "T/m", "k1": "1/m² (k1)"}
 UNIT_TEXT |= {"k1l": "1/m (k1l)"}

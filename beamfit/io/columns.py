@@ -29,7 +29,7 @@ from beamfit.io.cells import (
 from beamfit.io.toml import LIST, TABLE, TEXT, Key, read_toml
 from beamfit.particles import LIGHT
 
-# Kind of unit -> unit at the end of a header -> factor to SI (stored current: to mA).
+# Kind of unit -> unit in a header -> factor to SI (stored current: to mA, energy: to MeV).
 UNITS: dict[str, dict[str, float]] = {
     "length": {"um": 1e-6, "mm": 1e-3, "m": 1.0, "nm": 1e-9, "cm": 1e-2},
     "length or duration": {"mm": 1e-3, "m": 1.0, "ps": LIGHT / 1e12},
@@ -37,9 +37,9 @@ UNITS: dict[str, dict[str, float]] = {
     "current": {"mA": 1.0, "A": 1e3, "uA": 1e-3, "nA": 1e-6},
     "voltage": {"kV": 1e3, "V": 1.0, "MV": 1e6},
     "pressure": {"Pa": 1.0, "mbar": 100.0, "Torr": 101325 / 760},
-    "energy in MeV": {"MeV": 1.0},
+    "energy": {"MeV": 1.0, "GeV": 1e3, "keV": 1e-3, "eV": 1e-6},
 }
-UNITS["length or share"] = UNITS["length"] | {"%": 0.01}
+UNITS |= {f"{kind} or share": UNITS[kind] | {"%": 0.01} for kind in ("length", "time")}
 # All units that a header may end with.
 UNIT_NAMES = {*SETTINGS, *(unit for units in UNITS.values() for unit in units)}
 UNIT_SUFFIXES = tuple(f"_{unit}" for unit in UNIT_NAMES)
@@ -58,6 +58,7 @@ UNIT_SPELLINGS = {
         "s": ("sec",),
         "h": ("hours",),
         "MeV": ("MEV", "mev"),
+        "GeV": ("GEV", "gev"),
         "mA": ("ma",),
         "Pa": ("pa", "PA"),
         "Torr": ("torr", "TORR"),
@@ -446,6 +447,7 @@ def columns_of(
     sheet: Sheet,
     quantities: Mapping[str, str],
     other: Callable[[str], Column | None] = lambda header: None,
+    names: str = "names with units, such as size_x_um or time_s",
 ) -> dict[str, Column]:
     """Map every header of a sheet to a quantity and unit.
 
@@ -458,6 +460,8 @@ def columns_of(
         or a word.
     other : callable
         Column of any other header, in the form of `standard_header`; None if it is unknown.
+    names : str
+        Names expected instead of several unknown ones, for the message.
 
     Returns
     -------
@@ -493,7 +497,7 @@ def columns_of(
         elif not not_in_layout:
             raise _duplicate_error(sheet, column.key, found[column.key].header, header)
     if errors:
-        raise errors[0] if sheet.skip_bad is None else _unknown_columns_error(errors)
+        raise errors[0] if sheet.skip_bad is None else _unknown_columns_error(errors, names)
     return found
 
 
@@ -513,14 +517,14 @@ def _duplicate_error(sheet: Sheet, key: str, first: str, header: str) -> InputEr
     return sheet.header_error(f"{key} also in column '{file_header}'", expected, header)
 
 
-def _unknown_columns_error(errors: Sequence[InputError]) -> InputError:
+def _unknown_columns_error(errors: Sequence[InputError], names: str) -> InputError:
     """Error of all unknown columns, with the options that resolve it."""
     first, ignoring = errors[0], [f"--ignore '{error.column}'" for error in errors]
     columns_option = f"--columns '{first.column}=NAME' says what it is"
     expected = f"{first.expected}; {columns_option}, --ignore leaves it unread"
     if len(errors) > 1:
-        expected = f"names with units, such as size_x_um or time_s; {columns_option} (`beamfit "
-        expected += f"check` proposes a layout), or to leave them unread: {' '.join(ignoring)}"
+        expected = f"{names}; {columns_option} (`beamfit check` proposes a layout), or to leave "
+        expected += f"them unread: {' '.join(ignoring)}"
     return replace(first, expected=expected)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from os import PathLike
 from typing import TYPE_CHECKING, NamedTuple
@@ -26,7 +26,7 @@ from beamfit.io.columns import (
     unit_at_end,
 )
 from beamfit.io.files import name_of
-from beamfit.io.scan import is_size
+from beamfit.io.scan import ERROR_WORDS, PERCENT, is_size
 from beamfit.io.table import read_columns
 from beamfit.lifetime.record import (
     Conditions,
@@ -44,9 +44,9 @@ EXAMPLE_HEADER = "time_s,beam_current_mA"
 # Columns of a lifetime table without their unit, and the kind of unit.
 LIFETIME_QUANTITIES = {
     "tau": "time",
-    "tau_error": "time",
+    "tau_error": "time or share",
     "lifetime": "time",
-    "lifetime_error": "time",
+    "lifetime_error": "time or share",
     "beam_current": "current",
 }
 INCREASING_TIMES = "times that increase"
@@ -93,7 +93,7 @@ CURRENT_WORDS = MONITOR_WORDS | {"current", "i"}
 RING_WORDS = {"sr", "ring", "ler", "her", "total", "average", "mean", "beam", "storage"}
 OTHER_WORDS = {"error", "err", "std", "sd", "sigma", "rms", "set", "setpoint", "target", "nominal"}
 OTHER_WORDS |= {"bunch", "injected", "log"}
-# A lifetime column of an archive, which is not used.
+# A lifetime column of a decay record, which is not used.
 LIFETIME_HEADER = re.compile(r"(.*[\W_])?(life_?time|tau)([\W_].*)?", re.IGNORECASE)
 
 
@@ -127,8 +127,9 @@ def read_lifetimes(
     Parameters
     ----------
     path : str, path or pandas.DataFrame
-        A frame, CSV or HDF5 with `tau_h` (or `lifetime_h`; also _min, _s) and `beam_current_mA`;
-        optionally `tau_error_h`.
+        A frame, CSV or HDF5 with `tau_h` (or `lifetime_h`; also _min, _s) and `beam_current_mA`
+        (or another header of a current, as in a decay record); optionally `tau_error_h` or
+        `tau_error_%`.
     columns, ignore, skip_bad
         As for `read_decay_record`.
 
@@ -215,7 +216,7 @@ def _make_record(sheet: Sheet, offset: str | None) -> DecayRecord:
             option = f"'{example}' in the header, or --columns 'HEADER={example}'"
             found = f"no column of {quantity} among {', '.join(sheet.names)}"
             raise sheet.header_error(found, option)
-    notes = current_column_note(columns)
+    notes = current_column_note(columns) + _lifetime_column_note(sheet, columns["time"])
     sheet = sheet.drop_bad_rows(lambda rows: [rows.values(column) for column in columns.values()])
     if sheet.skip_bad and offset is None:
         sheet, negative_notes = _drop_negative(sheet, columns["current"])
@@ -341,7 +342,7 @@ def _check_time_origin(sheet: Sheet, column: Column, time: np.ndarray) -> None:
 
 def _lifetime_table(sheet: Sheet) -> LifetimeTable:
     """Make a lifetime table from the columns of a sheet."""
-    columns = columns_of(sheet, LIFETIME_QUANTITIES)
+    columns = columns_of(sheet, LIFETIME_QUANTITIES, _table_reader(sheet))
     kinds = [kind for kind in ("tau", "lifetime") if kind in columns]
     if len(kinds) != 1 or "beam_current" not in columns:
         raise sheet.header_error(
@@ -354,9 +355,27 @@ def _lifetime_table(sheet: Sheet) -> LifetimeTable:
         lambda rows: [_positive_values(rows, column) for column in wanted.values()]
     )
     values = {key: _positive_values(sheet, column) for key, column in wanted.items()}
+    if error is not None and error.unit == PERCENT:
+        values["error"] = values["error"] * values["lifetime"]
     hours = {key: values[key] / 3600 for key in ("lifetime", "error") if key in values}
-    provenance = {"comments": sheet.comments, "notes": sheet_notes(sheet)}
+    notes = current_column_note(wanted) + sheet_notes(sheet)
+    provenance = {"comments": sheet.comments, "notes": notes}
     return LifetimeTable(values["current"], **hours, name=name_of(sheet.path), **provenance)
+
+
+def _table_reader(sheet: Sheet) -> Callable[[str], Column | None]:
+    """Make a reader of headers outside `LIFETIME_QUANTITIES`: beam currents, and bare errors."""
+    has_current, factors = _names_beam_current(sheet), UNITS["time or share"]
+    # Two errors of one lifetime have one key, and are refused.
+    is_tau = any(standard_header(name).lower().startswith("tau_") for name in sheet.names)
+
+    def read_header(header: str) -> Column | None:
+        name, _, unit = header.rpartition("_")
+        if name.lower() in ERROR_WORDS and unit in factors:
+            return Column(header, f"{'tau' if is_tau else 'lifetime'}_error", unit, factors[unit])
+        return None if has_current else _current_column(header)
+
+    return read_header
 
 
 def _positive_values(sheet: Sheet, column: Column) -> np.ndarray:
@@ -596,12 +615,24 @@ def current_column_note(columns: Mapping[str, Column]) -> tuple[str, ...]:
     return () if unambiguous else (f"Column '{header}' is taken for the beam current.",)
 
 
+def _lifetime_column_note(sheet: Sheet, time: Column) -> tuple[str, ...]:
+    """Note on columns of lifetimes in a decay record, which are not used."""
+    names = [f"'{name}'" for name in sheet.names if LIFETIME_HEADER.fullmatch(name)]
+    if not names:
+        return ()
+    unused = f"Columns {', '.join(names)} are" if len(names) > 1 else f"Column {names[0]} is"
+    return (
+        f"{unused} not used: the lifetime comes from the current against time. To fit it as a "
+        f"table of lifetimes against current, leave out the time: --ignore '{time.header}'.",
+    )
+
+
 def _header_reader(sheet: Sheet):
     """Make a reader of headers outside `QUANTITIES`: of archives, dates, and beam currents.
 
     A beam current is guessed only if no header is named beam_current.
     """
-    has_current = any(standard_header(n).lower().startswith("beam_current_") for n in sheet.names)
+    has_current = _names_beam_current(sheet)
     first = {UTC_SUFFIX.sub("", n.lower()): next(iter(sheet[n]), "") for n in sheet.names}
     # A column `time` has dates; one of another such name only if its first cell is no number.
     dates = {name for name in DATE_HEADERS & set(first) if not is_number(first[name])} | {"time"}
@@ -624,6 +655,10 @@ def _header_reader(sheet: Sheet):
         return None if has_current else _current_column(header)
 
     return read_header
+
+
+def _names_beam_current(sheet: Sheet) -> bool:
+    return any(standard_header(n).lower().startswith("beam_current_") for n in sheet.names)
 
 
 def _current_column(header: str) -> Column | None:

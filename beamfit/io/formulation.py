@@ -14,7 +14,8 @@ from beamfit.io.cells import check_length
 from beamfit.io.files import read_text, text_lines
 from beamfit.language.document import Document
 from beamfit.language.parse import parse_document
-from beamfit.language.plan import check_document
+from beamfit.language.plan import check_document, check_mapping
+from beamfit.language.scope import values_of
 from beamfit.language.text import format_document
 from beamfit.language.xml import format_xml, parse_xml
 from beamfit.writing import write_atomically
@@ -205,7 +206,9 @@ def solve_formulation(
         With file, line and column.
     """
     with located(path):
-        check_document(document, {n: t.shape for n, t in (tables or {}).items()}, values or ())
+        shapes = {n: t.shape for n, t in (tables or {}).items()}
+        check_document(document, shapes, values or ())
+        values_of(check_mapping(document.mapping, shapes).scope, values or {})
         if document.problem is None:
             from beamfit.language.compiled import compute_document  # JAX from here on
 

@@ -162,6 +162,11 @@ class LatticeFile:
         """Refuse a scan with magnets or screens that the lattice lacks; see `check_names`."""
         check_names(scan, self.calibrations, self.places, self.default_screen, self.rest_energy)
 
+    @property
+    def magnets(self) -> list[str]:
+        """Names of the magnets and supplies that can be set, as of a `Beamline`."""
+        return list(self.calibrations)
+
     def check_magnets(self, limits: Iterable[str]) -> None:
         """Refuse limits of a magnet that the lattice lacks.
 

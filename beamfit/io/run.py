@@ -32,6 +32,7 @@ if TYPE_CHECKING:
 
 UNUSED, TIME = "unused", "time"
 EXAMPLE_HEADER = "time_s,u_valve,y_level"
+RUN_NAMES = "inputs u_... and outputs y_..., or --input COLUMN and --output COLUMN"
 
 
 def read_run(
@@ -87,7 +88,7 @@ def read_run(
     layout = layout_of(columns) + Layout(tuple(named), tuple(name for name, _ in named))
     sheet = read_columns(path, EXAMPLE_HEADER, layout, ignore, skip_bad)
     read_header = partial(_run_column, sheet=sheet, named=bool(named))
-    columns = columns_of(sheet, {TIME: "time"}, read_header)
+    columns = columns_of(sheet, {TIME: "time"}, read_header, RUN_NAMES)
     columns = {key: column for key, column in columns.items() if not key.startswith(UNUSED)}
     if TIME not in columns and step is None:
         raise sheet.header_error("no column of time", "time_s, or --step SECONDS")
@@ -115,14 +116,16 @@ def read_run(
     return Run(time, u, y, name=name_of(sheet.path), path=str(sheet.path), **provenance)
 
 
-def _run_column(header: str, sheet: Sheet, named: bool) -> Column | None:
+def _run_column(header: str, sheet: Sheet, named: bool) -> Column:
     """Column of time, input or output; if some are named, others are not read."""
     if header.lower() == TIME:
         return Column(header, TIME, DATE)
     is_read = header in sheet.file_headers or not named
     if is_read and len(header) > 2 and header[:2] in ("u_", "y_"):
         return Column(header, header)
-    return Column(header, f"{UNUSED} {header}") if header.startswith("note_") else None
+    if header.startswith("note_"):
+        return Column(header, f"{UNUSED} {header}")
+    raise sheet.header_error("neither time, input nor output", RUN_NAMES, header)
 
 
 def _run_values(sheet: Sheet, columns: Mapping[str, Column]) -> dict[str, np.ndarray]:

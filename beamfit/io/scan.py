@@ -49,7 +49,7 @@ QUANTITIES = {
     **dict.fromkeys(("size_x", "size_y"), "length"),
     **dict.fromkeys(("size_x_error", "size_y_error"), "length or share"),
     "resolution": "length",
-    **dict.fromkeys(ENERGIES, "energy in MeV"),
+    **dict.fromkeys(ENERGIES, "energy"),
     "energy_spread": "",
     "shot": "",
     "shots": "",

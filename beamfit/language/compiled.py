@@ -21,7 +21,7 @@ from beamfit.language import expression as x
 from beamfit.language.evaluate import Context, assign, check_rank, evaluate
 from beamfit.language.expression import error_at
 from beamfit.language.plan import Order, StepGroup, check_mapping
-from beamfit.language.scope import MappingStep, Scope, add_iterators, reads
+from beamfit.language.scope import MappingStep, Scope, add_iterators, reads, values_of
 from beamfit.language.steps import Arrays, defaults, run_call, scan_recurrence
 
 
@@ -278,27 +278,6 @@ def gain_parts(gain: str) -> tuple[str, str]:
     if not found:
         raise InputError(f"--derivative '{gain}'", "dOUTPUT/dINPUT, such as dy/dx")
     return found[1], found[2]
-
-
-def values_of(scope: Scope, given: Mapping[str, Sequence[float]]) -> dict[str, np.ndarray]:
-    """Make arrays of inputs from one number each, or one for each element in C order.
-
-    Raises
-    ------
-    InputError
-        If a name is not an input of the mapping, or the count is wrong.
-    """
-    found = {}
-    for name, numbers in given.items():
-        if name not in scope.inputs:
-            expected = f"an input of the document: {nearest(name, list(scope.inputs))}"
-            raise InputError(f"--set {name}=...", expected)
-        a = scope.inputs[name]
-        if len(numbers) not in (1, a.size):
-            expected = f"one, or {a.size} for {a.text}"
-            raise InputError(f"{len(numbers)} numbers in --set {name}=...", expected)
-        found[name] = np.broadcast_to(np.asarray(numbers, float), (a.size,)).reshape(a.shape)
-    return found
 
 
 @partial(jax.jit, static_argnums=(0, 1), compiler_options=SELDOM)

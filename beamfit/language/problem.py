@@ -14,9 +14,9 @@ import numpy as np
 from beamfit.greybox import problem as core
 from beamfit.language import document as d
 from beamfit.language import expression as x
-from beamfit.language.compiled import Program, compile_mapping, values_of
+from beamfit.language.compiled import Program, compile_mapping
 from beamfit.language.expression import error_at
-from beamfit.language.scope import check_problem
+from beamfit.language.scope import check_problem, values_of
 
 
 class Square(NamedTuple):

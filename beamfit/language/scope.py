@@ -590,3 +590,24 @@ def _check_variables(p: d.ProblemStatement) -> None:
         if not (low <= high and math.isfinite(high - low)):
             found = f"a random start of '{v.label}' in [{low:g}, {high:g}]"
             raise error_at(v.at, found, "a finite range, the lower end first")
+
+
+def values_of(scope: Scope, given: Mapping[str, Sequence[float]]) -> dict[str, np.ndarray]:
+    """Make arrays of inputs from one number each, or one for each element in C order.
+
+    Raises
+    ------
+    InputError
+        If a name is not an input of the mapping, or the count is wrong.
+    """
+    found = {}
+    for name, numbers in given.items():
+        if name not in scope.inputs:
+            expected = f"an input of the document: {nearest(name, list(scope.inputs))}"
+            raise InputError(f"--set {name}=...", expected)
+        a = scope.inputs[name]
+        if len(numbers) not in (1, a.size):
+            expected = f"one, or {a.size} for {a.text}"
+            raise InputError(f"{len(numbers)} numbers in --set {name}=...", expected)
+        found[name] = np.broadcast_to(np.asarray(numbers, float), (a.size,)).reshape(a.shape)
+    return found

@@ -34,7 +34,7 @@ from beamfit.lifetime.free_law import (
     weighted_quantity,
 )
 from beamfit.lifetime.record import LifetimeTable
-from beamfit.noise.memory import LN_SIZE_RANGE, STATED_READINGS
+from beamfit.noise.memory import STATED_READINGS
 from beamfit.quantity import HOUR, Quantity, Status
 from beamfit.statistics import POOR_FIT, chi2_probability, reach_of
 
@@ -49,8 +49,9 @@ MIN_BAD_ERRORS = 3.0
 TRIAL_EXPONENTS = np.linspace(MIN_EXPONENT, MAX_EXPONENT, 30)
 # Points of the running median that replaces a slip of the unit or a digit in the weights.
 MEDIAN_POINTS = 5
-# Prior probability that stated errors are wrong by a common factor (chosen: one table in five).
-P_WRONG_ERRORS = 0.2
+# Prior probability that stated errors are wrong by a common factor (chosen: one table in five),
+# which then has the inverse χ² prior about 1 of one reading.
+P_WRONG, WRONG_READINGS = 0.2, 1.0
 # Smallest loss rate of a trial law, over that of the median lifetime.
 MIN_RATE = 1e-6
 # Ratio of singular values below which points do not determine a combination of a and b.
@@ -145,11 +146,16 @@ class LifetimeFit:
         return loss_json(self) | json_of(more)
 
 
+def _log_norm(known: float) -> float:
+    """Log normalisation of the prior of the errors' common factor: inverse χ² about 1."""
+    return known / 2 * math.log(known) - float(gammaln(known / 2))
+
+
 class _Points(NamedTuple):
     """Points of a table in units of the mean current and the median lifetime, with an error model.
 
-    The errors have a common factor: near 1, as that many readings show it (`known`), or flat in its
-    logarithm (`known` 0). `log_prior` is that of the model.
+    The errors have a common factor with an inverse χ² prior about 1, worth `known` readings, or
+    flat in its logarithm (0). `log_prior` is that of the model, with this prior's normalisation.
     """
 
     current: np.ndarray
@@ -162,22 +168,19 @@ class _Points(NamedTuple):
     def of(cls, table: LifetimeTable, kept: np.ndarray) -> tuple[_Points, ...]:
         """Points of a table that are kept, with each error model.
 
-        Stated errors are right, or wrong by a common factor. Those that are not stated are equal,
-        or the same share of each lifetime; the more probable model comes first.
+        Stated errors are nearly right, or wrong by a common factor. Those that are not stated are
+        equal, or the same share of each lifetime; the more probable model comes first.
         """
         unit = float(np.median(table.lifetime))
         x, lifetime = table.current[kept] / table.current.mean(), table.lifetime[kept] / unit
-        some = -math.log(4 * LN_SIZE_RANGE)  # of a factor within 1/30 to 30
         if table.error is not None:
             error = np.maximum(table.error[kept] / unit, MIN_NOISE * lifetime)
-            near = (
-                STATED_READINGS / 2 * math.log(STATED_READINGS)
-                - gammaln(STATED_READINGS / 2)
-                + math.log1p(-P_WRONG_ERRORS)
+            worth = zip((STATED_READINGS, WRONG_READINGS), (1 - P_WRONG, P_WRONG), strict=True)
+            return tuple(
+                cls(x, lifetime, error, known, _log_norm(known) + math.log(chance))
+                for known, chance in worth
             )
-            right = cls(x, lifetime, error, STATED_READINGS, near)
-            return right, right._replace(known=0.0, log_prior=some + math.log(P_WRONG_ERRORS))
-        equal = cls(x, lifetime, np.ones(x.size), 0.0, some)
+        equal = cls(x, lifetime, np.ones(x.size), 0.0, 0.0)
         curve = np.maximum(lifetime + _least_squares(equal).residuals, MIN_RATE)
         models = equal, equal._replace(error=curve)
         return tuple(sorted(models, key=lambda one: -_integral([one], Law.constant).log))

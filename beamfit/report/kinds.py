@@ -15,11 +15,13 @@ from beamfit.emittance.slices import SliceFits
 from beamfit.errors import InputError
 from beamfit.language.compiled import Computed
 from beamfit.language.solution import ProblemSolution
+from beamfit.lifetime.lifetime_table import LifetimeFit
 from beamfit.report.density import density_page
 from beamfit.report.document import ReportPage
 from beamfit.report.dynamics import control_page, fedbatch_page, feed_page, response_page
 from beamfit.report.emittance import slices_page
 from beamfit.report.formulation import computed_page, formulation_page
+from beamfit.report.lifetime_table import lifetime_table_page
 from beamfit.report.tuning import tuning_page
 from beamfit.tuning.fit import TuningFit
 
@@ -35,6 +37,7 @@ OF_ONE = {
     DensityFit: density_page,
 }
 OF_SEVERAL = dict.fromkeys((ResponseFit, StatesFit), response_page)
+OF_SEVERAL |= {LifetimeFit: lifetime_table_page}
 
 
 def page_of(several: Sequence[Any]) -> ReportPage:

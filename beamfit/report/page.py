@@ -57,10 +57,10 @@ def write_report(
         File name: ``.html`` (self-contained) or ``.pdf`` for a page; ``.png`` or ``.svg`` for the
         pictures, the first under this name. An existing file is replaced atomically.
     result : EmittanceFit, SliceFits, DecayFit, ProblemSolution, ResponseFit, Loop, or sequence
-        The emittance of a scan or of the slices of a beam, the lifetime of a decay, a solved
-        formulation, the response of a process, a simulated loop, a fed-batch process or its planned
-        feed; or a sequence of RecordStudy (lifetimes of whole records) or of ResponseFit (several
-        outputs).
+        The emittance of a scan or of the slices of a beam, the lifetime of a decay or a table, a
+        solved formulation, the response of a process, a simulated loop, a fed-batch process or its
+        planned feed; or a sequence of RecordStudy (lifetimes of whole records) or of ResponseFit
+        (several outputs).
     posterior : Posterior or sequence of Posterior, optional
         Result of ``fit.sample``; for records one for each decay.
     command : str, optional

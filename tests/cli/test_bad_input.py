@@ -325,6 +325,30 @@ def test_no_jax_on_the_way_to_an_error(case, place):
     assert loaded == "[]"
 
 
+SETPOINT = "setpoint --lattice good.toml --vary Q525=0:5 --sigma 3e-8,2e-8,2e-8 --target"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ("design good.csv --lattice good.toml --vary Q525=5:0", "lower first"),
+        (f"{SETPOINT} match", "match=BETA_M:ALPHA"),
+        (f"{SETPOINT} size_y=1mm", "--plane y"),
+        ("batch none --kind lifetime --out a.csv", "no files"),
+        ("batch . --kind emittance --lattice good.toml --out a.xlsx", ".parquet"),
+        ("identify constant.csv", "input a at 1 all the time"),
+        ("solve short.bf --set b=1", "one of a"),
+    ],
+)
+def test_no_jax_on_the_way_to_an_error_of_other_commands(arguments, words, place):
+    rows = "".join(f"{k},1,{k}\n" for k in range(20))
+    (place / "constant.csv").write_text(f"time_s,u_a,y_b\n{rows}")
+    (place / "short.bf").write_text("input a = 1; output y; y = 2 * a;")
+    ran, loaded, _ = in_a_process(place, *arguments.split())
+    check(place, ran.returncode, ran.stdout, ran.stderr, [words])
+    assert "jax" not in loaded
+
+
 @pytest.mark.parametrize("arguments", [[], ["--help"], ["emittance", "--help"], ["--version"]])
 def test_no_jax_for_help(arguments, place):
     ran, loaded, _ = in_a_process(place, *arguments)

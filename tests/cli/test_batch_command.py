@@ -173,11 +173,17 @@ def test_records_are_answered_too(root, tmp_path):
         (["--kind", "emittance", "--out", "a.txt"], "a name ending in .csv"),
         (["--kind", "emittance", "--workers", "2", "--scheduler", "tcp://a:1"], "one of them"),
         (["--kind", "emittance"], "no files"),
-        (["--kind", "lifetime", "--quantity", "lifetime_maen"], "did you mean lifetime_mean"),
+        (
+            ["a.csv", "--kind", "lifetime", "--quantity", "lifetime_maen"],
+            "did you mean lifetime_mean",
+        ),
     ],
 )
-def test_a_wrong_command_is_one_line(run, tmp_path, more, words):
-    out = [] if "--out" in more else ["--out", tmp_path / "a.csv"]
+def test_a_wrong_command_is_one_line(run, tmp_path, monkeypatch, more, words):
+    monkeypatch.chdir(tmp_path)
+    if more[0] == "a.csv":
+        Path("a.csv").touch()
+    out = [] if "--out" in more else ["--out", tmp_path / "b.csv"]
     code, _, said = run("batch", tmp_path, *more, *out)
     assert code == 2
     assert words in said

@@ -75,6 +75,17 @@ def test_a_scan_is_held_against_each_lattice(files):
     assert "did you mean Q3?" in facts(said)["on other.toml"]["why"]
 
 
+def test_a_scan_that_fits_no_lattice_is_unusable_with_them(run, files):
+    scan, good, other = (files / name for name in ("scan.csv", "line.toml", "other.toml"))
+    other.write_text(LATTICE.replace('"Q2"', '"Q3"'))
+    status, out, error = run("check", scan, other)
+    assert (status, error.count("\n")) == (2, 1)
+    assert "other.toml: a lattice" in out
+    assert f"beamfit: {scan}: " in error
+    assert "did you mean Q3?" in error
+    assert run("check", scan, good, other)[::2] == (0, "")
+
+
 def test_sizes_and_settings_in_another_unit_are_asked_about(files):
     (files / "scan.csv").write_text(SCAN.replace("fwhm_x_mm", "size_x_m").replace(",0.", ",0.02"))
     wide = file_summary(files / "scan.csv")
@@ -162,6 +173,15 @@ ONE: LINE=(Q, M); TWO: LINE=(M, Q, M);
     assert status == 0
     assert "100 MeV total, electrons" in out
     assert "2 1/m² (k1), 0.1 m long" in out
+
+
+def test_columns_that_resemble_nothing_beside_a_time_are_a_run(run, tmp_path):
+    path = tmp_path / "log.csv"
+    path.write_text("time_s,valve,level\n0,0,0.1\n1,1,0.2\n")
+    status, out, error = run("check", path)
+    assert status == 2
+    assert '# "valve" = ""  # 0: u_valve if an input, y_valve if an output' in out
+    assert "expected inputs u_... and outputs y_..., or --input COLUMN and --output" in error
 
 
 def test_runs_and_formulations_are_understood(run):

@@ -76,6 +76,11 @@ BAD = {
     "no output": (table(*ROWS, head="time_s,u_valve,note_b\n"), (), [":1:", "y_"]),
     "no time": (table(*ROWS, head="note_c,u_valve,y_level\n"), (), [":1:", "--step"]),
     "an unknown column": (table(*ROWS, head="time_s,valve,y_level\n"), (), [":1:", "valve"]),
+    "unknown columns": (
+        table(*ROWS, head="time_s,valve,level\n"),
+        (),
+        ["inputs u_...", "outputs y_...", "--input", "--output"],
+    ),
     "a word": (table(*ROWS[:3], "3,open,1\n", *ROWS[4:]), (), [":5:", "u_valve", "open"]),
     "a blank input": (table(*ROWS[:3], "3,,1\n", *ROWS[4:]), (), [":5:", "u_valve", "empty"]),
     "an input that is none": (table(*ROWS), ("--input", "vavle"), ["vavle"]),

@@ -389,9 +389,11 @@ def test_a_table_of_lifetimes_is_judged_like_a_decay(run, tmp_path):
     [result] = json.loads(out)["results"]
     assert result["status"] == "converged"
     assert result["a"]["value"] * 3600 == pytest.approx(1e-4, rel=1e-4)
-    status, out, _ = run("lifetime", str(path))
+    page = tmp_path / "page.html"
+    status, out, _ = run("lifetime", str(path), "--report", str(page))
     assert status == 0
     assert "12 lifetimes at 100 to 500 mA" in out
+    assert "lifetimes of lifetimes.csv" in page.read_text()
     status, out, err = run("lifetime", str(path), "--sample")
     assert (status, out) == (2, "")
     assert "tables of lifetimes by themselves" in err

@@ -213,6 +213,14 @@ def test_a_table_of_lifetimes(tmp_path):
     np.testing.assert_allclose(found.error, np.array([1, 1, 0.5, 1]) / 60)
     assert found.comments == ("IOTA",)
     assert isinstance(read_lifetime_input(path), LifetimeTable)
+    path.write_text(f"I [A];tau [min];err (%)\n{rows.replace(',', ';')}")
+    found = read_lifetimes(path)
+    assert found.current.tolist() == [1000, 2000, 3000, 4000]
+    np.testing.assert_allclose(found.error, found.lifetime * [0.01, 0.01, 0.005, 0.01])
+    assert "Column 'I [A]' is taken for the beam current." in found.notes
+    path.write_text("I_A,tau_min,err_min,tau_error_min\n1,20,1,1\n")
+    with pytest.raises(InputError, match="tau_error also in column 'err_min'"):
+        read_lifetimes(path)
     path.write_text("beam_current_mA,tau_min\n1,20\n2,0\n3,12\n4,10\n5,9\n")
     with pytest.raises(InputError, match=r":3: column 'tau_min': 0 min; expected above zero"):
         read_lifetimes(path)

@@ -6,7 +6,7 @@ import pytest
 from beamfit.errors import InputError
 from beamfit.io.check import file_summary
 from beamfit.io.decay_record import read_decay_record, read_lifetime_input
-from beamfit.lifetime.record import DecayRecord
+from beamfit.lifetime.record import DecayRecord, LifetimeTable
 
 CURRENT = [200.0, 199.5, 199.1, 198.6]
 
@@ -59,7 +59,11 @@ def test_what_could_be_another_current_is_refused(header, words, tmp_path):
 def test_a_lifetime_beside_the_current_is_not_read(tmp_path):
     path = write(tmp_path, "time_s,beam_current_mA,Lifetime [h]", range(4), CURRENT, [9] * 4)
     assert isinstance(read_lifetime_input(path), DecayRecord)
-    assert read_decay_record(path).current.tolist() == CURRENT
+    record = read_decay_record(path)
+    assert record.current.tolist() == CURRENT
+    assert "Column 'Lifetime [h]' is not used" in record.notes[0]
+    assert "--ignore 'time_s'" in record.notes[0]
+    assert isinstance(read_lifetime_input(path, ignore=["time_s"]), LifetimeTable)
 
 
 def test_a_unit_in_the_header_is_said_once_more(tmp_path):

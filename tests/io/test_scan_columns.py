@@ -311,3 +311,11 @@ def test_a_comment_of_rms_over_a_fwhm_and_one_of_pixels_are_refused(read):
 def test_errors_that_are_all_zero_are_to_be_left_unread(read):
     with pytest.raises(InputError, match="--ignore 'size_x_error_um'"):
         read(table(["Q_A", "size_x_um", "size_x_error_um"], [(q, s, 0) for q, s, _ in ROWS]))
+
+
+@pytest.mark.parametrize(("unit", "energy"), [("GeV", 0.135), ("keV", 135e3), ("eV", 135e6)])
+def test_an_energy_may_have_another_unit(tmp_path, unit, energy):
+    path = tmp_path / "scan.csv"
+    rows = "".join(f"{k},200,{energy}\n" for k in range(3))
+    path.write_text(f"Q2_A,size_x_um,energy_{unit}\n{rows}")
+    np.testing.assert_allclose(read_quad_scan(path).energy, 135)
