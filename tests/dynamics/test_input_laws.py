@@ -6,12 +6,19 @@ import jax
 import numpy as np
 import pytest
 
-from beamfit.dynamics.alternatives import HIGHER, NO_DEPARTURE, Alternatives
+from beamfit.dynamics.alternatives import (
+    HIGHER,
+    NO_DEPARTURE,
+    Alternatives,
+    alternatives_of,
+)
+from beamfit.dynamics.checks import fuller_model_slopes
 from beamfit.dynamics.fit import identify
 from beamfit.dynamics.input_laws import apply_law, laws_between
 from beamfit.dynamics.paths import Path, Paths, inputs_with_levels
 from beamfit.dynamics.record import Run, Way, gain_error_share, levels_of
-from beamfit.dynamics.response import SECOND_ORDER, simulate
+from beamfit.dynamics.response import FIRST_ORDER, SECOND_ORDER, simulate
+from beamfit.dynamics.search import ResponseSearch
 from beamfit.errors import Status
 from tests.simulations import simulations
 
@@ -290,6 +297,21 @@ def test_a_second_order_is_no_law_of_an_input(count):
     assert told >= 0.9 * count
     assert len(named) >= count / 2
     np.testing.assert_allclose(named, 1.0, atol=0.1)
+
+
+def test_errors_take_a_second_order_as_a_first_with_the_sum_of_its_lags():
+    run, time, damping = oscillation(1, 1)
+    search = ResponseSearch("y", FIRST_ORDER, Paths.of((run,), None, False), True)
+    found = search.identify((run,))
+    slopes = fuller_model_slopes(found.prepared, found.fit)
+    others = alternatives_of((run,), found, search, slopes, True)
+    assert others.departure.kind == HIGHER
+    numbers = [v.name for v in found.fit.variables]
+    mean = found.fit.theta[: others.shift.shape[1]] + others.weight @ others.shift
+    lags = np.exp(mean[numbers.index("map[0]")])
+    assert abs(lags / (2.0 * damping * time) - 1.0) < 0.1, (lags, damping, time)
+    error = others.error(np.eye(len(mean))[[numbers.index("map[0]")]], np.zeros(1))
+    assert error > 0.9 * abs(np.log(lags) - found.fit.theta[numbers.index("map[0]")])
 
 
 def test_readings_far_off_that_follow_the_inputs_are_no_bad_ones():
