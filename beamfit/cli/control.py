@@ -9,6 +9,7 @@ import click
 import beamfit
 from beamfit.cli.option_text import gains_of, named_of
 from beamfit.cli.options import Command, Output, option, options
+from beamfit.dynamics.control_checks import check_limits, check_rates, check_steps, check_targets
 from beamfit.errors import InputError
 from beamfit.io.files import digest
 from beamfit.io.run import read_run
@@ -53,7 +54,12 @@ LIMIT = "NAME=LOW:HIGH, one of them may be left out, such as level=:3"
 )
 @option("--horizon STEPS", "Number of steps of a plan.", type=click.IntRange(2))
 @option("--every SAMPLES", "Samples of the runs per control step.", type=click.IntRange(1))
-@option("--smooth", "Cost of input changes against errors.", type=float, default=0.1)
+@option(
+    "--smooth",
+    "Cost of input changes against errors.",
+    type=click.FloatRange(0.0, min_open=True),
+    default=0.1,
+)
 @option("--for SECONDS", "Simulated time.", name="duration", type=float)
 @options("hidden columns ignore skip-bad seed report json")
 def control(
@@ -73,10 +79,15 @@ def control(
     inputs can achieve that; limits that cannot be kept are named.
     """
     targets, loads = _steps(targets, "set"), _steps(disturb, "disturb")
-    arguments |= {
-        "limits": gains_of(limit, "limit", LIMIT),
-        "rates": named_of(rate, "rate", RATE, float),
-    }
+    limits = gains_of(limit, "limit", LIMIT)
+    rates = named_of(rate, "rate", RATE, float)
+    # Before the runs are identified, which takes long.
+    check_limits(limits)
+    check_rates(rates)
+    for steps in (targets, loads):
+        check_steps(steps)
+    check_targets(targets, limits)
+    arguments |= {"limits": limits, "rates": rates}
     reading = {n: arguments.pop(n) for n in READING}
     runs = [read_run(path, **reading) for path in record]
     arguments |= {"offset": not no_offset, "disturbances": loads}

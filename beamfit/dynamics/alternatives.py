@@ -1,7 +1,8 @@
 """Comparison of alternative descriptions of how the inputs act on an output.
 
 Alternatives differ in the inputs between samples (held or moving), in a law of an input (or none)
-and in the delay (whole samples or fractions of one); the response may also have one further term.
+and in the delay (whole samples or fractions of one); the response may also have one further term,
+or be of second order instead of first.
 Each is fitted under every noise of a grid, white or wandering, and is weighted by its marginal
 likelihood, with the free numbers and the noise integrated out: a noise that wanders can absorb what
 a missing law leaves, and gains are then far off. The most probable departure is named, and the
@@ -30,18 +31,27 @@ from beamfit.dynamics.model import (
     pad_readings,
     predicted,
 )
-from beamfit.dynamics.paths import Path, Paths, PreparedReadings, inputs_by_path, prepare_readings
+from beamfit.dynamics.paths import (
+    Path,
+    Paths,
+    PreparedReadings,
+    inputs_by_path,
+    prepare_output,
+    prepare_readings,
+)
 from beamfit.dynamics.record import Run, Way
-from beamfit.dynamics.response import ARX
+from beamfit.dynamics.response import ARX, FIRST_ORDER, SECOND_ORDER
 from beamfit.dynamics.search import (
+    ResponseSearch,
     RunsFit,
     drift_columns,
     noise_grid,
     orthonormal_basis,
+    response_case,
     shape_parameters,
 )
 from beamfit.greybox import tree
-from beamfit.greybox.problem import with_slope
+from beamfit.greybox.problem import Problem, with_slope
 from beamfit.noise.correlated import Whitened, roots_by_each
 from beamfit.noise.memory import CorrelatedNoise
 from beamfit.statistics import MIN_SINGULAR_VALUE
@@ -53,7 +63,8 @@ CORRELATION_TIMES = 6
 WHITE_RATIOS = (0.0, 1.0, 10.0, 100.0)
 # Readings of each run that the comparison uses at most: chosen, for speed.
 MAX_READINGS = 2048
-# Prior odds that the response has no term beyond those of the model asked for: a guess.
+# Prior odds that the response has no term beyond those of the model asked for, and that a first
+# order is no second one: a guess.
 ODDS_AGAINST_TERM = 10.0
 # Where several laws are possible, the most probable ones are named until they make up this
 # probability.
@@ -83,19 +94,20 @@ TRIALS_PER_BATCH = 64
 
 
 # Kinds of departures that are not laws of an input.
-FURTHER, GROWTH = "further term", "growth"
+FURTHER, GROWTH, HIGHER = "further term", "growth", "second order"
 
 
 class Departure(NamedTuple):
-    """A departure from the plain response: a law of an input, a further term, or a growth.
+    """A departure from the plain response: a law of an input, a further term, a growth, or a second
+    order.
 
-    `words` describes it, `kind` is a kind of `InputLaw`, `FURTHER` or `GROWTH`. `probability` is
-    that of any departure, against none.
+    `words` describes it, `kind` is a kind of `InputLaw`, `FURTHER`, `GROWTH` or `HIGHER`.
+    `without` is the probability of no departure at all.
     """
 
     words: str
     kind: str
-    probability: float = 0.0
+    without: float = 1.0
 
     def with_growth(self, share: float) -> Departure:
         """Add the amount by which a growing quantity changes along the record to the words."""
@@ -112,7 +124,7 @@ GROWTH_DEPARTURES = [Departure("a delay", GROWTH), Departure("a gain", GROWTH)]
 
 
 class Trial(NamedTuple):
-    """A path, its log prior, and the index of a further term of the response if any."""
+    """A path, its log prior, and the index of a further term or second order if any."""
 
     path: Path
     prior: float
@@ -218,11 +230,13 @@ class _Batch(NamedTuple):
             roots, each = roots_by_each(some, columns, np.diff(time))
             triangles.append(roots @ triangle)
             volume, count = volume + each, count + len(time)
-        prior = np.eye(len(c.begin))[c.prior_indices]
-        offset = (theta - c.begin) @ prior.T
-        prior_rows = np.concatenate([np.tile(prior, (len(theta), 1, 1)), offset[..., None]], axis=2)
+        offset = (theta - c.begin) @ c.prior.T
+        prior_rows = np.concatenate(
+            [np.tile(c.prior, (len(theta), 1, 1)), offset[..., None]], axis=2
+        )
         rows = np.concatenate([*triangles, np.tile(prior_rows, (len(some), 1, 1, 1))], axis=2)
-        return repeat_for_noises(some, rows, volume, count + len(prior))
+        volume = volume + np.log(np.linalg.norm(c.prior, axis=1)).sum()
+        return repeat_for_noises(some, rows, volume, count + len(c.prior))
 
     def fit(self, begin: np.ndarray, rounds: int) -> tuple[np.ndarray, np.ndarray]:
         """Fit the numbers of each trial by Gauss-Newton steps; return them and the lowest -2 ln L.
@@ -342,10 +356,11 @@ class Comparison(NamedTuple):
     """A fit with all that its alternatives are fitted with.
 
     `data` holds padded readings, times and padded errors of each run; `begin` the numbers of the
-    fit without its delay and, last, 0 for the number that an alternative adds. `prior_indices` are
-    the numbers with a prior of width 1 about the fit: logarithms of time constants, raw numbers of
-    a damping, and the added number; without it an alternative could take them where no data count.
-    `grid` are noises, `terms` the columns of further terms by run, `departures` their descriptions.
+    fit without its delay and, last, 0 for the number that an alternative adds. `prior` has a row
+    for each number with a prior about the fit, its inverse width: 1 for logarithms of time
+    constants, raw numbers of a damping, and the added number; without it an alternative could take
+    them where no data count. `grid` are noises, `terms` the columns of further terms by run,
+    `departures` their descriptions.
     """
 
     runs: tuple[Run, ...]
@@ -355,7 +370,7 @@ class Comparison(NamedTuple):
     chosen: tuple[Any, ...]
     model: Any
     begin: np.ndarray
-    prior_indices: list[int]
+    prior: np.ndarray
     grid: list[CorrelatedNoise]
     terms: list[np.ndarray]
     departures: list[Departure]
@@ -366,9 +381,13 @@ class Comparison(NamedTuple):
     ) -> Comparison:
         """Prepare a fit; `slopes` are those of `fuller_model_slopes`."""
         prepared, fit = found.prepared, found.fit
-        physics, delay = prepared.runs[0].physics, found.path.delay
         readings = prepare_readings(
-            runs, prepared.output, physics, paths.rows_per_sample, delay, MAX_READINGS
+            runs,
+            prepared.output,
+            prepared.runs[0].physics,
+            paths.rows_per_sample,
+            found.path.delay,
+            MAX_READINGS,
         )
         drives = readings.drives
         errors = [noise.each[:MAX_READINGS] for (noise,) in found.noise]
@@ -382,18 +401,30 @@ class Comparison(NamedTuple):
             pad_readings(drive, each.T[:, :MAX_READINGS])
             for drive, each in zip(drives, columns, strict=True)
         ]
-        numbers = [v.name for v in fit.variables if v.name != "late"]
-        powers = physics.units(len(prepared.inputs))
-        prior_indices = [numbers.index(f"map[{k}]") for k, (_, gain) in enumerate(powers)
-                if not gain and f"map[{k}]" in numbers] + [len(numbers)]  # fmt: skip
-        core = fit.problem.core
-        chosen = tuple(leaf for leaf in core.chosen if leaf.path != "late")
         grid = noise_grid(prepared.time, CORRELATION_TIMES, WHITE_RATIOS)
-        begin = np.append(fit.theta[: len(numbers)], 0.0)
-        model = core.model | {"late": jnp.zeros(())}
+        numbers = _free_numbers(fit.problem, fit.theta, prepared)
         return cls(
-            runs, readings, data, paths.rows_per_sample, chosen, model, begin, prior_indices, grid,
-            terms, departures,
+            runs, readings, data, paths.rows_per_sample, *numbers, grid, terms, departures
+        )  # fmt: skip
+
+    def of_second_order(self, search: ResponseSearch) -> tuple[Path, Comparison]:
+        """Prepare a second order for the same readings and noises; also give its best path.
+
+        The prior of the slopes at the start is as wide as the output's scatter over T.
+        """
+        search = search._replace(physics=SECOND_ORDER)
+        path, model, _ = search.start(self.runs)
+        prepared = prepare_output(self.runs, search.output, SECOND_ORDER, path)
+        case = response_case(prepared, path, search.offset)
+        problem = case.problem(model, case.initial_noise)
+        chosen, model, begin, prior = _free_numbers(problem, problem.start, prepared)
+        slopes = np.eye(len(begin))[1 : 2 * len(self.runs) : 2]
+        time = shape_parameters(prepared, model)[0]
+        drives = tuple(replace(drive, physics=SECOND_ORDER) for drive in self.prepared.drives)
+        return path, self._replace(
+            prepared=self.prepared._replace(drives=drives), chosen=chosen, model=model,
+            begin=begin, prior=np.concatenate([prior, slopes * time / prepared.output_scale]),
+            terms=[each * 0.0 for each in self.terms],
         )  # fmt: skip
 
     def weigh(self, trials: list[Trial]) -> _TrialPosterior:
@@ -430,17 +461,33 @@ class Comparison(NamedTuple):
             yield _Batch(self, inputs, (part, width), terms), begin[k : k + TRIALS_PER_BATCH]
 
 
+def _free_numbers(
+    problem: Problem, theta: np.ndarray, prepared: PreparedOutput
+) -> tuple[Any, Any, np.ndarray, np.ndarray]:
+    """Give `chosen`, `model`, `begin` and `prior` of a `Comparison`."""
+    numbers = [name for name in problem.names if name != "late"]
+    powers = prepared.runs[0].physics.units(len(prepared.inputs))
+    indices = [numbers.index(f"map[{k}]") for k, (_, gain) in enumerate(powers)
+               if not gain and f"map[{k}]" in numbers] + [len(numbers)]  # fmt: skip
+    chosen = tuple(leaf for leaf in problem.core.chosen if leaf.path != "late")
+    model = problem.core.model | {"late": jnp.zeros(())}
+    begin = np.append(theta[: len(numbers)], 0.0)
+    return chosen, model, begin, np.eye(len(begin))[indices]
+
+
 def alternatives_of(
     runs: tuple[Run, ...],
     found: RunsFit,
-    paths: Paths,
+    search: ResponseSearch,
     slopes: Sequence[np.ndarray],
     departures: bool,
 ) -> Alternatives:
     """Weigh every path, law and further term against those of a fit.
 
-    With `departures` False neither laws nor further terms are tried.
+    With `departures` False neither laws nor further terms are tried. A second order is tried if
+    another departure is more probable than none.
     """
+    paths = search.paths
     comparison = Comparison.prepare(runs, found, paths, slopes)
     fitted_path = found.path._replace(delay=found.delay)
     lawless = paths.whole_delays() + paths.fractional_delays(fitted_path.delay)
@@ -454,6 +501,10 @@ def alternatives_of(
     has_law = np.array([trial.path.law is not None for trial in posterior.trials])
     if posterior.probability[has_law].sum() > posterior.probability[posterior.no_departure].sum():
         posterior = _refine_laws(comparison, posterior)
+    names = comparison.departures
+    if search.physics is FIRST_ORDER and posterior.probability[posterior.no_departure].sum() < 0.5:
+        second, departure = _second_order(comparison, search)
+        posterior, names = posterior.merge(second), [*names, departure]
     chance, no_departure = posterior.probability, posterior.no_departure
     others = ~no_departure | [not found.covers(trial.path) for trial in posterior.trials]
     others &= chance > MIN_PROBABILITY
@@ -463,11 +514,35 @@ def alternatives_of(
     return Alternatives(
         found.path if found.covers(best_path) else best_path,
         *posterior.select(no_departure).delay_moments(found.delay),
-        _name_departure(posterior, comparison.departures),
+        _name_departure(posterior, names),
         chance[others],
         (posterior.numbers - comparison.begin)[others, :-1],
         posterior.spread[others, :-1, :-1],
     )
+
+
+def _second_order(
+    comparison: Comparison, search: ResponseSearch
+) -> tuple[_TrialPosterior, Departure]:
+    """Weigh a second order with all delays, and describe it.
+
+    Its numbers are given as those of a first order, with the sum of its lags, 2 zeta T.
+    """
+    (_, way, delay), higher = comparison.of_second_order(search)
+    paths, runs = search.paths, len(comparison.runs)
+    tried = [p for p in paths.whole_delays() + paths.fractional_delays(delay) if p.way == way]
+    term, odds = len(comparison.departures), np.log(ODDS_AGAINST_TERM)
+    found = higher.weigh([Trial(path, paths.log_prior(path) - odds) for path in tried])
+    time, zeta = np.exp(found.numbers[found.log_posterior.argmax(), 2 * runs : 2 * runs + 2])
+    words = f"a second order with T of about {time:.2g} s and zeta of about {zeta:.2g}"
+    # Without the slopes at the start; the logarithms of T and zeta become that of 2 zeta T.
+    lower = np.delete(np.eye(len(higher.begin)), [*range(1, 2 * runs, 2), 2 * runs + 1], axis=0)
+    lower[runs, 2 * runs + 1] = 1.0
+    numbers = found.numbers @ lower.T
+    numbers[:, runs] += np.log(2.0)
+    trials = [trial._replace(term=term) for trial in found.trials]
+    spread = lower @ found.spread @ lower.T
+    return _TrialPosterior(trials, found.log_evidence, numbers, spread), Departure(words, HIGHER)
 
 
 def _law_trials(comparison: Comparison, own: Path, paths: Paths) -> list[Trial]:
@@ -540,7 +615,7 @@ def _name_departure(posterior: _TrialPosterior, names: Sequence[Departure]) -> D
     """Describe the most probable departures until they make up `NAMED_PROBABILITY`.
 
     Each kind of law and input and each further term is named once, by its most probable trial. The
-    kind is that of the first, the probability that of any departure.
+    kind is that of the first.
     """
     best: dict[Any, tuple[float, Departure]] = {}
     by_key: Counter[Any] = Counter()
@@ -567,7 +642,7 @@ def _name_departure(posterior: _TrialPosterior, names: Sequence[Departure]) -> D
         words = [f"{w} (P = {p:.2f})" for w, (_, p) in zip(words, ranked, strict=True)]
     first = best[ranked[0][0]][1]
     none = float(posterior.probability[posterior.no_departure].sum())
-    return first._replace(words=" or ".join(words), probability=max(1.0 - none, 0.0))
+    return first._replace(words=" or ".join(words), without=none)
 
 
 def _further_terms(

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from beamfit.answer import Table, cell, json_of
-from beamfit.dynamics.alternatives import FURTHER, GROWTH, Alternatives
+from beamfit.dynamics.alternatives import FURTHER, GROWTH, HIGHER, Alternatives
 from beamfit.dynamics.bad_readings import BadReadings
 from beamfit.dynamics.checks import Checks, HeldOutRun
 from beamfit.dynamics.input_laws import STATIC
@@ -404,17 +404,18 @@ def _feedback(e: ResponseEvidence) -> Finding | None:
     c = e.checks
     if c.feedback_probability >= POOR_FIT:
         return None
+    chance = _p_value(c.feedback_probability)
     if c.band_limited:
         cause = (
             f"Inputs of the same moment and later explain {100 * c.feedback_share:.0f} % of the "
-            f"residuals (p = {c.feedback_probability:.1g}), and {', '.join(c.band_limited)} has no "
+            f"residuals ({chance}), and {', '.join(c.band_limited)} has no "
             "high frequencies: it moves between samples, where the model holds each value until "
             "the next."
         )
         return Finding(Status.poor_fit, cause, "Sample faster, or hold inputs between samples.")
     cause = (
         f"Inputs of the same moment and later go with {100 * c.feedback_share:.0f} % of the noise "
-        f"(p = {c.feedback_probability:.1g}): they were set from the output (feedback). What noise "
+        f"({chance}): they were set from the output (feedback). What noise "
         "made the inputs do is then taken for a response, gains lean to the inverse of the "
         "controller's, and no error contains it."
     )
@@ -422,18 +423,29 @@ def _feedback(e: ResponseEvidence) -> Finding | None:
     return Finding(Status.poor_fit, cause, remedy)
 
 
+# Smallest probability that a message states.
+MIN_P_VALUE = 1e-16
+
+
+def _p_value(p: float) -> str:
+    return f"p < {MIN_P_VALUE:.0e}" if p < MIN_P_VALUE else f"p = {p:.1g}"
+
+
 def _departs(e: ResponseEvidence) -> Finding | None:
     c = e.checks
-    if c.law is None or 1.0 - c.law_probability >= POOR_FIT:
+    if c.law is None or c.no_law_probability >= POOR_FIT:
         return None
-    follows = "has" if c.law_kind in (FURTHER, GROWTH) else "follows"
-    cause = f"The output {follows} {c.law} (p = {max(1.0 - c.law_probability, 0.0):.1g} without)"
+    follows = "has" if c.law_kind in (FURTHER, GROWTH, HIGHER) else "follows"
+    cause = f"The output {follows} {c.law} ({_p_value(c.no_law_probability)} without)"
     if c.law_kind == GROWTH:
         remedy = "Cut the record into shorter ones, or give what it changes with as an input."
         cause += " along the record."
     elif c.law_kind == FURTHER:
         cause += ": the model lacks a part of the response."
         remedy = f"Try {_fuller_model(e)}."
+    elif c.law_kind == HIGHER:
+        cause += ": the model lacks a part of the response."
+        remedy = "Use a higher order: --model second-order."
     elif c.law_kind in STATIC:
         cause += ": the gain then changes with the input."
         remedy = "Stay where the gain is the same, or let it change: --map network."
@@ -453,7 +465,7 @@ def _lacks_response(e: ResponseEvidence) -> Finding | None:
         return None
     cause = (
         f"Past inputs, or parameters that change with them, explain {100 * c.input_share:.0f} % of "
-        f"the residuals (p = {c.input_probability:.1g}): the model lacks a part of the response. "
+        f"the residuals ({_p_value(c.input_probability)}): the model lacks a part of the response. "
         f"The free run explains {c.free_run_percent:.1f} % of the output."
     )
     return Finding(Status.poor_fit, cause, f"Try {_fuller_model(e)}.")
@@ -481,6 +493,7 @@ def _remarks(c: Checks) -> str:
     """Sentences on noise, input motion, jitter, drift and possible laws that the errors contain."""
     smooth, ramping, standing = map(", ".join, c.way)
     law = c.law[:1].upper() + c.law[1:] if c.law is not None else ""
+    likelier = f"likelier than none (P = {1.0 - c.no_law_probability:.2f})"
     sentences = {
         "The noise has a memory, which the errors contain.": c.white_probability < POOR_FIT,
         f"Without high frequencies, {smooth} is taken to move between samples.": smooth,
@@ -488,7 +501,7 @@ def _remarks(c: Checks) -> str:
         f"Readings of {standing} scatter about levels; the output follows the levels.": standing,
         f"Times of readings are uncertain by {c.jitter:.2g} s: errors contain it.": c.jitter,
         f"The output drifts as well (degree {c.drift} in time): errors contain it.": c.drift,
-        f"{law} is likelier than none (P = {c.law_probability:.2f}): errors contain it.": law,
+        f"{law} is {likelier}: errors contain it.": law,
     }
     return "".join(f" {sentence}" for sentence, holds in sentences.items() if holds)
 

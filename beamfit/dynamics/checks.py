@@ -68,8 +68,8 @@ class Checks(NamedTuple):
     law : str or None
         Law of an input, further term or growth that is more probable than none, in words; several
         where the runs do not distinguish them.
-    law_probability : float
-        Probability of such a departure, against none.
+    no_law_probability : float
+        Probability that there is no such departure.
     law_kind : str
         Kind of the departure.
     band_limited : tuple of str
@@ -95,7 +95,7 @@ class Checks(NamedTuple):
     together: tuple[str, ...] = ()
     first_order: bool = False
     law: str | None = None
-    law_probability: float = 0.0
+    no_law_probability: float = 1.0
     law_kind: str = ""
     band_limited: tuple[str, ...] = ()
     way: Way = Way()

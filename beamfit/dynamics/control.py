@@ -19,6 +19,13 @@ import numpy as np
 from scipy.signal import lfilter
 
 from beamfit.answer import Table, answer, json_of
+from beamfit.dynamics.control_checks import (
+    check_limits,
+    check_rates,
+    check_steps,
+    check_targets,
+    range_text,
+)
 from beamfit.dynamics.fit import ResponseFit
 from beamfit.dynamics.model import parameters_at, predicted
 from beamfit.dynamics.response import ARX, PHYSICS, Physics, run_from
@@ -513,22 +520,18 @@ def _ranges(
     names: Sequence[str], given: Mapping[str, tuple[float, float]], limits: np.ndarray
 ) -> np.ndarray:
     """Lower and upper limits, shape (2, names); the defaults where none are given."""
-    for name, (low, high) in given.items():
-        k = _index(names, name, "a limit of")
-        if not low < high:
-            raise InputError(f"limits {low:g} to {high:g} of {name}", "the lower one first")
-        limits[:, k] = low, high
+    check_limits(given)
+    for name, ends in given.items():
+        limits[:, _index(names, name, "a limit of")] = ends
     return limits
 
 
 def _rates(names: Sequence[str], given: Mapping[str, float]) -> np.ndarray:
     """Largest changes of inputs per second; infinite where none is given."""
     found = np.full(len(names), np.inf)
+    check_rates(given)
     for name, rate in given.items():
-        k = _index(names, name, "a rate of")
-        if not rate > 0:
-            raise InputError(f"rate {rate:g} of {name}", "above 0, in units a second")
-        found[k] = rate
+        found[_index(names, name, "a rate of")] = rate
     return found
 
 
@@ -678,10 +681,10 @@ class Loop:
         c, rows = self.control, []
         for i, name in enumerate(c.inputs):
             ends = at_limits(self)[:, i]
-            limit = _range(c.limits.low[i], c.limits.high[i])
+            limit = range_text(c.limits.low[i], c.limits.high[i])
             recorded = np.concatenate([run.inputs[name] for run in self.fits[0].runs])
             if c.limits.low[i] < recorded.min() or c.limits.high[i] > recorded.max():
-                limit += f" (the runs: {_range(recorded.min(), recorded.max())})"
+                limit += f" (the runs: {range_text(recorded.min(), recorded.max())})"
             rows.append([name, limit, f"at it in {ends.sum()} of {len(ends)} steps"])
             if np.isfinite(c.limits.rate[i]):
                 limit = f"{c.limits.rate[i] / c.step:.4g} a second"
@@ -691,7 +694,7 @@ class Loop:
             low, high = c.limits.below[i], c.limits.above[i]
             if np.isfinite([low, high]).any():
                 soft = int((self.trace.beyond[:, i] > LIMIT_TOLERANCE * r.size).sum())
-                limit = f"{_range(low, high)}, held off by {r.margin:.2g}"
+                limit = f"{range_text(low, high)}, held off by {r.margin:.2g}"
                 rows.append([r.name, limit, f"soft in {soft} of {len(self.time)} steps"])
         return ["", "limit", "used"], rows
 
@@ -705,12 +708,6 @@ class Loop:
             | {"changes": self.changes, "time_s": self.time, "targets": self.targets}
             | {"loop": self.trace, "models": [fit.headline for fit in self.fits]}
         )
-
-
-def _range(low: float, high: float) -> str:
-    if np.isfinite([low, high]).all():
-        return f"{low:.4g} to {high:.4g}"
-    return f"at most {high:.4g}" if np.isfinite(high) else f"at least {low:.4g}"
 
 
 def at_limits(loop: Loop) -> np.ndarray:
@@ -773,10 +770,8 @@ def simulate_loop(
     rest = np.asarray(jax.jit(lambda u: _present_outputs(control, start(control, u).x))(begin))
     wanted = _series(control, time, targets, rest, add=False)
     load = _series(control, time, disturbances, np.zeros(len(rest)), add=True)
-    for name, value, _ in targets:
-        low, high = (ends[control.output(name)] for ends in control.limits[3:])
-        if not low <= value <= high:
-            raise InputError(f"{name} wanted at {value:g}", f"{_range(low, high)}, its limits")
+    names, ends = [r.name for r in control.responses], np.transpose(control.limits[3:])
+    check_targets(targets, dict(zip(names, ends, strict=True)))
     noise = np.stack([_noise(fit, time, seed + i) for i, fit in enumerate(fits)], axis=1)
     run = jax.jit(partial(closed_loop, control))
     trace = Trace(*map(np.asarray, run(begin, wanted, noise, load)))
@@ -795,12 +790,9 @@ def _series(
 ) -> np.ndarray:
     """Values that change in steps, shape (steps, outputs)."""
     found = np.tile(at_first, (len(time), 1))
+    check_steps(steps, time[-1])
     for name, value, at in sorted(steps, key=lambda each: each[2]):
         i = control.output(name)
-        if not 0 <= at < time[-1]:
-            raise InputError(f"{name} at {at:g} s", f"a time within the loop, 0 to {time[-1]:g} s")
-        if not np.isfinite(value):
-            raise InputError(f"{value:g} for {name}", "a finite number")
         after = time >= at - 1e-9
         found[after, i] = found[after, i] * add + value
     return found

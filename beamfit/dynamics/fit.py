@@ -11,7 +11,13 @@ import numpy as np
 from scipy.special import ndtri
 
 from beamfit.answer import Table, answer, json_of
-from beamfit.dynamics.alternatives import FURTHER, GROWTH, Alternatives, alternatives_of
+from beamfit.dynamics.alternatives import (
+    FURTHER,
+    GROWTH,
+    HIGHER,
+    Alternatives,
+    alternatives_of,
+)
 from beamfit.dynamics.answer import (
     Curve,
     ResponseEvidence,
@@ -299,7 +305,7 @@ class _Identification(NamedTuple):
                 return found, None
             slopes = fuller_model_slopes(found.prepared, found.fit)
             departures = self.map == "constant"
-            alternatives = alternatives_of(runs, found, self.search.paths, slopes, departures)
+            alternatives = alternatives_of(runs, found, self.search, slopes, departures)
             if alternatives.path == found.path or not remaining:
                 break
             found = self.search.identify_path(runs, alternatives.path, found.fit.model)
@@ -338,10 +344,11 @@ class _Identification(NamedTuple):
         if not constant:
             curves = curves_of(best.fit, best.errors, prepared)
             return checks, *open_undetermined({}, curves, prepared, checks)
-        if alternatives is not None and alternatives.departure.probability > 0.5:
-            words, kind, chance = alternatives.departure
-            if checks.input_share or kind not in (FURTHER, GROWTH):  # more than digits
-                checks = checks._replace(law=words, law_probability=chance, law_kind=kind)
+        if alternatives is not None and alternatives.departure.without < 0.5:
+            words, kind, without = alternatives.departure
+            # A further part of the response explains more than digits.
+            if checks.input_share or kind not in (FURTHER, GROWTH, HIGHER):
+                checks = checks._replace(law=words, no_law_probability=without, law_kind=kind)
         input_errors = [gain_error_share(runs, found.path.way, name) for name in prepared.inputs]
         lags = lag_posterior(found, offset)
         step = float(mean_step(prepared.runs[0].dt))

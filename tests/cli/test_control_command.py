@@ -61,3 +61,25 @@ def test_bad_input_is_one_line_and_exit_2(options, words, run, record):
     assert (status, out, err.count("\n")) == (2, "", 1), err
     for word in words:
         assert word in err, err
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (("--set", "level=2", "--rate", "valve=-1"), ["rate -1 of valve", "above 0"]),
+        (("--set", "level=2", "--limit", "valve=2:1"), ["limits 2 to 1 of valve"]),
+        (("--set", "level=4", "--limit", "level=:3"), ["level wanted at 4", "at most 3"]),
+        (("--set", "level=2@-5"), ["level at -5 s", "0 s or later"]),
+        (("--set", "level=2", "--disturb", "level=inf"), ["inf for level", "finite"]),
+        (("--set", "level=2", "--smooth", 0), ["--smooth", "0"]),
+    ],
+)
+def test_limits_are_refused_before_the_runs_are_identified(
+    options, words, run, record, monkeypatch
+):
+    """After 23 s, they were."""
+    monkeypatch.setattr("beamfit.control", None)
+    status, out, err = run("control", record, *options)
+    assert (status, out) == (2, ""), err
+    for word in words:
+        assert word in err, err

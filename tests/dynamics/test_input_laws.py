@@ -1,14 +1,26 @@
 """Laws of an input as alternatives: what they hand on, their weights, what errors contain."""
 
+import re
+
+import jax
 import numpy as np
 import pytest
 
-from beamfit.dynamics.alternatives import NO_DEPARTURE, Alternatives
+from beamfit.dynamics.alternatives import (
+    HIGHER,
+    NO_DEPARTURE,
+    Alternatives,
+    alternatives_of,
+)
+from beamfit.dynamics.checks import fuller_model_slopes
 from beamfit.dynamics.fit import identify
 from beamfit.dynamics.input_laws import apply_law, laws_between
 from beamfit.dynamics.paths import Path, Paths, inputs_with_levels
 from beamfit.dynamics.record import Run, Way, gain_error_share, levels_of
+from beamfit.dynamics.response import FIRST_ORDER, SECOND_ORDER, simulate
+from beamfit.dynamics.search import ResponseSearch
 from beamfit.errors import Status
+from tests.simulations import simulations
 
 UP_AND_DOWN = np.array([0.0, 1.0, 2.0, 2.0, 1.5, 1.0, 0.0, -1.0])
 
@@ -253,6 +265,53 @@ def test_a_supply_that_ramps_at_a_fixed_rate_is_said():
     fit = identify(response(u, moves, 0.03, random))
     assert fit.status is Status.poor_fit
     assert "The output follows a rate limit of valve" in fit.message, fit.message
+
+
+def oscillation(seed, m):
+    """A process of second order that is still before the run, of m inputs, SIMULATED."""
+    random = np.random.default_rng([seed, 41])
+    moves = np.stack([np.repeat(random.uniform(0, 3, 20), 12) for _ in range(m)], axis=1)
+    time, damping = np.exp(random.uniform(np.log(1.5), np.log(8.0))), random.uniform(0.1, 0.9)
+    p = np.array([time, damping, *random.uniform(0.5, 2.0, moves.shape[1])])
+    start = np.array([moves[0] @ p[2:], 0.0])
+    y = jax.jit(simulate, static_argnums=0)(
+        SECOND_ORDER, np.tile(p, (240, 1)), moves, np.ones(240), start
+    )
+    y = y + random.choice([0.01, 0.03, 0.1]) * np.std(y) * random.normal(size=240)
+    inputs = {f"u{k}": each for k, each in enumerate(moves.T)}
+    return Run(np.arange(240.0), inputs, {"y": np.asarray(y)}), time, damping
+
+
+@simulations(10, 60)
+def test_a_second_order_is_no_law_of_an_input(count):
+    """8 of 16 were a rate limit or a shift: no further lag oscillates, and laws had no rival."""
+    told, named = 0, []
+    for seed in range(count):
+        run, *truth = oscillation(seed, 1 + seed // 10 % 2)
+        fit = identify(run)
+        told += "a higher order" in fit.message or fit.status is Status.converged
+        if fit.checks.law_kind == HIGHER:
+            assert fit.message.endswith("--model second-order."), fit.message
+            about = re.search(r"T of about (\S+) s and zeta of about (\S+) \(p", fit.message)
+            named.append(np.array(about.groups(), float) / truth)
+    assert told >= 0.9 * count
+    assert len(named) >= count / 2
+    np.testing.assert_allclose(named, 1.0, atol=0.1)
+
+
+def test_errors_take_a_second_order_as_a_first_with_the_sum_of_its_lags():
+    run, time, damping = oscillation(1, 1)
+    search = ResponseSearch("y", FIRST_ORDER, Paths.of((run,), None, False), True)
+    found = search.identify((run,))
+    slopes = fuller_model_slopes(found.prepared, found.fit)
+    others = alternatives_of((run,), found, search, slopes, True)
+    assert others.departure.kind == HIGHER
+    numbers = [v.name for v in found.fit.variables]
+    mean = found.fit.theta[: others.shift.shape[1]] + others.weight @ others.shift
+    lags = np.exp(mean[numbers.index("map[0]")])
+    assert abs(lags / (2.0 * damping * time) - 1.0) < 0.1, (lags, damping, time)
+    error = others.error(np.eye(len(mean))[[numbers.index("map[0]")]], np.zeros(1))
+    assert error > 0.9 * abs(np.log(lags) - found.fit.theta[numbers.index("map[0]")])
 
 
 def test_readings_far_off_that_follow_the_inputs_are_no_bad_ones():

@@ -438,8 +438,9 @@ def test_a_noise_that_wanders_is_no_law_but_for_as_often_as_its_odds_say(count):
     for seed in range(count):
         fit = identify(lawful(None, seed), delay=0)
         assert fit.status is Status.converged, seed
-        assert (f"(P = {fit.checks.law_probability:.2f})" in fit.message) == bool(fit.checks.law)
-        laws.append(fit.checks.law_probability)
+        probability = 1.0 - fit.checks.no_law_probability
+        assert (f"(P = {probability:.2f})" in fit.message) == bool(fit.checks.law)
+        laws.append(probability)
         assert all(abs(fit.quantities[n].value - truth) < 4 * fit.quantities[n].error
                    for n, truth in (("K", 2.0), ("tau", 1.5))), fit.quantities  # fmt: skip
     assert np.mean(np.array(laws) > 0.5) <= 0.25, laws
