@@ -12,7 +12,7 @@ import beamfit
 from beamfit.answer import text_of
 from beamfit.cli.option_text import target_of
 from beamfit.cli.options import Command, Output, option, options
-from beamfit.emittance.targets import Beam, Target, check_limits, common_energy
+from beamfit.emittance.targets import Beam, Target, check_beam, check_limits, common_energy
 from beamfit.errors import InputError, located
 from beamfit.io.files import digest
 from beamfit.io.line import build_line, read_lattice
@@ -110,7 +110,9 @@ def _beam_of_sigma(sigma: str | None, plane: str) -> dict[str, Beam]:
         numbers = []
     if len(numbers) != 3:
         raise InputError(f"--sigma '{sigma}'", "three numbers S11,S12,S22 in m², m rad, rad²")
-    return {plane: Beam(np.array(numbers))}
+    beam = Beam(np.array(numbers))
+    check_beam(plane, beam.sigma)
+    return {plane: beam}
 
 
 def _beams_of_fit(

@@ -135,7 +135,8 @@ class ResponseFit:
     def tables(self) -> tuple[Table, ...]:
         """Tables of all numbers."""
         rows = [[name, f"{q} {limit_words(q)}".rstrip()] for name, q in self.quantities.items()]
-        rows += [["delay", f"{self.delay:.4g} samples"]]
+        if "delay" not in self.quantities:
+            rows.append(["delay", f"{self.delay:.4g} samples"])
         rows += self.checks.rows() + [each.row() for each in self.held]
         found = [Table(f"{self.output} ({self.model}, {self.map} parameters)", [], rows)]
         return (*found, *(curve.table() for curve in self.curves))

@@ -167,7 +167,7 @@ def check_targets(
     for target in targets:
         _check_target(beams, target)
     for plane, beam in beams.items():
-        _check_beam(plane, beam.sigma)
+        check_beam(plane, beam.sigma)
         if beam.line not in (None, line.digest):
             raise InputError(
                 f"a beam in plane {plane} that was fitted in another line than '{line.name}'",
@@ -202,7 +202,7 @@ def _check_target(beams: Mapping[str, Beam], target: Target) -> None:
         raise InputError(found, "a finite alpha")
 
 
-def _check_beam(plane: str, sigma: np.ndarray) -> None:
+def check_beam(plane: str, sigma: np.ndarray) -> None:
     """Raise an error for a matrix that is not positive definite, or not in SI units."""
     s11, s12, s22 = sigma
     if not (s11 > 0 and s11 * s22 > s12**2):
