@@ -183,7 +183,7 @@ class _Points(NamedTuple):
         equal = cls(x, lifetime, np.ones(x.size), 0.0, 0.0)
         curve = np.maximum(lifetime + _least_squares(equal).residuals, MIN_RATE)
         models = equal, equal._replace(error=curve)
-        return tuple(sorted(models, key=lambda one: -_integral([one], Law.constant).log))
+        return tuple(sorted(models, key=lambda one: -_posterior([one], Law.constant).log))
 
 
 class _LeastSquares(NamedTuple):
@@ -215,16 +215,10 @@ class _LeastSquares(NamedTuple):
         """A value in a unit of this size; `slopes` are its derivatives by the numbers."""
         _, scales, axes = np.linalg.svd(self.slopes, full_matrices=False)
         along, lost = axes @ slopes[: self.numbers.size], scales <= RANK_TOLERANCE * scales[0]
-        raw = float(np.linalg.norm(along[~lost] / scales[~lost]))
-        raw = (
-            math.inf
-            if np.any(np.abs(along[lost]) > RANK_TOLERANCE)
-            else max(raw, EXACT * abs(value))
-        )
-        raw, reach = raw * size, reach_of(math.inf if self.stated else self.dof)
-        return Quantity.reaching(
-            float(value) * size, self.scale * raw, unit, raw, reach * self.scale * raw
-        )
+        raw = max(float(np.linalg.norm(along[~lost] / scales[~lost])), EXACT * abs(value)) * size
+        raw = math.inf if np.any(np.abs(along[lost]) > RANK_TOLERANCE) else raw
+        error, reach = self.scale * raw, reach_of(math.inf if self.stated else self.dof)
+        return Quantity.reaching(float(value) * size, error, unit, raw, reach * error)
 
 
 def _least_squares(points: _Points, exponent: bool = False) -> _LeastSquares:
@@ -255,7 +249,7 @@ def _least_squares(points: _Points, exponent: bool = False) -> _LeastSquares:
     return _LeastSquares(found.x, found.fun, found.jac, points.known > 0)
 
 
-class _Integral(NamedTuple):
+class _Posterior(NamedTuple):
     """Nodes of a posterior, flat arrays: share of a, exponent, change of b, and the lifetime at the
     mean current over the median one; weights of sum 1; and the log evidence.
     """
@@ -273,7 +267,7 @@ class _Integral(NamedTuple):
         return (self.share * x ** (1 + self.power) + gas) / self.lifetime
 
 
-def _places(low: np.ndarray, high: np.ndarray, count: int) -> np.ndarray:
+def _shifted_midpoints(low: np.ndarray, high: np.ndarray, count: int) -> np.ndarray:
     """Midpoints of equal parts of ranges, (m, count), shifted in each range by another part of a
     step: those of all ranges together fill it evenly.
     """
@@ -282,7 +276,7 @@ def _places(low: np.ndarray, high: np.ndarray, count: int) -> np.ndarray:
     return low[:, None] + parts * (high - low)[:, None]
 
 
-def _along_share(
+def _share_nodes(
     points: _Points, power: np.ndarray, change: np.ndarray, bounds: tuple[float, float]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Nodes of the share of a at exponents and changes of b, (m,), the most probable lifetime at
@@ -311,19 +305,19 @@ def _along_share(
         shape, norm, best, squares = profile(share)
         slope = -best[..., None] * shape**2 * error * bend
         slope -= shape * (np.sum(shape * slope, axis=-1) / norm)[..., None]
-        whole = np.maximum(np.sum(slope**2, axis=-1), EXACT**2)
-        step = np.sum(slope * (read - best[..., None] * shape), axis=-1) / whole
+        curvature = np.maximum(np.sum(slope**2, axis=-1), EXACT**2)
+        step = np.sum(slope * (read - best[..., None] * shape), axis=-1) / curvature
         share = np.clip(share + step, *UNPHYSICAL_SHARES)
-    far, near = SHARE_REACH * np.sqrt(squares / dof / whole), np.clip(share, *bounds)
+    far, near = SHARE_REACH * np.sqrt(squares / dof / curvature), np.clip(share, *bounds)
     low, high = np.maximum(near - far, bounds[0]), np.minimum(near + far, bounds[1])
-    nodes = _places(low[:, 0], high[:, 0], SHARE_NODES)
+    nodes = _shifted_midpoints(low[:, 0], high[:, 0], SHARE_NODES)
     _, norm, best, squares = profile(nodes)
     density = 1 / np.sqrt(norm) / best / (bounds[1] - bounds[0])
     log = np.log(density * (high - low) / SHARE_NODES) - dof / 2 * np.log(squares)
     return nodes, best, np.sqrt(squares / dof / norm), log
 
 
-def _exponents(points: _Points, change: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _exponent_nodes(points: _Points, change: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Exponents for each change of b in the range that the points allow, and the log prior
     probability of each, (m, EXPONENT_NODES).
     """
@@ -331,35 +325,35 @@ def _exponents(points: _Points, change: np.ndarray) -> tuple[np.ndarray, np.ndar
     for _ in range(REFINEMENTS):
         power = np.linspace(low, high, EXPONENT_NODES, axis=1)
         every = np.repeat(change, EXPONENT_NODES)
-        log = logsumexp(_along_share(points, power.ravel(), every, (0.0, 1.0))[-1], axis=1)
+        log = logsumexp(_share_nodes(points, power.ravel(), every, (0.0, 1.0))[-1], axis=1)
         log = log.reshape(power.shape) + log_exponent_prior(power)[0]
         held = log > log.max(axis=1, keepdims=True) - NEGLIGIBLE_LOG
         first, last = held.argmax(axis=1), held.shape[1] - 1 - held[:, ::-1].argmax(axis=1)
         ends = np.maximum(first - 1, 0), np.minimum(last + 1, EXPONENT_NODES - 1)
         low, high = (np.take_along_axis(power, end[:, None], axis=1)[:, 0] for end in ends)
-    power = _places(low, high, EXPONENT_NODES)
+    power = _shifted_midpoints(low, high, EXPONENT_NODES)
     return power, log_exponent_prior(power)[0] + np.log((high - low) / EXPONENT_NODES)[:, None]
 
 
-def _integral(
+def _posterior(
     every: Sequence[_Points], law: Law, bounds: tuple[float, float] = (0.0, 1.0)
-) -> _Integral:
+) -> _Posterior:
     """Posterior of the free or of the constant law, averaged over the error models."""
-    found = [_of_errors(points, law, bounds) for points in every]
+    found = [_error_model_posterior(points, law, bounds) for points in every]
     whole = float(logsumexp([one.log for one in found]))
     weight = np.concatenate([one.weight * math.exp(one.log - whole) for one in found])
     numbers = (np.concatenate(part) for part in zip(*(one[:4] for one in found), strict=True))
-    return _Integral(*numbers, weight, whole)
+    return _Posterior(*numbers, weight, whole)
 
 
-def _of_errors(points: _Points, law: Law, bounds: tuple[float, float]) -> _Integral:
+def _error_model_posterior(points: _Points, law: Law, bounds: tuple[float, float]) -> _Posterior:
     """Posterior of the free or of the constant law with one error model."""
     change, power, prior = np.zeros(1), np.zeros((1, 1)), np.zeros((1, 1))
     if law is Law.free:
         change = DRIFT * ndtri((np.arange(CHANGE_NODES) + 0.5) / CHANGE_NODES)
-        power, prior = _exponents(points, change)
+        power, prior = _exponent_nodes(points, change)
     every = np.repeat(change, power.shape[1])
-    share, best, spread, log = _along_share(points, power.ravel(), every, bounds)
+    share, best, spread, log = _share_nodes(points, power.ravel(), every, bounds)
     log = log + (prior - math.log(change.size)).ravel()[:, None]
     # Student's distribution of the lifetime at each node: one draw, evenly over all nodes.
     even = np.modf(math.sqrt(3.0) * np.arange(1, log.size + 1))[0].reshape(log.shape)
@@ -369,12 +363,12 @@ def _of_errors(points: _Points, law: Law, bounds: tuple[float, float]) -> _Integ
     whole -= (points.current.size - 1) / 2 * math.log(math.pi)
     numbers = (share, power.ravel()[:, None], every[:, None], np.maximum(drawn, MIN_RATE))
     flat = (np.broadcast_to(number, log.shape).ravel() for number in numbers)
-    return _Integral(*flat, np.exp(log - logsumexp(log)).ravel(), whole)
+    return _Posterior(*flat, np.exp(log - logsumexp(log)).ravel(), whole)
 
 
 def _log_evidence(models: Sequence[_Points]) -> float:
     """Log evidence of the constant and the free law, which are equally probable."""
-    return float(np.logaddexp(*(_integral(models, law).log for law in Law)))
+    return float(np.logaddexp(*(_posterior(models, law).log for law in Law)))
 
 
 class _Departure(NamedTuple):
@@ -389,7 +383,9 @@ class _Departure(NamedTuple):
     dof: int
 
 
-def _farthest_off(table: LifetimeTable, kept: np.ndarray, exponents: np.ndarray) -> _Departure:
+def _most_deviant_point(
+    table: LifetimeTable, kept: np.ndarray, exponents: np.ndarray
+) -> _Departure:
     """Leave out each point in turn (R. D. Cook and S. Weisberg, Residuals and influence in
     regression, 1982, eq. 2.2.8), in the loss rates, which are linear in those to a and b.
     """
@@ -419,7 +415,7 @@ def _outliers(table: LifetimeTable) -> np.ndarray:
     """Points that are more probably bad than good, one at a time."""
     kept = np.ones(len(table), bool)
     for _ in range(int(MAX_LEFT_OUT * len(table))):
-        worst = _farthest_off(table, kept, TRIAL_EXPONENTS)
+        worst = _most_deviant_point(table, kept, TRIAL_EXPONENTS)
         if worst.errors < MIN_BAD_ERRORS:
             break
         others = kept & (np.arange(len(table)) != worst.point)
@@ -432,7 +428,7 @@ def _outliers(table: LifetimeTable) -> np.ndarray:
     return ~kept
 
 
-def _tested(points: _Points, plain: _LeastSquares, power: _LeastSquares) -> ConstantA:
+def _test_constant_a(points: _Points, plain: _LeastSquares, power: _LeastSquares) -> ConstantA:
     """Test a constant a by the fall of chi², which knows no curvature."""
     fall, dof = max(plain.chi2 - power.chi2, 0.0), max(power.dof, 1)
     if points.known:
@@ -488,9 +484,9 @@ def _free_law(
     """Posterior with an exponent of a and a change of b; None where a negative a or b is more
     probable.
     """
-    found, constant = (_integral(every, law) for law in (Law.free, Law.constant))
+    found, constant = (_posterior(every, law) for law in (Law.free, Law.constant))
     if not np.all(plain.numbers[:2] >= 0):
-        rival = _integral(every, Law.constant, UNPHYSICAL_SHARES)
+        rival = _posterior(every, Law.constant, UNPHYSICAL_SHARES)
         if rival.log + math.log(UNPHYSICAL_ODDS) > found.log:
             return None
     (mean, unit, ends), weight = _units(table), found.weight
@@ -509,7 +505,7 @@ def _free_law(
     return FreeLaw(quoted, quoted["share"], exponent, None, *chances)
 
 
-def _widely(exact: Quantity, free: Quantity, freed: bool) -> Quantity:
+def _with_free_law(exact: Quantity, free: Quantity, freed: bool) -> Quantity:
     """A quantity with what the free law leaves open: at its median, or at the value of the constant
     law.
     """
@@ -519,13 +515,13 @@ def _widely(exact: Quantity, free: Quantity, freed: bool) -> Quantity:
 
 def _single_departure(table: LifetimeTable, kept: np.ndarray) -> str | None:
     """Sentence on one point that contradicts the constant law, which the others follow."""
-    off = _farthest_off(table, kept, np.zeros(1))
+    off = _most_deviant_point(table, kept, np.zeros(1))
     given = table.error is not None
     dof = off.dof + (STATED_READINGS if given else 0.0)
     chance = 2 * int(kept.sum()) * float(stdtr(dof, -off.errors))
     if chance >= POOR_FIT or (given and chi2_probability(off.rest, off.dof) < POOR_FIT):
         return None
-    [named] = _named(table, np.arange(len(table)) == off.point)
+    [named] = _point_names(table, np.arange(len(table)) == off.point)
     return (
         f"{named[0].upper()}{named[1:]} lies {off.errors:.2g} errors off the constant law of the "
         "others: measure it again"
@@ -570,7 +566,7 @@ def fit_lifetimes(table: LifetimeTable, law: Law | str = Law.free) -> LifetimeFi
     every = _Points.of(table, ~left_out)
     points = every[0]
     plain, power = (_least_squares(points, exponent) for exponent in (False, True))
-    test, exact = _tested(points, plain, power), _by_least_squares(table, plain)
+    test, exact = _test_constant_a(points, plain, power), _by_least_squares(table, plain)
     quiet = table.error is None and plain.scale < MIN_NOISE
     known = quiet or Law(law) is Law.constant
     free = None if known else _free_law(table, every, plain)
@@ -579,7 +575,7 @@ def fit_lifetimes(table: LifetimeTable, law: Law | str = Law.free) -> LifetimeFi
     given, unit = table.error is not None, float(np.median(table.lifetime))
     evidence = TableEvidence(
         exact, best.chi2, best.dof, test, _by_current(table, power) if refuted else None,
-        _named(table, left_out), None if given else best.scale * unit, free,
+        _point_names(table, left_out), None if given else best.scale * unit, free,
         not known and free is None,
     )  # fmt: skip
     finding = finding_of_table(evidence)
@@ -589,7 +585,9 @@ def fit_lifetimes(table: LifetimeTable, law: Law | str = Law.free) -> LifetimeFi
     if free is not None:
         open_ = finding.status is Status.unidentified
         found = free.quantities
-        quoted = {name: _widely(one, found[name], freed or open_) for name, one in exact.items()}
+        quoted = {
+            name: _with_free_law(one, found[name], freed or open_) for name, one in exact.items()
+        }
     elif refuted:  # a and b stay those of the constant law
         quoted |= {name: _lifetime(power, x, unit) for name, x in _units(table)[-1].items()}
     if finding.status is Status.unidentified:
@@ -603,7 +601,7 @@ def fit_lifetimes(table: LifetimeTable, law: Law | str = Law.free) -> LifetimeFi
     )  # fmt: skip
 
 
-def _named(table: LifetimeTable, which: np.ndarray) -> tuple[str, ...]:
+def _point_names(table: LifetimeTable, which: np.ndarray) -> tuple[str, ...]:
     return tuple(
         f"point {k + 1} ({table.lifetime[k]:.4g} h at {table.current[k]:.4g} mA)"
         for k in np.flatnonzero(which)
