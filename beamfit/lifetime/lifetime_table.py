@@ -249,7 +249,7 @@ def _least_squares(points: _Points, exponent: bool = False) -> _LeastSquares:
     return _LeastSquares(found.x, found.fun, found.jac, points.known > 0)
 
 
-class _Posterior(NamedTuple):
+class _TablePosterior(NamedTuple):
     """Nodes of a posterior, flat arrays: share of a, exponent, change of b, and the lifetime at the
     mean current over the median one; weights of sum 1; and the log evidence.
     """
@@ -337,16 +337,18 @@ def _exponent_nodes(points: _Points, change: np.ndarray) -> tuple[np.ndarray, np
 
 def _posterior(
     every: Sequence[_Points], law: Law, bounds: tuple[float, float] = (0.0, 1.0)
-) -> _Posterior:
+) -> _TablePosterior:
     """Posterior of the free or of the constant law, averaged over the error models."""
     found = [_error_model_posterior(points, law, bounds) for points in every]
     whole = float(logsumexp([one.log for one in found]))
     weight = np.concatenate([one.weight * math.exp(one.log - whole) for one in found])
     numbers = (np.concatenate(part) for part in zip(*(one[:4] for one in found), strict=True))
-    return _Posterior(*numbers, weight, whole)
+    return _TablePosterior(*numbers, weight, whole)
 
 
-def _error_model_posterior(points: _Points, law: Law, bounds: tuple[float, float]) -> _Posterior:
+def _error_model_posterior(
+    points: _Points, law: Law, bounds: tuple[float, float]
+) -> _TablePosterior:
     """Posterior of the free or of the constant law with one error model."""
     change, power, prior = np.zeros(1), np.zeros((1, 1)), np.zeros((1, 1))
     if law is Law.free:
@@ -363,7 +365,7 @@ def _error_model_posterior(points: _Points, law: Law, bounds: tuple[float, float
     whole -= (points.current.size - 1) / 2 * math.log(math.pi)
     numbers = (share, power.ravel()[:, None], every[:, None], np.maximum(drawn, MIN_RATE))
     flat = (np.broadcast_to(number, log.shape).ravel() for number in numbers)
-    return _Posterior(*flat, np.exp(log - logsumexp(log)).ravel(), whole)
+    return _TablePosterior(*flat, np.exp(log - logsumexp(log)).ravel(), whole)
 
 
 def _log_evidence(models: Sequence[_Points]) -> float:
@@ -413,18 +415,19 @@ def _most_deviant_point(
 
 def _outliers(table: LifetimeTable) -> np.ndarray:
     """Points that are more probably bad than good, one at a time."""
-    kept = np.ones(len(table), bool)
+    kept, good = np.ones(len(table), bool), None
     for _ in range(int(MAX_LEFT_OUT * len(table))):
         worst = _most_deviant_point(table, kept, TRIAL_EXPONENTS)
         if worst.errors < MIN_BAD_ERRORS:
             break
         others = kept & (np.arange(len(table)) != worst.point)
-        good, rest = (_log_evidence(_Points.of(table, rows)) for rows in (kept, others))
+        good = _log_evidence(_Points.of(table, kept)) if good is None else good
+        rest = _log_evidence(_Points.of(table, others))
         off = worst.distance / float(np.median(table.lifetime))
         bad = rest + math.log(P_BAD) - math.log(2 * math.log(MAX_BAD_ERRORS) * off)
         if good + math.log1p(-P_BAD) > bad:
             break
-        kept = others
+        kept, good = others, rest
     return ~kept
 
 
@@ -549,8 +552,9 @@ def fit_lifetimes(table: LifetimeTable, law: Law | str = Law.free) -> LifetimeFi
     -----
     Least squares on the lifetimes themselves: their errors, and not those of 1/tau, are what is
     stated. The posterior of the free law is integrated on a grid over the share of a, the exponent
-    and the change of b; stated errors have the noise prior of a decay. Points five robust standard
-    deviations off a law with a free exponent are left out and named.
+    and the change of b. Stated errors have the noise prior of a decay, or are wrong by a common
+    factor. Points that are more probably bad than good, by the evidence of the laws without each,
+    are left out and named.
 
     Examples
     --------
