@@ -404,6 +404,8 @@ def _narrow_range(e: TableEvidence) -> Finding | None:
     """Lifetimes that do not separate a and b, by the constant law or by the free one."""
     share, error = e.value_and_error("share")
     if not error < SEPARABLE:
+        if e.free is not None:  # the share that is quoted
+            share, error = e.free.share.value, e.free.share.error
         measured = (
             f" (share of a in the loss {share:.2g} ± {error:.2g})" if math.isfinite(error) else ""
         )

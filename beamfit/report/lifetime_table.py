@@ -91,7 +91,8 @@ def draw_lifetimes(figure: FigureBase, fit: LifetimeFit) -> None:
     above.errorbar(current, lifetime, error, **style, label="lifetimes")
     below.errorbar(current, fitted_lifetime(fit, current) - lifetime, error, **style)
     grid = np.linspace(table.current.min(), table.current.max(), CURVE_POINTS)
-    label = "fit" + (f", a as I^{exponent:.3g}" if exponent else "")
+    named = exponent and fit.status is not Status.unidentified
+    label = "fit" + (f", a as I^{exponent:.3g}" if named else "")
     above.plot(grid, fitted_lifetime(fit, grid), color=RED, lw=1.3, label=label, zorder=3)
     limits = above.get_ylim()
     if left_out.any():
