@@ -128,8 +128,9 @@ def _held_by_refills(e: Evidence) -> Finding | None:
     return Finding(
         Status.unidentified,
         "The beam is held by refills that the record does not resolve: its readings lie evenly "
-        "between two currents, and tell nothing of the lifetime; record several readings "
-        "between refills",
+        "between two currents, and tell nothing of the lifetime. If it has several readings "
+        "between refills, beamfit.study(record) fits the decays between them; else record more "
+        "often",
     )
 
 

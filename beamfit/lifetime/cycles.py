@@ -192,7 +192,8 @@ def collect_cycles(cycles: Sequence[DecayRecord]) -> Pieces:
     starts_known = all(cycle.start is not None for cycle in cycles)
     for cycle in cycles:
         begin = cycle.start if starts_known else begin
-        time, current, error = cycle.means(min(size, len(cycle) // MIN_CYCLE_READINGS))
+        blocks = max(-(-len(cycle) // size), MIN_CYCLE_READINGS)  # few readings are left over
+        time, current, error = cycle.means(len(cycle) // blocks)
         parts.append((begin + time, time - time[0], current, error, row))
         row += time.size
         begin += 2 * cycle.span  # unknown start: as if one cycle were missing in between

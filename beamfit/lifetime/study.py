@@ -68,6 +68,9 @@ REFUTING = (Status.poor_fit, Status.infeasible)
 CHANGE_MARGIN = 2.0
 # Time constants after which gas is pumped away: less than 1 % of it is left.
 GAS_TIME_CONSTANTS = 5.0
+# Smallest share of the current that a cycle of a common answer must lose to be also fitted alone,
+# over the standard deviation of a drift of b: with less a drift may take the place of a.
+OVER_DRIFT = 2.0
 # Smallest number of cycles in a part of a top-up record: chosen, since fewer make a poor point
 # of a trend.
 MIN_CYCLES_IN_PART = 10
@@ -270,6 +273,11 @@ def budget(record: DecayRecord, machine: Machine) -> Budget:
     return Budget(operation, parts, current, length, emittances, filed if contradicted else None)
 
 
+def _lost(cycle: DecayRecord) -> float:
+    """Loss of current over a cycle: the logarithm of its first over its last reading."""
+    return math.log(cycle.current[0] / cycle.current[-1])
+
+
 def separable_cycles(
     cycles: Sequence[DecayRecord], together: DecayRecord, fit: DecayFit
 ) -> list[DecayRecord]:
@@ -286,7 +294,7 @@ def separable_cycles(
     noise = min(fit.rms_residual * fit.inflation * noise_reduction, noise)
 
     def separates(cycle: DecayRecord) -> bool:
-        loss = math.log(cycle.current[0] / cycle.current[-1])
+        loss = _lost(cycle)
         # The parabola x²/2 over a length x deviates from its best straight line by
         # x²/(24 sqrt(5)) rms.
         bend = float(cycle.current.mean()) * loss**2 / 24 * math.sqrt(len(cycle) / 5)
@@ -451,11 +459,12 @@ def _pool_cycles(
         # With edges of digits (`mean` is set) no refill is missed: it would show as a step.
         fit = fit_cycles(group, group_name, law, found=group[0].mean is None)
         segment = join_cycles(group, group_name)
-        separable = separable_cycles(group, segment, fit)
-        single += separable
+        alone = separable_cycles(group, segment, fit)
         answered = fit.status not in REFUTING and fit.lifetime_mean.error is not None
-        if not answered and len(separable) == len(group):  # one law does not hold for these fills
+        if not answered and len(alone) == len(group):  # one law does not hold for these fills
+            single += alone
             continue
+        single += [cycle for cycle in alone if _lost(cycle) > OVER_DRIFT * DRIFT]
         pooled.append(Decay.of(segment, segment.start, fit, machine))
     return pooled, single
 

@@ -1,5 +1,7 @@
 """Top-up and repeated fills: one a and one b from many cycles."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
@@ -60,6 +62,26 @@ def test_top_up_of_ten_hours_has_one_answer(noise):
     off = fit.lifetime_mean.value - true_lifetime(fit.mean_current)
     assert abs(off) < 2 * fit.lifetime_mean.error < 0.02 * fit.lifetime_mean.value
     assert "200 cycles" in fit.message
+
+
+def test_cycles_that_lose_little_have_one_answer_however_many_readings_they_have():
+    """With a and b constant each would separate them; a drift of b leaves them open."""
+    time, current, number = top_up(0.005, seed=1, cycle=600.0, step=1.0)
+    study = study_record(DecayRecord(time, current))
+    assert study.decays == ()
+    fit = study.pooled[0].fit
+    assert fit.first.size == number[-1] + 1
+    off = fit.lifetime_mean.value - true_lifetime(fit.mean_current)
+    assert abs(off) < 3 * fit.lifetime_mean.error
+
+
+@pytest.mark.parametrize("length", [100, 601, 613])
+def test_all_readings_count_where_there_are_very_many(length):
+    """A cycle that no whole number of means fits has no readings left over at its end."""
+    cycle = DecayRecord(np.arange(length), 500 * np.exp(-np.arange(length) / 36000), start=0.0)
+    cycles = [replace(cycle, start=2.0 * length * k) for k in range(2_000_000 // length)]
+    means = collect_cycles(cycles).since.reshape(len(cycles), -1)
+    assert means[:, 1].min() * means.shape[1] > 0.98 * length
 
 
 @simulations(10, 30)

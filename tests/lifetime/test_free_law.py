@@ -446,6 +446,12 @@ def test_an_archive_slower_than_the_refills_has_no_limit(interval, count):
         assert found.lifetime_mean.interval_95 is None
 
 
+def test_the_fit_of_one_decay_says_what_to_do_with_a_record_of_many():
+    found = fit_decay(sawtooth(1.0, 3000, 0.005, 300.0, seed=1))
+    assert found.lifetime_mean.error is None
+    assert "several readings between refills, beamfit.study(record) fits" in found.message
+
+
 @simulations(3, 8)
 @pytest.mark.parametrize("hours", [0.3, 0.8])
 def test_a_staircase_of_digits_is_fitted_at_its_edges(hours, count):
