@@ -11,6 +11,7 @@ from pathlib import Path
 from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any, TypeVar
 
+from beamfit.compile_cache import one_blas_thread
 from beamfit.errors import InputError, nearest
 
 if TYPE_CHECKING:
@@ -53,7 +54,8 @@ def is_path(value: object) -> bool:
 
 
 def with_paths(function: F, name: str) -> F:
-    """Make a function accept paths in place of a scan, a line, a record, runs or a ring.
+    """Make a function accept paths in place of a scan, a line, a record, runs or a ring, and
+    compute with one BLAS thread.
 
     Parameters
     ----------
@@ -80,7 +82,8 @@ def with_paths(function: F, name: str) -> F:
     def opened(*args: Any, **named: Any) -> Any:
         bound = given.bind(*args, **named)
         bound.arguments |= _read_paths(bound.arguments)
-        return function(*bound.args, **bound.kwargs)
+        with one_blas_thread():
+            return function(*bound.args, **bound.kwargs)
 
     opened.__module__, opened.__name__, opened.__qualname__ = "beamfit", name, name
     return opened

@@ -1,4 +1,5 @@
-"""Settings of JAX, and a cache of compiled code, since compiling dominates the first answer's time.
+"""Settings of JAX and of BLAS, and a cache of compiled code, since compiling dominates the first
+answer's time.
 
 Every package that uses JAX calls `prepare_jax` on import. This module itself does not import JAX.
 """
@@ -7,6 +8,7 @@ from __future__ import annotations
 
 import os
 import warnings
+from contextlib import AbstractContextManager
 from pathlib import Path
 
 # Option names of JAX; the environment variables have capitals. All code is cached, because a
@@ -66,6 +68,25 @@ def prepare_jax() -> None:
         if code is not None:  # a subfolder that can be emptied without the locks of magnets
             code.mkdir(mode=0o700, exist_ok=True)
         jax.config.update(CACHE_FOLDER, None if code is None else str(code))
+
+
+def one_blas_thread() -> AbstractContextManager[object]:
+    """Limit the BLAS of NumPy and SciPy to one thread in a `with` block.
+
+    Matrices of scans and records are small: with two threads on a busy machine fits take three to
+    five times as long.
+
+    Examples
+    --------
+    >>> from threadpoolctl import threadpool_info
+    >>> with one_blas_thread():
+    ...     {library["num_threads"] for library in threadpool_info()}
+    {1}
+    """
+    import scipy.linalg  # loads the libraries of both, which are then limited  # noqa: F401
+    from threadpoolctl import threadpool_limits
+
+    return threadpool_limits(limits=1, user_api="blas")
 
 
 def own_folder() -> str | None:

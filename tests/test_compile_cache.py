@@ -7,8 +7,10 @@ import sys
 from importlib.metadata import version
 
 import pytest
+from threadpoolctl import threadpool_info, threadpool_limits
 
 from beamfit import compile_cache
+from beamfit.commands import with_paths
 from beamfit.compile_cache import TESTED_JAX
 
 # Says where code is kept and how often it was found there; runs one of the package's functions.
@@ -141,3 +143,12 @@ def test_compilation_is_quick_unless_the_user_says_otherwise():
     tried = version("jax").startswith(TESTED_JAX)
     flag = "--xla_cpu_use_fusion_emitters=false" if tried else "untried"
     assert done.stdout.split() == [flag, "0.0", "True"]
+
+
+def test_public_functions_compute_with_one_blas_thread():
+    """Whatever the user's threads are, which stand again afterwards."""
+    with threadpool_limits(2, user_api="blas"):
+        before = threadpool_info()
+        within = with_paths(threadpool_info, "threads")()
+        assert threadpool_info() == before
+    assert {one["num_threads"] for one in within if one["user_api"] == "blas"} == {1}

@@ -17,6 +17,7 @@ from beamfit.batch.columns import (
     emittance_rows,
     lifetime_rows,
 )
+from beamfit.compile_cache import one_blas_thread
 from beamfit.errors import InputError
 from beamfit.io.decay_record import read_lifetime_input
 from beamfit.io.files import digest
@@ -109,7 +110,8 @@ class Job:
             raise InputError(f"beamfit {beamfit.__version__} on a worker", f"{self.version} there")
         try:
             found = self._emittances(files) if self.kind == "emittance" else self._decays(files)
-            return self._csv(found)
+            with one_blas_thread():
+                return self._csv(found)
         except Exception as error:
             if len(files) > 1:
                 return "".join(self.answer([file]) for file in files)
