@@ -7,6 +7,9 @@ from contextlib import suppress
 from typing import Any
 
 SHOW_CURSOR = b"\x1b[?25h"
+# Threads of NumPy's and SciPy's linear algebra, read when these are imported: one, unless the user
+# sets them, as for `beamfit.compile_cache.one_blas_thread`.
+THREADS = ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OMP_NUM_THREADS")
 
 
 def _exit_on_signal(number: int, frame: Any) -> None:
@@ -33,6 +36,8 @@ def main() -> None:
             os.fstat(descriptor)
         except OSError:
             os.open(os.devnull, os.O_RDWR)
+    for name in THREADS:
+        os.environ.setdefault(name, "1")
     from beamfit.cli import main
 
     main()

@@ -7,9 +7,11 @@ import sys
 from importlib.metadata import version
 
 import pytest
+import scipy.linalg  # noqa: F401 - its library is there before threads are counted
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from beamfit import compile_cache
+from beamfit.__main__ import THREADS
 from beamfit.commands import with_paths
 from beamfit.compile_cache import TESTED_JAX
 
@@ -152,3 +154,17 @@ def test_public_functions_compute_with_one_blas_thread():
         within = with_paths(threadpool_info, "threads")()
         assert threadpool_info() == before
     assert {one["num_threads"] for one in within if one["user_api"] == "blas"} == {1}
+
+
+@pytest.mark.parametrize(("given", "seen"), [(None, "1"), ("3", "3")])
+def test_commands_have_one_blas_thread_unless_the_user_says_otherwise(given, seen):
+    script = """if True:
+        import atexit, os
+        from beamfit.__main__ import THREADS, main
+        atexit.register(lambda: print(*(os.environ[name] for name in THREADS)))
+        main()"""
+    kept = {name: value for name, value in os.environ.items() if name not in THREADS}
+    own = {} if given is None else dict.fromkeys(THREADS, given)
+    call = [sys.executable, "-c", script, "--version"]
+    done = subprocess.run(call, env=kept | own, capture_output=True, text=True, check=True)
+    assert done.stdout.split()[-3:] == [seen] * 3
