@@ -8,7 +8,7 @@ from typing import Any
 
 SHOW_CURSOR = b"\x1b[?25h"
 # Threads of NumPy's and SciPy's linear algebra, read when these are imported: one, unless the user
-# sets them, as for `beamfit.compile_cache.one_blas_thread`.
+# sets them, as for `beamfit.compile_cache.usual_arithmetic`.
 THREADS = ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OMP_NUM_THREADS")
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from beamfit.compile_cache import one_blas_thread
+from beamfit.compile_cache import usual_arithmetic
 from beamfit.errors import InputError, nearest
 
 if TYPE_CHECKING:
@@ -55,7 +55,7 @@ def is_path(value: object) -> bool:
 
 def with_paths(function: F, name: str) -> F:
     """Make a function accept paths in place of a scan, a line, a record, runs or a ring, and
-    compute with one BLAS thread.
+    compute with `usual_arithmetic`.
 
     Parameters
     ----------
@@ -82,7 +82,7 @@ def with_paths(function: F, name: str) -> F:
     def opened(*args: Any, **named: Any) -> Any:
         bound = given.bind(*args, **named)
         bound.arguments |= _read_paths(bound.arguments)
-        with one_blas_thread():
+        with usual_arithmetic():
             return function(*bound.args, **bound.kwargs)
 
     opened.__module__, opened.__name__, opened.__qualname__ = "beamfit", name, name

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import os
 import warnings
-from contextlib import AbstractContextManager
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 # Option names of JAX; the environment variables have capitals. All code is cached, because a
@@ -70,23 +71,26 @@ def prepare_jax() -> None:
         jax.config.update(CACHE_FOLDER, None if code is None else str(code))
 
 
-def one_blas_thread() -> AbstractContextManager[object]:
-    """Limit the BLAS of NumPy and SciPy to one thread in a `with` block.
+@contextmanager
+def usual_arithmetic() -> Iterator[None]:
+    """Compute in a `with` block with one BLAS thread and NumPy's default floating-point errors.
 
     Matrices of scans and records are small: with two threads on a busy machine fits take three to
-    five times as long.
+    twenty times as long. Probabilities underflow, which a caller may have made an error.
 
     Examples
     --------
     >>> from threadpoolctl import threadpool_info
-    >>> with one_blas_thread():
+    >>> with usual_arithmetic():
     ...     {library["num_threads"] for library in threadpool_info()}
     {1}
     """
+    import numpy as np
     import scipy.linalg  # loads the libraries of both, which are then limited  # noqa: F401
     from threadpoolctl import threadpool_limits
 
-    return threadpool_limits(limits=1, user_api="blas")
+    with threadpool_limits(limits=1, user_api="blas"), np.errstate(all="warn", under="ignore"):
+        yield
 
 
 def own_folder() -> str | None:

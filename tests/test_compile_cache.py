@@ -6,6 +6,7 @@ import subprocess
 import sys
 from importlib.metadata import version
 
+import numpy as np
 import pytest
 import scipy.linalg  # noqa: F401 - its library is there before threads are counted
 from threadpoolctl import threadpool_info, threadpool_limits
@@ -154,6 +155,11 @@ def test_public_functions_compute_with_one_blas_thread():
         within = with_paths(threadpool_info, "threads")()
         assert threadpool_info() == before
     assert {one["num_threads"] for one in within if one["user_api"] == "blas"} == {1}
+
+
+def test_floating_point_errors_that_the_user_raises_do_not_reach_the_fit():
+    with np.errstate(all="raise"):
+        assert with_paths(lambda: np.exp(-1e4), "underflow")() == 0
 
 
 @pytest.mark.parametrize(("given", "seen"), [(None, "1"), ("3", "3")])

@@ -17,7 +17,7 @@ from beamfit.batch.columns import (
     emittance_rows,
     lifetime_rows,
 )
-from beamfit.compile_cache import one_blas_thread
+from beamfit.compile_cache import usual_arithmetic
 from beamfit.errors import InputError
 from beamfit.io.decay_record import read_lifetime_input
 from beamfit.io.files import digest
@@ -110,7 +110,7 @@ class Job:
             raise InputError(f"beamfit {beamfit.__version__} on a worker", f"{self.version} there")
         try:
             found = self._emittances(files) if self.kind == "emittance" else self._decays(files)
-            with one_blas_thread():
+            with usual_arithmetic():
                 return self._csv(found)
         except Exception as error:
             if len(files) > 1:

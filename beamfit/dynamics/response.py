@@ -52,6 +52,10 @@ class Physics(NamedTuple):
     advance: Callable[[jax.Array, jax.Array, jax.Array, jax.Array], jax.Array]
     even: bool = False
 
+    def __reduce__(self) -> tuple[Callable[[str], Physics], tuple[str]]:
+        """Pickle the name: there is one response of each."""
+        return response_named, (self.name,)
+
 
 def _gains(inputs: tuple[str, ...], letter: str = "K") -> tuple[str, ...]:
     return (letter,) if len(inputs) == 1 else tuple(f"{letter}_{name}" for name in inputs)
@@ -158,6 +162,17 @@ ARX = Physics(
 )
 
 PHYSICS = {each.name: each for each in (FIRST_ORDER, SECOND_ORDER, ARX)}
+
+
+def response_named(name: str) -> Physics:
+    """Return the response of that name.
+
+    Examples
+    --------
+    >>> response_named("arx").even
+    True
+    """
+    return PHYSICS[name]
 
 
 def simulate(

@@ -190,6 +190,10 @@ class Scenario:
     network: bool = False
     whole_map: bool = True
 
+    def __reduce__(self) -> tuple[Callable[[str], Scenario], tuple[str]]:
+        """Pickle the name: there is one scenario of each."""
+        return scenario_of, (self.name,)
+
 
 class Scanned(Protocol):
     """A fitted scan, of any scenario."""

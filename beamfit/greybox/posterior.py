@@ -145,28 +145,34 @@ class Sampled:
     more: Any
 
 
-@lru_cache(maxsize=64)
-def _make_law(own, log_volume, derive, build) -> tuple[PosteriorLaw, Callable]:
-    """Make the law from a study's functions, and residuals that end with those of the priors."""
+class _Law(NamedTuple):
+    """The law of a posterior from a study's functions, as in `Statement`."""
 
-    def model_of(data: Sampled, moved: jax.Array) -> Any:
+    own: Callable[[Any], Any]
+    log_volume: Callable[[Any, Any], jax.Array]
+    derive: Callable[[Any, Any], jax.Array]
+    build: Callable[[Any, Any], Any]
+
+    def model_at(self, data: Sampled, moved: jax.Array) -> Any:
+        """Return the model at the sampled numbers."""
         theta = data.theta.at[data.moving].set(moved)
-        return own(tree.replace(data.core.model, data.core.chosen, theta))
+        return self.own(tree.replace(data.core.model, data.core.chosen, theta))
 
-    def residual(data: Sampled, moved: jax.Array) -> tuple[jax.Array, ...]:
+    def residual(self, data: Sampled, moved: jax.Array) -> tuple[jax.Array, ...]:
         """Residuals of the records without those of the priors, which have no noise factor."""
-        model = model_of(data, moved)
+        model = self.model_at(data, moved)
         return tuple(record.residual(model) for record in data.core.records) or (jnp.zeros(0),)
 
-    def with_priors(data: Sampled, moved: jax.Array) -> tuple[jax.Array, ...]:
-        model = model_of(data, moved)
+    def with_priors(self, data: Sampled, moved: jax.Array) -> tuple[jax.Array, ...]:
+        """Residuals that end with those of the priors."""
+        model = self.model_at(data, moved)
         priors = [prior.residual(model) for prior in data.core.priors]
-        return *residual(data, moved), jnp.concatenate([jnp.zeros(0), *priors])
+        return *self.residual(data, moved), jnp.concatenate([jnp.zeros(0), *priors])
 
-    def log_prior(data: Sampled, moved: jax.Array) -> jax.Array:
+    def log_prior(self, data: Sampled, moved: jax.Array) -> jax.Array:
         """Log density of priors and further objectives, -inf outside bounds and constraints."""
-        model, core = model_of(data, moved), data.core
-        value = log_volume(model, data.more)
+        model, core = self.model_at(data, moved), data.core
+        value = self.log_volume(model, data.more)
         for prior in core.priors:
             value -= 0.5 * jnp.sum(prior.residual(model) ** 2)
         for objective in core.objectives:
@@ -178,13 +184,17 @@ def _make_law(own, log_volume, derive, build) -> tuple[PosteriorLaw, Callable]:
             inside &= jnp.all((limited >= constraint.lower) & (limited <= constraint.upper))
         return jnp.where(inside, value, -jnp.inf)
 
-    law = PosteriorLaw(
-        residual,
-        log_prior,
-        lambda data, moved: derive(model_of(data, moved), data.more),
-        lambda data, moved: build(model_of(data, moved), data.more),
-    )
-    return law, with_priors
+    def derived(self, data: Sampled, moved: jax.Array) -> jax.Array:
+        """Derived numbers."""
+        return self.derive(self.model_at(data, moved), data.more)
+
+    def built(self, data: Sampled, moved: jax.Array) -> Any:
+        """Return the study's object that a user's functions take."""
+        return self.build(self.model_at(data, moved), data.more)
+
+
+# One law for the same functions: JAX compiles anew for another one.
+_law_of = lru_cache(maxsize=64)(_Law)
 
 
 def target_of(
@@ -235,9 +245,10 @@ def target_of(
     lower, upper = p.lower[moving], p.upper[moving]
     lower = np.array([stated.lower.get(n, low) for n, low in zip(names, lower, strict=True)])
     theta, derivative = _to_sampled(p, stated, optimum.theta)
-    law, with_priors = _make_law(stated.own, stated.log_volume, stated.derive, stated.build)
+    own = _law_of(stated.own, stated.log_volume, stated.derive, stated.build)
+    law = PosteriorLaw(own.residual, own.log_prior, own.derived, own.built)
     data = _data(p, theta, moving, stated)
-    slopes = slopes_of(law._replace(residual=with_priors), data, theta[moving])
+    slopes = slopes_of(law._replace(residual=own.with_priors), data, theta[moving])
     noise_found = tuple(scale if scale > 0 else 1.0 for scale in optimum.scales) or (1.0,)
     # Half-width of the proposals for numbers that the data do not determine.
     box = np.where(np.isfinite(upper - lower), 0.5 * (upper - lower), np.inf)

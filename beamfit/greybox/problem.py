@@ -437,6 +437,10 @@ class Problem:
         """Upper limit of each constraint element."""
         return _broadcast("upper", self._constraint_shapes)
 
+    def __getstate__(self) -> dict[str, Any]:
+        """State to be pickled: the compiled programs stay in their process."""
+        return {name: value for name, value in vars(self).items() if name != "compiled"}
+
     @property
     def has_data(self) -> bool:
         """True if there are records or priors: a fit, not only an optimisation."""
