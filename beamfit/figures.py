@@ -239,9 +239,8 @@ def _plane(fit: EmittanceFit, plane: str | None) -> str:
 
 def _render(picture: Picture) -> Figure:
     """Draw a picture of the report, in its style."""
-    from matplotlib import rc_context
 
-    from beamfit.report.document import STYLE, figure_of
+    from beamfit.report.document import figure_of, own_style
 
-    with rc_context(STYLE):
+    with own_style():
         return figure_of(picture)

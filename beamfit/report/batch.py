@@ -11,7 +11,6 @@ from pathlib import Path
 from urllib.parse import quote
 
 import numpy as np
-from matplotlib import rc_context
 from matplotlib.figure import FigureBase
 
 from beamfit.answer import MAX_ROWS_SHOWN, Table, plain_name
@@ -21,7 +20,6 @@ from beamfit.errors import Status
 from beamfit.quantity import Quantity, display_unit
 from beamfit.report.document import (
     RASTER_POINTS,
-    STYLE,
     Picture,
     ReportPage,
     Verdict,
@@ -85,8 +83,7 @@ def write_batch_report(
         single = folder / f"{i:02d}_{Path(file).stem}.html"
         write_report(single, batch.ledger.job.fit(file))
         links.append((file, quote(f"{folder.name}/{single.name}")))
-    with rc_context(STYLE):
-        write_page(target, _page(batch, courses, links), command)
+    write_page(target, _page(batch, courses, links), command)
 
 
 def _page(

@@ -8,6 +8,7 @@ import math
 import platform
 import re
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import ContextDecorator
 from datetime import UTC, datetime
 from importlib.metadata import version
 from textwrap import fill
@@ -16,6 +17,7 @@ from typing import Any, NamedTuple
 import jinja2
 import numpy as np
 from markupsafe import Markup, escape
+from matplotlib import style
 from matplotlib.axes import Axes
 from matplotlib.dates import AutoDateLocator, ConciseDateFormatter
 from matplotlib.figure import Figure, FigureBase
@@ -35,6 +37,17 @@ STYLE = {
     "axes.formatter.useoffset": False,  # no offsets such as "+1e1" on an axis
     "text.parse_math": False,  # a $ in a name is not mathematics
 }
+
+
+def own_style() -> ContextDecorator:
+    """Draw in a `with` block, or a function, in the style of the report, whatever a user's
+    matplotlibrc says.
+
+    Text set by TeX would need TeX, and take a % in a label for a comment.
+    """
+    return style.context(["default", STYLE])
+
+
 # Colours of the page, also of the planes x and y.
 BLUE, RED = "#1f5fa8", "#b5421f"
 # Number of points above which a curve is rasterised, to keep the page small.
@@ -256,7 +269,8 @@ class ShownFigure(Figure):
 
     def _repr_png_(self) -> bytes:
         buffer = io.BytesIO()
-        self.savefig(buffer, format="png", dpi=STYLE["figure.dpi"])
+        with own_style():
+            self.savefig(buffer, format="png", dpi=STYLE["figure.dpi"])
         return buffer.getvalue()
 
 

@@ -8,14 +8,19 @@ from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from matplotlib import rc_context
-
 from beamfit.emittance.fit import EmittanceFit
 from beamfit.errors import InputError
 from beamfit.lifetime.fit import DecayFit
 from beamfit.lifetime.study import RecordStudy
 from beamfit.report import kind_of
-from beamfit.report.document import STYLE, Picture, ReportPage, html_of, image_of, with_provenance
+from beamfit.report.document import (
+    Picture,
+    ReportPage,
+    html_of,
+    image_of,
+    own_style,
+    with_provenance,
+)
 from beamfit.report.emittance import emittance_page
 from beamfit.report.posterior import ReportedPosterior, of_decay, of_scan, with_posteriors
 from beamfit.sampling.posterior import Posterior
@@ -93,26 +98,26 @@ def write_report(
     True
     """
     kind_of(path)  # raises for an unknown suffix
-    with rc_context(STYLE):
-        several = tuple(result) if isinstance(result, list | tuple) else (result,)
-        sampled: list[ReportedPosterior] = []
-        first = several[0]
-        if isinstance(first, EmittanceFit):
-            page = emittance_page(first, methods)
-            sampled = [] if posterior is None else [of_scan(first, posterior)]
-        elif isinstance(first, DecayFit | RecordStudy):
-            from beamfit.report.lifetime import decay_page, study_of
+    several = tuple(result) if isinstance(result, list | tuple) else (result,)
+    sampled: list[ReportedPosterior] = []
+    first = several[0]
+    if isinstance(first, EmittanceFit):
+        page = emittance_page(first, methods)
+        sampled = [] if posterior is None else [of_scan(first, posterior)]
+    elif isinstance(first, DecayFit | RecordStudy):
+        from beamfit.report.lifetime import decay_page, study_of
 
-            studies = (study_of(first),) if isinstance(first, DecayFit) else several
-            page = decay_page(studies, shift, trend)
-            sampled = _of_decays(studies, posterior)
-        else:
-            from beamfit.report.kinds import page_of
+        studies = (study_of(first),) if isinstance(first, DecayFit) else several
+        page = decay_page(studies, shift, trend)
+        sampled = _of_decays(studies, posterior)
+    else:
+        from beamfit.report.kinds import page_of
 
-            page = page_of(several)
-        write_page(path, with_posteriors(page, sampled), command, inputs)
+        page = page_of(several)
+    write_page(path, with_posteriors(page, sampled), command, inputs)
 
 
+@own_style()
 def write_page(
     path: str | PathLike[str],
     page: ReportPage,

@@ -70,7 +70,7 @@ def test_a_record_that_says_nothing_still_has_a_page(tmp_path):
 
 def test_refills_are_listed(tmp_path):
     time = np.arange(0.0, 8000.0, 10.0)
-    saw = 100 * np.exp(-(time % 2000) / 36000)
+    saw = 100 * np.exp(-(time % 2000) / 6000)
     beamfit.write_report(tmp_path / "saw.html", (study_record(DecayRecord(time, saw)),))
     page = (tmp_path / "saw.html").read_text()
     assert page.count("<td>refill</td>") == 3
@@ -79,7 +79,7 @@ def test_refills_are_listed(tmp_path):
 
 def test_many_decays_have_a_row_each_and_alike_verdicts_are_said_once(tmp_path):
     time = np.arange(0.0, 12000.0, 10.0)
-    saw = 100 * np.exp(-(time % 2000) / 36000) + 1e-3 * np.sin(time)
+    saw = 100 * np.exp(-(time % 2000) / 6000) + 1e-3 * np.sin(time)
     errors = np.full(time.size, 1e-3)
     study = study_record(DecayRecord(time, saw, errors))
     assert len(study.decays) == 6
@@ -118,7 +118,7 @@ def test_a_spike_does_not_flatten_the_decay():
 def test_headings_of_several_tables_name_their_decays(tmp_path):
     """Tables of two decays each had one heading: nobody saw which of them to unfold."""
     time = np.arange(0.0, 6000.0, 10.0)
-    saw = 100 * np.exp(-(time % 2000) / 36000) + 1e-3 * np.random.default_rng(1).normal(size=600)
+    saw = 100 * np.exp(-(time % 2000) / 6000) + 1e-3 * np.random.default_rng(1).normal(size=600)
     beamfit.write_report(tmp_path / "saw.html", (study_record(DecayRecord(time, saw)),))
     page = (tmp_path / "saw.html").read_text().replace("<span>", "").replace("</span>", "")
     headings = re.findall("<h2>(.*?)</h2>", page)

@@ -8,6 +8,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from matplotlib import rc_context
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
@@ -186,3 +187,15 @@ def test_columns_of_a_page_give_way_to_a_small_screen(otr, tmp_path):
     for least in re.findall(r"minmax\((.*?), 1fr\)", style):
         assert least.startswith("min(100%,")
     assert "width=device-width" in style
+
+
+def test_pictures_do_not_hang_on_the_matplotlibrc_of_the_user(tmp_path):
+    """TeX, which is not installed everywhere, wide lines, black paper."""
+    fit = beamfit.fit_decay("measurements/aps_1999_decay.csv")
+    own = {"text.usetex": True, "lines.linewidth": 9, "axes.facecolor": "black", "font.size": 30}
+    with rc_context(own):
+        beamfit.write_report(tmp_path / "own.png", fit)
+        shown = fit.plot()._repr_png_()
+    beamfit.write_report(tmp_path / "usual.png", fit)
+    assert (tmp_path / "own.png").read_bytes() == (tmp_path / "usual.png").read_bytes()
+    assert shown == fit.plot()._repr_png_()
