@@ -320,7 +320,7 @@ def test_many_decays_are_a_row_each_and_nothing_is_cut_short(run, tmp_path, monk
     monkeypatch.setenv("COLUMNS", "80")
     time = np.arange(0.0, 10000.0, 10.0)
     noise = 1e-3 * np.random.default_rng(3).normal(size=time.size)
-    saw = 100 * np.exp(-(time % 2000) / 36000) + noise
+    saw = 100 * np.exp(-(time % 2000) / 6000) + noise
     path = write_record(tmp_path / "a_rather_long_name_of_a_topup_record.csv", time, saw)
     _, shown, _ = run("lifetime", str(path), "--ring", RING, "--full")
     assert "…" not in shown
