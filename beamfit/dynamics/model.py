@@ -132,6 +132,7 @@ def parameters_at(physics: Physics, raw: Any, point: jax.Array, added: Any = 0.0
     return jax.vmap(lambda each: physics.physical(each, m))(q + added)
 
 
+@jax.jit
 def predicted(model: Any, course: Any) -> jax.Array:
     """Predict the readings of a course: a `DrivenRun` or a `state_fit.Course`."""
     return course.predicted(model)
@@ -151,12 +152,9 @@ def pad_readings(course: Any, values: np.ndarray, by: float = 0.0) -> np.ndarray
     return np.pad(values, padding, constant_values=by)
 
 
-_predicted = jax.jit(predicted)
-
-
 def predict_readings(model: Any, course: Any) -> np.ndarray:
     """Predict the readings of a course, without padding."""
-    return np.asarray(_predicted(model, course))[: course.count]
+    return np.asarray(predicted(model, course))[: course.count]
 
 
 @jax.jit

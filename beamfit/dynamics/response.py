@@ -8,6 +8,7 @@ step is a function of one sample; the code that uses it scans and vectorises it.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -239,6 +240,7 @@ def mean_step(dt: jax.Array) -> jax.Array:
     return jnp.sum(dt) / jnp.maximum(jnp.sum(dt > 0), 1)
 
 
+@partial(jax.jit, static_argnums=(0, 5))
 def even_response(
     physics: Physics,
     p: jax.Array,
@@ -262,29 +264,23 @@ def even_response(
     x0, m = physics.begin(free, u[0]), u.shape[1]
     n = len(x0)
 
-    def step(length):
-        def moved(x, u):
-            return physics.advance(p, x, u, length)
+    def moved(length, unit):
+        return physics.advance(p, unit[:n], unit[n:], length)
 
-        return jax.jacfwd(moved, (0, 1))(0.0 * x0, jnp.zeros(m))
-
-    (a, b), (last, into) = step(dt), step((1.0 - fraction) * dt)
+    each = jax.vmap(jax.vmap(moved, (None, 0), 1), (0, None))
+    steps = each(jnp.stack([dt, (1.0 - fraction) * dt]), jnp.eye(n + m))
+    a, b, last, into = steps[0, :, :n], steps[0, :, n:], steps[1, :, :n], steps[1, :, n:]
     powers = [jnp.eye(n)]
     for _ in range(stride):
         powers.append(a @ powers[-1])
     to_state = jnp.concatenate([powers[k] @ b for k in range(stride - 1, -1, -1)], axis=1)
     earlier = (last @ powers[k] @ b for k in range(stride - 2, -1, -1))
     to_output = jnp.concatenate([*earlier, into], axis=1)
-    blocks = u.reshape(-1, stride * m)
-    # Drive of the state and of the next output.
-    drive = blocks @ jnp.concatenate([to_state, to_output[:1]]).T
-    system = Matrices(
-        powers[stride],
-        jnp.eye(n, n + 1),
-        (last @ powers[stride - 1])[:1],
-        jnp.zeros((1, n + 1)).at[0, n].set(1.0),
-        jnp.zeros(1),
-    )
+    drive, into_both = u.reshape(-1, stride * m), jnp.concatenate([to_state, to_output[:1]])
+    if stride * m > n + 1:  # fewer columns: the drives of the state and of the next output
+        drive, into_both = drive @ into_both.T, jnp.eye(n + 1)
+    output = (last @ powers[stride - 1])[:1]
+    system = Matrices(powers[stride], into_both[:n], output, into_both[n:], jnp.zeros(1))
     first = x0 if physics.even else physics.advance(p, x0, u[0], fraction * dt)
     return jnp.append(x0[:1], linear_outputs(system, drive, first)[0][:-1, 0])
 

@@ -293,7 +293,7 @@ def _triangular_factors(
         waves = drift_columns(run.time / run.time[run.count - 1], i, len(runs))
         shared.append(jnp.concatenate([waves.reshape(len(y), -1), y[:, None]], axis=1))
     read = jnp.concatenate([jnp.arange(len(run.index)) < run.count for run in runs])[:, None]
-    shared = jnp.concatenate(shared)
+    basis, corner = jnp.linalg.qr(jnp.where(read, jnp.concatenate(shared), 0.0))
 
     def one(path):
         (inputs, fraction), shapes = path
@@ -301,11 +301,15 @@ def _triangular_factors(
             replace(run, u=u, delay_fraction=fraction) for run, u in zip(runs, inputs, strict=True)
         ]
         parts = [linear_columns(delayed, i, shapes, offset) for i in range(len(runs))]
-        rows = jnp.concatenate(parts, axis=1)
-        repeated = jnp.broadcast_to(shared, (len(rows), *shared.shape))
-        rows = jnp.where(read, jnp.concatenate([rows, repeated], axis=2), 0.0)
-        padding = (0, 0), (0, max(0, rows.shape[2] - rows.shape[1])), (0, 0)
-        return jnp.linalg.qr(jnp.pad(rows, padding), mode="r")
+        own = jnp.where(read, jnp.concatenate(parts, axis=1), 0.0)
+        # Only what the shared columns do not span needs a factor of all readings.
+        inside = basis.T @ own
+        outside = jnp.linalg.qr(own - basis @ inside, mode="r")
+        rest = jnp.zeros((*outside.shape[:2], corner.shape[1]))
+        repeated = jnp.broadcast_to(corner, (len(own), *corner.shape))
+        top = jnp.concatenate([inside, repeated], axis=2)
+        rows = jnp.concatenate([top, jnp.concatenate([outside, rest], axis=2)], axis=1)
+        return jnp.linalg.qr(rows, mode="r")
 
     return jax.lax.map(one, (inputs, shapes))
 
@@ -648,7 +652,8 @@ class RunsFit(NamedTuple):
     ) -> tuple[Memory, CorrelatedNoise, float]:
         """Estimate the correlated noise from at most `max_readings` of each run and output."""
         rows, time = zip(*self.linear_rows(max_readings), strict=True)
-        prior = np.asarray(self.fit.problem.residual(self.fit.theta))[self.fit.problem.size :]
+        priors = (np.ravel(prior.residual(self.fit.model)) for prior in self.case.priors)
+        prior = np.concatenate([np.zeros(0), *priors])
         prior_rows = np.column_stack([self.fit.dense_jacobian[self.fit.problem.size :], prior])
         return noise_posterior(rows, time, prior_rows, noise)
 
