@@ -566,22 +566,24 @@ def _law_trials(comparison: Comparison, own: Path, paths: Paths) -> list[Trial]:
 def _nonlinear_laws(runs: Sequence[Run], name: str, way: Way) -> list[InputLaw]:
     """Laws of an input that a gain and a level cannot replace.
 
-    They count from the first change of the input on: what was before is in the states at the start.
+    They count from the first change of the input on, for `MAX_READINGS` rows: what was before is in
+    the states at the start.
     An input with readings that scatter about levels counts at these levels, and laws that change it
     by less than the errors of the levels are dropped. An input that never changes has no law.
     """
     levels = [way.levels(run, name) for run in runs]
     inputs = [each.at for each in levels]
-    since = [u[int(np.argmax(u != u[0])) :] for u in inputs]
-    moved = np.concatenate(since)
+    first = [int(np.argmax(u != u[0])) for u in inputs]
+    used = [u[: k + MAX_READINGS] for u, k in zip(inputs, first, strict=True)]
+    moved = np.concatenate([u[k:] for u, k in zip(used, first, strict=True)])
     if np.ptp(moved) == 0.0:
         return []
-    level_error = np.sqrt(sum(np.sum(each.variance[-len(u) :])
-                         for each, u in zip(levels, since, strict=True)))  # fmt: skip
+    level_error = np.sqrt(sum(np.sum(each.variance[k : k + MAX_READINGS])
+                         for each, k in zip(levels, first, strict=True)))  # fmt: skip
     laws = laws_between(name, *map(float, (min(map(np.min, inputs)), max(map(np.max, inputs)))))
     at = np.stack([
-        np.concatenate([law.output_and_slope(u)[-len(some) :, 0]
-                        for u, some in zip(inputs, since, strict=True)]) for law in laws
+        np.concatenate([law.output_and_slope(u)[k:, 0]
+                        for u, k in zip(used, first, strict=True)]) for law in laws
     ], axis=1)  # fmt: skip
     basis = np.linalg.qr(np.stack([np.ones(len(moved)), moved], axis=1))[0]
     at = at - at.mean(axis=0)

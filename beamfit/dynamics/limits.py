@@ -160,7 +160,8 @@ def _weigh_shapes(
     is_delay = np.array([v.name == "late" for v in runs_fit.fit.variables])
     is_delay &= np.any(np.concatenate(slopes), axis=0) & (runs_fit.errors is not None)
     late = runs_fit.fit.model["late"]
-    runs = [replace(run, delay_fraction=run.delay_fraction + late) for run in prepared.runs]
+    runs = [replace(run.up_to(MAX_NOISE_READINGS), delay_fraction=run.delay_fraction + late)
+            for run in prepared.runs]  # fmt: skip
     rows = []
     for i, (y, slope) in enumerate(zip(prepared.measured, slopes, strict=True)):
         own = np.column_stack([slope[:, is_delay], y])[:MAX_NOISE_READINGS]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import jax
@@ -47,6 +48,19 @@ class DrivenRun:
     def read(self) -> np.ndarray:
         """Rows of the readings."""
         return np.asarray(self.index)[: self.count]
+
+    def up_to(self, reading: int) -> DrivenRun:
+        """Leave out rows after a reading, if the steps are equal."""
+        if self.count <= reading or not self.even_rows:
+            return self
+        rows = int(self.index[reading - 1]) + self.even_rows
+        u, dt, time, index = (
+            self.u[:rows],
+            self.dt[:rows],
+            self.time[:reading],
+            self.index[:reading],
+        )
+        return replace(self, u=u, dt=dt, time=time, index=index, count=reading)
 
     @staticmethod
     def like(prepared: Sequence[PreparedOutput], i: int) -> DrivenRun:

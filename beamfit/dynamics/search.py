@@ -112,6 +112,25 @@ def best_drift_degree(own: np.ndarray, waves: np.ndarray, target: np.ndarray) ->
     return int(drift_bic(triangle, waves.shape[1] // MAX_DRIFT_DEGREE, len(target)).argmin())
 
 
+# Readings of each run and output that a start, or correlated noise, is estimated from at most.
+MAX_NOISE_READINGS = 5000
+
+
+def busiest_part(run: Run, output: str) -> Run:
+    """Part of `MAX_NOISE_READINGS` readings of a long run in which its inputs change most."""
+    read = np.flatnonzero(np.isfinite(run.outputs[output]))
+    if read.size <= MAX_NOISE_READINGS:
+        return run
+    changes = (np.abs(np.diff(u, prepend=u[0])) / max(np.ptp(u), TINY) for u in run.inputs.values())
+    moved = np.cumsum(sum(changes))[read]
+    first = np.argmax(moved[MAX_NOISE_READINGS - 1 :] - moved[: 1 - MAX_NOISE_READINGS])
+    rows = slice(read[first], read[first + MAX_NOISE_READINGS - 1] + 1)
+    inputs = {name: u[rows] for name, u in run.inputs.items()}
+    return replace(
+        run, time=run.time[rows], inputs=inputs, outputs={output: run.outputs[output][rows]}
+    )
+
+
 class Start(NamedTuple):
     """A path, a start model, and its information criterion with the best drift."""
 
@@ -140,7 +159,12 @@ class ResponseSearch(NamedTuple):
     def _starts(
         self, runs: tuple[Run, ...], physics: Physics, paths: Sequence[Path]
     ) -> list[Start]:
-        """Search a grid of time constants and dampings, then a finer one about its best point."""
+        """Search a grid of time constants and dampings, then a finer one about its best point.
+
+        The grid reaches to the length of the longest run, whatever part of it is searched.
+        """
+        duration = max(float(np.ptp(run.time)) for run in runs)
+        runs = tuple(busiest_part(run, self.output) for run in runs)
         prepared = prepare_output(runs, self.output, physics, paths[0])
         every = np.arange(len(paths))
         first = max(self.paths.delays[0], 0.0)
@@ -148,7 +172,7 @@ class ResponseSearch(NamedTuple):
         drives = readings.drives
         measured = tuple(map(pad_readings, drives, readings.measured))
         inputs, fraction = inputs_by_path(runs, readings, self.paths.rows_per_sample, paths)
-        axes = [np.log(np.geomspace(0.1 * prepared.interval, prepared.duration, GRID_LAGS))]
+        axes = [np.log(np.geomspace(0.1 * prepared.interval, duration, GRID_LAGS))]
         axes += [np.log(GRID_DAMPINGS)] if physics is not FIRST_ORDER else []
         spacing = np.array([axis[1] - axis[0] for axis in axes])
         count = sum(map(len, prepared.measured))
@@ -422,8 +446,6 @@ MAX_CORRELATED_ROUNDS = 3
 # Rounds end when -2 ln L falls by less than MIN_GAIN plus MIN_GAIN_PER_READING for each reading.
 MIN_GAIN = 0.05
 MIN_GAIN_PER_READING = 1e-4
-# Readings of each output that estimate correlated noise at most.
-MAX_NOISE_READINGS = 5000
 
 # Parts of a model that each run has for itself.
 RUN_PARTS = ("start", "nodes", "drift")
