@@ -7,7 +7,7 @@ from dataclasses import replace
 from typing import NamedTuple, TypeVar
 
 import numpy as np
-from scipy.ndimage import median_filter
+from numpy.lib.stride_tricks import sliding_window_view
 from scipy.special import expit
 
 from beamfit.dynamics.model import PreparedOutput
@@ -194,7 +194,8 @@ def _outliers(prepared: PreparedOutput, residuals: Sequence[np.ndarray]) -> list
     equal_series = _equal_series(prepared, residuals)
     each = zip(prepared.measured, residuals, prepared.time, equal_series, strict=True)
     for y, r, time, equal in each:
-        off = r - median_filter(r, MEDIAN_WIDTH, mode="nearest")
+        around = sliding_window_view(np.pad(r, MEDIAN_WIDTH // 2, "edge"), MEDIAN_WIDTH)
+        off = r - np.median(around, axis=1)
         found.append((odds_of_bad(off, y - r, time, float(floor)) > CLEAR_ODDS) & ~equal)
     return found
 
