@@ -74,7 +74,7 @@ class DrivenRun:
         if callable(raw):
             p = parameters_at(self.physics, raw, self.u)
             return model["offset"] + self.varying_response(p, start, fraction)
-        p = self.physics.physical(raw, self.u.shape[1])
+        p = self.physics.physical(raw)
         return model["offset"] + self.constant_response(p, start, fraction)
 
     def varying_response(self, p: jax.Array, start: jax.Array, fraction: Any) -> jax.Array:
@@ -141,9 +141,8 @@ def parameters_at(physics: Physics, raw: Any, point: jax.Array, added: Any = 0.0
     `raw` is a map of the operating point or constant raw numbers; `added` is added to the raw
     numbers.
     """
-    m = point.shape[1]
     q = jax.vmap(raw)(point) if callable(raw) else jnp.broadcast_to(raw, (len(point), len(raw)))
-    return jax.vmap(lambda each: physics.physical(each, m))(q + added)
+    return jax.vmap(physics.physical)(q + added)
 
 
 @jax.jit

@@ -31,7 +31,7 @@ class Physics(NamedTuple):
     free_states : int
         Unknown numbers in the state at the start.
     physical : callable
-        ``physical(q, m)``: stable parameters p of unbounded raw numbers q.
+        ``physical(q)``: stable parameters p of unbounded raw numbers q.
     raw : callable
         Inverse of `physical`.
     begin : callable
@@ -47,8 +47,8 @@ class Physics(NamedTuple):
     parameters: Callable[[tuple[str, ...]], tuple[str, ...]]
     units: Callable[[int], tuple[tuple[int, int], ...]]
     free_states: int
-    physical: Callable[[jax.Array, int], jax.Array]
-    raw: Callable[[jax.Array, int], jax.Array]
+    physical: Callable[[jax.Array], jax.Array]
+    raw: Callable[[jax.Array], jax.Array]
     begin: Callable[[jax.Array, jax.Array], jax.Array]
     advance: Callable[[jax.Array, jax.Array, jax.Array, jax.Array], jax.Array]
     even: bool = False
@@ -71,8 +71,8 @@ FIRST_ORDER = Physics(
     lambda inputs: ("tau", *_gains(inputs)),
     lambda m: ((1, 0),) + ((0, 1),) * m,
     1,
-    lambda q, m: jnp.concatenate([jnp.exp(q[:1]), q[1:]]),
-    lambda p, m: jnp.concatenate([jnp.log(p[:1]), p[1:]]),
+    jax.jit(lambda q: jnp.concatenate([jnp.exp(q[:1]), q[1:]])),
+    jax.jit(lambda p: jnp.concatenate([jnp.log(p[:1]), p[1:]])),
     lambda free, u0: free,
     _advance_first,
 )
@@ -118,8 +118,8 @@ SECOND_ORDER = Physics(
     lambda inputs: ("T", "zeta", *_gains(inputs)),
     lambda m: ((1, 0), (0, 0)) + ((0, 1),) * m,
     2,
-    lambda q, m: jnp.concatenate([jnp.exp(q[:2]), q[2:]]),
-    lambda p, m: jnp.concatenate([jnp.log(p[:2]), p[2:]]),
+    jax.jit(lambda q: jnp.concatenate([jnp.exp(q[:2]), q[2:]])),
+    jax.jit(lambda p: jnp.concatenate([jnp.log(p[:2]), p[2:]])),
     lambda free, u0: free,
     _advance_second,
 )
@@ -128,13 +128,15 @@ SECOND_ORDER = Physics(
 # ---- difference equation: y(k+1) = -a1 y(k) - a2 y(k-1) + b1 u(k) + b2 u(k-1) (eq 12)
 
 
-def _stable_arx(q, m):
+@jax.jit
+def _stable_arx(q):
     """Map raw numbers into the stability triangle |a2| < 1, |a1| < 1 + a2."""
     a2 = jnp.tanh(q[1])
     return jnp.concatenate([jnp.stack([(1.0 + a2) * jnp.tanh(q[0]), a2]), q[2:]])
 
 
-def _raw_arx(p, m):
+@jax.jit
+def _raw_arx(p):
     a2 = jnp.clip(p[1], -0.999999, 0.999999)
     a1 = jnp.clip(p[0] / (1.0 + a2), -0.999999, 0.999999)
     return jnp.concatenate([jnp.arctanh(jnp.stack([a1, a2])), p[2:]])
@@ -235,6 +237,7 @@ def response_at(
     return jnp.where(index == 0, x0[0], y)
 
 
+@jax.jit
 def mean_step(dt: jax.Array) -> jax.Array:
     """Mean of the steps, leaving out padding, where they are 0."""
     return jnp.sum(dt) / jnp.maximum(jnp.sum(dt > 0), 1)

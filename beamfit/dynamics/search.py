@@ -215,7 +215,7 @@ class ResponseSearch(NamedTuple):
         found = (np.linalg.lstsq(design / size, triangle[:, -1], rcond=1e-10)[0] / size)[:own]
         k = own - self.offset - runs * physics.free_states
         gains, first = np.split(found[: own - self.offset], [k])
-        raw = physics.raw(jnp.asarray(np.append(shape, gains)), len(prepared.inputs))
+        raw = physics.raw(np.append(shape, gains))
         level = float(found[-1]) if self.offset else 0.0
         return {"map": raw, "start": first.reshape(runs, -1), "offset": level, "late": 0.0}
 
@@ -274,7 +274,7 @@ def shape_parameters(prepared: PreparedOutput, model: Any) -> np.ndarray:
     """Time constants, damping or a1 and a2 of a model with constant parameters, gains left out."""
     physics, m = prepared.runs[0].physics, len(prepared.inputs)
     count = len(physics.units(m)) - m * (2 if physics is ARX else 1)
-    return np.asarray(physics.physical(model["map"], m))[:count]
+    return np.asarray(physics.physical(model["map"]))[:count]
 
 
 @jax.jit
@@ -294,6 +294,7 @@ def unit_outputs(run: DrivenRun, shapes: jax.Array) -> jax.Array:
     return jax.vmap(each, in_axes=(0, None, None))(shapes, gains, firsts)
 
 
+@partial(jax.jit, static_argnums=(1, 3))
 def linear_columns(runs: Sequence[DrivenRun], i: int, shapes: jax.Array, offset: bool) -> jax.Array:
     """Outputs of run i by shape for unit gains, first states of each run, and offset."""
     columns = jnp.swapaxes(unit_outputs(runs[i], shapes), 1, 2)
