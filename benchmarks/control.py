@@ -55,7 +55,7 @@ def ours(case: str) -> Controller:
     """The controller of beamfit."""
     physics, of = FIRST_ORDER, network
     if "second order" in case:
-        physics, of = SECOND_ORDER, SECOND_ORDER.raw(jnp.array(SECOND), 1)
+        physics, of = SECOND_ORDER, SECOND_ORDER.raw(jnp.array(SECOND))
     inf, one = np.full(1, np.inf), np.ones(1)
     limits = ControlLimits(0 * one, 2 * one, RATE * one, -inf, above(case) * one)
     responses = (Response("y", physics, of, 0.0, 0, 1.0, 0.2, 0.0),)
@@ -152,7 +152,7 @@ def run_peer(case: str, steps: int):
         took.append(time.process_time() - begin)
         u.append(given)
         raw = network(jnp.array([given])) if callable(r.of) else r.of
-        p = r.physics.physical(raw, 1)
+        p = r.physics.physical(raw)
         x = np.asarray(r.physics.advance(p, jnp.asarray(x), jnp.array([given]), STEP))
     return np.array(y), np.array(u), took
 

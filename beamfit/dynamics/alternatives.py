@@ -220,12 +220,14 @@ class _Batch(NamedTuple):
         """Whiten slopes and residuals of every trial by some noises of the grid."""
         c, some = self.comparison, [self.comparison.grid[k] for k in noises]
         triangles, volume, count = [], 0.0, 0
+        padded = np.pad(theta, ((0, TRIALS_PER_BATCH - len(theta)), (0, 0)), mode="edge")
         for run, data, term, u in zip(
             c.prepared.drives, c.data, self.terms, self.inputs, strict=True
         ):
             y, time, error = data
-            found = _factored_rows(c.chosen, c.model, run, (y, error, term, self.delays), theta, u)
-            columns, triangle = map(np.asarray, found)
+            data = y, error, term, self.delays
+            found = _factored_rows(c.chosen, c.model, run, data, padded, u)
+            columns, triangle = (np.asarray(each)[: len(theta)] for each in found)
             columns = np.swapaxes(columns[:, : len(time)], 0, 1)
             roots, each = roots_by_each(some, columns, np.diff(time))
             triangles.append(roots @ triangle)
@@ -437,20 +439,18 @@ class Comparison(NamedTuple):
         if len(trials) > MAX_TRIALS:
             batches = self._batches(trials, begin)
             parts = zip(*(b.fit(each, SCREENING_ROUNDS) for b, each in batches), strict=True)
-            begin, cost = (np.concatenate(part)[: len(trials)] for part in parts)
+            begin, cost = map(np.concatenate, parts)
             cost -= [2.0 * t.prior if t.is_departure else np.inf for t in trials]
             kept = np.argsort(cost)[:MAX_TRIALS]
             trials, begin = [trials[k] for k in kept], begin[kept]
         found = [batch.weigh(each) for batch, each in self._batches(trials, begin)]
-        parts = (np.concatenate(part)[: len(trials)] for part in zip(*found, strict=True))
-        return _TrialPosterior(trials, *parts)
+        return _TrialPosterior(trials, *map(np.concatenate, zip(*found, strict=True)))
 
     def _batches(
         self, trials: list[Trial], begin: np.ndarray
     ) -> Iterator[tuple[_Batch, np.ndarray]]:
         """Split trials and their start numbers into batches; the last trial fills the last one."""
-        more = -len(trials) % TRIALS_PER_BATCH
-        trials, begin = trials + trials[-1:] * more, np.pad(begin, ((0, more), (0, 0)), mode="edge")
+        trials = trials + trials[-1:] * (-len(trials) % TRIALS_PER_BATCH)
         for k in range(0, len(trials), TRIALS_PER_BATCH):
             some = trials[k : k + TRIALS_PER_BATCH]
             paths = [trial.path for trial in some]
@@ -566,22 +566,24 @@ def _law_trials(comparison: Comparison, own: Path, paths: Paths) -> list[Trial]:
 def _nonlinear_laws(runs: Sequence[Run], name: str, way: Way) -> list[InputLaw]:
     """Laws of an input that a gain and a level cannot replace.
 
-    They count from the first change of the input on: what was before is in the states at the start.
+    They count from the first change of the input on, for `MAX_READINGS` rows: what was before is in
+    the states at the start.
     An input with readings that scatter about levels counts at these levels, and laws that change it
     by less than the errors of the levels are dropped. An input that never changes has no law.
     """
     levels = [way.levels(run, name) for run in runs]
     inputs = [each.at for each in levels]
-    since = [u[int(np.argmax(u != u[0])) :] for u in inputs]
-    moved = np.concatenate(since)
+    first = [int(np.argmax(u != u[0])) for u in inputs]
+    used = [u[: k + MAX_READINGS] for u, k in zip(inputs, first, strict=True)]
+    moved = np.concatenate([u[k:] for u, k in zip(used, first, strict=True)])
     if np.ptp(moved) == 0.0:
         return []
-    level_error = np.sqrt(sum(np.sum(each.variance[-len(u) :])
-                         for each, u in zip(levels, since, strict=True)))  # fmt: skip
+    level_error = np.sqrt(sum(np.sum(each.variance[k : k + MAX_READINGS])
+                         for each, k in zip(levels, first, strict=True)))  # fmt: skip
     laws = laws_between(name, *map(float, (min(map(np.min, inputs)), max(map(np.max, inputs)))))
     at = np.stack([
-        np.concatenate([law.output_and_slope(u)[-len(some) :, 0]
-                        for u, some in zip(inputs, since, strict=True)]) for law in laws
+        np.concatenate([law.output_and_slope(u)[k:, 0]
+                        for u, k in zip(used, first, strict=True)]) for law in laws
     ], axis=1)  # fmt: skip
     basis = np.linalg.qr(np.stack([np.ones(len(moved)), moved], axis=1))[0]
     at = at - at.mean(axis=0)

@@ -7,13 +7,18 @@ from dataclasses import replace
 from typing import NamedTuple, TypeVar
 
 import numpy as np
-from scipy.ndimage import median_filter
+from numpy.lib.stride_tricks import sliding_window_view
 from scipy.special import expit
 
 from beamfit.dynamics.model import PreparedOutput
 from beamfit.dynamics.paths import usable_rows
 from beamfit.dynamics.record import MIN_READINGS, Run
-from beamfit.dynamics.search import JITTER_PENALTY, RunsFit, jitter_scales
+from beamfit.dynamics.search import (
+    JITTER_PENALTY,
+    MAX_NOISE_READINGS,
+    RunsFit,
+    jitter_scales,
+)
 from beamfit.errors import Status
 from beamfit.noise.digits import digit_of
 from beamfit.noise.model import Noise
@@ -189,7 +194,8 @@ def _outliers(prepared: PreparedOutput, residuals: Sequence[np.ndarray]) -> list
     equal_series = _equal_series(prepared, residuals)
     each = zip(prepared.measured, residuals, prepared.time, equal_series, strict=True)
     for y, r, time, equal in each:
-        off = r - median_filter(r, MEDIAN_WIDTH, mode="nearest")
+        around = sliding_window_view(np.pad(r, MEDIAN_WIDTH // 2, "edge"), MEDIAN_WIDTH)
+        off = r - np.median(around, axis=1)
         found.append((odds_of_bad(off, y - r, time, float(floor)) > CLEAR_ODDS) & ~equal)
     return found
 
@@ -212,7 +218,8 @@ def odds_of_bad(off: np.ndarray, fitted: np.ndarray, time: np.ndarray, floor: fl
     -----
     The good-and-bad-data model of `beamfit.noise.sizes.bad_density`. Good readings scatter by a
     constant part and a part proportional to the model's slope (jitter of the clock, or a small
-    error of the delay), both estimated by expectation and maximisation.
+    error of the delay), both estimated by expectation and maximisation from `MAX_NOISE_READINGS`
+    readings at most.
 
     Examples
     --------
@@ -221,19 +228,20 @@ def odds_of_bad(off: np.ndarray, fitted: np.ndarray, time: np.ndarray, floor: fl
     [50]
     """
     scale, _ = jitter_scales(fitted, time)
-    pulls = off / scale
+    some = slice(None, None, -(-len(off) // MAX_NOISE_READINGS))
+    pulls = off[some] / scale[:, some]
     level = np.maximum(1.4826 * np.median(np.abs(pulls), axis=1), floor)[:, None]
     for _ in range(50):
         pull = (pulls / level) ** 2
         bad = np.log(bad_density(pull, Noise()))
         good = expit(-0.5 * pull - bad)
-        level = np.sqrt(
-            np.sum(good * pulls**2, axis=1, keepdims=True) / good.sum(axis=1, keepdims=True)
-        )
-        level = np.maximum(level, floor)
-    minus = np.log(level * scale) - np.logaddexp(-0.5 * pull, bad)
+        squares = np.sum(good * pulls**2, axis=1, keepdims=True)
+        last, level = level, np.maximum(np.sqrt(squares / good.sum(axis=1, keepdims=True)), floor)
+    minus = np.log(level * scale[:, some]) - np.logaddexp(-0.5 * pull, bad)
     cost = 2.0 * minus.sum(axis=1) + JITTER_PENALTY * (np.arange(len(scale)) > 0)
-    return (bad + 0.5 * pull)[cost.argmin()]
+    best = cost.argmin()
+    pull = (off / scale[best] / last[best]) ** 2
+    return np.log(bad_density(pull, Noise())) + 0.5 * pull
 
 
 def _equal_series(prepared: PreparedOutput, residuals: Sequence[np.ndarray]) -> list[np.ndarray]:

@@ -35,7 +35,7 @@ PLAYS = (0.0, 0.4, 0.8, 1.2, 1.6, 2.0)
 
 
 def _follow_play(at: np.ndarray, now: float, width: np.ndarray) -> np.ndarray:
-    return np.clip(at, now - width, now + width)
+    return np.minimum(np.maximum(at, now - width), now + width)
 
 
 def _follow_stop(at: np.ndarray, now: float, width: np.ndarray) -> np.ndarray:
@@ -43,7 +43,7 @@ def _follow_stop(at: np.ndarray, now: float, width: np.ndarray) -> np.ndarray:
 
 
 def _follow_rate_limit(at: np.ndarray, now: float, width: np.ndarray) -> np.ndarray:
-    return np.clip(now, at - width, at + width)
+    return np.minimum(np.maximum(now, at - width), at + width)
 
 
 # Laws that follow an input row by row: the new position from the last one, the input and the width.

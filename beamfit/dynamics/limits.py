@@ -11,7 +11,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 from scipy.special import ndtri, stdtrit
 
@@ -160,11 +159,12 @@ def _weigh_shapes(
     is_delay = np.array([v.name == "late" for v in runs_fit.fit.variables])
     is_delay &= np.any(np.concatenate(slopes), axis=0) & (runs_fit.errors is not None)
     late = runs_fit.fit.model["late"]
-    runs = [replace(run, delay_fraction=run.delay_fraction + late) for run in prepared.runs]
+    runs = [replace(run.up_to(MAX_NOISE_READINGS), delay_fraction=run.delay_fraction + late)
+            for run in prepared.runs]  # fmt: skip
     rows = []
     for i, (y, slope) in enumerate(zip(prepared.measured, slopes, strict=True)):
         own = np.column_stack([slope[:, is_delay], y])[:MAX_NOISE_READINGS]
-        columns = np.asarray(linear_columns(runs, i, jnp.asarray(shapes), offset))[:, : len(own)]
+        columns = np.asarray(linear_columns(runs, i, shapes, offset))[:, : len(own)]
         own = np.broadcast_to(own, (len(shapes), *own.shape))
         each = runs_fit.noise[i][0].each[:MAX_NOISE_READINGS, None]
         rows.append(np.concatenate([columns, own], axis=2) / each)

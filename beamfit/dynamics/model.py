@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import jax
@@ -48,6 +49,19 @@ class DrivenRun:
         """Rows of the readings."""
         return np.asarray(self.index)[: self.count]
 
+    def up_to(self, reading: int) -> DrivenRun:
+        """Leave out rows after a reading, if the steps are equal."""
+        if self.count <= reading or not self.even_rows:
+            return self
+        rows = int(self.index[reading - 1]) + self.even_rows
+        u, dt, time, index = (
+            self.u[:rows],
+            self.dt[:rows],
+            self.time[:reading],
+            self.index[:reading],
+        )
+        return replace(self, u=u, dt=dt, time=time, index=index, count=reading)
+
     @staticmethod
     def like(prepared: Sequence[PreparedOutput], i: int) -> DrivenRun:
         """Give run i of the prepared outputs."""
@@ -60,7 +74,7 @@ class DrivenRun:
         if callable(raw):
             p = parameters_at(self.physics, raw, self.u)
             return model["offset"] + self.varying_response(p, start, fraction)
-        p = self.physics.physical(raw, self.u.shape[1])
+        p = self.physics.physical(raw)
         return model["offset"] + self.constant_response(p, start, fraction)
 
     def varying_response(self, p: jax.Array, start: jax.Array, fraction: Any) -> jax.Array:
@@ -127,11 +141,11 @@ def parameters_at(physics: Physics, raw: Any, point: jax.Array, added: Any = 0.0
     `raw` is a map of the operating point or constant raw numbers; `added` is added to the raw
     numbers.
     """
-    m = point.shape[1]
     q = jax.vmap(raw)(point) if callable(raw) else jnp.broadcast_to(raw, (len(point), len(raw)))
-    return jax.vmap(lambda each: physics.physical(each, m))(q + added)
+    return jax.vmap(physics.physical)(q + added)
 
 
+@jax.jit
 def predicted(model: Any, course: Any) -> jax.Array:
     """Predict the readings of a course: a `DrivenRun` or a `state_fit.Course`."""
     return course.predicted(model)
@@ -151,12 +165,9 @@ def pad_readings(course: Any, values: np.ndarray, by: float = 0.0) -> np.ndarray
     return np.pad(values, padding, constant_values=by)
 
 
-_predicted = jax.jit(predicted)
-
-
 def predict_readings(model: Any, course: Any) -> np.ndarray:
     """Predict the readings of a course, without padding."""
-    return np.asarray(_predicted(model, course))[: course.count]
+    return np.asarray(predicted(model, course))[: course.count]
 
 
 @jax.jit

@@ -239,8 +239,9 @@ def inputs_by_path(
         }
         by_law: dict[Any, np.ndarray] = {}
         each, rows = [], first * rows_per_sample + np.arange(len(drive.dt))
+        last = rows[-1] + 1 - min(whole_rows)
         for path, shift in zip(paths, whole_rows, strict=True):
-            u = by_way[path.way]
+            u = by_way[path.way][:last]
             u = np.stack([u, np.zeros_like(u)], axis=2)
             if path.law is not None:
                 k = list(run.inputs).index(path.law.input)

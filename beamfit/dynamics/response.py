@@ -8,6 +8,7 @@ step is a function of one sample; the code that uses it scans and vectorises it.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -30,7 +31,7 @@ class Physics(NamedTuple):
     free_states : int
         Unknown numbers in the state at the start.
     physical : callable
-        ``physical(q, m)``: stable parameters p of unbounded raw numbers q.
+        ``physical(q)``: stable parameters p of unbounded raw numbers q.
     raw : callable
         Inverse of `physical`.
     begin : callable
@@ -46,8 +47,8 @@ class Physics(NamedTuple):
     parameters: Callable[[tuple[str, ...]], tuple[str, ...]]
     units: Callable[[int], tuple[tuple[int, int], ...]]
     free_states: int
-    physical: Callable[[jax.Array, int], jax.Array]
-    raw: Callable[[jax.Array, int], jax.Array]
+    physical: Callable[[jax.Array], jax.Array]
+    raw: Callable[[jax.Array], jax.Array]
     begin: Callable[[jax.Array, jax.Array], jax.Array]
     advance: Callable[[jax.Array, jax.Array, jax.Array, jax.Array], jax.Array]
     even: bool = False
@@ -74,8 +75,8 @@ FIRST_ORDER = Physics(
     lambda inputs: ("tau", *_gains(inputs)),
     lambda m: ((1, 0),) + ((0, 1),) * m,
     1,
-    lambda q, m: jnp.concatenate([jnp.exp(q[:1]), q[1:]]),
-    lambda p, m: jnp.concatenate([jnp.log(p[:1]), p[1:]]),
+    jax.jit(lambda q: jnp.concatenate([jnp.exp(q[:1]), q[1:]])),
+    jax.jit(lambda p: jnp.concatenate([jnp.log(p[:1]), p[1:]])),
     lambda free, u0: free,
     _advance_first,
 )
@@ -121,8 +122,8 @@ SECOND_ORDER = Physics(
     lambda inputs: ("T", "zeta", *_gains(inputs)),
     lambda m: ((1, 0), (0, 0)) + ((0, 1),) * m,
     2,
-    lambda q, m: jnp.concatenate([jnp.exp(q[:2]), q[2:]]),
-    lambda p, m: jnp.concatenate([jnp.log(p[:2]), p[2:]]),
+    jax.jit(lambda q: jnp.concatenate([jnp.exp(q[:2]), q[2:]])),
+    jax.jit(lambda p: jnp.concatenate([jnp.log(p[:2]), p[2:]])),
     lambda free, u0: free,
     _advance_second,
 )
@@ -131,13 +132,15 @@ SECOND_ORDER = Physics(
 # ---- difference equation: y(k+1) = -a1 y(k) - a2 y(k-1) + b1 u(k) + b2 u(k-1) (eq 12)
 
 
-def _stable_arx(q, m):
+@jax.jit
+def _stable_arx(q):
     """Map raw numbers into the stability triangle |a2| < 1, |a1| < 1 + a2."""
     a2 = jnp.tanh(q[1])
     return jnp.concatenate([jnp.stack([(1.0 + a2) * jnp.tanh(q[0]), a2]), q[2:]])
 
 
-def _raw_arx(p, m):
+@jax.jit
+def _raw_arx(p):
     a2 = jnp.clip(p[1], -0.999999, 0.999999)
     a1 = jnp.clip(p[0] / (1.0 + a2), -0.999999, 0.999999)
     return jnp.concatenate([jnp.arctanh(jnp.stack([a1, a2])), p[2:]])
@@ -249,11 +252,13 @@ def response_at(
     return jnp.where(index == 0, x0[0], y)
 
 
+@jax.jit
 def mean_step(dt: jax.Array) -> jax.Array:
     """Mean of the steps, leaving out padding, where they are 0."""
     return jnp.sum(dt) / jnp.maximum(jnp.sum(dt > 0), 1)
 
 
+@partial(jax.jit, static_argnums=(0, 5))
 def even_response(
     physics: Physics,
     p: jax.Array,
@@ -277,29 +282,23 @@ def even_response(
     x0, m = physics.begin(free, u[0]), u.shape[1]
     n = len(x0)
 
-    def step(length):
-        def moved(x, u):
-            return physics.advance(p, x, u, length)
+    def moved(length, unit):
+        return physics.advance(p, unit[:n], unit[n:], length)
 
-        return jax.jacfwd(moved, (0, 1))(0.0 * x0, jnp.zeros(m))
-
-    (a, b), (last, into) = step(dt), step((1.0 - fraction) * dt)
+    each = jax.vmap(jax.vmap(moved, (None, 0), 1), (0, None))
+    steps = each(jnp.stack([dt, (1.0 - fraction) * dt]), jnp.eye(n + m))
+    a, b, last, into = steps[0, :, :n], steps[0, :, n:], steps[1, :, :n], steps[1, :, n:]
     powers = [jnp.eye(n)]
     for _ in range(stride):
         powers.append(a @ powers[-1])
     to_state = jnp.concatenate([powers[k] @ b for k in range(stride - 1, -1, -1)], axis=1)
     earlier = (last @ powers[k] @ b for k in range(stride - 2, -1, -1))
     to_output = jnp.concatenate([*earlier, into], axis=1)
-    blocks = u.reshape(-1, stride * m)
-    # Drive of the state and of the next output.
-    drive = blocks @ jnp.concatenate([to_state, to_output[:1]]).T
-    system = Matrices(
-        powers[stride],
-        jnp.eye(n, n + 1),
-        (last @ powers[stride - 1])[:1],
-        jnp.zeros((1, n + 1)).at[0, n].set(1.0),
-        jnp.zeros(1),
-    )
+    drive, into_both = u.reshape(-1, stride * m), jnp.concatenate([to_state, to_output[:1]])
+    if stride * m > n + 1:  # fewer columns: the drives of the state and of the next output
+        drive, into_both = drive @ into_both.T, jnp.eye(n + 1)
+    output = (last @ powers[stride - 1])[:1]
+    system = Matrices(powers[stride], into_both[:n], output, into_both[n:], jnp.zeros(1))
     first = x0 if physics.even else physics.advance(p, x0, u[0], fraction * dt)
     return jnp.append(x0[:1], linear_outputs(system, drive, first)[0][:-1, 0])
 

@@ -112,6 +112,25 @@ def best_drift_degree(own: np.ndarray, waves: np.ndarray, target: np.ndarray) ->
     return int(drift_bic(triangle, waves.shape[1] // MAX_DRIFT_DEGREE, len(target)).argmin())
 
 
+# Readings of each run and output that a start, or correlated noise, is estimated from at most.
+MAX_NOISE_READINGS = 5000
+
+
+def busiest_part(run: Run, output: str) -> Run:
+    """Part of `MAX_NOISE_READINGS` readings of a long run in which its inputs change most."""
+    read = np.flatnonzero(np.isfinite(run.outputs[output]))
+    if read.size <= MAX_NOISE_READINGS:
+        return run
+    changes = (np.abs(np.diff(u, prepend=u[0])) / max(np.ptp(u), TINY) for u in run.inputs.values())
+    moved = np.cumsum(sum(changes))[read]
+    first = np.argmax(moved[MAX_NOISE_READINGS - 1 :] - moved[: 1 - MAX_NOISE_READINGS])
+    rows = slice(read[first], read[first + MAX_NOISE_READINGS - 1] + 1)
+    inputs = {name: u[rows] for name, u in run.inputs.items()}
+    return replace(
+        run, time=run.time[rows], inputs=inputs, outputs={output: run.outputs[output][rows]}
+    )
+
+
 class Start(NamedTuple):
     """A path, a start model, and its information criterion with the best drift."""
 
@@ -140,7 +159,12 @@ class ResponseSearch(NamedTuple):
     def _starts(
         self, runs: tuple[Run, ...], physics: Physics, paths: Sequence[Path]
     ) -> list[Start]:
-        """Search a grid of time constants and dampings, then a finer one about its best point."""
+        """Search a grid of time constants and dampings, then a finer one about its best point.
+
+        The grid reaches to the length of the longest run, whatever part of it is searched.
+        """
+        duration = max(float(np.ptp(run.time)) for run in runs)
+        runs = tuple(busiest_part(run, self.output) for run in runs)
         prepared = prepare_output(runs, self.output, physics, paths[0])
         every = np.arange(len(paths))
         first = max(self.paths.delays[0], 0.0)
@@ -148,7 +172,7 @@ class ResponseSearch(NamedTuple):
         drives = readings.drives
         measured = tuple(map(pad_readings, drives, readings.measured))
         inputs, fraction = inputs_by_path(runs, readings, self.paths.rows_per_sample, paths)
-        axes = [np.log(np.geomspace(0.1 * prepared.interval, prepared.duration, GRID_LAGS))]
+        axes = [np.log(np.geomspace(0.1 * prepared.interval, duration, GRID_LAGS))]
         axes += [np.log(GRID_DAMPINGS)] if physics is not FIRST_ORDER else []
         spacing = np.array([axis[1] - axis[0] for axis in axes])
         count = sum(map(len, prepared.measured))
@@ -191,7 +215,7 @@ class ResponseSearch(NamedTuple):
         found = (np.linalg.lstsq(design / size, triangle[:, -1], rcond=1e-10)[0] / size)[:own]
         k = own - self.offset - runs * physics.free_states
         gains, first = np.split(found[: own - self.offset], [k])
-        raw = physics.raw(jnp.asarray(np.append(shape, gains)), len(prepared.inputs))
+        raw = physics.raw(np.append(shape, gains))
         level = float(found[-1]) if self.offset else 0.0
         return {"map": raw, "start": first.reshape(runs, -1), "offset": level, "late": 0.0}
 
@@ -250,7 +274,7 @@ def shape_parameters(prepared: PreparedOutput, model: Any) -> np.ndarray:
     """Time constants, damping or a1 and a2 of a model with constant parameters, gains left out."""
     physics, m = prepared.runs[0].physics, len(prepared.inputs)
     count = len(physics.units(m)) - m * (2 if physics is ARX else 1)
-    return np.asarray(physics.physical(model["map"], m))[:count]
+    return np.asarray(physics.physical(model["map"]))[:count]
 
 
 @jax.jit
@@ -270,6 +294,7 @@ def unit_outputs(run: DrivenRun, shapes: jax.Array) -> jax.Array:
     return jax.vmap(each, in_axes=(0, None, None))(shapes, gains, firsts)
 
 
+@partial(jax.jit, static_argnums=(1, 3))
 def linear_columns(runs: Sequence[DrivenRun], i: int, shapes: jax.Array, offset: bool) -> jax.Array:
     """Outputs of run i by shape for unit gains, first states of each run, and offset."""
     columns = jnp.swapaxes(unit_outputs(runs[i], shapes), 1, 2)
@@ -293,7 +318,7 @@ def _triangular_factors(
         waves = drift_columns(run.time / run.time[run.count - 1], i, len(runs))
         shared.append(jnp.concatenate([waves.reshape(len(y), -1), y[:, None]], axis=1))
     read = jnp.concatenate([jnp.arange(len(run.index)) < run.count for run in runs])[:, None]
-    shared = jnp.concatenate(shared)
+    basis, corner = jnp.linalg.qr(jnp.where(read, jnp.concatenate(shared), 0.0))
 
     def one(path):
         (inputs, fraction), shapes = path
@@ -301,11 +326,15 @@ def _triangular_factors(
             replace(run, u=u, delay_fraction=fraction) for run, u in zip(runs, inputs, strict=True)
         ]
         parts = [linear_columns(delayed, i, shapes, offset) for i in range(len(runs))]
-        rows = jnp.concatenate(parts, axis=1)
-        repeated = jnp.broadcast_to(shared, (len(rows), *shared.shape))
-        rows = jnp.where(read, jnp.concatenate([rows, repeated], axis=2), 0.0)
-        padding = (0, 0), (0, max(0, rows.shape[2] - rows.shape[1])), (0, 0)
-        return jnp.linalg.qr(jnp.pad(rows, padding), mode="r")
+        own = jnp.where(read, jnp.concatenate(parts, axis=1), 0.0)
+        # Only what the shared columns do not span needs a factor of all readings.
+        inside = basis.T @ own
+        outside = jnp.linalg.qr(own - basis @ inside, mode="r")
+        rest = jnp.zeros((*outside.shape[:2], corner.shape[1]))
+        repeated = jnp.broadcast_to(corner, (len(own), *corner.shape))
+        top = jnp.concatenate([inside, repeated], axis=2)
+        rows = jnp.concatenate([top, jnp.concatenate([outside, rest], axis=2)], axis=1)
+        return jnp.linalg.qr(rows, mode="r")
 
     return jax.lax.map(one, (inputs, shapes))
 
@@ -418,8 +447,6 @@ MAX_CORRELATED_ROUNDS = 3
 # Rounds end when -2 ln L falls by less than MIN_GAIN plus MIN_GAIN_PER_READING for each reading.
 MIN_GAIN = 0.05
 MIN_GAIN_PER_READING = 1e-4
-# Readings of each output that estimate correlated noise at most.
-MAX_NOISE_READINGS = 5000
 
 # Parts of a model that each run has for itself.
 RUN_PARTS = ("start", "nodes", "drift")
@@ -648,7 +675,8 @@ class RunsFit(NamedTuple):
     ) -> tuple[Memory, CorrelatedNoise, float]:
         """Estimate the correlated noise from at most `max_readings` of each run and output."""
         rows, time = zip(*self.linear_rows(max_readings), strict=True)
-        prior = np.asarray(self.fit.problem.residual(self.fit.theta))[self.fit.problem.size :]
+        priors = (np.ravel(prior.residual(self.fit.model)) for prior in self.case.priors)
+        prior = np.concatenate([np.zeros(0), *priors])
         prior_rows = np.column_stack([self.fit.dense_jacobian[self.fit.problem.size :], prior])
         return noise_posterior(rows, time, prior_rows, noise)
 

@@ -8,7 +8,6 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.optimize import nnls
 
 from beamfit.greybox import assess, problem, tree
 from beamfit.greybox.assess import TEST_DISTANCE, SearchState
@@ -390,6 +389,8 @@ def _vanishing_combination(rows: np.ndarray, free: np.ndarray, cut: float) -> np
         signed = np.vstack([rows[held], rows[free], -rows[free]])
         total = np.append(np.ones(held.sum()), np.zeros(2 * free.sum()))
         one = np.append(np.zeros(rows.shape[1]), 1.0)
+        from scipy.optimize import nnls  # slow to import, needed only here
+
         found, miss = nnls(np.vstack([signed.T, total]), one, maxiter=50 * len(signed))
         if miss <= cut:
             v[held], (up, down) = found[: held.sum()], np.split(found[held.sum() :], 2)

@@ -492,7 +492,7 @@ def _model_freedoms(p: Problem, theta: np.ndarray, directions: np.ndarray) -> np
     if not along.shape[1]:
         return along
     rows = np.vstack([_random_rows(p, theta, random) for _ in range(TEST_POINTS)])
-    _, sizes, right = np.linalg.svd(rows / size @ along, full_matrices=True)
+    _, sizes, right = np.linalg.svd(triangle(rows / size @ along), full_matrices=True)
     return along @ right[int(np.sum(sizes > VANISHING_ROW)) :].T
 
 

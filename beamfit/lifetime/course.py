@@ -371,7 +371,7 @@ def reference_of(
     # One more decay, off by an ordinary day's wander, regularises the variance of few decays.
     wander = float(residual @ residual) / share + WANDER**2
     wander = math.sqrt(wander / max(residual.size - 1, 1))
-    root = np.asarray(add_errors(root, wander * slopes))
+    root = add_errors(root, wander * slopes)
     coefficients, jacobian = _fit_loss(rows, parts, root, ring_row)
     if not (np.isfinite(coefficients).all() and coefficients.min() > 0):
         return None

@@ -589,6 +589,7 @@ def terms_at_voltages(
     return jax.lax.map(one, voltages)
 
 
+@jax.jit
 def scaled_losses(
     scales: Array, terms: LossTerms, pressure_factor: Array = 1.0
 ) -> tuple[Array, Array]:
@@ -629,6 +630,7 @@ def scaled_losses(
     return losses.a, losses.b
 
 
+@jax.jit
 def scaled_parts(scales: Array, terms: LossTerms, pressure_factor: Array = 1.0) -> Losses:
     """Loss coefficients by mechanism, scaled as in `scaled_losses`."""
     *factors, desorption = jnp.asarray(scales, float)[: len(SCALES)]

@@ -291,7 +291,7 @@ def gas_mixture(**fractions: float) -> Gas:
         for charge, number in MOLECULES[molecule].items():
             atoms[charge] = atoms.get(charge, 0.0) + number * fraction / total
     charges = sorted(atoms)
-    return Gas(jnp.array(charges, float), jnp.array([atoms[charge] for charge in charges]))
+    return Gas(np.array(charges, float), np.array([atoms[charge] for charge in charges]))
 
 
 class Bunch(NamedTuple):
@@ -562,6 +562,7 @@ def limit_acceptance(ring: Ring, height: Array) -> Array:
     return jnp.minimum(jnp.minimum(height, MAX_ACCEPTANCE), ring.momentum_acceptance)
 
 
+@jax.jit
 def stored_bunch(ring: Ring, operation: Operation, current: Array) -> Bunch:
     """Bunch that represents all bunches of a beam.
 

@@ -106,7 +106,7 @@ def _whitened_residuals(fit: ScaleFit, decays: Sequence[Decay]) -> tuple[np.ndar
         by_scales = (rows @ noise.covariance_root[k]).reshape(count, -1)
         scattered = (loss_slopes * noise.scatter[k]).reshape(count, -1)
         shifted = (residuals + rows @ (noise.shift[k] - noise.centre)).ravel()
-        whiten = np.asarray(add_errors(np.eye(count), np.hstack([by_scales, scattered])))
+        whiten = add_errors(np.eye(count), np.hstack([by_scales, scattered]))
         found.append((-whiten @ shifted, np.tensordot(whiten, loss_slopes, 1)))
     return tuple(map(np.array, zip(*found, strict=True)))
 
@@ -189,6 +189,21 @@ def _changed_names(
     return (best,) if probability[best] > POOR_FIT else ("a", "b")
 
 
+# Units of the rows of a loss budget.
+BUDGET_UNITS = {m.name: "1/h" for m in MECHANISMS if m.vary} | {
+    "a": "1/(mA s)", "b": "1/s", "lifetime": "h"
+}  # fmt: skip
+
+
+@jax.jit
+def _budget_row(scales: Array, terms: LossTerms) -> Array:
+    """Values of `BUDGET_UNITS` at the current of the terms."""
+    losses = scaled_parts(scales, terms)
+    rates = losses.rates(terms.current)
+    parts = [HOUR * rates[name] for name in BUDGET_UNITS if name in rates]
+    return jnp.stack([*parts, losses.a, losses.b, 1 / _rate(scales, terms) / HOUR])
+
+
 def budget_intervals(
     fit: ScaleFit,
     sample: Posterior,
@@ -217,26 +232,18 @@ def budget_intervals(
         Loss rate of each mechanism, 1/h, a, b, and the lifetime, h; NaN where only the limits of
         the scales determine them.
     """
-    units = {m.name: "1/h" for m in MECHANISMS if m.vary}
-    units |= {"a": "1/(mA s)", "b": "1/s", "lifetime": "h"}
     terms = fit.terms_at(operation, current)
-
-    def rows(scales: Array) -> Array:
-        losses = scaled_parts(scales, terms)
-        rates = losses.rates(current)
-        parts = [HOUR * rates[name] for name in units if name in rates]
-        return jnp.stack([*parts, losses.a, losses.b, 1 / _rate(scales, terms) / HOUR])
-
-    draws = np.asarray(jax.vmap(rows)(jnp.asarray(sample.draws)))
+    draws = np.asarray(jax.vmap(_budget_row, (0, None))(sample.draws, terms))
     ends = np.percentile(draws, [50, 50 - 50 * probability, 50 + 50 * probability], axis=0)
-    determined = fit.determines(rows)
+    determined = fit.determines(_budget_row, terms)
     found = np.where(determined, ends, np.nan).T
     return tuple(
         Interval(name, *map(float, values), unit, bool(known))
-        for (name, unit), values, known in zip(units.items(), found, determined, strict=True)
+        for (name, unit), values, known in zip(BUDGET_UNITS.items(), found, determined, strict=True)
     )
 
 
+@jax.jit
 def _rate(scales: Array, terms: LossTerms) -> Array:
     """Loss rate at the mean current, 1/s."""
     a, b = scaled_losses(scales, terms)
@@ -291,19 +298,19 @@ class Proposal(NamedTuple):
 def _candidate_rows(fit: ScaleFit, candidate: DecayCandidate) -> np.ndarray:
     """Slopes of the candidate's parts by the scales, in standard errors, shape (2, scales)."""
     terms = fit.terms_at(candidate.operation, candidate.current)
-    a, b = map(float, scaled_losses(jnp.asarray(fit.vector), terms))
+    a, b = map(float, scaled_losses(fit.vector, terms))
     time = np.linspace(0.0, candidate.duration, CANDIDATE_READINGS)
     beam = np.asarray(beam_at(time, candidate.current, a, b))
     record = DecayRecord(time, beam, np.full(CANDIDATE_READINGS, candidate.noise))
     mean, root = beam.mean(), information_root(Expansion.at(record, candidate.current, a, b))
     summary = Summaries(mean, loss_parts(a, b, mean), root)
     candidate_set = terms._replace(current=mean), summary
-    batch = jax.tree.map(lambda part: jnp.asarray(part)[None], candidate_set)
+    batch = jax.tree.map(lambda part: np.asarray(part)[None], candidate_set)
     candidate_set = DecaySet(*batch, fit.decays.pressure_error)
     *_, [rows], [change] = fit.linearise(candidate_set)
     # Scatter of a new decay: that of the most probable noise.
     scattered = change * fit.noise.scatter[fit.noise.most_probable]
-    return np.asarray(add_errors(np.eye(2), scattered)) @ rows
+    return add_errors(np.eye(2), scattered) @ rows
 
 
 def next_decays(fit: ScaleFit, candidates: Sequence[DecayCandidate]) -> tuple[Proposal, ...]:
@@ -399,9 +406,9 @@ class BestPoint(NamedTuple):
 
 def _lifetime(fit: ScaleFit, sample: Posterior, operation: Operation, current: float) -> Quantity:
     terms = fit.terms_at(operation, current)
-    if not fit.determines(lambda scales: _rate(scales, terms)):
+    if not fit.determines(_rate, terms):
         return Quantity(math.nan, None, "h")
-    rates = jax.vmap(_rate, (0, None))(jnp.asarray(sample.draws), terms)
+    rates = jax.vmap(_rate, (0, None))(sample.draws, terms)
     return quantity_of_draws(1 / np.asarray(rates) / HOUR, "h")
 
 
@@ -456,8 +463,8 @@ def best_operating_point(
     ends = max(low * ratio.min(), 1.01 * loss), max(high, low) * ratio.max()
     for _ in range(2):
         voltages = np.linspace(*ends, N_VOLTAGES)
-        terms = terms_at_voltages(fit.machine.ring, open_settings, current, jnp.asarray(voltages))
-        true = voltages[np.argmin(jax.vmap(_rate, (0, None))(jnp.asarray(draws), terms), axis=1)]
+        terms = terms_at_voltages(fit.machine.ring, open_settings, current, voltages)
+        true = voltages[np.argmin(jax.vmap(_rate, (0, None))(draws, terms), axis=1)]
         step = voltages[1] - voltages[0]
         ends = max(voltages[0], true.min() - step), min(voltages[-1], true.max() + step)
     found = np.clip(true / ratio, low, max(high, low))
@@ -540,22 +547,19 @@ def predict_held_back(fit: ScaleFit) -> tuple[LeaveOneOut, ...]:
     """
     measured, noise, found = fit.decays.measured, fit.noise, []
     weight, residuals, rows, change = fit.linearise(fit.decays)
+    sizes = np.array([noise.sizes(i, len(fit.names)) for i in range(noise.weight.size)])
     for k, name in enumerate(fit.names):
-        root = np.asarray(measured.root[k])
+        root = measured.root[k]
         if not np.any(root):
             continue
         inverse = np.linalg.inv(weight[k])
-        each = [
-            _predict_without(
-                residuals[k] + rows[k] @ (noise.shift[i] - noise.centre),
-                rows[k] @ noise.covariance_root[i],
-                change[k] * noise.sizes(i, len(fit.names))[k],
-                change[k] * noise.scatter[i],
-            )
-            for i in range(noise.weight.size)
-        ]
-        difference = np.array([(inverse @ one)[1] for one, _ in each])
-        variance = np.array([inverse[1] @ spread @ inverse[1] for _, spread in each])
+        difference, spread = _predict_without(
+            residuals[k] + (noise.shift - noise.centre) @ rows[k].T,
+            rows[k] @ noise.covariance_root,
+            change[k] * sizes[:, k, None],
+            change[k] * noise.scatter[:, None],
+        )
+        difference, variance = difference @ inverse[1], inverse[1] @ spread @ inverse[1]
         reading = np.linalg.inv(root)[1]
         rate, error = measured.parts[k, 1], np.linalg.norm(reading)
         # Under some noises a decay alone determines a scale, and is not predicted by the others.
@@ -575,25 +579,25 @@ def predict_held_back(fit: ScaleFit) -> tuple[LeaveOneOut, ...]:
 def _predict_without(
     residuals: np.ndarray, slopes: np.ndarray, scatter: np.ndarray, usual_scatter: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Residuals of a decay, (2,), against the fit to the others, and their covariance.
+    """Residuals of a decay, (k, 2), against the fit to the others, and their covariance, by noise.
 
     Parameters
     ----------
-    residuals : array, shape (2,)
+    residuals : array, shape (k, 2)
         Residuals against the fit to all decays.
-    slopes : array, shape (2, r)
+    slopes : array, shape (k, 2, r)
         Slopes by standard errors of the scales in the fit to all.
-    scatter, usual_scatter : array, shape (2, 2)
+    scatter, usual_scatter : array, shape (k, 2, 2)
         Slopes by the scatter of this decay in the fit, and of any decay.
     """
-    covariance = np.eye(2) + scatter @ scatter.T
+    covariance = np.eye(2) + scatter @ scatter.mT
     root = np.linalg.cholesky(covariance)
     white = np.linalg.solve(root, slopes)
-    shares, vectors = np.linalg.eigh(white @ white.T)
+    shares, vectors = np.linalg.eigh(white @ white.mT)
     # A decay that alone determines a scale has a prediction with infinite error.
-    inverse = vectors / np.maximum(1 - shares, np.finfo(float).eps) @ vectors.T
-    spread = root @ inverse @ root.T - covariance + np.eye(2) + usual_scatter @ usual_scatter.T
-    return root @ inverse @ np.linalg.solve(root, residuals), spread
+    inverse = vectors / np.maximum(1 - shares, np.finfo(float).eps)[:, None] @ vectors.mT
+    spread = root @ inverse @ root.mT - covariance + np.eye(2) + usual_scatter @ usual_scatter.mT
+    return (root @ inverse @ np.linalg.solve(root, residuals[..., None]))[..., 0], spread
 
 
 NOTE = (

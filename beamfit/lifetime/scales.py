@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
@@ -15,12 +15,12 @@ from jax.scipy.special import logsumexp
 from scipy.linalg import block_diag
 
 from beamfit.answer import json_of, shown
-from beamfit.arrays import padded_length
+from beamfit.arrays import array_module, padded_length
 from beamfit.errors import Finding, InputError, Judged, judge, nearest
 from beamfit.greybox.covariance import Spread, spread_of
 from beamfit.greybox.fit import Fit
 from beamfit.greybox.posterior import Optimum, Statement, target_of
-from beamfit.greybox.problem import Free, Prior, Problem, Record
+from beamfit.greybox.problem import Free, Prior, Problem, Record, with_slope
 from beamfit.greybox.solve import solve
 from beamfit.lifetime.expansion import LEVEL, LOSS, MAX_RELATIVE_ERROR, QUADRATIC, Expansion
 from beamfit.lifetime.fill_noise import (
@@ -68,16 +68,17 @@ class Summaries(NamedTuple):
 def loss_parts(a: Array, b: Array, mean_current: Array) -> Array:
     """Parts a I and a I + b, 1/s, by which a decay is compared with a model."""
     quadratic = a * mean_current
-    return jnp.stack([quadratic, quadratic + b], axis=-1)
+    return array_module(quadratic).stack([quadratic, quadratic + b], axis=-1)
 
 
-def loss_part_slopes(quadratic: np.ndarray, linear: np.ndarray) -> np.ndarray:
+def loss_part_slopes(quadratic: Array, linear: Array) -> Array:
     """Slopes of the parts by relative changes of a and b, shape (n, 2, 2).
 
     `quadratic` is a I and `linear` is b, both 1/s.
     """
-    rows = np.array([[quadratic, np.zeros_like(quadratic)], [quadratic, linear]])
-    return np.moveaxis(rows, -1, 0)
+    xp = array_module(quadratic)
+    rows = xp.asarray([[quadratic, xp.zeros_like(quadratic)], [quadratic, linear]])
+    return xp.moveaxis(rows, -1, 0)
 
 
 def information_root(expansion: Expansion, scale: float = 1.0) -> np.ndarray:
@@ -116,10 +117,10 @@ def add_errors(root: Array, changes: Array) -> Array:
     array, shape (..., n, n)
         W with WᵀW = Rᵀ (1 + G Gᵀ)⁻¹ R and G = R changes: the errors are integrated out.
     """
-    whitened = root @ changes
-    unit = jnp.eye(root.shape[-1])
-    cholesky = jnp.linalg.cholesky(unit + whitened @ jnp.swapaxes(whitened, -1, -2))
-    return jnp.linalg.solve(cholesky, root)
+    xp, whitened = array_module(root, changes), root @ changes
+    unit = xp.eye(root.shape[-1])
+    cholesky = xp.linalg.cholesky(unit + whitened @ xp.swapaxes(whitened, -1, -2))
+    return xp.linalg.solve(cholesky, root)
 
 
 def _cycles_root(fit: DecayFit, rate: float) -> np.ndarray:
@@ -179,7 +180,7 @@ def summarise(decays: Sequence[Decay], power: float = 0.0) -> Summaries:
         elif not power:
             parts[k] = loss_parts(a, b, fit.mean_current)
             root[k] = _cycles_root(fit, parts[k, 1])
-    return Summaries(*map(jnp.asarray, (current, parts, root)))
+    return Summaries(current, parts, root)
 
 
 # Relative error of a pressure reading by default: that of a calibrated gauge.
@@ -229,9 +230,7 @@ class DecaySet(NamedTuple):
         voltages: np.ndarray | None = None,
     ) -> DecaySet:
         """Reduce decays and compute their loss terms; `voltages` as in `LossTerms`."""
-        settings = settings_of(decays, machine)
-        rows = [loss_terms(machine.ring, *setting, voltages) for setting in settings]
-        terms = jax.tree.map(lambda *parts: jnp.stack(parts), *rows)
+        terms = _terms_of(settings_of(decays, machine), machine, voltages)
         return cls(terms, summarise(decays), pressure_error)
 
     def parts(self, scales: Array, factor: Array) -> Array:
@@ -239,7 +238,14 @@ class DecaySet(NamedTuple):
         return loss_parts(*scaled_losses(scales, self.terms, factor), self.terms.current)
 
 
-@jax.jit
+def _terms_of(
+    settings: Sequence[tuple[Operation, float]], machine: Machine, voltages: np.ndarray | None
+) -> LossTerms:
+    """Loss terms at settings and currents; each part has shape (n,)."""
+    rows = [loss_terms(machine.ring, *setting, voltages) for setting in settings]
+    return jax.tree.map(lambda *parts: np.stack(parts), *rows)
+
+
 def whitener(scales: Array, decays: DecaySet) -> Array:
     """Root of the information with each pressure factor integrated out, shape (n, 2, 2)."""
     ones = jnp.ones_like(decays.terms.current)
@@ -247,14 +253,10 @@ def whitener(scales: Array, decays: DecaySet) -> Array:
     return add_errors(decays.measured.root, decays.pressure_error * slope[..., None])
 
 
-@jax.jit
 def pulls(scales: Array, decays: DecaySet, weight: Array) -> Array:
     """Model minus measurement in standard errors, shape (n, 2); `weight` is from `whitener`."""
     difference = decays.parts(scales, jnp.ones_like(decays.terms.current)) - decays.measured.parts
     return jnp.einsum("nij,nj->ni", weight, difference)
-
-
-_pull_slopes = jax.jit(jax.jacfwd(pulls))
 
 
 @shown
@@ -417,20 +419,21 @@ class ScaleFit(Judged):
 
     def losses_at(self, operation: Operation, current: float) -> tuple[Array, Array]:
         """Scaled a, 1/(mA s), and b, 1/s, of first principles at a setting."""
-        return scaled_losses(jnp.asarray(self.vector), self.terms_at(operation, current))
+        return scaled_losses(self.vector, self.terms_at(operation, current))
 
-    def determines(self, quantity: Callable[[Array], Array]) -> np.ndarray:
+    def determines(
+        self, quantity: Callable[[Array, LossTerms], Array], terms: LossTerms
+    ) -> np.ndarray:
         """Return True for quantities that decays and priors determine.
 
-        ``quantity(scales)`` is a JAX array. A quantity is determined if its error is below a third
-        of its value, or of the ring file's value if that is larger; the limits of the scales do not
-        count.
+        ``quantity(scales, terms)`` is a JAX array. A quantity is determined if its error is below a
+        third of its value, or of the ring file's value if that is larger; the limits of the scales
+        do not count.
         """
-        vector = jnp.asarray(self.vector)
-        ring_file = jnp.ones_like(vector)
-        size = np.maximum(np.abs(quantity(vector)), np.abs(quantity(ring_file)))
-        error = self.spread.error(np.asarray(jax.jacfwd(quantity)(vector)))
-        return error < MAX_RELATIVE_ERROR * size
+        value, slope = _value_and_slope(quantity, self.vector, terms)
+        of_ring_file, _ = _value_and_slope(quantity, np.ones_like(self.vector), terms)
+        size = np.maximum(np.abs(value), np.abs(of_ring_file))
+        return self.spread.error(np.asarray(slope)) < MAX_RELATIVE_ERROR * size
 
     def linearise(self, decays: DecaySet) -> tuple[np.ndarray, ...]:
         """Linearise decays about the fitted scales.
@@ -444,7 +447,7 @@ class ScaleFit(Judged):
         rows, change : array, shapes (n, 2, p), (n, 2, 2)
             Slopes of the pulls by the scales, and by ln a and ln b of each decay.
         """
-        return _linearise(self.vector, decays)
+        return jax.device_get(_linearise(self.vector, decays))
 
     def __str__(self) -> str:
         rows = [f"{len(self.names)} decays: {self.status}. {self.message}"]
@@ -567,13 +570,14 @@ def fit_scales(
     free += [] if voltages is None else [Free(VOLTAGE, voltages[0], voltages[-1])]
     names = (*SCALES, VOLTAGE)[: len(free)]
     vector = np.array([priors.get(name, (1.0, 0.0))[0] for name in names])
-    models = _departure_changes(decays, machine, vector, voltages)
+    models = _departure_changes(decays, machine, vector, data.terms)
     limits = np.array([(each.lower, each.upper) for each in free], float).T
     last_best = None
     for _ in range(MAX_ITERATIONS):
-        linear = _linear_decays(vector, data, prior_terms, names)
+        weight, *rows = jax.device_get(_linearise(vector, data))
+        linear = LinearDecays(*rows, *_prior_rows(vector, prior_terms, names))
         noise = weigh_noises(linear, models, limits - vector)
-        arguments = data, (whitener(vector, data), _whitening_matrix(linear.loss_slopes, noise))
+        arguments = data, (weight, _whitening_matrix(linear.loss_slopes, noise))
         record = Record(RECORD, _whitened_pulls, arguments, zeros.ravel(), 1.0)
         found = solve(Problem(dict(zip(names, vector, strict=True)), free, [record], prior_terms))
         moved, vector = found.theta - vector, found.theta
@@ -607,31 +611,37 @@ def _whitened_pulls(
     return whiten @ pulls(_vector(model), decays, weight).ravel()
 
 
-def _linearise(vector: np.ndarray, decays: DecaySet) -> tuple[np.ndarray, ...]:
-    weight = whitener(jnp.asarray(vector), decays)
-    arguments = jnp.asarray(vector), decays, weight
-    weight, residuals, rows = map(np.asarray, (weight, pulls(*arguments), _pull_slopes(*arguments)))
+@partial(jax.jit, static_argnums=0)
+def _value_and_slope(
+    quantity: Callable[[Array, LossTerms], Array], vector: Array, terms: LossTerms
+) -> tuple[Array, Array]:
+    return with_slope(lambda scales: quantity(scales, terms), vector)
+
+
+@jax.jit
+def _linearise(vector: Array, decays: DecaySet) -> tuple[Array, ...]:
+    weight = whitener(vector, decays)
+    residuals, rows = with_slope(lambda scales: pulls(scales, decays, weight), vector)
     return weight, residuals, rows, weight @ _loss_slopes(vector, decays)
 
 
-def _loss_slopes(vector: np.ndarray, decays: DecaySet) -> np.ndarray:
+@jax.jit
+def _loss_slopes(vector: Array, decays: DecaySet) -> Array:
     """Slopes of the parts by ln a and ln b of each decay, shape (n, 2, 2)."""
-    a, b = map(np.asarray, scaled_losses(jnp.asarray(vector), decays.terms))
-    return loss_part_slopes(a * np.asarray(decays.terms.current), b)
+    a, b = scaled_losses(vector, decays.terms)
+    return loss_part_slopes(a * decays.terms.current, b)
 
 
-def _linear_decays(
-    vector: np.ndarray, decays: DecaySet, priors: Sequence[Prior], names: Sequence[str]
-) -> LinearDecays:
-    """Linearise decays and priors about some scales."""
-    _, residuals, rows, change = _linearise(vector, decays)
+def _prior_rows(
+    vector: np.ndarray, priors: Sequence[Prior], names: Sequence[str]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Residuals of the priors, and their slopes by the scales."""
     index = [names.index(prior.name) for prior in priors]
     mean, sd = (np.array([getattr(p, n) for p in priors], float) for n in ("mean", "sd"))
-    prior_slopes = np.eye(len(names))[index] / sd[:, None]
-    return LinearDecays(residuals, rows, change, (vector[index] - mean) / sd, prior_slopes)
+    return (vector[index] - mean) / sd, np.eye(len(names))[index] / sd[:, None]
 
 
-def _whitening_matrix(change: np.ndarray, noise: FillNoise) -> Array:
+def _whitening_matrix(change: np.ndarray, noise: FillNoise) -> np.ndarray:
     """Whitening matrix, (2n, 2n), of all pulls with the most probable noise.
 
     `change` are the slopes of the pulls by ln a and ln b.
@@ -643,21 +653,16 @@ def _whitening_matrix(change: np.ndarray, noise: FillNoise) -> Array:
 
 
 def _departure_changes(
-    decays: Sequence[Decay], machine: Machine, vector: np.ndarray, voltages: np.ndarray | None
+    decays: Sequence[Decay], machine: Machine, vector: np.ndarray, terms: LossTerms
 ) -> dict[str, np.ndarray]:
     """Changes of ln a and ln b of each decay by other departures, for `weigh_noises`."""
-    settings, scales = settings_of(decays, machine), jnp.asarray(vector[: len(SCALES)])
-
-    def logs(operation: Operation, current: float) -> np.ndarray:
-        terms = loss_terms(machine.ring, operation, current)
-        return np.log(np.array(scaled_losses(scales, terms), float))
-
-    found = {}
-    if voltages is None:
+    settings, found = settings_of(decays, machine), {}
+    if terms.voltages is None:
         factor = 1 + VOLTAGE_STEP
         raised = [(o._replace(rf_voltage=factor * o.rf_voltage), beam) for o, beam in settings]
-        change = np.array([logs(*to) - logs(*at) for to, at in zip(raised, settings, strict=True)])
-        found[VOLTAGE] = MODEL_SIZES[VOLTAGE] / VOLTAGE_STEP * change[..., None]
+        to, at = (np.log(scaled_losses(vector, each))
+                  for each in (_terms_of(raised, machine, None), terms))  # fmt: skip
+        found[VOLTAGE] = MODEL_SIZES[VOLTAGE] / VOLTAGE_STEP * (to - at).T[..., None]
     inputs = np.array([
         (1e-6 * o.rf_voltage, np.log(o.scraper_y), np.log(o.bunches)) for o, _ in settings
     ], float)  # fmt: skip
@@ -708,10 +713,10 @@ class SampledNoises(NamedTuple):
             np.pad(one, ((0, 0), (0, 0), (0, width - one.shape[2]))) for one in drawn_columns
         ]
         return cls(
-            prior=jnp.asarray(noise.prior[drawn] - np.log(noise.weight[drawn])) + jnp.log(counts),
-            sizes=jnp.asarray([noise.sizes(k, count) for k in drawn]),
-            rows=jnp.asarray(_loss_slopes(fit.vector, fit.decays)),
-            columns=jnp.asarray(columns),
+            prior=noise.prior[drawn] - np.log(noise.weight[drawn]) + jnp.log(counts),
+            sizes=np.array([noise.sizes(k, count) for k in drawn]),
+            rows=_loss_slopes(fit.vector, fit.decays),
+            columns=np.array(columns),
         )
 
 

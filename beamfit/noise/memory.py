@@ -17,7 +17,6 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.fft import irfft, next_fast_len, rfft
 from scipy.linalg.lapack import dpttrf, dpttrs, dtbtrs
 from scipy.special import logsumexp
 
@@ -412,6 +411,8 @@ def without_flicker(rows: np.ndarray, power: float) -> np.ndarray:
         return rows
     j = np.arange(1, len(rows))
     weights = np.append(1.0, np.cumprod((j - 1 - power / 2) / j))
+    from scipy.fft import irfft, next_fast_len, rfft  # slow to import, needed only here
+
     size = next_fast_len(2 * len(rows), real=True)
     filtered_rows = irfft(rfft(rows, size, axis=0) * rfft(weights, size)[:, None], size, axis=0)
     return filtered_rows[: len(rows)]

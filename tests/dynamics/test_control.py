@@ -30,7 +30,7 @@ INF = np.inf
 
 
 def response(physics, p, m=1, delay=0, margin=0.05, of=None, name="y"):
-    raw = physics.raw(jnp.array(p), m) if of is None else of
+    raw = physics.raw(jnp.array(p)) if of is None else of
     return Response(name, physics, raw, 0.5, delay, 1.0, 0.2, margin)
 
 
@@ -147,7 +147,7 @@ def test_plans_of_a_process_that_changes_are_the_best_where_a_limit_binds(above)
     state = control.begin([0.4])
 
     def ahead(plan, x):
-        p = jax.vmap(lambda u: FIRST_ORDER.physical(changing_lag(u), 1))(plan[:, None])
+        p = jax.vmap(lambda u: FIRST_ORDER.physical(changing_lag(u)))(plan[:, None])
         felt = jnp.concatenate([plan, plan[-1:]])[:, None]
         p = jnp.concatenate([p, p[-1:]])
         return simulate(FIRST_ORDER, p, felt, jnp.full(n + 1, 0.5), x)[1:]

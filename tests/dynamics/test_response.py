@@ -716,3 +716,19 @@ def test_a_network_at_few_values_is_told_as_that():
     assert fit.status is Status.unidentified
     assert "only at the few values that inputs had" in fit.message
     assert not fit.left_out
+
+
+@pytest.mark.parametrize(
+    ("noise", "status"), [(0.05, Status.converged), (40.0, Status.unidentified)]
+)
+def test_a_long_record_that_rests_at_first(noise, status):
+    """The start is sought where the input moves; what the noise hides is said."""
+    rng, n, fall = np.random.default_rng(0), 20_000, np.exp(-0.1)
+    u = np.repeat(rng.choice([0.0, 1.0, 2.0], n // 40), 40)
+    u[: n // 2] = u[0]
+    y = lfilter([0.0, 2.0 * (1.0 - fall)], [1.0, -fall], u) + 1.0 + noise * rng.normal(size=n)
+    fit = identify(Run(0.5 * np.arange(n), {"valve": u}, {"level": y}))
+    assert fit.status is status, fit.message
+    if status is Status.converged:
+        tau = fit.quantities["tau"]
+        assert abs(tau.value - 5.0) < 4 * tau.error

@@ -78,8 +78,8 @@ def test_the_difference_equation_of_the_report_has_the_samples_of_a_second_order
 def test_raw_numbers_of_any_size_are_stable_and_come_back(physics):
     count = len(physics.parameters(("a", "b")))
     for q in np.random.default_rng(1).normal(0, 1.5, (20, count)):
-        p = physics.physical(jnp.array(q), 2)
-        np.testing.assert_allclose(physics.raw(p, 2), q, rtol=1e-6)
+        p = physics.physical(jnp.array(q))
+        np.testing.assert_allclose(physics.raw(p), q, rtol=1e-6)
         x = physics.begin(jnp.ones(physics.free_states), jnp.zeros(2))
         y = simulate(physics, jnp.tile(p, (4000, 1)), jnp.zeros((4000, 2)), jnp.ones(4000), x[
             : physics.free_states])  # fmt: skip
