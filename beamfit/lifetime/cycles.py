@@ -167,8 +167,8 @@ def join_cycles(cycles: Sequence[DecayRecord], name: str) -> DecayRecord:
 
 # Above this many readings neighbours are averaged, in blocks within a cycle.
 MAX_READINGS = 16384
-# Readings or cycles this many robust standard deviations off are left out, if they are at most this
-# share of all.
+# Readings or cycles this many robust standard deviations off are left out, if they hold at most
+# this share of all readings.
 OUTLIER, MAX_OUTLIER_SHARE = 7.0, 0.2
 # Edge readings of cycles are left out if their mean over cycles is this many standard errors off
 # the law; smaller shifts are in the errors (`beamfit.lifetime.expansion.SHIFTS`).
@@ -205,12 +205,12 @@ def collect_cycles(cycles: Sequence[DecayRecord]) -> Pieces:
     )  # fmt: skip
 
 
-def _outliers(values: np.ndarray) -> np.ndarray:
-    """Flag outliers, unless they are too many."""
+def _outliers(values: np.ndarray, readings: np.ndarray | None = None) -> np.ndarray:
+    """Flag outliers, unless they are too many, or hold too many of the readings."""
     off = np.abs(values - np.median(values))
     spread = 1.4826 * np.median(off)
     outliers = off > OUTLIER * spread
-    if spread > 0 and outliers.mean() <= MAX_OUTLIER_SHARE:
+    if spread > 0 and np.average(outliers, weights=readings) <= MAX_OUTLIER_SHARE:
         return outliers
     return np.zeros(values.size, bool)
 
@@ -232,7 +232,35 @@ def _odd_cycles(expansion: Expansion) -> np.ndarray:
     off = rate - np.median(others, axis=1)
     differences = np.pad(np.abs(np.diff(rate)), 1, constant_values=np.inf)
     isolated = np.minimum(differences[:-1], differences[1:]) > 0.5 * np.abs(off)
-    return _outliers(off * np.sqrt(squares)) & isolated
+    return _outliers(off * np.sqrt(squares), expansion.pieces.lengths) & isolated
+
+
+def _uneven_cycles(expansion: Expansion) -> np.ndarray:
+    """Flag cycles in which the loss rate changes suddenly: about a parabola of their own,
+    neighbouring residuals are far more alike than in the others.
+
+    Readings at the edges, which may be within injections, do not count.
+    """
+    lengths, index = expansion.pieces.lengths, expansion.pieces.index_in_piece
+    edge = lengths // REFERENCE_NEIGHBOURS
+    left, right = (np.repeat(values, lengths) for values in (edge, lengths - edge))
+    inner, count = (index >= left) & (index < right), lengths - 2 * edge
+    first = np.cumsum(count) - count
+
+    def without(column: np.ndarray, other: np.ndarray) -> np.ndarray:
+        sums = np.add.reduceat(np.column_stack([column * other, other**2]), first)
+        return column - other * np.repeat(sums[:, 0] / np.maximum(sums[:, 1], 1e-300), count)
+
+    columns = [*(index[inner, None] ** np.arange(3.0)).T, expansion.reduced[inner, -1]]
+    while len(columns) > 1:
+        columns = [without(column, columns[0]) for column in columns[1:]]
+    residual = columns[0]
+    most = OUTLIER * 1.4826 * float(np.median(np.abs(residual)))
+    residual = np.clip(residual, -most, most)
+    product = np.append(residual[1:] * residual[:-1], 0.0)
+    product[first[1:] - 1] = 0.0
+    alike = np.add.reduceat(product, first) / np.sqrt(count)
+    return _outliers(alike, lengths) & (alike > 0) & (count > REFERENCE_NEIGHBOURS)
 
 
 def _edge_excess(expansion: Expansion) -> np.ndarray:
@@ -315,20 +343,31 @@ def _trim_edges(expansion: Expansion) -> tuple[Expansion, list[str]]:
     return expansion, sentences
 
 
+def _omission(flags: np.ndarray, which: str) -> list[str]:
+    """Sentence on the cycles that are left out."""
+    count = int(flags.sum())
+    return [f"{count} {'cycle was' if count == 1 else 'cycles were'} left out, {which}"]
+
+
 def clean_cycles(cycles: Pieces) -> tuple[Expansion, tuple[str, ...]]:
     """Fit without readings, edges of cycles and cycles that do not belong to the decay; sentences
     say which.
     """
-    plain = fit_law(cycles)
-    expansion, sentences = _trim_edges(with_course(plain))
+    plain, sentences = fit_law(cycles), []
+    expansion = with_course(plain)
+    if (uneven := _uneven_cycles(expansion)).any():
+        cycles = cycles.select(~np.repeat(uneven, cycles.lengths), MIN_CYCLE_READINGS)
+        plain = fit_law(cycles)
+        expansion = with_course(plain)
+        sentences += _omission(uneven, "in which the loss rate changes")
+    expansion, edges = _trim_edges(expansion)
+    sentences += edges
     before = expansion.pieces
     plain = plain if before is cycles else fit_law(before)
-    cut = np.repeat(_odd_cycles(plain), before.lengths)
-    if cut.any():
+    if (odd := _odd_cycles(plain)).any():
+        cut = np.repeat(odd, before.lengths)
         expansion = with_course(fit_law(before.select(~cut, MIN_CYCLE_READINGS)))
-        omitted = before.first.size - expansion.pieces.first.size
-        were = "cycle was" if omitted == 1 else "cycles were"
-        sentences.append(f"{omitted} {were} left out, whose loss rate lies far off the others'")
+        sentences += _omission(odd, "whose loss rate lies far off the others'")
     if (outliers := _outliers(expansion.reduced[:, -1])).any():
         sentences.append(f"{int(outliers.sum())} readings were left out as outliers")
         expansion = with_course(fit_law(expansion.pieces.select(~outliers, MIN_CYCLE_READINGS)))
@@ -435,16 +474,17 @@ def _with_parts(expansion: Expansion, begins: np.ndarray) -> Expansion:
     cycles.
 
     Departures weighted by time add up to zero, so that the last one follows from the others. A
-    cycle counts for the time until the next one, including an omitted cycle but not a gap; an
-    omitted cycle between two parts is shared equally. Departures may be large, so that the
+    cycle counts for the time until the next one, including an omitted cycle of the usual length but
+    not a gap; the time between two parts is shared equally. Departures may be large, so that the
     expansion is repeated `COURSE_STEPS` times.
     """
     first, time = expansion.pieces.first[begins], expansion.pieces.time
     count = np.diff(first, append=time.size)
     durations = np.diff(time[expansion.pieces.first], append=time[-1])
-    usual_duration = float(np.median(durations))
-    durations = np.minimum(durations, 2 * usual_duration)
-    shared = 0.5 * np.maximum(durations[begins[1:] - 1] - usual_duration, 0.0)
+    spans = time[expansion.pieces.first + expansion.pieces.lengths - 1]
+    spans = spans - time[expansion.pieces.first]
+    durations = np.minimum(durations, spans + float(np.median(durations)))
+    shared = 0.5 * (durations - spans)[begins[1:] - 1]
     part_time = np.add.reduceat(durations, begins) + np.append(0.0, shared) - np.append(shared, 0.0)
     shares = np.vstack([np.eye(begins.size - 1), -part_time[:-1] / part_time[-1]])
     numbers, departure = expansion.numbers, np.zeros(begins.size)

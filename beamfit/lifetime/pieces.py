@@ -315,7 +315,8 @@ def _ramp_length(current: np.ndarray, noise: float) -> int:
     """Count the readings of injection at the head of a piece.
 
     The current rises by more than the noise and three times more than anywhere later. Half as many
-    readings again are cut, since the last part of a smooth ramp is below that.
+    readings again are cut, since the last part of a smooth ramp is below that, but at most half of
+    those that follow.
     """
     rise = np.max(current) - np.min(current[:RAMP_WINDOW])
     if current.size < 3 * MIN_READINGS or rise <= 6 * noise:
@@ -326,7 +327,8 @@ def _ramp_length(current: np.ndarray, noise: float) -> int:
     later = float(np.max(rest - np.minimum.accumulate(rest)))
     if smooth[highest] - smooth[0] <= max(6 * noise, RAMP_RISE * later):
         return 0
-    cut = int(1.5 * (highest + RAMP_WINDOW // 2)) + 1
+    end = highest + RAMP_WINDOW // 2
+    cut = end + min(end, current.size - end) // 2 + 1
     return cut if current.size - cut >= MIN_READINGS else 0
 
 

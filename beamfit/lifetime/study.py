@@ -28,6 +28,7 @@ from beamfit.lifetime.mechanisms import MECHANISMS, Losses, loss_coefficients
 from beamfit.lifetime.pieces import (
     MIN_CYCLE_READINGS,
     MIN_CYCLES,
+    SHORT,
     Event,
     Split,
     beam_readings,
@@ -446,9 +447,11 @@ def split_at_settings(segment: DecayRecord) -> list[DecayRecord]:
 
 def _pool_cycles(
     cycles: Sequence[DecayRecord], name: str, machine: Machine | None, law: Law
-) -> tuple[list[Decay], list[DecayRecord]]:
-    """Fit cycles at the same settings together; also return those to be fitted alone."""
-    groups, pooled, single = group_by_settings(cycles), [], []
+) -> tuple[list[Decay], list[DecayRecord], list[Event]]:
+    """Fit cycles at the same settings together; also return those to be fitted alone, and the
+    events of those that are in neither.
+    """
+    groups, pooled, single, omitted = group_by_settings(cycles), [], [], []
     pooled_groups = sum(len(group) >= MIN_CYCLES for group in groups)
     for group in groups:
         if len(group) < MIN_CYCLES:
@@ -461,12 +464,25 @@ def _pool_cycles(
         segment = join_cycles(group, group_name)
         alone = separable_cycles(group, segment, fit)
         answered = fit.status not in REFUTING and fit.lifetime_mean.error is not None
-        if not answered and len(alone) == len(group):  # one law does not hold for these fills
-            single += alone
+        if not answered and (len(alone) == len(group) or not _is_held(group)):
+            # One law does not hold for these fills.
+            usual = np.median(np.repeat([*map(len, group)], [*map(len, group)]))
+            shortest = max(MIN_READINGS, SHORT * usual)
+            listed = {id(c) for c in alone} | {id(c) for c in group if len(c) >= shortest}
+            single += [c for c in group if id(c) in listed]
+            rest = [c for c in group if id(c) not in listed]
+            omitted += [event_of(c, "short", 0, len(c) - 1)._replace(time=c.start) for c in rest]
             continue
         single += [cycle for cycle in alone if _lost(cycle) > OVER_DRIFT * DRIFT]
         pooled.append(Decay.of(segment, segment.start, fit, machine))
-    return pooled, single
+    return pooled, single, omitted
+
+
+def _is_held(cycles: Sequence[DecayRecord]) -> bool:
+    """Tell if refills hold one current: mean currents differ by less than a cycle loses."""
+    current = np.array([cycle.mean_current for cycle in cycles])
+    lost = np.median([np.ptp(cycle.current) for cycle in cycles])
+    return bool(np.median(np.abs(current - np.median(current))) < lost)
 
 
 def _edges_of_cycles(cycles: list[DecayRecord]) -> list[DecayRecord]:
@@ -614,7 +630,8 @@ def study_record(
     split, refilled = _split_at_changes(undated)
     events, pieces, pooled = split.events, split.segments, []
     if refilled:
-        pooled, pieces = _pool_cycles(pieces, record.name, machine, law)
+        pooled, pieces, omitted = _pool_cycles(pieces, record.name, machine, law)
+        events = (*events, *omitted)
     elif _has_unresolved_refills(split):
         pieces = ()
     del split  # frees 160 MB for 1e7 readings
