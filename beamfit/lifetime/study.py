@@ -464,18 +464,24 @@ def _pool_cycles(
         segment = join_cycles(group, group_name)
         alone = separable_cycles(group, segment, fit)
         answered = fit.status not in REFUTING and fit.lifetime_mean.error is not None
-        if not answered and (len(alone) == len(group) or not _is_held(group)):
-            # One law does not hold for these fills.
-            usual = np.median(np.repeat([*map(len, group)], [*map(len, group)]))
+        if not answered and len(alone) == len(group):  # one law does not hold for these fills
+            single += group
+            continue
+        if not answered and not _is_held(group):
+            lengths = [len(cycle) for cycle in group]
+            usual = float(np.median(np.repeat(lengths, lengths)))  # of a reading's cycle
             shortest = max(MIN_READINGS, SHORT * usual)
-            listed = {id(c) for c in alone} | {id(c) for c in group if len(c) >= shortest}
-            single += [c for c in group if id(c) in listed]
-            rest = [c for c in group if id(c) not in listed]
-            omitted += [event_of(c, "short", 0, len(c) - 1)._replace(time=c.start) for c in rest]
+            single += [cycle for cycle in group if len(cycle) >= shortest]
+            omitted += [_short(cycle) for cycle in group if len(cycle) < shortest]
             continue
         single += [cycle for cycle in alone if _lost(cycle) > OVER_DRIFT * DRIFT]
         pooled.append(Decay.of(segment, segment.start, fit, machine))
     return pooled, single, omitted
+
+
+def _short(piece: DecayRecord) -> Event:
+    """List a piece that is too short for a fit as an event."""
+    return event_of(piece, "short", 0, len(piece) - 1)._replace(time=piece.start)
 
 
 def _is_held(cycles: Sequence[DecayRecord]) -> bool:
