@@ -183,7 +183,8 @@ def read_decay_record(
     offset : str, optional
         Reading of the monitor without beam, to be subtracted: a current such as ``0.12mA``, or
         ``zero-beam`` to take it from the readings without beam; its error is then part of
-        `monitor`. Readings without beam are left out.
+        `monitor`. Readings without beam are left out. The default is ``zero-beam`` if the monitor
+        reads below zero without beam.
 
     Returns
     -------
@@ -419,7 +420,7 @@ def offset_of(
     ----------
     option : str or None
         ``zero-beam``, or a current such as ``0.12mA`` or ``-30:uA``. None: no offset, and all
-        readings are kept.
+        readings are kept; but as ``zero-beam`` if readings without beam are below zero.
     current : array, shape (n,)
         Readings, mA.
     path : str or path, optional
@@ -440,15 +441,17 @@ def offset_of(
     >>> offset_of("zero-beam", np.r_[np.tile([0.1, 0.3], 10), np.full(50, 500.0)]).notes[0]
     '20 readings without beam give the offset of the monitor, 0.2 ± 0.023 mA, which is taken off.'
     """
-    with_beam = np.ones(current.size, bool)
-    if option is None:
+    below, with_beam = current < 0, np.ones(current.size, bool)
+    if option is None and not below.any():
         return Offset(0.0, 0.0, with_beam)
     full_current = float(np.percentile(current, 99))
     is_low = np.abs(current) < DARK_SHARE * full_current
     edges = np.flatnonzero(np.diff(np.r_[False, is_low, False].astype(int)))
     for first, end in zip(edges[::2], edges[1::2], strict=True):
         with_beam[first:end] = end - first < MIN_DARK
-    if option == ZERO_BEAM:
+    if option is None and np.any(below & with_beam):
+        return Offset(0.0, 0.0, np.ones(current.size, bool))
+    if option in (None, ZERO_BEAM):
         value, error, count = _zero_beam_reading(current[~with_beam], full_current, path)
         note = (
             f"{count} readings without beam give the offset of the monitor, {value:.4g} ± "

@@ -105,7 +105,10 @@ def test_readings_below_zero_that_are_left_out_speak_of_the_monitor(tmp_path):
     said = read_decay_record(path, skip_bad=True).notes[0]
     assert said.startswith("10 readings are below zero, -0.5 mA in the middle")
     assert "--offset zero-beam" in said
-    assert not any("below zero" in n for n in read_decay_record(path, offset="zero-beam").notes)
+    for offset in ("zero-beam", None):  # what the monitor reads without beam is its zero
+        read = read_decay_record(path, offset=offset)
+        assert "offset of the monitor, -0.5 ± 0 mA, which is taken off" in read.notes[0]
+        assert read.current.tolist() == pytest.approx(beam[:50])
     single = write(tmp_path, "time_s,beam_current_mA\n0,5\n1,4\n2,-1\n3,3\n", "single.csv")
     assert not any("below zero" in n for n in read_decay_record(single, skip_bad=True).notes)
 
