@@ -260,7 +260,7 @@ def brief(value: Any) -> str:
             return f"{{{_listed([f'{name}: {brief(one)}' for name, one in value.items()])}}}"
         case tuple() | list() if not hasattr(value, "_fields"):
             return f"({_listed([brief(one) for one in value])})"
-    if hasattr(value, "shape"):
+    if hasattr(value, "dtype"):
         return _array_words(value)
     if (headline := getattr(value, "headline", None)) is not None:
         return brief(headline)

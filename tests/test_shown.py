@@ -1,5 +1,6 @@
 """Every public value in one line at a prompt, and as a table in a notebook."""
 
+from collections import namedtuple
 from html.parser import HTMLParser
 
 import jax
@@ -125,4 +126,6 @@ def test_numbers_of_any_kind():
     assert brief(np.float64(0.25)) == "0.25"
     assert brief(np.array([1, 2])) == "(1, 2)"
     assert brief([[1.0] * 3] * 9) == "(9 of (1, 1, 1), ...)"
+    Curve = namedtuple("Curve", "shape size")  # a record whose field has the name of an array's
+    assert brief(Curve((2, 1), 0.5)) == "Curve((2, 1), 0.5)"
     assert repr(Quantity(1.0, None, "m")) == "<Quantity 1 m (not determined)>"
