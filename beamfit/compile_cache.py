@@ -11,6 +11,7 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from threading import Lock
 
 # Option names of JAX; the environment variables have capitals. All code is cached, because a
 # command compiles hundreds of small functions in milliseconds each.
@@ -71,12 +72,17 @@ def prepare_jax() -> None:
         jax.config.update(CACHE_FOLDER, None if code is None else str(code))
 
 
+# Calls that compute now, in whatever thread, and the limit that the first of them set.
+_LOCK, _RUNNING = Lock(), []
+
+
 @contextmanager
 def usual_arithmetic() -> Iterator[None]:
     """Compute in a `with` block with one BLAS thread and NumPy's default floating-point errors.
 
     Matrices of scans and records are small: with two threads on a busy machine fits take three to
-    twenty times as long. Probabilities underflow, which a caller may have made an error.
+    twenty times as long. Of calls at the same time the last to end gives the threads back.
+    Probabilities underflow, which a caller may have made an error.
 
     Examples
     --------
@@ -89,8 +95,16 @@ def usual_arithmetic() -> Iterator[None]:
     import scipy.linalg  # loads the libraries of both, which are then limited  # noqa: F401
     from threadpoolctl import threadpool_limits
 
-    with threadpool_limits(limits=1, user_api="blas"), np.errstate(all="warn", under="ignore"):
-        yield
+    with _LOCK:
+        _RUNNING.append(_RUNNING[0] if _RUNNING else threadpool_limits(1, user_api="blas"))
+    try:
+        with np.errstate(all="warn", under="ignore"):
+            yield
+    finally:
+        with _LOCK:
+            limit = _RUNNING.pop()
+            if not _RUNNING:
+                limit.restore_original_limits()
 
 
 def own_folder() -> str | None:

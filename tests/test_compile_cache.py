@@ -14,7 +14,7 @@ from threadpoolctl import threadpool_info, threadpool_limits
 from beamfit import compile_cache
 from beamfit.__main__ import THREADS
 from beamfit.commands import with_paths
-from beamfit.compile_cache import TESTED_JAX
+from beamfit.compile_cache import TESTED_JAX, usual_arithmetic
 
 # Says where code is kept and how often it was found there; runs one of the package's functions.
 SCRIPT = """
@@ -155,6 +155,18 @@ def test_public_functions_compute_with_one_blas_thread():
         within = with_paths(threadpool_info, "threads")()
         assert threadpool_info() == before
     assert {one["num_threads"] for one in within if one["user_api"] == "blas"} == {1}
+
+
+def test_threads_are_given_back_when_the_last_of_several_calls_ends():
+    first, second = usual_arithmetic(), usual_arithmetic()
+    with threadpool_limits(2, user_api="blas"):
+        before = threadpool_info()
+        first.__enter__()
+        second.__enter__()
+        first.__exit__(None, None, None)
+        assert threadpool_info() != before
+        second.__exit__(None, None, None)
+        assert threadpool_info() == before
 
 
 def test_floating_point_errors_that_the_user_raises_do_not_reach_the_fit():
