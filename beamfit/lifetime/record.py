@@ -90,10 +90,15 @@ def _first(bad: np.ndarray) -> int | None:
     return int(np.argmax(bad)) if bad.any() else None
 
 
+# Smallest number of digits of a reading with beam, where units may be mixed; chosen.
+MIN_DIGITS = 10
+
+
 def _unit_change(current: np.ndarray) -> int | None:
     """Row at which the unit switches between A and mA.
 
-    The current jumps by a factor of 1000, and the decay continues from there.
+    The current jumps by a factor of 1000, and the decay continues from there. Readings of a few
+    digits are what a monitor shows without beam.
     """
     low, high = 2.99, 3.01
     if np.max(current) < 10**low * np.min(current):
@@ -101,7 +106,13 @@ def _unit_change(current: np.ndarray) -> int | None:
     with np.errstate(divide="ignore", invalid="ignore"):
         decades = current[1:] / current[:-1]
         np.abs(np.log10(decades, out=decades), out=decades)
+    digit = None
     for row in np.flatnonzero((decades > low) & (decades < high)) + 1:
+        if digit is None:
+            small = np.unique(current[current < np.max(current) / 100])
+            digit = np.min(np.diff(small), initial=np.inf)
+        if min(current[row - 1], current[row]) < MIN_DIGITS * digit:
+            continue
         before, after = np.median(current[max(row - 3, 0) : row]), current[row : row + 3]
         # After a dump a single noisy reading may be a thousandth by chance, not several.
         with np.errstate(divide="ignore", invalid="ignore"):

@@ -172,6 +172,11 @@ def test_what_is_left_after_a_dump_is_no_change_of_unit(after):
     assert DecayRecord(np.arange(current.size), current).current.size == current.size
 
 
+def test_an_injection_after_readings_of_one_digit_is_no_change_of_unit():
+    current = np.array([0.0, 0.01, 0.01, 9.98, 9.97, 9.97, 9.96])
+    assert DecayRecord(np.arange(7), current).current.size == 7
+
+
 def test_errors_and_conditions_are_checked():
     with pytest.raises(InputError, match="reading 2: an error of 0 mA"):
         DecayRecord([0, 1], [2, 1], [0.1, 0.0])
