@@ -324,12 +324,14 @@ def draw_lifetime(figure: FigureBase, study: RecordStudy) -> None:
     finite = [top for top in tops if np.isfinite(top)]
     if finite:
         axes.set_ylim(0.6 * min(finite), 1.4 * max(finite))
-    axes.set(title="momentary lifetime", xlabel=f"time, {unit}", ylabel="lifetime, h")
+    title = "momentary lifetime" if study.decays else "lifetime at the mean current"
+    axes.set(title=title, xlabel=f"time, {unit}", ylabel="lifetime, h")
     legend_below(figure, axes, 2)
 
 
 def _cycle_lifetimes(fit: DecayFit) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return time in s, lifetime and its error in h of up to 48 parts of a pooled fit.
+    """Return time in s, lifetime at the mean current and its error in h of up to 48 parts of a
+    pooled fit.
 
     The deviation of the loss rate of a part is the slope of the residuals of its cycles.
     """
@@ -347,7 +349,7 @@ def _cycle_lifetimes(fit: DecayFit) -> tuple[np.ndarray, np.ndarray, np.ndarray]
     rate = np.add.reduceat(since * residual, part) / squares / level
     lifetimes = np.array([of.lifetime.value for of in fit.course] or [fit.lifetime_mean.value])
     which = np.searchsorted([of.start for of in fit.course][1:], at - record.time[0])
-    rate += fit.a.value * (level - fit.mean_current) + 1 / lifetimes[which] / HOUR
+    rate += 1 / lifetimes[which] / HOUR
     error = fit.rms_residual / np.sqrt(squares) / level
     positive = rate > 0
     return at[positive], 1 / rate[positive] / HOUR, (error / rate**2)[positive] / HOUR
