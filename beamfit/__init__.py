@@ -80,7 +80,6 @@ _HOME = {
 }
 # Functions that accept paths in place of objects read from them.
 _WITH_PATHS = {
-    "check",
     "constant_a_test",
     "control",
     "design",

@@ -239,7 +239,6 @@ def _plane(fit: EmittanceFit, plane: str | None) -> str:
 
 def _render(picture: Picture) -> Figure:
     """Draw a picture of the report, in its style."""
-
     from beamfit.report.document import figure_of, own_style
 
     with own_style():

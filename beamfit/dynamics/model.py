@@ -54,13 +54,10 @@ class DrivenRun:
         if self.count <= reading or not self.even_rows:
             return self
         rows = int(self.index[reading - 1]) + self.even_rows
-        u, dt, time, index = (
-            self.u[:rows],
-            self.dt[:rows],
-            self.time[:reading],
-            self.index[:reading],
-        )
-        return replace(self, u=u, dt=dt, time=time, index=index, count=reading)
+        return replace(
+            self, u=self.u[:rows], dt=self.dt[:rows],
+            time=self.time[:reading], index=self.index[:reading], count=reading,
+        )  # fmt: skip
 
     @staticmethod
     def like(prepared: Sequence[PreparedOutput], i: int) -> DrivenRun:

@@ -386,11 +386,11 @@ def _vanishing_combination(rows: np.ndarray, free: np.ndarray, cut: float) -> np
     """
     held, v = ~free, np.zeros(len(rows))
     if held.any():
+        from scipy.optimize import nnls  # slow to import, needed only here
+
         signed = np.vstack([rows[held], rows[free], -rows[free]])
         total = np.append(np.ones(held.sum()), np.zeros(2 * free.sum()))
         one = np.append(np.zeros(rows.shape[1]), 1.0)
-        from scipy.optimize import nnls  # slow to import, needed only here
-
         found, miss = nnls(np.vstack([signed.T, total]), one, maxiter=50 * len(signed))
         if miss <= cut:
             v[held], (up, down) = found[: held.sum()], np.split(found[held.sum() :], 2)

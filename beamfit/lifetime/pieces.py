@@ -725,14 +725,24 @@ def _log_step_cost(lengths: np.ndarray) -> float:
     return float(min(steps * np.log(count), regular) + steps * size)
 
 
+def usual_length(lengths: np.ndarray) -> float:
+    """Length of the part in which a typical reading lies.
+
+    Examples
+    --------
+    >>> usual_length(np.array([1, 1, 1, 10]))
+    10.0
+    """
+    return float(np.median(np.repeat(lengths, lengths)))
+
+
 def _flag_short_parts(number: np.ndarray, begins: np.ndarray, lengths: np.ndarray) -> np.ndarray:
     """Flag parts that are too short.
 
     A clear piece of eight readings or more is not left out altogether.
     """
     piece, sizes = number[begins], np.bincount(number)
-    usual = np.median(np.repeat(lengths, lengths))  # length of the part of a typical reading
-    short = lengths < max(MIN_CYCLE_READINGS, SHORT * usual)
+    short = lengths < max(MIN_CYCLE_READINGS, SHORT * usual_length(lengths))
     emptied = np.bincount(piece, weights=~short) == 0
     return short & ~(emptied & (sizes >= MIN_READINGS))[piece]
 
@@ -742,7 +752,7 @@ def _count_regular_cycles(lengths: np.ndarray) -> np.ndarray:
 
     A missed refill, too small to be found, would bend the long piece, which has most weight.
     """
-    usual = np.median(np.repeat(lengths, lengths))
+    usual = usual_length(lengths)
     regular = np.abs(lengths - usual) <= max(PERIOD_TOLERANCE * usual, 1.0)
     if lengths @ regular < 0.5 * lengths.sum():
         return np.ones(lengths.size, int)

@@ -106,11 +106,12 @@ def _unit_change(current: np.ndarray) -> int | None:
     with np.errstate(divide="ignore", invalid="ignore"):
         decades = current[1:] / current[:-1]
         np.abs(np.log10(decades, out=decades), out=decades)
-    digit = None
-    for row in np.flatnonzero((decades > low) & (decades < high)) + 1:
-        if digit is None:
-            small = np.unique(current[current < np.max(current) / 100])
-            digit = np.min(np.diff(small), initial=np.inf)
+    rows = np.flatnonzero((decades > low) & (decades < high)) + 1
+    if not rows.size:
+        return None
+    small = np.unique(current[current < np.max(current) / 100])
+    digit = np.diff(small).min() if small.size > 1 else 0.0
+    for row in rows:
         if min(current[row - 1], current[row]) < MIN_DIGITS * digit:
             continue
         before, after = np.median(current[max(row - 3, 0) : row]), current[row : row + 3]

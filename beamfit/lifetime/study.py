@@ -35,6 +35,7 @@ from beamfit.lifetime.pieces import (
     event_of,
     is_refilled,
     split_record,
+    usual_length,
 )
 from beamfit.lifetime.readings import (
     MIN_READINGS,
@@ -468,20 +469,19 @@ def _pool_cycles(
             single += group
             continue
         if not answered and not _is_held(group):
-            lengths = [len(cycle) for cycle in group]
-            usual = float(np.median(np.repeat(lengths, lengths)))  # of a reading's cycle
-            shortest = max(MIN_READINGS, SHORT * usual)
+            shortest = max(MIN_READINGS, SHORT * usual_length([len(cycle) for cycle in group]))
             single += [cycle for cycle in group if len(cycle) >= shortest]
-            omitted += [_short(cycle) for cycle in group if len(cycle) < shortest]
+            omitted += [_short(c, 0, len(c) - 1) for c in group if len(c) < shortest]
             continue
         single += [cycle for cycle in alone if _lost(cycle) > OVER_DRIFT * DRIFT]
         pooled.append(Decay.of(segment, segment.start, fit, machine))
     return pooled, single, omitted
 
 
-def _short(piece: DecayRecord) -> Event:
-    """List a piece that is too short for a fit as an event."""
-    return event_of(piece, "short", 0, len(piece) - 1)._replace(time=piece.start)
+def _short(piece: DecayRecord, first: int, last: int) -> Event:
+    """List readings of a piece that are too few for a fit as an event of the record."""
+    event = event_of(piece, "short", first, last)
+    return event._replace(time=piece.start + event.time)
 
 
 def _is_held(cycles: Sequence[DecayRecord]) -> bool:
@@ -573,8 +573,7 @@ def _fit_piece(piece: DecayRecord, law: Law, undivided: bool) -> tuple[list[Deca
         if sides_to_fit and max(map(len, sides_to_fit)) < len(piece):
             decays, events = _fit_each(sides_to_fit, law, undivided)
             short = [rows for rows in sides if 0 < np.sum(rows) < MIN_READINGS]
-            short = [event_of(piece, "short", *np.flatnonzero(rows)[[0, -1]]) for rows in short]
-            short = [one._replace(time=piece.start + one.time) for one in short]
+            short = [_short(piece, *np.flatnonzero(rows)[[0, -1]]) for rows in short]
             return decays, [*events, *short, event._replace(time=piece.start + at)]
     return [Decay(segment, segment.start, fit, None)], []
 

@@ -409,10 +409,10 @@ def without_flicker(rows: np.ndarray, power: float) -> np.ndarray:
     """
     if not power:
         return rows
-    j = np.arange(1, len(rows))
-    weights = np.append(1.0, np.cumprod((j - 1 - power / 2) / j))
     from scipy.fft import irfft, next_fast_len, rfft  # slow to import, needed only here
 
+    j = np.arange(1, len(rows))
+    weights = np.append(1.0, np.cumprod((j - 1 - power / 2) / j))
     size = next_fast_len(2 * len(rows), real=True)
     filtered_rows = irfft(rfft(rows, size, axis=0) * rfft(weights, size)[:, None], size, axis=0)
     return filtered_rows[: len(rows)]

@@ -158,6 +158,7 @@ def test_the_noise_of_uneven_readings():
         ([0, 1, 2, 3], [4, 3, -2, 1], "current", "reading 3: a negative current, -2 mA"),
         ([0, 1, 2, 3], [4, np.nan, 2, 1], "current", "reading 2: nan"),
         ([0, 1, 2, 3, 4], [99, 98, 0.097, 0.096, 0.095], "current", "a factor of 1000"),
+        ([0, 1, 2, 3, 4], [99, 98, 0.098, 0.098, 0.098], "current", "a factor of 1000"),
     ],
 )
 def test_what_no_beam_can_do(time, current, column, words):

@@ -5,6 +5,7 @@ import re
 
 import numpy as np
 import pytest
+from scipy.stats import chi2
 
 import beamfit
 from beamfit import figures
@@ -109,8 +110,10 @@ def test_the_lifetimes_of_cycles_are_those_at_the_mean_current():
     cycles = start[:, None] / (1 + 1e-7 * start[:, None] * time)
     beam = cycles.ravel() + 1e-3 * rng.normal(size=cycles.size)
     study = study_record(DecayRecord(10.0 * np.arange(beam.size), beam))
-    (points, *_), *_ = figures.lifetime(study).axes[0].containers
-    assert np.std(points.get_ydata()) < 3e-4 * study.pooled[0].fit.lifetime_mean.value
+    (points, _, (bars,)), *_ = figures.lifetime(study).axes[0].containers
+    error = [0.5 * np.ptp(bar[:, 1]) for bar in bars.get_segments()]
+    pulls = (points.get_ydata() - study.pooled[0].fit.lifetime_mean.value) / error
+    assert np.mean(pulls**2) < chi2.ppf(0.999, pulls.size) / pulls.size
 
 
 def test_a_spike_does_not_flatten_the_decay():
